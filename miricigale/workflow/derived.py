@@ -1,5 +1,5 @@
 """
-Derived runs: the same study with one thing otherwise, and the comparison of the two.
+Derived runs: the same study with one setting changed, and its comparison with the study.
 
 The stages ``variants``, ``rivals`` and ``experiments`` and the perturbed truths each declare what they change
 and which numbers are compared; what they share is here.

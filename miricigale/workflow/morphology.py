@@ -1,4 +1,4 @@
-"""Light of galaxies that is no Sersic profile: clumps, and stamps of an image of real galaxies."""
+"""Galaxies beyond Sersic profiles: clumps, and stamps of an image of real galaxies."""
 
 import dataclasses
 import functools
@@ -54,8 +54,8 @@ _LAYOUT = "miricigale stamps 1"
 
 def _sersic(catalog):
     """Which sources of a checked catalog are painted as Sersic profiles."""
-    spoilt = np.asarray(catalog["flags"]) & int(CatalogFlags.unusable_profile())
-    return (np.asarray(catalog["profile"]) == "sersic") & (spoilt == 0)
+    unusable = np.asarray(catalog["flags"]) & int(CatalogFlags.unusable_profile())
+    return (np.asarray(catalog["profile"]) == "sersic") & (unusable == 0)
 
 
 def add_clumps(catalog, filter, *, share, seed, point=None):
@@ -237,7 +237,7 @@ class RealGalaxies:
         return Cutout.from_image(CCDData(light, unit=self.image.unit, wcs=wcs), position)
 
     def labels_at(self, sky):
-        """Labels of the segments at positions; 0 where there is none."""
+        """Return the labels of the segments at positions; 0 outside of all."""
         return values_at(sky, self.image.wcs, self._found[1])
 
     @functools.cached_property

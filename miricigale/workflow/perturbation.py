@@ -1,4 +1,4 @@
-"""In what the sky of a study differs from what its analysis takes it for."""
+"""Differences between the sky of a truth and what the analysis assumes."""
 
 import dataclasses
 import functools
@@ -25,7 +25,7 @@ TORUS = {"opening_angle": 50.0, "radius_ratio": 10.0}
 @dataclasses.dataclass(frozen=True)
 class Perturbation:
     """
-    Sky and detector of a truth where they differ from what the reduction takes them for.
+    Sky and detector of a truth where they differ from what the reduction assumes.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ class Perturbation:
 
     def with_flat(self, image, exposure):
         """
-        Light that makes of the known flat field one that is in part that of another detector of the kind.
+        Return the light that turns the known flat field into one that is in part another detector's.
 
         Parameters
         ----------

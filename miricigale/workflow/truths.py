@@ -51,16 +51,16 @@ EFFECTS = {
     "clumps": "made-up clumps",
     "cutouts": "light of real galaxies",
 }
-#: Those that there are with AGN only.
+#: Effects that need an AGN.
 NEEDS_AGN = ("torus", "point_agn")
 
-#: What further images of the first sky have otherwise: section, key, and its two values.
+#: Setting that each variant image changes: section, key, and its two values.
 VARIANTS = {
     "residual": ("detector", "residual", ("etc", 0.0)),
     "gradient": ("scene", "background_gradient", (0.05, 0.0)),
     "plane": ("reduction", "background_plane", (True, False)),
 }
-#: That which there is with an image only.
+#: The effect that needs an image.
 CUTOUTS = "cutouts"
 #: All effects, or the sky that has all of them.
 ALL = "all"
@@ -91,7 +91,7 @@ class Truth:
     base: str = ""
 
     def values(self):
-        """Plain values, for hashing; without perturbations there is no word of any."""
+        """Plain values, for hashing; perturbations are listed only where there are some."""
         values = {"name": self.name, "frac_agn": self.frac_agn}
         if self.perturbations:
             values["perturbations"] = dict(self.perturbations)
@@ -196,7 +196,7 @@ def band_sets(config):
 
 def variant_changes(config):
     """
-    What each of the variant images of the first sky has otherwise than the study's.
+    Return the settings of the variant images that differ from the study's.
 
     Parameters
     ----------

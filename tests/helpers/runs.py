@@ -91,6 +91,15 @@ def small_config(filters, *, points=False, frac_agn=(0.0,), sets=("all", "none")
     )
 
 
+def one_band(band, *, n_groups=7, n_integrations=1, kind="ramps", **sections):
+    """A configuration of one exposure of one band."""
+    exposures = {
+        "filters": [band], "kind": kind, "n_groups": [n_groups], "n_integrations": [n_integrations],
+        "n_dithers": [1],
+    }  # fmt: skip
+    return StudyConfig.from_dict({"exposures": exposures, "fit": {"min_detected": 1}, **sections})
+
+
 def do_stage(config, folder, name, unit=""):
     STAGES[name].function(Context(config, folder, stage=STAGES[name], unit=unit), unit)
 

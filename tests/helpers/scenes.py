@@ -40,6 +40,19 @@ def gaussian_psf(sigma=0.85, oversampling=4, half=9, **facts):
     return InstrumentPSF(data, oversampling=oversampling, **facts)
 
 
+def catalog_at(sky, **columns):
+    """A catalog of points at positions; ``columns`` (values or one value for all) replace or add columns."""
+    columns = {
+        "id": np.arange(1, len(sky) + 1), "sky": sky, "redshift": 1.0, "profile": "point",
+        "half_light_radius": 0.0 * u.arcsec, "sersic_index": 1.0, "axis_ratio": 1.0,
+        "position_angle": 0.0 * u.deg, **columns,
+    }  # fmt: skip
+    table = QTable()
+    for name, value in columns.items():
+        table[name] = value if name == "sky" else np.broadcast_to(value, len(sky), subok=True)
+    return table
+
+
 def make_catalog(wcs, x, y, *, flux=10.0, profile="point", **columns):
     """A catalog of sources at given pixels."""
     x, y = np.broadcast_arrays(np.atleast_1d(np.asarray(x, float)), np.atleast_1d(y))

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData
-from astropy.table import QTable
 
+from helpers.runs import one_band
+from helpers.scenes import catalog_at
 from miricigale.depth import zodiacal_factor
 from miricigale.instrument import background_level
 from miricigale.planning import load_plan
@@ -145,30 +146,11 @@ def test_the_report_says_which_and_from_where():
 
 
 def test_images_have_the_background_that_was_asked_for():
-    config = StudyConfig.from_dict(
-        {
-            "exposures": {
-                "filters": BANDS[:1], "kind": "rates", "n_groups": [40], "n_integrations": [1],
-                "n_dithers": [1],
-            },
-            "fit": {"min_detected": 1},
-            "scene": {"background": "20 MJy/sr", "background_gradient": 0.0},
-        }
-    )  # fmt: skip
+    scene = {"background": "20 MJy/sr", "background_gradient": 0.0}
+    config = one_band(BANDS[0], kind="rates", n_groups=40, scene=scene)
     (exposure,) = study_exposures(config).values()
-    catalog = QTable(
-        {
-            "id": [1],
-            "sky": SkyCoord([exposure.pointing.ra], [exposure.pointing.dec]),
-            "redshift": [1.0],
-            "profile": ["point"],
-            "half_light_radius": [0.0] * u.arcsec,
-            "sersic_index": [1.0],
-            "axis_ratio": [1.0],
-            "position_angle": [0.0] * u.deg,
-            BANDS[0]: [1.0] * u.uJy,
-        }
-    )
+    sky = SkyCoord([exposure.pointing.ra], [exposure.pointing.dec])
+    catalog = catalog_at(sky, **{BANDS[0]: 1.0 * u.uJy})
     forecasts = []
     _, cal = expose_and_reduce(config, exposure, catalog, seed=1, tell=forecasts.append)
     # through gain, non-linearity, flat field and conversion back to a surface brightness

@@ -6,16 +6,16 @@ import pytest
 from astropy.table import QTable
 from numpy.testing import assert_allclose
 
+from helpers.runs import STAGES, do_stage
 from miricigale.pages import Page
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow import Context
 from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.page.numbers import StudyTables
-from miricigale.workflow.stages import experiments, study_stages
+from miricigale.workflow.stages import experiments
 from miricigale.workflow.truths import EXPERIMENTS
 
-STAGES = {stage.name: stage for stage in study_stages()}
 FILTERS = ["miri.f770w", "miri.f1500w", "miri.f2100w"]
 FAST = ("far_infrared", "no_model_error", "known_redshift", "free_agn")
 #: Sources, one of which is not in the sample.
@@ -43,10 +43,6 @@ def config_of(*names, frac_agn=(0.4,)):
             },
         }
     )
-
-
-def do(config, folder, name, unit):
-    STAGES[name].function(Context(config, folder, stage=STAGES[name], unit=unit), unit)
 
 
 @pytest.fixture(scope="module")
@@ -78,9 +74,9 @@ def folder(tmp_path_factory, truth):
         matched[name] = truth[name] + rng.normal(size=N) * error
     made.save_table("agn40/truth.ecsv", truth)
     made.save_table("agn40/matched.ecsv", matched)
-    do(config, folder, "fits", "agn40/all")
+    do_stage(config, folder, "fits", "agn40/all")
     for unit in STAGES["experiments"].unit_names(config):
-        do(config, folder, "experiments", unit)
+        do_stage(config, folder, "experiments", unit)
     return folder
 
 
@@ -198,7 +194,7 @@ def test_the_section_of_the_page(folder):
 def test_without_a_sampler_there_is_a_sentence(folder, monkeypatch):
     monkeypatch.setattr(experiments, "SAMPLERS", ("no_such_sampler",))
     config = config_of("samplers")
-    do(config, folder, "experiments", "agn40/samplers")
+    do_stage(config, folder, "experiments", "agn40/samplers")
     assert len(read(folder, "samplers")) == 0
     report = Page("made up")
     experiments.write_experiments(Context(config, folder), report, tables_of(folder))
@@ -210,7 +206,7 @@ def test_a_subset_is_spread_over_the_sample(folder, monkeypatch):
     monkeypatch.setattr(experiments, "N_FREE", 3)
     config = config_of("free_agn")
     kept = read(folder, "free_agn")
-    do(config, folder, "experiments", "agn40/free_agn")
+    do_stage(config, folder, "experiments", "agn40/free_agn")
     few = read(folder, "free_agn")
     assert len(few) == 3
     assert list(few["id"][[0, -1]]) == [1, N]
@@ -228,7 +224,7 @@ def test_a_sampler_agrees_with_the_grid(folder, monkeypatch):
     monkeypatch.setattr(experiments, "N_SAMPLED", 1)
     options = {"n_live": 150, "n_effective": 300, "max_calls": 20_000}
     monkeypatch.setattr(experiments, "SAMPLER_OPTIONS", options)
-    do(config_of("samplers"), folder, "experiments", "agn40/samplers")
+    do_stage(config_of("samplers"), folder, "experiments", "agn40/samplers")
     (row,) = read(folder, "samplers")
     (grid,) = QTable.read(folder / "agn40" / "fits_all.ecsv")[:1]
     for name in ("redshift", "frac_agn"):

@@ -6,16 +6,17 @@ import pytest
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable, Table
 
+from helpers.runs import STAGES, do_stage
+from helpers.scenes import catalog_at
 from miricigale.fitting import FitResults
 from miricigale.scene import CatalogFlags, check_catalog
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import ConfigError, MiricigaleWarning
-from miricigale.workflow import Context, StudyRunner
+from miricigale.workflow import StudyRunner
 from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.page.provenance import catalog_facts
 from miricigale.workflow.stages import study_stages
 
-STAGES = {stage.name: stage for stage in study_stages()}
 SHORT, LONG = ["nircam.f090w", "nircam.f150w", "nircam.f200w"], ["mips.24"]
 ALPHA = [1.5, 2.5]
 
@@ -26,15 +27,9 @@ def galaxies():
     rows = {"redshift": [0.8, 0.8], "mass": [1e10, 1e10], "tau": [1.0, 1.0], "age": [1.0, 1.0]}
     rows |= {"ebv": [0.4, 0.4], "alpha": ALPHA}
     fluxes = SEDModel.yang2021(agn=False).fluxes(QTable(rows), [*SHORT, *LONG])
-    table = QTable({"id": [1, 2], "redshift": [0.8, 0.8], "profile": ["point", "point"]})
-    table["sky"] = SkyCoord([53.1, 53.101] * u.deg, [-27.8, -27.8] * u.deg)
-    table["half_light_radius"] = [0, 0] * u.arcsec
-    table["sersic_index"] = table["axis_ratio"] = [1.0, 1.0]
-    table["position_angle"] = [0, 0] * u.deg
-    table["mag_f160w"] = [20.0, 20.0]
-    for name in (*SHORT, *LONG):
-        table[name] = fluxes[name]
-    return table
+    sky = SkyCoord([53.1, 53.101] * u.deg, [-27.8, -27.8] * u.deg)
+    light = {name: fluxes[name] for name in (*SHORT, *LONG)}
+    return catalog_at(sky, redshift=0.8, mag_f160w=20.0, **light)
 
 
 def run(folder, table, **sed):
@@ -44,7 +39,7 @@ def run(folder, table, **sed):
         {"catalog": {"source": str(folder / "mine.ecsv")}, "fit": {"model_error": 0.02}, "sed": sed}
     )
     for name, unit in (("catalog", ""), ("seds", ""), ("truth", "agn00")):
-        STAGES[name].function(Context(config, folder, stage=STAGES[name], unit=unit), unit)
+        do_stage(config, folder, name, unit)
     facts = dict(catalog_facts(config, check_catalog(table)))
     truth = QTable.read(folder / "agn00" / "truth.ecsv")
     return config, FitResults.read(folder / "input_seds.fits"), truth, facts["input SEDs fitted to"]
@@ -130,9 +125,9 @@ def test_a_catalog_of_ones_own_by_a_map_of_columns(galaxies, tmp_path):
         pytest.warns(MiricigaleWarning, match="1 of 4 sources have no usable flux"),
         pytest.warns(MiricigaleWarning, match=r"taken as missing, .* 1 of 4 \(-99\)"),
     ):
-        STAGES["catalog"].function(Context(config, tmp_path, stage=STAGES["catalog"]), "")
+        do_stage(config, tmp_path, "catalog")
     for name, unit in (("seds", ""), ("truth", "agn00")):
-        STAGES[name].function(Context(config, tmp_path, stage=STAGES[name], unit=unit), unit)
+        do_stage(config, tmp_path, name, unit)
     truth = QTable.read(tmp_path / "agn00" / "truth.ecsv")
     # 23.9 - 2.5 log(10) = 21.4 is below the limit; the source without a flux stays, and has none
     assert list(truth["id"]) == [2, 3, 4]
@@ -160,9 +155,9 @@ def test_magnitudes_and_text_ids_give_the_inputs_of_the_fluxes(galaxies, tmp_pat
         pytest.warns(MiricigaleWarning, match=r"nircam\.f200w 1 of 2 \(99\)"),
         pytest.warns(MiricigaleWarning, match="2 of 2 sources are points"),
     ):
-        STAGES["catalog"].function(Context(config, tmp_path, stage=STAGES["catalog"]), "")
+        do_stage(config, tmp_path, "catalog")
     for name, unit in (("seds", ""), ("truth", "agn00")):
-        STAGES[name].function(Context(config, tmp_path, stage=STAGES[name], unit=unit), unit)
+        do_stage(config, tmp_path, name, unit)
     catalog = QTable.read(tmp_path / "catalog.ecsv")
     assert catalog["flags"].tolist() == [0, CatalogFlags.MISSING_CODE]
     np.testing.assert_allclose(catalog[SHORT[0]].value, galaxies[SHORT[0]].value)

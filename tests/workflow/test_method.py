@@ -6,24 +6,14 @@ import pytest
 from astropy.table import QTable
 
 from helpers.points import PRIOR, point_catalog, save_points
+from helpers.runs import do_stage, one_band
 from miricigale.workflow import Context
-from miricigale.workflow.config import StudyConfig
-from miricigale.workflow.stages import study_stages
 
-STAGES = {stage.name: stage for stage in study_stages()}
 BAND = "miri.f1000w"
 
 
 def config_of(method):
-    return StudyConfig.from_dict(
-        {
-            "exposures": {
-                "filters": [BAND], "n_groups": [7], "n_integrations": [1], "n_dithers": [1],
-            },
-            "fit": {"min_detected": 1},
-            "photometry": {"method": method},
-        }
-    )  # fmt: skip
+    return one_band(BAND, photometry={"method": method})
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +32,7 @@ def folder(tmp_path_factory):
 def test_points_come_back_by_either_method(folder, method, scale):
     config = config_of(method)
     for name, unit in (("kernels", BAND), ("templates", ""), ("photometry", f"agn00/{BAND}")):
-        STAGES[name].function(Context(config, folder, stage=STAGES[name], unit=unit), unit)
+        do_stage(config, folder, name, unit)
     table = QTable.read(folder / "agn00" / "photometry" / f"{BAND}.ecsv")
     truth = QTable.read(folder / "agn00" / "truth.ecsv")
     index, separation, _ = truth["sky"].match_to_catalog_sky(table["sky"])

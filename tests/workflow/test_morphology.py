@@ -1,5 +1,7 @@
 """Shapes that no Sersic profile describes: light, place, size and turn of clumps and of stamps."""
 
+import functools
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -8,11 +10,12 @@ from astropy.nddata import CCDData
 from astropy.table import QTable
 
 from helpers import scenes
+from helpers.runs import STAGES, do_stage
+from helpers.scenes import catalog_at
 from miricigale.psf import gaussian_psf
 from miricigale.scene import Scene
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import ConfigError, DataError, MiricigaleWarning
-from miricigale.workflow import Context
 from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.morphology import (
     MIN_RADIUS,
@@ -22,7 +25,6 @@ from miricigale.workflow.morphology import (
     stamps_of_sources,
     write_stamps,
 )
-from miricigale.workflow.stages import study_stages
 from miricigale.workflow.study import check_study
 
 BAND, PRIOR, SEED = "miri.f770w", "wfc3.f160w", 5
@@ -31,14 +33,15 @@ PIXEL = 0.06
 
 def disks(n=400):
     rng = np.random.default_rng(3)
-    table = QTable(
-        {"id": 7 * np.arange(1, n + 1), "redshift": np.ones(n), "profile": ["sersic"] * n}
+    table = catalog_at(
+        SkyCoord(53.1 + 0.002 * np.arange(n), np.full(n, -27.8), unit="deg"),
+        id=7 * np.arange(1, n + 1),
+        profile="sersic",
+        half_light_radius=rng.uniform(0.2, 1.0, n) * u.arcsec,
+        axis_ratio=rng.uniform(0.2, 1.0, n),
+        position_angle=rng.uniform(0, 180, n) * u.deg,
+        **{BAND: rng.uniform(1, 100, n) * u.uJy},
     )
-    table["sky"] = SkyCoord(53.1 + 0.002 * np.arange(n), np.full(n, -27.8), unit="deg")
-    table["half_light_radius"] = rng.uniform(0.2, 1.0, n) * u.arcsec
-    table["sersic_index"], table["axis_ratio"] = np.full(n, 1.0), rng.uniform(0.2, 1.0, n)
-    table["position_angle"] = rng.uniform(0, 180, n) * u.deg
-    table[BAND] = rng.uniform(1, 100, n) * u.uJy
     table["miri.f1500w"] = 3 * table[BAND]
     return table
 
@@ -277,15 +280,9 @@ def test_a_study_paints_the_light_of_an_image(tmp_path, monkeypatch):
             "perturb": {"effects": "cutouts", "cutouts": str(tmp_path / "galaxies.fits")},
         }
     )
-    stages = {stage.name: stage for stage in study_stages()}
-
-    def run(name, unit=""):
-        stage = stages[name]
-        stage.function(Context(config, tmp_path, stage=stage, unit=unit), unit)
-
-    run("catalog")
-    run("seds")
-    run("truth", "agn00")
+    run = functools.partial(do_stage, config, tmp_path)
+    for name, unit in (("catalog", ""), ("seds", ""), ("truth", "agn00")):
+        run(name, unit)
     with pytest.warns(MiricigaleWarning, match="has no map of the noise"):
         run("truth", "agn00+cutouts")
     known, own = (
@@ -312,7 +309,7 @@ def test_a_study_paints_the_light_of_an_image(tmp_path, monkeypatch):
             run("exposures", f"{name}/{BAND}-0")
         assert painted == {"profile": [*profiles, "point"], "cutouts": ids}
     # another image under the same name is seen
-    plan = stages["truth"].plan
+    plan = STAGES["truth"].plan
     first = plan(config, "agn00+cutouts")
     image.data[0, 0] = 1.0
     image.write(tmp_path / "galaxies.fits", overwrite=True)

@@ -9,6 +9,8 @@ from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData
 from astropy.table import QTable
 
+from helpers.runs import STAGES
+from helpers.scenes import catalog_at
 from miricigale.instrument import Exposure, flat_field, miri_detector
 from miricigale.pages import Page
 from miricigale.psf import miri_psf
@@ -23,13 +25,11 @@ from miricigale.workflow.perturbation import (
     perturbed_parameters,
     point_columns,
 )
-from miricigale.workflow.stages import study_stages
 from miricigale.workflow.stages.fits import mock_photometry
 from miricigale.workflow.stages.images import expose_and_reduce
 from miricigale.workflow.stages.perturbed import perturbation_costs, write_perturbed
 from miricigale.workflow.truths import EFFECTS, study_truths
 
-STAGES = {stage.name: stage for stage in study_stages()}
 SEED, BAND, PRIOR = 7, "miri.f770w", "wfc3.f160w"
 BANDS = [BAND, "miri.f1500w"]
 
@@ -45,14 +45,16 @@ def config_of(effects="all", **perturb):
 
 
 def sources():
-    table = QTable({"id": [1, 2, 3], "redshift": [0.5, 1.0, 2.0], "profile": ["sersic"] * 3})
-    table["sky"] = SkyCoord([53.134, 53.136, 53.133], [-27.834, -27.835, -27.836], unit="deg")
-    table["half_light_radius"] = [0.5, 0.3, 0.4] * u.arcsec
-    table["sersic_index"], table["axis_ratio"] = [1.0, 2.0, 4.0], [0.8, 0.6, 1.0]
-    table["position_angle"] = [0.0, 30.0, 60.0] * u.deg
-    for k, name in enumerate(BANDS, start=1):
-        table[name] = k * np.array([10.0, 20.0, 30.0]) * u.uJy
-    return table
+    return catalog_at(
+        SkyCoord([53.134, 53.136, 53.133], [-27.834, -27.835, -27.836], unit="deg"),
+        redshift=[0.5, 1.0, 2.0],
+        profile="sersic",
+        half_light_radius=[0.5, 0.3, 0.4] * u.arcsec,
+        sersic_index=[1.0, 2.0, 4.0],
+        axis_ratio=[0.8, 0.6, 1.0],
+        position_angle=[0.0, 30.0, 60.0] * u.deg,
+        **{name: k * np.array([10.0, 20.0, 30.0]) * u.uJy for k, name in enumerate(BANDS, start=1)},
+    )
 
 
 def test_each_effect_is_one_more_truth():
@@ -339,16 +341,8 @@ def chain():
         n_groups=20,
         subarray="SUB256",
     )
-    n = 6
     x, y = (v.ravel() + 40.0 for v in np.meshgrid([10.0, 90.0, 170.0], [30.0, 130.0]))
-    table = QTable({"id": np.arange(1, n + 1), "redshift": np.ones(n), "profile": ["point"] * n})
-    table["sky"] = exposure.wcs.pixel_to_world(x, y)
-    table["half_light_radius"], table["position_angle"] = (
-        np.zeros(n) * u.arcsec,
-        np.zeros(n) * u.deg,
-    )
-    table["sersic_index"] = table["axis_ratio"] = np.ones(n)
-    table[BAND] = np.full(n, 2000.0) * u.uJy
+    table = catalog_at(exposure.wcs.pixel_to_world(x, y), **{BAND: 2000.0 * u.uJy})
     known = {}
 
     def run(effects, flux=1.0):

@@ -6,29 +6,21 @@ import pytest
 from astropy.table import QTable
 
 from helpers.points import PRIOR, point_catalog, save_points
+from helpers.runs import STAGES, do_stage, one_band
 from miricigale.evaluation import PUBLISHED
 from miricigale.pages import Page
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow import Context
-from miricigale.workflow.config import StudyConfig, load_config
-from miricigale.workflow.stages import rivals, study_stages
+from miricigale.workflow.config import load_config
+from miricigale.workflow.stages import rivals
 
-STAGES = {stage.name: stage for stage in study_stages()}
 BAND = "miri.f1500w"
 #: The last two are far too faint for a blind detection.
 N, N_FAINT = 14, 2
 
 
 def config_of(method, **photometry):
-    return StudyConfig.from_dict(
-        {
-            "exposures": {
-                "filters": [BAND], "n_groups": [7], "n_integrations": [1], "n_dithers": [1],
-            },
-            "fit": {"min_detected": 1},
-            "photometry": {"method": method, "rivals": True, **photometry},
-        }
-    )  # fmt: skip
+    return one_band(BAND, photometry={"method": method, "rivals": True, **photometry})
 
 
 def made_matched(truth):
@@ -52,7 +44,7 @@ def folder(tmp_path_factory):
     made.save_table("agn00/matched.ecsv", made_matched(truth))
     save_points(made, truth, BAND, np.random.default_rng(3), width=36.3)
     for name, unit in (("kernels", BAND), ("templates", ""), ("rivals", BAND)):
-        STAGES[name].function(Context(config, folder, stage=STAGES[name], unit=unit), unit)
+        do_stage(config, folder, name, unit)
     return folder
 
 
@@ -142,8 +134,7 @@ def test_the_rival_of_the_papers_method_is_the_packages(folder, tmp_path):
 
     shutil.copytree(folder, tmp_path / "run")
     config = config_of("yang2021")
-    stage = STAGES["rivals"]
-    stage.function(Context(config, tmp_path / "run", stage=stage, unit=BAND), BAND)
+    do_stage(config, tmp_path / "run", "rivals", BAND)
     table = QTable.read(tmp_path / "run" / "rivals" / f"{BAND}.ecsv")
     bright = table[:-N_FAINT]
     ratio = (bright["package"] / bright["flux_true"]).to_value(u.one)

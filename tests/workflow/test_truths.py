@@ -6,15 +6,14 @@ import pytest
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
+from helpers.runs import STAGES, do_stage
+from helpers.scenes import catalog_at
 from miricigale.evaluation import AGNPopulation
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import ConfigError
-from miricigale.workflow import Context
 from miricigale.workflow.config import StudyConfig
-from miricigale.workflow.stages import study_stages
 from miricigale.workflow.truths import band_sets, study_truths
 
-STAGES = {stage.name: stage for stage in study_stages()}
 N, PRIOR = 60, "wfc3.f160w"
 FRACTIONS = [0.0, 0.4, 0.99, "field"]
 
@@ -27,15 +26,9 @@ def make_truths(folder, **sed):
     parameters["tau"], parameters["ebv"], parameters["alpha"] = 1.0, 0.3, 2.0
     bands = ["acs.f606w", "acs.f814w", "wfc3.f125w", PRIOR]
     light = SEDModel.yang2021(agn=False).fluxes(parameters, bands)
-    table = QTable({"id": np.arange(1, N + 1), "redshift": parameters["redshift"]})
-    table["profile"] = "point"
-    table["sky"] = SkyCoord(53.1 + 0.001 * np.arange(N), np.full(N, -27.8), unit="deg")
-    table["half_light_radius"] = np.zeros(N) * u.arcsec
-    table["sersic_index"] = table["axis_ratio"] = 1.0
-    table["position_angle"] = np.zeros(N) * u.deg
-    table["mag_f160w"] = 20.0
-    for name in bands:
-        table[name] = light[name]
+    sky = SkyCoord(53.1 + 0.001 * np.arange(N), np.full(N, -27.8), unit="deg")
+    columns = {"redshift": parameters["redshift"], "mag_f160w": 20.0}
+    table = catalog_at(sky, **columns, **{name: light[name] for name in bands})
     table.write(folder / "mine.ecsv", overwrite=True)
     config = StudyConfig.from_dict(
         {
@@ -44,9 +37,8 @@ def make_truths(folder, **sed):
         }
     )
     for name in ("catalog", "seds", "truth"):
-        stage = STAGES[name]
-        for unit in stage.unit_names(config):
-            stage.function(Context(config, folder, stage=stage, unit=unit), unit)
+        for unit in STAGES[name].unit_names(config):
+            do_stage(config, folder, name, unit)
     return {name: QTable.read(folder / name / "truth.ecsv") for name in study_truths(config)}
 
 

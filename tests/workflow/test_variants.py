@@ -8,16 +8,13 @@ import pytest
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
-from helpers.points import point_catalog
+from helpers.points import PRIOR, point_catalog, save_prior
+from helpers.runs import STAGES, do_stage, one_band
 from miricigale.pages import Page
-from miricigale.photometry import detect_sources
-from miricigale.psf import hst_psf
-from miricigale.scene import highres_image
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow import Context
-from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.derived import changed_config
-from miricigale.workflow.stages import study_stages, variants
+from miricigale.workflow.stages import variants
 from miricigale.workflow.stages.exposures import IMAGES, grid_of, study_exposures
 from miricigale.workflow.stages.images import (
     background_of,
@@ -28,23 +25,12 @@ from miricigale.workflow.stages.images import (
 from miricigale.workflow.stages.measure import measure_band
 from miricigale.workflow.truths import variant_changes
 
-STAGES = {stage.name: stage for stage in study_stages()}
-BAND, PRIOR = "miri.f2100w", "wfc3.f160w"
+BAND = "miri.f2100w"
 
 
 def config_of(images="all", **sections):
-    exposures = {
-        "filters": [BAND], "kind": "rates", "n_groups": [10], "n_integrations": [4], "n_dithers": [1]
-    }  # fmt: skip
-    exposures |= sections.pop("exposures", {})
-    return StudyConfig.from_dict(
-        {
-            "exposures": exposures,
-            "fit": {"min_detected": 1},
-            "variants": {"images": images},
-            **sections,
-        }
-    )
+    options = {"kind": "rates", "n_groups": 10, "n_integrations": 4, **sections}
+    return one_band(BAND, variants={"images": images}, **options)
 
 
 def changed(config, changes):
@@ -67,7 +53,7 @@ def test_each_variant_switches_one_thing_over():
         "residual": {"detector": {"residual": 0.0}},
         "plane": {"reduction": {"background_plane": True}},
     }
-    ramps = config_of("gradient", exposures={"kind": "ramps"}, scene={"background_gradient": 0.0})
+    ramps = config_of("gradient", kind="ramps", scene={"background_gradient": 0.0})
     assert variant_changes(ramps) == {
         "rates": {},
         "gradient": {"scene": {"background_gradient": 0.05}},
@@ -124,17 +110,9 @@ def folder(tmp_path_factory):
     """Products up to the variants, of points 10 arcsec apart."""
     folder, config = tmp_path_factory.mktemp("variants"), config_of(["residual", "gradient"])
     truth = made_truth(SkyCoord(config.pointing.ra, config.pointing.dec, unit="deg"))
-    made = Context(config, folder)
-    made.save_table("agn00/truth.ecsv", truth)
-    psf = hst_psf(PRIOR, pixel_scale=0.06 * u.arcsec)
-    wcs = grid_of(config, config.highres.pixel_scale)
-    prior = highres_image(truth, filter=PRIOR, wcs=wcs, psf=psf, seed=1)
-    segmentation, detected = detect_sources(prior)
-    made.save_image("f160w.fits", prior)
-    made.save_image("segm.fits", prior, segmentation=np.asarray(segmentation.data, np.int32))
-    made.save_table("detections.ecsv", detected)
+    save_prior(Context(config, folder), truth, grid_of(config, config.highres.pixel_scale))
     for name, unit in (("kernels", BAND), ("templates", ""), ("variants", BAND)):
-        STAGES[name].function(Context(config, folder, stage=STAGES[name], unit=unit), unit)
+        do_stage(config, folder, name, unit)
     return folder
 
 

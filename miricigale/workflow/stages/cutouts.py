@@ -15,7 +15,7 @@ __all__ = ["Cutouts"]
 
 #: Side of the pictures, and the finest pixels of those of the bands, in arcsec.
 BOX, FINEST = 5.3, 0.1
-#: Pictures that are looked at together.
+#: Pictures that are made at once, to limit memory.
 _AT_ONCE = 1000
 #: Shades of gray, and the color of pixels without data.
 N_GRAY, NO_DATA = 48, (242, 226, 208)

@@ -49,7 +49,7 @@ SAMPLER_OPTIONS = {"n_live": 200, "n_effective": 1000, "max_calls": 60_000}
 SAMPLERS = ("nautilus", "dynesty")
 #: Parameters whose posteriors are ranked, and compared between a sampler and the grid.
 RANKED = ("redshift", "frac_agn")
-#: What the page says of each.
+#: Sentences of the page on each.
 _SENTENCES = {
     "free_agn": "Torus freed: inclination, p and q, which Yang et al. fix, have axes of their own (the other axes "
     f"of the AGN are thinner), for up to {N_FREE} sources of each sky.",
@@ -270,9 +270,9 @@ def _sampler_numbers(grid, sampled):
 
 def write_experiments(context, report, every):
     """
-    The section on the further fits; ``every`` are the ``StudyTables`` of all truths by name.
+    Write the section on the further fits; ``every`` are the ``StudyTables`` of all truths by name.
 
-    Each is held against the fit of the study with all bands of the same sources.
+    Each is compared with the fit of the study with all bands of the same sources.
     """
     names = context.config.fit.experiments
     if not names:

@@ -69,7 +69,7 @@ def reducer_of(config, n_threads=None):
             negative_noise=options.negative_noise,
         ),
         mosaics=reduction.MosaicSettings(pixfrac=options.pixfrac),
-        # what the analysis knows of the detector, also where a truth has another one
+        # the detector that the analysis assumes, also where a truth has another one
         references="simulated",
         n_threads=n_threads,
     )
@@ -114,7 +114,7 @@ def expose_and_reduce(
     seed : int
         Seed of the detector.
     perturbation : `~miricigale.workflow.perturbation.Perturbation`, optional
-        In what sky and detector differ from what the reduction takes them for; nothing by default.
+        Where sky and detector differ from what the reduction assumes; nothing by default.
     n_threads : int, optional
         Threads; it changes nothing in the result.
     tell : callable, optional

@@ -91,7 +91,7 @@ def study_catalog(options):
 
 @functools.lru_cache(maxsize=2)
 def _catalog(options, state):
-    """The catalog, read and warned of once; ``state`` tells whether a file has changed."""
+    """The catalog, read and warned of once; ``state`` changes with a file."""
     return read_catalog(
         options.source,
         columns=dict(pair.split("=") for pair in options.columns),
@@ -139,7 +139,7 @@ def bright_sources(catalog, options, prior):
     else:
         wanted = f"one of {catalog.colnames}, or the catalog must have fluxes in {prior}"
         raise argument_error("mag_column", wanted, repr(column))
-    # a source of which nothing is known is no faint one: it stays, and the report says why it is not fitted
+    # a source without a magnitude is kept; the report says why it is not fitted
     chosen = catalog[~(magnitudes > options.mag_limit)]
     if not np.any(magnitudes <= options.mag_limit):
         msg = (
@@ -201,7 +201,7 @@ def fit_seds(catalog, options, *, model_error, executor=None, progress_bar=False
         axes=axes | {"redshift": nodes[nodes > 0]},
         model_error=model_error,
         redshift_tolerance=REDSHIFT_STEP,
-        # a single band tells the light, if not its colors
+        # a single band is enough for a flux
         n_bands_min=1,
     )
     return fitter.fit(photometry, redshift="redshift", executor=executor, progress_bar=progress_bar)

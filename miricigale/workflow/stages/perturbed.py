@@ -1,4 +1,4 @@
-"""What it costs that the analysis does not know the sky: a section of the report."""
+"""Perturbed truths: the accuracy that unknown properties of the sky cost, a section of the report."""
 
 from pathlib import Path
 
@@ -112,7 +112,7 @@ def _cost(statistic, known, own, seed):
 
 
 def write_perturbed(context, report, truths, every):
-    """The section with one table; without perturbed truths there is none."""
+    """Write the section with one table, if there are perturbed truths."""
     config = context.config
     table = perturbation_costs(truths, every, config.exposures.filters, seed=context.seed)
     if len(table) == 0:
@@ -121,7 +121,7 @@ def write_perturbed(context, report, truths, every):
     options = config.perturb
     report.section(
         "What the analysis does not know",
-        "Skies that differ from what reduction, photometry and fits take them for, one effect at a time "
+        "Skies that differ from what reduction, photometry and fits assume, one effect at a time "
         f"and together: a PSF of another wavefront, or {100 * options.psf_width:g} % wider or narrower; "
         f"a flat field that is another detector's by {100 * options.flat:g} %; a gain other by "
         f"{100 * options.gain:g} % (which the conversion to fluxes does not know either); a signal other by "

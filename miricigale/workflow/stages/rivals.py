@@ -100,7 +100,7 @@ def rival_table(truth, matched, name, *, own, inside):
     The sources of a truth in a band, with the fluxes of the study's ``own`` method.
 
     ``shape`` is ``"point"``, ``"n < 2"`` or ``"n >= 2"``, ``half_light_radius`` that of the truth; ``snr`` the
-    true flux over the study's formal error; ``field`` tells the sources that were exposed (``inside``) and have
+    true flux over the study's formal error; ``field`` marks the sources that were exposed (``inside``) and have
     a model.
     """
     index = np.asarray(truth["sersic_index"], float)
@@ -120,7 +120,7 @@ def rival_table(truth, matched, name, *, own, inside):
 
 
 def read_rivals(context):
-    """Tables of the stage by band; none where it was not asked for."""
+    """Read the tables of the stage by band; empty where the stage is switched off."""
     config = context.config
     return read_tables(context, "rivals", band_names(config) if config.photometry.rivals else ())
 
@@ -193,7 +193,7 @@ def rival_numbers(tables):
 
 def rival_counts(table):
     """
-    What Source Extractor finds of a band, as `~miricigale.evaluation.Estimate` objects.
+    Count the detections of Source Extractor in a band, as `~miricigale.evaluation.Estimate` objects.
 
     ``detected`` sources in the field, ``matched`` ones of the catalog, and the share ``missed`` of the sources
     of the field that the template fit has measured. Intervals of the counts are Poisson's.
@@ -244,7 +244,7 @@ def source_extractor_numbers(tables, seed):
 
 
 def write_rivals(context, report, tables):
-    """The section on rival photometry; without tables there is none."""
+    """Write the section on rival photometry, unless there are no tables."""
     if not tables:
         return
     numbers = rival_numbers(tables)

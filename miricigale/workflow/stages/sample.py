@@ -128,7 +128,7 @@ def typical_source(sample, fitted, band):
     """
     Id of a source to be shown: a bright one among those nearest to redshift 1.2.
 
-    ``fitted`` says which rows of ``sample`` have a fit; None if there is none.
+    ``fitted`` says which rows of ``sample`` have a fit; None without any.
     """
     sample = sample[np.asarray(fitted, bool)]
     if len(sample) == 0:

@@ -83,7 +83,7 @@ HEADER = ("band", "images", *(cell.header for cell in CELLS))
     kernels=("images", "photometry"),
 )
 def measure_variants(context, band):
-    """Expose, reduce and measure a band of the reference truth with one thing otherwise at a time."""
+    """Expose, reduce and measure a band of the reference truth with one setting changed at a time."""
     config, plan = context.config, context.plan
     truth = QTable.read(context.path(f"{plan['truth']}/truth.ecsv"))
     exposures = band_exposures(config, band)
@@ -92,7 +92,7 @@ def measure_variants(context, band):
     lights = [scene.Scene(truth, wcs=e.wcs, **options).render() for e in exposures]
     suffix, _ = measured_mosaic(config)
     for name, changes in plan["changes"].items():
-        # all of them by rates, whatever the study's are
+        # all by rates, also where the study simulates ramps
         changes = {**changes, "exposures": {"kind": "rates"}}
         own = changed_config(config, (*IMAGES, "highres"), changes)
         imager, images = imager_of(own), []
@@ -113,7 +113,7 @@ def measure_variants(context, band):
 
 def variant_numbers(matched, tables, calculator, *, seed, statistic="mad", bin_size=30):
     """
-    Limits, errors and detections of the study's images and of the variants.
+    Return limits, errors and detections of the study's images and of the variants.
 
     Parameters
     ----------
@@ -206,7 +206,7 @@ def _half_width(draws):
 
 
 def variant_label(name, changes):
-    """What images are called on the page."""
+    """Return the name of images on the page."""
     if name == STUDY:
         return "of the study"
     if name == RATES:
@@ -230,7 +230,9 @@ def variant_rows(table, changes):
 
 def write_variants(context, report, matched, limits):
     """
-    The section on variant images; ``matched`` is of the reference truth, ``limits`` the calculator's by band.
+    Write the section on variant images.
+
+    ``matched`` is of the reference truth, ``limits`` are those of the calculator by band.
 
     Returns the numbers, or None where there are no variants.
     """
@@ -244,7 +246,7 @@ def write_variants(context, report, matched, limits):
     context.save_table("report/variants.ecsv", table)
     report.section(
         "What sets the limits",
-        "The first sky was exposed again with one thing otherwise, by rates. Prior, PSFs, kernels and "
+        "The first sky was exposed again with one setting changed at a time, by rates. Prior, PSFs, kernels and "
         "templates are those of the study, photons and cosmic rays have the same seeds, and errors of "
         "changes are of draws of the same sources.",
     )
@@ -269,7 +271,7 @@ def write_variants(context, report, matched, limits):
 
 
 def _write_gradient(report, table, changes):
-    """What the gradient does in the longest band, in words, if that is known."""
+    """Add a sentence on the effect of the gradient in the longest band, if it is known."""
     band = max(set(table["band"]), key=lambda name: Filter.from_name(name).pivot)
     limit, scatter = CELLS[2], CELLS[4]
     effects = [
