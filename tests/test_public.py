@@ -15,7 +15,7 @@ from astropy.table import QTable
 import miricigale
 from miricigale.detector import Dark
 
-ROOMS = [
+SUBPACKAGES = [
     item.name
     for item in pkgutil.iter_modules(miricigale.__path__)
     if item.ispkg and item.name not in ("plotting", "utils")
@@ -23,9 +23,9 @@ ROOMS = [
 BANDS = ["wfc3.f160w", "irac.ch1", "miri.f770w"]
 
 
-@pytest.mark.parametrize("room", ROOMS)
-def test_a_room_has_the_names_that_it_lists_and_no_others(room):
-    module = importlib.import_module(f"miricigale.{room}")
+@pytest.mark.parametrize("subpackage", SUBPACKAGES)
+def test_a_subpackage_has_the_names_that_it_lists_and_no_others(subpackage):
+    module = importlib.import_module(f"miricigale.{subpackage}")
     for name in module.__all__:
         assert getattr(module, name) is not None
     names = [name for name in dir(module) if not name.startswith("__")]

@@ -87,9 +87,9 @@ def best_model_table(
     parts["dust"] = derived["dust_luminosity"] * chain.dust(chain.key(values, "dust"))
     if model.has_agn:
         nucleus, power = chain.agn(values), derived["agn_power"]
-        for name, told in _AGN_COLUMNS.items():
+        for name, column in _AGN_COLUMNS.items():
             light = power * getattr(nucleus, name)
-            parts[f"agn.SKIRTOR2016_{told}"] = light
+            parts[f"agn.SKIRTOR2016_{column}"] = light
             quantities[AGN_PARTS[name][1]] = float(chain.weights @ light)
         disk = derived["accretion_power"] * disk_2500(chain, model.component("agn"), values)
         quantities["agn.intrin_Lnu_2500A_30deg"] = disk

@@ -66,7 +66,7 @@ def add_fit(commands):
     fit.add_argument(
         "--quasars",
         action="store_true",
-        help="fit type-1 AGN too, and tell by the evidence which objects are",
+        help="fit type-1 AGN too, and classify the objects by the evidence",
     )
     fit.add_argument(
         "--stars",
@@ -121,7 +121,7 @@ def _fit(args):
 def _fit_stopped(args):
     n_parts = len(list(args.output.glob("part-*.fits")))
     how = "the same command, without --no-resume," if not args.resume else "the same command"
-    return f"stopped; {n_parts} finished parts are in {args.output}/; {how} goes on from here"
+    return f"stopped; {n_parts} finished parts are in {args.output}/; {how} resumes here"
 
 
 def add_photometry(commands):
@@ -131,7 +131,7 @@ def add_photometry(commands):
     add("positional", nargs="*", metavar="IMAGE HIGHRES", help="the two images, without options")
     add("--image", metavar="FITS", help="image to be measured; FILE[EXTENSION] names an extension")
     add("--highres", metavar="FITS", help="high-resolution image: the prior")
-    add("--filter", help="filter of the image, such as miri.f770w, if its header does not tell")
+    add("--filter", help="filter of the image, such as miri.f770w, if its header does not state it")
     add("--highres-filter", metavar="FILTER", help="filter of the prior, likewise")
     add("--segmentation", metavar="FITS", help="segmentation map of the prior (else: detection)")
     add("--catalog", metavar="TABLE", help="FITS, ECSV, CSV or plain table with id, ra, dec")
@@ -155,7 +155,7 @@ def add_photometry(commands):
             f"--{prefix}pa-aper",
             type=quantity_in("deg"),
             metavar="DEG",
-            help=f"position angle of the detector's y axis ({what}), if the header does not tell",
+            help=f"position angle of the detector's y axis ({what}), if the header does not state it",
         )
         noise = phot.add_mutually_exclusive_group()
         for kind in _NOISE:

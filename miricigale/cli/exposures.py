@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from miricigale.cli.options import GOES_ON, quantity_in
+from miricigale.cli.options import RESUMES, quantity_in
 
 __all__ = ["add_reduce"]
 
@@ -43,7 +43,7 @@ def add_reduce(commands):
     add("--no-resume", dest="resume", action="store_false", help="make everything again")
     add("--threads", type=int, help="threads (default: all cores)")
     add("--no-progress", action="store_true", help="no progress bar")
-    reduce.set_defaults(call=_reduce, stopped=lambda _: GOES_ON)
+    reduce.set_defaults(call=_reduce, stopped=lambda _: RESUMES)
 
 
 def _reduce(args):

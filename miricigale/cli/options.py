@@ -2,10 +2,10 @@
 
 import argparse
 
-__all__ = ["GOES_ON", "chosen", "pair", "quantity_in"]
+__all__ = ["RESUMES", "chosen", "pair", "quantity_in"]
 
-#: What an interrupted command says that goes on where it stopped.
-GOES_ON = "stopped; the same command goes on from here"
+#: Message of an interrupted command that can be resumed.
+RESUMES = "stopped; the same command resumes here"
 
 
 def quantity_in(unit):

@@ -5,7 +5,7 @@ import sys
 import time
 from pathlib import Path
 
-from miricigale.cli.options import GOES_ON, chosen
+from miricigale.cli.options import RESUMES, chosen
 
 __all__ = ["add_compile", "add_plan", "add_run"]
 
@@ -42,14 +42,14 @@ def add_run(commands):
     run.add_argument("--from", dest="again", metavar="STAGE", help="do this stage or units again")
     run.add_argument("--print-config", action="store_true", help="print the configuration and stop")
     run.add_argument("--no-progress", action="store_true", help="no progress bars")
-    run.set_defaults(call=_run, stopped=lambda _: GOES_ON)
+    run.set_defaults(call=_run, stopped=lambda _: RESUMES)
 
 
 def _run(args):
     from miricigale.utils.exceptions import OtherResultsError
     from miricigale.utils.parallel import process_pool, thread_count
     from miricigale.workflow import load_config, run_study
-    from miricigale.workflow.cluster import cluster_executor
+    from miricigale.workflow.engine.cluster import cluster_executor
     from miricigale.workflow.options import read_setting
 
     options = chosen(args, "threads seed") | {"keep_level1b": args.keep_level1b or None}
@@ -218,7 +218,7 @@ def add_compile(commands):
     """Declare ``compile``."""
     what = "compile all kernels now, once for each installation"
     compilation = commands.add_parser("compile", help=what)
-    compilation.set_defaults(call=_compile, stopped=lambda _: GOES_ON)
+    compilation.set_defaults(call=_compile, stopped=lambda _: RESUMES)
 
 
 def _compile(args):

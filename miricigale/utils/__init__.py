@@ -1,1 +1,1 @@
-"""Shelves that every room uses: units, validation, tables, randomness, parallel maps."""
+"""What every subpackage uses: units, validation, tables, randomness, parallel maps."""

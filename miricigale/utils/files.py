@@ -281,12 +281,12 @@ def _allocated(path):
     """Bytes that a file has on the disk; holes, which are read as zeros, have none."""
     status = os.stat(path)
     blocks = getattr(status, "st_blocks", 0)
-    # some file systems tell no blocks, others fewer for a while, or compress
+    # some file systems report no blocks, others fewer for a while, or compress
     if not blocks or _EXPANSION * 512 * blocks >= status.st_size or not hasattr(os, "SEEK_DATA"):
         return status.st_size
     n_bytes, end = 0, 0
     with open(path, "rb", buffering=0) as stream, contextlib.suppress(OSError):
-        # an error tells that there are no data after this place
+        # an error means that there are no data after this place
         while True:
             start = stream.seek(end, os.SEEK_DATA)
             end = stream.seek(start, os.SEEK_HOLE)
@@ -336,7 +336,7 @@ def read_table(path, *, wanted, cls=QTable, form=None, hdu=None):
     cls : type, optional
         Class of the table.
     form : str, optional
-        Format by `astropy.table.Table.read`. By default content and suffix tell: FITS, VOTable,
+        Format by `astropy.table.Table.read`. By default by content and suffix: FITS, VOTable,
         ECSV, CSV or plain text, whose names of columns stand behind ``#`` if ``id`` is among them.
     hdu : int or str, optional
         Extension of a FITS file, the first table by default.
@@ -408,7 +408,7 @@ def writing(path):
             raise
         if err.errno is not None:
             raise OSError(err.errno, err.strerror, str(path)) from err
-        # numpy tells how much it wrote, but not why it was no more
+        # numpy says how much it wrote, but not why it was no more
         msg = f"{path} could not be written (is the disk full?): {err}"
         raise OSError(msg) from err
 

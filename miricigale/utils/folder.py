@@ -219,7 +219,7 @@ class RecordFolder(FileFolder):
             product["sha256"], operator.index(product["bytes"])
 
     def _refuse_foreign(self, *, damaged):
-        """Refuse a folder that is another's, or whose files cannot be told any more."""
+        """Refuse a folder that is another's, or whose files cannot be identified any more."""
         if damaged:
             msg = (
                 f"neither {MANIFEST} nor {SECOND_MANIFEST} in {self.folder} can be read, so that "

@@ -269,7 +269,7 @@ def _identity():
 
 
 def _place_of_birth():
-    """Host and boot; the machine's id tells hosts of one name from each other."""
+    """Host and boot; the machine's id distinguishes hosts of the same name."""
     return {
         "host": platform.node() or "localhost",
         "machine": _first_line("/etc/machine-id"),

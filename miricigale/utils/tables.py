@@ -25,7 +25,7 @@ __all__ = [
 
 
 class Flags(enum.IntFlag):
-    """Base of the flag sets: an IntFlag whose members' docs are told by `describe`."""
+    """Base of the flag sets: an IntFlag whose members' docs `describe` lists."""
 
     @classmethod
     def describe(cls):
@@ -167,8 +167,8 @@ def read_ids(table, argument="photometry"):
     """
     Ids of a catalog: numbers, or text whether it came as such or as bytes.
 
-    ``argument`` is what the table is called in messages. A `ValueError` tells ids that are masked or
-    empty, for nothing would tell their objects from others, numbers among text, several in a row, and
+    ``argument`` is what the table is called in messages. A `ValueError` names ids that are masked or
+    empty, for their objects could not be distinguished, numbers among text, several in a row, and
     bytes that are not UTF-8.
     """
     require_columns(table, ["id"], argument)
@@ -218,7 +218,7 @@ def ascii_ids(ids, argument):
     ------
     ValueError
         If an id is text that is not ASCII or ends in a blank, which FITS drops; the message
-        tells the first three.
+        names the first three.
     """
     ids = np.asarray(ids)
     if ids.dtype.kind in "UO":

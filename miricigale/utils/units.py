@@ -1,4 +1,4 @@
-"""The units that arrays have inside the package, and the doors that convert to them."""
+"""The units of arrays inside the package, and conversions to them at the public methods."""
 
 import dataclasses
 

@@ -6,10 +6,10 @@ __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
         "config": ("StudyConfig", "load_config", "preset_names"),
-        "runner": ("StudyRunner",),
-        "stage": ("Context", "Stage"),
+        "engine.runner": ("StudyRunner",),
+        "engine.stage": ("Context", "Stage"),
         "stages": ("study_stages",),
-        "store": ("ProductStore",),
+        "engine.store": ("ProductStore",),
         "disk": ("disk_use",),
         "study": ("check_study", "run_study"),
     },

@@ -12,7 +12,7 @@ from miricigale.instrument import imager_filters
 from miricigale.photometry.kernel_files import file_place
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow.disk import disk_use
-from miricigale.workflow.runner import StudyRunner
+from miricigale.workflow.engine.runner import StudyRunner
 from miricigale.workflow.sections import HighresSection
 from miricigale.workflow.stages import study_stages
 from miricigale.workflow.stages.exposures import grid_of, study_background, study_exposures

@@ -160,7 +160,7 @@ def test_ctrl_c_keeps_what_is_finished(catalog, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(GridEngine, "fit", stopped)
     assert main(command) == 130
     err = capsys.readouterr().err
-    assert f"stopped; 2 finished parts are in {out}/; the same command goes on from here" in err
+    assert f"stopped; 2 finished parts are in {out}/; the same command resumes here" in err
     assert main(command) == 0
     assert len(calls) == 4
     assert len(QTable.read(out / "table.fits")) == 5

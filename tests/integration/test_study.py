@@ -279,7 +279,7 @@ StudyRunner(config, sys.argv[2], stages).run()
 KILLER = """
 import json, os, signal, sys
 from miricigale.workflow import StudyRunner, load_config, study_stages
-from miricigale.workflow.stage import Context
+from miricigale.workflow.engine.stage import Context
 
 save = Context.save
 

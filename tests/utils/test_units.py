@@ -1,4 +1,4 @@
-"""Doors that convert units."""
+"""Conversions of units."""
 
 import astropy.units as u
 import numpy as np

@@ -59,9 +59,9 @@ def test_keys_are_set_on_the_command_line(capsys):
         "4",
     ]
     assert main(command) == 0
-    told = capsys.readouterr().out
+    out = capsys.readouterr().out
     for line in ("frac_agn = [0.0, 0.4]", 'plan = "quick"', 'source = "my file.ecsv"', "seed = 4"):
-        assert f"\n{line}\n" in told
+        assert f"\n{line}\n" in out
     for text, reason in (
         ("frac_agn=0.4", "a setting must be section.key=value"),
         ("sed.frac_agn=2", "must be between 0.0 and 0.99"),

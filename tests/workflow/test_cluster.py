@@ -28,7 +28,7 @@ def run(folder, *arguments):
     return done.returncode, done.stderr, products
 
 
-def test_workers_that_die_are_replaced_or_named_and_the_run_goes_on(tmp_path):
+def test_workers_that_die_are_replaced_or_named_and_the_run_resumes(tmp_path):
     status, message, whole = run(tmp_path / "processes")
     assert status == 0, message
     # one worker dies
@@ -44,7 +44,7 @@ def test_workers_that_die_are_replaced_or_named_and_the_run_goes_on(tmp_path):
     assert (tmp_path / "all.deaths").read_text() == "0"
     assert "4 workers of tcp://" in message
     assert "died over one unit" in message
-    assert "the same command goes on" in message
+    assert "the same command resumes it" in message
     assert products.items() < whole.items()
     assert "c/0.txt" not in products
     status, message, products = run(tmp_path / "all", "cluster")

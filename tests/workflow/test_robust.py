@@ -14,8 +14,8 @@ from astropy.nddata import CCDData
 from astropy.table import QTable
 
 from miricigale.workflow.config import StudyConfig
-from miricigale.workflow.runner import StudyRunner
-from miricigale.workflow.stage import Context, Stage
+from miricigale.workflow.engine.runner import StudyRunner
+from miricigale.workflow.engine.stage import Context, Stage
 
 TOY = Path(__file__).with_name("toy_study.py")
 

@@ -8,12 +8,12 @@ import pytest
 
 from miricigale.refdata import locate
 from miricigale.utils.exceptions import ConfigError, DataError, MiricigaleWarning, OtherResultsError
-from miricigale.workflow import runner
 from miricigale.workflow.config import StudyConfig, load_config
-from miricigale.workflow.runner import StudyRunner, check_disk
-from miricigale.workflow.stage import Stage, stage
+from miricigale.workflow.engine import runner
+from miricigale.workflow.engine.runner import StudyRunner, check_disk
+from miricigale.workflow.engine.stage import Stage, stage
+from miricigale.workflow.engine.store import ProductStore
 from miricigale.workflow.stages import study_stages
-from miricigale.workflow.store import ProductStore
 
 
 class Recorder:
@@ -191,10 +191,12 @@ def test_of_a_part_of_the_steps_the_disk_of_that_part_counts(tmp_path, monkeypat
         StudyConfig(), folder, recorder.stages(), until="first:a", progress_bar=True, **options
     )
     runner.run()
-    told = capsys.readouterr().err
-    assert "1 of 1 steps to do, which take about 0.01 GB" in told
-    assert "(0.0 GB are free)" in told
-    message = r"needs about 0.02 GB in .*, only 0.0\d GB are free; make room, choose another folder"
+    text = capsys.readouterr().err
+    assert "1 of 1 steps to do, which take about 0.01 GB" in text
+    assert "(0.0 GB are free)" in text
+    message = (
+        r"needs about 0.02 GB in .*, only 0.0\d GB are free; free some space, choose another folder"
+    )
     with pytest.raises(DataError, match=message):
         StudyRunner(StudyConfig(), folder, recorder.stages(), **options).run()
     assert recorder.ran == ["first:a"]
@@ -262,7 +264,7 @@ def test_other_reference_data_make_other_exposures(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("damage", "told"),
+    ("damage", "text"),
     [
         (None, "missing"),
         (lambda data: data[:-3], "7 bytes in place of 10"),
@@ -271,7 +273,7 @@ def test_other_reference_data_make_other_exposures(tmp_path, monkeypatch):
     ],
     ids=["removed", "truncated", "flipped", "edited"],
 )
-def test_a_damaged_product_is_named_and_made_again(tmp_path, caplog, damage, told):
+def test_a_damaged_product_is_named_and_made_again(tmp_path, caplog, damage, text):
     recorder, folder = Recorder(), tmp_path / "run"
     recorder.run(folder)
     path = folder / "first_a.txt"
@@ -281,7 +283,7 @@ def test_a_damaged_product_is_named_and_made_again(tmp_path, caplog, damage, tol
     assert recorder.run(folder) == ["first:a"]
     assert path.read_bytes() == whole
     (message,) = [line for line in caplog.messages if "first_a.txt" in line]
-    assert f"first_a.txt ({told})" in message
+    assert f"first_a.txt ({text})" in message
     assert "is done again, with the same bytes" in message
     # of many products some are named
     caplog.clear()
@@ -442,7 +444,7 @@ def test_stages_must_come_after_what_they_need(tmp_path):
         StudyRunner(StudyConfig(), tmp_path, [stage])
 
 
-def test_a_full_disk_is_told_before_the_run(tmp_path):
+def test_a_full_disk_is_text_before_the_run(tmp_path):
     with pytest.raises(DataError, match="the run needs about"):
         check_disk(tmp_path / "not" / "yet", 10**18)
     check_disk(tmp_path / "not" / "yet", 1)
@@ -540,7 +542,7 @@ def test_the_first_of_several_errors_is_raised(tmp_path):
         StudyRunner(config, tmp_path / "run", [stage], executor=executor).run()
 
 
-def test_a_process_that_died_before_a_unit_began_is_told(tmp_path):
+def test_a_process_that_died_before_a_unit_began_is_text(tmp_path):
     class Broken(Executor):
         def submit(self, *_, **__):
             raise BrokenExecutor
@@ -587,5 +589,5 @@ def test_kernels_are_compiled_before_what_calls_them(tmp_path, monkeypatch, capl
             assert order.index("compiled photometry") < order.index("c")
         order.clear()
     # never silent, also where no progress is shown
-    told = [line for line in caplog.messages if line.startswith("compiling")]
-    assert len(told) == 2
+    text = [line for line in caplog.messages if line.startswith("compiling")]
+    assert len(text) == 2

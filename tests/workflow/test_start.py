@@ -59,15 +59,15 @@ def test_light_commands_and_errors_import_nothing_heavy(tmp_path, arguments, sta
     assert [name for name in HEAVY if name in modules] == []
 
 
-@pytest.mark.parametrize("room", ["fitting", "photometry", "psf", "scene", "sed", "workflow"])
-def test_rooms_import_what_is_asked_for(tmp_path, room):
+@pytest.mark.parametrize("package", ["fitting", "photometry", "psf", "scene", "sed", "workflow"])
+def test_subpackages_import_what_is_asked_for(tmp_path, package):
     """Every public name is there, is listed, and is taken by ``import *``; others are refused."""
     code = (
-        f"import sys, miricigale.{room} as room\n"
+        f"import sys, miricigale.{package} as package\n"
         f"assert 'numba' not in sys.modules\n"
-        f"from miricigale.{room} import *\n"
-        f"assert set(room.__all__) <= set(dir()) and set(room.__all__) <= set(dir(room))\n"
-        f"assert not hasattr(room, 'nothing')\n"
+        f"from miricigale.{package} import *\n"
+        f"assert set(package.__all__) <= set(dir()) and set(package.__all__) <= set(dir(package))\n"
+        f"assert not hasattr(package, 'nothing')\n"
     )
     env = {**os.environ, "PYTHONPATH": os.path.dirname(os.path.dirname(miricigale.__file__))}
     subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=env, check=True, timeout=300)

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from miricigale.utils.exceptions import DataError
-from miricigale.workflow.store import ProductStore
+from miricigale.workflow.engine.store import ProductStore
 
 
 def saved(store, name, text="whole"):

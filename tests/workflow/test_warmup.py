@@ -17,10 +17,10 @@ ROOT = Path(miricigale.__file__).parent.parent
 KERNELS = """
 import sys
 from numba.core.dispatcher import Dispatcher
-def kernels(room):
+def kernels(subpackage):
     found = {}
     for name, module in list(sys.modules.items()):
-        if name.startswith(f"miricigale.{room}"):
+        if name.startswith(f"miricigale.{subpackage}"):
             for key, value in vars(module).items():
                 if isinstance(value, Dispatcher) and value.py_func.__module__ == name:
                     misses = sum(value.stats.cache_misses.values())

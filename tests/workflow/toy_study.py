@@ -8,10 +8,10 @@ import time
 from pathlib import Path
 
 from miricigale.utils.parallel import process_pool
-from miricigale.workflow.cluster import cluster_executor
 from miricigale.workflow.config import StudyConfig
-from miricigale.workflow.runner import StudyRunner
-from miricigale.workflow.stage import Stage
+from miricigale.workflow.engine.cluster import cluster_executor
+from miricigale.workflow.engine.runner import StudyRunner
+from miricigale.workflow.engine.stage import Stage
 
 
 def first(context, unit):

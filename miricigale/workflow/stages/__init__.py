@@ -9,7 +9,7 @@ def study_stages():
 
     Returns
     -------
-    stages : tuple of `~miricigale.workflow.stage.Stage`
+    stages : tuple of `~miricigale.workflow.engine.stage.Stage`
     """
     from miricigale.workflow.stages import (
         experiments,

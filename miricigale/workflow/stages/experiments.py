@@ -17,7 +17,7 @@ from miricigale.evaluation import (
 from miricigale.photometry.surveys import HERSCHEL_DEPTHS
 from miricigale.utils.tables import described_rows
 from miricigale.workflow.derived import Cell, cells_of, read_tables, rows_of
-from miricigale.workflow.stage import stage
+from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.stages.fits import FIT_SECTIONS, fit_mock, fit_sample
 from miricigale.workflow.stages.inputs import sed_resources
 from miricigale.workflow.truths import of_truth, study_truths

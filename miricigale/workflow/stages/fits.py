@@ -10,8 +10,8 @@ from miricigale import evaluation, fitting, photometry, sed
 from miricigale.photometry.surveys import fractional_error
 from miricigale.utils.tables import error_column
 from miricigale.workflow.derived import read_tables
+from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.perturbation import Perturbation
-from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.conditions import ConditionFlags, add_conditions, any_condition
 from miricigale.workflow.stages.exposures import (
     GRID,

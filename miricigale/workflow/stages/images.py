@@ -7,9 +7,9 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale import depth, detector, photometry, psf, reduction, scene
+from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.morphology import read_stamps
 from miricigale.workflow.perturbation import Perturbation
-from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.exposures import (
     EXPOSURE_RESOURCES,
     GRID,

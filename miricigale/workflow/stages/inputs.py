@@ -14,7 +14,7 @@ from miricigale.scene import read_catalog
 from miricigale.utils.exceptions import ConfigError, argument_error
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import ab_magnitude
-from miricigale.workflow.stage import stage
+from miricigale.workflow.engine.stage import stage
 
 __all__ = [
     "REDSHIFT_STEP",

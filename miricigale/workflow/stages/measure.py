@@ -5,7 +5,7 @@ from astropy.table import QTable
 
 from miricigale import photometry, psf
 from miricigale.utils.tables import error_column
-from miricigale.workflow.stage import stage
+from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.stages.exposures import (
     IMAGE_RESOURCES,
     KERNEL,

@@ -9,7 +9,7 @@ from miricigale import depth, photometry
 from miricigale.instrument import mosaic_wcs, tangent_offset
 from miricigale.utils.random import text_key
 from miricigale.utils.tables import error_column, match_sky
-from miricigale.workflow.stage import stage
+from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.stages.exposures import (
     EXPOSURE_RESOURCES,
     IMAGES,

@@ -9,6 +9,7 @@ import numpy as np
 from miricigale import sed
 from miricigale.evaluation import study_numbers
 from miricigale.pages import Page
+from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.page import paper
 from miricigale.workflow.page.image_sections import (
     field_text,
@@ -27,7 +28,6 @@ from miricigale.workflow.page.photometry_sections import write_errors, write_pho
 from miricigale.workflow.page.provenance import stand_ins, write_exposures, write_origin
 from miricigale.workflow.page.result_sections import write_results
 from miricigale.workflow.page.study_page import StudyPage
-from miricigale.workflow.stage import stage
 from miricigale.workflow.stages import experiments, perturbed, rivals, variants
 from miricigale.workflow.stages.exposures import EXPOSURE_RESOURCES, GRID, exposure_plan
 from miricigale.workflow.stages.inputs import sed_resources

@@ -10,8 +10,8 @@ from miricigale.evaluation.estimates import median
 from miricigale.pages import number
 from miricigale.utils.tables import described_rows, error_column
 from miricigale.workflow.derived import NO_SOURCE, read_tables
+from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.page.labels import band_label
-from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.conditions import ConditionFlags
 from miricigale.workflow.stages.exposures import (
     IMAGE_RESOURCES,

@@ -14,9 +14,9 @@ from miricigale.filters import Filter
 from miricigale.pages import render
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU, WAVE, ab_magnitude
+from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.page.labels import SET_COLORS, SET_LABELS, band_label
 from miricigale.workflow.page.numbers import StudyTables
-from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.conditions import ConditionFlags, any_condition
 from miricigale.workflow.stages.cutouts import Cutouts
 from miricigale.workflow.stages.exposures import bands_of_truth

@@ -13,9 +13,9 @@ from miricigale.utils.content import file_sha256
 from miricigale.utils.exceptions import ConfigError, DataError
 from miricigale.utils.meta import provenance
 from miricigale.utils.random import stream
+from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.morphology import RealGalaxies, stamps_of_sources, write_stamps
 from miricigale.workflow.perturbation import perturbed_model, perturbed_parameters, point_columns
-from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.inputs import catalog_bands, sed_resources
 from miricigale.workflow.stages.stars import star_fluxes
 from miricigale.workflow.truths import CATALOG, CUTOUTS, FIELD, study_truths, truth_names

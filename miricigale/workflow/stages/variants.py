@@ -12,9 +12,9 @@ from miricigale.photometry.error_curves import limiting_flux, measured_curve
 from miricigale.utils.random import stream
 from miricigale.utils.tables import described_rows, error_column
 from miricigale.workflow.derived import Cell, cells_of, changed_config, read_tables
+from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.page.band_figures import variant_figure
 from miricigale.workflow.page.labels import band_label
-from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.exposures import (
     EXPOSURE_RESOURCES,
     IMAGES,

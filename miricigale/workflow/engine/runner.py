@@ -18,10 +18,10 @@ from miricigale.utils.exceptions import (
 from miricigale.utils.parallel import available_memory, thread_count
 from miricigale.utils.progress import print_line
 from miricigale.workflow.config import load_config
-from miricigale.workflow.display import Display
-from miricigale.workflow.schedule import Task, run_tasks
-from miricigale.workflow.stage import run_unit
-from miricigale.workflow.store import CONFIG, ProductStore, check_disk
+from miricigale.workflow.engine.display import Display
+from miricigale.workflow.engine.schedule import Task, run_tasks
+from miricigale.workflow.engine.stage import run_unit
+from miricigale.workflow.engine.store import CONFIG, ProductStore, check_disk
 from miricigale.workflow.warmup import JOBS, compile_apart, describe_job, is_compiled
 
 __all__ = ["StudyRunner"]
@@ -67,7 +67,7 @@ class StudyRunner:
         The configuration.
     folder : path-like
         Where the products go.
-    stages : callable or tuple of `~miricigale.workflow.stage.Stage`
+    stages : callable or tuple of `~miricigale.workflow.engine.stage.Stage`
         In an order in which every stage comes after what it needs, or a function that returns
         them, which executors of processes need.
     executor : `concurrent.futures.Executor`, optional
@@ -185,7 +185,7 @@ class StudyRunner:
 
         Parameters
         ----------
-        store : `~miricigale.workflow.store.ProductStore`
+        store : `~miricigale.workflow.engine.store.ProductStore`
             The folder.
 
         Returns
@@ -222,7 +222,7 @@ class StudyRunner:
 
         Returns
         -------
-        store : `~miricigale.workflow.store.ProductStore`
+        store : `~miricigale.workflow.engine.store.ProductStore`
 
         Raises
         ------
@@ -361,7 +361,7 @@ class StudyRunner:
                 executor=self.executor,
                 n_threads=self.n_threads,
                 memory=self.config.run.memory * 1e9 or 0.5 * available_memory(),
-                tell=display.begin,
+                report=display.begin,
             )
 
     def _task(self, job, store, display):

@@ -68,9 +68,9 @@ def cluster_executor(address):
             msg = (
                 f"{err.allowed_failures + 1} workers of {address} died over one unit, the last on "
                 f"{err.last_worker.address}; was there too little memory? What is finished stands: "
-                "the same command goes on"
+                "the same command resumes it"
             )
             raise DataError(msg) from err
         except CancelledError as err:
-            msg = f"the scheduler at {address} was lost; what is finished stands: the same command goes on"
+            msg = f"the scheduler at {address} was lost; what is finished stands: the same command resumes it"
             raise DataError(msg) from err

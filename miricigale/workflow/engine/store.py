@@ -116,7 +116,7 @@ def check_disk(folder, needed):
     if needed > free:
         msg = (
             f"the run needs about {needed / 1e9:.2f} GB in {folder}, only {free / 1e9:.2f} GB are "
-            "free; make room, choose another folder, or simulate fewer exposures or skies"
+            "free; free some space, choose another folder, or simulate fewer exposures or skies"
         )
         raise DataError(msg)
     return free

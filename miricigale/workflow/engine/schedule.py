@@ -33,7 +33,7 @@ class Task:
     memory : int, optional
         Bytes that it takes.
     is_optional : bool, optional
-        Whether the others go on if it fails.
+        Whether the others continue if it fails.
     """
 
     group: str
@@ -57,7 +57,7 @@ class _Inline(Executor):
         return future
 
 
-def run_tasks(tasks, *, executor=None, n_threads=1, memory=float("inf"), tell=None):
+def run_tasks(tasks, *, executor=None, n_threads=1, memory=float("inf"), report=None):
     """
     Do tasks, each when what it needs is complete.
 
@@ -71,7 +71,7 @@ def run_tasks(tasks, *, executor=None, n_threads=1, memory=float("inf"), tell=No
         Threads of all tasks together.
     memory : float, optional
         Bytes that tasks side by side may take; a larger one is done alone.
-    tell : callable, optional
+    report : callable, optional
         Called with the titles of what runs, whenever that changes.
 
     Raises
@@ -98,8 +98,8 @@ def run_tasks(tasks, *, executor=None, n_threads=1, memory=float("inf"), tell=No
                 raise _died(task) from err
             if future is not None:
                 running[future] = task
-                if tell is not None:
-                    tell([other.title for other in running.values()])
+                if report is not None:
+                    report([other.title for other in running.values()])
         elif running:
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 failed = _finish(running.pop(future), future)
