@@ -7,7 +7,7 @@ The seven classes `Filter`, `SEDModel`, `Scene`, `Detector`, `Reducer`,
 that ``import miricigale`` opens no file and compiles nothing.
 """
 
-from miricigale.utils.lazy import lazy_names
+import lazy_loader
 
 try:
     from miricigale._version import __version__
@@ -16,18 +16,5 @@ except ImportError:  # a source tree that was never built
 
 __citation__ = "See CITATION.cff; the method repeats Yang et al. 2021, ApJ 908, 144."
 
-__getattr__, __dir__, __all__ = lazy_names(
-    __name__,
-    {
-        "detector": ("Detector", "Ramp"),
-        "filters": ("Filter", "FilterSet"),
-        "fitting": ("BayesFitter", "FitResults"),
-        "instrument": ("Exposure",),
-        "photometry": ("ErrorModel", "ForcedPhotometer"),
-        "psf": ("MatchingKernel",),
-        "reduction": ("Reducer",),
-        "scene": ("Scene",),
-        "sed": ("SED", "ModelGrid", "SEDModel"),
-    },
-)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 __all__ = ["__citation__", "__version__", *__all__]

@@ -1,5 +1,5 @@
 """The command line: a thin layer over the workflow and the classes."""
 
-from miricigale.utils.lazy import lazy_names
+import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_names(__name__, {"program": ("command", "main")})
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -5,8 +5,6 @@ from pathlib import Path
 
 from miricigale.cli.options import chosen, pair, quantity_in
 
-__all__ = ["add_fit", "add_photometry"]
-
 _NOISE = ("error", "variance", "inverse-variance", "weight")
 
 

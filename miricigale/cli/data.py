@@ -5,8 +5,6 @@ import sys
 import textwrap
 from pathlib import Path
 
-__all__ = ["add_data", "add_filters"]
-
 
 def add_filters(commands):
     """Declare ``filters``."""

@@ -4,8 +4,6 @@ from pathlib import Path
 
 from miricigale.cli.options import RESUMES, quantity_in
 
-__all__ = ["add_reduce"]
-
 _FILES = "mask saturation bias reset linearity dark gain read_noise flat photom"
 
 

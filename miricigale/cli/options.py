@@ -2,8 +2,6 @@
 
 import argparse
 
-__all__ = ["RESUMES", "chosen", "pair", "quantity_in"]
-
 #: Message of an interrupted command that can be resumed.
 RESUMES = "stopped; the same command resumes here"
 

@@ -12,8 +12,6 @@ from miricigale.cli.data import add_data, add_filters
 from miricigale.cli.exposures import add_reduce
 from miricigale.cli.study import add_compile, add_plan, add_run
 
-__all__ = ["command", "main"]
-
 # shells add the number of the signal to this
 _STOPPED = 128
 

@@ -7,8 +7,6 @@ from pathlib import Path
 
 from miricigale.cli.options import RESUMES, chosen
 
-__all__ = ["add_compile", "add_plan", "add_run"]
-
 
 def add_run(commands):
     """Declare ``run``."""

@@ -19,8 +19,6 @@ import math
 
 from miricigale.utils.compilation import njit
 
-__all__ = ["difference_weight", "weight_sums"]
-
 # least and greatest ratio of Poisson to read variance: the closed forms stay finite
 _X_MIN = 1e-12
 _X_MAX = 1e12

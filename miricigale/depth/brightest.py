@@ -5,8 +5,6 @@ import astropy.units as u
 from miricigale.depth.noise import ExposureNoise
 from miricigale.psf import MIRI_PIXEL_SCALE, miri_psf, psf_image
 
-__all__ = ["saturation_flux"]
-
 
 def saturation_flux(exposure, *, background=None, psf=None, detector=None):
     """

@@ -10,8 +10,6 @@ from miricigale.psf import MIRI_PIXEL_SCALE, miri_psf, psf_image
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import ANGLE, positive, to_array
 
-__all__ = ["extraction_map", "fitted_noise"]
-
 #: Samples of a pixel's side, and pixels of the detector on which sources are weighed.
 _SAMPLES, _SIZE = 4, 91
 

@@ -13,8 +13,6 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
 from miricigale.utils.units import ANGLE, SURFACE_BRIGHTNESS, TIME, to_array
 
-__all__ = ["aperture_noise", "extraction_weights", "sensitivity", "sensitivity_table"]
-
 # positions of the source's center within the pixel, per axis, over which is averaged
 _PHASES = (np.arange(4) + 0.5) / 4 - 0.5
 

@@ -19,8 +19,6 @@ from miricigale.psf import MIRI_PIXEL_SCALE
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
 
-__all__ = ["ExposureNoise", "noise_power", "pattern_amplitude", "ramp_variance"]
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ExposureNoise:

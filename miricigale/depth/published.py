@@ -10,16 +10,6 @@ from miricigale.instrument.figures import filter_row, table
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.units import to_array
 
-__all__ = [
-    "EtcSetup",
-    "etc_limit",
-    "etc_setup",
-    "proposal_limit",
-    "residual_amplitude",
-    "residual_presets",
-    "scaled_limit",
-]
-
 
 def _short(filter):
     """Name of a filter in the table; `KeyError` with the known ones for any other."""

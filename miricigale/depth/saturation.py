@@ -10,16 +10,6 @@ from miricigale.instrument import Exposure, electron_rate, miri_detector
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import require_columns
 
-__all__ = [
-    "NEVER",
-    "SKY_FRACTION",
-    "SaturationForecast",
-    "forecast_table",
-    "saturation_forecast",
-    "saturation_group",
-    "saturation_time",
-]
-
 #: Share of the full well above which the sky is reported.
 SKY_FRACTION = 0.6
 

@@ -17,8 +17,6 @@ from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.optional import require
 from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
 
-__all__ = ["sky_background", "zodiacal_factor", "zodiacal_levels"]
-
 #: Angles from the Sun, deg, between which the telescope may look.
 _FIELD_OF_REGARD = (85.0, 135.0)
 

@@ -9,16 +9,6 @@ from miricigale.evaluation.metrics import one_by_one
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import described_table
 
-__all__ = [
-    "CLASS_LIMITS",
-    "CLASS_NAMES",
-    "KIRKPATRICK_LIMITS",
-    "SelectionQuality",
-    "classify",
-    "confusion",
-    "selection_quality",
-]
-
 #: Names in order of rising fracAGN, and the limits between them.
 CLASS_NAMES = ("galaxy", "composite", "agn")
 CLASS_LIMITS = (0.1, 0.4)

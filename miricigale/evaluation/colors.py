@@ -12,8 +12,6 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.units import FNU, to_array
 
-__all__ = ["COLOR_WINDOWS", "ColorCircles", "ColorWindow", "color_classes", "color_estimates"]
-
 #: Distances from a center that are tried as radii, and places along each color that are tried as centers.
 _N_RADII, _N_CENTERS = 40, 17
 

@@ -9,17 +9,6 @@ from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import described_table, require_columns, unique_ids
 from miricigale.utils.units import FNU, LUMINOSITY, MASS, ab_magnitude, to_array
 
-__all__ = [
-    "PUBLISHED_LIGHT",
-    "dust_obscured_fraction",
-    "integrated_light",
-    "main_sequence_dust",
-    "main_sequence_sfr",
-    "number_counts",
-    "sfr_to_infrared_luminosity",
-    "uvj_quiescent",
-]
-
 #: Light of galaxies together in nW / m2 / sr: band, wavelength (um), least flux (uJy), value,
 #: errors down and up, reference.
 PUBLISHED_LIGHT = (

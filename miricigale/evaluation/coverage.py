@@ -8,8 +8,6 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import described_rows
 
-__all__ = ["coverage_table", "posterior_ranks"]
-
 
 def posterior_ranks(true, values, levels, *, seed=None):
     """

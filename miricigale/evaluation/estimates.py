@@ -8,8 +8,6 @@ from miricigale.evaluation.metrics import OUTLIER, fraction_interval, sigma_mad
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.random import check_seed, stream
 
-__all__ = ["Estimate", "bootstrap", "median", "scatter"]
-
 #: Values that are held at once: draws are made in pieces of this size.
 _PIECE = 4_000_000
 

@@ -7,16 +7,6 @@ from miricigale.evaluation.estimates import bootstrap, median
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import WAVE, positive, to_array
 
-__all__ = [
-    "PAH_FEATURES",
-    "equivalent_width",
-    "feature_magnitude",
-    "feature_redshifts",
-    "feature_residuals",
-    "light_share",
-    "mid_infrared_fractions",
-]
-
 #: Rest wavelengths of the strong features of polycyclic aromatic hydrocarbons.
 PAH_FEATURES = (3.3, 6.2, 7.7, 8.6, 11.3, 12.7) * u.um
 #: Components of a model that are the AGN's.

@@ -15,8 +15,6 @@ from miricigale.utils.tables import (
 )
 from miricigale.utils.units import ANGLE, FNU, to_array
 
-__all__ = ["AssociationFlags", "associate", "match_truth"]
-
 
 class AssociationFlags(Flags):
     """Why rows of two catalogs are no plain match."""

@@ -8,17 +8,6 @@ from astropy.stats import binom_conf_interval
 
 from miricigale.utils.exceptions import argument_error
 
-__all__ = [
-    "OUTLIER",
-    "PhotozMetrics",
-    "RecoveryMetrics",
-    "fraction_interval",
-    "photoz_metrics",
-    "recovery_metrics",
-    "running_median",
-    "sigma_mad",
-]
-
 #: abs(dz) / (1 + z) above which a redshift is an outlier.
 OUTLIER = 0.15
 

@@ -13,8 +13,6 @@ from miricigale.evaluation.quantities import OF_FITS, REDSHIFT_BINS, measure
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import described_rows, described_table
 
-__all__ = ["found_classes", "selection_table", "study_confusion", "study_numbers"]
-
 
 def study_numbers(study, *, seed, n_draws=500):
     """

@@ -13,8 +13,6 @@ from miricigale.utils.exceptions import unknown_name
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import described_rows
 
-__all__ = ["PUBLISHED", "PublishedNumber", "compare_with_paper", "comparison_rows"]
-
 #: Differences below this many errors are none.
 _AGREES = 2.0
 

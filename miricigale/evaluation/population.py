@@ -12,14 +12,6 @@ from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import described_table, require_columns, unique_ids
 from miricigale.utils.units import LUMINOSITY, MASS, positive, to_array
 
-__all__ = [
-    "AGNPopulation",
-    "agn_fraction",
-    "galaxy_mass_function",
-    "xray_luminosity_function",
-    "xray_obscured_fraction",
-]
-
 _DENSITY = u.Mpc**-3 / u.dex
 
 #: Ueda et al. 2014, table 4 (H0 = 70): A in Mpc^-3, luminosities as log of erg/s.

@@ -18,8 +18,6 @@ from miricigale.utils.exceptions import unknown_name
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import ab_magnitude
 
-__all__ = ["OF_FITS", "QUANTITIES", "REDSHIFT_BINS", "SHARES", "measure", "xray_fluxes"]
-
 #: Bins of redshift.
 REDSHIFT_BINS = ((0.0, 1.0), (1.0, 2.0), (2.0, 3.0), (3.0, np.inf))
 #: Fewest draws of statistics that are fits themselves.

@@ -11,8 +11,6 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import error_column, require_columns
 from miricigale.utils.units import FNU, ab_magnitude
 
-__all__ = ["StudyResults", "TruthResults"]
-
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class TruthResults:

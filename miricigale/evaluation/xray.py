@@ -12,15 +12,6 @@ from miricigale.sed.xray import stern2015, xray_flux
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import described_table
 
-__all__ = [
-    "XRAY_LIMITS",
-    "XRayLimit",
-    "completeness",
-    "half_complete",
-    "xray_luminosity_at",
-    "yang2021_xray_flux",
-]
-
 _CGS = u.erg / u.s / u.cm**2
 #: Share of the X-rays that absorption leaves in Yang et al. 2021.
 _TRANSMISSION = 0.5

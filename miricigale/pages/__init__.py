@@ -1,12 +1,5 @@
 """HTML pages from text, tables and figures; they know nothing of astronomy."""
 
-from miricigale.utils.lazy import lazy_names
+import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_names(
-    __name__,
-    {
-        "page": ("Page",),
-        "rendering": ("render",),
-        "values": ("Link", "Missing", "cell_of", "number"),
-    },
-)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -9,8 +9,6 @@ from miricigale.pages.values import Missing, cell_of
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.store import replacing
 
-__all__ = ["Page"]
-
 
 class Page:
     """

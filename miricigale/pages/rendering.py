@@ -6,8 +6,6 @@ import io
 
 import jinja2
 
-__all__ = ["image_of", "macros", "render"]
-
 #: Points, line nodes and glyphs above which a figure is smaller as pixels than as vectors.
 _MOST_MARKS = 1500
 

@@ -5,8 +5,6 @@ import dataclasses
 import numpy as np
 from markupsafe import Markup
 
-__all__ = ["Link", "Missing", "cell_of", "number"]
-
 
 @dataclasses.dataclass(frozen=True)
 class Missing:

@@ -1,17 +1,5 @@
 """What exposures would yield: noise or images, fits of mock photometry, times."""
 
-from miricigale.utils.lazy import lazy_names
+import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_names(
-    __name__,
-    {
-        "commands": ("plan_table", "write_plan"),
-        "config": ("PlanConfig", "load_plan"),
-        "exposures": ("BandPlan", "wall_clock"),
-        "images": ("image_sample", "images_study", "paired_bands", "paired_numbers"),
-        "page": ("write_page",),
-        "planner": ("Plan", "Planner"),
-        "compare": ("area_table", "comparison_table"),
-        "sample": ("make_sample",),
-    },
-)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -5,8 +5,6 @@ import numpy as np
 from miricigale.evaluation import OUTLIER, Estimate, bootstrap
 from miricigale.evaluation.estimates import median, scatter
 
-__all__ = ["accuracy", "difference"]
-
 
 def _share(found, among):
     """Share of sources found, by row: a statistic for `~miricigale.evaluation.bootstrap`."""

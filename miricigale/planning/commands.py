@@ -8,8 +8,6 @@ from astropy.table import QTable
 
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["plan_table", "write_plan"]
-
 
 def plan_table(*, quick=False):
     """

@@ -4,8 +4,6 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-__all__ = ["area_table", "comparison_table"]
-
 
 def _row(planner, plan, numbers):
     """One row of both tables."""

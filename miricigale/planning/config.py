@@ -9,8 +9,6 @@ from miricigale.workflow.background import LEVELS_DOC, check_levels
 from miricigale.workflow.options import Configuration, option, read_text, require
 from miricigale.workflow.sections import CatalogSection, FitBasics, SedSection
 
-__all__ = ["PlanConfig", "load_plan"]
-
 
 @dataclasses.dataclass(frozen=True)
 class PlanSection:

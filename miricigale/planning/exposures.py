@@ -20,8 +20,6 @@ from miricigale.photometry import ErrorModel
 from miricigale.utils.exceptions import ConfigError, DataError
 from miricigale.workflow.background import band_background
 
-__all__ = ["BandPlan", "RunErrors", "background_options", "band_plans", "wall_clock"]
-
 #: The plan needs no direction; an `Exposure` has one.
 _ANYWHERE = {"pointing": SkyCoord(0 * u.deg, 0 * u.deg), "roll": 0 * u.deg}
 

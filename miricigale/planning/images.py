@@ -32,15 +32,6 @@ from miricigale.workflow.stages.sample import SampleFlags
 from miricigale.workflow.study import run_study
 from miricigale.workflow.truths import CATALOG, FIELD, truth_names
 
-__all__ = [
-    "ImagedSample",
-    "image_sample",
-    "images_catalog",
-    "images_study",
-    "paired_bands",
-    "paired_numbers",
-]
-
 #: Sources that images say nothing of.
 _UNUSABLE = (
     SampleFlags.OUTSIDE_FIELD | SampleFlags.STAR | SampleFlags.NO_MODEL | SampleFlags.NOT_MATCHED

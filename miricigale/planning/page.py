@@ -9,8 +9,6 @@ from miricigale.plotting.axes import MEASURED, SECOND, TRUE, legend, new_figure
 from miricigale.plotting.comparison import plot_redshifts
 from miricigale.workflow.background import background_text
 
-__all__ = ["write_page"]
-
 _NO_COUNT = "nothing to count"
 #: Numbers of a plan: name, heading, format, factor.
 _NUMBERS = (

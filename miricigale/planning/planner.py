@@ -19,8 +19,6 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import error_column, require_columns
 from miricigale.workflow.stages.sample import detected_bands
 
-__all__ = ["EXISTING", "Plan", "Planner"]
-
 #: Name of the fit without MIRI.
 EXISTING = "existing bands"
 #: Sizes (arcsec) of sources for which errors are computed; each source takes the nearest.

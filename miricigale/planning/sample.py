@@ -13,8 +13,6 @@ from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.stages.inputs import bright_sources, fit_seds, study_catalog
 from miricigale.workflow.stages.truth import add_agn, add_field_agn, galaxy_parameters
 
-__all__ = ["agn_mix", "catalog_area", "make_sample"]
-
 #: Stellar populations may not be older than the universe: the fit's ages, Gyr, are cut to this share.
 _AGE_SHARE = 0.95
 

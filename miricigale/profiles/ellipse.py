@@ -2,8 +2,6 @@
 
 import numpy as np
 
-__all__ = ["ellipse_through", "ellipse_to_pixels"]
-
 
 def ellipse_through(jacobian, *, radius, axis_ratio, direction):
     """

@@ -5,17 +5,6 @@ import scipy
 
 from miricigale.utils.exceptions import argument_error
 
-__all__ = [
-    "SERSIC_INDEX_RANGE",
-    "light_table",
-    "parameter_rows",
-    "sersic_bn",
-    "sersic_enclosed_fraction",
-    "sersic_image",
-    "sersic_radius",
-    "sersic_stamp",
-]
-
 #: Indices that the images are made and tested for.
 SERSIC_INDEX_RANGE = (0.2, 10.0)
 

@@ -7,18 +7,6 @@ from scipy.fft import irfft, next_fast_len, rfft
 
 from miricigale.utils.compilation import njit
 
-__all__ = [
-    "core_moments",
-    "half_maximum_width",
-    "interpolate",
-    "line_scatter",
-    "matrix_dft_intensity",
-    "polygon_coverage",
-    "radial_sums",
-    "remove_plane",
-    "wavefront",
-]
-
 
 @njit(cache=True, nogil=True)
 def polygon_coverage(vertices, n, step, rows):

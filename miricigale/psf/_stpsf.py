@@ -13,8 +13,6 @@ from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.optional import require
 from miricigale.utils.units import ANGLE, to_array
 
-__all__ = ["stpsf_grid", "stpsf_psf"]
-
 
 def _instrument(filter_name, opd):
     if "STPSF_PATH" not in os.environ:

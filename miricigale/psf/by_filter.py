@@ -16,8 +16,6 @@ from miricigale.psf.resample import psf_image, psf_mosaic, rotate_psf
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error, unknown_name
 from miricigale.utils.units import ANGLE
 
-__all__ = ["MODEL_FILTERS", "checked_psf", "filter_psf"]
-
 _log = logging.getLogger(__name__)
 
 #: Filters that `filter_psf` knows.

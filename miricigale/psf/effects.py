@@ -9,15 +9,6 @@ from miricigale.psf import _core
 from miricigale.psf.optics import jwst_constants
 from miricigale.utils.exceptions import argument_error
 
-__all__ = [
-    "EFFECTS",
-    "cruciform",
-    "cruciform_fraction",
-    "cruciform_shift",
-    "detector_response",
-    "halo_share",
-]
-
 #: Effects that a PSF may include, in the order in which they act.
 EFFECTS = ("jitter", "cruciform", "pixel", "ipc")
 

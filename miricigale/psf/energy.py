@@ -14,8 +14,6 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import described_table
 from miricigale.utils.units import ANGLE, to_array
 
-__all__ = ["encircled_energy", "fwhm", "psf_table", "radius_of_encircled_energy"]
-
 
 def encircled_energy(psf, radius, *, pixel_scale=None):
     """

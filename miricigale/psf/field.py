@@ -9,8 +9,6 @@ from miricigale.psf.model import SHARED, InstrumentPSF, PSFGrid
 from miricigale.psf.resample import alike
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["grid_weights", "miri_psf_grid", "psf_at", "psf_grid"]
-
 
 def psf_grid(psfs, positions):
     """

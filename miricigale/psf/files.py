@@ -17,8 +17,6 @@ from miricigale.utils.store import native, open_parts, plain_value, replacing, w
 from miricigale.utils.unified import register
 from miricigale.utils.units import ANGLE, to_array
 
-__all__ = ["fits_image", "header_grid", "read_psf"]
-
 #: Units of an `InstrumentPSF`'s quantities, and arrays of a `MatchingKernel`, in files.
 _UNITS = {"pixel_scale": ANGLE, "angle": u.deg, "pa_aper": u.deg}
 _ARRAYS = ("array", "source", "target")

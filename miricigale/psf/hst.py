@@ -15,8 +15,6 @@ from miricigale.psf.telescope import band_quantiles, checked_grid, filter_name, 
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import ANGLE, to_array
 
-__all__ = ["WFC3_FILTERS", "hst_psf"]
-
 WFC3_FILTERS = ("wfc3.f105w", "wfc3.f125w", "wfc3.f140w", "wfc3.f160w")
 
 #: Width of the WFC3/IR pixel in arcsec and of the drop relative to it in the mosaics.

@@ -14,8 +14,6 @@ from miricigale.psf.model import PSFGrid
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.unified import read_write
 
-__all__ = ["KernelField"]
-
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class KernelField:

@@ -10,7 +10,6 @@ from scipy.signal import fftconvolve, oaconvolve
 
 from miricigale.psf.pairs import psf_pair, ready_arrays
 from miricigale.psf.wiener import (
-    REGULARIZATIONS,
     choose,
     energy_error,
     energy_radii,
@@ -20,8 +19,6 @@ from miricigale.psf.wiener import (
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.unified import read_write, unified_read
 from miricigale.utils.units import ANGLE, frozen_array, positive, to_array
-
-__all__ = ["REGULARIZATIONS", "MatchingKernel"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)

@@ -22,8 +22,6 @@ from miricigale.psf.telescope import Telescope, checked_grid, filter_name, odd_c
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import ANGLE
 
-__all__ = ["MIRI_FILTERS", "MIRI_PIXEL_SCALE", "local_pixel", "miri_psf"]
-
 #: Geometric mean of the imager's pixel, 0.110498 x 0.111336 arcsec (SIAF, MIRIM_FULL).
 MIRI_PIXEL_SCALE = math.sqrt(0.110498 * 0.111336) * u.arcsec
 

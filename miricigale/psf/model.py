@@ -13,8 +13,6 @@ from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.unified import read_write
 from miricigale.utils.units import ANGLE, positive, to_array
 
-__all__ = ["FRAMES", "InstrumentPSF", "PSFGrid", "from_photutils", "instrument_psf", "make_psf"]
-
 #: Where a PSF's axes may stand: on the detector (angle on the sky not yet known) or the sky.
 FRAMES = ("detector", "sky")
 

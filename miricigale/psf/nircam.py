@@ -8,8 +8,6 @@ from miricigale.psf.optics import jwst_constants
 from miricigale.psf.telescope import Telescope, checked_grid, filter_name, odd_cells
 from miricigale.utils.units import ANGLE
 
-__all__ = ["NIRCAM_FILTERS", "nircam_psf"]
-
 #: Pixel in arcsec of the wide filters, of the short- and the long-wavelength channel.
 _PIXELS = dict.fromkeys((f"nircam.f{n}w" for n in ("070", "090", "115", "150", "200")), 0.031)
 _PIXELS |= dict.fromkeys((f"nircam.f{n}w" for n in (277, 356, 444)), 0.063)

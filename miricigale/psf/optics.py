@@ -14,8 +14,6 @@ from miricigale.utils.parallel import single_threaded
 from miricigale.utils.random import stream
 from miricigale.utils.units import frozen_array
 
-__all__ = ["Pupil", "hst_pupil", "jwst_constants", "jwst_pupil", "polychromatic_psf"]
-
 #: One arcsecond in rad.
 ARCSEC = math.pi / 180 / 3600
 

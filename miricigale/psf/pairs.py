@@ -14,8 +14,6 @@ from miricigale.psf.wiener import gaussian_gain, odd_square
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.units import ANGLE, to_array
 
-__all__ = ["psf_pair", "ready_arrays"]
-
 _log = logging.getLogger(__name__)
 
 

@@ -13,8 +13,6 @@ from miricigale.psf.model import instrument_psf
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import ANGLE, positive, to_array
 
-__all__ = ["average_psf", "psf_image", "psf_mosaic", "rotate_psf"]
-
 _log = logging.getLogger(__name__)
 
 _ANGLES = ("pixel_scale", "angle")

@@ -9,8 +9,6 @@ from miricigale.psf.telescope import odd_cells
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import ANGLE, to_array
 
-__all__ = ["gaussian_psf", "moffat_psf"]
-
 
 def _round_psf(profile, pixel_scale, oversampling, fov):
     scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))

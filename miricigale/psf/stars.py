@@ -19,8 +19,6 @@ from miricigale.psf.resample import psf_image
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import ANGLE, positive, to_array
 
-__all__ = ["psf_from_stars"]
-
 
 def _as_list(value, kinds):
     return [value] if isinstance(value, kinds) else list(value)

@@ -12,8 +12,6 @@ from miricigale.refdata import citations
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.units import ANGLE, WAVE, positive, to_array
 
-__all__ = ["Telescope", "band_quantiles", "checked_grid", "filter_name", "odd_cells"]
-
 
 def filter_name(filter_, known):
     """The name of a filter that has a PSF, out of the known ones."""

@@ -10,16 +10,6 @@ from scipy.fft import fftshift, ifftshift, irfft2, next_fast_len, rfft2
 from miricigale.psf import _core
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 
-__all__ = [
-    "REGULARIZATIONS",
-    "choose",
-    "energy_error",
-    "energy_radii",
-    "gaussian_gain",
-    "odd_square",
-    "wiener",
-]
-
 _log = logging.getLogger(__name__)
 
 #: Regularization parameters that have a name; they belong to pixels of 0.06 arcsec.

@@ -11,8 +11,6 @@ from miricigale.instrument import background_level
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
 
-__all__ = ["Background"]
-
 
 @dataclasses.dataclass(frozen=True)
 class Background:

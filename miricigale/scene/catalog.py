@@ -19,8 +19,6 @@ from miricigale.utils.tables import (
 )
 from miricigale.utils.units import FNU
 
-__all__ = ["CATALOG_COLUMNS", "CatalogFlags", "check_catalog"]
-
 #: Columns that every catalog has, with their unit (None: dimensionless or not a number).
 CATALOG_COLUMNS = {
     "id": None,

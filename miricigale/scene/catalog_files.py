@@ -17,8 +17,6 @@ from miricigale.utils.files import read_table
 from miricigale.utils.missing import plain_floats
 from miricigale.utils.tables import error_column
 
-__all__ = ["read_catalog"]
-
 #: What makes a Sersic profile.
 _SHAPE = ("half_light_radius", "sersic_index", "axis_ratio", "position_angle")
 

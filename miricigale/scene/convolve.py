@@ -16,8 +16,6 @@ from scipy.ndimage import spline_filter
 
 from miricigale.utils.parallel import thread_count
 
-__all__ = ["Places", "add_nodes", "convolve", "phases"]
-
 
 class Places:
     """

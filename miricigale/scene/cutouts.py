@@ -12,8 +12,6 @@ from miricigale.scene.sky import local_jacobian
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import ANGLE, Frozen, frozen_array, positive, to_array
 
-__all__ = ["Cutout"]
-
 # two points of Gauss and Legendre in a cell: the light's variance in it is exact
 _GAUSS = 0.5 / math.sqrt(3.0)
 

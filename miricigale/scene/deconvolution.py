@@ -5,8 +5,6 @@ import scipy.fft
 
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["deconvolve"]
-
 
 def deconvolve(image, psf, *, max_gain=3.0):
     """

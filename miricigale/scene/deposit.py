@@ -7,8 +7,6 @@ import numpy as np
 from miricigale.scene import _core
 from miricigale.utils.parallel import chunks, parallel_map, threads
 
-__all__ = ["deposit_profiles", "smooth_from"]
-
 #: Rows that one task owns; fixed, so that threads change nothing.
 _ROWS = 64
 

@@ -11,8 +11,6 @@ from miricigale.scene.scene import Scene
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.units import positive
 
-__all__ = ["depth_to_rms", "highres_image"]
-
 #: Depth of the CANDELS wide fields in F160W, and the aperture and significance that it is for.
 _DEPTH, _APERTURE, _N_SIGMA = 27.6 * u.ABmag, 0.2 * u.arcsec, 5
 

@@ -14,8 +14,6 @@ from miricigale.scene.deposit import deposit_profiles, smooth_from
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.parallel import thread_count
 
-__all__ = ["FieldPainter", "Painter"]
-
 #: Sersic sources with a half-light radius below this many nodes are points.
 _UNRESOLVED = 0.05
 

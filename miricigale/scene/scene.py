@@ -24,8 +24,6 @@ from miricigale.utils.meta import provenance
 from miricigale.utils.tables import Flags, described_table
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, positive, to_array
 
-__all__ = ["Scene", "SceneFlags"]
-
 #: PSFs with known pixel, frame and filter.
 _TYPED = (InstrumentPSF, PSFGrid)
 

@@ -2,8 +2,6 @@
 
 import numpy as np
 
-__all__ = ["local_jacobian", "pixel_positions"]
-
 
 def local_jacobian(wcs, x, y):
     """

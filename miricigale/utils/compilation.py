@@ -17,8 +17,6 @@ from pathlib import Path
 import numba
 from numba.core import event
 
-__all__ = ["njit"]
-
 log = logging.getLogger(__name__)
 
 #: What the kernels of a subpackage do, and about how many seconds all of them take to compile.

@@ -7,8 +7,6 @@ import astropy.units as u
 import numpy as np
 from astropy.table import Table
 
-__all__ = ["content_sha256", "file_sha256"]
-
 
 def file_sha256(path):
     """The sha256 of a file as hexadecimal text."""

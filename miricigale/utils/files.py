@@ -15,18 +15,6 @@ from astropy.table import QTable
 
 from miricigale.utils.exceptions import DataError
 
-__all__ = [
-    "cached_by_file",
-    "check_unpacked",
-    "conf",
-    "open_fits",
-    "read_table",
-    "split_extension",
-    "unpacked_size",
-    "write_fits",
-    "writing",
-]
-
 # how packed files begin, and the module of Python's that opens them
 _PACKED = {b"\x1f\x8b": "gzip", b"BZh": "bz2", b"\xfd7zXZ\x00": "lzma"}
 _ZIP = b"PK\x03\x04"

@@ -12,8 +12,6 @@ from miricigale.utils.files import writing
 from miricigale.utils.lock import FolderLock
 from miricigale.utils.store import PARTIAL, replacing
 
-__all__ = ["FileFolder", "RecordFolder"]
-
 log = logging.getLogger(__name__)
 
 MANIFEST = "manifest.json"

@@ -4,8 +4,6 @@ import importlib
 import sys
 import warnings
 
-__all__ = ["lazy_names"]
-
 
 def lazy_names(package, names, *, moved=None):
     """

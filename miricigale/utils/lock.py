@@ -21,8 +21,6 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
-__all__ = ["FolderLock"]
-
 # what link says where there are no hard links
 _NO_LINKS = {errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK}
 # longer than another process takes to finish a lock file, in seconds

@@ -4,8 +4,6 @@ import datetime
 import functools
 import importlib.metadata
 
-__all__ = ["provenance", "undated"]
-
 
 @functools.cache
 def _version():

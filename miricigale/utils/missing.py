@@ -4,8 +4,6 @@ import numpy as np
 
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["negative_errors", "plain_floats", "without_codes"]
-
 #: Numbers that stand for no value, of either sign in magnitudes, negative in all other columns.
 _CODES = np.array([99.0, 99.9, 99.99, 99.999, 999.0, 999.9, 999.99, 9999.0, 9999.9, 99999.0])
 

@@ -8,9 +8,6 @@ import numpy as np
 
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["ObjectRows", "PerObject", "PerObjectDict"]
-
-
 #: Types of fields: an array whose first axis is the objects, and a dict of such.
 PerObject = Annotated[np.ndarray, "per object"]
 PerObjectDict = Annotated[dict, "per object"]

@@ -2,8 +2,6 @@
 
 import importlib
 
-__all__ = ["require"]
-
 
 def require(module, *, extra):
     """

@@ -4,8 +4,6 @@ import numbers
 
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["check_choice", "check_kind", "check_least", "check_positive"]
-
 
 def check_choice(value, name, known):
     """Refuse a value that is none of those known (a `ValueError`)."""

@@ -18,18 +18,6 @@ import threadpoolctl
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.progress import progress
 
-__all__ = [
-    "available_memory",
-    "check_memory",
-    "chunks",
-    "parallel_map",
-    "process_pool",
-    "single_threaded",
-    "thread_count",
-    "thread_pool",
-    "threads",
-]
-
 #: Functions whose pickle is longer (bytes) go to other processes once, not with every piece.
 _HEAVY = 100_000
 

@@ -5,8 +5,6 @@ import time
 
 from tqdm import tqdm
 
-__all__ = ["on_terminal", "print_line", "progress"]
-
 
 def on_terminal():
     """Whether a bar can be drawn: in a terminal or a notebook, not in a log file."""

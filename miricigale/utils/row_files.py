@@ -18,8 +18,6 @@ from miricigale.utils.files import open_fits, read_table, unpacked_size
 from miricigale.utils.store import plain_value, replacing
 from miricigale.utils.units import check_count
 
-__all__ = ["RowFile", "open_rows", "write_rows"]
-
 
 def open_rows(path, chunk_rows, *, hdu=None):
     """

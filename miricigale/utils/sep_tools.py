@@ -12,8 +12,6 @@ import sep
 
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["background", "extract", "native", "window_positions"]
-
 
 def native(array, dtype=None):
     """

@@ -11,8 +11,6 @@ import numpy as np
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import open_fits, write_fits, writing
 
-__all__ = ["PARTIAL", "Parts", "native", "open_parts", "plain_value", "replacing", "write_parts"]
-
 #: How the names of unfinished files begin.
 PARTIAL = ".partial-"
 _TEXT = "TEXT"

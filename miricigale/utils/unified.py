@@ -6,8 +6,6 @@ import os
 from astropy.io import registry
 from astropy.io.registry import UnifiedReadWrite, UnifiedReadWriteMethod
 
-__all__ = ["read_write", "register", "unified_read", "unified_write"]
-
 _SUFFIXES = {"fits": (".fits", ".fit", ".fits.gz"), "ascii.ecsv": (".ecsv",)}
 
 

@@ -1,16 +1,5 @@
 """The whole study: configuration, stages, and a runner that resumes."""
 
-from miricigale.utils.lazy import lazy_names
+import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_names(
-    __name__,
-    {
-        "config": ("StudyConfig", "load_config", "preset_names"),
-        "engine.runner": ("StudyRunner",),
-        "engine.stage": ("Context", "Stage"),
-        "stages": ("study_stages",),
-        "engine.store": ("ProductStore",),
-        "disk": ("disk_use",),
-        "study": ("check_study", "run_study"),
-    },
-)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -9,15 +9,6 @@ from miricigale.depth import sky_background
 from miricigale.utils.units import SURFACE_BRIGHTNESS
 from miricigale.workflow.options import require
 
-__all__ = [
-    "LEVELS_DOC",
-    "background_text",
-    "band_background",
-    "check_levels",
-    "of_filter",
-    "text_by_filter",
-]
-
 #: What the options say of levels.
 LEVELS_DOC = (
     "Zodiacal light (low, medium, high) or surface brightness ('12.5 MJy/sr'); one for all filters, or "

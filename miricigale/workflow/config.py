@@ -31,9 +31,6 @@ from miricigale.workflow.sections import (
 )
 from miricigale.workflow.truths import ALL, CUTOUTS, NEEDS_AGN, perturbed_values
 
-__all__ = ["StudyConfig", "load_config", "present_names", "preset_names"]
-
-
 #: Keys that had another name, which files may still have.
 _FORMER = {"photometry.n_pixels": "photometry.min_area"}
 

@@ -13,8 +13,6 @@ from astropy.table import QTable
 
 from miricigale.pages import Missing, number
 
-__all__ = ["Cell", "cells_of", "changed_config", "read_tables", "rows_of"]
-
 #: Why a number of a comparison is missing.
 NO_SOURCE = "no such source"
 

@@ -9,8 +9,6 @@ from miricigale.workflow.stages.exposures import grid_of, study_exposures, study
 from miricigale.workflow.stages.inputs import REDSHIFT_STEP, bright_sources, study_catalog
 from miricigale.workflow.truths import study_truths
 
-__all__ = ["disk_use"]
-
 #: Bytes, measured (``docs/guide/workflow.rst``): of a calibrated image and of slopes for each pixel of
 #: the detector; of mosaics, of model and residual, of the prior and of templates for each pixel of
 #: their grids.

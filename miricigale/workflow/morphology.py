@@ -23,8 +23,6 @@ from miricigale.utils.store import open_parts, write_parts
 from miricigale.utils.units import ANGLE
 from miricigale.workflow.stages.sample import values_at
 
-__all__ = ["RealGalaxies", "add_clumps", "read_stamps", "stamps_of_sources", "write_stamps"]
-
 log = logging.getLogger(__name__)
 
 #: Clumps in a galaxy, least and largest number; slope of the number by light, dN/dL ~ L^-slope, and largest

@@ -10,8 +10,6 @@ from pathlib import Path
 
 from miricigale.utils.exceptions import ConfigError
 
-__all__ = ["Configuration", "option", "read_setting", "read_text", "require", "toml_value"]
-
 
 def option(default, doc, *, low=None, high=None, choices=None, single=False):
     """A field with its documentation and limits in the metadata; ``single``: a list may be one value."""

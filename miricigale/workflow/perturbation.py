@@ -12,8 +12,6 @@ from miricigale.sed import components
 from miricigale.utils.random import stream
 from miricigale.workflow.morphology import add_clumps
 
-__all__ = ["Perturbation", "perturbed_model", "perturbed_parameters", "point_columns"]
-
 #: Mass fraction and time since the beginning (Gyr) of recent bursts, ends of their ranges.
 BURST = {"f_burst": (0.001, 0.05), "age_burst": (0.02, 0.2)}
 #: Ranges of the parameters of Draine & Li 2007.

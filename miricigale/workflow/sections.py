@@ -9,26 +9,6 @@ from miricigale.workflow.background import LEVELS_DOC
 from miricigale.workflow.options import option, require
 from miricigale.workflow.truths import ALL, CATALOG, EFFECTS, EXPERIMENTS, FIELD, SETS, VARIANTS
 
-__all__ = [
-    "CatalogSection",
-    "DetectorSection",
-    "ErrorSection",
-    "ExposureSection",
-    "FitBasics",
-    "FitSection",
-    "HighresSection",
-    "PerturbSection",
-    "PhotometrySection",
-    "PointSourceSection",
-    "PointingSection",
-    "ReductionSection",
-    "ReportSection",
-    "RunSection",
-    "SceneSection",
-    "SedSection",
-    "VariantSection",
-]
-
 
 @dataclasses.dataclass(frozen=True)
 class RunSection:

@@ -19,8 +19,6 @@ from miricigale.workflow.stages.exposures import grid_of, study_background, stud
 from miricigale.workflow.stages.inputs import study_catalog
 from miricigale.workflow.truths import CATALOG
 
-__all__ = ["MIN_SOURCES", "check_study", "run_study"]
-
 #: Sources that a field must have for an error function to be measured.
 MIN_SOURCES = 3
 

@@ -4,28 +4,6 @@ import dataclasses
 
 from miricigale.filters import Filter
 
-__all__ = [
-    "ALL",
-    "CATALOG",
-    "CUTOUTS",
-    "EFFECTS",
-    "EXPERIMENTS",
-    "FIELD",
-    "NEEDS_AGN",
-    "SETS",
-    "VARIANTS",
-    "Truth",
-    "band_sets",
-    "itself",
-    "of_reference",
-    "of_truth",
-    "perturbed_values",
-    "reference",
-    "study_truths",
-    "truth_names",
-    "variant_changes",
-]
-
 #: Sets of MIRI bands that join the existing ones in a fit: Yang et al. 2021, section 4.
 SETS = ("all", "none", "blue", "red")
 #: Further fits of each sample.

@@ -19,8 +19,6 @@ from pathlib import Path
 
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["JOBS", "compile_apart", "compile_job", "describe_job", "is_compiled"]
-
 log = logging.getLogger(__name__)
 
 _PACKAGE = Path(__file__).resolve().parent.parent

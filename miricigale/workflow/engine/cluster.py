@@ -6,8 +6,6 @@ from concurrent.futures import CancelledError
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.optional import require
 
-__all__ = ["cluster_executor"]
-
 
 def _version():
     from miricigale import __version__

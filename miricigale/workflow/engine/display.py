@@ -4,8 +4,6 @@ import logging
 
 from miricigale.utils.progress import on_terminal, print_line, progress
 
-__all__ = ["Display"]
-
 # shown by the command line at any verbosity
 _compilation_log = logging.getLogger("miricigale.utils.compilation")
 

@@ -24,8 +24,6 @@ from miricigale.workflow.engine.stage import run_unit
 from miricigale.workflow.engine.store import CONFIG, ProductStore, check_disk
 from miricigale.workflow.warmup import JOBS, compile_apart, describe_job, is_compiled
 
-__all__ = ["StudyRunner"]
-
 log = logging.getLogger(__name__)
 
 #: Bytes that a process takes for a unit whose stage does not say how many: measured, of a field

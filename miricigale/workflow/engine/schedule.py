@@ -7,8 +7,6 @@ from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future
 
 from miricigale.utils.exceptions import DataError
 
-__all__ = ["Task", "run_tasks"]
-
 log = logging.getLogger(__name__)
 
 

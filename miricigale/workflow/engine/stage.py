@@ -12,8 +12,6 @@ from miricigale.utils.folder import FileFolder
 from miricigale.utils.meta import undated
 from miricigale.utils.parallel import single_threaded
 
-__all__ = ["Context", "Stage", "run_unit", "stage"]
-
 
 @dataclasses.dataclass(frozen=True)
 class Stage:

@@ -9,8 +9,6 @@ from miricigale.utils.exceptions import DataError
 from miricigale.utils.folder import RecordFolder
 from miricigale.workflow.config import present_names
 
-__all__ = ["ProductStore", "check_disk"]
-
 CONFIG = "config.toml"
 
 

@@ -26,18 +26,6 @@ from miricigale.utils.units import ab_magnitude
 from miricigale.workflow.page.labels import band_label, by_wavelength
 from miricigale.workflow.stages.conditions import has_flag
 
-__all__ = [
-    "counts_figure",
-    "error_figure",
-    "input_figure",
-    "limit_figure",
-    "magnitude_figure",
-    "offset_figure",
-    "point_figure",
-    "variant_figure",
-]
-
-
 #: Panels of one range.
 _SHARED = {"sharex": True, "sharey": True}
 

@@ -6,8 +6,6 @@ from importlib import resources
 
 from markupsafe import Markup
 
-__all__ = ["sentence", "texts_of"]
-
 
 @functools.cache
 def _texts():

@@ -9,8 +9,6 @@ from miricigale.workflow.page.labels import SET_LABELS, browse, three_bands
 from miricigale.workflow.stages.exposures import study_exposures, study_pointings
 from miricigale.workflow.stages.images import measured_mosaic, reducer_of
 
-__all__ = ["field_text", "write_detections", "write_images", "write_summary"]
-
 
 def write_summary(page, truths):
     """Headline numbers, and links to the sources of each truth."""

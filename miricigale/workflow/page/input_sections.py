@@ -3,8 +3,6 @@
 from miricigale.workflow.page import band_figures
 from miricigale.workflow.page.labels import band_label
 
-__all__ = ["write_inputs"]
-
 
 def write_inputs(page):
     """Luminosities, star formation, counts and light of the galaxies of the reference truth."""

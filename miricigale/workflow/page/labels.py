@@ -7,18 +7,6 @@ from miricigale.pages import Link
 from miricigale.plotting.comparison import MEASURED, SECOND
 from miricigale.workflow.truths import CATALOG
 
-__all__ = [
-    "SET_COLORS",
-    "SET_LABELS",
-    "band_label",
-    "browse",
-    "by_wavelength",
-    "class_label",
-    "parameter_label",
-    "three_bands",
-    "truth_label",
-]
-
 #: Sets of bands: what they are called, and their colors.
 SET_LABELS = {
     "all": "with MIRI",

@@ -30,19 +30,6 @@ from miricigale.workflow.stages.conditions import (
 from miricigale.workflow.stages.exposures import pointing_exposures, pointing_time
 from miricigale.workflow.stages.sample import SampleFlags
 
-__all__ = [
-    "FEWEST",
-    "MIPS_LIMIT",
-    "StudyTables",
-    "above_proposal",
-    "as_ceers",
-    "as_paper",
-    "bright_isolated",
-    "study_metrics",
-    "truth_metrics",
-    "whole_sample",
-]
-
 #: Fewest sources of which a median with its error or scatter is shown.
 FEWEST = 5
 #: AB magnitude of the limit of the mock photometry at 24 um.

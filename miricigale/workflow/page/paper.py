@@ -18,8 +18,6 @@ from miricigale.workflow.page.declared import sentence, texts_of
 from miricigale.workflow.stages.conditions import ConditionFlags, has_flag
 from miricigale.workflow.stages.sample import matched_errors
 
-__all__ = ["agn_shares", "extra_numbers", "reasons_of", "study_results", "write_comparison"]
-
 #: Magnitudes of a small relative change of the flux.
 _MAG = 2.5 / np.log(10)
 

@@ -10,8 +10,6 @@ from miricigale.workflow.page.labels import band_label
 from miricigale.workflow.page.numbers import FEWEST
 from miricigale.workflow.stages.conditions import CONDITIONS, ConditionFlags
 
-__all__ = ["write_errors", "write_photometry"]
-
 #: How sources are marked in figures: bit, marker and label.
 _MARKS = (
     (int(ConditionFlags.CROWDED), "o", "crowded"),

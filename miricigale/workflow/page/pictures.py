@@ -11,15 +11,6 @@ from miricigale.plotting.measurements import background_figure, encircled_energy
 from miricigale.psf.wiener import energy_error
 from miricigale.workflow.page.labels import band_label
 
-__all__ = [
-    "binned",
-    "convolution_figure",
-    "field_figure",
-    "filled",
-    "residual_figure",
-    "subtraction_figure",
-]
-
 
 def filled(image):
     """Values of an image with NaN where it is masked."""

@@ -22,17 +22,6 @@ from miricigale.workflow.stages.exposures import (
 )
 from miricigale.workflow.stages.inputs import catalog_bands, input_bands
 
-__all__ = [
-    "catalog_facts",
-    "exposure_kinds",
-    "library_rows",
-    "sources_to_cite",
-    "stand_ins",
-    "versions",
-    "write_exposures",
-    "write_origin",
-]
-
 
 def exposure_kinds(config, forecasts, bands):
     """

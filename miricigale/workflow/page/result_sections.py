@@ -26,8 +26,6 @@ from miricigale.workflow.page.study_figures import CLASS_COLUMNS, FEATURES
 from miricigale.workflow.stages.conditions import CONDITIONS
 from miricigale.workflow.stages.sample import typical_source
 
-__all__ = ["write_results"]
-
 #: fracAGN of the truths of which a source is shown in detail.
 EXAMPLES = (0.0, 0.4)
 #: Parameters whose posteriors are compared with the truth, in its table as in the fit.

@@ -47,23 +47,6 @@ from miricigale.workflow.page.labels import (
 )
 from miricigale.workflow.page.numbers import MIPS_LIMIT
 
-__all__ = [
-    "band_residuals",
-    "class_figure",
-    "color_figure",
-    "detection_figure",
-    "disk_figure",
-    "example_figure",
-    "fraction_bins_figure",
-    "histogram_figure",
-    "rank_figure",
-    "redshift_figure",
-    "residual_figure",
-    "shape_figure",
-    "spectra_figure",
-    "xray_figure",
-]
-
 #: fracAGN of the spectra that are drawn over each other.
 SEQUENCE = (0.0, 0.2, 0.4, 0.6, 0.8, 0.99)
 #: Classes that sources are found in, as columns of tables.

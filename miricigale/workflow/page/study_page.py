@@ -6,8 +6,6 @@ from miricigale.workflow.page.declared import sentence, texts_of
 from miricigale.workflow.page.labels import band_label, three_bands, truth_label
 from miricigale.workflow.page.numbers import FEWEST, MIPS_LIMIT
 
-__all__ = ["StudyPage"]
-
 
 class StudyPage:
     """

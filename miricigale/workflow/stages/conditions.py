@@ -7,17 +7,6 @@ from miricigale.evaluation import AssociationFlags, photoz_metrics, recovery_met
 from miricigale.utils.tables import Flags, error_column
 from miricigale.workflow.stages.sample import SampleFlags
 
-__all__ = [
-    "CONDITIONS",
-    "ConditionFlags",
-    "add_conditions",
-    "any_condition",
-    "band_conditions",
-    "detection_counts",
-    "fit_conditions",
-    "has_flag",
-]
-
 
 class ConditionFlags(Flags):
     """Conditions of a source, or a detection, in a band; those of Yang et al. 2021 and doubtful matches."""

@@ -11,8 +11,6 @@ from miricigale.utils.parallel import chunks
 from miricigale.workflow.page.pictures import binned, filled
 from miricigale.workflow.stages.images import measured_mosaic
 
-__all__ = ["Cutouts"]
-
 #: Side of the pictures, and the finest pixels of those of the bands, in arcsec.
 BOX, FINEST = 5.3, 0.1
 #: Pictures that are made at once, to limit memory.

@@ -22,15 +22,6 @@ from miricigale.workflow.stages.fits import FIT_SECTIONS, fit_mock, fit_sample
 from miricigale.workflow.stages.inputs import sed_resources
 from miricigale.workflow.truths import of_truth, study_truths
 
-__all__ = [
-    "experiment_axes",
-    "experiment_numbers",
-    "experiment_units",
-    "far_infrared_photometry",
-    "fit_experiment",
-    "write_experiments",
-]
-
 #: Names on the page.
 LABELS = {
     "study": "as in the study",

@@ -20,33 +20,6 @@ from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow.background import band_background, of_filter, text_by_filter
 from miricigale.workflow.truths import truth_names
 
-__all__ = [
-    "EXPOSURE_RESOURCES",
-    "GRID",
-    "IMAGES",
-    "IMAGE_RESOURCES",
-    "KERNEL",
-    "background_options",
-    "band_exposures",
-    "band_names",
-    "bands_of_truth",
-    "dithers_of_band",
-    "dithers_text",
-    "exposure_memory",
-    "exposure_plan",
-    "exposure_units",
-    "exposures_of",
-    "grid_of",
-    "mosaic_memory",
-    "pointing_exposures",
-    "pointing_of",
-    "pointing_time",
-    "study_background",
-    "study_exposures",
-    "study_pointings",
-    "truth_bands",
-]
-
 #: Sections of the configuration on which the grids of images depend, what is exposed, and kernels.
 GRID = ("pointing", "exposures")
 IMAGES = (*GRID, "scene", "detector", "reduction")

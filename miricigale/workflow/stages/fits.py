@@ -35,14 +35,6 @@ from miricigale.workflow.truths import (
     truth_names,
 )
 
-__all__ = [
-    "FIT_SECTIONS",
-    "fit_photometry",
-    "make_errors",
-    "match_sources",
-    "mock_photometry",
-]
-
 
 class _Field:
     """Truth, detections and the two matched: what error functions and samples are made of."""

@@ -32,24 +32,6 @@ from miricigale.workflow.stages.exposures import (
 )
 from miricigale.workflow.truths import CUTOUTS, of_reference, of_truth, reference, study_truths
 
-__all__ = [
-    "DETECTION",
-    "background_of",
-    "expose_and_reduce",
-    "expose_image",
-    "imager_of",
-    "make_exposure",
-    "make_highres",
-    "make_kernel",
-    "make_mosaic",
-    "measured_mosaic",
-    "mosaic_psf",
-    "mosaics_of",
-    "prior_image",
-    "prior_psf",
-    "reducer_of",
-]
-
 log = logging.getLogger(__name__)
 
 

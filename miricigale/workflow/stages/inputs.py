@@ -16,20 +16,6 @@ from miricigale.utils.tables import error_column
 from miricigale.utils.units import ab_magnitude
 from miricigale.workflow.engine.stage import stage
 
-__all__ = [
-    "REDSHIFT_STEP",
-    "bright_sources",
-    "catalog_bands",
-    "fit_inputs",
-    "fit_plan",
-    "fit_seds",
-    "input_axes",
-    "input_bands",
-    "make_catalog",
-    "sed_resources",
-    "study_catalog",
-]
-
 #: Redshifts closer than this share a node of the grid of the input fit.
 REDSHIFT_STEP = 0.01
 

@@ -16,8 +16,6 @@ from miricigale.workflow.stages.exposures import (
 from miricigale.workflow.stages.images import measured_mosaic, mosaic_psf, prior_psf
 from miricigale.workflow.truths import itself
 
-__all__ = ["make_templates", "measure_band", "measure_photometry", "photometer_of"]
-
 
 @stage(
     "templates",

@@ -13,8 +13,6 @@ from miricigale.workflow.page.labels import band_label
 from miricigale.workflow.page.numbers import bright_isolated
 from miricigale.workflow.truths import ALL, CUTOUTS, EFFECTS
 
-__all__ = ["perturbation_costs", "write_perturbed"]
-
 #: Samples drawn for an error.
 N_DRAWS = 1000
 

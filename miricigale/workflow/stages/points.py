@@ -29,8 +29,6 @@ from miricigale.workflow.stages.images import (
 from miricigale.workflow.stages.measure import photometer_of
 from miricigale.workflow.stages.sample import in_field
 
-__all__ = ["measure_point_sources", "point_catalog"]
-
 #: Radius of the PSF stamps of Yang et al. 2021, at which f_aper is reported.
 STAMP_RADIUS = 1.5 * u.arcsec
 #: Flux of the point sources on the high-resolution image: bright, so that noise is no matter.

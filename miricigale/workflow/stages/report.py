@@ -34,8 +34,6 @@ from miricigale.workflow.stages.inputs import sed_resources
 from miricigale.workflow.stages.sample import footprint_area
 from miricigale.workflow.truths import reference, study_truths
 
-__all__ = ["make_report"]
-
 log = logging.getLogger(__name__)
 
 

@@ -23,16 +23,6 @@ from miricigale.workflow.stages.measure import measure_band
 from miricigale.workflow.stages.sample import SampleFlags, in_field
 from miricigale.workflow.truths import itself, of_reference, reference
 
-__all__ = [
-    "RIVALS",
-    "measure_rivals",
-    "read_rivals",
-    "rival_counts",
-    "rival_numbers",
-    "source_extractor_numbers",
-    "write_rivals",
-]
-
 #: Methods that are compared: name of the columns, and what the page calls them.
 RIVALS = {
     "package": "package",

@@ -10,18 +10,6 @@ from miricigale.photometry import ErrorModel
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import Flags, error_column
 
-__all__ = [
-    "SampleFlags",
-    "add_selection",
-    "detected_bands",
-    "footprint_area",
-    "in_field",
-    "matched_errors",
-    "mean_coverage",
-    "typical_source",
-    "values_at",
-]
-
 
 class SampleFlags(Flags):
     """Why a source of the catalog is not in the fitted sample."""

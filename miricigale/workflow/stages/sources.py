@@ -24,8 +24,6 @@ from miricigale.workflow.stages.inputs import sed_resources
 from miricigale.workflow.stages.sample import SampleFlags
 from miricigale.workflow.truths import of_truth, truth_names
 
-__all__ = ["CHUNK", "make_sources"]
-
 #: Sources whose details and pictures are in one file.
 CHUNK = 32
 #: Cells of the spectra, evenly spaced in the logarithm of wavelength.

@@ -7,8 +7,6 @@ from astropy.table import QTable
 
 from miricigale.filters import FilterSet
 
-__all__ = ["star_fluxes"]
-
 TEMPERATURES = np.geomspace(2000, 30000, 120) * u.K
 WAVELENGTHS = np.geomspace(0.2, 40, 1500) * u.um
 

@@ -20,8 +20,6 @@ from miricigale.workflow.stages.inputs import catalog_bands, sed_resources
 from miricigale.workflow.stages.stars import star_fluxes
 from miricigale.workflow.truths import CATALOG, CUTOUTS, FIELD, study_truths, truth_names
 
-__all__ = ["add_agn", "add_field_agn", "catalog_fractions", "galaxy_parameters", "make_truth"]
-
 #: What the models of the galaxies depend on beside their fits.
 MODELS = ("sed.alpha", "sed.alpha_draw", "sed.infrared")
 GALAXY_PARAMETERS = ("tau", "age", "ebv", "alpha", "metallicity")

@@ -33,15 +33,6 @@ from miricigale.workflow.stages.measure import joined_photometry, measure_band
 from miricigale.workflow.stages.sample import SampleFlags
 from miricigale.workflow.truths import itself, of_reference, reference, variant_changes
 
-__all__ = [
-    "HEADER",
-    "add_reasons",
-    "measure_variants",
-    "variant_numbers",
-    "variant_rows",
-    "write_variants",
-]
-
 #: Draws of the sources for the errors of limits.
 N_DRAWS = 100
 #: What images are called: where the key is on, and where it is off.

@@ -1,0 +1,2 @@
+from .program import command as command
+from .program import main as main

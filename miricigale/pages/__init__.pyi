@@ -1,0 +1,6 @@
+from .page import Page as Page
+from .rendering import render as render
+from .values import Link as Link
+from .values import Missing as Missing
+from .values import cell_of as cell_of
+from .values import number as number

@@ -1,0 +1,16 @@
+from .commands import plan_table as plan_table
+from .commands import write_plan as write_plan
+from .compare import area_table as area_table
+from .compare import comparison_table as comparison_table
+from .config import PlanConfig as PlanConfig
+from .config import load_plan as load_plan
+from .exposures import BandPlan as BandPlan
+from .exposures import wall_clock as wall_clock
+from .images import image_sample as image_sample
+from .images import images_study as images_study
+from .images import paired_bands as paired_bands
+from .images import paired_numbers as paired_numbers
+from .page import write_page as write_page
+from .planner import Plan as Plan
+from .planner import Planner as Planner
+from .sample import make_sample as make_sample

@@ -1,0 +1,13 @@
+from .background import Background as Background
+from .catalog import CATALOG_COLUMNS as CATALOG_COLUMNS
+from .catalog import CatalogFlags as CatalogFlags
+from .catalog import check_catalog as check_catalog
+from .catalog_files import read_catalog as read_catalog
+from .cutouts import Cutout as Cutout
+from .deconvolution import deconvolve as deconvolve
+from .highres import depth_to_rms as depth_to_rms
+from .highres import highres_image as highres_image
+from .render import FieldPainter as FieldPainter
+from .render import Painter as Painter
+from .scene import Scene as Scene
+from .scene import SceneFlags as SceneFlags

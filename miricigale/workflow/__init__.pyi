@@ -1,0 +1,11 @@
+from .config import StudyConfig as StudyConfig
+from .config import load_config as load_config
+from .config import preset_names as preset_names
+from .disk import disk_use as disk_use
+from .engine.runner import StudyRunner as StudyRunner
+from .engine.stage import Context as Context
+from .engine.stage import Stage as Stage
+from .engine.store import ProductStore as ProductStore
+from .stages import study_stages as study_stages
+from .study import check_study as check_study
+from .study import run_study as run_study
