@@ -37,7 +37,7 @@ def test_the_classes_of_the_package_import_from_it():
 
     for cls in (ErrorModel, FitResults, MatchingKernel, ModelGrid, Ramp):
         assert cls.__name__ in dir(miricigale)
-    with pytest.raises(AttributeError, match="has no attribute 'FitResult'") as caught:
+    with pytest.raises(AttributeError, match="No miricigale attribute FitResult") as caught:
         miricigale.FitResult  # noqa: B018
     assert caught.value.name == "FitResult"
 

@@ -20,8 +20,8 @@ from astropy.io import fits
 from scipy.optimize import least_squares
 
 from miricigale.sed import _core
+from miricigale.sed._core import DISK_MEAN
 from miricigale.sed.components import ParametricTorus
-from miricigale.sed.components.agn import DISK_MEAN
 from miricigale.sed.components.parametric_torus import _constants
 
 
