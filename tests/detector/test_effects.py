@@ -289,9 +289,3 @@ def test_residual_by_name_has_the_amplitude_of_the_filter(make_block, name):
 def test_errors_name_the_argument(effect, name):
     with pytest.raises(ValueError, match=f"'{name}' must be"):
         effect()
-
-
-def test_effects_on_ramps_want_a_ramp(make_block):
-    block = make_block()
-    with pytest.raises(ValueError, match="Dark acts on a ramp"):
-        Dark().apply(np.zeros(block.exposure.shape), block)

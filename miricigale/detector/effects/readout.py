@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from miricigale.detector import _core
-from miricigale.detector.effects.base import Effect, check_amounts, check_finite, check_ramp
+from miricigale.detector.effects.base import Effect, check_amounts, check_finite
 from miricigale.instrument import DQ
 from miricigale.utils.exceptions import argument_error
 
@@ -28,9 +28,8 @@ class Nonlinearity(Effect):
 
     linear: bool = False
 
-    def apply(self, array, block):
+    def apply(self, ramp, block):
         """Turn electrons into DN above the bias."""
-        ramp = check_ramp(array, block, self)
         properties = block.properties
         step = 8.0
         nodes = step * np.arange(
@@ -72,9 +71,8 @@ class Bias(Effect):
         if self.level is not None:
             check_finite(level=self.level)
 
-    def apply(self, array, block):
+    def apply(self, ramp, block):
         """Add the level."""
-        ramp = check_ramp(array, block, self)
         level = self.mean(block.properties)
         ramp += np.float32(level)
         if self.reset_noise:
@@ -117,9 +115,8 @@ class ReadNoise(Effect):
         if not 1 <= self.octaves <= 40 or int(self.octaves) != self.octaves:
             raise argument_error("octaves", "an integer from 1 to 40", self.octaves)
 
-    def apply(self, array, block):
+    def apply(self, ramp, block):
         """Add the noise."""
-        ramp = check_ramp(array, block, self)
         sigma = self.deviation(block.properties)
         first = block.rows.start
         _core.add_noise(ramp, float(sigma), block.key, first)
@@ -146,9 +143,8 @@ class ADConversion(Effect):
             return np.inf
         return float(properties.gain * properties.linearize(highest))
 
-    def apply(self, array, block):
+    def apply(self, ramp, block):
         """Turn DN into counts."""
-        ramp = check_ramp(array, block, self)
         counts = np.empty(ramp.shape, np.uint16)
         _core.digitize(ramp, counts, block.group_dq, np.uint8(DQ.AD_FLOOR), np.uint8(DQ.SATURATED))
         return counts
