@@ -11,19 +11,12 @@ import numpy as np
 from miricigale.depth.saturation import SKY_FRACTION, SaturationForecast, saturation_forecast
 from miricigale.detector import level1b
 from miricigale.detector.collected import Charge
-from miricigale.detector.effects import (
-    ORDER,
-    Block,
-    Effect,
-    FirstFrame,
-    LastFrame,
-    Persistence,
-    ReadNoise,
-    ResetAnomaly,
-    ResetDecay,
-    Residual,
-)
-from miricigale.detector.effects.order import check_order, checked_effects, keyed, place_of
+from miricigale.detector.effects.base import Block, Effect
+from miricigale.detector.effects.charge import Persistence
+from miricigale.detector.effects.light import Residual
+from miricigale.detector.effects.order import ORDER, check_order, checked_effects, keyed, place_of
+from miricigale.detector.effects.readout import ReadNoise
+from miricigale.detector.effects.reset import FirstFrame, LastFrame, ResetAnomaly, ResetDecay
 from miricigale.detector.image import checked_light
 from miricigale.detector.latent import checked_previous
 from miricigale.detector.ramp import Ramp
@@ -58,7 +51,7 @@ class Detector:
     Parameters
     ----------
     effects : iterable of `~miricigale.detector.Effect`
-        In the order of ``miricigale.detector.effects.ORDER``: the first act on light; `Photons`
+        In the order of ``miricigale.detector.effects.order.ORDER``: the first act on light; `Photons`
         makes a ramp of it; `ADConversion` ends. Effects of other kinds stand where they are put.
     properties : `~miricigale.instrument.DetectorProperties`, optional
         Gain, noise and the rest; `~miricigale.instrument.miri_detector` if not given.
@@ -181,7 +174,7 @@ class Detector:
         exposure : `~miricigale.instrument.Exposure`
             How it is exposed.
         seed : int, `~numpy.random.Generator` or None, optional
-            Seed of the run. Every effect has its own stream in each exposure (told apart
+            Seed of the run. Every effect has its own stream in each exposure (distinguished
             by filter and dither) and detector row.
         previous : `Latent` or iterable of `Latent`, optional
             Exposures before, for a detector with `Persistence`.
@@ -202,7 +195,7 @@ class Detector:
             If the image has no unit of surface brightness.
         ValueError
             If the image has another shape, another filter or place on the sky (where its
-            ``meta["filter"]`` and WCS tell), masked pixels, values that are not finite or that
+            ``meta["filter"]`` and WCS state it), masked pixels, values that are not finite or that
             are negative, or ``previous`` belongs to another sub-array or is of no use to this
             detector.
 

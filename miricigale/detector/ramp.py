@@ -275,7 +275,7 @@ class Ramp(NDData):
         ----------
         path : path-like
             An ``*_uncal.fits`` of the MIRI imager, an ``*_ramp.fits``, or what one of the steps
-            between them saved; of ground tests too, whose headers tell no filter or pointing.
+            between them saved; of ground tests too, whose headers state no filter or pointing.
 
         Returns
         -------

@@ -8,7 +8,7 @@ import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
 
-from miricigale.detector.effects import effect_from_record
+from miricigale.detector.effects.order import effect_from_record
 from miricigale.instrument import (
     DQ,
     DetectorProperties,
@@ -129,7 +129,7 @@ def _ramp_shape(path, head):
 
 
 def _exposure(path, header, shape):
-    """The exposure that the keywords and the shape tell."""
+    """The exposure that the keywords and the shape describe."""
     n_int, n_group, *size = shape
     name, readout, part, dither = exposure_keywords(header)
     for key, value in (("READPATT", readout), ("SUBARRAY", part)):

@@ -68,7 +68,7 @@ def draw_groups(charge, maps, drift, usable, part, *, thresholds, poisson_factor
     table = _core.tabulate(linear, derivative, n_int, s, charge.read_variance, inv_gain, group_time)
     zero = table[0, 0]
     table[0, 1:] = (table[0, 1:] - zero) / rates[1:]
-    # where rates are too low to be told from none
+    # where rates are too low to be distinguished from none
     table[0, :9] = table[0, 9]
     # pixels that are full in the first group have no slope
     quoted_scale = (_SLOPES - 1) / (limit / (group_time * truth.gain)) ** 0.25

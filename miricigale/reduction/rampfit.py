@@ -235,14 +235,8 @@ def fit_groups(
 
     data = _plain(data)
     variance = np.square(read_noise) + (1 / 12 if data.dtype.kind in "iu" else 0.0)
-    out = (
-        np.zeros((ny, nx), np.float32),
-        np.zeros((ny, nx), np.float32),
-        np.zeros((ny, nx), np.float32),
-        np.zeros((ny, nx), np.int16),
-        np.zeros((ny, nx), np.int16),
-        np.zeros((ny, nx), np.int64),
-    )
+    kinds = (np.float32,) * 3 + (np.int16,) * 2 + (np.int64,)
+    out = tuple(np.zeros((ny, nx), kind) for kind in kinds)
     ramp = (data, (drift, bias, reset), (coef, saturation, dark))
     # a trace of read noise keeps the closed forms finite
     noise = (np.maximum(variance, 1e-6), poisson_factor / gain, np.square(slow_noise))
@@ -259,16 +253,10 @@ def fit_groups(
         _core.refit(ramp, group_dq, ys, xs, start, cuts, fit, out)
 
     with threads(n_threads) as executor:
-        events = parallel_map(
-            fit_block,
-            chunks(ny, _ROWS),
-            executor=executor,
-            progress_bar=progress_bar,
-            desc="slopes",
-        )
-        events = np.concatenate(events)
+        options = {"executor": executor, "progress_bar": progress_bar, "desc": "slopes"}
+        events = np.concatenate(parallel_map(fit_block, chunks(ny, _ROWS), **options))
         n_diff = last_group - first_group - 1
-        showers = None
+        showers = np.zeros((4, 0), np.int64)
         if np.isfinite(shower):
             showers = find_showers(
                 data, events, usable, shower, first_group=first_group, last_group=last_group
@@ -374,7 +362,7 @@ def threshold(value, name):
     return float(value)
 
 
-def _neighbors(events, threshold, usable, n_diff, showers=None):
+def _neighbors(events, threshold, usable, n_diff, showers):
     """
     Yield the pixels beside large jumps, and those of showers, and where they are to be cut.
 
@@ -383,8 +371,6 @@ def _neighbors(events, threshold, usable, n_diff, showers=None):
     """
     ny, nx = usable.shape
     large = events[_core.own_charge(events, nx, n_diff) >= threshold].astype(np.int64)
-    if showers is None:
-        showers = np.zeros((4, 0), np.int64)
     if len(large) == 0 and showers[0].size == 0:
         return
     cut = large[:, 2] * n_diff + large[:, 3]

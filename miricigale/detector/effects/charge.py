@@ -178,7 +178,7 @@ class Persistence(Effect):
 
     A pixel that was filled at the rate R collects, a time t after that exposure,
     ``R sum_k amplitudes[k] exp(-t / times[k])`` more electrons per second. Resets do not
-    stop it: time goes on through all integrations and the reset frames between them.
+    stop it: time runs through all integrations and the reset frames between them.
     Without ``previous`` nothing happens. What is remembered was measured behind the interpixel
     capacitance, so that the effect stands after it.
 
@@ -254,7 +254,7 @@ class Persistence(Effect):
         return ramp
 
     def expected(self, array, block):
-        """Add the mean rate over all groups, where previous exposures are told."""
+        """Add the mean rate over all groups, where previous exposures are given."""
         if not block.previous:
             return array
         rates = [latent.rate.value[block.rows] for latent in block.previous]

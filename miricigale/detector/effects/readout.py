@@ -78,7 +78,7 @@ class Bias(Effect):
         if self.reset_noise:
             offset = np.empty(ramp.shape[2:])
             for i in range(ramp.shape[0]):
-                # integrations are told apart by the row that the stream is for
+                # integrations are distinguished by the row that the stream is for
                 first = block.rows.start + (i + 1) * 2**20
                 _core.standard_normals(block.key, first, offset)
                 ramp[i] += np.asarray(self.reset_noise * offset, np.float32)
