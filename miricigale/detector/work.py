@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from miricigale.detector import _core
+from miricigale.detector._core.charge import add_poisson
 from miricigale.detector.effects.base import Block, WholeBlock
 from miricigale.detector.effects.charge import (
     BadPixels,
@@ -148,7 +148,7 @@ class Work:
             n += 1
         ramp = np.zeros(block.ramp_shape, np.float32)
         electrons = np.ascontiguousarray(mean * block.group_time, float)
-        _core.add_poisson(ramp, electrons, block.key, block.rows.start)
+        add_poisson(ramp, electrons, block.key, block.rows.start)
         return mean, ramp, chain[n + 1 :]
 
     def _collected(self, rows):

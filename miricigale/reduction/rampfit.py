@@ -17,7 +17,9 @@ import dataclasses
 import numpy as np
 
 from miricigale.instrument import DQ
-from miricigale.reduction import _core
+from miricigale.reduction._core.lanes import refit
+from miricigale.reduction._core.pixel import DO_NOT_USE, JUMP, SATURATED, own_charge
+from miricigale.reduction._core.rows import fit_rows
 from miricigale.reduction.showers import find_showers
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.parallel import chunks, parallel_map, threads
@@ -245,12 +247,12 @@ def fit_groups(
     plain = usable if flagged is None else usable & ~flagged
 
     def fit_block(rows):
-        events = _core.fit_rows(ramp, plain, rows.start, rows.stop, fit, out)
+        events = fit_rows(ramp, plain, rows.start, rows.stop, fit, out)
         return events[np.lexsort(events.T[3::-1])]
 
     def refit_block(part):
         ys, xs, start, cuts = part
-        _core.refit(ramp, group_dq, ys, xs, start, cuts, fit, out)
+        refit(ramp, group_dq, ys, xs, start, cuts, fit, out)
 
     with threads(n_threads) as executor:
         options = {"executor": executor, "progress_bar": progress_bar, "desc": "slopes"}
@@ -337,7 +339,7 @@ def _flagged(group_dq, shape, last_group, usable):
         got = f"{group_dq.dtype}, shape {group_dq.shape}"
         raise argument_error("group_dq", f"uint8, of shape {shape}", got)
     seen = np.zeros(shape[2:], bool)
-    wanted = np.uint8(_core.DO_NOT_USE | _core.SATURATED | _core.JUMP)
+    wanted = np.uint8(DO_NOT_USE | SATURATED | JUMP)
     for k, g in np.ndindex(shape[0], last_group):
         seen |= (group_dq[k, g] & wanted) != 0
     return seen if (seen & usable).any() else None
@@ -370,7 +372,7 @@ def _neighbors(events, threshold, usable, n_diff, showers):
     pixel's cuts, and the cuts. Pixels keep the cuts that they found themselves.
     """
     ny, nx = usable.shape
-    large = events[_core.own_charge(events, nx, n_diff) >= threshold].astype(np.int64)
+    large = events[own_charge(events, nx, n_diff) >= threshold].astype(np.int64)
     if len(large) == 0 and showers[0].size == 0:
         return
     cut = large[:, 2] * n_diff + large[:, 3]

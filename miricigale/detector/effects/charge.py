@@ -5,7 +5,14 @@ import dataclasses
 import numpy as np
 from scipy import ndimage
 
-from miricigale.detector import _core
+from miricigale.detector._core.charge import (
+    add_cosmic_rays,
+    add_latent,
+    add_poisson,
+    cosmic_ray_deposits,
+    couple_neighbors,
+)
+from miricigale.detector._core.readout import clip_well
 from miricigale.detector.effects.base import Effect, check_amounts, check_share
 from miricigale.instrument import DQ, bad_pixel_mask, reference_pixel_mask
 from miricigale.utils.exceptions import argument_error
@@ -41,7 +48,7 @@ class Dark(Effect):
     def apply(self, ramp, block):
         """Add the dark charge."""
         mean = np.full(ramp.shape[2:], self._rate(block.properties) * block.group_time)
-        _core.add_poisson(ramp, mean, block.key, block.rows.start)
+        add_poisson(ramp, mean, block.key, block.rows.start)
         return ramp
 
     def expected(self, array, block):
@@ -66,7 +73,7 @@ class InterpixelCapacitance(Effect):
     def apply(self, ramp, block):
         """Couple the accumulated charge of neighbors."""
         kernel = np.asarray(block.properties.ipc_kernel, np.float32)
-        _core.couple_neighbors(ramp, kernel)
+        couple_neighbors(ramp, kernel)
         return ramp
 
     def expected(self, array, block):
@@ -134,7 +141,7 @@ class CosmicRays(Effect):
 
     def apply(self, ramp, block):
         """Add the charge of the hits."""
-        _core.add_cosmic_rays(ramp, *self._arguments(block))
+        add_cosmic_rays(ramp, *self._arguments(block))
         return ramp
 
     def hits(self, block):
@@ -155,7 +162,7 @@ class CosmicRays(Effect):
             A pixel may have several in one group.
         """
         key, first, n_rows, settings = self._arguments(block)
-        where, electrons = _core.cosmic_ray_deposits(key, first, n_rows, block.ramp_shape, settings)
+        where, electrons = cosmic_ray_deposits(key, first, n_rows, block.ramp_shape, settings)
         where[1] += first
         return where, electrons
 
@@ -250,7 +257,7 @@ class Persistence(Effect):
         if released.shape[1:] != block.ramp_shape[:2]:
             # all groups as one
             released = released.sum(axis=(1, 2), keepdims=True)
-        _core.add_latent(ramp, rates, released, block.key, block.rows.start)
+        add_latent(ramp, rates, released, block.key, block.rows.start)
         return ramp
 
     def expected(self, array, block):
@@ -289,7 +296,7 @@ class BadPixels(Effect):
         dead, hot = self._pixels(block)
         ramp[:, :, dead] = 0.0
         mean = np.where(hot, self.hot_current * block.group_time, 0.0)
-        _core.add_poisson(ramp, mean, block.key, block.rows.start)
+        add_poisson(ramp, mean, block.key, block.rows.start)
         block.pixel_dq[dead] |= np.uint32(DQ.DEAD | DQ.DO_NOT_USE)
         block.pixel_dq[hot] |= np.uint32(DQ.HOT | DQ.DO_NOT_USE)
         return ramp
@@ -348,7 +355,7 @@ class Saturation(Effect):
     def apply(self, ramp, block):
         """Clip the charge and flag it."""
         well = self.limit(block.properties)
-        _core.clip_well(ramp, well, block.group_dq, np.uint8(DQ.SATURATED))
+        clip_well(ramp, well, block.group_dq, np.uint8(DQ.SATURATED))
         return ramp
 
     def limit(self, properties):

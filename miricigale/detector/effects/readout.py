@@ -4,7 +4,13 @@ import dataclasses
 
 import numpy as np
 
-from miricigale.detector import _core
+from miricigale.detector._core.random import standard_normals
+from miricigale.detector._core.readout import (
+    add_noise,
+    add_pink_noise,
+    digitize,
+    interpolate_response,
+)
 from miricigale.detector.effects.base import Effect, check_amounts, check_finite
 from miricigale.instrument import DQ
 from miricigale.utils.exceptions import argument_error
@@ -37,7 +43,7 @@ class Nonlinearity(Effect):
         )
         response = self.response(nodes, properties)
         response = np.ascontiguousarray(response, np.float32)
-        _core.interpolate_response(ramp, float(properties.gain), response, step)
+        interpolate_response(ramp, float(properties.gain), response, step)
         return ramp
 
     def response(self, dn, properties):
@@ -80,7 +86,7 @@ class Bias(Effect):
             for i in range(ramp.shape[0]):
                 # integrations are distinguished by the row that the stream is for
                 first = block.rows.start + (i + 1) * 2**20
-                _core.standard_normals(block.key, first, offset)
+                standard_normals(block.key, first, offset)
                 ramp[i] += np.asarray(self.reset_noise * offset, np.float32)
         return ramp
 
@@ -119,12 +125,12 @@ class ReadNoise(Effect):
         """Add the noise."""
         sigma = self.deviation(block.properties)
         first = block.rows.start
-        _core.add_noise(ramp, float(sigma), block.key, first)
+        add_noise(ramp, float(sigma), block.key, first)
         if self.pink:
             # streams apart from those of the white noise
             key = block.key[::-1].copy()
             n_rows = block.exposure.shape[0]
-            _core.add_pink_noise(ramp, float(self.pink), int(self.octaves), 4, key, first, n_rows)
+            add_pink_noise(ramp, float(self.pink), int(self.octaves), 4, key, first, n_rows)
         return ramp
 
     def deviation(self, properties):
@@ -146,5 +152,5 @@ class ADConversion(Effect):
     def apply(self, ramp, block):
         """Turn DN into counts."""
         counts = np.empty(ramp.shape, np.uint16)
-        _core.digitize(ramp, counts, block.group_dq, np.uint8(DQ.AD_FLOOR), np.uint8(DQ.SATURATED))
+        digitize(ramp, counts, block.group_dq, np.uint8(DQ.AD_FLOOR), np.uint8(DQ.SATURATED))
         return counts

@@ -20,7 +20,7 @@ import dataclasses
 
 import numpy as np
 
-from miricigale.detector import _core
+from miricigale.detector._core.readout import pull_last_group
 from miricigale.detector.effects.base import Effect, check_finite
 from miricigale.instrument import reference_pixel_mask
 from miricigale.utils.exceptions import argument_error
@@ -186,7 +186,7 @@ class LastFrame(Effect):
     def apply(self, ramp, block):
         """Pull the last groups."""
         sees = _light_sensitive(block)
-        _core.pull_last_group(
+        pull_last_group(
             ramp, sees, block.rows.start, np.float32(self.offset), np.float32(self.coupling)
         )
         return ramp
