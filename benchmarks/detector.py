@@ -28,7 +28,7 @@ from miricigale.detector import (
     ResetAnomaly,
     Residual,
 )
-from miricigale.detector.effects import stream_key
+from miricigale.detector.effects.base import stream_key
 from miricigale.instrument import Exposure, background_level, miri_detector
 
 N_GROUPS = int(sys.argv[1]) if len(sys.argv) > 1 else 200

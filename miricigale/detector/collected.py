@@ -4,14 +4,8 @@ import dataclasses
 
 import numpy as np
 
-from miricigale.detector.effects import (
-    Bias,
-    FirstFrame,
-    LastFrame,
-    Nonlinearity,
-    ReadNoise,
-    ResetAnomaly,
-)
+from miricigale.detector.effects.readout import Bias, Nonlinearity, ReadNoise
+from miricigale.detector.effects.reset import FirstFrame, LastFrame, ResetAnomaly
 from miricigale.instrument import DetectorProperties, Exposure
 
 __all__ = ["Charge"]
@@ -62,7 +56,7 @@ class Charge:
     meta: dict
 
     def shows(self, kind):
-        """Whether an effect acted, as `Ramp.shows` tells it."""
+        """Whether an effect acted, as for `Ramp.shows`."""
         return self._effect(kind) is not None
 
     @property

@@ -1,5 +1,6 @@
 """The detector: a tuple of effects, applied block by block."""
 
+import dataclasses
 import logging
 import math
 import warnings
@@ -10,19 +11,12 @@ import numpy as np
 from miricigale.depth.saturation import SKY_FRACTION, SaturationForecast, saturation_forecast
 from miricigale.detector import level1b
 from miricigale.detector.collected import Charge
-from miricigale.detector.effects import (
-    ORDER,
-    Block,
-    Effect,
-    FirstFrame,
-    LastFrame,
-    Persistence,
-    ReadNoise,
-    ResetAnomaly,
-    ResetDecay,
-    Residual,
-)
-from miricigale.detector.effects.order import check_order, keyed, place_of
+from miricigale.detector.effects.base import Block, Effect
+from miricigale.detector.effects.charge import Persistence
+from miricigale.detector.effects.light import Residual
+from miricigale.detector.effects.order import ORDER, check_order, checked_effects, keyed, place_of
+from miricigale.detector.effects.readout import ReadNoise
+from miricigale.detector.effects.reset import FirstFrame, LastFrame, ResetAnomaly, ResetDecay
 from miricigale.detector.image import checked_light
 from miricigale.detector.latent import checked_previous
 from miricigale.detector.ramp import Ramp
@@ -30,6 +24,7 @@ from miricigale.detector.work import Work
 from miricigale.instrument import DetectorProperties, ImageFacts, miri_detector
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.meta import provenance
+from miricigale.utils.options import check_kind
 from miricigale.utils.parallel import check_memory
 from miricigale.utils.random import check_seed
 from miricigale.utils.units import SURFACE_BRIGHTNESS
@@ -48,6 +43,7 @@ _STANDARD = [
 _EXPOSE_TO = "expose fewer groups, or write it by 'expose_to'"
 
 
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Detector:
     """
     A detector: effects in the order in which they act.
@@ -55,7 +51,7 @@ class Detector:
     Parameters
     ----------
     effects : iterable of `~miricigale.detector.Effect`
-        In the order of ``miricigale.detector.effects.ORDER``: the first act on light; `Photons`
+        In the order of ``miricigale.detector.effects.order.ORDER``: the first act on light; `Photons`
         makes a ramp of it; `ADConversion` ends. Effects of other kinds stand where they are put.
     properties : `~miricigale.instrument.DetectorProperties`, optional
         Gain, noise and the rest; `~miricigale.instrument.miri_detector` if not given.
@@ -73,17 +69,16 @@ class Detector:
     (Photons(flat=True), ReadNoise(sigma=None, pink=0.0, octaves=16), ADConversion())
     """
 
-    def __init__(self, effects, *, properties=None):
-        effects = tuple(effects)
-        for effect in effects:
-            if not isinstance(effect, Effect):
-                raise argument_error("effects", "made of detector effects", repr(effect))
-        check_order(effects)
-        properties = miri_detector() if properties is None else properties
-        if not isinstance(properties, DetectorProperties):
-            raise argument_error("properties", "a DetectorProperties", repr(properties))
-        self._effects = effects
-        self._properties = properties
+    effects: tuple
+    _: dataclasses.KW_ONLY
+    properties: DetectorProperties | None = None
+
+    def __post_init__(self):
+        object.__setattr__(self, "effects", checked_effects(self.effects))
+        check_order(self.effects)
+        check_kind(self.properties, "properties", DetectorProperties)
+        if self.properties is None:
+            object.__setattr__(self, "properties", miri_detector())
 
     @classmethod
     def miri_imager(cls, *effects, properties=None):
@@ -130,7 +125,7 @@ class Detector:
         ValueError
             If it is no effect, or one of a kind that has no place in the order.
         """
-        chain = list(self._effects)
+        chain = list(self.effects)
         for effect in effects:
             place = place_of(effect)
             if place is None:
@@ -139,7 +134,7 @@ class Detector:
             chain = [e for e in chain if place_of(e) != place]
             after = [i for i, e in enumerate(chain) if (place_of(e) or 0) > place]
             chain.insert(after[0] if after else len(chain), effect)
-        return type(self)(chain, properties=self._properties)
+        return type(self)(chain, properties=self.properties)
 
     def without(self, *kinds):
         """
@@ -157,21 +152,11 @@ class Detector:
         for kind in kinds:
             if not (isinstance(kind, type) and issubclass(kind, Effect)):
                 raise argument_error("kinds", "classes of effects", repr(kind))
-        chain = [effect for effect in self._effects if not isinstance(effect, kinds)]
-        return type(self)(chain, properties=self._properties)
-
-    @property
-    def effects(self):
-        """The effects in their order, a tuple."""
-        return self._effects
-
-    @property
-    def properties(self):
-        """The `~miricigale.instrument.DetectorProperties`."""
-        return self._properties
+        chain = [effect for effect in self.effects if not isinstance(effect, kinds)]
+        return type(self)(chain, properties=self.properties)
 
     def __repr__(self):
-        lines = ",\n    ".join(map(repr, self._effects))
+        lines = ",\n    ".join(map(repr, self.effects))
         return f"Detector((\n    {lines},\n))"
 
     def expose(
@@ -189,7 +174,7 @@ class Detector:
         exposure : `~miricigale.instrument.Exposure`
             How it is exposed.
         seed : int, `~numpy.random.Generator` or None, optional
-            Seed of the run. Every effect has its own stream in each exposure (told apart
+            Seed of the run. Every effect has its own stream in each exposure (distinguished
             by filter and dither) and detector row.
         previous : `Latent` or iterable of `Latent`, optional
             Exposures before, for a detector with `Persistence`.
@@ -210,7 +195,7 @@ class Detector:
             If the image has no unit of surface brightness.
         ValueError
             If the image has another shape, another filter or place on the sky (where its
-            ``meta["filter"]`` and WCS tell), masked pixels, values that are not finite or that
+            ``meta["filter"]`` and WCS state it), masked pixels, values that are not finite or that
             are negative, or ``previous`` belongs to another sub-array or is of no use to this
             detector.
 
@@ -241,7 +226,7 @@ class Detector:
             pixel_dq=pixel_dq,
             group_dq=group_dq,
             effects=task.effects,
-            properties=self._properties,
+            properties=self.properties,
             meta=task.meta,
         )
 
@@ -296,7 +281,7 @@ class Detector:
                 pixel_dq[rows] = pixel_flags
 
             task.run(store, n_threads, progress_bar)
-            finish(pixel_dq, task.effects, task.meta, self._properties)
+            finish(pixel_dq, task.effects, task.meta, self.properties)
         return path
 
     def collect(
@@ -338,7 +323,7 @@ class Detector:
         Charge comes at a constant rate within the exposure, that of latent images too, and
         noise of the level after a reset is left out.
         """
-        for effect in self._effects:
+        for effect in self.effects:
             pink = isinstance(effect, ReadNoise) and effect.pink > 0
             if pink or isinstance(effect, ResetDecay) or place_of(effect) is None:
                 wanted = (
@@ -349,7 +334,7 @@ class Detector:
         seed = check_seed(seed)
         task = self._task(image, exposure, seed, previous)
         *planes, pixel_dq = task.collect(n_threads, progress_bar)
-        return Charge(exposure, *planes, pixel_dq, task.effects, self._properties, seed, task.meta)
+        return Charge(exposure, *planes, pixel_dq, task.effects, self.properties, seed, task.meta)
 
     def forecast(self, image, exposure, *, sources=None):
         """
@@ -385,21 +370,20 @@ class Detector:
         """
         light = checked_light(image, exposure)
         effects, _ = self._acting(image)
-        block = Block(exposure, self._properties, slice(0, light.shape[0]), None, None, None)
+        block = Block(exposure, self.properties, slice(0, light.shape[0]), None, None, None)
         for effect in effects:
             light = effect.expected(light, block)
-        limit = min(effect.limit(self._properties) for effect in effects)
-        told = SaturationForecast.from_rate(light, exposure, limit, sources)
-        if told.sky_too_bright:
-            warnings.warn(
-                _sky_message(exposure, told.sky_fraction), MiricigaleWarning, stacklevel=2
-            )
-        return told
+        limit = min(effect.limit(self.properties) for effect in effects)
+        forecast = SaturationForecast.from_rate(light, exposure, limit, sources)
+        if forecast.sky_too_bright:
+            message = _sky_message(exposure, forecast.sky_fraction)
+            warnings.warn(message, MiricigaleWarning, stacklevel=2)
+        return forecast
 
     def _acting(self, image):
         """Return the effects that the image does not hold already, and what it holds."""
         included = ImageFacts.of(image).psf_includes
-        return tuple(e for e in self._effects if e.included_as not in included), sorted(included)
+        return tuple(e for e in self.effects if e.included_as not in included), sorted(included)
 
     def _task(self, image, exposure, seed, previous):
         """Check what is exposed and gather what all its blocks share."""
@@ -407,7 +391,7 @@ class Detector:
         seed = check_seed(seed)
         effects, included = self._acting(image)
         previous = checked_previous(previous, exposure)
-        if previous and not any(isinstance(e, Persistence) for e in self._effects):
+        if previous and not any(isinstance(e, Persistence) for e in self.effects):
             wanted = "given to a detector whose effects hold Persistence"
             raise argument_error("previous", wanted, "one without it")
         fraction = self._check_sky(light, exposure)
@@ -418,13 +402,13 @@ class Detector:
             previous=[repr(latent) for latent in previous] or None,
         )
         return Work(
-            light, exposure, self._properties, keyed(effects, seed, exposure), previous, meta
+            light, exposure, self.properties, keyed(effects, seed, exposure), previous, meta
         )
 
     def _check_sky(self, light, exposure):
         """Share of the full well that the median pixel fills in one integration."""
         fraction = saturation_forecast(
-            exposure, background=np.median(light) * SURFACE_BRIGHTNESS, detector=self._properties
+            exposure, background=np.median(light) * SURFACE_BRIGHTNESS, detector=self.properties
         )
         message = _sky_message(exposure, fraction)
         if fraction >= 1:

@@ -12,7 +12,7 @@ from miricigale.utils.units import TIME, Frozen, frozen_array, to_array
 
 __all__ = ["Latent", "checked_previous"]
 
-# pixels of a ramp that tell nothing of the light
+# pixels of a ramp without information on the light
 _NO_LIGHT = DQ.DO_NOT_USE | DQ.NON_SCIENCE | DQ.REFERENCE_PIXEL | DQ.DEAD
 
 
@@ -40,7 +40,7 @@ class Latent(Frozen):
 
     Notes
     -----
-    To forget, go on: ``latent.after(t)`` is the same exposure a time t later. Several
+    To let time pass: ``latent.after(t)`` is the same exposure a time t later. Several
     exposures before add up (``previous=[...]`` of `~miricigale.detector.Detector.expose`).
     """
 
@@ -116,7 +116,7 @@ class Latent(Frozen):
 
 
 def checked_previous(previous, exposure):
-    """Exposures before one, a `Latent` or several, as a tuple; a `ValueError` tells what is none of its pixels."""
+    """Exposures before one, a `Latent` or several, as a tuple; those of other pixels are refused."""
     if previous is None:
         return ()
     previous = tuple(previous) if np.iterable(previous) else (previous,)

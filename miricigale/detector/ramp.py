@@ -4,9 +4,10 @@ import numpy as np
 from astropy.nddata import NDData
 
 from miricigale.detector import level1b, ramp_reader
-from miricigale.detector.effects import Effect
+from miricigale.detector.effects.order import checked_effects
 from miricigale.instrument import STEPS, DetectorProperties
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_kind
 from miricigale.utils.units import DN
 
 __all__ = ["Ramp"]
@@ -16,6 +17,15 @@ def _read_only(array):
     view = array.view()
     view.flags.writeable = False
     return view
+
+
+def _flags(values, name, shape, dtype):
+    """Read-only flags of a shape and type; others are refused."""
+    values = np.asarray(values)
+    if values.shape != shape or values.dtype != dtype:
+        got = f"shape {values.shape}, dtype {values.dtype}"
+        raise argument_error(name, f"of shape {shape}, dtype {np.dtype(dtype)}", got)
+    return _read_only(values)
 
 
 def _remade(data, exposure, values):
@@ -46,8 +56,8 @@ class Ramp(NDData):
     properties : `~miricigale.instrument.DetectorProperties`, optional
         Of the simulated detector that made the counts; None where they are not known.
     steps : iterable of str, optional
-        What the pipeline has done to the counts (`~miricigale.instrument.STEPS`); nothing if
-        not given.
+        What the pipeline has done to the counts (`~miricigale.instrument.STEPS`), kept as a frozenset; nothing
+        if not given.
     header : `~astropy.io.fits.Header`, optional
         Keywords of the observation, by which reference files are chosen; those that `write`
         would write if not given.
@@ -84,23 +94,12 @@ class Ramp(NDData):
             raise argument_error("data", "of dtype uint16 or float32", data.dtype)
         if pixel_dq is None:
             pixel_dq = np.zeros(shape[2:], np.uint32)
-        pixel_dq = np.asarray(pixel_dq)
-        if pixel_dq.shape != shape[2:] or pixel_dq.dtype != np.uint32:
-            got = f"shape {pixel_dq.shape}, dtype {pixel_dq.dtype}"
-            raise argument_error("pixel_dq", f"of shape {shape[2:]}, dtype uint32", got)
+        pixel_dq = _flags(pixel_dq, "pixel_dq", shape[2:], np.uint32)
         if group_dq is not None:
-            group_dq = np.asarray(group_dq)
-            if group_dq.shape != shape or group_dq.dtype != np.uint8:
-                got = f"shape {group_dq.shape}, dtype {group_dq.dtype}"
-                raise argument_error("group_dq", f"of shape {shape}, dtype uint8", got)
-            group_dq = _read_only(group_dq)
+            group_dq = _flags(group_dq, "group_dq", shape, np.uint8)
         if effects is not None:
-            effects = tuple(effects)
-            for effect in effects:
-                if not isinstance(effect, Effect):
-                    raise argument_error("effects", "made of detector effects", repr(effect))
-        if properties is not None and not isinstance(properties, DetectorProperties):
-            raise argument_error("properties", "a DetectorProperties", repr(properties))
+            effects = checked_effects(effects)
+        check_kind(properties, "properties", DetectorProperties)
         steps = frozenset(steps)
         if unknown := steps - set(STEPS.values()):
             raise argument_error("steps", f"of {sorted(STEPS.values())}", sorted(unknown))
@@ -111,14 +110,10 @@ class Ramp(NDData):
                 raise argument_error("reference_output", wanted, reference_output.shape)
             reference_output = _read_only(reference_output)
         super().__init__(_read_only(data), unit=DN, meta=dict(meta or {}))
-        self._properties = properties
-        self._steps = steps
+        self.exposure, self.pixel_dq, self.group_dq = exposure, pixel_dq, group_dq
+        self.effects, self.properties, self.steps = effects, properties, steps
+        self.reference_output = reference_output
         self._header = None if header is None else header.copy()
-        self._reference_output = reference_output
-        self._exposure = exposure
-        self._pixel_dq = _read_only(pixel_dq)
-        self._group_dq = group_dq
-        self._effects = effects
         self._frozen = True
 
     def __setattr__(self, name, value):
@@ -127,54 +122,22 @@ class Ramp(NDData):
             raise AttributeError(msg)
         super().__setattr__(name, value)
 
-    def __reduce__(self):
-        # made anew, for arrays to be read-only again
+    def _values(self):
+        """Arguments by which the ramp can be made again, but for data and exposure."""
         names = (
             "pixel_dq", "group_dq", "effects", "properties", "steps", "reference_output"
         )  # fmt: skip
         values = {name: getattr(self, name) for name in names}
-        values |= {"header": self._header, "meta": dict(self.meta)}
-        return _remade, (self.data, self.exposure, values)
+        return values | {"header": self._header, "meta": dict(self.meta)}
 
-    @property
-    def exposure(self):
-        """The `~miricigale.instrument.Exposure`."""
-        return self._exposure
-
-    @property
-    def pixel_dq(self):
-        """Flags of pixels, uint32 (ny, nx)."""
-        return self._pixel_dq
-
-    @property
-    def group_dq(self):
-        """Flags of groups, uint8 like the data, or None."""
-        return self._group_dq
-
-    @property
-    def effects(self):
-        """What acted, a tuple of `Effect` in their order; None where it is not known."""
-        return self._effects
+    def __reduce__(self):
+        # made anew, for arrays to be read-only again
+        return _remade, (self.data, self.exposure, self._values())
 
     @property
     def simulated(self):
         """Whether the package's `Detector` made the counts: it is known what acted."""
-        return self._effects is not None
-
-    @property
-    def properties(self):
-        """The `~miricigale.instrument.DetectorProperties` of a simulated ramp; None if not known."""
-        return self._properties
-
-    @property
-    def steps(self):
-        """What the pipeline has done to the counts, a frozenset of names."""
-        return self._steps
-
-    @property
-    def reference_output(self):
-        """Counts of the fifth output, or None."""
-        return self._reference_output
+        return self.effects is not None
 
     @property
     def observed(self):
@@ -186,7 +149,7 @@ class Ramp(NDData):
         """A copy of the keywords of the observation, `~astropy.io.fits.Header`."""
         if self._header is not None:
             return self._header.copy()
-        primary, science = level1b.header(self._exposure)
+        primary, science = level1b.header(self.exposure)
         primary.update(science)
         return primary
 
@@ -194,7 +157,7 @@ class Ramp(NDData):
     def group_time(self):
         """Time between groups in s: that of the header, or of the exposure."""
         stated = None if self._header is None else self._header.get("TGROUP")
-        return self._exposure.group_time.to_value("s") if stated is None else float(stated)
+        return self.exposure.group_time.to_value("s") if stated is None else float(stated)
 
     def integration(self, number):
         """
@@ -217,19 +180,10 @@ class Ramp(NDData):
         if not 0 <= number < self.shape[0]:
             raise argument_error("number", f"from 0 to {self.shape[0] - 1}", number)
         part = slice(number, number + 1)
-        cut = lambda plane: None if plane is None else plane[part]  # noqa: E731
-        return Ramp(
-            self.data[part],
-            self._exposure.replace(n_integrations=1),
-            pixel_dq=self._pixel_dq,
-            group_dq=cut(self._group_dq),
-            effects=self._effects,
-            properties=self._properties,
-            steps=self._steps,
-            header=self._header,
-            reference_output=cut(self._reference_output),
-            meta=dict(self.meta),
-        )
+        values = self._values()
+        for name in ("group_dq", "reference_output"):
+            values[name] = None if values[name] is None else values[name][part]
+        return Ramp(self.data[part], self.exposure.replace(n_integrations=1), **values)
 
     def shows(self, kind):
         """
@@ -245,14 +199,14 @@ class Ramp(NDData):
         shows : bool or None
             None where it is not known what acted.
         """
-        if self._effects is None:
+        if self.effects is None:
             return None
-        return any(isinstance(effect, kind) for effect in self._effects)
+        return any(isinstance(effect, kind) for effect in self.effects)
 
     @property
     def wcs(self):
         """The exposure's `~astropy.wcs.WCS` (of the two pixel axes)."""
-        return self._exposure.wcs
+        return self.exposure.wcs
 
     @wcs.setter
     def wcs(self, value):
@@ -321,7 +275,7 @@ class Ramp(NDData):
         ----------
         path : path-like
             An ``*_uncal.fits`` of the MIRI imager, an ``*_ramp.fits``, or what one of the steps
-            between them saved; of ground tests too, whose headers tell no filter or pointing.
+            between them saved; of ground tests too, whose headers state no filter or pointing.
 
         Returns
         -------

@@ -8,7 +8,7 @@ import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
 
-from miricigale.detector.effects import effect_from_record
+from miricigale.detector.effects.order import effect_from_record
 from miricigale.instrument import (
     DQ,
     DetectorProperties,
@@ -96,14 +96,11 @@ def _read(path, hdus):
         values["reference_output"] = _counts(path, hdus["REFOUT"])
     if "SIM_META" in hdus:
         values["meta"] = json.loads(hdus["SIM_META"].data["JSON"][0].tobytes())
-        records = values["meta"].pop("effects", None)
-        if records is not None:
+        if (records := values["meta"].pop("effects", None)) is not None:
             values["effects"] = [effect_from_record(record) for record in records]
-        properties = values["meta"].pop("properties", None)
-        if properties is not None:
+        if (properties := values["meta"].pop("properties", None)) is not None:
             values["properties"] = DetectorProperties(**properties)
-    values |= _flags(path, hdus, exposure, shape)
-    return values
+    return values | _flags(path, hdus, exposure, shape)
 
 
 def _check_kind(path, header):
@@ -132,7 +129,7 @@ def _ramp_shape(path, head):
 
 
 def _exposure(path, header, shape):
-    """The exposure that the keywords and the shape tell."""
+    """The exposure that the keywords and the shape describe."""
     n_int, n_group, *size = shape
     name, readout, part, dither = exposure_keywords(header)
     for key, value in (("READPATT", readout), ("SUBARRAY", part)):
@@ -144,20 +141,18 @@ def _exposure(path, header, shape):
     if any(stated) and not all(stated):
         msg = f"{path} must have all of RA_REF, DEC_REF, ROLL_REF or none, got {pointed}"
         raise DataError(msg)
-    sky = {"pointing": None, "roll": None}
+    pointing, roll = None, None
     if all(stated):
-        sky = {
-            "pointing": SkyCoord(pointed[0] * u.deg, pointed[1] * u.deg),
-            "roll": pointed[2] * u.deg,
-        }
+        pointing, roll = SkyCoord(*pointed[:2], unit="deg"), pointed[2] * u.deg
     exposure = Exposure(
         name,
         readout=readout,
         n_groups=n_group,
         n_integrations=n_int,
         subarray=part,
+        pointing=pointing,
+        roll=roll,
         dither=dither,
-        **sky,
     )
     if tuple(size) != exposure.shape:
         wanted = f"{exposure.shape} pixels for {exposure.subarray}"
@@ -227,7 +222,6 @@ def _counts(path, hdu):
 
 def _flags(path, hdus, exposure, shape):
     """Flags of pixels and groups, as far as the file has them; reference pixels are always known."""
-    values = {}
     name = next((name for name in ("SIM_PIXELDQ", "PIXELDQ") if name in hdus), None)
     if name is None:
         pixel_dq = np.zeros(shape[2:], np.uint32)
@@ -241,7 +235,7 @@ def _flags(path, hdus, exposure, shape):
     if name != "SIM_PIXELDQ":
         mask = reference_pixel_mask(subarray=exposure.subarray)
         pixel_dq = np.where(mask, pixel_dq | _REFERENCE, pixel_dq)
-    values["pixel_dq"] = pixel_dq
+    values = {"pixel_dq": pixel_dq}
     if "GROUPDQ" in hdus:
         group_dq = np.asarray(hdus["GROUPDQ"].data).astype(np.uint8)
         if group_dq.shape != shape:

@@ -4,19 +4,17 @@ import dataclasses
 
 import numpy as np
 
-from miricigale.detector import _core
-from miricigale.detector.effects import (
+from miricigale.detector._core.charge import add_poisson
+from miricigale.detector.effects.base import Block, WholeBlock
+from miricigale.detector.effects.charge import (
     BadPixels,
-    Block,
     CosmicRays,
     Dark,
     InterpixelCapacitance,
     Persistence,
-    Photons,
     ReferencePixels,
-    Residual,
-    WholeBlock,
 )
+from miricigale.detector.effects.light import Photons, Residual
 from miricigale.instrument import DetectorProperties, Exposure
 from miricigale.utils.parallel import chunks, parallel_map, threads
 
@@ -79,16 +77,21 @@ class Work:
 
     def run(self, store, n_threads, progress_bar):
         """Expose all rows, block by block; each block is handed to ``store``."""
-        n_int, n_group, ny, nx = self.shape
+        n_int, n_group, _, nx = self.shape
         height = max(1, _BLOCK_SAMPLES // (n_int * n_group * nx))
 
         def work(rows):
             store(rows, *self._exposed(rows))
 
-        desc = f"ramp {self.exposure.filter}"
+        self._each_block(work, height, "ramp", n_threads, progress_bar)
+
+    def _each_block(self, work, height, desc, n_threads, progress_bar):
+        """Call a function of blocks of so many rows, side by side; returns what it returns."""
+        desc = f"{desc} {self.exposure.filter}"
+        blocks = chunks(self.shape[2], height)
         with threads(n_threads) as executor:
-            parallel_map(
-                work, chunks(ny, height), executor=executor, progress_bar=progress_bar, desc=desc
+            return parallel_map(
+                work, blocks, executor=executor, progress_bar=progress_bar, desc=desc
             )
 
     def collect(self, n_threads, progress_bar):
@@ -101,22 +104,19 @@ class Work:
             mean[rows], electrons[rows], pixel_dq[rows], *hits = self._collected(rows)
             return hits
 
-        desc = f"charge {self.exposure.filter}"
-        with threads(n_threads) as executor:
-            hits = parallel_map(
-                work,
-                chunks(shape[0], _ROWS),
-                executor=executor,
-                progress_bar=progress_bar,
-                desc=desc,
-            )
+        hits = self._each_block(work, _ROWS, "charge", n_threads, progress_bar)
         places = np.concatenate([where for where, _ in hits], axis=1)
         return mean, electrons, places, np.concatenate([charge for _, charge in hits]), pixel_dq
 
+    def _with_halo(self, rows, chain):
+        """Rows that the effects of a chain need for some rows, and where these are in them."""
+        halo = sum(effect.halo for effect, _ in chain)
+        wide = slice(max(rows.start - halo, 0), min(rows.stop + halo, self.light.shape[0]))
+        return wide, slice(rows.start - wide.start, rows.stop - wide.start)
+
     def _exposed(self, rows):
         """Apply the effects to some rows: counts, flags of pixels, flags of groups."""
-        halo = sum(effect.halo for effect, _ in self.keyed)
-        wide = slice(max(rows.start - halo, 0), min(rows.stop + halo, self.light.shape[0]))
+        wide, inner = self._with_halo(rows, self.keyed)
         shape = (*self.shape[:2], wide.stop - wide.start, self.shape[3])
         pixel_dq = np.zeros(shape[2:], np.uint32)
         group_dq = np.zeros(shape, np.uint8)
@@ -124,7 +124,6 @@ class Work:
         _, array, rest = self._lit(Block, where, self.keyed)
         for effect, key in rest:
             array = effect.apply(array, Block(*where, key, self.previous))
-        inner = slice(rows.start - wide.start, rows.stop - wide.start)
         return array[:, :, inner], pixel_dq[inner], group_dq[:, :, inner]
 
     def _lit(self, kind, where, chain):
@@ -149,14 +148,13 @@ class Work:
             n += 1
         ramp = np.zeros(block.ramp_shape, np.float32)
         electrons = np.ascontiguousarray(mean * block.group_time, float)
-        _core.add_poisson(ramp, electrons, block.key, block.rows.start)
+        add_poisson(ramp, electrons, block.key, block.rows.start)
         return mean, ramp, chain[n + 1 :]
 
     def _collected(self, rows):
         """Collect the charge of some rows: mean rate, electrons, flags of pixels, hits."""
         chain = [(effect, key) for effect, key in self.keyed if isinstance(effect, _COLLECTING)]
-        halo = sum(effect.halo for effect, _ in chain)
-        wide = slice(max(rows.start - halo, 0), min(rows.stop + halo, self.light.shape[0]))
+        wide, inner = self._with_halo(rows, chain)
         shape = (wide.stop - wide.start, self.shape[3])
         pixel_dq = np.zeros(shape, np.uint32)
         where = (self.exposure, self.properties, wide, pixel_dq, np.zeros((1, 1, *shape), np.uint8))
@@ -167,10 +165,11 @@ class Work:
         hits = (np.empty((3, 0), np.int32), np.empty(0))
         for effect, key in self.keyed:
             if isinstance(effect, CosmicRays):
-                groups = np.broadcast_to(
+                # the shape alone is used of its flags
+                flags = np.broadcast_to(
                     np.uint8(0), (*self.shape[:2], rows.stop - rows.start, shape[1])
                 )
-                block = Block(self.exposure, self.properties, rows, pixel_dq, groups, key)
-                hits = effect.hits(block)
-        inner = slice(rows.start - wide.start, rows.stop - wide.start)
+                hits = effect.hits(
+                    Block(self.exposure, self.properties, rows, pixel_dq, flags, key)
+                )
         return mean[inner], ramp[0, 0, inner], pixel_dq[inner], *hits

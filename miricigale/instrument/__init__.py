@@ -14,7 +14,7 @@ __getattr__, __dir__, __all__ = lazy_names(
             "reference_pixel_mask",
         ),
         "dithers": ("dither_offsets", "dither_patterns", "read_dithers", "tile_offsets"),
-        "dq": ("DQ", "dq_legend", "read_dq"),
+        "dq": ("DQ", "dq_legend", "dq_planes", "read_dq", "with_own_bits"),
         "exposure": (
             "CEERS_FILTERS",
             "Exposure",
@@ -24,13 +24,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         ),
         "image_files": ("read_image", "write_image"),
         "figures": ("imager_filters",),
-        "keywords": (
-            "READOUT_NAMES",
-            "STEPS",
-            "exposure_keywords",
-            "joined_header",
-            "steps_done",
-        ),
+        "keywords": ("READOUT_NAMES", "STEPS", "exposure_keywords", "joined_header", "steps_done"),
         "photometric": (
             "background_level",
             "background_spectrum",

@@ -105,22 +105,12 @@ class DetectorProperties:
         return float(self.delinearize(self.full_well / self.gain))
 
     @property
-    def cosmic_ray_rate(self):
-        """Hits per pixel per second."""
-        return self.cosmic_ray_flux * self.pixel_pitch**2
-
-    @property
     def ipc_kernel(self):
         """Interpixel capacitance, shape (3, 3), sum 1."""
         horizontal, vertical, diagonal = self.ipc
         center = 1 - 2 * horizontal - 2 * vertical - 4 * diagonal
-        return np.array(
-            [
-                [diagonal, vertical, diagonal],
-                [horizontal, center, horizontal],
-                [diagonal, vertical, diagonal],
-            ]
-        )
+        edge = [diagonal, vertical, diagonal]
+        return np.array([edge, [horizontal, center, horizontal], edge])
 
     def linearize(self, dn):
         """

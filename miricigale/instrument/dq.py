@@ -5,7 +5,7 @@ import numpy as np
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.tables import Flags
 
-__all__ = ["DQ", "dq_legend", "read_dq"]
+__all__ = ["DQ", "dq_legend", "dq_planes", "read_dq", "with_own_bits"]
 
 
 class DQ(Flags):
@@ -13,7 +13,7 @@ class DQ(Flags):
     Why a pixel is not used, or is worse than its neighbors.
 
     The lower 32 bits are those of JWST, all of which have a meaning there; conditions that JWST
-    does not tell apart have the bits above them. Flags of images are int64; ``pixel_dq`` of
+    does not distinguish have the bits above them. Flags of images are int64; ``pixel_dq`` of
     ramps (uint32) and ``group_dq`` (uint8) hold the lower bits. A pixel of an image is masked
     where DO_NOT_USE is set; the other bits say why, or that a slope stands on fewer groups.
 
@@ -88,7 +88,7 @@ _WITHOUT_LEGEND = (
 
 def dq_legend():
     """
-    Header cards that tell what the bits of a plane mean.
+    Return header cards with the meaning of the bits of a plane.
 
     Returns
     -------
@@ -103,6 +103,38 @@ def dq_legend():
         if flag:
             header[f"DQBIT{flag.value.bit_length() - 1}"] = flag.name
     return header
+
+
+def dq_planes(flags):
+    """
+    Split flags into the planes that files hold.
+
+    Parameters
+    ----------
+    flags : `~numpy.ndarray` of int64
+        Bits as in `DQ`.
+
+    Yields
+    ------
+    name : str
+        ``DQ``, the 32 bits that JWST has; then ``DQ_OWN``, those above, if any is set.
+    plane : `~numpy.ndarray` of uint32 or uint8
+    header : `~astropy.io.fits.Header`
+    """
+    from astropy.io import fits
+
+    flags = np.asarray(flags).astype(np.int64)
+    yield "DQ", (flags & 0xFFFFFFFF).astype(np.uint32), dq_legend()
+    if np.any(flags >> 32):
+        header = fits.Header([("DQSHIFT", 32, "bit n of this plane is bit n + 32 of the legend")])
+        yield "DQ_OWN", (flags >> 32).astype(np.uint8), header
+
+
+def with_own_bits(flags, hdus):
+    """Flags of a plane DQ with the bits above 31 that a file has in ``DQ_OWN``."""
+    if "DQ_OWN" not in hdus:
+        return flags
+    return flags | (np.asarray(hdus["DQ_OWN"].data).astype(np.int64) << 32)
 
 
 def read_dq(hdu):

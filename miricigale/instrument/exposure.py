@@ -208,7 +208,7 @@ class Exposure:
 
     def check_sky(self):
         """
-        Refuse an exposure that does not tell its filter, or where it looks.
+        Refuse an exposure without a filter or a pointing.
 
         Raises
         ------

@@ -6,18 +6,22 @@ import astropy.units as u
 import numpy as np
 from astropy.io import fits
 
-from miricigale.instrument import dq_legend, read_dq
+from miricigale.instrument import dq_planes, read_dq, with_own_bits
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import open_fits, write_fits
 from miricigale.utils.meta import undated
 from miricigale.utils.store import plain_value
 
-__all__ = ["read_image", "write_image"]
+__all__ = ["json_meta", "read_image", "write_image"]
 
 
-def _plain(value):
-    """A value as JSON knows it; a quantity keeps its unit as text."""
-    return f"{value}" if isinstance(value, u.Quantity) else plain_value(value)
+def json_meta(meta):
+    """The meta dictionary of an image as JSON, without dates; a quantity keeps its unit as text."""
+
+    def plain(value):
+        return f"{value}" if isinstance(value, u.Quantity) else plain_value(value)
+
+    return json.dumps(undated(meta), default=plain, allow_nan=True)
 
 
 #: Steps of rounded values in the median error of an image: with its dither that adds less than 1e-3
@@ -56,15 +60,6 @@ def _step(error):
     return float(np.median(error[good])) / _STEPS
 
 
-def _flag_planes(flags):
-    """Flags as the 32 bits that JWST has, DQ, and the bits above, DQ_OWN, if any is set."""
-    flags = np.asarray(flags).astype(np.int64)
-    yield _packed((flags & 0xFFFFFFFF).astype(np.uint32), "DQ", dq_legend())
-    if np.any(flags >> 32):
-        header = fits.Header([("DQSHIFT", 32, "bit n of this plane is bit n + 32 of the legend")])
-        yield _packed((flags >> 32).astype(np.uint8), "DQ_OWN", header)
-
-
 def write_image(image, path, *, planes=None, rounded=False):
     """
     Write an image as FITS: SCI, ERR, MASK and further planes.
@@ -84,7 +79,7 @@ def write_image(image, path, *, planes=None, rounded=False):
     """
     header = image.wcs.to_header(relax=True) if image.wcs is not None else fits.Header()
     header["BUNIT"] = image.unit.to_string("fits")
-    header["META"] = json.dumps(undated(image.meta), default=_plain, allow_nan=True)
+    header["META"] = json_meta(image.meta)
     data, error = np.asarray(image.data, np.float32), None
     if image.uncertainty is not None:
         error = np.asarray(image.uncertainty.array, np.float32)
@@ -96,16 +91,10 @@ def write_image(image, path, *, planes=None, rounded=False):
         hdus.append(_packed(np.asarray(image.mask, np.uint8), "MASK"))
     for name, plane in (planes or {}).items():
         if name.lower() == "dq":
-            hdus.extend(_flag_planes(plane))
+            hdus += [_packed(part, label, legend) for label, part, legend in dq_planes(plane)]
         else:
             hdus.append(_packed(np.asarray(plane), name.upper()))
     write_fits(hdus, path, overwrite=True)
-
-
-def _read_flags(hdus):
-    """Flags of `_flag_planes`, or of a file of an earlier version, whose DQ has all bits."""
-    flags = read_dq(hdus["DQ"])
-    return flags | (hdus["DQ_OWN"].data.astype(np.int64) << 32) if "DQ_OWN" in hdus else flags
 
 
 def _unit(header, path):
@@ -165,5 +154,9 @@ def read_image(path, *, planes=()):
         extra = []
         for name in planes:
             is_dq = name.lower() == "dq"
-            extra.append(_read_flags(hdus) if is_dq else np.array(hdus[name.upper()].data))
+            extra.append(
+                with_own_bits(read_dq(hdus["DQ"]), hdus)
+                if is_dq
+                else np.array(hdus[name.upper()].data)
+            )
     return (image, *extra) if extra else image

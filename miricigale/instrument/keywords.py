@@ -10,7 +10,7 @@ READOUT_NAMES = {"FAST": "FASTR1", "SLOW": "SLOWR1"}
 #: Where the light is blocked there is no filter.
 _NO_FILTER = ("", "OPAQUE", "N/A", "ANY")
 
-#: Steps of the JWST pipeline by the keywords that tell of them.
+#: Steps of the JWST pipeline by the keywords that record them.
 STEPS = {
     "S_DQINIT": "dq_init",
     "S_SATURA": "saturation",

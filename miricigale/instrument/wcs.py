@@ -150,20 +150,26 @@ def imager_wcs(pointing, roll, *, subarray="FULL"):
     """
     ra, dec = scalar_position(pointing, "pointing")
     roll = float(to_array(roll, u.deg, "roll", ndim=0, finite=True))
-    from astropy.wcs import WCS, Sip
+    from astropy.wcs import Sip
 
     part = aperture(subarray)
     cd, a, b, ap, bp = _sip(subarray)
-    wcs = WCS(naxis=2)
-    wcs.wcs.ctype = ["RA---TAN-SIP", "DEC--TAN-SIP"]
-    wcs.wcs.cunit = ["deg", "deg"]
-    wcs.wcs.crval = [ra, dec]
-    wcs.wcs.crpix = [part.reference[0] + 1, part.reference[1] + 1]
+    wcs = _gnomonic((ra, dec), [n + 1 for n in part.reference], part.shape, "-SIP")
     wcs.wcs.cd = _rotate(roll) @ cd
-    wcs.wcs.radesys = "ICRS"
     wcs.sip = Sip(a, b, ap, bp, wcs.wcs.crpix)
-    wcs.pixel_shape = part.shape[::-1]
     wcs.wcs.set()
+    return wcs
+
+
+def _gnomonic(center, reference, shape, distortion=""):
+    """A tangential WCS of a shape about a position, (ra, dec) in deg, without its scale."""
+    from astropy.wcs import WCS
+
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype = [f"RA---TAN{distortion}", f"DEC--TAN{distortion}"]
+    wcs.wcs.cunit, wcs.wcs.radesys = ["deg", "deg"], "ICRS"
+    wcs.wcs.crval, wcs.wcs.crpix = center, reference
+    wcs.pixel_shape = shape[::-1]
     return wcs
 
 
@@ -276,21 +282,13 @@ def north_up_wcs(center, pixel_scale, shape):
     ny, nx = (int(n) for n in shape)
     if ny < 1 or nx < 1:
         raise argument_error("shape", "two positive integers", shape)
-    from astropy.wcs import WCS
-
-    wcs = WCS(naxis=2)
-    wcs.wcs.ctype = ["RA---TAN", "DEC--TAN"]
-    wcs.wcs.cunit = ["deg", "deg"]
-    wcs.wcs.crval = [ra, dec]
-    wcs.wcs.crpix = [(nx + 1) / 2, (ny + 1) / 2]
+    wcs = _gnomonic((ra, dec), [(nx + 1) / 2, (ny + 1) / 2], (ny, nx))
     wcs.wcs.cdelt = [-scale, scale]
-    wcs.wcs.radesys = "ICRS"
-    wcs.pixel_shape = (nx, ny)
     wcs.wcs.set()
     return wcs
 
 
-def mosaic_wcs(exposures, pixel_scale, *, margin=0 * u.arcsec):
+def mosaic_wcs(exposures, pixel_scale):
     """
     The smallest north-up grid that holds every pixel of the exposures.
 
@@ -300,8 +298,6 @@ def mosaic_wcs(exposures, pixel_scale, *, margin=0 * u.arcsec):
         What is to be covered; a WCS must have its ``pixel_shape``.
     pixel_scale : `~astropy.units.Quantity`
         Side of a pixel of the mosaic.
-    margin : `~astropy.units.Quantity`, optional
-        Rim added on each side.
 
     Returns
     -------
@@ -335,13 +331,11 @@ def mosaic_wcs(exposures, pixel_scale, *, margin=0 * u.arcsec):
     start = SkyCoord(
         np.arctan2(mean[1], mean[0]), np.arctan2(mean[2], np.hypot(mean[0], mean[1])), unit="rad"
     )
-    rim = float(to_array(margin, u.arcsec, "margin", ndim=0))
-    scale = float(to_array(pixel_scale, u.arcsec, "pixel_scale", ndim=0))
     # twice: the second time about the middle of the box that the first found
     for _ in range(2):
         grid = north_up_wcs(start, pixel_scale, (1, 1))
         x, y = grid.all_world2pix(ra, dec, 0)
         middle = (x.min() + x.max()) / 2, (y.min() + y.max()) / 2
         start = SkyCoord(*grid.all_pix2world(*middle, 0), unit="deg")
-    shape = [int(np.ceil(np.ptp(t) + 2 * rim / scale)) for t in (y, x)]
+    shape = [int(np.ceil(np.ptp(t))) for t in (y, x)]
     return north_up_wcs(start, pixel_scale, shape)

@@ -39,7 +39,7 @@ def fit_steps(reducer, ramp, maps, *, reset, skipped):
     Returns
     -------
     fit : `~miricigale.reduction.RampFit`
-        The significance of jumps is not told by the pipeline: NaN. ``n_used`` counts differences of
+        The pipeline does not state the significance of jumps: NaN. ``n_used`` counts differences of
         groups without a flag.
 
     Raises
@@ -78,13 +78,9 @@ def fit_steps(reducer, ramp, maps, *, reset, skipped):
         steps.append((RefPixStep, {}, {"refpix": "N/A", "sirskernel": "N/A"}))
     noise = {"gain": models.gain(), "readnoise": models.read_noise()}
     if reducer.jump_threshold is not None:
-        limit = reducer.jump_threshold
-        options = {
-            "rejection_threshold": limit,
-            "three_group_rejection_threshold": limit,
-            "four_group_rejection_threshold": limit,
-            "flag_4_neighbors": reducer.ramps.neighbor_threshold is not None,
-        }
+        limits = ("", "three_group_", "four_group_")
+        options = {f"{name}rejection_threshold": reducer.jump_threshold for name in limits}
+        options["flag_4_neighbors"] = reducer.ramps.neighbor_threshold is not None
         if reducer.ramps.neighbor_threshold is not None:
             options["min_jump_to_flag_neighbors"] = reducer.ramps.neighbor_threshold
         steps.append((JumpStep, options, noise))

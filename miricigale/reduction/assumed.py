@@ -54,8 +54,8 @@ def maps_of(reducer, ramp):
     if not isinstance(ramp, (Ramp, Charge)):
         raise argument_error("ramp", "a Ramp or a Charge", type(ramp).__name__)
     if is_own(reducer, ramp):
-        told = reducer.references is not None or reducer.properties is not None
-        if not told and ramp.properties not in (None, reducer.detector):
+        stated = reducer.references is not None or reducer.properties is not None
+        if not stated and ramp.properties not in (None, reducer.detector):
             msg = (
                 f"the ramp was made by another detector than miri_detector(), {ramp.properties}: "
                 "give 'references' or 'properties' (references='simulated' takes it for miri_detector())"
@@ -137,10 +137,8 @@ def brightness_of(reducer, rate):
         pointing=None,
         roll=None,
     )
-    what = "surface brightness"
-    files = needed(
-        reducer.references, _header(exposure, facts.day), facts.steps, names=BRIGHTNESS, what=what
-    )
+    what, header = "surface brightness", _header(exposure, facts.day)
+    files = needed(reducer.references, header, facts.steps, names=BRIGHTNESS, what=what)
     if files.photom is None:
         raise argument_error("references", f"given with 'photom' for {what}", "none")
     flat, flags, used = 1.0, None, {"flat": "none", "photom": files.photom.name}
@@ -155,9 +153,8 @@ def brightness_of(reducer, rate):
     values = {"dark": 0.0, "gain": None, "flat": flat, "flags": flags}
     values["conversion"] = read_photom(files.photom, exposure, facts.day)
     meta = {f"reference_{name}": text for name, text in used.items()}
-    meta["steps"] = sorted(
-        {*facts.steps, "photom"} | ({"flat"} if used["flat"] != "none" else set())
-    )
+    done = {"photom"} if used["flat"] == "none" else {"photom", "flat"}
+    meta["steps"] = sorted(done | set(facts.steps))
     return values, meta
 
 

@@ -23,7 +23,7 @@ __all__ = [
     "subtract_background",
 ]
 
-#: Whose sigma tells what lies far below the background.
+#: Which noise determines what lies far below the background.
 NEGATIVE_NOISES = ("larger", "background")
 
 # least share of the pixels that is taken for sky
@@ -32,7 +32,7 @@ _LEAST_SKY = 0.05
 _GROW = 3
 # sky near sources may be brighter than far from them by this much, in the noise of a pixel
 _CONTAMINATION = 0.1
-# pixels that tell a median of a smooth image
+# pixels from which the median of a smooth image is taken
 _SOME = 100_000
 # noise of the sky over the errors of the image that cannot be that of the sky alone
 _EXCESS = 3.0

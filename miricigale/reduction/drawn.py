@@ -12,7 +12,7 @@ kept shifts the slope by the weight of its difference.
 import numpy as np
 from numpy.polynomial import polynomial
 
-from miricigale.reduction import _core
+from miricigale.reduction._core.drawing import draw_slopes, hit_slopes, tabulate, variances
 from miricigale.reduction.rampfit import fit_result, threshold
 from miricigale.utils.random import stream
 
@@ -65,14 +65,14 @@ def draw_groups(charge, maps, drift, usable, part, *, thresholds, poisson_factor
     read = charge.measured(rates[:, None] * group_time * (groups + 1)) + (level - offset)[groups]
     linear = polynomial.polyval(read, maps.linearity)
     derivative = polynomial.polyval(read, polynomial.polyder(maps.linearity))
-    table = _core.tabulate(linear, derivative, n_int, s, charge.read_variance, inv_gain, group_time)
+    table = tabulate(linear, derivative, n_int, s, charge.read_variance, inv_gain, group_time)
     zero = table[0, 0]
     table[0, 1:] = (table[0, 1:] - zero) / rates[1:]
-    # where rates are too low to be told from none
+    # where rates are too low to be distinguished from none
     table[0, :9] = table[0, 9]
     # pixels that are full in the first group have no slope
     quoted_scale = (_SLOPES - 1) / (limit / (group_time * truth.gain)) ** 0.25
-    quoted = _core.variances(
+    quoted = variances(
         (np.arange(_SLOPES) / quoted_scale) ** 4, n_int, n_diff, s, inv_gain, group_time
     )
 
@@ -80,14 +80,14 @@ def draw_groups(charge, maps, drift, usable, part, *, thresholds, poisson_factor
     images = tuple(np.empty(shape, np.float32) for _ in range(3))
     mean = np.where(usable, charge.mean, np.nan)
     normals = rng.standard_normal(shape, np.float32)
-    _core.draw_slopes(
+    draw_slopes(
         mean, charge.electrons, charge.total_time, normals, table, zero, scale, quoted,
         quoted_scale, images,
     )  # fmt: skip
     n_used = np.where(usable, np.int16(n_int * n_diff), np.int16(0))
     images += n_used, np.zeros(shape, np.int16), np.zeros(shape, np.int64)
     names = ("jump_threshold", "neighbor_threshold")
-    jumps = _core.hit_slopes(
+    jumps = hit_slopes(
         mean, charge.hits, charge.hit_electrons, (n_int, n_group, *part),
         (group_time, s, inv_gain), (limit, 1 / truth.gain),
         tuple(map(threshold, thresholds, names)), rng, images,

@@ -18,14 +18,16 @@ from miricigale.detector import Ramp
 from miricigale.instrument import (
     DQ,
     STEPS,
-    dq_legend,
+    dq_planes,
     exposure_keywords,
     imager_wcs,
     joined_header,
     read_dq,
     steps_done,
     subarrays,
+    with_own_bits,
 )
+from miricigale.instrument.image_files import json_meta
 from miricigale.reduction.assumed import middle_of
 from miricigale.reduction.images import plain_flags, plain_mask, sigma
 from miricigale.utils.exceptions import DataError, argument_error
@@ -33,7 +35,6 @@ from miricigale.utils.files import open_fits, write_fits
 from miricigale.utils.meta import undated
 from miricigale.utils.optional import require
 from miricigale.utils.parallel import check_memory
-from miricigale.utils.store import plain_value
 from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS
 
 __all__ = ["ImageFile", "open_exposure", "read_images", "write_image"]
@@ -138,30 +139,27 @@ def read_images(path):
     if error is None and (parts := [planes[name] for name in _VARIANCES if name in planes]):
         error = np.sqrt(np.sum([np.nan_to_num(part) for part in parts], axis=0))
     out = []
-    for number in range(shape[0] if len(shape) == 3 else 1):
-        cut = (lambda array, k=number: array[k]) if len(shape) == 3 else (lambda array: array)
-        values, own = cut(data), dict(meta)
-        if len(shape) == 3:
-            own["integration"] = number
-        flag = cut(flags)
+    for number in range(shape[0]) if len(shape) == 3 else (...,):
+        own = meta if number is ... else {**meta, "integration": number}
+        values, flag = data[number], flags[number]
         bad = ~np.isfinite(values) | ((flag & DQ.DO_NOT_USE) != 0)
-        sigma = None
+        uncertainty = None
         if error is not None:
-            sigma = cut(error)
-            bad |= ~np.isfinite(sigma)
+            uncertainty = StdDevUncertainty(error[number])
+            bad |= ~np.isfinite(uncertainty.array)
         if "WHT" in planes:
-            bad |= ~(cut(planes["WHT"]) > 0)
+            bad |= ~(planes["WHT"][number] > 0)
         image = CCDData(
             values,
             unit=unit,
-            uncertainty=None if sigma is None else StdDevUncertainty(sigma),
+            uncertainty=uncertainty,
             mask=bad,
             flags=flag,
             wcs=wcs,
-            meta=own,
+            meta=dict(own),
         )
         part = {
-            name: plane if name == "CON" or plane.shape != shape else cut(plane)
+            name: plane if name == "CON" or plane.shape != shape else plane[number]
             for name, plane in planes.items()
         }
         out.append(ImageFile(image, part, header))
@@ -196,23 +194,26 @@ def open_exposure(path):
 
 
 def _mean(images):
-    """Mean of the integrations of an exposure; flags are those that all have, or that tell of any."""
+    """Mean of the integrations of an exposure; its flags are those of any, DO_NOT_USE those of all."""
     weight = np.array([~image.mask for image in images], float)
     count = weight.sum(axis=0)
     data = np.array([np.nan_to_num(image.data) for image in images])
-    first, sigma = images[0], None
+    first, uncertainty = images[0], None
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = np.where(count > 0, (weight * data).sum(axis=0) / count, np.nan)
         if all(image.uncertainty is not None for image in images):
             error = np.array([np.nan_to_num(image.uncertainty.array) for image in images])
-            sigma = np.where(count > 0, np.sqrt((weight * error**2).sum(axis=0)) / count, np.nan)
+            total = np.sqrt((weight * error**2).sum(axis=0))
+            uncertainty = StdDevUncertainty(
+                np.where(count > 0, total / count, np.nan).astype(np.float32)
+            )
     flags = np.bitwise_or.reduce([image.flags for image in images]) & ~int(DQ.DO_NOT_USE)
     flags |= np.where(count == 0, int(DQ.DO_NOT_USE), 0)
     meta = {key: value for key, value in first.meta.items() if key != "integration"}
     return CCDData(
         mean.astype(np.float32),
         unit=first.unit,
-        uncertainty=None if sigma is None else StdDevUncertainty(sigma.astype(np.float32)),
+        uncertainty=uncertainty,
         mask=count == 0,
         flags=flags,
         wcs=first.wcs,
@@ -227,11 +228,8 @@ def _unit(header, path):
         unit = u.Unit(text.replace("counts", "DN")) if text else None
     except ValueError:
         unit = None
-    for known, own in (
-        (u.Unit("DN/s"), RATE),
-        (RATE, RATE),
-        (SURFACE_BRIGHTNESS, SURFACE_BRIGHTNESS),
-    ):
+    brightness = SURFACE_BRIGHTNESS
+    for known, own in ((u.Unit("DN/s"), RATE), (RATE, RATE), (brightness, brightness)):
         if unit is not None and unit.is_equivalent(known):
             factor = unit.to(known)
             return own if factor == 1 else u.Unit(factor * own)
@@ -263,9 +261,7 @@ def _flags(hdus, shape, path):
     if flags.shape != shape:
         msg = f"{path} must have {shape} pixels in DQ, as in SCI, got {flags.shape}"
         raise DataError(msg)
-    if "DQ_OWN" in hdus:
-        flags = flags | (np.asarray(hdus["DQ_OWN"].data).astype(np.int64) << 32)
-    return flags
+    return with_own_bits(flags, hdus)
 
 
 def _meta(header, path):
@@ -374,12 +370,9 @@ def write_image(image, path, *, planes=None, header=None, overwrite=False):
     names = {RATE: "DN/s", SURFACE_BRIGHTNESS: "MJy/sr"}
     unit = next((n for own, n in names.items() if image.unit == own), image.unit.to_string("fits"))
     science["BUNIT"] = unit
-    science["META"] = json.dumps(meta, default=_plain, allow_nan=True)
-    for key, name in (
-        ("PHOTMJSR", "photmjsr"),
-        ("PA_APER", "pa_aper"),
-        ("XPOSURE", "exposure_time"),
-    ):
+    science["META"] = json_meta(image.meta)
+    names = {"PHOTMJSR": "photmjsr", "PA_APER": "pa_aper", "XPOSURE": "exposure_time"}
+    for key, name in names.items():
         if isinstance(meta.get(name), (int, float)):
             science[key] = meta[name]
     hdus = [primary, fits.ImageHDU(np.asarray(image.data, np.float32), science, name="SCI")]
@@ -387,13 +380,10 @@ def write_image(image, path, *, planes=None, header=None, overwrite=False):
         error = image.uncertainty.represent_as(StdDevUncertainty).array
         hdus.append(fits.ImageHDU(np.asarray(error, np.float32), name="ERR"))
         hdus[-1].header["BUNIT"] = unit
-    flags = np.zeros(image.shape, np.int64) if image.flags is None else np.asarray(image.flags)
+    flags = plain_flags(image)
     if image.mask is not None:
         flags = flags | np.where(image.mask, int(DQ.DO_NOT_USE), 0)
-    hdus.append(fits.ImageHDU((flags & 0xFFFFFFFF).astype(np.uint32), dq_legend(), name="DQ"))
-    if np.any(flags >> 32):
-        own = fits.Header([("DQSHIFT", 32, "bit n of this plane is bit n + 32 of the legend")])
-        hdus.append(fits.ImageHDU((flags >> 32).astype(np.uint8), own, name="DQ_OWN"))
+    hdus += [fits.ImageHDU(plane, legend, name=name) for name, plane, legend in dq_planes(flags)]
     for name, plane in planes.items():
         plane = np.asarray(plane)
         if name not in PLANES or plane.shape[-2:] != image.shape[-2:]:
@@ -443,7 +433,3 @@ def _joined(image, planes):
     )
     own = {name: cube(lambda file, n=name: file.planes[n]) for name in files[0].planes}
     return joined, {**own, **planes}, first.wcs
-
-
-def _plain(value):
-    return f"{value}" if isinstance(value, u.Quantity) else plain_value(value)

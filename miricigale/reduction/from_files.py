@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 #: Changes with what the products hold.
 _VERSION = 5
 
-#: What a bad file may raise; the others go on.
+#: Errors of a bad file; the other files are reduced all the same.
 _ERRORS = (ArithmeticError, ImportError, KeyError, MemoryError, OSError, ValueError)
 
 
@@ -130,7 +130,7 @@ def reduce_files(
 
 
 def _stem(path):
-    """Name of a file without what tells its stage."""
+    """Name of a file without its suffix of the stage."""
     stem = path.name.removesuffix(".gz").removesuffix(".fits")
     head, _, stage = stem.rpartition("_")
     known = ("uncal", "ramp", "rate", "rateints", "cal", "calints", "i2d", "crf")
@@ -243,16 +243,10 @@ def _show(page, path, members, notes):
     scale = meta["pixel_scale"]
     data = np.where(image.mask, np.nan, image.data)
     plot_image(data, ax=axes[0, 0], pixel_scale=scale, colorbar="MJy/sr", title=path.name)
+    options = {"stretch": "linear", "limits": (0, len(members)), "colorbar": "exposures"}
     count = np.squeeze(file.planes["CON"]).astype(float)
-    plot_image(
-        count,
-        ax=axes[0, 1],
-        pixel_scale=scale,
-        stretch="linear",
-        limits=(0, len(members)),
-        colorbar="exposures",
-        title="exposures of each pixel",
-    )
+    title = "exposures of each pixel"
+    plot_image(count, ax=axes[0, 1], pixel_scale=scale, title=title, **options)
     page.figure(axes[0, 0].figure, f"Mosaic {path.name}, background subtracted, and its exposures.")
 
 

@@ -96,16 +96,10 @@ def flag_pixels(source, where, flag):
 
 def exposure_values(exposure):
     """Fields of an exposure in values that fit a header."""
-    values = {
-        "filter": exposure.filter,
-        "readout": exposure.readout,
-        "subarray": exposure.subarray,
-        "n_groups": exposure.n_groups,
-        "n_integrations": exposure.n_integrations,
-        "dither": exposure.dither,
-        "group_time": float(exposure.group_time.to_value("s")),
-        "exposure_time": float(exposure.exposure_time.to_value("s")),
-    }
+    names = ("filter", "readout", "subarray", "n_groups", "n_integrations", "dither")
+    values = {name: getattr(exposure, name) for name in names}
+    for name in ("group_time", "exposure_time"):
+        values[name] = float(getattr(exposure, name).to_value("s"))
     if exposure.pointing is not None:
         values |= {
             "ra": float(exposure.pointing.ra.deg),
@@ -128,12 +122,12 @@ def seen_wcs(im):
     return wcs
 
 
-def check_images(images, wcs, *, shape=None):
+def check_images(images, wcs):
     """Refuse images that cannot be put together, and what is no grid for them."""
     if not isinstance(wcs, WCS):
         raise argument_error("wcs", "an astropy WCS", type(wcs).__name__)
-    if shape is None and wcs.pixel_shape is None:
-        raise argument_error("wcs", "a WCS with a pixel_shape, or 'shape' given", "neither")
+    if wcs.pixel_shape is None:
+        raise argument_error("wcs", "a WCS with a pixel_shape", "one without")
     if not images:
         raise argument_error("images", "at least one image", "none")
     for im in images:

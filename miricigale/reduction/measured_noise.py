@@ -48,7 +48,7 @@ class MeasuredNoise:
         Its error; NaN if the gain is infinite.
     effective : bool
         Whether the gain is that of all noise that grows with time, slow noise of the read-out too,
-        because neither signals of the pixels nor reference pixels tell photons from it.
+        because neither signals of the pixels nor reference pixels separate photons from it.
     slow_noise : float
         Standard deviation that the read-out adds from one group to the next, DN; zero where there are
         no reference pixels to show it.
@@ -150,15 +150,15 @@ def measure_noise(ramp):
     inverse = (weight * (m - middle) * v).sum() / squares
     rest = weight * (v - mean - inverse * (m - middle)) ** 2
     inverse_err = max(np.sqrt(rest.sum() / (len(rows) - 2)), 1.0) / np.sqrt(squares)
-    told = inverse > _SEEN * inverse_err
-    if not told:
+    seen = inverse > _SEEN * inverse_err
+    if not seen:
         inverse = (mean - slow) / middle
         inverse_err = np.hypot(mean_err, slow_err) / abs(middle)
     if inverse > _SEEN * inverse_err:
         gain, gain_err = 1 / inverse, inverse_err / inverse**2
     else:
         gain, gain_err, slow = np.inf, np.nan, mean
-    effective = not told and not dark and np.isfinite(gain)
+    effective = not seen and not dark and np.isfinite(gain)
     slow_noise = np.sqrt(max(slow, 0.0))
     return MeasuredNoise(
         *map(float, (read_noise, read_err, gain, gain_err)), bool(effective), float(slow_noise)

@@ -174,7 +174,7 @@ def noise_correction(pixfrac, ratio):
     return r / (1 - 1 / (3 * r)) if r >= 1 else 1 / (1 - r / 3)
 
 
-def drizzle_images(images, wcs, *, shape=None, pixfrac=1.0, weights=None, pixel_maps=None):
+def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None):
     """
     Drizzle images onto one grid.
 
@@ -184,9 +184,7 @@ def drizzle_images(images, wcs, *, shape=None, pixfrac=1.0, weights=None, pixel_
         Surface brightness in one unit, with uncertainty and WCS; masked pixels get no
         weight.
     wcs : `~astropy.wcs.WCS`
-        Of the output.
-    shape : tuple of int, optional
-        ``(ny, nx)`` of the output; by default ``wcs.pixel_shape``.
+        Of the output, with its ``pixel_shape``.
     pixfrac : float, optional
         Side of the drops in input pixels, 0-1.
     weights : list of `~numpy.ndarray`, optional
@@ -200,7 +198,7 @@ def drizzle_images(images, wcs, *, shape=None, pixfrac=1.0, weights=None, pixel_
         The brightness is the area- and weight-weighted mean (square kernel), so that the
         sum of brightness times pixel area is conserved. Variances go through with squared
         weights. ``image.meta["noise_correction"]`` says by how much sums over many
-        pixels are noisier than these variances tell (`noise_correction`).
+        pixels are noisier than these variances state (`noise_correction`).
 
     Raises
     ------
@@ -209,20 +207,14 @@ def drizzle_images(images, wcs, *, shape=None, pixfrac=1.0, weights=None, pixel_
         the output has no shape or lies elsewhere on the sky.
     """
     images = list(images)
-    check_images(images, wcs, shape=shape)
+    check_images(images, wcs)
     if not 0 < pixfrac <= 1:
         raise argument_error("pixfrac", "above 0 and at most 1", pixfrac)
-    shape = wcs.pixel_shape[::-1] if shape is None else shape
-    shape = tuple(int(n) for n in shape)
+    shape = tuple(int(n) for n in wcs.pixel_shape[::-1])
     if pixel_maps is None:
         pixel_maps = [pixel_map(im.wcs, wcs, im.shape) for im in images]
     check_overlap(pixel_maps, shape)
     weights = [weight_map(im) for im in images] if weights is None else list(weights)
-    return _drizzle(images, wcs, shape, pixfrac, weights, pixel_maps)
-
-
-def _drizzle(images, wcs, shape, pixfrac, weights, pixel_maps):
-    """As `drizzle_images`, of what was checked; images may lie beside the grid."""
     # drizzle works in float32: weights near one
     positive = [w[w > 0] for w in weights]
     positive = [w for w in positive if w.size]
@@ -249,23 +241,19 @@ def _drizzle(images, wcs, shape, pixfrac, weights, pixel_maps):
         before[part] = sink.out_wht[part]
 
     if n_images.any():
-        data, variance = sink.out_img, sink.out_img2
-        variance = variance[0] if isinstance(variance, (list, tuple)) else variance
-        weight = sink.out_wht
+        data, variance, weight = sink.out_img, sink.out_img2[0], sink.out_wht
     else:
         data = np.full(shape, np.nan, np.float32)
         variance, weight = data, np.zeros(shape, np.float32)
     covered = (weight > 0) & np.isfinite(data)
     flags = np.where(covered, 0, int(DQ.NON_SCIENCE | DQ.DO_NOT_USE))
-    scales = [_scale(im.wcs) for im in images]
-    ratio = _scale(wcs) / float(np.mean(scales))
-    meta = _meta(images)
-    meta.update(
-        pixfrac=float(pixfrac),
-        pixel_scale=_scale(wcs) * 3600,
-        noise_correction=noise_correction(pixfrac, ratio)
-        * float(np.mean([ImageFacts.of(im).noise_correction for im in images])),
-    )
+    ratio = _scale(wcs) / float(np.mean([_scale(im.wcs) for im in images]))
+    before_drizzle = float(np.mean([ImageFacts.of(im).noise_correction for im in images]))
+    meta = _meta(images) | {
+        "pixfrac": float(pixfrac),
+        "pixel_scale": _scale(wcs) * 3600,
+        "noise_correction": noise_correction(pixfrac, ratio) * before_drizzle,
+    }
     out = image(
         np.where(covered, data, np.nan),
         images[0].unit,

@@ -17,7 +17,9 @@ import dataclasses
 import numpy as np
 
 from miricigale.instrument import DQ
-from miricigale.reduction import _core
+from miricigale.reduction._core.lanes import refit
+from miricigale.reduction._core.pixel import DO_NOT_USE, JUMP, SATURATED, own_charge
+from miricigale.reduction._core.rows import fit_rows
 from miricigale.reduction.showers import find_showers
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.parallel import chunks, parallel_map, threads
@@ -235,14 +237,8 @@ def fit_groups(
 
     data = _plain(data)
     variance = np.square(read_noise) + (1 / 12 if data.dtype.kind in "iu" else 0.0)
-    out = (
-        np.zeros((ny, nx), np.float32),
-        np.zeros((ny, nx), np.float32),
-        np.zeros((ny, nx), np.float32),
-        np.zeros((ny, nx), np.int16),
-        np.zeros((ny, nx), np.int16),
-        np.zeros((ny, nx), np.int64),
-    )
+    kinds = (np.float32,) * 3 + (np.int16,) * 2 + (np.int64,)
+    out = tuple(np.zeros((ny, nx), kind) for kind in kinds)
     ramp = (data, (drift, bias, reset), (coef, saturation, dark))
     # a trace of read noise keeps the closed forms finite
     noise = (np.maximum(variance, 1e-6), poisson_factor / gain, np.square(slow_noise))
@@ -251,24 +247,18 @@ def fit_groups(
     plain = usable if flagged is None else usable & ~flagged
 
     def fit_block(rows):
-        events = _core.fit_rows(ramp, plain, rows.start, rows.stop, fit, out)
+        events = fit_rows(ramp, plain, rows.start, rows.stop, fit, out)
         return events[np.lexsort(events.T[3::-1])]
 
     def refit_block(part):
         ys, xs, start, cuts = part
-        _core.refit(ramp, group_dq, ys, xs, start, cuts, fit, out)
+        refit(ramp, group_dq, ys, xs, start, cuts, fit, out)
 
     with threads(n_threads) as executor:
-        events = parallel_map(
-            fit_block,
-            chunks(ny, _ROWS),
-            executor=executor,
-            progress_bar=progress_bar,
-            desc="slopes",
-        )
-        events = np.concatenate(events)
+        options = {"executor": executor, "progress_bar": progress_bar, "desc": "slopes"}
+        events = np.concatenate(parallel_map(fit_block, chunks(ny, _ROWS), **options))
         n_diff = last_group - first_group - 1
-        showers = None
+        showers = np.zeros((4, 0), np.int64)
         if np.isfinite(shower):
             showers = find_showers(
                 data, events, usable, shower, first_group=first_group, last_group=last_group
@@ -349,7 +339,7 @@ def _flagged(group_dq, shape, last_group, usable):
         got = f"{group_dq.dtype}, shape {group_dq.shape}"
         raise argument_error("group_dq", f"uint8, of shape {shape}", got)
     seen = np.zeros(shape[2:], bool)
-    wanted = np.uint8(_core.DO_NOT_USE | _core.SATURATED | _core.JUMP)
+    wanted = np.uint8(DO_NOT_USE | SATURATED | JUMP)
     for k, g in np.ndindex(shape[0], last_group):
         seen |= (group_dq[k, g] & wanted) != 0
     return seen if (seen & usable).any() else None
@@ -374,7 +364,7 @@ def threshold(value, name):
     return float(value)
 
 
-def _neighbors(events, threshold, usable, n_diff, showers=None):
+def _neighbors(events, threshold, usable, n_diff, showers):
     """
     Yield the pixels beside large jumps, and those of showers, and where they are to be cut.
 
@@ -382,9 +372,7 @@ def _neighbors(events, threshold, usable, n_diff, showers=None):
     pixel's cuts, and the cuts. Pixels keep the cuts that they found themselves.
     """
     ny, nx = usable.shape
-    large = events[_core.own_charge(events, nx, n_diff) >= threshold].astype(np.int64)
-    if showers is None:
-        showers = np.zeros((4, 0), np.int64)
+    large = events[own_charge(events, nx, n_diff) >= threshold].astype(np.int64)
     if len(large) == 0 and showers[0].size == 0:
         return
     cut = large[:, 2] * n_diff + large[:, 3]

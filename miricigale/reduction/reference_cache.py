@@ -12,19 +12,8 @@ from miricigale.utils.exceptions import DataError, argument_error
 
 __all__ = ["ReferenceCache"]
 
-#: Reference types of CRDS by the names of `ReferenceFiles`.
-_TYPES = {
-    "mask": "mask",
-    "saturation": "saturation",
-    "bias": "superbias",
-    "reset": "reset",
-    "linearity": "linearity",
-    "dark": "dark",
-    "gain": "gain",
-    "read_noise": "readnoise",
-    "flat": "flat",
-    "photom": "photom",
-}
+#: Reference types of CRDS whose names are not those of `ReferenceFiles`.
+_TYPES = {"bias": "superbias", "read_noise": "readnoise"}
 
 #: Keywords of files by the parameters of rules.
 _KEYWORDS = {
@@ -126,13 +115,19 @@ class ReferenceCache:
         }
         values["META.INSTRUMENT.NAME"] = "MIRI"
         instruments = self._mapping(self.context)[1]
-        rules = self._mapping(_name(instruments, "MIRI", self.context))[1]
+        name = instruments.get("MIRI", instruments.get("miri"))
+        if name is None:
+            msg = f"{self.context} has no mapping for MIRI"
+            raise DataError(msg)
+        rules = self._mapping(name)[1]
         chosen = {}
-        for name, kind in _TYPES.items():
+        for name in ReferenceFiles.names():
+            kind = _TYPES.get(name, name)
             rule = rules.get(kind, rules.get(kind.upper(), _NOT_APPLICABLE))
             if rule == _NOT_APPLICABLE:
                 continue
-            chosen[name] = self._file(self._choose(rule, values))
+            file = self._choose(rule, values)
+            chosen[name] = None if file is None else self._file(file)
         return ReferenceFiles(**chosen, incomplete=incomplete, origin=self.context)
 
     def _choose(self, rule, values):
@@ -152,8 +147,7 @@ class ReferenceCache:
         return None if selector in (None, _NOT_APPLICABLE) else selector
 
     def _file(self, name):
-        if name is None:
-            return None
+        """Path of a file of the cache."""
         folder = self.folder / "references" / "jwst"
         for path in (folder / "miri" / name, folder / name):
             if path.is_file():
@@ -180,14 +174,6 @@ class ReferenceCache:
             raise DataError(msg) from err
 
 
-def _name(instruments, name, context):
-    try:
-        return instruments[name] if name in instruments else instruments[name.lower()]
-    except KeyError:
-        msg = f"{context} has no mapping for {name}"
-        raise DataError(msg) from None
-
-
 @dataclasses.dataclass(frozen=True)
 class _Selector:
     """One level of a rule."""
@@ -205,12 +191,10 @@ class _Selector:
         best, chosen = 0, None
         for key, case in self.cases.items():
             patterns = key if isinstance(key, tuple) else (key,)
-            found = [
-                _match(
-                    substitutions.get(name, {}).get(pattern, pattern), values.get(name, "UNDEFINED")
-                )
-                for name, pattern in zip(names, patterns, strict=True)
-            ]
+            found = []
+            for name, pattern in zip(names, patterns, strict=True):
+                pattern = substitutions.get(name, {}).get(pattern, pattern)
+                found.append(_match(pattern, values.get(name, "UNDEFINED")))
             if min(found) < 0:
                 continue
             if chosen is None or sum(found) > best:

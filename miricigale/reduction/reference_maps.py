@@ -23,6 +23,8 @@ __all__ = [
 #: Values of keywords that fit any exposure.
 _ANY = ("", "N/A", "ANY", "GENERIC", "*")
 
+_WANTED = "a {} reference of CRDS (FITS with {})"
+
 _SPOILT = int(DQ.DO_NOT_USE)
 
 
@@ -33,29 +35,19 @@ def _refuse(path, kind, what, got, wanted):
 
 def _check(path, kind, header, exposure, *, reftype, filtered=False, timed=False):
     """Refuse a reference of another kind, detector, filter or read-out."""
-
-    def stated(name):
-        value = str(header.get(name, "")).strip().upper()
-        return None if value in _ANY else value
-
-    for name, wanted in (
-        ("REFTYPE", reftype.upper()),
-        ("INSTRUME", "MIRI"),
-        ("DETECTOR", "MIRIMAGE"),
-    ):
-        if stated(name) not in (None, wanted):
-            _refuse(path, kind, name, stated(name), wanted)
-    if filtered and exposure.filter is not None and stated("FILTER") is not None:
-        wanted = exposure.filter.rpartition(".")[2].upper()
-        if stated("FILTER") != wanted:
-            _refuse(path, kind, "FILTER", stated("FILTER"), wanted)
-    readout = READOUT_NAMES.get(stated("READPATT"), stated("READPATT"))
-    if readout not in (None, exposure.readout):
-        _refuse(path, kind, "READPATT", readout, exposure.readout)
-    if timed:
-        for name, wanted in (("NFRAMES", 1), ("GROUPGAP", 0)):
-            if header.get(name, wanted) != wanted:
-                _refuse(path, kind, name, header[name], wanted)
+    names = ("REFTYPE", "INSTRUME", "DETECTOR", "FILTER", "READPATT")
+    stated = {name: str(header.get(name, "")).strip().upper() for name in names}
+    stated["READPATT"] = READOUT_NAMES.get(stated["READPATT"], stated["READPATT"])
+    wanted = {"REFTYPE": reftype.upper(), "INSTRUME": "MIRI", "DETECTOR": "MIRIMAGE"}
+    wanted["READPATT"] = exposure.readout
+    if filtered and exposure.filter is not None:
+        wanted["FILTER"] = exposure.filter.rpartition(".")[2].upper()
+    for name, value in wanted.items():
+        if stated[name] not in (value, *_ANY):
+            _refuse(path, kind, name, stated[name], value)
+    for name, value in {"NFRAMES": 1, "GROUPGAP": 0}.items() if timed else ():
+        if header.get(name, value) != value:
+            _refuse(path, kind, name, header[name], value)
 
 
 def _cut(path, kind, array, header, exposure):
@@ -85,21 +77,14 @@ def _cut(path, kind, array, header, exposure):
     return array[..., y : y + ny, x : x + nx]
 
 
-def _native(array, dtype=np.float32):
-    return np.ascontiguousarray(array, dtype)
-
-
 def _flags(path, kind, hdus, header, exposure):
     """Flags of a reference by the names in its legend, as `DQ`."""
     shape = exposure.shape
     if "DQ" not in hdus or hdus["DQ"].data is None:
         return np.zeros(shape, np.int64)
     stored = hdus["DQ"].data
-    stored = (
-        stored.reshape(stored.shape[-2:]) if stored.size == np.prod(stored.shape[-2:]) else stored
-    )
-    if stored.ndim > 2:
-        stored = np.bitwise_or.reduce(stored.reshape(-1, *stored.shape[-2:]), axis=0)
+    # those of groups and integrations together
+    stored = np.bitwise_or.reduce(stored.reshape(-1, *stored.shape[-2:]), axis=0)
     stored = _cut(path, kind, stored, header, exposure).astype(np.int64)
     table = hdus["DQ_DEF"].data if "DQ_DEF" in hdus else None
     if table is None or len(table) == 0:
@@ -113,14 +98,20 @@ def _flags(path, kind, hdus, header, exposure):
     return out
 
 
+def _header(hdus, path, kind, extension):
+    """Keywords of a file that must have an extension."""
+    if extension not in hdus:
+        wanted = _WANTED.format(kind, extension)
+        msg = f"{path} cannot be read as {wanted}: it has {[hdu.name for hdu in hdus]}"
+        raise DataError(msg)
+    return joined_header(hdus, extension)
+
+
 def _read(path, exposure, kind, reftype, extension="SCI", **options):
     """Array, header and flags of a reference."""
-    wanted = f"a {kind} reference of CRDS (FITS with {extension})"
+    wanted = _WANTED.format(kind, extension)
     with open_fits(path, wanted=wanted) as hdus:
-        if extension not in hdus:
-            msg = f"{path} cannot be read as {wanted}: it has {[hdu.name for hdu in hdus]}"
-            raise DataError(msg)
-        header = joined_header(hdus, extension)
+        header = _header(hdus, path, kind, extension)
         _check(path, kind, header, exposure, reftype=reftype, **options)
         shape = hdus[extension].shape
         if len(shape) < 2:
@@ -128,19 +119,15 @@ def _read(path, exposure, kind, reftype, extension="SCI", **options):
             raise DataError(msg)
         n_bytes = 4 * np.prod(shape[:-2], dtype=float) * np.prod(exposure.shape)
         check_memory(n_bytes, f"the {kind} reference {path}", advice="use one with fewer groups")
-        array = _native(_cut(path, kind, hdus[extension].data, header, exposure))
-        flags = _flags(path, kind, hdus, header, exposure)
-    return array, flags
+        array = _cut(path, kind, hdus[extension].data, header, exposure)
+        array = np.ascontiguousarray(array, np.float32)
+        return array, _flags(path, kind, hdus, header, exposure)
 
 
 def read_mask(path, exposure):
     """Flags of bad pixels; there is no other value."""
-    wanted = "a mask reference of CRDS (FITS with DQ)"
-    with open_fits(path, wanted=wanted) as hdus:
-        if "DQ" not in hdus:
-            msg = f"{path} cannot be read as {wanted}: it has {[hdu.name for hdu in hdus]}"
-            raise DataError(msg)
-        header = joined_header(hdus, "DQ")
+    with open_fits(path, wanted=_WANTED.format("mask", "DQ")) as hdus:
+        header = _header(hdus, path, "mask", "DQ")
         _check(path, "mask", header, exposure, reftype="MASK")
         return None, _flags(path, "mask", hdus, header, exposure)
 
@@ -243,31 +230,28 @@ def read_photom(path, exposure, day):
     `~miricigale.utils.exceptions.DataError`
         If there is no row for them, or the time is needed and not known.
     """
-    wanted = "a photom reference of CRDS (FITS with PHOTOM)"
     short = exposure.filter.rpartition(".")[2].upper()
-    with open_fits(path, wanted=wanted) as hdus:
-        if "PHOTOM" not in hdus:
-            msg = f"{path} cannot be read as {wanted}: it has {[hdu.name for hdu in hdus]}"
-            raise DataError(msg)
-        header = joined_header(hdus, "PHOTOM")
+    with open_fits(path, wanted=_WANTED.format("photom", "PHOTOM")) as hdus:
+        header = _header(hdus, path, "photom", "PHOTOM")
         for name, value in (("REFTYPE", "PHOTOM"), ("INSTRUME", "MIRI"), ("DETECTOR", "MIRIMAGE")):
             if str(header.get(name, value)).strip().upper() not in (value, *_ANY):
                 _refuse(path, "photom", name, header[name], value)
         rows = hdus["PHOTOM"].data
-        names = [str(name).strip().upper() for name in rows["filter"]]
-        parts = [str(name).strip().upper() for name in rows["subarray"]]
-        found = None
-        for part in (exposure.subarray, "GENERIC"):
-            index = [i for i in range(len(rows)) if (names[i], parts[i]) == (short, part)]
-            if index:
-                found = index[0]
-                break
-        if found is None:
+        columns = (
+            [str(name).strip().upper() for name in rows[key]] for key in ("filter", "subarray")
+        )
+        keys = list(zip(*columns, strict=True))
+        known = [
+            keys.index((short, part))
+            for part in (exposure.subarray, "GENERIC")
+            if (short, part) in keys
+        ]
+        if not known:
             msg = f"{path} has no row for {short} and {exposure.subarray}"
             raise DataError(msg)
-        conversion = float(rows["photmjsr"][found])
+        conversion = float(rows["photmjsr"][known[0]])
         times = {
-            name: {key.lower(): float(hdus[name].data[key][found]) for key in hdus[name].data.names
+            name: {key.lower(): float(hdus[name].data[key][known[0]]) for key in hdus[name].data.names
                    if key.lower() not in ("filter", "subarray")}
             for name in ("TIMECOEFF", *_TIMES) if name in hdus and hdus[name].data is not None
         }  # fmt: skip

@@ -10,6 +10,9 @@ __all__ = ["reference_channels", "reference_drift"]
 #: Channels of the read-out, to which columns belong in turn.
 _CHANNELS = 4
 
+#: Standard deviations at which the means are clipped.
+_CLIP = 3.0
+
 
 def reference_drift(data, reference):
     """
@@ -38,9 +41,7 @@ def reference_drift(data, reference):
     return drift - drift.mean()
 
 
-def reference_channels(
-    data, reference, *, origin=(0, 0), odd_even_rows=True, clip=3.0, window=None
-):
+def reference_channels(data, reference, *, origin=(0, 0), window=None):
     """
     Drift of each channel of the read-out, of odd and even rows apart.
 
@@ -51,11 +52,7 @@ def reference_channels(
     reference : `~numpy.ndarray` of bool, shape (ny, nx)
         Which pixels see no light.
     origin : tuple of int, optional
-        Column and row of the first pixel in the full frame: they tell its channel and parity.
-    odd_even_rows : bool, optional
-        Whether odd and even rows have levels of their own.
-    clip : float, optional
-        Sigma at which the means are clipped.
+        Column and row of the first pixel in the full frame, which determine its channel and parity.
     window : int or None, optional
         Odd number of groups over which the drift is smoothed in each integration (local straight
         lines), so that less of the noise of few reference pixels comes in; None for none.
@@ -83,8 +80,6 @@ def reference_channels(
     JWST pipeline documentation, reference pixel correction (MIRI).
     """
     n_int, n_group, ny, nx = data.shape
-    if not clip > 0:
-        raise argument_error("clip", "positive", clip)
     if window is not None and not (window >= 3 and window % 2 == 1 and int(window) == window):
         raise argument_error("window", "an odd number of at least 3, or None", window)
     columns = np.flatnonzero(reference.any(axis=0))
@@ -92,7 +87,7 @@ def reference_channels(
     pixels, known = data[..., columns], reference[:, columns]
     # left and right of the middle
     sides = [np.flatnonzero(columns < nx / 2), np.flatnonzero(columns >= nx / 2)]
-    parity = (np.arange(ny) + origin[1]) % 2 if odd_even_rows else np.zeros(ny, int)
+    parity = (np.arange(ny) + origin[1]) % 2
     values = np.zeros((n_int, n_group, 2, _CHANNELS))
     for channel in range(_CHANNELS):
         mine = [side[columns[side] % _CHANNELS == channel] for side in sides]
@@ -106,25 +101,23 @@ def reference_channels(
                 good = known[np.ix_(rows, side)].ravel()
                 part = pixels[:, :, rows][..., side].reshape(n_int, n_group, -1)[..., good]
                 change = part.astype(float) - part[:, :1]
-                values[:, :, odd, channel] += _clipped_mean(change, clip) / len(mine)
-    if not odd_even_rows:
-        values[:, :, 1] = values[:, :, 0]
+                values[:, :, odd, channel] += _clipped_mean(change) / len(mine)
     if window is not None:
         length = min(int(window), n_group - 1 + n_group % 2)
         if length >= 3:
             values[:, 1:] = savgol_filter(values, length, 1, axis=1)[:, 1:]
-    return values[:, :, parity if odd_even_rows else np.zeros(ny, int)]
+    return values[:, :, parity]
 
 
-def _clipped_mean(values, clip):
-    """Mean along the last axis, of what lies within ``clip`` standard deviations of it."""
+def _clipped_mean(values):
+    """Mean along the last axis, of what lies within three standard deviations of it."""
     keep = np.ones(values.shape, bool)
     while True:
         count = np.maximum(keep.sum(axis=-1), 1)
         mean = np.where(keep, values, 0).sum(axis=-1) / count
         residual = values - mean[..., None]
         spread = np.sqrt(np.where(keep, np.square(residual), 0).sum(axis=-1) / count)
-        new = keep & (np.abs(residual) <= clip * spread[..., None] + 1e-12)
+        new = keep & (np.abs(residual) <= _CLIP * spread[..., None] + 1e-12)
         if np.array_equal(new, keep):
             return mean
         keep = new

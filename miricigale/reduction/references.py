@@ -224,7 +224,7 @@ class ReferenceFiles:
     -----
     ``"measured"`` takes gain and read noise from the scatter of the ramp's own groups
     (`measure_noise`); in sub-arrays without reference pixels (``SUB256``, ``BRIGHTSKY``) under an even sky
-    the gain has slow noise of the read-out in it, of which a warning tells. References of the full frame are
+    the gain has slow noise of the read-out in it, and there is a warning. References of the full frame are
     cut to the sub-array of the exposure; one of
     another detector, filter, read-out pattern or part of the detector is refused.
 

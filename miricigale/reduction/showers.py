@@ -11,7 +11,7 @@ _LARGE = 300.0
 #: Pixels around a hit that are looked at, and the Gaussian width by which they are smoothed.
 _REACH, _WIDTH = 48, 4.0
 
-#: Groups before and after that tell what a pixel collects in one.
+#: Groups before and after from which the usual charge of one group is measured.
 _BESIDE = 3
 
 
@@ -19,8 +19,8 @@ def find_showers(data, jumps, usable, threshold, *, first_group, last_group):
     """
     Find the differences of groups that showers spoil, around large jumps.
 
-    What a pixel gains in the group of the jump is held against the median of what it gains in
-    the groups beside, smoothed over 4 pixels, with the jumps of the group left out. The noise is that
+    What a pixel gains in the group of the jump is compared with the median of what it gains in
+    the groups before and after, smoothed over 4 pixels, with the jumps of the group left out. The noise is that
     of the same pixels, from the scatter of their neighborhood.
 
     Parameters

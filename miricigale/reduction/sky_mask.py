@@ -75,7 +75,7 @@ def _risen(smooth, good, sky, threshold, area):
     # correlated noise is smoothed less, so that it is measured, on the negative side: of the
     # other the mask leaves a part
     below = -smooth[sky & (smooth < 0)]
-    # a million of them tell their median
+    # a million of them determine the median
     below = below[:: max(1, below.size // 1_000_000)].copy()
     if not below.size:
         return np.zeros(smooth.shape, bool)

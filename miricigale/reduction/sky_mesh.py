@@ -99,8 +99,7 @@ def sky_boxes(data, mask, box, *, mode=False):
     at = columns[:-1, None] + np.arange(width)
     inside = at < columns[1:, None]
     at = np.minimum(at, nx - 1)
-    found = {name: np.empty((rows.size - 1, n)) for name in ("level", "spread", "count", "y", "x")}
-    share = np.empty((rows.size - 1, n))
+    level, spread, count, share, y, x = np.empty((6, rows.size - 1, n))
     for i in range(rows.size - 1):
         strip = slice(rows[i], rows[i + 1])
         good = ~mask[strip]
@@ -110,20 +109,12 @@ def sky_boxes(data, mask, box, *, mode=False):
         values = np.sort(values.swapaxes(0, 1).reshape(n, -1), axis=1)
         number = np.add.reduceat(good.sum(axis=0), columns[:-1])
         for j, many in enumerate(number):
-            level, spread, count = _clipped(values[j, :many], mode)
-            found["level"][i, j], found["spread"][i, j], found["count"][i, j] = level, spread, count
+            level[i, j], spread[i, j], count[i, j] = _clipped(values[j, :many], mode)
         share[i] = number / (np.diff(columns) * good.shape[0])
-        y = np.add.reduceat(good.T @ np.arange(rows[i], rows[i + 1]), columns[:-1])
-        x = np.add.reduceat(good.sum(axis=0) * np.arange(nx), columns[:-1])
-        found["y"][i], found["x"][i] = (v / np.maximum(number, 1) for v in (y, x))
-    return SkyBoxes(
-        (rows, columns),
-        found["level"],
-        found["spread"],
-        found["count"].astype(int),
-        share,
-        (found["y"], found["x"]),
-    )
+        along_y = np.add.reduceat(good.T @ np.arange(rows[i], rows[i + 1]), columns[:-1])
+        along_x = np.add.reduceat(good.sum(axis=0) * np.arange(nx), columns[:-1])
+        y[i], x[i] = (v / np.maximum(number, 1) for v in (along_y, along_x))
+    return SkyBoxes((rows, columns), level, spread, count.astype(int), share, (y, x))
 
 
 def _clipped(values, mode):
@@ -244,7 +235,7 @@ def _filtered(values, size):
     if size == 1:
         return values
     before, after = (size - 1) // 2, size // 2
-    # what rises towards an edge goes on beyond it, or the median would pull it back
+    # what rises toward an edge is continued beyond it, or the median would pull it back
     padded = values
     for axis, n in enumerate(values.shape):
         ends = [(before, after) if k == axis else (0, 0) for k in (0, 1)]

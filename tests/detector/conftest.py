@@ -5,7 +5,7 @@ from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData
 
 from miricigale.detector import Block
-from miricigale.detector.effects import stream_key
+from miricigale.detector.effects.base import stream_key
 from miricigale.instrument import Exposure, miri_detector
 
 

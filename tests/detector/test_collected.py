@@ -133,11 +133,3 @@ def test_what_cannot_be_collected_is_refused(collect):
 
     with pytest.raises(ValueError, match=r"'effects' must be the package's own.*Glow"):
         collect(Detector((Photons(), Glow(), ADConversion())))
-
-
-def test_repr_says_what_was_collected(collect):
-    text = repr(collect(Detector.miri_imager(CosmicRays(flux=0.0))))
-    assert text == (
-        "<Charge miri.f770w: 3 integration(s) x 12 groups, 64 x 72 pixels, "
-        "0 deposits of cosmic rays>"
-    )

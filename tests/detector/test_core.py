@@ -4,15 +4,16 @@ import numpy as np
 import pytest
 from scipy import ndimage, stats
 
-from miricigale.detector import _core
-from miricigale.detector._core.random import GUIDE, fill_table, log_factorial
+from miricigale.detector._core.charge import add_poisson, couple_neighbors
+from miricigale.detector._core.random import GUIDE, fill_table, log_factorial, standard_normals
+from miricigale.detector._core.readout import add_pink_noise, digitize
 
 KEY = np.array([11, 22, 33, 44], np.uint64)
 
 
 def normals(shape, first_row=0, key=KEY):
     out = np.empty(shape)
-    _core.standard_normals(key, first_row, out)
+    standard_normals(key, first_row, out)
     return out
 
 
@@ -51,7 +52,7 @@ def test_a_row_does_not_know_its_block():
 @pytest.mark.parametrize("mean", [0.05, 0.555, 3.0, 9.99, 10.0, 31.0, 161.0, 5000.0])
 def test_poisson_numbers_are_poisson(mean):
     ramp = np.zeros((2, 100, 10, 100), np.float32)
-    _core.add_poisson(ramp, np.full((10, 100), mean), KEY, 0)
+    add_poisson(ramp, np.full((10, 100), mean), KEY, 0)
     counts = np.diff(ramp, axis=1, prepend=0).ravel().astype(int)
     low, high = stats.poisson.ppf([1e-3, 1 - 1e-3], mean).astype(int)
     # about 40 bins, each with many expected counts
@@ -84,7 +85,7 @@ def test_groups_of_any_means_are_poisson_and_independent():
     rng = np.random.default_rng(3)
     mean = 10 ** rng.uniform(-2, 4.6, (20, 500))
     ramp = np.zeros((1, 200, 20, 500), np.float32)
-    _core.add_poisson(ramp, mean, KEY, 0)
+    add_poisson(ramp, mean, KEY, 0)
     counts = np.diff(ramp[0].astype(float), axis=0, prepend=0)
     # beyond 2^24 the sum is no whole number in float32
     counts = counts[:, mean < 5e4]
@@ -116,8 +117,8 @@ def test_a_pixel_draws_the_same_beside_other_rows():
     rng = np.random.default_rng(4)
     mean = 10 ** rng.uniform(0, 3, (6, 90))
     whole, part = np.zeros((2, 50, 6, 90), np.float32), np.zeros((2, 50, 2, 90), np.float32)
-    _core.add_poisson(whole, mean, KEY, 100)
-    _core.add_poisson(part, np.ascontiguousarray(mean[3:5]), KEY, 103)
+    add_poisson(whole, mean, KEY, 100)
+    add_poisson(part, np.ascontiguousarray(mean[3:5]), KEY, 103)
     np.testing.assert_array_equal(whole[:, :, 3:5], part)
 
 
@@ -125,22 +126,22 @@ def test_dark_columns_leave_the_draws_of_others_alone():
     mean = np.full((3, 40), 25.0)
     mean[:, ::3] = 0.0
     ramp, alone = np.zeros((2, 2, 30, 3, 40), np.float32)
-    _core.add_poisson(ramp, mean, KEY, 0)
+    add_poisson(ramp, mean, KEY, 0)
     bright = mean[0] > 0
     assert not ramp[..., ~bright].any()
-    _core.add_poisson(alone[..., : bright.sum()], mean[:, bright], KEY, 0)
+    add_poisson(alone[..., : bright.sum()], mean[:, bright], KEY, 0)
     np.testing.assert_array_equal(ramp[..., bright], alone[..., : bright.sum()])
 
 
 def test_poisson_of_no_light_is_nothing():
     ramp = np.zeros((1, 5, 2, 8), np.float32)
-    _core.add_poisson(ramp, np.zeros((2, 8)), KEY, 0)
+    add_poisson(ramp, np.zeros((2, 8)), KEY, 0)
     assert not ramp.any()
 
 
 def test_enormous_means_stay_finite():
     ramp = np.zeros((1, 3, 1, 4), np.float32)
-    _core.add_poisson(ramp, np.full((1, 4), 1e15), KEY, 0)
+    add_poisson(ramp, np.full((1, 4), 1e15), KEY, 0)
     np.testing.assert_allclose(ramp[0, -1], 3e9, rtol=1e-3)
 
 
@@ -155,7 +156,7 @@ def test_coupling_is_a_convolution():
     ramp = rng.uniform(0, 1000, (1, 2, 9, 11)).astype(np.float32)
     kernel = np.array([[1, 2, 1], [3, 10, 4], [1, 5, 1]], np.float32) / 28
     expected = [ndimage.correlate(plane, kernel, mode="nearest") for plane in ramp[0]]
-    _core.couple_neighbors(ramp, kernel)
+    couple_neighbors(ramp, kernel)
     np.testing.assert_allclose(ramp[0], expected, rtol=1e-5)
 
 
@@ -164,7 +165,7 @@ def test_rounding_and_limits_of_the_converter():
     ramp = values.reshape(1, 1, 1, -1)
     counts = np.empty(ramp.shape, np.uint16)
     flags = np.zeros(ramp.shape, np.uint8)
-    _core.digitize(ramp, counts, flags, np.uint8(64), np.uint8(2))
+    digitize(ramp, counts, flags, np.uint8(64), np.uint8(2))
     assert counts.ravel().tolist() == [0, 0, 0, 1, 1235, 65535, 65535, 65535]
     assert flags.ravel().tolist() == [64, 0, 0, 0, 0, 0, 2, 2]
 
@@ -172,7 +173,7 @@ def test_rounding_and_limits_of_the_converter():
 def test_pink_noise_has_its_variance_and_falls_with_frequency():
     n_rows, n_group = 64, 128
     ramp = np.zeros((1, n_group, n_rows, 8), np.float32)
-    _core.add_pink_noise(ramp, 2.0, 10, 4, KEY, 0, n_rows)
+    add_pink_noise(ramp, 2.0, 10, 4, KEY, 0, n_rows)
     # columns share four outputs in turn
     np.testing.assert_array_equal(ramp[..., :4], ramp[..., 4:])
     series = ramp[0].reshape(-1, 8)[:, :4].astype(float)
@@ -184,5 +185,5 @@ def test_pink_noise_has_its_variance_and_falls_with_frequency():
     assert slope == pytest.approx(-1, abs=0.3)
     # and rows are what they are in any block
     part = np.zeros((1, n_group, 5, 8), np.float32)
-    _core.add_pink_noise(part, 2.0, 10, 4, KEY, 20, n_rows)
+    add_pink_noise(part, 2.0, 10, 4, KEY, 20, n_rows)
     np.testing.assert_array_equal(part, ramp[:, :, 20:25])

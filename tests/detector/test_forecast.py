@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from astropy.table import QTable
 
+from helpers.errors import refuses
 from miricigale.depth import forecast_table
 from miricigale.depth.saturation import NEVER, saturation_group
 from miricigale.detector import (
@@ -172,8 +173,7 @@ def test_sources_off_the_image_and_without_a_place(make_exposure, make_sky, plai
     )
     assert told.sources["id"].tolist() == [101, 102]
     assert len(plain.forecast(sky, exposure).sources) == 0
-    with pytest.raises(ValueError, match="'sources' must"):
-        plain.forecast(sky, exposure, sources=QTable({"id": [1]}))
+    refuses("'sources' must", plain.forecast, sky, exposure, sources=QTable({"id": [1]}))
 
 
 def test_table_of_several_exposures(make_exposure, make_sky, plain):
@@ -192,7 +192,5 @@ def test_table_of_several_exposures(make_exposure, make_sky, plain):
     assert table["ids"].tolist() == ["101", "101 100"]
     assert table["group_time"].unit == u.s
     assert table["sky_fraction"][1] == pytest.approx(8 * table["sky_fraction"][0])
-    with pytest.raises(ValueError, match="'forecasts' must be at least one"):
-        forecast_table([])
-    with pytest.raises(ValueError, match="'forecasts' must be made of SaturationForecast"):
-        forecast_table([exposure])
+    refuses("'forecasts' must be at least one", forecast_table, [])
+    refuses("'forecasts' must be made of SaturationForecast", forecast_table, [exposure])

@@ -6,6 +6,7 @@ import pytest
 from astropy.io import fits
 from astropy.time import Time
 
+from helpers.errors import refuses
 from helpers.real import real_file
 from miricigale.detector import Detector, Ramp, ramp_reader
 from miricigale.instrument import DQ, STEPS, steps_done
@@ -66,8 +67,7 @@ def test_reads_what_a_step_of_the_pipeline_saved(tmp_path):
     np.testing.assert_array_equal(second.data[0], data[1])
     assert second.exposure.n_integrations == 1
     assert second.steps == ramp.steps
-    with pytest.raises(ValueError, match="'number' must be from 0 to 1, got 2"):
-        ramp.integration(2)
+    refuses("'number' must be from 0 to 1, got 2", ramp.integration, 2)
 
 
 def test_ramps_larger_than_the_memory_are_refused_before_they_are_read(tmp_path, monkeypatch):
@@ -110,8 +110,7 @@ def test_a_ramp_of_a_ground_test():
     assert (exposure.readout, exposure.subarray) == ("FASTR1", "SUB64")
     assert ramp.group_time == 0.085
     assert not ramp.simulated
-    with pytest.raises(ValueError, match="'exposure' must be one with a filter, got None"):
-        exposure.pointing_keywords()
+    refuses("'exposure' must be one with a filter, got None", exposure.pointing_keywords)
 
 
 def test_an_exposure_of_nothing_is_not_simulated(make_exposure, make_sky):
@@ -123,8 +122,7 @@ def test_an_exposure_of_nothing_is_not_simulated(make_exposure, make_sky):
     }.items():
         with pytest.raises(ValueError, match=f"'exposure' must be one with a {name}"):
             Detector.miri_imager().expose(sky, exposure.replace(**options), seed=1)
-    with pytest.raises(ValueError, match="'pointing, roll' must be both given or both None"):
-        exposure.replace(roll=None)
+    refuses("'pointing, roll' must be both given or both None", exposure.replace, roll=None)
 
 
 def test_keywords_of_a_ramp_that_was_not_read_are_those_of_its_file(
@@ -144,8 +142,7 @@ def test_flags_of_another_shape_are_refused(tmp_path):
     stage(path)
     with fits.open(path, mode="update") as hdus:
         hdus["GROUPDQ"].data = hdus["GROUPDQ"].data[:, :3]
-    with pytest.raises(DataError, match=r"flags of shape \(2, 4, 64, 72\) in GROUPDQ"):
-        Ramp.read(path)
+    refuses(r"flags of shape \(2, 4, 64, 72\) in GROUPDQ", Ramp.read, path, error=DataError)
 
 
 def test_a_real_ramp_keeps_its_keywords_and_its_fifth_output(tmp_path):

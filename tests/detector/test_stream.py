@@ -17,6 +17,7 @@ from miricigale.detector import (
     Ramp,
     ReadNoise,
     ResetAnomaly,
+    ResetDecay,
     Residual,
 )
 
@@ -26,6 +27,7 @@ EVERYTHING = (
     ReadNoise(pink=2.0),
     Persistence(),
     ResetAnomaly(),
+    ResetDecay(),
     FirstFrame(),
     LastFrame(),
 )
@@ -40,6 +42,7 @@ def test_the_file_is_the_same_with_every_effect(make_exposure, make_sky, tmp_pat
     start = Time("2023-01-02T03:04:05")
     held = detector.expose(sky, exposure, **options)
     one = held.write(tmp_path / "a_uncal.fits", start=start)
+    # an odd number of rows, so that pairs that are reset together are in two blocks
     set_block_size(136 * 10 * 7)
     two = detector.expose_to(
         tmp_path / "b_uncal.fits", sky, exposure, start=start, n_threads=3, **options

@@ -7,6 +7,7 @@ from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 from numpy.testing import assert_allclose
 
+from helpers.errors import refuses
 from miricigale.instrument import (
     Exposure,
     dither_offsets,
@@ -118,8 +119,7 @@ def test_a_list_of_pointings(tmp_path):
     assert_allclose(read_dithers(several, observation=7).value, truth[:1])
     # all exposures have these
     assert_allclose(read_dithers(path, exposure=1).value, truth)
-    with pytest.raises(ValueError, match=r"'observation' must be one of \[4, 7\], got None"):
-        read_dithers(several)
+    refuses(r"'observation' must be one of \[4, 7\], got None", read_dithers, several)
     other = pointing_list(tmp_path / "nircam.pointing", {1: rows[4:5]})
     with pytest.raises(
         DataError, match=r"no exposures of MIRIM apertures; it has \['NRCALL_FULL'\]"
@@ -152,10 +152,8 @@ def test_tiles_meet_on_the_sky(overlap):
 
 
 def test_refuses_tiles():
-    with pytest.raises(ValueError, match="'n_y' must be a positive integer, got 0"):
-        tile_offsets(2, 0)
-    with pytest.raises(ValueError, match="'overlap' must be at least 0 and less than 1, got 1"):
-        tile_offsets(2, 2, overlap=1)
+    refuses("'n_y' must be a positive integer, got 0", tile_offsets, 2, 0)
+    refuses("'overlap' must be at least 0 and less than 1, got 1", tile_offsets, 2, 2, overlap=1)
 
 
 def test_exposures_of_a_list_with_dithers_of_their_own(tmp_path):
@@ -195,22 +193,17 @@ def test_a_table_has_no_observations(tmp_path):
     path = tmp_path / "dithers.ecsv"
     QTable({"x_offset": [1] * u.arcsec, "y_offset": [2] * u.arcsec}).write(path)
     for name in ("observation", "exposure"):
-        with pytest.raises(ValueError, match=f"'{name}' must be left out, but for a .pointing"):
-            read_dithers(path, **{name: 1})
+        refuses(f"'{name}' must be left out, but for a .pointing", read_dithers, path, **{name: 1})
 
 
 def test_refuses(tmp_path):
-    with pytest.raises(DataError, match="no file of dithers"):
-        read_dithers(tmp_path / "nothing.ecsv")
+    refuses("no file of dithers", read_dithers, tmp_path / "nothing.ecsv", error=DataError)
     path = tmp_path / "text.ecsv"
     path.write_text("nonsense")
-    with pytest.raises(DataError, match=r"text\.ecsv cannot be read as a table"):
-        read_dithers(path)
-    with pytest.raises(ValueError, match=r"'pattern' must be .*'y_offset'"):
-        dither_offsets(QTable({"x_offset": [1] * u.arcsec}))
+    refuses(r"text\.ecsv cannot be read as a table", read_dithers, path, error=DataError)
+    refuses(r"'pattern' must be .*'y_offset'", dither_offsets, QTable({"x_offset": [1] * u.arcsec}))
     with pytest.raises(u.UnitsError, match="'x_offset' must be convertible to arcsec"):
         dither_offsets(QTable({"x_offset": [1.0], "y_offset": [1.0]}))
-    with pytest.raises(ValueError, match="'start' must be 0 or a positive integer"):
-        dither_offsets("ceers", 3, start=-1)
+    refuses("'start' must be 0 or a positive integer", dither_offsets, "ceers", 3, start=-1)
     with pytest.raises(ValueError, match=r"'pattern' must be offsets of shape \(3, 2\)"):
         dither_offsets([[0, 0], [1, 2]] * u.arcsec, 2, start=1)

@@ -9,6 +9,7 @@ from astropy.coordinates import SkyCoord
 from astropy.tests.helper import assert_quantity_allclose
 from numpy.testing import assert_allclose
 
+from helpers.errors import refuses
 from miricigale.depth import saturation_forecast
 from miricigale.instrument import (
     CEERS_FILTERS,
@@ -102,8 +103,7 @@ def test_patterns_go_on_and_tables_are_taken():
         assert len(np.unique(offsets.value.round(6), axis=0)) == 13
     table = [[0, 0], [1, -2]] * u.arcsec
     assert_quantity_allclose(dither_offsets(table, 2), table)
-    with pytest.raises(ValueError, match=r"'pattern' must be offsets of shape \(3, 2\)"):
-        dither_offsets(table, 3)
+    refuses(r"'pattern' must be offsets of shape \(3, 2\)", dither_offsets, table, 3)
     with pytest.raises(KeyError, match="no dither pattern 'spiral'; known: 4-point"):
         dither_offsets("spiral", 3)
 
@@ -151,8 +151,7 @@ def test_normalizes_and_freezes():
     ],
 )
 def test_rejects_what_cannot_be_exposed(options, error, message):
-    with pytest.raises(error, match=message):
-        exposure(**options)
+    refuses(message, exposure, **options, error=error)
 
 
 def test_rejects_foreign_filters():

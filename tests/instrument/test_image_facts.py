@@ -3,6 +3,7 @@ import pytest
 from astropy.io import fits
 from astropy.nddata import CCDData
 
+from helpers.errors import refuses
 from miricigale.instrument import ImageFacts
 
 
@@ -34,5 +35,4 @@ def test_headers_of_files_are_understood():
 )
 def test_values_of_another_kind_are_named(key, value):
     image = CCDData(np.zeros((2, 2)), unit="MJy/sr", meta={key: value})
-    with pytest.raises(ValueError, match=rf"'image' must be one whose meta\['{key}'\] is"):
-        ImageFacts.of(image)
+    refuses(rf"'image' must be one whose meta\['{key}'\] is", ImageFacts.of, image)

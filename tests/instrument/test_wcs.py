@@ -7,6 +7,7 @@ from astropy.coordinates import SkyCoord
 from astropy.wcs import WCS
 from numpy.testing import assert_allclose
 
+from helpers.errors import refuses
 from miricigale.instrument import (
     Exposure,
     aperture,
@@ -171,8 +172,6 @@ def test_mosaic_holds_every_exposure_and_no_more():
     for values, n in ((x, nx), (y, ny)):
         assert -0.51 < values.min() < 1.5
         assert n - 2.5 < values.max() < n - 0.49
-    wider = mosaic_wcs(exposures, 0.11 * u.arcsec, margin=11 * u.arcsec)
-    assert_allclose(wider.pixel_shape, (nx + 200, ny + 200), atol=1)
 
 
 def test_offsets_follow_the_turned_axes():
@@ -183,16 +182,13 @@ def test_offsets_follow_the_turned_axes():
 
 
 def test_rejects_what_is_no_pointing():
-    with pytest.raises(ValueError, match="'pointing' must be one SkyCoord"):
-        imager_wcs((53, -27), ROLL)
+    refuses("'pointing' must be one SkyCoord", imager_wcs, (53, -27), ROLL)
     with pytest.raises(u.UnitsError, match="'roll' must be a quantity convertible to deg"):
         imager_wcs(FIELD, 35)
     with pytest.raises(KeyError, match="no sub-array 'SUB999'; known: BRIGHTSKY, FULL"):
         imager_wcs(FIELD, ROLL, subarray="SUB999")
-    with pytest.raises(ValueError, match="'pixel_scale' must be positive"):
-        north_up_wcs(FIELD, 0 * u.arcsec, (3, 3))
-    with pytest.raises(ValueError, match="'exposures' must be at least one exposure"):
-        mosaic_wcs([], 0.1 * u.arcsec)
+    refuses("'pixel_scale' must be positive", north_up_wcs, FIELD, 0 * u.arcsec, (3, 3))
+    refuses("'exposures' must be at least one exposure", mosaic_wcs, [], 0.1 * u.arcsec)
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -6,7 +6,7 @@ import pytest
 from astropy.io import fits
 
 from miricigale.detector import CosmicRays, Detector, Ramp
-from miricigale.detector.effects import Block, stream_key
+from miricigale.detector.effects.base import Block, stream_key
 from miricigale.instrument import DQ, Exposure, field_mask, flat_field, photmjsr
 from miricigale.reduction import RampSettings, Reducer
 

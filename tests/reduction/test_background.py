@@ -4,6 +4,7 @@ import pytest
 from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData, StdDevUncertainty
 
+from helpers.errors import refuses
 from miricigale.instrument import DQ, north_up_wcs
 from miricigale.reduction import (
     BackgroundFlags,
@@ -162,8 +163,7 @@ def test_masked_pixels_do_not_count(noise):
     ],
 )
 def test_bad_options_are_named(noise, options, match):
-    with pytest.raises(ValueError, match=match):
-        subtract_background(make(noise), **options)
+    refuses(match, subtract_background, make(noise), **options)
 
 
 def blobs(shape, number, peak, width, seed=0):

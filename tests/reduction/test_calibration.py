@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from astropy.nddata import CCDData, StdDevUncertainty
 
+from helpers.errors import refuses
 from miricigale.instrument import DQ, field_mask, flat_field, photmjsr, psf_fwhm
 from miricigale.psf import miri_psf
 from miricigale.reduction import calibrate, calibration, find_cosmic_rays
@@ -118,5 +119,4 @@ def test_a_masked_image_has_no_cosmic_rays():
         data, unit="MJy/sr", uncertainty=StdDevUncertainty(data), mask=np.ones((20, 20), bool)
     )
     assert not find_cosmic_rays(ccd, fwhm=2.0).any()
-    with pytest.raises(ValueError, match="'fwhm' must be positive"):
-        find_cosmic_rays(ccd, fwhm=0.0)
+    refuses("'fwhm' must be positive", find_cosmic_rays, ccd, fwhm=0.0)

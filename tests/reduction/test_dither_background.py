@@ -1,8 +1,8 @@
 import numpy as np
-import pytest
 from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData, StdDevUncertainty
 
+from helpers.errors import refuses
 from miricigale.instrument import north_up_wcs
 from miricigale.reduction import (
     BackgroundSettings,
@@ -122,11 +122,7 @@ def test_the_reducer_takes_backgrounds_of_dithers_in_its_second_pass():
 
 def test_bad_input_is_named():
     images, _, _ = dithers(3)
-    with pytest.raises(ValueError, match="'images' must be at least three dithers, got 2"):
-        dither_backgrounds(images[:2])
-    with pytest.raises(ValueError, match="'box' must be at least 1"):
-        dither_backgrounds(images, box=0)
-    with pytest.raises(ValueError, match="'backgrounds' must be one for each of 3 images"):
-        dither_backgrounds(images, [])
-    with pytest.raises(ValueError, match="'method' must be 'masked' or 'sep' or 'dithers'"):
-        BackgroundSettings("none")
+    refuses("'images' must be at least three dithers, got 2", dither_backgrounds, images[:2])
+    refuses("'box' must be at least 1", dither_backgrounds, images, box=0)
+    refuses("'backgrounds' must be one for each of 3 images", dither_backgrounds, images, [])
+    refuses("'method' must be 'masked' or 'sep' or 'dithers'", BackgroundSettings, "none")

@@ -7,6 +7,7 @@ from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData
 from astropy.table import Table
 
+from helpers.errors import refuses
 from miricigale.cli import main
 from miricigale.detector import Detector
 from miricigale.instrument import Exposure, background_level
@@ -94,8 +95,7 @@ def test_backgrounds_of_dithers_are_those_of_the_classes(files, tmp_path):
 
 
 def test_wrong_arguments_are_named(files, tmp_path, capsys):
-    with pytest.raises(ValueError, match="'paths' must be at least one file, got none"):
-        reduce_files([], tmp_path)
+    refuses("'paths' must be at least one file, got none", reduce_files, [], tmp_path)
     with pytest.raises(ValueError, match="files of different names, got two of f770w_0"):
         reduce_files([files[0], tmp_path / "f770w_0_cal.fits"], tmp_path)
     arguments = [

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from helpers.errors import refuses
 from miricigale.instrument import DQ, miri_detector
 from miricigale.reduction import fit_groups, reference_channels, reference_drift
 
@@ -317,8 +318,7 @@ def test_maps_give_each_pixel_what_its_own_constants_give():
     np.testing.assert_array_equal(
         fit_groups(data, usable=usable, **{**options, **maps}).rate[usable], fit.rate[usable]
     )
-    with pytest.raises(ValueError, match="'gain' must be positive, got 1 pixels"):
-        fit_groups(data, **{**options, **maps})
+    refuses("'gain' must be positive, got 1 pixels", fit_groups, data, **{**options, **maps})
 
 
 def test_reset_anomaly_and_dark_are_taken_off_by_group_and_integration():
@@ -421,8 +421,7 @@ def test_drift_of_channels_and_rows_is_taken_off_as_in_the_official_pipeline():
 )
 def test_bad_options_are_named(options, match):
     data = np.zeros((1, 5, 3, 4), np.uint16)
-    with pytest.raises(ValueError, match=match):
-        fit_groups(data, **{**OPTIONS, **options})
+    refuses(match, fit_groups, data, **{**OPTIONS, **options})
 
 
 def test_refuses_another_number_of_dimensions():

@@ -7,6 +7,7 @@ from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData, StdDevUncertainty
 from scipy.ndimage import convolve
 
+from helpers.errors import refuses
 from miricigale.detector import (
     BadPixels,
     CosmicRays,
@@ -167,30 +168,9 @@ def test_the_whole_way_keeps_fluxes_and_errors(field):
     assert 0.97 < pull.std() < 1.1
 
 
-def test_the_fine_mosaic_has_the_same_light(field):
-    exps, positions, _, ramps = field
-    reducer = Reducer(mosaics=MosaicSettings(outlier_threshold=None))
-    result = reducer.run(ramps[:2], pixel_scale=0.11 * u.arcsec)
-    fine = reducer.mosaic(result.images, mosaic_wcs(exps[:2], 0.06 * u.arcsec))
-    sums = []
-    for mosaic in (result.mosaic, fine):
-        area = pixel_area_map(mosaic.wcs, mosaic.shape)
-        x, y = (float(v) for v in mosaic.wcs.world_to_pixel(positions[5]))
-        yy, xx = np.mgrid[: mosaic.shape[0], : mosaic.shape[1]]
-        inside = np.hypot(xx - x, yy - y) * mosaic.meta["pixel_scale"] < 0.9
-        sums.append((mosaic.data * area)[inside].sum() * 1e12)
-    assert sums[1] == pytest.approx(sums[0], rel=0.01)
-
-
-def test_settings_do_not_change_and_results_do_not_depend_on_threads(field):
-    ramps = field[3]
-    one = Reducer(n_threads=1)
+def test_settings_do_not_change():
     with pytest.raises(AttributeError):
-        one.jump_threshold = 3.0
-    a, b = one.fit_ramp(ramps[0]), one.replace(n_threads=4).fit_ramp(ramps[0])
-    np.testing.assert_array_equal(a.data, b.data)
-    np.testing.assert_array_equal(a.uncertainty.array, b.uncertainty.array)
-    np.testing.assert_array_equal(a.flags, b.flags)
+        Reducer(n_threads=1).jump_threshold = 3.0
 
 
 def test_subarrays_beside_the_field_are_not_masked_away():
@@ -256,42 +236,34 @@ def test_groups_can_be_left_out():
     ],
 )
 def test_bad_settings_are_named(kind, options, match):
-    with pytest.raises(ValueError, match=match):
-        kind(**options)
+    refuses(match, kind, **options)
 
 
 def test_refuses_what_does_not_belong_together():
     reducer = Reducer(properties=DetectorProperties())
-    with pytest.raises(ValueError, match="'images' must be at least one image, got none"):
-        Reducer().combine([], [])
-    with pytest.raises(ValueError, match="'ramps' must be at least one ramp"):
-        reducer.run([])
+    refuses("'images' must be at least one image, got none", Reducer().combine, [], [])
+    refuses("'ramps' must be at least one ramp", reducer.run, [])
     ramps = [
         expose(5.0, exposure(n_groups=2, filt=f), without=[CosmicRays])
         for f in ("miri.f770w", "miri.f1000w")
     ]
-    with pytest.raises(ValueError, match=r"'ramps' must be of one filter \(miri.f770w\)"):
-        reducer.run(ramps)
+    refuses(r"'ramps' must be of one filter \(miri.f770w\)", reducer.run, ramps)
     bare = CCDData(np.ones((4, 4)), unit="adu / s", uncertainty=StdDevUncertainty(np.ones((4, 4))))
-    with pytest.raises(ValueError, match="'rate' must be an image whose meta has 'filter'"):
-        reducer.calibrate(bare)
+    refuses("'rate' must be an image whose meta has 'filter'", reducer.calibrate, bare)
 
 
 def test_what_is_no_ramp_or_grid_is_named():
     image = CCDData(np.zeros((8, 8)), unit="MJy/sr", uncertainty=StdDevUncertainty(np.ones((8, 8))))
     with pytest.raises(ValueError, match="'ramp' must be a Ramp or a Charge, got ndarray"):
         Reducer().fit_ramp(np.zeros((1, 5, 8, 8)))
-    with pytest.raises(ValueError, match="'wcs' must be an astropy WCS, got NoneType"):
-        Reducer().mosaic([image], None)
+    refuses("'wcs' must be an astropy WCS, got NoneType", Reducer().mosaic, [image], None)
     rate = Reducer().fit_ramp(expose(SKY, exposure()))
     grid = mosaic_wcs([exposure()], 0.11 * u.arcsec)
-    with pytest.raises(ValueError, match="'images' must be surface brightness"):
-        Reducer().mosaic([rate], grid)
+    refuses("'images' must be surface brightness", Reducer().mosaic, [rate], grid)
     cal = Reducer().calibrate(rate)
     far = mosaic_wcs([exposure()], 0.11 * u.arcsec)
     far.wcs.crval = [150.1, 2.2]
-    with pytest.raises(ValueError, match="'wcs' must be a grid that overlaps the images"):
-        Reducer().mosaic([cal], far)
+    refuses("'wcs' must be a grid that overlaps the images", Reducer().mosaic, [cal], far)
 
 
 def test_the_official_pipeline_is_asked_for_by_name(monkeypatch):

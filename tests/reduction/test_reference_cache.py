@@ -2,6 +2,7 @@
 
 import pytest
 
+from helpers.errors import refuses
 from helpers.references import write_cache
 from miricigale.reduction import ReferenceCache
 from miricigale.utils.exceptions import DataError
@@ -100,10 +101,8 @@ def test_the_context_is_that_of_the_variable_or_the_last(folder, monkeypatch):
 
 def test_what_is_not_there_is_named(folder, tmp_path, monkeypatch):
     monkeypatch.delenv("CRDS_PATH", raising=False)
-    with pytest.raises(ValueError, match="'folder' must be given, or the variable CRDS_PATH set"):
-        ReferenceCache()
-    with pytest.raises(DataError, match="is no CRDS cache of JWST"):
-        ReferenceCache(tmp_path / "nothing")
+    refuses("'folder' must be given, or the variable CRDS_PATH set", ReferenceCache)
+    refuses("is no CRDS cache of JWST", ReferenceCache, tmp_path / "nothing", error=DataError)
     with pytest.raises(DataError, match=r"is no CRDS cache with jwst_0009\.pmap"):
         ReferenceCache(folder, "jwst_0009.pmap")
     (folder / "references/jwst/miri/flight.fits").unlink()
@@ -122,11 +121,9 @@ def test_what_is_not_there_is_named(folder, tmp_path, monkeypatch):
 )
 def test_rules_of_other_kinds_are_refused(tmp_path, selector, match):
     write_cache(tmp_path, {"gain": (f"({DETECTOR},)", selector)})
-    with pytest.raises(DataError, match=match):
-        chosen(tmp_path)
+    refuses(match, chosen, tmp_path, error=DataError)
 
 
 def test_nothing_of_a_mapping_is_executed(tmp_path):
     write_cache(tmp_path, {"gain": (f"({DETECTOR},)", "__import__('os').getcwd()")})
-    with pytest.raises(DataError, match="cannot be read as a CRDS mapping"):
-        chosen(tmp_path)
+    refuses("cannot be read as a CRDS mapping", chosen, tmp_path, error=DataError)

@@ -8,6 +8,7 @@ from astropy.io import fits
 from astropy.nddata import CCDData
 from numpy.polynomial import Polynomial
 
+from helpers.errors import refuses
 from helpers.real import real_file
 from helpers.references import write_photom, write_reference
 from miricigale.detector import CosmicRays, Detector, InterpixelCapacitance, Ramp, ResetAnomaly
@@ -156,11 +157,9 @@ def test_a_bias_of_its_own_stands_before_the_polynomial(exposure, real, referenc
 
 
 def test_without_references_it_is_refused(ramp, real, references):
-    with pytest.raises(ValueError, match=r"did not simulate \(needed: mask, saturation, linear"):
-        Reducer().fit_ramp(real)
+    refuses(r"did not simulate \(needed: mask, saturation, linear", Reducer().fit_ramp, real)
     # our own ramps of another detector are not ours to reduce in silence either
-    with pytest.raises(ValueError, match="was made by another detector than miri_detector"):
-        Reducer().fit_ramp(ramp)
+    refuses("was made by another detector than miri_detector", Reducer().fit_ramp, ramp)
     rate = Reducer(references="simulated", skip_first=9).fit_ramp(ramp)
     assert rate.meta["reference_gain"] == "4 e-/DN of the simulated detector"
     rate = Reducer(properties=OTHER, skip_first=9).fit_ramp(ramp)
@@ -175,8 +174,7 @@ def test_without_references_it_is_refused(ramp, real, references):
     assert rate.meta["reference_dark"] == "none"
     with pytest.warns(MiricigaleWarning, match="the dark current is in the slopes still"):
         Reducer(references=partial, cosmic_rays=False).calibrate(rate)
-    with pytest.raises(ValueError, match="must be given for surface brightness"):
-        Reducer().calibrate(rate)
+    refuses("must be given for surface brightness", Reducer().calibrate, rate)
 
 
 def test_slopes_without_any_reference_have_measured_noise(real):
@@ -255,12 +253,9 @@ def test_files_for_something_else_are_refused(exposure, real, references, tmp_pa
     path = real_file("miri_facts/jwst_miri_readnoise_SLITLESSPRISM.fits")
     with pytest.raises(DataError, match="and not SUB256"):
         Reducer(references=references.replace(read_noise=path)).fit_ramp(real)
-    with pytest.raises(ValueError, match="'gain' must be the path of a file, got nowhere"):
-        ReferenceFiles(gain="nowhere.fits")
-    with pytest.raises(ValueError, match="'gain' must be a path or a number above 0 in e-/DN"):
-        ReferenceFiles(gain=-1.0)
-    with pytest.raises(ValueError, match=r"'flat' must be a path, got 1\.0"):
-        ReferenceFiles(flat=1.0)
+    refuses("'gain' must be the path of a file, got nowhere", ReferenceFiles, gain="nowhere.fits")
+    refuses("'gain' must be a path or a number above 0 in e-/DN", ReferenceFiles, gain=-1.0)
+    refuses(r"'flat' must be a path, got 1\.0", ReferenceFiles, flat=1.0)
 
 
 def test_flags_of_references_are_read_by_their_names(exposure, real, references, tmp_path):

@@ -7,6 +7,7 @@ from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData
 from scipy.ndimage import gaussian_filter
 
+from helpers.errors import refuses
 from miricigale.detector import CosmicRays, Detector
 from miricigale.instrument import DQ, Exposure, flat_field, miri_detector, photmjsr
 from miricigale.reduction import RampSettings, Reducer
@@ -76,5 +77,4 @@ def test_only_large_hits_make_showers():
 
 
 def test_a_wrong_threshold_is_named():
-    with pytest.raises(ValueError, match="'shower_threshold' must be positive or None"):
-        RampSettings(shower_threshold=0)
+    refuses("'shower_threshold' must be positive or None", RampSettings, shower_threshold=0)

@@ -9,35 +9,3 @@ same numbers, and a kernel may draw a neighboring row again where it needs it.
 All kernels release the interpreter lock. Ramps have shape (n_int, n_group, n_row, n_col),
 float32; ``first_row`` is the detector row of the block's first row.
 """
-
-from miricigale.detector._core.charge import (
-    add_cosmic_rays,
-    add_latent,
-    add_poisson,
-    cosmic_ray_deposits,
-    couple_neighbors,
-)
-from miricigale.detector._core.random import standard_normals
-from miricigale.detector._core.readout import (
-    add_noise,
-    add_pink_noise,
-    clip_well,
-    digitize,
-    interpolate_response,
-    pull_last_group,
-)
-
-__all__ = [
-    "add_cosmic_rays",
-    "add_latent",
-    "add_noise",
-    "add_pink_noise",
-    "add_poisson",
-    "clip_well",
-    "cosmic_ray_deposits",
-    "couple_neighbors",
-    "digitize",
-    "interpolate_response",
-    "pull_last_group",
-    "standard_normals",
-]

@@ -223,26 +223,11 @@ def _push(deposits, n, slot, head, row, col, charge):
 
 
 @njit(cache=True, nogil=True)
-def _deposits(
-    key,
-    first_row,
-    n_detector_rows,
-    n_row,
-    n_col,
-    n_slot,
-    hits_per_row,
-    thickness,
-    yield_median,
-    yield_sigma,
-    track_max,
-    leakage,
-    shower_fraction,
-    shower_charge,
-    shower_sigma,
-    shower_above,
-):
+def _deposits(key, first_row, n_detector_rows, n_row, n_col, n_slot, settings):
     """
-    Draw cosmic-ray hits, of which ``hits_per_row`` are expected in all ``n_slot`` groups.
+    Draw cosmic-ray hits of some rows, in all ``n_slot`` groups.
+
+    ``settings`` are ten numbers; ``hits_per_row`` hits are expected in a row and all groups.
 
     ``thickness`` of the layer and ``track_max`` are in pixels; ``yield_median`` is in electrons per
     pixel of path and ``yield_sigma`` the scatter of its natural logarithm. ``leakage`` is the share
@@ -253,6 +238,8 @@ def _deposits(
     Returns the deposits (next of the same group, row, column, electrons), their number, and the
     first of each group; -1 ends a list.
     """
+    hits_per_row, thickness, yield_median, yield_sigma, track_max, leakage = settings[:6]
+    shower_fraction, shower_charge, shower_sigma, shower_above = settings[6:]
     reach = math.ceil(track_max) + 2
     if shower_fraction > 0.0:
         reach = max(reach, math.ceil(3.0 * shower_sigma) + 1)
@@ -320,10 +307,10 @@ def _deposits(
 
 @njit(cache=True, nogil=True)
 def add_cosmic_rays(ramp, key, first_row, n_detector_rows, settings):
-    """Add the charge of cosmic-ray hits; ``settings`` are the last ten parameters of `_deposits`."""
+    """Add the charge of cosmic-ray hits; ``settings`` are those of `_deposits`."""
     n_int, n_group, n_row, n_col = ramp.shape
     deposits, _, head = _deposits(
-        key, first_row, n_detector_rows, n_row, n_col, n_int * n_group, *settings
+        key, first_row, n_detector_rows, n_row, n_col, n_int * n_group, settings
     )
     plane = np.zeros((n_row, n_col), np.float32)
     for i in range(n_int):
@@ -348,7 +335,7 @@ def cosmic_ray_deposits(key, first_row, n_detector_rows, shape, settings):
     """
     n_int, n_group, n_row, n_col = shape
     deposits, n, head = _deposits(
-        key, first_row, n_detector_rows, n_row, n_col, n_int * n_group, *settings
+        key, first_row, n_detector_rows, n_row, n_col, n_int * n_group, settings
     )
     where = np.empty((3, n), np.int32)
     charge = np.empty(n)

@@ -37,16 +37,8 @@ __all__ = [
 _GAMMA = np.uint64(0x9E3779B97F4A7C15)
 _MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
 _MIX_2 = np.uint64(0x94D049BB133111EB)
-_U11 = np.uint64(11)
-_U17 = np.uint64(17)
-_U23 = np.uint64(23)
-_U19 = np.uint64(19)
-_U27 = np.uint64(27)
-_U30 = np.uint64(30)
-_U31 = np.uint64(31)
-_U41 = np.uint64(41)
-_U45 = np.uint64(45)
-_U255 = np.uint64(255)
+_U11, _U17, _U19, _U23, _U27, _U30 = (np.uint64(n) for n in (11, 17, 19, 23, 27, 30))
+_U31, _U41, _U45, _U255 = (np.uint64(n) for n in (31, 41, 45, 255))
 _TO_UNIT = 2.0**-53
 
 #: Means from which PTRS is used (it needs at least 10).

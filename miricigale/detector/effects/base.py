@@ -15,7 +15,7 @@ __all__ = [
     "WholeBlock",
     "check_amounts",
     "check_finite",
-    "check_ramp",
+    "check_share",
     "key_words",
     "stream_key",
 ]
@@ -89,22 +89,17 @@ def stream_key(seed, exposure, name):
     return key_words(seed, "detector", exposure.filter, exposure.dither, name)
 
 
-def check_ramp(array, block, effect):
-    """Check that an effect on ramps was given one."""
-    if array.shape != block.ramp_shape:
-        msg = (
-            f"{type(effect).__name__} acts on a ramp of shape {block.ramp_shape} but was given "
-            f"shape {array.shape}: 'effects' must hold Photons before it"
-        )
-        raise ValueError(msg)
-    return array
-
-
 def check_finite(**values):
     """Check that settings are finite."""
     for name, value in values.items():
         if not np.all(np.isfinite(value)):
             raise argument_error(name, "finite", value)
+
+
+def check_share(name, value, highest=1):
+    """Check that a setting lies between 0 and ``highest``."""
+    if not 0 <= value <= highest:
+        raise argument_error(name, f"from 0 to {highest}", value)
 
 
 def check_amounts(*, above_zero=False, **values):

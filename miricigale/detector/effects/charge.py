@@ -5,8 +5,15 @@ import dataclasses
 import numpy as np
 from scipy import ndimage
 
-from miricigale.detector import _core
-from miricigale.detector.effects.base import Effect, check_amounts, check_ramp
+from miricigale.detector._core.charge import (
+    add_cosmic_rays,
+    add_latent,
+    add_poisson,
+    cosmic_ray_deposits,
+    couple_neighbors,
+)
+from miricigale.detector._core.readout import clip_well
+from miricigale.detector.effects.base import Effect, check_amounts, check_share
 from miricigale.instrument import DQ, bad_pixel_mask, reference_pixel_mask
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import TIME, to_array
@@ -38,11 +45,10 @@ class Dark(Effect):
     def __post_init__(self):
         check_amounts(current=self.current)
 
-    def apply(self, array, block):
+    def apply(self, ramp, block):
         """Add the dark charge."""
-        ramp = check_ramp(array, block, self)
         mean = np.full(ramp.shape[2:], self._rate(block.properties) * block.group_time)
-        _core.add_poisson(ramp, mean, block.key, block.rows.start)
+        add_poisson(ramp, mean, block.key, block.rows.start)
         return ramp
 
     def expected(self, array, block):
@@ -64,11 +70,10 @@ class InterpixelCapacitance(Effect):
     halo = 1
     included_as = "ipc"
 
-    def apply(self, array, block):
+    def apply(self, ramp, block):
         """Couple the accumulated charge of neighbors."""
-        ramp = check_ramp(array, block, self)
         kernel = np.asarray(block.properties.ipc_kernel, np.float32)
-        _core.couple_neighbors(ramp, kernel)
+        couple_neighbors(ramp, kernel)
         return ramp
 
     def expected(self, array, block):
@@ -127,25 +132,16 @@ class CosmicRays(Effect):
     shower_above: float = 0.0
 
     def __post_init__(self):
-        check_amounts(
-            flux=self.flux,
-            yield_median=self.yield_median,
-            yield_dex=self.yield_dex,
-            shower_charge=self.shower_charge,
-            shower_above=self.shower_above,
-        )
+        for name in ("flux", "yield_median", "yield_dex", "shower_charge", "shower_above"):
+            check_amounts(**{name: getattr(self, name)})
         check_amounts(above_zero=True, thickness=self.thickness, shower_sigma=self.shower_sigma)
-        if not 0 <= self.leakage <= 0.2:
-            raise argument_error("leakage", "from 0 to 0.2", self.leakage)
-        if not 0 <= self.shower_fraction <= 1:
-            raise argument_error("shower_fraction", "from 0 to 1", self.shower_fraction)
-        if not 0 <= self.track_max <= 200:
-            raise argument_error("track_max", "from 0 to 200 pixels", self.track_max)
+        check_share("leakage", self.leakage, 0.2)
+        check_share("shower_fraction", self.shower_fraction)
+        check_share("track_max", self.track_max, 200)
 
-    def apply(self, array, block):
+    def apply(self, ramp, block):
         """Add the charge of the hits."""
-        ramp = check_ramp(array, block, self)
-        _core.add_cosmic_rays(ramp, *self._arguments(block))
+        add_cosmic_rays(ramp, *self._arguments(block))
         return ramp
 
     def hits(self, block):
@@ -166,7 +162,7 @@ class CosmicRays(Effect):
             A pixel may have several in one group.
         """
         key, first, n_rows, settings = self._arguments(block)
-        where, electrons = _core.cosmic_ray_deposits(key, first, n_rows, block.ramp_shape, settings)
+        where, electrons = cosmic_ray_deposits(key, first, n_rows, block.ramp_shape, settings)
         where[1] += first
         return where, electrons
 
@@ -176,19 +172,10 @@ class CosmicRays(Effect):
         flux = properties.cosmic_ray_flux if self.flux is None else self.flux
         pitch = properties.pixel_pitch
         hits_per_row = flux * pitch**2 * block.ramp_shape[3] * block.total_time
-        settings = (
-            float(hits_per_row),
-            float(self.thickness / pitch),
-            float(self.yield_median * pitch),
-            float(self.yield_dex * np.log(10.0)),
-            float(self.track_max),
-            float(self.leakage),
-            float(self.shower_fraction),
-            float(self.shower_charge),
-            float(self.shower_sigma),
-            float(self.shower_above),
-        )
-        return block.key, block.rows.start, block.exposure.shape[0], settings
+        track = self.thickness / pitch, self.yield_median * pitch, self.yield_dex * np.log(10.0)
+        shower = self.shower_fraction, self.shower_charge, self.shower_sigma, self.shower_above
+        settings = (hits_per_row, *track, self.track_max, self.leakage, *shower)
+        return block.key, block.rows.start, block.exposure.shape[0], tuple(map(float, settings))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -198,7 +185,7 @@ class Persistence(Effect):
 
     A pixel that was filled at the rate R collects, a time t after that exposure,
     ``R sum_k amplitudes[k] exp(-t / times[k])`` more electrons per second. Resets do not
-    stop it: time goes on through all integrations and the reset frames between them.
+    stop it: time runs through all integrations and the reset frames between them.
     Without ``previous`` nothing happens. What is remembered was measured behind the interpixel
     capacitance, so that the effect stands after it.
 
@@ -261,9 +248,8 @@ class Persistence(Effect):
             for a, t in zip(self.amplitudes, self.times, strict=True)
         )
 
-    def apply(self, array, block):
+    def apply(self, ramp, block):
         """Add the charge that comes free."""
-        ramp = check_ramp(array, block, self)
         if not block.previous:
             return ramp
         rates = np.stack([latent.rate.value[block.rows] for latent in block.previous])
@@ -271,11 +257,11 @@ class Persistence(Effect):
         if released.shape[1:] != block.ramp_shape[:2]:
             # all groups as one
             released = released.sum(axis=(1, 2), keepdims=True)
-        _core.add_latent(ramp, rates, released, block.key, block.rows.start)
+        add_latent(ramp, rates, released, block.key, block.rows.start)
         return ramp
 
     def expected(self, array, block):
-        """Add the mean rate over all groups, where previous exposures are told."""
+        """Add the mean rate over all groups, where previous exposures are given."""
         if not block.previous:
             return array
         rates = [latent.rate.value[block.rows] for latent in block.previous]
@@ -305,13 +291,12 @@ class BadPixels(Effect):
     def __post_init__(self):
         check_amounts(hot_current=self.hot_current)
 
-    def apply(self, array, block):
+    def apply(self, ramp, block):
         """Empty the dead pixels and heat the hot ones."""
-        ramp = check_ramp(array, block, self)
         dead, hot = self._pixels(block)
         ramp[:, :, dead] = 0.0
         mean = np.where(hot, self.hot_current * block.group_time, 0.0)
-        _core.add_poisson(ramp, mean, block.key, block.rows.start)
+        add_poisson(ramp, mean, block.key, block.rows.start)
         block.pixel_dq[dead] |= np.uint32(DQ.DEAD | DQ.DO_NOT_USE)
         block.pixel_dq[hot] |= np.uint32(DQ.HOT | DQ.DO_NOT_USE)
         return ramp
@@ -338,9 +323,8 @@ class ReferencePixels(Effect):
     REFERENCE_PIXEL and NON_SCIENCE.
     """
 
-    def apply(self, array, block):
+    def apply(self, ramp, block):
         """Empty the reference columns."""
-        ramp = check_ramp(array, block, self)
         mask = reference_pixel_mask(subarray=block.exposure.subarray)[block.rows]
         ramp[:, :, mask] = 0.0
         block.pixel_dq[mask] |= np.uint32(DQ.REFERENCE_PIXEL | DQ.NON_SCIENCE)
@@ -368,11 +352,10 @@ class Saturation(Effect):
     def __post_init__(self):
         check_amounts(above_zero=True, full_well=self.full_well)
 
-    def apply(self, array, block):
+    def apply(self, ramp, block):
         """Clip the charge and flag it."""
-        ramp = check_ramp(array, block, self)
         well = self.limit(block.properties)
-        _core.clip_well(ramp, well, block.group_dq, np.uint8(DQ.SATURATED))
+        clip_well(ramp, well, block.group_dq, np.uint8(DQ.SATURATED))
         return ramp
 
     def limit(self, properties):

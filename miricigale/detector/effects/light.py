@@ -6,7 +6,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from miricigale.depth import residual_amplitude, residual_presets
-from miricigale.detector import _core
+from miricigale.detector._core.charge import add_poisson
+from miricigale.detector._core.random import standard_normals
 from miricigale.detector.effects.base import Effect, key_words
 from miricigale.instrument import electrons_per_brightness, flat_field
 from miricigale.utils.exceptions import argument_error, unknown_name
@@ -56,7 +57,7 @@ class Residual(Effect):
         # a row is drawn from the first column of the detector on, whatever part is read
         white = np.empty((n_row + 2 * reach, left + n_col + 2 * reach))
         # rows beyond the detector have streams of their own
-        _core.standard_normals(key, bottom + block.rows.start - reach + 10_000, white)
+        standard_normals(key, bottom + block.rows.start - reach + 10_000, white)
         white = white[:, left:]
         if reach:
             delta = np.zeros(2 * reach + 1)
@@ -91,7 +92,7 @@ class Photons(Effect):
         """Turn surface brightness (MJy/sr) into a ramp (electrons)."""
         mean = self.expected(array, block) * block.group_time
         ramp = np.zeros(block.ramp_shape, np.float32)
-        _core.add_poisson(ramp, np.ascontiguousarray(mean, float), block.key, block.rows.start)
+        add_poisson(ramp, np.ascontiguousarray(mean, float), block.key, block.rows.start)
         return ramp
 
     def expected(self, array, block):

@@ -3,7 +3,7 @@
 import ast
 import itertools
 
-from miricigale.detector.effects.base import OtherEffect, stream_key
+from miricigale.detector.effects.base import Effect, OtherEffect, stream_key
 from miricigale.detector.effects.charge import (
     BadPixels,
     CosmicRays,
@@ -18,7 +18,7 @@ from miricigale.detector.effects.readout import ADConversion, Bias, Nonlinearity
 from miricigale.detector.effects.reset import FirstFrame, LastFrame, ResetAnomaly, ResetDecay
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["ORDER", "check_order", "effect_from_record", "keyed", "place_of"]
+__all__ = ["ORDER", "check_order", "checked_effects", "effect_from_record", "keyed", "place_of"]
 
 #: The order in which the effects act. Others may stand anywhere after `Photons`.
 ORDER = (
@@ -66,6 +66,15 @@ def effect_from_record(record):
         if kind.__name__ == name:
             return kind(**settings)
     return OtherEffect(name, tuple(settings.items()))
+
+
+def checked_effects(effects):
+    """Effects as a tuple; anything that is not an effect is refused."""
+    effects = tuple(effects)
+    for effect in effects:
+        if not isinstance(effect, Effect):
+            raise argument_error("effects", "made of detector effects", repr(effect))
+    return effects
 
 
 def place_of(effect):

@@ -4,8 +4,14 @@ import dataclasses
 
 import numpy as np
 
-from miricigale.detector import _core
-from miricigale.detector.effects.base import Effect, check_amounts, check_finite, check_ramp
+from miricigale.detector._core.random import standard_normals
+from miricigale.detector._core.readout import (
+    add_noise,
+    add_pink_noise,
+    digitize,
+    interpolate_response,
+)
+from miricigale.detector.effects.base import Effect, check_amounts, check_finite
 from miricigale.instrument import DQ
 from miricigale.utils.exceptions import argument_error
 
@@ -28,9 +34,8 @@ class Nonlinearity(Effect):
 
     linear: bool = False
 
-    def apply(self, array, block):
+    def apply(self, ramp, block):
         """Turn electrons into DN above the bias."""
-        ramp = check_ramp(array, block, self)
         properties = block.properties
         step = 8.0
         nodes = step * np.arange(
@@ -38,7 +43,7 @@ class Nonlinearity(Effect):
         )
         response = self.response(nodes, properties)
         response = np.ascontiguousarray(response, np.float32)
-        _core.interpolate_response(ramp, float(properties.gain), response, step)
+        interpolate_response(ramp, float(properties.gain), response, step)
         return ramp
 
     def response(self, dn, properties):
@@ -72,17 +77,16 @@ class Bias(Effect):
         if self.level is not None:
             check_finite(level=self.level)
 
-    def apply(self, array, block):
+    def apply(self, ramp, block):
         """Add the level."""
-        ramp = check_ramp(array, block, self)
         level = self.mean(block.properties)
         ramp += np.float32(level)
         if self.reset_noise:
             offset = np.empty(ramp.shape[2:])
             for i in range(ramp.shape[0]):
-                # integrations are told apart by the row that the stream is for
+                # integrations are distinguished by the row that the stream is for
                 first = block.rows.start + (i + 1) * 2**20
-                _core.standard_normals(block.key, first, offset)
+                standard_normals(block.key, first, offset)
                 ramp[i] += np.asarray(self.reset_noise * offset, np.float32)
         return ramp
 
@@ -117,17 +121,16 @@ class ReadNoise(Effect):
         if not 1 <= self.octaves <= 40 or int(self.octaves) != self.octaves:
             raise argument_error("octaves", "an integer from 1 to 40", self.octaves)
 
-    def apply(self, array, block):
+    def apply(self, ramp, block):
         """Add the noise."""
-        ramp = check_ramp(array, block, self)
         sigma = self.deviation(block.properties)
         first = block.rows.start
-        _core.add_noise(ramp, float(sigma), block.key, first)
+        add_noise(ramp, float(sigma), block.key, first)
         if self.pink:
             # streams apart from those of the white noise
             key = block.key[::-1].copy()
             n_rows = block.exposure.shape[0]
-            _core.add_pink_noise(ramp, float(self.pink), int(self.octaves), 4, key, first, n_rows)
+            add_pink_noise(ramp, float(self.pink), int(self.octaves), 4, key, first, n_rows)
         return ramp
 
     def deviation(self, properties):
@@ -146,9 +149,8 @@ class ADConversion(Effect):
             return np.inf
         return float(properties.gain * properties.linearize(highest))
 
-    def apply(self, array, block):
+    def apply(self, ramp, block):
         """Turn DN into counts."""
-        ramp = check_ramp(array, block, self)
         counts = np.empty(ramp.shape, np.uint16)
-        _core.digitize(ramp, counts, block.group_dq, np.uint8(DQ.AD_FLOOR), np.uint8(DQ.SATURATED))
+        digitize(ramp, counts, block.group_dq, np.uint8(DQ.AD_FLOOR), np.uint8(DQ.SATURATED))
         return counts

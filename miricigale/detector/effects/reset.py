@@ -20,8 +20,8 @@ import dataclasses
 
 import numpy as np
 
-from miricigale.detector import _core
-from miricigale.detector.effects.base import Effect, check_finite, check_ramp
+from miricigale.detector._core.readout import pull_last_group
+from miricigale.detector.effects.base import Effect, check_finite
 from miricigale.instrument import reference_pixel_mask
 from miricigale.utils.exceptions import argument_error
 
@@ -84,9 +84,8 @@ class ResetAnomaly(Effect):
         amplitudes = [self.amplitudes[min(i, last)] for i in range(n_integrations)]
         return np.outer(amplitudes, np.exp(-np.arange(n_groups) / self.groups))
 
-    def apply(self, array, block):
+    def apply(self, ramp, block):
         """Add the offsets."""
-        ramp = check_ramp(array, block, self)
         offsets = self.offsets(*ramp.shape[:2]).astype(np.float32)
         sees = _light_sensitive(block).astype(np.float32)
         for i, g in np.ndindex(*offsets.shape):
@@ -121,9 +120,8 @@ class ResetDecay(Effect):
         if not (np.isfinite(self.groups) and self.groups > 0):
             raise argument_error("groups", "positive", self.groups)
 
-    def apply(self, array, block):
+    def apply(self, ramp, block):
         """Offset the groups of all integrations but the first."""
-        ramp = check_ramp(array, block, self)
         sees = _light_sensitive(block)
         decay = (self.share * np.exp(-np.arange(ramp.shape[1]) / self.groups)).astype(np.float32)
         # the last first: what an integration is offset by is of the one before as it was
@@ -150,9 +148,8 @@ class FirstFrame(Effect):
     def __post_init__(self):
         check_finite(offset=self.offset)
 
-    def apply(self, array, block):
+    def apply(self, ramp, block):
         """Offset the first groups."""
-        ramp = check_ramp(array, block, self)
         ramp[:, 0] += np.float32(self.offset) * _light_sensitive(block).astype(np.float32)
         return ramp
 
@@ -186,11 +183,10 @@ class LastFrame(Effect):
         if not 0 <= self.coupling < 1:
             raise argument_error("coupling", "a share from 0 to 1", self.coupling)
 
-    def apply(self, array, block):
+    def apply(self, ramp, block):
         """Pull the last groups."""
-        ramp = check_ramp(array, block, self)
         sees = _light_sensitive(block)
-        _core.pull_last_group(
+        pull_last_group(
             ramp, sees, block.rows.start, np.float32(self.offset), np.float32(self.coupling)
         )
         return ramp

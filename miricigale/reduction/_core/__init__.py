@@ -18,29 +18,3 @@ squared that a free difference j brings.
 
 All integrations of a pixel share one slope and one Poisson variance.
 """
-
-from miricigale.reduction._core.drawing import draw_slopes, hit_slopes, tabulate, variances
-from miricigale.reduction._core.lanes import refit
-from miricigale.reduction._core.pixel import (
-    DO_NOT_USE,
-    JUMP,
-    JUMP_NEIGHBOR,
-    SATURATED,
-    own_charge,
-)
-from miricigale.reduction._core.rows import BLOCK, fit_rows
-
-__all__ = [
-    "BLOCK",
-    "DO_NOT_USE",
-    "JUMP",
-    "JUMP_NEIGHBOR",
-    "SATURATED",
-    "draw_slopes",
-    "fit_rows",
-    "hit_slopes",
-    "own_charge",
-    "refit",
-    "tabulate",
-    "variances",
-]
