@@ -99,7 +99,7 @@ class Module:
         return choices[number]
 
     def ignore(self, *keys):
-        """Take parameters that change nothing, or that another line of the report tells of."""
+        """Take parameters that change nothing, or that another line of the report names."""
         self._taken.update(keys)
 
     def rest(self):

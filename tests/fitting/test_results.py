@@ -80,7 +80,7 @@ def test_no_parameter_leaves_its_limits():
     assert results[0].distribution("slope")[0][-1].value == pytest.approx(0.2)
 
 
-def test_views_agree_with_the_catalogue(results):
+def test_views_agree_with_the_catalog(results):
     view = results[3]
     assert view.ids == 3
     assert view.chi2 == results.chi2[3]

@@ -11,7 +11,7 @@ from astropy.table import QTable
 from scipy.stats import chi2
 
 from miricigale.filters import FilterSet
-from miricigale.fitting import BayesFitter, Samples
+from miricigale.fitting import BayesFitter, GridSettings, Samples
 from miricigale.sed import SED, SEDModel
 from miricigale.utils.exceptions import DataError
 
@@ -314,7 +314,7 @@ def test_draws_have_the_joint_posterior_of_all_models(make_grid, draw_photometry
     """Frequencies of (galaxy, torus, fraction) against the weights of all models, by chi2."""
     grid = make_grid(3)
     table, _ = draw_photometry(grid, 3, seed=5)
-    fitter = BayesFitter(grid, rtol=0)
+    fitter = BayesFitter(grid, settings=GridSettings(rtol=0))
     results = fitter.fit(table)
     n = 20_000
     samples = fitter.sample(table, n, seed=9)

@@ -154,7 +154,7 @@ def fit_experiment(context, unit):
         options = {
             "engine": plan["sampler"],
             "priors": sampler_priors(options["axes"]),
-            **plan["options"],
+            "settings": fitting.SamplerSettings(**plan["options"]),
         }
         given["seed"] = context.seed
     model_error = 0.0 if name == "no_model_error" else config.fit.model_error
