@@ -45,7 +45,7 @@ class BayesFitter:
 
     On a grid, pairs (galaxy, AGN template) that no AGN fraction can make good enough are found by a
     bound and left out; of the rest those with most of the weight are evaluated in double precision,
-    the others in single precision unless ``rtol`` is below 5e-7. A sampler takes parameters as
+    the others in single precision unless ``rtol`` of the settings is below 5e-7. A sampler takes parameters as
     they are, continuous, object by object; models older than the universe, or impossible together,
     have no weight.
 
@@ -73,22 +73,22 @@ class BayesFitter:
     engine : {"grid", "nautilus", "dynesty"} or callable, optional
         How the posterior is found: on a grid, or by a sampler. A callable is a sampler of the
         user's; see `miricigale.fitting.samplers.get_sampler`.
+    axes : dict, optional
+        Parameter name to values, for a grid of a model (see `~miricigale.sed.SEDModel.grid`).
     model_error, error_floor : float or dict of str to float, optional
         Part of the flux that is added to its error in quadrature, and least relative error of a flux,
         for all or by filter.
     template_error : `~miricigale.fitting.TemplateError`, optional
         Of a grid: error of the models by rest wavelength, added in quadrature too; what it does to the
         normalization of the likelihood counts. ``sigma`` of the results has that of the best model.
+    scale_error : bool, optional
+        Whether the uncertainty of each model's own scale is part of the posterior of masses,
+        luminosities and fluxes: so by default, but CIGALE leaves it out.
     n_bands_min : int, optional
         Objects with fewer usable bands, upper limits among them, are flagged and not fitted. One
         band at least must be no limit.
     max_reduced_chi2 : float, optional
         Above this reduced chi2 of the best model an object is flagged.
-    scale_error : bool, optional
-        Whether the uncertainty of each model's own scale is part of the posterior of masses,
-        luminosities and fluxes: so by default, but CIGALE leaves it out.
-    axes : dict, optional
-        Parameter name to values, for a grid of a model (see `~miricigale.sed.SEDModel.grid`).
     compat : {"cigale"}, optional
         Reproduce choices of CIGALE that are not ours: no ``scale_error``, no result where the best
         chi2 is above 1417 (its weights, from which the best chi2 is not subtracted, all vanish;
@@ -113,11 +113,14 @@ class BayesFitter:
 
     Examples
     --------
-    >>> from miricigale.fitting import BayesFitter
+    >>> from miricigale.fitting import BayesFitter, SamplerSettings
     >>> fitter = BayesFitter(grid)  # doctest: +SKIP
     >>> fitter.fit(photometry).to_table()["id", "redshift_mean"]  # doctest: +SKIP
     >>> priors = {"redshift": (0.01, 6), "tau": (0.1, 10, "log"), "age": (0.1, 13), "ebv": (0, 1)}
-    >>> fitter = BayesFitter(model, bands, priors=priors, engine="nautilus")  # doctest: +SKIP
+    >>> settings = SamplerSettings(n_live=300)
+    >>> fitter = BayesFitter(  # doctest: +SKIP
+    ...     model, bands, priors=priors, engine="nautilus", settings=settings
+    ... )
     >>> results = fitter.fit(photometry, seed=1)  # doctest: +SKIP
 
     References

@@ -74,7 +74,7 @@ class GridFit:
         """Make a grid if it is none, work out its priors and derived quantities, set the engine up."""
         if compat not in (None, "cigale"):
             raise argument_error("compat", "None or 'cigale'", repr(compat))
-        finer, interpolate = settings.finer, settings.interpolate
+        finer, interpolate = settings.finer, int(settings.interpolate)
         grid = model
         if isinstance(model, SEDModel):
             if axes is None or filters is None:

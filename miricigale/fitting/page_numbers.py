@@ -101,8 +101,6 @@ def known_redshifts(rows, name):
         return None, None
     if name not in names:
         raise argument_error("z_spec", f"one of the columns {list(names)}", repr(name))
-    values = []
-    for i in range(rows.n_chunks):
-        values.append(plain_floats(rows.chunk(i)[name], name, "photometry"))
-    z = np.concatenate(values)
+    chunks = (rows.chunk(i) for i in range(rows.n_chunks))
+    z = np.concatenate([plain_floats(chunk[name], name, "photometry") for chunk in chunks])
     return name, np.where(z > 0, z, np.nan)

@@ -247,17 +247,8 @@ def test_axes_in_our_units(tmp_path):
 def test_parameters_and_options_of_the_chain(tmp_path):
     setup = quiet(write(tmp_path))
     model = setup.model()
-    assert [c.name for c in model.components] == [
-        *(
-            "delayed",
-            "bc03",
-            "nebular",
-            "modified_starburst",
-            "dl07",
-            "parametric_torus",
-            "meiksin2006",
-        )
-    ]
+    names = "delayed bc03 nebular modified_starburst dl07 parametric_torus meiksin2006"
+    assert [c.name for c in model.components] == names.split()
     defaults = {name: p.default for name, p in model.parameters.items()}
     wanted = {"f_burst": 0, "age_burst": 0.02, "tau_burst": 0.05, "separation_age": 10}
     wanted |= {
@@ -351,7 +342,7 @@ def test_other_modules(tmp_path):
     np.testing.assert_allclose(axes["alpha_mir"], [2.0, 2.5])
     np.testing.assert_allclose(axes["redshift"], [0.5, 0.75, 1.0])
     assert not setup.model().has_agn
-    assert setup.variables == (*("stellar.m_star", "sfh.sfr10Myrs", "sfh.age", "dust.luminosity"),)
+    assert setup.variables == ("stellar.m_star", "sfh.sfr10Myrs", "sfh.age", "dust.luminosity")
 
 
 def test_history_from_a_file(tmp_path):
@@ -571,18 +562,12 @@ def test_a_run_gives_the_models_back(run, tmp_path):
         "agn.i": ([30, np.nan, 70], "deg"),
         "dust.umin": ([1] * 3, ""),
     }
-    for name, unit in (
-        ("stellar_mass", "Msun"),
-        ("dust_luminosity", "W"),
-        ("sfr_10myr", "Msun/yr"),
-        ("accretion_power", "W"),
+    for name, unit, theirs in (
+        ("stellar_mass", "Msun", "stellar.m_star"),
+        ("dust_luminosity", "W", "dust.luminosity"),
+        ("sfr_10myr", "Msun/yr", "sfh.sfr10Myrs"),
+        ("accretion_power", "W", "agn.accretion_power"),
     ):
-        theirs = {
-            "stellar_mass": "stellar.m_star",
-            "dust_luminosity": "dust.luminosity",
-            "sfr_10myr": "sfh.sfr10Myrs",
-            "accretion_power": "agn.accretion_power",
-        }[name]
         best[theirs] = (factor * truth[name].to_value(unit), unit)
     for name, (values, unit) in best.items():
         got = u.Quantity(table[f"best.{name}"])

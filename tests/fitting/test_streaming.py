@@ -18,7 +18,7 @@ import pytest
 from astropy.io import fits
 from astropy.table import QTable
 
-from helpers.results import assert_joined, assert_same
+from helpers.results import assert_joined, assert_same, assert_same_tables
 from miricigale.fitting import BayesFitter, FitFlags, FitResults, fit_file, open_results
 from miricigale.utils.exceptions import DataError
 
@@ -329,11 +329,7 @@ def test_results_are_read_as_if_they_were_one(fitter, catalog, tmp_path):
         results.write_table(tmp_path / "table.fits")
     written = QTable.read(tmp_path / "table.fits", character_as_bytes=False, mask_invalid=False)
     for table in (results.to_table(), written):
-        assert table.colnames == wanted.colnames
-        for name in wanted.colnames:
-            assert table[name].unit == wanted[name].unit
-            assert table[name].info.description == wanted[name].info.description
-            np.testing.assert_array_equal(np.asarray(table[name]), np.asarray(wanted[name]))
+        assert_same_tables(table, wanted)
     assert "nobody" in written.meta["CITE"]
     few = results.to_table(["id", "mass_p50"])
     assert few.colnames == ["id", "mass_p50"]
