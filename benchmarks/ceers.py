@@ -29,6 +29,8 @@ from miricigale.filters import FilterSet, read_catalog_photometry
 from miricigale.fitting import (
     BayesFitter,
     FitResults,
+    GridSettings,
+    SamplerSettings,
     TemplateError,
     apply_zero_points,
     calibrate_zero_points,
@@ -184,13 +186,16 @@ def compare(table, grid, n, engine):
     errors = {b: 0.3 if b.startswith("miri") else 0.06 for b in bands}
     ours = BayesFitter(grid, bands, model_error=errors).fit(table)
     if engine == "interpolate":
-        fitter = BayesFitter(
-            grid, bands, model_error=errors, interpolate=400, finer=SEDModel.survey()
-        )
+        settings = GridSettings(interpolate=400, finer=SEDModel.survey())
+        fitter = BayesFitter(grid, bands, model_error=errors, settings=settings)
     else:
-        few = {"n_live": 300, "n_effective": 500}
         fitter = BayesFitter(
-            SEDModel.survey(), bands, model_error=errors, priors=_continuous(), engine=engine, **few
+            SEDModel.survey(),
+            bands,
+            model_error=errors,
+            priors=_continuous(),
+            engine=engine,
+            settings=SamplerSettings(n_live=300, n_effective=500),
         )
     start = time.process_time()
     theirs = fitter.fit(table, seed=1)

@@ -38,7 +38,7 @@ from miricigale.evaluation import (
     photoz_metrics,
     recovery_metrics,
 )
-from miricigale.fitting import BayesFitter
+from miricigale.fitting import BayesFitter, GridSettings
 from miricigale.instrument import CEERS_FILTERS, ceers_exposures
 from miricigale.photometry import YANG2021_DEPTHS, ErrorModel
 from miricigale.refdata import conf
@@ -176,7 +176,7 @@ def best_galaxies(model, photometry, bands, axes):
     """Table of the fits of galaxies without AGN at their redshifts."""
     nodes = np.unique(np.round(photometry["redshift"], 2))
     axes = axes | {"redshift": nodes[nodes > 0]}
-    fitter = BayesFitter(model, bands, axes=axes, redshift_tolerance=0.01)
+    fitter = BayesFitter(model, bands, axes=axes, settings=GridSettings(redshift_tolerance=0.01))
     return fitter.fit(photometry, redshift="redshift").to_table()
 
 
@@ -278,9 +278,9 @@ def observe(truth, limits, seed, *, deeper=0.0, error_scale=1.0):
 def fitter_of(dust, torus, miri, model_error, prior_f):
     """The fitter with a set of the bands of MIRI, kept for the next case."""
     bands = [*YANG2021_DEPTHS, *SETS[miri]]
-    return BayesFitter(
-        model_of(dust, torus), bands, axes=AXES, model_error=model_error, prior_f=prior_f
-    )
+    settings = GridSettings(prior_f=prior_f)
+    model = model_of(dust, torus)
+    return BayesFitter(model, bands, axes=AXES, model_error=model_error, settings=settings)
 
 
 def fit(case, frac_agn, miri, seed):

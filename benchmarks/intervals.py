@@ -16,7 +16,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from miricigale.fitting import BayesFitter, FitFlags
+from miricigale.fitting import BayesFitter, FitFlags, GridSettings
 from miricigale.fitting.posterior import cell_edges
 from miricigale.sed import SEDModel
 
@@ -106,7 +106,8 @@ def main():
     print(f"draws    ms {' '.join(f'{name:>16s}' for name in NAMES)}  on one node")
     for n_draws in args.draws:
         finer = model if n_draws else None
-        fitter = BayesFitter(grid, BANDS, interpolate=n_draws, finer=finer, **options)
+        settings = GridSettings(interpolate=n_draws, finer=finer)
+        fitter = BayesFitter(grid, BANDS, settings=settings, **options)
         start = time.process_time()
         results = fitter.fit(table)
         spent = 1e3 * (time.process_time() - start) / args.n

@@ -11,6 +11,7 @@ from astropy.table import Table
 from miricigale.cigale.names import AGN_PARTS, cigale_names
 from miricigale.filters import Filter
 from miricigale.filters.band_names import filter_of_band
+from miricigale.fitting.drawing import best_parameters
 from miricigale.sed.spectrum import distance
 from miricigale.sed.xray_bands import SPAN, XRays, disk_2500
 from miricigale.utils.store import replacing
@@ -87,9 +88,9 @@ def best_model_table(
     parts["dust"] = derived["dust_luminosity"] * chain.dust(chain.key(values, "dust"))
     if model.has_agn:
         nucleus, power = chain.agn(values), derived["agn_power"]
-        for name, column in _AGN_COLUMNS.items():
+        for name, theirs in _AGN_COLUMNS.items():
             light = power * getattr(nucleus, name)
-            parts[f"agn.SKIRTOR2016_{column}"] = light
+            parts[f"agn.SKIRTOR2016_{theirs}"] = light
             quantities[AGN_PARTS[name][1]] = float(chain.weights @ light)
         disk = derived["accretion_power"] * disk_2500(chain, model.component("agn"), values)
         quantities["agn.intrin_Lnu_2500A_30deg"] = disk
@@ -221,23 +222,13 @@ def write_best_models(results, folder, *, modules=None, xray=None, overwrite=Fal
     modules = results.meta.get("cigale", {}).get("modules", {}) if modules is None else modules
     paths = []
     for one in results[results.fitted]:
-        known = dict(one.constants)
-        known |= {
-            name: one.best[name] for name in (*one.axes, "redshift", "mass") if name in one.best
-        }
-        names = one.model.parameters
-        known = {
-            name: float(getattr(value, "value", value))
-            for name, value in known.items()
-            if name in names
-        }
-        # what makes no difference to the best model has no value
-        known = {name: value for name, value in known.items() if np.isfinite(value)}
         own = one.distance is not None and np.isfinite(one.distance)
         far = float(one.distance) * u.Mpc if own else None
         if xray:
             xray = xray | {"alpha_ox": float(one.best.get("alpha_ox", np.nan))}
-        table = best_model_table(one.model, known, modules=modules, far=far, xray=xray)
+        table = best_model_table(
+            one.model, best_parameters(one, one.model), modules=modules, far=far, xray=xray
+        )
         table.meta["best.chi_square"] = float(one.chi2)
         path = folder / f"{np.asarray(one.ids).item()}_best_model.fits"
         meta, table.meta = table.meta, {}

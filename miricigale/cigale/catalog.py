@@ -120,13 +120,13 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
         "default_error": no_error,
         "left_out": left_out + other,
     }
-    problems = {
+    notes = {
         f"left out, no filter here ({GIVE_FILTER})": left_out,
         "left out, no bands": other,
         "10 % of the flux taken for the error": no_error,
         "taken as missing, upper limits that are not positive": no_limit,
     }
-    text = "; ".join(f"{what}: {', '.join(which)}" for what, which in problems.items() if which)
+    text = "; ".join(f"{what}: {', '.join(which)}" for what, which in notes.items() if which)
     if strict and left_out:
         msg = f"{path}: {text}"
         raise DataError(msg)

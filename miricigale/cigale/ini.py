@@ -11,7 +11,7 @@ from miricigale.utils.exceptions import ConfigError, DataError
 
 __all__ = ["parse_ini", "parse_values"]
 
-#: What the settings beside the modules are; empty ones count as not given.
+#: Settings other than those of the modules; empty ones count as not given.
 _SPEC = """\
 data_file = string(default="")
 parameters_file = string(default="")
@@ -20,7 +20,6 @@ analysis_method = option(pdf_analysis, savefluxes, default=pdf_analysis)
 bands = force_list(default=list())
 properties = force_list(default=list())
 additionalerror = float(min=0, default=0.1)
-cores = integer(default=1)
 [analysis_params]
 variables = force_list(default=list())
 bands = force_list(default=list())

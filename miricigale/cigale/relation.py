@@ -5,10 +5,10 @@ import warnings
 
 import astropy.units as u
 import numpy as np
-from scipy.special import log_ndtr
 
 from miricigale.fitting import FitFlags
-from miricigale.fitting.quantities import DERIVED_LEVELS
+from miricigale.fitting.quantities import draws_summary
+from miricigale.fitting.samplers.run import chi2_at
 from miricigale.utils.exceptions import MiricigaleWarning
 from miricigale.utils.parallel import chunks
 
@@ -61,7 +61,7 @@ def near_relation(fitter, photometry, results, most, *, redshift=None, seed=0):
     for rows in chunks(len(results), _OBJECTS):
         z = None if redshift is None else np.asarray(redshift)[rows]
         with warnings.catch_warnings():
-            # told by the fit
+            # the fit has given this warning
             warnings.simplefilter("ignore", MiricigaleWarning)
             samples = fitter.sample(photometry[rows], N_DRAWS, seed=seed, redshift=z)
         kept = _near(samples, most)
@@ -116,24 +116,16 @@ def _summarize(results, new, i, index, values):
         rest = (len(index) - found.size) * axis.weights
         new["pdf"][name][i] = (np.bincount(node, minlength=axis.values.size) + rest) / len(index)
     for j, name in enumerate(results.quantities):
-        found = values[name][np.isfinite(values[name])]
-        if not found.size:
-            new["moments"][i, j], new["quantiles"][i, j] = np.nan, np.nan
-            continue
-        new["moments"][i, j, :2] = found.mean(), found.std()
-        lit = found[found > 0]
-        if np.isfinite(results.moments[i, j, 2]):
-            new["moments"][i, j, 2] = np.log10(lit).mean() if lit.size else np.nan
-        new["quantiles"][i, j] = np.quantile(found, DERIVED_LEVELS)
+        found = draws_summary(values[name], with_log=np.isfinite(results.moments[i, j, 2]))
+        new["moments"][i, j], new["quantiles"][i, j] = found
 
 
 def _take_best(results, new, i, index, scale, flux, values):
     """The draw of the least chi2 as the best model."""
     sigma, limit = results.sigma[i], results.limit[i]
     used = np.isfinite(sigma)
-    pull = (results.flux[i] - flux)[:, used] / sigma[used]
-    terms = np.where(limit[used], -2.0 * log_ndtr(pull), np.square(pull))
-    chi2 = terms.sum(axis=1)
+    data = (results.flux[i][used], sigma[used], limit[used])
+    chi2 = chi2_at(np.ones(len(flux)), flux[:, used], *data)
     k = int(np.argmin(chi2))
     new["chi2"][i], new["best_flux"][i] = chi2[k], flux[k]
     new["best_index"][i], new["best_scale"][i] = index[k], scale[k]

@@ -116,7 +116,6 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
         limits=LIMIT_FLAGS[flag] != "none",
         redshift_decimals=analysis["redshift_decimals"],
         mock=analysis["mock_flag"],
-        cores=config["cores"],
         method=config["analysis_method"],
         names=names,
         **{k: tuple(v) if isinstance(v, list) else v for k, v in vars(chain).items()},

@@ -15,7 +15,7 @@ from miricigale.cigale.relation import near_relation
 from miricigale.cigale.results import described, write_cigale_results
 from miricigale.filters.band_names import xray_energies
 from miricigale.filters.filter_set import FilterSet
-from miricigale.fitting import BayesFitter, FitResults
+from miricigale.fitting import BayesFitter, FitResults, GridSettings
 from miricigale.sed import SEDModel
 from miricigale.sed.xray_bands import with_xray_bands, xray_filter
 from miricigale.utils.exceptions import ConfigError, argument_error
@@ -61,8 +61,6 @@ class CigaleSetup:
         To how many decimals known redshifts are rounded; negative: not at all.
     mock : bool
         Whether an analysis of mock objects was asked for.
-    cores : int
-        Number of cores asked for.
     method : str
         ``pdf_analysis``, or ``savefluxes``, which `save_models` does.
     left_out, replaced, differs : tuple of str
@@ -91,7 +89,6 @@ class CigaleSetup:
     limits: bool = False
     redshift_decimals: int = 2
     mock: bool = False
-    cores: int = 1
     method: str = "pdf_analysis"
     left_out: tuple = ()
     replaced: tuple = ()
@@ -264,7 +261,10 @@ class CigaleSetup:
         """
         if self.redshift is not None:
             # the nearest node is taken at any distance
-            options = {"redshift_tolerance": np.inf} | options
+            settings = options.get("settings", GridSettings())
+            if settings.redshift_tolerance is None:
+                settings = dataclasses.replace(settings, redshift_tolerance=np.inf)
+            options |= {"settings": settings}
         fitter = self.fitter(photometry, compat=compat, **options)
         known = {"executor": executor, "progress_bar": progress_bar}
         if "redshift" in photometry.colnames:

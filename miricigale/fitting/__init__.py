@@ -3,7 +3,7 @@ Bayesian fits of galaxy and AGN spectra to photometry.
 
 `BayesFitter` evaluates every model of a `~miricigale.sed.ModelGrid`, or lets a nested sampler choose
 models, and returns `FitResults`, posteriors of all parameters and derived quantities. `Samples` are
-models drawn from them, `mock_analysis` and `leave_out` tell how far they can be trusted.
+models drawn from them, `mock_analysis` and `leave_out` show how far they can be trusted.
 """
 
 from miricigale.utils.lazy import lazy_names
@@ -28,6 +28,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "priors": ("magnitude_prior",),
         "results": ("FitResults",),
         "samples": ("Samples",),
+        "settings": ("GridSettings", "SamplerSettings"),
         "streaming": ("fit_file",),
     },
 )

@@ -16,8 +16,8 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from miricigale.fitting.continuation import Continuation
-from miricigale.fitting.quantities import DERIVED_LEVELS
-from miricigale.fitting.samplers.run import best_scale, chi2_at
+from miricigale.fitting.quantities import DERIVED_LEVELS, draws_summary
+from miricigale.fitting.samplers.run import best_scale, chi2_at, systematic_draws
 from miricigale.utils.random import stream
 
 __all__ = ["Between"]
@@ -76,17 +76,16 @@ class Between:
             for j, name in enumerate(names):
                 pdf = np.bincount(node[name], minlength=results.pdf[name].shape[1]) / m
                 new["pdf"][name][i] = pdf
-                moments, quantiles = _summary(values[name])
+                moments, quantiles = draws_summary(values[name])
                 new["axis_moments"][i, j], new["axis_quantiles"][i, j] = moments[:2], quantiles
             shape = new["pdf_2d"].shape[1:]
             place = node["redshift"] * shape[1] + node.get("frac_agn", 0)
             new["pdf_2d"][i] = np.bincount(place, minlength=shape[0] * shape[1]).reshape(shape) / m
             for j, name in enumerate(results.quantities):
                 if name in derived:
-                    moments, new["quantiles"][i, j] = _summary(derived[name])
-                    # a mean of logarithms is not of every quantity
-                    moments[2] *= np.where(np.isfinite(results.moments[i, j, 2]), 1.0, np.nan)
-                    new["moments"][i, j] = moments
+                    with_log = np.isfinite(results.moments[i, j, 2])
+                    found = draws_summary(derived[name], with_log=with_log)
+                    new["moments"][i, j], new["quantiles"][i, j] = found
         return results._changed(**new)
 
 
@@ -114,7 +113,7 @@ class _Object:
         now = self._evaluate(x, step)
         while step < 1.0:
             weight, step = _next_step(now["true"] - now["node"], step)
-            chosen = _resampled(weight, self.rng)
+            chosen = systematic_draws(weight, weight.size, self.rng)
             x, now = x[chosen], {key: value[chosen] for key, value in now.items()}
             for i in range(_MOVES if step < 1.0 else _LAST):
                 x, now = self._move(x, now, step, whole=i % 2)
@@ -247,21 +246,3 @@ def _next_step(rise, step):
     # a step is made in any case
     to = min(max(low, step + 1e-3), 1.0)
     return weight(to), to
-
-
-def _resampled(weight, rng):
-    """Rows chosen in proportion to weights, as evenly as can be (systematic resampling)."""
-    total = np.cumsum(weight)
-    n = total.size
-    place = (np.arange(n) + rng.random()) / n * total[-1]
-    return np.minimum(np.searchsorted(total, place), n - 1)
-
-
-def _summary(value):
-    """Mean, standard deviation and mean log10, and quantiles at `DERIVED_LEVELS`, of draws."""
-    value = value[np.isfinite(value)]
-    if not value.size:
-        return np.full(3, np.nan), np.full(DERIVED_LEVELS.size, np.nan)
-    lit = value[value > 0]
-    log = np.mean(np.log10(lit)) if lit.size else np.nan
-    return np.array([value.mean(), value.std(), log]), np.quantile(value, DERIVED_LEVELS)

@@ -13,7 +13,7 @@ from miricigale.filters import FilterSet
 from miricigale.fitting.likelihood import per_band
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.tables import described_table, error_column, require_columns
-from miricigale.utils.units import FNU, WAVE, check_count, frozen_array, to_array
+from miricigale.utils.units import FNU, WAVE, frozen_array, to_array
 
 __all__ = [
     "TemplateError",
@@ -26,6 +26,8 @@ __all__ = [
 
 #: Fluxes of lower S/N say more of their noise than of the models.
 _LEAST_SIGNAL = 5.0
+#: Least number of such fluxes for what is measured by band, and in a bin of rest wavelength.
+_N_BAND, _N_BIN = 30, 10
 #: Median of the absolute value of a normal deviate.
 _MEDIAN = 0.6744897501960817
 #: How many times their errors fluxes scatter by that are something else's.
@@ -33,23 +35,7 @@ _WIDE = 5.0
 #: Largest template error that is looked for.
 _MOST = 10.0
 #: Edges in um of the bins of rest wavelength; wider where few bands fall.
-_EDGES = (
-    0.09,
-    0.17,
-    0.22,
-    0.28,
-    0.36,
-    0.45,
-    0.6,
-    0.8,
-    1.1,
-    1.5,
-    2.0,
-    2.6,
-    3.6,
-    5.5,
-    12.0,
-)
+_EDGES = (0.09, 0.17, 0.22, 0.28, 0.36, 0.45, 0.6, 0.8, 1.1, 1.5, 2.0, 2.6, 3.6, 5.5, 12.0)
 #: What `measure_template_error` found with `_EDGES`; see `TemplateError.survey`.
 _SURVEY = (0.120, 0.089, 0.084, 0.090, 0.069, 0.065, 0.057, 0.062, 0.065, 0.049)
 _SURVEY += (0.045, 0.081, 0.243, 0.544)
@@ -160,13 +146,13 @@ def _excess(flux, error, model, scatter):
     return brentq(excess, 0.0, _MOST, xtol=1e-4) if excess(0.0) > 0 else 0.0
 
 
-def measure_band_errors(left, template_error, *, longest=2.5 * u.um, n_min=30):
+def measure_band_errors(left, template_error, *, longest=2.5 * u.um):
     """
     Measure errors of bands that are not those of models: noise, and other apertures, PSFs and blends.
 
     By the greatest likelihood of what was measured in bands that were left out of a fit, given what the other
     bands predict, where starlight makes the flux: errors are those of the catalog times a factor, and a part of
-    the flux, beside the template error and that of the prediction. (Residuals of a fit that has the bands would
+    the flux, added to the template error and that of the prediction. (Residuals of a fit that has the bands would
     be too small, as models follow them.) One in twenty fluxes may be an outlier, with errors five times as large.
     Errors of drizzled images may be too small by such a factor, for their noise is correlated; but where sources
     were selected in these bands, the factor is also that of the fluxes that noise or neighbors brought into the
@@ -180,8 +166,6 @@ def measure_band_errors(left, template_error, *, longest=2.5 * u.um, n_min=30):
         That of the fit.
     longest : `~astropy.units.Quantity`, optional
         Longest rest wavelength that is looked at.
-    n_min : int, optional
-        Fluxes of S/N above 5, in all bands together, that are needed.
 
     Returns
     -------
@@ -193,17 +177,17 @@ def measure_band_errors(left, template_error, *, longest=2.5 * u.um, n_min=30):
     Raises
     ------
     ValueError
-        If redshifts were free, or there are fewer fluxes.
+        If redshifts were free, or there are fewer than 30 fluxes of S/N above 5.
     """
-    longest, n_min = to_array(longest, WAVE, "longest", ndim=0), check_count(n_min, "n_min")
+    longest = to_array(longest, WAVE, "longest", ndim=0)
     for results in left.results.values():
         _check_known(results)
     z = np.array([left.results[name].best["redshift"].value for name in left.bands])
     rest = _pivots(left.bands).value / (1.0 + z.T)
     with np.errstate(invalid="ignore"):
         good = (left.predicted > 0) & (left.flux > _LEAST_SIGNAL * left.flux_err) & (rest < longest)
-    if np.count_nonzero(good) < n_min:
-        raise argument_error("left", f"with {n_min} fluxes of S/N above 5", "fewer")
+    if np.count_nonzero(good) < _N_BAND:
+        raise argument_error("left", f"with {_N_BAND} fluxes of S/N above 5", "fewer")
     model, err = left.predicted[good], left.flux_err[good]
     fixed = np.square(left.predicted_std[good])
     fixed += np.square(template_error(rest[good] * WAVE) * model)
@@ -223,7 +207,7 @@ def measure_band_errors(left, template_error, *, longest=2.5 * u.um, n_min=30):
     return tuple(np.exp(min(found, key=lambda one: one.fun).x[:2]).tolist())
 
 
-def measure_template_error(results, *, model_error=0.0, edges=None, n_min=10):
+def measure_template_error(results, *, model_error=0.0, edges=None):
     """
     Measure the template error from fits of real sources at known redshifts.
 
@@ -241,11 +225,9 @@ def measure_template_error(results, *, model_error=0.0, edges=None, n_min=10):
         Of a fit at known redshifts.
     model_error : float or dict of str to float, optional
         Errors of bands that the fit had and that are not those of models (`measure_band_errors`), as parts of
-        the flux: what is found is beside them, in quadrature.
+        the flux: the result is added to them in quadrature.
     edges : `~astropy.units.Quantity`, shape (n + 1,), optional
         Edges of the bins.
-    n_min : int, optional
-        Fluxes of S/N above 5 without which a bin is left out.
 
     Returns
     -------
@@ -254,10 +236,10 @@ def measure_template_error(results, *, model_error=0.0, edges=None, n_min=10):
     Raises
     ------
     ValueError
-        If redshifts were free, no bin has as many fluxes, or ``model_error`` names a band that the results lack.
+        If redshifts were free, no bin has 10 fluxes of S/N above 5, or ``model_error`` names an
+        unknown band.
     """
     edges = to_array(_EDGES * WAVE if edges is None else edges, WAVE, "edges", ndim=1)
-    n_min = check_count(n_min, "n_min")
     own = per_band(model_error, results.filters, "model_error")
     flux, error, _, good = _residuals(results)
     error = np.hypot(error, np.array([own[name] for name in results.filters]) * flux)
@@ -265,13 +247,13 @@ def measure_template_error(results, *, model_error=0.0, edges=None, n_min=10):
     wave, found = [], []
     for low, high in itertools.pairwise(edges):
         some = good & (rest >= low) & (rest < high)
-        if np.count_nonzero(some) < n_min:
+        if np.count_nonzero(some) < _N_BIN:
             continue
         wave.append(np.sqrt(low * high))
         columns = flux, error, results.model_flux, results.model_flux_std
         found.append(_excess(*(column[some] for column in columns)))
     if not wave:
-        raise argument_error("results", f"with {n_min} fluxes of S/N above 5 in a bin", "fewer")
+        raise argument_error("results", f"with {_N_BIN} fluxes of S/N above 5 in a bin", "fewer")
     return TemplateError(wave * WAVE, found)
 
 
@@ -310,7 +292,7 @@ def measure_priors(results):
     return {name: results.pdf[name][results.fitted].mean(axis=0) for name in names}
 
 
-def calibrate_zero_points(results, *, reference=None, n_min=30):
+def calibrate_zero_points(results, *, reference=None):
     """
     Measure what the fluxes of each band want to be multiplied by to agree with the best models.
 
@@ -324,8 +306,6 @@ def calibrate_zero_points(results, *, reference=None, n_min=30):
         Of a fit at known redshifts.
     reference : str, optional
         Band whose factor is 1; by default that of the most sources.
-    n_min : int, optional
-        Sources of S/N above 5 without which a band keeps a factor of 1.
 
     Returns
     -------
@@ -338,9 +318,8 @@ def calibrate_zero_points(results, *, reference=None, n_min=30):
     KeyError
         If the reference is no band that was fitted.
     ValueError
-        If redshifts were free, or the reference has fewer sources than ``n_min``.
+        If redshifts were free, or the reference has fewer than 30 sources of S/N above 5.
     """
-    n_min = check_count(n_min, "n_min")
     flux, _, model, good = _residuals(results)
     bands = list(results.fitted_filters)
     columns = [results.filters.index(name) for name in bands]
@@ -349,18 +328,18 @@ def calibrate_zero_points(results, *, reference=None, n_min=30):
         reference = bands[int(np.argmax(n))]
     elif reference not in bands:
         raise unknown_name("band that was fitted", reference, bands)
-    if n[bands.index(reference)] < n_min:
-        wanted = f"a band with {n_min} sources of S/N above 5"
+    if n[bands.index(reference)] < _N_BAND:
+        wanted = f"a band with {_N_BAND} sources of S/N above 5"
         raise argument_error("reference", wanted, f"{reference} with {n[bands.index(reference)]}")
     factor, scatter = np.ones(len(bands)), np.full(len(bands), np.nan)
-    for i in np.flatnonzero(n >= n_min):
+    for i in np.flatnonzero(n >= _N_BAND):
         some = good[:, columns[i]]
         ratio = np.log(model[some, columns[i]] / flux[some, columns[i]])
         middle = np.median(ratio)
         factor[i] = np.exp(middle)
         # standard error of a median
         scatter[i] = np.sqrt(np.pi / (2.0 * n[i])) * np.median(np.abs(ratio - middle)) / _MEDIAN
-    known = n >= n_min
+    known = n >= _N_BAND
     factor[known] /= factor[bands.index(reference)]
     texts = {
         "band": (np.array(bands), "band"),

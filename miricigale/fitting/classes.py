@@ -53,10 +53,10 @@ def fit_classes(path, output, *, quasars=False, stars=None, **options):
     if stars is not None:
         from miricigale.sed import read_spectra
 
-        # a file that cannot be read is told before hours of fitting
+        # a file that cannot be read is refused before hours of fitting
         spectra = read_spectra(stars)
-    told = set()
-    with _each_once(told):
+    shown = set()
+    with _each_once(shown):
         found = {"galaxy": fit_catalog(path, output, **options)}
     # after the fit, which refuses what it cannot read before it loads the models
     from miricigale.sed import SEDModel, quasar_axes, template_grid
@@ -72,19 +72,19 @@ def fit_classes(path, output, *, quasars=False, stars=None, **options):
     for name, make in models.items():
         left = ("pairs", "redshift") if name == "star" else ("pairs",)
         own = {key: value for key, value in options.items() if key not in left}
-        with _each_once(told):
+        with _each_once(shown):
             found[name] = fit_catalog(path, Path(output) / name, models=make, **own)
     return found
 
 
 @contextmanager
-def _each_once(told):
-    """Show warnings but those of a text that was ``told``: what holds for the catalog holds for all classes."""
+def _each_once(shown):
+    """Show each text of a warning once, for it holds for all classes; ``shown`` are those so far."""
     show = warnings.showwarning
 
     def once(message, *args, **kwargs):
-        if str(message) not in told:
-            told.add(str(message))
+        if str(message) not in shown:
+            shown.add(str(message))
             show(message, *args, **kwargs)
 
     warnings.showwarning = once
@@ -113,9 +113,14 @@ def write_table(found, path, *, overwrite=False):
     write_rows(path, _tables(found), len(first), id_width=width, overwrite=overwrite)
 
 
-def _tables(found):
+def _parts(found):
+    """Iterate over the parts of the results: `FitResults` by class."""
     for parts in zip(*(results.parts() for results in found.values()), strict=True):
-        some = dict(zip(found, parts, strict=True))
+        yield dict(zip(found, parts, strict=True))
+
+
+def _tables(found):
+    for some in _parts(found):
         table = some["galaxy"].to_table()
         for name, (values, text) in class_columns(some).items():
             table[name] = values
@@ -125,10 +130,7 @@ def _tables(found):
 
 def classes_of(found):
     """Columns of `~miricigale.fitting.compare_classes` for all objects: dict of name to array."""
-    parts = [
-        class_columns(dict(zip(found, part, strict=True)))
-        for part in zip(*(results.parts() for results in found.values()), strict=True)
-    ]
+    parts = [class_columns(some) for some in _parts(found)]
     return {name: np.concatenate([part[name][0] for part in parts]) for name in parts[0]}
 
 

@@ -12,7 +12,7 @@ __all__ = ["Continuation"]
 
 #: Least flux, and least part of a prior.
 _TINY, _LEAST = 1e-290, 1e-9
-#: Part of the steps of AGN light that widens errors: some AGN have little light beside the galaxy's.
+#: Part of the steps of AGN light that widens errors: some AGN have little light compared with the galaxy's.
 _OF_AGN = 0.25
 
 

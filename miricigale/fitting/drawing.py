@@ -8,7 +8,15 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import described_table
 from miricigale.utils.units import FNU
 
-__all__ = ["best_sed", "labeled", "plot_pdf", "plot_pdf2d", "plot_sed", "samples"]
+__all__ = [
+    "best_parameters",
+    "best_sed",
+    "labeled",
+    "plot_pdf",
+    "plot_pdf2d",
+    "plot_sed",
+    "samples",
+]
 
 
 def samples(results, key):
@@ -32,6 +40,18 @@ def samples(results, key):
     values = zip(results.parameters, one.draws.T, strict=True)
     columns = {n: (u.Quantity(v, results.unit(n)), results._meaning(n)) for n, v in values}
     return described_table(columns, dict(results.meta) | {"id": str(key)})
+
+
+def best_parameters(results, model):
+    """Parameters of ``model`` in the best fit of one object, without those that have no effect there: dict."""
+    best = results._fitted_one().best
+    names = dict.fromkeys((*results.axes, "redshift", "mass"))
+    known = {name: best[name].value for name in names if name in best}
+    return {
+        name: u.Quantity(value, model.parameters[name].unit)
+        for name, value in (results.constants | known).items()
+        if name in model.parameters and np.isfinite(value)
+    }
 
 
 def best_sed(results, model=None, **changes):
@@ -59,16 +79,7 @@ def best_sed(results, model=None, **changes):
     model = results._one("best_sed").model if model is None else model
     if model is None:
         raise argument_error("model", "an SEDModel (these results know none)", "None")
-    best = results._fitted_one().best
-    known = dict(results.constants)
-    names = {**dict.fromkeys(results.axes), "redshift": None}
-    known |= {name: best[name] for name in names if name in best and np.isfinite(best[name].value)}
-    values = {
-        name: u.Quantity(getattr(value, "value", value), model.parameters[name].unit)
-        for name, value in known.items()
-        if name in model.parameters
-    }
-    sed = model.evaluate(**{**values, "mass": best["mass"], **changes})
+    sed = model.evaluate(**best_parameters(results, model) | changes)
     if results.distance is None or not np.isfinite(results.distance) or "redshift" in changes:
         return sed
     nearer = distance(sed.redshift, model.cosmology) / (float(results.distance) * u.Mpc.to(u.m))

@@ -16,8 +16,9 @@ from miricigale.fitting.likelihood import (
 )
 from miricigale.fitting.priors import known_redshifts
 from miricigale.fitting.results import FitResults
-from miricigale.fitting.samplers import Request, get_sampler
+from miricigale.fitting.samplers import get_sampler
 from miricigale.fitting.samplers.fit import SamplerFit
+from miricigale.fitting.settings import GridSettings, SamplerSettings
 from miricigale.sed import ModelGrid
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.meta import provenance
@@ -44,7 +45,7 @@ class BayesFitter:
 
     On a grid, pairs (galaxy, AGN template) that no AGN fraction can make good enough are found by a
     bound and left out; of the rest those with most of the weight are evaluated in double precision,
-    the others in single precision unless ``rtol`` is below 5e-7. A sampler takes parameters as
+    the others in single precision unless ``rtol`` of the settings is below 5e-7. A sampler takes parameters as
     they are, continuous, object by object; models older than the universe, or impossible together,
     have no weight.
 
@@ -72,65 +73,28 @@ class BayesFitter:
     engine : {"grid", "nautilus", "dynesty"} or callable, optional
         How the posterior is found: on a grid, or by a sampler. A callable is a sampler of the
         user's; see `miricigale.fitting.samplers.get_sampler`.
+    axes : dict, optional
+        Parameter name to values, for a grid of a model (see `~miricigale.sed.SEDModel.grid`).
     model_error, error_floor : float or dict of str to float, optional
         Part of the flux that is added to its error in quadrature, and least relative error of a flux,
         for all or by filter.
     template_error : `~miricigale.fitting.TemplateError`, optional
         Of a grid: error of the models by rest wavelength, added in quadrature too; what it does to the
         normalization of the likelihood counts. ``sigma`` of the results has that of the best model.
-    sfr_prior : tuple, optional
-        Of a grid: a function of stellar mass and redshift (a `~astropy.units.Quantity`, and an array that
-        broadcasts with it) to a star-formation rate, and a scatter in dex. The prior of the galaxies of each
-        redshift is multiplied by that log-normal distribution of their rate over the last 100 Myr, at the mass
-        that fits best without AGN, and keeps its sum. Not with ``interpolate``.
+    scale_error : bool, optional
+        Whether the uncertainty of each model's own scale is part of the posterior of masses,
+        luminosities and fluxes: so by default, but CIGALE leaves it out.
     n_bands_min : int, optional
         Objects with fewer usable bands, upper limits among them, are flagged and not fitted. One
         band at least must be no limit.
     max_reduced_chi2 : float, optional
         Above this reduced chi2 of the best model an object is flagged.
-    scale_error : bool, optional
-        Whether the uncertainty of each model's own scale is part of the posterior of masses,
-        luminosities and fluxes: so by default, but CIGALE leaves it out.
-    axes : dict, optional
-        Parameter name to values, for a grid of a model (see `~miricigale.sed.SEDModel.grid`).
-    prior_f : {"grid", "uniform"}, optional
-        Prior of a grid's AGN fractions: equal for all values of the grid (so that f = 0, which is
-        evaluated once for each galaxy, carries the summed weight of all AGN templates), or by the
-        width of their cells.
-    redshift_tolerance : float, optional
-        How far, in abs(dz) / (1 + z), a fixed redshift may lie from its node of the grid; half the
-        distance of the nodes by default.
     compat : {"cigale"}, optional
         Reproduce choices of CIGALE that are not ours: no ``scale_error``, no result where the best
         chi2 is above 1417 (its weights, from which the best chi2 is not subtracted, all vanish;
         flagged ``NO_LIKELIHOOD``), and no standard deviation below 5 % of the mean.
-    rtol : float, optional
-        Largest relative error of posterior weights, means and standard deviations that leaving
-        out models of a grid may cause; 0 evaluates every model.
-    interpolate : int, optional
-        Of a grid: draw so many models of each object between the nodes, with fluxes interpolated from the
-        nodes around, by sequential Monte Carlo (Del Moral et al. 2006), and take posteriors, means and
-        percentiles from them. Known redshifts are then those of the catalog, in chi2, the evidence and the
-        best model too. 400 do for 68 % intervals. 0: the nodes alone.
-    finer : `~miricigale.sed.SEDModel`, optional
-        With ``interpolate``: the model that made the grid, of which a finer grid is made, between whose nodes
-        fluxes are good to 0.5 % along each axis. Not needed where ``model`` is the model. Without it fluxes are
-        interpolated from the grid's own nodes, and intervals are too narrow where its cells are wide.
-    predict : list of str or `~miricigale.filters.FilterSet`, optional
-        For a sampler: more bands, in which the fluxes of the models are predicted. A grid predicts
-        all of its bands.
-    n_live : int, optional
-        Live points of a sampler; more for posteriors of several narrow peaks.
-    n_effective : int, optional
-        Effective size that a sample shall have (nautilus; dynesty's follows from ``n_live``).
-    max_calls : int, optional
-        Models that a sampler evaluates for one object at most (dynesty counts the steps of its
-        walkers, some of which leave the prior); ``converged`` of the results tells.
-    n_draws, n_cells : int, optional
-        Draws of equal weight that are kept of a sample (see `FitResults.samples`), and cells of each
-        axis, for PDFs and plots.
-    sampler_options : dict, optional
-        Passed on to the sampler.
+    settings : `GridSettings` or `SamplerSettings`, optional
+        More settings of the engine.
 
     Attributes
     ----------
@@ -145,15 +109,18 @@ class BayesFitter:
         If there is no engine, filter or parameter of a name.
     ValueError
         If an option is of the wrong kind or of another engine, a prior is none, or leaves values that
-        the libraries of the model do not have; or if ``finer`` did not make the grid.
+        the libraries of the model do not have; or if ``finer`` of the settings did not make the grid.
 
     Examples
     --------
-    >>> from miricigale.fitting import BayesFitter
+    >>> from miricigale.fitting import BayesFitter, SamplerSettings
     >>> fitter = BayesFitter(grid)  # doctest: +SKIP
     >>> fitter.fit(photometry).to_table()["id", "redshift_mean"]  # doctest: +SKIP
     >>> priors = {"redshift": (0.01, 6), "tau": (0.1, 10, "log"), "age": (0.1, 13), "ebv": (0, 1)}
-    >>> fitter = BayesFitter(model, bands, priors=priors, engine="nautilus")  # doctest: +SKIP
+    >>> settings = SamplerSettings(n_live=300)
+    >>> fitter = BayesFitter(  # doctest: +SKIP
+    ...     model, bands, priors=priors, engine="nautilus", settings=settings
+    ... )
     >>> results = fitter.fit(photometry, seed=1)  # doctest: +SKIP
 
     References
@@ -168,35 +135,31 @@ class BayesFitter:
         *,
         priors=None,
         engine="grid",
+        axes=None,
         model_error=0.1,
         error_floor=0.0,
+        template_error=None,
+        scale_error=None,
         n_bands_min=2,
         max_reduced_chi2=100.0,
-        scale_error=None,
-        axes=None,
-        prior_f="grid",
-        redshift_tolerance=None,
         compat=None,
-        rtol=1e-6,
-        template_error=None,
-        sfr_prior=None,
-        interpolate=0,
-        finer=None,
-        predict=(),
-        n_live=500,
-        n_effective=2000,
-        max_calls=500_000,
-        n_draws=1000,
-        n_cells=100,
-        sampler_options=None,
+        settings=None,
     ):
-        _check_options(locals())
-        if engine != "grid":
+        on_grid = engine == "grid"
+        kind = GridSettings if on_grid else SamplerSettings
+        settings = kind() if settings is None else settings
+        if not isinstance(settings, kind):
+            wanted = f"{kind.__name__} with engine={engine!r}"
+            raise argument_error("settings", wanted, type(settings).__name__)
+        of_grid = {"axes": axes, "template_error": template_error, "compat": compat}
+        if not on_grid:
+            for name, value in of_grid.items():
+                if value is not None:
+                    raise argument_error(name, "left out with a sampler", repr(value))
             get_sampler(engine)
-        names = (
-            None if filters is None and engine == "grid" else filter_names("filters", filters or ())
-        )
-        asked = (*(names or ()), *filter_names("predict", predict))
+        names = None if filters is None and on_grid else filter_names("filters", filters or ())
+        predict = () if on_grid else filter_names("predict", settings.predict)
+        asked = (*(names or ()), *predict)
         if names is not None and (not names or len(set(asked)) < len(asked)):
             raise argument_error("filters", "different names, at least one", f"{list(asked)}")
         if scale_error not in (None, True, False) or (compat and scale_error):
@@ -208,38 +171,18 @@ class BayesFitter:
         self._engine_name = engine if isinstance(engine, str) else repr(engine)
         self.model = None if isinstance(model, ModelGrid) else model
         scale_error = compat is None if scale_error is None else bool(scale_error)
-        if engine == "grid":
+        if on_grid:
             self.backend = GridFit.of_model(
-                model,
-                filters,
-                axes,
-                priors,
-                prior_f=prior_f,
-                rtol=rtol,
-                scale_error=scale_error,
-                redshift_tolerance=redshift_tolerance,
-                compat=compat,
-                template_error=template_error,
-                sfr_prior=sfr_prior,
-                interpolate=check_count(interpolate, "interpolate", least=0),
-                finer=finer,
+                model, filters, priors, settings, scale_error=scale_error, **of_grid
             )
             for name in names or ():
                 if name not in self.bands:
                     raise unknown_name("filter of the grid", name, self.bands)
         else:
             self.backend = SamplerFit.of_model(
-                model,
-                filters,
-                predict,
-                priors,
-                sampler=engine,
-                scale_error=scale_error,
-                request=Request(n_live, n_effective, max_calls, dict(sampler_options or {})),
-                n_draws=n_draws,
-                n_cells=n_cells,
+                model, filters, priors, settings, sampler=engine, scale_error=scale_error
             )
-        of_bands = self.bands if engine == "grid" else names
+        of_bands = self.bands if on_grid else names
         self._reader = PhotometryReader(
             self.bands,
             names,
@@ -331,7 +274,7 @@ class BayesFitter:
         -----
         `~miricigale.utils.exceptions.MiricigaleWarning`
             If ``filters`` was not given and the photometry has bands (names of filters, or columns
-            in a unit of flux density with an error beside them) that the grid lacks. Bands that
+            in a unit of flux density that have an error) that the grid lacks. Bands that
             are not fitted are also in ``meta["fit"]["unused_bands"]`` of the results. And of numbers that
             look like codes for a missing value, such as -99 or 99 with an error of 99, by band and count.
 
@@ -456,7 +399,7 @@ class BayesFitter:
         return samples._changed(model=self.model, meta=meta)
 
     def settings(self, filters=None):
-        """Return what the fit was told, for the meta of results: a dict of plain values."""
+        """Return the settings of the fit, for the meta of results: a dict of plain values."""
         return {
             "engine": self._engine_name,
             "filters": list(filters or self.filters or self.bands),
@@ -465,13 +408,3 @@ class BayesFitter:
             "n_bands_min": self.n_bands_min,
             **self.backend.settings(),
         }
-
-
-def _check_options(given):
-    """Refuse options of another engine than the one that was chosen."""
-    of_grid = given["engine"] == "grid"
-    for name in (SamplerFit if of_grid else GridFit).options:
-        value, default = given[name], BayesFitter.__init__.__kwdefaults__[name]
-        if value is not default and not (np.ndim(value) == 0 and value == default):
-            wanted = "left out with engine='grid'" if of_grid else "left out with a sampler"
-            raise argument_error(name, wanted, repr(value))

@@ -11,9 +11,15 @@ from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.row_files import open_rows
 from miricigale.utils.tables import error_column
 
-__all__ = ["fit_catalog"]
+__all__ = ["fit_catalog", "open_catalog"]
 
 log = logging.getLogger(__name__)
+
+
+def open_catalog(path, chunk_rows, *, hdu=None, catalog_map=None):
+    """Open a catalog by rows (`~miricigale.utils.row_files.RowFile`), under the names of a map if one is given."""
+    rows = open_rows(path, chunk_rows, hdu=hdu)
+    return rows if catalog_map is None else MappedRows(rows, as_catalog_map(catalog_map))
 
 
 def fit_catalog(
@@ -71,12 +77,9 @@ def fit_catalog(
     `~miricigale.utils.exceptions.DataError`
         If there is no such file, or it cannot be read by rows.
     ValueError
-        If no column is a flux in a known filter with an error beside it.
+        If no column is a flux in a known filter that has an error.
     """
-    rows = open_rows(path, chunk_rows, hdu=hdu)
-    if catalog_map is not None:
-        catalog_map = as_catalog_map(catalog_map)
-        rows = MappedRows(rows, catalog_map)
+    rows = open_catalog(path, chunk_rows, hdu=hdu, catalog_map=catalog_map)
     names = rows.colnames
     known = set(Filter.names())
     bands = [

@@ -85,7 +85,7 @@ class GridEngine:
         Relative error that pruning may cause. The weight of what is left out is bounded to a
         tenth of it, and what it could add to the variance of any derived quantity to
         ``rtol``, so that those with a long tail hold it too. (The standard deviation of an AGN's
-        quantity below a thousandth of the mean total luminosity is held to a part of the latter.)
+        quantity below a thousandth of the mean total luminosity is accurate to a part of the latter.)
         From 5e-7 on, pairs of little weight are evaluated in single precision, in which a weight
         is good to some 1e-7.
     scale_error : bool

@@ -30,7 +30,7 @@ from miricigale.sed import ModelGrid, SEDModel
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.parallel import chunks, parallel_map
 from miricigale.utils.random import stream
-from miricigale.utils.units import MASS, is_number
+from miricigale.utils.units import MASS
 
 __all__ = ["GridFit"]
 
@@ -47,7 +47,7 @@ class GridFit:
     """
     How `~miricigale.fitting.BayesFitter` fits with every model of a grid; picklable.
 
-    Fields that are not objects of the package are as told to the fitter; ``fraction`` is the AGN
+    Fields that are not objects of the package are those given to the fitter; ``fraction`` is the AGN
     fraction in the definition that the grid does not use, None if it has none.
     """
 
@@ -62,9 +62,6 @@ class GridFit:
     template_error: TemplateError | None = None
     between: Between | None = None
 
-    #: Options of the fitter that no other backend has.
-    options = ("axes", "prior_f", "redshift_tolerance", "compat", "rtol", "template_error")
-    options += ("sfr_prior", "interpolate", "finer")
     #: Objects in a piece of the catalog.
     chunk_size = 64
     #: Weight of the first or last redshift above which an object is flagged.
@@ -72,35 +69,12 @@ class GridFit:
 
     @classmethod
     def of_model(
-        cls,
-        model,
-        filters,
-        axes,
-        priors,
-        *,
-        prior_f,
-        rtol,
-        scale_error,
-        redshift_tolerance,
-        compat,
-        template_error,
-        sfr_prior,
-        interpolate,
-        finer,
+        cls, model, filters, priors, settings, *, axes, scale_error, compat, template_error
     ):
         """Make a grid if it is none, work out its priors and derived quantities, set the engine up."""
-        if not (is_number(rtol) and 0 <= rtol < 0.1):
-            raise argument_error("rtol", "in [0, 0.1)", repr(rtol))
-        near = redshift_tolerance
-        if near is not None and not (is_number(near) and near >= 0):
-            raise argument_error("redshift_tolerance", ">= 0", repr(near))
-        if sfr_prior is not None and interpolate:
-            raise argument_error("sfr_prior", "None with 'interpolate'", repr(sfr_prior))
         if compat not in (None, "cigale"):
             raise argument_error("compat", "None or 'cigale'", repr(compat))
-        if finer is not None and not (interpolate and isinstance(finer, SEDModel)):
-            wanted = "an SEDModel" if interpolate else "None without 'interpolate'"
-            raise argument_error("finer", wanted, repr(finer))
+        finer, interpolate = settings.finer, int(settings.interpolate)
         grid = model
         if isinstance(model, SEDModel):
             if axes is None or filters is None:
@@ -113,7 +87,7 @@ class GridFit:
             raise argument_error("axes", "None when 'model' is a ModelGrid", "a value")
         elif not isinstance(model, ModelGrid):
             raise argument_error("model", "a ModelGrid or an SEDModel", type(model).__name__)
-        priors = grid_priors(grid, priors, prior_f=prior_f)
+        priors = grid_priors(grid, priors, prior_f=settings.prior_f)
         quantities, fraction = Quantities.of_grid(grid), OtherFraction.of_grid(grid)
         engine = GridEngine(
             galaxy=np.asarray(grid.galaxy, dtype=float),
@@ -134,11 +108,21 @@ class GridFit:
             template_error=grid_errors(
                 template_error, grid.filters if model is grid else filters, grid.redshift
             ),
-            mass_prior=None if sfr_prior is None else sfr_log_prior(sfr_prior, grid),
-            rtol=float(rtol),
+            mass_prior=sfr_log_prior(settings.sfr_prior, grid),
+            rtol=float(settings.rtol),
             scale_error=scale_error,
         )
-        out = cls(grid, priors, quantities, fraction, engine, near, compat, prior_f, template_error)
+        out = cls(
+            grid=grid,
+            priors=priors,
+            quantities=quantities,
+            fraction=fraction,
+            engine=engine,
+            redshift_tolerance=settings.redshift_tolerance,
+            compat=compat,
+            prior_f=settings.prior_f,
+            template_error=template_error,
+        )
         # a single model has nothing between
         if not interpolate or all(axis.values.size == 1 for axis in priors.axes.values()):
             return out
@@ -177,7 +161,7 @@ class GridFit:
         }
 
     def settings(self):
-        """Return what the fit was told, in plain values."""
+        """Return the settings of the fit as plain values."""
         return {
             "prior_f": self.prior_f,
             "rtol": self.engine.rtol,
@@ -196,7 +180,7 @@ class GridFit:
             more["template_error"] = {"wave": wave, "error": error.error.tolist()}
         if prior is not None:
             relation, scatter, z = prior.args[:3]
-            # a function has no value to tell it by: its own at some masses
+            # a function is known by its values at some masses
             mass = [1e8, 1e10, 1e12] * MASS
             rates = [expected_sfr(relation, mass, one).tolist() for one in z[[0, -1]]]
             more["sfr_prior"] = {"scatter": scatter, "sfr": rates}
@@ -436,8 +420,5 @@ def _draw_piece(engine, n_draws, piece):
 
 def _forget(out, rows):
     """Leave nothing of these objects, in place."""
-    sums = (out.chi2, out.log_sum, out.best_scale, out.best_flux, out.zf, out.galaxy, out.agn)
-    derived = (out.band, out.moments, out.quantiles, out.share, out.share_quantiles)
-    for array in (*sums, *derived, *out.joint.values()):
-        array[rows] = np.nan
-    out.index[rows] = -1
+    for array in (*out[:-1], *out.joint.values()):
+        array[rows] = -1 if array.dtype.kind == "i" else np.nan

@@ -26,7 +26,7 @@ __all__ = ["Nodes", "Place", "finer_grid", "less_factor"]
 _POWERS = (1.0, 0.5, 0.1, -0.5)
 #: Fluxes below this part of a model's brightest band are interpolated as if they were it.
 _DARK = 1e-12
-#: Those below this part of it are not held to the chain.
+#: Fluxes below this part of it are not compared with the chain.
 _FAINT = 1e-6
 #: Least of what is interpolated in the logarithm.
 _TINY = 1e-290
@@ -373,7 +373,7 @@ def finer_grid(model, grid, filters, constants, nodes):
 
 @dataclass(frozen=True, eq=False)
 class _Test:
-    """Models of a chain, to which interpolated ones are held."""
+    """Models of a chain, to compare interpolated ones with."""
 
     model: object
     filters: object

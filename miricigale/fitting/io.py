@@ -102,7 +102,7 @@ def read_results(path, *, rows=None):
 
 
 def _old_facts(fit, filters):
-    """What files of the formats before told in the settings of their meta."""
+    """Facts that files of earlier formats have in the settings of their meta."""
     return {
         "fitted_filters": fit.get("filters", filters),
         "redshift_fixed": fit.get("redshift") == "fixed",
@@ -264,7 +264,7 @@ def open_results(path, *, partial=False, model=None):
     if not (partial or results.complete):
         msg = (
             f"{path} holds {len(results.paths)} of {results.n_parts} parts: fit_file with the "
-            "same arguments goes on; partial=True opens what is there"
+            "same arguments resumes; partial=True opens what is there"
         )
         raise DataError(msg)
     return results

@@ -249,9 +249,9 @@ def unused_bands(table, filters, stacklevel=None):
     """
     Names of the bands of a catalog that are not fitted (``filters``), in the order of the columns.
 
-    A column is a band if it has an error ``<name>_err`` beside it and both are in a unit of flux
+    A column is a band if it has an error ``<name>_err`` and both are in a unit of flux
     density, or if its name is that of a filter. With a ``stacklevel``, that of the caller of this
-    function, a `~miricigale.utils.exceptions.MiricigaleWarning` tells them.
+    function, a `~miricigale.utils.exceptions.MiricigaleWarning` names them.
     """
     known, columns = set(Filter.names()), set(table.colnames)
     out = []
@@ -282,7 +282,7 @@ def limits(table, name):
     Rows whose flux in a band is an upper limit: array of bool, shape (n,).
 
     The column ``<name>_limit``, if it is there, is boolean, or holds 0 and 1 or ``true`` and
-    ``false`` as text files do; masked and empty values are no limits. A `ValueError` tells a column
+    ``false`` as text files do; masked and empty values are no limits. A `ValueError` is raised for a column
     that holds something else, such as the limit itself.
     """
     column = f"{name}_limit"
@@ -339,7 +339,7 @@ def flux_column(table, name):
     """
     Fluxes of a column in uJy, NaN where masked: a new array, shape (n,).
 
-    A `ValueError` tells one without real numbers, or with several in a row.
+    A `ValueError` is raised for one without real numbers, or with several in a row.
     """
     column = table[name]
     column = getattr(column, "unmasked", column)

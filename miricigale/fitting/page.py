@@ -7,15 +7,15 @@ import numpy as np
 
 from miricigale.evaluation import photoz_metrics
 from miricigale.filters import Filter, FilterSet
-from miricigale.filters.catalog_files import MappedRows, as_catalog_map
+from miricigale.filters.catalog_files import MappedRows
 from miricigale.fitting import FitFlags
 from miricigale.fitting.classes import classes_of, classes_section
+from miricigale.fitting.from_files import open_catalog
 from miricigale.fitting.likelihood import unused_bands
 from miricigale.fitting.page_numbers import FitNumbers, known_redshifts
 from miricigale.pages import Page, number
 from miricigale.plotting.axes import WIDTH, new_figure
 from miricigale.plotting.comparison import plot_redshifts
-from miricigale.utils.row_files import open_rows
 
 __all__ = ["fit_page"]
 
@@ -28,6 +28,20 @@ _FEW = 5
 _LONG = 200
 #: AGN fraction above which an object counts as one with an AGN.
 _SOME_AGN = 0.2
+#: What flags say where more than a tenth of the objects have them.
+_WIDESPREAD = {
+    FitFlags.HIGH_CHI2: "have no model that fits (reduced chi2 above the limit): errors that are too small, "
+    "zero points, wrong columns or units, or models not theirs.",
+    FitFlags.REDSHIFT_EDGE: "reach the first or last redshift of the grid.",
+}
+#: Columns on flux over model and on pulls, and their formats.
+_RATIOS = {
+    "flux / model": ".3f",
+    "16 %": ".2f",
+    "84 %": ".2f",
+    "median pull": "+.2f",
+    "beyond 3 sigma": "{:.1f} %",
+}
 
 
 def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None):
@@ -58,14 +72,12 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None):
     """
     classes = results if isinstance(results, dict) else {"galaxy": results}
     results = classes["galaxy"]
-    rows = open_rows(path, results.job["chunk_rows"], hdu=hdu)
-    if catalog_map is not None:
-        rows = MappedRows(rows, as_catalog_map(catalog_map))
+    rows = open_catalog(path, results.job["chunk_rows"], hdu=hdu, catalog_map=catalog_map)
     found = every = FitNumbers(results)
     known = known_redshifts(rows, z_spec)
     columns = classes_of(classes) if len(classes) > 1 else None
     if columns is not None:
-        # what stars and quasars are as galaxies tells nothing of the fit
+        # fits of stars and quasars with galaxies say nothing about the fit
         ours = np.isin(columns["class"], ["galaxy", ""])
         found, known = found.only(ours), (known[0], None if known[1] is None else known[1][ours])
     page = Page(
@@ -94,54 +106,54 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None):
 
 def _notices(found):
     good = found.good
-    lines = []
-    poor = good & (found.flags & int(FitFlags.HIGH_CHI2) != 0)
-    if good.any() and np.mean(poor[good]) > 0.1:
-        lines.append(
-            f"{100 * np.mean(poor[good]):.0f} % of the objects have no model that fits (reduced chi2 above "
-            "the limit): errors that are too small, zero points, wrong columns or units, or models not theirs."
-        )
-    for name, column in zip(found.filters, found.ratio.T, strict=True):
-        some = column[np.isfinite(column)]
-        if some.size >= 30 and not 0.8 < np.median(some) < 1.25:
-            lines.append(
-                f"{name}: fluxes are {np.median(some):.2f} times those of the best models in the median of "
-                f"{some.size} objects: look at its zero point and unit."
-            )
-    edge = good & (found.flags & int(FitFlags.REDSHIFT_EDGE) != 0)
-    if good.any() and np.mean(edge[good]) > 0.1:
-        lines.append(
-            f"{100 * np.mean(edge[good]):.0f} % of the objects reach the first or last redshift of the grid."
-        )
     if good.size and not good.any():
-        lines.append("No object was fitted; the flags below say why.")
+        return ["No object was fitted; the flags below say why."]
+    lines = []
+    for flag, text in _WIDESPREAD.items():
+        share = _mean(found.flags[good] & int(flag) != 0)
+        if share > 0.1:
+            lines.append(f"{100 * share:.0f} % of the objects {text}")
+    for name, ratio, _ in found.bands():
+        if ratio.size >= 30 and not 0.8 < np.median(ratio) < 1.25:
+            lines.append(
+                f"{name}: fluxes are {np.median(ratio):.2f} times those of the best models in the median of "
+                f"{ratio.size} objects: look at its zero point and unit."
+            )
     return lines
 
 
 def _summary(page, found):
-    good = found.good
-    none = "no object was fitted"
+    good, none = found.good, "no object was fitted"
     items = [
         ("objects", len(good)),
         ("fitted", int(good.sum())),
         ("without any flag", int(np.count_nonzero(good & (found.flags == 0)))),
-        ("bands of an object, median", number(_median(found.n_bands[good]), ".0f", none)),
-        ("reduced chi2, median", number(_median(found.chi2), ".2f", none)),
+    ]
+    numbers = [
+        ("bands of an object, median", _median(found.n_bands[good]), ".0f"),
+        ("reduced chi2, median", _median(found.chi2), ".2f"),
     ]
     if not found.fixed:
-        items.append(("redshift, median", number(_median(found.z[good, 1]), ".2f", none)))
-        width = (found.z[:, 2] - found.z[:, 0]) / 2 / (1 + found.z[:, 1])
-        items.append(("half width of z over 1 + z, median", number(_median(width), ".3f", none)))
+        low, z, high = found.z.T
+        numbers += [
+            ("redshift, median", _median(z[good]), ".2f"),
+            ("half width of z over 1 + z, median", _median((high - low) / 2 / (1 + z)), ".3f"),
+        ]
     if np.isfinite(found.frac).any():
-        share = np.mean(found.frac[good, 0] > _SOME_AGN)
-        label = f"with 84 % of the posterior above fracAGN {_SOME_AGN:g}"
-        items.append((label, number(share, "{:.0f} %", none, scale=100)))
-    page.items(items)
+        share = 100 * _mean(found.frac[good, 0] > _SOME_AGN)
+        numbers.append(
+            (f"with 84 % of the posterior above fracAGN {_SOME_AGN:g}", share, "{:.0f} %")
+        )
+    page.items(items + [(label, number(value, spec, none)) for label, value, spec in numbers])
 
 
 def _median(values):
     values = values[np.isfinite(values)]
     return np.median(values) if values.size else np.nan
+
+
+def _mean(values):
+    return np.mean(values) if values.size else np.nan
 
 
 def _redshifts(page, found, known):
@@ -187,66 +199,37 @@ def _goodness(page, found):
     page.section(
         "How well models fit",
         "Reduced chi2 is that of the best model over bands less one, with the model error in the errors. "
-        "A median ratio far from 1 in one band tells of its zero point, unit or curve.",
+        "A median ratio far from 1 in one band indicates a wrong zero point, unit or curve.",
     )
-    good = np.isfinite(found.chi2)
-    order = np.argsort([_pivot(name) for name in found.filters])
     figure, axes = new_figure(1, 2, size=(WIDTH / 2, 3.6))
     ax = axes[0, 0]
-    if good.any():
-        values = np.clip(found.chi2[good], 1e-2, 1e3)
-        ax.hist(values, np.geomspace(1e-2, 1e3, 51), color="0.75")
-        ax.axvline(np.median(found.chi2[good]), color=_COLOR, lw=1, label="median")
+    chi2 = found.chi2[found.good]
+    if chi2.size:
+        ax.hist(np.clip(chi2, 1e-2, 1e3), np.geomspace(1e-2, 1e3, 51), color="0.75")
+        ax.axvline(np.median(chi2), color=_COLOR, lw=1, label="median")
         ax.legend(frameon=False)
     ax.set(
         xscale="log", xlabel="reduced chi2 (those beyond in the outermost bins)", ylabel="objects"
     )
     ax = axes[0, 1]
-    rows = []
-    for k, i in enumerate(order):
-        ratio, pull = (
-            values[np.isfinite(values)] for values in (found.ratio[:, i], found.pull[:, i])
-        )
-        name = found.filters[i]
-        none = "no flux was fitted"
-        low = mid = high = np.nan
-        if ratio.size:
-            low, mid, high = np.percentile(ratio.astype(float), [16, 50, 84])
+    rows, none = [], "no flux was fitted"
+    bands = sorted(found.bands(), key=lambda band: _pivot(band[0]))
+    for k, (name, ratio, pull) in enumerate(bands):
+        low, mid, high = np.percentile(ratio, [16, 50, 84]) if ratio.size else [np.nan] * 3
         if ratio.size >= _FEW:
             ax.errorbar(k, mid, [[mid - low], [high - mid]], fmt="o", color=_COLOR, ms=4, lw=1)
-        rows.append(
-            (
-                name,
-                f"{_pivot(name):.3g}",
-                ratio.size,
-                number(mid, ".3f", none),
-                number(low, ".2f", none),
-                number(high, ".2f", none),
-                number(np.median(pull) if pull.size else np.nan, "+.2f", none),
-                number(
-                    np.mean(np.abs(pull) > 3) if pull.size else np.nan, "{:.1f} %", none, scale=100
-                ),
-            )
-        )
+        values = (mid, low, high, _median(pull), 100 * _mean(np.abs(pull) > 3))
+        texts = [number(v, spec, none) for v, spec in zip(values, _RATIOS.values(), strict=True)]
+        rows.append((name, f"{_pivot(name):.3g}", ratio.size, *texts))
     ax.axhline(1.0, color="0.6", lw=0.8)
-    ax.set_xticks(range(len(order)), [found.filters[i] for i in order], rotation=90, fontsize=7)
+    ax.set_xticks(range(len(bands)), [name for name, *_ in bands], rotation=90, fontsize=7)
     ax.set(ylabel="flux over that of the best model", ylim=(0.4, 1.8))
     page.figure(
         figure,
         f"Reduced chi2, and measured over model flux in bands of {_FEW} or more fluxes: median, 16-84 % (in full "
         "in the table).",
     )
-    header = (
-        "band",
-        "um",
-        "fluxes",
-        "flux / model",
-        "16 %",
-        "84 %",
-        "median pull",
-        "beyond 3 sigma",
-    )
-    page.table(rows, header=header)
+    page.table(rows, header=("band", "um", "fluxes", *_RATIOS))
 
 
 def _pivot(name):
@@ -263,22 +246,22 @@ def _physics(page, found):
     figure, axes = new_figure(1, 2 if with_agn else 1, size=(WIDTH / 2, 3.6))
     rows = np.flatnonzero(good)[:: max(1, int(good.sum()) // _POINTS)]
     ax = axes[0, 0]
-    mass = np.log10(found.mass[rows, 1])
+    z, mass = found.z[rows, 1], np.log10(found.mass[rows, 1])
+    strong = found.frac[rows, 0] > _SOME_AGN
+    ax.plot(
+        z[~strong], mass[~strong], ".", ms=3, color="0.6" if with_agn else _COLOR, label="others"
+    )
     if with_agn:
-        strong = found.frac[rows, 0] > _SOME_AGN
-        ax.plot(found.z[rows[~strong], 1], mass[~strong], ".", ms=3, color="0.6", label="others")
         label = f"84 % above fracAGN {_SOME_AGN:g}"
-        ax.plot(found.z[rows[strong], 1], mass[strong], ".", ms=4, color=_SECOND, label=label)
-        ax.legend(frameon=False, fontsize=8)
-        ax = axes[0, 1]
+        ax.plot(z[strong], mass[strong], ".", ms=4, color=_SECOND, label=label)
         bins = np.linspace(0, 1, 26)
-        ax.hist(found.frac[good, 1], bins, color="0.75", label="posterior median")
-        ax.hist(found.frac[good, 0], bins, histtype="step", color=_COLOR, label="16th percentile")
-        ax.set(xlabel="fracAGN", ylabel="objects", yscale="log")
-        ax.legend(frameon=False, fontsize=8)
-        ax = axes[0, 0]
-    else:
-        ax.plot(found.z[rows, 1], mass, ".", ms=3, color=_COLOR)
+        axes[0, 1].hist(found.frac[good, 1], bins, color="0.75", label="posterior median")
+        axes[0, 1].hist(
+            found.frac[good, 0], bins, histtype="step", color=_COLOR, label="16th percentile"
+        )
+        axes[0, 1].set(xlabel="fracAGN", ylabel="objects", yscale="log")
+        for one in axes[0]:
+            one.legend(frameon=False, fontsize=8)
     low, high = np.percentile(mass, [0.5, 99.5])
     ax.set(xlabel="redshift", ylabel="log stellar mass (Msun)", ylim=(low - 0.5, high + 0.5))
     page.figure(
@@ -334,7 +317,8 @@ def _choose(found):
 
 def _left_out(page, rows, found):
     page.section(
-        "What was left out", "Nothing is dropped in silence: a row of the catalog is a row here."
+        "What was left out",
+        "Each row of the catalog is a row of the results, flagged if not fitted.",
     )
     lines = list(rows.told()) if isinstance(rows, MappedRows) else []
     unused = unused_bands(rows.chunk(0), list(found.filters))
@@ -342,8 +326,7 @@ def _left_out(page, rows, found):
         lines.append(
             f"bands that were not fitted, for want of a filter or of errors: {', '.join(unused)}"
         )
-    empty = [name for name, column in zip(found.filters, found.ratio.T, strict=True)
-             if not np.isfinite(column).any()]  # fmt: skip
+    empty = [name for name, ratio, _ in found.bands() if not ratio.size]
     if empty:
         lines.append(f"bands without a flux in any object: {', '.join(empty)}")
     bad = found.unusable.sum(axis=0)
@@ -366,13 +349,10 @@ def _left_out(page, rows, found):
 def _settings(page, results):
     page.section("What was fitted")
     first = next(iter(results.parts()))
-    meta = dict(first.meta)
-    rows = [
-        (name, _plain(value)) for name, value in meta.get("fit", {}).items() if name != "filters"
-    ]
-    model = results.model
-    if model is not None:
-        rows += [(name, _plain(value)) for name, value in model.recipe.items()]
+    settings = {name: v for name, v in first.meta.get("fit", {}).items() if name != "filters"}
+    if results.model is not None:
+        settings |= results.model.recipe
+    rows = [(name, _plain(value)) for name, value in settings.items()]
     for name, axis in first.axes.items():
         values = np.asarray(axis.values)
         text = f"{values.size} from {values[0]:g} to {values[-1]:g} {u.Unit(axis.unit)}"

@@ -23,7 +23,6 @@ class FitNumbers:
             setattr(self, name, np.concatenate([part[name] for part in parts]))
         first = next(iter(results.parts()))
         self.filters, self.fixed = first.fitted_filters, first.redshift_fixed
-        self.meta = dict(first.meta)
 
     def only(self, rows):
         """A copy of some objects."""
@@ -31,6 +30,11 @@ class FitNumbers:
         for name in self._names:
             setattr(new, name, getattr(self, name)[rows])
         return new
+
+    def bands(self):
+        """Iterate over bands: name, and finite flux ratios and pulls of all objects."""
+        for name, ratio, pull in zip(self.filters, self.ratio.T, self.pull.T, strict=True):
+            yield name, ratio[np.isfinite(ratio)].astype(float), pull[np.isfinite(pull)]
 
     @property
     def good(self):
@@ -97,8 +101,6 @@ def known_redshifts(rows, name):
         return None, None
     if name not in names:
         raise argument_error("z_spec", f"one of the columns {list(names)}", repr(name))
-    values = []
-    for i in range(rows.n_chunks):
-        values.append(plain_floats(rows.chunk(i)[name], name, "photometry"))
-    z = np.concatenate(values)
+    chunks = (rows.chunk(i) for i in range(rows.n_chunks))
+    z = np.concatenate([plain_floats(chunk[name], name, "photometry") for chunk in chunks])
     return name, np.where(z > 0, z, np.nan)

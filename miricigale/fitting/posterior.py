@@ -50,7 +50,7 @@ def moments(values, pdf):
 
 
 def check_levels(levels):
-    """Levels of percentiles as an array; a `ValueError` tells others than between 0 and 1."""
+    """Levels of percentiles as an array; a `ValueError` if one is not between 0 and 1."""
     levels = np.atleast_1d(np.asarray(levels, dtype=float))
     if levels.ndim != 1:
         raise argument_error("levels", "a number or a list of numbers", f"shape {levels.shape}")

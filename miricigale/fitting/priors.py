@@ -195,7 +195,7 @@ def known_redshifts(photometry, redshift):
     """
     Redshifts of a catalog: a column by its name, one value, or one for each object.
 
-    NaN where one is missing, masked, not finite or not positive. A `ValueError` tells a column that
+    NaN where one is missing, masked, not finite or not positive. A `ValueError` is raised for a column that
     is not there, or another shape.
     """
     n = len(photometry)
@@ -267,9 +267,11 @@ def sfr_log_prior(sfr_prior, grid):
     """
     Prior of star-formation rates given mass and redshift, for `~miricigale.fitting.grid.GridEngine`.
 
-    ``sfr_prior`` is that of `~miricigale.fitting.BayesFitter`: a relation and its scatter. A `ValueError` tells
-    what is none.
+    ``sfr_prior`` is that of `~miricigale.fitting.GridSettings`: a relation and its scatter, or None. Anything
+    else is a `ValueError`.
     """
+    if sfr_prior is None:
+        return None
     wanted = "a function of stellar mass and redshift, and a scatter in dex above 0"
     pair = sfr_prior if isinstance(sfr_prior, tuple) and len(sfr_prior) == 2 else (None, None)
     relation, scatter = pair
@@ -281,7 +283,7 @@ def sfr_log_prior(sfr_prior, grid):
 
 
 def expected_sfr(relation, mass, redshift):
-    """Star-formation rates of a relation in Msun/yr; a `ValueError` tells where they are none."""
+    """Star-formation rates of a relation in Msun/yr; a `ValueError` where they are not positive and finite."""
     rate = to_array(relation(mass, redshift), u.Msun / u.yr, "sfr_prior")
     bad = ~((rate > 0) & np.isfinite(rate))
     if np.any(bad):
@@ -306,7 +308,7 @@ def read_density(redshift_prior, n):
     Check densities of redshift for n objects: (redshifts, shape (n_z,), densities).
 
     Densities have the shape (n_z,), for all, or (n, n_z); straight lines join them, and they are 0
-    outside. Masked ones are NaN. A `ValueError` tells shapes that do not agree, redshifts that do
+    outside. Masked ones are NaN. A `ValueError` is raised for shapes that do not agree, redshifts that do
     not ascend or are masked, and densities that are negative or infinite.
     """
     wanted = "(redshifts of shape (n_z,), densities of shape (n_z,) or (n, n_z))"

@@ -18,6 +18,7 @@ __all__ = [
     "Quantities",
     "ShapeQuantities",
     "check_draws",
+    "draws_summary",
     "kept_percentiles",
     "plain",
     "unit_of",
@@ -50,11 +51,25 @@ def unit_of(column):
     return getattr(column, "unit", None) or u.dimensionless_unscaled
 
 
+def draws_summary(value, *, with_log=True):
+    """
+    Mean, standard deviation and mean log10, and quantiles at `DERIVED_LEVELS`, of finite draws.
+
+    The mean log10, of draws above 0, is NaN without ``with_log``: for quantities that do not scale with mass.
+    """
+    value = value[np.isfinite(value)]
+    if not value.size:
+        return np.full(3, np.nan), np.full(DERIVED_LEVELS.size, np.nan)
+    lit = value[value > 0]
+    log = np.mean(np.log10(lit)) if with_log and lit.size else np.nan
+    return np.array([value.mean(), value.std(), log]), np.quantile(value, DERIVED_LEVELS)
+
+
 def kept_percentiles(name, levels, kept):
     """
     Percentiles of a quantity, shape (n, n_levels), linear between its kept quantiles.
 
-    ``kept`` has those at `DERIVED_LEVELS`, shape (n, n_kept). A `ValueError` tells levels beyond
+    ``kept`` has those at `DERIVED_LEVELS`, shape (n, n_kept). A `ValueError` is raised for levels beyond
     these: nothing is known of the tails.
     """
     low, high = DERIVED_LEVELS[[0, -1]]

@@ -1,4 +1,4 @@
-"""Fits of catalogs larger than memory: from file to file, in pieces that a later call goes on from."""
+"""Fits of catalogs larger than memory: from file to file, in pieces, and resumed by a later call."""
 
 import contextlib
 import importlib.metadata
@@ -11,18 +11,16 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.filters.catalog_files import (
-    MappedRows,
-    as_catalog_map,
     codes_of,
     warn_of_codes,
 )
 from miricigale.fitting.fitter import BayesFitter
+from miricigale.fitting.from_files import open_catalog
 from miricigale.fitting.io import FORMAT, FitFolder, open_results, part_ids, part_name
 from miricigale.utils.content import content_sha256
 from miricigale.utils.exceptions import MiricigaleWarning, OtherResultsError, argument_error
 from miricigale.utils.progress import progress
 from miricigale.utils.random import check_seed
-from miricigale.utils.row_files import open_rows
 from miricigale.utils.store import plain_value
 from miricigale.utils.tables import ascii_ids, error_column, read_ids, require_columns
 from miricigale.utils.units import FNU
@@ -57,7 +55,7 @@ def fit_file(
     The results are those of `BayesFitter.fit` for the whole catalog, number for number; only
     one piece is in memory. They lie in a folder: ``part-00000.fits`` and so on, each a file that
     `FitResults.read` reads, and ``manifest.json``, which says of what fit they are. A call that
-    was stopped goes on with the same arguments and fits what is missing.
+    was stopped resumes with the same arguments and fits what is missing.
 
     Parameters
     ----------
@@ -77,7 +75,7 @@ def fit_file(
         As for `BayesFitter.fit`, for all rows of the catalog; densities of redshift may be the name
         of a column that holds them.
     seed : int, optional
-        As for `BayesFitter.fit`. A sampler needs one, so that a later call can go on.
+        As for `BayesFitter.fit`. A sampler needs one, so that a later call can resume it.
     flux_unit : unit-like, optional
         Unit of flux columns and their errors where the file gives none, as CSV does.
     catalog_map : `~miricigale.filters.CatalogMap`, str or path-like, optional
@@ -101,8 +99,8 @@ def fit_file(
     Warns
     -----
     `~miricigale.utils.exceptions.MiricigaleWarning`
-        What `BayesFitter.fit` warns of, once. Numbers that look like codes for a missing value are counted and
-        told before anything is fitted, and with ``catalog_map`` what it takes as missing.
+        What `BayesFitter.fit` warns of, once. Numbers that look like codes for a missing value are counted
+        before anything is fitted, and with ``catalog_map`` what it takes as missing.
 
     Raises
     ------
@@ -113,7 +111,7 @@ def fit_file(
         If the folder holds parts of another fit.
     ValueError
         What `BayesFitter.fit` raises; if an id is no ASCII text, which FITS cannot hold,
-        before anything is fitted. A note tells the rows.
+        before anything is fitted. A note names the rows.
     """
     if not isinstance(fitter, BayesFitter):
         raise argument_error("fitter", "a BayesFitter", type(fitter).__name__)
@@ -121,7 +119,7 @@ def fit_file(
         raise argument_error("path_in", "the path of a catalog", type(path_in).__name__)
     if fitter.engine != "grid":
         if seed is None:
-            raise argument_error("seed", "given for a sampler, so that it can go on", "None")
+            raise argument_error("seed", "given for a sampler, so that it can be resumed", "None")
         seed = check_seed(seed)
     else:
         # the same fit, in whatever order they are given
@@ -130,14 +128,13 @@ def fit_file(
     if unit is not None and not unit.is_equivalent(FNU):
         msg = f"'flux_unit' must be convertible to {FNU}, got {unit}"
         raise u.UnitsError(msg)
-    rows = open_rows(path_in, chunk_rows, hdu=hdu)
-    if catalog_map is not None:
-        rows = MappedRows(rows, as_catalog_map(catalog_map))
+    rows = open_catalog(path_in, chunk_rows, hdu=hdu, catalog_map=catalog_map)
     options = {"redshift": redshift, "redshift_prior": redshift_prior, "pairs": pairs}
     if catalog_map is None:
         warn_of_codes(_codes(rows, fitter.bands), rows.path.name, 2)
-    for text in rows.told() if catalog_map is not None else ():
-        warnings.warn(f"{rows.path.name}: {text}", MiricigaleWarning, stacklevel=2)
+    else:
+        for text in rows.told():
+            warnings.warn(f"{rows.path.name}: {text}", MiricigaleWarning, stacklevel=2)
     fluxes = {c for name in fitter.bands for c in (name, error_column(name))}
     inputs = _Inputs(rows, options, unit, fluxes)
     _check_ids(rows)
@@ -153,7 +150,7 @@ def fit_file(
 
 @contextlib.contextmanager
 def _noted(rows, i):
-    """Tell the rows of a piece with what is wrong in it."""
+    """Add the rows of a piece to an error about it."""
     try:
         yield
     except ValueError as err:
@@ -216,7 +213,7 @@ def _keys(ids):
 
 
 class _Inputs:
-    """The pieces of a catalog, and of what was given beside it."""
+    """The pieces of a catalog, and of the arrays given with it."""
 
     def __init__(self, rows, options, unit, fluxes):
         self.rows, self.unit, self.fluxes, self.options = rows, unit, fluxes, options
@@ -289,7 +286,7 @@ def _begin(folder, job, resume):
             if begun != versions["miricigale"]:
                 remedy += (
                     f" (they are of miricigale {begun}, whose settings may have other names: that "
-                    "version can go on, and open_results(path, partial=True) reads them)"
+                    "version can resume it, and open_results(path, partial=True) reads them)"
                 )
             raise OtherResultsError(msg, remedy)
         return
@@ -309,5 +306,5 @@ def _differences(old, new, prefix=""):
         elif a != b:
             out.append(prefix + name)
     # checksums say less than settings
-    told = [name for name in out if name.split(".")[0] != "fitter"]
-    return told or out
+    settings = [name for name in out if name.split(".")[0] != "fitter"]
+    return settings or out

@@ -282,7 +282,7 @@ def test_a_band_takes_the_filter_that_is_given(tmp_path):
         (12.0, ValueError, r"'names' must be .* 'IRAS1' is a Filter, .* got float"),
     ],
 )
-def test_a_wrong_filter_is_told_when_it_is_read(tmp_path, given, error, wanted):
+def test_a_wrong_filter_is_refused_when_it_is_read(tmp_path, given, error, wanted):
     path = tmp_path / "galaxies.txt"
     path.write_text("# id redshift IRAS1 IRAS1_err\na 0.5 3 0.1\n")
     with pytest.raises(error, match=wanted):

@@ -136,7 +136,7 @@ def test_the_dialect_is_that_of_configobj(tmp_path):
 
 def test_settings_have_their_types(tmp_path):
     found = parse_ini(write(tmp_path))
-    assert (found["cores"], found["additionalerror"]) == (2, 0.05)
+    assert found["additionalerror"] == 0.05
     assert found["bands"][:2] == ["hst.wfc3.F160W", "hst.wfc3.F160W_err"]
     assert found["properties"] == []
     analysis = found["analysis_params"]
@@ -247,17 +247,8 @@ def test_axes_in_our_units(tmp_path):
 def test_parameters_and_options_of_the_chain(tmp_path):
     setup = quiet(write(tmp_path))
     model = setup.model()
-    assert [c.name for c in model.components] == [
-        *(
-            "delayed",
-            "bc03",
-            "nebular",
-            "modified_starburst",
-            "dl07",
-            "parametric_torus",
-            "meiksin2006",
-        )
-    ]
+    names = "delayed bc03 nebular modified_starburst dl07 parametric_torus meiksin2006"
+    assert [c.name for c in model.components] == names.split()
     defaults = {name: p.default for name, p in model.parameters.items()}
     wanted = {"f_burst": 0, "age_burst": 0.02, "tau_burst": 0.05, "separation_age": 10}
     wanted |= {
@@ -278,7 +269,7 @@ def test_parameters_and_options_of_the_chain(tmp_path):
     dust = model.component("attenuation")
     assert (dust.gas_law, dust.ebv_scaling) == ("lmc", "cigale")
     assert setup.additional_error == 0.05
-    assert (setup.limits, setup.mock, setup.cores, setup.redshift_decimals) == (True, True, 2, 1)
+    assert (setup.limits, setup.mock, setup.redshift_decimals) == (True, True, 1)
     assert list(setup.bands.items())[2] == ("miri.f770w", "F770W")
     assert setup.predicted == {"miri.f2100w": "jwst.miri.F2100W"}
 
@@ -351,7 +342,7 @@ def test_other_modules(tmp_path):
     np.testing.assert_allclose(axes["alpha_mir"], [2.0, 2.5])
     np.testing.assert_allclose(axes["redshift"], [0.5, 0.75, 1.0])
     assert not setup.model().has_agn
-    assert setup.variables == (*("stellar.m_star", "sfh.sfr10Myrs", "sfh.age", "dust.luminosity"),)
+    assert setup.variables == ("stellar.m_star", "sfh.sfr10Myrs", "sfh.age", "dust.luminosity")
 
 
 def test_history_from_a_file(tmp_path):
@@ -396,9 +387,9 @@ def test_a_parameter_by_another_name_does_not_become_the_default(tmp_path, old, 
         quiet(write(tmp_path, (old, new)))
 
 
-def test_defaults_and_parameters_without_a_part_are_told(tmp_path):
-    more = write(tmp_path, ("normalise = True", "normalise = True\n    colour = 3"))
-    assert "sfhdelayed.colour" in quiet(more).left_out
+def test_defaults_and_parameters_without_a_part_are_reported(tmp_path):
+    more = write(tmp_path, ("normalise = True", "normalise = True\n    color = 3"))
+    assert "sfhdelayed.color" in quiet(more).left_out
     without = write(tmp_path, ("    delta = -0.36\n", ""))
     assert "skirtor2016: not in the file, the defaults here: delta = 0" in quiet(without).differs
 
@@ -571,18 +562,12 @@ def test_a_run_gives_the_models_back(run, tmp_path):
         "agn.i": ([30, np.nan, 70], "deg"),
         "dust.umin": ([1] * 3, ""),
     }
-    for name, unit in (
-        ("stellar_mass", "Msun"),
-        ("dust_luminosity", "W"),
-        ("sfr_10myr", "Msun/yr"),
-        ("accretion_power", "W"),
+    for name, unit, theirs in (
+        ("stellar_mass", "Msun", "stellar.m_star"),
+        ("dust_luminosity", "W", "dust.luminosity"),
+        ("sfr_10myr", "Msun/yr", "sfh.sfr10Myrs"),
+        ("accretion_power", "W", "agn.accretion_power"),
     ):
-        theirs = {
-            "stellar_mass": "stellar.m_star",
-            "dust_luminosity": "dust.luminosity",
-            "sfr_10myr": "sfh.sfr10Myrs",
-            "accretion_power": "agn.accretion_power",
-        }[name]
         best[theirs] = (factor * truth[name].to_value(unit), unit)
     for name, (values, unit) in best.items():
         got = u.Quantity(table[f"best.{name}"])
@@ -737,9 +722,9 @@ def test_text_and_fits_say_the_same(run, tmp_path):
     # what was replaced stands in both
     header = " ".join(fits.getheader(tmp_path / "results.fits", 1)["COMMENT"])
     head = (tmp_path / "results.txt").read_text().partition(" id ")[0]
-    for told in (header, head):
-        assert "skirtor2016 by parametric_torus" in told
-        assert "1 no band" in told
+    for text in (header, head):
+        assert "skirtor2016 by parametric_torus" in text
+        assert "1 no band" in text
     assert one["flags"].tolist() == results.flags.tolist()
     (tmp_path / "x.txt").write_text("id b\n1 2\n")
     with pytest.raises(DataError, match=r"no column best.chi_square"):
@@ -1038,7 +1023,7 @@ def test_x_ray_bands_are_fitted_where_there_is_a_module(tmp_path):
         got = results.mean(name)[0]
         assert got.value == pytest.approx(mean, abs=5 * std / np.sqrt(500)), name
     assert results.log_evidence[0] < fitter.fit(catalog, redshift=[0.5]).log_evidence[0]
-    # without the module the band is left out, and told
+    # without the module the band is left out, and reported
     path.write_text(INI.replace(*BAND, 1))
     setup = quiet(path)
     assert "band xray_boxcar_0p5to2keV (no module xray)" in setup.describe()

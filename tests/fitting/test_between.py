@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from astropy.table import QTable
 
-from miricigale.fitting import BayesFitter, FitFlags
+from miricigale.fitting import BayesFitter, FitFlags, GridSettings
 from miricigale.sed import ModelGrid, SEDModel
 
 BANDS = tuple(f"band{i}" for i in range(8))
@@ -79,7 +79,7 @@ def coverage(results, true, name):
 
 def test_intervals_hold_the_truth_between_nodes(grid, drawn):
     table, true = drawn
-    results = BayesFitter(grid, model_error=0.0, interpolate=150).fit(table)
+    results = BayesFitter(grid, model_error=0.0, settings=GridSettings(interpolate=150)).fit(table)
     nodes = BayesFitter(grid, model_error=0.0).fit(table)
     for name in ("redshift", "tau", "ebv", "mass", "sfr", "beta"):
         # three times the binomial error of 300 objects
@@ -104,7 +104,9 @@ def test_what_rests_on_one_node_is_flagged(grid, drawn):
 def test_known_redshifts_are_those_of_the_catalog(grid, drawn):
     """Also where they lie between nodes; the rest is then that of these redshifts."""
     table, true = drawn
-    results = BayesFitter(grid, model_error=0.0, interpolate=150).fit(table, redshift="z")
+    results = BayesFitter(grid, model_error=0.0, settings=GridSettings(interpolate=150)).fit(
+        table, redshift="z"
+    )
     np.testing.assert_allclose(results.percentile("redshift", 0.5).value[:, 0], true["redshift"])
     for name in ("tau", "ebv", "mass", "sfr"):
         assert abs(coverage(results, true, name) - 0.68) < 0.08, name
@@ -123,7 +125,9 @@ def test_chi2_and_evidence_are_those_at_the_known_redshift(grid):
     for i, name in enumerate(BANDS):
         table[name] = observed[:, i] * u.uJy
         table[f"{name}_err"] = error[:, i] * u.uJy
-    results = BayesFitter(grid, model_error=0.0, interpolate=20).fit(table, redshift=z)
+    results = BayesFitter(grid, model_error=0.0, settings=GridSettings(interpolate=20)).fit(
+        table, redshift=z
+    )
     unit, data = models / error[:, None], (observed / error)[:, None]
     scale = np.sum(unit * data, axis=2) / np.sum(unit**2, axis=2)
     chi2 = np.sum((data - scale[..., None] * unit) ** 2, axis=2)
@@ -160,19 +164,19 @@ def test_masses_at_low_redshift_are_those_of_the_distance(grid):
     for i, name in enumerate(BANDS):
         table[name] = model[:, i] * u.uJy
         table[f"{name}_err"] = 0.05 * model[:, i] * u.uJy
-    results = BayesFitter(near, model_error=0.0, interpolate=50).fit(table, redshift=0.02)
+    results = BayesFitter(near, model_error=0.0, settings=GridSettings(interpolate=50)).fit(
+        table, redshift=0.02
+    )
     assert results.best_scale[0] == pytest.approx(1e9, rel=1e-3)
 
 
 def test_the_same_objects_have_the_same_draws(grid, drawn):
     table, _ = drawn
-    fitter = BayesFitter(grid, model_error=0.0, interpolate=50)
+    fitter = BayesFitter(grid, model_error=0.0, settings=GridSettings(interpolate=50))
     some, turned = fitter.fit(table[:6]), fitter.fit(table[:6][::-1])
     np.testing.assert_array_equal(
         some.percentile("mass", [0.16, 0.5]), turned.percentile("mass", [0.16, 0.5])[::-1]
     )
-    with pytest.raises(ValueError, match="'interpolate' must be an integer >= 0"):
-        BayesFitter(grid, interpolate=-1)
 
 
 OPTICAL = ["megacam.u", "acs.f606w", "acs.f814w", "wfc3.f125w", "wfc3.f160w", "irac.ch1"]
@@ -224,7 +228,7 @@ def test_interpolated_models_are_those_of_the_chain(chain, off_nodes):
     want = np.column_stack([fluxes[name].value for name in CHAIN_BANDS])
     off = []
     for finer in (None, model):
-        fitter = BayesFitter(grid, interpolate=1, finer=finer)
+        fitter = BayesFitter(grid, settings=GridSettings(interpolate=1, finer=finer))
         models = fitter.backend.between.models
         flux, power = models.fluxes(models.models(values))
         ratio = np.log(flux * 1e10 / want)
@@ -239,7 +243,7 @@ def test_interpolated_models_are_those_of_the_chain(chain, off_nodes):
 def test_intervals_of_galaxies_and_agn(chain, off_nodes):
     """Of models of the chain, two-sided; ``benchmarks/intervals.py`` measures more of them."""
     (model, grid), (table, true, _) = chain, off_nodes
-    fitter = BayesFitter(grid, model_error=0.0, interpolate=300, finer=model)
+    fitter = BayesFitter(grid, model_error=0.0, settings=GridSettings(interpolate=300, finer=model))
     results = fitter.fit(table)
     nodes = BayesFitter(grid, model_error=0.0).fit(table)
     names = ("redshift", "frac_agn", "stellar_mass", "sfr", "dust_luminosity")
@@ -265,9 +269,9 @@ def test_known_redshifts_between_nodes_are_those_of_the_chain(chain):
     for name in CHAIN_BANDS:
         table[name], table[f"{name}_err"] = fluxes[name], 0.02 * fluxes[name]
     known = np.array(true["redshift"])
-    results = BayesFitter(grid, model_error=0.0, interpolate=20, finer=model).fit(
-        table, redshift=known
-    )
+    results = BayesFitter(
+        grid, model_error=0.0, settings=GridSettings(interpolate=20, finer=model)
+    ).fit(table, redshift=known)
     # fluxes are good to half a percent, a quarter of their errors
     assert np.all(results.chi2 < len(CHAIN_BANDS) / 10)
     nodes = BayesFitter(grid, model_error=0.0).fit(table, redshift=known)
@@ -280,10 +284,10 @@ def test_a_finer_grid_is_of_the_model_that_made_the_grid(chain):
     model, grid = chain
     other = SEDModel.yang2021(libraries="bundled", frac_agn_definition="3-1000um")
     with pytest.raises(ValueError, match="'finer' must be the model that made the grid"):
-        BayesFitter(grid, interpolate=10, finer=other)
-    with pytest.raises(ValueError, match="'finer' must be None without 'interpolate'"):
-        BayesFitter(grid, finer=model)
+        BayesFitter(grid, settings=GridSettings(interpolate=10, finer=other))
     with pytest.raises(ValueError, match="'finer' must be left out when 'model' is an SEDModel"):
-        BayesFitter(model, CHAIN_BANDS, axes=CHAIN, interpolate=10, finer=other)
+        BayesFitter(
+            model, CHAIN_BANDS, axes=CHAIN, settings=GridSettings(interpolate=10, finer=other)
+        )
     with pytest.raises(ValueError, match="'finer' must be an SEDModel"):
-        BayesFitter(grid, interpolate=10, finer=grid)
+        BayesFitter(grid, settings=GridSettings(interpolate=10, finer=grid))

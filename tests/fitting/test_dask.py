@@ -67,9 +67,9 @@ def test_two_dask_workers_give_the_numbers_of_one_process(grid, photometry, tmp_
         n_done = client.run(lambda dask_worker: dask_worker.state.executed_count)
         assert len(n_done) == 2
         assert min(n_done.values()) > 0
-        photometry.write(tmp_path / "catalogue.fits")
+        photometry.write(tmp_path / "catalog.fits")
         results = fit_file(
-            fitter, tmp_path / "catalogue.fits", tmp_path / "out", chunk_rows=50, executor=executor
+            fitter, tmp_path / "catalog.fits", tmp_path / "out", chunk_rows=50, executor=executor
         )
         table = results.to_table()
     for name, column in whole.to_table().items():
@@ -101,7 +101,7 @@ def test_any_executor_will_do(grid, photometry):
     assert_same(fitter.fit(photometry, executor=Plain()), fitter.fit(photometry))
 
 
-def test_a_fault_in_a_worker_is_told_and_leaves_no_file(tmp_path, monkeypatch):
+def test_a_fault_in_a_worker_is_reported_and_leaves_no_file(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     heavy = partial(operator.getitem, list(range(100_000)))
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as executor:

@@ -1,7 +1,5 @@
 """The grid engine where grids, priors and data are at their limits."""
 
-import pickle
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import astropy.units as u
@@ -9,7 +7,7 @@ import numpy as np
 import pytest
 from astropy.table import QTable
 
-from miricigale.fitting import BayesFitter, FitFlags, fit_file
+from miricigale.fitting import BayesFitter, FitFlags, GridSettings
 from miricigale.fitting import grid as engine_module
 
 
@@ -54,7 +52,7 @@ def test_numbers_of_galaxies_about_those_of_a_block(
     grid = make_grid(6, n_z=2, n_tau=n_galaxies[0], n_age=n_galaxies[1])
     grid = replace(grid, allowed=np.ones_like(grid.allowed), dust_luminosity=grid.dust_luminosity)
     table, _ = draw_photometry(grid, 3, seed=3, noise=0.2)
-    _assert_equal_plain(BayesFitter(grid, rtol=rtol), table, brute_force)
+    _assert_equal_plain(BayesFitter(grid, settings=GridSettings(rtol=rtol)), table, brute_force)
 
 
 def test_known_redshifts_of_bright_objects(make_grid, draw_photometry, brute_force):
@@ -84,7 +82,10 @@ def test_priors_that_leave_little(make_grid, draw_photometry, brute_force):
     table, _ = draw_photometry(grid, 4, seed=2, noise=0.3)
     for rtol in (0.0, 1e-6):
         results = _assert_equal_plain(
-            BayesFitter(grid, priors=priors, rtol=rtol), table, brute_force, priors=priors
+            BayesFitter(grid, priors=priors, settings=GridSettings(rtol=rtol)),
+            table,
+            brute_force,
+            priors=priors,
         )
         for name in priors:
             assert np.all(results.pdf[name][:, np.equal(priors[name], 0)] == 0), name
@@ -108,13 +109,14 @@ def test_several_lists_equal_one(make_grid, draw_photometry, monkeypatch):
     pairs = [("age", "tau97"), ("tau", "frac_agn"), ("redshift", "age"), ("redshift", "tau97")]
     pairs += [("frac_agn", "tau97")]
     for rtol, tolerance in ((0.0, 1e-11), (1e-6, 1e-6)):
-        fitter = BayesFitter(grid, rtol=rtol)
+        fitter = BayesFitter(grid, settings=GridSettings(rtol=rtol))
         want, drawn = fitter.fit(table, pairs=pairs), fitter.sample(table, 400, seed=1)
         with monkeypatch.context() as patch:
             patch.setattr(engine_module, "_CAPACITY", 1)
-            short = BayesFitter(grid, rtol=rtol)
+            short = BayesFitter(grid, settings=GridSettings(rtol=rtol))
             got, others = short.fit(table, pairs=pairs), short.sample(table, 400, seed=1)
         np.testing.assert_allclose(got.pdf_2d, want.pdf_2d, rtol=tolerance, atol=tolerance)
+        np.testing.assert_allclose(got.log_evidence, want.log_evidence, atol=tolerance)
         np.testing.assert_allclose(
             got.moments[:, :, :2], want.moments[:, :, :2], rtol=1e3 * tolerance
         )
@@ -143,7 +145,7 @@ def test_models_without_light_in_the_used_bands(rtol, make_grid, draw_photometry
     table, _ = draw_photometry(grid, 4, seed=4, noise=0.5)
     for name in grid.filters[3:]:
         del table[name], table[f"{name}_err"]
-    fitter = BayesFitter(dark, rtol=rtol, model_error=0.0)
+    fitter = BayesFitter(dark, settings=GridSettings(rtol=rtol), model_error=0.0)
     results = fitter.fit(table)
     assert results.fitted.all()
     n_fractions = grid.frac_agn.size
@@ -246,7 +248,7 @@ def test_galaxies_without_dust_where_fractions_refer_to_all_infrared_light(
     # tori so bright that no AGN at all fits best
     grid = replace(grid, agn=grid.agn * 1e3)
     table, _ = draw_photometry(grid, 6, seed=5, noise=0.1)
-    fitter = BayesFitter(grid, rtol=rtol)
+    fitter = BayesFitter(grid, settings=GridSettings(rtol=rtol))
     results = fitter.fit(table)
     for i in range(len(table)):
         want = brute_force(grid, results.flux[i], results.sigma[i])
@@ -281,49 +283,3 @@ def test_signal_to_noise_of_a_million_and_its_inverse(noise, make_grid, draw_pho
         # nothing is known but the sign: no model is preferred by more than the few sigma of noise
         prior = grid.allowed.sum(axis=1) / grid.allowed.sum()
         assert np.all(np.abs(np.log(results.pdf["redshift"] / prior)) < 5.0)
-
-
-def test_pieces_threads_and_pickles_change_no_digit(make_grid, draw_photometry):
-    grid = make_grid(2, n_tau=13, n_age=5)
-    table, _ = draw_photometry(grid, 23, noise=0.5, missing=0.2)
-    pairs = [("age", "tau97"), ("tau", "frac_agn")]
-    fitter = BayesFitter(grid)
-    want = fitter.fit(table, pairs=pairs)
-    copied = pickle.loads(pickle.dumps(fitter))
-    with ThreadPoolExecutor(4) as threads:
-        others = [
-            copied.fit(table, pairs=pairs, chunk_size=1),
-            fitter.fit(table, pairs=pairs, chunk_size=5, executor=threads),
-            BayesFitter(grid).fit(table, pairs=pairs, chunk_size=3, executor=threads),
-        ]
-    for got in others:
-        for name in ("chi2", "log_evidence", "pdf_2d", "moments", "quantiles", "model_flux_std"):
-            np.testing.assert_array_equal(getattr(got, name), getattr(want, name), err_msg=name)
-        for pair in pairs:
-            np.testing.assert_array_equal(got.pairs[pair], want.pairs[pair])
-
-
-def test_lists_of_redshifts_go_with_rows_of_files(make_grid, draw_photometry, tmp_path):
-    """An id of an earlier piece is a duplicate; redshifts and p(z) stay with their rows."""
-    grid = make_grid(1)
-    table, truth = draw_photometry(grid, 6, noise=0.3)
-    table["id"] = [0, 1, 2, 0, 4, 5]
-    table.write(tmp_path / "catalogue.fits")
-    fitter = BayesFitter(grid)
-    redshift = [float(grid.redshift[t[0]]) for t in truth]
-    nodes = [0.0, 1.0, 3.0]
-    density = [[1.0, 2.0 + i, 0.5] for i in range(6)]
-    for name, options in (
-        ("known", {"redshift": redshift}),
-        ("density", {"redshift_prior": (nodes, density)}),
-    ):
-        files = fit_file(
-            fitter, tmp_path / "catalogue.fits", tmp_path / name, chunk_rows=3, **options
-        )
-        whole = fitter.fit(table, **options)
-        parts = list(files.parts())
-        got = np.concatenate([part.flags for part in parts])
-        np.testing.assert_array_equal(got, whole.flags)
-        assert got[3] & int(FitFlags.DUPLICATE_ID)
-        got = np.concatenate([part.pdf_2d for part in parts])
-        np.testing.assert_array_equal(got, whole.pdf_2d)

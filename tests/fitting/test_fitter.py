@@ -1,7 +1,6 @@
 import itertools
 import math
-import pickle
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
 
 import astropy.units as u
 import numpy as np
@@ -12,16 +11,8 @@ from scipy.stats import norm
 
 from helpers.grids import cells
 from helpers.results import assert_same
-from miricigale.fitting import BayesFitter, FitFlags, leave_out
+from miricigale.fitting import BayesFitter, FitFlags, GridSettings, SamplerSettings, leave_out
 from miricigale.sed import SEDModel
-
-
-def test_threads_and_pieces_change_nothing(grid, photometry):
-    fitter = BayesFitter(grid)
-    serial = fitter.fit(photometry)
-    assert_same(serial, fitter.fit(photometry, chunk_size=5))
-    with ThreadPoolExecutor(3) as pool:
-        assert_same(serial, fitter.fit(photometry, executor=pool, chunk_size=2))
 
 
 @pytest.mark.slow
@@ -39,12 +30,6 @@ def test_processes_change_nothing(grid, photometry):
     np.testing.assert_allclose(here.pdf_2d, alone.pdf_2d, rtol=1e-12, atol=1e-18)
     np.testing.assert_allclose(here.moments, alone.moments, rtol=1e-12)
     np.testing.assert_allclose(here.quantiles, alone.quantiles, rtol=1e-12)
-
-
-def test_a_fitter_out_of_a_pickle_fits_alike(grid, photometry):
-    fitter = BayesFitter(grid)
-    again = pickle.loads(pickle.dumps(fitter))
-    assert_same(fitter.fit(photometry), again.fit(photometry))
 
 
 def test_noiseless_models_are_found(grid, draw_photometry):
@@ -93,7 +78,9 @@ def test_fixed_redshift_goes_to_the_nearest_node_or_is_flagged(grid, photometry)
     ]
     assert not results.fitted[1:5].any()
     assert results.fitted[5:].all()
-    strict = BayesFitter(grid, redshift_tolerance=0.001).fit(photometry, redshift=z)
+    strict = BayesFitter(grid, settings=GridSettings(redshift_tolerance=0.001)).fit(
+        photometry, redshift=z
+    )
     assert FitFlags.names(strict.flags[0]) == ["redshift_outside"]
 
 
@@ -154,12 +141,6 @@ def test_model_error_is_added_in_quadrature(grid, photometry):
     np.testing.assert_allclose(results.sigma[used], np.hypot(err, extra)[used])
 
 
-def test_an_empty_catalogue_gives_empty_results(grid, photometry):
-    results = BayesFitter(grid).fit(photometry[:0])
-    assert len(results) == 0
-    assert len(results.to_table()) == 0
-
-
 @pytest.mark.parametrize(
     ("options", "error", "text"),
     [
@@ -172,8 +153,14 @@ def test_an_empty_catalogue_gives_empty_results(grid, photometry):
         ({"priors": {"tau": [1, 2]}}, ValueError, r"must be 5 weights, for tau"),
         ({"priors": {"frac_agn": "log"}}, ValueError, "with values above 0"),
         ({"priors": {"tau": lambda x: -x}}, ValueError, "finite, >= 0 and not all 0"),
-        ({"prior_f": "no"}, ValueError, "'prior_f' must be 'grid' or 'uniform'"),
-        ({"rtol": 1}, ValueError, r"'rtol' must be in \[0, 0.1\)"),
+        ({"settings": GridSettings("no")}, ValueError, "'prior_f' must be 'grid' or 'uniform'"),
+        ({"settings": SamplerSettings()}, ValueError, "'settings' must be GridSettings"),
+        ({"filters": ["band0", "band0"]}, ValueError, "must be different names, at least one"),
+        ({"filters": []}, ValueError, "'filters' must be different names, at least one"),
+        ({"priors": ["tau"]}, ValueError, "'priors' must be a dict of parameters, got list"),
+        ({"n_bands_min": True}, ValueError, "'n_bands_min' must be an integer >= 1, got True"),
+        ({"max_reduced_chi2": "x"}, ValueError, "'max_reduced_chi2' must be positive, got 'x'"),
+        ({"scale_error": "no"}, ValueError, "'scale_error' must be True, False or None, got 'no'"),
         ({"n_bands_min": 0}, ValueError, "'n_bands_min' must be an integer >= 1"),
         ({"axes": {"a": [1]}}, ValueError, "'axes' must be None when"),
     ],
@@ -245,7 +232,7 @@ def test_a_density_weighs_the_redshifts_by_its_integral_over_their_cells(
 ):
     """Posterior with p(z) = posterior with a flat prior times the integrals, by quadrature."""
     grid = make_grid(3, n_z=6)
-    fitter = BayesFitter(grid, rtol=0)
+    fitter = BayesFitter(grid, settings=GridSettings(rtol=0))
     table, _ = draw_photometry(grid, 5, seed=2)
     nodes = np.array([0.0, 0.4, 0.9, 2.0, 9.0])
     density = np.array([0.1, 2.0, 0.3, 0.5, 0.0])
@@ -380,19 +367,18 @@ def test_priors_may_be_distributions_and_functions_of_one_value(grid, photometry
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"filters": ["band0", "band0"]}, "'filters' must be different names, at least one"),
-        ({"filters": []}, "'filters' must be different names, at least one"),
-        ({"priors": ["tau"]}, "'priors' must be a dict of parameters, got list"),
-        ({"n_bands_min": True}, "'n_bands_min' must be an integer >= 1, got True"),
+        ({"rtol": 1}, r"'rtol' must be in \[0, 0.1\), got 1"),
         ({"rtol": "low"}, r"'rtol' must be in \[0, 0.1\), got 'low'"),
-        ({"max_reduced_chi2": "x"}, "'max_reduced_chi2' must be positive, got 'x'"),
         ({"redshift_tolerance": "x"}, "'redshift_tolerance' must be >= 0, got 'x'"),
-        ({"scale_error": "no"}, "'scale_error' must be True, False or None, got 'no'"),
+        ({"interpolate": -1}, "'interpolate' must be an integer >= 0"),
+        ({"interpolate": 9, "sfr_prior": ()}, "'sfr_prior' must be None with 'interpolate'"),
+        ({"finer": 1}, "'finer' must be None without 'interpolate'"),
+        ({"interpolate": 9, "finer": 1}, "'finer' must be an SEDModel"),
     ],
 )
-def test_arguments_that_mean_nothing_are_refused(grid, options, message):
+def test_settings_that_mean_nothing_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
-        BayesFitter(grid, **options)
+        GridSettings(**options)
 
 
 def test_weights_and_pieces_have_no_unit_and_no_fraction(grid, photometry):

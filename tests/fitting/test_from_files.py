@@ -1,4 +1,4 @@
-"""``miricigale fit``: the folder it fills, and how it goes on."""
+"""``miricigale fit``: the folder it fills, and how it is resumed."""
 
 import warnings
 
@@ -71,7 +71,7 @@ def test_a_catalog_becomes_a_folder_of_results(catalog, tmp_path, capsys):
     assert open_results(out).n_parts == 2
 
 
-def test_real_galaxies_have_their_own_grid_whose_errors_are_told(tmp_path, caplog):
+def test_real_galaxies_have_their_own_grid_whose_errors_are_logged(tmp_path, caplog):
     """Of models of the survey grid without noise the best fit has all that went in."""
     model, axes = SEDModel.survey(), SEDModel.survey_axes()
     nodes = {name: np.full(2, values[len(values) // 2]) for name, values in axes.items()}
@@ -184,7 +184,7 @@ def test_options_that_cannot_be_used_are_one_sentence(catalog, tmp_path, capsys,
     assert list((tmp_path / "out").glob("part-*")) == []
 
 
-def test_a_table_without_photometry_is_told_what_is_wanted(tmp_path, capsys):
+def test_a_table_without_photometry_is_refused_with_what_is_wanted(tmp_path, capsys):
     QTable({"id": [1], "flux": [1.0] * u.uJy}).write(tmp_path / "cat.fits")
     assert main(["fit", str(tmp_path / "cat.fits"), "-o", str(tmp_path / "out")]) == 2
     assert "a table with columns <filter> and <filter>_err" in capsys.readouterr().err
@@ -196,7 +196,7 @@ def test_pairs_are_two_names(capsys):
     assert "'cat.fits' is no pair NAME:NAME" in capsys.readouterr().err
 
 
-def test_bands_of_no_filter_are_told(catalog, tmp_path):
+def test_bands_without_a_filter_are_named(catalog, tmp_path):
     table = catalog.copy()
     table["hst.f606w"], table["hst.f606w_err"] = table["irac.ch1"], table["irac.ch1_err"]
     table.write(tmp_path / "cat.fits")
@@ -242,7 +242,7 @@ def test_the_page_of_a_catalog_says_how_redshifts_compare_and_what_was_left_out(
 
 
 def test_fluxes_behind_the_milky_way_give_the_galaxies_in_front_of_it(catalog, tmp_path):
-    """E(B-V) of 0.3, 0.2 mag in F125W, put on the fluxes and told to the fit; without it masses are low."""
+    """E(B-V) of 0.3, 0.2 mag in F125W, put on the fluxes and given to the fit; without it masses are low."""
     table = catalog.copy()
     lost = band_extinction(list(BANDS), 0.3)
     for name in BANDS:
@@ -297,7 +297,7 @@ def test_a_catalog_is_sorted_into_galaxies_quasars_and_stars(
     command += ["--quasars", "--stars", str(folder), "--chunk-rows", "4"]
     with pytest.warns(MiricigaleWarning) as record:
         assert main(command) == 0
-    # what holds for the catalog is told once for all classes, what holds for one class is told
+    # warnings of the catalog come once for all classes, those of one class too
     texts = [str(one.message) for one in record]
     assert sum("not fitted" in text and "miri.f999w" in text for text in texts) == 1
     assert texts.count("a star is left out") == 1
@@ -312,7 +312,7 @@ def test_a_catalog_is_sorted_into_galaxies_quasars_and_stars(
     assert "Galaxy, quasar or star" in page
     assert "that of the galaxy" in page
     monkeypatch.undo()
-    # the fits of the classes are whole: the same command goes on from them, and finds nothing to do
+    # the fits of the classes are whole: the same command resumes from them, and finds nothing to do
     with pytest.warns(MiricigaleWarning, match="not fitted"):
         assert main(command) == 0
     capsys.readouterr()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from helpers.grids import derived_quantities, free_parameters
-from miricigale.fitting import BayesFitter
+from miricigale.fitting import BayesFitter, GridSettings
 
 CASES = {
     "default": ({}, {}),
@@ -19,7 +19,7 @@ CASES = {
             }
         },
     ),
-    "prior_f by width": ({}, {"prior_f": "uniform"}),
+    "prior_f by width": ({}, {}),
     "no galaxy-only models": ({"frac": [0.1, 0.5, 0.95]}, {}),
     "no AGN": ({"frac": [0.0]}, {}),
     "many fractions": ({"frac": np.append(np.arange(10) * 0.1, 0.99)}, {}),
@@ -62,10 +62,11 @@ def _compare(fitter, table, brute_force, *, rtol, atol=1e-12, **options):
 def test_every_sum_equals_the_plain_one(case, make_grid, draw_photometry, brute_force):
     of_grid, of_fitter = CASES[case]
     grid = make_grid(3, **of_grid)
-    fitter = BayesFitter(grid, rtol=0, **of_fitter)
+    prior_f = "uniform" if case == "prior_f by width" else "grid"
+    fitter = BayesFitter(grid, settings=GridSettings(prior_f, rtol=0), **of_fitter)
     table, _ = draw_photometry(grid, 6, seed=5, missing=0.2)
     options = {k: v for k, v in of_fitter.items() if k not in ("model_error", "error_floor")}
-    _compare(fitter, table, brute_force, rtol=1e-9, **options)
+    _compare(fitter, table, brute_force, rtol=1e-9, prior_f=prior_f, **options)
 
 
 @pytest.mark.parametrize("noise", [1e-3, 0.03, 0.3, 3.0, 30.0])
@@ -79,7 +80,7 @@ def test_pruning_loses_no_more_than_asked(
     for name in grid.filters:
         table[name][0] = -abs(table[name][0])
     table[grid.filters[0]][0] = abs(table[f"{grid.filters[0]}_err"][0])
-    fitter = BayesFitter(grid, model_error=model_error, rtol=1e-6)
+    fitter = BayesFitter(grid, model_error=model_error, settings=GridSettings(rtol=1e-6))
     _compare(fitter, table, brute_force, rtol=1e-5, atol=1e-6)
 
 
@@ -186,21 +187,6 @@ def test_galaxies_alone_weigh_one_over_the_number_of_fractions(make_grid, draw_p
     np.testing.assert_allclose(results.pdf["frac_agn"], 0.25, rtol=1e-6)
     np.testing.assert_allclose(results.pdf["temperature_polar"], 0.5, rtol=1e-6)
     np.testing.assert_allclose(results.pdf["ebv_polar"], 1 / 3, rtol=1e-6)
-    uniform = BayesFitter(dark, prior_f="uniform").fit(table)
+    uniform = BayesFitter(dark, settings=GridSettings(prior_f="uniform")).fit(table)
     width = np.diff([0.0, 0.1, 0.35, 0.7, 1.0])
     np.testing.assert_allclose(uniform.pdf["frac_agn"][0], width, rtol=1e-6)
-
-
-def test_a_short_list_of_pairs_changes_nothing(make_grid, draw_photometry, monkeypatch):
-    """When the list is full it is worked off, and the search goes on."""
-    from miricigale.fitting import grid as module
-
-    grid = make_grid(8, n_tau=20, n_age=16)
-    table, _ = draw_photometry(grid, 6, noise=1.0)
-    fitter = BayesFitter(grid)
-    want = fitter.fit(table)
-    monkeypatch.setattr(module, "_CAPACITY", 1)
-    got = BayesFitter(grid).fit(table)
-    np.testing.assert_allclose(got.pdf_2d, want.pdf_2d, atol=1e-6)
-    np.testing.assert_allclose(got.moments[:, :, 0], want.moments[:, :, 0], rtol=1e-5)
-    np.testing.assert_allclose(got.log_evidence, want.log_evidence, atol=1e-6)

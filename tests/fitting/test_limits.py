@@ -11,7 +11,15 @@ from scipy.special import log_ndtr
 from scipy.stats import norm
 
 from helpers.grids import cells, free_parameters, model_priors, other_fraction
-from miricigale.fitting import BayesFitter, FitFlags, FitResults, fit_file, leave_out, mock_analysis
+from miricigale.fitting import (
+    BayesFitter,
+    FitFlags,
+    FitResults,
+    GridSettings,
+    fit_file,
+    leave_out,
+    mock_analysis,
+)
 from miricigale.fitting.samplers.run import best_scale, chi2_at
 
 ERROR = {"band0": 0.1, "band1": 0.05, "band3": 0.2}
@@ -25,7 +33,12 @@ PRIORS = {
     "ebv_polar": lambda x: np.exp(-3 * x),
     "temperature_polar": [1.0, 3.0],
 }
-EVERYTHING = {"model_error": ERROR, "error_floor": FLOOR, "priors": PRIORS, "rtol": 0}
+EVERYTHING = {
+    "model_error": ERROR,
+    "error_floor": FLOOR,
+    "priors": PRIORS,
+    "settings": GridSettings(rtol=0),
+}
 
 
 def add_limits(table, grid, part=0.3, seed=0):
@@ -163,7 +176,9 @@ def test_pruning_loses_no_more_than_asked(noise, make_grid, draw_photometry):
     grid = make_grid(7, n_tau=12, n_age=9)
     table = draw_photometry(grid, 10, seed=3, noise=noise, missing=0.1)[0]
     table = add_limits(table, grid, part=0.4)
-    whole, pruned = (BayesFitter(grid, rtol=rtol).fit(table) for rtol in (0, 1e-6))
+    whole, pruned = (
+        BayesFitter(grid, settings=GridSettings(rtol=rtol)).fit(table) for rtol in (0, 1e-6)
+    )
     np.testing.assert_allclose(pruned.pdf_2d, whole.pdf_2d, atol=1e-6)
     np.testing.assert_allclose(pruned.log_evidence, whole.log_evidence, atol=1e-6)
     np.testing.assert_allclose(pruned.chi2, whole.chi2, rtol=1e-12)
@@ -219,7 +234,7 @@ def test_samplers_and_grid_define_limits_alike(noise, make_grid, draw_photometry
 def test_percentiles_of_the_other_fraction(make_grid, draw_photometry, brute_force):
     """The weight of every model is spread over its cell of the fraction."""
     grid = make_grid(3, n_tau=8, n_age=6)
-    fitter = BayesFitter(grid, rtol=0)
+    fitter = BayesFitter(grid, settings=GridSettings(rtol=0))
     table = add_limits(draw_photometry(grid, 8, seed=7, noise=0.4)[0], grid, part=0.2)
     results = fitter.fit(table)
     edges = cells(grid.frac_agn, (0.0, 1.0))
@@ -254,7 +269,7 @@ def test_percentiles_of_the_other_fraction(make_grid, draw_photometry, brute_for
 
 def test_a_limit_far_above_all_models_changes_nothing(make_grid, draw_photometry):
     grid = make_grid(3)
-    fitter = BayesFitter(grid, rtol=0)
+    fitter = BayesFitter(grid, settings=GridSettings(rtol=0))
     table = draw_photometry(grid, 10, seed=2)[0]
     without = table.copy()
     without["band4"] = np.nan * u.uJy
@@ -278,7 +293,7 @@ def test_a_limit_without_error_is_a_wall(make_grid, draw_photometry, error):
     table["band4"] = wall * u.uJy
     table["band4_err"] = error * wall * u.uJy
     table["band4_limit"] = True
-    fitter = BayesFitter(grid, model_error=0.0, rtol=0)
+    fitter = BayesFitter(grid, model_error=0.0, settings=GridSettings(rtol=0))
     results = fitter.fit(table)
     assert np.all(results.best_flux[:, 4] <= wall * (1 + 1e-8))
     assert np.all(results.model_flux[:, 4] <= wall * (1 + 1e-8))
@@ -405,14 +420,14 @@ def test_negative_models_have_no_limits(make_grid, draw_photometry):
 
 
 @pytest.fixture(scope="module")
-def catalogue(grid, draw_photometry):
+def catalog(grid, draw_photometry):
     table = draw_photometry(grid, 60, seed=8, noise=0.15, missing=0.1)[0]
     return add_limits(table, grid, part=0.25)
 
 
-def test_results_keep_limits_in_files(grid, catalogue, tmp_path):
+def test_results_keep_limits_in_files(grid, catalog, tmp_path):
     fitter = BayesFitter(grid)
-    results = fitter.fit(catalogue)
+    results = fitter.fit(catalog)
     results.write(tmp_path / "r.fits")
     again = FitResults.read(tmp_path / "r.fits")
     assert again.limit.dtype == bool
@@ -423,14 +438,14 @@ def test_results_keep_limits_in_files(grid, catalogue, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["fits", "ecsv", "csv"])
-def test_catalogues_on_disk(grid, catalogue, tmp_path, kind):
+def test_catalogs_on_disk(grid, catalog, tmp_path, kind):
     fitter = BayesFitter(grid)
-    catalogue = catalogue.copy()
-    catalogue["id"][40] = catalogue["id"][3]
-    path = tmp_path / f"catalogue.{kind}"
+    catalog = catalog.copy()
+    catalog["id"][40] = catalog["id"][3]
+    path = tmp_path / f"catalog.{kind}"
     unit = None
     if kind == "csv":
-        plain = catalogue.copy()
+        plain = catalog.copy()
         for name in plain.colnames:
             plain[name] = getattr(plain[name], "value", plain[name])
             if name.endswith("_limit"):
@@ -438,19 +453,19 @@ def test_catalogues_on_disk(grid, catalogue, tmp_path, kind):
         plain.write(path, format="csv")
         unit = u.uJy
     else:
-        catalogue.write(path)
+        catalog.write(path)
     parts = list(fit_file(fitter, path, tmp_path / "out", chunk_rows=25, flux_unit=unit).parts())
-    whole = fitter.fit(catalogue)
+    whole = fitter.fit(catalog)
     for name in ("limit", "chi2", "pdf_2d", "moments", "quantiles", "n_bands", "flags"):
         joined = np.concatenate([getattr(part, name) for part in parts])
         np.testing.assert_array_equal(joined, getattr(whole, name), err_msg=name)
 
 
-def test_samples_follow_the_posterior(grid, catalogue):
+def test_samples_follow_the_posterior(grid, catalog):
     fitter = BayesFitter(grid)
-    results = fitter.fit(catalogue)
+    results = fitter.fit(catalog)
     n = 4000
-    samples = fitter.sample(catalogue, n, seed=1)
+    samples = fitter.sample(catalog, n, seed=1)
     np.testing.assert_array_equal(samples.fitted, results.fitted)
     np.testing.assert_array_equal(samples.flags & 4096, results.flags & 4096)
     ok = results.fitted
@@ -465,17 +480,17 @@ def test_samples_follow_the_posterior(grid, catalogue):
     assert np.abs(pull[near]).max() < 4.5
 
 
-def test_mocks_perturb_fluxes_and_keep_limits(grid, catalogue):
+def test_mocks_perturb_fluxes_and_keep_limits(grid, catalog):
     fitter = BayesFitter(grid, model_error=0.0)
-    results = fitter.fit(catalogue)
-    mock = mock_analysis(fitter, results, catalogue, seed=5)
+    results = fitter.fit(catalog)
+    mock = mock_analysis(fitter, results, catalog, seed=5)
     pulls = []
     for j, name in enumerate(grid.filters):
         limit = results.limit[:, j]
-        new, old = mock.photometry[name].value, catalogue[name].value
+        new, old = mock.photometry[name].value, catalog[name].value
         np.testing.assert_array_equal(new[limit], old[limit])
         changed = results.fitted & np.isfinite(old) & ~limit
-        pulls.append(((new - results.best_flux[:, j]) / catalogue[f"{name}_err"].value)[changed])
+        pulls.append(((new - results.best_flux[:, j]) / catalog[f"{name}_err"].value)[changed])
     np.testing.assert_array_equal(mock.recovered.limit, results.limit)
     np.testing.assert_array_equal(mock.recovered.fitted, results.fitted)
     pull = np.concatenate(pulls)
@@ -485,13 +500,13 @@ def test_mocks_perturb_fluxes_and_keep_limits(grid, catalogue):
     assert metrics["n"][0] == results.fitted.sum()
 
 
-def test_bands_left_out_have_predictions_but_no_pull_for_limits(grid, catalogue):
+def test_bands_left_out_have_predictions_but_no_pull_for_limits(grid, catalog):
     fitter = BayesFitter(grid)
-    out = leave_out(fitter, catalogue, ["band2"])
-    limit = np.array(catalogue["band2_limit"])
+    out = leave_out(fitter, catalog, ["band2"])
+    limit = np.array(catalog["band2_limit"])
     found = out.results["band2"]
     assert np.isnan(out.pull[limit]).all()
     assert np.isfinite(out.predicted[limit & found.fitted]).all()
     assert not found.limit[:, 2].any()
     assert found.limit[:, 3].any()
-    assert np.isfinite(out.pull[~limit & found.fitted & np.isfinite(catalogue["band2"])]).all()
+    assert np.isfinite(out.pull[~limit & found.fitted & np.isfinite(catalog["band2"])]).all()

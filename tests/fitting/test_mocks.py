@@ -1,4 +1,4 @@
-"""Mock catalogues refitted, and bands left out."""
+"""Mock catalogs refitted, and bands left out."""
 
 import astropy.units as u
 import numpy as np
@@ -9,7 +9,7 @@ from miricigale.plotting.axes import new_figure
 
 
 @pytest.fixture(scope="module")
-def catalogue(grid, draw_photometry):
+def catalog(grid, draw_photometry):
     return draw_photometry(grid, 400, seed=8, noise=0.15, missing=0.1)[0]
 
 
@@ -19,22 +19,22 @@ def fitter(grid):
 
 
 @pytest.fixture(scope="module")
-def results(fitter, catalogue):
-    return fitter.fit(catalogue)
+def results(fitter, catalog):
+    return fitter.fit(catalog)
 
 
 @pytest.fixture(scope="module")
-def mock(fitter, results, catalogue):
-    return mock_analysis(fitter, results, catalogue, seed=5)
+def mock(fitter, results, catalog):
+    return mock_analysis(fitter, results, catalog, seed=5)
 
 
-def test_the_mock_is_the_best_model_with_the_errors_of_the_object(mock, results, catalogue):
+def test_the_mock_is_the_best_model_with_the_errors_of_the_object(mock, results, catalog):
     pulls = []
     for i, name in enumerate(results.filters):
         flux = mock.photometry[name].to_value(u.uJy)
-        measured = np.isfinite(catalogue[name].value)
+        measured = np.isfinite(catalog[name].value)
         np.testing.assert_array_equal(np.isfinite(flux), measured)
-        error = catalogue[f"{name}_err"].to_value(u.uJy)
+        error = catalog[f"{name}_err"].to_value(u.uJy)
         np.testing.assert_array_equal(mock.photometry[f"{name}_err"].to_value(u.uJy), error)
         pulls.append(((flux - results.best_flux[:, i]) / error)[measured])
     pull = np.concatenate(pulls)
@@ -45,7 +45,7 @@ def test_the_mock_is_the_best_model_with_the_errors_of_the_object(mock, results,
 
 def test_recovery_is_calibrated(mock):
     """
-    Best models have the noise of the catalogue in them and are not drawn from the prior.
+    Best models have the noise of the catalog in them and are not drawn from the prior.
 
     The intervals need not hold 68 % of them, but not far from it.
     """
@@ -79,17 +79,17 @@ def test_without_noise_the_truth_comes_back(grid, draw_photometry):
     assert np.all(np.abs(mock.metrics(["mass"])["offset"]) < 0.01)
 
 
-def test_a_cut_changes_nothing(fitter, results, catalogue, mock):
+def test_a_cut_changes_nothing(fitter, results, catalog, mock):
     some = [7, 300, 12]
-    part = mock_analysis(fitter, fitter.fit(catalogue[some]), catalogue[some], seed=5)
+    part = mock_analysis(fitter, fitter.fit(catalog[some]), catalog[some], seed=5)
     for name in results.filters:
         np.testing.assert_array_equal(part.photometry[name], mock.photometry[name][some])
-    other = mock_analysis(fitter, results, catalogue, seed=6)
+    other = mock_analysis(fitter, results, catalog, seed=6)
     assert np.any(other.photometry["band0"] != mock.photometry["band0"])
 
 
-def test_objects_without_fit_and_upper_limits_stay(fitter, catalogue):
-    table = catalogue[:4].copy()
+def test_objects_without_fit_and_upper_limits_stay(fitter, catalog):
+    table = catalog[:4].copy()
     for name in fitter.grid.filters:
         table[name][1] = np.nan
     table["band2_limit"] = [True, False, False, False]
@@ -102,8 +102,8 @@ def test_objects_without_fit_and_upper_limits_stay(fitter, catalogue):
     assert mock.metrics(["redshift"])["n"][0] == 3
 
 
-def test_known_redshifts_have_to_be_given_again(fitter, catalogue):
-    table = catalogue[:5]
+def test_known_redshifts_have_to_be_given_again(fitter, catalog):
+    table = catalog[:5]
     results = fitter.fit(table, redshift="redshift")
     with pytest.raises(ValueError, match="'redshift' must be given again"):
         mock_analysis(fitter, results, table, seed=0)
@@ -113,8 +113,8 @@ def test_known_redshifts_have_to_be_given_again(fitter, catalogue):
         mock_analysis(fitter, results, table[::-1], seed=0, redshift="redshift")
 
 
-def test_bands_left_out(fitter, catalogue, results):
-    out = leave_out(fitter, catalogue, ["band1", "band4"])
+def test_bands_left_out(fitter, catalog, results):
+    out = leave_out(fitter, catalog, ["band1", "band4"])
     assert out.results["band1"] is out.results["band4"]
     n_used = np.isfinite(results.sigma[:, [0, 2, 3, 5]]).sum(axis=1)
     np.testing.assert_array_equal(out.results["band1"].n_bands, n_used)
@@ -122,42 +122,42 @@ def test_bands_left_out(fitter, catalogue, results):
     want = (out.flux - out.predicted) / np.sqrt(out.flux_err**2 + out.predicted_std**2)
     np.testing.assert_allclose(out.pull[good], want[good], rtol=1e-12)
     table = out.to_table()
-    np.testing.assert_array_equal(table["band4"], catalogue["band4"].to(u.uJy))
+    np.testing.assert_array_equal(table["band4"], catalog["band4"].to(u.uJy))
     assert table["band4_predicted"].unit == u.uJy
     assert all(table[name].info.description for name in table.colnames)
     metrics = out.metrics()
-    # models and errors are right here: pulls are centred and about a third beyond 1
+    # models and errors are right here: pulls are centered and about a third beyond 1
     assert np.all(np.abs(metrics["pull"]) < 0.3)
     assert np.all(np.abs(metrics["within"] - 0.68) < 0.12)
-    each = leave_out(fitter, catalogue[:20], ["band1", "band4"], separately=True)
+    each = leave_out(fitter, catalog[:20], ["band1", "band4"], separately=True)
     assert each.results["band1"] is not each.results["band4"]
     assert np.all(each.results["band1"].n_bands >= out.results["band1"].n_bands[:20])
 
 
-def test_a_wrong_zero_point_is_found(fitter, catalogue):
-    table = catalogue.copy()
+def test_a_wrong_zero_point_is_found(fitter, catalog):
+    table = catalog.copy()
     table["band3"] = table["band3"] * 3.0
     out = leave_out(fitter, table, ["band3"])
     assert out.metrics()["offset"][0] == pytest.approx(2.0, abs=0.5)
 
 
-def test_bands_that_are_not_there(fitter, catalogue):
+def test_bands_that_are_not_there(fitter, catalog):
     with pytest.raises(KeyError, match="no filter of the models 'band9'"):
-        leave_out(fitter, catalogue, ["band9"])
+        leave_out(fitter, catalog, ["band9"])
     with pytest.raises(ValueError, match="'bands' must be a list"):
-        leave_out(fitter, catalogue, "band1")
+        leave_out(fitter, catalog, "band1")
     with pytest.raises(ValueError, match=r"'photometry' must be a table with the columns \['band1"):
-        leave_out(fitter, catalogue["id", "band2", "band2_err"], ["band1"])
+        leave_out(fitter, catalog["id", "band2", "band2_err"], ["band1"])
 
 
-def test_nothing_left_to_fit_or_to_compare_is_refused(fitter, catalogue):
+def test_nothing_left_to_fit_or_to_compare_is_refused(fitter, catalog):
     every = [f"band{i}" for i in range(6)]
     with pytest.raises(ValueError, match=r"n_bands_min = 2 or more of .* are left, got .*'band5'"):
-        leave_out(fitter, catalogue, every)
+        leave_out(fitter, catalog, every)
     with pytest.raises(ValueError, match="'bands' must be such that n_bands_min = 2"):
-        leave_out(fitter, catalogue, every[1:])
-    leave_out(fitter, catalogue[:3], every[2:])
-    table = catalogue[:20].copy()
+        leave_out(fitter, catalog, every[1:])
+    leave_out(fitter, catalog[:3], every[2:])
+    table = catalog[:20].copy()
     table["band3"] = np.nan * u.uJy
     table["band4_err"] = 0.0 * u.uJy
     with pytest.raises(ValueError, match=r"'bands' must be measured .*got \['band3', 'band4'\]"):
@@ -165,18 +165,18 @@ def test_nothing_left_to_fit_or_to_compare_is_refused(fitter, catalogue):
     # a limit is a prediction's due
     table["band5_limit"] = True
     assert np.isfinite(leave_out(fitter, table, ["band5"]).predicted).any()
-    assert len(leave_out(fitter, catalogue[:0], ["band1"])) == 0
+    assert len(leave_out(fitter, catalog[:0], ["band1"])) == 0
     with pytest.raises(ValueError, match="'fitter' must be a BayesFitter, got dict"):
-        leave_out({}, catalogue, ["band1"])
+        leave_out({}, catalog, ["band1"])
 
 
-def test_drawing(mock, fitter, catalogue):
+def test_drawing(mock, fitter, catalog):
     ax = new_figure()[1][0, 0]
     assert mock.plot("mass", ax=ax) is ax
     assert ax.get_xscale() == "log"
     ax = new_figure()[1][0, 0]
     assert "Gyr" in mock.plot("age", ax=ax).get_xlabel()
-    out = leave_out(fitter, catalogue[:50], ["band1"])
+    out = leave_out(fitter, catalog[:50], ["band1"])
     ax = new_figure()[1][0, 0]
     assert out.plot("band1", ax=ax).get_xlim() == (-5, 5)
     with pytest.raises(KeyError, match="no band that was left out 'band2'"):

@@ -13,7 +13,7 @@ from astropy.table import QTable
 
 from helpers.grids import free_parameters
 from helpers.results import assert_same
-from miricigale.fitting import BayesFitter, FitResults, fit_file, open_results
+from miricigale.fitting import BayesFitter, FitResults, GridSettings, fit_file, open_results
 
 PRIORS = {
     "redshift": lambda z: z * np.exp(-z),
@@ -24,7 +24,7 @@ PRIORS = {
 CASES = {
     "default": ({}, {}),
     "priors": ({}, {"priors": PRIORS}),
-    "prior_f by width": ({}, {"prior_f": "uniform"}),
+    "prior_f by width": ({}, {}),
     "no galaxy-only models": ({"frac": [0.1, 0.5, 0.95]}, {}),
     "no AGN": ({"frac": [0.0]}, {}),
     "one redshift": ({"n_z": 1}, {}),
@@ -58,13 +58,15 @@ def test_every_pair_is_the_sum_over_all_models(
     of_grid, of_fitter = CASES[case]
     options = {k: v for k, v in of_fitter.items() if k != "compat"}
     grid = make_grid(3, **of_grid)
-    fitter = BayesFitter(grid, rtol=rtol, **of_fitter)
+    prior_f = "uniform" if case == "prior_f by width" else "grid"
+    fitter = BayesFitter(grid, settings=GridSettings(prior_f, rtol=rtol), **of_fitter)
     table, _ = draw_photometry(grid, 4, seed=5, missing=0.2, noise=0.3)
     pairs = free_pairs(fitter)
     results = fitter.fit(table, pairs=pairs)
     assert results.fitted.all()
     for i in range(len(table)):
-        weights = brute_force(grid, results.flux[i], results.sigma[i], **options)["weights"]
+        data = results.flux[i], results.sigma[i]
+        weights = brute_force(grid, *data, prior_f=prior_f, **options)["weights"]
         for x, y in pairs:
             want = plain(grid, weights, x, y, options.get("priors"))
             np.testing.assert_allclose(
@@ -74,7 +76,7 @@ def test_every_pair_is_the_sum_over_all_models(
 
 def test_with_upper_limits_and_known_redshifts(make_grid, draw_photometry, brute_force):
     grid = make_grid(6)
-    fitter = BayesFitter(grid, rtol=0, n_bands_min=2)
+    fitter = BayesFitter(grid, settings=GridSettings(rtol=0), n_bands_min=2)
     table, truth = draw_photometry(grid, 4, seed=8, noise=0.3)
     table["band1_limit"] = [True, True, False, True]
     table["band4_limit"] = [False, True, True, False]
@@ -125,7 +127,9 @@ def test_merged_models_are_as_all_of_them_apart(make_grid, draw_photometry):
     )
     table, _ = draw_photometry(apart, 5, noise=0.3)
     priors = {"temperature_polar": [1.0, 3.0], "law": [2.0, 1.0]}
-    one, two = (BayesFitter(grid, rtol=0, priors=priors) for grid in (merged, apart))
+    one, two = (
+        BayesFitter(grid, settings=GridSettings(rtol=0), priors=priors) for grid in (merged, apart)
+    )
     pairs = free_pairs(two)
     one, two = one.fit(table, pairs=pairs), two.fit(table, pairs=pairs)
     assert {"ebv_polar", "temperature_polar", "law"} < set(one.axes)
@@ -246,9 +250,9 @@ def test_files_keep_them(results, tmp_path):
 def test_from_file_to_file(fitter, photometry, tmp_path):
     table = QTable(photometry, copy=True)
     table["id"][9] = table["id"][1]
-    table.write(tmp_path / "catalogue.fits")
+    table.write(tmp_path / "catalog.fits")
     pairs = [("age", "redshift"), ("tau", "temperature_polar")]
-    source, folder = tmp_path / "catalogue.fits", tmp_path / "out"
+    source, folder = tmp_path / "catalog.fits", tmp_path / "out"
     files = fit_file(fitter, source, folder, chunk_rows=5, pairs=pairs)
     whole = fitter.fit(table, pairs=pairs)
     parts = list(files.parts())

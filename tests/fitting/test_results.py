@@ -4,6 +4,7 @@ import pytest
 from astropy.table import QTable
 from matplotlib.figure import Figure
 
+from helpers.results import assert_same_tables
 from miricigale.fitting import BayesFitter, FitResults
 from miricigale.fitting.posterior import cell_edges, cell_percentiles, moments
 from miricigale.sed import SEDModel
@@ -80,7 +81,7 @@ def test_no_parameter_leaves_its_limits():
     assert results[0].distribution("slope")[0][-1].value == pytest.approx(0.2)
 
 
-def test_views_agree_with_the_catalogue(results):
+def test_views_agree_with_the_catalog(results):
     view = results[3]
     assert view.ids == 3
     assert view.chi2 == results.chi2[3]
@@ -133,12 +134,7 @@ def test_write_and_read(results, tmp_path):
     path = tmp_path / "fits.fits"
     results.write(path)
     again = FitResults.read(path)
-    one, two = results.to_table(), again.to_table()
-    assert one.colnames == two.colnames
-    for name in one.colnames:
-        assert one[name].info.description == two[name].info.description
-        assert getattr(one[name], "unit", None) == getattr(two[name], "unit", None)
-        np.testing.assert_array_equal(one[name], two[name])
+    assert_same_tables(results.to_table(), again.to_table())
     np.testing.assert_array_equal(results.pdf_2d, again.pdf_2d)
     assert again.meta["fit"] == results.meta["fit"]
     assert again[5].best["mass"] == results[5].best["mass"]

@@ -15,6 +15,7 @@ from miricigale.fitting import (
     BayesFitter,
     FitFlags,
     FitResults,
+    SamplerSettings,
     fit_file,
     leave_out,
     samplers,
@@ -74,9 +75,10 @@ def photometry(flux, err, ids=None, names=BANDS):
     return table
 
 
-def linear_fitter(priors, engine="nautilus", **kwargs):
-    settings = {"n_live": 200, "n_effective": 1500, "model_error": 0.0, "n_bands_min": 1}
-    return BayesFitter(Linear(), BANDS, priors=priors, engine=engine, **settings | kwargs)
+def linear_fitter(priors, engine="nautilus", **settings):
+    settings = SamplerSettings(**{"n_live": 200, "n_effective": 1500} | settings)
+    options = {"model_error": 0.0, "n_bands_min": 1, "settings": settings}
+    return BayesFitter(Linear(), BANDS, priors=priors, engine=engine, **options)
 
 
 # ------------------------------------------------------------------------ posteriors
@@ -204,7 +206,9 @@ def test_real_model_agrees_with_the_grid_engine(engine, limits):
         table[f"{name}_limit"] = [True]
     grid = BayesFitter(model, REAL, axes=axes).fit(table)
     priors = {"ebv": (0.0, 0.6), "frac_agn": (0.0, 0.9), "tau": 1.0, "age": 2.0}
-    fitter = BayesFitter(model, REAL, priors=priors, engine=engine, n_live=250)
+    fitter = BayesFitter(
+        model, REAL, priors=priors, engine=engine, settings=SamplerSettings(n_live=250)
+    )
     results = fitter.fit(table, redshift=[1.0], seed=3)
     for name in ("ebv", "frac_agn", "frac_agn_ir", "mass", "accretion_power", "dust_luminosity"):
         mean, std = grid.mean(name)[0], grid.std(name)[0]
@@ -238,7 +242,7 @@ def test_choices_share_the_posterior_by_their_evidence(engine):
     assert list(results.axes["b"].values) == list(values)
 
 
-# -------------------------------------------------------------------------- catalogues
+# -------------------------------------------------------------------------- catalogs
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -264,9 +268,9 @@ def test_processes_give_the_same_numbers(engine):
     fluxes = model.fluxes(QTable({"redshift": [0.5, 1.0], "age": [2.0, 3.0]}), REAL)
     flux = np.array([fluxes[name].value for name in REAL]).T
     table = photometry(flux, 0.3 * flux, names=REAL)
-    settings = {"engine": engine, "n_live": 100, "n_effective": 100, "n_draws": 50}
+    settings = SamplerSettings(n_live=100, n_effective=100, n_draws=50)
     priors = {"ebv": (0.0, 1.0), "redshift": (0.1, 2.0)}
-    fitter = BayesFitter(model, REAL, priors=priors, **settings)
+    fitter = BayesFitter(model, REAL, priors=priors, engine=engine, settings=settings)
     serial = fitter.fit(table, seed=1)
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(2, mp_context=context) as pool:
@@ -311,8 +315,9 @@ def test_models_that_the_universe_has_no_time_for_have_no_weight(engine):
     fluxes = model.fluxes(QTable({"redshift": [3.0], "age": [1.5]}), REAL)
     flux = np.array([[fluxes[name][0].value for name in REAL]] * 2)
     table = photometry(flux, 0.5 * flux, names=REAL)
-    settings = {"engine": engine, "n_live": 80, "n_effective": 200}
-    fitter = BayesFitter(model, REAL, priors={"age": (1.0, 10.0)}, **settings)
+    settings = SamplerSettings(n_live=80, n_effective=200)
+    priors = {"age": (1.0, 10.0)}
+    fitter = BayesFitter(model, REAL, priors=priors, engine=engine, settings=settings)
     results = fitter.fit(table, redshift=[3.0, 15.0], seed=1)
     limit = model.cosmology.age(3.0).to_value("Gyr")
     assert results.samples(0)["age"].max().to_value("Gyr") <= limit
@@ -439,7 +444,7 @@ def test_priors_of_no_use_are_refused(given, message):
         space.make_prior("redshift", given, Z)
 
 
-# ----------------------------------------------------------------------------- the doors
+# - refused settings
 
 
 @pytest.mark.parametrize("name", ["nautilus", "dynesty"])

@@ -1,4 +1,4 @@
-"""Fits from file to file: the numbers of one call, in pieces that a later call goes on from."""
+"""Fits from file to file: the numbers of one call, in pieces that a later call resumes from."""
 
 import csv
 import gzip
@@ -18,7 +18,7 @@ import pytest
 from astropy.io import fits
 from astropy.table import QTable
 
-from helpers.results import assert_joined, assert_same
+from helpers.results import assert_joined, assert_same, assert_same_tables
 from miricigale.fitting import BayesFitter, FitFlags, FitResults, fit_file, open_results
 from miricigale.utils.exceptions import DataError
 
@@ -57,7 +57,7 @@ def fitter(grid):
 
 
 @pytest.fixture
-def catalogue(grid, draw_photometry):
+def catalog(grid, draw_photometry):
     """Photometry with gaps, useless rows and ids that occur again, near and far."""
     table = draw_photometry(grid, 150, missing=0.15)[0]
     ids = [f"{'n' * (1 + i % 5)}{i}" for i in range(150)]
@@ -72,39 +72,39 @@ def catalogue(grid, draw_photometry):
 
 
 @pytest.mark.parametrize("chunk_rows", [1, 7, 64, 100, 1000])
-def test_the_pieces_are_one_fit_bit_for_bit(fitter, catalogue, tmp_path, chunk_rows):
-    catalogue = catalogue[: 25 * chunk_rows]
-    catalogue.write(tmp_path / "catalogue.fits")
-    whole = fitter.fit(catalogue)
-    results = fit_file(fitter, tmp_path / "catalogue.fits", tmp_path / "out", chunk_rows=chunk_rows)
-    assert len(results.paths) == -(-len(catalogue) // chunk_rows)
+def test_the_pieces_are_one_fit_bit_for_bit(fitter, catalog, tmp_path, chunk_rows):
+    catalog = catalog[: 25 * chunk_rows]
+    catalog.write(tmp_path / "catalog.fits")
+    whole = fitter.fit(catalog)
+    results = fit_file(fitter, tmp_path / "catalog.fits", tmp_path / "out", chunk_rows=chunk_rows)
+    assert len(results.paths) == -(-len(catalog) // chunk_rows)
     assert_joined(results.parts(), whole)
     twice = (whole.flags & FitFlags.DUPLICATE_ID) > 0
-    assert np.flatnonzero(twice).tolist() == [i for i in (5, 120, 140) if i < len(catalogue)]
+    assert np.flatnonzero(twice).tolist() == [i for i in (5, 120, 140) if i < len(catalog)]
 
 
 @pytest.mark.parametrize("how", ["column", "values", "prior", "priors", "prior column"])
-def test_redshifts_go_with_their_rows(fitter, catalogue, tmp_path, how):
+def test_redshifts_go_with_their_rows(fitter, catalog, tmp_path, how):
     rng = np.random.default_rng(3)
     nodes = np.linspace(0.0, 3.0, 7)
-    density = rng.uniform(0.1, 1.0, (len(catalogue), 7))
+    density = rng.uniform(0.1, 1.0, (len(catalog), 7))
     options, options_file = {}, None
     if how == "column":
         options = {"redshift": "redshift"}
     elif how == "values":
-        options = {"redshift": np.array(catalogue["redshift"])}
+        options = {"redshift": catalog["redshift"].tolist()}
     elif how == "prior":
         options = {"redshift_prior": (nodes, density[0])}
     else:
         options = {"redshift_prior": (nodes, density)}
         if how == "prior column":
-            catalogue["p_z"] = density
+            catalog["p_z"] = density
             options_file = {"redshift_prior": (nodes, "p_z")}
-    catalogue.write(tmp_path / "catalogue.fits")
-    whole = fitter.fit(catalogue, **options)
+    catalog.write(tmp_path / "catalog.fits")
+    whole = fitter.fit(catalog, **options)
     results = fit_file(
         fitter,
-        tmp_path / "catalogue.fits",
+        tmp_path / "catalog.fits",
         tmp_path / "out",
         chunk_rows=40,
         **(options_file or options),
@@ -112,25 +112,25 @@ def test_redshifts_go_with_their_rows(fitter, catalogue, tmp_path, how):
     assert_joined(results.parts(), whole)
 
 
-def test_text_tables_are_read_by_rows(fitter, catalogue, tmp_path):
-    catalogue["note"] = [f'a "note"\nof {i} lines' for i in range(len(catalogue))]
-    whole = fitter.fit(catalogue)
+def test_text_tables_are_read_by_rows(fitter, catalog, tmp_path):
+    catalog["note"] = [f'a "note"\nof {i} lines' for i in range(len(catalog))]
+    whole = fitter.fit(catalog)
     for delimiter in (" ", ","):
-        catalogue.write(tmp_path / "catalogue.ecsv", delimiter=delimiter, overwrite=True)
+        catalog.write(tmp_path / "catalog.ecsv", delimiter=delimiter, overwrite=True)
         results = fit_file(
-            fitter, tmp_path / "catalogue.ecsv", tmp_path / "out", chunk_rows=40, resume=False
+            fitter, tmp_path / "catalog.ecsv", tmp_path / "out", chunk_rows=40, resume=False
         )
         assert_joined(results.parts(), whole)
 
 
-def test_csv_has_the_unit_that_it_is_told(fitter, catalogue, tmp_path):
-    whole = fitter.fit(catalogue)
-    path = tmp_path / "catalogue.csv"
+def test_csv_has_the_unit_that_is_given(fitter, catalog, tmp_path):
+    whole = fitter.fit(catalog)
+    path = tmp_path / "catalog.csv"
     with open(path, "w", newline="") as stream:
         writer = csv.writer(stream)
-        writer.writerow(catalogue.colnames)
-        for row in catalogue:
-            flux = [repr(float(row[c].to_value(u.nJy))) for c in catalogue.colnames[1:-1]]
+        writer.writerow(catalog.colnames)
+        for row in catalog:
+            flux = [repr(float(row[c].to_value(u.nJy))) for c in catalog.colnames[1:-1]]
             writer.writerow([row["id"], *flux, row["redshift"]])
     results = fit_file(fitter, path, tmp_path / "out", chunk_rows=40, flux_unit=u.nJy)
     assert len(list(results.parts())) == 4
@@ -144,13 +144,13 @@ def test_csv_has_the_unit_that_it_is_told(fitter, catalogue, tmp_path):
         fit_file(fitter, path, tmp_path / "no unit", flux_unit="mag")
 
 
-def test_a_stopped_fit_goes_on(fitter, catalogue, tmp_path):
-    catalogue.write(tmp_path / "catalogue.fits")
-    arguments = (fitter, tmp_path / "catalogue.fits", tmp_path / "out")
-    whole = fitter.fit(catalogue)
+def test_a_stopped_fit_is_resumed(fitter, catalog, tmp_path):
+    catalog.write(tmp_path / "catalog.fits")
+    arguments = (fitter, tmp_path / "catalog.fits", tmp_path / "out")
+    whole = fitter.fit(catalog)
     with pytest.raises(Stopped):
         fit_file(*arguments, chunk_rows=40, executor=Counting(stop=3))
-    with pytest.raises(DataError, match=r"holds 2 of 4 parts: fit_file .* goes on"):
+    with pytest.raises(DataError, match=r"holds 2 of 4 parts: fit_file .* resumes"):
         open_results(tmp_path / "out")
     there = open_results(tmp_path / "out", partial=True)
     assert (len(there), there.complete) == (80, False)
@@ -164,11 +164,11 @@ def test_a_stopped_fit_goes_on(fitter, catalogue, tmp_path):
     assert executor.n_tasks == 2
 
 
-def test_a_damaged_part_is_made_again(fitter, catalogue, tmp_path):
-    catalogue.write(tmp_path / "catalogue.fits")
-    arguments = (fitter, tmp_path / "catalogue.fits", tmp_path / "out")
+def test_a_damaged_part_is_made_again(fitter, catalog, tmp_path):
+    catalog.write(tmp_path / "catalog.fits")
+    arguments = (fitter, tmp_path / "catalog.fits", tmp_path / "out")
     fit_file(*arguments, chunk_rows=40)
-    whole = fitter.fit(catalogue)
+    whole = fitter.fit(catalog)
     one, two = (tmp_path / "out" / f"part-0000{i}.fits" for i in (1, 2))
     one.write_bytes(one.read_bytes()[:-2880])
     data = bytearray(two.read_bytes())
@@ -183,9 +183,9 @@ def test_a_damaged_part_is_made_again(fitter, catalogue, tmp_path):
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
 @pytest.mark.parametrize("moment", ["manifest.json", "part-00001.fits"])
-def test_a_killed_fit_goes_on(fitter, catalogue, tmp_path, moment):
-    path, out = tmp_path / "catalogue.fits", tmp_path / "out"
-    catalogue.write(path)
+def test_a_killed_fit_is_resumed(fitter, catalog, tmp_path, moment):
+    path, out = tmp_path / "catalog.fits", tmp_path / "out"
+    catalog.write(path)
     (tmp_path / "fitter").write_bytes(pickle.dumps(fitter))
     code = """
         import os, pickle, signal, sys
@@ -228,10 +228,12 @@ def test_a_killed_fit_goes_on(fitter, catalogue, tmp_path, moment):
     assert names == [*MANIFESTS, "part-00000.fits", "part-00001.fits"]
 
 
-def test_a_full_disk_is_told_with_the_file_and_left_behind(fitter, catalogue, tmp_path, full_disk):
-    path, out = tmp_path / "catalogue.fits", tmp_path / "out"
-    catalogue.write(path)
-    whole = fitter.fit(catalogue)
+def test_a_full_disk_is_reported_with_the_file_and_left_behind(
+    fitter, catalog, tmp_path, full_disk
+):
+    path, out = tmp_path / "catalog.fits", tmp_path / "out"
+    catalog.write(path)
+    whole = fitter.fit(catalog)
     with (
         pytest.raises(OSError, match=r"part-00000\.fits"),
         full_disk(20000),
@@ -244,12 +246,12 @@ def test_a_full_disk_is_told_with_the_file_and_left_behind(fitter, catalogue, tm
     assert_joined(results.parts(), whole)
     with pytest.raises(OSError, match=r"table\.fits'?$"), full_disk(20000):
         results.write_table(tmp_path / "table.fits")
-    assert sorted(item.name for item in tmp_path.iterdir()) == ["catalogue.fits", "out"]
+    assert sorted(item.name for item in tmp_path.iterdir()) == ["catalog.fits", "out"]
 
 
-def test_parts_of_another_fit_are_refused(fitter, grid, catalogue, tmp_path):
-    path, out = tmp_path / "catalogue.fits", tmp_path / "out"
-    catalogue.write(path)
+def test_parts_of_another_fit_are_refused(fitter, grid, catalog, tmp_path):
+    path, out = tmp_path / "catalog.fits", tmp_path / "out"
+    catalog.write(path)
     fit_file(fitter, path, out, chunk_rows=80, redshift="redshift")
     same = {"chunk_rows": 80, "redshift": "redshift"}
 
@@ -263,23 +265,23 @@ def test_parts_of_another_fit_are_refused(fitter, grid, catalogue, tmp_path):
     )
     refused("chunk_rows", chunk_rows=79)
     refused("redshift", redshift=None)
-    refused("redshift", redshift=np.array(catalogue["redshift"]))
+    refused("redshift", redshift=np.array(catalog["redshift"]))
     refused("model_error", BayesFitter(grid, max_reduced_chi2=30.0, model_error=0.2))
     refused("max_reduced_chi2", BayesFitter(grid))
     refused("priors", BayesFitter(grid, max_reduced_chi2=30.0, priors={"tau": "log"}))
     other = replace(grid, galaxy=grid.galaxy * (1 + 1e-15 * np.arange(6)))
     refused("grid", BayesFitter(other, max_reduced_chi2=30.0))
-    catalogue["band0"][0] *= 1.01
-    catalogue.write(path, overwrite=True)
+    catalog["band0"][0] *= 1.01
+    catalog.write(path, overwrite=True)
     refused(r"catalogue\.sha256")
     results = fit_file(fitter, path, out, chunk_rows=150, resume=False)
     assert [item.name for item in sorted(out.iterdir())] == [*MANIFESTS, "part-00000.fits"]
-    assert_joined(results.parts(), fitter.fit(catalogue))
+    assert_joined(results.parts(), fitter.fit(catalog))
 
 
-def test_parts_of_another_version_are_refused_with_what_to_do(fitter, catalogue, tmp_path):
-    path, out = tmp_path / "catalogue.fits", tmp_path / "out"
-    catalogue.write(path)
+def test_parts_of_another_version_are_refused_with_what_to_do(fitter, catalog, tmp_path):
+    path, out = tmp_path / "catalog.fits", tmp_path / "out"
+    catalog.write(path)
     fit_file(fitter, path, out)
     old_manifest(out)
     manifest = json.loads((out / "manifest.json").read_text())
@@ -294,25 +296,25 @@ def test_parts_of_another_version_are_refused_with_what_to_do(fitter, catalogue,
     assert len(open_results(out, partial=True)) == 150
 
 
-def test_a_call_that_failed_at_once_binds_no_other(fitter, catalogue, tmp_path):
-    path, out = tmp_path / "catalogue.csv", tmp_path / "out"
-    catalogue.write(path)
+def test_a_call_that_failed_at_once_binds_no_other(fitter, catalog, tmp_path):
+    path, out = tmp_path / "catalog.csv", tmp_path / "out"
+    catalog.write(path)
     with pytest.raises(u.UnitsError, match="convertible to uJy"):
         fit_file(fitter, path, out)
     # the remedy is another setting, in the folder that the first call made
     results = fit_file(fitter, path, out, flux_unit="uJy")
-    assert len(results) == len(catalogue)
+    assert len(results) == len(catalog)
 
 
-def test_results_are_read_as_if_they_were_one(fitter, catalogue, tmp_path):
-    catalogue.write(tmp_path / "catalogue.fits")
-    whole = fitter.fit(catalogue)
-    fit_file(fitter, tmp_path / "catalogue.fits", tmp_path / "out", chunk_rows=40)
+def test_results_are_read_as_if_they_were_one(fitter, catalog, tmp_path):
+    catalog.write(tmp_path / "catalog.fits")
+    whole = fitter.fit(catalog)
+    fit_file(fitter, tmp_path / "catalog.fits", tmp_path / "out", chunk_rows=40)
     results = open_results(tmp_path / "out")
     assert (len(results), results.complete) == (150, True)
     assert repr(results).startswith("<FitResultsFiles of 150 objects, ")
-    assert [item.ids for item in results] == catalogue["id"].tolist()
-    key = catalogue["id"][90]
+    assert [item.ids for item in results] == catalog["id"].tolist()
+    key = catalog["id"][90]
     assert results[key].best["mass"] == whole[key].best["mass"]
     # across parts, in any order
     rows = np.array([100, 3, 41, 40, 149, 3])
@@ -327,11 +329,7 @@ def test_results_are_read_as_if_they_were_one(fitter, catalogue, tmp_path):
         results.write_table(tmp_path / "table.fits")
     written = QTable.read(tmp_path / "table.fits", character_as_bytes=False, mask_invalid=False)
     for table in (results.to_table(), written):
-        assert table.colnames == wanted.colnames
-        for name in wanted.colnames:
-            assert table[name].unit == wanted[name].unit
-            assert table[name].info.description == wanted[name].info.description
-            np.testing.assert_array_equal(np.asarray(table[name]), np.asarray(wanted[name]))
+        assert_same_tables(table, wanted)
     assert "nobody" in written.meta["CITE"]
     few = results.to_table(["id", "mass_p50"])
     assert few.colnames == ["id", "mass_p50"]
@@ -340,9 +338,9 @@ def test_results_are_read_as_if_they_were_one(fitter, catalogue, tmp_path):
         results.to_table(["weight"])
 
 
-def test_a_catalogue_without_rows_has_results_without_rows(fitter, catalogue, tmp_path):
+def test_a_catalog_without_rows_has_results_without_rows(fitter, catalog, tmp_path):
     for suffix in ("fits", "ecsv"):
-        catalogue[:0].write(tmp_path / f"empty.{suffix}")
+        catalog[:0].write(tmp_path / f"empty.{suffix}")
         results = fit_file(fitter, tmp_path / f"empty.{suffix}", tmp_path / suffix)
         assert len(results) == len(results.to_table()) == 0
         results.write_table(tmp_path / "table.fits", overwrite=True)
@@ -350,13 +348,13 @@ def test_a_catalogue_without_rows_has_results_without_rows(fitter, catalogue, tm
 
 
 @pytest.mark.parametrize("suffix", ["ecsv", "csv"])
-def test_ids_that_parts_cannot_hold_are_refused_at_once(fitter, catalogue, tmp_path, suffix):
+def test_ids_that_parts_cannot_hold_are_refused_at_once(fitter, catalog, tmp_path, suffix):
     name = "Kümmel 3"
-    ids = np.array(catalogue["id"].astype("U20"))
+    ids = np.array(catalog["id"].astype("U20"))
     ids[5], ids[120] = 'with "quotes", and a\nline', name
-    catalogue["id"] = ids
-    path = tmp_path / f"catalogue.{suffix}"
-    catalogue.write(path)
+    catalog["id"] = ids
+    path = tmp_path / f"catalog.{suffix}"
+    catalog.write(path)
     executor = Counting()
     with pytest.raises(ValueError, match=rf"'photometry' must be ASCII.* got '{name}'") as info:
         fit_file(fitter, path, tmp_path / "out", chunk_rows=40, flux_unit="uJy", executor=executor)
@@ -364,19 +362,17 @@ def test_ids_that_parts_cannot_hold_are_refused_at_once(fitter, catalogue, tmp_p
     assert executor.n_tasks == 0
     assert not (tmp_path / "out").exists()
     # in memory they are as good as others
-    assert fitter.fit(catalogue)[name].ids == name
+    assert fitter.fit(catalog)[name].ids == name
 
 
 @pytest.mark.parametrize(
     ("start", "match"),
     [("é".encode(), "'photometry' must be ASCII.* got 'é"), (b"\xe9n", "bytes of text in UTF-8")],
 )
-def test_ids_in_fits_that_are_no_ascii_are_refused_at_once(
-    fitter, catalogue, tmp_path, start, match
-):
-    path = tmp_path / "catalogue.fits"
-    catalogue.write(path)
-    key = catalogue["id"][149].encode()
+def test_ids_in_fits_that_are_no_ascii_are_refused_at_once(fitter, catalog, tmp_path, start, match):
+    path = tmp_path / "catalog.fits"
+    catalog.write(path)
+    key = catalog["id"][149].encode()
     data = path.read_bytes()
     assert data.count(key) == 1
     path.write_bytes(data.replace(key, start + key[2:]))
@@ -388,9 +384,9 @@ def test_ids_in_fits_that_are_no_ascii_are_refused_at_once(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_folder_takes_one_fit_at_a_time(fitter, catalogue, tmp_path):
-    path, out = tmp_path / "catalogue.fits", tmp_path / "out"
-    catalogue.write(path)
+def test_a_folder_takes_one_fit_at_a_time(fitter, catalog, tmp_path):
+    path, out = tmp_path / "catalog.fits", tmp_path / "out"
+    catalog.write(path)
     inner = []
 
     class Second(Counting):
@@ -405,9 +401,9 @@ def test_a_folder_takes_one_fit_at_a_time(fitter, catalogue, tmp_path):
     assert not (out / "fit.lock").exists()
 
 
-def test_a_fit_that_was_killed_at_its_first_moment_goes_on(fitter, catalogue, tmp_path):
-    path, out = tmp_path / "catalogue.fits", tmp_path / "out"
-    catalogue.write(path)
+def test_a_fit_that_was_killed_at_its_first_moment_is_resumed(fitter, catalog, tmp_path):
+    path, out = tmp_path / "catalog.fits", tmp_path / "out"
+    catalog.write(path)
     out.mkdir()
     # a number above the largest that Linux gives to a process
     (out / "fit.lock").write_text("4194305")
@@ -429,9 +425,9 @@ def old_manifest(out, **more):
     return parts
 
 
-def test_folders_of_the_layout_before_are_read(fitter, catalogue, tmp_path):
-    path, out = tmp_path / "catalogue.fits", tmp_path / "out"
-    catalogue.write(path)
+def test_folders_of_the_layout_before_are_read(fitter, catalog, tmp_path):
+    path, out = tmp_path / "catalog.fits", tmp_path / "out"
+    catalog.write(path)
     want = fit_file(fitter, path, out, chunk_rows=80).to_table(["id", "mass_mean"])
     old_manifest(out)
     results = open_results(out)
@@ -446,9 +442,9 @@ def test_folders_of_the_layout_before_are_read(fitter, catalogue, tmp_path):
 
 @pytest.mark.parametrize("resume", [True, False])
 @pytest.mark.parametrize("name", ["../victim", "{}/victim", "part-00000.fits/../../victim"])
-def test_a_manifest_that_names_other_files_is_refused(fitter, catalogue, tmp_path, name, resume):
-    path, out = tmp_path / "catalogue.fits", tmp_path / "out"
-    catalogue.write(path)
+def test_a_manifest_that_names_other_files_is_refused(fitter, catalog, tmp_path, name, resume):
+    path, out = tmp_path / "catalog.fits", tmp_path / "out"
+    catalog.write(path)
     fit_file(fitter, path, out)
     (tmp_path / "victim").write_text("mine")
     name = name.format(tmp_path)
@@ -460,9 +456,9 @@ def test_a_manifest_that_names_other_files_is_refused(fitter, catalogue, tmp_pat
     assert (out / "part-00000.fits").is_file()
 
 
-def test_links_are_not_followed(fitter, catalogue, tmp_path):
-    path, out = tmp_path / "catalogue.fits", tmp_path / "out"
-    catalogue.write(path)
+def test_links_are_not_followed(fitter, catalog, tmp_path):
+    path, out = tmp_path / "catalog.fits", tmp_path / "out"
+    catalog.write(path)
     (tmp_path / "victim").write_text("mine")
     results = fit_file(fitter, path, out)
     for name in ("manifest.json", "part-00000.fits"):
@@ -480,25 +476,25 @@ def test_links_are_not_followed(fitter, catalogue, tmp_path):
     assert (tmp_path / "victim").read_text() == "mine"
 
 
-def test_numbers_as_ids(fitter, catalogue, tmp_path):
+def test_numbers_as_ids(fitter, catalog, tmp_path):
     for kind in (np.uint64, np.int32, float):
         ids = np.arange(150).astype(kind)
         ids[100] = ids[2]
-        catalogue["id"] = ids
-        catalogue.write(tmp_path / "catalogue.fits", overwrite=True)
+        catalog["id"] = ids
+        catalog.write(tmp_path / "catalog.fits", overwrite=True)
         results = fit_file(
-            fitter, tmp_path / "catalogue.fits", tmp_path / "out", chunk_rows=40, resume=False
+            fitter, tmp_path / "catalog.fits", tmp_path / "out", chunk_rows=40, resume=False
         )
-        assert_joined(results.parts(), fitter.fit(catalogue))
+        assert_joined(results.parts(), fitter.fit(catalog))
 
 
-def test_what_cannot_be_read_by_rows_is_refused(fitter, catalogue, tmp_path):
+def test_what_cannot_be_read_by_rows_is_refused(fitter, catalog, tmp_path):
     def refused(name, match, error=DataError, **options):
         with pytest.raises(error, match=match):
             fit_file(fitter, tmp_path / name, tmp_path / "out", **options)
 
     good = tmp_path / "good.fits"
-    catalogue.write(good)
+    catalog.write(good)
     refused("absent.fits", "no table .*absent.fits")
     (tmp_path / "text.md").write_text("id flux\n1 2\n")
     refused("text.md", "write it as FITS .* or ECSV")

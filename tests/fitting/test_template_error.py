@@ -10,6 +10,7 @@ from astropy.table import QTable
 from miricigale.filters import FilterSet
 from miricigale.fitting import (
     BayesFitter,
+    GridSettings,
     TemplateError,
     apply_zero_points,
     calibrate_zero_points,
@@ -51,7 +52,9 @@ def test_posterior_is_the_sum_over_models_with_the_errors_of_their_redshifts(gri
     """With 1 / sigma of every band in the likelihood, which is that of normal deviates."""
     error = TemplateError([0.1, 0.3, 1.0, 3.0, 10.0] * u.um, [0.5, 0.1, 0.02, 0.3, 1.0])
     table, _ = draw_photometry(grid, 6, seed=3, noise=0.3)
-    fitter = BayesFitter(grid, model_error=0.0, template_error=error, rtol=0.0)
+    fitter = BayesFitter(
+        grid, model_error=0.0, template_error=error, settings=GridSettings(rtol=0.0)
+    )
     results = fitter.fit(table)
     index = np.meshgrid(*(np.arange(n) for n in (5, 9, grid.n_agn, 4)), indexing="ij")
     model = grid.flux(*index)
@@ -173,7 +176,7 @@ def test_free_redshifts_and_bad_errors_are_refused(grid, draw_photometry):
         BayesFitter(grid, template_error=0.1)
 
 
-def test_errors_of_bands_are_told_from_those_of_models(residuals):
+def test_errors_of_bands_are_distinguished_from_those_of_models(residuals):
     """Two bands with errors three times too small, and 10 % more scatter than the models."""
     grid, table, z = residuals
     rng = np.random.default_rng(4)
@@ -204,7 +207,7 @@ def test_how_often_values_occur_is_measured(make_grid, draw_photometry):
     rng = np.random.default_rng(3)
     kind, z = (rng.random(1000) < 0.25).astype(int), rng.integers(2, size=1000)
     model = grid.galaxy[z, kind] / np.linalg.norm(grid.galaxy[z, kind], axis=1)[:, None]
-    # of a total S/N of 3, with which galaxies are told apart, but not well
+    # of a total S/N of 3, which distinguishes galaxies, but not well
     err = np.full(model.shape, 1.0)
     flux = 3.0 * model + err * rng.normal(size=model.shape)
     table = QTable({"id": np.arange(1000)})
@@ -252,8 +255,13 @@ def test_prior_of_star_formation_given_mass_and_redshift(make_grid):
     def relation(mass, redshift):
         return 10 ** (0.8 * np.log10(mass / u.Msun) - 7.0 + redshift) * u.Msun / u.yr
 
-    fitter = BayesFitter(grid, model_error=0.0, sfr_prior=(relation, 0.3), rtol=0.0)
-    fits = fitter.fit(table), BayesFitter(grid, model_error=0.0, rtol=0.0).fit(table)
+    fitter = BayesFitter(
+        grid, model_error=0.0, settings=GridSettings(sfr_prior=(relation, 0.3), rtol=0.0)
+    )
+    fits = (
+        fitter.fit(table),
+        BayesFitter(grid, model_error=0.0, settings=GridSettings(rtol=0.0)).fit(table),
+    )
     # which redshift it is stays with the fluxes
     np.testing.assert_allclose(fits[0].pdf["redshift"], fits[1].pdf["redshift"], rtol=1e-6)
     known = fitter.fit(table, redshift=grid.redshift[1])
@@ -264,17 +272,20 @@ def test_prior_of_star_formation_given_mass_and_redshift(make_grid):
     part = np.mean(draws.to_table()["tau"] == grid.galaxy_parameters["tau"][0])
     assert part == pytest.approx(prior[0] / prior.sum(), abs=5 * np.sqrt(0.25 / 4000))
     with pytest.raises(ValueError, match="'sfr_prior' must be a function"):
-        BayesFitter(grid, sfr_prior=relation)
-    bare = BayesFitter(grid, sfr_prior=(lambda mass, z: relation(mass, z).value, 0.3))
+        BayesFitter(grid, settings=GridSettings(sfr_prior=relation))
+    bare = BayesFitter(
+        grid, settings=GridSettings(sfr_prior=(lambda mass, z: relation(mass, z).value, 0.3))
+    )
     with pytest.raises(u.UnitsError, match="'sfr_prior' must be a quantity"):
         bare.fit(table)
     for factor, got in ((np.nan, "nan"), (0.0, "0"), (-1.0, "-"), (np.inf, "inf")):
-        nothing = BayesFitter(grid, sfr_prior=(lambda m, z, x=factor: x * relation(m, z), 0.3))
+        settings = GridSettings(sfr_prior=(lambda m, z, x=factor: x * relation(m, z), 0.3))
+        nothing = BayesFitter(grid, settings=settings)
         with pytest.raises(
             ValueError, match=f"'sfr_prior' must be .* above 0 and finite, got {got}"
         ):
             nothing.fit(table)
-    with pytest.raises(ValueError, match="'sfr_prior' must be None with 'interpolate'"):
-        BayesFitter(grid, sfr_prior=(relation, 0.3), interpolate=100)
-    with pytest.raises(ValueError, match="'sfr_prior' must be left out with a sampler"):
-        BayesFitter(None, ["acs.f606w"], engine="nautilus", sfr_prior=(relation, 0.3))
+    with pytest.raises(
+        ValueError, match="'settings' must be SamplerSettings with engine='nautilus'"
+    ):
+        BayesFitter(None, ["acs.f606w"], engine="nautilus", settings=GridSettings())

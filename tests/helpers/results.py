@@ -26,3 +26,12 @@ def assert_joined(parts, whole):
                 joined = np.concatenate([one[name] for one in split])
                 np.testing.assert_array_equal(joined, array, err_msg=str(name), strict=True)
             assert all(list(one) == list(value) for one in split)
+
+
+def assert_same_tables(one, two):
+    """Two tables have the same columns, with the same units, descriptions and values."""
+    assert one.colnames == two.colnames
+    for name in one.colnames:
+        assert one[name].info.description == two[name].info.description, name
+        assert getattr(one[name], "unit", None) == getattr(two[name], "unit", None), name
+        np.testing.assert_array_equal(np.asarray(one[name]), np.asarray(two[name]), name)

@@ -90,7 +90,7 @@ def _limit(u):
     real = type(u)
     zero, one, half = real(0.0), real(1.0), real(0.5)
     mills = _mills(u)
-    # of what is smaller than exp(-80) nothing is left beside 1
+    # of what is smaller than exp(-80) nothing is left compared with 1
     bell = exponential(max(-half * u * u, real(-80.0)))
     above = mills if u > zero else real(2.0) - mills * bell
     hazard = real(_ROOT_TWO_OVER_PI) * (one if u > zero else bell) / above

@@ -102,7 +102,7 @@ def agn_products(agn, target, z, agn_pq, agn_weighted):
     for k in range(agn_pq.shape[0]):
         for b in range(agn.shape[1]):
             agn_weighted[k, b] = agn[k, b] * weight[b]
-        # apart from the loop above: a sum beside a store is taken in an order that depends on
+        # apart from the loop above: a sum next to a store is taken in an order that depends on
         # where the arrays lie, and results shall not
         p = 0.0
         q = 0.0
@@ -223,7 +223,7 @@ def _list_block(pairs, norm, n_used, key, n):
 
     ``pairs.rows`` says what the galaxies are, and is filled with their largest bounds; bounds are of
     R + 2 ln(prior), `DONE` for pairs that are not kept. ``key`` is that of the first AGN model, ``n``
-    runs are in the list, which must have room for one of every AGN model; returned is how many are now.
+    runs are in the list, which must have space for one of every AGN model; returned is how many are now.
     """
     one = np.float32(1)
     zero = np.float32(0)

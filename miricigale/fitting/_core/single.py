@@ -7,7 +7,7 @@ D* = <m, wm> there, R* D(x) - N(x)^2 is a quadratic in x that is 0 at x*, so tha
     R* - R(x) = (x - x*) (K (x - x*) + M) / D(x),    K = R* b - a^2,
 
 with M = 0 unless x* is an end of the range. What is worked out in double precision is x - x*, and
-R*, which single precision could not tell from that of other pairs; the rest is of order 1, and
+R*, which single precision could not distinguish from that of other pairs; the rest is of order 1, and
 rounding changes a weight by some 1e-7.
 """
 

@@ -96,7 +96,7 @@ def make_workspace(n_z, n_galaxy, n_agn, n_frac, n_bands, zero_frac, capacity):
     """Make the work space for a grid of the given size; ``capacity`` runs are listed at once."""
     n_blocks = -(-n_galaxy // BLOCK)
     n_padded = n_blocks * BLOCK
-    # a list that can hold every run needs no more room
+    # a list that can hold every run needs no more space
     capacity = max(min(int(capacity), n_z * n_blocks * n_agn), 2 * max(n_agn, 1))
     single = np.float32
     return Pairs(

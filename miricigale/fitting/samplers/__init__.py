@@ -9,14 +9,12 @@ import numpy as np
 
 from miricigale.utils.exceptions import unknown_name
 from miricigale.utils.optional import require
-from miricigale.utils.units import check_count
 
 __all__ = [
     "CITATIONS",
     "SAMPLERS",
     "Draws",
     "Lockstep",
-    "Request",
     "effective_size",
     "get_sampler",
 ]
@@ -30,33 +28,6 @@ CITATIONS = {
 _BATCH = 128
 #: Walkers that go side by side, so that their models are evaluated together.
 _QUEUE = 64
-
-
-@dataclass(frozen=True)
-class Request:
-    """
-    Settings of a sampler.
-
-    Parameters
-    ----------
-    n_live : int
-        Number of live points.
-    n_effective : int
-        Effective size that the sample shall have, if the sampler can go on until it has.
-    max_calls : int
-        Number of evaluated models after which the sampler stops, finished or not.
-    options : dict
-        Passed on to the sampler.
-    """
-
-    n_live: int
-    n_effective: int
-    max_calls: int
-    options: dict
-
-    def __post_init__(self):
-        for name, least in (("n_live", 10), ("n_effective", 1), ("max_calls", 1)):
-            check_count(getattr(self, name), name, least)
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,7 +222,7 @@ def get_sampler(engine):
         - ``log_like(points)``: ln(likelihood), shape (m,), of points of the unit cube, shape
           (m, n_dim), in which the prior is flat, and the numbers of these calls, shape (m,);
         - ``rng``: the `~numpy.random.Generator` that everything random is drawn from;
-        - ``request``: a `Request`,
+        - ``request``: the `~miricigale.fitting.SamplerSettings`,
 
         it returns `Draws`.
 

@@ -12,12 +12,12 @@ from miricigale.fitting.priors import GridAxis
 from miricigale.fitting.quantities import DERIVED_LEVELS
 from miricigale.fitting.results import FitResults
 from miricigale.fitting.samplers import CITATIONS
-from miricigale.fitting.samplers.run import ContinuousEngine, FluxModel
+from miricigale.fitting.samplers.run import ContinuousEngine, FluxModel, systematic_draws
 from miricigale.fitting.samplers.space import Space, prior_cells, redshift_axis
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.random import stream
-from miricigale.utils.units import MASS, check_count
+from miricigale.utils.units import MASS
 
 __all__ = ["SamplerFit"]
 
@@ -31,31 +31,24 @@ class SamplerFit:
     """
     How `~miricigale.fitting.BayesFitter` fits with a nested sampler; picklable.
 
-    ``redshift_given`` tells whether the priors say something of the redshift; ``n_draws`` of equal
-    weight are kept of each object, and each axis has ``n_cells``.
+    ``redshift_given`` is whether the priors say something of the redshift.
     """
 
     engine: ContinuousEngine
     space: Space
     redshift_given: bool
-    n_draws: int
-    n_cells: int
 
-    #: Options of the fitter that no other backend has.
-    options = ("predict", "n_live", "n_effective", "max_calls", "n_draws", "n_cells")
-    options += ("sampler_options",)
     #: Objects in a piece of the catalog.
     chunk_size = 1
 
     @classmethod
-    def of_model(cls, model, filters, predict, priors, *, sampler, scale_error, request, **sizes):
+    def of_model(cls, model, filters, priors, settings, *, sampler, scale_error):
         """Work out the priors of a model, and set the sampler up."""
         if not isinstance(model, FluxModel):
             raise argument_error("model", "an SEDModel", type(model).__name__)
         if not isinstance(priors, dict):
             raise argument_error("priors", "a dict of parameters", type(priors).__name__)
-        for name, least in (("n_draws", 1), ("n_cells", 2)):
-            check_count(sizes[name], name, least)
+        predict = settings.predict
         names = tuple(n for some in (filters, predict) for n in getattr(some, "names", some))
         bands = FilterSet([*filters, *predict]) if isinstance(model, SEDModel) else names
         engine = ContinuousEngine(
@@ -63,11 +56,11 @@ class SamplerFit:
             filters=bands,
             names=names,
             sampler=sampler,
-            request=request,
+            request=settings,
             profile="mass" not in priors,
             scale_error=scale_error,
         )
-        fit = cls(engine, Space.of_model(model, priors), "redshift" in priors, **sizes)
+        fit = cls(engine, Space.of_model(model, priors), "redshift" in priors)
         fit._check_libraries()
         return fit
 
@@ -102,17 +95,17 @@ class SamplerFit:
     @property
     def content(self):
         """What makes a fit another one, besides `settings`: name to anything with a checksum."""
-        model = self.engine.model
+        model, request = self.engine.model, self.engine.request
         recipe = model.recipe if isinstance(model, SEDModel) else type(model)
-        return {"space": self.space, "model": recipe, "draws": (self.n_draws, self.n_cells)}
+        return {"space": self.space, "model": recipe, "draws": (request.n_draws, request.n_cells)}
 
     @property
     def edge_weight(self):
         """Weight of the first or last cell of redshift above which an object is flagged."""
-        return max(0.01, 2.0 / self.n_cells)
+        return max(0.01, 2.0 / self.engine.request.n_cells)
 
     def settings(self):
-        """Return what the fit was told, in plain values."""
+        """Return the settings of the fit as plain values."""
         request = self.engine.request
         fixed = self.space.fixed.items()
         return {
@@ -186,9 +179,13 @@ class SamplerFit:
             if name == "mass" or name in axes:
                 continue
             if name == "redshift":
-                nodes, weights, bounds = redshift_axis(spaces, self._limits, self.n_cells)
+                nodes, weights, bounds = redshift_axis(
+                    spaces, self._limits, self.engine.request.n_cells
+                )
             else:
-                nodes, weights, bounds = prior_cells(self.space.free[name], self.n_cells)
+                nodes, weights, bounds = prior_cells(
+                    self.space.free[name], self.engine.request.n_cells
+                )
             kind = "agn" if name in of_agn else "galaxy"
             kind = name if name in ("redshift", "frac_agn") else kind
             unit = 1 if name == "redshift" else model.parameters[name].unit
@@ -209,7 +206,7 @@ class SamplerFit:
             "axis_quantiles": (len(axes), n_levels),
             "moments": (len(quantities), 3),
             "quantiles": (len(quantities), n_levels),
-            "draws": (self.n_draws, len(axes) + len(quantities)),
+            "draws": (self.engine.request.n_draws, len(axes) + len(quantities)),
             **dict.fromkeys(("model_flux", "model_flux_std", "best_flux"), (n_bands,)),
             **dict.fromkeys(_SINGLE, ()),
         }
@@ -269,7 +266,7 @@ class SamplerFit:
         axis_parts = [_summary(values[name], weight) for name in axes]
         parts = [_summary(array, weight) for array in found.derived.values()]
         columns = [values[name] for name in axes] + list(found.derived.values())
-        mean = weight @ found.flux
+        mean, n_draws = weight @ found.flux, self.engine.request.n_draws
         return {
             "pdf": {n: np.bincount(cells[n], weight, minlength=size[n]) for n in axes},
             "pdf_2d": joint("redshift", "frac_agn").reshape(-1, n_f),
@@ -278,7 +275,9 @@ class SamplerFit:
             "axis_quantiles": [part[1] for part in axis_parts],
             "moments": [part[0] for part in parts],
             "quantiles": [part[1] for part in parts],
-            "draws": np.column_stack(columns)[_draw(weight, self.n_draws, rng)],
+            "draws": np.column_stack(columns)[
+                rng.permutation(systematic_draws(weight, n_draws, rng))
+            ],
             "model_flux": mean,
             "model_flux_std": np.sqrt(weight @ np.square(found.flux - mean)),
             "best": best,
@@ -311,10 +310,3 @@ def _summary(values, weight):
     order = np.argsort(values, kind="stable")
     middle = np.cumsum(weight[order]) - 0.5 * weight[order]
     return np.array([mean, std, log_mean]), np.interp(levels, middle, values[order])
-
-
-def _draw(weight, n, rng):
-    """Rows of a weighted sample, in proportion to weight with as few repetitions as may be."""
-    total = np.cumsum(weight)
-    place = (np.arange(n) + rng.random()) / n * total[-1]
-    return rng.permutation(np.minimum(np.searchsorted(total, place), weight.size - 1))

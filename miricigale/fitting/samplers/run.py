@@ -7,11 +7,19 @@ import numpy as np
 from astropy.table import QTable
 from scipy.special import erfcx, log_ndtr
 
-from miricigale.fitting.samplers import Request, effective_size, get_sampler
+from miricigale.fitting.samplers import effective_size, get_sampler
+from miricigale.fitting.settings import SamplerSettings
 from miricigale.utils.parallel import single_threaded
 from miricigale.utils.random import stream
 
-__all__ = ["ContinuousEngine", "FluxModel", "Posterior", "best_scale", "chi2_at"]
+__all__ = [
+    "ContinuousEngine",
+    "FluxModel",
+    "Posterior",
+    "best_scale",
+    "chi2_at",
+    "systematic_draws",
+]
 
 #: Draws from the prior of which at least one has to be possible.
 _TRIALS = 2048
@@ -109,7 +117,7 @@ class ContinuousEngine:
     filters: object
     names: tuple
     sampler: object
-    request: Request
+    request: SamplerSettings
     profile: bool = True
     scale_error: bool = True
 
@@ -208,6 +216,13 @@ def _positive_normal(mean, std, rng):
             break
         out[below] = mean[below] + std[below] * rng.standard_normal(below.size)
     return out
+
+
+def systematic_draws(weight, n, rng):
+    """Rows in proportion to weights, with as few repetitions as possible (systematic resampling): shape (n,)."""
+    total = np.cumsum(weight)
+    place = (np.arange(n) + rng.random()) / n * total[-1]
+    return np.minimum(np.searchsorted(total, place), weight.size - 1)
 
 
 def _hazard(x):

@@ -169,7 +169,7 @@ def make_prior(name, prior, parameter):
     Prior of one parameter, or its fixed value.
 
     ``prior`` is given as for `~miricigale.fitting.BayesFitter`, its numbers may be quantities;
-    ``parameter`` is the declaration (`~miricigale.sed.Parameter`). A `ValueError` tells something else,
+    ``parameter`` is the declaration (`~miricigale.sed.Parameter`). A `ValueError` is raised for something else,
     or what lies outside the bounds of the parameter.
     """
     argument = f"priors[{name!r}]"

@@ -164,7 +164,8 @@ def fit_experiment(context, unit):
             context.save_table(f"{of}/experiments/{name}.ecsv", left)
             return
         priors = sampler_priors(options["axes"])
-        options = {"engine": plan["sampler"], "priors": priors, **plan["options"]}
+        settings = fitting.SamplerSettings(**plan["options"])
+        options = {"engine": plan["sampler"], "priors": priors, "settings": settings}
         # samplers are Python: threads gain nothing
         given = {"seed": context.seed, "executor": None}
     results = fit_mock(context, mock, bands, given=given, **options)

@@ -186,7 +186,7 @@ def fit_seds(catalog, options, *, model_error, executor=None, progress_bar=False
         list(bands),
         axes=axes | {"redshift": nodes[nodes > 0]},
         model_error=model_error,
-        redshift_tolerance=REDSHIFT_STEP,
+        settings=fitting.GridSettings(redshift_tolerance=REDSHIFT_STEP),
         # a single band is enough for a flux
         n_bands_min=1,
     )

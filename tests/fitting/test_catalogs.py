@@ -1,4 +1,4 @@
-"""What catalogues may hold that a fit cannot use: it is told, flagged or refused, never guessed."""
+"""What catalogs may hold that a fit cannot use: it is reported, flagged or refused, never guessed."""
 
 import warnings
 
@@ -8,19 +8,26 @@ import pytest
 from astropy.table import Column, MaskedColumn, QTable, Table
 from numpy.testing import assert_allclose, assert_array_equal
 
-from miricigale.fitting import BayesFitter, FitFlags, FitResults, Samples, fit_file
+from miricigale.fitting import (
+    BayesFitter,
+    FitFlags,
+    FitResults,
+    GridSettings,
+    Samples,
+    fit_file,
+)
 from miricigale.utils.exceptions import MiricigaleWarning
 
 
 @pytest.fixture
-def catalogue(grid, draw_photometry):
+def catalog(grid, draw_photometry):
     return draw_photometry(grid, 6, noise=0.1)[0]
 
 
 @pytest.fixture
-def wider(catalogue):
+def wider(catalog):
     """Bands that the grid lacks, by unit and by name, and columns that are none."""
-    table = catalogue.copy()
+    table = catalog.copy()
     table["hst.f606w"], table["hst.f606w_err"] = table["band0"], table["band0_err"]
     table["miri.f560w"] = np.ones(6)
     table["mass"], table["mass_err"] = 1e10 * u.Msun, 1e9 * u.Msun
@@ -31,21 +38,23 @@ def wider(catalogue):
 # ------------------------------------------------------------------------------- bands
 
 
-def test_bands_that_the_grid_lacks_are_named(grid, catalogue, wider):
+def test_bands_that_the_grid_lacks_are_named(grid, catalog, wider):
     fitter = BayesFitter(grid)
-    with pytest.warns(MiricigaleWarning, match=r"are not fitted: hst\.f606w, miri\.f560w$") as told:
+    with pytest.warns(
+        MiricigaleWarning, match=r"are not fitted: hst\.f606w, miri\.f560w$"
+    ) as record:
         results = fitter.fit(wider)
-    assert len(told) == 1
+    assert len(record) == 1
     # the line that called
-    assert told[0].filename == __file__
+    assert record[0].filename == __file__
     assert results.meta["fit"]["unused_bands"] == ["hst.f606w", "miri.f560w"]
-    with pytest.warns(MiricigaleWarning, match="hst.f606w") as told:
+    with pytest.warns(MiricigaleWarning, match="hst.f606w") as record:
         samples = fitter.sample(wider, 2, seed=1)
-    assert told[0].filename == __file__
+    assert record[0].filename == __file__
     assert samples.meta["fit"]["unused_bands"] == ["hst.f606w", "miri.f560w"]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        alone = fitter.fit(catalogue)
+        alone = fitter.fit(catalog)
         # who names the bands knows
         chosen = BayesFitter(grid, ["band0", "band1", "band2"]).fit(wider)
     assert alone.meta["fit"]["unused_bands"] == []
@@ -54,11 +63,11 @@ def test_bands_that_the_grid_lacks_are_named(grid, catalogue, wider):
     assert chosen.meta["fit"]["unused_bands"] == unused
 
 
-def test_a_catalogue_on_disk_is_warned_of_once(grid, wider, tmp_path):
+def test_a_catalog_on_disk_is_warned_of_once(grid, wider, tmp_path):
     wider.write(tmp_path / "cat.fits")
-    with pytest.warns(MiricigaleWarning, match="hst.f606w") as told:
+    with pytest.warns(MiricigaleWarning, match="hst.f606w") as record:
         results = fit_file(BayesFitter(grid), tmp_path / "cat.fits", tmp_path / "o", chunk_rows=2)
-    assert [w.filename for w in told if w.category is MiricigaleWarning] == [__file__]
+    assert [w.filename for w in record if w.category is MiricigaleWarning] == [__file__]
     for part in results.parts():
         assert part.meta["fit"]["unused_bands"] == ["hst.f606w", "miri.f560w"]
 
@@ -67,8 +76,8 @@ def test_a_catalogue_on_disk_is_warned_of_once(grid, wider, tmp_path):
 
 
 @pytest.mark.parametrize("kind", [int, str])
-def test_masked_ids_are_refused(grid, catalogue, tmp_path, kind):
-    table = Table(catalogue)
+def test_masked_ids_are_refused(grid, catalog, tmp_path, kind):
+    table = Table(catalog)
     table["id"] = MaskedColumn(np.arange(6).astype(kind), mask=[0, 0, 0, 0, 1, 0])
     match = "'photometry' must be a table with an id in every row, got 1 masked or empty"
     with pytest.raises(ValueError, match=rf"{match}, the first in row 4 \(from 0\)"):
@@ -84,15 +93,15 @@ def test_masked_ids_are_refused(grid, catalogue, tmp_path, kind):
         assert "in rows 3 to 5 of" in error.value.__notes__[0]
 
 
-def test_text_ids_are_text_wherever_they_come_from(grid, catalogue, tmp_path):
-    catalogue["id"] = [f"g{i}" for i in range(6)]
+def test_text_ids_are_text_wherever_they_come_from(grid, catalog, tmp_path):
+    catalog["id"] = [f"g{i}" for i in range(6)]
     fitter = BayesFitter(grid)
-    want, drawn = fitter.fit(catalogue), fitter.sample(catalogue, 5, seed=1)
-    catalogue.write(tmp_path / "cat.fits")
+    want, drawn = fitter.fit(catalog), fitter.sample(catalog, 5, seed=1)
+    catalog.write(tmp_path / "cat.fits")
     read = Table.read(tmp_path / "cat.fits", character_as_bytes=True)
     assert read["id"].dtype.kind == "S"
-    of_objects = Table(catalogue)
-    of_objects["id"] = np.array(catalogue["id"].tolist(), dtype=object)
+    of_objects = Table(catalog)
+    of_objects["id"] = np.array(catalog["id"].tolist(), dtype=object)
     for table in (read, of_objects):
         got = fitter.fit(table)
         assert got["g3"].chi2 == want["g3"].chi2
@@ -116,10 +125,10 @@ def test_text_ids_are_text_wherever_they_come_from(grid, catalogue, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["Kümmel 3", "b "])
-def test_ids_that_fits_files_cannot_hold_are_named(grid, catalogue, tmp_path, name):
-    catalogue["id"] = ["a", "b", name, "c", "d", "e"]
+def test_ids_that_fits_files_cannot_hold_are_named(grid, catalog, tmp_path, name):
+    catalog["id"] = ["a", "b", name, "c", "d", "e"]
     fitter = BayesFitter(grid)
-    results, samples = fitter.fit(catalogue), fitter.sample(catalogue, 2, seed=1)
+    results, samples = fitter.fit(catalog), fitter.sample(catalog, 2, seed=1)
     for item in (results, samples):
         assert item[name] is not None
         with pytest.raises(ValueError, match=rf"'ids' must be ASCII, .* got '{name}'"):
@@ -127,11 +136,11 @@ def test_ids_that_fits_files_cannot_hold_are_named(grid, catalogue, tmp_path, na
 
 
 @pytest.mark.parametrize("dtype", ["i1", "u1", "i2", "u2", ">i4", ">u4", "i8", "u8", ">f4", "f8"])
-def test_ids_of_any_number_survive_files(grid, catalogue, tmp_path, dtype):
+def test_ids_of_any_number_survive_files(grid, catalog, tmp_path, dtype):
     known = np.dtype(dtype)
     top = np.iinfo(known).max if known.kind in "iu" else 2**24
     ids = np.array([1, 2, 3, 4, top - 1, top], dtype=known)
-    table = Table(catalogue)
+    table = Table(catalog)
     table["id"] = ids
     fitter = BayesFitter(grid)
     results, samples = fitter.fit(table), fitter.sample(table, 2, seed=1)
@@ -143,20 +152,20 @@ def test_ids_of_any_number_survive_files(grid, catalogue, tmp_path, dtype):
         assert item.row(ids[5]) == 5
 
 
-def test_bytes_that_are_no_text_are_refused(grid, catalogue):
-    table = Table(catalogue)
+def test_bytes_that_are_no_text_are_refused(grid, catalog):
+    table = Table(catalog)
     table["id"] = np.array([b"a", "ä".encode("latin1"), b"c", b"d", b"e", b"f"])
     with pytest.raises(ValueError, match=r"bytes of text in UTF-8, got b'\\xe4'"):
         BayesFitter(grid).fit(table)
 
 
-def test_masked_redshifts_are_missing(grid, catalogue):
+def test_masked_redshifts_are_missing(grid, catalog):
     fitter = BayesFitter(grid)
-    z = np.array(catalogue["redshift"], dtype=float)
+    z = np.array(catalog["redshift"], dtype=float)
     mask = np.arange(6) == 2
-    want = fitter.fit(catalogue, redshift=np.where(mask, np.nan, z))
+    want = fitter.fit(catalog, redshift=np.where(mask, np.nan, z))
     assert FitFlags.NO_REDSHIFT & want.flags[2]
-    table = Table(catalogue)
+    table = Table(catalog)
     table["z"] = MaskedColumn(z, mask=mask)
     for given in ("z", table["z"], np.ma.array(z, mask=mask), table["z"].tolist()):
         got = fitter.fit(table, redshift=given)
@@ -164,22 +173,22 @@ def test_masked_redshifts_are_missing(grid, catalogue):
         assert_array_equal(got.chi2, want.chi2)
 
 
-def test_masked_densities_are_missing(grid, catalogue):
+def test_masked_densities_are_missing(grid, catalog):
     fitter = BayesFitter(grid)
     nodes = np.linspace(0.0, 3.0, 31)
     density = np.ma.array(np.ones((6, 31)), mask=np.zeros((6, 31), dtype=bool))
     density[3, 7:9] = np.ma.masked
-    got = fitter.fit(catalogue, redshift_prior=(nodes, density))
+    got = fitter.fit(catalog, redshift_prior=(nodes, density))
     assert_array_equal(got.flags & int(FitFlags.NO_REDSHIFT) > 0, np.arange(6) == 3)
     assert_array_equal(got.fitted, np.arange(6) != 3)
     with pytest.raises(ValueError, match=r"'redshift_prior\[0\]' must be >= 0 and ascending"):
-        fitter.fit(catalogue, redshift_prior=(np.ma.masked_less(nodes, 1.0), np.ones(31)))
+        fitter.fit(catalog, redshift_prior=(np.ma.masked_less(nodes, 1.0), np.ones(31)))
 
 
-def test_errors_may_be_per_cent(grid, catalogue):
-    want = BayesFitter(grid, model_error=0.2, error_floor={"band1": 0.3}).fit(catalogue)
+def test_errors_may_be_per_cent(grid, catalog):
+    want = BayesFitter(grid, model_error=0.2, error_floor={"band1": 0.3}).fit(catalog)
     floor = {"band1": 30 * u.percent}
-    got = BayesFitter(grid, model_error=20 * u.percent, error_floor=floor).fit(catalogue)
+    got = BayesFitter(grid, model_error=20 * u.percent, error_floor=floor).fit(catalog)
     assert_allclose(got.sigma, want.sigma, rtol=1e-12)
     with pytest.raises(u.UnitsError, match="'model_error' must be convertible to"):
         BayesFitter(grid, model_error=0.1 * u.uJy)
@@ -234,7 +243,7 @@ def test_the_best_model_has_the_lowest_chi2_of_those_that_matter(
         weights[g // 4] = 1e-30
         for rtol in (0.0, 1e-6):
             priors = {"tau": weights}
-            fitter = BayesFitter(grid, priors=priors, rtol=rtol)
+            fitter = BayesFitter(grid, priors=priors, settings=GridSettings(rtol=rtol))
             results = fitter.fit(table[i : i + 1])
             want = brute_force(grid, results.flux[0], results.sigma[0], priors=priors)
             if rtol == 0.0:
@@ -249,13 +258,13 @@ def test_the_best_model_has_the_lowest_chi2_of_those_that_matter(
     assert n_better > 0
 
 
-def test_tables_of_any_kind_are_the_same_fit(grid, catalogue, tmp_path):
+def test_tables_of_any_kind_are_the_same_fit(grid, catalog, tmp_path):
     """Plain columns with units, other units, files, NaN that files mask."""
-    catalogue["band1"][2] = np.nan
-    want = BayesFitter(grid).fit(catalogue)
-    plain = Table(catalogue)
-    catalogue.write(tmp_path / "cat.fits")
-    catalogue.write(tmp_path / "cat.ecsv")
+    catalog["band1"][2] = np.nan
+    want = BayesFitter(grid).fit(catalog)
+    plain = Table(catalog)
+    catalog.write(tmp_path / "cat.fits")
+    catalog.write(tmp_path / "cat.ecsv")
     tables = [plain, Table(plain, masked=True)]
     tables += [cls.read(tmp_path / f"cat.{x}") for cls in (Table, QTable) for x in ("fits", "ecsv")]
     for table in tables:
@@ -266,8 +275,8 @@ def test_tables_of_any_kind_are_the_same_fit(grid, catalogue, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["text", "true and false", "complex numbers"])
-def test_fluxes_are_numbers(grid, catalogue, kind):
-    table = Table(catalogue)
+def test_fluxes_are_numbers(grid, catalog, kind):
+    table = Table(catalog)
     flux = np.asarray(table["band1"])
     columns = {"text": flux.astype(str), "true and false": flux > 0, "complex numbers": flux * 1j}
     table["band1"] = Column(columns[kind], unit="uJy")
@@ -277,16 +286,16 @@ def test_fluxes_are_numbers(grid, catalogue, kind):
 
 
 @pytest.mark.parametrize("code", [1e99, -1e99, 1e-99])
-def test_codes_beyond_all_measurements_are_left_out(grid, catalogue, code):
+def test_codes_beyond_all_measurements_are_left_out(grid, catalog, code):
     """Their squares are no numbers, or leave none of those of others."""
     column, flag = ("band2_err", FitFlags.BAD_ERROR)
     if code < 0:
         column, flag = ("band2", FitFlags.BAD_FLUX)
-    missing = catalogue.copy()
+    missing = catalog.copy()
     missing[column][1] = np.nan
-    catalogue[column][1] = code * u.uJy
+    catalog[column][1] = code * u.uJy
     fitter = BayesFitter(grid)
-    got, want = fitter.fit(catalogue), fitter.fit(missing)
+    got, want = fitter.fit(catalog), fitter.fit(missing)
     assert_array_equal(got.flags, want.flags | np.where(np.arange(6) == 1, int(flag), 0))
     for name in ("chi2", "log_evidence", "moments", "n_bands"):
         assert_array_equal(getattr(got, name), getattr(want, name))
@@ -314,9 +323,9 @@ def test_fluxes_without_noise_give_their_model_back(make_grid, draw_photometry, 
 # ----------------------------------------------------------- codes for a missing value
 
 
-def coded(catalogue):
+def coded(catalog):
     """-99 with errors alike in a row, an error of -999, 99 with 99; real fluxes of -98.9 are none."""
-    table = catalogue.copy()
+    table = catalog.copy()
     table["band1"][0] = table["band1_err"][0] = -99 * u.uJy
     table["band1_err"][2] = -999 * u.uJy
     table["band2"][3] = table["band2_err"][3] = 99 * u.uJy
@@ -325,21 +334,21 @@ def coded(catalogue):
     return table
 
 
-def test_numbers_that_look_like_codes_are_told_before_the_fit(grid, catalogue):
+def test_numbers_that_look_like_codes_are_reported_before_the_fit(grid, catalog):
     wanted = (
         r"photometry: look like .* as they are: band1 2 of 6 \(-999, -99\); band2 1 of 6 \(99\)"
     )
-    with pytest.warns(MiricigaleWarning, match=wanted) as told:
-        BayesFitter(grid).fit(coded(catalogue))
-    assert len(told) == 1
-    assert told[0].filename == __file__
+    with pytest.warns(MiricigaleWarning, match=wanted) as record:
+        BayesFitter(grid).fit(coded(catalog))
+    assert len(record) == 1
+    assert record[0].filename == __file__
 
 
-def test_codes_of_a_whole_file_are_counted(grid, catalogue, tmp_path):
-    path = tmp_path / "catalogue.fits"
-    coded(catalogue).write(path)
+def test_codes_of_a_whole_file_are_counted(grid, catalog, tmp_path):
+    path = tmp_path / "catalog.fits"
+    coded(catalog).write(path)
     with pytest.warns(
-        MiricigaleWarning, match=r"catalogue\.fits: look like .*band1 2 of 6"
-    ) as told:
+        MiricigaleWarning, match=r"catalog\.fits: look like .*band1 2 of 6"
+    ) as record:
         fit_file(BayesFitter(grid), path, tmp_path / "out", chunk_rows=2)
-    assert len(told) == 1
+    assert len(record) == 1

@@ -1,0 +1,109 @@
+"""Settings of the two ways to find a posterior: the sum over a grid, and a sampler."""
+
+from dataclasses import dataclass, field
+
+from miricigale.sed import SEDModel
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.units import check_count, is_number
+
+__all__ = ["GridSettings", "SamplerSettings"]
+
+
+@dataclass(frozen=True)
+class GridSettings:
+    """
+    How `BayesFitter` sums over a grid.
+
+    Parameters
+    ----------
+    prior_f : {"grid", "uniform"}, optional
+        Prior of a grid's AGN fractions: equal for all values of the grid (so that f = 0, which is
+        evaluated once for each galaxy, carries the summed weight of all AGN templates), or by the
+        width of their cells.
+    redshift_tolerance : float, optional
+        How far, in abs(dz) / (1 + z), a fixed redshift may lie from its node of the grid; half the
+        distance of the nodes by default.
+    rtol : float, optional
+        Largest relative error of posterior weights, means and standard deviations that leaving
+        out models may cause; 0 evaluates every model.
+    sfr_prior : tuple, optional
+        A function of stellar mass and redshift (a `~astropy.units.Quantity`, and an array that
+        broadcasts with it) to a star-formation rate, and a scatter in dex. The prior of the galaxies of each
+        redshift is multiplied by that log-normal distribution of their rate over the last 100 Myr, at the mass
+        that fits best without AGN, and keeps its sum. Not with ``interpolate``.
+    interpolate : int, optional
+        Number of models drawn between the nodes for each object, with fluxes interpolated from the
+        nodes around, by sequential Monte Carlo (Del Moral et al. 2006); posteriors, means and
+        percentiles are theirs. Known redshifts are then those of the catalog, in chi2, the evidence and the
+        best model too. 400 suffice for 68 % intervals. 0: the nodes alone.
+    finer : `~miricigale.sed.SEDModel`, optional
+        With ``interpolate``: the model that made the grid, of which a finer grid is made, between whose nodes
+        fluxes are good to 0.5 % along each axis. Not needed where a model is fitted. Without it fluxes are
+        interpolated from the grid's own nodes, and intervals are too narrow where its cells are wide.
+
+    Raises
+    ------
+    ValueError
+        If a value is of the wrong kind, or goes with another one that was not given.
+    """
+
+    prior_f: str = "grid"
+    redshift_tolerance: float | None = None
+    rtol: float = 1e-6
+    sfr_prior: tuple | None = None
+    interpolate: int = 0
+    finer: SEDModel | None = None
+
+    def __post_init__(self):
+        if not (is_number(self.rtol) and 0 <= self.rtol < 0.1):
+            raise argument_error("rtol", "in [0, 0.1)", repr(self.rtol))
+        near = self.redshift_tolerance
+        if near is not None and not (is_number(near) and near >= 0):
+            raise argument_error("redshift_tolerance", ">= 0", repr(near))
+        if check_count(self.interpolate, "interpolate", least=0) and self.sfr_prior is not None:
+            raise argument_error("sfr_prior", "None with 'interpolate'", repr(self.sfr_prior))
+        if self.finer is not None and not (self.interpolate and isinstance(self.finer, SEDModel)):
+            wanted = "an SEDModel" if self.interpolate else "None without 'interpolate'"
+            raise argument_error("finer", wanted, repr(self.finer))
+
+
+@dataclass(frozen=True)
+class SamplerSettings:
+    """
+    How `BayesFitter` samples, and what it keeps of a sample.
+
+    Parameters
+    ----------
+    predict : list of str or `~miricigale.filters.FilterSet`, optional
+        More bands, in which the fluxes of the models are predicted.
+    n_live : int, optional
+        Number of live points; more for posteriors of several narrow peaks.
+    n_effective : int, optional
+        Effective size that the sample shall have (nautilus; dynesty's follows from ``n_live``).
+    max_calls : int, optional
+        Number of models evaluated for one object after which the sampler stops, finished or not (dynesty counts
+        the steps of its walkers, some of which leave the prior); see ``converged`` of the results.
+    n_draws, n_cells : int, optional
+        Draws of equal weight that are kept of a sample (see `FitResults.samples`), and cells of each
+        axis, for PDFs and plots.
+    options : dict, optional
+        Passed to the sampler.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a number is not a whole number, or too small.
+    """
+
+    predict: tuple = ()
+    n_live: int = 500
+    n_effective: int = 2000
+    max_calls: int = 500_000
+    n_draws: int = 1000
+    n_cells: int = 100
+    options: dict = field(default_factory=dict)
+
+    def __post_init__(self):
+        least = {"n_live": 10, "n_effective": 1, "max_calls": 1, "n_draws": 1, "n_cells": 2}
+        for name, value in least.items():
+            check_count(getattr(self, name), name, value)
