@@ -13,17 +13,7 @@ from miricigale.utils.exceptions import ConfigError, argument_error
 __all__ = ["COMPONENTS", "ROLES", "Component", "read_config", "register"]
 
 #: What a component does, in the order in which light meets it.
-ROLES = (
-    "sfh",
-    "stellar",
-    "nebular",
-    "attenuation",
-    "dust",
-    "agn",
-    "xray",
-    "igm",
-    "foreground",
-)
+ROLES = ("sfh", "stellar", "nebular", "attenuation", "dust", "agn", "xray", "igm", "foreground")
 
 #: Components by name, for configurations.
 COMPONENTS = Registry("component")

@@ -22,12 +22,12 @@ class Parameter:
     ----------
     default : float
         In ``unit``.
-    unit : `~astropy.units.Unit` or str, optional
-        Unit; dimensionless if not given.
     bounds : tuple of float
         Smallest and largest value allowed, in ``unit``, both included.
     doc : str
         One sentence that says what it is.
+    unit : `~astropy.units.Unit` or str, optional
+        Unit; dimensionless if not given.
 
     Raises
     ------
@@ -35,7 +35,7 @@ class Parameter:
         If the default is outside the bounds.
     """
 
-    def __init__(self, *, default, bounds, doc, unit=""):
+    def __init__(self, default, bounds, doc, *, unit=""):
         self.unit = u.Unit(unit)
         self.default = float(default)
         self.bounds = (float(bounds[0]), float(bounds[1]))
@@ -57,7 +57,7 @@ class Parameter:
 
     def replace(self, default, name=None):
         """Copy with another default, and another name if one is given."""
-        new = Parameter(default=default, bounds=self.bounds, doc=self.doc, unit=self.unit)
+        new = Parameter(default, self.bounds, self.doc, unit=self.unit)
         new.name = name or self.name
         return new
 

@@ -32,10 +32,7 @@ def folders(tmp_path, monkeypatch):
     common = {"kind": "user", "title": "T", "licence": "L", "citation": "C", "source": "a page"}
     records = {
         "test.file": Resource(
-            name="test.file",
-            file="sub/file.dat",
-            sha256=hashlib.sha256(TEXT).hexdigest(),
-            **common,
+            name="test.file", file="sub/file.dat", sha256=hashlib.sha256(TEXT).hexdigest(), **common
         ),
         "test.folder": Resource(name="test.folder", file="folder", **common),
         "test.package": Resource(name="test.package", **(common | {"kind": "package"})),

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from astropy.io import fits
+from numpy.testing import assert_allclose
 
 from miricigale.refdata import locate, resource
 from miricigale.refdata.tables import load_ssp
@@ -37,7 +38,7 @@ def test_dust_spectra_are_normalized():
     table = load_dl07(str(locate("dust.dl07")))
     for name in ("single", "powerlaw"):
         total = np.trapezoid(table[name], table["wave"], axis=-1)
-        np.testing.assert_allclose(total, 1.0, atol=1e-4)
+        assert_allclose(total, 1.0, atol=1e-4)
 
 
 def test_files_say_where_they_come_from():

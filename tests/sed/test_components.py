@@ -2,14 +2,11 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.io import fits
+from numpy.testing import assert_allclose
 
 from helpers.components import values_of
 from miricigale.sed import _core
-from miricigale.sed.components import (
-    BC03,
-    CalzettiLeitherer,
-    DelayedSFH,
-)
+from miricigale.sed.components import BC03, CalzettiLeitherer, DelayedSFH
 from miricigale.utils.exceptions import DataError
 
 # ----------------------------------------------------------------------------- stars
@@ -93,8 +90,8 @@ def test_old_stars_have_their_share_of_the_color_excess():
     wave = np.array([0.2, 0.55])
     young, old = part.factors(wave, values_of(part, ebv=0.5, ebv_factor=0.44))
     k = _core.leitherer_calzetti(wave)
-    np.testing.assert_allclose(-2.5 * np.log10(young), 0.5 * k)
-    np.testing.assert_allclose(-2.5 * np.log10(old), 0.22 * k)
+    assert_allclose(-2.5 * np.log10(young), 0.5 * k)
+    assert_allclose(-2.5 * np.log10(old), 0.22 * k)
 
 
 def test_foreign_files_are_refused(tmp_path):

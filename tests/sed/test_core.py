@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import quad
 
 from miricigale.sed import _core
@@ -10,7 +11,7 @@ def test_delayed_history_forms_one_solar_mass_and_has_the_delayed_shape():
     rate = _core.delayed_history(3000, 500.0)
     assert rate.sum() * 1e6 == pytest.approx(1.0, rel=1e-12)
     t = np.arange(3000)
-    np.testing.assert_allclose(rate / rate[500], t / 500 * np.exp(1 - t / 500), rtol=1e-12)
+    assert_allclose(rate / rate[500], t / 500 * np.exp(1 - t / 500), rtol=1e-12)
     # the continuous integral of t exp(-t/tau) / tau^2 from 0 to T is 1 - (1 + T/tau) exp(-T/tau)
     whole = 1 - (1 + 3000 / 500) * np.exp(-3000 / 500)
     assert rate[500] * 1e6 == pytest.approx(500 * np.exp(-1) / 500**2 / whole, rel=1e-3)
@@ -31,7 +32,7 @@ def test_burst_forms_its_fraction():
 def test_time_weights_are_means_of_ten_interpolations():
     age = np.array([0.0, 0.5, 3.0, 10.0])
     weights = _core.time_weights(age, 10).toarray()
-    np.testing.assert_allclose(weights.sum(axis=1), 1.0)
+    assert_allclose(weights.sum(axis=1), 1.0)
     table = np.array([5.0, 1.0, 2.0, 9.0])
     for k in (0, 2, 7):
         want = np.mean([np.interp(k + i / 10, age, table) for i in range(1, 11)])
@@ -72,7 +73,7 @@ def test_leitherer_joins_calzetti():
 def test_modified_curve_keeps_the_color_excess(slope, bump):
     band = np.array([0.44, 0.55])
     want = np.diff(_core.leitherer_calzetti(band))
-    np.testing.assert_allclose(np.diff(_core.attenuation_curve(band, slope, bump)), want)
+    assert_allclose(np.diff(_core.attenuation_curve(band, slope, bump)), want)
 
 
 def test_bump_stands_at_2175():
@@ -149,7 +150,7 @@ def test_band_means_over_the_part_that_a_spectrum_covers(ends):
 def test_meiksin_is_clear_redward_of_lyman_alpha():
     z = 3.0
     wave = np.linspace(0.12160001 * (1 + z), 5.0, 1000)
-    np.testing.assert_array_equal(_core.meiksin_transmission(wave, z), 1.0)
+    assert_array_equal(_core.meiksin_transmission(wave, z), 1.0)
 
 
 @pytest.mark.parametrize(

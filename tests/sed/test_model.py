@@ -7,6 +7,7 @@ import pytest
 from astropy.cosmology import FlatLambdaCDM
 from astropy.table import QTable
 from astropy.tests.helper import assert_quantity_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 from miricigale.filters import Filter, FilterSet
 from miricigale.sed import COSMOLOGY, ModelFlags, ModelGrid, Parameter, SEDModel, yang2021_axes
@@ -281,8 +282,8 @@ def test_three_ways_to_a_flux_agree(model, filters, grid):
     for i, row in enumerate(rows):
         direct = filters.synthetic_fluxes(model.evaluate(**row)).value
         listed = np.array([got[name][i].value for name in filters.names])
-        np.testing.assert_allclose(listed, want[i], rtol=1e-6)
-        np.testing.assert_allclose(direct, want[i], rtol=1e-6)
+        assert_allclose(listed, want[i], rtol=1e-6)
+        assert_allclose(direct, want[i], rtol=1e-6)
         g = np.flatnonzero(
             np.all(
                 [grid.galaxy_parameters[n] == row[n] for n in grid.galaxy_parameters.colnames],
@@ -303,7 +304,7 @@ def test_both_definitions_obey_the_factorisation(filters):
     row |= {n: grid.agn_parameters[n][3] for n in grid.agn_parameters.colnames}
     sed = model.evaluate(**row, redshift=0.5, frac_agn=0.4, mass=1.0)
     got = filters.synthetic_fluxes(sed).value
-    np.testing.assert_allclose(got, grid.flux(0, 5, 3, 1), rtol=1e-6)
+    assert_allclose(got, grid.flux(0, 5, 3, 1), rtol=1e-6)
     power = sed.meta["derived"]["accretion_power"].value
     reference = 0.4 / 0.6 * grid.dust_luminosity[5]
     assert power == pytest.approx(reference * grid.agn_properties["accretion_power"][3].value)
@@ -321,7 +322,7 @@ def test_grid_counts_identical_models(grid):
 def test_grid_marks_galaxies_older_than_the_universe(grid):
     age = grid.galaxy_parameters["age"]
     universe = COSMOLOGY.age(grid.redshift)
-    np.testing.assert_array_equal(grid.allowed, age[None, :] <= universe[:, None])
+    assert_array_equal(grid.allowed, age[None, :] <= universe[:, None])
     assert not grid.allowed.all()
 
 
@@ -336,10 +337,10 @@ def test_grid_survives_writing(grid, tmp_path):
     grid.write(tmp_path / "grid.fits")
     back = ModelGrid.read(tmp_path / "grid.fits")
     for name in ("redshift", "galaxy", "agn", "dust_luminosity", "frac_agn", "allowed"):
-        np.testing.assert_array_equal(getattr(back, name), getattr(grid, name))
+        assert_array_equal(getattr(back, name), getattr(grid, name))
     assert back.filters == grid.filters
     for name, values in grid.axes.items():
-        np.testing.assert_array_equal(back.axes[name], values)
+        assert_array_equal(back.axes[name], values)
     for name in ("inert", "bounds", "recipe", "frac_agn_definition"):
         assert getattr(back, name) == getattr(grid, name)
     for name in grid.galaxy_properties.colnames:
@@ -379,7 +380,7 @@ def test_order_of_the_rows_does_not_matter(model, filters):
     )
     one = model.fluxes(table, filters)
     two = model.fluxes(table[::-1], filters)[::-1]
-    np.testing.assert_array_equal(one["irac.ch1"], two["irac.ch1"])
+    assert_array_equal(one["irac.ch1"], two["irac.ch1"])
 
 
 def test_redshift_is_needed(model, filters):
@@ -409,7 +410,7 @@ def test_axes_of_the_paper_make_24_million_models():
     sizes = {name: len(values) for name, values in axes.items()}
     assert np.prod(list(sizes.values())) == 24_024_000
     step = np.diff(np.log(1 + axes["redshift"]))
-    np.testing.assert_allclose(step, 0.03)
+    assert_allclose(step, 0.03)
     assert axes["redshift"][0] == pytest.approx(0.01)
     assert axes["redshift"][-1] < 6.0
     assert "frac_agn" not in yang2021_axes("galaxy")
@@ -507,7 +508,7 @@ def test_axes_that_cannot_be_are_refused_by_name(model, filters):
         with pytest.raises(ValueError, match=match):
             model.grid(axes, filters)
     grid = model.grid({"redshift": [1.0], "age": [500 * u.Myr, 1 * u.Gyr]}, filters)
-    np.testing.assert_allclose(grid.galaxy_parameters["age"].to_value(u.Gyr), [0.5, 1.0])
+    assert_allclose(grid.galaxy_parameters["age"].to_value(u.Gyr), [0.5, 1.0])
 
 
 def test_a_default_agn_fraction_is_in_the_grid_too(filters):
@@ -515,7 +516,7 @@ def test_a_default_agn_fraction_is_in_the_grid_too(filters):
     grid = model.grid({"redshift": [1.0], "age": [1.0]}, filters)
     row = model.fluxes(QTable({"redshift": [1.0], "age": [1.0]}), filters)
     want = [row[name][0].value / 1e10 for name in filters.names]
-    np.testing.assert_allclose(grid.flux(0, 0, 0, 0), want, rtol=1e-6)
+    assert_allclose(grid.flux(0, 0, 0, 0), want, rtol=1e-6)
 
 
 def test_igm_components_may_have_parameters(filters):
@@ -590,7 +591,7 @@ def test_a_fraction_of_the_light_in_any_range(span):
         {"redshift": [0.5], "age": [1.0, 3.0], "frac_agn": [0.0, 0.3]}, bands, cache=False
     )
     one = grid.flux(0, 1, 0, 1) * 1e10
-    np.testing.assert_allclose([table[b][0].value for b in bands], one, rtol=1e-5)
+    assert_allclose([table[b][0].value for b in bands], one, rtol=1e-5)
     assert spectra.derived["agn_power"].value == pytest.approx(
         table["agn_power"][0].value, rel=1e-6
     )

@@ -6,8 +6,6 @@ import numpy as np
 
 from miricigale.utils.compilation import njit
 
-__all__ = ["band_means", "band_tables"]
-
 BUCKETS = 2048  # of equal width in each band, to find a point of its curve without a search
 
 

@@ -4,8 +4,6 @@ import math
 
 import numpy as np
 
-__all__ = ["DISKS", "DISK_BREAKS", "DISK_SLOPES", "disk_nodes", "disk_spectrum"]
-
 #: Breaks in um and slopes of L_lambda between them. ``skirtor``: the form of CIGALE since
 #: 2020, Stalevski's from 8 nm on; ``stalevski2016``: as the SKIRTOR library was computed, from
 #: 1 nm (12 % of its light is below 8 nm); ``schartmann2005``: after Schartmann et al. 2005,

@@ -9,8 +9,6 @@ from miricigale.sed._core.nodes import trapezoid_weights
 from miricigale.sed._core.thermal import PLANCK_K
 from miricigale.utils.compilation import njit
 
-__all__ = ["DISK_MEAN", "POLAR_LAWS", "add_polar", "polar_curve", "polar_grid", "polar_share"]
-
 #: Mean over the sphere of cos i (1 + 2 cos i) / 3: a disk's light over its face-on value.
 DISK_MEAN = 7.0 / 18.0
 
