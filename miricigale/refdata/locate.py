@@ -241,7 +241,7 @@ def fingerprint_of(path, *, trust=True):
     try:
         record = stored_record(path) or {}
     except DataError:
-        # 'miricigale data check' tells; the file itself is what counts
+        # reported by 'miricigale data check'; the file itself is what counts
         record = {}
     if (record.get("size"), record.get("mtime_ns")) == (status.st_size, status.st_mtime_ns):
         return record["sha256"]

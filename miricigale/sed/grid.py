@@ -49,8 +49,8 @@ def fraction_span(definition):
     """
     Range of wavelengths in um of whose light an AGN fraction is a share; None for ``"dust"``.
 
-    ``definition`` is ``"dust"`` or a range such as ``"3-1000um"`` or ``"5-20um"`` in 0.1-1000 um; a ValueError
-    tells anything else.
+    ``definition`` is ``"dust"`` or a range such as ``"3-1000um"`` or ``"5-20um"`` in 0.1-1000 um; anything else
+    is a ValueError.
     """
     match = _SPAN.fullmatch(definition) if isinstance(definition, str) else None
     low, high = map(float, match.groups()) if match else (0.0, 0.0)

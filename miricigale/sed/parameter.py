@@ -61,10 +61,6 @@ class Parameter:
         new.name = name or self.name
         return new
 
-    def contains(self, value):
-        """Whether a value in the unit is finite and inside the bounds."""
-        return math.isfinite(value) and self.bounds[0] <= value <= self.bounds[1]
-
     def check(self, value):
         """
         Convert a value to a float in the unit and check the bounds.
@@ -87,8 +83,8 @@ class Parameter:
         if number is np.ma.masked or np.asarray(number).dtype.kind not in "iuf":
             raise argument_error(self.name, "one number", repr(value))
         number = float(number)
-        if not self.contains(number):
-            low, high = self.bounds
+        low, high = self.bounds
+        if not (math.isfinite(number) and low <= number <= high):
             raise argument_error(self.name, f"from {low} to {high} {self.unit}".rstrip(), number)
         return number
 

@@ -213,7 +213,7 @@ def xray_flux(
 
 
 def check_band(band, name):
-    """Ends of a band in keV; a ValueError tells what is not two ascending positive energies."""
+    """Ends of a band in keV; a ValueError unless these are two ascending positive energies."""
     ends = to_array(band, u.keV, name, ndim=1, finite=True)
     if ends.shape != (2,) or not 0 < ends[0] < ends[1]:
         raise argument_error(name, "two ascending positive energies", band)

@@ -126,11 +126,6 @@ def test_names_are_forgiving():
     assert "did you mean" not in str(info.value)
 
 
-def test_own_filters_stand_beside_those_of_the_library():
-    own = Filter([1, 2] * u.um, [1, 1], name="own")
-    assert FilterSet([own, "miri.f770w"]).names == ("own", "miri.f770w")
-
-
 def test_plot_returns_the_axes(filters):
     from matplotlib.figure import Figure
 

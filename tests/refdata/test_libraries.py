@@ -561,12 +561,6 @@ def test_damage_is_told(folder):
     assert state().state == "damaged"
 
 
-def test_the_fingerprint_is_that_of_the_content(folder):
-    report = add_library(NAME, source(folder))
-    write_library(read_fake(source(folder, "1 2 3\nend\n")), report.path)
-    assert fingerprint(NAME) == file_sha256(report.path) != report.sha256
-
-
 def test_names_and_readers_are_checked(folder, monkeypatch):
     path = source(folder)
     with pytest.raises(KeyError, match=r"no library 'ssp.bc03'; known: .*test.library"):

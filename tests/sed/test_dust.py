@@ -24,7 +24,6 @@ from miricigale.sed.components.dust import (
     load_dl07,
 )
 from miricigale.utils.exceptions import DataError
-from miricigale.utils.files import conf
 
 EVERY = [Casey2012, Dale2014, DraineLi2007, DraineLi2007Alpha]
 ALPHA = np.arange(1, 65) / 16.0
@@ -198,18 +197,6 @@ def test_source_trees_and_archives_are_read_alike(dale_folder, tmp_path):
         got = read_dale2014(tmp_path / source)
         assert got.meta["files"] == wanted.meta["files"]
         assert_array_equal(got.spectra["removed"], wanted.spectra["removed"])
-
-
-@pytest.mark.parametrize("kind", ["zip", "tar.gz"])
-def test_archives_that_unpack_beyond_the_bound_are_refused(dale_folder, tmp_path, kind):
-    shutil.copytree(dale_folder, tmp_path / "dale")
-    with open(tmp_path / "dale" / "spectra.0.00AGN.dat", "ab") as stream:
-        stream.write(bytes(20_000_000))
-    archive = shutil.make_archive(
-        str(tmp_path / "dale"), {"tar.gz": "gztar"}.get(kind, kind), tmp_path, "dale"
-    )
-    with conf.set_temp("unpacked_size", 1), pytest.raises(DataError, match="would unpack to"):
-        read_dale2014(archive)
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,6 @@ from scipy.integrate import quad
 from scipy.special import gamma
 
 from miricigale.sed import _core
-from miricigale.sed.component import COMPONENTS
 from miricigale.sed.components import Inoue2014, Madau1995, Meiksin2006
 from miricigale.sed.components.igm import load_lines
 from miricigale.utils.exceptions import DataError
@@ -60,11 +59,6 @@ def depth(part, wave, redshift):
 
 
 # ---------------------------------------------------------------------------- all three
-
-
-@pytest.mark.parametrize("cls", MODELS)
-def test_by_name(cls):
-    assert COMPONENTS.get(cls.name) is cls
 
 
 @pytest.mark.parametrize("cls", MODELS)

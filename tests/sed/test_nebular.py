@@ -4,7 +4,7 @@ import pytest
 from astropy.io import fits
 from numpy.testing import assert_allclose
 
-from miricigale.sed import COMPONENTS, _core
+from miricigale.sed import _core
 from miricigale.sed.components import BC03
 from miricigale.sed.components.nebular import Nebular, load_nebular
 from miricigale.utils.exceptions import DataError
@@ -295,12 +295,6 @@ def test_line_width_is_a_setting_with_a_unit():
         Nebular(line_width=3.0 * u.um)
     with pytest.raises(ValueError, match="'gas' must be one of stellar, free"):
         Nebular(gas="ionized")
-
-
-def test_is_known_by_name():
-    component = COMPONENTS.get("nebular")(log_u=-3.0)
-    assert component.role == "nebular"
-    assert component.parameters["log_u"].default == -3.0
 
 
 def test_refuses_a_foreign_file(tmp_path):

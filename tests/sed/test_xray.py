@@ -10,7 +10,6 @@ from scipy.integrate import quad
 
 from helpers.components import values_of
 from miricigale.sed import COSMOLOGY
-from miricigale.sed.component import COMPONENTS
 from miricigale.sed.components import XRay
 from miricigale.sed.xray import band_luminosity, stern2015, stern2015_6um, xray_flux
 
@@ -177,13 +176,6 @@ def test_flux_refuses(changes, match):
 
 
 # ------------------------------------------------------------------------------ component
-
-
-def test_component_is_known_by_name():
-    part = COMPONENTS.get("xray")()
-    assert isinstance(part, XRay)
-    assert part.settings == {"law": "stern2015"}
-    assert len(part.nodes()) == 0
 
 
 def test_component_equals_the_functions_for_any_array():

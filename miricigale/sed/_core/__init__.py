@@ -9,7 +9,7 @@ from miricigale.sed._core.attenuation import (
     smc_power_law,
 )
 from miricigale.sed._core.bands import band_means, band_tables
-from miricigale.sed._core.disk import DISK_BREAKS, DISK_SLOPES, DISKS, disk_nodes, disk_spectrum
+from miricigale.sed._core.disk import DISK_BREAKS, DISKS, disk_nodes, disk_spectrum
 from miricigale.sed._core.histories import (
     YOUNG,
     age_steps,

@@ -14,7 +14,7 @@ def band_tables(start, band_wave, throughput):
     """
     What `band_means` needs to know of passbands that are linear between their points.
 
-    ``start``, int, shape (n_band + 1,), tells where each band begins in ``band_wave`` and ``throughput``,
+    ``start``, int, shape (n_band + 1,), is where each band begins in ``band_wave`` and ``throughput``,
     which hold all bands one after the other.
 
     Returns

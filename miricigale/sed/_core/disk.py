@@ -13,7 +13,7 @@ DISKS = {
     "schartmann2005": ((0.008, 0.05, 0.125, 10.0, 1000.0), (1.0, -0.2, -1.5, -4.0)),
     "stalevski2016": ((0.001, 0.01, 0.1, 5.0, 1000.0), (0.2, -1.0, -1.5, -4.0)),
 }
-DISK_BREAKS, DISK_SLOPES = DISKS["skirtor"]
+DISK_BREAKS = DISKS["skirtor"][0]
 
 
 def disk_spectrum(wave, delta=0.0, disk="skirtor"):

@@ -214,10 +214,6 @@ class Skirtor2016(AGN):
         """Axes on which the library has not these values: see `LibraryTable.missing`."""
         return self.table.missing(**values)
 
-    def covers(self, **values):
-        """Whether the library has these values of its axes, as for `missing`: bool."""
-        return not self.missing(**values)
-
     def invalid(self, values):
         return _refusal(self.path, tuple([float(values[name]) for name in SKIRTOR_AXES]))
 

@@ -18,7 +18,7 @@ def milky_way(wave, r_v):
     """
     k(lambda) of the Milky Way: Cardelli et al. 1989, the optical part of O'Donnell 1994.
 
-    Given for 0.1-3.33 um (from dust_extinction); the cubic of the far ultraviolet goes on below
+    Given for 0.1-3.33 um (from dust_extinction); the cubic of the far ultraviolet continues below
     and the power law of the infrared has no end.
     """
     import astropy.units as u

@@ -34,7 +34,7 @@ class ParametricTorus(AGN):
     power, the dust emission stays what it is.
 
     The rest is **not fitted**: ``p`` moves the weight by dm/dlnr ~ r^(3 - p), so c falls by p - 1;
-    ``q`` thins the torus towards the poles, ``tau exp(-q |cos theta|)``; ``opening_angle`` moves the edge;
+    ``q`` thins the torus toward the poles, ``tau exp(-q |cos theta|)``; ``opening_angle`` moves the edge;
     ``radius_ratio`` is the outer end of the integral. Angles outside 20-60 deg are refused: the
     form, fitted at 40 deg, would send out more light face on than any surface can, or take
     less than nothing from the disk.
