@@ -97,9 +97,9 @@ class Report:
         return "\n".join(lines)
 
 
-def _some(values, most=12):
-    """The values of an axis, or their number and ends where there are many."""
-    if values.size <= most:
+def _some(values):
+    """The values of an axis, or their number and ends where there are more than twelve."""
+    if values.size <= 12:
         return f"{values.size}: {' '.join(f'{v:g}' for v in values)}"
     first, last = (" ".join(f"{v:g}" for v in part) for part in (values[:3], values[-2:]))
     return f"{values.size}: {first} ... {last}"
