@@ -97,7 +97,7 @@ def as_catalog_map(catalog_map, options=None):
 
 
 def told_of(lost, coded, what="taken as missing, by the number that stands there"):
-    """What is to be told of bands without a filter, and of numbers that stand for no value."""
+    """Yield warnings about bands without a filter, and numbers that stand for no value."""
     if lost:
         yield f"left out, no filter here: {', '.join(lost)}"
     parts = []
@@ -137,7 +137,7 @@ def codes_of(table, bands):
             values = plain_floats(table[name], name, "photometry")
             errors = plain_floats(table[error], error, "photometry")
         except ValueError:
-            # told by who reads them
+            # the reader of these columns raises the error
             continue
         missing, no_error = without_codes(values, errors)
         # zeros with zero errors are flagged object by object
@@ -183,7 +183,7 @@ class MappedRows:
         return tuple(self._theirs)
 
     def chunk(self, i):
-        """A piece; what is to be told of it is told by `told`."""
+        """A piece of the table; its warnings are those of `told`."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", MiricigaleWarning)
             return self.map.convert(self._rows.chunk(i), self._rows.path.name)[0]
@@ -193,7 +193,7 @@ class MappedRows:
         return self._rows.foreign_chunks(self._theirs.get(name, name))
 
     def told(self):
-        """What is to be told of the whole file; reads all of it."""
+        """Return the warnings about the whole file, all of which is read."""
         parts = {}
         for i in range(self._rows.n_chunks):
             table = self._rows.chunk(i)

@@ -55,7 +55,7 @@ class CatalogMap:
         the total; if it is in mag it is added to the magnitudes.
     limits : bool, optional
         Whether a negative error marks an upper limit, as in CIGALE: the flux is the limit and minus the error its
-        1 sigma, and a column ``<filter>_limit`` tells. Limits that are not positive are missing.
+        1 sigma, marked in a column ``<filter>_limit``. Limits that are not positive are missing.
 
     Raises
     ------
@@ -119,7 +119,7 @@ class CatalogMap:
         """What the map says, in plain values."""
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         if not self.limits:
-            # as before there were any: results of such maps can be gone on with
+            # as before limits were known, so that results of such maps can be resumed
             del values["limits"]
         values["columns"] = dict(self.columns)
         values["units"] = {name: str(unit) for name, unit in self.units.items()}

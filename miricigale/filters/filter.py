@@ -137,7 +137,7 @@ class Filter(Frozen):
         return tuple(FILTERS.names())
 
     @classmethod
-    def read(cls, path, *, name=None, unit=u.AA, response=None):
+    def read(cls, path, *, name=None, unit=u.AA):
         """
         Read a filter from a text file.
 
@@ -146,13 +146,11 @@ class Filter(Frozen):
         path : path-like
             Two columns, wavelength and throughput. Comment lines start with ``#``; those
             at the top may hold, as in CIGALE's files, the name, the word ``photon`` or
-            ``energy`` and a description.
+            ``energy`` (what the throughput counts, else photons) and a description.
         name : str, optional
             Name of the filter; else the one in the file, else that of the file.
         unit : `~astropy.units.Unit`, optional
             Unit of the wavelengths.
-        response : {"photon", "energy"}, optional
-            What the throughput counts; else what the file says, else photons.
 
         Returns
         -------
@@ -180,14 +178,11 @@ class Filter(Frozen):
             msg = f"filter file {path} has not two columns of numbers"
             raise DataError(msg) from None
         kinds = [text.lower() for text in comments[:3] if text.lower() in ("photon", "energy")]
-        response = response or (kinds[0] if kinds else "photon")
-        if response not in ("photon", "energy"):
-            raise argument_error("response", "'photon' or 'energy'", repr(response))
         if name is None:
             name = comments[0] if kinds and comments[0].lower() not in kinds else path.stem
         order = np.argsort(wave)
         wave, throughput = wave[order], throughput[order]
-        if response == "energy":
+        if kinds[:1] == ["energy"]:
             throughput = throughput / (wave / wave.mean())
         return cls(wave * u.Unit(unit), throughput, name=name, meta={"source": path.name})
 

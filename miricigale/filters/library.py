@@ -111,14 +111,14 @@ def _register():
     def add(name, curve, **metadata):
         registry.register(name, _load, curve=curve, **metadata)
 
-    for room, prefix, bands in (
+    for instrument, prefix, bands in (
         ("miri", "jwst_", _MIRI),
         ("nircam", "jwst_", _NIRCAM),
         ("acs", "acs_wfc_", _ACS),
         ("wfc3", "wfc3_ir_", _WFC3),
     ):
         for band in bands.split():
-            add(f"{room}.{band}", f"{prefix}{band}")
+            add(f"{instrument}.{band}", f"{prefix}{band}")
     for band, number in (("u", 9301), ("g", 9401), ("r", 9601), ("i", 9701), ("z", 9801)):
         add(f"megacam.{band}", f"cfht_megacam_{band}s_{number}")
     for band in ("j1", "j2", "j3", "h1", "h2", "k"):
@@ -141,5 +141,5 @@ def _register():
     return registry
 
 
-#: The registry of the library; `Filter.from_name` is its public door.
+#: The registry of the library; its public access is `Filter.from_name`.
 FILTERS = _register()

@@ -47,11 +47,15 @@ class Conf(ConfigNamespace):
 conf = Conf()
 
 
+def _folder(configured, default):
+    if configured:
+        return Path(configured).expanduser()
+    return Path(_config.get_cache_dir()) / default
+
+
 def data_folder():
     """The user's folder for reference data: ``conf.data_folder``, or one in astropy's cache folder."""
-    if conf.data_folder:
-        return Path(conf.data_folder).expanduser()
-    return Path(_config.get_cache_dir()) / "miricigale"
+    return _folder(conf.data_folder, "miricigale")
 
 
 def cache_folder():
@@ -64,9 +68,7 @@ def cache_folder():
         ``conf.cache_folder``, or ``miricigale/cache`` in astropy's cache folder; it need not
         exist, and may be deleted at any time.
     """
-    if conf.cache_folder:
-        return Path(conf.cache_folder).expanduser()
-    return Path(_config.get_cache_dir()) / "miricigale" / "cache"
+    return _folder(conf.cache_folder, "miricigale/cache")
 
 
 _kept_sha256 = cached_by_file(256)(file_sha256)
@@ -241,7 +243,7 @@ def fingerprint_of(path, *, trust=True):
     try:
         record = stored_record(path) or {}
     except DataError:
-        # 'miricigale data check' tells; the file itself is what counts
+        # reported by 'miricigale data check'; the file itself is what counts
         record = {}
     if (record.get("size"), record.get("mtime_ns")) == (status.st_size, status.st_mtime_ns):
         return record["sha256"]

@@ -26,7 +26,7 @@ def _locked(target):
 
     What an interrupted process left half written is removed. The lock is advisory
     (``flock``); where the system has none two processes that add the same resource at the
-    same moment may leave a record that does not fit the file, which `check_resources` tells.
+    same moment may leave a record that does not fit the file, which `check_resources` reports.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
     with open(target.with_name(f".{target.name}.lock"), "ab") as handle:

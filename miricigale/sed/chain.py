@@ -47,7 +47,15 @@ COLORS = {"nuv_r": ("nuv", "r"), "u_v": ("u", "v"), "v_j": ("v", "j")}
 STELLAR = ("sfh", "stellar", "nebular")
 GALAXY = (STELLAR, ("attenuation",), ("dust",))
 SKY = ("igm", "foreground")
-KEPT = 128  # stars of so many histories are kept
+MAX_HISTORIES = 128  # stars of so many histories are kept
+#: Methods of `Chain` that keep what they made last, and how many results.
+MAX_KEPT = {
+    "_populations": 8,
+    "factors": 256,
+    "dust": 256,
+    "agn_templates": 256,
+    "sky_transmission": 64,
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,23 +111,6 @@ def distinct(items):
     return list(seen), np.array(index, dtype=np.int64)
 
 
-def _kept(maxsize):
-    """Decorator: a method keeps what it made last, by its arguments, as long as its object lives."""
-
-    def decorate(method):
-        @functools.wraps(method)
-        def call(self, *key):
-            made = self._made.get(method)
-            if made is None:
-                made = functools.lru_cache(maxsize=maxsize)(functools.partial(method, self))
-                self._made[method] = made
-            return made(*key)
-
-        return call
-
-    return decorate
-
-
 class Chain:
     """
     Components in order, on the union of their nodes.
@@ -169,7 +160,10 @@ class Chain:
         self._names = {
             role: tuple(part.parameters) if part else () for role, part in self.by_role.items()
         }
-        self._made, self._stars = {}, {}
+        self._stars = {}
+        # what was made last is kept, by its arguments, as long as the chain lives
+        for name, maxsize in MAX_KEPT.items():
+            setattr(self, name, functools.lru_cache(maxsize)(getattr(self, name)))
 
     def _functionals(self):
         wave, n = self.wave, self.wave.size
@@ -201,7 +195,6 @@ class Chain:
 
     # ------------------------------------------------------------------ stars
 
-    @_kept(8)
     def _populations(self, metallicity):
         """Ages, spectra on our grid, surviving mass and ionizing photons of one metallicity."""
         stellar = self.by_role["stellar"]
@@ -225,7 +218,7 @@ class Chain:
             made = self._make_stars(metallicity, [values[i] for i in rows])
             known.update(zip([new[i] for i in rows], made, strict=True))
         # histories that follow on one another share what was made last
-        self._stars = dict(list((self._stars | known).items())[-KEPT:])
+        self._stars = dict(list((self._stars | known).items())[-MAX_HISTORIES:])
         return [known[key] for key in keys]
 
     def _make_stars(self, metallicity, values):
@@ -273,7 +266,6 @@ class Chain:
 
     # ------------------------------------------------------- attenuation and dust
 
-    @_kept(256)
     def factors(self, key):
         """Transmissions for young stars, old stars and gas; None for gas that is as the stars."""
         attenuation, values = self.by_role["attenuation"], self._dict(key, "attenuation")
@@ -324,7 +316,6 @@ class Chain:
         )  # fmt: skip
         return out, absorbed
 
-    @_kept(256)
     def dust(self, key):
         """Dust spectrum in W/um for one watt, by the key of ``dust``; zeros without the component."""
         if self.by_role["dust"] is None:
@@ -358,7 +349,6 @@ class Chain:
             changed[name] = agn.parameters[name].default
         return self.key(changed, "agn")
 
-    @_kept(256)
     def agn_templates(self, key):
         """`~miricigale.sed.components.AGNTemplates` by a key of `agn_key`."""
         return self.by_role["agn"].templates(self.wave, self._dict(key, "agn"))
@@ -367,7 +357,6 @@ class Chain:
         """`~miricigale.sed.components.AGNTemplates` for a dict of values, whatever its fraction."""
         return self.agn_templates(self.agn_key(values))
 
-    @_kept(64)
     def sky_transmission(self, redshift, key):
         """Transmission between the source and us, by the key of ``igm`` and ``foreground``."""
         observed, values = self.wave * (1.0 + redshift), self._dict(key, *SKY)

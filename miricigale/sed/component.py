@@ -13,17 +13,7 @@ from miricigale.utils.exceptions import ConfigError, argument_error
 __all__ = ["COMPONENTS", "ROLES", "Component", "read_config", "register"]
 
 #: What a component does, in the order in which light meets it.
-ROLES = (
-    "sfh",
-    "stellar",
-    "nebular",
-    "attenuation",
-    "dust",
-    "agn",
-    "xray",
-    "igm",
-    "foreground",
-)
+ROLES = ("sfh", "stellar", "nebular", "attenuation", "dust", "agn", "xray", "igm", "foreground")
 
 #: Components by name, for configurations.
 COMPONENTS = Registry("component")
@@ -124,18 +114,14 @@ class Component:
     @classmethod
     def declared(cls):
         """Parameters as declared in the class bodies, base classes first."""
-        out = {}
-        for base in reversed(cls.__mro__):
-            out.update({k: v for k, v in vars(base).items() if isinstance(v, Parameter)})
-        return out
+        bodies = [vars(base).items() for base in reversed(cls.__mro__)]
+        return {k: v for body in bodies for k, v in body if isinstance(v, Parameter)}
 
     @classmethod
     def all_options(cls):
         """Options as declared in the class bodies: dict of name to the values allowed."""
-        out = {}
-        for base in reversed(cls.__mro__):
-            out.update(vars(base).get("options", {}))
-        return out
+        bodies = [vars(base).get("options", {}) for base in reversed(cls.__mro__)]
+        return {name: values for body in bodies for name, values in body.items()}
 
     @property
     def settings(self):

@@ -183,10 +183,8 @@ class GalacticExtinction(Foreground):
     )
     packages = ("dust_extinction",)
     options = {"law": tuple(LAWS), "beyond": BEYOND}
-    ebv_galactic = Parameter(
-        default=0.0, bounds=(0.0, 5.0), unit="mag", doc="Color excess of the Milky Way's dust."
-    )
-    r_v = Parameter(default=3.1, bounds=_R_V, doc="A(V) / E(B-V) of the Milky Way's dust.")
+    ebv_galactic = Parameter(0.0, (0.0, 5.0), "Color excess of the Milky Way's dust.", unit="mag")
+    r_v = Parameter(3.1, _R_V, "A(V) / E(B-V) of the Milky Way's dust.")
 
     def __init__(self, **defaults):
         super().__init__(**defaults)

@@ -30,14 +30,15 @@ _TABLES = (
 )
 #: Those that may have no columns.
 _MAY_LACK = ("galaxy_properties", "galaxy_shape")
+#: Unit, type and axes of the arrays: redshift z, galaxy g, AGN a, fraction f, band b.
 _ARRAYS = {
-    "redshift": (u.one, float),
-    "galaxy": (u.uJy / u.Msun, float),
-    "agn": (u.uJy / u.W, float),
-    "dust_luminosity": (u.W / u.Msun, float),
-    "frac_agn": (u.one, float),
-    "allowed": (u.one, bool),
-    "agn_multiplicity": (u.one, np.int64),
+    "redshift": (u.one, float, "z"),
+    "galaxy": (u.uJy / u.Msun, float, "zgb"),
+    "agn": (u.uJy / u.W, float, "zab"),
+    "dust_luminosity": (u.W / u.Msun, float, "g"),
+    "frac_agn": (u.one, float, "f"),
+    "allowed": (u.one, bool, "zg"),
+    "agn_multiplicity": (u.one, np.int64, "a"),
 }
 #: What a model and the grids that it made have in common.
 RECIPE = ("components", "options", "imf", "frac_agn_definition", "cosmology")
@@ -48,8 +49,8 @@ def fraction_span(definition):
     """
     Range of wavelengths in um of whose light an AGN fraction is a share; None for ``"dust"``.
 
-    ``definition`` is ``"dust"`` or a range such as ``"3-1000um"`` or ``"5-20um"`` in 0.1-1000 um; a ValueError
-    tells anything else.
+    ``definition`` is ``"dust"`` or a range such as ``"3-1000um"`` or ``"5-20um"`` in 0.1-1000 um; anything else
+    is a ValueError.
     """
     match = _SPAN.fullmatch(definition) if isinstance(definition, str) else None
     low, high = map(float, match.groups()) if match else (0.0, 0.0)
@@ -155,7 +156,7 @@ class ModelGrid(Frozen):
         object.__setattr__(self, "bounds", bounds)
         if self.galaxy_shape is None:
             object.__setattr__(self, "galaxy_shape", QTable())
-        for name, (_, dtype) in _ARRAYS.items():
+        for name, (_, dtype, _) in _ARRAYS.items():
             object.__setattr__(self, name, frozen_array(getattr(self, name), dtype))
         n_z, n_b = self.redshift.size, len(self.filters)
         n_g, n_a = self.dust_luminosity.size, self.agn_multiplicity.size
@@ -164,16 +165,9 @@ class ModelGrid(Frozen):
         if len(inert) != n_a:
             raise argument_error("inert", f"names for each of {n_a} AGN models", len(inert))
         fraction_span(self.frac_agn_definition)
-        shapes = {
-            "redshift": (n_z,),
-            "galaxy": (n_z, n_g, n_b),
-            "agn": (n_z, n_a, n_b),
-            "dust_luminosity": (n_g,),
-            "frac_agn": (self.frac_agn.size,),
-            "allowed": (n_z, n_g),
-            "agn_multiplicity": (n_a,),
-        }
-        for name, shape in shapes.items():
+        sizes = {"z": n_z, "g": n_g, "a": n_a, "f": self.frac_agn.size, "b": n_b}
+        for name, (_, _, letters) in _ARRAYS.items():
+            shape = tuple(sizes[letter] for letter in letters)
             if getattr(self, name).shape != shape:
                 raise argument_error(name, f"of shape {shape}", f"{getattr(self, name).shape}")
         for name in _TABLES:
@@ -292,7 +286,7 @@ def _write(grid, path, *, overwrite=False):
         for name, table in tables.items()
     }
     arrays = {}
-    for name, (unit, _) in _ARRAYS.items():
+    for name, (unit, *_) in _ARRAYS.items():
         array = getattr(grid, name)
         arrays[name] = array if unit == u.one else u.Quantity(array, unit, copy=False)
     write_parts(path, _LAYOUTS[0], text=text, arrays=arrays, tables=tables, overwrite=overwrite)

@@ -13,6 +13,7 @@ from miricigale.sed.grid import ModelGrid
 from miricigale.sed.spectrum import distance
 from miricigale.sed.tables import BLOCK, dilution, seen_agn
 from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.tables import described_table
 
 __all__ = ["check_axes", "model_grid"]
 
@@ -70,12 +71,10 @@ def _distinct_agn(component, rows):
 
 
 def _parameter_table(parameters, rows):
-    out = QTable()
-    for name, parameter in parameters.items():
-        column = np.array([row[name] for row in rows], dtype=float)
-        out[name] = u.Quantity(column, parameter.unit)
-        out[name].info.description = parameter.doc
-    return out
+    columns = {name: np.array([row[name] for row in rows], dtype=float) for name in parameters}
+    return described_table(
+        {n: (u.Quantity(columns[n], p.unit), p.doc) for n, p in parameters.items()}
+    )
 
 
 class _Galaxies:
@@ -110,20 +109,18 @@ class _Galaxies:
 
 def _galaxy_tables(quantities):
     """What scales with mass, and what does not."""
-    scaling, shape = QTable(), QTable()
+    scaling, shape = {}, {}
     for name, values in quantities.items():
         if name in ("stellar_mass_formed", "reference"):
             continue
         entry = DERIVED[name]
         if entry.extensive:
-            scaling[name] = values * (entry.unit / u.Msun)
-            scaling[name].info.description = f"{entry.text}, for one solar mass formed"
+            text = "3-1000 um light of stars and dust, without AGN"
+            text = text if name == "ir_luminosity" else entry.text
+            scaling[name] = values * (entry.unit / u.Msun), f"{text}, for one solar mass formed"
         else:
-            shape[name] = values * entry.unit
-            shape[name].info.description = entry.text
-    text = "3-1000 um light of stars and dust, without AGN, for one solar mass formed"
-    scaling["ir_luminosity"].info.description = text
-    return scaling, shape
+            shape[name] = values * entry.unit, entry.text
+    return described_table(scaling), described_table(shape)
 
 
 def _agn_table(model, parts):
@@ -139,12 +136,14 @@ def _agn_table(model, parts):
         "l_6um": seen["six"],
         "ir_luminosity": seen["infrared"],
     }
-    out = QTable()
-    for name, column in values.items():
-        out[name] = column * scale * u.dimensionless_unscaled
-        out[name].info.description = f"{DERIVED[name].text}, W for each W of AGN power"
-    out["ir_luminosity"].info.description = "3-1000 um light of the AGN, W for each W of AGN power"
-    return scale, out
+    texts = {name: DERIVED[name].text for name in values}
+    texts["ir_luminosity"] = "3-1000 um light of the AGN"
+    return scale, described_table(
+        {
+            name: (column * scale * u.one, f"{texts[name]}, W for each W of AGN power")
+            for name, column in values.items()
+        }
+    )
 
 
 def model_grid(model, axes, filters):

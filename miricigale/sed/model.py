@@ -21,14 +21,12 @@ from miricigale.utils.units import WAVE
 __all__ = ["SEDModel"]
 
 _MODEL_PARAMETERS = {
-    "redshift": Parameter(default=1.0, bounds=(0.0, 20.0), doc="Redshift."),
-    "mass": Parameter(
-        default=1e10, bounds=(0.0, 1e16), unit="Msun", doc="Mass of all stars ever formed."
-    ),
+    "redshift": Parameter(1.0, (0.0, 20.0), "Redshift."),
+    "mass": Parameter(1e10, (0.0, 1e16), "Mass of all stars ever formed.", unit="Msun"),
     "dust_excess": Parameter(
-        default=1.0,
-        bounds=(0.0, 1e6),
-        doc="Dust luminosity over the power that attenuation takes; 1 is energy balance.",
+        1.0,
+        (0.0, 1e6),
+        "Dust luminosity over the power that attenuation takes; 1 is energy balance.",
     ),
 }
 for _name, _parameter in _MODEL_PARAMETERS.items():

@@ -22,12 +22,12 @@ class Parameter:
     ----------
     default : float
         In ``unit``.
-    unit : `~astropy.units.Unit` or str, optional
-        Unit; dimensionless if not given.
     bounds : tuple of float
         Smallest and largest value allowed, in ``unit``, both included.
     doc : str
         One sentence that says what it is.
+    unit : `~astropy.units.Unit` or str, optional
+        Unit; dimensionless if not given.
 
     Raises
     ------
@@ -35,7 +35,7 @@ class Parameter:
         If the default is outside the bounds.
     """
 
-    def __init__(self, *, default, bounds, doc, unit=""):
+    def __init__(self, default, bounds, doc, *, unit=""):
         self.unit = u.Unit(unit)
         self.default = float(default)
         self.bounds = (float(bounds[0]), float(bounds[1]))
@@ -57,13 +57,9 @@ class Parameter:
 
     def replace(self, default, name=None):
         """Copy with another default, and another name if one is given."""
-        new = Parameter(default=default, bounds=self.bounds, doc=self.doc, unit=self.unit)
+        new = Parameter(default, self.bounds, self.doc, unit=self.unit)
         new.name = name or self.name
         return new
-
-    def contains(self, value):
-        """Whether a value in the unit is finite and inside the bounds."""
-        return math.isfinite(value) and self.bounds[0] <= value <= self.bounds[1]
 
     def check(self, value):
         """
@@ -87,8 +83,8 @@ class Parameter:
         if number is np.ma.masked or np.asarray(number).dtype.kind not in "iuf":
             raise argument_error(self.name, "one number", repr(value))
         number = float(number)
-        if not self.contains(number):
-            low, high = self.bounds
+        low, high = self.bounds
+        if not (math.isfinite(number) and low <= number <= high):
             raise argument_error(self.name, f"from {low} to {high} {self.unit}".rstrip(), number)
         return number
 

@@ -1,5 +1,9 @@
 """Chains and axes after published studies, with what stands in where libraries are missing."""
 
+import functools
+import tomllib
+from importlib import resources as importlib_resources
+
 import numpy as np
 
 from miricigale.refdata import find_resource
@@ -130,32 +134,7 @@ def yang2021_axes(kind="fit"):
     """
     if kind not in ("fit", "galaxy", "quick"):
         raise argument_error("kind", "'fit', 'galaxy' or 'quick'", repr(kind))
-    if kind == "quick":
-        return {
-            "tau": np.array([0.1, 1.0, 5.0]),
-            "age": np.array([0.5, 1.0, 3.0, 5.0]),
-            "ebv": np.array([0.1, 0.3, 0.5, 0.9]),
-            "alpha": np.array([1.5, 2.5]),
-            "tau97": np.array([3.0, 7.0, 11.0]),
-            "ebv_polar": np.array([0.0, 0.2]),
-            "temperature_polar": np.array([100.0, 300.0]),
-            "frac_agn": np.array([0.0, 0.2, 0.4, 0.6, 0.8, 0.99]),
-            "redshift": _redshifts(0.06),
-        }
-    axes = {
-        "tau": np.array([0.1, 0.5, 1.0, 5.0]),
-        "age": np.array([0.5, 1.0, 3.0, 5.0, 7.0]),
-        "ebv": np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.7, 0.9]),
-        "alpha": np.array([1.0, 1.5, 2.0, 2.5]),
-    }
-    if kind == "fit":
-        axes |= {
-            "tau97": np.array([3.0, 5.0, 7.0, 9.0, 11.0]),
-            "ebv_polar": np.array([0.0, 0.1, 0.2, 0.3]),
-            "temperature_polar": np.array([100.0, 200.0, 300.0]),
-            "frac_agn": np.append(np.round(np.arange(10) * 0.1, 10), 0.99),
-        }
-    return axes | {"redshift": _redshifts(0.03)}
+    return _values(f"yang2021_{kind}")
 
 
 def survey_axes():
@@ -172,20 +151,7 @@ def survey_axes():
     axes : dict of str to `~numpy.ndarray`
         In the units of the parameters (Gyr, mag, K); to be changed at will.
     """
-    return {
-        "tau": np.array([0.1, 0.5, 3.0]),
-        "age": np.array([0.05, 0.12, 0.3, 0.7, 1.5, 3.0, 6.0]),
-        "f_burst": np.array([0.0, 0.03, 0.3]),
-        "metallicity": np.array([0.004, 0.02]),
-        "slope": np.array([-0.4, 0.0]),
-        "ebv": np.array([0.0, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.4]),
-        "q_pah": np.array([0.47, 4.58]),
-        "tau97": np.array([3.0, 7.0, 11.0]),
-        "ebv_polar": np.array([0.0, 0.2]),
-        "temperature_polar": np.array([200.0]),
-        "frac_agn": np.array([0.0, 0.1, 0.2, 0.4, 0.6, 0.8, 0.95]),
-        "redshift": _redshifts(0.02, 0.01, 7.0),
-    }
+    return _values("survey_axes")
 
 
 def survey_priors():
@@ -203,16 +169,7 @@ def survey_priors():
     priors : dict of str to `~numpy.ndarray`
         Weights of the values of each axis.
     """
-    return {
-        "tau": np.array([0.2595, 0.4233, 0.3172]),
-        "age": np.array([0.0372, 0.0322, 0.2058, 0.2, 0.3446, 0.1591, 0.0211]),
-        "f_burst": np.array([0.7721, 0.2036, 0.0243]),
-        "metallicity": np.array([0.3722, 0.6278]),
-        "slope": np.array([0.4545, 0.5455]),
-        "ebv": np.array([0.109, 0.2712, 0.3281, 0.1, 0.0416, 0.0636, 0.0381, 0.0485]),
-        "q_pah": np.array([0.8905, 0.1095]),
-        "frac_agn": np.array([0.8018, 0.1079, 0.0565, 0.0226, 0.0081, 0.0028, 0.0003]),
-    }
+    return _values("survey_priors")
 
 
 def quasar_axes():
@@ -228,20 +185,23 @@ def quasar_axes():
     axes : dict of str to `~numpy.ndarray`
         In the units of the parameters (Gyr, mag, deg, K); to be changed at will.
     """
-    return {
-        "tau": np.array([0.5]),
-        "age": np.array([0.3, 2.0]),
-        "ebv": np.array([0.2]),
-        "inclination": np.array([30.0]),
-        "disk_slope": np.array([-0.3, 0.0, 0.3]),
-        "tau97": np.array([3.0, 7.0, 11.0]),
-        "ebv_polar": np.array([0.0, 0.05, 0.1, 0.2, 0.4]),
-        "temperature_polar": np.array([200.0]),
-        "frac_agn": np.array([0.7, 0.85, 0.93, 0.97, 0.99, 0.997]),
-        "redshift": survey_axes()["redshift"],
-    }
+    return _values("quasar_axes")
 
 
-def _redshifts(step, first=0.01, last=6.0):
+@functools.cache
+def _tables():
+    text = (importlib_resources.files("miricigale.sed") / "presets.toml").read_text("utf-8")
+    return tomllib.loads(text)
+
+
+def _values(name):
+    """New arrays of a table of ``presets.toml``; redshifts are even in ln(1 + z)."""
+    table = dict(_tables()[name])
+    step = table.pop("redshift", None)
+    out = {axis: np.array(values) for axis, values in table.items()}
+    return out if step is None else out | {"redshift": _redshifts(**step)}
+
+
+def _redshifts(step, first, last):
     n = int(np.floor(np.log((1.0 + last) / (1.0 + first)) / step)) + 1
     return (1.0 + first) * np.exp(step * np.arange(n)) - 1.0

@@ -20,7 +20,7 @@ from miricigale.sed.derived import (
 )
 from miricigale.sed.spectrum import SED, ModelSpectra, distance
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
-from miricigale.utils.tables import Flags
+from miricigale.utils.tables import Flags, described_table
 from miricigale.utils.units import FNU, WAVE
 
 __all__ = ["ModelFlags", "dilution", "flux_table", "seen_agn", "spectra"]
@@ -272,16 +272,8 @@ def flux_table(model, table, filters):
         if model.has_agn:
             without = (values["frac_agn"][rows] > 0) & (got["agn_power"] == 0)
             flags[rows[without]] |= int(ModelFlags.NO_AGN_POWER)
-    out = QTable()
-    if "id" in table.colnames:
-        out["id"] = table["id"]
+    out = {"id": (table["id"], table["id"].info.description)} if "id" in table.colnames else {}
     for name, column in zip(filters.names, flux.T, strict=True):
-        out[name] = column * FNU
-        out[name].info.description = f"model flux density in {name}"
-    for name, column in names.items():
-        out[name] = derived[name] * column.unit
-        out[name].info.description = column.text
-    out["flags"] = flags
-    out["flags"].info.description = ModelFlags.describe()
-    out.meta.update(model.meta)
-    return out
+        out[name] = column * FNU, f"model flux density in {name}"
+    out |= {n: (derived[n] * entry.unit, entry.text) for n, entry in names.items()}
+    return described_table(out | {"flags": (flags, ModelFlags.describe())}, model.meta)

@@ -118,7 +118,7 @@ def template_grid(spectra, filters, *, beyond="error"):
         The bands.
     beyond : {"error", "rayleigh-jeans"}, optional
         What is done with spectra that end before the bands do: they are refused, or continued with
-        F_nu ~ wave^-2 to 100 um, and a warning tells. That holds within some percent for stars of 3500 K and
+        F_nu ~ wave^-2 to 100 um, with a warning. That holds within some percent for stars of 3500 K and
         above; for brown dwarfs and stars in dust it does not.
 
     Returns

@@ -213,7 +213,7 @@ def xray_flux(
 
 
 def check_band(band, name):
-    """Ends of a band in keV; a ValueError tells what is not two ascending positive energies."""
+    """Ends of a band in keV; a ValueError unless these are two ascending positive energies."""
     ends = to_array(band, u.keV, name, ndim=1, finite=True)
     if ends.shape != (2,) or not 0 < ends[0] < ends[1]:
         raise argument_error(name, "two ascending positive energies", band)
@@ -248,18 +248,10 @@ class XRay(Component):
         "xray_flux": (u.W / u.m**2, "X-ray flux of the AGN in the observed band"),
     }
 
-    photon_index = Parameter(
-        default=1.8, bounds=(0.0, 4.0), doc="Gamma of the power law, N(E) ~ E^-Gamma."
-    )
-    xray_low = Parameter(
-        default=0.5, bounds=(0.01, 100.0), unit="keV", doc="Lowest observed energy."
-    )
-    xray_high = Parameter(
-        default=7.0, bounds=(0.01, 1000.0), unit="keV", doc="Highest observed energy."
-    )
-    xray_transmission = Parameter(
-        default=1.0, bounds=(0.0, 1.0), doc="Share of the flux that absorption leaves."
-    )
+    photon_index = Parameter(1.8, (0.0, 4.0), "Gamma of the power law, N(E) ~ E^-Gamma.")
+    xray_low = Parameter(0.5, (0.01, 100.0), "Lowest observed energy.", unit="keV")
+    xray_high = Parameter(7.0, (0.01, 1000.0), "Highest observed energy.", unit="keV")
+    xray_transmission = Parameter(1.0, (0.0, 1.0), "Share of the flux that absorption leaves.")
 
     def invalid(self, values):
         """Say so if the band is empty."""

@@ -188,14 +188,15 @@ def _agn_rows(grid, slopes, disk, hard):
     """What a grid says of its AGN, each of them repeated for every slope."""
     rows = np.repeat(np.arange(grid.n_agn), slopes.size)
     parameters, properties = grid.agn_parameters[rows], grid.agn_properties[rows]
-    parameters["alpha_ox"] = np.tile(slopes, grid.n_agn) * u.one
-    parameters["alpha_ox"].info.description = "slope from 2500 A to 2 keV"
-    properties["l_2500"] = disk[rows] / u.Hz
-    text = "L_nu of the disk at 2500 A, without dust at 30 deg, W/Hz for each W of AGN power"
-    properties["l_2500"].info.description = text
-    properties["l_2_10kev"] = hard * u.one
-    text = "2-10 keV luminosity of the AGN, unabsorbed, W for each W of AGN power"
-    properties["l_2_10kev"].info.description = text
+    of_disk = "L_nu of the disk at 2500 A, without dust at 30 deg, W/Hz for each W of AGN power"
+    of_corona = "2-10 keV luminosity of the AGN, unabsorbed, W for each W of AGN power"
+    for table, name, values, text in (
+        (parameters, "alpha_ox", np.tile(slopes, grid.n_agn) * u.one, "slope from 2500 A to 2 keV"),
+        (properties, "l_2500", disk[rows] / u.Hz, of_disk),
+        (properties, "l_2_10kev", hard * u.one, of_corona),
+    ):
+        table[name] = values
+        table[name].info.description = text
     return {
         "agn_parameters": parameters,
         "agn_properties": properties,

@@ -6,6 +6,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable, Table
+from numpy.testing import assert_allclose, assert_array_equal
 
 from miricigale.filters import SURVEYS, CatalogMap, read_catalog_photometry
 from miricigale.filters.catalog_files import MappedRows
@@ -40,11 +41,11 @@ def test_magnitudes_of_any_format_are_fluxes(tmp_path, suffix):
     columns = {"id": "name", BAND: "H", f"{BAND}_err": "dH"}
     out = read_catalog_photometry(path, columns=columns, units={"flux": "ABmag"})
     assert out["id"].tolist() == ["a1", "b2", "c3"]
-    np.testing.assert_allclose(out[BAND].to_value(u.uJy), [1, 10, 0.1])
-    np.testing.assert_allclose(out[BAND].to(u.ABmag).value, magnitude)
+    assert_allclose(out[BAND].to_value(u.uJy), [1, 10, 0.1])
+    assert_allclose(out[BAND].to(u.ABmag).value, magnitude)
     # d ln f = ln(10) / 2.5 dm
     relative = np.log(10) / 2.5 * np.array([0.01, 0.02, 0.3])
-    np.testing.assert_allclose((out[f"{BAND}_err"] / out[BAND]).value, relative)
+    assert_allclose((out[f"{BAND}_err"] / out[BAND]).value, relative)
 
 
 def test_units_differ_by_column():
@@ -135,11 +136,11 @@ def test_factors():
     columns = {"id": [1, 2], BAND: [1.0, 2.0], f"{BAND}_err": [0.1, 0.1], "total": [2.0, 3.0]}
     out, _ = convert(columns, units={"flux": "uJy"}, factor="total")
     assert out[BAND].value.tolist() == [2, 6]
-    np.testing.assert_allclose(out[f"{BAND}_err"].value, [0.2, 0.3])
+    assert_allclose(out[f"{BAND}_err"].value, [0.2, 0.3])
     table = Table(columns)
     table["total"] = [-2.5, 0.0] * u.mag
     out, _ = CatalogMap(units={"flux": "uJy"}, factor="total").convert(table)
-    np.testing.assert_allclose(out[BAND].value, [10, 2])
+    assert_allclose(out[BAND].value, [10, 2])
     with pytest.raises(KeyError, match="no column of catalog 'totl'"):
         convert(columns, units={"flux": "uJy"}, factor="totl")
 
@@ -238,7 +239,7 @@ def test_a_map_in_a_file(tmp_path):
     assert mine.columns == {BAND: "H"}
     assert mine.settings()["missing"] == (-1.0,)
     out, _ = mine.convert(Table({"id": [1, 2], "H": [23.9, -1.0]}))
-    np.testing.assert_allclose(out[BAND].value, [1, np.nan])
+    assert_allclose(out[BAND].value, [1, np.nan])
     path.write_text("column = 1\n")
     with pytest.raises(DataError, match=r"it has \['column'\]; known: \['columns', 'units'"):
         CatalogMap.read(path)
@@ -253,10 +254,8 @@ def test_negative_errors_are_upper_limits_where_the_map_says_so(tmp_path):
     path = write(table, tmp_path / "c.csv")
     with pytest.warns(MiricigaleWarning, match=rf"{BAND} 3 of 6 \(-99.99, -99.9, -1\)"):
         out = read_catalog_photometry(path, limits=True, units={"flux": "mJy"})
-    np.testing.assert_allclose(out[BAND].value, [5e3, 2e3, np.nan, 3e3, np.nan, 4e3])
-    np.testing.assert_allclose(
-        out[f"{BAND}_err"].value, [500, 200, np.nan, 0, np.nan, np.nan], rtol=1e-12
-    )
+    assert_allclose(out[BAND].value, [5e3, 2e3, np.nan, 3e3, np.nan, 4e3])
+    assert_allclose(out[f"{BAND}_err"].value, [500, 200, np.nan, 0, np.nan, np.nan], rtol=1e-12)
     assert out[f"{BAND}_limit"].tolist() == [False, True, False, False, False, False]
     plain, _ = CatalogMap(units={"flux": "mJy"}).convert(table)
     assert f"{BAND}_limit" not in plain.colnames
@@ -264,7 +263,7 @@ def test_negative_errors_are_upper_limits_where_the_map_says_so(tmp_path):
     # a factor to the total is one of the limit too
     table["ap"] = np.full(6, 1.5)
     out, _ = CatalogMap(units={"flux": "mJy"}, limits=True, factor="ap").convert(table)
-    np.testing.assert_allclose([out[BAND][1].value, out[f"{BAND}_err"][1].value], [3e3, 300])
+    assert_allclose([out[BAND][1].value, out[f"{BAND}_err"][1].value], [3e3, 300])
     with pytest.raises(ValueError, match=r"must be fluxes in .* where negative errors mark limits"):
         CatalogMap(units={"flux": "ABmag"}, limits=True).convert(table)
     table[f"{BAND}_limit"] = np.zeros(6, bool)
@@ -287,7 +286,7 @@ def test_pieces_are_the_whole(tmp_path, suffix):
     parts = [rows.chunk(i) for i in range(rows.n_chunks)]
     assert [len(part) for part in parts] == [3, 3, 1]
     for name in ("id", BAND):
-        np.testing.assert_array_equal(
+        assert_array_equal(
             np.concatenate([np.asarray(p[name]) for p in parts]), np.asarray(whole[name])
         )
 
@@ -302,8 +301,8 @@ def test_the_real_part_of_ceers(data_file):
     flux = np.asarray(theirs["jwst.miri.F770W"])
     # -99.99, and in one row -99.9
     there = flux > -99
-    np.testing.assert_array_equal(np.isfinite(mine["miri.f770w"].value), there)
-    np.testing.assert_allclose(mine["miri.f770w"].to_value(u.mJy)[there], flux[there])
+    assert_array_equal(np.isfinite(mine["miri.f770w"].value), there)
+    assert_allclose(mine["miri.f770w"].to_value(u.mJy)[there], flux[there])
     snr = mine["miri.f770w"] / mine["miri.f770w_err"]
     # of its README: 1053 of the whole table, of which this is a part
     assert np.count_nonzero(snr > 5) <= 1053

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from miricigale.profiles import ellipse_through, ellipse_to_pixels
 
@@ -29,7 +30,7 @@ def test_points_of_the_ellipse_stay_on_it():
     radius, ratio, theta = ellipse_through(jacobian, radius=2.0, axis_ratio=0.3, direction=0.7)
     along = moved[0] * np.cos(theta) + moved[1] * np.sin(theta)
     across = -moved[0] * np.sin(theta) + moved[1] * np.cos(theta)
-    np.testing.assert_allclose(np.hypot(along, across / ratio), radius, rtol=1e-12)
+    assert_allclose(np.hypot(along, across / ratio), radius, rtol=1e-12)
 
 
 def test_position_angle_on_a_north_up_image():

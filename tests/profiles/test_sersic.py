@@ -3,6 +3,7 @@ import itertools
 import numpy as np
 import pytest
 from astropy.modeling.models import Sersic2D
+from numpy.testing import assert_allclose
 from scipy.special import gamma
 
 from helpers.light import pixel_gaussian
@@ -20,14 +21,12 @@ INDICES = (0.3, 0.5, 1.0, 2.5, 4.0, 8.0)
 def test_bn_is_what_ciotti_and_bertin_give():
     n = np.array([1.0, 2.0, 4.0, 8.0])
     series = 2 * n - 1 / 3 + 4 / (405 * n) + 46 / (25515 * n**2) + 131 / (1148175 * n**3)
-    np.testing.assert_allclose(sersic_bn(n), series, rtol=1e-4)
+    assert_allclose(sersic_bn(n), series, rtol=1e-4)
 
 
 def test_light_beyond_ten_radii():
     # 3.9 % at n = 4 and 11.5 % at n = 8
-    np.testing.assert_allclose(
-        1 - sersic_enclosed_fraction(10.0, [4, 8]), [0.039, 0.115], atol=5e-4
-    )
+    assert_allclose(1 - sersic_enclosed_fraction(10.0, [4, 8]), [0.039, 0.115], atol=5e-4)
 
 
 @pytest.mark.parametrize("n", INDICES)
@@ -43,7 +42,7 @@ def test_index_one_half_is_a_gaussian(r_eff, ratio):
     x, y = 30.37, 29.81
     image = sersic_image((60, 60), x=x, y=y, r_eff=r_eff, n=0.5, axis_ratio=ratio)
     truth = np.outer(pixel_gaussian(60, y, ratio * sigma), pixel_gaussian(60, x, sigma))
-    np.testing.assert_allclose(image, truth, atol=3e-4 * truth.max())
+    assert_allclose(image, truth, atol=3e-4 * truth.max())
     assert image.sum() == pytest.approx(1.0, abs=1e-4)
 
 
@@ -62,7 +61,7 @@ def test_total_light_and_division_of_pixels(n, r_eff, ratio):
     # pixels are sums of smaller pixels, the central one included
     fine = sersic_image((35, 35), x=5 * (x - 97) + 2, y=5 * (y - 97) + 2, r_eff=5 * r_eff, **shape)
     coarse = image[97:104, 97:104]
-    np.testing.assert_allclose(
+    assert_allclose(
         fine.reshape(7, 5, 7, 5).sum(axis=(1, 3)), coarse, rtol=1e-3, atol=3e-4 * coarse.max()
     )
 
@@ -152,7 +151,7 @@ def test_agrees_with_the_model_of_astropy_away_from_the_cusp():
     y, x = np.mgrid[:81, :81]
     model = Sersic2D(amplitude=1, r_eff=12, n=2, x_0=40, y_0=40, ellip=0.4, theta=0.4)
     ratio = (image / model(x, y))[np.hypot(x - 40, y - 40) > 10]
-    np.testing.assert_allclose(ratio, ratio.mean(), rtol=2e-3)
+    assert_allclose(ratio, ratio.mean(), rtol=2e-3)
     bn = sersic_bn(2)
     norm = 2 * np.pi * 2 * 0.6 * 144 * np.exp(bn) * bn**-4 * 6  # Gamma(4) = 6
     assert ratio.mean() == pytest.approx(1 / norm, rel=1e-3)
@@ -170,7 +169,7 @@ def test_stamp_is_a_cut_of_the_image():
     stamp, (y0, x0) = sersic_stamp(x=70.2, y=60.9, enclosed=0.99, **kwargs)
     image = sersic_image((140, 140), x=70.2, y=60.9, **kwargs)
     ny, nx = stamp.shape
-    np.testing.assert_allclose(stamp, image[y0 : y0 + ny, x0 : x0 + nx], rtol=1e-9)
+    assert_allclose(stamp, image[y0 : y0 + ny, x0 : x0 + nx], rtol=1e-9)
     assert 3 * 0.99 < stamp.sum() < 3
     small, _ = sersic_stamp(x=70.2, y=60.9, enclosed=0.99, max_radius=4, **kwargs)
     assert max(small.shape) <= 9

@@ -18,7 +18,7 @@ from miricigale.refdata import (
     locate,
     registry,
 )
-from miricigale.refdata.locate import data_folder, file_sha256, fingerprint, record_path
+from miricigale.refdata.locate import data_folder, fingerprint, record_path
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
 from miricigale.utils.store import PARTIAL
 
@@ -32,10 +32,7 @@ def folders(tmp_path, monkeypatch):
     common = {"kind": "user", "title": "T", "licence": "L", "citation": "C", "source": "a page"}
     records = {
         "test.file": Resource(
-            name="test.file",
-            file="sub/file.dat",
-            sha256=hashlib.sha256(TEXT).hexdigest(),
-            **common,
+            name="test.file", file="sub/file.dat", sha256=hashlib.sha256(TEXT).hexdigest(), **common
         ),
         "test.folder": Resource(name="test.folder", file="folder", **common),
         "test.package": Resource(name="test.package", **(common | {"kind": "package"})),
@@ -212,8 +209,3 @@ def test_check_tells_the_state_of_each(folders):
         "test.folder": "absent",
         "test.package": "from package",
     }
-
-
-def test_checksum(tmp_path):
-    path = source(tmp_path)
-    assert file_sha256(path) == hashlib.sha256(TEXT).hexdigest()

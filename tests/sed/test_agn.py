@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.io import fits
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import quad
 
 from helpers.components import values_of
@@ -69,11 +70,6 @@ def test_slope_of_the_disk_in_the_optical(disk, inside):
         assert slope[0] == pytest.approx(-1.5 + delta, rel=1e-9)
 
 
-def test_unknown_disk_is_refused():
-    with pytest.raises(ValueError, match=r"'disk' must be one of skirtor, .* got 'shakura'"):
-        ParametricTorus(disk="shakura")
-
-
 @pytest.mark.parametrize("disk", sorted(_core.DISKS))
 def test_other_disks_have_the_same_power_and_leave_the_dust_alone(torus, disk):
     other = ParametricTorus(disk=disk)
@@ -84,11 +80,11 @@ def test_other_disks_have_the_same_power_and_leave_the_dust_alone(torus, disk):
         changed = other.torus_spectra(wave, values | {"disk_slope": delta})
         power = [np.trapezoid(s.face_on, wave) for s in (plain, changed)]
         assert power[1] == pytest.approx(power[0], rel=1e-12)
-        np.testing.assert_array_equal(changed.dust, plain.dust)
+        assert_array_equal(changed.dust, plain.dust)
         # what the torus lets through is a property of the torus
         both = (plain.face_on > 0) & (changed.face_on > 0)
         through = [s.disk[both] / s.face_on[both] for s in (plain, changed)]
-        np.testing.assert_allclose(through[1], through[0], rtol=1e-12)
+        assert_allclose(through[1], through[0], rtol=1e-12)
 
 
 def test_shallower_disk_is_redder(torus, wave):
@@ -103,7 +99,7 @@ def test_shallower_disk_is_redder(torus, wave):
 
 
 def test_smc_law_is_the_published_power_law():
-    np.testing.assert_allclose(
+    assert_allclose(
         _core.polar_curve(np.array([1.0, 0.55, 0.15]), "smc"), [1.39, 2.848, 13.54], rtol=1e-3
     )
 
@@ -114,9 +110,7 @@ def test_calzetti_law_has_its_ratio_of_total_to_selective_extinction():
     assert blue - visual == pytest.approx(1.0, abs=0.06)
     # as for starbursts down to the Lyman limit, on and not off below it
     wave = np.geomspace(0.0913, 5.0, 500)
-    np.testing.assert_allclose(
-        _core.polar_curve(wave, "calzetti"), _core.leitherer_calzetti(wave), rtol=1e-12
-    )
+    assert_allclose(_core.polar_curve(wave, "calzetti"), _core.leitherer_calzetti(wave), rtol=1e-12)
     below = _core.polar_curve(np.array([0.0911, 0.05, 0.02]), "calzetti")
     assert below[0] == pytest.approx(_core.polar_curve(np.array([0.0913]), "calzetti")[0], rel=0.01)
     assert np.all(np.diff(below) > 0)
@@ -175,7 +169,7 @@ def test_polar_dust_is_a_modified_blackbody(wave):
     shape /= np.expm1(np.minimum(14387.769 / (wave * 130.0), 600.0))
     bright = polar > 1e-12 * polar.max()
     ratio = polar[bright] / shape[bright]
-    np.testing.assert_allclose(ratio, ratio[0], rtol=1e-6)
+    assert_allclose(ratio, ratio[0], rtol=1e-6)
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -189,7 +183,7 @@ def test_polar_dust_dims_the_disk_only_where_the_line_of_sight_misses_the_torus(
         visible = (wave > 0.1) & (wave < 1.0)
         seen = [p.disk[visible] / p.accretion_power for p in (bare, dusty)]
         curve = 10 ** (-0.4 * 0.3 * _core.polar_curve(wave[visible], law))
-        np.testing.assert_allclose(seen[1] / seen[0], curve if dimmed else 1.0, rtol=1e-10)
+        assert_allclose(seen[1] / seen[0], curve if dimmed else 1.0, rtol=1e-10)
 
 
 def test_without_polar_dust_its_parameters_make_no_difference(torus, wave):
@@ -197,7 +191,7 @@ def test_without_polar_dust_its_parameters_make_no_difference(torus, wave):
     assert set(torus.inert(values)) == {"temperature_polar", "emissivity_polar"}
     first = torus.templates(wave, values)
     second = torus.templates(wave, values | {"temperature_polar": 500.0, "emissivity_polar": 1.0})
-    np.testing.assert_array_equal(first.total, second.total)
+    assert_array_equal(first.total, second.total)
     assert not first.polar.any()
 
 
@@ -396,15 +390,13 @@ def test_folder_is_read_as_written(folder):
         "inclination": [0, 40, 70],
     }
     assert len(library.meta["files"]) == 12
-    np.testing.assert_allclose(library.wave, WAVE, rtol=1e-7)
+    assert_allclose(library.wave, WAVE, rtol=1e-7)
     key = (7, 0.5, 1.5, 40, 20, 70)
     table = spectrum(*key)
     row = library.row(**dict(zip(library.axes, key, strict=True)))
     # per watt of accretion: 4 pi d^2 F_lambda / L
-    np.testing.assert_allclose(
-        library.spectra["dust"][row], table[:, 4] / FLUX / WAVE, rtol=2e-7, atol=1e-37
-    )
-    np.testing.assert_allclose(
+    assert_allclose(library.spectra["dust"][row], table[:, 4] / FLUX / WAVE, rtol=2e-7, atol=1e-37)
+    assert_allclose(
         library.spectra["disk"][row],
         (table[:, 2] + table[:, 3]) / FLUX / WAVE,
         rtol=2e-7,
@@ -429,8 +421,8 @@ def test_archives_and_folders_of_archives_are_the_same(folder, tmp_path, kind):
     wanted = read_skirtor(folder)
     for path in (archive, archive.parent):
         library = read_skirtor(path)
-        np.testing.assert_array_equal(library.spectra["disk"], wanted.spectra["disk"])
-        np.testing.assert_array_equal(library.axes["q"], wanted.axes["q"])
+        assert_array_equal(library.spectra["disk"], wanted.spectra["disk"])
+        assert_array_equal(library.axes["q"], wanted.axes["q"])
 
 
 @pytest.mark.parametrize("kind", ["zip", "tar", "tar.gz"])
@@ -460,7 +452,7 @@ def test_library_comes_back_from_disk(folder, tmp_path):
     library = read_skirtor(folder)
     write_library(library, tmp_path / "skirtor2016.fits")
     again = open_library(tmp_path / "skirtor2016.fits", "torus.skirtor2016")
-    np.testing.assert_array_equal(again.spectra["dust"], library.spectra["dust"])
+    assert_array_equal(again.spectra["dust"], library.spectra["dust"])
     assert again.meta == library.meta
 
 
@@ -574,11 +566,9 @@ def test_fits_grid_is_the_same_as_text(tmp_path):
             (tmp_path / file_name(*key)).write_text(text(spectrum(*key)))
     texts = read_skirtor(tmp_path)
     for name in library.spectra:
-        np.testing.assert_allclose(
-            library.spectra[name], texts.spectra[name], rtol=1e-6, atol=1e-37
-        )
+        assert_allclose(library.spectra[name], texts.spectra[name], rtol=1e-6, atol=1e-37)
     for name in library.axes:
-        np.testing.assert_array_equal(library.axes[name], texts.axes[name])
+        assert_array_equal(library.axes[name], texts.axes[name])
 
 
 @pytest.mark.parametrize(
@@ -624,12 +614,10 @@ def test_skirtor_gives_the_library_where_nothing_is_changed(skirtor, angle):
     dust = power(table[:, 4] / WAVE, skirtor.nodes())
     assert np.trapezoid(base.dust, wave) == pytest.approx(1.0, rel=1e-6)
     at = np.searchsorted(wave, WAVE * (1 - 1e-6))[:-1]
-    np.testing.assert_allclose(
-        base.dust[at], (table[:, 4] / WAVE / dust)[:-1], rtol=1e-5, atol=1e-25
-    )
+    assert_allclose(base.dust[at], (table[:, 4] / WAVE / dust)[:-1], rtol=1e-5, atol=1e-25)
     # power laws instead of straight lines between 132 points: 0.3 %; scattered light, 2 % of the
     # disk at inclination 0, takes the disk's color there
-    np.testing.assert_allclose(
+    assert_allclose(
         base.disk[at], ((table[:, 2] + table[:, 3]) / WAVE / dust)[:-1], rtol=0.015, atol=1e-12
     )
     assert np.interp([1e-4, 2e3], wave, base.dust, left=0, right=0).tolist() == [0, 0]
@@ -655,16 +643,16 @@ def test_skirtor_keeps_its_power_with_another_disk(skirtor):
     )
     power = [np.trapezoid(s.face_on, wave) for s in (first, second)]
     assert power[1] == pytest.approx(power[0], rel=1e-12)
-    np.testing.assert_array_equal(first.dust, second.dust)
+    assert_array_equal(first.dust, second.dust)
     inside = (wave > 0.2) & (wave < 4)
     slope = np.gradient(np.log(second.face_on[inside]), np.log(wave[inside]))
-    np.testing.assert_allclose(slope, -1.86, rtol=1e-6)
+    assert_allclose(slope, -1.86, rtol=1e-6)
 
 
 def test_skirtor_says_what_it_has(skirtor):
     values = values_of(skirtor)
     assert skirtor.invalid(values) is None
-    assert skirtor.covers(tau97=3.0, q=[0.0, 1.5], age=5.0)
+    assert not skirtor.missing(tau97=3.0, q=[0.0, 1.5], age=5.0)
     assert skirtor.missing(q=[0.0, 1.0], tau97=3.0) == {"q": (0.0, 1.5)}
     says = skirtor.invalid(values | {"tau97": 5.0, "inclination": 45.0})
     assert "'tau97' must be one of 3, 7, got 5" in says
@@ -698,8 +686,8 @@ def real(data_file):
 
 def test_real_grid_has_what_its_authors_say(real):
     assert real.n_rows == 50
-    np.testing.assert_array_equal(real.values_of("tau97"), [3, 5, 7, 9, 11])
-    np.testing.assert_array_equal(real.values_of("inclination"), np.arange(10) * 10.0)
+    assert_array_equal(real.values_of("tau97"), [3, 5, 7, 9, 11])
+    assert_array_equal(real.values_of("inclination"), np.arange(10) * 10.0)
     assert real.wave[[0, -1]] == pytest.approx([1e-3, 1e3], rel=1e-6)
 
 
@@ -726,9 +714,9 @@ def test_real_grid_survives_the_authors_layout(real, tmp_path):
         (tmp_path / file_name(*key)).write_text(text(np.column_stack(columns)))
     again = read_skirtor(tmp_path)
     for name in real.spectra:
-        np.testing.assert_allclose(again.spectra[name], real.spectra[name], rtol=2e-7, atol=1e-30)
+        assert_allclose(again.spectra[name], real.spectra[name], rtol=2e-7, atol=1e-30)
     for name in real.axes:
-        np.testing.assert_array_equal(again.axes[name], real.axes[name])
+        assert_array_equal(again.axes[name], real.axes[name])
 
 
 def test_disk_of_the_real_library_is_the_form_of_2016(real):
@@ -736,7 +724,7 @@ def test_disk_of_the_real_library_is_the_form_of_2016(real):
     top = real.row(tau97=3, p=1, q=0, opening_angle=40, radius_ratio=20, inclination=0)
     shape = _core.disk_spectrum(real.wave, 0.0, "stalevski2016") * 18 / 7
     inside = real.wave < 30
-    np.testing.assert_allclose(real.spectra["disk"][top][inside] / shape[inside], 1.0, atol=0.1)
+    assert_allclose(real.spectra["disk"][top][inside] / shape[inside], 1.0, atol=0.1)
 
 
 def test_real_spectrum_that_looks_wrong(real):
@@ -807,7 +795,7 @@ def test_grains_leave_the_law_alone_beyond_a_tenth_of_a_micron(wave):
     )
     long = wave >= 0.1
     scale = one.accretion_power / two.accretion_power
-    np.testing.assert_allclose(two.disk[long] * scale, one.disk[long], rtol=1e-9)
+    assert_allclose(two.disk[long] * scale, one.disk[long], rtol=1e-9)
     # grains of the SMC take less of the ionizing light than the power law continued
     assert np.all(two.disk[wave < 0.05] * scale >= one.disk[wave < 0.05])
 

@@ -6,81 +6,6 @@ from miricigale.sed import _core
 from miricigale.sed._core import igm
 
 
-def test_delayed_history_forms_one_solar_mass_and_has_the_delayed_shape():
-    rate = _core.delayed_history(3000, 500.0)
-    assert rate.sum() * 1e6 == pytest.approx(1.0, rel=1e-12)
-    t = np.arange(3000)
-    np.testing.assert_allclose(rate / rate[500], t / 500 * np.exp(1 - t / 500), rtol=1e-12)
-    # the continuous integral of t exp(-t/tau) / tau^2 from 0 to T is 1 - (1 + T/tau) exp(-T/tau)
-    whole = 1 - (1 + 3000 / 500) * np.exp(-3000 / 500)
-    assert rate[500] * 1e6 == pytest.approx(500 * np.exp(-1) / 500**2 / whole, rel=1e-3)
-
-
-def test_delayed_history_peaks_at_tau():
-    assert np.argmax(_core.delayed_history(5000, 700.0)) == 700
-
-
-def test_burst_forms_its_fraction():
-    old = _core.delayed_history(2000, 300.0)
-    new = _core.delayed_history(2000, 300.0, 0.2, 50, 30.0)
-    assert new.sum() == pytest.approx(1e-6)
-    burst = new[-50:].sum() - 0.8 * old[-50:].sum()
-    assert burst == pytest.approx(0.2e-6, rel=1e-10)
-
-
-def test_time_weights_are_means_of_ten_interpolations():
-    age = np.array([0.0, 0.5, 3.0, 10.0])
-    weights = _core.time_weights(age, 10).toarray()
-    np.testing.assert_allclose(weights.sum(axis=1), 1.0)
-    table = np.array([5.0, 1.0, 2.0, 9.0])
-    for k in (0, 2, 7):
-        want = np.mean([np.interp(k + i / 10, age, table) for i in range(1, 11)])
-        assert weights[k] @ table == pytest.approx(want)
-
-
-@pytest.mark.parametrize(
-    ("wave", "k"),
-    [
-        # Calzetti et al. 2000, eq. 4, worked out by hand; k(V) is R_V = 4.05
-        (0.55, 2.659 * (-2.156 + 1.509 / 0.55 - 0.198 / 0.55**2 + 0.011 / 0.55**3) + 4.05),
-        (0.30, 2.659 * (-2.156 + 5.03 - 2.2 + 0.4074074) + 4.05),
-        (0.15, 2.659 * (-2.156 + 10.06 - 8.8 + 3.2592593) + 4.05),
-        (1.0, 2.659 * (-1.857 + 1.040) + 4.05),
-        (2.0, 2.659 * (-1.857 + 0.520) + 4.05),
-        # Leitherer et al. 2002, eq. 14, in um: 5.472 + 0.671/l - 9.218e-3/l^2 + 2.620e-5/l^3... at 0.12
-        (0.12, 5.472 + 0.671 / 0.12 - 9.218e-3 / 0.12**2 + 2.620e-3 / 0.12**3),
-        (0.09, 0.0),
-        (5.0, 0.0),
-    ],
-)
-def test_starburst_curve_at_points(wave, k):
-    assert _core.leitherer_calzetti(np.array([wave]))[0] == pytest.approx(k, rel=1e-6)
-
-
-def test_starburst_curve_has_r_v_and_color_excess():
-    b, v = _core.leitherer_calzetti(np.array([0.44, 0.55]))
-    assert v == pytest.approx(4.05, abs=0.01)
-    assert b - v == pytest.approx(1.0, abs=0.05)
-
-
-def test_leitherer_joins_calzetti():
-    low, high = _core.leitherer_calzetti(np.array([0.1499999, 0.1500001]))
-    assert low == pytest.approx(high, rel=0.04)
-
-
-@pytest.mark.parametrize(("slope", "bump"), [(0.0, 3.0), (-0.5, 0.0), (0.3, 1.5)])
-def test_modified_curve_keeps_the_color_excess(slope, bump):
-    band = np.array([0.44, 0.55])
-    want = np.diff(_core.leitherer_calzetti(band))
-    np.testing.assert_allclose(np.diff(_core.attenuation_curve(band, slope, bump)), want)
-
-
-def test_bump_stands_at_2175():
-    wave = np.linspace(0.18, 0.26, 801)
-    extra = _core.attenuation_curve(wave, 0.0, 3.0) - _core.attenuation_curve(wave)
-    assert wave[np.argmax(extra)] == pytest.approx(0.2175, abs=0.003)
-
-
 def test_disk_integrates_to_one_and_has_its_slopes():
     total = sum(
         quad(lambda w: float(_core.disk_spectrum(np.array([w]))[0]), a, b)[0]
@@ -144,12 +69,6 @@ def test_band_means_over_the_part_that_a_spectrum_covers(ends):
 
 
 # ------------------------------------------------------------------------------ IGM
-
-
-def test_meiksin_is_clear_redward_of_lyman_alpha():
-    z = 3.0
-    wave = np.linspace(0.12160001 * (1 + z), 5.0, 1000)
-    np.testing.assert_array_equal(_core.meiksin_transmission(wave, z), 1.0)
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import QTable
+from numpy.testing import assert_allclose, assert_array_equal
 
 from miricigale.sed import ModelGrid
 from miricigale.utils.exceptions import DataError
@@ -30,7 +31,7 @@ def make(**changes):
 
 
 def test_flux_is_the_stated_sum():
-    np.testing.assert_allclose(make().flux(0, 2, 0, 1), 1.0 + 1.0 * 3.0 * 0.5)
+    assert_allclose(make().flux(0, 2, 0, 1), 1.0 + 1.0 * 3.0 * 0.5)
     assert make().flux(0, [0, 1], 0, 1).shape == (2, 2)
     assert make().n_models == 2 * 3 * 2 * 3
 
@@ -101,7 +102,7 @@ def test_facts_that_decide_are_attributes_and_survive_writing_copying_and_pickli
     for other in (*copies, pickle.loads(pickle.dumps(grid))):
         same_facts(other)
         assert other.meta == {"note": "for people"}
-        np.testing.assert_array_equal(other.galaxy, grid.galaxy)
+        assert_array_equal(other.galaxy, grid.galaxy)
         assert not other.galaxy.flags.writeable
 
 
@@ -123,4 +124,4 @@ def test_files_of_the_layout_before_are_read(tmp_path):
     old = ModelGrid.read(path)
     same_facts(old)
     assert old.galaxy_parameters["tau"].info.description == "words"
-    np.testing.assert_array_equal(old.agn, grid.agn)
+    assert_array_equal(old.agn, grid.agn)

@@ -12,6 +12,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.cosmology import Planck18
+from numpy.testing import assert_allclose, assert_array_equal
 
 from miricigale.filters import Filter, FilterSet
 from miricigale.filters import filter as filter_curves
@@ -58,7 +59,7 @@ def model(**options):
 
 def same(a, b):
     for name in ("galaxy", "agn", "redshift", "dust_luminosity", "allowed"):
-        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+        assert_array_equal(getattr(a, name), getattr(b, name))
     assert {**a.meta, "created": 0} == {**b.meta, "created": 0}
     for name in ("galaxy_properties", "galaxy_shape", "galaxy_parameters"):
         one, two = getattr(a, name), getattr(b, name)
@@ -66,7 +67,7 @@ def same(a, b):
         for column in one.colnames:
             assert one[column].unit == two[column].unit
             assert one[column].info.description == two[column].info.description
-            np.testing.assert_array_equal(one[column].value, two[column].value)
+            assert_array_equal(one[column].value, two[column].value)
 
 
 def test_a_grid_is_made_once_and_read_back_bit_for_bit(folder, made):
@@ -150,7 +151,7 @@ def test_numbers_do_not_change_without_a_new_version(name):
     versions = [vars(base)["version"] for base in cls.__mro__ if "version" in vars(base)]
     assert versions == kept["versions"], f"note the new numbers of {name} in {KEPT.name}"
     got = [float(u.Quantity(value).value) for value in numbers(name)]
-    np.testing.assert_allclose(got, kept["numbers"], rtol=1e-9, err_msg=f"raise {name}.version")
+    assert_allclose(got, kept["numbers"], rtol=1e-9, err_msg=f"raise {name}.version")
 
 
 def change_torus(folder, width):

@@ -50,7 +50,7 @@ def test_every_component_declares_unit_bounds_doc_and_reference(name):
         assert parameter.doc.endswith(".")
 
 
-def test_model_has_the_names_that_other_rooms_use():
+def test_model_has_the_names_that_other_subpackages_use():
     names = set(SEDModel.yang2021().parameters)
     assert names >= {
         *("tau", "age", "metallicity", "ebv", "ebv_factor", "uv_bump", "slope", "alpha"),

@@ -2,6 +2,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import MaskedColumn, QTable, Table
+from numpy.testing import assert_allclose
 
 from helpers.components import values_of
 from miricigale.sed import SEDModel
@@ -47,7 +48,7 @@ def test_a_single_step_forms_everything(cls):
     part = cls()
     for changes in ({}, {"f_burst": 0.3, "age_burst": 0.001}):
         known = {k: v for k, v in changes.items() if k in part.parameters}
-        np.testing.assert_allclose(part.history(values_of(part, age=0.001, **known)), [1e-6])
+        assert_allclose(part.history(values_of(part, age=0.001, **known)), [1e-6])
 
 
 @pytest.mark.parametrize("cls", [DelayedSFH, DoubleExponentialSFH])
@@ -58,7 +59,7 @@ def test_a_burst_as_old_as_the_galaxy_makes_its_fraction(cls):
     with_burst, without = part.history(values), part.history(values | {"f_burst": 0.0})
     burst = with_burst - 0.6 * without
     t = np.arange(300)
-    np.testing.assert_allclose(burst / burst[0], np.exp(-t / 50), rtol=1e-8)
+    assert_allclose(burst / burst[0], np.exp(-t / 50), rtol=1e-8)
     assert burst.sum() == pytest.approx(0.4e-6, rel=1e-10)
 
 
@@ -82,7 +83,7 @@ def test_delayed_history_is_its_formula():
     # sum of k q^k over k < n, in closed form
     q, n = np.exp(-1 / 1700), 13000
     total = (q - n * q**n + (n - 1) * q ** (n + 1)) / (1 - q) ** 2
-    np.testing.assert_allclose(rate, 1e-6 * t * np.exp(-t / 1700) / total, rtol=1e-9)
+    assert_allclose(rate, 1e-6 * t * np.exp(-t / 1700) / total, rtol=1e-9)
 
 
 @pytest.mark.parametrize("tau", [0.001, 0.3, 6.0, 100.0, -0.001, -0.5, -40.0])
@@ -97,7 +98,7 @@ def test_exponential_history_is_a_geometric_series(tau):
     else:
         scale = -tau * 1e3
         want = (np.exp((n - 2000) / scale) - np.exp(-2000 / scale)) / -np.expm1(-2000 / scale)
-    np.testing.assert_allclose(formed, want, rtol=1e-9, atol=1e-12)
+    assert_allclose(formed, want, rtol=1e-9, atol=1e-12)
 
 
 def test_double_exponential_has_a_burst_on_top_of_the_main_history():
@@ -106,9 +107,9 @@ def test_double_exponential_has_a_burst_on_top_of_the_main_history():
         values_of(part, age=5.0, tau=3.0, f_burst=0.1, age_burst=0.1, tau_burst=0.02)
     )
     main = 0.9e-6 * np.exp(-np.arange(5000) / 3000) / np.exp(-np.arange(5000) / 3000).sum()
-    np.testing.assert_allclose(rate[:-100], main[:-100], rtol=1e-10)
+    assert_allclose(rate[:-100], main[:-100], rtol=1e-10)
     burst = rate[-100:] - main[-100:]
-    np.testing.assert_allclose(burst[1:] / burst[:-1], np.exp(-1 / 20), rtol=1e-8)
+    assert_allclose(burst[1:] / burst[:-1], np.exp(-1 / 20), rtol=1e-8)
     assert burst.sum() == pytest.approx(1e-7, rel=1e-9)
 
 
@@ -121,7 +122,7 @@ def test_an_exponential_without_time_is_refused():
 
 def test_constant_history_is_constant():
     part = ConstantSFH()
-    np.testing.assert_allclose(part.history(values_of(part, age=0.25)), 1e-6 / 250, rtol=1e-14)
+    assert_allclose(part.history(values_of(part, age=0.25)), 1e-6 / 250, rtol=1e-14)
 
 
 # -------------------------------------------------------------------------- tables
@@ -132,7 +133,7 @@ def test_rows_of_1_myr_are_the_steps():
     part = TableSFH(table_of(np.arange(300), rate))
     values = values_of(part)
     assert values["age"] == pytest.approx(0.3)
-    np.testing.assert_allclose(part.history(values), 1e-6 * rate / rate.sum(), rtol=1e-12)
+    assert_allclose(part.history(values), 1e-6 * rate / rate.sum(), rtol=1e-12)
 
 
 def test_uneven_bins_keep_their_mass_in_every_step(uneven):
@@ -143,7 +144,7 @@ def test_uneven_bins_keep_their_mass_in_every_step(uneven):
     assert values["age"] == pytest.approx(0.779)
     got = uneven.history(values)
     want = np.interp(np.arange(1, 780), edges, formed) / formed[-1]
-    np.testing.assert_allclose(np.cumsum(got) * 1e6, want, rtol=1e-12)
+    assert_allclose(np.cumsum(got) * 1e6, want, rtol=1e-12)
     # the first step holds 0.3 Myr of rate 2, the eighth 0.5 Myr of rate 5
     assert got[7] / got[0] == pytest.approx(2.5 / 0.6, rel=1e-12)
 
@@ -151,7 +152,7 @@ def test_uneven_bins_keep_their_mass_in_every_step(uneven):
 def test_a_table_that_ends_within_a_step_keeps_its_mass():
     part = TableSFH(table_of([0, 1.25, 2.5], [4, 8, 8]))  # ends at 3.75 Myr
     got = part.history(values_of(part))
-    np.testing.assert_allclose(got * 1e6, np.array([4, 7, 8, 6]) / 25, rtol=1e-12)
+    assert_allclose(got * 1e6, np.array([4, 7, 8, 6]) / 25, rtol=1e-12)
 
 
 def test_time_is_counted_from_the_first_row_in_any_unit():
@@ -160,20 +161,20 @@ def test_time_is_counted_from_the_first_row_in_any_unit():
     table = Table({"time": [4.0, 4.01, 4.02], "sfr_0": rate}, units={"time": "Gyr"})
     table["sfr_0"].unit = "kg / s"
     second = TableSFH(table)
-    np.testing.assert_allclose(first.history(values_of(first)), second.history(values_of(second)))
+    assert_allclose(first.history(values_of(first)), second.history(values_of(second)))
 
 
 def test_an_earlier_observation_sees_the_first_part_alone(uneven):
     values = values_of(uneven)
     whole, part = uneven.history(values), uneven.history(values | {"age": 0.1})
-    np.testing.assert_allclose(part / part.sum(), whole[:100] / whole[:100].sum(), rtol=1e-12)
+    assert_allclose(part / part.sum(), whole[:100] / whole[:100].sum(), rtol=1e-12)
 
 
 def test_index_selects_the_column():
     part = TableSFH(table_of(np.arange(4), [1, 1, 1, 1], [0, 0, 0, 7]), sfh_index=1)
     values = values_of(part)
-    np.testing.assert_allclose(part.history(values), [0, 0, 0, 1e-6])
-    np.testing.assert_allclose(part.history(values | {"sfh_index": 0.0}), 2.5e-7)
+    assert_allclose(part.history(values), [0, 0, 0, 1e-6])
+    assert_allclose(part.history(values | {"sfh_index": 0.0}), 2.5e-7)
     assert "'sfh_index' must be a whole number below 2" in part.invalid(values | {"sfh_index": 2.0})
     assert "'sfh_index'" in part.invalid(values | {"sfh_index": 0.5})
     assert "must be after the first stars" in part.invalid(values | {"age": 0.002})
@@ -235,7 +236,7 @@ def test_model_from_a_configuration_reads_the_file(tmp_path, suffix):
     parts = [{"name": "sfh_table", "path": str(path)}, {"name": "bc03"}]
     constant = [{"name": "constant", "age": 0.5}, {"name": "bc03"}]
     mine, theirs = (SEDModel.from_dict({"components": c}).evaluate() for c in (parts, constant))
-    np.testing.assert_allclose(mine.fnu, theirs.fnu, rtol=1e-10)
+    assert_allclose(mine.fnu, theirs.fnu, rtol=1e-10)
 
 
 def test_files_that_are_no_tables_are_refused(tmp_path):

@@ -2,6 +2,7 @@ import itertools
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.integrate import quad
 
 from helpers.components import values_of
@@ -38,8 +39,8 @@ def test_light_of_a_history_is_the_sum_of_its_steps(stars, age, separation):
     mass = 1e6 * history[::-1]
     young = k < separation
     got = stars.age_weights(history, values_of(stars, separation_age=separation))
-    np.testing.assert_allclose(got[0] @ light, (steps * mass)[:, young].sum(axis=1), rtol=1e-10)
-    np.testing.assert_allclose(got[1] @ light, (steps * mass)[:, ~young].sum(axis=1), rtol=1e-10)
+    assert_allclose(got[0] @ light, (steps * mass)[:, young].sum(axis=1), rtol=1e-10)
+    assert_allclose(got[1] @ light, (steps * mass)[:, ~young].sum(axis=1), rtol=1e-10)
 
 
 def test_masses_are_parted_at_the_separation_age(stars):

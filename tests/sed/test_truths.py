@@ -15,6 +15,7 @@ from astropy.cosmology import FlatLambdaCDM
 from astropy.modeling.physical_models import BlackBody
 from astropy.table import QTable
 from astropy.tests.helper import assert_quantity_allclose
+from numpy.testing import assert_allclose
 from scipy.integrate import quad
 from scipy.special import hyp2f1
 
@@ -106,7 +107,7 @@ def test_magnitude_zero_is_3631_jansky(all_bands):
     # 10^((8.9 - 0) / 2.5) Jy = 3630.78: the definition, AB = -2.5 log(F / erg/s/cm2/Hz) - 48.60
     magnitude = all_bands.synthetic_fluxes(sed).to_value(u.ABmag)
     exact = -2.5 * np.log10((3631 * u.Jy).to_value(u.erg / u.s / u.cm**2 / u.Hz)) - 48.60
-    np.testing.assert_allclose(magnitude, exact, atol=1e-6)
+    assert_allclose(magnitude, exact, atol=1e-6)
 
 
 # ------------------------------------------------------------------------------ distances

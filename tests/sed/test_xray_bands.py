@@ -4,6 +4,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import quad
 
 from miricigale.fitting import BayesFitter
@@ -44,8 +45,8 @@ def test_the_corona_hangs_on_the_disk_by_alpha_ox(model, grid):
     )
     assert x.filters == (*grid.filters, "soft", "hard")
     assert x.n_agn == 2 * grid.n_agn
-    np.testing.assert_array_equal(x.agn[:, ::2, :3], grid.agn)
-    np.testing.assert_array_equal(x.galaxy[..., :3], grid.galaxy)
+    assert_array_equal(x.agn[:, ::2, :3], grid.agn)
+    assert_array_equal(x.galaxy[..., :3], grid.galaxy)
     slopes = x.agn_parameters["alpha_ox"].value
     assert slopes.tolist() == [-1.8, -1.4] * grid.n_agn
     angle = x.agn_parameters["inclination"].to_value(u.deg)
@@ -116,7 +117,7 @@ def test_a_fit_takes_alpha_ox_from_the_x_rays(model, grid):
     assert found.best["l_2_10kev"][0].to_value(u.W) == pytest.approx(truth, rel=1e-6)
     assert str(found.best["l_2500"].unit) == "W / Hz"
     without = BayesFitter(x, list(grid.filters), model_error=0.05).fit(table, redshift=[0.5])
-    np.testing.assert_allclose(without.pdf["alpha_ox"][0], 1 / 9, rtol=1e-6)
+    assert_allclose(without.pdf["alpha_ox"][0], 1 / 9, rtol=1e-6)
     # upper limits in X-rays exclude bright coronae
     for name in BANDS:
         table[f"{name}_limit"] = [True]
@@ -139,6 +140,4 @@ def test_what_is_refused_and_how_bands_are_drawn(model, grid):
         with_xray_bands(once, model, {"hard": BANDS["hard"]})
     # 12.398 Angstrom keV
     band = xray_filter("x", [2, 12] * u.keV)
-    np.testing.assert_allclose(
-        band.wave[[1, -2]].to_value(u.AA), [12.39842 / 12, 12.39842 / 2], rtol=1e-5
-    )
+    assert_allclose(band.wave[[1, -2]].to_value(u.AA), [12.39842 / 12, 12.39842 / 2], rtol=1e-5)

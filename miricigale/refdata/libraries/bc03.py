@@ -18,7 +18,7 @@ SOLAR_LUMINOSITY = 3.826e26
 PADOVA_1994 = {22: 0.0001, 32: 0.0004, 42: 0.004, 52: 0.008, 62: 0.02, 72: 0.05, 82: 0.1}
 PADOVA_2000 = {122: 0.0004, 132: 0.001, 142: 0.004, 152: 0.008, 162: 0.019, 172: 0.03}
 IMFS = {"chab": "Chabrier", "salp": "Salpeter", "kroup": "Kroupa"}
-#: Second age in yr: tells the version of 2003 from that of 2016.
+#: Second age in yr, which differs between the versions of 2003 and 2016.
 SECOND_AGE = {2003: 125893.0, 2016: 1.0e5}
 
 LONGEST = 160.0  # um

@@ -2,15 +2,9 @@
 
 import contextlib
 import datetime
-import importlib
-import inspect
+import pkgutil
 import shutil
-import struct
-import tarfile
 import textwrap
-import threading
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,20 +26,6 @@ READERS = {
     "dust.dale2014": "miricigale.refdata.libraries.dale2014:read_dale2014",
     "ssp.bc03_user": "miricigale.refdata.libraries.bc03:read_bc03",
 }
-
-#: What a reader raises when a file is not what it should be.
-_FOREIGN = (
-    ArithmeticError,
-    EOFError,
-    LookupError,
-    OSError,
-    TypeError,
-    ValueError,
-    struct.error,
-    tarfile.TarError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
 
 
 @dataclass(frozen=True)
@@ -117,9 +97,9 @@ class Report:
         return "\n".join(lines)
 
 
-def _some(values, most=12):
-    """The values of an axis, or their number and ends where there are many."""
-    if values.size <= most:
+def _some(values):
+    """The values of an axis, or their number and ends where there are more than twelve."""
+    if values.size <= 12:
         return f"{values.size}: {' '.join(f'{v:g}' for v in values)}"
     first, last = (" ".join(f"{v:g}" for v in part) for part in (values[:3], values[-2:]))
     return f"{values.size}: {first} ... {last}"
@@ -166,7 +146,7 @@ def add_library(name, path, *, progress_bar=False):
     target = data_folder() / record.file
     with _steps(name, show=progress_bar) as step:
         step("reading")
-        library = _read(reader, name, path, progress_bar)
+        library = _read(reader, name, path)
         with installing(target) as (partial, entry):
             step("writing")
             write_library(library, partial)
@@ -184,22 +164,16 @@ def _reader(name):
         reader = READERS[name]
     except KeyError:
         raise unknown_name("library", name, READERS) from None
-    if isinstance(reader, str):
-        module, function = reader.split(":")
-        reader = getattr(importlib.import_module(module), function)
-    return reader
+    return pkgutil.resolve_name(reader) if isinstance(reader, str) else reader
 
 
-def _read(reader, name, path, progress_bar):
+def _read(reader, name, path):
     """Read the files; whatever is wrong with them is one sentence that names them."""
-    options = {}
-    if "progress_bar" in inspect.signature(reader).parameters:
-        options["progress_bar"] = progress_bar
     try:
-        library = reader(path, **options)
+        library = reader(path)
     except DataError:
         raise
-    except _FOREIGN as err:
+    except Exception as err:  # readers of different formats raise different exceptions
         reason = err.args[0] if isinstance(err, KeyError) and err.args else err
         msg = f"{path} cannot be read as {name!r}: {reason or type(err).__name__}"
         raise DataError(msg) from err
@@ -241,27 +215,12 @@ def _present(target):
 
 @contextlib.contextmanager
 def _steps(name, *, show):
-    """Say what is being done and for how long: conversions take up to minutes."""
-    bar = progress(show=show, total=3, desc=name, unit="step")
-    stop = threading.Event()
+    """Say what is being done: conversions take up to minutes."""
+    with contextlib.closing(progress(show=show, total=3, desc=name, unit="step")) as bar:
 
-    def tick():
-        # nothing moves while a reader works but the clock
-        while not stop.wait(0.5):
+        def step(text):
+            bar.set_description(f"{name}: {text}", refresh=False)
+            bar.update()
             bar.refresh()
 
-    def step(text):
-        bar.set_description(f"{name}: {text}", refresh=False)
-        bar.update()
-        bar.refresh()
-
-    thread = threading.Thread(target=tick, daemon=True)
-    if show:
-        thread.start()
-    try:
         yield step
-    finally:
-        stop.set()
-        if show:
-            thread.join()
-        bar.close()

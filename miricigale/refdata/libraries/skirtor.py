@@ -44,12 +44,9 @@ _FITS_UNITS = {
     "INCLINATION": ("deg",),
     "WAVE_REST": ("um", "micron"),
     "NU_REST": ("Hz",),
-    "LNU_TOTAL": ("Hz-1 solLum", "solLum Hz-1"),
-    "LNU_DISK_DIRECT": ("Hz-1 solLum", "solLum Hz-1"),
-    "LNU_DISK_SCATTERED": ("Hz-1 solLum", "solLum Hz-1"),
-    "LNU_DUST_TOTAL": ("Hz-1 solLum", "solLum Hz-1"),
-    "LNU_TRANSPARENT": ("Hz-1 solLum", "solLum Hz-1"),
 }
+_FITS_LIGHT = ("TOTAL", "DISK_DIRECT", "DISK_SCATTERED", "DUST_TOTAL", "TRANSPARENT")
+_FITS_UNITS |= {f"LNU_{name}": ("Hz-1 solLum", "solLum Hz-1") for name in _FITS_LIGHT}
 
 
 def read_skirtor(path):
@@ -274,10 +271,7 @@ def _read_fits(path):
     if not np.allclose(nu * wave, 2.99792458e14, rtol=1e-4):
         msg = f"{path}: frequencies and wavelengths do not belong together"
         raise DataError(msg)
-    power = {
-        name: table[f"LNU_{name}"][:, order] * nu
-        for name in ("TOTAL", "DISK_DIRECT", "DISK_SCATTERED", "DUST_TOTAL", "TRANSPARENT")
-    }
+    power = {name: table[f"LNU_{name}"][:, order] * nu for name in _FITS_LIGHT}
     for name, array in power.items():
         if not (np.isfinite(array).all() and array.min() >= 0.0):
             msg = f"{path}: negative, infinite or missing numbers in LNU_{name}"

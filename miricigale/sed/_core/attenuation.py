@@ -4,14 +4,6 @@ import numpy as np
 
 from miricigale.sed._core.thermal import drude
 
-__all__ = [
-    "attenuation_curve",
-    "leitherer_calzetti",
-    "pei_extinction",
-    "power_law_attenuation",
-    "smc_power_law",
-]
-
 _BREAK = 0.0912  # nothing is attenuated at this wavelength and below
 _B, _V = 0.44, 0.55
 

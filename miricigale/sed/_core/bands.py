@@ -6,8 +6,6 @@ import numpy as np
 
 from miricigale.utils.compilation import njit
 
-__all__ = ["band_means", "band_tables"]
-
 BUCKETS = 2048  # of equal width in each band, to find a point of its curve without a search
 
 
@@ -16,7 +14,7 @@ def band_tables(start, band_wave, throughput):
     """
     What `band_means` needs to know of passbands that are linear between their points.
 
-    ``start``, int, shape (n_band + 1,), tells where each band begins in ``band_wave`` and ``throughput``,
+    ``start``, int, shape (n_band + 1,), is where each band begins in ``band_wave`` and ``throughput``,
     which hold all bands one after the other.
 
     Returns

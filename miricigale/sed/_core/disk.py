@@ -4,8 +4,6 @@ import math
 
 import numpy as np
 
-__all__ = ["DISKS", "DISK_BREAKS", "DISK_SLOPES", "disk_nodes", "disk_spectrum"]
-
 #: Breaks in um and slopes of L_lambda between them. ``skirtor``: the form of CIGALE since
 #: 2020, Stalevski's from 8 nm on; ``stalevski2016``: as the SKIRTOR library was computed, from
 #: 1 nm (12 % of its light is below 8 nm); ``schartmann2005``: after Schartmann et al. 2005,
@@ -15,7 +13,7 @@ DISKS = {
     "schartmann2005": ((0.008, 0.05, 0.125, 10.0, 1000.0), (1.0, -0.2, -1.5, -4.0)),
     "stalevski2016": ((0.001, 0.01, 0.1, 5.0, 1000.0), (0.2, -1.0, -1.5, -4.0)),
 }
-DISK_BREAKS, DISK_SLOPES = DISKS["skirtor"]
+DISK_BREAKS = DISKS["skirtor"][0]
 
 
 def disk_spectrum(wave, delta=0.0, disk="skirtor"):

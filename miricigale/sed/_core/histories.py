@@ -8,17 +8,6 @@ from scipy.sparse import csr_matrix
 from miricigale.sed._core.nodes import cells
 from miricigale.utils.compilation import njit
 
-__all__ = [
-    "YOUNG",
-    "age_steps",
-    "constant_history",
-    "delayed_history",
-    "double_exponential_history",
-    "split_by_age",
-    "table_history",
-    "time_weights",
-]
-
 YOUNG = 10  # Myr
 
 _BLOCK = 64

@@ -14,16 +14,6 @@ import numpy as np
 
 from miricigale.utils.compilation import njit
 
-__all__ = [
-    "INOUE_LIMIT",
-    "LYMAN_LIMIT",
-    "inoue_lines",
-    "inoue_transmission",
-    "lyman_lines",
-    "madau_transmission",
-    "meiksin_transmission",
-]
-
 LYMAN_LIMIT = 0.0912  # um, the rounded value that Madau, Meiksin and CIGALE use
 INOUE_LIMIT = 0.09118  # um, Inoue et al. 2014, section 4
 

@@ -5,8 +5,6 @@ from scipy.sparse import csr_matrix, hstack
 
 from miricigale.sed._core.nodes import cells, hat_matrix, merge_nodes
 
-__all__ = ["absorbed_share", "line_operator", "photons_by_age"]
-
 ALPHA_B = 2.58e-19  # m3/s, recombination to all but the ground state at 10^4 K: Ferland 1980
 ALPHA_1 = 1.54e-19  # m3/s, to the ground state
 

@@ -3,8 +3,6 @@
 import numpy as np
 from scipy.sparse import csr_matrix
 
-__all__ = ["cells", "hat_matrix", "merge_nodes", "photon_weights", "trapezoid_weights"]
-
 _HC = 1.98644586e-19  # J um
 
 

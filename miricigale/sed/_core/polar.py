@@ -9,8 +9,6 @@ from miricigale.sed._core.nodes import trapezoid_weights
 from miricigale.sed._core.thermal import PLANCK_K
 from miricigale.utils.compilation import njit
 
-__all__ = ["DISK_MEAN", "POLAR_LAWS", "add_polar", "polar_curve", "polar_grid", "polar_share"]
-
 #: Mean over the sphere of cos i (1 + 2 cos i) / 3: a disk's light over its face-on value.
 DISK_MEAN = 7.0 / 18.0
 
@@ -29,7 +27,7 @@ def polar_curve(wave, law):
     the polynomial of Leitherer et al. 2002 below 0.15 um, **continued** below 0.0912 um, since
     this dust stands before a source that is bright there.
     ``gaskell``: Gaskell et al. 2004, fit of their appendix for x = 1 / lambda in 1.6-8 um^-1;
-    the cubic goes on below 1.6 until it is zero (x = 0.60, 1.68 um), the line goes on above
+    the cubic continues below 1.6 until it is zero (x = 0.60, 1.68 um), the line continues above
     8; divided by A(B)/A(V) - 1 = 0.182 (their table 3), as CIGALE does.
     """
     wave = np.asarray(wave, dtype=float)
@@ -112,7 +110,7 @@ def add_polar(grid, face_on, disk, dust, ebv, temperature, beta, share, dims_dis
     polar = 0.0
     if dusty:
         if body == 0.0 and lost > 0.0:
-            return parts, power, math.nan  # the grid has no room for what the dust sends out
+            return parts, power, math.nan  # the grid ends before the light of the dust
         if body > 0.0:
             polar = share * lost / body
             total += share * lost

@@ -7,8 +7,6 @@ import numpy as np
 from miricigale.sed._core.bands import band_means
 from miricigale.utils.compilation import njit
 
-__all__ = ["block_fluxes", "mix_light", "weighted_sums"]
-
 _TILE = 256  # wavelengths of all ages that stay in the cache
 
 

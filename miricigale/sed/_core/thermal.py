@@ -2,8 +2,6 @@
 
 import numpy as np
 
-__all__ = ["PLANCK_K", "drude", "modified_blackbody", "planck_lambda"]
-
 PLANCK_K = 14387.768775  # h c / k in um K
 
 

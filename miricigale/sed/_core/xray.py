@@ -3,8 +3,6 @@
 import numpy as np
 from scipy.special import exprel
 
-__all__ = ["power_law_energy", "stern2015", "stern2015_6um", "xray_flux"]
-
 _STERN = (40.981, 1.024, -0.047)
 _ERG = 1e-7  # W s
 _UNIT_6UM = 1e41 * _ERG  # W

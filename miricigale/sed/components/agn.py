@@ -86,29 +86,19 @@ class AGN(Component):
     role = "agn"
     options = {"polar_law": (*_core.POLAR_LAWS, _GRAINS), "disk": tuple(_core.DISKS)}
     packages = ("dust_extinction",)
-    frac_agn = Parameter(
-        default=0.0, bounds=(0.0, 0.999999), doc="AGN fraction, in the model's definition."
-    )
-    inclination = Parameter(
-        default=70.0, bounds=(0.0, 90.0), unit="deg", doc="Angle between axis and line of sight."
-    )
+    frac_agn = Parameter(0.0, (0.0, 0.999999), "AGN fraction, in the model's definition.")
+    inclination = Parameter(70.0, (0.0, 90.0), "Angle between axis and line of sight.", unit="deg")
     opening_angle = Parameter(
-        default=40.0, bounds=(10.0, 80.0), unit="deg",
-        doc="Angle between the equator and the edge of the torus.",
-    )  # fmt: skip
+        40.0, (10.0, 80.0), "Angle between the equator and the edge of the torus.", unit="deg"
+    )
     disk_slope = Parameter(
-        default=0.0, bounds=(-1.0, 1.0),
-        doc="Added to the disk's optical slope, L_lambda ~ lambda^(-1.5 + disk_slope).",
-    )  # fmt: skip
-    ebv_polar = Parameter(
-        default=0.1, bounds=(0.0, 3.0), unit="mag", doc="Color excess of the polar dust."
+        0.0,
+        (-1.0, 1.0),
+        "Added to the disk's optical slope, L_lambda ~ lambda^(-1.5 + disk_slope).",
     )
-    temperature_polar = Parameter(
-        default=100.0, bounds=(20.0, 1500.0), unit="K", doc="Temperature of the polar dust."
-    )
-    emissivity_polar = Parameter(
-        default=1.6, bounds=(0.5, 3.0), doc="Emissivity index of the polar dust."
-    )
+    ebv_polar = Parameter(0.1, (0.0, 3.0), "Color excess of the polar dust.", unit="mag")
+    temperature_polar = Parameter(100.0, (20.0, 1500.0), "Temperature of the polar dust.", unit="K")
+    emissivity_polar = Parameter(1.6, (0.5, 3.0), "Emissivity index of the polar dust.")
 
     def torus_spectra(self, wave, values):
         """
@@ -207,19 +197,13 @@ class Skirtor2016(AGN):
     reference = "Stalevski et al. 2012, MNRAS 420, 2756; 2016, MNRAS 458, 2288"
     resource = "torus.skirtor2016"
     tau97 = Parameter(
-        default=7.0, bounds=(3.0, 11.0),
-        doc="Optical depth at 9.7 um along the equator: 3, 5, 7, 9 or 11.",
-    )  # fmt: skip
-    p = Parameter(
-        default=1.0, bounds=(0.0, 1.5), doc="Slope of density with radius: 0, 0.5, 1 or 1.5."
+        7.0, (3.0, 11.0), "Optical depth at 9.7 um along the equator: 3, 5, 7, 9 or 11."
     )
-    q = Parameter(
-        default=1.0, bounds=(0.0, 1.5), doc="Slope of density with angle: 0, 0.5, 1 or 1.5."
-    )
+    p = Parameter(1.0, (0.0, 1.5), "Slope of density with radius: 0, 0.5, 1 or 1.5.")
+    q = Parameter(1.0, (0.0, 1.5), "Slope of density with angle: 0, 0.5, 1 or 1.5.")
     radius_ratio = Parameter(
-        default=20.0, bounds=(10.0, 30.0),
-        doc="Outer over inner radius of the torus: 10, 20 or 30.",
-    )  # fmt: skip
+        20.0, (10.0, 30.0), "Outer over inner radius of the torus: 10, 20 or 30."
+    )
 
     @property
     def table(self):
@@ -229,10 +213,6 @@ class Skirtor2016(AGN):
     def missing(self, **values):
         """Axes on which the library has not these values: see `LibraryTable.missing`."""
         return self.table.missing(**values)
-
-    def covers(self, **values):
-        """Whether the library has these values of its axes, as for `missing`: bool."""
-        return not self.missing(**values)
 
     def invalid(self, values):
         return _refusal(self.path, tuple([float(values[name]) for name in SKIRTOR_AXES]))

@@ -18,7 +18,7 @@ def milky_way(wave, r_v):
     """
     k(lambda) of the Milky Way: Cardelli et al. 1989, the optical part of O'Donnell 1994.
 
-    Given for 0.1-3.33 um (from dust_extinction); the cubic of the far ultraviolet goes on below
+    Given for 0.1-3.33 um (from dust_extinction); the cubic of the far ultraviolet continues below
     and the power law of the infrared has no end.
     """
     import astropy.units as u
@@ -114,12 +114,8 @@ class Attenuation(Component):
 class _Screen(Attenuation):
     """A curve k(lambda) times a color excess, which old stars have a share of."""
 
-    ebv = Parameter(
-        default=0.3, bounds=(0.0, 3.0), unit="mag", doc="Color excess of stars below 10 Myr."
-    )
-    ebv_factor = Parameter(
-        default=1.0, bounds=(0.0, 1.0), doc="Color excess of older stars over that of young ones."
-    )
+    ebv = Parameter(0.3, (0.0, 3.0), "Color excess of stars below 10 Myr.", unit="mag")
+    ebv_factor = Parameter(1.0, (0.0, 1.0), "Color excess of older stars over that of young ones.")
 
     def _law(self, values):
         raise NotImplementedError
@@ -139,17 +135,11 @@ class _Starburst(Attenuation):
     """The starburst curve with a free slope and an ultraviolet bump."""
 
     options = {"ebv_scaling": ("exact", "cigale")}
-    uv_bump = Parameter(
-        default=0.0,
-        bounds=(0.0, 10.0),
-        doc="Amplitude of the ultraviolet bump in k (Milky Way: 3).",
-    )
-    slope = Parameter(default=0.0, bounds=(-1.2, 0.6), doc="Change of the curve's power-law slope.")
-    uv_bump_wavelength = Parameter(
-        default=0.2175, bounds=(0.18, 0.26), unit="um", doc="Center of the bump."
-    )
+    uv_bump = Parameter(0.0, (0.0, 10.0), "Amplitude of the ultraviolet bump in k (Milky Way: 3).")
+    slope = Parameter(0.0, (-1.2, 0.6), "Change of the curve's power-law slope.")
+    uv_bump_wavelength = Parameter(0.2175, (0.18, 0.26), "Center of the bump.", unit="um")
     uv_bump_width = Parameter(
-        default=0.035, bounds=(0.005, 0.1), unit="um", doc="Full width at half maximum of the bump."
+        0.035, (0.005, 0.1), "Full width at half maximum of the bump.", unit="um"
     )
 
     def _law(self, values):
@@ -226,17 +216,11 @@ class ModifiedStarburst(_Starburst):
     )
     packages = ("dust_extinction",)
     options = {"gas_law": ("mw", "lmc", "smc", "mw_pei1992")}
-    ebv_lines = Parameter(
-        default=0.3, bounds=(0.0, 5.0), unit="mag", doc="Color excess of the gas."
-    )
+    ebv_lines = Parameter(0.3, (0.0, 5.0), "Color excess of the gas.", unit="mag")
     ebv_factor_stars = Parameter(
-        default=0.44, bounds=(0.0, 1.0), doc="Color excess of the stars over that of the gas."
+        0.44, (0.0, 1.0), "Color excess of the stars over that of the gas."
     )
-    r_v_gas = Parameter(
-        default=3.1,
-        bounds=(2.0, 6.0),
-        doc="A(V) / E(B-V) of the gas's dust, for gas_law='mw' only.",
-    )
+    r_v_gas = Parameter(3.1, (2.0, 6.0), "A(V) / E(B-V) of the gas's dust, for gas_law='mw' only.")
 
     def factors(self, wave, values):
         """See `Attenuation.factors`; the same for young and old stars."""
@@ -302,20 +286,12 @@ class CharlotFall(Attenuation):
 
     name = "charlot_fall"
     reference = "Charlot & Fall 2000, ApJ 539, 718; Boquien et al. 2019, A&A 622, A103"
-    av_ism = Parameter(
-        default=1.0, bounds=(0.0, 10.0), unit="mag", doc="A_V of the interstellar medium."
-    )
+    av_ism = Parameter(1.0, (0.0, 10.0), "A_V of the interstellar medium.", unit="mag")
     mu = Parameter(
-        default=0.44,
-        bounds=(1e-4, 1.0),
-        doc="A_V of the interstellar medium over that of it and the birth clouds.",
+        0.44, (1e-4, 1.0), "A_V of the interstellar medium over that of it and the birth clouds."
     )
-    slope_ism = Parameter(
-        default=-0.7, bounds=(-3.0, 0.0), doc="Slope of attenuation in the interstellar medium."
-    )
-    slope_bc = Parameter(
-        default=-1.3, bounds=(-3.0, 0.0), doc="Slope of attenuation in the birth clouds."
-    )
+    slope_ism = Parameter(-0.7, (-3.0, 0.0), "Slope of attenuation in the interstellar medium.")
+    slope_bc = Parameter(-1.3, (-3.0, 0.0), "Slope of attenuation in the birth clouds.")
 
     def factors(self, wave, values):
         """See `Attenuation.factors`."""

@@ -80,9 +80,7 @@ class Dale2014(DustEmission):
     reference = "Dale et al. 2014, ApJ 784, 83"
     resource = "dust.dale2014"
     options = {"starlight": ("removed", "kept")}
-    alpha = Parameter(
-        default=2.0, bounds=(0.0625, 4.0), doc="Slope of dust mass in intensity, dM ~ U^-alpha dU."
-    )
+    alpha = Parameter(2.0, (0.0625, 4.0), "Slope of dust mass in intensity, dM ~ U^-alpha dU.")
 
     def nodes(self):
         return open_library(self.path, self.resource).wave
@@ -116,15 +114,9 @@ class Casey2012(DustEmission):
 
     name = "casey2012"
     reference = "Casey 2012, MNRAS 425, 3094"
-    temperature_dust = Parameter(
-        default=35.0, bounds=(10.0, 150.0), unit="K", doc="Temperature of the dust."
-    )
-    emissivity_dust = Parameter(
-        default=1.6, bounds=(0.5, 3.0), doc="Slope beta of the opacity in frequency."
-    )
-    alpha_mir = Parameter(
-        default=2.0, bounds=(1.0, 5.0), doc="Slope of S_nu in wavelength in the mid-infrared."
-    )
+    temperature_dust = Parameter(35.0, (10.0, 150.0), "Temperature of the dust.", unit="K")
+    emissivity_dust = Parameter(1.6, (0.5, 3.0), "Slope beta of the opacity in frequency.")
+    alpha_mir = Parameter(2.0, (1.0, 5.0), "Slope of S_nu in wavelength in the mid-infrared.")
 
     def nodes(self):
         return NODES
@@ -188,9 +180,9 @@ class DraineLi2007(_DraineLi):
     """
 
     name = "dl07"
-    u_min = Parameter(default=1.0, bounds=(0.1, 25.0), doc="Least intensity of starlight.")
-    gamma = Parameter(default=0.02, bounds=(0.0, 1.0), doc="Mass fraction heated by more.")
-    q_pah = Parameter(default=2.5, bounds=(0.47, 4.58), doc="Mass fraction in PAHs, per cent.")
+    u_min = Parameter(1.0, (0.1, 25.0), "Least intensity of starlight.")
+    gamma = Parameter(0.02, (0.0, 1.0), "Mass fraction heated by more.")
+    q_pah = Parameter(2.5, (0.47, 4.58), "Mass fraction in PAHs, per cent.")
 
     @staticmethod
     def mean_intensity(values):
@@ -232,9 +224,7 @@ class DraineLi2007Alpha(_DraineLi):
 
     name = "dl07_alpha"
     reference = "Draine & Li 2007, ApJ 657, 810; alpha after Dale et al. 2014, ApJ 784, 83"
-    alpha = Parameter(
-        default=2.0, bounds=(1.0, 3.5), doc="Slope of dust mass in intensity, as Dale's alpha."
-    )
+    alpha = Parameter(2.0, (1.0, 3.5), "Slope of dust mass in intensity, as Dale's alpha.")
 
     def spectrum(self, values):
         path = self.path

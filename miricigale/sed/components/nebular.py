@@ -16,12 +16,7 @@ from miricigale.utils.units import frozen_array
 __all__ = ["Nebular"]
 
 _KM_S = 1e-9 * _core.LIGHT  # speed of light
-_WIDTH = Parameter(
-    default=300.0,
-    bounds=(1.0, 3000.0),
-    unit="km / s",
-    doc="Full width of the lines at half maximum.",
-)
+_WIDTH = Parameter(300.0, (1.0, 3000.0), "Full width of the lines at half maximum.", unit="km / s")
 _WIDTH.name = "line_width"
 
 
@@ -152,21 +147,17 @@ class Nebular(Component):
     options = {"gas": ("stellar", "free")}
     others = ("metallicity",)
     log_u = Parameter(
-        default=-2.0,
-        bounds=(-4.0, 0.0),
-        doc="Ionization parameter U at the inner edge of the gas, in log; to -3 at Z = 0.05.",
+        -2.0,
+        (-4.0, 0.0),
+        "Ionization parameter U at the inner edge of the gas, in log; to -3 at Z = 0.05.",
     )
     metallicity_gas = Parameter(
-        default=0.02,
-        bounds=(0.0001, 0.05),
-        doc="Metallicity of the gas if gas='free': 0.0001, 0.0004, 0.004, 0.008, 0.02 or 0.05.",
+        0.02,
+        (0.0001, 0.05),
+        "Metallicity of the gas if gas='free': 0.0001, 0.0004, 0.004, 0.008, 0.02 or 0.05.",
     )
-    f_esc = Parameter(
-        default=0.0, bounds=(0.0, 1.0), doc="Share of ionizing photons that leave the galaxy."
-    )
-    f_dust = Parameter(
-        default=0.0, bounds=(0.0, 1.0), doc="Share of ionizing photons that dust absorbs."
-    )
+    f_esc = Parameter(0.0, (0.0, 1.0), "Share of ionizing photons that leave the galaxy.")
+    f_dust = Parameter(0.0, (0.0, 1.0), "Share of ionizing photons that dust absorbs.")
 
     def __init__(self, *, line_width=_WIDTH.default, **defaults):
         super().__init__(**defaults)

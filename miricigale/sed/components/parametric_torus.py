@@ -34,7 +34,7 @@ class ParametricTorus(AGN):
     power, the dust emission stays what it is.
 
     The rest is **not fitted**: ``p`` moves the weight by dm/dlnr ~ r^(3 - p), so c falls by p - 1;
-    ``q`` thins the torus towards the poles, ``tau exp(-q |cos theta|)``; ``opening_angle`` moves the edge;
+    ``q`` thins the torus toward the poles, ``tau exp(-q |cos theta|)``; ``opening_angle`` moves the edge;
     ``radius_ratio`` is the outer end of the integral. Angles outside 20-60 deg are refused: the
     form, fitted at 40 deg, would send out more light face on than any surface can, or take
     less than nothing from the disk.
@@ -43,18 +43,16 @@ class ParametricTorus(AGN):
     name = "parametric_torus"
     reference = "form after Stalevski et al. 2012, 2016, MNRAS 420, 2756; 458, 2288"
     resource = "torus.parametric"
-    tau97 = Parameter(
-        default=7.0, bounds=(1.0, 15.0), doc="Optical depth at 9.7 um along the equator."
-    )
-    p = Parameter(default=1.0, bounds=(0.0, 2.0), doc="Slope of density with radius.")
-    q = Parameter(default=1.0, bounds=(0.0, 2.0), doc="Slope of density with angle.")
+    tau97 = Parameter(7.0, (1.0, 15.0), "Optical depth at 9.7 um along the equator.")
+    p = Parameter(1.0, (0.0, 2.0), "Slope of density with radius.")
+    q = Parameter(1.0, (0.0, 2.0), "Slope of density with angle.")
     opening_angle = Parameter(
-        default=40.0, bounds=(20.0, 60.0), unit="deg",
-        doc="Angle between the equator and the edge of the torus; fitted at 40 deg only.",
-    )  # fmt: skip
-    radius_ratio = Parameter(
-        default=20.0, bounds=(5.0, 40.0), doc="Outer over inner radius of the torus."
+        40.0,
+        (20.0, 60.0),
+        "Angle between the equator and the edge of the torus; fitted at 40 deg only.",
+        unit="deg",
     )
+    radius_ratio = Parameter(20.0, (5.0, 40.0), "Outer over inner radius of the torus.")
 
     def nodes(self):
         high = 30.0 * (1000.0 / 30.0) ** (np.arange(1, 53) / 52)

@@ -14,13 +14,7 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import read_table
 from miricigale.utils.units import to_array
 
-__all__ = [
-    "ConstantSFH",
-    "DelayedSFH",
-    "DoubleExponentialSFH",
-    "StarFormationHistory",
-    "TableSFH",
-]
+__all__ = ["ConstantSFH", "DelayedSFH", "DoubleExponentialSFH", "StarFormationHistory", "TableSFH"]
 
 _RATE = u.Msun / u.yr
 
@@ -30,10 +24,7 @@ class StarFormationHistory(Component):
 
     role = "sfh"
     age = Parameter(
-        default=1.0,
-        bounds=(0.001, 13.7),
-        unit="Gyr",
-        doc="Time since the first stars formed; rounded to 1 Myr.",
+        1.0, (0.001, 13.7), "Time since the first stars formed; rounded to 1 Myr.", unit="Gyr"
     )
 
     def steps(self, values):
@@ -55,14 +46,10 @@ class StarFormationHistory(Component):
 class BurstHistory(StarFormationHistory):
     """Base: histories that may end in an exponential burst."""
 
-    tau = Parameter(default=1.0, bounds=(0.001, 100.0), unit="Gyr", doc="E-folding time.")
-    f_burst = Parameter(default=0.0, bounds=(0.0, 0.99), doc="Mass fraction made in the burst.")
-    age_burst = Parameter(
-        default=0.02, bounds=(0.001, 5.0), unit="Gyr", doc="Time since the burst began."
-    )
-    tau_burst = Parameter(
-        default=0.05, bounds=(0.001, 100.0), unit="Gyr", doc="E-folding time of the burst."
-    )
+    tau = Parameter(1.0, (0.001, 100.0), "E-folding time.", unit="Gyr")
+    f_burst = Parameter(0.0, (0.0, 0.99), "Mass fraction made in the burst.")
+    age_burst = Parameter(0.02, (0.001, 5.0), "Time since the burst began.", unit="Gyr")
+    tau_burst = Parameter(0.05, (0.001, 100.0), "E-folding time of the burst.", unit="Gyr")
 
     def _numbers(self, values):
         """Arguments of the functions in `_core`, times in Myr."""
@@ -112,12 +99,12 @@ class DoubleExponentialSFH(BurstHistory):
     name = "double_exponential"
     reference = "Boquien et al. 2019, A&A 622, A103, sect. 3.1.1"
     tau = Parameter(
-        default=6.0,
-        bounds=(-100.0, 100.0),
+        6.0,
+        (-100.0, 100.0),
+        "E-folding time of the main history; negative: the rate rises; not within 1 Myr of 0.",
         unit="Gyr",
-        doc="E-folding time of the main history; negative: the rate rises; not within 1 Myr of 0.",
     )
-    f_burst = Parameter(default=0.01, bounds=(0.0, 0.99), doc="Mass fraction made in the burst.")
+    f_burst = Parameter(0.01, (0.0, 0.99), "Mass fraction made in the burst.")
 
     def history(self, values):
         return _core.double_exponential_history(*self._numbers(values))
@@ -171,12 +158,12 @@ class TableSFH(StarFormationHistory):
 
     name = "sfh_table"
     reference = "Boquien et al. 2019, A&A 622, A103, sect. 3.1.1"
-    sfh_index = Parameter(default=0, bounds=(0, 9999), doc="Which column of rates, counted from 0.")
+    sfh_index = Parameter(0, (0, 9999), "Which column of rates, counted from 0.")
     age = Parameter(
-        default=1.0,
-        bounds=(0.001, 13.7),
+        1.0,
+        (0.001, 13.7),
+        "Time of observation since the first row; rounded to 1 Myr; default: the table's end.",
         unit="Gyr",
-        doc="Time of observation since the first row; rounded to 1 Myr; default: the table's end.",
     )
 
     def __init__(self, table=None, *, path=None, **defaults):

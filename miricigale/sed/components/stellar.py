@@ -26,10 +26,10 @@ class StellarPopulations(Component):
     imf = ""
 
     separation_age = Parameter(
-        default=_core.YOUNG,
-        bounds=(0.0, 1000.0),
+        _core.YOUNG,
+        (0.0, 1000.0),
+        "Age that parts young from old stars; rounded to 1 Myr.",
         unit="Myr",
-        doc="Age that parts young from old stars; rounded to 1 Myr.",
     )
 
     def metallicities(self):
@@ -141,9 +141,9 @@ class BC03(StellarPopulations):
     resource = "ssp.bc03"
     imf = "Kroupa (inferred)"
     metallicity = Parameter(
-        default=0.02,
-        bounds=(0.0001, 0.05),
-        doc="Mass fraction of metals: 0.0001, 0.0004, 0.004, 0.008, 0.02 (solar) or 0.05.",
+        0.02,
+        (0.0001, 0.05),
+        "Mass fraction of metals: 0.0001, 0.0004, 0.004, 0.008, 0.02 (solar) or 0.05.",
     )
 
     def nodes(self):
@@ -172,9 +172,7 @@ class BC03Library(StellarPopulations):
     reference = "Bruzual & Charlot 2003, MNRAS 344, 1000"
     resource = "ssp.bc03_user"
     metallicity = Parameter(
-        default=0.02,
-        bounds=(0.0001, 0.1),
-        doc="Mass fraction of metals, one of those that the files have.",
+        0.02, (0.0001, 0.1), "Mass fraction of metals, one of those that the files have."
     )
 
     def _library(self):

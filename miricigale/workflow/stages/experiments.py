@@ -7,7 +7,7 @@ import numpy as np
 from astropy.table import QTable
 from scipy import stats
 
-from miricigale import photometry, sed
+from miricigale import fitting, photometry, sed
 from miricigale.evaluation import (
     fraction_interval,
     photoz_metrics,
