@@ -1,5 +1,5 @@
 """
-How kernels are compiled: with a word to the user, and without a cache where none can be kept.
+How kernels are compiled: with a message to the user, and without a cache where none can be kept.
 
 numba compiles a kernel when it is first called and keeps the code on disk, in the folder
 ``NUMBA_CACHE_DIR`` or else beside the source, so that this happens once for each installation. The code of a
@@ -21,8 +21,8 @@ __all__ = ["njit"]
 
 log = logging.getLogger(__name__)
 
-#: What the kernels of a room do, and about how many seconds all of them take to compile.
-_ROOMS = {
+#: What the kernels of a subpackage do, and about how many seconds all of them take to compile.
+_SUBPACKAGES = {
     "depth": ("depths", 5),
     "detector": ("the detector", 15),
     "fitting": ("the fit", 20),
@@ -36,19 +36,19 @@ _ROOMS = {
 
 
 class _Listener(event.Listener):
-    """Says what is compiled, once for each room; compiling is faster without garbage collection."""
+    """Says what is compiled, once for each subpackage; compiling is faster without garbage collection."""
 
     def __init__(self):
-        self.told = set()
+        self.announced = set()
         self.depth = 0
         self.collect = False
 
     # numba calls both with its compiler lock held
     def on_start(self, event):
-        room = event.data["dispatcher"].py_func.__module__.split(".")[1:2]
-        if room and room[0] in _ROOMS and room[0] not in self.told:
-            self.told.add(room[0])
-            log.info("compiling %s, once for each installation, about %d s", *_ROOMS[room[0]])
+        name = event.data["dispatcher"].py_func.__module__.split(".")[1:2]
+        if name and name[0] in _SUBPACKAGES and name[0] not in self.announced:
+            self.announced.add(name[0])
+            log.info("compiling %s, once for each installation, about %d s", *_SUBPACKAGES[name[0]])
         if self.depth == 0:
             self.collect = gc.isenabled()
             gc.disable()
