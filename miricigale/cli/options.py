@@ -4,7 +4,7 @@ import argparse
 
 __all__ = ["GOES_ON", "chosen", "pair", "quantity_in"]
 
-#: What an interrupted command says that goes on where it stopped.
+#: Message of an interrupted command that resumes where it stopped.
 GOES_ON = "stopped; the same command goes on from here"
 
 

@@ -1,1 +1,1 @@
-"""Shelves that every room uses: units, validation, tables, randomness, parallel maps."""
+"""Utilities that every subpackage uses: units, validation, tables, randomness, parallel maps."""

@@ -1,4 +1,4 @@
-"""A folder of files that belong together: written whole or not at all, and what stands in it noted."""
+"""A folder of files that belong together: written completely or not at all, and recorded in a manifest."""
 
 import hashlib
 import json
@@ -195,7 +195,7 @@ class RecordFolder(FileFolder):
             product["sha256"], operator.index(product["bytes"])
 
     def _refuse_foreign(self, *, damaged):
-        """Refuse a folder that is another's, or whose files cannot be told any more."""
+        """Refuse a folder that belongs to something else, or whose files are no longer known."""
         if damaged:
             msg = (
                 f"neither {MANIFEST} nor {SECOND_MANIFEST} in {self.folder} can be read, so that "

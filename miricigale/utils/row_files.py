@@ -380,7 +380,7 @@ def write_rows(path, tables, n_rows, *, id_width=0, overwrite=False):
 
 
 def _fits_rows(table, id_width):
-    """Header and rows of a table as astropy writes it, ids that are text as wide as told."""
+    """Header and rows of a table as astropy writes it, text ids as wide as ``id_width``."""
     if "id" in table.colnames and table["id"].dtype.kind == "U":
         about = table["id"].info.description
         table["id"] = np.asarray(table["id"]).astype(f"U{max(1, id_width // 4)}")

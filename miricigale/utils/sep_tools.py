@@ -2,7 +2,7 @@
 Interface to sep: native byte order, contiguous memory, and explicit defaults.
 
 sep wants C-contiguous arrays in native byte order and knows no NaN; and its ``extract``
-filters with ``filter_type='matched'`` unless told otherwise, which reads the threshold as
+filters with ``filter_type='matched'`` unless specified otherwise, which reads the threshold as
 a filtered signal-to-noise and is not what Source Extractor's ``DETECT_THRESH`` means. The
 functions here take any array, put NaN into the mask, and use ``filter_type='conv'``.
 """

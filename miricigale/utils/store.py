@@ -1,4 +1,4 @@
-"""Files of our own: written whole or not at all; arrays, tables and text in one FITS layout."""
+"""Files of the package: written completely or not at all; arrays, tables and text in one FITS layout."""
 
 import contextlib
 import json

@@ -25,7 +25,7 @@ __all__ = [
 
 
 class Flags(enum.IntFlag):
-    """Base of the flag sets: an IntFlag whose members' docs are told by `describe`."""
+    """Base of the flag sets: an IntFlag whose bits `describe` explains."""
 
     @classmethod
     def describe(cls):

@@ -90,7 +90,7 @@ def read_write(what, options=""):
         See `unified_read`.
     """
     path = "Parameters\n----------\npath : path-like\n    The file.\n"
-    known = "format : str, optional\n    By default told by the suffix of ``path``.\n"
+    known = "format : str, optional\n    By default determined by the suffix of ``path``.\n"
     read = f"""
 Read {what} from a file that `write` made.
 
@@ -116,7 +116,7 @@ OSError
 
 def register(cls, *, read=None, write=None, name="fits"):
     """
-    Register a format of a class; files are told by their suffix.
+    Register a format of a class; files are identified by their suffix.
 
     Parameters
     ----------
