@@ -11,5 +11,4 @@ __getattr__, __dir__, __all__ = lazy_names(
         "run": ("fit_cigale", "read_pcigale_ini"),
         "setup": ("CigaleSetup",),
     },
-    moved={"miricigale.filters": ("cigale_band", "filter_of_band")},
 )

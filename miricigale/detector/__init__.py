@@ -23,8 +23,4 @@ __getattr__, __dir__, __all__ = lazy_names(
         "latent": ("Latent",),
         "ramp": ("Ramp",),
     },
-    moved={
-        "miricigale.depth": ("SaturationForecast", "forecast_table"),
-        "miricigale.instrument": ("DQ",),
-    },
 )

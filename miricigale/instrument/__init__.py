@@ -52,17 +52,4 @@ __getattr__, __dir__, __all__ = lazy_names(
             "tangent_offset",
         ),
     },
-    moved={
-        "miricigale.depth": (
-            "EtcSetup",
-            "etc_limit",
-            "etc_setup",
-            "proposal_limit",
-            "residual_amplitude",
-            "residual_presets",
-            "saturation_forecast",
-            "saturation_time",
-            "scaled_limit",
-        )
-    },
 )

@@ -33,5 +33,4 @@ __getattr__, __dir__, __all__ = lazy_names(
         "surveys": ("YANG2021_DEPTHS",),
         "yang2021": ("Yang2021Photometer",),
     },
-    moved={"miricigale.depth": ("sensitivity", "sensitivity_table")},
 )

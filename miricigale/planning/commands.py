@@ -23,7 +23,7 @@ def plan_table(*, quick=False):
     table : `~astropy.table.QTable`
         A row for each band. Three limits of point sources: ``limit_etc``, the exposure time
         calculator's scaled by the root of the time; ``limit``, of these exposures by
-        `~miricigale.photometry.sensitivity` with the residual pattern
+        `~miricigale.depth.sensitivity` with the residual pattern
         (``residual="etc"``); ``limit_proposal``, of the survey's proposal.
     """
     from astropy.coordinates import SkyCoord

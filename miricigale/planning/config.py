@@ -6,7 +6,7 @@ from typing import ClassVar
 from miricigale.instrument import CEERS_FILTERS, imager_filters, readout_patterns
 from miricigale.utils.exceptions import unknown_name
 from miricigale.workflow.background import LEVELS_DOC, check_levels
-from miricigale.workflow.options import Configuration, option, read_text, require
+from miricigale.workflow.options import Configuration, option, read_text
 from miricigale.workflow.sections import CatalogSection, FitBasics, SedSection
 
 
@@ -228,54 +228,43 @@ class PlanConfig(Configuration):
 
     def __post_init__(self):
         exposures, fit, agn, n = self.exposures, self.fit, self.agn, len(self.exposures.bands)
-        require(n, "exposures", "bands", "must name at least one filter", "none")
-        bands = list(exposures.bands)
-        require(len(set(bands)) == n, "exposures", "bands", "must not repeat", bands)
-        for name in bands:
+        self.check(n, "exposures.bands", "must name at least one filter")
+        self.check_unique("exposures.bands")
+        for name in exposures.bands:
             if name not in imager_filters():
                 raise unknown_name("imaging filter", name, imager_filters())
-        key = "depth" if exposures.depth else "time"
         wanted = f"must have one number, or one per band ({n})"
-        for name in (key, "dithers"):
-            values = getattr(exposures, name)
-            require(len(values) in (1, n), "exposures", name, wanted, len(values))
+        for key in ("depth" if exposures.depth else "time", "dithers"):
+            self.check_length(f"exposures.{key}", (1, n), wanted)
         if not exposures.depth:
             least = min(exposures.time)
-            require(least > 0, "exposures", "time", "must be positive", least)
+            self.check(least > 0, "exposures.time", "must be positive", least)
         wanted = f"must have one number per band ({len(fit.bands)})"
-        require(len(fit.bands) == len(fit.depths), "fit", "depths", wanted, len(fit.depths))
+        self.check_length("fit.depths", (len(fit.bands),), wanted)
         wanted = f"must have one number per fracAGN ({len(agn.frac_agn)})"
-        require(len(agn.shares) == len(agn.frac_agn), "agn", "shares", wanted, len(agn.shares))
-        require(sum(agn.shares) > 0, "agn", "shares", "must not all be 0", list(agn.shares))
-        plain = SedSection().frac_agn
-        wanted = "must be left out: [agn] has the mix"
-        require(self.sed.frac_agn == plain, "sed", "frac_agn", wanted, list(self.sed.frac_agn))
-        for name in ("redshift", "luminosity"):
-            span = getattr(self.sample, name)
+        self.check_length("agn.shares", (len(agn.frac_agn),), wanted)
+        self.check(sum(agn.shares) > 0, "agn.shares", "must not all be 0")
+        good = self.sed.frac_agn == SedSection().frac_agn
+        self.check(good, "sed.frac_agn", "must be left out: [agn] has the mix")
+        for key in ("redshift", "luminosity"):
+            span = getattr(self.sample, key)
             good = len(span) == 2 and span[0] < span[1]
-            require(good, "sample", name, "must be two numbers in order", list(span))
+            self.check(good, f"sample.{key}", "must be two numbers in order")
         background = self.background
         check_levels("background", "level", background.level, n, background.date)
         good = not background.date or background.ra >= 0
-        wanted = "must come with a position (ra, dec)"
-        require(good, "background", "date", wanted, repr(background.date))
+        self.check(good, "background.date", "must come with a position (ra, dec)")
         good = self.noise.kind != "run" or self.noise.run
-        require(good, "noise", "run", "must be a folder with kind = 'run'", "none")
+        self.check(good, "noise.run", "must be a folder with kind = 'run'", "none")
         if self.images.enabled:
-            self._check_images()
+            wanted = "must be left out with [images], which need positions"
+            self.check(not self.sample.luminosity_function, "sample.luminosity_function", wanted)
+            wanted = "must be FASTR1 with [images], as of a run"
+            self.check(exposures.readout == "FASTR1", "exposures.readout", wanted)
         for name in exposures.sets:
-            unknown = [band for band in self.set_bands(name) if band not in bands]
-            wanted = f"must be 'all' or bands of {bands}"
-            require(not unknown, "exposures", "sets", wanted, repr(name))
-
-    def _check_images(self):
-        """What images cannot do."""
-        wanted = "must be left out with [images], which need positions"
-        named = self.sample.luminosity_function
-        require(not named, "sample", "luminosity_function", wanted, repr(named))
-        readout = self.exposures.readout
-        wanted = "must be FASTR1 with [images], as of a run"
-        require(readout == "FASTR1", "exposures", "readout", wanted, repr(readout))
+            good = set(self.set_bands(name)) <= set(exposures.bands)
+            wanted = f"must be 'all' or bands of {list(exposures.bands)}"
+            self.check(good, "exposures.sets", wanted, repr(name))
 
     def set_bands(self, name):
         """Bands of one of the ``sets``, in order of wavelength."""

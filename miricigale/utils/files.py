@@ -1,4 +1,4 @@
-"""Files that others give us: opened, or refused in one sentence that names the file."""
+"""Files of users: opened, or refused in one sentence that names the file."""
 
 import contextlib
 import functools

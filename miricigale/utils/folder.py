@@ -195,8 +195,12 @@ class RecordFolder(FileFolder):
                 checksum, key, record = json.loads(line)
                 if checksum != _checksum({key: record}):
                     continue
-                self.check_record(record)
+                if record is not None:
+                    self.check_record(record)
             except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+                continue
+            if record is None:
+                self.records.pop(key, None)
                 continue
             self._check_names(path, {key: record})
             self.records[key] = record
@@ -320,15 +324,21 @@ class RecordFolder(FileFolder):
         """
         record = {"hash": digest, **notes, "products": products}
         self.records[key] = record
+        self._append(key, record)
+
+    def drop(self, key):
+        """Remove a record and the files that it names."""
+        if key in self.records:
+            self._append(key, None)
+            for name in self.records.pop(key)["products"]:
+                self.path(name).unlink(missing_ok=True)
+
+    def _append(self, key, record):
+        """Append a record to the journal, None for one that is removed."""
         path = self.path(JOURNAL)
         with writing(path), path.open("ab") as file:
             # the first line end closes a line that could not be written wholly
             file.write(f"\n{json.dumps([_checksum({key: record}), key, record])}\n".encode())
-
-    def drop(self, key):
-        """Forget a record and remove the files that it names."""
-        for name in self.records.pop(key, {}).get("products", {}):
-            self.path(name).unlink(missing_ok=True)
 
     def standing_bytes(self):
         """Bytes that files in the folder take, also those of work that was stopped."""

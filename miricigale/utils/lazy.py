@@ -2,10 +2,9 @@
 
 import importlib
 import sys
-import warnings
 
 
-def lazy_names(package, names, *, moved=None):
+def lazy_names(package, names):
     """
     Let a package import its modules when one of their names is first asked for.
 
@@ -15,8 +14,6 @@ def lazy_names(package, names, *, moved=None):
         Name of the package, ``__name__``.
     names : dict of str to tuple of str
         The public names of each module of the package; none for a module that is public itself.
-    moved : dict of str to tuple of str, optional
-        Names that now stand in other packages, by the package: they work, with a warning.
 
     Returns
     -------
@@ -30,15 +27,8 @@ def lazy_names(package, names, *, moved=None):
         __getattr__, __dir__, __all__ = lazy_names(__name__, {"filter": ("Filter",)})
     """
     home = {name: module for module, own in names.items() for name in own or (module,)}
-    gone = {name: other for other, own in (moved or {}).items() for name in own}
 
     def getter(name):
-        if name in gone:
-            msg = f"{package}.{name} has moved: import it from {gone[name]}"
-            from astropy.utils.exceptions import AstropyDeprecationWarning
-
-            warnings.warn(msg, AstropyDeprecationWarning, stacklevel=2)
-            return getattr(importlib.import_module(gone[name]), name)
         if name not in home:
             msg = f"module {package!r} has no attribute {name!r}"
             # with these Python tells the nearest name

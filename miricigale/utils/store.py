@@ -1,4 +1,4 @@
-"""Files of our own: written whole or not at all; arrays, tables and text in one FITS layout."""
+"""Files of the package: written completely or not at all; arrays, tables and text in one FITS layout."""
 
 import contextlib
 import json
@@ -17,7 +17,7 @@ _TEXT = "TEXT"
 
 
 @contextlib.contextmanager
-def replacing(path, *, overwrite=True, sync=False):
+def replacing(path, *, overwrite=True):
     """
     Write a file under a temporary name, and give it its own when it is whole.
 
@@ -27,8 +27,6 @@ def replacing(path, *, overwrite=True, sync=False):
         The file. Its folder exists.
     overwrite : bool, optional
         Whether a file that is there is replaced.
-    sync : bool, optional
-        Whether the content is on the disk before the name is.
 
     Yields
     ------
@@ -49,9 +47,6 @@ def replacing(path, *, overwrite=True, sync=False):
     try:
         with writing(path):
             yield partial
-            if sync:
-                with open(partial, "rb+") as handle:
-                    os.fsync(handle.fileno())
             os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)

@@ -10,7 +10,7 @@ from astropy.utils.exceptions import AstropyDeprecationWarning
 
 from miricigale.utils.exceptions import ConfigError, unknown_name
 from miricigale.workflow.background import check_levels
-from miricigale.workflow.options import Configuration, read_text, require
+from miricigale.workflow.options import Configuration, read_text
 from miricigale.workflow.sections import (
     CatalogSection,
     DetectorSection,
@@ -69,93 +69,74 @@ class StudyConfig(Configuration):
     report: ReportSection = dataclasses.field(default_factory=ReportSection)
 
     def __post_init__(self):
-        exposures, fit, n = self.exposures, self.fit, len(self.exposures.filters)
-        kernels, alpha, pixel = (
-            self.photometry.regularization,
-            self.sed.alpha,
-            self.highres.pixel_scale,
-        )
-        n_patterns = len(exposures.dithers)
+        exposures, fit, perturb = self.exposures, self.fit, self.perturb
+        n = len(exposures.filters)
         wanted = f"must have one pattern, or one per filter ({n})"
-        require(n_patterns in (0, 1, n), "exposures", "dithers", wanted, n_patterns)
+        self.check_length("exposures.dithers", (0, 1, n), wanted)
         lists = any(name.lower().endswith(".pointing") for name in exposures.dithers)
         for key in ("dither_observation", "dither_exposures"):
-            value = getattr(exposures, key)
-            wanted = "must come with a .pointing file in dithers"
-            require(lists or not value, "exposures", key, wanted, value)
+            good = lists or not getattr(exposures, key)
+            self.check(good, f"exposures.{key}", "must come with a .pointing file in dithers")
         for key in ("n_groups", "n_integrations", "n_dithers", "dither_exposures"):
-            values = getattr(exposures, key)
-            wanted = f"must have one number per filter ({n})"
-            require(len(values) in (0, n), "exposures", key, wanted, len(values))
-            least = min(values, default=1)
-            require(least >= 1, "exposures", key, "must be at least 1", least)
-        require(n, "exposures", "filters", "must name at least one filter", "none")
-        names = list(exposures.filters)
-        require(len(set(names)) == n, "exposures", "filters", "must not repeat", names)
-        for section, key, values in (
-            ("sed", "frac_agn", list(self.sed.frac_agn)),
-            ("fit", "sets", list(fit.sets)),
-        ):
-            require(values, section, key, "must have at least one value", "none")
-        for section, key, values in (
-            ("sed", "frac_agn", list(self.sed.frac_agn)),
-            ("fit", "sets", list(fit.sets)),
-            ("fit", "experiments", list(fit.experiments)),
-            ("perturb", "effects", list(self.perturb.effects)),
-            ("perturb", "of", list(self.perturb.of)),
-            ("variants", "images", list(self.variants.images)),
-        ):
-            require(len(set(values)) == len(values), section, key, "must not repeat", values)
+            name = f"exposures.{key}"
+            self.check_length(name, (0, n), f"must have one number per filter ({n})")
+            least = min(getattr(exposures, key), default=1)
+            self.check(least >= 1, name, "must be at least 1", least)
+        self.check(n, "exposures.filters", "must name at least one filter")
+        self.check_unique("exposures.filters")
+        for name, values in (("sed.frac_agn", self.sed.frac_agn), ("fit.sets", fit.sets)):
+            self.check(values, name, "must have at least one value")
+            self.check_unique(name)
+        for name in ("fit.experiments", "perturb.effects", "perturb.of", "variants.images"):
+            self.check_unique(name)
         scene = self.scene
         check_levels("scene", "background", scene.background, n, scene.background_date)
         first = self.sed.frac_agn[0]
-        require(
-            not isinstance(first, str), "sed", "frac_agn", "must begin with a number", repr(first)
-        )
-        require("all" in fit.sets, "fit", "sets", "must have 'all'", list(fit.sets))
-        halves = {"blue", "red"}.intersection(fit.sets)
+        good = not isinstance(first, str)
+        self.check(good, "sed.frac_agn", "must begin with a number", repr(first))
+        self.check("all" in fit.sets, "fit.sets", "must have 'all'")
+        good = n > 1 or not {"blue", "red"}.intersection(fit.sets)
         wanted = "may have 'blue' and 'red' with two filters and more only"
-        require(n > 1 or not halves, "fit", "sets", wanted, list(fit.sets))
-        foreign = sorted(set(self.perturb.of) - set(self.sed.frac_agn), key=str)
+        self.check(good, "fit.sets", wanted)
+        foreign = sorted(set(perturb.of) - set(self.sed.frac_agn), key=str)
         wanted = f"must be out of [sed] frac_agn, {list(self.sed.frac_agn)}"
-        require(not foreign, "perturb", "of", wanted, foreign)
-        lacking = sorted(set(NEEDS_AGN).intersection(self.perturb.effects))
-        with_agn = any(value != 0 for value in perturbed_values(self))
+        self.check(not foreign, "perturb.of", wanted, foreign)
+        lacking = sorted(set(NEEDS_AGN).intersection(perturb.effects))
+        good = not lacking or any(value != 0 for value in perturbed_values(self))
         wanted = f"must have a value above 0 for {lacking}"
-        require(with_agn or not lacking, "perturb", "of", wanted, list(self.perturb.of))
-        perturb, with_image = self.perturb, bool(self.perturb.cutouts)
-        wanted = "must name an image for the effect 'cutouts'"
-        good = with_image or CUTOUTS not in perturb.effects
-        require(good, "perturb", "cutouts", wanted, repr(perturb.cutouts))
-        wanted = "must be empty without the effect 'cutouts'"
-        good = not with_image or {CUTOUTS, ALL}.intersection(perturb.effects)
-        require(good, "perturb", "cutouts", wanted, repr(perturb.cutouts))
-        wanted = "must be empty without an image in cutouts"
-        good = with_image or not perturb.cutouts_psf
-        require(good, "perturb", "cutouts_psf", wanted, repr(perturb.cutouts_psf))
+        self.check(good, "perturb.of", wanted, list(perturb.of))
+        good = perturb.cutouts or CUTOUTS not in perturb.effects
+        self.check(good, "perturb.cutouts", "must name an image for the effect 'cutouts'")
+        good = not perturb.cutouts or {CUTOUTS, ALL}.intersection(perturb.effects)
+        self.check(good, "perturb.cutouts", "must be empty without the effect 'cutouts'")
+        good = perturb.cutouts or not perturb.cutouts_psf
+        self.check(good, "perturb.cutouts_psf", "must be empty without an image in cutouts")
         for key in ("columns", "units"):
             pairs = getattr(self.catalog, key)
             good = all(len(pair.split("=")) == 2 and all(pair.split("=")) for pair in pairs)
-            require(good, "catalog", key, "must have the form 'name=value'", list(pairs))
+            self.check(good, f"catalog.{key}", "must have the form 'name=value'")
+        rates = "with [exposures] kind = 'rates', which have no ramps"
         ramps = exposures.kind == "ramps"
-        wanted = "must be false with [exposures] kind = 'rates', which have no ramps"
-        require(ramps or not self.run.keep_level1b, "run", "keep_level1b", wanted, "true")
-        backend = self.reduction.backend
-        wanted = "must be 'native' with [exposures] kind = 'rates', which have no ramps"
-        require(ramps or backend == "native", "reduction", "backend", wanted, repr(backend))
+        good = ramps or not self.run.keep_level1b
+        self.check(good, "run.keep_level1b", f"must be false {rates}")
+        good = ramps or self.reduction.backend == "native"
+        self.check(good, "reduction.backend", f"must be 'native' {rates}")
+        alpha = self.sed.alpha
         good = len(alpha) == 2 and 0 < alpha[0] <= alpha[1] <= 4
-        require(good, "sed", "alpha", "must be two numbers in order, above 0 to 4", list(alpha))
+        self.check(good, "sed.alpha", "must be two numbers in order, above 0 to 4")
         wanted = f"must be at most the number of MIRI filters ({n})"
-        require(fit.min_detected <= n, "fit", "min_detected", wanted, fit.min_detected)
+        self.check(fit.min_detected <= n, "fit.min_detected", wanted)
         wanted = f"must have one number per band ({len(fit.bands)})"
-        require(len(fit.bands) == len(fit.depths), "fit", "depths", wanted, len(fit.depths))
-        good = self.photometry.method != "yang2021" or pixel == 0.06
-        require(good, "highres", "pixel_scale", "must be 0.06 with method = 'yang2021'", pixel)
-        good = not self.photometry.rivals or pixel == 0.06
-        require(good, "highres", "pixel_scale", "must be 0.06 with [photometry] rivals", pixel)
+        self.check_length("fit.depths", (len(fit.bands),), wanted)
+        photometry, fine = self.photometry, self.highres.pixel_scale == 0.06
+        good = photometry.method != "yang2021" or fine
+        self.check(good, "highres.pixel_scale", "must be 0.06 with method = 'yang2021'")
+        good = not photometry.rivals or fine
+        self.check(good, "highres.pixel_scale", "must be 0.06 with [photometry] rivals")
+        kernels = photometry.regularization
         good = kernels in ("auto", "yang2021") or _is_positive(kernels)
         wanted = "must be 'auto', 'yang2021' or a positive number as text"
-        require(good, "photometry", "regularization", wanted, repr(kernels))
+        self.check(good, "photometry.regularization", wanted)
 
     @classmethod
     def from_dict(cls, values, *, base=None):

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import operator
 import tomllib
 import types
 import typing
@@ -66,6 +67,24 @@ class Configuration:
 
     heading: typing.ClassVar[str]
 
+    def check(self, good, name, wanted, got=None):
+        """Refuse a key ``section.key`` that does not agree with others; its value came, if not ``got``."""
+        section, _, key = name.partition(".")
+        require(good, section, key, wanted, _shown(self._value(name)) if got is None else got)
+
+    def check_length(self, name, lengths, wanted):
+        """Refuse a list whose length is none of ``lengths``; the message has the length."""
+        n = len(self._value(name))
+        self.check(n in lengths, name, wanted, n)
+
+    def check_unique(self, name):
+        """Refuse a list with a repeated value."""
+        values = self._value(name)
+        self.check(len(set(values)) == len(values), name, "must not repeat")
+
+    def _value(self, name):
+        return operator.attrgetter(name)(self)
+
     @classmethod
     def from_dict(cls, values, *, base=None):
         """
@@ -92,8 +111,8 @@ class Configuration:
             raise ConfigError(msg)
         for name, entries in values.items():
             if not isinstance(entries, dict):
-                msg = f"[{name}] must be a section, got {entries!r}"
-                raise ConfigError(msg)
+                label = f"[{name}]"
+                raise _wrong(label, "a section", entries)
             sections[name] = _replace_section(name, sections[name], entries)
         return cls(**sections)
 
@@ -104,11 +123,9 @@ class Configuration:
         for label, text in texts:
             try:
                 config = cls.from_dict(tomllib.loads(text), base=config)
-            except tomllib.TOMLDecodeError as err:
-                msg = f"{label} is not valid TOML: {err}"
-                raise ConfigError(msg) from None
-            except ConfigError as err:
-                msg = f"{label}: {err}"
+            except (tomllib.TOMLDecodeError, ConfigError) as err:
+                what = ":" if isinstance(err, ConfigError) else " is not valid TOML:"
+                msg = f"{label}{what} {err}"
                 raise ConfigError(msg) from None
         return cls.from_dict(overrides, base=config) if overrides else config
 
@@ -122,6 +139,15 @@ class Configuration:
                 lines.append(f"# {entry.metadata['doc']}{_limits_text(entry.metadata)}")
                 lines.append(f"{entry.name} = {toml_value(getattr(section, entry.name))}")
         return "\n".join(lines) + "\n"
+
+
+def _shown(value):
+    """A value as error messages have it."""
+    if isinstance(value, bool):
+        return toml_value(value)
+    if isinstance(value, tuple):
+        return list(value) or "none"
+    return repr(value)
 
 
 def _replace_section(name, section, entries):
@@ -138,13 +164,16 @@ def _replace_section(name, section, entries):
     return dataclasses.replace(section, **changes)
 
 
+def _wrong(label, wanted, value):
+    return ConfigError(f"{label} must be {wanted}, got {value!r}")
+
+
 def _checked(label, value, hint, limits):
     if typing.get_origin(hint) is tuple:
         if limits["single"] and isinstance(value, (int, float, str)):
             value = (value,)
         if not isinstance(value, (list, tuple)):
-            msg = f"{label} must be a list, got {value!r}"
-            raise ConfigError(msg)
+            raise _wrong(label, "a list", value)
         item = typing.get_args(hint)[0]
         return tuple(_checked(label, entry, item, limits) for entry in value)
     if isinstance(hint, types.UnionType):
@@ -155,21 +184,16 @@ def _checked(label, value, hint, limits):
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if type(value) is not hint:
-        msg = f"{label} must be of type {hint.__name__}, got {value!r}"
-        raise ConfigError(msg)
+        raise _wrong(label, f"of type {hint.__name__}", value)
     if hint is float and not math.isfinite(value):
-        msg = f"{label} must be a finite number, got {value!r}"
-        raise ConfigError(msg)
+        raise _wrong(label, "a finite number", value)
     low, high, choices = limits["low"], limits["high"], limits["choices"]
     if choices and value not in choices:
-        msg = f"{label} must be one of {list(choices)}, got {value!r}"
-        raise ConfigError(msg)
+        raise _wrong(label, f"one of {list(choices)}", value)
     # the negated comparison also refuses NaN
     if (low is not None and not value >= low) or (high is not None and not value <= high):
-        msg = f"{label} must be between {low} and {high}, got {value!r}"
-        if high is None:
-            msg = f"{label} must be at least {low}, got {value!r}"
-        raise ConfigError(msg)
+        wanted = f"at least {low}" if high is None else f"between {low} and {high}"
+        raise _wrong(label, wanted, value)
     return value
 
 

@@ -1,15 +1,11 @@
 """Published limits, and the exposure time calculator's set-up against its public description."""
 
-import importlib
-
 import astropy.units as u
 import numpy as np
 import pytest
 from astropy.tests.helper import assert_quantity_allclose
-from astropy.utils.exceptions import AstropyDeprecationWarning
 from numpy.testing import assert_allclose
 
-from miricigale import depth
 from miricigale.depth import (
     etc_limit,
     etc_setup,
@@ -85,19 +81,3 @@ def test_versions_of_the_calculator():
         etc_limit("miri.f770w", "3.0")
     with pytest.raises(KeyError, match=r"no band of the survey 'miri.f560w'"):
         proposal_limit("miri.f560w")
-
-
-@pytest.mark.parametrize(
-    ("package", "name"),
-    [
-        ("instrument", "etc_limit"),
-        ("instrument", "saturation_time"),
-        ("detector", "forecast_table"),
-        ("photometry", "sensitivity"),
-    ],
-)
-def test_names_that_moved_here_work_with_a_warning(package, name):
-    old = importlib.import_module(f"miricigale.{package}")
-    with pytest.warns(AstropyDeprecationWarning, match=f"{name} has moved: import it from"):
-        assert getattr(old, name) is getattr(depth, name)
-    assert name not in dir(old)

@@ -74,6 +74,17 @@ def test_records_outlive_a_kill_at_any_byte_of_the_journal(tmp_path):
     assert set(Parts(folder).records) == {"part-0.txt", "part-2.txt"}
 
 
+def test_a_removed_record_stays_removed_after_a_kill(tmp_path):
+    with Parts(tmp_path) as store:
+        write(store, "part-0.txt", "abc")
+    with Parts(tmp_path) as store:
+        store.drop("part-0.txt")
+        journal = (tmp_path / ".manifest.journal").read_bytes()
+        write(store, "part-0.txt", "abc")
+    (tmp_path / ".manifest.journal").write_bytes(journal)
+    assert Parts(tmp_path).records == {}
+
+
 def test_an_earlier_layout_stays_readable(tmp_path):
     with Parts(tmp_path) as store:
         write(store, "part-0.txt", "abc")

@@ -23,7 +23,7 @@ def test_what_stood_there_stays_when_writing_fails(tmp_path):
         raise RuntimeError(msg)
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
-    with replacing(path, sync=True) as partial:
+    with replacing(path) as partial:
         assert partial.suffix == path.suffix
         partial.write_text("new")
     assert path.read_text() == "new"

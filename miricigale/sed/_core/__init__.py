@@ -1,6 +1,5 @@
 """Arithmetic of spectra: arrays in, arrays out (um, W/um, Myr unless said)."""
 
-# ruff: noqa: F401
 from miricigale.sed._core.attenuation import (
     attenuation_curve,
     leitherer_calzetti,
