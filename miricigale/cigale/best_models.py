@@ -16,8 +16,6 @@ from miricigale.sed.spectrum import distance
 from miricigale.sed.xray_bands import SPAN, XRays, disk_2500
 from miricigale.utils.store import replacing
 
-__all__ = ["best_model_table", "write_best_models"]
-
 _LYMAN = 0.0912  # um
 _LIGHT = 299792458.0  # m/s
 _KEV_UM = (const.h * const.c).to_value(u.keV * u.um)

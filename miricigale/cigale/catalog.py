@@ -14,8 +14,6 @@ from miricigale.utils.missing import negative_errors, plain_floats, without_code
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU
 
-__all__ = ["cigale_columns", "read_cigale_catalog"]
-
 #: All below stands for nothing, besides NaN and the codes of `without_codes`.
 THRESHOLD = -9990.0
 #: Relative error of fluxes without a column of errors.

@@ -7,8 +7,6 @@ import numpy as np
 
 from miricigale.sed.spectrum import distance
 
-__all__ = ["at_their_distances"]
-
 
 def at_their_distances(results, redshift, distances, cosmology):
     """

@@ -9,8 +9,6 @@ import numpy as np
 
 from miricigale.utils.exceptions import ConfigError, DataError
 
-__all__ = ["parse_ini", "parse_values"]
-
 #: Settings other than those of the modules; empty ones count as not given.
 _SPEC = """\
 data_file = string(default="")

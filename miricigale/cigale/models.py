@@ -14,8 +14,6 @@ from miricigale.sed.xray_bands import XRays, disk_2500
 from miricigale.utils.exceptions import ConfigError
 from miricigale.utils.store import replacing
 
-__all__ = ["save_models", "with_agn_parts"]
-
 _MOST = 2_000_000
 
 

@@ -15,8 +15,6 @@ from miricigale.sed.xray_bands import ALPHA_OX
 from miricigale.utils.exceptions import ConfigError
 from miricigale.utils.files import read_table
 
-__all__ = ["Chain", "read_modules"]
-
 #: Parameters of CIGALE that do not change a model's spectrum here or there.
 _WITHOUT_EFFECT = {
     "sfhdelayed": ("sfr_A", "normalise"),

@@ -2,8 +2,6 @@
 
 import astropy.units as u
 
-__all__ = ["AGN_PARTS", "cigale_names", "unit_of"]
-
 #: Parts of an AGN's light, by their names in `~miricigale.sed.components.AGNTemplates`: our name of the
 #: luminosity, which models do not have by themselves, and CIGALE's.
 AGN_PARTS = {

@@ -12,8 +12,6 @@ from miricigale.fitting.samplers.run import chi2_at
 from miricigale.utils.exceptions import MiricigaleWarning
 from miricigale.utils.parallel import chunks
 
-__all__ = ["N_DRAWS", "near_relation"]
-
 #: Just et al. 2007, ApJ 665, 1004, equation 3: slope and offset, for erg/s/Hz.
 _JUST = (-0.137, 2.638)
 #: Draws of each object, and objects whose draws are in memory at once.

@@ -14,8 +14,6 @@ from miricigale.utils.files import read_table
 from miricigale.utils.store import replacing
 from miricigale.utils.tables import error_column
 
-__all__ = ["read_cigale_results", "write_cigale_results"]
-
 _CHI2 = ("best.chi_square", "best.reduced_chi_square")
 
 

@@ -13,8 +13,6 @@ from miricigale.filters.band_names import band_filters, given_filters, xray_ener
 from miricigale.utils.exceptions import ConfigError, MiricigaleWarning, argument_error
 from miricigale.utils.tables import error_column
 
-__all__ = ["fit_cigale", "read_pcigale_ini"]
-
 
 def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
     """

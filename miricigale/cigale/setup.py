@@ -21,8 +21,6 @@ from miricigale.sed.xray_bands import with_xray_bands, xray_filter
 from miricigale.utils.exceptions import ConfigError, argument_error
 from miricigale.utils.tables import require_columns
 
-__all__ = ["CigaleSetup"]
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CigaleSetup:

@@ -1,26 +1,5 @@
 """From light to counts: the detector, its effects and the ramps it makes."""
 
-from miricigale.utils.lazy import lazy_names
+import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_names(
-    __name__,
-    {
-        "collected": ("Charge",),
-        "detector": ("Detector",),
-        "effects.base": ("Block", "Effect", "OtherEffect"),
-        "effects.charge": (
-            "BadPixels",
-            "CosmicRays",
-            "Dark",
-            "InterpixelCapacitance",
-            "Persistence",
-            "ReferencePixels",
-            "Saturation",
-        ),
-        "effects.light": ("Photons", "Residual"),
-        "effects.readout": ("ADConversion", "Bias", "Nonlinearity", "ReadNoise"),
-        "effects.reset": ("FirstFrame", "LastFrame", "ResetAnomaly", "ResetDecay"),
-        "latent": ("Latent",),
-        "ramp": ("Ramp",),
-    },
-)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -8,8 +8,6 @@ from miricigale.detector.effects.readout import Bias, Nonlinearity, ReadNoise
 from miricigale.detector.effects.reset import FirstFrame, LastFrame, ResetAnomaly
 from miricigale.instrument import DetectorProperties, Exposure
 
-__all__ = ["Charge"]
-
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Charge:

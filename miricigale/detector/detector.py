@@ -29,8 +29,6 @@ from miricigale.utils.parallel import check_memory
 from miricigale.utils.random import check_seed
 from miricigale.utils.units import SURFACE_BRIGHTNESS
 
-__all__ = ["Detector"]
-
 logger = logging.getLogger(__name__)
 
 #: What acts unless it is asked for more.

@@ -10,8 +10,6 @@ from miricigale.instrument import Exposure, ImageFacts
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
 
-__all__ = ["checked_light"]
-
 # pixels by which the image may lie off the exposure
 _PLACE = 0.1
 

@@ -10,8 +10,6 @@ from miricigale.instrument import DQ, aperture, miri_detector
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import TIME, Frozen, frozen_array, to_array
 
-__all__ = ["Latent", "checked_previous"]
-
 # pixels of a ramp without information on the light
 _NO_LIGHT = DQ.DO_NOT_USE | DQ.NON_SCIENCE | DQ.REFERENCE_PIXEL | DQ.DEAD
 

@@ -21,8 +21,6 @@ from astropy.time import Time, TimeDelta
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.store import plain_value, replacing
 
-__all__ = ["header", "row_writer", "write"]
-
 _ASDF = (
     b"#ASDF 1.0.0\n#ASDF_STANDARD 1.6.0\n%YAML 1.1\n%TAG ! tag:stsci.edu:asdf/\n"
     b"--- !core/asdf-1.1.0\nmeta: {}\n...\n"

@@ -10,8 +10,6 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_kind
 from miricigale.utils.units import DN
 
-__all__ = ["Ramp"]
-
 
 def _read_only(array):
     view = array.view()

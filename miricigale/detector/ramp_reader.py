@@ -22,8 +22,6 @@ from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import open_fits
 from miricigale.utils.parallel import check_memory
 
-__all__ = ["read"]
-
 _WANTED = "a ramp of the MIRI imager"
 
 # bytes converted at a time

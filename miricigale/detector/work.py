@@ -18,8 +18,6 @@ from miricigale.detector.effects.light import Photons, Residual
 from miricigale.instrument import DetectorProperties, Exposure
 from miricigale.utils.parallel import chunks, parallel_map, threads
 
-__all__ = ["Work"]
-
 #: What makes the charge of a pixel, whenever it comes within the exposure; cosmic rays apart.
 _COLLECTING = (
     Residual,

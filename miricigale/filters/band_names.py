@@ -11,15 +11,6 @@ from miricigale.filters.filter import Filter
 from miricigale.filters.library import SEDPY, curve_folder
 from miricigale.utils.exceptions import argument_error
 
-__all__ = [
-    "band_filters",
-    "cigale_band",
-    "filter_of_band",
-    "given_filters",
-    "is_line",
-    "xray_energies",
-]
-
 _XRAY = re.compile(r"xray_boxcar_(\d+(?:p\d+)?)to(\d+(?:p\d+)?)keV")
 
 

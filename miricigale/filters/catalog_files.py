@@ -12,15 +12,6 @@ from miricigale.utils.files import read_table
 from miricigale.utils.missing import plain_floats, without_codes
 from miricigale.utils.tables import error_column
 
-__all__ = [
-    "MappedRows",
-    "as_catalog_map",
-    "codes_of",
-    "read_catalog_photometry",
-    "told_of",
-    "warn_of_codes",
-]
-
 #: Bands whose missing values are counted one by one in a message.
 _FEW = 8
 

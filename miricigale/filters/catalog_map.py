@@ -19,8 +19,6 @@ from miricigale.utils.missing import negative_errors, plain_floats, without_code
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU
 
-__all__ = ["CatalogMap"]
-
 #: Unit that a column without any has.
 _DEFAULT_UNITS = {"ra": u.deg, "dec": u.deg, "position_angle": u.deg}
 #: Names of AB magnitudes as a unit.

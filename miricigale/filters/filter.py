@@ -13,8 +13,6 @@ from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import unpacked_size
 from miricigale.utils.units import FNU, WAVE, Frozen, frozen_array, frozen_quantity, to_array
 
-__all__ = ["Filter"]
-
 #: Version of the band averages: raised when the same curve gives other numbers.
 VERSION = 1
 

@@ -11,8 +11,6 @@ from miricigale.filters.library import full_name
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.units import FNU, WAVE
 
-__all__ = ["FilterSet", "filter_table"]
-
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class FilterSet:

@@ -11,8 +11,6 @@ from miricigale.refdata import Registry, citations
 from miricigale.utils.exceptions import DataError, unknown_name
 from miricigale.utils.units import WAVE
 
-__all__ = ["FILTERS", "full_name", "load_curve"]
-
 _RESOURCE = "filters.sedpy"
 
 _MIRI = "f560w f770w f1000w f1130w f1280w f1500w f1800w f2100w f2550w"

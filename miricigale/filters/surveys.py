@@ -10,8 +10,6 @@ from miricigale.filters.library import full_name
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.tables import error_column
 
-__all__ = ["SURVEYS", "is_band"]
-
 
 @dataclasses.dataclass(frozen=True)
 class _Survey:

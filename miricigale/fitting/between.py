@@ -20,8 +20,6 @@ from miricigale.fitting.quantities import DERIVED_LEVELS, draws_summary
 from miricigale.fitting.samplers.run import best_scale, chi2_at, systematic_draws
 from miricigale.utils.random import stream
 
-__all__ = ["Between"]
-
 #: Least variance of a scale.
 _TINY = 1e-290
 #: Part of the population that the weights of a step may leave effective, and moves in each.

@@ -15,15 +15,6 @@ from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.tables import described_table, error_column, require_columns
 from miricigale.utils.units import FNU, WAVE, frozen_array, to_array
 
-__all__ = [
-    "TemplateError",
-    "apply_zero_points",
-    "calibrate_zero_points",
-    "measure_band_errors",
-    "measure_priors",
-    "measure_template_error",
-]
-
 #: Fluxes of lower S/N say more of their noise than of the models.
 _LEAST_SIGNAL = 5.0
 #: Least number of such fluxes for what is measured by band, and in a bin of rest wavelength.

@@ -15,8 +15,6 @@ from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import described_table, error_column, read_ids, require_columns
 from miricigale.utils.units import FNU, frozen_array
 
-__all__ = ["LeaveOutResult", "MockResult", "leave_out", "mock_analysis"]
-
 _LEVELS = (0.16, 0.84)
 
 

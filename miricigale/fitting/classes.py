@@ -12,8 +12,6 @@ from miricigale.pages import number
 from miricigale.plotting.axes import WIDTH, new_figure
 from miricigale.utils.row_files import write_rows
 
-__all__ = ["classes_of", "classes_section", "fit_classes", "write_table"]
-
 #: Objects of each class but the first that a page lists, those of the highest ratio.
 _LISTED = 10
 #: ln ratio beyond which a class is called sure (odds of 150 to 1).

@@ -5,8 +5,6 @@ import numpy as np
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import described_table
 
-__all__ = ["class_columns", "compare_classes"]
-
 
 def compare_classes(results, *, prior=None):
     r"""

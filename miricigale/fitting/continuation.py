@@ -8,8 +8,6 @@ import numpy as np
 from miricigale.fitting.interpolation import Nodes, Place, less_factor
 from miricigale.fitting.posterior import cell_edges
 
-__all__ = ["Continuation"]
-
 #: Least flux, and least part of a prior.
 _TINY, _LEAST = 1e-290, 1e-9
 #: Part of the steps of AGN light that widens errors: some AGN have little light compared with the galaxy's.

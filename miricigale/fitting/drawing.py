@@ -8,16 +8,6 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import described_table
 from miricigale.utils.units import FNU
 
-__all__ = [
-    "best_parameters",
-    "best_sed",
-    "labeled",
-    "plot_pdf",
-    "plot_pdf2d",
-    "plot_sed",
-    "samples",
-]
-
 
 def samples(results, key):
     """

@@ -26,8 +26,6 @@ from miricigale.utils.parallel import chunks, parallel_map, single_threaded
 from miricigale.utils.random import check_seed
 from miricigale.utils.units import check_count, is_number
 
-__all__ = ["BayesFitter"]
-
 logger = logging.getLogger(__name__)
 
 

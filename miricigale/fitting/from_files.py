@@ -11,8 +11,6 @@ from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.row_files import open_rows
 from miricigale.utils.tables import error_column
 
-__all__ = ["fit_catalog", "open_catalog"]
-
 log = logging.getLogger(__name__)
 
 

@@ -11,8 +11,6 @@ from miricigale.fitting import _core
 from miricigale.fitting.posterior import cell_edges
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["GridEngine", "GridOutput"]
-
 #: Runs of up to 64 pairs listed at once by one worker (260 bytes each).
 _CAPACITY = 1 << 16
 #: Part of ``rtol`` that the weight of what is left out may have.

@@ -32,8 +32,6 @@ from miricigale.utils.parallel import chunks, parallel_map
 from miricigale.utils.random import stream
 from miricigale.utils.units import MASS
 
-__all__ = ["GridFit"]
-
 #: Best chi2 above which exp(-chi2 / 2) is below the smallest normal number for every model.
 VANISHING_CHI2 = 1417.0
 #: Numbers of joint sums that a piece may have at once (32 MB).

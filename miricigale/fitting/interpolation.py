@@ -20,8 +20,6 @@ from miricigale.sed import ModelFlags
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import MASS
 
-__all__ = ["Nodes", "Place", "finer_grid", "less_factor"]
-
 #: Powers of a parameter that may be its scale; those below 0 with the sign changed.
 _POWERS = (1.0, 0.5, 0.1, -0.5)
 #: Fluxes below this part of a model's brightest band are interpolated as if they were it.

@@ -20,19 +20,6 @@ from miricigale.utils.store import native, open_parts, write_parts
 from miricigale.utils.tables import ascii_ids
 from miricigale.utils.unified import register
 
-__all__ = [
-    "FORMAT",
-    "FitFolder",
-    "FitResultsFiles",
-    "open_results",
-    "part_ids",
-    "part_name",
-    "read_results",
-    "read_samples",
-    "write_results",
-    "write_samples",
-]
-
 #: Layout of a folder of `fit_file`.
 FORMAT = "miricigale-fitparts-2"
 _OLD_FORMAT = "miricigale-fitparts-1"

@@ -12,18 +12,6 @@ from miricigale.utils.object_rows import ObjectRows, PerObject
 from miricigale.utils.tables import Flags, error_column, read_ids, require_columns
 from miricigale.utils.units import FNU, to_array
 
-__all__ = [
-    "FitData",
-    "FitFlags",
-    "PhotometryReader",
-    "filter_names",
-    "flags_of_fits",
-    "flux_column",
-    "limits",
-    "per_band",
-    "unused_bands",
-]
-
 #: S/N of the best model in all bands together below which an object is flagged.
 LOW_SIGNAL = 3.0
 #: Least error in units of the flux: below it chi2 in double precision has no digits left.

@@ -17,8 +17,6 @@ from miricigale.pages import Page, number
 from miricigale.plotting.axes import WIDTH, new_figure
 from miricigale.plotting.comparison import plot_redshifts
 
-__all__ = ["fit_page"]
-
 #: Examples on the page, and points in a drawing.
 _EXAMPLES, _POINTS = 6, 5000
 _COLOR, _SECOND = "#1d4ed8", "#c2410c"

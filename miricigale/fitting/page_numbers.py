@@ -7,8 +7,6 @@ import numpy as np
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing import plain_floats
 
-__all__ = ["KNOWN_REDSHIFTS", "FitNumbers", "known_redshifts"]
-
 #: Columns that hold known redshifts, the first that is there.
 KNOWN_REDSHIFTS = ("z_spec", "zspec", "z_true", "redshift_spec", "redshift")
 

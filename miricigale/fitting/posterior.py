@@ -4,19 +4,6 @@ import numpy as np
 
 from miricigale.utils.exceptions import argument_error, unknown_name
 
-__all__ = [
-    "bin_cells",
-    "cell_edges",
-    "cell_percentiles",
-    "check_levels",
-    "check_pairs",
-    "joint_names",
-    "joint_tables",
-    "moments",
-    "node_cells",
-    "randomized_ranks",
-]
-
 _ROWS = 256  # searched at once; more would cost digits
 #: Letters of the engine's joint sums: redshift and fraction before galaxy, galaxy before AGN model.
 _LETTERS = {"redshift": "z", "frac_agn": "f", "galaxy": "g", "agn": "k"}

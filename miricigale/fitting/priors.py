@@ -12,21 +12,6 @@ from miricigale.fitting.quantities import plain
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.units import MASS, is_number, to_array
 
-__all__ = [
-    "GridAxis",
-    "GridPriors",
-    "density_log_prior",
-    "expected_sfr",
-    "fixed_log_prior",
-    "grid_priors",
-    "integrals",
-    "integrals_to",
-    "known_redshifts",
-    "magnitude_prior",
-    "read_density",
-    "sfr_log_prior",
-]
-
 
 @dataclass(frozen=True, eq=False)
 class GridAxis:

@@ -11,19 +11,6 @@ from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.random import stream
 from miricigale.utils.units import LUMINOSITY, MASS
 
-__all__ = [
-    "DERIVED_LEVELS",
-    "ModelValues",
-    "OtherFraction",
-    "Quantities",
-    "ShapeQuantities",
-    "check_draws",
-    "draws_summary",
-    "kept_percentiles",
-    "plain",
-    "unit_of",
-]
-
 #: Levels at which the distributions of derived quantities are kept.
 DERIVED_LEVELS = np.array(
     [0.001, 0.005, 0.01, 0.025, 0.05, 0.1, 0.16, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5]

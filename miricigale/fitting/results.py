@@ -16,8 +16,6 @@ from miricigale.utils.tables import described_table, error_column
 from miricigale.utils.unified import read_write
 from miricigale.utils.units import FNU
 
-__all__ = ["FitResults"]
-
 _LEVELS = (0.16, 0.5, 0.84)
 #: Part of the mean below which CIGALE gives no standard deviation.
 CIGALE_LEAST_STD = 0.05

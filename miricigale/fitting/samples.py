@@ -18,8 +18,6 @@ from miricigale.utils.tables import described_table, error_column
 from miricigale.utils.unified import read_write
 from miricigale.utils.units import FNU, WAVE
 
-__all__ = ["Samples"]
-
 _LEVELS = (0.16, 0.5, 0.84)
 
 

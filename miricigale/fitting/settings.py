@@ -6,8 +6,6 @@ from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import check_count, is_number
 
-__all__ = ["GridSettings", "SamplerSettings"]
-
 
 @dataclass(frozen=True)
 class GridSettings:

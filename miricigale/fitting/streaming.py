@@ -25,8 +25,6 @@ from miricigale.utils.store import plain_value
 from miricigale.utils.tables import ascii_ids, error_column, read_ids, require_columns
 from miricigale.utils.units import FNU
 
-__all__ = ["fit_file"]
-
 logger = logging.getLogger(__name__)
 
 _PACKAGES = ("miricigale", "numpy", "numba", "astropy")

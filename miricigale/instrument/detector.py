@@ -12,15 +12,6 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.units import frozen_array
 
-__all__ = [
-    "DetectorProperties",
-    "bad_pixel_mask",
-    "field_mask",
-    "flat_field",
-    "miri_detector",
-    "reference_pixel_mask",
-]
-
 # Our own detector is one and the same everywhere: its pixels are drawn with this seed
 _SEED = 56075
 

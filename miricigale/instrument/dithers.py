@@ -15,8 +15,6 @@ from miricigale.utils.files import read_table, unpacked_size
 from miricigale.utils.tables import require_columns
 from miricigale.utils.units import ANGLE, to_array
 
-__all__ = ["dither_offsets", "dither_patterns", "read_dithers", "tile_offsets"]
-
 # sides of the pixel at the reference, arcsec (SIAF)
 _PIXEL = (0.110497, 0.111336)
 

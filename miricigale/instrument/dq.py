@@ -5,8 +5,6 @@ import numpy as np
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.tables import Flags
 
-__all__ = ["DQ", "dq_legend", "dq_planes", "read_dq", "with_own_bits"]
-
 
 class DQ(Flags):
     """

@@ -16,8 +16,6 @@ from miricigale.instrument.wcs import imager_wcs, scalar_position, tangent_offse
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.units import to_array
 
-__all__ = ["CEERS_FILTERS", "Exposure", "ceers_exposures", "frame_time", "readout_patterns"]
-
 #: Bands of the CEERS/MIRI imaging.
 CEERS_FILTERS = (
     "miri.f770w",

@@ -6,8 +6,6 @@ import tomllib
 from miricigale.refdata import locate
 from miricigale.utils.exceptions import unknown_name
 
-__all__ = ["imager_filters"]
-
 
 @functools.cache
 def table(name="imager"):

@@ -5,8 +5,6 @@ import numbers
 
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["ImageFacts"]
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ImageFacts:

@@ -12,8 +12,6 @@ from miricigale.utils.files import open_fits, write_fits
 from miricigale.utils.meta import undated
 from miricigale.utils.store import plain_value
 
-__all__ = ["json_meta", "read_image", "write_image"]
-
 
 def json_meta(meta):
     """The meta dictionary of an image as JSON, without dates; a quantity keeps its unit as text."""

@@ -2,8 +2,6 @@
 
 from astropy.io import fits
 
-__all__ = ["READOUT_NAMES", "STEPS", "exposure_keywords", "joined_header", "steps_done"]
-
 #: Read-out patterns by the names that they had before the launch.
 READOUT_NAMES = {"FAST": "FASTR1", "SLOW": "SLOWR1"}
 

@@ -12,15 +12,6 @@ from miricigale.refdata import locate
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.units import SURFACE_BRIGHTNESS, WAVE, to_array
 
-__all__ = [
-    "background_level",
-    "background_spectrum",
-    "electron_rate",
-    "electrons_per_brightness",
-    "photmjsr",
-    "psf_fwhm",
-]
-
 #: Factor on the low zodiacal light for each name that ``zodi`` may have.
 _ZODI = {"none": 0.0, "low": 1.0}
 

@@ -14,16 +14,6 @@ import numpy as np
 from miricigale.instrument.figures import table
 from miricigale.utils.exceptions import argument_error, unknown_name
 
-__all__ = [
-    "Aperture",
-    "aperture",
-    "attitude_matrix",
-    "imager_columns",
-    "pixel_to_v2v3",
-    "subarrays",
-    "v2v3_to_sky",
-]
-
 _ARCSEC = np.pi / 180 / 3600
 
 

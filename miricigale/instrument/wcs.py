@@ -16,15 +16,6 @@ from miricigale.instrument.siaf import (
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import positive, to_array
 
-__all__ = [
-    "imager_wcs",
-    "mosaic_wcs",
-    "north_up_wcs",
-    "pixel_area_map",
-    "pixel_to_sky",
-    "tangent_offset",
-]
-
 _SIP_ORDER = 5
 _SIP_INVERSE_ORDER = 8
 

@@ -8,8 +8,6 @@ from miricigale.photometry import _core
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.profiles import ellipse_to_pixels, sersic_stamp
 
-__all__ = ["RIM", "Cutout", "convolve_padded", "own_segments", "sersic_cutouts"]
-
 #: Rim of zeros around fine stamps, for the splines and the pixel response to fade in.
 RIM = 8
 

@@ -10,8 +10,6 @@ from miricigale.photometry.flags import POOR_CHI2, POOR_STRAIN, ForcedFlags
 from miricigale.photometry.residual_sources import ResidualPeaks, residual_peaks
 from miricigale.utils.parallel import chunks
 
-__all__ = ["Diagnostics", "diagnose", "source_flags"]
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Diagnostics:

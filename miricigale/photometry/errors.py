@@ -12,15 +12,6 @@ from miricigale.photometry import _core
 from miricigale.photometry.templates import batches
 from miricigale.utils.parallel import chunks, parallel_map
 
-__all__ = [
-    "LinearFit",
-    "cross_matrix",
-    "noise_correlation",
-    "normal_matrix",
-    "sandwich_matrix",
-    "stated_correlation",
-]
-
 
 def noise_correlation(
     residual, usable, *, weight=None, max_lag=8, clip=5.0, significance=3.0, executor=None

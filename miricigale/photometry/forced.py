@@ -26,8 +26,6 @@ from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.parallel import single_threaded, thread_count, threads
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, positive, to_array
 
-__all__ = ["ForcedPhotometer"]
-
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class ForcedPhotometer:

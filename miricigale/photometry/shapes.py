@@ -7,8 +7,6 @@ import scipy.fft
 
 from miricigale.photometry import _core
 
-__all__ = ["FITTED", "Shape", "ShapeFitter", "ShapeModels", "not_fitted"]
-
 #: What is known of shapes beforehand (mean and width): ln of the circularised half-light radius
 #: (arcsec), ln of the Sersic index, the two ellipticities, and the offset of the center (pixels).
 _RADIUS, _INDEX, _ELLIPTICITY, _OFFSET = (np.log(0.2), 0.8), (np.log(1.8), 0.8), 0.6, 0.7

@@ -9,8 +9,6 @@ from miricigale.photometry import _core
 from miricigale.photometry.cutouts import Cutout
 from miricigale.photometry.shapes import ShapeModels
 
-__all__ = ["Change", "TemplateChanges"]
-
 #: Half-width (fine pixels) of the stamps of changes, least and most, in half-light radii and in rms
 #: widths of the PSF.
 _HALF, _MOST, _REACH, _WIDTHS = 16, 160, 5.0, 4.0

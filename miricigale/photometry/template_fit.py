@@ -16,8 +16,6 @@ from miricigale.utils.exceptions import MiricigaleWarning
 from miricigale.utils.parallel import chunks
 from miricigale.utils.units import ANGLE
 
-__all__ = ["TemplateFit", "inner"]
-
 #: Squared cosine between two components from which their sum alone is measured: errors of each are then
 #: ten times that of the sum, and a template that is a few percent wrong says all of the difference.
 _SEPARABLE = 0.99

@@ -10,8 +10,6 @@ from miricigale.photometry import _core
 from miricigale.photometry.cutouts import RIM, convolve_padded
 from miricigale.utils.parallel import parallel_map
 
-__all__ = ["BankSources", "Block", "FineTemplates", "TemplateBank", "batches"]
-
 #: Pixels of the stamps that a thread works on at a time.
 _PART = 250_000
 

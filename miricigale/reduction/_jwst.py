@@ -13,8 +13,6 @@ from miricigale.reduction.rampfit import fit_result
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.optional import require
 
-__all__ = ["fit_steps"]
-
 #: Gain that stands for none: no photon noise.
 _NO_NOISE = 1e12
 

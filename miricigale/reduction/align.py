@@ -17,8 +17,6 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_positive
 from miricigale.utils.units import ANGLE, positive
 
-__all__ = ["Alignment", "align_images", "align_to_catalog"]
-
 # pairs vote for the shift within this radius, and are matched within it after the shift, arcsec
 _VOTE = 0.1
 # sources to solve for a shift, and for a rotation too

@@ -11,8 +11,6 @@ from miricigale.reduction.reference_maps import read_flat, read_photom
 from miricigale.reduction.references import BRIGHTNESS, SLOPES, STEP_OF, needed, own_maps
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 
-__all__ = ["brightness_of", "history_of", "is_own", "maps_of", "middle_of"]
-
 _OWN = "of the simulated detector"
 
 

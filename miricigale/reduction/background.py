@@ -15,14 +15,6 @@ from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.options import check_choice, check_least, check_positive
 from miricigale.utils.tables import Flags
 
-__all__ = [
-    "Background",
-    "BackgroundFlags",
-    "estimate_background",
-    "remove_background",
-    "subtract_background",
-]
-
 #: Which noise determines what lies far below the background.
 NEGATIVE_NOISES = ("larger", "background")
 

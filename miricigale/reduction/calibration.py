@@ -9,8 +9,6 @@ from miricigale.reduction.images import flag_pixels, plain_flags, plain_mask, si
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS
 
-__all__ = ["calibrate", "find_cosmic_rays"]
-
 # mean scale of the imager's pixels, to turn a FWHM into pixels; the detection kernel
 # needs no more accuracy
 _PIXEL_SCALE = 0.1109

@@ -10,8 +10,6 @@ from miricigale.reduction.results import ReductionResult
 from miricigale.reduction.sky_match import match_levels
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["combine", "drizzle", "subtract_dithers"]
-
 
 def drizzle(settings, images, wcs):
     """

@@ -14,8 +14,6 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.parallel import chunks
 from miricigale.utils.units import ANGLE
 
-__all__ = ["dither_backgrounds", "restored"]
-
 # rows of which the median of many images is taken together
 _ROWS = 128
 # the mask of the mosaic is widened by this many pixels: images are sharper or wider than it

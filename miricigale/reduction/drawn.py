@@ -16,8 +16,6 @@ from miricigale.reduction._core.drawing import draw_slopes, hit_slopes, tabulate
 from miricigale.reduction.rampfit import fit_result, threshold
 from miricigale.utils.random import stream
 
-__all__ = ["draw_groups"]
-
 # nodes of the tables by rate and by slope; they are even in its fourth root
 _NODES = 1024
 _SLOPES = 4096

@@ -37,8 +37,6 @@ from miricigale.utils.optional import require
 from miricigale.utils.parallel import check_memory
 from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS
 
-__all__ = ["ImageFile", "open_exposure", "read_images", "write_image"]
-
 _WANTED = "an image of JWST (FITS with SCI)"
 
 #: Planes beside the image, its errors and its flags.

@@ -27,8 +27,6 @@ from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.progress import progress
 from miricigale.utils.units import ANGLE, SURFACE_BRIGHTNESS, to_array
 
-__all__ = ["reduce_files"]
-
 log = logging.getLogger(__name__)
 
 #: Changes with what the products hold.

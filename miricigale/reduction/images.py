@@ -8,21 +8,6 @@ from miricigale.instrument import DQ, ImageFacts
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import SURFACE_BRIGHTNESS
 
-__all__ = [
-    "DQ",
-    "check_images",
-    "check_overlap",
-    "exposure_values",
-    "flag_pixels",
-    "image",
-    "overlaps",
-    "plain_flags",
-    "plain_mask",
-    "seen_wcs",
-    "sigma",
-    "with_data",
-]
-
 
 def image(data, unit, *, error, flags, wcs, meta):
     """Make an image that is masked where its flags say so, or where it is not finite."""

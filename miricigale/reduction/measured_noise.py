@@ -7,8 +7,6 @@ import numpy as np
 from miricigale.instrument import DQ
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["MeasuredNoise", "measure_noise"]
-
 # pixels that are looked at, at most
 _PIXELS = 60_000
 

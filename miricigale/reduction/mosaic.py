@@ -25,15 +25,6 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_least, check_positive
 from miricigale.utils.parallel import chunks
 
-__all__ = [
-    "Mosaic",
-    "drizzle_images",
-    "noise_correction",
-    "pixel_map",
-    "reject_outliers",
-    "weight_map",
-]
-
 # rows of a grid of which the median of many images is taken together
 _ROWS = 256
 # nodes of the grid on which a distorted WCS is evaluated; between them bicubic splines

@@ -24,8 +24,6 @@ from miricigale.reduction.showers import find_showers
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.parallel import chunks, parallel_map, threads
 
-__all__ = ["RampFit", "fit_groups", "fit_result", "threshold"]
-
 # rows that one call of the kernel fits; the events come out in this order
 _ROWS = 32
 

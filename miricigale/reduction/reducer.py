@@ -29,8 +29,6 @@ from miricigale.utils.parallel import thread_count
 from miricigale.utils.progress import progress
 from miricigale.utils.units import ANGLE, RATE, SURFACE_BRIGHTNESS, to_array
 
-__all__ = ["Reducer"]
-
 #: Classes of the options that are objects.
 _KINDS = {
     "reset_anomaly": ResetAnomaly, "ramps": RampSettings, "background": BackgroundSettings,

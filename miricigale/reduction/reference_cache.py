@@ -10,8 +10,6 @@ from pathlib import Path
 from miricigale.reduction.references import ReferenceFiles
 from miricigale.utils.exceptions import DataError, argument_error
 
-__all__ = ["ReferenceCache"]
-
 #: Reference types of CRDS whose names are not those of `ReferenceFiles`.
 _TYPES = {"bias": "superbias", "read_noise": "readnoise"}
 

@@ -7,19 +7,6 @@ from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import open_fits
 from miricigale.utils.parallel import check_memory
 
-__all__ = [
-    "read_bias",
-    "read_dark",
-    "read_flat",
-    "read_gain",
-    "read_linearity",
-    "read_mask",
-    "read_noise",
-    "read_photom",
-    "read_reset",
-    "read_saturation",
-]
-
 #: Values of keywords that fit any exposure.
 _ANY = ("", "N/A", "ANY", "GENERIC", "*")
 

@@ -5,8 +5,6 @@ from scipy.signal import savgol_filter
 
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["reference_channels", "reference_drift"]
-
 #: Channels of the read-out, to which columns belong in turn.
 _CHANNELS = 4
 

@@ -11,8 +11,6 @@ from miricigale.reduction import reference_maps as maps
 from miricigale.reduction.measured_noise import measure_noise
 from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error
 
-__all__ = ["DetectorMaps", "ReferenceFiles", "needed", "own_maps"]
-
 #: What slopes need, and what surface brightness needs beside them.
 SLOPES = ("mask", "saturation", "linearity", "dark", "gain", "read_noise")
 BRIGHTNESS = ("flat", "photom")

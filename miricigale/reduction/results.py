@@ -15,8 +15,6 @@ from miricigale.reduction.slopes import shares_charge
 from miricigale.utils.meta import provenance
 from miricigale.utils.units import RATE
 
-__all__ = ["ReductionResult", "rate_image"]
-
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class ReductionResult:

@@ -5,8 +5,6 @@ import dataclasses
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_choice, check_least, check_positive
 
-__all__ = ["BACKENDS", "BackgroundSettings", "MosaicSettings", "RampSettings"]
-
 #: Known backends.
 BACKENDS = ("native", "jwst")
 

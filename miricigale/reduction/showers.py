@@ -3,8 +3,6 @@
 import numpy as np
 from scipy.ndimage import gaussian_filter, label
 
-__all__ = ["find_showers"]
-
 #: Tracks whose jumps add up to so many sigma are looked around.
 _LARGE = 300.0
 

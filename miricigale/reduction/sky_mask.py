@@ -3,8 +3,6 @@
 import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter, label
 
-__all__ = ["cells_of", "contamination", "darkest", "detect", "grown", "pixels_of"]
-
 # detection of what is masked: standard deviations of the smoothing in pixels (cores, and
 # the wings of bright sources), and the least number of connected pixels: those of the smoothing
 _TIERS = ((0.85, 5), (2.5, 20))

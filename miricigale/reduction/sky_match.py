@@ -6,8 +6,6 @@ from miricigale.reduction.images import check_images, plain_mask, with_data
 from miricigale.reduction.mosaic import pixel_map
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["match_levels", "sky_offsets"]
-
 # pixels of the grid that are averaged before images are compared
 _CELL = 8
 # so many cells in common make a comparison

@@ -7,8 +7,6 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.ndimage import distance_transform_edt
 
-__all__ = ["SkyBoxes", "SkyMesh", "sky_boxes", "spread_over"]
-
 #: Clipping of a box, in standard deviations, and what it leaves of that of a Gaussian.
 _CLIP, _CLIPPED = 3.0, 0.98655
 #: Error of the median of n Gaussian values, times sqrt(n) over their standard deviation.

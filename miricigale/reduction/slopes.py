@@ -20,8 +20,6 @@ from miricigale.reduction.rampfit import fit_groups
 from miricigale.reduction.reference_pixels import reference_channels, reference_drift
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 
-__all__ = ["fit_slopes", "shares_charge"]
-
 # flags of a ramp's pixels that forbid a slope
 _UNUSABLE = DQ.DO_NOT_USE | DQ.NON_SCIENCE | DQ.REFERENCE_PIXEL | DQ.DEAD
 

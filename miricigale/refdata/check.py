@@ -6,8 +6,6 @@ from miricigale.refdata.locate import find_place, fingerprint_of, stored_record
 from miricigale.refdata.registry import resources
 from miricigale.utils.exceptions import DataError
 
-__all__ = ["ResourceState", "check_resources"]
-
 
 class ResourceState(NamedTuple):
     """

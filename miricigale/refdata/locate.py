@@ -16,19 +16,6 @@ from miricigale.utils.content import file_sha256
 from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error
 from miricigale.utils.files import cached_by_file
 
-__all__ = [
-    "cache_folder",
-    "conf",
-    "data_folder",
-    "file_sha256",
-    "find_resource",
-    "fingerprint",
-    "fingerprint_of",
-    "locate",
-    "record_path",
-    "stored_record",
-]
-
 
 class Conf(ConfigNamespace):
     """Settings of the package, kept in astropy's configuration folder."""

@@ -7,8 +7,6 @@ from importlib import resources as importlib_resources
 
 from miricigale.utils.exceptions import unknown_name
 
-__all__ = ["Registry", "Resource", "citations", "resource", "resources"]
-
 
 @dataclasses.dataclass(frozen=True)
 class Resource:

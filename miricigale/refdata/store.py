@@ -16,8 +16,6 @@ try:
 except ImportError:  # no such locks on Windows
     fcntl = None
 
-__all__ = ["add_resource", "installing"]
-
 
 @contextlib.contextmanager
 def _locked(target):

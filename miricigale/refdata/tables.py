@@ -4,8 +4,6 @@ from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import cached_by_file, open_fits
 from miricigale.utils.units import frozen_array
 
-__all__ = ["load_ssp", "read_images"]
-
 SOLAR_LUMINOSITY = 3.828e26  # W, IAU 2015
 
 

@@ -5,30 +5,6 @@ Spectral energy distributions: what galaxies and AGN send out, as components in 
 that the grid fitter uses; the links of the chain stand in `miricigale.sed.components`.
 """
 
-from miricigale.utils.lazy import lazy_names
+import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_names(
-    __name__,
-    {
-        "components": (),
-        "component": ("ROLES", "Component"),
-        "derived": ("DERIVED", "Derived"),
-        "foreground": (
-            "Foreground",
-            "GalacticExtinction",
-            "band_extinction",
-            "color_excess",
-            "deredden",
-        ),
-        "grid": ("ModelGrid",),
-        "model": ("SEDModel",),
-        "parameter": ("Parameter",),
-        # with all components, which make themselves known
-        "presets": ("COMPONENTS", "quasar_axes", "survey_axes", "survey_priors", "yang2021_axes"),
-        "spectrum": ("COSMOLOGY", "SED", "ModelSpectra"),
-        "tables": ("ModelFlags",),
-        "templates": ("read_spectra", "template_grid"),
-        "xray_bands": ("with_xray_bands",),
-        "xray": ("XRay", "band_luminosity", "stern2015", "stern2015_6um", "xray_flux"),
-    },
-)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

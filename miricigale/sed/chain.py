@@ -9,8 +9,6 @@ from miricigale.filters import FilterSet
 from miricigale.sed import _core
 from miricigale.sed.component import ROLES
 
-__all__ = ["COLORS", "Chain", "Galaxy", "Stars", "distinct"]
-
 #: Version of the numbers that follow from the components: raised when the chain, the derived
 #: quantities or the grids change, so that grids kept on the disk are made anew.
 VERSION = 1

@@ -10,8 +10,6 @@ from miricigale.refdata.locate import fingerprint_of
 from miricigale.sed.parameter import Parameter
 from miricigale.utils.exceptions import ConfigError, argument_error
 
-__all__ = ["COMPONENTS", "ROLES", "Component", "read_config", "register"]
-
 #: What a component does, in the order in which light meets it.
 ROLES = ("sfh", "stellar", "nebular", "attenuation", "dust", "agn", "xray", "igm", "foreground")
 

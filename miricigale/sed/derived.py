@@ -8,15 +8,6 @@ import numpy as np
 from miricigale.sed.chain import COLOR_BANDS, COLORS, UV_WINDOWS
 from miricigale.utils.units import LUMINOSITY, MASS
 
-__all__ = [
-    "DERIVED",
-    "Derived",
-    "agn_quantities",
-    "columns",
-    "galaxy_quantities",
-    "scaled_quantities",
-]
-
 
 @dataclass(frozen=True)
 class Derived:

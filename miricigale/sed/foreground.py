@@ -14,8 +14,6 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import error_column, require_columns
 from miricigale.utils.units import FNU
 
-__all__ = ["Foreground", "GalacticExtinction", "band_extinction", "color_excess", "deredden"]
-
 #: Laws of extinction with R_V, as `dust_extinction` names them, and whom to cite.
 LAWS = {
     "G23": "Gordon et al. 2023, ApJ 950, 86",

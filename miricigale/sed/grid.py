@@ -13,8 +13,6 @@ from miricigale.utils.store import open_parts, write_parts
 from miricigale.utils.unified import register, unified_read, unified_write
 from miricigale.utils.units import Frozen, frozen_array
 
-__all__ = ["DEFINITIONS", "ModelGrid", "fraction_span"]
-
 #: What the AGN fraction is a fraction of.
 DEFINITIONS = ("dust", "3-1000um")
 _SPAN = re.compile(r"(\d+(?:\.\d+)?)-(\d+(?:\.\d+)?)um")

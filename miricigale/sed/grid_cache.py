@@ -15,8 +15,6 @@ from miricigale.utils.content import content_sha256
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.store import PARTIAL
 
-__all__ = ["cached_grid", "grid_key"]
-
 ABANDONED = 86400.0  # seconds after which an unfinished file counts as abandoned
 
 _log = logging.getLogger(__name__)

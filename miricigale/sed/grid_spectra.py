@@ -9,16 +9,6 @@ from miricigale.sed.spectrum import distance
 from miricigale.sed.tables import dilution
 from miricigale.utils.exceptions import argument_error
 
-__all__ = [
-    "band_names",
-    "check_model",
-    "draw_fluxes",
-    "model_fluxes",
-    "observed_spectra",
-    "rest_spectra",
-    "row_values",
-]
-
 
 def check_model(model, grid):
     """Refuse a model that is not the one of the grid, as far as the grid says what it was."""

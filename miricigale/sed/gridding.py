@@ -15,8 +15,6 @@ from miricigale.sed.tables import BLOCK, dilution, seen_agn
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.tables import described_table
 
-__all__ = ["check_axes", "model_grid"]
-
 #: Roles whose parameters shape the galaxy.
 GALAXY_ROLES = sum(GALAXY, ())
 

@@ -18,8 +18,6 @@ from miricigale.utils.exceptions import ConfigError, argument_error, unknown_nam
 from miricigale.utils.meta import provenance
 from miricigale.utils.units import WAVE
 
-__all__ = ["SEDModel"]
-
 _MODEL_PARAMETERS = {
     "redshift": Parameter(1.0, (0.0, 20.0), "Redshift."),
     "mass": Parameter(1e10, (0.0, 1e16), "Mass of all stars ever formed.", unit="Msun"),

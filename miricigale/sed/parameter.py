@@ -7,8 +7,6 @@ import numpy as np
 
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["Parameter"]
-
 
 class Parameter:
     """

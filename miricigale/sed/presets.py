@@ -11,16 +11,6 @@ from miricigale.sed import components as c
 from miricigale.sed.component import COMPONENTS
 from miricigale.utils.exceptions import argument_error
 
-__all__ = [
-    "LIBRARIES",
-    "quasar_axes",
-    "survey_axes",
-    "survey_components",
-    "survey_priors",
-    "yang2021_axes",
-    "yang2021_components",
-]
-
 #: Where a preset takes its libraries from.
 LIBRARIES = ("best", "bundled")
 

@@ -10,8 +10,6 @@ from astropy.cosmology import FlatLambdaCDM
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import FNU, WAVE, Frozen, frozen_quantity, to_array
 
-__all__ = ["COSMOLOGY", "SED", "ModelSpectra", "distance"]
-
 #: WMAP7, as in Yang et al. 2021.
 COSMOLOGY = FlatLambdaCDM(H0=70.4, Om0=0.272, name="yang2021")
 

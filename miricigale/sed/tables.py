@@ -23,8 +23,6 @@ from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.tables import Flags, described_table
 from miricigale.utils.units import FNU, WAVE
 
-__all__ = ["ModelFlags", "dilution", "flux_table", "seen_agn", "spectra"]
-
 BLOCK = 128  # rows worked out together: their spectra fit into the processor's cache
 
 

@@ -17,8 +17,6 @@ from miricigale.utils.meta import provenance
 from miricigale.utils.missing import plain_floats
 from miricigale.utils.units import FNU, WAVE
 
-__all__ = ["read_spectra", "template_grid"]
-
 _SUFFIXES = (".fits", ".fit", ".dat", ".txt", ".csv", ".ecsv", ".ascii")
 _FLAM = u.erg / u.s / u.cm**2 / u.AA
 #: How libraries write units that astropy does not know, in small letters.

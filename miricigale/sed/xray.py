@@ -10,17 +10,6 @@ from miricigale.sed.spectrum import COSMOLOGY, distance
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import LUMINOSITY, to_array
 
-__all__ = [
-    "STERN2015_RANGE",
-    "XRAY_FLUX",
-    "XRay",
-    "band_luminosity",
-    "check_band",
-    "stern2015",
-    "stern2015_6um",
-    "xray_flux",
-]
-
 #: nu L_nu at 6 um that the samples of Stern 2015 span, roughly: Seyferts to luminous quasars.
 STERN2015_RANGE = (1e42, 1e47) * u.erg / u.s
 

@@ -15,8 +15,6 @@ from miricigale.sed.xray import check_band
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import positive, to_array
 
-__all__ = ["ALPHA_OX", "SPAN", "XRays", "disk_2500", "with_xray_bands", "xray_filter"]
-
 #: Slopes between 2500 A and 2 keV, the values of X-CIGALE.
 ALPHA_OX = tuple(np.round(np.arange(-1.9, -1.05, 0.1), 1))
 _PER_DEX = 0.3838  # alpha_ox over log(L_nu(2 keV) / L_nu(2500 A))

@@ -5,7 +5,7 @@ from astropy.io import fits
 from numpy.testing import assert_allclose
 
 from helpers.components import values_of
-from miricigale.refdata.libraries.bc03 import read_ised
+from miricigale.refdata.libraries.ised import read_ised
 from miricigale.sed import _core
 from miricigale.sed.components import BC03, CalzettiLeitherer, DelayedSFH
 from miricigale.utils.exceptions import DataError

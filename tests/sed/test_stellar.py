@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import quad
 
 from helpers.components import values_of
-from miricigale.refdata.libraries.bc03 import read_ised
+from miricigale.refdata.libraries.ised import read_ised
 from miricigale.sed import _core
 from miricigale.sed.components import BC03, ConstantSFH, DelayedSFH
 

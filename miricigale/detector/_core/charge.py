@@ -21,14 +21,6 @@ from miricigale.detector._core.random import (
 )
 from miricigale.utils.compilation import njit
 
-__all__ = [
-    "add_cosmic_rays",
-    "add_latent",
-    "add_poisson",
-    "cosmic_ray_deposits",
-    "couple_neighbors",
-]
-
 #: Greatest mean for which a draw is done; beyond it a pixel is saturated a thousandfold.
 _MEAN_MAX = 1e9
 

@@ -15,25 +15,6 @@ from numba import uint64
 
 from miricigale.utils.compilation import njit
 
-__all__ = [
-    "GUIDE",
-    "PTRS_FROM",
-    "advance",
-    "fill_normals",
-    "fill_table",
-    "log_factorial",
-    "mix",
-    "poisson",
-    "poisson_inversion",
-    "ptrs_constants",
-    "ptrs_rest",
-    "seed_stream",
-    "standard_normals",
-    "table_lookup",
-    "uniform",
-    "unit",
-]
-
 _GAMMA = np.uint64(0x9E3779B97F4A7C15)
 _MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
 _MIX_2 = np.uint64(0x94D049BB133111EB)

@@ -8,15 +8,6 @@ from numba import uint64
 from miricigale.detector._core.random import fill_normals, mix, seed_stream
 from miricigale.utils.compilation import njit
 
-__all__ = [
-    "add_noise",
-    "add_pink_noise",
-    "clip_well",
-    "digitize",
-    "interpolate_response",
-    "pull_last_group",
-]
-
 
 @njit(cache=True, nogil=True)
 def clip_well(ramp, well, group_dq, flag):

@@ -12,3 +12,7 @@ Effects act on blocks of full rows. What a row gets does not depend on the block
 (see `miricigale.detector._core`), so neither the height of the blocks nor the number of
 threads changes a result, and a detector of any size needs little memory.
 """
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

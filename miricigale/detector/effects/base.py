@@ -8,18 +8,6 @@ from miricigale.instrument import DetectorProperties, Exposure
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.random import stream
 
-__all__ = [
-    "Block",
-    "Effect",
-    "OtherEffect",
-    "WholeBlock",
-    "check_amounts",
-    "check_finite",
-    "check_share",
-    "key_words",
-    "stream_key",
-]
-
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Block:

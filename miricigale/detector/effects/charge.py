@@ -18,16 +18,6 @@ from miricigale.instrument import DQ, bad_pixel_mask, reference_pixel_mask
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import TIME, to_array
 
-__all__ = [
-    "BadPixels",
-    "CosmicRays",
-    "Dark",
-    "InterpixelCapacitance",
-    "Persistence",
-    "ReferencePixels",
-    "Saturation",
-]
-
 
 @dataclasses.dataclass(frozen=True)
 class Dark(Effect):

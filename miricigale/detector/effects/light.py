@@ -12,8 +12,6 @@ from miricigale.detector.effects.base import Effect, key_words
 from miricigale.instrument import electrons_per_brightness, flat_field
 from miricigale.utils.exceptions import argument_error, unknown_name
 
-__all__ = ["Photons", "Residual"]
-
 
 @dataclasses.dataclass(frozen=True)
 class Residual(Effect):

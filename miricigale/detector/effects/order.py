@@ -18,8 +18,6 @@ from miricigale.detector.effects.readout import ADConversion, Bias, Nonlinearity
 from miricigale.detector.effects.reset import FirstFrame, LastFrame, ResetAnomaly, ResetDecay
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["ORDER", "check_order", "checked_effects", "effect_from_record", "keyed", "place_of"]
-
 #: The order in which the effects act. Others may stand anywhere after `Photons`.
 ORDER = (
     Residual,

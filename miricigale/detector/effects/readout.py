@@ -15,8 +15,6 @@ from miricigale.detector.effects.base import Effect, check_amounts, check_finite
 from miricigale.instrument import DQ
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["ADConversion", "Bias", "Nonlinearity", "ReadNoise"]
-
 
 @dataclasses.dataclass(frozen=True)
 class Nonlinearity(Effect):

@@ -25,8 +25,6 @@ from miricigale.detector.effects.base import Effect, check_finite
 from miricigale.instrument import reference_pixel_mask
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["FirstFrame", "LastFrame", "ResetAnomaly", "ResetDecay"]
-
 
 def _light_sensitive(block):
     """True where a pixel is no reference pixel, (n_row, n_col)."""

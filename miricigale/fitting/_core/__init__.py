@@ -22,21 +22,3 @@ from miricigale.fitting._core.workspace import (
     make_target,
     make_workspace,
 )
-
-__all__ = [
-    "BLOCK",
-    "JOINT",
-    "PER_DEX",
-    "Request",
-    "Tables",
-    "aligned",
-    "clear",
-    "make_limits",
-    "make_scales",
-    "make_sums",
-    "make_target",
-    "make_workspace",
-    "sum_nodes",
-    "sum_up",
-    "summarize",
-]

@@ -3,8 +3,6 @@
 from miricigale.fitting._core.structs import KERNEL
 from miricigale.utils.compilation import njit
 
-__all__ = ["sum_nodes"]
-
 #: Least weight that counts.
 _LEAST = 1e-3
 

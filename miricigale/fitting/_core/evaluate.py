@@ -42,8 +42,6 @@ from miricigale.fitting._core.sums import (
 )
 from miricigale.utils.compilation import njit
 
-__all__ = ["sum_up"]
-
 _LOG10_E = 0.43429448190325183
 # Models without AGN so far below the best are not looked at for a reference.
 _NEAR = 50.0

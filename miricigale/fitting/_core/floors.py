@@ -8,8 +8,6 @@ from miricigale.fitting._core.functions import log10
 from miricigale.fitting._core.structs import BLOCK, DONE, KERNEL, KEY_BITS, KEY_MASK, PART
 from miricigale.utils.compilation import njit
 
-__all__ = ["first_floor", "second_floor"]
-
 # Steps of the histogram of bounds ...
 _N_LEVELS = 1024
 # ... and how many for each unit of chi2.

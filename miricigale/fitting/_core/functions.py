@@ -8,8 +8,6 @@ from numba.extending import intrinsic, overload
 from miricigale.fitting._core.structs import PART
 from miricigale.utils.compilation import njit
 
-__all__ = ["as_type", "exponential", "log10", "polynomial"]
-
 _LOG2E = 1.4426950408889634
 # Their sum is ln 2; products of the first with whole numbers are exact in either precision.
 _LN2_HIGH = 0.693359375

@@ -15,17 +15,6 @@ from miricigale.fitting._core.functions import log10
 from miricigale.fitting._core.structs import KERNEL, PART, Scales
 from miricigale.utils.compilation import njit
 
-__all__ = [
-    "N_BINS",
-    "N_SHARE",
-    "PER_DEX",
-    "add_model",
-    "clear_rows",
-    "make_scales",
-    "summarize",
-    "widest",
-]
-
 PER_DEX = 100
 N_BINS = 2048
 #: Bins of a fraction.

@@ -13,15 +13,6 @@ from miricigale.fitting._core.limits import limited_scale
 from miricigale.fitting._core.structs import BLOCK, DONE, KEY_BITS, KEY_MASK, NO_LIGHT, PART
 from miricigale.utils.compilation import njit
 
-__all__ = [
-    "best_mixture",
-    "best_scale",
-    "fill_up",
-    "galaxy_products",
-    "gather",
-    "likelihoods",
-]
-
 
 @njit(**PART)
 def galaxy_products(tables, target, z, block, pq):

@@ -23,8 +23,6 @@ from miricigale.fitting._core.functions import exponential, polynomial
 from miricigale.fitting._core.structs import BLOCK, NO_LIGHT, PART
 from miricigale.utils.compilation import njit
 
-__all__ = ["LIMITED_SIZE", "limited_likelihoods", "limited_scale"]
-
 # Offsets of the vectors in Lanes.limited: scale, half of chi2 and of its second derivative, the
 # limits' probability over exp(exponent), the exponent, the scale without limits (0 in lanes that do
 # not count), whether a model counts, change of what limits leave, unit of 1 / scale, work space.

@@ -20,15 +20,6 @@ from miricigale.fitting._core.lanes import best_scale
 from miricigale.fitting._core.structs import BLOCK, DONE, KERNEL, KEY_BITS, PART
 from miricigale.utils.compilation import njit
 
-__all__ = [
-    "GROUP",
-    "ROWS",
-    "agn_products",
-    "best_of_galaxy",
-    "list_runs",
-    "project",
-]
-
 #: Tori handled side by side; arrays of unit vectors are padded with zeros to a multiple.
 GROUP = 4
 

@@ -18,8 +18,6 @@ from miricigale.fitting._core.functions import exponential
 from miricigale.fitting._core.structs import BLOCK, NO_LIGHT, PART
 from miricigale.utils.compilation import njit
 
-__all__ = ["pair_weight", "single_likelihoods", "single_size"]
-
 # Offsets of the vectors in Lanes.single: N, D, K, M, the scale's variance, the share, x*, the
 # other fraction there ...
 _P, _A, _Q, _X, _B, _K, _M, _VAR, _SHARE, _BEST, _OTHER = (i * BLOCK for i in range(11))

@@ -15,24 +15,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = [
-    "BLOCK",
-    "KERNEL",
-    "NO_LIGHT",
-    "PART",
-    "Draws",
-    "Histograms",
-    "Joint",
-    "Lanes",
-    "Limits",
-    "Pairs",
-    "Request",
-    "Scales",
-    "Sums",
-    "Tables",
-    "Target",
-]
-
 #: Galaxies, or pairs, handled side by side; the tables of galaxies are padded to a multiple of it.
 BLOCK = 64
 #: A run is an AGN model with a block of galaxies at one redshift; its key has so many bits for the

@@ -11,18 +11,6 @@ from miricigale.fitting._core.single import pair_weight
 from miricigale.fitting._core.structs import BLOCK, PART
 from miricigale.utils.compilation import njit
 
-__all__ = [
-    "PARTS",
-    "add_joint",
-    "add_pairs",
-    "deposit",
-    "draw",
-    "find_best",
-    "finish_redshift",
-    "keep_best",
-    "take_draw",
-]
-
 #: Parts of the weight so far by which light models are sampled for the histograms ...
 PARTS = 16_000.0
 # ... and how many of them a pair must have to go there with all its fractions.

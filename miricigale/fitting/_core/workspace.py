@@ -22,16 +22,6 @@ from miricigale.fitting._core.structs import (
     Target,
 )
 
-__all__ = [
-    "JOINT",
-    "aligned",
-    "clear",
-    "make_limits",
-    "make_sums",
-    "make_target",
-    "make_workspace",
-]
-
 #: Joint sums that can be asked for: of redshift, galaxy, AGN model and fraction.
 JOINT = Joint._fields
 # Bytes of a cache line, and numbers in it.

@@ -19,8 +19,6 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.random import stream
 from miricigale.utils.units import MASS
 
-__all__ = ["SamplerFit"]
-
 _TRIALS = 64
 #: Numbers that each object has, whatever the model.
 _SINGLE = ("chi2", "log_evidence", "log_evidence_err", "n_calls", "n_effective", "converged")

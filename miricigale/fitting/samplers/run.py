@@ -12,15 +12,6 @@ from miricigale.fitting.settings import SamplerSettings
 from miricigale.utils.parallel import single_threaded
 from miricigale.utils.random import stream
 
-__all__ = [
-    "ContinuousEngine",
-    "FluxModel",
-    "Posterior",
-    "best_scale",
-    "chi2_at",
-    "systematic_draws",
-]
-
 #: Draws from the prior of which at least one has to be possible.
 _TRIALS = 2048
 _STEPS = 100

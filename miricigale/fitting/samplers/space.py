@@ -9,18 +9,6 @@ from miricigale.fitting.posterior import cell_edges
 from miricigale.fitting.priors import integrals, integrals_to, known_redshifts, read_density
 from miricigale.utils.exceptions import argument_error, unknown_name
 
-__all__ = [
-    "Choice",
-    "Continuous",
-    "Flat",
-    "Log",
-    "Space",
-    "Table",
-    "make_prior",
-    "prior_cells",
-    "redshift_axis",
-]
-
 #: Part of a prior without limits that may lie outside the cells of its axis.
 _TAIL = 1e-3
 

@@ -26,23 +26,3 @@ from miricigale.photometry._core.stamps import (
     residual_statistics,
     whiten_stamps,
 )
-
-__all__ = [
-    "INDEX_RANGE",
-    "add_model",
-    "autocorrelation",
-    "block_covariance",
-    "box_response",
-    "convolve_batch",
-    "convolve_stamps",
-    "cross_pairs",
-    "factorize",
-    "find_pairs",
-    "pair_products",
-    "projections",
-    "residual_statistics",
-    "sample_stamps",
-    "shape_models",
-    "spline_response",
-    "whiten_stamps",
-]

@@ -14,8 +14,6 @@ from miricigale.depth._core import difference_weight, weight_sums
 from miricigale.reduction._core.pixel import JUMP, JUMP_NEIGHBOR, SATURATED, own_charge
 from miricigale.utils.compilation import njit
 
-__all__ = ["draw_slopes", "hit_slopes", "tabulate", "variances"]
-
 # what is done to an entry of a pixel
 _OWN = 1
 _NEIGHBOR = 2

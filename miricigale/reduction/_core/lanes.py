@@ -22,8 +22,6 @@ from miricigale.reduction._core.pixel import (
 )
 from miricigale.utils.compilation import njit
 
-__all__ = ["LANES", "fill_lane", "fit_lanes", "fitting_lanes", "refit", "settle"]
-
 #: Pixels that are fitted side by side (inner, vectorized loop).
 LANES = 32
 

@@ -4,25 +4,6 @@ import numpy as np
 
 from miricigale.utils.compilation import njit
 
-__all__ = [
-    "DO_NOT_USE",
-    "JUMP",
-    "JUMP_NEIGHBOR",
-    "LEAK",
-    "SATURATED",
-    "X_MIN",
-    "at",
-    "cut_by_flags",
-    "gather",
-    "level_of",
-    "linear",
-    "no_slope",
-    "own_charge",
-    "polynomial",
-    "store",
-    "weights",
-]
-
 # bits that the kernels set or read; instrument.DQ gives them names
 DO_NOT_USE = 1
 SATURATED = 2

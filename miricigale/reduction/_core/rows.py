@@ -14,8 +14,6 @@ from miricigale.reduction._core.pixel import (
 )
 from miricigale.utils.compilation import njit
 
-__all__ = ["BLOCK", "fit_rows"]
-
 #: Pixels that are worked on together (inner, vectorized loop).
 BLOCK = 64
 

@@ -5,12 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from miricigale.refdata.libraries.ised import Ised, parse_ised, read_bytes, read_ised
+from miricigale.refdata.libraries.ised import parse_ised, read_bytes
 from miricigale.refdata.libraries.table import LibraryTable
 from miricigale.refdata.locate import file_sha256
 from miricigale.utils.exceptions import DataError, argument_error
-
-__all__ = ["Ised", "read_bc03", "read_ised"]
 
 #: Of GALAXEV, in W: its files are in this unit (3.826e33 erg/s).
 SOLAR_LUMINOSITY = 3.826e26

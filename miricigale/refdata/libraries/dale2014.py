@@ -11,8 +11,6 @@ from miricigale.refdata.locate import locate
 from miricigale.refdata.tables import load_ssp
 from miricigale.utils.exceptions import DataError
 
-__all__ = ["read_dale2014"]
-
 SPECTRA = "spectra.0.00AGN.dat"
 CALIBRATION = "dhcal.dat"
 STARS = "stellar_SED_age13Gyr_tau10Gyr.spec"

@@ -17,8 +17,6 @@ import numpy as np
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import unpacked_size
 
-__all__ = ["Ised", "read_ised"]
-
 #: Quantities after the spectra, in their order.
 QUANTITIES = [
     "bolometric",

@@ -8,8 +8,6 @@ from pathlib import PurePosixPath
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import check_unpacked, unpacked_size
 
-__all__ = ["is_archive", "members"]
-
 
 def is_archive(path):
     """Whether a file is a zip or tar archive."""

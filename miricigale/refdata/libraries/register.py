@@ -17,8 +17,6 @@ from miricigale.refdata.store import installing
 from miricigale.utils.exceptions import DataError, argument_error, unknown_name
 from miricigale.utils.progress import progress
 
-__all__ = ["READERS", "Report", "add_library"]
-
 #: What reads the distributed files of a library: a function, or ``"module:function"``,
 #: imported on first use; called with a `~pathlib.Path`, it gives a `LibraryTable`.
 READERS = {

@@ -12,8 +12,6 @@ from miricigale.refdata.libraries.table import LibraryTable
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import open_fits
 
-__all__ = ["SKIRTOR_AXES", "read_skirtor"]
-
 #: Values of the whole library: 19,200 spectra.
 SKIRTOR_AXES = {
     "tau97": (3.0, 5.0, 7.0, 9.0, 11.0),

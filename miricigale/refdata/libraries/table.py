@@ -16,8 +16,6 @@ from miricigale.utils.files import open_fits
 from miricigale.utils.store import open_parts, write_parts
 from miricigale.utils.units import WAVE, frozen_array, to_array
 
-__all__ = ["LibraryTable", "open_library", "verify_library", "write_library"]
-
 #: Layouts of files; in the first the kinds of spectra were versions of one extension.
 _LAYOUTS = ("miricigale-library-2", "miricigale-library-1")
 

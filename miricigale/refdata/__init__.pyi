@@ -1,0 +1,12 @@
+from .check import ResourceState as ResourceState
+from .check import check_resources as check_resources
+from .locate import cache_folder as cache_folder
+from .locate import conf as conf
+from .locate import find_resource as find_resource
+from .locate import locate as locate
+from .registry import Registry as Registry
+from .registry import Resource as Resource
+from .registry import citations as citations
+from .registry import resource as resource
+from .registry import resources as resources
+from .store import add_resource as add_resource
