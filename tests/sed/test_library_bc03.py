@@ -7,7 +7,8 @@ from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
 from miricigale.refdata.libraries import add_library, write_library
-from miricigale.refdata.libraries.bc03 import read_bc03, read_ised
+from miricigale.refdata.libraries.bc03 import read_bc03
+from miricigale.refdata.libraries.ised import read_ised
 from miricigale.refdata.locate import conf
 from miricigale.sed import SEDModel
 from miricigale.sed.components import BC03Library, ConstantSFH
