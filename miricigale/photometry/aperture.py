@@ -15,8 +15,6 @@ from miricigale.utils.meta import provenance
 from miricigale.utils.sep_tools import background as sep_background
 from miricigale.utils.units import ANGLE, FNU, positive, to_array
 
-__all__ = ["aperture_photometry", "source_extractor_photometry"]
-
 
 def aperture_photometry(image, sky, diameter, *, local_background=None):
     """

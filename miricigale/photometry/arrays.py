@@ -15,17 +15,6 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.parallel import chunks
 from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
 
-__all__ = [
-    "FitArrays",
-    "ImageArrays",
-    "fine_wcs",
-    "fit_arrays",
-    "image_arrays",
-    "local_maps",
-    "pixel_scale",
-    "sky_pixels",
-]
-
 #: uJy per MJy.
 _MICRO = 1e12
 

@@ -10,8 +10,6 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
 from miricigale.utils.tables import error_column
 
-__all__ = ["join_bands", "measure_bands"]
-
 
 def measure_bands(images, kernels, templates, **options):
     """

@@ -10,8 +10,6 @@ import numpy as np
 from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.units import SURFACE_BRIGHTNESS, ab_quantity
 
-__all__ = ["calibration", "parsed_unit"]
-
 #: Names of count rates in headers that are no units of astropy.
 _COUNTS = (
     (r"\bcps\b", "ct/s"),

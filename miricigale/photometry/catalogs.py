@@ -10,8 +10,6 @@ from astropy.table import Table
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import require_columns, unique_ids
 
-__all__ = ["OPTIONAL", "CatalogSources", "catalog_sources", "joined_sky", "sersic_rows"]
-
 #: Columns of a catalog that need not be there, and that templates keep.
 OPTIONAL = ("flux", "components")
 

@@ -12,8 +12,6 @@ from miricigale.psf import encircled_energy, radius_of_encircled_energy
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import ANGLE, FNU, to_array
 
-__all__ = ["aperture_correction", "encircled_flux", "flux_scaling"]
-
 
 def encircled_flux(image, sky, flux, radii):
     """

@@ -19,15 +19,6 @@ from miricigale.utils.sep_tools import extract
 from miricigale.utils.tables import Flags, described_table
 from miricigale.utils.units import ANGLE, FNU, positive
 
-__all__ = [
-    "DETECTION_PRESETS",
-    "DetectionFlags",
-    "DetectionPreset",
-    "bright_centroids",
-    "detect_sources",
-    "detection_purity",
-]
-
 
 class DetectionFlags(Flags):
     """Flags of detections, those of Source Extractor and sep."""

@@ -6,8 +6,6 @@ from scipy.sparse.linalg import splu
 
 from miricigale.utils.random import stream
 
-__all__ = ["correlated_draws"]
-
 #: What correlations are multiplied by until the matrix is positive.
 _SHRINK = (1.0, 1 - 1e-9, 1 - 1e-6, 1 - 1e-4, 0.999, 0.99, 0.95, 0.9, 0.8, 0.5, 0.0)
 

@@ -14,8 +14,6 @@ from miricigale.utils.tables import described_table, require_columns
 from miricigale.utils.unified import read_write
 from miricigale.utils.units import FNU
 
-__all__ = ["ErrorCalibration"]
-
 #: Least number of sources in a bin, and edges of the bins in flux over the error by noise.
 _LEAST = 30
 _EDGES = (1.0, 3.0, 5.0, 10.0, 20.0, 50.0)

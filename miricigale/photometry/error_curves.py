@@ -11,19 +11,6 @@ from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.tables import described_table, error_column, require_columns
 from miricigale.utils.units import FNU
 
-__all__ = [
-    "STATISTICS",
-    "Analytic",
-    "Binned",
-    "common_bands",
-    "curves_from_table",
-    "curves_to_table",
-    "flux_table",
-    "limiting_flux",
-    "measured_curve",
-    "same_rows",
-]
-
 #: What turns the median of absolute values into a standard deviation.
 STATISTICS = {"mad": 1.482602218505602, "median_abs": 1.0}
 

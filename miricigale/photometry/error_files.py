@@ -9,8 +9,6 @@ from miricigale.utils.files import read_table
 from miricigale.utils.store import replacing
 from miricigale.utils.unified import register
 
-__all__ = ["write_ecsv"]
-
 
 def write_ecsv(table, path, *, overwrite=False):
     """Write a table as ECSV, whole or not at all."""

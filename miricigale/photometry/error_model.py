@@ -26,8 +26,6 @@ from miricigale.utils.tables import error_column, require_columns
 from miricigale.utils.unified import read_write
 from miricigale.utils.units import FNU, ab_quantity, to_array
 
-__all__ = ["ErrorModel"]
-
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class ErrorModel:

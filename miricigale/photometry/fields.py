@@ -5,8 +5,6 @@ import dataclasses
 import numpy as np
 from numpy.polynomial import legendre
 
-__all__ = ["SmoothField", "legendre_terms", "n_terms"]
-
 
 def n_terms(order):
     """Number of terms of a polynomial of two variables."""

@@ -23,8 +23,6 @@ from miricigale.utils.tables import ascii_ids
 from miricigale.utils.unified import register
 from miricigale.utils.units import SURFACE_BRIGHTNESS
 
-__all__ = []
-
 
 def _sky_columns(sky):
     icrs = sky.icrs

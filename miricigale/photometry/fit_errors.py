@@ -11,8 +11,6 @@ from miricigale.photometry.template_fit import inner
 from miricigale.utils.parallel import chunks
 from miricigale.utils.units import ANGLE
 
-__all__ = ["Covariances", "fit_covariances"]
-
 #: Size of the covariance's blocks and of the margin around them, arcsec.
 _CORE, _HALO = 18.0, 6.0
 

@@ -2,8 +2,6 @@
 
 from miricigale.utils.tables import Flags
 
-__all__ = ["POOR_CHI2", "POOR_STRAIN", "ForcedFlags"]
-
 #: Template-weighted chi^2 from which a fit is poor, in units of the noise's variance.
 POOR_CHI2 = 2.0
 

@@ -8,7 +8,7 @@ import warnings
 import astropy.units as u
 import numpy as np
 
-from miricigale.photometry import _core
+from miricigale.photometry._core.stamps import add_model
 from miricigale.photometry.arrays import (
     fit_arrays,
     image_arrays,
@@ -25,8 +25,6 @@ from miricigale.psf import KernelField
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.parallel import single_threaded, thread_count, threads
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, positive, to_array
-
-__all__ = ["ForcedPhotometer"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -319,7 +317,7 @@ class ForcedPhotometer:
             values = flux[place.near][bank.order]
             for block in bank.blocks():
                 some = values[block.first : block.last]
-                _core.add_model(model, block.values, block.box, block.start, some)
+                add_model(model, block.values, block.box, block.start, some)
         return model / arrays.area * SURFACE_BRIGHTNESS
 
     def _rows(self, sources, place, templates):

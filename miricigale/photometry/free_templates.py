@@ -13,8 +13,6 @@ from miricigale.photometry.errors import (
 )
 from miricigale.utils.parallel import parallel_map
 
-__all__ = ["FreeTemplates", "free_templates"]
-
 #: Changes whose root of the sum of squares over the noise is below this are left out: they can move
 #: no flux by more of its errors.
 _LEAST = 0.3

@@ -23,8 +23,6 @@ from miricigale.utils.store import replacing
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import to_array
 
-__all__ = ["empty_positions", "measure_files"]
-
 _log = logging.getLogger(__name__)
 
 #: Endings of tables that can be written.

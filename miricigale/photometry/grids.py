@@ -12,17 +12,6 @@ from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_e
 from miricigale.utils.files import open_fits, split_extension
 from miricigale.utils.optional import require
 
-__all__ = [
-    "check_same_grid",
-    "filter_name",
-    "find_image",
-    "grid_angle",
-    "is_exposure",
-    "open_image",
-    "open_map",
-    "read_wcs",
-]
-
 
 @contextlib.contextmanager
 def open_image(path, wanted):

@@ -25,8 +25,6 @@ from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import require_columns
 from miricigale.utils.units import FNU, SURFACE_BRIGHTNESS
 
-__all__ = ["calibrate_errors"]
-
 #: Radius (fine pixels) of a profile that is as good as a point.
 _POINT = 0.05
 

@@ -10,15 +10,6 @@ from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import open_fits, split_extension
 from miricigale.utils.units import ANGLE, to_array
 
-__all__ = [
-    "can_be_modeled",
-    "file_place",
-    "image_psf",
-    "is_own_kernel",
-    "matching_kernel",
-    "read_kernel",
-]
-
 _log = logging.getLogger(__name__)
 
 

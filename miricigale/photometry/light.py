@@ -12,8 +12,6 @@ from miricigale.photometry.wings import adjust_wings
 from miricigale.profiles import sersic_stamp
 from miricigale.utils.parallel import parallel_map
 
-__all__ = ["FineImage", "cutouts"]
-
 #: Width (pixels) of the Gaussian that tells the core, its least signal-to-noise, how many standard
 #: deviations of chi^2 a profile may miss it by, and the signal-to-noise that makes a neighbor.
 _WIDTH, _CORE_SNR, _EXCESS, _OTHER_SNR = 1.5, 4.0, 3.0, 4.0

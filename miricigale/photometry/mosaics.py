@@ -22,8 +22,6 @@ from miricigale.photometry.sky_noise import mask_filled, sky_noise
 from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error
 from miricigale.utils.units import SURFACE_BRIGHTNESS
 
-__all__ = ["MosaicFile", "MosaicHeader", "read_mosaic"]
-
 _log = logging.getLogger(__name__)
 
 #: Maps of the noise, and the extensions that hold them in the image's own file.

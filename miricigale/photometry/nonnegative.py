@@ -7,8 +7,6 @@ import numpy as np
 from miricigale.photometry.errors import LinearFit
 from miricigale.utils.exceptions import MiricigaleWarning
 
-__all__ = ["nonnegative_fluxes"]
-
 #: How often all wrong signs are changed at once without there being fewer, and steps in all.
 _PATIENCE, _STEPS = 3, 300
 

@@ -13,8 +13,6 @@ from miricigale.photometry.template_fit import TemplateFit
 from miricigale.utils.exceptions import MiricigaleWarning
 from miricigale.utils.units import ANGLE
 
-__all__ = ["OffsetMap", "fit_offsets", "source_offsets"]
-
 #: Least signal-to-noise of sources whose offsets are measured, largest light of others relative to
 #: their own, both below their template, and least number of sources for each term of the map.
 _BRIGHT, _ISOLATED, _SOURCES = 20.0, 0.2, 3

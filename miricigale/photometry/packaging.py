@@ -19,8 +19,6 @@ from miricigale.photometry.results import ForcedPhotometryResult, crowded
 from miricigale.utils.meta import provenance
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS
 
-__all__ = ["CatalogRows", "package"]
-
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class CatalogRows:

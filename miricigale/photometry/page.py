@@ -13,8 +13,6 @@ from miricigale.plotting.axes import new_figure
 from miricigale.plotting.images import plot_image, plot_model_residual, plot_segmentation
 from miricigale.utils.units import ab_magnitude
 
-__all__ = ["photometry_page"]
-
 #: Largest number of pixels across a drawing of a whole image, and rows of the table.
 _ACROSS, _ROWS = 1500, 40
 #: Signal-to-noise above which a poor fit tells of the PSF.

@@ -10,8 +10,6 @@ from miricigale.photometry.residual_sources import new_sources
 from miricigale.photometry.template_fit import TemplateFit
 from miricigale.utils.units import ANGLE
 
-__all__ = ["fit_image"]
-
 #: How often positions of new sources are refined, and the errors by which the center of a profile
 #: differs from the catalog's position where it is taken instead.
 _REFINED, _ELSEWHERE = 2, 3.0

@@ -9,8 +9,6 @@ from miricigale.photometry.templates import BankSources, FineTemplates, Template
 from miricigale.psf import KernelField
 from miricigale.utils.units import ANGLE
 
-__all__ = ["Placement"]
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Placement:

@@ -11,8 +11,6 @@ from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_e
 from miricigale.utils.files import read_table
 from miricigale.utils.tables import unique_ids
 
-__all__ = ["check_labels", "labels_at", "read_catalog", "read_prior"]
-
 _log = logging.getLogger(__name__)
 
 #: Extensions of segmentation maps, and names of columns.

@@ -9,8 +9,6 @@ from astropy.stats import mad_std
 
 from miricigale.utils.parallel import chunks, parallel_map
 
-__all__ = ["ResidualPeaks", "new_sources", "residual_peaks", "unexplained_neighbors"]
-
 #: Least signal-to-noise of light that no template explains, its least share of the model below it and
 #: of a neighbor's flux, and its distance to sources in full widths at half maximum: the least to any,
 #: and the largest to one that is flagged.

@@ -24,8 +24,6 @@ from miricigale.utils.tables import described_table, error_column
 from miricigale.utils.unified import read_write
 from miricigale.utils.units import ANGLE, FNU
 
-__all__ = ["ForcedPhotometryResult", "crowded"]
-
 
 def crowded(sky, flux, *, radius=2 * u.arcsec, delta_mag=1.0):
     """

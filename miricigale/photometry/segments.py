@@ -8,8 +8,6 @@ from photutils.segmentation import SegmentationImage
 
 from miricigale.utils.exceptions import argument_error, unknown_name
 
-__all__ = ["DILATION_RULES", "DilationRule", "dilate_segments"]
-
 
 @dataclasses.dataclass(frozen=True)
 class DilationRule:

@@ -8,16 +8,6 @@ from astropy.stats import mad_std
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.units import FNU
 
-__all__ = [
-    "filled_areas",
-    "mask_filled",
-    "sky_noise",
-    "warn_of_background",
-    "warn_of_sky",
-    "weight_scale",
-]
-
-
 #: Pixels of the smallest area that counts as filled.
 _FILLED = 25
 

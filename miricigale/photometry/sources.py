@@ -24,8 +24,6 @@ from miricigale.utils.tables import unique_ids
 from miricigale.utils.unified import read_write
 from miricigale.utils.units import ANGLE
 
-__all__ = ["SourceTemplates"]
-
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class SourceTemplates:

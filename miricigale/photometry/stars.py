@@ -18,8 +18,6 @@ from miricigale.utils.meta import provenance
 from miricigale.utils.tables import described_table
 from miricigale.utils.units import ANGLE, FNU, positive
 
-__all__ = ["psf_photometry"]
-
 #: Bit of a star that is on no pixel; by its name, which all versions of photutils have.
 _NO_OVERLAP = next(f.bit_value for f in PSF_FLAGS.FLAG_DEFINITIONS if f.name == "no_overlap")
 

@@ -3,8 +3,6 @@
 import math
 import types
 
-__all__ = ["HERSCHEL_DEPTHS", "YANG2021_DEPTHS", "fractional_error"]
-
 #: 5-sigma AB depths of 15 bands of CANDELS/EGS like the paper's (after Stefanon 2017 and FIDEL): the
 #: paper states none.
 YANG2021_DEPTHS = types.MappingProxyType(

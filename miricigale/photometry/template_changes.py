@@ -5,11 +5,9 @@ import dataclasses
 import numpy as np
 import scipy.ndimage
 
-from miricigale.photometry import _core
+from miricigale.photometry._core.shapes import INDEX_RANGE
 from miricigale.photometry.cutouts import Cutout
 from miricigale.photometry.shapes import ShapeModels
-
-__all__ = ["Change", "TemplateChanges"]
 
 #: Half-width (fine pixels) of the stamps of changes, least and most, in half-light radii and in rms
 #: widths of the PSF.
@@ -163,5 +161,5 @@ def _steps(root, derivatives, least):
 
 def _moved(parameters, step):
     moved = parameters + step
-    moved[3] = np.clip(moved[3], *np.log(_core.INDEX_RANGE))
+    moved[3] = np.clip(moved[3], *np.log(INDEX_RANGE))
     return moved

@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import scipy.sparse
 
-from miricigale.photometry import _core
+from miricigale.photometry._core.stamps import add_model
 from miricigale.photometry.arrays import pixel_scale
 from miricigale.photometry.errors import LinearFit, normal_matrix
 from miricigale.photometry.fields import legendre_terms
@@ -15,8 +15,6 @@ from miricigale.photometry.template_changes import TemplateChanges
 from miricigale.utils.exceptions import MiricigaleWarning
 from miricigale.utils.parallel import chunks
 from miricigale.utils.units import ANGLE
-
-__all__ = ["TemplateFit", "inner"]
 
 #: Squared cosine between two components from which their sum alone is measured: errors of each are then
 #: ten times that of the sum, and a template that is a few percent wrong says all of the difference.
@@ -259,7 +257,7 @@ class TemplateFit:
         for bank, flux in layers:
             for block in bank.blocks():
                 part = flux[block.first : block.last]
-                _core.add_model(image, block.values, block.box, block.start, part)
+                add_model(image, block.values, block.box, block.start, part)
         return image
 
     def residual(self, model):

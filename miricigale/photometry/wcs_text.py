@@ -8,8 +8,6 @@ from astropy.wcs import WCS
 
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["grid_text", "text_grid"]
-
 
 def _exact(has_cd):
     """Names of the numbers of a WCS that a header rounds."""

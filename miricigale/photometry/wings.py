@@ -3,8 +3,6 @@
 import numpy as np
 import scipy.optimize
 
-__all__ = ["adjust_wings"]
-
 #: Ratio of the radii of neighboring nodes, and how much the scale may change between two nodes
 #: (standard deviation) where the image does not tell.
 _RATIO, _CHANGE = 1.35, 0.3

@@ -12,8 +12,6 @@ from miricigale.photometry.sources import SourceTemplates
 from miricigale.psf import MatchingKernel
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["Yang2021Photometer"]
-
 #: The grid of images and templates, and the width of the PSF stamps.
 _PIXEL, _STAMP = 0.06 * u.arcsec, 3.0 * u.arcsec
 

@@ -3,8 +3,6 @@
 import numpy as np
 import scipy.fft
 
-__all__ = ["autocorrelation"]
-
 
 def autocorrelation(rows, usable, lag, map_parts=map):
     """

@@ -5,8 +5,6 @@ import scipy.fft
 
 from miricigale.utils.compilation import njit
 
-__all__ = ["box_response", "convolve_batch", "sample_stamps", "spline_response"]
-
 
 def spline_response(shape):
     """

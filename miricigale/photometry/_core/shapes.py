@@ -9,8 +9,6 @@ import scipy.special
 
 from miricigale.utils.compilation import njit
 
-__all__ = ["INDEX_RANGE", "shape_models"]
-
 #: Sersic indices that can be fitted.
 INDEX_RANGE = (0.4, 6.0)
 

@@ -5,8 +5,6 @@ import scipy.linalg
 import scipy.sparse
 from scipy.sparse.linalg import splu
 
-__all__ = ["block_covariance", "factorize"]
-
 
 def factorize(matrix):
     """

@@ -5,17 +5,6 @@ import numpy as np
 from miricigale.photometry._core.sampling import convolve_batch
 from miricigale.utils.compilation import njit
 
-__all__ = [
-    "add_model",
-    "convolve_stamps",
-    "cross_pairs",
-    "find_pairs",
-    "pair_products",
-    "projections",
-    "residual_statistics",
-    "whiten_stamps",
-]
-
 
 @njit(cache=True, nogil=True)
 def _sweep(box, grow, pairs):
