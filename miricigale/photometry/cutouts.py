@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from miricigale.photometry import _core
+from miricigale.photometry._core.sampling import convolve_batch
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.profiles import ellipse_to_pixels, sersic_stamp
 
@@ -103,4 +103,4 @@ def sersic_cutouts(rows, xy, jacobian):
 def convolve_padded(array, response):
     """Convolve one array with a rim around it, by the transform that ``response(shape)`` gives."""
     shape = tuple(n + 2 * RIM for n in array.shape)
-    return _core.convolve_batch(np.pad(array, RIM)[None], response(shape), shape)
+    return convolve_batch(np.pad(array, RIM)[None], response(shape), shape)

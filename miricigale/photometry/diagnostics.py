@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from miricigale.photometry import _core
+from miricigale.photometry._core.stamps import residual_statistics
 from miricigale.photometry.errors import noise_correlation, stated_correlation
 from miricigale.photometry.flags import POOR_CHI2, POOR_STRAIN, ForcedFlags
 from miricigale.photometry.residual_sources import ResidualPeaks, residual_peaks
@@ -88,7 +88,7 @@ def _statistics(fit, residual):
             start = block.start[part.start : part.stop + 1]
             rows = slice(block.first + part.start, block.first + part.stop)
             stamps = (block.values, block.box[part], start)
-            _core.residual_statistics(*stamps, residual, fit.inverse_sigma, out[rows])
+            residual_statistics(*stamps, residual, fit.inverse_sigma, out[rows])
 
         fit.bank.map(measure, block.parts())
     return out

@@ -8,7 +8,16 @@ import scipy.fft
 import scipy.sparse
 from astropy.stats import mad_std
 
-from miricigale.photometry import _core
+from miricigale.photometry._core.noise import autocorrelation
+from miricigale.photometry._core.solve import block_covariance, factorize
+from miricigale.photometry._core.stamps import (
+    convolve_stamps,
+    cross_pairs,
+    find_pairs,
+    pair_products,
+    projections,
+    whiten_stamps,
+)
 from miricigale.photometry.templates import batches
 from miricigale.utils.parallel import chunks, parallel_map
 
@@ -73,7 +82,7 @@ def noise_correlation(
     level = sum(parallel_map(clipped, parts, executor=executor)) / np.count_nonzero(kept)
     level = residual.dtype.type(level)
     lag = min(max_lag, (min(residual.shape) - 1) // 2)
-    covariance, error = _core.autocorrelation(
+    covariance, error = autocorrelation(
         lambda part: rows(part) - level,
         kept,
         lag,
@@ -138,7 +147,7 @@ def _whitened(bank, block, inverse_sigma):
 
     def scale(part):
         stamps = (block.values, block.box[part], block.start[part])
-        _core.whiten_stamps(*stamps, inverse_sigma, values, sums[part])
+        whiten_stamps(*stamps, inverse_sigma, values, sums[part])
 
     bank.map(scale, block.parts())
     return values, sums
@@ -150,7 +159,7 @@ def _projected(bank, block, values, images):
 
     def project_part(part):
         for image, one in zip(images, out, strict=True):
-            _core.projections(values, block.box[part], block.start[part], image, one[part])
+            projections(values, block.box[part], block.start[part], image, one[part])
 
     bank.map(project_part, block.parts())
     return out.T
@@ -161,7 +170,7 @@ def _products(bank, left, right, pairs):
     out = np.empty(len(pairs))
 
     def multiply(part):
-        _core.pair_products(*left, *right, pairs[part], out[part])
+        pair_products(*left, *right, pairs[part], out[part])
 
     bank.map(multiply, chunks(len(pairs), _PAIRS))
     return out
@@ -233,7 +242,7 @@ def normal_matrix(bank, inverse_sigma, images=()):
         Sums of squares of the templates without weights; their sums inside the image, and on usable pixels.
     """
     n = len(bank.order)
-    pairs = _core.find_pairs(bank.box)
+    pairs = find_pairs(bank.box)
     products = np.zeros(len(pairs))
     sums = np.empty((n, 4))
     projection = np.empty((n, len(images)))
@@ -253,7 +262,7 @@ def sandwich_matrix(bank, inverse_sigma, correlation, images=()):
     correlation made once for each padded shape.
     """
     n = len(bank.order)
-    pairs = _core.find_pairs(bank.box, grow=correlation.shape[0] // 2)
+    pairs = find_pairs(bank.box, grow=correlation.shape[0] // 2)
     products = np.zeros(len(pairs))
     diagonal, projection = np.empty(n), np.empty((n, len(images)))
     spread = _spread_by(correlation, bank)
@@ -282,7 +291,7 @@ def _spread_by(correlation, bank):
 
         def convolve(batch):
             shape, rows = batch
-            _core.convolve_stamps(*white, rows, transfer(shape), shape, box, start, values)
+            convolve_stamps(*white, rows, transfer(shape), shape, box, start, values)
 
         # rounded up so that many stamps share a shape
         shapes = -(-box[:, 2:] // 8) * 8
@@ -322,7 +331,7 @@ def cross_matrix(bank, other, inverse_sigma, correlation=None):
                 )
             )
         for mine, _, left in live:
-            pairs = _core.cross_pairs(mine.box, right[1])
+            pairs = cross_pairs(mine.box, right[1])
             if len(pairs):
                 values.append(_products(bank, left, right, pairs))
                 rows.append(pairs[:, 0] + mine.first)
@@ -353,7 +362,7 @@ class LinearFit:
     corner_rhs: np.ndarray
 
     def __post_init__(self):
-        solve = _core.factorize(self.matrix)
+        solve = factorize(self.matrix)
         z = solve(self.border) if self.border.shape[1] else self.border
         q = np.linalg.inv(self.corner - self.border.T @ z)
         common = q @ (self.corner_rhs - z.T @ self.rhs)
@@ -378,7 +387,7 @@ class LinearFit:
             Fillings of the sandwich, each its sparse matrix, border and corner; None for noise
             that is white with the given sigmas.
         core, halo, pattern
-            See `~miricigale.photometry._core.block_covariance`.
+            See `~miricigale.photometry._core.solve.block_covariance`.
 
         Returns
         -------
@@ -389,7 +398,7 @@ class LinearFit:
             Formal error over that of the source alone.
         """
         z, q = self._z, self._q
-        local, inverse = _core.block_covariance(
+        local, inverse = block_covariance(
             self.matrix, xy[:, 1], xy[:, 0], core=core, halo=halo, pattern=pattern,
             middles=[None if one is None else one[0] for one in fillings],
         )  # fmt: skip

@@ -8,7 +8,7 @@ import warnings
 import astropy.units as u
 import numpy as np
 
-from miricigale.photometry import _core
+from miricigale.photometry._core.stamps import add_model
 from miricigale.photometry.arrays import (
     fit_arrays,
     image_arrays,
@@ -317,7 +317,7 @@ class ForcedPhotometer:
             values = flux[place.near][bank.order]
             for block in bank.blocks():
                 some = values[block.first : block.last]
-                _core.add_model(model, block.values, block.box, block.start, some)
+                add_model(model, block.values, block.box, block.start, some)
         return model / arrays.area * SURFACE_BRIGHTNESS
 
     def _rows(self, sources, place, templates):

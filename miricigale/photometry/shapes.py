@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import scipy.fft
 
-from miricigale.photometry import _core
+from miricigale.photometry._core.sampling import box_response
+from miricigale.photometry._core.shapes import INDEX_RANGE, shape_models
 
 #: What is known of shapes beforehand (mean and width): ln of the circularised half-light radius
 #: (arcsec), ln of the Sersic index, the two ellipticities, and the offset of the center (pixels).
@@ -39,7 +40,7 @@ class Shape:
     """A profile that was fitted."""
 
     flux: float  # Total light.
-    parameters: np.ndarray  # (6,): As for `~miricigale.photometry._core.shape_models`.
+    parameters: np.ndarray  # (6,): As for `~miricigale.photometry._core.shapes.shape_models`.
     point: float  # Probability that the source is a point.
     covariance: np.ndarray  # (7, 7): Of ln flux and the parameters.
 
@@ -91,10 +92,10 @@ class ShapeModels:
         """
         A Sersic profile of unit light and its derivatives on a stamp, (1 + derivatives, *shape).
 
-        Parameters are those of `~miricigale.photometry._core.shape_models`.
+        Parameters are those of `~miricigale.photometry._core.shapes.shape_models`.
         """
         size = _period(shape)
-        return _core.shape_models(
+        return shape_models(
             self._transform(size), size, shape, parameters, derivatives=derivatives
         )  # fmt: skip
 
@@ -114,7 +115,7 @@ class ShapeModels:
             of.append(slice(low - begin - rim, high - begin - rim))
         padded[tuple(to)] = images[tuple(of)]
         # the samples of the PSF are integrated over pixels too
-        response = self._transform(size) / _core.box_response((size, size), np.eye(2))
+        response = self._transform(size) / box_response((size, size), np.eye(2))
         spectra = scipy.fft.rfft2(padded) * response.astype(np.complex64)
         found = scipy.fft.irfft2(spectra, s=(size, size), overwrite_x=True)
         return found[:, rims[0] : rims[0] + shape[0], rims[1] : rims[1] + shape[1]]
@@ -239,8 +240,8 @@ def _minimum(stamp, start, mean, width, n_free):
     """
     free = slice(0, n_free)
     precision = np.concatenate([[0.0], width[free] ** -2])
-    low = np.array([-np.inf, -np.inf, np.log(0.05), np.log(_core.INDEX_RANGE[0]), -2.0, -2.0])
-    high = np.array([np.inf, np.inf, np.log(stamp.size), np.log(_core.INDEX_RANGE[1]), 2.0, 2.0])
+    low = np.array([-np.inf, -np.inf, np.log(0.05), np.log(INDEX_RANGE[0]), -2.0, -2.0])
+    high = np.array([np.inf, np.inf, np.log(stamp.size), np.log(INDEX_RANGE[1]), 2.0, 2.0])
 
     def at(parameters):
         columns = stamp.whitened(stamp.models(parameters, n_free))

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import scipy.ndimage
 
-from miricigale.photometry import _core
+from miricigale.photometry._core.shapes import INDEX_RANGE
 from miricigale.photometry.cutouts import Cutout
 from miricigale.photometry.shapes import ShapeModels
 
@@ -161,5 +161,5 @@ def _steps(root, derivatives, least):
 
 def _moved(parameters, step):
     moved = parameters + step
-    moved[3] = np.clip(moved[3], *np.log(_core.INDEX_RANGE))
+    moved[3] = np.clip(moved[3], *np.log(INDEX_RANGE))
     return moved

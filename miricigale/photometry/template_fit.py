@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import scipy.sparse
 
-from miricigale.photometry import _core
+from miricigale.photometry._core.stamps import add_model
 from miricigale.photometry.arrays import pixel_scale
 from miricigale.photometry.errors import LinearFit, normal_matrix
 from miricigale.photometry.fields import legendre_terms
@@ -257,7 +257,7 @@ class TemplateFit:
         for bank, flux in layers:
             for block in bank.blocks():
                 part = flux[block.first : block.last]
-                _core.add_model(image, block.values, block.box, block.start, part)
+                add_model(image, block.values, block.box, block.start, part)
         return image
 
     def residual(self, model):

@@ -6,7 +6,12 @@ import functools
 import numpy as np
 import scipy.fft
 
-from miricigale.photometry import _core
+from miricigale.photometry._core.sampling import (
+    box_response,
+    convolve_batch,
+    sample_stamps,
+    spline_response,
+)
 from miricigale.photometry.cutouts import RIM, convolve_padded
 from miricigale.utils.parallel import parallel_map
 
@@ -32,9 +37,9 @@ class FineTemplates:
             object.__setattr__(self, name, value.reshape(-1, *value.shape[-2:]))
 
     def _response(self, shape):
-        response = 1.0 / _core.spline_response(shape)
+        response = 1.0 / spline_response(shape)
         if self.sides is not None:
-            response = response * _core.box_response(shape, self.sides)
+            response = response * box_response(shape, self.sides)
         return response
 
     @functools.cached_property
@@ -67,7 +72,7 @@ class FineTemplates:
         return np.einsum("nk,kl,nl->n", weights, self._kernel_power, weights)
 
     def _sides_only(self, shape):
-        return _core.box_response(shape, self.sides)
+        return box_response(shape, self.sides)
 
     @functools.lru_cache(maxsize=256)  # noqa: B019 - lives as long as one measurement
     def _transfer(self, shape, convolved, place):
@@ -75,7 +80,7 @@ class FineTemplates:
             return scipy.fft.rfft2(self.kernel[place], s=shape) * self._response(shape)
         # a profile is integrated over fine pixels already, which the PSF's samples are not
         transfer = scipy.fft.rfft2(self.target[place], s=shape) * self._response(shape)
-        return transfer / _core.box_response(shape, np.eye(2))
+        return transfer / box_response(shape, np.eye(2))
 
     def _transfers(self, shape, convolved, weights):
         """The transform for each of some sources, or for all if they are alike."""
@@ -120,7 +125,7 @@ class FineTemplates:
             h, w = cutout.data.shape
             stamp[RIM : RIM + h, RIM : RIM + w] = cutout.data
         transfer = self._transfers(shape, group[0].convolved, weights)
-        return _core.convolve_batch(stamps, transfer, shape)
+        return convolve_batch(stamps, transfer, shape)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -347,7 +352,7 @@ class TemplateBank:
             begin = np.concatenate([[0], np.cumsum(box[:, 2] * box[:, 3])])
             sums = np.zeros(int(begin[-1]))
             center = self._sources.xy[sources[rows]]
-            _core.sample_stamps(coefficients, which, amplitude, center, poly, box, begin, sums)
+            sample_stamps(coefficients, which, amplitude, center, poly, box, begin, sums)
             for k, low, high in zip(rows, begin[:-1], begin[1:], strict=True):
                 block.values[start[k] : start[k + 1]] += sums[low:high]
 

@@ -4,7 +4,7 @@ import scipy.fft
 import scipy.ndimage
 from numpy.testing import assert_allclose
 
-from miricigale.photometry import _core
+from miricigale.photometry._core.shapes import shape_models
 from miricigale.photometry.light import FineImage, cutouts
 from miricigale.photometry.shapes import ShapeFitter
 from miricigale.profiles import sersic_image
@@ -45,7 +45,7 @@ def test_gaussian_and_its_convolution():
     r_eff, psf_width = 4.0, 1.5
     sigma = np.hypot(r_eff / np.sqrt(2 * np.log(2)), psf_width)
     parameters = [30.3, 29.6, np.log(r_eff), np.log(0.5), 0.0, 0.0]
-    image = _core.shape_models(
+    image = shape_models(
         transform(128, psf_width), 128, (61, 61), parameters, derivatives=0
     )[0]  # fmt: skip
     y, x = np.indices((61, 61))
@@ -61,7 +61,7 @@ def test_models_are_those_of_the_renderer(n, r_eff, q):
         20.3, 19.6, np.log(r_eff * np.sqrt(q)), np.log(n), eta * np.cos(1.0), eta * np.sin(1.0),
     ]  # fmt: skip
     # a large period, for the wings of its images not to matter
-    image = _core.shape_models(transform(256), 256, (41, 41), parameters, derivatives=0)[0]
+    image = shape_models(transform(256), 256, (41, 41), parameters, derivatives=0)[0]
     assert_allclose(image, truth, atol=1e-3 * truth.max())
 
 
@@ -69,14 +69,13 @@ def test_models_are_those_of_the_renderer(n, r_eff, q):
 def test_derivatives(ellipticity):
     psf = transform(64)
     parameters = np.array([15.3, 16.2, np.log(3.0), np.log(1.7), *ellipticity])
-    images = _core.shape_models(psf, 64, (33, 33), parameters)
+    images = shape_models(psf, 64, (33, 33), parameters)
     assert images.shape == (7, 33, 33)
     for k in range(6):
         step = np.zeros(6)
         step[k] = 2e-2
         high, low = (
-            _core.shape_models(psf, 64, (33, 33), parameters + s, derivatives=0)[0]
-            for s in (step, -step)
+            shape_models(psf, 64, (33, 33), parameters + s, derivatives=0)[0] for s in (step, -step)
         )
         assert_allclose(images[1 + k], (high - low) / 4e-2, atol=5e-3 * np.abs(images[1 + k]).max())
 

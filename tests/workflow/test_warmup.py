@@ -133,7 +133,7 @@ def test_kernels_run_where_nothing_can_be_kept(tmp_path):
         "caching.CacheImpl._locator_classes = []\n"
         "caching.CompileResultCacheImpl._locator_classes = []\n"
         "logging.basicConfig(stream=sys.stdout)\n"
-        "from miricigale.photometry import _core\n"
+        "from miricigale.photometry._core import stamps\n"
         "from miricigale.psf import _core as psf\n"
         "import numpy as np\n"
         "print(psf.polygon_coverage.__name__)\n"
