@@ -26,6 +26,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "mosaics": ("MosaicFile", "read_mosaic"),
         "priors": ("read_prior",),
         "segments": ("DILATION_RULES", "DilationRule", "dilate_segments"),
+        "settings": ("ErrorSettings", "MemorySettings"),
         "sky_noise": ("weight_scale",),
         "sources": ("SourceTemplates",),
         "results": ("ForcedPhotometryResult", "crowded"),
