@@ -105,7 +105,7 @@ def simulate(name, depth, residual, seed, limit, cosmic_rays=True):
     kernel = MatchingKernel.from_psfs(
         sharp, psf, lo_angle=angle, resampling="drizzle", pixel_scale=SCALE
     )
-    photometer = ForcedPhotometer(kernel, template="psf", fit_background=True)
+    photometer = ForcedPhotometer(kernel, template="psf", background_order=0)
     result = photometer.measure(mosaic, catalog=truth["id", "sky"])
     # where all dithers overlap the noise is the smallest
     sigma = np.where(mosaic.mask, np.inf, mosaic.uncertainty.array)

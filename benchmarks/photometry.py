@@ -176,7 +176,7 @@ def cutouts(quick):
                 image *= step**2
             sigma = 0.02 * step
             image = mosaic(image + rng.normal(0, sigma, image.shape), low, sigma)
-            photometer = ForcedPhotometer(kernel, fit_background=True)
+            photometer = ForcedPhotometer(kernel, background_order=0)
             measured(
                 "band", len(detected), size, scale, truth,
                 photometer.measure, image, templates=templates,

@@ -189,7 +189,7 @@ def main():
     hst = hst_psf("wfc3.f160w", pixel_scale=FINE * u.arcsec)
     target = psf_mosaic(miri_psf(args.band), FINE * u.arcsec, 40 * u.deg)
     kernel = MatchingKernel.from_psfs(hst, target, pixel_scale=FINE * u.arcsec, extent=9 * u.arcsec)
-    photometer = ForcedPhotometer(kernel, fit_background=True)
+    photometer = ForcedPhotometer(kernel, background_order=0)
     fields, rows, start = [], [], time.process_time()
     for seed in range(args.first, args.first + args.scenes):
         field = Field(seed, kernel, kernel.target)

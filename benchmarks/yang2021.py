@@ -25,6 +25,7 @@ from astropy.table import QTable
 from miricigale.depth import scaled_limit
 from miricigale.instrument import ceers_exposures, mosaic_wcs, pixel_area_map
 from miricigale.photometry import (
+    ErrorSettings,
     ForcedPhotometer,
     Yang2021Photometer,
     detect_sources,
@@ -37,6 +38,7 @@ from miricigale.utils.tables import match_sky
 
 CENTER = SkyCoord(53.13440, -27.83444, unit="deg")
 PRIOR = "wfc3.f160w"
+WHITE = ErrorSettings(correlated_noise=False)
 FINE, COARSE = 0.06 * u.arcsec, 0.11 * u.arcsec
 
 
@@ -144,7 +146,7 @@ def compare(band, seeds):
             "the same, segments dilated": (paper, fine, "area"),
             "ours, 0.11": (ours, coarse, None),
             "ours, bare segments, white": (
-                ForcedPhotometer(ours.kernel, template="cutout", wings=False, correlated_noise=False),
+                ForcedPhotometer(ours.kernel, template="cutout", wings=False, errors=WHITE),
                 coarse, None),
         }  # fmt: skip
         for name, (photometer, image, dilation) in runs.items():
@@ -177,7 +179,7 @@ def dilation(band):
     catalog = sources(band, rng)
     image, fine = expose(catalog, band, exposures, 2e-3, rng)
     highres = highres_image(catalog, filter=PRIOR, wcs=fine.wcs, psf=hst, seed=1)
-    photometer = ForcedPhotometer(kernel, template="cutout", wings=False, correlated_noise=False)
+    photometer = ForcedPhotometer(kernel, template="cutout", wings=False, errors=WHITE)
     # 1 sigma of a point source at 27.6 AB (5 sigma)
     limit = 10 ** (0.4 * (23.9 - 27.6)) / 5
     print(f"{band}: measured over true flux minus one by the signal-to-noise in F160W")

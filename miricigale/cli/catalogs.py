@@ -169,7 +169,8 @@ def add_photometry(commands):
             help=f"subtract a background measured in such boxes of the {what}",
         )
     what = "fit no constant with the sources"
-    add("--no-background", dest="fit_background", action="store_false", help=what)
+    none = {"dest": "background_order", "action": "store_const", "const": None, "default": 0}
+    add("--no-background", **none, help=what)
     add(
         "--max-shift",
         type=quantity_in("arcsec"),
@@ -211,7 +212,7 @@ def _photometry(args):
         *images,
         **chosen(args, f"segmentation catalog kernel {psfs}"),
         **{f"highres_{name}": getattr(args, f"highres_{name}") for name in psfs.split()},
-        **chosen(args, "fit_background max_shift background_order offset_order second_pass"),
+        **chosen(args, "max_shift background_order offset_order second_pass"),
         **chosen(args, "components output model residual overwrite seed"),
         page=page,
         n_threads=args.threads,

@@ -26,6 +26,8 @@ from .results import crowded as crowded
 from .segments import DILATION_RULES as DILATION_RULES
 from .segments import DilationRule as DilationRule
 from .segments import dilate_segments as dilate_segments
+from .settings import ErrorSettings as ErrorSettings
+from .settings import MemorySettings as MemorySettings
 from .sky_noise import weight_scale as weight_scale
 from .sources import SourceTemplates as SourceTemplates
 from .stars import psf_photometry as psf_photometry

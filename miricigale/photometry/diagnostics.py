@@ -31,7 +31,7 @@ def diagnose(fit, xy):
     model = fit.model()
     residual = fit.residual(model)
     correlation = None
-    if fit.settings.correlated_noise and len(fit.rows):
+    if fit.settings.errors.correlated_noise and len(fit.rows):
         correlation = _correlation(fit, residual, model)
     chi2, left, core = _statistics(fit, residual).T
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -65,7 +65,7 @@ def fit_covariances(fit, correlation=None):
 
 def _psf_errors(fit):
     """Errors of the fluxes of all rows by that of the PSF."""
-    settings, kernel = fit.settings, fit.settings.mean_kernel
+    settings, kernel = fit.settings.errors, fit.settings.mean_kernel
     fraction = settings.psf_error
     if fraction is None:
         if settings.size_scatter is None:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import numbers
-import os
 import warnings
 
 import astropy.units as u
@@ -19,6 +18,7 @@ from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.packaging import CatalogRows, package
 from miricigale.photometry.passes import fit_image
 from miricigale.photometry.placement import Placement
+from miricigale.photometry.settings import ErrorSettings, MemorySettings
 from miricigale.photometry.sky_noise import warn_of_background
 from miricigale.photometry.sources import SourceTemplates
 from miricigale.psf import KernelField
@@ -49,16 +49,12 @@ class ForcedPhotometer:
         segment of enough signal-to-noise belongs to them, otherwise takes a point source.
         ``"cutout"`` does so without regard to the signal-to-noise. ``"sersic"`` draws the
         profile that the catalog states.
-    min_snr : float, optional
-        Least signal-to-noise of a segment for ``"auto"``.
     wings : bool, optional
         Whether cutouts are carried on beyond their well-measured core by a profile scaled to what is
         seen; otherwise they are the segments as they are.
-    fit_background : bool, optional
-        Whether a background is fitted with the sources.
     background_order : int, optional
-        Order of the polynomial in position that the background is, 0 (a constant) to 4. Its terms are images
-        that are kept during the fit.
+        If given, a background is fitted with the sources: a polynomial in position of this order, 0 (a
+        constant) to 4. Its terms are images that are kept during the fit.
     max_shift : `~astropy.units.Quantity`, optional
         If given, a shift of the whole image is fitted too. A larger one than this is not
         believed: a warning says so and the image is measured without.
@@ -66,10 +62,6 @@ class ForcedPhotometer:
         If given (0 to 3), a map of offsets takes the place of the one shift: a polynomial in position of
         this order through the offsets of bright isolated sources that are below ``max_shift``. With too few
         of them the order is lowered, or one shift fitted, and a warning says so.
-    correlated_noise : bool, optional
-        Whether the noise's autocorrelation is measured on source-free pixels and goes into
-        the errors; otherwise the image's uncertainty is taken as white noise. With fewer than 400 pixels
-        it is what the mosaic states (``meta["noise_correction"]``), if it does.
     integrate : bool, optional
         Whether templates are averaged over the image's pixels, for a kernel whose target
         does not include the response of the pixel.
@@ -84,25 +76,10 @@ class ForcedPhotometer:
     positive : bool, optional
         Whether the solution without negative fluxes is given too (``flux_positive``). All else belongs to
         the fluxes without that condition, which alone have no bias.
-    radius : `~astropy.units.Quantity`, optional
-        Half-width to which templates are cut; as far as the kernel reaches by default.
-    min_coverage : float, optional
-        Sources with less of their template's light on usable pixels are not measured.
-    max_bytes : float, optional
-        Memory for templates; beyond it they are made anew for each pass.
-    size_scatter : float or None, optional
-        Templates fitted to the high-resolution image (``"auto"`` and ``"cutout"`` with ``wings``) may
-        change as far as their fit leaves them open, and in size by this standard deviation of ln size,
-        since galaxies are not of one size in all bands. None takes them without error. Shapes that a
-        catalog states always are.
-    psf_error : float, optional
-        Error of a point source's flux, as a fraction, by that of the image's PSF: about 0.8 of the
-        fractional error of its width. By default that of the kernel's encircled energy, for templates
-        that are images, and none for the others, which need the kernel's target only.
-    scratch : path-like, optional
-        Folder with room for files of the size of the image, in which what is made of it is kept in place of
-        memory, for images that are larger. It changes nothing in the result, whose model and
-        residual are then such files too, which go with them.
+    errors : `ErrorSettings`, optional
+        What the errors are made of.
+    memory : `MemorySettings`, optional
+        What is kept in memory.
     n_threads : int, optional
         Number of threads; by default one for each processor. It changes nothing in the
         result.
@@ -137,29 +114,23 @@ class ForcedPhotometer:
     kernel: object
     _: dataclasses.KW_ONLY
     template: str = "auto"
-    min_snr: float = 5.0
     wings: bool = True
-    fit_background: bool = False
-    background_order: int = 0
+    background_order: int | None = None
     max_shift: u.Quantity | None = None
     offset_order: int | None = None
-    correlated_noise: bool = True
     integrate: bool = False
     components: int = 1
     second_pass: bool = False
     positive: bool = False
-    radius: u.Quantity | None = None
-    min_coverage: float = 0.05
-    max_bytes: float = 1.5e9
-    size_scatter: float | None = 0.1
-    psf_error: float | None = None
-    scratch: object = None
+    errors: ErrorSettings = dataclasses.field(default_factory=ErrorSettings)
+    memory: MemorySettings = dataclasses.field(default_factory=MemorySettings)
     n_threads: int | None = None
 
     def __post_init__(self):
         template = self.template
         if template not in ("auto", "cutout", "psf", "sersic"):
             raise argument_error("template", "'auto', 'cutout', 'psf' or 'sersic'", repr(template))
+        # the kernel that all have in common: the mean, with PSFs in any case
         mean = self.kernel.mean if isinstance(self.kernel, KernelField) else self.kernel
         bare = mean.source is None or mean.target is None
         changed = {"bare": bare, "mean_kernel": mean, "n_threads": thread_count(self.n_threads)}
@@ -175,38 +146,27 @@ class ForcedPhotometer:
             # as far as it reaches, and as wide
             mean = dataclasses.replace(mean, source=mean.array, target=mean.array)
             changed |= {"template": "cutout", "wings": False, "mean_kernel": mean}
-        _check_order("background_order", self.background_order, 4)
-        if self.background_order and not self.fit_background:
-            wanted = "0 without 'fit_background'"
-            raise argument_error("background_order", wanted, self.background_order)
-        if self.offset_order is not None:
-            _check_order("offset_order", self.offset_order, 3)
-            if self.max_shift is None:
-                raise argument_error("max_shift", "given with 'offset_order'", "None")
+        for name, largest in (("background_order", 4), ("offset_order", 3)):
+            order = getattr(self, name)
+            if order is None:
+                continue
+            if (
+                not isinstance(order, numbers.Integral)
+                or isinstance(order, bool)
+                or not 0 <= order <= largest
+            ):
+                raise argument_error(name, f"an integer from 0 to {largest}", repr(order))
+        if self.offset_order is not None and self.max_shift is None:
+            raise argument_error("max_shift", "given with 'offset_order'", "None")
         if self.components not in (1, 2):
             raise argument_error("components", "1 or 2", repr(self.components))
-        if not self.min_snr >= 0:
-            raise argument_error("min_snr", "at least 0", self.min_snr)
-        if not 0 < self.min_coverage < 1:
-            raise argument_error("min_coverage", "between 0 and 1", self.min_coverage)
-        for name in ("size_scatter", "psf_error"):
-            value = getattr(self, name)
-            if value is not None and not 0 <= value < 1:
-                raise argument_error(name, "from 0 to 1", value)
-        for name in ("max_shift", "radius"):
-            value = getattr(self, name)
-            if value is not None:
-                changed[name] = positive(value, ANGLE, name) * ANGLE
-        if self.scratch is not None and not os.path.isdir(self.scratch):
-            raise argument_error("scratch", "a folder that is there", self.scratch)
-        # the kernel that all have in common: the mean, with PSFs in any case
+        for name, kind in (("errors", ErrorSettings), ("memory", MemorySettings)):
+            if not isinstance(getattr(self, name), kind):
+                raise argument_error(name, kind.__name__, repr(getattr(self, name)))
+        if self.max_shift is not None:
+            changed["max_shift"] = positive(self.max_shift, ANGLE, "max_shift") * ANGLE
         for name, value in changed.items():
             object.__setattr__(self, name, value)
-
-    @property
-    def reach(self):
-        """Half-width in arcsec to which templates are cut, or infinity (float)."""
-        return np.inf if self.radius is None else self.radius.value
 
     def __repr__(self):
         return f"<ForcedPhotometer template={self.template!r}, {self.kernel!r}>"
@@ -229,7 +189,7 @@ class ForcedPhotometer:
             As for `SourceTemplates.from_images`, or for Sersic templates `SourceTemplates.from_catalog`.
         templates : `SourceTemplates`, optional
             What the sources look like, in place of the three above, made once for several
-            images. The settings ``template``, ``min_snr`` and ``wings`` are then theirs.
+            images. The settings ``template`` and ``wings`` are then theirs.
 
         Returns
         -------
@@ -247,7 +207,7 @@ class ForcedPhotometer:
             exactly 0 are not masked, or a background that was left in ``image`` or ``highres``
             goes into the fluxes.
         """
-        arrays = fit_arrays(image, "image", self.scratch)
+        arrays = fit_arrays(image, "image", self.memory.scratch)
         given = [one is not None for one in (highres, segmentation, catalog)]
         if templates is None:
             sources = dataclasses.replace(catalog_sources(catalog), sky=catalog["sky"])
@@ -277,7 +237,7 @@ class ForcedPhotometer:
             bank = place.bank(rows.near, templates, executor)
             found = fit_image(arrays, bank, self, rows, place.grid(templates))
             result = package(*found, rows, meta)
-        if not self.fit_background:
+        if self.background_order is None:
             warn_of_background(result, self.mean_kernel)
         return result
 
@@ -365,7 +325,7 @@ class ForcedPhotometer:
             return dataclasses.replace(found, flags=flags, meta={**found.meta, "template": "auto"})
         return SourceTemplates.from_images(
             highres, segmentation, catalog, psf=self.mean_kernel.source, template=self.template,
-            min_snr=self.min_snr, wings=self.wings, n_threads=self.n_threads,
+            wings=self.wings, n_threads=self.n_threads,
         )  # fmt: skip
 
     def _check_scale(self, name, wcs):
@@ -389,12 +349,3 @@ class ForcedPhotometer:
                     f"kernel is from one whose peak holds {peaks[1]:.3g}: is it of the same image?"
                 )
                 warnings.warn(msg, MiricigaleWarning, stacklevel=3)
-
-
-def _check_order(name, order, largest):
-    if (
-        not isinstance(order, numbers.Integral)
-        or isinstance(order, bool)
-        or not 0 <= order <= largest
-    ):
-        raise argument_error(name, f"an integer from 0 to {largest}", repr(order))

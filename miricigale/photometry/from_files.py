@@ -45,7 +45,7 @@ def measure_files(
     highres_psf_angle=None,
     pa_aper=None,
     highres_pa_aper=None,
-    fit_background=True,
+    background_order=0,
     max_shift=None,
     output=None,
     page=None,
@@ -88,8 +88,8 @@ def measure_files(
         +y.
     pa_aper, highres_pa_aper : `~astropy.units.Quantity`, optional
         Position angle of the detector's +y axis, if the header does not tell.
-    fit_background : bool, optional
-        Whether a constant is fitted to the image with the sources.
+    background_order : int or None, optional
+        Order of the background that is fitted with the sources, 0 for a constant; none is fitted if None.
     max_shift : `~astropy.units.Quantity`, optional
         If given, a shift of the image up to this is fitted.
     output, page, model, residual : path-like, optional
@@ -170,7 +170,7 @@ def measure_files(
         bar.update()
         bar.set_description("fluxes")
         photometer = ForcedPhotometer(
-            matching, fit_background=fit_background, max_shift=max_shift, n_threads=n_threads,
+            matching, background_order=background_order, max_shift=max_shift, n_threads=n_threads,
             **options,
         )  # fmt: skip
         result = photometer.measure(mosaic, prior, segments, sources)

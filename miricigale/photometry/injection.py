@@ -165,9 +165,7 @@ class _Field:
         source = photometer.mean_kernel.source
         self.models = ShapeModels(source / source.sum())
         self.reach = source.shape[0] / 2
-        templates = SourceTemplates.from_images(
-            highres, segmentation, catalog, psf=source, min_snr=photometer.min_snr
-        )
+        templates = SourceTemplates.from_images(highres, segmentation, catalog, psf=source)
         if "label" in catalog.colnames:
             self.own = np.asarray(catalog["label"], int)
         else:

@@ -186,8 +186,8 @@ def _new_sources(catalog, xy, wcs, columns):
 def _common(fit, covariance):
     """Parameters of the whole image with their errors."""
     found, errors = {}, np.sqrt(np.diag(covariance)) if len(covariance) else np.empty(0)
-    if fit.settings.fit_background and fit.fit is not None:
-        order, shape = fit.settings.background_order, fit.arrays.flux.shape
+    order, shape = fit.settings.background_order, fit.arrays.flux.shape
+    if order is not None and fit.fit is not None:
         terms = fit.common[: n_terms(order)]
         found["background"] = terms[0] * SURFACE_BRIGHTNESS
         found["background_err"] = errors[0] * SURFACE_BRIGHTNESS

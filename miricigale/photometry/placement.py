@@ -63,8 +63,7 @@ class Placement:
             fine,
             BankSources(templates.drawn(grid, fine_xy), fine_xy, xy, poly),
             shape,
-            radius=settings.reach / self.scale,
-            max_bytes=settings.max_bytes,
+            max_bytes=settings.memory.max_bytes,
             weigh=weigh,
             executor=executor,
         )

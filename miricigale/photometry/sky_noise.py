@@ -163,7 +163,7 @@ def warn_of_background(result, kernel):
         msg = (
             f"'image' has a background of {level:.3g} between the sources, which is not fitted and adds "
             f"about {added:.3g} to fluxes whose median error is {error:.3g}: subtract it, or give "
-            "'fit_background'"
+            "'background_order'"
         )
         warnings.warn(msg, MiricigaleWarning, stacklevel=5)
 

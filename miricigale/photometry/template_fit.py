@@ -20,6 +20,9 @@ from miricigale.utils.units import ANGLE
 #: ten times that of the sum, and a template that is a few percent wrong says all of the difference.
 _SEPARABLE = 0.99
 
+#: Least part of a template's light on usable pixels: sources with less are not measured.
+_MIN_COVERAGE = 0.05
+
 
 class TemplateFit:
     """
@@ -70,8 +73,9 @@ class TemplateFit:
         self.host = np.arange(len(bank.order)) if host is None else host
         self.scale = pixel_scale(arrays.wcs)
         self.inverse_sigma = arrays.inverse_sigma
-        self._radius = settings.reach / self.scale
-        self._background = self._background_columns() if settings.fit_background else []
+        self._background = (
+            self._background_columns() if settings.background_order is not None else []
+        )
         self.shift = self.offset_map = self.free = None
         self.bank = bank
         moved = np.zeros(2) if moved is None else moved
@@ -99,9 +103,9 @@ class TemplateFit:
         white = [self.arrays.whitened(column) for column in self.columns]
         data = self.arrays.whitened(self.arrays.flux)
         matrix, projection, power, light = normal_matrix(bank, self.inverse_sigma, [data, *white])
-        self.light, self.power = light / self._full_light(), power
+        self.light, self.power = light / bank.full_light()[:, None], power
         diagonal = matrix.diagonal()
-        rows = (self.light[:, 1] >= self.settings.min_coverage) & (diagonal > 0)
+        rows = (self.light[:, 1] >= _MIN_COVERAGE) & (diagonal > 0)
         with np.errstate(divide="ignore", invalid="ignore"):
             excess = bank.noise_terms() / np.where(power > 0, power, np.inf)
         self.noisy = excess > 0.5
@@ -133,7 +137,7 @@ class TemplateFit:
         ``fitted`` (`~miricigale.photometry.shapes.FITTED`, (k,)) is what is known of the bank's first sources;
         those after them are points.
         """
-        if self.fit is None or self.settings.size_scatter is None:
+        if self.fit is None or self.settings.errors.size_scatter is None:
             return
         known = not_fitted(len(self.bank.order))
         known[: len(fitted)] = fitted
@@ -152,7 +156,7 @@ class TemplateFit:
             TemplateChanges(
                 self.settings.mean_kernel.source,
                 self.settings.mean_kernel.target,
-                self.settings.size_scatter,
+                self.settings.errors.size_scatter,
             ),
             [self.arrays.whitened(one) for one in (self.arrays.flux, *self.columns)],
             self.inverse_sigma,
@@ -174,11 +178,6 @@ class TemplateFit:
         self.inseparable[second[~apart]] = True
         self.degenerate[second] = False
         self.pairs = np.stack([first, second], axis=1)[apart]
-
-    def _full_light(self):
-        """Light of a whole template, within the radius to which they are cut."""
-        half = self._radius * self.scale / self.settings.mean_kernel.pixel_scale.to_value(ANGLE)
-        return self.bank.full_light(half)[:, None]
 
     def _find_shift(self, plain, shift):
         limit = self.settings.max_shift.value / self.scale

@@ -90,12 +90,6 @@ class FineTemplates:
             return found[0]
         return sum(w[:, None, None] * one for w, one in zip(weights.T[used], found, strict=True))
 
-    def light_within(self, half):
-        """Light of each place's PSF within some pixels of the middle, shape (k,)."""
-        middle = self.target.shape[1] // 2
-        cut = slice(middle - int(min(half, middle)), middle + int(min(half, middle)) + 1)
-        return self.target[:, cut, cut].sum(axis=(1, 2))
-
     def shape(self, cutout):
         """Shape of the transform for a cutout, rounded up so that many share it."""
         array = self.kernel if cutout.convolved else self.target
@@ -198,9 +192,8 @@ class TemplateBank:
         What convolves, and what stands where.
     shape : (int, int)
         Shape of the image.
-    radius, max_bytes : float, optional
-        Largest half-width of a stamp in image pixels; memory for stamps: if they need more they are made
-        anew whenever needed.
+    max_bytes : float, optional
+        Memory for stamps: if they need more they are made anew whenever needed.
     weigh : callable, optional
         Called with positions on the image, shape (m, 2): what the kernel of each place counts there,
         shape (m, k). Needed for several kernels.
@@ -208,20 +201,17 @@ class TemplateBank:
         Threads that the bank's `map` works with.
     """
 
-    def __init__(
-        self, fine, sources, shape, *, radius=np.inf, max_bytes=1.5e9, weigh=None, executor=None
-    ):
+    def __init__(self, fine, sources, shape, *, max_bytes=1.5e9, weigh=None, executor=None):
         self._fine, self._sources, self._weigh = fine, sources, weigh
         self._weights = np.ones((len(sources.cutout), 1)) if weigh is None else weigh(sources.xy)
-        self._shape, self._radius = shape, radius
-        self._max_bytes, self.executor = max_bytes, executor
-        box = self._boxes(shape, radius)
+        self._shape, self._max_bytes, self.executor = shape, max_bytes, executor
+        box = self._boxes(shape)
         self.order = np.argsort(box[:, 0], kind="stable")
         self.box = np.ascontiguousarray(box[self.order])
         self.start = np.concatenate([[0], np.cumsum(self.box[:, 2] * self.box[:, 3])])
         self._kept = None
 
-    def _boxes(self, shape, radius):
+    def _boxes(self, shape):
         """Boxes on the image that hold the fine stamps, cut to the image."""
         fine, n = self._fine, len(self._sources.cutout)
         low, high = np.empty((n, 2)), np.empty((n, 2))
@@ -243,8 +233,8 @@ class TemplateBank:
             ]
         )
         offset = np.einsum("kij,ckj->cki", matrix, corners)
-        first = np.maximum(offset.min(axis=0), -radius) + self._sources.xy
-        last = np.minimum(offset.max(axis=0), radius) + self._sources.xy
+        first = offset.min(axis=0) + self._sources.xy
+        last = offset.max(axis=0) + self._sources.xy
         limit = np.array(shape)[::-1]
         first = np.clip(np.floor(first), 0, limit).astype(int)
         last = np.clip(np.ceil(last) + 1, 0, limit).astype(int)
@@ -253,7 +243,7 @@ class TemplateBank:
 
     def _of(self, sources, **changes):
         """A bank of other sources."""
-        form = {"radius": self._radius, "max_bytes": self._max_bytes, "weigh": self._weigh}
+        form = {"max_bytes": self._max_bytes, "weigh": self._weigh}
         form |= {"fine": self._fine, "shape": self._shape, "executor": self.executor}
         return TemplateBank(sources=sources, **{**form, **changes})
 
@@ -308,9 +298,9 @@ class TemplateBank:
         area = np.abs(np.linalg.det(self._sources.poly[:, :, 1:3]))
         return (noise * area * self._fine.kernel_power(self._weights))[self.order]
 
-    def full_light(self, half):
-        """Light of a whole point source within some fine pixels of its middle, by row."""
-        return (self._weights @ self._fine.light_within(half))[self.order]
+    def full_light(self):
+        """Light of a whole point source, by row."""
+        return (self._weights @ self._fine.target.sum(axis=(1, 2)))[self.order]
 
     def blocks(self):
         """Yield all templates in order, as `Block` of some tens of MB each."""

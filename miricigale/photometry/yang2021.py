@@ -8,6 +8,7 @@ from astropy.wcs.utils import pixel_to_pixel
 
 from miricigale.photometry.corrections import aperture_correction
 from miricigale.photometry.forced import ForcedPhotometer
+from miricigale.photometry.settings import ErrorSettings
 from miricigale.photometry.sources import SourceTemplates
 from miricigale.psf import MatchingKernel
 from miricigale.utils.exceptions import argument_error
@@ -81,10 +82,8 @@ class Yang2021Photometer:
         self.aperture = aperture_correction(target, _STAMP / 2)
         self._photometer = ForcedPhotometer(
             self.kernel,
-            correlated_noise=False,
             # errors are those of the image's noise alone
-            size_scatter=None,
-            psf_error=0.0,
+            errors=ErrorSettings(correlated_noise=False, size_scatter=None, psf_error=0.0),
             n_threads=n_threads,
         )
         self._n_threads = n_threads

@@ -132,7 +132,7 @@ def _photometry():
         gaussian_psf(0.3 * u.arcsec, pixel_scale=0.11 * u.arcsec, fov=3 * u.arcsec),
         pixel_scale=0.06 * u.arcsec,
     )
-    ForcedPhotometer(kernel, fit_background=True).measure(
+    ForcedPhotometer(kernel, background_order=0).measure(
         mosaic, prior, SegmentationImage(labels), QTable({"id": ids, "sky": sky})
     )
 

@@ -8,7 +8,7 @@ from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
 from miricigale.instrument import north_up_wcs
-from miricigale.photometry import ForcedPhotometer
+from miricigale.photometry import ErrorSettings, ForcedPhotometer
 from miricigale.photometry.draws import correlated_draws
 
 
@@ -55,8 +55,8 @@ def test_draws_depend_on_the_seed_alone(tools):
     assert_array_equal(measured(tools, n_threads=2).sample(5, seed=3), draws)
     assert np.all(result.sample(5, seed=4)[:, :7] != draws[:, :7])
     # a source that stands alone does not know of the rest of the catalogue
-    few = measured(tools, sky=[6, 4], correlated_noise=False)
-    many = measured(tools, correlated_noise=False)
+    few = measured(tools, sky=[6, 4], errors=ErrorSettings(correlated_noise=False))
+    many = measured(tools, errors=ErrorSettings(correlated_noise=False))
     assert_allclose(
         ((few.sample(5, seed=3) - few.flux) / few.flux_err)[:, 0].value,
         ((many.sample(5, seed=3) - many.flux) / many.flux_err)[:, 6].value,
@@ -76,7 +76,7 @@ def test_draws_of_components_belong_together(tools):
     sky = tools.CENTER.reshape(1)
     high = tools.render(sky, [1.0], np.hypot(0.4, tools.HI), fine, (201, 201))
     low = tools.render(sky, [50.0], np.hypot(0.4, tools.LO), wcs, (101, 101))
-    result = ForcedPhotometer(tools.kernel, correlated_noise=False).measure(
+    result = ForcedPhotometer(tools.kernel, errors=ErrorSettings(correlated_noise=False)).measure(
         tools.as_ccd(low, wcs, 0.1),
         tools.as_ccd(high, fine, high.max() * 1e-4),
         np.ones((201, 201), int),

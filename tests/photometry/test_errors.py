@@ -9,7 +9,7 @@ from astropy.table import QTable
 from numpy.testing import assert_allclose
 
 from miricigale.instrument import north_up_wcs, pixel_area_map
-from miricigale.photometry import ForcedPhotometer
+from miricigale.photometry import ErrorSettings, ForcedPhotometer, MemorySettings
 from miricigale.photometry.errors import (
     LinearFit,
     noise_correlation,
@@ -45,8 +45,10 @@ def test_pulls_are_unity(tools, kind):
     truth = tools.render(sky, flux, tools.LO, wcs, shape)
     level = 0.5 * 1e-12 / tools.SR
     catalog = QTable({"sky": sky})
-    photometer = ForcedPhotometer(tools.kernel, template="psf", fit_background=True)
-    naive = ForcedPhotometer(tools.kernel, template="psf", correlated_noise=False)
+    photometer = ForcedPhotometer(tools.kernel, template="psf", background_order=0)
+    naive = ForcedPhotometer(
+        tools.kernel, template="psf", errors=ErrorSettings(correlated_noise=False)
+    )
     pulls, plain, chi2 = [], [], []
     noises = noise_images(kind, shape, rng)
     for k in range(12):
@@ -89,14 +91,14 @@ def test_errors_on_mosaics_are_the_scatter_of_fits_of_nothing(tools, scale, whit
     at = (np.arange(9) - 4) * 2.7
     dx, dy = (a.ravel() + rng.uniform(-0.3, 0.3, 81) for a in np.meshgrid(at, at))
     catalog = QTable({"sky": tools.CENTER.spherical_offsets_by(dx * u.arcsec, dy * u.arcsec)})
-    photometer = ForcedPhotometer(tools.kernel, template="psf", psf_error=0.0)
+    photometer = ForcedPhotometer(tools.kernel, template="psf", errors=ErrorSettings(psf_error=0.0))
     pulls, plain = [], []
     for k in range(10):
         mosaic = drizzled(tools, rng, scale, 26.0)
         result = photometer.measure(mosaic, catalog=catalog)
         pulls.append(result.flux / result.flux_err)
         if k < 3:
-            naive = dataclasses.replace(photometer, correlated_noise=False)
+            naive = dataclasses.replace(photometer, errors=ErrorSettings(correlated_noise=False))
             result = naive.measure(mosaic, catalog=catalog)
             plain.append(result.flux / result.flux_err)
     # 810 fits: 2.5 %
@@ -108,7 +110,7 @@ def test_errors_on_mosaics_are_the_scatter_of_fits_of_nothing(tools, scale, whit
 def test_a_mosaic_without_room_for_sky_states_its_correlation(tools, scale):
     rng = np.random.default_rng(9)
     catalog = QTable({"sky": tools.CENTER.spherical_offsets_by([0] * u.arcsec, [0] * u.arcsec)})
-    photometer = ForcedPhotometer(tools.kernel, template="psf", psf_error=0.0)
+    photometer = ForcedPhotometer(tools.kernel, template="psf", errors=ErrorSettings(psf_error=0.0))
     pulls = []
     for _ in range(100):
         mosaic = drizzled(tools, rng, scale, 19 * scale)
@@ -146,7 +148,9 @@ def test_error_of_an_isolated_source_is_the_closed_form(tools):
     rng = np.random.default_rng(0)
     image = tools.as_ccd(rng.normal(size=(120, 120)), wcs, 1.0)
     catalog = QTable({"sky": tools.positions(rng, 1, 0.1)})
-    result = ForcedPhotometer(tools.kernel, correlated_noise=False).measure(image, catalog=catalog)
+    result = ForcedPhotometer(tools.kernel, errors=ErrorSettings(correlated_noise=False)).measure(
+        image, catalog=catalog
+    )
     per_pixel = pixel_area_map(wcs, (120, 120))[60, 60] * 1e12
     expected = per_pixel * np.sqrt(4 * np.pi) * tools.LO / 0.11
     assert_allclose(result.flux_err.value, expected, rtol=1e-3)
@@ -159,9 +163,9 @@ def test_blended_covariance_is_the_dense_inverse(tools):
     sigma = rng.uniform(0.5, 2, (70, 70))
     image = tools.as_ccd(rng.normal(size=(70, 70)), wcs, 1.0)
     image.uncertainty.array[:] = sigma
-    result = ForcedPhotometer(tools.kernel, template="psf", correlated_noise=False).measure(
-        image, catalog=QTable({"sky": sky})
-    )
+    result = ForcedPhotometer(
+        tools.kernel, template="psf", errors=ErrorSettings(correlated_noise=False)
+    ).measure(image, catalog=QTable({"sky": sky}))
     area = pixel_area_map(wcs, (70, 70)) * 1e12
     design = np.stack(
         [
@@ -202,7 +206,11 @@ def test_errors_are_those_of_the_direct_convolution(tools, monkeypatch, max_byte
     noise = scipy.ndimage.gaussian_filter(noise, 1.0)
     mask = rng.random(shape) < 0.1
     image = tools.as_ccd(noise, wcs, noise.std(), mask=mask)
-    options = {"template": "psf", "fit_background": True, "max_bytes": max_bytes}
+    options = {
+        "template": "psf",
+        "background_order": 0,
+        "memory": MemorySettings(max_bytes=max_bytes),
+    }
     photometer = ForcedPhotometer(tools.kernel, **options)
     catalog = QTable({"sky": sky})
     found = photometer.measure(image, catalog=catalog)

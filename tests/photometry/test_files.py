@@ -14,20 +14,28 @@ from astropy.table import QTable, Table
 from numpy.testing import assert_array_equal
 
 from miricigale.instrument import north_up_wcs
-from miricigale.photometry import ErrorModel, ForcedPhotometer, ForcedPhotometryResult
+from miricigale.photometry import (
+    ErrorModel,
+    ErrorSettings,
+    ForcedPhotometer,
+    ForcedPhotometryResult,
+)
 from miricigale.utils.exceptions import DataError
 
 OPTIONS = {
     "plain": {},
     "all": {
-        "fit_background": True,
         "background_order": 1,
         "max_shift": 0.2 * u.arcsec,
         "components": 2,
         "second_pass": True,
         "positive": True,
     },
-    "map": {"max_shift": 0.2 * u.arcsec, "offset_order": 0, "correlated_noise": False},
+    "map": {
+        "max_shift": 0.2 * u.arcsec,
+        "offset_order": 0,
+        "errors": ErrorSettings(correlated_noise=False),
+    },
 }
 
 

@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from miricigale.instrument import north_up_wcs
 from miricigale.photometry import (
     ErrorCalibration,
+    ErrorSettings,
     ForcedPhotometer,
     SourceTemplates,
     calibrate_errors,
@@ -74,7 +75,9 @@ def points(tools):
 def test_injected_points_tell_understated_errors(tools, points, stated):
     data, wcs, catalog = points
     image = tools.as_ccd(data, wcs, stated)
-    photometer = ForcedPhotometer(tools.kernel, template="psf", correlated_noise=False)
+    photometer = ForcedPhotometer(
+        tools.kernel, template="psf", errors=ErrorSettings(correlated_noise=False)
+    )
     before = image.data.copy()
     calibration = calibrate_errors(photometer, image, catalog=catalog, n_trials=8, seed=3)
     assert_array_equal(image.data, before)
@@ -133,7 +136,9 @@ def test_galaxies_are_injected_into_the_prior_too(tools):
 def test_rendered_sources_are_measured_as_they_are(tools, points):
     _, wcs, catalog = points
     empty = tools.as_ccd(np.zeros((300, 300)), wcs, 0.1)
-    photometer = ForcedPhotometer(tools.kernel, template="psf", correlated_noise=False)
+    photometer = ForcedPhotometer(
+        tools.kernel, template="psf", errors=ErrorSettings(correlated_noise=False)
+    )
     flux = np.arange(1.0, 41.0) * u.uJy
     light = photometer.render(empty, SourceTemplates.from_catalog(catalog), flux)
     image = tools.as_ccd(light.to_value("MJy/sr"), wcs, 0.1)

@@ -76,7 +76,7 @@ def test_positive_fluxes_stand_beside_the_others(tools):
     data = tools.render(sky, flux, tools.LO, wcs, shape) + rng.normal(0, sigma, shape) + 0.5
     image = tools.as_ccd(data, wcs, sigma)
     plain, both = (
-        ForcedPhotometer(tools.kernel, template="psf", fit_background=True, positive=flag).measure(
+        ForcedPhotometer(tools.kernel, template="psf", background_order=0, positive=flag).measure(
             image, catalog=QTable({"sky": sky})
         )
         for flag in (False, True)

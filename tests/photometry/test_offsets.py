@@ -100,9 +100,9 @@ def test_background_that_varies(tools, field):
     sky = 0.4 + 0.3 * (x / nx) - 0.2 * (y / ny) ** 2 + 0.1 * (x / nx) * (y / ny)
     image = tools.as_ccd(field.image.data + sky, field.wcs, 0.01)
     constant, varying = (
-        ForcedPhotometer(
-            tools.kernel, template="psf", fit_background=True, background_order=order
-        ).measure(image, catalog=field.catalog)
+        ForcedPhotometer(tools.kernel, template="psf", background_order=order).measure(
+            image, catalog=field.catalog
+        )
         for order in (0, 2)
     )
     assert np.abs(constant.flux.value - field.flux).max() > 0.3
@@ -130,8 +130,7 @@ def test_terms_are_those_of_a_polynomial():
     [
         ({"offset_order": 1}, "'max_shift' must be given with 'offset_order'"),
         ({"offset_order": 4, "max_shift": 1 * u.arcsec}, "'offset_order' must be an integer"),
-        ({"background_order": 1}, "'background_order' must be 0 without"),
-        ({"background_order": True, "fit_background": True}, "must be an integer from 0 to 4"),
+        ({"background_order": True}, "must be an integer from 0 to 4"),
     ],
 )
 def test_bad_orders_are_refused(tools, options, text):
@@ -159,7 +158,7 @@ def test_real_images_are_aligned(data_file):
             fits.getdata(f"{psfs}_{name}.fits.gz").mean(axis=0) for name in ("kernel_f770w", "psf")
         )
         kernel = MatchingKernel.from_array(kernel, pixel_scale=0.04 * u.arcsec, source=psf)
-    options = {"fit_background": True, "max_shift": 0.2 * u.arcsec}
+    options = {"background_order": 0, "max_shift": 0.2 * u.arcsec}
     one, mapped = (
         ForcedPhotometer(kernel, offset_order=order, **options).measure(
             image, prior, segments, sources

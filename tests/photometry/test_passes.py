@@ -10,7 +10,7 @@ from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
 from miricigale.instrument import north_up_wcs
-from miricigale.photometry import ForcedFlags, ForcedPhotometer, detect_sources
+from miricigale.photometry import ErrorSettings, ForcedFlags, ForcedPhotometer, detect_sources
 
 
 def flagged(flags, flag):
@@ -138,7 +138,7 @@ def nuclei(tools):
 
 def test_points_on_top_of_galaxies(tools, nuclei):
     catalog = QTable({"sky": nuclei.sky})
-    fixed = {"size_scatter": None}
+    fixed = {"errors": ErrorSettings(size_scatter=None)}
     one, free, exact, two = (
         ForcedPhotometer(tools.kernel, **options).measure(*nuclei.images, catalog)
         for options in (fixed, {}, {"components": 2, **fixed}, {"components": 2})
@@ -177,7 +177,7 @@ def test_points_are_where_the_galaxies_are(tools, nuclei):
     east, north = rng.normal(0, 0.03, (2, nuclei.n)) * u.arcsec
     number = np.where((np.arange(nuclei.n) >= 8) & (np.arange(nuclei.n) < 24), 2, 1)
     double = number == 2
-    photometer = ForcedPhotometer(tools.kernel, size_scatter=None)
+    photometer = ForcedPhotometer(tools.kernel, errors=ErrorSettings(size_scatter=None))
     for sky in (nuclei.sky, nuclei.sky.spherical_offsets_by(east, north)):
         catalog = QTable({"sky": sky, "components": number})
         result = photometer.measure(*nuclei.images, catalog)
@@ -219,7 +219,7 @@ def test_covariance_of_two_components_is_that_of_least_squares(tools):
     image = tools.as_ccd(30 * templates[0] + 12 * templates[1], wcs, sigma)
     catalog = QTable({"sky": sky, "components": [2]})
     result = ForcedPhotometer(
-        tools.kernel, template="cutout", wings=False, correlated_noise=False
+        tools.kernel, template="cutout", wings=False, errors=ErrorSettings(correlated_noise=False)
     ).measure(image, high, np.ones((221, 221), int), catalog)
     assert_allclose(result.flux.value, 42, rtol=2e-3)
     assert_allclose(result.flux_point.value, 12, rtol=0.01)

@@ -6,7 +6,7 @@ import pytest
 from astropy.nddata import CCDData, StdDevUncertainty
 
 from miricigale.instrument import north_up_wcs, pixel_area_map
-from miricigale.photometry import ForcedPhotometer, detect_sources
+from miricigale.photometry import ErrorSettings, ForcedPhotometer, detect_sources
 from miricigale.psf import MatchingKernel
 
 galsim = pytest.importorskip("galsim", reason="needs galsim: pip install miricigale[galsim]")
@@ -65,7 +65,9 @@ def pulls(tools):
     box = galsim.Convolve(moffat(0.35), galsim.Pixel(COARSE))
     psfs[1] = box.drawImage(nx=101, ny=101, scale=FINE, method="no_pixel").array
     kernel = MatchingKernel.from_psfs(*(p.astype(float) for p in psfs), pixel_scale=FINE * u.arcsec)
-    photometer = ForcedPhotometer(kernel, correlated_noise=False, psf_error=0.0)
+    photometer = ForcedPhotometer(
+        kernel, errors=ErrorSettings(correlated_noise=False, psf_error=0.0)
+    )
     found = np.full((2, DRAWS, 24), np.nan)
     for draw in range(DRAWS):
         noisy = []

@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from miricigale.instrument import imager_wcs, north_up_wcs
 from miricigale.photometry import (
+    ErrorSettings,
     ForcedFlags,
     ForcedPhotometer,
     SourceTemplates,
@@ -273,14 +274,14 @@ def test_psf_that_changes_over_the_field(tools):
     assert np.abs(ratio - 1).max() < 0.5 * 0.055 / 4 / 0.22 + 5e-3
     # one kernel for all: a Gaussian of width t fitted to one of width s
     middle = shape[1] / 2
-    plain = ForcedPhotometer(kernel(middle), size_scatter=None)
+    plain = ForcedPhotometer(kernel(middle), errors=ErrorSettings(size_scatter=None))
     ratio = plain.measure(low, templates=templates).flux.value / flux
     t2, s2 = width(middle) ** 2 + size**2, width(x) ** 2 + size**2
     assert_allclose(ratio, 2 * t2 / (t2 + s2), atol=5e-3)
     assert np.abs(ratio - 1).max() > 0.09
     # all at one place, or all alike, are as one kernel
     same = KernelField([kernel(middle)] * 3, field.sky[:3])
-    plain = ForcedPhotometer(same, size_scatter=None)
+    plain = ForcedPhotometer(same, errors=ErrorSettings(size_scatter=None))
     alike = plain.measure(low, templates=templates).flux.value / flux
     assert_allclose(alike, ratio, rtol=1e-7)
     none = ForcedPhotometer(field).measure(low, templates=templates[:0])

@@ -8,7 +8,7 @@ from astropy.wcs import WCS
 from numpy.testing import assert_allclose
 
 from miricigale.instrument import north_up_wcs
-from miricigale.photometry import ForcedPhotometer, psf_photometry
+from miricigale.photometry import ErrorSettings, ForcedPhotometer, psf_photometry
 from miricigale.psf import gaussian_psf, make_psf
 
 SCALE = 0.11
@@ -73,9 +73,9 @@ def test_stars_come_back_with_true_errors_and_every_row_stays(stars, psf):
 def test_it_agrees_with_forced_photometry(tools, stars, psf):
     image, catalog, _ = stars
     fixed = psf_photometry(image, psf, catalog, max_shift=None)
-    forced = ForcedPhotometer(tools.kernel, template="psf", correlated_noise=False).measure(
-        image, catalog=catalog
-    )
+    forced = ForcedPhotometer(
+        tools.kernel, template="psf", errors=ErrorSettings(correlated_noise=False)
+    ).measure(image, catalog=catalog)
     good = np.isfinite(fixed["flux"].value)
     assert good.sum() == 79
     assert np.all(fixed["shift"][good] == 0)

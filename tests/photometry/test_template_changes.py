@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from scipy.signal import fftconvolve
 
 from miricigale.instrument import north_up_wcs
-from miricigale.photometry import ForcedPhotometer, detect_sources
+from miricigale.photometry import ErrorSettings, ForcedPhotometer, detect_sources
 from miricigale.photometry.cutouts import Cutout
 from miricigale.photometry.shapes import not_fitted
 from miricigale.photometry.template_changes import TemplateChanges
@@ -158,7 +158,9 @@ def blend(tools):
         noise = 0.05
     high, low = images
     segments, found = detect_sources(high)
-    photometer = ForcedPhotometer(tools.kernel, psf_error=0.0, correlated_noise=False, n_threads=1)
+    photometer = ForcedPhotometer(
+        tools.kernel, errors=ErrorSettings(psf_error=0.0, correlated_noise=False), n_threads=1
+    )
     return types.SimpleNamespace(
         photometer=photometer,
         low=low,
@@ -173,7 +175,7 @@ def blend(tools):
 def test_terms_add_in_quadrature_and_are_columns(blend):
     arguments = blend.low, blend.high, blend.segments, blend.found
     result = ForcedPhotometer(
-        blend.photometer.kernel, psf_error=0.024, correlated_noise=False
+        blend.photometer.kernel, errors=ErrorSettings(psf_error=0.024, correlated_noise=False)
     ).measure(*arguments)
     terms = [result.flux_err_noise, result.flux_err_template, result.flux_err_psf]
     # peaks of the noise have no flux of which a part could be wrong
@@ -219,7 +221,8 @@ def test_a_blend_is_solved_as_by_dense_algebra(blend, monkeypatch):
     arguments = blend.low, blend.high, blend.segments, blend.found
     result = blend.photometer.measure(*arguments)
     exact = ForcedPhotometer(
-        blend.photometer.kernel, psf_error=0.0, correlated_noise=False, size_scatter=None
+        blend.photometer.kernel,
+        errors=ErrorSettings(psf_error=0.0, correlated_noise=False, size_scatter=None),
     ).measure(*arguments)
     fit = kept[0]
     shape = blend.low.shape
@@ -277,7 +280,9 @@ def test_psf_error_is_what_a_wide_psf_does(tools, width):
         catalog["sersic_index"] = [0.5]
         catalog["axis_ratio"] = [1.0]
         catalog["position_angle"] = [0.0] * u.deg
-    photometer = ForcedPhotometer(kernel, template=template, psf_error=0.03, correlated_noise=False)
+    photometer = ForcedPhotometer(
+        kernel, template=template, errors=ErrorSettings(psf_error=0.03, correlated_noise=False)
+    )
     result = photometer.measure(image, catalog=catalog)
     # Gaussians: d ln flux / d ln width is 1 for points
     assert result.flux.value[0] - 100 == pytest.approx(result.flux_err_psf.value[0], rel=0.05)
@@ -285,7 +290,7 @@ def test_psf_error_is_what_a_wide_psf_does(tools, width):
 
 def test_psf_error_out_of_range_is_named(tools):
     with pytest.raises(ValueError, match="'psf_error' must be from 0 to 1, got 2"):
-        ForcedPhotometer(tools.kernel, psf_error=2)
+        ForcedPhotometer(tools.kernel, errors=ErrorSettings(psf_error=2))
 
 
 def test_pulls_of_galaxies_on_a_noisy_prior(tools):
@@ -302,8 +307,10 @@ def test_pulls_of_galaxies_on_a_noisy_prior(tools):
         tools.render(sky, flux, np.hypot(psf, size), one, (n, n))
         for one, psf, n in zip(wcs, (tools.HI, tools.LO), (660, 360), strict=True)
     ]
-    photometer = ForcedPhotometer(tools.kernel, correlated_noise=False)
-    plain = ForcedPhotometer(tools.kernel, correlated_noise=False, size_scatter=None)
+    photometer = ForcedPhotometer(tools.kernel, errors=ErrorSettings(correlated_noise=False))
+    plain = ForcedPhotometer(
+        tools.kernel, errors=ErrorSettings(correlated_noise=False, size_scatter=None)
+    )
     for _ in range(3):
         high = tools.as_ccd(truth[0] + rng.normal(0, 2.5, (660, 660)), wcs[0], 2.5)
         low = tools.as_ccd(truth[1] + rng.normal(0, 0.1, (360, 360)), wcs[1], 0.1)

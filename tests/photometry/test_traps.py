@@ -186,7 +186,7 @@ def test_a_background_is_fitted_or_said(field, tmp_path):
     path = edited(field, tmp_path, "image", raised)
     np.testing.assert_allclose(np.median(fluxes(field, image=path) / field.flux), 1, atol=0.007)
     with pytest.warns(MiricigaleWarning, match=r"a background of 0\.05\d* MJy / sr between"):
-        fluxes(field, image=path, fit_background=False)
+        fluxes(field, image=path, background_order=None)
     prior = edited(field, tmp_path, "prior", lambda hdus: hdus["SCI"].data.__iadd__(0.06))
     with pytest.warns(MiricigaleWarning, match="'highres' has a sky of 2.* times its noise"):
         fluxes(field, highres=prior)

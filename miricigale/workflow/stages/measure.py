@@ -72,7 +72,7 @@ def photometer_of(context, name, method):
     # the constant absorbs the light of faint sources and of wings in the background
     return photometry.ForcedPhotometer(
         psf.MatchingKernel.read(context.path(f"kernel_{name}.fits")),
-        fit_background=True,
+        background_order=0,
         n_threads=context.n_threads,
     )
 
