@@ -202,16 +202,15 @@ def _photometry(args):
         msg = "wanted are --image and --highres, or the two files without options"
         raise ValueError(msg)
     known = [*(kind.replace("-", "_") for kind in _NOISE), "filter", "unit", "zero_point"]
+    known += ["background_box", "psf", "psf_scale", "psf_angle", "pa_aper"]
     images = [
-        MosaicFile(path, **{n: getattr(args, prefix + n) for n in (*known, "background_box")})
+        MosaicFile(path, **{n: getattr(args, prefix + n) for n in known})
         for path, prefix in zip(paths, ("", "highres_"), strict=True)
     ]
-    psfs = "psf psf_scale psf_angle pa_aper"
     page = args.page or args.output.with_suffix(".html")
     table = measure_files(
         *images,
-        **chosen(args, f"segmentation catalog kernel {psfs}"),
-        **{f"highres_{name}": getattr(args, f"highres_{name}") for name in psfs.split()},
+        **chosen(args, "segmentation catalog kernel"),
         **chosen(args, "max_shift background_order offset_order second_pass"),
         **chosen(args, "components output model residual overwrite seed"),
         page=page,

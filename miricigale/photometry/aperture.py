@@ -1,5 +1,7 @@
 """Aperture photometry in the manner of Source Extractor, to compare forced photometry with."""
 
+import dataclasses
+
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
@@ -10,10 +12,14 @@ from photutils.segmentation import SourceCatalog
 
 from miricigale.photometry.arrays import image_arrays, pixel_scale
 from miricigale.photometry.detection import detect_sources
-from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
 from miricigale.utils.sep_tools import background as sep_background
 from miricigale.utils.units import ANGLE, FNU, positive, to_array
+
+#: The paper's settings on its pixels: PHOT_AUTOPARAMS, BACK_SIZE and BACK_FILTERSIZE, width of the ring for
+#: the local background; light of a point source in the AUTO ellipse and in the circle.
+_KRON, _BACKGROUND, _RING = (2.5, 3.5), (64, 6), 40
+_AUTO_FRACTION, _APERTURE_FRACTION = 0.94, 0.8
 
 
 def aperture_photometry(image, sky, diameter, *, local_background=None):
@@ -100,12 +106,6 @@ def source_extractor_photometry(
     threshold=None,
     n_pixels=None,
     diameter=1.86 * u.arcsec,
-    kron=(2.5, 3.5),
-    aperture_fraction=0.8,
-    auto_fraction=0.94,
-    background_box=64,
-    background_filter=6,
-    local_background=40,
     stated_on=0.06 * u.arcsec,
 ):
     """
@@ -123,14 +123,6 @@ def source_extractor_photometry(
         See `~miricigale.photometry.detect_sources`.
     diameter : `~astropy.units.Quantity`, optional
         Of the circular aperture; 31 pixels of 0.06 arcsec by default.
-    kron : (float, float), optional
-        Source Extractor's PHOT_AUTOPARAMS: factor on the Kron radius, and least scaled radius.
-    aperture_fraction, auto_fraction : float, optional
-        Light of a point source in the circle and in the AUTO ellipse.
-    background_box, background_filter : int, optional
-        BACK_SIZE in pixels and BACK_FILTERSIZE in boxes.
-    local_background : int, optional
-        Width of the ring for the local background in pixels, 0 for none.
     stated_on : `~astropy.units.Quantity` or None, optional
         Pixel scale for which settings in pixels are meant; None for the image's own.
 
@@ -138,44 +130,30 @@ def source_extractor_photometry(
     -------
     table : `~astropy.table.QTable`
         The detections, with ``flux_auto``, ``flux_auto_err``, ``flux_aper``, ``flux_aper_err`` as
-        measured, and ``flux_best``, ``flux_best_err``: the brighter of the two after each is
-        divided by its fraction.
+        measured (Kron ellipses of PHOT_AUTOPARAMS 2.5, 3.5), and ``flux_best``, ``flux_best_err``: the brighter of
+        the two after each is divided by its part of a point source's light (0.94 and 0.8).
 
     References
     ----------
     Yang et al. 2021, ApJ 908, 144, appendix (the settings); Bertin & Arnouts 1996.
     """
-    for name, value in (
-        ("aperture_fraction", aperture_fraction),
-        ("auto_fraction", auto_fraction),
-    ):
-        if not 0 < value <= 1:
-            raise argument_error(name, "above 0 and at most 1", value)
     segmentation, catalog = detect_sources(
-        image,
-        preset=preset,
-        threshold=threshold,
-        n_pixels=n_pixels,
-        subtract_background=True,
-        box=background_box,
-        filter_size=background_filter,
-        stated_on=stated_on,
-    )
+        image, preset=preset, threshold=threshold, n_pixels=n_pixels, subtract_background=True,
+        box=_BACKGROUND[0], filter_size=_BACKGROUND[1], stated_on=stated_on,
+    )  # fmt: skip
     arrays = image_arrays(image, "image")
     ratio = 1.0
     if stated_on is not None:
         ratio = float(to_array(stated_on, ANGLE, "stated_on")) / pixel_scale(image.wcs)
-    box = max(1, round(background_box * ratio))
-    level, _ = sep_background(arrays.flux, ~arrays.usable, box, background_filter)
+    box = max(1, round(_BACKGROUND[0] * ratio))
+    level, _ = sep_background(arrays.flux, ~arrays.usable, box, _BACKGROUND[1])
     flux = arrays.flux - np.where(arrays.usable, level, 0.0)
     values = [np.empty(0)] * 4
     if len(catalog):
-        values = _measure(
-            arrays, flux, segmentation, catalog, diameter, kron, local_background * ratio, image.wcs
-        )
+        values = _measure(arrays, flux, segmentation, catalog, diameter, ratio)
     auto, auto_err, aper, aper_err = values
-    best = np.stack([auto, auto_err]) / auto_fraction
-    others = np.stack([aper, aper_err]) / aperture_fraction
+    best = np.stack([auto, auto_err]) / _AUTO_FRACTION
+    others = np.stack([aper, aper_err]) / _APERTURE_FRACTION
     best = np.where(np.nan_to_num(best[0], nan=-np.inf) > others[0], best, others)
     for name, flux, error, text in (
         ("flux_auto", auto, auto_err, "Light in the Kron ellipse"),
@@ -189,22 +167,23 @@ def source_extractor_photometry(
     return catalog
 
 
-def _measure(arrays, flux, segmentation, catalog, diameter, kron, local_background, wcs):
-    sigma = np.where(arrays.usable, arrays.sigma, 0.0)
+def _measure(arrays, flux, segmentation, catalog, diameter, ratio):
+    """Light and errors in Kron ellipses and circles, less the level of rings around them."""
+    arrays = dataclasses.replace(
+        arrays, flux=flux, sigma=np.where(arrays.usable, arrays.sigma, 0.0)
+    )
+    factor, least = _KRON
     sources = SourceCatalog(
         flux,
         segmentation,
-        error=sigma,
+        error=arrays.sigma,
         mask=~arrays.usable,
-        local_bkg_width=round(local_background),
-        kron_params=(kron[0], kron[1] / kron[0], 0.0),
+        local_bkg_width=round(_RING * ratio),
+        kron_params=(factor, least / factor, 0.0),
     )
     auto, auto_err = (np.atleast_1d(v) for v in (sources.kron_flux, sources.kron_flux_err))
-    radius = float(to_array(diameter, ANGLE, "diameter")) / 2 / pixel_scale(wcs)
+    radius = float(to_array(diameter, ANGLE, "diameter")) / 2 / pixel_scale(arrays.wcs)
     xy = np.stack([catalog["x_centroid"], catalog["y_centroid"]], axis=-1)
-    shifted = type(arrays)(flux, sigma, arrays.usable, arrays.area, wcs, arrays.measured_noise)
-    aper, aper_err, coverage = _circle_sums(shifted, xy, radius)
-    if local_background:
-        ring = _annulus_levels(shifted, xy, radius, local_background)
-        aper = aper - ring * np.pi * radius**2 * coverage
-    return auto, auto_err, aper, aper_err
+    aper, aper_err, coverage = _circle_sums(arrays, xy, radius)
+    ring = _annulus_levels(arrays, xy, radius, _RING * ratio)
+    return auto, auto_err, aper - ring * np.pi * radius**2 * coverage, aper_err

@@ -45,8 +45,8 @@ def own_segments(segmentation, labels, xy):
     ----------
     segmentation : int `~numpy.ndarray`, shape (ny, nx)
         Label of each fine pixel, 0 for none.
-    labels : int `~numpy.ndarray`, shape (n,), or None
-        The label that each source says it has; by default the one at its position.
+    labels : int `~numpy.ndarray`, shape (n,)
+        The label of each source.
     xy : `~numpy.ndarray`, shape (n, 2)
         Positions on the fine grid.
 
@@ -56,13 +56,6 @@ def own_segments(segmentation, labels, xy):
         The source's own label, 0 if it has none; ``NO_SEGMENT`` and ``SHARED_SEGMENT``. Of several
         sources on a segment the one nearest to its middle owns it.
     """
-    ny, nx = segmentation.shape
-    x, y = np.rint(np.where(np.isfinite(xy), xy, -1)).astype(int).T
-    if labels is None:
-        inside = (x >= 0) & (x < nx) & (y >= 0) & (y < ny)
-        labels = np.where(
-            inside, segmentation[np.clip(y, 0, ny - 1), np.clip(x, 0, nx - 1)], 0
-        ).astype(int)
     label = np.array(labels, dtype=int)
     flags = np.where(label > 0, 0, int(ForcedFlags.NO_SEGMENT))
     values, counts = np.unique(label[label > 0], return_counts=True)

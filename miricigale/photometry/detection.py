@@ -154,8 +154,9 @@ def detect_sources(
     Bertin & Arnouts 1996, A&AS 117, 393; Barbary 2016, JOSS 1, 58.
     """
     arrays, settings = _prepared(
-        image, preset, (box, filter_size) if subtract_background else None, stated_on,
-        threshold=threshold, n_pixels=n_pixels, fwhm=fwhm, n_levels=n_levels, contrast=contrast,
+        image, preset, subtract_background=subtract_background, box=box, filter_size=filter_size,
+        stated_on=stated_on, threshold=threshold, n_pixels=n_pixels, fwhm=fwhm, n_levels=n_levels,
+        contrast=contrast,
     )  # fmt: skip
     rule = None if dilation is None else dilation_rule(dilation)
     objects, found = _extract(arrays.flux, arrays, settings)
@@ -171,17 +172,7 @@ def detect_sources(
 
 
 @deprecated_renamed_argument("min_area", "n_pixels", "0.1", arg_in_kwargs=True)
-def detection_purity(
-    image,
-    *,
-    snr_edges=None,
-    preset="yang2021",
-    subtract_background=False,
-    box=64,
-    filter_size=6,
-    stated_on=None,
-    **settings,
-):
+def detection_purity(image, *, snr_edges=None, preset="yang2021", **settings):
     """
     Estimate which share of the detections is real, from the image's negative.
 
@@ -190,16 +181,15 @@ def detection_purity(
 
     Parameters
     ----------
-    image, preset, stated_on
+    image, preset
         As for `detect_sources`.
     snr_edges : array_like, shape (n + 1,), optional
         Signal-to-noise of segments (column ``snr`` of `detect_sources`) between which detections
         are counted; ten bins from the least to the largest of the negative image and one above by
         default.
-    subtract_background, box, filter_size : optional
-        Likewise. The background is estimated once, on the image, and subtracted from both.
     **settings
-        ``threshold``, ``n_pixels``, ``fwhm``, ``n_levels`` and ``contrast``, likewise.
+        Other options of `detect_sources` but ``dilation``. A background is estimated once, on the image, and
+        subtracted from both.
 
     Returns
     -------
@@ -228,8 +218,7 @@ def detection_purity(
     ----------
     Gehrels 1986, ApJ 303, 336 (Poisson intervals).
     """
-    background = (box, filter_size) if subtract_background else None
-    arrays, settings = _prepared(image, preset, background, stated_on, **settings)
+    arrays, settings = _prepared(image, preset, **settings)
     positive, negative = (
         _segment_snr(flux, arrays, settings) for flux in (arrays.flux, -arrays.flux)
     )
@@ -268,8 +257,10 @@ def detection_purity(
     return described_table(columns, {**meta, **dataclasses.asdict(settings)})
 
 
-def _prepared(image, preset, background, stated_on, **given):
-    """Arrays with the background (box, filter) taken off, and settings on the image's pixels."""
+def _prepared(
+    image, preset, *, subtract_background=False, box=64, filter_size=6, stated_on=None, **given
+):
+    """Arrays with the background taken off, and settings on the image's pixels."""
     if preset not in DETECTION_PRESETS:
         raise unknown_name("detection preset", preset, DETECTION_PRESETS)
     settings = dataclasses.replace(
@@ -282,9 +273,9 @@ def _prepared(image, preset, background, stated_on, **given):
     if stated_on is not None:
         ratio = positive(stated_on, ANGLE, "stated_on") / pixel_scale(arrays.wcs)
         settings = settings.on_pixels(ratio)
-    if background is not None:
-        box = max(1, round(background[0] * ratio))
-        level = sep_background(arrays.flux, ~arrays.usable, box, background[1])[0]
+    if subtract_background:
+        box = max(1, round(box * ratio))
+        level = sep_background(arrays.flux, ~arrays.usable, box, filter_size)[0]
         arrays = dataclasses.replace(arrays, flux=arrays.flux - level)
     return arrays, settings
 

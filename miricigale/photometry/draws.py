@@ -2,8 +2,8 @@
 
 import numpy as np
 import scipy.sparse
-from scipy.sparse.linalg import splu
 
+from miricigale.photometry._core.solve import symmetric_lu
 from miricigale.utils.random import stream
 
 #: What correlations are multiplied by until the matrix is positive.
@@ -52,12 +52,7 @@ def correlated_draws(covariance, keys, size, seed):
 def _cholesky(matrix):
     """Lower factor of a sparse matrix and the place of each row in it, None if it is not positive."""
     try:
-        lu = splu(
-            matrix.tocsc(),
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
-        )
+        lu = symmetric_lu(matrix)
     except RuntimeError:
         return None
     diagonal = lu.U.diagonal()

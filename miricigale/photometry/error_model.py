@@ -275,7 +275,7 @@ class ErrorModel:
             raise argument_error("n_sigma", "positive", n_sigma)
         return limiting_flux(self._curve(filter), n_sigma) * FNU
 
-    def limiting_magnitude(self, filter, n_sigma=5.0, *, magnitude_error=None):
+    def limiting_magnitude(self, filter, n_sigma=5.0):
         """
         The limit as AB magnitude.
 
@@ -284,20 +284,13 @@ class ErrorModel:
         filter : str
             Band.
         n_sigma : float, optional
-            Signal-to-noise at the limit.
-        magnitude_error : float, optional
-            Instead of ``n_sigma``: the error in magnitudes at the limit (the paper takes
-            0.217, which is 2.5 / ln(10) / 5).
+            Signal-to-noise at the limit (the paper's error of 0.217 mag is one of 5.003).
 
         Returns
         -------
         limit : `~astropy.units.Magnitude`
             AB; NaN if no flux reaches it.
         """
-        if magnitude_error is not None:
-            if not magnitude_error > 0:
-                raise argument_error("magnitude_error", "positive", magnitude_error)
-            n_sigma = 2.5 / np.log(10) / magnitude_error
         return self.limiting_flux(filter, n_sigma).to(u.ABmag)
 
     def assign(self, photometry, *, filters=None, noise=None):

@@ -22,9 +22,7 @@ from miricigale.photometry.templates import batches
 from miricigale.utils.parallel import chunks, parallel_map
 
 
-def noise_correlation(
-    residual, usable, *, weight=None, max_lag=8, clip=5.0, significance=3.0, executor=None
-):
+def noise_correlation(residual, usable, *, weight=None, executor=None):
     """
     Measure the covariance of pixels' noise on a whitened residual image.
 
@@ -34,18 +32,12 @@ def noise_correlation(
         Data minus model, over sigma, and which pixels are free of sources and have data.
     weight : `~numpy.ndarray`, shape (ny, nx), optional
         1 / sigma, if the residual is not over sigma yet.
-    max_lag : int, optional
-        Largest separation that is looked at, in pixels.
-    clip : float, optional
-        Pixels further from the median than this many robust standard deviations do not take part.
-    significance : float, optional
-        Rings of separations in which the mean is less significant than this are cut off.
     executor : `concurrent.futures.Executor`, optional
         Threads to work with.
 
     Returns
     -------
-    correlation : `~numpy.ndarray`, shape (2 m + 1, 2 m + 1), m <= max_lag
+    correlation : `~numpy.ndarray`, shape (2 m + 1, 2 m + 1), m <= 8
         Mean product at each separation, in units of sigma^2: the middle is 1 for true
         sigmas, and the whole a single number for noise that is not correlated (0 for a
         residual that is the same everywhere).
@@ -75,13 +67,13 @@ def noise_correlation(
 
     def clipped(part):
         z = rows(part)
-        kept[part] = usable[part] & (np.abs(z - middle) <= clip * spread)
+        kept[part] = usable[part] & (np.abs(z - middle) <= _CLIP * spread)
         return z[kept[part]].sum(dtype=float)
 
     parts = list(chunks(len(residual), 256))
     level = sum(parallel_map(clipped, parts, executor=executor)) / np.count_nonzero(kept)
     level = residual.dtype.type(level)
-    lag = min(max_lag, (min(residual.shape) - 1) // 2)
+    lag = min(_MAX_LAG, (min(residual.shape) - 1) // 2)
     covariance, error = autocorrelation(
         lambda part: rows(part) - level,
         kept,
@@ -98,7 +90,7 @@ def noise_correlation(
         mean = covariance[member].mean()
         mean_error = error[member].mean() * np.sqrt(2.0 / np.count_nonzero(member))
         peak = np.max(np.abs(covariance[member]) / error[member])
-        if abs(mean) > significance * mean_error or peak > significance + 1.5:
+        if abs(mean) > _SIGNIFICANCE * mean_error or peak > _SIGNIFICANCE + 1.5:
             break
         lag = outer - 1
     keep = slice(len(index) // 2 - lag, len(index) // 2 + lag + 1)
@@ -132,6 +124,10 @@ def stated_correlation(factor):
     triangle = 1 - np.abs(np.arange(-lag, lag + 1)) / width
     return np.outer(triangle, triangle)
 
+
+#: Largest separation (pixels) of the noise correlation; pixels further from the median than this many robust
+#: standard deviations do not take part; rings of separations whose mean is less significant than this are cut off.
+_MAX_LAG, _CLIP, _SIGNIFICANCE = 8, 5.0, 3.0
 
 #: Pairs of stamps that a thread works on at a time.
 _PAIRS = 1024

@@ -1,6 +1,5 @@
 """Forced photometry of files: what they are is checked first, then measured and put on a page."""
 
-import dataclasses
 import logging
 import os
 import tempfile
@@ -21,30 +20,23 @@ from miricigale.utils.files import split_extension
 from miricigale.utils.progress import progress
 from miricigale.utils.store import replacing
 from miricigale.utils.tables import error_column
-from miricigale.utils.units import to_array
 
 _log = logging.getLogger(__name__)
 
 #: Endings of tables that can be written.
 _TABLES = (".ecsv", ".fits", ".fits.gz")
 
+#: Largest number of empty positions at which errors are tested.
+_EMPTY = 400
+
 
 def measure_files(
     image,
     highres,
     *,
-    filter=None,
     segmentation=None,
     catalog=None,
     kernel=None,
-    psf=None,
-    highres_psf=None,
-    psf_scale=None,
-    highres_psf_scale=None,
-    psf_angle=None,
-    highres_psf_angle=None,
-    pa_aper=None,
-    highres_pa_aper=None,
     background_order=0,
     max_shift=None,
     output=None,
@@ -52,7 +44,6 @@ def measure_files(
     model=None,
     residual=None,
     overwrite=False,
-    n_empty=400,
     seed=1,
     n_threads=None,
     progress_bar=False,
@@ -64,10 +55,8 @@ def measure_files(
     Parameters
     ----------
     image, highres : path-like or `~miricigale.photometry.MosaicFile`
-        The image and the prior.
-    filter : str, optional
-        Filter of the image, if its header does not tell; it must be one that
-        `~miricigale.filters.Filter` knows.
+        The image and the prior; as `~miricigale.photometry.MosaicFile` with what is not in their headers, such as
+        filters, maps of the noise and PSFs.
     segmentation, catalog : path-like, optional
         See `~miricigale.photometry.read_prior`. Without a segmentation sources are detected
         on the prior.
@@ -75,19 +64,6 @@ def measure_files(
         From the prior's resolution to that of the image, on the prior's pixels; see
         ``miricigale.photometry.kernel_files.read_kernel``. Without a PSF of the prior sources are
         the segments as they are, and those without one are not measured.
-    psf, highres_psf : path-like, optional
-        PSFs of image and prior with the pixel and the drizzling in them: ``file.fits``,
-        ``file.fits[EXTENSION]``, or of a cube ``file.fits[EXTENSION,PLANE]`` (``mean`` for the mean
-        of all planes). Their centers are found. Those of MIRI, NIRCam's wide filters and WFC3/IR
-        are compared with the model (`~miricigale.psf.checked_psf`), which is taken where none is
-        given (`~miricigale.psf.filter_psf`).
-    psf_scale, highres_psf_scale : `~astropy.units.Quantity`, optional
-        Pixel of the PSFs; by default that of their header, or else of their images.
-    psf_angle, highres_psf_angle : `~astropy.units.Quantity`, optional
-        Position angle of the PSFs' +y; by default that of their header, or else of their images'
-        +y.
-    pa_aper, highres_pa_aper : `~astropy.units.Quantity`, optional
-        Position angle of the detector's +y axis, if the header does not tell.
     background_order : int or None, optional
         Order of the background that is fitted with the sources, 0 for a constant; none is fitted if None.
     max_shift : `~astropy.units.Quantity`, optional
@@ -97,10 +73,8 @@ def measure_files(
         background) and of the residual are written; not if None.
     overwrite : bool, optional
         Whether files that are there are replaced.
-    n_empty : int, optional
-        Empty positions at which errors are tested, for the page.
     seed : int, optional
-        Seed of these positions.
+        Seed of the empty positions at which errors are tested, for the page.
     n_threads : int, optional
         Number of threads; all by default.
     progress_bar : bool, optional
@@ -126,7 +100,7 @@ def measure_files(
         one if isinstance(one, MosaicFile) else MosaicFile(one) for one in (image, highres)
     )
     extras = {"segmentation": segmentation, "catalog": catalog, "kernel": kernel}
-    extras.update(psf=psf, highres_psf=highres_psf)
+    extras.update(psf=image.psf, highres_psf=highres.psf)
     inputs = [one for one in extras.values() if one is not None]
     results = {"output": output, "page": page, "model": model, "residual": residual}
     for what, path in results.items():
@@ -135,37 +109,23 @@ def measure_files(
     if len(set(written)) < len(written):
         given = ", ".join(what for what, path in results.items() if path is not None)
         raise argument_error(given, "different files", [str(path) for path in written])
-    filter_ = _check_images(image, highres, filter)
+    _check_images(image, highres)
     for what, path in extras.items():
         if path is not None and not os.path.isfile(file_place(path)[0]):
             msg = f"no file {path} ('{what}')"
             raise DataError(msg)
     if catalog is not None:
         _check_catalog(catalog, image, highres)
-    psfs = {"kernel": kernel, "psf": psf, "highres_psf": highres_psf}
-    psfs.update(psf_scale=psf_scale, highres_psf_scale=highres_psf_scale)
-    psfs.update(psf_angle=psf_angle, highres_psf_angle=highres_psf_angle)
-    headers = [
-        dataclasses.replace(
-            one.header,
-            filter=name,
-            pa_aper=_checked_angle(one, angle, argument),
-        )
-        for one, name, angle, argument in (
-            (image, filter_, pa_aper, "pa_aper"),
-            (highres, highres.header.filter, highres_pa_aper, "highres_pa_aper"),
-        )
-    ]
-    _check_psfs(image, highres, headers, kernel, psf, highres_psf)
+    _check_psfs(image, highres, kernel)
+    filter_ = image.header.filter
     # heavy imports only after the files were checked
     from miricigale.photometry import ForcedPhotometer
 
     with progress(show=progress_bar, total=4, desc="images", unit="steps") as bar:
         mosaic, prior = image.read(), highres.read()
-        mosaic.meta["filter"] = filter_
         bar.update()
         bar.set_description("kernel and sources")
-        matching = matching_kernel(*headers, **psfs)
+        matching = matching_kernel(image, highres, kernel)
         segments, sources = _sources(prior, segmentation, catalog, highres.path)
         bar.update()
         bar.set_description("fluxes")
@@ -192,7 +152,7 @@ def measure_files(
         if page is not None:
             from miricigale.photometry.page import photometry_page
 
-            pulls = _pulls(result, matching, n_empty, seed, n_threads)
+            pulls = _pulls(result, matching, seed, n_threads)
             photometry_page(result, filter_, mosaic, prior, matching, pulls, segments).write(page)
         bar.update()
     return table
@@ -245,21 +205,16 @@ def _check_output(what, path, overwrite, inputs):
         raise argument_error(what, "in a folder that can be written to", path) from err
 
 
-def _check_images(image, highres, filter_):
-    """The filter of the image, after checking that the two are what they should be."""
-    wanted = filter_ or image.filter
-    plain = [MosaicFile(one.path).header.filter for one in (image, highres)]
-    if wanted is not None and plain[0] not in (None, wanted) and plain[1] == wanted:
+def _check_images(image, highres):
+    """Refuse images that are not what they should be, or do not overlap."""
+    wanted, stated = image.filter, [MosaicFile(one.path).header.filter for one in (image, highres)]
+    if wanted is not None and stated[0] not in (None, wanted) and stated[1] == wanted:
         msg = (
             f"'image' and 'highres' seem to be swapped: {highres.path} is the image in {wanted}, "
-            f"{image.path} is in {plain[0]}"
+            f"{image.path} is in {stated[0]}"
         )
         raise ValueError(msg)
-    if wanted is not None and plain[0] not in (None, wanted):
-        raise argument_error("filter", f"{plain[0]!r}, the filter in {image.path}", repr(wanted))
-    for one in (image, highres):
-        _ = one.header
-    found = wanted or plain[0]
+    found, _ = (one.header.filter for one in (image, highres))
     if found is None:
         wanted = f"given, for the header of {image.path} does not name it"
         raise argument_error("filter", wanted, None)
@@ -279,7 +234,6 @@ def _check_images(image, highres, filter_):
             f"{where[0]}, that of {highres.path} at {where[1]} deg"
         )
         raise ValueError(msg)
-    return found
 
 
 def _middle(header):
@@ -298,38 +252,22 @@ def _overlap(one, other):
     return bool(np.any((x > -0.5) & (x < nx - 0.5) & (y > -0.5) & (y < ny - 0.5)))
 
 
-def _checked_angle(file, angle, argument):
-    """The position angle that was given or that the header states, which must agree."""
-    stated = file.header.pa_aper
-    if angle is None:
-        return stated
-    angle = float(to_array(angle, u.deg, argument, finite=True)) * u.deg
-    if stated is not None:
-        difference = (angle - stated).to_value(u.deg)
-        if abs((difference + 180) % 360 - 180) > 1:
-            wanted = f"PA_APER of {file.path}, {stated.value:.2f} deg"
-            raise argument_error(argument, wanted, angle)
-    return angle
-
-
-def _check_psfs(image, highres, headers, kernel, psf, highres_psf):
+def _check_psfs(image, highres, kernel):
     """Refuse images whose PSF is neither given nor known."""
     from miricigale.psf import MODEL_FILTERS
 
     if kernel is not None:
-        if psf is not None:
-            raise argument_error("psf", "left out where a kernel is given", psf)
+        if image.psf is not None:
+            raise argument_error("psf", "left out where a kernel is given", image.psf)
         return
-    for file, header, path, prefix in (
-        (image, headers[0], psf, ""),
-        (highres, headers[1], highres_psf, "highres_"),
-    ):
-        if path is not None or can_be_modeled(header):
+    for file, prefix in ((image, ""), (highres, "highres_")):
+        name = file.header.filter
+        if file.psf is not None or can_be_modeled(file.header):
             continue
-        if header.filter in MODEL_FILTERS:
+        if name in MODEL_FILTERS:
             wanted = f"given, for the header of {file.path} has no PA_APER (or '{prefix}psf')"
             raise argument_error(prefix + "pa_aper", wanted, None)
-        name = header.filter or "an image whose filter is unknown ('highres_filter')"
+        name = name or "an image whose filter is unknown ('highres_filter')"
         wanted = f"given (or 'kernel'), for there is no model PSF for {name}"
         raise argument_error(prefix + "psf", wanted, None)
 
@@ -373,11 +311,11 @@ def _sources(prior, segmentation, catalog, path):
     return read_prior(prior, segmentation=segments.data, catalog=catalog, path=path)
 
 
-def _pulls(result, kernel, n, seed, n_threads):
+def _pulls(result, kernel, seed, n_threads):
     """Flux over error of point sources where none is; None without a PSF or such places."""
     from miricigale.photometry import ForcedPhotometer
 
-    empty = empty_positions(result, n, seed=seed)
+    empty = _empty_positions(result, seed)
     if kernel.target is None or not len(empty):
         return None
     blank = ForcedPhotometer(kernel, template="psf", n_threads=n_threads)
@@ -387,9 +325,9 @@ def _pulls(result, kernel, n, seed, n_threads):
         return blank.measure(result.residual_image, catalog=empty).snr
 
 
-def empty_positions(result, n, *, seed):
+def _empty_positions(result, seed):
     """
-    Up to ``n`` random positions at which a measurement left no light: ``id`` and ``sky``.
+    Random positions at which a measurement left no light: ``id`` and ``sky``.
 
     They are at least 0.3 arcsec from pixels with light of a model (above a third of the
     noise) or without data.
@@ -409,6 +347,6 @@ def empty_positions(result, n, *, seed):
     free = scipy.ndimage.binary_erosion(free, iterations=steps)
     y, x = np.nonzero(free)
     rng = np.random.default_rng(seed)
-    chosen = rng.choice(len(x), min(n, len(x)), replace=False) if len(x) else np.zeros(0, int)
+    chosen = rng.choice(len(x), min(_EMPTY, len(x)), replace=False) if len(x) else np.zeros(0, int)
     sky = residual.wcs.pixel_to_world(x[chosen].astype(float), y[chosen].astype(float)).icrs
     return QTable({"id": np.arange(1, len(chosen) + 1), "sky": sky})

@@ -31,6 +31,9 @@ _POINT = 0.05
 #: Least distance of two injected sources in widths of the PSF (FWHM), and attempts to place each.
 _APART, _ATTEMPTS = 4.0, 50
 
+#: Injected fluxes, over the median error of sources by noise: uniform in the logarithm between these.
+_SNR_RANGE = (1.0, 100.0)
+
 #: Flags with which a source may still be copied.
 _HARMLESS = ForcedFlags.BLENDED | ForcedFlags.POOR_FIT | ForcedFlags.UNEXPLAINED_NEIGHBOR
 
@@ -47,7 +50,6 @@ def calibrate_errors(
     *,
     n_trials=10,
     n_sources=None,
-    snr_range=(1.0, 100.0),
     seed=None,
     progress_bar=False,
 ):
@@ -71,9 +73,6 @@ def calibrate_errors(
     n_sources : int, optional
         Sources injected in each trial, and empty places; by default a seventh of the sources in the
         catalog, at least ten. Fewer, if there is no room for so many.
-    snr_range : tuple of float, optional
-        Fluxes over the median error of sources by noise, between which injected fluxes are drawn, uniform
-        in the logarithm.
     seed : int or `~numpy.random.Generator`, optional
         The same seed gives the same result.
     progress_bar : bool, optional
@@ -98,9 +97,6 @@ def calibrate_errors(
         raise argument_error("photometer", wanted, repr(photometer))
     if isinstance(n_trials, bool) or int(n_trials) != n_trials or n_trials < 1:
         raise argument_error("n_trials", "an integer of at least 1", n_trials)
-    low, high = snr_range
-    if not 0 < low < high:
-        raise argument_error("snr_range", "two increasing positive numbers", snr_range)
     require_columns(catalog, ["sky"], "catalog")
     seed = check_seed(seed)
     if n_sources is None:
@@ -111,7 +107,7 @@ def calibrate_errors(
     tables = []
     for trial in progress(range(int(n_trials)), show=progress_bar, desc="inject"):
         rng = stream(seed, "injection", trial)
-        found = field.trial(int(n_sources), (low, high), rng)
+        found = field.trial(int(n_sources), rng)
         found["trial"] = trial
         tables.append(found)
     sources = vstack(tables, metadata_conflicts="silent")
@@ -220,13 +216,13 @@ class _Field:
             found.append(at)
         return found
 
-    def trial(self, n, snr_range, rng):
+    def trial(self, n, rng):
         """Inject, measure, and tell what came back."""
         at = self._places(2 * n, rng, [])
         if len(at) < 2:
             raise argument_error("image", "with room for sources", "none")
         full, empty = np.array(at[::2]), np.array(at[1::2])
-        flux = self.error * np.exp(rng.uniform(*np.log(snr_range), len(full)))
+        flux = self.error * np.exp(rng.uniform(*np.log(_SNR_RANGE), len(full)))
         new = self._galaxies(full, flux, rng) if self.donors else self._points(full, flux)
         light = self.photometer.render(self.image, new.light, new.flux * FNU)
         image = _with_data(self.image, self.image.data + light.to_value(self.image.unit))

@@ -63,30 +63,26 @@ def _centered(data):
     return float((core * x).sum() / core.sum()), float((core * y).sum() / core.sum())
 
 
-def _read_psf(path, argument, header, *, scale, angle):
-    """
-    A PSF, or the mean of several, with its center in the middle.
-
-    ``scale`` and ``angle`` are what the caller gave (or None), ``header`` is that of the image which
-    the PSF is for.
-    """
+def _read_psf(file, argument):
+    """A PSF of a file, or the mean of several, with its center in the middle."""
     from miricigale.psf import MODEL_FILTERS, average_psf, make_psf, psf_image
     from miricigale.psf.files import header_grid
 
+    path, header = file.psf, file.header
     known = header.filter in MODEL_FILTERS
     planes, stated = _planes(path, "a PSF")
     cell, turn = header_grid(stated)
-    if scale is not None:
-        given = float(to_array(scale, ANGLE, f"{argument}_scale"))
+    if file.psf_scale is not None:
+        given = float(to_array(file.psf_scale, ANGLE, f"{argument}_scale"))
         if cell is not None and abs(given / cell - 1) > 0.02:
             wanted = f"{cell:.4g} arcsec, as the header of {path} says"
-            raise argument_error(argument + "_scale", wanted, scale)
+            raise argument_error(argument + "_scale", wanted, file.psf_scale)
         cell = given
-    if angle is not None:
-        given = float(to_array(angle, u.deg, f"{argument}_angle", finite=True))
+    if file.psf_angle is not None:
+        given = float(to_array(file.psf_angle, u.deg, f"{argument}_angle", finite=True))
         if turn is not None and abs((given - turn + 180) % 360 - 180) > 0.5:
             wanted = f"{turn:.4g} deg, as the header of {path} says"
-            raise argument_error(argument + "_angle", wanted, angle)
+            raise argument_error(argument + "_angle", wanted, file.psf_angle)
         turn = given
     cell, turn = (
         default if value is None else value
@@ -115,7 +111,8 @@ def _read_psf(path, argument, header, *, scale, angle):
         kept.append(make_psf(middle, **form, meta={"file": str(path)}))
     psf = kept[0] if len(kept) == 1 else average_psf(kept)
     # if the user stated the pixel scale, only smoothing of the image can explain a wider PSF
-    return _compared(psf, header, argument, smoothed=scale is not None) if known else psf
+    smoothed = file.psf_scale is not None
+    return _compared(psf, header, argument, smoothed=smoothed) if known else psf
 
 
 def _grid(header):
@@ -138,12 +135,6 @@ def _compared(psf, header, argument, *, smoothed=False):
         smoothed=smoothed,
         argument=argument,
     )
-
-
-def is_own_kernel(path):
-    """Whether a file is a kernel with its PSFs, as `~miricigale.psf.MatchingKernel.write` makes it."""
-    with open_fits(file_place(path)[0], wanted="a matching kernel") as hdus:
-        return "KERNEL" in hdus and "SOURCE" in hdus and "TARGET" in hdus
 
 
 def read_kernel(path, *, pixel_scale, highres_psf=None):
@@ -180,8 +171,11 @@ def read_kernel(path, *, pixel_scale, highres_psf=None):
     from miricigale.psf import MatchingKernel
     from miricigale.psf.files import header_grid
 
-    if is_own_kernel(path):
-        kernel = MatchingKernel.read(file_place(path)[0], format="fits")
+    name = file_place(path)[0]
+    with open_fits(name, wanted="a matching kernel") as hdus:
+        own = all(part in hdus for part in ("KERNEL", "SOURCE", "TARGET"))
+    if own:
+        kernel = MatchingKernel.read(name, format="fits")
         stated = kernel.pixel_scale.value
     else:
         planes, header = _planes(path, "a kernel")
@@ -216,21 +210,16 @@ def can_be_modeled(header):
     return name in MODEL_FILTERS and (name.startswith("wfc3.") or header.pa_aper is not None)
 
 
-def image_psf(header, path=None, *, argument="psf", scale=None, angle=None):
+def image_psf(file, argument="psf"):
     """
     The PSF of an image: that of a file, or the model of its filter.
 
     Parameters
     ----------
-    header : `~miricigale.photometry.MosaicHeader`
-        Of the image.
-    path : path-like, optional
-        What has the PSF; the model without it.
+    file : `~miricigale.photometry.MosaicFile`
+        The image.
     argument : str, optional
-        What ``path`` is called in messages.
-    scale, angle : `~astropy.units.Quantity`, optional
-        Pixel and position angle of +y of the file, if its header does not say them; those of the image by
-        default.
+        What its PSF is called in messages.
 
     Returns
     -------
@@ -242,39 +231,34 @@ def image_psf(header, path=None, *, argument="psf", scale=None, angle=None):
     `~miricigale.utils.exceptions.DataError`
         If the file is missing or holds no PSF.
     """
-    if path is not None:
-        return _read_psf(path, argument, header, scale=scale, angle=angle)
-    return _model_psf(header, argument) if can_be_modeled(header) else None
-
-
-def _model_psf(header, argument):
-    """The model of the PSF of an image by its filter."""
     from miricigale.psf import filter_psf
 
+    if file.psf is not None:
+        return _read_psf(file, argument)
+    header = file.header
+    if not can_be_modeled(header):
+        return None
     scale, angle = _grid(header)
-    psf = filter_psf(
+    _log.info("%s: the model of %s", argument, header.filter)
+    return filter_psf(
         header.filter,
         pixel_scale=scale * ANGLE,
         pa=header.pa_aper,
         grid_angle=angle * u.deg,
         resampling=None if header.exposure else "drizzle",
     )
-    _log.info("%s: the model of %s", argument, header.filter)
-    return psf
 
 
-def matching_kernel(image, highres, *, kernel=None, psf=None, highres_psf=None, **options):
+def matching_kernel(image, highres, kernel=None):
     """
     The kernel from the prior to the image.
 
     Parameters
     ----------
-    image, highres : `~miricigale.photometry.MosaicHeader`
-        Of the two images, with filters and position angles.
-    kernel, psf, highres_psf : path-like, optional
+    image, highres : `~miricigale.photometry.MosaicFile`
+        The two images.
+    kernel : path-like, optional
         As for `~miricigale.photometry.from_files.measure_files`.
-    **options
-        ``psf_scale``, ``psf_angle``, ``highres_psf_scale`` and ``highres_psf_angle``, likewise.
 
     Returns
     -------
@@ -290,22 +274,18 @@ def matching_kernel(image, highres, *, kernel=None, psf=None, highres_psf=None, 
     """
     from miricigale.psf import MODEL_FILTERS, MatchingKernel, make_psf, rotate_psf
 
-    scale, angle = _grid(highres)
-    psfs, fine, turn = {}, scale * ANGLE, angle * u.deg
-    for what, header, path in (("psf", image, psf), ("highres_psf", highres, highres_psf)):
-        if path is not None:
-            form = {name: options.get(f"{what}_{name}") for name in ("scale", "angle")}
-            psfs[what] = _read_psf(path, what, header, **form)
-        elif kernel is None or (what == "highres_psf" and can_be_modeled(header)):
-            psfs[what] = _model_psf(header, what)
-    sharp, wide = psfs.get("highres_psf"), psfs.get("psf")
+    scale, angle = _grid(highres.header)
+    fine, turn, header = scale * ANGLE, angle * u.deg, image.header
+    wide = image_psf(image) if kernel is None else None
+    sharp = image_psf(highres, "highres_psf")
+    psfs = {"psf": wide, "highres_psf": sharp}
     if kernel is not None:
         if sharp is not None:
             sharp = rotate_psf(sharp, grid_angle=turn)
         made = read_kernel(kernel, highres_psf=sharp, pixel_scale=fine)
-        if made.target is not None and image.filter in MODEL_FILTERS:
+        if made.target is not None and header.filter in MODEL_FILTERS:
             form = {"pixel_scale": fine, "frame": "sky", "angle": turn, "enclosed": 1.0}
-            _compared(make_psf(made.target, **form), image, "kernel")
+            _compared(make_psf(made.target, **form), header, "kernel")
     else:
         _check_widths(sharp.fwhm, wide.fwhm)
         made = MatchingKernel.from_psfs(sharp, wide, pixel_scale=fine, grid_angle=turn)
@@ -319,6 +299,7 @@ def matching_kernel(image, highres, *, kernel=None, psf=None, highres_psf=None, 
             "enclosed": one.enclosed,
         }
         for what, one in psfs.items()
+        if one is not None
     }
     _log.info("%r", made)
     return made

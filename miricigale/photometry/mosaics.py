@@ -20,7 +20,7 @@ from miricigale.photometry.grids import (
 )
 from miricigale.photometry.sky_noise import mask_filled, sky_noise
 from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error
-from miricigale.utils.units import SURFACE_BRIGHTNESS
+from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
 
 _log = logging.getLogger(__name__)
 
@@ -86,6 +86,15 @@ class MosaicFile:
         default the extensions ERR (an error) or WHT (a weight) of the image's own file.
     background_box : int, optional
         If given, a background is measured in boxes of so many pixels and subtracted.
+    psf : path-like, optional
+        PSF of the image with the pixel and the drizzling in it: ``file.fits``, ``file.fits[EXTENSION]``, or of
+        a cube ``file.fits[EXTENSION,PLANE]`` (``mean`` for the mean of all planes). Its center is found.
+        That of MIRI, NIRCam's wide filters and WFC3/IR is compared with the model
+        (`~miricigale.psf.checked_psf`), which is taken where none is given (`~miricigale.psf.filter_psf`).
+    psf_scale, psf_angle : `~astropy.units.Quantity`, optional
+        Pixel of the PSF and position angle of its +y; by default those of its header, or else of the image.
+    pa_aper : `~astropy.units.Quantity`, optional
+        Position angle of the detector's +y axis, if the header does not state it.
     """
 
     path: object
@@ -98,6 +107,10 @@ class MosaicFile:
     inverse_variance: object = None
     weight: object = None
     background_box: int | None = None
+    psf: object = None
+    psf_scale: u.Quantity | None = None
+    psf_angle: u.Quantity | None = None
+    pa_aper: u.Quantity | None = None
 
     def __post_init__(self):
         given = [name for name in _NOISE if getattr(self, name) is not None]
@@ -116,7 +129,7 @@ class MosaicFile:
         `~miricigale.utils.exceptions.DataError`
             If the file is missing or damaged, or has no image with celestial coordinates.
         ValueError
-            If the header names another filter than ``filter``.
+            If the header states another filter or angle than ``filter`` and ``pa_aper``.
         """
         with open_image(self.path, "an image") as (hdus, extension):
             return _header(self, hdus, find_image(hdus, extension, self.path, ("SCI",)))
@@ -288,12 +301,23 @@ def _header(file, hdus, index):
         shape=hdu.shape,
         wcs=wcs,
         filter=name,
-        pa_aper=None if angle is None else float(angle) * u.deg,
+        pa_aper=_checked_angle(file, None if angle is None else float(angle) * u.deg),
         unit=unit if file.unit is None else str(file.unit),
         exposure=is_exposure(get),
         keywords={key: get(key) for key in ("PHOTMJSR", "PHOTFLAM", "PHOTPLAM", "EXPTIME")},
         meta={**meta, **{key: value for key, value in extra.items() if value is not None}},
     )
+
+
+def _checked_angle(file, stated):
+    """The position angle that was given or that the header states, which must agree."""
+    if file.pa_aper is None:
+        return stated
+    angle = float(to_array(file.pa_aper, u.deg, "pa_aper", finite=True)) * u.deg
+    if stated is not None and abs(((angle - stated).to_value(u.deg) + 180) % 360 - 180) > 1:
+        wanted = f"PA_APER of {file.path}, {stated.value:.2f} deg"
+        raise argument_error("pa_aper", wanted, angle)
+    return angle
 
 
 def _native(data):

@@ -11,6 +11,7 @@ from miricigale.photometry import ForcedFlags
 from miricigale.photometry.arrays import pixel_scale
 from miricigale.plotting.axes import new_figure
 from miricigale.plotting.images import plot_image, plot_model_residual, plot_segmentation
+from miricigale.plotting.posteriors import plot_pulls
 from miricigale.utils.units import ab_magnitude
 
 #: Largest number of pixels across a drawing of a whole image, and rows of the table.
@@ -37,14 +38,14 @@ def photometry_page(result, filter_, image, highres, kernel, pulls=None, segment
     page.section("Summary")
     errors = result.flux_err[good & (result.flags == 0)]
     depth = np.nan if not len(errors) else (5 * np.median(errors)).to_value(u.ABmag)
-    none = "no source was measured without a flag"
+    none, rms = "no source was measured without a flag", _pulls_rms(pulls)
     page.items(
         [
             ("sources of the prior", len(result)),
             ("measured", int(np.count_nonzero(good))),
             ("above 5 sigma", int(np.count_nonzero(good & (snr > 5)))),
             ("5 sigma of the median source without flags, AB", number(depth, ".2f", none)),
-            ("pulls at empty positions, robust rms", _pull(pulls)),
+            ("pulls at empty positions, robust rms", number(rms, ".2f", "no empty positions")),
             *_fitted(result),
         ]
     )
@@ -63,7 +64,9 @@ def photometry_page(result, filter_, image, highres, kernel, pulls=None, segment
             "Point sources were fitted to the residual image where no source is: flux over error "
             "should scatter by 1 around 0.",
         )
-        page.figure(_pull_figure(pulls), f"{len(pulls)} positions and a Gaussian of width 1.")
+        figure, axes = new_figure(1, 1, size=(5.6, 3.4))
+        plot_pulls(pulls, ax=axes[0, 0], limit=6.0).set_xlabel("flux / error")
+        page.figure(figure, f"{len(pulls)} positions and a Gaussian of width 1.")
     _flag_table(page, result)
     _source_table(page, result)
     _input_table(page, image, highres, kernel)
@@ -102,18 +105,15 @@ def _notices(result, image, highres, kernel, pulls):
     if abs(highres.meta.get("sky_over_noise", 0.0)) > 1:
         level = highres.meta["sky_over_noise"]
         lines.append(f"The prior has a sky of {level:.3g} times its noise, in the templates too.")
-    if pulls is not None and len(pulls) >= 100 and not 0.8 < _rms(pulls) < 1.25:
-        lines.append(f"Pulls at empty positions scatter by {_rms(pulls):.2f} instead of 1.")
+    rms = _pulls_rms(pulls)
+    if pulls is not None and len(pulls) >= 100 and not 0.8 < rms < 1.25:
+        lines.append(f"Pulls at empty positions scatter by {rms:.2f} instead of 1.")
     return lines
 
 
-def _rms(values):
-    values = values[np.isfinite(values)]
+def _pulls_rms(pulls):
+    values = [] if pulls is None else pulls[np.isfinite(pulls)]
     return float(mad_std(values)) if len(values) else np.nan
-
-
-def _pull(pulls):
-    return number(None if pulls is None else _rms(pulls), ".2f", "no empty positions")
 
 
 def _fitted(result):
@@ -145,21 +145,16 @@ def _examples(result):
     snr = np.nan_to_num(result.snr, nan=-np.inf)
     good = np.isfinite(result.snr)
     clean = good & (result.flags == 0)
-    chosen = []
+    chosen = {}
     if good.any():
-        k = int(np.argmax(np.where(clean, snr, -np.inf) if clean.any() else snr))
         what = "the brightest without a flag" if clean.any() else "the brightest"
-        chosen.append((k, what))
+        chosen[what] = np.argmax(np.where(clean if clean.any() else good, snr, -np.inf))
     poor = good & (result.flags & int(ForcedFlags.POOR_FIT) != 0)
     if poor.any():
-        chosen.append((int(np.argmax(np.where(poor, result.chi2, -np.inf))), "the poorest fit"))
-    return [
-        (
-            k,
-            f"Around source {result.id[k]}, {what}: signal-to-noise {snr[k]:.0f}, chi2 {result.chi2[k]:.1f}.",
-        )
-        for k, what in chosen
-    ]
+        chosen["the poorest fit"] = np.argmax(np.where(poor, result.chi2, -np.inf))
+    for what, k in chosen.items():
+        numbers = f"signal-to-noise {snr[k]:.0f}, chi2 {result.chi2[k]:.1f}"
+        yield int(k), f"Around source {result.id[k]}, {what}: {numbers}."
 
 
 def _zoom(result, highres, segments, k, size=12.0):
@@ -209,31 +204,14 @@ def _magnitudes(result, filter_):
         ax.legend(frameon=False)
     ax.set(xlabel=f"{filter_} (AB)", ylabel="sources")
     ax = axes[0, 1]
-    ax.plot(
-        mag[detected & ~clean],
-        error[detected & ~clean],
-        "x",
-        color="#c2410c",
-        ms=4,
-        label="flagged",
-    )
-    ax.plot(mag[clean], error[clean], ".", color="#1d4ed8", ms=5, label="no flag")
+    for rows, marker, color, label in (
+        (detected & ~clean, "x", "#c2410c", "flagged"),
+        (clean, ".", "#1d4ed8", "no flag"),
+    ):
+        ax.plot(mag[rows], error[rows], marker, color=color, ms=5, label=label)
     ax.axhline(1.0857 / 5, color="0.5", lw=0.8, ls="--", label="5 sigma")
     ax.set(xlabel=f"{filter_} (AB)", ylabel="error (mag)", yscale="log")
     ax.legend(frameon=False)
-    return figure
-
-
-def _pull_figure(pulls):
-    figure, axes = new_figure(1, 1, size=(5.6, 3.4))
-    ax = axes[0, 0]
-    values = pulls[np.isfinite(pulls)]
-    bins = np.linspace(-6, 6, 49)
-    ax.hist(np.clip(values, -6, 6), bins, color="0.75")
-    middle = 0.5 * (bins[1:] + bins[:-1])
-    gauss = np.exp(-0.5 * middle**2) / np.sqrt(2 * np.pi) * len(values) * (bins[1] - bins[0])
-    ax.plot(middle, gauss, color="#1d4ed8")
-    ax.set(xlabel="flux / error (those beyond 6 in the outermost bins)", ylabel="positions")
     return figure
 
 
@@ -254,61 +232,38 @@ def _source_table(page, result):
     text = f"The {len(order)} brightest of {len(result)}; all are in the table that was written. "
     text += "Residual is what the fit left in the core over what it took there."
     page.section("Brightest sources", text)
-    mag = ab_magnitude(result.flux)
-    none = "no positive flux"
-    rows = [
-        (
-            str(result.id[k]),
-            ", ".join(ForcedFlags.names(result.flags[k])).replace("_", " ") or "none",
-            str(result.template[k]),
-            f"{result.sky[k].ra.deg:.5f}",
-            f"{result.sky[k].dec.deg:.5f}",
-            number(result.flux[k].value, ".4g", "not measured"),
-            number(result.flux_err[k].value, ".2g", "not measured"),
-            number(mag[k], ".2f", none),
-            number(result.snr[k], ".1f", "not measured"),
-            number(result.chi2[k], ".2f", "not measured"),
-            number(result.residual_fraction[k], "+.2f", "not measured"),
-        )
-        for k in order
-    ]
-    header = ("id", "flags", "template", "RA", "Dec", "flux (uJy)", "error", "AB", "S/N", "chi2")
-    page.table(rows, header=(*header, "residual"), text=3, empty="The catalog has no source.")
+    shown = result.to_table()[order]
+    shown["AB"] = ab_magnitude(result.flux)[order]
+    page.entries(shown, _SOURCE_COLUMNS, text=3, empty="The catalog has no source.")
+
+
+#: Columns of the table of sources.
+_LOST = "not measured"
+_SOURCE_COLUMNS = {
+    "id": lambda row: str(row["id"]),
+    "flags": lambda row: ", ".join(ForcedFlags.names(row["flags"])).replace("_", " ") or "none",
+    "template": lambda row: str(row["template"]),
+    "RA": lambda row: f"{row['sky'].ra.deg:.5f}",
+    "Dec": lambda row: f"{row['sky'].dec.deg:.5f}",
+    "flux (uJy)": lambda row: number(row["flux"].value, ".4g", _LOST),
+    "error": lambda row: number(row["flux_err"].value, ".2g", _LOST),
+    "AB": ("AB", ".2f", "no positive flux"),
+    "S/N": ("snr", ".1f", _LOST),
+    "chi2": ("chi2", ".2f", _LOST),
+    "residual": ("residual_fraction", "+.2f", _LOST),
+}
 
 
 def _input_table(page, image, highres, kernel):
     page.section("What was read")
-    keys = [
-        ("source", "file"),
-        ("filter", "filter"),
-        ("source_unit", "unit of the pixels"),
-        ("calibration", "calibration"),
-        ("noise", "noise"),
-        ("noise_scale", "noise on the sky over that of the map"),
-        ("weight_scale", "factor on the errors of the weights"),
-        ("sky_over_noise", "median sky over noise"),
-        ("background_box", "box of the background that was subtracted (pixels)"),
-        ("pa_aper", "PA_APER (deg)"),
-        ("n_masked", "pixels without data"),
-    ]
-    none = "not stated or not done"
-    cells = [
-        (label, *(_text(one.meta.get(key), none) for one in (image, highres)))
-        for key, label in keys
-    ]
-    shapes = (f"{one.data.shape[1]} x {one.data.shape[0]}" for one in (image, highres))
-    scales = (f"{pixel_scale(one.wcs):.4f}" for one in (image, highres))
-    cells += [("pixels", *shapes), ("pixel (arcsec)", *scales)]
-    psfs = kernel.meta.get("psfs", {})
-    for key, label in (
-        ("from", "PSF"),
-        ("fwhm", "FWHM of the PSF (arcsec)"),
-        ("enclosed", "light on the grid of the PSF"),
-    ):
-        cells.append(
-            (label, *(_text(psfs.get(k, {}).get(key), none) for k in ("psf", "highres_psf")))
-        )
-    page.table(cells, header=("", "image", "prior"), text=3)
+    none, psfs = "not stated or not done", kernel.meta.get("psfs", {})
+    cells = []
+    for one, psf in ((image, "psf"), (highres, "highres_psf")):
+        facts = {**one.meta, **{f"psf_{key}": text for key, text in psfs.get(psf, {}).items()}}
+        facts["pixels"] = f"{one.data.shape[1]} x {one.data.shape[0]}"
+        facts["pixel_scale"] = f"{pixel_scale(one.wcs):.4f}"
+        cells.append([_text(facts.get(key), none) for key in _FACTS])
+    page.table(zip(_FACTS.values(), *cells, strict=True), header=("", "image", "prior"), text=3)
     origin = kernel.meta.get("file", "made from two PSFs")
     page.text(
         f"Kernel: {kernel.array.shape[0]} x {kernel.array.shape[0]} pixels of "
@@ -318,10 +273,27 @@ def _input_table(page, image, highres, kernel):
 
 
 def _text(value, reason):
-    return (
-        number(None, "", reason)
-        if value is None
-        else f"{value:.5g}"
-        if isinstance(value, float)
-        else value
-    )
+    if value is None:
+        return number(None, "", reason)
+    return f"{value:.5g}" if isinstance(value, float) else value
+
+
+#: What is shown of the files that were read.
+_FACTS = {
+    "source": "file",
+    "filter": "filter",
+    "source_unit": "unit of the pixels",
+    "calibration": "calibration",
+    "noise": "noise",
+    "noise_scale": "noise on the sky over that of the map",
+    "weight_scale": "factor on the errors of the weights",
+    "sky_over_noise": "median sky over noise",
+    "background_box": "box of the background that was subtracted (pixels)",
+    "pa_aper": "PA_APER (deg)",
+    "n_masked": "pixels without data",
+    "pixels": "pixels",
+    "pixel_scale": "pixel (arcsec)",
+    "psf_from": "PSF",
+    "psf_fwhm": "FWHM of the PSF (arcsec)",
+    "psf_enclosed": "light on the grid of the PSF",
+}

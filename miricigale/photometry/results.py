@@ -25,7 +25,7 @@ from miricigale.utils.unified import read_write
 from miricigale.utils.units import ANGLE, FNU
 
 
-def crowded(sky, flux, *, radius=2 * u.arcsec, delta_mag=1.0):
+def crowded(sky, flux, *, radius=2 * u.arcsec):
     """
     Find sources that have a neighbor which is bright enough to matter.
 
@@ -37,13 +37,12 @@ def crowded(sky, flux, *, radius=2 * u.arcsec, delta_mag=1.0):
         Fluxes.
     radius : `~astropy.units.Quantity`, optional
         How near a neighbor is.
-    delta_mag : float, optional
-        A neighbor counts if it is brighter than the source's magnitude plus this.
 
     Returns
     -------
     crowded : bool `~numpy.ndarray`, shape (n,)
-        A source whose flux is not positive is crowded by any positive neighbor, one whose
+        Whether a neighbor is brighter than the source's magnitude + 1. A source whose flux is not positive is
+        crowded by any positive neighbor, one whose
         position is not known by none.
 
     References
@@ -56,7 +55,7 @@ def crowded(sky, flux, *, radius=2 * u.arcsec, delta_mag=1.0):
         flux = np.asarray(getattr(flux, "value", flux), float)
         i, j, _, _ = sky[known].search_around_sky(sky[known], radius)
         i, j = known[i], known[j]
-        limit = np.maximum(flux[i], 0.0) * 10 ** (-0.4 * delta_mag)
+        limit = np.maximum(flux[i], 0.0) * 10**-0.4
         found[i[(i != j) & (flux[j] > limit)]] = True
     return found
 

@@ -171,9 +171,10 @@ class SourceTemplates:
         psf = _psf_array(psf, scale)
         xy = np.stack(highres.wcs.world_to_pixel(known.sky), axis=-1).reshape(-1, 2)
         warn_of_sky(fine, segments)
+        here, _ = labels_at(segments, xy)
         if known.label is not None:
-            check_labels(known.label, labels_at(segments, xy)[0], "catalog['label']")
-        label, flags = own_segments(segments, known.label, xy)
+            check_labels(known.label, here, "catalog['label']")
+        label, flags = own_segments(segments, here if known.label is None else known.label, xy)
         with threads(n_threads) as executor, single_threaded():
             light, more, snr, fitted = cutouts(
                 FineImage(fine.flux, fine.sigma**2, psf, scale), segments, label, xy,

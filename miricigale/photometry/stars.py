@@ -6,14 +6,12 @@ import astropy.units as u
 import numpy as np
 from astropy.table import Table
 from astropy.utils.exceptions import AstropyUserWarning
-from photutils.background import LocalBackground
 from photutils.psf import PSF_FLAGS, PSFPhotometry
 
 from miricigale.photometry.arrays import image_arrays, pixel_scale, sky_pixels
 from miricigale.photometry.catalogs import catalog_sources
 from miricigale.photometry.grids import grid_angle
 from miricigale.psf import psf_mosaic
-from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
 from miricigale.utils.tables import described_table
 from miricigale.utils.units import ANGLE, FNU, positive
@@ -28,12 +26,10 @@ def psf_photometry(
     catalog,
     *,
     pa=None,
-    fit_size=None,
     max_shift=0.1 * u.arcsec,
-    local_background=None,
 ):
     """
-    Fit a PSF to stars one by one, by `photutils.psf.PSFPhotometry`.
+    Fit a PSF to stars one by one (`photutils.psf.PSFPhotometry`), on squares of four times its FWHM.
 
     Parameters
     ----------
@@ -47,13 +43,8 @@ def psf_photometry(
     pa : `~astropy.units.Quantity`, optional
         Position angle of the +y axis of a PSF in the detector frame; needed for those. The PSF is
         turned to the image's axes.
-    fit_size : `~astropy.units.Quantity`, optional
-        Side of the square that is fitted; four full widths at half maximum by default.
     max_shift : `~astropy.units.Quantity` or None, optional
         How far positions may move along either axis; None keeps those of the catalog.
-    local_background : (`~astropy.units.Quantity`, `~astropy.units.Quantity`), optional
-        Inner and outer radius of an annulus whose sigma-clipped median is subtracted; none by
-        default.
 
     Returns
     -------
@@ -66,7 +57,7 @@ def psf_photometry(
     Raises
     ------
     ValueError
-        If a size is not positive, the angle of the PSF is not known, or the catalog does not fit.
+        If ``max_shift`` is not positive, the angle of the PSF is not known, or the catalog does not fit.
 
     Notes
     -----
@@ -91,8 +82,7 @@ def psf_photometry(
         resampling=None,
     )
     width = model.fwhm
-    size = 4 * width if fit_size is None else fit_size
-    side = positive(size, ANGLE, "fit_size") / scale
+    side = positive(4 * width, ANGLE, "psf") / scale
     side = max(3, 2 * int(np.ceil((side - 1) / 2)) + 1)
     bound = None
     if max_shift is None:
@@ -105,8 +95,7 @@ def psf_photometry(
     found = {name: np.full(n, np.nan) for name in names}
     flags = np.full(n, _NO_OVERLAP)
     if len(rows):
-        fitted = _fit(arrays, model, xy[rows], side, bound, width.value / scale,
-                      _annulus(local_background, scale))  # fmt: skip
+        fitted = _fit(arrays, model, xy[rows], side, bound, width.value / scale)
         keys = ("flux_fit", "flux_err", "x_fit", "y_fit", "reduced_chi2", "qfit", "cfit")
         for name, key in zip(names, keys, strict=True):
             found[name][rows] = np.ma.filled(np.ma.asarray(fitted[key], float), np.nan)
@@ -137,11 +126,10 @@ def psf_photometry(
     return described_table(columns, meta)
 
 
-def _fit(arrays, model, xy, side, bound, width, background):
+def _fit(arrays, model, xy, side, bound, width):
     """Run photutils on the flux per pixel."""
     photometry = PSFPhotometry(
         model, (side, side), grouper=None, xy_bounds=bound, aperture_radius=max(width, 1.5),
-        local_bkg_estimator=background,
     )  # fmt: skip
     with warnings.catch_warnings():
         # what did not converge or has no pixels is in the flags
@@ -152,15 +140,6 @@ def _fit(arrays, model, xy, side, bound, width, background):
             error=np.where(arrays.usable, arrays.sigma, 1.0),
             init_params=Table({"x": xy[:, 0], "y": xy[:, 1]}),
         )
-
-
-def _annulus(radii, scale):
-    if radii is None:
-        return None
-    inner, outer = (positive(r, ANGLE, "local_background") / scale for r in radii)
-    if not inner < outer:
-        raise argument_error("local_background", "an inner and a larger outer radius", radii)
-    return LocalBackground(inner, outer)
 
 
 def _describe_flags():

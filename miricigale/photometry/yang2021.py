@@ -25,9 +25,8 @@ class Yang2021Photometer:
     ----------
     source, target : `~photutils.psf.ImagePSF`
         PSF of the high-resolution image, and of the mosaic that is measured. Both must say what
-        fraction of all light they hold (as those of the package do).
-    source_angle, target_angle : `~astropy.units.Quantity`, optional
-        Position angles of PSFs in the detector frame, as of `~miricigale.psf.MatchingKernel.from_psfs`.
+        fraction of all light they hold (as those of the package do), and be in the frame of the sky
+        (`~miricigale.psf.rotate_psf`).
     scaling : float, optional
         The paper's f_scaling, by which the image is multiplied before it is measured: of
         `~miricigale.photometry.flux_scaling` on bright point sources.
@@ -63,9 +62,7 @@ class Yang2021Photometer:
     Yang et al. 2021, ApJ 908, 144, sections 3.2 to 3.4; Merlin et al. 2015, A&A 582, A15 (T-PHOT).
     """
 
-    def __init__(
-        self, source, target, *, source_angle=None, target_angle=None, scaling=1.0, n_threads=None
-    ):
+    def __init__(self, source, target, *, scaling=1.0, n_threads=None):
         if not (np.isfinite(scaling) and scaling > 0):
             raise argument_error("scaling", "positive", scaling)
         self.kernel = MatchingKernel.from_psfs(
@@ -73,8 +70,6 @@ class Yang2021Photometer:
             target,
             pixel_scale=_PIXEL,
             regularization="yang2021",
-            hi_angle=source_angle,
-            lo_angle=target_angle,
             extent=_STAMP,
             normalize=True,
         )

@@ -174,8 +174,8 @@ class RealGalaxies:
         -------
         galaxies : `RealGalaxies`
         """
-        file = photometry.MosaicFile(path)
-        model = image_psf(file.header, psf, argument="cutouts_psf")
+        file = photometry.MosaicFile(path, psf=psf)
+        model = image_psf(file, argument="cutouts_psf")
         if model is None:
             log.warning("%s: no PSF is known, and none is taken out of its galaxies", path)
         else:

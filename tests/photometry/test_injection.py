@@ -152,7 +152,6 @@ def test_rendered_sources_are_measured_as_they_are(tools, points):
     [
         ({"n_trials": 0}, "n_trials"),
         ({"n_sources": 0}, "n_sources"),
-        ({"snr_range": (3, 1)}, "snr_range"),
     ],
 )
 def test_options_out_of_range_are_named(tools, points, options, name):

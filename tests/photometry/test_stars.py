@@ -126,7 +126,3 @@ def test_neighbors_are_told_and_options_checked(tools, stars, psf):
     # a PSF on other pixels is brought to the image's
     assert np.isfinite(psf_photometry(image, narrow, two)["flux"].value).all()
     assert len(psf_photometry(image, psf, catalog[:0])) == 0
-    with pytest.raises(ValueError, match="'fit_size' must be positive"):
-        psf_photometry(image, psf, two, fit_size=0 * u.arcsec)
-    with pytest.raises(ValueError, match="'local_background' must be an inner and a larger"):
-        psf_photometry(image, psf, two, local_background=(2 * u.arcsec, 1 * u.arcsec))

@@ -12,7 +12,7 @@ from astropy.io import fits
 from astropy.table import Table
 
 from miricigale.instrument import north_up_wcs, pixel_area_map
-from miricigale.photometry import read_mosaic
+from miricigale.photometry import MosaicFile, read_mosaic
 from miricigale.photometry.from_files import measure_files
 from miricigale.psf import (
     MatchingKernel,
@@ -82,7 +82,12 @@ def field(tmp_path_factory):
 
 def measured(field, **options):
     options = {**field.paths, **options}
-    return measure_files(options.pop("image"), options.pop("highres"), n_threads=1, **options)
+    images = []
+    for name, prefix in (("image", ""), ("highres", "highres_")):
+        keys = ("psf", "psf_scale", "psf_angle", "pa_aper")
+        known = {key: options.pop(prefix + key, None) for key in keys}
+        images.append(MosaicFile(options.pop(name), **known))
+    return measure_files(*images, n_threads=1, **options)
 
 
 def fluxes(field, **options):

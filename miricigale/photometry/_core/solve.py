@@ -6,6 +6,16 @@ import scipy.sparse
 from scipy.sparse.linalg import splu
 
 
+def symmetric_lu(matrix):
+    """Factorize a symmetric sparse matrix without pivots (`scipy.sparse.linalg.SuperLU`)."""
+    return splu(
+        matrix.tocsc(),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
+
+
 def factorize(matrix):
     """
     Factorize a symmetric positive sparse matrix after scaling it to a unit diagonal.
@@ -23,12 +33,7 @@ def factorize(matrix):
         raise np.linalg.LinAlgError(msg)
     unit = scipy.sparse.diags_array(1.0 / scale)
     try:
-        lu = splu(
-            (unit @ matrix @ unit).tocsc(),
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
-        )
+        lu = symmetric_lu(unit @ matrix @ unit)
     except RuntimeError as err:
         msg = f"the normal equations are singular ({err})"
         raise np.linalg.LinAlgError(msg) from None
