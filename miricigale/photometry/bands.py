@@ -34,7 +34,7 @@ def measure_bands(images, kernels, templates, **options):
     Raises
     ------
     ValueError, TypeError, `~astropy.units.UnitsError`
-        If a band has no kernel or an input does not fit; a note tells the band.
+        If a band has no kernel or an input does not fit; a note names the band.
     """
     missing = sorted(set(images) ^ set(kernels))
     if missing:
@@ -100,13 +100,17 @@ def join_bands(results):
             label = {"flux": name, error_column("flux"): error_column(name)}.get(
                 column, f"{name}_{column}"
             )
-            joined[label] = _spread(one[column], index, column)
+            joined[label] = spread_rows(one[column], index, column)
             joined[label].info.description = one[column].info.description
     return joined
 
 
-def _spread(values, index, column):
-    """The rows of a column, or what stands for one that is missing."""
+def spread_rows(values, index, column):
+    """
+    Rows of a column by number, filled for those that are missing (-1).
+
+    Missing numbers are NaN or 0, texts "none", and ``flags``, if that is the name of the column, ``NO_DATA``.
+    """
     if np.all(index >= 0):
         return values[index].copy()
     kind = np.asarray(values).dtype.kind

@@ -1,4 +1,4 @@
-"""The columns of a catalog that photometry knows."""
+"""The columns of a catalog that photometry uses."""
 
 import dataclasses
 
@@ -16,7 +16,7 @@ OPTIONAL = ("flux", "components")
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CatalogSources:
-    """What a catalog says of its sources: arrays of shape (n,), None for columns that it does not have."""
+    """The sources of a catalog: arrays of shape (n,), None for columns that it does not have."""
 
     id: np.ndarray
     sky: SkyCoord

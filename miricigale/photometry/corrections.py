@@ -1,4 +1,4 @@
-"""Corrections that bright point sources tell: encircled energy, scale, apertures."""
+"""Corrections from bright point sources: encircled energy, scale, apertures."""
 
 import astropy.units as u
 import numpy as np

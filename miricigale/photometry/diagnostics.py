@@ -1,4 +1,4 @@
-"""What the residual of a fit says about it: noise, goodness of fit and flags."""
+"""Diagnostics of a fit from its residual: noise, goodness of fit and flags."""
 
 import dataclasses
 
@@ -13,7 +13,7 @@ from miricigale.utils.parallel import chunks
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Diagnostics:
-    """A fit held against its image."""
+    """A fit compared with its image."""
 
     #: (ny, nx): uJy per pixel; the residual is zero where the image is not usable.
     model: np.ndarray

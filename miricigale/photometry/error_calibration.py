@@ -25,7 +25,7 @@ _ONE_SIGMA = 68.27
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class ErrorCalibration:
     """
-    What sources of known flux say of the errors; `calibrate_errors` makes it.
+    Scatter of sources of known flux in units of their errors; `calibrate_errors` makes it.
 
     Attributes
     ----------

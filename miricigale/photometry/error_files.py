@@ -1,4 +1,4 @@
-"""Errors in files: tables of curves, and of the sources that tell factors."""
+"""Files of error models (curves) and of error calibrations (sources of known flux)."""
 
 import dataclasses
 

@@ -111,8 +111,8 @@ class ErrorModel:
         model : `ErrorModel`
             Errors at the median true flux of each bin, joined in asinh(flux), constant
             beyond the first and last. With ``"mad"`` bins are pooled until both the error and
-            the signal-to-noise rise with flux (isotonic regression); with ``"median_abs"`` each stands
-            for itself, and the limit may be that of an unlucky one.
+            the signal-to-noise rise with flux (isotonic regression); with ``"median_abs"`` each is
+            used as it is, and the limit may be that of an unlucky one.
 
         Raises
         ------
@@ -244,7 +244,7 @@ class ErrorModel:
 
     def extrapolated(self, flux, filter):
         """
-        Tell which fluxes lie outside of what the model was measured on.
+        Find fluxes outside of the range in which the model was measured.
 
         Parameters are those of `sigma`.
 

@@ -55,7 +55,7 @@ def noise_correlation(residual, usable, *, weight=None, executor=None):
     def rows(part):
         return residual[part] if weight is None else residual[part] * weight[part]
 
-    # some millions of pixels tell the median and the spread well enough
+    # some millions of pixels are enough for the median and the spread
     every = np.s_[:: max(1, np.count_nonzero(usable) // _SOME)]
     some, where = (np.ascontiguousarray(one).reshape(-1)[every] for one in (residual, usable))
     if weight is not None:
@@ -86,7 +86,7 @@ def noise_correlation(residual, usable, *, weight=None, executor=None):
     ring = np.maximum(np.abs(index)[:, None], np.abs(index)[None])
     for outer in range(lag, 0, -1):
         member = ring == outer
-        # each value stands twice in a ring
+        # a ring holds each value twice
         mean = covariance[member].mean()
         mean_error = error[member].mean() * np.sqrt(2.0 / np.count_nonzero(member))
         peak = np.max(np.abs(covariance[member]) / error[member])
@@ -318,14 +318,8 @@ def cross_matrix(bank, other, inverse_sigma, correlation=None):
             mine = next(waiting, None)
             if mine is None:
                 break
-            values_of = _whitened(bank, mine, inverse_sigma)[0]
-            live.append(
-                (
-                    mine,
-                    int((mine.box[:, 0] + mine.box[:, 2]).max()),
-                    (values_of, mine.box, mine.start),
-                )
-            )
+            left = (_whitened(bank, mine, inverse_sigma)[0], mine.box, mine.start)
+            live.append((mine, _reach(mine, left), left))
         for mine, _, left in live:
             pairs = cross_pairs(mine.box, right[1])
             if len(pairs):

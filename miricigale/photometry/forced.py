@@ -56,8 +56,8 @@ class ForcedPhotometer:
         If given, a background is fitted with the sources: a polynomial in position of this order, 0 (a
         constant) to 4. Its terms are images that are kept during the fit.
     max_shift : `~astropy.units.Quantity`, optional
-        If given, a shift of the whole image is fitted too. A larger one than this is not
-        believed: a warning says so and the image is measured without.
+        If given, a shift of the whole image is fitted too. A larger one than this is
+        rejected with a warning, and the image is measured without.
     offset_order : int, optional
         If given (0 to 3), a map of offsets takes the place of the one shift: a polynomial in position of
         this order through the offsets of bright isolated sources that are below ``max_shift``. With too few

@@ -6,7 +6,6 @@ import tempfile
 import warnings
 from pathlib import Path
 
-import astropy.units as u
 import numpy as np
 from astropy.io.fits.verify import VerifyWarning
 
@@ -93,7 +92,7 @@ def measure_files(
     `~miricigale.utils.exceptions.DataError`
         If a file is missing, damaged, or without unit or coordinates.
     ValueError
-        If something that was given is not what the headers say, the images do not overlap or
+        If an argument contradicts a header, the images do not overlap or
         seem to be swapped, a PSF is missing, or a result cannot be written.
     """
     image, highres = (
@@ -162,21 +161,19 @@ def _with_new_sources(table, new, filter_):
     """A table and, in its last rows, the sources that the catalog lacks."""
     if new is None or len(new) == 0:
         return table
-    from astropy.table import vstack
+    from astropy.table import QTable, vstack
 
-    known = {"id": "id", "sky": "sky", "flux": filter_, "flux_err": error_column(filter_)}
-    known.update({name: f"{filter_}_{name}" for name in ("flags", "snr", "coverage", "chi2")})
-    rows = table[np.zeros(len(new), int)]
-    for name, column in known.items():
-        rows[column] = new[name]
-    for name in set(table.colnames) - set(known.values()):
-        values = rows[name]
-        if isinstance(values, u.Quantity) or values.dtype.kind == "f":
-            values[:] = np.nan
-        elif values.dtype.kind == "b":
-            values[:] = False
-    rows[f"{filter_}_template"] = "point"
-    return vstack([table, rows], metadata_conflicts="silent")
+    from miricigale.photometry.bands import spread_rows
+
+    known = {"id": "id", "sky": "sky", filter_: "flux", error_column(filter_): "flux_err"}
+    known.update({f"{filter_}_{name}": name for name in ("flags", "snr", "coverage", "chi2")})
+    absent = np.full(len(new), -1)
+    rows = {
+        name: new[known[name]] if name in known else spread_rows(table[name], absent, name)
+        for name in table.colnames
+    }
+    rows[f"{filter_}_template"] = np.full(len(new), "point")
+    return vstack([table, QTable(rows)], metadata_conflicts="silent")
 
 
 def _check_output(what, path, overwrite, inputs):

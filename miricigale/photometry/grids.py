@@ -18,7 +18,7 @@ def open_image(path, wanted):
     """
     Open ``file.fits[EXTENSION]``: yields its HDUs and the extension (str, int or None).
 
-    ``wanted`` says what the file should be, for messages.
+    ``wanted`` is what the file should be, for messages.
     """
     name, extension = split_extension(path)
     with open_fits(name, wanted=wanted) as hdus:
@@ -162,12 +162,12 @@ def _asdf_wcs(header, hdus):
 
 
 def filter_name(get):
-    """The filter that a header (``get(keyword)``) names, ``instrument.filter``; None if it does not tell."""
+    """The filter that a header (``get(keyword)``) names, ``instrument.filter``; None if it names none."""
     instrument = str(get("INSTRUME") or "").strip().lower()
     names = [str(get(key) or "").strip().lower() for key in ("FILTER", "FILTER1", "FILTER2")]
     names = [name for name in names if name and not name.startswith("clear")]
     pupil = str(get("PUPIL") or "").strip().lower()
-    # NIRCam's narrow filters stand in the pupil wheel, in front of a wide one
+    # NIRCam's narrow filters are in the pupil wheel, in front of a wide one
     if instrument == "nircam" and re.fullmatch(r"f\d{3}[a-z]\d?", pupil):
         names = [pupil]
     return f"{instrument}.{names[0]}" if instrument and len(names) == 1 else None

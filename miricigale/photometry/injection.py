@@ -59,7 +59,7 @@ def calibrate_errors(
     Copies of the prior's own sources (points and fitted profiles, with their segments) are put at random
     places into the prior and, with other fluxes, into the image; all is measured anew together with the
     sources that are there, and with as many empty places. The scatter of measured less true flux over the
-    error tells the factor by which errors must be multiplied.
+    error gives the factor by which errors must be multiplied.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def calibrate_errors(
         How often the image is measured.
     n_sources : int, optional
         Sources injected in each trial, and empty places; by default a seventh of the sources in the
-        catalog, at least ten. Fewer, if there is no room for so many.
+        catalog, at least ten. Fewer if there is no free place for so many.
     seed : int or `~numpy.random.Generator`, optional
         The same seed gives the same result.
     progress_bar : bool, optional
@@ -138,7 +138,7 @@ class _Injected:
 
 
 class _Field:
-    """The images, what is copied, and where there is room."""
+    """The images, the sources that are copied, and free places."""
 
     def __init__(self, photometer, image, highres, segmentation, catalog):
         self.photometer, self.image, self.highres = photometer, image, highres
@@ -217,7 +217,7 @@ class _Field:
         return found
 
     def trial(self, n, rng):
-        """Inject, measure, and tell what came back."""
+        """Inject sources and measure them: a table of true and measured fluxes."""
         at = self._places(2 * n, rng, [])
         if len(at) < 2:
             raise argument_error("image", "with room for sources", "none")
@@ -242,7 +242,7 @@ class _Field:
         return table
 
     def _points(self, at, flux):
-        """Points, of which no prior tells."""
+        """Points, which the prior does not show."""
         sky = self.image.wcs.pixel_to_world(*at.T).transform_to(self.sky.frame)
         catalog = QTable({"sky": sky})
         light = SourceTemplates.from_catalog(catalog)

@@ -123,7 +123,7 @@ def _grid(header):
 
 
 def _compared(psf, header, argument, *, smoothed=False):
-    """A PSF beside the model of the image that it is for."""
+    """A PSF, compared with the model of its image."""
     from miricigale.psf import checked_psf
 
     return checked_psf(

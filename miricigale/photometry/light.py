@@ -1,4 +1,4 @@
-"""What sources look like on the high-resolution image: points, profiles, or the image itself."""
+"""Templates of sources on the high-resolution image: points, profiles, or the image itself."""
 
 import dataclasses
 
@@ -12,7 +12,7 @@ from miricigale.photometry.wings import adjust_wings
 from miricigale.profiles import sersic_stamp
 from miricigale.utils.parallel import parallel_map
 
-#: Width (pixels) of the Gaussian that tells the core, its least signal-to-noise, how many standard
+#: Width (pixels) of the Gaussian that defines the core, its least signal-to-noise, how many standard
 #: deviations of chi^2 a profile may miss it by, and the signal-to-noise that makes a neighbor.
 _WIDTH, _CORE_SNR, _EXCESS, _OTHER_SNR = 1.5, 4.0, 3.0, 4.0
 
@@ -32,7 +32,7 @@ _PASSES, _CONTAMINATED, _AT_A_TIME = 4, 4.0, 512
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FineImage:
-    """A high-resolution image on which sources are looked at."""
+    """A high-resolution image from which templates are made."""
 
     data: np.ndarray  # (ny, nx): light per pixel (any unit), background subtracted
     variance: np.ndarray  # (ny, nx): its variance, infinite where not usable

@@ -122,7 +122,7 @@ class MosaicFile:
     @functools.cached_property
     def header(self):
         """
-        What the header says, as a `MosaicHeader`, without reading the image.
+        The contents of the header, a `MosaicHeader`, without reading the image.
 
         Raises
         ------
@@ -239,7 +239,7 @@ class MosaicFile:
 
     def _noise_map(self, hdus, header):
         """Kind, values and place of the map of the noise; the kind is None if there is none."""
-        # what the caller says of the image holds for its map
+        # a unit given by the caller holds for the map too
         stated = "" if self.unit is not None else header.unit
         for kind, names in _NOISE.items():
             path = getattr(self, kind)
@@ -259,7 +259,7 @@ class MosaicFile:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MosaicHeader:
-    """What the header of an image says."""
+    """Contents of the header of an image."""
 
     index: int  # Extension of the image.
     shape: tuple  # Rows and columns.
@@ -337,7 +337,7 @@ def _in_unit(hdu, kind, unit, path):
     text = str(hdu.header.get("BUNIT", "") or "").strip()
     power = _POWERS.get(kind)
     have, wanted = parsed_unit(text), parsed_unit(unit)
-    # many squares are said to be in the unit of the image itself
+    # headers of many variance maps state the unit of the image itself
     if None in (power, have, wanted) or have in (wanted, wanted**power):
         return values
     try:

@@ -17,7 +17,7 @@ from miricigale.utils.units import ANGLE
 #: their own, both below their template, and least number of sources for each term of the map.
 _BRIGHT, _ISOLATED, _SOURCES = 20.0, 0.2, 3
 
-#: Error (pixels) that no measured offset is believed to be below, distance from the map in errors beyond
+#: Least error (pixels) of a measured offset, distance from the map in errors beyond
 #: which a source does not count, and change of the map (pixels) at which it is done.
 _FLOOR, _CLIP, _DONE = 0.01, 4.0, 5e-3
 
@@ -88,7 +88,7 @@ class OffsetMap:
 
 def source_offsets(fit, residual, model, rows):
     """
-    Measure where sources are, relative to where their templates stand.
+    Measure the offsets of sources from their templates.
 
     Parameters
     ----------

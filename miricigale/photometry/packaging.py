@@ -19,6 +19,9 @@ from miricigale.photometry.results import ForcedPhotometryResult, crowded
 from miricigale.utils.meta import provenance
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS
 
+#: Names of the errors of a flux after ``flux_err``: their sum, and its terms.
+_TERMS = ("", "_noise", "_template", "_psf")
+
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class CatalogRows:
@@ -33,7 +36,7 @@ class CatalogRows:
     xy: np.ndarray  # (n, 2): Positions on the image; NaN far outside.
     near: np.ndarray  # (k,): The sources that have a template, in the order of the bank's sources.
     fitted: np.ndarray  # (k,): What is known of the shapes of these.
-    #: Fluxes that say who is crowded; None for those that are measured.
+    #: Fluxes by which crowded sources are found; None for those that are measured.
     reference: np.ndarray | None = None
     #: Which sources have two components; None where their fits decide.
     double: np.ndarray | None = None
@@ -84,10 +87,9 @@ def package(fit, diagnostics, new_xy, catalog, meta):
         id=np.array(catalog.id),
         sky=catalog.sky,
         flux=flux[:n] * FNU,
-        flux_err=flux_err[0, :n] * FNU,
-        flux_err_noise=flux_err[1, :n] * FNU,
-        flux_err_template=flux_err[2, :n] * FNU,
-        flux_err_psf=flux_err[3, :n] * FNU,
+        **{
+            f"flux_err{name}": error[:n] * FNU for name, error in zip(_TERMS, flux_err, strict=True)
+        },
         covariance=joint[:n, :n],
         flags=flags[:n],
         coverage=coverage[:n],
@@ -118,14 +120,9 @@ def package(fit, diagnostics, new_xy, catalog, meta):
         result = dataclasses.replace(result, flux_positive=positive[:n] * FNU)
     if not fit.settings.second_pass:
         return result
-    more = {
-        "flux": flux,
-        "flux_err": flux_err[0],
-        "flags": flags,
-        "coverage": coverage,
-        "chi2": chi2,
-    }
-    new = _new_sources(catalog, new_xy, fit.arrays.wcs, {k: v[n:] for k, v in more.items()})
+    names = ("flux", "flux_err", "flags", "coverage", "chi2")
+    columns = zip(names, (flux, flux_err[0], flags, coverage, chi2), strict=True)
+    new = _new_sources(catalog, new_xy, fit.arrays.wcs, {name: one[n:] for name, one in columns})
     return dataclasses.replace(result, new_sources=new)
 
 

@@ -16,7 +16,7 @@ from miricigale.utils.units import ab_magnitude
 
 #: Largest number of pixels across a drawing of a whole image, and rows of the table.
 _ACROSS, _ROWS = 1500, 40
-#: Signal-to-noise above which a poor fit tells of the PSF.
+#: Signal-to-noise above which a poor fit points to a wrong PSF.
 _BRIGHT = 20.0
 
 

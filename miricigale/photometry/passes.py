@@ -48,14 +48,14 @@ def fit_image(arrays, bank, settings, catalog, grid_wcs):
         # before templates may change, which hides some of the light of a point in their middle
         poor = _poor(fit, catalog, new_xy)
     if settings.second_pass:
-        # templates that may change take in some of the light of what is beside them
+        # templates that may change absorb some of the light of their neighbors
         new_xy = _new_positions(fit, catalog)
     if len(new_xy) or len(double):
         fit.bank.forget()
         new_xy = more.refined(double, new_xy)
         fit = more.fit(double, new_xy)
         if choose:
-            # what is poorly fitted also with what was lacking beside it
+            # sources that are poorly fitted also with the new sources next to them
             poor = _poor(fit, catalog, new_xy)
     if fit.free is None:
         fit.free_templates(catalog.fitted)
@@ -111,7 +111,7 @@ class _More:
         self._bank, self.catalog, self._grid_wcs = bank, catalog, grid_wcs
         self._arrays, self._settings, self._scale = first.arrays, first.settings, first.scale
         self._displacement, self._map = first.displacement, first.offset_map
-        # one that was not believed is not searched again
+        # a shift that was rejected is not searched again
         self._search = first.shift is not None
 
     def fit(self, double, new_xy, search=None):

@@ -60,7 +60,7 @@ def read_prior(highres, *, segmentation=None, catalog=None, path=None):
     -----
     `~miricigale.utils.exceptions.MiricigaleWarning`
         If segments belong to no source of the catalog: their light stays in the image; if most
-        sources have no segment, or some stand on another one than that of their id.
+        sources have no segment, or some are on another one than that of their id.
 
     Examples
     --------
@@ -198,8 +198,8 @@ def check_labels(labels, here, what):
     """
     Refuse labels that are those of another segmentation map, or warn of them.
 
-    ``labels`` are those that sources say they have, ``here`` those at their positions (0 for none),
-    ``what`` is the name for messages. Refused if more than half of the sources stand on another segment than
+    ``labels`` are those of the sources, ``here`` those at their positions (0 for none),
+    ``what`` is the name for messages. Refused if more than half of the sources are on another segment than
     theirs, warned of from three and a tenth on.
     """
     both = (labels > 0) & (here > 0)

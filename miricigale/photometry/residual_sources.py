@@ -21,7 +21,7 @@ class ResidualPeaks:
 
     xy: np.ndarray  # (n, 2): Their pixels.
     refined: np.ndarray  # (n, 2): Tops of the parabolas through each pixel and its neighbors.
-    flux: np.ndarray  # (n,): As point sources that stand alone, in the residual's unit.
+    flux: np.ndarray  # (n,): As isolated point sources, in the residual's unit.
     full_width: float  # Full width at half maximum of the PSF, in pixels.
 
 
@@ -221,7 +221,7 @@ def unexplained_neighbors(peaks, xy, flux):
 
 def new_sources(peaks, xy, flux):
     """
-    Tell which peaks are more than what an imperfect template leaves of a bright source.
+    Find peaks that are more than what an imperfect template leaves of a bright source.
 
     False for peaks with less than a tenth of the flux of a source within two full widths.
     """

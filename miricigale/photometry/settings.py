@@ -54,7 +54,7 @@ class MemorySettings:
     max_bytes : float, optional
         Memory for templates; beyond it they are made anew for each pass.
     scratch : path-like, optional
-        Folder with room for files of the size of the image, in which images are kept in place of
+        Folder, large enough for files of the size of the image, in which images are kept in place of
         memory. Model and residual of the result are then such files too, which are deleted with them.
 
     Raises

@@ -1,4 +1,4 @@
-"""The noise of an image on its source-free pixels, beside what a map says of it."""
+"""The noise of an image on its source-free pixels, compared with its noise map."""
 
 import warnings
 
@@ -17,7 +17,7 @@ _WIDTH, _SIGNIFICANT, _RIM = 2.0, 3.5, 3
 
 def weight_scale(data, weight, *, mask=None):
     """
-    Measure the factor between the noise of an image and what its weights say.
+    Measure the factor between the noise of an image and that of its weights.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def filled_areas(values, usable):
     """
     Areas of pixels that are exactly 0 for want of data, such as the corners of drizzled images.
 
-    ``usable`` are the pixels that count as data so far. Nowhere True if the pixels beside such areas have
+    ``usable`` are the pixels that count as data so far. Nowhere True if the pixels next to such areas have
     no noise either (their median is below a tenth of that of all others): then the image is a noiseless
     one, and 0 is its sky.
     """

@@ -1,4 +1,4 @@
-"""What sources look like on a high-resolution image: made once, used for every band."""
+"""Templates of sources from a high-resolution image: made once, used for every band."""
 
 import dataclasses
 from typing import ClassVar
@@ -28,7 +28,7 @@ from miricigale.utils.units import ANGLE
 @dataclasses.dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class SourceTemplates:
     """
-    The sources of a catalog and what each looks like, before it is brought to an image.
+    The sources of a catalog and the light of each, before it is brought to an image.
 
     It does not depend on the image that is measured: made once from a high-resolution image it
     serves every band (`ForcedPhotometer.measure`, `measure_bands`). Made by `from_images`,
@@ -58,7 +58,7 @@ class SourceTemplates:
     psf : `~numpy.ndarray`, shape (k, k), or None
         PSF of the high-resolution image, of unit sum.
     flux : `~numpy.ndarray`, shape (n,), or None
-        The catalog's fluxes, in whatever unit, which tell the crowded sources.
+        The catalog's fluxes, in any unit, by which crowded sources are found.
     components : int `~numpy.ndarray`, shape (n,), or None
         1, or 2 for sources that are fitted with a point on top of their template.
     meta : dict
@@ -134,7 +134,7 @@ class SourceTemplates:
             Segments of ``highres``.
         catalog : `~astropy.table.QTable`
             Column ``sky``, and if there are ``id`` (1, 2, ... otherwise), ``label`` (the
-            segment; by default that at the position), ``flux`` (which tells who is crowded; the
+            segment; by default that at the position), ``flux`` (by which crowded sources are found; the
             measured fluxes otherwise) and ``components`` (1, or 2 for a point on top of the template).
         psf : `~numpy.ndarray` or `~photutils.psf.ImagePSF`
             PSF of ``highres``: an array on its pixels, odd, square and centered, or one of the
@@ -190,7 +190,7 @@ class SourceTemplates:
     @classmethod
     def from_catalog(cls, catalog, *, template="psf", wcs=None):
         """
-        Take what a catalog says: points, or the Sersic profiles that it states.
+        Make templates from a catalog alone: points, or the Sersic profiles that it states.
 
         Parameters
         ----------
@@ -288,7 +288,7 @@ class SourceTemplates:
         Parameters
         ----------
         parts : sequence of `SourceTemplates`
-            On one grid, or without any; no id may be in two. Two sources may stand at one place,
+            On one grid, or without any; no id may be in two. Two sources may be at one position,
             such as a galaxy and a point in its middle.
 
         Returns
@@ -390,16 +390,11 @@ class SourceTemplates:
 
 
 def _segments(segmentation, shape):
-    segments = segmentation
-    if isinstance(segmentation, SegmentationImage):
-        segments = segmentation.data
-    segments = np.asarray(segments)
+    plain = not isinstance(segmentation, SegmentationImage)
+    segments = np.asarray(segmentation if plain else segmentation.data)
     if segments.shape != shape or segments.dtype.kind not in "iu":
-        raise argument_error(
-            "segmentation",
-            f"integers of the shape {shape} of 'highres'",
-            f"{segments.dtype} of shape {segments.shape}",
-        )
+        wanted, got = f"integers of the shape {shape} of 'highres'", segments.dtype
+        raise argument_error("segmentation", wanted, f"{got} of shape {segments.shape}")
     return segments
 
 

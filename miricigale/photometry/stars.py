@@ -1,4 +1,4 @@
-"""PSF photometry of stars with photutils, to stand beside forced photometry."""
+"""PSF photometry of stars with photutils, to compare with forced photometry."""
 
 import warnings
 
@@ -61,7 +61,7 @@ def psf_photometry(
 
     Notes
     -----
-    Each star is fitted as if it were alone: ``neighbor`` tells where it is not, and forced photometry
+    Each star is fitted as if it were alone: ``neighbor`` marks where it is not, and forced photometry
     is for those. Sources are not grouped on purpose: photutils 3.0 keeps the model of a group by the number
     of its sources, so that groups of a second band in one process may be fitted with the PSF of the first
     (mended in 3.1).

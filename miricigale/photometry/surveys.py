@@ -1,4 +1,4 @@
-"""Depths and errors of bands that surveys have beside MIRI's."""
+"""Depths and errors of surveys in other bands than MIRI's."""
 
 import math
 import types

@@ -17,7 +17,7 @@ from miricigale.utils.parallel import chunks
 from miricigale.utils.units import ANGLE
 
 #: Squared cosine between two components from which their sum alone is measured: errors of each are then
-#: ten times that of the sum, and a template that is a few percent wrong says all of the difference.
+#: ten times that of the sum, and the difference is that of a template that is a few percent wrong.
 _SEPARABLE = 0.99
 
 #: Least part of a template's light on usable pixels: sources with less are not measured.
@@ -38,7 +38,7 @@ class TemplateFit:
         How they are fitted.
     host : int `~numpy.ndarray`, shape (n,), optional
         For each source of the bank the one whose component it is: a second component has the
-        number of the source on which it stands, all others have their own.
+        number of that source, all others have their own.
     moved : `~numpy.ndarray`, shape (2,) or (n, 2), optional
         Pixels by which templates are moved; a shift that is fitted is searched from there.
     search : bool, optional
@@ -57,7 +57,7 @@ class TemplateFit:
         Rows that were fitted.
     degenerate, noisy, inseparable : bool `~numpy.ndarray`, shape (n,)
         Templates that equal another's; those whose power is mostly noise; second components that
-        cannot be told from the first.
+        cannot be distinguished from the first.
     pairs : int `~numpy.ndarray`, shape (k, 2)
         Rows of the two components of the sources that have two.
     power, light : `~numpy.ndarray`, shape (n,) and (n, 2)
@@ -165,7 +165,7 @@ class TemplateFit:
             self.flux[self.rows] = self.free.flux
 
     def _find_pairs(self, matrix, rows):
-        """Tell which second components can be fitted beside the first."""
+        """Find the second components that can be fitted together with the first."""
         order = self.bank.order
         row = np.argsort(order)
         second = np.flatnonzero(self.host[order] != order)
@@ -184,7 +184,7 @@ class TemplateFit:
         for _ in range(8):
             dy, dx = np.gradient(self.model())
             self._solve(plain.shifted(shift), [-dx, -dy])
-            # the columns are steps from where the templates stand now
+            # the columns are steps from the present positions of the templates
             step = self.fit.common[-2:]
             found = shift + step
             if np.hypot(*found) > limit:
@@ -201,7 +201,7 @@ class TemplateFit:
         self.shift = found * self.scale
 
     def displacement(self, xy):
-        """Where templates stand less where the catalog has them, (x, y) in pixels, at positions."""
+        """Positions of templates less those of the catalog, (x, y) in pixels."""
         if self.offset_map is not None:
             return self.offset_map.field(*xy.T) / self.scale
         shift = np.zeros(2) if self.shift is None else self.shift / self.scale

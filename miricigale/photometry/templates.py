@@ -1,4 +1,4 @@
-"""Templates: what each source of the high-resolution image looks like on another image."""
+"""Templates: the light of each source of the high-resolution image, as seen on another image."""
 
 import dataclasses
 import functools
@@ -182,14 +182,14 @@ class BankSources:
 
 class TemplateBank:
     """
-    All templates of an image, made block by block and kept only if there is room.
+    All templates of an image, made block by block and kept only if memory allows.
 
     Rows are in the order of the stamps' first image rows, ``order`` gives the source of each.
 
     Parameters
     ----------
     fine, sources : `FineTemplates`, `BankSources`
-        What convolves, and what stands where.
+        The convolution, and the sources.
     shape : (int, int)
         Shape of the image.
     max_bytes : float, optional

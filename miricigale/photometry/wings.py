@@ -4,7 +4,7 @@ import numpy as np
 import scipy.optimize
 
 #: Ratio of the radii of neighboring nodes, and how much the scale may change between two nodes
-#: (standard deviation) where the image does not tell.
+#: (standard deviation) where the image does not constrain it.
 _RATIO, _CHANGE = 1.35, 0.3
 
 
@@ -34,7 +34,7 @@ def adjust_wings(stamp, radius, core, *, convolve, data, weight):
     Notes
     -----
     The scale is linear in ln(radius) between nodes and found by least squares, with a random walk as
-    prior: it starts from 1 in the core and goes on as it was where the noise hides the light.
+    prior: it starts from 1 in the core and stays constant where the noise hides the light.
     """
     last = radius.max()
     n_nodes = max(int(np.ceil(np.log(max(last / core, 1.0)) / np.log(_RATIO))), 1)

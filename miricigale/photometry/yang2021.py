@@ -24,7 +24,7 @@ class Yang2021Photometer:
     Parameters
     ----------
     source, target : `~photutils.psf.ImagePSF`
-        PSF of the high-resolution image, and of the mosaic that is measured. Both must say what
+        PSF of the high-resolution image, and of the mosaic that is measured. Both must state what
         fraction of all light they hold (as those of the package do), and be in the frame of the sky
         (`~miricigale.psf.rotate_psf`).
     scaling : float, optional

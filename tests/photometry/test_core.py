@@ -3,7 +3,6 @@ import pytest
 import scipy.fft
 import scipy.sparse
 from numpy.testing import assert_allclose
-from scipy.ndimage import convolve
 from scipy.special import erf
 
 from miricigale.photometry._core.noise import autocorrelation
@@ -14,34 +13,6 @@ from miricigale.photometry._core.sampling import (
     spline_response,
 )
 from miricigale.photometry._core.solve import block_covariance, factorize
-from miricigale.photometry._core.stamps import (
-    add_model,
-    convolve_stamps,
-    cross_pairs,
-    find_pairs,
-    pair_products,
-    projections,
-)
-
-
-@pytest.fixture
-def stamps():
-    """Random stamps in random boxes on an image of 60 x 70."""
-    rng = np.random.default_rng(1)
-    size = rng.integers(3, 12, (25, 2))
-    corner = (rng.random((25, 2)) * (np.array([60, 70]) - size)).astype(int)
-    corner = corner[np.argsort(corner[:, 0])]
-    size = np.minimum(size, np.array([60, 70]) - corner)
-    box = np.concatenate([corner, size], axis=1)
-    start = np.concatenate([[0], np.cumsum(box[:, 2] * box[:, 3])])
-    return box, start, rng.normal(size=start[-1]).astype(np.float32)
-
-
-def dense(box, start, values, shape=(60, 70)):
-    out = np.zeros((len(box), *shape))
-    for k, (y, x, h, w) in enumerate(box):
-        out[k, y : y + h, x : x + w] = values[start[k] : start[k + 1]].reshape(h, w)
-    return out
 
 
 def sample(image, x, y, transfer=1.0):
@@ -96,79 +67,6 @@ def test_jacobian_keeps_the_sum():
         coefficients, np.zeros(1, int), np.ones(1), np.array([[20.2, 19.7]]), poly, box, start, out
     )
     assert_allclose(out.sum(), image.sum(), rtol=1e-4)
-
-
-def test_pairs_are_all_that_overlap(stamps):
-    box, _, _ = stamps
-    for grow in (0, 3):
-        found = {tuple(p) for p in find_pairs(box, grow)}
-        expected = set()
-        for i in range(len(box)):
-            for j in range(i + 1, len(box)):
-                apart = [
-                    box[j, a] >= box[i, a] + box[i, a + 2] + grow
-                    or box[i, a] - grow >= box[j, a] + box[j, a + 2]
-                    for a in (0, 1)
-                ]
-                if not any(apart):
-                    expected.add((i, j))
-        assert found == expected
-
-
-def test_pairs_of_two_sets_are_all_that_overlap(stamps):
-    box, _, _ = stamps
-    other = np.concatenate([box[::2] + np.array([-3, 2, 4, 1]), [[20, 20, 0, 4], [5, 5, 40, 3]]])
-    other = other[np.argsort(other[:, 0], kind="stable")]
-    found = [tuple(p) for p in cross_pairs(box, other)]
-    expected = set()
-    for i, (y0, x0, ny, nx) in enumerate(box):
-        for j, (v0, u0, nv, nu) in enumerate(other):
-            rows = set(range(y0, y0 + ny)) & set(range(v0, v0 + nv))
-            columns = set(range(x0, x0 + nx)) & set(range(u0, u0 + nu))
-            if rows and columns:
-                expected.add((i, j))
-    assert len(found) == len(expected) > 10
-    assert set(found) == expected
-    assert len(cross_pairs(box[:0], other)) == 0
-
-
-def test_products_projections_and_models_are_those_of_dense_images(stamps):
-    box, start, values = stamps
-    images = dense(box, start, values)
-    pairs = find_pairs(box)
-    out = np.empty(len(pairs))
-    pair_products(values, box, start, values, box, start, pairs, out)
-    gram = np.einsum("iyx,jyx->ij", images, images)
-    assert_allclose(out, gram[pairs[:, 0], pairs[:, 1]], rtol=1e-6, atol=1e-6)
-    sky = np.random.default_rng(3).normal(size=(60, 70))
-    one = np.empty(len(box))
-    projections(values, box, start, sky, one)
-    assert_allclose(one, np.einsum("iyx,yx->i", images, sky), atol=1e-10)
-    model = np.zeros((60, 70))
-    add_model(model, values, box, start, one)
-    assert_allclose(model, np.einsum("i,iyx->yx", one, images), atol=1e-10)
-
-
-def test_stamps_convolved_with_a_small_kernel(stamps):
-    box, start, values = stamps
-    kernel = np.random.default_rng(0).normal(size=(5, 5))
-    kernel = kernel + kernel[::-1, ::-1]
-    grown = box + np.array([-2, -2, 4, 4])
-    grown_start = np.concatenate([[0], np.cumsum(grown[:, 2] * grown[:, 3])])
-    out = np.full(grown_start[-1], np.nan, np.float32)
-    shape = (16, 18)
-    transfer = scipy.fft.rfft2(kernel, s=shape)
-    rows = [k for k in range(len(box)) if k != 7]
-    convolve_stamps(values, box, start, rows, transfer, shape, grown, grown_start, out)
-    # those that were not asked for are not touched
-    assert np.isnan(out).sum() == np.prod(grown[7, 2:])
-    for k, (_, _, h, w) in enumerate(box):
-        if k == 7:
-            continue
-        stamp = np.pad(values[start[k] : start[k + 1]].reshape(h, w), 2)
-        expected = convolve(stamp.astype(float), kernel, mode="constant")
-        got = out[grown_start[k] : grown_start[k + 1]].reshape(h + 4, w + 4)
-        assert_allclose(got, expected, atol=1e-5)
 
 
 def crowded_matrix(n=900, size=300, seed=0):

@@ -125,19 +125,6 @@ def test_terms_are_those_of_a_polynomial():
     assert_allclose(field(2, 4), [one[4, 2] for one in terms], rtol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        ({"offset_order": 1}, "'max_shift' must be given with 'offset_order'"),
-        ({"offset_order": 4, "max_shift": 1 * u.arcsec}, "'offset_order' must be an integer"),
-        ({"background_order": True}, "must be an integer from 0 to 4"),
-    ],
-)
-def test_bad_orders_are_refused(tools, options, text):
-    with pytest.raises(ValueError, match=text):
-        ForcedPhotometer(tools.kernel, **options)
-
-
 def test_real_images_are_aligned(data_file):
     """F770W of PRIMER-UDS against F444W: within a tenth of a native pixel (0.11 arcsec)."""
     from astropy.io import fits

@@ -5,21 +5,16 @@ import types
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
 from miricigale.instrument import north_up_wcs
 from miricigale.photometry import ErrorSettings, ForcedFlags, ForcedPhotometer, detect_sources
+from miricigale.photometry.catalogs import joined_sky
 
 
 def flagged(flags, flag):
     return (np.asarray(flags) & int(flag)) != 0
-
-
-def joined(*coords):
-    ra, dec = (np.concatenate([getattr(one, name).deg for one in coords]) for name in ("ra", "dec"))
-    return SkyCoord(ra, dec, unit="deg")
 
 
 def grid(rng, n, spacing, jitter):
@@ -42,7 +37,9 @@ def crowd(tools):
         np.append(east[:50] + distance * np.cos(angle), [-18.0, 2.0]) * u.arcsec,
         np.append(north[:50] + distance * np.sin(angle), [2.0, 18.0]) * u.arcsec,
     )
-    data = tools.render(joined(sky, hidden), np.append(flux, hidden_flux), tools.LO, wcs, shape)
+    data = tools.render(
+        joined_sky([sky, hidden]), np.append(flux, hidden_flux), tools.LO, wcs, shape
+    )
     image = tools.as_ccd(data + rng.normal(0, sigma, shape), wcs, sigma)
     return types.SimpleNamespace(
         sky=sky, flux=flux, hidden=hidden, hidden_flux=hidden_flux, image=image, wcs=wcs
@@ -87,7 +84,7 @@ def test_second_pass_finds_what_the_catalogue_lacks(tools, crowd, moved):
     assert not flagged(result.flags, ForcedFlags.UNEXPLAINED_NEIGHBOR).any()
     # the errors are those of a catalogue that has them all
     full = ForcedPhotometer(tools.kernel, template="psf").measure(
-        crowd.image, catalog=QTable({"sky": joined(crowd.sky, crowd.hidden)})
+        crowd.image, catalog=QTable({"sky": joined_sky([crowd.sky, crowd.hidden])})
     )
     assert_allclose(result.flux_err.value, full.flux_err.value[:81], rtol=0.05)
 
@@ -227,8 +224,3 @@ def test_covariance_of_two_components_is_that_of_least_squares(tools):
     assert_allclose(result.flux_err.value**2, expected.sum(), rtol=0.01)
     joint = result.joint_covariance.toarray()
     assert_allclose(joint[0, 1], expected[0, 1] + expected[1, 1], rtol=0.01)
-
-
-def test_bad_number_of_components_is_refused(tools):
-    with pytest.raises(ValueError, match="'components' must be 1 or 2"):
-        ForcedPhotometer(tools.kernel, components=3)

@@ -26,17 +26,21 @@ def _sweep(box, grow, pairs):
     return count
 
 
+def _listed(search, *boxes):
+    """The pairs that a search finds, after counting them."""
+    pairs = np.empty((search(*boxes, np.empty((0, 2), np.int32)), 2), np.int32)
+    if len(pairs):
+        search(*boxes, pairs)
+    return pairs
+
+
 def find_pairs(box, grow=0):
     """
     List the pairs i < j, (n_pairs, 2), of boxes that overlap after one of them is grown by some pixels.
 
     Boxes, (n, 4), are (y0, x0, ny, nx), sorted by y0.
     """
-    n = _sweep(box, grow, np.empty((0, 2), np.int32))
-    pairs = np.empty((n, 2), np.int32)
-    if n:
-        _sweep(box, grow, pairs)
-    return pairs
+    return _listed(_sweep, box, grow)
 
 
 @njit(cache=True, nogil=True)
@@ -74,11 +78,7 @@ def cross_pairs(box, other):
     Boxes, (n, 4) and (m, 4), are (y0, x0, ny, nx), each set sorted by y0.
     """
     tallest = box[:, 2].max(initial=0)
-    n = _cross(box, other, tallest, np.empty((0, 2), np.int32))
-    pairs = np.empty((n, 2), np.int32)
-    if n:
-        _cross(box, other, tallest, pairs)
-    return pairs
+    return _listed(_cross, box, other, tallest)
 
 
 # products of float32 add up in float64 without rounding, in whatever order
