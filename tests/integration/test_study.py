@@ -104,7 +104,7 @@ def test_a_killed_and_a_stopped_run_go_on(study):
     for stop, number in (("interrupted", signal.SIGINT), ("terminated", signal.SIGTERM)):
         status, message = study[stop]
         assert status == 128 + number
-        assert "goes on from here" in message
+        assert "the same command resumes here" in message
     assert not study["locked"]
     assert study["done"].returncode == 0, study["done"].stderr
     assert study["done"].stdout.strip().endswith("report/index.html")
