@@ -20,14 +20,7 @@ from miricigale.utils.units import ANGLE, FNU, positive
 _NO_OVERLAP = next(f.bit_value for f in PSF_FLAGS.FLAG_DEFINITIONS if f.name == "no_overlap")
 
 
-def psf_photometry(
-    image,
-    psf,
-    catalog,
-    *,
-    pa=None,
-    max_shift=0.1 * u.arcsec,
-):
+def psf_photometry(image, psf, catalog, *, pa=None, max_shift=0.1 * u.arcsec):
     """
     Fit a PSF to stars one by one (`photutils.psf.PSFPhotometry`), on squares of four times its FWHM.
 
@@ -75,11 +68,7 @@ def psf_photometry(
     n, ids, sky = len(known.id), known.id, catalog["sky"]
     scale = pixel_scale(image.wcs)
     model = psf_mosaic(
-        psf,
-        scale * ANGLE,
-        pa,
-        grid_angle=grid_angle(image.wcs, arrays.flux.shape),
-        resampling=None,
+        psf, scale * ANGLE, pa, grid_angle=grid_angle(image.wcs, arrays.flux.shape), resampling=None
     )
     width = model.fwhm
     side = positive(4 * width, ANGLE, "psf") / scale
