@@ -168,16 +168,17 @@ def add_photometry(commands):
             metavar="PIXELS",
             help=f"subtract a background measured in such boxes of the {what}",
         )
-    what = "fit no constant with the sources"
-    none = {"dest": "background_order", "action": "store_const", "const": None, "default": 0}
-    add("--no-background", **none, help=what)
     add(
         "--max-shift",
         type=quantity_in("arcsec"),
         metavar="ARCSEC",
         help="fit a shift of the image up to this",
     )
-    add("--background-order", type=int, default=0, help="order of the background, 0 for a constant")
+    background = phot.add_mutually_exclusive_group().add_argument
+    what = "order of the background, 0 for a constant"
+    background("--background-order", type=int, default=0, help=what)
+    none = {"dest": "background_order", "action": "store_const", "const": None}
+    background("--no-background", **none, help="fit no constant with the sources")
     add("--offset-order", type=int, help="order of a map of offsets in place of one shift")
     what = "fit what the prior lacks too; last rows of the table"
     add("--second-pass", action="store_true", help=what)
