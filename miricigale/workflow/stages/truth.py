@@ -25,6 +25,16 @@ MODELS = ("sed.alpha", "sed.alpha_draw", "sed.infrared")
 GALAXY_PARAMETERS = ("tau", "age", "ebv", "alpha", "metallicity")
 #: Inclinations (deg) of AGN seen through the torus, after Yang et al. 2021, and of the others.
 EDGE_ON, FACE_ON = (60.0, 70.0, 80.0, 90.0), (0.0, 10.0, 20.0, 30.0, 40.0)
+#: Parameters of the injected tori, in the order of their draws: values (a list) or a uniform range (a tuple).
+TORUS = {
+    "tau97": [3.0, 5.0, 7.0, 9.0, 11.0],
+    "p": [0.0, 0.5, 1.0, 1.5],
+    "q": [0.0, 0.5, 1.0, 1.5],
+    "inclination": list(EDGE_ON),
+    "ebv_polar": (0, 0.3),
+    "temperature_polar": (100, 300),
+    "emissivity_polar": (1, 2),
+}
 
 
 def galaxy_parameters(config, catalog, best, *, seed):
@@ -75,23 +85,14 @@ def add_agn(table, frac_agn, seed):
     source has its own random stream. See table 3
     of Yang et al. 2021, ApJ 908, 144.
     """
-    drawn = [_torus(stream(seed, "truth", str(key))) for key in table["id"]]
     table["frac_agn"] = np.broadcast_to(np.asarray(frac_agn, float), len(table)).copy()
-    for name in drawn[0]:
-        table[name] = np.array([torus[name] for torus in drawn])
+    streams = [stream(seed, "truth", str(key)) for key in table["id"]]
+    for name, values in TORUS.items():
+        table[name] = np.array([_draw(one, values) for one in streams], dtype=float)
 
 
-def _torus(rng):
-    """Parameters of a torus."""
-    return {
-        "tau97": rng.choice([3.0, 5.0, 7.0, 9.0, 11.0]),
-        "p": rng.choice([0.0, 0.5, 1.0, 1.5]),
-        "q": rng.choice([0.0, 0.5, 1.0, 1.5]),
-        "inclination": rng.choice(EDGE_ON),
-        "ebv_polar": rng.uniform(0, 0.3),
-        "temperature_polar": rng.uniform(100, 300),
-        "emissivity_polar": rng.uniform(1, 2),
-    }
+def _draw(rng, values):
+    return rng.uniform(*values) if isinstance(values, tuple) else rng.choice(values)
 
 
 def catalog_fractions(catalog):
