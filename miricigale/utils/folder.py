@@ -229,7 +229,7 @@ class RecordFolder(FileFolder):
             )
             raise DataError(msg)
         # what was killed at its first moment leaves these
-        ours = (self.lock_name, PARTIAL)
+        ours = (self.lock_name, f".{self.lock_name}", PARTIAL)
         if self.folder.exists() and (
             not self.folder.is_dir()
             or any(not entry.name.startswith(ours) for entry in self.folder.iterdir())

@@ -6,16 +6,14 @@ import signal
 import subprocess
 import sys
 import textwrap
-import time
 
 import pytest
 
-from miricigale.utils import lock
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.lock import FolderLock
 
 HOLD = """
-    import sys, time
+    import sys
     from miricigale.utils.lock import FolderLock
     with FolderLock(sys.argv[1]):
         print("held", flush=True)
@@ -41,6 +39,10 @@ def holder(tmp_path):
     process.communicate()
 
 
+def names(folder):
+    return sorted(entry.name for entry in folder.iterdir())
+
+
 def content(folder):
     return json.loads((folder / "run.lock").read_text())
 
@@ -55,14 +57,14 @@ def leave(folder, **changes):
 
 def test_a_lock_is_there_while_it_is_held_and_alone(tmp_path):
     with FolderLock(tmp_path, name="fit.lock", purpose="fit") as held:
-        assert [item.name for item in tmp_path.iterdir()] == ["fit.lock"]
+        assert names(tmp_path) == [".fit.lock", "fit.lock"]
         assert json.loads(held.path.read_text())["pid"] == os.getpid()
         again = FolderLock(tmp_path, name="fit.lock", purpose="fit")
         for other in (held, again):
             with pytest.raises(DataError, match=f"in use by a fit: process {os.getpid()} on"):
                 other.__enter__()
         assert held.path.is_file()
-    assert list(tmp_path.iterdir()) == []
+    assert names(tmp_path) == [".fit.lock"]
 
 
 def test_another_process_keeps_out_until_it_ends(tmp_path, holder):
@@ -85,7 +87,7 @@ def test_a_killed_process_leaves_a_lock_that_is_taken_over(tmp_path, holder):
     assert content(tmp_path)["pid"] == holder.pid
     with FolderLock(tmp_path):
         assert content(tmp_path)["pid"] == os.getpid()
-    assert list(tmp_path.iterdir()) == []
+    assert names(tmp_path) == [".run.lock"]
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
@@ -134,63 +136,21 @@ def test_a_forked_child_does_not_free_the_lock_of_its_parent(tmp_path):
     finally:
         process.communicate("")
     assert process.returncode == 0
-    assert list(tmp_path.iterdir()) == []
+    assert names(tmp_path) == [".run.lock"]
 
 
-def test_a_number_that_the_system_gave_away_again_is_not_the_owner(tmp_path):
-    leave(tmp_path, start="12345")
-    with FolderLock(tmp_path):
-        assert content(tmp_path)["start"] != "12345"
-
-
-def test_a_process_of_before_the_last_boot_is_gone(tmp_path):
-    with FolderLock(tmp_path):
-        if not content(tmp_path)["boot"]:
-            pytest.skip("the system tells no boot")
-    leave(tmp_path, boot="another")
-    with FolderLock(tmp_path):
-        assert content(tmp_path)["boot"] != "another"
-
-
-@pytest.mark.parametrize("changes", [{"host": "node7"}, {"machine": "another", "boot": "b"}])
+@pytest.mark.parametrize("changes", [{"host": "node7"}, {"machine": "another"}])
 def test_a_lock_of_another_host_is_never_taken_for_dead(tmp_path, changes):
-    text = leave(tmp_path, pid=2**22 + 1, start="1", **changes)
+    text = leave(tmp_path, pid=2**22 + 1, **changes)
     wanted = r"on another host: process 4194305 on .*if it is gone, remove .*run\.lock"
     with pytest.raises(DataError, match=wanted), FolderLock(tmp_path):
         pass
     assert (tmp_path / "run.lock").read_text() == text
 
 
-def test_the_kernel_knows_of_owners_whose_number_is_not_seen(tmp_path, holder, monkeypatch):
-    # as in another container with this host name: its processes have numbers of their own
-    monkeypatch.setattr(lock, "_process_start", lambda pid: None)
-    monkeypatch.setattr(lock, "_PATIENCE", 0.1)
-    with pytest.raises(DataError, match=f"process {holder.pid} on"), FolderLock(tmp_path):
-        pass
-    assert content(tmp_path)["pid"] == holder.pid
-
-
-def test_locks_of_an_earlier_form_hold_a_number_only(tmp_path, holder):
-    path = tmp_path / "run.lock"
-    path.write_text(str(holder.pid))
-    with pytest.raises(DataError, match=f"process {holder.pid} "), FolderLock(tmp_path):
-        pass
-    for gone in (str(2**22 + 1), f"{os.getpid()}\n"):
-        path.unlink(missing_ok=True)
-        path.write_text(gone)
-        with FolderLock(tmp_path):
-            assert content(tmp_path)["pid"] == os.getpid()
-
-
-@pytest.mark.parametrize("text", ["", "{", "[1]", '{"pid": "x"}', "\x00\xff", "[" * 60000])
-def test_what_cannot_be_read_is_taken_over_once_it_is_old(tmp_path, monkeypatch, text):
-    monkeypatch.setattr(lock, "_PATIENCE", 0.1)
-    path = tmp_path / "run.lock"
-    path.write_text(text)
-    with pytest.raises(DataError, match=r"unknown.*remove .*run\.lock"), FolderLock(tmp_path):
-        pass
-    old = time.time() - 60
-    os.utime(path, (old, old))
+@pytest.mark.parametrize("text", ["", "{", "[1]", '{"pid": "x"}', "\x00\xff", "[" * 60000, "17"])
+def test_what_cannot_be_read_is_taken_over(tmp_path, text):
+    (tmp_path / "run.lock").write_text(text)
     with FolderLock(tmp_path):
         assert content(tmp_path)["pid"] == os.getpid()
 
@@ -209,43 +169,21 @@ def test_what_is_no_file_is_refused_at_once(tmp_path, make):
     make(tmp_path / "run.lock")
     with pytest.raises(DataError, match=r"run\.lock is no plain file"), FolderLock(tmp_path):
         pass
-    assert [entry.name for entry in tmp_path.iterdir()] == ["run.lock"]
+    assert names(tmp_path) == ["run.lock"]
 
 
-def test_a_lock_made_anew_by_hand_is_left_to_its_owner(tmp_path):
+def test_a_removed_file_does_not_free_the_lock(tmp_path):
     with FolderLock(tmp_path) as first:
         first.path.unlink()
-        with FolderLock(tmp_path) as second:
-            first.__exit__(None, None, None)
-            assert second.path.is_file()
-    assert not second.path.exists()
-
-
-def test_file_systems_without_hard_links(tmp_path, monkeypatch):
-    def link(*args):
-        raise OSError(lock.errno.EPERM, "no links here")
-
-    monkeypatch.setattr(os, "link", link)
-    with FolderLock(tmp_path):
-        assert content(tmp_path)["pid"] == os.getpid()
         with pytest.raises(DataError, match="in use"), FolderLock(tmp_path):
             pass
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_file_systems_without_flock_leave_old_locks_to_the_user(tmp_path, monkeypatch):
-    monkeypatch.setattr(lock, "_flock", lambda handle: None)
-    with FolderLock(tmp_path), pytest.raises(DataError, match="in use"), FolderLock(tmp_path):
-        pass
-    leave(tmp_path, start="12345")
-    with pytest.raises(DataError, match=r"has no flock .* remove"), FolderLock(tmp_path):
-        pass
+    assert names(tmp_path) == [".run.lock"]
 
 
 def test_a_full_disk_leaves_no_lock(tmp_path, full_disk):
     with pytest.raises(OSError, match=r"run\.lock"), full_disk(10), FolderLock(tmp_path):
         pass
-    assert list(tmp_path.iterdir()) == []
+    assert names(tmp_path) == [".run.lock"]
 
 
 def test_of_many_that_find_an_old_lock_one_wins(tmp_path):
@@ -268,11 +206,7 @@ def test_of_many_that_find_an_old_lock_one_wins(tmp_path):
             n += 1
             os.unlink(inside)
             # as if killed: the file stays and names a process that is gone
-            text = lock.path.read_text().replace(f'"pid": {os.getpid()}', '"pid": 4194305')
-            with open(lock.path, "r+") as stream:
-                stream.write(text)
-                stream.truncate()
-            lock._close()
+            lock._lock.release()
     """
     leave(tmp_path, pid=2**22 + 1)
     processes = [start(code, tmp_path) for _ in range(5)]
