@@ -12,7 +12,7 @@ import pytest
 def pytest_configure(config):
     # figures belong to no window
     os.environ.setdefault("MPLBACKEND", "agg")
-    from miricigale.refdata import conf
+    from miricigale import conf
 
     config.own_folder = Path(tempfile.mkdtemp(prefix="miricigale-tests-"))
     conf.data_folder = str(config.own_folder / "data")

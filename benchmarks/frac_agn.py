@@ -31,6 +31,7 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable, vstack
 
+from miricigale import conf
 from miricigale.depth import proposal_limit, scaled_limit
 from miricigale.evaluation import (
     classify,
@@ -41,7 +42,6 @@ from miricigale.evaluation import (
 from miricigale.fitting import BayesFitter, GridSettings
 from miricigale.instrument import CEERS_FILTERS, ceers_exposures
 from miricigale.photometry import YANG2021_DEPTHS, ErrorModel
-from miricigale.refdata import conf
 from miricigale.refdata.libraries import add_library
 from miricigale.scene import read_catalog
 from miricigale.sed import SEDModel

@@ -17,8 +17,8 @@ import time
 import numpy as np
 from astropy.table import QTable
 
+from miricigale import conf
 from miricigale.filters import FilterSet
-from miricigale.refdata import conf
 from miricigale.sed import SEDModel, components, yang2021_axes
 
 BANDS = [

@@ -24,9 +24,9 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
+from miricigale import conf
 from miricigale.cigale import read_cigale_results, read_pcigale_ini
 from miricigale.cigale.names import cigale_names
-from miricigale.refdata import conf
 from miricigale.refdata.libraries import add_library
 from miricigale.utils.exceptions import MiricigaleWarning
 

@@ -13,6 +13,7 @@ from .scene import Scene as Scene
 from .sed import SED as SED
 from .sed import ModelGrid as ModelGrid
 from .sed import SEDModel as SEDModel
+from .utils.configuration import conf as conf
 
 __citation__: str
 __version__: str

@@ -1,7 +1,6 @@
 from .check import ResourceState as ResourceState
 from .check import check_resources as check_resources
 from .locate import cache_folder as cache_folder
-from .locate import conf as conf
 from .locate import find_resource as find_resource
 from .locate import locate as locate
 from .registry import Registry as Registry

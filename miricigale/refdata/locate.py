@@ -9,29 +9,12 @@ from importlib import resources as importlib_resources
 from pathlib import Path
 
 from astropy import config as _config
-from astropy.config import ConfigItem, ConfigNamespace
 
 from miricigale.refdata.registry import resource
+from miricigale.utils.configuration import conf
 from miricigale.utils.content import file_sha256
 from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error
 from miricigale.utils.files import cached_by_file
-
-
-class Conf(ConfigNamespace):
-    """Settings of the package, kept in astropy's configuration folder."""
-
-    data_folder = ConfigItem(
-        "", "Folder for reference data that the user brings; empty: astropy's cache folder."
-    )
-    cache_folder = ConfigItem(
-        "", "Folder for what can be made again; empty: astropy's cache folder."
-    )
-    grid_cache_size = ConfigItem(
-        1000, "Size in MB to which the cache of model grids may grow; 0: none.", "integer(min=0)"
-    )
-
-
-conf = Conf()
 
 
 def _folder(configured, default):

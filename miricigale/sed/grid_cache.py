@@ -8,9 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from miricigale.filters import filter as filter_curves
-from miricigale.refdata.locate import cache_folder, conf, fingerprint_of
+from miricigale.refdata.locate import cache_folder, fingerprint_of
 from miricigale.sed import chain
 from miricigale.sed.grid import ModelGrid
+from miricigale.utils.configuration import conf
 from miricigale.utils.content import content_sha256
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.store import PARTIAL
@@ -66,7 +67,7 @@ def cached_grid(model, axes, filters, make):
     A grid from the cache folder, or one of ``make(model, axes, filters)`` that is then kept there.
 
     The least recently used grids go when all together are larger than
-    ``miricigale.refdata.conf.grid_cache_size`` (MB; 0: nothing is kept). A cache that cannot be
+    ``miricigale.conf.grid_cache_size`` (MB; 0: nothing is kept). A cache that cannot be
     read or written is logged and done without: the grid is the same. Models with components from
     outside this package are not cached, since their code may change under the same name.
     """

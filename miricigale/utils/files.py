@@ -9,10 +9,10 @@ import warnings
 import zipfile
 from pathlib import Path
 
-from astropy.config import ConfigItem, ConfigNamespace
 from astropy.io import fits
 from astropy.table import QTable
 
+from miricigale.utils.configuration import conf
 from miricigale.utils.exceptions import DataError
 
 # how packed files begin, and the module of Python's that opens them
@@ -22,19 +22,6 @@ _COMPRESS = b"\x1f\x9d"
 _CHUNK = 1 << 20
 # a file may unpack to so many times its size, however large it is
 _EXPANSION = 8
-
-
-class Conf(ConfigNamespace):
-    """Settings of the package for files, kept in astropy's configuration folder."""
-
-    unpacked_size = ConfigItem(
-        4000,
-        "Size in MB to which a packed file may unpack, or eight times its size if that is more.",
-        "integer(min=1)",
-    )
-
-
-conf = Conf()
 
 
 def cached_by_file(maxsize):
@@ -176,7 +163,7 @@ def check_unpacked(path, n_bytes):
     """
     Refuse to unpack a file to more than the bound.
 
-    The bound is ``miricigale.utils.files.conf.unpacked_size`` (MB, 4000 by default), or eight
+    The bound is ``miricigale.conf.unpacked_size`` (MB, 4000 by default), or eight
     times the size of the file if that is more.
 
     Parameters
@@ -197,7 +184,7 @@ def check_unpacked(path, n_bytes):
             f"{path} ({packed / 1e6:.3g} MB on the disk) would unpack to "
             f"{'more than ' if n_bytes == bound + 1 else ''}{n_bytes / 1e9:.3g} GB, and the bound "
             f"is {bound / 1e9:.3g} GB; if it is to be trusted, raise "
-            "miricigale.utils.files.conf.unpacked_size (in MB)"
+            "miricigale.conf.unpacked_size (in MB)"
         )
         raise DataError(msg)
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
+from miricigale import conf
 from miricigale.cigale import best_model_table, read_cigale_results, read_pcigale_ini
 from miricigale.cigale.names import cigale_names
-from miricigale.refdata import conf
 from miricigale.refdata.libraries import add_library
 from miricigale.sed import SEDModel
 from miricigale.sed import components as parts

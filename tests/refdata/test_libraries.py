@@ -17,11 +17,10 @@ import pytest
 from astropy.io import fits
 from numpy.testing import assert_allclose, assert_array_equal
 
-from miricigale import refdata
+from miricigale import conf, refdata
 from miricigale.refdata import (
     Resource,
     check_resources,
-    conf,
     find_resource,
     locate,
     registry,
@@ -489,7 +488,8 @@ def test_a_process_that_dies_between_file_and_record_leaves_a_library_that_works
 ADD = """
 import sys
 import numpy as np
-from miricigale.refdata import Resource, conf, registry
+from miricigale import conf
+from miricigale.refdata import Resource, registry
 from miricigale.refdata.libraries import READERS, LibraryTable, add_library
 
 value, folder = float(sys.argv[1]), sys.argv[2]

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
+from miricigale import conf
 from miricigale.refdata import (
     Resource,
     add_resource,
     cache_folder,
     check_resources,
-    conf,
     find_resource,
     locate,
     registry,

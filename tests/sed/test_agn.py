@@ -11,12 +11,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import quad
 
 from helpers.components import values_of
+from miricigale import conf
 from miricigale.refdata.libraries import open_library, write_library
 from miricigale.refdata.libraries.skirtor import read_skirtor
 from miricigale.sed import _core
 from miricigale.sed.components import ParametricTorus, Skirtor2016, TorusSpectra
 from miricigale.utils.exceptions import DataError
-from miricigale.utils.files import conf
 
 LAWS = ("smc", "calzetti", "gaskell")
 

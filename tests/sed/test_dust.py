@@ -260,7 +260,7 @@ def test_other_places_are_refused_by_name(dale_folder, tmp_path):
 
 
 def test_unregistered_templates_are_named_with_the_command(monkeypatch, tmp_path):
-    from miricigale.refdata import conf
+    from miricigale import conf
 
     monkeypatch.delenv("MIRICIGALE_DATA", raising=False)
     wanted = r"miricigale data add dust\.dale2014 PATH"

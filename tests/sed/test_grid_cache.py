@@ -14,9 +14,10 @@ import pytest
 from astropy.cosmology import Planck18
 from numpy.testing import assert_allclose, assert_array_equal
 
+from miricigale import conf
 from miricigale.filters import Filter, FilterSet
 from miricigale.filters import filter as filter_curves
-from miricigale.refdata import conf, resource
+from miricigale.refdata import resource
 from miricigale.sed import COMPONENTS, Component, SEDModel, chain, gridding
 from miricigale.sed.components import (
     BC03,

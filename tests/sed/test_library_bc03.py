@@ -6,10 +6,10 @@ import pytest
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
+from miricigale import conf
 from miricigale.refdata.libraries import add_library, write_library
 from miricigale.refdata.libraries.bc03 import read_bc03
 from miricigale.refdata.libraries.ised import read_ised
-from miricigale.refdata.locate import conf
 from miricigale.sed import SEDModel
 from miricigale.sed.components import BC03Library, ConstantSFH
 from miricigale.utils.exceptions import DataError

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from miricigale.refdata import conf, resource
+from miricigale import conf
+from miricigale.refdata import resource
 from miricigale.refdata.libraries import LibraryTable, add_library, write_library
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import DataError

@@ -13,9 +13,9 @@ import pytest
 from astropy.io import fits
 from astropy.table import QTable
 
+from miricigale import conf
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import (
-    conf,
     open_fits,
     read_table,
     unpacked_size,
@@ -120,7 +120,7 @@ def test_a_bomb_takes_no_memory(tmp_path):
         import resource, sys
         from miricigale.utils.files import open_fits
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        from miricigale.utils.files import conf
+        from miricigale import conf
         conf.unpacked_size = 250
         try:
             open_fits(sys.argv[1], wanted="an image")

@@ -5,8 +5,9 @@ import sys
 import numpy as np
 import pytest
 
+from miricigale import conf
 from miricigale.cli import main
-from miricigale.refdata import Resource, conf, locate, registry
+from miricigale.refdata import Resource, locate, registry
 from miricigale.refdata.libraries import READERS, LibraryTable
 from miricigale.refdata.locate import file_sha256
 

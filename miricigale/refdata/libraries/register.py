@@ -107,7 +107,7 @@ def add_library(name, path, *, progress_bar=False):
     """
     Read the distributed files of a library and keep it where models find it.
 
-    The library stands in the data folder (`miricigale.refdata.conf`) as one FITS file, read
+    The library stands in the data folder (`miricigale.conf`) as one FITS file, read
     from disk as it is needed, with a record of what it was made from beside it. One that
     stands there already is replaced once the new one was read, checked, written and read
     back.
