@@ -2,6 +2,7 @@ import json
 import shutil
 import threading
 import types
+import warnings
 from concurrent.futures import BrokenExecutor, Executor, ThreadPoolExecutor
 
 import pytest
@@ -66,6 +67,33 @@ def test_an_interrupted_run_goes_on_where_it_was(tmp_path):
     recorder.fail_at = None
     assert recorder.run(tmp_path / "run") == ["first:b", "second"]
     assert not (tmp_path / "run" / "run.lock").exists()
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_fact_is_warned_of_once_a_run_and_kept_for_each_unit(tmp_path, caplog):
+    def warn(context, unit):
+        warnings.warn(f"3 sources are faint in {unit!r}", MiricigaleWarning, stacklevel=2)
+        if unit == "b":
+            warnings.warn("the field is crowded", MiricigaleWarning, stacklevel=2)
+
+    stages = (Stage("one", warn, "one", units=lambda _: "abc"),)
+    with pytest.warns(MiricigaleWarning) as caught:
+        store = StudyRunner(StudyConfig(), tmp_path / "run", stages).run()
+    texts = ["3 sources are faint in 'a'", "the field is crowded"]
+    assert [str(one.message) for one in caught] == texts
+    assert "2 more such warnings of other units" in caplog.text
+    assert store.records["one:b"]["warnings"] == ["3 sources are faint in 'b'", texts[1]]
+
+
+@pytest.mark.filterwarnings("default")
+def test_warnings_before_an_error_are_shown(tmp_path):
+    def fail(context, unit):
+        warnings.warn("the field is crowded", MiricigaleWarning, stacklevel=2)
+        raise ValueError("no sources")
+
+    run = StudyRunner(StudyConfig(), tmp_path / "run", (Stage("one", fail, "one"),)).run
+    with pytest.warns(MiricigaleWarning, match="crowded"), pytest.raises(ValueError, match="no so"):
+        run()
 
 
 def test_only_what_depends_on_a_change_is_done_again(tmp_path):

@@ -1,8 +1,14 @@
 """What a run says of its progress."""
 
+import collections
 import logging
+import re
+import warnings
 
+from miricigale.utils.folder import MANIFEST
 from miricigale.utils.progress import on_terminal, print_line, progress
+
+log = logging.getLogger(__name__)
 
 # shown by the command line at any verbosity
 _compilation_log = logging.getLogger("miricigale.utils.compilation")
@@ -16,12 +22,22 @@ class Display:
         self._lines = show and not self.is_bar
         self._bar = progress(total=total, show=self.is_bar, desc="study", unit="step")
         self._spent = {}
+        self._facts = collections.Counter()
 
     def __enter__(self):
         return self
 
     def __exit__(self, *exc):
         self._bar.close()
+        if more := self._facts.total() - len(self._facts):
+            log.warning("%d more such warnings of other units: 'warnings' in %s", more, MANIFEST)
+
+    def warn(self, category, text):
+        """Show a warning, once for units that differ in what it quotes, such as the band."""
+        fact = re.sub(r"'[^']*'", "", text)
+        self._facts[fact] += 1
+        if self._facts[fact] == 1:
+            warnings.warn(text, category, stacklevel=2)
 
     def compilation(self, text):
         """Say what is compiled, also where no progress is shown."""

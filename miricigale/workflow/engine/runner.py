@@ -390,8 +390,11 @@ class StudyRunner:
             )
 
         def finish(result):
-            products, seconds = result
-            store.finish(job.key, digest, products, seconds=seconds)
+            products, seconds, warned = result
+            notes = {"warnings": [text for _, text in warned]} if warned else {}
+            store.finish(job.key, digest, products, seconds=round(seconds, 2), **notes)
+            for category, text in warned:
+                display.warn(category, text)
             log.debug("%s took %.1f s", job.key, seconds)
             display.finish(stage, self.config, seconds)
 

@@ -4,6 +4,7 @@ import dataclasses
 import socket
 import time
 import types
+import warnings
 from collections.abc import Callable
 
 from miricigale.instrument.image_files import read_image, write_image
@@ -240,6 +241,8 @@ def run_unit(config, folder, stages, name, unit, **options):
         Checksum and size of what was written, by name.
     seconds : float
         Time that it took.
+    warned : list of (type, str)
+        Class and text of each warning, for the process of the run to show.
 
     Raises
     ------
@@ -254,12 +257,16 @@ def run_unit(config, folder, stages, name, unit, **options):
     (stage,) = (s for s in (stages() if callable(stages) else stages) if s.name == name)
     context = Context(config, folder, stage=stage, unit=unit, **options)
     begin = time.perf_counter()
+    caught = []
     try:
         # results independent of the number of cores to the last digit
-        with single_threaded():
+        with single_threaded(), warnings.catch_warnings(record=True) as caught:
             stage.function(context, unit)
-    except (ValueError, KeyError, OSError) as err:
+    except Exception as err:
+        for one in caught:
+            warnings.warn(one.message, stacklevel=2)
         err.add_note(f"in stage {stage.key(unit)}")
         raise
     products = {product: context.products.describe(product) for product in context.saved}
-    return products, time.perf_counter() - begin
+    warned = [(one.category, str(one.message)) for one in caught]
+    return products, time.perf_counter() - begin, warned

@@ -64,19 +64,6 @@ class ProductStore(RecordFolder):
             return path
         return None
 
-    def finish(self, key, digest, products, *, seconds):
-        """
-        Record that a stage is done.
-
-        Parameters
-        ----------
-        key, digest, products
-            As for `~miricigale.utils.folder.RecordFolder.finish`.
-        seconds : float
-            Time that it took.
-        """
-        super().finish(key, digest, products, seconds=round(seconds, 2))
-
     def checksums(self, keys):
         """Checksums of all products of units by their keys; those that are not done have none."""
         return {
