@@ -8,7 +8,7 @@ import numpy as np
 from astropy.table import QTable, Table
 
 from miricigale.filters.band_names import band_filters, filter_of_band, given_filters, is_line
-from miricigale.utils.exceptions import DataError, MiricigaleWarning
+from miricigale.utils.exceptions import CatalogWarning, DataError
 from miricigale.utils.files import read_table
 from miricigale.utils.missing import negative_errors, plain_floats, without_codes
 from miricigale.utils.tables import error_column
@@ -65,7 +65,7 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
 
     Warns
     -----
-    `~miricigale.utils.exceptions.MiricigaleWarning`
+    `~miricigale.utils.exceptions.CatalogWarning`
         Of bands and columns that are left out, and limits that are not positive, all in one message.
 
     Notes
@@ -129,7 +129,7 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
         msg = f"{path}: {text}"
         raise DataError(msg)
     if text:
-        warnings.warn(f"{path}: {text}", MiricigaleWarning, stacklevel=2)
+        warnings.warn(f"{path}: {text}", CatalogWarning, stacklevel=2)
     return out
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from miricigale.fitting import FitFlags
 from miricigale.fitting.quantities import draws_summary
 from miricigale.fitting.samplers.run import chi2_at
-from miricigale.utils.exceptions import MiricigaleWarning
+from miricigale.utils.exceptions import FitWarning
 from miricigale.utils.parallel import chunks
 
 #: Just et al. 2007, ApJ 665, 1004, equation 3: slope and offset, for erg/s/Hz.
@@ -60,7 +60,7 @@ def near_relation(fitter, photometry, results, most, *, redshift=None, seed=0):
         z = None if redshift is None else np.asarray(redshift)[rows]
         with warnings.catch_warnings():
             # the fit has given this warning
-            warnings.simplefilter("ignore", MiricigaleWarning)
+            warnings.simplefilter("ignore", FitWarning)
             samples = fitter.sample(photometry[rows], N_DRAWS, seed=seed, redshift=z)
         kept = _near(samples, most)
         values = {name: samples.values(name).value for name in results.parameters}

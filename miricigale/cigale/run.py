@@ -10,7 +10,7 @@ from miricigale.cigale.modules import read_modules
 from miricigale.cigale.names import cigale_names
 from miricigale.cigale.setup import CigaleSetup
 from miricigale.filters.band_names import band_filters, given_filters, xray_energies
-from miricigale.utils.exceptions import ConfigError, MiricigaleWarning, argument_error
+from miricigale.utils.exceptions import CatalogWarning, ConfigError, argument_error
 from miricigale.utils.tables import error_column
 
 
@@ -48,7 +48,7 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
 
     Warns
     -----
-    `~miricigale.utils.exceptions.MiricigaleWarning`
+    `~miricigale.utils.exceptions.CatalogWarning`
         Of all that is left out, replaced or different, in one message.
     """
     path = Path(path)
@@ -123,7 +123,7 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
         msg = f"{path}:\n{text}"
         raise ConfigError(msg)
     if text:
-        warnings.warn(f"{path}:\n{text}", MiricigaleWarning, stacklevel=2)
+        warnings.warn(f"{path}:\n{text}", CatalogWarning, stacklevel=2)
     return setup
 
 

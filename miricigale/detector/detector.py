@@ -22,7 +22,7 @@ from miricigale.detector.latent import checked_previous
 from miricigale.detector.ramp import Ramp
 from miricigale.detector.work import Work
 from miricigale.instrument import DetectorProperties, ImageFacts, miri_detector
-from miricigale.utils.exceptions import MiricigaleWarning, argument_error
+from miricigale.utils.exceptions import DetectorWarning, argument_error
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_kind
 from miricigale.utils.parallel import check_memory
@@ -199,7 +199,7 @@ class Detector:
 
         Warns
         -----
-        `~miricigale.utils.exceptions.MiricigaleWarning`
+        `~miricigale.utils.exceptions.DetectorWarning`
             If the sky alone fills the well before the last group.
         """
         task = self._task(image, exposure, seed, previous)
@@ -313,7 +313,7 @@ class Detector:
 
         Warns
         -----
-        `~miricigale.utils.exceptions.MiricigaleWarning`
+        `~miricigale.utils.exceptions.DetectorWarning`
             As `expose`.
 
         Notes
@@ -363,7 +363,7 @@ class Detector:
 
         Warns
         -----
-        `~miricigale.utils.exceptions.MiricigaleWarning`
+        `~miricigale.utils.exceptions.DetectorWarning`
             If the sky fills more than 60 % of the well by the last group.
         """
         light = checked_light(image, exposure)
@@ -375,7 +375,7 @@ class Detector:
         forecast = SaturationForecast.from_rate(light, exposure, limit, sources)
         if forecast.sky_too_bright:
             message = _sky_message(exposure, forecast.sky_fraction)
-            warnings.warn(message, MiricigaleWarning, stacklevel=2)
+            warnings.warn(message, DetectorWarning, stacklevel=2)
         return forecast
 
     def _acting(self, image):
@@ -410,7 +410,7 @@ class Detector:
         )
         message = _sky_message(exposure, fraction)
         if fraction >= 1:
-            warnings.warn(message, MiricigaleWarning, stacklevel=4)
+            warnings.warn(message, DetectorWarning, stacklevel=4)
         elif fraction > SKY_FRACTION:
             logger.warning(message)
         return fraction

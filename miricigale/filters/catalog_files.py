@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from miricigale.filters.catalog_map import CatalogMap
-from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error
+from miricigale.utils.exceptions import CatalogWarning, DataError, argument_error
 from miricigale.utils.files import read_table
 from miricigale.utils.missing import plain_floats, without_codes
 from miricigale.utils.tables import error_column
@@ -48,7 +48,7 @@ def read_catalog_photometry(path, catalog_map=None, *, hdu=None, **options):
 
     Warns
     -----
-    `~miricigale.utils.exceptions.MiricigaleWarning`
+    `~miricigale.utils.exceptions.CatalogWarning`
         Of numbers that stand for no value, and of bands without a filter.
 
     Examples
@@ -66,7 +66,7 @@ def read_catalog_photometry(path, catalog_map=None, *, hdu=None, **options):
     _, lost = catalog_map.names(table.colnames, path.name)
     table, coded = catalog_map.convert(table, path.name)
     for text in told_of(lost, coded):
-        warnings.warn(f"{path.name}: {text}", MiricigaleWarning, stacklevel=2)
+        warnings.warn(f"{path.name}: {text}", CatalogWarning, stacklevel=2)
     return table
 
 
@@ -145,7 +145,7 @@ def warn_of_codes(coded, where, stacklevel):
         (), found, "look like numbers that stand for no value, and are fitted as they are"
     ):
         how = "NaN is a missing band; read_catalog_photometry, or --map, makes them so"
-        warnings.warn(f"{where}: {text} ({how})", MiricigaleWarning, stacklevel=stacklevel + 1)
+        warnings.warn(f"{where}: {text} ({how})", CatalogWarning, stacklevel=stacklevel + 1)
 
 
 class MappedRows:
@@ -176,7 +176,7 @@ class MappedRows:
     def chunk(self, i):
         """A piece of the table; its warnings are those of `told`."""
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", MiricigaleWarning)
+            warnings.simplefilter("ignore", CatalogWarning)
             return self.map.convert(self._rows.chunk(i), self._rows.path.name)[0]
 
     def foreign_chunks(self, name):
@@ -190,7 +190,7 @@ class MappedRows:
             table = self._rows.chunk(i)
             with warnings.catch_warnings():
                 if i:
-                    warnings.simplefilter("ignore", MiricigaleWarning)
+                    warnings.simplefilter("ignore", CatalogWarning)
                 for name, codes in self.map.convert(table, self._rows.path.name)[1].items():
                     parts.setdefault(name, []).append(codes)
         return list(told_of(self._lost, {name: np.concatenate(v) for name, v in parts.items()}))

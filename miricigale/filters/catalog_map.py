@@ -14,7 +14,7 @@ from astropy.table import QTable
 
 from miricigale.filters.filter import Filter
 from miricigale.filters.surveys import SURVEYS, is_band
-from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error, unknown_name
+from miricigale.utils.exceptions import CatalogWarning, DataError, argument_error, unknown_name
 from miricigale.utils.missing import negative_errors, plain_floats, without_codes
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU
@@ -189,7 +189,7 @@ class CatalogMap:
 
         Warns
         -----
-        `~miricigale.utils.exceptions.MiricigaleWarning`
+        `~miricigale.utils.exceptions.CatalogWarning`
             Of units other than the file's.
         """
         names, _ = self.names(table.colnames, argument)
@@ -235,7 +235,7 @@ class CatalogMap:
         asked = _unit(asked, name)
         if has is not None and has != asked and not (has == u.mag and _is_ab(asked)):
             msg = f"{argument}: {name!r} taken in {asked}, the file says {has}"
-            warnings.warn(msg, MiricigaleWarning, stacklevel=5)
+            warnings.warn(msg, CatalogWarning, stacklevel=5)
         return asked
 
     def _set_unit(self, table, name, argument):

@@ -44,7 +44,7 @@ def fit_classes(path, output, *, quasars=False, stars=None, **options):
 
     Warns
     -----
-    `~miricigale.utils.exceptions.MiricigaleWarning`
+    `~miricigale.utils.exceptions.FitWarning`
         What `~miricigale.fitting.fit_catalog` warns of, once for all classes.
     """
     spectra = None

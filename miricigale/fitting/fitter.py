@@ -270,7 +270,7 @@ class BayesFitter:
 
         Warns
         -----
-        `~miricigale.utils.exceptions.MiricigaleWarning`
+        `~miricigale.utils.exceptions.FitWarning`
             If ``filters`` was not given and the photometry has bands (names of filters, or columns
             in a unit of flux density that have an error) that the grid lacks. Bands that
             are not fitted are also in ``meta["fit"]["unused_bands"]`` of the results. And of numbers that

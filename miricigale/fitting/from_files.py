@@ -7,7 +7,7 @@ import numpy as np
 
 from miricigale.filters import Filter
 from miricigale.filters.catalog_files import MappedRows, as_catalog_map
-from miricigale.utils.exceptions import MiricigaleWarning, argument_error
+from miricigale.utils.exceptions import FitWarning, argument_error
 from miricigale.utils.row_files import open_rows
 from miricigale.utils.tables import error_column
 
@@ -67,7 +67,7 @@ def fit_catalog(
 
     Warns
     -----
-    `~miricigale.utils.exceptions.MiricigaleWarning`
+    `~miricigale.utils.exceptions.FitWarning`
         If the catalog has bands under names that no filter has, or without errors.
 
     Raises
@@ -103,7 +103,7 @@ def fit_catalog(
             f"bands of the photometry are not fitted, as their names ('miricigale filters') or "
             f"errors are missing: {', '.join(unused)}"
         )
-        warnings.warn(msg, MiricigaleWarning, stacklevel=2)
+        warnings.warn(msg, FitWarning, stacklevel=2)
     if axes == "survey":
         model, nodes = SEDModel.survey(), SEDModel.survey_axes()
         error = TemplateError.survey() if model_error is None else None

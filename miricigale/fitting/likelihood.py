@@ -7,7 +7,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.filters import Filter
-from miricigale.utils.exceptions import MiricigaleWarning, argument_error
+from miricigale.utils.exceptions import FitWarning, argument_error
 from miricigale.utils.object_rows import ObjectRows, PerObject
 from miricigale.utils.tables import Flags, error_column, read_ids, require_columns
 from miricigale.utils.units import FNU, to_array
@@ -239,7 +239,7 @@ def unused_bands(table, filters, stacklevel=None):
 
     A column is a band if it has an error ``<name>_err`` and both are in a unit of flux
     density, or if its name is that of a filter. With a ``stacklevel``, that of the caller of this
-    function, a `~miricigale.utils.exceptions.MiricigaleWarning` names them.
+    function, a `~miricigale.utils.exceptions.FitWarning` names them.
     """
     known, columns = set(Filter.names()), set(table.colnames)
     out = []
@@ -252,7 +252,7 @@ def unused_bands(table, filters, stacklevel=None):
             out.append(name)
     if out and stacklevel is not None:
         text = "bands of the photometry that the grid lacks are not fitted"
-        warnings.warn(f"{text}: {', '.join(out)}", MiricigaleWarning, stacklevel=stacklevel + 1)
+        warnings.warn(f"{text}: {', '.join(out)}", FitWarning, stacklevel=stacklevel + 1)
     return out
 
 

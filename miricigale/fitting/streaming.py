@@ -18,7 +18,7 @@ from miricigale.fitting.fitter import BayesFitter
 from miricigale.fitting.from_files import open_catalog
 from miricigale.fitting.io import FORMAT, FitFolder, open_results, part_ids, part_name
 from miricigale.utils.content import content_sha256
-from miricigale.utils.exceptions import MiricigaleWarning, OtherResultsError, argument_error
+from miricigale.utils.exceptions import CatalogWarning, OtherResultsError, argument_error
 from miricigale.utils.progress import progress
 from miricigale.utils.random import check_seed
 from miricigale.utils.store import plain_value
@@ -96,7 +96,7 @@ def fit_file(
 
     Warns
     -----
-    `~miricigale.utils.exceptions.MiricigaleWarning`
+    `~miricigale.utils.exceptions.CatalogWarning`
         What `BayesFitter.fit` warns of, once. Numbers that look like codes for a missing value are counted
         before anything is fitted, and with ``catalog_map`` what it takes as missing.
 
@@ -132,7 +132,7 @@ def fit_file(
         warn_of_codes(_codes(rows, fitter.bands), rows.path.name, 2)
     else:
         for text in rows.told():
-            warnings.warn(f"{rows.path.name}: {text}", MiricigaleWarning, stacklevel=2)
+            warnings.warn(f"{rows.path.name}: {text}", CatalogWarning, stacklevel=2)
     fluxes = {c for name in fitter.bands for c in (name, error_column(name))}
     inputs = _Inputs(rows, options, unit, fluxes)
     _check_ids(rows)

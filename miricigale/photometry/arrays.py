@@ -96,7 +96,7 @@ def image_arrays(image, name):
 
     Warns
     -----
-    `~miricigale.utils.exceptions.MiricigaleWarning`
+    `~miricigale.utils.exceptions.PhotometryWarning`
         If areas that are exactly 0 are taken as without data.
     """
     data, noise, usable = _checked(image, name)

@@ -22,7 +22,7 @@ from miricigale.photometry.settings import ErrorSettings, MemorySettings
 from miricigale.photometry.sky_noise import warn_of_background
 from miricigale.photometry.sources import SourceTemplates
 from miricigale.psf import KernelField
-from miricigale.utils.exceptions import MiricigaleWarning, argument_error
+from miricigale.utils.exceptions import PhotometryWarning, argument_error
 from miricigale.utils.parallel import single_threaded, thread_count, threads
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, positive, to_array
 
@@ -142,7 +142,7 @@ class ForcedPhotometer:
                 "the kernel has no PSFs: sources are their segments as they are, without wings, and "
                 "those without a segment are not measured"
             )
-            warnings.warn(msg, MiricigaleWarning, stacklevel=3)
+            warnings.warn(msg, PhotometryWarning, stacklevel=3)
             # as far as it reaches, and as wide
             mean = dataclasses.replace(mean, source=mean.array, target=mean.array)
             changed |= {"template": "cutout", "wings": False, "mean_kernel": mean}
@@ -202,7 +202,7 @@ class ForcedPhotometer:
 
         Warns
         -----
-        `~miricigale.utils.exceptions.MiricigaleWarning`
+        `~miricigale.utils.exceptions.PhotometryWarning`
             If no source is on the image, labels are not those of the segmentation, areas that are
             exactly 0 are not masked, or a background that was left in ``image`` or ``highres``
             goes into the fluxes.
@@ -223,7 +223,7 @@ class ForcedPhotometer:
             msg = (
                 f"none of the {len(sources.id)} sources is on or near 'image': nothing is measured"
             )
-            warnings.warn(msg, MiricigaleWarning, stacklevel=2)
+            warnings.warn(msg, PhotometryWarning, stacklevel=2)
         if templates is None:
             templates = self._templates(highres, segmentation, catalog[place.near])
         else:
@@ -348,4 +348,4 @@ class ForcedPhotometer:
                     f"the templates were made with a PSF whose peak holds {peaks[0]:.3g} of the light, the "
                     f"kernel is from one whose peak holds {peaks[1]:.3g}: is it of the same image?"
                 )
-                warnings.warn(msg, MiricigaleWarning, stacklevel=3)
+                warnings.warn(msg, PhotometryWarning, stacklevel=3)

@@ -14,7 +14,7 @@ from miricigale.instrument.image_files import write_image
 from miricigale.photometry.grids import grid_angle
 from miricigale.photometry.kernel_files import can_be_modeled, file_place, matching_kernel
 from miricigale.photometry.mosaics import MosaicFile
-from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error
+from miricigale.utils.exceptions import DataError, PhotometryWarning, argument_error
 from miricigale.utils.files import split_extension
 from miricigale.utils.progress import progress
 from miricigale.utils.store import replacing
@@ -318,7 +318,7 @@ def _pulls(result, kernel, seed, n_threads):
     blank = ForcedPhotometer(kernel, template="psf", n_threads=n_threads)
     with warnings.catch_warnings():
         # the warning about a background was given already
-        warnings.simplefilter("ignore", MiricigaleWarning)
+        warnings.simplefilter("ignore", PhotometryWarning)
         return blank.measure(result.residual_image, catalog=empty).snr
 
 

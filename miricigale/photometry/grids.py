@@ -8,7 +8,7 @@ import warnings
 import astropy.units as u
 import numpy as np
 
-from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error
+from miricigale.utils.exceptions import DataError, PhotometryWarning, argument_error
 from miricigale.utils.files import open_fits, split_extension
 from miricigale.utils.optional import require
 
@@ -112,7 +112,7 @@ def read_wcs(header, hdus):
 
     Warns
     -----
-    `~miricigale.utils.exceptions.MiricigaleWarning`
+    `~miricigale.utils.exceptions.PhotometryWarning`
         If distortion is in the ASDF extension alone and gwcs is not installed.
     """
     from astropy.wcs import WCS, FITSFixedWarning
@@ -133,7 +133,7 @@ def read_wcs(header, hdus):
                 f"{hdus.filename()}: the coordinates in the header lack the distortion, which is in "
                 f"the extension ASDF: positions are pixels off. {err}"
             )
-            warnings.warn(msg, MiricigaleWarning, stacklevel=3)
+            warnings.warn(msg, PhotometryWarning, stacklevel=3)
     return wcs
 
 

@@ -165,7 +165,7 @@ def read_kernel(path, *, pixel_scale, highres_psf=None):
 
     Warns
     -----
-    `~miricigale.utils.exceptions.MiricigaleWarning`
+    `~miricigale.utils.exceptions.PSFWarning`
         As `~miricigale.psf.MatchingKernel.from_array`.
     """
     from miricigale.psf import MatchingKernel

@@ -19,7 +19,7 @@ from miricigale.photometry.grids import (
     read_wcs,
 )
 from miricigale.photometry.sky_noise import mask_filled, sky_noise
-from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error
+from miricigale.utils.exceptions import DataError, PhotometryWarning, argument_error
 from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
 
 _log = logging.getLogger(__name__)
@@ -162,7 +162,7 @@ class MosaicFile:
 
         Warns
         -----
-        `~miricigale.utils.exceptions.MiricigaleWarning`
+        `~miricigale.utils.exceptions.PhotometryWarning`
             If there is no map of the noise, its scale departs from 1 by more than 10 times, or areas
             that are exactly 0 are masked.
         """
@@ -191,7 +191,7 @@ class MosaicFile:
             zeros = float(np.mean(data[usable] == 0)) if usable.any() else 0.0
             extra = f", and {zeros:.0%} of its pixels are exactly 0" if zeros > 1e-3 else ""
             msg = f"{self.path} has no map of the noise, which will be measured on the image{extra}"
-            warnings.warn(msg, MiricigaleWarning, stacklevel=2)
+            warnings.warn(msg, PhotometryWarning, stacklevel=2)
             meta["noise"] = "none"
         else:
             sigma = _sigma(kind, values)
@@ -383,4 +383,4 @@ def _note_scale(file, kind, scale):
             f"{file.path}: noise on the sky is {scale:.4g} times what the {kind} map says, {done}; "
             "is it the map of this image, in its unit?"
         )
-        warnings.warn(msg, MiricigaleWarning, stacklevel=3)
+        warnings.warn(msg, PhotometryWarning, stacklevel=3)

@@ -10,7 +10,7 @@ from astropy.table import QTable
 from miricigale.photometry.fields import SmoothField, legendre_terms, n_terms
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.template_fit import TemplateFit
-from miricigale.utils.exceptions import MiricigaleWarning
+from miricigale.utils.exceptions import PhotometryWarning
 from miricigale.utils.units import ANGLE
 
 #: Least signal-to-noise of sources whose offsets are measured, largest light of others relative to
@@ -170,7 +170,7 @@ def fit_offsets(arrays, bank, settings, catalog):
                 f"an offset map needs at least {_SOURCES} bright isolated sources within 'max_shift', "
                 f"got {np.count_nonzero(good)}: one shift is fitted to all sources instead"
             )
-            warnings.warn(msg, MiricigaleWarning, stacklevel=5)
+            warnings.warn(msg, PhotometryWarning, stacklevel=5)
             return TemplateFit(arrays, bank, settings, search=True)
         member = fit.bank.order[rows]
         field, used = _robust_field(xy[member], offset, error, good, arrays.flux.shape, order)
@@ -186,7 +186,7 @@ def fit_offsets(arrays, bank, settings, catalog):
             f"{_SOURCES * n_terms(settings.offset_order)} bright isolated sources within 'max_shift', "
             f"got {np.count_nonzero(good)}: order {order} is taken"
         )
-        warnings.warn(msg, MiricigaleWarning, stacklevel=5)
+        warnings.warn(msg, PhotometryWarning, stacklevel=5)
     near = catalog.near[member]
     table = QTable({"id": catalog.id[near], "sky": catalog.sky[near]})
     table["x_centroid"], table["y_centroid"] = xy[member].T

@@ -7,7 +7,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.photometry.grids import open_map
-from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error
+from miricigale.utils.exceptions import CatalogWarning, DataError, argument_error
 from miricigale.utils.files import read_table
 from miricigale.utils.tables import unique_ids
 
@@ -58,7 +58,7 @@ def read_prior(highres, *, segmentation=None, catalog=None, path=None):
 
     Warns
     -----
-    `~miricigale.utils.exceptions.MiricigaleWarning`
+    `~miricigale.utils.exceptions.CatalogWarning`
         If segments belong to no source of the catalog: their light stays in the image; if most
         sources have no segment, or some are on another one than that of their id.
 
@@ -210,7 +210,7 @@ def check_labels(labels, here, what):
         raise argument_error(what, wanted, f"{text}: is it the map of another detection?")
     if wrong >= max(3, 0.1 * n):
         msg = f"the labels of {what} are those of {text}"
-        warnings.warn(msg, MiricigaleWarning, stacklevel=4)
+        warnings.warn(msg, CatalogWarning, stacklevel=4)
 
 
 def _labels(sources, segments, ids, wcs, catalog, segmentation):
@@ -235,7 +235,7 @@ def _labels(sources, segments, ids, wcs, catalog, segmentation):
     msg += f" of {segmentation} and are taken as points"
     if n_without > 0.5 * n_inside:
         msg += ": is it the map of another detection?"
-        warnings.warn(msg, MiricigaleWarning, stacklevel=3)
+        warnings.warn(msg, CatalogWarning, stacklevel=3)
     elif n_without:
         _log.info(msg)
     orphans = np.setdiff1d(np.arange(1, len(ids) + 1), label)
@@ -245,5 +245,5 @@ def _labels(sources, segments, ids, wcs, catalog, segmentation):
             f"{orphans.size} segments of {segmentation} belong to no source of {catalog} and are not "
             f"fitted (ids {some}{', ...' if orphans.size > 5 else ''})"
         )
-        warnings.warn(msg, MiricigaleWarning, stacklevel=3)
+        warnings.warn(msg, CatalogWarning, stacklevel=3)
     return label

@@ -12,7 +12,7 @@ from miricigale.photometry.fields import legendre_terms
 from miricigale.photometry.free_templates import free_templates
 from miricigale.photometry.shapes import not_fitted
 from miricigale.photometry.template_changes import TemplateChanges
-from miricigale.utils.exceptions import MiricigaleWarning
+from miricigale.utils.exceptions import PhotometryWarning
 from miricigale.utils.parallel import chunks
 from miricigale.utils.units import ANGLE
 
@@ -192,7 +192,7 @@ class TemplateFit:
                     f"a shift of {np.round(found * self.scale, 3)} arcsec is beyond 'max_shift' "
                     f"{self.settings.max_shift}: measured without a shift"
                 )
-                warnings.warn(msg, MiricigaleWarning, stacklevel=6)
+                warnings.warn(msg, PhotometryWarning, stacklevel=6)
                 self._solve(plain, [])
                 return
             if np.hypot(*step) < 1e-3:

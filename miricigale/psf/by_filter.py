@@ -13,7 +13,7 @@ from miricigale.psf.miri import MIRI_FILTERS, miri_psf
 from miricigale.psf.model import instrument_psf
 from miricigale.psf.nircam import NIRCAM_FILTERS, nircam_psf
 from miricigale.psf.resample import psf_image, psf_mosaic, rotate_psf
-from miricigale.utils.exceptions import MiricigaleWarning, argument_error, unknown_name
+from miricigale.utils.exceptions import PSFWarning, argument_error, unknown_name
 from miricigale.utils.units import ANGLE
 
 _log = logging.getLogger(__name__)
@@ -115,7 +115,7 @@ def checked_psf(
 
     Warns
     -----
-    `~miricigale.utils.exceptions.MiricigaleWarning`
+    `~miricigale.utils.exceptions.PSFWarning`
         If the light was scaled by more than 0.01, the PSF is narrower by more than 5 % or
         wider by more than 15 %, or the image seems to be smoothed.
     """
@@ -143,7 +143,7 @@ def checked_psf(
             f"'{argument}' is {ratio:.2g} times as wide (FWHM {width:.3g} arcsec) as the model of "
             f"{filter}, with which it is not compared: was the image brought to this resolution?"
         )
-        warnings.warn(msg, MiricigaleWarning, stacklevel=2)
+        warnings.warn(msg, PSFWarning, stacklevel=2)
         return psf
     if not 1 / _OTHER_WIDTH < ratio < _OTHER_WIDTH:
         wanted = f"a PSF of {filter}, about {usual:.3g} arcsec wide (FWHM)"
@@ -159,7 +159,7 @@ def checked_psf(
             f"'{argument}' is {abs(ratio - 1):.0%} {word} (FWHM {width:.3g} arcsec) than the model of "
             f"{filter}: does it hold the pixel, the drizzling and no more?"
         )
-        warnings.warn(msg, MiricigaleWarning, stacklevel=2)
+        warnings.warn(msg, PSFWarning, stacklevel=2)
     return _scaled(psf, float(stamp.sum()), filter, argument)
 
 
@@ -216,7 +216,7 @@ def _scaled(psf, expected, filter_, argument):
         f"{width:.3g} arcsec, as the model of {filter_} does ({expected:.3f})"
     )
     if abs(taken - held) > 0.01:
-        warnings.warn(msg, MiricigaleWarning, stacklevel=3)
+        warnings.warn(msg, PSFWarning, stacklevel=3)
     else:
         _log.info(msg)
     return psf.replaced(psf.data * (taken / held), total_known=True)

@@ -166,7 +166,7 @@ class MatchingKernel:
 
         Warns
         -----
-        `~miricigale.utils.exceptions.MiricigaleWarning`
+        `~miricigale.utils.exceptions.PSFWarning`
             If the automatic choice cannot keep its limits or misses the wide PSF by more than
             0.02 of the light; if a kernel is normalized by default although more than 0.01 of
             the light lies beyond a grid.
@@ -239,7 +239,7 @@ class MatchingKernel:
 
         Warns
         -----
-        `~miricigale.utils.exceptions.MiricigaleWarning`
+        `~miricigale.utils.exceptions.PSFWarning`
             If the kernel was normalized by more than 0.001, or its core stands more than 0.1
             pixel off the center: it moves images by that.
         """

@@ -9,7 +9,7 @@ from astropy.nddata import NDData
 from photutils.psf import GriddedPSFModel, ImagePSF
 
 from miricigale.psf import _core
-from miricigale.utils.exceptions import MiricigaleWarning, argument_error
+from miricigale.utils.exceptions import PSFWarning, argument_error
 from miricigale.utils.unified import read_write
 from miricigale.utils.units import ANGLE, positive, to_array
 
@@ -279,7 +279,7 @@ def make_psf(data, *, pixel_scale, frame, oversampling=1, enclosed=None, **facts
 
     Warns
     -----
-    `~miricigale.utils.exceptions.MiricigaleWarning`
+    `~miricigale.utils.exceptions.PSFWarning`
         If an oversampled PSF of unit sum is scaled.
     """
     data = np.array(data, dtype=float)
@@ -296,7 +296,7 @@ def make_psf(data, *, pixel_scale, frame, oversampling=1, enclosed=None, **facts
         factor = oversampling**2
         text = f"'data' sums to {total:.4g} with {oversampling} x {oversampling} cells per pixel: "
         text += f"multiplied by {factor} (a PSF sums to {factor} over the infinite plane)"
-        warnings.warn(text, MiricigaleWarning, stacklevel=2)
+        warnings.warn(text, PSFWarning, stacklevel=2)
     data *= factor
     psf = InstrumentPSF(
         data, pixel_scale=pixel_scale, frame=frame, oversampling=oversampling, **facts

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.fft import fftshift, ifftshift, irfft2, next_fast_len, rfft2
 
 from miricigale.psf import _core
-from miricigale.utils.exceptions import MiricigaleWarning, argument_error
+from miricigale.utils.exceptions import PSFWarning, argument_error
 
 _log = logging.getLogger(__name__)
 
@@ -120,7 +120,7 @@ def choose(regularization, make, source, target, tolerance):
 
     Warns
     -----
-    `~miricigale.utils.exceptions.MiricigaleWarning`
+    `~miricigale.utils.exceptions.PSFWarning`
         If no kernel keeps the limits, or the one that was chosen misses the wide PSF's
         encircled energy by more than 0.02.
     """
@@ -167,6 +167,6 @@ def choose(regularization, make, source, target, tolerance):
     text += f"(limit {limits[0]:.4f}), negative pixels {best['negative_sum']:.3f} (limit "
     text += f"{limits[1]:.3f}), error of the encircled energy {best['max_error']:.4f}"
     if not allowed or best["max_error"] > _ERROR:
-        warnings.warn(text, MiricigaleWarning, stacklevel=3)
+        warnings.warn(text, PSFWarning, stacklevel=3)
     _log.info(text)
     return mu, make(mu), best

@@ -9,7 +9,7 @@ from miricigale.detector import Charge, Ramp
 from miricigale.instrument import Exposure, ImageFacts
 from miricigale.reduction.reference_maps import read_flat, read_photom
 from miricigale.reduction.references import BRIGHTNESS, SLOPES, STEP_OF, needed, own_maps
-from miricigale.utils.exceptions import MiricigaleWarning, argument_error
+from miricigale.utils.exceptions import ReferenceWarning, argument_error
 
 _OWN = "of the simulated detector"
 
@@ -147,7 +147,7 @@ def brightness_of(reducer, rate):
         used["flat"] = files.flat.name
     if "dark" not in facts.steps:
         msg = "the dark current is in the slopes still: it becomes a part of the background"
-        warnings.warn(msg, MiricigaleWarning, stacklevel=4)
+        warnings.warn(msg, ReferenceWarning, stacklevel=4)
     values = {"dark": 0.0, "gain": None, "flat": flat, "flags": flags}
     values["conversion"] = read_photom(files.photom, exposure, facts.day)
     meta = {f"reference_{name}": text for name, text in used.items()}

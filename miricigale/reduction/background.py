@@ -11,7 +11,7 @@ from miricigale.reduction.images import flag_pixels, plain_mask, sigma, with_dat
 from miricigale.reduction.sky_mask import cells_of, contamination, darkest, detect, grown, pixels_of
 from miricigale.reduction.sky_mesh import SkyMesh, sky_boxes
 from miricigale.utils import sep_tools
-from miricigale.utils.exceptions import MiricigaleWarning, argument_error
+from miricigale.utils.exceptions import ReductionWarning, argument_error
 from miricigale.utils.options import check_choice, check_least, check_positive
 from miricigale.utils.tables import Flags
 
@@ -135,7 +135,7 @@ def estimate_background(
 
     Warns
     -----
-    `~miricigale.utils.exceptions.MiricigaleWarning`
+    `~miricigale.utils.exceptions.ReductionWarning`
         If it cannot be trusted; ``background.flags`` says why.
 
     Notes
@@ -302,7 +302,7 @@ def warn_of(background, mask):
         f"{np.median(background.error[good]):.2g} ({100 * background.source_mask[good].mean():.0f} % of the "
         f"pixels are sources): {reasons}"
     )
-    warnings.warn(text, MiricigaleWarning, stacklevel=3)
+    warnings.warn(text, ReductionWarning, stacklevel=3)
 
 
 def _plain(data, mask, box, filter_size, correlation):

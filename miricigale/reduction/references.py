@@ -9,7 +9,7 @@ import numpy as np
 
 from miricigale.reduction import reference_maps as maps
 from miricigale.reduction.measured_noise import measure_noise
-from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error
+from miricigale.utils.exceptions import DataError, ReferenceWarning, argument_error
 
 #: What slopes need, and what surface brightness needs beside them.
 SLOPES = ("mask", "saturation", "linearity", "dark", "gain", "read_noise")
@@ -154,7 +154,7 @@ def needed(references, header, steps, *, names, what):
 
     Warns
     -----
-    `~miricigale.utils.exceptions.MiricigaleWarning`
+    `~miricigale.utils.exceptions.ReferenceWarning`
         If some are missing and that is allowed.
     """
     if references is None:
@@ -174,7 +174,7 @@ def needed(references, header, steps, *, names, what):
         raise argument_error("references", wanted, f"none for {', '.join(missing)}")
     if missing:
         msg = f"{what} without references for {', '.join(missing)}: these steps are left out"
-        warnings.warn(msg, MiricigaleWarning, stacklevel=5)
+        warnings.warn(msg, ReferenceWarning, stacklevel=5)
     return references
 
 
@@ -370,7 +370,7 @@ class ReferenceFiles:
                     "light is even and there are no reference pixels, which would tell slow noise of the "
                     "read-out from photons (measure_noise). Give 'gain' if it is known"
                 )
-                warnings.warn(msg, MiricigaleWarning, stacklevel=4)
+                warnings.warn(msg, ReferenceWarning, stacklevel=4)
         if self.origin is not None:
             used["context"] = self.origin
         return DetectorMaps(**values, used=used)

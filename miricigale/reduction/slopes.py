@@ -18,7 +18,7 @@ from miricigale.reduction.assumed import is_own
 from miricigale.reduction.drawn import draw_groups
 from miricigale.reduction.rampfit import fit_groups
 from miricigale.reduction.reference_pixels import reference_channels, reference_drift
-from miricigale.utils.exceptions import MiricigaleWarning, argument_error
+from miricigale.utils.exceptions import ReductionWarning, argument_error
 
 # flags of a ramp's pixels that forbid a slope
 _UNUSABLE = DQ.DO_NOT_USE | DQ.NON_SCIENCE | DQ.REFERENCE_PIXEL | DQ.DEAD
@@ -166,4 +166,4 @@ def _warn_of(what, remedy):
         f"the ramp shows {what} that this Reducer leaves in: "
         f"give it {remedy}'skip_first' groups to be left out"
     )
-    warnings.warn(msg, MiricigaleWarning, stacklevel=5)
+    warnings.warn(msg, ReductionWarning, stacklevel=5)

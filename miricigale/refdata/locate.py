@@ -13,7 +13,7 @@ from astropy import config as _config
 from miricigale.refdata.registry import resource
 from miricigale.utils.configuration import conf
 from miricigale.utils.content import file_sha256
-from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error
+from miricigale.utils.exceptions import DataError, ReferenceWarning, argument_error
 from miricigale.utils.files import cached_by_file
 
 
@@ -102,7 +102,7 @@ def _warn_of_override(record, label, path):
         return
     if fingerprint_of(path) != record.sha256:
         msg = f"resource {record.name!r} is taken from {path}, which differs from the bundled file"
-        warnings.warn(msg, MiricigaleWarning, stacklevel=3)
+        warnings.warn(msg, ReferenceWarning, stacklevel=3)
 
 
 def file_record(name):

@@ -12,7 +12,7 @@ from miricigale.filters.catalog_files import as_catalog_map, told_of
 from miricigale.filters.surveys import is_band
 from miricigale.refdata import locate, resources
 from miricigale.scene.catalog import CATALOG_COLUMNS, CatalogFlags, check_catalog
-from miricigale.utils.exceptions import DataError, MiricigaleWarning
+from miricigale.utils.exceptions import CatalogWarning, DataError
 from miricigale.utils.files import read_table
 from miricigale.utils.missing import plain_floats
 from miricigale.utils.tables import error_column
@@ -67,7 +67,7 @@ def read_catalog(path, catalog_map=None, **options):
 
     Warns
     -----
-    `~miricigale.utils.exceptions.MiricigaleWarning`
+    `~miricigale.utils.exceptions.CatalogWarning`
         Of numbers that stand for no value (`CatalogFlags`, ``MISSING_CODE``), sources without a usable
         flux (``NO_FLUX``), right ascensions that look like hours, fluxes that look like those of another
         unit by counts or colors, units other than the file's, bands without a filter, and missing profiles.
@@ -105,7 +105,7 @@ def read_catalog(path, catalog_map=None, **options):
     # counts need an area that is right
     texts += list(_hours(table, catalog)) or _odd_units(catalog)
     for text in texts:
-        warnings.warn(f"{path.name}: {text}", MiricigaleWarning, stacklevel=2)
+        warnings.warn(f"{path.name}: {text}", CatalogWarning, stacklevel=2)
     return catalog
 
 

@@ -19,7 +19,7 @@ from miricigale.scene.catalog_files import read_catalog
 from miricigale.scene.cutouts import Cutout
 from miricigale.scene.render import FieldPainter, Painter
 from miricigale.scene.sky import local_jacobian, pixel_positions
-from miricigale.utils.exceptions import MiricigaleWarning, argument_error
+from miricigale.utils.exceptions import CatalogWarning, argument_error
 from miricigale.utils.meta import provenance
 from miricigale.utils.tables import Flags, described_table
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, positive, to_array
@@ -84,7 +84,7 @@ class Scene:
 
     Warns
     -----
-    `~miricigale.utils.exceptions.MiricigaleWarning`
+    `~miricigale.utils.exceptions.CatalogWarning`
         If fluxes are NaN, infinite or negative, with the number of each: such sources are not
         painted, and flagged in the truth.
 
@@ -213,7 +213,7 @@ class Scene:
             f"{len(ids)} of {len(self._catalog)} sources are not painted: fluxes in {self._filter!r} "
             f"are {', '.join(counts)} (flag no_flux of the truth): ids {first}"
         )
-        warnings.warn(msg, MiricigaleWarning, stacklevel=3)
+        warnings.warn(msg, CatalogWarning, stacklevel=3)
 
     @staticmethod
     def _check_background(background):

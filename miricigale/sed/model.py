@@ -373,7 +373,7 @@ class SEDModel:
 
         Warns
         -----
-        `~miricigale.utils.exceptions.MiricigaleWarning`
+        `~miricigale.utils.exceptions.ModelWarning`
             If a column's name is within a letter or two of a parameter's.
         """
         return tables.flux_table(self, table, self._bands(filters))

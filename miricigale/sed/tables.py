@@ -19,7 +19,7 @@ from miricigale.sed.derived import (
     scaled_quantities,
 )
 from miricigale.sed.spectrum import SED, ModelSpectra, distance
-from miricigale.utils.exceptions import MiricigaleWarning, argument_error
+from miricigale.utils.exceptions import ModelWarning, argument_error
 from miricigale.utils.tables import Flags, described_table
 from miricigale.utils.units import FNU, WAVE
 
@@ -77,7 +77,7 @@ def _warn_of_slips(model, names):
         close = difflib.get_close_matches(name.lower(), lower, n=1, cutoff=0.85)
         if close:
             msg = f"column {name!r} is no parameter and left alone: is it {lower[close[0]]!r}?"
-            warnings.warn(msg, MiricigaleWarning, stacklevel=4)
+            warnings.warn(msg, ModelWarning, stacklevel=4)
 
 
 def _keys(columns, names, rows):
@@ -135,7 +135,7 @@ def spectra(model, values):
         spectrum = spectrum + got["agn_power"] * agn.total
     if values.get("frac_agn", 0.0) > 0.0 and got["agn_power"][0] == 0.0:
         msg = "frac_agn has no effect: the galaxy has no dust luminosity that it could refer to"
-        warnings.warn(msg, MiricigaleWarning, stacklevel=4)
+        warnings.warn(msg, ModelWarning, stacklevel=4)
     far = distance(z, model.cosmology)
     scaled = scaled_quantities(model, got, np.array([values["mass"]]), z, far, values)
     factor = chain.sky(values) * (values["mass"] * float(dilution(z, far)))

@@ -5,10 +5,18 @@ import difflib
 from astropy.utils.exceptions import AstropyUserWarning
 
 __all__ = [
+    "CatalogWarning",
     "ConfigError",
     "DataError",
+    "DetectorWarning",
+    "FitWarning",
     "MiricigaleWarning",
+    "ModelWarning",
     "OtherResultsError",
+    "PSFWarning",
+    "PhotometryWarning",
+    "ReductionWarning",
+    "ReferenceWarning",
     "argument_error",
     "unknown_name",
 ]
@@ -40,7 +48,39 @@ class OtherResultsError(ValueError):
 
 
 class MiricigaleWarning(AstropyUserWarning):
-    """Something that the user can mend or should know of."""
+    """Something that the user can mend or should know of; the base of all warnings of the package."""
+
+
+class CatalogWarning(MiricigaleWarning):
+    """Rows or columns of a catalog that are not used, or not as they stand."""
+
+
+class ReferenceWarning(MiricigaleWarning):
+    """Reference data that are assumed, of another instrument setting, or missing."""
+
+
+class ModelWarning(MiricigaleWarning):
+    """Spectra or templates that do not cover what is asked of them."""
+
+
+class DetectorWarning(MiricigaleWarning):
+    """Saturation and other limits of simulated exposures."""
+
+
+class ReductionWarning(MiricigaleWarning):
+    """Backgrounds and ramps that could not be determined as asked."""
+
+
+class PSFWarning(MiricigaleWarning):
+    """PSFs or kernels that are approximate, cut off or not normalized."""
+
+
+class PhotometryWarning(MiricigaleWarning):
+    """Images, errors or templates of photometry that limit what its fluxes mean."""
+
+
+class FitWarning(MiricigaleWarning):
+    """Bands or errors of a fit that are not used, or not as given."""
 
 
 def argument_error(name, wanted, got):
