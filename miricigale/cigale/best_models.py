@@ -61,7 +61,7 @@ def best_model_table(
         As `~miricigale.sed.SEDModel.values`.
     """
     values = model.values(parameters)
-    spectra = model.decompose(**parameters)
+    spectra = model.evaluate(**parameters)
     chain, mass = model.chain, values["mass"]
     derived = {name: quantity.value for name, quantity in spectra.derived.items()}
     stars, quantities = _stars(model, values)

@@ -78,11 +78,11 @@ def mid_infrared_fractions(model, parameters):
     out = np.full(len(parameters), np.nan)
     for k, row in enumerate(parameters):
         try:
-            spectra = model.decompose(**{name: row[name] for name in names})
+            spectra = model.evaluate(**{name: row[name] for name in names})
         except ValueError:
             # outside of the libraries, or without a mass
             continue
-        total, parts = spectra.total, spectra.components
+        total, parts = spectra, spectra.components
         agn = sum((parts[name].fnu for name in _AGN_PARTS if name in parts), start=0 * total.fnu)
         out[k] = light_share(total.wave / (1 + total.redshift), total.fnu, agn)
     return out

@@ -1,16 +1,17 @@
 """Names of bands: of CIGALE, old and new, and of surveys, for ours."""
 
-import os
 import re
 import tomllib
 from functools import cache
 from importlib import resources as importlib_resources
-from pathlib import Path
 
-from miricigale.filters.filter import Filter
-from miricigale.filters.library import SEDPY, curve_folder
-from miricigale.utils.exceptions import argument_error
+from miricigale.filters.library import FILTERS, SEDPY, curve_folder
 
+# between the parts of a name, and the endings of the files of curves
+_BETWEEN = re.compile(r"[\s._/:-]+")
+_ENDING = re.compile(r"\.(dat|txt|par|res|filter)$", re.IGNORECASE)
+# bands that are one of a single instrument, whatever is before them
+_ALONE = re.compile(r"f\d+\w*|ch[1-4]|j[123]|h[12]|f850lp")
 _XRAY = re.compile(r"xray_boxcar_(\d+(?:p\d+)?)to(\d+(?:p\d+)?)keV")
 
 
@@ -32,7 +33,40 @@ def _curves():
 def _is_here(name):
     if name.startswith(SEDPY):
         return name.removeprefix(SEDPY) in _curves()
-    return name in Filter.names()
+    return name in FILTERS.names()
+
+
+@cache
+def find_filter(text):
+    """
+    Filter that a name in any of the usual forms is.
+
+    Parameters
+    ----------
+    text : str
+        A name of the library, its band alone where that leaves no choice (``F770W``), a curve of astro-sedpy,
+        or a name of CIGALE's, EAZY's, the SVO's, 3D-HST's or of papers: ``JWST/MIRI.F770W``,
+        ``wfc3_ir_f160w``, ``IRAC 3.6``, ``sdss_r``.
+
+    Returns
+    -------
+    name : str or None
+        A name for `~miricigale.filters.Filter.from_name`; None if there is no such curve here.
+    """
+    lower = text.lower()
+    alone = _ALONE.fullmatch(lower)
+    found = [
+        name
+        for name in FILTERS.names()
+        if lower == name or (alone and lower == name.partition(".")[2])
+    ]
+    if len(found) == 1:
+        return found[0]
+    name = filter_of_band(text)
+    if name is None and text in _curves():
+        ours = [name for name in FILTERS.names() if FILTERS.metadata(name)["curve"] == text]
+        name = ours[0] if ours else SEDPY + text
+    return name
 
 
 @cache
@@ -59,9 +93,11 @@ def filter_of_band(band):
     name = _by_rule(band)
     if name is not None:
         return name
+    plain = _BETWEEN.sub(".", _ENDING.sub("", band.strip()))
     for rule, ours in free:
-        match = rule.fullmatch(band)
-        written = (match[1].lower(), match[1].upper(), match[1].capitalize()) if match else ()
+        match = rule.fullmatch(plain)
+        part = "".join(match.groups()) if match else ""
+        written = (part.lower(), part.upper(), part.capitalize()) if match else ()
         for name in map(ours.format, written):
             if _is_here(name):
                 return name
@@ -143,46 +179,3 @@ def band_filters(bands, known):
         else:
             filters[name] = band
     return filters, lost
-
-
-def given_filters(names):
-    """
-    Filters that a user gave for bands.
-
-    Parameters
-    ----------
-    names : dict of str to `~miricigale.filters.Filter`, str or path-like, or None
-        By the band's name a filter, the name of one here, or the path of its file (see `Filter.read`); the
-        filter of a file has the name of the band.
-
-    Returns
-    -------
-    filters : dict of str to `~miricigale.filters.Filter`
-
-    Raises
-    ------
-    KeyError
-        If there is no filter of a name.
-    `~miricigale.utils.exceptions.DataError`
-        If a file cannot be read as a filter.
-    ValueError
-        If a value is something else.
-    """
-    out = {}
-    for band, given in (names or {}).items():
-        if isinstance(given, Filter):
-            out[band] = given
-        elif isinstance(given, os.PathLike) or (isinstance(given, str) and _is_path(given)):
-            out[band] = Filter.read(Path(given).expanduser(), name=band)
-        elif isinstance(given, str):
-            out[band] = Filter.from_name(filter_of_band(given) or given)
-        else:
-            wanted = f"a dict whose value for {band!r} is a Filter, the name of one or the path of its file"
-            raise argument_error("names", wanted, type(given).__name__)
-    return out
-
-
-def _is_path(text):
-    if filter_of_band(text) is not None:
-        return False
-    return os.sep in text or Path(text).suffix in (".dat", ".txt", ".par") or Path(text).is_file()

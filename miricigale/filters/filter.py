@@ -2,15 +2,21 @@
 
 import dataclasses
 import functools
+import os
+import re
 from pathlib import Path
 
 import astropy.units as u
 import numpy as np
+from astropy.table import QTable
 
 from miricigale.filters import _core
-from miricigale.filters.library import FILTERS, full_name, load_curve
-from miricigale.utils.exceptions import DataError, argument_error
-from miricigale.utils.files import unpacked_size
+from miricigale.filters.band_names import find_filter
+from miricigale.filters.library import FILTERS, load_curve
+from miricigale.filters.spectra import check_wave, spectrum_arrays
+from miricigale.utils.exceptions import DataError, argument_error, unknown_name
+from miricigale.utils.files import read_table, unpacked_size, write_table
+from miricigale.utils.interactive import Interactive
 from miricigale.utils.units import FNU, WAVE, Frozen, frozen_array, frozen_quantity, to_array
 
 #: Version of the band averages: raised when the same curve gives other numbers.
@@ -18,6 +24,10 @@ VERSION = 1
 
 #: Share of a band that a spectrum may leave uncovered.
 UNCOVERED = 1e-4
+
+# what a header says of the wavelengths of a curve
+_UNITS = re.compile(r"\b(um|microns?|nm|AA|Angstroms?)\b", re.IGNORECASE)
+_TABLES = (".ecsv", ".fits", ".fit", ".xml", ".vot", ".votable")
 
 # relative width of the step to zero at the end of a curve that does not end in zero
 _STEP = 1e-6
@@ -37,15 +47,17 @@ def _padded(wave, throughput):
     return wave, throughput
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
-class Filter(Frozen):
+@dataclasses.dataclass(frozen=True, eq=False, repr=False, init=False)
+class Filter(Frozen, Interactive):
     """
     A passband: the response to photons against wavelength.
 
+    ``Filter("F770W")`` is the one of the library (`from_name`); ``filter(wave)`` is the throughput there.
+
     Parameters
     ----------
-    wave : `~astropy.units.Quantity`, shape (n,)
-        Strictly ascending wavelengths.
+    wave : `~astropy.units.Quantity`, shape (n,), or str
+        Strictly ascending wavelengths; or a name for `from_name`, alone.
     throughput : array_like, shape (n,)
         Detected share of the photons, or anything in proportion; not negative. Between
         the wavelengths it is linear. Zeros beyond the first at each end are trimmed, and
@@ -72,6 +84,8 @@ class Filter(Frozen):
     >>> from miricigale.filters import Filter
     >>> Filter([9, 9.5, 10.5, 11] * u.um, [0, 1, 1, 0], name="mine").pivot
     <Quantity 9.98955573 um>
+    >>> Filter("JWST/MIRI.F770W").name
+    'miri.f770w'
     """
 
     wave: u.Quantity
@@ -82,7 +96,47 @@ class Filter(Frozen):
     reference_wavelength: u.Quantity | None = None
     reference_temperature: u.Quantity | None = None
 
-    def __post_init__(self):
+    _other_names = {
+        "wavelength": "wave",
+        "transmission": "throughput",
+        "response": "throughput",
+        "pivot_wavelength": "pivot",
+        "mean_wavelength": "effective_wavelength",
+        "bandwidth": "width",
+        "effective_width": "width",
+        "edges": "bounds",
+        "from_file": "read",
+    }
+
+    def __init__(
+        self,
+        wave,
+        throughput=None,
+        name=None,
+        *,
+        meta=None,
+        reference_wavelength=None,
+        reference_temperature=None,
+    ):
+        if isinstance(wave, str) and throughput is None:
+            self.__dict__.update(Filter.from_name(wave).__dict__)
+            return
+        if isinstance(wave, str):
+            # the name first, as others have it
+            wave, throughput, name = throughput, name, wave
+        if throughput is None or name is None:
+            raise argument_error("name", "given with 'wave' and 'throughput'", repr(name))
+        self.__dict__.update(
+            wave=wave,
+            throughput=throughput,
+            name=name,
+            meta=meta,
+            reference_wavelength=reference_wavelength,
+            reference_temperature=reference_temperature,
+        )
+        self._check()
+
+    def _check(self):
         wave = to_array(self.wave, WAVE, "wave", ndim=1, finite=True)
         throughput = to_array(self.throughput, u.one, "throughput", ndim=1, finite=True)
         if wave.size < 2 or wave.shape != throughput.shape:
@@ -106,6 +160,29 @@ class Filter(Frozen):
     def __repr__(self):
         return f"<Filter {self.name}: pivot {self.pivot:.4f}, width {self.width:.3f}>"
 
+    def _facts(self):
+        return {
+            "Filter": self.name,
+            "pivot": f"{self.pivot:.4f}",
+            "width": f"{self.width:.4f}",
+            "source": self.meta.get("source", ""),
+        }
+
+    def _key(self):
+        curve = self.wave.value.tobytes(), self.throughput.tobytes()
+        return self.name, *curve, self.reference_wavelength, self.reference_temperature
+
+    def __eq__(self, other):
+        return self._key() == other._key() if isinstance(other, Filter) else NotImplemented
+
+    def __hash__(self):
+        return hash(self._key()[:3])
+
+    def __call__(self, wave):
+        """Throughput at wavelengths, by straight lines; 0 outside."""
+        x = to_array(wave, WAVE, "wave")
+        return np.interp(x, self.wave.value, self.throughput, left=0.0, right=0.0)
+
     @classmethod
     def from_name(cls, name):
         """
@@ -114,8 +191,8 @@ class Filter(Frozen):
         Parameters
         ----------
         name : str
-            One of `names`, such as ``"miri.f770w"``, also written ``"MIRI.F770W"`` or ``"F770W"``,
-            or ``"sedpy."`` and the name of any curve of astro-sedpy.
+            One of `names`, such as ``"miri.f770w"``, in any usual form (``"F770W"``, ``"JWST/MIRI.F770W"``,
+            ``"wfc3_ir_f160w"``, ``"IRAC1"``, ``"SDSS r"``), or ``"sedpy."`` and any curve of astro-sedpy.
 
         Returns
         -------
@@ -125,9 +202,12 @@ class Filter(Frozen):
         Raises
         ------
         KeyError
-            If there is no such filter; the message lists the known ones.
+            If there is no such filter; the message lists the nearest ones.
         """
-        return _from_name(full_name(name))
+        found = find_filter(str(name))
+        if found is None and not str(name).startswith("sedpy."):
+            raise unknown_name("filter", name, FILTERS.names())
+        return _from_name(found or str(name))
 
     @staticmethod
     def names():
@@ -135,20 +215,21 @@ class Filter(Frozen):
         return tuple(FILTERS.names())
 
     @classmethod
-    def read(cls, path, *, name=None, unit=u.AA):
+    def read(cls, path, *, name=None, unit=None):
         """
-        Read a filter from a text file.
+        Read a filter from a file.
 
         Parameters
         ----------
         path : path-like
-            Two columns, wavelength and throughput. Comment lines start with ``#``; those
-            at the top may hold, as in CIGALE's files, the name, the word ``photon`` or
-            ``energy`` (what the throughput counts, else photons) and a description.
+            Two columns, wavelength and throughput: a table with units (ECSV, FITS, VOTable as of the SVO), or
+            text. Its comments start with ``#``; those at the top may hold, as in CIGALE's files, the name,
+            the word ``photon`` or ``energy`` (what the throughput counts, else photons) and a
+            description, or name the unit of the wavelengths.
         name : str, optional
             Name of the filter; else the one in the file, else that of the file.
         unit : `~astropy.units.Unit`, optional
-            Unit of the wavelengths.
+            Unit of the wavelengths; else the one in the file, Angstrom in CIGALE's.
 
         Returns
         -------
@@ -157,9 +238,16 @@ class Filter(Frozen):
         Raises
         ------
         `~miricigale.utils.exceptions.DataError`
-            If the file is missing or has not two columns of numbers.
+            If the file is missing, has not two columns of numbers, or no unit of the wavelengths is known.
         """
-        path = Path(path)
+        path = Path(path).expanduser()
+        if path.suffix.lower() in _TABLES:
+            table = read_table(path, wanted="a filter")
+            if len(table.colnames) < 2 or not hasattr(table.columns[0], "unit"):
+                msg = f"filter file {path} has not two columns, the first with a unit"
+                raise DataError(msg)
+            wave, throughput = (table[column] for column in table.colnames[:2])
+            return cls(wave, throughput, name or table.meta.get("name") or path.stem)
         unpacked_size(path)
         try:
             lines = path.read_text().splitlines()
@@ -178,14 +266,29 @@ class Filter(Frozen):
         kinds = [text.lower() for text in comments[:3] if text.lower() in ("photon", "energy")]
         if name is None:
             name = comments[0] if kinds and comments[0].lower() not in kinds else path.stem
+        if unit is None:
+            found = _UNITS.search(" ".join(comments))
+            if not kinds and found is None:
+                msg = f"filter file {path} does not say the unit of its wavelengths: give 'unit'"
+                raise DataError(msg)
+            unit = u.AA if kinds else _unit(found[1])
         order = np.argsort(wave)
         wave, throughput = wave[order], throughput[order]
         if kinds[:1] == ["energy"]:
             throughput = throughput / (wave / wave.mean())
         return cls(wave * u.Unit(unit), throughput, name=name, meta={"source": path.name})
 
+    def to_table(self):
+        """The curve as a `~astropy.table.QTable` of ``wave`` (um) and ``throughput``."""
+        meta = {"name": self.name, **self.meta}
+        return QTable({"wave": self.wave, "throughput": self.throughput}, meta=meta)
+
+    def write(self, path, *, overwrite=False):
+        """Write the curve as a table, in the format of the suffix (``.ecsv``, ``.fits``, ...)."""
+        write_table(self.to_table(), path, overwrite=overwrite)
+
     @classmethod
-    def from_synphot(cls, bandpass, *, name):
+    def from_synphot(cls, bandpass, *, name=None):
         """
         Make a filter of a synphot bandpass.
 
@@ -193,8 +296,8 @@ class Filter(Frozen):
         ----------
         bandpass : `synphot.SpectralElement`
             With a finite wavelength set.
-        name : str
-            Name of the filter.
+        name : str, optional
+            Name of the filter; the bandpass's expression if not given.
 
         Returns
         -------
@@ -204,6 +307,7 @@ class Filter(Frozen):
         if wave is None:
             raise argument_error("bandpass", "one with a wavelength set", bandpass)
         throughput = np.asarray(bandpass(wave).value, dtype=float)
+        name = name or str(bandpass.meta.get("expr") or "synphot")
         return cls(wave, throughput, name=name, meta={"source": "synphot"})
 
     def to_synphot(self):
@@ -240,6 +344,18 @@ class Filter(Frozen):
         """Rectangular width, int T dlam / max T, um."""
         wave, throughput, _ = self._fine
         return _core.photon_integral(wave, throughput, 1) / throughput.max() * WAVE
+
+    @functools.cached_property
+    def fwhm(self):
+        """Full width at half of the highest throughput, um."""
+        wave, throughput, _ = self._fine
+        high = wave[throughput >= 0.5 * throughput.max()]
+        return (high[-1] - high[0]) * WAVE
+
+    @property
+    def bounds(self):
+        """Wavelengths beyond which the throughput is 0, um, shape (2,)."""
+        return self.wave[[0, -1]]
 
     @functools.cached_property
     def catalog_factor(self):
@@ -308,15 +424,18 @@ class Filter(Frozen):
             raise ValueError(msg)
         return first, part / covered if covered > 0 else part
 
-    def synthetic_flux(self, sed):
+    def synthetic_flux(self, sed, flux=None):
         """
         Mean flux density of a spectrum in this band (photon-counting, AB convention).
 
         Parameters
         ----------
         sed : object
-            With ``wave`` and ``fnu``, quantities of one dimension; F_nu is taken as
-            linear between the wavelengths.
+            An `~miricigale.sed.SED`, a pair of wavelengths and flux densities (F_nu or F_lambda), a
+            spectrum of specutils or synphot, or an astropy model of a flux density. F_nu is taken as linear
+            between the wavelengths.
+        flux : `~astropy.units.Quantity`, optional
+            Flux densities, if ``sed`` is the wavelengths.
 
         Returns
         -------
@@ -332,9 +451,13 @@ class Filter(Frozen):
         ----------
         Bessell & Murphy 2012, PASP, 124, 140, equation A15.
         """
-        wave, fnu = spectrum_arrays(sed)
+        wave, fnu = spectrum_arrays(sed if flux is None else (sed, flux), self._fine[0])
         first, part = self._weights(wave, UNCOVERED)
         return float(part @ fnu[first : first + part.size]) * FNU
+
+    def synthetic_magnitude(self, sed, flux=None):
+        """AB magnitude of a spectrum in this band; see `synthetic_flux`."""
+        return self.synthetic_flux(sed, flux).to(u.ABmag)
 
     def plot(self, ax=None, **kwargs):
         """
@@ -356,25 +479,58 @@ class Filter(Frozen):
         return plot_filters([(self.wave.value, self.throughput, self.name)], ax=ax, **kwargs)
 
 
-def check_wave(wave):
-    """Wavelengths of a spectrum as an array in um."""
-    wave = (
-        to_array(wave, WAVE, "wave", ndim=1) if hasattr(wave, "unit") else np.asarray(wave, float)
-    )
-    if wave.ndim != 1 or wave.size < 2 or not np.all(np.diff(wave) > 0):
-        raise argument_error("wave", "two or more strictly ascending wavelengths", wave)
-    return wave
+def _unit(word):
+    return u.um if word.lower().startswith("micron") else u.Unit("AA" if word[:1] in "aA" else word)
 
 
-def spectrum_arrays(sed):
-    """Wavelengths (um) and F_nu (uJy) of anything with ``wave`` and ``fnu``."""
-    if not (hasattr(sed, "wave") and hasattr(sed, "fnu")):
-        raise argument_error("sed", "an object with wave and fnu", type(sed).__name__)
-    wave, fnu = check_wave(sed.wave), to_array(sed.fnu, FNU, "sed.fnu", ndim=1)
-    if wave.shape != fnu.shape:
-        got = f"{fnu.size} for {wave.size} wavelengths"
-        raise argument_error("sed.fnu", "as many values as sed.wave", got)
-    return wave, fnu
+def as_filter(given, name=None, *, unit=None):
+    """
+    Filter of anything that says which one is meant.
+
+    Parameters
+    ----------
+    given : `Filter`, str, path-like or `synphot.SpectralElement`
+        A filter, a name for `Filter.from_name`, the path of a file for `Filter.read`, or a bandpass.
+    name : str, optional
+        Name of what comes from a file or a bandpass.
+    unit : `~astropy.units.Unit`, optional
+        As for `Filter.read`.
+
+    Returns
+    -------
+    filter : `Filter`
+
+    Raises
+    ------
+    KeyError
+        If there is no filter of a name.
+    `~miricigale.utils.exceptions.DataError`
+        If a file cannot be read as a filter.
+    ValueError
+        If it is something else.
+    """
+    if isinstance(given, Filter):
+        return given
+    if isinstance(given, os.PathLike) or (isinstance(given, str) and _is_path(given)):
+        return Filter.read(given, name=name, unit=unit)
+    if isinstance(given, str):
+        return Filter.from_name(given)
+    if hasattr(given, "waveset"):
+        return Filter.from_synphot(given, name=name)
+    wanted = "a Filter, the name of one, the path of its file or a synphot SpectralElement"
+    raise argument_error(name or "filter", wanted, type(given).__name__)
+
+
+def _is_path(text):
+    if find_filter(text) is not None:
+        return False
+    endings = (".dat", ".txt", ".par", *_TABLES)
+    return text.lower().endswith(endings) or os.path.isfile(os.path.expanduser(text))
+
+
+def given_filters(names):
+    """Filters that a user of CIGALE gave for bands, a dict by the band of what `as_filter` takes."""
+    return {band: as_filter(given, band, unit=u.AA) for band, given in (names or {}).items()}
 
 
 @functools.lru_cache(maxsize=512)

@@ -1,26 +1,29 @@
 """Several filters at once."""
 
 import dataclasses
+import fnmatch
 
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from miricigale.filters.filter import UNCOVERED, Filter, check_wave, spectrum_arrays
-from miricigale.filters.library import full_name
+from miricigale.filters.band_names import find_filter
+from miricigale.filters.filter import UNCOVERED, Filter, as_filter
+from miricigale.filters.spectra import check_wave, spectrum_arrays
 from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.interactive import Interactive
 from miricigale.utils.units import FNU, WAVE
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
-class FilterSet:
+class FilterSet(Interactive):
     """
     An ordered set of filters.
 
     Parameters
     ----------
     filters : iterable of `Filter` or str
-        Filters, or names of the library.
+        Filters, or anything else for `as_filter`; ``"miri.*"`` stands for all names of the library of this form.
 
     Raises
     ------
@@ -40,18 +43,21 @@ class FilterSet:
 
     filters: tuple
 
+    _other_names = {"pivot": "pivots"}
+
     def __post_init__(self):
-        items = [self.filters] if isinstance(self.filters, (str, Filter)) else self.filters
-        filters = tuple(f if isinstance(f, Filter) else Filter.from_name(f) for f in items)
+        items = self.filters
+        items = [items] if isinstance(items, (str, Filter)) or hasattr(items, "waveset") else items
+        filters = tuple(one for item in items for one in _each(item))
         names = [f.name for f in filters]
         if not names or len(set(names)) < len(names):
             raise argument_error("filters", "one or more filters of different names", names)
         object.__setattr__(self, "filters", filters)
 
     @classmethod
-    def from_names(cls, names):
-        """Make a set of filters of the library; see `Filter.from_name`."""
-        return cls(names)
+    def from_names(cls, *names):
+        """Make a set of filters of the library, by a list of names or several; see `Filter.from_name`."""
+        return cls(names[0] if len(names) == 1 else names)
 
     @property
     def names(self):
@@ -71,7 +77,7 @@ class FilterSet:
 
     def __contains__(self, name):
         name = getattr(name, "name", name)
-        return name in self.names or (isinstance(name, str) and full_name(name) in self.names)
+        return name in self.names or (isinstance(name, str) and find_filter(name) in self.names)
 
     def __getitem__(self, key):
         """The filter of a name or number; for a slice or a list of names, a set."""
@@ -81,7 +87,7 @@ class FilterSet:
             return FilterSet([self[name] for name in key])
         if isinstance(key, str):
             known = self.names
-            name = key if key in known else full_name(key)
+            name = key if key in known else find_filter(key)
             if name not in known:
                 raise unknown_name("filter in this set", key, known)
             return self.filters[known.index(name)]
@@ -89,6 +95,23 @@ class FilterSet:
 
     def __repr__(self):
         return f"<FilterSet {', '.join(self.names)}>"
+
+    def __add__(self, other):
+        others = other.filters if isinstance(other, FilterSet) else (as_filter(other),)
+        return FilterSet((*self.filters, *others))
+
+    def __eq__(self, other):
+        return self.filters == other.filters if isinstance(other, FilterSet) else NotImplemented
+
+    def __hash__(self):
+        return hash(self.filters)
+
+    def to_table(self):
+        """The filters as a `~astropy.table.QTable`: ``name``, ``pivot`` and ``width`` (um)."""
+        return _table(self.filters)
+
+    def _repr_html_(self):
+        return self.to_table()._repr_html_()
 
     def weights(self, wave, *, tolerance=UNCOVERED):
         """
@@ -127,14 +150,15 @@ class FilterSet:
         Parameters
         ----------
         sed : object
-            With ``wave`` and ``fnu``, quantities of one dimension.
+            See `Filter.synthetic_flux`.
 
         Returns
         -------
         fluxes : `~astropy.units.Quantity`, shape (n_filters,)
             In uJy.
         """
-        wave, fnu = spectrum_arrays(sed)
+        where = np.unique(np.concatenate([band._fine[0] for band in self.filters]))
+        wave, fnu = spectrum_arrays(sed, where)
         return self.weights(wave) @ fnu * FNU
 
     def plot(self, ax=None, **kwargs):
@@ -174,12 +198,19 @@ def filter_table(pattern=""):
     table : `~astropy.table.QTable`
         ``name``, ``pivot`` and ``width`` (um).
     """
-    names = [name for name in Filter.names() if pattern.lower() in name]
-    filters = [Filter.from_name(name) for name in names]
-    return QTable(
-        {
-            "name": np.array(names, dtype=str),
-            "pivot": u.Quantity([f.pivot for f in filters], u.um) if names else [] * u.um,
-            "width": u.Quantity([f.width for f in filters], u.um) if names else [] * u.um,
-        }
-    )
+    return _table([Filter.from_name(name) for name in Filter.names() if pattern.lower() in name])
+
+
+def _table(filters):
+    widths = {key: [getattr(f, key).value for f in filters] * WAVE for key in ("pivot", "width")}
+    return QTable({"name": np.array([f.name for f in filters], dtype=str), **widths})
+
+
+def _each(item):
+    """The filters that an item of a set stands for."""
+    if isinstance(item, str) and "*" in item:
+        found = fnmatch.filter(Filter.names(), item.lower())
+        if not found:
+            raise unknown_name("filters like", item, Filter.names())
+        return [Filter.from_name(name) for name in found]
+    return [as_filter(item)]

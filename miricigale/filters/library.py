@@ -81,18 +81,6 @@ def _load(name):
     return wave * WAVE, throughput, {"meta": meta, **metadata}
 
 
-def full_name(name):
-    """
-    Name in the library of a filter that may be written ``MIRI.F770W`` or ``F770W``.
-
-    In upper or lower case, with its instrument or without where that leaves no choice; as it came
-    if the library has nothing of the kind.
-    """
-    lower = str(name).lower()
-    found = [one for one in FILTERS.names() if lower in (one, one.partition(".")[2])]
-    return found[0] if len(found) == 1 else str(name)
-
-
 def load_curve(name):
     """Wavelengths, throughput and options of `Filter` of a filter of the library."""
     if name.startswith(SEDPY):

@@ -4,9 +4,8 @@ import dataclasses
 import re
 import types
 
-from miricigale.filters.band_names import filter_of_band
+from miricigale.filters.band_names import find_filter
 from miricigale.filters.filter import Filter
-from miricigale.filters.library import full_name
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.tables import error_column
 
@@ -41,7 +40,7 @@ class _Survey:
                 continue
             band = self.bands.get(match[1], "")
             if band == "":
-                band = filter_of_band(match[1]) or full_name(match[1])
+                band = find_filter(match[1])
             if band is None or not is_band(band):
                 lost.append(name)
             elif band in found:

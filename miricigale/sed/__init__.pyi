@@ -18,7 +18,6 @@ from .presets import survey_priors as survey_priors
 from .presets import yang2021_axes as yang2021_axes
 from .spectrum import COSMOLOGY as COSMOLOGY
 from .spectrum import SED as SED
-from .spectrum import ModelSpectra as ModelSpectra
 from .tables import ModelFlags as ModelFlags
 from .templates import read_spectra as read_spectra
 from .templates import template_grid as template_grid

@@ -322,28 +322,18 @@ class SEDModel:
         Returns
         -------
         sed : `SED`
-            As observed; ``meta["derived"]`` holds the derived quantities.
+            As observed, with its ``components``, ``parameters`` and ``derived`` quantities.
 
         Raises
         ------
         KeyError, ValueError
             See `values`.
         """
-        return self.decompose(**parameters).total
-
-    def decompose(self, **parameters):
-        """
-        Spectra of one model, part by part, with derived quantities.
-
-        Returns
-        -------
-        spectra : `ModelSpectra`
-        """
         return tables.spectra(self, self.values(parameters))
 
     def derived(self, **parameters):
         """Derived quantities of one model: dict of name to `~astropy.units.Quantity`."""
-        return self.decompose(**parameters).derived
+        return self.evaluate(**parameters).derived
 
     def fluxes(self, table, filters):
         """

@@ -6,9 +6,17 @@ from dataclasses import dataclass, field
 import astropy.units as u
 import numpy as np
 from astropy.cosmology import FlatLambdaCDM
+from astropy.table import QTable
 
-from miricigale.utils.exceptions import argument_error
-from miricigale.utils.units import FNU, WAVE, Frozen, frozen_quantity, to_array
+from miricigale.filters import FilterSet, as_filter
+from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.files import read_table, write_table
+from miricigale.utils.interactive import Interactive
+from miricigale.utils.meta import full_meta
+from miricigale.utils.optional import require
+from miricigale.utils.units import FNU, WAVE, Frozen, frozen_quantity, is_number, to_array
+
+_FLAM = u.erg / u.s / u.cm**2 / u.AA
 
 #: WMAP7, as in Yang et al. 2021.
 COSMOLOGY = FlatLambdaCDM(H0=70.4, Om0=0.272, name="yang2021")
@@ -31,9 +39,11 @@ def distance(redshift, cosmology):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class SED(Frozen):
+class SED(Frozen, Interactive):
     """
     Spectral energy distribution: flux density against observed wavelength.
+
+    It can be multiplied by numbers, and added to another one with the same wavelengths.
 
     Parameters
     ----------
@@ -44,7 +54,11 @@ class SED(Frozen):
     redshift : float, optional
         Redshift at which the source is seen.
     meta : dict, optional
-        Anything that should stay with it.
+        Anything that should stay with it; of a model its ``parameters`` and ``derived`` quantities.
+    components : dict of str to `SED`, optional
+        Its parts at the same wavelengths. Of a model ``stellar`` (attenuated), ``dust``, with gas ``nebular``
+        (attenuated) and with an AGN ``agn_disk``, ``agn_torus`` and ``agn_polar`` sum to the whole;
+        ``stellar_intrinsic`` is the light of stars and gas before dust.
 
     Raises
     ------
@@ -67,6 +81,15 @@ class SED(Frozen):
     _: dataclasses.KW_ONLY
     redshift: float = 0.0
     meta: dict = field(default_factory=dict)
+    components: dict = field(default_factory=dict)
+
+    _other_names = {
+        "wavelength": "wave",
+        "flux": "fnu",
+        "properties": "derived",
+        "to_spectrum": "to_specutils",
+        "to_spectrum1d": "to_specutils",
+    }
 
     def __post_init__(self):
         if not hasattr(self.fnu, "unit"):
@@ -89,6 +112,55 @@ class SED(Frozen):
         object.__setattr__(self, "fnu", fnu)
         object.__setattr__(self, "redshift", float(self.redshift))
         object.__setattr__(self, "meta", dict(self.meta))
+        object.__setattr__(self, "components", dict(self.components))
+
+    @property
+    def parameters(self):
+        """Parameters of the model: dict of name to `~astropy.units.Quantity`, empty of other spectra."""
+        return self.meta.get("parameters", {})
+
+    @property
+    def derived(self):
+        """Derived quantities of the model by name, such as ``stellar_mass``; see `SEDModel.derived_columns`."""
+        return self.meta.get("derived", {})
+
+    @property
+    def rest_wavelength(self):
+        """Wavelengths at the source, um."""
+        return self.wave / (1.0 + self.redshift)
+
+    @property
+    def frequency(self):
+        """Observed frequencies, Hz."""
+        return self.wave.to(u.Hz, u.spectral())
+
+    @property
+    def flam(self):
+        """Flux density F_lambda, erg/s/cm2/Angstrom."""
+        return self.fnu.to(_FLAM, u.spectral_density(self.wave))
+
+    def _each(self, change):
+        """Copy with F_nu of the whole and of each part changed."""
+        parts = {name: part._each(change) for name, part in self.components.items()}
+        return self.replace(fnu=change(self.fnu), components=parts)
+
+    def __mul__(self, number):
+        if not is_number(number):
+            return NotImplemented
+        return self._each(lambda fnu: fnu * number)
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, number):
+        return self * (1.0 / number) if is_number(number) else NotImplemented
+
+    def __add__(self, other):
+        if not isinstance(other, SED):
+            return NotImplemented
+        if self.redshift != other.redshift or not np.array_equal(self.wave, other.wave):
+            wanted = "an SED at the same redshift and wavelengths"
+            raise argument_error("other", wanted, repr(other))
+        return SED(self.wave, self.fnu + other.fnu, redshift=self.redshift)
 
     def replace(self, **changes):
         """Copy with other values of the constructor's arguments."""
@@ -131,7 +203,71 @@ class SED(Frozen):
         stretch = (1.0 + redshift) / (1.0 + self.redshift)
         ratio = distance(self.redshift, cosmology) / distance(redshift, cosmology)
         fnu = self.fnu * float(stretch * ratio**2)
-        return self.replace(wave=self.wave * stretch, fnu=fnu, redshift=redshift)
+        parts = {
+            name: part.redshifted(redshift, cosmology=cosmology)
+            for name, part in self.components.items()
+        }
+        return self.replace(wave=self.wave * stretch, fnu=fnu, redshift=redshift, components=parts)
+
+    def synthetic_flux(self, band):
+        """Mean flux density in a band; see `~miricigale.filters.Filter.synthetic_flux`."""
+        return as_filter(band).synthetic_flux(self)
+
+    def synthetic_magnitude(self, band):
+        """AB magnitude in a band."""
+        return self.synthetic_flux(band).to(u.ABmag)
+
+    def fluxes(self, bands):
+        """Mean flux densities in several bands, uJy, shape (n,); see `~miricigale.filters.FilterSet`."""
+        return FilterSet(bands).synthetic_fluxes(self)
+
+    def to_table(self):
+        """The spectrum as a `~astropy.table.QTable` of ``wave`` (um), ``fnu`` (uJy) and the parts."""
+        table = QTable({"wave": self.wave, "fnu": self.fnu})
+        for name, part in self.components.items():
+            table[name] = part.fnu
+        table.meta["redshift"] = self.redshift
+        for values in (self.parameters, self.derived):
+            table.meta |= {name: float(u.Quantity(one).value) for name, one in values.items()}
+        table.meta |= {k: v for k, v in self.meta.items() if k not in ("parameters", "derived")}
+        return table
+
+    def write(self, path, *, overwrite=False):
+        """Write the spectrum as a table, in the format of the suffix (``.ecsv``, ``.fits``, ...)."""
+        write_table(self.to_table(), path, overwrite=overwrite)
+
+    @classmethod
+    def read(cls, path):
+        """
+        Read a spectrum from a table.
+
+        Parameters
+        ----------
+        path : path-like
+            As `write` makes it, or with wavelengths and flux densities in the first two columns, with units.
+
+        Returns
+        -------
+        sed : `SED`
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.DataError`
+            If it is no such file.
+        """
+        table = read_table(path, wanted="a spectrum")
+        if len(table.columns) < 2 or any(not hasattr(c, "unit") for c in table.columns.values()):
+            msg = f"{path} has no two columns with units, wavelengths and flux densities"
+            raise DataError(msg)
+        meta = full_meta(table.meta)
+        redshift = float(meta.pop("redshift", 0.0))
+        wave, fnu, *names = table.colnames
+        parts = {
+            name: cls(table[wave], table[name], redshift=redshift)
+            for name in names
+            if table[name].unit.is_equivalent(FNU)
+        }
+        return cls(table[wave], table[fnu], redshift=redshift, meta=meta, components=parts)
 
     @classmethod
     def from_synphot(cls, spectrum, *, wave=None, redshift=None):
@@ -172,6 +308,12 @@ class SED(Frozen):
             Empirical1D, points=self.wave.to(u.AA), lookup_table=self.fnu, meta=self.meta
         )
 
+    def to_specutils(self):
+        """This spectrum for specutils (``Spectrum``, or ``Spectrum1D`` before its version 2)."""
+        specutils = require("specutils", extra="specutils")
+        kind = getattr(specutils, "Spectrum", None) or specutils.Spectrum1D
+        return kind(spectral_axis=self.wave, flux=self.fnu, meta=dict(self.meta))
+
     def plot(self, ax=None, **kwargs):
         """Draw the spectrum (`miricigale.plotting.spectra.plot_spectrum`) and return the axes."""
         from miricigale.plotting.spectra import plot_spectrum
@@ -184,27 +326,9 @@ class SED(Frozen):
             f"redshift {self.redshift:.4g}>"
         )
 
-
-@dataclass(frozen=True, eq=False)
-class ModelSpectra:
-    """
-    Spectra of one model, part by part.
-
-    Parameters
-    ----------
-    total : `SED`
-        The whole, as observed.
-    components : dict of str to `SED`
-        ``stellar`` (attenuated), ``dust``, with gas ``nebular`` (attenuated) and with an AGN
-        ``agn_disk``, ``agn_torus`` and ``agn_polar``: they sum to ``total``.
-        ``stellar_intrinsic`` is the light of stars and gas before dust.
-    derived : dict of str to `~astropy.units.Quantity`
-        See `SEDModel.derived_columns`.
-    parameters : dict of str to `~astropy.units.Quantity`
-        All parameters.
-    """
-
-    total: SED
-    components: dict
-    derived: dict
-    parameters: dict
+    def _facts(self):
+        span = f"{self.wave[0]:.4g} to {self.wave[-1]:.4g}, {self.wave.size} points"
+        facts = {"SED": span, "redshift": f"{self.redshift:.4g}"}
+        if self.components:
+            facts["components"] = ", ".join(self.components)
+        return facts | {name: f"{u.Quantity(one):.4g}" for name, one in self.derived.items()}

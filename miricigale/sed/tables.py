@@ -18,7 +18,7 @@ from miricigale.sed.derived import (
     galaxy_quantities,
     scaled_quantities,
 )
-from miricigale.sed.spectrum import SED, ModelSpectra, distance
+from miricigale.sed.spectrum import SED, distance
 from miricigale.utils.exceptions import ModelWarning, argument_error
 from miricigale.utils.tables import Flags, described_table
 from miricigale.utils.units import FNU, WAVE
@@ -121,7 +121,7 @@ def _stack(filters):
 
 
 def spectra(model, values):
-    """Spectra of one model part by part, with derived quantities; see `SEDModel.decompose`."""
+    """The spectrum of one model with its parts and derived quantities; see `SEDModel.evaluate`."""
     chain, z = model.chain, values["redshift"]
     galaxy, agn = chain.galaxy(values), None
     spectrum, absorbed = galaxy.light, np.array([galaxy.dust_luminosity])
@@ -135,7 +135,7 @@ def spectra(model, values):
         spectrum = spectrum + got["agn_power"] * agn.total
     if values.get("frac_agn", 0.0) > 0.0 and got["agn_power"][0] == 0.0:
         msg = "frac_agn has no effect: the galaxy has no dust luminosity that it could refer to"
-        warnings.warn(msg, ModelWarning, stacklevel=4)
+        warnings.warn(msg, ModelWarning, stacklevel=3)
     far = distance(z, model.cosmology)
     scaled = scaled_quantities(model, got, np.array([values["mass"]]), z, far, values)
     factor = chain.sky(values) * (values["mass"] * float(dilution(z, far)))
@@ -148,8 +148,8 @@ def spectra(model, values):
         for name, entry in model.derived_columns().items()
     }
 
-    def sed(spectrum, **meta):
-        return SED(wave, chain.lnu(spectrum) * factor * FNU, redshift=z, meta=meta)
+    def sed(spectrum, **options):
+        return SED(wave, chain.lnu(spectrum) * factor * FNU, redshift=z, **options)
 
     parts = {"stellar_intrinsic": sed(galaxy.intrinsic), "stellar": sed(galaxy.starlight)}
     if galaxy.nebular is not None:
@@ -159,8 +159,8 @@ def spectra(model, values):
     if agn is not None:
         for name in ("disk", "torus", "polar"):
             parts[f"agn_{name}"] = sed(got["agn_power"] * getattr(agn, name))
-    total = sed(spectrum, **model.meta, parameters=quantities, derived=derived)
-    return ModelSpectra(total, parts, derived, quantities)
+    meta = {**model.meta, "parameters": quantities, "derived": derived}
+    return sed(spectrum, meta=meta, components=parts)
 
 
 class _Blocks:

@@ -13,7 +13,8 @@ from astropy.io import fits
 from astropy.table import QTable
 
 from miricigale.utils.configuration import conf
-from miricigale.utils.exceptions import DataError
+from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.meta import fits_meta
 
 # how packed files begin, and the module of Python's that opens them
 _PACKED = {b"\x1f\x8b": "gzip", b"BZh": "bz2", b"\xfd7zXZ\x00": "lzma"}
@@ -341,6 +342,52 @@ def read_table(path, *, wanted, cls=QTable, form=None, hdu=None):
         raise
     except Exception as err:  # readers of different formats raise different exceptions
         raise _unreadable(path, wanted, err) from err
+
+
+#: Formats of tables by suffix, and what `astropy.table.Table.write` takes for each.
+_WRITERS = {
+    ".fits": {"format": "fits"},
+    ".fit": {"format": "fits"},
+    ".ecsv": {"format": "ascii.ecsv"},
+    ".csv": {"format": "ascii.csv"},
+    ".xml": {"format": "votable"},
+    ".vot": {"format": "votable"},
+    ".votable": {"format": "votable"},
+    ".h5": {"format": "hdf5", "path": "table", "serialize_meta": True},
+    ".hdf5": {"format": "hdf5", "path": "table", "serialize_meta": True},
+    ".parquet": {"format": "parquet"},
+}
+
+
+def write_table(table, path, *, overwrite=False):
+    """
+    Write a table in the format that the suffix of the file names.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        The table.
+    path : path-like
+        FITS, ECSV, CSV, VOTable (``.xml``), HDF5 (with h5py) or parquet (with pyarrow).
+    overwrite : bool, optional
+        Whether a file that is there is replaced.
+
+    Raises
+    ------
+    ValueError
+        If the suffix names no format.
+    OSError
+        If the file is there and ``overwrite`` is not set.
+    """
+    path = Path(path)
+    options = _WRITERS.get(path.suffix.lower())
+    if options is None:
+        raise argument_error("path", f"a file ending in one of {', '.join(_WRITERS)}", str(path))
+    if options["format"] == "fits":
+        table = table.copy(copy_data=False)
+        table.meta = fits_meta(table.meta)
+    with writing(path):
+        table.write(path, overwrite=overwrite, **options)
 
 
 def _table_format(path):

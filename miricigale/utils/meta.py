@@ -3,6 +3,11 @@
 import datetime
 import functools
 import importlib.metadata
+import json
+import math
+import re
+
+import numpy as np
 
 
 @functools.cache
@@ -56,3 +61,48 @@ def undated(meta):
         for key, value in meta.items()
         if key != "created"
     }
+
+
+def fits_meta(meta):
+    """
+    What a FITS header can hold of a meta dictionary.
+
+    Parameters
+    ----------
+    meta : dict
+        Anything by name.
+
+    Returns
+    -------
+    cards : dict
+        Numbers, truth values and short text by name (``HIERARCH`` before names that FITS does not have by
+        itself), and all of it in ``META`` as JSON, for `full_meta`.
+    """
+    cards = {}
+    for key, value in meta.items():
+        value = value.item() if isinstance(value, np.generic) else value
+        plain = isinstance(value, (bool, int)) or (
+            isinstance(value, float) and math.isfinite(value)
+        )
+        if plain or (isinstance(value, str) and value.isascii() and len(value) < _SHORT):
+            own = _KEYWORD.fullmatch(key) is not None and key.upper() not in _RESERVED
+            cards[key if own else f"HIERARCH {key}"] = value
+    return cards | {"META": json.dumps(meta, default=_plain)}
+
+
+def full_meta(meta):
+    """The meta dictionary that `fits_meta` put into a header; of other headers what they hold."""
+    return json.loads(meta["META"]) if "META" in meta else dict(meta)
+
+
+def _plain(value):
+    """A value that JSON does not know as one that it does; a quantity keeps its unit as text."""
+    if isinstance(value, (np.generic, np.ndarray)) and not hasattr(value, "unit"):
+        return value.tolist()
+    return str(value)
+
+
+_KEYWORD = re.compile(r"[A-Za-z0-9_-]{1,8}")
+_RESERVED = {"META", "SIMPLE", "EXTEND", "BITPIX", "NAXIS", "TFIELDS", "EXTNAME", "COMMENT"}
+# text and keyword together stand on one card
+_SHORT = 40

@@ -279,7 +279,7 @@ def test_a_band_takes_the_filter_that_is_given(tmp_path):
     [
         ("none.dat", DataError, "none.dat cannot be read"),
         ("miri.f707w", KeyError, "miri.f770w"),
-        (12.0, ValueError, r"'names' must be .* 'IRAS1' is a Filter, .* got float"),
+        (12.0, ValueError, r"'IRAS1' must be a Filter, .* got float"),
     ],
 )
 def test_a_wrong_filter_is_refused_when_it_is_read(tmp_path, given, error, wanted):

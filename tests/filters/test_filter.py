@@ -1,5 +1,6 @@
 """Passbands against closed forms, published pivots and synphot."""
 
+import pickle
 from types import SimpleNamespace
 
 import astropy.units as u
@@ -9,7 +10,7 @@ from astropy.modeling.physical_models import BlackBody
 from astropy.tests.helper import assert_quantity_allclose
 from numpy.testing import assert_allclose
 
-from miricigale.filters import Filter
+from miricigale.filters import Filter, FilterSet, find_filter
 from miricigale.utils.exceptions import DataError
 
 PIVOTS = {  # SVO and STScI, um
@@ -187,9 +188,18 @@ def test_reads_the_files_of_cigale(tmp_path):
     assert band.name == "my.band"
     # an energy response in proportion to lam is a flat photon response
     assert_quantity_allclose(band.pivot, box().pivot, rtol=1e-9)
-    path.write_text("80000 1\n120000 1\n")
+    path.write_text("# wavelength (micron), photons\n8 1\n12 1\n")
     assert Filter.read(path).name == "some"
-    assert_quantity_allclose(Filter.read(path, name="a").pivot, box().pivot, rtol=1e-9)
+    assert_quantity_allclose(Filter.read(path).pivot, box().pivot, rtol=1e-9)
+    # micrometers would be taken for Angstrom
+    path.write_text("8 1\n12 1\n")
+    with pytest.raises(DataError, match="does not say the unit of its wavelengths"):
+        Filter.read(path)
+    band = Filter.read(path, name="a", unit=u.um)
+    assert_quantity_allclose(band.pivot, box().pivot, rtol=1e-9)
+    for name in ("a.ecsv", "a.fits", "a.xml"):
+        band.write(tmp_path / name)
+        assert Filter.read(tmp_path / name, name="a") == band
 
 
 def test_unreadable_files_are_named(tmp_path):
@@ -209,9 +219,93 @@ def test_plot_returns_the_axes():
     assert len(ax.lines) == 1
 
 
+def test_spectra_of_other_packages():
+    """A spectrum of constant F_nu has this flux in any band, whatever it comes as."""
+    from astropy.modeling.models import Const1D
+    from synphot import ConstFlux1D, SourceSpectrum
+
+    band, wave = box(), np.linspace(5, 15, 300) * u.um
+    flam = (3 * u.uJy).to(u.erg / u.s / u.cm**2 / u.AA, u.spectral_density(wave))
+    model = SourceSpectrum(ConstFlux1D, amplitude=3 * u.uJy)
+    one_d = SimpleNamespace(spectral_axis=wave[::-1], flux=np.full(300, 3e-6) * u.Jy)
+    for sed, rtol in (
+        ((wave, np.full(300, 3.0) * u.uJy), 1e-12),
+        ((wave[::-1], flam[::-1]), 1e-12),
+        (one_d, 1e-12),
+        (model, 1e-9),
+        (Const1D(amplitude=3 * u.uJy), 1e-12),
+    ):
+        assert_quantity_allclose(band.synthetic_flux(sed), 3 * u.uJy, rtol=rtol)
+        assert_quantity_allclose(FilterSet([band]).synthetic_fluxes(sed), [3] * u.uJy, rtol=rtol)
+    assert_quantity_allclose(band.synthetic_flux(wave, flam), 3 * u.uJy)
+    assert_quantity_allclose(band.synthetic_magnitude(model).value, 23.9 - 2.5 * np.log10(3))
+    with pytest.raises(u.UnitsError, match="wavelengths with a unit"):
+        band.synthetic_flux((wave.value, flam))
+
+
+def test_a_filter_says_what_it_has():
+    band = Filter("F770W")
+    assert band == Filter.from_name("miri.f770w") == pickle.loads(pickle.dumps(band))
+    assert hash(band) == hash(Filter("f770w"))
+    assert band.wavelength is band.wave
+    assert band.transmission is band.throughput
+    # half power points of the JWST documentation: 6.581 and 8.687 um
+    assert_quantity_allclose(band.fwhm, 2.106 * u.um, atol=0.05 * u.um)
+    assert band(100 * u.um) == 0
+    assert_quantity_allclose(band(band.wave), band.throughput)
+    assert "pivot" in band._repr_html_()
+    with pytest.raises(
+        AttributeError, match=r"Filter has no 'min_wavelength'; it has .*wavelength"
+    ):
+        band.min_wavelength  # noqa: B018
+    assert Filter([1, 2] * u.um, [1, 1], "own") == Filter("own", [1, 2] * u.um, [1, 1])
+    with pytest.raises(u.UnitsError, match="'wave' must be a quantity"):
+        Filter([1, 2], [1, 1], name="own")
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("MIRI F770W", "miri.f770w"),
+        ("miri_f770w", "miri.f770w"),
+        ("JWST/MIRI.F770W", "miri.f770w"),
+        ("jwst_f770w", "miri.f770w"),
+        ("jwst.miri.F770W", "miri.f770w"),
+        ("jwst_nircam_f444w", "nircam.f444w"),
+        ("WFC3/IR F160W", "wfc3.f160w"),
+        ("wfc3_ir_f160w", "wfc3.f160w"),
+        ("hst/wfc3/IR/f160w.dat", "wfc3.f160w"),
+        ("HST/ACS_WFC.F606W", "acs.f606w"),
+        ("hst/ACS_update_sep07/wfc_f606w_t81.dat", "acs.f606w"),
+        ("f_F160W", None),
+        ("IRAC1", "irac.ch1"),
+        ("IRAC 4.5", "irac.ch2"),
+        ("Spitzer/IRAC.I3", "irac.ch3"),
+        ("IRAC/irac_tr4_2004-08-09.dat", "irac.ch4"),
+        ("MIPS1", "mips.24"),
+        ("Spitzer/MIPS.24mu", "mips.24"),
+        ("2mass_Ks", "sedpy.twomass_Ks"),
+        ("2MASS/2MASS.J", "sedpy.twomass_J"),
+        ("Paranal/VISTA.Ks", "sedpy.vista_vircam_Ks"),
+        ("UKIRT/UKIDSS.K", "sedpy.ukirt_wfcam_K"),
+        ("SDSS r", "sedpy.sdss_r0"),
+        ("SLOAN/SDSS.r", "sedpy.sdss_r0"),
+        ("GALEX/GALEX.FUV", "sedpy.galex_FUV"),
+        ("WISE/WISE.W3", "sedpy.wise_w3"),
+        ("pacs.green", "sedpy.herschel_pacs_100"),
+        ("Herschel/SPIRE.PSW", "sedpy.herschel_spire_250"),
+        # one of many
+        ("r", None),
+        ("Ks", None),
+    ],
+)
+def test_names_of_others(text, name):
+    assert find_filter(text) == name
+
+
 def test_what_is_no_spectrum_is_named():
     band = box()
-    with pytest.raises(ValueError, match="'sed' must be an object with wave and fnu, got NoneType"):
+    with pytest.raises(ValueError, match=r"'sed' must be a spectrum: .*, got NoneType"):
         band.synthetic_flux(None)
     with pytest.raises(ValueError, match=r"'sed\.fnu' must be as many values as sed\.wave, got 2"):
         band.synthetic_flux(spectrum([7, 9, 13], [1, 1]))

@@ -359,7 +359,7 @@ def test_dust_dims_balmer_lines(part, amount, k):
     """The Balmer decrement rises by 10^(0.4 E (k(H beta) - k(H alpha)))."""
     model, excess = chain_of(part), 0.6
     clear, dusty = (
-        model.decompose(age=0.1, redshift=0.0, **{amount: value}).components["nebular"]
+        model.evaluate(age=0.1, redshift=0.0, **{amount: value}).components["nebular"]
         for value in (0.0, excess)
     )
     lost = [
@@ -379,8 +379,8 @@ def test_dust_takes_of_gas_and_stars_what_each_loses():
     """Absorbed power from the light without dust, the two laws and nothing of the chain."""
     part, excess = ModifiedStarburst(slope=-0.3), 0.5
     model = chain_of(part)
-    clear = model.decompose(age=0.3, redshift=0.0, ebv_lines=0.0).components
-    dusty = model.decompose(age=0.3, redshift=0.0, ebv_lines=excess)
+    clear = model.evaluate(age=0.3, redshift=0.0, ebv_lines=0.0).components
+    dusty = model.evaluate(age=0.3, redshift=0.0, ebv_lines=excess)
     wave = clear["stellar"].wave.to_value(u.um)
     starburst = CalzettiLeitherer(slope=-0.3)
     stars = starburst.factors(wave, values_of(starburst, ebv=0.44 * excess))[0]

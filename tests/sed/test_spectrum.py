@@ -3,7 +3,8 @@ import numpy as np
 import pytest
 from astropy.tests.helper import assert_quantity_allclose
 
-from miricigale.sed import COSMOLOGY, SED
+from miricigale.filters import Filter
+from miricigale.sed import COSMOLOGY, SED, SEDModel
 
 WAVE = np.geomspace(0.3, 40.0, 300) * u.um
 
@@ -68,3 +69,36 @@ def test_plot_returns_the_axes_it_was_given(flat):
     ax = Figure().subplots()
     assert flat.plot(ax=ax) is ax
     assert ax.get_xscale() == "log"
+
+
+def test_a_spectrum_of_a_model_has_its_parts_and_can_be_kept(tmp_path):
+    sed = SEDModel.yang2021(libraries="bundled").evaluate(redshift=1.5, mass=5e10, frac_agn=0.3)
+    names = ["stellar", "dust", "agn_disk", "agn_torus", "agn_polar"]
+    total = sum(sed.components[name].fnu for name in names)
+    assert_quantity_allclose(total, sed.flux, rtol=1e-9, atol=1e-20 * u.uJy)
+    assert sed.parameters["mass"] == 5e10 * u.Msun
+    assert_quantity_allclose(sed.rest_wavelength * 2.5, sed.wavelength)
+    assert_quantity_allclose(sed.flam * sed.wave, sed.fnu * sed.frequency, rtol=1e-12)
+    for part in (2 * sed, sed * 2, sed / 0.5):
+        assert_quantity_allclose(part.components["dust"].fnu, 2 * sed.components["dust"].fnu)
+    assert_quantity_allclose((sed + sed).fnu, 2 * sed.fnu)
+    far = sed.redshifted(2.0)
+    total = sum(far.components[name].fnu for name in names)
+    assert_quantity_allclose(total, far.fnu, rtol=1e-9, atol=1e-20 * u.uJy)
+    for name in ("sed.ecsv", "sed.fits"):
+        sed.write(tmp_path / name)
+        back = SED.read(tmp_path / name)
+        assert back.redshift == 1.5
+        assert_quantity_allclose(back.fnu, sed.fnu)
+        assert set(back.components) == set(sed.components)
+    assert sed.synthetic_flux("F770W") == Filter("F770W").synthetic_flux(sed)
+    assert_quantity_allclose(sed.fluxes(["F770W"])[0].to(u.ABmag), sed.synthetic_magnitude("F770W"))
+    assert "stellar_mass" in sed._repr_html_()
+
+
+def test_spectra_at_other_wavelengths_are_not_added():
+    one = SED([1, 2] * u.um, [1, 1] * u.uJy)
+    with pytest.raises(ValueError, match="'other' must be an SED at the same redshift and wavele"):
+        one + SED([1, 3] * u.um, [1, 1] * u.uJy)
+    with pytest.raises(TypeError):
+        one * "two"

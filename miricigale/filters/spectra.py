@@ -1,0 +1,77 @@
+"""Spectra of other packages as arrays."""
+
+import astropy.units as u
+import numpy as np
+
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.units import FNU, WAVE, to_array
+
+
+def check_wave(wave):
+    """Wavelengths of a spectrum as an array in um."""
+    wave = (
+        to_array(wave, WAVE, "wave", ndim=1) if hasattr(wave, "unit") else np.asarray(wave, float)
+    )
+    if wave.ndim != 1 or wave.size < 2 or not np.all(np.diff(wave) > 0):
+        raise argument_error("wave", "two or more strictly ascending wavelengths", wave)
+    return wave
+
+
+def spectrum_arrays(sed, where=None):
+    """
+    Wavelengths (um) and F_nu (uJy) of a spectrum.
+
+    Parameters
+    ----------
+    sed : object
+        With ``wave`` and ``fnu``; a pair of wavelengths and flux densities; a spectrum of specutils
+        (``spectral_axis`` and ``flux``) or synphot; or a function of wavelengths that gives flux
+        densities, as astropy's models are.
+    where : `~numpy.ndarray`, shape (n,), optional
+        Wavelengths (um) at which a function is evaluated.
+
+    Returns
+    -------
+    wave, fnu : `~numpy.ndarray`, shape (n,)
+
+    Raises
+    ------
+    ValueError
+        If it is no spectrum.
+    `~astropy.units.UnitsError`
+        If it has other units than a flux density's.
+    """
+    if hasattr(sed, "wave") and hasattr(sed, "fnu"):
+        wave, flux = sed.wave, sed.fnu
+    elif isinstance(sed, (tuple, list)) and len(sed) == 2:
+        wave, flux = sed
+    elif hasattr(sed, "spectral_axis") and hasattr(sed, "flux"):
+        wave, flux = sed.spectral_axis.to(WAVE, u.spectral()), sed.flux
+    elif hasattr(sed, "waveset"):
+        if sed.waveset is None and where is None:
+            raise argument_error("sed", "a spectrum with a waveset", "one without")
+        wave = where * WAVE if sed.waveset is None else sed.waveset
+        flux = sed(wave, flux_unit=u.Jy)
+    elif callable(sed) and where is not None:
+        wave = where * WAVE
+        flux = sed(wave)
+    else:
+        wanted = "a spectrum: an SED, (wavelengths, flux densities), or one of specutils or synphot"
+        raise argument_error("sed", wanted, type(sed).__name__)
+    if not hasattr(wave, "unit"):
+        msg = "'sed' must have wavelengths with a unit, got bare numbers"
+        raise u.UnitsError(msg)
+    order = slice(None, None, -1 if wave[-1] < wave[0] else 1)
+    wave, flux = check_wave(wave[order]), flux[order]
+    plain = getattr(flux, "unit", None) == FNU
+    fnu = to_array(
+        flux,
+        FNU,
+        "sed.fnu",
+        ndim=1,
+        equivalencies=[] if plain else u.spectral_density(wave * WAVE),
+    )
+    if wave.shape != fnu.shape:
+        got = f"{fnu.size} for {wave.size} wavelengths"
+        raise argument_error("sed.fnu", "as many values as sed.wave", got)
+    return wave, fnu

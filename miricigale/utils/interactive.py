@@ -1,0 +1,40 @@
+"""What objects share in interactive sessions: other names of attributes, and a table in notebooks."""
+
+import difflib
+import html
+from typing import ClassVar
+
+
+class Interactive:
+    """
+    Base of classes that are used in sessions.
+
+    An attribute that a user of other packages knows by another name is found by it; any other name ends in a
+    sentence that lists the nearest ones. In notebooks an object is shown as a table of what it holds.
+    """
+
+    #: Names that are usual elsewhere, and the attribute of ours.
+    _other_names: ClassVar[dict] = {}
+
+    def __getattr__(self, name):
+        # copies and notebooks ask for private names that need not be there
+        if name.startswith("_"):
+            raise AttributeError(name)
+        if name in self._other_names:
+            return getattr(self, self._other_names[name])
+        known = [one for one in dir(self) if not one.startswith("_")]
+        near = difflib.get_close_matches(name, [*known, *self._other_names], n=3, cutoff=0.5)
+        msg = f"{type(self).__name__} has no {name!r}; it has {', '.join(near or known)}"
+        raise AttributeError(msg, name=name, obj=self)
+
+    def _facts(self):
+        """What a notebook shows: dict of label to value."""
+        return {type(self).__name__: repr(self)}
+
+    def _repr_html_(self):
+        rows = "".join(
+            f"<tr><th style='text-align:left'>{html.escape(str(label))}</th>"
+            f"<td style='text-align:left'>{html.escape(str(value))}</td></tr>"
+            for label, value in self._facts().items()
+        )
+        return f"<table>{rows}</table>"
