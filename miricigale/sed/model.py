@@ -15,6 +15,7 @@ from miricigale.sed.grid_cache import cached_grid
 from miricigale.sed.parameter import Parameter
 from miricigale.sed.spectrum import COSMOLOGY
 from miricigale.utils.exceptions import ConfigError, argument_error, unknown_name
+from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import provenance
 from miricigale.utils.units import WAVE
 
@@ -27,13 +28,16 @@ _MODEL_PARAMETERS = {
         "Dust luminosity over the power that attenuation takes; 1 is energy balance.",
     ),
 }
+_OTHER_NAMES = {"z": "redshift", "stellar_mass": "mass"}
 for _name, _parameter in _MODEL_PARAMETERS.items():
     _parameter.name = _name
 
 
-class SEDModel:
+class SEDModel(Interactive):
     """
     A model of spectra: a chain of components.
+
+    ``model(redshift=1.0, ...)`` is `evaluate`.
 
     Parameters
     ----------
@@ -267,6 +271,9 @@ class SEDModel:
     def __repr__(self):
         return f"<SEDModel {' -> '.join(c.name for c in self.components)}>"
 
+    def _facts(self):
+        return {component.role: repr(component) for component in self.components}
+
     # --------------------------------------------------------------- evaluation
 
     def values(self, parameters):
@@ -289,6 +296,7 @@ class SEDModel:
         ValueError
             If a value is outside its bounds, or the galaxy older than the universe.
         """
+        parameters = {_OTHER_NAMES.get(name, name): value for name, value in parameters.items()}
         for name in parameters:
             if name not in self._parameters:
                 raise unknown_name("parameter", name, self._parameters)
@@ -331,6 +339,8 @@ class SEDModel:
         """
         return tables.spectra(self, self.values(parameters))
 
+    __call__ = evaluate
+
     def derived(self, **parameters):
         """Derived quantities of one model: dict of name to `~astropy.units.Quantity`."""
         return self.evaluate(**parameters).derived
@@ -341,7 +351,7 @@ class SEDModel:
 
         Parameters
         ----------
-        table : `~astropy.table.Table`
+        table : `~astropy.table.Table`, dict, `pandas.DataFrame` or path-like
             A row for each model; columns by parameter name, the defaults where there is
             none; ``redshift`` is needed. Other columns than parameters are left alone.
         filters : `~miricigale.filters.FilterSet` or list of str

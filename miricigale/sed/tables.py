@@ -6,7 +6,7 @@ import warnings
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable, Table
+from astropy.table import QTable
 
 from miricigale.filters.filter import UNCOVERED
 from miricigale.sed import _core
@@ -20,7 +20,7 @@ from miricigale.sed.derived import (
 )
 from miricigale.sed.spectrum import SED, distance
 from miricigale.utils.exceptions import ModelWarning, argument_error
-from miricigale.utils.tables import Flags, described_table
+from miricigale.utils.tables import Flags, as_table, described_table
 from miricigale.utils.units import FNU, WAVE
 
 BLOCK = 128  # rows worked out together: their spectra fit into the processor's cache
@@ -237,11 +237,7 @@ class _Blocks:
 
 def flux_table(model, table, filters):
     """Fluxes and derived quantities of rows of parameters; see `SEDModel.fluxes`."""
-    if not isinstance(table, (Table, dict)):
-        raise argument_error("table", "a table", type(table).__name__)
-    if isinstance(table, dict) and any(np.ndim(column) != 1 for column in table.values()):
-        raise argument_error("table", "columns of one dimension", "a dict of other things")
-    table = QTable(table, copy=False)
+    table = QTable(as_table(table, "table"), copy=False)
     _warn_of_slips(model, table.colnames)
     n = len(table)
     taken = {"id", "flags", *columns(model)}

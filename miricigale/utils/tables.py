@@ -2,7 +2,9 @@
 
 import enum
 import inspect
+import os
 import re
+from collections.abc import Mapping
 
 import astropy.units as u
 import numpy as np
@@ -13,6 +15,7 @@ from miricigale.utils.units import ANGLE, to_array
 
 __all__ = [
     "Flags",
+    "as_table",
     "ascii_ids",
     "described_rows",
     "described_table",
@@ -56,6 +59,61 @@ class Flags(enum.IntFlag):
             plain = text.replace("#:", "").replace("``", "")
             found[member.value] = member.name.lower().replace("_", " "), " ".join(plain.split())
         return found
+
+
+def as_table(data, argument):
+    """
+    Table of anything that has columns.
+
+    Parameters
+    ----------
+    data : `~astropy.table.Table`, row of one, dict, structured array, `pandas.DataFrame` or path-like
+        Columns by name; numbers in a dict are those of every row.
+    argument : str
+        The argument's name, for the message.
+
+    Returns
+    -------
+    table : `~astropy.table.Table`
+        Itself, if it is one.
+
+    Raises
+    ------
+    ValueError
+        If it is none of these, or columns differ in length.
+    `~miricigale.utils.exceptions.DataError`
+        If a file cannot be read as a table.
+    """
+    from astropy.table import QTable, Row
+
+    if isinstance(data, Table):
+        return data
+    if isinstance(data, Row):
+        return data.table[data.index : data.index + 1]
+    if isinstance(data, (str, os.PathLike)):
+        from miricigale.utils.files import read_table
+
+        return read_table(data, wanted="a table")
+    if hasattr(data, "to_numpy") and hasattr(data, "columns"):
+        data = {str(name): data[name].to_numpy() for name in data.columns}
+    try:
+        if isinstance(data, Mapping):
+            shape = np.broadcast_shapes((1,), *(np.shape(column) for column in data.values()))
+            columns = {name: _filled(column, shape[0]) for name, column in data.items()}
+            return QTable(columns, copy=False)
+        if isinstance(data, np.ndarray) and data.dtype.names:
+            return QTable(data, copy=False)
+    except ValueError as err:
+        raise argument_error(argument, "a table with columns of one length", str(err)) from None
+    wanted = "a table, a dict of columns, a structured array, a DataFrame or the path of a table"
+    raise argument_error(argument, wanted, type(data).__name__)
+
+
+def _filled(column, n):
+    """A column of ``n`` rows, of one value for all."""
+    if np.ndim(column):
+        return column
+    return np.full(n, column) if not hasattr(column, "unit") else u.Quantity([column] * n)
 
 
 def described_table(columns, meta=None):
