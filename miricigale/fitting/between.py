@@ -131,7 +131,7 @@ class _Object:
         """Coordinates in the cells of nodes: the prior is normal in each."""
         z, g, k, f = index.T
         rng, node = self.rng, {"redshift": z, "frac_agn": f}
-        for name, axis in self.models.priors.axes.items():
+        for name, axis in self.models.axes.items():
             if axis.kind in ("galaxy", "agn"):
                 # drawn from the prior where the model has none of its own
                 share = axis.share[:, g if axis.kind == "galaxy" else np.maximum(k, 0)].cumsum(

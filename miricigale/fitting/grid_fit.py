@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 from functools import partial
 
-import astropy.units as u
 import numpy as np
 
 from miricigale.filters import FilterSet
@@ -15,7 +14,6 @@ from miricigale.fitting.interpolation import Nodes, finer_grid
 from miricigale.fitting.likelihood import FitFlags
 from miricigale.fitting.posterior import check_pairs, joint_names, joint_tables
 from miricigale.fitting.priors import (
-    GridPriors,
     density_log_prior,
     expected_sfr,
     fixed_log_prior,
@@ -23,9 +21,10 @@ from miricigale.fitting.priors import (
     known_redshifts,
     sfr_log_prior,
 )
-from miricigale.fitting.quantities import DERIVED_LEVELS, OtherFraction, Quantities, plain
+from miricigale.fitting.quantities import Quantities, plain
 from miricigale.fitting.results import CIGALE_LEAST_STD, FitResults
 from miricigale.fitting.samples import Samples
+from miricigale.fitting.settings import GridSettings
 from miricigale.sed import ModelGrid, SEDModel
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.parallel import chunks, parallel_map
@@ -45,18 +44,12 @@ class GridFit:
     """
     How `~miricigale.fitting.BayesFitter` fits with every model of a grid; picklable.
 
-    Fields that are not objects of the package are those given to the fitter; ``fraction`` is the AGN
-    fraction in the definition that the grid does not use, None if it has none.
+    ``given`` are the settings of the fitter, without the model of a finer grid, which ``between`` has made.
     """
 
-    grid: object
-    priors: GridPriors
-    quantities: Quantities
-    fraction: OtherFraction | None
     engine: GridEngine
-    redshift_tolerance: float | None
+    given: GridSettings
     compat: str | None
-    prior_f: str
     template_error: TemplateError | None = None
     between: Between | None = None
 
@@ -86,23 +79,13 @@ class GridFit:
         elif not isinstance(model, ModelGrid):
             raise argument_error("model", "a ModelGrid or an SEDModel", type(model).__name__)
         priors = grid_priors(grid, priors, prior_f=settings.prior_f)
-        quantities, fraction = Quantities.of_grid(grid), OtherFraction.of_grid(grid)
         engine = GridEngine(
-            galaxy=np.asarray(grid.galaxy, dtype=float),
-            agn=np.asarray(grid.agn, dtype=float),
-            dust=np.asarray(grid.dust_luminosity, dtype=float),
-            frac=np.asarray(grid.frac_agn, dtype=float),
-            usable=np.asarray(grid.allowed, dtype=bool) & (priors.galaxy > 0),
-            prior_galaxy=priors.galaxy,
-            prior_agn=priors.agn,
-            prior_frac=priors.frac,
-            galaxy_scale=quantities.galaxy_scale,
-            agn_scale=quantities.agn_scale,
-            mixed_galaxy=quantities.mixed_galaxy,
-            mixed_agn=quantities.mixed_agn,
-            levels=DERIVED_LEVELS,
-            share_galaxy=None if fraction is None else fraction.galaxy,
-            share_agn=None if fraction is None else fraction.agn,
+            grid=grid,
+            priors=priors,
+            quantities=Quantities.of_grid(grid),
+            galaxy=grid.galaxy,
+            agn=grid.agn,
+            usable=grid.allowed & (priors.galaxy > 0),
             template_error=grid_errors(
                 template_error, grid.filters if model is grid else filters, grid.redshift
             ),
@@ -110,17 +93,7 @@ class GridFit:
             rtol=float(settings.rtol),
             scale_error=scale_error,
         )
-        out = cls(
-            grid=grid,
-            priors=priors,
-            quantities=quantities,
-            fraction=fraction,
-            engine=engine,
-            redshift_tolerance=settings.redshift_tolerance,
-            compat=compat,
-            prior_f=settings.prior_f,
-            template_error=template_error,
-        )
+        out = cls(engine, replace(settings, finer=None), compat, template_error)
         # a single model has nothing between
         if not interpolate or all(axis.values.size == 1 for axis in priors.axes.values()):
             return out
@@ -129,9 +102,17 @@ class GridFit:
             same = isinstance(filters, FilterSet) and tuple(filters.names) == grid.filters
             bands = filters if same else grid.filters
             finest = finer_grid(finer, grid, bands, out.constants, nodes)
-        return replace(
-            out, between=Between(Continuation(priors, engine, nodes, finest), interpolate)
-        )
+        return replace(out, between=Between(Continuation(engine, nodes, finest), interpolate))
+
+    @property
+    def grid(self):
+        """The `~miricigale.sed.ModelGrid`."""
+        return self.engine.grid
+
+    @property
+    def priors(self):
+        """`~miricigale.fitting.priors.GridPriors`."""
+        return self.engine.priors
 
     @property
     def filters(self):
@@ -161,7 +142,7 @@ class GridFit:
     def settings(self):
         """Return the settings of the fit as plain values."""
         return {
-            "prior_f": self.prior_f,
+            "prior_f": self.given.prior_f,
             "rtol": self.engine.rtol,
             "scale_error": self.engine.scale_error,
             "compat": self.compat,
@@ -194,8 +175,7 @@ class GridFit:
 
     def check_data(self, data):
         """Refuse limits in bands in which a model has negative flux."""
-        bound = data.limit.any(axis=0)
-        for i in np.flatnonzero(bound & self.engine._negative) if bound.any() else ():
+        for i in np.flatnonzero(data.limit.any(axis=0) & self.engine.negative):
             wanted = "without limits in bands in which a model has negative flux"
             raise argument_error("photometry", wanted, f"some in {self.filters[i]}")
 
@@ -212,7 +192,7 @@ class GridFit:
             log_prior = density_log_prior(redshift_prior, z, allowed, flags)
         elif redshift is not None:
             values = known_redshifts(photometry, redshift)
-            log_prior = fixed_log_prior(values, z, allowed, self.redshift_tolerance, flags)
+            log_prior = fixed_log_prior(values, z, allowed, self.given.redshift_tolerance, flags)
         else:
             if not allowed.any():
                 flags |= int(FitFlags.NO_MODEL)
@@ -227,7 +207,7 @@ class GridFit:
 
     def check_pairs(self, pairs):
         """Check pairs of parameters; see `~miricigale.fitting.posterior.check_pairs`."""
-        derived = (*self.quantities.names, getattr(self.fraction, "name", None))
+        derived = self.engine.quantities.names
         wanted = "of parameters of the grid ('sample' draws derived quantities jointly)"
         return check_pairs(pairs, self.priors.axes, self.constants, derived, wanted)
 
@@ -314,12 +294,8 @@ class GridFit:
                 models = out.galaxy if axis.kind == "galaxy" else out.agn
                 # not a matrix product, whose last digits depend on how many rows there are
                 pdf[name] = np.einsum("ng,vg->nv", models, axis.share)
-        moments, quantiles = self.quantities.summarize(out)
-        names, units, texts, intensive = self._derived
-        if self.fraction is not None:
-            share = np.column_stack([out.share, np.full(len(out.share), np.nan)])
-            moments = np.concatenate([moments, share[:, None]], axis=1)
-            quantiles = np.concatenate([quantiles, out.share_quantiles[:, None]], axis=1)
+        known = self.engine.quantities
+        moments, quantiles = known.summarize(out)
         # limits are probabilities, which have no unit
         log_sigma = np.log(np.where(data.measured, data.sigma, 1.0)).sum(axis=1)
         log_sigma += 0.5 * data.measured.sum(axis=1) * np.log(2.0 * np.pi)
@@ -341,10 +317,10 @@ class GridFit:
             best_index=out.index,
             best_scale=out.best_scale,
             best=self._best(out),
-            quantities=names,
-            units=units,
-            descriptions=texts,
-            intensive=intensive,
+            quantities=known.names,
+            units=known.units,
+            descriptions=known.descriptions,
+            intensive=known.intensive,
             moments=moments,
             quantiles=quantiles,
             model_flux=out.band[:, 0],
@@ -353,16 +329,6 @@ class GridFit:
             constants=self.constants,
             least_std=CIGALE_LEAST_STD if self.compat == "cigale" else 0.0,
         )
-
-    @property
-    def _derived(self):
-        """Derived quantities, the other AGN fraction the last: names, units, texts, intensive."""
-        known, other = self.quantities, self.fraction
-        names, units, texts = known.names, known.units, known.descriptions
-        if other is None:
-            return names, units, texts, known.shape.names
-        units, texts = (*units, u.dimensionless_unscaled), (*texts, other.description)
-        return (*names, other.name), units, texts, (*known.shape.names, other.name)
 
     def _best(self, out):
         """Parameters and derived quantities of the best models: name to array."""
@@ -383,12 +349,8 @@ class GridFit:
                 values = np.where(frac > 0, plain(grid.agn_parameters[name])[k], np.nan)
             best[name] = np.where(ok, values, np.nan)
         scale = np.where(ok, out.best_scale, np.nan)
-        derived = self.quantities.best(grid, g, k, frac, scale)
-        for i, name in enumerate(self.quantities.names):
-            best[name] = np.broadcast_to(derived[i], (ok.size,))
-        if self.fraction is not None:
-            values = self.fraction.evaluate(g, k, frac)
-            best[self.fraction.name] = np.where(ok, values, np.nan)
+        for name in self.engine.quantities.names:
+            best[name] = self.engine.quantities.evaluate(name, grid, g, k, frac, scale)
         return best
 
     # ----------------------------------------------------------------------- draws

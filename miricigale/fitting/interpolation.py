@@ -15,7 +15,7 @@ from astropy.table import QTable
 
 from miricigale.fitting import _core
 from miricigale.fitting.priors import grid_priors
-from miricigale.fitting.quantities import OtherFraction, Quantities
+from miricigale.fitting.quantities import Quantities
 from miricigale.sed import ModelFlags
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import MASS
@@ -151,8 +151,9 @@ class Kind:
         """Steps from one value of each axis to the next, and choices of one of three nodes with their offsets."""
         shape = np.array(self.model.shape, np.int64)
         stride = np.array([shape[a + 1 :].prod() for a in range(shape.size)], np.int64)
-        choice = np.indices(np.minimum(shape, 3)).reshape(shape.size, -1).T.astype(np.int64)
-        return stride, choice.reshape(-1, shape.size), choice @ stride
+        few = np.minimum(shape, 3)
+        choice = np.indices(few).reshape(shape.size, few.prod()).T.astype(np.int64)
+        return stride, choice, choice @ stride
 
     def _sum(self, table, place, z, other, part):
         n, (stride, choice, offset) = z.size, self._around
@@ -201,7 +202,6 @@ class Nodes:
 
     axes: dict
     quantities: Quantities
-    fraction: OtherFraction | None
     kinds: dict
     allowed: np.ndarray
 
@@ -212,7 +212,8 @@ class Nodes:
     def of_grid(cls, grid, axes=None):
         """Of a `~miricigale.sed.ModelGrid`, whose axes may be known."""
         axes = grid_priors(grid).axes if axes is None else axes
-        known, of = Quantities.of_grid(grid), OtherFraction.of_grid(grid)
+        known = Quantities.of_grid(grid)
+        of = known.fraction
         galaxy = [*known.galaxy_scale, known.mixed_galaxy, np.asarray(grid.dust_luminosity)]
         agn = [*known.agn_scale, known.mixed_agn]
         if of is not None:
@@ -225,7 +226,7 @@ class Nodes:
             for kind, flux, rows in (("galaxy", grid.galaxy, galaxy), ("agn", grid.agn, agn))
         }
         axes = {name: replace(axis, share=None) for name, axis in axes.items()}
-        return cls(axes, known, of, kinds, np.asarray(grid.allowed))
+        return cls(axes, known, kinds, np.asarray(grid.allowed))
 
     @property
     def redshift(self):
@@ -289,7 +290,7 @@ class Nodes:
 
     def describe(self, place, power, scale):
         """Derived quantities of models of given AGN power and scale: dict by name."""
-        known, of = self.quantities, self.fraction
+        known, of = self.quantities, self.quantities.fraction
         galaxy, n, out = self.kinds["galaxy"].values(place), len(known.galaxy_scale), {}
         out.update(zip(known.names, scale * galaxy[:n], strict=False))
         total = scale * galaxy[n]
