@@ -1,13 +1,12 @@
 """From a catalog of photometry to fluxes, errors and flags that a fit can use, and the flags of fits."""
 
-import warnings
 from dataclasses import dataclass
 
 import astropy.units as u
 import numpy as np
 
 from miricigale.filters import Filter
-from miricigale.utils.exceptions import MiricigaleWarning, argument_error
+from miricigale.utils.exceptions import argument_error
 from miricigale.utils.object_rows import ObjectRows, PerObject
 from miricigale.utils.tables import Flags, error_column, read_ids, require_columns
 from miricigale.utils.units import FNU, to_array
@@ -233,13 +232,12 @@ class PhotometryReader:
         return FitData(ids, flux, err, sigma, limit, flags)
 
 
-def unused_bands(table, filters, stacklevel=None):
+def unused_bands(table, filters):
     """
     Names of the bands of a catalog that are not fitted (``filters``), in the order of the columns.
 
     A column is a band if it has an error ``<name>_err`` and both are in a unit of flux
-    density, or if its name is that of a filter. With a ``stacklevel``, that of the caller of this
-    function, a `~miricigale.utils.exceptions.MiricigaleWarning` names them.
+    density, or if its name is that of a filter.
     """
     known, columns = set(Filter.names()), set(table.colnames)
     out = []
@@ -250,9 +248,6 @@ def unused_bands(table, filters, stacklevel=None):
         measured = pair[1] in columns and all(_is_flux(table[c]) for c in pair)
         if measured or name in known or name.startswith("sedpy."):
             out.append(name)
-    if out and stacklevel is not None:
-        text = "bands of the photometry that the grid lacks are not fitted"
-        warnings.warn(f"{text}: {', '.join(out)}", MiricigaleWarning, stacklevel=stacklevel + 1)
     return out
 
 

@@ -10,10 +10,7 @@ import warnings
 import astropy.units as u
 import numpy as np
 
-from miricigale.filters.catalog_files import (
-    codes_of,
-    warn_of_codes,
-)
+from miricigale.filters.catalog_files import codes_of, warn_of_codes
 from miricigale.fitting.fitter import BayesFitter
 from miricigale.fitting.from_files import open_catalog
 from miricigale.fitting.io import FORMAT, FitFolder, open_results, part_ids, part_name
@@ -189,10 +186,11 @@ def _fit_parts(fitter, inputs, folder, seed, executor, progress_bar):
                     table, options = inputs.take(i)
                     keys = _keys(read_ids(table))
                     repeated = np.array([key in seen for key in keys], dtype=bool)
-                    # what is true of all pieces is said of the first, to the caller of fit_file
-                    options["stacklevel"] = None if n_new else 5
-                    results = fitter._fit_rows(
-                        table, options, seed=seed, repeated=repeated, executor=executor
+                    if not n_new:
+                        # which holds for all pieces: to the caller of fit_file
+                        fitter.warn_of_bands(table, 3)
+                    results = fitter.fit_part(
+                        table, **options, seed=seed, repeated=repeated, executor=executor
                     )
                 n_new += 1
                 folder.save(name, results.write)

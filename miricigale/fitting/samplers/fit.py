@@ -85,6 +85,11 @@ class SamplerFit:
         return self.engine.names
 
     @property
+    def priors(self):
+        """Prior of each free parameter by name."""
+        return self.space.free
+
+    @property
     def citations(self):
         """What to cite for model and sampler."""
         engine, known = self.engine.sampler, self.engine.model.meta.get("citations", ())
