@@ -13,7 +13,7 @@ from miricigale.fitting.quantities import DERIVED_LEVELS
 from miricigale.fitting.results import FitResults
 from miricigale.fitting.samplers import CITATIONS
 from miricigale.fitting.samplers.run import ContinuousEngine, FluxModel, systematic_draws
-from miricigale.fitting.samplers.space import Space, prior_cells, redshift_axis
+from miricigale.fitting.samplers.space import Space, redshift_axis
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.random import stream
@@ -159,7 +159,8 @@ class SamplerFit:
     @property
     def _limits(self):
         """Least and largest redshift."""
-        return self.space.redshift_limits or self.engine.model.parameters["redshift"].bounds
+        prior = self.space.free.get("redshift", self.engine.model.parameters["redshift"])
+        return prior.bounds
 
     # ------------------------------------------------------------------------- fit
 
@@ -177,18 +178,14 @@ class SamplerFit:
         model = self.engine.model
         agn = model.component("agn") if isinstance(model, SEDModel) else None
         of_agn = () if agn is None else tuple(agn.parameters)
-        axes = {}
+        axes, n_cells = {}, self.engine.request.n_cells
         for name in ("redshift", *self.space.free):
             if name == "mass" or name in axes:
                 continue
             if name == "redshift":
-                nodes, weights, bounds = redshift_axis(
-                    spaces, self._limits, self.engine.request.n_cells
-                )
+                nodes, weights, bounds = redshift_axis(spaces, self._limits, n_cells)
             else:
-                nodes, weights, bounds = prior_cells(
-                    self.space.free[name], self.engine.request.n_cells
-                )
+                nodes, weights, bounds = self.space.free[name].cells(n_cells)
             kind = "agn" if name in of_agn else "galaxy"
             kind = name if name in ("redshift", "frac_agn") else kind
             unit = 1 if name == "redshift" else model.parameters[name].unit
