@@ -150,10 +150,8 @@ def _evaluate_runs(
             _rescale(sums, lanes, math.exp(0.5 * (best[2] - reference)))
         best[2] = reference
     light = single and limits is None
-    for i in range(lanes.left.size):
-        lanes.left[i] = 1.0
-    for i in range(lanes.known.size):
-        lanes.known[i] = 0
+    lanes.left[:] = 1.0
+    lanes.known[:] = 0
     n_listed = 1.0
     for r in range(n):
         if pairs.top[r] >= floor:

@@ -54,9 +54,8 @@ def project(tables, target, pairs):
         if target.log_prior[z] < -1e200:
             continue
         p, norm = pairs.p32[z], pairs.inverse_norm[z]
-        for i in range(p.size):
-            p[i] = zero
-            norm[i] = zero
+        p[:] = 0.0
+        norm[:] = 0.0
         for j in range(target.bands.size):
             row = tables.galaxy32[z, target.bands[j]]
             s, d = target.root32[z, j], target.data32[z, j]
@@ -188,9 +187,7 @@ def _project_tori(agn, target, z, unit, of_torus):
 @njit(**PART)
 def _products(unit_galaxy, unit_agn, k, n_used, rows):
     """Fill rows[m * BLOCK + i] = <galaxy i, AGN model k + m> for GROUP AGN models (register blocking)."""
-    zero = np.float32(0)
-    for i in range(GROUP * BLOCK):
-        rows[i] = zero
+    rows[: GROUP * BLOCK] = 0.0
     t0, t1, t2, t3 = unit_agn[k], unit_agn[k + 1], unit_agn[k + 2], unit_agn[k + 3]
     # what is beyond the used bands is 0
     for j in range(0, n_used, 3):
@@ -285,9 +282,7 @@ def list_runs(tables, target, limits, pairs, delta, reference, position):
     # the largest prior a pair can have from AGN model and fraction
     log_pair = tables.log_top_agn + tables.log_top_frac
     # `_products` takes three bands at a time
-    for j in range(bands.size, bands.size + 2):
-        for i in range(BLOCK):
-            pairs.unit_galaxy[j, i] = np.float32(0)
+    pairs.unit_galaxy[bands.size : bands.size + 2] = 0.0
     margin = 2.0
     n = np.int64(0)
     z_now = np.int64(-1)
