@@ -30,7 +30,6 @@ class GridOutput(NamedTuple):
 
     chi2: np.ndarray  # (n,), of the best model
     log_sum: np.ndarray  # (n,): ln of the sum of prior exp(-chi2 / 2)
-    n_models: np.ndarray  # (n,): how many models were evaluated
     best_scale: np.ndarray  # (n,): solar masses formed of the best model
     best_flux: np.ndarray  # (n, nb): fluxes of that
     index: np.ndarray  # int (n, 4): its redshift, galaxy, AGN model and AGN fraction
@@ -245,7 +244,6 @@ class GridEngine:
         out = GridOutput(
             chi2=np.full(n, np.nan),
             log_sum=np.full(n, np.nan),
-            n_models=np.zeros(n),
             best_scale=np.full(n, np.nan),
             best_flux=np.full((n, n_bands), np.nan),
             index=np.full((n, 4), -1),
@@ -315,7 +313,6 @@ class GridEngine:
             norm += limits.dark
         out.chi2[i] = chi2
         out.log_sum[i] = np.log(total) + 0.5 * (sums.best[2] - norm)
-        out.n_models[i] = sums.best[3]
         # sums in single precision differ by some 1e-8
         out.zf[i] = sums.zf / sums.zf.sum()
         out.galaxy[i] = sums.galaxy[:, 0] / sums.galaxy[:, 0].sum()

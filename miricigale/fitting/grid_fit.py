@@ -27,6 +27,7 @@ from miricigale.fitting.samples import Samples
 from miricigale.fitting.settings import GridSettings
 from miricigale.sed import ModelGrid, SEDModel
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_choice
 from miricigale.utils.parallel import chunks, parallel_map
 from miricigale.utils.random import stream
 from miricigale.utils.units import MASS
@@ -63,8 +64,7 @@ class GridFit:
         cls, model, filters, priors, settings, *, axes, scale_error, compat, template_error
     ):
         """Make a grid if it is none, work out its priors and derived quantities, set the engine up."""
-        if compat not in (None, "cigale"):
-            raise argument_error("compat", "None or 'cigale'", repr(compat))
+        check_choice(compat, "compat", (None, "cigale"))
         finer, interpolate = settings.finer, int(settings.interpolate)
         grid = model
         if isinstance(model, SEDModel):
@@ -220,16 +220,14 @@ class GridFit:
         """`FitResults` of a piece: its photometry and priors of redshift."""
         data, log_prior = piece
         joint = joint_names(pairs, self.priors.axes)
-        options, step = {}, max(len(data), 1)
+        # between nodes each object has an engine of its own
         own = self.between is not None and data.redshift is not None and self.grid.redshift.size > 1
-        if own:
-            # each has an engine of its own
-            step = 1
-        elif joint:
-            # joint sums are large: those of a few objects are reduced before the next are made
-            size = self.engine.size
-            step = max(1, _JOINT_SIZE // sum(size[name[0]] * size[name[1]] for name in joint))
+        options, size = {}, self.engine.size
+        if joint and not own:
             options = {"joint": joint, "workspace": self.engine.workspace(joint=joint)}
+        # joint sums are large: those of a few objects are reduced before the next are made
+        each = sum(size[x] * size[y] for x, y in joint)
+        step = 1 if own else max(1, min(_JOINT_SIZE // max(each, 1), len(data)))
         parts = []
         for rows in list(chunks(len(data), step)) or [slice(0, 0)]:
             some = data[rows]
@@ -336,18 +334,12 @@ class GridFit:
         ok = np.isfinite(out.chi2)
         z, g, k, f = np.where(ok[:, None], out.index, 0).T
         frac = grid.frac_agn[f]
-        best = {}
-        for name, axis in self.priors.axes.items():
-            if axis.kind == "redshift":
-                values = grid.redshift[z]
-            elif axis.kind == "frac_agn":
-                values = frac
-            elif axis.kind == "galaxy":
-                values = plain(grid.galaxy_parameters[name])[g]
-            else:
-                # without AGN light there is no template
-                values = np.where(frac > 0, plain(grid.agn_parameters[name])[k], np.nan)
-            best[name] = np.where(ok, values, np.nan)
+        values = {"redshift": grid.redshift[z], "frac_agn": frac}
+        values |= {name: plain(column)[g] for name, column in grid.galaxy_parameters.items()}
+        for name, column in grid.agn_parameters.items():
+            # without AGN light there is no template
+            values[name] = np.where(frac > 0, plain(column)[k], np.nan) if grid.n_agn else None
+        best = {name: np.where(ok, values[name], np.nan) for name in self.priors.axes}
         scale = np.where(ok, out.best_scale, np.nan)
         for name in self.engine.quantities.names:
             best[name] = self.engine.quantities.evaluate(name, grid, g, k, frac, scale)

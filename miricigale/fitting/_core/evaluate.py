@@ -105,7 +105,6 @@ def _evaluate_alone(tables, target, limits, pairs, lanes, sums, delta, scale_err
                     total[0] += t
                     total[1] += t * s * s / inverse
                     total[2] += t if s == 0.0 else 0.0
-                    best[3] += 1.0
                     for d in range(draws.next.size):
                         while draws.next[d] <= total[0]:
                             now = max(total[0], draws.next[d])

@@ -175,8 +175,7 @@ class Sums(NamedTuple):
     total: np.ndarray  # (7,): sum l, l (s / sigma_s)^2, l of models with s = 0;
     #     sum l s^2 times galaxy's and AGN's part of the mixed quantity; l phi, l phi^2 with phi
     #     the other fraction; weight not yet in the histograms
-    best: np.ndarray  # (4,): R and s of the best model, R + 2 ln(prior) that has weight 1,
-    #     number of models
+    best: np.ndarray  # (3,): R and s of the best model, R + 2 ln(prior) that has weight 1
     index: np.ndarray  # int64 (4,): z, galaxy, agn, frac of the best model; -1 where none
     joint: Joint
     hist: Histograms

@@ -103,20 +103,17 @@ def add_pairs(tables, lanes, sums, z, thin):
     total_zero = 0.0
     share_1 = 0.0
     share_2 = 0.0
-    n_alive = 0.0
     for i in range(BLOCK):
         weight += buffer[at.W0 + i]
         total_r += buffer[at.WR + i]
         total_zero += buffer[at.WZ + i]
         share_1 += buffer[at.F1 + i]
         share_2 += buffer[at.F2 + i]
-        n_alive += 1.0 if buffer[at.PRIOR + i] > -1e200 else 0.0
     total[0] += weight
     total[1] += total_r
     total[2] += total_zero
     total[4] += share_1
     total[5] += share_2
-    sums.best[3] += n_alive * frac_sum.size
     least = thin * total[0]
     total_cross = 0.0
     for i in range(BLOCK):
