@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 
 from miricigale.filters import FilterSet
-from miricigale.fitting.between import Between
+from miricigale.fitting.between import between_nodes
 from miricigale.fitting.calibration import TemplateError, grid_errors
 from miricigale.fitting.continuation import Continuation
 from miricigale.fitting.grid import GridEngine
@@ -52,7 +52,7 @@ class GridFit:
     given: GridSettings
     compat: str | None
     template_error: TemplateError | None = None
-    between: Between | None = None
+    between: Continuation | None = None
 
     #: Objects in a piece of the catalog.
     chunk_size = 64
@@ -65,7 +65,7 @@ class GridFit:
     ):
         """Make a grid if it is none, work out its priors and derived quantities, set the engine up."""
         check_choice(compat, "compat", (None, "cigale"))
-        finer, interpolate = settings.finer, int(settings.interpolate)
+        finer, interpolate = settings.finer, settings.interpolate
         grid = model
         if isinstance(model, SEDModel):
             if axes is None or filters is None:
@@ -102,7 +102,7 @@ class GridFit:
             same = isinstance(filters, FilterSet) and tuple(filters.names) == grid.filters
             bands = filters if same else grid.filters
             finest = finer_grid(finer, grid, bands, out.constants, nodes)
-        return replace(out, between=Between(Continuation(engine, nodes, finest), interpolate))
+        return replace(out, between=Continuation(engine, nodes, finest))
 
     @property
     def grid(self):
@@ -147,7 +147,7 @@ class GridFit:
             "scale_error": self.engine.scale_error,
             "compat": self.compat,
             "n_models": int(self.engine.n_models),
-            "interpolate": 0 if self.between is None else self.between.n_draws,
+            "interpolate": 0 if self.between is None else int(self.given.interpolate),
             "constants": self.constants,
         } | self._more_settings
 
@@ -163,8 +163,8 @@ class GridFit:
             mass = [1e8, 1e10, 1e12] * MASS
             rates = [expected_sfr(relation, mass, one).tolist() for one in z[[0, -1]]]
             more["sfr_prior"] = {"scatter": scatter, "sfr": rates}
-        if self.between is not None and self.between.models.finer is not self.between.models.nodes:
-            finer = self.between.models.finer.axes.items()
+        if self.between is not None and self.between.finer is not self.between.nodes:
+            finer = self.between.finer.axes.items()
             more["finer"] = {name: int(axis.values.size) for name, axis in finer}
         return more
 
@@ -222,7 +222,7 @@ class GridFit:
         joint = joint_names(pairs, self.priors.axes)
         # between nodes each object has an engine of its own
         own = self.between is not None and data.redshift is not None and self.grid.redshift.size > 1
-        options, size = {}, self.engine.size
+        options, size, n_draws = {}, self.engine.size, self.given.interpolate
         if joint and not own:
             options = {"joint": joint, "workspace": self.engine.workspace(joint=joint)}
         # joint sums are large: those of a few objects are reduced before the next are made
@@ -237,16 +237,18 @@ class GridFit:
             out = self.engine.fit(**some.of_engine(log_prior[rows]), **options)
             results = self._results(some, out, pairs)
             if self.between is not None:
-                results = self._refined(self.engine, some, log_prior[rows], results)
+                results = between_nodes(
+                    self.between, self.engine, some, log_prior[rows], n_draws, results
+                )
             parts.append(results)
         return FitResults.concatenate(parts)
 
     def _at_redshift(self, data, log_prior, joint, pairs):
         """Results of one object at its own redshift, between nodes; they stand at the nearest node."""
-        z, n_z = float(data.redshift[0]), log_prior.shape[1]
+        z, n_z, n_draws = float(data.redshift[0]), log_prior.shape[1], self.given.interpolate
         fitted = np.isfinite(log_prior).any()
         node = int(np.argmax(log_prior[0]))
-        engine = self.between.models.at_redshift(z if fitted else self.grid.redshift[0], node)
+        engine = self.between.at_redshift(z if fitted else self.grid.redshift[0], node)
         log_prior = log_prior[:, node : node + 1]
         out = engine.fit(**data.of_engine(log_prior), joint=joint)
         if fitted:
@@ -263,15 +265,7 @@ class GridFit:
         results = self._results(data, out, pairs)
         best = results.best | {"redshift": np.where(np.isfinite(out.chi2), z, np.nan)}
         results = results._changed(best=best)
-        return self._refined(engine, data, log_prior, results)
-
-    def _refined(self, engine, data, log_prior, results):
-        """Results between the nodes."""
-        wide, seeds = self.between.widened(data)
-        index, _ = engine.draw(
-            n_draws=self.between.n_draws, seeds=seeds, **wide.of_engine(log_prior)
-        )
-        return self.between.refine(engine, data, wide, log_prior, index, seeds, results)
+        return between_nodes(self.between, engine, data, log_prior, n_draws, results)
 
     def _results(self, data, out, pairs):
         """From models to parameters and derived quantities."""
