@@ -86,9 +86,6 @@ class Continuation:
     nodes: Nodes
     finer: Nodes
 
-    def __getstate__(self):
-        return {name: getattr(self, name) for name in self.__dataclass_fields__}
-
     @property
     def axes(self):
         """`~miricigale.fitting.priors.GridAxis` of each parameter with several values or a prior, by name."""

@@ -8,7 +8,7 @@ mass enter in closed form. Nothing is said of what lies beyond the outermost nod
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from astropy.table import QTable
@@ -205,9 +205,6 @@ class Nodes:
     kinds: dict
     allowed: np.ndarray
 
-    def __getstate__(self):
-        return {name: getattr(self, name) for name in self.__dataclass_fields__}
-
     @classmethod
     def of_grid(cls, grid, axes=None):
         """Of a `~miricigale.sed.ModelGrid`, whose axes may be known."""
@@ -348,14 +345,14 @@ def finer_grid(model, grid, filters, constants, nodes):
     """
     axes = {name: [value] for name, value in constants.items()}
     axes |= {name: np.asarray(grid.axes.get(name, a.values)) for name, a in nodes.axes.items()}
-    test = _Test(model, filters, constants, grid.frac_agn)
-    if not test.rms(nodes) < 1e-3:
+    error = partial(_chain_rms, model, filters, constants, grid.frac_agn)
+    if not error(nodes) < 1e-3:
         wanted = "the model that made the grid"
         raise argument_error("finer", wanted, "one with other fluxes at its nodes")
     finer = nodes
     for _ in range(_HALVINGS):
         before = axes
-        rms = {name: test.rms(finer, name) for name in ("redshift", *finer.scales)}
+        rms = {name: error(finer, name) for name in ("redshift", *finer.scales)}
         # the worst first, as far as there is memory
         for name in sorted((n for n in rms if rms[n] > _TOLERANCE), key=rms.get, reverse=True):
             halved = axes | {name: np.sort([*axes[name], *_middles(finer, name)])}
@@ -370,42 +367,33 @@ def finer_grid(model, grid, filters, constants, nodes):
     return finer
 
 
-@dataclass(frozen=True, eq=False)
-class _Test:
-    """Models of a chain, to compare interpolated ones with."""
+def _chain_rms(model, filters, constants, frac_agn, nodes, name=None, n=300):
+    """
+    Rms of interpolated ln flux, but for a factor, at random nodes, or anywhere between those of an axis.
 
-    model: object
-    filters: object
-    constants: dict
-    frac: np.ndarray
-
-    def rms(self, nodes, name=None, n=300):
-        """
-        Rms of interpolated ln flux, but for a factor, at random nodes, or anywhere between those of an axis.
-
-        It is 0 where the model has nothing between them.
-        """
-        rng, known = np.random.default_rng(1), self.model.parameters
-        values = {other: rng.choice(axis.values, n) for other, axis in nodes.axes.items()}
-        if name is not None:
-            axis = nodes.axes[name].values
-            first = rng.integers(max(axis.size - 1, 1), size=n)
-            values[name] = axis[first] + rng.random(n) * (np.roll(axis, -1) - axis)[first]
-        values |= {other: np.full(n, value) for other, value in self.constants.items()}
-        table = QTable({other: value * known[other].unit for other, value in values.items()})
-        table["mass"] = 1.0 * MASS
-        true = self.model.fluxes(table, self.filters)
-        flags = true["flags"]
-        if np.any(flags & int(ModelFlags.NOT_IN_LIBRARY)) and name is not None:
-            return 0.0
-        frac = values.get("frac_agn", np.full(n, self.frac[0]))
-        place = nodes.place(values, values["redshift"])
-        flux = nodes.fluxes(place, frac)[0]
-        true = np.column_stack([true[band].value for band in true.colnames[: flux.shape[1]]])
-        good = np.isfinite(true).all(axis=1)
-        top = _FAINT * true[good].max(axis=1, keepdims=True)
-        ratio = np.maximum(flux[good], top) / np.maximum(true[good], top)
-        return np.sqrt(np.mean(np.minimum(np.abs(less_factor(np.log(ratio))), _MOST) ** 2))
+    It is compared with the chain, and 0 where the chain has nothing between them.
+    """
+    rng, known = np.random.default_rng(1), model.parameters
+    values = {other: rng.choice(axis.values, n) for other, axis in nodes.axes.items()}
+    if name is not None:
+        axis = nodes.axes[name].values
+        first = rng.integers(max(axis.size - 1, 1), size=n)
+        values[name] = axis[first] + rng.random(n) * (np.roll(axis, -1) - axis)[first]
+    values |= {other: np.full(n, value) for other, value in constants.items()}
+    table = QTable({other: value * known[other].unit for other, value in values.items()})
+    table["mass"] = 1.0 * MASS
+    true = model.fluxes(table, filters)
+    flags = true["flags"]
+    if np.any(flags & int(ModelFlags.NOT_IN_LIBRARY)) and name is not None:
+        return 0.0
+    frac = values.get("frac_agn", np.full(n, frac_agn[0]))
+    place = nodes.place(values, values["redshift"])
+    flux = nodes.fluxes(place, frac)[0]
+    true = np.column_stack([true[band].value for band in true.colnames[: flux.shape[1]]])
+    good = np.isfinite(true).all(axis=1)
+    top = _FAINT * true[good].max(axis=1, keepdims=True)
+    ratio = np.maximum(flux[good], top) / np.maximum(true[good], top)
+    return np.sqrt(np.mean(np.minimum(np.abs(less_factor(np.log(ratio))), _MOST) ** 2))
 
 
 def _middles(nodes, name):

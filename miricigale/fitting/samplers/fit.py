@@ -12,7 +12,7 @@ from miricigale.fitting.posterior import cell_edges, check_pairs
 from miricigale.fitting.priors import GridAxis
 from miricigale.fitting.quantities import DERIVED_LEVELS, plain
 from miricigale.fitting.results import FitResults
-from miricigale.fitting.samplers import CITATIONS, effective_size, get_sampler
+from miricigale.fitting.samplers import CITATIONS, get_sampler
 from miricigale.fitting.samplers.run import Calls, FluxModel, positive_normal, systematic_draws
 from miricigale.fitting.samplers.space import Space, redshift_axis
 from miricigale.fitting.settings import SamplerSettings
@@ -286,7 +286,9 @@ class SamplerFit:
             sampled = get_sampler(self.sampler)(calls, space.n_dim, rng, self.request)
             keep = sampled.weight > 0
             weight, call = sampled.weight[keep], np.asarray(sampled.call)[keep]
-            n_effective, weight = effective_size(weight), weight / weight.sum()
+            # Kish's
+            n_effective = np.sum(weight) ** 2 / np.sum(np.square(weight))
+            weight = weight / weight.sum()
             # the best of all models that were met, whether or not they are part of the sample
             best = [int(np.argmin(calls.of("chi2", slice(None))))]
             scale, best_scale = calls.of("scale", call), calls.of("scale", best)
