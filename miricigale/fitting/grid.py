@@ -1,8 +1,8 @@
 """The grid engine: every model of a `~miricigale.sed.ModelGrid`, by factors."""
 
+from collections import namedtuple
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from scipy.special import log_ndtr, logsumexp, ndtr, ndtri
@@ -25,25 +25,34 @@ _THIN = 1e-4
 _SINGLE = 5e-7
 
 
-class GridOutput(NamedTuple):
-    """What a fit of n objects returns; not a number, or -1, in rows that were not fitted."""
-
-    chi2: np.ndarray  # (n,), of the best model
-    log_sum: np.ndarray  # (n,): ln of the sum of prior exp(-chi2 / 2)
-    best_scale: np.ndarray  # (n,): solar masses formed of the best model
-    best_flux: np.ndarray  # (n, nb): fluxes of that
-    index: np.ndarray  # int (n, 4): its redshift, galaxy, AGN model and AGN fraction
-    zf: np.ndarray  # (n, nz, nf): joint posterior of redshift and AGN fraction
-    galaxy: np.ndarray  # (n, nG) and
-    agn: np.ndarray  # (n, nA): posteriors of galaxy models and AGN models
-    band: np.ndarray  # (n, 2, nb): posterior mean and standard deviation of model fluxes
-    moments: np.ndarray  # (n, n_quantities, 3): mean, standard deviation and mean log10 and
-    quantiles: np.ndarray  # (n, n_quantities, n_levels) of derived quantities
-    share: np.ndarray  # (n, 2): mean and standard deviation and
-    share_quantiles: np.ndarray  # (n, n_levels) of the other AGN fraction
-    draw_index: np.ndarray  # int (n, n_draws, 4): models drawn from the posterior
-    draw_scale: np.ndarray  # (n, n_draws, 2): their scales and the variances of these
-    joint: dict  # (n, ...): joint posteriors that were asked for, by two letters of z, g, k and f
+#: What a fit of n objects returns, by the axes of each array after that of the objects: z redshifts, g
+#: galaxies, k AGN models, f AGN fractions, b bands, q derived quantities, l levels of their quantiles, d draws.
+_AXES = {
+    # chi2 of the best model, ln of the sum of prior exp(-chi2 / 2)
+    "chi2": "",
+    "log_sum": "",
+    # of the best model: solar masses formed, fluxes; redshift, galaxy, AGN model and AGN fraction
+    "best_scale": "",
+    "best_flux": "b",
+    "index": "4",
+    # posteriors of redshift and AGN fraction, of galaxies, of AGN models
+    "zf": "zf",
+    "galaxy": "g",
+    "agn": "k",
+    # mean and standard deviation of model fluxes; mean, standard deviation, mean log10 of quantities
+    "band": "2b",
+    "moments": "q3",
+    "quantiles": "ql",
+    # mean and standard deviation of the other AGN fraction
+    "share": "2",
+    "share_quantiles": "l",
+    # models drawn from the posterior, their scales and the variances of these
+    "draw_index": "d4",
+    "draw_scale": "d2",
+}
+#: These arrays, not a number or -1 in rows that were not fitted; ``joint`` are joint posteriors that were
+#: asked for, by two of the letters z, g, k and f.
+GridOutput = namedtuple("GridOutput", [*_AXES, "joint"])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -230,8 +239,6 @@ class GridEngine:
         -------
         out : `GridOutput`
         """
-        size = self.size
-        n_z, n_galaxy, n_agn, n_frac = size.values()
         n, n_bands = flux.shape
         data = np.where(np.isfinite(sigma), flux, 0.0)
         inverse = np.zeros((n, n_bands)) if limit_sigma is None else 1.0 / limit_sigma
@@ -240,24 +247,15 @@ class GridEngine:
         seeds = np.zeros(n, np.uint64) if seeds is None else np.array(seeds, np.uint64)
         # the galaxy's, the AGN model's and the sum of both
         n_quantities = len(self.quantities.galaxy_scale) + len(self.quantities.agn_scale) + 1
-        n_levels = DERIVED_LEVELS.size
+        size = self.size | {"b": n_bands, "q": n_quantities, "l": DERIVED_LEVELS.size, "d": n_draws}
+        size |= {"2": 2, "3": 3, "4": 4}
+
+        def empty(axes, value):
+            return np.full((n, *map(size.get, axes)), value)
+
         out = GridOutput(
-            chi2=np.full(n, np.nan),
-            log_sum=np.full(n, np.nan),
-            best_scale=np.full(n, np.nan),
-            best_flux=np.full((n, n_bands), np.nan),
-            index=np.full((n, 4), -1),
-            zf=np.full((n, n_z, n_frac), np.nan),
-            galaxy=np.full((n, n_galaxy), np.nan),
-            agn=np.full((n, n_agn), np.nan),
-            band=np.full((n, 2, n_bands), np.nan),
-            moments=np.full((n, n_quantities, 3), np.nan),
-            quantiles=np.full((n, n_quantities, n_levels), np.nan),
-            share=np.full((n, 2), np.nan),
-            share_quantiles=np.full((n, n_levels), np.nan),
-            draw_index=np.full((n, n_draws, 4), -1),
-            draw_scale=np.full((n, n_draws, 2), np.nan),
-            joint={name: np.full((n, size[name[0]], size[name[1]]), np.nan) for name in joint},
+            *(empty(axes, -1 if "index" in name else np.nan) for name, axes in _AXES.items()),
+            joint={name: empty(name, np.nan) for name in joint},
         )
         workspace = self.workspace(n_draws, joint) if workspace is None else workspace
         sums = workspace[0]
