@@ -1,6 +1,6 @@
 """Models drawn from posteriors: joint distributions, fluxes in any band, spectra."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import astropy.units as u
@@ -11,9 +11,10 @@ from miricigale.fitting.likelihood import FitFlags
 from miricigale.fitting.posterior import bin_cells, check_levels, node_cells
 from miricigale.fitting.priors import grid_priors
 from miricigale.fitting.quantities import FRACTIONS, Quantities
+from miricigale.fitting.results import FitRows
 from miricigale.sed import grid_spectra as spectra
 from miricigale.utils.exceptions import argument_error, unknown_name
-from miricigale.utils.object_rows import ObjectRows, PerObject
+from miricigale.utils.object_rows import PerObject
 from miricigale.utils.random import stream
 from miricigale.utils.tables import described_table, error_column
 from miricigale.utils.unified import read_write
@@ -23,7 +24,7 @@ _LEVELS = (0.16, 0.5, 0.84)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Samples(ObjectRows):
+class Samples(FitRows):
     """
     Models drawn from the posteriors of the objects of a catalog.
 
@@ -71,8 +72,6 @@ class Samples(ObjectRows):
     axes: dict | None = None
     seed: int = 0
 
-    #: Where the formats of files are registered.
-    io_module = "miricigale.fitting.io"
     read, write = read_write(
         "draws (FITS: all but grid and model; ECSV: their table, not read back)",
         """grid : `~miricigale.sed.ModelGrid`
@@ -122,10 +121,6 @@ model : `~miricigale.sed.SEDModel`, optional
     def fitted(self):
         """Which objects have draws."""
         return (self.index[..., 0] >= 0).all(axis=-1)
-
-    def with_model(self, model):
-        """Return a copy that knows the `~miricigale.sed.SEDModel`."""
-        return replace(self, model=model)
 
     # ------------------------------------------------------------------- values
 
@@ -322,7 +317,7 @@ model : `~miricigale.sed.SEDModel`, optional
     def _binned(self, name, key, bins):
         """Edges of the cells, and the cell of every draw (-1: none)."""
         unit = self.unit(name)
-        values = self._one(key).values(name).value
+        values = self[key]._fitted_one().values(name).value
         if name in self.axes:
             axis = self.axes[name]
             edges, place = node_cells(values, axis.values, axis.bounds)
@@ -336,14 +331,6 @@ model : `~miricigale.sed.SEDModel`, optional
     def _extensive(self, name):
         known = self._quantities
         return name in known.names and name not in known.intensive
-
-    def _one(self, key):
-        """Return the samples of one object that was fitted."""
-        one = self[key]
-        if not one.fitted:
-            names = ", ".join(FitFlags.names(one.flags)) or "no draws"
-            raise argument_error("key", "the id of an object that was fitted", f"{key!r} ({names})")
-        return one
 
     # ---------------------------------------------------------- fluxes and spectra
 
@@ -442,7 +429,7 @@ model : `~miricigale.sed.SEDModel`, optional
         spectra : `~astropy.units.Quantity`, shape (n_draws, n_wave)
             In W / Hz or uJy.
         """
-        one = self._one(key)
+        one = self[key]._fitted_one()
         function = spectra.rest_spectra if rest else spectra.observed_spectra
         wave, values = function(self._model(), self.grid, one.index, one.scale)
         return wave * WAVE, values * (u.W / u.Hz if rest else FNU)
