@@ -85,35 +85,22 @@ def randomized_ranks(pdf, node, draw):
     return upto - own * np.asarray(draw)
 
 
-def node_cells(values, nodes, bounds=(-np.inf, np.inf)):
-    """Edges of the cells around nodes, and the cell of each value that lies on one; -1 for NaN."""
-    finite = np.isfinite(values)
-    place = np.argmin(np.abs(np.where(finite, values, 0.0) - nodes[:, None]), axis=0)
-    return cell_edges(nodes, bounds), np.where(finite, place, -1)
-
-
-def bin_cells(values, bins, *, log=False):
+def bin_edges(values, bins, *, log=False):
     """
-    Edges of bins, and the bin of each value; -1 for those in none. The last has its upper edge too.
+    Edges of bins, or those given: a number of bins lies between the least and the largest value.
 
-    A number of bins lies between the least and the largest value, with equal widths in the logarithm
-    with ``log``, if all values are above 0.
+    They have equal widths, in the logarithm with ``log``, if all values are above 0.
     """
-    finite = np.isfinite(values)
     if np.ndim(bins):
-        edges = np.asarray(bins, dtype=float)
-    else:
-        low, high = values[finite].min(), values[finite].max()
-        # equal values get a narrow bin
-        high = max(high, low + 1e-6 * max(abs(low), 1e-30))
-        edges = np.linspace(low, high, int(bins) + 1)
-        if log and low > 0:
-            edges = np.geomspace(low, high, int(bins) + 1)
-            edges[[0, -1]] = low, high
-    place = np.searchsorted(edges, values, side="right") - 1
-    place = np.where(values == edges[-1], edges.size - 2, place)
-    inside = finite & (place >= 0) & (place < edges.size - 1)
-    return edges, np.where(inside, place, -1)
+        return np.asarray(bins, dtype=float)
+    low, high = np.nanmin(values), np.nanmax(values)
+    # equal values get a narrow bin
+    high = max(high, low + 1e-6 * max(abs(low), 1e-30))
+    if not (log and low > 0):
+        return np.linspace(low, high, int(bins) + 1)
+    edges = np.geomspace(low, high, int(bins) + 1)
+    edges[[0, -1]] = low, high
+    return edges
 
 
 def check_pairs(pairs, axes, constant, derived, wanted):

@@ -8,7 +8,7 @@ import numpy as np
 
 from miricigale.fitting.drawing import labeled
 from miricigale.fitting.likelihood import FitFlags
-from miricigale.fitting.posterior import bin_cells, check_levels, node_cells
+from miricigale.fitting.posterior import bin_edges, cell_edges, check_levels
 from miricigale.fitting.priors import grid_priors
 from miricigale.fitting.quantities import FRACTIONS, Quantities
 from miricigale.fitting.results import FitRows
@@ -284,9 +284,8 @@ model : `~miricigale.sed.SEDModel`, optional
         weights : `~numpy.ndarray`, shape (n_bins,)
             Part of the draws in each.
         """
-        edges, place = self._binned(name, key, bins)
-        weights = np.bincount(place[place >= 0], minlength=edges.size - 1) / place.size
-        return edges, weights
+        values, edges = self._binned(name, key, bins)
+        return edges * self.unit(name), np.histogram(values, edges)[0] / self.n_draws
 
     def pdf_2d(self, a, b, key, *, bins=30):
         """
@@ -307,26 +306,21 @@ model : `~miricigale.sed.SEDModel`, optional
             Part of the draws in each; the draws without a value (parameters of an AGN that is
             not there) are in none.
         """
-        a_edges, i = self._binned(a, key, bins)
-        b_edges, j = self._binned(b, key, bins)
-        weights = np.zeros((a_edges.size - 1, b_edges.size - 1))
-        both = (i >= 0) & (j >= 0)
-        np.add.at(weights, (i[both], j[both]), 1.0 / self.n_draws)
-        return a_edges, b_edges, weights
+        x, x_edges = self._binned(a, key, bins)
+        y, y_edges = self._binned(b, key, bins)
+        part = np.full(self.n_draws, 1.0 / self.n_draws)
+        weights = np.histogram2d(x, y, (x_edges, y_edges), weights=part)[0]
+        return x_edges * self.unit(a), y_edges * self.unit(b), weights
 
     def _binned(self, name, key, bins):
-        """Edges of the cells, and the cell of every draw (-1: none)."""
-        unit = self.unit(name)
-        values = self[key]._fitted_one().values(name).value
+        """Values in the draws of an object, and edges of the cells."""
+        unit, values = self.unit(name), self[key]._fitted_one().values(name).value
         if name in self.axes:
-            axis = self.axes[name]
-            edges, place = node_cells(values, axis.values, axis.bounds)
-        else:
-            bins = bins.to_value(unit) if hasattr(bins, "unit") else bins
-            if not np.ndim(bins) and not np.isfinite(values).any():
-                raise argument_error("name", "one with values in the draws", repr(name))
-            edges, place = bin_cells(values, bins, log=self._extensive(name))
-        return edges * unit, place
+            return values, cell_edges(self.axes[name].values, self.axes[name].bounds)
+        if not np.isfinite(values).any() and not np.ndim(bins):
+            raise argument_error("name", "one with values in the draws", repr(name))
+        bins = bins.to_value(unit) if hasattr(bins, "unit") else bins
+        return values, bin_edges(values, bins, log=self._extensive(name))
 
     def _extensive(self, name):
         known = self._quantities
