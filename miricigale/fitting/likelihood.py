@@ -21,8 +21,8 @@ _SMALL, _LARGE = 1e-60, 1e60
 _DARK = 1e-8
 #: Sum of squared S/N that counts as 0: smaller numbers have fewer digits, or none.
 _NO_SIGNAL = 1e-280
-_TRUE = ("true", "t", "1")
-_FALSE = ("false", "f", "0", "")
+_TRUE = ("true", "t", "1", "1.0")
+_FALSE = ("false", "f", "0", "0.0", "-0.0", "")
 _KINDS = {"U": "text", "S": "text", "b": "true and false", "c": "complex numbers"}
 
 
@@ -273,16 +273,12 @@ def limits(table, name):
         return np.zeros(len(table), dtype=bool)
     values = table[column]
     mask = np.asarray(getattr(values, "mask", False))
-    values = np.asarray(getattr(values, "unmasked", np.ma.getdata(values)))
-    if values.dtype.kind in "US":
-        values = np.char.strip(np.char.lower(values.astype(str)))
-        known = np.isin(values, [*_TRUE, *_FALSE])
-        limit = np.isin(values, _TRUE)
-    elif values.dtype.kind in "biuf" and getattr(table[column], "unit", None) is None:
-        known, limit = (values == 0) | (values == 1), values == 1
-    else:
+    plain = np.asarray(getattr(values, "unmasked", np.ma.getdata(values)))
+    text = np.char.strip(np.char.lower(plain.astype(str)))
+    limit, known = np.isin(text, _TRUE), np.isin(text, (*_TRUE, *_FALSE))
+    if getattr(values, "unit", None) is not None:
         known = limit = np.zeros(len(table), dtype=bool)
-    if values.shape != (len(table),) or not np.all(known | mask):
+    if plain.shape != (len(table),) or not np.all(known | mask):
         wanted = f"a table whose column {column!r} is boolean"
         raise argument_error("photometry", wanted, _some(table[column]))
     return limit & ~mask
