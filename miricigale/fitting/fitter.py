@@ -310,9 +310,7 @@ class BayesFitter:
             fitted_filters=tuple(settings["filters"]),
             redshift_fixed=fixed,
             model=self.model,
-            meta=provenance(
-                citations=self.backend.citations, fit=settings, **self.backend.provenance()
-            ),
+            meta=provenance(fit=settings, **self.backend.provenance()),
         )
 
     def warn_of_bands(self, photometry, stacklevel):
@@ -386,7 +384,8 @@ class BayesFitter:
         samples = self.backend.sample(
             data, known, n_draws, seed, executor=executor, progress_bar=progress_bar
         )
-        meta = provenance(citations=self.backend.citations, fit=settings, seed=seed)
+        cited = self.backend.provenance()["citations"]
+        meta = provenance(citations=cited, fit=settings, seed=seed)
         return samples._changed(model=self.model, meta=meta)
 
     def settings(self, filters=None):

@@ -120,11 +120,6 @@ class GridFit:
         return self.grid.filters
 
     @property
-    def citations(self):
-        """What to cite for the models."""
-        return self.grid.meta.get("citations", ())
-
-    @property
     def content(self):
         """What makes a fit another one, besides `settings`: name to anything with a checksum."""
         return {"grid": self.grid, "priors": self.priors}
@@ -169,9 +164,9 @@ class GridFit:
         return more
 
     def provenance(self):
-        """Return what results say of the grid."""
-        known = self.grid.meta.items()
-        return {"grid": {k: v for k, v in known if k not in ("citations", "axes")}}
+        """Return what results say of the grid, and what to cite for it."""
+        known = {key: value for key, value in self.grid.meta.items() if key != "axes"}
+        return {"citations": known.pop("citations", ()), "grid": known}
 
     def check_data(self, data):
         """Refuse limits in bands in which a model has negative flux."""

@@ -52,12 +52,9 @@ class Scale:
         """The nodes on the scale."""
         return _scaled(self.values, self.power)
 
-    def nearest(self, value):
-        """Nodes nearest to values."""
-        return np.searchsorted(0.5 * (self.values[1:] + self.values[:-1]), value, side="right")
-
-    def weights(self, value, node):
-        """First of the nodes around values, shape (n,), and the weights of that and the next two, (n, 3)."""
+    def around(self, value):
+        """Nodes nearest to values, first of the three around, both (n,), and the weights of these, (n, 3)."""
+        node = np.searchsorted(0.5 * (self.values[1:] + self.values[:-1]), value, side="right")
         n, x = self.values.size, _scaled(value, self.power)
         first = np.clip(node - 1, 0, max(n - 3, 0))
         out = np.zeros((len(x), 3))
@@ -68,7 +65,7 @@ class Scale:
                 if j != i:
                     a, b = self.scaled[first + i], self.scaled[first + j]
                     out[:, i] *= (x - b) / (a - b)
-        return first, out
+        return node, first, out
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,8 +252,7 @@ class Nodes:
             near[name] = np.zeros(len(redshift), np.int64)
             if name in self.scales:
                 inside = np.clip(values[name], *axis.values[[0, -1]])
-                near[name] = node = self.scales[name].nearest(inside)
-                weights[name] = self.scales[name].weights(inside, node)
+                near[name], *weights[name] = self.scales[name].around(inside)
             elif axis.kind in self.kinds:
                 weights[name] = near[name], np.tile([1.0, 0.0, 0.0], (len(redshift), 1))
         between = self.between(redshift)

@@ -188,15 +188,9 @@ class FitFolder(RecordFolder):
         facts, parts = super().parse(values)
         facts["job"]["catalogue"]["rows"], facts["job"]["chunk_rows"]
         if facts["format"] == _OLD_FORMAT:
-            parts = {
-                name: {
-                    "hash": "",
-                    "rows": part["rows"],
-                    "fitted": part["fitted"],
-                    "products": {name: {key: part[key] for key in ("sha256", "bytes")}},
-                }
-                for name, part in parts.items()
-            }
+            for name, part in parts.items():
+                product = {key: part.pop(key) for key in ("sha256", "bytes")}
+                part |= {"hash": "", "products": {name: product}}
         return facts | {"format": FORMAT}, parts
 
 

@@ -348,22 +348,14 @@ model : `~miricigale.sed.SEDModel`, optional
         ValueError
             If a band is not one of the grid and no model is known, or the model is another.
         """
-        names, extra = self._bands(filters)
-        some = self._several()
+        names, extra = spectra.band_names(self.grid, filters)
+        model, some = self._model() if extra else None, self._several()
         out = np.full((*some.scale.shape, len(names)), np.nan)
         fitted = some.fitted
-        model = self._model() if extra else None
         out[fitted] = spectra.draw_fluxes(
             self.grid, some.index[fitted], some.scale[fitted], names, extra, model
         )
         return out.reshape(*self.scale.shape, len(names)) * FNU
-
-    def _bands(self, filters):
-        """Names of the bands asked for, and those that only a model has."""
-        names, extra = spectra.band_names(self.grid, filters)
-        if extra:
-            self._model()
-        return names, extra
 
     def _model(self):
         if self.model is None:
@@ -389,7 +381,7 @@ model : `~miricigale.sed.SEDModel`, optional
             (``<name>_err``) and percentiles (``<name>_p16``, ...) in uJy.
         """
         levels = check_levels(levels)
-        names, _ = self._bands(filters)
+        names, _ = spectra.band_names(self.grid, filters)
         some = self._several()
         columns = {
             "id": (np.array(some.ids), "identifier"),

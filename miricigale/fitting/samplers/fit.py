@@ -98,12 +98,6 @@ class SamplerFit:
         return self.space.free
 
     @property
-    def citations(self):
-        """What to cite for model and sampler."""
-        known = self.model.meta.get("citations", ())
-        return (*known, *(CITATIONS.get(self.sampler, ()) if isinstance(self.sampler, str) else ()))
-
-    @property
     def content(self):
         """What makes a fit another one, besides `settings`: name to anything with a checksum."""
         model, request = self.model, self.request
@@ -131,9 +125,10 @@ class SamplerFit:
         }
 
     def provenance(self):
-        """Return what results say of the model."""
-        known = self.model.meta.items()
-        return {"model": {k: v for k, v in known if k != "citations"}}
+        """Return what results say of the model, and what to cite for it and the sampler."""
+        known = dict(self.model.meta)
+        cited = CITATIONS.get(self.sampler, ()) if isinstance(self.sampler, str) else ()
+        return {"citations": (*known.pop("citations", ()), *cited), "model": known}
 
     def check_data(self, data):
         """All data will do."""
