@@ -13,6 +13,7 @@ Crank-Nicolson moves for a t distribution: Grumitt et al. 2024, arXiv:2407.07781
 import numpy as np
 from scipy.special import ndtr, ndtri
 
+from miricigale.fitting.interpolation import rows_of
 from miricigale.fitting.quantities import DERIVED_LEVELS, draws_summary
 from miricigale.fitting.samplers.run import best_scale, chi2_at, systematic_draws
 from miricigale.utils.random import stream
@@ -163,7 +164,7 @@ class _Object:
         out |= {"true": np.full(len(x), -np.inf), "node": np.zeros(len(x))}
         some = np.flatnonzero(models.possible)
         if some.size:
-            models = models.rows(some)
+            models = rows_of(models, some)
             z = models.node["redshift"]
             out["true"][some] = self._likelihood(self.models.fluxes(models)[0], z, self.sigma)[2]
             if step < 1.0:

@@ -363,9 +363,8 @@ def apply_zero_points(photometry, zero_points):
         If a column is missing.
     """
     require_columns(zero_points, ["band", "factor"], "zero_points")
-    factors = {
-        str(b): float(f) for b, f in zip(zero_points["band"], zero_points["factor"], strict=True)
-    }
+    names, values = map(str, zero_points["band"]), map(float, zero_points["factor"])
+    factors = dict(zip(names, values, strict=True))
     columns = [c for name in factors for c in (name, error_column(name))]
     require_columns(photometry, columns, "photometry", units=dict.fromkeys(columns, FNU))
     out = QTable(photometry, copy=True)

@@ -176,13 +176,10 @@ class MockResult:
     def _metric(self, name):
         true, mean = self.true(name).value, self.recovered.mean(name).value
         good = np.isfinite(true) & np.isfinite(mean)
+        unit, difference = self.truth.unit(name).to_string(), (mean - true)[good]
         if self.truth.extensive(name):
             both = good & (true > 0) & (mean > 0)
-            difference = np.log10(mean[both] / true[both])
-            unit = "dex"
-        else:
-            difference = (mean - true)[good]
-            unit = self.truth.unit(name).to_string()
+            unit, difference = "dex", np.log10(mean[both] / true[both])
         if not good.any():
             return unit, 0, np.nan, np.nan, np.nan
         offset, scatter = np.nan, np.nan

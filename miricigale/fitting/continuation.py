@@ -58,15 +58,6 @@ class Models:
     place: Place
     possible: np.ndarray  # (n,) of bool
 
-    def rows(self, some):
-        """Part of the models."""
-        return Models(
-            {name: value[some] for name, value in self.values.items()},
-            {name: value[some] for name, value in self.node.items()},
-            self.place.rows(some),
-            self.possible[some],
-        )
-
 
 @dataclass(frozen=True, eq=False)
 class Continuation:

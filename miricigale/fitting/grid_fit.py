@@ -136,32 +136,29 @@ class GridFit:
 
     def settings(self):
         """Return the settings of the fit as plain values."""
-        return {
+        error, prior, between = self.template_error, self.engine.mass_prior, self.between
+        out = {
             "prior_f": self.given.prior_f,
             "rtol": self.engine.rtol,
             "scale_error": self.engine.scale_error,
             "compat": self.compat,
             "n_models": int(self.engine.n_models),
-            "interpolate": 0 if self.between is None else int(self.given.interpolate),
+            "interpolate": 0 if between is None else int(self.given.interpolate),
             "constants": self.constants,
-        } | self._more_settings
-
-    @property
-    def _more_settings(self):
-        error, prior, more = self.template_error, self.engine.mass_prior, {}
+        }
         if error is not None:
             wave = error.wave.value.tolist()
-            more["template_error"] = {"wave": wave, "error": error.error.tolist()}
+            out["template_error"] = {"wave": wave, "error": error.error.tolist()}
         if prior is not None:
             relation, scatter, z = prior.args[:3]
             # a function is known by its values at some masses
             mass = [1e8, 1e10, 1e12] * MASS
             rates = [expected_sfr(relation, mass, one).tolist() for one in z[[0, -1]]]
-            more["sfr_prior"] = {"scatter": scatter, "sfr": rates}
-        if self.between is not None and self.between.finer is not self.between.nodes:
-            finer = self.between.finer.axes.items()
-            more["finer"] = {name: int(axis.values.size) for name, axis in finer}
-        return more
+            out["sfr_prior"] = {"scatter": scatter, "sfr": rates}
+        if between is not None and between.finer is not between.nodes:
+            axes = between.finer.axes.items()
+            out["finer"] = {name: int(axis.values.size) for name, axis in axes}
+        return out
 
     def provenance(self):
         """Return what results say of the grid, and what to cite for it."""

@@ -7,7 +7,7 @@ times z^2, without the distance at low redshift, is linear in ln(1 + z) between 
 mass enter in closed form. Nothing is said of what lies beyond the outermost nodes.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -77,14 +77,16 @@ class Place:
     redshift: np.ndarray
     between: tuple  # nodes of redshift, the others, and the part of the way to those
 
-    def rows(self, some):
-        """Part of the models."""
-        return Place(
-            {name: node[some] for name, node in self.near.items()},
-            {name: (first[some], w[some]) for name, (first, w) in self.weights.items()},
-            self.redshift[some],
-            tuple(value[some] for value in self.between),
-        )
+
+def rows_of(value, some):
+    """Some rows of an array, or of all arrays in a dict, a sequence or a dataclass."""
+    if isinstance(value, np.ndarray):
+        return value[some]
+    if isinstance(value, dict):
+        return {name: rows_of(one, some) for name, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return tuple(rows_of(one, some) for one in value)
+    return type(value)(*(rows_of(getattr(value, item.name), some) for item in fields(value)))
 
 
 @dataclass(frozen=True, eq=False)

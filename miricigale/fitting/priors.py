@@ -190,10 +190,9 @@ def known_redshifts(photometry, redshift):
             raise argument_error("redshift", wanted, repr(redshift))
         redshift = photometry[redshift]
     values = _unmasked(redshift, "redshift")
-    if values.ndim == 0:
-        values = np.full(n, float(values))
-    if values.shape != (n,):
+    if values.shape not in ((), (n,)):
         raise argument_error("redshift", f"{n} values", f"shape {values.shape}")
+    values = np.broadcast_to(values, (n,))
     with np.errstate(invalid="ignore"):
         good = np.isfinite(values) & (values > 0)
     return np.where(good, values, np.nan)
