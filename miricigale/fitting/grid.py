@@ -172,8 +172,7 @@ class GridEngine:
             prior_zero=float(prior_frac[0]) if self._zero_frac else 0.0,
             log_zero=float(log_frac[0]) if self._zero_frac else -1e300,
             edge_zero=float(edge[1]),
-            log_top_agn=float(of_agn[0].max()),
-            log_top_frac=float(log_frac[above].max(initial=-1e300)),
+            log_top_pair=float(of_agn[0].max() + log_frac[above].max(initial=-1e300)),
             share_mean=float(self._agn_prior @ shares[1]),
         )
 

@@ -279,8 +279,6 @@ def list_runs(tables, target, limits, pairs, delta, reference, position):
     n_z, n_blocks = tables.tiles.shape[0], tables.tiles.shape[1]
     n_agn = tables.agn.shape[1]
     rows, bands = pairs.rows, target.bands
-    # the largest prior a pair can have from AGN model and fraction
-    log_pair = tables.log_top_agn + tables.log_top_frac
     # `_products` takes three bands at a time
     pairs.unit_galaxy[bands.size : bands.size + 2] = 0.0
     margin = 2.0
@@ -299,7 +297,7 @@ def list_runs(tables, target, limits, pairs, delta, reference, position):
             agn_known = False
             _project_tori(tables.agn32[z], target, z, pairs.unit_agn, pairs.agn32)
         start, norm = block * BLOCK, target.norm[z]
-        lowest = reference - delta - target.log_prior[z] - log_pair
+        lowest = reference - delta - target.log_prior[z] - tables.log_top_pair
         log_usable = tables.log_usable[z, start : start + BLOCK]
         p32 = pairs.p32[z, start : start + BLOCK]
         inverse = pairs.inverse_norm[z, start : start + BLOCK]
@@ -314,7 +312,9 @@ def list_runs(tables, target, limits, pairs, delta, reference, position):
             usable = log_usable[i] > -1e200
             rows[_LEAST + i] = t if usable else _NEVER
             rows[_P + i] = p32[i] if usable else _NOWHERE
-            rows[_BASE + i] = max(log_usable[i] + (target.log_prior[z] + log_pair), -1e30)
+            rows[_BASE + i] = max(
+                log_usable[i] + (target.log_prior[z] + tables.log_top_pair), -1e30
+            )
         for j in range(bands.size):
             row = tables.galaxy32[z, bands[j], start : start + BLOCK]
             s32 = target.root32[z, j]

@@ -78,8 +78,7 @@ class Tables(NamedTuple):
     prior_zero: float  # its prior,
     log_zero: float  # 2 ln of it,
     edge_zero: float  # and c at the upper edge of its cell
-    log_top_agn: float  # largest 2 ln(prior) of an AGN model
-    log_top_frac: float  # and of a fraction above 0
+    log_top_pair: float  # largest 2 ln(prior) of an AGN model and a fraction above 0
     share_mean: float  # mean of the AGN models's share over the prior
 
 

@@ -139,21 +139,20 @@ class SamplerFit:
 
         See `~miricigale.fitting.grid_fit.GridFit.redshifts`.
         """
-        space = self.space
+        space, kind = self.space, "free" if "redshift" in self.space.free else "fixed"
         if redshift is not None:
             kind = "fixed"
             spaces = space.at_redshifts(self._limits, photometry, redshift, flags)
         elif redshift_prior is not None:
-            if "redshift" in space.fixed and self.redshift_given:
+            if kind == "fixed" and self.redshift_given:
                 raise argument_error("redshift_prior", "None where 'priors' fix it", "densities")
             kind = "prior"
             spaces = space.with_densities(self._limits, redshift_prior, flags)
-        elif not self.redshift_given:
+        elif self.redshift_given:
+            spaces = [space] * len(flags)
+        else:
             msg = "'priors' must have 'redshift', or 'redshift' or 'redshift_prior' be given"
             raise ValueError(msg)
-        else:
-            kind = "free" if "redshift" in space.free else "fixed"
-            spaces = [space] * len(flags)
         if any(one.n_dim == 0 for one in spaces):
             raise argument_error("priors", "at least one free parameter", "none")
         n_free = max((one.n_dim for one in spaces), default=0) + self.profile
@@ -178,20 +177,20 @@ class SamplerFit:
 
     def _axes(self, spaces):
         """Cells of all parameters that are free for some object, and of redshift."""
-        model = self.model
+        model, n_cells = self.model, self.request.n_cells
         agn = model.component("agn") if isinstance(model, SEDModel) else None
-        of_agn = () if agn is None else tuple(agn.parameters)
-        axes, n_cells = {}, self.request.n_cells
-        for name in ("redshift", *self.space.free):
-            if name == "mass" or name in axes:
+        kinds = {} if agn is None else dict.fromkeys(agn.parameters, "agn")
+        kinds |= {"redshift": "redshift", "frac_agn": "frac_agn"}
+        axes = {}
+        for name in dict.fromkeys(("redshift", *self.space.free)):
+            if name == "mass":
                 continue
             if name == "redshift":
-                nodes, weights, bounds = redshift_axis(spaces, self._limits, n_cells)
+                unit, cells = 1, redshift_axis(spaces, self._limits, n_cells)
             else:
-                nodes, weights, bounds = self.space.free[name].cells(n_cells)
-            kind = "agn" if name in of_agn else "galaxy"
-            kind = name if name in ("redshift", "frac_agn") else kind
-            unit = 1 if name == "redshift" else model.parameters[name].unit
+                unit, cells = model.parameters[name].unit, self.space.free[name].cells(n_cells)
+            nodes, weights, bounds = cells
+            kind = kinds.get(name, "galaxy")
             axes[name] = GridAxis(name, nodes, unit, kind, weights, None, bounds)
         return axes
 
