@@ -10,7 +10,8 @@ from astropy.table import QTable
 from miricigale.fitting.fitter import BayesFitter
 from miricigale.fitting.likelihood import FitFlags, PhotometryReader, flux_column
 from miricigale.fitting.posterior import randomized_ranks
-from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_names
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import (
     described_rows,
@@ -255,9 +256,7 @@ def leave_out(fitter, photometry, bands, *, separately=False, **options):
     bands = tuple(bands)
     if len(set(bands)) < len(bands):
         raise argument_error("bands", "different names", f"{list(bands)}")
-    for name in bands:
-        if name not in fitter.bands:
-            raise unknown_name("filter of the models", name, fitter.bands)
+    check_names(bands, "filter of the models", fitter.bands)
     zero = dict.fromkeys(bands, 0.0)
     data = PhotometryReader(bands, bands, zero, zero, 1).read(photometry)
     groups = [(name,) for name in bands] if separately else [bands]
@@ -392,8 +391,7 @@ class LeaveOutResult:
         """Draw the distribution of the pulls of one band, or of all; returns the axes."""
         from miricigale.plotting.posteriors import plot_pulls
 
-        if band is not None and band not in self.bands:
-            raise unknown_name("band that was left out", band, self.bands)
+        check_names(() if band is None else [band], "band that was left out", self.bands)
         pull = self.pull if band is None else self.pull[:, self.bands.index(band)]
         kwargs.setdefault("label", band)
         return plot_pulls(pull.ravel(), ax=ax, **kwargs)

@@ -21,9 +21,9 @@ from miricigale.fitting.samplers import get_sampler
 from miricigale.fitting.samplers.fit import SamplerFit
 from miricigale.fitting.settings import GridSettings, SamplerSettings
 from miricigale.sed import ModelGrid
-from miricigale.utils.exceptions import MiricigaleWarning, argument_error, unknown_name
+from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.meta import provenance
-from miricigale.utils.options import check_positive
+from miricigale.utils.options import check_names, check_positive
 from miricigale.utils.parallel import chunks, parallel_map, single_threaded
 from miricigale.utils.random import check_seed
 from miricigale.utils.units import check_count
@@ -183,9 +183,7 @@ class BayesFitter:
         )
         self.bands, self.priors = self.backend.filters, self.backend.priors
         self.grid = self.backend.grid if on_grid else None
-        for name in names or ():
-            if name not in self.bands:
-                raise unknown_name("filter of the grid", name, self.bands)
+        check_names(names or (), "filter of the grid", self.bands)
         of_bands = self.bands if on_grid else names
         self.n_bands_min = check_count(n_bands_min, "n_bands_min")
         self._reader = PhotometryReader(

@@ -12,9 +12,10 @@ from miricigale.fitting.results import CIGALE_LEAST_STD, FitResults
 from miricigale.fitting.samples import Samples
 from miricigale.sed import ModelGrid
 from miricigale.utils.content import content_sha256
-from miricigale.utils.exceptions import DataError, argument_error, unknown_name
+from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import open_fits
 from miricigale.utils.folder import RecordFolder
+from miricigale.utils.options import check_names
 from miricigale.utils.row_files import write_rows
 from miricigale.utils.store import native, open_parts, write_parts
 from miricigale.utils.tables import ascii_ids
@@ -349,9 +350,7 @@ class FitResultsFiles:
             raise DataError(msg)
         for part in self.parts():
             table = part.to_table()
-            for name in columns or ():
-                if name not in table.colnames:
-                    raise unknown_name("column", name, table.colnames)
+            check_names(columns or (), "column", table.colnames)
             yield table if columns is None else table[list(columns)]
 
     def write_table(self, path, *, columns=None, overwrite=False):

@@ -10,8 +10,9 @@ from miricigale.fitting import drawing
 from miricigale.fitting.likelihood import FitFlags, filter_names
 from miricigale.fitting.posterior import cell_edges, cell_percentiles, check_levels, moments
 from miricigale.fitting.quantities import DERIVED_LEVELS, kept_percentiles
-from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.exceptions import argument_error
 from miricigale.utils.object_rows import ObjectRows, PerObject, PerObjectDict
+from miricigale.utils.options import check_names
 from miricigale.utils.tables import described_table, error_column
 from miricigale.utils.unified import read_write
 from miricigale.utils.units import FNU
@@ -231,8 +232,7 @@ class FitResults(FitRows):
         return name in self.quantities and name not in self.intensive
 
     def _quantity(self, name):
-        if name not in self.quantities:
-            raise unknown_name("parameter", name, self.parameters)
+        check_names([name], "parameter", self.parameters)
         return self.quantities.index(name)
 
     def _meaning(self, name):
@@ -357,9 +357,7 @@ class FitResults(FitRows):
             return known[x, y]
         if (y, x) in known:
             return np.swapaxes(known[y, x], -1, -2)
-        for name in (x, y):
-            if name not in self.parameters:
-                raise unknown_name("parameter", name, self.parameters)
+        check_names((x, y), "parameter", self.parameters)
         have = ", ".join(f"{a} and {b}" for a, b in known) or "none"
         msg = f"no joint posterior of {x} and {y}; known: {have} ('pairs' of BayesFitter.fit)"
         raise KeyError(msg)
@@ -424,9 +422,9 @@ class FitResults(FitRows):
         """
         some = self._several()
         columns = {"id": (some.ids, "identifier")}
-        for name in filter_names("filters", self.filters if filters is None else filters):
-            if name not in self.filters:
-                raise unknown_name("filter of the models", name, self.filters)
+        names = filter_names("filters", self.filters if filters is None else filters)
+        check_names(names, "filter of the models", self.filters)
+        for name in names:
             mean, std, best = (
                 array[:, self.filters.index(name)] * FNU
                 for array in (some.model_flux, some.model_flux_std, some.best_flux)

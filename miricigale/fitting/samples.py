@@ -13,8 +13,9 @@ from miricigale.fitting.priors import grid_priors
 from miricigale.fitting.quantities import FRACTIONS, Quantities
 from miricigale.fitting.results import FitRows
 from miricigale.sed import grid_spectra as spectra
-from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.exceptions import argument_error
 from miricigale.utils.object_rows import PerObject
+from miricigale.utils.options import check_names
 from miricigale.utils.random import stream
 from miricigale.utils.tables import described_table, error_column
 from miricigale.utils.unified import read_write
@@ -151,8 +152,7 @@ model : `~miricigale.sed.SEDModel`, optional
         """Unit of a parameter or derived quantity."""
         if name in self.axes:
             return u.Unit(self.axes[name].unit)
-        if name not in self.parameters:
-            raise unknown_name("parameter", name, self.parameters)
+        check_names([name], "parameter", self.parameters)
         known = self._quantities
         if name in self._fractions:
             return u.dimensionless_unscaled

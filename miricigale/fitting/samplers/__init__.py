@@ -7,8 +7,8 @@ from functools import partial
 
 import numpy as np
 
-from miricigale.utils.exceptions import unknown_name
 from miricigale.utils.optional import require
+from miricigale.utils.options import check_names
 
 #: What to cite for them.
 CITATIONS = {
@@ -221,6 +221,5 @@ def get_sampler(engine):
     """
     if callable(engine):
         return engine
-    if engine not in SAMPLERS:
-        raise unknown_name("engine", engine, SAMPLERS)
+    check_names([engine], "engine", SAMPLERS)
     return partial(SAMPLERS[engine], require(engine, extra="samplers"))

@@ -8,7 +8,8 @@ import numpy as np
 from miricigale.fitting.likelihood import FitFlags
 from miricigale.fitting.posterior import cell_edges
 from miricigale.fitting.priors import integrals, integrals_to, known_redshifts, read_density
-from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_names
 
 #: Part of a prior without limits that may lie outside the cells of its axis.
 _TAIL = 1e-3
@@ -257,9 +258,7 @@ class Space:
     def of_model(cls, model, priors):
         """Take the priors of the parameters of a model; parameters without are at their defaults."""
         declared = model.parameters
-        for name in priors:
-            if name not in declared:
-                raise unknown_name("parameter", name, declared)
+        check_names(priors, "parameter", declared)
         made = {name: make_prior(name, priors[name], declared[name]) for name in priors}
         free = {name: made[name] for name in declared if not _number(made.get(name, 0.0))}
         fixed = {
