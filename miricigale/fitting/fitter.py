@@ -23,10 +23,10 @@ from miricigale.fitting.settings import GridSettings, SamplerSettings
 from miricigale.sed import ModelGrid
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.meta import provenance
-from miricigale.utils.options import check_names, check_positive
+from miricigale.utils.options import check_names
 from miricigale.utils.parallel import chunks, parallel_map, single_threaded
 from miricigale.utils.random import check_seed
-from miricigale.utils.units import check_count
+from miricigale.utils.units import check_count, is_number
 
 logger = logging.getLogger(__name__)
 
@@ -173,7 +173,8 @@ class BayesFitter:
         if scale_error not in (None, True, False) or (compat and scale_error):
             wanted = "False with compat='cigale'" if compat else "True, False or None"
             raise argument_error("scale_error", wanted, repr(scale_error))
-        check_positive(max_reduced_chi2, "max_reduced_chi2")
+        if not (is_number(max_reduced_chi2) and max_reduced_chi2 > 0):
+            raise argument_error("max_reduced_chi2", "positive", repr(max_reduced_chi2))
         self.engine, self.filters = engine, names
         self.model = None if isinstance(model, ModelGrid) else model
         scale_error = compat is None if scale_error is None else bool(scale_error)
