@@ -285,14 +285,14 @@ def sum_up(tables, scales, request, target, limits, sums, pairs, lanes, *, singl
             tables, target, limits, pairs, lanes, sums, request, n, reference, floor,
             single and not few,
         )  # fmt: skip
-        room = share * request.rtol * total[0]
+        allowed = share * request.rtol * total[0]
         tail = (target.norm.max() + 1.0) / request.tail
         unit = (
             math.exp(min(0.5 * (reference - best[2]), 600.0)) * prior_sum / max(prior_top, 1e-300)
         )
         floor = second_floor(
-            tables, target, pairs, n, reference, room, unit, request.delta, tail,
-            widest(scales, sums) if room > 0.0 else None,
+            tables, target, pairs, n, reference, allowed, unit, request.delta, tail,
+            widest(scales, sums) if allowed > 0.0 else None,
         )  # fmt: skip
         _evaluate_runs(
             tables, target, limits, pairs, lanes, sums, request, n, reference, floor, single

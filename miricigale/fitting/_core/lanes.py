@@ -71,7 +71,7 @@ def gather(tables, target, limits, pairs, lanes, r, start, floor, filled):
     """
     Put pairs of run r, from galaxy ``start`` of its block on, whose bound reaches the floor, in lanes.
 
-    They are marked as done. Returned are how many lanes are filled then, and the galaxy to go on with,
+    They are marked as done. Returned are how many lanes are filled then, and the next galaxy,
     `BLOCK` if none is left.
     """
     key, row = pairs.run_key[r], pairs.bound[r]

@@ -273,7 +273,7 @@ def list_runs(tables, target, limits, pairs, delta, reference, position):
     blocks, plus the block. ``reference`` is R + 2 ln(prior) that some model reaches, pairs that are
     more than ``delta`` below it are left out.
 
-    Returned are the number of runs in the list, where to go on, and the reference, raised when a better
+    Returned are the number of runs in the list, where to resume, and the reference, raised when a better
     model is met.
     """
     n_z, n_blocks = tables.tiles.shape[0], tables.tiles.shape[1]

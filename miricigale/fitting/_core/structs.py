@@ -144,7 +144,7 @@ class Histograms(NamedTuple):
 
 
 class Draws(NamedTuple):
-    """Models drawn while the sums go on."""
+    """Models drawn while weights are summed up."""
 
     next: np.ndarray  # (n_draws,): sum l at which a draw is replaced
     index: np.ndarray  # int64 (n_draws, 4)
