@@ -53,32 +53,28 @@ def fit_classes(path, output, *, quasars=False, stars=None, **options):
 
         # a file that cannot be read is refused before hours of fitting
         spectra = read_spectra(stars)
-    shown = set()
-    with _each_once(shown):
+    with _each_once():
         found = {"galaxy": fit_catalog(path, output, **options)}
-    # after the fit, which refuses what it cannot read before it loads the models
-    from miricigale.sed import SEDModel, quasar_axes, template_grid
+        # after the fit, which refuses what it cannot read before it loads the models
+        from miricigale.sed import SEDModel, quasar_axes, template_grid
 
-    models = {}
-    if quasars:
-        models["quasar"] = lambda _: (SEDModel.survey(), quasar_axes())
-    if spectra is not None:
-        models["star"] = lambda bands: (
-            template_grid(spectra, bands, beyond="rayleigh-jeans"),
-            None,
-        )
-    for name, make in models.items():
-        left = ("pairs", "redshift") if name == "star" else ("pairs",)
-        own = {key: value for key, value in options.items() if key not in left}
-        with _each_once(shown):
+        models = {}
+        if quasars:
+            models["quasar"] = lambda _: (SEDModel.survey(), quasar_axes())
+        if spectra is not None:
+            beyond = "rayleigh-jeans"
+            models["star"] = lambda bands: (template_grid(spectra, bands, beyond=beyond), None)
+        for name, make in models.items():
+            left = ("pairs", "redshift") if name == "star" else ("pairs",)
+            own = {key: value for key, value in options.items() if key not in left}
             found[name] = fit_catalog(path, Path(output) / name, models=make, **own)
     return found
 
 
 @contextmanager
-def _each_once(shown):
-    """Show each text of a warning once, for it holds for all classes; ``shown`` are those so far."""
-    show = warnings.showwarning
+def _each_once():
+    """Show each text of a warning once, for it holds for all classes."""
+    show, shown = warnings.showwarning, set()
 
     def once(message, *args, **kwargs):
         if str(message) not in shown:

@@ -72,12 +72,11 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None):
     results = classes["galaxy"]
     rows = open_catalog(path, results.job["chunk_rows"], hdu=hdu, catalog_map=catalog_map)
     found = every = fit_numbers(results)
-    name, z_known = known_redshifts(rows, z_spec)
+    found.meta["known"], found["z_known"] = known_redshifts(rows, z_spec)
     columns = classes_of(classes) if len(classes) > 1 else None
     if columns is not None:
         # fits of stars and quasars with galaxies say nothing about the fit
-        ours = np.isin(columns["class"], ["galaxy", ""])
-        found, z_known = found[ours], None if z_known is None else z_known[ours]
+        found = found[np.isin(columns["class"], ["galaxy", ""])]
     page = Page(
         f"Fits of {Path(path).name}",
         subtitle=f"{len(results)} objects, {len(found.meta['filters'])} bands",
@@ -93,7 +92,7 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None):
     _summary(page, found)
     if columns is not None:
         classes_section(page, columns, list(classes), every["ids"], every["chi2"])
-    _redshifts(page, found, name, z_known)
+    _redshifts(page, found)
     _goodness(page, found)
     _physics(page, found)
     _examples(page, results, every)
@@ -171,16 +170,16 @@ def _draw_counts(ax, xlabel, bins, samples):
     ax.set(xlabel=xlabel, ylabel="objects")
 
 
-def _redshifts(page, found, name, z_known):
+def _redshifts(page, found):
     if found.meta["fixed"]:
         page.section("Redshifts", "Redshifts were given; they were not fitted.")
         return
     page.section("Redshifts")
     samples, text = {"fitted": found["z"][found["good"], 1]}, "Fitted redshifts (posterior medians)"
-    some = found["good"] & np.isfinite(np.nan if z_known is None else z_known)
+    some, name = found["good"] & np.isfinite(found["z_known"]), found.meta["known"]
     figure, axes = new_figure(1, 1 + some.any(), size=(WIDTH / 2, 4.2))
     if some.any():
-        z, (low, middle, high) = z_known[some], found["z"][some].T
+        z, (low, middle, high) = found["z_known"][some], found["z"][some].T
         metrics = photoz_metrics(z, middle)
         inside = np.mean((low <= z) & (z <= high))
         page.items(

@@ -76,7 +76,7 @@ def known_redshifts(rows, name):
     -------
     name : str or None
         The column, None without one.
-    redshift : `~numpy.ndarray`, shape (n,), or None
+    redshift : `~numpy.ndarray`, shape (n,)
         NaN where it is missing or not positive.
 
     Raises
@@ -88,7 +88,7 @@ def known_redshifts(rows, name):
     if name is None:
         name = next((one for one in KNOWN_REDSHIFTS if one in names), None)
     if name is None:
-        return None, None
+        return None, np.full(rows.n_rows, np.nan)
     if name not in names:
         raise argument_error("z_spec", f"one of the columns {list(names)}", repr(name))
     chunks = (rows.chunk(i) for i in range(rows.n_chunks))
