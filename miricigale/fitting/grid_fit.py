@@ -214,7 +214,7 @@ class GridFit:
         joint = joint_names(pairs, self.priors.axes)
         # between nodes each object has an engine of its own
         own = self.between is not None and data.redshift is not None and self.grid.redshift.size > 1
-        options, size, n_draws = {}, self.engine.size, self.given.interpolate
+        options, size = {}, self.engine.size
         if joint and not own:
             options = {"joint": joint, "workspace": self.engine.workspace(joint=joint)}
         # joint sums are large: those of a few objects are reduced before the next are made
@@ -222,22 +222,20 @@ class GridFit:
         step = 1 if own else max(1, min(_JOINT_SIZE // max(each, 1), len(data)))
         parts = []
         for rows in list(chunks(len(data), step)) or [slice(0, 0)]:
-            some = data[rows]
+            some, prior, engine = data[rows], log_prior[rows], self.engine
             if own and len(some):
-                parts.append(self._at_redshift(some, log_prior[rows], joint, pairs))
-                continue
-            out = self.engine.fit(**some.of_engine(log_prior[rows]), **options)
-            results = self._results(some, out, pairs)
+                engine, prior, results = self._at_redshift(some, prior, joint, pairs)
+            else:
+                results = self._results(some, engine.fit(**some.of_engine(prior), **options), pairs)
             if self.between is not None:
-                results = between_nodes(
-                    self.between, self.engine, some, log_prior[rows], n_draws, results
-                )
+                n_draws = self.given.interpolate
+                results = between_nodes(self.between, engine, some, prior, n_draws, results)
             parts.append(results)
         return FitResults.concatenate(parts)
 
     def _at_redshift(self, data, log_prior, joint, pairs):
-        """Results of one object at its own redshift, between nodes; they stand at the nearest node."""
-        z, n_z, n_draws = float(data.redshift[0]), log_prior.shape[1], self.given.interpolate
+        """Engine and prior at an object's own redshift, and results, which stand at the nearest node."""
+        z, n_z = float(data.redshift[0]), log_prior.shape[1]
         fitted = np.isfinite(log_prior).any()
         node = int(np.argmax(log_prior[0]))
         engine = self.between.at_redshift(z if fitted else self.grid.redshift[0], node)
@@ -256,8 +254,7 @@ class GridFit:
         )
         results = self._results(data, out, pairs)
         best = results.best | {"redshift": np.where(np.isfinite(out.chi2), z, np.nan)}
-        results = results._changed(best=best)
-        return between_nodes(self.between, engine, data, log_prior, n_draws, results)
+        return engine, log_prior, results._changed(best=best)
 
     def _results(self, data, out, pairs):
         """From models to parameters and derived quantities."""
