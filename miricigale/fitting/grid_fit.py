@@ -243,15 +243,13 @@ class GridFit:
         out = engine.fit(**data.of_engine(log_prior), joint=joint)
         if fitted:
             out.index[:, 0] = node
-        here = np.arange(n_z) == node
-        whole = {
-            name: np.where(here.reshape(-1, 1), table, table * 0.0)
-            for name, table in out.joint.items()
-            if name[0] == "z"
-        }
-        out = out._replace(
-            zf=np.where(here[:, None], out.zf, out.zf * 0.0), joint=out.joint | whole
-        )
+        here = (np.arange(n_z) == node)[:, None]
+
+        def all_redshifts(table):
+            return np.where(here, table, table * 0.0)
+
+        joint = {k: all_redshifts(v) if k[0] == "z" else v for k, v in out.joint.items()}
+        out = out._replace(zf=all_redshifts(out.zf), joint=joint)
         results = self._results(data, out, pairs)
         best = results.best | {"redshift": np.where(np.isfinite(out.chi2), z, np.nan)}
         return engine, log_prior, results._changed(best=best)

@@ -191,9 +191,7 @@ def known_redshifts(photometry, redshift):
     if values.shape not in ((), (n,)):
         raise argument_error("redshift", f"{n} values", f"shape {values.shape}")
     values = np.broadcast_to(values, (n,))
-    with np.errstate(invalid="ignore"):
-        good = np.isfinite(values) & (values > 0)
-    return np.where(good, values, np.nan)
+    return np.where(np.isfinite(values) & (values > 0), values, np.nan)
 
 
 def magnitude_prior(

@@ -285,8 +285,7 @@ class Space:
         values = known_redshifts(photometry, redshift)
         missing = np.isnan(values)
         low, high = limits
-        with np.errstate(invalid="ignore"):
-            outside = ~missing & ~((values >= low) & (values <= high))
+        outside = ~missing & ~((values >= low) & (values <= high))
         flags[missing] |= int(FitFlags.NO_REDSHIFT)
         flags[outside] |= int(FitFlags.REDSHIFT_OUTSIDE)
         good = np.where(missing | outside, 0.5 * (low + high), values)
