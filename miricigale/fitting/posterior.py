@@ -56,9 +56,6 @@ def cell_percentiles(values, pdf, levels, bounds=(-np.inf, np.inf)):
     levels = np.asarray(levels, dtype=float)
     out = np.full((pdf.shape[0], levels.size), np.nan)
     good = np.flatnonzero(np.isfinite(pdf).all(axis=1) & (pdf.sum(axis=1) > 0))
-    if len(edges) == 2:
-        out[good] = edges[0]
-        return out
     part = pdf[good]
     total = np.cumsum(part, axis=1)
     target = levels * total[:, -1:]

@@ -362,8 +362,6 @@ class SamplerFit:
 
 def _cell(axis, values):
     """Cell of an axis in which each value lies; the outermost take what is beyond."""
-    if axis.values.size == 1:
-        return np.zeros(values.size, dtype=np.int64)
     edges = cell_edges(axis.values, axis.bounds)
     return np.searchsorted(edges[1:-1], values, side="right")
 
@@ -371,9 +369,8 @@ def _cell(axis, values):
 def _summary(values, weight):
     """Mean, standard deviation and mean of log10, and quantiles, of a weighted sample."""
     good = np.isfinite(values)
-    levels = np.asarray(DERIVED_LEVELS)
     if not good.any():
-        return np.full(3, np.nan), np.full(levels.size, np.nan)
+        return np.full(3, np.nan), np.full(DERIVED_LEVELS.size, np.nan)
     values, weight = values[good], weight[good] / weight[good].sum()
     mean = weight @ values
     std = np.sqrt(weight @ np.square(values - mean))
@@ -383,4 +380,4 @@ def _summary(values, weight):
         log_mean = weight[positive] @ np.log10(values[positive]) / weight[positive].sum()
     order = np.argsort(values, kind="stable")
     middle = np.cumsum(weight[order]) - 0.5 * weight[order]
-    return np.array([mean, std, log_mean]), np.interp(levels, middle, values[order])
+    return np.array([mean, std, log_mean]), np.interp(DERIVED_LEVELS, middle, values[order])
