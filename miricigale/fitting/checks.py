@@ -130,17 +130,14 @@ class MockResult:
             derived quantity, ``<name>_true``, ``_mean``, ``_std``, ``_p16``, ``_p50`` and
             ``_p84``.
         """
-        columns = {
-            "id": (np.array(self.recovered.ids), "identifier"),
-            "flags": (np.array(self.recovered.flags), FitFlags.describe()),
-        }
-        table = self.recovered.to_table()
+        table, names = self.recovered.to_table(), ["id", "flags"]
         for name in self.parameters:
-            columns[f"{name}_true"] = (self.true(name), f"true value of {name}: the best model's")
-            for suffix in ("mean", "std", "p16", "p50", "p84"):
-                column = table[f"{name}_{suffix}"]
-                columns[f"{name}_{suffix}"] = (column, column.info.description)
-        return described_table(columns, dict(self.recovered.meta) | {"mock": dict(self.meta)})
+            table[f"{name}_true"] = self.true(name)
+            table[f"{name}_true"].info.description = f"true value of {name}: the best model's"
+            names += [f"{name}_{part}" for part in ("true", "mean", "std", "p16", "p50", "p84")]
+        table = table[names]
+        table.meta["mock"] = dict(self.meta)
+        return table
 
     def metrics(self, parameters=None):
         """
