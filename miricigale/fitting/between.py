@@ -10,12 +10,10 @@ Int. J. Nonlin. Sci. Num. Sim. 10, 273) and about the mean of all with their cov
 Crank-Nicolson moves for a t distribution: Grumitt et al. 2024, arXiv:2407.07781). `Continuation` has the models.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from miricigale.fitting.continuation import Continuation
+from miricigale.fitting.interpolation import rows_of
 from miricigale.fitting.quantities import DERIVED_LEVELS, draws_summary
 from miricigale.fitting.samplers.run import best_scale, chi2_at, systematic_draws
 from miricigale.utils.random import stream
@@ -30,61 +28,55 @@ _FIRST, _LAST, _NEXT = 18, 54, 6
 _DEGREES, _TAKEN = 5.0, 0.25
 
 
-@dataclass(frozen=True, eq=False)
-class Between:
+def between_nodes(models, engine, data, log_prior, n_draws, results):
     """
-    How the posterior of a grid is continued between its nodes; picklable.
+    Results with posteriors, moments and percentiles of models between the nodes.
 
     Parameters
     ----------
     models : `~miricigale.fitting.continuation.Continuation`
         The grid with what lies between its nodes.
+    engine : `~miricigale.fitting.grid.GridEngine`
+        Of the nodes, or of the redshift of one object.
+    data : `~miricigale.fitting.likelihood.FitData`
+        Photometry of n objects.
+    log_prior : `~numpy.ndarray`, shape (n, nz)
+        ln(prior) of their redshifts.
     n_draws : int
         Members of the population of each object.
+    results : `~miricigale.fitting.FitResults`
+        What was found on the nodes.
     """
-
-    models: Continuation
-    n_draws: int
-
-    def widened(self, data):
-        """Photometry with the errors by which nodes are drawn, and seeds of the draws."""
-        more = np.where(data.measured, self.models.errors * np.nan_to_num(data.flux), 0.0)
-        seeds = [stream(0, "between", str(key)).integers(2**63) for key in data.ids]
-        return data._changed(sigma=np.hypot(data.sigma, more)), np.array(seeds, np.int64)
-
-    def refine(self, engine, data, wide, log_prior, index, seeds, results):
-        """
-        Results with posteriors, moments and percentiles of models between the nodes.
-
-        ``index``, shape (n, n_draws, 4), are models of ``engine``, of the nodes or at the redshift of one object,
-        drawn from the posteriors of ``wide`` with ln(prior) of redshifts ``log_prior``.
-        """
-        names, n = list(results.axes), len(data)
-        new = {
-            name: np.array(getattr(results, name)) for name in ("pdf_2d", "moments", "quantiles")
-        }
-        new["pdf"] = {name: np.array(results.pdf[name]) for name in names}
-        new["axis_moments"] = np.full((n, len(names), 2), np.nan)
-        new["axis_quantiles"] = np.full((n, len(names), DERIVED_LEVELS.size), np.nan)
-        for i in np.flatnonzero((index[:, :, 0] >= 0).all(axis=1)):
-            rng = np.random.default_rng(int(seeds[i]))
-            one = _Object(self.models, engine, data[i : i + 1], wide.sigma[i], log_prior[i], rng)
-            values, node, derived = one.population(index[i])
-            m = len(next(iter(values.values())))
-            for j, name in enumerate(names):
-                pdf = np.bincount(node[name], minlength=results.pdf[name].shape[1]) / m
-                new["pdf"][name][i] = pdf
-                moments, quantiles = draws_summary(values[name])
-                new["axis_moments"][i, j], new["axis_quantiles"][i, j] = moments[:2], quantiles
-            shape = new["pdf_2d"].shape[1:]
-            place = node["redshift"] * shape[1] + node.get("frac_agn", 0)
-            new["pdf_2d"][i] = np.bincount(place, minlength=shape[0] * shape[1]).reshape(shape) / m
-            for j, name in enumerate(results.quantities):
-                if name in derived:
-                    with_log = np.isfinite(results.moments[i, j, 2])
-                    found = draws_summary(derived[name], with_log=with_log)
-                    new["moments"][i, j], new["quantiles"][i, j] = found
-        return results._changed(**new)
+    # nodes are drawn by wider errors
+    more = np.where(data.measured, models.errors * np.nan_to_num(data.flux), 0.0)
+    wide = data._changed(sigma=np.hypot(data.sigma, more))
+    seeds = [stream(0, "between", str(key)).integers(2**63) for key in data.ids]
+    seeds = np.array(seeds, np.int64)
+    index, _ = engine.draw(n_draws=n_draws, seeds=seeds, **wide.of_engine(log_prior))
+    names, n = list(results.axes), len(data)
+    new = {name: np.array(getattr(results, name)) for name in ("pdf_2d", "moments", "quantiles")}
+    new["pdf"] = {name: np.array(results.pdf[name]) for name in names}
+    new["axis_moments"] = np.full((n, len(names), 2), np.nan)
+    new["axis_quantiles"] = np.full((n, len(names), DERIVED_LEVELS.size), np.nan)
+    for i in np.flatnonzero((index[:, :, 0] >= 0).all(axis=1)):
+        rng = np.random.default_rng(int(seeds[i]))
+        one = _Object(models, engine, data[i : i + 1], wide.sigma[i], log_prior[i], rng)
+        values, node, derived = one.population(index[i])
+        m = len(next(iter(values.values())))
+        for j, name in enumerate(names):
+            pdf = new["pdf"][name]
+            pdf[i] = np.bincount(node[name], minlength=pdf.shape[1]) / m
+            moments, quantiles = draws_summary(values[name])
+            new["axis_moments"][i, j], new["axis_quantiles"][i, j] = moments[:2], quantiles
+        shape = new["pdf_2d"].shape[1:]
+        place = node["redshift"] * shape[1] + node.get("frac_agn", 0)
+        new["pdf_2d"][i] = np.bincount(place, minlength=shape[0] * shape[1]).reshape(shape) / m
+        for j, name in enumerate(results.quantities):
+            if name in derived:
+                with_log = np.isfinite(results.moments[i, j, 2])
+                found = draws_summary(derived[name], with_log=with_log)
+                new["moments"][i, j], new["quantiles"][i, j] = found
+    return results._changed(**new)
 
 
 class _Object:
@@ -131,7 +123,7 @@ class _Object:
         """Coordinates in the cells of nodes: the prior is normal in each."""
         z, g, k, f = index.T
         rng, node = self.rng, {"redshift": z, "frac_agn": f}
-        for name, axis in self.models.priors.axes.items():
+        for name, axis in self.models.axes.items():
             if axis.kind in ("galaxy", "agn"):
                 # drawn from the prior where the model has none of its own
                 share = axis.share[:, g if axis.kind == "galaxy" else np.maximum(k, 0)].cumsum(
@@ -172,7 +164,7 @@ class _Object:
         out |= {"true": np.full(len(x), -np.inf), "node": np.zeros(len(x))}
         some = np.flatnonzero(models.possible)
         if some.size:
-            models = models.rows(some)
+            models = rows_of(models, some)
             z = models.node["redshift"]
             out["true"][some] = self._likelihood(self.models.fluxes(models)[0], z, self.sigma)[2]
             if step < 1.0:

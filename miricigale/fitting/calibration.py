@@ -11,7 +11,8 @@ from scipy.special import expit, ndtr
 
 from miricigale.filters import FilterSet
 from miricigale.fitting.likelihood import per_band
-from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_names
 from miricigale.utils.tables import described_table, error_column, require_columns
 from miricigale.utils.units import FNU, WAVE, frozen_array, to_array
 
@@ -317,8 +318,7 @@ def calibrate_zero_points(results, *, reference=None):
     n = good[:, columns].sum(axis=0)
     if reference is None:
         reference = bands[int(np.argmax(n))]
-    elif reference not in bands:
-        raise unknown_name("band that was fitted", reference, bands)
+    check_names([reference], "band that was fitted", bands)
     if n[bands.index(reference)] < _N_BAND:
         wanted = f"a band with {_N_BAND} sources of S/N above 5"
         raise argument_error("reference", wanted, f"{reference} with {n[bands.index(reference)]}")
@@ -363,9 +363,8 @@ def apply_zero_points(photometry, zero_points):
         If a column is missing.
     """
     require_columns(zero_points, ["band", "factor"], "zero_points")
-    factors = {
-        str(b): float(f) for b, f in zip(zero_points["band"], zero_points["factor"], strict=True)
-    }
+    names, values = map(str, zero_points["band"]), map(float, zero_points["factor"])
+    factors = dict(zip(names, values, strict=True))
     columns = [c for name in factors for c in (name, error_column(name))]
     require_columns(photometry, columns, "photometry", units=dict.fromkeys(columns, FNU))
     out = QTable(photometry, copy=True)

@@ -10,9 +10,16 @@ from astropy.table import QTable
 from miricigale.fitting.fitter import BayesFitter
 from miricigale.fitting.likelihood import FitFlags, PhotometryReader, flux_column
 from miricigale.fitting.posterior import randomized_ranks
-from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_names
 from miricigale.utils.random import check_seed, stream
-from miricigale.utils.tables import described_table, error_column, read_ids, require_columns
+from miricigale.utils.tables import (
+    described_rows,
+    described_table,
+    error_column,
+    read_ids,
+    require_columns,
+)
 from miricigale.utils.units import FNU, frozen_array
 
 _LEVELS = (0.16, 0.84)
@@ -62,13 +69,11 @@ def mock_analysis(fitter, results, photometry, *, seed, model_error=False, **opt
     ).reshape(results.flux.shape)
     error = results.sigma if model_error else results.flux_err
     used = np.isfinite(results.sigma) & results.fitted[:, None] & np.isfinite(error)
+    change, drawn = used & ~results.limit, results.best_flux + noise * error
     mock = QTable(photometry, copy=True)
     for name in filters:
         i = results.filters.index(name)
-        change = used[:, i] & ~results.limit[:, i]
-        flux = flux_column(photometry, name)
-        flux[change] = (results.best_flux[:, i] + noise[:, i] * error[:, i])[change]
-        mock[name] = flux * FNU
+        mock[name] = np.where(change[:, i], drawn[:, i], flux_column(photometry, name)) * FNU
     recovered = fitter.fit(mock, **options)
     return MockResult(
         results, recovered, mock, seed, {"seed": seed, "model_error": bool(model_error)}
@@ -125,17 +130,14 @@ class MockResult:
             derived quantity, ``<name>_true``, ``_mean``, ``_std``, ``_p16``, ``_p50`` and
             ``_p84``.
         """
-        columns = {
-            "id": (np.array(self.recovered.ids), "identifier"),
-            "flags": (np.array(self.recovered.flags), FitFlags.describe()),
-        }
-        table = self.recovered.to_table()
+        table, names = self.recovered.to_table(), ["id", "flags"]
         for name in self.parameters:
-            columns[f"{name}_true"] = (self.true(name), f"true value of {name}: the best model's")
-            for suffix in ("mean", "std", "p16", "p50", "p84"):
-                column = table[f"{name}_{suffix}"]
-                columns[f"{name}_{suffix}"] = (column, column.info.description)
-        return described_table(columns, dict(self.recovered.meta) | {"mock": dict(self.meta)})
+            table[f"{name}_true"] = self.true(name)
+            table[f"{name}_true"].info.description = f"true value of {name}: the best model's"
+            names += [f"{name}_{part}" for part in ("true", "mean", "std", "p16", "p50", "p84")]
+        table = table[names]
+        table.meta["mock"] = dict(self.meta)
+        return table
 
     def metrics(self, parameters=None):
         """
@@ -156,33 +158,32 @@ class MockResult:
             parameters of the grid, whose truth lies on a node, the coverage counts randomized
             ranks.
         """
-        names = self.parameters if parameters is None else tuple(parameters)
-        rows = [self._metric(name) for name in names]
         texts = {
+            "parameter": "parameter or derived quantity",
             "unit": "unit of offset and scatter",
             "n": "objects with a true value that were fitted",
             "offset": "median of posterior mean less truth",
             "scatter": "1.48 times the median absolute deviation of the same",
             "coverage": "part of truths within the 16-84 % interval; 0.68 is right",
         }
-        first = {"parameter": (np.array(names, dtype=str), "parameter or derived quantity")}
-        return _metrics_table(first, rows, texts, {"mock": dict(self.meta)})
+        names = self.parameters if parameters is None else parameters
+        table = described_rows([(name, *self._metric(name)) for name in names], texts)
+        table.meta["mock"] = dict(self.meta)
+        return table
 
     def _metric(self, name):
         true, mean = self.true(name).value, self.recovered.mean(name).value
         good = np.isfinite(true) & np.isfinite(mean)
+        unit, difference = self.truth.unit(name).to_string(), (mean - true)[good]
         if self.truth.extensive(name):
             both = good & (true > 0) & (mean > 0)
-            difference = np.log10(mean[both] / true[both])
-            unit = "dex"
-        else:
-            difference = (mean - true)[good]
-            unit = self.truth.unit(name).to_string()
+            unit, difference = "dex", np.log10(mean[both] / true[both])
+        if not good.any():
+            return unit, 0, np.nan, np.nan, np.nan
         offset, scatter = np.nan, np.nan
         if difference.size:
-            offset = float(np.median(difference))
-            scatter = float(mad_std(difference))
-        coverage = float(np.mean(self._inside(name, good))) if good.any() else np.nan
+            offset, scatter = float(np.median(difference)), float(mad_std(difference))
+        coverage = float(np.mean(self._inside(name, good)))
         return unit, int(np.count_nonzero(good)), offset, scatter, coverage
 
     def _inside(self, name, good):
@@ -252,9 +253,7 @@ def leave_out(fitter, photometry, bands, *, separately=False, **options):
     bands = tuple(bands)
     if len(set(bands)) < len(bands):
         raise argument_error("bands", "different names", f"{list(bands)}")
-    for name in bands:
-        if name not in fitter.bands:
-            raise unknown_name("filter of the models", name, fitter.bands)
+    check_names(bands, "filter of the models", fitter.bands)
     zero = dict.fromkeys(bands, 0.0)
     data = PhotometryReader(bands, bands, zero, zero, 1).read(photometry)
     groups = [(name,) for name in bands] if separately else [bands]
@@ -267,25 +266,22 @@ def leave_out(fitter, photometry, bands, *, separately=False, **options):
     empty = [name for name, known in zip(bands, data.used.any(axis=0), strict=True) if not known]
     if empty and len(photometry):
         raise argument_error("bands", "measured for one object at least", f"{empty}")
-    results, predicted, scatter = {}, [], []
+    results = {}
     for group in groups:
         blank = QTable(photometry, copy=True)
         for name in group:
             blank[name] = np.full(len(blank), np.nan) * FNU
             if f"{name}_limit" in blank.colnames:
                 blank[f"{name}_limit"] = np.zeros(len(blank), dtype=bool)
-        found = fitter.fit(blank, **options)
-        for name in group:
-            i = found.filters.index(name)
-            results[name] = found
-            predicted.append(found.model_flux[:, i])
-            scatter.append(found.model_flux_std[:, i])
+        results |= dict.fromkeys(group, fitter.fit(blank, **options))
+    column = [fitter.bands.index(name) for name in bands]
+    fits = list(zip(results.values(), column, strict=True))
     return LeaveOutResult(
         bands=bands,
         flux=np.where(data.measured, data.flux, np.nan),
         flux_err=np.where(data.measured, data.flux_err, np.nan),
-        predicted=np.array(predicted).T,
-        predicted_std=np.array(scatter).T,
+        predicted=np.array([found.model_flux[:, i] for found, i in fits]).T,
+        predicted_std=np.array([found.model_flux_std[:, i] for found, i in fits]).T,
         results=results,
     )
 
@@ -368,16 +364,15 @@ class LeaveOutResult:
             absolute deviation of the pulls; ``within``, the part of pulls within 1 (0.68 if
             errors and models are right).
         """
-        rows = [self._metric(i) for i in range(len(self.bands))]
         texts = {
+            "band": "band that was left out",
             "n": "objects measured and predicted",
             "offset": "median of measured over predicted, less 1",
             "pull": "median of the pulls",
             "pull_scatter": "1.48 times their median absolute deviation",
             "within": "part of the pulls within 1",
         }
-        first = {"band": (np.array(self.bands, dtype=str), "band that was left out")}
-        return _metrics_table(first, rows, texts)
+        return described_rows([(n, *self._metric(i)) for i, n in enumerate(self.bands)], texts)
 
     def _metric(self, i):
         good = np.isfinite(self.pull[:, i])
@@ -393,15 +388,7 @@ class LeaveOutResult:
         """Draw the distribution of the pulls of one band, or of all; returns the axes."""
         from miricigale.plotting.posteriors import plot_pulls
 
-        if band is not None and band not in self.bands:
-            raise unknown_name("band that was left out", band, self.bands)
+        check_names(() if band is None else [band], "band that was left out", self.bands)
         pull = self.pull if band is None else self.pull[:, self.bands.index(band)]
         kwargs.setdefault("label", band)
         return plot_pulls(pull.ravel(), ax=ax, **kwargs)
-
-
-def _metrics_table(columns, rows, texts, meta=None):
-    """Table of a first column and a row of numbers for each of its values."""
-    numbers = (np.array([row[i] for row in rows]) for i in range(len(texts)))
-    pairs = zip(numbers, texts.values(), strict=True)
-    return described_table(columns | dict(zip(texts, pairs, strict=True)), meta)

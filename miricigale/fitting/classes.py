@@ -53,32 +53,28 @@ def fit_classes(path, output, *, quasars=False, stars=None, **options):
 
         # a file that cannot be read is refused before hours of fitting
         spectra = read_spectra(stars)
-    shown = set()
-    with _each_once(shown):
+    with _each_once():
         found = {"galaxy": fit_catalog(path, output, **options)}
-    # after the fit, which refuses what it cannot read before it loads the models
-    from miricigale.sed import SEDModel, quasar_axes, template_grid
+        # after the fit, which refuses what it cannot read before it loads the models
+        from miricigale.sed import SEDModel, quasar_axes, template_grid
 
-    models = {}
-    if quasars:
-        models["quasar"] = lambda _: (SEDModel.survey(), quasar_axes())
-    if spectra is not None:
-        models["star"] = lambda bands: (
-            template_grid(spectra, bands, beyond="rayleigh-jeans"),
-            None,
-        )
-    for name, make in models.items():
-        left = ("pairs", "redshift") if name == "star" else ("pairs",)
-        own = {key: value for key, value in options.items() if key not in left}
-        with _each_once(shown):
+        models = {}
+        if quasars:
+            models["quasar"] = lambda _: (SEDModel.survey(), quasar_axes())
+        if spectra is not None:
+            beyond = "rayleigh-jeans"
+            models["star"] = lambda bands: (template_grid(spectra, bands, beyond=beyond), None)
+        for name, make in models.items():
+            left = ("pairs", "redshift") if name == "star" else ("pairs",)
+            own = {key: value for key, value in options.items() if key not in left}
             found[name] = fit_catalog(path, Path(output) / name, models=make, **own)
     return found
 
 
 @contextmanager
-def _each_once(shown):
-    """Show each text of a warning once, for it holds for all classes; ``shown`` are those so far."""
-    show = warnings.showwarning
+def _each_once():
+    """Show each text of a warning once, for it holds for all classes."""
+    show, shown = warnings.showwarning, set()
 
     def once(message, *args, **kwargs):
         if str(message) not in shown:
@@ -155,15 +151,12 @@ def classes_section(page, columns, names, ids, chi2):
     )
     rows = []
     for name in names:
-        mine = label == name
+        mine, own = label == name, chi2 if name == "galaxy" else columns[f"reduced_chi2_{name}"]
         sure = columns[f"probability_{name}"][mine] > 1.0 / (1.0 + np.exp(-_SURE))
-        own = (chi2 if name == "galaxy" else columns[f"reduced_chi2_{name}"])[mine]
-        middle = number(np.median(own) if own.size else np.nan, ".2f", "no object")
-        rows.append((name, int(mine.sum()), int(sure.sum()), middle))
+        middle = np.median(own[mine]) if mine.any() else np.nan
+        rows.append((name, int(mine.sum()), int(sure.sum()), number(middle, ".2f", "no object")))
     rows.append(("not fitted with all classes", int(np.sum(label == "")), "", ""))
-    page.table(
-        rows, header=("class", "objects", "of them beyond 150 to 1", "reduced chi2, median"), text=1
-    )
+    page.table(rows, header=("class", "objects", "of them beyond 150 to 1", "reduced chi2, median"))
     figure, axes = new_figure(1, len(others), size=(WIDTH / 2, 3.2))
     for ax, name in zip(axes[0], others, strict=True):
         ratio = columns[f"log_ratio_{name}"]
@@ -174,23 +167,16 @@ def classes_section(page, columns, names, ids, chi2):
     page.figure(
         figure, "Evidence over that of galaxies; what is beyond stands in the outermost bins."
     )
-    order = []
+    surest = []
     for name in others:
+        ratio, own = columns[f"log_ratio_{name}"], columns[f"reduced_chi2_{name}"]
         mine = np.flatnonzero(label == name)
-        best = np.argsort(-columns[f"log_ratio_{name}"][mine], kind="stable")
-        order.extend(mine[best][:_LISTED])
-    if order:
+        for i in mine[np.argsort(-ratio[mine], kind="stable")][:_LISTED]:
+            numbers = (f"{ratio[i]:+.1f}", f"{own[i]:.2f}", f"{chi2[i]:.2f}")
+            surest.append((str(ids[i]), name, *numbers))
+    if surest:
         page.table(
-            [
-                (
-                    str(ids[i]),
-                    label[i],
-                    f"{columns[f'log_ratio_{label[i]}'][i]:+.1f}",
-                    f"{columns[f'reduced_chi2_{label[i]}'][i]:.2f}",
-                    f"{chi2[i]:.2f}",
-                )
-                for i in order
-            ],
+            surest,
             header=("id", "class", "ln ratio to galaxy", "its reduced chi2", "that of the galaxy"),
             caption=f"Up to {_LISTED} objects of each class, the surest first.",
             text=2,

@@ -5,6 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
+from miricigale.fitting.grid import GridEngine
 from miricigale.fitting.interpolation import Nodes, Place, less_factor
 from miricigale.fitting.posterior import cell_edges
 
@@ -57,15 +58,6 @@ class Models:
     place: Place
     possible: np.ndarray  # (n,) of bool
 
-    def rows(self, some):
-        """Part of the models."""
-        return Models(
-            {name: value[some] for name, value in self.values.items()},
-            {name: value[some] for name, value in self.node.items()},
-            self.place.rows(some),
-            self.possible[some],
-        )
-
 
 @dataclass(frozen=True, eq=False)
 class Continuation:
@@ -74,33 +66,32 @@ class Continuation:
 
     Parameters
     ----------
-    priors : `~miricigale.fitting.priors.GridPriors`
-        Its axes and priors.
     engine : `~miricigale.fitting.grid.GridEngine`
-        Its tables.
+        Its models and priors.
     nodes, finer : `~miricigale.fitting.interpolation.Nodes`
         Its models, and those of a grid with more nodes between which models are interpolated: of the same, if
         there is none.
     """
 
-    priors: object
-    engine: object
+    engine: GridEngine
     nodes: Nodes
     finer: Nodes
 
-    def __getstate__(self):
-        return {name: getattr(self, name) for name in self.__dataclass_fields__}
+    @property
+    def axes(self):
+        """`~miricigale.fitting.priors.GridAxis` of each parameter with several values or a prior, by name."""
+        return self.engine.priors.axes
 
     @cached_property
     def cells(self):
         """`Cells` of each axis with several values, by name."""
-        axes = self.priors.axes.items()
+        axes = self.axes.items()
         return {n: Cells.of_nodes(a.values, a.weights) for n, a in axes if a.values.size > 1}
 
     @cached_property
     def errors(self):
         """Rms by band, (nb,), of ln flux, but for a factor, from nodes to edges of cells."""
-        flux = self.engine.galaxy[:, :: max(self.priors.galaxy.size // 100, 1)]
+        flux = self.engine.galaxy[:, :: max(self.engine.grid.n_galaxies // 100, 1)]
         steps = (np.square(step) for step in self._steps(flux) if len(step))
         return np.sqrt(sum((np.median(one, axis=0) for one in steps), np.zeros(flux.shape[2])))
 
@@ -116,13 +107,14 @@ class Continuation:
             low, high = np.log(np.maximum(some[z - 1 : z + 1], _TINY))
             yield 0.5 * less_factor(high - low)
         for name in self.cells:
-            kind = self.priors.axes[name].kind
+            kind = self.axes[name].kind
             if kind in self.nodes.kinds:
                 part = 1.0 if kind == "galaxy" else np.sqrt(_OF_AGN)
                 yield part * self.nodes.kinds[kind].steps(name)
         if "frac_agn" in self.cells:
-            dust = engine.dust[:: max(self.priors.galaxy.size // 100, 1), None]
-            power = dust * engine.frac / np.maximum(1.0 - engine.frac, 1e-12)
+            frac = engine.grid.frac_agn
+            dust = engine.grid.dust_luminosity[:: max(self.engine.grid.n_galaxies // 100, 1), None]
+            power = dust * frac / np.maximum(1.0 - frac, 1e-12)
             agn = np.median(engine.agn[z], axis=0)
             ln = np.log(some[z][:, None] + power[..., None] * agn + _TINY)
             steps = 0.5 * less_factor(np.diff(ln, axis=1))
@@ -131,7 +123,7 @@ class Continuation:
 
     def models(self, values):
         """`Models` of values by name, shape (n,), some of which may be missing: these have the only node."""
-        n, axes = len(next(iter(values.values()))), self.priors.axes
+        n, axes = len(next(iter(values.values()))), self.axes
         node = {name: np.zeros(n, np.int64) for name in axes}
         node |= {name: self.cells[name].of(value) for name, value in values.items()}
         z = axes["redshift"].values
@@ -157,7 +149,9 @@ class Continuation:
 
     def fluxes(self, models):
         """Fluxes of one solar mass formed, shape (n, nb), and the AGN's power."""
-        frac = models.values.get("frac_agn", self.engine.frac[models.node.get("frac_agn", 0)])
+        frac = models.values.get(
+            "frac_agn", self.engine.grid.frac_agn[models.node.get("frac_agn", 0)]
+        )
         return self.finer.fluxes(models.place, np.broadcast_to(frac, models.possible.shape))
 
     def at_nodes(self, models, engine):
@@ -167,13 +161,13 @@ class Continuation:
         z = node["redshift"] if len(engine.galaxy) > 1 else 0 * galaxy
         flux = engine.galaxy[z, galaxy]
         if engine.agn.shape[1]:
-            frac = engine.frac[node["frac_agn"]]
-            power = engine.dust[galaxy] * frac / np.maximum(1.0 - frac, 1e-12)
+            frac = engine.grid.frac_agn[node["frac_agn"]]
+            power = engine.grid.dust_luminosity[galaxy] * frac / np.maximum(1.0 - frac, 1e-12)
             flux = flux + power[:, None] * engine.agn[z, kinds["agn"].models(node)]
         return flux
 
     def describe(self, models, power, scale):
         """Values of parameters and derived quantities of models of given scales: dicts by name."""
-        axes, node = self.priors.axes, models.node
+        axes, node = self.axes, models.node
         values = {name: models.values.get(name, a.values[node[name]]) for name, a in axes.items()}
         return values, self.finer.describe(models.place, power, scale)

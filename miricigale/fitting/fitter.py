@@ -1,6 +1,7 @@
 """BayesFitter: posteriors of galaxy and AGN parameters from broad-band photometry."""
 
 import logging
+import warnings
 
 import numpy as np
 
@@ -20,8 +21,9 @@ from miricigale.fitting.samplers import get_sampler
 from miricigale.fitting.samplers.fit import SamplerFit
 from miricigale.fitting.settings import GridSettings, SamplerSettings
 from miricigale.sed import ModelGrid
-from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.exceptions import FitWarning, argument_error
 from miricigale.utils.meta import provenance
+from miricigale.utils.options import check_names
 from miricigale.utils.parallel import chunks, parallel_map, single_threaded
 from miricigale.utils.random import check_seed
 from miricigale.utils.units import check_count, is_number
@@ -96,6 +98,14 @@ class BayesFitter:
 
     Attributes
     ----------
+    bands : tuple of str
+        Bands of the models, in the order of the results.
+    grid : `~miricigale.sed.ModelGrid`
+        The grid; None for a sampler.
+    priors : `~miricigale.fitting.priors.GridPriors` or dict
+        Priors of a grid, or that of each free parameter by name.
+    n_bands_min : int
+        Objects with fewer usable bands are not fitted.
     backend : `~miricigale.fitting.grid_fit.GridFit` or `~miricigale.fitting.samplers.fit.SamplerFit`
         What fits, with the priors and the derived quantities.
 
@@ -166,27 +176,23 @@ class BayesFitter:
         if not (is_number(max_reduced_chi2) and max_reduced_chi2 > 0):
             raise argument_error("max_reduced_chi2", "positive", repr(max_reduced_chi2))
         self.engine, self.filters = engine, names
-        self._engine_name = engine if isinstance(engine, str) else repr(engine)
         self.model = None if isinstance(model, ModelGrid) else model
         scale_error = compat is None if scale_error is None else bool(scale_error)
-        if on_grid:
-            self.backend = GridFit.of_model(
-                model, filters, priors, settings, scale_error=scale_error, **of_grid
-            )
-            for name in names or ():
-                if name not in self.bands:
-                    raise unknown_name("filter of the grid", name, self.bands)
-        else:
-            self.backend = SamplerFit.of_model(
-                model, filters, priors, settings, sampler=engine, scale_error=scale_error
-            )
+        kind, more = (GridFit, of_grid) if on_grid else (SamplerFit, {"sampler": engine})
+        self.backend = kind.of_model(
+            model, filters, priors, settings, scale_error=scale_error, **more
+        )
+        self.bands, self.priors = self.backend.filters, self.backend.priors
+        self.grid = self.backend.grid if on_grid else None
+        check_names(names or (), "filter of the grid", self.bands)
         of_bands = self.bands if on_grid else names
+        self.n_bands_min = check_count(n_bands_min, "n_bands_min")
         self._reader = PhotometryReader(
             self.bands,
             names,
             per_band(model_error, of_bands, "model_error"),
             per_band(error_floor, of_bands, "error_floor"),
-            check_count(n_bands_min, "n_bands_min"),
+            self.n_bands_min,
         )
         self.max_reduced_chi2 = float(max_reduced_chi2)
 
@@ -194,28 +200,12 @@ class BayesFitter:
         bands = "bands of the photometry" if self.filters is None else f"{len(self.filters)} bands"
         if self.engine == "grid":
             return f"<BayesFitter of {self.grid!r}, {bands}>"
-        free = ", ".join(self.backend.space.free)
+        free = ", ".join(self.priors)
         return f"<BayesFitter of {self.model!r}, {bands}, {self._engine_name}, free: {free}>"
 
     @property
-    def bands(self):
-        """Bands of the models, in the order of the results: tuple of str."""
-        return self.backend.filters
-
-    @property
-    def n_bands_min(self):
-        """Objects with fewer usable bands are not fitted."""
-        return self._reader.n_bands_min
-
-    @property
-    def grid(self):
-        """The `~miricigale.sed.ModelGrid`; None for a sampler."""
-        return self.backend.grid if self.engine == "grid" else None
-
-    @property
-    def priors(self):
-        """`~miricigale.fitting.priors.GridPriors`, or the prior of each free parameter by name."""
-        return self.backend.priors if self.engine == "grid" else self.backend.space.free
+    def _engine_name(self):
+        return self.engine if isinstance(self.engine, str) else repr(self.engine)
 
     def fit(
         self,
@@ -288,21 +278,19 @@ class BayesFitter:
         `~astropy.units.UnitsError`
             If a flux column has no unit of flux density.
         """
-        options = {"redshift": redshift, "redshift_prior": redshift_prior, "pairs": pairs}
-        options["stacklevel"] = 4
         warn_of_codes(codes_of(photometry, self._reader.fitted(photometry)), "photometry", 2)
+        self.warn_of_bands(photometry, 2)
+        given = {"redshift": redshift, "redshift_prior": redshift_prior, "pairs": pairs}
         parallel = {"executor": executor, "progress_bar": progress_bar}
-        return self._fit_rows(photometry, options, seed=seed, chunk_size=chunk_size, **parallel)
+        return self.fit_part(photometry, **given, seed=seed, chunk_size=chunk_size, **parallel)
 
-    def _fit_rows(
-        self, photometry, options, *, seed=None, chunk_size=None, repeated=None, **parallel
-    ):
-        """Fit a catalog, or a part of one of which earlier parts had the ``repeated`` rows."""
+    def fit_part(self, photometry, *, pairs, seed, chunk_size=None, repeated=None, **options):
+        """Do what `fit` does, without warnings; earlier parts of the catalog had the ``repeated`` rows."""
         size = self.backend.chunk_size if chunk_size is None else chunk_size
         size = check_count(size, "chunk_size")
         seed = None if self.engine == "grid" else check_seed(seed)
-        pairs = options.pop("pairs")
-        data, known, settings = self._prepare(photometry, **options, repeated=repeated)
+        known = {name: options.pop(name) for name in ("redshift", "redshift_prior")}
+        data, known, settings = self._prepare(photometry, **known, repeated=repeated)
         task = self.backend.task(pairs, seed, known)
         # the measured errors take no part, and what goes to other processes is kept small
         sent = data._changed(flux_err=None)
@@ -310,7 +298,7 @@ class BayesFitter:
         pieces = [(sent[some], known[some]) for some in rows]
         # for threads too, which share this setting with their process
         with single_threaded():
-            results = FitResults.concatenate(parallel_map(task, pieces, desc="fit", **parallel))
+            results = FitResults.concatenate(parallel_map(task, pieces, desc="fit", **options))
         logger.debug("fitted %d objects", len(data))
         settings |= {} if seed is None else {"seed": seed}
         fixed = settings["redshift"] == "fixed"
@@ -321,30 +309,31 @@ class BayesFitter:
             fitted_filters=tuple(settings["filters"]),
             redshift_fixed=fixed,
             model=self.model,
-            meta=provenance(
-                citations=self.backend.citations, fit=settings, **self.backend.provenance()
-            ),
+            meta=provenance(fit=settings, **self.backend.provenance()),
         )
 
-    def _prepare(self, photometry, *, redshift, redshift_prior, stacklevel, repeated=None):
-        """
-        Photometry with flags, what is known of the redshift of every object, and the settings.
+    def warn_of_bands(self, photometry, stacklevel):
+        """Warn of bands that are not fitted, if the fitter does not name those that are."""
+        unused = unused_bands(photometry, self._reader.fitted(photometry))
+        if unused and self.filters is None:
+            text = "bands of the photometry that the grid lacks are not fitted"
+            text = f"{text}: {', '.join(unused)}"
+            warnings.warn(text, FitWarning, stacklevel=stacklevel + 1)
 
-        ``stacklevel`` is that of the warnings; None for none.
-        """
+    def _prepare(self, photometry, *, redshift, redshift_prior, repeated=None):
+        """Photometry with flags, what is known of the redshift of every object, and the settings."""
         filters = self._reader.fitted(photometry)
         if redshift is not None and redshift_prior is not None:
             msg = "'redshift' and 'redshift_prior' must not be given both"
             raise ValueError(msg)
-        # who names the bands knows that others are left out
-        unused = unused_bands(photometry, filters, stacklevel if self.filters is None else None)
         data = self._reader.read(photometry, repeated)
         self.backend.check_data(data)
         flags = np.array(data.flags)
         known, n_free, kind = self.backend.redshifts(photometry, redshift, redshift_prior, flags)
         few = (data.measured.sum(axis=1) < n_free) & ((flags & int(FitFlags.UNFITTED)) == 0)
         flags[few] |= int(FitFlags.FEW_FOR_PARAMETERS)
-        settings = self.settings(filters) | {"redshift": kind, "unused_bands": unused}
+        settings = self.settings(filters) | {"redshift": kind}
+        settings["unused_bands"] = unused_bands(photometry, filters)
         if kind == "fixed":
             data = data._changed(redshift=known_redshifts(photometry, redshift))
         return data._changed(flags=flags), known, settings
@@ -387,13 +376,15 @@ class BayesFitter:
             raise ValueError(msg)
         n_draws, seed = check_count(n_draws, "n_draws"), check_seed(seed)
         warn_of_codes(codes_of(photometry, self._reader.fitted(photometry)), "photometry", 2)
+        self.warn_of_bands(photometry, 2)
         data, known, settings = self._prepare(
-            photometry, redshift=redshift, redshift_prior=redshift_prior, stacklevel=3
+            photometry, redshift=redshift, redshift_prior=redshift_prior
         )
         samples = self.backend.sample(
             data, known, n_draws, seed, executor=executor, progress_bar=progress_bar
         )
-        meta = provenance(citations=self.backend.citations, fit=settings, seed=seed)
+        cited = self.backend.provenance()["citations"]
+        meta = provenance(citations=cited, fit=settings, seed=seed)
         return samples._changed(model=self.model, meta=meta)
 
     def settings(self, filters=None):

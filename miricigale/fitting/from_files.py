@@ -105,23 +105,23 @@ def fit_catalog(
         )
         warnings.warn(msg, FitWarning, stacklevel=2)
     if axes == "survey":
-        model, nodes = SEDModel.survey(), SEDModel.survey_axes()
+        model, nodes, least = SEDModel.survey(), SEDModel.survey_axes(), 0.0
         error = TemplateError.survey() if model_error is None else None
-        errors = {"model_error": model_error or 0.0, "template_error": error}
-        if error is not None and models is None:
-            log.warning(
-                "errors of the models: %.0f to %.0f %% of the flux by rest wavelength, measured on sources "
-                "of CEERS (TemplateError.survey)",
-                *(100 * np.array([error.error.min(), error.error.max()])),
-            )
     else:
-        model, nodes = SEDModel.yang2021(), SEDModel.yang2021_axes(axes)
-        errors = {"model_error": 0.1 if model_error is None else model_error}
+        model, nodes, least = SEDModel.yang2021(), SEDModel.yang2021_axes(axes), 0.1
+        error = None
     if models is not None:
         model, nodes = models(bands)
+    elif error is not None:
+        log.warning(
+            "errors of the models: %.0f to %.0f %% of the flux by rest wavelength, measured on sources "
+            "of CEERS (TemplateError.survey)",
+            *(100 * np.array([error.error.min(), error.error.max()])),
+        )
     if ebv and isinstance(model, SEDModel):
         dust = GalacticExtinction(ebv_galactic=ebv, beyond="transparent")
         model = SEDModel([*model.components, dust])
-    fitter = BayesFitter(model, bands, axes=nodes, **errors)
+    errors = {"model_error": least if model_error is None else model_error}
+    fitter = BayesFitter(model, bands, axes=nodes, template_error=error, **errors)
     options |= {"catalog_map": catalog_map, "hdu": hdu, "chunk_rows": chunk_rows}
     return fit_file(fitter, path, output, **options)

@@ -1,15 +1,17 @@
 """The grid engine: every model of a `~miricigale.sed.ModelGrid`, by factors."""
 
+from collections import namedtuple
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from scipy.special import log_ndtr, logsumexp, ndtr, ndtri
 
 from miricigale.fitting import _core
 from miricigale.fitting.posterior import cell_edges
-from miricigale.utils.exceptions import argument_error
+from miricigale.fitting.priors import GridPriors
+from miricigale.fitting.quantities import DERIVED_LEVELS, Quantities
+from miricigale.sed import ModelGrid
 
 #: Runs of up to 64 pairs listed at once by one worker (260 bytes each).
 _CAPACITY = 1 << 16
@@ -23,26 +25,34 @@ _THIN = 1e-4
 _SINGLE = 5e-7
 
 
-class GridOutput(NamedTuple):
-    """What a fit of n objects returns; not a number, or -1, in rows that were not fitted."""
-
-    chi2: np.ndarray  # (n,), of the best model
-    log_sum: np.ndarray  # (n,): ln of the sum of prior exp(-chi2 / 2)
-    n_models: np.ndarray  # (n,): how many models were evaluated
-    best_scale: np.ndarray  # (n,): solar masses formed of the best model
-    best_flux: np.ndarray  # (n, nb): fluxes of that
-    index: np.ndarray  # int (n, 4): its redshift, galaxy, AGN model and AGN fraction
-    zf: np.ndarray  # (n, nz, nf): joint posterior of redshift and AGN fraction
-    galaxy: np.ndarray  # (n, nG) and
-    agn: np.ndarray  # (n, nA): posteriors of galaxy models and AGN models
-    band: np.ndarray  # (n, 2, nb): posterior mean and standard deviation of model fluxes
-    moments: np.ndarray  # (n, n_quantities, 3): mean, standard deviation and mean log10 and
-    quantiles: np.ndarray  # (n, n_quantities, n_levels) of derived quantities
-    share: np.ndarray  # (n, 2): mean and standard deviation and
-    share_quantiles: np.ndarray  # (n, n_levels) of the other AGN fraction
-    draw_index: np.ndarray  # int (n, n_draws, 4): models drawn from the posterior
-    draw_scale: np.ndarray  # (n, n_draws, 2): their scales and the variances of these
-    joint: dict  # (n, ...): joint posteriors that were asked for, by two letters of z, g, k and f
+#: What a fit of n objects returns, by the axes of each array after that of the objects: z redshifts, g
+#: galaxies, k AGN models, f AGN fractions, b bands, q derived quantities, l levels of their quantiles, d draws.
+_AXES = {
+    # chi2 of the best model, ln of the sum of prior exp(-chi2 / 2)
+    "chi2": "",
+    "log_sum": "",
+    # of the best model: solar masses formed, fluxes; redshift, galaxy, AGN model and AGN fraction
+    "best_scale": "",
+    "best_flux": "b",
+    "index": "4",
+    # posteriors of redshift and AGN fraction, of galaxies, of AGN models
+    "zf": "zf",
+    "galaxy": "g",
+    "agn": "k",
+    # mean and standard deviation of model fluxes; mean, standard deviation, mean log10 of quantities
+    "band": "2b",
+    "moments": "q3",
+    "quantiles": "ql",
+    # mean and standard deviation of the other AGN fraction
+    "share": "2",
+    "share_quantiles": "l",
+    # models drawn from the posterior, their scales and the variances of these
+    "draw_index": "d4",
+    "draw_scale": "d2",
+}
+#: These arrays, not a number or -1 in rows that were not fitted; ``joint`` are joint posteriors that were
+#: asked for, by two of the letters z, g, k and f.
+GridOutput = namedtuple("GridOutput", [*_AXES, "joint"])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -52,27 +62,17 @@ class GridEngine:
 
     Parameters
     ----------
-    galaxy : `~numpy.ndarray`, shape (nz, nG, nb)
-        Galaxy fluxes in uJy for each solar mass formed.
-    agn : `~numpy.ndarray`, shape (nz, nA, nb)
-        AGN fluxes in uJy for each W of AGN power; nA may be 0.
-    dust : `~numpy.ndarray`, shape (nG,)
-        Dust luminosity in W for each solar mass formed.
-    frac : `~numpy.ndarray`, shape (nf,)
-        AGN fractions, ascending.
+    grid : `~miricigale.sed.ModelGrid`
+        The grid.
+    priors : `~miricigale.fitting.priors.GridPriors`
+        Prior weights of its models.
+    quantities : `~miricigale.fitting.quantities.Quantities`
+        What is derived from them.
+    galaxy, agn : `~numpy.ndarray`, shapes (nz, nG, nb) and (nz, nA, nb)
+        Their fluxes, in uJy for each solar mass formed and for each W of AGN power: those of the grid, or
+        at another redshift than its own.
     usable : `~numpy.ndarray` of bool, shape (nz, nG)
-        Models that may be used.
-    prior_galaxy, prior_agn, prior_frac : `~numpy.ndarray`
-        Prior weights of galaxy models, AGN models and fractions.
-    galaxy_scale, agn_scale : `~numpy.ndarray`, shapes (n_qg, nG) and (n_qa, nA)
-        Derived quantities for each solar mass formed and for each W.
-    mixed_galaxy, mixed_agn : `~numpy.ndarray`, shapes (nG,) and (nA,)
-        Parts of galaxy and AGN model in one quantity that is the sum of both.
-    levels : `~numpy.ndarray`
-        Ascending levels of the quantiles of derived quantities.
-    share_galaxy, share_agn : `~numpy.ndarray`, shapes (nG,) and (nA,), optional
-        The AGN fraction in another definition is y / (1 + y), y the product of f / (1 - f) and
-        both.
+        Galaxies that may be used.
     template_error : `~numpy.ndarray`, shape (nz, nb), optional
         Part of a flux that is added to its error in quadrature at each redshift; what this does to the
         normalization of the likelihood is part of the weights.
@@ -90,21 +90,12 @@ class GridEngine:
         Whether the variance of each model's own scale is part of the posterior.
     """
 
+    grid: ModelGrid
+    priors: GridPriors
+    quantities: Quantities
     galaxy: np.ndarray
     agn: np.ndarray
-    dust: np.ndarray
-    frac: np.ndarray
     usable: np.ndarray
-    prior_galaxy: np.ndarray
-    prior_agn: np.ndarray
-    prior_frac: np.ndarray
-    galaxy_scale: np.ndarray
-    agn_scale: np.ndarray
-    mixed_galaxy: np.ndarray
-    mixed_agn: np.ndarray
-    levels: np.ndarray
-    share_galaxy: np.ndarray | None = None
-    share_agn: np.ndarray | None = None
     template_error: np.ndarray | None = None
     mass_prior: object = None
     rtol: float = 1e-6
@@ -115,13 +106,13 @@ class GridEngine:
         """Number of different models that are evaluated or bounded."""
         n_row = int(np.count_nonzero(self.usable))
         n_zero = int(self._zero_frac)
-        return n_row * (n_zero + self.agn.shape[1] * (self.frac.size - n_zero))
+        return n_row * (n_zero + self.grid.n_agn * (self.grid.frac_agn.size - n_zero))
 
     @property
     def size(self):
         """Numbers of redshifts, galaxies, AGN models and fractions, by the letters of joint sums."""
         n_z, n_galaxy, _ = self.galaxy.shape
-        return {"z": n_z, "g": n_galaxy, "k": self.agn.shape[1], "f": self.frac.size}
+        return {"z": n_z, "g": n_galaxy, "k": self.agn.shape[1], "f": self.grid.frac_agn.size}
 
     @property
     def delta(self):
@@ -148,22 +139,22 @@ class GridEngine:
         padded[:, :n_galaxy] /= unit
         galaxy32 = _core.aligned(n_z, n_bands, n_padded, dtype=np.float32)
         galaxy32[:] = padded.transpose(0, 2, 1)
-        log_galaxy = _two_log(self.prior_galaxy / self.prior_galaxy.sum())
+        priors, known = self.priors, self.quantities
+        dust, frac = self.grid.dust_luminosity, self.grid.frac_agn
+        log_galaxy = _two_log(priors.galaxy / priors.galaxy.sum())
         log_usable = np.full((n_z, n_padded), -1e300)
         log_usable[:, :n_galaxy] = np.where(self.usable, log_galaxy, -1e300)
-        share_galaxy, share_agn = self.share_galaxy, self.share_agn
-        if share_galaxy is None or share_agn is None:
-            share_galaxy, share_agn = np.zeros(n_galaxy), np.zeros(self.agn.shape[1])
-        log_dust = np.log10(self.dust, where=self.dust > 0, out=np.full(n_galaxy, -400.0))
+        of, n_agn = known.fraction, self.agn.shape[1]
+        shares = (np.zeros(n_galaxy), np.zeros(n_agn)) if of is None else (of.galaxy, of.agn)
+        log_dust = np.log10(dust, where=dust > 0, out=np.full(n_galaxy, -400.0))
         of_galaxy = np.zeros((4, n_padded))
-        of_galaxy[:, :n_galaxy] = (self.dust, log_dust, share_galaxy, self.mixed_galaxy)
-        n_agn = self.agn.shape[1]
+        of_galaxy[:, :n_galaxy] = (dust, log_dust, shares[0], known.mixed_galaxy)
         of_agn = np.zeros((3, max(n_agn, 1)))
-        of_agn[:, :n_agn] = (_two_log(self._agn_prior), share_agn, self.mixed_agn)
-        prior_frac = self.prior_frac / self.prior_frac.sum()
+        of_agn[:, :n_agn] = (_two_log(self._agn_prior), shares[1], known.mixed_agn)
+        prior_frac = priors.frac / priors.frac.sum()
         log_frac = _two_log(prior_frac)
-        ratio, edge = _ratio(self.frac), _ratio(cell_edges(self.frac, (0.0, 1.0)))
-        above = self.frac > 0
+        ratio, edge = _ratio(frac), _ratio(cell_edges(frac, (0.0, 1.0)))
+        above = frac > 0
         log_ratio = np.log10(ratio, where=above, out=np.zeros(ratio.size)) * _core.PER_DEX
         of_frac = np.array([ratio, log_ratio, prior_frac, log_frac, edge[:-1], edge[1:]])
         return _core.Tables(
@@ -181,24 +172,24 @@ class GridEngine:
             prior_zero=float(prior_frac[0]) if self._zero_frac else 0.0,
             log_zero=float(log_frac[0]) if self._zero_frac else -1e300,
             edge_zero=float(edge[1]),
-            log_top_agn=float(of_agn[0].max()),
-            log_top_frac=float(log_frac[above].max(initial=-1e300)),
-            share_mean=float(self._agn_prior @ share_agn),
+            log_top_pair=float(of_agn[0].max() + log_frac[above].max(initial=-1e300)),
+            share_mean=float(self._agn_prior @ shares[1]),
         )
 
     @property
     def _zero_frac(self):
-        return bool(self.frac[0] == 0.0)
+        return bool(self.grid.frac_agn[0] == 0.0)
 
     @cached_property
     def _agn_prior(self):
-        return self.prior_agn / max(self.prior_agn.sum(), 1e-300)
+        return self.priors.agn / max(self.priors.agn.sum(), 1e-300)
 
     @cached_property
     def _scales(self):
-        agn = np.zeros((self.agn_scale.shape[0] + 1, max(self.agn.shape[1], 1)))
-        agn[:, : self.agn.shape[1]] = np.vstack([self.agn_scale, self.mixed_agn])
-        return _core.make_scales(np.vstack([self.galaxy_scale, self.mixed_galaxy]), agn)
+        known, n_agn = self.quantities, self.agn.shape[1]
+        agn = np.zeros((len(known.agn_scale) + 1, max(n_agn, 1)))
+        agn[:, :n_agn] = np.vstack([known.agn_scale, known.mixed_agn])
+        return _core.make_scales(np.vstack([known.galaxy_scale, known.mixed_galaxy]), agn)
 
     def workspace(self, n_draws=0, joint=()):
         """Make the accumulators and work space of one worker (some tens of MB)."""
@@ -231,7 +222,7 @@ class GridEngine:
             ln(prior) of the redshifts, -inf where it is 0; rows of -inf are not fitted.
         limit, limit_sigma : `~numpy.ndarray`, shape (n, nb), optional
             Upper limits and their errors in uJy; bands with infinite error have none. A band has
-            a flux or a limit, not both.
+            a flux or a limit, not both, and no limit if some model has negative flux there.
         n_draws : int, optional
             Number of models to draw from each posterior; see `draw`.
         seeds : `~numpy.ndarray` of int, shape (n,), optional
@@ -246,45 +237,24 @@ class GridEngine:
         Returns
         -------
         out : `GridOutput`
-
-        Raises
-        ------
-        ValueError
-            If there are limits in a band in which a model has negative flux.
         """
-        size = self.size
-        n_z, n_galaxy, n_agn, n_frac = size.values()
         n, n_bands = flux.shape
         data = np.where(np.isfinite(sigma), flux, 0.0)
         inverse = np.zeros((n, n_bands)) if limit_sigma is None else 1.0 / limit_sigma
         limit = np.where(inverse > 0, 0.0 if limit is None else limit, 0.0)
-        negative = np.flatnonzero((inverse > 0).any(axis=0) & self._negative)
-        if negative.size:
-            wanted = "in bands in which no model has negative flux"
-            raise argument_error("limit", wanted, f"limits in band {int(negative[0])}")
         log_prior = np.where(np.isfinite(log_prior), 2.0 * log_prior, -1e300)
         seeds = np.zeros(n, np.uint64) if seeds is None else np.array(seeds, np.uint64)
         # the galaxy's, the AGN model's and the sum of both
-        n_quantities = len(self.galaxy_scale) + len(self.agn_scale) + 1
-        n_levels = self.levels.size
+        n_quantities = len(self.quantities.galaxy_scale) + len(self.quantities.agn_scale) + 1
+        size = self.size | {"b": n_bands, "q": n_quantities, "l": DERIVED_LEVELS.size, "d": n_draws}
+        size |= {"2": 2, "3": 3, "4": 4}
+
+        def empty(axes, value):
+            return np.full((n, *map(size.get, axes)), value)
+
         out = GridOutput(
-            chi2=np.full(n, np.nan),
-            log_sum=np.full(n, np.nan),
-            n_models=np.zeros(n),
-            best_scale=np.full(n, np.nan),
-            best_flux=np.full((n, n_bands), np.nan),
-            index=np.full((n, 4), -1),
-            zf=np.full((n, n_z, n_frac), np.nan),
-            galaxy=np.full((n, n_galaxy), np.nan),
-            agn=np.full((n, n_agn), np.nan),
-            band=np.full((n, 2, n_bands), np.nan),
-            moments=np.full((n, n_quantities, 3), np.nan),
-            quantiles=np.full((n, n_quantities, n_levels), np.nan),
-            share=np.full((n, 2), np.nan),
-            share_quantiles=np.full((n, n_levels), np.nan),
-            draw_index=np.full((n, n_draws, 4), -1),
-            draw_scale=np.full((n, n_draws, 2), np.nan),
-            joint={name: np.full((n, size[name[0]], size[name[1]]), np.nan) for name in joint},
+            *(empty(axes, -1 if "index" in name else np.nan) for name, axes in _AXES.items()),
+            joint={name: empty(name, np.nan) for name in joint},
         )
         workspace = self.workspace(n_draws, joint) if workspace is None else workspace
         sums = workspace[0]
@@ -326,8 +296,9 @@ class GridEngine:
         z, g, k, f = out.index[i] = sums.index
         scale = out.best_scale[i] = sums.best[1]
         model = scale * self.galaxy[z, g]
-        if self.frac[f] > 0:
-            power = scale * self.dust[g] * self.frac[f] / (1.0 - self.frac[f])
+        frac = self.grid.frac_agn[f]
+        if frac > 0:
+            power = scale * self.grid.dust_luminosity[g] * frac / (1.0 - frac)
             model = model + power * self.agn[z, k]
         out.best_flux[i] = model
         # from the residuals: |F|^2_w - R would lose digits
@@ -339,7 +310,6 @@ class GridEngine:
             norm += limits.dark
         out.chi2[i] = chi2
         out.log_sum[i] = np.log(total) + 0.5 * (sums.best[2] - norm)
-        out.n_models[i] = sums.best[3]
         # sums in single precision differ by some 1e-8
         out.zf[i] = sums.zf / sums.zf.sum()
         out.galaxy[i] = sums.galaxy[:, 0] / sums.galaxy[:, 0].sum()
@@ -351,7 +321,7 @@ class GridEngine:
         mean, square = sums.band / total
         out.band[i] = mean, np.sqrt(np.maximum(square - mean * mean, 0.0))
         derived = out.moments[i], out.quantiles[i], out.share[i], out.share_quantiles[i]
-        _core.summarize(self._scales, sums, float(self.scale_error), self.levels, *derived)
+        _core.summarize(self._scales, sums, float(self.scale_error), DERIVED_LEVELS, *derived)
         out.draw_index[i] = sums.draws.index
         out.draw_scale[i] = sums.draws.scale
         for name, table in out.joint.items():
@@ -402,7 +372,7 @@ class GridEngine:
         )
 
     @cached_property
-    def _negative(self):
+    def negative(self):
         """Bands in which a model has negative flux."""
         negative = np.any(self.galaxy < 0, axis=(0, 1))
         return negative | np.any(self.agn < 0, axis=(0, 1))

@@ -3,11 +3,10 @@
 from dataclasses import dataclass, replace
 from functools import partial
 
-import astropy.units as u
 import numpy as np
 
 from miricigale.filters import FilterSet
-from miricigale.fitting.between import Between
+from miricigale.fitting.between import between_nodes
 from miricigale.fitting.calibration import TemplateError, grid_errors
 from miricigale.fitting.continuation import Continuation
 from miricigale.fitting.grid import GridEngine
@@ -15,7 +14,6 @@ from miricigale.fitting.interpolation import Nodes, finer_grid
 from miricigale.fitting.likelihood import FitFlags
 from miricigale.fitting.posterior import check_pairs, joint_names, joint_tables
 from miricigale.fitting.priors import (
-    GridPriors,
     density_log_prior,
     expected_sfr,
     fixed_log_prior,
@@ -23,11 +21,13 @@ from miricigale.fitting.priors import (
     known_redshifts,
     sfr_log_prior,
 )
-from miricigale.fitting.quantities import DERIVED_LEVELS, OtherFraction, Quantities, plain
+from miricigale.fitting.quantities import Quantities, plain
 from miricigale.fitting.results import CIGALE_LEAST_STD, FitResults
 from miricigale.fitting.samples import Samples
+from miricigale.fitting.settings import GridSettings
 from miricigale.sed import ModelGrid, SEDModel
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_choice
 from miricigale.utils.parallel import chunks, parallel_map
 from miricigale.utils.random import stream
 from miricigale.utils.units import MASS
@@ -45,20 +45,14 @@ class GridFit:
     """
     How `~miricigale.fitting.BayesFitter` fits with every model of a grid; picklable.
 
-    Fields that are not objects of the package are those given to the fitter; ``fraction`` is the AGN
-    fraction in the definition that the grid does not use, None if it has none.
+    ``given`` are the settings of the fitter, without the model of a finer grid, which ``between`` has made.
     """
 
-    grid: object
-    priors: GridPriors
-    quantities: Quantities
-    fraction: OtherFraction | None
     engine: GridEngine
-    redshift_tolerance: float | None
+    given: GridSettings
     compat: str | None
-    prior_f: str
     template_error: TemplateError | None = None
-    between: Between | None = None
+    between: Continuation | None = None
 
     #: Objects in a piece of the catalog.
     chunk_size = 64
@@ -70,9 +64,8 @@ class GridFit:
         cls, model, filters, priors, settings, *, axes, scale_error, compat, template_error
     ):
         """Make a grid if it is none, work out its priors and derived quantities, set the engine up."""
-        if compat not in (None, "cigale"):
-            raise argument_error("compat", "None or 'cigale'", repr(compat))
-        finer, interpolate = settings.finer, int(settings.interpolate)
+        check_choice(compat, "compat", (None, "cigale"))
+        finer, interpolate = settings.finer, settings.interpolate
         grid = model
         if isinstance(model, SEDModel):
             if axes is None or filters is None:
@@ -86,23 +79,13 @@ class GridFit:
         elif not isinstance(model, ModelGrid):
             raise argument_error("model", "a ModelGrid or an SEDModel", type(model).__name__)
         priors = grid_priors(grid, priors, prior_f=settings.prior_f)
-        quantities, fraction = Quantities.of_grid(grid), OtherFraction.of_grid(grid)
         engine = GridEngine(
-            galaxy=np.asarray(grid.galaxy, dtype=float),
-            agn=np.asarray(grid.agn, dtype=float),
-            dust=np.asarray(grid.dust_luminosity, dtype=float),
-            frac=np.asarray(grid.frac_agn, dtype=float),
-            usable=np.asarray(grid.allowed, dtype=bool) & (priors.galaxy > 0),
-            prior_galaxy=priors.galaxy,
-            prior_agn=priors.agn,
-            prior_frac=priors.frac,
-            galaxy_scale=quantities.galaxy_scale,
-            agn_scale=quantities.agn_scale,
-            mixed_galaxy=quantities.mixed_galaxy,
-            mixed_agn=quantities.mixed_agn,
-            levels=DERIVED_LEVELS,
-            share_galaxy=None if fraction is None else fraction.galaxy,
-            share_agn=None if fraction is None else fraction.agn,
+            grid=grid,
+            priors=priors,
+            quantities=Quantities.of_grid(grid),
+            galaxy=grid.galaxy,
+            agn=grid.agn,
+            usable=grid.allowed & (priors.galaxy > 0),
             template_error=grid_errors(
                 template_error, grid.filters if model is grid else filters, grid.redshift
             ),
@@ -110,17 +93,7 @@ class GridFit:
             rtol=float(settings.rtol),
             scale_error=scale_error,
         )
-        out = cls(
-            grid=grid,
-            priors=priors,
-            quantities=quantities,
-            fraction=fraction,
-            engine=engine,
-            redshift_tolerance=settings.redshift_tolerance,
-            compat=compat,
-            prior_f=settings.prior_f,
-            template_error=template_error,
-        )
+        out = cls(engine, replace(settings, finer=None), compat, template_error)
         # a single model has nothing between
         if not interpolate or all(axis.values.size == 1 for axis in priors.axes.values()):
             return out
@@ -129,19 +102,22 @@ class GridFit:
             same = isinstance(filters, FilterSet) and tuple(filters.names) == grid.filters
             bands = filters if same else grid.filters
             finest = finer_grid(finer, grid, bands, out.constants, nodes)
-        return replace(
-            out, between=Between(Continuation(priors, engine, nodes, finest), interpolate)
-        )
+        return replace(out, between=Continuation(engine, nodes, finest))
+
+    @property
+    def grid(self):
+        """The `~miricigale.sed.ModelGrid`."""
+        return self.engine.grid
+
+    @property
+    def priors(self):
+        """`~miricigale.fitting.priors.GridPriors`."""
+        return self.engine.priors
 
     @property
     def filters(self):
         """Bands of the models."""
         return self.grid.filters
-
-    @property
-    def citations(self):
-        """What to cite for the models."""
-        return self.grid.meta.get("citations", ())
 
     @property
     def content(self):
@@ -160,42 +136,38 @@ class GridFit:
 
     def settings(self):
         """Return the settings of the fit as plain values."""
-        return {
-            "prior_f": self.prior_f,
+        error, prior, between = self.template_error, self.engine.mass_prior, self.between
+        out = {
+            "prior_f": self.given.prior_f,
             "rtol": self.engine.rtol,
             "scale_error": self.engine.scale_error,
             "compat": self.compat,
             "n_models": int(self.engine.n_models),
-            "interpolate": 0 if self.between is None else self.between.n_draws,
+            "interpolate": 0 if between is None else int(self.given.interpolate),
             "constants": self.constants,
-        } | self._more_settings
-
-    @property
-    def _more_settings(self):
-        error, prior, more = self.template_error, self.engine.mass_prior, {}
+        }
         if error is not None:
             wave = error.wave.value.tolist()
-            more["template_error"] = {"wave": wave, "error": error.error.tolist()}
+            out["template_error"] = {"wave": wave, "error": error.error.tolist()}
         if prior is not None:
             relation, scatter, z = prior.args[:3]
             # a function is known by its values at some masses
             mass = [1e8, 1e10, 1e12] * MASS
             rates = [expected_sfr(relation, mass, one).tolist() for one in z[[0, -1]]]
-            more["sfr_prior"] = {"scatter": scatter, "sfr": rates}
-        if self.between is not None and self.between.models.finer is not self.between.models.nodes:
-            finer = self.between.models.finer.axes.items()
-            more["finer"] = {name: int(axis.values.size) for name, axis in finer}
-        return more
+            out["sfr_prior"] = {"scatter": scatter, "sfr": rates}
+        if between is not None and between.finer is not between.nodes:
+            axes = between.finer.axes.items()
+            out["finer"] = {name: int(axis.values.size) for name, axis in axes}
+        return out
 
     def provenance(self):
-        """Return what results say of the grid."""
-        known = self.grid.meta.items()
-        return {"grid": {k: v for k, v in known if k not in ("citations", "axes")}}
+        """Return what results say of the grid, and what to cite for it."""
+        known = {key: value for key, value in self.grid.meta.items() if key != "axes"}
+        return {"citations": known.pop("citations", ()), "grid": known}
 
     def check_data(self, data):
         """Refuse limits in bands in which a model has negative flux."""
-        bound = data.limit.any(axis=0)
-        for i in np.flatnonzero(bound & self.engine._negative) if bound.any() else ():
+        for i in np.flatnonzero(data.limit.any(axis=0) & self.engine.negative):
             wanted = "without limits in bands in which a model has negative flux"
             raise argument_error("photometry", wanted, f"some in {self.filters[i]}")
 
@@ -212,7 +184,7 @@ class GridFit:
             log_prior = density_log_prior(redshift_prior, z, allowed, flags)
         elif redshift is not None:
             values = known_redshifts(photometry, redshift)
-            log_prior = fixed_log_prior(values, z, allowed, self.redshift_tolerance, flags)
+            log_prior = fixed_log_prior(values, z, allowed, self.given.redshift_tolerance, flags)
         else:
             if not allowed.any():
                 flags |= int(FitFlags.NO_MODEL)
@@ -227,7 +199,7 @@ class GridFit:
 
     def check_pairs(self, pairs):
         """Check pairs of parameters; see `~miricigale.fitting.posterior.check_pairs`."""
-        derived = (*self.quantities.names, getattr(self.fraction, "name", None))
+        derived = self.engine.quantities.names
         wanted = "of parameters of the grid ('sample' draws derived quantities jointly)"
         return check_pairs(pairs, self.priors.axes, self.constants, derived, wanted)
 
@@ -240,60 +212,47 @@ class GridFit:
         """`FitResults` of a piece: its photometry and priors of redshift."""
         data, log_prior = piece
         joint = joint_names(pairs, self.priors.axes)
-        options, step = {}, max(len(data), 1)
+        # between nodes each object has an engine of its own
         own = self.between is not None and data.redshift is not None and self.grid.redshift.size > 1
-        if own:
-            # each has an engine of its own
-            step = 1
-        elif joint:
-            # joint sums are large: those of a few objects are reduced before the next are made
-            size = self.engine.size
-            step = max(1, _JOINT_SIZE // sum(size[name[0]] * size[name[1]] for name in joint))
+        options, size = {}, self.engine.size
+        if joint and not own:
             options = {"joint": joint, "workspace": self.engine.workspace(joint=joint)}
+        # joint sums are large: those of a few objects are reduced before the next are made
+        each = sum(size[x] * size[y] for x, y in joint)
+        step = 1 if own else max(1, min(_JOINT_SIZE // max(each, 1), len(data)))
         parts = []
         for rows in list(chunks(len(data), step)) or [slice(0, 0)]:
-            some = data[rows]
+            some, prior, engine = data[rows], log_prior[rows], self.engine
             if own and len(some):
-                parts.append(self._at_redshift(some, log_prior[rows], joint, pairs))
-                continue
-            out = self.engine.fit(**some.of_engine(log_prior[rows]), **options)
-            results = self._results(some, out, pairs)
+                engine, prior, results = self._at_redshift(some, prior, joint, pairs)
+            else:
+                results = self._results(some, engine.fit(**some.of_engine(prior), **options), pairs)
             if self.between is not None:
-                results = self._refined(self.engine, some, log_prior[rows], results)
+                n_draws = self.given.interpolate
+                results = between_nodes(self.between, engine, some, prior, n_draws, results)
             parts.append(results)
         return FitResults.concatenate(parts)
 
     def _at_redshift(self, data, log_prior, joint, pairs):
-        """Results of one object at its own redshift, between nodes; they stand at the nearest node."""
+        """Engine and prior at an object's own redshift, and results, which stand at the nearest node."""
         z, n_z = float(data.redshift[0]), log_prior.shape[1]
         fitted = np.isfinite(log_prior).any()
         node = int(np.argmax(log_prior[0]))
-        engine = self.between.models.at_redshift(z if fitted else self.grid.redshift[0], node)
+        engine = self.between.at_redshift(z if fitted else self.grid.redshift[0], node)
         log_prior = log_prior[:, node : node + 1]
         out = engine.fit(**data.of_engine(log_prior), joint=joint)
         if fitted:
             out.index[:, 0] = node
-        here = np.arange(n_z) == node
-        whole = {
-            name: np.where(here.reshape(-1, 1), table, table * 0.0)
-            for name, table in out.joint.items()
-            if name[0] == "z"
-        }
-        out = out._replace(
-            zf=np.where(here[:, None], out.zf, out.zf * 0.0), joint=out.joint | whole
-        )
+        here = (np.arange(n_z) == node)[:, None]
+
+        def all_redshifts(table):
+            return np.where(here, table, table * 0.0)
+
+        joint = {k: all_redshifts(v) if k[0] == "z" else v for k, v in out.joint.items()}
+        out = out._replace(zf=all_redshifts(out.zf), joint=joint)
         results = self._results(data, out, pairs)
         best = results.best | {"redshift": np.where(np.isfinite(out.chi2), z, np.nan)}
-        results = results._changed(best=best)
-        return self._refined(engine, data, log_prior, results)
-
-    def _refined(self, engine, data, log_prior, results):
-        """Results between the nodes."""
-        wide, seeds = self.between.widened(data)
-        index, _ = engine.draw(
-            n_draws=self.between.n_draws, seeds=seeds, **wide.of_engine(log_prior)
-        )
-        return self.between.refine(engine, data, wide, log_prior, index, seeds, results)
+        return engine, log_prior, results._changed(best=best)
 
     def _results(self, data, out, pairs):
         """From models to parameters and derived quantities."""
@@ -314,12 +273,8 @@ class GridFit:
                 models = out.galaxy if axis.kind == "galaxy" else out.agn
                 # not a matrix product, whose last digits depend on how many rows there are
                 pdf[name] = np.einsum("ng,vg->nv", models, axis.share)
-        moments, quantiles = self.quantities.summarize(out)
-        names, units, texts, intensive = self._derived
-        if self.fraction is not None:
-            share = np.column_stack([out.share, np.full(len(out.share), np.nan)])
-            moments = np.concatenate([moments, share[:, None]], axis=1)
-            quantiles = np.concatenate([quantiles, out.share_quantiles[:, None]], axis=1)
+        known = self.engine.quantities
+        moments, quantiles = known.summarize(out)
         # limits are probabilities, which have no unit
         log_sigma = np.log(np.where(data.measured, data.sigma, 1.0)).sum(axis=1)
         log_sigma += 0.5 * data.measured.sum(axis=1) * np.log(2.0 * np.pi)
@@ -341,10 +296,10 @@ class GridFit:
             best_index=out.index,
             best_scale=out.best_scale,
             best=self._best(out),
-            quantities=names,
-            units=units,
-            descriptions=texts,
-            intensive=intensive,
+            quantities=known.names,
+            units=known.units,
+            descriptions=known.descriptions,
+            intensive=known.intensive,
             moments=moments,
             quantiles=quantiles,
             model_flux=out.band[:, 0],
@@ -354,41 +309,21 @@ class GridFit:
             least_std=CIGALE_LEAST_STD if self.compat == "cigale" else 0.0,
         )
 
-    @property
-    def _derived(self):
-        """Derived quantities, the other AGN fraction the last: names, units, texts, intensive."""
-        known, other = self.quantities, self.fraction
-        names, units, texts = known.names, known.units, known.descriptions
-        if other is None:
-            return names, units, texts, known.shape.names
-        units, texts = (*units, u.dimensionless_unscaled), (*texts, other.description)
-        return (*names, other.name), units, texts, (*known.shape.names, other.name)
-
     def _best(self, out):
         """Parameters and derived quantities of the best models: name to array."""
         grid = self.grid
         ok = np.isfinite(out.chi2)
         z, g, k, f = np.where(ok[:, None], out.index, 0).T
         frac = grid.frac_agn[f]
-        best = {}
-        for name, axis in self.priors.axes.items():
-            if axis.kind == "redshift":
-                values = grid.redshift[z]
-            elif axis.kind == "frac_agn":
-                values = frac
-            elif axis.kind == "galaxy":
-                values = plain(grid.galaxy_parameters[name])[g]
-            else:
-                # without AGN light there is no template
-                values = np.where(frac > 0, plain(grid.agn_parameters[name])[k], np.nan)
-            best[name] = np.where(ok, values, np.nan)
+        values = {"redshift": grid.redshift[z], "frac_agn": frac}
+        values |= {name: plain(column)[g] for name, column in grid.galaxy_parameters.items()}
+        for name, column in grid.agn_parameters.items():
+            # without AGN light there is no template
+            values[name] = np.where(frac > 0, plain(column)[k], np.nan) if grid.n_agn else None
+        best = {name: np.where(ok, values[name], np.nan) for name in self.priors.axes}
         scale = np.where(ok, out.best_scale, np.nan)
-        derived = self.quantities.best(grid, g, k, frac, scale)
-        for i, name in enumerate(self.quantities.names):
-            best[name] = np.broadcast_to(derived[i], (ok.size,))
-        if self.fraction is not None:
-            values = self.fraction.evaluate(g, k, frac)
-            best[self.fraction.name] = np.where(ok, values, np.nan)
+        for name in self.engine.quantities.names:
+            best[name] = self.engine.quantities.evaluate(name, grid, g, k, frac, scale)
         return best
 
     # ----------------------------------------------------------------------- draws

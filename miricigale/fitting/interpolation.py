@@ -7,15 +7,15 @@ times z^2, without the distance at low redshift, is linear in ln(1 + z) between 
 mass enter in closed form. Nothing is said of what lies beyond the outermost nodes.
 """
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, partial
 
 import numpy as np
 from astropy.table import QTable
 
 from miricigale.fitting import _core
 from miricigale.fitting.priors import grid_priors
-from miricigale.fitting.quantities import OtherFraction, Quantities
+from miricigale.fitting.quantities import Quantities
 from miricigale.sed import ModelFlags
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import MASS
@@ -52,12 +52,9 @@ class Scale:
         """The nodes on the scale."""
         return _scaled(self.values, self.power)
 
-    def nearest(self, value):
-        """Nodes nearest to values."""
-        return np.searchsorted(0.5 * (self.values[1:] + self.values[:-1]), value, side="right")
-
-    def weights(self, value, node):
-        """First of the nodes around values, shape (n,), and the weights of that and the next two, (n, 3)."""
+    def around(self, value):
+        """Nodes nearest to values, first of the three around, both (n,), and the weights of these, (n, 3)."""
+        node = np.searchsorted(0.5 * (self.values[1:] + self.values[:-1]), value, side="right")
         n, x = self.values.size, _scaled(value, self.power)
         first = np.clip(node - 1, 0, max(n - 3, 0))
         out = np.zeros((len(x), 3))
@@ -68,7 +65,7 @@ class Scale:
                 if j != i:
                     a, b = self.scaled[first + i], self.scaled[first + j]
                     out[:, i] *= (x - b) / (a - b)
-        return first, out
+        return node, first, out
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,14 +77,16 @@ class Place:
     redshift: np.ndarray
     between: tuple  # nodes of redshift, the others, and the part of the way to those
 
-    def rows(self, some):
-        """Part of the models."""
-        return Place(
-            {name: node[some] for name, node in self.near.items()},
-            {name: (first[some], w[some]) for name, (first, w) in self.weights.items()},
-            self.redshift[some],
-            tuple(value[some] for value in self.between),
-        )
+
+def rows_of(value, some):
+    """Some rows of an array, or of all arrays in a dict, a sequence or a dataclass."""
+    if isinstance(value, np.ndarray):
+        return value[some]
+    if isinstance(value, dict):
+        return {name: rows_of(one, some) for name, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return tuple(rows_of(one, some) for one in value)
+    return type(value)(*(rows_of(getattr(value, item.name), some) for item in fields(value)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,8 +150,9 @@ class Kind:
         """Steps from one value of each axis to the next, and choices of one of three nodes with their offsets."""
         shape = np.array(self.model.shape, np.int64)
         stride = np.array([shape[a + 1 :].prod() for a in range(shape.size)], np.int64)
-        choice = np.indices(np.minimum(shape, 3)).reshape(shape.size, -1).T.astype(np.int64)
-        return stride, choice.reshape(-1, shape.size), choice @ stride
+        few = np.minimum(shape, 3)
+        choice = np.indices(few).reshape(shape.size, few.prod()).T.astype(np.int64)
+        return stride, choice, choice @ stride
 
     def _sum(self, table, place, z, other, part):
         n, (stride, choice, offset) = z.size, self._around
@@ -201,18 +201,15 @@ class Nodes:
 
     axes: dict
     quantities: Quantities
-    fraction: OtherFraction | None
     kinds: dict
     allowed: np.ndarray
-
-    def __getstate__(self):
-        return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
     @classmethod
     def of_grid(cls, grid, axes=None):
         """Of a `~miricigale.sed.ModelGrid`, whose axes may be known."""
         axes = grid_priors(grid).axes if axes is None else axes
-        known, of = Quantities.of_grid(grid), OtherFraction.of_grid(grid)
+        known = Quantities.of_grid(grid)
+        of = known.fraction
         galaxy = [*known.galaxy_scale, known.mixed_galaxy, np.asarray(grid.dust_luminosity)]
         agn = [*known.agn_scale, known.mixed_agn]
         if of is not None:
@@ -225,7 +222,7 @@ class Nodes:
             for kind, flux, rows in (("galaxy", grid.galaxy, galaxy), ("agn", grid.agn, agn))
         }
         axes = {name: replace(axis, share=None) for name, axis in axes.items()}
-        return cls(axes, known, of, kinds, np.asarray(grid.allowed))
+        return cls(axes, known, kinds, np.asarray(grid.allowed))
 
     @property
     def redshift(self):
@@ -257,8 +254,7 @@ class Nodes:
             near[name] = np.zeros(len(redshift), np.int64)
             if name in self.scales:
                 inside = np.clip(values[name], *axis.values[[0, -1]])
-                near[name] = node = self.scales[name].nearest(inside)
-                weights[name] = self.scales[name].weights(inside, node)
+                near[name], *weights[name] = self.scales[name].around(inside)
             elif axis.kind in self.kinds:
                 weights[name] = near[name], np.tile([1.0, 0.0, 0.0], (len(redshift), 1))
         between = self.between(redshift)
@@ -289,7 +285,7 @@ class Nodes:
 
     def describe(self, place, power, scale):
         """Derived quantities of models of given AGN power and scale: dict by name."""
-        known, of = self.quantities, self.fraction
+        known, of = self.quantities, self.quantities.fraction
         galaxy, n, out = self.kinds["galaxy"].values(place), len(known.galaxy_scale), {}
         out.update(zip(known.names, scale * galaxy[:n], strict=False))
         total = scale * galaxy[n]
@@ -347,14 +343,14 @@ def finer_grid(model, grid, filters, constants, nodes):
     """
     axes = {name: [value] for name, value in constants.items()}
     axes |= {name: np.asarray(grid.axes.get(name, a.values)) for name, a in nodes.axes.items()}
-    test = _Test(model, filters, constants, grid.frac_agn)
-    if not test.rms(nodes) < 1e-3:
+    error = partial(_chain_rms, model, filters, constants, grid.frac_agn)
+    if not error(nodes) < 1e-3:
         wanted = "the model that made the grid"
         raise argument_error("finer", wanted, "one with other fluxes at its nodes")
     finer = nodes
     for _ in range(_HALVINGS):
         before = axes
-        rms = {name: test.rms(finer, name) for name in ("redshift", *finer.scales)}
+        rms = {name: error(finer, name) for name in ("redshift", *finer.scales)}
         # the worst first, as far as there is memory
         for name in sorted((n for n in rms if rms[n] > _TOLERANCE), key=rms.get, reverse=True):
             halved = axes | {name: np.sort([*axes[name], *_middles(finer, name)])}
@@ -369,42 +365,33 @@ def finer_grid(model, grid, filters, constants, nodes):
     return finer
 
 
-@dataclass(frozen=True, eq=False)
-class _Test:
-    """Models of a chain, to compare interpolated ones with."""
+def _chain_rms(model, filters, constants, frac_agn, nodes, name=None, n=300):
+    """
+    Rms of interpolated ln flux, but for a factor, at random nodes, or anywhere between those of an axis.
 
-    model: object
-    filters: object
-    constants: dict
-    frac: np.ndarray
-
-    def rms(self, nodes, name=None, n=300):
-        """
-        Rms of interpolated ln flux, but for a factor, at random nodes, or anywhere between those of an axis.
-
-        It is 0 where the model has nothing between them.
-        """
-        rng, known = np.random.default_rng(1), self.model.parameters
-        values = {other: rng.choice(axis.values, n) for other, axis in nodes.axes.items()}
-        if name is not None:
-            axis = nodes.axes[name].values
-            first = rng.integers(max(axis.size - 1, 1), size=n)
-            values[name] = axis[first] + rng.random(n) * (np.roll(axis, -1) - axis)[first]
-        values |= {other: np.full(n, value) for other, value in self.constants.items()}
-        table = QTable({other: value * known[other].unit for other, value in values.items()})
-        table["mass"] = 1.0 * MASS
-        true = self.model.fluxes(table, self.filters)
-        flags = true["flags"]
-        if np.any(flags & int(ModelFlags.NOT_IN_LIBRARY)) and name is not None:
-            return 0.0
-        frac = values.get("frac_agn", np.full(n, self.frac[0]))
-        place = nodes.place(values, values["redshift"])
-        flux = nodes.fluxes(place, frac)[0]
-        true = np.column_stack([true[band].value for band in true.colnames[: flux.shape[1]]])
-        good = np.isfinite(true).all(axis=1)
-        top = _FAINT * true[good].max(axis=1, keepdims=True)
-        ratio = np.maximum(flux[good], top) / np.maximum(true[good], top)
-        return np.sqrt(np.mean(np.minimum(np.abs(less_factor(np.log(ratio))), _MOST) ** 2))
+    It is compared with the chain, and 0 where the chain has nothing between them.
+    """
+    rng, known = np.random.default_rng(1), model.parameters
+    values = {other: rng.choice(axis.values, n) for other, axis in nodes.axes.items()}
+    if name is not None:
+        axis = nodes.axes[name].values
+        first = rng.integers(max(axis.size - 1, 1), size=n)
+        values[name] = axis[first] + rng.random(n) * (np.roll(axis, -1) - axis)[first]
+    values |= {other: np.full(n, value) for other, value in constants.items()}
+    table = QTable({other: value * known[other].unit for other, value in values.items()})
+    table["mass"] = 1.0 * MASS
+    true = model.fluxes(table, filters)
+    flags = true["flags"]
+    if np.any(flags & int(ModelFlags.NOT_IN_LIBRARY)) and name is not None:
+        return 0.0
+    frac = values.get("frac_agn", np.full(n, frac_agn[0]))
+    place = nodes.place(values, values["redshift"])
+    flux = nodes.fluxes(place, frac)[0]
+    true = np.column_stack([true[band].value for band in true.colnames[: flux.shape[1]]])
+    good = np.isfinite(true).all(axis=1)
+    top = _FAINT * true[good].max(axis=1, keepdims=True)
+    ratio = np.maximum(flux[good], top) / np.maximum(true[good], top)
+    return np.sqrt(np.mean(np.minimum(np.abs(less_factor(np.log(ratio))), _MOST) ** 2))
 
 
 def _middles(nodes, name):

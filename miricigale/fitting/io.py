@@ -12,9 +12,10 @@ from miricigale.fitting.results import CIGALE_LEAST_STD, FitResults
 from miricigale.fitting.samples import Samples
 from miricigale.sed import ModelGrid
 from miricigale.utils.content import content_sha256
-from miricigale.utils.exceptions import DataError, argument_error, unknown_name
+from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import open_fits
 from miricigale.utils.folder import RecordFolder
+from miricigale.utils.options import check_names
 from miricigale.utils.row_files import write_rows
 from miricigale.utils.store import native, open_parts, write_parts
 from miricigale.utils.tables import ascii_ids
@@ -30,6 +31,7 @@ _OLD_RESULTS = ("miricigale-fitresults-3", "miricigale-fitresults-2")
 _SAMPLES = "miricigale-samples-1"
 _DICTS = ("pdf", "best")
 _TUPLES = ("filters", "quantities", "descriptions", "intensive", "fitted_filters")
+_AXIS = ("values", "unit", "kind", "weights", "bounds")
 _FACTS = ("redshift_fixed", "constants", "least_std", "meta")
 
 
@@ -37,21 +39,19 @@ def write_results(results, path, *, overwrite=False):
     """Write results: a table extension of all arrays, and a text extension of all else."""
     single, results = results.isscalar, results._several()
     ascii_ids(results.ids, "ids")
-    table = {}
-    for name, value in results._per_object():
-        if isinstance(value, np.ndarray):
-            table[name] = value
+    table = {n: array for n, array in results._per_object() if isinstance(array, np.ndarray)}
     for name in _DICTS:
-        for key, value in getattr(results, name).items():
-            table[f"{name}:{key}"] = getattr(value, "value", value)
-    for i, weights in enumerate(results.pairs.values()):
-        table[f"pair:{i}"] = weights
+        parts = getattr(results, name).items()
+        table |= {f"{name}:{key}": getattr(value, "value", value) for key, value in parts}
+    table |= {f"pair:{i}": weights for i, weights in enumerate(results.pairs.values())}
     text = {name: getattr(results, name) for name in (*_TUPLES, *_FACTS)}
-    text["pairs"] = [list(names) for names in results.pairs]
-    text["units"] = [u.Unit(unit).to_string() for unit in results.units]
-    text["shapes"] = {name: array.shape[1:] for name, array in table.items()}
-    text["axes"] = _axes_to_plain(results.axes)
-    text["single"] = single
+    text |= {
+        "pairs": [list(names) for names in results.pairs],
+        "units": [u.Unit(unit).to_string() for unit in results.units],
+        "shapes": {name: array.shape[1:] for name, array in table.items()},
+        "axes": _axes_to_plain(results.axes),
+        "single": single,
+    }
     # FITS has no columns of arrays without elements
     full = {name: array for name, array in table.items() if array.size or not len(array)}
     write_parts(path, _RESULTS, text=text, tables={"RESULTS": Table(full)}, overwrite=overwrite)
@@ -75,11 +75,8 @@ def read_results(path, *, rows=None):
         values |= {name: text[name] for name in _FACTS}
         values |= {name: array for name, array in columns.items() if ":" not in name}
         for name in _DICTS:
-            values[name] = {
-                key.removeprefix(f"{name}:"): array
-                for key, array in columns.items()
-                if key.startswith(f"{name}:")
-            }
+            own = (key for key in columns if key.startswith(f"{name}:"))
+            values[name] = {key.removeprefix(f"{name}:"): columns[key] for key in own}
         pairs = enumerate(text.get("pairs", ()))
         values["pairs"] = {tuple(names): columns[f"pair:{i}"] for i, names in pairs}
         values["units"] = tuple(u.Unit(unit) for unit in text["units"])
@@ -147,32 +144,22 @@ def read_samples(path, grid, *, model=None):
 
 def _axes_to_plain(axes):
     """Turn axes without their shares into what JSON knows."""
-    return {
-        name: {
-            "values": axis.values,
-            "unit": u.Unit(axis.unit).to_string(),
-            "kind": axis.kind,
-            "weights": axis.weights,
-            "bounds": list(axis.bounds),
-        }
-        for name, axis in axes.items()
-    }
+    plain = {name: {key: getattr(axis, key) for key in _AXIS} for name, axis in axes.items()}
+    return {name: one | {"unit": u.Unit(one["unit"]).to_string()} for name, one in plain.items()}
 
 
 def _axes_from_plain(text, shares=None):
     """Make axes of what `_axes_to_plain` returned; ``shares`` by name are part of them."""
-    return {
-        name: GridAxis(
-            name,
-            np.array(axis["values"]),
-            u.Unit(axis["unit"]),
-            axis["kind"],
-            np.array(axis["weights"]),
-            (shares or {}).get(name),
-            tuple(axis["bounds"]),
-        )
-        for name, axis in text.items()
-    }
+    axes = {}
+    for name, axis in text.items():
+        arrays = {key: np.array(axis[key]) for key in ("values", "weights")}
+        plain = {
+            "unit": u.Unit(axis["unit"]),
+            "kind": axis["kind"],
+            "bounds": tuple(axis["bounds"]),
+        }
+        axes[name] = GridAxis(name, **arrays, **plain, share=(shares or {}).get(name))
+    return axes
 
 
 def _write_table(results, path, *, overwrite=False):
@@ -202,15 +189,9 @@ class FitFolder(RecordFolder):
         facts, parts = super().parse(values)
         facts["job"]["catalogue"]["rows"], facts["job"]["chunk_rows"]
         if facts["format"] == _OLD_FORMAT:
-            parts = {
-                name: {
-                    "hash": "",
-                    "rows": part["rows"],
-                    "fitted": part["fitted"],
-                    "products": {name: {key: part[key] for key in ("sha256", "bytes")}},
-                }
-                for name, part in parts.items()
-            }
+            for name, part in parts.items():
+                product = {key: part.pop(key) for key in ("sha256", "bytes")}
+                part |= {"hash": "", "products": {name: product}}
         return facts | {"format": FORMAT}, parts
 
 
@@ -369,9 +350,7 @@ class FitResultsFiles:
             raise DataError(msg)
         for part in self.parts():
             table = part.to_table()
-            for name in columns or ():
-                if name not in table.colnames:
-                    raise unknown_name("column", name, table.colnames)
+            check_names(columns or (), "column", table.colnames)
             yield table if columns is None else table[list(columns)]
 
     def write_table(self, path, *, columns=None, overwrite=False):

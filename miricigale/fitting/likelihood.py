@@ -1,13 +1,12 @@
 """From a catalog of photometry to fluxes, errors and flags that a fit can use, and the flags of fits."""
 
-import warnings
 from dataclasses import dataclass
 
 import astropy.units as u
 import numpy as np
 
 from miricigale.filters import Filter
-from miricigale.utils.exceptions import FitWarning, argument_error
+from miricigale.utils.exceptions import argument_error
 from miricigale.utils.object_rows import ObjectRows, PerObject
 from miricigale.utils.tables import Flags, error_column, read_ids, require_columns
 from miricigale.utils.units import FNU, to_array
@@ -22,8 +21,8 @@ _SMALL, _LARGE = 1e-60, 1e60
 _DARK = 1e-8
 #: Sum of squared S/N that counts as 0: smaller numbers have fewer digits, or none.
 _NO_SIGNAL = 1e-280
-_TRUE = ("true", "t", "1")
-_FALSE = ("false", "f", "0", "")
+_TRUE = ("true", "t", "1", "1.0")
+_FALSE = ("false", "f", "0", "0.0", "-0.0", "")
 _KINDS = {"U": "text", "S": "text", "b": "true and false", "c": "complex numbers"}
 
 
@@ -233,13 +232,12 @@ class PhotometryReader:
         return FitData(ids, flux, err, sigma, limit, flags)
 
 
-def unused_bands(table, filters, stacklevel=None):
+def unused_bands(table, filters):
     """
     Names of the bands of a catalog that are not fitted (``filters``), in the order of the columns.
 
     A column is a band if it has an error ``<name>_err`` and both are in a unit of flux
-    density, or if its name is that of a filter. With a ``stacklevel``, that of the caller of this
-    function, a `~miricigale.utils.exceptions.FitWarning` names them.
+    density, or if its name is that of a filter.
     """
     known, columns = set(Filter.names()), set(table.colnames)
     out = []
@@ -250,9 +248,6 @@ def unused_bands(table, filters, stacklevel=None):
         measured = pair[1] in columns and all(_is_flux(table[c]) for c in pair)
         if measured or name in known or name.startswith("sedpy."):
             out.append(name)
-    if out and stacklevel is not None:
-        text = "bands of the photometry that the grid lacks are not fitted"
-        warnings.warn(f"{text}: {', '.join(out)}", FitWarning, stacklevel=stacklevel + 1)
     return out
 
 
@@ -278,16 +273,12 @@ def limits(table, name):
         return np.zeros(len(table), dtype=bool)
     values = table[column]
     mask = np.asarray(getattr(values, "mask", False))
-    values = np.asarray(getattr(values, "unmasked", np.ma.getdata(values)))
-    if values.dtype.kind in "US":
-        values = np.char.strip(np.char.lower(values.astype(str)))
-        known = np.isin(values, [*_TRUE, *_FALSE])
-        limit = np.isin(values, _TRUE)
-    elif values.dtype.kind in "biuf" and getattr(table[column], "unit", None) is None:
-        known, limit = (values == 0) | (values == 1), values == 1
-    else:
+    plain = np.asarray(getattr(values, "unmasked", np.ma.getdata(values)))
+    text = np.char.strip(np.char.lower(plain.astype(str)))
+    limit, known = np.isin(text, _TRUE), np.isin(text, (*_TRUE, *_FALSE))
+    if getattr(values, "unit", None) is not None:
         known = limit = np.zeros(len(table), dtype=bool)
-    if values.shape != (len(table),) or not np.all(known | mask):
+    if plain.shape != (len(table),) or not np.all(known | mask):
         wanted = f"a table whose column {column!r} is boolean"
         raise argument_error("photometry", wanted, _some(table[column]))
     return limit & ~mask

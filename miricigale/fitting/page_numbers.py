@@ -1,8 +1,7 @@
 """Numbers of the objects of a fitted catalog that a page shows, and their known redshifts."""
 
-import copy
-
 import numpy as np
+from astropy.table import Table, vstack
 
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing import plain_floats
@@ -11,33 +10,25 @@ from miricigale.utils.missing import plain_floats
 KNOWN_REDSHIFTS = ("z_spec", "zspec", "z_true", "redshift_spec", "redshift")
 
 
-class FitNumbers:
-    """Numbers of all objects: redshift, fraction, mass, fit and residuals of each."""
+def fit_numbers(results):
+    """
+    Numbers of all objects, in the order of the catalog.
 
-    def __init__(self, results):
-        parts = [_numbers(part) for part in results.parts()]
-        self._names = list(parts[0])
-        for name in self._names:
-            setattr(self, name, np.concatenate([part[name] for part in parts]))
-        first = next(iter(results.parts()))
-        self.filters, self.fixed = first.fitted_filters, first.redshift_fixed
+    Parameters
+    ----------
+    results : `~miricigale.fitting.FitResultsFiles`
+        The fit.
 
-    def only(self, rows):
-        """A copy of some objects."""
-        new = copy.copy(self)
-        for name in self._names:
-            setattr(new, name, getattr(self, name)[rows])
-        return new
-
-    def bands(self):
-        """Iterate over bands: name, and finite flux ratios and pulls of all objects."""
-        for name, ratio, pull in zip(self.filters, self.ratio.T, self.pull.T, strict=True):
-            yield name, ratio[np.isfinite(ratio)].astype(float), pull[np.isfinite(pull)]
-
-    @property
-    def good(self):
-        """Objects that were fitted."""
-        return np.isfinite(self.chi2)
+    Returns
+    -------
+    table : `~astropy.table.Table`
+        A row for each object: redshift, fraction and mass at 16, 50 and 84 %, fit, and ratios and pulls in the
+        bands ``meta["filters"]``; ``meta["fixed"]`` is whether redshifts were given.
+    """
+    table = vstack([Table(_numbers(part)) for part in results.parts()])
+    first = next(iter(results.parts()))
+    table.meta.update(filters=first.fitted_filters, fixed=first.redshift_fixed)
+    return table
 
 
 def _numbers(part):
@@ -53,6 +44,7 @@ def _numbers(part):
         "ids": np.array(part.ids).astype(str),
         "flags": np.array(part.flags),
         "n_bands": np.array(part.n_bands),
+        "good": np.isfinite(part.reduced_chi2),
         "chi2": np.array(part.reduced_chi2, float),
         "ratio": ratio.astype(np.float32),
         "pull": pull.astype(np.float32),
@@ -84,7 +76,7 @@ def known_redshifts(rows, name):
     -------
     name : str or None
         The column, None without one.
-    redshift : `~numpy.ndarray`, shape (n,), or None
+    redshift : `~numpy.ndarray`, shape (n,)
         NaN where it is missing or not positive.
 
     Raises
@@ -96,7 +88,7 @@ def known_redshifts(rows, name):
     if name is None:
         name = next((one for one in KNOWN_REDSHIFTS if one in names), None)
     if name is None:
-        return None, None
+        return None, np.full(rows.n_rows, np.nan)
     if name not in names:
         raise argument_error("z_spec", f"one of the columns {list(names)}", repr(name))
     chunks = (rows.chunk(i) for i in range(rows.n_chunks))

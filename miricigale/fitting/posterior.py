@@ -4,7 +4,6 @@ import numpy as np
 
 from miricigale.utils.exceptions import argument_error, unknown_name
 
-_ROWS = 256  # searched at once; more would cost digits
 #: Letters of the engine's joint sums: redshift and fraction before galaxy, galaxy before AGN model.
 _LETTERS = {"redshift": "z", "frac_agn": "f", "galaxy": "g", "agn": "k"}
 #: The pair that every fit has.
@@ -57,39 +56,17 @@ def cell_percentiles(values, pdf, levels, bounds=(-np.inf, np.inf)):
     levels = np.asarray(levels, dtype=float)
     out = np.full((pdf.shape[0], levels.size), np.nan)
     good = np.flatnonzero(np.isfinite(pdf).all(axis=1) & (pdf.sum(axis=1) > 0))
-    if len(edges) == 2:
-        out[good] = edges[0]
-        return out
-    for first in range(0, good.size, _ROWS):
-        rows = good[first : first + _ROWS]
-        part = pdf[rows]
-        total = np.cumsum(part, axis=1)
-        target = levels * total[:, -1:]
-        # one search for all rows: each lies two above the one before it
-        shift = 2.0 * np.arange(rows.size)[:, None]
-        place = np.searchsorted(
-            (total / total[:, -1:] + shift).ravel(), (np.minimum(levels, 1.0) + shift).ravel()
-        )
-        j = place.reshape(target.shape) - np.arange(rows.size)[:, None] * total.shape[1]
-        j = _first_not_below(total, target, np.clip(j, 0, total.shape[1] - 1))
-        own = np.take_along_axis(part, j, axis=1)
-        below = np.take_along_axis(total, j, axis=1) - own
-        inside = np.clip((target - below) / np.maximum(own, 1e-300), 0.0, 1.0)
-        out[rows] = edges[j] + inside * (edges[j + 1] - edges[j])
+    part = pdf[good]
+    total = np.cumsum(part, axis=1)
+    target = levels * total[:, -1:]
+    # the first cell whose upper edge is not below the level
+    cell = [np.searchsorted(row, one) for row, one in zip(total, target, strict=True)]
+    cell = np.minimum(np.reshape(cell, target.shape).astype(int), total.shape[1] - 1)
+    own = np.take_along_axis(part, cell, axis=1)
+    below = np.take_along_axis(total, cell, axis=1) - own
+    inside = np.clip((target - below) / np.maximum(own, 1e-300), 0.0, 1.0)
+    out[good] = edges[cell] + inside * (edges[cell + 1] - edges[cell])
     return out
-
-
-def _first_not_below(total, target, place):
-    """Mend places in rising rows that the shift rounded: the first that is not below the target."""
-    last = total.shape[1] - 1
-    while True:
-        here = np.take_along_axis(total, place, axis=1)
-        before = np.take_along_axis(total, np.maximum(place - 1, 0), axis=1)
-        up = (here < target) & (place < last)
-        down = (before >= target) & (place > 0)
-        if not np.any(up | down):
-            return place
-        place = place + up - (down & ~up)
 
 
 def randomized_ranks(pdf, node, draw):
@@ -105,35 +82,22 @@ def randomized_ranks(pdf, node, draw):
     return upto - own * np.asarray(draw)
 
 
-def node_cells(values, nodes, bounds=(-np.inf, np.inf)):
-    """Edges of the cells around nodes, and the cell of each value that lies on one; -1 for NaN."""
-    finite = np.isfinite(values)
-    place = np.argmin(np.abs(np.where(finite, values, 0.0) - nodes[:, None]), axis=0)
-    return cell_edges(nodes, bounds), np.where(finite, place, -1)
-
-
-def bin_cells(values, bins, *, log=False):
+def bin_edges(values, bins, *, log=False):
     """
-    Edges of bins, and the bin of each value; -1 for those in none. The last has its upper edge too.
+    Edges of bins, or those given: a number of bins lies between the least and the largest value.
 
-    A number of bins lies between the least and the largest value, with equal widths in the logarithm
-    with ``log``, if all values are above 0.
+    They have equal widths, in the logarithm with ``log``, if all values are above 0.
     """
-    finite = np.isfinite(values)
     if np.ndim(bins):
-        edges = np.asarray(bins, dtype=float)
-    else:
-        low, high = values[finite].min(), values[finite].max()
-        # equal values get a narrow bin
-        high = max(high, low + 1e-6 * max(abs(low), 1e-30))
-        edges = np.linspace(low, high, int(bins) + 1)
-        if log and low > 0:
-            edges = np.geomspace(low, high, int(bins) + 1)
-            edges[[0, -1]] = low, high
-    place = np.searchsorted(edges, values, side="right") - 1
-    place = np.where(values == edges[-1], edges.size - 2, place)
-    inside = finite & (place >= 0) & (place < edges.size - 1)
-    return edges, np.where(inside, place, -1)
+        return np.asarray(bins, dtype=float)
+    low, high = np.nanmin(values), np.nanmax(values)
+    # equal values get a narrow bin
+    high = max(high, low + 1e-6 * max(abs(low), 1e-30))
+    if not (log and low > 0):
+        return np.linspace(low, high, int(bins) + 1)
+    edges = np.geomspace(low, high, int(bins) + 1)
+    edges[[0, -1]] = low, high
+    return edges
 
 
 def check_pairs(pairs, axes, constant, derived, wanted):

@@ -9,7 +9,8 @@ import numpy as np
 from miricigale.fitting.likelihood import FitFlags
 from miricigale.fitting.posterior import cell_edges
 from miricigale.fitting.quantities import plain
-from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_choice, check_names
 from miricigale.utils.units import MASS, is_number, to_array
 
 
@@ -74,8 +75,7 @@ def grid_priors(grid, priors=None, *, prior_f="grid"):
     if priors is not None and not isinstance(priors, dict):
         raise argument_error("priors", "a dict of parameters", type(priors).__name__)
     priors = dict(priors or {})
-    if prior_f not in ("grid", "uniform"):
-        raise argument_error("prior_f", "'grid' or 'uniform'", repr(prior_f))
+    check_choice(prior_f, "prior_f", ("grid", "uniform"))
     axes = {}
     z, f = grid.redshift, grid.frac_agn
     axes["redshift"] = _axis("redshift", z, 1, "redshift", priors, bounds=(0.0, np.inf))
@@ -98,9 +98,7 @@ def grid_priors(grid, priors=None, *, prior_f="grid"):
             if rows is not None:
                 left[rows] /= len(nodes)
         agn *= left
-    unknown = sorted(set(priors) - set(axes))
-    if unknown:
-        raise unknown_name("grid parameter", unknown[0], axes)
+    check_names(sorted(priors), "grid parameter", axes)
     if not galaxy.sum() > 0 or (agn.size and not agn.sum() > 0):
         raise argument_error("priors", "positive for at least one model", "0 for all")
     frac = axes["frac_agn"].weights if agn.size else np.ones(1)
@@ -190,13 +188,10 @@ def known_redshifts(photometry, redshift):
             raise argument_error("redshift", wanted, repr(redshift))
         redshift = photometry[redshift]
     values = _unmasked(redshift, "redshift")
-    if values.ndim == 0:
-        values = np.full(n, float(values))
-    if values.shape != (n,):
+    if values.shape not in ((), (n,)):
         raise argument_error("redshift", f"{n} values", f"shape {values.shape}")
-    with np.errstate(invalid="ignore"):
-        good = np.isfinite(values) & (values > 0)
-    return np.where(good, values, np.nan)
+    values = np.broadcast_to(values, (n,))
+    return np.where(np.isfinite(values) & (values > 0), values, np.nan)
 
 
 def magnitude_prior(

@@ -7,8 +7,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.fitting.posterior import cell_percentiles
-from miricigale.utils.exceptions import argument_error, unknown_name
-from miricigale.utils.random import stream
+from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import LUMINOSITY, MASS
 
 #: Levels at which the distributions of derived quantities are kept.
@@ -21,10 +20,10 @@ DERIVED_LEVELS.flags.writeable = False
 _SAME = 1e-9
 #: Shape quantities whose outermost cells end at 0.
 _NOT_NEGATIVE = ("a_v", "age_mass", "age_light")
-#: AGN fractions by name, and what they are; the AGN's part in them and the galaxy's.
 _IR = ("AGN share of 3-1000 um light", "ir_luminosity_agn", "ir_luminosity_galaxy")
 _DUST = ("AGN power over the sum with the dust luminosity", "agn_power", "dust_luminosity")
-_FRACTIONS = {"frac_agn_dust": _DUST, "frac_agn_ir": _IR}
+#: AGN fractions by name: what they are, the AGN's part in them and the galaxy's.
+FRACTIONS = {"frac_agn_dust": _DUST, "frac_agn_ir": _IR}
 _ALL = 1e30
 
 
@@ -77,21 +76,7 @@ class ShapeQuantities:
     """
 
     names: tuple
-    units: tuple
-    descriptions: tuple
     values: np.ndarray
-
-    @classmethod
-    def of_grid(cls, grid):
-        """Take all columns of ``grid.galaxy_shape`` (`~miricigale.sed.ModelGrid`)."""
-        columns = tuple(grid.galaxy_shape.itercols())
-        values = [plain(column) for column in columns]
-        return cls(
-            tuple(column.info.name for column in columns),
-            tuple(unit_of(column) for column in columns),
-            tuple(_text(column, "") for column in columns),
-            np.array(values, float).reshape(len(columns), grid.dust_luminosity.size),
-        )
 
     @cached_property
     def _nodes(self):
@@ -108,14 +93,6 @@ class ShapeQuantities:
             start = np.concatenate([[0], np.flatnonzero(step) + 1])
             out.append((order, start, value[start]))
         return out
-
-    def nodes(self, name):
-        """Different values of a quantity in the grid, ascending: array, shape (n_nodes,)."""
-        return self._nodes[self.names.index(name)][2]
-
-    def bounds(self, name):
-        """Limits that the outermost cells do not pass."""
-        return (0.0 if name in _NOT_NEGATIVE else -np.inf, np.inf)
 
     def summarize(self, weights, levels):
         """
@@ -141,119 +118,9 @@ class ShapeQuantities:
             out[:, i, 0] = mean
             out[:, i, 1] = np.sqrt(np.sum(part * (value - mean[:, None]) ** 2, axis=1))
             pdf = np.add.reduceat(part, start, axis=1)
-            quantiles[:, i] = cell_percentiles(nodes, pdf, levels, self.bounds(self.names[i]))
+            bounds = (0.0 if self.names[i] in _NOT_NEGATIVE else -np.inf, np.inf)
+            quantiles[:, i] = cell_percentiles(nodes, pdf, levels, bounds)
         return out, quantiles
-
-
-@dataclass(frozen=True, eq=False)
-class Quantities:
-    """
-    What is derived from the models of a grid, and how.
-
-    The order is: the galaxy's quantities (for each solar mass formed), the AGN's (for each W of
-    AGN power), the one that both have a part in (``mixed``), then those that do not scale with mass
-    (``shape``). Arrays of galaxies have the shape (n_quantities, nG) or (nG,), those of the AGN likewise.
-    """
-
-    names: tuple
-    units: tuple
-    descriptions: tuple
-    galaxy_scale: np.ndarray
-    agn_scale: np.ndarray
-    mixed_galaxy: np.ndarray
-    mixed_agn: np.ndarray
-    shape: ShapeQuantities
-
-    @classmethod
-    def of_grid(cls, grid):
-        """
-        Quantities of a model grid.
-
-        All columns of its property tables are taken. A column of both tables (``ir_luminosity``)
-        gives three quantities: the sum, and the parts ``<name>_galaxy`` and ``<name>_agn``;
-        without one, the sum is ``total_luminosity``, dust luminosity and AGN power.
-        """
-        n_galaxy, n_agn = grid.dust_luminosity.size, grid.agn_multiplicity.size
-        of_galaxy, of_agn = grid.galaxy_properties, grid.agn_properties
-        both = [n for n in of_galaxy.colnames if n_agn and n in of_agn.colnames]
-        names, units, texts = ["mass"], [MASS], ["mass of stars formed"]
-        galaxy_scale, agn_scale = [np.ones(n_galaxy)], []
-        for name in of_galaxy.colnames:
-            names.append(f"{name}_galaxy" if name in both else name)
-            column = of_galaxy[name]
-            unit = unit_of(column) * MASS
-            in_watt = unit.is_equivalent(LUMINOSITY)
-            factor = unit.to(LUMINOSITY) if in_watt else 1.0
-            units.append(LUMINOSITY if in_watt else unit)
-            texts.append(_text(column, ", for one solar mass formed"))
-            galaxy_scale.append(plain(column) * factor)
-        for name in of_agn.colnames if n_agn else ():
-            names.append(f"{name}_agn" if name in both else name)
-            column = of_agn[name]
-            unit = unit_of(column)
-            units.append(LUMINOSITY if unit == u.dimensionless_unscaled else unit * LUMINOSITY)
-            texts.append(_text(column, ", W for each W of AGN power"))
-            agn_scale.append(plain(column))
-        if both:
-            name = both[0]
-            mixed_galaxy = galaxy_scale[1 + of_galaxy.colnames.index(name)]
-            mixed_agn = agn_scale[of_agn.colnames.index(name)]
-            names.append(name)
-            texts.append(f"{texts[1 + of_galaxy.colnames.index(name)]}; and of the AGN")
-        else:
-            mixed_galaxy, mixed_agn = np.asarray(grid.dust_luminosity), np.ones(n_agn)
-            names.append("total_luminosity")
-            texts.append("dust luminosity and AGN power")
-        units.append(LUMINOSITY)
-        shape = ShapeQuantities.of_grid(grid)
-        return cls(
-            (*names, *shape.names),
-            (*units, *shape.units),
-            (*texts, *shape.descriptions),
-            np.array(galaxy_scale),
-            np.array(agn_scale, float).reshape(len(agn_scale), n_agn),
-            np.array(mixed_galaxy, float),
-            np.array(mixed_agn, float),
-            shape,
-        )
-
-    def summarize(self, out):
-        """Moments and quantiles of all quantities, from what the grid engine found for n objects."""
-        moments, quantiles = self.shape.summarize(out.galaxy, DERIVED_LEVELS)
-        return (
-            np.concatenate([out.moments, moments], axis=1),
-            np.concatenate([out.quantiles, quantiles], axis=1),
-        )
-
-    def evaluate(self, name, grid, g, k, frac, scale):
-        """
-        Values of a quantity for single models: galaxies, AGN templates, fractions and scales.
-
-        Indices and numbers have one shape, and the values have it too; a scale of NaN gives NaN.
-        """
-        i = self.names.index(name)
-        n_galaxy, n_agn = len(self.galaxy_scale), len(self.agn_scale)
-        if i < n_galaxy:
-            return scale * self.galaxy_scale[i][g]
-        if i > n_galaxy + n_agn:
-            # no value where there is no model
-            return np.where(
-                np.isfinite(scale), self.shape.values[i - n_galaxy - n_agn - 1][g], np.nan
-            )
-        power = scale * frac / (1.0 - frac) * grid.dust_luminosity[g]
-        if i < n_galaxy + n_agn:
-            return power * self.agn_scale[i - n_galaxy][k]
-        mixed = scale * self.mixed_galaxy[g]
-        return mixed + power * self.mixed_agn[k] if self.mixed_agn.size else mixed
-
-    def best(self, grid, g, k, frac, scale):
-        """Values of all quantities for single models (see `evaluate`): shape (n_quantities, ...)."""
-        return np.array([self.evaluate(n, grid, g, k, frac, scale) for n in self.names])
-
-
-def _text(column, ending):
-    text = getattr(column.info, "description", None) or column.info.name
-    return text.removesuffix(ending)
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,7 +134,6 @@ class OtherFraction:
     """
 
     name: str
-    description: str
     galaxy: np.ndarray
     agn: np.ndarray
 
@@ -275,128 +141,137 @@ class OtherFraction:
     def of_grid(cls, grid):
         """Of a `~miricigale.sed.ModelGrid`; None if it has no AGN or not the quantities needed."""
         by_dust = grid.frac_agn_definition == "dust"
-        name = "frac_agn_ir" if by_dust else "frac_agn_dust"
         of_galaxy = "ir_luminosity" if by_dust else "dust_luminosity"
         of_agn = "ir_luminosity" if by_dust else "agn_power"
         tables = (grid.galaxy_properties, of_galaxy), (grid.agn_properties, of_agn)
         if not grid.n_agn or any(column not in table.colnames for table, column in tables):
             return None
-        galaxy, agn = (_in_watt(table[column]) for table, column in tables)
-        reference = np.asarray(grid.dust_luminosity, float)
+        galaxy, agn = (_in_watt(table[column])[0] for table, column in tables)
+        reference = grid.dust_luminosity
         # where a galaxy has none of it all of it is the AGN's
         ratio = np.where(reference > 0, _ALL, 0.0)
         np.divide(reference, galaxy, out=ratio, where=galaxy > 0)
-        return cls(name, _FRACTIONS[name][0], ratio, agn)
+        return cls("frac_agn_ir" if by_dust else "frac_agn_dust", ratio, agn)
 
-    def evaluate(self, g, k, frac):
-        """Values for models of galaxies g and AGN models k at fractions of the grid."""
-        y = frac / (1.0 - frac) * self.galaxy[g] * self.agn[k]
-        return y / (1.0 + y)
+
+@dataclass(frozen=True, eq=False)
+class Quantities:
+    """
+    What is derived from the models of a grid, and how.
+
+    The order is: the galaxy's quantities (for each solar mass formed), the AGN's (for each W of
+    AGN power), the one that both have a part in (``mixed``), then those that do not scale with mass
+    (``shape``), and the AGN fraction in the definition that the grid does not use, if it has one. Arrays of
+    galaxies have the shape (n_quantities, nG) or (nG,), those of the AGN likewise.
+    """
+
+    names: tuple
+    units: tuple
+    descriptions: tuple
+    galaxy_scale: np.ndarray
+    agn_scale: np.ndarray
+    mixed_galaxy: np.ndarray
+    mixed_agn: np.ndarray
+    shape: ShapeQuantities
+    fraction: OtherFraction | None
+
+    @classmethod
+    def of_grid(cls, grid):
+        """
+        Quantities of a model grid.
+
+        All columns of its property tables are taken. A column of both tables (``ir_luminosity``)
+        gives three quantities: the sum, and the parts ``<name>_galaxy`` and ``<name>_agn``;
+        without one, the sum is ``total_luminosity``, dust luminosity and AGN power.
+        """
+        n_agn = grid.n_agn
+        of_galaxy, of_agn = grid.galaxy_properties, grid.agn_properties
+        both = [n for n in of_galaxy.colnames if n_agn and n in of_agn.colnames]
+        # name, unit and meaning of each
+        found = [("mass", MASS, "mass of stars formed")]
+        galaxy_scale, agn_scale = [np.ones(grid.n_galaxies)], []
+        mixed_galaxy, mixed_agn = grid.dust_luminosity, np.ones(n_agn)
+        mixed = ("total_luminosity", LUMINOSITY, "dust luminosity and AGN power")
+        for column in of_galaxy.itercols():
+            name, text = column.info.name, _text(column, ", for one solar mass formed")
+            values, unit = _in_watt(column)
+            found.append((f"{name}_galaxy" if name in both else name, unit, text))
+            galaxy_scale.append(values)
+            if name in both[:1]:
+                mixed, mixed_galaxy = (name, LUMINOSITY, f"{text}; and of the AGN"), values
+        for column in of_agn.itercols() if n_agn else ():
+            name, unit = column.info.name, unit_of(column)
+            unit = LUMINOSITY if unit == u.dimensionless_unscaled else unit * LUMINOSITY
+            text = _text(column, ", W for each W of AGN power")
+            found.append((f"{name}_agn" if name in both else name, unit, text))
+            agn_scale.append(plain(column))
+            if name in both[:1]:
+                mixed_agn = agn_scale[-1]
+        columns = list(grid.galaxy_shape.itercols())
+        of_shape = [(c.info.name, unit_of(c), _text(c, "")) for c in columns]
+        fraction = OtherFraction.of_grid(grid)
+        found += [mixed, *of_shape]
+        if fraction is not None:
+            text = FRACTIONS[fraction.name][0]
+            found.append((fraction.name, u.dimensionless_unscaled, text))
+        values = np.array([plain(c) for c in columns], float).reshape(len(columns), grid.n_galaxies)
+        return cls(
+            *zip(*found, strict=True),
+            np.array(galaxy_scale),
+            np.array(agn_scale, float).reshape(len(agn_scale), n_agn),
+            np.array(mixed_galaxy, float),
+            np.array(mixed_agn, float),
+            ShapeQuantities(tuple(name for name, *_ in of_shape), values),
+            fraction,
+        )
+
+    @property
+    def intensive(self):
+        """Names of those that do not scale with mass."""
+        return self.names[len(self.galaxy_scale) + len(self.agn_scale) + 1 :]
+
+    def summarize(self, out):
+        """Moments and quantiles of all quantities, from what the grid engine found for n objects."""
+        moments, quantiles = self.shape.summarize(out.galaxy, DERIVED_LEVELS)
+        parts = [(out.moments, out.quantiles), (moments, quantiles)]
+        if self.fraction is not None:
+            share = np.column_stack([out.share, np.full(len(out.share), np.nan)])
+            parts.append((share[:, None], out.share_quantiles[:, None]))
+        return tuple(np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
+
+    def evaluate(self, name, grid, g, k, frac, scale):
+        """
+        Values of a quantity for single models: galaxies, AGN templates, fractions and scales.
+
+        Indices and numbers have one shape, and the values have it too; a scale of NaN gives NaN.
+        """
+        i = self.names.index(name)
+        n_galaxy, n_agn, of = len(self.galaxy_scale), len(self.agn_scale), self.fraction
+        if i < n_galaxy:
+            return scale * self.galaxy_scale[i][g]
+        if name in self.intensive:
+            if name in self.shape.names:
+                values = self.shape.values[i - n_galaxy - n_agn - 1][g]
+            else:
+                y = frac / (1.0 - frac) * of.galaxy[g] * of.agn[k]
+                values = y / (1.0 + y)
+            # no value where there is no model
+            return np.where(np.isfinite(scale), values, np.nan)
+        power = scale * frac / (1.0 - frac) * grid.dust_luminosity[g]
+        if i < n_galaxy + n_agn:
+            return power * self.agn_scale[i - n_galaxy][k]
+        mixed = scale * self.mixed_galaxy[g]
+        return mixed + power * self.mixed_agn[k] if self.mixed_agn.size else mixed
+
+
+def _text(column, ending):
+    text = getattr(column.info, "description", None) or column.info.name
+    return text.removesuffix(ending)
 
 
 def _in_watt(column):
-    """Values in W for each solar mass, or plain ones."""
-    if isinstance(column, u.Quantity) and column.unit.is_equivalent(LUMINOSITY / MASS):
-        return column.to_value(LUMINOSITY / MASS)
-    return plain(column)
-
-
-def check_draws(grid, ids, flags, index, scale):
-    """Refuse models drawn from a grid whose shapes do not agree, or that are none of the grid."""
-    n, shape = ids.size, np.shape(scale)
-    if len(shape) != 2 or shape[0] != n or shape[1] < 1:
-        raise argument_error("scale", f"of shape ({n}, n_draws)", f"{shape}")
-    if np.shape(index) != (*shape, 4):
-        raise argument_error("index", f"of shape {(*shape, 4)}", f"{np.shape(index)}")
-    if np.shape(flags) != (n,):
-        raise argument_error("flags", f"of shape ({n},)", f"{np.shape(flags)}")
-    sizes = (grid.redshift.size, grid.n_galaxies, max(grid.n_agn, 1), grid.frac_agn.size)
-    index = np.asarray(index, dtype=np.int64)
-    drawn = index[(index[:, :, 0] >= 0).all(axis=1)].reshape(-1, 4)
-    lowest = np.array([0, 0, -1, 0])
-    if np.any(drawn < lowest) or np.any(drawn >= np.array(sizes)):
-        raise argument_error("index", f"within the grid's {sizes}", "others")
-    if np.any((drawn[:, 2] < 0) & (grid.frac_agn[drawn[:, 3]] > 0)):
-        raise argument_error("index", "with an AGN model where the AGN fraction is above 0", "none")
-
-
-class ModelValues:
-    """
-    Values of parameters and derived quantities of models of a grid.
-
-    ``axes`` are the parameters that have several values, with ``share``; ``seed`` chooses values of
-    parameters without effect.
-    """
-
-    def __init__(self, grid, axes, seed):
-        self.grid, self.axes, self.seed = grid, axes, seed
-        self.quantities = Quantities.of_grid(grid)
-        have = set(self.quantities.names)
-        self.fractions = tuple(n for n, parts in _FRACTIONS.items() if set(parts[1:]) <= have)
-
-    @property
-    def names(self):
-        """Names of parameters, derived quantities and AGN fractions."""
-        return (*self.axes, *self.quantities.names, *self.fractions)
-
-    def unit(self, name):
-        """Unit of a parameter or quantity."""
-        if name in self.axes:
-            return u.Unit(self.axes[name].unit)
-        if name in self.fractions:
-            return u.dimensionless_unscaled
-        if name not in self.quantities.names:
-            raise unknown_name("parameter", name, self.names)
-        return self.quantities.units[self.quantities.names.index(name)]
-
-    def description(self, name):
-        """One line on a parameter or quantity."""
-        if name in self.quantities.names:
-            return self.quantities.descriptions[self.quantities.names.index(name)]
-        if name in self.fractions:
-            return _FRACTIONS[name][0]
-        for table in (self.grid.galaxy_parameters, self.grid.agn_parameters):
-            if name in table.colnames and table[name].info.description:
-                return table[name].info.description
-        return name
-
-    def extensive(self, name):
-        """Whether a quantity scales with mass."""
-        return name in self.quantities.names and name not in self.quantities.shape.names
-
-    def values(self, name, ids, index, scale):
-        """
-        Values of a parameter or quantity in models drawn for n objects: shape (n, n_draws).
-
-        ``ids`` key the streams of parameters without effect; NaN for parameters of an AGN that is not
-        there. See `~miricigale.fitting.Samples` for ``index`` and ``scale``.
-        """
-        z, g, k, f = np.moveaxis(index, -1, 0)
-        grid = self.grid
-        if name == "redshift":
-            return grid.redshift[z]
-        if name in self.axes:
-            axis = self.axes[name]
-            if axis.kind == "frac_agn":
-                return grid.frac_agn[f]
-            return self._of_axis(axis, g if axis.kind == "galaxy" else k, ids)
-        if name in self.fractions:
-            agn, galaxy = (self.values(part, ids, index, scale) for part in _FRACTIONS[name][1:])
-            whole = agn + galaxy
-            return np.divide(agn, whole, out=np.zeros_like(whole), where=whole != 0)
-        frac = grid.frac_agn[f]
-        return self.quantities.evaluate(name, grid, g, np.maximum(k, 0), frac, scale)
-
-    def _of_axis(self, axis, model, ids):
-        """Values of a parameter; where a model stands for several, drawn as its prior has it."""
-        share = axis.share
-        out = axis.values[np.argmax(share, axis=0)][model]
-        several = np.count_nonzero(share > 0, axis=0) > 1
-        many = several[model] & (model >= 0)
-        total = np.cumsum(share, axis=0)
-        for i in np.flatnonzero(many.any(axis=1)):
-            rng = stream(self.seed, "samples", axis.name, str(ids[i]))
-            draw = rng.random(model.shape[1])[many[i]]
-            cdf = total[:, model[i][many[i]]]
-            out[i, many[i]] = axis.values[np.sum(draw * cdf[-1] >= cdf, axis=0)]
-        return np.where(model >= 0, out, np.nan)
+    """Values of a column for each solar mass, and the unit of the whole: W of luminosities."""
+    unit = unit_of(column) * MASS
+    if not unit.is_equivalent(LUMINOSITY):
+        return plain(column), unit
+    return plain(column) * unit.to(LUMINOSITY), LUMINOSITY

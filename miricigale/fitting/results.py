@@ -10,8 +10,9 @@ from miricigale.fitting import drawing
 from miricigale.fitting.likelihood import FitFlags, filter_names
 from miricigale.fitting.posterior import cell_edges, cell_percentiles, check_levels, moments
 from miricigale.fitting.quantities import DERIVED_LEVELS, kept_percentiles
-from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.exceptions import argument_error
 from miricigale.utils.object_rows import ObjectRows, PerObject, PerObjectDict
+from miricigale.utils.options import check_names
 from miricigale.utils.tables import described_table, error_column
 from miricigale.utils.unified import read_write
 from miricigale.utils.units import FNU
@@ -31,8 +32,27 @@ _PARTS = {
 }
 
 
+class FitRows(ObjectRows):
+    """Base of what fits return: objects that may be flagged as not fitted, and the model if it is known."""
+
+    #: Where the formats of files are registered.
+    io_module = "miricigale.fitting.io"
+
+    def with_model(self, model):
+        """Return a copy that knows the `~miricigale.sed.SEDModel`, for other bands and for spectra."""
+        return replace(self, model=model)
+
+    def _fitted_one(self):
+        """Refuse a single object that was not fitted."""
+        if not self.fitted:
+            names = ", ".join(FitFlags.names(self.flags)) or "no draws"
+            got = f"{np.asarray(self.ids).item()!r} ({names})"
+            raise argument_error("key", "the id of an object that was fitted", got)
+        return self
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class FitResults(ObjectRows):
+class FitResults(FitRows):
     """
     Posteriors of the objects of a catalog, in its order.
 
@@ -153,8 +173,6 @@ class FitResults(ObjectRows):
     model: object = None
     meta: dict = field(default_factory=dict)
 
-    #: Where the formats of files are registered.
-    io_module = "miricigale.fitting.io"
     read, write = read_write("results (FITS: all but the model; ECSV: their table, not read back)")
 
     def __post_init__(self):
@@ -214,8 +232,7 @@ class FitResults(ObjectRows):
         return name in self.quantities and name not in self.intensive
 
     def _quantity(self, name):
-        if name not in self.quantities:
-            raise unknown_name("parameter", name, self.parameters)
+        check_names([name], "parameter", self.parameters)
         return self.quantities.index(name)
 
     def _meaning(self, name):
@@ -232,18 +249,19 @@ class FitResults(ObjectRows):
         return self._moments(name)[1] * self.unit(name)
 
     def _moments(self, name):
-        if name in self.axes and self.axis_moments is None:
+        kept = self._kept(name, "moments")
+        if kept is None:
             mean, std = moments(self.axes[name].values, self.pdf[name])
         else:
-            kept = self._kept(name, self.axis_moments, self.moments)
             mean, std = kept[..., 0], kept[..., 1]
         return mean, np.maximum(std, self.least_std * np.abs(mean))
 
-    def _kept(self, name, of_axes, of_quantities):
-        """What a sampler keeps of a parameter, or any fit of a derived quantity."""
-        if name in self.axes:
-            return of_axes[..., list(self.axes).index(name), :]
-        return of_quantities[..., self._quantity(name), :]
+    def _kept(self, name, what):
+        """Moments or quantiles that are kept; None of a parameter of which the cells are."""
+        if name not in self.axes:
+            return getattr(self, what)[..., self._quantity(name), :]
+        kept = getattr(self, f"axis_{what}")
+        return None if kept is None else kept[..., list(self.axes).index(name), :]
 
     def percentile(self, name, levels):
         """
@@ -270,11 +288,11 @@ class FitResults(ObjectRows):
         """
         levels = check_levels(levels)
         some = self._several()
-        if name in self.axes and self.axis_quantiles is None:
+        kept = some._kept(name, "quantiles")
+        if kept is None:
             axis = self.axes[name]
             out = cell_percentiles(axis.values, some.pdf[name], levels, axis.bounds)
         else:
-            kept = some._kept(name, some.axis_quantiles, some.quantiles)
             out = kept_percentiles(name, levels, kept)
         return (out[0] if self.isscalar else out) * self.unit(name)
 
@@ -292,8 +310,7 @@ class FitResults(ObjectRows):
         """
         if name in self.axes:
             return self._edges(name) * self.unit(name), self.pdf[name]
-        edges = self.quantiles[..., self._quantity(name), :]
-        return edges * self.unit(name), np.diff(DERIVED_LEVELS)
+        return self._kept(name, "quantiles") * self.unit(name), np.diff(DERIVED_LEVELS)
 
     def _edges(self, name):
         return cell_edges(self.axes[name].values, self.axes[name].bounds)
@@ -340,9 +357,7 @@ class FitResults(ObjectRows):
             return known[x, y]
         if (y, x) in known:
             return np.swapaxes(known[y, x], -1, -2)
-        for name in (x, y):
-            if name not in self.parameters:
-                raise unknown_name("parameter", name, self.parameters)
+        check_names((x, y), "parameter", self.parameters)
         have = ", ".join(f"{a} and {b}" for a, b in known) or "none"
         msg = f"no joint posterior of {x} and {y}; known: {have} ('pairs' of BayesFitter.fit)"
         raise KeyError(msg)
@@ -407,9 +422,9 @@ class FitResults(ObjectRows):
         """
         some = self._several()
         columns = {"id": (some.ids, "identifier")}
-        for name in filter_names("filters", self.filters if filters is None else filters):
-            if name not in self.filters:
-                raise unknown_name("filter of the models", name, self.filters)
+        names = filter_names("filters", self.filters if filters is None else filters)
+        check_names(names, "filter of the models", self.filters)
+        for name in names:
             mean, std, best = (
                 array[:, self.filters.index(name)] * FNU
                 for array in (some.model_flux, some.model_flux_std, some.best_flux)
@@ -421,22 +436,11 @@ class FitResults(ObjectRows):
 
     # ---------------------------------------------------------------- single objects
 
-    def with_model(self, model):
-        """Return a copy that knows the `~miricigale.sed.SEDModel`, for spectra of the best fits."""
-        return replace(self, model=model)
-
     def _one(self, what):
         """Refuse several objects where one is needed."""
         if not self.isscalar:
             msg = f"{what} is of a single object: results[id].{what}()"
             raise TypeError(msg)
-        return self
-
-    def _fitted_one(self):
-        if not self.fitted:
-            names = ", ".join(FitFlags.names(self.flags))
-            got = f"{np.asarray(self.ids).item()!r} ({names})"
-            raise argument_error("key", "the id of an object that was fitted", got)
         return self
 
     samples, best_sed, plot_sed = drawing.samples, drawing.best_sed, drawing.plot_sed

@@ -1,6 +1,6 @@
 """Models drawn from posteriors: joint distributions, fluxes in any band, spectra."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import astropy.units as u
@@ -8,12 +8,15 @@ import numpy as np
 
 from miricigale.fitting.drawing import labeled
 from miricigale.fitting.likelihood import FitFlags
-from miricigale.fitting.posterior import bin_cells, check_levels, node_cells
+from miricigale.fitting.posterior import bin_edges, cell_edges, check_levels
 from miricigale.fitting.priors import grid_priors
-from miricigale.fitting.quantities import ModelValues, check_draws
+from miricigale.fitting.quantities import FRACTIONS, Quantities
+from miricigale.fitting.results import FitRows
 from miricigale.sed import grid_spectra as spectra
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.object_rows import ObjectRows, PerObject
+from miricigale.utils.object_rows import PerObject
+from miricigale.utils.options import check_names
+from miricigale.utils.random import stream
 from miricigale.utils.tables import described_table, error_column
 from miricigale.utils.unified import read_write
 from miricigale.utils.units import FNU, WAVE
@@ -22,7 +25,7 @@ _LEVELS = (0.16, 0.5, 0.84)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Samples(ObjectRows):
+class Samples(FitRows):
     """
     Models drawn from the posteriors of the objects of a catalog.
 
@@ -70,8 +73,6 @@ class Samples(ObjectRows):
     axes: dict | None = None
     seed: int = 0
 
-    #: Where the formats of files are registered.
-    io_module = "miricigale.fitting.io"
     read, write = read_write(
         "draws (FITS: all but grid and model; ECSV: their table, not read back)",
         """grid : `~miricigale.sed.ModelGrid`
@@ -83,13 +84,30 @@ model : `~miricigale.sed.SEDModel`, optional
 
     def __post_init__(self):
         ids = np.asarray(self.ids)
-        check_draws(self.grid, ids, self.flags, self.index, self.scale)
+        self._check(ids.size)
         dtypes = {"ids": ids.dtype, "flags": np.int64, "index": np.int32, "scale": float}
         for name, dtype in dtypes.items():
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype))
         if self.axes is None:
             object.__setattr__(self, "axes", grid_priors(self.grid).axes)
         super().__post_init__()
+
+    def _check(self, n):
+        """Refuse draws whose shapes do not agree, or that are no models of the grid."""
+        grid, index, shape = self.grid, np.asarray(self.index), np.shape(self.scale)
+        if len(shape) != 2 or shape[0] != n or shape[1] < 1:
+            raise argument_error("scale", f"of shape ({n}, n_draws)", f"{shape}")
+        for name, wanted in (("index", (*shape, 4)), ("flags", (n,))):
+            if np.shape(getattr(self, name)) != wanted:
+                got = f"{np.shape(getattr(self, name))}"
+                raise argument_error(name, f"of shape {wanted}", got)
+        sizes = (grid.redshift.size, grid.n_galaxies, max(grid.n_agn, 1), grid.frac_agn.size)
+        drawn = index[(index[:, :, 0] >= 0).all(axis=1)].reshape(-1, 4)
+        if np.any(drawn < [0, 0, -1, 0]) or np.any(drawn >= sizes):
+            raise argument_error("index", f"within the grid's {sizes}", "others")
+        if np.any((drawn[:, 2] < 0) & (grid.frac_agn[drawn[:, 3]] > 0)):
+            wanted = "with an AGN model where the AGN fraction is above 0"
+            raise argument_error("index", wanted, "none")
 
     def __repr__(self):
         what = repr(np.asarray(self.ids).item()) if self.isscalar else f"{len(self)} objects"
@@ -105,15 +123,18 @@ model : `~miricigale.sed.SEDModel`, optional
         """Which objects have draws."""
         return (self.index[..., 0] >= 0).all(axis=-1)
 
-    def with_model(self, model):
-        """Return a copy that knows the `~miricigale.sed.SEDModel`."""
-        return replace(self, model=model)
-
     # ------------------------------------------------------------------- values
 
     @cached_property
-    def _models(self):
-        return ModelValues(self.grid, self.axes, int(self.seed))
+    def _quantities(self):
+        return Quantities.of_grid(self.grid)
+
+    @property
+    def _fractions(self):
+        have = self._quantities.names
+        return [
+            name for name, parts in FRACTIONS.items() if all(part in have for part in parts[1:])
+        ]
 
     @property
     def parameters(self):
@@ -123,15 +144,31 @@ model : `~miricigale.sed.SEDModel`, optional
         Parameters with several values in the grid, derived quantities and, where the grid has
         AGN, the AGN fraction in both definitions.
         """
-        return self._models.names
+        fractions = self._fractions
+        derived = (name for name in self._quantities.names if name not in fractions)
+        return (*self.axes, *derived, *fractions)
 
     def unit(self, name):
         """Unit of a parameter or derived quantity."""
-        return self._models.unit(name)
+        if name in self.axes:
+            return u.Unit(self.axes[name].unit)
+        check_names([name], "parameter", self.parameters)
+        known = self._quantities
+        if name in self._fractions:
+            return u.dimensionless_unscaled
+        return known.units[known.names.index(name)]
 
     def description(self, name):
         """One line on a parameter or derived quantity."""
-        return self._models.description(name)
+        known = self._quantities
+        if name in FRACTIONS:
+            return FRACTIONS[name][0]
+        if name in known.names:
+            return known.descriptions[known.names.index(name)]
+        for table in (self.grid.galaxy_parameters, self.grid.agn_parameters):
+            if name in table.colnames and table[name].info.description:
+                return table[name].info.description
+        return name
 
     def values(self, name):
         """
@@ -144,12 +181,37 @@ model : `~miricigale.sed.SEDModel`, optional
             draw has none.
         """
         some, unit = self._several(), self.unit(name)
-        fitted = some.fitted
-        out = np.full(some.scale.shape, np.nan)
-        out[fitted] = self._models.values(
-            name, some.ids[fitted], some.index[fitted], some.scale[fitted]
-        )
+        out = np.where(some.fitted[:, None], some._values(name), np.nan)
         return out.reshape(self.scale.shape) * unit
+
+    def _values(self, name):
+        """Values without their unit, shape (n, n_draws); of any model for objects without draws."""
+        z, g, k, f = np.moveaxis(self.index, -1, 0)
+        grid, axis = self.grid, self.axes.get(name)
+        if name in self._fractions:
+            agn, galaxy = (self._values(part) for part in FRACTIONS[name][1:])
+            whole = agn + galaxy
+            return np.divide(agn, whole, out=np.zeros_like(whole), where=whole != 0)
+        if axis is None:
+            frac = grid.frac_agn[f]
+            return self._quantities.evaluate(name, grid, g, np.maximum(k, 0), frac, self.scale)
+        if axis.kind in ("redshift", "frac_agn"):
+            return grid.redshift[z] if axis.kind == "redshift" else grid.frac_agn[f]
+        return self._of_axis(axis, g if axis.kind == "galaxy" else k)
+
+    def _of_axis(self, axis, model):
+        """Values of a parameter; where a model stands for several, drawn as its prior has it."""
+        share = axis.share
+        out = axis.values[np.argmax(share, axis=0)][model]
+        several = np.count_nonzero(share > 0, axis=0) > 1
+        many = several[model] & (model >= 0)
+        total = np.cumsum(share, axis=0)
+        for i in np.flatnonzero(many.any(axis=1)):
+            rng = stream(int(self.seed), "samples", axis.name, str(self.ids[i]))
+            draw = rng.random(model.shape[1])[many[i]]
+            cdf = total[:, model[i][many[i]]]
+            out[i, many[i]] = axis.values[np.sum(draw * cdf[-1] >= cdf, axis=0)]
+        return np.where(model >= 0, out, np.nan)
 
     def to_table(self, names=None):
         """
@@ -222,9 +284,8 @@ model : `~miricigale.sed.SEDModel`, optional
         weights : `~numpy.ndarray`, shape (n_bins,)
             Part of the draws in each.
         """
-        edges, place = self._binned(name, key, bins)
-        weights = np.bincount(place[place >= 0], minlength=edges.size - 1) / place.size
-        return edges, weights
+        values, edges = self._binned(name, key, bins)
+        return edges * self.unit(name), np.histogram(values, edges)[0] / self.n_draws
 
     def pdf_2d(self, a, b, key, *, bins=30):
         """
@@ -245,34 +306,25 @@ model : `~miricigale.sed.SEDModel`, optional
             Part of the draws in each; the draws without a value (parameters of an AGN that is
             not there) are in none.
         """
-        a_edges, i = self._binned(a, key, bins)
-        b_edges, j = self._binned(b, key, bins)
-        weights = np.zeros((a_edges.size - 1, b_edges.size - 1))
-        both = (i >= 0) & (j >= 0)
-        np.add.at(weights, (i[both], j[both]), 1.0 / self.n_draws)
-        return a_edges, b_edges, weights
+        x, x_edges = self._binned(a, key, bins)
+        y, y_edges = self._binned(b, key, bins)
+        part = np.full(self.n_draws, 1.0 / self.n_draws)
+        weights = np.histogram2d(x, y, (x_edges, y_edges), weights=part)[0]
+        return x_edges * self.unit(a), y_edges * self.unit(b), weights
 
     def _binned(self, name, key, bins):
-        """Edges of the cells, and the cell of every draw (-1: none)."""
-        unit = self.unit(name)
-        values = self._one(key).values(name).value
+        """Values in the draws of an object, and edges of the cells."""
+        unit, values = self.unit(name), self[key]._fitted_one().values(name).value
         if name in self.axes:
-            axis = self.axes[name]
-            edges, place = node_cells(values, axis.values, axis.bounds)
-        else:
-            bins = bins.to_value(unit) if hasattr(bins, "unit") else bins
-            if not np.ndim(bins) and not np.isfinite(values).any():
-                raise argument_error("name", "one with values in the draws", repr(name))
-            edges, place = bin_cells(values, bins, log=self._models.extensive(name))
-        return edges * unit, place
+            return values, cell_edges(self.axes[name].values, self.axes[name].bounds)
+        if not np.isfinite(values).any() and not np.ndim(bins):
+            raise argument_error("name", "one with values in the draws", repr(name))
+        bins = bins.to_value(unit) if hasattr(bins, "unit") else bins
+        return values, bin_edges(values, bins, log=self._extensive(name))
 
-    def _one(self, key):
-        """Return the samples of one object that was fitted."""
-        one = self[key]
-        if not one.fitted:
-            names = ", ".join(FitFlags.names(one.flags)) or "no draws"
-            raise argument_error("key", "the id of an object that was fitted", f"{key!r} ({names})")
-        return one
+    def _extensive(self, name):
+        known = self._quantities
+        return name in known.names and name not in known.intensive
 
     # ---------------------------------------------------------- fluxes and spectra
 
@@ -296,22 +348,14 @@ model : `~miricigale.sed.SEDModel`, optional
         ValueError
             If a band is not one of the grid and no model is known, or the model is another.
         """
-        names, extra = self._bands(filters)
-        some = self._several()
+        names, extra = spectra.band_names(self.grid, filters)
+        model, some = self._model() if extra else None, self._several()
         out = np.full((*some.scale.shape, len(names)), np.nan)
         fitted = some.fitted
-        model = self._model() if extra else None
         out[fitted] = spectra.draw_fluxes(
             self.grid, some.index[fitted], some.scale[fitted], names, extra, model
         )
         return out.reshape(*self.scale.shape, len(names)) * FNU
-
-    def _bands(self, filters):
-        """Names of the bands asked for, and those that only a model has."""
-        names, extra = spectra.band_names(self.grid, filters)
-        if extra:
-            self._model()
-        return names, extra
 
     def _model(self):
         if self.model is None:
@@ -337,7 +381,7 @@ model : `~miricigale.sed.SEDModel`, optional
             (``<name>_err``) and percentiles (``<name>_p16``, ...) in uJy.
         """
         levels = check_levels(levels)
-        names, _ = self._bands(filters)
+        names, _ = spectra.band_names(self.grid, filters)
         some = self._several()
         columns = {
             "id": (np.array(some.ids), "identifier"),
@@ -371,7 +415,7 @@ model : `~miricigale.sed.SEDModel`, optional
         spectra : `~astropy.units.Quantity`, shape (n_draws, n_wave)
             In W / Hz or uJy.
         """
-        one = self._one(key)
+        one = self[key]._fitted_one()
         function = spectra.rest_spectra if rest else spectra.observed_spectra
         wave, values = function(self._model(), self.grid, one.index, one.scale)
         return wave * WAVE, values * (u.W / u.Hz if rest else FNU)

@@ -10,10 +10,7 @@ import warnings
 import astropy.units as u
 import numpy as np
 
-from miricigale.filters.catalog_files import (
-    codes_of,
-    warn_of_codes,
-)
+from miricigale.filters.catalog_files import codes_of, warn_of_codes
 from miricigale.fitting.fitter import BayesFitter
 from miricigale.fitting.from_files import open_catalog
 from miricigale.fitting.io import FORMAT, FitFolder, open_results, part_ids, part_name
@@ -134,7 +131,7 @@ def fit_file(
         for text in rows.told():
             warnings.warn(f"{rows.path.name}: {text}", CatalogWarning, stacklevel=2)
     fluxes = {c for name in fitter.bands for c in (name, error_column(name))}
-    inputs = _Inputs(rows, options, unit, fluxes)
+    take = _pieces(rows, options, unit, fluxes)
     _check_ids(rows)
     given = {"hdu": hdu, "flux_unit": None if unit is None else unit.to_string()}
     if catalog_map is not None:
@@ -142,7 +139,7 @@ def fit_file(
     job = _job(fitter, rows, options | {"seed": seed}, given)
     with FitFolder(path_out) as folder:
         _begin(folder, job, resume)
-        _fit_parts(fitter, inputs, folder, seed, executor, progress_bar)
+        _fit_parts(fitter, rows, take, folder, seed, executor, progress_bar)
     return open_results(path_out, model=fitter.model)
 
 
@@ -173,9 +170,8 @@ def _codes(rows, bands):
     return {name: np.concatenate(codes) for name, codes in parts.items()}
 
 
-def _fit_parts(fitter, inputs, folder, seed, executor, progress_bar):
+def _fit_parts(fitter, rows, take, folder, seed, executor, progress_bar):
     """Fit the pieces whose parts are not there, and write them."""
-    rows = inputs.rows
     seen, n_new = set(), 0
     with progress(show=progress_bar, total=rows.n_rows, desc="fit", unit="obj") as bar:
         for i in range(rows.n_chunks):
@@ -186,13 +182,14 @@ def _fit_parts(fitter, inputs, folder, seed, executor, progress_bar):
                 if name in folder.records:
                     logger.warning("%s is damaged and is made again", folder.path(name))
                 with _noted(rows, i):
-                    table, options = inputs.take(i)
+                    table, options = take(i)
                     keys = _keys(read_ids(table))
                     repeated = np.array([key in seen for key in keys], dtype=bool)
-                    # what is true of all pieces is said of the first, to the caller of fit_file
-                    options["stacklevel"] = None if n_new else 5
-                    results = fitter._fit_rows(
-                        table, options, seed=seed, repeated=repeated, executor=executor
+                    if not n_new:
+                        # which holds for all pieces: to the caller of fit_file
+                        fitter.warn_of_bands(table, 3)
+                    results = fitter.fit_part(
+                        table, **options, seed=seed, repeated=repeated, executor=executor
                     )
                 n_new += 1
                 folder.save(name, results.write)
@@ -210,33 +207,30 @@ def _keys(ids):
     return [key if key == key else None for key in ids.tolist()]
 
 
-class _Inputs:
-    """The pieces of a catalog, and of the arrays given with it."""
+def _pieces(rows, options, unit, fluxes):
+    """Function of the number of a piece: its table, and the arguments of `fit` that go with it."""
+    prior = options["redshift_prior"]
+    if prior is not None and (isinstance(prior, str) or len(prior) != 2):
+        raise argument_error("redshift_prior", "redshifts and densities", repr(prior))
+    nodes, density = (None, None) if prior is None else prior
+    redshift = _beside("redshift", options["redshift"], 1, rows.n_rows)
+    density = _beside("redshift_prior", density, 2, rows.n_rows)
 
-    def __init__(self, rows, options, unit, fluxes):
-        self.rows, self.unit, self.fluxes, self.options = rows, unit, fluxes, options
-        self.redshift = _beside("redshift", options["redshift"], 1, rows.n_rows)
-        prior = options["redshift_prior"]
-        if prior is not None:
-            if isinstance(prior, str) or len(prior) != 2:
-                raise argument_error("redshift_prior", "redshifts and densities", repr(prior))
-            self.nodes = prior[0]
-            self.density = _beside("redshift_prior", prior[1], 2, rows.n_rows)
-
-    def take(self, i):
-        """Piece ``i``: table, and the arguments of `fit` that go with it."""
-        table, piece = self.rows.chunk(i), slice(*self.rows.span(i))
-        for name in self.fluxes.intersection(table.colnames) if self.unit is not None else ():
+    def take(i):
+        table, piece = rows.chunk(i), slice(*rows.span(i))
+        for name in fluxes.intersection(table.colnames) if unit is not None else ():
             if table[name].unit is None:
-                table[name].unit = self.unit
-        options = self.options | {"redshift": self.redshift(piece)}
-        if options["redshift_prior"] is not None:
-            density = self.density(piece)
-            if isinstance(density, str):
-                require_columns(table, [density], "photometry")
-                density = table[density]
-            options["redshift_prior"] = (self.nodes, density)
-        return table, options
+                table[name].unit = unit
+        given = options | {"redshift": redshift(piece)}
+        if prior is not None:
+            values = density(piece)
+            if isinstance(values, str):
+                require_columns(table, [values], "photometry")
+                values = table[values]
+            given["redshift_prior"] = (nodes, values)
+        return table, given
+
+    return take
 
 
 def _beside(argument, value, ndim, n):

@@ -2,13 +2,20 @@
 
 import numbers
 
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.exceptions import argument_error, unknown_name
 
 
 def check_choice(value, name, known):
     """Refuse a value that is none of those known (a `ValueError`)."""
     if value not in known:
         raise argument_error(name, " or ".join(repr(one) for one in known), repr(value))
+
+
+def check_names(names, kind, known):
+    """Refuse the first of some names that is not known (a `KeyError` that lists those that are)."""
+    for name in names:
+        if name not in known:
+            raise unknown_name(kind, name, known)
 
 
 def check_kind(value, name, kind):

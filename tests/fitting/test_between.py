@@ -229,7 +229,7 @@ def test_interpolated_models_are_those_of_the_chain(chain, off_nodes):
     off = []
     for finer in (None, model):
         fitter = BayesFitter(grid, settings=GridSettings(interpolate=1, finer=finer))
-        models = fitter.backend.between.models
+        models = fitter.backend.between
         flux, power = models.fluxes(models.models(values))
         ratio = np.log(flux * 1e10 / want)
         off.append(np.sqrt(np.mean(np.minimum(np.abs(ratio), 0.3) ** 2)))

@@ -396,7 +396,7 @@ def test_transform_inverts_the_cumulative_prior(given):
     values = prior.transform(unit)
     assert_allclose(prior.cdf(values), unit, atol=1e-10)
     assert values.min() >= 0.0
-    nodes, weights, bounds = space.prior_cells(prior, 50)
+    nodes, weights, bounds = prior.cells(50)
     assert_allclose(weights.sum(), 1.0)
     assert np.all(np.diff(nodes) > 0)
     assert bounds[0] <= nodes[0] < nodes[-1] <= bounds[1]

@@ -77,7 +77,7 @@ def test_uniform_weights_give_straight_quantiles():
     order = np.random.default_rng(0).permutation(20)
     values = (np.arange(20) + 0.5)[order]
     # each value twice, to the last digit or nearly
-    shape = ShapeQuantities(("v",), (u.mag,), ("",), np.concatenate([values, values + 1e-12])[None])
+    shape = ShapeQuantities(("v",), np.concatenate([values, values + 1e-12])[None])
     weights = np.full((300, 40), 1 / 40)
     weights[7] = np.nan
     moments, quantiles = shape.summarize(weights, DERIVED_LEVELS)
@@ -103,7 +103,7 @@ def test_the_place_in_a_catalog_makes_no_difference():
 
 def test_objects_without_a_value():
     """All weight on models without a color: no value, and no warning."""
-    shape = ShapeQuantities(("c", "d"), (u.mag,) * 2, ("",) * 2, np.array([[np.nan, 1.0]] * 2))
+    shape = ShapeQuantities(("c", "d"), np.array([[np.nan, 1.0]] * 2))
     moments, quantiles = shape.summarize(np.array([[1.0, 0.0], [0.5, 0.5]]), np.array([0.5]))
     assert np.isnan(moments[0]).all()
     np.testing.assert_array_equal(moments[1, :, 0], 1.0)

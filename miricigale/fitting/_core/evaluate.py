@@ -105,7 +105,6 @@ def _evaluate_alone(tables, target, limits, pairs, lanes, sums, delta, scale_err
                     total[0] += t
                     total[1] += t * s * s / inverse
                     total[2] += t if s == 0.0 else 0.0
-                    best[3] += 1.0
                     for d in range(draws.next.size):
                         while draws.next[d] <= total[0]:
                             now = max(total[0], draws.next[d])
@@ -150,10 +149,8 @@ def _evaluate_runs(
             _rescale(sums, lanes, math.exp(0.5 * (best[2] - reference)))
         best[2] = reference
     light = single and limits is None
-    for i in range(lanes.left.size):
-        lanes.left[i] = 1.0
-    for i in range(lanes.known.size):
-        lanes.known[i] = 0
+    lanes.left[:] = 1.0
+    lanes.known[:] = 0
     n_listed = 1.0
     for r in range(n):
         if pairs.top[r] >= floor:
@@ -288,14 +285,14 @@ def sum_up(tables, scales, request, target, limits, sums, pairs, lanes, *, singl
             tables, target, limits, pairs, lanes, sums, request, n, reference, floor,
             single and not few,
         )  # fmt: skip
-        room = share * request.rtol * total[0]
+        allowed = share * request.rtol * total[0]
         tail = (target.norm.max() + 1.0) / request.tail
         unit = (
             math.exp(min(0.5 * (reference - best[2]), 600.0)) * prior_sum / max(prior_top, 1e-300)
         )
         floor = second_floor(
-            tables, target, pairs, n, reference, room, unit, request.delta, tail,
-            widest(scales, sums) if room > 0.0 else None,
+            tables, target, pairs, n, reference, allowed, unit, request.delta, tail,
+            widest(scales, sums) if allowed > 0.0 else None,
         )  # fmt: skip
         _evaluate_runs(
             tables, target, limits, pairs, lanes, sums, request, n, reference, floor, single

@@ -68,13 +68,13 @@ def first_floor(pairs, n, reference):
 
 
 @njit(**KERNEL)
-def _raise_bounds(tables, target, pairs, n, room, tail_galaxy, tail_agn, reference, count):
+def _raise_bounds(tables, target, pairs, n, allowed, tail_galaxy, tail_agn, reference, count):
     """
     Raise the bounds of the n listed runs by what second moments ask for, and fill their histogram.
 
     A model has s^2 <= R / <G, wG> and power^2 <= R / <A, wA>, R <= |F|^2_w. Their product with
     the quantities' squares is compared with the variances: ``tail_galaxy`` and ``tail_agn`` are from
-    `widest`, ``room`` is |F|^2_w over how much more second moments may miss than weights. A bound is
+    `widest`, ``allowed`` is |F|^2_w over how much more second moments may miss than weights. A bound is
     raised by 2 ln of how much more than its weight a pair can add to second moments.
     """
     top = 0.0
@@ -91,13 +91,13 @@ def _raise_bounds(tables, target, pairs, n, room, tail_galaxy, tail_agn, referen
             for g in range(tail_galaxy.size):
                 unit = tables.galaxy_unit[z, g]
                 inverse = np.float64(pairs.inverse_norm[z, g])
-                amp = tail_galaxy[g] * room * inverse * inverse / max(unit * unit * top, 1e-300)
+                amp = tail_galaxy[g] * allowed * inverse * inverse / max(unit * unit * top, 1e-300)
                 pairs.tail_galaxy[g] = _TWO_LN_10 * log10(amp) if amp > 1.0 else 0.0
             for k in range(tail_agn.size):
                 b2 = 0.0
                 for b in range(weight.size):
                     b2 += tables.agn[z, k, b] * tables.agn[z, k, b] * weight[b]
-                amp = tail_agn[k] * room / b2 if b2 > 0.0 else 0.0
+                amp = tail_agn[k] * allowed / b2 if b2 > 0.0 else 0.0
                 pairs.tail_agn[k] = _TWO_LN_10 * log10(amp) if amp > 1.0 else 0.0
         start = ((key >> KEY_BITS) & KEY_MASK) * BLOCK
         more = pairs.tail_agn[key & KEY_MASK]
@@ -110,20 +110,20 @@ def _raise_bounds(tables, target, pairs, n, room, tail_galaxy, tail_agn, referen
         _count_run(row, reference, DONE, count)
 
 
-def second_floor(tables, target, pairs, n, reference, room, unit, delta, tail, widest):
+def second_floor(tables, target, pairs, n, reference, allowed, unit, delta, tail, widest):
     """
     Least bound to evaluate, once the weight of the best pairs is known.
 
-    The weight of a pair is at most ``unit`` times exp((bound - reference) / 2), and ``room`` is what
+    The weight of a pair is at most ``unit`` times exp((bound - reference) / 2), and ``allowed`` is what
     may be left out: the pairs below the floor sum up to no more. It is at most ``delta`` below the
-    reference. Bounds are raised by what second moments ask for: ``tail`` and ``widest`` are ``room``
+    reference. Bounds are raised by what second moments ask for: ``tail`` and ``widest`` are ``allowed``
     and both tails of `_raise_bounds`.
     """
-    if not room > 0.0:
+    if not allowed > 0.0:
         return _ALL
     count = _make_count()
     _raise_bounds(tables, target, pairs, n, tail, *widest, reference, count)
     # from the lowest up
     left = np.cumsum((count[:2, :_N_LEVELS].sum(axis=0) * _DECAY * unit)[::-1])
-    last = _N_LEVELS - np.searchsorted(left, room, side="right")
+    last = _N_LEVELS - np.searchsorted(left, allowed, side="right")
     return reference - min(last / _PER_UNIT, delta)

@@ -93,8 +93,7 @@ def add_model(tables, hist, g, k, j, s, t):
 def clear_rows(table, used):
     """Set the used bins of every row to zero and mark the rows as empty."""
     for i in range(used.shape[0]):
-        for j in range(used[i, 0], used[i, 1] + 1):
-            table[i, j] = 0.0
+        table[i, used[i, 0] : used[i, 1] + 1] = 0.0
         used[i, 0] = N_BINS
         used[i, 1] = -1
 

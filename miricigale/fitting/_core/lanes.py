@@ -18,9 +18,8 @@ from miricigale.utils.compilation import njit
 def galaxy_products(tables, target, z, block, pq):
     """Fill ``Lanes.pq`` with <G, wF> and <G, wG> of a block of the galaxies of one redshift."""
     p, q = pq[0, block * BLOCK : (block + 1) * BLOCK], pq[1, block * BLOCK : (block + 1) * BLOCK]
-    for i in range(BLOCK):
-        p[i] = 0.0
-        q[i] = 0.0
+    p[:] = 0.0
+    q[:] = 0.0
     for b in target.bands:
         w = target.weight[z, b]
         wf = w * target.flux[b]
@@ -72,7 +71,7 @@ def gather(tables, target, limits, pairs, lanes, r, start, floor, filled):
     """
     Put pairs of run r, from galaxy ``start`` of its block on, whose bound reaches the floor, in lanes.
 
-    They are marked as done. Returned are how many lanes are filled then, and the galaxy to go on with,
+    They are marked as done. Returned are how many lanes are filled then, and the next galaxy,
     `BLOCK` if none is left.
     """
     key, row = pairs.run_key[r], pairs.bound[r]
@@ -146,8 +145,7 @@ def likelihoods(of_frac, lanes, reference, scale_error, record):
         # the numerator of the scale is linear in c
         p, a = buffer[at.P + i], buffer[at.A + i]
         n_dark += 1.0 if p > -1e29 and min(p + c_0 * a, p + c_1 * a) <= 0.0 else 0.0
-    for i in range(at.W0, at.T):
-        buffer[i] = 0.0
+    buffer[at.W0 : at.T] = 0.0
     for j in range(of_frac.shape[1]):
         c = of_frac[at.RATIO, j]
         f = of_frac[at.PRIOR_FRAC, j]

@@ -178,13 +178,10 @@ def _best_scales(buffer, work, terms, limit, c, level, reference, close):
         steps += 1
         for i in range(BLOCK):
             terms[_S + i] = real(work[_SCALE + i] * work[_UNIT + i])
-            terms[_PRODUCT + i] = real(1.0)
-            work[_FACTOR + i] = 1.0
-        for i in range(BLOCK):
-            terms[_G + i] = real(0.0)
-            terms[_D + i] = real(0.0)
-            terms[_H + i] = real(0.0)
-            terms[_SUM + i] = real(0.0)
+        terms[_PRODUCT : _PRODUCT + BLOCK] = 1.0
+        work[_FACTOR : _FACTOR + BLOCK] = 1.0
+        terms[_G : _H + BLOCK] = 0.0
+        terms[_SUM : _SUM + BLOCK] = 0.0
         for j in range(n):
             galaxy, agn = limit[j], limit[n + j]
             top = real(level[j])
@@ -247,8 +244,7 @@ def limited_likelihoods(of_frac, lanes, limits, reference, scale_error, record, 
         for m in range(2 * n):
             for i in range(BLOCK):
                 lanes.limit32[m, i] = min(lanes.limit[m, i] / work[_UNIT + i], _LARGEST)
-    for i in range(at.W0, at.WR + BLOCK):
-        buffer[i] = 0.0
+    buffer[at.W0 : at.WR + BLOCK] = 0.0
     reached = 0.0
     record -= _ROUNDING if single else 0.0
     over = 0.0
@@ -279,8 +275,7 @@ def limited_likelihoods(of_frac, lanes, limits, reference, scale_error, record, 
             some += work[_ALIVE + i]
         warm = some > 0.0
         if not warm:
-            for i in range(BLOCK):
-                weight[i] = 0.0
+            weight[:] = 0.0
             continue
         if single:
             _best_scales(

@@ -54,9 +54,8 @@ def project(tables, target, pairs):
         if target.log_prior[z] < -1e200:
             continue
         p, norm = pairs.p32[z], pairs.inverse_norm[z]
-        for i in range(p.size):
-            p[i] = zero
-            norm[i] = zero
+        p[:] = 0.0
+        norm[:] = 0.0
         for j in range(target.bands.size):
             row = tables.galaxy32[z, target.bands[j]]
             s, d = target.root32[z, j], target.data32[z, j]
@@ -188,9 +187,7 @@ def _project_tori(agn, target, z, unit, of_torus):
 @njit(**PART)
 def _products(unit_galaxy, unit_agn, k, n_used, rows):
     """Fill rows[m * BLOCK + i] = <galaxy i, AGN model k + m> for GROUP AGN models (register blocking)."""
-    zero = np.float32(0)
-    for i in range(GROUP * BLOCK):
-        rows[i] = zero
+    rows[: GROUP * BLOCK] = 0.0
     t0, t1, t2, t3 = unit_agn[k], unit_agn[k + 1], unit_agn[k + 2], unit_agn[k + 3]
     # what is beyond the used bands is 0
     for j in range(0, n_used, 3):
@@ -276,18 +273,14 @@ def list_runs(tables, target, limits, pairs, delta, reference, position):
     blocks, plus the block. ``reference`` is R + 2 ln(prior) that some model reaches, pairs that are
     more than ``delta`` below it are left out.
 
-    Returned are the number of runs in the list, where to go on, and the reference, raised when a better
+    Returned are the number of runs in the list, where to resume, and the reference, raised when a better
     model is met.
     """
     n_z, n_blocks = tables.tiles.shape[0], tables.tiles.shape[1]
     n_agn = tables.agn.shape[1]
     rows, bands = pairs.rows, target.bands
-    # the largest prior a pair can have from AGN model and fraction
-    log_pair = tables.log_top_agn + tables.log_top_frac
     # `_products` takes three bands at a time
-    for j in range(bands.size, bands.size + 2):
-        for i in range(BLOCK):
-            pairs.unit_galaxy[j, i] = np.float32(0)
+    pairs.unit_galaxy[bands.size : bands.size + 2] = 0.0
     margin = 2.0
     n = np.int64(0)
     z_now = np.int64(-1)
@@ -304,7 +297,7 @@ def list_runs(tables, target, limits, pairs, delta, reference, position):
             agn_known = False
             _project_tori(tables.agn32[z], target, z, pairs.unit_agn, pairs.agn32)
         start, norm = block * BLOCK, target.norm[z]
-        lowest = reference - delta - target.log_prior[z] - log_pair
+        lowest = reference - delta - target.log_prior[z] - tables.log_top_pair
         log_usable = tables.log_usable[z, start : start + BLOCK]
         p32 = pairs.p32[z, start : start + BLOCK]
         inverse = pairs.inverse_norm[z, start : start + BLOCK]
@@ -319,7 +312,9 @@ def list_runs(tables, target, limits, pairs, delta, reference, position):
             usable = log_usable[i] > -1e200
             rows[_LEAST + i] = t if usable else _NEVER
             rows[_P + i] = p32[i] if usable else _NOWHERE
-            rows[_BASE + i] = max(log_usable[i] + (target.log_prior[z] + log_pair), -1e30)
+            rows[_BASE + i] = max(
+                log_usable[i] + (target.log_prior[z] + tables.log_top_pair), -1e30
+            )
         for j in range(bands.size):
             row = tables.galaxy32[z, bands[j], start : start + BLOCK]
             s32 = target.root32[z, j]

@@ -105,8 +105,7 @@ def single_likelihoods(of_frac, lanes, reference, scale_error, record):
     one = np.float32(1)
     c_0, c_1 = of_frac[at.RATIO, 0], of_frac[at.RATIO, -1]
     _prepare(buffer, light, c_0, c_1, reference, scale_error)
-    for i in range(_S0, _SZ + BLOCK):
-        light[i] = zero
+    light[_S0 : _SZ + BLOCK] = 0.0
     reached = 0.0
     n_dark = 0.0
     for i in range(BLOCK):

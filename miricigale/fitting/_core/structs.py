@@ -78,8 +78,7 @@ class Tables(NamedTuple):
     prior_zero: float  # its prior,
     log_zero: float  # 2 ln of it,
     edge_zero: float  # and c at the upper edge of its cell
-    log_top_agn: float  # largest 2 ln(prior) of an AGN model
-    log_top_frac: float  # and of a fraction above 0
+    log_top_pair: float  # largest 2 ln(prior) of an AGN model and a fraction above 0
     share_mean: float  # mean of the AGN models's share over the prior
 
 
@@ -145,7 +144,7 @@ class Histograms(NamedTuple):
 
 
 class Draws(NamedTuple):
-    """Models drawn while the sums go on."""
+    """Models drawn while weights are summed up."""
 
     next: np.ndarray  # (n_draws,): sum l at which a draw is replaced
     index: np.ndarray  # int64 (n_draws, 4)
@@ -175,8 +174,7 @@ class Sums(NamedTuple):
     total: np.ndarray  # (7,): sum l, l (s / sigma_s)^2, l of models with s = 0;
     #     sum l s^2 times galaxy's and AGN's part of the mixed quantity; l phi, l phi^2 with phi
     #     the other fraction; weight not yet in the histograms
-    best: np.ndarray  # (4,): R and s of the best model, R + 2 ln(prior) that has weight 1,
-    #     number of models
+    best: np.ndarray  # (3,): R and s of the best model, R + 2 ln(prior) that has weight 1
     index: np.ndarray  # int64 (4,): z, galaxy, agn, frac of the best model; -1 where none
     joint: Joint
     hist: Histograms

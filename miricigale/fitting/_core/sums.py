@@ -62,34 +62,28 @@ def find_best(tables, limits, lanes, sums, z, level):
 
 
 @njit(**PART)
+def _finish(flux, of_redshift, joint, z, total, band):
+    """Add the sums of galaxies or AGN models over one redshift to those over all, and begin anew."""
+    for i in range(flux.shape[0]):
+        if not of_redshift[0, i] > 0.0:
+            continue
+        if joint.size > 0:
+            joint[z, i] += of_redshift[0, i]
+        for b in range(band.shape[1]):
+            t = flux[i, b]
+            band[0, b] += of_redshift[1, i] * t
+            band[1, b] += of_redshift[2, i] * t * t
+        for m in range(3):
+            total[i, m] += of_redshift[m, i]
+            of_redshift[m, i] = 0.0
+
+
+@njit(**PART)
 def finish_redshift(tables, lanes, sums, z):
     """Add what was summed up over one redshift to the sums over all, and begin anew."""
-    galaxy_z, agn_z, band = lanes.galaxy_z, lanes.agn_z, sums.band
-    zg, zk, n_bands = sums.joint.zg, sums.joint.zk, band.shape[1]
-    for g in range(tables.galaxy.shape[1]):
-        if not galaxy_z[0, g] > 0.0:
-            continue
-        if zg.size > 0:
-            zg[z, g] += galaxy_z[0, g]
-        for b in range(n_bands):
-            t = tables.galaxy[z, g, b]
-            band[0, b] += galaxy_z[1, g] * t
-            band[1, b] += galaxy_z[2, g] * t * t
-        for m in range(3):
-            sums.galaxy[g, m] += galaxy_z[m, g]
-            galaxy_z[m, g] = 0.0
-    for k in range(agn_z.shape[1]):
-        if not agn_z[0, k] > 0.0:
-            continue
-        if zk.size > 0:
-            zk[z, k] += agn_z[0, k]
-        for b in range(n_bands):
-            t = tables.agn[z, k, b]
-            band[0, b] += agn_z[1, k] * t
-            band[1, b] += agn_z[2, k] * t * t
-        for m in range(3):
-            sums.agn[k, m] += agn_z[m, k]
-            agn_z[m, k] = 0.0
+    joint = sums.joint
+    _finish(tables.galaxy[z], lanes.galaxy_z, joint.zg, z, sums.galaxy, sums.band)
+    _finish(tables.agn[z], lanes.agn_z, joint.zk, z, sums.agn, sums.band)
 
 
 @njit(**PART)
@@ -109,20 +103,17 @@ def add_pairs(tables, lanes, sums, z, thin):
     total_zero = 0.0
     share_1 = 0.0
     share_2 = 0.0
-    n_alive = 0.0
     for i in range(BLOCK):
         weight += buffer[at.W0 + i]
         total_r += buffer[at.WR + i]
         total_zero += buffer[at.WZ + i]
         share_1 += buffer[at.F1 + i]
         share_2 += buffer[at.F2 + i]
-        n_alive += 1.0 if buffer[at.PRIOR + i] > -1e200 else 0.0
     total[0] += weight
     total[1] += total_r
     total[2] += total_zero
     total[4] += share_1
     total[5] += share_2
-    sums.best[3] += n_alive * frac_sum.size
     least = thin * total[0]
     total_cross = 0.0
     for i in range(BLOCK):

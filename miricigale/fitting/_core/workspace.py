@@ -47,7 +47,7 @@ def make_sums(n_z, n_galaxy, n_agn, n_frac, n_bands, n_draws=0, joint=()):
         flat=flat,
         joint=Joint(**{name: parts.pop(name) for name in JOINT}),
         **parts,
-        best=np.zeros(4),
+        best=np.zeros(3),
         index=np.full(4, -1),
         hist=Histograms(
             **hist,

@@ -7,17 +7,8 @@ from functools import partial
 
 import numpy as np
 
-from miricigale.utils.exceptions import unknown_name
 from miricigale.utils.optional import require
-
-__all__ = [
-    "CITATIONS",
-    "SAMPLERS",
-    "Draws",
-    "Lockstep",
-    "effective_size",
-    "get_sampler",
-]
+from miricigale.utils.options import check_names
 
 #: What to cite for them.
 CITATIONS = {
@@ -60,11 +51,6 @@ class Draws:
         return weight / weight.sum()
 
 
-def effective_size(weight):
-    """Kish's effective size of a weighted sample, (sum w)^2 / sum w^2."""
-    return float(np.sum(weight) ** 2 / np.sum(np.square(weight)))
-
-
 def _sample_nautilus(package, log_like, n_dim, rng, request):
     """Sample the unit cube; see `get_sampler`."""
     # one network finds bounds about as good as four, in a quarter of the time
@@ -102,7 +88,7 @@ def _sample_dynesty(package, log_like, n_dim, rng, request):
     lockstep = Lockstep(log_like, options["queue_size"])
     sampler = package.NestedSampler(
         lockstep.evaluate,
-        _itself,
+        np.asarray,
         n_dim,
         nlive=request.n_live,
         rstate=rng,
@@ -120,10 +106,6 @@ def _sample_dynesty(package, log_like, n_dim, rng, request):
         log_evidence_err=float(results.logzerr[-1]),
         converged=int(np.sum(results.ncall)) < request.max_calls,
     )
-
-
-def _itself(point):
-    return point
 
 
 class Lockstep:
@@ -239,6 +221,5 @@ def get_sampler(engine):
     """
     if callable(engine):
         return engine
-    if engine not in SAMPLERS:
-        raise unknown_name("engine", engine, SAMPLERS)
+    check_names([engine], "engine", SAMPLERS)
     return partial(SAMPLERS[engine], require(engine, extra="samplers"))

@@ -4,24 +4,27 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+from astropy.table import QTable
 
 from miricigale.filters import FilterSet
 from miricigale.fitting.likelihood import FitFlags
 from miricigale.fitting.posterior import cell_edges, check_pairs
 from miricigale.fitting.priors import GridAxis
-from miricigale.fitting.quantities import DERIVED_LEVELS
+from miricigale.fitting.quantities import DERIVED_LEVELS, plain
 from miricigale.fitting.results import FitResults
-from miricigale.fitting.samplers import CITATIONS
-from miricigale.fitting.samplers.run import ContinuousEngine, FluxModel, systematic_draws
-from miricigale.fitting.samplers.space import Space, prior_cells, redshift_axis
+from miricigale.fitting.samplers import CITATIONS, get_sampler
+from miricigale.fitting.samplers.run import Calls, FluxModel, positive_normal, systematic_draws
+from miricigale.fitting.samplers.space import Space, redshift_axis
+from miricigale.fitting.settings import SamplerSettings
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.parallel import single_threaded
 from miricigale.utils.random import stream
 from miricigale.utils.units import MASS
 
-_TRIALS = 64
-#: Numbers that each object has, whatever the model.
-_SINGLE = ("chi2", "log_evidence", "log_evidence_err", "n_calls", "n_effective", "converged")
+#: Draws from the prior of which every component has to be able to evaluate one, and of which at least one
+#: has to be possible for an object.
+_FEW_TRIALS, _TRIALS = 64, 2048
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,12 +32,21 @@ class SamplerFit:
     """
     How `~miricigale.fitting.BayesFitter` fits with a nested sampler; picklable.
 
-    ``redshift_given`` is whether the priors say something of the redshift.
+    ``bands`` are those that are evaluated, a set of filters or what the model takes for it, ``filters`` their
+    names; ``sampler`` is a name or function (see `get_sampler`), ``redshift_given`` whether the priors say
+    something of the redshift. With ``profile`` the mass of each model is the one that fits best, with its
+    Gaussian error if ``scale_error``, and no parameter.
     """
 
-    engine: ContinuousEngine
+    model: object
+    bands: object
+    filters: tuple
+    sampler: object
+    request: SamplerSettings
     space: Space
     redshift_given: bool
+    profile: bool
+    scale_error: bool
 
     #: Objects in a piece of the catalog.
     chunk_size = 1
@@ -49,27 +61,28 @@ class SamplerFit:
         predict = settings.predict
         names = tuple(n for some in (filters, predict) for n in getattr(some, "names", some))
         bands = FilterSet([*filters, *predict]) if isinstance(model, SEDModel) else names
-        engine = ContinuousEngine(
+        fit = cls(
             model=model,
-            filters=bands,
-            names=names,
+            bands=bands,
+            filters=names,
             sampler=sampler,
             request=settings,
+            space=Space.of_model(model, priors),
+            redshift_given="redshift" in priors,
             profile="mass" not in priors,
             scale_error=scale_error,
         )
-        fit = cls(engine, Space.of_model(model, priors), "redshift" in priors)
         fit._check_libraries()
         return fit
 
     def _check_libraries(self):
         """Refuse priors of which no draw can be evaluated by some component."""
-        if not isinstance(self.engine.model, SEDModel):
+        if not isinstance(self.model, SEDModel):
             return
-        points = np.random.default_rng(0).random((_TRIALS, self.space.n_dim))
+        points = np.random.default_rng(0).random((_FEW_TRIALS, self.space.n_dim))
         values = self.space.values(points)
-        rows = [{name: float(v[i]) for name, v in values.items()} for i in range(_TRIALS)]
-        for component in self.engine.model.components:
+        rows = [{name: float(v[i]) for name, v in values.items()} for i in range(_FEW_TRIALS)]
+        for component in self.model.components:
             if not component.refuses:
                 continue
             why = [component.invalid(row) for row in rows]
@@ -80,36 +93,30 @@ class SamplerFit:
                 raise argument_error(argument, wanted, f"none: {why[0]}")
 
     @property
-    def filters(self):
-        """Bands of the models."""
-        return self.engine.names
-
-    @property
-    def citations(self):
-        """What to cite for model and sampler."""
-        engine, known = self.engine.sampler, self.engine.model.meta.get("citations", ())
-        return (*known, *(CITATIONS.get(engine, ()) if isinstance(engine, str) else ()))
+    def priors(self):
+        """Prior of each free parameter by name."""
+        return self.space.free
 
     @property
     def content(self):
         """What makes a fit another one, besides `settings`: name to anything with a checksum."""
-        model, request = self.engine.model, self.engine.request
+        model, request = self.model, self.request
         recipe = model.recipe if isinstance(model, SEDModel) else type(model)
         return {"space": self.space, "model": recipe, "draws": (request.n_draws, request.n_cells)}
 
     @property
     def edge_weight(self):
         """Weight of the first or last cell of redshift above which an object is flagged."""
-        return max(0.01, 2.0 / self.engine.request.n_cells)
+        return max(0.01, 2.0 / self.request.n_cells)
 
     def settings(self):
         """Return the settings of the fit as plain values."""
-        request = self.engine.request
+        request = self.request
         fixed = self.space.fixed.items()
         return {
             "priors": {name: str(prior) for name, prior in self.space.free.items()},
-            "mass": "profile" if self.engine.profile else "parameter",
-            "scale_error": self.engine.scale_error,
+            "mass": "profile" if self.profile else "parameter",
+            "scale_error": self.scale_error,
             "n_live": request.n_live,
             "n_effective": request.n_effective,
             "max_calls": request.max_calls,
@@ -118,9 +125,10 @@ class SamplerFit:
         }
 
     def provenance(self):
-        """Return what results say of the model."""
-        known = self.engine.model.meta.items()
-        return {"model": {k: v for k, v in known if k != "citations"}}
+        """Return what results say of the model, and what to cite for it and the sampler."""
+        known = dict(self.model.meta)
+        cited = CITATIONS.get(self.sampler, ()) if isinstance(self.sampler, str) else ()
+        return {"citations": (*known.pop("citations", ()), *cited), "model": known}
 
     def check_data(self, data):
         """All data will do."""
@@ -131,103 +139,97 @@ class SamplerFit:
 
         See `~miricigale.fitting.grid_fit.GridFit.redshifts`.
         """
-        space = self.space
+        space, kind = self.space, "free" if "redshift" in self.space.free else "fixed"
         if redshift is not None:
             kind = "fixed"
             spaces = space.at_redshifts(self._limits, photometry, redshift, flags)
         elif redshift_prior is not None:
-            if "redshift" in space.fixed and self.redshift_given:
+            if kind == "fixed" and self.redshift_given:
                 raise argument_error("redshift_prior", "None where 'priors' fix it", "densities")
             kind = "prior"
             spaces = space.with_densities(self._limits, redshift_prior, flags)
-        elif not self.redshift_given:
+        elif self.redshift_given:
+            spaces = [space] * len(flags)
+        else:
             msg = "'priors' must have 'redshift', or 'redshift' or 'redshift_prior' be given"
             raise ValueError(msg)
-        else:
-            kind = "free" if "redshift" in space.free else "fixed"
-            spaces = [space] * len(flags)
         if any(one.n_dim == 0 for one in spaces):
             raise argument_error("priors", "at least one free parameter", "none")
-        n_free = max((one.n_dim for one in spaces), default=0) + self.engine.profile
+        n_free = max((one.n_dim for one in spaces), default=0) + self.profile
         return spaces, n_free, kind
 
     @property
     def _limits(self):
         """Least and largest redshift."""
-        return self.space.redshift_limits or self.engine.model.parameters["redshift"].bounds
+        prior = self.space.free.get("redshift", self.model.parameters["redshift"])
+        return prior.bounds
 
     # ------------------------------------------------------------------------- fit
 
     def task(self, pairs, seed, spaces):
         """Function that fits a piece of the catalog; every object has its own random stream."""
         axes = self._axes(spaces)
-        parameters = self.engine.model.parameters
+        parameters = self.model.parameters
         constant = [name for name in parameters if name not in axes and name != "mass"]
         wanted = "of free parameters but mass ('samples' of the results has draws of all)"
-        pairs = check_pairs(pairs, axes, constant, ("mass", *self.engine.columns), wanted)
+        pairs = check_pairs(pairs, axes, constant, ("mass", *self.columns), wanted)
         return partial(self._fit_piece, axes, pairs, seed)
 
     def _axes(self, spaces):
         """Cells of all parameters that are free for some object, and of redshift."""
-        model = self.engine.model
+        model, n_cells = self.model, self.request.n_cells
         agn = model.component("agn") if isinstance(model, SEDModel) else None
-        of_agn = () if agn is None else tuple(agn.parameters)
+        kinds = {} if agn is None else dict.fromkeys(agn.parameters, "agn")
+        kinds |= {"redshift": "redshift", "frac_agn": "frac_agn"}
         axes = {}
-        for name in ("redshift", *self.space.free):
-            if name == "mass" or name in axes:
+        for name in dict.fromkeys(("redshift", *self.space.free)):
+            if name == "mass":
                 continue
             if name == "redshift":
-                nodes, weights, bounds = redshift_axis(
-                    spaces, self._limits, self.engine.request.n_cells
-                )
+                unit, cells = 1, redshift_axis(spaces, self._limits, n_cells)
             else:
-                nodes, weights, bounds = prior_cells(
-                    self.space.free[name], self.engine.request.n_cells
-                )
-            kind = "agn" if name in of_agn else "galaxy"
-            kind = name if name in ("redshift", "frac_agn") else kind
-            unit = 1 if name == "redshift" else model.parameters[name].unit
+                unit, cells = model.parameters[name].unit, self.space.free[name].cells(n_cells)
+            nodes, weights, bounds = cells
+            kind = kinds.get(name, "galaxy")
             axes[name] = GridAxis(name, nodes, unit, kind, weights, None, bounds)
         return axes
 
     def _fit_piece(self, axes, pairs, seed, piece):
         """`FitResults` of a piece: its photometry, parameters and priors."""
         data, spaces = piece
-        flags, n = np.array(data.flags), len(data)
-        columns = self.engine.columns
+        flags, n, columns = np.array(data.flags), len(data), self.columns
         quantities = ("mass", *columns)
         size = {name: axis.values.size for name, axis in axes.items()}
-        n_levels, n_bands = len(DERIVED_LEVELS), len(self.filters)
+        n_axes, n_derived, n_levels = len(axes), len(quantities), len(DERIVED_LEVELS)
         shapes = {
             "pdf_2d": (size["redshift"], size.get("frac_agn", 1)),
-            "axis_moments": (len(axes), 2),
-            "axis_quantiles": (len(axes), n_levels),
-            "moments": (len(quantities), 3),
-            "quantiles": (len(quantities), n_levels),
-            "draws": (self.engine.request.n_draws, len(axes) + len(quantities)),
-            **dict.fromkeys(("model_flux", "model_flux_std", "best_flux"), (n_bands,)),
-            **dict.fromkeys(_SINGLE, ()),
+            "axis_moments": (n_axes, 2),
+            "axis_quantiles": (n_axes, n_levels),
+            "moments": (n_derived, 3),
+            "quantiles": (n_derived, n_levels),
+            "draws": (self.request.n_draws, n_axes + n_derived),
+            **dict.fromkeys(("model_flux", "model_flux_std", "best_flux"), (len(self.filters),)),
+            **dict.fromkeys(("chi2", "log_evidence", "log_evidence_err", "n_effective"), ()),
         }
         out = {name: np.full((n, *shape), np.nan) for name, shape in shapes.items()}
         out |= {
+            "n_calls": np.zeros(n, np.int64),
+            "converged": np.zeros(n, bool),
             "pdf": {name: np.full((n, size[name]), np.nan) for name in axes},
             "pairs": {(x, y): np.full((n, size[x], size[y]), np.nan) for x, y in pairs},
             "best": {name: np.full(n, np.nan) for name in (*axes, *quantities)},
         }
         for row in np.flatnonzero((flags & int(FitFlags.UNFITTED)) == 0):
-            found = self.engine.fit(data._take(row), spaces[row], seed)
+            found = self._sample(data._take(row), spaces[row], seed, axes, pairs)
             if found is None:
                 flags[row] |= int(FitFlags.NO_MODEL)
                 continue
-            draw = stream(seed, "draws", str(data.ids[row]))
-            for name, value in self._reduce(found, spaces[row].fixed, axes, pairs, draw).items():
+            for name, value in found.items():
                 if isinstance(value, dict):
                     for key, array in out[name].items():
                         array[row] = value[key]
                 else:
                     out[name][row] = value
-        out["n_calls"] = np.nan_to_num(out["n_calls"]).astype(np.int64)
-        out["converged"] = np.nan_to_num(out["converged"]).astype(bool)
         return FitResults(
             **data.columns,
             flags=flags,
@@ -243,51 +245,123 @@ class SamplerFit:
             **out,
         )
 
-    def _reduce(self, found, fixed, axes, pairs, rng):
-        """What results hold of a weighted sample, by their names."""
-        weight, values, best = found.weight, dict(found.parameters), dict(found.best)
-        for name in axes:
-            if name not in values:
-                values[name] = np.full(weight.size, fixed[name])
-                best[name] = fixed[name]
+    # ------------------------------------------------------------------ one object
+
+    @property
+    def columns(self):
+        """Derived quantities: `~miricigale.sed.Derived` by name."""
+        columns = dict(self.model.derived_columns())
+        # the parameter mass, by another name
+        columns.pop("stellar_mass_formed", None)
+        return columns
+
+    def models(self, values, mass=None):
+        """
+        Fluxes in uJy (m, n_bands), NaN where a model is not possible, and derived quantities by name.
+
+        ``values`` has all parameters but mass by name, each of shape (m,); ``mass`` is in solar masses
+        formed, 1 by default.
+        """
+        n = len(next(iter(values.values())))
+        table = QTable(values | {"mass": np.ones(n) if mass is None else mass}, copy=False)
+        got = self.model.fluxes(table, self.bands)
+        flux = np.column_stack([got[name].value for name in self.filters])
+        return flux, {name: plain(got[name]) for name in self.columns}
+
+    def _sample(self, data, space, seed, axes, pairs):
+        """What results hold of the posterior of one object, by name; None if its prior leaves no model."""
+        key = str(data.ids)
+        with single_threaded():
+            calls, rng = Calls(self, data, space), stream(seed, "fit", "prior", key)
+            trials = (calls(rng.random((256, space.n_dim)))[0] for _ in range(_TRIALS // 256))
+            if not any(np.isfinite(log_like).any() for log_like in trials):
+                return None
+            calls, rng = Calls(self, data, space), stream(seed, "fit", key)
+            sampled = get_sampler(self.sampler)(calls, space.n_dim, rng, self.request)
+            keep = sampled.weight > 0
+            weight, call = sampled.weight[keep], np.asarray(sampled.call)[keep]
+            # Kish's
+            n_effective = np.sum(weight) ** 2 / np.sum(np.square(weight))
+            weight = weight / weight.sum()
+            # the best of all models that were met, whether or not they are part of the sample
+            best = [int(np.argmin(calls.of("chi2", slice(None))))]
+            scale, best_scale = calls.of("scale", call), calls.of("scale", best)
+            if self.profile and self.scale_error:
+                std = np.sqrt(calls.of("variance", call))
+                scale = positive_normal(scale, std, stream(seed, "scale", key))
+            values = {
+                name: np.full(len(call), value)
+                for name, value in space.fixed.items()
+                if name in axes
+            }
+            values |= calls.of("parameters", call)
+            of_best = {name: np.array([array[0]]) for name, array in values.items()}
+            of_best |= calls.of("parameters", best)
+            derived = self._scaled(calls.of("derived", call), values, scale, space.fixed)
+            of_best |= self._scaled(calls.of("derived", best), of_best, best_scale, space.fixed)
+        rng = stream(seed, "draws", key)
+        flux = calls.of("flux", call) * scale[:, None]
+        return {
+            "chi2": calls.of("chi2", best)[0],
+            "log_evidence": sampled.log_evidence,
+            "log_evidence_err": sampled.log_evidence_err,
+            "n_calls": calls.n,
+            "n_effective": n_effective,
+            "converged": sampled.converged,
+            "best": {name: array[0] for name, array in of_best.items()},
+            "best_flux": calls.of("flux", best)[0] * best_scale[0],
+            **self._reduced(weight, values, derived, flux, axes, pairs, rng),
+        }
+
+    def _scaled(self, derived, parameters, scale, fixed):
+        """Derived quantities of models of given masses, from those for one solar mass."""
+        columns = self.columns
+        out = {"mass": scale}
+        out |= {
+            name: array * scale if columns[name].extensive else array
+            for name, array in derived.items()
+        }
+        other = [name for name, column in columns.items() if column.of == "xray"]
+        if other:
+            # these are not proportional to mass
+            rest = {n: np.full(scale.size, v) for n, v in fixed.items() if n != "mass"}
+            got = self.models(rest | parameters, scale)[1]
+            out |= {name: got[name] for name in other}
+        return out
+
+    def _reduced(self, weight, values, derived, flux, axes, pairs, rng):
+        """What results hold of a weighted sample, by name."""
         size = {name: axis.values.size for name, axis in axes.items()}
         cells = {name: _cell(axis, values[name]) for name, axis in axes.items()}
         # one cell of the AGN fraction where it is no axis
         cells.setdefault("frac_agn", np.zeros(weight.size, dtype=np.int64))
-        n_f = size.setdefault("frac_agn", 1)
+        size.setdefault("frac_agn", 1)
 
         def joint(x, y):
             place = cells[x] * size[y] + cells[y]
             sums = np.bincount(place, weight, minlength=size[x] * size[y])
             return sums.reshape(size[x], size[y])
 
-        axis_parts = [_summary(values[name], weight) for name in axes]
-        parts = [_summary(array, weight) for array in found.derived.values()]
-        columns = [values[name] for name in axes] + list(found.derived.values())
-        mean, n_draws = weight @ found.flux, self.engine.request.n_draws
+        columns = [values[name] for name in axes] + list(derived.values())
+        parts = [_summary(array, weight) for array in columns]
+        n_axes, mean, n_draws = len(axes), weight @ flux, self.request.n_draws
+        drawn = rng.permutation(systematic_draws(weight, n_draws, rng))
         return {
             "pdf": {n: np.bincount(cells[n], weight, minlength=size[n]) for n in axes},
-            "pdf_2d": joint("redshift", "frac_agn").reshape(-1, n_f),
+            "pdf_2d": joint("redshift", "frac_agn"),
             "pairs": {(x, y): joint(x, y) for x, y in pairs},
-            "axis_moments": [part[0][:2] for part in axis_parts],
-            "axis_quantiles": [part[1] for part in axis_parts],
-            "moments": [part[0] for part in parts],
-            "quantiles": [part[1] for part in parts],
-            "draws": np.column_stack(columns)[
-                rng.permutation(systematic_draws(weight, n_draws, rng))
-            ],
+            "axis_moments": [moments[:2] for moments, _ in parts[:n_axes]],
+            "axis_quantiles": [quantiles for _, quantiles in parts[:n_axes]],
+            "moments": [moments for moments, _ in parts[n_axes:]],
+            "quantiles": [quantiles for _, quantiles in parts[n_axes:]],
+            "draws": np.column_stack(columns)[drawn],
             "model_flux": mean,
-            "model_flux_std": np.sqrt(weight @ np.square(found.flux - mean)),
-            "best": best,
-            "best_flux": found.best_flux,
-            **{name: getattr(found, name) for name in _SINGLE},
+            "model_flux_std": np.sqrt(weight @ np.square(flux - mean)),
         }
 
 
 def _cell(axis, values):
     """Cell of an axis in which each value lies; the outermost take what is beyond."""
-    if axis.values.size == 1:
-        return np.zeros(values.size, dtype=np.int64)
     edges = cell_edges(axis.values, axis.bounds)
     return np.searchsorted(edges[1:-1], values, side="right")
 
@@ -295,9 +369,8 @@ def _cell(axis, values):
 def _summary(values, weight):
     """Mean, standard deviation and mean of log10, and quantiles, of a weighted sample."""
     good = np.isfinite(values)
-    levels = np.asarray(DERIVED_LEVELS)
     if not good.any():
-        return np.full(3, np.nan), np.full(levels.size, np.nan)
+        return np.full(3, np.nan), np.full(DERIVED_LEVELS.size, np.nan)
     values, weight = values[good], weight[good] / weight[good].sum()
     mean = weight @ values
     std = np.sqrt(weight @ np.square(values - mean))
@@ -307,4 +380,4 @@ def _summary(values, weight):
         log_mean = weight[positive] @ np.log10(values[positive]) / weight[positive].sum()
     order = np.argsort(values, kind="stable")
     middle = np.cumsum(weight[order]) - 0.5 * weight[order]
-    return np.array([mean, std, log_mean]), np.interp(levels, middle, values[order])
+    return np.array([mean, std, log_mean]), np.interp(DERIVED_LEVELS, middle, values[order])

@@ -1,13 +1,15 @@
 """Priors of continuous parameters: from the unit cube to values."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from miricigale.fitting.likelihood import FitFlags
 from miricigale.fitting.posterior import cell_edges
 from miricigale.fitting.priors import integrals, integrals_to, known_redshifts, read_density
-from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_names
 
 #: Part of a prior without limits that may lie outside the cells of its axis.
 _TAIL = 1e-3
@@ -28,14 +30,20 @@ class Flat:
         """Cumulative prior."""
         return np.clip((value - self.low) / (self.high - self.low), 0.0, 1.0)
 
-    def nodes(self, n):
-        """Middles of n cells."""
-        return self.transform((np.arange(n) + 0.5) / n)
-
     @property
     def bounds(self):
         """Limits of the outermost cells."""
         return (self.low, self.high)
+
+    def nodes(self, n):
+        """Middles of n cells."""
+        return self.transform((np.arange(n) + 0.5) / n)
+
+    def cells(self, n):
+        """Nodes of n cells (or the prior's own values), their weights, and the limits of the outermost."""
+        nodes, bounds = self.nodes(n), self.bounds
+        total = self.cdf(cell_edges(nodes, bounds)[1:-1])
+        return nodes, np.diff(np.concatenate([[0.0], total, [1.0]])), bounds
 
     def __str__(self):
         return f"flat from {self.low:g} to {self.high:g}"
@@ -69,17 +77,24 @@ class Choice:
         place = np.searchsorted(np.cumsum(self.weights), unit, side="right")
         return self.values[np.minimum(place, self.values.size - 1)]
 
+    @property
+    def bounds(self):
+        """The first and the last value."""
+        return (self.values[0], self.values[-1])
+
+    def cells(self, n):
+        """The values, whatever n, their weights and limits: as of `Flat`."""
+        return self.values, self.weights, (-np.inf, np.inf)
+
     def __str__(self):
         return f"one of {', '.join(f'{v:g}' for v in self.values)}"
 
 
 @dataclass(frozen=True, eq=False)
-class Continuous:
+class Continuous(Flat):
     """A distribution of `scipy.stats`, cut to ``low`` and ``high``."""
 
     law: object
-    low: float
-    high: float
 
     @property
     def _ends(self):
@@ -100,8 +115,6 @@ class Continuous:
         low, high = self.transform(np.array([_TAIL, 1.0 - _TAIL]))
         return (Log if 0 < 30 * low < high else Flat)(low, high).nodes(n)
 
-    bounds = Flat.bounds
-
     def __str__(self):
         law = getattr(getattr(self.law, "dist", None), "name", type(self.law).__name__)
         return f"{law} of mean {self.law.mean():g}, std {self.law.std():g}"
@@ -113,10 +126,21 @@ class Table:
 
     value: np.ndarray
     density: np.ndarray
-    _total: np.ndarray = field(init=False, repr=False)
 
-    def __post_init__(self):
-        object.__setattr__(self, "_total", integrals(self.value, self.density))
+    @cached_property
+    def _total(self):
+        return integrals(self.value, self.density)
+
+    @property
+    def bounds(self):
+        """The first and the last node."""
+        return (self.value[0], self.value[-1])
+
+    def nodes(self, n):
+        """Middles of n equal cells."""
+        return Flat(*self.bounds).nodes(n)
+
+    cells = Flat.cells
 
     @property
     def area(self):
@@ -167,7 +191,7 @@ def make_prior(name, prior, parameter):
             raise argument_error(argument, wanted, repr(prior))
         return _interval(argument, *parameter.bounds, prior)
     if hasattr(prior, "ppf") and hasattr(prior, "cdf"):
-        law = Continuous(prior, *parameter.bounds)
+        law = Continuous(*parameter.bounds, prior)
         first, last = law._ends
         if not last - first > 0:
             text = f"with weight from {law.low} to {law.high}"
@@ -234,9 +258,7 @@ class Space:
     def of_model(cls, model, priors):
         """Take the priors of the parameters of a model; parameters without are at their defaults."""
         declared = model.parameters
-        for name in priors:
-            if name not in declared:
-                raise unknown_name("parameter", name, declared)
+        check_names(priors, "parameter", declared)
         made = {name: make_prior(name, priors[name], declared[name]) for name in priors}
         free = {name: made[name] for name in declared if not _number(made.get(name, 0.0))}
         fixed = {
@@ -258,21 +280,12 @@ class Space:
         """Number of free parameters."""
         return len(self.free)
 
-    @property
-    def redshift_limits(self):
-        """Least and largest redshift of the prior; None where it has none."""
-        prior = self.free.get("redshift")
-        if prior is None:
-            return None
-        return (prior.values[0], prior.values[-1]) if isinstance(prior, Choice) else prior.bounds
-
     def at_redshifts(self, limits, photometry, redshift, flags):
         """Copies with the redshift of every object, within ``limits``; what cannot be used is flagged."""
         values = known_redshifts(photometry, redshift)
         missing = np.isnan(values)
         low, high = limits
-        with np.errstate(invalid="ignore"):
-            outside = ~missing & ~((values >= low) & (values <= high))
+        outside = ~missing & ~((values >= low) & (values <= high))
         flags[missing] |= int(FitFlags.NO_REDSHIFT)
         flags[outside] |= int(FitFlags.REDSHIFT_OUTSIDE)
         good = np.where(missing | outside, 0.5 * (low + high), values)
@@ -302,23 +315,9 @@ class Space:
         return out
 
 
-def prior_cells(prior, n):
-    """Nodes of n cells (or the prior's own values), their weights, and the limits of the outermost."""
-    if isinstance(prior, Choice):
-        return prior.values, prior.weights, (-np.inf, np.inf)
-    if isinstance(prior, Table):
-        flat = Flat(prior.value[0], prior.value[-1])
-        nodes, bounds = flat.nodes(n), flat.bounds
-    else:
-        nodes, bounds = prior.nodes(n), prior.bounds
-    edges = cell_edges(nodes, bounds)
-    total = prior.cdf(edges[1:-1])
-    return nodes, np.diff(np.concatenate([[0.0], total, [1.0]])), bounds
-
-
 def redshift_axis(spaces, limits, n):
     """
-    Cells of redshift (`prior_cells`) for objects that may have a prior, or a redshift, of their own.
+    Cells of redshift (see `Flat.cells`) for objects that may have a prior, or a redshift, of their own.
 
     The weights are the mean prior of the objects.
     """
@@ -327,14 +326,14 @@ def redshift_axis(spaces, limits, n):
         values = [space.fixed["redshift"] for space in spaces] or [0.0]
         low, high = min(values), max(values)
         if high > low:
-            return prior_cells(Flat(low, high), n)
+            return Flat(low, high).cells(n)
         return np.array([low]), np.ones(1), (low, low)
     if all(prior is free[0] for prior in free):
-        return prior_cells(free[0], n)
+        return free[0].cells(n)
     tables = [prior for prior in free if isinstance(prior, Table)]
     if tables:
-        limits = min(p.value[0] for p in tables), max(p.value[-1] for p in tables)
-    nodes, _, bounds = prior_cells(Flat(*limits), n)
+        limits = min(p.bounds[0] for p in tables), max(p.bounds[1] for p in tables)
+    nodes, _, bounds = Flat(*limits).cells(n)
     edges = cell_edges(nodes, bounds)
     cdf = np.mean([p.cdf(edges) for p in tables] or [edges], axis=0)
     return nodes, np.diff(cdf) / (cdf[-1] - cdf[0]), bounds
