@@ -364,7 +364,7 @@ def _median_of(images, wcs, weights, pixel_maps):
     """
     Median and number of images on each pixel of a grid, each image drizzled alone.
 
-    Each is kept where it lies and some rows are looked at together, for a field of many pointings
+    Each is kept where it lies and the rows are taken in strips, for a field of many pointings
     has many images, few of which overlap.
     """
     shape = wcs.pixel_shape[::-1]
