@@ -78,7 +78,7 @@ def observe(exp, light, *, seed):
     unit = noise.sky / noise.background.value
     more = np.clip(light - noise.background.value, 0, None) * unit
     sigma = (np.sqrt(noise.variance() + noise.growth * more) / unit).astype(np.float32)
-    inside = field_mask(light.shape, subarray=exp.subarray)
+    inside = field_mask(subarray=exp.subarray)
     mask = ~inside if inside.any() else np.zeros_like(inside)
     data = light + np.random.default_rng(seed).normal(size=light.shape) * sigma
     return CCDData(

@@ -84,10 +84,9 @@ class Charge:
             level += bias.mean(self.properties)
         if (anomaly := self._effect(ResetAnomaly)) is not None:
             level += anomaly.offsets(*shape)
-        if (first := self._effect(FirstFrame)) is not None:
-            level[:, 0] += first.offset
-        if (last := self._effect(LastFrame)) is not None:
-            level[:, -1] += last.offset
+        for kind, group in ((FirstFrame, 0), (LastFrame, -1)):
+            if (effect := self._effect(kind)) is not None:
+                level[:, group] += effect.offset
         return level.mean(axis=0)
 
     def measured(self, electrons):

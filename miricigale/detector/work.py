@@ -6,28 +6,14 @@ import numpy as np
 
 from miricigale.detector._core.charge import add_poisson
 from miricigale.detector.effects.base import Block, WholeBlock
-from miricigale.detector.effects.charge import (
-    BadPixels,
-    CosmicRays,
-    Dark,
-    InterpixelCapacitance,
-    Persistence,
-    ReferencePixels,
-)
-from miricigale.detector.effects.light import Photons, Residual
+from miricigale.detector.effects.charge import CosmicRays, Dark, Saturation
+from miricigale.detector.effects.light import Photons
+from miricigale.detector.effects.order import ORDER
 from miricigale.instrument import DetectorProperties, Exposure
 from miricigale.utils.parallel import chunks, parallel_map, threads
 
 #: What makes the charge of a pixel, whenever it comes within the exposure; cosmic rays apart.
-_COLLECTING = (
-    Residual,
-    Photons,
-    Dark,
-    InterpixelCapacitance,
-    Persistence,
-    BadPixels,
-    ReferencePixels,
-)
+_COLLECTING = tuple(kind for kind in ORDER[: ORDER.index(Saturation)] if kind is not CosmicRays)
 
 # rows whose charge is collected at once
 _ROWS = 128

@@ -7,8 +7,9 @@ import numpy as np
 from numpy.polynomial import polynomial as poly
 
 from miricigale.instrument.figures import filter_row, table
-from miricigale.instrument.siaf import aperture, imager_columns, shape_aperture
+from miricigale.instrument.siaf import aperture, imager_columns
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_least, check_positive
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.units import frozen_array
 
@@ -68,11 +69,9 @@ class DetectorProperties:
 
     def __post_init__(self):
         for name in ("gain", "full_well", "pixel_pitch", "adc_bits"):
-            if not getattr(self, name) > 0:
-                raise argument_error(name, "positive", getattr(self, name))
+            check_positive(getattr(self, name), name)
         for name in ("read_noise", "dark_current", "bias", "cosmic_ray_flux", "reference_columns"):
-            if not getattr(self, name) >= 0:
-                raise argument_error(name, "at least 0", getattr(self, name))
+            check_least(getattr(self, name), name, 0)
         coefficients = tuple(float(c) for c in self.nonlinearity)
         object.__setattr__(self, "nonlinearity", coefficients)
         object.__setattr__(self, "ipc", tuple(float(c) for c in self.ipc))
@@ -167,17 +166,6 @@ def miri_detector():
     return DetectorProperties(**table()["detector"])
 
 
-def _cut(full, shape, subarray):
-    """Cut a full-frame map to a sub-array, or its first rows and columns for another shape."""
-    part = shape_aperture(shape, subarray)
-    if part is not None:
-        return full[part.slices]
-    ny, nx = (int(n) for n in shape)
-    if not (0 < ny <= full.shape[0] and 0 < nx <= full.shape[1]):
-        raise argument_error("shape", f"at most {full.shape}", shape)
-    return full[:ny, :nx]
-
-
 @functools.lru_cache(maxsize=2)
 def _flat_pixels(seed):
     return stream(seed, "flat", "pixels").standard_normal(aperture("FULL").shape, np.float32)
@@ -202,7 +190,7 @@ def _full_flat(filter, seed):
     return frozen_array(flat, np.float32)
 
 
-def flat_field(filter, shape=None, *, subarray=None, seed=_SEED):
+def flat_field(filter, *, subarray="FULL", seed=_SEED):
     """
     Relative response of the pixels: the same for the simulated detector and the reduction.
 
@@ -210,11 +198,8 @@ def flat_field(filter, shape=None, *, subarray=None, seed=_SEED):
     ----------
     filter : str
         One of `~miricigale.instrument.imager_filters`.
-    shape : tuple of int, optional
-        ``(ny, nx)`` of a sub-array; any other shape means the first rows and columns of
-        the full frame, which is the default.
     subarray : str, optional
-        Name of the sub-array.
+        One of `~miricigale.instrument.subarrays`.
     seed : int, optional
         Seed of another realization, of another detector of the kind.
 
@@ -226,7 +211,7 @@ def flat_field(filter, shape=None, *, subarray=None, seed=_SEED):
         drawn once, and no measurement.
     """
     filter_row(filter)
-    return _cut(_full_flat(str(filter), check_seed(seed)), shape, subarray)
+    return _full_flat(str(filter), check_seed(seed))[aperture(subarray).slices]
 
 
 @functools.cache
@@ -243,25 +228,25 @@ def _full_bad_pixels():
     return frozen_array(mask, bool)
 
 
-def bad_pixel_mask(shape=None, *, subarray=None):
+def bad_pixel_mask(*, subarray="FULL"):
     """
     Pixels that never work, about 0.1 %.
 
-    Parameters are those of `flat_field` without the filter.
+    ``subarray`` is as for `flat_field`.
 
     Returns
     -------
     mask : `~numpy.ndarray` of bool, shape (ny, nx)
         True where bad. Read-only, and always the same; reference pixels are not bad.
     """
-    return _cut(_full_bad_pixels(), shape, subarray)
+    return _full_bad_pixels()[aperture(subarray).slices]
 
 
-def reference_pixel_mask(shape=None, *, subarray=None):
+def reference_pixel_mask(*, subarray="FULL"):
     """
     Pixels that see no light: four columns on each side of the full frame.
 
-    Parameters are those of `flat_field` without the filter.
+    ``subarray`` is as for `flat_field`.
 
     Returns
     -------
@@ -270,17 +255,17 @@ def reference_pixel_mask(shape=None, *, subarray=None):
     mask = np.zeros(aperture("FULL").shape, dtype=bool)
     n = miri_detector().reference_columns
     mask[:, :n] = mask[:, -n:] = True
-    return _cut(mask, shape, subarray)
+    return mask[aperture(subarray).slices]
 
 
-def field_mask(shape=None, *, subarray=None):
+def field_mask(*, subarray="FULL"):
     """
     Pixels that see the sky through the imaging filters.
 
     The others lie behind the masks of the coronagraphs (or are reference pixels). This
     is the rectangle of the aperture MIRIM_ILLUM.
 
-    Parameters are those of `flat_field` without the filter.
+    ``subarray`` is as for `flat_field`.
 
     Returns
     -------
@@ -289,4 +274,4 @@ def field_mask(shape=None, *, subarray=None):
     """
     mask = np.zeros(aperture("FULL").shape, dtype=bool)
     mask[:, slice(*imager_columns())] = True
-    return _cut(mask, shape, subarray)
+    return mask[aperture(subarray).slices]

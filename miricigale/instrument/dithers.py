@@ -98,7 +98,7 @@ def dither_offsets(pattern, n=None, *, start=0):
         How many; all of the pattern's by default. Named patterns start again, shifted by a
         quarter pixel, when they are used up.
     start : int, optional
-        Which of the pattern's points comes first, from 0, as cycling patterns go on from tile to
+        Which of the pattern's points comes first, from 0, as cycling patterns continue from tile to
         tile.
 
     Returns

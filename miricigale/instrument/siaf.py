@@ -12,7 +12,7 @@ import functools
 import numpy as np
 
 from miricigale.instrument.figures import table
-from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.exceptions import unknown_name
 
 _ARCSEC = np.pi / 180 / 3600
 
@@ -191,6 +191,12 @@ def unit_vector(longitude, latitude):
     return np.stack([cos * np.cos(longitude), cos * np.sin(longitude), np.sin(latitude)])
 
 
+def vector_angles(vector):
+    """Longitude and latitude (rad) of vectors, the three components first."""
+    x, y, z = vector
+    return np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
+
+
 def v2v3_to_sky(v2, v3, matrix):
     """
     Sky positions of telescope coordinates.
@@ -209,21 +215,5 @@ def v2v3_to_sky(v2, v3, matrix):
     """
     vector = unit_vector(np.asarray(v2) * _ARCSEC, np.asarray(v3) * _ARCSEC)
     vector = np.tensordot(matrix, vector, axes=1)
-    ra = np.degrees(np.arctan2(vector[1], vector[0])) % 360
-    dec = np.degrees(np.arctan2(vector[2], np.hypot(vector[0], vector[1])))
-    return ra, dec
-
-
-def shape_aperture(shape, subarray):
-    """The aperture named, or the one that ``shape`` stands for, or None for a shape of none."""
-    if subarray is not None:
-        found = aperture(subarray)
-        if shape is not None and tuple(shape) != found.shape:
-            raise argument_error("shape", f"{found.shape} for {subarray!r}", tuple(shape))
-        return found
-    if shape is None:
-        return aperture("FULL")
-    for name in subarrays():
-        if aperture(name).shape == tuple(shape):
-            return aperture(name)
-    return None
+    ra, dec = vector_angles(vector)
+    return np.degrees(ra) % 360, np.degrees(dec)

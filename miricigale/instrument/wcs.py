@@ -12,6 +12,7 @@ from miricigale.instrument.siaf import (
     pixel_to_v2v3,
     unit_vector,
     v2v3_to_sky,
+    vector_angles,
 )
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import positive, to_array
@@ -192,11 +193,7 @@ def tangent_offset(pointing, x_offset, y_offset, pa):
     to_east = np.array([-np.sin(ra), np.cos(ra), 0.0])
     to_north = np.cross(radial, to_east)
     vector = radial + np.multiply.outer(east, to_east) + np.multiply.outer(north, to_north)
-    return SkyCoord(
-        np.arctan2(vector[..., 1], vector[..., 0]),
-        np.arctan2(vector[..., 2], np.hypot(vector[..., 0], vector[..., 1])),
-        unit="rad",
-    )
+    return SkyCoord(*vector_angles(np.moveaxis(vector, -1, 0)), unit="rad")
 
 
 def pixel_area_map(wcs, shape, out=None):
@@ -319,9 +316,7 @@ def mosaic_wcs(exposures, pixel_scale):
         dec.append(world[1])
     ra, dec = np.concatenate(ra), np.concatenate(dec)
     mean = unit_vector(np.radians(ra), np.radians(dec)).mean(axis=1)
-    start = SkyCoord(
-        np.arctan2(mean[1], mean[0]), np.arctan2(mean[2], np.hypot(mean[0], mean[1])), unit="rad"
-    )
+    start = SkyCoord(*vector_angles(mean), unit="rad")
     # twice: the second time about the middle of the box that the first found
     for _ in range(2):
         grid = north_up_wcs(start, pixel_scale, (1, 1))

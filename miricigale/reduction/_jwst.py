@@ -68,7 +68,7 @@ def fit_steps(reducer, ramp, maps, *, reset, skipped):
     steps = [(SaturationStep, {}, {"saturation": models.saturation(), "superbias": "N/A"})]
     if maps.reset is not None or np.any(reset):
         steps.append((ResetStep, {}, {"reset": models.reset(reset)}))
-    if _bends(maps):
+    if len(maps.linearity) > 2 or np.any(np.asarray(maps.linearity)[0] != 0):
         steps.append((LinearityStep, {}, {"linearity": models.linearity()}))
     if maps.dark is not None:
         steps.append((DarkCurrentStep, {}, {"dark": models.dark()}))
@@ -108,10 +108,6 @@ def _run(kind, model, options, references):
     for name, value in references.items():
         setattr(step, f"override_{name}", value)
     return step.process(model)
-
-
-def _bends(maps):
-    return len(maps.linearity) > 2 or np.any(np.asarray(maps.linearity)[0] != 0)
 
 
 def _result(planes, flags, groups, first, last):

@@ -204,15 +204,14 @@ def _aligned(image, x, y, catalog, radius, argument):
             wanted = f"one with at least {_LEAST} sources of the catalog within {radius:g} arcsec"
             raise argument_error(argument, wanted, f"{np.count_nonzero(used)} of {len(x)} sources")
         turn, move = _solved(one[used], other[used])
-        residual = other - _turned(one, turn) - move
+        residual = other - one @ _rotation(turn).T - move
         spread = np.sqrt(np.mean(np.square(residual[used])))
         new = np.hypot(*residual.T) < max(3 * spread, 1e-6)
         if np.array_equal(new, used):
             break
         used = new
     wcs = image.wcs.deepcopy()
-    cos, sin = np.cos(turn), np.sin(turn)
-    matrix = np.array([[cos, sin], [-sin, cos]])
+    matrix = _rotation(turn)
     if wcs.wcs.has_cd():
         wcs.wcs.cd = matrix @ wcs.wcs.cd
     else:
@@ -233,9 +232,10 @@ def _aligned(image, x, y, catalog, radius, argument):
     return out, alignment
 
 
-def _turned(places, turn):
+def _rotation(turn):
+    """Matrix of a turn from north to east, of places (east, north)."""
     cos, sin = np.cos(turn), np.sin(turn)
-    return places @ np.array([[cos, sin], [-sin, cos]]).T
+    return np.array([[cos, sin], [-sin, cos]])
 
 
 def _solved(one, other):
@@ -244,4 +244,4 @@ def _solved(one, other):
     if len(one) >= _LEAST_ROTATION:
         a, b = one - one.mean(axis=0), other - other.mean(axis=0)
         turn = np.arctan2(np.sum(a[:, 1] * b[:, 0] - a[:, 0] * b[:, 1]), np.sum(a * b))
-    return turn, (other - _turned(one, turn)).mean(axis=0)
+    return turn, (other - one @ _rotation(turn).T).mean(axis=0)

@@ -164,7 +164,8 @@ def estimate_background(
     Detection in tiers of smoothing, from wide to narrow, follows Bagley et al. 2023, ApJL 946, L12, sec. 3.
     """
     check_choice(method, "method", ("masked", "sep"))
-    check_mesh(box, filter_size)
+    check_least(box, "box", 4, whole=True)
+    check_least(filter_size, "filter_size", 1, whole=True)
     check_positive(threshold, "threshold")
     check_least(iterations, "iterations", 0, whole=True)
     mask = plain_mask(image)
@@ -253,12 +254,6 @@ def _averaged(data, mask, stated, step, correlation):
         error, part = cells_of(*stated, step)
         stated = error * np.float32(correlation / step), ~small & (part > 0)
     return np.where(small, 0, mean), small, stated
-
-
-def check_mesh(box, filter_size, *, least=4):
-    """Refuse boxes, or a filter of boxes, that are too small."""
-    check_least(box, "box", least, whole=True)
-    check_least(filter_size, "filter_size", 1, whole=True)
 
 
 def _stated(image, mask):

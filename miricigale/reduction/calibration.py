@@ -7,6 +7,7 @@ from scipy.ndimage import binary_dilation, convolve, find_objects, label, maximu
 from miricigale.instrument import DQ, field_mask, flat_field, photmjsr, psf_fwhm
 from miricigale.reduction.images import flag_pixels, plain_flags, plain_mask, sigma, with_data
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_positive
 from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS
 
 # mean scale of the imager's pixels, to turn a FWHM into pixels; the detection kernel
@@ -56,8 +57,7 @@ def find_cosmic_rays(image, *, fwhm):
     ----------
     van Dokkum 2001, PASP 113, 1420; McCully et al. 2018, astroscrappy.
     """
-    if not fwhm > 0:
-        raise argument_error("fwhm", "positive", fwhm)
+    check_positive(fwhm, "fwhm")
     mask = plain_mask(image)
     error = sigma(image)
     good = ~mask & np.isfinite(error) & (error > 0)
@@ -138,7 +138,6 @@ def calibrate(
     flat=None,
     conversion=None,
     flags=None,
-    field_only=True,
     cosmic_rays=False,
 ):
     """
@@ -163,26 +162,27 @@ def calibrate(
         MJy/sr per DN/s; that of the simulated detector and ``gain`` if not given.
     flags : `~numpy.ndarray` of int64, shape (ny, nx), optional
         Flags of the flat field.
-    field_only : bool, optional
-        Whether pixels behind the coronagraph masks are masked; sub-arrays that lie wholly
-        outside the imager's field are left alone.
     cosmic_rays : bool, optional
         Whether residual cosmic rays are searched and masked (`find_cosmic_rays`).
 
     Returns
     -------
     cal : `~astropy.nddata.CCDData`
-        MJy/sr; ``meta["photmjsr"]`` is the conversion.
+        MJy/sr; ``meta["photmjsr"]`` is the conversion. Pixels behind the coronagraph masks are
+        masked; sub-arrays that lie wholly outside the imager's field are left alone.
 
     Raises
     ------
     ValueError
-        If the image is not in DN/s.
+        If the image is not in DN/s, or not of the shape of the sub-array.
     """
     if rate.unit is None or not rate.unit.is_equivalent(RATE):
         raise argument_error("rate", f"in {RATE}", f"unit {rate.unit}")
+    inside = field_mask(subarray=subarray)
+    if rate.shape != inside.shape:
+        raise argument_error("rate", f"of shape {inside.shape} for {subarray!r}", rate.shape)
     if flat is None:
-        flat = flat_field(filter, rate.shape, subarray=subarray)
+        flat = flat_field(filter, subarray=subarray)
         if ipc_kernel is not None:
             flat = convolve(flat, np.asarray(ipc_kernel, np.float32), mode="nearest")
     flat = np.broadcast_to(np.asarray(flat, np.float32), rate.shape)
@@ -199,11 +199,9 @@ def calibrate(
     if flags is not None:
         out.flags |= flags
         out.mask |= (flags & DQ.DO_NOT_USE) != 0
-    if field_only:
-        inside = field_mask(rate.shape, subarray=subarray)
-        outside = ~inside if inside.any() else np.zeros_like(inside)
-        outside &= (plain_flags(rate) & DQ.REFERENCE_PIXEL) == 0
-        out = flag_pixels(out, outside, DQ.NON_SCIENCE | DQ.DO_NOT_USE)
+    outside = ~inside if inside.any() else np.zeros_like(inside)
+    outside &= (plain_flags(rate) & DQ.REFERENCE_PIXEL) == 0
+    out = flag_pixels(out, outside, DQ.NON_SCIENCE | DQ.DO_NOT_USE)
     if cosmic_rays:
         fwhm = psf_fwhm(filter).value / _PIXEL_SCALE
         hits = find_cosmic_rays(out, fwhm=fwhm)

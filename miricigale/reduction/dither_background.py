@@ -6,11 +6,12 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from miricigale.instrument import DQ, mosaic_wcs
-from miricigale.reduction.background import check_mesh, estimate_background, warn_of
+from miricigale.reduction.background import estimate_background, warn_of
 from miricigale.reduction.images import check_images, plain_mask, seen_wcs, with_data
 from miricigale.reduction.mosaic import drizzle_images, pixel_map
 from miricigale.reduction.sky_mesh import sky_boxes, spread_over
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_least
 from miricigale.utils.parallel import chunks
 from miricigale.utils.units import ANGLE
 
@@ -20,7 +21,7 @@ _ROWS = 128
 _WIDER = 2
 
 
-def dither_backgrounds(images, backgrounds=None, *, wcs=None, box=16, filter_size=1):
+def dither_backgrounds(images, backgrounds=None, *, wcs=None, box=16):
     """
     Backgrounds of dithered images from the other dithers, with the sources masked ("super background").
 
@@ -35,10 +36,10 @@ def dither_backgrounds(images, backgrounds=None, *, wcs=None, box=16, filter_siz
         Grid of a mosaic, with its ``pixel_shape``, on which the sources are searched for that are masked; by
         default that of `~miricigale.instrument.mosaic_wcs` with pixels of 0.11 arcsec. What stays on the
         detector does not add up there, as sources do.
-    box, filter_size : int, optional
-        Boxes of pixels, and the median filter of boxes, over which the median of the dithers is
-        smoothed. ``box=1`` takes it pixel by pixel: patterns of single pixels are taken off too, and each
-        image gets the noise of n - 1 others, 1.25 / sqrt(n - 1) of its own.
+    box : int, optional
+        Pixels of the boxes over which the median of the dithers is smoothed. ``box=1`` takes it pixel
+        by pixel: patterns of single pixels are taken off too, and each image gets the noise of n - 1
+        others, 1.25 / sqrt(n - 1) of its own.
 
     Returns
     -------
@@ -69,7 +70,7 @@ def dither_backgrounds(images, backgrounds=None, *, wcs=None, box=16, filter_siz
     images = list(images)
     if len(images) < 3:
         raise argument_error("images", "at least three dithers", len(images))
-    check_mesh(box, filter_size, least=1)
+    check_least(box, "box", 1, whole=True)
     shape = images[0].shape
     for im in images:
         if im.shape != shape:
@@ -97,9 +98,10 @@ def dither_backgrounds(images, backgrounds=None, *, wcs=None, box=16, filter_siz
                 "images", "ones that leave some sky to each other", "none in common"
             )
         boxes = sky_boxes(np.where(known, template, 0), ~known, max(box, 4))
-        smooth = spread_over(boxes.level, boxes.used, boxes.edges, shape, filter_size)
-        error = spread_over(boxes.error, boxes.used, boxes.edges, shape, filter_size)
-        error *= np.float32(1.2533 / filter_size if filter_size > 1 else 1.0)
+        smooth, error = (
+            spread_over(values, boxes.used, boxes.edges, shape, filter_size=1)
+            for values in (boxes.level, boxes.error)
+        )
         if box == 1:
             error = np.where(known, own.rms * np.float32(1.2533 / np.sqrt(len(images) - 1)), error)
             smooth = np.where(known, template, smooth)

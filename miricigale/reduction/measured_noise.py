@@ -38,8 +38,8 @@ class MeasuredNoise:
 
     Parameters
     ----------
-    read_noise, read_noise_err : float
-        Standard deviation of one read, DN (rounding not included), and its error.
+    read_noise : float
+        Standard deviation of one read, DN (rounding not included).
     gain : float
         Electrons per DN; infinite if no photon noise is seen.
     gain_err : float
@@ -53,7 +53,6 @@ class MeasuredNoise:
     """
 
     read_noise: float
-    read_noise_err: float
     gain: float
     gain_err: float
     effective: bool = False
@@ -135,10 +134,9 @@ def measure_noise(ramp):
         if blind[0].size >= _FEWEST:
             dark.append(_noise(_parts(ramp, k, blind)[1])[:2])
     m, v, v_err, s, s_err = np.array(rows).T
-    read, read_err = _mean(s, s_err)
+    read, _ = _mean(s, s_err)
     rounding = 1 / 12 if ramp.data.dtype.kind == "u" else 0.0
     read_noise = np.sqrt(max(read - rounding, 0.0))
-    read_err /= 2 * max(read_noise, 1e-3)
     mean, mean_err = _mean(v, v_err)
     slow, slow_err = _mean(*np.array(dark).T) if dark else (0.0, 0.0)
     # v = m / gain and slow noise of the read-out, which does not go with the signal
@@ -159,7 +157,7 @@ def measure_noise(ramp):
     effective = not seen and not dark and np.isfinite(gain)
     slow_noise = np.sqrt(max(slow, 0.0))
     return MeasuredNoise(
-        *map(float, (read_noise, read_err, gain, gain_err)), bool(effective), float(slow_noise)
+        *map(float, (read_noise, gain, gain_err)), bool(effective), float(slow_noise)
     )
 
 

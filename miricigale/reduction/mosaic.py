@@ -22,11 +22,13 @@ from miricigale.reduction.images import (
 )
 from miricigale.utils import sep_tools
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_least, check_positive
+from miricigale.utils.options import check_positive
 from miricigale.utils.parallel import chunks
 
 # rows of a grid of which the median of many images is taken together
 _ROWS = 256
+# steepest differences to its neighbors by which a pixel may differ from the other dithers
+_DERIVATIVE = 1.2
 # nodes of the grid on which a distorted WCS is evaluated; between them bicubic splines
 _NODES = 49
 
@@ -270,7 +272,7 @@ def _add(sink, im, weight, pixel_map, wcs, pixfrac=1.0, **planes):
     )
 
 
-def reject_outliers(images, wcs, *, threshold=5.0, derivative=1.2, weights=None, pixel_maps=None):
+def reject_outliers(images, wcs, *, threshold=5.0, weights=None, pixel_maps=None):
     """
     Mask pixels that disagree with the other dithers.
 
@@ -282,10 +284,6 @@ def reject_outliers(images, wcs, *, threshold=5.0, derivative=1.2, weights=None,
         Grid on which they are compared; best with pixels of about the detector's size.
     threshold : float, optional
         In sigma of the pixel (with the noise of the median).
-    derivative : float, optional
-        A pixel may differ, beyond the noise, by this times the steepest difference to its
-        four neighbors in the median image: point sources are sampled differently in
-        each dither.
     weights, pixel_maps : list, optional
         As in `drizzle_images`.
 
@@ -298,7 +296,9 @@ def reject_outliers(images, wcs, *, threshold=5.0, derivative=1.2, weights=None,
     Notes
     -----
     Each image is drizzled alone, the median of these is interpolated back to the pixels of
-    each image (linearly), and compared there.
+    each image (linearly), and compared there. Beyond the noise a pixel may differ by 1.2 times the
+    steepest difference to its four neighbors in the median image: point sources are sampled
+    differently in each dither.
 
     References
     ----------
@@ -307,7 +307,6 @@ def reject_outliers(images, wcs, *, threshold=5.0, derivative=1.2, weights=None,
     images = list(images)
     check_images(images, wcs)
     check_positive(threshold, "threshold")
-    check_least(derivative, "derivative", 0)
     if len(images) < 3:
         return images
     weights = [weight_map(im) for im in images] if weights is None else weights
@@ -341,7 +340,7 @@ def reject_outliers(images, wcs, *, threshold=5.0, derivative=1.2, weights=None,
         # that of the median too, of as many images as there are at this place
         noise = sigma(im) * np.sqrt(1 + share[row, column])
         with np.errstate(invalid="ignore"):
-            far = np.abs(im.data - expected) > threshold * noise + derivative * slope
+            far = np.abs(im.data - expected) > threshold * noise + _DERIVATIVE * slope
         outlier = far & known & ~plain_mask(im)
         flagged = flag_pixels(im, outlier, DQ.OUTLIER | DQ.DO_NOT_USE)
         flagged.meta["n_outliers"] = int(np.count_nonzero(outlier))
@@ -365,7 +364,7 @@ def _median_of(images, wcs, weights, pixel_maps):
     """
     Median and number of images on each pixel of a grid, each image drizzled alone.
 
-    Each is kept where it lies and some rows are looked at together, for a field of many pointings
+    Each is kept where it lies and the rows are taken in strips, for a field of many pointings
     has many images, few of which overlap.
     """
     shape = wcs.pixel_shape[::-1]

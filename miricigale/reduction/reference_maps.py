@@ -49,7 +49,7 @@ def _cut(path, kind, array, header, exposure):
         origin = part.origin
     else:
         msg = (
-            f"{path} does not tell which part of the detector it covers: {array.shape[-2:]} pixels "
+            f"{path} does not state which part of the detector it covers: {array.shape[-2:]} pixels "
             "without SUBSTRT1 and SUBSTRT2"
         )
         raise DataError(msg)
@@ -246,7 +246,7 @@ def read_photom(path, exposure, day):
         msg = f"{path} has no conversion for {short} and {exposure.subarray}: {conversion}"
         raise DataError(msg)
     if times and day is None:
-        msg = f"{path} has a conversion that depends on time, and the exposure does not tell when"
+        msg = f"{path} has a conversion that depends on time, and the exposure does not state when"
         raise DataError(msg)
     if (old := times.pop("TIMECOEFF", None)) is not None:
         conversion += old["amplitude"] * np.exp(-(day - old["t0"]) / old["tau"])

@@ -367,7 +367,7 @@ class ReferenceFiles:
             if "gain" in unknown and measured.effective:
                 msg = (
                     f"the gain of {measured.gain:.3g} e-/DN is that of all noise that grows with time: the "
-                    "light is even and there are no reference pixels, which would tell slow noise of the "
+                    "light is even and there are no reference pixels, which would separate slow noise of the "
                     "read-out from photons (measure_noise). Give 'gain' if it is known"
                 )
                 warnings.warn(msg, ReferenceWarning, stacklevel=4)

@@ -4,7 +4,6 @@ import numpy as np
 
 from miricigale.reduction.images import check_images, plain_mask, with_data
 from miricigale.reduction.mosaic import pixel_map
-from miricigale.utils.exceptions import argument_error
 
 # pixels of the grid that are averaged before images are compared
 _CELL = 8
@@ -112,8 +111,6 @@ def match_levels(images, wcs, *, pixel_maps=None):
         Of one level where they overlap; ``meta["sky_offset"]`` is what was taken off.
     """
     images = list(images)
-    if not images:
-        raise argument_error("images", "at least one image", "none")
     offsets = sky_offsets(images, wcs, pixel_maps=pixel_maps)
     return [
         with_data(

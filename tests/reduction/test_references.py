@@ -293,7 +293,7 @@ def test_the_conversion_follows_time_as_the_pipeline_has_it(exposure, tmp_path):
     old = {"TIMECOEFF": {"amplitude": 0.2, "tau": 250.0, "t0": 59500.0}}
     old = write_photom(tmp_path / "c.fits", rows, times=old)
     assert read_photom(old, exposure, day) == pytest.approx(0.5 + 0.2 * np.exp(-2), rel=1e-6)
-    with pytest.raises(DataError, match="depends on time, and the exposure does not tell when"):
+    with pytest.raises(DataError, match="depends on time, and the exposure does not state when"):
         read_photom(old, exposure, None)
     with pytest.raises(DataError, match="has no row for F560W and SUB256"):
         read_photom(plain, exposure.replace(filter="miri.f560w"), None)
