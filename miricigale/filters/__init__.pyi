@@ -7,4 +7,5 @@ from .filter import Filter as Filter
 from .filter import as_filter as as_filter
 from .filter_set import FilterSet as FilterSet
 from .filter_set import filter_table as filter_table
+from .photometry_table import as_photometry as as_photometry
 from .surveys import SURVEYS as SURVEYS

@@ -26,7 +26,7 @@ def samples(results, key):
     if results.draws is None:
         msg = "results of a grid hold no draws; BayesFitter.sample makes some"
         raise ValueError(msg)
-    one = results[key]._fitted_one()
+    one = results.loc[key]._fitted_one()
     values = zip(results.parameters, one.draws.T, strict=True)
     columns = {n: (u.Quantity(v, results.unit(n)), results._meaning(n)) for n, v in values}
     return described_table(columns, dict(results.meta) | {"id": str(key)})
@@ -73,7 +73,7 @@ def best_sed(results, model=None, **changes):
     if results.distance is None or not np.isfinite(results.distance) or "redshift" in changes:
         return sed
     nearer = distance(sed.redshift, model.cosmology) / (float(results.distance) * u.Mpc.to(u.m))
-    return sed.replace(fnu=sed.fnu * float(nearer**2))
+    return sed * float(nearer**2)
 
 
 def plot_sed(results, ax=None, *, model=None, filters=None, **kwargs):

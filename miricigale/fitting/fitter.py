@@ -5,6 +5,7 @@ import warnings
 
 import numpy as np
 
+from miricigale.filters import as_photometry
 from miricigale.filters.catalog_files import codes_of, warn_of_codes
 from miricigale.fitting.grid_fit import GridFit
 from miricigale.fitting.likelihood import (
@@ -20,18 +21,20 @@ from miricigale.fitting.results import FitResults
 from miricigale.fitting.samplers import get_sampler
 from miricigale.fitting.samplers.fit import SamplerFit
 from miricigale.fitting.settings import GridSettings, SamplerSettings
-from miricigale.sed import ModelGrid
+from miricigale.sed import ModelGrid, yang2021_axes
 from miricigale.utils.exceptions import FitWarning, argument_error
+from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_names
 from miricigale.utils.parallel import chunks, parallel_map, single_threaded
 from miricigale.utils.random import check_seed
-from miricigale.utils.units import check_count, is_number
+from miricigale.utils.tables import error_column
+from miricigale.utils.units import FNU, check_count, is_number
 
 logger = logging.getLogger(__name__)
 
 
-class BayesFitter:
+class BayesFitter(Interactive):
     """
     Fit photometry and sum up the posterior: with every model of a grid, or by a nested sampler.
 
@@ -73,8 +76,9 @@ class BayesFitter:
     engine : {"grid", "nautilus", "dynesty"} or callable, optional
         How the posterior is found: on a grid, or by a sampler. A callable is a sampler of the
         user's; see `miricigale.fitting.samplers.get_sampler`.
-    axes : dict, optional
-        Parameter name to values, for a grid of a model (see `~miricigale.sed.SEDModel.grid`).
+    axes : dict or str, optional
+        Parameter name to values, for a grid of a model (see `~miricigale.sed.SEDModel.grid`); or a name for
+        `~miricigale.sed.yang2021_axes`, such as ``"quick"``.
     model_error, error_floor : float or dict of str to float, optional
         Part of the flux that is added to its error in quadrature, and least relative error of a flux,
         for all or by filter.
@@ -159,6 +163,7 @@ class BayesFitter:
         if not isinstance(settings, kind):
             wanted = f"{kind.__name__} with engine={engine!r}"
             raise argument_error("settings", wanted, type(settings).__name__)
+        axes = yang2021_axes(axes) if isinstance(axes, str) else axes
         of_grid = {"axes": axes, "template_error": template_error, "compat": compat}
         if not on_grid:
             for name, value in of_grid.items():
@@ -196,6 +201,14 @@ class BayesFitter:
         )
         self.max_reduced_chi2 = float(max_reduced_chi2)
 
+    def _facts(self):
+        return {
+            "BayesFitter": self._engine_name,
+            "models": repr(self.grid or self.model),
+            "bands": ", ".join(self.filters or self.bands),
+            "priors": ", ".join(self.priors) if isinstance(self.priors, dict) else "of the grid",
+        }
+
     def __repr__(self):
         bands = "bands of the photometry" if self.filters is None else f"{len(self.filters)} bands"
         if self.engine == "grid":
@@ -224,9 +237,10 @@ class BayesFitter:
 
         Parameters
         ----------
-        photometry : `~astropy.table.QTable`
-            One row for each object: ``id``, a flux column for each filter, called by the
-            filter's name, and its error ``<name>_err``. NaN is a missing band. Where a boolean
+        photometry : `~astropy.table.QTable`, dict, `pandas.DataFrame` or path-like
+            One row for each object: ``id`` (else rows are counted from 1), a column of fluxes or AB magnitudes
+            for each filter, called by any usual name of it, and its error ``<name>_err`` or ``e_<name>``
+            (`~miricigale.filters.as_photometry`). NaN is a missing band. Where a boolean
             column ``<name>_limit`` is true the flux is an upper limit and the error its 1 sigma
             (without model error and floor); its term of chi2 is -2 ln of the probability that a
             measurement of the model lies below the limit (Sawicki 2012, PASP 124, 1208, appendix).
@@ -278,11 +292,27 @@ class BayesFitter:
         `~astropy.units.UnitsError`
             If a flux column has no unit of flux density.
         """
+        photometry = self._table(photometry)
         warn_of_codes(codes_of(photometry, self._reader.fitted(photometry)), "photometry", 2)
         self.warn_of_bands(photometry, 2)
         given = {"redshift": redshift, "redshift_prior": redshift_prior, "pairs": pairs}
         parallel = {"executor": executor, "progress_bar": progress_bar}
         return self.fit_part(photometry, **given, seed=seed, chunk_size=chunk_size, **parallel)
+
+    __call__ = fit
+
+    def _table(self, photometry):
+        """The catalog by our names; a band of ``filters`` that it lacks is a missing one of all objects."""
+        table = as_photometry(photometry, self.filters or self.bands)
+        lost = [name for name in self.filters or () if name not in table.colnames]
+        if not lost or len(lost) == len(self.filters):
+            return table
+        text = f"the photometry has no {', '.join(lost)}: missing bands of all objects"
+        warnings.warn(text, FitWarning, stacklevel=3)
+        table = table.copy(copy_data=False)
+        for name in lost:
+            table[name] = table[error_column(name)] = np.full(len(table), np.nan) * FNU
+        return table
 
     def fit_part(self, photometry, *, pairs, seed, chunk_size=None, repeated=None, **options):
         """Do what `fit` does, without warnings; earlier parts of the catalog had the ``repeated`` rows."""
@@ -375,6 +405,7 @@ class BayesFitter:
             msg = "draws of a sampler are in its results: fitter.fit(photometry).samples(id)"
             raise ValueError(msg)
         n_draws, seed = check_count(n_draws, "n_draws"), check_seed(seed)
+        photometry = self._table(photometry)
         warn_of_codes(codes_of(photometry, self._reader.fitted(photometry)), "photometry", 2)
         self.warn_of_bands(photometry, 2)
         data, known, settings = self._prepare(

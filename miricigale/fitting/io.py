@@ -1,6 +1,7 @@
 """Results and draws in FITS files, and results in the files of a folder."""
 
 import itertools
+import numbers
 from pathlib import Path
 
 import astropy.units as u
@@ -15,6 +16,7 @@ from miricigale.utils.content import content_sha256
 from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import open_fits
 from miricigale.utils.folder import RecordFolder
+from miricigale.utils.object_rows import ByID
 from miricigale.utils.options import check_names
 from miricigale.utils.row_files import write_rows
 from miricigale.utils.store import native, open_parts, write_parts
@@ -300,14 +302,29 @@ class FitResultsFiles:
         return itertools.chain.from_iterable(self.parts())
 
     def __getitem__(self, key):
-        """Return `FitResults`, as these have them by an id or by rows; others are not read."""
+        """Return `FitResults` of a row or rows, or of an id that is text; others are not read."""
         if isinstance(key, (slice, list)) or np.ndim(key):
             return self._rows(np.arange(len(self))[key])
+        if isinstance(key, numbers.Integral):
+            return self._rows(np.arange(len(self))[[key]])[0]
+        return self._take(self.row(key))
+
+    @property
+    def loc(self):
+        """Objects by id: ``results.loc[id]``."""
+        return ByID(self)
+
+    def _take(self, place):
+        path, row = place
+        return self._read(path, [row])[0]
+
+    def row(self, key):
+        """The file of an id and the row in it."""
         key = key.item() if isinstance(key, np.generic) else key
         for path in self.paths:
             ids = part_ids(path).tolist()
             if key in ids:
-                return self._read(path, [ids.index(key)])._take(0)
+                return path, ids.index(key)
         msg = f"no object with the id {key!r} among {len(self)}"
         raise KeyError(msg)
 

@@ -1,6 +1,7 @@
 """What a fit returns: posteriors of the objects of a catalog."""
 
 import html
+import re
 from dataclasses import dataclass, field, replace
 
 import astropy.units as u
@@ -37,10 +38,22 @@ class FitRows(ObjectRows):
 
     #: Where the formats of files are registered.
     io_module = "miricigale.fitting.io"
+    _other_names = {"quantile": "percentile"}
 
     def with_model(self, model):
         """Return a copy that knows the `~miricigale.sed.SEDModel`, for other bands and for spectra."""
         return replace(self, model=model)
+
+    def to_pandas(self):
+        """The table as a `pandas.DataFrame`, without units."""
+        return self.to_table().to_pandas()
+
+    def flag_names(self):
+        """Names of the flags of each object: list of lists of str."""
+        return [FitFlags.names(value) for value in np.atleast_1d(self.flags)]
+
+    def __add__(self, other):
+        return type(self).concatenate([self, other])
 
     def _fitted_one(self):
         """Refuse a single object that was not fitted."""
@@ -57,8 +70,8 @@ class FitResults(FitRows):
     Posteriors of the objects of a catalog, in its order.
 
     Made by `BayesFitter.fit`; every array is read-only, and NaN for objects that could not be
-    fitted. ``results[id]`` and ``results[rows]`` are of this class too: of a single object the arrays
-    have no axis of objects (shapes below without ``n``), and only a single object has spectra and
+    fitted. ``results[0]``, ``results[rows]`` and ``results.loc[id]`` are of this class too: of a single object
+    the arrays have no axis of objects (shapes below without ``n``), and only a single object has spectra and
     plots.
 
     Parameters
@@ -263,6 +276,26 @@ class FitResults(FitRows):
         kept = getattr(self, f"axis_{what}")
         return None if kept is None else kept[..., list(self.axes).index(name), :]
 
+    def median(self, name):
+        """Posterior medians of a parameter: `~astropy.units.Quantity`, shape (n,)."""
+        return self.percentile(name, [0.5])[..., 0]
+
+    def summary(self):
+        """Id, names of flags, chi2, and the 16th, 50th and 84th percentiles, as a table."""
+        table = self.to_table()
+        kept = [name for name in table.colnames if re.search(r"^(id|chi2_best)$|_p\d\d$", name)]
+        table = table[kept]
+        table.add_column([", ".join(names) for names in self.flag_names()], 1, "flags")
+        return table
+
+    def _column(self, name):
+        """Posterior medians of a parameter, or a column of the table."""
+        return self.median(name) if name in self.parameters else super()._column(name)
+
+    def plot(self, ax=None, **kwargs):
+        """Draw the spectrum and the photometry of a single object (`plot_sed`); returns the axes."""
+        return self.plot_sed(ax, **kwargs)
+
     def percentile(self, name, levels):
         """
         Posterior percentiles.
@@ -439,7 +472,7 @@ class FitResults(FitRows):
     def _one(self, what):
         """Refuse several objects where one is needed."""
         if not self.isscalar:
-            msg = f"{what} is of a single object: results[id].{what}()"
+            msg = f"{what} is of a single object: results[0].{what}() or results.loc[id].{what}()"
             raise TypeError(msg)
         return self
 

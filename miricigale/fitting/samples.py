@@ -314,7 +314,7 @@ model : `~miricigale.sed.SEDModel`, optional
 
     def _binned(self, name, key, bins):
         """Values in the draws of an object, and edges of the cells."""
-        unit, values = self.unit(name), self[key]._fitted_one().values(name).value
+        unit, values = self.unit(name), self.loc[key]._fitted_one().values(name).value
         if name in self.axes:
             return values, cell_edges(self.axes[name].values, self.axes[name].bounds)
         if not np.isfinite(values).any() and not np.ndim(bins):
@@ -415,7 +415,7 @@ model : `~miricigale.sed.SEDModel`, optional
         spectra : `~astropy.units.Quantity`, shape (n_draws, n_wave)
             In W / Hz or uJy.
         """
-        one = self[key]._fitted_one()
+        one = self.loc[key]._fitted_one()
         function = spectra.rest_spectra if rest else spectra.observed_spectra
         wave, values = function(self._model(), self.grid, one.index, one.scale)
         return wave * WAVE, values * (u.W / u.Hz if rest else FNU)

@@ -1,12 +1,14 @@
 """Frozen classes that hold a row for each object of a catalog: slices, rows by id, joins."""
 
+import numbers
 from dataclasses import fields
 from functools import cached_property
 from typing import Annotated
 
 import numpy as np
 
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.interactive import Interactive
 
 #: Types of fields: an array whose first axis is the objects, and a dict of such.
 PerObject = Annotated[np.ndarray, "per object"]
@@ -19,16 +21,19 @@ def _frozen(array, copy):
     return array
 
 
-class ObjectRows:
+class ObjectRows(Interactive):
     """
     Base of frozen dataclasses with a row for each object of a catalog, and its ``ids``.
 
     Fields of the types `PerObject` and `PerObjectDict` are read-only arrays, dicts of such, or None.
     Indexing gives the same class:
 
-    - ``results[id]``, one number or text: the object of this id (the first, if it occurs twice),
-      whose arrays have no first axis, as an element of a `~astropy.coordinates.SkyCoord` has none;
-    - ``results[rows]``, a slice, a list or an array of row numbers or of truth values: these rows.
+    - ``results[0]``, a row number: a single object, whose arrays have no first axis, as an element of a
+      `~astropy.coordinates.SkyCoord` has none;
+    - ``results[rows]``, a slice, a list or an array of row numbers or of truth values: these rows;
+    - ``results.loc[id]``: the object of this id (the first, if it occurs twice), a list of ids: several.
+
+    ``results["redshift_p50"]`` is a column of the table, ``results["some id"]`` also an object whose id is text.
     """
 
     def __post_init__(self):
@@ -78,7 +83,27 @@ class ObjectRows:
             if isinstance(rows, np.ndarray) and rows.size == 0 and rows.dtype != bool:
                 rows = rows.astype(np.intp)
             return self._take(rows)
+        if isinstance(key, numbers.Integral) and not isinstance(key, (bool, np.bool_)):
+            if not -len(self) <= key < len(self):
+                msg = f"no row {key} among {len(self)}; results.loc[id] is the object of an id"
+                raise IndexError(msg)
+            return self._take(int(key))
+        if isinstance(key, str) and key not in self._row_of_id:
+            return self._column(key)
         return self._take(self.row(key))
+
+    @property
+    def loc(self):
+        """Objects by id: ``results.loc[id]`` and, for several, ``results.loc[[id, ...]]``."""
+        return ByID(self)
+
+    def _column(self, name):
+        """A column of the table, by name."""
+        table = self.to_table() if hasattr(self, "to_table") else {}
+        if name not in getattr(table, "colnames", ()):
+            known = [*getattr(table, "colnames", ()), *map(str, self._row_of_id)]
+            raise unknown_name("column or id", name, known)
+        return table[name]
 
     def _take(self, rows):
         """Copy with these rows of every array; with a row number, a single object."""
@@ -177,6 +202,18 @@ class ObjectRows:
                 joined = None if value is None else _joined(values, name)
             new.__dict__[name] = joined
         return new
+
+
+class ByID:
+    """Rows of a catalog by id."""
+
+    def __init__(self, rows):
+        self._rows = rows
+
+    def __getitem__(self, key):
+        if isinstance(key, (list, np.ndarray)) and np.ndim(key):
+            return self._rows[[self._rows.row(one) for one in key]]
+        return self._rows._take(self._rows.row(key))
 
 
 def _rows(array, rows):

@@ -201,8 +201,11 @@ def test_a_prior_that_leaves_nothing_is_flagged(grid, photometry):
 @pytest.mark.parametrize("filters", [None, ["band0", "band1"]])
 def test_what_is_no_table_is_named(grid, photometry, filters):
     fitter = BayesFitter(grid, filters)
-    for bad in (None, {"id": [1]}):
-        with pytest.raises(ValueError, match="'photometry' must be a table, got"):
+    for bad, wanted in (
+        (None, "a table, a dict of columns, .* got NoneType"),
+        ({"id": [1]}, "a table with"),
+    ):
+        with pytest.raises(ValueError, match=f"'photometry' must be {wanted}"):
             fitter.fit(bad)
     with pytest.raises(ValueError, match=r"'redshift' must be numbers, got \['a', 'b'\]"):
         fitter.fit(photometry[:2], redshift=["a", "b"])

@@ -2,6 +2,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
+from astropy.tests.helper import assert_quantity_allclose
 from matplotlib.figure import Figure
 
 from helpers.results import assert_same_tables
@@ -94,8 +95,10 @@ def test_views_agree_with_the_catalog(results):
     assert edges.unit == u.Msun
     assert len(edges) == len(weights) + 1
     assert len(list(results)) == len(results)
-    with pytest.raises(KeyError, match="no object with the id 99 among 12; the first are 0, 1"):
+    with pytest.raises(IndexError, match="no row 99 among 12"):
         results[99]
+    with pytest.raises(KeyError, match="no object with the id 99 among 12; the first are 0, 1"):
+        results.loc[99]
     with pytest.raises(KeyError, match="no parameter 'mood'; known: accretion_power"):
         results.mean("mood")
     with pytest.raises(ValueError, match="'levels' must be between 0 and 1"):
@@ -203,3 +206,23 @@ def test_results_draw_what_they_hold(results):
     ax = Figure().subplots()
     assert results[2].plot_pdf2d(ax=ax) is ax
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("redshift", "frac_agn")
+
+
+def test_rows_ids_and_columns(results, tmp_path):
+    assert results[0].ids == results.ids[0]
+    assert results[-1].ids == results.ids[-1]
+    assert results.loc[results.ids[2]].chi2 == results.chi2[2]
+    assert results.loc[[3, 1]].ids.tolist() == [3, 1]
+    table = results.to_table()
+    assert_quantity_allclose(results["mass_p50"], table["mass_p50"])
+    assert_quantity_allclose(results["mass"], results.median("mass"))
+    assert_quantity_allclose(results.median("mass"), table["mass_p50"])
+    summary = results.summary()
+    assert summary.colnames[:3] == ["id", "flags", "chi2_best"]
+    assert len(results + results) == 2 * len(results)
+    assert len(results.flag_names()) == len(results)
+    results.write(tmp_path / "a.csv")
+    back = QTable.read(tmp_path / "a.csv")
+    np.testing.assert_allclose(back["mass_p50"], table["mass_p50"].value)
+    with pytest.raises(AttributeError, match="FitResults has no 'medain'; it has median"):
+        results.medain  # noqa: B018

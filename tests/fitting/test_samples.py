@@ -208,7 +208,7 @@ def test_what_is_refused(real, model, samples):
     with pytest.raises(ValueError, match="'index' must be within the grid's"):
         Samples(*args, real.index + 10, real.scale)
     with pytest.raises(KeyError, match="no object with the id 'd' among 3"):
-        real["d"]
+        real.loc["d"]
     with pytest.raises(KeyError, match="no parameter 'mood'"):
         real.values("mood")
     with pytest.raises(ValueError, match="'model' must be an SEDModel"):

@@ -22,7 +22,7 @@ from helpers.results import assert_joined, assert_same, assert_same_tables
 from miricigale.fitting import BayesFitter, FitFlags, FitResults, fit_file, open_results
 from miricigale.utils.exceptions import DataError
 
-MANIFESTS = [".manifest.copy.json", "manifest.json"]
+MANIFESTS = [".fit.lock", ".manifest.copy.json", "manifest.json"]
 
 
 class Stopped(Exception):
@@ -334,7 +334,7 @@ def test_results_are_read_as_if_they_were_one(fitter, catalog, tmp_path):
     few = results.to_table(["id", "mass_p50"])
     assert few.colnames == ["id", "mass_p50"]
     np.testing.assert_array_equal(few["mass_p50"], wanted["mass_p50"])
-    with pytest.raises(KeyError, match="no column 'weight'; known: "):
+    with pytest.raises(KeyError, match="no column 'weight'; the nearest"):
         results.to_table(["weight"])
 
 

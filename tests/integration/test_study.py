@@ -117,7 +117,7 @@ def test_every_product_stands_in_the_manifest_and_nothing_else(study):
     manifest = json.loads((study["folder"] / "manifest.json").read_text())
     recorded = {name for record in manifest["stages"].values() for name in record["products"]}
     found = {str(p.relative_to(study["folder"])) for p in study["folder"].rglob("*") if p.is_file()}
-    assert found - recorded == {"manifest.json", ".manifest.copy.json", "config.toml"}
+    assert found - recorded == {".run.lock", "manifest.json", ".manifest.copy.json", "config.toml"}
     assert recorded - found == set()
 
 

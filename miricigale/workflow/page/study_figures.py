@@ -244,7 +244,7 @@ def example_figure(results, row, key, model):
     drawn too if it is there. ``row`` of the truth has ``redshift`` and ``frac_agn``; ``model`` is that of
     the fits.
     """
-    best = results["all"][key]
+    best = results["all"].loc[key]
     parts, posteriors, joint = {}, {}, {}
     for name in ("all", "none"):
         one = results[name][key] if name in results else None

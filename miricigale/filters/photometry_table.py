@@ -1,0 +1,127 @@
+"""Catalogs of measured fluxes, however their columns are called."""
+
+import re
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from miricigale.filters.band_names import find_filter
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.tables import as_table, error_column
+from miricigale.utils.units import FNU
+
+# what stands before or after the band in names of fluxes, magnitudes and their errors
+_ERROR = re.compile(
+    r"(?:e|err|error|sigma|d)_(?:mag_|flux_)?(?P<a>.+)|(?P<b>.+?)(?:_flux|_mag)?_?(?:err|error|unc|_e)",
+    re.IGNORECASE,
+)
+_FLUX = re.compile(r"(?:f|flux|mag|m)_(?P<a>.+)|(?P<b>.+?)_(?:flux|mag)", re.IGNORECASE)
+_IDS = ("id", "number", "source_id", "objid")
+#: Error of a magnitude to that of a flux, as a part of it.
+_PER_MAGNITUDE = 0.4 * np.log(10)
+
+
+def as_photometry(data, bands, argument="photometry"):
+    """
+    Catalog with columns by the names of bands, of any table.
+
+    Parameters
+    ----------
+    data : `~astropy.table.Table` or anything for `~miricigale.utils.tables.as_table`
+        Fluxes by any usual name of a band (``F770W``, ``f_F770W``, ``mag_F770W``, ``jwst.miri.F770W``) and
+        their errors (``F770W_err``, ``e_F770W``, ``err_F770W``), as flux densities or AB magnitudes.
+    bands : iterable of str
+        Our names of the bands that are meant; other columns stay as they are.
+    argument : str, optional
+        The argument's name, for messages.
+
+    Returns
+    -------
+    table : `~astropy.table.Table`
+        Itself, if its columns have our names already; else a copy with fluxes by band, errors ``<band>_err``
+        and ``id``, which counts the rows from 1 where there is none.
+
+    Raises
+    ------
+    ValueError
+        If it is no table, or two columns are the same band.
+    """
+    table, bands = as_table(data, argument), tuple(bands)
+    names = _our_names(table.colnames, bands, argument)
+    magnitudes = [name for name in bands if _is_ab(table, names.get(name))]
+    if not magnitudes and "id" in names and all(ours == name for ours, name in names.items()):
+        return table
+    back = {theirs: ours for ours, theirs in names.items()}
+    out = QTable(table, copy=False)
+    if back:
+        out = QTable({back.get(name, name): out[name] for name in table.colnames}, copy=False)
+    out.meta = table.meta
+    if "id" not in out.colnames:
+        out["id"] = np.arange(1, len(out) + 1)
+    for name in magnitudes:
+        _to_fluxes(out, name)
+    return out
+
+
+def _our_names(colnames, bands, argument):
+    """Our names of the columns that are fluxes and errors of bands, and of ids, to theirs."""
+    errors = {error_column(name): name for name in bands}
+    found = {name: name for name in (*bands, *errors, "id") if name in colnames}
+    for theirs in colnames:
+        if theirs in found:
+            continue
+        ours = "id" if theirs.lower() in _IDS else _band_of(theirs, bands)
+        if ours is None or (ours in colnames):
+            continue
+        if ours in found:
+            wanted = f"a table with one column for {ours!r}"
+            raise argument_error(argument, wanted, f"{found[ours]!r} and {theirs!r}")
+        found[ours] = theirs
+    return found
+
+
+def _band_of(name, bands):
+    """Our name of a column of flux or error; None of others."""
+    if _find(name, bands):
+        return _find(name, bands)
+    for pattern, called in ((_ERROR, error_column), (_FLUX, str)):
+        match = pattern.fullmatch(name)
+        part = match and (match["a"] or match["b"])
+        # errors of what is called flux_F770W
+        inner = part and _FLUX.fullmatch(part)
+        for text in filter(None, (part, inner and (inner["a"] or inner["b"]))):
+            if _find(text, bands):
+                return called(_find(text, bands))
+    return None
+
+
+def _find(text, bands):
+    band = text if text in bands else find_filter(text)
+    return band if band in bands else None
+
+
+def _is_ab(table, name):
+    if name is None:
+        return False
+    unit = getattr(table[name], "unit", None)
+    if unit is None:
+        return re.match(r"(?:mag|m)_|.*_mag$", name, re.IGNORECASE) is not None
+    return unit == u.ABmag
+
+
+def _to_fluxes(table, name):
+    """Magnitudes of a band and their errors as fluxes in uJy."""
+    magnitude = _plain(table[name])
+    flux = 10 ** (-0.4 * (magnitude - 23.9))
+    table[name] = flux * FNU
+    error = error_column(name)
+    if error in table.colnames:
+        table[error] = _PER_MAGNITUDE * flux * _plain(table[error]) * FNU
+
+
+def _plain(column):
+    """Numbers of a column, NaN where masked."""
+    mask = np.asarray(getattr(column, "mask", False))
+    values = np.asarray(getattr(getattr(column, "unmasked", column), "value", column), float)
+    return np.where(mask, np.nan, values)

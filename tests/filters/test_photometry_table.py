@@ -1,0 +1,94 @@
+"""Catalogs as people write them: the same fluxes whatever their columns are called."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import MaskedColumn, QTable, Table
+
+from miricigale.filters import as_photometry
+
+BANDS = ("miri.f770w", "wfc3.f160w")
+
+
+@pytest.fixture
+def catalog():
+    return QTable(
+        {
+            "id": ["a", "b"],
+            "miri.f770w": [1.0, 2.0] * u.uJy,
+            "miri.f770w_err": [0.1, 0.2] * u.uJy,
+            "wfc3.f160w": [3.0, 4.0] * u.uJy,
+            "wfc3.f160w_err": [0.3, 0.1] * u.uJy,
+            "F999X": [1, 2],
+        }
+    )
+
+
+def renamed(catalog, flux, error):
+    names = {"miri.f770w": "F770W", "wfc3.f160w": "F160W"}
+    out = catalog.copy()
+    for ours, theirs in names.items():
+        out.rename_column(ours, flux.format(theirs))
+        out.rename_column(f"{ours}_err", error.format(theirs))
+    return out
+
+
+def same(got, catalog):
+    for name in BANDS:
+        for column in (name, f"{name}_err"):
+            np.testing.assert_allclose(got[column].to_value(u.uJy), catalog[column].value)
+
+
+def test_a_table_by_our_names_is_itself(catalog):
+    assert as_photometry(catalog, BANDS) is catalog
+
+
+@pytest.mark.parametrize(
+    ("flux", "error"),
+    [
+        ("{}", "{}_err"),
+        ("{}", "e_{}"),
+        ("f_{}", "e_{}"),
+        ("flux_{}", "err_{}"),
+        ("{}_flux", "{}_flux_err"),
+        ("FLUX_{}", "FLUX_{}_ERR"),
+        ("{}", "{}_error"),
+    ],
+)
+def test_columns_are_called_in_many_ways(catalog, flux, error):
+    same(as_photometry(renamed(catalog, flux, error), BANDS), catalog)
+
+
+def test_any_kind_of_table_is_taken(catalog, tmp_path):
+    catalog.write(tmp_path / "a.ecsv")
+    plain = {name: catalog[name] for name in catalog.colnames if name != "id"}
+    same(as_photometry(tmp_path / "a.ecsv", BANDS), catalog)
+    got = as_photometry(plain, BANDS)
+    same(got, catalog)
+    assert got["id"].tolist() == [1, 2]
+    assert len(as_photometry(catalog[1], BANDS)) == 1
+
+
+def test_magnitudes_become_fluxes(catalog):
+    """0.1 mag is 9.2 % of a flux (to first order); AB 23.9 is 1 uJy."""
+    table = Table({"NUMBER": [7, 8], "mag_F770W": [23.9, 21.4], "e_mag_F770W": [0.1, 0.05]})
+    got = as_photometry(table, BANDS)
+    assert got["id"].tolist() == [7, 8]
+    np.testing.assert_allclose(got["miri.f770w"].value, [1.0, 10.0])
+    np.testing.assert_allclose(got["miri.f770w_err"].value, [0.0921034, 0.460517], rtol=1e-6)
+    catalog["miri.f770w"] = catalog["miri.f770w"].to(u.ABmag)
+    catalog["miri.f770w_err"] = [0.1, 0.1] * u.mag
+    got = as_photometry(catalog, BANDS)
+    np.testing.assert_allclose(got["miri.f770w"].value, [1.0, 2.0])
+    np.testing.assert_allclose(got["miri.f770w_err"].value, [0.0921034, 0.1842068], rtol=1e-6)
+    masked = Table({"mag_F770W": MaskedColumn([23.9, 1.0], mask=[False, True])})
+    assert np.isnan(as_photometry(masked, BANDS)["miri.f770w"].value).tolist() == [False, True]
+
+
+def test_two_columns_for_one_band_are_refused(catalog):
+    table = renamed(catalog, "{}", "{}_err")
+    table["jwst_f770w"] = table["F770W"]
+    with pytest.raises(ValueError, match=r"one column for 'miri.f770w', got 'F770W' and 'jwst_f77"):
+        as_photometry(table, BANDS)
+    with pytest.raises(ValueError, match=r"'catalog' must be a table, .*, got int"):
+        as_photometry(3, BANDS, "catalog")
