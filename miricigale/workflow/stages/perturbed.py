@@ -18,6 +18,8 @@ N_DRAWS = 1000
 
 #: Name of what no effect has changed.
 NONE = "none"
+#: Sizes of effects that the page gives in percent.
+_SHARES = ("psf_width", "flat", "gain", "linearity", "zero_point", "zero_point_existing")
 _LABELS = {NONE: "none", **EFFECTS, ALL: "all together"}
 
 
@@ -109,39 +111,21 @@ def _cost(statistic, known, own, seed):
     return value.n, value.value, value.error, change.value, change.error
 
 
-def write_perturbed(context, report, truths, every):
+def write_perturbed(page, truths, every):
     """Write the section with one table, if there are perturbed truths."""
-    config = context.config
-    table = perturbation_costs(truths, every, config.exposures.filters, seed=context.seed)
+    config, options = page.config, page.config.perturb
+    table = perturbation_costs(truths, every, config.exposures.filters, seed=page.context.seed)
     if len(table) == 0:
         return
-    context.save_table("report/perturbations.ecsv", table)
-    options = config.perturb
-    report.section(
-        "What the analysis does not know",
-        "Skies that differ from what reduction, photometry and fits assume, one effect at a time "
-        f"and together: a PSF of another wavefront, or {100 * options.psf_width:g} % wider or narrower; "
-        f"a flat field that is another detector's by {100 * options.flat:g} %; a gain other by "
-        f"{100 * options.gain:g} % (which the conversion to fluxes does not know either); a signal other by "
-        f"{100 * options.linearity:g} % at the full well; fluxes {100 * options.zero_point:g} % (MIRI) and "
-        f"{100 * options.zero_point_existing:g} % (existing bands) higher or lower, and positions "
-        f"{1000 * options.astrometry:g} mas off, by band; sources of other models, and of other shapes than "
-        f"the prior shows{_shapes(config, truths)}. Kernels, error functions, templates and grids stay as they "
-        "are.",
-    )
-    quantities = list(dict.fromkeys(table["quantity"]))
-    cells = {(row["truth"], row["perturbation"], row["quantity"]): row for row in table}
-    report.table(
-        [
-            (base, _LABELS[name], *(_cell(cells[base, name, q]) for q in quantities))
-            for base, name in dict.fromkeys((row["truth"], row["perturbation"]) for row in table)
-        ],
-        header=("sky", "perturbation", *(_header(quantity) for quantity in quantities)),
-        caption="Fluxes of bright isolated sources (above 20 sigma), redshifts and AGN fractions of "
-        "the fits with all MIRI bands. In brackets the change against the same sources without the perturbation, "
-        "and its error by bootstrap of these sources",
-        text=2,
-    )
+    sizes = {name: 100 * getattr(options, name) for name in _SHARES}
+    sizes["astrometry"] = 1000 * options.astrometry
+    page.numbers("perturbations", table, shapes=_shapes(config, truths), **sizes)
+    rows = {}
+    for row in table:
+        known = {"sky": row["truth"], "perturbation": _LABELS[row["perturbation"]]}
+        cells = rows.setdefault((row["truth"], row["perturbation"]), known)
+        cells[_header(row["quantity"])] = _cell(row)
+    page.table("table", rows.values())
 
 
 def _shapes(config, truths):
