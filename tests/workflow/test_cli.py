@@ -84,7 +84,10 @@ def test_an_empty_sample_is_refused(capsys, tmp_path):
         ("[highres]\nfilter = 'nircam.f200w'\n", "[highres] filter: "),
         ("[pointing]\nra = 10.0\n", "[pointing] at RA 10.0"),
         ("[scene]\nbackground_scale = 50.0\n", "the sky fills"),
-        ("[exposures]\nfilters = ['miri.f560x', 'miri.f770w']\n", "[exposures] filters must be filters out of"),
+        (
+            "[exposures]\nfilters = ['miri.f560x', 'miri.f770w']\n",
+            "[exposures] filters must be filters out of",
+        ),
         ("[fit]\nbands = ['megacam.x']\ndepths = [25.0]\n", "[fit] bands must be filters that"),
     ],
 )

@@ -500,6 +500,6 @@ def test_costs_are_changes_of_the_same_sources(tmp_path):
     write_perturbed(page, truths, every)
     page = report.to_html()
     assert "<th class=n>F770W offset</th>" in page
-    assert "<td>agn40</td><td>zero point, MIRI</td><td class=n>+2.0 (+2.0 ± 0.0) %</td>" in page
+    assert "<td>agn40</td><td>zero point, MIRI</td><td class=n>+2.0 % (+2.0 ± 0.0 %)</td>" in page
     written = QTable.read(tmp_path / "report" / "perturbations.ecsv")
     np.testing.assert_array_equal(written["change"], table["change"])

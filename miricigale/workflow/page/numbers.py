@@ -12,6 +12,7 @@ from miricigale.evaluation import (
     PUBLISHED_LIGHT,
     fraction_interval,
     integrated_light,
+    posterior_ranks,
     recovery_metrics,
     sigma_mad,
 )
@@ -111,6 +112,17 @@ class StudyTables:
         known = np.isfinite(self.truth["stellar_mass"].value)
         known &= ~np.asarray(self.truth["star"], bool)
         return self.truth[known & self.inside if field else known]
+
+
+def true_ranks(results, sample, name, seed):
+    """
+    Ranks of the true values of a parameter in their posteriors.
+
+    Ranks are randomized within cells of the grid, for injected fractions lie on its nodes.
+    """
+    values, levels = results.cdf(name)
+    true = u.Quantity(sample[name]).to_value(values.unit)
+    return posterior_ranks(true, values.value, levels, seed=seed)
 
 
 def as_ceers(config, name):

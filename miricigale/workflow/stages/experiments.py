@@ -2,7 +2,6 @@
 
 import importlib.util
 
-import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 from scipy import stats
@@ -11,7 +10,6 @@ from miricigale import fitting, photometry, sed
 from miricigale.evaluation import (
     fraction_interval,
     photoz_metrics,
-    posterior_ranks,
     recovery_metrics,
 )
 from miricigale.photometry.surveys import HERSCHEL_DEPTHS
@@ -19,6 +17,7 @@ from miricigale.utils.tables import described_rows
 from miricigale.workflow.derived import read_tables, rows_of
 from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.page.declared import sentence, texts_of
+from miricigale.workflow.page.numbers import true_ranks
 from miricigale.workflow.stages.fits import FIT_SECTIONS, fit_mock, fit_sample
 from miricigale.workflow.stages.inputs import sed_resources
 from miricigale.workflow.truths import of_truth, study_truths
@@ -161,9 +160,7 @@ def _ranked(results, sample, seed):
     for name in RANKED:
         rank = np.full(len(table), np.nan)
         if len(table) and not (name == "redshift" and results.redshift_fixed):
-            values, levels = results.cdf(name)
-            true = u.Quantity(sample[name]).to_value(values.unit)
-            rank = posterior_ranks(true, values.value, levels, seed=seed)
+            rank = true_ranks(results, sample, name, seed)
         table[f"{name}_rank"] = rank
         table[f"{name}_rank"].info.description = "Rank of the true value in the posterior"
     return table

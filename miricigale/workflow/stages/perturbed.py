@@ -7,9 +7,9 @@ from astropy.table import Table
 
 from miricigale.evaluation import bootstrap
 from miricigale.evaluation.estimates import median, outlier_share, scatter
-from miricigale.filters import Filter
-from miricigale.pages import Missing
-from miricigale.workflow.page.labels import band_label
+from miricigale.pages import Missing, number
+from miricigale.workflow.page.declared import sentence, texts_of
+from miricigale.workflow.page.labels import band_label, by_wavelength
 from miricigale.workflow.page.numbers import bright_isolated
 from miricigale.workflow.truths import ALL, CUTOUTS, EFFECTS
 
@@ -19,15 +19,14 @@ N_DRAWS = 1000
 #: Name of what no effect has changed.
 NONE = "none"
 #: Sizes of effects that the page gives in percent.
-_SHARES = ("psf_width", "flat", "gain", "linearity", "zero_point", "zero_point_existing")
+_SHARES = ("psf_width", "flat", "gain", "linearity", "zero_point", "zero_point_existing", "clumps")
 _LABELS = {NONE: "none", **EFFECTS, ALL: "all together"}
 
 
 def _quantities(bands):
     """Columns of the table: name to the kind of the values, the band, and their statistic."""
-    by_wave = sorted(bands, key=lambda name: Filter.from_name(name).pivot)
-    found = {}
-    for band in (by_wave[0], by_wave[-1]):
+    order, found = by_wavelength(bands), {}
+    for band in (order[0], order[-1]):
         found[f"{band} offset"] = ("flux", band, median)
         found[f"{band} scatter"] = ("flux", band, scatter)
     return found | {
@@ -118,29 +117,19 @@ def write_perturbed(page, truths, every):
     if len(table) == 0:
         return
     sizes = {name: 100 * getattr(options, name) for name in _SHARES}
-    sizes["astrometry"] = 1000 * options.astrometry
-    page.numbers("perturbations", table, shapes=_shapes(config, truths), **sizes)
+    sizes |= {"astrometry": 1000 * options.astrometry, "image": Path(options.cutouts).name}
+    effects = {name for truth in truths.values() for name, _ in truth.perturbations}
+    shapes = {"clumps": "clumps", CUTOUTS: f"cutouts_{options.cutouts_of}"}
+    texts = texts_of("perturbations")
+    shown = "; ".join(texts[label] for name, label in shapes.items() if name in effects)
+    shapes = sentence(f" ({shown})", sizes) if shown else ""
+    page.numbers("perturbations", table, shapes=shapes, **sizes)
     rows = {}
     for row in table:
         known = {"sky": row["truth"], "perturbation": _LABELS[row["perturbation"]]}
         cells = rows.setdefault((row["truth"], row["perturbation"]), known)
         cells[_header(row["quantity"])] = _cell(row)
     page.table("table", rows.values())
-
-
-def _shapes(config, truths):
-    """Which shapes: clumps are made up, and stamps are those of an image."""
-    effects = {name for truth in truths.values() for name, _ in truth.perturbations}
-    options, parts = config.perturb, []
-    if "clumps" in effects:
-        parts.append(f"{100 * options.clumps:g} % of the light of disks in made-up clumps")
-    if CUTOUTS in effects:
-        name = Path(options.cutouts).name
-        whose = (
-            "their own light" if options.cutouts_of == "own" else "light of galaxies of their size"
-        )
-        parts.append(f"{whose} on {name} in place of Sersic profiles")
-    return f" ({'; '.join(parts)})" if parts else ""
 
 
 def _header(quantity):
@@ -150,13 +139,11 @@ def _header(quantity):
 
 def _cell(row):
     """Text of a value and its change; per cent but for scatter of redshifts and fracAGN."""
-    if not np.isfinite(row["value"]):
-        return Missing("no source")
     share = "." in row["quantity"] or row["quantity"].endswith("outliers")
-    scale, digits, unit = (100, 1, " %") if share else (1, 4, "")
+    spec, alone = ".1f %" if share else ".4f", row["perturbation"] == NONE
     signed = "+" if row["quantity"].endswith("offset") else ""
-    text = f"{scale * row['value']:{signed}.{digits}f}"
-    if row["perturbation"] == NONE:
-        return f"{text} ± {scale * row['value_err']:.{digits}f}{unit}"
-    change = f"{scale * row['change']:+.{digits}f} ± {scale * row['change_err']:.{digits}f}"
-    return f"{text} ({change}){unit}"
+    error = row["value_err"] if alone else None
+    cell = number(row["value"], signed + spec, "no source", error=error)
+    if alone or isinstance(cell, Missing):
+        return cell
+    return f"{cell} ({number(row['change'], f'+{spec}', '', error=row['change_err'])})"
