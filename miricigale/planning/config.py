@@ -106,7 +106,7 @@ class ExposureSection:
         Pointings side by side.
     """
 
-    bands: tuple[str, ...] = CEERS_FILTERS
+    bands: tuple[str, ...] = option(CEERS_FILTERS, unique=True)
     time: tuple[float, ...] = option(
         (1665.0, 1665.0, 1665.0, 1665.0, 1665.0, 4662.0), low=0.0, single=True
     )
@@ -286,7 +286,6 @@ class PlanConfig(Configuration):
     def __post_init__(self):
         exposures, fit, agn, n = self.exposures, self.fit, self.agn, len(self.exposures.bands)
         self.check(n, "exposures.bands", "must name at least one filter")
-        self.check_unique("exposures.bands")
         for name in exposures.bands:
             if name not in imager_filters():
                 raise unknown_name("imaging filter", name, imager_filters())

@@ -83,12 +83,8 @@ class StudyConfig(Configuration):
             least = min(getattr(exposures, key), default=1)
             self.check(least >= 1, name, "must be at least 1", least)
         self.check(n, "exposures.filters", "must name at least one filter")
-        self.check_unique("exposures.filters")
         for name, values in (("sed.frac_agn", self.sed.frac_agn), ("fit.sets", fit.sets)):
             self.check(values, name, "must have at least one value")
-            self.check_unique(name)
-        for name in ("fit.experiments", "perturb.effects", "perturb.of", "variants.images"):
-            self.check_unique(name)
         scene = self.scene
         check_levels("scene", "background", scene.background, n, scene.background_date)
         first = self.sed.frac_agn[0]

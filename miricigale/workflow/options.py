@@ -1,5 +1,6 @@
 """Sections of options as frozen dataclasses: read from TOML, checked, written again."""
 
+import contextlib
 import dataclasses
 import inspect
 import json
@@ -27,12 +28,15 @@ class Limits:
         All that text may be.
     single : bool, optional
         Whether one value may stand for a list of one.
+    unique : bool, optional
+        Whether a list may not have a value twice.
     """
 
     low: float | None = None
     high: float | None = None
     choices: tuple | None = None
     single: bool = False
+    unique: bool = False
 
     def __str__(self):
         names = ", ".join(self.choices or ())
@@ -59,6 +63,18 @@ def require(good, section, key, wanted, got):
     if not good:
         msg = f"[{section}] {key} {wanted}, got {got}"
         raise ConfigError(msg)
+
+
+@contextlib.contextmanager
+def of_option(label, *errors):
+    """Name the option whose value a class refuses by one of some errors: a `ConfigError`."""
+    try:
+        yield
+    except ConfigError:
+        raise
+    except errors as err:
+        msg = f"{label} {err.args[0]}"
+        raise ConfigError(msg) from err
 
 
 def read_text(path):
@@ -106,20 +122,13 @@ class Configuration:
     def check(self, good, name, wanted, got=None):
         """Refuse a key ``section.key`` that does not agree with others; its value came, if not ``got``."""
         section, _, key = name.partition(".")
-        require(good, section, key, wanted, _shown(self._value(name)) if got is None else got)
+        value = operator.attrgetter(name)(self)
+        require(good, section, key, wanted, _shown(value) if got is None else got)
 
     def check_length(self, name, lengths, wanted):
         """Refuse a list whose length is none of ``lengths``; the message has the length."""
-        n = len(self._value(name))
+        n = len(operator.attrgetter(name)(self))
         self.check(n in lengths, name, wanted, n)
-
-    def check_unique(self, name):
-        """Refuse a list with a repeated value."""
-        values = self._value(name)
-        self.check(len(set(values)) == len(values), name, "must not repeat")
-
-    def _value(self, name):
-        return operator.attrgetter(name)(self)
 
     @classmethod
     def from_dict(cls, values, *, base=None):
@@ -212,7 +221,11 @@ def _checked(label, value, hint, limits):
         if not isinstance(value, (list, tuple)):
             raise _wrong(label, "a list", value)
         item = typing.get_args(hint)[0]
-        return tuple(_checked(label, entry, item, limits) for entry in value)
+        value = tuple(_checked(label, entry, item, limits) for entry in value)
+        if limits.unique and len(set(value)) != len(value):
+            msg = f"{label} must not repeat, got {list(value)}"
+            raise ConfigError(msg)
+        return value
     if isinstance(hint, types.UnionType):
         # a number within the limits, or one of the names
         named = isinstance(value, str)

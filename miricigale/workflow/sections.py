@@ -163,7 +163,7 @@ class SedSection:
     alpha: tuple[float, ...] = (1.5, 2.5)
     alpha_draw: str = option("uniform", choices=("uniform", "nodes"))
     frac_agn: tuple[float | str, ...] = option(
-        (0.0,), low=0.0, high=0.99, choices=(FIELD, CATALOG), single=True
+        (0.0,), low=0.0, high=0.99, choices=(FIELD, CATALOG), single=True, unique=True
     )
     infrared: str = option("fit", choices=("fit", "main-sequence"))
 
@@ -196,7 +196,7 @@ class ExposureSection:
         Exposure of a .pointing file (column Exp) of each filter, where their dithers differ.
     """
 
-    filters: tuple[str, ...] = CEERS_FILTERS
+    filters: tuple[str, ...] = option(CEERS_FILTERS, unique=True)
     plan: str = option("ceers", choices=("ceers", "quick"))
     kind: str = option("ramps", choices=("ramps", "rates"))
     n_groups: tuple[int, ...] = ()
@@ -409,8 +409,8 @@ class FitSection(FitBasics):
         Further fits of each sample with all MIRI bands.
     """
 
-    sets: tuple[str, ...] = option(("all", "none"), choices=SETS)
-    experiments: tuple[str, ...] = option((), choices=EXPERIMENTS)
+    sets: tuple[str, ...] = option(("all", "none"), choices=SETS, unique=True)
+    experiments: tuple[str, ...] = option((), choices=EXPERIMENTS, unique=True)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -470,10 +470,10 @@ class PerturbSection:
         own: the galaxy at the place of the source; any: a drawn one, scaled to its size.
     """
 
-    effects: tuple[str, ...] = option((), choices=(*EFFECTS, ALL), single=True)
+    effects: tuple[str, ...] = option((), choices=(*EFFECTS, ALL), single=True, unique=True)
     together: bool = True
     of: tuple[float | str, ...] = option(
-        (), low=0.0, high=0.99, choices=(FIELD, CATALOG), single=True
+        (), low=0.0, high=0.99, choices=(FIELD, CATALOG), single=True, unique=True
     )
     psf_width: float = option(0.02, low=0.0, high=0.2)
     flat: float = option(1.0, low=0.0, high=1.0)
@@ -500,7 +500,7 @@ class VariantSection:
         background, the plane that is taken off before the mesh.
     """
 
-    images: tuple[str, ...] = option((), choices=(*VARIANTS, ALL), single=True)
+    images: tuple[str, ...] = option((), choices=(*VARIANTS, ALL), single=True, unique=True)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,7 +1,6 @@
 """The study as one call."""
 
 import collections
-import contextlib
 from pathlib import Path
 
 import astropy.units as u
@@ -14,6 +13,7 @@ from miricigale.photometry.kernel_files import file_place
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow.disk import disk_use
 from miricigale.workflow.engine.runner import StudyRunner
+from miricigale.workflow.options import of_option
 from miricigale.workflow.sections import HighresSection
 from miricigale.workflow.stages import study_stages
 from miricigale.workflow.stages.exposures import grid_of, study_background, study_exposures
@@ -54,7 +54,7 @@ def check_study(config):
     ):
         unknown = sorted(set(names).difference(known))
         config.check(not unknown, name, f"must be filters {wanted}", unknown)
-    with _of_option("[exposures]"):
+    with of_option("[exposures]", KeyError, ValueError):
         exposures = study_exposures(config)
     number = collections.Counter(exposure.filter for exposure in exposures.values())
     few = [name for name in number if number[name] < 3]
@@ -62,7 +62,7 @@ def check_study(config):
     wanted = "must have three exposures of each filter to be 'dithers'"
     config.check(good, "reduction.background", wanted, few)
     for exposure in exposures.values():
-        with _of_option("[scene] background:"):
+        with of_option("[scene] background:", KeyError, ValueError, ImportError):
             level = study_background(config, exposure.filter)
         fill = float(saturation_forecast(exposure, background=level))
         if fill >= 1:
@@ -90,20 +90,8 @@ def check_study(config):
         return
     from miricigale.psf import hst_psf
 
-    with _of_option("[highres] filter:"):
+    with of_option("[highres] filter:", KeyError, ValueError):
         hst_psf(config.highres.filter, pixel_scale=config.highres.pixel_scale * u.arcsec)
-
-
-@contextlib.contextmanager
-def _of_option(label):
-    """Name the option that is wrong where a class of the package refuses its value."""
-    try:
-        yield
-    except ConfigError:
-        raise
-    except (KeyError, ValueError, ImportError) as err:
-        msg = f"{label} {err.args[0]}"
-        raise ConfigError(msg) from err
 
 
 def run_study(

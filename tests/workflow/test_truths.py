@@ -109,7 +109,7 @@ def test_dust_of_the_main_sequence_leaves_the_stars(truths, tmp_path):
 def test_the_dusts_alpha_is_drawn_from_nodes(tmp_path):
     nodes = {"alpha": [1.5, 2.5], "alpha_draw": "nodes", "frac_agn": 0.0}
     assert set(make_truths(tmp_path, **nodes)["agn00"]["alpha"]) == {1.5, 2.0, 2.5}
-    with pytest.raises(ConfigError, match="holds no node"):
+    with pytest.raises(ConfigError, match="must hold a node"):
         make_truths(tmp_path, **{**nodes, "alpha": [1.6, 1.7]})
 
 
