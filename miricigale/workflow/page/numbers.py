@@ -229,18 +229,12 @@ def _detected(config, tables, least):
         if limit > config.catalog.mag_limit:
             continue
         chosen = tables.field & (prior < limit)
-        n = int(np.count_nonzero(chosen & (tables.matched["n_detected"] >= least)))
-        fraction, low, high = fraction_interval(n, int(chosen.sum()))
-        row = {
-            "limit": limit,
-            "n": int(chosen.sum()),
-            "fraction": fraction,
-            "low": low,
-            "high": high,
-        }
-        known = proposal is not None and chosen.any()
-        row["to_proposal"] = float(np.mean(proposal[chosen] >= least)) if known else np.nan
-        rows.append(row | {"paper": paper})
+        n, found = int(chosen.sum()), chosen & (tables.matched["n_detected"] >= least)
+        fraction, low, high = fraction_interval(int(np.count_nonzero(found)), n)
+        known = proposal is not None and n > 0
+        to_proposal = float(np.mean(proposal[chosen] >= least)) if known else np.nan
+        row = {"limit": limit, "n": n, "fraction": fraction, "low": low, "high": high}
+        rows.append(row | {"to_proposal": to_proposal, "paper": paper})
     return rows
 
 
