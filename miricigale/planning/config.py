@@ -284,7 +284,7 @@ class PlanConfig(Configuration):
     overheads: OverheadSection = dataclasses.field(default_factory=OverheadSection)
 
     def __post_init__(self):
-        exposures, fit, agn, n = self.exposures, self.fit, self.agn, len(self.exposures.bands)
+        exposures, agn, n = self.exposures, self.agn, len(self.exposures.bands)
         self.check(n, "exposures.bands", "must name at least one filter")
         for name in exposures.bands:
             if name not in imager_filters():
@@ -295,8 +295,6 @@ class PlanConfig(Configuration):
         if not exposures.depth:
             least = min(exposures.time)
             self.check(least > 0, "exposures.time", "must be positive", least)
-        wanted = f"must have one number per band ({len(fit.bands)})"
-        self.check_length("fit.depths", (len(fit.bands),), wanted)
         wanted = f"must have one number per fracAGN ({len(agn.frac_agn)})"
         self.check_length("agn.shares", (len(agn.frac_agn),), wanted)
         self.check(sum(agn.shares) > 0, "agn.shares", "must not all be 0")

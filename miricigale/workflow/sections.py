@@ -85,6 +85,12 @@ class CatalogSection:
     mag_limit: float = option(26.6, low=10.0, high=40.0)
     mag_column: str = "mag_f160w"
 
+    def __post_init__(self):
+        for key in ("columns", "units"):
+            pairs = getattr(self, key)
+            good = all(len(pair.split("=")) == 2 and all(pair.split("=")) for pair in pairs)
+            require(good, "catalog", key, "must have the form 'name=value'", list(pairs))
+
 
 @dataclasses.dataclass(frozen=True)
 class PointingSection:
@@ -166,6 +172,11 @@ class SedSection:
         (0.0,), low=0.0, high=0.99, choices=(FIELD, CATALOG), single=True, unique=True
     )
     infrared: str = option("fit", choices=("fit", "main-sequence"))
+
+    def __post_init__(self):
+        good = len(self.alpha) == 2 and 0 < self.alpha[0] <= self.alpha[1] <= 4
+        wanted = "must be two numbers in order, above 0 to 4"
+        require(good, "sed", "alpha", wanted, list(self.alpha))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -394,6 +405,11 @@ class FitBasics:
     axes: str = option("fit", choices=("fit", "quick"))
     model_error: float = option(0.1, low=0.0, high=1.0)
     min_detected: int = option(2, low=0, high=9)
+
+    def __post_init__(self):
+        n = len(self.bands)
+        wanted = f"must have one number per band ({n})"
+        require(len(self.depths) == n, "fit", "depths", wanted, len(self.depths))
 
 
 @dataclasses.dataclass(frozen=True)
