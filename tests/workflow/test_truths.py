@@ -128,7 +128,7 @@ def test_names_of_truths_and_sets():
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"sed": {"frac_agn": []}}, "must have at least one value"),
+        ({"sed": {"frac_agn": []}}, "must begin with a number, got none"),
         ({"sed": {"frac_agn": [0.2, 0.2]}}, "must not repeat"),
         ({"sed": {"frac_agn": ["field", 0.0]}}, "must begin with a number"),
         ({"sed": {"frac_agn": [0.0, "quasars"]}}, r"must be one of \['field', 'catalog'\]"),
