@@ -16,14 +16,15 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.instrument.image_files import read_image
-from miricigale.pages import number
+from miricigale.pages import cell_of, number
 from miricigale.sed import SEDModel
 from miricigale.workflow import Context, load_config
 from miricigale.workflow.page import band_figures, labels, pictures, provenance, study_figures
+from miricigale.workflow.page.declared import texts_of
 from miricigale.workflow.page.numbers import StudyTables
 from miricigale.workflow.page.paper import study_results
 from miricigale.workflow.stages.sample import SampleFlags, typical_source
-from miricigale.workflow.stages.variants import HEADER, variant_rows
+from miricigale.workflow.stages.variants import variant_entries
 from miricigale.workflow.truths import reference, study_truths, variant_changes
 
 
@@ -155,8 +156,13 @@ def main():
     header = ("fit", "n", "dz/(1+z)", "sigma_MAD", "outliers", "fracAGN", "scatter", "width")
     print(rst_table(header, rows), "\n")
     if config.variants.images:
-        rows = variant_rows(QTable.read(run / "report" / "variants.ecsv"), variant_changes(config))
-        print(rst_table(HEADER, rows))
+        table = QTable.read(run / "report" / "variants.ecsv")
+        columns = texts_of("variants")["table"]["columns"]
+        rows = [
+            [cell_of(entry, tuple(column)) for _, *column in columns]
+            for entry in variant_entries(table, variant_changes(config))
+        ]
+        print(rst_table([header for header, *_ in columns], rows))
 
 
 if __name__ == "__main__":

@@ -5,195 +5,252 @@ from typing import ClassVar
 
 from miricigale.instrument import CEERS_FILTERS, imager_filters, readout_patterns
 from miricigale.utils.exceptions import unknown_name
-from miricigale.workflow.background import LEVELS_DOC, check_levels
+from miricigale.workflow.background import check_levels
 from miricigale.workflow.options import Configuration, option, read_text
-from miricigale.workflow.sections import CatalogSection, FitBasics, SedSection
+from miricigale.workflow.sections import CatalogSection, FitBasics, RunBasics, SedSection
 
 
 @dataclasses.dataclass(frozen=True)
-class PlanSection:
-    """What the plan is called and how it goes."""
+class PlanSection(RunBasics):
+    """
+    What the plan is called and how it goes.
 
-    name: str = option("plan", "Name of the plan; its folder unless --output is given.")
-    seed: int = option(20210211, "Seed of every random draw.", low=0)
-    threads: int = option(0, "Threads; 0 for as many as there are cores.", low=0)
+    Parameters
+    ----------
+    name
+        Name of the plan; its folder unless --output is given.
+    """
+
+    name: str = "plan"
 
 
 @dataclasses.dataclass(frozen=True)
 class SampleSection:
-    """The galaxies of the mock photometry."""
+    """
+    The galaxies of the mock photometry.
 
-    n_sources: int = option(500, "Sources drawn from it; 0 for all.", low=0, high=100000)
-    redshift: tuple[float, ...] = option((0.01, 6.0), "Range of redshifts.", low=0.0, high=20.0)
-    luminosity: tuple[float, ...] = option(
-        (0.0, 16.0), "Range of log10 of the dust's luminosity (Lsun).", low=0.0, high=20.0
-    )
-    area: float = option(
-        0.0, "Area of the catalog (square arcmin); 0 for the bundled one's.", low=0.0
-    )
-    luminosity_function: str = option(
-        "",
-        "Table of log_luminosity, redshift, phi (per Mpc3 and dex) that the sample is drawn after.",
-    )
+    Parameters
+    ----------
+    n_sources
+        Sources drawn from it; 0 for all.
+    redshift
+        Range of redshifts.
+    luminosity
+        Range of log10 of the dust's luminosity (Lsun).
+    area
+        Area of the catalog (square arcmin); 0 for the bundled one's.
+    luminosity_function
+        Table of log_luminosity, redshift, phi (per Mpc3 and dex) that the sample is drawn after.
+    """
+
+    n_sources: int = option(500, low=0, high=100000)
+    redshift: tuple[float, ...] = option((0.01, 6.0), low=0.0, high=20.0)
+    luminosity: tuple[float, ...] = option((0.0, 16.0), low=0.0, high=20.0)
+    area: float = option(0.0, low=0.0)
+    luminosity_function: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
 class AgnSection:
-    """The mix of AGN, and how they are selected."""
+    """
+    The mix of AGN, and how they are selected.
 
-    field: bool = option(
-        False, "Whether AGN are those of a real field, after an X-ray luminosity function."
-    )
+    Parameters
+    ----------
+    field
+        Whether AGN are those of a real field, after an X-ray luminosity function.
+    frac_agn
+        fracAGN of the sources, unless of a field or in a column frac_agn of the catalog.
+    shares
+        Share of the sources of each.
+    limit
+        fracAGN from which a source is an AGN.
+    select
+        Selected by the probability of a fracAGN above the limit, or by the mean.
+    threshold
+        Least probability of a selected source.
+    """
+
+    field: bool = False
     frac_agn: tuple[float, ...] = option(
-        (0.0, 0.2, 0.4, 0.6, 0.8, 0.99),
-        "fracAGN of the sources, unless of a field or in a column frac_agn of the catalog.",
-        low=0.0,
-        high=0.99,
-        single=True,
+        (0.0, 0.2, 0.4, 0.6, 0.8, 0.99), low=0.0, high=0.99, single=True
     )
-    shares: tuple[float, ...] = option(
-        (0.5, 0.1, 0.1, 0.1, 0.1, 0.1), "Share of the sources of each.", low=0.0, single=True
-    )
-    limit: float = option(0.4, "fracAGN from which a source is an AGN.", low=0.01, high=0.99)
-    select: str = option(
-        "probability",
-        "Selected by the probability of a fracAGN above the limit, or by the mean.",
-        choices=("probability", "mean"),
-    )
-    threshold: float = option(0.5, "Least probability of a selected source.", low=0.0, high=1.0)
+    shares: tuple[float, ...] = option((0.5, 0.1, 0.1, 0.1, 0.1, 0.1), low=0.0, single=True)
+    limit: float = option(0.4, low=0.01, high=0.99)
+    select: str = option("probability", choices=("probability", "mean"))
+    threshold: float = option(0.5, low=0.0, high=1.0)
 
 
 @dataclasses.dataclass(frozen=True)
 class ExposureSection:
-    """The MIRI bands, and how long each is exposed."""
+    """
+    The MIRI bands, and how long each is exposed.
 
-    bands: tuple[str, ...] = option(CEERS_FILTERS, "MIRI filters.")
+    Parameters
+    ----------
+    bands
+        MIRI filters.
+    time
+        Exposure time (s) of each band in a pointing, all dithers; one for all.
+    depth
+        5-sigma AB depth of each band instead of a time.
+    dithers
+        Dithers of each band.
+    readout
+        Readout pattern.
+    max_fill
+        Largest share of the well that the sky fills.
+    sets
+        Sets of bands that are compared: all, or names joined by commas.
+    pointings
+        Pointings side by side.
+    """
+
+    bands: tuple[str, ...] = option(CEERS_FILTERS, unique=True)
     time: tuple[float, ...] = option(
-        (1665.0, 1665.0, 1665.0, 1665.0, 1665.0, 4662.0),
-        "Exposure time (s) of each band in a pointing, all dithers; one for all.",
-        low=0.0,
-        single=True,
+        (1665.0, 1665.0, 1665.0, 1665.0, 1665.0, 4662.0), low=0.0, single=True
     )
-    depth: tuple[float, ...] = option(
-        (), "5-sigma AB depth of each band instead of a time.", low=10.0, high=40.0, single=True
-    )
-    dithers: tuple[int, ...] = option(
-        (3, 3, 3, 3, 3, 6), "Dithers of each band.", low=1, high=500, single=True
-    )
-    readout: str = option("FASTR1", "Readout pattern.", choices=readout_patterns())
-    max_fill: float = option(
-        0.6, "Largest share of the well that the sky fills.", low=0.05, high=0.95
-    )
-    sets: tuple[str, ...] = option(
-        ("all",), "Sets of bands that are compared: all, or names joined by commas."
-    )
-    pointings: int = option(1, "Pointings side by side.", low=1, high=10000)
+    depth: tuple[float, ...] = option((), low=10.0, high=40.0, single=True)
+    dithers: tuple[int, ...] = option((3, 3, 3, 3, 3, 6), low=1, high=500, single=True)
+    readout: str = option("FASTR1", choices=readout_patterns())
+    max_fill: float = option(0.6, low=0.05, high=0.95)
+    sets: tuple[str, ...] = ("all",)
+    pointings: int = option(1, low=1, high=10000)
 
 
 @dataclasses.dataclass(frozen=True)
 class BackgroundSection:
-    """The sky."""
+    """
+    The sky.
 
-    level: tuple[str, ...] = option(("low",), LEVELS_DOC, single=True)
-    ra: float = option(-1.0, "Right ascension in degrees; -1: no position.", low=-1, high=360)
-    dec: float = option(0.0, "Declination in degrees.", low=-90, high=90)
-    date: str = option("", "Day, such as 2027-03-01, instead of a level (needs zodipy).")
+    Parameters
+    ----------
+    level
+        Zodiacal light (low, medium, high) or surface brightness ('12.5 MJy/sr'); one for all filters, or one
+        for each.
+    ra
+        Right ascension in degrees; -1: no position.
+    dec
+        Declination in degrees.
+    date
+        Day, such as 2027-03-01, instead of a level (needs zodipy).
+    """
+
+    level: tuple[str, ...] = option(("low",), single=True)
+    ra: float = option(-1.0, low=-1, high=360)
+    dec: float = option(0.0, low=-90, high=90)
+    date: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
 class NoiseSection:
-    """Where the errors of MIRI fluxes come from."""
+    """
+    Where the errors of MIRI fluxes come from.
 
-    kind: str = option(
-        "fitted",
-        "Fit on the mosaic, aperture photometry, or the error function of a run.",
-        choices=("fitted", "aperture", "run"),
-    )
-    run: str = option("", "Folder of the run whose errors.ecsv is scaled, with kind = 'run'.")
-    residual: float | str = option(
-        0.0,
-        "Fraction of the sky that stays as a fixed pattern, or the calculator's.",
-        low=0.0,
-        high=0.1,
-        choices=("etc",),
-    )
-    fractional: float = option(
-        0.03, "Part of the flux added in quadrature (templates, blends).", low=0.0, high=1.0
-    )
-    sizes: bool = option(True, "Whether errors grow with the half-light radii of the sources.")
+    Parameters
+    ----------
+    kind
+        Fit on the mosaic, aperture photometry, or the error function of a run.
+    run
+        Folder of the run whose errors.ecsv is scaled, with kind = 'run'.
+    residual
+        Fraction of the sky that stays as a fixed pattern, or the calculator's.
+    fractional
+        Part of the flux added in quadrature (templates, blends).
+    sizes
+        Whether errors grow with the half-light radii of the sources.
+    """
+
+    kind: str = option("fitted", choices=("fitted", "aperture", "run"))
+    run: str = ""
+    residual: float | str = option(0.0, low=0.0, high=0.1, choices=("etc",))
+    fractional: float = option(0.03, low=0.0, high=1.0)
+    sizes: bool = True
 
 
 @dataclasses.dataclass(frozen=True)
 class ImageSection:
-    """Images of the planned exposures, measured as in a run, beside the noise of the section above."""
+    """
+    Images of the planned exposures, measured as in a run, beside the noise of the section above.
 
-    enabled: bool = option(False, "Whether the exposures are imaged and measured too.")
-    kind: str = option("rates", "As of the exposures of a run.", choices=("rates", "ramps"))
-    ra: float = option(
-        -1.0,
-        "Right ascension of the pointing in degrees; -1: the middle of the catalog.",
-        low=-1,
-        high=360,
-    )
-    dec: float = option(0.0, "Declination in degrees.", low=-90, high=90)
-    roll: float = option(0.0, "Position angle of V3 in degrees.", low=-360, high=360)
+    Parameters
+    ----------
+    enabled
+        Whether the exposures are imaged and measured too.
+    kind
+        As of the exposures of a run.
+    ra
+        Right ascension of the pointing in degrees; -1: the middle of the catalog.
+    dec
+        Declination in degrees.
+    roll
+        Position angle of V3 in degrees.
+    """
+
+    enabled: bool = False
+    kind: str = option("rates", choices=("rates", "ramps"))
+    ra: float = option(-1.0, low=-1, high=360)
+    dec: float = option(0.0, low=-90, high=90)
+    roll: float = option(0.0, low=-360, high=360)
 
 
 @dataclasses.dataclass(frozen=True)
 class SurveySection:
-    """Depth against area."""
+    """
+    Depth against area.
 
-    areas: tuple[int, ...] = option(
-        (), "Numbers of pointings that the exposure times are divided among.", low=1, high=1000
-    )
-    rank: str = option(
-        "agn",
-        "What is ranked for each hour: AGN found, or precision of fracAGN or redshift.",
-        choices=("agn", "frac_agn", "redshift"),
-    )
+    Parameters
+    ----------
+    areas
+        Numbers of pointings that the exposure times are divided among.
+    rank
+        What is ranked for each hour: AGN found, or precision of fracAGN or redshift.
+    """
+
+    areas: tuple[int, ...] = option((), low=1, high=1000)
+    rank: str = option("agn", choices=("agn", "frac_agn", "redshift"))
 
 
 @dataclasses.dataclass(frozen=True)
 class OverheadSection:
-    """What the observatory charges besides the exposures, in s: approximations to APT."""
+    """
+    What the observatory charges besides the exposures, in s: approximations to APT.
+
+    Parameters
+    ----------
+    slew
+        Slew to the first pointing (as in reports of APT's Smart Accounting).
+    next_slew
+        Slew to a neighboring pointing; of our own: such reports have 51 s to the next visit of a target,
+        and 169 s with another roll.
+    guide_star
+        Acquisition of the guide star of each pointing (JDox, Visit Timing).
+    visit
+        Scripts and cleanup of each pointing (JDox, JWST Instrument Overheads).
+    filter
+        Move of the filter wheel, each band (JDox, JWST Instrument Overheads).
+    script
+        Compilation of scripts, each band (JDox, JWST Instrument Overheads).
+    exposure
+        Set-up and cleanup of each exposure (JDox, JWST Instrument Overheads: of the first of several
+        dithers; APT charges less for the others).
+    dither
+        Small angle maneuver between dithers; of our own: APT takes it from the distance (JDox, JWST Slew
+        Times and Overheads).
+    observatory
+        Part added to all of it (JDox, JWST Observing Overheads Summary).
+    """
 
     # JDox is the JWST user documentation; its "JWST Instrument Overheads" are of APT 2023.3.4
-    slew: float = option(
-        1800.0, "Slew to the first pointing (as in reports of APT's Smart Accounting).", low=0.0
-    )
-    next_slew: float = option(
-        150.0,
-        "Slew to a neighboring pointing; of our own: such reports have 51 s to the next visit of a "
-        "target, and 169 s with another roll.",
-        low=0.0,
-    )
-    guide_star: float = option(
-        284.0, "Acquisition of the guide star of each pointing (JDox, Visit Timing).", low=0.0
-    )
-    visit: float = option(
-        90.0, "Scripts and cleanup of each pointing (JDox, JWST Instrument Overheads).", low=0.0
-    )
-    filter: float = option(
-        50.0, "Move of the filter wheel, each band (JDox, JWST Instrument Overheads).", low=0.0
-    )
-    script: float = option(
-        22.0, "Compilation of scripts, each band (JDox, JWST Instrument Overheads).", low=0.0
-    )
-    exposure: float = option(
-        44.0,
-        "Set-up and cleanup of each exposure (JDox, JWST Instrument Overheads: of the first of several "
-        "dithers; APT charges less for the others).",
-        low=0.0,
-    )
-    dither: float = option(
-        60.0,
-        "Small angle maneuver between dithers; of our own: APT takes it from the distance (JDox, JWST "
-        "Slew Times and Overheads).",
-        low=0.0,
-    )
-    observatory: float = option(
-        0.16, "Part added to all of it (JDox, JWST Observing Overheads Summary).", low=0.0, high=1.0
-    )
+    slew: float = option(1800.0, low=0.0)
+    next_slew: float = option(150.0, low=0.0)
+    guide_star: float = option(284.0, low=0.0)
+    visit: float = option(90.0, low=0.0)
+    filter: float = option(50.0, low=0.0)
+    script: float = option(22.0, low=0.0)
+    exposure: float = option(44.0, low=0.0)
+    dither: float = option(60.0, low=0.0)
+    observatory: float = option(0.16, low=0.0, high=1.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -227,9 +284,8 @@ class PlanConfig(Configuration):
     overheads: OverheadSection = dataclasses.field(default_factory=OverheadSection)
 
     def __post_init__(self):
-        exposures, fit, agn, n = self.exposures, self.fit, self.agn, len(self.exposures.bands)
+        exposures, agn, n = self.exposures, self.agn, len(self.exposures.bands)
         self.check(n, "exposures.bands", "must name at least one filter")
-        self.check_unique("exposures.bands")
         for name in exposures.bands:
             if name not in imager_filters():
                 raise unknown_name("imaging filter", name, imager_filters())
@@ -239,8 +295,6 @@ class PlanConfig(Configuration):
         if not exposures.depth:
             least = min(exposures.time)
             self.check(least > 0, "exposures.time", "must be positive", least)
-        wanted = f"must have one number per band ({len(fit.bands)})"
-        self.check_length("fit.depths", (len(fit.bands),), wanted)
         wanted = f"must have one number per fracAGN ({len(agn.frac_agn)})"
         self.check_length("agn.shares", (len(agn.frac_agn),), wanted)
         self.check(sum(agn.shares) > 0, "agn.shares", "must not all be 0")

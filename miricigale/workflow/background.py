@@ -9,11 +9,6 @@ from miricigale.depth import sky_background
 from miricigale.utils.units import SURFACE_BRIGHTNESS
 from miricigale.workflow.options import require
 
-#: What the options say of levels.
-LEVELS_DOC = (
-    "Zodiacal light (low, medium, high) or surface brightness ('12.5 MJy/sr'); one for all filters, or "
-    "one for each."
-)
 #: Names of levels, and the percentiles that they are.
 _PERCENTILES = {"low": 10, "medium": 50, "high": 90}
 

@@ -11,8 +11,6 @@ import types
 import numpy as np
 from astropy.table import QTable
 
-from miricigale.pages import Missing, number
-
 #: Why a number of a comparison is missing.
 NO_SOURCE = "no such source"
 
@@ -52,49 +50,3 @@ def rows_of(table, ids):
     """Return the rows of a table with the given ids, in their order."""
     place = {key: row for row, key in enumerate(np.asarray(table["id"]))}
     return table[[place[key] for key in np.asarray(ids)]]
-
-
-@dataclasses.dataclass(frozen=True)
-class Cell:
-    """
-    A number of a comparison as the page shows it.
-
-    Parameters
-    ----------
-    header : str
-        Name of its column on the page.
-    key : str
-        Name of its value in a row.
-    spec : str
-        Format, such as ``"+.2f"``.
-    scale : float, optional
-        Factor before it is written.
-    unit : str, optional
-        Text after the number.
-    error : bool, optional
-        Whether its error, ``<key>_err`` in a row, follows the value.
-    why : str, optional
-        Why there is no number where the value is not finite.
-    """
-
-    header: str
-    key: str
-    spec: str
-    scale: float = 1
-    unit: str = ""
-    error: bool = False
-    why: str = NO_SOURCE
-
-    def text(self, row):
-        """Text of the number in a row of a table, or `~miricigale.pages.Missing`."""
-        text = number(row[self.key], self.spec, self.why, scale=self.scale)
-        if isinstance(text, Missing):
-            return text
-        if self.error:
-            text += f" ± {self.scale * row[f'{self.key}_err']:{self.spec.lstrip('+')}}"
-        return text + self.unit
-
-
-def cells_of(row, cells):
-    """Texts of several `Cell` objects in a row of a table."""
-    return [cell.text(row) for cell in cells]

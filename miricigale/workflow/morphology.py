@@ -185,7 +185,7 @@ class RealGalaxies:
 
     @functools.cached_property
     def _found(self):
-        """Light before the PSF, labels, detections and the pixels that may be used."""
+        """Light before the PSF, labels, detections, pixels that may be used and boxes of the labels."""
         segments, table = photometry.detect_sources(self.image, **DETECTION)
         usable = np.isfinite(self.image.data)
         if self.image.mask is not None:
@@ -198,11 +198,8 @@ class RealGalaxies:
             data, rim = deconvolve(data, array), int(np.ceil(_RIM / scale))
         # what lies beyond the edges is not known
         usable[:rim], usable[-rim:], usable[:, :rim], usable[:, -rim:] = False, False, False, False
-        return data, np.asarray(segments.data), table, usable
-
-    @functools.cached_property
-    def _slices(self):
-        return find_objects(self._found[1])
+        labels = np.asarray(segments.data)
+        return data, labels, table, usable, find_objects(labels)
 
     def cutout(self, label, position=None):
         """
@@ -220,8 +217,8 @@ class RealGalaxies:
         cutout : `~miricigale.scene.Cutout` or None
             None where its signal-to-noise is below 50, or a pixel of it is masked or near the edge.
         """
-        data, labels, table, usable = self._found
-        box = self._slices[label - 1]
+        data, labels, table, usable, boxes = self._found
+        box = boxes[label - 1]
         own = labels[box] == label
         if not (table["snr"][label - 1] >= MIN_SNR and np.all(usable[box][own])):
             return None

@@ -1,9 +1,12 @@
 """Sections of options as frozen dataclasses: read from TOML, checked, written again."""
 
+import contextlib
 import dataclasses
+import inspect
 import json
 import math
 import operator
+import re
 import tomllib
 import types
 import typing
@@ -12,10 +15,47 @@ from pathlib import Path
 from miricigale.utils.exceptions import ConfigError
 
 
-def option(default, doc, *, low=None, high=None, choices=None, single=False):
-    """A field with its documentation and limits in the metadata; ``single``: a list may be one value."""
-    limits = {"doc": doc, "low": low, "high": high, "choices": choices, "single": single}
-    return dataclasses.field(default=default, metadata=limits)
+@dataclasses.dataclass(frozen=True)
+class Limits:
+    """
+    What values a key of a configuration may have.
+
+    Parameters
+    ----------
+    low, high : float, optional
+        Least and largest number.
+    choices : tuple of str, optional
+        All that text may be.
+    single : bool, optional
+        Whether one value may stand for a list of one.
+    unique : bool, optional
+        Whether a list may not have a value twice.
+    """
+
+    low: float | None = None
+    high: float | None = None
+    choices: tuple | None = None
+    single: bool = False
+    unique: bool = False
+
+    def __str__(self):
+        names = ", ".join(self.choices or ())
+        if self.low is None:
+            return f" One of {names}." if names else ""
+        span = f"at least {self.low}" if self.high is None else f"{self.low} to {self.high}"
+        return f" ({span} or {names})" if names else f" ({span})"
+
+
+def option(default, **limits):
+    """A field of a section with `Limits`; one without needs its default only."""
+    return dataclasses.field(default=default, metadata={"limits": Limits(**limits)})
+
+
+def option_docs(section):
+    """What the docstrings of a section, and of those that it inherits from, say of each key."""
+    text = "\n".join(inspect.cleandoc(cls.__doc__ or "") for cls in reversed(section.__mro__))
+    entries = re.findall(r"^(\w+)\n((?: +.*\n)+)", text + "\n", flags=re.MULTILINE)
+    return {name: " ".join(doc.split()) for name, doc in entries}
 
 
 def require(good, section, key, wanted, got):
@@ -23,6 +63,18 @@ def require(good, section, key, wanted, got):
     if not good:
         msg = f"[{section}] {key} {wanted}, got {got}"
         raise ConfigError(msg)
+
+
+@contextlib.contextmanager
+def of_option(label, *errors):
+    """Name the option whose value a class refuses by one of some errors: a `ConfigError`."""
+    try:
+        yield
+    except ConfigError:
+        raise
+    except errors as err:
+        msg = f"{label} {err.args[0]}"
+        raise ConfigError(msg) from err
 
 
 def read_text(path):
@@ -70,20 +122,13 @@ class Configuration:
     def check(self, good, name, wanted, got=None):
         """Refuse a key ``section.key`` that does not agree with others; its value came, if not ``got``."""
         section, _, key = name.partition(".")
-        require(good, section, key, wanted, _shown(self._value(name)) if got is None else got)
+        value = operator.attrgetter(name)(self)
+        require(good, section, key, wanted, _shown(value) if got is None else got)
 
     def check_length(self, name, lengths, wanted):
         """Refuse a list whose length is none of ``lengths``; the message has the length."""
-        n = len(self._value(name))
+        n = len(operator.attrgetter(name)(self))
         self.check(n in lengths, name, wanted, n)
-
-    def check_unique(self, name):
-        """Refuse a list with a repeated value."""
-        values = self._value(name)
-        self.check(len(set(values)) == len(values), name, "must not repeat")
-
-    def _value(self, name):
-        return operator.attrgetter(name)(self)
 
     @classmethod
     def from_dict(cls, values, *, base=None):
@@ -134,9 +179,10 @@ class Configuration:
         lines = [self.heading]
         for field in dataclasses.fields(self):
             section = getattr(self, field.name)
-            lines += ["", f"[{field.name}]  # {type(section).__doc__.strip()}"]
+            summary, docs = type(section).__doc__.split("\n\n")[0], option_docs(type(section))
+            lines += ["", f"[{field.name}]  # {summary.strip()}"]
             for entry in dataclasses.fields(section):
-                lines.append(f"# {entry.metadata['doc']}{_limits_text(entry.metadata)}")
+                lines.append(f"# {docs[entry.name]}{_limits_of(entry)}")
                 lines.append(f"{entry.name} = {toml_value(getattr(section, entry.name))}")
         return "\n".join(lines) + "\n"
 
@@ -158,7 +204,7 @@ def _replace_section(name, section, entries):
         raise ConfigError(msg)
     hints = typing.get_type_hints(type(section))
     changes = {
-        key: _checked(f"[{name}] {key}", value, hints[key], fields[key].metadata)
+        key: _checked(f"[{name}] {key}", value, hints[key], _limits_of(fields[key]))
         for key, value in entries.items()
     }
     return dataclasses.replace(section, **changes)
@@ -170,24 +216,28 @@ def _wrong(label, wanted, value):
 
 def _checked(label, value, hint, limits):
     if typing.get_origin(hint) is tuple:
-        if limits["single"] and isinstance(value, (int, float, str)):
+        if limits.single and isinstance(value, (int, float, str)):
             value = (value,)
         if not isinstance(value, (list, tuple)):
             raise _wrong(label, "a list", value)
         item = typing.get_args(hint)[0]
-        return tuple(_checked(label, entry, item, limits) for entry in value)
+        value = tuple(_checked(label, entry, item, limits) for entry in value)
+        if limits.unique and len(set(value)) != len(value):
+            msg = f"{label} must not repeat, got {list(value)}"
+            raise ConfigError(msg)
+        return value
     if isinstance(hint, types.UnionType):
         # a number within the limits, or one of the names
         named = isinstance(value, str)
         hint = str if named else float
-        limits = {**limits, **({"low": None, "high": None} if named else {"choices": None})}
+        limits = Limits(choices=limits.choices) if named else Limits(limits.low, limits.high)
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if type(value) is not hint:
         raise _wrong(label, f"of type {hint.__name__}", value)
     if hint is float and not math.isfinite(value):
         raise _wrong(label, "a finite number", value)
-    low, high, choices = limits["low"], limits["high"], limits["choices"]
+    low, high, choices = limits.low, limits.high, limits.choices
     if choices and value not in choices:
         raise _wrong(label, f"one of {list(choices)}", value)
     # the negated comparison also refuses NaN
@@ -197,16 +247,8 @@ def _checked(label, value, hint, limits):
     return value
 
 
-def _limits_text(limits):
-    if limits["choices"] and limits["low"] is not None:
-        return f" ({limits['low']} to {limits['high']} or {', '.join(limits['choices'])})"
-    if limits["choices"]:
-        return f" One of {', '.join(limits['choices'])}."
-    if limits["low"] is not None and limits["high"] is not None:
-        return f" ({limits['low']} to {limits['high']})"
-    if limits["low"] is not None:
-        return f" (at least {limits['low']})"
-    return ""
+def _limits_of(field):
+    return field.metadata.get("limits", Limits())
 
 
 def toml_value(value):

@@ -13,6 +13,7 @@ from miricigale.photometry.kernel_files import file_place
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow.disk import disk_use
 from miricigale.workflow.engine.runner import StudyRunner
+from miricigale.workflow.options import of_option
 from miricigale.workflow.sections import HighresSection
 from miricigale.workflow.stages import study_stages
 from miricigale.workflow.stages.exposures import grid_of, study_background, study_exposures
@@ -40,37 +41,29 @@ def check_study(config):
     """
     for key in ("cutouts", "cutouts_psf"):
         path = getattr(config.perturb, key)
-        if path and not Path(file_place(path)[0]).expanduser().is_file():
-            msg = f"[perturb] {key} = {path!r} is no file"
-            raise ConfigError(msg)
-    known = set(Filter.names())
-    unknown = [name for name in config.fit.bands if name not in known]
-    if unknown:
-        msg = f"[fit] bands has unknown filters {unknown}; 'miricigale filters' lists them"
-        raise ConfigError(msg)
-    unknown = [name for name in config.exposures.filters if name not in imager_filters()]
-    if unknown:
-        msg = f"[exposures] filters has {unknown}; known: {list(imager_filters())}"
-        raise ConfigError(msg)
-    try:
+        good = not path or Path(file_place(path)[0]).expanduser().is_file()
+        config.check(good, f"perturb.{key}", "must be a file")
+    for name, names, known, wanted in (
+        ("fit.bands", config.fit.bands, Filter.names(), "that 'miricigale filters' lists"),
+        (
+            "exposures.filters",
+            config.exposures.filters,
+            imager_filters(),
+            f"out of {list(imager_filters())}",
+        ),
+    ):
+        unknown = sorted(set(names).difference(known))
+        config.check(not unknown, name, f"must be filters {wanted}", unknown)
+    with of_option("[exposures]", KeyError, ValueError):
         exposures = study_exposures(config)
-    except ConfigError:
-        raise
-    except (KeyError, ValueError) as err:
-        msg = f"[exposures] {err.args[0]}"
-        raise ConfigError(msg) from err
     number = collections.Counter(exposure.filter for exposure in exposures.values())
-    if config.reduction.background == "dithers" and (few := [n for n in number if number[n] < 3]):
-        msg = (
-            f"[reduction] background = 'dithers' takes three exposures of each filter, not so {few}"
-        )
-        raise ConfigError(msg)
+    few = [name for name in number if number[name] < 3]
+    good = config.reduction.background != "dithers" or not few
+    wanted = "must have three exposures of each filter to be 'dithers'"
+    config.check(good, "reduction.background", wanted, few)
     for exposure in exposures.values():
-        try:
+        with of_option("[scene] background:", KeyError, ValueError, ImportError):
             level = study_background(config, exposure.filter)
-        except (KeyError, ValueError, ImportError) as err:
-            msg = f"[scene] background: {err.args[0]}"
-            raise ConfigError(msg) from err
         fill = float(saturation_forecast(exposure, background=level))
         if fill >= 1:
             msg = (
@@ -97,11 +90,8 @@ def check_study(config):
         return
     from miricigale.psf import hst_psf
 
-    try:
+    with of_option("[highres] filter:", KeyError, ValueError):
         hst_psf(config.highres.filter, pixel_scale=config.highres.pixel_scale * u.arcsec)
-    except (KeyError, ValueError) as err:
-        msg = f"[highres] filter: {err.args[0]}"
-        raise ConfigError(msg) from err
 
 
 def run_study(

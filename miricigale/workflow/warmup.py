@@ -25,146 +25,41 @@ _PACKAGE = Path(__file__).resolve().parent.parent
 
 
 def _fit():
+    import astropy.units as u
     from astropy.table import QTable
 
     from miricigale.fitting import BayesFitter
     from miricigale.sed import SEDModel
 
+    bands = ["wfc3.f160w", "irac.ch1", "miri.f770w", "miri.f1500w", "miri.f2100w"]
     table = QTable({"id": [1], "redshift": [1.0], "mass": [1e10]})
-    SEDModel.yang2021(agn=False).fluxes(table, _BANDS)
+    SEDModel.yang2021(agn=False).fluxes(table, bands)
     # with frac_agn = 0 the AGN would be skipped
     table["frac_agn"] = [0.4]
-    SEDModel.yang2021().fluxes(table, _BANDS)
-    fitter = BayesFitter(SEDModel.yang2021(), _BANDS, axes=_axes(), model_error=0.1)
-    table = _photometry_table()
+    SEDModel.yang2021().fluxes(table, bands)
+    axes = {name: values[:2] for name, values in SEDModel.yang2021_axes("quick").items()}
+    fitter = BayesFitter(SEDModel.yang2021(), bands, axes=axes, model_error=0.1)
+    for k, name in enumerate(bands):
+        table[name], table[f"{name}_err"] = [1.0 + k] * u.uJy, [0.5] * u.uJy
     fitter.fit(table)
-    table["z"] = [1.0]
-    fitter.fit(table, redshift="z")
+    fitter.fit(table, redshift="redshift")
 
 
 def _images():
     import astropy.units as u
     from astropy.coordinates import SkyCoord
+    from astropy.table import QTable
 
     from miricigale.instrument import Exposure, north_up_wcs
-    from miricigale.photometry import detect_sources
-    from miricigale.psf import hst_psf
     from miricigale.reduction import RampSettings, Reducer
-    from miricigale.scene import highres_image
     from miricigale.workflow.config import load_config
-    from miricigale.workflow.stages.images import expose_and_reduce, reducer_of
+    from miricigale.workflow.stages.images import expose_and_reduce, prior_image, reducer_of
 
+    center = SkyCoord(53.1344 * u.deg, -27.83444 * u.deg)
     # options that are off by default call further kernels
-    config = load_config("goodss", quick=True, overrides={"detector": {"residual": 0.01}})
-    center = SkyCoord(config.pointing.ra * u.deg, config.pointing.dec * u.deg)
-    catalog = _catalog(center)
-    exposures = Exposure(
-        "miri.f770w", n_groups=12, subarray="SUB64", pointing=center, roll=0 * u.deg
-    ).dithered("ceers", 2)
-    ramps = []
-    for n_integrations in (1, 2):
-        images = [
-            expose_and_reduce(
-                config,
-                dataclasses.replace(exposure, n_integrations=n_integrations),
-                catalog,
-                seed=1,
-                n_threads=2,
-                keep=ramps.append,
-            )[1]
-            for exposure in exposures
-        ]
-    # low thresholds, so that few pixels contain large jumps
-    Reducer(jump_threshold=2.0, ramps=RampSettings(neighbor_threshold=2.0)).fit_ramp(ramps[0])
-    grid = north_up_wcs(center, 0.06 * u.arcsec, (128, 128))
-    reducer_of(config).drizzle(images, grid)
-    prior = highres_image(
-        catalog, filter="wfc3.f160w", wcs=grid, psf=hst_psf(), depth=27.6 * u.ABmag, seed=1
-    )
-    detect_sources(prior)
-
-
-def _photometry():
-    import astropy.units as u
-    import numpy as np
-    from astropy.coordinates import SkyCoord
-    from astropy.nddata import CCDData, StdDevUncertainty
-    from astropy.table import QTable
-    from photutils.segmentation import SegmentationImage
-    from scipy.ndimage import gaussian_filter
-
-    from miricigale.instrument import north_up_wcs
-    from miricigale.photometry import ForcedPhotometer
-    from miricigale.psf import MatchingKernel, gaussian_psf
-
-    center = SkyCoord(0 * u.deg, 0 * u.deg)
-    hires, native = (
-        north_up_wcs(center, scale * u.arcsec, (size, size))
-        for scale, size in ((0.06, 132), (0.11, 72))
-    )
-    rng = np.random.default_rng(1)
-    ids = np.arange(1, 4)
-    sky = SkyCoord([-1.0, 0.5, 1.5] * u.arcsec, [-1.0, 0.5, 1.0] * u.arcsec)
-
-    def image(wcs, width):
-        y, x = np.mgrid[: wcs.pixel_shape[1], : wcs.pixel_shape[0]]
-        # correlated noise, as in a mosaic
-        light = 0.03 * gaussian_filter(rng.standard_normal(y.shape), 1.0)
-        for px, py in zip(*wcs.world_to_pixel(sky), strict=True):
-            light += np.exp(-0.5 * ((x - px) ** 2 + (y - py) ** 2) / width**2)
-        return CCDData(
-            np.asarray(light, np.float32),
-            unit="MJy/sr",
-            wcs=wcs,
-            uncertainty=StdDevUncertainty(np.full(y.shape, 0.01, np.float32)),
-            mask=np.zeros(y.shape, bool),
-        )
-
-    # wider than the PSF, so that profiles are fitted
-    prior, mosaic = image(hires, 2.5), image(native, 1.8)
-    labels = np.zeros(prior.shape, np.int32)
-    x, y = hires.world_to_pixel(sky)
-    yy, xx = np.mgrid[: labels.shape[0], : labels.shape[1]]
-    for k in range(3):
-        labels[(xx - x[k]) ** 2 + (yy - y[k]) ** 2 < 36] = ids[k]
-    kernel = MatchingKernel.from_psfs(
-        gaussian_psf(0.2 * u.arcsec, pixel_scale=0.06 * u.arcsec, fov=3 * u.arcsec),
-        gaussian_psf(0.3 * u.arcsec, pixel_scale=0.11 * u.arcsec, fov=3 * u.arcsec),
-        pixel_scale=0.06 * u.arcsec,
-    )
-    ForcedPhotometer(kernel, background_order=0).measure(
-        mosaic, prior, SegmentationImage(labels), QTable({"id": ids, "sky": sky})
-    )
-
-
-_BANDS = ["wfc3.f160w", "irac.ch1", "miri.f770w", "miri.f1500w", "miri.f2100w"]
-
-
-def _axes():
-    from miricigale.sed import SEDModel
-
-    axes = SEDModel.yang2021_axes("quick")
-    return {name: values[:2] for name, values in axes.items()}
-
-
-def _photometry_table():
-    import astropy.units as u
-    from astropy.table import QTable
-
-    table = QTable({"id": [1]})
-    for k, name in enumerate(_BANDS):
-        table[name] = [1.0 + k] * u.uJy
-        table[f"{name}_err"] = [0.5] * u.uJy
-    return table
-
-
-def _catalog(center):
-    """A galaxy and a star."""
-    import astropy.units as u
-    from astropy.coordinates import SkyCoord
-    from astropy.table import QTable
-
-    return QTable(
+    overrides = {"detector": {"residual": 0.01}}
+    config = load_config("goodss", quick=True, overrides=overrides)
+    galaxy_and_star = QTable(
         {
             "id": [1, 2],
             "sky": SkyCoord(center.ra + [0, 1] * u.arcsec, center.dec + [0, 1] * u.arcsec),
@@ -178,6 +73,57 @@ def _catalog(center):
             "wfc3.f160w": [3.0, 5.0] * u.uJy,
         }
     )
+    exposures = Exposure(
+        "miri.f770w", n_groups=12, subarray="SUB64", pointing=center, roll=0 * u.deg
+    ).dithered("ceers", 2)
+    options, ramps, images = {"seed": 1, "n_threads": 2}, [], []
+    for n in (1, 2):
+        for exposure in exposures:
+            own = dataclasses.replace(exposure, n_integrations=n)
+            _, cal = expose_and_reduce(config, own, galaxy_and_star, keep=ramps.append, **options)
+            images.append(cal)
+    # low thresholds, so that few pixels contain large jumps
+    Reducer(jump_threshold=2.0, ramps=RampSettings(neighbor_threshold=2.0)).fit_ramp(ramps[0])
+    grid = north_up_wcs(center, 0.06 * u.arcsec, (128, 128))
+    reducer_of(config).drizzle(images, grid)
+    prior_image(config, galaxy_and_star, grid, seed=1)
+
+
+def _photometry():
+    import astropy.units as u
+    import numpy as np
+    from astropy.coordinates import SkyCoord
+    from astropy.nddata import CCDData, StdDevUncertainty
+    from scipy.ndimage import gaussian_filter
+
+    from miricigale.instrument import north_up_wcs
+    from miricigale.photometry import ForcedPhotometer, detect_sources
+    from miricigale.psf import MatchingKernel, gaussian_psf
+
+    rng = np.random.default_rng(1)
+    sky = SkyCoord([-1.0, 0.5, 1.5] * u.arcsec, [-1.0, 0.5, 1.0] * u.arcsec)
+
+    def image(scale, size, width):
+        wcs = north_up_wcs(SkyCoord(0 * u.deg, 0 * u.deg), scale, (size, size))
+        y, x = np.mgrid[:size, :size]
+        # correlated noise, as in a mosaic
+        light = 0.03 * gaussian_filter(rng.standard_normal(y.shape), 1.0)
+        for px, py in zip(*wcs.world_to_pixel(sky), strict=True):
+            light += np.exp(-0.5 * ((x - px) ** 2 + (y - py) ** 2) / width**2)
+        options = {"unit": "MJy/sr", "wcs": wcs, "mask": np.zeros(y.shape, bool)}
+        errors = StdDevUncertainty(np.full(y.shape, 0.01, np.float32))
+        return CCDData(np.asarray(light, np.float32), uncertainty=errors, **options)
+
+    # wider than the PSF, so that profiles are fitted
+    fine, native = 0.06 * u.arcsec, 0.11 * u.arcsec
+    prior, mosaic = image(fine, 132, 2.5), image(native, 72, 1.8)
+    kernel = MatchingKernel.from_psfs(
+        gaussian_psf(0.2 * u.arcsec, pixel_scale=fine, fov=3 * u.arcsec),
+        gaussian_psf(0.3 * u.arcsec, pixel_scale=native, fov=3 * u.arcsec),
+        pixel_scale=fine,
+    )
+    photometer = ForcedPhotometer(kernel, background_order=0)
+    photometer.measure(mosaic, prior, *detect_sources(prior, threshold=10))
 
 
 #: What is compiled together: what it is, and about how many seconds it takes on a slow machine.

@@ -89,7 +89,7 @@ def test_a_catalog_whose_fractions_cannot_be_is_refused(planner, tmp_path):
     catalog["frac_agn"][3] = 1.5
     catalog.write(tmp_path / "images.ecsv")
     config = images_study(planner, tmp_path / "images.ecsv")
-    with pytest.raises(ConfigError, match=r"between 0 and 0\.99; 1 of \d+ are not, such as 1\.5"):
+    with pytest.raises(ConfigError, match=r"between 0 and 0\.99, got 1 of \d+ others, \[1\.5\]"):
         check_study(config)
     read_catalog("catalog.goodss").write(tmp_path / "plain.ecsv")
     config = images_study(planner, tmp_path / "plain.ecsv")

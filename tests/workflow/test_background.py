@@ -203,6 +203,6 @@ def test_backgrounds_of_dithers_take_three_of_them():
         }
     )
     with pytest.raises(
-        ConfigError, match=r"^\[reduction\] background = 'dithers' .* \['miri.f2100w'\]"
+        ConfigError, match=r"^\[reduction\] background must have three .* \['miri.f2100w'\]"
     ):
         check_study(config)

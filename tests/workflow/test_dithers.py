@@ -132,7 +132,7 @@ def test_what_are_no_dithers_is_refused(listed, table, tmp_path):
             dithers=str(listed))  # fmt: skip
     refused(r"dithers: ceers\.pointing: 'exposure' must be one of \[1, 2\], got None",
             dithers=str(listed), dither_observation=5)  # fmt: skip
-    refused("n_dithers is 3 for miri.f770w, whose file of dithers has 2", dithers=str(table),
+    refused("n_dithers must be at most 2 for miri.f770w, .*got 3", dithers=str(table),
             n_dithers=[3, 3])  # fmt: skip
     refused(r"dithers must have one pattern, or one per filter \(2\), got 3", dithers=["none"] * 3)
     refused("dither_observation must come with a .pointing file", dithers=str(table),

@@ -12,7 +12,9 @@ from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow import Context
 from miricigale.workflow.config import StudyConfig
+from miricigale.workflow.page.declared import texts_of
 from miricigale.workflow.page.numbers import StudyTables
+from miricigale.workflow.page.study_page import DeclaredPage
 from miricigale.workflow.stages import experiments
 from miricigale.workflow.truths import EXPERIMENTS
 
@@ -177,16 +179,18 @@ def test_numbers_of_perfect_fits(truth):
 
 def test_the_section_of_the_page(folder):
     context, report = Context(config_of(*FAST), folder), Page("made up")
-    experiments.write_experiments(context, report, tables_of(folder))
+    experiments.write_experiments(DeclaredPage(report, context), tables_of(folder))
     report.write(folder / "page.html")
     page = (folder / "page.html").read_text()
     for name in ("study", *FAST):
-        assert experiments.LABELS[name] in page
+        assert texts_of("experiments")["labels"][name] in page
     numbers = QTable.read(folder / "report" / "experiments.ecsv")
     assert list(numbers["experiment"]) == ["study", *FAST]
     assert np.all(numbers["n"] == N - 1)
     report = Page("made up")
-    experiments.write_experiments(Context(config_of(), folder), report, tables_of(folder))
+    experiments.write_experiments(
+        DeclaredPage(report, Context(config_of(), folder)), tables_of(folder)
+    )
     report.write(folder / "none.html")
     assert "Further fits" not in (folder / "none.html").read_text()
 
@@ -197,7 +201,7 @@ def test_without_a_sampler_there_is_a_sentence(folder, monkeypatch):
     do_stage(config, folder, "experiments", "agn40/samplers")
     assert len(read(folder, "samplers")) == 0
     report = Page("made up")
-    experiments.write_experiments(Context(config, folder), report, tables_of(folder))
+    experiments.write_experiments(DeclaredPage(report, Context(config, folder)), tables_of(folder))
     report.write(folder / "left.html")
     assert "Neither nautilus nor dynesty is installed" in (folder / "left.html").read_text()
 
@@ -213,7 +217,7 @@ def test_a_subset_is_spread_over_the_sample(folder, monkeypatch):
     same = kept[np.isin(kept["id"], few["id"])]
     assert_allclose(few["frac_agn_mean"], same["frac_agn_mean"], rtol=1e-6)
     report = Page("made up")
-    experiments.write_experiments(Context(config, folder), report, tables_of(folder))
+    experiments.write_experiments(DeclaredPage(report, Context(config, folder)), tables_of(folder))
     numbers = QTable.read(folder / "report" / "experiments.ecsv")
     assert list(numbers["n_sources"]) == [N - 1, 3, 3]
 
@@ -240,4 +244,6 @@ def test_experiments_are_chosen_by_name():
         config_of("free")
     with pytest.raises(ConfigError, match="must not repeat"):
         config_of("samplers", "samplers")
-    assert set(experiments.LABELS) == {"study", *EXPERIMENTS}
+    texts = texts_of("experiments")
+    assert set(texts["labels"]) == {"study", *EXPERIMENTS}
+    assert set(texts["sentences"]) == set(EXPERIMENTS)

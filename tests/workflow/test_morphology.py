@@ -315,7 +315,9 @@ def test_a_study_paints_the_light_of_an_image(tmp_path, monkeypatch):
     image.write(tmp_path / "galaxies.fits", overwrite=True)
     assert plan(config, "agn00+cutouts") != first
     (tmp_path / "galaxies.fits").unlink()
-    with pytest.raises(ConfigError, match=r"\[perturb\] cutouts = '.*galaxies.fits' is no file"):
+    with pytest.raises(
+        ConfigError, match=r"\[perturb\] cutouts must be a file, got '.*galaxies.fits'"
+    ):
         check_study(config)
 
 

@@ -19,6 +19,7 @@ from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow import Context, load_config
 from miricigale.workflow.config import StudyConfig
+from miricigale.workflow.page.study_page import DeclaredPage
 from miricigale.workflow.perturbation import (
     Perturbation,
     perturbed_model,
@@ -493,12 +494,12 @@ def test_costs_are_changes_of_the_same_sources(tmp_path):
     assert cost["all", "fracAGN scatter"]["change"] == pytest.approx(0)
     assert len(perturbation_costs(study_truths(config_of([])), every, BANDS, seed=SEED)) == 0
     report = Page("made up")
-    context = Context(config, tmp_path)
-    write_perturbed(context, report, study_truths(config_of([])), every)
+    page = DeclaredPage(report, Context(config, tmp_path))
+    write_perturbed(page, study_truths(config_of([])), every)
     assert "does not know" not in report.to_html()
-    write_perturbed(context, report, truths, every)
+    write_perturbed(page, truths, every)
     page = report.to_html()
     assert "<th class=n>F770W offset</th>" in page
-    assert "<td>agn40</td><td>zero point, MIRI</td><td class=n>+2.0 (+2.0 ± 0.0) %</td>" in page
+    assert "<td>agn40</td><td>zero point, MIRI</td><td class=n>+2.0 % (+2.0 ± 0.0 %)</td>" in page
     written = QTable.read(tmp_path / "report" / "perturbations.ecsv")
     np.testing.assert_array_equal(written["change"], table["change"])

@@ -12,6 +12,7 @@ from miricigale.pages import Page
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow import Context
 from miricigale.workflow.config import load_config
+from miricigale.workflow.page.study_page import DeclaredPage
 from miricigale.workflow.stages import rivals
 
 BAND = "miri.f1500w"
@@ -117,14 +118,14 @@ def test_galaxies_are_told_apart_by_size(tables):
 
 
 def test_the_section_of_the_page(folder, tables):
-    report = Page("made up")
-    rivals.write_rivals(Context(config_of("package"), folder), report, tables)
+    report, context = Page("made up"), Context(config_of("package"), folder)
+    rivals.write_rivals(DeclaredPage(report, context), tables)
     report.write(folder / "page.html")
     page = (folder / "page.html").read_text()
     assert "Rival photometry" in page
     assert "F1500W" in page
     report = Page("made up")
-    rivals.write_rivals(Context(config_of("package"), folder), report, {})
+    rivals.write_rivals(DeclaredPage(report, context), {})
     report.write(folder / "none.html")
     assert "Rival photometry" not in (folder / "none.html").read_text()
 

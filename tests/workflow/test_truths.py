@@ -109,7 +109,7 @@ def test_dust_of_the_main_sequence_leaves_the_stars(truths, tmp_path):
 def test_the_dusts_alpha_is_drawn_from_nodes(tmp_path):
     nodes = {"alpha": [1.5, 2.5], "alpha_draw": "nodes", "frac_agn": 0.0}
     assert set(make_truths(tmp_path, **nodes)["agn00"]["alpha"]) == {1.5, 2.0, 2.5}
-    with pytest.raises(ConfigError, match="holds no node"):
+    with pytest.raises(ConfigError, match="must hold a node"):
         make_truths(tmp_path, **{**nodes, "alpha": [1.6, 1.7]})
 
 
@@ -128,7 +128,7 @@ def test_names_of_truths_and_sets():
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"sed": {"frac_agn": []}}, "must have at least one value"),
+        ({"sed": {"frac_agn": []}}, "must begin with a number, got none"),
         ({"sed": {"frac_agn": [0.2, 0.2]}}, "must not repeat"),
         ({"sed": {"frac_agn": ["field", 0.0]}}, "must begin with a number"),
         ({"sed": {"frac_agn": [0.0, "quasars"]}}, r"must be one of \['field', 'catalog'\]"),

@@ -14,6 +14,7 @@ from miricigale.pages import Page
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow import Context
 from miricigale.workflow.derived import changed_config
+from miricigale.workflow.page.study_page import DeclaredPage
 from miricigale.workflow.stages import variants
 from miricigale.workflow.stages.exposures import IMAGES, grid_of, study_exposures
 from miricigale.workflow.stages.images import (
@@ -198,9 +199,9 @@ def test_the_report_says_what_each_costs(tmp_path):
     for name, bands in tables.items():
         context.save_table(f"variants/{name}/{BAND}.ecsv", bands[BAND])
     report = Page("made up")
-    nothing = Context(config_of([]), tmp_path)
-    assert variants.write_variants(nothing, report, matched, {BAND: 22.15}) is None
-    numbers = variants.write_variants(context, report, matched, {BAND: 22.15})
+    nothing = DeclaredPage(report, Context(config_of([]), tmp_path))
+    assert variants.write_variants(nothing, matched, {BAND: 22.15}) is None
+    numbers = variants.write_variants(DeclaredPage(report, context), matched, {BAND: 22.15})
     page = report.to_html()
     assert "residual noise</td>" in page
     assert "without the gradient the limit changes by +0.00 ± 0.00 mag" in page

@@ -1,5 +1,6 @@
 """Runs the stages, side by side where they can be; what stands already and is current is kept."""
 
+import collections
 import dataclasses
 import fnmatch
 import hashlib
@@ -259,11 +260,10 @@ class StudyRunner:
 
     def _products_bytes(self):
         """Bytes that the products of the units take that are wanted."""
-        total = 0
-        for name, units in self.units.items():
-            wanted = sum(job.stage.name == name for job in self.jobs)
-            total += self.disk.get(name, 0) * wanted / max(1, len(units))
-        return int(total)
+        wanted = collections.Counter(job.stage.name for job in self.jobs)
+        return int(
+            sum(self.disk.get(name, 0) * n / len(self.units[name]) for name, n in wanted.items())
+        )
 
     def _config_stands(self, store):
         """Whether manifest and ``config.toml`` say what this run does."""
@@ -333,11 +333,8 @@ class StudyRunner:
             return
         stands, edited = self._file_stands(store), store.edited_config()
         if edited is not None and not stands:
-            kept = edited.with_name("config.edited.toml")
-            for n in itertools.count(2):
-                if not os.path.lexists(kept):
-                    break
-                kept = edited.with_name(f"config.edited{n}.toml")
+            names = (f"config.edited{n if n > 1 else ''}.toml" for n in itertools.count(1))
+            kept = next(k for k in map(edited.with_name, names) if not os.path.lexists(k))
             os.replace(edited, kept)
             log.warning("the edited %s is kept as %s", edited, kept.name)
         store.begin(_values(self.config), self.config.to_toml(), write=not stands)
@@ -430,10 +427,7 @@ def _values(config):
 
 def _summary(keys):
     """Stages, with the number of units where there are several."""
-    counts = {}
-    for key in keys:
-        name = key.split(":")[0]
-        counts[name] = counts.get(name, 0) + 1
+    counts = collections.Counter(key.split(":")[0] for key in keys)
     return ", ".join(f"{name} ({n})" if n > 1 else name for name, n in counts.items())
 
 

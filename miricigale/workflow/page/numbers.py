@@ -12,6 +12,7 @@ from miricigale.evaluation import (
     PUBLISHED_LIGHT,
     fraction_interval,
     integrated_light,
+    posterior_ranks,
     recovery_metrics,
     sigma_mad,
 )
@@ -111,6 +112,17 @@ class StudyTables:
         known = np.isfinite(self.truth["stellar_mass"].value)
         known &= ~np.asarray(self.truth["star"], bool)
         return self.truth[known & self.inside if field else known]
+
+
+def true_ranks(results, sample, name, seed):
+    """
+    Ranks of the true values of a parameter in their posteriors.
+
+    Ranks are randomized within cells of the grid, for injected fractions lie on its nodes.
+    """
+    values, levels = results.cdf(name)
+    true = u.Quantity(sample[name]).to_value(values.unit)
+    return posterior_ranks(true, values.value, levels, seed=seed)
 
 
 def as_ceers(config, name):
@@ -217,18 +229,12 @@ def _detected(config, tables, least):
         if limit > config.catalog.mag_limit:
             continue
         chosen = tables.field & (prior < limit)
-        n = int(np.count_nonzero(chosen & (tables.matched["n_detected"] >= least)))
-        fraction, low, high = fraction_interval(n, int(chosen.sum()))
-        row = {
-            "limit": limit,
-            "n": int(chosen.sum()),
-            "fraction": fraction,
-            "low": low,
-            "high": high,
-        }
-        known = proposal is not None and chosen.any()
-        row["to_proposal"] = float(np.mean(proposal[chosen] >= least)) if known else np.nan
-        rows.append(row | {"paper": paper})
+        n, found = int(chosen.sum()), chosen & (tables.matched["n_detected"] >= least)
+        fraction, low, high = fraction_interval(int(np.count_nonzero(found)), n)
+        known = proposal is not None and n > 0
+        to_proposal = float(np.mean(proposal[chosen] >= least)) if known else np.nan
+        row = {"limit": limit, "n": n, "fraction": fraction, "low": low, "high": high}
+        rows.append(row | {"to_proposal": to_proposal, "paper": paper})
     return rows
 
 

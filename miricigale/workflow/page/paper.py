@@ -167,10 +167,8 @@ def reasons_of(config, metrics, model):
 
 def write_comparison(page, reasons, sentences):
     """The section with all numbers of Yang et al. 2021 and those of the run."""
-    context = page.context
-    table = compare_with_paper(page.study, seed=context.seed, reasons=reasons)
-    context.save_table("report/paper.ecsv", table)
-    page.section("paper")
+    table = compare_with_paper(page.study, seed=page.context.seed, reasons=reasons)
+    page.numbers("paper", table)
     page.report.bullets(sentences)
     header = ("part", "number", "paper", "here", "completeness", "verdict")
     caption = page.sentence("table")

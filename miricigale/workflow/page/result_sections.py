@@ -1,12 +1,10 @@
 """Sections on the fits of all truths, in the order of Yang et al. 2021."""
 
-import astropy.units as u
 import numpy as np
 
 from miricigale.evaluation import (
     coverage_table,
     feature_residuals,
-    posterior_ranks,
     selection_table,
     study_confusion,
 )
@@ -21,7 +19,7 @@ from miricigale.workflow.page.labels import (
     parameter_label,
     truth_label,
 )
-from miricigale.workflow.page.numbers import FEWEST
+from miricigale.workflow.page.numbers import FEWEST, true_ranks
 from miricigale.workflow.page.study_figures import CLASS_COLUMNS, FEATURES
 from miricigale.workflow.stages.conditions import CONDITIONS
 from miricigale.workflow.stages.sample import typical_source
@@ -232,25 +230,15 @@ def _residual(estimate):
     return number(value, "+.3f", reason, error=estimate.error)
 
 
-def _posterior_ranks(tables, seed):
-    """
-    Ranks of the true values of a truth in their posteriors, by set of bands and parameter.
-
-    Ranks are randomized within cells of the grid, for injected fractions lie on its nodes.
-    """
-    ranks = {}
-    for unit, results in tables.results.items():
-        for name in COVERED:
-            if name in tables.truth.colnames and len(results):
-                values, levels = results.cdf(name)
-                true = u.Quantity(tables.sample[name]).to_value(values.unit)
-                ranks[unit, name] = posterior_ranks(true, values.value, levels, seed=seed)
-    return ranks
-
-
 def _write_coverage(page):
     """Ranks of the truth in the posteriors, and how many are within central intervals."""
-    ranks = _posterior_ranks(page.tables, page.context.seed)
+    tables = page.tables
+    ranks = {
+        (unit, name): true_ranks(results, tables.sample, name, page.context.seed)
+        for unit, results in tables.results.items()
+        for name in COVERED
+        if name in tables.truth.colnames and len(results)
+    }
     if not ranks:
         return
     table = coverage_table({" ".join(key): values for key, values in ranks.items()})

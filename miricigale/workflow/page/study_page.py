@@ -7,11 +7,9 @@ from miricigale.workflow.page.labels import band_label, three_bands, truth_label
 from miricigale.workflow.page.numbers import FEWEST, MIPS_LIMIT
 
 
-class StudyPage:
+class DeclaredPage:
     """
-    What the sections of a study's page read, and the page that they fill.
-
-    Titles, paragraphs, captions and tables are named: ``sections.toml`` declares them, by section.
+    A page that is filled with what ``sections.toml`` declares: titles, paragraphs, captions and tables.
 
     Parameters
     ----------
@@ -19,45 +17,16 @@ class StudyPage:
         The page.
     context : `~miricigale.workflow.Context`
         The run.
-    every : dict of str to `~miricigale.workflow.page.numbers.StudyTables`
-        The tables of the truths of whose sky the analysis knows all, the reference first.
-    study : `~miricigale.evaluation.StudyResults`
-        The same.
-    metrics : dict
-        Plain numbers of the field, the bands and the fits (``report/metrics.json``).
-    shares : dict of str to `~numpy.ndarray`
-        True AGN shares of the 5-15 um light of all sources by truth, empty without AGN.
-    model : `~miricigale.sed.SEDModel`
-        That of the fits.
-    area : `~astropy.units.Quantity`
-        Solid angle of the imaged field.
     """
 
-    def __init__(self, report, context, every, study, metrics, shares, model, area):
+    def __init__(self, report, context):
         self.report, self.context, self.config = report, context, context.config
-        self.every, self.study, self.first = every, study, study.truths[0]
-        self.tables = every[self.first.name]
-        self.bands = self.config.exposures.filters
-        self.metrics, self.shares, self.model, self.area = metrics, shares, model, area
         self._section = None
 
-    @functools.cached_property
+    @property
     def facts(self):
-        """What the sentences say of the run: dict of str to values."""
-        options, chosen = self.config.catalog, [band_label(n) for n in three_bands(self.bands)]
-        return self.metrics | {
-            "truth": truth_label(self.first),
-            "three_bands": ", ".join(chosen),
-            "longest": chosen[-1],
-            "detected_bands": "the one band" if len(self.bands) == 1 else "two or more bands",
-            "prior": band_label(self.config.highres.filter),
-            "mag_column": options.mag_column,
-            "mag_limit": options.mag_limit,
-            "mips_limit": MIPS_LIMIT,
-            "fewest": FEWEST,
-            "model_error": 100 * self.config.fit.model_error,
-            **{name: self.model.meta[name] for name in ("cosmology", "frac_agn_definition")},
-        }
+        """What all sentences say of the run: dict of str to values."""
+        return {}
 
     def sentence(self, name, **facts):
         """Return a sentence of the current section, filled with facts of the run and further ones."""
@@ -68,6 +37,11 @@ class StudyPage:
         self._section = name
         paragraph = self.sentence(text, **facts) if text in texts_of(name) else ""
         self.report.section(texts_of(name)["title"], paragraph)
+
+    def numbers(self, name, table, **facts):
+        """Save numbers as ``report/<name>.ecsv``, and begin the section on them."""
+        self.context.save_table(f"report/{name}.ecsv", table)
+        self.section(name, **facts)
 
     def text(self, name, **facts):
         """Add a paragraph."""
@@ -93,6 +67,54 @@ class StudyPage:
             empty=sentence(table.get("empty", ""), facts),
             text=table.get("text", 1),
         )
+
+
+class StudyPage(DeclaredPage):
+    """
+    What the sections of a study's page read, and the page that they fill.
+
+    Parameters
+    ----------
+    report, context
+        As for `DeclaredPage`.
+    every : dict of str to `~miricigale.workflow.page.numbers.StudyTables`
+        The tables of the truths of whose sky the analysis knows all, the reference first.
+    study : `~miricigale.evaluation.StudyResults`
+        The same.
+    metrics : dict
+        Plain numbers of the field, the bands and the fits (``report/metrics.json``).
+    shares : dict of str to `~numpy.ndarray`
+        True AGN shares of the 5-15 um light of all sources by truth, empty without AGN.
+    model : `~miricigale.sed.SEDModel`
+        That of the fits.
+    area : `~astropy.units.Quantity`
+        Solid angle of the imaged field.
+    """
+
+    def __init__(self, report, context, every, study, metrics, shares, model, area):
+        super().__init__(report, context)
+        self.every, self.study, self.first = every, study, study.truths[0]
+        self.tables = every[self.first.name]
+        self.bands = self.config.exposures.filters
+        self.metrics, self.shares, self.model, self.area = metrics, shares, model, area
+
+    @functools.cached_property
+    def facts(self):
+        """What the sentences say of the run: dict of str to values."""
+        options, chosen = self.config.catalog, [band_label(n) for n in three_bands(self.bands)]
+        return self.metrics | {
+            "truth": truth_label(self.first),
+            "three_bands": ", ".join(chosen),
+            "longest": chosen[-1],
+            "detected_bands": "the one band" if len(self.bands) == 1 else "two or more bands",
+            "prior": band_label(self.config.highres.filter),
+            "mag_column": options.mag_column,
+            "mag_limit": options.mag_limit,
+            "mips_limit": MIPS_LIMIT,
+            "fewest": FEWEST,
+            "model_error": 100 * self.config.fit.model_error,
+            **{name: self.model.meta[name] for name in ("cosmology", "frac_agn_definition")},
+        }
 
     @property
     def band_rows(self):

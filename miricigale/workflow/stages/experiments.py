@@ -2,7 +2,6 @@
 
 import importlib.util
 
-import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 from scipy import stats
@@ -11,26 +10,18 @@ from miricigale import fitting, photometry, sed
 from miricigale.evaluation import (
     fraction_interval,
     photoz_metrics,
-    posterior_ranks,
     recovery_metrics,
 )
 from miricigale.photometry.surveys import HERSCHEL_DEPTHS
 from miricigale.utils.tables import described_rows
-from miricigale.workflow.derived import Cell, cells_of, read_tables, rows_of
+from miricigale.workflow.derived import read_tables, rows_of
 from miricigale.workflow.engine.stage import stage
+from miricigale.workflow.page.declared import sentence, texts_of
+from miricigale.workflow.page.numbers import true_ranks
 from miricigale.workflow.stages.fits import FIT_SECTIONS, fit_mock, fit_sample
 from miricigale.workflow.stages.inputs import sed_resources
 from miricigale.workflow.truths import of_truth, study_truths
 
-#: Names on the page.
-LABELS = {
-    "study": "as in the study",
-    "free_agn": "torus freed",
-    "far_infrared": "with far infrared",
-    "no_model_error": "without model error",
-    "known_redshift": "redshifts known",
-    "samplers": "nested sampler",
-}
 #: Most sources of each truth that are fitted with a freed torus.
 N_FREE = 100
 #: Sources of all truths together that are fitted by a sampler, and its settings.
@@ -40,30 +31,7 @@ SAMPLER_OPTIONS = {"n_live": 200, "n_effective": 1000, "max_calls": 60_000}
 SAMPLERS = ("nautilus", "dynesty")
 #: Parameters whose posteriors are ranked, and compared between a sampler and the grid.
 RANKED = ("redshift", "frac_agn")
-#: Sentences of the page on each.
-_SENTENCES = {
-    "free_agn": "Torus freed: inclination, p and q, which Yang et al. fix, have axes of their own (the other axes "
-    f"of the AGN are thinner), for up to {N_FREE} sources of each sky.",
-    "far_infrared": "With far infrared: mock fluxes at 100, 160, 250, 350 and 500 µm, to the depths of deep "
-    "Herschel surveys.",
-    "no_model_error": "Without model error: no relative error is added to the fluxes.",
-    "known_redshift": "Redshifts known: those of the truth are given to the fit.",
-    "samplers": "Nested sampler: parameters are continuous, in place of the nodes of the grid.",
-}
 _NO_SAMPLER = "Neither nautilus nor dynesty is installed (pip install nautilus-sampler)."
-_FIXED, _NO_AGN = "no such source, or redshifts were given", "no source with an AGN"
-_CELLS = (
-    Cell("sources", "n_sources", "d"),
-    Cell("z sigma_MAD", "photoz_sigma_mad", ".4f", why=_FIXED),
-    Cell("outliers", "photoz_outliers", ".1f", 100, " %", why=_FIXED),
-    Cell("fracAGN offset", "frac_agn_bias", "+.3f"),
-    Cell("scatter", "frac_agn_sigma_mad", ".3f"),
-    Cell("width", "frac_agn_width", ".3f"),
-    Cell("accretion power offset (dex)", "power_bias", "+.2f", why=_NO_AGN),
-    Cell("scatter", "power_sigma_mad", ".2f", why=_NO_AGN),
-    Cell("z in 68 %", "redshift_coverage", ".0f", 100, " %", why=_FIXED),
-    Cell("fracAGN in 68 %", "frac_agn_coverage", ".0f", 100, " %"),
-)
 #: What Yang et al. 2021 fix, freed; the fixed values (70 deg, 1, 1) are nodes or within. To stay below
 #: a hundred million models the other axes of the AGN are thinner than in the study.
 _FREED = {"inclination": (60.0, 70.0, 90.0), "p": (0.0, 1.0), "q": (0.0, 1.0)}
@@ -192,9 +160,7 @@ def _ranked(results, sample, seed):
     for name in RANKED:
         rank = np.full(len(table), np.nan)
         if len(table) and not (name == "redshift" and results.redshift_fixed):
-            values, levels = results.cdf(name)
-            true = u.Quantity(sample[name]).to_value(values.unit)
-            rank = posterior_ranks(true, values.value, levels, seed=seed)
+            rank = true_ranks(results, sample, name, seed)
         table[f"{name}_rank"] = rank
         table[f"{name}_rank"].info.description = "Rank of the true value in the posterior"
     return table
@@ -251,22 +217,26 @@ def experiment_numbers(sample, table):
 
 def _sampler_numbers(grid, sampled):
     """Means of a sampler minus those of the grid in units of its widths, and widths over widths."""
-    found = []
+    found = {}
     for name in RANKED:
         width = np.asarray(grid[f"{name}_std"], float)
         shift = np.asarray(sampled[f"{name}_mean"] - grid[f"{name}_mean"], float) / width
         ratio = np.asarray(sampled[f"{name}_std"], float) / width
-        found += [np.nanmedian(np.abs(shift)), np.nanmax(np.abs(shift)), np.nanmedian(ratio)]
+        found |= {
+            f"{name}_median": np.nanmedian(np.abs(shift)),
+            f"{name}_most": np.nanmax(np.abs(shift)),
+        }
+        found[f"{name}_widths"] = np.nanmedian(ratio)
     return found
 
 
-def write_experiments(context, report, every):
+def write_experiments(page, every):
     """
     Write the section on the further fits; ``every`` are the ``StudyTables`` of all truths by name.
 
     Each is compared with the fit of the study with all bands of the same sources.
     """
-    names = context.config.fit.experiments
+    context, names = page.context, page.config.fit.experiments
     if not names:
         return
     rows, pairs, left = [], [], {}
@@ -282,33 +252,18 @@ def write_experiments(context, report, every):
                 fits.append(("study", same))
             fits.append((name, table))
             if name == "samplers" and len(table):
-                pairs.append((of, len(table), *_sampler_numbers(same, table)))
+                pairs.append({"truth": of, "n": len(table), **_sampler_numbers(same, table)})
         for name, table in fits:
             rows.append((of, name, len(table), experiment_numbers(study.sample, table)))
     texts = {"truth": "Sky", "experiment": "Fit", "n_sources": "Sources"}
     texts |= {key: key.replace("_", " ") for key in rows[0][3]}
     numbers = described_rows([(*row, *values.values()) for *row, values in rows], texts)
-    context.save_table("report/experiments.ecsv", numbers)
-    report.section(
-        "Further fits",
-        "The same photometry with all MIRI bands fitted in other ways, beside the fit of the study. "
-        + " ".join(_SENTENCES[name] for name in names),
-    )
-    report.table(
-        [(row["truth"], LABELS[row["experiment"]], *cells_of(row, _CELLS)) for row in numbers],
-        header=("sky", "fit", *(cell.header for cell in _CELLS)),
-        caption="Redshift, AGN fraction and accretion power against truth, and shares of the true values in the "
-        "central 68 % of their posteriors; where an experiment has a part of the sample, the fit of the "
-        "study of the same sources stands above it",
-        text=2,
-    )
+    declared = texts_of("experiments")
+    sentences = " ".join(declared["sentences"][name] for name in names)
+    page.numbers("experiments", numbers, sentences=sentence(sentences, {"n_free": N_FREE}))
+    labels = declared["labels"]
+    page.table("table", [dict(row) | {"fit": labels[row["experiment"]]} for row in numbers])
     if pairs:
-        report.table(
-            [(of, n, *(f"{value:.2f}" for value in values)) for of, n, *values in pairs],
-            header=("sky", "sources", "z: median", "largest", "widths",
-                    "fracAGN: median", "largest", "widths"),
-            caption="Nested sampler with continuous parameters against the grid: absolute difference of the "
-            "means in units of the grid's posterior width, median and largest, and median ratio of the widths",
-        )  # fmt: skip
+        page.table("samplers", pairs)
     for name, why in left.items():
-        report.text(f"Left out: {LABELS[name]}. {why}")
+        page.text("left", fit=labels[name], why=why)

@@ -16,8 +16,8 @@ from miricigale.instrument import (
     tangent_offset,
     tile_offsets,
 )
-from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow.background import band_background, of_filter, text_by_filter
+from miricigale.workflow.options import of_option, require
 from miricigale.workflow.truths import truth_names
 
 #: Sections of the configuration on which the grids of images depend, what is exposed, and kernels.
@@ -63,11 +63,8 @@ def _dithers(options, k):
         )
         return name, text
     path, part = Path(name).expanduser(), {}
-    if not path.is_file():
-        msg = (
-            f"[exposures] dithers must be a file or one of {list(dither_patterns())}, got {name!r}"
-        )
-        raise ConfigError(msg)
+    wanted = f"must be a file or one of {list(dither_patterns())}"
+    require(path.is_file(), "exposures", "dithers", wanted, repr(name))
     if path.suffix.lower() == ".pointing":
         if options.dither_observation:
             part["observation"] = options.dither_observation
@@ -82,11 +79,8 @@ def _dithers(options, k):
 @functools.lru_cache(maxsize=64)
 def _file_pattern(path, *_, **part):
     """Offsets in a file, which is read again when it has changed."""
-    try:
+    with of_option(f"[exposures] dithers: {path.name}:", ValueError, u.UnitsError):
         offsets = read_dithers(path, **part)
-    except (ValueError, u.UnitsError) as err:
-        msg = f"[exposures] dithers: {path.name}: {err}"
-        raise ConfigError(msg) from err
     return tuple(map(tuple, offsets.to_value(u.arcsec).tolist()))
 
 
@@ -125,9 +119,9 @@ def _exposures(field, options, patterns):
         n_dithers = options.n_dithers[k] if options.n_dithers else None
         if not named:
             n_dithers = n_dithers or len(pattern)
-            if n_dithers > len(pattern):
-                msg = f"[exposures] n_dithers is {n_dithers} for {name}, whose file of dithers has {len(pattern)}"
-                raise ConfigError(msg)
+            wanted = f"must be at most {len(pattern)} for {name}, as its file of dithers has"
+            good = n_dithers <= len(pattern)
+            require(good, "exposures", "n_dithers", wanted, n_dithers)
         offsets = pattern if named else pattern * u.arcsec
         number = 0
         for center in _centers(field):

@@ -11,10 +11,11 @@ from miricigale.filters import Filter
 from miricigale.refdata import resources
 from miricigale.refdata.locate import fingerprint
 from miricigale.scene import read_catalog
-from miricigale.utils.exceptions import ConfigError, argument_error
+from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import ab_magnitude
 from miricigale.workflow.engine.stage import stage
+from miricigale.workflow.options import require
 
 #: Redshifts closer than this share a node of the grid of the input fit.
 REDSHIFT_STEP = 0.01
@@ -127,12 +128,9 @@ def bright_sources(catalog, options, prior):
         raise argument_error("mag_column", wanted, repr(column))
     # a source without a magnitude is kept; the report says why it is not fitted
     chosen = catalog[~(magnitudes > options.mag_limit)]
-    if not np.any(magnitudes <= options.mag_limit):
-        msg = (
-            f"[catalog] mag_limit = {options.mag_limit} leaves none of the {len(catalog)} sources, "
-            f"whose {column} begins at {np.nanmin(magnitudes):.2f}"
-        )
-        raise ConfigError(msg)
+    good = np.any(magnitudes <= options.mag_limit)
+    wanted = f"leaves none of the {len(catalog)} sources, {column} of {np.nanmin(magnitudes):.2f} and more"
+    require(good, "catalog", "mag_limit", wanted, options.mag_limit)
     return chosen
 
 
@@ -165,9 +163,8 @@ def fit_seds(catalog, options, *, model_error, executor=None, progress_bar=False
     column of errors, and ``max_wavelength`` (um), up to which these are fitted.
     """
     bands, longest = input_bands(catalog, options.max_wavelength)
-    if not bands:
-        msg = f"[sed] max_wavelength = {options.max_wavelength} leaves none of the catalog's bands"
-        raise ConfigError(msg)
+    wanted = "leaves none of the catalog's bands"
+    require(bands, "sed", "max_wavelength", wanted, options.max_wavelength)
     photometry = QTable({"id": catalog["id"]})
     photometry["redshift"] = np.asarray(catalog["redshift"], float)
     for name, own in bands.items():

@@ -7,9 +7,9 @@ from astropy.table import Table
 
 from miricigale.evaluation import bootstrap
 from miricigale.evaluation.estimates import median, outlier_share, scatter
-from miricigale.filters import Filter
-from miricigale.pages import Missing
-from miricigale.workflow.page.labels import band_label
+from miricigale.pages import Missing, number
+from miricigale.workflow.page.declared import sentence, texts_of
+from miricigale.workflow.page.labels import band_label, by_wavelength
 from miricigale.workflow.page.numbers import bright_isolated
 from miricigale.workflow.truths import ALL, CUTOUTS, EFFECTS
 
@@ -18,14 +18,15 @@ N_DRAWS = 1000
 
 #: Name of what no effect has changed.
 NONE = "none"
+#: Sizes of effects that the page gives in percent.
+_SHARES = ("psf_width", "flat", "gain", "linearity", "zero_point", "zero_point_existing", "clumps")
 _LABELS = {NONE: "none", **EFFECTS, ALL: "all together"}
 
 
 def _quantities(bands):
     """Columns of the table: name to the kind of the values, the band, and their statistic."""
-    by_wave = sorted(bands, key=lambda name: Filter.from_name(name).pivot)
-    found = {}
-    for band in (by_wave[0], by_wave[-1]):
+    order, found = by_wavelength(bands), {}
+    for band in (order[0], order[-1]):
         found[f"{band} offset"] = ("flux", band, median)
         found[f"{band} scatter"] = ("flux", band, scatter)
     return found | {
@@ -109,54 +110,26 @@ def _cost(statistic, known, own, seed):
     return value.n, value.value, value.error, change.value, change.error
 
 
-def write_perturbed(context, report, truths, every):
+def write_perturbed(page, truths, every):
     """Write the section with one table, if there are perturbed truths."""
-    config = context.config
-    table = perturbation_costs(truths, every, config.exposures.filters, seed=context.seed)
+    config, options = page.config, page.config.perturb
+    table = perturbation_costs(truths, every, config.exposures.filters, seed=page.context.seed)
     if len(table) == 0:
         return
-    context.save_table("report/perturbations.ecsv", table)
-    options = config.perturb
-    report.section(
-        "What the analysis does not know",
-        "Skies that differ from what reduction, photometry and fits assume, one effect at a time "
-        f"and together: a PSF of another wavefront, or {100 * options.psf_width:g} % wider or narrower; "
-        f"a flat field that is another detector's by {100 * options.flat:g} %; a gain other by "
-        f"{100 * options.gain:g} % (which the conversion to fluxes does not know either); a signal other by "
-        f"{100 * options.linearity:g} % at the full well; fluxes {100 * options.zero_point:g} % (MIRI) and "
-        f"{100 * options.zero_point_existing:g} % (existing bands) higher or lower, and positions "
-        f"{1000 * options.astrometry:g} mas off, by band; sources of other models, and of other shapes than "
-        f"the prior shows{_shapes(config, truths)}. Kernels, error functions, templates and grids stay as they "
-        "are.",
-    )
-    quantities = list(dict.fromkeys(table["quantity"]))
-    cells = {(row["truth"], row["perturbation"], row["quantity"]): row for row in table}
-    report.table(
-        [
-            (base, _LABELS[name], *(_cell(cells[base, name, q]) for q in quantities))
-            for base, name in dict.fromkeys((row["truth"], row["perturbation"]) for row in table)
-        ],
-        header=("sky", "perturbation", *(_header(quantity) for quantity in quantities)),
-        caption="Fluxes of bright isolated sources (above 20 sigma), redshifts and AGN fractions of "
-        "the fits with all MIRI bands. In brackets the change against the same sources without the perturbation, "
-        "and its error by bootstrap of these sources",
-        text=2,
-    )
-
-
-def _shapes(config, truths):
-    """Which shapes: clumps are made up, and stamps are those of an image."""
+    sizes = {name: 100 * getattr(options, name) for name in _SHARES}
+    sizes |= {"astrometry": 1000 * options.astrometry, "image": Path(options.cutouts).name}
     effects = {name for truth in truths.values() for name, _ in truth.perturbations}
-    options, parts = config.perturb, []
-    if "clumps" in effects:
-        parts.append(f"{100 * options.clumps:g} % of the light of disks in made-up clumps")
-    if CUTOUTS in effects:
-        name = Path(options.cutouts).name
-        whose = (
-            "their own light" if options.cutouts_of == "own" else "light of galaxies of their size"
-        )
-        parts.append(f"{whose} on {name} in place of Sersic profiles")
-    return f" ({'; '.join(parts)})" if parts else ""
+    shapes = {"clumps": "clumps", CUTOUTS: f"cutouts_{options.cutouts_of}"}
+    texts = texts_of("perturbations")
+    shown = "; ".join(texts[label] for name, label in shapes.items() if name in effects)
+    shapes = sentence(f" ({shown})", sizes) if shown else ""
+    page.numbers("perturbations", table, shapes=shapes, **sizes)
+    rows = {}
+    for row in table:
+        known = {"sky": row["truth"], "perturbation": _LABELS[row["perturbation"]]}
+        cells = rows.setdefault((row["truth"], row["perturbation"]), known)
+        cells[_header(row["quantity"])] = _cell(row)
+    page.table("table", rows.values())
 
 
 def _header(quantity):
@@ -166,13 +139,11 @@ def _header(quantity):
 
 def _cell(row):
     """Text of a value and its change; per cent but for scatter of redshifts and fracAGN."""
-    if not np.isfinite(row["value"]):
-        return Missing("no source")
     share = "." in row["quantity"] or row["quantity"].endswith("outliers")
-    scale, digits, unit = (100, 1, " %") if share else (1, 4, "")
+    spec, alone = ".1f %" if share else ".4f", row["perturbation"] == NONE
     signed = "+" if row["quantity"].endswith("offset") else ""
-    text = f"{scale * row['value']:{signed}.{digits}f}"
-    if row["perturbation"] == NONE:
-        return f"{text} ± {scale * row['value_err']:.{digits}f}{unit}"
-    change = f"{scale * row['change']:+.{digits}f} ± {scale * row['change_err']:.{digits}f}"
-    return f"{text} ({change}){unit}"
+    error = row["value_err"] if alone else None
+    cell = number(row["value"], signed + spec, "no source", error=error)
+    if alone or isinstance(cell, Missing):
+        return cell
+    return f"{cell} ({number(row['change'], f'+{spec}', '', error=row['change_err'])})"

@@ -7,10 +7,11 @@ from astropy.table import QTable, vstack
 from miricigale import photometry
 from miricigale.evaluation import Estimate, bootstrap, match_truth, recovery_metrics
 from miricigale.evaluation.estimates import median
-from miricigale.pages import number
+from miricigale.pages import Missing, number
 from miricigale.utils.tables import described_rows, error_column
 from miricigale.workflow.derived import NO_SOURCE, read_tables
 from miricigale.workflow.engine.stage import stage
+from miricigale.workflow.page.declared import texts_of
 from miricigale.workflow.page.labels import band_label
 from miricigale.workflow.stages.conditions import ConditionFlags
 from miricigale.workflow.stages.exposures import (
@@ -165,20 +166,7 @@ def rival_numbers(tables):
                 ratios = ratio.median, ratio.median_err, ratio.sigma_mad
                 pair = pulls.median, pulls.sigma_mad
                 found.append((band, kind, group, method, *sizes, *ratios, *pair))
-    texts = {
-        "band": "Band, or all together",
-        "kind": "By what sources are grouped",
-        "group": "Sources of the field that are not at an edge",
-        "method": "How they are measured",
-        "n_group": "Sources of the group",
-        "n": "Sources with a flux",
-        "median": "Median of measured over true flux minus one",
-        "median_err": "Its error",
-        "scatter": "sigma_MAD of the same",
-        "pull_median": "Median of (measured - true) / error",
-        "pull_scatter": "sigma_MAD of the same",
-    }
-    return described_rows(found, texts)
+    return described_rows(found, texts_of("rivals")["numbers"])
 
 
 def rival_counts(table):
@@ -233,69 +221,34 @@ def source_extractor_numbers(tables, seed):
     return {f"source_extractor.{name}": number for name, number in numbers.items()}
 
 
-def write_rivals(context, report, tables):
+def write_rivals(page, tables):
     """Write the section on rival photometry, unless there are no tables."""
     if not tables:
         return
     numbers = rival_numbers(tables)
-    context.save_table("report/rivals.ecsv", numbers)
-    report.section(
-        "Rival photometry",
-        "The same images measured by three methods: the package's forced photometry (templates with "
-        "wings, on the mosaics' own pixels), the steps of Yang et al. 2021 after T-PHOT (bare segments, "
-        "on pixels of 0.06 arcsec, errors for white noise), and blind as by Source Extractor with the "
-        "settings of the paper (the brighter of AUTO/0.94 and the 1.86 arcsec aperture/0.8). Errors are "
-        "the formal ones of each.",
-    )
+    page.numbers("rivals", numbers)
     # by group of each band: what is shown for each method
-    shown = {}
+    groups, bands = {}, {}
     for row in numbers:
-        cells = shown.setdefault((row["band"], row["kind"], row["group"]), [row["n_group"]])
-        text = number(row["median"], "+.1f", NO_SOURCE, scale=100)
-        if np.isfinite(row["median"]):
-            text += f" ± {100 * row['scatter']:.1f} % ({row['n']})"
-        cells.append(text)
-        if row["kind"] == "all":
-            cells.append(number(row["pull_scatter"], ".1f", NO_SOURCE))
-    header = [RIVALS[method] for method in RIVALS]
-    report.table(
-        [
-            (kind, group, *cells)
-            for (band, kind, group), cells in shown.items()
-            if band == "all" and kind != "all"
-        ],
-        header=("by", "sources", "in the group", *header),
-        caption="Measured over true flux minus one, median ± scatter (number measured), of all bands "
-        "together: by the true flux over the study's formal error, and, of those above 5, by shape, "
-        "size and neighbors; sources at the edge are left out",
-        text=2,
-    )
-    report.table(
-        [
-            (band_label(band), *cells)
-            for (band, kind, _), cells in shown.items()
-            if kind == "all" and band != "all"
-        ],
-        header=("band", "above 5 sigma", *(x for h in header for x in (h, "scatter of pulls"))),
-        caption="The same by band, with the scatter of (measured - true) / formal error",
-    )
+        label = RIVALS[row["method"]]
+        cell = number(row["median"], "+.1f %", NO_SOURCE, error=row["scatter"])
+        if not isinstance(cell, Missing):
+            cell += f" ({row['n']})"
+        if row["band"] == "all" and row["kind"] != "all":
+            known = {"by": row["kind"], "sources": row["group"], "in the group": row["n_group"]}
+            groups.setdefault((row["kind"], row["group"]), known)[label] = cell
+        elif row["band"] != "all" and row["kind"] == "all":
+            known = {"band": band_label(row["band"]), "above 5 sigma": row["n_group"]}
+            pulls = number(row["pull_scatter"], ".1f", NO_SOURCE)
+            bands.setdefault(row["band"], known).update({label: cell, f"pulls, {label}": pulls})
+    page.table("groups", groups.values())
+    page.table("bands", bands.values())
     rows = []
     for name, table in tables.items():
-        counts, offset = rival_counts(table), _se_offset(table, context.seed)
+        counts, offset = rival_counts(table), _se_offset(table, page.context.seed)
         rows.append(
-            (
-                band_label(name),
-                *(counts[key].n for key in ("detected", "matched", "missed")),
-                number(counts["missed"].value, ".0f", NO_SOURCE, scale=100),
-                number(offset.value, "+.3f", NO_SOURCE),
-                number(offset.error, ".3f", NO_SOURCE),
-            )
+            {"band": band_label(name), "offset": offset.value, "offset_err": offset.error}
+            | {key: one.n for key, one in counts.items()}
+            | {"share": counts["missed"].value}
         )
-    report.table(
-        rows,
-        header=("band", "detected", "in the catalog", "measured by templates", "missed (%)",
-                "offset (mag)", "its error"),
-        caption="Source Extractor on the mosaics of 0.06 arcsec: detections in the field, those of them that are "
-        "sources of the catalog; the share of the sources with a forced flux that it misses, and its "
-        "magnitudes minus those of the steps of Yang et al. above 5 sigma",
-    )  # fmt: skip
+    page.table("source_extractor", rows)

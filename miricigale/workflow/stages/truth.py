@@ -10,11 +10,12 @@ from miricigale.evaluation import AGNPopulation, agn_fraction, main_sequence_dus
 from miricigale.photometry.kernel_files import file_place
 from miricigale.refdata.locate import fingerprint
 from miricigale.utils.content import file_sha256
-from miricigale.utils.exceptions import ConfigError, DataError
+from miricigale.utils.exceptions import DataError
 from miricigale.utils.meta import provenance
 from miricigale.utils.random import stream
 from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.morphology import RealGalaxies, stamps_of_sources, write_stamps
+from miricigale.workflow.options import require
 from miricigale.workflow.perturbation import perturbed_model, perturbed_parameters, point_columns
 from miricigale.workflow.stages.inputs import catalog_bands, sed_resources
 from miricigale.workflow.stages.stars import star_fluxes
@@ -57,9 +58,8 @@ def galaxy_parameters(config, catalog, best, *, seed):
         if config.sed.alpha_draw == "nodes":
             nodes = sed.SEDModel.yang2021_axes("fit")["alpha"]
             nodes = nodes[(nodes >= low) & (nodes <= high)]
-            if len(nodes) == 0:
-                msg = f"[sed] alpha = {[low, high]} holds no node of the fit's grid"
-                raise ConfigError(msg)
+            wanted = "must hold a node of the fit's grid with alpha_draw = 'nodes'"
+            require(len(nodes), "sed", "alpha", wanted, [low, high])
             table["alpha"] = [rng.choice(nodes) for rng in streams]
         else:
             table["alpha"] = [rng.uniform(low, high) for rng in streams]
@@ -97,17 +97,15 @@ def _draw(rng, values):
 
 def catalog_fractions(catalog):
     """The column ``frac_agn`` of a catalog, or a `ConfigError` that says what is wrong with it."""
-    if "frac_agn" not in catalog.colnames:
-        msg = "[sed] frac_agn = 'catalog' needs a column frac_agn in the catalog"
-        raise ConfigError(msg)
+    known = "frac_agn" in catalog.colnames
+    wanted = "'catalog' needs a column frac_agn in the catalog"
+    require(known, "sed", "frac_agn", wanted, catalog.colnames)
     values = np.asarray(catalog["frac_agn"], float)
     bad = values[~((values >= 0) & (values <= 0.99))]
-    if len(bad):
-        msg = (
-            f"the column frac_agn of the catalog must be between 0 and 0.99; {len(bad)} of "
-            f"{len(values)} are not, such as {bad[0]:g}"
-        )
-        raise ConfigError(msg)
+    wanted = "'catalog' needs a column frac_agn of values between 0 and 0.99"
+    require(
+        not len(bad), "sed", "frac_agn", wanted, f"{len(bad)} of {len(values)} others, {bad[:3]}"
+    )
     return values
 
 

@@ -4,17 +4,19 @@ import astropy.units as u
 import numpy as np
 from astropy.stats import biweight_scale
 from astropy.table import QTable
+from markupsafe import Markup
 
 from miricigale import psf, scene
 from miricigale.evaluation import Estimate, match_truth
-from miricigale.filters import Filter
+from miricigale.pages import number
 from miricigale.photometry.error_curves import limiting_flux, measured_curve
 from miricigale.utils.random import stream
 from miricigale.utils.tables import described_rows, error_column
-from miricigale.workflow.derived import Cell, cells_of, changed_config, read_tables
+from miricigale.workflow.derived import changed_config, read_tables
 from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.page.band_figures import variant_figure
-from miricigale.workflow.page.labels import band_label
+from miricigale.workflow.page.declared import texts_of
+from miricigale.workflow.page.labels import band_label, by_wavelength
 from miricigale.workflow.stages.exposures import (
     EXPOSURE_RESOURCES,
     IMAGES,
@@ -33,6 +35,8 @@ from miricigale.workflow.stages.measure import joined_photometry, measure_band
 from miricigale.workflow.stages.sample import SampleFlags
 from miricigale.workflow.truths import itself, of_reference, reference, variant_changes
 
+#: Why a scatter has no change: of the study itself, or unknown.
+_SAME = "compared with itself, or no limit"
 #: Draws of the sources for the errors of limits.
 N_DRAWS = 100
 #: What images are called: where the key is on, and where it is off.
@@ -43,19 +47,6 @@ _LABELS = {
 }
 STUDY, RATES = "study", "rates"
 _OUT = SampleFlags.OUTSIDE_FIELD | SampleFlags.STAR | SampleFlags.NO_MODEL
-_NO_LIMIT = "the error function reaches 5 sigma nowhere"
-_SAME = "compared with itself, or no limit"
-#: Numbers of the page.
-CELLS = (
-    Cell("5 sigma", "limit", ".2f", why=_NO_LIMIT),
-    Cell("minus calculator", "offset", "+.2f", why=_NO_LIMIT),
-    Cell("change (mag)", "limit_change", "+.2f", error=True, why=_SAME),
-    Cell("faint scatter (µJy)", "scatter", ".3g"),
-    Cell("change", "scatter_change", "+.1f", 100, " %", error=True, why=_SAME),
-    Cell("detected", "detected", "d"),
-    Cell("complete", "completeness", ".0f", 100, " %", why="no such galaxy"),
-)
-HEADER = ("band", "images", *(cell.header for cell in CELLS))
 
 
 @stage(
@@ -164,24 +155,7 @@ def variant_numbers(matched, tables, calculator, *, seed, statistic="mad", bin_s
             complete = Estimate.of_fraction(np.count_nonzero(seen & bright), bright.sum())
             numbers += [int(np.count_nonzero(seen & field)), complete.value, complete.error]
             rows.append((band, name, len(samples[0]), limit, *numbers))
-    texts = {
-        "band": "Band",
-        "images": "Images: of the study, or with one thing otherwise",
-        "n": "Measured sources",
-        "calculator": "Limit of the exposure time calculator, scaled, AB",
-        "limit": "5-sigma limit of the error function, AB",
-        "limit_err": "Its error",
-        "limit_change": "Against the study's images (by rates)",
-        "limit_change_err": "Its error",
-        "scatter": "Biweight scatter of the fluxes of sources fainter than the calculator's limit, uJy",
-        "scatter_err": "Its error",
-        "scatter_change": "Relative change against the study's images (by rates)",
-        "scatter_change_err": "Its error",
-        "detected": "Galaxies of the field above 5 sigma",
-        "completeness": "Share of galaxies brighter than the calculator's limit that are detected",
-        "completeness_err": "Half of its 68 % interval",
-    }
-    return described_rows(rows, texts)
+    return described_rows(rows, texts_of("variants")["numbers"])
 
 
 def _measures(curve, faint):
@@ -207,19 +181,24 @@ def variant_label(name, changes):
     return _LABELS[name][0 if value else 1]
 
 
-def variant_rows(table, changes):
+def variant_entries(table, changes):
     """
-    Rows under `HEADER`.
+    Rows of the table of the page.
 
     ``table`` is of `variant_numbers`, ``changes`` of `~miricigale.workflow.truths.variant_changes`.
     """
-    table = table.copy()
-    table["offset"] = table["limit"] - table["calculator"]
-    names = ((band_label(row["band"]), variant_label(row["images"], changes)) for row in table)
-    return [(*name, *cells_of(row, CELLS)) for name, row in zip(names, table, strict=True)]
+    return [
+        dict(row)
+        | {
+            "band": band_label(row["band"]),
+            "images": variant_label(row["images"], changes),
+            "offset": row["limit"] - row["calculator"],
+        }
+        for row in table
+    ]
 
 
-def write_variants(context, report, matched, limits):
+def write_variants(page, matched, limits):
     """
     Write the section on variant images.
 
@@ -227,55 +206,37 @@ def write_variants(context, report, matched, limits):
 
     Returns the numbers, or None where there are no variants.
     """
-    config, changes = context.config, variant_changes(context.config)
+    context, config, changes = page.context, page.config, variant_changes(page.config)
     if not changes:
         return None
     bands = band_names(config)
     tables = {name: read_tables(context, f"variants/{name}", bands) for name in changes}
     options = {"statistic": config.errors.statistic, "bin_size": config.errors.bin_size}
     table = variant_numbers(matched, tables, limits, seed=context.seed, **options)
-    context.save_table("report/variants.ecsv", table)
-    report.section(
-        "What sets the limits",
-        "The first sky was exposed again with one setting changed at a time, by rates. Prior, PSFs, kernels and "
-        "templates are those of the study, photons and cosmic rays have the same seeds, and errors of "
-        "changes are of draws of the same sources.",
-    )
+    page.numbers("variants", table)
     labels = {name: variant_label(name, changes) for name in (STUDY, *changes)}
-    report.figure(
-        variant_figure(table, labels),
-        "5-sigma limits of the error function minus those of the exposure time calculator (4.0, low "
-        "background), scaled to the same time; below 0: shallower.",
-    )
-    report.table(
-        variant_rows(table, changes),
-        header=HEADER,
-        caption="5-sigma limits of error functions of the flux alone (AB), scatter of the fluxes of "
-        "sources fainter than the calculator's limit, galaxies of the field above 5 sigma, and the share "
-        "of those brighter than the calculator's limit that are; changes against the images of the study"
-        + (" by rates" if RATES in changes else ""),
-        text=2,
-    )
+    page.figure("figure", variant_figure(table, labels))
+    by_rates = " by rates" if RATES in changes else ""
+    page.table("table", variant_entries(table, changes), by_rates=by_rates)
     if "gradient" in changes:
-        _write_gradient(report, table, changes)
+        _write_gradient(page, table, changes)
     return table
 
 
-def _write_gradient(report, table, changes):
+def _write_gradient(page, table, changes):
     """Add a sentence on the effect of the gradient in the longest band, if it is known."""
-    band = max(set(table["band"]), key=lambda name: Filter.from_name(name).pivot)
-    limit, scatter = CELLS[2], CELLS[4]
-    effects = [
-        f"{variant_label(row['images'], changes)} the limit changes by {limit.text(row)} mag, the scatter "
-        f"of faint fluxes by {scatter.text(row)}"
-        for row in table[table["band"] == band]
-        if row["images"] in ("gradient", "plane") and np.isfinite(row["limit_change"])
-    ]
+    band = by_wavelength(set(table["band"]))[-1]
+    effects = []
+    for row in table[table["band"] == band]:
+        if row["images"] in ("gradient", "plane") and np.isfinite(row["limit_change"]):
+            limit, scatter = (
+                number(row[key], spec, _SAME, error=row[f"{key}_err"])
+                for key, spec in (("limit_change", "+.2f"), ("scatter_change", "+.1f %"))
+            )
+            label = variant_label(row["images"], changes)
+            effects.append(page.sentence("effect", images=label, limit=limit, scatter=scatter))
     if effects:
-        report.text(
-            f"In {band_label(band)}: {'; '.join(effects)}. Yang et al. 2021 hold the gradient of 5 % per "
-            "arcmin responsible for a limit in F2100W that is 0.95 mag shallower than the calculator's."
-        )
+        page.text("gradient", band=band_label(band), effects=Markup("; ").join(effects))
 
 
 def add_reasons(reasons, table, config):
