@@ -19,6 +19,7 @@ from .exposure import ceers_exposures as ceers_exposures
 from .exposure import frame_time as frame_time
 from .exposure import readout_patterns as readout_patterns
 from .figures import imager_filters as imager_filters
+from .image import Image as Image
 from .image_facts import ImageFacts as ImageFacts
 from .image_files import read_image as read_image
 from .image_files import write_image as write_image

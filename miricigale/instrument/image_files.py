@@ -7,6 +7,7 @@ import numpy as np
 from astropy.io import fits
 
 from miricigale.instrument import dq_planes, read_dq, with_own_bits
+from miricigale.instrument.image import Image
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import open_fits, write_fits
 from miricigale.utils.meta import undated
@@ -131,7 +132,7 @@ def read_image(path, *, planes=()):
     `~miricigale.utils.exceptions.DataError`
         If the file is missing, or has no SCI extension or no unit of an image.
     """
-    from astropy.nddata import CCDData, StdDevUncertainty
+    from astropy.nddata import StdDevUncertainty
     from astropy.wcs import WCS
 
     with open_fits(path, wanted="an image (FITS with SCI)") as hdus:
@@ -141,7 +142,7 @@ def read_image(path, *, planes=()):
         header = hdus["SCI"].header
         wcs = WCS(header)
         error = np.array(hdus["ERR"].data, np.float32) if "ERR" in hdus else None
-        image = CCDData(
+        image = Image(
             np.array(hdus["SCI"].data, np.float32),
             unit=_unit(header, path),
             wcs=wcs if wcs.has_celestial else None,

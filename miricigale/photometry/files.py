@@ -7,9 +7,10 @@ import astropy.units as u
 import numpy as np
 import scipy.sparse
 from astropy.coordinates import SkyCoord
-from astropy.nddata import CCDData, StdDevUncertainty
+from astropy.nddata import StdDevUncertainty
 from astropy.table import QTable, Table
 
+from miricigale.instrument.image import Image
 from miricigale.photometry.cutouts import Cutout
 from miricigale.photometry.error_files import write_ecsv
 from miricigale.photometry.fields import SmoothField
@@ -186,8 +187,8 @@ def _read_result(path):
         return ForcedPhotometryResult(
             sky=columns["sky"],
             **found,
-            model_image=CCDData(parts.array("model"), meta=dict(text["image_meta"]), **options),
-            residual_image=CCDData(
+            model_image=Image(parts.array("model"), meta=dict(text["image_meta"]), **options),
+            residual_image=Image(
                 parts.array("residual"),
                 mask=parts.array("mask").astype(bool),
                 uncertainty=StdDevUncertainty(parts.array("sigma"), copy=False),

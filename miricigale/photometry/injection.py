@@ -8,6 +8,7 @@ from astropy.nddata import CCDData
 from astropy.table import QTable, vstack
 from photutils.segmentation import SegmentationImage
 
+from miricigale.instrument.image import Image
 from miricigale.photometry.arrays import image_arrays, pixel_scale
 from miricigale.photometry.catalogs import joined_sky
 from miricigale.photometry.cutouts import Cutout
@@ -318,7 +319,7 @@ def _profile(parameters, reach):
 
 def _with_data(image, data):
     """An image with other pixels."""
-    return CCDData(
+    return Image(
         data, unit=image.unit, wcs=image.wcs, mask=image.mask, uncertainty=image.uncertainty,
         meta=dict(image.meta),
     )  # fmt: skip

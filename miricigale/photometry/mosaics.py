@@ -9,6 +9,7 @@ import warnings
 import astropy.units as u
 import numpy as np
 
+from miricigale.instrument.image import Image
 from miricigale.photometry.calibration import calibration, parsed_unit
 from miricigale.photometry.grids import (
     filter_name,
@@ -166,7 +167,7 @@ class MosaicFile:
             If there is no map of the noise, its scale departs from 1 by more than 10 times, or areas
             that are exactly 0 are masked.
         """
-        from astropy.nddata import CCDData, StdDevUncertainty
+        from astropy.nddata import StdDevUncertainty
 
         from miricigale.instrument import pixel_area_map
 
@@ -228,7 +229,7 @@ class MosaicFile:
             level, scale, _ = sky_noise(np.where(usable, data, 0), usable)
         meta["sky_over_noise"] = float(f"{level / (scale or 1):.4g}")
         meta["n_masked"] = int(np.count_nonzero(~usable))
-        return CCDData(
+        return Image(
             data,
             unit=SURFACE_BRIGHTNESS,
             wcs=header.wcs,

@@ -6,9 +6,10 @@ import itertools
 import numpy as np
 import scipy.sparse
 from astropy.coordinates import SkyCoord
-from astropy.nddata import CCDData, StdDevUncertainty
+from astropy.nddata import StdDevUncertainty
 from astropy.table import QTable
 
+from miricigale.instrument.image import Image
 from miricigale.photometry.diagnostics import source_flags
 from miricigale.photometry.fields import SmoothField, n_terms
 from miricigale.photometry.fit_errors import fit_covariances
@@ -208,8 +209,8 @@ def _images(fit, diagnostics, meta):
         image[~arrays.usable] = np.nan
     options = {"unit": SURFACE_BRIGHTNESS, "wcs": arrays.wcs}
     return {
-        "model_image": CCDData(model, meta=dict(meta), **options),
-        "residual_image": CCDData(
+        "model_image": Image(model, meta=dict(meta), **options),
+        "residual_image": Image(
             residual, mask=~arrays.usable, uncertainty=StdDevUncertainty(sigma, copy=False),
             meta=dict(meta), **options,
         ),

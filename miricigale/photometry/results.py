@@ -13,6 +13,7 @@ from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData
 from astropy.table import QTable
 
+from miricigale.instrument.image import Image
 from miricigale.photometry.arrays import pixel_scale
 from miricigale.photometry.draws import correlated_draws
 from miricigale.photometry.fields import SmoothField
@@ -201,7 +202,7 @@ class ForcedPhotometryResult:
             for one in (square, usable.astype(float))
         )
         chi2 = np.divide(total, weight, out=np.full(total.shape, np.nan), where=usable)
-        return CCDData(chi2, unit="", wcs=image.wcs, mask=~usable, meta=dict(image.meta))
+        return Image(chi2, unit="", wcs=image.wcs, mask=~usable, meta=dict(image.meta))
 
     def sample(self, size, *, seed=None, point=False):
         """

@@ -27,6 +27,7 @@ from miricigale.instrument import (
     subarrays,
     with_own_bits,
 )
+from miricigale.instrument.image import Image
 from miricigale.instrument.image_files import json_meta
 from miricigale.reduction.assumed import middle_of
 from miricigale.reduction.images import plain_flags, plain_mask, sigma
@@ -147,7 +148,7 @@ def read_images(path):
             bad |= ~np.isfinite(uncertainty.array)
         if "WHT" in planes:
             bad |= ~(planes["WHT"][number] > 0)
-        image = CCDData(
+        image = Image(
             values,
             unit=unit,
             uncertainty=uncertainty,
@@ -208,7 +209,7 @@ def _mean(images):
     flags = np.bitwise_or.reduce([image.flags for image in images]) & ~int(DQ.DO_NOT_USE)
     flags |= np.where(count == 0, int(DQ.DO_NOT_USE), 0)
     meta = {key: value for key, value in first.meta.items() if key != "integration"}
-    return CCDData(
+    return Image(
         mean.astype(np.float32),
         unit=first.unit,
         uncertainty=uncertainty,
@@ -421,7 +422,7 @@ def _joined(image, planes):
     def cube(values):
         return np.array([values(file) for file in files])
 
-    joined = CCDData(
+    joined = Image(
         cube(lambda file: file.image.data),
         unit=first.unit,
         uncertainty=StdDevUncertainty(cube(lambda file: sigma(file.image))),

@@ -5,6 +5,7 @@ from astropy.nddata import CCDData, StdDevUncertainty
 from astropy.wcs import WCS
 
 from miricigale.instrument import DQ, ImageFacts
+from miricigale.instrument.image import Image
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import SURFACE_BRIGHTNESS
 
@@ -15,7 +16,7 @@ def image(data, unit, *, error, flags, wcs, meta):
     error = np.asarray(error, np.float32)
     flags = np.asarray(flags, np.int64)
     mask = (flags & DQ.DO_NOT_USE) != 0
-    return CCDData(
+    return Image(
         data,
         unit=unit,
         uncertainty=StdDevUncertainty(error),
@@ -59,7 +60,7 @@ def with_data(source, data, *, factor=None, unit=None, **meta):
     if source.uncertainty is not None:
         error = sigma(source)
         uncertainty = StdDevUncertainty(np.array(error if factor is None else error * factor))
-    return CCDData(
+    return Image(
         data,
         unit=source.unit if unit is None else unit,
         uncertainty=uncertainty,

@@ -5,12 +5,12 @@ import warnings
 
 import astropy.units as u
 import numpy as np
-from astropy.nddata import CCDData
 from astropy.table import Table
 from astropy.wcs import WCS
 from photutils.psf import GriddedPSFModel
 
 from miricigale.instrument import aperture, pixel_area_map
+from miricigale.instrument.image import Image
 from miricigale.profiles import ellipse_to_pixels
 from miricigale.psf import InstrumentPSF, PSFGrid
 from miricigale.scene.background import Background
@@ -374,7 +374,7 @@ class Scene:
         if self._background is not None:
             brightness += self._background.image(self._wcs, self._shape)
             meta["background"] = float(self._background.level.value)
-        return CCDData(brightness, unit=SURFACE_BRIGHTNESS, wcs=self._wcs, meta=meta)
+        return Image(brightness, unit=SURFACE_BRIGHTNESS, wcs=self._wcs, meta=meta)
 
     def plot(self, ax=None, *, background=False, sources=False, **kwargs):
         """
