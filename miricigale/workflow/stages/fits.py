@@ -4,12 +4,10 @@ from concurrent.futures import ThreadPoolExecutor
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
 
 from miricigale import evaluation, fitting, photometry, sed
 from miricigale.photometry.surveys import fractional_error
 from miricigale.utils.tables import error_column
-from miricigale.workflow.derived import read_tables
 from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.perturbation import Perturbation
 from miricigale.workflow.stages.conditions import ConditionFlags, add_conditions, any_condition
@@ -43,8 +41,8 @@ class _Field:
         config = context.config
         bands = config.exposures.filters
         radius = config.photometry.match_radius * u.arcsec
-        self.truth = QTable.read(context.path(f"{name}/truth.ecsv"))
-        tables = read_tables(context, f"{name}/photometry", bands)
+        self.truth = context.table(f"{name}/truth.ecsv")
+        tables = context.tables(f"{name}/photometry", bands)
         self.detections = joined_photometry(tables)
         self.matched = evaluation.match_truth(self.truth, self.detections, bands, radius=radius)
         self.association = evaluation.associate(self.truth, self.detections, radius=radius)
@@ -207,14 +205,9 @@ def fit_photometry(context, unit):
 
 def fit_sample(context, name, **options):
     """Truth, matched sources and `mock_photometry` of a truth."""
-    truth, matched = (
-        QTable.read(context.path(f"{name}/{table}.ecsv")) for table in ("truth", "matched")
-    )
-    return (
-        truth,
-        matched,
-        mock_photometry(context.config, truth, matched, seed=context.seed, **options),
-    )
+    truth, matched = context.tables(name, ("truth", "matched")).values()
+    mock = mock_photometry(context.config, truth, matched, seed=context.seed, **options)
+    return truth, matched, mock
 
 
 def fit_mock(context, mock, bands, *, model_error=None, given=None, **options):
