@@ -210,7 +210,7 @@ def fit_sample(context, name, **options):
     return truth, matched, mock
 
 
-def fit_mock(context, mock, bands, *, model_error=None, given=None, **options):
+def fit_mock(context, mock, bands, *, given=None, **options):
     """
     Fit mock photometry in the existing and in further bands as the study does.
 
@@ -222,12 +222,10 @@ def fit_mock(context, mock, bands, *, model_error=None, given=None, **options):
         As of `mock_photometry`.
     bands : iterable of str
         Bands that join the existing ones.
-    model_error : float, optional
-        In place of the study's.
     given : dict, optional
         Further arguments of ``BayesFitter.fit``.
     **options
-        Further arguments of `~miricigale.fitting.BayesFitter`.
+        Further arguments of `~miricigale.fitting.BayesFitter`, or others than the study's.
 
     Returns
     -------
@@ -237,8 +235,7 @@ def fit_mock(context, mock, bands, *, model_error=None, given=None, **options):
     fitter = fitting.BayesFitter(
         sed.SEDModel.yang2021(),
         [*fit.bands, *bands],
-        model_error=fit.model_error if model_error is None else model_error,
-        **options,
+        **({"model_error": fit.model_error} | options),
     )
     with ThreadPoolExecutor(context.n_threads) as executor:
         given = {"executor": executor, "progress_bar": context.progress_bar} | (given or {})
