@@ -6,11 +6,10 @@ from typing import ClassVar
 from miricigale.instrument import CEERS_FILTERS, imager_filters, readout_patterns
 from miricigale.utils.exceptions import unknown_name
 from miricigale.workflow.background import check_levels
-from miricigale.workflow.options import Configuration, option, read_text
+from miricigale.workflow.options import Configuration, Section, option, read_text
 from miricigale.workflow.sections import CatalogSection, FitBasics, RunBasics, SedSection
 
 
-@dataclasses.dataclass(frozen=True)
 class PlanSection(RunBasics):
     """
     What the plan is called and how it goes.
@@ -24,8 +23,7 @@ class PlanSection(RunBasics):
     name: str = "plan"
 
 
-@dataclasses.dataclass(frozen=True)
-class SampleSection:
+class SampleSection(Section):
     """
     The galaxies of the mock photometry.
 
@@ -50,8 +48,7 @@ class SampleSection:
     luminosity_function: str = ""
 
 
-@dataclasses.dataclass(frozen=True)
-class AgnSection:
+class AgnSection(Section):
     """
     The mix of AGN, and how they are selected.
 
@@ -81,8 +78,7 @@ class AgnSection:
     threshold: float = option(0.5, low=0.0, high=1.0)
 
 
-@dataclasses.dataclass(frozen=True)
-class ExposureSection:
+class ExposureSection(Section):
     """
     The MIRI bands, and how long each is exposed.
 
@@ -118,8 +114,7 @@ class ExposureSection:
     pointings: int = option(1, low=1, high=10000)
 
 
-@dataclasses.dataclass(frozen=True)
-class BackgroundSection:
+class BackgroundSection(Section):
     """
     The sky.
 
@@ -142,8 +137,7 @@ class BackgroundSection:
     date: str = ""
 
 
-@dataclasses.dataclass(frozen=True)
-class NoiseSection:
+class NoiseSection(Section):
     """
     Where the errors of MIRI fluxes come from.
 
@@ -168,8 +162,7 @@ class NoiseSection:
     sizes: bool = True
 
 
-@dataclasses.dataclass(frozen=True)
-class ImageSection:
+class ImageSection(Section):
     """
     Images of the planned exposures, measured as in a run, beside the noise of the section above.
 
@@ -194,8 +187,7 @@ class ImageSection:
     roll: float = option(0.0, low=-360, high=360)
 
 
-@dataclasses.dataclass(frozen=True)
-class SurveySection:
+class SurveySection(Section):
     """
     Depth against area.
 
@@ -211,8 +203,7 @@ class SurveySection:
     rank: str = option("agn", choices=("agn", "frac_agn", "redshift"))
 
 
-@dataclasses.dataclass(frozen=True)
-class OverheadSection:
+class OverheadSection(Section):
     """
     What the observatory charges besides the exposures, in s: approximations to APT.
 

@@ -1,15 +1,14 @@
 """
 Derived runs: the same study with one setting changed, and its comparison with the study.
 
-The stages ``variants``, ``rivals`` and ``experiments`` and the perturbed truths each declare what they change
-and which numbers are compared; what they share is here.
+The stages ``variants``, ``rivals`` and ``experiments`` and the perturbed truths each say what they change
+and compute the numbers that are compared; ``page/sections.toml`` declares what the page says of them.
 """
 
 import dataclasses
 import types
 
 import numpy as np
-from astropy.table import QTable
 
 #: Why a number of a comparison is missing.
 NO_SOURCE = "no such source"
@@ -39,11 +38,6 @@ def changed_config(config, sections, changes):
             for name in sections
         }
     )
-
-
-def read_tables(context, folder, names):
-    """Read the tables ``<folder>/<name>.ecsv`` of a stage, by name."""
-    return {name: QTable.read(context.path(f"{folder}/{name}.ecsv")) for name in names}
 
 
 def rows_of(table, ids):

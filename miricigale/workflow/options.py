@@ -51,11 +51,21 @@ def option(default, **limits):
     return dataclasses.field(default=default, metadata={"limits": Limits(**limits)})
 
 
-def option_docs(section):
-    """What the docstrings of a section, and of those that it inherits from, say of each key."""
-    text = "\n".join(inspect.cleandoc(cls.__doc__ or "") for cls in reversed(section.__mro__))
-    entries = re.findall(r"^(\w+)\n((?: +.*\n)+)", text + "\n", flags=re.MULTILINE)
-    return {name: " ".join(doc.split()) for name, doc in entries}
+@typing.dataclass_transform(frozen_default=True, field_specifiers=(option,))
+class Section:
+    """Base of the sections of a configuration: each is a frozen dataclass, whose docstring explains its keys."""
+
+    def __init_subclass__(cls):
+        dataclasses.dataclass(frozen=True)(cls)
+
+    @classmethod
+    def docs(cls):
+        """What the docstring, and those of the sections that it inherits from, say of each key."""
+        text = "".join(
+            f"{inspect.cleandoc(base.__doc__ or '')}\n" for base in reversed(cls.__mro__)
+        )
+        entries = re.findall(r"^(\w+)\n((?: +.*\n)+)", text, flags=re.MULTILINE)
+        return {name: " ".join(doc.split()) for name, doc in entries}
 
 
 def require(good, section, key, wanted, got):
@@ -109,7 +119,7 @@ def read_setting(text):
 
 class Configuration:
     """
-    Base of a configuration: a frozen dataclass whose fields are sections, dataclasses of `option` fields.
+    Base of a configuration: a frozen dataclass whose fields are sections (`Section`).
 
     Attributes
     ----------
@@ -179,7 +189,7 @@ class Configuration:
         lines = [self.heading]
         for field in dataclasses.fields(self):
             section = getattr(self, field.name)
-            summary, docs = type(section).__doc__.split("\n\n")[0], option_docs(type(section))
+            summary, docs = type(section).__doc__.split("\n\n")[0], section.docs()
             lines += ["", f"[{field.name}]  # {summary.strip()}"]
             for entry in dataclasses.fields(section):
                 lines.append(f"# {docs[entry.name]}{_limits_of(entry)}")

@@ -4,17 +4,14 @@ Sections of a run's configuration: every key with its default, its limits and wh
 What a docstring says of a key is its comment in files of configurations and its entry in the reference.
 """
 
-import dataclasses
-
 from miricigale.filters import SURVEYS
 from miricigale.instrument import CEERS_FILTERS
 from miricigale.photometry import YANG2021_DEPTHS
-from miricigale.workflow.options import option, require
+from miricigale.workflow.options import Section, option, require
 from miricigale.workflow.truths import ALL, CATALOG, EFFECTS, EXPERIMENTS, FIELD, SETS, VARIANTS
 
 
-@dataclasses.dataclass(frozen=True)
-class RunBasics:
+class RunBasics(Section):
     """
     What runs and plans have in common.
 
@@ -33,7 +30,6 @@ class RunBasics:
     threads: int = option(0, low=0)
 
 
-@dataclasses.dataclass(frozen=True)
 class RunSection(RunBasics):
     """
     What the run is called and how it goes.
@@ -50,8 +46,7 @@ class RunSection(RunBasics):
     keep_level1b: bool = False
 
 
-@dataclasses.dataclass(frozen=True)
-class CatalogSection:
+class CatalogSection(Section):
     """
     The real sources that are simulated.
 
@@ -92,8 +87,7 @@ class CatalogSection:
             require(good, "catalog", key, "must have the form 'name=value'", list(pairs))
 
 
-@dataclasses.dataclass(frozen=True)
-class PointingSection:
+class PointingSection(Section):
     """
     Where the telescope looks.
 
@@ -138,8 +132,7 @@ def _is_position(text):
     return 0 <= ra <= 360 and -90 <= dec <= 90
 
 
-@dataclasses.dataclass(frozen=True)
-class SedSection:
+class SedSection(Section):
     """
     How the input SEDs are fitted and what AGN is added.
 
@@ -179,8 +172,7 @@ class SedSection:
         require(good, "sed", "alpha", wanted, list(self.alpha))
 
 
-@dataclasses.dataclass(frozen=True)
-class ExposureSection:
+class ExposureSection(Section):
     """
     What is exposed, and for how long.
 
@@ -218,8 +210,7 @@ class ExposureSection:
     dither_exposures: tuple[int, ...] = ()
 
 
-@dataclasses.dataclass(frozen=True)
-class SceneSection:
+class SceneSection(Section):
     """
     The sky behind the sources.
 
@@ -249,8 +240,7 @@ class SceneSection:
     gradient_angle: float = 45.0
 
 
-@dataclasses.dataclass(frozen=True)
-class HighresSection:
+class HighresSection(Section):
     """
     The high-resolution image that is the prior.
 
@@ -269,8 +259,7 @@ class HighresSection:
     depth: float = option(27.6, low=20.0, high=35.0)
 
 
-@dataclasses.dataclass(frozen=True)
-class DetectorSection:
+class DetectorSection(Section):
     """
     What the detector does to the light.
 
@@ -287,8 +276,7 @@ class DetectorSection:
     residual: float | str = option(0.0, low=0.0, high=0.1, choices=("etc",))
 
 
-@dataclasses.dataclass(frozen=True)
-class ReductionSection:
+class ReductionSection(Section):
     """
     How ramps become mosaics.
 
@@ -332,8 +320,7 @@ class ReductionSection:
     pixfrac: float = option(1.0, low=0.1, high=1.0)
 
 
-@dataclasses.dataclass(frozen=True)
-class PhotometrySection:
+class PhotometrySection(Section):
     """
     How sources are found and measured.
 
@@ -361,8 +348,7 @@ class PhotometrySection:
     rivals: bool = False
 
 
-@dataclasses.dataclass(frozen=True)
-class ErrorSection:
+class ErrorSection(Section):
     """
     How the error function is made.
 
@@ -381,8 +367,7 @@ class ErrorSection:
     coverage: bool = True
 
 
-@dataclasses.dataclass(frozen=True)
-class FitBasics:
+class FitBasics(Section):
     """
     The fits.
 
@@ -412,7 +397,6 @@ class FitBasics:
         require(len(self.depths) == n, "fit", "depths", wanted, len(self.depths))
 
 
-@dataclasses.dataclass(frozen=True)
 class FitSection(FitBasics):
     """
     The final fits, with and without MIRI.
@@ -429,8 +413,7 @@ class FitSection(FitBasics):
     experiments: tuple[str, ...] = option((), choices=EXPERIMENTS, unique=True)
 
 
-@dataclasses.dataclass(frozen=True)
-class PointSourceSection:
+class PointSourceSection(Section):
     """
     The check with bright point sources on a grid.
 
@@ -449,8 +432,7 @@ class PointSourceSection:
     signal_to_noise: float = option(1000.0, low=20.0, high=1e5)
 
 
-@dataclasses.dataclass(frozen=True)
-class PerturbSection:
+class PerturbSection(Section):
     """
     In what the sky differs from what the analysis takes it for: one more sky for each effect.
 
@@ -504,8 +486,7 @@ class PerturbSection:
     cutouts_of: str = option("own", choices=("own", "any"))
 
 
-@dataclasses.dataclass(frozen=True)
-class VariantSection:
+class VariantSection(Section):
     """
     Further images of the first sky, by rates, to see what sets the limits of the fluxes.
 
@@ -519,8 +500,7 @@ class VariantSection:
     images: tuple[str, ...] = option((), choices=(*VARIANTS, ALL), single=True, unique=True)
 
 
-@dataclasses.dataclass(frozen=True)
-class ReportSection:
+class ReportSection(Section):
     """
     The page at the end.
 

@@ -34,6 +34,11 @@ def test_the_text_gives_the_configuration_back(tmp_path):
         ({"noise": {"kind": "run"}}, r"run must be a folder"),
         ({"sed": {"frac_agn": 0.5}}, r"\[agn\] has the mix"),
         ({"survey": {"rank": "price"}}, r"rank must be one of"),
+        ({"catalog": {"columns": ["z"]}}, r"\[catalog\] columns must have the form 'name=value'"),
+        (
+            {"fit": {"depths": [25.0]}},
+            r"\[fit\] depths must have one number per band \(15\), got 1",
+        ),
     ],
 )
 def test_what_cannot_be_planned_is_named(values, message):

@@ -1,3 +1,4 @@
+import dataclasses
 import math
 import tomllib
 
@@ -5,6 +6,7 @@ import numpy as np
 import pytest
 from astropy.utils.exceptions import AstropyDeprecationWarning
 
+from miricigale.planning import PlanConfig
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow.config import StudyConfig, load_config, preset_names
 from miricigale.workflow.options import toml_value
@@ -109,6 +111,13 @@ def test_defaults_describe_ceers():
     config = StudyConfig()
     assert len(config.exposures.filters) == 6
     assert len(config.fit.bands) == 15
+
+
+@pytest.mark.parametrize("config", [StudyConfig(), PlanConfig()], ids=["study", "plan"])
+def test_every_key_is_explained_and_nothing_else(config):
+    for section in vars(config).values():
+        assert list(section.docs()) == [field.name for field in dataclasses.fields(section)]
+        assert all(doc.endswith(".") for doc in section.docs().values())
 
 
 def test_all_text_comes_back_from_toml():

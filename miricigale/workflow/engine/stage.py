@@ -7,6 +7,8 @@ import types
 import warnings
 from collections.abc import Callable
 
+from astropy.table import QTable
+
 from miricigale.instrument.image_files import read_image, write_image
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.folder import FileFolder
@@ -191,6 +193,14 @@ class Context:
             msg = f"stage {self._name!r} reads {name!r} without declaring the stage that makes it"
             raise RuntimeError(msg)
         return self.products.path(name)
+
+    def table(self, name):
+        """Read a table that an earlier stage wrote."""
+        return QTable.read(self.path(name))
+
+    def tables(self, folder, names):
+        """Read the tables ``<folder>/<name>.ecsv`` that an earlier stage wrote, by name."""
+        return {name: self.table(f"{folder}/{name}.ecsv") for name in names}
 
     def save(self, name, writer):
         """Write a product whole or not at all, and note it for the manifest."""

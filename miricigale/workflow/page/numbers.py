@@ -84,7 +84,7 @@ class StudyTables:
         """Bright point sources by band; empty where that check was not made."""
         config = self._context.config
         bands = config.exposures.filters if config.point_sources.enabled else ()
-        return {band: QTable.read(self._context.path(f"points/{band}.ecsv")) for band in bands}
+        return self._context.tables("points", bands)
 
     @property
     def sample(self):

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
 
 from miricigale.refdata import citations, resource, resources
 from miricigale.utils.meta import provenance
@@ -146,12 +145,12 @@ def write_exposures(page):
     config, context = page.config, page.context
     page.section("exposures")
     forecasts = {
-        unit: QTable.read(context.path(f"{page.first.name}/exposures/{unit}_forecast.ecsv"))
+        unit: context.table(f"{page.first.name}/exposures/{unit}_forecast.ecsv")
         for unit in study_exposures(config)
     }
     page.table("exposures", exposure_kinds(config, forecasts, page.metrics["bands"]))
     page.report.text(f"Dithers: {dithers_text(config)}. {_background_sentence(config)}.")
-    catalog = QTable.read(context.path("catalog.ecsv"))
+    catalog = context.table("catalog.ecsv")
     page.report.table(catalog_facts(config, catalog), header=("catalog", ""), text=2)
 
 

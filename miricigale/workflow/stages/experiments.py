@@ -14,7 +14,7 @@ from miricigale.evaluation import (
 )
 from miricigale.photometry.surveys import HERSCHEL_DEPTHS
 from miricigale.utils.tables import described_rows
-from miricigale.workflow.derived import read_tables, rows_of
+from miricigale.workflow.derived import rows_of
 from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.page.declared import sentence, texts_of
 from miricigale.workflow.page.numbers import true_ranks
@@ -243,7 +243,7 @@ def write_experiments(page, every):
     for of, study in every.items():
         own = _ranked(study.results["all"], study.sample, context.seed)
         fits = [("study", own)]
-        for name, table in read_tables(context, f"{of}/experiments", names).items():
+        for name, table in context.tables(f"{of}/experiments", names).items():
             if "left_out" in table.meta:
                 left[name] = table.meta["left_out"]
                 continue

@@ -4,12 +4,10 @@ from concurrent.futures import ThreadPoolExecutor
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
 
 from miricigale import evaluation, fitting, photometry, sed
 from miricigale.photometry.surveys import fractional_error
 from miricigale.utils.tables import error_column
-from miricigale.workflow.derived import read_tables
 from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.perturbation import Perturbation
 from miricigale.workflow.stages.conditions import ConditionFlags, add_conditions, any_condition
@@ -43,8 +41,8 @@ class _Field:
         config = context.config
         bands = config.exposures.filters
         radius = config.photometry.match_radius * u.arcsec
-        self.truth = QTable.read(context.path(f"{name}/truth.ecsv"))
-        tables = read_tables(context, f"{name}/photometry", bands)
+        self.truth = context.table(f"{name}/truth.ecsv")
+        tables = context.tables(f"{name}/photometry", bands)
         self.detections = joined_photometry(tables)
         self.matched = evaluation.match_truth(self.truth, self.detections, bands, radius=radius)
         self.association = evaluation.associate(self.truth, self.detections, radius=radius)
@@ -207,17 +205,12 @@ def fit_photometry(context, unit):
 
 def fit_sample(context, name, **options):
     """Truth, matched sources and `mock_photometry` of a truth."""
-    truth, matched = (
-        QTable.read(context.path(f"{name}/{table}.ecsv")) for table in ("truth", "matched")
-    )
-    return (
-        truth,
-        matched,
-        mock_photometry(context.config, truth, matched, seed=context.seed, **options),
-    )
+    truth, matched = context.tables(name, ("truth", "matched")).values()
+    mock = mock_photometry(context.config, truth, matched, seed=context.seed, **options)
+    return truth, matched, mock
 
 
-def fit_mock(context, mock, bands, *, model_error=None, given=None, **options):
+def fit_mock(context, mock, bands, *, given=None, **options):
     """
     Fit mock photometry in the existing and in further bands as the study does.
 
@@ -229,12 +222,10 @@ def fit_mock(context, mock, bands, *, model_error=None, given=None, **options):
         As of `mock_photometry`.
     bands : iterable of str
         Bands that join the existing ones.
-    model_error : float, optional
-        In place of the study's.
     given : dict, optional
         Further arguments of ``BayesFitter.fit``.
     **options
-        Further arguments of `~miricigale.fitting.BayesFitter`.
+        Further arguments of `~miricigale.fitting.BayesFitter`, or others than the study's.
 
     Returns
     -------
@@ -244,8 +235,7 @@ def fit_mock(context, mock, bands, *, model_error=None, given=None, **options):
     fitter = fitting.BayesFitter(
         sed.SEDModel.yang2021(),
         [*fit.bands, *bands],
-        model_error=fit.model_error if model_error is None else model_error,
-        **options,
+        **({"model_error": fit.model_error} | options),
     )
     with ThreadPoolExecutor(context.n_threads) as executor:
         given = {"executor": executor, "progress_bar": context.progress_bar} | (given or {})

@@ -4,7 +4,6 @@ import logging
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
 
 from miricigale import depth, detector, photometry, psf, reduction, scene
 from miricigale.workflow.engine.stage import stage
@@ -182,7 +181,7 @@ def make_exposure(context, unit):
     rate, cal = expose_and_reduce(
         config,
         exposure,
-        QTable.read(context.path(f"{truth}/truth.ecsv")),
+        context.table(f"{truth}/truth.ecsv"),
         seed=context.seed,
         perturbation=Perturbation(effects, context.seed, stamps),
         n_threads=context.n_threads,
@@ -249,7 +248,7 @@ DETECTION = ("photometry.threshold", "photometry.n_pixels")
 def make_highres(context, _):
     """Stage 9: the high-resolution image, its segmentation and the detected sources."""
     config = context.config
-    truth = QTable.read(context.path(f"{context.plan['truth']}/truth.ecsv"))
+    truth = context.table(f"{context.plan['truth']}/truth.ecsv")
     wcs = grid_of(config, config.highres.pixel_scale)
     image, segmentation, detected = prior_image(config, truth, wcs, seed=context.seed)
     context.save_image("f160w.fits", image)

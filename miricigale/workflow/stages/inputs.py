@@ -147,7 +147,7 @@ def bright_sources(catalog, options, prior):
 def fit_inputs(context, _):
     """Stage 2: fit a galaxy grid to the catalog's fluxes at the known redshifts."""
     results = fit_seds(
-        QTable.read(context.path("catalog.ecsv")),
+        context.table("catalog.ecsv"),
         context.config.sed,
         model_error=context.config.fit.model_error,
         progress_bar=context.progress_bar,

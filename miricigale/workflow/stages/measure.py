@@ -1,7 +1,6 @@
 """Stage 11: forced photometry."""
 
 import numpy as np
-from astropy.table import QTable
 
 from miricigale import photometry, psf
 from miricigale.utils.tables import error_column
@@ -90,7 +89,7 @@ def measure_band(context, mosaic, name, method):
 def _detections(context):
     """The high-resolution image, the labels of its segments, and the detected sources."""
     image, (_, labels) = context.image("f160w.fits"), context.image("segm.fits", "segmentation")
-    return image, labels.astype(np.int32), QTable.read(context.path("detections.ecsv"))
+    return image, labels.astype(np.int32), context.table("detections.ecsv")
 
 
 def joined_photometry(tables):

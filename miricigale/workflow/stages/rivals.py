@@ -9,7 +9,7 @@ from miricigale.evaluation import Estimate, bootstrap, match_truth, recovery_met
 from miricigale.evaluation.estimates import median
 from miricigale.pages import Missing, number
 from miricigale.utils.tables import described_rows, error_column
-from miricigale.workflow.derived import NO_SOURCE, read_tables
+from miricigale.workflow.derived import NO_SOURCE
 from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.page.declared import texts_of
 from miricigale.workflow.page.labels import band_label
@@ -63,8 +63,7 @@ def measure_rivals(context, name):
     """Measure a band of the reference truth by the other method and as Source Extractor does."""
     config, of_truth = context.config, context.plan["truth"]
     radius = config.photometry.match_radius * u.arcsec
-    truth = QTable.read(context.path(f"{of_truth}/truth.ecsv"))
-    matched = QTable.read(context.path(f"{of_truth}/matched.ecsv"))
+    truth, matched = context.tables(of_truth, ("truth", "matched")).values()
     own = config.photometry.method
     other = "package" if own == "yang2021" else "yang2021"
     mosaic = context.image(f"{of_truth}/mosaic_{name}_fine.fits")
@@ -113,7 +112,7 @@ def rival_table(truth, matched, name, *, own, inside):
 def read_rivals(context):
     """Read the tables of the stage by band; empty where the stage is switched off."""
     config = context.config
-    return read_tables(context, "rivals", band_names(config) if config.photometry.rivals else ())
+    return context.tables("rivals", band_names(config) if config.photometry.rivals else ())
 
 
 def _groups(table):

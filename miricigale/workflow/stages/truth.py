@@ -158,7 +158,7 @@ def make_truth(context, name):
     """Stage 3: the best-fit SED (and its AGN) of each source through every band."""
     config, frac_agn = context.config, context.plan["frac_agn"]
     effects = context.plan.get("perturbations", {})
-    catalog = QTable.read(context.path("catalog.ecsv"))
+    catalog = context.table("catalog.ecsv")
     best = fitting.FitResults.read(context.path("input_seds.fits")).to_table()
     parameters = galaxy_parameters(config, catalog, best, seed=context.seed)
     prior = config.highres.filter

@@ -3,7 +3,6 @@
 import astropy.units as u
 import numpy as np
 from astropy.stats import biweight_scale
-from astropy.table import QTable
 from markupsafe import Markup
 
 from miricigale import psf, scene
@@ -12,7 +11,7 @@ from miricigale.pages import number
 from miricigale.photometry.error_curves import limiting_flux, measured_curve
 from miricigale.utils.random import stream
 from miricigale.utils.tables import described_rows, error_column
-from miricigale.workflow.derived import changed_config, read_tables
+from miricigale.workflow.derived import changed_config
 from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.page.band_figures import variant_figure
 from miricigale.workflow.page.declared import texts_of
@@ -67,7 +66,7 @@ _OUT = SampleFlags.OUTSIDE_FIELD | SampleFlags.STAR | SampleFlags.NO_MODEL
 def measure_variants(context, band):
     """Expose, reduce and measure a band of the reference truth with one setting changed at a time."""
     config, plan = context.config, context.plan
-    truth = QTable.read(context.path(f"{plan['truth']}/truth.ecsv"))
+    truth = context.table(f"{plan['truth']}/truth.ecsv")
     exposures = band_exposures(config, band)
     # the sources on the sky are the same in all of them
     options = {"filter": band, "psf": psf.miri_psf(band), "n_threads": context.n_threads}
@@ -210,7 +209,7 @@ def write_variants(page, matched, limits):
     if not changes:
         return None
     bands = band_names(config)
-    tables = {name: read_tables(context, f"variants/{name}", bands) for name in changes}
+    tables = {name: context.tables(f"variants/{name}", bands) for name in changes}
     options = {"statistic": config.errors.statistic, "bin_size": config.errors.bin_size}
     table = variant_numbers(matched, tables, limits, seed=context.seed, **options)
     page.numbers("variants", table)
