@@ -117,7 +117,9 @@ def test_names_say_what_is_written(result, tmp_path):
     table = QTable.read(tmp_path / "r.ecsv")
     assert_array_equal(table["flux"].value, result.flux.value)
     assert table["flux_err"].info.description == "1-sigma error of the flux"
-    for name in ("r.txt", "r.csv", "r"):
+    result.write(tmp_path / "r.csv")
+    assert_array_equal(QTable.read(tmp_path / "r.csv")["flux"], result.flux.value)
+    for name in ("r.txt", "r"):
         with pytest.raises(IORegistryError, match=r"must end in one of \.ecsv, \.fits"):
             result.write(tmp_path / name)
         assert not (tmp_path / name).exists()

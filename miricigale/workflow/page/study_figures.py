@@ -247,7 +247,7 @@ def example_figure(results, row, key, model):
     best = results["all"].loc[key]
     parts, posteriors, joint = {}, {}, {}
     for name in ("all", "none"):
-        one = results[name][key] if name in results else None
+        one = results[name].loc[key] if name in results else None
         if one is None or not np.isfinite(one.chi2):
             continue
         label = SET_LABELS[name]

@@ -234,7 +234,7 @@ class _Sources(StudyTables):
 
     def _fit(self, unit, key):
         """Chi2, posteriors and moments of a source, and the spectrum of its best model."""
-        one = self.results[unit][key]
+        one = self.results[unit].loc[key]
         if not one.fitted:
             return None
         fit = {
