@@ -46,6 +46,8 @@ def as_photometry(data, bands, argument="photometry"):
     ------
     ValueError
         If it is no table, or two columns are the same band.
+    `~astropy.units.UnitsError`
+        If errors of magnitudes are in another unit than mag.
     """
     table, bands = as_table(data, argument), tuple(bands)
     names = _our_names(table.colnames, bands, argument)
@@ -60,7 +62,7 @@ def as_photometry(data, bands, argument="photometry"):
     if "id" not in out.colnames:
         out["id"] = np.arange(1, len(out) + 1)
     for name in magnitudes:
-        _to_fluxes(out, name)
+        _to_fluxes(out, name, argument)
     return out
 
 
@@ -110,13 +112,17 @@ def _is_ab(table, name):
     return unit == u.ABmag
 
 
-def _to_fluxes(table, name):
+def _to_fluxes(table, name, argument):
     """Magnitudes of a band and their errors as fluxes in uJy."""
     magnitude = _plain(table[name])
     flux = 10 ** (-0.4 * (magnitude - 23.9))
     table[name] = flux * FNU
     error = error_column(name)
     if error in table.colnames:
+        unit = getattr(table[error], "unit", None)
+        if unit not in (None, u.mag, u.ABmag, u.dimensionless_unscaled):
+            msg = f"{argument!r} column {error!r} must be in mag, as {name!r} is, got {unit}"
+            raise u.UnitsError(msg)
         table[error] = _PER_MAGNITUDE * flux * _plain(table[error]) * FNU
 
 

@@ -211,7 +211,9 @@ def test_what_is_no_table_is_named(grid, photometry, filters):
         fitter.fit(photometry[:2], redshift=["a", "b"])
     table = photometry.copy()
     table["band0"] = np.full(len(table), 22.0) * u.ABmag
-    with pytest.raises(u.UnitsError, match=r"column 'band0' must be convertible to uJy, got mag"):
+    with pytest.raises(
+        u.UnitsError, match=r"column 'band0_err' must be in mag, as 'band0' is, got uJy"
+    ):
         fitter.fit(table)
 
 
