@@ -114,7 +114,7 @@ def test_details_are_those_of_the_fits(run):
         assert close(entry["true"], [truth[name][row].value for name in bands])
         assert close(entry["flux"][3:], [matched[name][row].value for name in BANDS])
         assert entry["flags"] == [matched[f"{name}_flags"][row] for name in BANDS]
-        one = results["all"][entry["id"]]
+        one = results["all"].loc[entry["id"]]
         assert [*one.filters] == bands
         assert close(entry["flux"], one.flux)
         assert close(entry["error"], one.flux_err, rtol=6e-3)
