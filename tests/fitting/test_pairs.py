@@ -183,7 +183,7 @@ def test_draws_agree_within_their_error(fitter, results, photometry):
     samples = fitter.sample(photometry[:1], n, seed=2)
     key = photometry["id"][0]
     for x, y in results.pairs:
-        want = results[key].joint_pdf(x, y)
+        want = results.loc[key].joint_pdf(x, y)
         got = samples.pdf_2d(x, y, key)[2]
         # a binomial number in each cell
         error = np.sqrt(want * (1 - want) / n)
@@ -260,7 +260,7 @@ def test_from_file_to_file(fitter, photometry, tmp_path):
         joined = np.concatenate([part.pairs[names] for part in parts])
         np.testing.assert_array_equal(joined, whole.pairs[names])
     key = table["id"][7]
-    got = open_results(folder)[key].joint_pdf("redshift", "age")
+    got = open_results(folder).loc[key].joint_pdf("redshift", "age")
     np.testing.assert_array_equal(got, whole[key].joint_pdf("redshift", "age"))
     # the same in other words goes on, others do not
     fit_file(fitter, source, folder, chunk_rows=5, pairs=[*pairs, ("redshift", "frac_agn")])

@@ -120,7 +120,7 @@ def test_details_are_those_of_the_fits(run):
         assert close(entry["error"], one.flux_err, rtol=6e-3)
         assert close([entry["parameters"][names.index("sfr")]], [truth["sfr"][row].value])
         for name, found in results.items():
-            one, fit = found[entry["id"]], entry["fits"][name]
+            one, fit = found.loc[entry["id"]], entry["fits"][name]
             assert (fit["n_bands"], True) == (one.n_bands, close([fit["chi2"]], [one.chi2]))
             mass = [kind("stellar_mass").value for kind in (one.mean, one.std)]
             assert close(fit["moments"][names.index("stellar_mass")], mass)
