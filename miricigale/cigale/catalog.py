@@ -8,7 +8,7 @@ import numpy as np
 from astropy.table import QTable, Table
 
 from miricigale.filters.band_names import band_filters, filter_of_band, is_line
-from miricigale.filters.filter import given_filters
+from miricigale.filters.given import given_filters
 from miricigale.utils.exceptions import CatalogWarning, DataError
 from miricigale.utils.files import read_table
 from miricigale.utils.missing import negative_errors, plain_floats, without_codes

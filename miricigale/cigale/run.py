@@ -10,7 +10,7 @@ from miricigale.cigale.modules import read_modules
 from miricigale.cigale.names import cigale_names
 from miricigale.cigale.setup import CigaleSetup
 from miricigale.filters.band_names import band_filters, xray_energies
-from miricigale.filters.filter import given_filters
+from miricigale.filters.given import given_filters
 from miricigale.utils.exceptions import CatalogWarning, ConfigError, argument_error
 from miricigale.utils.tables import error_column
 

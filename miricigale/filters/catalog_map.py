@@ -24,7 +24,7 @@ _DEFAULT_UNITS = {"ra": u.deg, "dec": u.deg, "position_angle": u.deg}
 #: Names of AB magnitudes as a unit.
 _AB = ("abmag", "mag(ab)", "ab", "mag_ab")
 #: Error in magnitudes times flux is an error of the flux.
-_PER_MAGNITUDE = 0.4 * np.log(10)
+PER_MAGNITUDE = 0.4 * np.log(10)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -296,10 +296,10 @@ class CatalogMap:
     def _errors(self, column, name, errors, flux, ab, argument):
         """Errors of fluxes in uJy, from those in the file's unit."""
         if ab and "flux" in self.units and name not in self.units:
-            return _PER_MAGNITUDE * flux * errors
+            return PER_MAGNITUDE * flux * errors
         unit = self._asked(name, column, not ab, argument)
         if ab and (unit is None or unit == u.mag or _is_ab(unit)):
-            return _PER_MAGNITUDE * flux * errors
+            return PER_MAGNITUDE * flux * errors
         if unit is None or not unit.is_equivalent(FNU):
             msg = f"'{argument}' column {name!r} must be convertible to {FNU}, got {unit}"
             raise u.UnitsError(msg)

@@ -2,8 +2,6 @@
 
 import dataclasses
 import functools
-import os
-import re
 from pathlib import Path
 
 import astropy.units as u
@@ -12,10 +10,11 @@ from astropy.table import QTable
 
 from miricigale.filters import _core
 from miricigale.filters.band_names import find_filter
+from miricigale.filters.curve_files import read_curve
 from miricigale.filters.library import FILTERS, load_curve
 from miricigale.filters.spectra import check_wave, spectrum_arrays
-from miricigale.utils.exceptions import DataError, argument_error, unknown_name
-from miricigale.utils.files import read_table, unpacked_size, write_table
+from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.files import write_table
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.units import FNU, WAVE, Frozen, frozen_array, frozen_quantity, to_array
 
@@ -24,10 +23,6 @@ VERSION = 1
 
 #: Share of a band that a spectrum may leave uncovered.
 UNCOVERED = 1e-4
-
-# what a header says of the wavelengths of a curve
-_UNITS = re.compile(r"\b(um|microns?|nm|AA|Angstroms?)\b", re.IGNORECASE)
-_TABLES = (".ecsv", ".fits", ".fit", ".xml", ".vot", ".votable")
 
 # relative width of the step to zero at the end of a curve that does not end in zero
 _STEP = 1e-6
@@ -105,7 +100,6 @@ class Filter(Frozen, Interactive):
         "bandwidth": "width",
         "effective_width": "width",
         "edges": "bounds",
-        "from_file": "read",
     }
 
     def __init__(
@@ -124,8 +118,9 @@ class Filter(Frozen, Interactive):
         if isinstance(wave, str):
             # the name first, as others have it
             wave, throughput, name = throughput, name, wave
-        if throughput is None or name is None:
-            raise argument_error("name", "given with 'wave' and 'throughput'", repr(name))
+        for argument, value in (("throughput", throughput), ("name", name)):
+            if value is None:
+                raise argument_error(argument, "given with 'wave'", "None")
         self.__dict__.update(
             wave=wave,
             throughput=throughput,
@@ -240,43 +235,8 @@ class Filter(Frozen, Interactive):
         `~miricigale.utils.exceptions.DataError`
             If the file is missing, has not two columns of numbers, or no unit of the wavelengths is known.
         """
-        path = Path(path).expanduser()
-        if path.suffix.lower() in _TABLES:
-            table = read_table(path, wanted="a filter")
-            if len(table.colnames) < 2 or not hasattr(table.columns[0], "unit"):
-                msg = f"filter file {path} has not two columns, the first with a unit"
-                raise DataError(msg)
-            wave, throughput = (table[column] for column in table.colnames[:2])
-            return cls(wave, throughput, name or table.meta.get("name") or path.stem)
-        unpacked_size(path)
-        try:
-            lines = path.read_text().splitlines()
-        except (OSError, UnicodeDecodeError) as err:
-            msg = f"filter file {path} cannot be read: {err}"
-            raise DataError(msg) from None
-        comments = [line.lstrip("# ").strip() for line in lines if line.startswith("#")]
-        try:
-            data = np.array(
-                [line.split()[:2] for line in lines if line[:1] not in ("#", "")], float
-            )
-            wave, throughput = data.T
-        except ValueError:
-            msg = f"filter file {path} has not two columns of numbers"
-            raise DataError(msg) from None
-        kinds = [text.lower() for text in comments[:3] if text.lower() in ("photon", "energy")]
-        if name is None:
-            name = comments[0] if kinds and comments[0].lower() not in kinds else path.stem
-        if unit is None:
-            found = _UNITS.search(" ".join(comments))
-            if not kinds and found is None:
-                msg = f"filter file {path} does not say the unit of its wavelengths: give 'unit'"
-                raise DataError(msg)
-            unit = u.AA if kinds else _unit(found[1])
-        order = np.argsort(wave)
-        wave, throughput = wave[order], throughput[order]
-        if kinds[:1] == ["energy"]:
-            throughput = throughput / (wave / wave.mean())
-        return cls(wave * u.Unit(unit), throughput, name=name, meta={"source": path.name})
+        wave, throughput, found = read_curve(path, unit)
+        return cls(wave, throughput, name or found, meta={"source": Path(path).name})
 
     def to_table(self):
         """The curve as a `~astropy.table.QTable` of ``wave`` (um) and ``throughput``."""
@@ -451,7 +411,7 @@ class Filter(Frozen, Interactive):
         ----------
         Bessell & Murphy 2012, PASP, 124, 140, equation A15.
         """
-        wave, fnu = spectrum_arrays(sed if flux is None else (sed, flux), self._fine[0])
+        wave, fnu = spectrum_arrays(sed if flux is None else (sed, flux), [self])
         first, part = self._weights(wave, UNCOVERED)
         return float(part @ fnu[first : first + part.size]) * FNU
 
@@ -477,60 +437,6 @@ class Filter(Frozen, Interactive):
         from miricigale.plotting.filters import plot_filters
 
         return plot_filters([(self.wave.value, self.throughput, self.name)], ax=ax, **kwargs)
-
-
-def _unit(word):
-    return u.um if word.lower().startswith("micron") else u.Unit("AA" if word[:1] in "aA" else word)
-
-
-def as_filter(given, name=None, *, unit=None):
-    """
-    Filter of anything that says which one is meant.
-
-    Parameters
-    ----------
-    given : `Filter`, str, path-like or `synphot.SpectralElement`
-        A filter, a name for `Filter.from_name`, the path of a file for `Filter.read`, or a bandpass.
-    name : str, optional
-        Name of what comes from a file or a bandpass.
-    unit : `~astropy.units.Unit`, optional
-        As for `Filter.read`.
-
-    Returns
-    -------
-    filter : `Filter`
-
-    Raises
-    ------
-    KeyError
-        If there is no filter of a name.
-    `~miricigale.utils.exceptions.DataError`
-        If a file cannot be read as a filter.
-    ValueError
-        If it is something else.
-    """
-    if isinstance(given, Filter):
-        return given
-    if isinstance(given, os.PathLike) or (isinstance(given, str) and _is_path(given)):
-        return Filter.read(given, name=name, unit=unit)
-    if isinstance(given, str):
-        return Filter.from_name(given)
-    if hasattr(given, "waveset"):
-        return Filter.from_synphot(given, name=name)
-    wanted = "a Filter, the name of one, the path of its file or a synphot SpectralElement"
-    raise argument_error(name or "filter", wanted, type(given).__name__)
-
-
-def _is_path(text):
-    if find_filter(text) is not None:
-        return False
-    endings = (".dat", ".txt", ".par", *_TABLES)
-    return text.lower().endswith(endings) or os.path.isfile(os.path.expanduser(text))
-
-
-def given_filters(names):
-    """Filters that a user of CIGALE gave for bands, a dict by the band of what `as_filter` takes."""
-    return {band: as_filter(given, band, unit=u.AA) for band, given in (names or {}).items()}
 
 
 @functools.lru_cache(maxsize=512)

@@ -8,7 +8,8 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.filters.band_names import find_filter
-from miricigale.filters.filter import UNCOVERED, Filter, as_filter
+from miricigale.filters.filter import UNCOVERED, Filter
+from miricigale.filters.given import as_filter
 from miricigale.filters.spectra import check_wave, spectrum_arrays
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.interactive import Interactive
@@ -157,8 +158,7 @@ class FilterSet(Interactive):
         fluxes : `~astropy.units.Quantity`, shape (n_filters,)
             In uJy.
         """
-        where = np.unique(np.concatenate([band._fine[0] for band in self.filters]))
-        wave, fnu = spectrum_arrays(sed, where)
+        wave, fnu = spectrum_arrays(sed, self.filters)
         return self.weights(wave) @ fnu * FNU
 
     def plot(self, ax=None, **kwargs):

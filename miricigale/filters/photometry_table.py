@@ -1,13 +1,17 @@
 """Catalogs of measured fluxes, however their columns are called."""
 
 import re
+import warnings
 
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
 from miricigale.filters.band_names import find_filter
-from miricigale.utils.exceptions import argument_error
+from miricigale.filters.catalog_files import told_of
+from miricigale.filters.catalog_map import PER_MAGNITUDE
+from miricigale.utils.exceptions import CatalogWarning, argument_error
+from miricigale.utils.missing import plain_floats, without_codes
 from miricigale.utils.tables import as_table, error_column
 from miricigale.utils.units import FNU
 
@@ -18,8 +22,6 @@ _ERROR = re.compile(
 )
 _FLUX = re.compile(r"(?:f|flux|mag|m)_(?P<a>.+)|(?P<b>.+?)_(?:flux|mag)", re.IGNORECASE)
 _IDS = ("id", "number", "source_id", "objid")
-#: Error of a magnitude to that of a flux, as a part of it.
-_PER_MAGNITUDE = 0.4 * np.log(10)
 
 
 def as_photometry(data, bands, argument="photometry"):
@@ -48,6 +50,11 @@ def as_photometry(data, bands, argument="photometry"):
         If it is no table, or two columns are the same band.
     `~astropy.units.UnitsError`
         If errors of magnitudes are in another unit than mag.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.CatalogWarning`
+        Of magnitudes such as 99 or -99, which stand for no value and become NaN.
     """
     table, bands = as_table(data, argument), tuple(bands)
     names = _our_names(table.colnames, bands, argument)
@@ -61,8 +68,9 @@ def as_photometry(data, bands, argument="photometry"):
     out.meta = table.meta
     if "id" not in out.colnames:
         out["id"] = np.arange(1, len(out) + 1)
-    for name in magnitudes:
-        _to_fluxes(out, name, argument)
+    coded = {name: _to_fluxes(out, name, argument) for name in magnitudes}
+    for text in told_of((), coded):
+        warnings.warn(f"{argument}: {text}", CatalogWarning, stacklevel=3)
     return out
 
 
@@ -113,21 +121,22 @@ def _is_ab(table, name):
 
 
 def _to_fluxes(table, name, argument):
-    """Magnitudes of a band and their errors as fluxes in uJy."""
-    magnitude = _plain(table[name])
-    flux = 10 ** (-0.4 * (magnitude - 23.9))
-    table[name] = flux * FNU
-    error = error_column(name)
+    """
+    Magnitudes of a band and their errors as fluxes in uJy, NaN where they are missing.
+
+    Returns the numbers that stand for no value, NaN in rows that have none.
+    """
+    error, errors = error_column(name), None
+    magnitudes = plain_floats(table[name], name, argument)
     if error in table.colnames:
         unit = getattr(table[error], "unit", None)
         if unit not in (None, u.mag, u.ABmag, u.dimensionless_unscaled):
             msg = f"{argument!r} column {error!r} must be in mag, as {name!r} is, got {unit}"
             raise u.UnitsError(msg)
-        table[error] = _PER_MAGNITUDE * flux * _plain(table[error]) * FNU
-
-
-def _plain(column):
-    """Numbers of a column, NaN where masked."""
-    mask = np.asarray(getattr(column, "mask", False))
-    values = np.asarray(getattr(getattr(column, "unmasked", column), "value", column), float)
-    return np.where(mask, np.nan, values)
+        errors = plain_floats(table[error], error, argument)
+    missing, no_error = without_codes(magnitudes, errors, magnitudes=True)
+    flux = 10 ** (-0.4 * (np.where(missing, np.nan, magnitudes) - 23.9))
+    table[name] = flux * FNU
+    if errors is not None:
+        table[error] = PER_MAGNITUDE * flux * np.where(no_error, np.nan, errors) * FNU
+    return np.where(missing, magnitudes, np.nan)

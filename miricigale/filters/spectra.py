@@ -17,7 +17,7 @@ def check_wave(wave):
     return wave
 
 
-def spectrum_arrays(sed, where=None):
+def spectrum_arrays(sed, bands):
     """
     Wavelengths (um) and F_nu (uJy) of a spectrum.
 
@@ -27,8 +27,8 @@ def spectrum_arrays(sed, where=None):
         With ``wave`` and ``fnu``; a pair of wavelengths and flux densities; a spectrum of specutils
         (``spectral_axis`` and ``flux``) or synphot; or a function of wavelengths that gives flux
         densities, as astropy's models are.
-    where : `~numpy.ndarray`, shape (n,), optional
-        Wavelengths (um) at which a function is evaluated.
+    bands : iterable of `~miricigale.filters.Filter`
+        Where a function is evaluated.
 
     Returns
     -------
@@ -48,12 +48,10 @@ def spectrum_arrays(sed, where=None):
     elif hasattr(sed, "spectral_axis") and hasattr(sed, "flux"):
         wave, flux = sed.spectral_axis.to(WAVE, u.spectral()), sed.flux
     elif hasattr(sed, "waveset"):
-        if sed.waveset is None and where is None:
-            raise argument_error("sed", "a spectrum with a waveset", "one without")
-        wave = where * WAVE if sed.waveset is None else sed.waveset
+        wave = _inside(bands) if sed.waveset is None else sed.waveset
         flux = sed(wave, flux_unit=u.Jy)
-    elif callable(sed) and where is not None:
-        wave = where * WAVE
+    elif callable(sed):
+        wave = _inside(bands)
         flux = sed(wave)
     else:
         wanted = "a spectrum: an SED, (wavelengths, flux densities), or one of specutils or synphot"
@@ -75,3 +73,8 @@ def spectrum_arrays(sed, where=None):
         got = f"{fnu.size} for {wave.size} wavelengths"
         raise argument_error("sed.fnu", "as many values as sed.wave", got)
     return wave, fnu
+
+
+def _inside(bands):
+    """Wavelengths of the curves of bands, refined."""
+    return np.unique(np.concatenate([band._fine[0] for band in bands])) * WAVE

@@ -11,7 +11,7 @@ from miricigale.fitting.likelihood import FitFlags
 from miricigale.fitting.posterior import bin_edges, cell_edges, check_levels
 from miricigale.fitting.priors import grid_priors
 from miricigale.fitting.quantities import FRACTIONS, Quantities
-from miricigale.fitting.results import FitRows
+from miricigale.fitting.rows import FitRows
 from miricigale.sed import grid_spectra as spectra
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.object_rows import PerObject

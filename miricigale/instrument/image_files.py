@@ -10,17 +10,12 @@ from miricigale.instrument import dq_planes, read_dq, with_own_bits
 from miricigale.instrument.image import Image
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import open_fits, write_fits
-from miricigale.utils.meta import undated
-from miricigale.utils.store import plain_value
+from miricigale.utils.meta import plain_text, undated
 
 
 def json_meta(meta):
     """The meta dictionary of an image as JSON, without dates; a quantity keeps its unit as text."""
-
-    def plain(value):
-        return f"{value}" if isinstance(value, u.Quantity) else plain_value(value)
-
-    return json.dumps(undated(meta), default=plain, allow_nan=True)
+    return json.dumps(undated(meta), default=plain_text)
 
 
 #: Steps of rounded values in the median error of an image: with its dither that adds less than 1e-3

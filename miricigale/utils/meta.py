@@ -80,14 +80,15 @@ def fits_meta(meta):
     """
     cards = {}
     for key, value in meta.items():
+        key = str(key)
         value = value.item() if isinstance(value, np.generic) else value
         plain = isinstance(value, (bool, int)) or (
             isinstance(value, float) and math.isfinite(value)
         )
-        if plain or (isinstance(value, str) and value.isascii() and len(value) < _SHORT):
+        if plain or (isinstance(value, str) and _TEXT.fullmatch(value)):
             own = _KEYWORD.fullmatch(key) is not None and key.upper() not in _RESERVED
             cards[key if own else f"HIERARCH {key}"] = value
-    return cards | {"META": json.dumps(meta, default=_plain)}
+    return cards | {"META": json.dumps(meta, default=plain_text)}
 
 
 def full_meta(meta):
@@ -95,7 +96,7 @@ def full_meta(meta):
     return json.loads(meta["META"]) if "META" in meta else dict(meta)
 
 
-def _plain(value):
+def plain_text(value):
     """A value that JSON does not know as one that it does; a quantity keeps its unit as text."""
     if isinstance(value, (np.generic, np.ndarray)) and not hasattr(value, "unit"):
         return value.tolist()
@@ -104,5 +105,5 @@ def _plain(value):
 
 _KEYWORD = re.compile(r"[A-Za-z0-9_-]{1,8}")
 _RESERVED = {"META", "SIMPLE", "EXTEND", "BITPIX", "NAXIS", "TFIELDS", "EXTNAME", "COMMENT"}
-# text and keyword together stand on one card
-_SHORT = 40
+# short enough to stand on one card with its keyword
+_TEXT = re.compile(r"[ -~]{0,40}")

@@ -193,7 +193,7 @@ def test_reads_the_files_of_cigale(tmp_path):
     assert_quantity_allclose(Filter.read(path).pivot, box().pivot, rtol=1e-9)
     # micrometers would be taken for Angstrom
     path.write_text("8 1\n12 1\n")
-    with pytest.raises(DataError, match="does not say the unit of its wavelengths"):
+    with pytest.raises(DataError, match="does not state the unit of its wavelengths"):
         Filter.read(path)
     band = Filter.read(path, name="a", unit=u.um)
     assert_quantity_allclose(band.pivot, box().pivot, rtol=1e-9)

@@ -6,6 +6,7 @@ import pytest
 from astropy.table import MaskedColumn, QTable, Table
 
 from miricigale.filters import as_photometry
+from miricigale.utils.exceptions import CatalogWarning
 
 BANDS = ("miri.f770w", "wfc3.f160w")
 
@@ -83,6 +84,14 @@ def test_magnitudes_become_fluxes(catalog):
     np.testing.assert_allclose(got["miri.f770w_err"].value, [0.0921034, 0.1842068], rtol=1e-6)
     masked = Table({"mag_F770W": MaskedColumn([23.9, 1.0], mask=[False, True])})
     assert np.isnan(as_photometry(masked, BANDS)["miri.f770w"].value).tolist() == [False, True]
+
+
+def test_magnitudes_that_stand_for_no_value_become_missing_bands():
+    table = Table({"mag_F770W": [23.9, 99.0, 22.0], "e_mag_F770W": [0.1, 0.1, -99.0]})
+    with pytest.warns(CatalogWarning, match=r"taken as missing, .*: miri.f770w 1 of 3 \(99\)"):
+        got = as_photometry(table, BANDS)
+    assert np.isnan(got["miri.f770w"].value).tolist() == [False, True, False]
+    assert np.isnan(got["miri.f770w_err"].value).tolist() == [False, True, True]
 
 
 def test_two_columns_for_one_band_are_refused(catalog):

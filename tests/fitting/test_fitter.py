@@ -6,6 +6,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
+from numpy.testing import assert_array_equal
 from scipy.integrate import quad
 from scipy.stats import norm
 
@@ -13,6 +14,7 @@ from helpers.grids import cells
 from helpers.results import assert_same
 from miricigale.fitting import BayesFitter, FitFlags, GridSettings, SamplerSettings, leave_out
 from miricigale.sed import SEDModel
+from miricigale.utils.exceptions import FitWarning
 
 
 @pytest.mark.slow
@@ -215,6 +217,31 @@ def test_what_is_no_table_is_named(grid, photometry, filters):
         u.UnitsError, match=r"column 'band0_err' must be in mag, as 'band0' is, got uJy"
     ):
         fitter.fit(table)
+
+
+def test_catalogs_come_in_any_kind_of_table(grid, photometry, tmp_path):
+    fitter = BayesFitter(grid)
+    want = fitter.fit(photometry)
+    photometry.write(tmp_path / "a.ecsv")
+    plain = {name: photometry[name] for name in photometry.colnames}
+    other = photometry.copy()
+    for name in grid.filters:
+        other.rename_column(f"{name}_err", f"e_{name}")
+    for given in (tmp_path / "a.ecsv", plain, other):
+        assert_array_equal(fitter(given).chi2, want.chi2)
+    del plain["id"]
+    assert fitter.fit(plain).ids.tolist() == list(range(1, len(photometry) + 1))
+
+
+def test_a_band_that_is_not_there_is_a_missing_band(grid, photometry):
+    fitter = BayesFitter(grid, ["band0", "band1", "band2"], n_bands_min=2)
+    without = photometry.copy()
+    without["band1"] *= np.nan
+    want = fitter.fit(without)
+    without.remove_columns(["band1", "band1_err"])
+    with pytest.warns(FitWarning, match="the photometry has no band1: missing bands of all obje"):
+        got = fitter.fit(without)
+    assert_array_equal(got.chi2, want.chi2)
 
 
 def test_infinite_fluxes_are_flagged(grid, photometry):

@@ -102,3 +102,13 @@ def test_spectra_at_other_wavelengths_are_not_added():
         one + SED([1, 3] * u.um, [1, 1] * u.uJy)
     with pytest.raises(TypeError):
         one * "two"
+
+
+def test_a_spectrum_goes_to_specutils():
+    pytest.importorskip("specutils", reason="needs specutils: pip install miricigale[specutils]")
+    sed = SED(WAVE, np.linspace(1, 9, WAVE.size) * u.uJy)
+    other = sed.to_specutils()
+    assert_quantity_allclose(other.flux, sed.fnu)
+    assert_quantity_allclose(
+        Filter("F770W").synthetic_flux(other), sed.synthetic_flux("F770W"), rtol=1e-12
+    )

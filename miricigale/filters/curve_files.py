@@ -1,0 +1,86 @@
+"""Files of filter curves."""
+
+import re
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+
+from miricigale.utils.exceptions import DataError
+from miricigale.utils.files import read_table, unpacked_size
+
+# units that a header may name
+_UNITS = re.compile(r"\b(um|microns?|nm|AA|Angstroms?)\b", re.IGNORECASE)
+#: Suffixes of files that are tables with units.
+TABLES = (".ecsv", ".fits", ".fit", ".xml", ".vot", ".votable")
+
+
+def read_curve(path, unit=None):
+    """
+    Read a filter curve; see `~miricigale.filters.Filter.read`.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    unit : `~astropy.units.Unit`, optional
+        Unit of the wavelengths; else the one in the file.
+
+    Returns
+    -------
+    wave : `~astropy.units.Quantity`, shape (n,)
+        Ascending wavelengths.
+    throughput : `~numpy.ndarray`, shape (n,)
+        Response to photons.
+    name : str
+        The one in the file, else that of the file.
+    """
+    path = Path(path).expanduser()
+    return _of_table(path, unit) if path.suffix.lower() in TABLES else _of_text(path, unit)
+
+
+def _of_table(path, unit):
+    table = read_table(path, wanted="a filter")
+    columns = [table[name] for name in table.colnames[:2]]
+    has = getattr(columns[0], "unit", None) if columns else None
+    if len(columns) < 2 or (unit is None and has is None):
+        msg = f"filter file {path} has not two columns, the first with a unit of wavelength"
+        raise DataError(msg)
+    wave = np.asarray(getattr(columns[0], "value", columns[0]), float)
+    name = str(table.meta.get("name") or table.meta.get("NAME") or path.stem)
+    return wave * u.Unit(unit or has), np.asarray(columns[1], float), name
+
+
+def _of_text(path, unit):
+    unpacked_size(path)
+    try:
+        lines = path.read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as err:
+        msg = f"filter file {path} cannot be read: {err}"
+        raise DataError(msg) from None
+    comments = [line.lstrip("# ").strip() for line in lines if line.startswith("#")]
+    try:
+        data = np.array([line.split()[:2] for line in lines if line[:1] not in ("#", "")], float)
+        wave, throughput = data.T
+    except ValueError:
+        msg = f"filter file {path} has not two columns of numbers"
+        raise DataError(msg) from None
+    # as in CIGALE's files, which are in Angstrom
+    kinds = [text.lower() for text in comments[:3] if text.lower() in ("photon", "energy")]
+    named = kinds and comments[0].lower() not in kinds
+    if unit is None:
+        found = _UNITS.search(" ".join(comments))
+        if not kinds and found is None:
+            msg = f"filter file {path} does not state the unit of its wavelengths: give 'unit'"
+            raise DataError(msg)
+        unit = u.AA if kinds else _unit(found[1])
+    order = np.argsort(wave)
+    wave, throughput = wave[order], throughput[order]
+    if kinds[:1] == ["energy"]:
+        throughput = throughput / (wave / wave.mean())
+    return wave * u.Unit(unit), throughput, comments[0] if named else path.stem
+
+
+def _unit(word):
+    word = word.lower()
+    return {"u": u.um, "m": u.um, "n": u.nm, "a": u.AA}[word[0]]

@@ -1,0 +1,60 @@
+"""Filters of whatever a user gives for one."""
+
+import os
+
+import astropy.units as u
+
+from miricigale.filters.band_names import find_filter
+from miricigale.filters.curve_files import TABLES
+from miricigale.filters.filter import Filter
+from miricigale.utils.exceptions import argument_error
+
+
+def as_filter(given, name=None, *, unit=None):
+    """
+    Filter of anything that says which one is meant.
+
+    Parameters
+    ----------
+    given : `Filter`, str, path-like or `synphot.SpectralElement`
+        A filter, a name for `Filter.from_name`, the path of a file for `Filter.read`, or a bandpass.
+    name : str, optional
+        Name of what comes from a file or a bandpass.
+    unit : `~astropy.units.Unit`, optional
+        As for `Filter.read`.
+
+    Returns
+    -------
+    filter : `Filter`
+
+    Raises
+    ------
+    KeyError
+        If there is no filter of a name.
+    `~miricigale.utils.exceptions.DataError`
+        If a file cannot be read as a filter.
+    ValueError
+        If it is something else.
+    """
+    if isinstance(given, Filter):
+        return given
+    if isinstance(given, os.PathLike) or (isinstance(given, str) and _is_path(given)):
+        return Filter.read(given, name=name, unit=unit)
+    if isinstance(given, str):
+        return Filter.from_name(given)
+    if hasattr(given, "waveset"):
+        return Filter.from_synphot(given, name=name)
+    wanted = "a Filter, the name of one, the path of its file or a synphot SpectralElement"
+    raise argument_error(name or "filter", wanted, type(given).__name__)
+
+
+def _is_path(text):
+    if find_filter(text) is not None:
+        return False
+    endings = (".dat", ".txt", ".par", *TABLES)
+    return text.lower().endswith(endings) or os.path.isfile(os.path.expanduser(text))
+
+
+def given_filters(names):
+    """Filters that a user of CIGALE gave for bands, a dict by the band of what `as_filter` takes."""
+    return {band: as_filter(given, band, unit=u.AA) for band, given in (names or {}).items()}
