@@ -7,7 +7,7 @@ import numpy as np
 from astropy.table import QTable, Table
 
 from miricigale.filters import FilterSet
-from miricigale.filters.filter import spectrum_arrays
+from miricigale.filters.spectra import spectrum_arrays
 from miricigale.sed.component import Component, register
 from miricigale.sed.parameter import Parameter
 from miricigale.utils.exceptions import argument_error
@@ -304,7 +304,7 @@ def band_extinction(filters, ebv, *, law="G23", r_v=3.1, sed=None, beyond="refus
     r_v : float, optional
         A(V) / E(B-V).
     sed : object, optional
-        Spectrum of the source before extinction, with ``wave`` and ``fnu`` (observed); else F_nu is
+        Observed spectrum of the source before extinction, as for `~miricigale.filters.Filter.synthetic_flux`; else F_nu is
         constant.
     beyond : {"refuse", "transparent"}, optional
         Whether bands that reach beyond the long end of the law are refused, or taken as free of
@@ -335,7 +335,7 @@ def band_extinction(filters, ebv, *, law="G23", r_v=3.1, sed=None, beyond="refus
     values, _ = _color_excess(ebv)
     check_bands(bands, law, beyond)
     low, high = coverage(law)
-    points = None if sed is None else spectrum_arrays(sed)
+    points = None if sed is None else spectrum_arrays(sed, bands)
     if points is not None:
         bands.weights(points[0])  # refuses what the spectrum does not cover
     # many sources lie in one cell of a map

@@ -12,6 +12,9 @@ from filelock import FileLock, Timeout
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.store import replacing
 
+# a child that a killed process has just forked holds the lock until it runs; in seconds
+_PATIENCE = 0.3
+
 
 class FolderLock:
     """
@@ -43,14 +46,14 @@ class FolderLock:
         self.folder = Path(folder)
         self.path = self.folder / name
         self.purpose = purpose
-        self._lock = FileLock(self.folder / f".{name}", blocking=False)
+        self._lock = FileLock(self.folder / f".{name}", timeout=_PATIENCE)
 
     def __enter__(self):
         if self._lock.is_locked:
             raise self._refusal()
         self._check_host()
         try:
-            self._lock.acquire()
+            self._lock.acquire(poll_interval=0.02)
         except Timeout:
             raise self._refusal() from None
         except PermissionError as err:

@@ -96,9 +96,8 @@ def test_children_of_a_killed_process_do_not_hold_its_lock(tmp_path):
         import os, sys, time
         from miricigale.utils.lock import FolderLock
         with FolderLock(sys.argv[1]):
-            child = os.fork()
-            if child:
-                print(child, flush=True)
+            if os.fork() == 0:
+                print(os.getpid(), flush=True)
             time.sleep(60)
     """
     process = start(code, tmp_path)
