@@ -304,8 +304,8 @@ def band_extinction(filters, ebv, *, law="G23", r_v=3.1, sed=None, beyond="refus
     r_v : float, optional
         A(V) / E(B-V).
     sed : object, optional
-        Observed spectrum of the source before extinction, as for `~miricigale.filters.Filter.synthetic_flux`; else F_nu is
-        constant.
+        Observed spectrum of the source before extinction, as for
+        `~miricigale.filters.Filter.synthetic_flux`; else F_nu is constant.
     beyond : {"refuse", "transparent"}, optional
         Whether bands that reach beyond the long end of the law are refused, or taken as free of
         extinction there.
