@@ -10,11 +10,11 @@ from astropy.time import Time
 
 from miricigale.filters import Filter
 from miricigale.instrument import background_level
-from miricigale.instrument.figures import filter_row
-from miricigale.instrument.wcs import scalar_position
+from miricigale.instrument.figures import filter_row, imager_filter
 from miricigale.refdata import locate
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.optional import require
+from miricigale.utils.positions import as_position
 from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
 
 #: Angles from the Sun, deg, between which the telescope may look.
@@ -81,11 +81,9 @@ def zodiacal_factor(filter, level="medium", *, position=None, date=None):
     >>> print(f"{zodiacal_factor('miri.f1000w', 'medium', position=cosmos):.1f}")
     1.9
     """
-    name = f"miri.{str(filter).removeprefix('miri.')}"
-    filter_row(name)
+    name = imager_filter(filter)
     if position is not None:
-        ra, dec = scalar_position(position, "position")
-        position = SkyCoord(ra * u.deg, dec * u.deg)
+        position = as_position(position, "position")
     if date is not None:
         if position is None:
             raise argument_error("date", "given with a position", date)

@@ -21,7 +21,7 @@ from miricigale.detector.image import checked_light
 from miricigale.detector.latent import checked_previous
 from miricigale.detector.ramp import Ramp
 from miricigale.detector.work import Work
-from miricigale.instrument import DetectorProperties, ImageFacts, miri_detector
+from miricigale.instrument import DetectorProperties, miri_detector
 from miricigale.utils.exceptions import DetectorWarning, argument_error
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_kind
@@ -165,8 +165,9 @@ class Detector:
 
         Parameters
         ----------
-        image : `~astropy.nddata.CCDData`
-            Noiseless surface brightness (MJy/sr), shape ``exposure.shape``, sky included.
+        image : `~astropy.nddata.CCDData` or `~miricigale.scene.Scene`
+            Noiseless surface brightness (MJy/sr), shape ``exposure.shape``, sky included; of a scene what it
+            renders.
             What its ``meta["psf_includes"]`` names (a list such as ``["pixel", "ipc"]``, or
             its text) is not applied again.
         exposure : `~miricigale.instrument.Exposure`
@@ -366,8 +367,8 @@ class Detector:
         `~miricigale.utils.exceptions.DetectorWarning`
             If the sky fills more than 60 % of the well by the last group.
         """
-        light = checked_light(image, exposure)
-        effects, _ = self._acting(image)
+        light, included = checked_light(image, exposure)
+        effects = self._acting(included)
         block = Block(exposure, self.properties, slice(0, light.shape[0]), None, None, None)
         for effect in effects:
             light = effect.expected(light, block)
@@ -378,16 +379,15 @@ class Detector:
             warnings.warn(message, DetectorWarning, stacklevel=2)
         return forecast
 
-    def _acting(self, image):
-        """Return the effects that the image does not hold already, and what it holds."""
-        included = ImageFacts.of(image).psf_includes
-        return tuple(e for e in self.effects if e.included_as not in included), sorted(included)
+    def _acting(self, included):
+        """Return the effects that an image does not hold already."""
+        return tuple(e for e in self.effects if e.included_as not in included)
 
     def _task(self, image, exposure, seed, previous):
         """Check what is exposed and gather what all its blocks share."""
-        light = checked_light(image, exposure)
+        light, included = checked_light(image, exposure)
         seed = check_seed(seed)
-        effects, included = self._acting(image)
+        effects = self._acting(included)
         previous = checked_previous(previous, exposure)
         if previous and not any(isinstance(e, Persistence) for e in self.effects):
             wanted = "given to a detector whose effects hold Persistence"
@@ -395,7 +395,7 @@ class Detector:
         fraction = self._check_sky(light, exposure)
         meta = provenance(
             seed=seed,
-            psf_includes=included,
+            psf_includes=sorted(included),
             sky_well_fraction=round(fraction, 4),
             previous=[repr(latent) for latent in previous] or None,
         )

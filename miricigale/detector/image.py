@@ -16,7 +16,7 @@ _PLACE = 0.1
 
 def checked_light(image, exposure):
     """
-    Surface brightness of an image in MJy/sr, (ny, nx), nowhere negative.
+    Surface brightness of an image, or a scene, in MJy/sr, (ny, nx), nowhere negative, and what its PSF includes.
 
     Raises
     ------
@@ -31,10 +31,13 @@ def checked_light(image, exposure):
     if not isinstance(exposure, Exposure):
         raise argument_error("exposure", "an Exposure", type(exposure).__name__)
     exposure.check_sky()
+    if hasattr(image, "render"):
+        image = image.render()
     if isinstance(image, u.Quantity):
         image = NDData(image)
     if not isinstance(image, NDData) or image.unit is None:
-        msg = f"'image' must be a CCDData in {SURFACE_BRIGHTNESS}, got {type(image).__name__}"
+        wanted = f"a Scene or a CCDData in {SURFACE_BRIGHTNESS}"
+        msg = f"'image' must be {wanted}, got {type(image).__name__}"
         raise TypeError(msg)
     masked = np.count_nonzero(image.mask)
     if masked:
@@ -53,7 +56,7 @@ def checked_light(image, exposure):
     # an FFT leaves noise of this size around bright sources
     if lowest < -1e-6 * np.abs(light).max():
         raise argument_error("image", "surface brightness that is nowhere negative", lowest)
-    return np.maximum(light, 0.0)
+    return np.maximum(light, 0.0), facts.psf_includes
 
 
 def _check_place(image, exposure):

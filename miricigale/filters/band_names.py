@@ -6,6 +6,7 @@ from functools import cache
 from importlib import resources as importlib_resources
 
 from miricigale.filters.library import FILTERS, SEDPY, curve_folder
+from miricigale.utils.exceptions import unknown_name
 
 # between the parts of a name, and the endings of the files of curves
 _BETWEEN = re.compile(r"[\s._/:-]+")
@@ -66,6 +67,36 @@ def find_filter(text):
     if name is None and text in _curves():
         ours = [name for name in FILTERS.names() if FILTERS.metadata(name)["curve"] == text]
         name = ours[0] if ours else SEDPY + text
+    return name
+
+
+def known_filter(given, known, kind="filter"):
+    """
+    Filter out of some that a user means.
+
+    Parameters
+    ----------
+    given : str or `~miricigale.filters.Filter`
+        In any of the forms of `find_filter`.
+    known : iterable of str
+        Our names of those that may be meant.
+    kind : str, optional
+        What they are called in messages.
+
+    Returns
+    -------
+    name : str
+        One of ``known``.
+
+    Raises
+    ------
+    KeyError
+        If it is none of them.
+    """
+    text = str(getattr(given, "name", given))
+    name = text if text in known else find_filter(text)
+    if name not in known:
+        raise unknown_name(kind, text, known)
     return name
 
 

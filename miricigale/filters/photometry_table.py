@@ -21,6 +21,8 @@ _ERROR = re.compile(
     re.IGNORECASE,
 )
 _FLUX = re.compile(r"(?:f|flux|mag|m)_(?P<a>.+)|(?P<b>.+?)_(?:flux|mag)", re.IGNORECASE)
+# columns that are the only band asked for
+_ALONE = ("flux", "flux_density", "fnu", "f_nu", "mag", "magnitude", "abmag")
 _IDS = ("id", "number", "source_id", "objid")
 
 
@@ -88,6 +90,9 @@ def _our_names(colnames, bands, argument):
             wanted = f"a table with one column for {ours!r}"
             raise argument_error(argument, wanted, f"{found[ours]!r} and {theirs!r}")
         found[ours] = theirs
+    alone = [name for name in colnames if name.lower() in _ALONE]
+    if len(bands) == len(alone) == 1 and bands[0] not in found:
+        found[bands[0]] = alone[0]
     return found
 
 
@@ -116,7 +121,7 @@ def _is_ab(table, name):
         return False
     unit = getattr(table[name], "unit", None)
     if unit is None:
-        return re.match(r"(?:mag|m)_|.*_mag$", name, re.IGNORECASE) is not None
+        return re.match(r"(?:mag|m)_|.*_mag$|(?:ab)?mag(?:nitude)?$", name, re.IGNORECASE) is not None
     return unit == u.ABmag
 
 

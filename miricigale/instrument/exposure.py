@@ -3,18 +3,21 @@
 import dataclasses
 import functools
 import math
+from typing import ClassVar
 
 import astropy.units as u
 from astropy.coordinates import SkyCoord
 
 from miricigale.instrument.detector import miri_detector
 from miricigale.instrument.dithers import dither_offsets
-from miricigale.instrument.figures import filter_row, table
+from miricigale.instrument.figures import imager_filter, table
 from miricigale.instrument.photometric import electron_rate
 from miricigale.instrument.siaf import aperture, attitude_matrix, pixel_to_v2v3, v2v3_to_sky
-from miricigale.instrument.wcs import imager_wcs, scalar_position, tangent_offset
+from miricigale.instrument.wcs import imager_wcs, tangent_offset
 from miricigale.utils.exceptions import argument_error, unknown_name
-from miricigale.utils.units import to_array
+from miricigale.utils.interactive import Interactive
+from miricigale.utils.positions import as_position
+from miricigale.utils.units import is_number, to_array
 
 #: Bands of the CEERS/MIRI imaging.
 CEERS_FILTERS = (
@@ -69,71 +72,137 @@ def frame_time(readout="FASTR1", subarray="FULL"):
     return times[readout][subarray] * u.s
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Exposure:
+def _counts_of(filter, time, frame, n_integrations, max_fill=0.6):
+    """Groups and integrations of an exposure that lasts a time; the integrations may be given."""
+    seconds = float(to_array(time, u.s, "time", ndim=0, finite=True))
+    frames = round(seconds / frame.value)
+    if frames < 2:
+        raise argument_error("time", f"at least two frames of {frame}", time)
+    if n_integrations is None:
+        fills = miri_detector().full_well / electron_rate(filter)
+        n_integrations = math.ceil(frames / max(2, math.floor(max_fill * fills / frame.value)))
+    return max(2, round(frames / n_integrations)), n_integrations
+
+
+@dataclasses.dataclass(frozen=True, eq=False, init=False, repr=False)
+class Exposure(Interactive):
     """
     One exposure of the imager.
 
     Parameters
     ----------
-    filter : str or None
-        Such as ``"miri.f770w"``; None where it is not known, as in ground tests.
+    filter : str, `~miricigale.filters.Filter` or None
+        Such as ``"F770W"`` or ``"miri.f770w"``; None where it is not known, as in ground tests.
     readout : str, optional
         Readout pattern, ``"FASTR1"`` or ``"SLOWR1"``.
-    n_groups : int
+    n_groups : int, optional
         Groups in an integration, at least 2.
     n_integrations : int, optional
-        Integrations.
+        Integrations; 1 by default, with ``time`` as of `from_time`.
     subarray : str, optional
         One of `~miricigale.instrument.subarrays`.
-    pointing : `~astropy.coordinates.SkyCoord` or None
-        Where the reference pixel of the sub-array looks; None, as ``roll``, where nothing is
-        pointed at: such an exposure has no world coordinates.
-    roll : `~astropy.units.Quantity` or None
-        Position angle of +V3 at the reference pixel, east of north.
+    pointing : `~astropy.coordinates.SkyCoord`, str, pair or None, optional
+        Where the reference pixel of the sub-array looks; text such as ``"150.1 +2.2"`` or a pair is right
+        ascension and declination. None, as ``roll``, where nothing is pointed at: such an exposure has no world
+        coordinates.
+    roll : `~astropy.units.Quantity`, optional
+        Position angle of +V3 at the reference pixel, east of north; 0 deg if only the pointing is given.
     dither : int, optional
         Number of the dither, from 0: a label, and part of the random key.
+    time : `~astropy.units.Quantity`, optional
+        Wanted exposure time in place of ``n_groups``, as for `from_time`.
 
     Raises
     ------
     KeyError
         If filter, readout or sub-array are not known.
     ValueError
-        If a count is too small or the pointing is not one position.
+        If a count is too small, neither or both of ``n_groups`` and ``time`` are given, or the pointing is not
+        one position.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale import Exposure
+    >>> Exposure("F770W", time=1 * u.hour, pointing="150.1 +2.2")
+    <Exposure miri.f770w: FASTR1, 2 x 648 groups, 3596.4 s, FULL at 150.1 +2.2, roll 0 deg>
     """
 
     filter: str | None
     _: dataclasses.KW_ONLY
-    readout: str = "FASTR1"
+    readout: str
     n_groups: int
-    n_integrations: int = 1
-    subarray: str = "FULL"
+    n_integrations: int
+    subarray: str
     pointing: SkyCoord | None
     roll: u.Quantity | None
-    dither: int = 0
+    dither: int
 
-    def __post_init__(self):
-        if self.filter is not None:
-            filter_row(self.filter)
-            short = str(self.filter).removeprefix("miri.")
-            object.__setattr__(self, "filter", f"miri.{short}")
-        aperture(self.subarray)
-        frame_time(self.readout, self.subarray)
+    _other_names: ClassVar[dict] = {
+        "groups": "n_groups",
+        "ngroups": "n_groups",
+        "integrations": "n_integrations",
+        "nints": "n_integrations",
+        "time": "exposure_time",
+        "position": "pointing",
+        "center": "pointing",
+    }
+
+    def __init__(
+        self,
+        filter,
+        *,
+        readout="FASTR1",
+        n_groups=None,
+        n_integrations=None,
+        subarray="FULL",
+        pointing=None,
+        roll=None,
+        dither=0,
+        time=None,
+    ):
+        filter = None if filter is None else imager_filter(filter)
+        readout, subarray = str(readout).upper(), str(subarray).upper()
+        aperture(subarray)
+        frame = frame_time(readout, subarray)
+        if (n_groups is None) == (time is None):
+            got = "neither" if time is None else "both"
+            raise argument_error("n_groups, time", "one of them given", got)
+        if time is not None:
+            n_groups, n_integrations = _counts_of(filter, time, frame, n_integrations)
+        counts = {"n_groups": n_groups, "n_integrations": n_integrations, "dither": dither}
+        counts["n_integrations"] = 1 if n_integrations is None else n_integrations
         for name, least in (("n_groups", 2), ("n_integrations", 1), ("dither", 0)):
-            value = getattr(self, name)
-            if isinstance(value, bool) or int(value) != value or value < least:
+            value = counts[name]
+            if not is_number(value) or value != int(value) or value < least:
                 raise argument_error(name, f"an integer of at least {least}", value)
-            object.__setattr__(self, name, int(value))
-        if (self.pointing is None) != (self.roll is None):
-            raise argument_error("pointing, roll", "both given or both None", "one of them")
-        if self.pointing is None:
-            return
-        scalar_position(self.pointing, "pointing")
-        object.__setattr__(
-            self, "pointing", SkyCoord(self.pointing.icrs.ra, self.pointing.icrs.dec)
+            counts[name] = int(value)
+        if pointing is not None:
+            pointing = as_position(pointing, "pointing")
+            roll = to_array(
+                0.0 * u.deg if roll is None else roll, u.deg, "roll", ndim=0, finite=True
+            )
+            roll = float(roll) % 360 * u.deg
+        elif roll is not None:
+            raise argument_error("pointing", "given where 'roll' is", "None")
+        values = {"filter": filter, "readout": readout, "subarray": subarray, **counts}
+        for name, value in {**values, "pointing": pointing, "roll": roll}.items():
+            object.__setattr__(self, name, value)
+
+    def __repr__(self):
+        text = (
+            f"<Exposure {self.filter}: {self.readout}, {self.n_integrations} x {self.n_groups} groups, "
+            f"{self.exposure_time.value:.1f} s, {self.subarray}"
         )
-        roll = float(to_array(self.roll, u.deg, "roll", ndim=0, finite=True))
-        object.__setattr__(self, "roll", roll % 360 * u.deg)
+        if self.pointing is not None:
+            ra, dec = self.pointing.ra.deg, self.pointing.dec.deg
+            text += f" at {ra:.6g} {dec:+.6g}, roll {self.roll.value:g} deg"
+        return f"{text}>"
+
+    def _facts(self):
+        fields = (field.name for field in dataclasses.fields(self))
+        values = {name.replace("_", " "): getattr(self, name) for name in fields}
+        return values | {"exposure time": self.exposure_time}
 
     @classmethod
     def from_time(cls, filter, time, *, max_fill=0.6, **options):
@@ -156,18 +225,15 @@ class Exposure:
         -------
         exposure : `Exposure`
         """
-        seconds = float(to_array(time, u.s, "time", ndim=0, finite=True))
         frame = frame_time(options.get("readout", "FASTR1"), options.get("subarray", "FULL"))
-        frames = round(seconds / frame.value)
-        if frames < 2:
-            raise argument_error("time", f"at least two frames of {frame}", time)
-        fills = miri_detector().full_well / electron_rate(filter)
-        most = max(2, math.floor(max_fill * fills / frame.value))
-        n_integrations = math.ceil(frames / most)
-        n_groups = max(2, round(frames / n_integrations))
+        n_groups, n_integrations = _counts_of(filter, time, frame, None, max_fill)
         return cls(filter, n_groups=n_groups, n_integrations=n_integrations, **options)
 
-    replace = dataclasses.replace
+    def replace(self, **changes):
+        """Copy with other values of the parameters; a ``time`` replaces the counts."""
+        if "time" in changes:
+            changes = {"n_groups": None, "n_integrations": None} | changes
+        return dataclasses.replace(self, **changes)
 
     @property
     def aperture(self):
@@ -203,6 +269,41 @@ class Exposure:
     def duration(self):
         """Time with the reset frame between integrations, s."""
         return self.exposure_time + (self.n_integrations - 1) * self.frame_time
+
+    @property
+    def footprint(self):
+        """Corners of the sub-array on the sky, `~astropy.coordinates.SkyCoord` of shape (4,)."""
+        self.check_sky()
+        ny, nx = self.shape
+        return self.wcs.pixel_to_world(
+            [-0.5, nx - 0.5, nx - 0.5, -0.5], [-0.5, -0.5, ny - 0.5, ny - 0.5]
+        )
+
+    def plot(self, ax=None, **kwargs):
+        """
+        Draw the sub-array on the sky, north up and east to the left.
+
+        Parameters
+        ----------
+        ax : `~matplotlib.axes.Axes`, optional
+            Where; the current axes by default. Dithers are drawn over each other.
+        **kwargs
+            Passed to `matplotlib.axes.Axes.fill`.
+
+        Returns
+        -------
+        ax : `~matplotlib.axes.Axes`
+
+        Raises
+        ------
+        ValueError
+            If the exposure has no filter or no pointing.
+        """
+        from miricigale.plotting.images import plot_footprint
+
+        corners, label = self.footprint, f"{self.filter}, dither {self.dither}"
+        options = {"label": label} | kwargs
+        return plot_footprint(corners.ra.deg, corners.dec.deg, ax=ax, **options)
 
     def check_sky(self):
         """
@@ -274,14 +375,14 @@ class Exposure:
             "SUBSIZE2": part.shape[0],
         }
 
-    def dithered(self, pattern, n=None, *, first=0, start=0):
+    def dithered(self, pattern="4-point", n=None, *, first=0, start=0):
         """
         This exposure at ``n`` positions of a dither pattern.
 
         Parameters
         ----------
-        pattern : str, path-like, `~astropy.units.Quantity` or `~astropy.table.Table`
-            See `dither_offsets`.
+        pattern : str, path-like, `~astropy.units.Quantity`, `~astropy.table.Table` or int, optional
+            See `dither_offsets`; a number is ``n`` of the default's.
         n : int, optional
             Number of positions; all of the pattern's by default.
         first : int, optional
@@ -293,6 +394,9 @@ class Exposure:
         -------
         exposures : list of `Exposure`
         """
+        self.check_sky()
+        if isinstance(pattern, int):
+            pattern, n = "4-point", pattern
         pa = self.pa_aper
         return [
             self.replace(pointing=tangent_offset(self.pointing, dx, dy, pa), dither=first + number)

@@ -3,8 +3,8 @@
 import functools
 import tomllib
 
+from miricigale.filters.band_names import known_filter
 from miricigale.refdata import locate
-from miricigale.utils.exceptions import unknown_name
 
 
 @functools.cache
@@ -18,9 +18,28 @@ def imager_filters():
     return tuple(f"miri.{name}" for name in table()["filters"])
 
 
+def imager_filter(filter):
+    """
+    Our name of an imaging filter.
+
+    Parameters
+    ----------
+    filter : str or `~miricigale.filters.Filter`
+        Any usual name, such as ``"miri.f770w"``, ``"F770W"`` or ``"JWST/MIRI.F770W"``.
+
+    Returns
+    -------
+    name : str
+        Such as ``"miri.f770w"``.
+
+    Raises
+    ------
+    KeyError
+        If it is none of the nine imaging filters.
+    """
+    return known_filter(filter, imager_filters(), "imaging filter")
+
+
 def filter_row(name):
-    """The figures of one filter; `KeyError` with the known names for any other."""
-    try:
-        return table()["filters"][str(name).removeprefix("miri.")]
-    except KeyError:
-        raise unknown_name("imaging filter", name, imager_filters()) from None
+    """The figures of one filter; errors as of `imager_filter`."""
+    return table()["filters"][imager_filter(name).removeprefix("miri.")]

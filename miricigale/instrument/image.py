@@ -14,6 +14,26 @@ class Image(CCDData):
     data are the primary HDU, with uncertainty and mask as extensions, as astropy has them.
     """
 
+    def plot(self, ax=None, **kwargs):
+        """
+        Draw the image, scaled by asinh.
+
+        Parameters
+        ----------
+        ax : `~matplotlib.axes.Axes`, optional
+            Where; the current axes by default.
+        **kwargs
+            Passed to `~matplotlib.axes.Axes.imshow`.
+
+        Returns
+        -------
+        ax : `~matplotlib.axes.Axes`
+        """
+        from miricigale.plotting.scene import plot_scene
+
+        label = f"{self.meta.get('filter') or ''} [{self.unit.to_string('vounit')}]".strip()
+        return plot_scene(self.data, ax=ax, label=label, **kwargs)
+
     def to_hdu(self, *args, **kwargs):
         """The HDUs that ``write`` writes; see `astropy.nddata.CCDData.to_hdu`."""
         plain = CCDData(self, copy=False)

@@ -15,17 +15,16 @@ from miricigale.instrument.siaf import (
     vector_angles,
 )
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.positions import as_position
 from miricigale.utils.units import positive, to_array
 
 _SIP_ORDER = 5
 _SIP_INVERSE_ORDER = 8
 
 
-def scalar_position(position, name):
-    """Check that ``position`` is one SkyCoord and return its ICRS ra, dec in deg."""
-    if not isinstance(position, SkyCoord) or not position.isscalar:
-        raise argument_error(name, "one SkyCoord", repr(position))
-    position = position.icrs
+def _radec(position, name):
+    """Right ascension and declination of one position (`as_position`), in deg."""
+    position = as_position(position, name)
     return float(position.ra.deg), float(position.dec.deg)
 
 
@@ -48,7 +47,7 @@ def pixel_to_sky(x, y, pointing, roll, *, subarray="FULL"):
     -------
     sky : `~astropy.coordinates.SkyCoord`
     """
-    ra, dec = scalar_position(pointing, "pointing")
+    ra, dec = _radec(pointing, "pointing")
     roll = float(to_array(roll, u.deg, "roll", ndim=0))
     part = aperture(subarray)
     # the reference through the polynomial, so that it looks exactly at the pointing
@@ -140,7 +139,7 @@ def imager_wcs(pointing, roll, *, subarray="FULL"):
     ----------
     Shupe et al. 2005, ASP Conf. 347, 491 (SIP).
     """
-    ra, dec = scalar_position(pointing, "pointing")
+    ra, dec = _radec(pointing, "pointing")
     roll = float(to_array(roll, u.deg, "roll", ndim=0, finite=True))
     from astropy.wcs import Sip
 
@@ -183,7 +182,7 @@ def tangent_offset(pointing, x_offset, y_offset, pa):
     -------
     position : `~astropy.coordinates.SkyCoord`
     """
-    ra, dec = (np.radians(angle) for angle in scalar_position(pointing, "pointing"))
+    ra, dec = (np.radians(angle) for angle in _radec(pointing, "pointing"))
     x = to_array(x_offset, u.rad, "x_offset")
     y = to_array(y_offset, u.rad, "y_offset")
     pa = float(to_array(pa, u.rad, "pa", ndim=0))
@@ -265,7 +264,7 @@ def north_up_wcs(center, pixel_scale, shape):
     wcs : `~astropy.wcs.WCS`
         With ``pixel_shape`` (nx, ny).
     """
-    ra, dec = scalar_position(center, "center")
+    ra, dec = _radec(center, "center")
     scale = positive(pixel_scale, u.deg, "pixel_scale")
     ny, nx = (int(n) for n in shape)
     if ny < 1 or nx < 1:

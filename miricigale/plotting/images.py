@@ -2,13 +2,14 @@
 
 import numpy as np
 
-from miricigale.plotting.axes import add_borders, new_figure, resolve_axes
+from miricigale.plotting.axes import TRUE, add_borders, new_figure, resolve_axes
 
 __all__ = [
     "add_colorbar",
     "color_image",
     "mark_sky",
     "plot_color",
+    "plot_footprint",
     "plot_image",
     "plot_model_residual",
     "plot_offsets",
@@ -348,6 +349,33 @@ def mark_sky(ax, length, *, north=(0, 1), east=(-1, 0), color="black"):
         note.arrow_patch.set_path_effects(edge)
         ax.text(*(origin + 1.35 * step), letter, **text)
     ax.set(xlim=(left, right), ylim=(bottom, top), xticks=[], yticks=[], xlabel="", ylabel="")
+    return ax
+
+
+def plot_footprint(ra, dec, *, ax=None, **kwargs):
+    """
+    Draw an outline on the sky, north up and east to the left.
+
+    Parameters
+    ----------
+    ra, dec : `~numpy.ndarray`, shape (n,)
+        Corners in deg.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where; the current axes by default.
+    **kwargs
+        Passed to `matplotlib.axes.Axes.fill`.
+
+    Returns
+    -------
+    ax : `~matplotlib.axes.Axes`
+    """
+    ax = resolve_axes(ax)
+    # right ascensions on both sides of 0 h lie beside each other
+    ax.fill((ra - ra[0] + 180) % 360 - 180 + ra[0], dec, **{"fc": "none", "ec": TRUE} | kwargs)
+    ax.set(xlabel="right ascension [deg]", ylabel="declination [deg]")
+    ax.set_aspect(1 / np.cos(np.radians(np.mean(dec))), adjustable="datalim")
+    ax.xaxis.set_inverted(True)
+    ax.ticklabel_format(useOffset=False)
     return ax
 
 

@@ -21,6 +21,7 @@ from .miri import MIRI_PIXEL_SCALE as MIRI_PIXEL_SCALE
 from .miri import miri_psf as miri_psf
 from .model import InstrumentPSF as InstrumentPSF
 from .model import PSFGrid as PSFGrid
+from .model import as_psf as as_psf
 from .model import from_photutils as from_photutils
 from .model import instrument_psf as instrument_psf
 from .model import make_psf as make_psf

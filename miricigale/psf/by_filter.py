@@ -7,13 +7,14 @@ import warnings
 import astropy.units as u
 import numpy as np
 
+from miricigale.filters.band_names import known_filter
 from miricigale.psf import _core
 from miricigale.psf.hst import WFC3_FILTERS, hst_psf
 from miricigale.psf.miri import MIRI_FILTERS, miri_psf
 from miricigale.psf.model import instrument_psf
 from miricigale.psf.nircam import NIRCAM_FILTERS, nircam_psf
 from miricigale.psf.resample import psf_image, psf_mosaic, rotate_psf
-from miricigale.utils.exceptions import PSFWarning, argument_error, unknown_name
+from miricigale.utils.exceptions import PSFWarning, argument_error
 from miricigale.utils.units import ANGLE
 
 _log = logging.getLogger(__name__)
@@ -62,6 +63,7 @@ def filter_psf(filter, *, pixel_scale, pa=None, grid_angle=0.0 * u.deg, resampli
     ValueError
         If the position angle is missing.
     """
+    filter = known_filter(filter, MODEL_FILTERS, "model PSF for the filter")
     if filter in WFC3_FILTERS:
         return rotate_psf(hst_psf(filter, pixel_scale=pixel_scale), grid_angle=grid_angle)
     return psf_mosaic(
@@ -71,11 +73,7 @@ def filter_psf(filter, *, pixel_scale, pa=None, grid_angle=0.0 * u.deg, resampli
 
 def _exposure(filter_):
     """The model of a single exposure, in the detector's axes."""
-    if filter_ in MIRI_FILTERS:
-        return miri_psf(filter_)
-    if filter_ in NIRCAM_FILTERS:
-        return nircam_psf(filter_)
-    raise unknown_name("model PSF for the filter", filter_, MODEL_FILTERS)
+    return miri_psf(filter_) if filter_ in MIRI_FILTERS else nircam_psf(filter_)
 
 
 def checked_psf(

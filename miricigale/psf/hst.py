@@ -7,11 +7,12 @@ import astropy.units as u
 import numpy as np
 from scipy.optimize import brentq
 
+from miricigale.filters.band_names import known_filter
 from miricigale.psf import _core
 from miricigale.psf.effects import detector_response
 from miricigale.psf.model import make_psf
 from miricigale.psf.optics import hst_pupil, polychromatic_psf
-from miricigale.psf.telescope import band_quantiles, checked_grid, filter_name, odd_cells
+from miricigale.psf.telescope import band_quantiles, checked_grid, odd_cells
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import ANGLE, to_array
 
@@ -103,7 +104,7 @@ def hst_psf(
     Krist, Hook & Stoehr 2011, SPIE 8127, 81270J; Skelton et al. 2014, ApJS 214, 24
     (mosaics of 0.06 arcsec pixels).
     """
-    name = filter_name(filter, WFC3_FILTERS)
+    name = known_filter(filter, WFC3_FILTERS, "PSF for the filter")
     oversampling, width = checked_grid(oversampling, fov, 10.0)
     scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))
     if fwhm is None:

@@ -6,6 +6,7 @@ import math
 import astropy.units as u
 import numpy as np
 
+from miricigale.filters.band_names import known_filter
 from miricigale.instrument import aperture, pixel_to_v2v3
 from miricigale.psf import _core
 from miricigale.psf.effects import (
@@ -18,7 +19,7 @@ from miricigale.psf.effects import (
 )
 from miricigale.psf.model import make_psf
 from miricigale.psf.optics import jwst_constants
-from miricigale.psf.telescope import Telescope, checked_grid, filter_name, odd_cells
+from miricigale.psf.telescope import Telescope, checked_grid, odd_cells
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import ANGLE
 
@@ -195,7 +196,7 @@ def miri_psf(
     >>> psf.frame, psf.includes
     ('detector', ('jitter', 'cruciform', 'pixel', 'ipc'))
     """
-    name = filter_name(filter, MIRI_FILTERS)
+    name = known_filter(filter, MIRI_FILTERS, "PSF for the filter")
     oversampling, width = checked_grid(oversampling, fov, 21.0)
     unknown = set(includes) - set(EFFECTS)
     if unknown:

@@ -317,6 +317,53 @@ def make_psf(data, *, pixel_scale, frame, oversampling=1, enclosed=None, **facts
     return psf
 
 
+def as_psf(psf, argument="psf"):
+    """
+    PSF of whatever a user has for one.
+
+    Parameters
+    ----------
+    psf : `~photutils.psf.ImagePSF`, `~photutils.psf.GriddedPSFModel`, model, kernel or array
+        PSFs are returned as they are. Of a functional model of photutils or astropy (with ``x_0``, ``y_0`` and
+        ``flux``) its values about the center are taken, four to a pixel; an array or an astropy kernel has one
+        value for each pixel of the image that it is for.
+    argument : str, optional
+        The argument's name for messages.
+
+    Returns
+    -------
+    psf : `~photutils.psf.ImagePSF` or `~photutils.psf.GriddedPSFModel`
+        Of unit sum if it was made of something else.
+
+    Raises
+    ------
+    ValueError
+        If it is nothing of these, or holds no light.
+    """
+    if isinstance(psf, (ImagePSF, GriddedPSFModel)):
+        return psf
+    cells = 1
+    if {"x_0", "y_0", "flux"} <= set(getattr(psf, "param_names", ())):
+        # copies of the model: the parameters of a model of photutils are the user's
+        cells, model = 4, psf.copy()
+        model.x_0, model.y_0, model.flux = 0.0, 0.0, 1.0
+        reach = max(5.0, *np.abs(np.ravel(model.bounding_box.bounding_box())))
+        axis = np.arange(-np.ceil(reach * cells), np.ceil(reach * cells) + 1) / cells
+        data = model(*np.meshgrid(axis, axis))
+    else:
+        data = np.asarray(getattr(psf, "array", psf))
+    if data.ndim != 2 or data.dtype.kind not in "iuf":
+        wanted = "a PSF or model of photutils, an astropy kernel or a 2D array"
+        raise argument_error(argument, wanted, type(psf).__name__)
+    data = data.astype(float)
+    if not np.all(np.isfinite(data)) or not data.sum() > 0:
+        raise argument_error(argument, "finite, with a positive sum", f"a sum of {data.sum()}")
+    if min(data.shape) < 4:
+        # photutils interpolates between four values at least
+        data = np.pad(data, 2)
+    return ImagePSF(data * (cells**2 / data.sum()), oversampling=cells)
+
+
 def from_photutils(model, *, x=None, y=None, **options):
     """
     Take over a PSF from photutils (or from stpsf, which writes the gridded form).

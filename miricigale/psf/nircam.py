@@ -2,10 +2,11 @@
 
 import astropy.units as u
 
+from miricigale.filters.band_names import known_filter
 from miricigale.psf.effects import detector_response
 from miricigale.psf.model import make_psf
 from miricigale.psf.optics import jwst_constants
-from miricigale.psf.telescope import Telescope, checked_grid, filter_name, odd_cells
+from miricigale.psf.telescope import Telescope, checked_grid, odd_cells
 from miricigale.utils.units import ANGLE
 
 #: Pixel in arcsec of the wide filters, of the short- and the long-wavelength channel.
@@ -53,7 +54,7 @@ def nircam_psf(filter, *, oversampling=4, fov=None, wavefront_error=75 * u.nm, s
     >>> nircam_psf("nircam.f444w", fov=4 * u.arcsec).includes
     ('jitter', 'pixel')
     """
-    name = filter_name(filter, _PIXELS)
+    name = known_filter(filter, _PIXELS, "PSF for the filter")
     scale = _PIXELS[name]
     oversampling, width = checked_grid(oversampling, fov, 6.0 if scale < 0.05 else 10.0)
     # the detectors' axes stand within 0.6 deg of the telescope's

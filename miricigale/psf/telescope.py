@@ -9,16 +9,8 @@ import numpy as np
 from miricigale.filters import Filter
 from miricigale.psf.optics import jwst_pupil, polychromatic_psf
 from miricigale.refdata import citations
-from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import ANGLE, WAVE, positive, to_array
-
-
-def filter_name(filter_, known):
-    """The name of a filter that has a PSF, out of the known ones."""
-    name = filter_ if isinstance(filter_, str) else getattr(filter_, "name", None)
-    if name not in known:
-        raise unknown_name("PSF for the filter", name, known)
-    return name
 
 
 @functools.lru_cache(maxsize=64)

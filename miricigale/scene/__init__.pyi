@@ -1,6 +1,7 @@
 from .background import Background as Background
 from .catalog import CATALOG_COLUMNS as CATALOG_COLUMNS
 from .catalog import CatalogFlags as CatalogFlags
+from .catalog import as_sources as as_sources
 from .catalog import check_catalog as check_catalog
 from .catalog_files import read_catalog as read_catalog
 from .cutouts import Cutout as Cutout

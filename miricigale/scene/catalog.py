@@ -1,14 +1,17 @@
 """The catalog of sources: its columns, what is refused and what is flagged."""
 
+import warnings
+
 import astropy.units as u
 import numpy as np
-from astropy.coordinates import SkyCoord
 from astropy.table import QTable, Table
 
+from miricigale.filters.photometry_table import as_photometry
 from miricigale.filters.surveys import is_band
 from miricigale.profiles import SERSIC_INDEX_RANGE
-from miricigale.utils.exceptions import argument_error
-from miricigale.utils.missing import without_codes
+from miricigale.utils.exceptions import CatalogWarning, argument_error
+from miricigale.utils.missing import plain_floats, without_codes
+from miricigale.utils.positions import as_positions
 from miricigale.utils.tables import (
     Flags,
     ascii_ids,
@@ -29,6 +32,18 @@ CATALOG_COLUMNS = {
     "sersic_index": None,
     "axis_ratio": None,
     "position_angle": u.deg,
+}
+
+#: What makes a Sersic profile.
+_SHAPE = ("half_light_radius", "sersic_index", "axis_ratio", "position_angle")
+
+#: Names of columns that are usual elsewhere.
+_OTHER_NAMES = {
+    "redshift": {"z", "redshift"},
+    "half_light_radius": {"re", "r_e", "reff", "r_eff", "hlr", "r50"},
+    "sersic_index": {"n", "sersic", "n_sersic", "sersic_n"},
+    "axis_ratio": {"q", "ba", "b_a", "axis_ratio"},
+    "position_angle": {"pa", "theta", "position_angle"},
 }
 
 PROFILES = ("sersic", "point", "cutout")
@@ -92,18 +107,47 @@ def _without_codes(values):
     return values
 
 
-def check_catalog(table, *, filters=(), argument="catalog"):
+def as_sources(data, filter, argument="catalog"):
+    """
+    Table of sources with our names of columns, of any table.
+
+    Parameters
+    ----------
+    data : `~astropy.table.Table` or anything for `~miricigale.filters.photometry_table.as_photometry`
+        Besides fluxes, shapes may have names that are usual elsewhere (``re``, ``n``, ``q``, ``pa``).
+    filter : str
+        The band of the fluxes that are meant.
+    argument : str, optional
+        What the table is called in messages.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        A copy.
+    """
+    table = QTable(as_photometry(data, [filter], argument), copy=True)
+    for ours, others in _OTHER_NAMES.items():
+        theirs = [name for name in table.colnames if name.lower() in others]
+        if ours not in table.colnames and theirs:
+            table.rename_column(theirs[0], ours)
+    return table
+
+
+def check_catalog(table, *, filters=(), wcs=None, argument="catalog"):
     """
     Check a catalog and bring it into the package's units.
 
     Parameters
     ----------
     table : `~astropy.table.Table`
-        With the columns of `CATALOG_COLUMNS`; ``ra`` and ``dec`` (with units) may stand for
-        ``sky``. Columns of fluxes are called by their filter (``"miri.f770w"``), those of
-        errors end on ``_err``. ``star`` (bool) says which sources are stars.
+        With positions (see `~miricigale.utils.positions.as_positions`) and fluxes, whose columns are called
+        by their filter (``"miri.f770w"``), those of errors end on ``_err``. The other columns of
+        `CATALOG_COLUMNS` may be there, ``id`` must: without ``profile`` sources with a complete shape are
+        Sersic profiles and the others points. ``star`` (bool) says which sources are stars.
     filters : iterable of str, optional
         Flux columns that must be there.
+    wcs : `~astropy.wcs.WCS`, optional
+        World coordinates of pixels ``x`` and ``y``, where there are no other positions.
     argument : str, optional
         What the table is called in messages.
 
@@ -118,39 +162,33 @@ def check_catalog(table, *, filters=(), argument="catalog"):
     Raises
     ------
     ValueError
-        If a column is missing, ``star`` is not bool, an id is there twice or is no integer nor ASCII text,
-        a position is not finite, a profile has an unknown name or there are no rows.
+        If ids, positions or fluxes are missing, ``star`` is not bool, an id is there twice or is no integer
+        nor ASCII text, a position is not finite, a profile has an unknown name or there are no rows.
     `~astropy.units.UnitsError`
         If a column has no unit or a wrong one; a column called by a filter must be a flux.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.CatalogWarning`
+        If there is no column ``profile``, with the number of sources that are points.
     """
     if not isinstance(table, Table):
         raise argument_error(argument, "a table", type(table).__name__)
     catalog = QTable(table, copy=True)
-    if "sky" not in catalog.colnames and {"ra", "dec"} <= set(catalog.colnames):
-        require_columns(catalog, ["ra", "dec"], argument, units={"ra": u.deg, "dec": u.deg})
-        sky = [_plain(catalog, name, u.deg, argument) for name in ("ra", "dec")]
-        bad = ~np.isfinite(sky[0]) | ~np.isfinite(sky[1])
-        _refuse_positions(bad, argument)
-        catalog["sky"] = SkyCoord(*sky)
+    if len(catalog) == 0:
+        raise argument_error(argument, "a table with rows", "none")
+    catalog["sky"] = as_positions(catalog, argument, wcs)
+    points = list(_fill_columns(catalog, argument))
     units = {name: unit for name, unit in CATALOG_COLUMNS.items() if unit is not None}
     require_columns(catalog, CATALOG_COLUMNS, argument, units=units)
     fluxes = [*filters, *(name for name in catalog.colnames if is_band(name))]
     require_columns(catalog, filters, argument, units=dict.fromkeys(fluxes, FNU))
-    if len(catalog) == 0:
-        raise argument_error(argument, "a table with rows", "none")
-    if not isinstance(catalog["sky"], SkyCoord):
-        raise argument_error(
-            argument, "a table with SkyCoord in 'sky'", type(catalog["sky"]).__name__
-        )
     _refuse_missing(catalog, argument)
     ids = read_ids(catalog, argument)
     if ids.dtype.kind not in "iuU":
         wanted = "a table with integers or text in 'id'"
         raise argument_error(argument, wanted, catalog["id"].dtype)
     catalog["id"] = unique_ids(ascii_ids(ids, argument), argument)
-    sky = catalog["sky"].icrs
-    _refuse_positions(~(np.isfinite(sky.ra.deg) & np.isfinite(sky.dec.deg)), argument)
-    catalog["sky"] = SkyCoord(sky.ra, sky.dec)
     profile = np.asarray(catalog["profile"]).astype(str)
     unknown = sorted(set(profile.tolist()) - set(PROFILES))
     if unknown:
@@ -172,14 +210,28 @@ def check_catalog(table, *, filters=(), argument="catalog"):
         raise argument_error(argument, "a table with True or False in 'star'", got)
     catalog["flags"] = _flags(catalog)
     catalog["flags"].info.description = CatalogFlags.describe()
+    for text in points:
+        warnings.warn(f"{argument}: {text}", CatalogWarning, stacklevel=3)
     return catalog
 
 
-def _refuse_positions(bad, argument):
-    if np.any(bad):
-        rows = np.flatnonzero(bad)
-        wanted = "a table of finite positions"
-        raise argument_error(argument, wanted, f"{rows.size} that are not, first in row {rows[0]}")
+def _fill_columns(table, argument):
+    """Add missing columns of redshifts and profiles to a table; yield what has become a point, and why."""
+    missing = [name for name in _SHAPE if name not in table.colnames]
+    for name in ("redshift", *missing):
+        if name not in table.colnames:
+            table[name] = np.full(len(table), np.nan) * (CATALOG_COLUMNS[name] or u.one)
+    if "profile" in table.colnames:
+        return
+    usable = np.full(len(table), not missing)
+    for name in () if missing else _SHAPE:
+        values = plain_floats(table[name], name, argument)
+        usable &= np.isfinite(values) & ((values > 0) | (name == "position_angle"))
+    table["profile"] = np.where(usable, "sersic", "point")
+    n = int(np.count_nonzero(~usable))
+    if n:
+        why = f"no column {missing[0]!r}" if missing else "incomplete or not positive shapes"
+        yield f"{n} of {len(table)} sources are points ({why})"
 
 
 def _flags(catalog):

@@ -11,14 +11,10 @@ from miricigale.filters import Filter
 from miricigale.filters.catalog_files import as_catalog_map, told_of
 from miricigale.filters.surveys import is_band
 from miricigale.refdata import locate, resources
-from miricigale.scene.catalog import CATALOG_COLUMNS, CatalogFlags, check_catalog
+from miricigale.scene.catalog import CatalogFlags, check_catalog
 from miricigale.utils.exceptions import CatalogWarning, DataError
 from miricigale.utils.files import read_table
-from miricigale.utils.missing import plain_floats
 from miricigale.utils.tables import error_column
-
-#: What makes a Sersic profile.
-_SHAPE = ("half_light_radius", "sersic_index", "axis_ratio", "position_angle")
 
 #: Counts of galaxies in K: AB magnitude and log of the number per magnitude and square degree (Weaver et
 #: al. 2022, ApJS 258, 11, table 2).
@@ -53,8 +49,7 @@ def read_catalog(path, catalog_map=None, **options):
     Returns
     -------
     catalog : `~astropy.table.QTable`
-        As made by `check_catalog`. Where there is no column ``profile``, sources whose profile is
-        complete are Sersic profiles and the others points.
+        As made by `check_catalog`.
 
     Raises
     ------
@@ -70,7 +65,8 @@ def read_catalog(path, catalog_map=None, **options):
     `~miricigale.utils.exceptions.CatalogWarning`
         Of numbers that stand for no value (`CatalogFlags`, ``MISSING_CODE``), sources without a usable
         flux (``NO_FLUX``), right ascensions that look like hours, fluxes that look like those of another
-        unit by counts or colors, units other than the file's, bands without a filter, and missing profiles.
+        unit by counts or colors, units other than the file's, bands without a filter, and shapes that are
+        not complete.
 
     Examples
     --------
@@ -97,7 +93,7 @@ def read_catalog(path, catalog_map=None, **options):
     _, lost = catalog_map.names(table.colnames, path.name)
     table, coded = catalog_map.convert(table, path.name)
     _flags_of_stars(table)
-    texts = [*told_of(lost, coded), *_fill_profiles(table, path.name)]
+    texts = list(told_of(lost, coded))
     catalog = check_catalog(table, argument=path.name)
     for codes in coded.values():
         catalog["flags"][~np.isnan(codes)] |= int(CatalogFlags.MISSING_CODE)
@@ -118,25 +114,6 @@ def _flags_of_stars(table):
     values = [str(value).strip().lower() for value in star.tolist()]
     if star.dtype.kind in "iuUS" and set(values) <= set(words):
         table["star"] = np.array([words[value] for value in values], dtype=bool)
-
-
-def _fill_profiles(table, argument):
-    """Add missing columns of profiles; yield warnings."""
-    if "profile" in table.colnames:
-        return
-    missing = [name for name in _SHAPE if name not in table.colnames]
-    usable = np.full(len(table), not missing)
-    for name in _SHAPE:
-        if name in missing:
-            table[name] = np.full(len(table), np.nan) * (CATALOG_COLUMNS[name] or u.one)
-        elif not missing:
-            values = plain_floats(table[name], name, argument)
-            usable &= np.isfinite(values) & ((values > 0) | (name == "position_angle"))
-    table["profile"] = np.where(usable, "sersic", "point")
-    why = f"no column {missing[0]!r}" if missing else "incomplete or not positive shapes"
-    n = int(np.count_nonzero(~usable))
-    if n:
-        yield f"{n} of {len(table)} sources are points ({why})"
 
 
 def _missing_fluxes(catalog):

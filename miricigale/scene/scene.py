@@ -5,22 +5,26 @@ import warnings
 
 import astropy.units as u
 import numpy as np
-from astropy.table import Table
 from astropy.wcs import WCS
 from photutils.psf import GriddedPSFModel
 
-from miricigale.instrument import aperture, pixel_area_map
+from miricigale.depth import sky_background
+from miricigale.filters.band_names import find_filter
+from miricigale.instrument import Exposure, aperture, pixel_area_map
 from miricigale.instrument.image import Image
 from miricigale.profiles import ellipse_to_pixels
-from miricigale.psf import InstrumentPSF, PSFGrid
+from miricigale.psf import InstrumentPSF, PSFGrid, as_psf, miri_psf
+from miricigale.refdata import resources
 from miricigale.scene.background import Background
-from miricigale.scene.catalog import CatalogFlags, check_catalog, unmasked
+from miricigale.scene.catalog import CatalogFlags, as_sources, check_catalog, unmasked
 from miricigale.scene.catalog_files import read_catalog
 from miricigale.scene.cutouts import Cutout
 from miricigale.scene.render import FieldPainter, Painter
 from miricigale.scene.sky import local_jacobian, pixel_positions
 from miricigale.utils.exceptions import CatalogWarning, argument_error
+from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import provenance
+from miricigale.utils.options import check_kind
 from miricigale.utils.tables import Flags, described_table
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, positive, to_array
 
@@ -41,27 +45,31 @@ class SceneFlags(Flags):
     DRAWN_AS_POINT = 16  # a Sersic profile whose parameters cannot be used
 
 
-class Scene:
+class Scene(Interactive):
     """
     A catalog of sources as an instrument would see it without noise.
 
     Parameters
     ----------
-    catalog : `~astropy.table.Table` or str
-        As checked by `~miricigale.scene.check_catalog`, with a flux column called
-        ``filter``; or what `~miricigale.scene.read_catalog` takes.
-    filter : str
-        The flux column, such as ``"miri.f770w"``.
-    wcs : `~astropy.wcs.WCS`
+    catalog : `~astropy.table.Table`, dict, `pandas.DataFrame`, str or path-like
+        Sources with positions (``sky``, or ``ra`` and ``dec``) and the fluxes of ``filter``, under any usual
+        name of the band or as ``flux``: enough for points. All columns are those of
+        `~miricigale.scene.check_catalog`. Text is a bundled catalog (``"catalog.goodss"``) or a file.
+    exposure : `~miricigale.instrument.Exposure`, optional
+        What the image is exposed by: gives ``filter`` and ``wcs``.
+    filter : str or `~miricigale.filters.Filter`, optional
+        Any name of the filter of the fluxes, such as ``"F770W"``.
+    wcs : `~astropy.wcs.WCS`, optional
         World coordinates of the image with their ``pixel_shape``, distorted or not.
-    psf : `~photutils.psf.ImagePSF` or `~photutils.psf.GriddedPSFModel`
-        PSF on the image's pixels with the pixel response in it, or PSFs over the field (see
-        `~miricigale.psf.miri_psf_grid`). The pixel of an
+    psf : `~photutils.psf.ImagePSF`, `~photutils.psf.GriddedPSFModel` or other, optional
+        PSF on the image's pixels with the pixel response in it (see `~miricigale.psf.as_psf`), or PSFs over
+        the field (see `~miricigale.psf.miri_psf_grid`); `~miricigale.psf.miri_psf` by default. The pixel of an
         `~miricigale.psf.InstrumentPSF` or a `~miricigale.psf.PSFGrid` and, in the frame of the
         sky, its angle are compared with the WCS; its filter, if it has one, must be ``filter``,
         and the sub-array of a grid have the image's shape.
-    background : `~miricigale.scene.Background` or `~astropy.units.Quantity`, optional
-        Background, or its constant level; none by default.
+    background : `~miricigale.scene.Background`, `~astropy.units.Quantity` or str, optional
+        Background, or its constant level, or how bright the zodiacal light is, as for
+        `~miricigale.depth.sky_background` (``"low"``); none by default.
     enclosed : float, optional
         Sersic profiles are painted to the isophote that holds this fraction.
     max_radius : `~astropy.units.Quantity`, optional
@@ -99,10 +107,11 @@ class Scene:
     def __init__(
         self,
         catalog,
+        exposure=None,
         *,
-        filter,
-        wcs,
-        psf,
+        filter=None,
+        wcs=None,
+        psf=None,
         background=None,
         enclosed=0.9995,
         max_radius=12 * u.arcsec,
@@ -110,14 +119,25 @@ class Scene:
         cutouts=None,
         agn=None,
     ):
-        catalog = catalog if isinstance(catalog, Table) else read_catalog(catalog)
-        self._filter = filter if isinstance(filter, str) else filter.name
-        self._catalog = check_catalog(catalog, filters=[self._filter])
+        if exposure is not None:
+            check_kind(exposure, "exposure", Exposure)
+            exposure.check_sky()
+            filter = exposure.filter if filter is None else filter
+            wcs = exposure.wcs if wcs is None else wcs
+        for name, value in (("filter", filter), ("wcs", wcs)):
+            if value is None:
+                raise argument_error(name, "given, or an exposure", "None")
         if not isinstance(wcs, WCS):
             raise argument_error("wcs", "an astropy WCS", type(wcs).__name__)
         if wcs.pixel_shape is None:
             raise argument_error("wcs", "a WCS with its pixel_shape", "one without")
-        self._wcs = wcs
+        name = str(getattr(filter, "name", filter))
+        self._wcs, self._filter = wcs, find_filter(name) or name
+        if isinstance(catalog, str) and catalog in resources():
+            catalog = read_catalog(catalog)
+        sources = as_sources(catalog, self._filter)
+        self._catalog = check_catalog(sources, filters=[self._filter], wcs=wcs)
+        psf = miri_psf(self._filter) if psf is None else as_psf(psf)
         self._shape = tuple(int(n) for n in wcs.pixel_shape[::-1])
         self._background = self._check_background(background)
         scale = self._pixel_scale()
@@ -130,6 +150,9 @@ class Scene:
         self._cutouts = self._check_cutouts(cutouts)
         self._galaxy_flux, self._agn_flux = self._split_flux(agn)
         self._warn_of_fluxes()
+
+    def __len__(self):
+        return len(self._catalog)
 
     def __repr__(self):
         ny, nx = self._shape
@@ -215,12 +238,14 @@ class Scene:
         )
         warnings.warn(msg, CatalogWarning, stacklevel=3)
 
-    @staticmethod
-    def _check_background(background):
+    def _check_background(self, background):
         if background is None or isinstance(background, Background):
             return background
+        if isinstance(background, str):
+            background = sky_background(self._filter, background)
         if not isinstance(background, u.Quantity):
-            raise argument_error("background", "a Background or a Quantity", repr(background))
+            wanted = "a Background, a Quantity in MJy/sr or a level such as 'low'"
+            raise argument_error("background", wanted, repr(background))
         level = to_array(background, SURFACE_BRIGHTNESS, "background", ndim=0, finite=True)
         if level < 0:
             raise argument_error("background", "at least 0", background)
@@ -352,6 +377,23 @@ class Scene:
         that were filled in.
         """
         return self._painted[1].copy()
+
+    def to_table(self):
+        """What is in the image: `truth`."""
+        return self.truth
+
+    def write(self, path, *, overwrite=False):
+        """
+        Write the image that `render` makes.
+
+        Parameters
+        ----------
+        path : path-like
+            A FITS file.
+        overwrite : bool, optional
+            Whether a file of that name is replaced.
+        """
+        self.render().write(path, overwrite=overwrite)
 
     def render(self):
         """

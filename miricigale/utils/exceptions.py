@@ -95,10 +95,10 @@ _LISTED = 40
 def unknown_name(kind, name, known):
     """Make the `KeyError` for an unknown name that lists the right ones, or of many the nearest three."""
     known = sorted(map(str, known))
-    lower = {one.lower(): one for one in known}
+    # also by the last part of names with dots
+    lower = {one.lower().rpartition(".")[2]: one for one in known}
+    lower |= {one.lower(): one for one in known}
     if len(known) > _LISTED:
-        # also by the last part of names with dots
-        lower = {one.lower().rpartition(".")[2]: one for one in known} | lower
         close = difflib.get_close_matches(str(name).lower(), lower, n=6, cutoff=0.4)
         near = list(dict.fromkeys(lower[one] for one in close))[:3] or known[:3]
         return KeyError(f"no {kind} {name!r}; the nearest of {len(known)} are {', '.join(near)}")

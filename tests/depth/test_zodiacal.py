@@ -63,7 +63,7 @@ def test_without_the_package_the_error_says_how_to_install_it(monkeypatch):
 def test_unknown_names_are_refused():
     with pytest.raises(KeyError, match="no level of the zodiacal light 'mid'; known: high, low"):
         zodiacal_factor("miri.f770w", "mid")
-    with pytest.raises(KeyError, match=r"no imaging filter 'miri\.f707w'"):
+    with pytest.raises(KeyError, match="no imaging filter 'f707w'"):
         zodiacal_factor("f707w")
 
 

@@ -172,7 +172,7 @@ def test_warns_of_a_saturating_sky(make_exposure, make_sky, detector, caplog):
 def test_refuses_wrong_images(make_exposure, make_sky, detector):
     exposure = make_exposure()
     refuses("'exposure' must be an Exposure", detector.expose, make_sky(exposure, 1.0), None)
-    with pytest.raises(TypeError, match="'image' must be a CCDData"):
+    with pytest.raises(TypeError, match="'image' must be a Scene or a CCDData"):
         detector.expose(np.zeros(exposure.shape), exposure)
     with pytest.raises(u.UnitsError, match="'image' must be convertible to MJy / sr"):
         detector.expose(CCDData(np.zeros(exposure.shape), unit="adu"), exposure)

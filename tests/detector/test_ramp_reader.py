@@ -122,7 +122,7 @@ def test_an_exposure_of_nothing_is_not_simulated(make_exposure, make_sky):
     }.items():
         with pytest.raises(ValueError, match=f"'exposure' must be one with a {name}"):
             Detector.miri_imager().expose(sky, exposure.replace(**options), seed=1)
-    refuses("'pointing, roll' must be both given or both None", exposure.replace, roll=None)
+    refuses("'pointing' must be given where 'roll' is", exposure.replace, pointing=None)
 
 
 def test_keywords_of_a_ramp_that_was_not_read_are_those_of_its_file(

@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
 from miricigale.depth import saturation_forecast
+from miricigale.filters import Filter
 from miricigale.instrument import (
     CEERS_FILTERS,
     Exposure,
@@ -152,6 +153,62 @@ def test_normalizes_and_freezes():
 )
 def test_rejects_what_cannot_be_exposed(options, error, message):
     refuses(message, exposure, **options, error=error)
+
+
+@pytest.mark.parametrize(
+    "pointing",
+    [
+        "53.1 -27.8",
+        "3h32m24s -27d48m00s",
+        "03:32:24 -27:48:00",
+        "3 32 24 -27 48 0",
+        (53.1, -27.8),
+        (53.1 * u.deg, -27.8 * u.deg),
+        SkyCoord([53.1], [-27.8], unit="deg"),
+        SkyCoord(53.1, -27.8, unit="deg").galactic,
+    ],
+)
+def test_a_pointing_has_any_form(pointing):
+    made = Exposure("F770W", n_groups=10, pointing=pointing)
+    assert made.pointing.separation(SkyCoord(53.1, -27.8, unit="deg")) < 1e-6 * u.arcsec
+    assert made.roll == 0 * u.deg
+
+
+@pytest.mark.parametrize(
+    "name", ["F770W", "f770w", "MIRI/F770W", "JWST/MIRI.F770W", Filter("F770W")]
+)
+def test_a_filter_has_any_name(name):
+    assert Exposure(name, n_groups=10).filter == "miri.f770w"
+
+
+def test_time_in_place_of_groups():
+    made = Exposure("F1500W", time=30 * u.min, pointing=FIELD)
+    same = Exposure.from_time("F1500W", 30 * u.min, pointing=FIELD)
+    assert (made.n_groups, made.n_integrations) == (same.n_groups, same.n_integrations)
+    assert made.exposure_time.to_value(u.min) == pytest.approx(30, abs=0.1)
+    split = Exposure("F1500W", time=30 * u.min, n_integrations=9)
+    assert split.n_integrations == 9
+    assert split.exposure_time.to_value(u.min) == pytest.approx(30, abs=0.3)
+    # 111 frames of 2.775 s
+    assert made.replace(time=308 * u.s).exposure_time.to_value(u.s) == pytest.approx(308, abs=3)
+    refuses(
+        "'n_groups, time' must be one of them given, got both",
+        made.replace,
+        time=1 * u.h,
+        n_groups=3,
+    )
+    refuses("'n_groups, time' must be one of them given, got neither", Exposure, "F770W")
+
+
+def test_the_footprint_is_the_field_of_the_array():
+    made = Exposure("F770W", n_groups=10, pointing=FIELD)
+    corners = made.footprint
+    sides = corners.separation(np.roll(corners, -1)).to_value(u.arcsec)
+    # 1032 x 1024 pixels of 0.1105 by 0.1113 arcsec
+    np.testing.assert_allclose(sides, [114.0, 114.0, 114.0, 114.0], rtol=0.02)
+    ax = made.plot()
+    assert ax.xaxis_inverted()
+    np.testing.assert_allclose(ax.patches[0].get_xy()[:4, 1], corners.dec.deg)
 
 
 def test_rejects_foreign_filters():

@@ -182,7 +182,7 @@ def test_offsets_follow_the_turned_axes():
 
 
 def test_rejects_what_is_no_pointing():
-    refuses("'pointing' must be one SkyCoord", imager_wcs, (53, -27), ROLL)
+    refuses("'pointing' must be one SkyCoord", imager_wcs, 53, ROLL)
     with pytest.raises(u.UnitsError, match="'roll' must be a quantity convertible to deg"):
         imager_wcs(FIELD, 35)
     with pytest.raises(KeyError, match="no sub-array 'SUB999'; known: BRIGHTSKY, FULL"):

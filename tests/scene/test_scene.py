@@ -225,7 +225,8 @@ def bare_wcs():
     ("options", "message"),
     [
         ({"filter": "miri.f1000w"}, "'catalog' must be a table with the columns"),
-        ({"psf": np.ones((3, 3))}, "'psf' must be a photutils ImagePSF, got ndarray"),
+        ({"psf": np.ones(3)}, "'psf' must be a PSF or model of photutils, an astropy kernel or a 2D"),
+        ({"psf": np.zeros((5, 5))}, "'psf' must be finite, with a positive sum"),
         (
             {"psf": scenes.gaussian_psf(pixel_scale=0.06 * u.arcsec)},
             r"pixels of 0\.0600 arcsec where the WCS has 0\.1100",
@@ -236,7 +237,7 @@ def bare_wcs():
             r"'psf' must be one of the filter miri\.f770w, got one",
         ),
         ({"psf": ImagePSF(np.ones((8, 8)), oversampling=4)}, "'psf' must be centered on a node"),
-        ({"background": 3.0}, "'background' must be a Background or a Quantity"),
+        ({"background": 3.0}, "'background' must be a Background, a Quantity in MJy/sr or a level"),
         ({"background": -3 * u.MJy / u.sr}, r"'background' must be at least 0, got -3\.0 MJy"),
         ({"wcs": bare_wcs()}, "'wcs' must be a WCS with its pixel_shape"),
         ({"n_threads": 0}, "'n_threads' must be at least 1 and an integer, got 0"),
@@ -250,11 +251,11 @@ def test_refuses(wcs, psf, options, message):
         Scene(catalog, **{"filter": FILTER, "wcs": wcs, "psf": psf} | options)
 
 
-def test_magnitudes_are_no_fluxes(wcs, psf):
+def test_magnitudes_are_fluxes(wcs, psf):
     catalog = scenes.make_catalog(wcs, 50, 45)
     catalog[FILTER] = [20.0] * u.ABmag
-    with pytest.raises(u.UnitsError, match=r"'miri\.f770w' must be convertible to uJy, got mag"):
-        make_scene(catalog, wcs, psf)
+    truth = make_scene(catalog, wcs, psf).truth
+    assert truth["flux_total"][0].to_value(u.uJy) == pytest.approx(3631e6 * 1e-8, rel=1e-4)
 
 
 def test_psfs_that_fit(wcs):

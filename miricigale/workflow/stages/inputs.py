@@ -79,7 +79,7 @@ def study_catalog(options):
 @functools.lru_cache(maxsize=2)
 def _catalog(options, state):
     """The catalog, read and warned of once; ``state`` changes with a file."""
-    return read_catalog(
+    catalog = read_catalog(
         options.source,
         columns=dict(pair.split("=") for pair in options.columns),
         units=dict(pair.split("=") for pair in options.units),
@@ -87,6 +87,9 @@ def _catalog(options, state):
         missing=options.missing,
         factor=options.factor or None,
     )
+    known = np.count_nonzero(catalog["redshift"] > 0)
+    require(known, "catalog", "source", "must have a column 'redshift'", catalog.colnames)
+    return catalog
 
 
 def _input_plan(config, _):

@@ -1,0 +1,123 @@
+"""Positions on the sky in any of the usual forms."""
+
+import re
+
+import astropy.units as u
+import numpy as np
+from astropy.coordinates import SkyCoord
+
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.missing import plain_floats, without_codes
+
+__all__ = ["as_position", "as_positions"]
+
+_WANTED = "one SkyCoord, text such as '150.1 +2.2' or '10h00m24s +02d12m00s', or (ra, dec) in deg"
+#: Columns of right ascension and declination, in lower case and without what follows an underscore.
+_PAIRS = {"ra": "dec", "alpha": "delta", "raj2000": "dej2000", "lon": "lat"}
+
+
+def as_position(value, argument):
+    """
+    One position of whatever says where it is.
+
+    Parameters
+    ----------
+    value : `~astropy.coordinates.SkyCoord`, str or sequence of two
+        Text is in degrees, or in hours and degrees where it has an ``h``, colons or six numbers; of a pair
+        bare numbers are degrees.
+    argument : str
+        The argument's name, for the message.
+
+    Returns
+    -------
+    position : `~astropy.coordinates.SkyCoord`
+        One position, ICRS.
+
+    Raises
+    ------
+    ValueError
+        If it is nothing of these, or not finite.
+    """
+    try:
+        if isinstance(value, str):
+            hours = re.search("[hH:]", value) or len(value.split()) > 2
+            position = SkyCoord(value, unit=(u.hourangle if hours else u.deg, u.deg))
+        elif isinstance(value, SkyCoord):
+            position = value
+        else:
+            position = SkyCoord(*(u.Quantity(angle, u.deg) for angle in value))
+        # a `ValueError` of more than one
+        position = position.reshape(()).icrs
+    except (TypeError, ValueError) as err:
+        raise argument_error(argument, _WANTED, f"{value!r} ({err})") from None
+    if not np.isfinite([position.ra.deg, position.dec.deg]).all():
+        raise argument_error(argument, "finite", repr(value))
+    return SkyCoord(position.ra, position.dec)
+
+
+def as_positions(table, argument, wcs=None):
+    """
+    Positions of the rows of a table, by whichever of its columns have them.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        With ``sky`` or another column of `~astropy.coordinates.SkyCoord`; ``ra`` and ``dec`` in any case and
+        unit (degrees without one), also ``ALPHA_J2000`` and ``RAJ2000``; or, with a WCS, pixels ``x`` and ``y``.
+    argument : str
+        What the table is called in messages.
+    wcs : `~astropy.wcs.WCS`, optional
+        For 0-based pixels.
+
+    Returns
+    -------
+    sky : `~astropy.coordinates.SkyCoord`
+        ICRS.
+
+    Raises
+    ------
+    ValueError
+        If there are no such columns, or a position is not finite.
+    """
+    skies = [name for name in table.colnames if isinstance(table[name], SkyCoord)]
+    columns = {}
+    for name in table.colnames:
+        columns.setdefault(name.lower().removesuffix("_j2000"), name)
+    pair = next(
+        ((columns[a], columns[b]) for a, b in _PAIRS.items() if {a, b} <= set(columns)), None
+    )
+    if "sky" in skies or (skies and pair is None):
+        sky = table["sky" if "sky" in skies else skies[0]].icrs
+    elif pair is not None:
+        angles = [_degrees(table, name, argument) for name in pair]
+        _refuse_missing(~np.isfinite(angles).all(axis=0), argument)
+        sky = SkyCoord(*angles, unit="deg")
+    elif wcs is not None and {"x", "y"} <= set(columns):
+        pixels = [plain_floats(table[columns[name]], columns[name], argument) for name in "xy"]
+        _refuse_missing(~np.isfinite(pixels).all(axis=0), argument)
+        sky = wcs.pixel_to_world(*pixels).icrs
+    else:
+        wanted = "a table with positions: 'sky' (SkyCoord), or 'ra' and 'dec'"
+        wanted += "" if wcs is None else ", or pixels 'x' and 'y'"
+        raise argument_error(argument, wanted, f"the columns {table.colnames}")
+    _refuse_missing(~(np.isfinite(sky.ra.deg) & np.isfinite(sky.dec.deg)), argument)
+    return SkyCoord(sky.ra, sky.dec)
+
+
+def _degrees(table, name, argument):
+    """Angles in degrees, NaN where they are missing."""
+    column = table[name]
+    unit = getattr(column, "unit", None) or u.deg
+    if not u.Unit(unit).is_equivalent(u.deg):
+        msg = f"{argument!r} column {name!r} must be an angle, got {unit}"
+        raise u.UnitsError(msg)
+    values = plain_floats(column, name, argument)
+    values[without_codes(values)[0]] = np.nan
+    return values * u.Unit(unit).to(u.deg)
+
+
+def _refuse_missing(bad, argument):
+    if np.any(bad):
+        rows = np.flatnonzero(bad)
+        wanted = "a table of finite positions"
+        raise argument_error(argument, wanted, f"{rows.size} that are not, first in row {rows[0]}")

@@ -1,0 +1,130 @@
+"""Scenes of catalogs, filters, PSFs and grids in the forms that users have."""
+
+import astropy.units as u
+import numpy as np
+import pandas as pd
+import pytest
+from astropy.convolution import Gaussian2DKernel
+from astropy.coordinates import SkyCoord
+from astropy.table import QTable, Table
+from photutils.psf import CircularGaussianPRF, MoffatPSF
+
+from helpers import scenes
+from miricigale.detector import Detector
+from miricigale.filters import Filter
+from miricigale.instrument import Exposure
+from miricigale.psf import as_psf, miri_psf
+from miricigale.scene import Scene, as_sources
+
+RA, DEC = np.array([150.1, 150.102]), np.array([2.2, 2.201])
+SKY = SkyCoord(RA, DEC, unit="deg")
+FLUX = np.array([5.0, 7.0])
+MAG = 23.9 - 2.5 * np.log10(FLUX)
+
+
+@pytest.fixture(scope="module")
+def exposure():
+    return Exposure("F770W", n_groups=10, pointing="150.1 2.2", subarray="SUB128")
+
+
+def pixels(exposure):
+    x, y = exposure.wcs.world_to_pixel(SKY)
+    return {"X": x, "Y": y, "flux": FLUX * u.uJy}
+
+
+@pytest.mark.parametrize(
+    "catalog",
+    [
+        QTable({"sky": SKY, "miri.f770w": FLUX * u.uJy}),
+        QTable({"position": SKY, "F770W": FLUX * u.uJy}),
+        Table({"RA": RA, "DEC": DEC, "f_f770w": FLUX * 1e3 * u.nJy}),
+        {"ra": RA * u.deg, "dec": np.radians(DEC) * u.rad, "F770W": FLUX * 1e-6 * u.Jy},
+        {"ALPHA_J2000": RA, "DELTA_J2000": DEC, "mag_F770W": MAG},
+        {"RAJ2000": RA / 15 * u.hourangle, "DEJ2000": DEC, "JWST/MIRI.F770W": MAG * u.ABmag},
+        pd.DataFrame({"ra": RA, "dec": DEC, "mag": MAG}),
+        np.array(
+            list(zip(RA, DEC, MAG, strict=True)), dtype=[("ra", "f8"), ("dec", "f8"), ("mag", "f8")]
+        ),
+        pixels,
+    ],
+)
+def test_one_truth_of_any_catalog(catalog, exposure):
+    if callable(catalog):
+        catalog = catalog(exposure)
+    with pytest.warns(match="sources are points"):
+        truth = Scene(catalog, exposure).truth
+    assert truth["id"].tolist() == [1, 2]
+    assert truth["sky"].separation(SKY).max() < 1e-4 * u.arcsec
+    np.testing.assert_allclose(truth["flux_total"].to_value(u.uJy), FLUX, rtol=1e-4)
+
+
+def test_files_are_read(exposure, tmp_path):
+    QTable({"sky": SKY, "F770W": FLUX * u.uJy, "profile": ["point"] * 2}).write(tmp_path / "a.ecsv")
+    truth = Scene(tmp_path / "a.ecsv", exposure).to_table()
+    np.testing.assert_allclose(truth["flux_total"].value, FLUX)
+
+
+def test_shapes_by_their_usual_names():
+    shapes = {"Re": [0.3] * u.arcsec, "n": [1.0], "q": [0.5], "PA": [30.0] * u.deg, "z": [1.5]}
+    table = as_sources({"ra": [150.1], "dec": [2.2], "flux": [1.0] * u.uJy, **shapes}, "miri.f770w")
+    names = {"half_light_radius", "sersic_index", "axis_ratio", "position_angle", "redshift"}
+    assert names | {"miri.f770w"} <= set(table.colnames)
+
+
+def test_an_exposure_gives_filter_grid_and_psf(exposure):
+    catalog = {"sky": SKY, "F770W": FLUX * u.uJy, "profile": "point"}
+    scene = Scene(catalog, exposure)
+    by_hand = Scene(
+        catalog, filter=Filter("F770W"), wcs=exposure.wcs, psf=miri_psf("JWST/MIRI.F770W")
+    )
+    np.testing.assert_array_equal(scene.render().data, by_hand.render().data)
+    assert len(scene) == 2
+
+
+def test_levels_of_the_sky(exposure):
+    catalog = {"sky": SKY, "F770W": FLUX * u.uJy, "profile": "point"}
+    levels = [Scene(catalog, exposure, background=k).background.level for k in ("low", "high")]
+    # Rigby et al. 2023, figure 8: some 6 MJy/sr
+    assert 4 < levels[0].to_value(u.MJy / u.sr) < 8
+    assert levels[1] > levels[0]
+
+
+def test_a_detector_takes_a_scene(exposure):
+    catalog = {"sky": SKY, "F770W": FLUX * u.uJy, "profile": "point"}
+    scene, detector = Scene(catalog, exposure, background="low"), Detector.miri_imager()
+    ramps = [detector.expose(light, exposure, seed=1) for light in (scene, scene.render())]
+    np.testing.assert_array_equal(ramps[0].data, ramps[1].data)
+
+
+def test_what_lacks_is_named(exposure):
+    for catalog, options, message in (
+        ({"F770W": FLUX * u.uJy}, {}, "a table with positions: 'sky'"),
+        ({"ra": RA, "dec": [2.2, np.nan], "flux": FLUX * u.uJy}, {}, "finite positions, got 1"),
+        ({"ra": RA, "dec": DEC}, {}, r"columns \['miri.f770w'\]"),
+        ({"ra": RA, "dec": DEC}, {"exposure": None}, "'filter' must be given, or an exposure"),
+        (3, {}, "'catalog' must be a table, a dict of columns"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Scene(catalog, **{"exposure": exposure} | options)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        CircularGaussianPRF(fwhm=2.0 * np.sqrt(2 * np.log(2)) * 0.85),
+        Gaussian2DKernel(0.85, x_size=21, y_size=21, mode="oversample", factor=11),
+        np.outer(scenes.pixel_gaussian(21, 10, 0.85), scenes.pixel_gaussian(21, 10, 0.85)),
+    ],
+)
+def test_psfs_of_others(given):
+    model = as_psf(given)
+    y, x = np.mgrid[:21, :21]
+    expected = np.outer(scenes.pixel_gaussian(21, 10, 0.85), scenes.pixel_gaussian(21, 10, 0.85))
+    model.x_0, model.y_0 = 10, 10
+    np.testing.assert_allclose(model(x, y), expected, atol=2e-3 * expected.max())
+
+
+def test_the_model_of_the_user_is_left_alone():
+    model = MoffatPSF(flux=3.0, x_0=7.0, y_0=5.0, alpha=2.0, beta=3.0)
+    assert as_psf(model).data.sum() == pytest.approx(16)
+    assert (model.flux.value, model.x_0.value) == (3.0, 7.0)
