@@ -5,6 +5,7 @@ import logging
 import math
 import warnings
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from miricigale.detector.ramp import Ramp
 from miricigale.detector.work import Work
 from miricigale.instrument import DetectorProperties, miri_detector
 from miricigale.utils.exceptions import DetectorWarning, argument_error
+from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_kind
 from miricigale.utils.parallel import check_memory
@@ -42,15 +44,16 @@ _EXPOSE_TO = "expose fewer groups, or write it by 'expose_to'"
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
-class Detector:
+class Detector(Interactive):
     """
     A detector: effects in the order in which they act.
 
     Parameters
     ----------
-    effects : iterable of `~miricigale.detector.Effect`
-        In the order of ``miricigale.detector.effects.order.ORDER``: the first act on light; `Photons`
-        makes a ramp of it; `ADConversion` ends. Effects of other kinds stand where they are put.
+    effects : iterable of `~miricigale.detector.Effect`, optional
+        Those of `miri_imager` by default. In the order of ``miricigale.detector.effects.order.ORDER``: the
+        first act on light; `Photons` makes a ramp of it; `ADConversion` ends. Effects of other kinds stand
+        where they are put.
     properties : `~miricigale.instrument.DetectorProperties`, optional
         Gain, noise and the rest; `~miricigale.instrument.miri_detector` if not given.
 
@@ -67,12 +70,17 @@ class Detector:
     (Photons(flat=True), ReadNoise(sigma=None, pink=0.0, octaves=16), ADConversion())
     """
 
-    effects: tuple
+    effects: tuple | None = None
     _: dataclasses.KW_ONLY
     properties: DetectorProperties | None = None
 
+    _other_names: ClassVar[dict] = {
+        name: f"properties.{name}" for name in ("gain", "read_noise", "dark_current", "full_well")
+    }
+
     def __post_init__(self):
-        object.__setattr__(self, "effects", checked_effects(self.effects))
+        effects = [kind() for kind in _STANDARD] if self.effects is None else self.effects
+        object.__setattr__(self, "effects", checked_effects(effects))
         check_order(self.effects)
         check_kind(self.properties, "properties", DetectorProperties)
         if self.properties is None:
@@ -103,7 +111,7 @@ class Detector:
         >>> [type(effect).__name__ for effect in detector.without(CosmicRays).effects][:3]
         ['Residual', 'Photons', 'Dark']
         """
-        return cls([kind() for kind in _STANDARD], properties=properties).replaced(*effects)
+        return cls(properties=properties).replaced(*effects)
 
     def replaced(self, *effects):
         """
@@ -157,8 +165,11 @@ class Detector:
         lines = ",\n    ".join(map(repr, self.effects))
         return f"Detector((\n    {lines},\n))"
 
+    def _facts(self):
+        return {type(effect).__name__: effect for effect in self.effects}
+
     def expose(
-        self, image, exposure, *, seed=None, previous=None, n_threads=None, progress_bar=False
+        self, image, exposure=None, *, seed=None, previous=None, n_threads=None, progress_bar=False
     ):
         """
         Expose the detector to a scene.
@@ -170,8 +181,8 @@ class Detector:
             renders.
             What its ``meta["psf_includes"]`` names (a list such as ``["pixel", "ipc"]``, or
             its text) is not applied again.
-        exposure : `~miricigale.instrument.Exposure`
-            How it is exposed.
+        exposure : `~miricigale.instrument.Exposure`, optional
+            How it is exposed; a scene of an exposure knows.
         seed : int, `~numpy.random.Generator` or None, optional
             Seed of the run. Every effect has its own stream in each exposure (distinguished
             by filter and dither) and detector row.
@@ -221,7 +232,7 @@ class Detector:
         task.run(store, n_threads, progress_bar)
         return Ramp(
             data,
-            exposure,
+            task.exposure,
             pixel_dq=pixel_dq,
             group_dq=group_dq,
             effects=task.effects,
@@ -233,7 +244,7 @@ class Detector:
         self,
         path,
         image,
-        exposure,
+        exposure=None,
         *,
         seed=None,
         previous=None,
@@ -272,7 +283,7 @@ class Detector:
         task = self._task(image, exposure, seed, previous)
         pixel_dq = np.zeros(task.shape[2:], np.uint32)
         options = {"start": start, "overwrite": overwrite}
-        with level1b.row_writer(path, exposure, **options) as (write_rows, finish):
+        with level1b.row_writer(path, task.exposure, **options) as (write_rows, finish):
 
             def store(rows, counts, pixel_flags, group_flags):
                 # level 1b holds no flags of groups
@@ -284,7 +295,7 @@ class Detector:
         return path
 
     def collect(
-        self, image, exposure, *, seed=None, previous=None, n_threads=None, progress_bar=False
+        self, image, exposure=None, *, seed=None, previous=None, n_threads=None, progress_bar=False
     ):
         """
         Expose the detector to a scene without following the groups.
@@ -333,9 +344,11 @@ class Detector:
         seed = check_seed(seed)
         task = self._task(image, exposure, seed, previous)
         *planes, pixel_dq = task.collect(n_threads, progress_bar)
-        return Charge(exposure, *planes, pixel_dq, task.effects, self.properties, seed, task.meta)
+        return Charge(
+            task.exposure, *planes, pixel_dq, task.effects, self.properties, seed, task.meta
+        )
 
-    def forecast(self, image, exposure, *, sources=None):
+    def forecast(self, image, exposure=None, *, sources=None):
         """
         Say what an exposure will saturate, without simulating it.
 
@@ -367,7 +380,7 @@ class Detector:
         `~miricigale.utils.exceptions.DetectorWarning`
             If the sky fills more than 60 % of the well by the last group.
         """
-        light, included = checked_light(image, exposure)
+        light, exposure, included = checked_light(image, exposure)
         effects = self._acting(included)
         block = Block(exposure, self.properties, slice(0, light.shape[0]), None, None, None)
         for effect in effects:
@@ -385,7 +398,7 @@ class Detector:
 
     def _task(self, image, exposure, seed, previous):
         """Check what is exposed and gather what all its blocks share."""
-        light, included = checked_light(image, exposure)
+        light, exposure, included = checked_light(image, exposure)
         seed = check_seed(seed)
         effects = self._acting(included)
         previous = checked_previous(previous, exposure)

@@ -16,7 +16,9 @@ _PLACE = 0.1
 
 def checked_light(image, exposure):
     """
-    Surface brightness of an image, or a scene, in MJy/sr, (ny, nx), nowhere negative, and what its PSF includes.
+    Light that is exposed: surface brightness of an image or a scene in MJy/sr, exposure, what the PSF includes.
+
+    The brightness, (ny, nx), is nowhere negative; without an exposure that of the scene is taken.
 
     Raises
     ------
@@ -28,6 +30,7 @@ def checked_light(image, exposure):
         If the exposure has no filter or pointing, or the image another shape, filter or place on the
         sky than the exposure, masked pixels, or values that are not finite or that are negative.
     """
+    exposure = getattr(image, "exposure", None) if exposure is None else exposure
     if not isinstance(exposure, Exposure):
         raise argument_error("exposure", "an Exposure", type(exposure).__name__)
     exposure.check_sky()
@@ -56,7 +59,7 @@ def checked_light(image, exposure):
     # an FFT leaves noise of this size around bright sources
     if lowest < -1e-6 * np.abs(light).max():
         raise argument_error("image", "surface brightness that is nowhere negative", lowest)
-    return np.maximum(light, 0.0), facts.psf_includes
+    return np.maximum(light, 0.0), exposure, facts.psf_includes
 
 
 def _check_place(image, exposure):

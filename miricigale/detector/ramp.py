@@ -1,12 +1,16 @@
 """The ramp: counts of one exposure, group by group, and its file."""
 
+import operator
+from typing import ClassVar
+
 import numpy as np
 from astropy.nddata import NDData
 
 from miricigale.detector import level1b, ramp_reader
 from miricigale.detector.effects.order import checked_effects
-from miricigale.instrument import STEPS, DetectorProperties
+from miricigale.instrument import DQ, STEPS, DetectorProperties
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.interactive import Interactive
 from miricigale.utils.options import check_kind
 from miricigale.utils.units import DN
 
@@ -30,7 +34,7 @@ def _remade(data, exposure, values):
     return Ramp(data, exposure, **values)
 
 
-class Ramp(NDData):
+class Ramp(Interactive, NDData):
     """
     Counts of one exposure: every group of every integration.
 
@@ -69,6 +73,13 @@ class Ramp(NDData):
     ValueError
         If a shape is not that of the exposure, a dtype is another or a step is not known.
     """
+
+    _other_names: ClassVar[dict] = {
+        "filter": "exposure.filter",
+        "dq": "pixel_dq",
+        "n_groups": "exposure.n_groups",
+        "n_integrations": "exposure.n_integrations",
+    }
 
     def __init__(
         self,
@@ -182,6 +193,54 @@ class Ramp(NDData):
         for name in ("group_dq", "reference_output"):
             values[name] = None if values[name] is None else values[name][part]
         return Ramp(self.data[part], self.exposure.replace(n_integrations=1), **values)
+
+    def __getitem__(self, number):
+        number = operator.index(number)
+        if not -len(self.data) <= number < len(self.data):
+            msg = f"integration {number} of {len(self.data)}"
+            raise IndexError(msg)
+        return self.integration(number % len(self.data))
+
+    def plot(self, pixel=None, ax=None, **kwargs):
+        """
+        Draw the counts of a pixel over time.
+
+        Parameters
+        ----------
+        pixel : tuple of int, optional
+            Column and row, (x, y) from 0; the usable pixel that gathers most counts by default.
+        ax : `~matplotlib.axes.Axes`, optional
+            Where; the current axes by default.
+        **kwargs
+            Passed to `matplotlib.axes.Axes.plot`.
+
+        Returns
+        -------
+        ax : `~matplotlib.axes.Axes`
+            A line for each integration; flagged groups (saturated, jumps), where flags are known, are crossed.
+
+        Raises
+        ------
+        ValueError
+            If there is no such pixel.
+        """
+        from miricigale.plotting.measurements import plot_ramp
+
+        ny, nx = self.shape[2:]
+        if pixel is None:
+            gathered = self.data[0, -1].astype(float) - self.data[0, 0]
+            gathered[(self.pixel_dq & int(DQ.DO_NOT_USE)) != 0] = -np.inf
+            pixel = np.unravel_index(np.argmax(gathered), gathered.shape)[::-1]
+        x, y = (operator.index(number) for number in pixel)
+        if not (0 <= x < nx and 0 <= y < ny):
+            raise argument_error("pixel", f"(x, y) below ({nx}, {ny})", pixel)
+        time = (np.arange(self.shape[1]) + 1) * self.group_time
+        flags = None if self.group_dq is None else self.group_dq[:, :, y, x] != 0
+        title = f"pixel ({x}, {y})"
+        return plot_ramp(time, self.data[:, :, y, x], flags, ax=ax, title=title, **kwargs)
+
+    def _facts(self):
+        return self.exposure._facts() | {"data": f"{self.shape} {self.data.dtype}"}
 
     def shows(self, kind):
         """

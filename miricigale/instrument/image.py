@@ -1,8 +1,10 @@
 """Images that astropy can write."""
 
+import numpy as np
 from astropy.io import fits
 from astropy.nddata import CCDData
 
+from miricigale.instrument.dq import dq_planes
 from miricigale.utils.meta import fits_meta
 
 
@@ -11,7 +13,8 @@ class Image(CCDData):
     An `~astropy.nddata.CCDData` whose meta may hold more than a FITS header does.
 
     ``write`` and ``to_hdu`` put numbers and short text on cards, and all of it as JSON on the card ``META``; the
-    data are the primary HDU, with uncertainty and mask as extensions, as astropy has them.
+    data are the primary HDU, with uncertainty and mask as extensions, as astropy has them, and flags as
+    JWST has them (``DQ``).
     """
 
     def plot(self, ax=None, **kwargs):
@@ -37,5 +40,10 @@ class Image(CCDData):
     def to_hdu(self, *args, **kwargs):
         """The HDUs that ``write`` writes; see `astropy.nddata.CCDData.to_hdu`."""
         plain = CCDData(self, copy=False)
+        plain.flags = None
         plain.meta = fits.Header(fits_meta(self.meta))
-        return plain.to_hdu(*args, **kwargs)
+        hdus = plain.to_hdu(*args, **kwargs)
+        if self.flags is not None:
+            planes = dq_planes(np.asarray(self.flags))
+            hdus += [fits.ImageHDU(plane, legend, name=name) for name, plane, legend in planes]
+        return hdus

@@ -10,6 +10,7 @@ from miricigale.plotting.axes import (
     legend,
     new_figure,
     panels,
+    resolve_axes,
 )
 from miricigale.plotting.comparison import plot_offsets
 from miricigale.plotting.images import plot_image
@@ -19,6 +20,7 @@ __all__ = [
     "encircled_energy_figure",
     "features_figure",
     "offsets_figure",
+    "plot_ramp",
 ]
 
 
@@ -184,3 +186,36 @@ def features_figure(values, ranges, *, limit=0.6):
             legend(ax, loc="upper right", ncols=2)
     label_outer(axes, "redshift", "measured - model (mag)")
     return figure
+
+
+def plot_ramp(time, counts, flagged=None, *, ax=None, title=None, **kwargs):
+    """
+    Draw the counts of a pixel over time.
+
+    Parameters
+    ----------
+    time : `~numpy.ndarray`, shape (n_group,)
+        Seconds since the reset.
+    counts : `~numpy.ndarray`, shape (n_int, n_group)
+        Counts in DN; a line for each integration.
+    flagged : `~numpy.ndarray` of bool, shape (n_int, n_group), optional
+        Groups that are crossed.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where; the current axes by default.
+    title : str, optional
+        Over the picture.
+    **kwargs
+        Passed to `matplotlib.axes.Axes.plot`.
+
+    Returns
+    -------
+    ax : `~matplotlib.axes.Axes`
+    """
+    ax = resolve_axes(ax)
+    ax.plot(time, counts.T, **{"marker": ".", "ms": 4, "lw": 0.8} | kwargs)
+    if flagged is not None and np.any(flagged):
+        at = np.broadcast_to(time, counts.shape)
+        ax.plot(at[flagged], counts[flagged], "x", color=MEASURED, label="flagged")
+        ax.legend(frameon=False)
+    ax.set(xlabel="time since the reset [s]", ylabel="counts [DN]", title=title)
+    return ax

@@ -1,10 +1,10 @@
 """The images of one filter put together: aligned, on one level, without outliers, drizzled."""
 
-from miricigale.instrument import ImageFacts, mosaic_wcs
+from miricigale.instrument import ImageFacts
 from miricigale.reduction.align import align_images
 from miricigale.reduction.background import BackgroundFlags, estimate_background, remove_background
 from miricigale.reduction.dither_background import dither_backgrounds, restored
-from miricigale.reduction.images import check_images, check_overlap, seen_wcs
+from miricigale.reduction.images import check_images, check_overlap, own_grid
 from miricigale.reduction.mosaic import drizzle_images, pixel_map, reject_outliers, weight_map
 from miricigale.reduction.results import ReductionResult
 from miricigale.reduction.sky_match import match_levels
@@ -75,7 +75,7 @@ def combine(reducer, images, backgrounds, rates, wcs, pixel_scale, align):
             raise argument_error("align", "a SkyCoord, 'dithers' or None", repr(align))
         images, _ = align_images(images, None if isinstance(align, str) else align)
     if wcs is None:
-        wcs = mosaic_wcs([seen_wcs(im) for im in images], pixel_scale)
+        wcs = own_grid(images, pixel_scale)
     notes = []
     if reducer.mosaics.outlier_threshold is not None and len(images) < 3:
         number = "a single dither" if len(images) == 1 else "two dithers"

@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from miricigale.instrument import DQ, mosaic_wcs
+from miricigale.instrument import DQ
 from miricigale.reduction.background import estimate_background, warn_of
-from miricigale.reduction.images import check_images, plain_mask, seen_wcs, with_data
+from miricigale.reduction.images import check_images, own_grid, plain_mask, with_data
 from miricigale.reduction.mosaic import drizzle_images, pixel_map
 from miricigale.reduction.sky_mesh import sky_boxes, spread_over
 from miricigale.utils.exceptions import argument_error
@@ -84,7 +84,7 @@ def dither_backgrounds(images, backgrounds=None, *, wcs=None, box=16):
         raise argument_error("backgrounds", f"one for each of {len(images)} images", len(alone))
     masks = [plain_mask(im) for im in images]
     if wcs is None:
-        wcs = mosaic_wcs([seen_wcs(im) for im in images], 0.11 * ANGLE)
+        wcs = own_grid(images, 0.11 * ANGLE)
     sources = _deep_masks(images, alone, wcs)
     levels = [float(np.median(b.level[~m])) for b, m in zip(alone, masks, strict=True)]
     templates = _other_medians(images, masks, sources, levels)

@@ -95,7 +95,8 @@ def read_images(path):
     Parameters
     ----------
     path : path-like
-        A ``_rate``, ``_rateints``, ``_cal``, ``_calints``, ``_crf`` or ``_i2d`` file of the MIRI imager.
+        A ``_rate``, ``_rateints``, ``_cal``, ``_calints``, ``_crf`` or ``_i2d`` file of the MIRI imager, or what
+        `~miricigale.instrument.Image` wrote.
 
     Returns
     -------
@@ -118,6 +119,11 @@ def read_images(path):
     """
     path = Path(path)
     with open_fits(path, wanted=_WANTED) as hdus:
+        if "META" in hdus[0].header and len(hdus[0].shape) == 2:
+            # as astropy names the planes of a CCDData
+            hdus[0].name = "SCI"
+            if "UNCERT" in hdus:
+                hdus["UNCERT"].name = "ERR"
         if "SCI" not in hdus or hdus["SCI"].header.get("NAXIS") not in (2, 3):
             msg = f"{path} cannot be read as {_WANTED}: it has no image in SCI"
             raise DataError(msg)
@@ -135,6 +141,8 @@ def read_images(path):
         error = _plane(hdus, "ERR", shape, path)
         planes = {name: _plane(hdus, name, shape, path) for name in PLANES if name in hdus}
         flags = _flags(hdus, shape, path)
+        if "MASK" in hdus:
+            flags |= np.where(_plane(hdus, "MASK", shape, path) != 0, int(DQ.DO_NOT_USE), 0)
     if error is None and (parts := [planes[name] for name in _VARIANCES if name in planes]):
         error = np.sqrt(np.sum([np.nan_to_num(part) for part in parts], axis=0))
     out = []

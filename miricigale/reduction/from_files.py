@@ -212,10 +212,8 @@ def _mosaic(reducer, members, path, scale, settings, resume):
             background=dataclasses.replace(reducer.background, method="masked")
         )
     result = reducer.combine(images, backgrounds, pixel_scale=scale * ANGLE)
-    mosaic = result.mosaic
-    mosaic.meta["notes"] = list(result.notes)
-    level = result.mosaic_background.level
-    _write(mosaic, path, key, WHT=result.weight, CON=result.n_images, BKG=level)
+    result.mosaic.meta["key"] = key
+    result.write(path, overwrite=True)
     return "reduced", list(result.notes)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 from astropy.nddata import CCDData, StdDevUncertainty
 from astropy.wcs import WCS
 
-from miricigale.instrument import DQ, ImageFacts
+from miricigale.instrument import DQ, ImageFacts, mosaic_wcs
 from miricigale.instrument.image import Image
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import SURFACE_BRIGHTNESS
@@ -98,7 +98,7 @@ def exposure_values(exposure):
 
 def seen_wcs(im):
     """WCS of the part of an image that holds its unmasked pixels, with its shape."""
-    good = ~np.asarray(im.mask)
+    good = ~plain_mask(im)
     rows, columns = (np.flatnonzero(good.any(axis=axis)) for axis in (1, 0))
     if rows.size == 0:
         rows, columns = (np.arange(n) for n in im.shape)
@@ -108,12 +108,23 @@ def seen_wcs(im):
     return wcs
 
 
+def own_grid(images, pixel_scale):
+    """The smallest north-up grid that holds every unmasked pixel of images that can be put together."""
+    check_alike(images)
+    return mosaic_wcs([seen_wcs(im) for im in images], pixel_scale)
+
+
 def check_images(images, wcs):
     """Refuse images that cannot be put together, and what is no grid for them."""
     if not isinstance(wcs, WCS):
         raise argument_error("wcs", "an astropy WCS", type(wcs).__name__)
     if wcs.pixel_shape is None:
         raise argument_error("wcs", "a WCS with a pixel_shape", "one without")
+    check_alike(images)
+
+
+def check_alike(images):
+    """Refuse images that cannot be put together."""
     if not images:
         raise argument_error("images", "at least one image", "none")
     for im in images:

@@ -1,6 +1,7 @@
 """The `Reducer`: ramps in, calibrated images and mosaics out."""
 
 import dataclasses
+import glob
 import os
 from dataclasses import field
 
@@ -13,6 +14,7 @@ from miricigale.reduction.background import subtract_background
 from miricigale.reduction.calibration import calibrate
 from miricigale.reduction.combine import combine, drizzle, subtract_dithers
 from miricigale.reduction.files import open_exposure
+from miricigale.reduction.images import own_grid
 from miricigale.reduction.reference_cache import ReferenceCache
 from miricigale.reduction.references import ReferenceFiles
 from miricigale.reduction.results import rate_image
@@ -23,7 +25,8 @@ from miricigale.reduction.settings import (
     RampSettings,
 )
 from miricigale.reduction.slopes import fit_slopes
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.interactive import Interactive
 from miricigale.utils.options import check_choice, check_kind, check_least, check_positive
 from miricigale.utils.parallel import thread_count
 from miricigale.utils.progress import progress
@@ -36,8 +39,27 @@ _KINDS = {
 }  # fmt: skip
 
 
+def _opened(given):
+    """An exposure of its file; anything else itself."""
+    return open_exposure(given) if isinstance(given, (str, os.PathLike)) else given
+
+
+def _several(given):
+    """Exposures of one, of a pattern of files, or of several."""
+    if isinstance(given, str) and glob.has_magic(given) and not os.path.exists(given):
+        paths = sorted(glob.glob(os.path.expanduser(given)))
+        if not paths:
+            msg = f"no file is called {given}"
+            raise DataError(msg)
+        return paths
+    if isinstance(given, (str, os.PathLike)) and os.path.isdir(given):
+        wanted = f"files, such as {os.path.join(given, '*_uncal.fits')!r}"
+        raise argument_error("ramps", wanted, "a folder")
+    return [given] if isinstance(given, (str, os.PathLike, Ramp, Charge, CCDData)) else given
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Reducer:
+class Reducer(Interactive):
     """
     Settings of the reduction; every method leaves them as they are.
 
@@ -62,8 +84,8 @@ class Reducer:
         Whether residual cosmic rays are searched on the slope image (`find_cosmic_rays`). Off: ramps of 30
         groups keep at most one hit in a full frame, and what the search flags lies in the wings of stars
         (``benchmarks/cosmic_rays.py``). Of use in ramps of a few groups.
-    background : `BackgroundSettings`, optional
-        How backgrounds are estimated.
+    background : `BackgroundSettings` or str, optional
+        How backgrounds are estimated, or the method alone (``"dithers"``).
     mosaics : `MosaicSettings`, optional
         How images are combined.
     references : ReferenceFiles, ReferenceCache, "none" or "simulated", optional
@@ -105,6 +127,8 @@ class Reducer:
 
     def __post_init__(self):
         check_choice(self.backend, "backend", BACKENDS)
+        if isinstance(self.background, str):
+            object.__setattr__(self, "background", BackgroundSettings(self.background))
         check_positive(self.jump_threshold, "jump_threshold", optional=True)
         for name in ("skip_first", "skip_last"):
             if getattr(self, name) is not None:
@@ -120,6 +144,9 @@ class Reducer:
             raise argument_error("references", wanted, repr(self.references))
 
     replace = dataclasses.replace
+
+    def _facts(self):
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
     @property
     def detector(self):
@@ -142,6 +169,7 @@ class Reducer:
         ValueError
             If it is no ramp, or fewer than two groups are left.
         """
+        ramp = _opened(ramp)
         return fit_slopes(self, ramp, maps_of(self, ramp), progress_bar)
 
     def fit_ramp(self, ramp, *, planes=False, progress_bar=False):
@@ -150,8 +178,8 @@ class Reducer:
 
         Parameters
         ----------
-        ramp : `~miricigale.detector.Ramp` or `~miricigale.detector.Charge`
-            Counts in DN; or what was collected, whose slopes are drawn.
+        ramp : `~miricigale.detector.Ramp`, `~miricigale.detector.Charge` or path-like
+            Counts in DN, or their file; or what was collected, whose slopes are drawn.
         planes : bool, optional
             Whether the two parts of the variance are given too.
         progress_bar : bool, optional
@@ -167,6 +195,7 @@ class Reducer:
             ``planes`` it is the ``image`` of an `ImageFile`, whose ``planes`` are ``VAR_POISSON``
             and ``VAR_RNOISE``, (DN/s)^2: what `write_image` writes as a ``_rate``.
         """
+        ramp = _opened(ramp)
         maps = maps_of(self, ramp)
         rate = rate_image(self, ramp, maps, fit_slopes(self, ramp, maps, progress_bar))
         return rate if planes else rate.image
@@ -177,8 +206,8 @@ class Reducer:
 
         Parameters
         ----------
-        ramp : `~miricigale.detector.Ramp`
-            Counts in DN.
+        ramp : `~miricigale.detector.Ramp` or path-like
+            Counts in DN, or their file.
         planes, progress_bar : bool, optional
             As for `fit_ramp`.
 
@@ -188,6 +217,7 @@ class Reducer:
             As `fit_ramp` returns them, one for each integration; the references are those of
             the exposure. `write_image` makes a ``_rateints`` of the list.
         """
+        ramp = _opened(ramp)
         if not isinstance(ramp, Ramp):
             raise argument_error("ramp", "a Ramp", type(ramp).__name__)
         maps = maps_of(self, ramp)
@@ -207,14 +237,15 @@ class Reducer:
 
         Parameters
         ----------
-        rate : `~astropy.nddata.CCDData`
-            DN/s, from `fit_ramp` (its meta dictionary names filter and sub-array).
+        rate : `~astropy.nddata.CCDData` or path-like
+            DN/s, from `fit_ramp` (its meta dictionary names filter and sub-array), or its file.
 
         Returns
         -------
         cal : `~astropy.nddata.CCDData`
             MJy/sr.
         """
+        rate = _opened(rate)
         facts = ImageFacts.of(rate)
         for key in ("filter", "subarray"):
             if getattr(facts, key) is None:
@@ -236,15 +267,17 @@ class Reducer:
 
         Parameters
         ----------
-        image : `~astropy.nddata.CCDData`
-            A calibrated image or a mosaic.
+        image : `~astropy.nddata.CCDData` or path-like
+            A calibrated image or a mosaic, or its file.
 
         Returns
         -------
         image : `~astropy.nddata.CCDData`
         background : `Background`
         """
-        return subtract_background(image, **self.background.negative, **self.background.mesh)
+        return subtract_background(
+            _opened(image), **self.background.negative, **self.background.mesh
+        )
 
     def subtract_dithers(self, images, *, wcs=None):
         """
@@ -264,7 +297,7 @@ class Reducer:
         """
         return subtract_dithers(self, list(images), wcs=wcs)
 
-    def mosaic(self, images, wcs):
+    def mosaic(self, images, wcs=None):
         """
         Drizzle images onto one grid.
 
@@ -273,8 +306,8 @@ class Reducer:
         images : iterable of `~astropy.nddata.CCDData`
             Calibrated, background-subtracted images. Outliers are masked first, if there
             are three or more images and that was not done before.
-        wcs : `~astropy.wcs.WCS`
-            Of the output, with ``pixel_shape``.
+        wcs : `~astropy.wcs.WCS`, optional
+            Of the output, with ``pixel_shape``; by default as of `run`.
 
         Returns
         -------
@@ -290,6 +323,8 @@ class Reducer:
             If the images are not surface brightness of one filter, or the grid has no shape
             or lies elsewhere on the sky.
         """
+        images = [_opened(image) for image in _several(images)]
+        wcs = own_grid(images, 0.11 * ANGLE) if wcs is None else wcs
         return self.drizzle(images, wcs)[0].image
 
     def drizzle(self, images, wcs):
@@ -323,8 +358,7 @@ class Reducer:
             MJy/sr, background subtracted.
         background : `Background`
         """
-        if isinstance(exposure, (str, os.PathLike)):
-            exposure = open_exposure(exposure)
+        exposure = _opened(exposure)
         if isinstance(exposure, (Ramp, Charge)):
             exposure = self.fit_ramp(exposure)
         if not isinstance(exposure, CCDData):
@@ -343,10 +377,10 @@ class Reducer:
 
         Parameters
         ----------
-        ramps : iterable of Ramp, Charge, `~astropy.nddata.CCDData` or path-like
-            Exposures at any stage, as `reduce` takes them. One at a time is held if this is
-            a generator, or paths. For files of several filters see
-            `miricigale.reduction.reduce_files`.
+        ramps : str, Ramp or iterable of Ramp, Charge, `~astropy.nddata.CCDData` or path-like
+            Exposures at any stage, as `reduce` takes them; one of them, or a pattern of files
+            (``"*_uncal.fits"``), too. One at a time is held if this is a generator, or paths. For files of
+            several filters see `miricigale.reduction.reduce_files`.
         wcs : `~astropy.wcs.WCS`, optional
             Of the mosaic; by default the smallest north-up grid that holds
             every unmasked pixel of the dithers.
@@ -371,7 +405,7 @@ class Reducer:
         """
         to_array(pixel_scale, ANGLE, "pixel_scale", ndim=0, finite=True)
         rates, images, backgrounds, name = [], [], [], None
-        for ramp in progress(ramps, show=progress_bar, desc="reduce"):
+        for ramp in progress(_several(ramps), show=progress_bar, desc="reduce"):
             rate, subtracted, background = self.reduce(ramp)
             del ramp
             band = ImageFacts.of(subtracted).filter

@@ -1,6 +1,7 @@
 """What a reduction returns."""
 
 import dataclasses
+from typing import ClassVar
 
 import numpy as np
 from astropy.io.fits import Header
@@ -9,15 +10,16 @@ from astropy.nddata import CCDData
 from miricigale.instrument import ImageFacts
 from miricigale.reduction.assumed import history_of
 from miricigale.reduction.background import Background
-from miricigale.reduction.files import ImageFile
+from miricigale.reduction.files import ImageFile, write_image
 from miricigale.reduction.images import exposure_values, image
 from miricigale.reduction.slopes import shares_charge
+from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import provenance
 from miricigale.utils.units import RATE
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
-class ReductionResult:
+class ReductionResult(Interactive):
     """
     What the reduction of one filter's dithers gave.
 
@@ -50,6 +52,14 @@ class ReductionResult:
     mosaic_background: Background
     notes: tuple = ()
 
+    _other_names: ClassVar[dict] = {
+        "image": "mosaic",
+        **{
+            name: f"mosaic.{name}"
+            for name in ("data", "uncertainty", "mask", "wcs", "unit", "meta")
+        },
+    }
+
     @property
     def filter(self):
         """Name of the filter."""
@@ -58,6 +68,44 @@ class ReductionResult:
     def __repr__(self):
         ny, nx = self.mosaic.shape
         return f"<ReductionResult {self.filter}: {len(self.images)} dithers, mosaic {ny} x {nx}>"
+
+    def _facts(self):
+        levels = [f"{background.level.mean():.4g}" for background in self.backgrounds]
+        return {
+            "filter": self.filter,
+            "dithers": len(self.images),
+            "mosaic": f"{self.mosaic.shape} pixels, {self.mosaic.unit}",
+            "backgrounds": f"{', '.join(levels)} MJy/sr",
+            "notes": "; ".join(self.notes) or "none",
+        }
+
+    def plot(self, ax=None, **kwargs):
+        """Draw the mosaic, as `~miricigale.instrument.Image.plot`."""
+        return self.mosaic.plot(ax=ax, **kwargs)
+
+    def write(self, path, *, overwrite=False):
+        """
+        Write the mosaic with its planes ERR, DQ, WHT, CON (number of exposures) and BKG.
+
+        Parameters
+        ----------
+        path : path-like
+            A FITS file.
+        overwrite : bool, optional
+            Whether a file of that name is replaced.
+
+        Returns
+        -------
+        path : `pathlib.Path`
+
+        Raises
+        ------
+        OSError
+            If the file exists and ``overwrite`` is False.
+        """
+        self.mosaic.meta["notes"] = list(self.notes)
+        planes = {"WHT": self.weight, "CON": self.n_images, "BKG": self.mosaic_background.level}
+        return write_image(self.mosaic, path, planes=planes, overwrite=overwrite)
 
 
 def rate_image(reducer, ramp, maps, fit):

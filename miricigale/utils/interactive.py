@@ -2,6 +2,7 @@
 
 import difflib
 import html
+import operator
 from typing import ClassVar
 
 
@@ -13,7 +14,7 @@ class Interactive:
     sentence that lists the nearest ones. In notebooks an object is shown as a table of what it holds.
     """
 
-    #: Names that are usual elsewhere, and the attribute of ours.
+    #: Names that are usual elsewhere, and the attribute of ours, or of one of its parts (``"part.name"``).
     _other_names: ClassVar[dict] = {}
 
     def __getattr__(self, name):
@@ -21,7 +22,7 @@ class Interactive:
         if name.startswith("_"):
             raise AttributeError(name)
         if name in self._other_names:
-            return getattr(self, self._other_names[name])
+            return operator.attrgetter(self._other_names[name])(self)
         known = [one for one in dir(self) if not one.startswith("_")]
         near = difflib.get_close_matches(name, [*known, *self._other_names], n=3, cutoff=0.5)
         msg = f"{type(self).__name__} has no {name!r}; it has {', '.join(near or known)}"
@@ -30,6 +31,10 @@ class Interactive:
     def _facts(self):
         """What a notebook shows: dict of label to value."""
         return {type(self).__name__: repr(self)}
+
+    def summary(self):
+        """Return what a notebook shows, as lines of text."""
+        return "\n".join(f"{label}: {value}" for label, value in self._facts().items())
 
     def _repr_html_(self):
         rows = "".join(

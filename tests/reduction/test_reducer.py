@@ -232,7 +232,7 @@ def test_groups_can_be_left_out():
         (Reducer, {"skip_first": -1}, "'skip_first' must be at least 0, an integer, got -1"),
         (Reducer, {"n_threads": 0}, "'n_threads' must be at least 1 and an integer"),
         (Reducer, {"properties": 3}, "'properties' must be a DetectorProperties"),
-        (Reducer, {"background": "sep"}, "'background' must be a BackgroundSettings, got 'sep'"),
+        (Reducer, {"background": 3}, "'background' must be a BackgroundSettings, got 3"),
     ],
 )
 def test_bad_settings_are_named(kind, options, match):
@@ -256,7 +256,8 @@ def test_what_is_no_ramp_or_grid_is_named():
     image = CCDData(np.zeros((8, 8)), unit="MJy/sr", uncertainty=StdDevUncertainty(np.ones((8, 8))))
     with pytest.raises(ValueError, match="'ramp' must be a Ramp or a Charge, got ndarray"):
         Reducer().fit_ramp(np.zeros((1, 5, 8, 8)))
-    refuses("'wcs' must be an astropy WCS, got NoneType", Reducer().mosaic, [image], None)
+    refuses("'wcs' must be an astropy WCS, got tuple", Reducer().mosaic, [image], (8, 8))
+    refuses("'images' must be CCDData with uncertainty and WCS", Reducer().mosaic, [image])
     rate = Reducer().fit_ramp(expose(SKY, exposure()))
     grid = mosaic_wcs([exposure()], 0.11 * u.arcsec)
     refuses("'images' must be surface brightness", Reducer().mosaic, [rate], grid)

@@ -1,0 +1,114 @@
+"""What a `Reducer` takes and gives, in the forms that users have."""
+
+import astropy.units as u
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.nddata import CCDData
+
+from helpers.errors import refuses
+from miricigale.detector import Detector, Ramp
+from miricigale.instrument import DQ, Exposure
+from miricigale.reduction import Reducer, open_exposure, read_images
+from miricigale.scene import Scene
+from miricigale.utils.exceptions import DataError
+
+CATALOG = {"ra": [150.1], "dec": [2.2], "F770W": [50.0] * u.uJy, "profile": "point"}
+
+
+@pytest.fixture(scope="module")
+def ramps():
+    exposure = Exposure("F770W", n_groups=12, pointing="150.1 2.2", subarray="SUB128")
+    detector = Detector()
+    scenes = [Scene(CATALOG, one, background="low") for one in exposure.dithered(3)]
+    return [detector.expose(scene, seed=1) for scene in scenes]
+
+
+@pytest.fixture(scope="module")
+def folder(ramps, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("ramps")
+    for number, ramp in enumerate(ramps):
+        ramp.write(folder / f"d{number}_uncal.fits")
+    return folder
+
+
+def equal(first, second):
+    return np.array_equal(first.data, second.data, equal_nan=True)
+
+
+def test_files_patterns_and_ramps_are_one(ramps, folder):
+    expected = Reducer().run(ramps)
+    assert equal(Reducer().run(f"{folder}/d?_uncal.fits").mosaic, expected.mosaic)
+    single = Reducer().run(ramps[0]).mosaic
+    for given in (str(folder / "d0_uncal.fits"), folder / "d0_uncal.fits", [ramps[0]]):
+        assert equal(Reducer().run(given).mosaic, single)
+
+
+def test_what_is_no_file_is_said(folder):
+    with pytest.raises(DataError, match=r"no file is called .*e\*"):
+        Reducer().run(f"{folder}/e*_uncal.fits")
+    refuses("'ramps' must be files, such as .* got a folder", Reducer().run, folder)
+
+
+def test_images_of_ccddata_come_back(ramps, folder, tmp_path):
+    path = tmp_path / "rate.fits"
+    rate = Reducer().fit_ramp(folder / "d0_uncal.fits")
+    rate.write(path)
+    back = open_exposure(path)
+    assert equal(back, rate)
+    assert np.array_equal(back.uncertainty.array, rate.uncertainty.array, equal_nan=True)
+    np.testing.assert_array_equal(back.flags, rate.flags)
+    np.testing.assert_array_equal(back.mask, rate.mask)
+    assert (back.unit, back.meta) == (rate.unit, rate.meta)
+    calibrated = Reducer().calibrate(path)
+    assert equal(calibrated, Reducer().calibrate(rate))
+    # and astropy reads it as it reads its own
+    np.testing.assert_array_equal(CCDData.read(path).mask, rate.mask)
+    assert equal(Reducer().mosaic(calibrated), Reducer().mosaic([calibrated]))
+
+
+def test_a_result_is_written_and_drawn(ramps, tmp_path):
+    result = Reducer().run(ramps)
+    path = result.write(tmp_path / "mosaic.fits")
+    with fits.open(path) as hdus:
+        assert {"SCI", "ERR", "DQ", "WHT", "CON", "BKG"} <= {hdu.name for hdu in hdus}
+    assert equal(read_images(path)[0].image, result.mosaic)
+    refuses("exists", result.write, path, error=OSError)
+    assert result.image is result.mosaic
+    assert "dithers: 3" in result.summary()
+    ax = result.plot()
+    assert "[MJy" in ax.images[0].colorbar.ax.get_ylabel()
+
+
+def test_a_method_stands_for_its_settings():
+    assert Reducer(background="dithers").background.method == "dithers"
+    refuses("'method' must be 'masked' or 'sep' or 'dithers'", Reducer, background="mesh")
+
+
+def test_a_detector_of_defaults():
+    assert [type(effect) for effect in Detector().effects] == [
+        type(effect) for effect in Detector.miri_imager().effects
+    ]
+    assert Detector().gain == Detector().properties.gain
+    with pytest.raises(AttributeError, match="Detector has no 'expse'; it has expose"):
+        Detector().expse  # noqa: B018
+    refuses("'exposure' must be an Exposure", Detector().expose, np.zeros((3, 3)) * u.MJy / u.sr)
+
+
+def test_integrations_and_pixels_of_a_ramp(ramps):
+    ramp = ramps[0]
+    assert isinstance(ramp[-1], Ramp)
+    np.testing.assert_array_equal(ramp[0].data, ramp.data[:1])
+    with pytest.raises(IndexError, match="integration 1 of 1"):
+        ramp[1]
+    assert ramp.filter == "miri.f770w"
+    ax = ramp.plot((40, 50))
+    np.testing.assert_array_equal(ax.lines[0].get_ydata(), ramp.data[0, :, 50, 40])
+    np.testing.assert_allclose(ax.lines[0].get_xdata()[-1], ramp.exposure.integration_time.value)
+    refuses(r"'pixel' must be \(x, y\) below", ramp.plot, (500, 0))
+    # without a pixel the usable one with most counts
+    counts = ramp.plot(ax=plt.figure().subplots()).lines[0].get_ydata().astype(float)
+    gathered = ramp.data[0, -1].astype(float) - ramp.data[0, 0]
+    usable = (ramp.pixel_dq & int(DQ.DO_NOT_USE)) == 0
+    assert counts[-1] - counts[0] == gathered[usable].max()
