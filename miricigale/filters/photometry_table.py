@@ -121,7 +121,9 @@ def _is_ab(table, name):
         return False
     unit = getattr(table[name], "unit", None)
     if unit is None:
-        return re.match(r"(?:mag|m)_|.*_mag$|(?:ab)?mag(?:nitude)?$", name, re.IGNORECASE) is not None
+        return (
+            re.match(r"(?:mag|m)_|.*_mag$|(?:ab)?mag(?:nitude)?$", name, re.IGNORECASE) is not None
+        )
     return unit == u.ABmag
 
 

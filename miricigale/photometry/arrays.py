@@ -13,7 +13,7 @@ from miricigale.instrument import ImageFacts, north_up_wcs, pixel_area_map
 from miricigale.photometry.sky_noise import mask_filled
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.parallel import chunks
-from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
+from miricigale.utils.units import FNU, SURFACE_BRIGHTNESS, to_array
 
 #: uJy per MJy.
 _MICRO = 1e12
@@ -76,8 +76,8 @@ def image_arrays(image, name):
     Parameters
     ----------
     image : `~astropy.nddata.CCDData`
-        Two-dimensional, in units of surface brightness, with a celestial WCS. Without an
-        uncertainty the noise is 1.4826 times the median absolute deviation of the image.
+        Two-dimensional, in units of surface brightness or of the flux in a pixel, with a celestial WCS.
+        Without an uncertainty the noise is 1.4826 times the median absolute deviation of the image.
     name : str
         The argument's name, for messages.
 
@@ -92,7 +92,7 @@ def image_arrays(image, name):
     ValueError
         If it is not two-dimensional or has no celestial WCS or no usable pixel.
     `~astropy.units.UnitsError`
-        If the unit is not one of surface brightness.
+        If the unit is neither of surface brightness nor of flux density.
 
     Warns
     -----
@@ -101,9 +101,10 @@ def image_arrays(image, name):
     """
     data, noise, usable = _checked(image, name)
     area = pixel_area_map(image.wcs, usable.shape) * _MICRO
+    each = 1.0 if _per_pixel(image) else area
     return ImageArrays(
-        flux=np.where(usable, np.asarray(data[0], float) * data[1], 0.0) * area,
-        sigma=np.where(usable, np.asarray(noise[0], float) * noise[1] * area, np.inf),
+        flux=np.where(usable, np.asarray(data[0], float) * data[1], 0.0) * each,
+        sigma=np.where(usable, np.asarray(noise[0], float) * noise[1] * each, np.inf),
         usable=usable,
         area=area,
         wcs=image.wcs,
@@ -125,7 +126,8 @@ def fit_arrays(image, name, scratch=None):
         for out, (values, factor) in ((flux, data), (inverse, noise)):
             out[part] = values[part]
             out[part] *= np.float32(factor)
-            out[part] *= area[part]
+            if not _per_pixel(image):
+                out[part] *= area[part]
         with np.errstate(divide="ignore", invalid="ignore"):
             np.divide(np.float32(1), inverse[part], out=inverse[part])
         flux[part][~usable[part]] = inverse[part][~usable[part]] = 0
@@ -141,8 +143,13 @@ def fit_arrays(image, name, scratch=None):
     )
 
 
+def _per_pixel(image):
+    """Whether an image has a flux in each pixel, and no surface brightness."""
+    return image.unit.is_equivalent(FNU)
+
+
 def _checked(image, name):
-    """Data and noise, each with its factor to MJy/sr, and which pixels are usable."""
+    """Data and noise, each with its factor to MJy/sr or to uJy in a pixel, and which pixels are usable."""
     if not isinstance(image, CCDData):
         msg = f"'{name}' must be a CCDData, got {type(image).__name__}"
         raise TypeError(msg)
@@ -151,7 +158,8 @@ def _checked(image, name):
         raise argument_error(name, "a two-dimensional image", f"shape {data.shape}")
     if image.wcs is None or not image.wcs.has_celestial:
         raise argument_error(name, "an image with a celestial WCS", "one without")
-    factor = float(to_array(1 * image.unit, SURFACE_BRIGHTNESS, name))
+    unit = FNU if _per_pixel(image) else SURFACE_BRIGHTNESS
+    factor = float(to_array(1 * image.unit, unit, name))
     usable = np.isfinite(data)
     if image.mask is not None:
         usable &= ~np.asarray(image.mask, bool)
@@ -160,7 +168,7 @@ def _checked(image, name):
         noise = np.broadcast_to(np.float64(spread), data.shape), factor
     else:
         given = image.uncertainty.represent_as(StdDevUncertainty)
-        scale = factor if given.unit is None else (1 * given.unit).to_value(SURFACE_BRIGHTNESS)
+        scale = factor if given.unit is None else (1 * given.unit).to_value(unit)
         noise = np.asarray(given.array), float(scale)
     usable &= np.isfinite(noise[0]) & (noise[0] > 0)
     mask_filled(data, usable, f"'{name}'")

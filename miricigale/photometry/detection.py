@@ -11,6 +11,7 @@ from astropy.utils.decorators import deprecated_renamed_argument
 from photutils.segmentation import SegmentationImage, make_2dgaussian_kernel
 
 from miricigale.photometry.arrays import image_arrays, pixel_scale
+from miricigale.photometry.mosaics import as_mosaic
 from miricigale.photometry.segments import dilate_segments, dilation_rule
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.meta import provenance
@@ -107,8 +108,8 @@ def detect_sources(
 
     Parameters
     ----------
-    image : `~astropy.nddata.CCDData`
-        In units of surface brightness, with WCS. Without an uncertainty the noise is
+    image : `~astropy.nddata.CCDData`, path-like or other (see `as_mosaic`)
+        In units of surface brightness or of the flux in a pixel, with WCS. Without an uncertainty the noise is
         measured on the image.
     preset : str, optional
         Name in `DETECTION_PRESETS`, for the settings that are not given.
@@ -268,7 +269,7 @@ def _prepared(
     )
     if not settings.threshold > 0:
         raise argument_error("threshold", "positive", settings.threshold)
-    arrays = image_arrays(image, "image")
+    arrays = image_arrays(as_mosaic(image, "image"), "image")
     ratio = 1.0
     if stated_on is not None:
         ratio = positive(stated_on, ANGLE, "stated_on") / pixel_scale(arrays.wcs)

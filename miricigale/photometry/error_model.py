@@ -7,6 +7,9 @@ from typing import ClassVar
 import astropy.units as u
 import numpy as np
 
+from miricigale.filters.band_names import find_filter
+from miricigale.instrument import Exposure
+from miricigale.instrument.figures import imager_filter
 from miricigale.photometry.error_curves import (
     STATISTICS,
     Analytic,
@@ -20,6 +23,7 @@ from miricigale.photometry.error_curves import (
 )
 from miricigale.photometry.surveys import YANG2021_DEPTHS, fractional_error
 from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import provenance
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import error_column, require_columns
@@ -27,8 +31,13 @@ from miricigale.utils.unified import read_write
 from miricigale.utils.units import FNU, ab_quantity, to_array
 
 
+def _band(name):
+    """Our name of a band, or its own where it is none of ours."""
+    return find_filter(str(name)) or str(name)
+
+
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
-class ErrorModel:
+class ErrorModel(Interactive):
     """
     The 1-sigma error of a flux, band by band; make it with one of the class methods.
 
@@ -55,7 +64,8 @@ class ErrorModel:
     meta: dict = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
-        object.__setattr__(self, "curves", types.MappingProxyType(dict(self.curves)))
+        curves = {_band(name): curve for name, curve in self.curves.items()}
+        object.__setattr__(self, "curves", types.MappingProxyType(curves))
         object.__setattr__(self, "meta", dict(self.meta))
 
     def __repr__(self):
@@ -77,7 +87,7 @@ class ErrorModel:
 
     def _curve(self, name):
         try:
-            return self.curves[name]
+            return self.curves[_band(getattr(name, "name", name))]
         except KeyError:
             raise unknown_name("band of this error model", name, self.curves) from None
 
@@ -184,15 +194,15 @@ class ErrorModel:
         return cls.from_depths(YANG2021_DEPTHS, fractional=fractional)
 
     @classmethod
-    def from_exposure(cls, filter, time, *, fractional=0.0, **options):
+    def from_exposure(cls, filter, time=None, *, fractional=0.0, **options):
         """
         Compute the noise of sources fitted on the mosaic of an exposure.
 
         Parameters
         ----------
-        filter : str
-            One of the imaging filters.
-        time : `~astropy.units.Quantity`
+        filter : str or `~miricigale.instrument.Exposure`
+            Any name of one of the imaging filters; or an exposure, which has the time, integrations and frames.
+        time : `~astropy.units.Quantity`, optional
             Total exposure time.
         fractional : float, optional
             Part of the flux that is added in quadrature.
@@ -219,6 +229,14 @@ class ErrorModel:
         # loads photutils, which a command that reads depths does without
         from miricigale.depth import fitted_noise
 
+        if isinstance(filter, Exposure):
+            known = {"n_integrations": filter.n_integrations, "frame_time": filter.frame_time}
+            options = known | options
+            time = filter.exposure_time if time is None else time
+            filter = filter.filter
+        if time is None:
+            raise argument_error("time", "given, or an Exposure", "None")
+        filter = imager_filter(filter)
         sky, photon = fitted_noise(filter, time, **options)
         curve = Analytic(sky, float(fractional), photon)
         return cls({str(filter): curve}, provenance(source="exposure"))

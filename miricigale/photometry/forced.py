@@ -2,10 +2,13 @@
 
 import dataclasses
 import numbers
+import os
 import warnings
 
 import astropy.units as u
 import numpy as np
+from astropy.coordinates import SkyCoord
+from astropy.table import Table
 
 from miricigale.photometry._core.stamps import add_model
 from miricigale.photometry.arrays import (
@@ -15,20 +18,23 @@ from miricigale.photometry.arrays import (
 )
 from miricigale.photometry.catalogs import catalog_sources
 from miricigale.photometry.flags import ForcedFlags
+from miricigale.photometry.mosaics import as_mosaic
 from miricigale.photometry.packaging import CatalogRows, package
 from miricigale.photometry.passes import fit_image
 from miricigale.photometry.placement import Placement
+from miricigale.photometry.priors import detected_prior, read_catalog, read_prior
 from miricigale.photometry.settings import ErrorSettings, MemorySettings
 from miricigale.photometry.sky_noise import warn_of_background
 from miricigale.photometry.sources import SourceTemplates
-from miricigale.psf import KernelField
+from miricigale.psf import KernelField, MatchingKernel
 from miricigale.utils.exceptions import PhotometryWarning, argument_error
+from miricigale.utils.interactive import Interactive
 from miricigale.utils.parallel import single_threaded, thread_count, threads
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, positive, to_array
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
-class ForcedPhotometer:
+class ForcedPhotometer(Interactive):
     """
     Measure the sources of a catalog on an image of lower resolution.
 
@@ -37,13 +43,17 @@ class ForcedPhotometer:
 
     Parameters
     ----------
-    kernel : `~miricigale.psf.MatchingKernel` or `~miricigale.psf.KernelField`
+    kernel : `~miricigale.psf.MatchingKernel` or `~miricigale.psf.KernelField`, optional
         From the high-resolution image's PSF (``source``) to the image's (``target``), on the
         pixels of the high-resolution image. ``target`` must be the PSF of the image that is
         measured: that of a drizzled mosaic for a drizzled mosaic. With kernels of several places
         each source has that of its own; shapes are fitted with the mean of the sources. Of a kernel
         without PSFs sources are the segments as they are (``template="cutout"``, ``wings=False``),
         which a warning says; those without a segment are not measured.
+    psf, highres_psf : `~photutils.psf.ImagePSF`, str or other, optional
+        In place of the kernel the PSFs of the image and of the high-resolution image, in the forms of
+        `~miricigale.psf.MatchingKernel.from_psfs`, which makes the kernel. Of an image without a
+        high-resolution one that of the image alone: sources are points.
     template : {"auto", "cutout", "psf", "sersic"}, optional
         What sources look like. ``"auto"`` cuts them from the high-resolution image where a
         segment of enough signal-to-noise belongs to them, otherwise takes a point source.
@@ -111,8 +121,10 @@ class ForcedPhotometer:
     Fuller 1987, Measurement Error Models (errors in variables).
     """
 
-    kernel: object
+    kernel: object = None
     _: dataclasses.KW_ONLY
+    psf: dataclasses.InitVar[object] = None
+    highres_psf: dataclasses.InitVar[object] = None
     template: str = "auto"
     wings: bool = True
     background_order: int | None = None
@@ -126,7 +138,22 @@ class ForcedPhotometer:
     memory: MemorySettings = dataclasses.field(default_factory=MemorySettings)
     n_threads: int | None = None
 
-    def __post_init__(self):
+    def __post_init__(self, psf, highres_psf):
+        if (self.kernel is None) == (psf is None):
+            got = "neither" if psf is None else "both"
+            raise argument_error("kernel, psf", "one of them given", got)
+        if self.kernel is None:
+            if highres_psf is None:
+                kernel = MatchingKernel.identity(psf)
+                object.__setattr__(
+                    self, "template", "psf" if self.template == "auto" else self.template
+                )
+            else:
+                kernel = MatchingKernel.from_psfs(highres_psf, psf)
+            object.__setattr__(self, "kernel", kernel)
+        if not isinstance(self.kernel, (MatchingKernel, KernelField)):
+            wanted = "a MatchingKernel or a KernelField (or give 'psf')"
+            raise argument_error("kernel", wanted, type(self.kernel).__name__)
         template = self.template
         if template not in ("auto", "cutout", "psf", "sersic"):
             raise argument_error("template", "'auto', 'cutout', 'psf' or 'sersic'", repr(template))
@@ -168,8 +195,13 @@ class ForcedPhotometer:
         for name, value in changed.items():
             object.__setattr__(self, name, value)
 
+    replace = dataclasses.replace
+
     def __repr__(self):
         return f"<ForcedPhotometer template={self.template!r}, {self.kernel!r}>"
+
+    def _facts(self):
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
     def measure(self, image, highres=None, segmentation=None, catalog=None, *, templates=None):
         """
@@ -177,16 +209,17 @@ class ForcedPhotometer:
 
         Parameters
         ----------
-        image : `~astropy.nddata.CCDData`
-            The image, in units of surface brightness, background subtracted unless it is
-            fitted, with WCS, uncertainty and mask. Any pixel scale and orientation.
-        highres : `~astropy.nddata.CCDData`, optional
-            The high-resolution image, background subtracted, on pixels of the kernel. Needed
-            for cutouts; without it the kernel's grid is taken to be north up.
-        segmentation : `~photutils.segmentation.SegmentationImage` or array, optional
-            Segments of ``highres``; needed for cutouts.
-        catalog : `~astropy.table.QTable`
-            As for `SourceTemplates.from_images`, or for Sersic templates `SourceTemplates.from_catalog`.
+        image : `~astropy.nddata.CCDData`, path-like or other (see `as_mosaic`)
+            The image, in units of surface brightness or of the flux in a pixel, background subtracted unless
+            it is fitted, with WCS, uncertainty and mask. Any pixel scale and orientation.
+        highres : `~astropy.nddata.CCDData`, path-like or other, optional
+            The high-resolution image, background subtracted, on pixels of the kernel (or the catalog,
+            where there is none). Needed for cutouts; without it the kernel's grid is taken to be north up.
+        segmentation : `~photutils.segmentation.SegmentationImage`, array or path-like, optional
+            Segments of ``highres``; for cutouts they are detected (`detect_sources`) if not given.
+        catalog : table in any form, path-like or `~astropy.coordinates.SkyCoord`, optional
+            Positions, and what `SourceTemplates.from_images`, or for Sersic templates
+            `SourceTemplates.from_catalog`, take; by default a source for each segment.
         templates : `SourceTemplates`, optional
             What the sources look like, in place of the three above, made once for several
             images. The settings ``template`` and ``wings`` are then theirs.
@@ -207,9 +240,13 @@ class ForcedPhotometer:
             exactly 0 are not masked, or a background that was left in ``image`` or ``highres``
             goes into the fluxes.
         """
+        if isinstance(highres, (SkyCoord, Table)) and segmentation is None and catalog is None:
+            highres, catalog = None, highres
+        image = as_mosaic(image, "image")
         arrays = fit_arrays(image, "image", self.memory.scratch)
         given = [one is not None for one in (highres, segmentation, catalog)]
         if templates is None:
+            highres, segmentation, catalog = self._prior(highres, segmentation, catalog)
             sources = dataclasses.replace(catalog_sources(catalog), sky=catalog["sky"])
         elif any(given):
             raise argument_error("templates", "given alone with the image", "a catalog too")
@@ -241,6 +278,8 @@ class ForcedPhotometer:
             warn_of_background(result, self.mean_kernel)
         return result
 
+    __call__ = measure
+
     def render(self, image, templates, flux):
         """
         Draw sources as they are seen on an image.
@@ -264,7 +303,7 @@ class ForcedPhotometer:
         ValueError, TypeError, `~astropy.units.UnitsError`
             If an input does not fit; the message says which.
         """
-        arrays = image_arrays(image, "image")
+        arrays = image_arrays(as_mosaic(image, "image"), "image")
         flux = to_array(flux, FNU, "flux", ndim=1)
         if len(flux) != len(templates):
             raise argument_error("flux", f"{len(templates)} fluxes, one for each source", len(flux))
@@ -304,6 +343,25 @@ class ForcedPhotometer:
         )
         return rows, templates
 
+    def _prior(self, highres, segmentation, catalog):
+        """High-resolution image, segments and catalog, detected where cutouts need what was not given."""
+        if highres is None and catalog is None:
+            raise argument_error("catalog", "given without a high-resolution image", "None")
+        if highres is not None:
+            highres = as_mosaic(highres, "highres")
+            if highres.wcs is None:
+                image_arrays(highres, "highres")
+            self._check_scale("highres", highres.wcs)
+        if self.template in ("psf", "sersic") or highres is None:
+            return highres, segmentation, read_catalog(catalog)
+        if segmentation is None:
+            return highres, *detected_prior(highres, catalog)
+        if catalog is not None and not isinstance(segmentation, (str, os.PathLike)):
+            # labels are those of the catalog, or by position
+            return highres, segmentation, read_catalog(catalog)
+        segmentation = getattr(segmentation, "data", segmentation)
+        return highres, *read_prior(highres, segmentation=segmentation, catalog=catalog)
+
     def _templates(self, highres, segmentation, catalog):
         """The templates that the settings ask for."""
         if highres is None and segmentation is not None:
@@ -311,10 +369,6 @@ class ForcedPhotometer:
         for name, value in (("highres", highres), ("segmentation", segmentation)):
             if value is None and self.template == "cutout":
                 raise argument_error(name, "given for cutouts", "None")
-        if highres is not None:
-            if getattr(highres, "wcs", None) is None:
-                image_arrays(highres, "highres")
-            self._check_scale("highres", highres.wcs)
         if self.template in ("psf", "sersic") or segmentation is None:
             kind = "sersic" if self.template == "sersic" else "psf"
             grid = None if highres is None else highres.wcs

@@ -118,14 +118,19 @@ def measure_files(
     _check_psfs(image, highres, kernel)
     filter_ = image.header.filter
     # heavy imports only after the files were checked
-    from miricigale.photometry import ForcedPhotometer
+    from miricigale.photometry import ForcedPhotometer, read_prior
+    from miricigale.photometry.priors import detected_prior
 
     with progress(show=progress_bar, total=4, desc="images", unit="steps") as bar:
         mosaic, prior = image.read(), highres.read()
         bar.update()
         bar.set_description("kernel and sources")
         matching = matching_kernel(image, highres, kernel)
-        segments, sources = _sources(prior, segmentation, catalog, highres.path)
+        if segmentation is None:
+            segments, sources = detected_prior(prior, catalog)
+        else:
+            given = {"segmentation": segmentation, "catalog": catalog}
+            segments, sources = read_prior(prior, path=highres.path, **given)
         bar.update()
         bar.set_description("fluxes")
         photometer = ForcedPhotometer(
@@ -294,18 +299,6 @@ def _check_catalog(path, image, highres):
             where = _middle(file.header).to_string("decimal", precision=4)
             msg += f": the first is at {first}, the middle of the image at {where} deg"
         raise ValueError(msg)
-
-
-def _sources(prior, segmentation, catalog, path):
-    from miricigale.photometry import detect_sources, read_prior
-
-    if segmentation is not None:
-        return read_prior(prior, segmentation=segmentation, catalog=catalog, path=path)
-    segments, detected = detect_sources(prior)
-    _log.info("%d sources detected on %s", len(detected), path)
-    if catalog is None:
-        return segments.data, detected
-    return read_prior(prior, segmentation=segments.data, catalog=catalog, path=path)
 
 
 def _pulls(result, kernel, seed, n_threads):

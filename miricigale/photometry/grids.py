@@ -7,10 +7,18 @@ import warnings
 
 import astropy.units as u
 import numpy as np
+from astropy.io import fits
 
 from miricigale.utils.exceptions import DataError, PhotometryWarning, argument_error
 from miricigale.utils.files import open_fits, split_extension
 from miricigale.utils.optional import require
+
+
+class Opened(fits.HDUList):
+    """The HDUs of a user, in place of the path of their file."""
+
+    def __str__(self):
+        return self.filename() or "the list of HDUs"
 
 
 @contextlib.contextmanager
@@ -20,6 +28,9 @@ def open_image(path, wanted):
 
     ``wanted`` is what the file should be, for messages.
     """
+    if isinstance(path, Opened):
+        yield path, None
+        return
     name, extension = split_extension(path)
     with open_fits(name, wanted=wanted) as hdus:
         yield hdus, extension

@@ -4,14 +4,18 @@ import dataclasses
 import functools
 import json
 import logging
+import os
 import warnings
 
 import astropy.units as u
 import numpy as np
+from astropy.io import fits
+from astropy.nddata import CCDData, NDData
 
 from miricigale.instrument.image import Image
 from miricigale.photometry.calibration import calibration, parsed_unit
 from miricigale.photometry.grids import (
+    Opened,
     filter_name,
     find_image,
     is_exposure,
@@ -27,7 +31,7 @@ _log = logging.getLogger(__name__)
 
 #: Maps of the noise, and the extensions that hold them in the image's own file.
 _NOISE = {
-    "error": ("ERR", "RMS"),
+    "error": ("ERR", "RMS", "UNCERT"),
     "variance": ("VAR",),
     "inverse_variance": ("IVAR",),
     "weight": ("WHT", "WEIGHT"),
@@ -59,6 +63,41 @@ def read_mosaic(path, **options):
     >>> image = read_mosaic("f444w_sci.fits.gz", weight="f444w_wht.fits.gz")  # doctest: +SKIP
     """
     return MosaicFile(path, **options).read()
+
+
+def as_mosaic(image, argument="image"):
+    """
+    Image of whatever holds one.
+
+    Parameters
+    ----------
+    image : `~astropy.nddata.NDData`, path-like, `~astropy.io.fits.HDUList` or HDU
+        Files and HDUs are read as by `read_mosaic`.
+    argument : str, optional
+        The argument's name for messages.
+
+    Returns
+    -------
+    image : `~astropy.nddata.CCDData`
+        Itself, if it is one.
+
+    Raises
+    ------
+    ValueError
+        If it is nothing of these, or has no unit.
+    """
+    if isinstance(image, CCDData):
+        return image
+    if isinstance(image, (str, os.PathLike)):
+        return read_mosaic(image)
+    if isinstance(image, fits.HDUList):
+        return read_mosaic(Opened(image))
+    if isinstance(image, (fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU)):
+        return read_mosaic(Opened([image]))
+    wanted = "a CCDData, an NDData with unit and WCS, HDUs or the path of a FITS file"
+    if not isinstance(image, NDData) or image.unit is None:
+        raise argument_error(argument, wanted, type(image).__name__)
+    return CCDData(image)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,23 +1,20 @@
 """Segmentation maps and catalogs that others made, as the prior of forced photometry."""
 
 import logging
+import os
 import warnings
 
-import astropy.units as u
 import numpy as np
 
 from miricigale.photometry.grids import open_map
 from miricigale.utils.exceptions import CatalogWarning, DataError, argument_error
-from miricigale.utils.files import read_table
-from miricigale.utils.tables import unique_ids
+from miricigale.utils.positions import as_positions
+from miricigale.utils.tables import as_table, unique_ids
 
 _log = logging.getLogger(__name__)
 
 #: Extensions of segmentation maps, and names of columns.
 _SEGMENTS = ("SEGMENTATION", "SEGMAP", "SEG", "SCI")
-_SKY = ("sky", "skycoord", "sky_centroid", "coord")
-_RA = ("ra", "alpha_j2000", "raj2000", "ra_j2000", "alphawin_j2000")
-_DEC = ("dec", "delta_j2000", "dej2000", "dec_j2000", "decj2000", "deltawin_j2000")
 _ID = ("id", "number", "id_obj", "objid", "label")
 
 
@@ -32,9 +29,9 @@ def read_prior(highres, *, segmentation=None, catalog=None, path=None):
     segmentation : path-like or int `~numpy.ndarray`, optional
         Segmentation map: whole numbers, 0 for the sky, any ids; ``file.fits[EXTENSION]`` names
         an extension.
-    catalog : path-like, optional
-        FITS, ECSV, CSV or a plain table with ``ra`` and ``dec`` (deg, or with a unit), or a
-        `~astropy.coordinates.SkyCoord`, and ``id``. Without it every segment is a source, whose
+    catalog : path-like, table or `~astropy.coordinates.SkyCoord`, optional
+        A table in any form (`~miricigale.utils.tables.as_table`) with positions
+        (`~miricigale.utils.positions.as_positions`) and ``id``. Without it every segment is a source, whose
         id is that of the segment.
     path : path-like, optional
         File of ``highres``, for messages.
@@ -84,9 +81,40 @@ def read_prior(highres, *, segmentation=None, catalog=None, path=None):
     if catalog is None:
         return segments, _from_segments(highres, segments, ids)
     sources = read_catalog(catalog)
+    if isinstance(catalog, (str, os.PathLike)):
+        sources = sources["id", "sky"]
+    else:
+        catalog = "the catalog"
     if segments is not None:
         sources["label"] = _labels(sources, segments, ids, highres.wcs, catalog, segmentation)
     return segments, sources
+
+
+def detected_prior(highres, catalog=None):
+    """
+    Segments that are detected on an image, and its sources: those of a catalog, or the detected ones.
+
+    Parameters
+    ----------
+    highres : `~astropy.nddata.CCDData`
+        The image.
+    catalog : optional
+        As for `read_prior`.
+
+    Returns
+    -------
+    segments : int32 `~numpy.ndarray`, shape (ny, nx)
+        Labels.
+    sources : `~astropy.table.QTable`
+        As of `read_prior`, or of `~miricigale.photometry.detect_sources`.
+    """
+    from miricigale.photometry.detection import detect_sources
+
+    segments, detected = detect_sources(highres)
+    _log.info("%d sources detected on the high-resolution image", len(detected))
+    if catalog is None:
+        return segments.data, detected
+    return read_prior(highres, segmentation=segments.data, catalog=catalog)
 
 
 def _numbered(data, path):
@@ -133,55 +161,34 @@ def _from_segments(highres, segments, ids):
     return QTable({"id": ids, "sky": sky, "label": index})
 
 
-def read_catalog(path):
+def read_catalog(catalog):
     """
-    Ids and positions of a table in any of the usual formats; see ``catalog`` of `read_prior`.
+    Ids and positions of a catalog in any of the usual forms; see ``catalog`` of `read_prior`.
 
-    A position that is missing is NaN.
+    A position that is missing is NaN; other columns are kept.
 
     Raises
     ------
     `~miricigale.utils.exceptions.DataError`, ValueError
-        If the file is missing or damaged, or has no positions; if ids are not unique.
+        If a file is missing or damaged, or there are no positions; if ids are not unique.
     """
     from astropy.coordinates import SkyCoord
     from astropy.table import QTable
 
-    table = read_table(path, wanted="a catalog (FITS, ECSV, CSV or a plain table)")
-    names = {name.lower(): name for name in table.colnames}
-
-    def first(choices):
-        return next((names[name] for name in choices if name in names), None)
-
-    sky = next((n for n in table.colnames if isinstance(table[n], SkyCoord)), None)
-    sky = first(_SKY) if sky is None and first(_SKY) in table.colnames else sky
-    if sky is not None and isinstance(table[sky], SkyCoord):
-        position = table[sky].icrs
-    else:
-        columns = [first(_RA), first(_DEC)]
-        if None in columns:
-            msg = (
-                f"{path} has no position: wanted are the columns ra and dec, or a SkyCoord; "
-                f"there are {table.colnames}"
-            )
-            raise DataError(msg)
-        position = SkyCoord(*(_degrees(table[name], name, path) for name in columns))
-    key = first(_ID)
-    ids = np.arange(1, len(table) + 1) if key is None else np.asarray(table[key])
-    if key is None:
-        _log.info("%s has no ids; its rows are counted from 1", path)
-    return QTable({"id": unique_ids(ids, f"catalog {path}"), "sky": position})
-
-
-def _degrees(column, name, path):
-    """A coordinate as a quantity; NaN where it is missing."""
-    values = np.ma.filled(column, np.nan) if np.ma.isMaskedArray(column) else column
-    unit = getattr(values, "unit", None) or getattr(column, "unit", None) or u.deg
-    try:
-        return u.Quantity(np.asarray(getattr(values, "value", values), float), unit).to(u.deg)
-    except (TypeError, ValueError, u.UnitConversionError) as err:
-        msg = f"{path}: the column {name} must be an angle in numbers, got {unit}, {column[:1]}"
-        raise DataError(msg) from err
+    name = f"catalog {catalog}" if isinstance(catalog, (str, os.PathLike)) else "catalog"
+    if isinstance(catalog, SkyCoord):
+        catalog = QTable({"sky": catalog.reshape(-1)})
+    table = QTable(as_table(catalog, "catalog"), copy=False)
+    table["sky"] = as_positions(table, name, missing=True)
+    if "id" not in table.colnames:
+        # labels are the ids of files, and in tables those of segments
+        known = _ID if isinstance(catalog, (str, os.PathLike)) else _ID[:-1]
+        theirs = [one for one in table.colnames if one.lower() in known]
+        if not theirs:
+            _log.info("%s has no ids; its rows are counted from 1", name)
+        table["id"] = table[theirs[0]] if theirs else np.arange(1, len(table) + 1)
+    table["id"] = unique_ids(np.asarray(table["id"]), name)
+    return table
 
 
 def labels_at(segments, xy):

@@ -20,6 +20,7 @@ from miricigale.photometry.fields import SmoothField
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.offsets import OffsetMap
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.interactive import Tabular
 from miricigale.utils.random import check_seed
 from miricigale.utils.tables import described_table, error_column
 from miricigale.utils.unified import read_write
@@ -62,7 +63,7 @@ def crowded(sky, flux, *, radius=2 * u.arcsec):
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class ForcedPhotometryResult:
+class ForcedPhotometryResult(Tabular):
     """
     Fluxes of all sources of a catalog on one image.
 
@@ -266,6 +267,34 @@ class ForcedPhotometryResult:
             rows.append(found[0])
         errors = self.flux_err.value[rows]
         return float(self.covariance[rows[0], rows[1]] / np.prod(errors))
+
+    _other_names: ClassVar[dict] = {
+        "ids": "id",
+        "residual": "residual_image",
+        "model": "model_image",
+        "fluxes": "flux",
+        "errors": "flux_err",
+    }
+
+    @property
+    def magnitude(self):
+        """AB magnitudes, `~astropy.units.Magnitude`; NaN where the flux is not positive."""
+        flux = np.where(self.flux.value > 0, self.flux.value, np.nan) * self.flux.unit
+        return flux.to(u.ABmag)
+
+    def flag_names(self):
+        """Return the names of the flags of each source: a list of lists of str."""
+        return [list(ForcedFlags.names(value)) for value in self.flags]
+
+    def _facts(self):
+        measured = np.isfinite(self.flux.value)
+        facts = {"sources": len(self), "measured": int(measured.sum())}
+        facts["above 5 sigma"] = int(np.count_nonzero(self.snr[measured] > 5))
+        flags = self.flags[self.flags != 0]
+        for value, (name, _) in ForcedFlags.meanings().items():
+            if n := int(np.count_nonzero(flags & value)):
+                facts[f"flag {name}"] = n
+        return facts
 
     def to_table(self, name=None):
         """

@@ -1,5 +1,7 @@
 """Figures of images and photometry: background, light within radii, offsets by kind of source."""
 
+import itertools
+
 import numpy as np
 
 from miricigale.plotting.axes import (
@@ -20,6 +22,7 @@ __all__ = [
     "encircled_energy_figure",
     "features_figure",
     "offsets_figure",
+    "plot_energies",
     "plot_ramp",
 ]
 
@@ -116,6 +119,36 @@ def encircled_energy_figure(radius, before, after, *, limit=0.04):
     reach = max([100 * limit, *(100 * np.nanmax(np.abs(v)) for v in after.values())])
     axes[0, 1].set_ylim(-1.15 * reach, 1.15 * reach)
     return figure
+
+
+def plot_energies(radius, curves, *, ax=None, **kwargs):
+    """
+    Draw encircled energies.
+
+    Parameters
+    ----------
+    radius : array-like, shape (n,)
+        Radii in arcsec.
+    curves : dict of str to array-like, shape (n,)
+        Fraction of all light within the radius, by name.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where; the current axes by default.
+    **kwargs
+        Passed to `matplotlib.axes.Axes.plot`.
+
+    Returns
+    -------
+    ax : `~matplotlib.axes.Axes`
+    """
+    ax = resolve_axes(ax)
+    styles = (("tab:blue", "-"), (TRUE, "-"), (MEASURED, "--"))
+    for (name, values), (color, style) in zip(
+        curves.items(), itertools.cycle(styles), strict=False
+    ):
+        ax.plot(radius, values, **{"label": name, "color": color, "ls": style, "lw": 1.4} | kwargs)
+    ax.set(xlabel="radius [arcsec]", ylabel="encircled energy", ylim=(0, None))
+    ax.legend(frameon=False)
+    return ax
 
 
 def offsets_figure(groups, *, limit=1.0, marked=None):

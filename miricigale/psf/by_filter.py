@@ -67,13 +67,16 @@ def filter_psf(filter, *, pixel_scale, pa=None, grid_angle=0.0 * u.deg, resampli
     if filter in WFC3_FILTERS:
         return rotate_psf(hst_psf(filter, pixel_scale=pixel_scale), grid_angle=grid_angle)
     return psf_mosaic(
-        _exposure(filter), pixel_scale, pa, grid_angle=grid_angle, resampling=resampling
+        exposure_psf(filter), pixel_scale, pa, grid_angle=grid_angle, resampling=resampling
     )
 
 
-def _exposure(filter_):
-    """The model of a single exposure, in the detector's axes."""
-    return miri_psf(filter_) if filter_ in MIRI_FILTERS else nircam_psf(filter_)
+def exposure_psf(filter, scale=None):
+    """The model of a single exposure, in the detector's axes; WFC3/IR is drizzled to ``scale``."""
+    filter = known_filter(filter, MODEL_FILTERS, "model PSF for the filter")
+    if filter in WFC3_FILTERS:
+        return hst_psf(filter) if scale is None else hst_psf(filter, pixel_scale=scale)
+    return miri_psf(filter) if filter in MIRI_FILTERS else nircam_psf(filter)
 
 
 def checked_psf(
@@ -122,7 +125,7 @@ def checked_psf(
     angle = psf.angle
     form = {"pixel_scale": scale, "grid_angle": angle, "resampling": resampling}
     if psf.frame == "detector":
-        model = _detector_model(filter, scale)
+        model = exposure_psf(filter, scale)
     else:
         model = filter_psf(filter, pa=angle if pa is None else pa, **form)
     x, y, _ = _core.core_moments(psf.data)
@@ -159,12 +162,6 @@ def checked_psf(
         )
         warnings.warn(msg, PSFWarning, stacklevel=2)
     return _scaled(psf, float(stamp.sum()), filter, argument)
-
-
-def _detector_model(filter_, scale):
-    if filter_ in WFC3_FILTERS:
-        return hst_psf(filter_, pixel_scale=scale)
-    return _exposure(filter_)
 
 
 def _check_turn(psf, center, stamps, about, argument):

@@ -59,6 +59,8 @@ def fits_image(path, ext, plane, pixel_scale, *, wanted, oversampling=1):
             got = None if data is None else f"shape {data.shape}"
             raise argument_error("path", f"a file with a 2D image in extension {ext!r}", got)
         data, header = np.array(data, dtype=float), hdus[ext].header
+    if oversampling is None:
+        oversampling = int(header.get("OVERSAMP", 1))
     cell, angle = header_grid(header)
     if pixel_scale is None:
         if cell is None:
@@ -73,7 +75,15 @@ def fits_image(path, ext, plane, pixel_scale, *, wanted, oversampling=1):
 
 
 def read_psf(
-    path, *, frame, ext=0, plane=None, pixel_scale=None, oversampling=1, angle=None, **options
+    path,
+    *,
+    frame=None,
+    ext=0,
+    plane=None,
+    pixel_scale=None,
+    oversampling=None,
+    angle=None,
+    **options,
 ):
     """
     Read a PSF from an image in any FITS file.
@@ -82,8 +92,8 @@ def read_psf(
     ----------
     path : path-like
         The file.
-    frame, oversampling
-        As for `make_psf`.
+    frame, oversampling : optional
+        As for `make_psf`; by default those of STPSF's files (the detector's frame, OVERSAMP), else the sky and 1.
     ext : int or str, optional
         The extension.
     plane : int, optional
@@ -110,6 +120,11 @@ def read_psf(
     data, header, pixel_scale, turn = fits_image(
         path, ext, plane, pixel_scale, wanted="a PSF", oversampling=oversampling
     )
+    if oversampling is None:
+        oversampling = int(header.get("OVERSAMP", 1))
+    if frame is None:
+        # as STPSF and WebbPSF write them
+        frame = "detector" if {"OVERSAMP", "PIXELSCL"} <= set(header) else "sky"
     if frame == "detector" and isinstance(header.get("PA_APER"), (int, float)):
         options.setdefault("pa_aper", float(header["PA_APER"]) * u.deg)
     if frame == "sky" and turn is not None:

@@ -2,12 +2,17 @@
 
 import dataclasses
 import functools
+import os
 from typing import ClassVar
 
 import astropy.units as u
 import numpy as np
+from astropy.nddata import CCDData
 from scipy.signal import fftconvolve, oaconvolve
 
+from miricigale.filters import Filter
+from miricigale.instrument.image import Image
+from miricigale.psf.model import instrument_psf
 from miricigale.psf.pairs import psf_pair, ready_arrays
 from miricigale.psf.wiener import (
     choose,
@@ -17,12 +22,26 @@ from miricigale.psf.wiener import (
     wiener,
 )
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.interactive import Interactive
 from miricigale.utils.unified import read_write, unified_read
 from miricigale.utils.units import ANGLE, frozen_array, positive, to_array
 
 
+def _named(psf):
+    """A PSF of a file or of the name of a filter; anything else itself."""
+    if isinstance(psf, os.PathLike) or (isinstance(psf, str) and os.path.isfile(psf)):
+        from miricigale.psf.files import read_psf
+
+        return read_psf(psf)
+    if isinstance(psf, (str, Filter)):
+        from miricigale.psf.by_filter import exposure_psf
+
+        return exposure_psf(psf)
+    return psf
+
+
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
-class MatchingKernel:
+class MatchingKernel(Interactive):
     """
     A convolution kernel from a sharp PSF to a wide one.
 
@@ -78,7 +97,12 @@ class MatchingKernel:
     regularization: float = float("nan")
     meta: dict = dataclasses.field(default_factory=dict)
 
+    _other_names: ClassVar[dict] = {"data": "array", "kernel": "array", "convolve": "apply"}
+
     def __post_init__(self):
+        if hasattr(self.array, "evaluate"):
+            wanted = "a square array ('MatchingKernel.from_psfs' makes the kernel of two PSFs)"
+            raise argument_error("array", wanted, type(self.array).__name__)
         for name in ("array", "source", "target"):
             value = getattr(self, name)
             if value is not None:
@@ -100,7 +124,7 @@ class MatchingKernel:
         hi,
         lo,
         *,
-        pixel_scale,
+        pixel_scale=None,
         regularization="auto",
         hi_angle=None,
         lo_angle=None,
@@ -115,13 +139,14 @@ class MatchingKernel:
 
         Parameters
         ----------
-        hi, lo : `~photutils.psf.ImagePSF` or `~numpy.ndarray`
-            The sharp and the wide PSF. An array is taken as sampled on the image's grid
-            (pixel and orientation), its sum the fraction of light it holds. Cores that do
+        hi, lo : `~photutils.psf.ImagePSF`, `~numpy.ndarray`, str or other
+            The sharp and the wide PSF; text is a file for `read_psf` or a filter that has a model
+            (`filter_psf`). An array, and a functional model of photutils, is taken as sampled on the
+            image's grid (pixel and orientation), its sum the fraction of light it holds. Cores that do
             not stand on the center (by more than 0.01 pixel) are brought there, arrays with
             an even number of pixels to an odd one; ``meta["centering"]`` has the shifts.
-        pixel_scale : `~astropy.units.Quantity`
-            Pixel of the image that is to be convolved.
+        pixel_scale : `~astropy.units.Quantity`, optional
+            Pixel of the image that is to be convolved; that of the sharp PSF by default.
         regularization : float, str, optional
             The Wiener parameter mu; ``"yang2021"`` for 0.03. It belongs to the pixel
             scale: the penalty of a given structure grows as the pixel's fourth power.
@@ -186,6 +211,12 @@ class MatchingKernel:
         >>> round(float(kernel.array.sum()), 4)
         1.0
         """
+        hi, lo = (_named(psf) for psf in (hi, lo))
+        if pixel_scale is None:
+            pixel_scale = getattr(hi, "pixel_scale", None)
+            if pixel_scale is None:
+                wanted = "given where 'hi' does not state it"
+                raise argument_error("pixel_scale", wanted, "None")
         scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))
         if resampling not in ("drizzle", None):
             raise argument_error("resampling", "'drizzle' or None", repr(resampling))
@@ -210,6 +241,40 @@ class MatchingKernel:
                 **figures,
             },
         )
+
+    @classmethod
+    def identity(cls, psf, *, angle=None):
+        """
+        Make the kernel that changes nothing, for sources that are points on an image of this PSF.
+
+        Parameters
+        ----------
+        psf : `~photutils.psf.ImagePSF`, str or other
+            As for `from_psfs`, with its pixel; the kernel is on its cells.
+        angle : `~astropy.units.Quantity`, optional
+            Position angle of the +y axis of a PSF in the detector frame.
+
+        Returns
+        -------
+        kernel : `MatchingKernel`
+            Its ``source`` and ``target`` are the PSF, north up.
+
+        Raises
+        ------
+        ValueError
+            If the pixel of the PSF is unknown, or its angle.
+        """
+        psf = instrument_psf(_named(psf))
+        if psf.frame == "detector" and angle is None and psf.pa_aper is None:
+            wanted = "given to 'MatchingKernel.identity' for a PSF in the detector's frame"
+            raise argument_error("angle", wanted, "None")
+        source, target, mended = psf_pair(
+            psf, psf, psf.cell, angles=(angle, angle), grid_angle=0.0 * u.deg, resampling=None,
+            extent=None, normalize=None,
+        )  # fmt: skip
+        array = np.zeros_like(source)
+        array[tuple(n // 2 for n in array.shape)] = mended["energy"]
+        return cls(array, pixel_scale=psf.cell * ANGLE, source=source, target=target, meta=mended)
 
     @classmethod
     def from_array(cls, array, *, pixel_scale, source=None, target=None):
@@ -309,12 +374,14 @@ class MatchingKernel:
 
         Parameters
         ----------
-        image : `~numpy.ndarray`, shape (ny, nx)
+        image : `~numpy.ndarray` or `~astropy.nddata.CCDData`, shape (ny, nx)
             Image on pixels of ``pixel_scale``.
 
         Returns
         -------
-        image : `~numpy.ndarray`, shape (ny, nx)
+        image : `~numpy.ndarray` or `~astropy.nddata.CCDData`, shape (ny, nx)
+            Of an image with coordinates and unit a copy without uncertainty: noise that was convolved is
+            correlated.
 
         Raises
         ------
@@ -322,6 +389,11 @@ class MatchingKernel:
             If the image is not 2D or not finite (a pixel without data must be given a
             value before it is spread over the kernel).
         """
+        if isinstance(image, CCDData):
+            data = self.apply(image.data)
+            return Image(
+                data, unit=image.unit, wcs=image.wcs, mask=image.mask, meta=dict(image.meta)
+            )
         image = np.asarray(image, dtype=float)
         if image.ndim != 2:
             raise argument_error("image", "2D", f"shape {image.shape}")
@@ -332,6 +404,46 @@ class MatchingKernel:
         full = convolve(image, self.array, mode="full")
         h = self.array.shape[0] // 2
         return full[h : h + image.shape[0], h : h + image.shape[1]]
+
+    __call__ = apply
+
+    def plot(self, ax=None, **kwargs):
+        """
+        Draw the encircled energies of the two PSFs, and of the sharp one after convolution.
+
+        Parameters
+        ----------
+        ax : `~matplotlib.axes.Axes`, optional
+            Where; the current axes by default.
+        **kwargs
+            Passed to `matplotlib.axes.Axes.plot`.
+
+        Returns
+        -------
+        ax : `~matplotlib.axes.Axes`
+
+        Raises
+        ------
+        ValueError
+            If the kernel was made without PSFs.
+        """
+        from miricigale.plotting.measurements import plot_energies
+
+        self._need_psfs()
+        pixels = energy_radii(self.target)
+        psfs = {"sharp PSF": self.source, "wide PSF": self.target, "convolved": self.matched}
+        zero = np.zeros_like(self.target)
+        curves = {name: energy_error(psf, zero, pixels) for name, psf in psfs.items()}
+        return plot_energies(pixels * self.pixel_scale.value, curves, ax=ax, **kwargs)
+
+    def _facts(self):
+        return {
+            "pixels": self.array.shape,
+            "pixel scale": self.pixel_scale,
+            "sum": f"{self.array.sum():.4f}",
+            "regularization": f"{self.regularization:.3g}",
+            "noise gain": f"{self.noise_gain:.3g}",
+        }
 
     def encircled_energy_error(self, radii=None):
         """

@@ -209,16 +209,15 @@ def instrument_psf(psf, argument="psf"):
 
     Raises
     ------
-    TypeError
-        If it is no `~photutils.psf.ImagePSF`.
     ValueError
-        If its scale or frame is unknown, or its oversampling differs between the axes.
+        If it is no `~photutils.psf.ImagePSF`, its scale or frame is unknown, or its oversampling differs
+        between the axes.
     """
     if isinstance(psf, InstrumentPSF):
         return psf
     if not isinstance(psf, ImagePSF):
-        msg = f"'{argument}' must be a photutils ImagePSF, got {type(psf).__name__}"
-        raise TypeError(msg)
+        wanted = "a PSF on pixels of known size (see miricigale.psf.from_photutils and make_psf)"
+        raise argument_error(argument, wanted, type(psf).__name__)
     missing = [key for key in ("pixel_scale", "frame") if key not in psf.meta]
     if missing:
         wanted = f"a PSF whose {' and '.join(missing)} is known (see miricigale.psf.from_photutils)"
@@ -247,7 +246,7 @@ def _cells(model, argument):
     return int(oversampling[0])
 
 
-def make_psf(data, *, pixel_scale, frame, oversampling=1, enclosed=None, **facts):
+def make_psf(data, *, pixel_scale, frame="sky", oversampling=1, enclosed=None, **facts):
     """
     Make a PSF of an array, normalized and checked.
 
@@ -370,7 +369,7 @@ def from_photutils(model, *, x=None, y=None, **options):
 
     Parameters
     ----------
-    model : `~photutils.psf.ImagePSF` or `~photutils.psf.GriddedPSFModel`
+    model : `~photutils.psf.ImagePSF`, `~photutils.psf.GriddedPSFModel` or what `as_psf` takes
         Normalized as photutils asks: sum ``oversampling**2`` over the infinite plane.
     x, y : float, optional
         Detector position at which a gridded model is evaluated; needed for those.
@@ -384,14 +383,13 @@ def from_photutils(model, *, x=None, y=None, **options):
 
     Raises
     ------
-    TypeError
-        If the model is of another kind.
     ValueError
-        If a gridded model comes without a position.
+        If the model is of another kind, or a gridded model comes without a position.
     """
+    model = as_psf(model, "model")
     if isinstance(model, ImagePSF):
         data, options["origin"] = model.data, tuple(model.origin)
-    elif isinstance(model, GriddedPSFModel):
+    else:
         if x is None or y is None:
             raise argument_error("x, y", "given for a GriddedPSFModel", (x, y))
         step = 1.0 / np.broadcast_to(model.oversampling, 2)
@@ -400,9 +398,6 @@ def from_photutils(model, *, x=None, y=None, **options):
             for n, s in zip(model.data.shape[1:], step, strict=True)
         )
         data = model.evaluate(*np.meshgrid(xx + x, yy + y), 1.0, x, y)
-    else:
-        msg = f"'model' must be an ImagePSF or a GriddedPSFModel, got {type(model).__name__}"
-        raise TypeError(msg)
     return make_psf(data, oversampling=_cells(model, "model"), **options)
 
 

@@ -8,7 +8,7 @@ from photutils.psf import GriddedPSFModel, ImagePSF
 from scipy.signal import fftconvolve
 
 from miricigale.psf import _core
-from miricigale.psf.model import make_psf
+from miricigale.psf.model import from_photutils, make_psf
 from miricigale.psf.resample import average_psf, centered_psf, psf_image, psf_mosaic, rotate_psf
 from miricigale.psf.wiener import gaussian_gain, odd_square
 from miricigale.utils.exceptions import PSFWarning, argument_error
@@ -26,6 +26,9 @@ def psf_pair(hi, lo, scale, *, angles, grid_angle, resampling, extent, normalize
     ``angles`` those of the two.
     """
     given, psfs, centering = {"hi": hi, "lo": lo}, {}, {}
+    for name, psf in given.items():
+        if hasattr(psf, "param_names") and not isinstance(psf, (ImagePSF, GriddedPSFModel)):
+            given[name] = from_photutils(psf, pixel_scale=scale * ANGLE, angle=grid_angle)
     for name, psf in given.items():
         if isinstance(psf, GriddedPSFModel):
             msg = f"'{name}' must be an ImagePSF or an array, got a GriddedPSFModel: psf_at or "

@@ -5,6 +5,8 @@ import html
 import operator
 from typing import ClassVar
 
+from miricigale.utils.exceptions import unknown_name
+
 
 class Interactive:
     """
@@ -43,3 +45,40 @@ class Interactive:
             for label, value in self._facts().items()
         )
         return f"<table>{rows}</table>"
+
+
+class Tabular(Interactive):
+    """
+    Base of results with a table, ``to_table()``, which they are indexed like.
+
+    ``result["flux"]`` is a column, ``result[0]`` a row, ``result[rows]`` a table of these, ``result.loc[id]`` the
+    row, or the table, of an id.
+    """
+
+    def __getitem__(self, key):
+        table = self.to_table()
+        if isinstance(key, str) and key not in table.colnames:
+            raise unknown_name("column", key, table.colnames)
+        return table[key]
+
+    @property
+    def columns(self):
+        """Columns of the table by name."""
+        return self.to_table().columns
+
+    @property
+    def loc(self):
+        """Rows by id."""
+        table = self.to_table()
+        table.add_index("id")
+        return table.loc
+
+    def to_pandas(self):
+        """Return the table as a `pandas.DataFrame`; positions are the columns ``ra`` and ``dec`` in deg."""
+        table = self.to_table()
+        if "sky" in table.colnames:
+            at = table.colnames.index("sky")
+            angles = [table["sky"].ra.deg, table["sky"].dec.deg]
+            table.add_columns(angles, indexes=[at, at], names=["ra", "dec"])
+            table.remove_column("sky")
+        return table.to_pandas()

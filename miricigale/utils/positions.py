@@ -13,7 +13,13 @@ __all__ = ["as_position", "as_positions"]
 
 _WANTED = "one SkyCoord, text such as '150.1 +2.2' or '10h00m24s +02d12m00s', or (ra, dec) in deg"
 #: Columns of right ascension and declination, in lower case and without what follows an underscore.
-_PAIRS = {"ra": "dec", "alpha": "delta", "raj2000": "dej2000", "lon": "lat"}
+_PAIRS = {
+    "ra": "dec",
+    "alpha": "delta",
+    "raj2000": "dej2000",
+    "alphawin": "deltawin",
+    "lon": "lat",
+}
 
 
 def as_position(value, argument):
@@ -55,7 +61,7 @@ def as_position(value, argument):
     return SkyCoord(position.ra, position.dec)
 
 
-def as_positions(table, argument, wcs=None):
+def as_positions(table, argument, wcs=None, *, missing=False):
     """
     Positions of the rows of a table, by whichever of its columns have them.
 
@@ -68,6 +74,8 @@ def as_positions(table, argument, wcs=None):
         What the table is called in messages.
     wcs : `~astropy.wcs.WCS`, optional
         For 0-based pixels.
+    missing : bool, optional
+        Whether positions may be missing, which are then NaN.
 
     Returns
     -------
@@ -77,8 +85,9 @@ def as_positions(table, argument, wcs=None):
     Raises
     ------
     ValueError
-        If there are no such columns, or a position is not finite.
+        If there are no such columns, or a position is not finite and ``missing`` is False.
     """
+    refuse = _pass if missing else _refuse_missing
     skies = [name for name in table.colnames if isinstance(table[name], SkyCoord)]
     columns = {}
     for name in table.colnames:
@@ -90,17 +99,17 @@ def as_positions(table, argument, wcs=None):
         sky = table["sky" if "sky" in skies else skies[0]].icrs
     elif pair is not None:
         angles = [_degrees(table, name, argument) for name in pair]
-        _refuse_missing(~np.isfinite(angles).all(axis=0), argument)
+        refuse(~np.isfinite(angles).all(axis=0), argument)
         sky = SkyCoord(*angles, unit="deg")
     elif wcs is not None and {"x", "y"} <= set(columns):
         pixels = [plain_floats(table[columns[name]], columns[name], argument) for name in "xy"]
-        _refuse_missing(~np.isfinite(pixels).all(axis=0), argument)
+        refuse(~np.isfinite(pixels).all(axis=0), argument)
         sky = wcs.pixel_to_world(*pixels).icrs
     else:
         wanted = "a table with positions: 'sky' (SkyCoord), or 'ra' and 'dec'"
         wanted += "" if wcs is None else ", or pixels 'x' and 'y'"
         raise argument_error(argument, wanted, f"the columns {table.colnames}")
-    _refuse_missing(~(np.isfinite(sky.ra.deg) & np.isfinite(sky.dec.deg)), argument)
+    refuse(~(np.isfinite(sky.ra.deg) & np.isfinite(sky.dec.deg)), argument)
     return SkyCoord(sky.ra, sky.dec)
 
 
@@ -114,6 +123,10 @@ def _degrees(table, name, argument):
     values = plain_floats(column, name, argument)
     values[without_codes(values)[0]] = np.nan
     return values * u.Unit(unit).to(u.deg)
+
+
+def _pass(bad, argument):
+    """Let positions be missing."""
 
 
 def _refuse_missing(bad, argument):

@@ -136,16 +136,14 @@ def test_catalogues_that_cannot_be_used_are_refused(prior, tmp_path):
     image, _, sky = prior
     path = tmp_path / "a.csv"
     Table({"id": IDS, "x": PLACES[:, 0]}).write(path)
-    with pytest.raises(
-        DataError, match=r"a.csv has no position: wanted are the columns ra and dec"
-    ):
+    with pytest.raises(ValueError, match=r"a.csv' must be a table with positions: 'sky'"):
         read_prior(image, catalog=path)
     with pytest.raises(ValueError, match="ids are unique"):
         read_prior(image, catalog=write_csv(tmp_path / "b.csv", [1, 1, 2, 3], sky))
     Table({"ra": ["10:00:00"], "dec": ["-27:00:00"]}).write(tmp_path / "c.csv")
-    with pytest.raises(DataError, match="the column ra must be an angle in numbers"):
+    with pytest.raises(ValueError, match="'ra'"):
         read_prior(image, catalog=tmp_path / "c.csv")
-    with pytest.raises(DataError, match=r"absent.csv cannot be read as a catalog .*: no such file"):
+    with pytest.raises(DataError, match=r"absent.csv cannot be read as a table: no such file"):
         read_prior(image, catalog=tmp_path / "absent.csv")
     with pytest.raises(ValueError, match="'segmentation' or 'catalog' must be given"):
         read_prior(image)

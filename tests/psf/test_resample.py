@@ -262,8 +262,8 @@ def test_takes_over_photutils_models():
     np.testing.assert_allclose(there.data, 0.9 * psf.data, rtol=1e-6, atol=1e-9)
     with pytest.raises(ValueError, match="given for a GriddedPSFModel"):
         from_photutils(grid, **kind)
-    with pytest.raises(TypeError, match="'model' must be an ImagePSF or a GriddedPSFModel"):
-        from_photutils(psf.data, **kind)
+    with pytest.raises(ValueError, match="'model' must be a PSF or model of photutils"):
+        from_photutils("psf", **kind)
 
 
 def test_reads_any_fits_image(tmp_path):

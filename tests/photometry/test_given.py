@@ -1,0 +1,223 @@
+"""Images, catalogs, PSFs and results of forced photometry in the forms that users have."""
+
+import astropy.units as u
+import numpy as np
+import pandas as pd
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.io import fits
+from astropy.nddata import CCDData, NDData, StdDevUncertainty
+from astropy.table import QTable
+from astropy.wcs import WCS
+from photutils.psf import CircularGaussianPRF
+
+from helpers.errors import refuses
+from miricigale.filters import Filter
+from miricigale.instrument import Exposure, pixel_area_map
+from miricigale.photometry import ErrorModel, ForcedPhotometer, detect_sources
+from miricigale.psf import MatchingKernel, gaussian_psf, make_psf, read_psf
+
+NOISE = {0.03: 0.002, 0.09: 0.01}
+FWHM = {0.03: 0.12, 0.09: 0.27}
+
+
+def grid(n, scale):
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype, wcs.wcs.crval = ["RA---TAN", "DEC--TAN"], [150.1, 2.2]
+    wcs.wcs.crpix, wcs.wcs.cdelt = [(n + 1) / 2] * 2, [-scale / 3600, scale / 3600]
+    wcs.pixel_shape = (n, n)
+    return wcs
+
+
+@pytest.fixture(scope="module")
+def sky():
+    rng = np.random.default_rng(2)
+    x, y = (v.ravel() + rng.uniform(-1, 1, 16) for v in np.meshgrid(*[np.linspace(12, 84, 4)] * 2))
+    return grid(96, 0.09).pixel_to_world(x, y)
+
+
+@pytest.fixture(scope="module")
+def flux():
+    return np.random.default_rng(3).uniform(2, 30, 16)
+
+
+def drawn(n, scale, sky, flux):
+    """Points with Gaussian PSFs, a flux in uJy in each pixel."""
+    wcs, rng = grid(n, scale), np.random.default_rng(4)
+    y, x = np.mgrid[:n, :n]
+    data = rng.normal(0, NOISE[scale], (n, n))
+    for at, value in zip(np.transpose(wcs.world_to_pixel(sky)), flux, strict=True):
+        data += CircularGaussianPRF(x_0=at[0], y_0=at[1], flux=value, fwhm=FWHM[scale] / scale)(
+            x, y
+        )
+    error = StdDevUncertainty(np.full((n, n), NOISE[scale]))
+    return CCDData(data, unit="uJy", wcs=wcs, uncertainty=error)
+
+
+@pytest.fixture(scope="module")
+def images(sky, flux):
+    return drawn(96, 0.09, sky, flux), drawn(288, 0.03, sky, flux)
+
+
+@pytest.fixture(scope="module")
+def psfs():
+    # with the response of the pixel, as the sources are drawn
+    wide, sharp = (
+        gaussian_psf(np.hypot(FWHM[s], s * np.sqrt(8 * np.log(2) / 12)) * u.arcsec,
+                     pixel_scale=s * u.arcsec, fov=f * u.arcsec)
+        for s, f in ((0.09, 4), (0.03, 2))
+    )  # fmt: skip
+    return {"psf": wide, "highres_psf": sharp}
+
+
+@pytest.fixture(scope="module")
+def photometer(psfs):
+    return ForcedPhotometer(**psfs)
+
+
+def test_the_kernel_is_that_of_the_psfs(photometer, psfs):
+    made = MatchingKernel.from_psfs(psfs["highres_psf"], psfs["psf"], pixel_scale=0.03 * u.arcsec)
+    np.testing.assert_array_equal(photometer.kernel.array, made.array)
+    np.testing.assert_array_equal(photometer.replace(positive=True).kernel.array, made.array)
+
+
+def test_points_need_a_psf_and_positions(images, psfs, sky, flux):
+    points = ForcedPhotometer(psf=psfs["psf"])
+    for catalog in (sky, {"ra": sky.ra.deg, "dec": sky.dec.deg}, QTable({"sky": sky})):
+        result = points.measure(images[0], catalog=catalog)
+        pulls = (result.flux.value - flux) / result.flux_err.value
+        # 16 sources of a signal-to-noise ratio of 100 to 700
+        assert np.abs(pulls).max() < 4
+        assert np.sqrt(np.mean(pulls**2)) < 1.6
+    by_hand = points.measure(images[0], sky)
+    np.testing.assert_array_equal(by_hand.flux.value, result.flux.value)
+
+
+def forms(image, folder):
+    """The same image in other forms."""
+    area = pixel_area_map(image.wcs, image.shape) * 1e12  # uJy in MJy, sr
+    name = folder / f"{image.shape[0]}.fits"
+    image.write(name, overwrite=True)
+    brightness = StdDevUncertainty(image.uncertainty.array / area)
+    nano = StdDevUncertainty(image.uncertainty.array * 1e3)
+    return (
+        name,
+        str(name),
+        image.to_hdu(),
+        NDData(image.data, unit=image.unit, wcs=image.wcs, uncertainty=image.uncertainty),
+        CCDData(image.data / area, unit="MJy/sr", wcs=image.wcs, uncertainty=brightness),
+        CCDData(image.data * 1e3, unit="nJy", wcs=image.wcs, uncertainty=nano),
+    )
+
+
+@pytest.mark.filterwarnings("ignore:.*belong to no source of the catalog")
+def test_images_of_any_form_give_the_same(images, photometer, sky, flux, tmp_path):
+    expected = photometer.measure(*images, catalog=sky)
+    np.testing.assert_allclose(expected.flux.value, flux, rtol=0.03)
+    for pair in zip(*(forms(image, tmp_path) for image in images), strict=True):
+        result = photometer(*pair, catalog=sky)
+        np.testing.assert_allclose(result.flux.value, expected.flux.value, rtol=1e-4)
+        np.testing.assert_allclose(result.flux_err.value, expected.flux_err.value, rtol=1e-3)
+
+
+def test_sources_are_detected_where_none_are_given(images, photometer, sky, flux):
+    result = photometer.measure(*images)
+    _, detected = detect_sources(images[1])
+    assert len(result) == len(detected)
+    index, separation, _ = sky.match_to_catalog_sky(result.sky)
+    assert separation.max() < 0.05 * u.arcsec
+    np.testing.assert_allclose(result.flux.value[index], flux, rtol=0.03)
+
+
+def test_what_is_no_image_or_kernel_is_named(images, psfs, sky):
+    refuses("'kernel, psf' must be one of them given, got neither", ForcedPhotometer)
+    kernel = MatchingKernel.identity(psfs["psf"])
+    refuses("one of them given, got both", ForcedPhotometer, kernel, psf=psfs["psf"])
+    refuses("'kernel' must be a MatchingKernel or a KernelField", ForcedPhotometer, psfs["psf"])
+    refuses("'angle' must be given to 'MatchingKernel.identity'", ForcedPhotometer, psf="F770W")
+    refuses("'psf' must be a PSF on pixels of known size", ForcedPhotometer, psf=np.ones((9, 9)))
+    points = ForcedPhotometer(psf=psfs["psf"])
+    refuses("'image' must be a CCDData, an NDData with unit", points.measure, np.ones((9, 9)), sky)
+    refuses("'catalog' must be given without a high-resolution", points.measure, images[0])
+
+
+def test_results_are_indexed_like_their_table(images, psfs, sky):
+    result = ForcedPhotometer(psf=psfs["psf"]).measure(images[0], sky)
+    np.testing.assert_array_equal(result["flux"].value, result.flux.value)
+    assert result[3]["id"] == result.loc[4]["id"] == 4
+    assert [len(part) for part in (result[:5], result[result.snr > 0], result[[1, 2]])] == [
+        5,
+        16,
+        2,
+    ]
+    assert list(result.columns) == result.to_table().colnames
+    frame = result.to_pandas()
+    np.testing.assert_allclose(frame["ra"], sky.ra.deg)
+    assert list(frame.columns[:3]) == ["id", "ra", "dec"]
+    np.testing.assert_allclose(result.magnitude.value, 23.9 - 2.5 * np.log10(result.flux.value))
+    assert result.flag_names()[0] == []
+    assert "sources: 16" in result.summary()
+    refuses(
+        "no column 'fluxx'; known: .*; did you mean 'flux'",
+        result.__getitem__,
+        "fluxx",
+        error=KeyError,
+    )
+    assert result.residual is result.residual_image
+
+
+def test_a_kernel_is_applied_and_drawn(psfs, images):
+    kernel = MatchingKernel.from_psfs(psfs["highres_psf"], psfs["psf"])
+    assert kernel.pixel_scale == 0.03 * u.arcsec
+    convolved = kernel(images[1])
+    np.testing.assert_array_equal(convolved.data, kernel.apply(images[1].data))
+    assert (convolved.unit, convolved.uncertainty) == (u.uJy, None)
+    curves = {line.get_label(): line.get_ydata() for line in kernel.plot().lines}
+    # Gaussians: half of the light within half of the width at half maximum, if that is resolved
+    radius = kernel.plot().lines[0].get_xdata()
+    np.testing.assert_allclose(curves["convolved"], curves["wide PSF"], atol=5e-3)
+    sigma = psfs["highres_psf"].fwhm.value / np.sqrt(8 * np.log(2))
+    truth = 1 - np.exp(-0.5 * (radius / sigma) ** 2)
+    np.testing.assert_allclose(curves["sharp PSF"], truth, atol=0.02)
+    refuses("'array' must be a square array", MatchingKernel, psfs["psf"], pixel_scale=1 * u.arcsec)
+
+
+def test_psf_files_of_stpsf(tmp_path, psfs):
+    data = psfs["psf"].data
+    header = fits.Header({"PIXELSCL": 0.09 / 4, "OVERSAMP": 4})
+    fits.writeto(tmp_path / "psf.fits", data, header)
+    psf = read_psf(tmp_path / "psf.fits")
+    assert (psf.frame, psf.oversampling[0]) == ("detector", 4)
+    assert psf.pixel_scale.value == pytest.approx(0.09)
+    assert make_psf(np.ones((5, 5)) / 25, pixel_scale=1 * u.arcsec, enclosed=1.0).frame == "sky"
+
+
+def test_errors_of_an_exposure():
+    exposure = Exposure("F770W", time=1 * u.h)
+    model = ErrorModel.from_exposure(exposure)
+    same = ErrorModel.from_exposure(
+        "JWST/MIRI.F770W",
+        exposure.exposure_time,
+        n_integrations=exposure.n_integrations,
+        frame_time=exposure.frame_time,
+    )
+    for name in ("F770W", "miri.f770w", Filter("F770W")):
+        assert model.limiting_flux(name) == same.limiting_flux("miri.f770w")
+    assert ErrorModel.from_depths({"IRAC1": 26.0}).filters == ("irac.ch1",)
+    refuses("'time' must be given, or an Exposure", ErrorModel.from_exposure, "F770W")
+
+
+def test_catalogs_of_pandas_with_missing_positions(images, psfs, sky):
+    ra = np.where(np.arange(16) == 2, np.nan, sky.ra.deg)
+    catalog = pd.DataFrame({"RA": ra, "DEC": sky.dec.deg, "NUMBER": np.arange(16) + 100})
+    result = ForcedPhotometer(psf=psfs["psf"]).measure(images[0], catalog=catalog)
+    assert result.id[0] == 100
+    assert np.flatnonzero(~np.isfinite(result.flux.value)).tolist() == [2]
+
+
+def test_positions_that_are_none(images, psfs):
+    points = ForcedPhotometer(psf=psfs["psf"])
+    refuses("a table with positions", points.measure, images[0], catalog={"flux": [1.0]})
+    far = SkyCoord([10.0], [10.0], unit="deg")
+    with pytest.warns(match="none of the 1 sources is on or near"):
+        points.measure(images[0], far)
