@@ -3,17 +3,10 @@
 import shutil
 import sys
 import textwrap
-from pathlib import Path
 
 
-def add_filters(commands):
-    """Declare ``filters``."""
-    filters = commands.add_parser("filters", help="list the filters")
-    filters.add_argument("pattern", nargs="?", default="", help="part of the name")
-    filters.set_defaults(call=_filters)
-
-
-def _filters(args):
+def filters(args):
+    """List the filters."""
     from miricigale.filters import filter_table
 
     table = filter_table(args.pattern)
@@ -24,22 +17,8 @@ def _filters(args):
     return 0
 
 
-def add_data(commands):
-    """Declare ``data``."""
-    data = commands.add_parser("data", help="reference data: list, check or add")
-    actions = data.add_subparsers(dest="action", metavar="ACTION", required=True)
-    listing = actions.add_parser("list", help="what there is, where, its license, what to cite")
-    listing.add_argument("pattern", nargs="?", default="", help="part of the name")
-    listing.set_defaults(call=_data_list)
-    check = actions.add_parser("check", help="whether each file is there and whole")
-    check.set_defaults(call=_data_check)
-    add = actions.add_parser("add", help="bring a file into the data folder; convert a library")
-    add.add_argument("name", help="resource name, as 'miricigale data list' has it")
-    add.add_argument("path", type=Path, help="file, folder or archive as distributed")
-    add.set_defaults(call=_data_add, stopped=lambda _: "stopped; nothing was changed")
-
-
-def _data_list(args):
+def data_list(args):
+    """List reference data."""
     from miricigale.refdata import find_resource, resources
 
     records = {name: record for name, record in resources().items() if args.pattern in name}
@@ -66,7 +45,8 @@ def _data_list(args):
     return 0
 
 
-def _data_check(args):
+def data_check(args):
+    """Check reference data."""
     from miricigale.refdata import check_resources
 
     rows = check_resources()
@@ -81,7 +61,8 @@ def _data_check(args):
     return int(bool(bad))
 
 
-def _data_add(args):
+def data_add(args):
+    """Add a file of reference data."""
     from miricigale.refdata import add_resource
     from miricigale.refdata.libraries import READERS, add_library
 

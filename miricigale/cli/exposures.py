@@ -1,53 +1,18 @@
 """The command that reduces exposures."""
 
-from pathlib import Path
-
-from miricigale.cli.options import RESUMES, quantity_in
-
 _FILES = "mask saturation bias reset linearity dark gain read_noise flat photom"
 
 
-def add_reduce(commands):
-    """Declare ``reduce``."""
-    reduce = commands.add_parser(
-        "reduce",
-        help="reduce files of exposures to a mosaic of each filter",
-        description="Files of the MIRI imager at any stage (uncal, ramp, rate, rateints, cal, i2d) to "
-        "calibrated images and mosaics, with a page of pictures. What the package did not simulate "
-        "needs references: --crds, files, or --references none for slopes in DN/s.",
-    )
-    add = reduce.add_argument
-    add("files", nargs="+", type=Path, metavar="FILE", help="files of exposures")
-    add("-o", "--output", type=Path, required=True, metavar="DIR", help="folder of the products")
-    add("--crds", type=Path, metavar="DIR", help="local CRDS cache; its files by each header")
-    add("--context", metavar="PMAP", help="context of the cache, such as jwst_1364.pmap (the last)")
-    add("--references", choices=("none", "simulated"), help="do without; or own constants")
-    for name in _FILES.split():
-        kind = "number or file" if name in ("saturation", "bias") else "file"
-        kind = "file, number or 'measured'" if name in ("gain", "read_noise") else kind
-        add(f"--{name.replace('_', '-')}", metavar="REF", help=f"{name.replace('_', ' ')} ({kind})")
-    add("--incomplete", action="store_true", help="do without references that are missing")
-    add("--backend", choices=("native", "jwst"), default="native", help="who fits the ramps")
-    add("--skip-first", type=int, metavar="N", help="groups left out at the start of integrations")
-    add("--skip-last", type=int, metavar="N", help="groups left out at their end")
-    add(
-        "--pixel-scale",
-        type=quantity_in("arcsec"),
-        default="0.11",
-        metavar="ARCSEC",
-        help="of the mosaics (0.11)",
-    )
-    add("--rateints", action="store_true", help="slopes of each integration too")
-    add("--no-resume", dest="resume", action="store_false", help="make everything again")
-    add("--threads", type=int, help="threads (default: all cores)")
-    add("--no-progress", action="store_true", help="no progress bar")
-    reduce.set_defaults(call=_reduce, stopped=lambda _: RESUMES)
-
-
-def _reduce(args):
+def reduce(args):
+    """Reduce exposures."""
     from miricigale.reduction import Reducer
     from miricigale.reduction.from_files import reduce_files
+    from miricigale.utils.exceptions import DataError
 
+    for path in args.files:
+        if not path.is_file():
+            msg = f"no file {path}"
+            raise DataError(msg)
     reducer = Reducer(
         backend=args.backend,
         references=_references(args),

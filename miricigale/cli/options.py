@@ -1,9 +1,18 @@
-"""What the options of several commands are made of."""
+"""The parser of the program, from the declarations of ``commands.toml``."""
 
 import argparse
+import sys
+import tomllib
+from importlib import resources
+from pathlib import Path
 
-#: Message of an interrupted command that can be resumed.
-RESUMES = "stopped; the same command resumes here"
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose errors are one sentence."""
+
+    def error(self, message):
+        """Say what is wrong with the arguments, and end with status 2."""
+        self.exit(2, f"{self.prog}: {message} (see {self.prog} --help)\n")
 
 
 def quantity_in(unit):
@@ -17,11 +26,6 @@ def quantity_in(unit):
     return number
 
 
-def chosen(args, names):
-    """Options by the names of the arguments that they become."""
-    return {name: getattr(args, name) for name in names.split()}
-
-
 def pair(text):
     """Two names with a colon between them."""
     names = tuple(text.split(":"))
@@ -29,3 +33,114 @@ def pair(text):
         msg = f"{text!r} is no pair NAME:NAME"
         raise argparse.ArgumentTypeError(msg)
     return names
+
+
+#: Types of options by their names in the declarations.
+TYPES = {
+    "int": int,
+    "float": float,
+    "path": Path,
+    "pair": pair,
+    "arcsec": quantity_in("arcsec"),
+    "deg": quantity_in("deg"),
+}
+
+
+def chosen(args, names):
+    """Options by the names of the arguments that they become."""
+    return {name: getattr(args, name) for name in names.split()}
+
+
+def declarations():
+    """What ``commands.toml`` declares: of each command by name, and of ``shared`` options."""
+    return tomllib.loads((resources.files("miricigale.cli") / "commands.toml").read_text("utf-8"))
+
+
+def make_parser(argv):
+    """The parser of the program; help texts are complete where they are asked for."""
+    known = {}
+    if not argv or {"-h", "--help"} & set(argv):
+        from miricigale.filters.surveys import SURVEYS
+        from miricigale.workflow.config import preset_names
+
+        known = {"{presets}": ", ".join(preset_names()), "{surveys}": ", ".join(SURVEYS)}
+    declared = declarations()
+    shared = declared.pop("shared")
+    talk = argparse.ArgumentParser(add_help=False, argument_default=argparse.SUPPRESS)
+    how = talk.add_mutually_exclusive_group()
+    how.add_argument("-v", "--verbose", action="store_true", help="say what is done")
+    how.add_argument("-q", "--quiet", action="store_true", help="errors and warnings only")
+    about = "Plan and analyze JWST/MIRI deep imaging."
+    parser = Parser(prog="miricigale", description=about, parents=[talk])
+    parser.add_argument("--version", action="store_true", help="print the version and stop")
+    parsers = {"": parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=Parser)}
+    for name, command in declared.items():
+        group, _, last = name.rpartition(" ")
+        text = _filled(command["help"], known)
+        made = parsers[group].add_parser(
+            last,
+            help=text,
+            description=command.get("description", f"{text[0].upper()}{text[1:]}."),
+            epilog="examples:\n  " + "\n  ".join(command["examples"]),
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            parents=[talk],
+        )
+        if "call" not in command:
+            parsers[name] = made.add_subparsers(dest="action", metavar="ACTION", required=True)
+            continue
+        stopped = command.get("stopped", "miricigale: stopped")
+        made.set_defaults(call=command["call"], stopped=stopped)
+        options = command.get("options", {})
+        options |= {shared[one]["flags"]: shared[one] for one in command.get("shared", ())}
+        groups = {}
+        for flags, option in _of_both(options):
+            _add(made, groups, flags, option, known)
+    return parser
+
+
+def _of_both(options):
+    """Options with those of the image and of the prior apart."""
+    for flags, option in options.items():
+        both = (("", "image"), ("highres-", "prior")) if "{prefix}" in flags else (("", ""),)
+        for prefix, what in both:
+            words = {"{prefix}": prefix, "{what}": what}
+            texts = {k: _filled(v, words) for k, v in option.items() if isinstance(v, str)}
+            yield _filled(flags, words), option | texts
+
+
+def _add(parser, groups, flags, option, known):
+    """Add an option to a parser, or to its group of options of which one may be given."""
+    own = {key: value for key, value in option.items() if key not in ("flags", "group", "key")}
+    own["help"] = _filled(own["help"], known)
+    if "type" in own:
+        own["type"] = TYPES[own["type"]]
+    if own.get("type") is Path and "default" in own:
+        own["default"] = Path(own["default"])
+    if own.get("action") == "boolean":
+        own["action"] = argparse.BooleanOptionalAction
+    if isinstance(own.get("metavar"), list):
+        own["metavar"] = tuple(own["metavar"])
+    if own.get("default") == "" and own.get("action") == "store_true":
+        own["default"] = None
+    if (group := option.get("group")) is not None:
+        parser = groups.setdefault(group, None) or parser.add_mutually_exclusive_group()
+        groups[group] = parser
+    parser.add_argument(*flags.split(), **own)
+
+
+def _filled(text, words):
+    for name, value in words.items():
+        text = text.replace(name, value)
+    return text
+
+
+def read_input(folder):
+    """Write what standard input holds, a table, into a folder: its path."""
+    data = sys.stdin.buffer.read()
+    ending = (
+        "fits" if data.startswith(b"SIMPLE") else "ecsv" if data.startswith(b"# %ECSV") else "csv"
+    )
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"input.{ending}"
+    path.write_bytes(data)
+    return path

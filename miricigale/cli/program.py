@@ -1,42 +1,16 @@
 """The program ``miricigale``: its commands, and what it says of input that cannot be used."""
 
-import argparse
+import importlib
 import logging
 import os
 import signal
 import sys
 import threading
 
-from miricigale.cli.catalogs import add_fit, add_photometry
-from miricigale.cli.data import add_data, add_filters
-from miricigale.cli.exposures import add_reduce
-from miricigale.cli.study import add_compile, add_plan, add_run
+from miricigale.cli.options import make_parser
 
 # shells add the number of the signal to this
 _STOPPED = 128
-
-
-def _parser():
-    parser = argparse.ArgumentParser(
-        prog="miricigale", description="Plan and analyze JWST/MIRI deep imaging."
-    )
-    parser.add_argument("--version", action="store_true", help="print the version and stop")
-    parser.add_argument("-v", "--verbose", action="store_true", help="say what is done")
-    parser.set_defaults(stopped=lambda _: "miricigale: stopped")
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
-
-    for add in (
-        add_run,
-        add_fit,
-        add_photometry,
-        add_reduce,
-        add_plan,
-        add_filters,
-        add_compile,
-        add_data,
-    ):
-        add(commands)
-    return parser
 
 
 def main(argv=None):
@@ -53,18 +27,24 @@ def main(argv=None):
     status : int
         0 if all went well, 2 for input that cannot be used, 130 if interrupted, 143 if terminated.
     """
-    parser = _parser()
+    argv = sys.argv[1:] if argv is None else argv
+    parser = make_parser(argv)
+    if "_ARGCOMPLETE" in os.environ:
+        import argcomplete
+
+        argcomplete.autocomplete(parser)
     args = parser.parse_args(argv)
+    verbose, quiet = (getattr(args, name, False) for name in ("verbose", "quiet"))
+    if quiet:
+        args.no_progress = True
     handler = logging.StreamHandler()
     # astropy has a handler of its own
     handler.addFilter(lambda record: not record.name.startswith("astropy"))
-    logging.basicConfig(
-        level=logging.INFO if args.verbose else logging.WARNING,
-        format="%(message)s",
-        handlers=[handler],
-    )
-    # messages about compilation are shown at any verbosity
-    logging.getLogger("miricigale.utils.compilation").setLevel(logging.INFO)
+    level = logging.INFO if verbose else logging.ERROR if quiet else logging.WARNING
+    logging.basicConfig(level=level, format="%(message)s", handlers=[handler])
+    if not quiet:
+        # messages about compilation are shown at any verbosity
+        logging.getLogger("miricigale.utils.compilation").setLevel(logging.INFO)
     if args.version:
         from miricigale import __version__
 
@@ -74,16 +54,17 @@ def main(argv=None):
         parser.print_help()
         return 2
     try:
-        return args.call(args)
+        module, _, function = args.call.partition(":")
+        return getattr(importlib.import_module(f"miricigale.cli.{module}"), function)(args)
     except KeyboardInterrupt as stop:
-        print(args.stopped(args), file=sys.stderr)
+        print(args.stopped, file=sys.stderr)
         return _STOPPED + (stop.args[0] if stop.args else signal.SIGINT)
     except Exception as err:
         from astropy.units import UnitsError
 
         # one clear sentence for input that cannot be used; the traceback is for --verbose
         expected = (ValueError, KeyError, OSError, ImportError, UnitsError)
-        if args.verbose or not isinstance(err, expected):
+        if verbose or not isinstance(err, expected):
             raise
         message = err.args[0] if isinstance(err, KeyError) and err.args else err
         # the message of a KeyError may be the key alone

@@ -5,10 +5,11 @@ from astropy.io import fits
 from astropy.nddata import CCDData
 
 from miricigale.instrument.dq import dq_planes
+from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import fits_meta
 
 
-class Image(CCDData):
+class Image(Interactive, CCDData):
     """
     An `~astropy.nddata.CCDData` whose meta may hold more than a FITS header does.
 
@@ -16,6 +17,17 @@ class Image(CCDData):
     data are the primary HDU, with uncertainty and mask as extensions, as astropy has them, and flags as
     JWST has them (``DQ``).
     """
+
+    def _facts(self):
+        ny, nx = self.shape
+        known = {} if self.mask is None else {"masked": f"{100 * np.mean(self.mask):.3g} %"}
+        if self.wcs is not None and self.wcs.has_celestial:
+            known["center"] = self.wcs.pixel_to_world(nx / 2 - 0.5, ny / 2 - 0.5).to_string(
+                "hmsdms"
+            )
+        shown = ("filter", "subarray", "n_exposures", "exposure_time", "background", "steps")
+        known |= {name.replace("_", " "): self.meta[name] for name in shown if name in self.meta}
+        return {"pixels": f"{ny} x {nx}", "unit": self.unit, **known}
 
     def plot(self, ax=None, **kwargs):
         """

@@ -12,6 +12,7 @@ import numpy as np
 from astropy.io import fits
 from astropy.nddata import CCDData, NDData
 
+from miricigale.filters.band_names import find_filter
 from miricigale.instrument.image import Image
 from miricigale.photometry.calibration import calibration, parsed_unit
 from miricigale.photometry.grids import (
@@ -153,6 +154,8 @@ class MosaicFile:
     pa_aper: u.Quantity | None = None
 
     def __post_init__(self):
+        if self.filter is not None:
+            object.__setattr__(self, "filter", find_filter(str(self.filter)) or str(self.filter))
         given = [name for name in _NOISE if getattr(self, name) is not None]
         if len(given) > 1:
             raise argument_error(", ".join(_NOISE), "at most one of them", " and ".join(given))
@@ -333,6 +336,8 @@ def _header(file, hdus, index):
     if stated is not None and file.filter is not None and stated != file.filter:
         raise argument_error("filter", f"{stated!r}, the filter in {file.path}", repr(file.filter))
     angle = get("PA_APER")
+    # a mosaic of our own has a list
+    angle = meta.get("pa_aper") if angle is None else angle
     unit = str(header.get("BUNIT", "") or "").strip()
     name = file.filter or stated
     extra = {"filter": name, "pa_aper": angle}
@@ -341,7 +346,7 @@ def _header(file, hdus, index):
         shape=hdu.shape,
         wcs=wcs,
         filter=name,
-        pa_aper=_checked_angle(file, None if angle is None else float(angle) * u.deg),
+        pa_aper=_checked_angle(file, None if angle is None else np.asarray(angle, float) * u.deg),
         unit=unit if file.unit is None else str(file.unit),
         exposure=is_exposure(get),
         keywords={key: get(key) for key in ("PHOTMJSR", "PHOTFLAM", "PHOTPLAM", "EXPTIME")},
@@ -354,8 +359,11 @@ def _checked_angle(file, stated):
     if file.pa_aper is None:
         return stated
     angle = float(to_array(file.pa_aper, u.deg, "pa_aper", finite=True)) * u.deg
-    if stated is not None and abs(((angle - stated).to_value(u.deg) + 180) % 360 - 180) > 1:
-        wanted = f"PA_APER of {file.path}, {stated.value:.2f} deg"
+    if (
+        stated is not None
+        and np.max(np.abs(((angle - stated).to_value(u.deg) + 180) % 360 - 180)) > 1
+    ):
+        wanted = f"PA_APER of {file.path}, {np.round(stated.value, 2)} deg"
         raise argument_error("pa_aper", wanted, angle)
     return angle
 

@@ -122,6 +122,25 @@ class InstrumentPSF(ImagePSF):
         facts = {**self.facts, **changes, "meta": {**self.meta, **(meta or {})}}
         return InstrumentPSF(self.data if data is None else data, **facts)
 
+    def plot(self, ax=None, **kwargs):
+        """
+        Draw the cells of the PSF, scaled by asinh.
+
+        Parameters
+        ----------
+        ax : `~matplotlib.axes.Axes`, optional
+            Where; the current axes by default.
+        **kwargs
+            Passed to `~matplotlib.axes.Axes.imshow`.
+
+        Returns
+        -------
+        ax : `~matplotlib.axes.Axes`
+        """
+        from miricigale.plotting.scene import plot_scene
+
+        return plot_scene(self.data, ax=ax, label=f"{self.filter or 'PSF'}", **kwargs)
+
     @property
     def facts(self):
         """The parameters with which it was made, without data and meta (dict)."""

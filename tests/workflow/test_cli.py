@@ -1,10 +1,23 @@
+import io
+import shlex
 import subprocess
 import sys
+from pathlib import Path
 
+import astropy.units as u
 import pytest
+from astropy.table import Table
 
 from miricigale.cli import main
+from miricigale.cli.options import declarations, make_parser, read_input
+from miricigale.detector import Detector
+from miricigale.filters.surveys import SURVEYS
+from miricigale.instrument import Exposure
+from miricigale.psf import InstrumentPSF
+from miricigale.reduction import Reducer
+from miricigale.scene import Scene
 from miricigale.workflow import load_config
+from miricigale.workflow.config import preset_names
 
 
 def test_the_configuration_can_be_printed_and_given_back(capsys, tmp_path):
@@ -149,3 +162,103 @@ def test_importing_the_package_opens_nothing_heavy():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_every_command_has_two_examples_that_it_can_read():
+    declared = declarations()
+    parser = make_parser(["--help"])
+    for name, command in declared.items():
+        if name == "shared":
+            continue
+        assert len(command["examples"]) == 2
+        for example in command["examples"]:
+            program, *words = shlex.split(example)
+            assert program == "miricigale"
+            # exits where options or arguments are none of the command's
+            parser.parse_args(words)
+
+
+def test_help_names_presets_and_surveys(capsys):
+    for command, words in (("run", preset_names()), ("fit", SURVEYS)):
+        with pytest.raises(SystemExit) as stop:
+            main([command, "--help"])
+        text = " ".join(capsys.readouterr().out.split())
+        assert stop.value.code == 0
+        assert ", ".join(words) in text
+        assert "examples:" in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["fit"], "miricigale fit: the following arguments are required: CATALOG"),
+        (["fitt"], "miricigale: argument COMMAND: invalid choice: 'fitt'"),
+        (["plan", "--depth", "x"], "miricigale plan: argument --depth: invalid float value"),
+        (["photometry", "a", "b", "--error", "c", "--weight", "d"], "not allowed with argument"),
+        (["reduce", "absent_uncal.fits", "-o", "out"], "miricigale: no file absent_uncal.fits"),
+        (["show", "absent.fits"], "miricigale: no file absent.fits"),
+        (["-v", "-q", "filters"], "not allowed with argument"),
+    ],
+)
+def test_wrong_calls_are_one_sentence_and_status_2(
+    capsys, tmp_path, monkeypatch, arguments, message
+):
+    monkeypatch.chdir(tmp_path)
+    try:
+        status = main(arguments)
+    except SystemExit as stop:
+        status = stop.code
+    text = capsys.readouterr().err
+    assert status == 2
+    assert message in text
+    assert text.count("\n") == 1
+    assert not any(tmp_path.iterdir())
+
+
+def test_quiet_and_verbose_stand_anywhere():
+    parser = make_parser([])
+    for words in (["-q", "compile"], ["compile", "-q"], ["compile", "--quiet"]):
+        assert parser.parse_args(words).quiet
+    assert not hasattr(parser.parse_args(["compile"]), "verbose")
+
+
+def test_plans_of_bands_are_exposed_as_in_ceers(capsys):
+    assert main(["plan", "--bands", "f2100w", "F770W", "--print-config"]) == 0
+    captured = capsys.readouterr()
+    assert 'bands = ["miri.f2100w", "miri.f770w"]' in captured.out
+    assert "time = [4662.0, 1665.0]" in captured.out
+    assert "exposed as in CEERS: 4662 s, 1665 s" in captured.err
+    command = ["plan", "--set", "exposures.pointings=3", "--print-config"]
+    assert main(command) == 0
+    assert "pointings = 3" in capsys.readouterr().out
+
+
+def test_products_are_shown_cited_and_have_psfs(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    exposure = Exposure("F770W", n_groups=8, pointing="150.1 2.2", subarray="SUB64")
+    catalog = {"ra": [150.1], "dec": [2.2], "F770W": [20.0] * u.uJy, "profile": "point"}
+    ramp = Detector().expose(Scene(catalog, exposure, background="low"), seed=1)
+    ramp.write("a_uncal.fits")
+    Reducer().run(ramp).write("mosaic.fits")
+    Table({"x": [1, 2]}, meta={"citations": ["Nobody 2030"]}).write("t.ecsv")
+    for name, words in (("a_uncal.fits", "Ramp"), ("mosaic.fits", "Image"), ("t.ecsv", "Table")):
+        assert main(["show", name]) == 0
+        assert f"{name}: " in (text := capsys.readouterr().out)
+        assert words in text
+        assert Path(f"{name}.png").exists() == (name != "t.ecsv")
+    assert main(["cite", "t.ecsv"]) == 0
+    assert capsys.readouterr().out == "Nobody 2030\n"
+    assert main(["cite"]) == 0
+    assert "ApJ 908, 144" in capsys.readouterr().out
+    assert main(["psf", "mosaic.fits", "-o", "psf.fits"]) == 0
+    # Perrin et al.: 0.269 arcsec, and what drizzling adds
+    assert 0.26 < InstrumentPSF.read("psf.fits").fwhm.to_value(u.arcsec) < 0.31
+    assert main(["psf", "t.ecsv"]) == 2
+
+
+def test_a_catalog_comes_from_standard_input(tmp_path, monkeypatch):
+    text = b"id,F770W,F770W_err\n1,2.0,0.1\n"
+    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(text)))
+    path = read_input(tmp_path / "fits")
+    assert path.name == "input.csv"
+    assert path.read_bytes() == text

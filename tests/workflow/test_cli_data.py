@@ -1,5 +1,6 @@
 """The data command: list, check and add, their output and exit statuses."""
 
+import importlib
 import sys
 
 import numpy as np
@@ -34,7 +35,7 @@ def folder(tmp_path, monkeypatch):
     everything = {name: known[name] for name in ("ssp.bc03", "filters.sedpy")} | {NAME: record}
     for module in (
         registry,
-        sys.modules["miricigale.refdata.check"],
+        importlib.import_module("miricigale.refdata.check"),
         sys.modules["miricigale.refdata"],
     ):
         monkeypatch.setattr(module, "resources", lambda: everything)

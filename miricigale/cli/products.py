@@ -1,0 +1,117 @@
+"""Commands of single products: show, psf, cite."""
+
+import warnings
+from pathlib import Path
+
+
+def _readers():
+    """Functions that read a product, the most particular first."""
+    from miricigale.fitting import FitResults
+    from miricigale.photometry import ErrorModel, ForcedPhotometryResult, read_mosaic
+    from miricigale.psf import InstrumentPSF, MatchingKernel, read_psf
+    from miricigale.reduction import open_exposure
+    from miricigale.utils.files import read_table
+
+    classes = (FitResults, ForcedPhotometryResult, MatchingKernel, InstrumentPSF, ErrorModel)
+    yield from (cls.read for cls in classes)
+    yield from (open_exposure, read_mosaic, read_psf)
+    yield lambda path: read_table(path, wanted="a table")
+
+
+def open_product(path):
+    """
+    Open a file of any kind.
+
+    Parameters
+    ----------
+    path : path-like
+        A product of the package, a file of JWST, or any FITS image or table.
+
+    Returns
+    -------
+    product : object
+        Of the class that reads it: `~miricigale.fitting.FitResults`, `~miricigale.detector.Ramp`, ...
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If there is no such file, or it is nothing of these.
+    """
+    from astropy.io.registry import IORegistryError
+
+    from miricigale.utils.exceptions import DataError
+
+    # of a reader for a file of another kind
+    other = (OSError, ValueError, KeyError, TypeError, IORegistryError)
+    path = Path(path)
+    if not path.is_file():
+        msg = f"no file {path}"
+        raise DataError(msg)
+    with warnings.catch_warnings():
+        # they are about what was tried
+        warnings.simplefilter("ignore")
+        for read in _readers():
+            try:
+                return read(path)
+            except other:
+                continue
+    msg = f"{path} is no product, image or table that can be read"
+    raise DataError(msg)
+
+
+def show(args):
+    """Say what a file is, and draw it."""
+    from astropy.table import Table
+
+    product = open_product(args.file)
+    print(f"{args.file}: {type(product).__name__}")
+    if isinstance(product, Table):
+        product.info(["attributes", "stats"])
+    elif hasattr(product, "summary"):
+        print(product.summary())
+    else:
+        print(product)
+    if not hasattr(product, "plot"):
+        return 0
+    picture = args.picture or Path(f"{args.file.name}.png")
+    if args.picture is None and picture.exists():
+        print(f"picture: {picture} is there already; --picture gives another name")
+        return 0
+    from matplotlib import pyplot as plt
+
+    plt.switch_backend("agg")
+    product.plot()
+    plt.gcf().savefig(picture, dpi=120)
+    print(f"picture: {picture}")
+    return 0
+
+
+def psf(args):
+    """Write the PSF of a mosaic."""
+    from miricigale.photometry import MosaicFile
+    from miricigale.photometry.kernel_files import image_psf
+    from miricigale.psf import MODEL_FILTERS
+    from miricigale.utils.exceptions import argument_error
+
+    made = image_psf(MosaicFile(args.image, filter=args.filter, pa_aper=args.pa_aper))
+    if made is None:
+        wanted = f"an image of a filter with a model ({', '.join(MODEL_FILTERS)}) and its PA_APER"
+        raise argument_error("IMAGE", wanted, args.image)
+    made.write(args.output, overwrite=args.overwrite)
+    print(f"{args.output}: FWHM {made.fwhm:.4f}, pixel {made.pixel_scale:.4f}")
+    return 0
+
+
+def cite(args):
+    """Print what to cite."""
+    if args.file is None:
+        from miricigale import __version__
+
+        print(f"miricigale {__version__} (CITATION.cff)")
+        print("Yang et al. 2021, ApJ 908, 144 (the study that it repeats)")
+        print("and what 'miricigale cite FILE' names for the products that you use")
+        return 0
+    product = open_product(args.file)
+    found = getattr(product, "meta", {}).get("citations", ())
+    print("\n".join(found) if found else f"{args.file} names nothing to be cited")
+    return 0
