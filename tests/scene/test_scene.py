@@ -225,7 +225,10 @@ def bare_wcs():
     ("options", "message"),
     [
         ({"filter": "miri.f1000w"}, "'catalog' must be a table with the columns"),
-        ({"psf": np.ones(3)}, "'psf' must be a PSF or model of photutils, an astropy kernel or a 2D"),
+        (
+            {"psf": np.ones(3)},
+            "'psf' must be a PSF or model of photutils, an astropy kernel or a 2D",
+        ),
         ({"psf": np.zeros((5, 5))}, "'psf' must be finite, with a positive sum"),
         (
             {"psf": scenes.gaussian_psf(pixel_scale=0.06 * u.arcsec)},
