@@ -209,6 +209,16 @@ class Filter(Frozen, Interactive):
         """Names of the library, sorted, as a tuple."""
         return tuple(FILTERS.names())
 
+    @property
+    def min_wavelength(self):
+        """Shortest wavelength of `bounds`."""
+        return self.bounds[0]
+
+    @property
+    def max_wavelength(self):
+        """Longest wavelength of `bounds`."""
+        return self.bounds[1]
+
     @classmethod
     def read(cls, path, *, name=None, unit=None):
         """

@@ -261,6 +261,12 @@ class FitResults(FitRows):
         """Posterior medians of a parameter, or a column of the table."""
         return self.median(name) if name in self.parameters else super()._column(name)
 
+    def _value(self, name):
+        # half-made copies have no axes yet
+        if "axes" in self.__dict__ and name in self.parameters:
+            return self.median(name)
+        return None
+
     def plot(self, ax=None, **kwargs):
         """Draw the spectrum and the photometry of a single object (`plot_sed`); returns the axes."""
         return self.plot_sed(ax, **kwargs)

@@ -211,6 +211,12 @@ class SEDModel(Interactive):
         """The component of a role (one of `~miricigale.sed.ROLES`), or None."""
         return next((c for c in self.components if c.role == role), None)
 
+    def __getitem__(self, name):
+        found = next((c for c in self.components if name in (c.name, c.role)), None)
+        if found is None:
+            raise unknown_name("component", name, [c.name for c in self.components])
+        return found
+
     @property
     def has_agn(self):
         """Whether the chain has an AGN."""

@@ -87,9 +87,15 @@ class SED(Frozen, Interactive):
         "wavelength": "wave",
         "flux": "fnu",
         "properties": "derived",
+        "quantities": "derived",
         "to_spectrum": "to_specutils",
         "to_spectrum1d": "to_specutils",
     }
+
+    def _value(self, name):
+        # half-made copies have no meta yet
+        known = self.derived | self.parameters if "meta" in self.__dict__ else {}
+        return known.get(name)
 
     def __post_init__(self):
         if not hasattr(self.fnu, "unit"):

@@ -25,10 +25,15 @@ class Interactive:
             raise AttributeError(name)
         if name in self._other_names:
             return operator.attrgetter(self._other_names[name])(self)
+        if (value := self._value(name)) is not None:
+            return value
         known = [one for one in dir(self) if not one.startswith("_")]
         near = difflib.get_close_matches(name, [*known, *self._other_names], n=3, cutoff=0.5)
         msg = f"{type(self).__name__} has no {name!r}; it has {', '.join(near or known)}"
         raise AttributeError(msg, name=name, obj=self)
+
+    def _value(self, name):
+        """A quantity that the object holds by this name; None without one."""
 
     def _facts(self):
         """What a notebook shows: dict of label to value."""

@@ -8,6 +8,7 @@ from astropy.io import fits
 from astropy.table import QTable, Table
 from scipy.integrate import quad
 
+from helpers.errors import refuses
 from miricigale.cigale import CigaleSetup, fit_cigale, read_cigale_results, write_best_models
 from miricigale.cigale import read_pcigale_ini as read
 from miricigale.cigale.ini import parse_ini, parse_values
@@ -197,8 +198,7 @@ def test_values(text, wanted):
     ],
 )
 def test_nothing_else_is_evaluated(text):
-    with pytest.raises(ValueError, match=r"^fracAGN "):
-        parse_values(text, "fracAGN")
+    refuses(r"^fracAGN ", parse_values, text, "fracAGN")
 
 
 @pytest.mark.parametrize(
@@ -219,10 +219,8 @@ def test_nothing_else_is_evaluated(text):
 def test_foreign_files_are_refused(tmp_path, content, wanted):
     path = tmp_path / "pcigale.ini"
     path.write_text(content)
-    with pytest.raises(DataError, match=wanted):
-        read(path)
-    with pytest.raises(DataError, match="no such file"):
-        read(tmp_path / "none.ini")
+    refuses(wanted, read, path, error=DataError)
+    refuses("no such file", read, tmp_path / "none.ini", error=DataError)
 
 
 # --------------------------------------------------------------------------- modules
@@ -383,8 +381,7 @@ def test_an_age_of_older_versions_is_that_of_the_main_population(tmp_path):
     ],
 )
 def test_a_parameter_by_another_name_does_not_become_the_default(tmp_path, old, new, wanted):
-    with pytest.raises(ConfigError, match=wanted):
-        quiet(write(tmp_path, (old, new)))
+    refuses(wanted, quiet, write(tmp_path, (old, new)), error=ConfigError)
 
 
 def test_defaults_and_parameters_without_a_part_are_reported(tmp_path):
@@ -402,8 +399,7 @@ def test_a_run_with_a_filter_of_the_user(tmp_path):
         read(path, libraries="bundled")
     setup = quiet(path, names={"AKARI_S7": str(curve)})
     assert setup.bands["AKARI_S7"] == "AKARI_S7"
-    with pytest.raises(DataError, match=r"none\.dat"):
-        quiet(path, names={"AKARI_S7": "none.dat"})
+    refuses(r"none\.dat", quiet, path, error=DataError, names={"AKARI_S7": "none.dat"})
     table = QTable(ROWS)
     fluxes = setup.model().fluxes(table, setup.filters())
     write_catalog(
@@ -481,10 +477,8 @@ def test_rounding_of_redshifts(tmp_path):
     np.testing.assert_allclose(z, [0.04, 0.1, 1.2, 1.3, 0.0, np.nan, np.nan])
     exact = quiet(write(tmp_path, ("redshift_decimals = 1", "redshift_decimals = -1")))
     np.testing.assert_array_equal(exact.rounded([0.1234, 2.5]), [0.1234, 2.5])
-    with pytest.raises(ValueError, match="redshifts"):
-        setup.axes()
-    with pytest.raises(ValueError, match="redshifts"):
-        setup.axes([np.nan])
+    refuses("redshifts", setup.axes)
+    refuses("redshifts", setup.axes, [np.nan])
 
 
 # ------------------------------------------------------------------------- whole runs
@@ -674,8 +668,7 @@ def test_all_models_are_saved(tmp_path):
         tmp_path, ("pdf_analysis", "savefluxes"), ("fracAGN = 0.0, 0.5, 0.9", "fracAGN = 0.0, 0.5")
     )
     setup = quiet(path)
-    with pytest.raises(ConfigError, match=r"savefluxes\): CigaleSetup.save_models"):
-        fit_cigale(setup)
+    refuses(r"savefluxes\): CigaleSetup.save_models", fit_cigale, setup, error=ConfigError)
     table = setup.save_models(tmp_path / "models-block-0.fits", [0.5])
     # 2 tau x 2 ages x 2 E(B-V) x 2 tau97 x 2 inclinations x 2 fractions
     assert len(table) == 64
@@ -700,8 +693,7 @@ def test_all_models_are_saved(tmp_path):
         setup.filters()["irac.ch1"].synthetic_flux(sed).value,
         rtol=1e-5,
     )
-    with pytest.raises(OSError, match="overwrite"):
-        setup.save_models(tmp_path / "models-block-0.fits", [0.5])
+    refuses("overwrite", setup.save_models, tmp_path / "models-block-0.fits", [0.5], error=OSError)
 
 
 def test_text_and_fits_say_the_same(run, tmp_path):
@@ -709,8 +701,7 @@ def test_text_and_fits_say_the_same(run, tmp_path):
     results = fit_cigale(setup)
     for name in ("results.fits", "results.txt"):
         setup.write_results(results, tmp_path / name)
-        with pytest.raises(OSError, match="overwrite"):
-            setup.write_results(results, tmp_path / name)
+        refuses("overwrite", setup.write_results, results, tmp_path / name, error=OSError)
     one, two = (read_cigale_results(tmp_path / f"results.{x}") for x in ("fits", "txt"))
     assert one.colnames == two.colnames
     for name in one.colnames:
@@ -727,8 +718,7 @@ def test_text_and_fits_say_the_same(run, tmp_path):
         assert "1 no band" in text
     assert one["flags"].tolist() == results.flags.tolist()
     (tmp_path / "x.txt").write_text("id b\n1 2\n")
-    with pytest.raises(DataError, match=r"no column best.chi_square"):
-        read_cigale_results(tmp_path / "x.txt")
+    refuses(r"no column best.chi_square", read_cigale_results, tmp_path / "x.txt", error=DataError)
 
 
 def test_known_and_unknown_redshifts(run, tmp_path):
@@ -1005,8 +995,7 @@ def test_x_ray_bands_are_fitted_where_there_is_a_module(tmp_path):
     ):
         path.write_text(text.replace(old, new))
         if what:
-            with pytest.raises(ConfigError, match=what):
-                quiet(path)
+            refuses(what, quiet, path, error=ConfigError)
         else:
             assert "xray.E_cut = 300 (one value at a time)" in quiet(path).describe()
     # the bound of the relation, against every model by itself

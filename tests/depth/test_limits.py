@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose
 from photutils.aperture import ApertureStats, CircularAnnulus, CircularAperture
 from scipy.ndimage import gaussian_filter
 
+from helpers.errors import refuses
 from miricigale.depth import etc_limit, etc_setup, sensitivity, sensitivity_table
 from miricigale.depth.limits import extraction_weights
 from miricigale.depth.noise import noise_power, ramp_variance
@@ -235,8 +236,7 @@ def test_noise_is_that_of_simulated_and_reduced_exposures(residual, n_exposures,
     ],
 )
 def test_errors_name_the_argument(options, name, psf):
-    with pytest.raises(ValueError, match=f"'{name}' must be"):
-        sensitivity(NAME, **{"psf": psf, **options})
+    refuses(f"'{name}' must be", sensitivity, NAME, **{"psf": psf, **options})
 
 
 def test_unknown_names_list_the_known():
@@ -244,7 +244,5 @@ def test_unknown_names_list_the_known():
         sensitivity(NAME, residual="sky")
     with pytest.raises(ValueError, match=r"'psf' must be one of the filter miri\.f770w, got one"):
         sensitivity("miri.f770w", psf=miri_psf("miri.f560w"))
-    with pytest.raises(KeyError, match="no imaging filter"):
-        sensitivity("miri.f600w")
-    with pytest.raises(u.UnitsError, match="'time' must be"):
-        sensitivity(NAME, 1e4)
+    refuses("no imaging filter", sensitivity, "miri.f600w", error=KeyError)
+    refuses("'time' must be", sensitivity, NAME, 1e4, error=u.UnitsError)

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from helpers.errors import refuses
 from miricigale.evaluation import (
     CLASS_NAMES,
     KIRKPATRICK_LIMITS,
@@ -30,8 +31,7 @@ def test_classes_have_the_published_limits():
     assert got == ["galaxy"] * 2 + ["composite"] * 2 + ["agn"] * 2 + ["unknown"]
     got = classify([0.2, 0.5, 0.8], limits=KIRKPATRICK_LIMITS)
     assert got.tolist() == ["galaxy", "composite", "agn"]
-    with pytest.raises(ValueError, match="'frac_agn' must be between 0 and 1"):
-        classify([1.2])
+    refuses("'frac_agn' must be between 0 and 1", classify, [1.2])
 
 
 def test_purity_falls_with_the_share_of_wanted_sources_and_completeness_does_not():
@@ -52,7 +52,6 @@ def test_nothing_selected_has_no_purity():
 
 
 def test_other_lengths_are_refused():
-    with pytest.raises(ValueError, match="'found' must be a 1-D array as long as 'true'"):
-        confusion(["agn"], [])
+    refuses("'found' must be a 1-D array as long as 'true'", confusion, ["agn"], [])
     with pytest.raises(ValueError, match="'selected' must be a 1-D array as long as 'wanted'"):
         selection_quality([True], [True, False])

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from astropy.table import QTable
 
+from helpers.errors import refuses
 from helpers.studies import mock_study
 from miricigale.evaluation import (
     COLOR_WINDOWS,
@@ -163,5 +164,4 @@ def test_colors_tell_models_apart():
 def test_circles_need_agn_and_are_by_distance():
     got = ColorCircles((0.0, 0.0), 1.0, 2.0).classify([[0.6, 0.6], [1.2, 1.2], [2.0, 2.0]])
     assert got.tolist() == ["agn", "composite", "galaxy"]
-    with pytest.raises(ValueError, match="'classes' must be with an AGN that has colors"):
-        ColorCircles.fit([[0, 0]], ["galaxy"])
+    refuses("'classes' must be with an AGN that has colors", ColorCircles.fit, [[0, 0]], ["galaxy"])

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from helpers.errors import refuses
 from miricigale.evaluation import coverage_table, posterior_ranks
 
 LEVELS = np.linspace(0.001, 0.999, 999)
@@ -88,7 +89,5 @@ def test_posteriors_that_do_not_exist_have_no_rank():
 def test_refuses():
     with pytest.raises(ValueError, match="'values' must be of one shape"):
         posterior_ranks([1.0, 2.0], np.zeros((3, 4)), np.zeros(4))
-    with pytest.raises(ValueError, match="'ranks' must be between 0 and 1"):
-        coverage_table({"x": [1.5]})
-    with pytest.raises(ValueError, match="'levels' must be between 0 and 1"):
-        coverage_table({}, levels=(68,))
+    refuses("'ranks' must be between 0 and 1", coverage_table, {"x": [1.5]})
+    refuses("'levels' must be between 0 and 1", coverage_table, {}, levels=(68,))

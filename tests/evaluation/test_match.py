@@ -4,6 +4,7 @@ import pytest
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
+from helpers.errors import refuses
 from miricigale.evaluation import AssociationFlags, associate, match_truth
 from miricigale.utils.tables import match_sky
 
@@ -114,8 +115,7 @@ def test_association_of_what_cannot_be_placed():
     assert none["status"].tolist() == ["unmatched"]
     assert none.meta["counts"] == {"matched": 0, "ambiguous": 0, "unmatched": 1}
     assert len(associate(here[:0], here[:0], radius=1 * u.arcsec)) == 0
-    with pytest.raises(ValueError, match="'radius' must be positive"):
-        associate(here, here, radius=0 * u.arcsec)
+    refuses("'radius' must be positive", associate, here, here, radius=0 * u.arcsec)
     with pytest.raises(ValueError, match=r"'second' must be a table with the columns \['sky'\]"):
         associate(here, QTable({"id": [1]}), radius=1 * u.arcsec)
 

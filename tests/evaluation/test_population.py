@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from astropy.table import QTable
 
+from helpers.errors import refuses
 from miricigale.evaluation import (
     AGNPopulation,
     agn_fraction,
@@ -207,13 +208,11 @@ def test_what_is_no_galaxy_has_no_agn():
 def test_refuses():
     with pytest.raises(ValueError, match="'min_luminosity' must be from 1e41 to 1e46 erg/s"):
         AGNPopulation(min_luminosity=1 * u.W)
-    with pytest.raises(ValueError, match="'compton_thick' must be >= 0, got -1"):
-        AGNPopulation(compton_thick=-1)
+    refuses("'compton_thick' must be >= 0, got -1", AGNPopulation, compton_thick=-1)
     with pytest.raises(u.UnitsError, match="'stellar_mass' must be a quantity"):
         AGNPopulation().probability(1e10, 1.0)
     table = QTable({"id": [1, 1], "redshift": [1.0, 1.0], "stellar_mass": [1e10, 1e10] * u.Msun})
-    with pytest.raises(ValueError, match=r"ids are unique, got duplicates such as \[1\]"):
-        AGNPopulation().draw(table, seed=1)
+    refuses(r"ids are unique, got duplicates such as \[1\]", AGNPopulation().draw, table, seed=1)
 
 
 # --------------------------------------------------------------------------- fractions

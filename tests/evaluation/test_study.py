@@ -6,6 +6,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 
+from helpers.errors import refuses
 from helpers.studies import BANDS, FITS, LIMITS, mock_study, mock_truth
 from miricigale.evaluation import (
     PUBLISHED,
@@ -152,8 +153,7 @@ def test_what_a_study_lacks_is_nan(study):
     alone = StudyResults((one,), BANDS)
     assert np.isnan(got(alone, "z_outliers", band_set="red").value)
     assert np.isnan(got(alone, "z_outlier_ratio").value)
-    with pytest.raises(KeyError, match="no quantity 'z_scater'"):
-        got(study, "z_scater")
+    refuses("no quantity 'z_scater'", got, study, "z_scater", error=KeyError)
 
 
 def test_all_numbers_of_all_fits(study):
@@ -254,10 +254,8 @@ def test_tables_of_other_sources_are_refused():
     with pytest.raises(ValueError, match="'matched' must be of the sources of 'truth'"):
         TruthResults(**values | {"matched": one.matched[::-1]})
     fits = {"all": one.fits["all"][1:]}
-    with pytest.raises(ValueError, match="'fits' must be tables of the sample"):
-        TruthResults(**values | {"fits": fits})
-    with pytest.raises(ValueError, match="'field' must be of shape"):
-        TruthResults(**values | {"field": one.field[1:]})
+    refuses("'fits' must be tables of the sample", TruthResults, **values | {"fits": fits})
+    refuses("'field' must be of shape", TruthResults, **values | {"field": one.field[1:]})
     assert repr(one) == f"<TruthResults 'agn20', {one.sample.sum()} fitted>"
     assert one.magnitude_error(BANDS[0]).shape == (100,)
     assert one.matched[BANDS[0]].unit == u.uJy

@@ -4,6 +4,7 @@ import pytest
 from scipy.special import ndtr, ndtri
 from scipy.stats import norm
 
+from helpers.errors import refuses
 from miricigale.evaluation import (
     completeness,
     half_complete,
@@ -59,10 +60,8 @@ def test_there_is_no_limit_where_all_or_none_are_found():
 
 
 def test_refuses():
-    with pytest.raises(ValueError, match="'found' must be a 1-D array as long as 'values'"):
-        half_complete([1.0], [True, False])
-    with pytest.raises(ValueError, match="'edges' must be ascending"):
-        completeness([1.0], [True], [1.0, 0.0])
+    refuses("'found' must be a 1-D array as long as 'values'", half_complete, [1.0], [True, False])
+    refuses("'edges' must be ascending", completeness, [1.0], [True], [1.0, 0.0])
 
 
 def test_half_of_the_sources_is_half_where_some_bright_ones_are_lost():

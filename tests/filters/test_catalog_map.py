@@ -8,6 +8,7 @@ import pytest
 from astropy.table import QTable, Table
 from numpy.testing import assert_allclose, assert_array_equal
 
+from helpers.errors import refuses
 from miricigale.filters import SURVEYS, CatalogMap, read_catalog_photometry
 from miricigale.filters.catalog_files import MappedRows
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
@@ -223,10 +224,8 @@ def test_bands_without_a_filter_are_told_and_ones_own_columns_come_first(tmp_pat
     columns = {"sedpy.vlt_isaac_Ks": "HAWKI_KS_FLUX", "sedpy.vlt_isaac_Ks_err": "HAWKI_KS_FLUXERR"}
     out = read_catalog_photometry(path, survey="candels", columns=columns)
     assert out["sedpy.vlt_isaac_Ks"].unit == u.uJy
-    with pytest.raises(ValueError, match="a table with columns of 'dja'"):
-        read_catalog_photometry(path, "dja")
-    with pytest.raises(KeyError, match=r"no survey 'cosmos2015'"):
-        read_catalog_photometry(path, "cosmos2015")
+    refuses("a table with columns of 'dja'", read_catalog_photometry, path, "dja")
+    refuses(r"no survey 'cosmos2015'", read_catalog_photometry, path, "cosmos2015", error=KeyError)
     names = ["id", "f_F606W", "e_F606W", "f_ACS_F606W", "e_ACS_F606W"]
     with pytest.raises(DataError, match=r"f_F606W and f_ACS_F606W are both the filter acs\.f606w"):
         CatalogMap(survey="3dhst").convert(Table({name: [1.0] for name in names}))
@@ -269,8 +268,7 @@ def test_negative_errors_are_upper_limits_where_the_map_says_so(tmp_path):
     table[f"{BAND}_limit"] = np.zeros(6, bool)
     with pytest.raises(ValueError, match="where negative errors mark limits, got both"):
         CatalogMap(units={"flux": "mJy"}, limits=True).convert(table)
-    with pytest.raises(ValueError, match="'limits' must be True or False"):
-        CatalogMap(limits="yes")
+    refuses("'limits' must be True or False", CatalogMap, limits="yes")
 
 
 @pytest.mark.parametrize("suffix", FORMATS)

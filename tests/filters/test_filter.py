@@ -10,6 +10,7 @@ from astropy.modeling.physical_models import BlackBody
 from astropy.tests.helper import assert_quantity_allclose
 from numpy.testing import assert_allclose
 
+from helpers.errors import refuses
 from miricigale.filters import Filter, FilterSet, find_filter
 from miricigale.utils.exceptions import DataError
 
@@ -166,15 +167,12 @@ def test_spectrum_that_does_not_cover_the_band_is_refused():
     ],
 )
 def test_rejects_what_is_no_curve(wave, throughput, message):
-    with pytest.raises(ValueError, match=message):
-        Filter(wave, throughput, name="bad")
+    refuses(message, Filter, wave, throughput, name="bad")
 
 
 def test_rejects_wrong_units():
-    with pytest.raises(u.UnitsError, match="'wave' must be"):
-        Filter([1, 2] * u.K, [1, 1], name="bad")
-    with pytest.raises(u.UnitsError, match="'wave' must be a quantity"):
-        Filter([1, 2], [1, 1], name="bad")
+    refuses("'wave' must be", Filter, [1, 2] * u.K, [1, 1], error=u.UnitsError, name="bad")
+    refuses("'wave' must be a quantity", Filter, [1, 2], [1, 1], error=u.UnitsError, name="bad")
 
 
 def test_any_curve_of_sedpy_by_its_name():
@@ -193,8 +191,7 @@ def test_reads_the_files_of_cigale(tmp_path):
     assert_quantity_allclose(Filter.read(path).pivot, box().pivot, rtol=1e-9)
     # micrometers would be taken for Angstrom
     path.write_text("8 1\n12 1\n")
-    with pytest.raises(DataError, match="does not state the unit of its wavelengths"):
-        Filter.read(path)
+    refuses("does not state the unit of its wavelengths", Filter.read, path, error=DataError)
     band = Filter.read(path, name="a", unit=u.um)
     assert_quantity_allclose(band.pivot, box().pivot, rtol=1e-9)
     for name in ("a.ecsv", "a.fits", "a.xml"):
@@ -204,11 +201,9 @@ def test_reads_the_files_of_cigale(tmp_path):
 
 def test_unreadable_files_are_named(tmp_path):
     path = tmp_path / "some.dat"
-    with pytest.raises(DataError, match=r"some.dat cannot be read"):
-        Filter.read(path)
+    refuses(r"some.dat cannot be read", Filter.read, path, error=DataError)
     path.write_text("one two\n")
-    with pytest.raises(DataError, match=r"some.dat has not two columns of numbers"):
-        Filter.read(path)
+    refuses(r"some.dat has not two columns of numbers", Filter.read, path, error=DataError)
 
 
 def test_plot_returns_the_axes():
@@ -239,8 +234,7 @@ def test_spectra_of_other_packages():
         assert_quantity_allclose(FilterSet([band]).synthetic_fluxes(sed), [3] * u.uJy, rtol=rtol)
     assert_quantity_allclose(band.synthetic_flux(wave, flam), 3 * u.uJy)
     assert_quantity_allclose(band.synthetic_magnitude(model).value, 23.9 - 2.5 * np.log10(3))
-    with pytest.raises(u.UnitsError, match="wavelengths with a unit"):
-        band.synthetic_flux((wave.value, flam))
+    refuses("wavelengths with a unit", band.synthetic_flux, (wave.value, flam), error=u.UnitsError)
 
 
 def test_a_filter_says_what_it_has():
@@ -259,8 +253,7 @@ def test_a_filter_says_what_it_has():
     ):
         band.min_wavelength  # noqa: B018
     assert Filter([1, 2] * u.um, [1, 1], "own") == Filter("own", [1, 2] * u.um, [1, 1])
-    with pytest.raises(u.UnitsError, match="'wave' must be a quantity"):
-        Filter([1, 2], [1, 1], name="own")
+    refuses("'wave' must be a quantity", Filter, [1, 2], [1, 1], error=u.UnitsError, name="own")
 
 
 @pytest.mark.parametrize(
@@ -305,7 +298,6 @@ def test_names_of_others(text, name):
 
 def test_what_is_no_spectrum_is_named():
     band = box()
-    with pytest.raises(ValueError, match=r"'sed' must be a spectrum: .*, got NoneType"):
-        band.synthetic_flux(None)
+    refuses(r"'sed' must be a spectrum: .*, got NoneType", band.synthetic_flux, None)
     with pytest.raises(ValueError, match=r"'sed\.fnu' must be as many values as sed\.wave, got 2"):
         band.synthetic_flux(spectrum([7, 9, 13], [1, 1]))

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from astropy.table import MaskedColumn, QTable, Table
 
+from helpers.errors import refuses
 from miricigale.filters import as_photometry
 from miricigale.utils.exceptions import CatalogWarning
 
@@ -97,7 +98,5 @@ def test_magnitudes_that_stand_for_no_value_become_missing_bands():
 def test_two_columns_for_one_band_are_refused(catalog):
     table = renamed(catalog, "{}", "{}_err")
     table["jwst_f770w"] = table["F770W"]
-    with pytest.raises(ValueError, match=r"one column for 'miri.f770w', got 'F770W' and 'jwst_f77"):
-        as_photometry(table, BANDS)
-    with pytest.raises(ValueError, match=r"'catalog' must be a table, .*, got int"):
-        as_photometry(3, BANDS, "catalog")
+    refuses(r"one column for 'miri.f770w', got 'F770W' and 'jwst_f77", as_photometry, table, BANDS)
+    refuses(r"'catalog' must be a table, .*, got int", as_photometry, 3, BANDS, "catalog")

@@ -8,6 +8,7 @@ import pytest
 from astropy.modeling.models import BlackBody
 from astropy.table import QTable, Table, vstack
 
+from helpers.errors import refuses
 from miricigale.cli import main
 from miricigale.fitting import fit_catalog, open_results
 from miricigale.fitting.grid import GridEngine
@@ -191,8 +192,7 @@ def test_a_table_without_photometry_is_refused_with_what_is_wanted(tmp_path, cap
 
 
 def test_pairs_are_two_names(capsys):
-    with pytest.raises(SystemExit, match="2"):
-        main(["fit", "--pairs", "age:tau", "cat.fits"])
+    refuses("2", main, ["fit", "--pairs", "age:tau", "cat.fits"], error=SystemExit)
     assert "'cat.fits' is no pair NAME:NAME" in capsys.readouterr().err
 
 
@@ -237,8 +237,7 @@ def test_the_page_of_a_catalog_says_how_redshifts_compare_and_what_was_left_out(
     ):
         assert text in page, text
     assert "outliers, above 0.15" in page
-    with pytest.raises(ValueError, match="z_phot"):
-        fit_page(results, tmp_path / "cat.fits", z_spec="z_phot")
+    refuses("z_phot", fit_page, results, tmp_path / "cat.fits", z_spec="z_phot")
 
 
 def test_fluxes_behind_the_milky_way_give_the_galaxies_in_front_of_it(catalog, tmp_path):

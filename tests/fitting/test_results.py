@@ -5,6 +5,7 @@ from astropy.table import QTable
 from astropy.tests.helper import assert_quantity_allclose
 from matplotlib.figure import Figure
 
+from helpers.errors import refuses
 from helpers.results import assert_same_tables
 from miricigale.fitting import BayesFitter, FitResults
 from miricigale.fitting.posterior import cell_edges, cell_percentiles, moments
@@ -99,10 +100,8 @@ def test_views_agree_with_the_catalog(results):
         results[99]
     with pytest.raises(KeyError, match="no object with the id 99 among 12; the first are 0, 1"):
         results.loc[99]
-    with pytest.raises(KeyError, match="no parameter 'mood'; known: accretion_power"):
-        results.mean("mood")
-    with pytest.raises(ValueError, match="'levels' must be between 0 and 1"):
-        results.percentile("mass", [16])
+    refuses("no parameter 'mood'; known: accretion_power", results.mean, "mood", error=KeyError)
+    refuses("'levels' must be between 0 and 1", results.percentile, "mass", [16])
 
 
 def test_prediction_of_the_best_model(results, grid):
@@ -111,17 +110,14 @@ def test_prediction_of_the_best_model(results, grid):
     want = results.best_scale[0] * grid.flux(z, g, k, f)
     got = [table[f"{name}_best"][0].value for name in grid.filters]
     np.testing.assert_allclose(got, want, rtol=1e-12)
-    with pytest.raises(KeyError, match="no filter of the models 'band9'"):
-        results.predict(["band9"])
+    refuses("no filter of the models 'band9'", results.predict, ["band9"], error=KeyError)
 
 
 def test_tails_that_are_not_kept_have_no_percentiles(results):
     wanted = "'levels' must be from 0.001 to 0.999 for 'mass', whose distribution is kept there"
     for level in (1e-5, 0.9995):
-        with pytest.raises(ValueError, match=f"{wanted}, got .*{level:g}"):
-            results.percentile("mass", [0.5, level])
-        with pytest.raises(ValueError, match="for 'frac_agn_ir'"):
-            results[0].percentile("frac_agn_ir", level)
+        refuses(f"{wanted}, got .*{level:g}", results.percentile, "mass", [0.5, level])
+        refuses("for 'frac_agn_ir'", results[0].percentile, "frac_agn_ir", level)
     ends = results.percentile("mass", [0.001, 0.999])
     np.testing.assert_array_equal(ends, results.quantiles[:, 0][:, [0, -1]] * u.Msun)
     # the distribution of a parameter is known in full: its first cell is uniform
@@ -141,8 +137,7 @@ def test_write_and_read(results, tmp_path):
     np.testing.assert_array_equal(results.pdf_2d, again.pdf_2d)
     assert again.meta["fit"] == results.meta["fit"]
     assert again[5].best["mass"] == results[5].best["mass"]
-    with pytest.raises(OSError, match="already exists"):
-        results.write(path)
+    refuses("already exists", results.write, path, error=OSError)
     results.write(path, overwrite=True)
 
 
@@ -159,8 +154,7 @@ def test_ids_may_be_text_and_the_grid_without_agn(make_grid, draw_photometry, tm
 def test_foreign_files_are_refused(grid, tmp_path):
     path = tmp_path / "grid.fits"
     grid.write(path)
-    with pytest.raises(DataError, match="holds no fit results"):
-        FitResults.read(path)
+    refuses("holds no fit results", FitResults.read, path, error=DataError)
     path.write_text("text")
     for name in ("grid.fits", "none.fits"):
         with pytest.raises(DataError, match=f"{name} cannot be read as fit results: "):

@@ -10,6 +10,7 @@ from astropy.io import fits
 from astropy.table import QTable
 from scipy.stats import chi2
 
+from helpers.errors import refuses
 from helpers.results import assert_same_tables
 from miricigale.filters import FilterSet
 from miricigale.fitting import BayesFitter, GridSettings, Samples
@@ -209,18 +210,14 @@ def test_what_is_refused(real, model, samples):
         Samples(*args, real.index + 10, real.scale)
     with pytest.raises(KeyError, match="no object with the id 'd' among 3"):
         real.loc["d"]
-    with pytest.raises(KeyError, match="no parameter 'mood'"):
-        real.values("mood")
+    refuses("no parameter 'mood'", real.values, "mood", error=KeyError)
     with pytest.raises(ValueError, match="'model' must be an SEDModel"):
         Samples(*args, real.index, real.scale).predict(["miri.f1500w"])
     with pytest.raises(ValueError, match="'model' must be the one of the grid \\(components"):
         real.with_model(SEDModel.yang2021(agn=False)).sed_band("a")
-    with pytest.raises(ValueError, match=r"'key' must be .* got 'c' \(no_band\)"):
-        real.sed_band("c")
-    with pytest.raises(ValueError, match="'filters' must be a list"):
-        real.predict("miri.f770w")
-    with pytest.raises(ValueError, match="'levels' must be between 0 and 1"):
-        real.sed_band("a", (16, 84))
+    refuses(r"'key' must be .* got 'c' \(no_band\)", real.sed_band, "c")
+    refuses("'filters' must be a list", real.predict, "miri.f770w")
+    refuses("'levels' must be between 0 and 1", real.sed_band, "a", (16, 84))
     with pytest.raises(ValueError, match="read-only"):
         samples.scale[0, 0] = 1
     assert isinstance(samples.to_table(["mass"]), QTable)
@@ -240,8 +237,7 @@ def test_write_and_read(real, model, tmp_path):
     real.grid.write(tmp_path / "grid.fits")
     grid = type(real.grid).read(tmp_path / "grid.fits")
     np.testing.assert_array_equal(Samples.read(path, grid).values("mass"), real.values("mass"))
-    with pytest.raises(OSError, match="already exists"):
-        real.write(path)
+    refuses("already exists", real.write, path, error=OSError)
     real["b"].write(path, overwrite=True)
     assert list(Samples.read(path, real.grid).ids) == ["b"]
 
@@ -260,10 +256,8 @@ def test_files_that_are_no_samples_are_refused(real, grid, samples, tmp_path):
     with pytest.raises(DataError, match=r"half\.fits is not a complete file of samples"):
         Samples.read(tmp_path / "half.fits", grid)
     grid.write(path, overwrite=True)
-    with pytest.raises(DataError, match="holds no samples"):
-        Samples.read(path, grid)
-    with pytest.raises(DataError, match=r"absent\.fits"):
-        Samples.read(tmp_path / "absent.fits", grid)
+    refuses("holds no samples", Samples.read, path, grid, error=DataError)
+    refuses(r"absent\.fits", Samples.read, tmp_path / "absent.fits", grid, error=DataError)
 
 
 def test_draws_with_a_prior_keep_it_in_files(make_grid, draw_photometry, tmp_path):
@@ -303,8 +297,7 @@ def test_draws_are_those_of_the_object_whatever_its_company(grid, photometry):
     other = fitter.sample(photometry, 50, seed=5)
     assert np.any(whole.index != other.index)
     for bad in (0, 1.5, True):
-        with pytest.raises(ValueError, match="'n_draws' must be an integer >= 1"):
-            fitter.sample(photometry, bad, seed=1)
+        refuses("'n_draws' must be an integer >= 1", fitter.sample, photometry, bad, seed=1)
 
 
 def test_draws_have_the_joint_posterior_of_all_models(make_grid, draw_photometry, brute_force):

@@ -18,6 +18,7 @@ import pytest
 from astropy.io import fits
 from astropy.table import QTable
 
+from helpers.errors import refuses
 from helpers.results import assert_joined, assert_same, assert_same_tables
 from miricigale.fitting import BayesFitter, FitFlags, FitResults, fit_file, open_results
 from miricigale.utils.exceptions import DataError
@@ -289,18 +290,14 @@ def test_parts_of_another_version_are_refused_with_what_to_do(fitter, catalog, t
     manifest["job"]["settings"]["former"] = 1
     (out / "manifest.json").write_text(json.dumps(manifest))
     match = r"settings.former differ; give another folder, or resume=False .* of miricigale 0.1, "
-    with pytest.raises(
-        ValueError, match=match + r".*open_results\(path, partial=True\) reads them"
-    ):
-        fit_file(fitter, path, out)
+    refuses(match + r".*open_results\(path, partial=True\) reads them", fit_file, fitter, path, out)
     assert len(open_results(out, partial=True)) == 150
 
 
 def test_a_call_that_failed_at_once_binds_no_other(fitter, catalog, tmp_path):
     path, out = tmp_path / "catalog.csv", tmp_path / "out"
     catalog.write(path)
-    with pytest.raises(u.UnitsError, match="convertible to uJy"):
-        fit_file(fitter, path, out)
+    refuses("convertible to uJy", fit_file, fitter, path, out, error=u.UnitsError)
     # the remedy is another setting, in the folder that the first call made
     results = fit_file(fitter, path, out, flux_unit="uJy")
     assert len(results) == len(catalog)
@@ -334,8 +331,7 @@ def test_results_are_read_as_if_they_were_one(fitter, catalog, tmp_path):
     few = results.to_table(["id", "mass_p50"])
     assert few.colnames == ["id", "mass_p50"]
     np.testing.assert_array_equal(few["mass_p50"], wanted["mass_p50"])
-    with pytest.raises(KeyError, match="no column 'weight'; the nearest"):
-        results.to_table(["weight"])
+    refuses("no column 'weight'; the nearest", results.to_table, ["weight"], error=KeyError)
 
 
 def test_a_catalog_without_rows_has_results_without_rows(fitter, catalog, tmp_path):
@@ -471,8 +467,7 @@ def test_links_are_not_followed(fitter, catalog, tmp_path):
     assert not (tmp_path / "table.fits").is_symlink()
     (out / "part-00000.fits").unlink()
     (out / "part-00000.fits").symlink_to(tmp_path / "victim")
-    with pytest.raises(DataError, match="symbolic link"):
-        fit_file(fitter, path, out, resume=False)
+    refuses("symbolic link", fit_file, fitter, path, out, error=DataError, resume=False)
     assert (tmp_path / "victim").read_text() == "mine"
 
 
@@ -490,8 +485,7 @@ def test_numbers_as_ids(fitter, catalog, tmp_path):
 
 def test_what_cannot_be_read_by_rows_is_refused(fitter, catalog, tmp_path):
     def refused(name, match, error=DataError, **options):
-        with pytest.raises(error, match=match):
-            fit_file(fitter, tmp_path / name, tmp_path / "out", **options)
+        refuses(match, fit_file, fitter, tmp_path / name, tmp_path / "out", error=error, **options)
 
     good = tmp_path / "good.fits"
     catalog.write(good)
@@ -519,21 +513,17 @@ def test_what_cannot_be_read_by_rows_is_refused(fitter, catalog, tmp_path):
     refused("good.fits", "'chunk_rows' must be an integer >= 1, got 0", ValueError, chunk_rows=0)
     refused("good.fits", "'redshift' must be 150 values", ValueError, redshift=[1.0, 2.0])
     assert not (tmp_path / "out").exists()
-    with pytest.raises(ValueError, match="'fitter' must be a BayesFitter, got str"):
-        fit_file("fitter", good, tmp_path / "out")
+    refuses("'fitter' must be a BayesFitter, got str", fit_file, "fitter", good, tmp_path / "out")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.tex").write_text("mine")
     for resume in (True, False):
         with pytest.raises(DataError, match="is not empty and is no fit's folder"):
             fit_file(fitter, good, tmp_path / "full", resume=resume)
     assert (tmp_path / "full" / "thesis.tex").read_text() == "mine"
-    with pytest.raises(DataError, match="need a folder of their own"):
-        fit_file(fitter, good, good)
+    refuses("need a folder of their own", fit_file, fitter, good, good, error=DataError)
 
 
 def test_a_folder_of_something_else_is_no_results(tmp_path):
-    with pytest.raises(DataError, match="holds no results of fit_file"):
-        open_results(tmp_path)
+    refuses("holds no results of fit_file", open_results, tmp_path, error=DataError)
     (tmp_path / "manifest.json").write_text('{"format": "photos"}')
-    with pytest.raises(DataError, match=r"neither manifest.json nor .* can be read"):
-        open_results(tmp_path)
+    refuses(r"neither manifest.json nor .* can be read", open_results, tmp_path, error=DataError)

@@ -141,6 +141,10 @@ GUESSES = [
         "m.SEDModel.yang2021().evaluate(redshft=1)",
         "redshft.*did you mean 'redshift'",
     ),
+    ("star formation of a model", "m.SEDModel.yang2021().evaluate(redshift=1.0).sfr", None),
+    ("component of a model", 'm.SEDModel.yang2021()["agn"]', None),
+    ("component that is none", 'm.SEDModel.yang2021()["dst"]', "no component 'dst'; known: bc03"),
+    ("range of a filter", 'm.Filter("F770W").min_wavelength', None),
     ("a copy of an exposure", "copy.deepcopy(exposure)", None),
     ("pickle of a reducer", "pickle.loads(pickle.dumps(m.Reducer()))", None),
 ]

@@ -5,6 +5,7 @@ import sep
 from numpy.testing import assert_allclose
 from scipy.special import ndtr
 
+from helpers.errors import refuses
 from miricigale.instrument import north_up_wcs
 from miricigale.photometry import (
     aperture_correction,
@@ -98,8 +99,7 @@ def test_encircled_energy_and_scale_of_point_sources(tools, stars):
     assert_allclose(factor, 1 / 0.9, rtol=0.01)
     expected = 1 / (1 - np.exp(-0.5 * (0.5 / tools.LO) ** 2))
     assert_allclose(aperture_correction(psf, 0.5 * u.arcsec), expected, rtol=2e-3)
-    with pytest.raises(ValueError, match="'flux' must be positive"):
-        encircled_flux(image, sky, -flux * u.uJy, radii)
+    refuses("'flux' must be positive", encircled_flux, image, sky, -flux * u.uJy, radii)
 
 
 def extended(tools, scale, half=9.0):

@@ -5,6 +5,7 @@ from astropy.nddata import CCDData
 from astropy.utils.exceptions import AstropyDeprecationWarning
 from numpy.testing import assert_allclose
 
+from helpers.errors import refuses
 from miricigale.instrument import north_up_wcs
 from miricigale.photometry import (
     DETECTION_PRESETS,
@@ -86,8 +87,7 @@ def test_bad_settings(deep):
     _, _, image = deep
     with pytest.raises(KeyError, match="no detection preset 'deep'; known: default"):
         detect_sources(image, preset="deep")
-    with pytest.raises(ValueError, match="'threshold' must be positive"):
-        detect_sources(image, threshold=-1)
+    refuses("'threshold' must be positive", detect_sources, image, threshold=-1)
     with pytest.raises(ValueError, match="'image' must be an image with a celestial WCS"):
         detect_sources(CCDData(np.ones((20, 20)), unit="MJy/sr"))
 
@@ -150,8 +150,7 @@ def test_dilated_detections_hold_more_of_their_light(deep):
     assert abs(np.median(left)) < 0.02
     with pytest.raises(KeyError, match="no dilation rule 'twice'; known: area"):
         detect_sources(image, dilation="twice")
-    with pytest.raises(ValueError, match="'factors' must be 1 numbers of at least 1"):
-        DilationRule(factors=0.5)
+    refuses("'factors' must be 1 numbers of at least 1", DilationRule, factors=0.5)
 
 
 def test_purity_of_noise_and_of_sources(tools):

@@ -7,6 +7,7 @@ import scipy.sparse
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
+from helpers.errors import refuses
 from miricigale.instrument import north_up_wcs
 from miricigale.photometry import ErrorSettings, ForcedPhotometer
 from miricigale.photometry.draws import correlated_draws
@@ -45,8 +46,7 @@ def test_moments_of_draws_are_those_of_the_covariance(tools):
     assert_allclose(result.correlation(10, 11), np.corrcoef(draws.T)[0, 1], atol=0.02)
     assert abs(result.correlation(10, 16)) < 1e-12
     assert np.isnan(result.correlation(10, 17))
-    with pytest.raises(KeyError, match="no source with the id 3"):
-        result.correlation(10, 3)
+    refuses("no source with the id 3", result.correlation, 10, 3, error=KeyError)
 
 
 def test_draws_depend_on_the_seed_alone(tools):
@@ -63,8 +63,7 @@ def test_draws_depend_on_the_seed_alone(tools):
         rtol=1e-9,
     )
     for size in (0, 2.5, True):
-        with pytest.raises(ValueError, match="'size' must be an integer of at least 1"):
-            result.sample(size)
+        refuses("'size' must be an integer of at least 1", result.sample, size)
     with pytest.raises(ValueError, match="'point' must be False where no second components"):
         result.sample(3, seed=1, point=True)
 

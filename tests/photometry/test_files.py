@@ -13,6 +13,7 @@ from astropy.nddata import CCDData
 from astropy.table import QTable, Table
 from numpy.testing import assert_array_equal
 
+from helpers.errors import refuses
 from miricigale.instrument import north_up_wcs
 from miricigale.photometry import (
     ErrorModel,
@@ -105,8 +106,7 @@ def test_result_comes_back(result, tmp_path):
     check(result, pickle.loads(pickle.dumps(result)))
     check(result, copy.deepcopy(result))
     check(result, copy.copy(result))
-    with pytest.raises(OSError, match="overwrite"):
-        result.write(path)
+    refuses("overwrite", result.write, path, error=OSError)
     before = path.read_bytes()
     result.write(path, overwrite=True)
     assert path.read_bytes() == before

@@ -7,6 +7,7 @@ from astropy.nddata import CCDData
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
+from helpers.errors import refuses
 from miricigale.instrument import imager_wcs, north_up_wcs, pixel_area_map
 from miricigale.photometry import (
     ErrorSettings,
@@ -379,8 +380,7 @@ def test_files_in_place_of_memory_change_nothing(tools, field, tmp_path):
         assert not isinstance(getattr(one, name).data.base, np.memmap)
     # nothing is left behind
     assert not list(tmp_path.iterdir())
-    with pytest.raises(ValueError, match="'scratch' must be a folder that is there"):
-        MemorySettings(scratch=tmp_path / "none")
+    refuses("'scratch' must be a folder that is there", MemorySettings, scratch=tmp_path / "none")
 
 
 @pytest.mark.parametrize("n_threads", [2, 3])
@@ -443,10 +443,8 @@ def test_integration_over_pixels(tools):
     ],
 )
 def test_bad_settings_are_refused(tools, change, error, text):
-    with pytest.raises(error, match=text):
-        ForcedPhotometer(tools.kernel, **change)
-    with pytest.raises(ValueError, match="'psf_error' must be from 0 to 1, got 2"):
-        ErrorSettings(psf_error=2)
+    refuses(text, ForcedPhotometer, tools.kernel, error=error, **change)
+    refuses("'psf_error' must be from 0 to 1, got 2", ErrorSettings, psf_error=2)
 
 
 def test_bad_inputs_are_refused(tools, field):

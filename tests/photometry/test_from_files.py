@@ -12,6 +12,7 @@ from astropy.io import fits
 from astropy.nddata import CCDData, StdDevUncertainty
 from astropy.table import QTable, Table
 
+from helpers.errors import refuses
 from helpers.light import gaussian_image
 from helpers.mosaics import render
 from miricigale.cli import main
@@ -314,8 +315,7 @@ def test_kernels_that_are_none_are_refused(files):
         ("sum", np.ones((5, 5)), "a kernel whose sum is 1, got a sum of 25"),
     ):
         path = files.save(f"{name}.fits", data)
-        with pytest.raises(DataError, match=message):
-            read_kernel(path, **options)
+        refuses(message, read_kernel, path, error=DataError, **options)
 
 
 def test_a_real_field_agrees_with_another_program(data_file, tmp_path, capsys):

@@ -6,6 +6,7 @@ import pytest
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
+from helpers.errors import refuses
 from miricigale.instrument import north_up_wcs
 from miricigale.photometry import (
     ErrorCalibration,
@@ -50,8 +51,7 @@ def test_few_sources_are_one_bin_and_fewer_none(tmp_path):
     sources = known(np.ones_like, n=40)
     calibration = ErrorCalibration.from_sources(sources)
     assert len(calibration.bins) == 1
-    with pytest.raises(ValueError, match="'sources' must be at least 30 sources"):
-        ErrorCalibration.from_sources(sources[:20])
+    refuses("'sources' must be at least 30 sources", ErrorCalibration.from_sources, sources[:20])
     calibration.write(tmp_path / "c.ecsv")
     again = ErrorCalibration.read(tmp_path / "c.ecsv")
     assert_allclose(again.bins["factor"], calibration.bins["factor"], rtol=1e-12)
@@ -93,8 +93,7 @@ def test_injected_points_tell_understated_errors(tools, points, stated):
     assert_allclose(factor, calibration.factor(result.flux, result.flux_err_noise), rtol=1e-12)
     assert_allclose(np.sqrt(scaled.covariance.diagonal()), scaled.flux_err.value, rtol=1e-9)
     assert_array_equal(scaled.flux, result.flux)
-    with pytest.raises(ValueError, match="'result' must be one with errors as they were measured"):
-        calibration.apply(scaled)
+    refuses("'result' must be one with errors as they were measured", calibration.apply, scaled)
 
 
 def test_galaxies_are_injected_into_the_prior_too(tools):

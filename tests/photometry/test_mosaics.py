@@ -8,6 +8,7 @@ import pytest
 from astropy.io import fits
 from numpy.testing import assert_allclose
 
+from helpers.errors import refuses
 from miricigale.instrument import north_up_wcs, pixel_area_map
 from miricigale.photometry import MosaicFile, read_mosaic, weight_scale
 from miricigale.photometry.grids import grid_angle
@@ -234,8 +235,7 @@ def test_the_angle_of_a_grid_is_that_of_its_columns(tools, angle):
     found = grid_angle(wcs, SHAPE).value % 360
     assert abs((found - expected + 180) % 360 - 180) < 0.01
     wcs.wcs.cdelt = [SCALE / 3600, SCALE / 3600]
-    with pytest.raises(ValueError, match="a mirrored one"):
-        grid_angle(wcs, SHAPE)
+    refuses("a mirrored one", grid_angle, wcs, SHAPE)
 
 
 def test_a_real_i2d_file_of_the_jwst_pipeline(data_file):

@@ -7,6 +7,7 @@ from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.table import QTable, Table
 
+from helpers.errors import refuses
 from miricigale.instrument import north_up_wcs
 from miricigale.photometry import read_prior
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
@@ -128,22 +129,18 @@ def test_a_prior_on_other_pixels_is_refused_by_name(prior, tmp_path):
         path = tmp_path / "moved.fits"
         path.unlink(missing_ok=True)
         save(tmp_path, (labels * scale)[cut:], image.wcs, name=path.name, dtype=dtype, **change)
-        with pytest.raises(DataError, match=message):
-            read_prior(image, segmentation=path)
+        refuses(message, read_prior, image, error=DataError, segmentation=path)
 
 
 def test_catalogues_that_cannot_be_used_are_refused(prior, tmp_path):
     image, _, sky = prior
     path = tmp_path / "a.csv"
     Table({"id": IDS, "x": PLACES[:, 0]}).write(path)
-    with pytest.raises(ValueError, match=r"a.csv' must be a table with positions: 'sky'"):
-        read_prior(image, catalog=path)
+    refuses(r"a.csv' must be a table with positions: 'sky'", read_prior, image, catalog=path)
     with pytest.raises(ValueError, match="ids are unique"):
         read_prior(image, catalog=write_csv(tmp_path / "b.csv", [1, 1, 2, 3], sky))
     Table({"ra": ["10:00:00"], "dec": ["-27:00:00"]}).write(tmp_path / "c.csv")
-    with pytest.raises(ValueError, match="'ra'"):
-        read_prior(image, catalog=tmp_path / "c.csv")
+    refuses("'ra'", read_prior, image, catalog=tmp_path / "c.csv")
     with pytest.raises(DataError, match=r"absent.csv cannot be read as a table: no such file"):
         read_prior(image, catalog=tmp_path / "absent.csv")
-    with pytest.raises(ValueError, match="'segmentation' or 'catalog' must be given"):
-        read_prior(image)
+    refuses("'segmentation' or 'catalog' must be given", read_prior, image)

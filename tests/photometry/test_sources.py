@@ -9,6 +9,7 @@ from astropy.io import fits
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
+from helpers.errors import refuses
 from miricigale.instrument import imager_wcs, north_up_wcs
 from miricigale.photometry import (
     ErrorSettings,
@@ -207,8 +208,7 @@ def test_what_does_not_fit_is_refused(tools, scene, tmp_path):
     other = SourceTemplates.from_arrays([np.ones((3, 3))], [(0, 0)], detected[:1], wcs=coarse)
     with pytest.raises(ValueError, match="'templates' must be on the kernel's pixels"):
         photometer.measure(images["one"], templates=other)
-    with pytest.raises(ValueError, match="'parts' must be on one grid"):
-        SourceTemplates.concatenate([templates, other])
+    refuses("'parts' must be on one grid", SourceTemplates.concatenate, [templates, other])
     with pytest.raises(ValueError, match="'id' must be a table whose ids are unique"):
         SourceTemplates.concatenate([templates, templates])
     with pytest.raises(ValueError, match="'arrays' must be two-dimensional, finite"):

@@ -11,6 +11,7 @@ from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.table import Table
 
+from helpers.errors import refuses
 from miricigale.instrument import north_up_wcs, pixel_area_map
 from miricigale.photometry import MosaicFile, read_mosaic
 from miricigale.photometry.from_files import measure_files
@@ -123,14 +124,10 @@ def test_psfs_of_any_sum_hold_what_the_model_does(field, tmp_path, width, total)
 def test_psfs_on_cells_of_a_pixel_are_told_by_their_width(field, tmp_path):
     data = miri_psf("miri.f770w", fov=8 * ARCSEC).data
     path = saved(tmp_path, data / data.sum())
-    with pytest.raises(
-        ValueError, match=r"'psf' must be a PSF of miri.f770w, about 0\.28.*its pix"
-    ):
-        fluxes(field, psf=path)
+    refuses(r"'psf' must be a PSF of miri.f770w, about 0\.28.*its pix", fluxes, field, psf=path)
     # the header tells the cell; then the roll is missing
     path = saved(tmp_path, data / data.sum(), PIXELSCL=0.11092 / 4)
-    with pytest.raises(ValueError, match="one whose spikes stand as in the detector's axes"):
-        fluxes(field, psf=path)
+    refuses("one whose spikes stand as in the detector's axes", fluxes, field, psf=path)
     with pytest.raises(ValueError, match=r"'psf_scale' must be 0\.02773 arcsec, as the header"):
         fluxes(field, psf=path, psf_scale=0.11 * ARCSEC)
     # of a single exposure: not as wide as that of a mosaic
@@ -265,8 +262,7 @@ def test_catalogs_of_other_fields_and_missing_positions(field, tmp_path, monkeyp
         catalog = field.catalog.copy()
         catalog["ra"] = change(catalog["ra"])
         catalog.write(tmp_path / "far.fits", overwrite=True)
-        with pytest.raises(ValueError, match=message):
-            fluxes(field, catalog=tmp_path / "far.fits")
+        refuses(message, fluxes, field, catalog=tmp_path / "far.fits")
 
 
 def test_model_psfs_of_a_nircam_prior(field, tmp_path):

@@ -2,6 +2,7 @@
 
 import pytest
 
+from helpers.errors import refuses
 from miricigale.planning import PlanConfig, load_plan
 from miricigale.utils.exceptions import ConfigError
 
@@ -42,8 +43,7 @@ def test_the_text_gives_the_configuration_back(tmp_path):
     ],
 )
 def test_what_cannot_be_planned_is_named(values, message):
-    with pytest.raises(ConfigError, match=message):
-        PlanConfig.from_dict(values)
+    refuses(message, PlanConfig.from_dict, values, error=ConfigError)
 
 
 def test_a_band_that_miri_lacks_is_named_with_the_others():
@@ -58,5 +58,4 @@ def test_sets_are_in_order_of_wavelength_by_any_name():
 
 
 def test_a_file_that_is_not_there_is_named():
-    with pytest.raises(ConfigError, match=r"no configuration file .*absent\.toml"):
-        load_plan("absent.toml")
+    refuses(r"no configuration file .*absent\.toml", load_plan, "absent.toml", error=ConfigError)

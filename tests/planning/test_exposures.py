@@ -4,6 +4,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 
+from helpers.errors import refuses
 from miricigale.depth import etc_limit, saturation_forecast, sensitivity
 from miricigale.instrument import background_level
 from miricigale.photometry import ErrorModel
@@ -121,5 +122,4 @@ def test_errors_of_a_run_are_its_own_for_its_exposures(tmp_path, own, same):
 
 
 def test_a_run_that_is_none_is_named(tmp_path):
-    with pytest.raises(DataError, match=r"has no errors\.ecsv"):
-        RunErrors.read(tmp_path)
+    refuses(r"has no errors\.ecsv", RunErrors.read, tmp_path, error=DataError)

@@ -3,6 +3,7 @@ import pytest
 from matplotlib.colors import AsinhNorm, Normalize
 from matplotlib.figure import Figure
 
+from helpers.errors import refuses
 from helpers.figures import line_data
 from miricigale.plotting.images import (
     add_colorbar,
@@ -35,8 +36,7 @@ def test_axes_are_in_arcsec_about_the_middle(image, ax):
     left, _, bottom, _ = other.images[0].get_extent()
     assert left == pytest.approx(-20.5 * 0.11)
     assert bottom == pytest.approx(-15.5 * 0.11)
-    with pytest.raises(ValueError, match="'stretch' must be 'asinh' or 'linear'"):
-        plot_image(image, ax=other, stretch="log")
+    refuses("'stretch' must be 'asinh' or 'linear'", plot_image, image, ax=other, stretch="log")
 
 
 def test_an_image_is_drawn_as_it_is(image, ax):
@@ -84,8 +84,7 @@ def test_residual_is_image_minus_model(image):
     norm = plot_model_residual(image, image + 3.0)[2].images[0].norm
     assert norm.vmin == -norm.vmax
     assert axes[0].images[0].norm.vmax == axes[1].images[0].norm.vmax
-    with pytest.raises(ValueError, match="'ax' must be three axes"):
-        plot_model_residual(image, image, ax=[axes[0]])
+    refuses("'ax' must be three axes", plot_model_residual, image, image, ax=[axes[0]])
 
 
 def test_color_shows_where_the_light_is_red(image):
@@ -100,8 +99,7 @@ def test_color_shows_where_the_light_is_red(image):
     holed = image.copy()
     holed[3, 4] = np.nan
     assert (color_image(dark, holed, dark)[3, 4] == 0).all()
-    with pytest.raises(ValueError, match="must be of one shape"):
-        color_image(image, dark, dark[:5])
+    refuses("must be of one shape", color_image, image, dark, dark[:5])
 
 
 def test_marks_have_their_length_and_direction(image, ax):

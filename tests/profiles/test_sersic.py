@@ -6,6 +6,7 @@ from astropy.modeling.models import Sersic2D
 from numpy.testing import assert_allclose
 from scipy.special import gamma
 
+from helpers.errors import refuses
 from helpers.light import pixel_gaussian
 from miricigale.profiles import (
     sersic_bn,
@@ -186,5 +187,4 @@ def test_stamp_is_a_cut_of_the_image():
 )
 def test_refuses(name, value, match):
     kwargs = {"x": 5, "y": 5, "r_eff": 2.0, "n": 1.0, name: value}
-    with pytest.raises(ValueError, match=match):
-        sersic_image((11, 11), **kwargs)
+    refuses(match, sersic_image, (11, 11), **kwargs)

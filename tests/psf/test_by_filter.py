@@ -4,6 +4,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 
+from helpers.errors import refuses
 from miricigale.psf import (
     checked_psf,
     encircled_energy,
@@ -66,8 +67,7 @@ def test_widths_and_spikes_of_another_psf_are_refused(mosaic):
     with pytest.warns(MiricigaleWarning, match=r"is 2.1 times as wide .* this resolution"):
         assert checked_psf(wide, "miri.f770w", smoothed=True) is wide
     sharp = gaussian_psf(0.3 * u.arcsec, pixel_scale=PIXEL, fov=5 * u.arcsec)
-    with pytest.raises(ValueError, match=r"must be a PSF of miri\.f2100w"):
-        checked_psf(sharp, "miri.f2100w", smoothed=True)
+    refuses(r"must be a PSF of miri\.f2100w", checked_psf, sharp, "miri.f2100w", smoothed=True)
     # turned by the wrong angle, and not at all
     plain = make_psf(stamp(filter_psf("miri.f770w", pixel_scale=PIXEL, pa=0 * u.deg), 61), **SKY)
     with pytest.raises(ValueError, match="whose spikes stand as in the detector's axes"):

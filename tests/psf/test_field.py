@@ -5,6 +5,7 @@ from astropy.coordinates import SkyCoord
 from astropy.nddata import NDData
 from photutils.psf import GriddedPSFModel, ImagePSF
 
+from helpers.errors import refuses
 from miricigale.instrument import aperture, pixel_to_sky
 from miricigale.psf import (
     MIRI_PIXEL_SCALE,
@@ -192,15 +193,12 @@ def test_f160w_over_a_mosaic_of_two_rolls():
 def test_refuses():
     psf = gaussian_psf(0.3 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=2 * u.arcsec)
     square = [(0, 0), (9, 0), (0, 9), (9, 9)]
-    with pytest.raises(ValueError, match=r"'positions' must be of shape \(4, 2\)"):
-        psf_grid([psf] * 4, square[:3])
+    refuses(r"'positions' must be of shape \(4, 2\)", psf_grid, [psf] * 4, square[:3])
     with pytest.raises(ValueError, match="'positions' must be all points of a rectangular grid"):
         psf_grid([psf] * 4, [(0, 0), (9, 0), (0, 9), (8, 9)])
-    with pytest.raises(ValueError, match="'positions' must be different places"):
-        psf_grid([psf] * 5, [*square, (9, 9)])
+    refuses("'positions' must be different places", psf_grid, [psf] * 5, [*square, (9, 9)])
     wide = gaussian_psf(0.3 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=3 * u.arcsec)
-    with pytest.raises(ValueError, match="'psfs' must be alike in shape"):
-        psf_grid([psf, psf, psf, wide], square)
+    refuses("'psfs' must be alike in shape", psf_grid, [psf, psf, psf, wide], square)
     with pytest.raises(ValueError, match="'psfs' must be alike in oversampling, got 4 and 3"):
         psf_grid([psf, psf, psf, miri_psf("miri.f770w", **SMALL)], square)
     with pytest.raises(ValueError, match="'n_psfs' must be a square number of at least 4, got 6"):
@@ -211,5 +209,4 @@ def test_refuses():
         psf_at(ImagePSF(np.ones((5, 5))), 0, 0)
     meta = {"grid_xypos": square, "oversampling": 1}
     bare = GriddedPSFModel(NDData(np.ones((4, 5, 5)), meta=meta))
-    with pytest.raises(ValueError, match="from_photutils"):
-        psf_at(bare, 0, 0)
+    refuses("from_photutils", psf_at, bare, 0, 0)

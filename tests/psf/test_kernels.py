@@ -5,6 +5,7 @@ from astropy.io import fits
 from photutils.psf_matching import make_wiener_kernel
 from scipy.signal import fftconvolve
 
+from helpers.errors import refuses
 from helpers.light import gaussian_image
 from miricigale.psf import (
     MatchingKernel,
@@ -174,8 +175,7 @@ def test_cropping_says_what_is_lost(hi, lo):
     assert 0.01 < small.meta["lost"] < 0.05
     smaller = small.cropped(6 * u.arcsec)
     assert smaller.meta["lost"] == pytest.approx(kernel.array.sum() - smaller.array.sum())
-    with pytest.raises(ValueError, match="'extent' must be at most"):
-        small.cropped(20 * u.arcsec)
+    refuses("'extent' must be at most", small.cropped, 20 * u.arcsec)
     direct = MatchingKernel.from_psfs(
         hi, lo["f1500w"], pixel_scale=SCALE, lo_angle=0 * u.deg, extent=10 * u.arcsec
     )
@@ -197,8 +197,7 @@ def test_values_are_frozen_and_checked():
     kernel = MatchingKernel(gaussian_image(5, 1.0), pixel_scale=SCALE)
     with pytest.raises(ValueError, match="read-only"):
         kernel.array[0, 0] = 1
-    with pytest.raises(ValueError, match="'source, target' must be the kernel's PSFs"):
-        kernel.encircled_energy_error()
+    refuses("'source, target' must be the kernel's PSFs", kernel.encircled_energy_error)
     with pytest.raises(ValueError, match="'array' must be square with an odd number"):
         MatchingKernel(np.ones((4, 4)), pixel_scale=SCALE)
     with pytest.raises(ValueError, match="'image' must be finite, got 1 pixels"):

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from photutils.psf import ImagePSF
 
+from helpers.errors import refuses
 from miricigale.filters import Filter
 from miricigale.psf import (
     _core,
@@ -249,23 +250,16 @@ def test_gaussian_and_moffat_have_their_width_and_energy():
 def test_wrong_arguments_are_named():
     with pytest.raises(KeyError, match=r"no PSF for the filter 'miri.f999w'; known: miri.f1000w"):
         miri_psf("miri.f999w")
-    with pytest.raises(ValueError, match="'includes' must be out of"):
-        miri_psf("miri.f770w", includes=("pixel", "smile"))
-    with pytest.raises(u.UnitsError, match="'fov' must be a quantity"):
-        miri_psf("miri.f770w", fov=10)
+    refuses("'includes' must be out of", miri_psf, "miri.f770w", includes=("pixel", "smile"))
+    refuses("'fov' must be a quantity", miri_psf, "miri.f770w", error=u.UnitsError, fov=10)
     with pytest.raises(u.UnitsError, match="'wavefront_error' must be convertible"):
         miri_psf("miri.f770w", wavefront_error=1 * u.s)
-    with pytest.raises(ValueError, match="'oversampling' must be a positive integer"):
-        miri_psf("miri.f770w", oversampling=0)
-    with pytest.raises(ValueError, match="'fwhm' must be at least"):
-        hst_psf(fwhm=0.1 * u.arcsec)
+    refuses("'oversampling' must be a positive integer", miri_psf, "miri.f770w", oversampling=0)
+    refuses("'fwhm' must be at least", hst_psf, fwhm=0.1 * u.arcsec)
     psf = gaussian_psf(0.5 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=4 * u.arcsec)
-    with pytest.raises(ValueError, match="'radius' must be between 0 and the half width"):
-        encircled_energy(psf, 3 * u.arcsec)
-    with pytest.raises(ValueError, match="'fraction' must be positive and at most"):
-        radius_of_encircled_energy(psf, 1.5)
+    refuses("'radius' must be between 0 and the half width", encircled_energy, psf, 3 * u.arcsec)
+    refuses("'fraction' must be positive and at most", radius_of_encircled_energy, psf, 1.5)
     with pytest.raises(ValueError, match="'data' must be normalized to 4"):
         make_psf(np.ones((9, 9)), pixel_scale=1 * u.arcsec, oversampling=2, frame="sky")
     bare = ImagePSF(np.ones((9, 9)) / 81)
-    with pytest.raises(ValueError, match="from_photutils"):
-        fwhm(bare)
+    refuses("from_photutils", fwhm, bare)

@@ -10,6 +10,7 @@ from astropy.coordinates import SkyCoord
 from astropy.io.registry import IORegistryError
 from photutils.psf import ImagePSF
 
+from helpers.errors import refuses
 from miricigale.psf import (
     InstrumentPSF,
     KernelField,
@@ -47,13 +48,10 @@ def test_copies_pickles_and_files_keep_all(psf, tmp_path):
     ):  # fmt: skip
         same(one, psf)
         assert one(0.3, 0.4) == psf(0.3, 0.4)
-    with pytest.raises(OSError, match="overwrite"):
-        psf.write(tmp_path / "psf.fits")
-    with pytest.raises(IORegistryError, match=r"\.ecsv must end in"):
-        psf.write(tmp_path / "psf.ecsv")
+    refuses("overwrite", psf.write, tmp_path / "psf.fits", error=OSError)
+    refuses(r"\.ecsv must end in", psf.write, tmp_path / "psf.ecsv", error=IORegistryError)
     MatchingKernel(np.eye(3), 0.1 * u.arcsec).write(tmp_path / "kernel.fits")
-    with pytest.raises(DataError, match="holds no PSFs"):
-        InstrumentPSF.read(tmp_path / "kernel.fits")
+    refuses("holds no PSFs", InstrumentPSF.read, tmp_path / "kernel.fits", error=DataError)
 
 
 def test_grids_are_copied_and_pickled():

@@ -2,6 +2,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 
+from helpers.errors import refuses
 from helpers.light import gaussian_image
 from miricigale.psf import _core, hst_pupil, jwst_pupil, optics
 
@@ -167,12 +168,8 @@ def test_image_stands_on_the_middle_cell_whatever_the_wavefront():
 
 def test_bad_arguments_are_named():
     pupil = jwst_pupil(128)
-    with pytest.raises(ValueError, match="'rms' must be zero or positive"):
-        pupil.wavefront_error(-1.0)
-    with pytest.raises(ValueError, match="'n' must be odd, got 50"):
-        optics.polychromatic_psf(pupil, 0.0, [5.6], step=0.1, n=50)
-    with pytest.raises(ValueError, match="an image below"):
-        optics.polychromatic_psf(pupil, 0.0, [5.6], step=0.1, n=501)
-    with pytest.raises(ValueError, match="'n' must be at least 64"):
-        jwst_pupil(32)
+    refuses("'rms' must be zero or positive", pupil.wavefront_error, -1.0)
+    refuses("'n' must be odd, got 50", optics.polychromatic_psf, pupil, 0.0, [5.6], step=0.1, n=50)
+    refuses("an image below", optics.polychromatic_psf, pupil, 0.0, [5.6], step=0.1, n=501)
+    refuses("'n' must be at least 64", jwst_pupil, 32)
     assert (1 * u.arcsec).to_value(u.rad) == pytest.approx(ARCSEC)

@@ -8,6 +8,7 @@ from astropy.wcs import WCS
 from photutils.psf import ImagePSF
 from scipy.signal import fftconvolve
 
+from helpers.errors import refuses
 from helpers.light import gaussian_image
 from miricigale.psf import (
     MatchingKernel,
@@ -109,8 +110,7 @@ def test_oversampled_psf_of_unit_sum_is_scaled_and_said():
 def test_sums_that_are_no_fraction_are_refused_unless_scaled(factor):
     data = factor * gaussian_image(51, HI)
     kind = {"pixel_scale": SCALE, "frame": "sky"}
-    with pytest.raises(ValueError, match=r"'data' must be .*'enclosed' given"):
-        make_psf(data, **kind)
+    refuses(r"'data' must be .*'enclosed' given", make_psf, data, **kind)
     with pytest.raises(ValueError, match="'hi' must be a PSF whose sum is the fraction of light"):
         MatchingKernel.from_psfs(data, gaussian_image(51, LO), pixel_scale=SCALE)
     kernel = MatchingKernel.from_psfs(
@@ -119,8 +119,7 @@ def test_sums_that_are_no_fraction_are_refused_unless_scaled(factor):
     assert_is_the_gaussian_kernel(kernel)
     psf = make_psf(data, **kind, enclosed=0.97)
     assert psf.enclosed == pytest.approx(0.97)
-    with pytest.raises(ValueError, match="'enclosed' must be above 0 and at most 1"):
-        make_psf(data, **kind, enclosed=1.5)
+    refuses("'enclosed' must be above 0 and at most 1", make_psf, data, **kind, enclosed=1.5)
 
 
 def test_truncated_wings_are_said_and_the_kernel_has_unit_sum():
@@ -216,11 +215,9 @@ def test_scale_and_angle_come_from_the_header(tmp_path):
     assert psf.angle.value == pytest.approx(30)
     with pytest.raises(ValueError, match=r"'pixel_scale' must be 0\.04 arcsec by the header"):
         read_psf(path, frame="sky", pixel_scale=0.06 * u.arcsec)
-    with pytest.raises(ValueError, match=r"'angle' must be the header's, 30 deg"):
-        read_psf(path, frame="sky", angle=0 * u.deg)
+    refuses(r"'angle' must be the header's, 30 deg", read_psf, path, frame="sky", angle=0 * u.deg)
     fits.writeto(path, gaussian_image(51, HI), header(flip=1), overwrite=True)
-    with pytest.raises(ValueError, match="'path' must be a file with east to the left"):
-        read_psf(path, frame="sky")
+    refuses("'path' must be a file with east to the left", read_psf, path, frame="sky")
     # stpsf's, arcsec per cell
     fits.writeto(
         path, gaussian_image(51, 4 * HI), fits.Header({"PIXELSCL": 0.0275}), overwrite=True
@@ -229,8 +226,7 @@ def test_scale_and_angle_come_from_the_header(tmp_path):
         psf = read_psf(path, frame="detector", oversampling=4)
     assert psf.pixel_scale.value == pytest.approx(0.11)
     fits.writeto(path, gaussian_image(51, HI), overwrite=True)
-    with pytest.raises(ValueError, match="'pixel_scale' must be given where the header"):
-        read_psf(path, frame="sky")
+    refuses("'pixel_scale' must be given where the header", read_psf, path, frame="sky")
 
 
 def test_roll_of_the_header_turns_the_psf(tmp_path):
@@ -299,8 +295,7 @@ def test_kernels_of_regions_blend():
     assert mean.meta["weights"] == [0.75, 0.25]
     with pytest.raises(ValueError, match="'kernels' must be alike"):
         MatchingKernel.blend([kernels[0], kernels[0].cropped(1 * u.arcsec)])
-    with pytest.raises(ValueError, match="'weights' must be 2 non-negative numbers"):
-        MatchingKernel.blend(kernels, [0, 0])
+    refuses("'weights' must be 2 non-negative numbers", MatchingKernel.blend, kernels, [0, 0])
 
 
 @pytest.mark.filterwarnings("ignore:light beyond the PSFs' grids")

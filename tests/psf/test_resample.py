@@ -5,6 +5,7 @@ from astropy.nddata import NDData
 from astropy.wcs import WCS
 from photutils.psf import GriddedPSFModel, ImagePSF
 
+from helpers.errors import refuses
 from miricigale.psf import (
     average_psf,
     encircled_energy,
@@ -148,13 +149,10 @@ def test_second_moments_of_a_mosaic_of_dithers():
 
 
 def test_unknown_and_superfluous_angles_are_errors():
-    with pytest.raises(ValueError, match="'angle' must be the position angle of the detector"):
-        rotate_psf(blob(1.0, 1.0))
-    with pytest.raises(u.UnitsError, match="'angle' must be a quantity"):
-        rotate_psf(blob(1.0, 1.0), 30.0)
+    refuses("'angle' must be the position angle of the detector", rotate_psf, blob(1.0, 1.0))
+    refuses("'angle' must be a quantity", rotate_psf, blob(1.0, 1.0), 30.0, error=u.UnitsError)
     on_sky = rotate_psf(blob(1.0, 1.0), 30 * u.deg)
-    with pytest.raises(ValueError, match="left out for a PSF that stands on the sky"):
-        rotate_psf(on_sky, 30 * u.deg)
+    refuses("left out for a PSF that stands on the sky", rotate_psf, on_sky, 30 * u.deg)
 
 
 def test_average_over_rolls_is_weighted():
@@ -167,16 +165,11 @@ def test_average_over_rolls_is_weighted():
 
 def test_average_refuses_what_differs():
     a = blob(1.0, 0.0)
-    with pytest.raises(ValueError, match="'psfs' must be alike in frame"):
-        average_psf([a, rotate_psf(a, 10 * u.deg)])
-    with pytest.raises(ValueError, match="'psfs' must be alike in pixel_scale"):
-        average_psf([a, blob(1.0, 0.0, scale=0.06)])
-    with pytest.raises(ValueError, match=r"'psfs' must be alike in (shape|origin)"):
-        average_psf([a, blob(1.0, 0.0, n=101)])
-    with pytest.raises(ValueError, match="'psfs' must be at least one"):
-        average_psf([])
-    with pytest.raises(ValueError, match="'weights' must be 2 non-negative"):
-        average_psf([a, a], weights=[1.0, -1.0])
+    refuses("'psfs' must be alike in frame", average_psf, [a, rotate_psf(a, 10 * u.deg)])
+    refuses("'psfs' must be alike in pixel_scale", average_psf, [a, blob(1.0, 0.0, scale=0.06)])
+    refuses(r"'psfs' must be alike in (shape|origin)", average_psf, [a, blob(1.0, 0.0, n=101)])
+    refuses("'psfs' must be at least one", average_psf, [])
+    refuses("'weights' must be 2 non-negative", average_psf, [a, a], weights=[1.0, -1.0])
 
 
 @pytest.mark.parametrize("scale", [0.03, 0.06, 0.11])
@@ -242,8 +235,7 @@ def test_mosaic_of_several_rolls_is_the_mean():
     both = psf_mosaic(psf, pa=[10, 70] * u.deg, **kind)
     parts = [psf_mosaic(psf, pa=a * u.deg, **kind).data for a in (10, 70)]
     np.testing.assert_allclose(both.data, np.mean(parts, axis=0), atol=1e-12)
-    with pytest.raises(ValueError, match="'pa' must be the position angle"):
-        psf_mosaic(psf, 0.06 * u.arcsec)
+    refuses("'pa' must be the position angle", psf_mosaic, psf, 0.06 * u.arcsec)
     with pytest.raises(ValueError, match="'resampling' must be 'drizzle' or None"):
         psf_mosaic(psf, 0.06 * u.arcsec, 0 * u.deg, resampling="lanczos")
 
@@ -260,10 +252,8 @@ def test_takes_over_photutils_models():
     grid = GriddedPSFModel(NDData(stack, meta={"grid_xypos": positions, "oversampling": 4}))
     there = from_photutils(grid, x=50, y=50, **kind)
     np.testing.assert_allclose(there.data, 0.9 * psf.data, rtol=1e-6, atol=1e-9)
-    with pytest.raises(ValueError, match="given for a GriddedPSFModel"):
-        from_photutils(grid, **kind)
-    with pytest.raises(ValueError, match="'model' must be a PSF or model of photutils"):
-        from_photutils("psf", **kind)
+    refuses("given for a GriddedPSFModel", from_photutils, grid, **kind)
+    refuses("'model' must be a PSF or model of photutils", from_photutils, "psf", **kind)
 
 
 def test_reads_any_fits_image(tmp_path):
@@ -278,10 +268,8 @@ def test_reads_any_fits_image(tmp_path):
     one = read_psf(path, ext=1, plane=1, enclosed=0.9, **kind)
     np.testing.assert_allclose(one.data, 0.9 * psf.data, rtol=1e-5, atol=1e-7)
     assert one.enclosed == pytest.approx(0.9)
-    with pytest.raises(ValueError, match="a file with a 2D image in extension 0"):
-        read_psf(path, **kind)
-    with pytest.raises(ValueError, match="'data' must be normalized to 16"):
-        read_psf(path, ext=1, plane=1, **kind)
+    refuses("a file with a 2D image in extension 0", read_psf, path, **kind)
+    refuses("'data' must be normalized to 16", read_psf, path, ext=1, plane=1, **kind)
 
 
 def test_sizes_that_make_no_grid_are_named():
@@ -291,11 +279,9 @@ def test_sizes_that_make_no_grid_are_named():
     with pytest.raises(ValueError, match="'shape' must be at least one row and column, got 0"):
         psf_image(psf, pixel_scale=0.06 * u.arcsec, shape=0)
     kind = {"pa": 3 * u.deg} if psf.frame == "detector" else {}
-    with pytest.raises(ValueError, match="'pixel_scale' must be positive"):
-        psf_mosaic(psf, 0 * u.arcsec, **kind)
+    refuses("'pixel_scale' must be positive", psf_mosaic, psf, 0 * u.arcsec, **kind)
     with pytest.raises(ValueError, match="'oversampling' must be a positive integer, got 0"):
         psf_mosaic(psf, 0.06 * u.arcsec, oversampling=0, **kind)
-    with pytest.raises(ValueError, match="'fov' must be positive"):
-        psf_mosaic(psf, 0.06 * u.arcsec, fov=-2 * u.arcsec, **kind)
+    refuses("'fov' must be positive", psf_mosaic, psf, 0.06 * u.arcsec, fov=-2 * u.arcsec, **kind)
     with pytest.raises(ValueError, match="'angle' must be finite"):
         make_psf(np.ones((5, 5)) / 25, pixel_scale=1 * u.arcsec, frame="sky", angle=np.nan * u.deg)

@@ -8,6 +8,7 @@ from astropy.nddata import CCDData, NDData, StdDevUncertainty
 from astropy.table import Table
 from astropy.wcs import WCS
 
+from helpers.errors import refuses
 from miricigale.psf import encircled_energy, fwhm, miri_psf, psf_from_stars
 
 SIZE, SCALE = 260, 0.1109
@@ -126,16 +127,13 @@ def test_refuses(field):
     images, tables, sky = field
     scale = {"pixel_scale": SCALE * u.arcsec}
     bare = NDData(images[0].data)
-    with pytest.raises(ValueError, match="'images' must be at least one image"):
-        psf_from_stars([], tables)
+    refuses("'images' must be at least one image", psf_from_stars, [], tables)
     with pytest.raises(ValueError, match=r"'images' must be NDData .* got ndarray"):
         psf_from_stars([images[0].data], tables, **scale)
-    with pytest.raises(ValueError, match="'pixel_scale' must be given for images without world"):
-        psf_from_stars(bare, tables[0])
+    refuses("'pixel_scale' must be given for images without world", psf_from_stars, bare, tables[0])
     with pytest.raises(ValueError, match="'stars' must be 'x' and 'y' for images without a WCS"):
         psf_from_stars(bare, sky, **scale)
-    with pytest.raises(ValueError, match="'stars' must be a table with 'sky', or one with"):
-        psf_from_stars(images, tables[:2])
+    refuses("'stars' must be a table with 'sky', or one with", psf_from_stars, images, tables[:2])
     with pytest.raises(ValueError, match="'stars' must be tables with 'x' and 'y', or 'sky'"):
         psf_from_stars(bare, Table({"a": [1]}), **scale)
     with pytest.raises(ValueError, match="'stars' must be at least 4 with stamps on the images"):

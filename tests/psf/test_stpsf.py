@@ -5,6 +5,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 
+from helpers.errors import refuses
 from miricigale.psf import encircled_energy, miri_psf, psf_at, stpsf_grid, stpsf_psf
 from miricigale.utils.exceptions import DataError
 
@@ -32,10 +33,8 @@ def data(tmp_path, monkeypatch):
 
 def test_says_what_is_missing(monkeypatch):
     monkeypatch.delenv("STPSF_PATH", raising=False)
-    with pytest.raises(DataError, match="STPSF_PATH"):
-        stpsf_psf("miri.f770w")
-    with pytest.raises(ValueError, match="'n_psfs' must be a square number, got 3"):
-        stpsf_grid("miri.f770w", n_psfs=3)
+    refuses("STPSF_PATH", stpsf_psf, "miri.f770w", error=DataError)
+    refuses("'n_psfs' must be a square number, got 3", stpsf_grid, "miri.f770w", n_psfs=3)
 
 
 def test_names_the_package_that_is_missing(monkeypatch):
@@ -43,8 +42,7 @@ def test_names_the_package_that_is_missing(monkeypatch):
 
     monkeypatch.setenv("STPSF_PATH", "/nowhere")
     monkeypatch.setitem(sys.modules, "stpsf", None)
-    with pytest.raises(ImportError, match=r"miricigale\[stpsf\]"):
-        stpsf_psf("miri.f770w")
+    refuses(r"miricigale\[stpsf\]", stpsf_psf, "miri.f770w", error=ImportError)
 
 
 def test_says_why_the_data_do_not_do(monkeypatch):

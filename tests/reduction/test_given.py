@@ -46,8 +46,7 @@ def test_files_patterns_and_ramps_are_one(ramps, folder):
 
 
 def test_what_is_no_file_is_said(folder):
-    with pytest.raises(DataError, match=r"no file is called .*e\*"):
-        Reducer().run(f"{folder}/e*_uncal.fits")
+    refuses(r"no file is called .*e\*", Reducer().run, f"{folder}/e*_uncal.fits", error=DataError)
     refuses("'ramps' must be files, such as .* got a folder", Reducer().run, folder)
 
 
@@ -103,7 +102,7 @@ def test_integrations_and_pixels_of_a_ramp(ramps):
     with pytest.raises(IndexError, match="integration 1 of 1"):
         ramp[1]
     assert ramp.filter == "miri.f770w"
-    ax = ramp.plot((40, 50))
+    ax = ramp.plot((40, 50), ax=plt.figure().subplots())
     np.testing.assert_array_equal(ax.lines[0].get_ydata(), ramp.data[0, :, 50, 40])
     np.testing.assert_allclose(ax.lines[0].get_xdata()[-1], ramp.exposure.integration_time.value)
     refuses(r"'pixel' must be \(x, y\) below", ramp.plot, (500, 0))

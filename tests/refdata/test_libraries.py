@@ -17,6 +17,7 @@ import pytest
 from astropy.io import fits
 from numpy.testing import assert_allclose, assert_array_equal
 
+from helpers.errors import refuses
 from miricigale import conf, refdata
 from miricigale.refdata import (
     Resource,
@@ -160,10 +161,8 @@ def test_rows_are_found_by_the_values_of_their_axes():
     assert library.row(tau=7.001, q=0.97) is None
     assert library.row(tau=7.0, q=1e-4) is None
     assert_allclose(library.values_of("q"), [0.0, 0.97], rtol=1e-7)
-    with pytest.raises(ValueError, match=r"'q' must be given to find a row of 'test.library'"):
-        library.row(tau=3.0)
-    with pytest.raises(KeyError, match=r"no axis 'p'; axes: tau, q"):
-        library.values_of("p")
+    refuses(r"'q' must be given to find a row of 'test.library'", library.row, tau=3.0)
+    refuses(r"no axis 'p'; axes: tau, q", library.values_of, "p", error=KeyError)
 
 
 @pytest.mark.parametrize("scale", [1e-12, 1e-4, 1.0, 1e9])
@@ -199,8 +198,7 @@ def test_whether_the_grid_is_complete_is_known():
     ],
 )
 def test_what_is_no_library_is_refused(changes, message):
-    with pytest.raises(ValueError, match=message):
-        make(**changes)
+    refuses(message, make, **changes)
 
 
 @pytest.mark.parametrize("wave", [[1.0], [2.0, 1.0], [0.0, 1.0], [1.0, np.inf], [1.0, 1.0]])
@@ -234,10 +232,8 @@ def test_foreign_and_other_files_are_refused_by_name(tmp_path):
     with pytest.raises(DataError, match=r"x.fits holds no library .*miricigale data add"):
         open_library(path, NAME)
     write_library(make("other"), path)
-    with pytest.raises(DataError, match=r"x.fits holds 'other', not 'test.library'"):
-        open_library(path, NAME)
-    with pytest.raises(DataError, match=r"cannot be read as library"):
-        open_library(tmp_path, NAME)
+    refuses(r"x.fits holds 'other', not 'test.library'", open_library, path, NAME, error=DataError)
+    refuses(r"cannot be read as library", open_library, tmp_path, NAME, error=DataError)
 
 
 @pytest.mark.parametrize("kept", [0.02, 0.3, 0.5, 0.7, 0.9, 0.999])
@@ -262,8 +258,7 @@ def test_one_changed_bit_is_found(tmp_path):
         data = bytearray(whole)
         data[int(place * len(data))] ^= 1
         path.write_bytes(bytes(data))
-        with pytest.raises(DataError, match=r"x.fits"):
-            verify_library(path, NAME)
+        refuses(r"x.fits", verify_library, path, NAME, error=DataError)
 
 
 def test_spectra_with_nan_are_not_whole(tmp_path):
@@ -406,8 +401,7 @@ def test_the_record_says_what_it_was_made_from(folder):
 def test_a_refused_library_leaves_the_old_one(folder, text, message):
     before = add_library(NAME, source(folder))
     path = source(folder, text)
-    with pytest.raises(DataError, match=message):
-        add_library(NAME, path)
+    refuses(message, add_library, NAME, path, error=DataError)
     assert names(folder) == ["test.fits", "test.fits.json"]
     assert file_sha256(before.path) == before.sha256
     assert state().state == "ok"
@@ -549,8 +543,7 @@ def test_damage_is_told(folder):
     # a whole library, but not the one of the record
     write_library(read_fake(source(folder, "1 2 3\nend\n")), report.path)
     assert (state().state, state().bad) == ("wrong checksum", True)
-    with pytest.raises(DataError, match="sha256 differs"):
-        locate(NAME, check=True)
+    refuses("sha256 differs", locate, NAME, error=DataError, check=True)
     record_path(report.path).write_text("{")
     row = state()
     assert (row.state, row.bad) == ("damaged", True)
@@ -568,11 +561,9 @@ def test_names_and_readers_are_checked(folder, monkeypatch):
     with pytest.raises(DataError, match=r"no file or folder .*absent.dat"):
         add_library(NAME, folder / "absent.dat")
     monkeypatch.setitem(READERS, NAME, lambda path: make("other"))
-    with pytest.raises(ValueError, match="'reader' must be one that gives the library"):
-        add_library(NAME, path)
+    refuses("'reader' must be one that gives the library", add_library, NAME, path)
     monkeypatch.setitem(READERS, NAME, lambda path: make(meta={}))
-    with pytest.raises(ValueError, match=r"'reader' must be .*checksums"):
-        add_library(NAME, path)
+    refuses(r"'reader' must be .*checksums", add_library, NAME, path)
     assert names(folder) == []
 
 

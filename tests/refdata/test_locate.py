@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from helpers.errors import refuses
 from miricigale import conf
 from miricigale.refdata import (
     Resource,
@@ -79,18 +80,15 @@ def test_absent_resource_says_where_to_get_it(folders):
         DataError, match=r"'test.file' \(T\) is in none of the data folder .*a page"
     ):
         locate("test.file")
-    with pytest.raises(KeyError, match="no resource 'nope'"):
-        locate("nope")
-    with pytest.raises(ValueError, match="'name' must be a resource that is a file"):
-        locate("test.package")
+    refuses("no resource 'nope'", locate, "nope", error=KeyError)
+    refuses("'name' must be a resource that is a file", locate, "test.package")
 
 
 def test_absent_resource_can_be_asked_for(folders):
     assert find_resource("test.file") is None
     path = add_resource("test.file", source(folders))
     assert find_resource("test.file") == path
-    with pytest.raises(KeyError, match="no resource 'nope'"):
-        find_resource("nope")
+    refuses("no resource 'nope'", find_resource, "nope", error=KeyError)
 
 
 def test_an_empty_environment_is_no_folder(folders, monkeypatch):
@@ -160,18 +158,15 @@ def test_wrong_file_is_refused(folders):
     path.write_bytes(b"other numbers\n")
     with pytest.raises(DataError, match=r"mine.dat is not the file .* 'test.file' describes"):
         add_resource("test.file", path)
-    with pytest.raises(DataError, match="no file or folder"):
-        add_resource("test.file", folders / "absent")
-    with pytest.raises(ValueError, match="'name' must be a resource that is a file"):
-        add_resource("test.package", path)
+    refuses("no file or folder", add_resource, "test.file", folders / "absent", error=DataError)
+    refuses("'name' must be a resource that is a file", add_resource, "test.package", path)
 
 
 def test_file_that_changed_is_noticed(folders):
     path = add_resource("test.file", source(folders))
     path.write_bytes(b"broken\n")
     assert locate("test.file") == path
-    with pytest.raises(DataError, match="sha256 differs"):
-        locate("test.file", check=True)
+    refuses("sha256 differs", locate, "test.file", error=DataError, check=True)
 
 
 def test_environment_wins_over_the_folder_over_the_package(folders, monkeypatch):

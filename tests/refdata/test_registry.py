@@ -2,8 +2,7 @@
 
 import re
 
-import pytest
-
+from helpers.errors import refuses
 from miricigale.refdata import Registry, citations, resource, resources
 
 
@@ -19,8 +18,7 @@ def test_every_record_says_where_it_comes_from():
 
 
 def test_unknown_resource_lists_the_known():
-    with pytest.raises(KeyError, match=r"no resource 'nope'; known: .*instrument.siaf"):
-        resource("nope")
+    refuses(r"no resource 'nope'; known: .*instrument.siaf", resource, "nope", error=KeyError)
 
 
 def test_citations_are_sorted_without_repeats():
@@ -45,10 +43,8 @@ def test_registry_loads_on_first_use():
 def test_registry_refuses():
     registry = Registry("thing")
     registry.register("a", str)
-    with pytest.raises(ValueError, match="thing 'a' is registered already"):
-        registry.register("a", str)
-    with pytest.raises(KeyError, match="no thing 'b'; known: a"):
-        registry.get("b")
+    refuses("thing 'a' is registered already", registry.register, "a", str)
+    refuses("no thing 'b'; known: a", registry.get, "b", error=KeyError)
 
 
 def test_metadata_is_a_copy():

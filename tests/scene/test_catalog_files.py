@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
+from helpers.errors import refuses
 from miricigale.scene import CatalogFlags, read_catalog
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
 
@@ -172,8 +173,7 @@ def test_blanks_are_missing(tmp_path):
     assert catalog["flags"].tolist() == [0, f.NO_FLUX | f.NO_REDSHIFT, 0]
     assert catalog["star"].tolist() == [False, True, False]
     path.write_text("id,ra,dec,redshift,wfc3.f160w\n1,53.1,-27.8,0.5,faint\n")
-    with pytest.raises(ValueError, match=r"numbers in 'wfc3\.f160w', got .*faint"):
-        read_catalog(path, units={"flux": "uJy"})
+    refuses(r"numbers in 'wfc3\.f160w', got .*faint", read_catalog, path, units={"flux": "uJy"})
 
 
 def test_positions_in_hours(plain, tmp_path):
@@ -199,8 +199,7 @@ def test_empty_files(plain, tmp_path):
         read_catalog(path, columns=COLUMNS | SHAPE, units=UNITS)
     path = tmp_path / "text.csv"
     path.write_text("")
-    with pytest.raises(DataError, match=r"text\.csv cannot be read as a table"):
-        read_catalog(path)
+    refuses(r"text\.csv cannot be read as a table", read_catalog, path, error=DataError)
 
 
 # ------------------------------------------------------------------------- warnings

@@ -9,6 +9,7 @@ import pytest
 from astropy.nddata import CCDData
 
 from helpers import scenes
+from helpers.errors import refuses
 from helpers.scenes import light, moments
 from miricigale.profiles import sersic_image
 from miricigale.scene import Cutout
@@ -114,10 +115,8 @@ def test_pixels_without_a_measurement_are_an_error_or_counted(wcs, psf):
     data[2, 3], data[4, 4] = np.nan, -np.inf
     mask[2, 3] = mask[6, 0] = True
     image = CCDData(data, unit="MJy / sr", wcs=own, mask=mask)
-    with pytest.raises(ValueError, match=r"'image' must be without masked .* got 3 of 63 pixels"):
-        Cutout.from_image(image)
-    with pytest.raises(ValueError, match="'fill' must be finite, got nan"):
-        Cutout.from_image(image, fill=np.nan)
+    refuses(r"'image' must be without masked .* got 3 of 63 pixels", Cutout.from_image, image)
+    refuses("'fill' must be finite, got nan", Cutout.from_image, image, fill=np.nan)
     with pytest.raises(u.UnitsError, match="'fill' must be convertible to MJy"):
         Cutout.from_image(image, fill=1 * u.s)
     stamp = Cutout.from_image(image, fill=2000 * u.kJy / u.sr)
@@ -163,8 +162,7 @@ def test_light_beyond_the_edge_is_in_no_pixel(wcs, psf):
     ],
 )
 def test_a_stamp_for_each_cutout(wcs, psf, cutouts, message):
-    with pytest.raises(ValueError, match=message):
-        scenes.make_scene(one(wcs, 50, 45), wcs, psf, cutouts=cutouts)
+    refuses(message, scenes.make_scene, one(wcs, 50, 45), wcs, psf, cutouts=cutouts)
 
 
 @pytest.mark.parametrize(
@@ -176,8 +174,7 @@ def test_a_stamp_for_each_cutout(wcs, psf, cutouts, message):
     ],
 )
 def test_refuses(data, scale, message):
-    with pytest.raises((ValueError, u.UnitsError), match=message):
-        Cutout(data, pixel_scale=scale)
+    refuses(message, Cutout, data, error=(ValueError, u.UnitsError), pixel_scale=scale)
 
 
 def test_images_without_a_usable_wcs_are_refused():

@@ -10,6 +10,7 @@ from astropy.table import QTable, Table
 from photutils.psf import CircularGaussianPRF, MoffatPSF
 
 from helpers import scenes
+from helpers.errors import refuses
 from miricigale.detector import Detector
 from miricigale.filters import Filter
 from miricigale.instrument import Exposure
@@ -104,8 +105,7 @@ def test_what_lacks_is_named(exposure):
         ({"ra": RA, "dec": DEC}, {"exposure": None}, "'filter' must be given, or an exposure"),
         (3, {}, "'catalog' must be a table, a dict of columns"),
     ):
-        with pytest.raises(ValueError, match=message):
-            Scene(catalog, **{"exposure": exposure} | options)
+        refuses(message, Scene, catalog, **{"exposure": exposure} | options)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 
 from helpers import scenes
+from helpers.errors import refuses
 from miricigale.instrument import north_up_wcs
 from miricigale.psf import encircled_energy, hst_psf
 from miricigale.scene import Scene, depth_to_rms, highres_image
@@ -61,8 +62,7 @@ def test_refuses(fine, psf, catalog):
     kwargs = {"filter": FILTER, "wcs": fine, "psf": psf, "seed": 1}
     with pytest.raises(u.UnitsError, match="'depth' must be a quantity convertible to uJy"):
         highres_image(catalog, depth=27.0, **kwargs)
-    with pytest.raises(ValueError, match="'depth' must be positive"):
-        highres_image(catalog, depth=-1 * u.uJy, **kwargs)
+    refuses("'depth' must be positive", highres_image, catalog, depth=-1 * u.uJy, **kwargs)
 
 
 def test_f160w_mosaic_through_its_psf():

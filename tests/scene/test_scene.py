@@ -7,6 +7,7 @@ from astropy.coordinates import SkyCoord
 from photutils.psf import ImagePSF
 
 from helpers import scenes
+from helpers.errors import refuses
 from helpers.scenes import FILTER, light, make_scene, moments
 from miricigale.instrument import pixel_area_map
 from miricigale.scene import Background, Scene, SceneFlags
@@ -250,8 +251,7 @@ def bare_wcs():
 )
 def test_refuses(wcs, psf, options, message):
     catalog = scenes.make_catalog(wcs, 50, 45)
-    with pytest.raises(ValueError, match=message):
-        Scene(catalog, **{"filter": FILTER, "wcs": wcs, "psf": psf} | options)
+    refuses(message, Scene, catalog, **{"filter": FILTER, "wcs": wcs, "psf": psf} | options)
 
 
 def test_magnitudes_are_fluxes(wcs, psf):

@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import quad
 
 from helpers.components import values_of
+from helpers.errors import refuses
 from miricigale import conf
 from miricigale.refdata.libraries import open_library, write_library
 from miricigale.refdata.libraries.skirtor import read_skirtor
@@ -138,8 +139,7 @@ def test_no_law_makes_the_disk_brighter(law):
 
 
 def test_unknown_law_is_refused():
-    with pytest.raises(ValueError, match=r"'polar_law' must be .*gaskell, smc_wd01, got 'mrn'"):
-        ParametricTorus(polar_law="mrn")
+    refuses(r"'polar_law' must be .*gaskell, smc_wd01, got 'mrn'", ParametricTorus, polar_law="mrn")
     with pytest.raises(ValueError, match="'law' must be one of smc, calzetti, gaskell, got 'mrn'"):
         _core.polar_curve(np.array([1.0]), "mrn")
 
@@ -268,8 +268,7 @@ def test_no_torus_takes_more_than_shines_on_it_nor_less_than_nothing(torus, tau,
 
 def test_opening_angles_beyond_the_fit_are_refused():
     for angle in (10.0, 70.0):
-        with pytest.raises(ValueError, match="'opening_angle' must be from 20"):
-            ParametricTorus(opening_angle=angle)
+        refuses("'opening_angle' must be from 20", ParametricTorus, opening_angle=angle)
 
 
 def test_absorbed_share_is_near_that_of_the_geometry(torus):
@@ -463,11 +462,9 @@ def test_truncated_and_foreign_spectra_are_refused(folder):
     with pytest.raises(DataError, match=r"t7_p0\.5_q0_.*i40_sed\.dat: wanted 132 rows of 7 num"):
         read_skirtor(folder)
     path.write_text(whole.replace("e-", "x-", 1))
-    with pytest.raises(DataError, match=r"i40_sed\.dat: not a number"):
-        read_skirtor(folder)
+    refuses(r"i40_sed\.dat: not a number", read_skirtor, folder, error=DataError)
     path.write_text("# nothing")
-    with pytest.raises(DataError, match="got 0 words"):
-        read_skirtor(folder)
+    refuses("got 0 words", read_skirtor, folder, error=DataError)
 
 
 @pytest.mark.parametrize(
@@ -482,8 +479,7 @@ def test_truncated_and_foreign_spectra_are_refused(folder):
 def test_wrong_numbers_are_refused_by_name(folder, change, says):
     path = a_file(folder)
     path.write_text(text(change(np.loadtxt(path))))
-    with pytest.raises(DataError, match=rf"t7_p0\.5_q0_.*i40_sed\.dat.*{says}"):
-        read_skirtor(folder)
+    refuses(rf"t7_p0\.5_q0_.*i40_sed\.dat.*{says}", read_skirtor, folder, error=DataError)
 
 
 def test_holes_are_refused_by_name(folder):
@@ -495,8 +491,7 @@ def test_holes_are_refused_by_name(folder):
 def test_face_on_spectra_are_wanted(folder):
     for path in folder.rglob("*_i0_sed.dat"):
         path.unlink()
-    with pytest.raises(DataError, match="no spectrum at inclination 0"):
-        read_skirtor(folder)
+    refuses("no spectrum at inclination 0", read_skirtor, folder, error=DataError)
 
 
 def test_values_that_skirtor_has_not_are_refused(folder):
@@ -513,19 +508,16 @@ def test_one_model_twice_is_taken_once_if_it_is_the_same(folder):
     copy.write_bytes(path.read_bytes())
     assert read_skirtor(folder).n_rows == 12
     copy.write_text(text(np.loadtxt(path) * np.array([1, *6 * [1.001]])))
-    with pytest.raises(DataError, match="the same model with different numbers"):
-        read_skirtor(folder)
+    refuses("the same model with different numbers", read_skirtor, folder, error=DataError)
 
 
 def test_other_things_are_refused(tmp_path, folder):
     (tmp_path / "empty").mkdir()
     with pytest.raises(DataError, match=r"empty holds no spectrum; wanted the SKIRTOR library"):
         read_skirtor(tmp_path / "empty")
-    with pytest.raises(DataError, match=r"nowhere does not exist"):
-        read_skirtor(tmp_path / "nowhere")
+    refuses(r"nowhere does not exist", read_skirtor, tmp_path / "nowhere", error=DataError)
     (tmp_path / "notes.txt").write_text("hello")
-    with pytest.raises(DataError, match=r"notes\.txt"):
-        read_skirtor(tmp_path / "notes.txt")
+    refuses(r"notes\.txt", read_skirtor, tmp_path / "notes.txt", error=DataError)
     fits.PrimaryHDU(np.zeros((2, 2))).writeto(tmp_path / "image.fits")
     with pytest.raises(DataError, match=r"image\.fits is not the SKIRTOR library"):
         read_skirtor(tmp_path / "image.fits")
@@ -583,8 +575,7 @@ def test_fits_grid_is_the_same_as_text(tmp_path):
 def test_wrong_fits_grids_are_refused(tmp_path, column, factor, says):
     path = tmp_path / "grid.fits"
     write_fits(path, lambda name, array: array * (factor if name == column else 1.0))
-    with pytest.raises(DataError, match=rf"grid\.fits.*{says}"):
-        read_skirtor(path)
+    refuses(rf"grid\.fits.*{says}", read_skirtor, path, error=DataError)
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ from astropy.io import fits
 from numpy.testing import assert_allclose
 
 from helpers.components import values_of
+from helpers.errors import refuses
 from miricigale.refdata.libraries.ised import read_ised
 from miricigale.sed import _core
 from miricigale.sed.components import BC03, CalzettiLeitherer, DelayedSFH
@@ -25,8 +26,7 @@ def test_sun_like_luminosity_of_an_old_population():
 
 
 def test_metallicity_outside_the_table_is_refused(model):
-    with pytest.raises(ValueError, match=r"'metallicity' must be one of 0\.0001, .* got 0\.03"):
-        model.evaluate(metallicity=0.03)
+    refuses(r"'metallicity' must be one of 0\.0001, .* got 0\.03", model.evaluate, metallicity=0.03)
 
 
 @pytest.mark.parametrize("name", ["delayed0.5", "delayed1", "delayed3"])
@@ -72,8 +72,7 @@ def test_foreign_files_are_refused(tmp_path):
 
     path = tmp_path / "other.fits"
     fits.PrimaryHDU(np.zeros((2, 2))).writeto(path)
-    with pytest.raises(DataError, match="not a table of simple stellar populations"):
-        load_ssp(str(path))
+    refuses("not a table of simple stellar populations", load_ssp, str(path), error=DataError)
 
 
 def test_defaults_of_a_component_take_units():

@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.optimize import brentq
 
 from helpers.components import values_of
+from helpers.errors import refuses
 from miricigale.filters import FilterSet
 from miricigale.refdata.libraries import write_library
 from miricigale.refdata.libraries.dale2014 import read_dale2014
@@ -240,23 +241,19 @@ def test_other_places_are_refused_by_name(dale_folder, tmp_path):
         read_dale2014(tmp_path)
     path = tmp_path / "other.fits"
     fits.PrimaryHDU(np.zeros((2, 2))).writeto(path)
-    with pytest.raises(DataError, match=r"other\.fits cannot be read as templates"):
-        read_dale2014(path)
+    refuses(r"other\.fits cannot be read as templates", read_dale2014, path, error=DataError)
     half = tmp_path / "half"
     half.mkdir()
     shutil.copy(dale_folder / "spectra.0.00AGN.dat", half)
-    with pytest.raises(DataError, match=r"half has spectra.* without dhcal\.dat"):
-        read_dale2014(half)
+    refuses(r"half has spectra.* without dhcal\.dat", read_dale2014, half, error=DataError)
     for name in ("a", "b"):
         shutil.copytree(dale_folder, tmp_path / "two" / name)
-    with pytest.raises(DataError, match="must hold one"):
-        read_dale2014(tmp_path / "two")
+    refuses("must hold one", read_dale2014, tmp_path / "two", error=DataError)
     with zipfile.ZipFile(tmp_path / "cut.zip", "w") as archive:
         archive.write(dale_folder / "dhcal.dat", "dhcal.dat")
     data = (tmp_path / "cut.zip").read_bytes()
     (tmp_path / "cut.zip").write_bytes(data[: len(data) // 2])
-    with pytest.raises(DataError, match=r"cut\.zip"):
-        read_dale2014(tmp_path / "cut.zip")
+    refuses(r"cut\.zip", read_dale2014, tmp_path / "cut.zip", error=DataError)
 
 
 def test_unregistered_templates_are_named_with_the_command(monkeypatch, tmp_path):
@@ -284,8 +281,7 @@ def test_starlight_is_an_option(dale, dale_folder):
     part = Dale2014(starlight="kept")
     got = part.template(part.nodes(), alpha=2.0)
     assert_allclose(got, library.spectra["kept"][31], rtol=1e-12)
-    with pytest.raises(ValueError, match="'starlight' must be one of removed, kept, got 'both'"):
-        Dale2014(starlight="both")
+    refuses("'starlight' must be one of removed, kept, got 'both'", Dale2014, starlight="both")
 
 
 def test_distributed_templates_have_the_colors_that_are_listed(real_dale):
@@ -516,5 +512,4 @@ def test_more_intensity_makes_warmer_dust():
 def test_a_foreign_table_is_refused(tmp_path):
     path = tmp_path / "other.fits"
     fits.PrimaryHDU(np.zeros((2, 2))).writeto(path)
-    with pytest.raises(DataError, match="not a Draine & Li table"):
-        load_dl07(str(path))
+    refuses("not a Draine & Li table", load_dl07, str(path), error=DataError)

@@ -7,6 +7,7 @@ from astropy.io import fits
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
+from helpers.errors import refuses
 from miricigale.sed import ModelGrid
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.store import write_parts
@@ -51,8 +52,7 @@ def test_flux_is_the_stated_sum():
     ],
 )
 def test_arrays_that_do_not_agree_are_refused(changes, match):
-    with pytest.raises(ValueError, match=match):
-        make(**changes)
+    refuses(match, make, **changes)
 
 
 def test_arrays_are_read_only():
@@ -68,8 +68,7 @@ def test_foreign_and_truncated_files_are_refused(tmp_path):
             DataError, match=rf"{name}\.fits cannot be read as model grid data: {text}"
         ):
             ModelGrid.read(tmp_path / f"{name}.fits")
-    with pytest.raises(DataError, match="holds no model grid data"):
-        ModelGrid.read(tmp_path / "other.fits")
+    refuses("holds no model grid data", ModelGrid.read, tmp_path / "other.fits", error=DataError)
     make().write(tmp_path / "grid.fits")
     with fits.open(tmp_path / "grid.fits") as hdus:
         del hdus["GALAXY"]

@@ -16,6 +16,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import quad
 from scipy.special import gamma
 
+from helpers.errors import refuses
 from miricigale.sed import _core
 from miricigale.sed.components import Inoue2014, Madau1995, Meiksin2006
 from miricigale.sed.components.igm import load_lines
@@ -431,8 +432,7 @@ def test_inoue_below_the_limit_as_seen_starts_at_redshift_zero(wave, z):
 def test_a_foreign_table_is_refused(tmp_path, text, match):
     path = tmp_path / "lines.toml"
     path.write_text(text)
-    with pytest.raises(DataError, match=match):
-        load_lines(str(path))
+    refuses(match, load_lines, str(path), error=DataError)
 
 
 def test_a_table_in_the_wrong_order_is_refused(tmp_path):
@@ -441,5 +441,4 @@ def test_a_table_in_the_wrong_order_is_refused(tmp_path):
     names = ("wavelength", "laf1", "laf2", "laf3", "dla1", "dla2")
     lines = [f"{n} = {c.tolist()}" for n, c in zip(names, table[:, 1:].T, strict=True)]
     path.write_text("\n".join(lines))
-    with pytest.raises(DataError, match="from the longest to the shortest"):
-        load_lines(str(path))
+    refuses("from the longest to the shortest", load_lines, str(path), error=DataError)

@@ -6,6 +6,7 @@ import pytest
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
+from helpers.errors import refuses
 from miricigale import conf
 from miricigale.refdata.libraries import add_library, write_library
 from miricigale.refdata.libraries.bc03 import read_bc03
@@ -157,8 +158,7 @@ def test_a_text_file_cut_anywhere_is_refused(tmp_path):
     for cut in [0, 1, *rng.integers(2, int(0.98 * len(data)), 40)]:
         path = tmp_path / f"cut_{cut}.ised_ASCII"
         path.write_bytes(data[:cut])
-        with pytest.raises(DataError, match=rf"cut_{cut}\.ised_ASCII cannot be read"):
-            read_ised(path)
+        refuses(rf"cut_{cut}\.ised_ASCII cannot be read", read_ised, path, error=DataError)
 
 
 def test_a_compressed_file_cut_anywhere_is_refused(tmp_path):
@@ -166,16 +166,14 @@ def test_a_compressed_file_cut_anywhere_is_refused(tmp_path):
     for cut in (10, len(data) // 2, len(data) - 1):
         path = tmp_path / "cut.ised.gz"
         path.write_bytes(data[:cut])
-        with pytest.raises(DataError, match=r"cut\.ised\.gz cannot be read"):
-            read_ised(path)
+        refuses(r"cut\.ised\.gz cannot be read", read_ised, path, error=DataError)
 
 
 @pytest.mark.parametrize("data", [b"nothing of the kind\n" * 100, bytes(5000), b"12 of them\n"])
 def test_foreign_files_are_refused(tmp_path, data):
     path = tmp_path / "foreign.ised"
     path.write_bytes(data)
-    with pytest.raises(DataError, match=r"foreign\.ised cannot be read as a file of GALAXEV"):
-        read_ised(path)
+    refuses(r"foreign\.ised cannot be read as a file of GALAXEV", read_ised, path, error=DataError)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -1e-9])
@@ -184,8 +182,7 @@ def test_impossible_spectra_are_refused(tmp_path, bad):
     parts["spectra"][3, 50] = bad
     path = tmp_path / "bad.ised"
     path.write_bytes(binary(parts))
-    with pytest.raises(DataError, match=r"bad\.ised .* spectra must be (finite|0 or more)"):
-        read_ised(path)
+    refuses(r"bad\.ised .* spectra must be (finite|0 or more)", read_ised, path, error=DataError)
 
 
 def test_a_record_of_another_length_is_refused(tmp_path):
@@ -193,8 +190,7 @@ def test_a_record_of_another_length_is_refused(tmp_path):
     parts["spectra"] = [row if i != 4 else row[:-1] for i, row in enumerate(parts["spectra"])]
     path = tmp_path / "odd.ised"
     path.write_bytes(binary(parts))
-    with pytest.raises(DataError, match=rf"record 7 must hold {WAVE.size} numbers, got"):
-        read_ised(path)
+    refuses(rf"record 7 must hold {WAVE.size} numbers, got", read_ised, path, error=DataError)
 
 
 def test_composites_of_the_authors(data_file):
@@ -269,8 +265,7 @@ def test_mass_of_gas_tells_what_the_mass_of_stars_is(tmp_path, remnants_counted)
     assert_allclose(read_bc03(path).values["surviving"][1:], want[1:])
     parts["vectors"][12] = 2 * gas
     path.write_bytes(binary(parts, n_vectors=14))
-    with pytest.raises(DataError, match="do not sum to 1 Msun"):
-        read_bc03(path)
+    refuses("do not sum to 1 Msun", read_bc03, path, error=DataError)
 
 
 def test_far_infrared_is_dense_and_goes_on(write):
@@ -306,8 +301,7 @@ def test_names_of_2016_and_a_metallicity_from_the_name(write):
     ],
 )
 def test_files_that_contradict_themselves_are_refused(write, name, changes, match):
-    with pytest.raises(DataError, match=match):
-        read_bc03(write(name, **changes))
+    refuses(match, read_bc03, write(name, **changes), error=DataError)
 
 
 @pytest.mark.parametrize(
@@ -322,8 +316,7 @@ def test_files_that_contradict_themselves_are_refused(write, name, changes, matc
 def test_mixtures_are_refused(write, tmp_path, name, changes, match):
     write()
     write(name, **({"metallicity": 0.05} | changes))
-    with pytest.raises(DataError, match=match):
-        read_bc03(tmp_path)
+    refuses(match, read_bc03, tmp_path, error=DataError)
 
 
 def test_the_same_metallicity_twice_is_refused_but_a_pattern_picks_one(write, tmp_path):
@@ -333,8 +326,7 @@ def test_the_same_metallicity_twice_is_refused_but_a_pattern_picks_one(write, tm
         read_bc03(tmp_path)
     assert len(read_bc03(tmp_path / "*_ssp.ised").meta["files"]) == 1
     assert len(read_bc03([tmp_path / f"{NAME}.ised"]).meta["files"]) == 1
-    with pytest.raises(DataError, match=r"wanted files .*got none"):
-        read_bc03(tmp_path / "*.none")
+    refuses(r"wanted files .*got none", read_bc03, tmp_path / "*.none", error=DataError)
 
 
 # ------------------------------------------------------------------ the component
@@ -396,8 +388,7 @@ def test_without_the_files_the_error_says_what_to_do(tmp_path):
     with conf.set_temp("data_folder", str(tmp_path)):
         part = BC03Library()
         assert "BC03Library" in repr(part)
-        with pytest.raises(DataError, match=r"miricigale data add ssp\.bc03_user PATH"):
-            part.nodes()
+        refuses(r"miricigale data add ssp\.bc03_user PATH", part.nodes, error=DataError)
 
 
 def test_libraries_of_former_versions_name_the_surviving_mass_living(write, tmp_path):

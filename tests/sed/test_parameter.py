@@ -1,6 +1,7 @@
 import astropy.units as u
 import pytest
 
+from helpers.errors import refuses
 from miricigale.sed import COMPONENTS, Component, Parameter, SEDModel
 from miricigale.sed.components import DelayedSFH
 
@@ -22,21 +23,18 @@ def test_parameter_is_itself_on_the_class_and_a_number_on_an_instance():
 def test_parameter_converts_units_and_refuses_others():
     par = Example.length
     assert par.check(0.005 * u.km) == pytest.approx(5.0)
-    with pytest.raises(u.UnitsError, match="'length' must be convertible to m"):
-        par.check(3 * u.s)
+    refuses("'length' must be convertible to m", par.check, 3 * u.s, error=u.UnitsError)
 
 
 @pytest.mark.parametrize("value", [0.5, 11.0, float("nan"), float("inf")])
 def test_parameter_refuses_values_outside_its_bounds(value):
-    with pytest.raises(ValueError, match="'length' must be from 1"):
-        Example.length.check(value)
+    refuses("'length' must be from 1", Example.length.check, value)
 
 
 def test_component_is_frozen_and_knows_its_parameters():
     with pytest.raises(AttributeError, match="when the component is made"):
         Example().length = 4.0
-    with pytest.raises(TypeError, match="no parameter 'width'; known: length"):
-        Example(width=1.0)
+    refuses("no parameter 'width'; known: length", Example, error=TypeError, width=1.0)
 
 
 @pytest.mark.parametrize("name", COMPONENTS.names())
@@ -61,5 +59,4 @@ def test_model_has_the_names_that_other_subpackages_use():
 
 def test_registry_lists_the_right_names():
     assert COMPONENTS.get("delayed") is DelayedSFH
-    with pytest.raises(KeyError, match=r"no component 'delay'; known: .*delayed"):
-        COMPONENTS.get("delay")
+    refuses(r"no component 'delay'; known: .*delayed", COMPONENTS.get, "delay", error=KeyError)

@@ -5,6 +5,7 @@ from astropy.table import MaskedColumn, QTable, Table
 from numpy.testing import assert_allclose
 
 from helpers.components import values_of
+from helpers.errors import refuses
 from miricigale.sed import SEDModel
 from miricigale.sed.components import ConstantSFH, DelayedSFH, DoubleExponentialSFH, TableSFH
 from miricigale.utils.exceptions import DataError
@@ -182,8 +183,7 @@ def test_index_selects_the_column():
 
 def test_beyond_the_table_is_refused(uneven):
     assert "end of the table, 0.779 Gyr" in uneven.invalid(values_of(uneven, age=0.9))
-    with pytest.raises(ValueError, match="end of the table"):
-        TableSFH(table_of([0, 1], [1, 1]), age=0.003)
+    refuses("end of the table", TableSFH, table_of([0, 1], [1, 1]), age=0.003)
 
 
 def test_numbers_of_the_table_are_in_the_settings():
@@ -209,24 +209,18 @@ def test_bad_tables_are_refused(change, match):
     table = table_of([0, 1, 2], [1, 2, 3])
     for name, column in change.items():
         table[name] = column
-    with pytest.raises((ValueError, u.UnitsError), match=match):
-        TableSFH(table)
+    refuses(match, TableSFH, table, error=(ValueError, u.UnitsError))
 
 
 def test_masked_short_and_nameless_tables_are_refused():
     table = Table(table_of([0, 1, 2], [1, 2, 3]))
     table["sfr_0"] = MaskedColumn([1.0, 2.0, 3.0], mask=[0, 1, 0], unit=RATE)
-    with pytest.raises(ValueError, match="'sfr_0' must be without masked values, got 1"):
-        TableSFH(table)
-    with pytest.raises(ValueError, match="two rows or more"):
-        TableSFH(table_of([0], [1]))
-    with pytest.raises(ValueError, match="column 'time'"):
-        TableSFH(QTable({"t": [0, 1] * u.Myr, "sfr": [1, 1] * RATE}))
-    with pytest.raises(ValueError, match=r"'table' must be 13\.7 Gyr long at most"):
-        TableSFH(table_of([0, 9000], [1, 1]))
+    refuses("'sfr_0' must be without masked values, got 1", TableSFH, table)
+    refuses("two rows or more", TableSFH, table_of([0], [1]))
+    refuses("column 'time'", TableSFH, QTable({"t": [0, 1] * u.Myr, "sfr": [1, 1] * RATE}))
+    refuses(r"'table' must be 13\.7 Gyr long at most", TableSFH, table_of([0, 9000], [1, 1]))
     assert TableSFH(table_of([0, 9000], [1, 1]), age=13.0).age == 13.0
-    with pytest.raises(ValueError, match="one of them"):
-        TableSFH()
+    refuses("one of them", TableSFH)
 
 
 @pytest.mark.parametrize("suffix", ["ecsv", "fits"])

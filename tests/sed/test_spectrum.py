@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 from astropy.tests.helper import assert_quantity_allclose
 
+from helpers.errors import refuses
 from miricigale.filters import Filter
 from miricigale.sed import COSMOLOGY, SED, SEDModel
 
@@ -59,8 +60,7 @@ def test_sed_never_changes(flat):
     ],
 )
 def test_sed_refuses(wave, fnu, error, match):
-    with pytest.raises(error, match=match):
-        SED(wave, fnu)
+    refuses(match, SED, wave, fnu, error=error)
 
 
 def test_plot_returns_the_axes_it_was_given(flat):

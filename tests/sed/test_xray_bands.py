@@ -7,6 +7,7 @@ from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import quad
 
+from helpers.errors import refuses
 from miricigale.fitting import BayesFitter
 from miricigale.sed import COSMOLOGY, SEDModel, with_xray_bands
 from miricigale.sed.xray_bands import xray_filter
@@ -128,8 +129,7 @@ def test_a_fit_takes_alpha_ox_from_the_x_rays(model, grid):
 def test_what_is_refused_and_how_bands_are_drawn(model, grid):
     for bands, text in (({}, "new ones"), ({"miri.f770w": [1, 2] * u.keV}, "new ones"),
                         ({"x": [2, 1] * u.keV}, "two ascending positive energies")):  # fmt: skip
-        with pytest.raises(ValueError, match=text):
-            with_xray_bands(grid, model, bands)
+        refuses(text, with_xray_bands, grid, model, bands)
     with pytest.raises(ValueError, match="'alpha_ox' must be ascending"):
         with_xray_bands(grid, model, BANDS, alpha_ox=[-1.4, -1.4])
     with pytest.raises(ValueError, match="'cutoff' must be positive, got -3"):

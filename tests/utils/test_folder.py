@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from helpers.errors import refuses
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.folder import RecordFolder
 
@@ -100,8 +101,7 @@ def test_an_earlier_layout_stays_readable(tmp_path):
 
 def test_messages_say_whose_folder_it_is(tmp_path):
     (tmp_path / "mine").write_text("x")
-    with pytest.raises(DataError, match="is no fit's folder; choose another folder"):
-        Parts(tmp_path)
+    refuses("is no fit's folder; choose another folder", Parts, tmp_path, error=DataError)
     with (
         Parts(tmp_path / "fit"),
         pytest.raises(DataError, match=r"is in use by a fit: .* remove .*fit\.lock"),

@@ -9,6 +9,7 @@ import textwrap
 
 import pytest
 
+from helpers.errors import refuses
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.lock import FolderLock
 
@@ -61,8 +62,7 @@ def test_a_lock_is_there_while_it_is_held_and_alone(tmp_path):
         assert json.loads(held.path.read_text())["pid"] == os.getpid()
         again = FolderLock(tmp_path, name="fit.lock", purpose="fit")
         for other in (held, again):
-            with pytest.raises(DataError, match=f"in use by a fit: process {os.getpid()} on"):
-                other.__enter__()
+            refuses(f"in use by a fit: process {os.getpid()} on", other.__enter__, error=DataError)
         assert held.path.is_file()
     assert names(tmp_path) == [".fit.lock"]
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
+from helpers.errors import refuses
 from miricigale.utils.random import check_seed, stream, text_key
 
 
@@ -59,10 +60,7 @@ def test_seeds():
 
 @pytest.mark.parametrize("seed", [-1, 1.5, "3", True])
 def test_refuses_what_is_no_seed(seed):
-    with pytest.raises(
-        ValueError, match="'seed' must be a non-negative integer, a Generator or None"
-    ):
-        check_seed(seed)
+    refuses("'seed' must be a non-negative integer, a Generator or None", check_seed, seed)
 
 
 def test_seed_of_nothing_makes_streams():

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from helpers.errors import refuses
 from miricigale.utils import sep_tools
 
 
@@ -75,5 +76,4 @@ def test_bad_errors_are_masked(image):
     ],
 )
 def test_bad_arguments_are_named(image, call, match):
-    with pytest.raises(ValueError, match=match):
-        call(image)
+    refuses(match, call, image)

@@ -9,6 +9,7 @@ import pytest
 import threadpoolctl
 
 import miricigale
+from helpers.errors import refuses
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.meta import provenance
 from miricigale.utils.optional import require
@@ -43,8 +44,7 @@ def test_number_of_threads():
     assert thread_count(3) == 3
     assert 1 <= thread_count(None) <= os.cpu_count()
     for wrong in (0, -1, 1.5):
-        with pytest.raises(ValueError, match="'n_threads' must be at least 1 and an integer"):
-            thread_count(wrong)
+        refuses("'n_threads' must be at least 1 and an integer", thread_count, wrong)
 
 
 def test_one_thread_is_no_executor():
@@ -64,8 +64,7 @@ def test_parallel_map_gives_the_same_answer_in_order():
 
 
 def test_an_executor_can_be_submitted_to():
-    with pytest.raises(ValueError, match="'executor' must be a"):
-        parallel_map(math.sqrt, range(3), executor=2)
+    refuses("'executor' must be a", parallel_map, math.sqrt, range(3), executor=2)
 
 
 def test_parallel_map_passes_errors_on():

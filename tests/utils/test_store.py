@@ -9,6 +9,7 @@ import pytest
 from astropy.io.registry import IORegistryError
 from astropy.table import QTable
 
+from helpers.errors import refuses
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.store import open_parts, replacing, write_parts
 from miricigale.utils.unified import register, unified_read, unified_write
@@ -52,8 +53,7 @@ def test_parts_come_back(tmp_path):
     }
     text = {"meta": {"n": np.int64(3), "values": np.arange(3.0), "text": "\u03bb"}}
     write_parts(path, "test-1", text=text, arrays=arrays, tables={"rows": table})
-    with pytest.raises(OSError, match="overwrite"):
-        write_parts(path, "test-1")
+    refuses("overwrite", write_parts, path, "test-1", error=OSError)
     before = path.read_bytes()
     write_parts(path, "test-1", text=text, arrays=arrays, tables={"rows": table}, overwrite=True)
     assert path.read_bytes() == before
@@ -129,5 +129,4 @@ def test_read_and_write_are_unified_methods(tmp_path):
         with pytest.raises(IORegistryError, match=rf"{name} must end in one of \.fits"):
             Number(5.0).write(tmp_path / name)
     assert "Read a number." in Number.read.__doc__
-    with pytest.raises(DataError, match=r"c\.fits"):
-        Number.read(tmp_path / "c.fits")
+    refuses(r"c\.fits", Number.read, tmp_path / "c.fits", error=DataError)

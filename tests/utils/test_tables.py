@@ -7,6 +7,7 @@ from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
+from helpers.errors import refuses
 from miricigale.utils.tables import (
     Flags,
     ascii_ids,
@@ -58,8 +59,7 @@ def test_require_columns():
 
 def test_unique_ids():
     assert_array_equal(unique_ids([3, 1, 2], "catalog"), [3, 1, 2])
-    with pytest.raises(ValueError, match=r"'catalog' must be .* duplicates such as \[1\]"):
-        unique_ids([1, 1, 2], "catalog")
+    refuses(r"'catalog' must be .* duplicates such as \[1\]", unique_ids, [1, 1, 2], "catalog")
 
 
 def sky(x, y):
@@ -100,9 +100,5 @@ def test_ids_that_fits_holds(tmp_path, ids):
 
 def test_ids_that_fits_does_not_hold_are_told():
     ids = ["a", "Kümmel", "b ", "\N{GREEK SMALL LETTER ALPHA}", "c", "😀"]
-    with pytest.raises(
-        ValueError, match=r"'catalog' must be ASCII.* got 'Kümmel', 'b ', 'α' and 1"
-    ):
-        ascii_ids(ids, "catalog")
-    with pytest.raises(ValueError, match=r"got 'b '$"):
-        ascii_ids(["a", "b "], "ids")
+    refuses(r"'catalog' must be ASCII.* got 'Kümmel', 'b ', 'α' and 1", ascii_ids, ids, "catalog")
+    refuses(r"got 'b '$", ascii_ids, ["a", "b "], "ids")

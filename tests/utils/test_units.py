@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from helpers.errors import refuses
 from miricigale.utils.units import frozen_array, frozen_quantity, to_array
 
 
@@ -28,8 +29,7 @@ def test_uses_equivalencies():
     ],
 )
 def test_refuses_wrong_units(value, message):
-    with pytest.raises(u.UnitsError, match=message):
-        to_array(value, u.s, "x")
+    refuses(message, to_array, value, u.s, "x", error=u.UnitsError)
 
 
 def test_refuses_wrong_shape_and_nan():
@@ -70,5 +70,4 @@ def test_frozen_quantity_in_the_same_unit_is_a_copy():
     ],
 )
 def test_refuses_what_is_no_linear_quantity(value, error, message):
-    with pytest.raises(error, match=message):
-        to_array(value, u.uJy, "x")
+    refuses(message, to_array, value, u.uJy, "x", error=error)

@@ -8,6 +8,7 @@ import pytest
 from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData
 
+from helpers.errors import refuses
 from helpers.runs import one_band
 from helpers.scenes import catalog_at
 from miricigale.depth import zodiacal_factor
@@ -103,8 +104,7 @@ def test_a_level_is_what_it_says_in_any_unit():
     ],
 )  # fmt: skip
 def test_what_is_no_background_is_refused(scene, message):
-    with pytest.raises(ConfigError, match=rf"\[scene\] .*{message}"):
-        study(**scene)
+    refuses(rf"\[scene\] .*{message}", study, error=ConfigError, **scene)
 
 
 def test_a_plan_refuses_the_same():

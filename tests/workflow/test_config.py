@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from astropy.utils.exceptions import AstropyDeprecationWarning
 
+from helpers.errors import refuses
 from miricigale.planning import PlanConfig
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow.config import StudyConfig, load_config, preset_names
@@ -79,8 +80,7 @@ def test_what_cannot_be_used_is_refused_in_one_sentence(tmp_path, text, message)
 def test_missing_files_and_presets_are_named(tmp_path):
     with pytest.raises(ConfigError, match=r"no configuration file .*absent\.toml"):
         load_config(tmp_path / "absent.toml")
-    with pytest.raises(KeyError, match="no preset 'cosmos'; known: goodss"):
-        load_config("cosmos")
+    refuses("no preset 'cosmos'; known: goodss", load_config, "cosmos", error=KeyError)
     with pytest.raises(ConfigError, match="--quick belongs to presets"):
         load_config(tmp_path / "absent.toml", quick=True)
 
@@ -88,8 +88,7 @@ def test_missing_files_and_presets_are_named(tmp_path):
 def test_a_file_that_is_no_text_is_named(tmp_path):
     path = tmp_path / "binary.toml"
     path.write_bytes(b"\xff\xfe")
-    with pytest.raises(ConfigError, match=r"binary\.toml is not a text file in UTF-8"):
-        load_config(path)
+    refuses(r"binary\.toml is not a text file in UTF-8", load_config, path, error=ConfigError)
 
 
 def test_overrides_win():

@@ -9,6 +9,7 @@ from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData
 from astropy.table import QTable
 
+from helpers.errors import refuses
 from helpers.runs import STAGES
 from helpers.scenes import catalog_at
 from miricigale.instrument import Exposure, flat_field, miri_detector
@@ -99,8 +100,7 @@ def test_each_effect_is_one_more_truth():
     ],
 )
 def test_perturbations_that_cannot_be(perturb, message):
-    with pytest.raises(ConfigError, match=message):
-        config_of(**perturb)
+    refuses(message, config_of, error=ConfigError, **perturb)
 
 
 def test_no_stage_of_the_analysis_knows_of_them():

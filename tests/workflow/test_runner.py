@@ -7,6 +7,7 @@ from concurrent.futures import BrokenExecutor, Executor, ThreadPoolExecutor
 
 import pytest
 
+from helpers.errors import refuses
 from miricigale.refdata import locate
 from miricigale.utils.exceptions import ConfigError, DataError, MiricigaleWarning, OtherResultsError
 from miricigale.workflow.config import StudyConfig, load_config
@@ -140,8 +141,7 @@ def test_an_edited_configuration_is_not_overwritten(tmp_path):
     path = folder / "config.toml"
     edited = path.read_text().replace("min_detected = 2", "min_detected = 3 # mine")
     path.write_text(edited)
-    with pytest.raises(OtherResultsError, match=r"config\.toml was edited since"):
-        recorder.run(folder)
+    refuses(r"config\.toml was edited since", recorder.run, folder, error=OtherResultsError)
     assert path.read_text() == edited
     # it is used when it is asked for, and stays as it was written
     assert recorder.run(folder, load_config(path)) == []
@@ -399,8 +399,7 @@ def test_a_unit_depends_on_the_units_that_it_reads_only(tmp_path):
         text = context.path(f"{unit}/first.txt").read_text()
         context.save(f"{unit}/second.txt", lambda path: path.write_text(text))
         other = {"a": "b", "b": "a"}[unit]
-        with pytest.raises(RuntimeError, match="without declaring"):
-            context.path(f"{other}/first.txt")
+        refuses("without declaring", context.path, f"{other}/first.txt", error=RuntimeError)
 
     def run(units):
         ran.clear()
@@ -458,8 +457,7 @@ def test_a_part_of_the_stages_and_units(tmp_path):
     assert run(again="first:a/*") == ["a/1"]
     assert run() == []
     wanted = "'until' is 'fourth', which is no stage and matches no unit .*; stages: first, second, third;"
-    with pytest.raises(ConfigError, match=wanted):
-        run(until="fourth")
+    refuses(wanted, run, error=ConfigError, until="fourth")
     with pytest.raises(
         ConfigError, match="nothing of 'again', 'second', is among what 'until', 'first', needs"
     ):
@@ -473,8 +471,7 @@ def test_stages_must_come_after_what_they_need(tmp_path):
 
 
 def test_a_full_disk_is_text_before_the_run(tmp_path):
-    with pytest.raises(DataError, match="the run needs about"):
-        check_disk(tmp_path / "not" / "yet", 10**18)
+    refuses("the run needs about", check_disk, tmp_path / "not" / "yet", 10**18, error=DataError)
     check_disk(tmp_path / "not" / "yet", 1)
 
 

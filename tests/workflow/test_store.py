@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from helpers.errors import refuses
 from miricigale.utils.exceptions import DataError
 from miricigale.workflow.engine.store import ProductStore
 
@@ -106,15 +107,13 @@ def test_without_any_manifest_nothing_is_taken_for_a_product(folder):
         ProductStore(folder)
     for name in ("manifest.json", ".manifest.copy.json"):
         (folder / name).unlink()
-    with pytest.raises(DataError, match="is no run's folder"):
-        ProductStore(folder)
+    refuses("is no run's folder", ProductStore, folder, error=DataError)
     assert (folder / "part" / "product.txt").read_text() == "whole"
 
 
 def test_a_foreign_folder_is_refused(tmp_path):
     (tmp_path / "precious.txt").write_text("mine")
-    with pytest.raises(DataError, match="is no run's folder"):
-        ProductStore(tmp_path)
+    refuses("is no run's folder", ProductStore, tmp_path, error=DataError)
 
 
 def test_a_run_that_began_between_two_looks_is_no_foreign_folder(tmp_path, monkeypatch):

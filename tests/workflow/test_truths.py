@@ -6,6 +6,7 @@ import pytest
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
+from helpers.errors import refuses
 from helpers.runs import STAGES, do_stage
 from helpers.scenes import catalog_at
 from miricigale.evaluation import AGNPopulation
@@ -142,5 +143,4 @@ def test_names_of_truths_and_sets():
     ],
 )  # fmt: skip
 def test_truths_and_sets_that_cannot_be(values, message):
-    with pytest.raises(ConfigError, match=message):
-        StudyConfig.from_dict(values)
+    refuses(message, StudyConfig.from_dict, values, error=ConfigError)

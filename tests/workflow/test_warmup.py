@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import miricigale
+from helpers.errors import refuses
 from miricigale.workflow import warmup
 
 ROOT = Path(miricigale.__file__).parent.parent
@@ -122,8 +123,7 @@ def test_nothing_is_imported_from_the_folder_of_the_call(tmp_path):
 
 def test_unknown_jobs_are_refused():
     for function in (warmup.is_compiled, warmup.compile_job, warmup.compile_apart):
-        with pytest.raises(ValueError, match="'name' must be one of fit, images"):
-            function("fits")
+        refuses("'name' must be one of fit, images", function, "fits")
 
 
 def test_kernels_run_where_nothing_can_be_kept(tmp_path):
