@@ -248,10 +248,9 @@ def test_a_filter_says_what_it_has():
     assert band(100 * u.um) == 0
     assert_quantity_allclose(band(band.wave), band.throughput)
     assert "pivot" in band._repr_html_()
-    with pytest.raises(
-        AttributeError, match=r"Filter has no 'min_wavelength'; it has .*wavelength"
-    ):
-        band.min_wavelength  # noqa: B018
+    assert (band.min_wavelength, band.max_wavelength) == tuple(band.bounds)
+    with pytest.raises(AttributeError, match=r"Filter has no 'min_wave'; it has .*wave"):
+        band.min_wave  # noqa: B018
     assert Filter([1, 2] * u.um, [1, 1], "own") == Filter("own", [1, 2] * u.um, [1, 1])
     refuses("'wave' must be a quantity", Filter, [1, 2], [1, 1], error=u.UnitsError, name="own")
 
