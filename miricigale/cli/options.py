@@ -120,11 +120,10 @@ def _add(parser, groups, flags, option, known):
         own["action"] = argparse.BooleanOptionalAction
     if isinstance(own.get("metavar"), list):
         own["metavar"] = tuple(own["metavar"])
-    if own.get("default") == "" and own.get("action") == "store_true":
-        own["default"] = None
     if (group := option.get("group")) is not None:
-        parser = groups.setdefault(group, None) or parser.add_mutually_exclusive_group()
-        groups[group] = parser
+        if group not in groups:
+            groups[group] = parser.add_mutually_exclusive_group()
+        parser = groups[group]
     parser.add_argument(*flags.split(), **own)
 
 
@@ -135,12 +134,12 @@ def _filled(text, words):
 
 
 def read_input(folder):
-    """Write what standard input holds, a table, into a folder: its path."""
+    """Write what standard input holds, a table, beside the folder of its results: its path."""
     data = sys.stdin.buffer.read()
     ending = (
         "fits" if data.startswith(b"SIMPLE") else "ecsv" if data.startswith(b"# %ECSV") else "csv"
     )
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"input.{ending}"
+    path = folder.with_name(f"{folder.name}-input.{ending}")
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(data)
     return path

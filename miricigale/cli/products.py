@@ -66,7 +66,7 @@ def show(args):
     product = open_product(args.file)
     print(f"{args.file}: {type(product).__name__}")
     if isinstance(product, Table):
-        product.info(["attributes", "stats"])
+        product.info("stats")
     elif hasattr(product, "summary"):
         print(product.summary())
     else:

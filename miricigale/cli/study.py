@@ -64,7 +64,9 @@ def plan(args):
     keys = {flag.lstrip("-"): option["key"] for flag, option in options.items() if "key" in option}
     keys |= {"seed": "plan.seed", "threads": "plan.threads"}
     values = {key: getattr(args, name) for name, key in keys.items()}
-    values = {key: value for key, value in values.items() if value is not None}
+    values = {
+        key: value for key, value in values.items() if value is not None and value is not False
+    }
     others = [args.config, args.bands, args.position, args.output, *args.settings]
     if not values and not args.print_config and all(one is None for one in others):
         from miricigale.planning import plan_table

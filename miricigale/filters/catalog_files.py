@@ -148,22 +148,21 @@ def warn_of_codes(coded, where, stacklevel):
         warnings.warn(f"{where}: {text} ({how})", CatalogWarning, stacklevel=stacklevel + 1)
 
 
-class MappedRows:
+class RenamedRows:
     """
-    A table on disk by pieces (`~miricigale.utils.row_files.RowFile`), with our names and units.
+    A table on disk by pieces (`~miricigale.utils.row_files.RowFile`), with our names of columns.
 
     Parameters
     ----------
     rows : `~miricigale.utils.row_files.RowFile`
         The file.
-    catalog_map : `CatalogMap`
-        The map.
+    names : dict of str to str
+        Ours by the file's.
     """
 
-    def __init__(self, rows, catalog_map):
-        self._rows, self.map = rows, catalog_map
-        names, self._lost = catalog_map.names(rows.colnames, rows.path.name)
-        self._theirs = {ours: theirs for theirs, ours in names.items()}
+    def __init__(self, rows, names):
+        self._rows = rows
+        self._theirs = {names.get(theirs, theirs): theirs for theirs in rows.colnames}
 
     def __getattr__(self, name):
         return getattr(self._rows, name)
@@ -174,14 +173,38 @@ class MappedRows:
         return tuple(self._theirs)
 
     def chunk(self, i):
-        """A piece of the table; its warnings are those of `told`."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", CatalogWarning)
-            return self.map.convert(self._rows.chunk(i), self._rows.path.name)[0]
+        """A piece of the table."""
+        table = self._rows.chunk(i)
+        table.rename_columns(list(self._theirs.values()), list(self._theirs))
+        return table
 
     def foreign_chunks(self, name):
         """As `RowFile.foreign_chunks`, by our name."""
         return self._rows.foreign_chunks(self._theirs.get(name, name))
+
+
+class MappedRows(RenamedRows):
+    """
+    A table on disk by pieces, with our names and units.
+
+    Parameters
+    ----------
+    rows : `~miricigale.utils.row_files.RowFile`
+        The file.
+    catalog_map : `CatalogMap`
+        The map.
+    """
+
+    def __init__(self, rows, catalog_map):
+        names, self._lost = catalog_map.names(rows.colnames, rows.path.name)
+        super().__init__(rows, names)
+        self.map = catalog_map
+
+    def chunk(self, i):
+        """A piece of the table; its warnings are those of `told`."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", CatalogWarning)
+            return self.map.convert(self._rows.chunk(i), self._rows.path.name)[0]
 
     def told(self):
         """Return the warnings about the whole file, all of which is read."""

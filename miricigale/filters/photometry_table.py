@@ -10,6 +10,7 @@ from astropy.table import QTable
 from miricigale.filters.band_names import find_filter
 from miricigale.filters.catalog_files import told_of
 from miricigale.filters.catalog_map import PER_MAGNITUDE
+from miricigale.filters.library import FILTERS
 from miricigale.utils.exceptions import CatalogWarning, argument_error
 from miricigale.utils.missing import plain_floats, without_codes
 from miricigale.utils.tables import as_table, error_column
@@ -21,6 +22,9 @@ _ERROR = re.compile(
     re.IGNORECASE,
 )
 _FLUX = re.compile(r"(?:f|flux|mag|m)_(?P<a>.+)|(?P<b>.+?)_(?:flux|mag)", re.IGNORECASE)
+_MAGNITUDE = re.compile(
+    r"(?:(?:e|err|error)_)?(?:mag|m)_|.*_mag(?:_?err)?$|(?:ab)?mag(?:nitude)?$", re.IGNORECASE
+)
 # columns that are the only band asked for
 _ALONE = ("flux", "flux_density", "fnu", "f_nu", "mag", "magnitude", "abmag")
 _IDS = ("id", "number", "source_id", "objid")
@@ -34,7 +38,8 @@ def as_photometry(data, bands, argument="photometry"):
     ----------
     data : `~astropy.table.Table` or anything for `~miricigale.utils.tables.as_table`
         Fluxes by any usual name of a band (``F770W``, ``f_F770W``, ``mag_F770W``, ``jwst.miri.F770W``) and
-        their errors (``F770W_err``, ``e_F770W``, ``err_F770W``), as flux densities or AB magnitudes.
+        their errors (``F770W_err``, ``e_F770W``, ``err_F770W``), as flux densities or AB magnitudes. Where one
+        band is meant and none is named, ``flux`` or ``mag`` is it.
     bands : iterable of str
         Our names of the bands that are meant; other columns stay as they are.
     argument : str, optional
@@ -74,6 +79,34 @@ def as_photometry(data, bands, argument="photometry"):
     for text in told_of((), coded):
         warnings.warn(f"{argument}: {text}", CatalogWarning, stacklevel=3)
     return out
+
+
+def band_columns(colnames, argument="photometry"):
+    """
+    Columns that are fluxes and errors of bands under names other than ours.
+
+    Parameters
+    ----------
+    colnames : iterable of str
+        Of a catalog.
+    argument : str, optional
+        The argument's name, for messages.
+
+    Returns
+    -------
+    names : dict of str to str
+        Our names by theirs, of bands with an error; magnitudes are left out.
+
+    Raises
+    ------
+    ValueError
+        If two columns are the same band.
+    """
+    fluxes = [name for name in colnames if not _MAGNITUDE.match(name)]
+    found = _our_names(fluxes, FILTERS.names(), argument)
+    both = [name for name in found if error_column(name) in found]
+    kept = {*both, *map(error_column, both)}
+    return {theirs: ours for ours, theirs in found.items() if ours in kept and ours != theirs}
 
 
 def _our_names(colnames, bands, argument):
@@ -121,9 +154,7 @@ def _is_ab(table, name):
         return False
     unit = getattr(table[name], "unit", None)
     if unit is None:
-        return (
-            re.match(r"(?:mag|m)_|.*_mag$|(?:ab)?mag(?:nitude)?$", name, re.IGNORECASE) is not None
-        )
+        return _MAGNITUDE.match(name) is not None
     return unit == u.ABmag
 
 

@@ -2,11 +2,13 @@
 
 import logging
 import warnings
+from pathlib import Path
 
 import numpy as np
 
 from miricigale.filters import Filter
-from miricigale.filters.catalog_files import MappedRows, as_catalog_map
+from miricigale.filters.catalog_files import MappedRows, RenamedRows, as_catalog_map
+from miricigale.filters.photometry_table import band_columns
 from miricigale.utils.exceptions import FitWarning, argument_error
 from miricigale.utils.row_files import open_rows
 from miricigale.utils.tables import error_column
@@ -15,9 +17,12 @@ log = logging.getLogger(__name__)
 
 
 def open_catalog(path, chunk_rows, *, hdu=None, catalog_map=None):
-    """Open a catalog by rows (`~miricigale.utils.row_files.RowFile`), under the names of a map if one is given."""
+    """Open a catalog by rows (`~miricigale.utils.row_files.RowFile`), under our names or those of a map."""
     rows = open_rows(path, chunk_rows, hdu=hdu)
-    return rows if catalog_map is None else MappedRows(rows, as_catalog_map(catalog_map))
+    if catalog_map is not None:
+        return MappedRows(rows, as_catalog_map(catalog_map))
+    names = band_columns(rows.colnames, Path(path).name)
+    return RenamedRows(rows, names) if names else rows
 
 
 def fit_catalog(
@@ -40,7 +45,7 @@ def fit_catalog(
     ----------
     path : path-like
         FITS, ECSV, CSV, VOTable or plain text with ``id`` and, for each band, ``<filter>`` and
-        ``<filter>_err``, or with columns that ``catalog_map`` gives these names.
+        ``<filter>_err`` by any usual name of the filter, or with columns that ``catalog_map`` gives these names.
     output : path-like
         Folder of the results.
     axes : {"fit", "quick", "survey"}, optional

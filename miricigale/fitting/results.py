@@ -268,8 +268,14 @@ class FitResults(FitRows):
         return None
 
     def plot(self, ax=None, **kwargs):
-        """Draw the spectrum and the photometry of a single object (`plot_sed`); returns the axes."""
-        return self.plot_sed(ax, **kwargs)
+        """Draw a single object (`plot_sed`), or the masses of several over 1 + z; returns the axes."""
+        if self.isscalar:
+            return self.plot_sed(ax, **kwargs)
+        from miricigale.plotting.comparison import plot_relation
+
+        mass = self.median("mass")
+        labels = "1 + z", f"stellar mass ({mass.unit}), posterior medians"
+        return plot_relation(1 + self.median("redshift").value, mass.value, ax=ax, labels=labels)
 
     def percentile(self, name, levels):
         """

@@ -72,6 +72,13 @@ def frame_time(readout="FASTR1", subarray="FULL"):
     return times[readout][subarray] * u.s
 
 
+def _count(value, name, least):
+    """An integer that is not below ``least``."""
+    if not is_number(value) or value != int(value) or value < least:
+        raise argument_error(name, f"an integer of at least {least}", value)
+    return int(value)
+
+
 def _counts_of(filter, time, frame, n_integrations, max_fill=0.6):
     """Groups and integrations of an exposure that lasts a time; the integrations may be given."""
     seconds = float(to_array(time, u.s, "time", ndim=0, finite=True))
@@ -168,15 +175,13 @@ class Exposure(Interactive):
         if (n_groups is None) == (time is None):
             got = "neither" if time is None else "both"
             raise argument_error("n_groups, time", "one of them given", got)
+        counts = {"dither": _count(dither, "dither", 0)}
+        if n_integrations is not None:
+            n_integrations = _count(n_integrations, "n_integrations", 1)
         if time is not None:
             n_groups, n_integrations = _counts_of(filter, time, frame, n_integrations)
-        counts = {"n_groups": n_groups, "n_integrations": n_integrations, "dither": dither}
-        counts["n_integrations"] = 1 if n_integrations is None else n_integrations
-        for name, least in (("n_groups", 2), ("n_integrations", 1), ("dither", 0)):
-            value = counts[name]
-            if not is_number(value) or value != int(value) or value < least:
-                raise argument_error(name, f"an integer of at least {least}", value)
-            counts[name] = int(value)
+        counts["n_groups"] = _count(n_groups, "n_groups", 2)
+        counts["n_integrations"] = n_integrations or 1
         if pointing is not None:
             pointing = as_position(pointing, "pointing")
             roll = to_array(
@@ -196,7 +201,7 @@ class Exposure(Interactive):
         )
         if self.pointing is not None:
             ra, dec = self.pointing.ra.deg, self.pointing.dec.deg
-            text += f" at {ra:.6g} {dec:+.6g}, roll {self.roll.value:g} deg"
+            text += f" at {ra:.8g} {dec:+.8g}, roll {self.roll.value:g} deg"
         return f"{text}>"
 
     def _facts(self):
@@ -225,7 +230,10 @@ class Exposure(Interactive):
         -------
         exposure : `Exposure`
         """
-        frame = frame_time(options.get("readout", "FASTR1"), options.get("subarray", "FULL"))
+        kind = (
+            str(options.get(k, v)).upper() for k, v in (("readout", "FASTR1"), ("subarray", "FULL"))
+        )
+        frame = frame_time(*kind)
         n_groups, n_integrations = _counts_of(filter, time, frame, None, max_fill)
         return cls(filter, n_groups=n_groups, n_integrations=n_integrations, **options)
 

@@ -18,6 +18,7 @@ from .forced import ForcedPhotometer as ForcedPhotometer
 from .from_files import measure_files as measure_files
 from .injection import calibrate_errors as calibrate_errors
 from .mosaics import MosaicFile as MosaicFile
+from .mosaics import as_mosaic as as_mosaic
 from .mosaics import read_mosaic as read_mosaic
 from .offsets import OffsetMap as OffsetMap
 from .priors import read_prior as read_prior

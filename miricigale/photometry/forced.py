@@ -142,6 +142,10 @@ class ForcedPhotometer(Interactive):
         if (self.kernel is None) == (psf is None):
             got = "neither" if psf is None else "both"
             raise argument_error("kernel, psf", "one of them given", got)
+        if self.kernel is not None and highres_psf is not None:
+            raise argument_error(
+                "highres_psf", "given with 'psf', not with 'kernel'", "a kernel too"
+            )
         if self.kernel is None:
             if highres_psf is None:
                 kernel = MatchingKernel.identity(psf)

@@ -1,7 +1,5 @@
 """Figures of images and photometry: background, light within radii, offsets by kind of source."""
 
-import itertools
-
 import numpy as np
 
 from miricigale.plotting.axes import (
@@ -141,11 +139,11 @@ def plot_energies(radius, curves, *, ax=None, **kwargs):
     ax : `~matplotlib.axes.Axes`
     """
     ax = resolve_axes(ax)
-    styles = (("tab:blue", "-"), (TRUE, "-"), (MEASURED, "--"))
-    for (name, values), (color, style) in zip(
-        curves.items(), itertools.cycle(styles), strict=False
-    ):
-        ax.plot(radius, values, **{"label": name, "color": color, "ls": style, "lw": 1.4} | kwargs)
+    for k, (name, values) in enumerate(curves.items()):
+        # every third one is dashed: it may lie on the one before
+        ax.plot(
+            radius, values, **{"label": name, "ls": ("-", "-", "--")[k % 3], "lw": 1.4} | kwargs
+        )
     ax.set(xlabel="radius [arcsec]", ylabel="encircled energy", ylim=(0, None))
     ax.legend(frameon=False)
     return ax

@@ -139,7 +139,7 @@ class InstrumentPSF(ImagePSF):
         """
         from miricigale.plotting.scene import plot_scene
 
-        return plot_scene(self.data, ax=ax, label=f"{self.filter or 'PSF'}", **kwargs)
+        return plot_scene(self.data, ax=ax, label=self.filter or "PSF", **kwargs)
 
     @property
     def facts(self):

@@ -7,7 +7,7 @@ import numpy as np
 from astropy.io.fits import Header
 from astropy.nddata import CCDData
 
-from miricigale.instrument import ImageFacts
+from miricigale.instrument import Image, ImageFacts
 from miricigale.reduction.assumed import history_of
 from miricigale.reduction.background import Background
 from miricigale.reduction.files import ImageFile, write_image
@@ -103,9 +103,10 @@ class ReductionResult(Interactive):
         OSError
             If the file exists and ``overwrite`` is False.
         """
-        self.mosaic.meta["notes"] = list(self.notes)
+        mosaic = Image(self.mosaic, copy=False)
+        mosaic.meta = {**self.mosaic.meta, "notes": list(self.notes)}
         planes = {"WHT": self.weight, "CON": self.n_images, "BKG": self.mosaic_background.level}
-        return write_image(self.mosaic, path, planes=planes, overwrite=overwrite)
+        return write_image(mosaic, path, planes=planes, overwrite=overwrite)
 
 
 def rate_image(reducer, ramp, maps, fit):

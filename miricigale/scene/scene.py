@@ -138,6 +138,9 @@ class Scene(Interactive):
             catalog = read_catalog(catalog)
         sources = as_sources(catalog, self._filter)
         self._catalog = check_catalog(sources, filters=[self._filter], wcs=wcs)
+        if psf is None and (exposure is None or wcs is not exposure.wcs):
+            # the model is in the axes of the detector
+            raise argument_error("psf", "given for a grid that is not that of an exposure", "None")
         psf = miri_psf(self._filter) if psf is None else as_psf(psf)
         self._shape = tuple(int(n) for n in wcs.pixel_shape[::-1])
         self._background = self._check_background(background)

@@ -12,14 +12,14 @@ from miricigale.utils.missing import plain_floats, without_codes
 __all__ = ["as_position", "as_positions"]
 
 _WANTED = "one SkyCoord, text such as '150.1 +2.2' or '10h00m24s +02d12m00s', or (ra, dec) in deg"
-#: Columns of right ascension and declination, in lower case and without what follows an underscore.
-_PAIRS = {
-    "ra": "dec",
-    "alpha": "delta",
-    "raj2000": "dej2000",
-    "alphawin": "deltawin",
-    "lon": "lat",
-}
+#: Columns of right ascension and declination, in lower case and without ``_j2000``.
+_PAIRS = (
+    ("ra", "dec"),
+    ("alpha", "delta"),
+    ("alphawin", "deltawin"),
+    ("raj2000", "dej2000"),
+    ("raj2000", "decj2000"),
+)
 
 
 def as_position(value, argument):
@@ -92,9 +92,7 @@ def as_positions(table, argument, wcs=None, *, missing=False):
     columns = {}
     for name in table.colnames:
         columns.setdefault(name.lower().removesuffix("_j2000"), name)
-    pair = next(
-        ((columns[a], columns[b]) for a, b in _PAIRS.items() if {a, b} <= set(columns)), None
-    )
+    pair = next(((columns[a], columns[b]) for a, b in _PAIRS if {a, b} <= set(columns)), None)
     if "sky" in skies or (skies and pair is None):
         sky = table["sky" if "sky" in skies else skies[0]].icrs
     elif pair is not None:

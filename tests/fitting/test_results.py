@@ -220,3 +220,10 @@ def test_rows_ids_and_columns(results, tmp_path):
     np.testing.assert_allclose(back["mass_p50"], table["mass_p50"].value)
     with pytest.raises(AttributeError, match="FitResults has no 'medain'; it has median"):
         results.medain  # noqa: B018
+
+
+def test_the_picture_of_several_objects_is_masses_over_redshifts(results):
+    ax = results.plot(ax=Figure().subplots())
+    x, y = ax.lines[0].get_data()
+    np.testing.assert_allclose(x, 1 + results["redshift"].value)
+    np.testing.assert_allclose(y, results["mass"].to_value(u.Msun))

@@ -192,6 +192,11 @@ def test_time_in_place_of_groups():
     # 111 frames of 2.775 s
     assert made.replace(time=308 * u.s).exposure_time.to_value(u.s) == pytest.approx(308, abs=3)
     refuses(
+        "'n_integrations' must be an integer", Exposure, "F770W", time=1 * u.h, n_integrations=0
+    )
+    small = Exposure.from_time("F770W", 1 * u.min, readout="fastr1", subarray="sub64")
+    assert small.exposure_time.to_value(u.s) == pytest.approx(60, abs=0.1)
+    refuses(
         "'n_groups, time' must be one of them given, got both",
         made.replace,
         time=1 * u.h,

@@ -9,6 +9,7 @@ from astropy.io import fits
 from astropy.nddata import CCDData, NDData, StdDevUncertainty
 from astropy.table import QTable
 from astropy.wcs import WCS
+from matplotlib.figure import Figure
 from photutils.psf import CircularGaussianPRF
 
 from helpers.errors import refuses
@@ -133,6 +134,9 @@ def test_what_is_no_image_or_kernel_is_named(images, psfs, sky):
     refuses("'kernel, psf' must be one of them given, got neither", ForcedPhotometer)
     kernel = MatchingKernel.identity(psfs["psf"])
     refuses("one of them given, got both", ForcedPhotometer, kernel, psf=psfs["psf"])
+    refuses(
+        "'highres_psf' must be given with 'psf'", ForcedPhotometer, kernel, highres_psf=psfs["psf"]
+    )
     refuses("'kernel' must be a MatchingKernel or a KernelField", ForcedPhotometer, psfs["psf"])
     refuses("'angle' must be given to 'MatchingKernel.identity'", ForcedPhotometer, psf="F770W")
     refuses("'psf' must be a PSF on pixels of known size", ForcedPhotometer, psf=np.ones((9, 9)))
@@ -172,9 +176,10 @@ def test_a_kernel_is_applied_and_drawn(psfs, images):
     convolved = kernel(images[1])
     np.testing.assert_array_equal(convolved.data, kernel.apply(images[1].data))
     assert (convolved.unit, convolved.uncertainty) == (u.uJy, None)
-    curves = {line.get_label(): line.get_ydata() for line in kernel.plot().lines}
-    # Gaussians: half of the light within half of the width at half maximum, if that is resolved
-    radius = kernel.plot().lines[0].get_xdata()
+    lines = kernel.plot(ax=Figure().subplots()).lines
+    curves = {line.get_label(): line.get_ydata() for line in lines}
+    # the closed form of a Gaussian
+    radius = lines[0].get_xdata()
     np.testing.assert_allclose(curves["convolved"], curves["wide PSF"], atol=5e-3)
     sigma = psfs["highres_psf"].fwhm.value / np.sqrt(8 * np.log(2))
     truth = 1 - np.exp(-0.5 * (radius / sigma) ** 2)

@@ -72,7 +72,14 @@ def test_a_result_is_written_and_drawn(ramps, tmp_path):
     path = result.write(tmp_path / "mosaic.fits")
     with fits.open(path) as hdus:
         assert {"SCI", "ERR", "DQ", "WHT", "CON", "BKG"} <= {hdu.name for hdu in hdus}
-    assert equal(read_images(path)[0].image, result.mosaic)
+    back = read_images(path)[0].image
+    assert equal(back, result.mosaic)
+    np.testing.assert_array_equal(
+        back.flags & ~int(DQ.DO_NOT_USE), result.mosaic.flags & ~int(DQ.DO_NOT_USE)
+    )
+    # which leaves the image as it is
+    assert "notes" not in result.mosaic.meta
+    assert read_images(path)[0].image.meta["notes"] == list(result.notes)
     refuses("exists", result.write, path, error=OSError)
     assert result.image is result.mosaic
     assert "dithers: 3" in result.summary()

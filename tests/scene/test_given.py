@@ -41,6 +41,7 @@ def pixels(exposure):
         Table({"RA": RA, "DEC": DEC, "f_f770w": FLUX * 1e3 * u.nJy}),
         {"ra": RA * u.deg, "dec": np.radians(DEC) * u.rad, "F770W": FLUX * 1e-6 * u.Jy},
         {"ALPHA_J2000": RA, "DELTA_J2000": DEC, "mag_F770W": MAG},
+        {"RAJ2000": RA, "DECJ2000": DEC, "F770W": FLUX * u.uJy},
         {"RAJ2000": RA / 15 * u.hourangle, "DEJ2000": DEC, "JWST/MIRI.F770W": MAG * u.ABmag},
         pd.DataFrame({"ra": RA, "dec": DEC, "mag": MAG}),
         np.array(
@@ -103,6 +104,11 @@ def test_what_lacks_is_named(exposure):
         ({"ra": RA, "dec": [2.2, np.nan], "flux": FLUX * u.uJy}, {}, "finite positions, got 1"),
         ({"ra": RA, "dec": DEC}, {}, r"columns \['miri.f770w'\]"),
         ({"ra": RA, "dec": DEC}, {"exposure": None}, "'filter' must be given, or an exposure"),
+        (
+            {"ra": RA, "dec": DEC, "flux": FLUX * u.uJy, "profile": "point"},
+            {"exposure": None, "filter": "F770W", "wcs": exposure.wcs},
+            "'psf' must be given for a grid that is not that of an exposure",
+        ),
         (3, {}, "'catalog' must be a table, a dict of columns"),
     ):
         refuses(message, Scene, catalog, **{"exposure": exposure} | options)

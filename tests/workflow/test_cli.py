@@ -5,17 +5,19 @@ import sys
 from pathlib import Path
 
 import astropy.units as u
+import numpy as np
 import pytest
 from astropy.table import Table
 
 from miricigale.cli import main
-from miricigale.cli.options import declarations, make_parser, read_input
+from miricigale.cli.options import declarations, make_parser
 from miricigale.detector import Detector
 from miricigale.filters.surveys import SURVEYS
 from miricigale.instrument import Exposure
 from miricigale.psf import InstrumentPSF
 from miricigale.reduction import Reducer
 from miricigale.scene import Scene
+from miricigale.sed import SEDModel
 from miricigale.workflow import load_config
 from miricigale.workflow.config import preset_names
 
@@ -257,8 +259,19 @@ def test_products_are_shown_cited_and_have_psfs(capsys, tmp_path, monkeypatch):
 
 
 def test_a_catalog_comes_from_standard_input(tmp_path, monkeypatch):
-    text = b"id,F770W,F770W_err\n1,2.0,0.1\n"
+    bands = ("miri.f770w", "miri.f1000w", "miri.f1500w")
+    table = SEDModel.yang2021().fluxes({"redshift": [1.0, 2.0]}, bands)
+    rows = [[v for n in bands for v in (row[n].value, 0.1 * row[n].value)] for row in table]
+    theirs = "F770W,F770W_err,f_f1000w,e_f1000w,JWST/MIRI.F1500W,JWST/MIRI.F1500W_err"
+    ours = ",".join(f"{name},{name}_err" for name in bands)
+    body = "".join(f"{k},{','.join(map(repr, map(float, row)))}\n" for k, row in enumerate(rows))
+    text = f"id,{theirs}\n{body}".encode()
     monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(text)))
-    path = read_input(tmp_path / "fits")
-    assert path.name == "input.csv"
-    assert path.read_bytes() == text
+    (tmp_path / "ours.csv").write_text(f"id,{ours}\n{body}")
+    options = ["--axes", "quick", "--flux-unit", "uJy", "--no-progress", "--threads", "1"]
+    for path, name in (("-", "fits"), (str(tmp_path / "ours.csv"), "same")):
+        assert main(["fit", path, "-o", str(tmp_path / name), *options]) == 0
+    assert (tmp_path / "fits-input.csv").read_bytes() == text
+    found, same = (Table.read(tmp_path / name / "table.fits") for name in ("fits", "same"))
+    for column in ("id", "redshift_p50", "chi2_best"):
+        np.testing.assert_array_equal(found[column], same[column])
