@@ -24,7 +24,7 @@ from miricigale.detector.ramp import Ramp
 from miricigale.detector.work import Work
 from miricigale.instrument import DetectorProperties, miri_detector
 from miricigale.utils.exceptions import DetectorWarning, argument_error
-from miricigale.utils.interactive import Interactive
+from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_kind
 from miricigale.utils.parallel import check_memory
@@ -43,6 +43,7 @@ _STANDARD = [
 _EXPOSE_TO = "expose fewer groups, or write it by 'expose_to'"
 
 
+@checked_calls
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Detector(Interactive):
     """

@@ -10,7 +10,7 @@ from miricigale.detector import level1b, ramp_reader
 from miricigale.detector.effects.order import checked_effects
 from miricigale.instrument import DQ, STEPS, DetectorProperties
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.interactive import Interactive
+from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.options import check_kind
 from miricigale.utils.units import DN
 
@@ -34,6 +34,7 @@ def _remade(data, exposure, values):
     return Ramp(data, exposure, **values)
 
 
+@checked_calls
 class Ramp(Interactive, NDData):
     """
     Counts of one exposure: every group of every integration.

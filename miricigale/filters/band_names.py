@@ -17,10 +17,16 @@ _XRAY = re.compile(r"xray_boxcar_(\d+(?:p\d+)?)to(\d+(?:p\d+)?)keV")
 
 
 @cache
+def _declared():
+    """What ``band_names.toml`` has."""
+    text = (importlib_resources.files("miricigale.filters") / "band_names.toml").read_text("utf-8")
+    return tomllib.loads(text)
+
+
+@cache
 def _tables():
     """Names without a rule, rules of CIGALE's names, and rules of names written in any way."""
-    text = (importlib_resources.files("miricigale.filters") / "band_names.toml").read_text("utf-8")
-    tables = tomllib.loads(text)
+    tables = _declared()
     rules = [(re.compile(rule), ours, *back) for rule, ours, *back in tables["rules"]]
     free = [(re.compile(rule, re.IGNORECASE), ours) for rule, ours in tables["free"]]
     return tables["names"], rules, free
@@ -98,6 +104,12 @@ def known_filter(given, known, kind="filter"):
     if name not in known:
         raise unknown_name(kind, text, known)
     return name
+
+
+def eazy_filter(number):
+    """Filter of a number in EAZY's ``FILTER.RES.latest``; None if there is no such curve here."""
+    groups = _declared()["eazy"].items()
+    return next((start + group[number] for start, group in groups if number in group), None)
 
 
 @cache

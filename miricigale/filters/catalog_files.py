@@ -1,5 +1,6 @@
 """Catalogs of other people, read from files, whole or by pieces."""
 
+import dataclasses
 import os
 import warnings
 from pathlib import Path
@@ -25,11 +26,12 @@ def read_catalog_photometry(path, catalog_map=None, *, hdu=None, **options):
     path : path-like
         FITS, ECSV, VOTable, CSV or text.
     catalog_map : `CatalogMap`, str or path-like, optional
-        Names and units; the name of a survey (`SURVEYS`), or a TOML file (`CatalogMap.read`).
+        Names and units; the name of a survey (`SURVEYS`), or a file (`CatalogMap.read`): TOML, or a translate file
+        of EAZY.
     hdu : int or str, optional
         Extension of a FITS file with several tables.
     **options
-        As for `CatalogMap`, in place of it: ``columns``, ``units``, ``survey``, ``missing``, ``factor``,
+        As for `CatalogMap`, in place of what it has: ``columns``, ``units``, ``survey``, ``missing``, ``factor``,
         ``limits``.
 
     Returns
@@ -71,20 +73,17 @@ def read_catalog_photometry(path, catalog_map=None, *, hdu=None, **options):
 
 
 def as_catalog_map(catalog_map, options=None):
-    """A `CatalogMap` of what a caller gave: one, the name of a survey, a file, or keyword arguments."""
-    options = options or {}
-    if catalog_map is None:
-        return CatalogMap(**options)
-    if options:
-        raise argument_error("catalog_map", f"None beside {sorted(options)}", repr(catalog_map))
-    if isinstance(catalog_map, CatalogMap):
-        return catalog_map
-    if not isinstance(catalog_map, (str, os.PathLike)):
+    """A `CatalogMap` of what a caller gave: one, the name of a survey or a file, with keyword arguments."""
+    if isinstance(catalog_map, str) and not catalog_map.endswith((".toml", ".translate")):
+        catalog_map = CatalogMap(survey=catalog_map)
+    elif isinstance(catalog_map, (str, os.PathLike)):
+        catalog_map = CatalogMap.read(catalog_map)
+    elif catalog_map is None:
+        catalog_map = CatalogMap()
+    elif not isinstance(catalog_map, CatalogMap):
         wanted = "a CatalogMap, the name of a survey or a file"
         raise argument_error("catalog_map", wanted, type(catalog_map).__name__)
-    if isinstance(catalog_map, str) and not catalog_map.endswith(".toml"):
-        return CatalogMap(survey=catalog_map)
-    return CatalogMap.read(catalog_map)
+    return dataclasses.replace(catalog_map, **options or {})
 
 
 def told_of(lost, coded, what="taken as missing, by the number that stands there"):

@@ -12,6 +12,7 @@ import numpy as np
 from astropy.coordinates import Angle
 from astropy.table import QTable
 
+from miricigale.filters.band_names import eazy_filter
 from miricigale.filters.filter import Filter
 from miricigale.filters.surveys import SURVEYS, is_band
 from miricigale.utils.exceptions import CatalogWarning, DataError, argument_error, unknown_name
@@ -95,14 +96,20 @@ class CatalogMap:
         """
         Read a map in TOML: tables ``columns`` and ``units``, keys ``survey``, ``missing``, ``factor``, ``limits``.
 
+        A file that ends in ``.translate`` is one of EAZY's: lines of a column and ``F<number>`` or ``E<number>``
+        of a filter in ``FILTER.RES.latest``, ``id`` or ``z_spec``. It has no units.
+
         Raises
         ------
         `~miricigale.utils.exceptions.DataError`
-            If the file is missing, not TOML, or has another key.
+            If the file is missing, not TOML, or has another key; if it has a number of no filter here.
         """
         path = Path(path).expanduser()
         try:
-            values = tomllib.loads(path.read_text(encoding="utf-8"))
+            text = path.read_text(encoding="utf-8")
+            if path.suffix == ".translate":
+                return cls(columns=_translated(text, path))
+            values = tomllib.loads(text)
         except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as err:
             msg = f"{path} cannot be read as a map of columns: {err}"
             raise DataError(msg) from err
@@ -304,6 +311,28 @@ class CatalogMap:
             msg = f"'{argument}' column {name!r} must be convertible to {FNU}, got {unit}"
             raise u.UnitsError(msg)
         return u.Quantity(errors, unit).to_value(FNU)
+
+
+def _translated(text, path):
+    """Columns of a translate file of EAZY by our names."""
+    columns = {}
+    for line in text.splitlines():
+        theirs, meaning, *_ = [*line.partition("#")[0].split(), "", ""]
+        kind, number = meaning[:1].upper(), meaning[1:]
+        if meaning.lower() in ("id", "z_spec"):
+            columns["id" if meaning.lower() == "id" else "redshift"] = theirs
+        elif kind in ("F", "E") and number.isdigit():
+            name = eazy_filter(number)
+            if name is None:
+                msg = f"{path}: no filter here for {theirs} {meaning} (of FILTER.RES.latest)"
+                raise DataError(msg)
+            columns[name if kind == "F" else error_column(name)] = theirs
+        elif meaning and not meaning.upper().startswith("TOT"):
+            msg = (
+                f"{path}: {theirs} must be F or E and a number, id, z_spec or TOT, got {meaning!r}"
+            )
+            raise DataError(msg)
+    return columns
 
 
 def _plain_ids(table):

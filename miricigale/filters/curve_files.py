@@ -7,12 +7,10 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.utils.exceptions import DataError
-from miricigale.utils.files import read_table, unpacked_size
+from miricigale.utils.files import WRITERS, read_table, unpacked_size
 
 # units that a header may name
 _UNITS = re.compile(r"\b(um|microns?|nm|AA|Angstroms?)\b", re.IGNORECASE)
-#: Suffixes of files that are tables with units.
-TABLES = (".ecsv", ".fits", ".fit", ".xml", ".vot", ".votable")
 
 
 def read_curve(path, unit=None):
@@ -36,7 +34,7 @@ def read_curve(path, unit=None):
         The one in the file, else that of the file.
     """
     path = Path(path).expanduser()
-    return _of_table(path, unit) if path.suffix.lower() in TABLES else _of_text(path, unit)
+    return _of_table(path, unit) if path.suffix.lower() in WRITERS else _of_text(path, unit)
 
 
 def _of_table(path, unit):
@@ -44,7 +42,10 @@ def _of_table(path, unit):
     columns = [table[name] for name in table.colnames[:2]]
     has = getattr(columns[0], "unit", None) if columns else None
     if len(columns) < 2 or (unit is None and has is None):
-        msg = f"filter file {path} has not two columns, the first with a unit of wavelength"
+        msg = (
+            f"filter file {path} has not two columns, the first with a unit of wavelength: "
+            f"give 'unit' if it has none"
+        )
         raise DataError(msg)
     wave = np.asarray(getattr(columns[0], "value", columns[0]), float)
     name = str(table.meta.get("name") or table.meta.get("NAME") or path.stem)

@@ -15,7 +15,7 @@ from miricigale.filters.library import FILTERS, load_curve
 from miricigale.filters.spectra import check_wave, spectrum_arrays
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.files import write_table
-from miricigale.utils.interactive import Interactive
+from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.units import FNU, WAVE, Frozen, frozen_array, frozen_quantity, to_array
 
 #: Version of the band averages: raised when the same curve gives other numbers.
@@ -42,6 +42,7 @@ def _padded(wave, throughput):
     return wave, throughput
 
 
+@checked_calls
 @dataclasses.dataclass(frozen=True, eq=False, repr=False, init=False)
 class Filter(Frozen, Interactive):
     """

@@ -5,9 +5,9 @@ import os
 import astropy.units as u
 
 from miricigale.filters.band_names import find_filter
-from miricigale.filters.curve_files import TABLES
 from miricigale.filters.filter import Filter
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.files import WRITERS
 
 
 def as_filter(given, name=None, *, unit=None):
@@ -51,7 +51,7 @@ def as_filter(given, name=None, *, unit=None):
 def _is_path(text):
     if find_filter(text) is not None:
         return False
-    endings = (".dat", ".txt", ".par", *TABLES)
+    endings = (".dat", ".txt", ".par", *WRITERS)
     return text.lower().endswith(endings) or os.path.isfile(os.path.expanduser(text))
 
 

@@ -6,6 +6,7 @@ import warnings
 import numpy as np
 
 from miricigale.filters import as_photometry
+from miricigale.filters.band_names import known_filter
 from miricigale.filters.catalog_files import codes_of, warn_of_codes
 from miricigale.fitting.grid_fit import GridFit
 from miricigale.fitting.likelihood import (
@@ -23,9 +24,8 @@ from miricigale.fitting.samplers.fit import SamplerFit
 from miricigale.fitting.settings import GridSettings, SamplerSettings
 from miricigale.sed import ModelGrid, yang2021_axes
 from miricigale.utils.exceptions import FitWarning, argument_error
-from miricigale.utils.interactive import Interactive
+from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.meta import provenance
-from miricigale.utils.options import check_names
 from miricigale.utils.parallel import chunks, parallel_map, single_threaded
 from miricigale.utils.random import check_seed
 from miricigale.utils.tables import error_column
@@ -34,6 +34,7 @@ from miricigale.utils.units import FNU, check_count, is_number
 logger = logging.getLogger(__name__)
 
 
+@checked_calls
 class BayesFitter(Interactive):
     """
     Fit photometry and sum up the posterior: with every model of a grid, or by a nested sampler.
@@ -189,7 +190,9 @@ class BayesFitter(Interactive):
         )
         self.bands, self.priors = self.backend.filters, self.backend.priors
         self.grid = self.backend.grid if on_grid else None
-        check_names(names or (), "filter of the grid", self.bands)
+        if names is not None:
+            names = tuple(known_filter(name, self.bands, "filter of the grid") for name in names)
+            self.filters = names
         of_bands = self.bands if on_grid else names
         self.n_bands_min = check_count(n_bands_min, "n_bands_min")
         self._reader = PhotometryReader(

@@ -1,5 +1,6 @@
 """Fits of a catalog of photometry in a file, with the models of Yang et al. 2021 or of surveys."""
 
+import dataclasses
 import logging
 import warnings
 from pathlib import Path
@@ -16,11 +17,14 @@ from miricigale.utils.tables import error_column
 log = logging.getLogger(__name__)
 
 
-def open_catalog(path, chunk_rows, *, hdu=None, catalog_map=None):
+def open_catalog(path, chunk_rows, *, hdu=None, catalog_map=None, flux_unit=None):
     """Open a catalog by rows (`~miricigale.utils.row_files.RowFile`), under our names or those of a map."""
     rows = open_rows(path, chunk_rows, hdu=hdu)
     if catalog_map is not None:
-        return MappedRows(rows, as_catalog_map(catalog_map))
+        known = as_catalog_map(catalog_map)
+        if flux_unit is not None:
+            known = dataclasses.replace(known, units={"flux": flux_unit, **known.units})
+        return MappedRows(rows, known)
     names = band_columns(rows.colnames, Path(path).name)
     return RenamedRows(rows, names) if names else rows
 
@@ -57,7 +61,7 @@ def fit_catalog(
         Relative model error: 0.1 by default; with ``axes="survey"`` it takes the place of
         `miricigale.fitting.TemplateError.survey`, which is then the default.
     catalog_map : `~miricigale.filters.CatalogMap`, str or path-like, optional
-        Names and units of the catalog; the name of a survey, or a TOML file.
+        Names and units of the catalog; the name of a survey, or a file: TOML, or a translate file of EAZY.
     ebv : float, optional
         Color excess E(B-V) of the Milky Way, in mag, behind which all models but given grids are put
         (`~miricigale.sed.components.GalacticExtinction`, law of Gordon et al. 2023, none beyond 32 um). For one
@@ -82,7 +86,8 @@ def fit_catalog(
     ValueError
         If no column is a flux in a known filter that has an error.
     """
-    rows = open_catalog(path, chunk_rows, hdu=hdu, catalog_map=catalog_map)
+    unit = options.get("flux_unit")
+    rows = open_catalog(path, chunk_rows, hdu=hdu, catalog_map=catalog_map, flux_unit=unit)
     names = rows.colnames
     known = set(Filter.names())
     bands = [

@@ -38,7 +38,7 @@ _FACTS = ("redshift_fixed", "constants", "least_std", "meta")
 
 
 def write_results(results, path, *, overwrite=False):
-    """Write results: a table extension of all arrays, and a text extension of all else."""
+    """Write results: their table, a table extension of all arrays, and a text extension of all else."""
     single, results = results.isscalar, results._several()
     ascii_ids(results.ids, "ids")
     table = {n: array for n, array in results._per_object() if isinstance(array, np.ndarray)}
@@ -56,7 +56,8 @@ def write_results(results, path, *, overwrite=False):
     }
     # FITS has no columns of arrays without elements
     full = {name: array for name, array in table.items() if array.size or not len(array)}
-    write_parts(path, _RESULTS, text=text, tables={"RESULTS": Table(full)}, overwrite=overwrite)
+    parts = {"shown": results.to_table(), "text": text, "tables": {"RESULTS": Table(full)}}
+    write_parts(path, _RESULTS, **parts, overwrite=overwrite)
 
 
 def read_results(path, *, rows=None):
@@ -115,8 +116,8 @@ def write_samples(samples, path, *, overwrite=False):
         for i, axis in enumerate(samples.axes.values())
         if axis.share is not None
     }
-    tables = {"SAMPLES": table}
-    write_parts(path, _SAMPLES, text=text, arrays=shares, tables=tables, overwrite=overwrite)
+    parts = {"text": text, "arrays": shares, "tables": {"SAMPLES": table}}
+    write_parts(path, _SAMPLES, shown=samples.to_table(), **parts, overwrite=overwrite)
 
 
 def read_samples(path, grid, *, model=None):

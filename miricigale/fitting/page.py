@@ -70,7 +70,9 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None):
     """
     classes = results if isinstance(results, dict) else {"galaxy": results}
     results = classes["galaxy"]
-    rows = open_catalog(path, results.job["chunk_rows"], hdu=hdu, catalog_map=catalog_map)
+    job = results.job
+    names = {"catalog_map": catalog_map, "flux_unit": job["catalogue"]["flux_unit"]}
+    rows = open_catalog(path, job["chunk_rows"], hdu=hdu, **names)
     found = every = fit_numbers(results)
     found.meta["known"], found["z_known"] = known_redshifts(rows, z_spec)
     columns = classes_of(classes) if len(classes) > 1 else None

@@ -12,6 +12,7 @@ from miricigale.fitting.likelihood import FitFlags, filter_names
 from miricigale.fitting.posterior import cell_edges, cell_percentiles, check_levels, moments
 from miricigale.fitting.quantities import DERIVED_LEVELS, kept_percentiles
 from miricigale.fitting.rows import FitRows
+from miricigale.utils.interactive import checked_calls
 from miricigale.utils.object_rows import PerObject, PerObjectDict
 from miricigale.utils.options import check_names
 from miricigale.utils.tables import described_table, error_column
@@ -33,6 +34,7 @@ _PARTS = {
 }
 
 
+@checked_calls
 @dataclass(frozen=True, eq=False, repr=False)
 class FitResults(FitRows):
     """

@@ -123,7 +123,7 @@ def fit_file(
     if unit is not None and not unit.is_equivalent(FNU):
         msg = f"'flux_unit' must be convertible to {FNU}, got {unit}"
         raise u.UnitsError(msg)
-    rows = open_catalog(path_in, chunk_rows, hdu=hdu, catalog_map=catalog_map)
+    rows = open_catalog(path_in, chunk_rows, hdu=hdu, catalog_map=catalog_map, flux_unit=unit)
     options = {"redshift": redshift, "redshift_prior": redshift_prior, "pairs": pairs}
     if catalog_map is None:
         warn_of_codes(_codes(rows, fitter.bands), rows.path.name, 2)

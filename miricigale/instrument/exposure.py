@@ -15,7 +15,7 @@ from miricigale.instrument.photometric import electron_rate
 from miricigale.instrument.siaf import aperture, attitude_matrix, pixel_to_v2v3, v2v3_to_sky
 from miricigale.instrument.wcs import imager_wcs, tangent_offset
 from miricigale.utils.exceptions import argument_error, unknown_name
-from miricigale.utils.interactive import Interactive
+from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.positions import as_position
 from miricigale.utils.units import is_number, to_array
 
@@ -91,6 +91,7 @@ def _counts_of(filter, time, frame, n_integrations, max_fill=0.6):
     return max(2, round(frames / n_integrations)), n_integrations
 
 
+@checked_calls
 @dataclasses.dataclass(frozen=True, eq=False, init=False, repr=False)
 class Exposure(Interactive):
     """

@@ -23,7 +23,7 @@ from miricigale.photometry.error_curves import (
 )
 from miricigale.photometry.surveys import YANG2021_DEPTHS, fractional_error
 from miricigale.utils.exceptions import argument_error, unknown_name
-from miricigale.utils.interactive import Interactive
+from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.meta import provenance
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import error_column, require_columns
@@ -36,6 +36,7 @@ def _band(name):
     return find_filter(str(name)) or str(name)
 
 
+@checked_calls
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class ErrorModel(Interactive):
     """

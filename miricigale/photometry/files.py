@@ -144,9 +144,8 @@ def _write_result(result, path, *, overwrite=False):
     for name, field in fields.items():
         if field is not None:
             text[name] = {**dataclasses.asdict(field)}
-    write_parts(
-        path, "forced-photometry-1", text=text, arrays=arrays, tables=tables, overwrite=overwrite
-    )
+    parts = {"shown": result.to_table(), "text": text, "arrays": arrays, "tables": tables}
+    write_parts(path, "forced-photometry-1", **parts, overwrite=overwrite)
 
 
 def _without_sky(table):

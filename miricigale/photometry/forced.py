@@ -28,11 +28,12 @@ from miricigale.photometry.sky_noise import warn_of_background
 from miricigale.photometry.sources import SourceTemplates
 from miricigale.psf import KernelField, MatchingKernel
 from miricigale.utils.exceptions import PhotometryWarning, argument_error
-from miricigale.utils.interactive import Interactive
+from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.parallel import single_threaded, thread_count, threads
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, positive, to_array
 
 
+@checked_calls
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class ForcedPhotometer(Interactive):
     """

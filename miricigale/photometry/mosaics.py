@@ -13,6 +13,7 @@ from astropy.io import fits
 from astropy.nddata import CCDData, NDData
 
 from miricigale.filters.band_names import find_filter
+from miricigale.instrument.data_models import is_data_model, read_data_model
 from miricigale.instrument.image import Image
 from miricigale.photometry.calibration import calibration, parsed_unit
 from miricigale.photometry.grids import (
@@ -72,8 +73,8 @@ def as_mosaic(image, argument="image"):
 
     Parameters
     ----------
-    image : `~astropy.nddata.NDData`, path-like, `~astropy.io.fits.HDUList` or HDU
-        Files and HDUs are read as by `read_mosaic`.
+    image : `~astropy.nddata.NDData`, path-like, `~astropy.io.fits.HDUList`, HDU or data model of ``jwst``
+        Files, HDUs and data models are read as by `read_mosaic`.
     argument : str, optional
         The argument's name for messages.
 
@@ -91,6 +92,8 @@ def as_mosaic(image, argument="image"):
         return image
     if isinstance(image, (str, os.PathLike)):
         return read_mosaic(image)
+    if is_data_model(image):
+        return read_data_model(image, read_mosaic)
     if isinstance(image, fits.HDUList):
         return read_mosaic(Opened(image))
     if isinstance(image, (fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU)):

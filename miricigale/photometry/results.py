@@ -20,7 +20,7 @@ from miricigale.photometry.fields import SmoothField
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.offsets import OffsetMap
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.interactive import Tabular
+from miricigale.utils.interactive import Tabular, checked_calls
 from miricigale.utils.random import check_seed
 from miricigale.utils.tables import described_table, error_column
 from miricigale.utils.unified import read_write
@@ -62,6 +62,7 @@ def crowded(sky, flux, *, radius=2 * u.arcsec):
     return found
 
 
+@checked_calls
 @dataclasses.dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class ForcedPhotometryResult(Tabular):
     """

@@ -22,7 +22,7 @@ from miricigale.psf.wiener import (
     wiener,
 )
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.interactive import Interactive
+from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.unified import read_write, unified_read
 from miricigale.utils.units import ANGLE, frozen_array, positive, to_array
 
@@ -40,6 +40,7 @@ def _named(psf):
     return psf
 
 
+@checked_calls
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class MatchingKernel(Interactive):
     """

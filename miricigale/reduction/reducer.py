@@ -9,6 +9,7 @@ from astropy.nddata import CCDData
 
 from miricigale.detector import Charge, Ramp, ResetAnomaly
 from miricigale.instrument import DetectorProperties, ImageFacts, miri_detector
+from miricigale.instrument.data_models import is_data_model, read_data_model
 from miricigale.reduction.assumed import brightness_of, maps_of
 from miricigale.reduction.background import subtract_background
 from miricigale.reduction.calibration import calibrate
@@ -26,7 +27,7 @@ from miricigale.reduction.settings import (
 )
 from miricigale.reduction.slopes import fit_slopes
 from miricigale.utils.exceptions import DataError, argument_error
-from miricigale.utils.interactive import Interactive
+from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.options import check_choice, check_kind, check_least, check_positive
 from miricigale.utils.parallel import thread_count
 from miricigale.utils.progress import progress
@@ -37,10 +38,14 @@ _KINDS = {
     "reset_anomaly": ResetAnomaly, "ramps": RampSettings, "background": BackgroundSettings,
     "mosaics": MosaicSettings, "properties": DetectorProperties,
 }  # fmt: skip
+#: Settings without which nothing can be done.
+_NEEDED = ("ramps", "background", "mosaics")
 
 
 def _opened(given):
-    """An exposure of its file; anything else itself."""
+    """An exposure of its file or data model; anything else itself."""
+    if is_data_model(given):
+        return read_data_model(given, open_exposure)
     return open_exposure(given) if isinstance(given, (str, os.PathLike)) else given
 
 
@@ -55,9 +60,11 @@ def _several(given):
     if isinstance(given, (str, os.PathLike)) and os.path.isdir(given):
         wanted = f"files, such as {os.path.join(given, '*_uncal.fits')!r}"
         raise argument_error("ramps", wanted, "a folder")
-    return [given] if isinstance(given, (str, os.PathLike, Ramp, Charge, CCDData)) else given
+    one = isinstance(given, (str, os.PathLike, Ramp, Charge, CCDData)) or is_data_model(given)
+    return [given] if one else given
 
 
+@checked_calls
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Reducer(Interactive):
     """
@@ -134,7 +141,10 @@ class Reducer(Interactive):
             if getattr(self, name) is not None:
                 check_least(getattr(self, name), name, 0, whole=True)
         for name, kind in _KINDS.items():
-            check_kind(getattr(self, name), name, kind)
+            value = getattr(self, name)
+            if value is None and name in _NEEDED:
+                raise argument_error(name, f"a {kind.__name__}", "None")
+            check_kind(value, name, kind)
         thread_count(self.n_threads)
         known = (None, "none", "simulated")
         if not isinstance(self.references, (ReferenceFiles, ReferenceCache)) and (
@@ -348,7 +358,8 @@ class Reducer(Interactive):
         Parameters
         ----------
         exposure : Ramp, Charge, `~astropy.nddata.CCDData` or path-like
-            A ramp, a rate, an image in MJy/sr, or a file with one of them (`open_exposure`).
+            A ramp, a rate, an image in MJy/sr, or a file or data model of ``jwst`` with one of them
+            (`open_exposure`).
 
         Returns
         -------

@@ -13,11 +13,12 @@ from miricigale.reduction.background import Background
 from miricigale.reduction.files import ImageFile, write_image
 from miricigale.reduction.images import exposure_values, image
 from miricigale.reduction.slopes import shares_charge
-from miricigale.utils.interactive import Interactive
+from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.meta import provenance
 from miricigale.utils.units import RATE
 
 
+@checked_calls
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class ReductionResult(Interactive):
     """

@@ -43,7 +43,7 @@ def read_catalog(path, catalog_map=None, **options):
         `~miricigale.filters.read_catalog_photometry`. Our names are those of `CATALOG_COLUMNS`, ``ra``,
         ``dec``, ``star``, names of filters, those with ``_err`` for errors, and any other without a dot.
     **options
-        As for `~miricigale.filters.CatalogMap`, in place of it: ``columns``, ``units``, ``survey``,
+        As for `~miricigale.filters.CatalogMap`, in place of what it has: ``columns``, ``units``, ``survey``,
         ``missing``, ``factor``.
 
     Returns

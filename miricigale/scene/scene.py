@@ -22,7 +22,7 @@ from miricigale.scene.cutouts import Cutout
 from miricigale.scene.render import FieldPainter, Painter
 from miricigale.scene.sky import local_jacobian, pixel_positions
 from miricigale.utils.exceptions import CatalogWarning, argument_error
-from miricigale.utils.interactive import Interactive
+from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_kind
 from miricigale.utils.tables import Flags, described_table
@@ -45,6 +45,7 @@ class SceneFlags(Flags):
     DRAWN_AS_POINT = 16  # a Sersic profile whose parameters cannot be used
 
 
+@checked_calls
 class Scene(Interactive):
     """
     A catalog of sources as an instrument would see it without noise.

@@ -15,7 +15,7 @@ from miricigale.sed.grid_cache import cached_grid
 from miricigale.sed.parameter import Parameter
 from miricigale.sed.spectrum import COSMOLOGY
 from miricigale.utils.exceptions import ConfigError, argument_error, unknown_name
-from miricigale.utils.interactive import Interactive
+from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.meta import provenance
 from miricigale.utils.units import WAVE
 
@@ -33,6 +33,7 @@ for _name, _parameter in _MODEL_PARAMETERS.items():
     _parameter.name = _name
 
 
+@checked_calls
 class SEDModel(Interactive):
     """
     A model of spectra: a chain of components.

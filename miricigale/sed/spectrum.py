@@ -11,7 +11,7 @@ from astropy.table import QTable
 from miricigale.filters import FilterSet, as_filter
 from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import read_table, write_table
-from miricigale.utils.interactive import Interactive
+from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.meta import full_meta
 from miricigale.utils.optional import require
 from miricigale.utils.units import FNU, WAVE, Frozen, frozen_quantity, is_number, to_array
@@ -38,6 +38,7 @@ def distance(redshift, cosmology):
     return np.where(z > 0, far, (10.0 * u.pc).to_value(u.m))
 
 
+@checked_calls
 @dataclass(frozen=True, eq=False, repr=False)
 class SED(Frozen, Interactive):
     """
@@ -262,7 +263,8 @@ class SED(Frozen, Interactive):
             If it is no such file.
         """
         table = read_table(path, wanted="a spectrum")
-        if len(table.columns) < 2 or any(not hasattr(c, "unit") for c in table.columns.values()):
+        units = [getattr(column, "unit", None) for column in table.columns.values()]
+        if len(units) < 2 or None in units:
             msg = f"{path} has no two columns with units, wavelengths and flux densities"
             raise DataError(msg)
         meta = full_meta(table.meta)

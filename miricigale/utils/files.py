@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import importlib
+import io
 import math
 import os
 import warnings
@@ -11,6 +12,7 @@ from pathlib import Path
 
 from astropy.io import fits
 from astropy.table import QTable
+from astropy.utils.exceptions import AstropyUserWarning
 
 from miricigale.utils.configuration import conf
 from miricigale.utils.exceptions import DataError, argument_error
@@ -345,7 +347,7 @@ def read_table(path, *, wanted, cls=QTable, form=None, hdu=None):
 
 
 #: Formats of tables by suffix, and what `astropy.table.Table.write` takes for each.
-_WRITERS = {
+WRITERS = {
     ".fits": {"format": "fits"},
     ".fit": {"format": "fits"},
     ".ecsv": {"format": "ascii.ecsv"},
@@ -380,14 +382,29 @@ def write_table(table, path, *, overwrite=False):
         If the file is there and ``overwrite`` is not set.
     """
     path = Path(path)
-    options = _WRITERS.get(path.suffix.lower())
+    options = WRITERS.get(path.suffix.lower())
     if options is None:
-        raise argument_error("path", f"a file ending in one of {', '.join(_WRITERS)}", str(path))
-    if options["format"] == "fits":
-        table = table.copy(copy_data=False)
-        table.meta = fits_meta(table.meta)
+        raise argument_error("path", f"a file ending in one of {', '.join(WRITERS)}", str(path))
     with writing(path):
-        table.write(path, overwrite=overwrite, **options)
+        if options["format"] == "fits":
+            hdus = fits.HDUList([fits.PrimaryHDU(), table_hdu(table)])
+            hdus.writeto(path, overwrite=overwrite)
+        else:
+            table.write(path, overwrite=overwrite, **options)
+
+
+def table_hdu(table):
+    """Binary table of a table with any columns that astropy has; its meta as `fits_meta` has it."""
+    table = table.copy(copy_data=False)
+    table.meta = fits_meta(table.meta)
+    stream = io.BytesIO()
+    with warnings.catch_warnings():
+        # units such as dex are kept for astropy, and in the descriptions
+        warnings.filterwarnings("ignore", "The unit .* could not be saved", AstropyUserWarning)
+        table.write(stream, format="fits")
+    stream.seek(0)
+    with fits.open(stream) as hdus:
+        return hdus[1].copy()
 
 
 def _table_format(path):
@@ -401,8 +418,8 @@ def _table_format(path):
         return "votable"
     if start.startswith(b"# %ECSV") or suffix == ".ecsv":
         return "ascii.ecsv"
-    if suffix == ".csv":
-        return "ascii.csv"
+    if suffix in WRITERS:
+        return WRITERS[suffix]["format"]
     named = first.startswith("#") and "id" in first.strip("# \r").split()
     return "ascii.commented_header" if named else "ascii"
 

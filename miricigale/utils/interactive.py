@@ -1,14 +1,73 @@
 """What objects share in interactive sessions: other names of attributes, and a table in notebooks."""
 
+import abc
 import difflib
+import functools
 import html
+import inspect
 import operator
 from typing import ClassVar
 
 from miricigale.utils.exceptions import unknown_name
 
 
-class Interactive:
+def _no_attribute(owner, label, name, names):
+    """The error of an attribute that is not there, with the nearest names or all of them."""
+    known = [one for one in dir(owner) if not one.startswith("_")]
+    near = difflib.get_close_matches(name, [*known, *names], n=3, cutoff=0.5)
+    msg = f"{label} has no {name!r}; it has {', '.join(near or known)}"
+    return AttributeError(msg, name=name, obj=owner)
+
+
+class _Named(abc.ABCMeta):
+    """Metaclass of `Interactive`: names that a class does not have end in the same sentence as an object's."""
+
+    def __getattr__(cls, name):
+        if name.startswith("_"):
+            raise AttributeError(name)
+        raise _no_attribute(cls, cls.__name__, name, ())
+
+
+def checked_calls(cls):
+    """
+    Let calls of a class and its public methods with wrong arguments end in a sentence with the right ones.
+
+    Python names one argument at a time, and not those that there are. A decorator of classes, above the one of
+    dataclasses; errors from within a method stay as they are.
+    """
+    for name, member in list(vars(cls).items()):
+        if name.startswith("_") and name not in ("__init__", "__call__"):
+            continue
+        if isinstance(member, classmethod):
+            setattr(cls, name, classmethod(_checked(member.__func__)))
+        elif inspect.isfunction(member):
+            setattr(cls, name, _checked(member))
+    return cls
+
+
+def _checked(method):
+    @functools.wraps(method)
+    def call(*args, **kwargs):
+        try:
+            return method(*args, **kwargs)
+        except TypeError as err:
+            # only this frame: the arguments did not fit, and the method was not entered
+            if err.__traceback__.tb_next is not None:
+                raise
+            signature = inspect.signature(method)
+            plain = [one.replace(annotation=one.empty) for one in signature.parameters.values()][1:]
+            wanted = signature.replace(parameters=plain, return_annotation=signature.empty)
+            given = ", ".join(
+                [*(type(one).__name__ for one in args[1:]), *map("{}=".format, kwargs)]
+            )
+            name = method.__qualname__.removesuffix(".__init__").removesuffix(".__call__")
+            msg = f"{name} takes {wanted}, got ({given})"
+            raise TypeError(msg) from None
+
+    return call
+
+
+class Interactive(metaclass=_Named):
     """
     Base of classes that are used in sessions.
 
@@ -27,10 +86,7 @@ class Interactive:
             return operator.attrgetter(self._other_names[name])(self)
         if (value := self._value(name)) is not None:
             return value
-        known = [one for one in dir(self) if not one.startswith("_")]
-        near = difflib.get_close_matches(name, [*known, *self._other_names], n=3, cutoff=0.5)
-        msg = f"{type(self).__name__} has no {name!r}; it has {', '.join(near or known)}"
-        raise AttributeError(msg, name=name, obj=self)
+        raise _no_attribute(self, type(self).__name__, name, self._other_names)
 
     def _value(self, name):
         """A quantity that the object holds by this name; None without one."""

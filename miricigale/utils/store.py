@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from miricigale.utils.exceptions import DataError
-from miricigale.utils.files import open_fits, write_fits, writing
+from miricigale.utils.files import open_fits, table_hdu, write_fits, writing
 
 #: How the names of unfinished files begin.
 PARTIAL = ".partial-"
@@ -59,7 +59,7 @@ def plain_value(value):
     return str(value)
 
 
-def write_parts(path, layout, *, text=None, arrays=None, tables=None, overwrite=False):
+def write_parts(path, layout, *, shown=None, text=None, arrays=None, tables=None, overwrite=False):
     """
     Write arrays, tables and text to one FITS file; the same content gives the same bytes.
 
@@ -69,6 +69,8 @@ def write_parts(path, layout, *, text=None, arrays=None, tables=None, overwrite=
         The file.
     layout : str
         Name and version of what it holds; the keyword ``FORMAT`` of the primary header.
+    shown : `~astropy.table.QTable`, optional
+        The table that users of other programs want: the first extension, ``TABLE``, which is not read back.
     text : dict, optional
         Anything that JSON knows, and numbers and arrays of numpy: header cards are too short for
         it. Extension ``TEXT``.
@@ -89,6 +91,9 @@ def write_parts(path, layout, *, text=None, arrays=None, tables=None, overwrite=
     from astropy.table import Table
 
     hdus = [fits.PrimaryHDU(header=fits.Header({"FORMAT": layout}))]
+    if shown is not None:
+        hdus.append(table_hdu(shown))
+        hdus[-1].name = "TABLE"
     if text is not None:
         data = np.frombuffer(json.dumps(text, default=plain_value).encode(), dtype=np.uint8)
         hdus.append(fits.ImageHDU(data, name=_TEXT))

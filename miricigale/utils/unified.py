@@ -2,15 +2,12 @@
 
 import importlib
 import os
-from pathlib import Path
 
 from astropy.io import registry
 from astropy.io.registry import UnifiedReadWrite, UnifiedReadWriteMethod
 
 from miricigale.utils.files import write_table
 
-# other formats hold the table that people want, and cannot be read back as the whole
-_TABLES = (".csv", ".xml", ".vot", ".votable", ".h5", ".hdf5", ".parquet")
 _SUFFIXES = {"fits": (".fits", ".fit", ".fits.gz"), "ascii.ecsv": (".ecsv",)}
 
 
@@ -52,8 +49,10 @@ class _Write(_Method):
     method = "write"
 
     def __call__(self, path, *args, **kwargs):
-        is_table = "format" not in kwargs and Path(path).suffix.lower() in _TABLES
-        if is_table and hasattr(self._instance, "to_table"):
+        importlib.import_module(self._cls.io_module)
+        found = registry.identify_format("write", self._cls, os.fspath(path), None, [path], kwargs)
+        # other formats hold the table that people want, and cannot be read back as the whole
+        if not found and "format" not in kwargs and hasattr(self._instance, "to_table"):
             return write_table(self._instance.to_table(), path, **kwargs)
         found = self._format(path, args, kwargs)
         return self.registry.write(self._instance, path, *args, format=found, **kwargs)

@@ -9,7 +9,7 @@ from astropy.table import QTable, Table
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
-from miricigale.filters import SURVEYS, CatalogMap, read_catalog_photometry
+from miricigale.filters import SURVEYS, CatalogMap, Filter, read_catalog_photometry
 from miricigale.filters.catalog_files import MappedRows
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
 from miricigale.utils.missing import without_codes
@@ -322,3 +322,41 @@ def test_real_magnitudes_of_goodss(data_file):
 
 def test_surveys_are_named():
     assert set(SURVEYS) == {*NAMES, "cigale"}
+
+
+@pytest.mark.parametrize(
+    ("number", "name", "wavelength"),
+    [
+        (6, "acs.f814w", 8059.9),
+        (18, "irac.ch1", 35569.0),
+        (88, "megacam.u", 3828.0),
+        (131, "newfirm.h1", 15601.0),
+        (160, "sedpy.sdss_z0", 8946.7),
+        (205, "wfc3.f160w", 15396.0),
+        (208, "sedpy.wfc3_uvis_f275w", 2708.6),
+        (259, "sedpy.vista_vircam_Ks", 21503.0),
+        (325, "mips.24", 237589.0),
+        (377, "nircam.f444w", 44037.0),
+        (396, "miri.f770w", 76364.0),
+    ],
+)
+def test_translate_files_of_eazy(tmp_path, number, name, wavelength):
+    """Central wavelengths in Angstrom as ``FILTER.RES.latest.info`` has them by number."""
+    (tmp_path / "z.translate").write_text(
+        f"nr id\nzs z_spec\nflux_a F{number} # total\ndf_a E{number}\n"
+    )
+    (tmp_path / "cat.txt").write_text("# nr zs flux_a df_a\n7 1.5 2.0 0.1\n8 -1 -99 -99\n")
+    units = {"flux": "0.3631 uJy"}  # zero point 25
+    with pytest.warns(MiricigaleWarning, match="-99"):
+        out = read_catalog_photometry(tmp_path / "cat.txt", tmp_path / "z.translate", units=units)
+    assert_allclose(Filter.from_name(name).pivot.to_value(u.AA), wavelength, rtol=0.02)
+    assert out.colnames == ["id", "redshift", name, f"{name}_err"]
+    assert_allclose(out[name].to_value(u.uJy), [0.7262, np.nan])
+    assert_allclose(out[f"{name}_err"].to_value(u.uJy), [0.03631, np.nan])
+
+
+def test_translate_files_that_cannot_be_used(tmp_path):
+    path = tmp_path / "z.translate"
+    for line, said in (("flux F22", "no filter here for flux F22"), ("flux G205", "got 'G205'")):
+        path.write_text(f"{line}\n")
+        refuses(said, CatalogMap.read, path, error=DataError)

@@ -90,6 +90,7 @@ GUESSES = [
     ("reduce files", 'm.Reducer().run(str(tmp_path / "*_uncal.fits"))', None),
     ("reduce what is not there", 'm.Reducer().run("absent_uncal.fits")', "no such file"),
     ("method of the background", 'm.Reducer(background="sep")', None),
+    ("no background", "m.Reducer(background=None)", "'background' must be a BackgroundSettings"),
     ("slopes of a file", 'm.Reducer().fit_ramp(tmp_path / "a_uncal.fits")', None),
     (
         "mosaic without a grid",
@@ -147,6 +148,34 @@ GUESSES = [
     ("range of a filter", 'm.Filter("F770W").min_wavelength', None),
     ("a copy of an exposure", "copy.deepcopy(exposure)", None),
     ("pickle of a reducer", "pickle.loads(pickle.dumps(m.Reducer()))", None),
+    (
+        "filter of a file",
+        'm.Filter.from_file("f.dat")',
+        "Filter has no 'from_file'; it has from_name",
+    ),
+    ("filter as a table file", 'm.Filter("F770W").write(tmp_path / "f.parquet")', None),
+    (
+        "fluxes by keywords",
+        "MODEL.fluxes(redshift=1, filters=['F770W'])",
+        r"takes \(table, filters\)",
+    ),
+    (
+        "bands before axes",
+        "MODEL.grid(['F770W'], axes={'redshift': [1.0]})",
+        r"takes \(axes, filters",
+    ),
+    (
+        "exposure time by its keyword",
+        'm.Exposure("F770W", exptime=1)',
+        r"takes \(filter, \*, readout",
+    ),
+    ("gain of a detector to be", "m.Detector(gain=3)", r"Detector takes \(effects=None"),
+    ("fitter of bands", "m.BayesFitter(MODEL, ['F770W', 'IRAC1'], axes=AXES)", None),
+    (
+        "fitter without axes",
+        "m.BayesFitter(MODEL, ['F770W'])",
+        "'filters' and 'axes' must be given",
+    ),
 ]
 
 
@@ -181,6 +210,7 @@ def names(tmp_path_factory):
     ramp = m.Detector().expose(scene, seed=1)
     ramp.write(folder / "a_uncal.fits")
     known = {
+        "MODEL": m.SEDModel.yang2021(), "AXES": {"redshift": [0.5, 1.0]},
         "P": sky[0], "SKY": sky, "CATALOG": catalog, "SHARP": sharp, "WIDE": wide, "IMAGE": image,
         "HIGHRES": point(180, 0.03, 0.12), "exposure": exposure, "scene": scene, "ramp": ramp,
         "result": m.ForcedPhotometer(psf=wide).measure(image, sky), "tmp_path": folder,

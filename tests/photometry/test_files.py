@@ -120,13 +120,24 @@ def test_names_say_what_is_written(result, tmp_path):
     result.write(tmp_path / "r.csv")
     assert_array_equal(QTable.read(tmp_path / "r.csv")["flux"], result.flux.value)
     for name in ("r.txt", "r"):
-        with pytest.raises(IORegistryError, match=r"must end in one of \.ecsv, \.fits"):
+        with pytest.raises(ValueError, match=r"a file ending in one of \.fits"):
             result.write(tmp_path / name)
         assert not (tmp_path / name).exists()
     with pytest.raises(IORegistryError):
         ForcedPhotometryResult.read(tmp_path / "r.ecsv")
-    with pytest.raises(IORegistryError, match=r"must end in one of \.ecsv"):
-        ErrorModel.yang2021().write(tmp_path / "e.fits")
+    ErrorModel.yang2021().write(tmp_path / "e.fits")
+    assert len(QTable.read(tmp_path / "e.fits")) == len(ErrorModel.yang2021().to_table())
+
+
+def test_other_programs_find_the_table_first(result, tmp_path):
+    """What opens the first extension of a file with all of a result has its table."""
+    result.write(tmp_path / "r.fits")
+    first = QTable.read(tmp_path / "r.fits", hdu=1)
+    table = result.to_table()
+    assert first.colnames == table.colnames
+    assert_array_equal(first["flux"], table["flux"])
+    assert_array_equal(first["sky"].ra, table["sky"].ra)
+    assert_array_equal(ForcedPhotometryResult.read(tmp_path / "r.fits").flux, result.flux)
 
 
 def test_nothing_to_measure_can_be_kept(tools, tmp_path):
