@@ -77,7 +77,7 @@ class Detector(Interactive):
 
     _other_names: ClassVar[dict] = {
         name: f"properties.{name}" for name in ("gain", "read_noise", "dark_current", "full_well")
-    }
+    } | {"replace": "replaced"}
 
     def __post_init__(self):
         effects = [kind() for kind in _STANDARD] if self.effects is None else self.effects
@@ -240,6 +240,8 @@ class Detector(Interactive):
             properties=self.properties,
             meta=task.meta,
         )
+
+    __call__ = expose
 
     def expose_to(
         self,

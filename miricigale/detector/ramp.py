@@ -1,5 +1,6 @@
 """The ramp: counts of one exposure, group by group, and its file."""
 
+import numbers
 import operator
 from typing import ClassVar
 
@@ -78,6 +79,8 @@ class Ramp(Interactive, NDData):
     _other_names: ClassVar[dict] = {
         "filter": "exposure.filter",
         "dq": "pixel_dq",
+        "pixeldq": "pixel_dq",
+        "groupdq": "group_dq",
         "n_groups": "exposure.n_groups",
         "n_integrations": "exposure.n_integrations",
     }
@@ -196,7 +199,8 @@ class Ramp(Interactive, NDData):
         return Ramp(self.data[part], self.exposure.replace(n_integrations=1), **values)
 
     def __getitem__(self, number):
-        number = operator.index(number)
+        if not isinstance(number, numbers.Integral):
+            raise argument_error("number", "that of an integration", repr(number))
         if not -len(self.data) <= number < len(self.data):
             msg = f"integration {number} of {len(self.data)}"
             raise IndexError(msg)

@@ -101,6 +101,8 @@ class Exposure(Interactive):
     ----------
     filter : str, `~miricigale.filters.Filter` or None
         Such as ``"F770W"`` or ``"miri.f770w"``; None where it is not known, as in ground tests.
+    time : `~astropy.units.Quantity`, optional
+        Wanted exposure time in place of ``n_groups``, as for `from_time`.
     readout : str, optional
         Readout pattern, ``"FASTR1"`` or ``"SLOWR1"``.
     n_groups : int, optional
@@ -117,8 +119,6 @@ class Exposure(Interactive):
         Position angle of +V3 at the reference pixel, east of north; 0 deg if only the pointing is given.
     dither : int, optional
         Number of the dither, from 0: a label, and part of the random key.
-    time : `~astropy.units.Quantity`, optional
-        Wanted exposure time in place of ``n_groups``, as for `from_time`.
 
     Raises
     ------
@@ -152,13 +152,20 @@ class Exposure(Interactive):
         "integrations": "n_integrations",
         "nints": "n_integrations",
         "time": "exposure_time",
+        "total_time": "exposure_time",
         "position": "pointing",
         "center": "pointing",
+        "ra": "pointing.ra",
+        "dec": "pointing.dec",
+        "position_angle": "roll",
+        "pa": "roll",
+        "dithers": "dithered",
     }
 
     def __init__(
         self,
         filter,
+        time=None,
         *,
         readout="FASTR1",
         n_groups=None,
@@ -167,7 +174,6 @@ class Exposure(Interactive):
         pointing=None,
         roll=None,
         dither=0,
-        time=None,
     ):
         filter = None if filter is None else imager_filter(filter)
         readout, subarray = str(readout).upper(), str(subarray).upper()

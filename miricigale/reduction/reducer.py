@@ -432,6 +432,8 @@ class Reducer(Interactive):
         options = {"rates": rates, "wcs": wcs, "pixel_scale": pixel_scale, "align": align}
         return self.combine(images, backgrounds, **options)
 
+    __call__ = run
+
     def combine(
         self, images, backgrounds, *, rates=(), wcs=None, pixel_scale=0.11 * ANGLE, align=None
     ):

@@ -55,6 +55,9 @@ class ReductionResult(Interactive):
 
     _other_names: ClassVar[dict] = {
         "image": "mosaic",
+        "background": "backgrounds",
+        "calibrated": "images",
+        "cals": "images",
         **{
             name: f"mosaic.{name}"
             for name in ("data", "uncertainty", "mask", "wcs", "unit", "meta")
