@@ -7,6 +7,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
+from miricigale.filters import as_photometry
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.tables import described_table, error_column, require_columns
 from miricigale.utils.units import FNU
@@ -168,6 +169,8 @@ def same_rows(truth, measured):
 
 def flux_table(photometry, filters, known):
     """A copy of a table with fluxes in uJy, and the bands: those of ``known`` that it has by default."""
+    if filters is None and not set(known) & set(getattr(photometry, "colnames", ())):
+        photometry = as_photometry(photometry, known)
     require_columns(photometry, [], "photometry")
     if filters is None:
         filters = [name for name in known if name in photometry.colnames]

@@ -9,6 +9,7 @@ import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.table import Table
+from photutils.segmentation import SegmentationImage
 
 from miricigale.photometry._core.stamps import add_model
 from miricigale.photometry.arrays import (
@@ -44,7 +45,7 @@ class ForcedPhotometer(Interactive):
 
     Parameters
     ----------
-    kernel : `~miricigale.psf.MatchingKernel` or `~miricigale.psf.KernelField`, optional
+    kernel : `~miricigale.psf.MatchingKernel`, its file or `~miricigale.psf.KernelField`, optional
         From the high-resolution image's PSF (``source``) to the image's (``target``), on the
         pixels of the high-resolution image. ``target`` must be the PSF of the image that is
         measured: that of a drizzled mosaic for a drizzled mosaic. With kernels of several places
@@ -143,6 +144,8 @@ class ForcedPhotometer(Interactive):
         if (self.kernel is None) == (psf is None):
             got = "neither" if psf is None else "both"
             raise argument_error("kernel, psf", "one of them given", got)
+        if isinstance(self.kernel, (str, os.PathLike)):
+            object.__setattr__(self, "kernel", MatchingKernel.read(self.kernel))
         if self.kernel is not None and highres_psf is not None:
             raise argument_error(
                 "highres_psf", "given with 'psf', not with 'kernel'", "a kernel too"
@@ -223,8 +226,9 @@ class ForcedPhotometer(Interactive):
         segmentation : `~photutils.segmentation.SegmentationImage`, array or path-like, optional
             Segments of ``highres``; for cutouts they are detected (`detect_sources`) if not given.
         catalog : table in any form, path-like or `~astropy.coordinates.SkyCoord`, optional
-            Positions, and what `SourceTemplates.from_images`, or for Sersic templates
-            `SourceTemplates.from_catalog`, take; by default a source for each segment.
+            Positions (pixels ``x`` and ``y`` are those of ``highres``, or of ``image`` without it), and what
+            `SourceTemplates.from_images`, or for Sersic templates `SourceTemplates.from_catalog`, take; by
+            default a source for each segment.
         templates : `SourceTemplates`, optional
             What the sources look like, in place of the three above, made once for several
             images. The settings ``template`` and ``wings`` are then theirs.
@@ -251,7 +255,7 @@ class ForcedPhotometer(Interactive):
         arrays = fit_arrays(image, "image", self.memory.scratch)
         given = [one is not None for one in (highres, segmentation, catalog)]
         if templates is None:
-            highres, segmentation, catalog = self._prior(highres, segmentation, catalog)
+            highres, segmentation, catalog = self._prior(image, highres, segmentation, catalog)
             sources = dataclasses.replace(catalog_sources(catalog), sky=catalog["sky"])
         elif any(given):
             raise argument_error("templates", "given alone with the image", "a catalog too")
@@ -348,7 +352,7 @@ class ForcedPhotometer(Interactive):
         )
         return rows, templates
 
-    def _prior(self, highres, segmentation, catalog):
+    def _prior(self, image, highres, segmentation, catalog):
         """High-resolution image, segments and catalog, detected where cutouts need what was not given."""
         if highres is None and catalog is None:
             raise argument_error("catalog", "given without a high-resolution image", "None")
@@ -357,14 +361,18 @@ class ForcedPhotometer(Interactive):
             if highres.wcs is None:
                 image_arrays(highres, "highres")
             self._check_scale("highres", highres.wcs)
+        if catalog is not None:
+            # pixels of a catalog are those of the image it was made of
+            catalog = read_catalog(catalog, (image if highres is None else highres).wcs)
         if self.template in ("psf", "sersic") or highres is None:
-            return highres, segmentation, read_catalog(catalog)
+            return highres, segmentation, catalog
         if segmentation is None:
             return highres, *detected_prior(highres, catalog)
         if catalog is not None and not isinstance(segmentation, (str, os.PathLike)):
             # labels are those of the catalog, or by position
-            return highres, segmentation, read_catalog(catalog)
-        segmentation = getattr(segmentation, "data", segmentation)
+            return highres, segmentation, catalog
+        if isinstance(segmentation, SegmentationImage):
+            segmentation = segmentation.data
         return highres, *read_prior(highres, segmentation=segmentation, catalog=catalog)
 
     def _templates(self, highres, segmentation, catalog):

@@ -72,6 +72,9 @@ def read_prior(highres, *, segmentation=None, catalog=None, path=None):
         where = path or highres.meta.get("source", "the image")
         if isinstance(segmentation, np.ndarray):
             data, segmentation = segmentation, "the segmentation"
+            if data.dtype == bool:
+                wanted = "whole numbers, one for each source (scipy.ndimage.label makes them)"
+                raise argument_error("segmentation", wanted, "a mask")
         else:
             image = highres.data.shape, highres.wcs, where
             what = "a segmentation map", "the segmentation"
@@ -161,11 +164,11 @@ def _from_segments(highres, segments, ids):
     return QTable({"id": ids, "sky": sky, "label": index})
 
 
-def read_catalog(catalog):
+def read_catalog(catalog, wcs=None):
     """
     Ids and positions of a catalog in any of the usual forms; see ``catalog`` of `read_prior`.
 
-    A position that is missing is NaN; other columns are kept.
+    With a WCS positions may be pixels ``x`` and ``y``. A position that is missing is NaN; other columns are kept.
 
     Raises
     ------
@@ -179,7 +182,7 @@ def read_catalog(catalog):
     if isinstance(catalog, SkyCoord):
         catalog = QTable({"sky": catalog.reshape(-1)})
     table = QTable(as_table(catalog, "catalog"), copy=False)
-    table["sky"] = as_positions(table, name, missing=True)
+    table["sky"] = as_positions(table, name, wcs, missing=True)
     if "id" not in table.colnames:
         # labels are the ids of files, and in tables those of segments
         known = _ID if isinstance(catalog, (str, os.PathLike)) else _ID[:-1]

@@ -275,6 +275,8 @@ class ForcedPhotometryResult(Tabular):
         "model": "model_image",
         "fluxes": "flux",
         "errors": "flux_err",
+        "flux_error": "flux_err",
+        "mag": "magnitude",
     }
 
     @property

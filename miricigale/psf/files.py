@@ -20,6 +20,7 @@ from miricigale.utils.units import ANGLE, to_array
 #: Units of an `InstrumentPSF`'s quantities, and arrays of a `MatchingKernel`, in files.
 _UNITS = {"pixel_scale": ANGLE, "angle": u.deg, "pa_aper": u.deg}
 _ARRAYS = ("array", "source", "target")
+_LAYOUT = "psf-1"
 
 
 def header_grid(header):
@@ -86,7 +87,7 @@ def read_psf(
     **options,
 ):
     """
-    Read a PSF from an image in any FITS file.
+    Read a PSF from an image in any FITS file, or from one that `InstrumentPSF.write` made.
 
     Parameters
     ----------
@@ -117,6 +118,9 @@ def read_psf(
     ValueError
         If there is no 2D image there, or scale or angle are unknown or not the header's.
     """
+    with open_fits(path, wanted="a PSF") as hdus:
+        if hdus[0].header.get("FORMAT") == _LAYOUT:
+            return _read_psf(path)
     data, header, pixel_scale, turn = fits_image(
         path, ext, plane, pixel_scale, wanted="a PSF", oversampling=oversampling
     )
@@ -147,11 +151,11 @@ def _write_psf(psf, path, *, overwrite=False):
     for name, unit in _UNITS.items():
         facts[name] = None if facts[name] is None else facts[name].to_value(unit)
     text = {"facts": facts, "meta": psf.meta}
-    write_parts(path, "psf-1", text=text, arrays={"psf": psf.data}, overwrite=overwrite)
+    write_parts(path, _LAYOUT, text=text, arrays={"psf": psf.data}, overwrite=overwrite)
 
 
 def _read_psf(path):
-    with open_parts(path, ("psf-1",), wanted="PSFs") as parts:
+    with open_parts(path, (_LAYOUT,), wanted="PSFs") as parts:
         facts = parts.text["facts"]
         for name, unit in _UNITS.items():
             facts[name] = None if facts[name] is None else facts[name] * unit

@@ -98,7 +98,12 @@ class MatchingKernel(Interactive):
     regularization: float = float("nan")
     meta: dict = dataclasses.field(default_factory=dict)
 
-    _other_names: ClassVar[dict] = {"data": "array", "kernel": "array", "convolve": "apply"}
+    _other_names: ClassVar[dict] = {
+        "data": "array",
+        "kernel": "array",
+        "convolve": "apply",
+        "shape": "array.shape",
+    }
 
     def __post_init__(self):
         if hasattr(self.array, "evaluate"):

@@ -17,6 +17,7 @@ from astropy.utils.exceptions import AstropyUserWarning
 from miricigale.utils.configuration import conf
 from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.meta import fits_meta
+from miricigale.utils.positions import sky_as_angles
 
 # how packed files begin, and the module of Python's that opens them
 _PACKED = {b"\x1f\x8b": "gzip", b"BZh": "bz2", b"\xfd7zXZ\x00": "lzma"}
@@ -390,7 +391,8 @@ def write_table(table, path, *, overwrite=False):
             hdus = fits.HDUList([fits.PrimaryHDU(), table_hdu(table)])
             hdus.writeto(path, overwrite=overwrite)
         else:
-            table.write(path, overwrite=overwrite, **options)
+            plain = sky_as_angles(table) if options["format"] == "votable" else table
+            plain.write(path, overwrite=overwrite, **options)
 
 
 def table_hdu(table):

@@ -9,6 +9,7 @@ import operator
 from typing import ClassVar
 
 from miricigale.utils.exceptions import unknown_name
+from miricigale.utils.positions import sky_as_angles
 
 
 def _no_attribute(owner, label, name, names):
@@ -136,10 +137,4 @@ class Tabular(Interactive):
 
     def to_pandas(self):
         """Return the table as a `pandas.DataFrame`; positions are the columns ``ra`` and ``dec`` in deg."""
-        table = self.to_table()
-        if "sky" in table.colnames:
-            at = table.colnames.index("sky")
-            angles = [table["sky"].ra.deg, table["sky"].dec.deg]
-            table.add_columns(angles, indexes=[at, at], names=["ra", "dec"])
-            table.remove_column("sky")
-        return table.to_pandas()
+        return sky_as_angles(self.to_table()).to_pandas()

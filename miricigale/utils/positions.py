@@ -9,7 +9,7 @@ from astropy.coordinates import SkyCoord
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing import plain_floats, without_codes
 
-__all__ = ["as_position", "as_positions"]
+__all__ = ["as_position", "as_positions", "sky_as_angles"]
 
 _WANTED = "one SkyCoord, text such as '150.1 +2.2' or '10h00m24s +02d12m00s', or (ra, dec) in deg"
 #: Columns of right ascension and declination, in lower case and without ``_j2000``.
@@ -121,6 +121,17 @@ def _degrees(table, name, argument):
     values = plain_floats(column, name, argument)
     values[without_codes(values)[0]] = np.nan
     return values * u.Unit(unit).to(u.deg)
+
+
+def sky_as_angles(table):
+    """Copy of a table whose column ``sky`` is ``ra`` and ``dec`` in deg, for formats without positions."""
+    table = table.copy(copy_data=False)
+    if "sky" in table.colnames:
+        at = table.colnames.index("sky")
+        angles = [table["sky"].ra.deg, table["sky"].dec.deg] * u.deg
+        table.add_columns(list(angles), indexes=[at, at], names=["ra", "dec"])
+        table.remove_column("sky")
+    return table
 
 
 def _pass(bad, argument):

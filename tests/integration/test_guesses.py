@@ -114,6 +114,31 @@ GUESSES = [
         "m.ForcedPhotometer(psf=WIDE).measure(np.ones((9, 9)), SKY)",
         "'image' must be",
     ),
+    (
+        "segments as an array",
+        "m.ForcedPhotometer(psf=WIDE, highres_psf=SHARP).measure(IMAGE, HIGHRES, HIGHRES.data > 0.05)",
+        "'segmentation' must be whole numbers",
+    ),
+    (
+        "labels as an array",
+        "m.ForcedPhotometer(psf=WIDE, highres_psf=SHARP).measure(IMAGE, HIGHRES, LABELS)",
+        None,
+    ),
+    (
+        "sources by pixels",
+        "m.ForcedPhotometer(psf=WIDE).measure(IMAGE, catalog={'x': [29.5], 'y': [29.5]})",
+        None,
+    ),
+    ("PSFs of files", "m.MatchingKernel.from_psfs(PSF_FILE, PSF_FILE)", None),
+    ("results as VOTable", 'result.write(tmp_path / "r.vot")', None),
+    (
+        "noise of bands by name",
+        'm.ErrorModel.from_depths({"F770W": 26 * u.ABmag}).perturb({"F770W": [1.0] * u.uJy}, seed=1)',
+        None,
+    ),
+    ("exposure for a time", 'm.Exposure("F770W", 1 * u.hour).total_time', None),
+    ("detector as a function", "m.Detector()(scene, seed=1)", None),
+    ("group of a ramp", "ramp[0, 5]", "'number' must be that of an integration"),
     ("image as NDData", "m.ForcedPhotometer(psf=WIDE).measure(NDData(IMAGE), SKY)", None),
     ("fluxes", "result['flux']", None),
     ("a row", "result[0]", None),
@@ -167,7 +192,7 @@ GUESSES = [
     (
         "exposure time by its keyword",
         'm.Exposure("F770W", exptime=1)',
-        r"takes \(filter, \*, readout",
+        r"takes \(filter, time=None",
     ),
     ("gain of a detector to be", "m.Detector(gain=3)", r"Detector takes \(effects=None"),
     ("fitter of bands", "m.BayesFitter(MODEL, ['F770W', 'IRAC1'], axes=AXES)", None),
@@ -209,10 +234,12 @@ def names(tmp_path_factory):
     folder = tmp_path_factory.mktemp("guesses")
     ramp = m.Detector().expose(scene, seed=1)
     ramp.write(folder / "a_uncal.fits")
+    wide.write(folder / "psf.fits")
     known = {
         "MODEL": m.SEDModel.yang2021(), "AXES": {"redshift": [0.5, 1.0]},
         "P": sky[0], "SKY": sky, "CATALOG": catalog, "SHARP": sharp, "WIDE": wide, "IMAGE": image,
         "HIGHRES": point(180, 0.03, 0.12), "exposure": exposure, "scene": scene, "ramp": ramp,
+        "LABELS": (point(180, 0.03, 0.12).data > 0.05).astype(int), "PSF_FILE": folder / "psf.fits",
         "result": m.ForcedPhotometer(psf=wide).measure(image, sky), "tmp_path": folder,
     }  # fmt: skip
     return MODULES | known

@@ -243,7 +243,8 @@ def test_tables_without_fluxes_are_named(simulated):
     for method, options in ((model.assign, {}), (model.perturb, {"seed": 1})):
         message = r"'photometry' must be a table with at least one of the columns \['miri\.f770w'\]"
         refuses(message, method, table, **options)
-        refuses("'photometry' must be a table, got dict", method, {}, **options)
+        refuses(message, method, {}, **options)
+        refuses("'photometry' must be a table", method, 5.0, **options)
         magnitudes = QTable({BAND: [22.0] * u.ABmag})
         with pytest.raises(u.UnitsError, match=r"column 'miri\.f770w' must be convertible to uJy"):
             method(magnitudes, **options)
