@@ -412,8 +412,8 @@ class SEDModel(Interactive):
         ValueError
             If values do not ascend, are outside their bounds or not in the library.
         """
-        filters = self._bands(filters)
         axes = gridding.check_axes(self, axes)
+        filters = self._bands(filters)
         if not cache:
             return gridding.model_grid(self, axes, filters)
         return cached_grid(self, axes, filters, gridding.model_grid)
