@@ -65,7 +65,7 @@ def read_catalog_photometry(path, catalog_map=None, *, hdu=None, **options):
         raise DataError(msg)
     _, lost = catalog_map.names(table.colnames, path.name)
     table, coded = catalog_map.convert(table, path.name)
-    for text in told_of(lost, coded):
+    for text in catalog_messages(lost, coded):
         warnings.warn(f"{path.name}: {text}", CatalogWarning, stacklevel=2)
     return table
 
@@ -87,7 +87,7 @@ def as_catalog_map(catalog_map, options=None):
     return CatalogMap.read(catalog_map)
 
 
-def told_of(lost, coded, what="taken as missing, by the number that stands there"):
+def catalog_messages(lost, coded, what="taken as missing, by the number that stands there"):
     """Yield warnings about bands without a filter, and numbers that stand for no value."""
     if lost:
         yield f"left out, no filter here: {', '.join(lost)}"
@@ -117,7 +117,7 @@ def codes_of(table, bands):
     Returns
     -------
     coded : dict of str to `~numpy.ndarray` of float, shape (n,)
-        By band the number, NaN in rows that have none; as `told_of` takes it.
+        By band the number, NaN in rows that have none; as `catalog_messages` takes it.
     """
     coded = {}
     for name in bands:
@@ -141,7 +141,7 @@ def codes_of(table, bands):
 def warn_of_codes(coded, where, stacklevel):
     """Warn of what `codes_of` found, by band and count, for fits that take the numbers as they are."""
     found = {name: values for name, values in coded.items() if np.any(~np.isnan(values))}
-    for text in told_of(
+    for text in catalog_messages(
         (), found, "look like numbers that stand for no value, and are fitted as they are"
     ):
         how = "NaN is a missing band; read_catalog_photometry, or --map, makes them so"
@@ -201,12 +201,12 @@ class MappedRows(RenamedRows):
         self.map = catalog_map
 
     def chunk(self, i):
-        """A piece of the table; its warnings are those of `told`."""
+        """A piece of the table; its warnings are those of `messages`."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CatalogWarning)
             return self.map.convert(self._rows.chunk(i), self._rows.path.name)[0]
 
-    def told(self):
+    def messages(self):
         """Return the warnings about the whole file, all of which is read."""
         parts = {}
         for i in range(self._rows.n_chunks):
@@ -216,4 +216,6 @@ class MappedRows(RenamedRows):
                     warnings.simplefilter("ignore", CatalogWarning)
                 for name, codes in self.map.convert(table, self._rows.path.name)[1].items():
                     parts.setdefault(name, []).append(codes)
-        return list(told_of(self._lost, {name: np.concatenate(v) for name, v in parts.items()}))
+        return list(
+            catalog_messages(self._lost, {name: np.concatenate(v) for name, v in parts.items()})
+        )

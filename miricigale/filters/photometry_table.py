@@ -8,7 +8,7 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.filters.band_names import find_filter
-from miricigale.filters.catalog_files import told_of
+from miricigale.filters.catalog_files import catalog_messages
 from miricigale.filters.catalog_map import PER_MAGNITUDE
 from miricigale.filters.library import FILTERS
 from miricigale.utils.exceptions import CatalogWarning, argument_error
@@ -76,7 +76,7 @@ def as_photometry(data, bands, argument="photometry"):
     if "id" not in out.colnames:
         out["id"] = np.arange(1, len(out) + 1)
     coded = {name: _to_fluxes(out, name, argument) for name in magnitudes}
-    for text in told_of((), coded):
+    for text in catalog_messages((), coded):
         warnings.warn(f"{argument}: {text}", CatalogWarning, stacklevel=3)
     return out
 

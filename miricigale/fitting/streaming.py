@@ -128,7 +128,7 @@ def fit_file(
     if catalog_map is None:
         warn_of_codes(_codes(rows, fitter.bands), rows.path.name, 2)
     else:
-        for text in rows.told():
+        for text in rows.messages():
             warnings.warn(f"{rows.path.name}: {text}", CatalogWarning, stacklevel=2)
     fluxes = {c for name in fitter.bands for c in (name, error_column(name))}
     take = _pieces(rows, options, unit, fluxes)

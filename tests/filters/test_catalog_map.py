@@ -215,7 +215,7 @@ def test_columns_of_surveys(survey):
         assert out["ra"].unit == u.deg
 
 
-def test_bands_without_a_filter_are_told_and_ones_own_columns_come_first(tmp_path):
+def test_bands_without_a_filter_are_named_and_ones_own_columns_come_first(tmp_path):
     names = ["ID", "ACS_F606W_FLUX", "ACS_F606W_FLUXERR", "HAWKI_KS_FLUX", "HAWKI_KS_FLUXERR"]
     path = write(Table({name: [1.0] for name in names}), tmp_path / "c.fits")
     with pytest.warns(MiricigaleWarning, match="left out, no filter here: HAWKI_KS_FLUX$"):
@@ -280,7 +280,7 @@ def test_pieces_are_the_whole(tmp_path, suffix):
         whole = read_catalog_photometry(path, mine)
     rows = MappedRows(open_rows(path, 3), mine)
     assert rows.colnames == ("id", BAND)
-    assert [text.endswith(f"{BAND} 2 of 7 (99)") for text in rows.told()] == [True]
+    assert [text.endswith(f"{BAND} 2 of 7 (99)") for text in rows.messages()] == [True]
     parts = [rows.chunk(i) for i in range(rows.n_chunks)]
     assert [len(part) for part in parts] == [3, 3, 1]
     for name in ("id", BAND):

@@ -80,7 +80,7 @@ def test_cycling_goes_on_from_tile_to_tile():
         assert_allclose([x - 692.5, y - 511.5], [-dx / 0.1105, -dy / 0.1113], atol=0.7)
 
 
-def test_all_of_a_pattern_if_not_told_how_many():
+def test_all_of_a_pattern_by_default():
     assert dither_offsets("4-point").shape == (4, 2)
     assert dither_offsets([[0, 0], [1, 2], [3, 4]] * u.arcsec, start=1).value.tolist() == [
         [1, 2],

@@ -34,7 +34,7 @@ def read_ecsv(path, wanted):
 
 
 @pytest.mark.parametrize("name", ["t.fits", "t.fits.gz", "t.xml", "t.ecsv", "t.csv", "t.txt"])
-def test_tables_are_told_by_content_and_name(tmp_path, name):
+def test_tables_are_recognized_by_content_and_name(tmp_path, name):
     table = QTable({"id": [1, 2], "name": ["a", "b"], "x": [1.5, 2.5]})
     kind = {"t.xml": "votable", "t.txt": "ascii"}.get(name)
     table.write(tmp_path / name, format=kind)
@@ -112,7 +112,7 @@ def test_what_unpacks_beyond_the_bound_is_refused_by_name(tmp_path, module):
 
 
 def test_a_bomb_takes_no_memory(tmp_path):
-    # a part of its content is not told by the last bytes of a file of several members
+    # part of its content is not counted by the last bytes of a file of several members
     path = tmp_path / "bomb.fits.gz"
     pack("gzip", path, 100)
     path.write_bytes(3 * path.read_bytes())

@@ -33,7 +33,7 @@ def test_what_stood_there_stays_when_writing_fails(tmp_path):
         pass
 
 
-def test_a_full_disk_is_told_with_the_name_of_the_file(tmp_path):
+def test_a_full_disk_is_reported_with_the_name_of_the_file(tmp_path):
     path = tmp_path / "a.txt"
     with pytest.raises(OSError, match=r"a\.txt") as caught, replacing(path):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
