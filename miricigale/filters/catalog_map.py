@@ -24,7 +24,7 @@ _DEFAULT_UNITS = {"ra": u.deg, "dec": u.deg, "position_angle": u.deg}
 #: Names of AB magnitudes as a unit.
 _AB = ("abmag", "mag(ab)", "ab", "mag_ab")
 #: Error in magnitudes times flux is an error of the flux.
-PER_MAGNITUDE = 0.4 * np.log(10)
+_PER_MAGNITUDE = 0.4 * np.log(10)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -206,9 +206,9 @@ class CatalogMap:
         for name in out.colnames:
             if is_band(name):
                 if not name.endswith(error_column("")):
-                    coded[name] = self._set_band(out, name, factor, argument)
+                    coded[name] = self.set_band(out, name, factor, argument)
                 elif name.removesuffix(error_column("")) not in out.colnames:
-                    self._set_band(out, name, factor, argument)
+                    self.set_band(out, name, factor, argument)
             else:
                 self._set_unit(out, name, argument)
         return out, coded
@@ -250,8 +250,8 @@ class CatalogMap:
         elif asked or column.dtype.kind in "if":
             table[name] = u.Quantity(plain_floats(column, name, argument), unit)
 
-    def _set_band(self, table, name, factor, argument):
-        """Fluxes and errors of a band in uJy; the numbers that stand for no value."""
+    def set_band(self, table, name, factor, argument):
+        """Bring fluxes and errors of a band to uJy; returns the numbers that stand for no value."""
         error = error_column(name)
         unit = self._asked(name, table[name], True, argument)
         if unit is None or unit == u.mag or not (_is_ab(unit) or unit.is_equivalent(FNU)):
@@ -277,7 +277,12 @@ class CatalogMap:
         errors = np.where(missing | no_error, np.nan, errors)
         if self.limits:
             limit, nothing = negative_errors(flux, errors)
-            self._check_limits(table, name, ab, limit | nothing, argument)
+            if f"{name}_limit" in table.colnames:
+                wanted = f"a table without '{name}_limit' where negative errors mark limits"
+                raise argument_error(argument, wanted, "both")
+            if ab and np.any(limit | nothing):
+                wanted = f"fluxes in {name!r} where negative errors mark limits"
+                raise argument_error(argument, wanted, "AB magnitudes")
             code = np.where(nothing, values, code)
             table[name] = np.where(nothing, np.nan, flux * factor) * FNU
             table[f"{name}_limit"] = limit
@@ -285,21 +290,12 @@ class CatalogMap:
         table[error] = self._errors(table[error], error, errors, flux, ab, argument) * factor * FNU
         return code
 
-    def _check_limits(self, table, name, ab, negative, argument):
-        if f"{name}_limit" in table.colnames:
-            wanted = f"a table without the column '{name}_limit' where negative errors mark limits"
-            raise argument_error(argument, wanted, "both")
-        if ab and negative.any():
-            wanted = f"fluxes in {name!r} where negative errors mark limits"
-            raise argument_error(argument, wanted, "AB magnitudes")
-
     def _errors(self, column, name, errors, flux, ab, argument):
         """Errors of fluxes in uJy, from those in the file's unit."""
-        if ab and "flux" in self.units and name not in self.units:
-            return PER_MAGNITUDE * flux * errors
-        unit = self._asked(name, column, not ab, argument)
-        if ab and (unit is None or unit == u.mag or _is_ab(unit)):
-            return PER_MAGNITUDE * flux * errors
+        stated = not ab or name in self.units or "flux" not in self.units
+        unit = self._asked(name, column, not ab, argument) if stated else u.mag
+        if ab and (unit in (None, u.mag, u.dimensionless_unscaled) or _is_ab(unit)):
+            return _PER_MAGNITUDE * flux * errors
         if unit is None or not unit.is_equivalent(FNU):
             msg = f"'{argument}' column {name!r} must be convertible to {FNU}, got {unit}"
             raise u.UnitsError(msg)

@@ -67,9 +67,8 @@ def read_curve(curve):
 
 
 def _load(name):
-    metadata = {"curve": name.removeprefix(SEDPY)} if name.startswith(SEDPY) else {}
-    metadata = metadata or FILTERS.metadata(name)
-    curve = metadata.pop("curve")
+    metadata = {} if name.startswith(SEDPY) else FILTERS.metadata(name)
+    curve = metadata.pop("curve", name.removeprefix(SEDPY))
     wave, throughput, n_negative = read_curve(curve)
     meta = {
         "source": f"astro-sedpy {importlib.metadata.version('astro-sedpy')}, {curve}",

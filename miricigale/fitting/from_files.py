@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from miricigale.filters import Filter
-from miricigale.filters.catalog_files import MappedRows, RenamedRows, as_catalog_map
+from miricigale.filters.catalog_files import MappedRows, as_catalog_map
 from miricigale.filters.photometry_table import band_columns
 from miricigale.utils.exceptions import FitWarning, argument_error
 from miricigale.utils.row_files import open_rows
@@ -21,8 +21,8 @@ def open_catalog(path, chunk_rows, *, hdu=None, catalog_map=None):
     rows = open_rows(path, chunk_rows, hdu=hdu)
     if catalog_map is not None:
         return MappedRows(rows, as_catalog_map(catalog_map))
-    names = band_columns(rows.colnames, Path(path).name)
-    return RenamedRows(rows, names) if names else rows
+    rows.rename(band_columns(rows.colnames, Path(path).name))
+    return rows
 
 
 def fit_catalog(

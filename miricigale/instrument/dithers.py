@@ -13,7 +13,7 @@ from miricigale.instrument.siaf import aperture, imager_columns
 from miricigale.utils.exceptions import DataError, argument_error, unknown_name
 from miricigale.utils.files import read_table, unpacked_size
 from miricigale.utils.tables import require_columns
-from miricigale.utils.units import ANGLE, to_array
+from miricigale.utils.units import ANGLE, check_count, to_array
 
 # sides of the pixel at the reference, arcsec (SIAF)
 _PIXEL = (0.110497, 0.111336)
@@ -113,15 +113,13 @@ def dither_offsets(pattern, n=None, *, start=0):
     ValueError
         If ``n`` is smaller than 1, or with ``start`` larger than a table of offsets.
     """
-    if n is not None and (n < 1 or int(n) != n):
-        raise argument_error("n", "a positive integer", n)
-    if start < 0 or int(start) != start:
-        raise argument_error("start", "0 or a positive integer", start)
+    n = None if n is None else check_count(n, "n")
+    start = check_count(start, "start", 0)
     if isinstance(pattern, str):
         if pattern not in dither_patterns():
             raise unknown_name("dither pattern", pattern, dither_patterns())
         points = _points(pattern)
-        number = int(start) + np.arange(len(points) if n is None else int(n))
+        number = start + np.arange(len(points) if n is None else n)
         turns, step = np.divmod(number, len(points))
         return (points[step] + 0.25 * turns[:, None]) * np.array(_PIXEL) * ANGLE
     if isinstance(pattern, os.PathLike):
@@ -129,11 +127,11 @@ def dither_offsets(pattern, n=None, *, start=0):
     elif isinstance(pattern, Table):
         pattern = _table_offsets(pattern, "pattern")
     offsets = to_array(pattern, ANGLE, "pattern", ndim=2, finite=True)
-    last = len(offsets) if n is None else int(start) + int(n)
+    last = len(offsets) if n is None else start + n
     if offsets.shape[1] != 2 or len(offsets) < last or last <= start:
         wanted = f"offsets of shape ({last}, 2)"
         raise argument_error("pattern", wanted, f"shape {offsets.shape}")
-    return offsets[int(start) : last] * ANGLE
+    return offsets[start:last] * ANGLE
 
 
 def tile_offsets(n_x, n_y, *, overlap=0.1):
@@ -159,9 +157,7 @@ def tile_offsets(n_x, n_y, *, overlap=0.1):
     ValueError
         If a number is smaller than 1, or ``overlap`` is out of its range.
     """
-    for name, value in (("n_x", n_x), ("n_y", n_y)):
-        if isinstance(value, bool) or int(value) != value or value < 1:
-            raise argument_error(name, "a positive integer", value)
+    n_x, n_y = check_count(n_x, "n_x"), check_count(n_y, "n_y")
     if not 0 <= overlap < 1:
         raise argument_error("overlap", "at least 0 and less than 1", overlap)
     first, last = imager_columns()

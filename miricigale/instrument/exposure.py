@@ -17,7 +17,7 @@ from miricigale.instrument.wcs import imager_wcs, tangent_offset
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.positions import as_position
-from miricigale.utils.units import is_number, to_array
+from miricigale.utils.units import check_count, to_array
 
 #: Bands of the CEERS/MIRI imaging.
 CEERS_FILTERS = (
@@ -70,13 +70,6 @@ def frame_time(readout="FASTR1", subarray="FULL"):
         kind = f"sub-array of {readout}"
         raise unknown_name(kind, subarray, times[readout])
     return times[readout][subarray] * u.s
-
-
-def _count(value, name, least):
-    """An integer that is not below ``least``."""
-    if not is_number(value) or value != int(value) or value < least:
-        raise argument_error(name, f"an integer of at least {least}", value)
-    return int(value)
 
 
 def _counts_of(filter, time, frame, n_integrations, max_fill=0.6):
@@ -175,12 +168,12 @@ class Exposure(Interactive):
         if (n_groups is None) == (time is None):
             got = "neither" if time is None else "both"
             raise argument_error("n_groups, time", "one of them given", got)
-        counts = {"dither": _count(dither, "dither", 0)}
+        counts = {"dither": check_count(dither, "dither", 0)}
         if n_integrations is not None:
-            n_integrations = _count(n_integrations, "n_integrations", 1)
+            n_integrations = check_count(n_integrations, "n_integrations")
         if time is not None:
             n_groups, n_integrations = _counts_of(filter, time, frame, n_integrations)
-        counts["n_groups"] = _count(n_groups, "n_groups", 2)
+        counts["n_groups"] = check_count(n_groups, "n_groups", 2)
         counts["n_integrations"] = n_integrations or 1
         if pointing is not None:
             pointing = as_position(pointing, "pointing")

@@ -175,15 +175,6 @@ def cruciform(
     return (image + scattered) * (1 - fraction)
 
 
-def _apply_transfer(image, transfer, margin):
-    """Multiply the spectrum by ``transfer(fx, fy)`` (cycles per cell), padding by zeros."""
-    shape = [next_fast_len(size + 2 * margin, real=True) for size in image.shape]
-    fy, fx = np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1])
-    spectrum = rfft2(image, shape)
-    spectrum *= transfer(fx, fy)
-    return irfft2(spectrum, shape)[: image.shape[0], : image.shape[1]]
-
-
 def detector_response(image, *, oversampling, pixel=True, ipc=None, jitter=0.0, boxes=()):
     """
     Convolve an oversampled image with jitter, the pixel and the interpixel capacitance in one transform.
@@ -192,21 +183,22 @@ def detector_response(image, *, oversampling, pixel=True, ipc=None, jitter=0.0, 
     ``boxes`` are widths in pixels of further square boxes (drops, output pixels).
     """
     widths = [*boxes, 1.0] if pixel else list(boxes)
-
-    def transfer(fx, fy):
-        px, py = fx * oversampling, fy * oversampling
-        total = np.ones((py.size, px.size))
-        for width in widths:
-            total *= np.sinc(px * width) * np.sinc(py * width)
-        if ipc is not None:
-            # what its neighbors get of a pixel's charge the pixel loses
-            along_x, along_y, diagonal = ipc
-            cx, cy = np.cos(2 * np.pi * px), np.cos(2 * np.pi * py)
-            left = 1.0 - 2 * along_x - 2 * along_y - 4 * diagonal
-            total *= left + 2 * along_x * cx + 2 * along_y * cy + 4 * diagonal * cx * cy
-        if jitter > 0:
-            total *= np.exp(-2.0 * (math.pi * jitter) ** 2 * (px**2 + py**2))
-        return total
-
     extent = sum(widths) + 5 * jitter + (1 if ipc is not None else 0)
-    return _apply_transfer(image, transfer, math.ceil(extent * oversampling) + 1)
+    margin = math.ceil(extent * oversampling) + 1
+    shape = [next_fast_len(size + 2 * margin, real=True) for size in image.shape]
+    # frequencies in cycles per pixel
+    py = np.fft.fftfreq(shape[0])[:, None] * oversampling
+    px = np.fft.rfftfreq(shape[1]) * oversampling
+    transfer = np.ones((py.size, px.size))
+    for width in widths:
+        transfer *= np.sinc(px * width) * np.sinc(py * width)
+    if ipc is not None:
+        # what its neighbors get of a pixel's charge the pixel loses
+        along_x, along_y, diagonal = ipc
+        cx, cy = np.cos(2 * np.pi * px), np.cos(2 * np.pi * py)
+        left = 1.0 - 2 * along_x - 2 * along_y - 4 * diagonal
+        transfer *= left + 2 * along_x * cx + 2 * along_y * cy + 4 * diagonal * cx * cy
+    if jitter > 0:
+        transfer *= np.exp(-2.0 * (math.pi * jitter) ** 2 * (px**2 + py**2))
+    ny, nx = image.shape
+    return irfft2(rfft2(image, shape) * transfer, shape)[:ny, :nx]

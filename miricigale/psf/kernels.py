@@ -23,7 +23,7 @@ from miricigale.psf.wiener import (
 )
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import Interactive
-from miricigale.utils.unified import read_write, unified_read
+from miricigale.utils.unified import read_write
 from miricigale.utils.units import ANGLE, frozen_array, positive, to_array
 
 
@@ -70,25 +70,18 @@ class MatchingKernel(Interactive):
     """
 
     io_module: ClassVar[str] = "miricigale.psf.files"
-    read = unified_read(
-        """
-        Read what `write` wrote, or an image that is a kernel from any FITS file.
-
-        Parameters
-        ----------
-        path : path-like
-            The file.
-        ext : int or str, optional
-            The extension of an image; needed for files that `write` has not written.
-        plane : int, optional
-            Which plane of a cube.
-        pixel_scale : `~astropy.units.Quantity`, optional
-            As for `from_array`; from the header if it states it.
-        source : optional
-            As for `from_array`; for images only.
-        """
+    read, write = read_write(
+        "a kernel and its PSFs",
+        """ext : int or str, optional
+    The extension of an image in any FITS file that is a kernel; needed for files that `write` has not written.
+plane : int, optional
+    Which plane of a cube.
+pixel_scale : `~astropy.units.Quantity`, optional
+    As for `from_array`; from the header if it states it.
+source : optional
+    As for `from_array`; for images only.
+""",
     )
-    write = read_write("a kernel and its PSFs")[1]
 
     array: np.ndarray
     pixel_scale: u.Quantity

@@ -179,10 +179,10 @@ def check_unpacked(path, n_bytes):
     `~miricigale.utils.exceptions.DataError`
         If that is more than the bound.
     """
-    packed, bound = _bound(path)
+    bound = _bound(path)
     if n_bytes > bound:
         msg = (
-            f"{path} ({packed / 1e6:.3g} MB on the disk) would unpack to "
+            f"{path} ({os.stat(path).st_size / 1e6:.3g} MB on the disk) would unpack to "
             f"{'more than ' if n_bytes == bound + 1 else ''}{n_bytes / 1e9:.3g} GB, and the bound "
             f"is {bound / 1e9:.3g} GB; if it is to be trusted, raise "
             "miricigale.conf.unpacked_size (in MB)"
@@ -191,9 +191,8 @@ def check_unpacked(path, n_bytes):
 
 
 def _bound(path):
-    """Bytes on the disk, and how many a file may unpack to."""
-    packed = min(os.stat(path).st_size, _allocated(path))
-    return packed, max(conf.unpacked_size * 1_000_000, _EXPANSION * packed)
+    """How many bytes a file may unpack to."""
+    return max(conf.unpacked_size * 1_000_000, _EXPANSION * os.stat(path).st_size)
 
 
 def unpacked_size(path):
@@ -201,7 +200,7 @@ def unpacked_size(path):
     Size of a file without the packing that astropy opens by itself (gzip, bzip2, xz, zip).
 
     Content is counted piece by piece and not kept. That takes as long as unpacking does, once for
-    a file in a session. A file with holes counts as packed into what it takes on the disk.
+    a file in a session.
 
     Parameters
     ----------
@@ -222,7 +221,7 @@ def unpacked_size(path):
     if not os.path.isfile(path):
         return 0
     try:
-        n_bytes = _count(path, _bound(path)[1])
+        n_bytes = _count(path, _bound(path))
     except Exception as err:  # each packing has its own
         if getattr(err, "errno", None):
             # the reader that opens it says what is wrong
@@ -251,23 +250,6 @@ def _count(path, most):
                     n_bytes += len(piece)
             return min(n_bytes, most + 1)
     return os.stat(path).st_size
-
-
-def _allocated(path):
-    """Bytes that a file has on the disk; holes, which are read as zeros, have none."""
-    status = os.stat(path)
-    blocks = getattr(status, "st_blocks", 0)
-    # some file systems report no blocks, others fewer for a while, or compress
-    if not blocks or _EXPANSION * 512 * blocks >= status.st_size or not hasattr(os, "SEEK_DATA"):
-        return status.st_size
-    n_bytes, end = 0, 0
-    with open(path, "rb", buffering=0) as stream, contextlib.suppress(OSError):
-        # an error means that there are no data after this place
-        while True:
-            start = stream.seek(end, os.SEEK_DATA)
-            end = stream.seek(start, os.SEEK_HOLE)
-            n_bytes += end - start
-    return n_bytes
 
 
 def _refuse_stump(path):
@@ -334,10 +316,14 @@ def read_table(path, *, wanted, cls=QTable, form=None, hdu=None):
         form = _table_format(path) if form is None else form
         if form == "fits":
             with open_fits(path, wanted=wanted) as hdus:
-                return cls.read(hdus, format=form, character_as_bytes=False, hdu=hdu)
-        if hdu is not None:
+                table = cls.read(hdus, format=form, character_as_bytes=False, hdu=hdu)
+        elif hdu is not None:
             raise _unreadable(path, wanted, f"'hdu' is {hdu!r}, and it is no FITS file")
-        return cls.read(path, format=form)
+        else:
+            table = cls.read(path, format=form)
+        if not table.colnames:
+            raise _unreadable(path, wanted, "it has no columns")
+        return table
     except DataError:
         raise
     except Exception as err:  # readers of different formats raise different exceptions

@@ -200,11 +200,8 @@ def require_columns(table, names, argument, *, units=None):
             continue
         have = getattr(table[name], "unit", None)
         have = None if have is None else u.Unit(have)
-        if isinstance(have, u.function.FunctionUnitBase) or have is None:
-            good = False
-        else:
-            good = have.is_equivalent(unit)
-        if not good:
+        # magnitudes are no units of flux
+        if not (isinstance(have, u.UnitBase) and have.is_equivalent(unit)):
             msg = f"'{argument}' column {name!r} must be convertible to {unit}, got {have}"
             raise u.UnitsError(msg)
 
@@ -324,10 +321,7 @@ def match_sky(coords, reference, *, radius):
     if n and len(coords):
         nearest, sep, _ = match_coordinates_sky(reference, coords)
         sep = sep.to_value(u.arcsec)
-        taken = set()
-        for row in np.argsort(sep, kind="stable"):
-            if sep[row] <= limit and nearest[row] not in taken:
-                taken.add(nearest[row])
-                index[row] = nearest[row]
-                separation[row] = sep[row]
+        order = np.argsort(sep, kind="stable")
+        rows, first = np.unique(nearest[order[sep[order] <= limit]], return_index=True)
+        index[order[first]], separation[order[first]] = rows, sep[order[first]]
     return index, separation * u.arcsec

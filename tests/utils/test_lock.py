@@ -154,23 +154,6 @@ def test_what_cannot_be_read_is_taken_over(tmp_path, text):
         assert content(tmp_path)["pid"] == os.getpid()
 
 
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda path: path.symlink_to(path.with_name("nowhere")),
-        lambda path: path.symlink_to(path),
-        lambda path: os.mkfifo(path),
-        lambda path: path.mkdir(),
-    ],
-    ids=["dangling link", "endless link", "pipe", "folder"],
-)
-def test_what_is_no_file_is_refused_at_once(tmp_path, make):
-    make(tmp_path / "run.lock")
-    with pytest.raises(DataError, match=r"run\.lock is no plain file"), FolderLock(tmp_path):
-        pass
-    assert names(tmp_path) == ["run.lock"]
-
-
 def test_a_removed_file_does_not_free_the_lock(tmp_path):
     with FolderLock(tmp_path) as first:
         first.path.unlink()
