@@ -16,6 +16,7 @@ from miricigale.filters.filter import Filter
 from miricigale.filters.surveys import SURVEYS, is_band
 from miricigale.utils.exceptions import CatalogWarning, DataError, argument_error, unknown_name
 from miricigale.utils.missing import negative_errors, plain_floats, without_codes
+from miricigale.utils.options import check_choice, check_names
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU
 
@@ -72,8 +73,7 @@ class CatalogMap:
 
     def __post_init__(self):
         for argument in ("columns", "units"):
-            names = getattr(self, argument)
-            names = {} if names is None else names
+            names = getattr(self, argument) or {}
             if not isinstance(names, Mapping):
                 wanted = "a dict by our names of columns"
                 raise argument_error(argument, wanted, type(names).__name__)
@@ -84,10 +84,9 @@ class CatalogMap:
             object.__setattr__(self, argument, types.MappingProxyType(dict(names)))
         if len(set(self.columns.values())) < len(self.columns):
             raise argument_error("columns", "a dict whose values differ", dict(self.columns))
-        if self.survey is not None and self.survey not in SURVEYS:
-            raise unknown_name("survey", self.survey, SURVEYS)
-        if self.limits not in (True, False):
-            raise argument_error("limits", "True or False", repr(self.limits))
+        if self.survey is not None:
+            check_names([self.survey], "survey", SURVEYS)
+        check_choice(self.limits, "limits", (True, False))
         object.__setattr__(self, "missing", tuple(float(value) for value in self.missing))
 
     @classmethod
@@ -153,9 +152,7 @@ class CatalogMap:
         columns = {ours: theirs for ours, theirs in columns.items() if theirs not in taken}
         columns |= self.columns
         for ours, theirs in columns.items():
-            if theirs not in colnames:
-                kind = f"column of {argument} (for {ours!r})"
-                raise unknown_name(kind, theirs, colnames)
+            check_names([theirs], f"column of {argument} (for {ours!r})", colnames)
         ours = {theirs: name for name, theirs in columns.items()}
         kept = (name for name in colnames if name in ours or name not in columns)
         return {name: ours.get(name, name) for name in kept}, [n for n in lost if n not in ours]
@@ -196,10 +193,7 @@ class CatalogMap:
         out = QTable(meta=table.meta)
         for theirs, ours in names.items():
             out[ours] = table[theirs]
-        for name in self.units:
-            if name != "flux" and name not in out.colnames:
-                kind = f"column of {argument}"
-                raise unknown_name(kind, name, [*out.colnames, "flux"])
+        check_names(self.units, f"column of {argument}", [*out.colnames, "flux"])
         _plain_ids(out)
         factor = self._factor(table, argument)
         coded = {}
@@ -216,9 +210,7 @@ class CatalogMap:
     def _factor(self, table, argument):
         if self.factor is None:
             return 1.0
-        if self.factor not in table.colnames:
-            kind = f"column of {argument}"
-            raise unknown_name(kind, self.factor, table.colnames)
+        check_names([self.factor], f"column of {argument}", table.colnames)
         column = table[self.factor]
         values = plain_floats(column, self.factor, argument)
         return 10 ** (-0.4 * values) if column.unit == u.mag else values

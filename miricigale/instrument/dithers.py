@@ -10,8 +10,9 @@ import numpy as np
 from astropy.table import Table
 
 from miricigale.instrument.siaf import aperture, imager_columns
-from miricigale.utils.exceptions import DataError, argument_error, unknown_name
+from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import read_table, unpacked_size
+from miricigale.utils.options import check_names
 from miricigale.utils.tables import require_columns
 from miricigale.utils.units import ANGLE, check_count, to_array
 
@@ -50,23 +51,17 @@ _N_CYCLING = 311
 _PHASES = ((0.0, 0.0), (0.5, 0.0), (0.5, 0.5), (0.0, 0.5))
 
 
-def _radical_inverse(n, base):
-    """The first n numbers of a Halton sequence: evenly spread over 0 to 1 from any start."""
-    result, index, weight = np.zeros(n), np.arange(1, n + 1), 1.0 / base
-    while np.any(index):
-        result += weight * (index % base)
-        index, weight = index // base, weight / base
-    return result
-
-
 @functools.cache
 def _cycling(name):
+    from scipy.stats.qmc import Halton
+
     sigma, limit = _CYCLING[name]
-    share = _radical_inverse(_N_CYCLING, 2)
+    # evenly spread over 0 to 1 from any start; without the first, which is zero
+    share, turn = Halton(2, scramble=False).random(_N_CYCLING + 1)[1:].T
     inner = (0.4 * limit if name == "cycling-small" else 0.0) ** 2 / (2 * sigma**2)
     a, b = np.exp(-inner), np.exp(-((limit - 1) ** 2) / (2 * sigma**2))
     radius = sigma * np.sqrt(-2 * np.log(a - share * (a - b)))
-    angle = 2 * np.pi * _radical_inverse(_N_CYCLING, 3)
+    angle = 2 * np.pi * turn
     points = np.round(np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1))
     points += np.array(_PHASES)[np.arange(_N_CYCLING) % 4]
     points.flags.writeable = False
@@ -116,8 +111,7 @@ def dither_offsets(pattern, n=None, *, start=0):
     n = None if n is None else check_count(n, "n")
     start = check_count(start, "start", 0)
     if isinstance(pattern, str):
-        if pattern not in dither_patterns():
-            raise unknown_name("dither pattern", pattern, dither_patterns())
+        check_names([pattern], "dither pattern", dither_patterns())
         points = _points(pattern)
         number = start + np.arange(len(points) if n is None else n)
         turns, step = np.divmod(number, len(points))

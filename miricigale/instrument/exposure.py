@@ -14,8 +14,9 @@ from miricigale.instrument.figures import imager_filter, table
 from miricigale.instrument.photometric import electron_rate
 from miricigale.instrument.siaf import aperture, attitude_matrix, pixel_to_v2v3, v2v3_to_sky
 from miricigale.instrument.wcs import imager_wcs, tangent_offset
-from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import Interactive
+from miricigale.utils.options import check_names
 from miricigale.utils.positions import as_position
 from miricigale.utils.units import check_count, to_array
 
@@ -64,11 +65,8 @@ def frame_time(readout="FASTR1", subarray="FULL"):
         In s. Both patterns have one frame in a group.
     """
     times = table()["readout"]
-    if readout not in times:
-        raise unknown_name("readout pattern", readout, times)
-    if subarray not in times[readout]:
-        kind = f"sub-array of {readout}"
-        raise unknown_name(kind, subarray, times[readout])
+    check_names([readout], "readout pattern", times)
+    check_names([subarray], f"sub-array of {readout}", times[readout])
     return times[readout][subarray] * u.s
 
 
@@ -177,10 +175,8 @@ class Exposure(Interactive):
         counts["n_integrations"] = n_integrations or 1
         if pointing is not None:
             pointing = as_position(pointing, "pointing")
-            roll = to_array(
-                0.0 * u.deg if roll is None else roll, u.deg, "roll", ndim=0, finite=True
-            )
-            roll = float(roll) % 360 * u.deg
+            roll = 0.0 * u.deg if roll is None else roll
+            roll = float(to_array(roll, u.deg, "roll", ndim=0, finite=True)) % 360 * u.deg
         elif roll is not None:
             raise argument_error("pointing", "given where 'roll' is", "None")
         values = {"filter": filter, "readout": readout, "subarray": subarray, **counts}
@@ -223,10 +219,7 @@ class Exposure(Interactive):
         -------
         exposure : `Exposure`
         """
-        kind = (
-            str(options.get(k, v)).upper() for k, v in (("readout", "FASTR1"), ("subarray", "FULL"))
-        )
-        frame = frame_time(*kind)
+        frame = cls(filter, n_groups=2, **options).frame_time
         n_groups, n_integrations = _counts_of(filter, time, frame, None, max_fill)
         return cls(filter, n_groups=n_groups, n_integrations=n_integrations, **options)
 
@@ -431,10 +424,9 @@ def ceers_exposures(pointing, roll, *, filters=None, quick=False):
     Yang et al. 2021, ApJ, 908, 144, section 2.
     """
     filters = CEERS_FILTERS if filters is None else tuple(filters)
+    check_names(filters, "band of the survey", CEERS_FILTERS)
     exposures = []
     for name in filters:
-        if name not in _CEERS:
-            raise unknown_name("band of the survey", name, CEERS_FILTERS)
         n_groups, n_integrations, n_dithers = (_QUICK if quick else _CEERS)[name]
         base = Exposure(
             name, n_groups=n_groups, n_integrations=n_integrations, pointing=pointing, roll=roll

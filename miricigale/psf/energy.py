@@ -11,6 +11,7 @@ from miricigale.psf import _core
 from miricigale.psf.effects import detector_response
 from miricigale.psf.model import instrument_psf
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_choice
 from miricigale.utils.tables import described_table
 from miricigale.utils.units import ANGLE, to_array
 
@@ -114,12 +115,11 @@ def fwhm(psf, *, method="half_maximum"):
         If the method is unknown.
     """
     psf = instrument_psf(psf)
+    check_choice(method, "method", ("half_maximum", "gaussian"))
     if method == "half_maximum":
         return psf.fwhm
-    if method == "gaussian":
-        start = psf.fwhm.value / psf.cell
-        return _gaussian_width(psf.data, *psf.origin, start) * psf.cell * ANGLE
-    raise argument_error("method", "'half_maximum' or 'gaussian'", repr(method))
+    start = psf.fwhm.value / psf.cell
+    return _gaussian_width(psf.data, *psf.origin, start) * psf.cell * ANGLE
 
 
 def _gaussian_width(data, x, y, start):

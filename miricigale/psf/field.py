@@ -1,7 +1,6 @@
 """PSFs over the field, as photutils' gridded models."""
 
 import numpy as np
-from photutils.psf import GriddedPSFModel
 
 from miricigale.instrument import aperture, imager_columns
 from miricigale.psf.miri import miri_psf
@@ -150,15 +149,13 @@ def psf_at(grid, x, y):
 
     Raises
     ------
-    TypeError, ValueError
-        If it is no gridded model, or one of photutils' own.
+    TypeError
+        If it is something else, such as a gridded model of photutils' own.
     """
-    if not isinstance(grid, GriddedPSFModel):
-        msg = f"'grid' must be a photutils GriddedPSFModel, got {type(grid).__name__}"
-        raise TypeError(msg)
     if not isinstance(grid, PSFGrid):
-        wanted = "a PSFGrid (see miricigale.psf.from_photutils for others)"
-        raise argument_error("grid", wanted, "one whose pixel and frame are not known")
+        got = type(grid).__name__
+        msg = f"'grid' must be a PSFGrid (see miricigale.psf.from_photutils for others), got {got}"
+        raise TypeError(msg)
     weights = grid_weights(grid, float(x), float(y))[0]
     own = ("oversampling", "grid_xypos", "grid_shape")
     return InstrumentPSF(

@@ -15,14 +15,15 @@ from miricigale.instrument.image import Image
 from miricigale.psf.model import instrument_psf
 from miricigale.psf.pairs import psf_pair, ready_arrays
 from miricigale.psf.wiener import (
+    checked_square,
     choose,
     energy_error,
     energy_radii,
-    odd_square,
     wiener,
 )
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import Interactive
+from miricigale.utils.options import check_choice
 from miricigale.utils.unified import read_write
 from miricigale.utils.units import ANGLE, frozen_array, positive, to_array
 
@@ -99,7 +100,7 @@ source : optional
         for name in ("array", "source", "target"):
             value = getattr(self, name)
             if value is not None:
-                object.__setattr__(self, name, frozen_array(odd_square(value, name)))
+                object.__setattr__(self, name, frozen_array(checked_square(value, name)))
         scale = positive(self.pixel_scale, ANGLE, "pixel_scale")
         object.__setattr__(self, "pixel_scale", scale * ANGLE)
         object.__setattr__(self, "meta", dict(self.meta))
@@ -211,8 +212,7 @@ source : optional
                 wanted = "given where 'hi' does not state it"
                 raise argument_error("pixel_scale", wanted, "None")
         scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))
-        if resampling not in ("drizzle", None):
-            raise argument_error("resampling", "'drizzle' or None", repr(resampling))
+        check_choice(resampling, "resampling", ("drizzle", None))
         source, target, mended = psf_pair(
             hi, lo, scale, angles=(hi_angle, lo_angle), grid_angle=grid_angle,
             resampling=resampling, extent=extent, normalize=normalize,

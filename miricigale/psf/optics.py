@@ -10,6 +10,7 @@ import numpy as np
 from miricigale.psf import _core
 from miricigale.refdata import locate
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_least
 from miricigale.utils.parallel import single_threaded
 from miricigale.utils.random import stream
 from miricigale.utils.units import frozen_array
@@ -90,8 +91,7 @@ class Pupil:
         ValueError
             If ``rms`` is negative.
         """
-        if not rms >= 0:
-            raise argument_error("rms", "zero or positive", rms)
+        check_least(rms, "rms", 0)
         if rms == 0:
             return np.zeros_like(self.amplitude)
         axis = (np.arange(self.n) - 0.5 * (self.n - 1)) * 2 / self.n
@@ -145,8 +145,7 @@ def jwst_pupil(n=384, *, angle=4.83544897):
     ValueError
         If ``n`` is too small to resolve the struts.
     """
-    if n < 64:
-        raise argument_error("n", "at least 64", n)
+    check_least(n, "n", 64)
     constants = jwst_constants()
     # corners of the B segments reach the circle in the telescope's frame only
     diameter = constants["diameter"] * 1.002

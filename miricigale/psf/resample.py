@@ -5,12 +5,12 @@ import math
 
 import astropy.units as u
 import numpy as np
-from astropy.coordinates import Angle
 
 from miricigale.psf import _core
 from miricigale.psf.effects import detector_response
 from miricigale.psf.model import instrument_psf
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_choice
 from miricigale.utils.units import ANGLE, check_count, positive, to_array
 
 _log = logging.getLogger(__name__)
@@ -22,9 +22,6 @@ def _degrees(angle, argument):
     if angle is None:
         wanted = "the position angle of the detector's +y axis, east of north"
         raise argument_error(argument, wanted, "None: it is unknown where the PSF points")
-    if not isinstance(angle, (u.Quantity, Angle)):
-        msg = f"'{argument}' must be a quantity convertible to deg, got a bare number"
-        raise u.UnitsError(msg)
     return float(to_array(angle, u.deg, argument, finite=True))
 
 
@@ -229,8 +226,7 @@ def psf_mosaic(
     Fruchter & Hook 2002, PASP 114, 144.
     """
     psf = instrument_psf(psf)
-    if resampling not in ("drizzle", None):
-        raise argument_error("resampling", "'drizzle' or None", repr(resampling))
+    check_choice(resampling, "resampling", ("drizzle", None))
     if not 0 < pixfrac <= 1:
         raise argument_error("pixfrac", "above 0 and at most 1", pixfrac)
     scale = positive(pixel_scale, ANGLE, "pixel_scale")

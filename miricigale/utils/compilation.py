@@ -71,19 +71,18 @@ def njit(**options):
         except RuntimeError as err:
             if "no locator available" not in str(err):
                 raise
-        if "cache" not in _warned:
-            _warned.add("cache")
-            log.warning(
-                "compiled kernels cannot be kept, as neither the package's folder nor the user's "
-                "cache can be written: they are compiled in every process; set NUMBA_CACHE_DIR to "
-                "a folder that can be written"
-            )
+        _warn_of_no_cache()
         return numba.njit(**{**options, "cache": False})(function)
 
     return decorate
 
 
-_warned = set()
+@functools.cache
+def _warn_of_no_cache():
+    log.warning(
+        "compiled kernels cannot be kept, as neither the package's folder nor the user's cache can be "
+        "written: they are compiled in every process; set NUMBA_CACHE_DIR to a folder that can be written"
+    )
 
 
 @functools.cache

@@ -294,8 +294,8 @@ def read_table(path, *, wanted, cls=QTable, form=None, hdu=None):
     cls : type, optional
         Class of the table.
     form : str, optional
-        Format by `astropy.table.Table.read`. By default by content and suffix: FITS, VOTable,
-        ECSV, CSV or plain text, whose names of columns stand behind ``#`` if ``id`` is among them.
+        Format by `astropy.table.Table.read`. By default by content and suffix: those of `write_table`, or
+        plain text, whose names of columns stand behind ``#`` if ``id`` is among them.
     hdu : int or str, optional
         Extension of a FITS file, the first table by default.
 
@@ -330,19 +330,21 @@ def read_table(path, *, wanted, cls=QTable, form=None, hdu=None):
         raise _unreadable(path, wanted, err) from err
 
 
-#: Formats of tables by suffix, and what `astropy.table.Table.write` takes for each.
-_WRITERS = {
-    ".fits": {"format": "fits"},
-    ".fit": {"format": "fits"},
-    ".ecsv": {"format": "ascii.ecsv"},
-    ".csv": {"format": "ascii.csv"},
-    ".xml": {"format": "votable"},
-    ".vot": {"format": "votable"},
-    ".votable": {"format": "votable"},
-    ".h5": {"format": "hdf5", "path": "table", "serialize_meta": True},
-    ".hdf5": {"format": "hdf5", "path": "table", "serialize_meta": True},
-    ".parquet": {"format": "parquet"},
+#: Formats of tables by suffix, as `astropy.table.Table` calls them.
+TABLE_FORMATS = {
+    ".fits": "fits",
+    ".fit": "fits",
+    ".ecsv": "ascii.ecsv",
+    ".csv": "ascii.csv",
+    ".xml": "votable",
+    ".vot": "votable",
+    ".votable": "votable",
+    ".h5": "hdf5",
+    ".hdf5": "hdf5",
+    ".parquet": "parquet",
 }
+#: What astropy must know further to write a format.
+_OPTIONS = {"hdf5": {"path": "table", "serialize_meta": True}}
 
 
 def write_table(table, path, *, overwrite=False):
@@ -366,14 +368,16 @@ def write_table(table, path, *, overwrite=False):
         If the file is there and ``overwrite`` is not set.
     """
     path = Path(path)
-    options = _WRITERS.get(path.suffix.lower())
-    if options is None:
-        raise argument_error("path", f"a file ending in one of {', '.join(_WRITERS)}", str(path))
-    if options["format"] == "fits":
+    form = TABLE_FORMATS.get(path.suffix.lower())
+    if form is None:
+        raise argument_error(
+            "path", f"a file ending in one of {', '.join(TABLE_FORMATS)}", str(path)
+        )
+    if form == "fits":
         table = table.copy(copy_data=False)
         table.meta = fits_meta(table.meta)
     with writing(path):
-        table.write(path, overwrite=overwrite, **options)
+        table.write(path, overwrite=overwrite, format=form, **_OPTIONS.get(form, {}))
 
 
 def _table_format(path):
@@ -381,14 +385,12 @@ def _table_format(path):
         start = stream.read(65536)
     first = start.strip().partition(b"\n")[0].decode(errors="replace")
     suffix = Path(Path(path).name.lower().removesuffix(".gz")).suffix
-    if start.startswith(b"SIMPLE") or suffix in (".fits", ".fit"):
+    if start.startswith(b"SIMPLE"):
         return "fits"
-    if suffix in (".xml", ".vot", ".votable"):
-        return "votable"
-    if start.startswith(b"# %ECSV") or suffix == ".ecsv":
+    if start.startswith(b"# %ECSV"):
         return "ascii.ecsv"
-    if suffix == ".csv":
-        return "ascii.csv"
+    if suffix in TABLE_FORMATS:
+        return TABLE_FORMATS[suffix]
     named = first.startswith("#") and "id" in first.strip("# \r").split()
     return "ascii.commented_header" if named else "ascii"
 

@@ -42,12 +42,11 @@ def open_rows(path, chunk_rows, *, hdu=None):
     """
     chunk_rows = check_count(chunk_rows, "chunk_rows")
     path = Path(path)
-    if not path.is_file():
-        msg = f"no table {path}"
-        raise DataError(msg)
-    with open(path, "rb") as stream:
-        is_fits = stream.read(6) == b"SIMPLE"
-    return (_FitsRows if is_fits else RowFile)(path, chunk_rows, hdu)
+    if path.is_file():
+        with open(path, "rb") as stream:
+            if stream.read(6) == b"SIMPLE":
+                return _FitsRows(path, chunk_rows, hdu)
+    return RowFile(path, chunk_rows, hdu)
 
 
 class RowFile:

@@ -11,6 +11,7 @@ import numpy as np
 from astropy.table import Table
 
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_least
 from miricigale.utils.units import ANGLE, to_array
 
 __all__ = [
@@ -232,10 +233,8 @@ def read_ids(table, argument="photometry"):
     if ids.ndim != 1:
         raise argument_error(argument, "a table with one id in a row", f"{ids.shape}")
     missing = np.broadcast_to(np.asarray(getattr(column, "mask", False)), ids.shape)
-    if ids.dtype.kind == "O":
-        missing = missing | np.array([value is None for value in ids], dtype=bool)
-    elif ids.dtype.kind in "US":
-        missing = missing | (ids == ids.dtype.type())
+    if ids.dtype.kind in "OUS":
+        missing = missing | np.array([key in (None, "", b"") for key in ids.tolist()], dtype=bool)
     if missing.any():
         rows = np.flatnonzero(missing)
         got = f"{rows.size} masked or empty, the first in row {rows[0]} (from 0)"
@@ -313,8 +312,7 @@ def match_sky(coords, reference, *, radius):
     from astropy.coordinates import match_coordinates_sky
 
     limit = float(to_array(radius, ANGLE, "radius", ndim=0))
-    if not limit >= 0:
-        raise argument_error("radius", "at least 0", radius)
+    check_least(limit, "radius", 0)
     n = len(reference)
     index = np.full(n, -1)
     separation = np.full(n, np.nan)

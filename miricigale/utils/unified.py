@@ -8,10 +8,8 @@ from pathlib import Path
 from astropy.io import registry
 from astropy.io.registry import UnifiedReadWrite, UnifiedReadWriteMethod
 
-from miricigale.utils.files import write_table
+from miricigale.utils.files import TABLE_FORMATS, write_table
 
-# other formats hold the table that people want, and cannot be read back as the whole
-_TABLES = (".csv", ".xml", ".vot", ".votable", ".h5", ".hdf5", ".parquet")
 _SUFFIXES = {"fits": (".fits", ".fit", ".fits.gz"), "ascii.ecsv": (".ecsv",)}
 
 
@@ -86,8 +84,9 @@ class _Write(_Method):
     method = "write"
 
     def __call__(self, path, *args, **kwargs):
-        is_table = "format" not in kwargs and Path(path).suffix.lower() in _TABLES
-        if is_table and hasattr(self._instance, "to_table"):
+        # other formats hold the table that people want, and cannot be read back as the whole
+        form = None if "format" in kwargs else TABLE_FORMATS.get(Path(path).suffix.lower())
+        if form not in (None, *_SUFFIXES) and hasattr(self._instance, "to_table"):
             return write_table(self._instance.to_table(), path, **kwargs)
         found = self._format(path, kwargs)
         return self.registry.write(self._instance, path, *args, format=found, **kwargs)

@@ -131,14 +131,12 @@ def test_angle_turns_the_target(hi, lo):
 
 
 def test_angles_are_asked_for_by_name(hi, lo):
-    with pytest.raises(ValueError, match="'lo_angle' must be the position angle"):
-        MatchingKernel.from_psfs(hi, lo["f770w"], pixel_scale=SCALE)
-    with pytest.raises(ValueError, match="'hi_angle' must be left out"):
-        MatchingKernel.from_psfs(
-            hi, lo["f770w"], pixel_scale=SCALE, hi_angle=3 * u.deg, lo_angle=0 * u.deg
-        )
-    with pytest.raises(ValueError, match="'lo_angle' must be the position angle"):
-        MatchingKernel.from_psfs(hi, lo["f770w"], pixel_scale=SCALE, resampling="drizzle")
+    for options, match in (
+        ({}, "'lo_angle' must be the position angle"),
+        ({"resampling": "drizzle"}, "'lo_angle' must be the position angle"),
+        ({"hi_angle": 3 * u.deg, "lo_angle": 0 * u.deg}, "'hi_angle' must be left out"),
+    ):
+        refuses(match, MatchingKernel.from_psfs, hi, lo["f770w"], pixel_scale=SCALE, **options)
 
 
 def test_drizzled_target_is_wider(hi, lo):
@@ -197,34 +195,26 @@ def test_values_are_frozen_and_checked():
     kernel = MatchingKernel(gaussian_image(5, 1.0), pixel_scale=SCALE)
     with pytest.raises(ValueError, match="read-only"):
         kernel.array[0, 0] = 1
-    refuses("'source, target' must be the kernel's PSFs", kernel.encircled_energy_error)
-    with pytest.raises(ValueError, match="'array' must be square with an odd number"):
-        MatchingKernel(np.ones((4, 4)), pixel_scale=SCALE)
-    with pytest.raises(ValueError, match="'image' must be finite, got 1 pixels"):
-        kernel.apply(np.array([[1.0, np.nan], [0.0, 0.0]]))
-    with pytest.raises(ValueError, match="'hi' must be a PSF whose sum"):
-        MatchingKernel.from_psfs(
-            5 * gaussian_image(31, 1), gaussian_image(31, 2), pixel_scale=SCALE
-        )
-    with pytest.raises(ValueError, match="'hi, lo' must be arrays of the same shape"):
-        MatchingKernel.from_psfs(gaussian_image(31, 1), gaussian_image(33, 2), pixel_scale=SCALE)
-    with pytest.raises(ValueError, match="'regularization' must be positive or one of"):
-        MatchingKernel.from_psfs(
-            gaussian_image(31, 1), gaussian_image(31, 2), pixel_scale=SCALE, regularization="best"
-        )
     assert "5 x 5 px of 0.06 arcsec" in repr(kernel)
+    scale, (one, two) = {"pixel_scale": SCALE}, (gaussian_image(31, s) for s in (1, 2))
+    refuses("'source, target' must be the kernel's PSFs", kernel.encircled_energy_error)
+    refuses("'array' must be square with an odd number", MatchingKernel, np.ones((4, 4)), **scale)
+    refuses("'image' must be finite, got 1 pixels", kernel.apply, np.array([[1.0, np.nan]]))
+    for psfs, options, match in (
+        ((5 * one, two), {}, "'hi' must be a PSF whose sum"),
+        ((one, gaussian_image(33, 2)), {}, "'hi, lo' must be arrays of the same shape"),
+        ((one, two), {"regularization": "best"}, "'regularization' must be positive or one of"),
+    ):
+        refuses(match, MatchingKernel.from_psfs, *psfs, **scale, **options)
 
 
 def test_foreign_files_are_named(tmp_path):
     path = tmp_path / "kernel.fits"
-    with pytest.raises(
-        DataError, match=r"kernel\.fits cannot be read as a matching kernel: no such"
-    ):
-        MatchingKernel.read(path)
+    match = r"kernel\.fits cannot be read as a matching kernel: "
+    refuses(match + "no such", MatchingKernel.read, path, error=DataError)
     path.write_text("text")
-    with pytest.raises(DataError, match=r"kernel\.fits cannot be read as a matching kernel: "):
-        MatchingKernel.read(path)
+    refuses(match, MatchingKernel.read, path, error=DataError)
     hdus = [fits.PrimaryHDU(), fits.ImageHDU(gaussian_image(5, 1.0), name="KERNEL")]
     fits.HDUList(hdus).writeto(path, overwrite=True)
-    with pytest.raises(DataError, match=r"kernel\.fits is not a complete .*PIXSCALE"):
-        MatchingKernel.read(path)
+    match = r"kernel\.fits is not a complete .*PIXSCALE"
+    refuses(match, MatchingKernel.read, path, error=DataError)
