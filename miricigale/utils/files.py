@@ -85,24 +85,23 @@ def open_fits(path, *, wanted, **options):
         `check_unpacked`.
     """
     n_bytes = unpacked_size(path)
-    hdus = None
-    try:
-        _refuse_stump(Path(path))
-        with warnings.catch_warnings(record=True) as caught:
-            # made errors at once they would leave the file open
-            warnings.simplefilter("always")
-            hdus = fits.open(path, **options)
-            # headers are read late
-            len(hdus)
-        _check_declared(path, hdus, n_bytes)
-        _judge(caught)
-    except DataError:
-        hdus.close()
-        raise
-    except (OSError, TypeError, ValueError) as err:
-        if hdus is not None:
-            hdus.close()
-        raise _unreadable(path, wanted, err) from err
+    # closes the file if something is wrong with it
+    with contextlib.ExitStack() as opened:
+        try:
+            _refuse_stump(Path(path))
+            with warnings.catch_warnings(record=True) as caught:
+                # made errors at once they would leave the file open
+                warnings.simplefilter("always")
+                hdus = opened.enter_context(fits.open(path, **options))
+                # headers are read late
+                len(hdus)
+            _check_declared(path, hdus, n_bytes)
+            _judge(caught)
+        except DataError:
+            raise
+        except (OSError, TypeError, ValueError) as err:
+            raise _unreadable(path, wanted, err) from err
+        opened.pop_all()
     return hdus
 
 
@@ -370,9 +369,8 @@ def write_table(table, path, *, overwrite=False):
     path = Path(path)
     form = TABLE_FORMATS.get(path.suffix.lower())
     if form is None:
-        raise argument_error(
-            "path", f"a file ending in one of {', '.join(TABLE_FORMATS)}", str(path)
-        )
+        wanted = f"a file ending in one of {', '.join(TABLE_FORMATS)}"
+        raise argument_error("path", wanted, str(path))
     if form == "fits":
         table = table.copy(copy_data=False)
         table.meta = fits_meta(table.meta)

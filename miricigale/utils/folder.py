@@ -260,9 +260,8 @@ class RecordFolder(FileFolder):
 
     def faults(self, key):
         """What is wrong with the files of a record: dict of name to ``"missing"`` or what else, in words."""
-        found = {
-            name: self._fault(name, one) for name, one in self.records[key]["products"].items()
-        }
+        products = self.records[key]["products"].items()
+        found = {name: self._fault(name, product) for name, product in products}
         return {name: fault for name, fault in found.items() if fault}
 
     def _fault(self, name, product):

@@ -83,11 +83,10 @@ class ObjectRows(Interactive):
         if self.isscalar:
             msg = f"a {type(self).__name__} of a single object cannot be indexed"
             raise TypeError(msg)
-        if isinstance(key, (slice, list)) or (isinstance(key, np.ndarray) and key.ndim):
-            rows = key if isinstance(key, slice) else np.asarray(key)
-            if isinstance(rows, np.ndarray) and rows.size == 0 and rows.dtype != bool:
-                rows = rows.astype(np.intp)
-            return self._take(rows)
+        if isinstance(key, slice):
+            return self._take(key)
+        if isinstance(key, list) or (isinstance(key, np.ndarray) and key.ndim):
+            return self._take(key if len(key) else slice(0))
         if isinstance(key, numbers.Integral) and not isinstance(key, (bool, np.bool_)):
             if not -len(self) <= key < len(self):
                 msg = f"no row {key} among {len(self)}; results.loc[id] is the object of an id"
@@ -129,9 +128,7 @@ class ObjectRows(Interactive):
 
     def _several(self):
         """This, with an axis of objects where it is a single one."""
-        if not self.isscalar:
-            return self
-        return self._take(None)
+        return self._take(None) if self.isscalar else self
 
     @cached_property
     def _row_of_id(self):

@@ -222,7 +222,8 @@ def test_bands_without_a_filter_are_named_and_ones_own_columns_come_first(tmp_pa
     refuses("a table with columns of 'dja'", read_catalog_photometry, path, "dja")
     refuses(r"no survey 'cosmos2015'", read_catalog_photometry, path, "cosmos2015", error=KeyError)
     names = ["id", "f_F606W", "e_F606W", "f_ACS_F606W", "e_ACS_F606W"]
-    match, columns = "f_F606W and f_ACS_F606W are both the filter acs", {key: [1.0] for key in names}
+    match = r"f_F606W and f_ACS_F606W are both the filter acs\.f606w"
+    columns = {name: [1.0] for name in names}
     refuses(match, convert, columns, error=DataError, survey="3dhst")
 
 

@@ -141,7 +141,7 @@ def test_a_forked_child_does_not_free_the_lock_of_its_parent(tmp_path):
 @pytest.mark.parametrize("changes", [{"host": "node7"}, {"machine": "another"}])
 def test_a_lock_of_another_host_is_never_taken_for_dead(tmp_path, changes):
     text = leave(tmp_path, pid=2**22 + 1, **changes)
-    wanted = r"on another host: process 4194305 on .*if it is gone, remove .*run\.lock"
+    wanted = r"on another host: process 4194305 on .*if that process is gone, remove .*run\.lock"
     with pytest.raises(DataError, match=wanted), FolderLock(tmp_path):
         pass
     assert (tmp_path / "run.lock").read_text() == text
