@@ -51,6 +51,10 @@ class MatchingKernel(Interactive):
     the fraction of light that the wide PSF's grid holds, a little below 1, where that is known
     and 1 where it is not (see ``normalize`` in `from_psfs`).
 
+    ``read`` also takes an image in any FITS file that is a kernel, by its extension ``ext`` (int or str), the
+    ``plane`` of a cube (int), ``pixel_scale`` where the header does not state it, and ``source`` as for
+    `from_array`.
+
     Parameters
     ----------
     array : `~numpy.ndarray`, shape (n, n), n odd
@@ -71,18 +75,7 @@ class MatchingKernel(Interactive):
     """
 
     io_module: ClassVar[str] = "miricigale.psf.files"
-    read, write = read_write(
-        "a kernel and its PSFs",
-        """ext : int or str, optional
-    The extension of an image in any FITS file that is a kernel; needed for files that `write` has not written.
-plane : int, optional
-    Which plane of a cube.
-pixel_scale : `~astropy.units.Quantity`, optional
-    As for `from_array`; from the header if it states it.
-source : optional
-    As for `from_array`; for images only.
-""",
-    )
+    read, write = read_write("a kernel and its PSFs")
 
     array: np.ndarray
     pixel_scale: u.Quantity
@@ -206,11 +199,9 @@ source : optional
         1.0
         """
         hi, lo = (_named(psf) for psf in (hi, lo))
+        pixel_scale = getattr(hi, "pixel_scale", None) if pixel_scale is None else pixel_scale
         if pixel_scale is None:
-            pixel_scale = getattr(hi, "pixel_scale", None)
-            if pixel_scale is None:
-                wanted = "given where 'hi' does not state it"
-                raise argument_error("pixel_scale", wanted, "None")
+            raise argument_error("pixel_scale", "given where 'hi' does not state it", "None")
         scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))
         check_choice(resampling, "resampling", ("drizzle", None))
         source, target, mended = psf_pair(
