@@ -13,7 +13,7 @@ import numpy as np
 
 from miricigale.evaluation import Estimate
 from miricigale.planning import Planner, load_plan
-from miricigale.utils.parallel import thread_count, thread_pool
+from miricigale.utils.parallel import threads
 
 #: docs/sanity.rst: 342 sources. The run's errors are the plan's, scaled to as many sources, and of shares
 #: those of its own counts.
@@ -41,7 +41,7 @@ def main():
             "agn": {"frac_agn": 0.0, "shares": 1.0},
         }
     )
-    with thread_pool(thread_count()) as executor:
+    with threads() as executor:
         planner = Planner(config, executor=executor)
         plans = planner.compare()
     elapsed, used = time.monotonic() - clock, time.process_time() - begin

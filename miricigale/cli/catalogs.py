@@ -12,14 +12,13 @@ def fit(args):
     from miricigale.fitting.classes import fit_classes, write_table
     from miricigale.fitting.page import fit_page
     from miricigale.utils.exceptions import OtherResultsError
-    from miricigale.utils.parallel import thread_count, thread_pool
+    from miricigale.utils.parallel import threads
 
     hdu = int(args.hdu) if (args.hdu or "").isdigit() else args.hdu
-    n_threads = thread_count(args.threads or None)
     if str(args.photometry) == "-":
         args.photometry = read_input(args.output)
     try:
-        with thread_pool(n_threads) as executor:
+        with threads(args.threads or None) as executor:
             found = fit_classes(
                 args.photometry,
                 args.output,
@@ -27,7 +26,7 @@ def fit(args):
                 **chosen(args, "axes redshift model_error pairs flux_unit catalog_map ebv"),
                 **chosen(args, "chunk_rows resume"),
                 hdu=hdu,
-                executor=executor if n_threads > 1 else None,
+                executor=executor,
                 progress_bar=not args.no_progress,
             )
         table = args.output / "table.fits"

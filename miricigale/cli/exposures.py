@@ -1,5 +1,7 @@
 """The command that reduces exposures."""
 
+from miricigale.cli.options import chosen
+
 _FILES = "mask saturation bias reset linearity dark gain read_noise flat photom"
 
 
@@ -13,20 +15,13 @@ def reduce(args):
         if not path.is_file():
             msg = f"no file {path}"
             raise DataError(msg)
-    reducer = Reducer(
-        backend=args.backend,
-        references=_references(args),
-        skip_first=args.skip_first,
-        skip_last=args.skip_last,
-        n_threads=args.threads,
-    )
+    settings = chosen(args, "backend skip_first skip_last") | {"n_threads": args.threads}
     table = reduce_files(
         args.files,
         args.output,
-        reducer=reducer,
-        pixel_scale=args.pixel_scale,
+        reducer=Reducer(references=_references(args), **settings),
         integrations=args.rateints,
-        resume=args.resume,
+        **chosen(args, "pixel_scale resume"),
         progress_bar=not args.no_progress,
     )
     failed = table[table["status"] == "failed"]
@@ -42,8 +37,7 @@ def _references(args):
     """What the options say of references."""
     from miricigale.reduction import ReferenceCache, ReferenceFiles
 
-    given = {name: getattr(args, name) for name in _FILES.split()}
-    given = {name: _number(value) for name, value in given.items() if value is not None}
+    given = {k: _number(v) for k, v in chosen(args, _FILES).items() if v is not None}
     ways = [bool(given), args.crds is not None, args.references is not None]
     if sum(ways) > 1:
         msg = "wanted are files of references, --crds or --references, only one of these"

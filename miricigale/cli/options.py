@@ -113,9 +113,8 @@ def _add(parser, groups, flags, option, known):
     own = {key: value for key, value in option.items() if key not in ("flags", "group", "key")}
     own["help"] = _filled(own["help"], known)
     if "type" in own:
+        # argparse applies it to a default that is text
         own["type"] = TYPES[own["type"]]
-    if own.get("type") is Path and "default" in own:
-        own["default"] = Path(own["default"])
     if own.get("action") == "boolean":
         own["action"] = argparse.BooleanOptionalAction
     if isinstance(own.get("metavar"), list):
@@ -136,9 +135,8 @@ def _filled(text, words):
 def read_input(folder):
     """Write what standard input holds, a table, beside the folder of its results: its path."""
     data = sys.stdin.buffer.read()
-    ending = (
-        "fits" if data.startswith(b"SIMPLE") else "ecsv" if data.startswith(b"# %ECSV") else "csv"
-    )
+    kinds = {b"SIMPLE": "fits", b"# %ECS": "ecsv"}
+    ending = kinds.get(data[:6], "csv")
     path = folder.with_name(f"{folder.name}-input.{ending}")
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(data)

@@ -35,8 +35,7 @@ def main(argv=None):
         argcomplete.autocomplete(parser)
     args = parser.parse_args(argv)
     verbose, quiet = (getattr(args, name, False) for name in ("verbose", "quiet"))
-    if quiet:
-        args.no_progress = True
+    args.no_progress = quiet or getattr(args, "no_progress", False)
     handler = logging.StreamHandler()
     # astropy has a handler of its own
     handler.addFilter(lambda record: not record.name.startswith("astropy"))

@@ -80,7 +80,7 @@ def plan(args):
         msg = "wanted are --time or --depth, not both"
         raise ValueError(msg)
     from miricigale.planning import load_plan, write_plan
-    from miricigale.utils.parallel import thread_count, thread_pool
+    from miricigale.utils.parallel import threads
 
     if args.time is not None:
         # depths of the file would count in place of times
@@ -95,7 +95,7 @@ def plan(args):
         return 0
     folder = args.output or Path(config.plan.name)
     begin = time.monotonic()
-    with thread_pool(thread_count(config.plan.threads or None)) as executor:
+    with threads(config.plan.threads or None) as executor:
         show = not args.no_progress
         comparison = write_plan(config, folder, executor=executor, progress_bar=show)
     wanted = ["plan", "time", "z_scatter", "z_outliers", "frac_scatter", "completeness", "purity"]
@@ -125,15 +125,14 @@ def _bands_of(args, values):
 
 def compile_all(args):
     """Compile all kernels."""
-    from miricigale.utils.parallel import thread_count, thread_pool
+    from miricigale.utils.parallel import parallel_map, threads
     from miricigale.workflow.warmup import JOBS, compile_apart, describe_job, is_compiled
 
     names = [name for name in JOBS if not is_compiled(name)]
-    with thread_pool(thread_count()) as executor:
-        jobs = [executor.submit(compile_apart, name) for name in names]
-        for name in names:
-            print(describe_job(name), flush=True)
-        kept = [job.result() for job in jobs]
+    for name in names:
+        print(describe_job(name), flush=True)
+    with threads() as executor:
+        kept = parallel_map(compile_apart, names, executor=executor)
     if not all(kept):
         print("miricigale: compiled code cannot be kept; set NUMBA_CACHE_DIR", file=sys.stderr)
         return 1

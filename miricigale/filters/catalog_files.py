@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from miricigale.filters.catalog_map import CatalogMap
-from miricigale.utils.exceptions import CatalogWarning, DataError, argument_error
+from miricigale.utils.exceptions import CatalogWarning, argument_error
 from miricigale.utils.files import read_table
 from miricigale.utils.missing import plain_floats, without_codes
 from miricigale.utils.tables import error_column
@@ -62,12 +62,9 @@ def read_catalog_photometry(path, catalog_map=None, *, hdu=None, **options):
     catalog_map = as_catalog_map(catalog_map, options)
     path = Path(path)
     table = read_table(path, wanted="a table", hdu=hdu)
-    if not table.colnames:
-        msg = f"{path} cannot be read as a table: it has no columns"
-        raise DataError(msg)
     _, lost = catalog_map.names(table.colnames, path.name)
     table, coded = catalog_map.convert(table, path.name)
-    for text in told_of(lost, coded):
+    for text in catalog_messages(lost, coded):
         warnings.warn(f"{path.name}: {text}", CatalogWarning, stacklevel=2)
     return table
 
@@ -86,7 +83,7 @@ def as_catalog_map(catalog_map, options=None):
     return dataclasses.replace(catalog_map, **options or {})
 
 
-def told_of(lost, coded, what="taken as missing, by the number that stands there"):
+def catalog_messages(lost, coded, what="taken as missing, by the number that stands there"):
     """Yield warnings about bands without a filter, and numbers that stand for no value."""
     if lost:
         yield f"left out, no filter here: {', '.join(lost)}"
@@ -116,7 +113,7 @@ def codes_of(table, bands):
     Returns
     -------
     coded : dict of str to `~numpy.ndarray` of float, shape (n,)
-        By band the number, NaN in rows that have none; as `told_of` takes it.
+        By band the number, NaN in rows that have none; as `catalog_messages` takes it.
     """
     coded = {}
     for name in bands:
@@ -140,49 +137,23 @@ def codes_of(table, bands):
 def warn_of_codes(coded, where, stacklevel):
     """Warn of what `codes_of` found, by band and count, for fits that take the numbers as they are."""
     found = {name: values for name, values in coded.items() if np.any(~np.isnan(values))}
-    for text in told_of(
+    for text in catalog_messages(
         (), found, "look like numbers that stand for no value, and are fitted as they are"
     ):
         how = "NaN is a missing band; read_catalog_photometry, or --map, makes them so"
         warnings.warn(f"{where}: {text} ({how})", CatalogWarning, stacklevel=stacklevel + 1)
 
 
-class RenamedRows:
-    """
-    A table on disk by pieces (`~miricigale.utils.row_files.RowFile`), with our names of columns.
-
-    Parameters
-    ----------
-    rows : `~miricigale.utils.row_files.RowFile`
-        The file.
-    names : dict of str to str
-        Ours by the file's.
-    """
-
-    def __init__(self, rows, names):
-        self._rows = rows
-        self._theirs = {names.get(theirs, theirs): theirs for theirs in rows.colnames}
-
-    def __getattr__(self, name):
-        return getattr(self._rows, name)
-
-    @property
-    def colnames(self):
-        """Our names of the columns."""
-        return tuple(self._theirs)
-
-    def chunk(self, i):
-        """A piece of the table."""
-        table = self._rows.chunk(i)
-        table.rename_columns(list(self._theirs.values()), list(self._theirs))
-        return table
-
-    def foreign_chunks(self, name):
-        """As `RowFile.foreign_chunks`, by our name."""
-        return self._rows.foreign_chunks(self._theirs.get(name, name))
+def joined_codes(pieces):
+    """Join what `codes_of` or `CatalogMap.convert` found in each piece of a table."""
+    parts = {}
+    for coded in pieces:
+        for name, codes in coded.items():
+            parts.setdefault(name, []).append(codes)
+    return {name: np.concatenate(codes) for name, codes in parts.items()}
 
 
-class MappedRows(RenamedRows):
+class MappedRows:
     """
     A table on disk by pieces, with our names and units.
 
@@ -196,23 +167,22 @@ class MappedRows(RenamedRows):
 
     def __init__(self, rows, catalog_map):
         names, self._lost = catalog_map.names(rows.colnames, rows.path.name)
-        super().__init__(rows, names)
-        self.map = catalog_map
+        self._rows, self.map, self.colnames = rows, catalog_map, tuple(names.values())
+
+    def __getattr__(self, name):
+        return getattr(self._rows, name)
+
+    def _convert(self, i, *, quiet):
+        with warnings.catch_warnings():
+            if quiet:
+                warnings.simplefilter("ignore", CatalogWarning)
+            return self.map.convert(self._rows.chunk(i), self._rows.path.name)
 
     def chunk(self, i):
-        """A piece of the table; its warnings are those of `told`."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", CatalogWarning)
-            return self.map.convert(self._rows.chunk(i), self._rows.path.name)[0]
+        """A piece of the table; its warnings are those of `messages`."""
+        return self._convert(i, quiet=True)[0]
 
-    def told(self):
+    def messages(self):
         """Return the warnings about the whole file, all of which is read."""
-        parts = {}
-        for i in range(self._rows.n_chunks):
-            table = self._rows.chunk(i)
-            with warnings.catch_warnings():
-                if i:
-                    warnings.simplefilter("ignore", CatalogWarning)
-                for name, codes in self.map.convert(table, self._rows.path.name)[1].items():
-                    parts.setdefault(name, []).append(codes)
-        return list(told_of(self._lost, {name: np.concatenate(v) for name, v in parts.items()}))
+        pieces = (self._convert(i, quiet=i > 0)[1] for i in range(self._rows.n_chunks))
+        return list(catalog_messages(self._lost, joined_codes(pieces)))

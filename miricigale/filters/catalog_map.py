@@ -17,6 +17,7 @@ from miricigale.filters.filter import Filter
 from miricigale.filters.surveys import SURVEYS, is_band
 from miricigale.utils.exceptions import CatalogWarning, DataError, argument_error, unknown_name
 from miricigale.utils.missing import negative_errors, plain_floats, without_codes
+from miricigale.utils.options import check_choice, check_names
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU
 
@@ -25,7 +26,7 @@ _DEFAULT_UNITS = {"ra": u.deg, "dec": u.deg, "position_angle": u.deg}
 #: Names of AB magnitudes as a unit.
 _AB = ("abmag", "mag(ab)", "ab", "mag_ab")
 #: Error in magnitudes times flux is an error of the flux.
-PER_MAGNITUDE = 0.4 * np.log(10)
+_PER_MAGNITUDE = 0.4 * np.log(10)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -73,8 +74,7 @@ class CatalogMap:
 
     def __post_init__(self):
         for argument in ("columns", "units"):
-            names = getattr(self, argument)
-            names = {} if names is None else names
+            names = getattr(self, argument) or {}
             if not isinstance(names, Mapping):
                 wanted = "a dict by our names of columns"
                 raise argument_error(argument, wanted, type(names).__name__)
@@ -85,10 +85,9 @@ class CatalogMap:
             object.__setattr__(self, argument, types.MappingProxyType(dict(names)))
         if len(set(self.columns.values())) < len(self.columns):
             raise argument_error("columns", "a dict whose values differ", dict(self.columns))
-        if self.survey is not None and self.survey not in SURVEYS:
-            raise unknown_name("survey", self.survey, SURVEYS)
-        if self.limits not in (True, False):
-            raise argument_error("limits", "True or False", repr(self.limits))
+        if self.survey is not None:
+            check_names([self.survey], "survey", SURVEYS)
+        check_choice(self.limits, "limits", (True, False))
         object.__setattr__(self, "missing", tuple(float(value) for value in self.missing))
 
     @classmethod
@@ -160,9 +159,7 @@ class CatalogMap:
         columns = {ours: theirs for ours, theirs in columns.items() if theirs not in taken}
         columns |= self.columns
         for ours, theirs in columns.items():
-            if theirs not in colnames:
-                kind = f"column of {argument} (for {ours!r})"
-                raise unknown_name(kind, theirs, colnames)
+            check_names([theirs], f"column of {argument} (for {ours!r})", colnames)
         ours = {theirs: name for name, theirs in columns.items()}
         kept = (name for name in colnames if name in ours or name not in columns)
         return {name: ours.get(name, name) for name in kept}, [n for n in lost if n not in ours]
@@ -203,19 +200,16 @@ class CatalogMap:
         out = QTable(meta=table.meta)
         for theirs, ours in names.items():
             out[ours] = table[theirs]
-        for name in self.units:
-            if name != "flux" and name not in out.colnames:
-                kind = f"column of {argument}"
-                raise unknown_name(kind, name, [*out.colnames, "flux"])
+        check_names(self.units, f"column of {argument}", [*out.colnames, "flux"])
         _plain_ids(out)
         factor = self._factor(table, argument)
         coded = {}
         for name in out.colnames:
             if is_band(name):
                 if not name.endswith(error_column("")):
-                    coded[name] = self._set_band(out, name, factor, argument)
+                    coded[name] = self.set_band(out, name, factor, argument)
                 elif name.removesuffix(error_column("")) not in out.colnames:
-                    self._set_band(out, name, factor, argument)
+                    self.set_band(out, name, factor, argument)
             else:
                 self._set_unit(out, name, argument)
         return out, coded
@@ -223,9 +217,7 @@ class CatalogMap:
     def _factor(self, table, argument):
         if self.factor is None:
             return 1.0
-        if self.factor not in table.colnames:
-            kind = f"column of {argument}"
-            raise unknown_name(kind, self.factor, table.colnames)
+        check_names([self.factor], f"column of {argument}", table.colnames)
         column = table[self.factor]
         values = plain_floats(column, self.factor, argument)
         return 10 ** (-0.4 * values) if column.unit == u.mag else values
@@ -257,8 +249,8 @@ class CatalogMap:
         elif asked or column.dtype.kind in "if":
             table[name] = u.Quantity(plain_floats(column, name, argument), unit)
 
-    def _set_band(self, table, name, factor, argument):
-        """Fluxes and errors of a band in uJy; the numbers that stand for no value."""
+    def set_band(self, table, name, factor, argument):
+        """Bring fluxes and errors of a band to uJy; returns the numbers that stand for no value."""
         error = error_column(name)
         unit = self._asked(name, table[name], True, argument)
         if unit is None or unit == u.mag or not (_is_ab(unit) or unit.is_equivalent(FNU)):
@@ -284,7 +276,12 @@ class CatalogMap:
         errors = np.where(missing | no_error, np.nan, errors)
         if self.limits:
             limit, nothing = negative_errors(flux, errors)
-            self._check_limits(table, name, ab, limit | nothing, argument)
+            if f"{name}_limit" in table.colnames:
+                wanted = f"a table without '{name}_limit' where negative errors mark limits"
+                raise argument_error(argument, wanted, "both")
+            if ab and np.any(limit | nothing):
+                wanted = f"fluxes in {name!r} where negative errors mark limits"
+                raise argument_error(argument, wanted, "AB magnitudes")
             code = np.where(nothing, values, code)
             table[name] = np.where(nothing, np.nan, flux * factor) * FNU
             table[f"{name}_limit"] = limit
@@ -292,21 +289,12 @@ class CatalogMap:
         table[error] = self._errors(table[error], error, errors, flux, ab, argument) * factor * FNU
         return code
 
-    def _check_limits(self, table, name, ab, negative, argument):
-        if f"{name}_limit" in table.colnames:
-            wanted = f"a table without the column '{name}_limit' where negative errors mark limits"
-            raise argument_error(argument, wanted, "both")
-        if ab and negative.any():
-            wanted = f"fluxes in {name!r} where negative errors mark limits"
-            raise argument_error(argument, wanted, "AB magnitudes")
-
     def _errors(self, column, name, errors, flux, ab, argument):
         """Errors of fluxes in uJy, from those in the file's unit."""
-        if ab and "flux" in self.units and name not in self.units:
-            return PER_MAGNITUDE * flux * errors
-        unit = self._asked(name, column, not ab, argument)
-        if ab and (unit is None or unit == u.mag or _is_ab(unit)):
-            return PER_MAGNITUDE * flux * errors
+        stated = not ab or name in self.units or "flux" not in self.units
+        unit = self._asked(name, column, not ab, argument) if stated else u.mag
+        if ab and (unit in (None, u.mag, u.dimensionless_unscaled) or _is_ab(unit)):
+            return _PER_MAGNITUDE * flux * errors
         if unit is None or not unit.is_equivalent(FNU):
             msg = f"'{argument}' column {name!r} must be convertible to {FNU}, got {unit}"
             raise u.UnitsError(msg)

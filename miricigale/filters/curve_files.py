@@ -7,7 +7,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.utils.exceptions import DataError
-from miricigale.utils.files import WRITERS, read_table, unpacked_size
+from miricigale.utils.files import TABLE_FORMATS, read_table, unpacked_size
 
 # units that a header may name
 _UNITS = re.compile(r"\b(um|microns?|nm|AA|Angstroms?)\b", re.IGNORECASE)
@@ -34,7 +34,7 @@ def read_curve(path, unit=None):
         The one in the file, else that of the file.
     """
     path = Path(path).expanduser()
-    return _of_table(path, unit) if path.suffix.lower() in WRITERS else _of_text(path, unit)
+    return _of_table(path, unit) if path.suffix.lower() in TABLE_FORMATS else _of_text(path, unit)
 
 
 def _of_table(path, unit):

@@ -43,7 +43,7 @@ def _padded(wave, throughput):
 
 
 @checked_calls
-@dataclasses.dataclass(frozen=True, eq=False, repr=False, init=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Filter(Frozen, Interactive):
     """
     A passband: the response to photons against wavelength.
@@ -84,10 +84,10 @@ class Filter(Frozen, Interactive):
     'miri.f770w'
     """
 
-    wave: u.Quantity
-    throughput: np.ndarray
+    wave: u.Quantity | str
+    throughput: np.ndarray | None = None
+    name: str | None = None
     _: dataclasses.KW_ONLY
-    name: str
     meta: dict | None = None
     reference_wavelength: u.Quantity | None = None
     reference_temperature: u.Quantity | None = None
@@ -103,38 +103,19 @@ class Filter(Frozen, Interactive):
         "edges": "bounds",
     }
 
-    def __init__(
-        self,
-        wave,
-        throughput=None,
-        name=None,
-        *,
-        meta=None,
-        reference_wavelength=None,
-        reference_temperature=None,
-    ):
-        if isinstance(wave, str) and throughput is None:
-            self.__dict__.update(Filter.from_name(wave).__dict__)
-            return
+    def __post_init__(self):
+        wave, throughput, name = self.wave, self.throughput, self.name
         if isinstance(wave, str):
+            if throughput is None:
+                self.__dict__.update(Filter.from_name(wave).__dict__)
+                return
             # the name first, as others have it
             wave, throughput, name = throughput, name, wave
         for argument, value in (("throughput", throughput), ("name", name)):
             if value is None:
                 raise argument_error(argument, "given with 'wave'", "None")
-        self.__dict__.update(
-            wave=wave,
-            throughput=throughput,
-            name=name,
-            meta=meta,
-            reference_wavelength=reference_wavelength,
-            reference_temperature=reference_temperature,
-        )
-        self._check()
-
-    def _check(self):
-        wave = to_array(self.wave, WAVE, "wave", ndim=1, finite=True)
-        throughput = to_array(self.throughput, u.one, "throughput", ndim=1, finite=True)
+        wave = to_array(wave, WAVE, "wave", ndim=1, finite=True)
+        throughput = to_array(throughput, u.one, "throughput", ndim=1, finite=True)
         if wave.size < 2 or wave.shape != throughput.shape:
             shapes = f"{wave.shape} and {throughput.shape}"
             raise argument_error("throughput", "as many values as 'wave', two or more", shapes)
@@ -145,7 +126,7 @@ class Filter(Frozen, Interactive):
         wave, throughput = _padded(wave, throughput)
         object.__setattr__(self, "wave", frozen_quantity(wave * WAVE, WAVE, "wave"))
         object.__setattr__(self, "throughput", frozen_array(throughput))
-        object.__setattr__(self, "name", str(self.name))
+        object.__setattr__(self, "name", str(name))
         object.__setattr__(self, "meta", dict(self.meta or {}))
         for argument, unit in (("reference_wavelength", WAVE), ("reference_temperature", u.K)):
             value = getattr(self, argument)

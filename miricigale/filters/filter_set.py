@@ -7,7 +7,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from miricigale.filters.band_names import find_filter
+from miricigale.filters.band_names import find_filter, known_filter
 from miricigale.filters.filter import UNCOVERED, Filter
 from miricigale.filters.given import as_filter
 from miricigale.filters.spectra import check_wave, spectrum_arrays
@@ -17,7 +17,7 @@ from miricigale.utils.units import FNU, WAVE
 
 
 @checked_calls
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+@dataclasses.dataclass(frozen=True, repr=False)
 class FilterSet(Interactive):
     """
     An ordered set of filters.
@@ -88,11 +88,8 @@ class FilterSet(Interactive):
         if isinstance(key, (list, tuple)):
             return FilterSet([self[name] for name in key])
         if isinstance(key, str):
-            known = self.names
-            name = key if key in known else find_filter(key)
-            if name not in known:
-                raise unknown_name("filter in this set", key, known)
-            return self.filters[known.index(name)]
+            name = known_filter(key, self.names, "filter in this set")
+            return self.filters[self.names.index(name)]
         return self.filters[key]
 
     def __repr__(self):
@@ -101,12 +98,6 @@ class FilterSet(Interactive):
     def __add__(self, other):
         others = other.filters if isinstance(other, FilterSet) else (as_filter(other),)
         return FilterSet((*self.filters, *others))
-
-    def __eq__(self, other):
-        return self.filters == other.filters if isinstance(other, FilterSet) else NotImplemented
-
-    def __hash__(self):
-        return hash(self.filters)
 
     def to_table(self):
         """The filters as a `~astropy.table.QTable`: ``name``, ``pivot`` and ``width`` (um)."""
@@ -139,11 +130,7 @@ class FilterSet(Interactive):
             If ``wave`` does not ascend or leaves more of a band uncovered.
         """
         wave = check_wave(wave)
-        weights = np.zeros((len(self.filters), wave.size))
-        for row, band in zip(weights, self.filters, strict=True):
-            first, part = band._weights(wave, tolerance)
-            row[first : first + part.size] = part
-        return weights
+        return np.stack([band.weights(wave, tolerance=tolerance) for band in self.filters])
 
     def synthetic_fluxes(self, sed):
         """

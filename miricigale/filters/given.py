@@ -7,7 +7,7 @@ import astropy.units as u
 from miricigale.filters.band_names import find_filter
 from miricigale.filters.filter import Filter
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.files import WRITERS
+from miricigale.utils.files import TABLE_FORMATS
 
 
 def as_filter(given, name=None, *, unit=None):
@@ -51,7 +51,7 @@ def as_filter(given, name=None, *, unit=None):
 def _is_path(text):
     if find_filter(text) is not None:
         return False
-    endings = (".dat", ".txt", ".par", *WRITERS)
+    endings = (".dat", ".txt", ".par", *TABLE_FORMATS)
     return text.lower().endswith(endings) or os.path.isfile(os.path.expanduser(text))
 
 

@@ -8,7 +8,8 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.refdata import Registry, citations
-from miricigale.utils.exceptions import DataError, unknown_name
+from miricigale.utils.exceptions import DataError
+from miricigale.utils.options import check_names
 from miricigale.utils.units import WAVE
 
 _RESOURCE = "filters.sedpy"
@@ -67,9 +68,8 @@ def read_curve(curve):
 
 
 def _load(name):
-    metadata = {"curve": name.removeprefix(SEDPY)} if name.startswith(SEDPY) else {}
-    metadata = metadata or FILTERS.metadata(name)
-    curve = metadata.pop("curve")
+    metadata = {} if name.startswith(SEDPY) else FILTERS.metadata(name)
+    curve = metadata.pop("curve", name.removeprefix(SEDPY))
     wave, throughput, n_negative = read_curve(curve)
     meta = {
         "source": f"astro-sedpy {importlib.metadata.version('astro-sedpy')}, {curve}",
@@ -85,8 +85,7 @@ def load_curve(name):
     """Wavelengths, throughput and options of `Filter` of a filter of the library."""
     if name.startswith(SEDPY):
         known = [path.stem for path in curve_folder().glob("*.par")]
-        if name.removeprefix(SEDPY) not in known:
-            raise unknown_name("curve of astro-sedpy", name.removeprefix(SEDPY), known)
+        check_names([name.removeprefix(SEDPY)], "curve of astro-sedpy", known)
         return _load(name)
     return FILTERS.get(name)
 

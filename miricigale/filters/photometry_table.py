@@ -8,13 +8,11 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.filters.band_names import find_filter
-from miricigale.filters.catalog_files import told_of
-from miricigale.filters.catalog_map import PER_MAGNITUDE
+from miricigale.filters.catalog_files import catalog_messages
+from miricigale.filters.catalog_map import CatalogMap
 from miricigale.filters.library import FILTERS
 from miricigale.utils.exceptions import CatalogWarning, argument_error
-from miricigale.utils.missing import plain_floats, without_codes
 from miricigale.utils.tables import as_table, error_column
-from miricigale.utils.units import FNU
 
 # what stands before or after the band in names of fluxes, magnitudes and their errors
 _ERROR = re.compile(
@@ -56,7 +54,7 @@ def as_photometry(data, bands, argument="photometry"):
     ValueError
         If it is no table, or two columns are the same band.
     `~astropy.units.UnitsError`
-        If errors of magnitudes are in another unit than mag.
+        If errors of magnitudes are in another unit than mag or a flux density's.
 
     Warns
     -----
@@ -75,8 +73,9 @@ def as_photometry(data, bands, argument="photometry"):
     out.meta = table.meta
     if "id" not in out.colnames:
         out["id"] = np.arange(1, len(out) + 1)
-    coded = {name: _to_fluxes(out, name, argument) for name in magnitudes}
-    for text in told_of((), coded):
+    catalog_map = CatalogMap(units=dict.fromkeys(magnitudes, u.ABmag))
+    coded = {name: catalog_map.set_band(out, name, 1.0, argument) for name in magnitudes}
+    for text in catalog_messages((), coded):
         warnings.warn(f"{argument}: {text}", CatalogWarning, stacklevel=3)
     return out
 
@@ -156,25 +155,3 @@ def _is_ab(table, name):
     if unit is None:
         return _MAGNITUDE.match(name) is not None
     return unit == u.ABmag
-
-
-def _to_fluxes(table, name, argument):
-    """
-    Magnitudes of a band and their errors as fluxes in uJy, NaN where they are missing.
-
-    Returns the numbers that stand for no value, NaN in rows that have none.
-    """
-    error, errors = error_column(name), None
-    magnitudes = plain_floats(table[name], name, argument)
-    if error in table.colnames:
-        unit = getattr(table[error], "unit", None)
-        if unit not in (None, u.mag, u.ABmag, u.dimensionless_unscaled):
-            msg = f"{argument!r} column {error!r} must be in mag, as {name!r} is, got {unit}"
-            raise u.UnitsError(msg)
-        errors = plain_floats(table[error], error, argument)
-    missing, no_error = without_codes(magnitudes, errors, magnitudes=True)
-    flux = 10 ** (-0.4 * (np.where(missing, np.nan, magnitudes) - 23.9))
-    table[name] = flux * FNU
-    if errors is not None:
-        table[error] = PER_MAGNITUDE * flux * np.where(no_error, np.nan, errors) * FNU
-    return np.where(missing, magnitudes, np.nan)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from miricigale.filters import Filter
-from miricigale.filters.catalog_files import MappedRows, RenamedRows, as_catalog_map
+from miricigale.filters.catalog_files import MappedRows, as_catalog_map
 from miricigale.filters.photometry_table import band_columns
 from miricigale.utils.exceptions import FitWarning, argument_error
 from miricigale.utils.row_files import open_rows
@@ -25,8 +25,8 @@ def open_catalog(path, chunk_rows, *, hdu=None, catalog_map=None, flux_unit=None
         if flux_unit is not None:
             known = dataclasses.replace(known, units={"flux": flux_unit, **known.units})
         return MappedRows(rows, known)
-    names = band_columns(rows.colnames, Path(path).name)
-    return RenamedRows(rows, names) if names else rows
+    rows.rename(band_columns(rows.colnames, Path(path).name))
+    return rows
 
 
 def fit_catalog(

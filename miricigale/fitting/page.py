@@ -336,7 +336,7 @@ def _left_out(page, rows, found):
         "fluxes with an error that is no error (0, negative or infinite): {}; where negative errors "
         "mark upper limits, 'limits = true' in the map of --map says so": counts,
     }
-    entries = list(rows.told()) if isinstance(rows, MappedRows) else []
+    entries = list(rows.messages()) if isinstance(rows, MappedRows) else []
     entries += [line.format(", ".join(names)) for line, names in lines.items() if names]
     page.bullets(entries or ["No column and no number of the catalog."])
     counts = [("none", "", int(np.count_nonzero(found["flags"] == 0)))]

@@ -10,7 +10,7 @@ import warnings
 import astropy.units as u
 import numpy as np
 
-from miricigale.filters.catalog_files import codes_of, warn_of_codes
+from miricigale.filters.catalog_files import codes_of, joined_codes, warn_of_codes
 from miricigale.fitting.fitter import BayesFitter
 from miricigale.fitting.from_files import open_catalog
 from miricigale.fitting.io import FORMAT, FitFolder, open_results, part_ids, part_name
@@ -58,9 +58,9 @@ def fit_file(
         The fitter. (Of a sampler, the cells of a redshift axis that is not the same for all objects
         are those of each part.)
     path_in : path-like
-        The catalog: FITS with a binary table, ECSV, or CSV with a line of names (``.csv``), by pieces;
-        VOTable and plain text, which are in memory as a whole. Its columns are as `BayesFitter.fit`
-        wants them, or become so by ``catalog_map``.
+        The catalog: FITS with a binary table, by pieces; or ECSV, CSV, VOTable and plain text, which
+        are in memory as a whole. Its columns are as `BayesFitter.fit` wants them, or become so by
+        ``catalog_map``.
     path_out : path-like
         The folder; made if it is not there.
     chunk_rows : int, optional
@@ -126,9 +126,10 @@ def fit_file(
     rows = open_catalog(path_in, chunk_rows, hdu=hdu, catalog_map=catalog_map, flux_unit=unit)
     options = {"redshift": redshift, "redshift_prior": redshift_prior, "pairs": pairs}
     if catalog_map is None:
-        warn_of_codes(_codes(rows, fitter.bands), rows.path.name, 2)
+        pieces = (codes_of(rows.chunk(i), fitter.bands) for i in range(rows.n_chunks))
+        warn_of_codes(joined_codes(pieces), rows.path.name, 2)
     else:
-        for text in rows.told():
+        for text in rows.messages():
             warnings.warn(f"{rows.path.name}: {text}", CatalogWarning, stacklevel=2)
     fluxes = {c for name in fitter.bands for c in (name, error_column(name))}
     take = _pieces(rows, options, unit, fluxes)
@@ -156,18 +157,9 @@ def _noted(rows, i):
 
 def _check_ids(rows):
     """Refuse ids that parts cannot hold before the first is fitted, not when it is written."""
-    for i in rows.foreign_chunks("id") if "id" in rows.colnames else ():
+    for i in range(rows.n_chunks) if "id" in rows.colnames else ():
         with _noted(rows, i):
             ascii_ids(read_ids(rows.chunk(i)), "photometry")
-
-
-def _codes(rows, bands):
-    """What `codes_of` finds in the whole file."""
-    parts = {}
-    for i in range(rows.n_chunks):
-        for name, codes in codes_of(rows.chunk(i), bands).items():
-            parts.setdefault(name, []).append(codes)
-    return {name: np.concatenate(codes) for name, codes in parts.items()}
 
 
 def _fit_parts(fitter, rows, take, folder, seed, executor, progress_bar):

@@ -77,14 +77,11 @@ class DetectorProperties:
         object.__setattr__(self, "ipc", tuple(float(c) for c in self.ipc))
         if len(self.ipc) != 3:
             raise argument_error("ipc", "three shares", self.ipc)
-        if len(coefficients) < 2 or coefficients[:2] != (0.0, 1.0):
-            raise argument_error(
-                "nonlinearity", "coefficients that begin with 0, 1", self.nonlinearity
-            )
-        slope = poly.polyval(
-            np.linspace(0, self.full_well / self.gain, 200), poly.polyder(coefficients)
-        )
-        if np.any(slope < 0.2):
+        if coefficients[:2] != (0.0, 1.0):
+            wanted = "coefficients that begin with 0, 1"
+            raise argument_error("nonlinearity", wanted, self.nonlinearity)
+        signal = np.linspace(0, self.full_well / self.gain, 200)
+        if np.any(poly.polyval(signal, poly.polyder(coefficients)) < 0.2):
             raise argument_error("nonlinearity", "rising up to the full well", self.nonlinearity)
 
     replace = dataclasses.replace
@@ -141,9 +138,8 @@ class DetectorProperties:
         measured = target.copy()
         derivative = poly.polyder(self.nonlinearity)
         for _ in range(30):
-            step = (poly.polyval(measured, self.nonlinearity) - target) / poly.polyval(
-                measured, derivative
-            )
+            excess = poly.polyval(measured, self.nonlinearity) - target
+            step = excess / poly.polyval(measured, derivative)
             measured -= step
             if np.all(np.abs(step) < 1e-9 * (1 + target)):
                 break
@@ -252,9 +248,14 @@ def reference_pixel_mask(*, subarray="FULL"):
     -------
     mask : `~numpy.ndarray` of bool, shape (ny, nx)
     """
+    n, n_columns = miri_detector().reference_columns, aperture("FULL").shape[1]
+    return ~_columns_mask(n, n_columns - n, subarray)
+
+
+def _columns_mask(first, last, subarray):
+    """Columns of the full frame from the first to before the last, in a sub-array."""
     mask = np.zeros(aperture("FULL").shape, dtype=bool)
-    n = miri_detector().reference_columns
-    mask[:, :n] = mask[:, -n:] = True
+    mask[:, first:last] = True
     return mask[aperture(subarray).slices]
 
 
@@ -272,6 +273,4 @@ def field_mask(*, subarray="FULL"):
     mask : `~numpy.ndarray` of bool, shape (ny, nx)
         True where the sky is seen.
     """
-    mask = np.zeros(aperture("FULL").shape, dtype=bool)
-    mask[:, slice(*imager_columns())] = True
-    return mask[aperture(subarray).slices]
+    return _columns_mask(*imager_columns(), subarray)

@@ -10,10 +10,11 @@ import numpy as np
 from astropy.table import Table
 
 from miricigale.instrument.siaf import aperture, imager_columns
-from miricigale.utils.exceptions import DataError, argument_error, unknown_name
+from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import read_table, unpacked_size
+from miricigale.utils.options import check_names
 from miricigale.utils.tables import require_columns
-from miricigale.utils.units import ANGLE, to_array
+from miricigale.utils.units import ANGLE, check_count, to_array
 
 # sides of the pixel at the reference, arcsec (SIAF)
 _PIXEL = (0.110497, 0.111336)
@@ -50,23 +51,17 @@ _N_CYCLING = 311
 _PHASES = ((0.0, 0.0), (0.5, 0.0), (0.5, 0.5), (0.0, 0.5))
 
 
-def _radical_inverse(n, base):
-    """The first n numbers of a Halton sequence: evenly spread over 0 to 1 from any start."""
-    result, index, weight = np.zeros(n), np.arange(1, n + 1), 1.0 / base
-    while np.any(index):
-        result += weight * (index % base)
-        index, weight = index // base, weight / base
-    return result
-
-
 @functools.cache
 def _cycling(name):
+    from scipy.stats.qmc import Halton
+
     sigma, limit = _CYCLING[name]
-    share = _radical_inverse(_N_CYCLING, 2)
+    # evenly spread over 0 to 1 from any start; without the first, which is zero
+    share, turn = Halton(2, scramble=False).random(_N_CYCLING + 1)[1:].T
     inner = (0.4 * limit if name == "cycling-small" else 0.0) ** 2 / (2 * sigma**2)
     a, b = np.exp(-inner), np.exp(-((limit - 1) ** 2) / (2 * sigma**2))
     radius = sigma * np.sqrt(-2 * np.log(a - share * (a - b)))
-    angle = 2 * np.pi * _radical_inverse(_N_CYCLING, 3)
+    angle = 2 * np.pi * turn
     points = np.round(np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1))
     points += np.array(_PHASES)[np.arange(_N_CYCLING) % 4]
     points.flags.writeable = False
@@ -113,15 +108,12 @@ def dither_offsets(pattern, n=None, *, start=0):
     ValueError
         If ``n`` is smaller than 1, or with ``start`` larger than a table of offsets.
     """
-    if n is not None and (n < 1 or int(n) != n):
-        raise argument_error("n", "a positive integer", n)
-    if start < 0 or int(start) != start:
-        raise argument_error("start", "0 or a positive integer", start)
+    n = None if n is None else check_count(n, "n")
+    start = check_count(start, "start", 0)
     if isinstance(pattern, str):
-        if pattern not in dither_patterns():
-            raise unknown_name("dither pattern", pattern, dither_patterns())
+        check_names([pattern], "dither pattern", dither_patterns())
         points = _points(pattern)
-        number = int(start) + np.arange(len(points) if n is None else int(n))
+        number = start + np.arange(len(points) if n is None else n)
         turns, step = np.divmod(number, len(points))
         return (points[step] + 0.25 * turns[:, None]) * np.array(_PIXEL) * ANGLE
     if isinstance(pattern, os.PathLike):
@@ -129,11 +121,11 @@ def dither_offsets(pattern, n=None, *, start=0):
     elif isinstance(pattern, Table):
         pattern = _table_offsets(pattern, "pattern")
     offsets = to_array(pattern, ANGLE, "pattern", ndim=2, finite=True)
-    last = len(offsets) if n is None else int(start) + int(n)
+    last = len(offsets) if n is None else start + n
     if offsets.shape[1] != 2 or len(offsets) < last or last <= start:
         wanted = f"offsets of shape ({last}, 2)"
         raise argument_error("pattern", wanted, f"shape {offsets.shape}")
-    return offsets[int(start) : last] * ANGLE
+    return offsets[start:last] * ANGLE
 
 
 def tile_offsets(n_x, n_y, *, overlap=0.1):
@@ -159,9 +151,7 @@ def tile_offsets(n_x, n_y, *, overlap=0.1):
     ValueError
         If a number is smaller than 1, or ``overlap`` is out of its range.
     """
-    for name, value in (("n_x", n_x), ("n_y", n_y)):
-        if isinstance(value, bool) or int(value) != value or value < 1:
-            raise argument_error(name, "a positive integer", value)
+    n_x, n_y = check_count(n_x, "n_x"), check_count(n_y, "n_y")
     if not 0 <= overlap < 1:
         raise argument_error("overlap", "at least 0 and less than 1", overlap)
     first, last = imager_columns()

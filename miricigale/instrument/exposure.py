@@ -14,10 +14,11 @@ from miricigale.instrument.figures import imager_filter, table
 from miricigale.instrument.photometric import electron_rate
 from miricigale.instrument.siaf import aperture, attitude_matrix, pixel_to_v2v3, v2v3_to_sky
 from miricigale.instrument.wcs import imager_wcs, tangent_offset
-from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import Interactive, checked_calls
+from miricigale.utils.options import check_names
 from miricigale.utils.positions import as_position
-from miricigale.utils.units import is_number, to_array
+from miricigale.utils.units import check_count, to_array
 
 #: Bands of the CEERS/MIRI imaging.
 CEERS_FILTERS = (
@@ -64,19 +65,9 @@ def frame_time(readout="FASTR1", subarray="FULL"):
         In s. Both patterns have one frame in a group.
     """
     times = table()["readout"]
-    if readout not in times:
-        raise unknown_name("readout pattern", readout, times)
-    if subarray not in times[readout]:
-        kind = f"sub-array of {readout}"
-        raise unknown_name(kind, subarray, times[readout])
+    check_names([readout], "readout pattern", times)
+    check_names([subarray], f"sub-array of {readout}", times[readout])
     return times[readout][subarray] * u.s
-
-
-def _count(value, name, least):
-    """An integer that is not below ``least``."""
-    if not is_number(value) or value != int(value) or value < least:
-        raise argument_error(name, f"an integer of at least {least}", value)
-    return int(value)
 
 
 def _counts_of(filter, time, frame, n_integrations, max_fill=0.6):
@@ -182,19 +173,17 @@ class Exposure(Interactive):
         if (n_groups is None) == (time is None):
             got = "neither" if time is None else "both"
             raise argument_error("n_groups, time", "one of them given", got)
-        counts = {"dither": _count(dither, "dither", 0)}
+        counts = {"dither": check_count(dither, "dither", 0)}
         if n_integrations is not None:
-            n_integrations = _count(n_integrations, "n_integrations", 1)
+            n_integrations = check_count(n_integrations, "n_integrations")
         if time is not None:
             n_groups, n_integrations = _counts_of(filter, time, frame, n_integrations)
-        counts["n_groups"] = _count(n_groups, "n_groups", 2)
+        counts["n_groups"] = check_count(n_groups, "n_groups", 2)
         counts["n_integrations"] = n_integrations or 1
         if pointing is not None:
             pointing = as_position(pointing, "pointing")
-            roll = to_array(
-                0.0 * u.deg if roll is None else roll, u.deg, "roll", ndim=0, finite=True
-            )
-            roll = float(roll) % 360 * u.deg
+            roll = 0.0 * u.deg if roll is None else roll
+            roll = float(to_array(roll, u.deg, "roll", ndim=0, finite=True)) % 360 * u.deg
         elif roll is not None:
             raise argument_error("pointing", "given where 'roll' is", "None")
         values = {"filter": filter, "readout": readout, "subarray": subarray, **counts}
@@ -237,10 +226,7 @@ class Exposure(Interactive):
         -------
         exposure : `Exposure`
         """
-        kind = (
-            str(options.get(k, v)).upper() for k, v in (("readout", "FASTR1"), ("subarray", "FULL"))
-        )
-        frame = frame_time(*kind)
+        frame = cls(filter, n_groups=2, **options).frame_time
         n_groups, n_integrations = _counts_of(filter, time, frame, None, max_fill)
         return cls(filter, n_groups=n_groups, n_integrations=n_integrations, **options)
 
@@ -445,10 +431,9 @@ def ceers_exposures(pointing, roll, *, filters=None, quick=False):
     Yang et al. 2021, ApJ, 908, 144, section 2.
     """
     filters = CEERS_FILTERS if filters is None else tuple(filters)
+    check_names(filters, "band of the survey", CEERS_FILTERS)
     exposures = []
     for name in filters:
-        if name not in _CEERS:
-            raise unknown_name("band of the survey", name, CEERS_FILTERS)
         n_groups, n_integrations, n_dithers = (_QUICK if quick else _CEERS)[name]
         base = Exposure(
             name, n_groups=n_groups, n_integrations=n_integrations, pointing=pointing, roll=roll

@@ -47,13 +47,6 @@ def _packed(values, name, header=None, *, step=None):
     )
 
 
-def _step(error):
-    """What values of an image are rounded to; None without errors."""
-    if error is None or not np.any(good := np.isfinite(error) & (error > 0)):
-        return None
-    return float(np.median(error[good])) / _STEPS
-
-
 def write_image(image, path, *, planes=None, rounded=False):
     """
     Write an image as FITS: SCI, ERR, MASK and further planes.
@@ -77,7 +70,9 @@ def write_image(image, path, *, planes=None, rounded=False):
     data, error = np.asarray(image.data, np.float32), None
     if image.uncertainty is not None:
         error = np.asarray(image.uncertainty.array, np.float32)
-    step = _step(error) if rounded else None
+    step = None
+    if rounded and error is not None and np.any(good := np.isfinite(error) & (error > 0)):
+        step = float(np.median(error[good])) / _STEPS
     hdus = [fits.PrimaryHDU(), _packed(data, "SCI", header, step=step)]
     if error is not None:
         hdus.append(_packed(error, "ERR", step=step))
@@ -145,12 +140,10 @@ def read_image(path, *, planes=()):
             mask=np.array(hdus["MASK"].data, bool) if "MASK" in hdus else None,
             meta=json.loads(header.get("META", "{}")),
         )
-        extra = []
-        for name in planes:
-            is_dq = name.lower() == "dq"
-            extra.append(
-                with_own_bits(read_dq(hdus["DQ"]), hdus)
-                if is_dq
-                else np.array(hdus[name.upper()].data)
-            )
+        extra = [
+            with_own_bits(read_dq(hdus["DQ"]), hdus)
+            if name.lower() == "dq"
+            else np.array(hdus[name.upper()].data)
+            for name in planes
+        ]
     return (image, *extra) if extra else image

@@ -76,11 +76,7 @@ def joined_header(hdus, name="SCI"):
         header.remove(layout, ignore_missing=True)
         science.remove(layout, ignore_missing=True)
     for card in science.cards:
-        if (
-            card.keyword
-            and card.keyword not in header
-            and card.keyword not in ("COMMENT", "HISTORY")
-        ):
+        if card.keyword not in ("", "COMMENT", "HISTORY", *header):
             header.append(card)
     return header
 

@@ -9,7 +9,8 @@ from astropy.table import QTable
 from miricigale.instrument.detector import miri_detector
 from miricigale.instrument.figures import filter_row, table
 from miricigale.refdata import locate
-from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_least, check_names, check_positive
 from miricigale.utils.units import SURFACE_BRIGHTNESS, WAVE, to_array
 
 #: Factor on the low zodiacal light for each name that ``zodi`` may have.
@@ -40,19 +41,15 @@ def photmjsr(filter, *, gain=None):
     collecting area 25.4 m2, the mean pixel and the measured photon conversion efficiency T.
     """
     gain = miri_detector().gain if gain is None else float(gain)
-    if not gain > 0:
-        raise argument_error("gain", "positive", gain)
+    check_positive(gain, "gain")
     return filter_row(filter)["photmjsr"] * gain / table()["sensitivity"]["photmjsr_gain"]
 
 
 def _zodi_factor(zodi):
     if isinstance(zodi, str):
-        try:
-            return _ZODI[zodi]
-        except KeyError:
-            raise unknown_name("zodiacal background", zodi, _ZODI) from None
-    if not float(zodi) >= 0:
-        raise argument_error("zodi", "a name or a factor of at least 0", zodi)
+        check_names([zodi], "zodiacal background", _ZODI)
+        return _ZODI[zodi]
+    check_least(zodi, "zodi", 0)
     return float(zodi)
 
 

@@ -9,10 +9,12 @@ are 0-based here, with integers at their centers.
 import dataclasses
 import functools
 
+import astropy.units as u
 import numpy as np
+from astropy.coordinates.matrix_utilities import rotation_matrix
 
 from miricigale.instrument.figures import table
-from miricigale.utils.exceptions import unknown_name
+from miricigale.utils.options import check_names
 
 _ARCSEC = np.pi / 180 / 3600
 
@@ -86,10 +88,8 @@ def aperture(name="FULL"):
         If there is no such sub-array; the message lists the known ones.
     """
     siaf = table("siaf")
-    try:
-        row = siaf["subarrays"][name]
-    except KeyError:
-        raise unknown_name("sub-array", name, siaf["subarrays"]) from None
+    check_names([name], "sub-array", siaf["subarrays"])
+    row = siaf["subarrays"][name]
     nx, ny = row["size"]
     return Aperture(
         name=name,
@@ -144,16 +144,6 @@ def pixel_to_v2v3(x, y, *, subarray="FULL"):
     return v2, v3
 
 
-def _rotation(axis, angle):
-    """Right-handed rotation of vectors by ``angle`` (rad) about a coordinate axis."""
-    cos, sin = np.cos(angle), np.sin(angle)
-    matrix = np.eye(3)
-    a, b = {0: (1, 2), 1: (2, 0), 2: (0, 1)}[axis]
-    matrix[a, a] = matrix[b, b] = cos
-    matrix[a, b], matrix[b, a] = -sin, sin
-    return matrix
-
-
 def attitude_matrix(ra, dec, roll, *, v2, v3):
     """
     Rotation from the telescope frame to the sky.
@@ -176,12 +166,14 @@ def attitude_matrix(ra, dec, roll, *, v2, v3):
     ----------
     JWST-STScI-001550, "Description and use of the JWST Science Instrument Aperture File".
     """
+    ra, dec, roll = np.radians([ra, dec, roll])
+    # astropy turns the axes, not the vectors
     return (
-        _rotation(2, np.radians(ra))
-        @ _rotation(1, -np.radians(dec))
-        @ _rotation(0, -np.radians(roll))
-        @ _rotation(1, v3 * _ARCSEC)
-        @ _rotation(2, -v2 * _ARCSEC)
+        rotation_matrix(-ra * u.rad, "z")
+        @ rotation_matrix(dec * u.rad, "y")
+        @ rotation_matrix(roll * u.rad, "x")
+        @ rotation_matrix(-v3 * _ARCSEC * u.rad, "y")
+        @ rotation_matrix(v2 * _ARCSEC * u.rad, "z")
     )
 
 

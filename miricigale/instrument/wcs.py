@@ -56,12 +56,6 @@ def pixel_to_sky(x, y, pointing, roll, *, subarray="FULL"):
     return SkyCoord(*v2v3_to_sky(*pixel_to_v2v3(x, y, subarray=subarray), matrix), unit="deg")
 
 
-def tangent_plane(ra, dec):
-    """Gnomonic coordinates (deg) about (0, 0) of positions in deg near it."""
-    vector = unit_vector(np.radians(ra), np.radians(dec))
-    return np.degrees(vector[1] / vector[0]), np.degrees(vector[2] / vector[0])
-
-
 def _scaled_fit(x, y, values, order):
     """Least-squares polynomial without a constant, as a (order+1)^2 table."""
     sx, sy = np.abs(x).max(), np.abs(y).max()
@@ -90,7 +84,9 @@ def _sip(subarray):
     v2_ref, v3_ref = pixel_to_v2v3(*part.reference, subarray=subarray)
     matrix = attitude_matrix(0.0, 0.0, 0.0, v2=float(v2_ref), v3=float(v3_ref))
     ra, dec = v2v3_to_sky(*pixel_to_v2v3(gx, gy, subarray=subarray), matrix)
-    xi, eta = tangent_plane(ra, dec)
+    # gnomonic coordinates (deg) about (0, 0)
+    vector = unit_vector(np.radians(ra), np.radians(dec))
+    xi, eta = np.degrees(vector[1] / vector[0]), np.degrees(vector[2] / vector[0])
     dx, dy = (gx - part.reference[0]).ravel(), (gy - part.reference[1]).ravel()
     forward = _scaled_fit(dx, dy, np.stack([xi.ravel(), eta.ravel()], axis=1), _SIP_ORDER)
     cd = np.array([[t[1, 0], t[0, 1]] for t in forward])
@@ -101,12 +97,6 @@ def _sip(subarray):
     shift = np.stack([dx - plane[0], dy - plane[1]], axis=1)
     ap, bp = _scaled_fit(plane[0], plane[1], shift, _SIP_INVERSE_ORDER)
     return cd, a, b, ap, bp
-
-
-def _rotate(angle):
-    """Tangent plane (east, north) coordinates, axes turned by ``angle`` (deg) east of north."""
-    cos, sin = np.cos(np.radians(angle)), np.sin(np.radians(angle))
-    return np.array([[cos, sin], [-sin, cos]])
 
 
 def imager_wcs(pointing, roll, *, subarray="FULL"):
@@ -146,7 +136,8 @@ def imager_wcs(pointing, roll, *, subarray="FULL"):
     part = aperture(subarray)
     cd, a, b, ap, bp = _sip(subarray)
     wcs = _gnomonic((ra, dec), [n + 1 for n in part.reference], part.shape, "-SIP")
-    wcs.wcs.cd = _rotate(roll) @ cd
+    cos, sin = np.cos(np.radians(roll)), np.sin(np.radians(roll))
+    wcs.wcs.cd = np.array([[cos, sin], [-sin, cos]]) @ cd
     wcs.sip = Sip(a, b, ap, bp, wcs.wcs.crpix)
     wcs.wcs.set()
     return wcs

@@ -39,7 +39,7 @@ class ForcedFlags(Flags):
     UNEXPLAINED_NEIGHBOR = 512
     # the name of former versions
     UNEXPLAINED_NEIGHBOUR = 512
-    #: The point on top of the template cannot be told from it, or the template was not measured: one flux only.
+    #: The point on the template cannot be distinguished from it, or the template was not measured: one flux only.
     ONE_COMPONENT = 1024
     #: Not in the catalog: found on the residual of a first fit.
     NOT_IN_CATALOG = 2048

@@ -221,7 +221,7 @@ class _Field:
         """Inject sources and measure them: a table of true and measured fluxes."""
         at = self._places(2 * n, rng, [])
         if len(at) < 2:
-            raise argument_error("image", "with room for sources", "none")
+            raise argument_error("image", "large enough for sources", "none")
         full, empty = np.array(at[::2]), np.array(at[1::2])
         flux = self.error * np.exp(rng.uniform(*np.log(_SNR_RANGE), len(full)))
         new = self._galaxies(full, flux, rng) if self.donors else self._points(full, flux)
@@ -275,7 +275,7 @@ class _Field:
             rows.append((label, cut, donor, total))
             light.append(_profile(parameters, self.reach))
         if not rows:
-            raise argument_error("image", "with room for sources", "none")
+            raise argument_error("image", "large enough for sources", "none")
         # positions are those that detection would find
         own = np.zeros(labels.shape, int)
         for k, (label, cut, *_) in enumerate(rows, 1):

@@ -129,7 +129,7 @@ def _numbered(data, path):
             raise DataError(msg)
         # single precision holds no larger whole numbers
         if data.dtype.itemsize <= 4 and rounded.max(initial=0) > 2**24:
-            msg = f"{path} has ids above 2^24 in single precision, where they are not told apart"
+            msg = f"{path} has ids above 2^24 in single precision, where they are not distinct"
             raise DataError(msg)
         data = rounded
     data = data.astype(np.int64)

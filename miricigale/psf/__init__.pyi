@@ -34,6 +34,5 @@ from .resample import psf_image as psf_image
 from .resample import psf_mosaic as psf_mosaic
 from .resample import rotate_psf as rotate_psf
 from .shapes import gaussian_psf as gaussian_psf
-from .shapes import moffat_psf as moffat_psf
 from .stars import psf_from_stars as psf_from_stars
 from .wiener import REGULARIZATIONS as REGULARIZATIONS

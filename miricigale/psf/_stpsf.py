@@ -3,7 +3,6 @@
 import os
 
 import numpy as np
-from astropy.io import fits
 
 from miricigale.psf.effects import EFFECTS
 from miricigale.psf.field import psf_at
@@ -14,7 +13,7 @@ from miricigale.utils.optional import require
 from miricigale.utils.units import ANGLE, to_array
 
 
-def _instrument(filter_name, opd):
+def _instrument(filter_name):
     if "STPSF_PATH" not in os.environ:
         msg = "stpsf needs its data files: set the environment variable STPSF_PATH to their folder"
         raise DataError(msg)
@@ -26,16 +25,6 @@ def _instrument(filter_name, opd):
         msg = f"stpsf cannot use the data of STPSF_PATH: {str(err).splitlines()[0]}"
         raise DataError(msg) from err
     instrument.filter = str(filter_name).removeprefix("miri.").upper()
-    if isinstance(opd, str) and opd == "perfect":
-        instrument.pupilopd = None
-        instrument.include_si_wfe = False
-        instrument.include_ote_field_dependence = False
-    elif isinstance(opd, (str, os.PathLike)):
-        instrument.pupilopd = os.fspath(opd)
-    elif isinstance(opd, fits.HDUList):
-        instrument.pupilopd = opd
-    elif opd is not None:
-        raise argument_error("opd", "None, 'perfect', a path or an HDUList", type(opd).__name__)
     return instrument
 
 
@@ -45,7 +34,6 @@ def stpsf_grid(
     n_psfs=1,
     oversampling=4,
     fov=10.0 * ANGLE,
-    opd=None,
 ):
     """
     PSFs of the MIRI imager over the field, from stpsf.
@@ -60,9 +48,6 @@ def stpsf_grid(
         Cells per pixel.
     fov : `~astropy.units.Quantity`, optional
         Width of the grids.
-    opd : str, path-like or `~astropy.io.fits.HDUList`, optional
-        Wavefront error as stpsf takes it; ``"perfect"`` for none, and stpsf's default if
-        not given.
 
     Returns
     -------
@@ -83,7 +68,7 @@ def stpsf_grid(
     """
     if round(n_psfs**0.5) ** 2 != n_psfs:
         raise argument_error("n_psfs", "a square number", n_psfs)
-    instrument = _instrument(filter, opd)
+    instrument = _instrument(filter)
     pixels = to_array(fov, ANGLE, "fov") / MIRI_PIXEL_SCALE.value
     grid = instrument.psf_grid(
         num_psfs=int(n_psfs),

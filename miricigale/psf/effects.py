@@ -7,7 +7,7 @@ from scipy.fft import irfft2, next_fast_len, rfft2
 
 from miricigale.psf import _core
 from miricigale.psf.optics import jwst_constants
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_choice
 
 #: Effects that a PSF may include, in the order in which they act.
 EFFECTS = ("jitter", "cruciform", "pixel", "ipc")
@@ -33,8 +33,7 @@ _CENTRAL_CELL = 4 * math.log(1 + math.sqrt(2))
 
 def _amplitude(filter_name, calibration):
     """Light scattered along each axis per pixel of distance, beyond the inner radius."""
-    if calibration not in ("flight", "stpsf"):
-        raise argument_error("calibration", "'flight' or 'stpsf'", repr(calibration))
+    check_choice(calibration, "calibration", ("flight", "stpsf"))
     # the tabulated kernel holds at an oversampling of 4: one pixel is 4 cells of A / 4^2
     amplitude = jwst_constants()["cruciform"].get(filter_name, 0.0) / 4
     return amplitude * (_IN_FLIGHT.get(filter_name, 1.0) if calibration == "flight" else 1.0)
@@ -133,9 +132,7 @@ def _diffuse(image, profile):
     return irfft2(spectrum, (size, size))[:n, :n]
 
 
-def cruciform(
-    image, filter_name, *, oversampling, calibration="flight", shift=(0.0, 0.0), halo=0.0
-):
+def cruciform(image, filter_name, *, oversampling, calibration="flight", shift=(0.0, 0.0)):
     """
     Scatter light along rows and columns, as the detector does at short wavelengths.
 
@@ -149,12 +146,10 @@ def cruciform(
     filter_name, oversampling
         Such as ``"miri.f770w"``; cells per pixel.
     calibration : {"flight", "stpsf"}, optional
-        stpsf's amplitudes, or those with the factor 2 that in-flight F560W images want.
+        stpsf's amplitudes, or those with the factor 2 that in-flight F560W images want, and a part of the
+        light (`halo_share`) that goes evenly in all directions, as far as in the arms.
     shift : tuple of float, optional
         Offset of the cross in x, y in pixels (see `cruciform_shift`).
-    halo : float, optional
-        Share of the scattered light that goes evenly in all directions, as far as in the arms,
-        so that the encircled energies stay (see `halo_share`).
 
     References
     ----------
@@ -170,18 +165,10 @@ def cruciform(
         columns = _shifted(columns, shift[0] * oversampling, 1)
         rows = _shifted(rows, shift[1] * oversampling, 0)
     scattered = columns + rows
+    halo = halo_share(filter_name, calibration=calibration)
     if halo > 0:
         scattered = (1 - halo) * scattered + halo * _diffuse(image, kernel)
     return (image + scattered) * (1 - fraction)
-
-
-def _apply_transfer(image, transfer, margin):
-    """Multiply the spectrum by ``transfer(fx, fy)`` (cycles per cell), padding by zeros."""
-    shape = [next_fast_len(size + 2 * margin, real=True) for size in image.shape]
-    fy, fx = np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1])
-    spectrum = rfft2(image, shape)
-    spectrum *= transfer(fx, fy)
-    return irfft2(spectrum, shape)[: image.shape[0], : image.shape[1]]
 
 
 def detector_response(image, *, oversampling, pixel=True, ipc=None, jitter=0.0, boxes=()):
@@ -192,21 +179,22 @@ def detector_response(image, *, oversampling, pixel=True, ipc=None, jitter=0.0, 
     ``boxes`` are widths in pixels of further square boxes (drops, output pixels).
     """
     widths = [*boxes, 1.0] if pixel else list(boxes)
-
-    def transfer(fx, fy):
-        px, py = fx * oversampling, fy * oversampling
-        total = np.ones((py.size, px.size))
-        for width in widths:
-            total *= np.sinc(px * width) * np.sinc(py * width)
-        if ipc is not None:
-            # what its neighbors get of a pixel's charge the pixel loses
-            along_x, along_y, diagonal = ipc
-            cx, cy = np.cos(2 * np.pi * px), np.cos(2 * np.pi * py)
-            left = 1.0 - 2 * along_x - 2 * along_y - 4 * diagonal
-            total *= left + 2 * along_x * cx + 2 * along_y * cy + 4 * diagonal * cx * cy
-        if jitter > 0:
-            total *= np.exp(-2.0 * (math.pi * jitter) ** 2 * (px**2 + py**2))
-        return total
-
     extent = sum(widths) + 5 * jitter + (1 if ipc is not None else 0)
-    return _apply_transfer(image, transfer, math.ceil(extent * oversampling) + 1)
+    margin = math.ceil(extent * oversampling) + 1
+    shape = [next_fast_len(size + 2 * margin, real=True) for size in image.shape]
+    # frequencies in cycles per pixel
+    py = np.fft.fftfreq(shape[0])[:, None] * oversampling
+    px = np.fft.rfftfreq(shape[1]) * oversampling
+    transfer = np.ones((py.size, px.size))
+    for width in widths:
+        transfer *= np.sinc(px * width) * np.sinc(py * width)
+    if ipc is not None:
+        # what its neighbors get of a pixel's charge the pixel loses
+        along_x, along_y, diagonal = ipc
+        cx, cy = np.cos(2 * np.pi * px), np.cos(2 * np.pi * py)
+        left = 1.0 - 2 * along_x - 2 * along_y - 4 * diagonal
+        transfer *= left + 2 * along_x * cx + 2 * along_y * cy + 4 * diagonal * cx * cy
+    if jitter > 0:
+        transfer *= np.exp(-2.0 * (math.pi * jitter) ** 2 * (px**2 + py**2))
+    ny, nx = image.shape
+    return irfft2(rfft2(image, shape) * transfer, shape)[:ny, :nx]

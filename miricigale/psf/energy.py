@@ -11,6 +11,7 @@ from miricigale.psf import _core
 from miricigale.psf.effects import detector_response
 from miricigale.psf.model import instrument_psf
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_choice
 from miricigale.utils.tables import described_table
 from miricigale.utils.units import ANGLE, to_array
 
@@ -114,12 +115,11 @@ def fwhm(psf, *, method="half_maximum"):
         If the method is unknown.
     """
     psf = instrument_psf(psf)
+    check_choice(method, "method", ("half_maximum", "gaussian"))
     if method == "half_maximum":
         return psf.fwhm
-    if method == "gaussian":
-        start = psf.fwhm.value / psf.cell
-        return _gaussian_width(psf.data, *psf.origin, start) * psf.cell * ANGLE
-    raise argument_error("method", "'half_maximum' or 'gaussian'", repr(method))
+    start = psf.fwhm.value / psf.cell
+    return _gaussian_width(psf.data, *psf.origin, start) * psf.cell * ANGLE
 
 
 def _gaussian_width(data, x, y, start):
@@ -163,26 +163,19 @@ def psf_table(psfs, *, radii=(0.5, 1.0, 1.5, 2.5, 5.0) * u.arcsec):
     names = [psf.filter or "" for psf in psfs]
     flight = [psf_fwhm(n).value if n in imager_filters() else np.nan for n in names] * ANGLE
     angles = [psf.angle.value if psf.frame == "sky" else np.nan for psf in psfs] * u.deg
+    includes = [" ".join(psf.includes) for psf in psfs]
+    widths = u.Quantity([psf.fwhm for psf in psfs])
     gaussian = u.Quantity([fwhm(psf, method="gaussian") for psf in psfs])
     columns = {
         "filter": (names, None),
         "frame": ([psf.frame for psf in psfs], "axes of the detector, or turned to the sky"),
         "angle": (angles, "position angle of +y, east of north"),
-        "includes": (
-            [" ".join(psf.includes) for psf in psfs],
-            "what the PSF holds besides the optics",
-        ),
-        "fwhm": (
-            u.Quantity([psf.fwhm for psf in psfs]),
-            "full width at half maximum of the azimuthal mean",
-        ),
+        "includes": (includes, "what the PSF holds besides the optics"),
+        "fwhm": (widths, "full width at half maximum of the azimuthal mean"),
         "fwhm_gaussian": (gaussian, "that of a Gaussian fitted out to 0.75 FWHM"),
         "fwhm_flight": (flight, "of stars in flight (JWST program 1028)"),
         "r80": ([_r80(psf) for psf in psfs] * ANGLE, "radius that holds 80 % of all light"),
-        "enclosed": (
-            [psf.enclosed for psf in psfs],
-            "fraction of all light on the PSF's grid",
-        ),
+        "enclosed": ([psf.enclosed for psf in psfs], "fraction of all light on the PSF's grid"),
     }
     for radius in radii:
         within = [encircled_energy(psf, radius) for psf in psfs]

@@ -1,7 +1,6 @@
 """PSFs over the field, as photutils' gridded models."""
 
 import numpy as np
-from photutils.psf import GriddedPSFModel
 
 from miricigale.instrument import aperture, imager_columns
 from miricigale.psf.miri import miri_psf
@@ -38,10 +37,9 @@ def psf_grid(psfs, positions):
         raise argument_error("positions", f"of shape ({len(psfs)}, 2)", positions.shape)
     columns, rows = (np.unique(positions[:, k]) for k in (0, 1))
     points = np.unique(positions, axis=0)
-    if min(columns.size, rows.size) < 2 or len(points) != columns.size * rows.size:
-        raise argument_error("positions", "all points of a rectangular grid", positions.tolist())
-    if len(points) != len(psfs):
-        raise argument_error("positions", "different places", positions.tolist())
+    n = columns.size * rows.size
+    if min(columns.size, rows.size) < 2 or not len(psfs) == len(points) == n:
+        raise argument_error("positions", "each point of a rectangular grid", positions.tolist())
     psfs = alike(psfs, ("oversampling", "frame", "angle", "includes"))
     for i, psf in enumerate(psfs):
         ny, nx = psf.data.shape
@@ -50,7 +48,7 @@ def psf_grid(psfs, positions):
     return PSFGrid(psfs, positions)
 
 
-def miri_psf_grid(filter, *, n_psfs=9, subarray="FULL", positions=None, **options):
+def miri_psf_grid(filter, *, n_psfs=9, subarray="FULL", **options):
     """
     PSFs of the MIRI imager over the field.
 
@@ -69,8 +67,6 @@ def miri_psf_grid(filter, *, n_psfs=9, subarray="FULL", positions=None, **option
         `~miricigale.instrument.imager_columns`).
     subarray : str, optional
         One of `~miricigale.instrument.subarrays`, in whose pixels the positions are.
-    positions : array_like, shape (n, 2), optional
-        Positions x, y instead of the even grid.
     **options
         Those of `~miricigale.psf.miri_psf`.
 
@@ -82,7 +78,7 @@ def miri_psf_grid(filter, *, n_psfs=9, subarray="FULL", positions=None, **option
     Raises
     ------
     ValueError
-        If ``n_psfs`` is no square number of at least 4, or a position is off the array.
+        If ``n_psfs`` is no square number of at least 4.
 
     Examples
     --------
@@ -92,18 +88,16 @@ def miri_psf_grid(filter, *, n_psfs=9, subarray="FULL", positions=None, **option
     >>> grid.data.shape
     (4, 55, 55)
     """
-    if positions is None:
-        side = round(n_psfs**0.5) if n_psfs >= 4 else 0
-        if side**2 != n_psfs:
-            raise argument_error("n_psfs", "a square number of at least 4", n_psfs)
-        part = aperture(subarray)
-        ny, nx = part.shape
-        first, last = (int(np.clip(c - part.origin[0], 0, nx)) for c in imager_columns())
-        if last - first < 2:
-            first, last = 0, nx  # SUB64 and SUB128 lie outside the imager's own field
-        columns = np.linspace(first, last - 1, side)
-        rows = np.linspace(0, ny - 1, side)
-        positions = [(x, y) for y in rows for x in columns]
+    side = round(n_psfs**0.5) if n_psfs >= 4 else 0
+    if side**2 != n_psfs:
+        raise argument_error("n_psfs", "a square number of at least 4", n_psfs)
+    part = aperture(subarray)
+    ny, nx = part.shape
+    first, last = (int(np.clip(c - part.origin[0], 0, nx)) for c in imager_columns())
+    if last - first < 2:
+        first, last = 0, nx  # SUB64 and SUB128 lie outside the imager's own field
+    columns = np.linspace(first, last - 1, side)
+    positions = [(x, y) for y in np.linspace(0, ny - 1, side) for x in columns]
     psfs = [miri_psf(filter, position=tuple(p), subarray=subarray, **options) for p in positions]
     return psf_grid(psfs, positions)
 
@@ -155,15 +149,13 @@ def psf_at(grid, x, y):
 
     Raises
     ------
-    TypeError, ValueError
-        If it is no gridded model, or one of photutils' own.
+    TypeError
+        If it is something else, such as a gridded model of photutils' own.
     """
-    if not isinstance(grid, GriddedPSFModel):
-        msg = f"'grid' must be a photutils GriddedPSFModel, got {type(grid).__name__}"
-        raise TypeError(msg)
     if not isinstance(grid, PSFGrid):
-        wanted = "a PSFGrid (see miricigale.psf.from_photutils for others)"
-        raise argument_error("grid", wanted, "one whose pixel and frame are not known")
+        got = type(grid).__name__
+        msg = f"'grid' must be a PSFGrid (see miricigale.psf.from_photutils for others), got {got}"
+        raise TypeError(msg)
     weights = grid_weights(grid, float(x), float(y))[0]
     own = ("oversampling", "grid_xypos", "grid_shape")
     return InstrumentPSF(

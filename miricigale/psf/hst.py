@@ -21,6 +21,9 @@ WFC3_FILTERS = ("wfc3.f105w", "wfc3.f125w", "wfc3.f140w", "wfc3.f160w")
 #: Width of the WFC3/IR pixel in arcsec and of the drop relative to it in the mosaics.
 _WFC3_PIXEL, _WFC3_PIXFRAC = 0.128, 0.8
 
+#: FWHM of the mosaics' PSF at F160W in arcsec.
+_WFC3_FWHM = 0.20
+
 
 @functools.lru_cache(maxsize=8)
 def _hst_optics(name, cell, n, angle):
@@ -37,29 +40,27 @@ def _hst_blurred(data, oversampling, scale, sigma):
 
 
 @functools.lru_cache(maxsize=16)
-def _hst_blur(name, fwhm, scale):
-    """Gaussian sigma in arcsec with which the mosaic's PSF has the width asked for."""
+def _hst_blur(scale):
+    """Gaussian sigma in arcsec with which the mosaic's PSF has its width at F160W."""
     oversampling = max(1, math.ceil(scale / 0.015))
     cell = scale / oversampling
     middle = odd_cells(2.4, cell) // 2
-    data = _hst_optics(name, cell, 2 * middle + 1, 45.0)
+    data = _hst_optics("wfc3.f160w", cell, 2 * middle + 1, 45.0)
 
     def excess(sigma):
         image = _hst_blurred(data, oversampling, scale, sigma)
-        return _core.half_maximum_width(image, middle, middle) * cell - fwhm
+        return _core.half_maximum_width(image, middle, middle) * cell - _WFC3_FWHM
 
-    sharpest = fwhm + excess(0.0)
-    if sharpest > fwhm:
-        wanted = f"at least the {sharpest:.4f} arcsec that optics and pixels alone have"
-        raise argument_error("fwhm", wanted, f"{fwhm} arcsec")
-    return brentq(excess, 0.0, fwhm, xtol=1e-5)
+    if excess(0.0) > 0:
+        wanted = f"so fine that optics and pixels are narrower than {_WFC3_FWHM} arcsec (FWHM)"
+        raise argument_error("pixel_scale", wanted, f"{scale} arcsec")
+    return brentq(excess, 0.0, _WFC3_FWHM, xtol=1e-5)
 
 
 def hst_psf(
     filter="wfc3.f160w",
     *,
     pixel_scale=0.06 * u.arcsec,
-    fwhm=None,
     oversampling=4,
     fov=None,
     angle=0.0 * u.deg,
@@ -69,7 +70,8 @@ def hst_psf(
 
     The annular pupil with its vanes over the band, the detector's pixel (0.128 arcsec),
     the drop (0.8 of it), the mosaic's pixel, and a Gaussian for all else (interpixel
-    capacitance, jitter, registration), so wide that the FWHM is the one asked for.
+    capacitance, jitter, registration), so wide that the FWHM at F160W is 0.20 arcsec. Other filters
+    have the same blur.
 
     Parameters
     ----------
@@ -77,9 +79,6 @@ def hst_psf(
         A WFC3/IR filter.
     pixel_scale : `~astropy.units.Quantity`, optional
         Pixel of the mosaic.
-    fwhm : `~astropy.units.Quantity`, optional
-        Of the mosaic's PSF. By default 0.20 arcsec at F160W, and in other filters what
-        the same blur gives.
     oversampling : int, optional
         Cells per mosaic pixel.
     fov : `~astropy.units.Quantity`, optional
@@ -97,7 +96,7 @@ def hst_psf(
     KeyError
         If there is no such filter.
     ValueError
-        If the FWHM is below what optics and pixels have.
+        If the pixel is so coarse that the PSF is wider.
 
     References
     ----------
@@ -107,10 +106,7 @@ def hst_psf(
     name = known_filter(filter, WFC3_FILTERS, "PSF for the filter")
     oversampling, width = checked_grid(oversampling, fov, 10.0)
     scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))
-    if fwhm is None:
-        sigma = _hst_blur("wfc3.f160w", 0.20, scale)
-    else:
-        sigma = _hst_blur(name, float(to_array(fwhm, ANGLE, "fwhm")), scale)
+    sigma = _hst_blur(scale)
     cell = scale / oversampling
     # vanes at 45 deg to +y; on the sky an angle east of north is counter-clockwise
     turn = float(to_array(angle, u.deg, "angle"))

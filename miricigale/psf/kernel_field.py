@@ -12,6 +12,7 @@ from miricigale.psf.field import psf_at
 from miricigale.psf.kernels import MatchingKernel
 from miricigale.psf.model import PSFGrid
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_choice
 from miricigale.utils.unified import read_write
 
 
@@ -74,8 +75,7 @@ class KernelField:
         if not isinstance(self.sky, SkyCoord) or self.sky.shape != (len(kernels),):
             wanted = f"a SkyCoord of shape ({len(kernels)},), a place for each kernel"
             raise argument_error("sky", wanted, self.sky)
-        if self.method not in ("linear", "nearest"):
-            raise argument_error("method", "'linear' or 'nearest'", repr(self.method))
+        check_choice(self.method, "method", ("linear", "nearest"))
         # which refuses what is not alike
         object.__setattr__(self, "_mean", MatchingKernel.blend(kernels))
         distance = self._tree.query(self._unit(self.sky), k=min(2, len(kernels)))[0]

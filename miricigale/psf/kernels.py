@@ -15,15 +15,16 @@ from miricigale.instrument.image import Image
 from miricigale.psf.model import instrument_psf
 from miricigale.psf.pairs import psf_pair, ready_arrays
 from miricigale.psf.wiener import (
+    checked_square,
     choose,
     energy_error,
     energy_radii,
-    odd_square,
     wiener,
 )
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import Interactive, checked_calls
-from miricigale.utils.unified import read_write, unified_read
+from miricigale.utils.options import check_choice
+from miricigale.utils.unified import read_write
 from miricigale.utils.units import ANGLE, frozen_array, positive, to_array
 
 
@@ -51,6 +52,10 @@ class MatchingKernel(Interactive):
     the fraction of light that the wide PSF's grid holds, a little below 1, where that is known
     and 1 where it is not (see ``normalize`` in `from_psfs`).
 
+    ``read`` also takes an image in any FITS file that is a kernel, by its extension ``ext`` (int or str), the
+    ``plane`` of a cube (int), ``pixel_scale`` where the header does not state it, and ``source`` as for
+    `from_array`.
+
     Parameters
     ----------
     array : `~numpy.ndarray`, shape (n, n), n odd
@@ -71,25 +76,7 @@ class MatchingKernel(Interactive):
     """
 
     io_module: ClassVar[str] = "miricigale.psf.files"
-    read = unified_read(
-        """
-        Read what `write` wrote, or an image that is a kernel from any FITS file.
-
-        Parameters
-        ----------
-        path : path-like
-            The file.
-        ext : int or str, optional
-            The extension of an image; needed for files that `write` has not written.
-        plane : int, optional
-            Which plane of a cube.
-        pixel_scale : `~astropy.units.Quantity`, optional
-            As for `from_array`; from the header if it states it.
-        source : optional
-            As for `from_array`; for images only.
-        """
-    )
-    write = read_write("a kernel and its PSFs")[1]
+    read, write = read_write("a kernel and its PSFs")
 
     array: np.ndarray
     pixel_scale: u.Quantity
@@ -112,7 +99,7 @@ class MatchingKernel(Interactive):
         for name in ("array", "source", "target"):
             value = getattr(self, name)
             if value is not None:
-                object.__setattr__(self, name, frozen_array(odd_square(value, name)))
+                object.__setattr__(self, name, frozen_array(checked_square(value, name)))
         scale = positive(self.pixel_scale, ANGLE, "pixel_scale")
         object.__setattr__(self, "pixel_scale", scale * ANGLE)
         object.__setattr__(self, "meta", dict(self.meta))
@@ -218,14 +205,11 @@ class MatchingKernel(Interactive):
         1.0
         """
         hi, lo = (_named(psf) for psf in (hi, lo))
+        pixel_scale = getattr(hi, "pixel_scale", None) if pixel_scale is None else pixel_scale
         if pixel_scale is None:
-            pixel_scale = getattr(hi, "pixel_scale", None)
-            if pixel_scale is None:
-                wanted = "given where 'hi' does not state it"
-                raise argument_error("pixel_scale", wanted, "None")
+            raise argument_error("pixel_scale", "given where 'hi' does not state it", "None")
         scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))
-        if resampling not in ("drizzle", None):
-            raise argument_error("resampling", "'drizzle' or None", repr(resampling))
+        check_choice(resampling, "resampling", ("drizzle", None))
         source, target, mended = psf_pair(
             hi, lo, scale, angles=(hi_angle, lo_angle), grid_angle=grid_angle,
             resampling=resampling, extent=extent, normalize=normalize,

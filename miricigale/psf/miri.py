@@ -98,14 +98,8 @@ def _miri_data(telescope, oversampling, fov, includes, calibration, position=Non
         extra = _IN_FLIGHT_BLUR.get(name, 0.0) if calibration == "flight" else 0.0
         jitter = math.hypot(constants["jitter"], extra) / scale
     if "cruciform" in includes:
-        data = cruciform(
-            data,
-            name,
-            oversampling=oversampling,
-            calibration=calibration,
-            shift=shift,
-            halo=halo_share(name, calibration=calibration),
-        )
+        form = {"oversampling": oversampling, "calibration": calibration}
+        data = cruciform(data, name, shift=shift, **form)
     data = detector_response(
         data,
         oversampling=oversampling,

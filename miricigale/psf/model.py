@@ -11,7 +11,7 @@ from photutils.psf import GriddedPSFModel, ImagePSF
 from miricigale.psf import _core
 from miricigale.utils.exceptions import PSFWarning, argument_error
 from miricigale.utils.unified import read_write
-from miricigale.utils.units import ANGLE, positive, to_array
+from miricigale.utils.units import ANGLE, check_count, positive, to_array
 
 #: Where a PSF's axes may stand: on the detector (angle on the sky not yet known) or the sky.
 FRAMES = ("detector", "sky")
@@ -91,10 +91,9 @@ class InstrumentPSF(ImagePSF):
     ):
         if frame not in FRAMES:
             raise argument_error("frame", f"one of {FRAMES}", repr(frame))
-        if int(oversampling) != oversampling or oversampling < 1:
-            raise argument_error("oversampling", "a positive integer", oversampling)
+        cells = check_count(oversampling, "oversampling")
         scale = positive(pixel_scale, ANGLE, "pixel_scale")
-        super().__init__(data, oversampling=int(oversampling), origin=origin, meta=dict(meta or {}))
+        super().__init__(data, oversampling=cells, origin=origin, meta=dict(meta or {}))
         turn = float(to_array(angle, u.deg, "angle", finite=True)) if frame == "sky" else 0.0
         self.pixel_scale, self.frame, self.angle = scale * ANGLE, frame, turn * u.deg
         self.includes, self.filter = tuple(includes), filter
@@ -211,58 +210,29 @@ class PSFGrid(GriddedPSFModel):
 
 def instrument_psf(psf, argument="psf"):
     """
-    Check a PSF.
+    Check that a PSF states its pixel and frame.
 
     Parameters
     ----------
-    psf : `InstrumentPSF` or `~photutils.psf.ImagePSF`
-        One of photutils' own must state ``pixel_scale`` (arcsec) and ``frame`` in its meta, and may
-        state ``angle`` (deg) and ``includes``; `from_photutils` takes all others.
+    psf : `InstrumentPSF`
+        One of photutils' own does not: `from_photutils` takes it with what it lacks.
     argument : str, optional
         The argument's name for messages.
 
     Returns
     -------
     psf : `InstrumentPSF`
-        The same one if it is one already.
+        The same.
 
     Raises
     ------
     ValueError
-        If it is no `~photutils.psf.ImagePSF`, its scale or frame is unknown, or its oversampling differs
-        between the axes.
+        If it is something else.
     """
-    if isinstance(psf, InstrumentPSF):
-        return psf
-    if not isinstance(psf, ImagePSF):
+    if not isinstance(psf, InstrumentPSF):
         wanted = "a PSF on pixels of known size (see miricigale.psf.from_photutils and make_psf)"
         raise argument_error(argument, wanted, type(psf).__name__)
-    missing = [key for key in ("pixel_scale", "frame") if key not in psf.meta]
-    if missing:
-        wanted = f"a PSF whose {' and '.join(missing)} is known (see miricigale.psf.from_photutils)"
-        raise argument_error(
-            argument, wanted, f"a plain ImagePSF whose meta has {sorted(psf.meta)}"
-        )
-    if psf.meta["frame"] not in FRAMES:
-        raise argument_error(argument, f"in one of the frames {FRAMES}", repr(psf.meta["frame"]))
-    return InstrumentPSF(
-        psf.data,
-        pixel_scale=u.Quantity(psf.meta["pixel_scale"], ANGLE),
-        frame=psf.meta["frame"],
-        oversampling=_cells(psf, argument),
-        origin=psf.origin,
-        angle=u.Quantity(psf.meta.get("angle", 0.0), u.deg),
-        includes=psf.meta.get("includes", ()),
-        meta=psf.meta,
-    )
-
-
-def _cells(model, argument):
-    """The oversampling of a photutils model."""
-    oversampling = np.atleast_1d(model.oversampling)
-    if np.any(oversampling != oversampling[0]):
-        raise argument_error(argument, "oversampled alike in x and y", oversampling.tolist())
-    return int(oversampling[0])
+    return psf
 
 
 def make_psf(data, *, pixel_scale, frame="sky", oversampling=1, enclosed=None, **facts):
@@ -406,18 +376,18 @@ def from_photutils(model, *, x=None, y=None, **options):
         If the model is of another kind, or a gridded model comes without a position.
     """
     model = as_psf(model, "model")
+    oversampling = np.atleast_1d(model.oversampling)
+    if np.any(oversampling != oversampling[0]):
+        raise argument_error("model", "oversampled alike in x and y", oversampling.tolist())
+    cells = int(oversampling[0])
     if isinstance(model, ImagePSF):
         data, options["origin"] = model.data, tuple(model.origin)
     else:
         if x is None or y is None:
             raise argument_error("x, y", "given for a GriddedPSFModel", (x, y))
-        step = 1.0 / np.broadcast_to(model.oversampling, 2)
-        yy, xx = (
-            (np.arange(n) - (n - 1) / 2) * s
-            for n, s in zip(model.data.shape[1:], step, strict=True)
-        )
+        yy, xx = ((np.arange(n) - (n - 1) / 2) * (1.0 / cells) for n in model.data.shape[1:])
         data = model.evaluate(*np.meshgrid(xx + x, yy + y), 1.0, x, y)
-    return make_psf(data, oversampling=_cells(model, "model"), **options)
+    return make_psf(data, oversampling=cells, **options)
 
 
 def _half_width(data, origin):

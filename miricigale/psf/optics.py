@@ -10,6 +10,7 @@ import numpy as np
 from miricigale.psf import _core
 from miricigale.refdata import locate
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_least
 from miricigale.utils.parallel import single_threaded
 from miricigale.utils.random import stream
 from miricigale.utils.units import frozen_array
@@ -19,6 +20,10 @@ ARCSEC = math.pi / 180 / 3600
 
 #: Share of the variance of a wavefront error that is in terms of single segments.
 _SEGMENT_FRACTION = 0.6
+
+#: Radius of HST's central obscuration over that of the pupil. That of the telescope is 0.33; with 0.40 the
+#: light in the first ring agrees with STScI's empirical PSFs of WFC3/IR at F160W, whose cold mask is larger.
+_HST_OBSCURATION = 0.40
 
 #: Lines per pupil cell along y at which outlines are sampled.
 _ROWS = 8
@@ -60,11 +65,6 @@ class Pupil:
         """Side of a cell in m."""
         return self.diameter / self.n
 
-    @property
-    def clear_area(self):
-        """Collecting area in m^2."""
-        return float(self.amplitude.sum()) * self.step**2
-
     def wavefront_error(self, rms, *, seed=1):
         """
         Draw a wavefront error for the pupil.
@@ -91,8 +91,7 @@ class Pupil:
         ValueError
             If ``rms`` is negative.
         """
-        if not rms >= 0:
-            raise argument_error("rms", "zero or positive", rms)
+        check_least(rms, "rms", 0)
         if rms == 0:
             return np.zeros_like(self.amplitude)
         axis = (np.arange(self.n) - 0.5 * (self.n - 1)) * 2 / self.n
@@ -125,7 +124,7 @@ def _to_image(vertices, angle):
 
 
 @functools.lru_cache(maxsize=8)
-def jwst_pupil(n=384, *, angle=4.83544897, struts=True):
+def jwst_pupil(n=384, *, angle=4.83544897):
     """
     The entrance pupil of JWST as an image-plane axis sees it.
 
@@ -136,8 +135,6 @@ def jwst_pupil(n=384, *, angle=4.83544897, struts=True):
     angle : float, optional
         V3IdlYAngle in deg: V3 lies that far clockwise of the detector's +y axis. The
         default is MIRI's (SIAF, MIRIM_FULL).
-    struts : bool, optional
-        Whether the secondary mirror's struts obscure.
 
     Returns
     -------
@@ -148,8 +145,7 @@ def jwst_pupil(n=384, *, angle=4.83544897, struts=True):
     ValueError
         If ``n`` is too small to resolve the struts.
     """
-    if n < 64:
-        raise argument_error("n", "at least 64", n)
+    check_least(n, "n", 64)
     constants = jwst_constants()
     # corners of the B segments reach the circle in the telescope's frame only
     diameter = constants["diameter"] * 1.002
@@ -162,12 +158,11 @@ def jwst_pupil(n=384, *, angle=4.83544897, struts=True):
         amplitude += covered
         mine = covered > best
         segments[mine], best[mine] = index, covered[mine]
-    if struts:
-        blocked = np.zeros((n, n))
-        for vertices in constants["struts"].values():
-            covered = _core.polygon_coverage(_to_image(vertices, angle), n, step, _ROWS)
-            blocked = np.maximum(blocked, covered)
-        amplitude *= 1 - blocked
+    blocked = np.zeros((n, n))
+    for vertices in constants["struts"].values():
+        covered = _core.polygon_coverage(_to_image(vertices, angle), n, step, _ROWS)
+        blocked = np.maximum(blocked, covered)
+    amplitude *= 1 - blocked
     return Pupil(np.minimum(amplitude, 1.0), segments, diameter, angle)
 
 
@@ -179,7 +174,7 @@ def _circle(radius, x=0.0, y=0.0, corners=720):
 
 
 @functools.lru_cache(maxsize=8)
-def hst_pupil(n=256, *, angle=45.0, obscuration=0.40):
+def hst_pupil(n=256, *, angle=45.0):
     """
     The pupil of HST with its central obscuration, four vanes and three pads.
 
@@ -189,10 +184,6 @@ def hst_pupil(n=256, *, angle=45.0, obscuration=0.40):
         Cells per side.
     angle : float, optional
         Angle of a vane from the image's +y axis in deg.
-    obscuration : float, optional
-        Radius of the central obscuration over that of the pupil. That of the telescope is
-        0.33; 0.40 is the value with which the light in the first ring agrees with STScI's
-        empirical PSFs of WFC3/IR at F160W, whose cold mask is larger.
 
     Returns
     -------
@@ -211,7 +202,7 @@ def hst_pupil(n=256, *, angle=45.0, obscuration=0.40):
     radius, step = 0.5 * diameter, diameter / n
     amplitude = _core.polygon_coverage(_circle(radius), n, step, _ROWS)
     segments = (amplitude > 0).astype(np.int16)
-    amplitude *= 1 - _core.polygon_coverage(_circle(obscuration * radius), n, step, _ROWS)
+    amplitude *= 1 - _core.polygon_coverage(_circle(_HST_OBSCURATION * radius), n, step, _ROWS)
     half = 0.011 * radius
     blocked = np.zeros((n, n))
     for k in range(2):
@@ -254,7 +245,7 @@ def _center(pupil, opd, wavelength):
     return x, y
 
 
-def polychromatic_psf(pupil, opd, wavelengths, *, weights=None, step, n):
+def polychromatic_psf(pupil, opd, wavelengths, *, step, n):
     """
     Light of a point source summed over a band, before any detector, as a fraction in each cell, (n, n).
 
@@ -264,8 +255,8 @@ def polychromatic_psf(pupil, opd, wavelengths, *, weights=None, step, n):
         The pupil in the axes of the image.
     opd : `~numpy.ndarray`, shape (n_pupil, n_pupil)
         Optical path difference in nm.
-    wavelengths, weights : `~numpy.ndarray`, shape (m,)
-        In um; equal weights if not given.
+    wavelengths : `~numpy.ndarray`, shape (m,)
+        In um, of equal weight.
     step : float
         Side of an image cell in arcsec.
     n : int
@@ -278,30 +269,24 @@ def polychromatic_psf(pupil, opd, wavelengths, *, weights=None, step, n):
     """
     if n % 2 == 0:
         raise argument_error("n", "odd", n)
-    wavelengths = np.asarray(wavelengths, dtype=float) * 1e-6
+    wavelengths, opd = np.asarray(wavelengths, float) * 1e-6, np.asarray(opd, float) * 1e-9
     period = wavelengths.min() / pupil.step / ARCSEC
     if n * step > period:
         wanted = f"an image below {period:.1f} arcsec (a finer pupil allows more)"
         raise argument_error("n", wanted, f"{n} x {step:.4g} arcsec = {n * step:.1f} arcsec")
-    if weights is None:
-        weights = np.full(wavelengths.size, 1.0 / wavelengths.size)
+    weight = 1.0 / wavelengths.size
+    mean = float(np.average(wavelengths, weights=np.full(wavelengths.size, weight)))
+    axis = (np.arange(n) - (n - 1) // 2) * step * ARCSEC
+    image, power = np.zeros((n, n)), float(pupil.amplitude.sum())
+    across = (np.arange(pupil.n) - 0.5 * (pupil.n - 1)) * pupil.step
     # the same bits on any number of cores
     with single_threaded():
-        return _image(pupil, np.asarray(opd, dtype=float) * 1e-9, wavelengths, step, n, weights)
-
-
-def _image(pupil, opd, wavelengths, step, n, weights):
-    """Weighted sum of the images at some wavelengths, their core in the middle."""
-    shift = _center(pupil, opd, float(np.average(wavelengths, weights=weights)))
-    axis = (np.arange(n) - (n - 1) // 2) * step * ARCSEC
-    image = np.zeros((n, n))
-    power = float(pupil.amplitude.sum())
-    # the core goes to the middle by a tilt: one matrix then serves both axes
-    across = (np.arange(pupil.n) - 0.5 * (pupil.n - 1)) * pupil.step
-    path = opd - shift[0] * across - shift[1] * across[:, None]
-    for wavelength, weight in zip(wavelengths, weights, strict=True):
-        function = pupil.amplitude * np.exp(2j * np.pi * path / wavelength)
-        image += weight * _core.matrix_dft_intensity(
-            function, pupil.step, wavelength, axis, axis, power=power
-        )
+        # the core goes to the middle by a tilt: one matrix then serves both axes
+        shift = _center(pupil, opd, mean)
+        path = opd - shift[0] * across - shift[1] * across[:, None]
+        for wavelength in wavelengths:
+            function = pupil.amplitude * np.exp(2j * np.pi * path / wavelength)
+            image += weight * _core.matrix_dft_intensity(
+                function, pupil.step, wavelength, axis, axis, power=power
+            )
     return image

@@ -10,7 +10,7 @@ from scipy.signal import fftconvolve
 from miricigale.psf import _core
 from miricigale.psf.model import from_photutils, make_psf
 from miricigale.psf.resample import average_psf, centered_psf, psf_image, psf_mosaic, rotate_psf
-from miricigale.psf.wiener import gaussian_gain, odd_square
+from miricigale.psf.wiener import checked_square, gaussian_gain
 from miricigale.utils.exceptions import PSFWarning, argument_error
 from miricigale.utils.units import ANGLE, to_array
 
@@ -27,13 +27,11 @@ def psf_pair(hi, lo, scale, *, angles, grid_angle, resampling, extent, normalize
     """
     given, psfs, centering = {"hi": hi, "lo": lo}, {}, {}
     for name, psf in given.items():
-        if hasattr(psf, "param_names") and not isinstance(psf, (ImagePSF, GriddedPSFModel)):
-            given[name] = from_photutils(psf, pixel_scale=scale * ANGLE, angle=grid_angle)
-    for name, psf in given.items():
         if isinstance(psf, GriddedPSFModel):
-            msg = f"'{name}' must be an ImagePSF or an array, got a GriddedPSFModel: psf_at or "
-            msg += "from_photutils give its PSF at a position"
-            raise TypeError(msg)
+            wanted = "an ImagePSF or an array (psf_at gives the PSF of a grid at a position)"
+            raise argument_error(name, wanted, type(psf).__name__)
+        if hasattr(psf, "param_names") and not isinstance(psf, ImagePSF):
+            given[name] = from_photutils(psf, pixel_scale=scale * ANGLE, angle=grid_angle)
     arrays = {k: np.shape(v) for k, v in given.items() if not isinstance(v, ImagePSF)}
     if len(set(arrays.values())) > 1:
         raise argument_error("hi, lo", "arrays of the same shape", arrays)
@@ -86,11 +84,7 @@ def _missing(psf):
 
 def _from_array(array, name, scale, angle, grid_angle, normalize):
     """An array on the image's pixels as a PSF."""
-    array = np.asarray(array, dtype=float)
-    if array.ndim != 2 or array.shape[0] != array.shape[1]:
-        raise argument_error(name, "square", f"shape {array.shape}")
-    if not np.all(np.isfinite(array)):
-        raise argument_error(name, "finite", "NaN or infinite pixels")
+    array = checked_square(array, name, odd=False)
     total = array.sum()
     if not 0 < total < (np.inf if normalize else 1.02):
         wanted = "a PSF whose sum is the fraction of light it holds (or 'normalize' True)"
@@ -132,7 +126,7 @@ def ready_arrays(array, scale, **psfs):
     Parameters are those of `~miricigale.psf.MatchingKernel.from_array`, ``scale`` the pixel in arcsec. There is a
     target also if only the source is given.
     """
-    array = odd_square(array, "array")
+    array = checked_square(array, "array")
     total = float(array.sum())
     if not 0.9 <= total <= 1.1:
         raise argument_error("array", "a kernel whose sum is 1", f"a sum of {total:.6g}")
@@ -149,7 +143,7 @@ def ready_arrays(array, scale, **psfs):
         if isinstance(psf, ImagePSF):
             psf = psf_image(psf, pixel_scale=scale * ANGLE, shape=array.shape)
         if psf is not None:
-            psf = odd_square(psf, name)
+            psf = checked_square(psf, name)
             if psf.shape != array.shape or not psf.sum() > 0:
                 wanted = f"a PSF of the kernel's shape {array.shape}"
                 raise argument_error(name, wanted, f"{psf.shape} with a sum of {psf.sum():.4g}")

@@ -5,13 +5,13 @@ import math
 
 import astropy.units as u
 import numpy as np
-from astropy.coordinates import Angle
 
 from miricigale.psf import _core
 from miricigale.psf.effects import detector_response
 from miricigale.psf.model import instrument_psf
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.units import ANGLE, positive, to_array
+from miricigale.utils.options import check_choice
+from miricigale.utils.units import ANGLE, check_count, positive, to_array
 
 _log = logging.getLogger(__name__)
 
@@ -22,9 +22,6 @@ def _degrees(angle, argument):
     if angle is None:
         wanted = "the position angle of the detector's +y axis, east of north"
         raise argument_error(argument, wanted, "None: it is unknown where the PSF points")
-    if not isinstance(angle, (u.Quantity, Angle)):
-        msg = f"'{argument}' must be a quantity convertible to deg, got a bare number"
-        raise u.UnitsError(msg)
     return float(to_array(angle, u.deg, argument, finite=True))
 
 
@@ -97,7 +94,7 @@ def rotate_psf(psf, angle=None, *, grid_angle=0.0 * u.deg):
     return psf.replaced(data, frame="sky", angle=grid * u.deg, meta=meta)
 
 
-def average_psf(psfs, weights=None):
+def average_psf(psfs):
     """
     Average PSFs, for instance over dithers or rolls.
 
@@ -105,8 +102,6 @@ def average_psf(psfs, weights=None):
     ----------
     psfs : sequence of `~photutils.psf.ImagePSF`
         All of the same grid, frame, angle and effects.
-    weights : array_like, optional
-        Non-negative weights, such as exposure times; equal if not given.
 
     Returns
     -------
@@ -115,16 +110,14 @@ def average_psf(psfs, weights=None):
     Raises
     ------
     ValueError
-        If the list is empty, the PSFs differ, or the weights do not fit.
+        If the list is empty, or the PSFs differ.
     """
     psfs = list(psfs)
     if not psfs:
         raise argument_error("psfs", "at least one PSF", "none")
     psfs = alike(psfs, ("pixel_scale", "oversampling", "frame", "angle", "includes", "origin"))
-    w = np.ones(len(psfs)) if weights is None else np.asarray(weights, dtype=float)
-    if w.shape != (len(psfs),) or np.any(w < 0) or not w.sum() > 0:
-        raise argument_error("weights", f"{len(psfs)} non-negative numbers", weights)
-    data = np.tensordot(w / w.sum(), np.stack([psf.data for psf in psfs]), axes=1)
+    weights = np.full(len(psfs), 1 / len(psfs))
+    data = np.tensordot(weights, np.stack([psf.data for psf in psfs]), axes=1)
     return psfs[0].replaced(data, meta={"n_averaged": len(psfs)})
 
 
@@ -233,8 +226,7 @@ def psf_mosaic(
     Fruchter & Hook 2002, PASP 114, 144.
     """
     psf = instrument_psf(psf)
-    if resampling not in ("drizzle", None):
-        raise argument_error("resampling", "'drizzle' or None", repr(resampling))
+    check_choice(resampling, "resampling", ("drizzle", None))
     if not 0 < pixfrac <= 1:
         raise argument_error("pixfrac", "above 0 and at most 1", pixfrac)
     scale = positive(pixel_scale, ANGLE, "pixel_scale")
@@ -243,9 +235,7 @@ def psf_mosaic(
     turns = [_turn_by(psf, angle, grid, "pa") for angle in angles]
     if oversampling is None:
         oversampling = max(1, math.ceil(scale / psf.cell - 1e-6))
-    if int(oversampling) != oversampling or oversampling < 1:
-        raise argument_error("oversampling", "a positive integer", oversampling)
-    cell = scale / oversampling
+    cell = scale / check_count(oversampling, "oversampling")
     width = 2 * psf.half_width if fov is None else positive(fov, ANGLE, "fov")
     n = 2 * round(0.5 * width / cell - 0.5) + 1
     blurred = psf.data

@@ -17,7 +17,7 @@ from miricigale.psf.effects import EFFECTS
 from miricigale.psf.model import make_psf
 from miricigale.psf.resample import psf_image
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.units import ANGLE, positive, to_array
+from miricigale.utils.units import ANGLE, check_count, positive, to_array
 
 
 def _as_list(value, kinds):
@@ -101,7 +101,6 @@ def psf_from_stars(
     angle=0.0 * u.deg,
     includes=EFFECTS,
     enclosed=1.0,
-    max_iterations=10,
     progress_bar=False,
 ):
     """
@@ -134,8 +133,6 @@ def psf_from_stars(
     enclosed : float or `~photutils.psf.ImagePSF`, optional
         Fraction of a star's light within the stamp, or a PSF to take it from; it cannot be
         measured from stars. With 1 the encircled energies are those relative to the stamp.
-    max_iterations : int, optional
-        Most rounds of stacking and fitting.
     progress_bar : bool, optional
         Whether to show one.
 
@@ -163,8 +160,7 @@ def psf_from_stars(
     """
     images = _checked_images(images)
     scale = _pixel_scale(images, pixel_scale)
-    if isinstance(oversampling, float) or oversampling < 1:
-        raise argument_error("oversampling", "a positive integer", oversampling)
+    check_count(oversampling, "oversampling")
     width = float(to_array(fov, ANGLE, "fov", ndim=0))
     size = 2 * round(0.5 * width / scale - 0.5) + 1
     if not size >= 7:
@@ -175,7 +171,7 @@ def psf_from_stars(
         raise argument_error("stars", f"at least {least} with stamps on the images", len(stamps))
     builder = EPSFBuilder(
         oversampling=int(oversampling),
-        maxiters=int(max_iterations),
+        maxiters=10,
         smoothing_kernel="quartic",
         progress_bar=progress_bar,
     )

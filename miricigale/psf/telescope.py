@@ -9,8 +9,7 @@ import numpy as np
 from miricigale.filters import Filter
 from miricigale.psf.optics import jwst_pupil, polychromatic_psf
 from miricigale.refdata import citations
-from miricigale.utils.exceptions import argument_error
-from miricigale.utils.units import ANGLE, WAVE, positive, to_array
+from miricigale.utils.units import ANGLE, WAVE, check_count, positive, to_array
 
 
 @functools.lru_cache(maxsize=64)
@@ -38,9 +37,9 @@ def odd_cells(width, cell):
 
 def checked_grid(oversampling, fov, default):
     """Cells per pixel and width in arcsec of a PSF's grid."""
-    if isinstance(oversampling, float) or oversampling < 1:
-        raise argument_error("oversampling", "a positive integer", oversampling)
-    return int(oversampling), default if fov is None else positive(fov, ANGLE, "fov")
+    return check_count(oversampling, "oversampling"), default if fov is None else positive(
+        fov, ANGLE, "fov"
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,9 +73,8 @@ class Telescope:
     @classmethod
     def of(cls, filter, angle, wavefront_error, seed):
         """The telescope of the options of `~miricigale.psf.miri_psf`, checked."""
-        return cls(
-            filter, angle, float(to_array(wavefront_error, u.nm, "wavefront_error")), int(seed)
-        )
+        error = float(to_array(wavefront_error, u.nm, "wavefront_error"))
+        return cls(filter, angle, error, int(seed))
 
     @property
     def meta(self):

@@ -9,6 +9,7 @@ from scipy.fft import fftshift, ifftshift, irfft2, next_fast_len, rfft2
 
 from miricigale.psf import _core
 from miricigale.utils.exceptions import PSFWarning, argument_error
+from miricigale.utils.options import check_positive
 
 _log = logging.getLogger(__name__)
 
@@ -29,11 +30,12 @@ _GAIN, _NEGATIVE = 1.25, -1.5
 _ERROR = 0.02
 
 
-def odd_square(value, name):
+def checked_square(value, name, *, odd=True):
     """An array as floats, checked: square, odd, finite; ``name`` is the argument's."""
     value = np.asarray(value, dtype=float)
-    if value.ndim != 2 or value.shape[0] != value.shape[1] or value.shape[0] % 2 == 0:
-        raise argument_error(name, "square with an odd number of pixels", f"shape {value.shape}")
+    if value.ndim != 2 or value.shape[0] != value.shape[1] or (odd and value.shape[0] % 2 == 0):
+        wanted = "square with an odd number of pixels" if odd else "square"
+        raise argument_error(name, wanted, f"shape {value.shape}")
     if not np.all(np.isfinite(value)):
         raise argument_error(name, "finite", "NaN or infinite pixels")
     return value
@@ -148,8 +150,7 @@ def choose(regularization, make, source, target, tolerance):
             known = ["auto", *REGULARIZATIONS]
             raise argument_error("regularization", f"positive or one of {known}", regularization)
     if regularization != "auto":
-        if not regularization > 0:
-            raise argument_error("regularization", "positive", regularization)
+        check_positive(regularization, "regularization")
         mu = float(regularization)
         return mu, make(mu), figures(mu)
     tried = [(mu, figures(mu)) for mu in _SEQUENCE]

@@ -40,8 +40,8 @@ class BackgroundFlags(Flags):
     """Sources leave less than a twentieth of the pixels: the darkest twentieth was taken for sky, and its
     error is the difference to the median of the image."""
     EXCESS_NOISE = 2
-    """What is left as sky scatters by more than three times the errors of the image: by sources that cannot
-    be told apart, if the errors are right. The darkest twentieth was taken for sky, with the error of
+    """What is left as sky scatters by more than three times the errors of the image: by sources that blend
+    into each other, if the errors are right. The darkest twentieth was taken for sky, with the error of
     ``FEW_SKY``."""
     CONTAMINATED = 4
     """What is left as sky is brighter near sources than far from them: it has their light in it."""

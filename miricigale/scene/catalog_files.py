@@ -8,7 +8,7 @@ import numpy as np
 from astropy.units import UnitsWarning
 
 from miricigale.filters import Filter
-from miricigale.filters.catalog_files import as_catalog_map, told_of
+from miricigale.filters.catalog_files import as_catalog_map, catalog_messages
 from miricigale.filters.surveys import is_band
 from miricigale.refdata import locate, resources
 from miricigale.scene.catalog import CatalogFlags, check_catalog
@@ -93,7 +93,7 @@ def read_catalog(path, catalog_map=None, **options):
     _, lost = catalog_map.names(table.colnames, path.name)
     table, coded = catalog_map.convert(table, path.name)
     _flags_of_stars(table)
-    texts = list(told_of(lost, coded))
+    texts = list(catalog_messages(lost, coded))
     catalog = check_catalog(table, argument=path.name)
     for codes in coded.values():
         catalog["flags"][~np.isnan(codes)] |= int(CatalogFlags.MISSING_CODE)

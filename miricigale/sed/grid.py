@@ -10,7 +10,7 @@ from astropy.table import QTable
 
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.store import open_parts, write_parts
-from miricigale.utils.unified import register, unified_read, unified_write
+from miricigale.utils.unified import read_write, register
 from miricigale.utils.units import Frozen, frozen_array
 
 #: What the AGN fraction is a fraction of.
@@ -240,33 +240,7 @@ class ModelGrid(Frozen):
             out = out + power[..., np.newaxis] * self.agn[z, agn]
         return out
 
-    read = unified_read(
-        """
-        Read a grid that `write` made.
-
-        Parameters
-        ----------
-        path : path-like
-            The file.
-
-        Raises
-        ------
-        `~miricigale.utils.exceptions.DataError`
-            If the file is missing, something else or truncated.
-        """
-    )
-    write = unified_write(
-        """
-        Write the grid to a FITS file.
-
-        Parameters
-        ----------
-        path : path-like
-            The file.
-        overwrite : bool, optional
-            Whether a file that is there is replaced.
-        """
-    )
+    read, write = read_write("a grid")
 
     def __repr__(self):
         return (

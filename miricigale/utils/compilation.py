@@ -19,19 +19,6 @@ from numba.core import event
 
 log = logging.getLogger(__name__)
 
-#: What the kernels of a subpackage do, and about how many seconds all of them take to compile.
-_SUBPACKAGES = {
-    "depth": ("depths", 5),
-    "detector": ("the detector", 15),
-    "fitting": ("the fit", 20),
-    "photometry": ("photometry", 10),
-    "profiles": ("light profiles", 5),
-    "psf": ("PSFs", 10),
-    "reduction": ("the reduction", 15),
-    "scene": ("scenes", 15),
-    "sed": ("model spectra", 10),
-}
-
 
 class _Listener(event.Listener):
     """Says what is compiled, once for each subpackage; compiling is faster without garbage collection."""
@@ -44,9 +31,9 @@ class _Listener(event.Listener):
     # numba calls both with its compiler lock held
     def on_start(self, event):
         name = event.data["dispatcher"].py_func.__module__.split(".")[1:2]
-        if name and name[0] in _SUBPACKAGES and name[0] not in self.reported:
+        if name and name[0] not in self.reported:
             self.reported.add(name[0])
-            log.info("compiling %s, once for each installation, about %d s", *_SUBPACKAGES[name[0]])
+            log.info("compiling kernels of %s, once for each installation, up to 20 s", name[0])
         if self.depth == 0:
             self.collect = gc.isenabled()
             gc.disable()
@@ -84,19 +71,18 @@ def njit(**options):
         except RuntimeError as err:
             if "no locator available" not in str(err):
                 raise
-        if "cache" not in _warned:
-            _warned.add("cache")
-            log.warning(
-                "compiled kernels cannot be kept, as neither the package's folder nor the user's "
-                "cache can be written: they are compiled in every process; set NUMBA_CACHE_DIR to "
-                "a folder that can be written"
-            )
+        _warn_of_no_cache()
         return numba.njit(**{**options, "cache": False})(function)
 
     return decorate
 
 
-_warned = set()
+@functools.cache
+def _warn_of_no_cache():
+    log.warning(
+        "compiled kernels cannot be kept, as neither the package's folder nor the user's cache can be "
+        "written: they are compiled in every process; set NUMBA_CACHE_DIR to a folder that can be written"
+    )
 
 
 @functools.cache

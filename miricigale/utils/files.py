@@ -88,24 +88,23 @@ def open_fits(path, *, wanted, **options):
         `check_unpacked`.
     """
     n_bytes = unpacked_size(path)
-    hdus = None
-    try:
-        _refuse_stump(Path(path))
-        with warnings.catch_warnings(record=True) as caught:
-            # made errors at once they would leave the file open
-            warnings.simplefilter("always")
-            hdus = fits.open(path, **options)
-            # headers are read late
-            len(hdus)
-        _check_declared(path, hdus, n_bytes)
-        _judge(caught)
-    except DataError:
-        hdus.close()
-        raise
-    except (OSError, TypeError, ValueError) as err:
-        if hdus is not None:
-            hdus.close()
-        raise _unreadable(path, wanted, err) from err
+    # closes the file if something is wrong with it
+    with contextlib.ExitStack() as opened:
+        try:
+            _refuse_stump(Path(path))
+            with warnings.catch_warnings(record=True) as caught:
+                # made errors at once they would leave the file open
+                warnings.simplefilter("always")
+                hdus = opened.enter_context(fits.open(path, **options))
+                # headers are read late
+                len(hdus)
+            _check_declared(path, hdus, n_bytes)
+            _judge(caught)
+        except DataError:
+            raise
+        except (OSError, TypeError, ValueError) as err:
+            raise _unreadable(path, wanted, err) from err
+        opened.pop_all()
     return hdus
 
 
@@ -182,10 +181,10 @@ def check_unpacked(path, n_bytes):
     `~miricigale.utils.exceptions.DataError`
         If that is more than the bound.
     """
-    packed, bound = _bound(path)
+    bound = _bound(path)
     if n_bytes > bound:
         msg = (
-            f"{path} ({packed / 1e6:.3g} MB on the disk) would unpack to "
+            f"{path} ({os.stat(path).st_size / 1e6:.3g} MB on the disk) would unpack to "
             f"{'more than ' if n_bytes == bound + 1 else ''}{n_bytes / 1e9:.3g} GB, and the bound "
             f"is {bound / 1e9:.3g} GB; if it is to be trusted, raise "
             "miricigale.conf.unpacked_size (in MB)"
@@ -194,9 +193,8 @@ def check_unpacked(path, n_bytes):
 
 
 def _bound(path):
-    """Bytes on the disk, and how many a file may unpack to."""
-    packed = min(os.stat(path).st_size, _allocated(path))
-    return packed, max(conf.unpacked_size * 1_000_000, _EXPANSION * packed)
+    """How many bytes a file may unpack to."""
+    return max(conf.unpacked_size * 1_000_000, _EXPANSION * os.stat(path).st_size)
 
 
 def unpacked_size(path):
@@ -204,7 +202,7 @@ def unpacked_size(path):
     Size of a file without the packing that astropy opens by itself (gzip, bzip2, xz, zip).
 
     Content is counted piece by piece and not kept. That takes as long as unpacking does, once for
-    a file in a session. A file with holes counts as packed into what it takes on the disk.
+    a file in a session.
 
     Parameters
     ----------
@@ -225,7 +223,7 @@ def unpacked_size(path):
     if not os.path.isfile(path):
         return 0
     try:
-        n_bytes = _count(path, _bound(path)[1])
+        n_bytes = _count(path, _bound(path))
     except Exception as err:  # each packing has its own
         if getattr(err, "errno", None):
             # the reader that opens it says what is wrong
@@ -254,23 +252,6 @@ def _count(path, most):
                     n_bytes += len(piece)
             return min(n_bytes, most + 1)
     return os.stat(path).st_size
-
-
-def _allocated(path):
-    """Bytes that a file has on the disk; holes, which are read as zeros, have none."""
-    status = os.stat(path)
-    blocks = getattr(status, "st_blocks", 0)
-    # some file systems report no blocks, others fewer for a while, or compress
-    if not blocks or _EXPANSION * 512 * blocks >= status.st_size or not hasattr(os, "SEEK_DATA"):
-        return status.st_size
-    n_bytes, end = 0, 0
-    with open(path, "rb", buffering=0) as stream, contextlib.suppress(OSError):
-        # an error means that there are no data after this place
-        while True:
-            start = stream.seek(end, os.SEEK_DATA)
-            end = stream.seek(start, os.SEEK_HOLE)
-            n_bytes += end - start
-    return n_bytes
 
 
 def _refuse_stump(path):
@@ -315,8 +296,8 @@ def read_table(path, *, wanted, cls=QTable, form=None, hdu=None):
     cls : type, optional
         Class of the table.
     form : str, optional
-        Format by `astropy.table.Table.read`. By default by content and suffix: FITS, VOTable,
-        ECSV, CSV or plain text, whose names of columns stand behind ``#`` if ``id`` is among them.
+        Format by `astropy.table.Table.read`. By default by content and suffix: those of `write_table`, or
+        plain text, whose names of columns stand behind ``#`` if ``id`` is among them.
     hdu : int or str, optional
         Extension of a FITS file, the first table by default.
 
@@ -337,29 +318,35 @@ def read_table(path, *, wanted, cls=QTable, form=None, hdu=None):
         form = _table_format(path) if form is None else form
         if form == "fits":
             with open_fits(path, wanted=wanted) as hdus:
-                return cls.read(hdus, format=form, character_as_bytes=False, hdu=hdu)
-        if hdu is not None:
+                table = cls.read(hdus, format=form, character_as_bytes=False, hdu=hdu)
+        elif hdu is not None:
             raise _unreadable(path, wanted, f"'hdu' is {hdu!r}, and it is no FITS file")
-        return cls.read(path, format=form)
+        else:
+            table = cls.read(path, format=form)
+        if not table.colnames:
+            raise _unreadable(path, wanted, "it has no columns")
+        return table
     except DataError:
         raise
     except Exception as err:  # readers of different formats raise different exceptions
         raise _unreadable(path, wanted, err) from err
 
 
-#: Formats of tables by suffix, and what `astropy.table.Table.write` takes for each.
-WRITERS = {
-    ".fits": {"format": "fits"},
-    ".fit": {"format": "fits"},
-    ".ecsv": {"format": "ascii.ecsv"},
-    ".csv": {"format": "ascii.csv"},
-    ".xml": {"format": "votable"},
-    ".vot": {"format": "votable"},
-    ".votable": {"format": "votable"},
-    ".h5": {"format": "hdf5", "path": "table", "serialize_meta": True},
-    ".hdf5": {"format": "hdf5", "path": "table", "serialize_meta": True},
-    ".parquet": {"format": "parquet"},
+#: Formats of tables by suffix, as `astropy.table.Table` calls them.
+TABLE_FORMATS = {
+    ".fits": "fits",
+    ".fit": "fits",
+    ".ecsv": "ascii.ecsv",
+    ".csv": "ascii.csv",
+    ".xml": "votable",
+    ".vot": "votable",
+    ".votable": "votable",
+    ".h5": "hdf5",
+    ".hdf5": "hdf5",
+    ".parquet": "parquet",
 }
+#: What astropy must know further to write a format.
+_OPTIONS = {"hdf5": {"path": "table", "serialize_meta": True}}
 
 
 def write_table(table, path, *, overwrite=False):
@@ -383,16 +370,17 @@ def write_table(table, path, *, overwrite=False):
         If the file is there and ``overwrite`` is not set.
     """
     path = Path(path)
-    options = WRITERS.get(path.suffix.lower())
-    if options is None:
-        raise argument_error("path", f"a file ending in one of {', '.join(WRITERS)}", str(path))
+    form = TABLE_FORMATS.get(path.suffix.lower())
+    if form is None:
+        wanted = f"a file ending in one of {', '.join(TABLE_FORMATS)}"
+        raise argument_error("path", wanted, str(path))
     with writing(path):
-        if options["format"] == "fits":
+        if form == "fits":
             hdus = fits.HDUList([fits.PrimaryHDU(), table_hdu(table)])
             hdus.writeto(path, overwrite=overwrite)
         else:
-            plain = sky_as_angles(table) if options["format"] == "votable" else table
-            plain.write(path, overwrite=overwrite, **options)
+            plain = sky_as_angles(table) if form == "votable" else table
+            plain.write(path, overwrite=overwrite, format=form, **_OPTIONS.get(form, {}))
 
 
 def table_hdu(table):
@@ -414,14 +402,12 @@ def _table_format(path):
         start = stream.read(65536)
     first = start.strip().partition(b"\n")[0].decode(errors="replace")
     suffix = Path(Path(path).name.lower().removesuffix(".gz")).suffix
-    if start.startswith(b"SIMPLE") or suffix in (".fits", ".fit"):
+    if start.startswith(b"SIMPLE"):
         return "fits"
-    if suffix in (".xml", ".vot", ".votable"):
-        return "votable"
-    if start.startswith(b"# %ECSV") or suffix == ".ecsv":
+    if start.startswith(b"# %ECSV"):
         return "ascii.ecsv"
-    if suffix in WRITERS:
-        return WRITERS[suffix]["format"]
+    if suffix in TABLE_FORMATS:
+        return TABLE_FORMATS[suffix]
     named = first.startswith("#") and "id" in first.strip("# \r").split()
     return "ascii.commented_header" if named else "ascii"
 

@@ -4,7 +4,7 @@ import hashlib
 import json
 import logging
 import operator
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path, PurePosixPath
 
 from miricigale.utils.content import file_sha256
 from miricigale.utils.exceptions import DataError
@@ -49,15 +49,8 @@ class FileFolder:
             If the name leads out of the folder, by itself or by a symbolic link.
         """
         parts = PurePosixPath(name).parts
-        windows = PureWindowsPath(name)
-        if (
-            not parts
-            or ".." in windows.parts
-            or windows.drive
-            or windows.root
-            or "/".join(parts) != name
-            or "\0" in name
-        ):
+        # also none that leads out of a folder of Windows
+        if not parts or "/".join(parts) != name or ".." in parts or set(name) & set("\\:\0"):
             msg = f"{name!r} is not the name of a product: products lie in {self.folder}"
             raise DataError(msg)
         path = self.folder
@@ -170,23 +163,12 @@ class RecordFolder(FileFolder):
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as err:
             log.warning("%s is damaged (%s: %s)", path, type(err).__name__, err)
             return False
-        self._check_names(path, records)
         # earlier versions wrote none
         if values.get("sha256", _checksum(values)) != _checksum(values):
             log.warning("%s is damaged (its checksum is wrong)", path)
             return False
         self.facts, self.records = facts, records
         return True
-
-    def _check_names(self, path, records):
-        """Refuse records of files outside of the folder."""
-        for record in records.values():
-            for name in record["products"]:
-                try:
-                    self.path(name)
-                except DataError as err:
-                    msg = f"{path} cannot be used: {err}"
-                    raise DataError(msg) from None
 
     def _read_journal(self, path):
         """Add the records of a journal; a line that is not whole, as after a kill, is left out."""
@@ -201,9 +183,8 @@ class RecordFolder(FileFolder):
                 continue
             if record is None:
                 self.records.pop(key, None)
-                continue
-            self._check_names(path, {key: record})
-            self.records[key] = record
+            else:
+                self.records[key] = record
 
     def parse(self, values):
         """
@@ -215,10 +196,15 @@ class RecordFolder(FileFolder):
         return facts, values[self.records_name]
 
     def check_record(self, record):
-        """Raise an error (a `KeyError`, `TypeError` or `ValueError`) for a damaged record."""
+        """
+        Raise an error (a `KeyError`, `TypeError` or `ValueError`) for a damaged record.
+
+        A record of a file outside of the folder is refused by a `~miricigale.utils.exceptions.DataError`.
+        """
         record["hash"]
-        for product in record["products"].values():
+        for name, product in record["products"].items():
             product["sha256"], operator.index(product["bytes"])
+            self.path(name)
 
     def _refuse_foreign(self, *, damaged):
         """Refuse a folder that is another's, or whose files cannot be identified any more."""
@@ -270,13 +256,12 @@ class RecordFolder(FileFolder):
 
     def is_whole(self, key):
         """Whether all files of a record stand with the right checksums."""
-        return not any(self._fault(*item) for item in self.records[key]["products"].items())
+        return not self.faults(key)
 
     def faults(self, key):
         """What is wrong with the files of a record: dict of name to ``"missing"`` or what else, in words."""
-        found = {
-            name: self._fault(name, one) for name, one in self.records[key]["products"].items()
-        }
+        products = self.records[key]["products"].items()
+        found = {name: self._fault(name, product) for name, product in products}
         return {name: fault for name, fault in found.items() if fault}
 
     def _fault(self, name, product):

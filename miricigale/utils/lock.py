@@ -4,7 +4,6 @@ import datetime
 import json
 import os
 import platform
-import stat
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -51,7 +50,6 @@ class FolderLock:
     def __enter__(self):
         if self._lock.is_locked:
             raise self._refusal()
-        self._check_host()
         try:
             self._lock.acquire(poll_interval=0.02)
         except Timeout:
@@ -60,8 +58,9 @@ class FolderLock:
             msg = f"{self.folder} is locked by {self._lock.lock_file}, which this user may not open"
             raise DataError(msg) from err
         try:
-            # another host may have come first
-            self._check_host()
+            # where locks are not passed on to other hosts the file alone says who was first
+            if _is_elsewhere(self._owner()):
+                raise self._refusal()
             now = datetime.datetime.now(datetime.UTC)
             owner = _here() | {"pid": os.getpid(), "started": f"{now:%Y-%m-%d %H:%M:%S} UTC"}
             with replacing(self.path) as partial:
@@ -80,36 +79,28 @@ class FolderLock:
     def _owner(self):
         """What the file says of the owner; empty if it says nothing that can be used."""
         try:
-            # a link that leads nowhere could not be read, and reading a pipe would wait
-            if not stat.S_ISREG(os.lstat(self.path).st_mode):
-                msg = f"{self.path} is no plain file, as locks are: remove it"
-                raise DataError(msg)
             owner = json.loads(self.path.read_text(encoding="utf-8"))
             return owner if isinstance(owner["host"], str) else {}
         except (FileNotFoundError, ValueError, KeyError, TypeError, RecursionError):
             return {}
-
-    def _check_host(self):
-        owner = self._owner()
-        if owner and not _here().items() <= owner.items():
-            raise self._refusal()
 
     def _refusal(self):
         owner = self._owner()
         where = f"process {owner.get('pid', '(unknown)')} on {owner.get('host', 'unknown host')}"
         if owner.get("started"):
             where += f", started {owner['started']}"
-        if owner and not _here().items() <= owner.items():
-            msg = (
-                f"{self.folder} is in use by a {self.purpose} on another host: {where}; whether it "
-                f"still runs cannot be seen from {platform.node()}: if it is gone, remove {self.path}"
-            )
-        else:
-            msg = (
-                f"{self.folder} is in use by a {self.purpose}: {where}; "
-                f"if that process is gone, remove {self._lock.lock_file}"
-            )
-        return DataError(msg)
+        # where locks are not passed on, the file that names the owner is the lock
+        elsewhere = _is_elsewhere(owner)
+        place, file = (" on another host", self.path) if elsewhere else ("", self._lock.lock_file)
+        return DataError(
+            f"{self.folder} is in use by a {self.purpose}{place}: {where}; "
+            f"if that process is gone, remove {file}"
+        )
+
+
+def _is_elsewhere(owner):
+    """Whether a file names an owner on another host."""
+    return bool(owner) and not _here().items() <= owner.items()
 
 
 def _here():

@@ -40,12 +40,7 @@ class ObjectRows(Interactive):
         self._freeze(copy=True)
 
     def _freeze(self, copy):
-        for name, value in self._per_object():
-            if isinstance(value, dict):
-                value = {key: _frozen(array, copy) for key, array in value.items()}
-            elif value is not None:
-                value = _frozen(value, copy)
-            self.__dict__[name] = value
+        self.__dict__.update(self._mapped(lambda array: _frozen(array, copy)))
 
     def __setstate__(self, state):
         # arrays come back from pickles as ones that can be written to
@@ -56,6 +51,16 @@ class ObjectRows(Interactive):
         for item in fields(self):
             if item.type in (PerObject, PerObjectDict):
                 yield item.name, getattr(self, item.name)
+
+    def _mapped(self, function):
+        """Fields of arrays by name, after a function on each array."""
+        found = {}
+        for name, value in self._per_object():
+            if isinstance(value, dict):
+                found[name] = {key: function(array) for key, array in value.items()}
+            else:
+                found[name] = None if value is None else function(value)
+        return found
 
     @property
     def isscalar(self):
@@ -78,11 +83,10 @@ class ObjectRows(Interactive):
         if self.isscalar:
             msg = f"a {type(self).__name__} of a single object cannot be indexed"
             raise TypeError(msg)
-        if isinstance(key, (slice, list)) or (isinstance(key, np.ndarray) and key.ndim):
-            rows = key if isinstance(key, slice) else np.asarray(key)
-            if isinstance(rows, np.ndarray) and rows.size == 0 and rows.dtype != bool:
-                rows = rows.astype(np.intp)
-            return self._take(rows)
+        if isinstance(key, slice):
+            return self._take(key)
+        if isinstance(key, list) or (isinstance(key, np.ndarray) and key.ndim):
+            return self._take(key if len(key) else slice(0))
         if isinstance(key, numbers.Integral) and not isinstance(key, (bool, np.bool_)):
             if not -len(self) <= key < len(self):
                 msg = f"no row {key} among {len(self)}; results.loc[id] is the object of an id"
@@ -108,21 +112,14 @@ class ObjectRows(Interactive):
     def _take(self, rows):
         """Copy with these rows of every array; with a row number, a single object."""
         new = object.__new__(type(self))
-        values = dict(self.__dict__)
-        # what was computed from all rows
-        for name in [n for n in values if n not in self.__dataclass_fields__]:
-            del values[name]
-        for name, value in self._per_object():
-            if isinstance(value, dict):
-                values[name] = {key: _rows(array, rows) for key, array in value.items()}
-            elif value is not None:
-                values[name] = _rows(value, rows)
-        new.__dict__.update(values)
+        # without what was computed from all rows
+        values = {name: v for name, v in self.__dict__.items() if name in self.__dataclass_fields__}
+        new.__dict__.update(values | self._mapped(lambda array: _rows(array, rows)))
         return new
 
     def _changed(self, **changes):
         """Copy with other values of some fields, which are not checked; arrays are made read-only."""
-        new = self._take(slice(None)) if not self.isscalar else self._take(())
+        new = self._take(())
         for name, value in changes.items():
             if isinstance(value, np.ndarray):
                 value.flags.writeable = False
@@ -131,16 +128,7 @@ class ObjectRows(Interactive):
 
     def _several(self):
         """This, with an axis of objects where it is a single one."""
-        if not self.isscalar:
-            return self
-        new = self._take(())
-        for name, value in new._per_object():
-            if isinstance(value, dict):
-                value = {key: array[None] for key, array in value.items()}
-            elif value is not None:
-                value = np.asanyarray(value)[None]
-            new.__dict__[name] = value
-        return new
+        return self._take(None) if self.isscalar else self
 
     @cached_property
     def _row_of_id(self):

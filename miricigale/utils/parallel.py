@@ -104,36 +104,13 @@ def process_pool(n_processes):
         executor.shutdown(cancel_futures=True)
 
 
-@contextlib.contextmanager
-def thread_pool(n_threads):
-    """
-    Threads that are not waited for when the ``with`` block is left by an exception.
-
-    Parameters
-    ----------
-    n_threads : int
-        How many.
-
-    Yields
-    ------
-    executor : `concurrent.futures.ThreadPoolExecutor`
-    """
-    executor = ThreadPoolExecutor(n_threads)
-    try:
-        yield executor
-    except BaseException:
-        executor.shutdown(wait=False, cancel_futures=True)
-        raise
-    executor.shutdown()
-
-
-def _end_with_parent(level=logging.WARNING):
+def _end_with_parent(level):
     """
     Begin a process of `multiprocessing`: it leaves interrupts to its parent, and ends with it.
 
     Parameters
     ----------
-    level : int, optional
+    level : int
         Level of the messages that it writes to stderr.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -205,8 +182,7 @@ def _sent_once(function, executor):
         data = pickle.dumps(function, protocol=pickle.HIGHEST_PROTOCOL)
     except (pickle.PicklingError, AttributeError, TypeError):
         # the executor may have better means, or says what is wrong
-        yield (function,)
-        return
+        data = b""
     if len(data) <= _HEAVY:
         yield (function,)
     elif scatter is not None:
@@ -276,6 +252,8 @@ def threads(n_threads=None):
     """
     Threads for kernels and transforms that release the interpreter lock.
 
+    They are not waited for when the ``with`` block is left by an exception.
+
     Parameters
     ----------
     n_threads : int, optional
@@ -290,8 +268,13 @@ def threads(n_threads=None):
     if n_threads == 1:
         yield None
         return
-    with ThreadPoolExecutor(n_threads) as executor:
+    executor = ThreadPoolExecutor(n_threads)
+    try:
         yield executor
+    except BaseException:
+        executor.shutdown(wait=False, cancel_futures=True)
+        raise
+    executor.shutdown()
 
 
 class _SingleThreaded:

@@ -87,7 +87,6 @@ def as_positions(table, argument, wcs=None, *, missing=False):
     ValueError
         If there are no such columns, or a position is not finite and ``missing`` is False.
     """
-    refuse = _pass if missing else _refuse_missing
     skies = [name for name in table.colnames if isinstance(table[name], SkyCoord)]
     columns = {}
     for name in table.colnames:
@@ -97,17 +96,18 @@ def as_positions(table, argument, wcs=None, *, missing=False):
         sky = table["sky" if "sky" in skies else skies[0]].icrs
     elif pair is not None:
         angles = [_degrees(table, name, argument) for name in pair]
-        refuse(~np.isfinite(angles).all(axis=0), argument)
         sky = SkyCoord(*angles, unit="deg")
     elif wcs is not None and {"x", "y"} <= set(columns):
         pixels = [plain_floats(table[columns[name]], columns[name], argument) for name in "xy"]
-        refuse(~np.isfinite(pixels).all(axis=0), argument)
         sky = wcs.pixel_to_world(*pixels).icrs
     else:
         wanted = "a table with positions: 'sky' (SkyCoord), or 'ra' and 'dec'"
         wanted += "" if wcs is None else ", or pixels 'x' and 'y'"
         raise argument_error(argument, wanted, f"the columns {table.colnames}")
-    refuse(~(np.isfinite(sky.ra.deg) & np.isfinite(sky.dec.deg)), argument)
+    bad = np.flatnonzero(~(np.isfinite(sky.ra.deg) & np.isfinite(sky.dec.deg)))
+    if bad.size and not missing:
+        wanted = "a table of finite positions"
+        raise argument_error(argument, wanted, f"{bad.size} that are not, first in row {bad[0]}")
     return SkyCoord(sky.ra, sky.dec)
 
 
@@ -119,7 +119,7 @@ def _degrees(table, name, argument):
         msg = f"{argument!r} column {name!r} must be an angle, got {unit}"
         raise u.UnitsError(msg)
     values = plain_floats(column, name, argument)
-    values[without_codes(values)[0]] = np.nan
+    values[without_codes(values)[0] | np.isinf(values)] = np.nan
     return values * u.Unit(unit).to(u.deg)
 
 
@@ -132,14 +132,3 @@ def sky_as_angles(table):
         table.add_columns(list(angles), indexes=[at, at], names=["ra", "dec"])
         table.remove_column("sky")
     return table
-
-
-def _pass(bad, argument):
-    """Let positions be missing."""
-
-
-def _refuse_missing(bad, argument):
-    if np.any(bad):
-        rows = np.flatnonzero(bad)
-        wanted = "a table of finite positions"
-        raise argument_error(argument, wanted, f"{rows.size} that are not, first in row {rows[0]}")

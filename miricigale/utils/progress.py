@@ -1,9 +1,13 @@
 """Progress: off in the API unless asked for, on in the command line."""
 
+import contextlib
 import sys
 import time
 
 from tqdm import tqdm
+
+#: Seconds between lines where no bar is drawn.
+_EVERY = 60.0
 
 
 def on_terminal():
@@ -20,28 +24,22 @@ def print_line(text):
         sys.stderr.flush()
 
 
-class _Lines:
+class _Lines(contextlib.AbstractContextManager):
     """What `progress` returns where no bar is drawn: one line at the end, one a minute, or none."""
 
-    def __init__(self, iterable, total, desc, unit, *, show=True, every=60.0):
-        if total is None and hasattr(iterable, "__len__"):
-            total = len(iterable)
-        self.iterable, self.total, self.desc, self.unit = iterable, total, desc, unit
-        self.n = 0
-        self._show = show
-        self._every = every
-        self._begin = self._last = time.monotonic()
+    def __init__(self, iterable, total, desc, unit, show):
+        self.iterable, self.desc, self.unit, self._show = iterable, desc, unit, show
+        self.total = len(iterable) if total is None and hasattr(iterable, "__len__") else total
+        self.n, self._begin = 0, time.monotonic()
+        self._last = self._begin
 
     def update(self, n=1):
         self.n += n
-        if time.monotonic() - self._last > self._every:
+        if time.monotonic() - self._last > _EVERY:
             self._line()
 
-    def set_description(self, desc, refresh=True):
+    def set_description(self, desc):
         self.desc = desc
-
-    def refresh(self):
-        """A line stands as it is."""
 
     def close(self):
         if self.n:
@@ -49,23 +47,17 @@ class _Lines:
         self.n = 0
 
     def _line(self):
-        if not self._show:
-            return
         self._last = time.monotonic()
-        share = f"{self.n}" if self.total is None else f"{self.n} of {self.total}"
-        label = f"{self.desc}: " if self.desc else ""
-        print_line(f"{label}{share} {self.unit}, {self._last - self._begin:.0f} s")
+        if self._show:
+            share = f"{self.n}" if self.total is None else f"{self.n} of {self.total}"
+            label = f"{self.desc}: " if self.desc else ""
+            print_line(f"{label}{share} {self.unit}, {self._last - self._begin:.0f} s")
 
     def __iter__(self):
-        try:
+        with self:
             for item in self.iterable:
                 yield item
                 self.update()
-        finally:
-            self.close()
-
-    def __enter__(self):
-        return self
 
     def __exit__(self, *exc):
         self.close()
@@ -93,7 +85,7 @@ def progress(iterable=None, *, show=False, total=None, desc=None, unit="it"):
     """
     if not (show and on_terminal()):
         # without tqdm, whose semaphore outlives a process that is stopped
-        return _Lines(iterable, total, desc, unit, show=show)
+        return _Lines(iterable, total, desc, unit, show)
     # the notebook's bar is slow to import
     from tqdm.auto import tqdm
 

@@ -1,7 +1,5 @@
-"""Tables on disk by pieces of rows: FITS binary tables, ECSV and CSV are read, FITS is written."""
+"""Tables on disk by pieces of rows: FITS binary tables are read and written so, others are read as a whole."""
 
-import abc
-import gc
 import io
 import json
 import warnings
@@ -10,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
-from astropy.table import QTable, Table
+from astropy.table import QTable
 
 from miricigale.utils.content import file_sha256
-from miricigale.utils.exceptions import DataError, argument_error
-from miricigale.utils.files import open_fits, read_table, unpacked_size
+from miricigale.utils.exceptions import DataError
+from miricigale.utils.files import open_fits, read_table
 from miricigale.utils.store import plain_value, replacing
 from miricigale.utils.units import check_count
 
@@ -26,8 +24,8 @@ def open_rows(path, chunk_rows, *, hdu=None):
     Parameters
     ----------
     path : path-like
-        FITS with a binary table, ECSV, or CSV with a line of column names (``.csv``); VOTable and plain text,
-        which are in memory as a whole.
+        FITS with a binary table, of which one piece at a time is in memory; or any other file for
+        `~miricigale.utils.files.read_table`, also a packed one, which is in memory as a whole.
     chunk_rows : int
         Rows in a piece.
     hdu : int or str, optional
@@ -44,45 +42,32 @@ def open_rows(path, chunk_rows, *, hdu=None):
     """
     chunk_rows = check_count(chunk_rows, "chunk_rows")
     path = Path(path)
-    if not path.is_file():
-        msg = f"no table {path}"
-        raise DataError(msg)
-    with open(path, "rb") as stream:
-        start = stream.read(9)
-    if start.startswith(b"SIMPLE"):
-        return _FitsRows(path, chunk_rows, hdu)
-    if hdu is not None:
-        raise argument_error("hdu", f"None, for {path} is no FITS file", repr(hdu))
-    packed = start.startswith((b"\x1f\x8b", b"BZh", b"\xfd7zXZ"))
-    if not packed:
-        unpacked_size(path)
-    if start.startswith(b"# %ECSV"):
-        return _ECSVRows(path, chunk_rows)
-    if path.suffix.lower() == ".csv" and not packed:
-        return _CSVRows(path, chunk_rows)
-    if not packed and path.suffix.lower() in _WHOLE:
-        return _WholeRows(path, chunk_rows)
-    why = "unpack it first" if packed else "write it as FITS (a binary table) or ECSV"
-    msg = f"{path} cannot be read as a table in pieces of rows: {why}"
-    raise DataError(msg)
+    if path.is_file():
+        with open(path, "rb") as stream:
+            if stream.read(6) == b"SIMPLE":
+                return _FitsRows(path, chunk_rows, hdu)
+    return RowFile(path, chunk_rows, hdu)
 
 
-class RowFile(abc.ABC):
-    """A table on disk of which one piece at a time is in memory."""
+class RowFile:
+    """A table on disk in pieces of rows; this class reads it as a whole when it is first used."""
 
-    def __init__(self, path, chunk_rows):
-        self.path = path
-        self.chunk_rows = chunk_rows
+    def __init__(self, path, chunk_rows, hdu):
+        self.path, self.chunk_rows, self._hdu = path, chunk_rows, hdu
 
-    @property
-    @abc.abstractmethod
+    @cached_property
+    def _table(self):
+        return read_table(self.path, wanted="a catalog", hdu=self._hdu)
+
+    @cached_property
     def colnames(self):
         """Names of the columns."""
+        return tuple(self._table.colnames)
 
-    @property
-    @abc.abstractmethod
+    @cached_property
     def n_rows(self):
         """Number of rows."""
+        return len(self._table)
 
     @cached_property
     def sha256(self):
@@ -99,6 +84,10 @@ class RowFile(abc.ABC):
         start = i * self.chunk_rows
         return start, min(self.n_rows, start + self.chunk_rows)
 
+    def rename(self, names):
+        """Give columns other names in all pieces: a dict by the present ones."""
+        self.colnames = tuple(names.get(name, name) for name in self.colnames)
+
     def chunk(self, i):
         """
         Read piece ``i``.
@@ -108,233 +97,49 @@ class RowFile(abc.ABC):
         table : `~astropy.table.QTable`
             As `QTable.read` gives these rows of the whole file; text is text, not bytes.
         """
-        start, stop = self.span(i)
-        try:
-            table = self._read(start, stop)
-        except (OSError, ValueError, TypeError) as err:
-            first = (str(err).splitlines() or [type(err).__name__])[0]
-            msg = f"{self.path} rows {start} to {stop} cannot be read: {first}"
-            raise DataError(msg) from err
-        if len(table) != stop - start:
-            msg = f"{self.path} has {len(table)} rows where {stop - start} were counted"
-            raise DataError(msg)
+        table = self._read(slice(*self.span(i)))
+        table.rename_columns(table.colnames, list(self.colnames))
         return table
 
-    def foreign_chunks(self, name):
-        """
-        Pieces that may have text that is not ASCII, found without making tables of them.
-
-        Parameters
-        ----------
-        name : str
-            The column that is asked for.
-
-        Yields
-        ------
-        i : int
-            Each piece of which this column is all ASCII or no text is left out.
-        """
-        for i in range(self.n_chunks):
-            if self._is_foreign(name, *self.span(i)):
-                yield i
-
-    @abc.abstractmethod
-    def _is_foreign(self, name, start, stop):
-        """Whether these rows may have text that is not ASCII in a column."""
-
-    @abc.abstractmethod
-    def _read(self, start, stop):
-        """Read rows; ``start`` is the first of a piece."""
-
-
-#: Suffixes of files that are read as a whole: VOTable and plain text.
-_WHOLE = (".xml", ".vot", ".votable", ".txt", ".cat", ".dat")
-
-
-class _WholeRows(RowFile):
-    """Rows of a table that can be read as a whole only."""
-
-    @cached_property
-    def _table(self):
-        return read_table(self.path, wanted="a catalog")
-
-    @property
-    def colnames(self):
-        return tuple(self._table.colnames)
-
-    @property
-    def n_rows(self):
-        return len(self._table)
-
-    def _is_foreign(self, name, start, stop):
-        return self._table[name].dtype.kind in "OUS"
-
-    def _read(self, start, stop):
-        return self._table[start:stop]
+    def _read(self, rows):
+        return self._table[rows]
 
 
 class _FitsRows(RowFile):
+    """Rows of a FITS table."""
+
     def __init__(self, path, chunk_rows, hdu):
-        super().__init__(path, chunk_rows)
-        self._hdu = hdu
+        super().__init__(path, chunk_rows, hdu)
         with open_fits(path, wanted="a catalog") as hdus:
-            table = self._choose(hdus, hdu)
-            self._header = table.header.copy()
-            self._start = table.fileinfo()["datLoc"]
-            self._colnames = tuple(table.columns.names)
-            self._dtype = table.columns.dtype
-            formats = dict(zip(table.columns.names, table.columns.formats, strict=True))
-        self._width = self._header["NAXIS1"]
-        ragged = [name for name, text in formats.items() if "P" in text or "Q" in text]
+            table = self._choose(hdus)
+            self._header, self.n_rows = table.header.copy(), table.header["NAXIS2"]
+            self.colnames = tuple(table.columns.names)
+            ragged = [column.name for column in table.columns if set(column.format) & {"P", "Q"}]
         if ragged:
             msg = (
                 f"{path} has columns of variable length, {ragged}, "
                 "which cannot be read in pieces of rows"
             )
             raise DataError(msg)
-        wanted = self._start + self._width * self.n_rows
-        if path.stat().st_size < wanted:
-            msg = f"{path} is truncated: {path.stat().st_size} bytes, wanted at least {wanted}"
-            raise DataError(msg)
         # what belongs to the whole table
         for key in ("CHECKSUM", "DATASUM", "THEAP"):
             self._header.remove(key, ignore_missing=True)
         self._header["PCOUNT"] = 0
 
-    def _choose(self, hdus, hdu):
+    def _choose(self, hdus):
         tables = [i for i, item in enumerate(hdus) if isinstance(item, fits.BinTableHDU)]
-        if hdu is None:
-            if len(tables) != 1:
-                msg = f"{self.path} has {len(tables)} binary tables; 'hdu' says which is meant"
-                raise DataError(msg)
-            return hdus[tables[0]]
-        try:
-            chosen = hdus[hdu]
-        except (KeyError, IndexError) as err:
-            msg = f"{self.path} has no extension {hdu!r}"
-            raise DataError(msg) from err
-        if not isinstance(chosen, fits.BinTableHDU):
-            msg = f"{self.path} extension {hdu!r} is no binary table"
+        wanted = self._hdu.upper() if isinstance(self._hdu, str) else self._hdu
+        chosen = [i for i in tables if wanted in (None, i, hdus[i].name)]
+        if len(chosen) != 1:
+            asked = "'hdu' says which is meant" if wanted is None else f"{wanted!r} is none of them"
+            msg = f"{self.path} has {len(tables)} binary tables; {asked}"
             raise DataError(msg)
-        return chosen
+        return hdus[chosen[0]]
 
-    @property
-    def colnames(self):
-        return self._colnames
-
-    @property
-    def n_rows(self):
-        return self._header["NAXIS2"]
-
-    def _is_foreign(self, name, start, stop):
-        if start == stop or self._dtype[name].base.kind != "S":
-            return False
-        rows = np.memmap(
-            self.path,
-            self._dtype,
-            mode="r",
-            offset=self._start + start * self._width,
-            shape=stop - start,
-        )
-        return bool(np.any(np.ascontiguousarray(rows[name]).view(np.uint8) > 127))
-
-    def _read(self, start, stop):
+    def _read(self, rows):
         with open_fits(self.path, wanted="a catalog", memmap=True) as hdus:
-            table = self._choose(hdus, self._hdu)
-            part = fits.BinTableHDU(table.data[start:stop], header=self._header)
+            part = fits.BinTableHDU(self._choose(hdus).data[rows], header=self._header)
             return QTable.read(part, character_as_bytes=False)
-
-
-class _ECSVRows(RowFile):
-    """
-    Rows of ECSV; a row may go over several lines within quotes.
-
-    `astropy.io.ascii` reads in pieces of its own (``fast_reader={"chunk_size": ...}``), but these are of a number
-    of characters, not of rows, may end within quotes, and are not there for ECSV, whose header has the types.
-    """
-
-    @cached_property
-    def _index(self):
-        """Header, where each piece starts (bytes), number of rows."""
-        header, starts, n_rows, here = [], [], 0, 0
-        n_open, names_read = 0, False
-        with open(self.path, "rb") as stream:
-            for line in stream:
-                begin, here = here, here + len(line)
-                if n_open == 0 and (not line.strip() or line.startswith(b"#")):
-                    if not names_read:
-                        header.append(line)
-                elif not names_read:
-                    header.append(line)
-                    names_read = True
-                else:
-                    if n_open == 0:
-                        if n_rows % self.chunk_rows == 0:
-                            starts.append(begin)
-                        n_rows += 1
-                    n_open = (n_open + line.count(b'"')) % 2
-        if not names_read:
-            msg = f"{self.path} has no line of column names"
-            raise DataError(msg)
-        return b"".join(header), [*starts, here], n_rows
-
-    @property
-    def n_rows(self):
-        return self._index[2]
-
-    @property
-    def _header(self):
-        return self._index[0]
-
-    @cached_property
-    def colnames(self):
-        return tuple(self._parse(b"").colnames)
-
-    def _piece(self, start):
-        """The text of a piece, in bytes."""
-        starts = self._index[1]
-        i = start // self.chunk_rows
-        if i + 1 >= len(starts):
-            return b""
-        with open(self.path, "rb") as stream:
-            stream.seek(starts[i])
-            return stream.read(starts[i + 1] - starts[i])
-
-    def _is_foreign(self, name, start, stop):
-        del name, stop
-        return not self._piece(start).isascii()
-
-    def _parse(self, rows):
-        # a file, for astropy asks of text whether it is a URL, and urllib keeps what it was asked
-        table = QTable.read(io.BytesIO(self._header + rows), format="ascii.ecsv")
-        # what astropy read with is a cycle that holds the text of every field
-        gc.collect()
-        return table
-
-    def _read(self, start, stop):
-        del stop
-        return self._parse(self._piece(start))
-
-
-class _CSVRows(_ECSVRows):
-    """CSV, whose columns are what all of their rows can be read as."""
-
-    @cached_property
-    def _header(self):
-        """Header of ECSV."""
-        names, kinds = self._index[0], {}
-        for i in range(self.n_chunks):
-            text = io.BytesIO(names + self._piece(self.span(i)[0]))
-            for column in Table.read(text, format="ascii.csv").itercols():
-                kinds[column.name] = min(kinds.get(column.name, "i"), column.dtype.kind)
-        lines = ["# %ECSV 1.0", "# ---", "# delimiter: ','", "# datatype:"]
-        for name, kind in kinds.items():
-            lines.append(f"# - {json.dumps({'name': name, 'datatype': _KINDS[kind]})}")
-        return "\n".join([*lines, ""]).encode() + names
-
-
-#: Types of columns, any text first, in the order of the letters.
-_KINDS = {"U": "string", "f": "float64", "i": "int64"}
 
 
 def write_rows(path, tables, n_rows, *, id_width=0, overwrite=False):

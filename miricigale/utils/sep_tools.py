@@ -11,9 +11,10 @@ import numpy as np
 import sep
 
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.units import check_count
 
 
-def native(array, dtype=None):
+def native(array):
     """
     Return an array as sep wants it: C-contiguous, native byte order, not masked.
 
@@ -21,34 +22,27 @@ def native(array, dtype=None):
     ----------
     array : array_like
         Any array (FITS images are big-endian).
-    dtype : dtype, optional
-        Type wanted; by default float32 stays float32, bool and int32 stay, all else
-        becomes float64.
 
     Returns
     -------
     array : `~numpy.ndarray`
-        A view of the input's own memory where it already complies, else a copy.
+        Float32 stays float32, bool and int32 stay, all else becomes float64. A view of the input's
+        own memory where it already complies, else a copy.
     """
     array = np.asarray(array)
-    if dtype is None:
-        kind, size = array.dtype.kind, array.dtype.itemsize
-        if kind == "b":
-            dtype = np.bool_
-        elif kind == "f" and size == 4:
-            dtype = np.float32
-        elif kind in "iu" and size <= 4:
-            dtype = np.int32
-        else:
-            dtype = np.float64
-    return np.ascontiguousarray(array, dtype=np.dtype(dtype).newbyteorder("="))
+    dtype = np.dtype(np.float64)
+    if array.dtype.kind == "b" or (array.dtype.kind == "f" and array.dtype.itemsize == 4):
+        dtype = array.dtype.newbyteorder("=")
+    elif array.dtype.kind in "iu" and array.dtype.itemsize <= 4:
+        dtype = np.dtype(np.int32)
+    return np.ascontiguousarray(array, dtype=dtype)
 
 
-def _image(data, mask, name="data"):
+def _image(data, mask):
     """Return native data with non-finite pixels zeroed and added to the mask."""
     data = native(data)
     if data.ndim != 2:
-        raise argument_error(name, "a two-dimensional image", f"shape {data.shape}")
+        raise argument_error("data", "a two-dimensional image", f"shape {data.shape}")
     if data.dtype.kind != "f":
         data = data.astype(np.float64)
     if mask is not None:
@@ -72,10 +66,10 @@ def background(data, mask=None, box=64, filter_size=3):
         The image; NaN counts as masked.
     mask : array_like of bool, shape (ny, nx), optional
         True where a pixel does not take part.
-    box : int or (int, int), optional
-        Box size in pixels, (y, x) if two.
-    filter_size : int or (int, int), optional
-        Size of the median filter in boxes, (y, x) if two.
+    box : int, optional
+        Box size in pixels.
+    filter_size : int, optional
+        Size of the median filter in boxes.
 
     Returns
     -------
@@ -95,24 +89,23 @@ def background(data, mask=None, box=64, filter_size=3):
     data, mask = _image(data, mask)
     if mask is not None and mask.all():
         raise argument_error("mask", "a mask that leaves some pixels", "all pixels masked")
-    bh, bw = np.broadcast_to(box, 2)
-    fh, fw = np.broadcast_to(filter_size, 2)
-    for name, size in (("box", (bh, bw)), ("filter_size", (fh, fw))):
-        if min(size) < 1:
-            raise argument_error(name, "at least 1", f"{tuple(map(int, size))}")
-    result = sep.Background(data, mask=mask, bw=int(bw), bh=int(bh), fw=int(fw), fh=int(fh))
+    box, size = check_count(box, "box"), check_count(filter_size, "filter_size")
+    result = sep.Background(data, mask=mask, bw=box, bh=box, fw=size, fh=size)
     return result.back(dtype=data.dtype), result.rms(dtype=data.dtype)
+
+
+#: Detection filter of sep and Source Extractor.
+_PYRAMID = np.array([[1.0, 2.0, 1.0], [2.0, 4.0, 2.0], [1.0, 2.0, 1.0]])
 
 
 def extract(
     data,
     threshold,
     *,
-    err=None,
+    err,
     mask=None,
     min_area=5,
-    filter_kernel="default",
-    filter_type="conv",
+    filter_kernel=_PYRAMID,
     deblend_n_thresholds=32,
     deblend_contrast=0.005,
 ):
@@ -124,18 +117,15 @@ def extract(
     data : array_like, shape (ny, nx)
         Background-subtracted image; NaN counts as masked.
     threshold : float
-        In units of ``err`` if that is given, else in the unit of ``data``.
-    err : float or array_like, shape (ny, nx), optional
+        In units of ``err``.
+    err : array_like, shape (ny, nx)
         Noise of a pixel. Values that are not finite or not positive count as masked.
     mask : array_like of bool, shape (ny, nx), optional
         True where there is no data.
     min_area : int, optional
         Least number of connected pixels above the threshold.
-    filter_kernel : array_like, None or "default", optional
-        Detection filter; None for none, "default" for sep's 3 x 3 pyramid.
-    filter_type : {"conv", "matched"}, optional
-        "conv" is Source Extractor's meaning of the threshold. With "matched" the threshold
-        applies to the signal-to-noise of the filtered image.
+    filter_kernel : array_like or None, optional
+        Detection filter; None for none.
     deblend_n_thresholds, deblend_contrast : optional
         Source Extractor's DEBLEND_NTHRESH and DEBLEND_MINCONT (1 turns deblending off).
 
@@ -151,27 +141,14 @@ def extract(
     ValueError
         If arguments disagree in shape or are out of range.
     """
-    if filter_type not in ("conv", "matched"):
-        raise argument_error("filter_type", "'conv' or 'matched'", repr(filter_type))
-    if min_area < 1:
-        raise argument_error("min_area", "at least 1", min_area)
     data, mask = _image(data, mask)
-    if err is not None:
-        if np.ndim(err) == 0:
-            if not (np.isfinite(err) and err > 0):
-                raise argument_error("err", "positive", err)
-            err = float(err)
-        else:
-            err = native(err, data.dtype)
-            if err.shape != data.shape:
-                raise argument_error("err", f"of the image's shape {data.shape}", str(err.shape))
-            bad = ~(np.isfinite(err) & (err > 0))
-            if bad.any():
-                mask = bad if mask is None else mask | bad
-                err = np.where(bad, err.dtype.type(1), err)
-    options = {}
-    if not (isinstance(filter_kernel, str) and filter_kernel == "default"):
-        options["filter_kernel"] = None if filter_kernel is None else native(filter_kernel)
+    err = np.ascontiguousarray(err, data.dtype)
+    if err.shape != data.shape:
+        raise argument_error("err", f"of the image's shape {data.shape}", str(err.shape))
+    bad = ~(np.isfinite(err) & (err > 0))
+    if bad.any():
+        mask = bad if mask is None else mask | bad
+        err = np.where(bad, err.dtype.type(1), err)
     # sep's buffer of detected pixels never overflows
     sep.set_extract_pixstack(max(data.size, sep.get_extract_pixstack()))
     return sep.extract(
@@ -179,12 +156,12 @@ def extract(
         float(threshold),
         err=err,
         mask=mask,
-        minarea=int(min_area),
-        filter_type=filter_type,
+        minarea=check_count(min_area, "min_area"),
+        filter_kernel=None if filter_kernel is None else native(filter_kernel),
+        filter_type="conv",
         deblend_nthresh=int(deblend_n_thresholds),
         deblend_cont=float(deblend_contrast),
         segmentation_map=True,
-        **options,
     )
 
 

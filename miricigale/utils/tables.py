@@ -11,6 +11,7 @@ import numpy as np
 from astropy.table import Table
 
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_least
 from miricigale.utils.units import ANGLE, to_array
 
 __all__ = [
@@ -200,11 +201,8 @@ def require_columns(table, names, argument, *, units=None):
             continue
         have = getattr(table[name], "unit", None)
         have = None if have is None else u.Unit(have)
-        if isinstance(have, u.function.FunctionUnitBase) or have is None:
-            good = False
-        else:
-            good = have.is_equivalent(unit)
-        if not good:
+        # magnitudes are no units of flux
+        if not (isinstance(have, u.UnitBase) and have.is_equivalent(unit)):
             msg = f"'{argument}' column {name!r} must be convertible to {unit}, got {have}"
             raise u.UnitsError(msg)
 
@@ -235,10 +233,8 @@ def read_ids(table, argument="photometry"):
     if ids.ndim != 1:
         raise argument_error(argument, "a table with one id in a row", f"{ids.shape}")
     missing = np.broadcast_to(np.asarray(getattr(column, "mask", False)), ids.shape)
-    if ids.dtype.kind == "O":
-        missing = missing | np.array([value is None for value in ids], dtype=bool)
-    elif ids.dtype.kind in "US":
-        missing = missing | (ids == ids.dtype.type())
+    if ids.dtype.kind in "OUS":
+        missing = missing | np.array([key in (None, "", b"") for key in ids.tolist()], dtype=bool)
     if missing.any():
         rows = np.flatnonzero(missing)
         got = f"{rows.size} masked or empty, the first in row {rows[0]} (from 0)"
@@ -316,18 +312,14 @@ def match_sky(coords, reference, *, radius):
     from astropy.coordinates import match_coordinates_sky
 
     limit = float(to_array(radius, ANGLE, "radius", ndim=0))
-    if not limit >= 0:
-        raise argument_error("radius", "at least 0", radius)
+    check_least(limit, "radius", 0)
     n = len(reference)
     index = np.full(n, -1)
     separation = np.full(n, np.nan)
     if n and len(coords):
         nearest, sep, _ = match_coordinates_sky(reference, coords)
         sep = sep.to_value(u.arcsec)
-        taken = set()
-        for row in np.argsort(sep, kind="stable"):
-            if sep[row] <= limit and nearest[row] not in taken:
-                taken.add(nearest[row])
-                index[row] = nearest[row]
-                separation[row] = sep[row]
+        order = np.argsort(sep, kind="stable")
+        rows, first = np.unique(nearest[order[sep[order] <= limit]], return_index=True)
+        index[order[first]], separation[order[first]] = rows, sep[order[first]]
     return index, separation * u.arcsec

@@ -2,6 +2,7 @@
 
 import importlib
 import os
+from inspect import cleandoc
 
 from astropy.io import registry
 from astropy.io.registry import UnifiedReadWrite, UnifiedReadWriteMethod
@@ -21,31 +22,64 @@ class _Method(UnifiedReadWrite):
         # the method's own text, where it is looked up on an instance
         self.__doc__ = type(self).__doc__
 
-    def _format(self, path, args, kwargs):
+    def _format(self, path, kwargs):
         importlib.import_module(self._cls.io_module)
         known = kwargs.pop("format", None)
         if known is not None:
             return known
         path = os.fspath(path)
-        found = registry.identify_format(self.method, self._cls, path, None, [path, *args], kwargs)
+        found = registry.identify_format(self.method, self._cls, path, None, [path], kwargs)
         if len(found) == 1:
             return found[0]
-        column = "Read" if self.method == "read" else "Write"
-        formats = registry.get_formats(self._cls, column)["Format"].tolist()
+        formats = registry.get_formats(self._cls, self.method.capitalize())["Format"].tolist()
         suffixes = [suffix for name in formats for suffix in _SUFFIXES.get(name, ())]
         msg = f"{path} must end in one of {', '.join(suffixes)}, or 'format' be one of {formats}"
         raise registry.IORegistryError(msg)
 
 
 class _Read(_Method):
+    """
+    Read {what} from a file that `write` made.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    {options}format : str, optional
+        By default by the suffix of ``path``.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If the file is missing, something else or incomplete.
+    """
+
     method = "read"
 
     def __call__(self, path, *args, **kwargs):
-        found = self._format(path, args, kwargs)
+        found = self._format(path, kwargs)
         return self.registry.read(self._cls, path, *args, format=found, **kwargs)
 
 
 class _Write(_Method):
+    """
+    Write {what} to a file, from which `read` gets it back.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    format : str, optional
+        By default by the suffix of ``path``.
+    overwrite : bool, optional
+        Whether a file that is there is replaced.
+
+    Raises
+    ------
+    OSError
+        If the file is there and ``overwrite`` is not set.
+    """
+
     method = "write"
 
     def __call__(self, path, *args, **kwargs):
@@ -54,33 +88,17 @@ class _Write(_Method):
         # other formats hold the table that people want, and cannot be read back as the whole
         if not found and "format" not in kwargs and hasattr(self._instance, "to_table"):
             return write_table(self._instance.to_table(), path, **kwargs)
-        found = self._format(path, args, kwargs)
+        found = self._format(path, kwargs)
         return self.registry.write(self._instance, path, *args, format=found, **kwargs)
-
-
-def unified_read(doc):
-    """
-    Class method ``read(path, *, format=None, **options)``.
-
-    The class has an attribute ``io_module``: the name of the module that registers its formats,
-    imported when a file is first read or written.
-
-    Parameters
-    ----------
-    doc : str
-        Docstring of the method, of several lines: astropy adds the list of formats.
-    """
-    return UnifiedReadWriteMethod(type("Read", (_Read,), {"__doc__": doc}))
-
-
-def unified_write(doc):
-    """Method ``write(path, *, format=None, overwrite=False)``; see `unified_read`."""
-    return UnifiedReadWriteMethod(type("Write", (_Write,), {"__doc__": doc}))
 
 
 def read_write(what, options=""):
     """
     Class attributes ``read`` and ``write`` of a class.
+
+    The methods are ``read(path, *, format=None, **options)`` and ``write(path, *, format=None, overwrite=False)``.
+    The class has an attribute ``io_module``: the name of the module that registers its formats, imported when
+    a file is first read or written.
 
     Parameters
     ----------
@@ -92,36 +110,17 @@ def read_write(what, options=""):
     Returns
     -------
     read, write
-        See `unified_read`.
     """
-    path = "Parameters\n----------\npath : path-like\n    The file.\n"
-    known = "format : str, optional\n    By default by the suffix of ``path``.\n"
-    read = f"""
-Read {what} from a file that `write` made.
-
-{path}{options}{known}
-Raises
-------
-`~miricigale.utils.exceptions.DataError`
-    If the file is missing, something else or incomplete.
-"""
-    write = f"""
-Write {what} to a file, from which `read` gets it back.
-
-{path}{known}overwrite : bool, optional
-    Whether a file that is there is replaced.
-
-Raises
-------
-OSError
-    If the file is there and ``overwrite`` is not set.
-"""
-    return unified_read(read), unified_write(write)
+    docs = [cleandoc(base.__doc__).format(what=what, options=options) for base in (_Read, _Write)]
+    return tuple(
+        UnifiedReadWriteMethod(type(base.__name__, (base,), {"__doc__": doc}))
+        for base, doc in zip((_Read, _Write), docs, strict=True)
+    )
 
 
 def register(cls, *, read=None, write=None, name="fits"):
     """
-    Register a format of a class; files are recognized by their suffix.
+    Register a format of a class, known by its suffix.
 
     Parameters
     ----------

@@ -146,16 +146,6 @@ def test_catalog_convention_gives_the_true_flux_of_its_reference_spectrum():
     assert Filter.from_name("miri.f770w").catalog_factor == 1
 
 
-def test_spectrum_that_does_not_cover_the_band_is_refused():
-    with pytest.raises(ValueError, match=r"leaves .*% of filter 'box'"):
-        box().synthetic_flux(spectrum(np.array([5.0, 11.0]), np.ones(2)))
-    with pytest.raises(ValueError, match=r"leaves 100.00% of filter 'box'"):
-        box().synthetic_flux(spectrum(np.array([50.0, 110.0]), np.ones(2)))
-    # less than 1e-4 of the weight is missing
-    sed = spectrum(np.array([8.0001, 20.0]), np.full(2, 7.0))
-    assert_quantity_allclose(box().synthetic_flux(sed), 7 * u.uJy)
-
-
 @pytest.mark.parametrize(
     ("wave", "throughput", "message"),
     [
@@ -168,11 +158,6 @@ def test_spectrum_that_does_not_cover_the_band_is_refused():
 )
 def test_rejects_what_is_no_curve(wave, throughput, message):
     refuses(message, Filter, wave, throughput, name="bad")
-
-
-def test_rejects_wrong_units():
-    refuses("'wave' must be", Filter, [1, 2] * u.K, [1, 1], error=u.UnitsError, name="bad")
-    refuses("'wave' must be a quantity", Filter, [1, 2], [1, 1], error=u.UnitsError, name="bad")
 
 
 def test_any_curve_of_sedpy_by_its_name():
@@ -192,26 +177,14 @@ def test_reads_the_files_of_cigale(tmp_path):
     # micrometers would be taken for Angstrom
     path.write_text("8 1\n12 1\n")
     refuses("does not state the unit of its wavelengths", Filter.read, path, error=DataError)
+    refuses("none.dat cannot be read", Filter.read, tmp_path / "none.dat", error=DataError)
+    (tmp_path / "text.dat").write_text("one two\n")
+    refuses("has not two columns of num", Filter.read, tmp_path / "text.dat", error=DataError)
     band = Filter.read(path, name="a", unit=u.um)
     assert_quantity_allclose(band.pivot, box().pivot, rtol=1e-9)
     for name in ("a.ecsv", "a.fits", "a.xml"):
         band.write(tmp_path / name)
         assert Filter.read(tmp_path / name, name="a") == band
-
-
-def test_unreadable_files_are_named(tmp_path):
-    path = tmp_path / "some.dat"
-    refuses(r"some.dat cannot be read", Filter.read, path, error=DataError)
-    path.write_text("one two\n")
-    refuses(r"some.dat has not two columns of numbers", Filter.read, path, error=DataError)
-
-
-def test_plot_returns_the_axes():
-    from matplotlib.figure import Figure
-
-    ax = Figure().add_subplot()
-    assert Filter.from_name("miri.f770w").plot(ax=ax) is ax
-    assert len(ax.lines) == 1
 
 
 def test_spectra_of_other_packages():
@@ -252,51 +225,47 @@ def test_a_filter_says_what_it_has():
     with pytest.raises(AttributeError, match=r"Filter has no 'min_wave'; it has .*wave"):
         band.min_wave  # noqa: B018
     assert Filter([1, 2] * u.um, [1, 1], "own") == Filter("own", [1, 2] * u.um, [1, 1])
-    refuses("'wave' must be a quantity", Filter, [1, 2], [1, 1], error=u.UnitsError, name="own")
+    for wave in ([1, 2], [1, 2] * u.K):
+        refuses("'wave' must be", Filter, wave, [1, 1], error=u.UnitsError, name="own")
 
 
-@pytest.mark.parametrize(
-    ("text", "name"),
-    [
-        ("MIRI F770W", "miri.f770w"),
-        ("miri_f770w", "miri.f770w"),
-        ("JWST/MIRI.F770W", "miri.f770w"),
-        ("jwst_f770w", "miri.f770w"),
-        ("jwst.miri.F770W", "miri.f770w"),
-        ("jwst_nircam_f444w", "nircam.f444w"),
-        ("WFC3/IR F160W", "wfc3.f160w"),
-        ("wfc3_ir_f160w", "wfc3.f160w"),
-        ("hst/wfc3/IR/f160w.dat", "wfc3.f160w"),
-        ("HST/ACS_WFC.F606W", "acs.f606w"),
-        ("hst/ACS_update_sep07/wfc_f606w_t81.dat", "acs.f606w"),
-        ("f_F160W", None),
-        ("IRAC1", "irac.ch1"),
-        ("IRAC 4.5", "irac.ch2"),
-        ("Spitzer/IRAC.I3", "irac.ch3"),
-        ("IRAC/irac_tr4_2004-08-09.dat", "irac.ch4"),
-        ("MIPS1", "mips.24"),
-        ("Spitzer/MIPS.24mu", "mips.24"),
-        ("2mass_Ks", "sedpy.twomass_Ks"),
-        ("2MASS/2MASS.J", "sedpy.twomass_J"),
-        ("Paranal/VISTA.Ks", "sedpy.vista_vircam_Ks"),
-        ("UKIRT/UKIDSS.K", "sedpy.ukirt_wfcam_K"),
-        ("SDSS r", "sedpy.sdss_r0"),
-        ("SLOAN/SDSS.r", "sedpy.sdss_r0"),
-        ("GALEX/GALEX.FUV", "sedpy.galex_FUV"),
-        ("WISE/WISE.W3", "sedpy.wise_w3"),
-        ("pacs.green", "sedpy.herschel_pacs_100"),
-        ("Herschel/SPIRE.PSW", "sedpy.herschel_spire_250"),
-        # one of many
-        ("r", None),
-        ("Ks", None),
-    ],
-)
-def test_names_of_others(text, name):
-    assert find_filter(text) == name
+#: Names in other packages and papers, of filters here; None is one of many, or no filter.
+OTHERS = {
+    "miri.f770w": ["MIRI F770W", "miri_f770w", "JWST/MIRI.F770W", "jwst_f770w", "jwst.miri.F770W"],
+    "nircam.f444w": ["jwst_nircam_f444w"],
+    "wfc3.f160w": ["WFC3/IR F160W", "wfc3_ir_f160w", "hst/wfc3/IR/f160w.dat"],
+    "acs.f606w": ["HST/ACS_WFC.F606W", "hst/ACS_update_sep07/wfc_f606w_t81.dat"],
+    "irac.ch1": ["IRAC1"],
+    "irac.ch2": ["IRAC 4.5"],
+    "irac.ch3": ["Spitzer/IRAC.I3"],
+    "irac.ch4": ["IRAC/irac_tr4_2004-08-09.dat"],
+    "mips.24": ["MIPS1", "Spitzer/MIPS.24mu"],
+    "sedpy.twomass_Ks": ["2mass_Ks"],
+    "sedpy.twomass_J": ["2MASS/2MASS.J"],
+    "sedpy.vista_vircam_Ks": ["Paranal/VISTA.Ks"],
+    "sedpy.ukirt_wfcam_K": ["UKIRT/UKIDSS.K"],
+    "sedpy.sdss_r0": ["SDSS r", "SLOAN/SDSS.r"],
+    "sedpy.galex_FUV": ["GALEX/GALEX.FUV"],
+    "sedpy.wise_w3": ["WISE/WISE.W3"],
+    "sedpy.herschel_pacs_100": ["pacs.green"],
+    "sedpy.herschel_spire_250": ["Herschel/SPIRE.PSW"],
+    None: ["f_F160W", "r", "Ks"],
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_names_of_others(name):
+    assert {find_filter(text) for text in OTHERS[name]} == {name}
 
 
 def test_what_is_no_spectrum_is_named():
-    band = box()
-    refuses(r"'sed' must be a spectrum: .*, got NoneType", band.synthetic_flux, None)
-    with pytest.raises(ValueError, match=r"'sed\.fnu' must be as many values as sed\.wave, got 2"):
-        band.synthetic_flux(spectrum([7, 9, 13], [1, 1]))
+    for sed, match in (
+        (None, r"'sed' must be a spectrum: .*, got NoneType"),
+        (spectrum([7, 9, 13], [1, 1]), r"'sed\.fnu' must be as many values as sed\.wave, got 2"),
+        (spectrum(np.array([5.0, 11.0]), np.ones(2)), r"leaves .*% of filter 'box'"),
+        (spectrum(np.array([50.0, 110.0]), np.ones(2)), r"leaves 100.00% of filter 'box'"),
+    ):
+        refuses(match, box().synthetic_flux, sed)
+    # less than 1e-4 of the weight is missing
+    sed = spectrum(np.array([8.0001, 20.0]), np.full(2, 7.0))
+    assert_quantity_allclose(box().synthetic_flux(sed), 7 * u.uJy)

@@ -84,8 +84,8 @@ def test_uncovered_band_is_an_error_or_zero_on_request(filters):
 def test_rejects_bad_sets(filters):
     refuses("different names", FilterSet.from_names, ["miri.f770w", "miri.f770w"])
     refuses("one or more", FilterSet, [])
-    with pytest.raises(KeyError, match=r"no filter in this set 'nope'; known: irac.ch4"):
-        filters["nope"]
+    match = r"no filter in this set 'nope'; known: irac.ch4"
+    refuses(match, filters.__getitem__, "nope", error=KeyError)
     refuses("strictly ascending", filters.weights, [3.0, 2.0])
 
 
@@ -125,15 +125,12 @@ def test_names_are_forgiving():
     # a filter of one's own keeps its name
     own = Filter([1, 2] * u.um, [1, 1], name="F770W")
     assert FilterSet([own, "miri.f770w"])["F770W"] is own
-    with pytest.raises(
-        KeyError, match=r"no filter 'miri.f707w'; the nearest of 63 are miri.f770w, "
+    for name, match in (
+        ("miri.f707w", r"no filter 'miri.f707w'; the nearest of 63 are miri.f770w, "),
+        ("sedpy.jwst_f707w", r"no curve .* 'jwst_f707w'; the nearest .* jwst_f770w"),
+        ("something else", r"^((?!did you mean).)*$"),
     ):
-        Filter.from_name("miri.f707w")
-    with pytest.raises(KeyError, match=r"no curve .* 'jwst_f707w'; the nearest .* jwst_f770w"):
-        Filter.from_name("sedpy.jwst_f707w")
-    with pytest.raises(KeyError) as info:
-        Filter.from_name("something else")
-    assert "did you mean" not in str(info.value)
+        refuses(match, Filter.from_name, name, error=KeyError)
 
 
 def test_plot_returns_the_axes(filters):
@@ -142,3 +139,5 @@ def test_plot_returns_the_axes(filters):
     ax = Figure().add_subplot()
     assert filters.plot(ax=ax) is ax
     assert len(ax.lines) == 5
+    assert filters[0].plot(ax=ax) is ax
+    assert len(ax.lines) == 6

@@ -1,1 +1,1 @@
-"""What the tests of several rooms share: light in closed form, scenes, mosaics, grids, results."""
+"""What the tests of several folders share: light in closed form, scenes, mosaics, grids, results."""

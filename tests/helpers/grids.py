@@ -9,7 +9,7 @@ from miricigale.sed import ModelGrid
 
 
 def make_grid(seed=0, *, n_z=4, n_tau=5, n_age=4, polar=(0.0, 0.1, 0.3), frac=None, n_b=6):
-    """Smooth random spectra: galaxies and tori that overlap but can be told apart."""
+    """Smooth random spectra: galaxies and tori that overlap but can be distinguished."""
     rng = np.random.default_rng(seed)
     redshift = np.linspace(0.2, 2.0, n_z) if n_z > 1 else np.array([0.7])
     tau, age = np.linspace(0.5, 3.0, n_tau), np.linspace(0.5, 9.0, n_age)

@@ -5,8 +5,8 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData
 from astropy.table import QTable
-from astropy.wcs import WCS
 
+from miricigale.instrument import north_up_wcs
 from miricigale.psf import MatchingKernel
 from miricigale.sed import SEDModel
 from miricigale.workflow import Context
@@ -17,6 +17,7 @@ from miricigale.workflow.stages.truth import add_agn, add_field_agn
 from miricigale.workflow.truths import CATALOG, FIELD, study_truths
 
 STAGES = {stage.name: stage for stage in study_stages()}
+CENTER = SkyCoord(53.13440 * u.deg, -27.83444 * u.deg)
 SCALE = 0.11
 #: Pixels of the made-up images, and the rim that is masked.
 SHAPE, RIM = (130, 170), 15
@@ -25,11 +26,7 @@ AREA = 100 * 140 * SCALE**2 / 3600
 
 def sky_image(scale, shape, data, *, rim=0):
     """A north-up image about the pointing of the default configuration."""
-    wcs = WCS(naxis=2)
-    wcs.wcs.ctype = "RA---TAN", "DEC--TAN"
-    wcs.wcs.crval = 53.13440, -27.83444
-    wcs.wcs.crpix = (shape[1] + 1) / 2, (shape[0] + 1) / 2
-    wcs.wcs.cdelt = -scale / 3600, scale / 3600
+    wcs = north_up_wcs(CENTER, scale * u.arcsec, shape)
     mask = np.zeros(shape, bool)
     if rim:
         mask = np.ones(shape, bool)
@@ -110,9 +107,8 @@ def make_run(folder, filters, *, mass=3e10, points=False, report=True, text_ids=
     made = Context(config, folder)
     rng = np.random.default_rng(1)
     count = 24
-    center = SkyCoord(53.13440 * u.deg, -27.83444 * u.deg)
     step = rng.uniform([[-7.0], [-5.0]], [[7.0], [5.0]], size=(2, count)) * u.arcsec
-    sky = center.spherical_offsets_by(*step)
+    sky = CENTER.spherical_offsets_by(*step)
     parameters = QTable({"id": np.arange(1, count + 1), "redshift": np.linspace(0.3, 2.5, count)})
     if text_ids:
         parameters["id"] = [f"src-{key}" for key in parameters["id"]]
@@ -130,7 +126,7 @@ def make_run(folder, filters, *, mass=3e10, points=False, report=True, text_ids=
         bright.meta.update(f_scaling=0.9987, f_scaling_err=0.001, f_aper=1.14)
         made.save_table(f"points/{name}.ecsv", bright)
     for one in study_truths(config).values():
-        _save_truth(made, one, parameters, sky, center, rng)
+        _save_truth(made, one, parameters, sky, rng)
     do_stage(config, folder, "errors")
     for name in study_truths(config):
         do_stage(config, folder, "matches", name)
@@ -141,7 +137,7 @@ def make_run(folder, filters, *, mass=3e10, points=False, report=True, text_ids=
     return folder / "report"
 
 
-def _save_truth(made, one, parameters, sky, center, rng):
+def _save_truth(made, one, parameters, sky, rng):
     """The products of one truth: its sources, exposures, mosaics and photometry."""
     config, filters, count = made.config, made.config.exposures.filters, len(parameters)
     parameters = parameters.copy()
@@ -174,7 +170,7 @@ def _save_truth(made, one, parameters, sky, center, rng):
         residual = sky_image(SCALE, SHAPE, image.data - light, rim=RIM)
         made.save_image(f"{one.name}/photometry/{name}_residual.fits", residual)
         # one more than there are sources, which no source is near; the first is at the edge
-        table = QTable({"id": np.arange(1, count + 2), "sky": _with_one_more(sky, center)})
+        table = QTable({"id": np.arange(1, count + 2), "sky": _with_one_more(sky)})
         flux = np.append(truth[name].value + rng.normal(0, 0.2, count), 5.0)
         table["flux"] = flux * u.uJy
         table["flux_err"] = np.full(count + 1, 0.2) * u.uJy
@@ -192,6 +188,6 @@ def thicker_half(folder, name, n):
     return n_images
 
 
-def _with_one_more(sky, center):
-    far = center.spherical_offsets_by(0 * u.arcsec, 5.4 * u.arcsec)
+def _with_one_more(sky):
+    far = CENTER.spherical_offsets_by(0 * u.arcsec, 5.4 * u.arcsec)
     return SkyCoord([*sky.ra.deg, far.ra.deg] * u.deg, [*sky.dec.deg, far.dec.deg] * u.deg)

@@ -56,18 +56,15 @@ def catalog_at(sky, **columns):
 def make_catalog(wcs, x, y, *, flux=10.0, profile="point", **columns):
     """A catalog of sources at given pixels."""
     x, y = np.broadcast_arrays(np.atleast_1d(np.asarray(x, float)), np.atleast_1d(y))
-    n = len(x)
-    table = QTable()
-    table["id"] = np.arange(1, n + 1)
-    table["sky"] = SkyCoord(*wcs.all_pix2world(x, y, 0), unit="deg")
-    table["redshift"] = np.full(n, 1.0)
-    table["profile"] = np.broadcast_to(profile, n)
-    table["half_light_radius"] = np.broadcast_to(columns.get("radius", 0.3), n) * u.arcsec
-    table["sersic_index"] = np.broadcast_to(columns.get("index", 1.0), n)
-    table["axis_ratio"] = np.broadcast_to(columns.get("ratio", 1.0), n)
-    table["position_angle"] = np.broadcast_to(columns.get("angle", 0.0), n) * u.deg
-    table[FILTER] = np.broadcast_to(np.asarray(flux, float), n) * u.uJy
-    return table
+    given = {
+        "profile": profile,
+        "half_light_radius": columns.get("radius", 0.3) * u.arcsec,
+        "sersic_index": columns.get("index", 1.0),
+        "axis_ratio": columns.get("ratio", 1.0),
+        "position_angle": columns.get("angle", 0.0) * u.deg,
+        FILTER: np.asarray(flux, float) * u.uJy,
+    }
+    return catalog_at(SkyCoord(*wcs.all_pix2world(x, y, 0), unit="deg"), **given)
 
 
 def make_scene(catalog, wcs, psf, **options):

@@ -66,10 +66,8 @@ def test_cycling_spreads_over_its_circle_and_the_pixel(name, limit):
 
 def test_cycling_goes_on_from_tile_to_tile():
     every = dither_offsets("cycling-medium", 20)
-    first, then = (
-        dither_offsets("cycling-medium", 12),
-        dither_offsets("cycling-medium", 8, start=12),
-    )
+    first = dither_offsets("cycling-medium", 12)
+    then = dither_offsets("cycling-medium", 8, start=12)
     assert_allclose(np.vstack([first, then]).value, every.value)
     field = SkyCoord(53.1, -27.8, unit="deg")
     base = Exposure("miri.f2100w", n_groups=10, pointing=field, roll=20 * u.deg)
@@ -80,12 +78,10 @@ def test_cycling_goes_on_from_tile_to_tile():
         assert_allclose([x - 692.5, y - 511.5], [-dx / 0.1105, -dy / 0.1113], atol=0.7)
 
 
-def test_all_of_a_pattern_if_not_told_how_many():
+def test_all_of_a_pattern_by_default():
     assert dither_offsets("4-point").shape == (4, 2)
-    assert dither_offsets([[0, 0], [1, 2], [3, 4]] * u.arcsec, start=1).value.tolist() == [
-        [1, 2],
-        [3, 4],
-    ]
+    offsets = [[0, 0], [1, 2], [3, 4]]
+    assert dither_offsets(offsets * u.arcsec, start=1).value.tolist() == offsets[1:]
 
 
 @pytest.mark.parametrize("suffix", ["ecsv", "fits"])
@@ -97,6 +93,10 @@ def test_a_table_and_its_file(tmp_path, suffix):
     table.write(path)
     assert_allclose(read_dithers(path).value, truth)
     assert_allclose(dither_offsets(path, 2).value, truth[:2])
+    for name in ("observation", "exposure"):
+        refuses(f"'{name}' must be left out, but for a .pointing", read_dithers, path, **{name: 1})
+    path.write_text("nonsense")
+    refuses("cannot be read as a table", read_dithers, path, error=DataError)
 
 
 def test_a_list_of_pointings(tmp_path):
@@ -121,10 +121,8 @@ def test_a_list_of_pointings(tmp_path):
     assert_allclose(read_dithers(path, exposure=1).value, truth)
     refuses(r"'observation' must be one of \[4, 7\], got None", read_dithers, several)
     other = pointing_list(tmp_path / "nircam.pointing", {1: rows[4:5]})
-    with pytest.raises(
-        DataError, match=r"no exposures of MIRIM apertures; it has \['NRCALL_FULL'\]"
-    ):
-        read_dithers(other)
+    match = r"no exposures of MIRIM apertures; it has \['NRCALL_FULL'\]"
+    refuses(match, read_dithers, other, error=DataError)
 
 
 @pytest.mark.parametrize("overlap", [0.0, 0.2])
@@ -151,11 +149,6 @@ def test_tiles_meet_on_the_sky(overlap):
     assert found.separation(center) < 0.01 * u.arcsec
 
 
-def test_refuses_tiles():
-    refuses("'n_y' must be a positive integer, got 0", tile_offsets, 2, 0)
-    refuses("'overlap' must be at least 0 and less than 1, got 1", tile_offsets, 2, 2, overlap=1)
-
-
 def test_exposures_of_a_list_with_dithers_of_their_own(tmp_path):
     patterns = {
         1: [(-1.446, 3.956), (3.771, -5.358), (1.035, 4.889)],
@@ -170,10 +163,8 @@ def test_exposures_of_a_list_with_dithers_of_their_own(tmp_path):
     for exp, offsets in patterns.items():
         assert_allclose(read_dithers(path, exposure=exp).value, offsets)
     for exposure in (None, 3):
-        with pytest.raises(
-            ValueError, match=rf"'exposure' must be one of \[1, 2\], got {exposure}"
-        ):
-            read_dithers(path, exposure=exposure)
+        match = rf"'exposure' must be one of \[1, 2\], got {exposure}"
+        refuses(match, read_dithers, path, exposure=exposure)
 
 
 def test_tiles_have_one_pattern_or_none(tmp_path):
@@ -185,25 +176,45 @@ def test_tiles_have_one_pattern_or_none(tmp_path):
         lines = ["* Deep field (Obs 1)", HEADER, tile(1, 0.5), tile(2, x)]
         (tmp_path / f"{name}.pointing").write_text("\n".join(lines))
     assert_allclose(read_dithers(tmp_path / "same.pointing").value, [[0.5, 1.0]])
-    with pytest.raises(ValueError, match=r"other\.pointing: tiles of the observation have dithers"):
-        read_dithers(tmp_path / "other.pointing")
+    match = r"other\.pointing: tiles of the observation have dithers"
+    refuses(match, read_dithers, tmp_path / "other.pointing")
 
 
-def test_a_table_has_no_observations(tmp_path):
-    path = tmp_path / "dithers.ecsv"
-    QTable({"x_offset": [1] * u.arcsec, "y_offset": [2] * u.arcsec}).write(path)
-    for name in ("observation", "exposure"):
-        refuses(f"'{name}' must be left out, but for a .pointing", read_dithers, path, **{name: 1})
+OFFSETS = [[0, 0], [1, 2]] * u.arcsec
+BARE = QTable({"x_offset": [1.0], "y_offset": [1.0]})
 
 
-def test_refuses(tmp_path):
-    refuses("no file of dithers", read_dithers, tmp_path / "nothing.ecsv", error=DataError)
-    path = tmp_path / "text.ecsv"
-    path.write_text("nonsense")
-    refuses(r"text\.ecsv cannot be read as a table", read_dithers, path, error=DataError)
-    refuses(r"'pattern' must be .*'y_offset'", dither_offsets, QTable({"x_offset": [1] * u.arcsec}))
-    with pytest.raises(u.UnitsError, match="'x_offset' must be convertible to arcsec"):
-        dither_offsets(QTable({"x_offset": [1.0], "y_offset": [1.0]}))
-    refuses("'start' must be 0 or a positive integer", dither_offsets, "ceers", 3, start=-1)
-    with pytest.raises(ValueError, match=r"'pattern' must be offsets of shape \(3, 2\)"):
-        dither_offsets([[0, 0], [1, 2]] * u.arcsec, 2, start=1)
+@pytest.mark.parametrize(
+    ("function", "args", "options", "error", "match"),
+    [
+        (tile_offsets, [2, 0], {}, ValueError, "'n_y' must be an integer >= 1, got 0"),
+        (tile_offsets, [2, 2], {"overlap": 1}, ValueError, "'overlap' must be at least 0 and less"),
+        (read_dithers, ["nothing.ecsv"], {}, DataError, "no file of dithers"),
+        (dither_offsets, [BARE[["x_offset"]]], {}, ValueError, "'pattern' must be .*'y_offset'"),
+        (dither_offsets, [BARE], {}, u.UnitsError, "'x_offset' must be convertible to arcsec"),
+        (
+            dither_offsets,
+            ["ceers", 3],
+            {"start": -1},
+            ValueError,
+            "'start' must be an integer >= 0",
+        ),
+        (dither_offsets, ["spiral", 3], {}, KeyError, "no dither pattern 'spiral'; known: 4-point"),
+        (
+            dither_offsets,
+            [OFFSETS, 3],
+            {},
+            ValueError,
+            r"'pattern' must be offsets of shape \(3, 2",
+        ),
+        (
+            dither_offsets,
+            [OFFSETS, 2],
+            {"start": 1},
+            ValueError,
+            r"must be offsets of shape \(3, 2",
+        ),
+    ],
+)
+def test_refuses(function, args, options, error, match):
+    refuses(match, function, *args, error=error, **options)

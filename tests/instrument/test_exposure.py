@@ -26,8 +26,8 @@ ROLL = 120 * u.deg
 
 
 def exposure(**options):
-    options = {"n_groups": 10, "pointing": FIELD, "roll": ROLL, **options}
-    return Exposure("miri.f770w", **options)
+    options = {"filter": "F770W", "n_groups": 10, "pointing": FIELD, "roll": ROLL, **options}
+    return Exposure(**options)
 
 
 def test_times_follow_from_the_frames():
@@ -57,11 +57,10 @@ def test_the_trial_keeps_every_band():
     assert len(exposures) == 12
     full = sum(e.exposure_time for e in ceers_exposures(FIELD, ROLL))
     assert sum(e.exposure_time for e in exposures) < 0.3 * full
-    assert {e.filter for e in ceers_exposures(FIELD, ROLL, filters=["miri.f770w"])} == {
-        "miri.f770w"
-    }
-    with pytest.raises(KeyError, match=r"no band of the survey 'miri.f560w'"):
-        ceers_exposures(FIELD, ROLL, filters=["miri.f560w"])
+    one = ceers_exposures(FIELD, ROLL, filters=["miri.f770w"])
+    assert {e.filter for e in one} == {"miri.f770w"}
+    match, options = "no band of the survey 'miri.f560w'", {"filters": ["miri.f560w"]}
+    refuses(match, ceers_exposures, FIELD, ROLL, error=KeyError, **options)
 
 
 def test_no_integration_of_the_survey_saturates_on_the_sky():
@@ -104,9 +103,6 @@ def test_patterns_go_on_and_tables_are_taken():
         assert len(np.unique(offsets.value.round(6), axis=0)) == 13
     table = [[0, 0], [1, -2]] * u.arcsec
     assert_quantity_allclose(dither_offsets(table, 2), table)
-    refuses(r"'pattern' must be offsets of shape \(3, 2\)", dither_offsets, table, 3)
-    with pytest.raises(KeyError, match="no dither pattern 'spiral'; known: 4-point"):
-        dither_offsets("spiral", 3)
 
 
 def test_keywords_of_the_pointing():
@@ -137,9 +133,9 @@ def test_normalizes_and_freezes():
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
-        ({"n_groups": 1}, ValueError, "'n_groups' must be an integer of at least 2, got 1"),
+        ({"n_groups": 1}, ValueError, "'n_groups' must be an integer >= 2, got 1"),
         ({"n_groups": 2.5}, ValueError, "'n_groups' must be an integer"),
-        ({"n_integrations": 0}, ValueError, "'n_integrations' must be an integer of at least 1"),
+        ({"n_integrations": 0}, ValueError, "'n_integrations' must be an integer >= 1"),
         ({"readout": "FAST"}, KeyError, "no readout pattern 'FAST'; known: FASTR1, SLOWR1"),
         ({"subarray": "SUB1"}, KeyError, "no sub-array 'SUB1'"),
         (
@@ -147,6 +143,10 @@ def test_normalizes_and_freezes():
             KeyError,
             "no sub-array of SLOWR1 'SUB256'; known: FULL",
         ),
+        ({"filter": "wfc3.f160w"}, KeyError, "no imaging filter 'wfc3.f160w'; known: miri.f1000w"),
+        ({"n_groups": None}, ValueError, "'n_groups, time' must be one of them given, got neither"),
+        ({"time": 1 * u.h}, ValueError, "'n_groups, time' must be one of them given, got both"),
+        ({"time": 3 * u.s, "n_groups": None}, ValueError, "'time' must be at least two frames"),
         ({"roll": 3 * u.s}, u.UnitsError, "'roll' must be convertible to deg"),
         ({"pointing": 3}, ValueError, "'pointing' must be one SkyCoord"),
     ],
@@ -191,18 +191,8 @@ def test_time_in_place_of_groups():
     assert split.exposure_time.to_value(u.min) == pytest.approx(30, abs=0.3)
     # 111 frames of 2.775 s
     assert made.replace(time=308 * u.s).exposure_time.to_value(u.s) == pytest.approx(308, abs=3)
-    refuses(
-        "'n_integrations' must be an integer", Exposure, "F770W", time=1 * u.h, n_integrations=0
-    )
     small = Exposure.from_time("F770W", 1 * u.min, readout="fastr1", subarray="sub64")
     assert small.exposure_time.to_value(u.s) == pytest.approx(60, abs=0.1)
-    refuses(
-        "'n_groups, time' must be one of them given, got both",
-        made.replace,
-        time=1 * u.h,
-        n_groups=3,
-    )
-    refuses("'n_groups, time' must be one of them given, got neither", Exposure, "F770W")
 
 
 def test_the_footprint_is_the_field_of_the_array():
@@ -214,10 +204,3 @@ def test_the_footprint_is_the_field_of_the_array():
     ax = made.plot()
     assert ax.xaxis_inverted()
     np.testing.assert_allclose(ax.patches[0].get_xy()[:4, 1], corners.dec.deg)
-
-
-def test_rejects_foreign_filters():
-    with pytest.raises(KeyError, match=r"no imaging filter 'wfc3.f160w'; known: miri.f1000w"):
-        Exposure("wfc3.f160w", n_groups=10, pointing=FIELD, roll=ROLL)
-    with pytest.raises(ValueError, match="'time' must be at least two frames"):
-        Exposure.from_time("miri.f770w", 3 * u.s, pointing=FIELD, roll=ROLL)

@@ -23,14 +23,8 @@ def test_an_image_is_written_and_read_by_astropy(tmp_path):
         "text": "x" * 300,
     }
     data = np.arange(12.0).reshape(3, 4)
-    image = Image(
-        data,
-        unit=u.MJy / u.sr,
-        wcs=wcs,
-        meta=meta,
-        uncertainty=StdDevUncertainty(data + 1),
-        mask=data > 10,
-    )
+    image = Image(data, unit="MJy/sr", wcs=wcs, meta=meta, mask=data > 10)
+    image.uncertainty = StdDevUncertainty(data + 1)
     image.write(tmp_path / "a.fits")
     back = CCDData.read(tmp_path / "a.fits")
     np.testing.assert_array_equal(back.data, data)

@@ -183,10 +183,10 @@ def test_offsets_follow_the_turned_axes():
 
 def test_rejects_what_is_no_pointing():
     refuses("'pointing' must be one SkyCoord", imager_wcs, 53, ROLL)
-    with pytest.raises(u.UnitsError, match="'roll' must be a quantity convertible to deg"):
-        imager_wcs(FIELD, 35)
-    with pytest.raises(KeyError, match="no sub-array 'SUB999'; known: BRIGHTSKY, FULL"):
-        imager_wcs(FIELD, ROLL, subarray="SUB999")
+    match = "'roll' must be a quantity convertible to deg"
+    refuses(match, imager_wcs, FIELD, 35, error=u.UnitsError)
+    match, other = "no sub-array 'SUB999'; known: BRIGHTSKY, FULL", {"subarray": "SUB999"}
+    refuses(match, imager_wcs, FIELD, ROLL, error=KeyError, **other)
     refuses("'pixel_scale' must be positive", north_up_wcs, FIELD, 0 * u.arcsec, (3, 3))
     refuses("'exposures' must be at least one exposure", mosaic_wcs, [], 0.1 * u.arcsec)
 

@@ -12,7 +12,7 @@ from miricigale.planning import Planner, area_table, comparison_table, load_plan
 from miricigale.planning.accuracy import accuracy
 from miricigale.planning.planner import EXISTING
 from miricigale.utils.exceptions import ConfigError
-from miricigale.utils.parallel import thread_pool
+from miricigale.utils.parallel import threads
 
 BANDS = ["miri.f770w", "miri.f1500w"]
 SETTINGS = {
@@ -62,7 +62,7 @@ def test_noise_is_that_of_the_errors(planner):
 
 
 def test_draws_belong_to_source_and_band_and_no_thread_changes_them(planner, plans):
-    with thread_pool(2) as executor:
+    with threads(2) as executor:
         other = Planner(planner.config, executor=executor)
         again = other.evaluate(["miri.f770w"])
     mine = plans[2].sources

@@ -54,14 +54,8 @@ def test_pixel_is_that_of_the_distortion(x, y):
 def test_optics_at_a_position_are_those_of_the_warped_pupil(name, oversampling):
     """|F(P)|^2 sampled at J p is |F(P(J^-T w))|^2 at p: no interpolation, no small angles."""
     x, y = 359.0, 0.0
-    got = miri_psf(
-        name,
-        position=(x, y),
-        includes=(),
-        wavefront_error=0 * u.nm,
-        fov=6 * u.arcsec,
-        oversampling=oversampling,
-    )
+    kind = {"fov": 6 * u.arcsec, "oversampling": oversampling, "wavefront_error": 0 * u.nm}
+    got = miri_psf(name, position=(x, y), includes=(), **kind)
     map_ = local_pixel(x, y) / MIRI_PIXEL_SCALE.value
     n, constants = 384, jwst_constants()
     step = 1.03 * constants["diameter"] / n
@@ -77,26 +71,16 @@ def test_optics_at_a_position_are_those_of_the_warped_pupil(name, oversampling):
     amplitude = np.minimum(amplitude, 1) * (1 - blocked)
     cells = got.data.shape[0]
     axis = (np.arange(cells) - cells // 2) * MIRI_PIXEL_SCALE.to_value(u.rad) / oversampling
-    truth = np.mean(
-        [
-            _core.matrix_dft_intensity(
-                amplitude + 0j, step, wave * 1e-6, axis, axis, power=amplitude.sum()
-            )
-            for wave in band_quantiles(name, 9)
-        ],
-        axis=0,
-    )
-    truth *= oversampling**2
+    grid = {"theta_x": axis, "theta_y": axis, "power": amplitude.sum()}
+    images = [
+        _core.matrix_dft_intensity(amplitude + 0j, step, wave * 1e-6, **grid)
+        for wave in band_quantiles(name, 9)
+    ]
+    truth = np.mean(images, axis=0) * oversampling**2
     np.testing.assert_allclose(got.data, truth, atol=2e-3 * truth.max())
     assert got.enclosed == pytest.approx(truth.sum() / oversampling**2, abs=1e-3)
     # the square pixel's image is no such thing
-    square = miri_psf(
-        name,
-        includes=(),
-        wavefront_error=0 * u.nm,
-        fov=6 * u.arcsec,
-        oversampling=oversampling,
-    )
+    square = miri_psf(name, includes=(), **kind)
     assert np.abs(square.data - truth).max() > 5 * np.abs(got.data - truth).max()
 
 
@@ -118,13 +102,15 @@ def test_cross_leans_to_the_middle_of_the_array():
     for x, y in ((100.0, 100.0), (1000.0, 900.0)):
         shift = effects.cruciform_shift(x, y)
         assert np.sign(shift).tolist() == [np.sign(598 - x), np.sign(511 - y)]
-        out = effects.cruciform(image, "miri.f560w", oversampling=4, shift=shift)
+        # without a halo
+        form = {"oversampling": 4, "calibration": "stpsf"}
+        out = effects.cruciform(image, "miri.f560w", shift=shift, **form)
         cells = np.arange(401) - 200
         # arms beyond the core, where the other arm is not
         up, right = out[300:].sum(0), out[:, 300:].sum(1)
         assert (up @ cells) / up.sum() == pytest.approx(4 * shift[0], abs=1e-9)
         assert (right @ cells) / right.sum() == pytest.approx(4 * shift[1], abs=1e-9)
-        straight = effects.cruciform(image, "miri.f560w", oversampling=4)
+        straight = effects.cruciform(image, "miri.f560w", **form)
         assert out.sum() == pytest.approx(straight.sum(), rel=1e-12)
     assert effects.cruciform_shift(597.7, 511.0) == pytest.approx((0, 0), abs=1e-3)
 
@@ -190,23 +176,38 @@ def test_f160w_over_a_mosaic_of_two_rolls():
     np.testing.assert_allclose(middle.data, 0.5 * (a.data + b.data), rtol=1e-12)
 
 
-def test_refuses():
-    psf = gaussian_psf(0.3 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=2 * u.arcsec)
-    square = [(0, 0), (9, 0), (0, 9), (9, 9)]
-    refuses(r"'positions' must be of shape \(4, 2\)", psf_grid, [psf] * 4, square[:3])
-    with pytest.raises(ValueError, match="'positions' must be all points of a rectangular grid"):
-        psf_grid([psf] * 4, [(0, 0), (9, 0), (0, 9), (8, 9)])
-    refuses("'positions' must be different places", psf_grid, [psf] * 5, [*square, (9, 9)])
-    wide = gaussian_psf(0.3 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=3 * u.arcsec)
-    refuses("'psfs' must be alike in shape", psf_grid, [psf, psf, psf, wide], square)
-    with pytest.raises(ValueError, match="'psfs' must be alike in oversampling, got 4 and 3"):
-        psf_grid([psf, psf, psf, miri_psf("miri.f770w", **SMALL)], square)
-    with pytest.raises(ValueError, match="'n_psfs' must be a square number of at least 4, got 6"):
-        miri_psf_grid("miri.f770w", n_psfs=6)
-    with pytest.raises(ValueError, match="'position' must be on the 1032 x 1024 pixels of FULL"):
-        miri_psf("miri.f770w", position=(1032, 0), **SMALL)
-    with pytest.raises(TypeError, match="'grid' must be a photutils GriddedPSFModel, got ImagePSF"):
-        psf_at(ImagePSF(np.ones((5, 5))), 0, 0)
-    meta = {"grid_xypos": square, "oversampling": 1}
-    bare = GriddedPSFModel(NDData(np.ones((4, 5, 5)), meta=meta))
-    refuses("from_photutils", psf_at, bare, 0, 0)
+PSF = gaussian_psf(0.3 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=2 * u.arcsec)
+WIDE = gaussian_psf(0.3 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=3 * u.arcsec)
+SQUARE = [(0, 0), (9, 0), (0, 9), (9, 9)]
+
+
+@pytest.mark.parametrize(
+    ("psfs", "places", "match"),
+    [
+        ([PSF] * 4, SQUARE[:3], r"'positions' must be of shape \(4, 2\)"),
+        ([PSF] * 4, [*SQUARE[:3], (8, 9)], "'positions' must be each point of a rectangular grid"),
+        ([PSF] * 5, [*SQUARE, (9, 9)], "'positions' must be each point of a rectangular grid"),
+        ([PSF, PSF, PSF, WIDE], SQUARE, "'psfs' must be alike in shape"),
+        (
+            [PSF] * 3 + [miri_psf("miri.f770w", **SMALL)],
+            SQUARE,
+            "alike in oversampling, got 4 and 3",
+        ),
+    ],
+)
+def test_refuses(psfs, places, match):
+    refuses(match, psf_grid, psfs, places)
+
+
+def test_refuses_places_off_the_array_and_other_models():
+    refuses(
+        "'n_psfs' must be a square number of at least 4, got 6", miri_psf_grid, "F770W", n_psfs=6
+    )
+    off = {"position": (1032, 0), **SMALL}
+    refuses("'position' must be on the 1032 x 1024 pixels of FULL", miri_psf, "miri.f770w", **off)
+    meta = {"grid_xypos": SQUARE, "oversampling": 1}
+    for other in (
+        ImagePSF(np.ones((5, 5))),
+        GriddedPSFModel(NDData(np.ones((4, 5, 5)), meta=meta)),
+    ):
+        refuses("'grid' must be a PSFGrid", psf_at, other, 0, 0, error=TypeError)

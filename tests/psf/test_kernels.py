@@ -1,3 +1,5 @@
+import functools
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ from miricigale.psf import (
 from miricigale.utils.exceptions import DataError
 
 SCALE = 0.06 * u.arcsec
+kernel_of = functools.partial(MatchingKernel.from_psfs, pixel_scale=SCALE)
 
 
 @pytest.fixture(scope="module")
@@ -31,9 +34,7 @@ def lo():
 
 
 def test_kernel_between_gaussians_is_the_gaussian_of_the_difference():
-    kernel = MatchingKernel.from_psfs(
-        gaussian_image(101, 2.0), gaussian_image(101, 5.0), pixel_scale=SCALE, regularization=1e-6
-    )
+    kernel = kernel_of(gaussian_image(101, 2.0), gaussian_image(101, 5.0), regularization=1e-6)
     expected = gaussian_image(101, np.sqrt(25 - 4))
     np.testing.assert_allclose(kernel.array, expected, atol=2e-3 * expected.max())
     assert kernel.array.sum() == pytest.approx(1, abs=1e-6)
@@ -65,11 +66,11 @@ def test_kernel_is_photutils_wiener_kernel():
     ],
 )
 def test_error_of_the_encircled_energy(hi, lo, name, paper, fine):
-    kind = {"pixel_scale": SCALE, "lo_angle": 20 * u.deg}
-    kernel = MatchingKernel.from_psfs(hi, lo[name], regularization="yang2021", **kind)
+    kind = {"lo_angle": 20 * u.deg}
+    kernel = kernel_of(hi, lo[name], regularization="yang2021", **kind)
     assert kernel.regularization == 0.03
     assert paper[0] < kernel.meta["max_error"] < paper[1]
-    kernel = MatchingKernel.from_psfs(hi, lo[name], regularization=1e-3, **kind)
+    kernel = kernel_of(hi, lo[name], regularization=1e-3, **kind)
     assert kernel.meta["max_error"] < fine
     radii = [0.2, 0.5, 1.0, 2.0, 5.0] * u.arcsec
     error = kernel.encircled_energy_error(radii)
@@ -80,22 +81,20 @@ def test_error_of_the_encircled_energy(hi, lo, name, paper, fine):
 
 
 def test_automatic_regularization_is_the_smoothest_good_one(hi, lo):
-    kind = {"pixel_scale": SCALE, "lo_angle": 0 * u.deg}
-    kernel = MatchingKernel.from_psfs(hi, lo["f560w"], **kind)
+    kind = {"lo_angle": 0 * u.deg}
+    kernel = kernel_of(hi, lo["f560w"], **kind)
     assert kernel.meta["max_error"] <= kernel.meta["smallest_error"] + 1e-3
-    smoother = MatchingKernel.from_psfs(
-        hi, lo["f560w"], regularization=10**0.5 * kernel.regularization, **kind
-    )
+    smoother = kernel_of(hi, lo["f560w"], regularization=10**0.5 * kernel.regularization, **kind)
     assert smoother.meta["max_error"] > kernel.meta["smallest_error"] + 1e-3
     assert smoother.noise_gain < kernel.noise_gain
-    wide = MatchingKernel.from_psfs(hi, lo["f1500w"], **kind)
+    wide = kernel_of(hi, lo["f1500w"], **kind)
     assert wide.regularization > kernel.regularization
 
 
 def test_convolved_template_of_unit_flux_is_the_wide_psf(hi, lo):
     """Also its total: the light that the wide PSF's grid holds."""
     psf = rotate_psf(lo["f1000w"], 50 * u.deg)
-    kernel = MatchingKernel.from_psfs(hi, psf, pixel_scale=SCALE)
+    kernel = kernel_of(hi, psf)
     n = kernel.array.shape[0]
     template = psf_image(hi, pixel_scale=SCALE, shape=n)
     image = kernel.apply(template / template.sum())
@@ -103,48 +102,37 @@ def test_convolved_template_of_unit_flux_is_the_wide_psf(hi, lo):
     np.testing.assert_allclose(image, expected, atol=0.01 * expected.max())
     assert kernel.array.sum() == pytest.approx(expected.sum(), rel=1e-9)
     assert kernel.array.sum() == pytest.approx(psf.enclosed, abs=5e-3)
-    normalized = MatchingKernel.from_psfs(hi, psf, pixel_scale=SCALE, normalize=True)
+    normalized = kernel_of(hi, psf, normalize=True)
     assert normalized.array.sum() == pytest.approx(1, rel=1e-9)
     assert normalized.target.sum() == pytest.approx(1, rel=1e-9)
 
 
 def test_angle_turns_the_target(hi, lo):
-    one = MatchingKernel.from_psfs(
-        hi, lo["f770w"], pixel_scale=SCALE, lo_angle=70 * u.deg, regularization=1e-3
-    )
+    one = kernel_of(hi, lo["f770w"], lo_angle=70 * u.deg, regularization=1e-3)
     expected = psf_image(rotate_psf(lo["f770w"], 70 * u.deg), pixel_scale=SCALE, shape=349)
     np.testing.assert_allclose(one.target, expected, atol=1e-9)
-    relative = MatchingKernel.from_psfs(
-        gaussian_psf(0.2 * u.arcsec, pixel_scale=SCALE, fov=21 * u.arcsec),
-        lo["f770w"],
-        pixel_scale=SCALE,
-        lo_angle=70 * u.deg,
-        grid_angle=70 * u.deg,
-        regularization=1e-3,
-    )
+    sharp = gaussian_psf(0.2 * u.arcsec, pixel_scale=SCALE, fov=21 * u.arcsec)
+    angles = {"lo_angle": 70 * u.deg, "grid_angle": 70 * u.deg}
+    relative = kernel_of(sharp, lo["f770w"], regularization=1e-3, **angles)
     straight = psf_image(lo["f770w"], pixel_scale=SCALE, shape=349)
     np.testing.assert_allclose(relative.target, straight, atol=1e-9)
-    both = MatchingKernel.from_psfs(
-        hi, lo["f770w"], pixel_scale=SCALE, lo_angle=[0, 70] * u.deg, regularization=1e-3
-    )
+    both = kernel_of(hi, lo["f770w"], lo_angle=[0, 70] * u.deg, regularization=1e-3)
     np.testing.assert_allclose(both.target, 0.5 * (straight + expected), atol=1e-9)
 
 
 def test_angles_are_asked_for_by_name(hi, lo):
-    with pytest.raises(ValueError, match="'lo_angle' must be the position angle"):
-        MatchingKernel.from_psfs(hi, lo["f770w"], pixel_scale=SCALE)
-    with pytest.raises(ValueError, match="'hi_angle' must be left out"):
-        MatchingKernel.from_psfs(
-            hi, lo["f770w"], pixel_scale=SCALE, hi_angle=3 * u.deg, lo_angle=0 * u.deg
-        )
-    with pytest.raises(ValueError, match="'lo_angle' must be the position angle"):
-        MatchingKernel.from_psfs(hi, lo["f770w"], pixel_scale=SCALE, resampling="drizzle")
+    for options, match in (
+        ({}, "'lo_angle' must be the position angle"),
+        ({"resampling": "drizzle"}, "'lo_angle' must be the position angle"),
+        ({"hi_angle": 3 * u.deg, "lo_angle": 0 * u.deg}, "'hi_angle' must be left out"),
+    ):
+        refuses(match, kernel_of, hi, lo["f770w"], **options)
 
 
 def test_drizzled_target_is_wider(hi, lo):
-    kind = {"pixel_scale": SCALE, "lo_angle": 0 * u.deg, "regularization": 1e-3}
-    single = MatchingKernel.from_psfs(hi, lo["f770w"], **kind)
-    drizzled = MatchingKernel.from_psfs(hi, lo["f770w"], resampling="drizzle", **kind)
+    kind = {"lo_angle": 0 * u.deg, "regularization": 1e-3}
+    single = kernel_of(hi, lo["f770w"], **kind)
+    drizzled = kernel_of(hi, lo["f770w"], resampling="drizzle", **kind)
     assert drizzled.target.max() < 0.97 * single.target.max()
     assert drizzled.target.sum() == pytest.approx(single.target.sum(), rel=2e-3)
 
@@ -166,9 +154,7 @@ def test_apply_is_the_convolution_with_zeros_outside():
 
 
 def test_cropping_says_what_is_lost(hi, lo):
-    kernel = MatchingKernel.from_psfs(
-        hi, lo["f1500w"], pixel_scale=SCALE, lo_angle=0 * u.deg, regularization=1e-3
-    )
+    kernel = kernel_of(hi, lo["f1500w"], lo_angle=0 * u.deg, regularization=1e-3)
     small = kernel.cropped(10 * u.arcsec)
     assert small.array.shape == (167, 167)
     assert small.meta["lost"] == pytest.approx(kernel.array.sum() - small.array.sum())
@@ -176,9 +162,7 @@ def test_cropping_says_what_is_lost(hi, lo):
     smaller = small.cropped(6 * u.arcsec)
     assert smaller.meta["lost"] == pytest.approx(kernel.array.sum() - smaller.array.sum())
     refuses("'extent' must be at most", small.cropped, 20 * u.arcsec)
-    direct = MatchingKernel.from_psfs(
-        hi, lo["f1500w"], pixel_scale=SCALE, lo_angle=0 * u.deg, extent=10 * u.arcsec
-    )
+    direct = kernel_of(hi, lo["f1500w"], lo_angle=0 * u.deg, extent=10 * u.arcsec)
     assert direct.array.shape == (167, 167)
 
 
@@ -188,7 +172,7 @@ def test_noisy_psfs_still_match():
     sharp, wide = gaussian_image(101, 1.5), gaussian_image(101, 2.5)
     noisy = [p + rng.normal(scale=1e-3 * p.max(), size=p.shape) for p in (sharp, wide)]
     noisy = [p / p.sum() for p in noisy]
-    kernel = MatchingKernel.from_psfs(*noisy, pixel_scale=SCALE)
+    kernel = kernel_of(*noisy)
     clean = fftconvolve(sharp, kernel.array, mode="same")
     assert np.abs(clean - wide).max() < 0.02 * wide.max()
 
@@ -197,34 +181,26 @@ def test_values_are_frozen_and_checked():
     kernel = MatchingKernel(gaussian_image(5, 1.0), pixel_scale=SCALE)
     with pytest.raises(ValueError, match="read-only"):
         kernel.array[0, 0] = 1
-    refuses("'source, target' must be the kernel's PSFs", kernel.encircled_energy_error)
-    with pytest.raises(ValueError, match="'array' must be square with an odd number"):
-        MatchingKernel(np.ones((4, 4)), pixel_scale=SCALE)
-    with pytest.raises(ValueError, match="'image' must be finite, got 1 pixels"):
-        kernel.apply(np.array([[1.0, np.nan], [0.0, 0.0]]))
-    with pytest.raises(ValueError, match="'hi' must be a PSF whose sum"):
-        MatchingKernel.from_psfs(
-            5 * gaussian_image(31, 1), gaussian_image(31, 2), pixel_scale=SCALE
-        )
-    with pytest.raises(ValueError, match="'hi, lo' must be arrays of the same shape"):
-        MatchingKernel.from_psfs(gaussian_image(31, 1), gaussian_image(33, 2), pixel_scale=SCALE)
-    with pytest.raises(ValueError, match="'regularization' must be positive or one of"):
-        MatchingKernel.from_psfs(
-            gaussian_image(31, 1), gaussian_image(31, 2), pixel_scale=SCALE, regularization="best"
-        )
     assert "5 x 5 px of 0.06 arcsec" in repr(kernel)
+    scale, (one, two) = {"pixel_scale": SCALE}, (gaussian_image(31, s) for s in (1, 2))
+    refuses("'source, target' must be the kernel's PSFs", kernel.encircled_energy_error)
+    refuses("'array' must be square with an odd number", MatchingKernel, np.ones((4, 4)), **scale)
+    refuses("'image' must be finite, got 1 pixels", kernel.apply, np.array([[1.0, np.nan]]))
+    for psfs, options, match in (
+        ((5 * one, two), {}, "'hi' must be a PSF whose sum"),
+        ((one, gaussian_image(33, 2)), {}, "'hi, lo' must be arrays of the same shape"),
+        ((one, two), {"regularization": "best"}, "'regularization' must be positive or one of"),
+    ):
+        refuses(match, kernel_of, *psfs, **options)
 
 
 def test_foreign_files_are_named(tmp_path):
     path = tmp_path / "kernel.fits"
-    with pytest.raises(
-        DataError, match=r"kernel\.fits cannot be read as a matching kernel: no such"
-    ):
-        MatchingKernel.read(path)
+    match = r"kernel\.fits cannot be read as a matching kernel: "
+    refuses(match + "no such", MatchingKernel.read, path, error=DataError)
     path.write_text("text")
-    with pytest.raises(DataError, match=r"kernel\.fits cannot be read as a matching kernel: "):
-        MatchingKernel.read(path)
+    refuses(match, MatchingKernel.read, path, error=DataError)
     hdus = [fits.PrimaryHDU(), fits.ImageHDU(gaussian_image(5, 1.0), name="KERNEL")]
     fits.HDUList(hdus).writeto(path, overwrite=True)
-    with pytest.raises(DataError, match=r"kernel\.fits is not a complete .*PIXSCALE"):
-        MatchingKernel.read(path)
+    match = r"kernel\.fits is not a complete .*PIXSCALE"
+    refuses(match, MatchingKernel.read, path, error=DataError)

@@ -61,13 +61,9 @@ def test_grids_are_copied_and_pickled():
         assert one.filter == "miri.f1500w"
 
 
-def test_a_plain_model_of_photutils_is_taken_with_its_pixel():
+def test_a_plain_model_of_photutils_lacks_its_pixel():
     plain = ImagePSF(TURNED.data, oversampling=2)
-    with pytest.raises(ValueError, match=r"pixel_scale and frame is known .*from_photutils"):
-        encircled_energy(plain, 1 * u.arcsec)
-    plain.meta.update(pixel_scale=PSF.pixel_scale.value, frame="sky", angle=30.0)
-    assert encircled_energy(plain, 1 * u.arcsec) == encircled_energy(TURNED, 1 * u.arcsec)
-    assert instrument_psf(plain).angle == 30 * u.deg
+    refuses("pixels of known size .*from_photutils", encircled_energy, plain, 1 * u.arcsec)
     assert instrument_psf(PSF) is PSF
 
 
@@ -75,10 +71,7 @@ def test_fields_of_kernels_are_copied_pickled_and_written(tmp_path):
     kind = {"pixel_scale": 0.06 * u.arcsec, "fov": 2 * u.arcsec}
     sharp = gaussian_psf(0.2 * u.arcsec, **kind)
     kernels = [
-        MatchingKernel.from_psfs(
-            sharp, gaussian_psf(w * u.arcsec, **kind), pixel_scale=0.06 * u.arcsec
-        )
-        for w in (0.4, 0.5)
+        MatchingKernel.from_psfs(sharp, gaussian_psf(w * u.arcsec, **kind)) for w in (0.4, 0.5)
     ]
     field = KernelField(kernels, SkyCoord([53.0, 53.1], [-27.0, -27.0], unit="deg"), "nearest")
     field.write(tmp_path / "field.fits")

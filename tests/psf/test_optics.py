@@ -95,9 +95,10 @@ def test_radial_sums_of_a_flat_image_are_areas():
 
 
 def test_collecting_areas():
-    # 25.4 m^2: JWST, jwst-docs; 4.0 m^2: HST, handbooks
-    assert jwst_pupil(256).clear_area == pytest.approx(25.4, rel=0.02)
-    assert hst_pupil(obscuration=0.33).clear_area == pytest.approx(4.0, rel=0.03)
+    # 25.4 m^2: JWST, jwst-docs; HST's 4.0 m^2 of the handbooks are of an obscuration of 0.33, not 0.40
+    hst = 4.0 - np.pi * 1.2**2 * (0.40**2 - 0.33**2)
+    for pupil, area in ((jwst_pupil(256), 25.4), (hst_pupil(), hst)):
+        assert pupil.amplitude.sum() * pupil.step**2 == pytest.approx(area, rel=0.03)
 
 
 def test_jwst_has_18_segments_and_a_strut_along_v3():
@@ -105,15 +106,14 @@ def test_jwst_has_18_segments_and_a_strut_along_v3():
     assert set(np.unique(pupil.segments)) == set(range(19))
     column = pupil.amplitude[:, 127]
     assert column[230] < 0.1  # the upper strut blocks the B1 segment
-    assert jwst_pupil(256, angle=0.0, struts=False).amplitude[230, 127] > 0.99
     # symmetric about V3
     np.testing.assert_allclose(pupil.amplitude, pupil.amplitude[:, ::-1], atol=0.13)
 
 
 def test_v3_lies_clockwise_of_the_image_axis():
-    pupil = jwst_pupil(256, angle=10.0, struts=True)
-    bare = jwst_pupil(256, angle=10.0, struts=False)
-    y, x = np.nonzero((bare.amplitude - pupil.amplitude) > 0.9)
+    pupil = jwst_pupil(256, angle=10.0)
+    # cells of segments that are behind the struts
+    y, x = np.nonzero((pupil.segments > 0) & (pupil.amplitude < 0.1))
     upper = y > 200
     assert x[upper].mean() > 127.5 + 10
 
@@ -168,7 +168,7 @@ def test_image_stands_on_the_middle_cell_whatever_the_wavefront():
 
 def test_bad_arguments_are_named():
     pupil = jwst_pupil(128)
-    refuses("'rms' must be zero or positive", pupil.wavefront_error, -1.0)
+    refuses("'rms' must be at least 0", pupil.wavefront_error, -1.0)
     refuses("'n' must be odd, got 50", optics.polychromatic_psf, pupil, 0.0, [5.6], step=0.1, n=50)
     refuses("an image below", optics.polychromatic_psf, pupil, 0.0, [5.6], step=0.1, n=501)
     refuses("'n' must be at least 64", jwst_pupil, 32)

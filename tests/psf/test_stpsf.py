@@ -10,14 +10,29 @@ from miricigale.psf import encircled_energy, miri_psf, psf_at, stpsf_grid, stpsf
 from miricigale.utils.exceptions import DataError
 
 
+def perfect(monkeypatch):
+    """Make the optics of stpsf perfect."""
+    stpsf = pytest.importorskip("stpsf")
+    facts = {"pupilopd": None, "include_si_wfe": False, "include_ote_field_dependence": False}
+
+    def make(original=stpsf.MIRI):
+        instrument = original()
+        for name, value in facts.items():
+            setattr(instrument, name, value)
+        return instrument
+
+    monkeypatch.setattr(stpsf, "MIRI", make)
+
+
 @pytest.fixture
 def data(tmp_path, monkeypatch):
     """
-    The data of STPSF_PATH.
+    Perfect optics with the data of STPSF_PATH.
 
     Those of an older version without wavefronts do for perfect optics: stpsf asks for a
     version and for the name of a wavefront, and reads none.
     """
+    perfect(monkeypatch)
     source = Path(os.environ["STPSF_PATH"])
     if any((source / "MIRI" / "OPD").glob("OPD*.fits*")):
         return
@@ -55,10 +70,8 @@ def test_says_why_the_data_do_not_do(monkeypatch):
 
     monkeypatch.setenv("STPSF_PATH", "/nowhere")
     monkeypatch.setitem(sys.modules, "stpsf", types.SimpleNamespace(MIRI=refuse))
-    with pytest.raises(
-        DataError, match=r"cannot use the data of STPSF_PATH: .* 2\.1\.0 is needed\.$"
-    ):
-        stpsf_psf("miri.f770w")
+    match = r"cannot use the data of STPSF_PATH: .* 2\.1\.0 is needed\.$"
+    refuses(match, stpsf_psf, "miri.f770w", error=DataError)
 
 
 @pytest.mark.skipif("STPSF_PATH" not in os.environ, reason="needs STPSF_PATH and stpsf")
@@ -66,8 +79,7 @@ def test_says_why_the_data_do_not_do(monkeypatch):
 @pytest.mark.usefixtures("data")
 @pytest.mark.parametrize("name", ["miri.f1000w", "miri.f2100w"])
 def test_ours_is_like_stpsf(name):
-    pytest.importorskip("stpsf")
-    theirs = stpsf_psf(name, opd="perfect", fov=9 * u.arcsec)
+    theirs = stpsf_psf(name, fov=9 * u.arcsec)
     ours = miri_psf(name, wavefront_error=0 * u.nm, fov=9 * u.arcsec, calibration="stpsf")
     assert theirs.fwhm.value == pytest.approx(ours.fwhm.value, rel=0.01)
     radii = [0.2, 0.5, 1.0, 2.5] * u.arcsec
@@ -91,9 +103,8 @@ def test_ours_is_like_stpsf(name):
 @pytest.mark.usefixtures("data")
 def test_corners_of_the_array_are_like_stpsf():
     """Distortion and the lean of the cruciform: far nearer to stpsf than one PSF for all."""
-    pytest.importorskip("stpsf")
     kind = {"fov": 8 * u.arcsec}
-    grid = stpsf_grid("miri.f560w", n_psfs=4, opd="perfect", **kind)
+    grid = stpsf_grid("miri.f560w", n_psfs=4, **kind)
     assert grid.frame == "detector"
     assert list(grid.includes) == ["jitter", "cruciform", "pixel", "ipc"]
     kind |= {"wavefront_error": 0 * u.nm, "calibration": "stpsf"}

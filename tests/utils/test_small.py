@@ -87,9 +87,8 @@ def test_progress_is_silent_unless_asked(capsys):
 
 def test_progress_is_lines_where_no_bar_can_be_drawn(capsys):
     bar = progress(show=True, total=5, desc="work", unit="step")
-    bar.set_description("more work", refresh=False)
+    bar.set_description("more work")
     bar.update(3)
-    bar.refresh()
     bar.close()
     bar.close()
     text = capsys.readouterr().err

@@ -12,7 +12,7 @@ from astropy.table import QTable
 from helpers.errors import refuses
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.store import open_parts, replacing, write_parts
-from miricigale.utils.unified import register, unified_read, unified_write
+from miricigale.utils.unified import read_write, register
 
 
 def test_what_stood_there_stays_when_writing_fails(tmp_path):
@@ -33,7 +33,7 @@ def test_what_stood_there_stays_when_writing_fails(tmp_path):
         pass
 
 
-def test_a_full_disk_is_told_with_the_name_of_the_file(tmp_path):
+def test_a_full_disk_is_reported_with_the_name_of_the_file(tmp_path):
     path = tmp_path / "a.txt"
     with pytest.raises(OSError, match=r"a\.txt") as caught, replacing(path):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -89,20 +89,7 @@ def test_incomplete_and_foreign_files_are_named(tmp_path):
 
 class Number:
     io_module = __name__
-    read = unified_read(
-        """
-        Read a number.
-
-        It is in an array.
-        """
-    )
-    write = unified_write(
-        """
-        Write a number.
-
-        As an array.
-        """
-    )
+    read, write = read_write("a number")
 
     def __init__(self, value):
         self.value = value
@@ -128,5 +115,5 @@ def test_read_and_write_are_unified_methods(tmp_path):
     for name in ("a.ecsv", "b.dat"):
         with pytest.raises(IORegistryError, match=rf"{name} must end in one of \.fits"):
             Number(5.0).write(tmp_path / name)
-    assert "Read a number." in Number.read.__doc__
+    assert "Read a number from" in Number.read.__doc__
     refuses(r"c\.fits", Number.read, tmp_path / "c.fits", error=DataError)

@@ -98,7 +98,7 @@ def test_ids_that_fits_holds(tmp_path, ids):
     assert_array_equal(ascii_ids(ids, "ids"), np.asarray(ids))
 
 
-def test_ids_that_fits_does_not_hold_are_told():
+def test_ids_that_fits_does_not_hold_are_refused():
     ids = ["a", "Kümmel", "b ", "\N{GREEK SMALL LETTER ALPHA}", "c", "😀"]
     refuses(r"'catalog' must be ASCII.* got 'Kümmel', 'b ', 'α' and 1", ascii_ids, ids, "catalog")
     refuses(r"got 'b '$", ascii_ids, ["a", "b "], "ids")

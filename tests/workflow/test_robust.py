@@ -223,7 +223,7 @@ def test_a_flipped_byte_anywhere_is_mended(tmp_path):
             if message:
                 # the name of a product that leads elsewhere
                 assert "manifest" in name
-                assert "cannot be used" in message
+                assert "is not the name of a product" in message
                 (folder / name).write_bytes(whole[name])
             assert contents(folder) == {k: v for k, v in whole.items() if k.endswith(".txt")}
             manifests = [folder / "manifest.json", folder / ".manifest.copy.json"]

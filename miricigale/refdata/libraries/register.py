@@ -217,8 +217,7 @@ def _steps(name, *, show):
     with contextlib.closing(progress(show=show, total=3, desc=name, unit="step")) as bar:
 
         def step(text):
-            bar.set_description(f"{name}: {text}", refresh=False)
+            bar.set_description(f"{name}: {text}")
             bar.update()
-            bar.refresh()
 
         yield step
