@@ -13,7 +13,7 @@ from astropy import config as _config
 from miricigale.refdata.registry import resource
 from miricigale.utils.configuration import conf
 from miricigale.utils.content import file_sha256
-from miricigale.utils.exceptions import DataError, ReferenceWarning, argument_error
+from miricigale.utils.exceptions import DataError, ReferenceWarning, argument_error, data_error
 from miricigale.utils.files import cached_by_file
 
 
@@ -57,22 +57,21 @@ def stored_record(path):
     """
     beside = record_path(path)
     try:
-        # thousands of checksums: read once
-        record = _json(beside)
+        return dict(_read_record(beside))
     except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, ValueError) as err:
-        msg = f"{beside} cannot be read as the record of {path.name}: {err}"
-        raise DataError(msg) from err
-    if not isinstance(record, dict) or not isinstance(record.get("sha256"), str):
-        msg = f"{beside} cannot be read as the record of {path.name}: it has no 'sha256'"
-        raise DataError(msg)
-    return dict(record)
+        raise data_error(beside, f"cannot be read as the record of {path.name}: {err}") from err
 
 
 @cached_by_file(16)
-def _json(path):
-    return json.loads(Path(path).read_text(encoding="utf-8"))
+def _read_record(path):
+    # thousands of checksums: read once
+    record = json.loads(Path(path).read_text(encoding="utf-8"))
+    if not isinstance(record, dict) or not isinstance(record.get("sha256"), str):
+        msg = "it has no 'sha256'"
+        raise ValueError(msg)
+    return record
 
 
 def _places(record):
@@ -111,6 +110,12 @@ def file_record(name):
     if not record.file:
         raise argument_error("name", "a resource that is a file", f"{name!r} ({record.source})")
     return record
+
+
+def other_file(name, path):
+    """Make the `DataError` about a file whose checksum is not that of its record."""
+    what = f"is not the file that the record of {name!r} describes (sha256 differs)"
+    return data_error(path, what)
 
 
 def find_resource(name):
@@ -165,16 +170,13 @@ def locate(name, *, check=False):
     label, path = find_place(record)
     if path is None:
         tried = ", ".join(f"{label} ({folder})" for label, folder in _places(record))
-        msg = (
-            f"resource {name!r} ({record.title}) is in none of {tried}; "
-            f"get it from {record.source} and run 'miricigale data add {name} PATH'"
-        )
+        remedy = f"get it from {record.source} and run 'miricigale data add {name} PATH'"
+        msg = f"resource {name!r} ({record.title}) is in none of {tried}; {remedy}"
         raise DataError(msg)
     if check and path.is_file():
         wanted = record.sha256 or (stored_record(path) or {}).get("sha256", "")
         if wanted and file_sha256(path) != wanted:
-            msg = f"{path} is not the file that the record of {name!r} describes (sha256 differs)"
-            raise DataError(msg)
+            raise other_file(name, path)
     _warn_of_override(record, label, path)
     return path
 

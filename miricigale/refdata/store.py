@@ -6,8 +6,8 @@ import os
 import shutil
 from pathlib import Path
 
-from miricigale.refdata.locate import data_folder, file_record, file_sha256, record_path
-from miricigale.utils.exceptions import DataError
+from miricigale.refdata.locate import data_folder, file_record, file_sha256, other_file, record_path
+from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import unpacked_size
 from miricigale.utils.store import PARTIAL, replacing
 
@@ -132,11 +132,9 @@ def add_resource(name, path):
     """
     record, path = file_record(name), Path(path).expanduser()
     if not path.exists():
-        msg = f"no file or folder {path}"
-        raise DataError(msg)
+        raise data_error(path, "is no file or folder")
     if record.sha256 and (not path.is_file() or file_sha256(path) != record.sha256):
-        msg = f"{path} is not the file that the record of {name!r} describes (sha256 differs)"
-        raise DataError(msg)
+        raise other_file(name, path)
     # a copy has no holes
     unpacked_size(path)
     target = data_folder() / record.file

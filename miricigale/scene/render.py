@@ -47,10 +47,13 @@ class Painter:
     ----------
     shape : tuple of int
         Rows and columns of the image.
-    psf : `~photutils.psf.ImagePSF`
+    psf : `~photutils.psf.ImagePSF` or `~photutils.psf.GriddedPSFModel`
         PSF with the pixel response in it, oversampled alike in x and y, centered on one of
         its nodes. Its ``flux``, ``x_0`` and ``y_0`` are not looked at; light beyond its
-        edge is lost.
+        edge is lost. Of a grid of PSFs light has that of its own place, bilinear between those
+        of the grid as in photutils and constant beyond it; an extended source is blurred by
+        another PSF on its one side than on the other. All sources are painted and convolved
+        once, whatever the number of PSFs.
     enclosed : float, optional
         A Sersic profile is painted to the isophote that holds this fraction.
     max_radius : float, optional
@@ -60,23 +63,25 @@ class Painter:
     """
 
     shape: tuple
-    psf: ImagePSF
+    psf: ImagePSF | GriddedPSFModel
     enclosed: float = 0.995
     max_radius: float = math.inf
     n_threads: int | None = None
 
     def __post_init__(self):
-        if not isinstance(self.psf, ImagePSF):
-            raise argument_error("psf", "a photutils ImagePSF", type(self.psf).__name__)
-        self._prepare(np.asarray(self.psf.data)[None], self.psf.origin, [(0.0, 0.0)])
-
-    def _prepare(self, data, origin, where):
-        """Keep the PSFs, their coefficients and their places x, y."""
+        data, where = np.asarray(self.psf.data, dtype=float), [(0.0, 0.0)]
+        if isinstance(self.psf, GriddedPSFModel):
+            origin = np.subtract(data.shape[:0:-1], 1) / 2
+            where = np.asarray(self.psf.grid_xypos, dtype=float)
+        elif isinstance(self.psf, ImagePSF):
+            data, origin = data[np.newaxis], self.psf.origin
+        else:
+            wanted = "a photutils ImagePSF or GriddedPSFModel"
+            raise argument_error("psf", wanted, type(self.psf).__name__)
         oversampling, origin = _check(self, origin)
         (x, k_x), (y, k_y) = (np.unique(v, return_inverse=True) for v in np.transpose(where))
         order = np.zeros((y.size, x.size), dtype=np.int64)
         order[k_y, k_x] = np.arange(len(where))
-        data = np.asarray(data, dtype=float)
         own = {
             "_oversampling": oversampling,
             "_origin": origin,
@@ -95,8 +100,8 @@ class Painter:
 
     @property
     def enclosed_by_psf(self):
-        """Fraction of a point's light within the PSF's array."""
-        return float(np.sum(self.psf.data)) / self._oversampling**2
+        """Fraction of a point's light within the array of the PSF, the least of a grid."""
+        return float(self._data.sum(axis=(1, 2)).min()) / self._oversampling**2
 
     def _axes(self):
         """Places of the PSFs along y and along x."""
@@ -231,36 +236,3 @@ class Painter:
         part = np.zeros((y1 - y0, x1 - x0))
         _core.deposit_pieces(part, x - x0, y - y0, light)
         return _core.add_part(grid, part, y0, x0, land)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class FieldPainter(Painter):
-    """
-    Paints sources through a PSF that varies over the field.
-
-    Light has the PSF of its own place, bilinear between those of the grid as in photutils and
-    constant beyond it; an extended source is blurred by another PSF on its one side than on the
-    other. All sources are painted and convolved once, whatever the number of PSFs.
-
-    Parameters
-    ----------
-    shape, enclosed, max_radius, n_threads
-        As of `Painter`.
-    psf : `~photutils.psf.GriddedPSFModel`
-        PSFs with the pixel response in them, at positions on the image.
-    """
-
-    psf: GriddedPSFModel
-
-    def __post_init__(self):
-        if not isinstance(self.psf, GriddedPSFModel):
-            raise argument_error("psf", "a photutils GriddedPSFModel", type(self.psf).__name__)
-        data = np.asarray(self.psf.data)
-        origin = ((data.shape[2] - 1) / 2, (data.shape[1] - 1) / 2)
-        self._prepare(data, origin, np.asarray(self.psf.grid_xypos, dtype=float))
-
-    @property
-    def enclosed_by_psf(self):
-        """Least fraction of a point's light within the array of a PSF."""
-        sums = np.asarray(self.psf.data).sum(axis=(1, 2))
-        return float(sums.min()) / self._oversampling**2

@@ -3,8 +3,6 @@
 import contextlib
 import datetime
 import pkgutil
-import shutil
-import textwrap
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +12,7 @@ from miricigale.refdata.libraries.table import LibraryTable, verify_library, wri
 from miricigale.refdata.locate import data_folder, record_path, stored_record
 from miricigale.refdata.registry import resource
 from miricigale.refdata.store import installing
-from miricigale.utils.exceptions import DataError, argument_error, unknown_name
+from miricigale.utils.exceptions import DataError, argument_error, data_error, unknown_name
 from miricigale.utils.progress import progress
 
 #: What reads the distributed files of a library: a function, or ``"module:function"``,
@@ -45,8 +43,6 @@ class Report:
         Of the converted file.
     size : int
         Of the converted file, in bytes.
-    replaced : str
-        Date and checksum of the library that stood there, or empty.
     """
 
     library: LibraryTable
@@ -54,7 +50,6 @@ class Report:
     source: Path
     sha256: str
     size: int
-    replaced: str = ""
 
     def __str__(self):
         library, files = self.library, self.library.meta["files"]
@@ -77,22 +72,8 @@ class Report:
         rows += [("sha256", f"{self.sha256}  {self.path.name}")]
         rows += [("written", f"{self.path} ({self.size / 1e6:.1f} MB)")]
         rows += [("record", f"{record_path(self.path)} (checksums of all files)")]
-        if self.replaced:
-            rows += [("replaces", self.replaced)]
-        width = max(shutil.get_terminal_size((100, 24)).columns, 60)
-        lines, column = [library.name], max(len(key) for key, _ in rows) + 5
-        for key, text in rows:
-            # checksums and paths stay whole, to be copied
-            fill = key in ("found", "spectra", *axes)
-            lines += textwrap.wrap(
-                text,
-                width=width if fill else 10**6,
-                initial_indent=f"    {key}".ljust(column),
-                subsequent_indent=" " * column,
-                break_long_words=False,
-                break_on_hyphens=False,
-            )
-        return "\n".join(lines)
+        column = max(len(key) for key, _ in rows) + 1
+        return "\n".join([library.name, *(f"    {key:{column}}{text}" for key, text in rows)])
 
 
 def _some(values):
@@ -139,8 +120,7 @@ def add_library(name, path, *, progress_bar=False):
     path = Path(path).expanduser()
     # some readers take a pattern of names
     if not path.exists() and not any(mark in path.name for mark in "*?["):
-        msg = f"no file or folder {path}"
-        raise DataError(msg)
+        raise data_error(path, "is no file or folder")
     target = data_folder() / record.file
     with _steps(name, show=progress_bar) as step:
         step("reading")
@@ -151,10 +131,9 @@ def add_library(name, path, *, progress_bar=False):
             step("checking")
             # what was written is what counts
             library = verify_library(partial, name)
-            replaced = _present(target)
             entry |= _entry(library, path)
     known = stored_record(target)
-    return Report(library, target, path, known["sha256"], known["size"], replaced)
+    return Report(library, target, path, known["sha256"], known["size"])
 
 
 def _reader(name):
@@ -173,8 +152,8 @@ def _read(reader, name, path):
         raise
     except Exception as err:  # readers of different formats raise different exceptions
         reason = err.args[0] if isinstance(err, KeyError) and err.args else err
-        msg = f"{path} cannot be read as {name!r}: {reason or type(err).__name__}"
-        raise DataError(msg) from err
+        what = f"cannot be read as {name!r}: {reason or type(err).__name__}"
+        raise data_error(path, what) from err
     if not isinstance(library, LibraryTable) or library.name != name:
         got = repr(getattr(library, "name", type(library).__name__))
         raise argument_error("reader", f"one that gives the library {name!r}", got)
@@ -198,17 +177,6 @@ def _entry(library, source):
         "units": dict(library.units),
         "summary": list(library.summary),
     }
-
-
-def _present(target):
-    """Date and checksum of the library that stands there, or an empty text."""
-    if not target.exists():
-        return ""
-    try:
-        old = stored_record(target) or {}
-    except DataError:
-        old = {}
-    return f"one of {old.get('date', 'unknown date')}, sha256 {old.get('sha256', 'unknown')}"
 
 
 @contextlib.contextmanager
