@@ -225,8 +225,6 @@ class GalacticExtinction(Foreground):
 
 def _color_excess(ebv):
     """Color excesses in mag as an array of one dimension, and whether it was one number."""
-    if np.ndim(ebv) > 1:
-        raise argument_error("ebv", "one number or one for each row", f"shape {np.shape(ebv)}")
     flat = GalacticExtinction.ebv_galactic.replace(0.0, name="ebv").array(ebv)
     wrong = np.flatnonzero(~(np.isfinite(flat) & (flat >= 0)))
     if wrong.size:

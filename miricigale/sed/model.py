@@ -9,7 +9,7 @@ from miricigale.refdata import citations
 from miricigale.sed import gridding, presets, tables
 from miricigale.sed.chain import Chain
 from miricigale.sed.component import ROLES, Component, read_config
-from miricigale.sed.derived import columns
+from miricigale.sed.derived import DERIVED, Derived
 from miricigale.sed.grid import fraction_span
 from miricigale.sed.grid_cache import cached_grid
 from miricigale.sed.parameter import Parameter
@@ -267,7 +267,11 @@ class SEDModel(Interactive):
         columns : dict of str to `~miricigale.sed.Derived`
             Unit and description by name.
         """
-        return columns(self)
+        out = {n: d for n, d in DERIVED.items() if self.has_agn or d.of != "agn"}
+        xray = self.component("xray")
+        # the relation is not linear: it is worked out after scaling
+        more = xray.columns if xray else {}
+        return out | {n: Derived(unit, text, False, "xray") for n, (unit, text) in more.items()}
 
     def __getstate__(self):
         state = self.__dict__.copy()

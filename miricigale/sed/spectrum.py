@@ -9,7 +9,7 @@ from astropy.cosmology import FlatLambdaCDM
 from astropy.table import QTable
 
 from miricigale.filters import FilterSet, as_filter
-from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.exceptions import argument_error, data_error
 from miricigale.utils.files import read_table, write_table
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import full_meta
@@ -129,11 +129,6 @@ class SED(Frozen, Interactive):
     def derived(self):
         """Derived quantities of the model by name, such as ``stellar_mass``; see `SEDModel.derived_columns`."""
         return self.meta.get("derived", {})
-
-    @property
-    def rest_wavelength(self):
-        """Wavelengths at the source, um."""
-        return self.wave / (1.0 + self.redshift)
 
     @property
     def frequency(self):
@@ -263,8 +258,7 @@ class SED(Frozen, Interactive):
         """
         table = read_table(path, wanted="a spectrum")
         if len(table.columns) < 2 or any(not hasattr(c, "unit") for c in table.columns.values()):
-            msg = f"{path} has no two columns with units, wavelengths and flux densities"
-            raise DataError(msg)
+            raise data_error(path, "has no two columns with units, wavelengths and flux densities")
         meta = full_meta(table.meta)
         redshift = float(meta.pop("redshift", 0.0))
         wave, fnu, *names = table.colnames

@@ -172,10 +172,6 @@ def _entry(library, source):
         "files": dict(library.meta["files"]),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "version": __version__,
-        "n_spectra": library.n_rows,
-        "axes": {axis: library.values_of(axis).tolist() for axis in library.axes},
-        "units": dict(library.units),
-        "summary": list(library.summary),
     }
 
 

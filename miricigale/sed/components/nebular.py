@@ -9,7 +9,7 @@ from miricigale.refdata.tables import read_images
 from miricigale.sed import _core
 from miricigale.sed.component import Component, register
 from miricigale.sed.parameter import Parameter
-from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import cached_by_file, open_fits
 from miricigale.utils.units import frozen_array
 
@@ -65,16 +65,10 @@ class NebularTable:
     def emission(self, metallicity, log_u):
         """
         Continuum and lines one after the other, shape (n_age, n_wave + n_line), linear in log U
-        between logarithms; a ValueError if the table has no such metallicity, or not this log U for it.
+        between logarithms, of values that `Nebular.invalid` accepts.
         """
         models = self.models(metallicity)
-        if not models.size:
-            known = ", ".join(f"{z:g}" for z in self.metallicities)
-            raise argument_error("metallicity", f"one of {known}", f"{metallicity:g}")
-        nodes = self.log_u[models]
-        if not nodes[0] <= log_u <= nodes[-1]:
-            raise argument_error("log_u", f"from {nodes[0]:g} to {nodes[-1]:g}", f"{log_u:g}")
-        cell, t = _core.cells(nodes, log_u)
+        cell, t = _core.cells(self.log_u[models], log_u)
         low, high = (
             np.concatenate([self.continuum[m], self.lines[m]], axis=1)
             for m in models[cell : cell + 2]
@@ -98,8 +92,7 @@ def load_nebular(path):
             names = tuple(str(name).strip() for name in rows["NAME"])
             arrays["line_wave"] = frozen_array(rows["WAVE"])
     except KeyError as err:
-        msg = f"{path} is not {wanted}: {err.args[0]}"
-        raise DataError(msg) from err
+        raise data_error(path, f"is not {wanted}: {err.args[0]}") from err
     shape = (arrays["metallicity"].size, arrays["age"].size)
     wanted = {
         "continuum": (*shape, arrays["wave"].size),
@@ -108,8 +101,8 @@ def load_nebular(path):
     }
     for name, size in wanted.items():
         if arrays[name].shape != size:
-            msg = f"{path}: '{name}' must have shape {size}, got {arrays[name].shape}"
-            raise DataError(msg)
+            what = f"must hold '{name}' of shape {size}, got {arrays[name].shape}"
+            raise data_error(path, what)
     return NebularTable(names=names, **arrays)
 
 

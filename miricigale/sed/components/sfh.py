@@ -239,7 +239,4 @@ def _column(table, name, unit):
     column = table[name]
     if np.any(getattr(column, "mask", False)):
         raise argument_error(name, "without masked values", f"{np.sum(column.mask)} masked")
-    if getattr(column, "unit", None) is None:
-        msg = f"'{name}' must have a unit convertible to {unit}, got none"
-        raise u.UnitsError(msg)
     return to_array(column, unit, name, ndim=1, finite=True)
