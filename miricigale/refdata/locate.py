@@ -1,6 +1,5 @@
 """Finding reference data: environment, the user's folder, bundled files."""
 
-import hashlib
 import importlib.metadata
 import json
 import os
@@ -112,12 +111,6 @@ def file_record(name):
     return record
 
 
-def other_file(name, path):
-    """Make the `DataError` about a file whose checksum is not that of its record."""
-    what = f"is not the file that the record of {name!r} describes (sha256 differs)"
-    return data_error(path, what)
-
-
 def find_resource(name):
     """
     Find the file or folder of a resource, if it is anywhere.
@@ -140,7 +133,7 @@ def find_resource(name):
     return find_place(file_record(name))[1]
 
 
-def locate(name, *, check=False):
+def locate(name):
     """
     Find the file or folder of a resource.
 
@@ -151,9 +144,6 @@ def locate(name, *, check=False):
     ----------
     name : str
         Such as ``"ssp.bc03"``; see `resources`.
-    check : bool, optional
-        Whether the checksum is compared with the record, or with the one that was written
-        beside the file when it was added.
 
     Returns
     -------
@@ -164,7 +154,7 @@ def locate(name, *, check=False):
     KeyError
         If there is no such resource.
     `~miricigale.utils.exceptions.DataError`
-        If it is in none of the places, or its checksum differs.
+        If it is in none of the places.
     """
     record = file_record(name)
     label, path = find_place(record)
@@ -173,10 +163,6 @@ def locate(name, *, check=False):
         remedy = f"get it from {record.source} and run 'miricigale data add {name} PATH'"
         msg = f"resource {name!r} ({record.title}) is in none of {tried}; {remedy}"
         raise DataError(msg)
-    if check and path.is_file():
-        wanted = record.sha256 or (stored_record(path) or {}).get("sha256", "")
-        if wanted and file_sha256(path) != wanted:
-            raise other_file(name, path)
     _warn_of_override(record, label, path)
     return path
 
@@ -185,8 +171,7 @@ def fingerprint(name):
     """
     What identifies the data that a resource stands for now.
 
-    The sha256 of the file that `locate` finds (over names and contents for a folder), or the
-    version of the package that it comes from.
+    The sha256 of the file that `locate` finds, or the version of the package that it comes from.
     """
     record = resource(name)
     if not record.file:
@@ -197,18 +182,11 @@ def fingerprint(name):
 
 def fingerprint_of(path, *, trust=True):
     """
-    The sha256 of a file, or over names and contents of a folder.
+    The sha256 of a file.
 
     With ``trust`` the file is not read where its size and time are those of the record beside it, or
     of an earlier call.
     """
-    if path.is_dir():
-        parts = [
-            f"{p.relative_to(path)} {file_sha256(p)}"
-            for p in sorted(path.rglob("*"))
-            if p.is_file()
-        ]
-        return hashlib.sha256("\n".join(parts).encode()).hexdigest()
     if not trust:
         return file_sha256(path)
     status = path.stat()

@@ -63,7 +63,7 @@ class Painter:
     """
 
     shape: tuple
-    psf: ImagePSF | GriddedPSFModel
+    psf: "ImagePSF | GriddedPSFModel"
     enclosed: float = 0.995
     max_radius: float = math.inf
     n_threads: int | None = None

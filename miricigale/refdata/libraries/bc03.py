@@ -160,19 +160,19 @@ def _check_set(parts):
     file, first, _, imf = parts[0]
     seen = {}
     for other, part, metallicity, other_imf in parts:
-        why = None
-        if part.wave.shape != first.wave.shape or not np.array_equal(part.wave, first.wave):
-            why = f"{part.wave.size} wavelengths and the other {first.wave.size}, or others"
-        elif other_imf != imf:
-            why = f"a {other_imf} IMF and the other a {imf} IMF"
-        elif part.mass_limits != first.mass_limits:
-            why = f"masses of {part.mass_limits} Msun and the other of {first.mass_limits}"
-        elif part.age.shape != first.age.shape or not np.allclose(part.age, first.age, rtol=1e-4):
-            why = f"{part.age.size} ages and the other {first.age.size}, or others"
-        elif metallicity in seen:
-            why = f"the same metallicity as {seen[metallicity].name}, {metallicity:g}"
-        if why:
-            raise data_error(other, f"and {file.name} are not one set: the one has {why}")
+        ages = part.age.shape == first.age.shape and np.allclose(part.age, first.age, rtol=1e-4)
+        same = {
+            "wavelengths": np.array_equal(part.wave, first.wave),
+            "IMF": other_imf == imf,
+            "limits of mass": part.mass_limits == first.mass_limits,
+            "ages": ages,
+        }
+        differ = ", ".join(name for name, is_same in same.items() if not is_same)
+        if differ:
+            raise data_error(other, f"and {file.name} are not one set: other {differ}")
+        if metallicity in seen:
+            twice = f"the same metallicity as {seen[metallicity].name}, {metallicity:g}"
+            raise data_error(other, f"is not of one set: it has {twice}")
         seen[metallicity] = other
 
 

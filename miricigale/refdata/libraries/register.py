@@ -2,6 +2,8 @@
 
 import contextlib
 import datetime
+import json
+import os
 import pkgutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,11 +11,16 @@ from pathlib import Path
 import numpy as np
 
 from miricigale.refdata.libraries.table import LibraryTable, verify_library, write_library
-from miricigale.refdata.locate import data_folder, record_path, stored_record
+from miricigale.refdata.locate import data_folder, file_sha256, record_path, stored_record
 from miricigale.refdata.registry import resource
-from miricigale.refdata.store import installing
 from miricigale.utils.exceptions import DataError, argument_error, data_error, unknown_name
 from miricigale.utils.progress import progress
+from miricigale.utils.store import PARTIAL, replacing
+
+try:
+    import fcntl
+except ImportError:  # no such locks on Windows
+    fcntl = None
 
 #: What reads the distributed files of a library: a function, or ``"module:function"``,
 #: imported on first use; called with a `~pathlib.Path`, it gives a `LibraryTable`.
@@ -125,7 +132,7 @@ def add_library(name, path, *, progress_bar=False):
     with _steps(name, show=progress_bar) as step:
         step("reading")
         library = _read(reader, name, path)
-        with installing(target) as (partial, entry):
+        with _installing(target) as (partial, entry):
             step("writing")
             write_library(library, partial)
             step("checking")
@@ -134,6 +141,69 @@ def add_library(name, path, *, progress_bar=False):
             entry |= _entry(library, path)
     known = stored_record(target)
     return Report(library, target, path, known["sha256"], known["size"])
+
+
+@contextlib.contextmanager
+def _locked(target):
+    """
+    Keep other processes from writing the same file; wait if one does.
+
+    What an interrupted process left half written is removed. The lock is advisory
+    (``flock``); where the system has none two processes that add the same resource at the
+    same moment may leave a record that does not fit the file, which `check_resources` reports.
+    """
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with open(target.with_name(f".{target.name}.lock"), "ab") as handle:
+        held = fcntl is not None
+        try:
+            if held:
+                fcntl.flock(handle, fcntl.LOCK_EX)
+        except OSError:
+            # some network file systems have no locks
+            held = False
+        if held:
+            # no other process writes: these are left over from ones that ended
+            for path in target.parent.glob(f"{PARTIAL}*-{target.name}*"):
+                path.unlink(missing_ok=True)
+        yield
+
+
+@contextlib.contextmanager
+def _installing(target):
+    """
+    Write a file of the data folder and a record beside it; other processes wait.
+
+    Other processes find the old file or the new one whole; if the process dies in between, a
+    file without record ("unchecked").
+
+    Parameters
+    ----------
+    target : `pathlib.Path`
+        Where it is to be found; its folder is made.
+
+    Yields
+    ------
+    partial : `pathlib.Path`
+        What to write.
+    record : dict
+        To be filled with plain values, kept as JSON in ``<file>.json``; checksum, size and time
+        of the file are added.
+    """
+    beside, record = record_path(target), {}
+    with _locked(target), contextlib.ExitStack() as last, replacing(target) as partial:
+        yield partial, record
+        # before anything of the old one goes
+        with open(partial, "rb+") as handle:
+            os.fsync(handle.fileno())
+        status = partial.stat()
+        known = {
+            "sha256": file_sha256(partial),
+            "size": status.st_size,
+            "mtime_ns": status.st_mtime_ns,
+        }
+        new = last.enter_context(replacing(beside))
+        new.write_text(json.dumps(known | record, indent=1) + "\n", encoding="utf-8")
+        beside.unlink(missing_ok=True)
 
 
 def _reader(name):

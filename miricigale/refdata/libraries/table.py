@@ -10,7 +10,7 @@ import numpy as np
 from astropy.table import Table
 
 from miricigale.utils.exceptions import argument_error, data_error
-from miricigale.utils.files import open_fits
+from miricigale.utils.files import cached_by_file, open_fits
 from miricigale.utils.store import open_parts, write_parts
 from miricigale.utils.units import WAVE, frozen_array, to_array
 
@@ -297,24 +297,16 @@ def open_library(path, name):
     `~miricigale.utils.exceptions.DataError`
         If it is something else, another library or truncated.
     """
-    path = Path(path)
-    try:
-        status = path.stat()
-    except OSError as err:
-        reason = "no such file" if isinstance(err, FileNotFoundError) else err.strerror
-        raise data_error(path, f"cannot be read as the library {name!r}: {reason}") from err
     with _lock:
-        key = (status.st_ino, status.st_size, status.st_mtime_ns)
-        return _open(str(path.absolute()), key, name)
+        return _open(path, name)
 
 
 #: Threads that ask for the same library wait for one to open it.
 _lock = threading.Lock()
 
 
-@functools.lru_cache(maxsize=8)
-def _open(path, key, name):
-    del key
+@cached_by_file(maxsize=8)
+def _open(path, name):
     wanted = f"library {name!r} (made by 'miricigale data add')"
     # the mapping lives as long as the arrays that use it
     with open_parts(path, _LAYOUTS, wanted=wanted, memmap=True) as parts:
@@ -353,7 +345,7 @@ def verify_library(path, name):
     `~miricigale.utils.exceptions.DataError`
         If it is not whole, or a checksum or a number is not as it should be.
     """
-    library = _open.__wrapped__(str(path), None, name)
+    library = _open.__wrapped__(path, name)
     with open_fits(path, wanted=f"the library {name!r}") as hdus:
         for number, hdu in enumerate(hdus):
             # 1 is success, 2 no checksum
