@@ -163,14 +163,14 @@ def check_catalog(table, *, filters=(), wcs=None, argument="catalog"):
     if unknown:
         raise argument_error(argument, f"a table with 'profile' among {PROFILES}", unknown)
     catalog["profile"] = profile
-    for name, unit in CATALOG_COLUMNS.items():
-        if name not in ("id", "sky", "profile"):
-            catalog[name] = _plain(catalog, name, unit, argument)
+    numbers = {n: unit for n, unit in CATALOG_COLUMNS.items() if n not in ("id", "sky", "profile")}
     for name in catalog.colnames:
         unit = getattr(catalog[name], "unit", None)
         linear = isinstance(unit, u.UnitBase)  # a magnitude is none
         if "." in name and linear and unit.is_equivalent(FNU):
-            catalog[name] = _plain(catalog, name, FNU, argument)
+            numbers[name] = FNU
+    for name, unit in numbers.items():
+        catalog[name] = _plain(catalog, name, unit, argument)
     if "star" not in catalog.colnames:
         catalog["star"] = np.zeros(len(catalog), dtype=bool)
     star = catalog["star"]

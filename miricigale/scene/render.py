@@ -115,22 +115,11 @@ class Painter:
         shape = self._phases.shape
         sums = np.zeros((*shape[:3], shape[3] + 1, shape[4] + 1))
         sums[..., 1:, 1:] = self._phases.cumsum(axis=3).cumsum(axis=4)
-        (k_y, t_y), (k_x, t_x) = (axis.weights() for axis in self._axes())
-        low_y, high_y = self._ranges(self.shape[0])
-        low_x, high_x = self._ranges(self.shape[1])
-        return _core.Landing(
-            sums=sums,
-            low_y=low_y,
-            high_y=high_y,
-            low_x=low_x,
-            high_x=high_x,
-            oversampling=self._oversampling,
-            order=self._order,
-            k_y=k_y,
-            k_x=k_x,
-            t_y=t_y,
-            t_x=t_x,
+        y, x = (
+            (*self._ranges(n), *axis.weights())
+            for n, axis in zip(self.shape, self._axes(), strict=True)
         )
+        return _core.Landing(sums, self._oversampling, self._order, *y, *x)
 
     def _ranges(self, n):
         """For each node along an axis the range of the phase tables that lies on the image."""

@@ -133,7 +133,6 @@ class Scene(Interactive):
             raise argument_error("wcs", "a WCS with its pixel_shape", "one without")
         name = str(getattr(filter, "name", filter))
         self._wcs, self._filter = wcs, find_filter(name) or name
-        self._exposure = exposure
         if isinstance(catalog, str) and catalog in resources():
             catalog = read_catalog(catalog)
         sources = as_sources(catalog, self._filter)
@@ -170,11 +169,6 @@ class Scene(Interactive):
     def filter(self):
         """Name of the flux column."""
         return self._filter
-
-    @property
-    def exposure(self):
-        """The exposure that the image is for, or None."""
-        return self._exposure
 
     @property
     def wcs(self):

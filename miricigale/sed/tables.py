@@ -197,13 +197,9 @@ class _Blocks:
         """Spectra of AGN for one watt, which of them each row has, and their sums."""
         chain, n = self.chain, len(rows)
         which = np.zeros(n, dtype=np.int64)
-        active = np.flatnonzero(self.values["frac_agn"][rows] > 0)
-        if active.size == 0:
-            blank = dict.fromkeys(
-                ("infrared", "reference", "luminosity", "six", "accretion"), np.ones(n)
-            )
-            return np.zeros((1, chain.wave.size)), which, blank
-        names = chain.names("agn")
+        names, active = chain.names("agn"), np.flatnonzero(self.values["frac_agn"][rows] > 0)
+        # without any the first row stands for all, at no power
+        active = active if active.size else np.array([0])
         different, index = distinct(self._keys(rows[active], "agn"))
         keys = [chain.agn_key(dict(zip(names, row, strict=True))) for row in different]
         keys, place = distinct(keys)

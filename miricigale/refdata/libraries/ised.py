@@ -111,21 +111,7 @@ def read_ised(path):
         If it is another file, truncated or not finite.
     """
     path = Path(path)
-    return parse_ised(read_bytes(path), path)
-
-
-def read_bytes(path):
-    """Content of a file, decompressed if it is compressed by gzip."""
-    unpacked_size(path)
-    try:
-        data = path.read_bytes()
-        return gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data
-    except (OSError, EOFError, zlib.error) as err:
-        raise _foreign(path, err) from err
-
-
-def parse_ised(data, path):
-    """Like `read_ised`, from the decompressed content; ``path`` is for messages."""
+    data = _unpacked(path)
     order = _byte_order(data)
     source = _Words(data, path) if order is None else _Records(data, order, path)
     out = _content(source, path.name)
@@ -138,6 +124,16 @@ def parse_ised(data, path):
     if out.spectra.min() < 0:
         raise _foreign(path, f"spectra must be 0 or more, got {out.spectra.min():g}")
     return out
+
+
+def _unpacked(path):
+    """Content of a file, decompressed if it is compressed by gzip."""
+    unpacked_size(path)
+    try:
+        data = path.read_bytes()
+        return gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data
+    except (OSError, EOFError, zlib.error) as err:
+        raise _foreign(path, err) from err
 
 
 def _content(source, name):

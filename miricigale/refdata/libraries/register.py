@@ -48,15 +48,12 @@ class Report:
         What was read.
     sha256 : str
         Of the converted file.
-    size : int
-        Of the converted file, in bytes.
     """
 
     library: LibraryTable
     path: Path
     source: Path
     sha256: str
-    size: int
 
     def __str__(self):
         library, files = self.library, self.library.meta["files"]
@@ -77,7 +74,7 @@ class Report:
         if len(files) <= 5:
             rows += [("sha256", f"{value}  {name}") for name, value in files.items()]
         rows += [("sha256", f"{self.sha256}  {self.path.name}")]
-        rows += [("written", f"{self.path} ({self.size / 1e6:.1f} MB)")]
+        rows += [("written", f"{self.path} ({self.path.stat().st_size / 1e6:.1f} MB)")]
         rows += [("record", f"{record_path(self.path)} (checksums of all files)")]
         column = max(len(key) for key, _ in rows) + 1
         return "\n".join([library.name, *(f"    {key:{column}}{text}" for key, text in rows)])
@@ -139,8 +136,7 @@ def add_library(name, path, *, progress_bar=False):
             # what was written is what counts
             library = verify_library(partial, name)
             entry |= _entry(library, path)
-    known = stored_record(target)
-    return Report(library, target, path, known["sha256"], known["size"])
+    return Report(library, target, path, stored_record(target)["sha256"])
 
 
 @contextlib.contextmanager

@@ -100,16 +100,6 @@ class LibraryTable:
         for name in names:
             if not (name.isascii() and name.isidentifier()):
                 raise argument_error("axes", "named by plain identifiers", repr(name))
-        for name, unit in self.units.items():
-            if name not in (*names, "wave"):
-                known = f"of a column ({', '.join(names)})"
-                raise argument_error("units", known, repr(name))
-            try:
-                u.Unit(unit)
-            except (TypeError, ValueError):
-                raise argument_error("units", f"a unit for {name!r}", repr(unit)) from None
-        if u.Unit(self.units.get("wave", WAVE)) != WAVE:
-            raise argument_error("units", f"{WAVE} for 'wave'", repr(self.units["wave"]))
 
     @property
     def n_rows(self):

@@ -52,11 +52,6 @@ class NebularTable:
     line_wave: np.ndarray
     lines: np.ndarray
 
-    @functools.cached_property
-    def metallicities(self):
-        """Different metallicities, ascending."""
-        return np.unique(self.metallicity)
-
     def models(self, metallicity):
         """Numbers of the models of a metallicity, ascending in log U; empty if it is not there."""
         return np.flatnonzero(np.abs(self.metallicity / metallicity - 1.0) <= 1e-3)
@@ -165,16 +160,6 @@ class Nebular(Component):
         """The `NebularTable`."""
         return load_nebular(self.path)
 
-    @property
-    def line_names(self):
-        """Names of the lines, as `lines` has them: angstrom in air, um in vacuum."""
-        return self.table.names
-
-    @property
-    def line_wave(self):
-        """Vacuum wavelengths of the lines in um: `~numpy.ndarray`, shape (n_line,)."""
-        return self.table.line_wave
-
     @functools.cached_property
     def _drawn(self):
         table = self.table
@@ -184,11 +169,6 @@ class Nebular(Component):
 
     def nodes(self):
         return self._drawn[0]
-
-    def inert(self, values):
-        if _core.absorbed_share(values["f_esc"], values["f_dust"]) == 0.0:
-            return ("log_u", "metallicity_gas")
-        return () if self.gas == "free" else ("metallicity_gas",)
 
     def _metallicity(self, values):
         return values["metallicity" if self.gas == "stellar" else "metallicity_gas"]
@@ -200,7 +180,7 @@ class Nebular(Component):
         table, wanted = self.table, self._metallicity(values)
         models = table.models(wanted)
         if not models.size:
-            known = ", ".join(f"{z:g}" for z in table.metallicities)
+            known = ", ".join(f"{z:g}" for z in np.unique(table.metallicity))
             if self.gas == "free":
                 return f"'metallicity_gas' must be one of {known}, got {wanted:g}"
             return (
@@ -257,9 +237,9 @@ class Nebular(Component):
 
     def lines(self, age, weights, ionizing, values):
         """
-        Luminosities of the lines before any dust: dict of W by `line_names`.
+        Luminosities of the lines before any dust: dict of W by name.
 
         Parameters are those of `spectra`.
         """
         emission = self._emission(age, weights, ionizing, values)[self.table.wave.size :]
-        return dict(zip(self.line_names, emission.tolist(), strict=True))
+        return dict(zip(self.table.names, emission.tolist(), strict=True))

@@ -61,9 +61,6 @@ class BurstHistory(StarFormationHistory):
             values["tau_burst"] * 1e3,
         )
 
-    def inert(self, values):
-        return ("age_burst", "tau_burst") if values["f_burst"] == 0.0 else ()
-
     def invalid(self, values):
         if values["f_burst"] > 0.0 and values["age_burst"] > values["age"]:
             return f"'age_burst' must not exceed 'age', got {values['age_burst']:g} Gyr"
