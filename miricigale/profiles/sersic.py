@@ -204,7 +204,7 @@ def sersic_image(shape, *, x, y, total_flux=1.0, r_eff, n, axis_ratio=1.0, theta
     return image
 
 
-def sersic_stamp(*, x, y, total_flux=1.0, r_eff, n, axis_ratio=1.0, theta=0.0, max_radius=None):
+def sersic_stamp(*, x, y, total_flux=1.0, r_eff, n, axis_ratio=1.0, theta=0.0, max_radius=np.inf):
     """
     A Sersic profile on the smallest stamp that holds the isophote of 99.5 % of its light.
 
@@ -224,9 +224,7 @@ def sersic_stamp(*, x, y, total_flux=1.0, r_eff, n, axis_ratio=1.0, theta=0.0, m
         Row and column of the stamp's first pixel in the frame of ``x`` and ``y``.
     """
     _check(total_flux, r_eff, n, axis_ratio)
-    radius = r_eff * sersic_radius(_IN_STAMP, n)
-    if max_radius is not None:
-        radius = min(radius, max_radius)
+    radius = min(r_eff * sersic_radius(_IN_STAMP, n), max_radius)
     half_x = np.hypot(radius * np.cos(theta), radius * axis_ratio * np.sin(theta))
     half_y = np.hypot(radius * np.sin(theta), radius * axis_ratio * np.cos(theta))
     x0, x1 = int(np.floor(x - half_x + 0.5)), int(np.ceil(x + half_x - 0.5))

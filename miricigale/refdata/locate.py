@@ -94,15 +94,6 @@ def find_place(record):
     return "", None
 
 
-def _warn_of_override(record, label, path):
-    """Say so if a bundled file gives way to another one of different content."""
-    if label == "the package" or record.kind != "bundled" or not path.is_file():
-        return
-    if fingerprint_of(path) != record.sha256:
-        msg = f"resource {record.name!r} is taken from {path}, which differs from the bundled file"
-        warnings.warn(msg, ReferenceWarning, stacklevel=3)
-
-
 def file_record(name):
     """Record of a resource that is a file; others are refused."""
     record = resource(name)
@@ -163,7 +154,13 @@ def locate(name):
         remedy = f"get it from {record.source} and run 'miricigale data add {name} PATH'"
         msg = f"resource {name!r} ({record.title}) is in none of {tried}; {remedy}"
         raise DataError(msg)
-    _warn_of_override(record, label, path)
+    if (
+        label != "the package"
+        and record.kind == "bundled"
+        and fingerprint_of(path) != record.sha256
+    ):
+        msg = f"resource {record.name!r} is taken from {path}, which differs from the bundled file"
+        warnings.warn(msg, ReferenceWarning, stacklevel=2)
     return path
 
 
@@ -180,15 +177,12 @@ def fingerprint(name):
     return fingerprint_of(locate(name))
 
 
-def fingerprint_of(path, *, trust=True):
+def fingerprint_of(path):
     """
     The sha256 of a file.
 
-    With ``trust`` the file is not read where its size and time are those of the record beside it, or
-    of an earlier call.
+    It is not read where its size and time are those of the record beside it, or of an earlier call.
     """
-    if not trust:
-        return file_sha256(path)
     status = path.stat()
     try:
         record = stored_record(path) or {}

@@ -22,22 +22,6 @@ _UNRESOLVED = 0.05
 _DIRECT = 8
 
 
-def _check(painter, origin):
-    """Refuse a painter's settings; return its oversampling and the node of its center."""
-    oversampling = np.broadcast_to(painter.psf.oversampling, 2)
-    if oversampling[0] != oversampling[1]:
-        raise argument_error("psf", "oversampled alike in x and y", oversampling.tolist())
-    origin = np.asarray(origin, dtype=float)
-    if np.any(np.abs(origin - np.round(origin)) > 1e-6):
-        raise argument_error("psf", "centered on a node (odd shape)", f"origin {origin.tolist()}")
-    if not 0 < painter.enclosed < 1:
-        raise argument_error("enclosed", "between 0 and 1", painter.enclosed)
-    if not painter.max_radius > 0:
-        raise argument_error("max_radius", "positive", painter.max_radius)
-    thread_count(painter.n_threads)
-    return int(oversampling[0]), tuple(round(float(v)) for v in origin)
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class Painter:
     """
@@ -78,7 +62,19 @@ class Painter:
         else:
             wanted = "a photutils ImagePSF or GriddedPSFModel"
             raise argument_error("psf", wanted, type(self.psf).__name__)
-        oversampling, origin = _check(self, origin)
+        oversampling = np.broadcast_to(self.psf.oversampling, 2)
+        if oversampling[0] != oversampling[1]:
+            raise argument_error("psf", "oversampled alike in x and y", oversampling.tolist())
+        origin = np.asarray(origin, dtype=float)
+        if np.any(np.abs(origin - np.round(origin)) > 1e-6):
+            got = f"origin {origin.tolist()}"
+            raise argument_error("psf", "centered on a node (odd shape)", got)
+        if not 0 < self.enclosed < 1:
+            raise argument_error("enclosed", "between 0 and 1", self.enclosed)
+        if not self.max_radius > 0:
+            raise argument_error("max_radius", "positive", self.max_radius)
+        thread_count(self.n_threads)
+        oversampling, origin = int(oversampling[0]), tuple(round(float(v)) for v in origin)
         (x, k_x), (y, k_y) = (np.unique(v, return_inverse=True) for v in np.transpose(where))
         order = np.zeros((y.size, x.size), dtype=np.int64)
         order[k_y, k_x] = np.arange(len(where))

@@ -15,7 +15,7 @@ from miricigale.profiles import ellipse_to_pixels
 from miricigale.psf import InstrumentPSF, PSFGrid, as_psf, miri_psf
 from miricigale.refdata import resources
 from miricigale.scene.background import Background
-from miricigale.scene.catalog import CatalogFlags, as_sources, check_catalog
+from miricigale.scene.catalog import UNUSABLE_PROFILE, as_sources, check_catalog
 from miricigale.scene.catalog_files import read_catalog
 from miricigale.scene.cutouts import Cutout
 from miricigale.scene.render import Painter
@@ -143,7 +143,7 @@ class Scene(Interactive):
         psf = miri_psf(self._filter) if psf is None else as_psf(psf)
         self._shape = tuple(int(n) for n in wcs.pixel_shape[::-1])
         self._background = self._check_background(background)
-        scale = self._pixel_scale()
+        scale = float(np.abs(np.linalg.det(self._center_jacobian())) ** -0.5)
         self._check_psf(psf, scale)
         radius = positive(max_radius, ANGLE, "max_radius")
         self._painter = Painter(
@@ -253,9 +253,6 @@ class Scene(Interactive):
         ny, nx = self._shape
         return local_jacobian(self._wcs, np.array([(nx - 1) / 2]), np.array([(ny - 1) / 2]))[0]
 
-    def _pixel_scale(self):
-        return float(np.abs(np.linalg.det(self._center_jacobian())) ** -0.5)
-
     def _check_psf(self, psf, scale):
         if not isinstance(psf, _TYPED):
             # a plain photutils model is taken as it is
@@ -298,7 +295,7 @@ class Scene(Interactive):
         valid = np.isfinite(flux) & (flux >= 0)
         flags[~valid] |= SceneFlags.NO_FLUX
         sersic = catalog["profile"] == "sersic"
-        spoilt = (catalog["flags"] & int(CatalogFlags.unusable_profile())) != 0
+        spoilt = (catalog["flags"] & UNUSABLE_PROFILE) != 0
         flags[sersic & spoilt] |= SceneFlags.DRAWN_AS_POINT
         sersic &= ~spoilt
 

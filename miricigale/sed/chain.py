@@ -46,14 +46,9 @@ STELLAR = ("sfh", "stellar", "nebular")
 GALAXY = (STELLAR, ("attenuation",), ("dust",))
 SKY = ("igm", "foreground")
 MAX_HISTORIES = 128  # stars of so many histories are kept
-#: Methods of `Chain` that keep what they made last, and how many results.
-MAX_KEPT = {
-    "_populations": 8,
-    "factors": 256,
-    "dust": 256,
-    "agn_templates": 256,
-    "sky_transmission": 64,
-}
+#: Results that each of these methods of `Chain` keeps.
+MAX_KEPT = 256
+_KEEPING = ("_populations", "factors", "dust", "agn_templates", "sky_transmission")
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,8 +133,8 @@ class Chain:
         }
         self._stars = {}
         # what was made last is kept, by its arguments, as long as the chain lives
-        for name, maxsize in MAX_KEPT.items():
-            setattr(self, name, functools.lru_cache(maxsize)(getattr(self, name)))
+        for name in _KEEPING:
+            setattr(self, name, functools.lru_cache(MAX_KEPT)(getattr(self, name)))
 
     def _functionals(self):
         wave, n = self.wave, self.wave.size

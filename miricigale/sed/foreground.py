@@ -121,35 +121,8 @@ def check_bands(filters, law, beyond="refuse"):
         raise ValueError(msg)
 
 
-class Foreground(Component):
-    """Base: `transmission` at observed wavelengths, whatever the redshift."""
-
-    role = "foreground"
-
-    def transmission(self, wave, values):
-        """
-        Transmission of what lies in front of all.
-
-        Parameters
-        ----------
-        wave : `~numpy.ndarray`, shape (n,)
-            Observed wavelengths in um.
-        values : dict
-            Values of the parameters.
-
-        Returns
-        -------
-        transmission : `~numpy.ndarray`, shape (n,)
-            From 0 to 1.
-        """
-        raise NotImplementedError
-
-    def check_bands(self, filters):
-        """Raise a ValueError where the transmission is not known over a band."""
-
-
 @register
-class GalacticExtinction(Foreground):
+class GalacticExtinction(Component):
     """
     Extinction by dust of the Milky Way.
 
@@ -174,6 +147,7 @@ class GalacticExtinction(Foreground):
     """
 
     name = "galactic_extinction"
+    role = "foreground"
     reference = (
         "Gordon et al. 2023, ApJ 950, 86 (G23) or that of the law; Gordon 2024, JOSS 9, 7023"
     )
@@ -189,7 +163,21 @@ class GalacticExtinction(Foreground):
             raise ValueError(sentence)
 
     def transmission(self, wave, values):
-        """See `Foreground.transmission`."""
+        """
+        Transmission of what lies in front of all, whatever the redshift.
+
+        Parameters
+        ----------
+        wave : `~numpy.ndarray`, shape (n,)
+            Observed wavelengths in um.
+        values : dict
+            Values of the parameters.
+
+        Returns
+        -------
+        transmission : `~numpy.ndarray`, shape (n,)
+            From 0 to 1.
+        """
         ebv = values["ebv_galactic"]
         if ebv == 0.0:
             return np.ones(np.shape(wave))

@@ -48,10 +48,6 @@ def grid_key(model, axes, filters):
     return content_sha256(content)
 
 
-def _own(component):
-    return type(component).__module__.split(".")[0] == __name__.split(".")[0]
-
-
 def _unchanged(model):
     """Whether the files that were read are those that are there now."""
     return all(
@@ -69,7 +65,8 @@ def cached_grid(model, axes, filters, make):
     outside this package are not cached, since their code may change under the same name.
     """
     limit = conf.grid_cache_size * 1e6
-    if limit <= 0 or not all(map(_own, model.components)):
+    own = all(type(c).__module__.startswith("miricigale.") for c in model.components)
+    if limit <= 0 or not own:
         return make(model, axes, filters)
     path = cache_folder() / "grids" / f"{grid_key(model, axes, filters)}.fits"
     if path.exists():

@@ -318,15 +318,12 @@ class SEDModel(Interactive):
             why = component.invalid(out)
             if why:
                 raise ValueError(why)
-        limit = self._universe(out["redshift"])
+        limit = float(self.cosmology.age(out["redshift"]).to_value(u.Gyr))
         if out["age"] > limit:
             raise argument_error(
                 "age", f"at most the age of the universe, {limit:.3f} Gyr", out["age"]
             )
         return out
-
-    def _universe(self, redshift):
-        return float(self.cosmology.age(redshift).to_value(u.Gyr))
 
     def evaluate(self, **parameters):
         """

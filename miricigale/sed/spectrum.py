@@ -270,7 +270,7 @@ class SED(Frozen, Interactive):
         return cls(table[wave], table[fnu], redshift=redshift, meta=meta, components=parts)
 
     @classmethod
-    def from_synphot(cls, spectrum, *, wave=None, redshift=None):
+    def from_synphot(cls, spectrum, *, redshift=None):
         """
         Make an SED from a synphot spectrum.
 
@@ -278,14 +278,12 @@ class SED(Frozen, Interactive):
         ----------
         spectrum : `synphot.SourceSpectrum`
             The spectrum.
-        wave : `~astropy.units.Quantity`, optional
-            Where it is sampled; its own ``waveset`` if not given.
         redshift : float, optional
             Redshift of the source; the spectrum's ``z`` if not given.
         """
-        wave = spectrum.waveset if wave is None else u.Quantity(wave)
+        wave = spectrum.waveset
         if wave is None:
-            raise argument_error("wave", "given for a spectrum without waveset", "None")
+            raise argument_error("spectrum", "one with a waveset", repr(spectrum))
         fnu = spectrum(wave, flux_unit=u.Jy)
         order = np.argsort(wave)
         redshift = spectrum.z if redshift is None else redshift

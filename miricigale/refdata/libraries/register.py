@@ -13,7 +13,7 @@ import numpy as np
 from miricigale.refdata.libraries.table import LibraryTable, verify_library, write_library
 from miricigale.refdata.locate import data_folder, file_sha256, record_path, stored_record
 from miricigale.refdata.registry import resource
-from miricigale.utils.exceptions import DataError, argument_error, data_error, unknown_name
+from miricigale.utils.exceptions import DataError, data_error, unknown_name
 from miricigale.utils.progress import progress
 from miricigale.utils.store import PARTIAL, replacing
 
@@ -58,7 +58,7 @@ class Report:
     def __str__(self):
         library, files = self.library, self.library.meta["files"]
         units, n, wave = library.units, library.n_rows, library.wave
-        axes = {axis: library.values_of(axis) for axis in library.axes}
+        axes = library.levels
         number = f"{len(files):,} file{'s' if len(files) != 1 else ''}"
         rows = [("source", f"{self.source} ({number} read)")]
         kinds = ", ".join(f"{kind} ({units.get(kind) or 'no unit'})" for kind in library.spectra)
@@ -213,19 +213,13 @@ def _reader(name):
 def _read(reader, name, path):
     """Read the files; whatever is wrong with them is one sentence that names them."""
     try:
-        library = reader(path)
+        return reader(path)
     except DataError:
         raise
     except Exception as err:  # readers of different formats raise different exceptions
         reason = err.args[0] if isinstance(err, KeyError) and err.args else err
         what = f"cannot be read as {name!r}: {reason or type(err).__name__}"
         raise data_error(path, what) from err
-    if not isinstance(library, LibraryTable) or library.name != name:
-        got = repr(getattr(library, "name", type(library).__name__))
-        raise argument_error("reader", f"one that gives the library {name!r}", got)
-    if not library.meta.get("files"):
-        raise argument_error("reader", "one that gives meta['files'], their checksums", "none")
-    return library
 
 
 def _entry(library, source):

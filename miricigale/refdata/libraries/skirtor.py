@@ -72,7 +72,7 @@ def read_skirtor(path):
     path = Path(path)
     if not path.exists():
         raise data_error(path, f"does not exist; wanted {_WANTED}")
-    if path.is_file() and not is_archive(path) and not _NAME.fullmatch(path.name):
+    if path.is_file() and not is_archive(path):
         wave, axes, spectra, files = _read_fits(path)
     else:
         wave, axes, spectra, files = _read_texts(path)
@@ -125,9 +125,6 @@ def _file_name(key):
 
 def _texts(path):
     """Name, bytes and source of each spectrum below a folder, or in an archive or a folder of them."""
-    if _NAME.fullmatch(path.name):
-        yield path.name, path.read_bytes(), str(path)
-        return
     n = 0
     for place, data, source in members(path, _NAME.fullmatch):
         n += 1
@@ -254,8 +251,6 @@ def _read_fits(path):
     n = len(seen)
     axes = {"tau97": table["TAU"], "inclination": table["INCLINATION"]}
     axes |= {name: np.full(n, value) for name, value in _FITS_FIXED.items()}
-    if len(set(zip(axes["tau97"], axes["inclination"], strict=True))) < n:
-        raise data_error(path, "has two rows of the same TAU and INCLINATION")
     spectra = {
         "disk": (seen / (wave * _SUN)).astype(np.float32),
         "dust": (power["DUST_TOTAL"] / (wave * _SUN)).astype(np.float32),

@@ -85,8 +85,7 @@ class LibraryTable:
         for kind in ("axes", "values"):
             columns = {k: frozen_array(v) for k, v in getattr(self, kind).items()}
             object.__setattr__(self, kind, columns)
-        summary = (self.summary,) if isinstance(self.summary, str) else tuple(self.summary)
-        object.__setattr__(self, "summary", summary)
+        object.__setattr__(self, "summary", tuple(self.summary))
         object.__setattr__(self, "_index", self._make_index())
 
     def _check_names(self):
@@ -106,22 +105,9 @@ class LibraryTable:
         """Number of spectra of each kind."""
         return len(next(iter(self.spectra.values())))
 
-    def values_of(self, axis):
-        """
-        Different values of an axis, ascending.
-
-        Raises
-        ------
-        KeyError
-            If there is no such axis.
-        """
-        if axis not in self.axes:
-            msg = f"library {self.name!r} has no axis {axis!r}; axes: {', '.join(self.axes)}"
-            raise KeyError(msg)
-        return self._levels[axis].copy()
-
     @functools.cached_property
-    def _levels(self):
+    def levels(self):
+        """Different values of each axis, ascending: dict of name to `~numpy.ndarray`."""
         levels = {}
         for name, column in self.axes.items():
             found = np.unique(column)
@@ -131,7 +117,7 @@ class LibraryTable:
 
     def _codes(self, axis, values):
         """For each value the number of the level that is the same, or -1."""
-        levels = self._levels[axis]
+        levels = self.levels[axis]
         nearest = np.searchsorted(0.5 * (levels[1:] + levels[:-1]), values)
         # zero has no relative neighborhood: there the extent of the axis is the measure
         near = _SAME * np.maximum(np.abs(levels), 1e-3 * np.ptp(levels))
@@ -139,7 +125,7 @@ class LibraryTable:
 
     def _place(self, codes):
         """Number of a combination of levels among all of them."""
-        return np.ravel_multi_index(codes, [levels.size for levels in self._levels.values()])
+        return np.ravel_multi_index(codes, [levels.size for levels in self.levels.values()])
 
     def _make_index(self):
         codes = {name: self._codes(name, column) for name, column in self.axes.items()}
@@ -172,14 +158,14 @@ class LibraryTable:
         """
         return {
             name: tuple(levels.tolist())
-            for name, levels in self._levels.items()
+            for name, levels in self.levels.items()
             if np.any(self._codes(name, np.atleast_1d(values.get(name, []))) < 0)
         }
 
     @property
     def complete(self):
         """Whether every combination of the values of the axes has a row."""
-        return self.n_rows == np.prod([levels.size for levels in self._levels.values()])
+        return self.n_rows == np.prod([levels.size for levels in self.levels.values()])
 
     def row(self, **values):
         """

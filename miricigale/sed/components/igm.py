@@ -120,11 +120,10 @@ def load_lines(path):
         table = np.array([columns[name] for name in _COLUMNS], dtype=float).T
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, KeyError, TypeError, ValueError) as err:
         raise data_error(path, f"is not table 2 of Inoue et al. 2014: {err}") from err
-    if table.ndim != 2 or len(table) != 39 or not np.all(np.isfinite(table) & (table > 0)):
-        wanted = "must hold six columns of 39 positive numbers"
-        raise data_error(path, f"{wanted}, got shape {table.shape}")
-    if np.any(np.diff(table[:, 0]) >= 0):
-        raise data_error(path, "must hold 'wavelength' from the longest to the shortest")
+    positive = table.shape == (39, len(_COLUMNS)) and np.all(np.isfinite(table) & (table > 0))
+    if not positive or np.any(np.diff(table[:, 0]) >= 0):
+        what = "must hold six columns of 39 positive numbers, from the longest wavelength on"
+        raise data_error(path, what)
     lines = _core.inoue_lines(table)
     for array in lines:
         array.flags.writeable = False

@@ -88,16 +88,6 @@ def load_nebular(path):
             arrays["line_wave"] = frozen_array(rows["WAVE"])
     except KeyError as err:
         raise data_error(path, f"is not {wanted}: {err.args[0]}") from err
-    shape = (arrays["metallicity"].size, arrays["age"].size)
-    wanted = {
-        "continuum": (*shape, arrays["wave"].size),
-        "lines": (*shape, len(names)),
-        "log_u": shape[:1],
-    }
-    for name, size in wanted.items():
-        if arrays[name].shape != size:
-            what = f"must hold '{name}' of shape {size}, got {arrays[name].shape}"
-            raise data_error(path, what)
     return NebularTable(names=names, **arrays)
 
 

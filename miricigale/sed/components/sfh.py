@@ -173,11 +173,6 @@ class TableSFH(StarFormationHistory):
         self._rates = np.array([_core.table_history(edges, rate) for rate in rates])
         self._rates.flags.writeable = False
         length = self._rates.shape[1] / 1e3
-        if "age" not in defaults and length > type(self).age.bounds[1]:
-            limit = type(self).age.bounds[1]
-            raise argument_error(
-                "table", f"{limit} Gyr long at most where 'age' is not given", f"{length:g} Gyr"
-            )
         super().__init__(**{"age": length} | defaults)
         why = self.invalid({name: par.default for name, par in self.parameters.items()})
         if why:
