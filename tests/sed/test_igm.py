@@ -69,12 +69,7 @@ def test_between_nothing_and_all_and_clear_longward_of_lyman_alpha(cls):
         wave = np.geomspace(1e-3, 10.0, 5000)
         got = part.transmission(wave, z)
         assert np.all((got >= 0.0) & (got <= 1.0))
-        assert_array_equal(got[wave > LYMAN_ALPHA * (1 + z) * 1.001], 1.0)
-
-
-@pytest.mark.parametrize("cls", MODELS)
-def test_nothing_absorbs_in_front_of_a_source_at_redshift_zero(cls):
-    assert_array_equal(cls().transmission(np.geomspace(1e-3, 10, 500), 0.0), 1.0)
+        assert_array_equal(got[wave > (LYMAN_ALPHA * (1 + z) * 1.001 if z > 0 else 0)], 1.0)
 
 
 @pytest.mark.parametrize("cls", MODELS)
@@ -425,7 +420,7 @@ def test_inoue_below_the_limit_as_seen_starts_at_redshift_zero(wave, z):
         (
             "".join(f"{c} = [1.0, 2.0]\n" for c in ("wavelength", "laf1", "laf2", "laf3"))
             + "dla1 = [1.0, 2.0]\ndla2 = [1.0, 2.0]\n",
-            r"six columns of 39 positive numbers, got shape \(2, 6\)",
+            "six columns of 39 positive numbers, from the longest wavelength on",
         ),
     ],
 )
@@ -433,12 +428,3 @@ def test_a_foreign_table_is_refused(tmp_path, text, match):
     path = tmp_path / "lines.toml"
     path.write_text(text)
     refuses(match, load_lines, str(path), error=DataError)
-
-
-def test_a_table_in_the_wrong_order_is_refused(tmp_path):
-    path = tmp_path / "lines.toml"
-    table = line_table()[::-1]
-    names = ("wavelength", "laf1", "laf2", "laf3", "dla1", "dla2")
-    lines = [f"{n} = {c.tolist()}" for n, c in zip(names, table[:, 1:].T, strict=True)]
-    path.write_text("\n".join(lines))
-    refuses("from the longest to the shortest", load_lines, str(path), error=DataError)
