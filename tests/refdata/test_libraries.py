@@ -407,11 +407,6 @@ def test_a_better_library_replaces_the_old_one(folder):
     assert open_library(new.path, NAME).n_rows == 1
 
 
-def test_the_same_files_give_the_same_fingerprint(folder):
-    path = source(folder)
-    assert add_library(NAME, path).sha256 == add_library(NAME, path).sha256
-
-
 @pytest.mark.parametrize("error", [KeyboardInterrupt, OSError("No space left on device")])
 @pytest.mark.parametrize("place", ["written", "checked", "recorded"])
 def test_an_interrupted_conversion_changes_nothing(folder, monkeypatch, error, place):

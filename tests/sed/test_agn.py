@@ -13,7 +13,7 @@ from scipy.integrate import quad
 from helpers.components import values_of
 from helpers.errors import refuses
 from miricigale import conf
-from miricigale.refdata.libraries import open_library, write_library
+from miricigale.refdata.libraries import write_library
 from miricigale.refdata.libraries.skirtor import read_skirtor
 from miricigale.sed import _core
 from miricigale.sed.components import ParametricTorus, Skirtor2016, TorusSpectra
@@ -624,21 +624,6 @@ def test_skirtor_says_what_it_has(skirtor):
         skirtor.torus_spectra(full_grid(skirtor), values | {"q": 1.0})
 
 
-def test_library_registered_anew_is_read_anew(skirtor):
-    wave, values = full_grid(skirtor), values_of(skirtor)
-    before = skirtor.torus_spectra(wave, values).dust
-    library = open_library(skirtor.path, "torus.skirtor2016")
-    dust = np.array(library.spectra["dust"]) * (library.wave > 5)
-    spectra = {"disk": np.array(library.spectra["disk"]), "dust": dust}
-    axes = library.axes
-    write_library(
-        type(library)(library.name, library.wave, axes, spectra, library.units), skirtor.path
-    )
-    after = skirtor.torus_spectra(wave, values).dust
-    assert np.interp(4.0, wave, before) > 0
-    assert np.interp(4.0, wave, after) == 0.0
-
-
 # ------------------------------------------------------------------ the real SKIRTOR
 
 
@@ -663,23 +648,6 @@ def test_real_spectra_conserve_energy(real):
         mu = np.cos(np.radians(np.arange(90, -10, -10)))
         total = np.trapezoid(np.trapezoid(light, real.wave, axis=1), mu)
         assert total == pytest.approx(1.0, abs=0.05)
-
-
-def test_real_grid_survives_the_authors_layout(real, tmp_path):
-    """Written as lambda F_lambda at 10 Mpc in the documented columns, and read back."""
-    for k in range(real.n_rows):
-        key = [float(real.axes[a][k]) for a in real.axes]
-        mu = np.cos(np.radians(key[-1]))
-        disk, dust = (real.spectra[n][k].astype(float) * real.wave * FLUX for n in ("disk", "dust"))
-        shape = _core.disk_spectrum(real.wave, 0.0, "stalevski2016") * real.wave * FLUX
-        clear = shape * mu * (1 + 2 * mu) * 6 / 7
-        columns = [real.wave, disk + dust, disk, 0 * disk, dust, 0 * dust, clear]
-        (tmp_path / file_name(*key)).write_text(text(np.column_stack(columns)))
-    again = read_skirtor(tmp_path)
-    for name in real.spectra:
-        assert_allclose(again.spectra[name], real.spectra[name], rtol=2e-7, atol=1e-30)
-    for name in real.axes:
-        assert_array_equal(again.axes[name], real.axes[name])
 
 
 def test_disk_of_the_real_library_is_the_form_of_2016(real):

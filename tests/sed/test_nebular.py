@@ -293,20 +293,3 @@ def test_refuses_a_foreign_file(tmp_path):
         DataError, match=r"none\.fits cannot be read as a table of nebular emission"
     ):
         load_nebular(str(tmp_path / "none.fits"))
-
-
-def test_a_model_with_gas_is_the_one_without_where_all_photons_escape():
-    from miricigale.sed import SEDModel
-
-    parts = SEDModel.yang2021(agn=False, igm="madau1995").components
-    values = {"age": 1.0, "redshift": 0.5, "ebv": 0.2}
-    bare = SEDModel(parts).evaluate(**values)
-    escaping = SEDModel([*parts, Nebular(f_esc=1.0)]).evaluate(**values)
-    inside = bare.wave < 1e4 * u.um
-    assert_allclose(escaping.fnu_at(bare.wave[inside]).value, bare.fnu[inside].value, rtol=2e-3)
-    bright = SEDModel([*parts, Nebular()]).evaluate(**values)
-    part = (bright.wave > 0.2 * u.um) & (bright.wave < 1e4 * u.um)
-    more = (bright.fnu / escaping.fnu)[part].value
-    # dust takes the light of the gas as well and gives it back beyond 3 um
-    assert more.min() > 0.999
-    assert more.max() > 3.0

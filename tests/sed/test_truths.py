@@ -12,14 +12,12 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.cosmology import FlatLambdaCDM
-from astropy.modeling.physical_models import BlackBody
 from astropy.table import QTable
 from astropy.tests.helper import assert_quantity_allclose
 from numpy.testing import assert_allclose
-from scipy.integrate import quad
 from scipy.special import hyp2f1
 
-from miricigale.filters import Filter, FilterSet
+from miricigale.filters import FilterSet
 from miricigale.sed import COSMOLOGY, SED, SEDModel
 from miricigale.sed.spectrum import distance
 
@@ -210,38 +208,3 @@ def test_absorption_between_the_galaxies_takes_nothing_longward_of_lyman_alpha(b
 
 
 # ------------------------------------------------------------------------------ blackbodies
-
-
-@pytest.mark.parametrize(("kelvin", "beta"), [(100.0, 1.6), (300.0, 1.0)])
-@pytest.mark.parametrize("z", [0.0, 2.0])
-def test_polar_dust_through_narrow_bands_is_a_greybody(bundled, kelvin, beta, z):
-    """
-    (1 - exp(-(200 um / l)^beta)) B_nu(T): flux from the power and the shape.
-
-    Straight lines between nodes cost 2e-3 at most.
-    """
-    spectra = bundled.evaluate(
-        age=0.8,
-        frac_agn=0.6,
-        ebv_polar=0.3,
-        temperature_polar=kelvin,
-        emissivity_polar=beta,
-        inclination=80.0,
-        redshift=z,
-    )
-    polar = spectra.components["agn_polar"]
-    far = closed_form_distance(z, 70.4, 0.272) if z > 0 else 10 * u.pc
-    body = BlackBody(kelvin * u.K)
-
-    def shape(rest):
-        return -np.expm1(-((200 / rest) ** beta)) * body(rest * u.um).value
-
-    # integral over frequency, in log wavelength
-    total = quad(lambda s: shape(np.exp(s)) * np.exp(-s), np.log(2.0), np.log(5000), limit=200)[0]
-    power = luminosity(polar, far)
-    for rest in (8.0, 12.0, 25.0, 40.0):
-        seen = rest * (1 + z)
-        box = Filter([0.995 * seen, 1.005 * seen] * u.um, [1, 1], name="box")
-        lnu = power * shape(rest) / (total * const.c / u.um)
-        want = (1 + z) * lnu / (4 * np.pi * far**2)
-        assert_quantity_allclose(box.synthetic_flux(polar), want.to(u.uJy), rtol=3e-3)
