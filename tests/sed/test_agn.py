@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.table import Table
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import quad
 
@@ -511,14 +512,11 @@ def write_fits(path, change=lambda name, column: column):
     names = ("TOTAL", "DISK_DIRECT", "DISK_SCATTERED", "DUST_TOTAL", "DUST_SCATTERED")
     for k, name in enumerate((*names, "TRANSPARENT"), 1):
         columns[f"LNU_{name}"] = [t[:, k] / FLUX * 1e11 / nu for t in tables]
-    units = {"INCLINATION": "deg", "WAVE_REST": "um", "NU_REST": "Hz"}
-    out = []
-    for name, values in columns.items():
-        column = change(name, np.array(values))
-        shape = "132D" if column.ndim == 2 else "D"
-        unit = units.get(name, "Hz-1 solLum" if name.startswith("LNU") else None)
-        out.append(fits.Column(name, shape, unit=unit, array=column))
-    fits.BinTableHDU.from_columns(out).writeto(path)
+    units = {"INCLINATION": "deg", "WAVE_REST": "um", "NU_REST": "Hz", "TAU": None}
+    table = Table({name: change(name, np.array(values)) for name, values in columns.items()})
+    for name in table.colnames:
+        table[name].unit = units.get(name, "solLum / Hz")
+    table.write(path)
 
 
 def test_fits_grid_is_the_same_as_text(tmp_path):

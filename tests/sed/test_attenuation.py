@@ -60,12 +60,6 @@ def test_far_ultraviolet_is_that_of_leitherer(wave):
     assert curve(wave)[0] == pytest.approx(want, rel=1e-12)
 
 
-def test_the_two_starburst_fits_meet():
-    """At 0.15 um, where one follows the other, they differ by 0.2 %."""
-    low, high = curve([0.15 - 1e-9, 0.15])
-    assert low == pytest.approx(high, rel=3e-3)
-
-
 def test_nothing_is_dimmed_below_the_lyman_limit_nor_where_the_fit_turns_negative():
     # 2.659 (-1.857 + 1.040 / l) + 4.05 = 0
     zero = 1.040 / (1.857 - 4.05 / 2.659)
@@ -211,12 +205,6 @@ def pei(wave, galaxy):
         keys |= {f"{name}_amp": a * (1.0 + 1.0 / r_v), f"{name}_lambda": center}
         keys |= {f"{name}_b": b, f"{name}_n": n}
     return r_v * np.asarray(P92(**keys)(wave * u.um))
-
-
-def test_pei_agrees_with_dust_extinction():
-    wave = np.geomspace(0.095, 900.0, 300)
-    want = pei(wave, "smc")
-    assert_allclose(curve(wave, SMC(law="pei1992")), want, rtol=1e-6, atol=1e-9)
 
 
 # ------------------------------------------------------------------------ Charlot and Fall

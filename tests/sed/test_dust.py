@@ -254,15 +254,6 @@ def test_other_places_are_refused_by_name(dale_folder, tmp_path):
     refuses(r"cut\.zip", read_dale2014, tmp_path / "cut.zip", error=DataError)
 
 
-def test_unregistered_templates_are_named_with_the_command(monkeypatch, tmp_path):
-    from miricigale import conf
-
-    monkeypatch.delenv("MIRICIGALE_DATA", raising=False)
-    wanted = r"miricigale data add dust\.dale2014 PATH"
-    with conf.set_temp("data_folder", str(tmp_path)), pytest.raises(DataError, match=wanted):
-        Dale2014().nodes()
-
-
 def test_templates_are_exact_at_their_alphas_and_linear_between(dale, dale_folder):
     library, part = read_dale2014(dale_folder), Dale2014()
     nodes = part.nodes()

@@ -11,10 +11,8 @@ import astropy.constants as const
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.cosmology import FlatLambdaCDM
 from astropy.table import QTable
 from astropy.tests.helper import assert_quantity_allclose
-from numpy.testing import assert_allclose
 from scipy.special import hyp2f1
 
 from miricigale.filters import FilterSet
@@ -100,14 +98,6 @@ def test_fluxes_are_those_of_synphot(bundled, all_bands, kind, z):
         assert mine == pytest.approx(photon_mean(sed, band, wave), rel=4e-4 if z == 6 else 2e-4)
 
 
-def test_magnitude_zero_is_3631_jansky(all_bands):
-    sed = SED([0.1, 100.0] * u.um, [3631.0, 3631.0] * u.Jy)
-    # 10^((8.9 - 0) / 2.5) Jy = 3630.78: the definition, AB = -2.5 log(F / erg/s/cm2/Hz) - 48.60
-    magnitude = all_bands.synthetic_fluxes(sed).to_value(u.ABmag)
-    exact = -2.5 * np.log10((3631 * u.Jy).to_value(u.erg / u.s / u.cm**2 / u.Hz)) - 48.60
-    assert_allclose(magnitude, exact, atol=1e-6)
-
-
 # ------------------------------------------------------------------------------ distances
 
 
@@ -124,14 +114,6 @@ def closed_form_distance(z, h0, om):
 def test_distance_by_closed_form(z):
     got = float(distance(z, COSMOLOGY)) * u.m
     assert_quantity_allclose(got, closed_form_distance(z, 70.4, 0.272), rtol=1e-9)
-
-
-@pytest.mark.parametrize("z", [0.1, 1.0, 8.0])
-def test_distance_without_lambda(z):
-    """Einstein-de Sitter: (2 c / H0) (1 + z) (1 - 1 / sqrt(1 + z))."""
-    got = float(distance(z, FlatLambdaCDM(H0=65, Om0=1.0))) * u.m
-    want = 2 * const.c / (65 * u.km / u.s / u.Mpc) * (1 + z) * (1 - (1 + z) ** -0.5)
-    assert_quantity_allclose(got, want.to(u.m), rtol=1e-9)
 
 
 def test_a_galaxy_is_no_older_than_the_universe(bundled):

@@ -161,19 +161,6 @@ def test_component_equals_the_functions_for_any_array():
     assert one["xray_flux"] == pytest.approx(got["xray_flux"][2])
 
 
-def test_component_takes_values_that_change_along_the_rows():
-    part = XRay()
-    index, high = np.array([1.4, 2.0]), np.array([2.0, 10.0])
-    got = part.derived(
-        np.full(2, 1e37), 1.0, 1e26, values_of(part, photon_index=index, xray_high=high)
-    )
-    for i in range(2):
-        one = part.derived(
-            1e37, 1.0, 1e26, values_of(part, photon_index=index[i], xray_high=high[i])
-        )
-        assert got["xray_flux"][i] == pytest.approx(one["xray_flux"])
-
-
 def test_empty_band_is_invalid():
     part = XRay()
     assert part.invalid(values_of(part)) is None

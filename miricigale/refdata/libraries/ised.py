@@ -50,8 +50,6 @@ class Ised:
 
     Parameters
     ----------
-    name : str
-        Name of the file.
     age, wave : `~numpy.ndarray`, shape (n_age,) and (n_wave,)
         Ages in yr, wavelengths in A.
     spectra : `~numpy.ndarray`, shape (n_age, n_wave)
@@ -67,7 +65,6 @@ class Ised:
         The lines of text.
     """
 
-    name: str
     age: np.ndarray
     wave: np.ndarray
     spectra: np.ndarray
@@ -114,7 +111,7 @@ def read_ised(path):
     data = _unpacked(path)
     order = _byte_order(data)
     source = _Words(data, path) if order is None else _Records(data, order, path)
-    out = _content(source, path.name)
+    out = _content(source)
     for name, array in (("ages", out.age), ("wavelengths", out.wave)):
         if array.size < 2 or not np.all(np.diff(array) > 0) or array[0] < 0:
             raise _foreign(path, f"{name} must be positive and ascending")
@@ -136,7 +133,7 @@ def _unpacked(path):
         raise _foreign(path, err) from err
 
 
-def _content(source, name):
+def _content(source):
     """The numbers of a file in their order, whatever its form."""
     source.begin("the head")
     age = source.vector().astype(float)
@@ -156,7 +153,6 @@ def _content(source, name):
         source.begin(f"vector {len(vectors) + 1} after the spectra")
         vectors.append(source.vector(age.size).astype(float))
     return Ised(
-        name,
         age,
         wave,
         spectra,

@@ -158,16 +158,11 @@ def _read_texts(path):
         keys.append(key)
         disk.append((seen / (wave * _FLUX)).astype(np.float32))
         dust.append((table[4] / (wave * _FLUX)).astype(np.float32))
-        files[_short(source, path)] = digest
+        files[source.removeprefix(f"{path}{'/' if path.is_dir() else ':'}")] = digest
     if not keys:
         raise data_error(path, f"holds no spectrum; wanted {_WANTED}")
     axes = dict(zip(SKIRTOR_AXES, np.array(keys).T, strict=True))
     return wave, axes, {"disk": np.array(disk), "dust": np.array(dust)}, files
-
-
-def _short(source, path):
-    """Name of a source relative to the folder that was given."""
-    return source.removeprefix(f"{path}/") if path.is_dir() else source.removeprefix(f"{path}:")
 
 
 def _parse(data, source):
