@@ -62,12 +62,8 @@ def data_check(args):
 
 
 def data_add(args):
-    """Add a file of reference data."""
-    from miricigale.refdata import add_resource
-    from miricigale.refdata.libraries import READERS, add_library
+    """Add a library of reference data."""
+    from miricigale.refdata.libraries import add_library
 
-    if args.name in READERS:
-        print(add_library(args.name, args.path, progress_bar=sys.stderr.isatty()))
-    else:
-        print(add_resource(args.name, args.path))
+    print(add_library(args.name, args.path, progress_bar=sys.stderr.isatty()))
     return 0

@@ -1,4 +1,3 @@
-from .ellipse import ellipse_through as ellipse_through
 from .ellipse import ellipse_to_pixels as ellipse_to_pixels
 from .sersic import SERSIC_INDEX_RANGE as SERSIC_INDEX_RANGE
 from .sersic import sersic_bn as sersic_bn

@@ -172,29 +172,20 @@ def cell(dx, dy, size, par, table, out):
         out[1] = -2.0 * slope * gx * size * size / 12.0
         out[2] = -2.0 * slope * gy * size * size / 12.0
         return
-    light, mx, my = 0.0, 0.0, 0.0
+    nodes, weights = _NODES6, _WEIGHTS6
     if slope * change < _GAUSS3:
-        for i in range(3):
-            oy = 0.5 * size * _NODES3[i]
-            for j in range(3):
-                ox = 0.5 * size * _NODES3[j]
-                x, y = dx + ox, dy + oy
-                w = a * x * x + 2.0 * b * x * y + c * y * y
-                f = _WEIGHTS3[i] * _WEIGHTS3[j] * math.exp(-bn * math.exp(power * math.log(w)))
-                light += f
-                mx += f * ox
-                my += f * oy
-    else:
-        for i in range(6):
-            oy = 0.5 * size * _NODES6[i]
-            for j in range(6):
-                ox = 0.5 * size * _NODES6[j]
-                x, y = dx + ox, dy + oy
-                w = a * x * x + 2.0 * b * x * y + c * y * y
-                f = _WEIGHTS6[i] * _WEIGHTS6[j] * math.exp(-bn * math.exp(power * math.log(w)))
-                light += f
-                mx += f * ox
-                my += f * oy
+        nodes, weights = _NODES3, _WEIGHTS3
+    light, mx, my = 0.0, 0.0, 0.0
+    for i in range(nodes.size):
+        oy = 0.5 * size * nodes[i]
+        for j in range(nodes.size):
+            ox = 0.5 * size * nodes[j]
+            x, y = dx + ox, dy + oy
+            w = a * x * x + 2.0 * b * x * y + c * y * y
+            f = weights[i] * weights[j] * math.exp(-bn * math.exp(power * math.log(w)))
+            light += f
+            mx += f * ox
+            my += f * oy
     out[0] = par[3] * light * 0.25 * size * size
     if light > 0.0:
         out[1] = mx / light

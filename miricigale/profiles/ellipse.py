@@ -3,47 +3,6 @@
 import numpy as np
 
 
-def ellipse_through(jacobian, *, radius, axis_ratio, direction):
-    """
-    Carry ellipses through linear maps.
-
-    Parameters
-    ----------
-    jacobian : `~numpy.ndarray`, shape (..., 2, 2)
-        Maps, ``[x', y'] = jacobian @ [x, y]``; with or without reflection.
-    radius : array-like
-        Semi-major axes.
-    axis_ratio : array-like
-        Minor over major axis.
-    direction : array-like
-        Direction of the major axis in radians, from the first coordinate to the second.
-
-    Returns
-    -------
-    radius, axis_ratio, direction : `~numpy.ndarray`
-        The same of the ellipses' images, with directions in (-pi/2, pi/2].
-    """
-    jacobian = np.asarray(jacobian, dtype=float)
-    radius, axis_ratio, direction = np.broadcast_arrays(
-        np.asarray(radius, float), np.asarray(axis_ratio, float), np.asarray(direction, float)
-    )
-    cos, sin = np.cos(direction), np.sin(direction)
-    # columns: the images of the two semi-axes; their outer products add up to the shape matrix
-    axes = np.stack(
-        [np.stack([cos, -axis_ratio * sin], -1), np.stack([sin, axis_ratio * cos], -1)], -2
-    )
-    axes = jacobian @ (axes * radius[..., None, None])
-    shape = axes @ np.swapaxes(axes, -1, -2)
-    a, b, c = shape[..., 0, 0], shape[..., 0, 1], shape[..., 1, 1]
-    root = np.hypot(0.5 * (a - c), b)
-    major2 = 0.5 * (a + c) + root
-    area = np.abs(np.linalg.det(axes))  # keeps thin ellipses exact: major * minor
-    major = np.sqrt(major2)
-    ratio = np.divide(area, major2, out=np.ones_like(area), where=major2 > 0)
-    new = 0.5 * np.arctan2(2 * b, a - c)
-    return major, np.minimum(ratio, 1.0), new
-
-
 def ellipse_to_pixels(jacobian, *, radius, axis_ratio, position_angle):
     """
     Ellipses on the sky as ellipses on the pixel grid.
@@ -62,7 +21,25 @@ def ellipse_to_pixels(jacobian, *, radius, axis_ratio, position_angle):
     Returns
     -------
     radius, axis_ratio, theta : `~numpy.ndarray`
-        Pixels, ratio and radians from +x toward +y.
+        Pixels, ratio and radians from +x toward +y, in (-pi/2, pi/2].
     """
     direction = np.pi / 2 - np.asarray(position_angle, dtype=float)
-    return ellipse_through(jacobian, radius=radius, axis_ratio=axis_ratio, direction=direction)
+    jacobian = np.asarray(jacobian, dtype=float)
+    radius, axis_ratio, direction = np.broadcast_arrays(
+        np.asarray(radius, float), np.asarray(axis_ratio, float), direction
+    )
+    cos, sin = np.cos(direction), np.sin(direction)
+    # columns: the images of the two semi-axes; their outer products add up to the shape matrix
+    axes = np.stack(
+        [np.stack([cos, -axis_ratio * sin], -1), np.stack([sin, axis_ratio * cos], -1)], -2
+    )
+    axes = jacobian @ (axes * radius[..., None, None])
+    shape = axes @ np.swapaxes(axes, -1, -2)
+    a, b, c = shape[..., 0, 0], shape[..., 0, 1], shape[..., 1, 1]
+    root = np.hypot(0.5 * (a - c), b)
+    major2 = 0.5 * (a + c) + root
+    area = np.abs(np.linalg.det(axes))  # keeps thin ellipses exact: major * minor
+    major = np.sqrt(major2)
+    ratio = np.divide(area, major2, out=np.ones_like(area), where=major2 > 0)
+    new = 0.5 * np.arctan2(2 * b, a - c)
+    return major, np.minimum(ratio, 1.0), new

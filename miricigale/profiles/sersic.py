@@ -5,6 +5,7 @@ import scipy
 
 from miricigale.utils.exceptions import argument_error
 
+_IN_STAMP = 0.995  # of the light lies within the isophote that a stamp holds
 #: Indices that the images are made and tested for.
 SERSIC_INDEX_RANGE = (0.2, 10.0)
 
@@ -203,18 +204,14 @@ def sersic_image(shape, *, x, y, total_flux=1.0, r_eff, n, axis_ratio=1.0, theta
     return image
 
 
-def sersic_stamp(
-    *, x, y, total_flux=1.0, r_eff, n, axis_ratio=1.0, theta=0.0, enclosed=0.995, max_radius=None
-):
+def sersic_stamp(*, x, y, total_flux=1.0, r_eff, n, axis_ratio=1.0, theta=0.0, max_radius=np.inf):
     """
-    A Sersic profile on the smallest stamp that holds a fraction of its light.
+    A Sersic profile on the smallest stamp that holds the isophote of 99.5 % of its light.
 
     Parameters
     ----------
     x, y, total_flux, r_eff, n, axis_ratio, theta
         As in `sersic_image`.
-    enclosed : float, optional
-        Fraction of the light whose isophote the stamp must hold.
     max_radius : float, optional
         Largest semi-major axis of that isophote in pixels; the light beyond is lost (the
         sum of the stamp says how much is there).
@@ -227,11 +224,7 @@ def sersic_stamp(
         Row and column of the stamp's first pixel in the frame of ``x`` and ``y``.
     """
     _check(total_flux, r_eff, n, axis_ratio)
-    if not 0 < enclosed < 1:
-        raise argument_error("enclosed", "between 0 and 1", enclosed)
-    radius = r_eff * sersic_radius(enclosed, n)
-    if max_radius is not None:
-        radius = min(radius, max_radius)
+    radius = min(r_eff * sersic_radius(_IN_STAMP, n), max_radius)
     half_x = np.hypot(radius * np.cos(theta), radius * axis_ratio * np.sin(theta))
     half_y = np.hypot(radius * np.sin(theta), radius * axis_ratio * np.cos(theta))
     x0, x1 = int(np.floor(x - half_x + 0.5)), int(np.ceil(x + half_x - 0.5))

@@ -8,4 +8,3 @@ from .registry import Resource as Resource
 from .registry import citations as citations
 from .registry import resource as resource
 from .registry import resources as resources
-from .store import add_resource as add_resource

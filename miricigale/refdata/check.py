@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from miricigale.refdata.locate import find_place, fingerprint_of, stored_record
+from miricigale.refdata.locate import file_sha256, find_place, stored_record
 from miricigale.refdata.registry import resources
 from miricigale.utils.exceptions import DataError
 
@@ -66,9 +66,9 @@ def _state(record):
         if name in READERS:
             verify_library(path, name)
         wanted = record.sha256 or (beside or {}).get("sha256", "")
-        if not wanted or not path.is_file():
+        if not wanted:
             return ResourceState(name, "unchecked", where, "no record of its checksum")
-        if fingerprint_of(path, trust=False) != wanted:
+        if file_sha256(path) != wanted:
             return ResourceState(name, "wrong checksum", where, "sha256 differs from its record")
     except OSError as err:
         message = str(err) if isinstance(err, DataError) else f"{path} cannot be read: {err}"

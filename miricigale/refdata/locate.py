@@ -1,6 +1,5 @@
 """Finding reference data: environment, the user's folder, bundled files."""
 
-import hashlib
 import importlib.metadata
 import json
 import os
@@ -13,7 +12,7 @@ from astropy import config as _config
 from miricigale.refdata.registry import resource
 from miricigale.utils.configuration import conf
 from miricigale.utils.content import file_sha256
-from miricigale.utils.exceptions import DataError, ReferenceWarning, argument_error
+from miricigale.utils.exceptions import DataError, ReferenceWarning, argument_error, data_error
 from miricigale.utils.files import cached_by_file
 
 
@@ -57,22 +56,21 @@ def stored_record(path):
     """
     beside = record_path(path)
     try:
-        # thousands of checksums: read once
-        record = _json(beside)
+        return dict(_read_record(beside))
     except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, ValueError) as err:
-        msg = f"{beside} cannot be read as the record of {path.name}: {err}"
-        raise DataError(msg) from err
-    if not isinstance(record, dict) or not isinstance(record.get("sha256"), str):
-        msg = f"{beside} cannot be read as the record of {path.name}: it has no 'sha256'"
-        raise DataError(msg)
-    return dict(record)
+        raise data_error(beside, f"cannot be read as the record of {path.name}: {err}") from err
 
 
 @cached_by_file(16)
-def _json(path):
-    return json.loads(Path(path).read_text(encoding="utf-8"))
+def _read_record(path):
+    # thousands of checksums: read once
+    record = json.loads(Path(path).read_text(encoding="utf-8"))
+    if not isinstance(record, dict) or not isinstance(record.get("sha256"), str):
+        msg = "it has no 'sha256'"
+        raise ValueError(msg)
+    return record
 
 
 def _places(record):
@@ -94,15 +92,6 @@ def find_place(record):
         if path.exists():
             return label, path
     return "", None
-
-
-def _warn_of_override(record, label, path):
-    """Say so if a bundled file gives way to another one of different content."""
-    if label == "the package" or record.kind != "bundled" or not path.is_file():
-        return
-    if fingerprint_of(path) != record.sha256:
-        msg = f"resource {record.name!r} is taken from {path}, which differs from the bundled file"
-        warnings.warn(msg, ReferenceWarning, stacklevel=3)
 
 
 def file_record(name):
@@ -135,7 +124,7 @@ def find_resource(name):
     return find_place(file_record(name))[1]
 
 
-def locate(name, *, check=False):
+def locate(name):
     """
     Find the file or folder of a resource.
 
@@ -146,9 +135,6 @@ def locate(name, *, check=False):
     ----------
     name : str
         Such as ``"ssp.bc03"``; see `resources`.
-    check : bool, optional
-        Whether the checksum is compared with the record, or with the one that was written
-        beside the file when it was added.
 
     Returns
     -------
@@ -159,23 +145,22 @@ def locate(name, *, check=False):
     KeyError
         If there is no such resource.
     `~miricigale.utils.exceptions.DataError`
-        If it is in none of the places, or its checksum differs.
+        If it is in none of the places.
     """
     record = file_record(name)
     label, path = find_place(record)
     if path is None:
         tried = ", ".join(f"{label} ({folder})" for label, folder in _places(record))
-        msg = (
-            f"resource {name!r} ({record.title}) is in none of {tried}; "
-            f"get it from {record.source} and run 'miricigale data add {name} PATH'"
-        )
+        remedy = f"get it from {record.source} and run 'miricigale data add {name} PATH'"
+        msg = f"resource {name!r} ({record.title}) is in none of {tried}; {remedy}"
         raise DataError(msg)
-    if check and path.is_file():
-        wanted = record.sha256 or (stored_record(path) or {}).get("sha256", "")
-        if wanted and file_sha256(path) != wanted:
-            msg = f"{path} is not the file that the record of {name!r} describes (sha256 differs)"
-            raise DataError(msg)
-    _warn_of_override(record, label, path)
+    if (
+        label != "the package"
+        and record.kind == "bundled"
+        and fingerprint_of(path) != record.sha256
+    ):
+        msg = f"resource {record.name!r} is taken from {path}, which differs from the bundled file"
+        warnings.warn(msg, ReferenceWarning, stacklevel=2)
     return path
 
 
@@ -183,8 +168,7 @@ def fingerprint(name):
     """
     What identifies the data that a resource stands for now.
 
-    The sha256 of the file that `locate` finds (over names and contents for a folder), or the
-    version of the package that it comes from.
+    The sha256 of the file that `locate` finds, or the version of the package that it comes from.
     """
     record = resource(name)
     if not record.file:
@@ -193,22 +177,12 @@ def fingerprint(name):
     return fingerprint_of(locate(name))
 
 
-def fingerprint_of(path, *, trust=True):
+def fingerprint_of(path):
     """
-    The sha256 of a file, or over names and contents of a folder.
+    The sha256 of a file.
 
-    With ``trust`` the file is not read where its size and time are those of the record beside it, or
-    of an earlier call.
+    It is not read where its size and time are those of the record beside it, or of an earlier call.
     """
-    if path.is_dir():
-        parts = [
-            f"{p.relative_to(path)} {file_sha256(p)}"
-            for p in sorted(path.rglob("*"))
-            if p.is_file()
-        ]
-        return hashlib.sha256("\n".join(parts).encode()).hexdigest()
-    if not trust:
-        return file_sha256(path)
     status = path.stat()
     try:
         record = stored_record(path) or {}

@@ -1,6 +1,6 @@
 """Reading of the bundled tables: images of FITS files, as read-only arrays."""
 
-from miricigale.utils.exceptions import DataError
+from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import cached_by_file, open_fits
 from miricigale.utils.units import frozen_array
 
@@ -17,8 +17,7 @@ def read_images(path, names, *, wanted):
         with open_fits(path, wanted=wanted) as hdus:
             return {name: frozen_array(hdus[name].data) for name in names}
     except KeyError as err:
-        msg = f"{path} is not {wanted}: {err.args[0]}"
-        raise DataError(msg) from err
+        raise data_error(path, f"is not {wanted}: {err.args[0]}") from err
 
 
 @cached_by_file(maxsize=2)

@@ -8,7 +8,6 @@ from .cutouts import Cutout as Cutout
 from .deconvolution import deconvolve as deconvolve
 from .highres import depth_to_rms as depth_to_rms
 from .highres import highres_image as highres_image
-from .render import FieldPainter as FieldPainter
 from .render import Painter as Painter
 from .scene import Scene as Scene
 from .scene import SceneFlags as SceneFlags

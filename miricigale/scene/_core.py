@@ -47,23 +47,22 @@ class Landing(NamedTuple):
     Which part of the light deposited on a node lands on the image.
 
     ``sums``, shape (n_psfs, oversampling, oversampling, 2 L + 2, 2 L + 2), are cumulative sums of
-    each PSF's coefficients, one table for each sub-pixel phase; ``low_y`` to ``high_x`` give for
-    each row or column of nodes the range in them that lies on the image. ``order`` (n_y, n_x)
-    holds the PSFs on their rectangular grid over the field; ``k_y``, ``k_x`` are for each row or
-    column of nodes the place on that grid below it, ``t_y``, ``t_x`` the weight of the next
-    place.
+    each PSF's coefficients, one table for each sub-pixel phase. ``order`` (n_y, n_x) holds the PSFs
+    on their rectangular grid over the field. For each row (``_y``) or column (``_x``) of nodes
+    ``low`` to ``high`` are the range in the tables that lies on the image, ``k`` the place on the
+    grid of PSFs below it and ``t`` the weight of the next place.
     """
 
     sums: np.ndarray
-    low_y: np.ndarray
-    high_y: np.ndarray
-    low_x: np.ndarray
-    high_x: np.ndarray
     oversampling: int
     order: np.ndarray
+    low_y: np.ndarray
+    high_y: np.ndarray
     k_y: np.ndarray
-    k_x: np.ndarray
     t_y: np.ndarray
+    low_x: np.ndarray
+    high_x: np.ndarray
+    k_x: np.ndarray
     t_x: np.ndarray
 
 

@@ -60,51 +60,18 @@ class CatalogFlags(Flags):
     NO_FLUX = 32  # no band has a positive flux (with a positive error, where it has errors)
     MISSING_CODE = 64  # a flux or error was a number that stands for no value, such as -99
 
-    @classmethod
-    def unusable_profile(cls):
-        """The bits that make a Sersic profile be drawn as a point."""
-        return cls.BAD_RADIUS | cls.BAD_INDEX | cls.BAD_AXIS_RATIO | cls.BAD_ANGLE
 
-
-def unmasked(column):
-    """A column of numbers with NaN where it is masked, in either of astropy's two ways."""
-    if not hasattr(column, "mask"):
-        return column
-    if np.any(column.mask):
-        return (column if column.dtype.kind == "f" else column.astype(float)).filled(np.nan)
-    return column.unmasked if hasattr(column, "unmasked") else column.filled()
-
-
-def _refuse_missing(catalog, argument):
-    """No value of a column that says what a source is may be missing."""
-    for name in ("id", "profile"):
-        missing = np.asarray(getattr(catalog[name], "mask", False))
-        if np.any(missing):
-            row = int(np.argmax(missing))
-            wanted = f"a table without missing values in {name!r}"
-            raise argument_error(argument, wanted, f"{int(missing.sum())}, first in row {row}")
-        catalog[name] = unmasked(catalog[name])
+#: What makes a Sersic profile be drawn as a point.
+UNUSABLE_PROFILE = sum(flag for flag in CatalogFlags if flag.name.startswith("BAD_"))
 
 
 def _plain(table, name, unit, argument):
-    """A column as numbers in ``unit``, NaN where it has a number that stands for no value."""
-    column = unmasked(table[name])
-    try:
-        if unit is None:
-            values = column.to_value(u.one) if hasattr(column, "to_value") else np.asarray(column)
-            return _without_codes(values)
-        column = u.Quantity(column, dtype=float)
-        # an angle on the sky may be -99
-        values = column.value if name == "position_angle" else _without_codes(column.value)
-        return u.Quantity(values, column.unit).to(unit)
-    except (TypeError, ValueError):
-        raise argument_error(argument, f"a table with numbers in {name!r}", column.dtype) from None
-
-
-def _without_codes(values):
-    values = np.array(values, dtype=float)
-    values[without_codes(values)[0]] = np.nan
-    return values
+    """A column as numbers in ``unit``, NaN where it has none or one that stands for no value."""
+    values = plain_floats(table[name], name, argument)
+    if name != "position_angle":  # an angle on the sky may be -99
+        values[without_codes(values)[0]] = np.nan
+    values = u.Quantity(values, getattr(table[name], "unit", None)).to(unit or u.one)
+    return values if unit else values.value
 
 
 def as_sources(data, filter, argument="catalog"):
@@ -183,25 +150,26 @@ def check_catalog(table, *, filters=(), wcs=None, argument="catalog"):
     require_columns(catalog, CATALOG_COLUMNS, argument, units=units)
     fluxes = [*filters, *(name for name in catalog.colnames if is_band(name))]
     require_columns(catalog, filters, argument, units=dict.fromkeys(fluxes, FNU))
-    _refuse_missing(catalog, argument)
     ids = read_ids(catalog, argument)
     if ids.dtype.kind not in "iuU":
         wanted = "a table with integers or text in 'id'"
         raise argument_error(argument, wanted, catalog["id"].dtype)
     catalog["id"] = unique_ids(ascii_ids(ids, argument), argument)
-    profile = np.asarray(catalog["profile"]).astype(str)
+    profile = catalog["profile"]
+    # missing ones are refused below
+    profile = np.asarray(profile.filled("") if hasattr(profile, "mask") else profile).astype(str)
     unknown = sorted(set(profile.tolist()) - set(PROFILES))
     if unknown:
         raise argument_error(argument, f"a table with 'profile' among {PROFILES}", unknown)
     catalog["profile"] = profile
-    for name, unit in CATALOG_COLUMNS.items():
-        if name not in ("id", "sky", "profile"):
-            catalog[name] = _plain(catalog, name, unit, argument)
+    numbers = {n: unit for n, unit in CATALOG_COLUMNS.items() if n not in ("id", "sky", "profile")}
     for name in catalog.colnames:
         unit = getattr(catalog[name], "unit", None)
         linear = isinstance(unit, u.UnitBase)  # a magnitude is none
         if "." in name and linear and unit.is_equivalent(FNU):
-            catalog[name] = _plain(catalog, name, FNU, argument)
+            numbers[name] = FNU
+    for name, unit in numbers.items():
+        catalog[name] = _plain(catalog, name, unit, argument)
     if "star" not in catalog.colnames:
         catalog["star"] = np.zeros(len(catalog), dtype=bool)
     star = catalog["star"]

@@ -194,7 +194,7 @@ def convolve(grid, data, order, rows, columns, *, origin, margin, oversampling, 
                 light[i : i + own.shape[0], j : j + own.shape[1]] = own
             kernels = _kernels(data, origin, os_, order, (k_y, length_y), (k_x, length_x))
             size = (size_y, size_x)
-            totals = {}
+            totals = dict.fromkeys(kernels, 0.0)
             for a in range(os_):
                 for b in range(os_):
                     part = light[a::os_, b::os_]
@@ -204,10 +204,7 @@ def convolve(grid, data, order, rows, columns, *, origin, margin, oversampling, 
                     for power, kernel in kernels.items():
                         product = _kernel_spectrum(kernel[a, b], size, n_threads)
                         product *= spectrum
-                        if power in totals:
-                            totals[power] += product
-                        else:
-                            totals[power] = product
+                        totals[power] += product
             y = np.arange(low_y - margin, high_y - margin)
             x = np.arange(low_x - margin, high_x - margin)
             taken = np.ix_((y + margin - y0) % size_y, (x + margin - x0) % size_x)

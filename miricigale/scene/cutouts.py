@@ -37,8 +37,6 @@ class Cutout(Frozen):
     center : tuple of float, optional
         Pixel x, y (0-based) that stands at the catalog's position; the middle of the
         stamp if not given.
-    n_filled : int, optional
-        How many of the pixels are no measurements but were filled in (`from_image`).
 
     Raises
     ------
@@ -56,7 +54,6 @@ class Cutout(Frozen):
     pixel_scale: u.Quantity
     angle: u.Quantity = 0.0 * u.deg
     center: tuple | None = None
-    n_filled: int = 0
 
     def __post_init__(self):
         data = frozen_array(np.asarray(self.data, dtype=float))
@@ -74,7 +71,7 @@ class Cutout(Frozen):
         object.__setattr__(self, "center", (float(center[0]), float(center[1])))
 
     @classmethod
-    def from_image(cls, image, position=None, *, fill=None):
+    def from_image(cls, image, position=None):
         """
         Take the stamp, its scale, its angle and its center from an image with a WCS.
 
@@ -82,12 +79,9 @@ class Cutout(Frozen):
         ----------
         image : `~astropy.nddata.NDData`
             Background subtracted, such as a `~astropy.nddata.Cutout2D` of a mosaic made a
-            CCDData.
+            CCDData; all of its pixels hold light.
         position : `~astropy.coordinates.SkyCoord`, optional
             What stands at the catalog's position; the middle of the stamp if not given.
-        fill : float or `~astropy.units.Quantity`, optional
-            Value, in the image's unit, for pixels that are masked or not finite. Without it
-            they are an error; with it they are counted in ``n_filled``.
 
         Returns
         -------
@@ -98,14 +92,19 @@ class Cutout(Frozen):
         ------
         ValueError
             If there is no WCS, its pixels are not square to a per cent, or pixels are masked
-            or not finite and there is no ``fill``.
+            or not finite.
         """
         if not isinstance(image, NDData) or image.wcs is None:
             raise argument_error("image", "NDData with a WCS", type(image).__name__)
         data = np.array(image.data, dtype=float)
         if data.ndim != 2:
             raise argument_error("image", "a 2D image", f"shape {data.shape}")
-        n_filled = cls._fill(data, image, fill)
+        bad = ~np.isfinite(data)
+        if image.mask is not None:
+            bad |= np.asarray(image.mask, dtype=bool)
+        if bad.any():
+            got = f"{bad.sum()} of {bad.size} pixels that are"
+            raise argument_error("image", "without masked or infinite pixels (fill them)", got)
         ny, nx = data.shape
         middle = np.array([(nx - 1) / 2]), np.array([(ny - 1) / 2])
         # columns: the steps along x and y in (east, north), arcsec
@@ -124,41 +123,12 @@ class Cutout(Frozen):
             data, x = data[:, ::-1], nx - 1 - x
         angle = math.degrees(math.atan2(steps[0, 1], steps[1, 1]))
         scale = float(np.sqrt(np.prod(sides)))
-        return cls(
-            data,
-            pixel_scale=scale * ANGLE,
-            angle=angle * u.deg,
-            center=(x, y),
-            n_filled=n_filled,
-        )
-
-    @staticmethod
-    def _fill(data, image, fill):
-        """Fill pixels without a measurement; return how many there are."""
-        bad = ~np.isfinite(data)
-        if image.mask is not None:
-            bad |= np.asarray(image.mask, dtype=bool)
-        n_bad = int(bad.sum())
-        if n_bad == 0:
-            return 0
-        if fill is None:
-            got = f"{n_bad} of {bad.size} pixels that are"
-            raise argument_error("image", "without masked or infinite pixels (or give 'fill')", got)
-        if isinstance(fill, u.Quantity):
-            if image.unit is None:
-                raise argument_error("fill", "a number, as the image has no unit", fill)
-            fill = to_array(fill, image.unit, "fill", ndim=0)
-        fill = float(fill)
-        if not math.isfinite(fill):
-            raise argument_error("fill", "finite", fill)
-        data[bad] = fill
-        return n_bad
+        return cls(data, pixel_scale=scale * ANGLE, angle=angle * u.deg, center=(x, y))
 
     def __repr__(self):
         ny, nx = self.data.shape
-        filled = f", {self.n_filled} pixels filled" if self.n_filled else ""
         size = f"{nx} x {ny} pixels of {self.pixel_scale:.4g}"
-        return f"<Cutout {size}, angle {self.angle:.4g}{filled}>"
+        return f"<Cutout {size}, angle {self.angle:.4g}>"
 
     @functools.cached_property
     def _steps(self):

@@ -15,9 +15,9 @@ from miricigale.utils.units import positive
 _DEPTH, _APERTURE, _N_SIGMA = 27.6 * u.ABmag, 0.2 * u.arcsec, 5
 
 
-def depth_to_rms(depth, *, pixel_area, aperture_radius=_APERTURE):
+def depth_to_rms(depth, *, pixel_area):
     """
-    Noise of a pixel that belongs to a depth.
+    Noise of a pixel that belongs to a depth in an aperture of 0.2" in radius.
 
     Parameters
     ----------
@@ -26,8 +26,6 @@ def depth_to_rms(depth, *, pixel_area, aperture_radius=_APERTURE):
         correction for the light outside it.
     pixel_area : array-like
         Solid angle of the pixels in sr.
-    aperture_radius : `~astropy.units.Quantity`, optional
-        Radius of the aperture.
 
     Returns
     -------
@@ -37,7 +35,7 @@ def depth_to_rms(depth, *, pixel_area, aperture_radius=_APERTURE):
     Raises
     ------
     ValueError
-        If the depth or the aperture is not positive.
+        If the depth is not positive.
 
     Examples
     --------
@@ -50,9 +48,8 @@ def depth_to_rms(depth, *, pixel_area, aperture_radius=_APERTURE):
     # magnitudes become fluxes
     flux = depth.to(u.uJy) if isinstance(depth, u.Magnitude) else depth
     limit = positive(flux, u.uJy, "depth")
-    radius = positive(aperture_radius, u.rad, "aperture_radius")
     pixel_area = np.asarray(pixel_area, dtype=float)
-    n_pixels = math.pi * radius**2 / pixel_area
+    n_pixels = math.pi * _APERTURE.to_value(u.rad) ** 2 / pixel_area
     return (1e-12 * limit / _N_SIGMA / np.sqrt(n_pixels) / pixel_area)[()]
 
 

@@ -22,22 +22,6 @@ _UNRESOLVED = 0.05
 _DIRECT = 8
 
 
-def _check(painter, origin):
-    """Refuse a painter's settings; return its oversampling and the node of its center."""
-    oversampling = np.broadcast_to(painter.psf.oversampling, 2)
-    if oversampling[0] != oversampling[1]:
-        raise argument_error("psf", "oversampled alike in x and y", oversampling.tolist())
-    origin = np.asarray(origin, dtype=float)
-    if np.any(np.abs(origin - np.round(origin)) > 1e-6):
-        raise argument_error("psf", "centered on a node (odd shape)", f"origin {origin.tolist()}")
-    if not 0 < painter.enclosed < 1:
-        raise argument_error("enclosed", "between 0 and 1", painter.enclosed)
-    if not painter.max_radius > 0:
-        raise argument_error("max_radius", "positive", painter.max_radius)
-    thread_count(painter.n_threads)
-    return int(oversampling[0]), tuple(round(float(v)) for v in origin)
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class Painter:
     """
@@ -47,10 +31,13 @@ class Painter:
     ----------
     shape : tuple of int
         Rows and columns of the image.
-    psf : `~photutils.psf.ImagePSF`
+    psf : `~photutils.psf.ImagePSF` or `~photutils.psf.GriddedPSFModel`
         PSF with the pixel response in it, oversampled alike in x and y, centered on one of
         its nodes. Its ``flux``, ``x_0`` and ``y_0`` are not looked at; light beyond its
-        edge is lost.
+        edge is lost. Of a grid of PSFs light has that of its own place, bilinear between those
+        of the grid as in photutils and constant beyond it; an extended source is blurred by
+        another PSF on its one side than on the other. All sources are painted and convolved
+        once, whatever the number of PSFs.
     enclosed : float, optional
         A Sersic profile is painted to the isophote that holds this fraction.
     max_radius : float, optional
@@ -60,23 +47,37 @@ class Painter:
     """
 
     shape: tuple
-    psf: ImagePSF
+    psf: "ImagePSF | GriddedPSFModel"
     enclosed: float = 0.995
     max_radius: float = math.inf
     n_threads: int | None = None
 
     def __post_init__(self):
-        if not isinstance(self.psf, ImagePSF):
-            raise argument_error("psf", "a photutils ImagePSF", type(self.psf).__name__)
-        self._prepare(np.asarray(self.psf.data)[None], self.psf.origin, [(0.0, 0.0)])
-
-    def _prepare(self, data, origin, where):
-        """Keep the PSFs, their coefficients and their places x, y."""
-        oversampling, origin = _check(self, origin)
+        data, where = np.asarray(self.psf.data, dtype=float), [(0.0, 0.0)]
+        if isinstance(self.psf, GriddedPSFModel):
+            origin = np.subtract(data.shape[:0:-1], 1) / 2
+            where = np.asarray(self.psf.grid_xypos, dtype=float)
+        elif isinstance(self.psf, ImagePSF):
+            data, origin = data[np.newaxis], self.psf.origin
+        else:
+            wanted = "a photutils ImagePSF or GriddedPSFModel"
+            raise argument_error("psf", wanted, type(self.psf).__name__)
+        oversampling = np.broadcast_to(self.psf.oversampling, 2)
+        if oversampling[0] != oversampling[1]:
+            raise argument_error("psf", "oversampled alike in x and y", oversampling.tolist())
+        origin = np.asarray(origin, dtype=float)
+        if np.any(np.abs(origin - np.round(origin)) > 1e-6):
+            got = f"origin {origin.tolist()}"
+            raise argument_error("psf", "centered on a node (odd shape)", got)
+        if not 0 < self.enclosed < 1:
+            raise argument_error("enclosed", "between 0 and 1", self.enclosed)
+        if not self.max_radius > 0:
+            raise argument_error("max_radius", "positive", self.max_radius)
+        thread_count(self.n_threads)
+        oversampling, origin = int(oversampling[0]), tuple(round(float(v)) for v in origin)
         (x, k_x), (y, k_y) = (np.unique(v, return_inverse=True) for v in np.transpose(where))
         order = np.zeros((y.size, x.size), dtype=np.int64)
         order[k_y, k_x] = np.arange(len(where))
-        data = np.asarray(data, dtype=float)
         own = {
             "_oversampling": oversampling,
             "_origin": origin,
@@ -95,8 +96,8 @@ class Painter:
 
     @property
     def enclosed_by_psf(self):
-        """Fraction of a point's light within the PSF's array."""
-        return float(np.sum(self.psf.data)) / self._oversampling**2
+        """Fraction of a point's light within the array of the PSF, the least of a grid."""
+        return float(self._data.sum(axis=(1, 2)).min()) / self._oversampling**2
 
     def _axes(self):
         """Places of the PSFs along y and along x."""
@@ -110,22 +111,11 @@ class Painter:
         shape = self._phases.shape
         sums = np.zeros((*shape[:3], shape[3] + 1, shape[4] + 1))
         sums[..., 1:, 1:] = self._phases.cumsum(axis=3).cumsum(axis=4)
-        (k_y, t_y), (k_x, t_x) = (axis.weights() for axis in self._axes())
-        low_y, high_y = self._ranges(self.shape[0])
-        low_x, high_x = self._ranges(self.shape[1])
-        return _core.Landing(
-            sums=sums,
-            low_y=low_y,
-            high_y=high_y,
-            low_x=low_x,
-            high_x=high_x,
-            oversampling=self._oversampling,
-            order=self._order,
-            k_y=k_y,
-            k_x=k_x,
-            t_y=t_y,
-            t_x=t_x,
+        y, x = (
+            (*self._ranges(n), *axis.weights())
+            for n, axis in zip(self.shape, self._axes(), strict=True)
         )
+        return _core.Landing(sums, self._oversampling, self._order, *y, *x)
 
     def _ranges(self, n):
         """For each node along an axis the range of the phase tables that lies on the image."""
@@ -231,36 +221,3 @@ class Painter:
         part = np.zeros((y1 - y0, x1 - x0))
         _core.deposit_pieces(part, x - x0, y - y0, light)
         return _core.add_part(grid, part, y0, x0, land)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class FieldPainter(Painter):
-    """
-    Paints sources through a PSF that varies over the field.
-
-    Light has the PSF of its own place, bilinear between those of the grid as in photutils and
-    constant beyond it; an extended source is blurred by another PSF on its one side than on the
-    other. All sources are painted and convolved once, whatever the number of PSFs.
-
-    Parameters
-    ----------
-    shape, enclosed, max_radius, n_threads
-        As of `Painter`.
-    psf : `~photutils.psf.GriddedPSFModel`
-        PSFs with the pixel response in them, at positions on the image.
-    """
-
-    psf: GriddedPSFModel
-
-    def __post_init__(self):
-        if not isinstance(self.psf, GriddedPSFModel):
-            raise argument_error("psf", "a photutils GriddedPSFModel", type(self.psf).__name__)
-        data = np.asarray(self.psf.data)
-        origin = ((data.shape[2] - 1) / 2, (data.shape[1] - 1) / 2)
-        self._prepare(data, origin, np.asarray(self.psf.grid_xypos, dtype=float))
-
-    @property
-    def enclosed_by_psf(self):
-        """Least fraction of a point's light within the array of a PSF."""
-        sums = np.asarray(self.psf.data).sum(axis=(1, 2))
-        return float(sums.min()) / self._oversampling**2

@@ -6,7 +6,6 @@ import warnings
 import astropy.units as u
 import numpy as np
 from astropy.wcs import WCS
-from photutils.psf import GriddedPSFModel
 
 from miricigale.depth import sky_background
 from miricigale.filters.band_names import find_filter
@@ -16,14 +15,15 @@ from miricigale.profiles import ellipse_to_pixels
 from miricigale.psf import InstrumentPSF, PSFGrid, as_psf, miri_psf
 from miricigale.refdata import resources
 from miricigale.scene.background import Background
-from miricigale.scene.catalog import CatalogFlags, as_sources, check_catalog, unmasked
+from miricigale.scene.catalog import UNUSABLE_PROFILE, as_sources, check_catalog
 from miricigale.scene.catalog_files import read_catalog
 from miricigale.scene.cutouts import Cutout
-from miricigale.scene.render import FieldPainter, Painter
+from miricigale.scene.render import Painter
 from miricigale.scene.sky import local_jacobian, pixel_positions
 from miricigale.utils.exceptions import CatalogWarning, argument_error
 from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.meta import provenance
+from miricigale.utils.missing import plain_floats
 from miricigale.utils.options import check_kind
 from miricigale.utils.tables import Flags, described_table
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, positive, to_array
@@ -134,7 +134,6 @@ class Scene(Interactive):
             raise argument_error("wcs", "a WCS with its pixel_shape", "one without")
         name = str(getattr(filter, "name", filter))
         self._wcs, self._filter = wcs, find_filter(name) or name
-        self._exposure = exposure
         if isinstance(catalog, str) and catalog in resources():
             catalog = read_catalog(catalog)
         sources = as_sources(catalog, self._filter)
@@ -145,11 +144,10 @@ class Scene(Interactive):
         psf = miri_psf(self._filter) if psf is None else as_psf(psf)
         self._shape = tuple(int(n) for n in wcs.pixel_shape[::-1])
         self._background = self._check_background(background)
-        scale = self._pixel_scale()
+        scale = float(np.abs(np.linalg.det(self._center_jacobian())) ** -0.5)
         self._check_psf(psf, scale)
         radius = positive(max_radius, ANGLE, "max_radius")
-        painter = FieldPainter if isinstance(psf, GriddedPSFModel) else Painter
-        self._painter = painter(
+        self._painter = Painter(
             self._shape, psf, enclosed=enclosed, max_radius=radius / scale, n_threads=n_threads
         )
         self._cutouts = self._check_cutouts(cutouts)
@@ -172,11 +170,6 @@ class Scene(Interactive):
     def filter(self):
         """Name of the flux column."""
         return self._filter
-
-    @property
-    def exposure(self):
-        """The exposure that the image is for, or None."""
-        return self._exposure
 
     @property
     def wcs(self):
@@ -215,14 +208,13 @@ class Scene(Interactive):
             return flux, np.zeros(len(flux))
         if agn not in self._catalog.colnames:
             raise argument_error("agn", f"a column of {self._catalog.colnames}", repr(agn))
-        column = unmasked(self._catalog[agn])
+        column = self._catalog[agn]
         unit = getattr(column, "unit", None)
         is_share = unit is None or unit == u.one
-        if is_share:
-            values, high = np.asarray(column, dtype=float), 1.0
-            wanted = "shares between 0 and 1"
-        else:
-            values, high = to_array(column, FNU, "agn"), np.finfo(float).max
+        values, high = plain_floats(column, agn, "catalog"), 1.0
+        wanted = "shares between 0 and 1"
+        if not is_share:
+            values, high = to_array(values * unit, FNU, "agn"), np.finfo(float).max
             wanted = "fluxes that are finite and not negative"
         bad = (values < 0) | (values > high)
         if np.any(bad):
@@ -256,17 +248,11 @@ class Scene(Interactive):
         if not isinstance(background, u.Quantity):
             wanted = "a Background, a Quantity in MJy/sr or a level such as 'low'"
             raise argument_error("background", wanted, repr(background))
-        level = to_array(background, SURFACE_BRIGHTNESS, "background", ndim=0, finite=True)
-        if level < 0:
-            raise argument_error("background", "at least 0", background)
         return Background(background)
 
     def _center_jacobian(self):
         ny, nx = self._shape
         return local_jacobian(self._wcs, np.array([(nx - 1) / 2]), np.array([(ny - 1) / 2]))[0]
-
-    def _pixel_scale(self):
-        return float(np.abs(np.linalg.det(self._center_jacobian())) ** -0.5)
 
     def _check_psf(self, psf, scale):
         if not isinstance(psf, _TYPED):
@@ -310,7 +296,7 @@ class Scene(Interactive):
         valid = np.isfinite(flux) & (flux >= 0)
         flags[~valid] |= SceneFlags.NO_FLUX
         sersic = catalog["profile"] == "sersic"
-        spoilt = (catalog["flags"] & int(CatalogFlags.unusable_profile())) != 0
+        spoilt = (catalog["flags"] & UNUSABLE_PROFILE) != 0
         flags[sersic & spoilt] |= SceneFlags.DRAWN_AS_POINT
         sersic &= ~spoilt
 
@@ -371,9 +357,6 @@ class Scene(Interactive):
             },
             provenance(filter=self._filter),
         )
-        filled = {catalog["id"][row].item(): one.n_filled for row, one in self._cutouts.items()}
-        if any(filled.values()):
-            truth.meta["cutout_pixels_filled"] = {key: n for key, n in filled.items() if n}
         return image, truth
 
     @property
@@ -383,8 +366,7 @@ class Scene(Interactive):
 
         A `~astropy.table.QTable` with ``id``, ``sky``, ``x``, ``y`` (pixels), ``profile`` as
         painted, ``flux_total``, ``flux_agn`` (of it), ``flux_in_image`` and ``flags``
-        (`SceneFlags`). Its meta has ``cutout_pixels_filled``, by id, where stamps have pixels
-        that were filled in.
+        (`SceneFlags`).
         """
         return self._painted[1].copy()
 

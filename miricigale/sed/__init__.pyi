@@ -3,7 +3,6 @@ from .component import ROLES as ROLES
 from .component import Component as Component
 from .derived import DERIVED as DERIVED
 from .derived import Derived as Derived
-from .foreground import Foreground as Foreground
 from .foreground import GalacticExtinction as GalacticExtinction
 from .foreground import band_extinction as band_extinction
 from .foreground import color_excess as color_excess

@@ -46,14 +46,9 @@ STELLAR = ("sfh", "stellar", "nebular")
 GALAXY = (STELLAR, ("attenuation",), ("dust",))
 SKY = ("igm", "foreground")
 MAX_HISTORIES = 128  # stars of so many histories are kept
-#: Methods of `Chain` that keep what they made last, and how many results.
-MAX_KEPT = {
-    "_populations": 8,
-    "factors": 256,
-    "dust": 256,
-    "agn_templates": 256,
-    "sky_transmission": 64,
-}
+#: Results that each of these methods of `Chain` keeps.
+MAX_KEPT = 256
+_KEEPING = ("_populations", "factors", "dust", "agn_templates", "sky_transmission")
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,28 +73,6 @@ class Stars:
     sfr_100myr: float
     age_mass: float
     age_light: float
-
-
-@dataclass(frozen=True, eq=False)
-class Galaxy:
-    """
-    A galaxy without AGN, for one solar mass formed; L_lambda in W/um.
-
-    ``starlight`` is that of stars and gas behind dust, ``nebular`` the gas's part of it,
-    ``intrinsic`` the same before dust; ``dust_luminosity`` is in W.
-    """
-
-    stars: Stars
-    starlight: np.ndarray
-    intrinsic: np.ndarray
-    nebular: np.ndarray | None
-    dust: np.ndarray
-    dust_luminosity: float
-
-    @property
-    def light(self):
-        """L_lambda of stars and dust in W/um."""
-        return self.starlight + self.dust
 
 
 def distinct(items):
@@ -148,7 +121,7 @@ class Chain:
         self.weights = _core.trapezoid_weights(wave)
         self.to_lnu = wave**2 / _core.LIGHT
         self._ionizing = wave < _core.LYMAN_LIMIT
-        self._at = {
+        self.at = {
             x: int(np.searchsorted(wave, x * (1 - 1e-9))) for x in (SIX, VISUAL, *INFRARED, *span)
         }
         self.functionals, self.reference_row = self._functionals(), 0
@@ -160,13 +133,13 @@ class Chain:
         }
         self._stars = {}
         # what was made last is kept, by its arguments, as long as the chain lives
-        for name, maxsize in MAX_KEPT.items():
-            setattr(self, name, functools.lru_cache(maxsize)(getattr(self, name)))
+        for name in _KEEPING:
+            setattr(self, name, functools.lru_cache(MAX_KEPT)(getattr(self, name)))
 
     def _functionals(self):
         wave, n = self.wave, self.wave.size
         infrared, visual = self._light_in(INFRARED), np.zeros(n)
-        visual[self._at[VISUAL]] = 1.0
+        visual[self.at[VISUAL]] = 1.0
         windows = np.zeros((len(UV_WINDOWS), n))
         for row, (low, high) in zip(windows, UV_WINDOWS, strict=True):
             first, last = np.searchsorted(wave, [low * (1 - 1e-9), high * (1 + 1e-9)])
@@ -176,7 +149,7 @@ class Chain:
 
     def _light_in(self, span):
         """Weights of the integral of L_lambda over a range of wavelengths."""
-        weights, part = np.zeros(self.wave.size), slice(self._at[span[0]], self._at[span[1]] + 1)
+        weights, part = np.zeros(self.wave.size), slice(self.at[span[0]], self.at[span[1]] + 1)
         weights[part] = _core.trapezoid_weights(self.wave[part])
         return weights
 
@@ -228,7 +201,7 @@ class Chain:
         # sums row by row: what is kept does not depend on what was asked for with it
         young_light, old_light = (_core.weighted_sums(w, spectra) for w in (young, old))
         both = young + old
-        bright = both * spectra[:, self._at[VISUAL]]
+        bright = both * spectra[:, self.at[VISUAL]]
         light = bright.sum(axis=1)
         age_light = (bright * age).sum(axis=1) / np.where(light > 0, light, np.nan) * 1e-3
         age_mass = (both * age).sum(axis=1) / both.sum(axis=1) * 1e-3
@@ -253,7 +226,7 @@ class Chain:
                 nebular_young=gas[0],
                 nebular_old=gas[1],
                 dust_power=dusty,
-                visual=float(self.visual(parts[0] + parts[1])),
+                visual=float((parts[0] + parts[1])[self.at[VISUAL]]),
                 stellar_mass=float(mass[i]),
                 sfr=float(h[-1]),
                 sfr_10myr=float(h[-10:].mean()),
@@ -324,19 +297,6 @@ class Chain:
         template.flags.writeable = False
         return template
 
-    def galaxy(self, values):
-        """`Galaxy` for a dict of values."""
-        (stars,), dim = self.stars([self.key(values, *STELLAR)]), self.key(values, "attenuation")
-        (light,), (absorbed,) = self.attenuated([stars], [dim])
-        nebular = None
-        if stars.nebular_young is not None:
-            young, old, gas = self.factors(dim)
-            nebular = stars.nebular_young * (young if gas is None else gas)
-            nebular += stars.nebular_old * (old if gas is None else gas)
-        absorbed *= values.get("dust_excess", 1.0)
-        dust = absorbed * self.dust(self.key(values, "dust"))
-        return Galaxy(stars, light, stars.young + stars.old, nebular, dust, float(absorbed))
-
     # ------------------------------------------------------------- AGN and the sky
 
     def agn_key(self, values):
@@ -373,21 +333,9 @@ class Chain:
 
     # --------------------------------------------------------------- derived values
 
-    def infrared(self, spectrum):
-        """Integral over 3-1000 um of L_lambda, along the last axis."""
-        return spectrum @ self.functionals[0]
-
     def reference(self, spectrum):
         """Integral of L_lambda over the range that AGN fractions refer to, along the last axis."""
         return spectrum @ self.functionals[self.reference_row]
-
-    def six_micron(self, spectrum):
-        """Power nu L_nu at 6 um."""
-        return spectrum[..., self._at[SIX]] * SIX
-
-    def visual(self, spectrum):
-        """L_lambda at 0.55 um."""
-        return spectrum[..., self._at[VISUAL]]
 
     def lnu(self, spectrum):
         """L_nu in W/Hz from L_lambda in W/um."""

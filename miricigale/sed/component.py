@@ -139,7 +139,7 @@ class Component:
         return ()
 
     def inert(self, values):
-        """Names of parameters that make no difference, given the values of all."""
+        """Names of parameters of an AGN that make no difference, given the values of all."""
         return ()
 
     def invalid(self, values):

@@ -62,16 +62,6 @@ _LOG_UV = np.log10(np.mean(UV_WINDOWS, axis=1))
 _BAND = {name: i for i, name in enumerate(COLOR_BANDS)}
 
 
-def columns(model):
-    """Derived quantities of a model: dict of name to `Derived`."""
-    out = {n: d for n, d in DERIVED.items() if model.has_agn or d.of != "agn"}
-    xray = model.component("xray")
-    if xray is not None:
-        # the relation is not linear: it is worked out after scaling
-        out |= {n: Derived(unit, text, False, "xray") for n, (unit, text) in xray.columns.items()}
-    return out
-
-
 def galaxy_quantities(stars, absorbed, sums, reference_row=0):
     """
     Derived quantities of n galaxies for one solar mass formed, in the units of `DERIVED`.
@@ -139,7 +129,7 @@ def scaled_quantities(model, values, mass, redshift, far, parameters):
     """
     out = {
         name: values[name] * mass if entry.extensive else values[name]
-        for name, entry in columns(model).items()
+        for name, entry in model.derived_columns().items()
         if entry.of != "xray"
     }
     xray = model.component("xray")

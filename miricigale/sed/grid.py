@@ -2,7 +2,7 @@
 
 import functools
 import re
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 
 import astropy.units as u
 import numpy as np
@@ -78,8 +78,8 @@ class ModelGrid(Frozen):
         Redshifts, ascending.
     galaxy : `~numpy.ndarray`, shape (nz, nG, nb)
         Fluxes of the galaxy (stars, nebulae, dust) in uJy for each solar mass formed.
-    agn : `~numpy.ndarray`, shape (nz, nA, nb)
-        Fluxes of the AGN in uJy for each watt of AGN power. nA may be 0.
+    agn : `~numpy.ndarray`, shape (nz, nA, nb), optional
+        Fluxes of the AGN in uJy for each watt of AGN power; by default there is no AGN: nA is 0.
     dust_luminosity : `~numpy.ndarray`, shape (nG,)
         Luminosity that the AGN fraction refers to, in W for each solar mass formed: the
         dust luminosity of the galaxy in the definition ``"dust"``, its 3-1000 um light in
@@ -123,19 +123,20 @@ class ModelGrid(Frozen):
     """
 
     filters: tuple
+    _: KW_ONLY
     redshift: np.ndarray
     galaxy: np.ndarray
-    agn: np.ndarray
     dust_luminosity: np.ndarray
-    frac_agn: np.ndarray
     allowed: np.ndarray
     galaxy_parameters: QTable
-    agn_parameters: QTable
-    galaxy_properties: QTable
-    agn_properties: QTable
-    agn_multiplicity: np.ndarray
+    agn: np.ndarray | None = None
+    frac_agn: np.ndarray = (0.0,)
+    agn_multiplicity: np.ndarray = ()
+    agn_parameters: QTable = field(default_factory=QTable)
+    agn_properties: QTable = field(default_factory=QTable)
+    galaxy_properties: QTable = field(default_factory=QTable)
+    galaxy_shape: QTable = field(default_factory=QTable)
     meta: dict = field(default_factory=dict)
-    galaxy_shape: QTable | None = None
     axes: dict = field(default_factory=dict)
     inert: tuple = ()
     bounds: dict = field(default_factory=dict)
@@ -152,8 +153,8 @@ class ModelGrid(Frozen):
         object.__setattr__(self, "axes", axes)
         bounds = {name: (float(low), float(high)) for name, (low, high) in self.bounds.items()}
         object.__setattr__(self, "bounds", bounds)
-        if self.galaxy_shape is None:
-            object.__setattr__(self, "galaxy_shape", QTable())
+        if self.agn is None:
+            object.__setattr__(self, "agn", np.zeros((len(self.redshift), 0, len(self.filters))))
         for name, (_, dtype, _) in _ARRAYS.items():
             object.__setattr__(self, name, frozen_array(getattr(self, name), dtype))
         n_z, n_b = self.redshift.size, len(self.filters)
@@ -268,10 +269,8 @@ def _read(path):
     with open_parts(path, _LAYOUTS, wanted="model grid data") as parts:
         text = parts.text
         facts = text if parts.layout == _LAYOUTS[0] else _former_facts(text["meta"])
-        # FITS cannot hold arrays without elements
-        empty = {"agn": np.zeros((len(parts.array("redshift")), 0, len(text["filters"])))}
-        empty["agn_multiplicity"] = np.zeros(0, int)
-        arrays = {n: parts.array(n) if n in parts else empty[n] for n in _ARRAYS}
+        # FITS cannot hold arrays without elements, those of AGN
+        arrays = {n: parts.array(n) for n in _ARRAYS if n in parts}
         tables = {
             name: _described(parts.table(name, QTable), text["descriptions"][name])
             for name in _TABLES

@@ -1,9 +1,9 @@
 """Grids kept between sessions, under a name made of everything that shapes them."""
 
+import contextlib
 import importlib.metadata
 import logging
 import os
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,9 +14,6 @@ from miricigale.sed.grid import ModelGrid
 from miricigale.utils.configuration import conf
 from miricigale.utils.content import content_sha256
 from miricigale.utils.exceptions import DataError
-from miricigale.utils.store import PARTIAL
-
-ABANDONED = 86400.0  # seconds after which an unfinished file counts as abandoned
 
 _log = logging.getLogger(__name__)
 
@@ -51,10 +48,6 @@ def grid_key(model, axes, filters):
     return content_sha256(content)
 
 
-def _own(component):
-    return type(component).__module__.split(".")[0] == __name__.split(".")[0]
-
-
 def _unchanged(model):
     """Whether the files that were read are those that are there now."""
     return all(
@@ -72,7 +65,8 @@ def cached_grid(model, axes, filters, make):
     outside this package are not cached, since their code may change under the same name.
     """
     limit = conf.grid_cache_size * 1e6
-    if limit <= 0 or not all(map(_own, model.components)):
+    own = all(type(c).__module__.startswith("miricigale.") for c in model.components)
+    if limit <= 0 or not own:
         return make(model, axes, filters)
     path = cache_folder() / "grids" / f"{grid_key(model, axes, filters)}.fits"
     if path.exists():
@@ -98,21 +92,14 @@ def cached_grid(model, axes, filters, make):
 
 
 def _make_room(folder, limit, keep):
-    files = []
+    """Remove what was used least recently, unfinished files too, until the rest is small enough."""
+    found = {}
     for path in folder.iterdir():
-        try:
-            stat = path.stat()
-        except FileNotFoundError:
-            continue
-        if path.name.startswith(PARTIAL):
-            if time.time() - stat.st_mtime > ABANDONED:
-                path.unlink(missing_ok=True)
-        elif path.suffix == ".fits":
-            files.append((stat.st_mtime_ns, stat.st_size, path))
-    total = sum(size for _, size, _ in files)
-    for _, size, path in sorted(files):
-        if total <= limit:
-            break
-        if path != keep:
+        # another process may be at the same
+        with contextlib.suppress(FileNotFoundError):
+            found[path] = path.stat()
+    total = sum(status.st_size for status in found.values())
+    for path in sorted(found, key=lambda path: found[path].st_mtime_ns):
+        if total > limit and path != keep:
             path.unlink(missing_ok=True)
-            total -= size
+            total -= found[path].st_size

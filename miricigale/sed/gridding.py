@@ -5,7 +5,6 @@ from collections.abc import Mapping
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
 
 from miricigale.sed.chain import GALAXY, distinct
 from miricigale.sed.derived import DERIVED, galaxy_quantities
@@ -107,17 +106,17 @@ class _Galaxies:
 
 def _galaxy_tables(quantities):
     """What scales with mass, and what does not."""
+    texts = {"ir_luminosity": "3-1000 um light of stars and dust, without AGN"}
     scaling, shape = {}, {}
     for name, values in quantities.items():
         if name in ("stellar_mass_formed", "reference"):
             continue
         entry = DERIVED[name]
+        text = texts.get(name, entry.text)
         if entry.extensive:
-            text = "3-1000 um light of stars and dust, without AGN"
-            text = text if name == "ir_luminosity" else entry.text
             scaling[name] = values * (entry.unit / u.Msun), f"{text}, for one solar mass formed"
         else:
-            shape[name] = values * entry.unit, entry.text
+            shape[name] = values * entry.unit, text
     return described_table(scaling), described_table(shape)
 
 
@@ -161,22 +160,28 @@ def model_grid(model, axes, filters):
     quantities = galaxies.quantities()
     properties, shape = _galaxy_tables(quantities)
 
-    agn_rows, count, inert = [], np.zeros(0, int), []
-    agn_spectra, agn_properties = np.zeros((0, chain.wave.size)), QTable()
+    nuclei, agn_spectra = {}, np.zeros((0, chain.wave.size))
     agn_parameters = {n: p for n, p in of_agn.items() if n != "frac_agn"}
     if with_agn:
         every = [r | {"frac_agn": 0.0} for r in _products(agn_parameters, axes)]
         _refuse_invalid(model, [defaults | row for row in every], ("agn",))
         agn_rows, count, inert = _distinct_agn(agn_component, every)
         parts = [chain.agn(row) for row in agn_rows]
-        scale, agn_properties = _agn_table(model, parts)
+        scale, properties_of_agn = _agn_table(model, parts)
         agn_spectra = chain.lnu(np.array([t.total for t in parts])) * scale[:, None]
+        nuclei = {
+            "frac_agn": frac_agn,
+            "agn_parameters": _parameter_table(agn_parameters, agn_rows),
+            "agn_properties": properties_of_agn,
+            "agn_multiplicity": count,
+            "inert": inert,
+        }
     reference = galaxies.absorbed
     if model.frac_agn_definition != "dust":
         reference = quantities["reference"]
 
     galaxy = np.empty((redshift.size, len(rows), len(filters)))
-    agn = np.empty((redshift.size, len(agn_rows), len(filters)))
+    agn = np.empty((redshift.size, len(agn_spectra), len(filters)))
     far = distance(redshift, model.cosmology)
     for i, z in enumerate(redshift):
         sky = chain.sky(defaults | {"redshift": float(z)})
@@ -191,20 +196,16 @@ def model_grid(model, axes, filters):
         galaxy=galaxy,
         agn=agn,
         dust_luminosity=reference,
-        frac_agn=frac_agn if with_agn else np.zeros(1),
         allowed=age[None, :] <= universe[:, None],
         galaxy_parameters=_parameter_table(of_galaxy, rows),
-        agn_parameters=_parameter_table(agn_parameters, agn_rows) if with_agn else QTable(),
         galaxy_properties=properties,
         galaxy_shape=shape,
-        agn_properties=agn_properties,
-        agn_multiplicity=count,
         meta=model.meta,
         axes=axes,
-        inert=inert,
         bounds={name: parameter.bounds for name, parameter in model.parameters.items()},
         frac_agn_definition=model.frac_agn_definition,
         recipe=model.recipe,
+        **nuclei,
     )
 
 

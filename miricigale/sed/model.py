@@ -9,7 +9,7 @@ from miricigale.refdata import citations
 from miricigale.sed import gridding, presets, tables
 from miricigale.sed.chain import Chain
 from miricigale.sed.component import ROLES, Component, read_config
-from miricigale.sed.derived import columns
+from miricigale.sed.derived import DERIVED, Derived
 from miricigale.sed.grid import fraction_span
 from miricigale.sed.grid_cache import cached_grid
 from miricigale.sed.parameter import Parameter
@@ -268,7 +268,11 @@ class SEDModel(Interactive):
         columns : dict of str to `~miricigale.sed.Derived`
             Unit and description by name.
         """
-        return columns(self)
+        out = {n: d for n, d in DERIVED.items() if self.has_agn or d.of != "agn"}
+        xray = self.component("xray")
+        # the relation is not linear: it is worked out after scaling
+        more = xray.columns if xray else {}
+        return out | {n: Derived(unit, text, False, "xray") for n, (unit, text) in more.items()}
 
     def __getstate__(self):
         state = self.__dict__.copy()
@@ -315,15 +319,12 @@ class SEDModel(Interactive):
             why = component.invalid(out)
             if why:
                 raise ValueError(why)
-        limit = self._universe(out["redshift"])
+        limit = float(self.cosmology.age(out["redshift"]).to_value(u.Gyr))
         if out["age"] > limit:
             raise argument_error(
                 "age", f"at most the age of the universe, {limit:.3f} Gyr", out["age"]
             )
         return out
-
-    def _universe(self, redshift):
-        return float(self.cosmology.age(redshift).to_value(u.Gyr))
 
     def evaluate(self, **parameters):
         """

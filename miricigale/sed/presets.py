@@ -27,12 +27,9 @@ def yang2021_components(*, agn=True, xray=False, igm="meiksin2006", libraries="b
     """
     choose, notes = _chooser(libraries)
 
-    def solar(library):
-        return library.invalid({"metallicity": 0.02})
-
     parts = [
         c.DelayedSFH(),
-        choose("stars", c.BC03Library(), c.BC03(), solar),
+        _stars(choose, [0.02]),
         c.CalzettiLeitherer(),
         choose("dust", c.Dale2014(), c.DraineLi2007Alpha(), lambda _: None),
         COMPONENTS.get(igm)(),
@@ -55,13 +52,9 @@ def survey_components(*, agn=True, igm="meiksin2006", libraries="best"):
     """
     choose, notes = _chooser(libraries)
 
-    def metals(library):
-        values = ({"metallicity": z} for z in survey_axes()["metallicity"])
-        return next(filter(None, map(library.invalid, values)), None)
-
     parts = [
         c.DelayedSFH(age_burst=0.03, tau_burst=0.05),
-        choose("stars", c.BC03Library(), c.BC03(), metals),
+        _stars(choose, survey_axes()["metallicity"]),
         c.Nebular(log_u=-2.5),
         c.CalzettiLeitherer(ebv_factor=0.44),
         c.DraineLi2007(),
@@ -80,19 +73,25 @@ def _chooser(libraries):
 
     def choose(what, better, plain, covers):
         if libraries == "bundled":
-            notes.append(f"{what}: {plain.resource}, as asked")
-            return plain
-        if find_resource(better.resource) is None:
-            notes.append(f"{what}: {plain.resource}; {better.resource} is not registered")
-            return plain
-        lacks = covers(better)
-        if lacks:
-            notes.append(f"{what}: {plain.resource}; {better.resource} {lacks}")
-            return plain
-        notes.append(f"{what}: {better.resource}")
-        return better
+            why = ", as asked"
+        elif find_resource(better.resource) is None:
+            why = f"; {better.resource} is not registered"
+        else:
+            lacks = covers(better)
+            why = f"; {better.resource} {lacks}" if lacks else ""
+        taken = plain if why else better
+        notes.append(f"{what}: {taken.resource}{why}")
+        return taken
 
     return choose, notes
+
+
+def _stars(choose, metallicities):
+    def covers(library):
+        refusals = (library.invalid({"metallicity": z}) for z in metallicities)
+        return next(filter(None, refusals), None)
+
+    return choose("stars", c.BC03Library(), c.BC03(), covers)
 
 
 def _torus(choose, axes):

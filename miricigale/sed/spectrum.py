@@ -9,7 +9,7 @@ from astropy.cosmology import FlatLambdaCDM
 from astropy.table import QTable
 
 from miricigale.filters import FilterSet, as_filter
-from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.exceptions import argument_error, data_error
 from miricigale.utils.files import read_table, write_table
 from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.meta import full_meta
@@ -130,11 +130,6 @@ class SED(Frozen, Interactive):
     def derived(self):
         """Derived quantities of the model by name, such as ``stellar_mass``; see `SEDModel.derived_columns`."""
         return self.meta.get("derived", {})
-
-    @property
-    def rest_wavelength(self):
-        """Wavelengths at the source, um."""
-        return self.wave / (1.0 + self.redshift)
 
     @property
     def frequency(self):
@@ -265,8 +260,7 @@ class SED(Frozen, Interactive):
         table = read_table(path, wanted="a spectrum")
         units = [getattr(column, "unit", None) for column in table.columns.values()]
         if len(units) < 2 or None in units:
-            msg = f"{path} has no two columns with units, wavelengths and flux densities"
-            raise DataError(msg)
+            raise data_error(path, "has no two columns with units, wavelengths and flux densities")
         meta = full_meta(table.meta)
         redshift = float(meta.pop("redshift", 0.0))
         wave, fnu, *names = table.colnames
@@ -278,7 +272,7 @@ class SED(Frozen, Interactive):
         return cls(table[wave], table[fnu], redshift=redshift, meta=meta, components=parts)
 
     @classmethod
-    def from_synphot(cls, spectrum, *, wave=None, redshift=None):
+    def from_synphot(cls, spectrum, *, redshift=None):
         """
         Make an SED from a synphot spectrum.
 
@@ -286,14 +280,12 @@ class SED(Frozen, Interactive):
         ----------
         spectrum : `synphot.SourceSpectrum`
             The spectrum.
-        wave : `~astropy.units.Quantity`, optional
-            Where it is sampled; its own ``waveset`` if not given.
         redshift : float, optional
             Redshift of the source; the spectrum's ``z`` if not given.
         """
-        wave = spectrum.waveset if wave is None else u.Quantity(wave)
+        wave = spectrum.waveset
         if wave is None:
-            raise argument_error("wave", "given for a spectrum without waveset", "None")
+            raise argument_error("spectrum", "one with a waveset", repr(spectrum))
         fnu = spectrum(wave, flux_unit=u.Jy)
         order = np.argsort(wave)
         redshift = spectrum.z if redshift is None else redshift

@@ -10,11 +10,10 @@ from astropy.table import QTable
 
 from miricigale.filters.filter import UNCOVERED
 from miricigale.sed import _core
-from miricigale.sed.chain import GALAXY, SKY, distinct
+from miricigale.sed.chain import GALAXY, SIX, SKY, STELLAR, distinct
 from miricigale.sed.derived import (
     DERIVED,
     agn_quantities,
-    columns,
     galaxy_quantities,
     scaled_quantities,
 )
@@ -48,10 +47,10 @@ def seen_agn(chain, parts):
     """Sums over AGN templates that the derived quantities need: dict of arrays."""
     total = np.array([t.total for t in parts])
     return {
-        "infrared": chain.infrared(total),
+        "infrared": total @ chain.functionals[0],
         "reference": chain.reference(total),
         "luminosity": total @ chain.weights,
-        "six": chain.six_micron(total),
+        "six": total[:, chain.at[SIX]] * SIX,
         "accretion": np.array([t.accretion_power for t in parts]),
     }
 
@@ -123,16 +122,28 @@ def _stack(filters):
 def spectra(model, values):
     """The spectrum of one model with its parts and derived quantities; see `SEDModel.evaluate`."""
     chain, z = model.chain, values["redshift"]
-    galaxy, agn = chain.galaxy(values), None
-    spectrum, absorbed = galaxy.light, np.array([galaxy.dust_luminosity])
+    (stars,), dim = chain.stars([chain.key(values, *STELLAR)]), chain.key(values, "attenuation")
+    (starlight,), absorbed = chain.attenuated([stars], [dim])
+    absorbed *= values.get("dust_excess", 1.0)
+    dust = absorbed * chain.dust(chain.key(values, "dust"))
+    spectrum = starlight + dust
+    parts = {"stellar_intrinsic": stars.young + stars.old, "stellar": starlight}
+    if stars.nebular_young is not None:
+        young, old, gas = chain.factors(dim)
+        nebular = stars.nebular_young * (young if gas is None else gas)
+        nebular += stars.nebular_old * (old if gas is None else gas)
+        parts |= {"stellar": starlight - nebular, "nebular": nebular}
+    parts["dust"] = dust
     sums = spectrum[None] @ chain.functionals.T
-    got = galaxy_quantities([galaxy.stars], absorbed, sums, chain.reference_row)
+    got = galaxy_quantities([stars], absorbed, sums, chain.reference_row)
     if model.has_agn:
         agn, fraction = chain.agn(values), values["frac_agn"]
         ratio = np.array([fraction / (1.0 - fraction)])
         seen = seen_agn(chain, [agn])
         got |= agn_quantities(model.frac_agn_definition, ratio, got, seen)
         spectrum = spectrum + got["agn_power"] * agn.total
+        for name in ("disk", "torus", "polar"):
+            parts[f"agn_{name}"] = got["agn_power"] * getattr(agn, name)
     if values.get("frac_agn", 0.0) > 0.0 and got["agn_power"][0] == 0.0:
         msg = "frac_agn has no effect: the galaxy has no dust luminosity that it could refer to"
         warnings.warn(msg, ModelWarning, stacklevel=3)
@@ -151,16 +162,9 @@ def spectra(model, values):
     def sed(spectrum, **options):
         return SED(wave, chain.lnu(spectrum) * factor * FNU, redshift=z, **options)
 
-    parts = {"stellar_intrinsic": sed(galaxy.intrinsic), "stellar": sed(galaxy.starlight)}
-    if galaxy.nebular is not None:
-        parts["stellar"] = sed(galaxy.starlight - galaxy.nebular)
-        parts["nebular"] = sed(galaxy.nebular)
-    parts["dust"] = sed(galaxy.dust)
-    if agn is not None:
-        for name in ("disk", "torus", "polar"):
-            parts[f"agn_{name}"] = sed(got["agn_power"] * getattr(agn, name))
     meta = {**model.meta, "parameters": quantities, "derived": derived}
-    return sed(spectrum, meta=meta, components=parts)
+    components = {name: sed(part) for name, part in parts.items()}
+    return sed(spectrum, meta=meta, components=components)
 
 
 class _Blocks:
@@ -193,13 +197,9 @@ class _Blocks:
         """Spectra of AGN for one watt, which of them each row has, and their sums."""
         chain, n = self.chain, len(rows)
         which = np.zeros(n, dtype=np.int64)
-        active = np.flatnonzero(self.values["frac_agn"][rows] > 0)
-        if active.size == 0:
-            blank = dict.fromkeys(
-                ("infrared", "reference", "luminosity", "six", "accretion"), np.ones(n)
-            )
-            return np.zeros((1, chain.wave.size)), which, blank
-        names = chain.names("agn")
+        names, active = chain.names("agn"), np.flatnonzero(self.values["frac_agn"][rows] > 0)
+        # without any the first row stands for all, at no power
+        active = active if active.size else np.array([0])
         different, index = distinct(self._keys(rows[active], "agn"))
         keys = [chain.agn_key(dict(zip(names, row, strict=True))) for row in different]
         keys, place = distinct(keys)
@@ -240,15 +240,12 @@ def flux_table(model, table, filters):
     table = QTable(as_table(table, "table"), copy=False)
     _warn_of_slips(model, table.colnames)
     n = len(table)
-    taken = {"id", "flags", *columns(model)}
-    for name in filters.names:
-        if name in taken:
-            raise argument_error(
-                "filters", f"without names of other columns ({name!r} is one)", name
-            )
+    names = model.derived_columns()
+    taken = set(filters.names) & {"id", "flags", *names}
+    if taken:
+        raise argument_error("filters", "without names of other columns", sorted(taken))
     values = _columns(model, table)
     flags = _row_flags(model, values, n)
-    names = columns(model)
     flux = np.full((n, len(filters)), np.nan)
     derived = {name: np.full(n, np.nan) for name in names}
     good = np.flatnonzero(flags == 0)

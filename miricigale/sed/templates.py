@@ -11,7 +11,7 @@ from astropy.table import QTable, Table
 from miricigale.filters import FilterSet
 from miricigale.sed.grid import ModelGrid
 from miricigale.sed.spectrum import SED
-from miricigale.utils.exceptions import DataError, ModelWarning, argument_error
+from miricigale.utils.exceptions import ModelWarning, argument_error, data_error
 from miricigale.utils.files import read_table
 from miricigale.utils.meta import provenance
 from miricigale.utils.missing import plain_floats
@@ -57,14 +57,12 @@ def read_spectra(path):
         names = sorted(p for p in path.iterdir() if p.is_file())
         files = [p for p in names if p.name.lower().removesuffix(".gz").endswith(_SUFFIXES)]
         if not files:
-            msg = f"{path} has no files of spectra ({', '.join(_SUFFIXES)})"
-            raise DataError(msg)
+            raise data_error(path, f"has no files of spectra ({', '.join(_SUFFIXES)})")
     out = {}
     for file in files:
         found = _read_file(file)
         if found.keys() & out.keys():
-            msg = f"{file} has the name of another file of spectra but for its suffix"
-            raise DataError(msg)
+            raise data_error(file, "has the name of another file of spectra but for its suffix")
         out |= found
     return out
 
@@ -75,8 +73,8 @@ def _read_file(file):
         warnings.simplefilter("ignore", u.UnitsWarning)
         table = read_table(file, wanted="a spectrum", cls=Table)
     if len(table.colnames) < 2:
-        msg = f"{file} cannot be read as a spectrum: it has the columns {table.colnames}"
-        raise DataError(msg)
+        got = f"it has the columns {table.colnames}"
+        raise data_error(file, f"cannot be read as a spectrum: {got}")
     first, *others = table.colnames
     gravities = [name for name in others if re.fullmatch(r"g\d\d", name)]
     try:
@@ -96,8 +94,7 @@ def _read_file(file):
                     out[name] = SED(wave, one * _unit(table[column], _FLAM))
         return out
     except (TypeError, ValueError, u.UnitsError) as err:
-        msg = f"{file} cannot be read as a spectrum: {err}"
-        raise DataError(msg) from err
+        raise data_error(file, f"cannot be read as a spectrum: {err}") from err
 
 
 def _unit(column, default):
@@ -161,15 +158,9 @@ def template_grid(spectra, filters, *, beyond="error"):
         filters=filters.names,
         redshift=np.zeros(1),
         galaxy=flux[None] / flux.mean(axis=1)[:, None],
-        agn=np.zeros((1, 0, len(filters))),
         dust_luminosity=np.zeros(n),
-        frac_agn=np.zeros(1),
         allowed=np.ones((1, n), bool),
         galaxy_parameters=templates,
-        agn_parameters=QTable(),
-        galaxy_properties=QTable(),
-        agn_properties=QTable(),
-        agn_multiplicity=np.zeros(0, int),
         meta=provenance(templates=list(seds)),
         axes={"redshift": np.zeros(1), "template": number},
     )

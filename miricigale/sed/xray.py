@@ -138,15 +138,7 @@ def band_luminosity(l_x, *, from_band, to_band, photon_index=1.8):
     )
 
 
-def xray_flux(
-    l_x_2_10,
-    redshift,
-    *,
-    band=(0.5, 7.0) * u.keV,
-    photon_index=1.8,
-    cosmology=COSMOLOGY,
-    transmission=1.0,
-):
+def xray_flux(l_x_2_10, redshift, *, band=(0.5, 7.0) * u.keV, photon_index=1.8, transmission=1.0):
     r"""
     Observed X-ray flux of a power law.
 
@@ -164,8 +156,6 @@ def xray_flux(
         The band, in the observer's frame.
     photon_index : float, optional
         Gamma of N(E) ~ E^-Gamma.
-    cosmology : `~astropy.cosmology.Cosmology`, optional
-        For the distance.
     transmission : float, optional
         Share of the flux that absorption leaves; Yang et al. 2021 halve it.
 
@@ -196,7 +186,7 @@ def xray_flux(
     index = to_array(photon_index, u.dimensionless_unscaled, "photon_index", finite=True)
     share = to_array(transmission, u.dimensionless_unscaled, "transmission", finite=True)
     _check("transmission", "from 0 to 1", share, (share < 0) | (share > 1))
-    far = distance(z, cosmology)
+    far = distance(z, COSMOLOGY)
     flux = _core.xray_flux(power, z, far, check_band(band, "band"), index, share)
     return (flux * u.W / u.m**2).to(XRAY_FLUX)
 

@@ -169,7 +169,8 @@ def with_xray_bands(grid, model, bands, *, alpha_ox=ALPHA_OX, **options):
         grid.galaxy_shape["age_mass"].to_value(u.Gyr),
         u.Quantity(grid.galaxy_parameters["metallicity"]).value,
     )
-    new = {"galaxy": np.concatenate([grid.galaxy, observed(*galaxies.values())], axis=2)}
+    galaxy = np.concatenate([grid.galaxy, observed(*galaxies.values())], axis=2)
+    new = {"galaxy": galaxy, "agn": None}
     if grid.n_agn:
         disk, inclination = _disks(grid, model)
         corona = xrays.corona(disk[:, None], slopes, inclination[:, None])
@@ -177,8 +178,6 @@ def with_xray_bands(grid, model, bands, *, alpha_ox=ALPHA_OX, **options):
         agn = np.repeat(grid.agn, slopes.size, axis=1)
         new["agn"] = np.concatenate([agn, observed(corona)], axis=2)
         new |= _agn_rows(grid, slopes, disk, corona.power)
-    else:
-        new["agn"] = np.zeros((z.size, 0, len(grid.filters) + len(energies)))
     return dataclasses.replace(grid, filters=(*grid.filters, *energies), **new)
 
 

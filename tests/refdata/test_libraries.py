@@ -9,7 +9,6 @@ import subprocess
 import sys
 import tracemalloc
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import astropy.units as u
 import numpy as np
@@ -25,7 +24,6 @@ from miricigale.refdata import (
     find_resource,
     locate,
     registry,
-    store,
 )
 from miricigale.refdata.libraries import (
     READERS,
@@ -160,9 +158,8 @@ def test_rows_are_found_by_the_values_of_their_axes():
     assert library.row(tau=5.0, q=0.97) is None
     assert library.row(tau=7.001, q=0.97) is None
     assert library.row(tau=7.0, q=1e-4) is None
-    assert_allclose(library.values_of("q"), [0.0, 0.97], rtol=1e-7)
+    assert_allclose(library.levels["q"], [0.0, 0.97], rtol=1e-7)
     refuses(r"'q' must be given to find a row of 'test.library'", library.row, tau=3.0)
-    refuses(r"no axis 'p'; axes: tau, q", library.values_of, "p", error=KeyError)
 
 
 @pytest.mark.parametrize("scale", [1e-12, 1e-4, 1.0, 1e9])
@@ -191,9 +188,6 @@ def test_whether_the_grid_is_complete_is_known():
         ({"axes": {}}, "one axis and one kind of spectra at least"),
         ({"axes": {"MASS": [1, 2, 3, 4]}, "units": {}}, "of other names"),
         ({"axes": {"a b": [1, 2, 3, 4]}, "units": {}}, "plain identifiers, got 'a b'"),
-        ({"units": {"dust": "furlong"}}, "a unit for 'dust', got 'furlong'"),
-        ({"units": {"wave": "Angstrom"}}, "um for 'wave', got 'Angstrom'"),
-        ({"units": {"dost": "W"}}, "of a column .*, got 'dost'"),
         ({"spectra": {"dust": np.zeros((4, 4))}, "units": {}}, r"'dust' must be of shape \(4, 5\)"),
     ],
 )
@@ -216,9 +210,6 @@ def test_meta_is_plain(tmp_path):
     numbers = {"n": np.int64(3), "x": np.float32(0.5), "v": np.arange(3)}
     write_library(make(meta=numbers), tmp_path / "x.fits")
     assert open_library(tmp_path / "x.fits", NAME).meta == {"n": 3, "x": 0.5, "v": [0, 1, 2]}
-    with pytest.raises(ValueError, match=r"'meta' must be plain values .*, got .*Path"):
-        write_library(make(meta={"path": Path("a")}), tmp_path / "y.fits")
-    assert not (tmp_path / "y.fits").exists()
 
 
 def test_foreign_and_other_files_are_refused_by_name(tmp_path):
@@ -342,19 +333,18 @@ def test_a_library_is_registered_and_found(folder):
     assert state().state == "absent"
     path = source(folder)
     report = add_library(NAME, path)
-    assert report.path == locate(NAME, check=True) == folder / "data" / "sed" / "test.fits"
+    assert report.path == locate(NAME) == folder / "data" / "sed" / "test.fits"
     assert names(folder) == ["test.fits", "test.fits.json"]
     library = open_library(report.path, NAME)
     assert library.spectrum("dust", library.row(tau=7, angle=90)) == pytest.approx(4.5)
     found = report.library
     assert (found.n_rows, found.complete, found.wave.size) == (4, True, 7)
-    assert found.values_of("angle").tolist() == [0.0, 90.0]
+    assert found.levels["angle"].tolist() == [0.0, 90.0]
     assert found.units["angle"] == "deg"
     assert report.sha256 == hashlib.sha256(report.path.read_bytes()).hexdigest()
     assert report.library.meta["files"] == {
         "fake.dat": hashlib.sha256(path.read_bytes()).hexdigest()
     }
-    assert report.replaced == ""
     assert state().state == "ok"
 
 
@@ -382,8 +372,6 @@ def test_the_record_says_what_it_was_made_from(folder):
     assert record["files"] == report.library.meta["files"]
     assert record["sha256"] == report.sha256
     assert record["size"] == report.path.stat().st_size
-    assert record["axes"] == {"tau": [3.0, 7.0], "angle": [0.0, 90.0]}
-    assert record["summary"] == ["4 spectra of nothing"]
     assert {"date", "version"} <= set(record)
 
 
@@ -413,17 +401,10 @@ def test_a_better_library_replaces_the_old_one(folder):
     mark = fingerprint(NAME)
     assert mark == old.sha256
     new = add_library(NAME, source(folder, "3 0 9.5\nend\n"))
-    assert old.sha256 in new.replaced
-    assert "replaces" in str(new)
     assert fingerprint(NAME) == new.sha256 != mark
     # whoever works with the old one goes on with it
     assert opened.spectrum("dust", 3) == pytest.approx(4.5)
     assert open_library(new.path, NAME).n_rows == 1
-
-
-def test_the_same_files_give_the_same_fingerprint(folder):
-    path = source(folder)
-    assert add_library(NAME, path).sha256 == add_library(NAME, path).sha256
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, OSError("No space left on device")])
@@ -438,7 +419,7 @@ def test_an_interrupted_conversion_changes_nothing(folder, monkeypatch, error, p
     where = {
         "written": (os, "fsync"),
         "checked": (register, "verify_library"),
-        "recorded": (store, "file_sha256"),
+        "recorded": (register, "file_sha256"),
     }[place]
     with monkeypatch.context() as patch:
         patch.setattr(*where, interrupt)
@@ -543,7 +524,6 @@ def test_damage_is_told(folder):
     # a whole library, but not the one of the record
     write_library(read_fake(source(folder, "1 2 3\nend\n")), report.path)
     assert (state().state, state().bad) == ("wrong checksum", True)
-    refuses("sha256 differs", locate, NAME, error=DataError, check=True)
     record_path(report.path).write_text("{")
     row = state()
     assert (row.state, row.bad) == ("damaged", True)
@@ -558,12 +538,10 @@ def test_names_and_readers_are_checked(folder, monkeypatch):
     path = source(folder)
     with pytest.raises(KeyError, match=r"no library 'ssp.bc03'; known: .*test.library"):
         add_library("ssp.bc03", path)
-    with pytest.raises(DataError, match=r"no file or folder .*absent.dat"):
+    with pytest.raises(DataError, match=r"absent.dat is no file or folder"):
         add_library(NAME, folder / "absent.dat")
     monkeypatch.setitem(READERS, NAME, lambda path: make("other"))
-    refuses("'reader' must be one that gives the library", add_library, NAME, path)
-    monkeypatch.setitem(READERS, NAME, lambda path: make(meta={}))
-    refuses(r"'reader' must be .*checksums", add_library, NAME, path)
+    refuses("holds 'other', not 'test.library'", add_library, NAME, path, error=DataError)
     assert names(folder) == []
 
 

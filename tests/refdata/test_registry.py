@@ -45,10 +45,3 @@ def test_registry_refuses():
     registry.register("a", str)
     refuses("thing 'a' is registered already", registry.register, "a", str)
     refuses("no thing 'b'; known: a", registry.get, "b", error=KeyError)
-
-
-def test_metadata_is_a_copy():
-    registry = Registry("thing")
-    registry.register("a", str, color="red")
-    registry.metadata("a")["color"] = "blue"
-    assert registry.metadata("a")["color"] == "red"

@@ -96,21 +96,6 @@ def test_a_catalog_of_cigale(tmp_path):
     assert catalog["star"].tolist() == [False, True]
 
 
-def test_columns_may_change_places(plain, tmp_path):
-    plain["ra"], plain["dec"] = [1.0, 1.0], [2.0, 2.0]
-    plain.rename_columns(["FLUX_H", "f36"], ["irac.ch1", "wfc3.f160w"])
-    path = write(plain, tmp_path / "c.csv")
-    columns = COLUMNS | {"wfc3.f160w": "irac.ch1", "irac.ch1": "wfc3.f160w"}
-    with (
-        pytest.warns(MiricigaleWarning, match="sources are points"),
-        pytest.warns(MiricigaleWarning, match="taken as missing"),
-    ):
-        catalog = read_catalog(path, columns=columns, units={"flux": "mJy"})
-    assert catalog["wfc3.f160w"].to_value(u.uJy) == pytest.approx([1, 2])
-    assert catalog["irac.ch1"][0].to_value(u.uJy) == pytest.approx(4)
-    assert catalog["sky"].ra.deg.tolist() == [53.1, 53.2]
-
-
 def test_wrong_names_are_refused_with_the_right_ones(plain, tmp_path):
     path = write(plain, tmp_path / "c.csv")
     for columns, units, message in (

@@ -89,11 +89,8 @@ def test_stamp_of_an_image_stands_as_the_image_does(psf, parity):
     y, x = np.mgrid[:61, :71]
     data = np.exp(-0.5 * ((x - 35) ** 2 + (y - 30) ** 2) / 2.0)
     data += 0.8 * np.exp(-0.5 * ((x - 60) ** 2 + (y - 45) ** 2) / 2.0)
-    data[0, 0] = np.nan
-    image = CCDData(data, unit="adu", wcs=own, mask=(x == 2) & (y == 2))
     sky = own.pixel_to_world(35, 30)
-    stamp = Cutout.from_image(image, sky, fill=0)
-    assert stamp.n_filled == 2
+    stamp = Cutout.from_image(CCDData(data, unit="adu", wcs=own), sky)
     assert stamp.pixel_scale.to_value(u.arcsec) == pytest.approx(0.05, rel=1e-6)
     wcs = scenes.tan_wcs(pa=20.0)
     catalog = one(wcs, 50, 45)
@@ -109,23 +106,12 @@ def test_stamp_of_an_image_stands_as_the_image_does(psf, parity):
     assert np.sum(blob * yy) / blob.sum() == pytest.approx(cy, abs=0.05)
 
 
-def test_pixels_without_a_measurement_are_an_error_or_counted(wcs, psf):
-    own = scenes.tan_wcs((7, 9), scale=0.1)
+def test_pixels_without_a_measurement_are_refused():
     data, mask = np.ones((7, 9)), np.zeros((7, 9), dtype=bool)
     data[2, 3], data[4, 4] = np.nan, -np.inf
     mask[2, 3] = mask[6, 0] = True
-    image = CCDData(data, unit="MJy / sr", wcs=own, mask=mask)
+    image = CCDData(data, unit="adu", wcs=scenes.tan_wcs((7, 9), scale=0.1), mask=mask)
     refuses(r"'image' must be without masked .* got 3 of 63 pixels", Cutout.from_image, image)
-    refuses("'fill' must be finite, got nan", Cutout.from_image, image, fill=np.nan)
-    with pytest.raises(u.UnitsError, match="'fill' must be convertible to MJy"):
-        Cutout.from_image(image, fill=1 * u.s)
-    stamp = Cutout.from_image(image, fill=2000 * u.kJy / u.sr)
-    assert stamp.data.sum() == pytest.approx(60 + 3 * 2)
-    assert "3 pixels filled" in repr(stamp)
-    scene = scenes.make_scene(one(wcs, 50, 45), wcs, psf, cutouts={1: stamp})
-    assert scene.truth.meta["cutout_pixels_filled"] == {1: 3}
-    whole = CCDData(np.ones((7, 9)), unit="adu", wcs=own)
-    assert Cutout.from_image(whole, fill=0).n_filled == 0
 
 
 def test_distortion_stretches_the_stamp(psf):
@@ -190,7 +176,7 @@ def test_images_without_a_usable_wcs_are_refused():
 
 
 def test_copies_cannot_be_changed_either():
-    cutout = Cutout(np.ones((3, 5)), pixel_scale=0.1 * u.arcsec, angle=30 * u.deg, n_filled=2)
+    cutout = Cutout(np.ones((3, 5)), pixel_scale=0.1 * u.arcsec, angle=30 * u.deg)
     for other in (copy.deepcopy(cutout), pickle.loads(pickle.dumps(cutout))):
         assert repr(other) == repr(cutout)
         assert other.center == cutout.center

@@ -22,20 +22,6 @@ def grid():
     return GriddedPSFModel(NDData(data, meta={"grid_xypos": CORNERS, "oversampling": 4}))
 
 
-def test_points_are_what_photutils_evaluates(wcs, grid):
-    x, y = [20.3, 49.5, 80.7, -2.0], [15.2, 44.5, 70.9, 50.0]
-    catalog = scenes.make_catalog(wcs, x, y, flux=[10.0, 20.0, 30.0, 40.0])
-    scene = make_scene(catalog, wcs, grid)
-    yy, xx = np.mgrid[:90, :100]
-    expected = sum(
-        grid.evaluate(xx, yy, f, a, b)
-        for f, a, b in zip((10.0, 20.0, 30.0, 40.0), x, y, strict=True)
-    )
-    image = light(scene)
-    np.testing.assert_allclose(image, expected, atol=2e-5 * expected.max())
-    assert scene.truth["flux_in_image"].value.sum() == pytest.approx(image.sum(), rel=1e-6)
-
-
 def test_galaxies_widen_by_the_local_psf(wcs, grid):
     """Variances add: the galaxy's and the mixture's of the PSFs at its center."""
     catalog = scenes.make_catalog(

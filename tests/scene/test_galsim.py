@@ -6,7 +6,6 @@ import pytest
 
 from helpers import scenes
 from miricigale.instrument import pixel_area_map
-from miricigale.profiles import sersic_image
 from miricigale.scene import Scene
 
 galsim = pytest.importorskip("galsim", reason="needs galsim: pip install miricigale[galsim]")
@@ -27,51 +26,6 @@ def galaxy(n, radius, ratio, angle):
     """Half-light radius along the major axis; ``angle`` in deg from +x toward +y."""
     round_one = galsim.Sersic(n=n, half_light_radius=radius * ratio**0.5, gsparams=SHARP)
     return round_one.shear(q=ratio, beta=angle * galsim.degrees)
-
-
-@pytest.mark.parametrize(
-    ("n", "radius", "ratio"),
-    [
-        (0.3, 1.0, 1.0),
-        (0.5, 2.0, 0.3),
-        (1.0, 1.0, 0.5),
-        (1.0, 3.0, 0.1),
-        (1.5, 8.0, 0.6),
-        (2.5, 1.0, 0.4),
-        (4.0, 2.0, 0.8),
-        (4.0, 6.0, 0.3),
-        (6.0, 3.0, 0.7),
-    ],
-)
-def test_pixels_of_a_profile(n, radius, ratio):
-    """Real-space integrals over the pixels, at a random sub-pixel position and angle."""
-    rng = np.random.default_rng(int(100 * n + 10 * radius))
-    dx, dy = rng.uniform(-0.5, 0.5, 2)
-    angle = rng.uniform(0, 180)
-    ours = sersic_image(
-        (21, 21),
-        x=10 + dx,
-        y=10 + dy,
-        r_eff=radius,
-        n=n,
-        axis_ratio=ratio,
-        theta=np.radians(angle),
-    )
-    # its brightness by Gauss-Legendre points: its own pixels go through Fourier space
-    fine = 16
-    theirs = np.zeros((21, 21))
-    model = galaxy(n, radius, ratio, angle)
-    nodes, weights = np.polynomial.legendre.leggauss(fine)
-    for i in range(21):
-        for j in range(21):
-            if np.hypot(i - 10, j - 10) < 3 or (i + j) % 3:
-                continue
-            x, y = j - 10 - dx + 0.5 * nodes, i - 10 - dy + 0.5 * nodes
-            values = [[model.xValue(a, b) for a in x] for b in y]
-            theirs[i, j] = 0.25 * weights @ np.array(values) @ weights
-    used = theirs > 1e-6
-    assert used.sum() >= 3
-    np.testing.assert_allclose(ours[used], theirs[used], rtol=1e-3)
 
 
 @pytest.mark.parametrize(

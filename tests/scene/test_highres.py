@@ -6,7 +6,7 @@ from helpers import scenes
 from helpers.errors import refuses
 from miricigale.instrument import north_up_wcs
 from miricigale.psf import encircled_energy, hst_psf
-from miricigale.scene import Scene, depth_to_rms, highres_image
+from miricigale.scene import Scene, highres_image
 
 FILTER = "miri.f770w"
 SHAPE = (240, 250)
@@ -48,14 +48,6 @@ def test_noise_does_not_know_the_sources(fine, psf, catalog):
     np.testing.assert_array_equal(both.data, again.data)
     other = highres_image(catalog, filter=FILTER, wcs=fine, psf=psf, seed=10)
     assert not np.any(both.data == other.data)
-
-
-def test_depth_to_rms_scales_with_the_aperture():
-    kwargs = {"pixel_area": 1e-13}
-    wide = depth_to_rms(1 * u.uJy, aperture_radius=0.4 * u.arcsec, **kwargs)
-    narrow = depth_to_rms(1 * u.uJy, aperture_radius=0.2 * u.arcsec, **kwargs)
-    assert narrow == pytest.approx(2 * wide)
-    assert depth_to_rms(23.9 * u.ABmag, **kwargs) == pytest.approx(narrow, rel=1e-6)
 
 
 def test_refuses(fine, psf, catalog):

@@ -242,7 +242,10 @@ def bare_wcs():
         ),
         ({"psf": ImagePSF(np.ones((8, 8)), oversampling=4)}, "'psf' must be centered on a node"),
         ({"background": 3.0}, "'background' must be a Background, a Quantity in MJy/sr or a level"),
-        ({"background": -3 * u.MJy / u.sr}, r"'background' must be at least 0, got -3\.0 MJy"),
+        (
+            {"background": -3 * u.MJy / u.sr},
+            r"'level' must be finite and not negative, got -3\.0 MJy",
+        ),
         ({"wcs": bare_wcs()}, "'wcs' must be a WCS with its pixel_shape"),
         ({"n_threads": 0}, "'n_threads' must be at least 1 and an integer, got 0"),
         ({"n_threads": 1.5}, r"'n_threads' must be at least 1 and an integer, got 1\.5"),

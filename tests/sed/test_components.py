@@ -1,14 +1,11 @@
-import astropy.units as u
 import numpy as np
 import pytest
 from astropy.io import fits
-from numpy.testing import assert_allclose
 
 from helpers.components import values_of
 from helpers.errors import refuses
 from miricigale.refdata.libraries.ised import read_ised
-from miricigale.sed import _core
-from miricigale.sed.components import BC03, CalzettiLeitherer, DelayedSFH
+from miricigale.sed.components import BC03, DelayedSFH
 from miricigale.utils.exceptions import DataError
 
 # ----------------------------------------------------------------------------- stars
@@ -55,16 +52,7 @@ def test_delayed_composites_agree_with_those_of_bc03(data_file, name):
             assert np.log10(ours / theirs) == pytest.approx(-0.034, abs=0.02), (target, center)
 
 
-# ------------------------------------------------------------------------ attenuation
-
-
-def test_old_stars_have_their_share_of_the_color_excess():
-    part = CalzettiLeitherer()
-    wave = np.array([0.2, 0.55])
-    young, old = part.factors(wave, values_of(part, ebv=0.5, ebv_factor=0.44))
-    k = _core.leitherer_calzetti(wave)
-    assert_allclose(-2.5 * np.log10(young), 0.5 * k)
-    assert_allclose(-2.5 * np.log10(old), 0.22 * k)
+# ------------------------------------------------------------------------------ files
 
 
 def test_foreign_files_are_refused(tmp_path):
@@ -73,7 +61,3 @@ def test_foreign_files_are_refused(tmp_path):
     path = tmp_path / "other.fits"
     fits.PrimaryHDU(np.zeros((2, 2))).writeto(path)
     refuses("not a table of simple stellar populations", load_ssp, str(path), error=DataError)
-
-
-def test_defaults_of_a_component_take_units():
-    assert DelayedSFH(tau=500 * u.Myr).tau == pytest.approx(0.5)

@@ -6,45 +6,7 @@ from miricigale.sed import _core
 from miricigale.sed._core import igm
 
 
-def test_disk_integrates_to_one_and_has_its_slopes():
-    total = sum(
-        quad(lambda w: float(_core.disk_spectrum(np.array([w]))[0]), a, b)[0]
-        for a, b in zip(_core.DISK_BREAKS[:-1], _core.DISK_BREAKS[1:], strict=True)
-    )
-    assert total == pytest.approx(1.0, rel=1e-6)
-    for a, b, slope in ((0.0082, 0.0098, 0.2), (0.011, 0.09, -1), (0.2, 4, -1.5), (6, 900, -4)):
-        low, high = _core.disk_spectrum(np.array([a, b]))
-        assert np.log(high / low) / np.log(b / a) == pytest.approx(slope)
-    low, high = _core.disk_spectrum(np.array([0.2, 4.0]), delta=0.5)
-    assert np.log(high / low) / np.log(20) == pytest.approx(-1.0)
-
-
-def test_modified_blackbody_obeys_wien_and_rayleigh_jeans():
-    wave = np.geomspace(1, 3000, 5000)
-    # optically thick and beta 0 is a blackbody: Wien's law 2897.77 um K
-    black = _core.planck_lambda(wave, 150.0)
-    assert wave[np.argmax(black)] == pytest.approx(2897.77 / 150.0, rel=2e-3)
-    thin = _core.modified_blackbody(np.array([2e5, 4e5]), 300.0, 1.6)
-    assert np.log(thin[1] / thin[0]) / np.log(2) == pytest.approx(-4 - 1.6, abs=0.01)
-
-
-def test_band_means_of_a_straight_line_by_numerical_integration():
-    wave = np.array([1.0, 2.0, 4.0, 8.0])
-    fnu = np.array([1.0, 5.0, 2.0, 7.0])
-    band = np.array([1.5, 2.5, 3.0, 5.0])
-    curve = np.array([0.0, 1.0, 0.4, 0.0])
-    start = np.array([0, 4])
-    tables = _core.band_tables(start, band, curve)
-    t = lambda x: np.interp(x, band, curve)  # noqa: E731
-    points = {"points": [2.0, 2.5, 3.0, 4.0], "epsabs": 1e-13}
-    top = quad(lambda x: np.interp(x, wave, fnu) * t(x) / x, 1.5, 5.0, **points)[0]
-    bottom = quad(lambda x: t(x) / x, 1.5, 5.0, **points)[0]
-    got = np.empty(start.size - 1)
-    _core.band_means(wave, np.log(wave), fnu, start, band, *tables, 1e-4, got)
-    assert got[0] == pytest.approx(top / bottom, rel=1e-10)
-
-
-@pytest.mark.parametrize("ends", [(1.8, 8.0), (1.0, 4.2), (1.8, 4.2)])
+@pytest.mark.parametrize("ends", [(1.0, 8.0), (1.8, 8.0), (1.0, 4.2), (1.8, 4.2)])
 def test_band_means_over_the_part_that_a_spectrum_covers(ends):
     """Within the tolerance the mean is that of the part covered, beyond it there is none."""
     wave = np.array([ends[0], 2.0, 4.0, ends[1]])
@@ -82,12 +44,6 @@ def test_meiksin_lyman_alpha_is_the_published_power_law(z, law):
     assert got == pytest.approx(np.exp(-law[0] * absorber ** law[1]), rel=1e-12)
 
 
-def test_meiksin_forest_agrees_with_the_observed_decrement():
-    """D_A = 0.27 +- 0.05 at z = 3 (Bechtold 1994; Kim et al. 2002 give tau_eff 0.36 +- 0.05)."""
-    tau = -np.log(_core.meiksin_transmission(np.array([0.1215 * 4.0]), 3.0)[0])
-    assert tau == pytest.approx(0.36, abs=0.05)
-
-
 def test_meiksin_lyman_limit_systems_by_direct_integration():
     """Eq. 7: N0 Gamma-weighted systems; series against numerical integration."""
     z, wave = 3.0, 0.0912 * 3.2
@@ -107,22 +63,3 @@ def test_meiksin_lyman_limit_systems_by_direct_integration():
     for n, term in enumerate(series, start=1):
         lls -= term * ((1 + z) ** (2.5 - 3 * n) * limit ** (3 * n) - limit**2.5)
     assert 0.25 * lls == pytest.approx(direct, rel=0.02)
-
-
-@pytest.mark.parametrize("function", [_core.meiksin_transmission, _core.madau_transmission])
-def test_transmission_falls_with_redshift_and_stays_between_0_and_1(function):
-    rest = np.linspace(0.08, 0.121, 300)
-    previous = 1.0
-    for z in (0.5, 1.0, 2.0, 3.0, 4.0):
-        got = function(rest * (1 + z), z)
-        assert np.all((got >= 0) & (got <= 1))
-        mean = got.mean()
-        assert mean < previous
-        previous = mean
-
-
-def test_madau_line_at_published_coefficients():
-    # Madau 1995: 0.0036 (l / 0.1216 um)^3.46 between the first two lines
-    got = _core.madau_transmission(np.array([0.11 * 4.0]), 3.0)[0]
-    line = 0.0912 / 0.75
-    assert got == pytest.approx(np.exp(-0.0036 * (0.44 / line) ** 3.46), rel=1e-12)

@@ -101,8 +101,6 @@ def test_no_dust_changes_nothing():
     wave = np.geomspace(0.01, 1000, 50)
     for r_v in (2.5, 3.1, 5.0):
         assert np.all(part.transmission(wave, values_of(part, r_v=r_v)) == 1.0)
-    assert part.inert(values_of(part)) == ("r_v",)
-    assert part.inert(values_of(part, ebv_galactic=0.1)) == ()
 
 
 def test_default_law_covers_the_bands_of_the_paper():
@@ -213,17 +211,6 @@ def test_rows_are_independent():
     assert many.meta["galactic_extinction"]["law"] == "G23"
 
 
-def test_band_extinction_of_a_component():
-    """The same numbers as the component's transmission on a fine grid."""
-    part = GalacticExtinction(law="F19", r_v=2.8)
-    wave = np.geomspace(0.25, 3.3, 30000)
-    light = part.transmission(wave, values_of(part, ebv_galactic=0.4))
-    bands = FilterSet(["acs.f435w", "wfc3.f160w"])
-    want = -2.5 * np.log10(bands.weights(wave) @ light)
-    got = band_extinction(bands, 0.4, law="F19", r_v=2.8)
-    assert_allclose([got[n][0].value for n in bands.names], want, rtol=1e-4)
-
-
 @pytest.mark.parametrize(
     ("ebv", "match"),
     [
@@ -231,7 +218,7 @@ def test_band_extinction_of_a_component():
         (np.ma.array([0.1, 0.2], mask=[0, 1]), "in 1 of 2 rows: 1"),
         (MaskedColumn([0.1, 0.2], mask=[1, 0], unit="mag"), "in 1 of 2 rows: 0"),
         (Masked([0.1, 0.2] * u.mag, mask=[0, 1]), "in 1 of 2 rows: 1"),
-        (np.full((2, 2), 0.1), "one number or one for each row"),
+        (np.full((2, 2), 0.1), "'ebv' must be of one dimension"),
         ("much", "'ebv' must be numbers, got values of type"),
     ],
 )

@@ -3,7 +3,6 @@ import json
 import logging
 import os
 import re
-import time
 from concurrent.futures import ThreadPoolExecutor
 from importlib import resources
 from pathlib import Path
@@ -28,7 +27,6 @@ from miricigale.sed.components import (
     ParametricTorus,
 )
 from miricigale.sed.grid_cache import grid_key
-from miricigale.utils.store import PARTIAL
 
 AXES = {"age": [0.5, 2.0], "ebv": [0.1, 0.4], "redshift": [0.3, 1.0]}
 BANDS = FilterSet.from_names(["wfc3.f160w", "miri.f770w"])
@@ -226,17 +224,6 @@ def test_threads_at_the_same_grid_get_the_same_numbers(folder):
     for grid in grids[1:]:
         same(grids[0], grid)
     assert len(list(folder.iterdir())) == 1
-
-
-def test_leftovers_of_a_killed_run_go(folder):
-    folder.mkdir()
-    old, new = folder / f"{PARTIAL}a.fits", folder / f"{PARTIAL}b.fits"
-    for path, age in ((old, 1e6), (new, 0.0)):
-        path.write_text("")
-        os.utime(path, (time.time() - age,) * 2)
-    model().grid(AXES, BANDS)
-    assert not old.exists()
-    assert new.exists()
 
 
 def test_a_damaged_file_is_made_again_and_said(folder, made, caplog):

@@ -126,7 +126,7 @@ def test_metal_lines_have_the_ratios_of_their_atoms(gas):
 
 
 def test_wavelengths_are_those_of_the_laboratory_in_vacuum(gas):
-    wave = dict(zip(gas.line_names, gas.line_wave, strict=True))
+    wave = dict(zip(gas.table.names, gas.table.line_wave, strict=True))
     published = {
         "Lyman-alpha": 0.121567, "H-beta": 0.486268, "H-alpha": 0.656461, "OIII-5007": 0.500824,
         "OII-3726": 0.372709, "Paschen-alpha": 1.87561, "Brackett-gamma": 2.16612,
@@ -200,7 +200,6 @@ def test_nothing_shines_when_all_photons_escape(gas):
     values = full(gas, f_esc=0.7, f_dust=0.3)
     assert gas.invalid(values) is None
     assert not one_photon(gas, "spectra", f_esc=0.7, f_dust=0.3).any()
-    assert set(gas.inert(values)) == {"log_u", "metallicity_gas"}
 
 
 # ------------------------------------------------------------------- metallicity, log U
@@ -228,8 +227,6 @@ def test_log_u_between_nodes_is_the_geometric_mean(gas):
 def test_gas_may_have_its_own_metallicity(gas):
     free = Nebular(gas="free", metallicity_gas=0.004)
     assert one_photon(free, metallicity=0.1) == one_photon(gas, metallicity=0.004)
-    assert free.inert(full(free)) == ()
-    assert gas.inert(full(gas)) == ("metallicity_gas",)
 
 
 @pytest.mark.parametrize(
@@ -246,11 +243,6 @@ def test_says_why_values_cannot_be_evaluated(options, values, text):
     assert component.invalid(full(component)) is None
     with pytest.raises(ValueError, match=text):
         raise ValueError(component.invalid(full(component, **values)))
-
-
-def test_gas_that_the_table_lacks_is_refused(gas):
-    refuses("'metallicity' must be one of", one_photon, gas, metallicity=0.013)
-    refuses("'log_u' must be from -4 to -3, got -2", one_photon, gas, metallicity=0.05)
 
 
 # ----------------------------------------------------------------------------- drawing
@@ -271,7 +263,7 @@ def test_line_power_is_kept_on_any_grid_that_holds_the_nodes(width):
     drawn = _core.hat_matrix(nodes, merged) @ (spectrum - continuum)
     assert np.trapezoid(drawn, merged) == pytest.approx(sum(lines.values()), rel=1e-6)
     # a line that stands alone
-    center = dict(zip(component.line_names, component.line_wave, strict=True))["SIV-10.51um"]
+    center = dict(zip(table.names, table.line_wave, strict=True))["SIV-10.51um"]
     part = np.abs(merged / center - 1.0) < 2.0 * width / 299792.458
     x, y = merged[part], drawn[part]
     assert np.trapezoid(y, x) == pytest.approx(lines["SIV-10.51um"], rel=1e-6)
@@ -301,20 +293,3 @@ def test_refuses_a_foreign_file(tmp_path):
         DataError, match=r"none\.fits cannot be read as a table of nebular emission"
     ):
         load_nebular(str(tmp_path / "none.fits"))
-
-
-def test_a_model_with_gas_is_the_one_without_where_all_photons_escape():
-    from miricigale.sed import SEDModel
-
-    parts = SEDModel.yang2021(agn=False, igm="madau1995").components
-    values = {"age": 1.0, "redshift": 0.5, "ebv": 0.2}
-    bare = SEDModel(parts).evaluate(**values)
-    escaping = SEDModel([*parts, Nebular(f_esc=1.0)]).evaluate(**values)
-    inside = bare.wave < 1e4 * u.um
-    assert_allclose(escaping.fnu_at(bare.wave[inside]).value, bare.fnu[inside].value, rtol=2e-3)
-    bright = SEDModel([*parts, Nebular()]).evaluate(**values)
-    part = (bright.wave > 0.2 * u.um) & (bright.wave < 1e4 * u.um)
-    more = (bright.fnu / escaping.fnu)[part].value
-    # dust takes the light of the gas as well and gives it back beyond 3 um
-    assert more.min() > 0.999
-    assert more.max() > 3.0

@@ -2,8 +2,7 @@ import astropy.units as u
 import pytest
 
 from helpers.errors import refuses
-from miricigale.sed import COMPONENTS, Component, Parameter, SEDModel
-from miricigale.sed.components import DelayedSFH
+from miricigale.sed import COMPONENTS, Component, Parameter
 
 
 class Example(Component):
@@ -46,17 +45,3 @@ def test_every_component_declares_unit_bounds_doc_and_reference(name):
         assert parameter.bounds[0] < parameter.bounds[1]
         assert parameter.bounds[0] <= parameter.default <= parameter.bounds[1]
         assert parameter.doc.endswith(".")
-
-
-def test_model_has_the_names_that_other_subpackages_use():
-    names = set(SEDModel.yang2021().parameters)
-    assert names >= {
-        *("tau", "age", "metallicity", "ebv", "ebv_factor", "uv_bump", "slope", "alpha"),
-        *("frac_agn", "tau97", "inclination", "opening_angle", "p", "q", "radius_ratio"),
-        *("ebv_polar", "temperature_polar", "emissivity_polar", "redshift", "mass"),
-    }
-
-
-def test_registry_lists_the_right_names():
-    assert COMPONENTS.get("delayed") is DelayedSFH
-    refuses(r"no component 'delay'; known: .*delayed", COMPONENTS.get, "delay", error=KeyError)

@@ -70,8 +70,6 @@ def test_a_burst_older_than_the_galaxy_is_refused_only_if_there_is_one(cls):
     values = values_of(part, age=0.1, age_burst=0.2, f_burst=0.1)
     assert "'age_burst' must not exceed 'age'" in part.invalid(values)
     assert part.invalid(values | {"f_burst": 0.0}) is None
-    assert set(part.inert(values | {"f_burst": 0.0})) == {"age_burst", "tau_burst"}
-    assert part.inert(values) == ()
 
 
 # -------------------------------------------------------------------- closed forms
@@ -202,7 +200,7 @@ def test_numbers_of_the_table_are_in_the_settings():
         ({"sfr_0": [1, np.inf, 2] * RATE}, "'sfr_0' must be finite"),
         ({"sfr_0": [0, 0, 0] * RATE}, "'sfr_0' must be a history that forms stars"),
         ({"sfr_0": [1, 1, 2] * u.Msun}, "'sfr_0' must be convertible to solMass / yr"),
-        ({"sfr_0": [1.0, 1.0, 2.0]}, "'sfr_0' must have a unit"),
+        ({"sfr_0": [1.0, 1.0, 2.0]}, "'sfr_0' must be convertible to solMass / yr, got None"),
     ],
 )
 def test_bad_tables_are_refused(change, match):
@@ -218,7 +216,7 @@ def test_masked_short_and_nameless_tables_are_refused():
     refuses("'sfr_0' must be without masked values, got 1", TableSFH, table)
     refuses("two rows or more", TableSFH, table_of([0], [1]))
     refuses("column 'time'", TableSFH, QTable({"t": [0, 1] * u.Myr, "sfr": [1, 1] * RATE}))
-    refuses(r"'table' must be 13\.7 Gyr long at most", TableSFH, table_of([0, 9000], [1, 1]))
+    refuses(r"'age' must be from 0\.001 to 13\.7 Gyr, got ", TableSFH, table_of([0, 9000], [1, 1]))
     assert TableSFH(table_of([0, 9000], [1, 1]), age=13.0).age == 13.0
     refuses("one of them", TableSFH)
 

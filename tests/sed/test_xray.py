@@ -3,7 +3,6 @@
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.cosmology import FlatLambdaCDM
 from astropy.tests.helper import assert_quantity_allclose
 from numpy.testing import assert_allclose
 from scipy.integrate import quad
@@ -74,13 +73,7 @@ def test_stern_refuses():
 # ---------------------------------------------------------------------------------- bands
 
 
-def test_bands_of_equal_power_per_decade():
-    """Gamma = 2: in proportion to the logarithm of the band's ends."""
-    got = band_luminosity(1 * u.W, from_band=HARD, to_band=FULL, photon_index=2.0)
-    assert_quantity_allclose(got, np.log(7 / 0.5) / np.log(10 / 2) * u.W, rtol=1e-14)
-
-
-@pytest.mark.parametrize("index", [0.5, 1.4, 1.8, 1.999999, 2.000001, 2.5, 3.0])
+@pytest.mark.parametrize("index", [0.5, 1.4, 1.8, 1.999999, 2.0, 2.000001, 2.5, 3.0])
 def test_bands_by_integration(index):
     ends = [quad(lambda e: e ** (1 - index), *band)[0] for band in ((0.5, 7), (2, 10))]
     got = band_luminosity(1 * u.W, from_band=HARD, to_band=FULL, photon_index=index)
@@ -95,14 +88,6 @@ def test_bands_there_and_back_and_in_parts():
     assert_quantity_allclose(total, there)
 
 
-def test_soft_over_hard_by_hand():
-    """(2^0.2 - 0.5^0.2) / (10^0.2 - 2^0.2) = 0.64 at Gamma 1.8."""
-    got = band_luminosity(1 * CGS, from_band=HARD, to_band=[0.5, 2] * u.keV)
-    want = (2**0.2 - 0.5**0.2) / (10**0.2 - 2**0.2)
-    assert_quantity_allclose(got, want * CGS)
-    assert want == pytest.approx(0.64, abs=0.01)
-
-
 @pytest.mark.parametrize("band", [[7, 0.5] * u.keV, [0, 2] * u.keV, [1, 2, 3] * u.keV])
 def test_bands_are_checked(band):
     refuses("'to_band' must be", band_luminosity, 1 * u.W, from_band=HARD, to_band=band)
@@ -112,14 +97,7 @@ def test_bands_are_checked(band):
 # ----------------------------------------------------------------------------------- flux
 
 
-def test_no_k_correction_for_equal_power_per_decade():
-    far = COSMOLOGY.luminosity_distance(2.0)
-    got = xray_flux(1e44 * ERG, 2.0, band=HARD, photon_index=2.0)
-    assert_quantity_allclose(got, 1e44 * ERG / (4 * np.pi * far**2), rtol=1e-12)
-    assert got.unit == CGS
-
-
-@pytest.mark.parametrize("index", [1.4, 1.8, 2.3])
+@pytest.mark.parametrize("index", [1.4, 1.8, 2.0, 2.3])
 @pytest.mark.parametrize("z", [0.1, 1.0, 4.0])
 def test_flux_is_the_power_of_the_rest_frame_band(index, z):
     """What is seen in 0.5-7 keV left in 0.5 (1 + z) to 7 (1 + z) keV."""
@@ -144,16 +122,11 @@ def test_flux_at_redshift_zero_is_at_ten_parsec():
     assert_quantity_allclose(got, 1 * u.W / (4 * np.pi * (10 * u.pc) ** 2))
 
 
-def test_flux_takes_arrays_cosmology_and_transmission():
-    other = FlatLambdaCDM(H0=50, Om0=1.0)
+def test_flux_takes_arrays_and_transmission():
     z, power = np.array([0.5, 1.0, 3.0]), [1e42, 1e43, 1e44] * ERG
-    got = xray_flux(power, z, cosmology=other, transmission=0.3)
-    each = [xray_flux(p, float(s), cosmology=other) for p, s in zip(power, z, strict=True)]
+    got = xray_flux(power, z, transmission=0.3)
+    each = [xray_flux(p, float(s)) for p, s in zip(power, z, strict=True)]
     assert_quantity_allclose(got, 0.3 * u.Quantity(each))
-    # Einstein-de Sitter: d_L = (2 c / H0) (1 + z) (1 - 1 / sqrt(1 + z))
-    far = 2 * 299792.458 / 50 * (1 + z) * (1 - 1 / np.sqrt(1 + z)) * u.Mpc
-    want = band_luminosity(power, from_band=HARD, to_band=FULL) * (1 + z) ** 0.2
-    assert_quantity_allclose(got, 0.3 * want / (4 * np.pi * far**2), rtol=1e-7)
 
 
 @pytest.mark.parametrize(
@@ -186,26 +159,6 @@ def test_component_equals_the_functions_for_any_array():
     assert set(got) == set(part.columns)
     one = part.derived(six[2], z[2], far[2], values_of(part))
     assert one["xray_flux"] == pytest.approx(got["xray_flux"][2])
-
-
-def test_component_takes_values_that_change_along_the_rows():
-    part = XRay()
-    index, high = np.array([1.4, 2.0]), np.array([2.0, 10.0])
-    got = part.derived(
-        np.full(2, 1e37), 1.0, 1e26, values_of(part, photon_index=index, xray_high=high)
-    )
-    for i in range(2):
-        one = part.derived(
-            1e37, 1.0, 1e26, values_of(part, photon_index=index[i], xray_high=high[i])
-        )
-        assert got["xray_flux"][i] == pytest.approx(one["xray_flux"])
-
-
-def test_relation_is_not_linear_in_luminosity():
-    """Ten times the light at 1e44 erg/s: 10^(1.024 - 0.047 (16 - 9)) = 4.95 times the X-rays."""
-    part = XRay()
-    got = part.derived(np.array([1e37, 1e38]), 1.0, 1e26, values_of(part))["l_2_10kev"]
-    assert got[1] / got[0] == pytest.approx(10 ** (1.024 - 0.047 * 7), rel=1e-10)
 
 
 def test_empty_band_is_invalid():

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from miricigale.refdata.libraries.ised import parse_ised, read_bytes
+from miricigale.refdata.libraries.ised import read_ised
 from miricigale.refdata.libraries.table import LibraryTable
 from miricigale.refdata.locate import file_sha256
-from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.exceptions import data_error
 
 #: Of GALAXEV, in W: its files are in this unit (3.826e33 erg/s).
 SOLAR_LUMINOSITY = 3.826e26
@@ -39,9 +39,9 @@ def read_bc03(path):
 
     Parameters
     ----------
-    path : path-like or iterable of path-like
-        A file ``.ised`` or ``.ised_ASCII`` (also ``.gz``), a folder of one set of them, a
-        pattern of names such as ``folder/bc2003_lr_*_ssp.ised``, or several files.
+    path : path-like
+        A file ``.ised`` or ``.ised_ASCII`` (also ``.gz``), a folder of one set of them, or a
+        pattern of names such as ``folder/bc2003_lr_*_ssp.ised``.
 
     Returns
     -------
@@ -56,13 +56,12 @@ def read_bc03(path):
         than its name, or the files are not one set (IMF, wavelengths, ages, limits of mass).
     """
     paths = _files(path)
-    parts, files = [], {}
+    parts, files = [], {file.name: file_sha256(file) for file in paths}
     for file in paths:
-        part = parse_ised(read_bytes(file), file)
-        files[file.name] = file_sha256(file)
-        if not part.is_ssp:
-            msg = f"{file} holds a composite population ({part.history}), wanted a single burst"
-            raise DataError(msg)
+        part = read_ised(file)
+        if part.law:
+            what = f"holds a composite population ({part.history}), wanted a single burst"
+            raise data_error(file, what)
         parts.append((file, part, _metallicity(part, file), _imf(part, file)))
     _check_set(parts)
     parts.sort(key=lambda item: item[2])
@@ -79,7 +78,6 @@ def read_bc03(path):
         basis.add(how)
     metal, name, (low, high) = [p[2] for p in parts], _set_name(paths[0].name), first.mass_limits
     extended = first.wave[-1] / 1e4 < LONGEST * (1 - 1e-6)
-    versions = [v for v, age in SECOND_AGE.items() if np.isclose(first.age[1], age, rtol=1e-3)]
     return LibraryTable(
         name="ssp.bc03_user",
         wave=wave,
@@ -91,7 +89,7 @@ def read_bc03(path):
             "files": files,
             "imf": imf,
             "mass_limits": list(first.mass_limits),
-            "version": versions[0] if versions else None,
+            "version": _version(first),
             "models": name,
             "surviving": sorted(basis),
         },
@@ -108,10 +106,6 @@ def read_bc03(path):
 
 
 def _files(path):
-    if isinstance(path, (list, tuple, set)):
-        if not path:
-            raise argument_error("path", "a file, a folder or several files", "nothing")
-        return sorted((Path(p) for p in path), key=str)
     path = Path(path).expanduser()
     if path.is_dir():
         found = sorted(p for p in path.iterdir() if _is_ised(p.name))
@@ -120,9 +114,8 @@ def _files(path):
     else:
         found = sorted(p for p in path.parent.glob(path.name) if _is_ised(p.name))
     if not found:
-        wanted = "wanted files *.ised or *.ised_ASCII (also .gz)"
-        msg = f"{path} cannot be read as populations of BC03: {wanted}, got none"
-        raise DataError(msg)
+        wanted = "wanted files *.ised or *.ised_ASCII (also .gz), got none"
+        raise data_error(path, f"cannot be read as populations of BC03: {wanted}")
     return found
 
 
@@ -141,11 +134,11 @@ def _metallicity(part, file):
     named = (PADOVA_1994 | PADOVA_2000).get(int(match[1])) if match else None
     stated = part.metallicity
     if named is None and stated is None:
-        msg = f"{file} states no metallicity: wanted 'Z=...' in its head or a name like _m62_"
-        raise DataError(msg)
+        wanted = "wanted 'Z=...' in its head or a name like _m62_"
+        raise data_error(file, f"states no metallicity: {wanted}")
     if named is not None and stated is not None and not np.isclose(named, stated, rtol=0.01):
-        msg = f"{file} states Z = {stated:g}, but its name (m{match[1]}) means Z = {named:g}"
-        raise DataError(msg)
+        what = f"states Z = {stated:g}, but its name (m{match[1]}) means Z = {named:g}"
+        raise data_error(file, what)
     return named if stated is None else stated
 
 
@@ -156,11 +149,9 @@ def _imf(part, file):
     if len(part.slopes) == 1 and np.isclose(part.slopes[0], 1.35, atol=0.01):
         stated = "Salpeter"
     if len(named) != 1 and stated is None:
-        msg = f"{file} names no IMF: wanted one of {', '.join(IMFS)} in its name"
-        raise DataError(msg)
+        raise data_error(file, f"names no IMF: wanted one of {', '.join(IMFS)} in its name")
     if len(named) == 1 and stated is not None and stated not in named:
-        msg = f"{file} holds a {stated} IMF, but its name means {named.pop()}"
-        raise DataError(msg)
+        raise data_error(file, f"holds a {stated} IMF, but its name means {named.pop()}")
     return stated if stated is not None else named.pop()
 
 
@@ -169,21 +160,26 @@ def _check_set(parts):
     file, first, _, imf = parts[0]
     seen = {}
     for other, part, metallicity, other_imf in parts:
-        why = None
-        if part.wave.shape != first.wave.shape or not np.array_equal(part.wave, first.wave):
-            why = f"{part.wave.size} wavelengths and the other {first.wave.size}, or others"
-        elif other_imf != imf:
-            why = f"a {other_imf} IMF and the other a {imf} IMF"
-        elif part.mass_limits != first.mass_limits:
-            why = f"masses of {part.mass_limits} Msun and the other of {first.mass_limits}"
-        elif part.age.shape != first.age.shape or not np.allclose(part.age, first.age, rtol=1e-4):
-            why = f"{part.age.size} ages and the other {first.age.size}, or others"
-        elif metallicity in seen:
-            why = f"the same metallicity as {seen[metallicity].name}, {metallicity:g}"
-        if why:
-            msg = f"{other} and {file.name} are not one set: the one has {why}"
-            raise DataError(msg)
+        ages = part.age.shape == first.age.shape and np.allclose(part.age, first.age, rtol=1e-4)
+        same = {
+            "wavelengths": np.array_equal(part.wave, first.wave),
+            "IMF": other_imf == imf,
+            "limits of mass": part.mass_limits == first.mass_limits,
+            "ages": ages,
+        }
+        differ = ", ".join(name for name, is_same in same.items() if not is_same)
+        if differ:
+            raise data_error(other, f"and {file.name} are not one set: other {differ}")
+        if metallicity in seen:
+            twice = f"the same metallicity as {seen[metallicity].name}, {metallicity:g}"
+            raise data_error(other, f"is not of one set: it has {twice}")
         seen[metallicity] = other
+
+
+def _version(part):
+    """Year of the version that made a file, by its second age, or None."""
+    years = [y for y, age in SECOND_AGE.items() if np.isclose(part.age[1], age, rtol=1e-3)]
+    return years[0] if years else None
 
 
 def _surviving(part, file):
@@ -195,25 +191,20 @@ def _surviving(part, file):
         with_remnants = np.abs(mass + gas - 1.0)[old].max()
         without = np.abs(mass + remnants + gas - 1.0)[old].max()
         if min(with_remnants, without) > 0.01:
-            msg = f"{file} has masses of stars, remnants and gas that do not sum to 1 Msun"
-            raise DataError(msg)
+            what = "has masses of stars, remnants and gas that do not sum to 1 Msun"
+            raise data_error(file, what)
         take = with_remnants < without
-    elif np.isclose(part.age[1], SECOND_AGE[2003], rtol=1e-3):
-        take = True
-    elif np.isclose(part.age[1], SECOND_AGE[2016], rtol=1e-3):
-        take = False
+    elif _version(part) is not None:
+        take = _version(part) == 2003
     else:
-        msg = (
-            f"{file} does not tell whether its mass of stars includes remnants: wanted a mass of "
-            f"gas, or a second age of {SECOND_AGE[2003]:g} yr (2003) or {SECOND_AGE[2016]:g} yr "
-            f"(2016), got {part.age[1]:g} yr"
-        )
-        raise DataError(msg)
+        ages = " or ".join(f"{second:g} yr ({year})" for year, second in SECOND_AGE.items())
+        what = "does not tell whether its mass of stars includes remnants: wanted a mass of gas"
+        raise data_error(file, f"{what}, or a second age of {ages}, got {part.age[1]:g} yr")
     surviving = mass - remnants if take else mass.copy()
     surviving[part.age == 0] = 1.0
     if surviving.min() < 0 or surviving.max() > 1.05:
-        msg = f"{file} must have surviving masses of 0 to 1 Msun, got up to {surviving.max():g}"
-        raise DataError(msg)
+        got = f"got up to {surviving.max():g}"
+        raise data_error(file, f"must have surviving masses of 0 to 1 Msun, {got}")
     return surviving, "mass in stars less remnants" if take else "mass in stars, as in the file"
 
 

@@ -9,7 +9,7 @@ from miricigale.refdata.libraries.members import is_archive, members
 from miricigale.refdata.libraries.table import LibraryTable
 from miricigale.refdata.locate import locate
 from miricigale.refdata.tables import load_ssp
-from miricigale.utils.exceptions import DataError
+from miricigale.utils.exceptions import data_error
 
 SPECTRA = "spectra.0.00AGN.dat"
 CALIBRATION = "dhcal.dat"
@@ -104,75 +104,65 @@ def _find(path):
     """Contents of the files by name, and where each was found."""
     wanted = (SPECTRA, CALIBRATION, STARS)
     if not path.is_dir() and not (path.is_file() and is_archive(path)):
+        what = "cannot be read as templates of Dale et al. 2014: wanted a folder or an archive"
         got = "got another file" if path.is_file() else "no such file or folder"
-        msg = (
-            f"{path} cannot be read as templates of Dale et al. 2014: wanted a folder or an "
-            f"archive that holds {SPECTRA} and {CALIBRATION}, {got}"
-        )
-        raise DataError(msg)
+        raise data_error(path, f"{what} that holds {SPECTRA} and {CALIBRATION}, {got}")
     found = list(members(path, lambda name: name in wanted))
     folders = [place.parent for place, _, _ in found if place.name == SPECTRA]
     if len(folders) > 1:
         folders = [f for f in folders if f.parts[-2:] == ("database_builder", "dale2014")]
     if len(folders) != 1:
-        msg = f"{path} must hold one {SPECTRA}, got {len(folders) or 'none'}"
-        raise DataError(msg)
+        raise data_error(path, f"must hold one {SPECTRA}, got {len(folders) or 'none'}")
     here = [(place.name, *rest) for place, *rest in found if place.parent == folders[0]]
     contents = {name: data for name, data, _ in here}
     if CALIBRATION not in contents:
-        msg = f"{path} has {SPECTRA} without {CALIBRATION}, which lists the alphas of its columns"
-        raise DataError(msg)
+        what = f"has {SPECTRA} without {CALIBRATION}, which lists the alphas of its columns"
+        raise data_error(path, what)
     return contents, {name: source for name, _, source in here}
 
 
 def _numbers(data, place, n_columns, wanted):
-    """Rows of numbers of a text file, comments left out: array (n_rows, n_columns)."""
+    """Columns of numbers of a text file, comments left out: array (n_rows, n_columns)."""
     try:
-        lines = [line.split() for line in data.decode("ascii").splitlines()]
-        rows = [words for words in lines if words and not words[0].startswith("#")]
-        odd = [i for i, words in enumerate(rows, 1) if len(words) != n_columns]
-        if odd:
-            msg = f"row {odd[0]} of {len(rows)} has {len(rows[odd[0] - 1])} columns"
-            raise ValueError(msg)
-        table = np.array(rows, dtype=float).reshape(len(rows), n_columns)
+        table = np.loadtxt(data.decode("ascii").splitlines(), ndmin=2)
     except ValueError as err:
-        msg = f"{place} is not {wanted} in {n_columns} columns: {err}"
-        raise DataError(msg) from err
+        raise data_error(place, f"is not {wanted} in {n_columns} columns: {err}") from err
+    if table.shape[1] != n_columns:
+        got = f"row 1 of {len(table)} has {table.shape[1]} columns"
+        raise data_error(place, f"is not {wanted} in {n_columns} columns: {got}")
     if not np.all(np.isfinite(table)):
-        msg = f"{place} must hold finite numbers, got {np.sum(~np.isfinite(table))} others"
-        raise DataError(msg)
+        raise data_error(
+            place, f"must hold finite numbers, got {np.sum(~np.isfinite(table))} others"
+        )
     return table
 
 
 def _read_calibration(data, place):
-    table = _numbers(data, place, 5, "the list of alphas")
-    if table.shape[0] != ALPHA.size or not np.allclose(table[:, 1], ALPHA, rtol=0, atol=1e-6):
-        msg = (
-            f"{place} must list alpha = {ALPHA[0]:g} to {ALPHA[-1]:g} in {ALPHA.size} steps in its "
-            f"second column, got {table.shape[0]} rows"
-        )
-        raise DataError(msg)
-    return table[:, 1], table[:, 2]
+    _, alpha, color, _, _ = _numbers(data, place, 5, "the list of alphas").T
+    if alpha.shape != ALPHA.shape or not np.allclose(alpha, ALPHA, rtol=0, atol=1e-6):
+        steps = f"{ALPHA[0]:g} to {ALPHA[-1]:g} in {ALPHA.size} steps in its second column"
+        raise data_error(place, f"must list alpha = {steps}, got {alpha.size} rows")
+    return alpha, color
 
 
 def _read_spectra(data, place):
     table = _numbers(data, place, 1 + ALPHA.size, "wavelength and log10 nuF_nu")
     wave = table[:, 0]
     if wave.size != N_WAVE:
-        msg = f"{place} must have {N_WAVE} rows, got {wave.size}: truncated or another version"
-        raise DataError(msg)
+        what = f"must have {N_WAVE} rows, got {wave.size}: truncated or another version"
+        raise data_error(place, what)
     if not np.all(np.diff(wave) > 0) or wave[0] > 1.0 or wave[-1] < 1e3:
-        msg = f"{place} must have ascending wavelengths in um, from 1 or less to 1000 or more"
-        raise DataError(msg)
+        what = "must have ascending wavelengths in um, from 1 or less to 1000 or more"
+        raise data_error(place, what)
     return wave, table[:, 1:]
 
 
 def _read_stars(data, place):
-    table = _numbers(data, place, 4, "wavelength in A and starlight in W/A")
-    wave, light = table[:, 0] / 1e4, table[:, 1]
+    wave, light, _, _ = _numbers(data, place, 4, "wavelength in A and starlight in W/A").T
+    wave = wave / 1e4
     if not np.all(np.diff(wave) > 0) or wave[0] > 1.0 or wave[-1] < 5.0 or np.any(light < 0):
-        msg = f"{place} must hold starlight, not negative, at ascending wavelengths from 1 to 5 um"
-        raise DataError(msg)
+        what = "must hold starlight, not negative, at ascending wavelengths from 1 to 5 um"
+        raise data_error(place, what)
     return wave, light
 
 
@@ -181,12 +171,10 @@ def _check_order(wave, log_power, color, places):
     log_fnu = (log_power + np.log10(wave)[:, None]).T
     at = np.log([60.0, 100.0])
     seen = np.array([np.subtract(*np.interp(at, np.log(wave), row)) for row in log_fnu])
-    if np.abs(seen - color).max() > 0.06:
-        msg = (
-            f"{places[SPECTRA]} does not fit {places[CALIBRATION]}: log f60/f100 differs by "
-            f"{np.abs(seen - color).max():.2f}, wanted less than 0.06"
-        )
-        raise DataError(msg)
+    worst = np.abs(seen - color).max()
+    if worst > 0.06:
+        what = f"does not fit {places[CALIBRATION]}: log f60/f100 differs by {worst:.2f}"
+        raise data_error(places[SPECTRA], f"{what}, wanted less than 0.06")
 
 
 def _bundled_starlight(wave):

@@ -7,14 +7,16 @@ lines of their own. `_content` has the order of the numbers.
 """
 
 import gzip
+import itertools
 import re
+import struct
 import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from miricigale.utils.exceptions import DataError
+from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import unpacked_size
 
 #: Quantities after the spectra, in their order.
@@ -48,8 +50,6 @@ class Ised:
 
     Parameters
     ----------
-    name : str
-        Name of the file.
     age, wave : `~numpy.ndarray`, shape (n_age,) and (n_wave,)
         Ages in yr, wavelengths in A.
     spectra : `~numpy.ndarray`, shape (n_age, n_wave)
@@ -65,7 +65,6 @@ class Ised:
         The lines of text.
     """
 
-    name: str
     age: np.ndarray
     wave: np.ndarray
     spectra: np.ndarray
@@ -77,15 +76,10 @@ class Ised:
     texts: tuple = field(default=())
 
     @property
-    def is_ssp(self):
-        """Whether it is a single burst."""
-        return self.law == 0
-
-    @property
     def history(self):
         """The star-formation law in words."""
         words = _LAWS.get(self.law, f"law {self.law}")
-        return words if self.is_ssp else f"{words}, tau {self.tau / 1e9:g} Gyr"
+        return f"{words}, tau {self.tau / 1e9:g} Gyr" if self.law else words
 
     @property
     def metallicity(self):
@@ -114,24 +108,10 @@ def read_ised(path):
         If it is another file, truncated or not finite.
     """
     path = Path(path)
-    return parse_ised(read_bytes(path), path)
-
-
-def read_bytes(path):
-    """Content of a file, decompressed if it is compressed by gzip."""
-    unpacked_size(path)
-    try:
-        data = path.read_bytes()
-        return gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data
-    except (OSError, EOFError, zlib.error) as err:
-        raise _foreign(path, err) from err
-
-
-def parse_ised(data, path):
-    """Like `read_ised`, from the decompressed content; ``path`` is for messages."""
+    data = _unpacked(path)
     order = _byte_order(data)
     source = _Words(data, path) if order is None else _Records(data, order, path)
-    out = _content(source, path.name)
+    out = _content(source)
     for name, array in (("ages", out.age), ("wavelengths", out.wave)):
         if array.size < 2 or not np.all(np.diff(array) > 0) or array[0] < 0:
             raise _foreign(path, f"{name} must be positive and ascending")
@@ -143,7 +123,17 @@ def parse_ised(data, path):
     return out
 
 
-def _content(source, name):
+def _unpacked(path):
+    """Content of a file, decompressed if it is compressed by gzip."""
+    unpacked_size(path)
+    try:
+        data = path.read_bytes()
+        return gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data
+    except (OSError, EOFError, zlib.error) as err:
+        raise _foreign(path, err) from err
+
+
+def _content(source):
     """The numbers of a file in their order, whatever its form."""
     source.begin("the head")
     age = source.vector().astype(float)
@@ -163,7 +153,6 @@ def _content(source, name):
         source.begin(f"vector {len(vectors) + 1} after the spectra")
         vectors.append(source.vector(age.size).astype(float))
     return Ised(
-        name,
         age,
         wave,
         spectra,
@@ -177,7 +166,7 @@ def _content(source, name):
 
 
 def _foreign(path, why):
-    return DataError(f"{path} cannot be read as a file of GALAXEV: {why}")
+    return data_error(path, f"cannot be read as a file of GALAXEV: {why}")
 
 
 def _truncated(path, where):
@@ -190,6 +179,15 @@ class _Source:
     def __init__(self, path):
         self.path, self.title = path, ""
 
+    def begin(self, title):
+        self.title = title
+
+    def integer(self):
+        return int(self.numbers("i4", 1)[0])
+
+    def floats(self, n):
+        return self.numbers("f4", n)
+
     def vector(self, n=None):
         """Numbers after their count, which may be known."""
         count = self.integer()
@@ -197,6 +195,10 @@ class _Source:
             wanted = "a count of" if n is None else n
             raise _foreign(self.path, f"{self.title} must hold {wanted} numbers, got {count}")
         return self.floats(count)
+
+    def indices(self):
+        """Fluxes for spectral indices."""
+        self.vector()
 
 
 # --------------------------------------------------------------------------- binary
@@ -214,19 +216,17 @@ def _byte_order(data):
 
 
 def _records(data, order, path):
-    """Contents of the records."""
-    at, out = 0, []
+    """Contents of the records, between their lengths."""
+    length, at, out = struct.Struct(f"{order}i"), 0, []
     while at < len(data):
-        where = f"in record {len(out) + 1}"
-        if at + 4 > len(data):
-            raise _truncated(path, where)
-        size = int(np.frombuffer(data, f"{order}i4", 1, at)[0])
-        if size < 0:
-            raise _foreign(path, f"record {len(out) + 1} has a length of {size} bytes")
-        if at + size + 8 > len(data):
-            raise _truncated(path, where)
-        if int(np.frombuffer(data, f"{order}i4", 1, at + 4 + size)[0]) != size:
-            raise _foreign(path, f"the lengths before and after record {len(out) + 1} differ")
+        where = f"record {len(out) + 1}"
+        try:
+            (size,) = length.unpack_from(data, at)
+            (again,) = length.unpack_from(data, at + 4 + size)
+        except struct.error:
+            raise _truncated(path, f"in {where}") from None
+        if size < 0 or again != size:
+            raise _foreign(path, f"the lengths before and after {where} differ")
         out.append(data[at + 4 : at + 4 + size])
         at += size + 8
     return out
@@ -249,35 +249,24 @@ class _Records(_Source):
     def ended(self):
         return self.number == len(self.records)
 
-    def _take(self, kind, n):
+    def numbers(self, kind, n):
         if self.at + 4 * n > len(self.data):
             got = f"{len(self.data)} bytes"
             raise _foreign(self.path, f"{self.title} must hold {n} numbers more, got {got}")
-        out = np.frombuffer(self.data, self.order + kind, n, self.at)
         self.at += 4 * n
-        return out
-
-    def integer(self):
-        return int(self._take("i4", 1)[0])
-
-    def floats(self, n):
-        return self._take("f4", n).astype(np.float32)
+        return np.frombuffer(self.data, self.order + kind, n, self.at - 4 * n).astype(kind)
 
     def indices(self):
-        """Fluxes for spectral indices, which need not be there."""
+        # they need not be there
         if self.at < len(self.data):
             self.vector()
 
     def texts(self):
-        out = [self._text()]
-        if len(self.data) - self.at >= 16 + 2 * _TEXT:
-            self.floats(4)
-            out += [self._text(), self._text()]
-        return out
-
-    def _text(self):
-        self.at += _TEXT
-        return self.data[self.at - _TEXT : self.at].decode("latin-1").strip()
+        places = [self.at]
+        if len(self.data) - self.at >= 16 + 3 * _TEXT:
+            # four times lie between
+            places += [self.at + _TEXT + 16, self.at + 2 * _TEXT + 16]
+        return [self.data[k : k + _TEXT].decode("latin-1").strip() for k in places]
 
 
 # ---------------------------------------------------------------------------- ASCII
@@ -288,67 +277,40 @@ class _Words(_Source):
 
     def __init__(self, data, path):
         super().__init__(path)
-        if (
-            b"\0" in data[:4096]
-            or not data[:4096].split()[:1]
-            or not data.split(None, 1)[0].isdigit()
-        ):
+        if b"\0" in data[:4096] or re.match(rb"\s*\d+\s", data) is None:
             raise _foreign(path, "wanted a record of Fortran or a count of ages at its beginning")
         text = data.decode("latin-1")
         if not text.endswith("\n"):
             raise _truncated(path, "within a line")
-        self.lines = text.splitlines()
-        self.at, self.words = 0, []
-
-    def begin(self, title):
-        self.title = title
+        self.lines = iter(text.splitlines())
+        self.words = itertools.chain.from_iterable(map(_repeated, self.lines))
 
     def ended(self):
-        return not self.words and not any(line.strip() for line in self.lines[self.at :])
+        following = list(itertools.islice(self.words, 1))
+        self.words = itertools.chain(following, self.words)
+        return not following
 
     def _take(self, n):
-        """Take n words; what is left of their last line waits."""
-        blocks, have = [self.words], len(self.words)
-        while have < n:
-            if self.at >= len(self.lines):
-                raise _truncated(self.path, f"within {self.title}")
-            line = self.lines[self.at]
-            self.at += 1
-            blocks.append(_repeated(line) if "*" in line else line.split())
-            have += len(blocks[-1])
-        words = [word for block in blocks for word in block]
-        self.words = words[n:]
-        return words[:n]
+        words = list(itertools.islice(self.words, n))
+        if len(words) < n:
+            raise _truncated(self.path, f"within {self.title}")
+        return words
 
-    def integer(self):
-        word = self._take(1)[0]
+    def numbers(self, kind, n):
         try:
-            return int(word)
-        except ValueError:
-            raise _foreign(
-                self.path, f"{self.title} must begin with a count, got {word!r}"
-            ) from None
-
-    def floats(self, n):
-        try:
-            return np.array(self._take(n), dtype=np.float32)
+            return np.array(self._take(n), dtype=kind)
         except ValueError as err:
             raise _foreign(self.path, f"{self.title} must be numbers: {err}") from err
 
-    def indices(self):
-        """Fluxes for spectral indices."""
-        self.vector()
-
     def texts(self):
         self._take(6)  # four times, a number and a truth value
-        if self.words or self.at + 3 > len(self.lines):
-            raise _foreign(self.path, "three lines of text must follow the numbers of its head")
-        self.at += 3
-        return [line.strip() for line in self.lines[self.at - 3 : self.at]]
+        return [line.strip() for line in itertools.islice(self.lines, 3)]
 
 
 def _repeated(line):
     """Words of a line with Fortran's repeat counts, such as ``3*0.0``."""
+    if "*" not in line:
+        return line.split()
     out = []
     for word in line.split():
         times, star, value = word.partition("*")

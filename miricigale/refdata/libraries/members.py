@@ -5,7 +5,7 @@ import zipfile
 import zlib
 from pathlib import PurePosixPath
 
-from miricigale.utils.exceptions import DataError
+from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import check_unpacked, unpacked_size
 
 
@@ -40,8 +40,7 @@ def members(path, accept):
                 check_unpacked(path, n_bytes)
                 yield place, read(), f"{path}:{place}"
     except (zipfile.BadZipFile, tarfile.TarError, EOFError, zlib.error) as err:
-        msg = f"{path} is a truncated or damaged archive: {err}"
-        raise DataError(msg) from err
+        raise data_error(path, f"is a truncated or damaged archive: {err}") from err
 
 
 def _zipped(path):

@@ -2,20 +2,25 @@
 
 import contextlib
 import datetime
+import json
+import os
 import pkgutil
-import shutil
-import textwrap
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from miricigale.refdata.libraries.table import LibraryTable, verify_library, write_library
-from miricigale.refdata.locate import data_folder, record_path, stored_record
+from miricigale.refdata.locate import data_folder, file_sha256, record_path, stored_record
 from miricigale.refdata.registry import resource
-from miricigale.refdata.store import installing
-from miricigale.utils.exceptions import DataError, argument_error, unknown_name
+from miricigale.utils.exceptions import DataError, data_error, unknown_name
 from miricigale.utils.progress import progress
+from miricigale.utils.store import PARTIAL, replacing
+
+try:
+    import fcntl
+except ImportError:  # no such locks on Windows
+    fcntl = None
 
 #: What reads the distributed files of a library: a function, or ``"module:function"``,
 #: imported on first use; called with a `~pathlib.Path`, it gives a `LibraryTable`.
@@ -43,23 +48,17 @@ class Report:
         What was read.
     sha256 : str
         Of the converted file.
-    size : int
-        Of the converted file, in bytes.
-    replaced : str
-        Date and checksum of the library that stood there, or empty.
     """
 
     library: LibraryTable
     path: Path
     source: Path
     sha256: str
-    size: int
-    replaced: str = ""
 
     def __str__(self):
         library, files = self.library, self.library.meta["files"]
         units, n, wave = library.units, library.n_rows, library.wave
-        axes = {axis: library.values_of(axis) for axis in library.axes}
+        axes = library.levels
         number = f"{len(files):,} file{'s' if len(files) != 1 else ''}"
         rows = [("source", f"{self.source} ({number} read)")]
         kinds = ", ".join(f"{kind} ({units.get(kind) or 'no unit'})" for kind in library.spectra)
@@ -75,24 +74,10 @@ class Report:
         if len(files) <= 5:
             rows += [("sha256", f"{value}  {name}") for name, value in files.items()]
         rows += [("sha256", f"{self.sha256}  {self.path.name}")]
-        rows += [("written", f"{self.path} ({self.size / 1e6:.1f} MB)")]
+        rows += [("written", f"{self.path} ({self.path.stat().st_size / 1e6:.1f} MB)")]
         rows += [("record", f"{record_path(self.path)} (checksums of all files)")]
-        if self.replaced:
-            rows += [("replaces", self.replaced)]
-        width = max(shutil.get_terminal_size((100, 24)).columns, 60)
-        lines, column = [library.name], max(len(key) for key, _ in rows) + 5
-        for key, text in rows:
-            # checksums and paths stay whole, to be copied
-            fill = key in ("found", "spectra", *axes)
-            lines += textwrap.wrap(
-                text,
-                width=width if fill else 10**6,
-                initial_indent=f"    {key}".ljust(column),
-                subsequent_indent=" " * column,
-                break_long_words=False,
-                break_on_hyphens=False,
-            )
-        return "\n".join(lines)
+        column = max(len(key) for key, _ in rows) + 1
+        return "\n".join([library.name, *(f"    {key:{column}}{text}" for key, text in rows)])
 
 
 def _some(values):
@@ -139,22 +124,82 @@ def add_library(name, path, *, progress_bar=False):
     path = Path(path).expanduser()
     # some readers take a pattern of names
     if not path.exists() and not any(mark in path.name for mark in "*?["):
-        msg = f"no file or folder {path}"
-        raise DataError(msg)
+        raise data_error(path, "is no file or folder")
     target = data_folder() / record.file
     with _steps(name, show=progress_bar) as step:
         step("reading")
         library = _read(reader, name, path)
-        with installing(target) as (partial, entry):
+        with _installing(target) as (partial, entry):
             step("writing")
             write_library(library, partial)
             step("checking")
             # what was written is what counts
             library = verify_library(partial, name)
-            replaced = _present(target)
             entry |= _entry(library, path)
-    known = stored_record(target)
-    return Report(library, target, path, known["sha256"], known["size"], replaced)
+    return Report(library, target, path, stored_record(target)["sha256"])
+
+
+@contextlib.contextmanager
+def _locked(target):
+    """
+    Keep other processes from writing the same file; wait if one does.
+
+    What an interrupted process left half written is removed. The lock is advisory
+    (``flock``); where the system has none two processes that add the same resource at the
+    same moment may leave a record that does not fit the file, which `check_resources` reports.
+    """
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with open(target.with_name(f".{target.name}.lock"), "ab") as handle:
+        held = fcntl is not None
+        try:
+            if held:
+                fcntl.flock(handle, fcntl.LOCK_EX)
+        except OSError:
+            # some network file systems have no locks
+            held = False
+        if held:
+            # no other process writes: these are left over from ones that ended
+            for path in target.parent.glob(f"{PARTIAL}*-{target.name}*"):
+                path.unlink(missing_ok=True)
+        yield
+
+
+@contextlib.contextmanager
+def _installing(target):
+    """
+    Write a file of the data folder and a record beside it; other processes wait.
+
+    Other processes find the old file or the new one whole; if the process dies in between, a
+    file without record ("unchecked").
+
+    Parameters
+    ----------
+    target : `pathlib.Path`
+        Where it is to be found; its folder is made.
+
+    Yields
+    ------
+    partial : `pathlib.Path`
+        What to write.
+    record : dict
+        To be filled with plain values, kept as JSON in ``<file>.json``; checksum, size and time
+        of the file are added.
+    """
+    beside, record = record_path(target), {}
+    with _locked(target), contextlib.ExitStack() as last, replacing(target) as partial:
+        yield partial, record
+        # before anything of the old one goes
+        with open(partial, "rb+") as handle:
+            os.fsync(handle.fileno())
+        status = partial.stat()
+        known = {
+            "sha256": file_sha256(partial),
+            "size": status.st_size,
+            "mtime_ns": status.st_mtime_ns,
+        }
+        new = last.enter_context(replacing(beside))
+        new.write_text(json.dumps(known | record, indent=1) + "\n", encoding="utf-8")
+        beside.unlink(missing_ok=True)
 
 
 def _reader(name):
@@ -168,19 +213,13 @@ def _reader(name):
 def _read(reader, name, path):
     """Read the files; whatever is wrong with them is one sentence that names them."""
     try:
-        library = reader(path)
+        return reader(path)
     except DataError:
         raise
     except Exception as err:  # readers of different formats raise different exceptions
         reason = err.args[0] if isinstance(err, KeyError) and err.args else err
-        msg = f"{path} cannot be read as {name!r}: {reason or type(err).__name__}"
-        raise DataError(msg) from err
-    if not isinstance(library, LibraryTable) or library.name != name:
-        got = repr(getattr(library, "name", type(library).__name__))
-        raise argument_error("reader", f"one that gives the library {name!r}", got)
-    if not library.meta.get("files"):
-        raise argument_error("reader", "one that gives meta['files'], their checksums", "none")
-    return library
+        what = f"cannot be read as {name!r}: {reason or type(err).__name__}"
+        raise data_error(path, what) from err
 
 
 def _entry(library, source):
@@ -193,22 +232,7 @@ def _entry(library, source):
         "files": dict(library.meta["files"]),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "version": __version__,
-        "n_spectra": library.n_rows,
-        "axes": {axis: library.values_of(axis).tolist() for axis in library.axes},
-        "units": dict(library.units),
-        "summary": list(library.summary),
     }
-
-
-def _present(target):
-    """Date and checksum of the library that stands there, or an empty text."""
-    if not target.exists():
-        return ""
-    try:
-        old = stored_record(target) or {}
-    except DataError:
-        old = {}
-    return f"one of {old.get('date', 'unknown date')}, sha256 {old.get('sha256', 'unknown')}"
 
 
 @contextlib.contextmanager

@@ -5,12 +5,15 @@ import itertools
 import re
 from pathlib import Path
 
+import astropy.units as u
 import numpy as np
 
 from miricigale.refdata.libraries.members import is_archive, members
 from miricigale.refdata.libraries.table import LibraryTable
-from miricigale.utils.exceptions import DataError
-from miricigale.utils.files import open_fits
+from miricigale.utils.content import file_sha256
+from miricigale.utils.exceptions import data_error
+from miricigale.utils.files import read_table
+from miricigale.utils.units import to_array
 
 #: Values of the whole library: 19,200 spectra.
 SKIRTOR_AXES = {
@@ -37,14 +40,9 @@ _FLUX = _SUN * 3.839e26 / (4.0 * np.pi * (1e7 * 3.0856775814913673e16) ** 2)  # 
 
 # lightningpy's FITS file has one torus only
 _FITS_FIXED = {"p": 1.0, "q": 0.0, "opening_angle": 40.0, "radius_ratio": 20.0}
-_FITS_UNITS = {
-    "TAU": ("",),
-    "INCLINATION": ("deg",),
-    "WAVE_REST": ("um", "micron"),
-    "NU_REST": ("Hz",),
-}
 _FITS_LIGHT = ("TOTAL", "DISK_DIRECT", "DISK_SCATTERED", "DUST_TOTAL", "TRANSPARENT")
-_FITS_UNITS |= {f"LNU_{name}": ("Hz-1 solLum", "solLum Hz-1") for name in _FITS_LIGHT}
+_FITS_UNITS = {"TAU": u.one, "INCLINATION": u.deg, "WAVE_REST": u.um, "NU_REST": u.Hz}
+_FITS_UNITS |= {f"LNU_{name}": u.Lsun / u.Hz for name in _FITS_LIGHT}
 
 
 def read_skirtor(path):
@@ -73,9 +71,8 @@ def read_skirtor(path):
     """
     path = Path(path)
     if not path.exists():
-        msg = f"{path} does not exist; wanted {_WANTED}"
-        raise DataError(msg)
-    if path.is_file() and not is_archive(path) and not _NAME.fullmatch(path.name):
+        raise data_error(path, f"does not exist; wanted {_WANTED}")
+    if path.is_file() and not is_archive(path):
         wave, axes, spectra, files = _read_fits(path)
     else:
         wave, axes, spectra, files = _read_texts(path)
@@ -108,21 +105,17 @@ def _check_product(path, axes):
         strange = sorted(set(here.tolist()) - set(SKIRTOR_AXES[name]))
         if strange:
             known = " ".join(f"{v:g}" for v in SKIRTOR_AXES[name])
-            msg = f"{path}: {name} {strange[0]:g} is not of SKIRTOR 2016, which has {known}"
-            raise DataError(msg)
+            what = f"has {name} {strange[0]:g}, which is not of SKIRTOR 2016: it has {known}"
+            raise data_error(path, what)
     there = set(zip(*(column.tolist() for column in axes.values()), strict=True))
     wanted = int(np.prod([v.size for v in values.values()]))
     if len(there) < wanted:
         product = itertools.product(*(v.tolist() for v in values.values()))
         holes = itertools.islice((key for key in product if key not in there), 3)
-        msg = (
-            f"{path}: {len(there):,} spectra, but the values found make {wanted:,}; missing, "
-            f"among others: {', '.join(map(_file_name, holes))}"
-        )
-        raise DataError(msg)
+        what = f"has {len(there):,} spectra, but the values found make {wanted:,}; missing, among others:"
+        raise data_error(path, f"{what} {', '.join(map(_file_name, holes))}")
     if values["inclination"][0] != 0.0:
-        msg = f"{path}: no spectrum at inclination 0, which is the disk seen from above"
-        raise DataError(msg)
+        raise data_error(path, "has no spectrum at inclination 0: the disk seen from above")
 
 
 def _file_name(key):
@@ -132,9 +125,6 @@ def _file_name(key):
 
 def _texts(path):
     """Name, bytes and source of each spectrum below a folder, or in an archive or a folder of them."""
-    if _NAME.fullmatch(path.name):
-        yield path.name, path.read_bytes(), str(path)
-        return
     n = 0
     for place, data, source in members(path, _NAME.fullmatch):
         n += 1
@@ -153,8 +143,8 @@ def _read_texts(path):
         digest = hashlib.sha256(data).hexdigest()
         if key in known:
             if known[key][0] != digest:
-                msg = f"{source} and {known[key][1]} are the same model with different numbers"
-                raise DataError(msg)
+                what = f"and {known[key][1]} are the same model with different numbers"
+                raise data_error(source, what)
             continue
         known[key] = (digest, source)
         table = _parse(data, source)
@@ -162,57 +152,47 @@ def _read_texts(path):
             wave = table[0]
             _check_wave(wave, source)
         elif not np.allclose(table[0], wave, rtol=1e-4, atol=0.0):
-            msg = f"{source} has other wavelengths than the files before it"
-            raise DataError(msg)
+            raise data_error(source, "has other wavelengths than the files before it")
         seen = table[2] + table[3]
         _check_columns(wave, table[1:], seen, key[-1], _FLUX, source)
         keys.append(key)
         disk.append((seen / (wave * _FLUX)).astype(np.float32))
         dust.append((table[4] / (wave * _FLUX)).astype(np.float32))
-        files[_short(source, path)] = digest
+        files[source.removeprefix(f"{path}{'/' if path.is_dir() else ':'}")] = digest
     if not keys:
-        msg = f"{path} holds no spectrum; wanted {_WANTED}"
-        raise DataError(msg)
+        raise data_error(path, f"holds no spectrum; wanted {_WANTED}")
     axes = dict(zip(SKIRTOR_AXES, np.array(keys).T, strict=True))
     return wave, axes, {"disk": np.array(disk), "dust": np.array(dust)}, files
 
 
-def _short(source, path):
-    """Name of a source relative to the folder that was given."""
-    return source.removeprefix(f"{path}/") if path.is_dir() else source.removeprefix(f"{path}:")
-
-
 def _parse(data, source):
     """The seven columns of one file, shape (7, 132): wavelength in um, then lambda F_lambda."""
-    start = 0
-    while data[start : start + 1] == b"#":
-        start = data.find(b"\n", start) + 1
-        if start == 0:
-            start = len(data)
-    tokens = data[start:].split()
+    rows = [line for line in data.splitlines() if not line.startswith(b"#")]
+    tokens = b"\n".join(rows).split()
     if len(tokens) != _ROWS * _COLUMNS:
-        msg = (
-            f"{source}: wanted {_ROWS} rows of {_COLUMNS} numbers below '#' lines, got "
-            f"{len(tokens)} words: truncated, or not a spectrum of SKIRTOR"
+        what = (
+            f"must have {_ROWS} rows of {_COLUMNS} numbers below '#' lines, got {len(tokens)} words"
         )
-        raise DataError(msg)
+        raise data_error(source, f"{what}: truncated, or not a spectrum of SKIRTOR")
     try:
         table = np.array([float(x) for x in tokens]).reshape(_ROWS, _COLUMNS)
     except ValueError as err:
-        msg = f"{source}: not a number in a spectrum of SKIRTOR: {err}"
-        raise DataError(msg) from err
-    if not (np.isfinite(table).all() and table.min() >= 0.0):
-        msg = f"{source}: negative, infinite or missing numbers"
-        raise DataError(msg)
+        raise data_error(source, f"has text in a spectrum of SKIRTOR: {err}") from err
+    _check_numbers(table, source)
     return table.T
+
+
+def _check_numbers(table, source):
+    if not (np.isfinite(table).all() and table.min() >= 0.0):
+        raise data_error(source, "has negative, infinite or missing numbers")
 
 
 def _check_wave(wave, source):
     """SKIRTOR has 132 wavelengths from 0.001 to 1000 um."""
     ascending = np.all(np.diff(wave) > 0.0)
     if not (ascending and np.isclose(wave[0], 1e-3, 1e-3) and np.isclose(wave[-1], 1e3, 1e-3)):
-        msg = f"{source}: wanted wavelengths from 0.001 to 1000 um, got {wave[0]:g} to {wave[-1]:g}"
-        raise DataError(msg)
+        got = f"{wave[0]:g} to {wave[-1]:g}"
+        raise data_error(source, f"must have wavelengths from 0.001 to 1000 um, got {got}")
 
 
 def _check_columns(wave, table, seen, inclination, unit, source):
@@ -224,17 +204,15 @@ def _check_columns(wave, table, seen, inclination, unit, source):
     """
     total, dust, transparent = table[0], table[3], table[-1]
     if np.abs(total - seen - dust).max() > 1e-3 * total.max():
-        msg = f"{source}: direct + scattered + dust is not the total: columns in another order?"
-        raise DataError(msg)
+        what = "has a total that is not direct + scattered + dust: columns in another order?"
+        raise data_error(source, what)
     mu = np.cos(np.radians(inclination))
     power = np.trapezoid(transparent / wave, wave) / unit
     law = mu * (1.0 + 2.0 * mu) / 3.0 * 18.0 / 7.0
     if abs(power - law) > 0.02:
-        msg = (
-            f"{source}: the transparent disk has {power:.4g} of 1e11 Lsun at 10 Mpc, wanted "
-            f"{law:.4g} at inclination {inclination:g}: another unit than W/m2 (lambda F_lambda)?"
-        )
-        raise DataError(msg)
+        what = f"has a transparent disk of {power:.4g} of 1e11 Lsun at 10 Mpc, wanted {law:.4g} at"
+        what = f"{what} inclination {inclination:g}: another unit than W/m2 (lambda F_lambda)?"
+        raise data_error(source, what)
 
 
 # ------------------------------------------------------------------ lightningpy's file
@@ -242,38 +220,25 @@ def _check_columns(wave, table, seen, inclination, unit, source):
 
 def _read_fits(path):
     """Wavelengths, axes, spectra and checksum from the FITS grid of lightningpy."""
-    with open_fits(path, wanted=_WANTED) as hdus:
-        rows = hdus[1].data if len(hdus) > 1 else None
-        columns = {} if getattr(rows, "columns", None) is None else rows.columns
-        units = {c.name: (c.unit or "").strip() for c in columns}
-        lacking = [name for name in _FITS_UNITS if name not in units]
-        if lacking:
-            msg = f"{path} is not {_WANTED}: a first table without column {lacking[0]}"
-            raise DataError(msg)
-        for name, known in _FITS_UNITS.items():
-            if units[name] not in known:
-                msg = f"{path}: column {name} must be in {known[0]!r}, got {units[name]!r}"
-                raise DataError(msg)
-        try:
-            table = {name: np.array(rows[name], dtype=float) for name in _FITS_UNITS}
-        except (OSError, ValueError, TypeError) as err:
-            msg = f"{path} is truncated or damaged: {err}"
-            raise DataError(msg) from err
+    table = read_table(path, wanted=_WANTED, hdu=1)
+    lacking = [name for name in _FITS_UNITS if name not in table.colnames]
+    if lacking:
+        raise data_error(path, f"is not {_WANTED}: its table has no column {lacking[0]}")
+    try:
+        table = {name: to_array(table[name], unit, name) for name, unit in _FITS_UNITS.items()}
+    except u.UnitsError as err:
+        raise data_error(path, f"has another unit: {err}") from err
     order = np.argsort(table["WAVE_REST"][0])
     wave = table["WAVE_REST"][0][order]
     if wave.shape != (_ROWS,) or not np.all(table["WAVE_REST"] == table["WAVE_REST"][0]):
-        msg = f"{path}: wanted the same {_ROWS} wavelengths in all rows"
-        raise DataError(msg)
+        raise data_error(path, f"must have the same {_ROWS} wavelengths in all rows")
     _check_wave(wave, path)
     nu = table["NU_REST"][:, order]
     if not np.allclose(nu * wave, 2.99792458e14, rtol=1e-4):
-        msg = f"{path}: frequencies and wavelengths do not belong together"
-        raise DataError(msg)
+        raise data_error(path, "has frequencies and wavelengths that do not belong together")
     power = {name: table[f"LNU_{name}"][:, order] * nu for name in _FITS_LIGHT}
     for name, array in power.items():
-        if not (np.isfinite(array).all() and array.min() >= 0.0):
-            msg = f"{path}: negative, infinite or missing numbers in LNU_{name}"
-            raise DataError(msg)
+        _check_numbers(array, f"{path}, column LNU_{name},")
     seen = power["DISK_DIRECT"] + power["DISK_SCATTERED"]
     for k, angle in enumerate(table["INCLINATION"]):
         part = [power["TOTAL"][k], None, None, power["DUST_TOTAL"][k], power["TRANSPARENT"][k]]
@@ -281,13 +246,8 @@ def _read_fits(path):
     n = len(seen)
     axes = {"tau97": table["TAU"], "inclination": table["INCLINATION"]}
     axes |= {name: np.full(n, value) for name, value in _FITS_FIXED.items()}
-    if len(set(zip(axes["tau97"], axes["inclination"], strict=True))) < n:
-        msg = f"{path}: two rows of the same TAU and INCLINATION"
-        raise DataError(msg)
     spectra = {
         "disk": (seen / (wave * _SUN)).astype(np.float32),
         "dust": (power["DUST_TOTAL"] / (wave * _SUN)).astype(np.float32),
     }
-    with path.open("rb") as stream:
-        digest = hashlib.file_digest(stream, "sha256").hexdigest()
-    return wave, axes, spectra, {path.name: digest}
+    return wave, axes, spectra, {path.name: file_sha256(path)}

@@ -1,8 +1,6 @@
 """The one format in which libraries are kept: FITS, an image for each kind of spectrum."""
 
-import bisect
 import functools
-import json
 import threading
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,8 +9,8 @@ import astropy.units as u
 import numpy as np
 from astropy.table import Table
 
-from miricigale.utils.exceptions import DataError, argument_error
-from miricigale.utils.files import open_fits
+from miricigale.utils.exceptions import argument_error, data_error
+from miricigale.utils.files import cached_by_file, open_fits
 from miricigale.utils.store import open_parts, write_parts
 from miricigale.utils.units import WAVE, frozen_array, to_array
 
@@ -75,23 +73,19 @@ class LibraryTable:
             raise argument_error("wave", "two or more positive, ascending wavelengths", got)
         self._check_names()
         n = self.n_rows
-        for kind in ("axes", "values"):
+        shapes = {"axes": (n,), "values": (n,), "spectra": (n, wave.size)}
+        for kind, shape in shapes.items():
             for name, column in getattr(self, kind).items():
-                if hasattr(column, "unit"):
+                if kind != "spectra" and hasattr(column, "unit"):
                     raise argument_error(name, "plain numbers (units stand apart)", "a quantity")
+                if np.shape(column) != shape:
+                    raise argument_error(name, f"of shape {shape}", np.shape(column))
+                if kind == "axes" and not np.all(np.isfinite(column)):
+                    raise argument_error(name, "finite in every row", "NaN or infinity")
+        for kind in ("axes", "values"):
             columns = {k: frozen_array(v) for k, v in getattr(self, kind).items()}
             object.__setattr__(self, kind, columns)
-            for name, column in columns.items():
-                if column.shape != (n,):
-                    raise argument_error(name, f"of shape ({n},)", column.shape)
-        for name, column in self.spectra.items():
-            if np.shape(column) != (n, wave.size):
-                raise argument_error(name, f"of shape {(n, wave.size)}", np.shape(column))
-        for name, column in self.axes.items():
-            if not np.all(np.isfinite(column)):
-                raise argument_error(name, "finite in every row", "NaN or infinity")
-        summary = (self.summary,) if isinstance(self.summary, str) else tuple(self.summary)
-        object.__setattr__(self, "summary", summary)
+        object.__setattr__(self, "summary", tuple(self.summary))
         object.__setattr__(self, "_index", self._make_index())
 
     def _check_names(self):
@@ -105,38 +99,15 @@ class LibraryTable:
         for name in names:
             if not (name.isascii() and name.isidentifier()):
                 raise argument_error("axes", "named by plain identifiers", repr(name))
-        for name, unit in self.units.items():
-            if name not in (*names, "wave"):
-                known = f"of a column ({', '.join(names)})"
-                raise argument_error("units", known, repr(name))
-            try:
-                u.Unit(unit)
-            except (TypeError, ValueError):
-                raise argument_error("units", f"a unit for {name!r}", repr(unit)) from None
-        if u.Unit(self.units.get("wave", WAVE)) != WAVE:
-            raise argument_error("units", f"{WAVE} for 'wave'", repr(self.units["wave"]))
 
     @property
     def n_rows(self):
         """Number of spectra of each kind."""
         return len(next(iter(self.spectra.values())))
 
-    def values_of(self, axis):
-        """
-        Different values of an axis, ascending.
-
-        Raises
-        ------
-        KeyError
-            If there is no such axis.
-        """
-        if axis not in self.axes:
-            msg = f"library {self.name!r} has no axis {axis!r}; axes: {', '.join(self.axes)}"
-            raise KeyError(msg)
-        return self._levels[axis].copy()
-
     @functools.cached_property
-    def _levels(self):
+    def levels(self):
+        """Different values of each axis, ascending: dict of name to `~numpy.ndarray`."""
         levels = {}
         for name, column in self.axes.items():
             found = np.unique(column)
@@ -144,44 +115,31 @@ class LibraryTable:
             levels[name] = found[np.append(True, np.diff(found) > gap)]
         return levels
 
-    @functools.cached_property
-    def _ladders(self):
-        """Levels of each axis as floats, and how near to each a value must be."""
-        ladders = {}
-        for name, levels in self._levels.items():
-            # zero has no relative neighborhood: there the extent of the axis is the measure
-            near = _SAME * np.maximum(np.abs(levels), 1e-3 * (levels[-1] - levels[0]))
-            ladders[name] = (levels.tolist(), near.tolist())
-        return ladders
+    def _codes(self, axis, values):
+        """For each value the number of the level that is the same, or -1."""
+        levels = self.levels[axis]
+        nearest = np.searchsorted(0.5 * (levels[1:] + levels[:-1]), values)
+        # zero has no relative neighborhood: there the extent of the axis is the measure
+        near = _SAME * np.maximum(np.abs(levels), 1e-3 * np.ptp(levels))
+        return np.where(np.abs(values - levels[nearest]) <= near[nearest], nearest, -1)
 
-    def _code(self, axis, value):
-        """Number of the level that is the same as a value, or -1."""
-        levels, near = self._ladders[axis]
-        right = bisect.bisect_left(levels, value)
-        for k in (right, right - 1):
-            if 0 <= k < len(levels) and abs(value - levels[k]) <= near[k]:
-                return k
-        return -1
+    def _place(self, codes):
+        """Number of a combination of levels among all of them."""
+        return np.ravel_multi_index(codes, [levels.size for levels in self.levels.values()])
 
     def _make_index(self):
-        keys = np.empty((self.n_rows, len(self.axes)), dtype=np.int32)
-        for k, (name, column) in enumerate(self.axes.items()):
-            found, which = np.unique(column, return_inverse=True)
-            codes = np.array([self._code(name, value) for value in found.tolist()])
-            if np.any(codes < 0):
+        codes = {name: self._codes(name, column) for name, column in self.axes.items()}
+        for name, numbers in codes.items():
+            if np.any(numbers < 0):
                 wanted = f"of values that differ by more than {_SAME:g}, relatively"
                 raise argument_error(name, wanted, "values closer together")
-            keys[:, k] = codes[which]
-        # bytes, unlike thousands of tuples, set off no collection of garbage
-        text, size = keys.tobytes(), keys.itemsize * keys.shape[1]
-        index = {}
-        for i in range(self.n_rows):
-            row = text[i * size : (i + 1) * size]
-            if row in index:
-                where = ", ".join(f"{name} = {column[i]:g}" for name, column in self.axes.items())
-                got = f"{where} in rows {index[row]} and {i}"
-                raise argument_error("axes", "different in every row", got)
-            index[row] = i
+        places = self._place(tuple(codes.values()))
+        index = dict(zip(places.tolist(), range(self.n_rows), strict=True))
+        if len(index) < self.n_rows:
+            row = next(i for i, place in enumerate(places.tolist()) if index[place] != i)
+            where = ", ".join(f"{name} = {column[row]:g}" for name, column in self.axes.items())
+            got = f"{where} in rows {row} and {index[places[row]]}"
+            raise argument_error("axes", "different in every row", got)
         return index
 
     def missing(self, **values):
@@ -200,14 +158,14 @@ class LibraryTable:
         """
         return {
             name: tuple(levels.tolist())
-            for name, levels in self._levels.items()
-            if any(self._code(name, value) < 0 for value in np.atleast_1d(values.get(name, [])))
+            for name, levels in self.levels.items()
+            if np.any(self._codes(name, np.atleast_1d(values.get(name, []))) < 0)
         }
 
     @property
     def complete(self):
         """Whether every combination of the values of the axes has a row."""
-        return self.n_rows == np.prod([levels.size for levels in self._levels.values()])
+        return self.n_rows == np.prod([levels.size for levels in self.levels.values()])
 
     def row(self, **values):
         """
@@ -228,8 +186,8 @@ class LibraryTable:
         if missing:
             got = f"only {', '.join(values) or 'none'}"
             raise argument_error(", ".join(missing), f"given to find a row of {self.name!r}", got)
-        codes = [self._code(name, float(values[name])) for name in self.axes]
-        return self._index.get(np.array(codes, dtype=np.int32).tobytes())
+        codes = [int(self._codes(name, float(values[name]))) for name in self.axes]
+        return self._index.get(int(self._place(codes))) if min(codes) >= 0 else None
 
     def spectrum(self, kind, row):
         """
@@ -262,17 +220,7 @@ def write_library(library, path):
         The library.
     path : path-like
         The file; one that is there is replaced.
-
-    Raises
-    ------
-    ValueError
-        If ``meta`` does not consist of plain values.
     """
-    try:
-        # a path or a date would come back as text
-        meta = json.loads(json.dumps(library.meta, default=_plain))
-    except (TypeError, ValueError) as err:
-        raise argument_error("meta", "plain values (text, numbers, lists, dicts)", err) from None
     text = {name: list(getattr(library, name)) for name in ("axes", "values", "spectra", "summary")}
     text["units"] = {name: str(unit) for name, unit in library.units.items()}
     rows = Table(library.axes | library.values)
@@ -287,20 +235,12 @@ def write_library(library, path):
         arrays[_extension(name)] = array if unit is None else u.Quantity(array, unit, copy=False)
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    text |= {"name": library.name, "meta": meta}
+    text |= {"name": library.name, "meta": library.meta}
     write_parts(path, _LAYOUTS[0], text=text, arrays=arrays, tables={"ROWS": rows}, overwrite=True)
 
 
 def _extension(kind):
     return f"SPECTRA_{kind.upper()}"
-
-
-def _plain(value):
-    """Make plain values of numpy's for JSON."""
-    if isinstance(value, (np.generic, np.ndarray)):
-        return value.tolist()
-    msg = f"{type(value).__name__} {value!r}"
-    raise TypeError(msg)
 
 
 def _fits_unit(library, name):
@@ -333,32 +273,22 @@ def open_library(path, name):
     `~miricigale.utils.exceptions.DataError`
         If it is something else, another library or truncated.
     """
-    path = Path(path)
-    try:
-        status = path.stat()
-    except OSError as err:
-        reason = "no such file" if isinstance(err, FileNotFoundError) else err.strerror
-        msg = f"{path} cannot be read as the library {name!r}: {reason}"
-        raise DataError(msg) from err
     with _lock:
-        key = (status.st_ino, status.st_size, status.st_mtime_ns)
-        return _open(str(path.absolute()), key, name)
+        return _open(path, name)
 
 
 #: Threads that ask for the same library wait for one to open it.
 _lock = threading.Lock()
 
 
-@functools.lru_cache(maxsize=8)
-def _open(path, key, name):
-    del key
+@cached_by_file(maxsize=8)
+def _open(path, name):
     wanted = f"library {name!r} (made by 'miricigale data add')"
     # the mapping lives as long as the arrays that use it
     with open_parts(path, _LAYOUTS, wanted=wanted, memmap=True) as parts:
         text = parts.text
         if text["name"] != name:
-            msg = f"{path} holds {text['name']!r}, not {name!r}"
-            raise DataError(msg)
+            raise data_error(path, f"holds {text['name']!r}, not {name!r}")
         rows, kinds = parts.table("ROWS"), text["spectra"]
         places = map(_extension, kinds)
         if parts.layout == _LAYOUTS[1]:
@@ -391,16 +321,15 @@ def verify_library(path, name):
     `~miricigale.utils.exceptions.DataError`
         If it is not whole, or a checksum or a number is not as it should be.
     """
-    library = _open.__wrapped__(str(path), None, name)
+    library = _open.__wrapped__(path, name)
     with open_fits(path, wanted=f"the library {name!r}") as hdus:
         for number, hdu in enumerate(hdus):
             # 1 is success, 2 no checksum
             if (hdu.verify_datasum(), hdu.verify_checksum()) != (1, 1):
-                msg = f"{path} is damaged: wrong checksum in HDU {number} ({hdu.name})"
-                raise DataError(msg)
+                what = f"is damaged: wrong checksum in HDU {number} ({hdu.name})"
+                raise data_error(path, what)
     for kind, spectra in library.spectra.items():
         for first in range(0, library.n_rows, 1000):
             if not np.all(np.isfinite(spectra[first : first + 1000])):
-                msg = f"{path} has {kind!r} spectra with NaN or infinity"
-                raise DataError(msg)
+                raise data_error(path, f"has {kind!r} spectra with NaN or infinity")
     return library

@@ -20,7 +20,7 @@ _WAVE_THICK = 200.0  # um: optical depth of the emitting dust is one
 
 def polar_curve(wave, law):
     """
-    Extinction k = A / E(B-V) of polar dust.
+    Extinction k = A / E(B-V) of polar dust, by a law of `POLAR_LAWS`.
 
     ``smc``: 1.39 lambda^-1.2 (Prevot et al. 1984, as in Bongiorno et al. 2012), all wavelengths.
     ``calzetti``: Calzetti et al. 2000 from 0.15 um on, zero where it falls below zero (3.1 um);
@@ -38,13 +38,10 @@ def polar_curve(wave, law):
         short = wave < 0.15
         ultraviolet = 5.472 + 0.671 * x - 9.218e-3 * x**2 + 2.62e-3 * x**3
         return np.where(short, ultraviolet, leitherer_calzetti(np.where(short, 0.15, wave)))
-    if law == "gaskell":
-        y = np.minimum(x, 3.69)
-        cubic = -0.8175 + 1.5848 * y - 0.3774 * y**2 + 0.0296 * y**3
-        line = 1.3468 + 0.0087 * x
-        return np.maximum(np.where(x < 3.69, cubic, line), 0.0) / 0.182
-    msg = f"'law' must be one of {', '.join(POLAR_LAWS)}, got {law!r}"
-    raise ValueError(msg)
+    y = np.minimum(x, 3.69)
+    cubic = -0.8175 + 1.5848 * y - 0.3774 * y**2 + 0.0296 * y**3
+    line = 1.3468 + 0.0087 * x
+    return np.maximum(np.where(x < 3.69, cubic, line), 0.0) / 0.182
 
 
 def polar_grid(wave, curve):

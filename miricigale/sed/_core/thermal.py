@@ -11,9 +11,9 @@ def planck_lambda(wave, temperature):
     return wave**-5.0 / np.expm1(x)
 
 
-def modified_blackbody(wave, temperature, beta, wave_thick=200.0):
-    """(1 - exp(-(wave_thick / wave)^beta)) B_lambda(T), arbitrary units."""
-    return -np.expm1(-((wave_thick / wave) ** beta)) * planck_lambda(wave, temperature)
+def modified_blackbody(wave, temperature, beta):
+    """(1 - exp(-(200 um / wave)^beta)) B_lambda(T), arbitrary units."""
+    return -np.expm1(-((200.0 / wave) ** beta)) * planck_lambda(wave, temperature)
 
 
 def drude(wave, center, width):

@@ -8,5 +8,5 @@ from miricigale.sed.components.nebular import *  # noqa: F403
 from miricigale.sed.components.parametric_torus import *  # noqa: F403
 from miricigale.sed.components.sfh import *  # noqa: F403
 from miricigale.sed.components.stellar import *  # noqa: F403
-from miricigale.sed.foreground import Foreground, GalacticExtinction  # noqa: F401
+from miricigale.sed.foreground import GalacticExtinction  # noqa: F401
 from miricigale.sed.xray import XRay  # noqa: F401

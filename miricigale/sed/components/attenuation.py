@@ -126,10 +126,6 @@ class _Screen(Attenuation):
         young = _dimmed(wave, ebv, *law)
         return young, young if factor == 1.0 else _dimmed(wave, ebv * factor, *law)
 
-    def inert(self, values):
-        """Every other parameter, where there is no dust."""
-        return tuple(n for n in self.parameters if n != "ebv") if values["ebv"] == 0.0 else ()
-
 
 class _Starburst(Attenuation):
     """The starburst curve with a free slope and an ultraviolet bump."""
@@ -176,12 +172,6 @@ class CalzettiLeitherer(_Starburst, _Screen):
         "Calzetti et al. 2000, ApJ 533, 682; Leitherer et al. 2002, ApJS 140, 303; "
         "Noll et al. 2009, A&A 507, 1793"
     )
-
-    def inert(self, values):
-        """The bump's place and width where there is no bump; all but ``ebv`` without dust."""
-        if values["ebv"] > 0.0 and values["uv_bump"] == 0.0:
-            return ("uv_bump_wavelength", "uv_bump_width")
-        return super().inert(values)
 
 
 @register
@@ -235,17 +225,6 @@ class ModifiedStarburst(_Starburst):
         else:
             law = ("pei1992", self.gas_law.removesuffix("_pei1992"))
         return _dimmed(wave, values["ebv_lines"], *law)
-
-    def inert(self, values):
-        """R_V of a law that has its own, the curve of stars or a bump that is not there."""
-        if values["ebv_lines"] == 0.0:
-            return tuple(n for n in self.parameters if n != "ebv_lines")
-        out = () if self.gas_law == "mw" else ("r_v_gas",)
-        if values["ebv_factor_stars"] == 0.0:
-            return (*out, *_Starburst.declared())
-        if values["uv_bump"] == 0.0:
-            return (*out, "uv_bump_wavelength", "uv_bump_width")
-        return out
 
 
 @register
@@ -302,9 +281,3 @@ class CharlotFall(Attenuation):
         young = old * _dimmed(wave, av * (1.0 - mu) / mu, "power_law", values["slope_bc"])
         young.flags.writeable = False
         return young, old
-
-    def inert(self, values):
-        """All but ``av_ism`` without dust; the slope of clouds that are not there."""
-        if values["av_ism"] == 0.0:
-            return ("mu", "slope_ism", "slope_bc")
-        return ("slope_bc",) if values["mu"] == 1.0 else ()

@@ -91,7 +91,6 @@ class Dale2014(DustEmission):
         return (1.0 - part) * spectra[low] + part * spectra[low + 1]
 
 
-WAVE_THICK = 200.0  # um, where the optical depth is 1
 #: Constants of L(alpha, T) in um^1/2, um^1/2, 1 / (um K), 1 / (um K), of Casey 2012.
 B = (26.68, 6.246, 1.905e-4, 7.243e-5)
 
@@ -133,9 +132,9 @@ class Casey2012(DustEmission):
         alpha = values["alpha_mir"]
         turn = self.turnover(alpha, temperature)
         # L_lambda goes as S_nu / lambda^2
-        at_turn = _core.modified_blackbody(turn, temperature, beta, WAVE_THICK) * turn**2
+        at_turn = _core.modified_blackbody(turn, temperature, beta) * turn**2
         power_law = at_turn * (NODES / turn) ** alpha * np.exp(-((NODES / turn) ** 2)) / NODES**2
-        return _core.modified_blackbody(NODES, temperature, beta, WAVE_THICK), power_law
+        return _core.modified_blackbody(NODES, temperature, beta), power_law
 
     def spectrum(self, values):
         blackbody, power_law = self.parts(values)
@@ -162,11 +161,8 @@ class _DraineLi(DustEmission):
     reference = "Draine & Li 2007, ApJ 657, 810"
     resource = "dust.dl07"
 
-    def _table(self):
-        return load_dl07(self.path)
-
     def nodes(self):
-        return self._table()["wave"]
+        return load_dl07(self.path)["wave"]
 
 
 @register
@@ -197,7 +193,7 @@ class DraineLi2007(_DraineLi):
         return float((1.0 - gamma) * least + gamma * lump)
 
     def spectrum(self, values):
-        table = self._table()
+        table = load_dl07(self.path)
         q_low, q_part = _cell(table["qpah"], values["q_pah"])
         u_low, u_part = _cell(np.log(table["umin"]), np.log(values["u_min"]))
         out = 0.0

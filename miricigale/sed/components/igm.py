@@ -7,7 +7,7 @@ import numpy as np
 
 from miricigale.sed import _core
 from miricigale.sed.component import Component, register
-from miricigale.utils.exceptions import DataError
+from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import cached_by_file
 
 __all__ = ["IGM", "Inoue2014", "Madau1995", "Meiksin2006"]
@@ -119,14 +119,11 @@ def load_lines(path):
         columns = tomllib.loads(Path(path).read_text())
         table = np.array([columns[name] for name in _COLUMNS], dtype=float).T
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, KeyError, TypeError, ValueError) as err:
-        msg = f"{path} is not table 2 of Inoue et al. 2014: {err}"
-        raise DataError(msg) from err
-    if table.ndim != 2 or len(table) != 39 or not np.all(np.isfinite(table) & (table > 0)):
-        msg = f"{path} must hold six columns of 39 positive numbers, got shape {table.shape}"
-        raise DataError(msg)
-    if np.any(np.diff(table[:, 0]) >= 0):
-        msg = f"{path} must hold 'wavelength' from the longest to the shortest"
-        raise DataError(msg)
+        raise data_error(path, f"is not table 2 of Inoue et al. 2014: {err}") from err
+    positive = table.shape == (39, len(_COLUMNS)) and np.all(np.isfinite(table) & (table > 0))
+    if not positive or np.any(np.diff(table[:, 0]) >= 0):
+        what = "must hold six columns of 39 positive numbers, from the longest wavelength on"
+        raise data_error(path, what)
     lines = _core.inoue_lines(table)
     for array in lines:
         array.flags.writeable = False

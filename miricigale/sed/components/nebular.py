@@ -9,7 +9,7 @@ from miricigale.refdata.tables import read_images
 from miricigale.sed import _core
 from miricigale.sed.component import Component, register
 from miricigale.sed.parameter import Parameter
-from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import cached_by_file, open_fits
 from miricigale.utils.units import frozen_array
 
@@ -52,11 +52,6 @@ class NebularTable:
     line_wave: np.ndarray
     lines: np.ndarray
 
-    @functools.cached_property
-    def metallicities(self):
-        """Different metallicities, ascending."""
-        return np.unique(self.metallicity)
-
     def models(self, metallicity):
         """Numbers of the models of a metallicity, ascending in log U; empty if it is not there."""
         return np.flatnonzero(np.abs(self.metallicity / metallicity - 1.0) <= 1e-3)
@@ -65,16 +60,10 @@ class NebularTable:
     def emission(self, metallicity, log_u):
         """
         Continuum and lines one after the other, shape (n_age, n_wave + n_line), linear in log U
-        between logarithms; a ValueError if the table has no such metallicity, or not this log U for it.
+        between logarithms, of values that `Nebular.invalid` accepts.
         """
         models = self.models(metallicity)
-        if not models.size:
-            known = ", ".join(f"{z:g}" for z in self.metallicities)
-            raise argument_error("metallicity", f"one of {known}", f"{metallicity:g}")
-        nodes = self.log_u[models]
-        if not nodes[0] <= log_u <= nodes[-1]:
-            raise argument_error("log_u", f"from {nodes[0]:g} to {nodes[-1]:g}", f"{log_u:g}")
-        cell, t = _core.cells(nodes, log_u)
+        cell, t = _core.cells(self.log_u[models], log_u)
         low, high = (
             np.concatenate([self.continuum[m], self.lines[m]], axis=1)
             for m in models[cell : cell + 2]
@@ -98,18 +87,7 @@ def load_nebular(path):
             names = tuple(str(name).strip() for name in rows["NAME"])
             arrays["line_wave"] = frozen_array(rows["WAVE"])
     except KeyError as err:
-        msg = f"{path} is not {wanted}: {err.args[0]}"
-        raise DataError(msg) from err
-    shape = (arrays["metallicity"].size, arrays["age"].size)
-    wanted = {
-        "continuum": (*shape, arrays["wave"].size),
-        "lines": (*shape, len(names)),
-        "log_u": shape[:1],
-    }
-    for name, size in wanted.items():
-        if arrays[name].shape != size:
-            msg = f"{path}: '{name}' must have shape {size}, got {arrays[name].shape}"
-            raise DataError(msg)
+        raise data_error(path, f"is not {wanted}: {err.args[0]}") from err
     return NebularTable(names=names, **arrays)
 
 
@@ -172,16 +150,6 @@ class Nebular(Component):
         """The `NebularTable`."""
         return load_nebular(self.path)
 
-    @property
-    def line_names(self):
-        """Names of the lines, as `lines` has them: angstrom in air, um in vacuum."""
-        return self.table.names
-
-    @property
-    def line_wave(self):
-        """Vacuum wavelengths of the lines in um: `~numpy.ndarray`, shape (n_line,)."""
-        return self.table.line_wave
-
     @functools.cached_property
     def _drawn(self):
         table = self.table
@@ -191,11 +159,6 @@ class Nebular(Component):
 
     def nodes(self):
         return self._drawn[0]
-
-    def inert(self, values):
-        if _core.absorbed_share(values["f_esc"], values["f_dust"]) == 0.0:
-            return ("log_u", "metallicity_gas")
-        return () if self.gas == "free" else ("metallicity_gas",)
 
     def _metallicity(self, values):
         return values["metallicity" if self.gas == "stellar" else "metallicity_gas"]
@@ -207,7 +170,7 @@ class Nebular(Component):
         table, wanted = self.table, self._metallicity(values)
         models = table.models(wanted)
         if not models.size:
-            known = ", ".join(f"{z:g}" for z in table.metallicities)
+            known = ", ".join(f"{z:g}" for z in np.unique(table.metallicity))
             if self.gas == "free":
                 return f"'metallicity_gas' must be one of {known}, got {wanted:g}"
             return (
@@ -264,9 +227,9 @@ class Nebular(Component):
 
     def lines(self, age, weights, ionizing, values):
         """
-        Luminosities of the lines before any dust: dict of W by `line_names`.
+        Luminosities of the lines before any dust: dict of W by name.
 
         Parameters are those of `spectra`.
         """
         emission = self._emission(age, weights, ionizing, values)[self.table.wave.size :]
-        return dict(zip(self.line_names, emission.tolist(), strict=True))
+        return dict(zip(self.table.names, emission.tolist(), strict=True))

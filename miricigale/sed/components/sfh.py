@@ -61,9 +61,6 @@ class BurstHistory(StarFormationHistory):
             values["tau_burst"] * 1e3,
         )
 
-    def inert(self, values):
-        return ("age_burst", "tau_burst") if values["f_burst"] == 0.0 else ()
-
     def invalid(self, values):
         if values["f_burst"] > 0.0 and values["age_burst"] > values["age"]:
             return f"'age_burst' must not exceed 'age', got {values['age_burst']:g} Gyr"
@@ -176,11 +173,6 @@ class TableSFH(StarFormationHistory):
         self._rates = np.array([_core.table_history(edges, rate) for rate in rates])
         self._rates.flags.writeable = False
         length = self._rates.shape[1] / 1e3
-        if "age" not in defaults and length > type(self).age.bounds[1]:
-            limit = type(self).age.bounds[1]
-            raise argument_error(
-                "table", f"{limit} Gyr long at most where 'age' is not given", f"{length:g} Gyr"
-            )
         super().__init__(**{"age": length} | defaults)
         why = self.invalid({name: par.default for name, par in self.parameters.items()})
         if why:
@@ -239,7 +231,4 @@ def _column(table, name, unit):
     column = table[name]
     if np.any(getattr(column, "mask", False)):
         raise argument_error(name, "without masked values", f"{np.sum(column.mask)} masked")
-    if getattr(column, "unit", None) is None:
-        msg = f"'{name}' must have a unit convertible to {unit}, got none"
-        raise u.UnitsError(msg)
     return to_array(column, unit, name, ndim=1, finite=True)

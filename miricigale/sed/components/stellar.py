@@ -196,7 +196,7 @@ class BC03Library(StellarPopulations):
         return self._library().wave
 
     def metallicities(self):
-        return _metallicities(self._library())
+        return tuple(self._library().levels["metallicity"].tolist())
 
     def table(self, metallicity):
         return _library_table(self._library(), self.nearest(metallicity))
@@ -205,11 +205,6 @@ class BC03Library(StellarPopulations):
         # the files need not be there
         values = [f"{n}={p.default:g}" for n, p in self.parameters.items()]
         return f"{type(self).__name__}({', '.join(values)})"
-
-
-@functools.lru_cache(maxsize=16)
-def _metallicities(library):
-    return tuple(library.values_of("metallicity").tolist())
 
 
 @functools.lru_cache(maxsize=8)
