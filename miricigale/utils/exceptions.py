@@ -18,6 +18,7 @@ __all__ = [
     "ReductionWarning",
     "ReferenceWarning",
     "argument_error",
+    "file_error",
     "unknown_name",
 ]
 
@@ -86,6 +87,11 @@ class FitWarning(MiricigaleWarning):
 def argument_error(name, wanted, got):
     """Make the `ValueError` that names an argument, what was wanted and what came."""
     return ValueError(f"'{name}' must be {wanted}, got {got}")
+
+
+def file_error(path, what):
+    """Make the `DataError` that names a file, and what is wrong with it or wanted of it."""
+    return DataError(f"{path} {what}")
 
 
 #: Of more names than this an error lists the nearest ones only.
