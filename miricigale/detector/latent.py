@@ -59,20 +59,19 @@ class Latent(Frozen):
         object.__setattr__(self, "gap", gap * TIME)
 
     @classmethod
-    def from_ramp(cls, ramp, gap, *, threshold=0.1, properties=None):
+    def from_ramp(cls, ramp, gap, *, threshold=0.1):
         """
         What a ramp leaves behind.
 
         Parameters
         ----------
         ramp : `~miricigale.detector.Ramp`
-            The exposure before, simulated or read.
+            The exposure before, simulated or read; of a ramp without ``properties`` those of
+            `~miricigale.instrument.miri_detector` are taken.
         gap : `~astropy.units.Quantity`
             Time from its end to the start of the next one.
         threshold : float, optional
             Pixels filled to less than this fraction of the full well leave nothing.
-        properties : `~miricigale.instrument.DetectorProperties`, optional
-            `~miricigale.instrument.miri_detector` if not given.
 
         Returns
         -------
@@ -83,7 +82,7 @@ class Latent(Frozen):
             raise argument_error("ramp", "a Ramp", type(ramp).__name__)
         if not 0 <= threshold <= 1:
             raise argument_error("threshold", "a fraction of the full well", threshold)
-        properties = miri_detector() if properties is None else properties
+        properties = ramp.properties or miri_detector()
         level = properties.linearize(np.asarray(ramp.data[-1, -1], float) - properties.bias)
         charge = np.clip(properties.gain * level, 0, properties.full_well)
         dark = (ramp.pixel_dq & np.uint32(_NO_LIGHT)) != 0

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
+from astropy.table import Table
 from astropy.time import Time, TimeDelta
 
 from miricigale.utils.exceptions import argument_error
@@ -157,8 +158,7 @@ def write(path, ramp, *, start=None, filename=None, overwrite=False):
         options["observation"] = ramp.header
     with row_writer(path, ramp.exposure, **options) as (write_rows, finish):
         write_rows(slice(0, ramp.shape[2]), ramp.data)
-        extra = {"reference_output": ramp.reference_output}
-        finish(ramp.pixel_dq, ramp.effects, ramp.meta, ramp.properties, **extra)
+        finish(ramp.pixel_dq, ramp.effects, ramp.meta, ramp.properties)
     return Path(path)
 
 
@@ -168,14 +168,11 @@ def _int_times(exposure, start):
     length = exposure.integration_time.to_value("day")
     step = length + exposure.frame_time.to_value("day")
     begin = start + step * np.arange(n_int)
-    fields = [fits.Column(name="integration_number", format="J", array=np.arange(1, n_int + 1))]
-    for name, shift in (("start", 0.0), ("mid", length / 2), ("end", length)):
-        column = f"int_{name}_MJD_UTC"
-        fields.append(fits.Column(name=column, format="D", array=begin + shift))
-    for name in ("start", "mid", "end"):
-        column = f"int_{name}_BJD_TDB"
-        fields.append(fits.Column(name=column, format="D", array=np.full(n_int, np.nan)))
-    return fits.BinTableHDU.from_columns(fields, name="INT_TIMES")
+    shifts = {"start": 0.0, "mid": length / 2, "end": length}
+    columns = {"integration_number": np.arange(1, n_int + 1, dtype=np.int32)}
+    columns |= {f"int_{name}_MJD_UTC": begin + shift for name, shift in shifts.items()}
+    columns |= {f"int_{name}_BJD_TDB": np.full(n_int, np.nan) for name in shifts}
+    return fits.BinTableHDU(Table(columns), name="INT_TIMES")
 
 
 @contextlib.contextmanager
@@ -200,8 +197,8 @@ def row_writer(path, exposure, *, start=None, filename=None, overwrite=False, ob
         Takes a slice of detector rows and their counts (uint16, shape (n_int, n_group, n_row,
         nx)), in any order and from any thread.
     finish : callable
-        To be called last, with the pixel_dq, effects, meta, properties and (by keyword)
-        reference_output of a `~miricigale.detector.Ramp`.
+        To be called last, with the pixel_dq, effects, meta and properties of a
+        `~miricigale.detector.Ramp`.
 
     Raises
     ------
@@ -246,7 +243,7 @@ def row_writer(path, exposure, *, start=None, filename=None, overwrite=False, ob
             yield write_rows, functools.partial(_append, partial, times)
 
 
-def _append(partial, times, pixel_dq, effects, meta, properties=None, *, reference_output=None):
+def _append(partial, times, pixel_dq, effects, meta, properties):
     """Add what level 1b does not know: flags, effects and provenance."""
     meta = dict(meta)
     if effects is not None:
@@ -255,8 +252,6 @@ def _append(partial, times, pixel_dq, effects, meta, properties=None, *, referen
         meta["properties"] = dataclasses.asdict(properties)
     text = json.dumps(meta, default=plain_value).encode()
     with fits.open(partial, mode="append") as hdus:
-        if reference_output is not None:
-            hdus.append(fits.ImageHDU(np.asarray(reference_output), name="REFOUT"))
         if times is not None:
             hdus.append(times)
         hdus.append(fits.ImageHDU(np.asarray(pixel_dq), name="SIM_PIXELDQ"))

@@ -65,8 +65,6 @@ class Ramp(Interactive, NDData):
     header : `~astropy.io.fits.Header`, optional
         Keywords of the observation, by which reference files are chosen; those that `write`
         would write if not given.
-    reference_output : `~numpy.ndarray` of uint16 or float32, optional
-        Counts of the fifth output, (n_int, n_group, ny, nx / 4).
     meta : dict, optional
         Where it came from.
 
@@ -96,7 +94,6 @@ class Ramp(Interactive, NDData):
         properties=None,
         steps=(),
         header=None,
-        reference_output=None,
         meta=None,
     ):
         data = np.asarray(data)
@@ -116,16 +113,10 @@ class Ramp(Interactive, NDData):
         steps = frozenset(steps)
         if unknown := steps - set(STEPS.values()):
             raise argument_error("steps", f"of {sorted(STEPS.values())}", sorted(unknown))
-        if reference_output is not None:
-            reference_output = np.asarray(reference_output)
-            if reference_output.shape[:2] != shape[:2] or reference_output.ndim != 4:
-                wanted = f"of four axes, the first {shape[:2]}"
-                raise argument_error("reference_output", wanted, reference_output.shape)
-            reference_output = _read_only(reference_output)
-        super().__init__(_read_only(data), unit=DN, meta=dict(meta or {}))
+        # the WCS is that of the two pixel axes
+        super().__init__(_read_only(data), unit=DN, wcs=exposure.wcs, meta=dict(meta or {}))
         self.exposure, self.pixel_dq, self.group_dq = exposure, pixel_dq, group_dq
         self.effects, self.properties, self.steps = effects, properties, steps
-        self.reference_output = reference_output
         self._header = None if header is None else header.copy()
         self._frozen = True
 
@@ -137,9 +128,7 @@ class Ramp(Interactive, NDData):
 
     def _values(self):
         """Arguments by which the ramp can be made again, but for data and exposure."""
-        names = (
-            "pixel_dq", "group_dq", "effects", "properties", "steps", "reference_output"
-        )  # fmt: skip
+        names = ("pixel_dq", "group_dq", "effects", "properties", "steps")
         values = {name: getattr(self, name) for name in names}
         return values | {"header": self._header, "meta": dict(self.meta)}
 
@@ -194,8 +183,8 @@ class Ramp(Interactive, NDData):
             raise argument_error("number", f"from 0 to {self.shape[0] - 1}", number)
         part = slice(number, number + 1)
         values = self._values()
-        for name in ("group_dq", "reference_output"):
-            values[name] = None if values[name] is None else values[name][part]
+        if self.group_dq is not None:
+            values["group_dq"] = self.group_dq[part]
         return Ramp(self.data[part], self.exposure.replace(n_integrations=1), **values)
 
     def __getitem__(self, number):
@@ -268,17 +257,6 @@ class Ramp(Interactive, NDData):
         return any(isinstance(effect, kind) for effect in self.effects)
 
     @property
-    def wcs(self):
-        """The exposure's `~astropy.wcs.WCS` (of the two pixel axes)."""
-        return self.exposure.wcs
-
-    @wcs.setter
-    def wcs(self, value):
-        if value is not None:
-            msg = "a ramp's WCS is that of its exposure"
-            raise AttributeError(msg)
-
-    @property
     def shape(self):
         """(n_int, n_group, ny, nx)."""
         return self.data.shape
@@ -320,9 +298,8 @@ class Ramp(Interactive, NDData):
 
         Notes
         -----
-        A ramp that was read and not simulated keeps the keywords of its file, and its fifth output
-        (``REFOUT``). ``INT_TIMES`` has the times of the integrations (UTC; barycentric ones are
-        not known).
+        A ramp that was read and not simulated keeps the keywords of its file. ``INT_TIMES`` has
+        the times of the integrations (UTC; barycentric ones are not known).
 
         Level 1b holds no flags. Those of pixels, and the effects with the meta dictionary, stand
         in two extensions of our own (``SIM_PIXELDQ``, ``SIM_META``) that the official pipeline

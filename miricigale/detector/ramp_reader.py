@@ -18,14 +18,11 @@ from miricigale.instrument import (
     reference_pixel_mask,
     steps_done,
 )
-from miricigale.utils.exceptions import DataError
+from miricigale.utils.exceptions import DataError, data_error
 from miricigale.utils.files import open_fits
 from miricigale.utils.parallel import check_memory
 
 _WANTED = "a ramp of the MIRI imager"
-
-# bytes converted at a time
-_CHUNK = 2**26
 
 _REFERENCE = np.uint32(DQ.REFERENCE_PIXEL | DQ.NON_SCIENCE)
 
@@ -63,35 +60,29 @@ def read(path):
     except (AttributeError, KeyError, SyntaxError, TypeError, ValueError, OSError) as err:
         if isinstance(err, DataError):
             raise
-        msg = f"{path} cannot be read as {_WANTED}: {err}"
-        raise DataError(msg) from err
+        raise data_error(path, f"cannot be read as {_WANTED}: {err}") from err
 
 
 def _read(path, hdus):
     if "SCI" not in hdus:
-        msg = f"{path} is no ramp: it has no SCI extension"
-        raise DataError(msg)
+        raise data_error(path, "is no ramp: it has no SCI extension")
     header = joined_header(hdus)
     _check_kind(path, header)
     shape = _ramp_shape(path, hdus["SCI"].header)
     exposure = _exposure(path, header, shape)
     _check_header(path, header, exposure)
-    # counts, flags of groups and the fifth output
-    n_bytes = math.prod(shape) * (abs(hdus["SCI"].header["BITPIX"]) // 8)
     check_memory(
-        n_bytes + sum(_size(hdus[name]) for name in ("GROUPDQ", "REFOUT") if name in hdus),
+        sum(_size(hdus[name]) for name in ("SCI", "GROUPDQ") if name in hdus),
         f"the ramp of {path}, shape {shape},",
         advice="split the file by integrations",
     )
     values = {
-        "data": _counts(path, hdus["SCI"]),
+        "data": _counts(hdus["SCI"]),
         "exposure": exposure,
         "steps": steps_done(header),
         "header": header,
         "meta": {"origin": header.get("ORIGIN", "unknown"), "filename": path.name},
     }
-    if "REFOUT" in hdus and hdus["REFOUT"].header.get("NAXIS") == 4:
-        values["reference_output"] = _counts(path, hdus["REFOUT"])
     if "SIM_META" in hdus:
         values["meta"] = json.loads(hdus["SIM_META"].data["JSON"][0].tobytes())
         if (records := values["meta"].pop("effects", None)) is not None:
@@ -107,22 +98,21 @@ def _check_kind(path, header):
     kind = str(header.get("EXP_TYPE", "")).strip()
     detector = header.get("DETECTOR", "MIRIMAGE")
     if instrument != "MIRI" or detector != "MIRIMAGE" or kind not in _KINDS:
-        msg = (
-            f"{path} must be an exposure of the MIRI imager (INSTRUME MIRI, DETECTOR MIRIMAGE, "
-            f"EXP_TYPE {' or '.join(_KINDS[:3])}), got {instrument} {detector} {kind}"
+        wanted = (
+            "must be an exposure of the MIRI imager (INSTRUME MIRI, DETECTOR MIRIMAGE, "
+            f"EXP_TYPE {' or '.join(_KINDS[:3])})"
         )
-        raise DataError(msg)
+        raise data_error(path, f"{wanted}, got {instrument} {detector} {kind}")
 
 
 def _ramp_shape(path, head):
     scaling = (head.get("BITPIX"), head.get("BZERO", 0), head.get("BSCALE", 1))
     if head["NAXIS"] != 4 or scaling not in ((16, 32768, 1), (-32, 0, 1), (-64, 0, 1)):
-        msg = (
-            f"{path} must hold a ramp in SCI: four axes (integration, group, y, x) of unsigned "
-            f"16-bit counts or of floats, got {head['NAXIS']} axes of BITPIX {scaling[0]} with "
-            f"BZERO {scaling[1]}"
+        wanted = (
+            "must hold a ramp in SCI: four axes (integration, group, y, x) of unsigned 16-bit "
+            f"counts or of floats, got {head['NAXIS']} axes of BITPIX {scaling[0]} with BZERO {scaling[1]}"
         )
-        raise DataError(msg)
+        raise data_error(path, wanted)
     return tuple(int(head[f"NAXIS{axis}"]) for axis in (4, 3, 2, 1))
 
 
@@ -132,13 +122,11 @@ def _exposure(path, header, shape):
     name, readout, part, dither = exposure_keywords(header)
     for key, value in (("READPATT", readout), ("SUBARRAY", part)):
         if value is None:
-            msg = f"{path} has no keyword {key}"
-            raise DataError(msg)
+            raise data_error(path, f"has no keyword {key}")
     pointed = [header.get(key) for key in ("RA_REF", "DEC_REF", "ROLL_REF")]
     stated = [value is not None for value in pointed]
     if any(stated) and not all(stated):
-        msg = f"{path} must have all of RA_REF, DEC_REF, ROLL_REF or none, got {pointed}"
-        raise DataError(msg)
+        raise data_error(path, f"must have all of RA_REF, DEC_REF, ROLL_REF or none, got {pointed}")
     pointing, roll = None, None
     if all(stated):
         pointing, roll = SkyCoord(*pointed[:2], unit="deg"), pointed[2] * u.deg
@@ -153,9 +141,8 @@ def _exposure(path, header, shape):
         dither=dither,
     )
     if tuple(size) != exposure.shape:
-        wanted = f"{exposure.shape} pixels for {exposure.subarray}"
-        msg = f"{path} must have {wanted}, got {tuple(size)}"
-        raise DataError(msg)
+        wanted = f"must have {exposure.shape} pixels for {exposure.subarray}"
+        raise data_error(path, f"{wanted}, got {tuple(size)}")
     return exposure
 
 
@@ -181,17 +168,15 @@ def _check_header(path, header, exposure):
     }
     for name, (stated, true, where) in wanted.items():
         if stated is not None and stated != true:
-            msg = f"{path} contradicts itself: {name} is {stated} in the header and {true} {where}"
-            raise DataError(msg)
+            what = f"{name} is {stated} in the header and {true} {where}"
+            raise data_error(path, f"contradicts itself: {what}")
     for name in ("TGROUP", "TFRAME"):
         stated = header.get(name)
         # the table of the read-out patterns is rounded to a millisecond or three digits
         if stated is not None and not abs(stated - frame) < 5e-3 * frame:
-            msg = (
-                f"{path} contradicts itself: {name} = {stated} s, but the frame of "
-                f"{exposure.readout} {exposure.subarray} takes {frame} s, and is one group"
-            )
-            raise DataError(msg)
+            truth = f"the frame of {exposure.readout} {exposure.subarray} takes {frame} s"
+            what = f"{name} = {stated} s, but {truth}, and is one group"
+            raise data_error(path, f"contradicts itself: {what}")
 
 
 def _size(hdu):
@@ -199,22 +184,13 @@ def _size(hdu):
     return math.prod(head[f"NAXIS{i + 1}"] for i in range(head["NAXIS"])) * abs(head["BITPIX"]) // 8
 
 
-def _chunks(flat):
-    step = _CHUNK // flat.itemsize
-    for start in range(0, flat.size, step):
-        yield flat[start : start + step]
-
-
-def _counts(path, hdu):
+def _counts(hdu):
     """Counts as they are kept, in the byte order of the machine."""
-    _ramp_shape(path, hdu.header)
-    raw = hdu.data
-    if raw.dtype.kind == "f":
-        return np.asarray(raw, np.float32)
-    data = np.empty(raw.shape, np.uint16)
-    for into, part in zip(_chunks(data.reshape(-1)), _chunks(raw.reshape(-1)), strict=True):
-        # BZERO 32768: the top bit is turned
-        np.bitwise_xor(part.astype(np.int16).view(np.uint16), np.uint16(0x8000), out=into)
+    if hdu.data.dtype.kind == "f":
+        return np.asarray(hdu.data, np.float32)
+    data = hdu.data.astype(np.uint16)
+    # BZERO 32768: the top bit is turned
+    data ^= np.uint16(0x8000)
     return data
 
 
@@ -228,8 +204,8 @@ def _flags(path, hdus, exposure, shape):
         stored = np.asarray(hdus[name].data).astype(np.int32).view(np.uint32)
         pixel_dq = stored ^ np.uint32(2**31)
     if pixel_dq.shape != shape[2:]:
-        msg = f"{path} must have flags of {shape[2:]} pixels in {name}, got {pixel_dq.shape}"
-        raise DataError(msg)
+        wanted = f"must have flags of {shape[2:]} pixels in {name}"
+        raise data_error(path, f"{wanted}, got {pixel_dq.shape}")
     if name != "SIM_PIXELDQ":
         mask = reference_pixel_mask(subarray=exposure.subarray)
         pixel_dq = np.where(mask, pixel_dq | _REFERENCE, pixel_dq)
@@ -237,7 +213,7 @@ def _flags(path, hdus, exposure, shape):
     if "GROUPDQ" in hdus:
         group_dq = np.asarray(hdus["GROUPDQ"].data).astype(np.uint8)
         if group_dq.shape != shape:
-            msg = f"{path} must have flags of shape {shape} in GROUPDQ, got {group_dq.shape}"
-            raise DataError(msg)
+            wanted = f"must have flags of shape {shape} in GROUPDQ"
+            raise data_error(path, f"{wanted}, got {group_dq.shape}")
         values["group_dq"] = group_dq
     return values

@@ -5,7 +5,6 @@ from .background import Background as Background
 from .background import BackgroundFlags as BackgroundFlags
 from .background import estimate_background as estimate_background
 from .background import remove_background as remove_background
-from .background import subtract_background as subtract_background
 from .calibration import calibrate as calibrate
 from .calibration import find_cosmic_rays as find_cosmic_rays
 from .dither_background import dither_backgrounds as dither_backgrounds

@@ -14,11 +14,12 @@ from miricigale.reduction.background import estimate_background
 from miricigale.reduction.images import plain_mask, with_data
 from miricigale.utils import sep_tools
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_positive
 from miricigale.utils.units import ANGLE, positive
 
 # pairs vote for the shift within this radius, and are matched within it after the shift, arcsec
 _VOTE = 0.1
+# sigma of a pixel above which sources are detected
+_DETECTED = 10.0
 # sources to solve for a shift, and for a rotation too
 _LEAST, _LEAST_ROTATION = 3, 10
 
@@ -52,7 +53,7 @@ class Alignment:
         return self.scatter / np.sqrt(max(self.n_matched, 1))
 
 
-def align_to_catalog(image, catalog, *, radius=1 * u.arcsec, threshold=10.0):
+def align_to_catalog(image, catalog, *, radius=1 * u.arcsec):
     """
     Correct the coordinates of an image by the positions of a catalog.
 
@@ -64,8 +65,6 @@ def align_to_catalog(image, catalog, *, radius=1 * u.arcsec, threshold=10.0):
         Positions, at the epoch of the image.
     radius : `~astropy.units.Quantity`, optional
         Largest shift.
-    threshold : float, optional
-        Sigma of a pixel above which sources are detected.
 
     Returns
     -------
@@ -80,16 +79,16 @@ def align_to_catalog(image, catalog, *, radius=1 * u.arcsec, threshold=10.0):
 
     Notes
     -----
-    Positions are windowed centroids. All pairs of a source and a position within ``radius`` vote for a
-    shift; what agrees with the most frequent to 0.1 arcsec is fitted by least squares, clipped at three
-    standard deviations; a rotation is fitted too with ten sources or more. A wrong scale
-    would be one of the distortion, and is not looked for.
+    Positions are windowed centroids, of sources above 10 sigma of a pixel. All pairs of a source and a
+    position within ``radius`` vote for a shift; what agrees with the most frequent to 0.1 arcsec is fitted
+    by least squares, clipped at three standard deviations; a rotation is fitted too with ten sources or
+    more. A wrong scale would be one of the distortion, and is not looked for.
     """
-    x, y = _sources(image, threshold, "image")
+    x, y = _sources(image, "image")
     return _aligned(image, x, y, _positions(catalog), positive(radius, ANGLE, "radius"), "image")
 
 
-def align_images(images, catalog=None, *, radius=1 * u.arcsec, threshold=10.0):
+def align_images(images, catalog=None, *, radius=1 * u.arcsec):
     """
     Align images to each other, or to a catalog.
 
@@ -100,7 +99,7 @@ def align_images(images, catalog=None, *, radius=1 * u.arcsec, threshold=10.0):
     catalog : `~astropy.coordinates.SkyCoord`, optional
         Without one, the first image stands where it is, and each of the others is aligned to the sources of
         those before it.
-    radius, threshold : optional
+    radius : optional
         As for `align_to_catalog`.
 
     Returns
@@ -122,7 +121,7 @@ def align_images(images, catalog=None, *, radius=1 * u.arcsec, threshold=10.0):
     out, alignments = [], []
     for k, im in enumerate(images):
         name = f"images[{k}]"
-        x, y = _sources(im, threshold, name)
+        x, y = _sources(im, name)
         if known is None:
             still = dict.fromkeys(("east", "north", "scatter"), 0 * ANGLE)
             aligned, alignment = im, Alignment(**still, rotation=0 * u.deg, n_matched=x.size)
@@ -146,22 +145,18 @@ def _positions(catalog):
         raise argument_error("catalog", "a SkyCoord of several positions", repr(catalog)[:60])
     unknown = int(np.count_nonzero(~np.isfinite(catalog.cartesian.norm())))
     if unknown:
-        raise argument_error(
-            "catalog", "of finite positions", f"{unknown} of {len(catalog)} that are not"
-        )
+        got = f"{unknown} of {len(catalog)} that are not"
+        raise argument_error("catalog", "of finite positions", got)
     return SkyCoord(catalog.icrs.ra, catalog.icrs.dec)
 
 
-def _sources(image, threshold, argument):
+def _sources(image, argument):
     """Windowed positions of the sources of an image, in pixels."""
     if image.wcs is None or image.uncertainty is None:
         raise argument_error(argument, "one with uncertainty and WCS", "one without")
     if not str(image.wcs.wcs.ctype[0]).startswith("RA"):
-        axes = " and ".join(image.wcs.wcs.ctype)
-        raise argument_error(
-            argument, "one with right ascension along its first axis of the sky", axes
-        )
-    check_positive(threshold, "threshold")
+        wanted = "one with right ascension along its first axis of the sky"
+        raise argument_error(argument, wanted, " and ".join(image.wcs.wcs.ctype))
     scale = float(np.mean(proj_plane_pixel_scales(image.wcs))) * 3600
     name = ImageFacts.of(image).filter
     if name is None:
@@ -169,7 +164,7 @@ def _sources(image, threshold, argument):
     width = psf_fwhm(name).to_value(ANGLE) / scale / 2.3548
     mask, background = plain_mask(image), estimate_background(image, warn=False)
     data = np.where(mask, 0, image.data - background.level)
-    found, _ = sep_tools.extract(data, threshold, err=background.rms, mask=mask)
+    found, _ = sep_tools.extract(data, _DETECTED, err=background.rms, mask=mask)
     # the edge, and what is masked, cuts sources
     x, y, fine = sep_tools.window_positions(data, found["x"], found["y"], width, mask=mask)
     moved = np.hypot(x - found["x"], y - found["y"])

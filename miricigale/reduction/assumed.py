@@ -4,9 +4,10 @@ import warnings
 
 import numpy as np
 from astropy.time import Time
+from scipy.ndimage import convolve
 
 from miricigale.detector import Charge, Ramp
-from miricigale.instrument import Exposure, ImageFacts
+from miricigale.instrument import Exposure, ImageFacts, flat_field, photmjsr
 from miricigale.reduction.reference_maps import read_flat, read_photom
 from miricigale.reduction.references import BRIGHTNESS, SLOPES, STEP_OF, needed, own_maps
 from miricigale.utils.exceptions import ReferenceWarning, argument_error
@@ -120,10 +121,14 @@ def brightness_of(reducer, rate):
     facts = ImageFacts.of(rate)
     if reducer.references == "simulated" or (reducer.references is None and facts.simulated):
         detector = reducer.detector
+        flat = flat_field(facts.filter, subarray=facts.subarray)
+        if facts.ipc:
+            # blurred as the image is: a uniform sky comes out uniform
+            flat = convolve(flat, np.asarray(detector.ipc_kernel, np.float32), mode="nearest")
         values = {
             "dark": detector.dark_current / detector.gain,
-            "gain": detector.gain,
-            "ipc_kernel": detector.ipc_kernel if facts.ipc else None,
+            "flat": flat,
+            "conversion": photmjsr(facts.filter, gain=detector.gain),
         }
         used = {"flat": f"flat field {_OWN}", "photom": f"conversion {_OWN}"}
         return values, {f"reference_{name}": text for name, text in used.items()}
@@ -148,8 +153,8 @@ def brightness_of(reducer, rate):
     if "dark" not in facts.steps:
         msg = "the dark current is in the slopes still: it becomes a part of the background"
         warnings.warn(msg, ReferenceWarning, stacklevel=4)
-    values = {"dark": 0.0, "gain": None, "flat": flat, "flags": flags}
-    values["conversion"] = read_photom(files.photom, exposure, facts.day)
+    conversion = read_photom(files.photom, exposure, facts.day)
+    values = {"dark": 0.0, "flat": flat, "conversion": conversion, "flags": flags}
     meta = {f"reference_{name}": text for name, text in used.items()}
     done = {"photom"} if used["flat"] == "none" else {"photom", "flat"}
     meta["steps"] = sorted(done | set(facts.steps))

@@ -15,9 +15,8 @@ from miricigale.utils.exceptions import ReductionWarning, argument_error
 from miricigale.utils.options import check_choice, check_least, check_positive
 from miricigale.utils.tables import Flags
 
-#: Which noise determines what lies far below the background.
-NEGATIVE_NOISES = ("larger", "background")
-
+# rounds of detecting and masking sources at most; it ends when the mask stays
+_ROUNDS = 5
 # least share of the pixels that is taken for sky
 _LEAST_SKY = 0.05
 # the mask of the sources is dilated by this many pixels
@@ -96,8 +95,6 @@ def estimate_background(
     box=64,
     filter_size=3,
     plane=True,
-    threshold=3.0,
-    iterations=5,
     warn=True,
 ):
     """
@@ -114,13 +111,6 @@ def estimate_background(
         Size of the boxes in pixels, and of the median filter in boxes.
     plane : bool, optional
         Whether a plane, or a parabola with twenty boxes or more, is taken off before the mesh of boxes.
-    threshold : float, optional
-        Sources are at least five connected pixels that rise by this many sigma above the
-        background after a Gaussian smoothing of 0.85 pixels, twenty after one of 2.5, for the wings of
-        bright sources, or twelve cells of 4 x 4 pixels that rise by twice as many after one of 8, for
-        what is faint and wide. Sigma is that of the smoothed image, as measured.
-    iterations : int, optional
-        How often sources are detected and masked at most; it ends when the mask stays.
     warn : bool, optional
         Whether there is a warning of a background that cannot be trusted.
 
@@ -140,6 +130,11 @@ def estimate_background(
 
     Notes
     -----
+    Sources are at least five connected pixels that rise by three sigma above the background after a
+    Gaussian smoothing of 0.85 pixels, twenty after one of 2.5, for the wings of bright sources, or twelve
+    cells of 4 x 4 pixels that rise by twice as many after one of 8, for what is faint and wide. Sigma is that
+    of the smoothed image, as measured.
+
     The mask of the sources is dilated by three pixels, and by half of the local half width of what it covers.
 
     A plane or parabola, fitted to the boxes, each at the mean place of its sky, is taken off first and given
@@ -166,8 +161,6 @@ def estimate_background(
     check_choice(method, "method", ("masked", "sep"))
     check_least(box, "box", 4, whole=True)
     check_least(filter_size, "filter_size", 1, whole=True)
-    check_positive(threshold, "threshold")
-    check_least(iterations, "iterations", 0, whole=True)
     mask = plain_mask(image)
     if mask.all():
         raise argument_error("image", "one with pixels that are not masked", "every pixel masked")
@@ -178,28 +171,27 @@ def estimate_background(
         background = _plain(data, mask, int(box), int(filter_size), correlation)
     else:
         stated, mesh = _stated(image, mask), (int(box), int(filter_size), plane)
-        background = _masked(data, mask, stated, mesh, correlation, threshold, iterations)
+        background = _masked(data, mask, stated, mesh, correlation)
     if warn:
         warn_of(background, mask)
     return background
 
 
-def _masked(data, mask, stated, mesh, correlation, threshold, iterations):
+def _masked(data, mask, stated, mesh, correlation):
     """Background with the sources masked; ``mesh`` has the size of the boxes, the filter and the plane."""
     box, filter_size, plane = mesh
     step = _step(correlation, box)
-    # without a plane what a gradient leaves at edges would be taken for sources, the more with each iteration
+    # without a plane what a gradient leaves at edges would be taken for sources, the more with each round
     if step == 1:
         mesh = SkyMesh(data, mask, box, filter_size, True)
-        mesh, sources, flags, doubt = _search(mesh, stated, threshold, iterations)
+        mesh, sources, flags, doubt = _search(mesh, stated)
     else:
         mean, small, known = _averaged(data, mask, stated, step, correlation)
         mesh = SkyMesh(mean, small, box // step, filter_size, True)
-        _, sources, flags, doubt = _search(mesh, known, threshold, iterations)
+        _, sources, flags, doubt = _search(mesh, known)
         sources = pixels_of(sources, data.shape, step) & ~mask
     if step > 1 or not plane:
-        masked = sources if iterations else None
-        mesh = SkyMesh(data, mask, box, filter_size, plane, masked)
+        mesh = SkyMesh(data, mask, box, filter_size, plane, sources)
     if not flags & BackgroundFlags.FEW_SKY and _excess(stated, mesh.rms, mask | sources) > _EXCESS:
         flags |= BackgroundFlags.EXCESS_NOISE
     if flags & (BackgroundFlags.FEW_SKY | BackgroundFlags.EXCESS_NOISE):
@@ -211,14 +203,14 @@ def _masked(data, mask, stated, mesh, correlation, threshold, iterations):
     return Background(mesh.level, mesh.rms, error, sources, mesh.box, mesh.filter_size, flags)
 
 
-def _search(mesh, stated, threshold, iterations):
+def _search(mesh, stated):
     """Mesh, mask of the sources, flags, and the light of sources that may be in the sky."""
     mask = mesh.mask
     sources, flags, doubt = np.zeros(mask.shape, bool), BackgroundFlags.GOOD, 0.0
     avoided = np.zeros(cells_of(mask).shape, bool)
-    for _ in range(iterations):
+    for _ in range(_ROUNDS):
         noise = _noise(stated, mesh.rms, mask | sources)
-        found = detect(mesh.residual, noise, mask, sources, threshold)
+        found = detect(mesh.residual, noise, mask, sources)
         found = grown(binary_dilation(found, iterations=_GROW), mask)
         found |= pixels_of(avoided, mask.shape)
         if np.count_nonzero(~found & ~mask) < _LEAST_SKY * np.count_nonzero(~mask):
@@ -236,7 +228,7 @@ def _search(mesh, stated, threshold, iterations):
         elif same:
             break
     else:
-        if iterations and high:
+        if high:
             flags = BackgroundFlags.CONTAMINATED
     return mesh, sources, flags, _REMAINDER * doubt
 
@@ -312,32 +304,6 @@ def _plain(data, mask, box, filter_size, correlation):
     return Background(level, rms, error, np.zeros(mask.shape, bool), box, filter_size, flags)
 
 
-def subtract_background(image, *, negative_threshold=10.0, negative_noise="larger", **options):
-    """
-    Subtract the background and mask what lies far below it.
-
-    Parameters
-    ----------
-    image : `~astropy.nddata.CCDData`
-        Any unit.
-    negative_threshold, negative_noise : optional
-        As of `remove_background`.
-    **options
-        Passed to `estimate_background`.
-
-    Returns
-    -------
-    image : `~astropy.nddata.CCDData`
-        Without background, as `remove_background` returns it.
-    background : `Background`
-    """
-    background = estimate_background(image, **options)
-    removed = remove_background(
-        image, background, negative_threshold=negative_threshold, negative_noise=negative_noise
-    )
-    return removed, background
-
-
 def remove_background(image, background, *, negative_threshold=10.0, negative_noise="larger"):
     """
     Take a background off an image and mask what lies far below it.
@@ -366,7 +332,7 @@ def remove_background(image, background, *, negative_threshold=10.0, negative_no
     ValueError
         If an option is out of range, or the errors are asked for and the image has none.
     """
-    check_choice(negative_noise, "negative_noise", NEGATIVE_NOISES)
+    check_choice(negative_noise, "negative_noise", ("larger", "background"))
     check_positive(negative_threshold, "negative_threshold", optional=True)
     out = with_data(
         image,

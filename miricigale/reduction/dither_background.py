@@ -8,20 +8,21 @@ from scipy.ndimage import binary_dilation
 from miricigale.instrument import DQ
 from miricigale.reduction.background import estimate_background, warn_of
 from miricigale.reduction.images import check_images, own_grid, plain_mask, with_data
-from miricigale.reduction.mosaic import drizzle_images, pixel_map
-from miricigale.reduction.sky_mesh import sky_boxes, spread_over
+from miricigale.reduction.mosaic import drizzle_images, nan_median, pixel_map
+from miricigale.reduction.sky_mesh import sky_boxes
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_least
 from miricigale.utils.parallel import chunks
 from miricigale.utils.units import ANGLE
 
 # rows of which the median of many images is taken together
 _ROWS = 128
+# pixels of the boxes over which the median of the dithers is smoothed
+_BOX = 16
 # the mask of the mosaic is widened by this many pixels: images are sharper or wider than it
 _WIDER = 2
 
 
-def dither_backgrounds(images, backgrounds=None, *, wcs=None, box=16):
+def dither_backgrounds(images, backgrounds=None, *, wcs=None):
     """
     Backgrounds of dithered images from the other dithers, with the sources masked ("super background").
 
@@ -36,23 +37,19 @@ def dither_backgrounds(images, backgrounds=None, *, wcs=None, box=16):
         Grid of a mosaic, with its ``pixel_shape``, on which the sources are searched for that are masked; by
         default that of `~miricigale.instrument.mosaic_wcs` with pixels of 0.11 arcsec. What stays on the
         detector does not add up there, as sources do.
-    box : int, optional
-        Pixels of the boxes over which the median of the dithers is smoothed. ``box=1`` takes it pixel
-        by pixel: patterns of single pixels are taken off too, and each image gets the noise of n - 1
-        others, 1.25 / sqrt(n - 1) of its own.
 
     Returns
     -------
     backgrounds : list of `Background`
         Of each image: the median of the other images in pixels of the detector, each less its own
-        level, without masked pixels, smoothed, and on the level of the image's own sky. Noise and flags
-        are those of what is left.
+        level, without masked pixels, smoothed over boxes of 16 pixels, and on the level of the image's
+        own sky. Noise and flags are those of what is left.
 
     Raises
     ------
     ValueError
         If there are fewer than three images, they differ in shape, none of the others of an image sees sky in
-        any of its pixels, or an option is out of range.
+        any of its pixels.
 
     Notes
     -----
@@ -70,16 +67,13 @@ def dither_backgrounds(images, backgrounds=None, *, wcs=None, box=16):
     images = list(images)
     if len(images) < 3:
         raise argument_error("images", "at least three dithers", len(images))
-    check_least(box, "box", 1, whole=True)
     shape = images[0].shape
     for im in images:
         if im.shape != shape:
             raise argument_error("images", f"of one shape {shape}", im.shape)
-    alone = (
-        [estimate_background(im, warn=False) for im in images]
-        if backgrounds is None
-        else list(backgrounds)
-    )
+    if backgrounds is None:
+        backgrounds = [estimate_background(im, warn=False) for im in images]
+    alone = list(backgrounds)
     if len(alone) != len(images):
         raise argument_error("backgrounds", f"one for each of {len(images)} images", len(alone))
     masks = [plain_mask(im) for im in images]
@@ -94,17 +88,10 @@ def dither_backgrounds(images, backgrounds=None, *, wcs=None, box=16):
     ):
         known = np.isfinite(template)
         if not known.any():
-            raise argument_error(
-                "images", "ones that leave some sky to each other", "none in common"
-            )
-        boxes = sky_boxes(np.where(known, template, 0), ~known, max(box, 4))
-        smooth, error = (
-            spread_over(values, boxes.used, boxes.edges, shape, filter_size=1)
-            for values in (boxes.level, boxes.error)
-        )
-        if box == 1:
-            error = np.where(known, own.rms * np.float32(1.2533 / np.sqrt(len(images) - 1)), error)
-            smooth = np.where(known, template, smooth)
+            wanted = "ones that leave some sky to each other"
+            raise argument_error("images", wanted, "none in common")
+        boxes = sky_boxes(np.where(known, template, 0), ~known, _BOX)
+        smooth, error = (boxes.smooth(v, shape, filter_size=1) for v in (boxes.level, boxes.error))
         sky = ~(mask | source)
         rest = with_data(im, im.data - smooth)
         constant = float(np.median(rest.data[sky])) if sky.any() else level
@@ -134,10 +121,8 @@ def restored(image, level):
 def _deep_masks(images, backgrounds, wcs):
     """Sources of the mosaic of the images, on the pixels of each."""
     check_images(images, wcs)
-    flat = []
-    for im, background in zip(images, backgrounds, strict=True):
-        flat.append(im.copy())
-        flat[-1].data = im.data - background.level
+    pairs = zip(images, backgrounds, strict=True)
+    flat = [with_data(im, im.data - background.level) for im, background in pairs]
     maps = [pixel_map(im.wcs, wcs, im.shape) for im in images]
     mosaic = drizzle_images(flat, wcs, pixel_maps=maps).image
     found = binary_dilation(estimate_background(mosaic, warn=False).source_mask, iterations=_WIDER)
@@ -161,15 +146,6 @@ def _other_medians(images, masks, sources, levels):
                 for im, mask, source, level in zip(images, masks, sources, levels, strict=True)
             ]
         ).astype(np.float32)
-        ordered = np.sort(stack, axis=0)
-        seen = np.isfinite(stack)
-        count = seen.sum(axis=0)
-        for template, plane, own in zip(out, stack, seen, strict=True):
-            # what is above the image's own value moves down by one where that is taken out
-            rank = (stack < plane).sum(axis=0)
-            left = count - own
-            middle = [np.maximum(left - 1, 0) // 2, np.maximum(left, 1) // 2]
-            middle = [np.minimum(m + (own & (m >= rank)), len(stack) - 1) for m in middle]
-            values = [np.take_along_axis(ordered, m[None], axis=0)[0] for m in middle]
-            template[rows] = np.where(left > 0, 0.5 * (values[0] + values[1]), np.nan)
+        for k, template in enumerate(out):
+            template[rows], _ = nan_median(np.delete(stack, k, axis=0))
     return out

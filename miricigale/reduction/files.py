@@ -27,11 +27,10 @@ from miricigale.instrument import (
     subarrays,
     with_own_bits,
 )
-from miricigale.instrument.image import Image
 from miricigale.instrument.image_files import json_meta
 from miricigale.reduction.assumed import middle_of
-from miricigale.reduction.images import plain_flags, plain_mask, sigma
-from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.reduction.images import flagged_image, plain_flags, plain_mask, sigma
+from miricigale.utils.exceptions import argument_error, data_error
 from miricigale.utils.files import open_fits, write_fits
 from miricigale.utils.meta import undated
 from miricigale.utils.optional import require
@@ -125,13 +124,11 @@ def read_images(path):
             if "UNCERT" in hdus:
                 hdus["UNCERT"].name = "ERR"
         if "SCI" not in hdus or hdus["SCI"].header.get("NAXIS") not in (2, 3):
-            msg = f"{path} cannot be read as {_WANTED}: it has no image in SCI"
-            raise DataError(msg)
+            raise data_error(path, f"cannot be read as {_WANTED}: it has no image in SCI")
         header = joined_header(hdus)
-        made = header.get("INSTRUME"), header.get("DETECTOR")
-        if made[0] not in (None, "MIRI") or made[1] not in (None, "MIRIMAGE"):
-            msg = f"{path} must be of the MIRI imager, got {made[0]} {made[1]}"
-            raise DataError(msg)
+        instrument, detector = header.get("INSTRUME", "MIRI"), header.get("DETECTOR", "MIRIMAGE")
+        if instrument != "MIRI" or detector != "MIRIMAGE":
+            raise data_error(path, f"must be of the MIRI imager, got {instrument} {detector}")
         shape = hdus["SCI"].shape
         check_memory(24 * np.prod(shape, dtype=float), f"the image {path}", advice="cut it")
         unit = _unit(hdus["SCI"].header, path)
@@ -147,29 +144,20 @@ def read_images(path):
         error = np.sqrt(np.sum([np.nan_to_num(part) for part in parts], axis=0))
     out = []
     for number in range(shape[0]) if len(shape) == 3 else (...,):
-        own = meta if number is ... else {**meta, "integration": number}
-        values, flag = data[number], flags[number]
-        bad = ~np.isfinite(values) | ((flag & DQ.DO_NOT_USE) != 0)
-        uncertainty = None
-        if error is not None:
-            uncertainty = StdDevUncertainty(error[number])
-            bad |= ~np.isfinite(uncertainty.array)
-        if "WHT" in planes:
-            bad |= ~(planes["WHT"][number] > 0)
-        image = Image(
-            values,
-            unit=unit,
-            uncertainty=uncertainty,
-            mask=bad,
-            flags=flag,
+        one = flagged_image(
+            data[number],
+            unit,
+            error=None if error is None else error[number],
+            flags=flags[number],
             wcs=wcs,
-            meta=dict(own),
+            meta=meta if number is ... else {**meta, "integration": number},
+            mask=~(planes["WHT"][number] > 0) if "WHT" in planes else False,
         )
         part = {
             name: plane if name == "CON" or plane.shape != shape else plane[number]
             for name, plane in planes.items()
         }
-        out.append(ImageFile(image, part, header))
+        out.append(ImageFile(one, part, header))
     return out
 
 
@@ -202,30 +190,28 @@ def open_exposure(path):
 
 def _mean(images):
     """Mean of the integrations of an exposure; its flags are those of any, DO_NOT_USE those of all."""
-    weight = np.array([~image.mask for image in images], float)
-    count = weight.sum(axis=0)
-    data = np.array([np.nan_to_num(image.data) for image in images])
-    first, uncertainty = images[0], None
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean = np.where(count > 0, (weight * data).sum(axis=0) / count, np.nan)
-        if all(image.uncertainty is not None for image in images):
-            error = np.array([np.nan_to_num(image.uncertainty.array) for image in images])
-            total = np.sqrt((weight * error**2).sum(axis=0))
-            uncertainty = StdDevUncertainty(
-                np.where(count > 0, total / count, np.nan).astype(np.float32)
-            )
-    flags = np.bitwise_or.reduce([image.flags for image in images]) & ~int(DQ.DO_NOT_USE)
-    flags |= np.where(count == 0, int(DQ.DO_NOT_USE), 0)
-    meta = {key: value for key, value in first.meta.items() if key != "integration"}
-    return Image(
-        mean.astype(np.float32),
-        unit=first.unit,
-        uncertainty=uncertainty,
-        mask=count == 0,
-        flags=flags,
-        wcs=first.wcs,
-        meta=meta,
+    first, error = images[0], None
+    mask = np.array([im.mask for im in images])
+    count = np.ma.masked_equal(np.count_nonzero(~mask, axis=0), 0)
+
+    def total(values):
+        return np.where(mask, 0, values).sum(axis=0, dtype=float)
+
+    mean = total([im.data for im in images]) / count
+    if all(im.uncertainty is not None for im in images):
+        error = np.sqrt(total([np.square(sigma(im)) for im in images])) / count
+        error = error.filled(np.nan)
+    flags = np.bitwise_or.reduce([im.flags for im in images]) & ~int(DQ.DO_NOT_USE)
+    flags |= np.where(mask.all(axis=0), int(DQ.DO_NOT_USE), 0)
+    meta, wcs = _shared_meta(first), first.wcs
+    return flagged_image(
+        mean.filled(np.nan), first.unit, error=error, flags=flags, wcs=wcs, meta=meta
     )
+
+
+def _shared_meta(one):
+    """The meta dictionary of an exposure, of an image of one of its integrations."""
+    return {key: value for key, value in one.meta.items() if key != "integration"}
 
 
 def _unit(header, path):
@@ -240,11 +226,8 @@ def _unit(header, path):
         if unit is not None and unit.is_equivalent(known):
             factor = unit.to(known)
             return own if factor == 1 else u.Unit(factor * own)
-    msg = (
-        f"{path} must state in BUNIT that it is a rate (DN/s, adu/s) or a surface brightness (MJy/sr), "
-        f"got {text!r}"
-    )
-    raise DataError(msg)
+    wanted = "must state in BUNIT that it is a rate (DN/s, adu/s) or a surface brightness (MJy/sr)"
+    raise data_error(path, f"{wanted}, got {text!r}")
 
 
 def _plane(hdus, name, shape, path):
@@ -253,8 +236,7 @@ def _plane(hdus, name, shape, path):
     data = hdus[name].data
     if data is None or data.shape[-2:] != shape[-2:] or (name != "CON" and data.shape != shape):
         got = None if data is None else data.shape
-        msg = f"{path} must have {shape} pixels in {name}, as in SCI, got {got}"
-        raise DataError(msg)
+        raise data_error(path, f"must have {shape} pixels in {name}, as in SCI, got {got}")
     kind = data.dtype.newbyteorder("=") if data.dtype.kind in "iu" else np.float32
     return np.array(data, kind)
 
@@ -266,8 +248,7 @@ def _flags(hdus, shape, path):
     # planes without our legend are JWST's own
     flags = read_dq(hdu) if "DQSCHEME" in hdu.header else np.asarray(hdu.data).astype(np.int64)
     if flags.shape != shape:
-        msg = f"{path} must have {shape} pixels in DQ, as in SCI, got {flags.shape}"
-        raise DataError(msg)
+        raise data_error(path, f"must have {shape} pixels in DQ, as in SCI, got {flags.shape}")
     return with_own_bits(flags, hdus)
 
 
@@ -319,7 +300,7 @@ def _wcs(hdus, header, meta):
     return wcs
 
 
-def write_image(image, path, *, planes=None, header=None, overwrite=False):
+def write_image(image, path, *, planes=None, overwrite=False):
     """
     Write an image as a FITS file that JWST's tools, photutils and DS9 open.
 
@@ -334,8 +315,6 @@ def write_image(image, path, *, planes=None, header=None, overwrite=False):
     planes : dict of str to `~numpy.ndarray`, optional
         Further planes by name (`ImageFile`), such as ``WHT``, ``CON`` (numbers of images)
         and ``BKG`` (what was subtracted), beside those of an `ImageFile`.
-    header : `~astropy.io.fits.Header`, optional
-        Keywords of the observation.
     overwrite : bool, optional
         Whether an existing file is replaced.
 
@@ -360,8 +339,6 @@ def write_image(image, path, *, planes=None, header=None, overwrite=False):
         "SUBARRAY": meta.get("subarray"), "READPATT": meta.get("readout"),
         "DATAMODL": "ImageModel" if image.data.ndim == 2 else "CubeModel", "FILENAME": path.name,
     }  # fmt: skip
-    if header is not None:
-        primary.header.extend(header.copy(strip=True), unique=True, strip=True)
     primary.header.update({key: value for key, value in keywords.items() if value is not None})
     for step in STEPS if isinstance(meta.get("steps"), list) else ():
         if STEPS[step] in meta["steps"]:
@@ -430,13 +407,14 @@ def _joined(image, planes):
     def cube(values):
         return np.array([values(file) for file in files])
 
-    joined = Image(
+    joined = flagged_image(
         cube(lambda file: file.image.data),
-        unit=first.unit,
-        uncertainty=StdDevUncertainty(cube(lambda file: sigma(file.image))),
-        mask=cube(lambda file: plain_mask(file.image)),
+        first.unit,
+        error=cube(lambda file: sigma(file.image)),
         flags=cube(lambda file: plain_flags(file.image)),
-        meta={key: value for key, value in first.meta.items() if key != "integration"},
+        wcs=None,
+        meta=_shared_meta(first),
+        mask=cube(lambda file: plain_mask(file.image)),
     )
     own = {name: cube(lambda file, n=name: file.planes[n]) for name in files[0].planes}
     return joined, {**own, **planes}, first.wcs

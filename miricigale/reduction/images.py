@@ -10,17 +10,20 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import SURFACE_BRIGHTNESS
 
 
-def image(data, unit, *, error, flags, wcs, meta):
-    """Make an image that is masked where its flags say so, or where it is not finite."""
+def flagged_image(data, unit, *, error, flags, wcs, meta, mask=False):
+    """Make an image that is also masked where its flags say so, or where it is not finite."""
     data = np.asarray(data, np.float32)
-    error = np.asarray(error, np.float32)
     flags = np.asarray(flags, np.int64)
-    mask = (flags & DQ.DO_NOT_USE) != 0
+    mask = mask | ((flags & DQ.DO_NOT_USE) != 0) | ~np.isfinite(data)
+    uncertainty = None
+    if error is not None:
+        uncertainty = StdDevUncertainty(np.asarray(error, np.float32))
+        mask |= ~np.isfinite(uncertainty.array)
     return Image(
         data,
         unit=unit,
-        uncertainty=StdDevUncertainty(error),
-        mask=mask | ~np.isfinite(data) | ~np.isfinite(error),
+        uncertainty=uncertainty,
+        mask=mask,
         flags=flags,
         wcs=wcs,
         meta=dict(meta),

@@ -15,7 +15,7 @@ from miricigale.reduction.images import (
     check_images,
     check_overlap,
     flag_pixels,
-    image,
+    flagged_image,
     overlaps,
     plain_mask,
     sigma,
@@ -27,6 +27,8 @@ from miricigale.utils.parallel import chunks
 
 # rows of a grid of which the median of many images is taken together
 _ROWS = 256
+# pixels of the boxes by which the variance that gives weights is smoothed
+_WEIGHT_BOX = 32
 # steepest differences to its neighbors by which a pixel may differ from the other dithers
 _DERIVATIVE = 1.2
 # nodes of the grid on which a distorted WCS is evaluated; between them bicubic splines
@@ -109,7 +111,7 @@ def pixel_map(wcs_in, wcs_out, shape):
     return tuple(RectBivariateSpline(nodes_y, nodes_x, values)(rows, columns) for values in (x, y))
 
 
-def weight_map(source, *, box=32, filter_size=3):
+def weight_map(source):
     """
     Inverse variance of an image that does not follow the data of single pixels.
 
@@ -117,8 +119,6 @@ def weight_map(source, *, box=32, filter_size=3):
     ----------
     source : `~astropy.nddata.CCDData`
         With uncertainty.
-    box, filter_size : int, optional
-        Over which the variance is smoothed (clipped mode of the boxes, median of boxes).
 
     Returns
     -------
@@ -128,7 +128,8 @@ def weight_map(source, *, box=32, filter_size=3):
     Notes
     -----
     The variance of a pixel is estimated from its own counts: weights by it would favor
-    pixels that fluctuated low, and lower the mosaic by about sigma^2 / rate.
+    pixels that fluctuated low, and lower the mosaic by about sigma^2 / rate. It is smoothed
+    by boxes of 32 pixels (their clipped modes, and medians of 3 x 3 boxes).
     """
     mask = plain_mask(source)
     variance = np.square(np.asarray(sigma(source), float))
@@ -136,7 +137,7 @@ def weight_map(source, *, box=32, filter_size=3):
     if bad.all():
         return np.zeros(mask.shape, np.float32)
     typical = np.median(variance[~bad])
-    smooth, _ = sep_tools.background(variance / typical, bad, box, filter_size)
+    smooth, _ = sep_tools.background(variance / typical, bad, _WEIGHT_BOX)
     # the spline between boxes may overshoot: weights stay within a factor of ten
     smooth = np.clip(smooth, 0.1, 10.0) * typical
     return np.where(bad, 0.0, 1.0 / smooth).astype(np.float32)
@@ -247,7 +248,7 @@ def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None):
         "pixel_scale": _scale(wcs) * 3600,
         "noise_correction": noise_correction(pixfrac, ratio) * before_drizzle,
     }
-    out = image(
+    out = flagged_image(
         np.where(covered, data, np.nan),
         images[0].unit,
         error=np.sqrt(np.where(covered, variance, np.nan)),
@@ -389,18 +390,17 @@ def _median_of(images, wcs, weights, pixel_maps):
             first, last = max(rows.start, strip.start), min(rows.stop, strip.stop)
             own = slice(first - rows.start, last - rows.start)
             plane[first - strip.start : last - strip.start, columns] = alone[own]
-        count[strip] = np.isfinite(stack).sum(axis=0)
-        median[strip] = _nan_median(stack, count[strip])
+        median[strip], count[strip] = nan_median(stack)
     return median, count
 
 
-def _nan_median(stack, count):
-    """Median along the first axis without NaN: sorting puts NaN last."""
-    ordered = np.sort(stack, axis=0)
-    low = np.maximum(count - 1, 0) // 2
-    high = np.minimum(count // 2, stack.shape[0] - 1)
-    pick = lambda i: np.take_along_axis(ordered, i[None], axis=0)[0]  # noqa: E731
-    return 0.5 * (pick(low) + pick(high))
+def nan_median(stack):
+    """Median along the first axis of what is not NaN (NaN of nothing), and how many values it has."""
+    # sorting puts NaN last
+    ordered, count = np.sort(stack, axis=0), np.isfinite(stack).sum(axis=0)
+    middle = np.maximum(count - 1, 0) // 2, np.minimum(count // 2, stack.shape[0] - 1)
+    low, high = (np.take_along_axis(ordered, i[None], axis=0)[0] for i in middle)
+    return 0.5 * (low + high), count
 
 
 def _scale(wcs):

@@ -22,6 +22,7 @@ from miricigale.reduction._core.pixel import DO_NOT_USE, JUMP, SATURATED, own_ch
 from miricigale.reduction._core.rows import fit_rows
 from miricigale.reduction.showers import find_showers
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_positive
 from miricigale.utils.parallel import chunks, parallel_map, threads
 
 # rows that one call of the kernel fits; the events come out in this order
@@ -99,17 +100,10 @@ _JUMP_TYPE = np.dtype(
 
 def fit_groups(
     data,
+    maps,
     *,
     group_time,
-    gain,
-    read_noise,
-    slow_noise=0.0,
-    bias=0.0,
     drift=0.0,
-    reset=None,
-    linearity=(0.0, 1.0),
-    saturation=np.inf,
-    dark=None,
     usable=None,
     group_dq=None,
     first_group=0,
@@ -128,31 +122,16 @@ def fit_groups(
     ----------
     data : `~numpy.ndarray`, shape (n_int, n_group, ny, nx)
         Groups in DN (one read each). It is read row by row and never copied as a whole.
+    maps : `DetectorMaps`
+        What the detector is taken for. The variance of rounding, 1/12, is added to that of reads
+        for integer data; the gain is infinite where photons make no noise. Of ``reset`` and
+        ``dark`` the last integration stands for all further ones, and a dark has no fewer groups
+        than are fitted.
     group_time : float
         Time between groups, s.
-    gain : float or `~numpy.ndarray`, shape (ny, nx)
-        Electrons per DN; infinite where photons make no noise.
-    read_noise : float or `~numpy.ndarray`, shape (ny, nx)
-        Standard deviation of one read, DN. The variance of rounding, 1/12, is added for
-        integer data.
-    slow_noise : float or `~numpy.ndarray`, shape (ny, nx), optional
-        Standard deviation that the read-out adds from one group to the next, DN: a random walk,
-        as the noise of photons is.
-    bias : float or `~numpy.ndarray`, shape (ny, nx), optional
-        Level of an empty pixel, DN.
     drift : array_like, shape (n_int, n_group) or (n_int, n_group, 1 or ny, 4), optional
-        What is added to it in each group, DN; of the four channels of the read-out, to which
+        What is added to the bias in each group, DN; of the four channels of the read-out, to which
         columns belong in turn, and of rows.
-    reset : `~numpy.ndarray`, shape (n, m, ny, nx), optional
-        What is added in the first m groups after a reset, DN; the last of the n integrations
-        stands for all further ones.
-    linearity : sequence of float or `~numpy.ndarray`, shape (n, ny, nx), optional
-        Polynomial (lowest power first) from measured to linear DN above the bias.
-    saturation : float or `~numpy.ndarray`, shape (ny, nx), optional
-        Raw DN from which a group and all later ones of the integration are left out.
-    dark : `~numpy.ndarray`, shape (n, m, ny, nx), optional
-        Dark signal of m groups at least, linear DN, subtracted from them; integrations as for
-        ``reset``.
     usable : `~numpy.ndarray` of bool, shape (ny, nx), optional
         Pixels to fit; the others get NaN.
     group_dq : `~numpy.ndarray` of uint8, shape of the data, optional
@@ -218,18 +197,18 @@ def fit_groups(
     if usable.shape != (ny, nx):
         raise argument_error("usable", f"of shape {(ny, nx)}", usable.shape)
 
-    gain = _map(gain, "gain", usable, above=0.0, infinite=True)
-    read_noise = _map(read_noise, "read_noise", usable, least=0.0)
-    slow_noise = _map(slow_noise, "slow_noise", usable, least=0.0)
-    bias = _map(bias, "bias", usable)
-    saturation = _map(saturation, "saturation", usable, infinite=True)
-    coef = _coefficients(linearity, usable)
+    gain = _map(maps.gain, "gain", usable, above=0.0, infinite=True)
+    read_noise = _map(maps.read_noise, "read_noise", usable, least=0.0)
+    slow_noise = _map(maps.slow_noise, "slow_noise", usable, least=0.0)
+    bias = _map(maps.bias, "bias", usable)
+    saturation = _map(maps.saturation, "saturation", usable, infinite=True)
+    coef = np.stack([_map(plane, "linearity", usable) for plane in maps.linearity])
     drift = _drift(drift, data.shape)
     if bias.size == 1:
         # one sum for all pixels
         drift, bias = bias[0, 0] + drift, np.zeros((1, 1))
-    reset = _groups(reset, "reset", data.shape)
-    dark = _groups(dark, "dark", data.shape, least=last_group)
+    reset = _groups(maps.reset, "reset", data.shape)
+    dark = _groups(maps.dark, "dark", data.shape, least=last_group)
     flagged = _flagged(group_dq, data.shape, last_group, usable)
     group_dq = np.zeros((1, 0, 1, 1), np.uint8) if flagged is None else _plain(group_dq)
 
@@ -291,18 +270,6 @@ def _map(values, name, usable, *, above=-np.inf, least=-np.inf, infinite=False):
     return np.where(good, values, 1.0)
 
 
-def _coefficients(values, usable):
-    """Coefficients (n, 1, 1) or (n, ny, nx) that are finite wherever they are used."""
-    values = np.array(values, float, order="C")
-    values = values[:, None, None] if values.ndim == 1 else values
-    if values.ndim != 3 or not values.size or values.shape[1:] not in ((1, 1), usable.shape):
-        wanted = (
-            f"coefficients of one polynomial or of shape (n, {usable.shape[0]}, {usable.shape[1]})"
-        )
-        raise argument_error("linearity", wanted, f"shape {values.shape}")
-    return np.concatenate([_map(plane, "linearity", usable)[None] for plane in values])
-
-
 def _drift(values, shape):
     """Drift of the read-out as (n_int, n_group, rows, channels)."""
     values = np.asarray(values, float)
@@ -355,11 +322,8 @@ def fit_result(rate, var_poisson, var_read, n_used, n_jump, flags, events, first
 
 def threshold(value, name):
     """Return a threshold as a float, infinite for None."""
-    if value is None:
-        return np.inf
-    if not value > 0:
-        raise argument_error(name, "positive or None", value)
-    return float(value)
+    check_positive(value, name, optional=True)
+    return np.inf if value is None else float(value)
 
 
 def _neighbors(events, threshold, usable, n_diff, showers):

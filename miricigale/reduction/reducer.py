@@ -11,7 +11,7 @@ from miricigale.detector import Charge, Ramp, ResetAnomaly
 from miricigale.instrument import DetectorProperties, ImageFacts, miri_detector
 from miricigale.instrument.data_models import is_data_model, read_data_model
 from miricigale.reduction.assumed import brightness_of, maps_of
-from miricigale.reduction.background import subtract_background
+from miricigale.reduction.background import estimate_background, remove_background
 from miricigale.reduction.calibration import calibrate
 from miricigale.reduction.combine import combine, drizzle, subtract_dithers
 from miricigale.reduction.files import open_exposure
@@ -146,10 +146,8 @@ class Reducer(Interactive):
                 raise argument_error(name, f"a {kind.__name__}", "None")
             check_kind(value, name, kind)
         thread_count(self.n_threads)
-        known = (None, "none", "simulated")
-        if not isinstance(self.references, (ReferenceFiles, ReferenceCache)) and (
-            self.references not in known
-        ):
+        known = isinstance(self.references, (ReferenceFiles, ReferenceCache))
+        if not known and self.references not in (None, "none", "simulated"):
             wanted = "ReferenceFiles, a ReferenceCache, 'none', 'simulated' or None"
             raise argument_error("references", wanted, repr(self.references))
 
@@ -261,13 +259,8 @@ class Reducer(Interactive):
             if getattr(facts, key) is None:
                 raise argument_error("rate", f"an image whose meta has {key!r}", "none")
         brightness, used = brightness_of(self, rate)
-        cal = calibrate(
-            rate,
-            filter=facts.filter,
-            subarray=facts.subarray,
-            **brightness,
-            cosmic_rays=self.cosmic_rays,
-        )
+        where = {"filter": facts.filter, "subarray": facts.subarray}
+        cal = calibrate(rate, **where, **brightness, cosmic_rays=self.cosmic_rays)
         cal.meta.update(used)
         return cal
 
@@ -285,9 +278,9 @@ class Reducer(Interactive):
         image : `~astropy.nddata.CCDData`
         background : `Background`
         """
-        return subtract_background(
-            _opened(image), **self.background.negative, **self.background.mesh
-        )
+        image = _opened(image)
+        background = estimate_background(image, **self.background.mesh)
+        return remove_background(image, background, **self.background.negative), background
 
     def subtract_dithers(self, images, *, wcs=None):
         """

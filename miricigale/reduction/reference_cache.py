@@ -7,11 +7,9 @@ import os
 import re
 from pathlib import Path
 
+from miricigale.reduction.reference_maps import TYPES
 from miricigale.reduction.references import ReferenceFiles
-from miricigale.utils.exceptions import DataError, argument_error
-
-#: Reference types of CRDS whose names are not those of `ReferenceFiles`.
-_TYPES = {"bias": "superbias", "read_noise": "readnoise"}
+from miricigale.utils.exceptions import DataError, argument_error, data_error
 
 #: Keywords of files by the parameters of rules.
 _KEYWORDS = {
@@ -77,8 +75,8 @@ class ReferenceCache:
         if context is None:
             found = sorted(self._mappings.glob("jwst_*.pmap"))
             if not found:
-                msg = f"{self.folder} is no CRDS cache of JWST: it has no mappings/jwst/jwst_*.pmap"
-                raise DataError(msg)
+                what = "is no CRDS cache of JWST: it has no mappings/jwst/jwst_*.pmap"
+                raise data_error(self.folder, what)
             context = found[-1].name
         object.__setattr__(self, "context", str(context))
         self._mapping(self.context)
@@ -115,12 +113,11 @@ class ReferenceCache:
         instruments = self._mapping(self.context)[1]
         name = instruments.get("MIRI", instruments.get("miri"))
         if name is None:
-            msg = f"{self.context} has no mapping for MIRI"
-            raise DataError(msg)
+            raise data_error(self.context, "has no mapping for MIRI")
         rules = self._mapping(name)[1]
         chosen = {}
         for name in ReferenceFiles.names():
-            kind = _TYPES.get(name, name)
+            kind = TYPES.get(name, name)
             rule = rules.get(kind, rules.get(kind.upper(), _NOT_APPLICABLE))
             if rule == _NOT_APPLICABLE:
                 continue
@@ -140,8 +137,7 @@ class ReferenceCache:
                 break
             selector = selector.choose(names, values, substitutions)
         if isinstance(selector, _Selector):
-            msg = f"{rule} has more selectors than parameters"
-            raise DataError(msg)
+            raise data_error(rule, "has more selectors than parameters")
         return None if selector in (None, _NOT_APPLICABLE) else selector
 
     def _file(self, name):
@@ -150,8 +146,8 @@ class ReferenceCache:
         for path in (folder / "miri" / name, folder / name):
             if path.is_file():
                 return path
-        msg = f"{self.folder} lacks the reference file {name}, which {self.context} chooses"
-        raise DataError(msg)
+        what = f"lacks the reference file {name}, which {self.context} chooses"
+        raise data_error(self.folder, what)
 
     def _mapping(self, name):
         """Header and selector of a mapping."""
@@ -165,11 +161,10 @@ class ReferenceCache:
             }
             return parts["header"], parts["selector"]
         except FileNotFoundError:
-            msg = f"{self.folder} is no CRDS cache with {name}: there is no {path}"
-            raise DataError(msg) from None
+            what = f"is no CRDS cache with {name}: there is no {path}"
+            raise data_error(self.folder, what) from None
         except (AttributeError, KeyError, SyntaxError, ValueError) as err:
-            msg = f"{path} cannot be read as a CRDS mapping: {err}"
-            raise DataError(msg) from err
+            raise data_error(path, f"cannot be read as a CRDS mapping: {err}") from err
 
 
 @dataclasses.dataclass(frozen=True)

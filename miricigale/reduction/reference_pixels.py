@@ -1,7 +1,6 @@
 """Drift of the read-out, as the pixels without light show it."""
 
 import numpy as np
-from scipy.signal import savgol_filter
 
 from miricigale.utils.exceptions import argument_error
 
@@ -29,17 +28,14 @@ def reference_drift(data, reference):
         Mean of each group's reference pixels minus the mean over all groups, DN; zeros if
         there is no reference pixel.
     """
-    drift = np.zeros(data.shape[:2])
     columns = np.flatnonzero(reference.any(axis=0))
     if columns.size == 0:
-        return drift
-    chosen = reference[:, columns]
-    for k, g in np.ndindex(*drift.shape):
-        drift[k, g] = data[k, g][:, columns][chosen].mean(dtype=float)
+        return np.zeros(data.shape[:2])
+    drift = data[..., columns][:, :, reference[:, columns]].mean(axis=-1, dtype=float)
     return drift - drift.mean()
 
 
-def reference_channels(data, reference, *, origin=(0, 0), window=None):
+def reference_channels(data, reference, *, origin=(0, 0)):
     """
     Drift of each channel of the read-out, of odd and even rows apart.
 
@@ -51,20 +47,17 @@ def reference_channels(data, reference, *, origin=(0, 0), window=None):
         Which pixels see no light.
     origin : tuple of int, optional
         Column and row of the first pixel in the full frame, which determine its channel and parity.
-    window : int or None, optional
-        Odd number of groups over which the drift is smoothed in each integration (local straight
-        lines), so that less of the noise of few reference pixels comes in; None for none.
 
     Returns
     -------
     drift : `~numpy.ndarray`, shape (n_int, n_group, ny, 4)
         DN of the channels, the first that of column 0; zero in the first group of each
-        integration, or where the smooth drift begins.
+        integration.
 
     Raises
     ------
     ValueError
-        If there is no reference pixel of a channel, or an option is out of range.
+        If there is no reference pixel of a channel.
 
     Notes
     -----
@@ -78,8 +71,6 @@ def reference_channels(data, reference, *, origin=(0, 0), window=None):
     JWST pipeline documentation, reference pixel correction (MIRI).
     """
     n_int, n_group, ny, nx = data.shape
-    if window is not None and not (window >= 3 and window % 2 == 1 and int(window) == window):
-        raise argument_error("window", "an odd number of at least 3, or None", window)
     columns = np.flatnonzero(reference.any(axis=0))
     # a small part of the data
     pixels, known = data[..., columns], reference[:, columns]
@@ -100,10 +91,6 @@ def reference_channels(data, reference, *, origin=(0, 0), window=None):
                 part = pixels[:, :, rows][..., side].reshape(n_int, n_group, -1)[..., good]
                 change = part.astype(float) - part[:, :1]
                 values[:, :, odd, channel] += _clipped_mean(change) / len(mine)
-    if window is not None:
-        length = min(int(window), n_group - 1 + n_group % 2)
-        if length >= 3:
-            values[:, 1:] = savgol_filter(values, length, 1, axis=1)[:, 1:]
     return values[:, :, parity]
 
 

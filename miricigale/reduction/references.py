@@ -1,15 +1,16 @@
 """Which reference files a reduction uses: named, and read into maps of the detector."""
 
 import dataclasses
+import numbers
 import os
 import warnings
 from pathlib import Path
 
 import numpy as np
 
-from miricigale.reduction import reference_maps as maps
 from miricigale.reduction.measured_noise import measure_noise
-from miricigale.utils.exceptions import DataError, ReferenceWarning, argument_error
+from miricigale.reduction.reference_maps import READERS
+from miricigale.utils.exceptions import ReferenceWarning, argument_error, data_error
 
 #: What slopes need, and what surface brightness needs beside them.
 SLOPES = ("mask", "saturation", "linearity", "dark", "gain", "read_noise")
@@ -249,29 +250,23 @@ class ReferenceFiles:
     def __post_init__(self):
         for name in self.names():
             value = getattr(self, name)
-            if value is None:
-                continue
-            if value == "measured" and name in _MEASURED:
+            if value is None or (value == "measured" and name in _MEASURED):
                 continue
             if isinstance(value, (str, os.PathLike)):
                 if not Path(value).is_file():
                     raise argument_error(name, "the path of a file", f"{value}: there is none")
                 object.__setattr__(self, name, Path(value))
                 continue
-            wanted = "a path"
-            if name in _NUMBERS:
-                wanted += f" or a number above 0 in {_NUMBERS[name]}"
-            if name in _MEASURED:
-                wanted += " or 'measured'"
-            number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
+            number = isinstance(value, numbers.Real) and not isinstance(value, bool)
             if name not in _NUMBERS or not number or not (np.isfinite(value) and value > 0):
-                raise argument_error(name, wanted, repr(value))
+                unit = f" or a number above 0 in {_NUMBERS[name]}" if name in _NUMBERS else ""
+                measured = " or 'measured'" if name in _MEASURED else ""
+                raise argument_error(name, f"a path{unit}{measured}", repr(value))
 
     @staticmethod
     def names():
         """Names of all references, in the order in which they are used."""
-        return ("mask", "saturation", "bias", "reset", "linearity", "dark", "gain", "read_noise",
-                "flat", "photom")  # fmt: skip
+        return (*READERS, *BRIGHTNESS)
 
     replace = dataclasses.replace
 
@@ -319,17 +314,7 @@ class ReferenceFiles:
             If a file cannot be read as what it should be.
         """
         values, used = {"pixel_dq": np.zeros(ramp.exposure.shape, np.int64)}, {}
-        readers = {
-            "mask": maps.read_mask,
-            "saturation": maps.read_saturation,
-            "bias": maps.read_bias,
-            "reset": maps.read_reset,
-            "linearity": maps.read_linearity,
-            "dark": maps.read_dark,
-            "gain": maps.read_gain,
-            "read_noise": maps.read_noise,
-        }
-        for name, reader in readers.items():
+        for name, reader in READERS.items():
             value = getattr(self, name)
             if STEP_OF.get(name) in ramp.steps:
                 used[name] = "done before"
@@ -352,11 +337,8 @@ class ReferenceFiles:
             del values["bias"]
             used["bias"] = "done before"
         if "dark" in values and values["dark"].shape[1] < ramp.shape[1]:
-            msg = (
-                f"{self.dark} is no dark reference for this exposure: it has "
-                f"{values['dark'].shape[1]} groups, and the ramp {ramp.shape[1]}"
-            )
-            raise DataError(msg)
+            got = f"it has {values['dark'].shape[1]} groups, and the ramp {ramp.shape[1]}"
+            raise data_error(self.dark, f"is no dark reference for this exposure: {got}")
         if unknown := [name for name in _MEASURED if name not in values]:
             measured = measure_noise(ramp)
             for name in unknown:

@@ -11,7 +11,7 @@ from miricigale.instrument import Image, ImageFacts
 from miricigale.reduction.assumed import history_of
 from miricigale.reduction.background import Background
 from miricigale.reduction.files import ImageFile, write_image
-from miricigale.reduction.images import exposure_values, image
+from miricigale.reduction.images import exposure_values, flagged_image
 from miricigale.reduction.slopes import shares_charge
 from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.meta import provenance
@@ -144,6 +144,8 @@ def rate_image(reducer, ramp, maps, fit):
         gain=float(np.median(maps.gain)),
         **history_of(reducer, ramp, maps),
     )
-    rate = image(fit.rate, RATE, error=fit.error, flags=fit.flags, wcs=ramp.exposure.wcs, meta=meta)
+    rate = flagged_image(
+        fit.rate, RATE, error=fit.error, flags=fit.flags, wcs=ramp.exposure.wcs, meta=meta
+    )
     planes = {"VAR_POISSON": fit.var_poisson, "VAR_RNOISE": fit.var_read}
     return ImageFile(rate, planes, Header())

@@ -27,8 +27,6 @@ class RampSettings:
         (`reference_channels`), which leave the first group unchanged. None: the
         mean in simulated ramps, and in others what the pipeline does, ``"channels"`` in full frames
         and nothing in sub-arrays.
-    reference_window : int or None, optional
-        Odd number of groups over which the drift of the channels is smoothed.
     ipc : bool or None, optional
         Whether neighbors share their charge, which lowers the photon noise of a pixel
         (and correlates it) and blurs the flat field. None: as the ramp says, False where
@@ -43,7 +41,6 @@ class RampSettings:
     neighbor_threshold: float | None = 10.0
     shower_threshold: float | None = None
     reference_correction: bool | str | None = None
-    reference_window: int | None = None
     ipc: bool | None = None
 
     def __post_init__(self):
@@ -51,9 +48,6 @@ class RampSettings:
             check_positive(getattr(self, name), name, optional=True)
         known = (True, False, "channels", None)
         check_choice(self.reference_correction, "reference_correction", known)
-        if self.reference_window is not None and self.reference_correction != "channels":
-            wanted = "None without reference_correction='channels'"
-            raise argument_error("reference_window", wanted, self.reference_window)
 
 
 @dataclasses.dataclass(frozen=True)

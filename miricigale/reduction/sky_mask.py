@@ -6,6 +6,8 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, label
 # detection of what is masked: standard deviations of the smoothing in pixels (cores, and
 # the wings of bright sources), and the least number of connected pixels: those of the smoothing
 _TIERS = ((0.85, 5), (2.5, 20))
+# sigma by which sources rise above the sky
+_THRESHOLD = 3.0
 # light too faint and wide for these is looked for in cells of so many pixels, smoothed by this many of
 # them, from this many connected ones on that rise by this times the threshold
 _CELL, _CELL_WIDTH, _CELL_AREA, _CELL_THRESHOLD = 4, 2.0, 12, 2.0
@@ -41,7 +43,7 @@ def pixels_of(cells, shape, size=_CELL):
     return wide[: shape[0], : shape[1]]
 
 
-def detect(residual, rms, mask, sources, threshold):
+def detect(residual, rms, mask, sources):
     """Pixels that rise above the noise of the image, smoothed little, more and much."""
     good = ~mask & (rms > 0)
     sky = good & ~sources
@@ -52,7 +54,7 @@ def detect(residual, rms, mask, sources, threshold):
     found = np.zeros(mask.shape, bool)
     for width, area in _TIERS:
         smooth = gaussian_filter(scaled, width, mode="nearest")
-        found |= _risen(smooth, good, sky, threshold, area)
+        found |= _risen(smooth, good, sky, _THRESHOLD, area)
     # what is found is left out, or it would be smeared over cells
     cells, share = cells_of(scaled, good & ~found)
     smooth, weight = (
@@ -62,9 +64,8 @@ def detect(residual, rms, mask, sources, threshold):
     smooth /= np.sqrt(np.maximum(weight, 1e-3))
     good, sky = (share >= 0.5) & (weight >= 0.3), cells_of(sky) >= 0.5
     if sky.any():
-        found |= pixels_of(
-            _risen(smooth, good, sky, _CELL_THRESHOLD * threshold, _CELL_AREA), mask.shape
-        )
+        wide = _risen(smooth, good, sky, _CELL_THRESHOLD * _THRESHOLD, _CELL_AREA)
+        found |= pixels_of(wide, mask.shape)
     return found & ~mask
 
 

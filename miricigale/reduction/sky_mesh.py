@@ -55,6 +55,62 @@ class SkyBoxes:
         """Statistical error of the level of each box."""
         return _MEDIAN_ERROR * self.spread / np.sqrt(np.maximum(self.count, 1))
 
+    def surface(self, values, shape):
+        """
+        Fit a polynomial through values of the boxes that count, clipped at three standard deviations.
+
+        It is a parabola with twenty boxes or more, for distortion bends a gradient of the sky; a plane
+        with six; zero with fewer. Returns it at the pixels of an image of a ``shape``, float32, and at
+        the mean places of the boxes' sky.
+        """
+        # in units of the image, about its middle
+        y, x = (v / edge[-1] - 0.5 for v, edge in zip(self.center, self.edges, strict=True))
+        everywhere = np.stack([np.ones_like(y), y, x, y * y, y * x, x * x], axis=-1)
+        terms, level = everywhere[self.used], values[self.used]
+        number = 6 if level.size >= 20 else 3 if level.size >= 6 else 0
+        coefficients, keep = np.zeros(6), np.ones(level.size, bool)
+        for _ in range(10 if number else 0):
+            fitted, *_ = np.linalg.lstsq(terms[keep, :number], level[keep], rcond=None)
+            coefficients[:number] = fitted
+            residual = level - terms @ coefficients
+            inner = residual[keep]
+            spread = 1.4826 * np.median(np.abs(inner - np.median(inner)))
+            new = np.abs(residual) <= 3 * spread
+            if new.sum() < 2 * number or np.array_equal(new, keep):
+                break
+            keep = new
+        y, x = (np.arange(n) / edge[-1] - 0.5 for n, edge in zip(shape, self.edges, strict=True))
+        constant, along_y, along_x, y2, yx, x2 = coefficients
+        # one product of matrices in place of six images
+        left = np.stack([constant + (along_y + y2 * y) * y, np.ones_like(y), yx * y], axis=1)
+        right = np.stack([np.ones_like(x), (along_x + x2 * x) * x, x])
+        pixels = left.astype(np.float32) @ right.astype(np.float32)
+        return pixels, everywhere @ coefficients
+
+    def smooth(self, values, shape, filter_size):
+        """
+        Lay a smooth surface through values of the boxes.
+
+        Parameters
+        ----------
+        values : `~numpy.ndarray`, shape (n, m)
+            Of the boxes. Those that do not count take the median of those around them, or the nearest.
+        shape : tuple of int
+            Of the image.
+        filter_size : int
+            Boxes over which the median is taken before.
+
+        Returns
+        -------
+        surface : `~numpy.ndarray` of float32, shape (ny, nx)
+            Bicubic spline through the centers of the boxes, linear beyond the outermost.
+        """
+        filtered = _filled(_filtered(np.where(self.used, values, np.nan), filter_size))
+        filtered = filtered.astype(np.float32)
+        for axis, edge in enumerate(self.edges):
+            filtered = np.moveaxis(_spline(edge, shape[axis]) @ filtered, 0, 1)
+        return filtered
+
 
 def box_edges(n, box):
     """Edges of boxes of about ``box`` pixels that divide ``n`` evenly."""
@@ -140,84 +196,6 @@ def _clipped(values, mode):
     return median + shift, spread / _CLIPPED, high - low
 
 
-def fit_surface(boxes, values):
-    """
-    Polynomial through values of boxes that count, clipped at three standard deviations.
-
-    Returns
-    -------
-    coefficients : `~numpy.ndarray`, shape (6,)
-        As `surface` takes them: a parabola with twenty boxes or more, for distortion bends a gradient
-        of the sky; a plane with six; zeros with fewer.
-    """
-    used = boxes.used
-    y, x, level = (v[used] for v in (*boxes.center, values))
-    terms = _terms(y, x, boxes)
-    number = 6 if x.size >= 20 else 3 if x.size >= 6 else 0
-    coefficients, keep = np.zeros(6), np.ones(x.size, bool)
-    for _ in range(10 if number else 0):
-        fitted, *_ = np.linalg.lstsq(terms[keep, :number], level[keep], rcond=None)
-        coefficients[:number] = fitted
-        residual = level - terms @ coefficients
-        inner = residual[keep]
-        spread = 1.4826 * np.median(np.abs(inner - np.median(inner)))
-        new = np.abs(residual) <= 3 * spread
-        if new.sum() < 2 * number or np.array_equal(new, keep):
-            break
-        keep = new
-    return coefficients
-
-
-def surface(coefficients, boxes):
-    """Polynomial of `fit_surface` at the places of boxes."""
-    return _terms(*boxes.center, boxes) @ coefficients
-
-
-def surface_over(coefficients, boxes, shape):
-    """Polynomial of `fit_surface` at the pixels of an image, float32."""
-    y, x = (np.arange(n) / edge[-1] - 0.5 for n, edge in zip(shape, boxes.edges, strict=True))
-    constant, along_y, along_x, y2, yx, x2 = coefficients
-    # one product of matrices in place of six images
-    left = np.stack([constant + (along_y + y2 * y) * y, np.ones_like(y), yx * y], axis=1)
-    right = np.stack([np.ones_like(x), (along_x + x2 * x) * x, x])
-    return left.astype(np.float32) @ right.astype(np.float32)
-
-
-def _terms(y, x, boxes):
-    # in units of the image, about its middle
-    y, x = (v / edge[-1] - 0.5 for v, edge in zip((y, x), boxes.edges, strict=True))
-    return np.stack([np.ones_like(y), y, x, y * y, y * x, x * x], axis=-1)
-
-
-def spread_over(values, used, edges, shape, filter_size):
-    """
-    Smooth surface through values of boxes.
-
-    Parameters
-    ----------
-    values : `~numpy.ndarray`, shape (n, m)
-        Of the boxes.
-    used : `~numpy.ndarray` of bool, shape (n, m)
-        Which of them count; the others take the median of those around them, or the nearest.
-    edges : tuple of `~numpy.ndarray`
-        Of the boxes.
-    shape : tuple of int
-        Of the image.
-    filter_size : int
-        Boxes over which the median is taken before.
-
-    Returns
-    -------
-    surface : `~numpy.ndarray` of float32, shape (ny, nx)
-        Bicubic spline through the centers of the boxes, linear beyond the outermost.
-    """
-    filtered = _filled(_filtered(np.where(used, values, np.nan), filter_size))
-    filtered = filtered.astype(np.float32)
-    for axis, edge in enumerate(edges):
-        filtered = np.moveaxis(_spline(edge, shape[axis]) @ filtered, 0, 1)
-    return filtered
-
-
 def _spline(edges, n):
     """What a cubic spline through values at the centers of boxes is at each pixel, as a matrix."""
     nodes = 0.5 * (edges[1:] + edges[:-1] - 1)
@@ -283,7 +261,7 @@ class SkyMesh:
         # boxes are measured once more without the surface, which widens their distribution
         if plane:
             boxes = sky_boxes(data, mask | sources, box, mode=mode)
-            self._smooth = self._surface(boxes, boxes.level)[0]
+            self._smooth, _ = boxes.surface(boxes.level, data.shape)
         self._measure(sources, mode=mode)
 
     def measured(self, sources):
@@ -293,31 +271,26 @@ class SkyMesh:
         out._measure(sources)
         return out
 
-    def _surface(self, boxes, values):
-        """Surface through boxes, each at the mean place of its sky, in each pixel and there."""
-        coefficients = fit_surface(boxes, values)
-        return surface_over(coefficients, boxes, self._data.shape), surface(coefficients, boxes)
-
     def _measure(self, sources, mode=False):
         boxes = sky_boxes(self._data - self._smooth, self.mask | sources, self.box, mode=mode)
         values = boxes.level
         if self.plane:
-            more, there = self._surface(boxes, values)
+            more, there = boxes.surface(values, self._data.shape)
             self._smooth, values = self._smooth + more, values - there
-        mesh = self._over(values, boxes)
+        self._boxes = boxes
+        mesh = self._over(values)
         self.tilted = self._data - self._smooth
         self.residual = self.tilted - mesh
         self.level = (self._smooth + mesh).astype(np.float32)
-        self.rms = np.maximum(self._over(boxes.spread, boxes), 0)
-        self._boxes = boxes
+        self.rms = np.maximum(self._over(boxes.spread), 0)
 
-    def _over(self, values, boxes):
-        return spread_over(values, boxes.used, boxes.edges, self._data.shape, self.filter_size)
+    def _over(self, values):
+        return self._boxes.smooth(values, self._data.shape, self.filter_size)
 
     @property
     def error(self):
         """What noise leaves open of the level."""
-        error = self._over(self._boxes.error, self._boxes)
+        error = self._over(self._boxes.error)
         # that of a median of so many boxes
         number = np.clip(np.count_nonzero(self._boxes.used), 1, self.filter_size**2)
         return np.maximum(error, 0) * np.float32(min(1.0, 1.2533 / np.sqrt(number)))

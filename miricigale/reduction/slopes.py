@@ -74,13 +74,10 @@ def fit_slopes(reducer, ramp, maps, progress_bar=False):
         if "jump" in ramp.steps:
             # the pipeline found them, and flags of groups mark them
             thresholds = None, None
-        names = (
-            "gain", "read_noise", "slow_noise", "bias", "reset", "linearity", "saturation", "dark"
-        )  # fmt: skip
         fit = fit_groups(
             ramp.data,
+            maps,
             group_time=ramp.group_time,
-            **{name: getattr(maps, name) for name in names},
             drift=_drift(reducer, ramp, reference, drift),
             usable=usable,
             group_dq=None if ramp.simulated else ramp.group_dq,
@@ -141,29 +138,21 @@ def _drift(reducer, ramp, reference, drift):
         return drift
     if how != "channels":
         return drift + reference_drift(ramp.data, reference)
-    origin = ramp.exposure.aperture.origin
-    found = reference_channels(
-        ramp.data, reference, origin=origin, window=reducer.ramps.reference_window
-    )
+    found = reference_channels(ramp.data, reference, origin=ramp.exposure.aperture.origin)
     return np.broadcast_to(drift, ramp.shape[:2])[:, :, None, None] + found
 
 
 def _anomaly(reducer, ramp, maps):
     """Offset of each group after a reset, DN, in addition to that of the references."""
-    exposure, skipping = ramp.exposure, reducer.skip_first is not None
-    if not skipping and ramp.shows(ResetDecay) and exposure.n_integrations > 1:
-        _warn_of("a decay after the resets between integrations", "")
-    if reducer.reset_anomaly is not None:
-        return reducer.reset_anomaly.offsets(exposure.n_integrations, exposure.n_groups)
-    if not skipping and maps.reset is None and ramp.shows(ResetAnomaly):
-        _warn_of("a reset anomaly", "'reset_anomaly', or ")
-    return 0.0
-
-
-def _warn_of(what, remedy):
-    """Warn of an effect of resets that stays in the slopes."""
-    msg = (
-        f"the ramp shows {what} that this Reducer leaves in: "
-        f"give it {remedy}'skip_first' groups to be left out"
-    )
-    warnings.warn(msg, ReductionWarning, stacklevel=5)
+    exposure, anomaly, left = ramp.exposure, reducer.reset_anomaly, []
+    if ramp.shows(ResetDecay) and exposure.n_integrations > 1:
+        left.append(("a decay after the resets between integrations", ""))
+    if anomaly is None and maps.reset is None and ramp.shows(ResetAnomaly):
+        left.append(("a reset anomaly", "'reset_anomaly', or "))
+    for what, remedy in left if reducer.skip_first is None else ():
+        msg = (
+            f"the ramp shows {what} that this Reducer leaves in: "
+            f"give it {remedy}'skip_first' groups to be left out"
+        )
+        warnings.warn(msg, ReductionWarning, stacklevel=4)
+    return 0.0 if anomaly is None else anomaly.offsets(exposure.n_integrations, exposure.n_groups)

@@ -1,12 +1,10 @@
-from math import lgamma
-
 import numpy as np
 import pytest
-from scipy import ndimage, stats
+from scipy import stats
 
-from miricigale.detector._core.charge import add_poisson, couple_neighbors
-from miricigale.detector._core.random import GUIDE, fill_table, log_factorial, standard_normals
-from miricigale.detector._core.readout import add_pink_noise, digitize
+from miricigale.detector._core.charge import add_poisson
+from miricigale.detector._core.random import GUIDE, fill_table, standard_normals
+from miricigale.detector._core.readout import digitize
 
 KEY = np.array([11, 22, 33, 44], np.uint64)
 
@@ -42,11 +40,6 @@ def test_streams_of_rows_and_keys_are_apart():
     correlation = np.corrcoef(np.vstack([rows, other]))
     np.fill_diagonal(correlation, 0)
     assert np.abs(correlation).max() < 5 / np.sqrt(4000)
-
-
-def test_a_row_does_not_know_its_block():
-    whole = normals((20, 50), first_row=100)
-    np.testing.assert_array_equal(whole[7:12], normals((5, 50), first_row=107))
 
 
 @pytest.mark.parametrize("mean", [0.05, 0.555, 3.0, 9.99, 10.0, 31.0, 161.0, 5000.0])
@@ -133,31 +126,10 @@ def test_dark_columns_leave_the_draws_of_others_alone():
     np.testing.assert_array_equal(ramp[..., bright], alone[..., : bright.sum()])
 
 
-def test_poisson_of_no_light_is_nothing():
-    ramp = np.zeros((1, 5, 2, 8), np.float32)
-    add_poisson(ramp, np.zeros((2, 8)), KEY, 0)
-    assert not ramp.any()
-
-
 def test_enormous_means_stay_finite():
     ramp = np.zeros((1, 3, 1, 4), np.float32)
     add_poisson(ramp, np.full((1, 4), 1e15), KEY, 0)
     np.testing.assert_allclose(ramp[0, -1], 3e9, rtol=1e-3)
-
-
-def test_log_factorial():
-    k = np.arange(0, 400)
-    got = [log_factorial(float(n)) for n in k]
-    np.testing.assert_allclose(got, [lgamma(n + 1) for n in k], atol=1e-9)
-
-
-def test_coupling_is_a_convolution():
-    rng = np.random.default_rng(0)
-    ramp = rng.uniform(0, 1000, (1, 2, 9, 11)).astype(np.float32)
-    kernel = np.array([[1, 2, 1], [3, 10, 4], [1, 5, 1]], np.float32) / 28
-    expected = [ndimage.correlate(plane, kernel, mode="nearest") for plane in ramp[0]]
-    couple_neighbors(ramp, kernel)
-    np.testing.assert_allclose(ramp[0], expected, rtol=1e-5)
 
 
 def test_rounding_and_limits_of_the_converter():
@@ -168,22 +140,3 @@ def test_rounding_and_limits_of_the_converter():
     digitize(ramp, counts, flags, np.uint8(64), np.uint8(2))
     assert counts.ravel().tolist() == [0, 0, 0, 1, 1235, 65535, 65535, 65535]
     assert flags.ravel().tolist() == [64, 0, 0, 0, 0, 0, 2, 2]
-
-
-def test_pink_noise_has_its_variance_and_falls_with_frequency():
-    n_rows, n_group = 64, 128
-    ramp = np.zeros((1, n_group, n_rows, 8), np.float32)
-    add_pink_noise(ramp, 2.0, 10, 4, KEY, 0, n_rows)
-    # columns share four outputs in turn
-    np.testing.assert_array_equal(ramp[..., :4], ramp[..., 4:])
-    series = ramp[0].reshape(-1, 8)[:, :4].astype(float)
-    assert series.std() == pytest.approx(2.0, rel=0.25)
-    power = np.mean(np.abs(np.fft.rfft(series - series.mean(axis=0), axis=0)) ** 2, axis=1)
-    frequency = np.arange(power.size)
-    low, high = (frequency >= 16) & (frequency < 64), (frequency >= 512) & (frequency < 2048)
-    slope = np.log(power[high].mean() / power[low].mean()) / np.log(32)
-    assert slope == pytest.approx(-1, abs=0.3)
-    # and rows are what they are in any block
-    part = np.zeros((1, n_group, 5, 8), np.float32)
-    add_pink_noise(part, 2.0, 10, 4, KEY, 20, n_rows)
-    np.testing.assert_array_equal(part, ramp[:, :, 20:25])

@@ -15,39 +15,16 @@ from miricigale.detector import (
     Detector,
     InterpixelCapacitance,
     Nonlinearity,
-    Photons,
     ReadNoise,
     ReferencePixels,
     Residual,
     Saturation,
 )
-from miricigale.instrument import DQ, aperture, bad_pixel_mask, flat_field, miri_detector, photmjsr
+from miricigale.instrument import DQ, aperture, bad_pixel_mask, miri_detector
 
 
 def empty(block):
     return np.zeros(block.ramp_shape, np.float32)
-
-
-def test_photons_come_at_the_calibrated_rate(make_block):
-    block = make_block("miri.f1000w", n_groups=40, subarray="SUB256")
-    exposure = block.exposure
-    ramp = Photons(flat=False).apply(np.full(exposure.shape, 11.7), block)
-    gain = miri_detector().gain
-    expected = 11.7 / photmjsr("miri.f1000w") * gain * exposure.integration_time.to_value("s")
-    assert ramp[0, -1].mean() == pytest.approx(
-        expected, abs=5 * np.sqrt(expected / ramp[0, -1].size)
-    )
-    # dispersion test of the Poisson distribution
-    n = ramp[0, -1].size
-    assert ramp[0, -1].var() / expected == pytest.approx(1, abs=5 * np.sqrt(2 / n))
-
-
-def test_photons_see_the_flat_field(make_block):
-    block = make_block(n_groups=2, subarray="SUB256")
-    ramp = Photons().apply(np.full(block.exposure.shape, 1e6), block)
-    flat = flat_field("miri.f770w", subarray="SUB256")
-    ratio = ramp[0, -1] / ramp[0, -1].mean() / (flat / flat.mean())
-    np.testing.assert_allclose(ratio, 1, atol=0.005)
 
 
 def test_dark_charge(make_block):
@@ -129,14 +106,6 @@ def test_showers_are_faint_and_wide(make_block):
     assert np.count_nonzero(image) > 1000
     # a Gaussian of 10^5 electrons, 15 pixels wide
     assert 0 < image.max() < 20 * 1e5 / (2 * np.pi * 15**2)
-
-
-def test_blocks_of_cosmic_rays_fit_together(make_block):
-    block = make_block(n_groups=20, subarray="SUB256")
-    effect = CosmicRays(flux=1e-6, shower_fraction=0.05)
-    whole = effect.apply(empty(block), block)
-    part = rows_of(block, slice(97, 104))
-    np.testing.assert_array_equal(effect.apply(empty(part), part), whole[:, :, 97:104])
 
 
 def test_bad_and_reference_pixels(make_block):

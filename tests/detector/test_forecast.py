@@ -110,23 +110,6 @@ def test_the_well_is_that_of_the_effects(make_exposure, make_sky, plain):
     assert high.forecast(sky, exposure).sky_fraction == pytest.approx(1e4 / reach)
 
 
-def test_a_converter_that_ends_first_is_met_in_the_told_group(make_exposure, make_sky, plain):
-    from miricigale.detector import Bias
-
-    properties = miri_detector().replace(bias=45_000.0)
-    chain = (*plain.effects[:-1], Bias(), plain.effects[-1])
-    detector = Detector(chain, properties=properties)
-    exposure = make_exposure(n_groups=12)
-    step = exposure.group_time.to_value("s")
-    reach = properties.gain * properties.linearize(20_535.5)
-    image = make_sky(exposure, 1.0)
-    image.data[20, 30] = brightness(reach / (7.5 * step))
-    told = detector.forecast(image, exposure, sources=sources_at([30], [20]))
-    ramp = detector.expose(image, exposure, seed=2)
-    flagged = ramp.group_dq[0, :, 20, 30] & DQ.SATURATED != 0
-    assert told.sources["group"][0] == np.argmax(flagged) + 1 == 8
-
-
 def test_flat_dark_and_bad_pixels(make_exposure, make_sky):
     exposure = make_exposure(n_groups=5, subarray="SUB256")
     detector = Detector.miri_imager()

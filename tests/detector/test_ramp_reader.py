@@ -79,8 +79,8 @@ def test_ramps_larger_than_the_memory_are_refused_before_they_are_read(tmp_path,
 
     monkeypatch.setattr(ramp_reader, "_counts", never)
     monkeypatch.setattr("miricigale.utils.parallel.available_memory", lambda: 150_000)
-    with pytest.raises(MemoryError, match=r"the ramp of .*jw_ramp\.fits, shape \(2, 4, 64, 72\)"):
-        Ramp.read(path)
+    wanted = r"the ramp of .*jw_ramp\.fits, shape \(2, 4, 64, 72\)"
+    refuses(wanted, Ramp.read, path, error=MemoryError)
 
 
 def test_exposures_larger_than_the_memory_are_refused_before_they_begin(
@@ -104,7 +104,6 @@ def test_a_ramp_of_a_ground_test():
     ramp = Ramp.read(path)
     with fits.open(path) as hdus:
         np.testing.assert_array_equal(ramp.data, hdus["SCI"].data)
-        np.testing.assert_array_equal(ramp.reference_output, hdus["REFOUT"].data)
     exposure = ramp.exposure
     assert (exposure.filter, exposure.pointing, exposure.wcs) == (None, None, None)
     assert (exposure.readout, exposure.subarray) == ("FASTR1", "SUB64")
@@ -145,7 +144,7 @@ def test_flags_of_another_shape_are_refused(tmp_path):
     refuses(r"flags of shape \(2, 4, 64, 72\) in GROUPDQ", Ramp.read, path, error=DataError)
 
 
-def test_a_real_ramp_keeps_its_keywords_and_its_fifth_output(tmp_path):
+def test_a_real_ramp_keeps_its_keywords(tmp_path):
     ramp = Ramp.read(real_file(GROUND))
     path = ramp.write(tmp_path / "jpl_uncal.fits")
     with fits.open(path) as hdus:
@@ -153,12 +152,10 @@ def test_a_real_ramp_keeps_its_keywords_and_its_fifth_output(tmp_path):
         assert header["ORIGIN"] == "JPL"
         assert header["FILENAME"] == "jpl_uncal.fits"
         assert "FILTER" not in header
-        np.testing.assert_array_equal(hdus["REFOUT"].data, ramp.reference_output)
         assert hdus[-1].name == "ASDF"
     back = Ramp.read(path)
     assert not back.simulated
     np.testing.assert_array_equal(back.data, ramp.data)
-    np.testing.assert_array_equal(back.reference_output, ramp.reference_output)
 
 
 def test_times_of_the_integrations(make_exposure, make_sky, tmp_path):

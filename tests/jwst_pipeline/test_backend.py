@@ -1,15 +1,13 @@
 """``Reducer(backend="jwst")``: ramps fitted by the official pipeline, behind our interface."""
 
-import astropy.units as u
 import numpy as np
 import pytest
-from astropy.coordinates import SkyCoord
 from astropy.io import fits
-from astropy.nddata import CCDData
 
 from helpers.errors import refuses
+from helpers.exposures import exposure_of, sky_of
 from miricigale.detector import Detector, FirstFrame, LastFrame, Ramp, ResetAnomaly
-from miricigale.instrument import DQ, Exposure, flat_field, miri_detector, photmjsr
+from miricigale.instrument import DQ, flat_field, miri_detector, photmjsr
 from miricigale.reduction import Reducer, ReferenceFiles
 
 pytest.importorskip("jwst", reason="needs the official pipeline: pip install miricigale[jwst]")
@@ -20,21 +18,14 @@ SKY, STAR = 38.0, 1500.0
 
 @pytest.fixture(scope="module")
 def exposure():
-    return Exposure(
-        "miri.f1500w",
-        n_groups=20,
-        n_integrations=2,
-        subarray="SUB256",
-        pointing=SkyCoord(53.1344, -27.8344, unit="deg"),
-        roll=30 * u.deg,
-    )
+    return exposure_of("miri.f1500w", n_groups=20, n_integrations=2)
 
 
 @pytest.fixture(scope="module")
 def sky(exposure):
     light = np.full(exposure.shape, SKY)
     light[40:210:17, 60:230:17] = STAR
-    return CCDData(light, unit="MJy/sr", meta={"psf_includes": ["ipc"]})
+    return sky_of(exposure, light, psf_includes=["ipc"])
 
 
 @pytest.fixture(scope="module")

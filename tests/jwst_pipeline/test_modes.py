@@ -5,13 +5,8 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from miricigale.detector import (
-    Detector,
-    FirstFrame,
-    LastFrame,
-    Ramp,
-    ResetAnomaly,
-)
+from helpers.exposures import exposure_of
+from miricigale.detector import Detector, FirstFrame, LastFrame, Ramp, ResetAnomaly
 from miricigale.instrument import DQ, Exposure, field_mask, flat_field, photmjsr
 from miricigale.reduction import Reducer
 
@@ -78,51 +73,39 @@ def test_slow_readout(tmp_path, tools):
     assert 0.7 < check_rate(tmp_path, seen, split=20.0) < 0.99
 
 
-def test_the_reddest_band(tmp_path, tools):
-    # the sky fills the well in about a hundred seconds: small sub-arrays are read in time
-    exposure = Exposure(
-        "miri.f2100w",
-        n_groups=20,
-        n_integrations=2,
-        subarray="SUB256",
-        pointing=tools.POINTING,
-        roll=20 * u.deg,
-    )
+def subarray_exposure(tools, band, n_groups, n_integrations, flux):
+    """Several integrations of a small sub-array, and nine stars in it."""
+    options = {"pointing": tools.POINTING, "roll": 20 * u.deg}
+    exposure = exposure_of(band, n_groups=n_groups, n_integrations=n_integrations, **options)
     x, y = (g.ravel() for g in np.meshgrid([60.3, 128.0, 190.6], [55.1, 130.4, 200.0]))
-    catalog = tools.star_field(exposure, x, y, np.full(9, 5e3))
+    return exposure, tools.star_field(exposure, x, y, np.full(9, flux))
+
+
+# in the reddest band the sky fills the well in about a hundred seconds: small sub-arrays are read in time
+@pytest.mark.parametrize(
+    ("mode", "split"),
+    [(("miri.f1500w", 12, 3, 2e3), 150.0), (("miri.f2100w", 20, 2, 5e3), 600.0)],
+)
+def test_sub_arrays_and_integrations(tmp_path, tools, mode, split):
+    exposure, catalog = subarray_exposure(tools, *mode)
     stages = {"detector1": "rate", "image2": "cal"}
     seen = reduce(tools, tmp_path, exposure, catalog, stages=stages)
-    check_rate(tmp_path, seen, split=600.0)
+    check_rate(tmp_path, seen, split=split)
     with fits.open(seen.product(tmp_path, "cal")) as hdus:
         head = hdus["SCI"].header
         assert head["BUNIT"] == "MJy/sr"
-        assert head["PHOTMJSR"] == pytest.approx(photmjsr("miri.f2100w"))
+        assert head["PHOTMJSR"] == pytest.approx(photmjsr(exposure.filter))
         use = (hdus["DQ"].data & DQ.DO_NOT_USE) == 0
         data = hdus["SCI"].data[use].astype(float)
     assert data.sum() == pytest.approx(seen.light[use].sum(), rel=2e-3)
 
 
 def test_what_resets_do_is_taken_off(tmp_path, tools):
-    exposure = Exposure(
-        "miri.f770w",
-        n_groups=40,
-        n_integrations=3,
-        subarray="SUB256",
-        pointing=tools.POINTING,
-        roll=20 * u.deg,
-    )
-    x, y = (g.ravel() for g in np.meshgrid([60.3, 128.0, 190.6], [55.1, 130.4, 200.0]))
-    catalog = tools.star_field(exposure, x, y, np.full(9, 1e3))
+    exposure, catalog = subarray_exposure(tools, "miri.f770w", 40, 3, 1e3)
     detector = Detector.miri_imager(ResetAnomaly(), FirstFrame(), LastFrame())
-    seen = reduce(
-        tools,
-        tmp_path,
-        exposure,
-        catalog,
-        stages={"detector1": "rate"},
-        extra=("--reset-anomaly", "--skip-first", "1"),
-        detector=detector,
-    )
+    extra, stages = ("--reset-anomaly", "--skip-first", "1"), {"detector1": "rate"}
+    options = {"stages": stages, "extra": extra, "detector": detector}
+    seen = reduce(tools, tmp_path, exposure, catalog, **options)
     with fits.open(seen.product(tmp_path, "rate")) as hdus:
         for step in ("S_RESET", "S_RSCD", "S_LASTFR"):
             assert hdus[0].header[step] == "COMPLETE"

@@ -3,11 +3,9 @@
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.coordinates import SkyCoord
-from astropy.nddata import CCDData
 from numpy.testing import assert_allclose, assert_array_equal
-from photutils.aperture import CircularAnnulus, CircularAperture, aperture_photometry
 
+from helpers.exposures import FIELD, exposure_of, sky_of
 from miricigale.detector import (
     CosmicRays,
     Detector,
@@ -18,37 +16,27 @@ from miricigale.detector import (
 )
 from miricigale.instrument import (
     DQ,
-    Exposure,
     background_level,
     miri_detector,
-    mosaic_wcs,
-    pixel_area_map,
 )
 from miricigale.reduction import RampSettings, Reducer
 
-CENTER = SkyCoord(53.1344, -27.8344, unit="deg")
 STORM = CosmicRays(flux=8e-7)  # ten times as many as there are
 F770W = ("miri.f770w", 200, 1)
 F2100W = ("miri.f2100w", 10, 28)
 
 
-def exposure_of(band, n_groups, n_integrations, *, dither=0, subarray="SUB256"):
-    return Exposure(
-        band,
-        n_groups=n_groups,
-        n_integrations=n_integrations,
-        subarray=subarray,
-        pointing=CENTER.directional_offset_by(1 * u.rad, dither * 1.37 * u.arcsec),
-        roll=30 * u.deg,
-        dither=dither,
-    )
+def mode_of(band, n_groups, n_integrations, dither=0):
+    pointing = FIELD.directional_offset_by(1 * u.rad, dither * 1.37 * u.arcsec)
+    options = {"n_groups": n_groups, "n_integrations": n_integrations, "dither": dither}
+    return exposure_of(band, pointing=pointing, **options)
 
 
 def both(exposure, light, *effects, seed=1, without=(), reducer=None, properties=None):
     """Fits to the ramp, and to what was collected, of one exposure; and the true slope."""
     reducer = Reducer() if reducer is None else reducer
     detector = Detector.miri_imager(*effects, properties=properties).without(*without)
-    image = CCDData(np.broadcast_to(light, exposure.shape).copy(), unit="MJy/sr")
+    image = sky_of(exposure, light)
     charge = detector.collect(image, exposure, seed=seed)
     fits = [
         reducer.fit_groups(exposed)
@@ -79,7 +67,7 @@ def pulls(fit, truth):
     ],
 )
 def test_slopes_have_the_noise_of_the_fit(mode, effects, without):
-    exposure = exposure_of(*mode)
+    exposure = mode_of(*mode)
     (fitted, drawn), truth = both(
         exposure, background_level(mode[0]).value, *effects, without=without
     )
@@ -110,7 +98,7 @@ def test_slopes_have_the_noise_of_the_fit(mode, effects, without):
 
 @pytest.mark.parametrize("mode", [F770W, F2100W])
 def test_the_same_hits_are_found_and_cost_the_same(mode):
-    (fitted, drawn), truth = both(exposure_of(*mode), background_level(mode[0]).value, STORM)
+    (fitted, drawn), truth = both(mode_of(*mode), background_level(mode[0]).value, STORM)
     hit = (fitted.flags & DQ.JUMP_DET) != 0
     assert 0.2 < hit.mean() < 0.6
     assert len(drawn.jumps) == pytest.approx(len(fitted.jumps), rel=0.02)
@@ -131,7 +119,7 @@ def test_the_same_hits_are_found_and_cost_the_same(mode):
 def test_hits_that_are_not_cut_stay_where_they_are():
     reducer = Reducer(jump_threshold=None)
     (fitted, drawn), truth = both(
-        exposure_of(*F770W), background_level("miri.f770w").value, STORM, reducer=reducer
+        mode_of(*F770W), background_level("miri.f770w").value, STORM, reducer=reducer
     )
     assert len(drawn.jumps) == 0
     one, other = pulls(fitted, truth), pulls(drawn, truth)
@@ -147,7 +135,7 @@ def test_hits_below_the_threshold_make_the_same_tails():
     level = background_level("miri.f770w").value
     tails = []
     for seed in range(5):
-        fits, truth = both(exposure_of(*F770W), level, STORM, reducer=reducer, seed=seed)
+        fits, truth = both(mode_of(*F770W), level, STORM, reducer=reducer, seed=seed)
         tails.append([np.sum(pulls(fit, truth) > 5) for fit in fits])
     fitted, drawn = np.sum(tails, axis=0)
     assert fitted > 1500
@@ -155,7 +143,7 @@ def test_hits_below_the_threshold_make_the_same_tails():
 
 
 def test_errors_follow_the_light_up_to_saturation():
-    exposure = exposure_of("miri.f770w", 40, 2)
+    exposure = mode_of("miri.f770w", 40, 2)
     light = np.broadcast_to(np.geomspace(1, 2e6, exposure.shape[1]), exposure.shape)
     (fitted, drawn), truth = both(exposure, light, STORM)
     first = np.isnan(fitted.rate).mean(axis=0)
@@ -184,7 +172,7 @@ def test_what_the_reduction_assumes_need_not_be_true():
         read_noise=1.3 * known.read_noise,
         nonlinearity=(0.0, 1.0, *(1.3 * c for c in known.nonlinearity[2:])),
     )
-    exposure = exposure_of("miri.f770w", 60, 1)
+    exposure = mode_of("miri.f770w", 60, 1)
     light = np.broadcast_to(np.geomspace(1, 200, exposure.shape[1]), exposure.shape)
     (fitted, drawn), truth = both(
         exposure,
@@ -204,7 +192,7 @@ def test_what_the_reduction_assumes_need_not_be_true():
 
 
 def test_what_resets_do_is_undone_or_stays_as_in_the_ramps():
-    exposure = exposure_of("miri.f1500w", 12, 3)
+    exposure = mode_of("miri.f1500w", 12, 3)
     resets = (ResetAnomaly(), FirstFrame(), LastFrame())
     level = background_level("miri.f1500w").value
     for reducer, low in (
@@ -222,15 +210,12 @@ def test_what_resets_do_is_undone_or_stays_as_in_the_ramps():
 
 
 def test_images_of_both_go_on_alike():
-    exposure = exposure_of("miri.f1000w", 20, 1)
+    exposure = mode_of("miri.f1000w", 20, 1)
     detector, reducer = Detector.miri_imager(), Reducer()
-    image = CCDData(np.full(exposure.shape, 11.5), unit="MJy/sr")
+    image = sky_of(exposure, 11.5)
     fitted, drawn = (
-        reducer.fit_ramp(exposed)
-        for exposed in (
-            detector.expose(image, exposure, seed=1),
-            detector.collect(image, exposure, seed=1),
-        )
+        reducer.fit_ramp(make(image, exposure, seed=1))
+        for make in (detector.expose, detector.collect)
     )
     assert drawn.unit == fitted.unit
     assert set(drawn.meta) == set(fitted.meta)
@@ -249,8 +234,8 @@ def test_images_of_both_go_on_alike():
 
 
 def test_same_seed_same_slopes_on_any_number_of_threads():
-    exposure = exposure_of("miri.f1000w", 20, 1)
-    image = CCDData(np.full(exposure.shape, 11.5), unit="MJy/sr")
+    exposure = mode_of("miri.f1000w", 20, 1)
+    image = sky_of(exposure, 11.5)
     detector, reducer = Detector.miri_imager(STORM), Reducer()
     one, two, other = (
         reducer.replace(n_threads=n).fit_groups(
@@ -261,44 +246,3 @@ def test_same_seed_same_slopes_on_any_number_of_threads():
     for name in ("rate", "var_poisson", "var_read", "n_used", "n_jump", "flags", "jumps"):
         assert_array_equal(getattr(one, name), getattr(two, name))
     assert np.nanmean(one.rate == other.rate) < 0.01
-
-
-def limits(detector, mode, make, *, seed, reducer):
-    """Standard deviation of empty apertures on the mosaic of three dithers, and their errors."""
-    exposures = [exposure_of(*mode, dither=d) for d in range(3)]
-    level = background_level(mode[0]).value
-    ramps = (
-        getattr(detector, make)(CCDData(np.full(e.shape, level), unit="MJy/sr"), e, seed=seed)
-        for e in exposures
-    )
-    wcs = mosaic_wcs(exposures, 0.11 * u.arcsec)
-    mosaic = reducer.run(ramps, wcs=wcs).mosaic
-    ny, nx = mosaic.shape
-    y, x = np.mgrid[20 : ny - 20 : 8, 20 : nx - 20 : 8].reshape(2, -1)
-    at = np.column_stack([x, y])
-    data = mosaic.data * pixel_area_map(wcs, mosaic.shape) * 1e12
-    area = CircularAperture(at, 3.0), CircularAnnulus(at, 5.0, 9.0)
-    inner, ring, lost = (
-        np.asarray(aperture_photometry(values, a)["aperture_sum"])
-        for values, a in (
-            (np.where(mosaic.mask, 0, data), area[0]),
-            (np.where(mosaic.mask, 0, data), area[1]),
-            (np.asarray(mosaic.mask, float), area[1]),
-        )
-    )
-    flux = inner - ring * area[0].area / area[1].area
-    return flux[lost == 0], float(np.mean(mosaic.mask))
-
-
-@pytest.mark.parametrize("mode", [("miri.f770w", 60, 1), ("miri.f2100w", 10, 4)])
-def test_apertures_on_mosaics_reach_the_same_limits(mode):
-    detector, reducer = Detector.miri_imager(Residual("etc")), Reducer()
-    fitted, drawn = (
-        [limits(detector, mode, make, seed=seed, reducer=reducer) for seed in range(4)]
-        for make in ("expose", "collect")
-    )
-    noise = [np.std(np.concatenate([flux for flux, _ in runs])) for runs in (fitted, drawn)]
-    assert len(np.concatenate([flux for flux, _ in drawn])) > 2000
-    assert_allclose(noise[1], noise[0], rtol=0.05)
-    masked = [np.mean([share for _, share in runs]) for runs in (fitted, drawn)]
-    assert_allclose(masked[1], masked[0], atol=1e-3)

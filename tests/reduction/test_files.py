@@ -3,16 +3,16 @@
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.nddata import CCDData, StdDevUncertainty
 from astropy.wcs import WCS
 
 from helpers.errors import refuses
+from helpers.exposures import exposure_of, sky_of
 from helpers.real import real_file
 from helpers.references import write_photom, write_reference
 from miricigale.detector import CosmicRays, Detector, Ramp
-from miricigale.instrument import DQ, Exposure, ImageFacts
+from miricigale.instrument import DQ, ImageFacts
 from miricigale.reduction import (
     BackgroundSettings,
     Reducer,
@@ -29,14 +29,7 @@ RATEINTS = "real/ramps/MIRI_5582_89_S_20180308-010230_SCE1_pipe_rateints.fits.gz
 
 @pytest.fixture
 def exposure():
-    return Exposure(
-        "miri.f1000w",
-        n_groups=12,
-        subarray="SUB64",
-        pointing=SkyCoord(53.1344, -27.8344, unit="deg"),
-        roll=30 * u.deg,
-        dither=1,
-    )
+    return exposure_of(n_groups=12, subarray="SUB64", dither=1)
 
 
 def rate_file(path, exposure, *, unit="DN/s", steps=("S_LINEAR", "S_DARK", "S_RAMP"), **planes):
@@ -54,11 +47,8 @@ def rate_file(path, exposure, *, unit="DN/s", steps=("S_LINEAR", "S_DARK", "S_RA
             **dict.fromkeys(steps, "COMPLETE"),
         }
     )  # fmt: skip
-    science = fits.Header({"BUNIT": unit})
-    for key, value in zip(
-        ("RA_REF", "DEC_REF", "ROLL_REF"), (53.1344, -27.8344, 30.0), strict=True
-    ):
-        science[key] = value
+    pointed = {"RA_REF": 53.1344, "DEC_REF": -27.8344, "ROLL_REF": 30.0}
+    science = fits.Header({"BUNIT": unit, **pointed})
     hdus = [primary, fits.ImageHDU(data, science, name="SCI")]
     planes = {"ERR": np.full(exposure.shape, 0.5), "DQ": dq, **planes}
     for name, plane in planes.items():
@@ -101,12 +91,13 @@ def test_errors_come_from_variances_where_there_are_no_others(tmp_path, exposure
     (file,) = read_images(tmp_path / "a_rate.fits")
     np.testing.assert_allclose(file.image.uncertainty.array, 0.5, rtol=1e-6)
     assert set(file.planes) == {"VAR_POISSON", "VAR_RNOISE"}
-    rate_file(tmp_path / "b_rate.fits", exposure, VAR_FLAT=np.ones((3, 4)))
-    with pytest.raises(DataError, match=r"must have \(64, 72\) pixels in VAR_FLAT"):
-        read_images(tmp_path / "b_rate.fits")
-    rate_file(tmp_path / "c_rate.fits", exposure, unit="Jy")
-    with pytest.raises(DataError, match="must state in BUNIT that it is a rate"):
-        read_images(tmp_path / "c_rate.fits")
+    for name, options, match in (
+        ("b", {"VAR_FLAT": np.ones((3, 4))}, r"must have \(64, 72\) pixels in VAR_FLAT"),
+        ("c", {"unit": "Jy"}, "must state in BUNIT that it is a rate"),
+    ):
+        path = tmp_path / f"{name}_rate.fits"
+        rate_file(path, exposure, **options)
+        refuses(match, read_images, path, error=DataError)
 
 
 def test_what_was_done_to_a_rate_is_not_done_again(tmp_path, exposure):
@@ -186,8 +177,7 @@ def test_real_rates_of_integrations_and_their_mean():
 
 
 def test_files_that_are_written_are_read_by_others(tmp_path, exposure):
-    sky = CCDData(np.full(exposure.shape, 30.0), unit="MJy/sr")
-    ramp = Detector.miri_imager().expose(sky, exposure, seed=1)
+    ramp = Detector.miri_imager().expose(sky_of(exposure, 30.0), exposure, seed=1)
     uncal = ramp.write(tmp_path / "a_uncal.fits")
     assert isinstance(open_exposure(uncal), Ramp)
     reducer = Reducer()
@@ -231,8 +221,8 @@ def test_what_is_no_image_is_refused(tmp_path):
     hdus = fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(np.ones((3, 3)), name="SCI")])
     hdus[0].header["INSTRUME"] = "NIRCAM"
     hdus.writeto(tmp_path / "nircam.fits")
-    with pytest.raises(DataError, match="must be of the MIRI imager, got NIRCAM None"):
-        read_images(tmp_path / "nircam.fits")
+    wanted = "must be of the MIRI imager, got NIRCAM MIRIMAGE"
+    refuses(wanted, read_images, tmp_path / "nircam.fits", error=DataError)
     refuses("'exposure' must be a Ramp, a Charge, CCDData or a path", Reducer().reduce, 3)
     image = CCDData(np.ones((4, 4)), unit="Jy", uncertainty=StdDevUncertainty(np.ones((4, 4))))
     refuses("'exposure' must be in adu / s or MJy / sr, got Jy", Reducer().reduce, image)
@@ -240,8 +230,8 @@ def test_what_is_no_image_is_refused(tmp_path):
 
 def test_slopes_have_their_two_variances_and_those_of_each_integration(exposure, tmp_path):
     exposure = exposure.replace(n_integrations=3)
-    sky = CCDData(np.full(exposure.shape, 12.0), unit="MJy/sr")
-    ramp = Detector.miri_imager().without(CosmicRays).expose(sky, exposure, seed=2)
+    detector = Detector.miri_imager().without(CosmicRays)
+    ramp = detector.expose(sky_of(exposure, 12.0), exposure, seed=2)
     reducer = Reducer(jump_threshold=None)
     rate = reducer.fit_ramp(ramp, planes=True)
     np.testing.assert_array_equal(rate.image.data, reducer.fit_ramp(ramp).data)

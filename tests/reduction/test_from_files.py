@@ -4,13 +4,13 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
-from astropy.nddata import CCDData
 from astropy.table import Table
 
 from helpers.errors import refuses
+from helpers.exposures import exposure_of, sky_of
 from miricigale.cli import main
 from miricigale.detector import Detector
-from miricigale.instrument import Exposure, background_level
+from miricigale.instrument import background_level
 from miricigale.reduction import BackgroundSettings, Reducer, read_images, reduce_files, write_image
 from miricigale.utils.exceptions import MiricigaleWarning
 
@@ -22,17 +22,12 @@ def files(tmp_path_factory):
     paths = []
     for name, n_dithers in (("miri.f770w", 3), ("miri.f1000w", 1)):
         for dither in range(n_dithers):
-            exposure = Exposure(
-                name,
-                n_groups=10,
-                subarray="SUB64",
-                pointing=SkyCoord(53.1344 + 1e-4 * dither, -27.8344, unit="deg"),
-                roll=30 * u.deg,
-                dither=dither,
-            )
+            pointing = SkyCoord(53.1344 + 1e-4 * dither, -27.8344, unit="deg")
+            options = {"n_groups": 10, "subarray": "SUB64", "dither": dither}
+            exposure = exposure_of(name, pointing=pointing, **options)
             light = np.full(exposure.shape, background_level(name).value)
             light[30:33, 40:43] += 500
-            ramp = Detector.miri_imager().expose(CCDData(light, unit="MJy/sr"), exposure, seed=1)
+            ramp = Detector.miri_imager().expose(sky_of(exposure, light), exposure, seed=1)
             stem = f"{name[5:]}_{dither}"
             if dither == 1:
                 rate = Reducer().fit_ramp(ramp)
@@ -98,17 +93,8 @@ def test_wrong_arguments_are_named(files, tmp_path, capsys):
     refuses("'paths' must be at least one file, got none", reduce_files, [], tmp_path)
     with pytest.raises(ValueError, match="files of different names, got two of f770w_0"):
         reduce_files([files[0], tmp_path / "f770w_0_cal.fits"], tmp_path)
-    arguments = [
-        "reduce",
-        str(files[0]),
-        "-o",
-        str(tmp_path),
-        "--gain",
-        "4",
-        "--references",
-        "none",
-    ]
-    assert main(arguments) != 0
+    arguments = ["reduce", str(files[0]), "-o", str(tmp_path)]
+    assert main([*arguments, "--gain", "4", "--references", "none"]) != 0
     assert "only one of these" in capsys.readouterr().err
 
 
@@ -133,21 +119,13 @@ def test_without_references_there_are_slopes_alone(files, tmp_path):
 
 
 def test_slopes_of_each_integration_on_demand(tmp_path):
-    exposure = Exposure(
-        "miri.f770w",
-        n_groups=10,
-        n_integrations=2,
-        subarray="SUB64",
-        pointing=SkyCoord(53.1344, -27.8344, unit="deg"),
-        roll=30 * u.deg,
-    )
-    sky = CCDData(np.full(exposure.shape, 5.0), unit="MJy/sr")
-    path = Detector.miri_imager().expose(sky, exposure, seed=1).write(tmp_path / "a_uncal.fits")
+    exposure = exposure_of("miri.f770w", n_groups=10, n_integrations=2, subarray="SUB64")
+    ramp = Detector.miri_imager().expose(sky_of(exposure, 5.0), exposure, seed=1)
+    path = ramp.write(tmp_path / "a_uncal.fits")
     arguments = ["reduce", str(path), "-o", str(tmp_path / "out"), "--no-progress"]
     assert main([*arguments, "--rateints"]) == 0
-    rate, *parts = read_images(tmp_path / "out/a_rate.fits") + read_images(
-        tmp_path / "out/a_rateints.fits"
-    )
+    out = tmp_path / "out"
+    rate, *parts = read_images(out / "a_rate.fits") + read_images(out / "a_rateints.fits")
     assert len(parts) == 2
     for file in (rate, *parts):
         assert {"VAR_POISSON", "VAR_RNOISE"} <= set(file.planes)
@@ -156,4 +134,4 @@ def test_slopes_of_each_integration_on_demand(tmp_path):
     ratio = parts[0].image.uncertainty.array[good] / rate.image.uncertainty.array[good]
     assert np.median(ratio) == pytest.approx(np.sqrt(2), rel=0.02)
     assert main(arguments) == 0
-    assert Table.read(tmp_path / "out/files.ecsv")["status"][0] == "reduced"
+    assert Table.read(out / "files.ecsv")["status"][0] == "reduced"

@@ -1,28 +1,18 @@
-import astropy.units as u
 import numpy as np
 import pytest
-from astropy.coordinates import SkyCoord
-from astropy.nddata import CCDData
 
 from helpers.errors import refuses
+from helpers.exposures import exposure_of, sky_of
 from miricigale.detector import Detector, InterpixelCapacitance, Ramp
-from miricigale.instrument import DQ, Exposure, miri_detector, reference_pixel_mask
+from miricigale.instrument import DQ, miri_detector, reference_pixel_mask
 from miricigale.reduction import Reducer, measure_noise
 from miricigale.utils.exceptions import MiricigaleWarning
 
 
 def expose(n_groups, light, properties, *, n_int=1, seed=1):
-    exposure = Exposure(
-        "miri.f1000w",
-        n_groups=n_groups,
-        n_integrations=n_int,
-        subarray="SUB256",
-        pointing=SkyCoord(53.1344, -27.8344, unit="deg"),
-        roll=30 * u.deg,
-    )
-    sky = CCDData(np.broadcast_to(light, exposure.shape).copy(), unit="MJy/sr")
+    exposure = exposure_of(n_groups=n_groups, n_integrations=n_int)
     detector = Detector.miri_imager(properties=properties).without(InterpixelCapacitance)
-    return detector.expose(sky, exposure, seed=seed, n_threads=1)
+    return detector.expose(sky_of(exposure, light), exposure, seed=seed, n_threads=1)
 
 
 @pytest.mark.parametrize(("gain", "read_noise"), [(4.0, 6.0), (2.5, 9.0)])
@@ -46,14 +36,7 @@ def test_one_brightness_tells_the_sum_of_what_grows_with_time():
 def drawn(seed, *, light, slow, n_int=2, n_groups=40, gain=5.0, read=5.0):
     """A ramp of SUB64 whose read-out has slow noise, in light that all pixels see alike."""
     rng = np.random.default_rng(seed)
-    exposure = Exposure(
-        "miri.f1000w",
-        n_groups=n_groups,
-        n_integrations=n_int,
-        subarray="SUB64",
-        pointing=SkyCoord(53.1344, -27.8344, unit="deg"),
-        roll=30 * u.deg,
-    )
+    exposure = exposure_of(n_groups=n_groups, n_integrations=n_int, subarray="SUB64")
     shape = (n_int, n_groups, *exposure.shape)
     steps = rng.normal(0, slow, shape)
     sees = ~reference_pixel_mask(subarray="SUB64")

@@ -6,6 +6,9 @@ from astropy.nddata import CCDData, StdDevUncertainty
 from reproject import reproject_exact
 
 from helpers.errors import refuses
+from helpers.exposures import FIELD as CENTER
+from helpers.exposures import gaussians
+from helpers.exposures import image_of as make
 from miricigale.instrument import DQ, imager_wcs, mosaic_wcs, north_up_wcs, pixel_area_map
 from miricigale.reduction import (
     drizzle_images,
@@ -15,15 +18,7 @@ from miricigale.reduction import (
     weight_map,
 )
 
-CENTER = SkyCoord(53.1344, -27.8344, unit="deg")
 FULL = (1024, 1032)
-
-
-def make(data, wcs, error=1.0, mask=None, **meta):
-    error = np.broadcast_to(np.float32(error), data.shape).copy()
-    return CCDData(
-        data, unit="MJy/sr", uncertainty=StdDevUncertainty(error), mask=mask, wcs=wcs, meta=meta
-    )
 
 
 def small_wcs(dx=0.0, dy=0.0, angle=30.0, shape=(150, 160)):
@@ -71,14 +66,12 @@ def test_agrees_with_reproject_exact(scale):
 @pytest.mark.parametrize("scale", [0.06, 0.11])
 def test_flux_of_point_sources_is_conserved_through_the_distortion(scale):
     rng = np.random.default_rng(5)
-    images, truth = [], None
-    sky = None
+    images, grid = [], np.mgrid[100:920:160, 100:920:160].reshape(2, -1)
+    sky = imager_wcs(CENTER, 30 * u.deg).pixel_to_world(*(grid + rng.uniform(-5, 5, grid.shape)))
+    truth = rng.uniform(10, 100, grid.shape[1])
     for step in range(3):
         wcs = imager_wcs(SkyCoord(CENTER.ra + step * 1.1 * u.arcsec, CENTER.dec), 30 * u.deg)
-        if sky is None:
-            grid = np.mgrid[100:920:160, 100:920:160].reshape(2, -1)
-            sky = wcs.pixel_to_world(*(grid + rng.uniform(-5, 5, grid.shape)))
-            truth = rng.uniform(10, 100, grid.shape[1])
+        wcs.pixel_shape = FULL[::-1]
         area = pixel_area_map(wcs, FULL)
         data = np.zeros(FULL)
         for x, y, flux in zip(*wcs.world_to_pixel(sky), truth, strict=True):
@@ -89,7 +82,7 @@ def test_flux_of_point_sources_is_conserved_through_the_distortion(scale):
             # flux over solid angle: sum(brightness * area) is the flux
             data[part] += flux * stamp / stamp.sum() / area[part]
         images.append(make(data, wcs, error=1e3))
-    out = mosaic_wcs(images_wcs(images), scale * u.arcsec)
+    out = mosaic_wcs([im.wcs for im in images], scale * u.arcsec)
     mosaic = drizzle_images(images, out)
     light = np.nan_to_num(mosaic.image.data) * pixel_area_map(out, out.pixel_shape[::-1])
     yy, xx = np.mgrid[: light.shape[0], : light.shape[1]]
@@ -100,13 +93,6 @@ def test_flux_of_point_sources_is_conserved_through_the_distortion(scale):
         assert light[part].sum() == pytest.approx(flux, rel=1e-5)
         center = np.average(xx[part], weights=light[part])
         assert center == pytest.approx(float(x), abs=0.02)
-
-
-def images_wcs(images):
-    """WCS of each image, with its shape."""
-    for im in images:
-        im.wcs.pixel_shape = im.shape[::-1]
-    return [im.wcs for im in images]
 
 
 def test_variances_are_those_of_many_draws():
@@ -175,11 +161,9 @@ def test_weights_do_not_follow_the_data():
     wcs = small_wcs()
     data = np.full((150, 160), 50.0)
     data[60:70, 60:70] += 1000
-    images = []
-    for _ in range(4):
-        counts = rng.poisson(data).astype(float)
-        # errors as an observer has them, from the counts themselves
-        images.append(make(counts, wcs, error=np.sqrt(np.maximum(counts, 1))))
+    # errors as an observer has them, from the counts themselves
+    draws = rng.poisson(data, (4, *data.shape)).astype(float)
+    images = [make(counts, wcs, error=np.sqrt(np.maximum(counts, 1))) for counts in draws]
     assert np.ptp(weight_map(images[0])) / weight_map(images[0]).mean() < 0.2
     mosaic = drizzle_images(images, mosaic_wcs([wcs], 0.11 * u.arcsec)).image
     sky = np.concatenate([mosaic.data[60:85, 60:120].ravel(), mosaic.data[110:120, 60:120].ravel()])
@@ -196,10 +180,7 @@ def test_outliers_are_masked_and_stars_are_not():
     images, where = [], []
     for shift in shifts:
         wcs = small_wcs(*shift)
-        yy, xx = np.mgrid[:150, :160]
-        data = np.zeros((150, 160))
-        for x, y, peak in zip(*wcs.world_to_pixel(sky), peaks, strict=True):
-            data += peak * np.exp(-0.5 * ((xx - x) ** 2 + (yy - y) ** 2) / 0.95**2)
+        data = gaussians((150, 160), *wcs.world_to_pixel(sky), peaks, 0.95)
         stars = data > 1
         error = np.sqrt(1 + data / 50)
         data = data + rng.normal(size=data.shape) * error
@@ -254,8 +235,8 @@ def test_refuses_what_cannot_be_put_together():
     refuses("'images' must be at least one image", drizzle_images, [], grid)
     other = CCDData(good.data, unit="Jy", wcs=wcs, uncertainty=StdDevUncertainty(good.data))
     refuses("'images' must be in one unit", drizzle_images, [good, other], grid)
-    with pytest.raises(ValueError, match="'images' must be CCDData with uncertainty and WCS"):
-        drizzle_images([CCDData(good.data, unit="Jy")], grid)
+    plain = [CCDData(good.data, unit="Jy")]
+    refuses("'images' must be CCDData with uncertainty and WCS", drizzle_images, plain, grid)
     refuses("'pixfrac' must be above 0", drizzle_images, [good], grid, pixfrac=0)
     bare = grid.deepcopy()
     bare.pixel_shape = None

@@ -1,18 +1,16 @@
 """Ramps of another detector, with its reference files in the form of CRDS."""
 
-import astropy.units as u
 import numpy as np
 import pytest
-from astropy.coordinates import SkyCoord
 from astropy.io import fits
-from astropy.nddata import CCDData
 from numpy.polynomial import Polynomial
 
 from helpers.errors import refuses
+from helpers.exposures import exposure_of, sky_of
 from helpers.real import real_file
 from helpers.references import write_photom, write_reference
 from miricigale.detector import CosmicRays, Detector, InterpixelCapacitance, Ramp, ResetAnomaly
-from miricigale.instrument import DQ, Exposure, field_mask, flat_field, miri_detector, photmjsr
+from miricigale.instrument import DQ, field_mask, flat_field, miri_detector, photmjsr
 from miricigale.reduction import RampSettings, Reducer, ReferenceFiles
 from miricigale.reduction.reference_maps import read_photom
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
@@ -30,14 +28,7 @@ OTHER = miri_detector().replace(
 
 @pytest.fixture(scope="module")
 def exposure():
-    return Exposure(
-        "miri.f1000w",
-        n_groups=30,
-        n_integrations=2,
-        subarray="SUB256",
-        pointing=SkyCoord(53.1344, -27.8344, unit="deg"),
-        roll=30 * u.deg,
-    )
+    return exposure_of(n_groups=30, n_integrations=2)
 
 
 @pytest.fixture(scope="module")
@@ -47,9 +38,8 @@ def ramp(exposure):
     light[40:210:17, 60:230:17] = 660.0
     anomaly = ResetAnomaly((-60.0, -40.0))
     detector = Detector.miri_imager(anomaly, properties=OTHER)
-    return detector.without(CosmicRays, InterpixelCapacitance).expose(
-        CCDData(light, unit="MJy/sr"), exposure, seed=4, n_threads=1
-    )
+    detector = detector.without(CosmicRays, InterpixelCapacitance)
+    return detector.expose(sky_of(exposure, light), exposure, seed=4, n_threads=1)
 
 
 @pytest.fixture(scope="module")

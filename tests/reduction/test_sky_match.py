@@ -1,28 +1,20 @@
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.coordinates import SkyCoord
-from astropy.nddata import CCDData, StdDevUncertainty
 
+from helpers.exposures import FIELD, gaussians, image_of
 from miricigale.instrument import DQ, mosaic_wcs, north_up_wcs
 from miricigale.reduction import MosaicSettings, Reducer, match_levels, sky_offsets
 
-CENTER = SkyCoord(53.1344, -27.8344, unit="deg")
 SHAPE = (160, 170)
 
 
 def dither(dx, dy, level, *, rng, sources=()):
-    wcs = north_up_wcs(CENTER, 0.11 * u.arcsec, SHAPE)
+    wcs = north_up_wcs(FIELD, 0.11 * u.arcsec, SHAPE)
     wcs.wcs.crpix = wcs.wcs.crpix - [dx, dy]
-    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
-    data = level + rng.normal(size=SHAPE)
-    for x0, y0, peak in sources:
-        data += peak * np.exp(-0.5 * ((x + dx - x0) ** 2 + (y + dy - y0) ** 2) / 1.5**2)
-    error = StdDevUncertainty(np.ones(SHAPE))
-    meta = {"filter": "miri.f770w"}
-    return CCDData(
-        data, unit="MJy/sr", uncertainty=error, mask=np.zeros(SHAPE, bool), wcs=wcs, meta=meta
-    )
+    x, y, peaks = np.reshape(sources, (-1, 3)).T
+    data = level + rng.normal(size=SHAPE) + gaussians(SHAPE, x - dx, y - dy, peaks, 1.5)
+    return image_of(data, wcs, filter="miri.f770w")
 
 
 def test_levels_are_those_put_in_whatever_the_sources():

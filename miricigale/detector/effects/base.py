@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from miricigale.instrument import DetectorProperties, Exposure
+from miricigale.instrument import DetectorProperties, Exposure, reference_pixel_mask
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.random import stream
 
@@ -49,8 +49,12 @@ class Block:
     def total_time(self):
         """Time during which charge is collected in all integrations in s."""
         exposure = self.exposure
-        group_time = exposure.group_time.to_value("s")
-        return exposure.n_integrations * exposure.n_groups * group_time
+        return exposure.n_integrations * exposure.n_groups * exposure.group_time.to_value("s")
+
+    @property
+    def reference(self):
+        """True where a pixel is a reference pixel, (n_row, n_col)."""
+        return reference_pixel_mask(subarray=self.exposure.subarray)[self.rows]
 
     @property
     def ramp_shape(self):

@@ -14,7 +14,7 @@ from miricigale.detector._core.charge import (
 )
 from miricigale.detector._core.readout import clip_well
 from miricigale.detector.effects.base import Effect, check_amounts, check_share
-from miricigale.instrument import DQ, bad_pixel_mask, reference_pixel_mask
+from miricigale.instrument import DQ, bad_pixel_mask
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import TIME, to_array
 
@@ -205,10 +205,9 @@ class Persistence(Effect):
         if not self.amplitudes or len(self.amplitudes) != len(self.times):
             got = f"{len(self.amplitudes)} and {len(self.times)}"
             raise argument_error("amplitudes, times", "of one length, at least one each", got)
-        if not all(0 <= a <= 1 for a in self.amplitudes):
-            raise argument_error("amplitudes", "shares from 0 to 1", self.amplitudes)
-        if not all(np.isfinite(t) and t > 0 for t in self.times):
-            raise argument_error("times", "positive", self.times)
+        for amplitude, time in zip(self.amplitudes, self.times, strict=True):
+            check_share("amplitudes", amplitude)
+            check_amounts(above_zero=True, times=time)
 
     def released(self, exposure, gap):
         """
@@ -242,8 +241,7 @@ class Persistence(Effect):
         """Add the charge that comes free."""
         if not block.previous:
             return ramp
-        rates = np.stack([latent.rate.value[block.rows] for latent in block.previous])
-        released = self._released(block)
+        rates, released = self._left(block)
         if released.shape[1:] != block.ramp_shape[:2]:
             # all groups as one
             released = released.sum(axis=(1, 2), keepdims=True)
@@ -254,12 +252,13 @@ class Persistence(Effect):
         """Add the mean rate over all groups, where previous exposures are given."""
         if not block.previous:
             return array
-        rates = [latent.rate.value[block.rows] for latent in block.previous]
-        released = self._released(block).sum(axis=(1, 2))
-        return array + np.tensordot(released, rates, 1) / block.total_time
+        rates, released = self._left(block)
+        return array + np.tensordot(released.sum(axis=(1, 2)), rates, 1) / block.total_time
 
-    def _released(self, block):
-        return np.stack([self.released(block.exposure, latent.gap) for latent in block.previous])
+    def _left(self, block):
+        """Former rates of the rows of a block, and what comes free of one of 1, for each exposure before."""
+        rates = np.stack([latent.rate.value[block.rows] for latent in block.previous])
+        return rates, np.stack([self.released(block.exposure, one.gap) for one in block.previous])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -315,15 +314,13 @@ class ReferencePixels(Effect):
 
     def apply(self, ramp, block):
         """Empty the reference columns."""
-        mask = reference_pixel_mask(subarray=block.exposure.subarray)[block.rows]
-        ramp[:, :, mask] = 0.0
-        block.pixel_dq[mask] |= np.uint32(DQ.REFERENCE_PIXEL | DQ.NON_SCIENCE)
+        ramp[:, :, block.reference] = 0.0
+        block.pixel_dq[block.reference] |= np.uint32(DQ.REFERENCE_PIXEL | DQ.NON_SCIENCE)
         return ramp
 
     def expected(self, array, block):
         """NaN: they are no part of the image."""
-        mask = reference_pixel_mask(subarray=block.exposure.subarray)[block.rows]
-        return np.where(mask, np.nan, array)
+        return np.where(block.reference, np.nan, array)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,9 +8,9 @@ from scipy.ndimage import gaussian_filter1d
 from miricigale.depth import residual_amplitude, residual_presets
 from miricigale.detector._core.charge import add_poisson
 from miricigale.detector._core.random import standard_normals
-from miricigale.detector.effects.base import Effect, key_words
+from miricigale.detector.effects.base import Effect, check_share, key_words
 from miricigale.instrument import electrons_per_brightness, flat_field
-from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.exceptions import unknown_name
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,10 +41,9 @@ class Residual(Effect):
         if isinstance(self.amplitude, str):
             if self.amplitude not in residual_presets():
                 raise unknown_name("residual preset", self.amplitude, residual_presets())
-        elif not 0 <= self.amplitude < 0.2:
-            raise argument_error("amplitude", "a fraction from 0 to 0.2", self.amplitude)
-        if not 0 <= self.correlation <= 30:
-            raise argument_error("correlation", "from 0 to 30 pixels", self.correlation)
+        else:
+            check_share("amplitude", self.amplitude, 0.2)
+        check_share("correlation", self.correlation, 30)
 
     def apply(self, array, block):
         """Multiply surface brightness by the pattern."""

@@ -21,14 +21,8 @@ import dataclasses
 import numpy as np
 
 from miricigale.detector._core.readout import pull_last_group
-from miricigale.detector.effects.base import Effect, check_finite
-from miricigale.instrument import reference_pixel_mask
+from miricigale.detector.effects.base import Effect, check_amounts, check_finite, check_share
 from miricigale.utils.exceptions import argument_error
-
-
-def _light_sensitive(block):
-    """True where a pixel is no reference pixel, (n_row, n_col)."""
-    return ~reference_pixel_mask(subarray=block.exposure.subarray)[block.rows]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,8 +55,7 @@ class ResetAnomaly(Effect):
         if not amplitudes:
             raise argument_error("amplitudes", "at least one amplitude", "none")
         check_finite(amplitudes=amplitudes)
-        if not (np.isfinite(self.groups) and self.groups > 0):
-            raise argument_error("groups", "positive", self.groups)
+        check_amounts(above_zero=True, groups=self.groups)
 
     def offsets(self, n_integrations, n_groups):
         """
@@ -85,7 +78,7 @@ class ResetAnomaly(Effect):
     def apply(self, ramp, block):
         """Add the offsets."""
         offsets = self.offsets(*ramp.shape[:2]).astype(np.float32)
-        sees = _light_sensitive(block).astype(np.float32)
+        sees = (~block.reference).astype(np.float32)
         for i, g in np.ndindex(*offsets.shape):
             ramp[i, g] += offsets[i, g] * sees
         return ramp
@@ -115,12 +108,11 @@ class ResetDecay(Effect):
     def __post_init__(self):
         if not -1 < self.share < 1:
             raise argument_error("share", "between -1 and 1", self.share)
-        if not (np.isfinite(self.groups) and self.groups > 0):
-            raise argument_error("groups", "positive", self.groups)
+        check_amounts(above_zero=True, groups=self.groups)
 
     def apply(self, ramp, block):
         """Offset the groups of all integrations but the first."""
-        sees = _light_sensitive(block)
+        sees = ~block.reference
         decay = (self.share * np.exp(-np.arange(ramp.shape[1]) / self.groups)).astype(np.float32)
         # the last first: what an integration is offset by is of the one before as it was
         for i in range(ramp.shape[0] - 1, 0, -1):
@@ -148,7 +140,7 @@ class FirstFrame(Effect):
 
     def apply(self, ramp, block):
         """Offset the first groups."""
-        ramp[:, 0] += np.float32(self.offset) * _light_sensitive(block).astype(np.float32)
+        ramp[:, 0] += np.float32(self.offset) * (~block.reference).astype(np.float32)
         return ramp
 
 
@@ -178,12 +170,11 @@ class LastFrame(Effect):
 
     def __post_init__(self):
         check_finite(offset=self.offset)
-        if not 0 <= self.coupling < 1:
-            raise argument_error("coupling", "a share from 0 to 1", self.coupling)
+        check_share("coupling", self.coupling)
 
     def apply(self, ramp, block):
         """Pull the last groups."""
-        sees = _light_sensitive(block)
+        sees = ~block.reference
         pull_last_group(
             ramp, sees, block.rows.start, np.float32(self.offset), np.float32(self.coupling)
         )

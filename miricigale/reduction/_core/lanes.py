@@ -16,7 +16,6 @@ from miricigale.reduction._core.pixel import (
     cut_by_flags,
     gather,
     no_slope,
-    polynomial,
     store,
     weights,
 )
@@ -200,50 +199,6 @@ def settle(lanes, n_int, scale, threshold, events, n_event, free, out):
     return n_free, events, n_event
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def _gather_lanes(data, levels, response, ys, xs, g0, g1, scratch, d, top):
-    """Linear differences (n_diff of all integrations, LANES) of some pixels, and their highest DN."""
-    drift, bias, reset = levels
-    coefficients, _, dark = response
-    coef, start, level, value, before = scratch
-    n_coef = coefficients.shape[0]
-    n = ys.size
-    rows = ys if drift.shape[2] > 1 else np.zeros_like(ys)
-    channels = xs % drift.shape[3]
-    for b in range(n):
-        start[b] = at(bias, ys[b], xs[b])
-        top[b] = 0.0
-        for j in range(n_coef):
-            coef[j, b] = at(coefficients[j], ys[b], xs[b])
-    i = -1
-    for k in range(data.shape[0]):
-        for g in range(g1):
-            plane = data[k, g]
-            shift = drift[k, g]
-            for b in range(n):
-                raw = float(plane[ys[b], xs[b]])
-                top[b] = raw if raw > top[b] else top[b]
-                level[b] = raw - (shift[rows[b], channels[b]] + start[b])
-            # groups before the first count for the saturation alone
-            if g < g0:
-                continue
-            if g < reset.shape[1]:
-                plane = reset[min(k, reset.shape[0] - 1), g]
-                for b in range(n):
-                    level[b] -= plane[ys[b], xs[b]]
-            polynomial(coef, level, value)
-            if dark.shape[1] > 0:
-                plane = dark[min(k, dark.shape[0] - 1), g]
-                for b in range(n):
-                    value[b] -= plane[ys[b], xs[b]]
-            if g > g0:
-                i += 1
-                for b in range(LANES):
-                    d[i, b] = value[b] - before[b]
-            for b in range(LANES):
-                before[b] = value[b]
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
 def refit(ramp, group_dq, ys, xs, start, cuts, fit, out):
     """
@@ -259,16 +214,6 @@ def refit(ramp, group_dq, ys, xs, start, cuts, fit, out):
     variance, inv_gain, slow = noise
     n_int = data.shape[0]
     n_diff = g1 - g0 - 1
-    coefficients, limits, _ = response
-    scratch = (
-        np.zeros((coefficients.shape[0], LANES)),
-        np.zeros(LANES),
-        np.zeros(LANES),
-        np.zeros(LANES),
-        np.zeros(LANES),
-    )
-    gathered = np.empty((n_int * n_diff, LANES))
-    top = np.empty(LANES)
     d = np.empty(n_int * n_diff)
     cut = np.empty(n_int * n_diff, np.bool_)
     valid = np.empty(n_int, np.int64)
@@ -284,19 +229,7 @@ def refit(ramp, group_dq, ys, xs, start, cuts, fit, out):
             continue
         y = ys[i]
         x = xs[i]
-        b = i % LANES
-        if b == 0:
-            some = slice(i, min(i + LANES, ys.size))
-            _gather_lanes(
-                data, levels, response, ys[some], xs[some], g0, g1, scratch, gathered, top
-            )
-        saturated = top[b] >= at(limits, y, x)
-        if saturated:
-            gather(data, levels, response, y, x, g0, g1, d, valid)
-        else:
-            valid[:] = n_diff
-            for j in range(d.size):
-                d[j] = gathered[j, b]
+        saturated = gather(data, levels, response, y, x, g0, g1, d, valid)
         cut[:] = False
         full, jumped = cut_by_flags(group_dq, y, x, g0, g1, cut, valid)
         flags = SATURATED if saturated or full else 0

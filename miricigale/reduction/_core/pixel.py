@@ -24,29 +24,6 @@ def at(values, y, x):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def level_of(levels, k, g, y, x):
-    """DN of an empty pixel in a group: drift of the read-out, bias and reset anomaly."""
-    drift, bias, reset = levels
-    row = y if drift.shape[2] > 1 else 0
-    channel = x % drift.shape[3]
-    value = drift[k, g, row, channel] + at(bias, y, x)
-    if g < reset.shape[1]:
-        value += reset[min(k, reset.shape[0] - 1), g, y, x]
-    return value
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def linear(value, coef, y, x):
-    """Linearity polynomial of a pixel, coefficients ascending, (n, 1, 1) or (n, ny, nx)."""
-    row = y if coef.shape[1] > 1 else 0
-    column = x if coef.shape[2] > 1 else 0
-    out = coef[coef.shape[0] - 1, row, column]
-    for k in range(coef.shape[0] - 2, -1, -1):
-        out = out * value + coef[k, row, column]
-    return out
-
-
-@njit(cache=True, error_model="numpy", inline="always")
 def polynomial(coef, level, value):
     """Linearity polynomial of many pixels at once, coefficients ascending (n, n_pixel), into ``value``."""
     n = value.size
@@ -112,13 +89,20 @@ def own_charge(jumps, nx, n_diff):
     return own - LEAK * leaked
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def gather(data, levels, response, y, x, g0, g1, d, valid):
     """Linear differences of one pixel, and how many are usable in each integration."""
-    coef, limits, dark = response
+    drift, bias, reset = levels
+    coefficients, limits, dark = response
     n_int = data.shape[0]
     n_diff = g1 - g0 - 1
-    saturation = at(limits, y, x)
+    # of all groups
+    row = y if drift.shape[2] > 1 else 0
+    channel = x % drift.shape[3]
+    start, saturation = at(bias, y, x), at(limits, y, x)
+    coef = np.empty(coefficients.shape[0])
+    for j in range(coef.size):
+        coef[j] = at(coefficients[j], y, x)
     saturated = False
     for k in range(n_int):
         valid[k] = n_diff
@@ -128,7 +112,12 @@ def gather(data, levels, response, y, x, g0, g1, d, valid):
             if raw >= saturation and valid[k] == n_diff:
                 valid[k] = max(g - g0 - 1, 0)
                 saturated = True
-            value = linear(raw - level_of(levels, k, g, y, x), coef, y, x)
+            level = raw - (drift[k, g, row, channel] + start)
+            if g < reset.shape[1]:
+                level -= reset[min(k, reset.shape[0] - 1), g, y, x]
+            value = coef[-1]
+            for j in range(coef.size - 2, -1, -1):
+                value = value * level + coef[j]
             if dark.shape[1] > 0:
                 value -= dark[min(k, dark.shape[0] - 1), g, y, x]
             if g > g0:
