@@ -64,12 +64,8 @@ def package(fit, diagnostics, new_xy, catalog, meta):
     chi2, left = np.full(n_all, np.nan), np.full(n_all, np.nan)
     joint = scipy.sparse.csr_array((2 * n_all, 2 * n_all))
     if len(fit.rows):
-        found = fit_covariances(fit, diagnostics.correlation)
-        common, blending[fit.rows] = found.common, found.blending
-        terms = [
-            _by_source(one, place[fit.rows], main[fit.rows], n_all)
-            for one in (found.noise, found.template, _outer(found.psf, found.noise))
-        ]
+        *covariances, common, blending[fit.rows] = fit_covariances(fit, diagnostics.correlation)
+        terms = [_by_source(one, place[fit.rows], main[fit.rows], n_all) for one in covariances]
         joint = terms[0] + terms[1] + terms[2]
         measured = fit.rows[main[fit.rows]]
         flux[place[measured]] = fit.total[measured]
@@ -137,13 +133,6 @@ def _by_source(covariance, place, main, n):
     found = (gather @ covariance @ gather.T).tocsr()
     found.sort_indices()
     return found
-
-
-def _outer(error, pattern):
-    """Covariance of errors that go together, for the pairs of a pattern."""
-    coo = pattern.tocoo()
-    data = error[coo.row] * error[coo.col]
-    return scipy.sparse.coo_array((data, (coo.row, coo.col)), shape=pattern.shape).tocsr()
 
 
 def _components(fit, catalog, joint, place, n_all):

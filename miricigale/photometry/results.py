@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import numbers
 from typing import ClassVar
 
 import astropy.units as u
@@ -24,7 +23,7 @@ from miricigale.utils.interactive import Tabular
 from miricigale.utils.random import check_seed
 from miricigale.utils.tables import described_table, error_column
 from miricigale.utils.unified import read_write
-from miricigale.utils.units import ANGLE, FNU
+from miricigale.utils.units import ANGLE, FNU, check_count
 
 
 def crowded(sky, flux, *, radius=2 * u.arcsec):
@@ -230,8 +229,7 @@ class ForcedPhotometryResult(Tabular):
         ValueError
             If ``size`` is not positive, or points are wanted that were not fitted.
         """
-        if isinstance(size, bool) or not isinstance(size, numbers.Integral) or size < 1:
-            raise argument_error("size", "an integer of at least 1", repr(size))
+        size = check_count(size, "size")
         if point and self.flux_point is None:
             raise argument_error("point", "False where no second components were fitted", point)
         keys = [("forced flux", key) for key in self.id.tolist()]
@@ -239,7 +237,7 @@ class ForcedPhotometryResult(Tabular):
         if self.joint_covariance is not None:
             covariance = self.joint_covariance
             keys += [("forced point", key) for key in self.id.tolist()]
-        draws = correlated_draws(covariance, keys, int(size), check_seed(seed))
+        draws = correlated_draws(covariance, keys, size, check_seed(seed))
         if point:
             return (self.flux_point.value + draws[:, len(self) :]) * FNU
         return (self.flux.value + draws[:, : len(self)]) * FNU
@@ -260,11 +258,10 @@ class ForcedPhotometryResult(Tabular):
         """
         rows = []
         for key in (first, second):
-            found = np.flatnonzero(self.id == key)
-            if len(found) == 0:
+            if not np.any(self.id == key):
                 msg = f"no source with the id {key!r}"
                 raise KeyError(msg)
-            rows.append(found[0])
+            rows.append(int(np.argmax(self.id == key)))
         errors = self.flux_err.value[rows]
         return float(self.covariance[rows[0], rows[1]] / np.prod(errors))
 
@@ -314,16 +311,14 @@ class ForcedPhotometryResult(Tabular):
         """
         flux, prefix = ("flux", "") if name is None else (name, f"{name}_")
         error, point = error_column(flux), f"{prefix}flux_point"
+        unknown = "Error by what is not known of the template"
         columns = {
             "id": (self.id, "Id of the catalog"),
             "sky": (self.sky, "Position of the catalog"),
             flux: (self.flux, "Total flux"),
             error: (self.flux_err, "1-sigma error of the flux"),
             f"{error}_noise": (self.flux_err_noise, "Error by the image's noise"),
-            f"{error}_template": (
-                self.flux_err_template,
-                "Error by what is not known of the template",
-            ),
+            f"{error}_template": (self.flux_err_template, unknown),
             f"{error}_psf": (self.flux_err_psf, "Error by that of the PSF"),
         }
         texts = {

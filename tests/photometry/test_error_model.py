@@ -259,7 +259,7 @@ def test_foreign_files_are_named(tmp_path):
     with pytest.raises(DataError, match=r"none\.ecsv cannot be read as an error model: no such"):
         ErrorModel.read(tmp_path / "none.ecsv")
     QTable({"a": [1]}).write(tmp_path / "other.ecsv")
-    with pytest.raises(DataError, match=r"other\.ecsv is no error model: .* the columns"):
+    with pytest.raises(DataError, match=r"other\.ecsv is not an error model: .* the columns"):
         ErrorModel.read(tmp_path / "other.ecsv")
 
 

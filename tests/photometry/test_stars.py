@@ -8,8 +8,8 @@ from astropy.wcs import WCS
 from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
-from miricigale.instrument import north_up_wcs
-from miricigale.photometry import ErrorSettings, ForcedPhotometer, psf_photometry
+from helpers.light import gaussian_image
+from miricigale.photometry import psf_photometry
 from miricigale.psf import gaussian_psf, make_psf
 
 SCALE = 0.11
@@ -18,10 +18,7 @@ SCALE = 0.11
 @pytest.fixture(scope="module")
 def psf(tools):
     # integrated over no pixel, as the images are made
-    n = 161
-    x = (np.arange(n) - n // 2) * SCALE / 4
-    data = np.exp(-0.5 * (x[:, None] ** 2 + x**2) / tools.LO**2)
-    data *= 16 * (SCALE / 4) ** 2 / (2 * np.pi * tools.LO**2)
+    data = 16 * gaussian_image(161, 4 * tools.LO / SCALE)
     return make_psf(data, pixel_scale=SCALE * u.arcsec, oversampling=4, frame="sky")
 
 
@@ -29,19 +26,13 @@ def psf(tools):
 def stars(tools):
     """Isolated stars with white noise, one masked, one off the image."""
     rng = np.random.default_rng(8)
-    shape = (300, 300)
-    wcs = north_up_wcs(tools.CENTER, SCALE * u.arcsec, shape)
-    grid = np.linspace(-13, 13, 9)
-    dx, dy = (a.ravel() + rng.uniform(-0.05, 0.05, 81) for a in np.meshgrid(grid, grid))
+    dx, dy = tools.lattice(rng, 9, 3.25, 0.05)
     dx[-1] = 60.0
-    sky = tools.CENTER.spherical_offsets_by(dx * u.arcsec, dy * u.arcsec)
-    flux = 10 ** rng.uniform(1, 2.5, 81)
+    sky, flux = tools.places(dx, dy), 10 ** rng.uniform(1, 2.5, 81)
     sigma = 0.02 / (SCALE**2 * tools.SR * 1e12)
-    image = tools.as_ccd(
-        tools.render(sky, flux, tools.LO, wcs, shape) + rng.normal(0, sigma, shape), wcs, sigma
-    )
-    x, y = wcs.world_to_pixel(sky[0])
-    image.mask = np.zeros(shape, bool)
+    image = tools.picture(sky, flux, (300, 300), sigma=sigma, rng=rng)
+    x, y = image.wcs.world_to_pixel(sky[0])
+    image.mask = np.zeros(image.shape, bool)
     image.mask[int(y) - 12 : int(y) + 13, int(x) - 12 : int(x) + 13] = True
     return image, QTable({"id": np.arange(81) + 500, "sky": sky}), flux
 
@@ -74,9 +65,7 @@ def test_stars_come_back_with_true_errors_and_every_row_stays(stars, psf):
 def test_it_agrees_with_forced_photometry(tools, stars, psf):
     image, catalog, _ = stars
     fixed = psf_photometry(image, psf, catalog, max_shift=None)
-    forced = ForcedPhotometer(
-        tools.kernel, template="psf", errors=ErrorSettings(correlated_noise=False)
-    ).measure(image, catalog=catalog)
+    forced = tools.measured(image, catalog, errors=tools.WHITE)
     good = np.isfinite(fixed["flux"].value)
     assert good.sum() == 79
     assert np.all(fixed["shift"][good] == 0)
@@ -120,7 +109,7 @@ def test_the_psf_is_turned_to_the_image(tools):
 
 def test_neighbors_are_told_and_options_checked(tools, stars, psf):
     image, catalog, _ = stars
-    two = QTable({"sky": tools.CENTER.spherical_offsets_by([0, 0.6] * u.arcsec, [0, 0] * u.arcsec)})
+    two = QTable({"sky": tools.places([0, 0.6])})
     assert psf_photometry(image, psf, two)["neighbor"].tolist() == [True, True]
     narrow = gaussian_psf(0.3 * u.arcsec, pixel_scale=0.03 * u.arcsec, fov=3 * u.arcsec)
     # a PSF on other pixels is brought to the image's
