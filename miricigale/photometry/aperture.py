@@ -75,20 +75,6 @@ def circle_sums(arrays, xy, radius):
     return flux, np.sqrt(noise), coverage
 
 
-def _annulus_levels(arrays, xy, radius, width):
-    """Mode of the flux per pixel in rings from ``radius`` to ``radius + width`` pixels."""
-    # faint sources within the rings raise the median
-    estimate = LocalBackground(radius, radius + width, bkg_estimator=SExtractorBackground())
-    levels = np.zeros(len(xy))
-    ny, nx = arrays.flux.shape
-    reach = radius + width
-    for k, (x, y) in enumerate(xy):
-        if -reach < x < nx + reach and -reach < y < ny + reach:
-            level = float(np.squeeze(estimate(arrays.flux, x, y, mask=~arrays.usable)))
-            levels[k] = level if np.isfinite(level) else 0.0
-    return levels
-
-
 def source_extractor_photometry(image, *, preset="yang2021_miri", stated_on=0.06 * u.arcsec):
     """
     Detect and measure on one image, blind, as Source Extractor does.
@@ -164,5 +150,7 @@ def _measure(arrays, flux, segmentation, catalog, ratio):
     radius = _DIAMETER / 2 / pixel_scale(arrays.wcs)
     xy = np.stack([catalog["x_centroid"], catalog["y_centroid"]], axis=-1)
     aper, aper_err, coverage = circle_sums(arrays, xy, radius)
-    ring = _annulus_levels(arrays, xy, radius, _RING * ratio)
+    # the mode, for faint sources within the rings raise the median
+    mode = LocalBackground(radius, radius + _RING * ratio, bkg_estimator=SExtractorBackground())
+    ring = np.nan_to_num(np.atleast_1d(mode(arrays.flux, *xy.T, mask=~arrays.usable)))
     return auto, auto_err, aper - ring * np.pi * radius**2 * coverage, aper_err

@@ -18,7 +18,6 @@ from miricigale.photometry.draws import correlated_draws
 from miricigale.photometry.fields import SmoothField
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.offsets import OffsetMap
-from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import Tabular
 from miricigale.utils.random import check_seed
 from miricigale.utils.tables import described_table, error_column
@@ -204,7 +203,7 @@ class ForcedPhotometryResult(Tabular):
         chi2 = np.divide(total, weight, out=np.full(total.shape, np.nan), where=usable)
         return Image(chi2, unit="", wcs=image.wcs, mask=~usable, meta=dict(image.meta))
 
-    def sample(self, size, *, seed=None, point=False):
+    def sample(self, size, *, seed=None):
         """
         Draw fluxes from their covariance, so that those of blends vary together.
 
@@ -215,9 +214,6 @@ class ForcedPhotometryResult(Tabular):
         seed : int or `~numpy.random.Generator`, optional
             The same seed gives the same draws, for a source that overlaps no other also in
             another catalog.
-        point : bool, optional
-            Whether the draws of ``flux_point`` are wanted, which belong to those of ``flux`` of the
-            same seed.
 
         Returns
         -------
@@ -227,20 +223,12 @@ class ForcedPhotometryResult(Tabular):
         Raises
         ------
         ValueError
-            If ``size`` is not positive, or points are wanted that were not fitted.
+            If ``size`` is not positive.
         """
         size = check_count(size, "size")
-        if point and self.flux_point is None:
-            raise argument_error("point", "False where no second components were fitted", point)
         keys = [("forced flux", key) for key in self.id.tolist()]
-        covariance = self.covariance
-        if self.joint_covariance is not None:
-            covariance = self.joint_covariance
-            keys += [("forced point", key) for key in self.id.tolist()]
-        draws = correlated_draws(covariance, keys, size, check_seed(seed))
-        if point:
-            return (self.flux_point.value + draws[:, len(self) :]) * FNU
-        return (self.flux.value + draws[:, : len(self)]) * FNU
+        draws = correlated_draws(self.covariance, keys, size, check_seed(seed))
+        return (self.flux.value + draws) * FNU
 
     def correlation(self, first, second):
         """

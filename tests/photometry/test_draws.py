@@ -7,7 +7,6 @@ from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
-from miricigale.photometry import ForcedPhotometer
 from miricigale.photometry.draws import correlated_draws
 
 
@@ -54,24 +53,6 @@ def test_draws_depend_on_the_seed_alone(tools):
     )
     for size in (0, 2.5, True):
         refuses("'size' must be an integer >= 1", result.sample, size)
-    refuses("'point' must be False where no second comp", result.sample, 3, seed=1, point=True)
-
-
-def test_draws_of_components_belong_together(tools):
-    # cov of (total, point) in closed form for a point and a template twice as wide
-    sky, sharp, wide = tools.places([0.0]), np.hypot(0.4, tools.HI), np.hypot(0.4, tools.LO)
-    low = tools.picture(sky, [50.0], (101, 101), width=wide, sigma=0.1)
-    high = tools.picture(sky, [1.0], (201, 201), scale=tools.FINE, width=sharp)
-    high.uncertainty.array[:] = high.data.max() * 1e-4
-    catalog = QTable({"sky": sky, "components": [2]})
-    photometer = ForcedPhotometer(tools.kernel, errors=tools.WHITE)
-    result = photometer.measure(low, high, np.ones((201, 201), int), catalog)
-    total, point = (result.sample(20_000, seed=1, point=k)[:, 0].value for k in (False, True))
-    host = total - point
-    expected = result.joint_covariance.toarray()
-    assert_allclose(np.cov(total, point), expected, rtol=0.05)
-    assert np.corrcoef(host, point)[0, 1] < -0.5
-    assert host.std() > total.std()
 
 
 def test_covariances_that_are_not_positive_keep_their_variances():

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.io.registry import IORegistryError
-from astropy.nddata import CCDData
-from astropy.table import QTable, Table
+from astropy.table import QTable
 from numpy.testing import assert_array_equal
 
 from helpers.errors import refuses
+from helpers.results import assert_equal_values
 from miricigale.instrument import north_up_wcs
 from miricigale.photometry import (
     ErrorModel,
@@ -59,44 +59,9 @@ def check(one, other):
     """Every field of a result, by what kind it is."""
     for name in (field.name for field in dataclasses.fields(one)):
         mine, theirs = getattr(one, name), getattr(other, name)
-        same_value(name, mine, theirs)
+        assert_equal_values(name, mine, theirs)
     assert_array_equal(one.sample(3, seed=1).value, other.sample(3, seed=1).value)
     assert_array_equal(one.chi2_image.data, other.chi2_image.data)
-
-
-def same_value(name, mine, theirs):
-    assert (mine is None) == (theirs is None), name
-    if mine is None:
-        return
-    if isinstance(mine, SkyCoord):
-        assert_array_equal(mine.icrs.ra.deg, theirs.icrs.ra.deg)
-        assert_array_equal(mine.icrs.dec.deg, theirs.icrs.dec.deg)
-    elif isinstance(mine, CCDData):
-        assert mine.unit == theirs.unit
-        assert mine.meta == theirs.meta
-        x = np.array([0.0, 100.0])
-        assert_array_equal(*(one.wcs.pixel_to_world_values(x, x) for one in (mine, theirs)))
-        same_value(name, mine.data, theirs.data)
-        same_value(name, mine.mask, theirs.mask)
-        if mine.uncertainty is not None:
-            same_value(name, mine.uncertainty.array, theirs.uncertainty.array)
-    elif isinstance(mine, Table):
-        assert mine.colnames == theirs.colnames
-        for column in mine.colnames:
-            same_value(column, mine[column], theirs[column])
-    elif hasattr(mine, "toarray"):
-        assert type(mine) is type(theirs)
-        assert_array_equal(mine.toarray(), theirs.toarray())
-    elif dataclasses.is_dataclass(mine):
-        for one in dataclasses.fields(mine):
-            if one.name != "wcs":
-                same_value(one.name, getattr(mine, one.name), getattr(theirs, one.name))
-    elif isinstance(mine, (dict, int, tuple)):
-        assert mine == theirs
-    else:
-        assert getattr(mine, "unit", None) == getattr(theirs, "unit", None)
-        assert_array_equal(np.asarray(mine), np.asarray(theirs))
-        assert np.asarray(mine).dtype == np.asarray(theirs).dtype, name
 
 
 def test_result_comes_back(result, tmp_path):

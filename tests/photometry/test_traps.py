@@ -10,6 +10,7 @@ import pytest
 from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.table import Table
+from astropy.wcs import WCS
 
 from helpers.errors import refuses
 from miricigale.instrument import north_up_wcs, pixel_area_map
@@ -36,6 +37,18 @@ def brightness(data, wcs):
     return data / pixel_area_map(wcs, data.shape) / 1e12
 
 
+def drawn(rng, name, model, sky, flux):
+    """Points with noise on the pixels of the image or the prior, uJy in each pixel."""
+    scale, n = SIZE[name]
+    data = rng.normal(0, NOISE[name], (n, n))
+    at = north_up_wcs(CENTER, scale * ARCSEC, (n, n)).world_to_pixel(sky)
+    for light, x, y in zip(flux, *at, strict=True):
+        i, j = round(float(x)), round(float(y))
+        form = {"pixel_scale": scale * ARCSEC, "shape": 2 * n + 1, "offset": (x - i, y - j)}
+        data += light * psf_image(model, **form)[n - j : 2 * n - j, n - i : 2 * n - i]
+    return data
+
+
 @pytest.fixture(scope="module")
 def field(tmp_path_factory):
     """Sixteen points with the PSFs of F770W at a roll of 75 deg and of F160W."""
@@ -54,12 +67,8 @@ def field(tmp_path_factory):
     made = types.SimpleNamespace(folder=folder, flux=flux, models=models)
     for name, model in models.items():
         scale, n = SIZE[name]
-        wcs, wide = north_up_wcs(CENTER, scale * ARCSEC, (n, n)), 2 * n + 1
-        data = rng.normal(0, NOISE[name], (n, n))
-        for light, x, y in zip(flux, *wcs.world_to_pixel(sky), strict=True):
-            i, j = round(float(x)), round(float(y))
-            stamp = psf_image(model, pixel_scale=scale * ARCSEC, shape=wide, offset=(x - i, y - j))
-            data += light * stamp[n - j : 2 * n - j, n - i : 2 * n - i]
+        wcs = north_up_wcs(CENTER, scale * ARCSEC, (n, n))
+        data = drawn(rng, name, model, sky, flux)
         header = wcs.to_header()
         header.update({"BUNIT": "MJy/sr", **headers[name]})
         error = brightness(np.full((n, n), NOISE[name]), wcs)
@@ -134,6 +143,18 @@ def test_psfs_on_cells_of_a_pixel_are_told_by_their_width(field, tmp_path):
     with pytest.warns(MiricigaleWarning) as said:
         fluxes(field, psf=path, psf_angle=PA * u.deg)
     assert "'psf' is 6% narrower" in str(said[0].message)
+
+
+def test_model_psfs_are_turned_to_the_angle_of_the_aperture(field, tmp_path):
+    def turned(hdus):
+        hdus["SCI"].header["PA_APER"] = PA - 30
+
+    path = edited(field, tmp_path, "image", turned)
+    right, wrong = (measured(field, image=one) for one in (field.paths["image"], path))
+    np.testing.assert_allclose(np.median(right["miri.f770w"].value / field.flux), 1, atol=0.007)
+    # the six spikes stand elsewhere at another angle
+    bright = field.flux > 30
+    assert np.all(wrong["miri.f770w_chi2"][bright] > 2 * right["miri.f770w_chi2"][bright])
 
 
 def test_a_turned_psf_with_its_angle_is_right(field, tmp_path):
@@ -267,25 +288,17 @@ def test_catalogs_of_other_fields_and_missing_positions(field, tmp_path, monkeyp
 
 def test_model_psfs_of_a_nircam_prior(field, tmp_path):
     """An image of points with NIRCam's model PSF, at the roll of its header."""
-    scale, n = SIZE["prior"]
-    wcs = north_up_wcs(CENTER, scale * ARCSEC, (n, n))
-    model = filter_psf("nircam.f444w", pixel_scale=scale * ARCSEC, pa=40 * u.deg)
+    model = filter_psf("nircam.f444w", pixel_scale=FINE * ARCSEC, pa=40 * u.deg)
     sky = SkyCoord(field.catalog["ra"], field.catalog["dec"], unit="deg")
-    data = np.random.default_rng(4).normal(0, NOISE["prior"], (n, n))
-    for light, x, y in zip(field.flux, *wcs.world_to_pixel(sky), strict=True):
-        i, j = round(float(x)), round(float(y))
-        stamp = psf_image(model, pixel_scale=scale * ARCSEC, shape=2 * n + 1, offset=(x - i, y - j))
-        data += 2 * light * stamp[n - j : 2 * n - j, n - i : 2 * n - i]
+    data = drawn(np.random.default_rng(4), "prior", model, sky, 2 * field.flux)
 
     def named(hdus):
-        hdus["SCI"].data[:] = brightness(data, wcs)
+        hdus["SCI"].data[:] = brightness(data, WCS(hdus["SCI"].header))
         hdus["SCI"].header.update(INSTRUME="NIRCAM", FILTER="F444W", PUPIL="CLEAR")
 
     path = edited(field, tmp_path, "prior", named)
-    with pytest.raises(
-        ValueError, match=r"'highres_pa_aper' must be given, .* \(or 'highres_psf'\)"
-    ):
-        fluxes(field, highres=path)
+    message = r"'highres_pa_aper' must be given, .* \(or 'highres_psf'\)"
+    refuses(message, fluxes, field, highres=path)
     found = fluxes(field, highres=path, highres_pa_aper=40 * u.deg, page=tmp_path / "page.html")
     assert "FWHM of the PSF (arcsec)" in (tmp_path / "page.html").read_text()
     np.testing.assert_allclose(np.median(found / field.flux), 1, atol=0.007)
