@@ -95,3 +95,12 @@ def stamps_of(bank, shape):
             stamp = block.values[block.start[k] : block.start[k + 1]].reshape(h, w)
             found[block.first + k, y : y + h, x : x + w] = stamp
     return found
+
+
+def disks(sky, wcs, shape, radius, labels=None):
+    """Segments that are disks of a radius (pixels) about positions, with labels from 1 by default."""
+    found, (y, x) = np.zeros(shape, np.int32), np.indices(shape)
+    labels = np.arange(1, len(sky) + 1) if labels is None else labels
+    for label, a, b in zip(labels, *wcs.world_to_pixel(sky), strict=True):
+        found[np.hypot(x - a, y - b) < radius] = label
+    return found

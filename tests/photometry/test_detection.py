@@ -5,7 +5,6 @@ from astropy.nddata import CCDData
 from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
-from miricigale.instrument import north_up_wcs
 from miricigale.photometry import (
     DETECTION_PRESETS,
     DilationRule,
@@ -144,14 +143,10 @@ def test_dilated_detections_hold_more_of_their_light(deep):
 
 
 def test_purity_of_noise_and_of_sources(tools):
-    rng = np.random.default_rng(7)
-    shape = (600, 600)
-    wcs = north_up_wcs(tools.CENTER, 0.06 * u.arcsec, shape)
-    noise = rng.normal(0, 1, shape)
-    options = {"preset": "yang2021", "n_pixels": 20}
-    table = detection_purity(
-        tools.as_ccd(noise, wcs, 1.0), snr_edges=[0, 2.5, 3, 3.5, np.inf], **options
-    )
+    rng, options = np.random.default_rng(7), {"preset": "yang2021", "n_pixels": 20}
+    form = {"scale": tools.FINE, "width": 0.15, "sigma": 1.0}
+    noise = tools.picture(tools.places([]), [], (600, 600), rng=rng, **form)
+    table = detection_purity(noise, snr_edges=[0, 2.5, 3, 3.5, np.inf], **options)
     # noise alone: as many on either side, so the purity is zero within its error
     assert table["n_positive"].sum() == table.meta["n_positive"] > 150
     error = np.sqrt(1 / table["n_positive"] + 1 / np.maximum(table["n_negative"], 1))
@@ -159,7 +154,8 @@ def test_purity_of_noise_and_of_sources(tools):
     # forty sources of a known place among it: what is not one of them is spurious
     sky = tools.positions(rng, 40, 16.0)
     flux = 10 ** rng.uniform(1.0, 2.0, 40) * 10 * tools.FINE**2 * tools.SR * 1e12
-    image = tools.as_ccd(noise + tools.render(sky, flux, 0.15, wcs, shape), wcs, 1.0)
+    image = tools.picture(sky, flux, (600, 600), **form)
+    image.data += noise.data
     _, found = detect_sources(image, **options)
     table = detection_purity(image, snr_edges=[0, 2.5, 3, 4, 5, np.inf], **options)
     separation = found["sky"].match_to_catalog_sky(sky)[1].arcsec

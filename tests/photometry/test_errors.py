@@ -121,17 +121,6 @@ def test_wrong_sigmas_do_not_matter(tools):
     assert_allclose(other.flux_err, result.flux_err, rtol=0.01)
 
 
-def test_error_of_an_isolated_source_is_the_closed_form(tools):
-    # white noise: sigma_flux = sigma / sqrt(sum(P^2)), sum(P^2) = pixel / (4 pi width^2)
-    rng = np.random.default_rng(0)
-    sky = tools.positions(rng, 1, 0.1)
-    image = tools.picture(sky, [0.0], (120, 120), sigma=1.0, rng=rng)
-    result = tools.measured(image, sky, errors=tools.WHITE)
-    per_pixel = pixel_area_map(image.wcs, (120, 120))[60, 60] * 1e12
-    expected = per_pixel * np.sqrt(4 * np.pi) * tools.LO / 0.11
-    assert_allclose(result.flux_err.value, expected, rtol=1e-3)
-
-
 def test_blended_covariance_is_the_dense_inverse(tools):
     rng, shape = np.random.default_rng(8), (70, 70)
     sky = tools.positions(rng, 12, 1.2)

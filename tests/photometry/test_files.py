@@ -1,24 +1,20 @@
 """Results come back as they were: from files, pickles and copies."""
 
 import copy
-import dataclasses
 import pickle
 
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.coordinates import SkyCoord
 from astropy.io.registry import IORegistryError
 from astropy.table import QTable
 from numpy.testing import assert_array_equal
 
 from helpers.errors import refuses
 from helpers.results import assert_equal_values
-from miricigale.instrument import north_up_wcs
 from miricigale.photometry import (
     ErrorModel,
     ErrorSettings,
-    ForcedPhotometer,
     ForcedPhotometryResult,
 )
 from miricigale.utils.exceptions import DataError
@@ -51,26 +47,17 @@ def result(request, tools, field):
     catalog = field.catalog[: 55 if request.param == "all" else None]
     if request.param == "all":
         catalog["components"] = np.where(np.arange(len(catalog)) == 3, 2, 1)
-    options = OPTIONS[request.param]
-    return ForcedPhotometer(tools.kernel, template="psf", **options).measure(image, catalog=catalog)
-
-
-def check(one, other):
-    """Every field of a result, by what kind it is."""
-    for name in (field.name for field in dataclasses.fields(one)):
-        mine, theirs = getattr(one, name), getattr(other, name)
-        assert_equal_values(name, mine, theirs)
-    assert_array_equal(one.sample(3, seed=1).value, other.sample(3, seed=1).value)
-    assert_array_equal(one.chi2_image.data, other.chi2_image.data)
+    return tools.measured(image, catalog, **OPTIONS[request.param])
 
 
 def test_result_comes_back(result, tmp_path):
     path = tmp_path / "r.fits"
     result.write(path)
-    check(result, ForcedPhotometryResult.read(path))
-    check(result, pickle.loads(pickle.dumps(result)))
-    check(result, copy.deepcopy(result))
-    check(result, copy.copy(result))
+    again = ForcedPhotometryResult.read(path), pickle.loads(pickle.dumps(result))
+    for one in (*again, copy.deepcopy(result), copy.copy(result)):
+        assert_equal_values("result", result, one)
+        assert_array_equal(result.sample(3, seed=1).value, one.sample(3, seed=1).value)
+        assert_array_equal(result.chi2_image.data, one.chi2_image.data)
     refuses("overwrite", result.write, path, error=OSError)
     before = path.read_bytes()
     result.write(path, overwrite=True)
@@ -95,11 +82,9 @@ def test_names_say_what_is_written(result, tmp_path):
 
 
 def test_nothing_to_measure_can_be_kept(tools, tmp_path):
-    wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, (60, 60))
-    image = tools.as_ccd(np.random.default_rng(1).normal(0, 0.1, (60, 60)), wcs, 0.1)
-    catalog = QTable({"sky": SkyCoord([], [], unit="deg")})
-    result = ForcedPhotometer(tools.kernel, template="psf").measure(image, catalog=catalog)
-    result.write(tmp_path / "r.fits")
+    form = {"sigma": 0.1, "rng": np.random.default_rng(1)}
+    image = tools.picture(tools.places([]), [], (60, 60), **form)
+    tools.measured(image, tools.places([])).write(tmp_path / "r.fits")
     assert len(ForcedPhotometryResult.read(tmp_path / "r.fits")) == 0
     image.write(tmp_path / "image.fits")
     with pytest.raises(DataError, match="holds no forced photometry"):

@@ -41,18 +41,15 @@ def test_noiseless_point_sources_come_back_exactly(tools, field):
 
 @pytest.mark.parametrize("grid", ["fine", "turned", "distorted"])
 def test_flux_does_not_depend_on_the_grid(tools, field, grid):
-    if grid == "fine":
-        shape = (480, 480)
-        wcs = north_up_wcs(tools.CENTER, 0.06 * u.arcsec, shape)
-    elif grid == "turned":
-        shape = (340, 340)
-        wcs = north_up_wcs(tools.CENTER, 0.13 * u.arcsec, shape)
+    shape = {"fine": (480, 480), "turned": (340, 340), "distorted": (1024, 1032)}[grid]
+    if grid == "distorted":
+        wcs = imager_wcs(tools.CENTER, 71 * u.deg)
+    else:
+        wcs = north_up_wcs(tools.CENTER, (0.06 if grid == "fine" else 0.13) * u.arcsec, shape)
+    if grid == "turned":
         c, s = np.cos(0.6), np.sin(0.6)
         wcs.wcs.pc = [[c, -s], [s, c]]
         wcs.wcs.set()
-    else:
-        shape = (1024, 1032)
-        wcs = imager_wcs(tools.CENTER, 71 * u.deg)
     data = tools.render(field.sky, field.flux, tools.LO, wcs, shape)
     # the scene itself conserves flux on this grid
     assert_allclose((data * pixel_area_map(wcs, shape)).sum() * 1e12, field.flux.sum(), rtol=1e-6)
@@ -112,22 +109,29 @@ def test_noisy_templates(tools, noise, snr, bias):
     assert np.median(np.concatenate(as_they_are)) < 1 - bias / 2
 
 
-def test_template_column_says_what_was_used(tools):
+def test_templates_and_flags_say_what_was_used(tools):
     sky, _, high, low = galaxies(tools, noise=0.01, n=9)
-    segmentation, _ = detect_sources(high, threshold=1.0, n_pixels=10)
-    # a blank place and one that is far off
-    catalog = QTable({"sky": joined_sky([sky, tools.places([1.6, 3600.0], [1.6, 0.0])])})
-    result = ForcedPhotometer(tools.kernel).measure(low, high, segmentation, catalog)
+    segmentation, detected = detect_sources(high, threshold=1.0, n_pixels=10)
+    # a blank place, one that is far off, and a second source on a segment
+    double = sky[0].spherical_offsets_by(0.15 * u.arcsec, 0 * u.arcsec).reshape(1)
+    catalog = QTable({"sky": joined_sky([sky, tools.places([1.6, 3600.0], [1.6, 0.0]), double])})
+    photometer = ForcedPhotometer(tools.kernel)
+    result = photometer.measure(low, high, segmentation, catalog)
     # Gaussians of this significance are profiles of index 1/2
-    assert result.template.tolist() == ["sersic"] * 9 + ["point", "none"]
+    assert result.template.tolist() == ["sersic"] * 9 + ["point", "none", "point"]
     assert np.all(result.template_snr[:9] > 20)
     assert np.isnan(result.template_snr[9:]).all()
-    as_asked = ForcedPhotometer(tools.kernel, template="cutout")
-    result = as_asked.measure(low, high, segmentation, catalog)
-    assert result.template.tolist() == ["cutout"] * 9 + ["point", "none"]
+    assert np.flatnonzero(flagged(result, ForcedFlags.NO_SEGMENT)).tolist() == [9]
+    assert np.flatnonzero(flagged(result, ForcedFlags.SHARED_SEGMENT)).tolist() == [11]
+    assert np.flatnonzero(np.isnan(result.flux)).tolist() == [10]
     table = result.to_table("miri.f770w")
     assert_array_equal(table["miri.f770w_template"], result.template)
     assert_array_equal(table["miri.f770w_template_snr"], result.template_snr)
+    as_asked = ForcedPhotometer(tools.kernel, template="cutout")
+    result = as_asked.measure(low, high, segmentation, catalog)
+    assert result.template.tolist() == ["cutout"] * 9 + ["point", "none", "point"]
+    # a detection's own table gives its labels
+    assert not photometer.measure(low, high, segmentation, detected).flags.any()
 
 
 def test_poor_fits_and_unexplained_neighbours_are_flagged(tools):
@@ -224,20 +228,6 @@ def test_noise_in_the_template_is_taken_off_the_diagonal(tools):
     terms = bank.noise_terms()[np.argsort(bank.order)]
     assert np.mean(power[1:]) > 1.1 * power[0]
     assert_allclose(np.mean(power[1:] - terms[1:]), power[0], rtol=0.02)
-
-
-def test_blank_positions_and_shared_segments_are_point_sources(tools):
-    sky, _, high, low = galaxies(tools, n=9)
-    segmentation, detected = detect_sources(high, threshold=1.0, n_pixels=10)
-    double = sky[0].spherical_offsets_by(0.15 * u.arcsec, 0 * u.arcsec).reshape(1)
-    catalog = QTable({"sky": joined_sky([sky, tools.places([1.6], [1.6]), double])})
-    result = ForcedPhotometer(tools.kernel).measure(low, high, segmentation, catalog)
-    assert flagged(result, ForcedFlags.NO_SEGMENT).tolist() == [False] * 9 + [True, False]
-    assert flagged(result, ForcedFlags.SHARED_SEGMENT).sum() == 1
-    assert np.isfinite(result.flux.value).all()
-    # a detection's own table gives its labels
-    result = ForcedPhotometer(tools.kernel).measure(low, high, segmentation, detected)
-    assert not result.flags.any()
 
 
 def test_sersic_templates(tools):
@@ -430,15 +420,12 @@ def test_positions_that_are_not_known_are_flagged(tools, field):
 def test_arrays_with_the_mistakes_of_files(tools):
     """A background, areas of zeros and labels of another map, without files."""
     rng, shape = np.random.default_rng(6), (400, 400)
-    wcs = north_up_wcs(tools.CENTER, tools.FINE * u.arcsec, shape)
     sky, flux = tools.places(*tools.lattice(rng, 5, 4.0, 0.0)), np.geomspace(3, 30, 25)
     form = {"scale": tools.FINE, "sigma": 5e-3, "rng": rng}
     sharp, wide = (
         tools.picture(sky, flux, shape, width=width, **form) for width in (tools.HI, tools.LO)
     )
-    labels, (y, x) = np.zeros(shape, int), np.indices(shape)
-    for k, (a, b) in enumerate(zip(*wcs.world_to_pixel(sky), strict=True), 1):
-        labels[(x - a) ** 2 + (y - b) ** 2 < 60] = k
+    labels = tools.disks(sky, sharp.wcs, shape, np.sqrt(60))
     catalog = QTable({"sky": sky, "label": np.arange(1, 26)})
     photometer = ForcedPhotometer(tools.kernel)
     assert_allclose(photometer.measure(wide, sharp, labels, catalog).flux.value, flux, rtol=0.03)
@@ -464,14 +451,9 @@ def test_arrays_with_the_mistakes_of_files(tools):
 
 def test_a_kernel_alone_measures_segments(tools, field):
     """Without PSFs the templates are the segments: what they hold, by closed form."""
-    wcs = north_up_wcs(tools.CENTER, tools.FINE * u.arcsec, (500, 500))
-    form = {"scale": tools.FINE, "width": tools.HI, "sigma": 1e-3}
+    form, kept = {"scale": tools.FINE, "width": tools.HI, "sigma": 1e-3}, np.arange(0, 60, 2)
     highres = tools.picture(field.sky, field.flux, (500, 500), **form)
-    labels, (y, x) = np.zeros((500, 500), int), np.indices((500, 500))
-    kept = np.arange(0, 60, 2)
-    for k in kept:
-        a, b = wcs.world_to_pixel(field.sky[k])
-        labels[(x - a) ** 2 + (y - b) ** 2 < 64] = k + 1
+    labels = tools.disks(field.sky[kept], highres.wcs, (500, 500), 8, kept + 1)
     bare = MatchingKernel.from_array(
         tools.kernel.array / tools.kernel.array.sum(), pixel_scale=tools.FINE * u.arcsec
     )

@@ -11,15 +11,13 @@ from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.table import QTable, Table
 
-from helpers.errors import refuses
 from helpers.light import gaussian_image
-from helpers.mosaics import render
+from helpers.mosaics import disks, render
 from miricigale.cli import main
 from miricigale.instrument import north_up_wcs, pixel_area_map
 from miricigale.instrument.image_files import write_image
 from miricigale.photometry import ForcedFlags, read_mosaic
-from miricigale.photometry.kernel_files import read_kernel
-from miricigale.utils.exceptions import DataError, MiricigaleWarning
+from miricigale.utils.exceptions import MiricigaleWarning
 
 CENTER = SkyCoord(34.3, -5.1, unit="deg")
 #: Pixels and rms of the PSFs of image and prior, arcsec.
@@ -54,10 +52,7 @@ def files(tmp_path_factory):
     low, high = (260, 262), (470, 474)
     image_wcs = north_up_wcs(CENTER, COARSE * u.arcsec, low)
     prior_wcs = north_up_wcs(CENTER, FINE * u.arcsec, high)
-    labels = np.zeros(high, np.int32)
-    y, x = np.indices(high)
-    for one, a, b in zip(ids, *prior_wcs.world_to_pixel(sky), strict=True):
-        labels[(x - a) ** 2 + (y - b) ** 2 < 64] = one
+    labels = disks(sky, prior_wcs, high, 8, ids)
     noise = 0.005
     data = points(sky, flux, WIDE, image_wcs, low) + rng.normal(0, noise, low)
     prior = points(sky, 3 * flux, SHARP, prior_wcs, high) + rng.normal(0, 0.002, high)
@@ -210,6 +205,7 @@ def test_our_own_files_are_read(files, tmp_path):
         ({"psf": None, "filter": "nircam.f480m"}, "there is no model PSF for nircam.f480m"),
         ({"kernel": "psf"}, "'psf' must be left out where a kernel is given"),
         ({"kernel": "segmentation", "psf": None, "highres-psf": None}, "cannot be read as a kernel"),
+        ({"kernel": "segmentation", "psf": None, "highres-psf": None}, "square with an odd number of pixels"),
         ({"psf": "segmentation"}, "seg.fits cannot be read as a PSF"),
         ({"psf": "cube"}, "must be an image with a PSF, got the shape"),
         ({"output": "out.txt"}, "'output' must be a table (.ecsv, .fits, .fits.gz)"),
@@ -256,19 +252,6 @@ def test_an_angle_other_than_the_headers_is_refused(files, tmp_path, capsys):
     command = arguments(files, output, image=path, psf=None)
     assert main([*command, "--pa-aper", "40"]) == 2
     assert "'pa_aper' must be PA_APER of" in capsys.readouterr().err
-
-
-def test_kernels_that_are_none_are_refused(files):
-    from miricigale.psf import gaussian_psf
-
-    sharp = gaussian_psf(0.2 * u.arcsec, pixel_scale=FINE * u.arcsec, fov=3 * u.arcsec)
-    options = {"highres_psf": sharp, "pixel_scale": FINE * u.arcsec}
-    for name, data, message in (
-        ("even", np.ones((4, 4)) / 16, "square with an odd number of pixels, got shape"),
-        ("sum", np.ones((5, 5)), "a kernel whose sum is 1, got a sum of 25"),
-    ):
-        path = files.save(f"{name}.fits", data)
-        refuses(message, read_kernel, path, error=DataError, **options)
 
 
 def test_a_real_field_agrees_with_another_program(data_file, tmp_path, capsys):

@@ -1,7 +1,5 @@
 """Maps of offsets and backgrounds that vary, on scenes that were distorted by a known amount."""
 
-import warnings
-
 import astropy.units as u
 import numpy as np
 import pytest
@@ -9,7 +7,6 @@ from astropy.table import QTable
 from numpy.testing import assert_allclose
 
 from miricigale.photometry import ForcedPhotometer, read_mosaic, read_prior
-from miricigale.photometry.fields import SmoothField, legendre_terms
 from miricigale.utils.exceptions import MiricigaleWarning
 
 SHAPE, SIGMA = (400, 400), 0.02
@@ -98,19 +95,7 @@ def test_background_that_varies(tools, field):
     assert np.abs(varying.residual_image.data).max() < 1e-5 * field.image.data.max()
 
 
-def test_terms_are_those_of_a_polynomial():
-    y, x = np.mgrid[:7, :9]
-    terms = legendre_terms(x, y, (7, 9), 2)
-    assert len(terms) == 6
-    assert max(np.abs(one).max() for one in terms) <= 1
-    # Legendre's polynomials, written out
-    u, v = (2 * x + 1) / 9 - 1, (2 * y + 1) / 7 - 1
-    expected = [np.ones((7, 9)), u, v, 1.5 * u**2 - 0.5, u * v, 1.5 * v**2 - 0.5]
-    assert_allclose(terms, [np.broadcast_to(one, (7, 9)) for one in expected], atol=1e-12)
-    field = SmoothField(np.eye(6), (7, 9), 2)
-    assert_allclose(field(2, 4), [one[4, 2] for one in terms], rtol=1e-12)
-
-
+@pytest.mark.filterwarnings("ignore")  # the scale of the weights, the kernel's centre
 def test_real_images_are_aligned(data_file):
     """F770W of PRIMER-UDS against F444W: within a tenth of a native pixel (0.11 arcsec)."""
     from astropy.io import fits
@@ -119,18 +104,15 @@ def test_real_images_are_aligned(data_file):
 
     uds = data_file("uds")
     start, psfs = f"{uds}/uds-test-", f"{uds}/psf/uds-test-f444w"
-    with warnings.catch_warnings():
-        # the scale of the weights, the kernel's centre
-        warnings.simplefilter("ignore")
-        image, prior = (
-            read_mosaic(f"{start}{band}_sci.fits.gz", weight=f"{start}{band}_wht.fits.gz")
-            for band in ("f770w", "f444w")
-        )
-        segments, sources = read_prior(prior, segmentation=f"{start}LW_seg.fits.gz")
-        kernel, psf = (
-            fits.getdata(f"{psfs}_{name}.fits.gz").mean(axis=0) for name in ("kernel_f770w", "psf")
-        )
-        kernel = MatchingKernel.from_array(kernel, pixel_scale=0.04 * u.arcsec, source=psf)
+    image, prior = (
+        read_mosaic(f"{start}{band}_sci.fits.gz", weight=f"{start}{band}_wht.fits.gz")
+        for band in ("f770w", "f444w")
+    )
+    segments, sources = read_prior(prior, segmentation=f"{start}LW_seg.fits.gz")
+    kernel, psf = (
+        fits.getdata(f"{psfs}_{name}.fits.gz").mean(axis=0) for name in ("kernel_f770w", "psf")
+    )
+    kernel = MatchingKernel.from_array(kernel, pixel_scale=0.04 * u.arcsec, source=psf)
     options = {"background_order": 0, "max_shift": 0.2 * u.arcsec}
     one, mapped = (
         ForcedPhotometer(kernel, offset_order=order, **options).measure(

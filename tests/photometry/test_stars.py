@@ -4,11 +4,11 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
-from astropy.wcs import WCS
 from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
-from helpers.light import gaussian_image
+from helpers.light import gaussian, gaussian_image
+from helpers.scenes import tan_wcs
 from miricigale.photometry import psf_photometry
 from miricigale.psf import gaussian_psf, make_psf
 
@@ -76,26 +76,16 @@ def test_it_agrees_with_forced_photometry(tools, stars, psf):
 
 
 def test_the_psf_is_turned_to_the_image(tools):
-    # an elliptical star on an image whose +y points 30 degrees east of north
-    wcs = WCS(naxis=2)
-    wcs.wcs.ctype = "RA---TAN", "DEC--TAN"
-    wcs.wcs.crval, wcs.wcs.crpix = (53.1, -27.8), (61, 61)
-    c, s = np.cos(np.radians(30)), np.sin(np.radians(30))
-    wcs.wcs.cd = np.array([[-c, s], [s, c]]) * SCALE / 3600
+    # an elliptical star, drawn out along north, on an image whose +y points 30 degrees east of north
+    def star(east, north):
+        return gaussian(east / 0.2, north / 0.4, 1.0) / 0.08
+
+    wcs = tan_wcs((121, 121), SCALE, pa=30.0)
     sky = wcs.pixel_to_world(60.3, 59.8)
-    yy, xx = np.indices((121, 121))
-    world = wcs.pixel_to_world(xx, yy)
-    east, north = (v.to_value(u.arcsec) for v in sky.spherical_offsets_to(world))
-    wide, narrow = 0.4, 0.2
-    # 50 uJy, drawn out along north
-    light = np.exp(-0.5 * ((north / wide) ** 2 + (east / narrow) ** 2)) / (
-        2 * np.pi * wide * narrow
-    )
+    light = star(*tools.offsets(sky, wcs, *np.indices((121, 121))))
     image = tools.as_ccd(light * 50e-12 / tools.SR, wcs, 0.01)
-    n = 201
-    g = (np.arange(n) - n // 2) * SCALE / 4
-    data = np.exp(-0.5 * ((g[:, None] / wide) ** 2 + (g / narrow) ** 2))
-    data *= 16 * (SCALE / 4) ** 2 / (2 * np.pi * wide * narrow)
+    g = (np.arange(201) - 100) * SCALE / 4
+    data = SCALE**2 * star(g, g[:, None])
     catalog = QTable({"sky": sky.reshape(1)})
     north_up = make_psf(data, pixel_scale=SCALE * u.arcsec, oversampling=4, frame="sky")
     assert_allclose(psf_photometry(image, north_up, catalog)["flux"].value, 50, rtol=0.01)

@@ -13,6 +13,7 @@ from astropy.table import Table
 from astropy.wcs import WCS
 
 from helpers.errors import refuses
+from helpers.mosaics import disks
 from miricigale.instrument import north_up_wcs, pixel_area_map
 from miricigale.photometry import MosaicFile, read_mosaic
 from miricigale.photometry.from_files import measure_files
@@ -74,10 +75,7 @@ def field(tmp_path_factory):
         error = brightness(np.full((n, n), NOISE[name]), wcs)
         hdus = [fits.PrimaryHDU(), fits.ImageHDU(brightness(data, wcs), header, name="SCI")]
         fits.HDUList([*hdus, fits.ImageHDU(error, name="ERR")]).writeto(folder / f"{name}.fits")
-    y, x = np.indices((n, n))
-    labels = np.zeros((n, n), np.int32)
-    for k, (a, b) in enumerate(zip(*wcs.world_to_pixel(sky), strict=True), 1):
-        labels[(x - a) ** 2 + (y - b) ** 2 < 100] = k
+    labels = disks(sky, wcs, (n, n), 10)
     fits.writeto(folder / "seg.fits", labels, wcs.to_header())
     made.catalog = Table({"id": np.arange(1, 17), "ra": sky.ra.deg, "dec": sky.dec.deg})
     made.catalog.write(folder / "cat.fits")
@@ -175,9 +173,8 @@ def test_kernels_of_other_pixels_filters_or_sums(field, tmp_path):
         found = fluxes(field, kernel=path)
     # a bare kernel of unit sum leaves out what lies beyond its grid
     np.testing.assert_allclose(np.median(found / field.flux), made.array.sum(), atol=0.01)
-    with pytest.raises(
-        DataError, match=r"kernel for pixels of 0\.04 arcsec, and those of the prior"
-    ):
+    message = r"kernel for pixels of 0\.04 arcsec, and those of the prior"
+    with pytest.raises(DataError, match=message):
         fluxes(field, kernel=saved(tmp_path, made.array / made.array.sum(), PIXSCALE=0.04))
     red = filter_psf("miri.f2100w", pixel_scale=COARSE * ARCSEC, pa=PA * u.deg)
     other = MatchingKernel.from_psfs(field.models["prior"], red, **given)
@@ -252,9 +249,7 @@ def test_labels_of_another_detection_are_not_taken(field, tmp_path):
     some = np.arange(17)
     some[[1, 2, 3]] = [2, 3, 1]
     fits.writeto(tmp_path / "some.fits", some[labels].astype(np.int32), header)
-    with pytest.warns(
-        MiricigaleWarning, match="are those of 3 of 16 sources that stand on another"
-    ):
+    with pytest.warns(MiricigaleWarning, match="those of 3 of 16 sources that stand on another"):
         fluxes(field, segmentation=tmp_path / "some.fits")
     # segments where no source is
     fits.writeto(tmp_path / "moved.fits", np.roll(labels, 30, axis=1), header)
@@ -273,15 +268,11 @@ def test_catalogs_of_other_fields_and_missing_positions(field, tmp_path, monkeyp
     found = fluxes(field, catalog=tmp_path / "gap.fits")
     assert np.flatnonzero(np.isnan(found)).tolist() == [3]
     monkeypatch.setattr("miricigale.photometry.mosaics.MosaicFile.read", unread)
-    for change, message in (
-        (
-            lambda ra: ra + 1,
-            r"none of the 16 sources of .*far.fits is on .*image.fits \('image'\): the",
-        ),
-        (lambda ra: ra / 15, "is ra in hours"),
-    ):
+    ra = field.catalog["ra"]
+    nowhere = r"none of the 16 sources of .*far.fits is on .*image.fits \('image'\): the"
+    for wrong, message in ((ra + 1, nowhere), (ra / 15, "is ra in hours")):
         catalog = field.catalog.copy()
-        catalog["ra"] = change(catalog["ra"])
+        catalog["ra"] = wrong
         catalog.write(tmp_path / "far.fits", overwrite=True)
         refuses(message, fluxes, field, catalog=tmp_path / "far.fits")
 

@@ -29,12 +29,8 @@ def points(tools):
     high = tools.picture(sky, flux, SHAPE, scale=0.06, width=tools.HI, sigma=1e-3)
     low = tools.picture(sky, 0.8 * flux, SHAPE, scale=0.06)
     low.data += tools.render(sky, 0.2 * flux, 0.9, low.wcs, SHAPE)
-    labels = np.zeros(SHAPE, int)
-    x, y = low.wcs.world_to_pixel(sky)
-    yy, xx = np.indices(SHAPE)
-    for k in range(9):
-        # 3 arcsec wide: all of the sharp light
-        labels[np.hypot(xx - x[k], yy - y[k]) < 15] = k + 1
+    # 1.8 arcsec wide: all of the sharp light
+    labels = tools.disks(sky, low.wcs, SHAPE, 15)
     catalog = QTable({"id": np.arange(1, 10), "label": np.arange(1, 10), "sky": sky})
     psfs = psf_of((1.0, tools.HI)), psf_of((0.8, tools.LO), (0.2, 0.9))
     return psfs, low, high, SegmentationImage(labels), catalog, flux
@@ -76,11 +72,7 @@ def test_errors_are_white_and_templates_as_they_are(points, tools):
     assert_allclose(other.flux.value, result.flux.value, rtol=1e-6)
     assert_allclose(other.template_snr, result.template_snr / 100, rtol=1e-6)
     # segments of two widths, with 86 % of the light: nothing is added to them
-    small = segments.data.copy()
-    y, x = np.indices(SHAPE)
-    px, py = low.wcs.world_to_pixel(catalog["sky"])
-    for k in range(9):
-        small[(np.hypot(x - px[k], y - py[k]) > 2 * tools.HI / 0.06) & (small == k + 1)] = 0
+    small = tools.disks(catalog["sky"], low.wcs, SHAPE, 2 * tools.HI / 0.06)
     bare = photometer.measure(low, high, small, catalog)
     # templates are those segments of unit light: too sharp, and so too faint
     assert np.all(bare.flux.value < result.flux.value)
