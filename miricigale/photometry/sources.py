@@ -217,7 +217,7 @@ class SourceTemplates:
         return cls(**known, light=(None,) * len(known["id"]), sersic=rows, wcs=wcs, meta=meta)
 
     @classmethod
-    def from_arrays(cls, arrays, corners, catalog, *, wcs, convolved=True, noise=None):
+    def from_arrays(cls, arrays, corners, catalog, *, wcs, convolved=True):
         """
         Take pictures of the sources that others made.
 
@@ -234,9 +234,6 @@ class SourceTemplates:
         convolved : bool or array_like of bool, shape (n,), optional
             Whether arrays show the sources through the high-resolution PSF (as that image does)
             or as they are, integrated over the pixels.
-        noise : array_like, shape (n,), optional
-            Sum of the variances of each array's noise, in units of its total squared: what
-            noise adds to a template's power, and is taken off.
 
         Returns
         -------
@@ -254,9 +251,6 @@ class SourceTemplates:
             got = f"{len(arrays)} arrays, corners {corners.dtype} of shape {corners.shape}"
             raise argument_error("arrays, corners", f"{n} each, as many as sources", got)
         convolved = np.broadcast_to(np.asarray(convolved, bool), n)
-        noise = np.zeros(n) if noise is None else np.asarray(noise, float)
-        if noise.shape != (n,) or not np.all(noise >= 0):
-            raise argument_error("noise", f"{n} numbers that are not negative", noise)
         light = []
         for k, one in enumerate(arrays):
             data = None if one is None else np.asarray(one, float)
@@ -267,7 +261,7 @@ class SourceTemplates:
                     got = f"shape {data.shape} and total {total} of source {known['id'][k]}"
                     raise argument_error("arrays", wanted, got)
                 at = tuple(int(c) for c in corners[k])
-                data = Cutout(data / total, at, float(noise[k]), bool(convolved[k]))
+                data = Cutout(data / total, at, convolved=bool(convolved[k]))
             light.append(data)
         return cls(**known, light=light, wcs=wcs, meta=provenance(template="arrays"))
 
