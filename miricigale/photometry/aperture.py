@@ -4,25 +4,24 @@ import dataclasses
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
-from astropy.utils.decorators import deprecated_renamed_argument
 from photutils.aperture import ApertureStats, CircularAperture
 from photutils.background import LocalBackground, SExtractorBackground
 from photutils.segmentation import SourceCatalog
 
 from miricigale.photometry.arrays import image_arrays, pixel_scale
 from miricigale.photometry.detection import detect_sources
-from miricigale.utils.meta import provenance
 from miricigale.utils.sep_tools import background as sep_background
+from miricigale.utils.tables import described_table
 from miricigale.utils.units import ANGLE, FNU, positive, to_array
 
 #: The paper's settings on its pixels: PHOT_AUTOPARAMS, BACK_SIZE and BACK_FILTERSIZE, width of the ring for
-#: the local background; light of a point source in the AUTO ellipse and in the circle.
-_KRON, _BACKGROUND, _RING = (2.5, 3.5), (64, 6), 40
+#: the local background, diameter of the circle (arcsec); light of a point source in the AUTO ellipse and in the
+#: circle.
+_KRON, _BACKGROUND, _RING, _DIAMETER = (2.5, 3.5), (64, 6), 40, 1.86
 _AUTO_FRACTION, _APERTURE_FRACTION = 0.94, 0.8
 
 
-def aperture_photometry(image, sky, diameter, *, local_background=None):
+def aperture_photometry(image, sky, diameter):
     """
     Sum light in circles.
 
@@ -34,9 +33,6 @@ def aperture_photometry(image, sky, diameter, *, local_background=None):
         Positions.
     diameter : `~astropy.units.Quantity`
         Of the aperture.
-    local_background : `~astropy.units.Quantity`, optional
-        Width of an annulus just outside the aperture whose mode as by Source Extractor (2.5 median -
-        1.5 mean of the clipped pixels) is subtracted.
 
     Returns
     -------
@@ -52,22 +48,17 @@ def aperture_photometry(image, sky, diameter, *, local_background=None):
     """
     arrays = image_arrays(image, "image")
     size = positive(diameter, ANGLE, "diameter")
-    scale = pixel_scale(image.wcs)
-    radius = size / 2 / scale
     xy = np.stack(arrays.wcs.world_to_pixel(sky), axis=-1).reshape(-1, 2)
-    flux, flux_err, coverage = _circle_sums(arrays, xy, radius)
-    if local_background is not None:
-        width = float(to_array(local_background, ANGLE, "local_background")) / scale
-        level = _annulus_levels(arrays, xy, radius, width)
-        flux = flux - level * np.pi * radius**2 * coverage
-    table = QTable({"flux": flux * FNU, "flux_err": flux_err * FNU, "coverage": coverage})
-    table["flux"].info.description = f"Light in a circle of {size:.4g} arcsec diameter"
-    table["flux_err"].info.description = "Its error for noise that is not correlated"
-    table["coverage"].info.description = "Fraction of the aperture on usable pixels"
-    return table
+    flux, flux_err, coverage = circle_sums(arrays, xy, size / 2 / pixel_scale(image.wcs))
+    columns = {
+        "flux": (flux * FNU, f"Light in a circle of {size:.4g} arcsec diameter"),
+        "flux_err": (flux_err * FNU, "Its error for noise that is not correlated"),
+        "coverage": (coverage, "Fraction of the aperture on usable pixels"),
+    }
+    return described_table(columns)
 
 
-def _circle_sums(arrays, xy, radius):
+def circle_sums(arrays, xy, radius):
     """Flux, error and usable fraction in circles, exact in the pixels that they cut."""
     n = len(xy)
     if n == 0:
@@ -84,30 +75,7 @@ def _circle_sums(arrays, xy, radius):
     return flux, np.sqrt(noise), coverage
 
 
-def _annulus_levels(arrays, xy, radius, width):
-    """Mode of the flux per pixel in rings from ``radius`` to ``radius + width`` pixels."""
-    # faint sources within the rings raise the median
-    estimate = LocalBackground(radius, radius + width, bkg_estimator=SExtractorBackground())
-    levels = np.zeros(len(xy))
-    ny, nx = arrays.flux.shape
-    reach = radius + width
-    for k, (x, y) in enumerate(xy):
-        if -reach < x < nx + reach and -reach < y < ny + reach:
-            level = float(np.squeeze(estimate(arrays.flux, x, y, mask=~arrays.usable)))
-            levels[k] = level if np.isfinite(level) else 0.0
-    return levels
-
-
-@deprecated_renamed_argument("min_area", "n_pixels", "0.1")
-def source_extractor_photometry(
-    image,
-    *,
-    preset="yang2021_miri",
-    threshold=None,
-    n_pixels=None,
-    diameter=1.86 * u.arcsec,
-    stated_on=0.06 * u.arcsec,
-):
+def source_extractor_photometry(image, *, preset="yang2021_miri", stated_on=0.06 * u.arcsec):
     """
     Detect and measure on one image, blind, as Source Extractor does.
 
@@ -119,10 +87,8 @@ def source_extractor_photometry(
     ----------
     image : `~astropy.nddata.CCDData`
         In units of surface brightness, with WCS.
-    preset, threshold, n_pixels : optional
+    preset : str or `DetectionPreset`, optional
         See `~miricigale.photometry.detect_sources`.
-    diameter : `~astropy.units.Quantity`, optional
-        Of the circular aperture; 31 pixels of 0.06 arcsec by default.
     stated_on : `~astropy.units.Quantity` or None, optional
         Pixel scale for which settings in pixels are meant; None for the image's own.
 
@@ -130,16 +96,17 @@ def source_extractor_photometry(
     -------
     table : `~astropy.table.QTable`
         The detections, with ``flux_auto``, ``flux_auto_err``, ``flux_aper``, ``flux_aper_err`` as
-        measured (Kron ellipses of PHOT_AUTOPARAMS 2.5, 3.5), and ``flux_best``, ``flux_best_err``: the brighter of
-        the two after each is divided by its part of a point source's light (0.94 and 0.8).
+        measured (Kron ellipses of PHOT_AUTOPARAMS 2.5, 3.5; circles of 1.86 arcsec), and ``flux_best``,
+        ``flux_best_err``: the brighter of the two after each is divided by its part of a point source's light
+        (0.94 and 0.8).
 
     References
     ----------
     Yang et al. 2021, ApJ 908, 144, appendix (the settings); Bertin & Arnouts 1996.
     """
     segmentation, catalog = detect_sources(
-        image, preset=preset, threshold=threshold, n_pixels=n_pixels, subtract_background=True,
-        box=_BACKGROUND[0], filter_size=_BACKGROUND[1], stated_on=stated_on,
+        image, preset=preset, subtract_background=True, box=_BACKGROUND[0],
+        filter_size=_BACKGROUND[1], stated_on=stated_on,
     )  # fmt: skip
     arrays = image_arrays(image, "image")
     ratio = 1.0
@@ -150,10 +117,9 @@ def source_extractor_photometry(
     flux = arrays.flux - np.where(arrays.usable, level, 0.0)
     values = [np.empty(0)] * 4
     if len(catalog):
-        values = _measure(arrays, flux, segmentation, catalog, diameter, ratio)
+        values = _measure(arrays, flux, segmentation, catalog, ratio)
     auto, auto_err, aper, aper_err = values
-    best = np.stack([auto, auto_err]) / _AUTO_FRACTION
-    others = np.stack([aper, aper_err]) / _APERTURE_FRACTION
+    best, others = np.stack(values[:2]) / _AUTO_FRACTION, np.stack(values[2:]) / _APERTURE_FRACTION
     best = np.where(np.nan_to_num(best[0], nan=-np.inf) > others[0], best, others)
     for name, flux, error, text in (
         ("flux_auto", auto, auto_err, "Light in the Kron ellipse"),
@@ -163,11 +129,10 @@ def source_extractor_photometry(
         catalog[name], catalog[f"{name}_err"] = flux * FNU, error * FNU
         catalog[name].info.description = text
         catalog[f"{name}_err"].info.description = "Error for noise that is not correlated"
-    catalog.meta.update(provenance(preset=preset))
     return catalog
 
 
-def _measure(arrays, flux, segmentation, catalog, diameter, ratio):
+def _measure(arrays, flux, segmentation, catalog, ratio):
     """Light and errors in Kron ellipses and circles, less the level of rings around them."""
     arrays = dataclasses.replace(
         arrays, flux=flux, sigma=np.where(arrays.usable, arrays.sigma, 0.0)
@@ -182,8 +147,10 @@ def _measure(arrays, flux, segmentation, catalog, diameter, ratio):
         kron_params=(factor, least / factor, 0.0),
     )
     auto, auto_err = (np.atleast_1d(v) for v in (sources.kron_flux, sources.kron_flux_err))
-    radius = float(to_array(diameter, ANGLE, "diameter")) / 2 / pixel_scale(arrays.wcs)
+    radius = _DIAMETER / 2 / pixel_scale(arrays.wcs)
     xy = np.stack([catalog["x_centroid"], catalog["y_centroid"]], axis=-1)
-    aper, aper_err, coverage = _circle_sums(arrays, xy, radius)
-    ring = _annulus_levels(arrays, xy, radius, _RING * ratio)
+    aper, aper_err, coverage = circle_sums(arrays, xy, radius)
+    # the mode, for faint sources within the rings raise the median
+    mode = LocalBackground(radius, radius + _RING * ratio, bkg_estimator=SExtractorBackground())
+    ring = np.nan_to_num(np.atleast_1d(mode(arrays.flux, *xy.T, mask=~arrays.usable)))
     return auto, auto_err, aper - ring * np.pi * radius**2 * coverage, aper_err

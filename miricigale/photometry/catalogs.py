@@ -1,7 +1,5 @@
 """The columns of a catalog that photometry uses."""
 
-import dataclasses
-
 import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
@@ -14,24 +12,9 @@ from miricigale.utils.tables import require_columns, unique_ids
 OPTIONAL = ("flux", "components")
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class CatalogSources:
-    """The sources of a catalog: arrays of shape (n,), None for columns that it does not have."""
-
-    id: np.ndarray
-    sky: SkyCoord
-    label: np.ndarray | None
-    flux: np.ndarray | None
-    components: np.ndarray | None
-
-    def kept(self):
-        """What templates keep of it, by name."""
-        return {name: getattr(self, name) for name in ("id", "sky", *OPTIONAL)}
-
-
 def catalog_sources(catalog):
     """
-    Read the columns of a catalog with ``sky``.
+    Return ``id``, ``sky`` (ICRS), ``flux`` and ``components`` of a catalog, by name; None without such a column.
 
     Raises
     ------
@@ -47,7 +30,6 @@ def catalog_sources(catalog):
     ids = np.arange(1, len(sky) + 1)
     if "id" in catalog.colnames:
         ids = unique_ids(catalog["id"], "catalog")
-    label = np.asarray(catalog["label"]) if "label" in catalog.colnames else None
     flux = components = None
     if "flux" in catalog.colnames:
         flux = np.asarray(getattr(catalog["flux"], "value", catalog["flux"]), float)
@@ -58,7 +40,7 @@ def catalog_sources(catalog):
             raise argument_error("catalog", "a column 'components' of 1 and 2", f"{found}")
     icrs = sky.icrs
     sky = SkyCoord(icrs.ra.deg, icrs.dec.deg, unit="deg")
-    return CatalogSources(ids, sky, label, flux, components)
+    return {"id": ids, "sky": sky, "flux": flux, "components": components}
 
 
 def sersic_rows(catalog):

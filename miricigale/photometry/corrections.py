@@ -5,7 +5,7 @@ import numpy as np
 from astropy.stats import mad_std
 from astropy.table import QTable
 
-from miricigale.photometry.aperture import _circle_sums
+from miricigale.photometry.aperture import circle_sums
 from miricigale.photometry.arrays import image_arrays
 from miricigale.photometry.arrays import pixel_scale as image_scale
 from miricigale.psf import encircled_energy, radius_of_encircled_energy
@@ -50,7 +50,7 @@ def encircled_flux(image, sky, flux, radii):
     xy = np.stack(arrays.wcs.world_to_pixel(sky), axis=-1).reshape(-1, 2)
     values = np.empty((len(radius), len(true)))
     for k, r in enumerate(radius):
-        inside, _, coverage = _circle_sums(arrays, xy, r / scale)
+        inside, _, coverage = circle_sums(arrays, xy, r / scale)
         values[k] = np.where(coverage > 0.999, inside / true, np.nan)
     if not np.isfinite(values).any(axis=1).all():
         raise argument_error("sky", "positions whose apertures are on the image", "none")

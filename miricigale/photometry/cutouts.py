@@ -6,7 +6,6 @@ import numpy as np
 
 from miricigale.photometry._core.sampling import convolve_batch
 from miricigale.photometry.flags import ForcedFlags
-from miricigale.profiles import ellipse_to_pixels, sersic_stamp
 
 #: Rim of zeros around fine stamps, for the splines and the pixel response to fade in.
 RIM = 8
@@ -68,29 +67,6 @@ def own_segments(segmentation, labels, xy):
         label[losers] = 0
         flags[losers] |= int(ForcedFlags.SHARED_SEGMENT)
     return label, flags
-
-
-def sersic_cutouts(rows, xy, jacobian):
-    """
-    Draw Sersic profiles on the fine grid: a `Cutout` for each source, None for points.
-
-    ``rows``, (n, 4), are half-light radius (arcsec; NaN for a point), index, axis ratio and position angle
-    (rad), ``xy``, (n, 2), positions on the grid, ``jacobian`` its pixels per arcsec, ``[dx, dy] = jacobian
-    @ [east, north]``. A profile is cut at the isophote of 99.5 % of the light.
-    """
-    found = []
-    for (radius, index, ratio, angle), (x, y) in zip(rows, xy, strict=True):
-        if not np.isfinite(radius):
-            found.append(None)
-            continue
-        r_eff, q, theta = ellipse_to_pixels(
-            jacobian, radius=radius, axis_ratio=ratio, position_angle=angle
-        )
-        stamp, origin = sersic_stamp(
-            x=x, y=y, r_eff=float(r_eff), n=index, axis_ratio=float(q), theta=float(theta)
-        )
-        found.append(Cutout(stamp, origin, convolved=False))
-    return found
 
 
 def convolve_padded(array, response):

@@ -7,14 +7,14 @@ import numpy as np
 import scipy.ndimage
 import scipy.stats
 from astropy.coordinates import SkyCoord
-from astropy.utils.decorators import deprecated_renamed_argument
 from photutils.segmentation import SegmentationImage, make_2dgaussian_kernel
 
 from miricigale.photometry.arrays import image_arrays, pixel_scale
 from miricigale.photometry.mosaics import as_mosaic
 from miricigale.photometry.segments import dilate_segments, dilation_rule
-from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
+from miricigale.utils.options import check_names, check_positive
 from miricigale.utils.sep_tools import background as sep_background
 from miricigale.utils.sep_tools import extract
 from miricigale.utils.tables import Flags, described_table
@@ -87,16 +87,12 @@ DETECTION_PRESETS = {
 }
 
 
-@deprecated_renamed_argument("min_area", "n_pixels", "0.1")
 def detect_sources(
     image,
     *,
     preset="yang2021",
     threshold=None,
     n_pixels=None,
-    fwhm=None,
-    n_levels=None,
-    contrast=None,
     subtract_background=False,
     box=64,
     filter_size=6,
@@ -111,17 +107,13 @@ def detect_sources(
     image : `~astropy.nddata.CCDData`, path-like or other (see `as_mosaic`)
         In units of surface brightness or of the flux in a pixel, with WCS. Without an uncertainty the noise is
         measured on the image.
-    preset : str, optional
-        Name in `DETECTION_PRESETS`, for the settings that are not given.
+    preset : str or `DetectionPreset`, optional
+        Settings, or their name in `DETECTION_PRESETS`.
     threshold : float, optional
-        In units of the noise of a pixel; it applies to the image after filtering, as
-        Source Extractor's DETECT_THRESH does.
+        In units of the noise of a pixel, in place of that of the preset; it applies to the image after
+        filtering, as Source Extractor's DETECT_THRESH does.
     n_pixels : int, optional
-        Least number of connected pixels (``min_area`` in former versions).
-    fwhm : float, optional
-        Width of the Gaussian filter in pixels; 0 for no filter.
-    n_levels, contrast : optional
-        Deblending.
+        Least number of connected pixels, in place of that of the preset.
     subtract_background : bool, optional
         Whether a background is measured and subtracted first.
     box, filter_size : int, optional
@@ -156,23 +148,19 @@ def detect_sources(
     """
     arrays, settings = _prepared(
         image, preset, subtract_background=subtract_background, box=box, filter_size=filter_size,
-        stated_on=stated_on, threshold=threshold, n_pixels=n_pixels, fwhm=fwhm, n_levels=n_levels,
-        contrast=contrast,
+        stated_on=stated_on, threshold=threshold, n_pixels=n_pixels,
     )  # fmt: skip
     rule = None if dilation is None else dilation_rule(dilation)
     objects, found = _extract(arrays.flux, arrays, settings)
-    labels = found
+    name = preset if isinstance(preset, str) else "own"
+    labels, meta = found, provenance(preset=name, **dataclasses.asdict(settings))
     if rule is not None:
         scale = pixel_scale(arrays.wcs)
         labels = dilate_segments(found, rule, pixel_scale=scale, mask=~arrays.usable).data
-    catalog = _catalog(objects, found, labels, arrays)
-    catalog.meta.update(provenance(preset=preset, **dataclasses.asdict(settings)))
-    if rule is not None:
-        catalog.meta["dilation"] = dataclasses.asdict(rule)
-    return SegmentationImage(labels), catalog
+        meta["dilation"] = dataclasses.asdict(rule)
+    return SegmentationImage(labels), _catalog(objects, found, labels, arrays, meta)
 
 
-@deprecated_renamed_argument("min_area", "n_pixels", "0.1", arg_in_kwargs=True)
 def detection_purity(image, *, snr_edges=None, preset="yang2021", **settings):
     """
     Estimate which share of the detections is real, from the image's negative.
@@ -262,13 +250,12 @@ def _prepared(
     image, preset, *, subtract_background=False, box=64, filter_size=6, stated_on=None, **given
 ):
     """Arrays with the background taken off, and settings on the image's pixels."""
-    if preset not in DETECTION_PRESETS:
-        raise unknown_name("detection preset", preset, DETECTION_PRESETS)
-    settings = dataclasses.replace(
-        DETECTION_PRESETS[preset], **{k: v for k, v in given.items() if v is not None}
-    )
-    if not settings.threshold > 0:
-        raise argument_error("threshold", "positive", settings.threshold)
+    if not isinstance(preset, DetectionPreset):
+        check_names([preset], "detection preset", DETECTION_PRESETS)
+        preset = DETECTION_PRESETS[preset]
+    given = {name: value for name, value in given.items() if value is not None}
+    settings = dataclasses.replace(preset, **given)
+    check_positive(settings.threshold, "threshold")
     arrays = image_arrays(as_mosaic(image, "image"), "image")
     ratio = 1.0
     if stated_on is not None:
@@ -340,7 +327,7 @@ def bright_centroids(flux, labels, fallback):
     return found
 
 
-def _catalog(objects, found, labels, arrays):
+def _catalog(objects, found, labels, arrays, meta):
     """The table of the detections: segments as found, and as they are returned."""
     n = len(objects)
     index = np.arange(1, n + 1)
@@ -371,7 +358,7 @@ def _catalog(objects, found, labels, arrays):
         "snr": (snr, "flux over flux_err"),
         "flags": (objects["flag"].astype(int) & known, DetectionFlags.describe()),
     }
-    return described_table(columns)
+    return described_table(columns, meta)
 
 
 def _sizes(labels, n):

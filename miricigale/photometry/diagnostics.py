@@ -71,9 +71,7 @@ def _correlation(fit, residual, model):
     if np.count_nonzero(free) < 400:
         stated = fit.arrays.noise_correction
         return stated_correlation(stated) if stated > 1 else None
-    correlation = noise_correlation(
-        residual, free, weight=fit.inverse_sigma, executor=fit.bank.executor
-    )
+    correlation = noise_correlation(residual, free, fit.inverse_sigma, executor=fit.bank.executor)
     return correlation if correlation.any() else None
 
 
@@ -85,10 +83,8 @@ def _statistics(fit, residual):
     for block in fit.bank.blocks():
 
         def measure(part, block=block):
-            start = block.start[part.start : part.stop + 1]
             rows = slice(block.first + part.start, block.first + part.stop)
-            stamps = (block.values, block.box[part], start)
-            residual_statistics(*stamps, residual, fit.inverse_sigma, out[rows])
+            residual_statistics(*block.some(part), residual, fit.inverse_sigma, out[rows])
 
         fit.bank.map(measure, block.parts())
     return out

@@ -10,7 +10,7 @@ from astropy.table import QTable
 
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
-from miricigale.utils.tables import described_table, require_columns
+from miricigale.utils.tables import described_rows, require_columns
 from miricigale.utils.unified import read_write
 from miricigale.utils.units import FNU
 
@@ -86,10 +86,19 @@ class ErrorCalibration:
         pull = (flux[good] - true[good]) / error[good]
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = flux[good] / true[good] - 1.0
-        rows = zip(*(_row(snr, pull, ratio, member) for member in _members(snr)), strict=True)
-        columns = zip(_COLUMNS, rows, _COLUMNS.values(), strict=True)
-        bins = described_table({name: (list(values), text) for name, values, text in columns})
-        return cls(sources, bins, provenance(source="injection", **meta))
+        rows = (_row(snr, pull, ratio, member) for member in _members(snr))
+        return cls(sources, described_rows(rows, _COLUMNS), provenance(source="injection", **meta))
+
+    def to_table(self):
+        """Return the sources, with the meta of the calibration, from which `from_table` makes it again."""
+        table = self.sources.copy()
+        table.meta = dict(self.meta)
+        return table
+
+    @classmethod
+    def from_table(cls, table):
+        """Make the calibration of a table that `to_table` made."""
+        return dataclasses.replace(cls.from_sources(table), meta=dict(table.meta))
 
     def factor(self, flux, flux_err_noise):
         """
@@ -129,18 +138,18 @@ class ErrorCalibration:
             If the errors were multiplied before.
         """
         if "error_calibration" in result.meta:
-            raise argument_error(
-                "result", "one with errors as they were measured", "a calibrated one"
-            )
+            wanted = "one with errors as they were measured"
+            raise argument_error("result", wanted, "a calibrated one")
         factor = self.factor(result.flux, result.flux_err_noise)
         names = ["flux_err", "flux_err_noise", "flux_err_template", "flux_err_psf"]
-        changed = {name: getattr(result, name) * factor for name in names}
-        known = np.nan_to_num(factor, nan=1.0)
-        changed["covariance"] = _scaled(result.covariance, known)
+        scale = scipy.sparse.diags_array(np.nan_to_num(factor, nan=1.0))
+        changed = {"covariance": (scale @ result.covariance @ scale).tocsr()}
         if result.joint_covariance is not None:
-            changed["joint_covariance"] = _scaled(result.joint_covariance, np.tile(known, 2))
-            changed["flux_point_err"] = result.flux_point_err * factor
-        bins = {name: [float(v) for v in self.bins[name]] for name in ("snr", "factor")}
+            names.append("flux_point_err")
+            scale = scipy.sparse.block_diag((scale, scale), format="csr")
+            changed["joint_covariance"] = (scale @ result.joint_covariance @ scale).tocsr()
+        changed |= {name: getattr(result, name) * factor for name in names}
+        bins = {name: self.bins[name].tolist() for name in ("snr", "factor")}
         meta = {**result.meta, "error_calibration": bins}
         return dataclasses.replace(result, **changed, meta=meta)
 
@@ -177,25 +186,12 @@ def _members(snr):
 
 
 def _row(snr, pull, ratio, member):
-    pull, middle = pull[member], np.median(pull[member])
+    pull = pull[member]
     ratio = ratio[member][np.isfinite(ratio[member])]
     factor = np.percentile(np.abs(pull), _ONE_SIGMA)
-    return (
-        float(snr[member].min()),
-        float(snr[member].max()),
-        float(np.median(snr[member])),
-        len(member),
-        float(np.std(pull)),
-        float(mad_std(pull)),
-        float(np.mean(pull)),
-        float(middle),
-        float(np.median(ratio)) if len(ratio) else np.nan,
-        float(factor),
-        # of a percentile: root of p (1 - p) / n over the density of |x| there, 0.484
-        float(factor * 0.4655 / 0.4839 / np.sqrt(len(member))),
-    )
-
-
-def _scaled(covariance, factor):
-    scale = scipy.sparse.diags_array(factor)
-    return (scale @ covariance @ scale).tocsr()
+    bias = np.median(ratio) if len(ratio) else np.nan
+    # of a percentile: root of p (1 - p) / n over the density of |x| there, 0.484
+    factor_err = factor * 0.4655 / 0.4839 / np.sqrt(len(member))
+    snr, spreads = snr[member], (np.std(pull), mad_std(pull))
+    limits = snr.min(), snr.max(), np.median(snr)
+    return *limits, len(member), *spreads, np.mean(pull), np.median(pull), bias, factor, factor_err

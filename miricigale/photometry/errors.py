@@ -18,20 +18,20 @@ from miricigale.photometry._core.stamps import (
     projections,
     whiten_stamps,
 )
-from miricigale.photometry.templates import batches
+from miricigale.photometry.templates import Block, batches
 from miricigale.utils.parallel import chunks, parallel_map
 
 
-def noise_correlation(residual, usable, *, weight=None, executor=None):
+def noise_correlation(residual, usable, weight, *, executor=None):
     """
     Measure the covariance of pixels' noise on a whitened residual image.
 
     Parameters
     ----------
     residual, usable : `~numpy.ndarray`, shape (ny, nx)
-        Data minus model, over sigma, and which pixels are free of sources and have data.
-    weight : `~numpy.ndarray`, shape (ny, nx), optional
-        1 / sigma, if the residual is not over sigma yet.
+        Data minus model, and which pixels are free of sources and have data.
+    weight : `~numpy.ndarray`, shape (ny, nx)
+        1 / sigma.
     executor : `concurrent.futures.Executor`, optional
         Threads to work with.
 
@@ -53,14 +53,14 @@ def noise_correlation(residual, usable, *, weight=None, executor=None):
         raise ValueError(msg)
 
     def rows(part):
-        return residual[part] if weight is None else residual[part] * weight[part]
+        return residual[part] * weight[part]
 
     # some millions of pixels are enough for the median and the spread
     every = np.s_[:: max(1, np.count_nonzero(usable) // _SOME)]
-    some, where = (np.ascontiguousarray(one).reshape(-1)[every] for one in (residual, usable))
-    if weight is not None:
-        some = some * np.ascontiguousarray(weight).reshape(-1)[every]
-    some = some[where]
+    some, inverse, where = (
+        np.ascontiguousarray(one).reshape(-1)[every] for one in (residual, weight, usable)
+    )
+    some = (some * inverse)[where]
     middle = np.median(some)
     spread = mad_std(some)
     kept = np.empty(usable.shape, bool)
@@ -138,82 +138,73 @@ _SOME = 4_000_000
 
 def _whitened(bank, block, inverse_sigma):
     """A block's stamps over the noise, and their sums as `whiten_stamps` makes them."""
-    values = np.empty_like(block.values)
+    white = dataclasses.replace(block, values=np.empty_like(block.values))
     sums = np.empty((len(block.box), 4))
 
     def scale(part):
-        stamps = (block.values, block.box[part], block.start[part])
-        whiten_stamps(*stamps, inverse_sigma, values, sums[part])
+        whiten_stamps(*block.some(part), inverse_sigma, white.values, sums[part])
 
     bank.map(scale, block.parts())
-    return values, sums
+    return white, sums
 
 
-def _projected(bank, block, values, images):
+def _projected(bank, block, images):
     """Sums of a block's stamps times images, shape (n, len(images))."""
     out = np.empty((len(images), len(block.box)))
 
     def project_part(part):
         for image, one in zip(images, out, strict=True):
-            projections(values, block.box[part], block.start[part], image, one[part])
+            projections(*block.some(part), image, one[part])
 
     bank.map(project_part, block.parts())
     return out.T
 
 
 def _products(bank, left, right, pairs):
-    """Sums of the products of pairs of stamps, each side as (values, box, start)."""
+    """Sums of the products of pairs of stamps of two blocks."""
     out = np.empty(len(pairs))
 
     def multiply(part):
-        pair_products(*left, *right, pairs[part], out[part])
+        pair_products(*left.stamps, *right.stamps, pairs[part], out[part])
 
     bank.map(multiply, chunks(len(pairs), _PAIRS))
     return out
 
 
-def _gather(n, diagonal, pairs, products):
-    i, j = pairs.T.astype(np.int64)
-    rows = np.concatenate([np.arange(n), i, j])
-    columns = np.concatenate([np.arange(n), j, i])
-    data = np.concatenate([diagonal, products, products])
-    return scipy.sparse.coo_array((data, (rows, columns)), shape=(n, n)).tocsr()
-
-
-def _walk(bank, inverse_sigma, pairs, out, spread=None):
+def _walk(bank, inverse_sigma, images, spread=None):
     """
-    Products of all pairs, with at most those blocks in memory that can still overlap.
+    Products of all pairs of the whitened stamps, and their projections on images.
 
-    ``spread`` is what is done to the right-hand one of a pair, given its block and whitened
-    stamps; the walk yields each block, its whitened stamps, those after it, and the stamps' sums.
+    At most those blocks are in memory that can still overlap. ``spread`` is what is done to the right-hand block
+    of a pair; stamps grow by its ``lag``. Returns the matrix, (n, n), the projection, and the stamps' sums.
     """
-    live = []
+    n, grow = len(bank.order), 0 if spread is None else spread.lag
+    pairs = find_pairs(bank.box, grow=grow)
+    products, diagonal = np.zeros(len(pairs)), np.empty(n)
+    sums, projection, live = np.empty((n, 4)), np.empty((n, len(images))), []
     for block in bank.blocks():
-        values, sums = _whitened(bank, block, inverse_sigma)
-        white = (values, block.box, block.start)
-        mine = white if spread is None else spread(block, white)
-        live = [one for one in live if one[1] > block.box[0, 0]]
-        live.append((block, _reach(block, mine), white))
-        for other, _, theirs in live:
+        rows = slice(block.first, block.last)
+        white, sums[rows] = _whitened(bank, block, inverse_sigma)
+        projection[rows] = _projected(bank, white, images)
+        mine, diagonal[rows] = white, sums[rows, 3]
+        if spread is not None:
+            mine = spread(white)
+            own = np.repeat(np.arange(len(block.box), dtype=np.int32), 2).reshape(-1, 2)
+            diagonal[rows] = _products(bank, white, mine, own)
+        live = [one for one in live if one.end + grow > block.box[0, 0]]
+        live.append(white)
+        for other in live:
             low, high = np.searchsorted(pairs[:, 0], [other.first, other.last])
-            rows = low + np.flatnonzero(
+            met = low + np.flatnonzero(
                 (pairs[low:high, 1] >= block.first) & (pairs[low:high, 1] < block.last)
             )
-            if len(rows):
-                local = pairs[rows] - np.array([other.first, block.first], pairs.dtype)
-                out[rows] = _products(bank, theirs, mine, local)
-        yield block, white, mine, sums
-
-
-def _own(block):
-    """Pairs of each stamp of a block with itself."""
-    return np.repeat(np.arange(len(block.box), dtype=np.int32), 2).reshape(-1, 2)
-
-
-def _reach(block, grown):
-    _, box, _ = grown
-    rim = block.box[0, 0] - box[0, 0] if len(box) else 0
-    return int((box[:, 0] + box[:, 2]).max() + 2 * rim)
+            if len(met):
+                local = pairs[met] - np.array([other.first, block.first], pairs.dtype)
+                products[met] = _products(bank, other, mine, local)
+    i, j = pairs.T.astype(np.int64)
+    where = np.concatenate([np.arange(n), i, j]), np.concatenate([np.arange(n), j, i])
+    data = np.concatenate([diagonal, products, products])
+    return scipy.sparse.coo_array((data, where), shape=(n, n)).tocsr(), projection, sums
 
 
 def normal_matrix(bank, inverse_sigma, images=()):
@@ -237,16 +228,8 @@ def normal_matrix(bank, inverse_sigma, images=()):
     power, light : `~numpy.ndarray`, shape (n,) and (n, 2)
         Sums of squares of the templates without weights; their sums inside the image, and on usable pixels.
     """
-    n = len(bank.order)
-    pairs = find_pairs(bank.box)
-    products = np.zeros(len(pairs))
-    sums = np.empty((n, 4))
-    projection = np.empty((n, len(images)))
-    for block, white, _, found in _walk(bank, inverse_sigma, pairs, products):
-        rows = slice(block.first, block.last)
-        sums[rows] = found
-        projection[rows] = _projected(bank, block, white[0], images)
-    return _gather(n, sums[:, 3], pairs, products), projection, sums[:, 2], sums[:, :2]
+    matrix, projection, sums = _walk(bank, inverse_sigma, images)
+    return matrix, projection, sums[:, 2], sums[:, :2]
 
 
 def sandwich_matrix(bank, inverse_sigma, correlation, images=()):
@@ -257,45 +240,37 @@ def sandwich_matrix(bank, inverse_sigma, correlation, images=()):
     in `normal_matrix`. Stamps are convolved with it by transforms in single precision, that of the
     correlation made once for each padded shape.
     """
-    n = len(bank.order)
-    pairs = find_pairs(bank.box, grow=correlation.shape[0] // 2)
-    products = np.zeros(len(pairs))
-    diagonal, projection = np.empty(n), np.empty((n, len(images)))
-    spread = _spread_by(correlation, bank)
-    for block, white, mine, _ in _walk(bank, inverse_sigma, pairs, products, spread):
-        rows = slice(block.first, block.last)
-        diagonal[rows] = _products(bank, white, mine, _own(block))
-        projection[rows] = _projected(bank, block, white[0], images)
-    return _gather(n, diagonal, pairs, products), projection
+    return _walk(bank, inverse_sigma, images, _Spread(correlation, bank))[:2]
 
 
-def _spread_by(correlation, bank):
-    """A function that convolves the whitened stamps of a block with the noise's correlation."""
-    lag = correlation.shape[0] // 2
-    kernel = np.asarray(correlation, np.float32)
+class _Spread:
+    """Convolves the whitened stamps of a block with the noise's correlation."""
 
-    @functools.lru_cache(maxsize=64)
-    def transfer(shape):
-        return scipy.fft.rfft2(kernel, s=shape)
+    def __init__(self, correlation, bank):
+        self.lag, self._map = correlation.shape[0] // 2, bank.map
+        self._kernel = np.asarray(correlation, np.float32)
+        self._transfer = functools.lru_cache(maxsize=64)(
+            lambda shape: scipy.fft.rfft2(self._kernel, s=shape)
+        )
 
-    def spread(block, white):
+    def __call__(self, block):
+        lag = self.lag
         if lag == 0:
-            return white[0] * kernel[0, 0], *white[1:]
+            return dataclasses.replace(block, values=block.values * self._kernel[0, 0])
         box = block.box + np.array([-lag, -lag, 2 * lag, 2 * lag])
         start = np.concatenate([[0], np.cumsum(box[:, 2] * box[:, 3])])
         values = np.empty(int(start[-1]), np.float32)
 
         def convolve(batch):
             shape, rows = batch
-            convolve_stamps(*white, rows, transfer(shape), shape, box, start, values)
+            transfer = self._transfer(shape)
+            convolve_stamps(*block.stamps, rows, transfer, shape, box, start, values)
 
         # rounded up so that many stamps share a shape
         shapes = -(-box[:, 2:] // 8) * 8
         fast = {n: scipy.fft.next_fast_len(int(n), True) for n in np.unique(shapes)}
-        bank.map(convolve, batches((fast[ny], fast[nx]) for ny, nx in shapes))
-        return values, box, start
-
-    return spread
+        self._map(convolve, batches((fast[ny], fast[nx]) for ny, nx in shapes))
+        return Block(block.first, box, start, values)
 
 
 def cross_matrix(bank, other, inverse_sigma, correlation=None):
@@ -305,27 +280,24 @@ def cross_matrix(bank, other, inverse_sigma, correlation=None):
     With a ``correlation`` (as of `sandwich_matrix`) the other bank's stamps are convolved with it.
     """
     rows, columns, values = [], [], []
-    spread = None if correlation is None else _spread_by(correlation, other)
+    spread = None if correlation is None else _Spread(correlation, other)
     waiting, live = bank.blocks(), []
-    for theirs in other.blocks():
-        right = (_whitened(other, theirs, inverse_sigma)[0], theirs.box, theirs.start)
-        if spread is not None:
-            right = spread(theirs, right)
+    for block in other.blocks():
+        right = _whitened(other, block, inverse_sigma)[0]
+        right = right if spread is None else spread(right)
         # of the first bank, those blocks only that this one and those after it can overlap
-        first, last = right[1][0, 0], (right[1][:, 0] + right[1][:, 2]).max()
-        live = [one for one in live if one[1] > first]
-        while not live or live[-1][0].box[0, 0] < last:
-            mine = next(waiting, None)
-            if mine is None:
+        live = [one for one in live if one.end > right.box[0, 0]]
+        while not live or live[-1].box[0, 0] < right.end:
+            left = next(waiting, None)
+            if left is None:
                 break
-            left = (_whitened(bank, mine, inverse_sigma)[0], mine.box, mine.start)
-            live.append((mine, _reach(mine, left), left))
-        for mine, _, left in live:
-            pairs = cross_pairs(mine.box, right[1])
+            live.append(_whitened(bank, left, inverse_sigma)[0])
+        for left in live:
+            pairs = cross_pairs(left.box, right.box)
             if len(pairs):
                 values.append(_products(bank, left, right, pairs))
-                rows.append(pairs[:, 0] + mine.first)
-                columns.append(pairs[:, 1] + theirs.first)
+                rows.append(pairs[:, 0] + left.first)
+                columns.append(pairs[:, 1] + right.first)
     shape = len(bank.order), len(other.order)
     if not values:
         return scipy.sparse.csr_array(shape)
@@ -356,14 +328,10 @@ class LinearFit:
         z = solve(self.border) if self.border.shape[1] else self.border
         q = np.linalg.inv(self.corner - self.border.T @ z)
         common = q @ (self.corner_rhs - z.T @ self.rhs)
-        for name, value in (
-            ("solve", solve),
-            ("_z", z),
-            ("_q", q),
-            ("common", common),
-            ("flux", solve(self.rhs) - z @ common),
-        ):
-            object.__setattr__(self, name, value)
+        found = {"solve": solve, "_z": z, "_q": q, "common": common}
+        found["flux"] = solve(self.rhs) - z @ common
+        # the class is frozen
+        self.__dict__.update(found)
 
     def covariances(self, xy, fillings, *, core, halo, pattern=None):
         """
@@ -388,10 +356,10 @@ class LinearFit:
             Formal error over that of the source alone.
         """
         z, q = self._z, self._q
+        middles = [None if one is None else one[0] for one in fillings]
         local, inverse = block_covariance(
-            self.matrix, xy[:, 1], xy[:, 0], core=core, halo=halo, pattern=pattern,
-            middles=[None if one is None else one[0] for one in fillings],
-        )  # fmt: skip
+            self.matrix, *xy.T[::-1], core=core, halo=halo, pattern=pattern, middles=middles
+        )
         inverse = inverse + np.einsum("kg,kg->k", z @ q, z)
         blending = np.sqrt(inverse * self.matrix.diagonal())
         found = [self._with_common(*both) for both in zip(local, fillings, strict=True)]

@@ -216,8 +216,4 @@ def _field(state):
 
 register(SourceTemplates, read=_read_templates, write=_write_templates)
 register(ForcedPhotometryResult, read=_read_result, write=_write_result)
-register(
-    ForcedPhotometryResult,
-    write=lambda result, path, **options: write_ecsv(result.to_table(), path, **options),
-    name="ascii.ecsv",
-)
+register(ForcedPhotometryResult, write=write_ecsv, name="ascii.ecsv")

@@ -1,7 +1,5 @@
 """Errors of a fit: by the noise, by what is not known of the templates, by the PSF."""
 
-import dataclasses
-
 import numpy as np
 import scipy.sparse
 from scipy.signal import oaconvolve
@@ -15,20 +13,20 @@ from miricigale.utils.units import ANGLE
 _CORE, _HALO = 18.0, 6.0
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Covariances:
-    """Errors of the fitted rows."""
+def fit_covariances(fit, correlation):
+    """
+    Covariances of a `TemplateFit`, with the correlation of the noise; None if that is white.
 
-    #: (n, n): By the image's noise, and by what is not known of the templates.
-    noise: object
-    template: object
-    psf: np.ndarray  # (n,): Errors by the PSF, which is the same for all.
-    common: np.ndarray  # (g, g): Of the common parameters.
-    blending: np.ndarray  # (n,): Formal error over that of the source alone.
-
-
-def fit_covariances(fit, correlation=None):
-    """The `Covariances` of a `TemplateFit`, with the correlation of the noise; white without."""
+    Returns
+    -------
+    noise, template, psf : `~scipy.sparse.csr_array`, shape (n, n)
+        Of the fitted rows: by the image's noise, by what is not known of the templates, and by the PSF, whose
+        errors go together.
+    common : `~numpy.ndarray`, shape (g, g)
+        Of the common parameters.
+    blending : `~numpy.ndarray`, shape (n,)
+        Formal error over that of the source alone.
+    """
     n, g, plain, free = len(fit.rows), len(fit.columns), fit.fit, fit.free
     solution, xy = plain, fit.bank.xy[fit.rows]
     fillings = [None if correlation is None else _sandwich(fit, correlation)]
@@ -60,7 +58,10 @@ def fit_covariances(fit, correlation=None):
         variance = noise.diagonal()
         blending[first] = np.sqrt(variance[first] + variance[second] + 2 * both) / alone[first]
         blending[second] = blending[first]
-    return Covariances(noise, template, _psf_errors(fit)[fit.rows], common, blending)
+    coo, error = noise.tocoo(), _psf_errors(fit)[fit.rows]
+    data = error[coo.row] * error[coo.col]
+    psf = scipy.sparse.coo_array((data, (coo.row, coo.col)), shape=noise.shape).tocsr()
+    return noise, template, psf, common, blending
 
 
 def _psf_errors(fit):

@@ -37,8 +37,6 @@ class ForcedFlags(Flags):
     POOR_FIT = 256
     #: Light that no template explains (5 sigma, a tenth of the flux) is within two widths of the PSF.
     UNEXPLAINED_NEIGHBOR = 512
-    # the name of former versions
-    UNEXPLAINED_NEIGHBOUR = 512
     #: The point on the template cannot be distinguished from it, or the template was not measured: one flux only.
     ONE_COMPONENT = 1024
     #: Not in the catalog: found on the residual of a first fit.

@@ -1,7 +1,6 @@
 """Forced photometry: all sources of a catalog fitted at once, with templates."""
 
 import dataclasses
-import numbers
 import os
 import warnings
 
@@ -17,7 +16,6 @@ from miricigale.photometry.arrays import (
     image_arrays,
     pixel_scale,
 )
-from miricigale.photometry.catalogs import catalog_sources
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.mosaics import as_mosaic
 from miricigale.photometry.packaging import CatalogRows, package
@@ -30,8 +28,16 @@ from miricigale.photometry.sources import SourceTemplates
 from miricigale.psf import KernelField, MatchingKernel
 from miricigale.utils.exceptions import PhotometryWarning, argument_error
 from miricigale.utils.interactive import Interactive, checked_calls
+from miricigale.utils.options import check_choice
 from miricigale.utils.parallel import single_threaded, thread_count, threads
-from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, positive, to_array
+from miricigale.utils.units import (
+    ANGLE,
+    FNU,
+    SURFACE_BRIGHTNESS,
+    is_number,
+    positive,
+    to_array,
+)
 
 
 @checked_calls
@@ -147,28 +153,23 @@ class ForcedPhotometer(Interactive):
         if isinstance(self.kernel, (str, os.PathLike)):
             object.__setattr__(self, "kernel", MatchingKernel.read(self.kernel))
         if self.kernel is not None and highres_psf is not None:
-            raise argument_error(
-                "highres_psf", "given with 'psf', not with 'kernel'", "a kernel too"
-            )
-        if self.kernel is None:
-            if highres_psf is None:
-                kernel = MatchingKernel.identity(psf)
-                object.__setattr__(
-                    self, "template", "psf" if self.template == "auto" else self.template
-                )
-            else:
-                kernel = MatchingKernel.from_psfs(highres_psf, psf)
-            object.__setattr__(self, "kernel", kernel)
-        if not isinstance(self.kernel, (MatchingKernel, KernelField)):
+            wanted = "given with 'psf', not with 'kernel'"
+            raise argument_error("highres_psf", wanted, "a kernel too")
+        template, kernel = self.template, self.kernel
+        check_choice(template, "template", ("auto", "cutout", "psf", "sersic"))
+        if kernel is None and highres_psf is None:
+            kernel = MatchingKernel.identity(psf)
+            template = "psf" if template == "auto" else template
+        elif kernel is None:
+            kernel = MatchingKernel.from_psfs(highres_psf, psf)
+        if not isinstance(kernel, (MatchingKernel, KernelField)):
             wanted = "a MatchingKernel or a KernelField (or give 'psf')"
-            raise argument_error("kernel", wanted, type(self.kernel).__name__)
-        template = self.template
-        if template not in ("auto", "cutout", "psf", "sersic"):
-            raise argument_error("template", "'auto', 'cutout', 'psf' or 'sersic'", repr(template))
+            raise argument_error("kernel", wanted, type(kernel).__name__)
         # the kernel that all have in common: the mean, with PSFs in any case
-        mean = self.kernel.mean if isinstance(self.kernel, KernelField) else self.kernel
+        mean = kernel.mean if isinstance(kernel, KernelField) else kernel
         bare = mean.source is None or mean.target is None
-        changed = {"bare": bare, "mean_kernel": mean, "n_threads": thread_count(self.n_threads)}
+        changed = {"kernel": kernel, "template": template, "bare": bare, "mean_kernel": mean}
+        changed["n_threads"] = thread_count(self.n_threads)
         if bare:
             if template not in ("auto", "cutout"):
                 wanted = f"a MatchingKernel with its PSFs for template={template!r}"
@@ -183,18 +184,11 @@ class ForcedPhotometer(Interactive):
             changed |= {"template": "cutout", "wings": False, "mean_kernel": mean}
         for name, largest in (("background_order", 4), ("offset_order", 3)):
             order = getattr(self, name)
-            if order is None:
-                continue
-            if (
-                not isinstance(order, numbers.Integral)
-                or isinstance(order, bool)
-                or not 0 <= order <= largest
-            ):
+            if order is not None and not (is_number(order, np.integer) and 0 <= order <= largest):
                 raise argument_error(name, f"an integer from 0 to {largest}", repr(order))
         if self.offset_order is not None and self.max_shift is None:
             raise argument_error("max_shift", "given with 'offset_order'", "None")
-        if self.components not in (1, 2):
-            raise argument_error("components", "1 or 2", repr(self.components))
+        check_choice(self.components, "components", (1, 2))
         for name, kind in (("errors", ErrorSettings), ("memory", MemorySettings)):
             if not isinstance(getattr(self, name), kind):
                 raise argument_error(name, kind.__name__, repr(getattr(self, name)))
@@ -256,7 +250,8 @@ class ForcedPhotometer(Interactive):
         given = [one is not None for one in (highres, segmentation, catalog)]
         if templates is None:
             highres, segmentation, catalog = self._prior(image, highres, segmentation, catalog)
-            sources = dataclasses.replace(catalog_sources(catalog), sky=catalog["sky"])
+            sources = SourceTemplates.from_catalog(catalog)
+            sources = dataclasses.replace(sources, sky=catalog["sky"])
         elif any(given):
             raise argument_error("templates", "given alone with the image", "a catalog too")
         elif not isinstance(templates, SourceTemplates):

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import scipy.sparse
 
+from miricigale.photometry._core.solve import factorize
 from miricigale.photometry.errors import (
     LinearFit,
     cross_matrix,
@@ -61,29 +62,16 @@ class FreeTemplates:
 
     def alone(self):
         """What blending with its own changes leaves of each source's power, shape (n,)."""
-        n, owner = self.n, self.owner
-        matrix, left = self.fit.matrix.tocoo(), np.ones(n)
-        if not len(owner):
-            return left
-        # the changes of each source by turns, in matrices that are filled up with ones
-        order = np.argsort(owner, kind="stable")
-        sources, first, count = np.unique(owner[order], return_index=True, return_counts=True)
-        turn = np.empty(len(owner), int)
-        turn[order] = np.arange(len(owner)) - np.repeat(first, count)
-        place = np.searchsorted(sources, owner)
-        block = np.tile(np.eye(count.max()), (len(sources), 1, 1))
-        side = np.zeros((len(sources), count.max()))
-        change = matrix.row - n
-        own = (change >= 0) & (matrix.col >= n)
-        own[own] = owner[change[own]] == owner[matrix.col[own] - n]
-        i, j = change[own], matrix.col[own] - n
-        block[place[i], turn[i], turn[j]] = matrix.data[own]
-        own = (change >= 0) & (matrix.col < n)
-        own[own] = owner[change[own]] == matrix.col[own]
-        side[place[change[own]], turn[change[own]]] = matrix.data[own]
-        lost = np.einsum("kq,kq->k", side, np.linalg.solve(block, side[..., None])[..., 0])
-        left[sources] -= lost / self.fit.matrix.diagonal()[sources]
-        return left
+        n, matrix = self.n, self.fit.matrix.tocoo()
+        if not len(self.owner):
+            return np.ones(n)
+        source = np.concatenate([np.arange(n), self.owner])
+        own = source[matrix.row] == source[matrix.col]
+        entries = matrix.data[own], (matrix.row[own], matrix.col[own])
+        blocks = scipy.sparse.coo_array(entries, shape=matrix.shape).tocsr()
+        side = blocks[n:, :n].sum(axis=1)
+        lost = np.bincount(self.owner, side * factorize(blocks[n:, n:])(side), minlength=n)
+        return 1.0 - lost / matrix.diagonal()[:n]
 
     def filling(self, middle):
         """

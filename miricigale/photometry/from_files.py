@@ -129,8 +129,7 @@ def measure_files(
         if segmentation is None:
             segments, sources = detected_prior(prior, catalog)
         else:
-            given = {"segmentation": segmentation, "catalog": catalog}
-            segments, sources = read_prior(prior, path=highres.path, **given)
+            segments, sources = read_prior(prior, segmentation=segmentation, catalog=catalog)
         bar.update()
         bar.set_description("fluxes")
         photometer = ForcedPhotometer(

@@ -8,23 +8,20 @@ from astropy.nddata import CCDData
 from astropy.table import QTable, vstack
 from photutils.segmentation import SegmentationImage
 
-from miricigale.instrument.image import Image
 from miricigale.photometry.arrays import image_arrays, pixel_scale
 from miricigale.photometry.catalogs import joined_sky
-from miricigale.photometry.cutouts import Cutout
 from miricigale.photometry.detection import bright_centroids
 from miricigale.photometry.error_calibration import ErrorCalibration
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.forced import ForcedPhotometer
 from miricigale.photometry.priors import labels_at
-from miricigale.photometry.shapes import ShapeModels
+from miricigale.photometry.shapes import Shape, ShapeModels
 from miricigale.photometry.sources import SourceTemplates
-from miricigale.profiles import sersic_stamp
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.progress import progress
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import require_columns
-from miricigale.utils.units import FNU, SURFACE_BRIGHTNESS
+from miricigale.utils.units import FNU, SURFACE_BRIGHTNESS, check_count
 
 #: Radius (fine pixels) of a profile that is as good as a point.
 _POINT = 0.05
@@ -96,21 +93,17 @@ def calibrate_errors(
     if not isinstance(photometer, ForcedPhotometer) or photometer.template == "sersic":
         wanted = "a ForcedPhotometer whose template is 'auto', 'cutout' or 'psf'"
         raise argument_error("photometer", wanted, repr(photometer))
-    if isinstance(n_trials, bool) or int(n_trials) != n_trials or n_trials < 1:
-        raise argument_error("n_trials", "an integer of at least 1", n_trials)
+    n_trials = check_count(n_trials, "n_trials")
     require_columns(catalog, ["sky"], "catalog")
     seed = check_seed(seed)
     if n_sources is None:
         n_sources = max(10, len(catalog) // 7)
-    if int(n_sources) != n_sources or n_sources < 1:
-        raise argument_error("n_sources", "an integer of at least 1", n_sources)
+    n_sources = check_count(n_sources, "n_sources")
     field = _Field(photometer, image, highres, segmentation, catalog)
     tables = []
-    for trial in progress(range(int(n_trials)), show=progress_bar, desc="inject"):
-        rng = stream(seed, "injection", trial)
-        found = field.trial(int(n_sources), rng)
-        found["trial"] = trial
-        tables.append(found)
+    for trial in progress(range(n_trials), show=progress_bar, desc="inject"):
+        tables.append(field.trial(n_sources, stream(seed, "injection", trial)))
+        tables[-1]["trial"] = trial
     sources = vstack(tables, metadata_conflicts="silent")
     return ErrorCalibration.from_sources(sources, seed=seed)
 
@@ -161,7 +154,6 @@ class _Field:
         # of kernels of several places the mean
         source = photometer.mean_kernel.source
         self.models = ShapeModels(source / source.sum())
-        self.reach = source.shape[0] / 2
         templates = SourceTemplates.from_images(highres, segmentation, catalog, psf=source)
         if "label" in catalog.colnames:
             self.own = np.asarray(catalog["label"], int)
@@ -169,12 +161,12 @@ class _Field:
             xy = np.stack(highres.wcs.world_to_pixel(catalog["sky"]), axis=-1).reshape(-1, 2)
             self.own, _ = labels_at(self.labels, xy)
         places = scipy.ndimage.find_objects(self.labels)
-        usable = self.base.flags & ~int(_HARMLESS) == 0
-        kinds = templates.kind
-        for k in np.flatnonzero(usable & (templates.flags == 0)):
-            donor = self._donor(templates.fitted[k], kinds[k], self.own[k], places)
-            if donor is not None:
-                self.donors.append(donor)
+        usable = (self.base.flags & ~int(_HARMLESS) == 0) & (templates.flags == 0)
+        found = zip(templates.fitted, templates.kind, self.own, strict=True)
+        donors = [
+            self._donor(*one, places) for one, good in zip(found, usable, strict=True) if good
+        ]
+        self.donors = [one for one in donors if one is not None]
         if not self.donors:
             wanted = "with sources that are points or profiles, to be copied"
             raise argument_error("highres", wanted, "none")
@@ -226,7 +218,7 @@ class _Field:
         flux = self.error * np.exp(rng.uniform(*np.log(_SNR_RANGE), len(full)))
         new = self._galaxies(full, flux, rng) if self.donors else self._points(full, flux)
         light = self.photometer.render(self.image, new.light, new.flux * FNU)
-        image = _with_data(self.image, self.image.data + light.to_value(self.image.unit))
+        image = _with_light(self.image, light)
         nothing = self.image.wcs.pixel_to_world(*empty.T).transform_to(self.sky.frame)
         both = QTable({"sky": joined_sky([self.sky, new.catalog["sky"], nothing])})
         if self.own is not None:
@@ -273,7 +265,8 @@ class _Field:
             label = int(labels.max()) + 1
             labels[cut][donor.mask] = label
             rows.append((label, cut, donor, total))
-            light.append(_profile(parameters, self.reach))
+            shape = Shape(1.0, parameters, 0.0, None)
+            light.append(shape.drawn(1.0, max(self.models.reach, 2 * shape.axes[0])))
         if not rows:
             raise argument_error("image", "large enough for sources", "none")
         # positions are those that detection would find
@@ -289,8 +282,7 @@ class _Field:
         truth = SourceTemplates(
             id=np.arange(len(rows)), sky=catalog["sky"].icrs, light=light, wcs=wcs
         )  # fmt: skip
-        added = (data / self.fine.area * SURFACE_BRIGHTNESS).to_value(self.highres.unit)
-        highres = _with_data(self.highres, self.highres.data + added)
+        highres = _with_light(self.highres, data / self.fine.area * SURFACE_BRIGHTNESS)
         return _Injected(catalog, truth, flux, np.array(kinds, "U6"), highres, labels)
 
     def _paint(self, image, parameters, light):
@@ -306,20 +298,8 @@ class _Field:
         target += stamp[i : i + target.shape[0], j : j + target.shape[1]]
 
 
-def _profile(parameters, reach):
-    """The light of a profile on the fine grid, before convolution."""
-    eta = np.hypot(*parameters[4:])
-    radius, ratio = np.exp(parameters[2] + eta / 2), np.exp(-eta)
-    stamp, origin = sersic_stamp(
-        x=parameters[0], y=parameters[1], r_eff=radius, n=np.exp(parameters[3]), axis_ratio=ratio,
-        theta=0.5 * np.arctan2(parameters[5], parameters[4]), max_radius=max(reach, 2 * radius),
-    )  # fmt: skip
-    return Cutout(stamp, origin, convolved=False)
-
-
-def _with_data(image, data):
-    """An image with other pixels."""
-    return Image(
-        data, unit=image.unit, wcs=image.wcs, mask=image.mask, uncertainty=image.uncertainty,
-        meta=dict(image.meta),
-    )  # fmt: skip
+def _with_light(image, light):
+    """A copy of an image with light (a quantity) added to it, whose noise is not known."""
+    found = image.copy()
+    found.data = image.data + light.to_value(image.unit)
+    return found

@@ -9,7 +9,6 @@ from miricigale.photometry.cutouts import Cutout
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.shapes import Shape, ShapeFitter, not_fitted
 from miricigale.photometry.wings import adjust_wings
-from miricigale.profiles import sersic_stamp
 from miricigale.utils.parallel import parallel_map
 
 #: Width (pixels) of the Gaussian that defines the core, its least signal-to-noise, how many standard
@@ -30,31 +29,28 @@ _DRAWN, _FARTHEST = 6.0, 200.0
 _PASSES, _CONTAMINATED, _AT_A_TIME = 4, 4.0, 512
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class FineImage:
-    """A high-resolution image from which templates are made."""
-
-    data: np.ndarray  # (ny, nx): light per pixel (any unit), background subtracted
-    variance: np.ndarray  # (ny, nx): its variance, infinite where not usable
-    psf: np.ndarray  # (k, k): odd and centered
-    scale: float  # arcsec per pixel
-
-
-def cutouts(image, segmentation, label, xy, *, min_snr=0.0, wings=True, select=True, executor=None):
+def cutouts(
+    data, variance, psf, scale, segmentation, label, xy, *, min_snr, wings=True, select=True,
+    executor=None,
+):  # fmt: skip
     """
     Make the template of each source from the high-resolution image.
 
     Parameters
     ----------
-    image : `FineImage`
-        The image.
+    data, variance : `~numpy.ndarray`, shape (ny, nx)
+        Light per pixel (any unit), background subtracted, and its variance, infinite where not usable.
+    psf : `~numpy.ndarray`, shape (k, k)
+        Its PSF, odd and centered.
+    scale : float
+        Arcsec per pixel.
     segmentation : int `~numpy.ndarray`, shape (ny, nx)
         Labels.
     label : int `~numpy.ndarray`, shape (n,)
         Label of each source, 0 for none.
     xy : `~numpy.ndarray`, shape (n, 2)
         Positions of the sources on the image.
-    min_snr : float, optional
+    min_snr : float
         Least signal-to-noise of a segment.
     wings : bool, optional
         Whether light outside of the segment is added; otherwise a cutout is the
@@ -87,7 +83,7 @@ def cutouts(image, segmentation, label, xy, *, min_snr=0.0, wings=True, select=T
     scaled with radius to what is seen (see `~miricigale.photometry.wings.adjust_wings`). Sources
     whose pixels hold light of others' models are fitted again without that light.
     """
-    segments = _Segments.of(image, segmentation)
+    segments = _Segments.of(data, variance, segmentation)
     flags, snr = np.zeros(len(label), int), np.full(len(label), np.nan)
     found, fitted, chosen = [None] * len(label), not_fitted(len(label)), []
     for k, one in enumerate(label):
@@ -101,9 +97,9 @@ def cutouts(image, segmentation, label, xy, *, min_snr=0.0, wings=True, select=T
             flags[k] = int(ForcedFlags.NOISY_SEGMENT)
     if not wings:
         for k in chosen:
-            found[k] = _bare(image, segments, label[k])
+            found[k] = _bare(data, variance, segments, label[k])
         return found, flags, snr, fitted
-    lights = _Lights(image, segments, select, executor)
+    lights = _Lights(data, variance, ShapeFitter(psf, scale), segments, select, executor)
     models = lights.fit([(label[k], xy[k]) for k in chosen])
     for k, model in zip(chosen, models, strict=True):
         if model is None:
@@ -127,8 +123,7 @@ class _Segments:
     ratio: np.ndarray
 
     @classmethod
-    def of(cls, image, labels):
-        data, variance = image.data, image.variance
+    def of(cls, data, variance, labels):
         places = scipy.ndimage.find_objects(labels)
         usable = np.isfinite(variance)
         flat, n = labels.ravel(), len(places) + 1
@@ -141,12 +136,12 @@ class _Segments:
         return cls(labels, usable, places, totals, ratio)
 
 
-def _bare(image, segments, label):
+def _bare(data, variance, segments, label):
     """The segment as it is."""
     place, total = segments.places[label - 1], segments.totals[label]
     member = (segments.labels[place] == label) & segments.usable[place]
-    light = np.where(member, image.data[place], 0.0) / total
-    noise = float(image.variance[place][member].sum()) / total**2
+    light = np.where(member, data[place], 0.0) / total
+    noise = float(variance[place][member].sum()) / total**2
     return Cutout(light, (place[0].start, place[1].start), noise=noise)
 
 
@@ -175,12 +170,10 @@ class _Model:
 class _Lights:
     """All sources of one image, whose pixels may hold light of each other."""
 
-    def __init__(self, image, segments, select, executor):
-        self.data, self.variance, self.segments = image.data, image.variance, segments
+    def __init__(self, data, variance, fitter, segments, select, executor):
+        self.data, self.variance, self.fitter, self.segments = data, variance, fitter, segments
         self.select, self.executor = select, executor
-        self.fitter = ShapeFitter(image.psf, image.scale)
-        self.reach = image.psf.shape[0] / 2
-        self.light, self.snr = _smooth(image.data, image.variance, executor)
+        self.light, self.snr = _smooth(data, variance, executor)
         # what is no more than a peak of the noise hides nothing
         self.others = segments.ratio >= _OTHER_SNR
 
@@ -283,14 +276,9 @@ class _Lights:
 
     def _profile(self, shape, corner, light=1.0):
         """A fitted profile on the fine grid, as far as the PSF reaches at least: steps at its edge show."""
-        x, y = shape.parameters[:2] + corner
-        radius, axis_ratio, angle = shape.axes
-        stamp, origin = sersic_stamp(
-            x=x, y=y, total_flux=light, r_eff=radius, n=np.exp(shape.parameters[3]),
-            axis_ratio=axis_ratio, theta=angle,
-            max_radius=max(self.reach, min(_DRAWN * radius, _FARTHEST)),
-        )  # fmt: skip
-        return Cutout(stamp, origin, convolved=False)
+        placed = dataclasses.replace(shape, parameters=shape.parameters + [*corner, 0, 0, 0, 0])
+        reach = min(_DRAWN * shape.axes[0], _FARTHEST)
+        return placed.drawn(light, max(self.fitter.reach, reach))
 
 
 def _around(place, xy, shape):

@@ -1,5 +1,6 @@
 """Images that observers bring, in any unit and with any map of the noise, as images in MJy/sr."""
 
+import contextlib
 import dataclasses
 import functools
 import json
@@ -178,7 +179,53 @@ class MosaicFile:
             If the header states another filter or angle than ``filter`` and ``pa_aper``.
         """
         with open_image(self.path, "an image") as (hdus, extension):
-            return _header(self, hdus, find_image(hdus, extension, self.path, ("SCI",)))
+            index = find_image(hdus, extension, self.path, ("SCI",))
+            header, first = hdus[index].header, hdus[0].header
+            wcs = read_wcs(header, hdus)
+        if wcs is None:
+            msg = f"{self.path} has no celestial coordinates (WCS) in its header"
+            raise DataError(msg)
+
+        def get(key):
+            return header.get(key, first.get(key))
+
+        meta = {}
+        # of another program it may be no JSON
+        with contextlib.suppress(json.JSONDecodeError):
+            meta = json.loads(header.get("META", "{}"))
+        name = filter_name(get) or meta.get("filter")
+        if self.filter is not None and name not in (None, self.filter):
+            raise argument_error(
+                "filter", f"{name!r}, the filter in {self.path}", repr(self.filter)
+            )
+        # a mosaic of our own has a list of angles
+        stated = {"filter": self.filter or name, "pa_aper": get("PA_APER")}
+        stated = {key: meta.get(key) if value is None else value for key, value in stated.items()}
+        return MosaicHeader(
+            index=index,
+            shape=hdus[index].shape,
+            wcs=wcs,
+            filter=stated["filter"],
+            pa_aper=self._checked_angle(stated["pa_aper"]),
+            unit=str(header.get("BUNIT", "") or "").strip()
+            if self.unit is None
+            else str(self.unit),
+            exposure=is_exposure(get),
+            keywords={key: get(key) for key in ("PHOTMJSR", "PHOTFLAM", "PHOTPLAM", "EXPTIME")},
+            meta={**meta, **{key: value for key, value in stated.items() if value is not None}},
+        )
+
+    def _checked_angle(self, stated):
+        """The position angle that was given or that the header states (deg, or None), which must agree."""
+        stated = None if stated is None else np.asarray(stated, float) * u.deg
+        if self.pa_aper is None:
+            return stated
+        angle = float(to_array(self.pa_aper, u.deg, "pa_aper", finite=True)) * u.deg
+        apart = 0.0 if stated is None else (angle - stated).to_value(u.deg)
+        if np.max(np.abs((apart + 180) % 360 - 180)) > 1:
+            wanted = f"PA_APER of {self.path}, {np.round(stated.value, 2)} deg"
+            raise argument_error("pa_aper", wanted, angle)
+        return angle
 
     def read(self):
         """
@@ -255,23 +302,20 @@ class MosaicFile:
 
             data -= background(data, ~usable, self.background_box)[0]
             meta["background_box"] = int(self.background_box)
+        relative = np.where(usable, data, 0)
         if sigma is not None:
             sigma *= factor
-            level, scale, _ = sky_noise(
-                np.where(usable, data, 0) / np.where(usable, sigma, 1), usable
-            )
+            relative = relative / np.where(usable, sigma, 1)
+        level, scale, _ = sky_noise(relative, usable)
+        if sigma is not None:
             _note_scale(self, kind, scale)
             meta["noise_scale"] = float(f"{scale:.6g}")
-            if kind == "weight":
-                if not scale > 0:
-                    msg = (
-                        f"{self.path}: the scale of its weights is unknown, for its sky is constant"
-                    )
-                    raise DataError(msg)
-                meta["weight_scale"] = meta["noise_scale"]
-                sigma *= sigma.dtype.type(scale)
-        else:
-            level, scale, _ = sky_noise(np.where(usable, data, 0), usable)
+        if kind == "weight":
+            if not scale > 0:
+                msg = f"{self.path}: the scale of its weights is unknown, for its sky is constant"
+                raise DataError(msg)
+            meta["weight_scale"] = meta["noise_scale"]
+            sigma *= sigma.dtype.type(scale)
         meta["sky_over_noise"] = float(f"{level / (scale or 1):.4g}")
         meta["n_masked"] = int(np.count_nonzero(~usable))
         return Image(
@@ -317,58 +361,6 @@ class MosaicHeader:
     exposure: bool
     keywords: dict  # Those of the photometric calibration.
     meta: dict  # What our own files carry, with ``filter`` and ``pa_aper`` (deg).
-
-
-def _header(file, hdus, index):
-    hdu = hdus[index]
-    header, first = hdu.header, hdus[0].header
-
-    def get(key):
-        return header.get(key, first.get(key))
-
-    wcs = read_wcs(header, hdus)
-    if wcs is None:
-        msg = f"{file.path} has no celestial coordinates (WCS) in its header"
-        raise DataError(msg)
-    try:
-        meta = json.loads(header.get("META", "{}"))
-    except json.JSONDecodeError:
-        # not one of ours
-        meta = {}
-    stated = filter_name(get) or meta.get("filter")
-    if stated is not None and file.filter is not None and stated != file.filter:
-        raise argument_error("filter", f"{stated!r}, the filter in {file.path}", repr(file.filter))
-    angle = get("PA_APER")
-    # a mosaic of our own has a list
-    angle = meta.get("pa_aper") if angle is None else angle
-    unit = str(header.get("BUNIT", "") or "").strip()
-    name = file.filter or stated
-    extra = {"filter": name, "pa_aper": angle}
-    return MosaicHeader(
-        index=index,
-        shape=hdu.shape,
-        wcs=wcs,
-        filter=name,
-        pa_aper=_checked_angle(file, None if angle is None else np.asarray(angle, float) * u.deg),
-        unit=unit if file.unit is None else str(file.unit),
-        exposure=is_exposure(get),
-        keywords={key: get(key) for key in ("PHOTMJSR", "PHOTFLAM", "PHOTPLAM", "EXPTIME")},
-        meta={**meta, **{key: value for key, value in extra.items() if value is not None}},
-    )
-
-
-def _checked_angle(file, stated):
-    """The position angle that was given or that the header states, which must agree."""
-    if file.pa_aper is None:
-        return stated
-    angle = float(to_array(file.pa_aper, u.deg, "pa_aper", finite=True)) * u.deg
-    if (
-        stated is not None
-        and np.max(np.abs(((angle - stated).to_value(u.deg) + 180) % 360 - 180)) > 1
-    ):
-        wanted = f"PA_APER of {file.path}, {np.round(stated.value, 2)} deg"
-        raise argument_error("pa_aper", wanted, angle)
-    return angle
 
 
 def _native(data):

@@ -125,12 +125,10 @@ def source_offsets(fit, residual, model, rows):
                 slice(max(c - half, low), max(min(c + half + 1, low + size), low))
                 for c, low, size in ((y, y0, ny), (x, x0, nx))
             )
-            inner = (
-                slice(place[0].start - y0, place[0].stop - y0),
-                slice(place[1].start - x0, place[1].stop - x0),
-            )
             stamp = block.values[block.start[one] : block.start[one + 1]].reshape(ny, nx)
-            light = fit.flux[rows[k]] * stamp[inner].astype(float)
+            stamp = stamp[place[0].start - y0 : place[0].stop - y0]
+            stamp = stamp[:, place[1].start - x0 : place[1].stop - x0]
+            light = fit.flux[rows[k]] * stamp.astype(float)
             if min(light.shape) < 5:
                 continue
             dy, dx = np.gradient(light)

@@ -64,12 +64,8 @@ def package(fit, diagnostics, new_xy, catalog, meta):
     chi2, left = np.full(n_all, np.nan), np.full(n_all, np.nan)
     joint = scipy.sparse.csr_array((2 * n_all, 2 * n_all))
     if len(fit.rows):
-        found = fit_covariances(fit, diagnostics.correlation)
-        common, blending[fit.rows] = found.common, found.blending
-        terms = [
-            _by_source(one, place[fit.rows], main[fit.rows], n_all)
-            for one in (found.noise, found.template, _outer(found.psf, found.noise))
-        ]
+        *covariances, common, blending[fit.rows] = fit_covariances(fit, diagnostics.correlation)
+        terms = [_by_source(one, place[fit.rows], main[fit.rows], n_all) for one in covariances]
         joint = terms[0] + terms[1] + terms[2]
         measured = fit.rows[main[fit.rows]]
         flux[place[measured]] = fit.total[measured]
@@ -83,25 +79,34 @@ def package(fit, diagnostics, new_xy, catalog, meta):
     flags[near & np.isfinite(flux)] |= int(ForcedFlags.UNEXPLAINED_NEIGHBOR)
     chi2[place[main]] = diagnostics.chi2[main]
     left[place[main]] = diagnostics.residual_fraction[main]
+    columns = {"flux": flux * FNU, "flags": flags, "coverage": coverage, "chi2": chi2}
+    columns["residual_fraction"] = left
+    for name, error in zip(_TERMS, flux_err, strict=True):
+        columns[f"flux_err{name}"] = error * FNU
+    if fit.settings.positive:
+        positive = np.full(n_all, np.nan)
+        if len(fit.rows):
+            positive[place[fit.rows]] = 0.0
+            np.add.at(positive, place[fit.rows], nonnegative_fluxes(*fit.solution))
+        columns["flux_positive"] = positive * FNU
+    new = None
+    if fit.settings.second_pass:
+        names = ("flux", "flux_err", "flags", "coverage", "chi2")
+        rows = {name: columns[name][n:] for name in names}
+        new = _new_sources(catalog, new_xy, fit.arrays.wcs, rows)
     reference = np.nan_to_num(flux[:n]) if catalog.reference is None else catalog.reference
-    result = ForcedPhotometryResult(
+    return ForcedPhotometryResult(
         id=np.array(catalog.id),
         sky=catalog.sky,
-        flux=flux[:n] * FNU,
-        **{
-            f"flux_err{name}": error[:n] * FNU for name, error in zip(_TERMS, flux_err, strict=True)
-        },
+        **{name: values[:n] for name, values in columns.items()},
         covariance=joint[:n, :n],
-        flags=flags[:n],
-        coverage=coverage[:n],
-        chi2=chi2[:n],
-        residual_fraction=left[:n],
         template=catalog.template,
         template_snr=catalog.template_snr,
         crowded=crowded(catalog.sky, reference),
         x=catalog.xy[:, 0].copy(),
         y=catalog.xy[:, 1].copy(),
         noise_correlation=diagnostics.correlation,
+        new_sources=new,
         psf_fwhm=np.sqrt(8 * np.log(2)) * fit.psf_width * fit.scale * ANGLE,
         meta=provenance(
             **meta,
@@ -113,18 +118,6 @@ def package(fit, diagnostics, new_xy, catalog, meta):
         **_common(fit, common),
         **_images(fit, diagnostics, {k: v for k, v in meta.items() if k == "filter"}),
     )
-    if fit.settings.positive:
-        positive = np.full(n_all, np.nan)
-        if len(fit.rows):
-            positive[place[fit.rows]] = 0.0
-            np.add.at(positive, place[fit.rows], nonnegative_fluxes(*fit.solution))
-        result = dataclasses.replace(result, flux_positive=positive[:n] * FNU)
-    if not fit.settings.second_pass:
-        return result
-    names = ("flux", "flux_err", "flags", "coverage", "chi2")
-    columns = zip(names, (flux, flux_err[0], flags, coverage, chi2), strict=True)
-    new = _new_sources(catalog, new_xy, fit.arrays.wcs, {name: one[n:] for name, one in columns})
-    return dataclasses.replace(result, new_sources=new)
 
 
 def _by_source(covariance, place, main, n):
@@ -137,13 +130,6 @@ def _by_source(covariance, place, main, n):
     found = (gather @ covariance @ gather.T).tocsr()
     found.sort_indices()
     return found
-
-
-def _outer(error, pattern):
-    """Covariance of errors that go together, for the pairs of a pattern."""
-    coo = pattern.tocoo()
-    data = error[coo.row] * error[coo.col]
-    return scipy.sparse.coo_array((data, (coo.row, coo.col)), shape=pattern.shape).tocsr()
 
 
 def _components(fit, catalog, joint, place, n_all):
@@ -176,7 +162,7 @@ def _new_sources(catalog, xy, wcs, columns):
     table["sky"] = wcs.pixel_to_world(*xy.T).transform_to(catalog.sky.frame)
     table["x_centroid"], table["y_centroid"] = xy.T
     for name, values in columns.items():
-        table[name] = values * FNU if name.startswith("flux") else values
+        table[name] = values
     table["snr"] = (table["flux"] / table["flux_err"]).value
     return table
 

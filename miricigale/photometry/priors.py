@@ -18,7 +18,7 @@ _SEGMENTS = ("SEGMENTATION", "SEGMAP", "SEG", "SCI")
 _ID = ("id", "number", "id_obj", "objid", "label")
 
 
-def read_prior(highres, *, segmentation=None, catalog=None, path=None):
+def read_prior(highres, *, segmentation=None, catalog=None):
     """
     Read the sources of a prior.
 
@@ -33,8 +33,6 @@ def read_prior(highres, *, segmentation=None, catalog=None, path=None):
         A table in any form (`~miricigale.utils.tables.as_table`) with positions
         (`~miricigale.utils.positions.as_positions`) and ``id``. Without it every segment is a source, whose
         id is that of the segment.
-    path : path-like, optional
-        File of ``highres``, for messages.
 
     Returns
     -------
@@ -69,14 +67,13 @@ def read_prior(highres, *, segmentation=None, catalog=None, path=None):
         raise ValueError(msg)
     segments = ids = None
     if segmentation is not None:
-        where = path or highres.meta.get("source", "the image")
         if isinstance(segmentation, np.ndarray):
             data, segmentation = segmentation, "the segmentation"
             if data.dtype == bool:
                 wanted = "whole numbers, one for each source (scipy.ndimage.label makes them)"
                 raise argument_error("segmentation", wanted, "a mask")
         else:
-            image = highres.data.shape, highres.wcs, where
+            image = highres.data.shape, highres.wcs, highres.meta.get("source", "the image")
             what = "a segmentation map", "the segmentation"
             with open_map(segmentation, *what, _SEGMENTS, image) as hdu:
                 data = np.array(hdu.data)

@@ -57,7 +57,8 @@ def residual_peaks(residual, model, inverse_sigma, width, xy, *, new=None, execu
     if not inverse_sigma.any():
         return ResidualPeaks(np.empty((0, 2), int), np.empty((0, 2)), np.empty(0), full_width)
     # fluxes of point sources by least squares, as if each stood alone: signal over power
-    snr, usable = _matched(residual, inverse_sigma, width, new, executor)
+    snr, power = _matched(residual, inverse_sigma, width, new, executor)
+    usable = power > 0
     # what is a thousandth of the stated noise is that of the arithmetic
     noise = max(mad_std(_some(snr, usable)), 1e-3)
     # few pixels are left for what follows, unless the image has a background
@@ -68,14 +69,13 @@ def residual_peaks(residual, model, inverse_sigma, width, xy, *, new=None, execu
         i, j = y[part], x[part]
         top = snr[i, j] >= _windows(snr, i, j, near).max(axis=(1, 2))
         i, j = i[top], j[top]
-        taken = _filtered(inverse_sigma, i, j, width, model)
-        top = snr[i, j] * np.sqrt(_power(inverse_sigma, i, j, width)) > _LEFT_SHARE * taken
+        taken = _filtered(model, inverse_sigma, i, j, width)
+        top = snr[i, j] * np.sqrt(power[i, j]) > _LEFT_SHARE * taken
         found.append((i[top], j[top]))
     y, x = (np.concatenate([one[k] for one in found] or [y]) for k in (0, 1))
 
     def light_at(y, x):
-        power = np.where(usable[y, x], _power(inverse_sigma, y, x, width), 1.0)
-        return np.where(usable[y, x], snr[y, x] / np.sqrt(power), 0.0)
+        return snr[y, x] / np.sqrt(np.where(usable[y, x], power[y, x], 1.0))
 
     light = light_at(y, x)
     order = np.argsort(-light, kind="stable")
@@ -113,58 +113,40 @@ def _radius(width):
 
 
 def _matched(residual, inverse_sigma, width, new, executor):
-    """Signal-to-noise of point sources at all pixels, and where enough of them is seen."""
-    snr = np.zeros_like(residual) if new is None else new()
-    usable = np.zeros(residual.shape, bool)
-    ny, halo = len(residual), _radius(width)
+    """Signal-to-noise and power of point sources at all pixels, both zero where too little of them is seen."""
+    snr, power = (np.zeros_like(residual) if new is None else new() for _ in range(2))
+    halo = _radius(width)
 
-    def strip(low):
-        rows = slice(max(low - halo, 0), low + _ROWS + halo)
-        return rows, slice(low - rows.start, min(low + _ROWS, ny) - rows.start)
+    def strip(part):
+        rows = slice(max(part.start - halo, 0), part.stop + halo)
+        return rows, slice(part.start - rows.start, part.stop - rows.start)
 
-    def smooth(image, sigma, inner):
-        return scipy.ndimage.gaussian_filter(image, sigma, mode="constant")[inner]
+    def fill_power(part):
+        rows, inner = strip(part)
+        square = inverse_sigma[rows] ** 2
+        square = scipy.ndimage.gaussian_filter(square, width / np.sqrt(2), mode="constant")[inner]
+        power[part] = square / (4 * np.pi * width**2)
 
-    def point_power(low):
-        rows, inner = strip(low)
-        power = smooth(inverse_sigma[rows] ** 2, width / np.sqrt(2), inner)
-        power /= 4 * np.pi * width**2
-        return power
+    def fill_snr(part):
+        rows, inner = strip(part)
+        power[part][power[part] <= limit] = 0.0
+        light = residual[rows] * inverse_sigma[rows] ** 2
+        light = scipy.ndimage.gaussian_filter(light, width, mode="constant")[inner]
+        np.divide(light, np.sqrt(power[part]), out=snr[part], where=power[part] > 0)
 
-    def seen(low):
-        return point_power(low)[inverse_sigma[low : low + _ROWS] > 0]
-
-    def fill(low):
-        rows, inner = strip(low)
-        place, power = slice(low, low + _ROWS), point_power(low)
-        usable[place] = power > limit
-        light = smooth(residual[rows] * inverse_sigma[rows] ** 2, width, inner)
-        np.divide(light, np.sqrt(power), out=snr[place], where=usable[place])
-
-    # of a large image, strips here and there
-    every = max(1, residual.size // _SOME)
-    power = parallel_map(seen, range(0, ny, _ROWS * every), executor=executor)
-    power = np.concatenate(power)
-    if not len(power):
-        power = np.concatenate(parallel_map(seen, range(0, ny, _ROWS), executor=executor))
-    limit = 0.25 * np.median(power)
-    parallel_map(fill, range(0, ny, _ROWS), executor=executor)
-    return snr, usable
+    parts = list(chunks(len(residual), _ROWS))
+    parallel_map(fill_power, parts, executor=executor)
+    limit = 0.25 * np.median(_some(power, inverse_sigma > 0))
+    parallel_map(fill_snr, parts, executor=executor)
+    return snr, power
 
 
-def _filtered(inverse_sigma, y, x, width, image=None):
-    """Inverse variance, times an image, filtered with a Gaussian at some pixels."""
+def _filtered(image, inverse_sigma, y, x, width):
+    """An image times inverse variance, filtered with a Gaussian at some pixels."""
     around = np.arange(-_radius(width), _radius(width) + 1)
     hat = np.exp(-0.5 * (around / width) ** 2)
-    values = _windows(inverse_sigma, y, x, around) ** 2
-    if image is not None:
-        values = values * _windows(image, y, x, around)
+    values = _windows(inverse_sigma, y, x, around) ** 2 * _windows(image, y, x, around)
     return np.einsum("kij,i,j->k", values, hat, hat) / hat.sum() ** 2
-
-
-def _power(inverse_sigma, y, x, width):
-    """Power of a point source at some pixels."""
-    return _filtered(inverse_sigma, y, x, width / np.sqrt(2)) / (4 * np.pi * width**2)
 
 
 def _some(image, which):

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import numbers
 from typing import ClassVar
 
 import astropy.units as u
@@ -19,12 +18,11 @@ from miricigale.photometry.draws import correlated_draws
 from miricigale.photometry.fields import SmoothField
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.offsets import OffsetMap
-from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import Tabular, checked_calls
 from miricigale.utils.random import check_seed
 from miricigale.utils.tables import described_table, error_column
 from miricigale.utils.unified import read_write
-from miricigale.utils.units import ANGLE, FNU
+from miricigale.utils.units import ANGLE, FNU, check_count
 
 
 def crowded(sky, flux, *, radius=2 * u.arcsec):
@@ -206,7 +204,7 @@ class ForcedPhotometryResult(Tabular):
         chi2 = np.divide(total, weight, out=np.full(total.shape, np.nan), where=usable)
         return Image(chi2, unit="", wcs=image.wcs, mask=~usable, meta=dict(image.meta))
 
-    def sample(self, size, *, seed=None, point=False):
+    def sample(self, size, *, seed=None):
         """
         Draw fluxes from their covariance, so that those of blends vary together.
 
@@ -217,9 +215,6 @@ class ForcedPhotometryResult(Tabular):
         seed : int or `~numpy.random.Generator`, optional
             The same seed gives the same draws, for a source that overlaps no other also in
             another catalog.
-        point : bool, optional
-            Whether the draws of ``flux_point`` are wanted, which belong to those of ``flux`` of the
-            same seed.
 
         Returns
         -------
@@ -229,21 +224,12 @@ class ForcedPhotometryResult(Tabular):
         Raises
         ------
         ValueError
-            If ``size`` is not positive, or points are wanted that were not fitted.
+            If ``size`` is not positive.
         """
-        if isinstance(size, bool) or not isinstance(size, numbers.Integral) or size < 1:
-            raise argument_error("size", "an integer of at least 1", repr(size))
-        if point and self.flux_point is None:
-            raise argument_error("point", "False where no second components were fitted", point)
+        size = check_count(size, "size")
         keys = [("forced flux", key) for key in self.id.tolist()]
-        covariance = self.covariance
-        if self.joint_covariance is not None:
-            covariance = self.joint_covariance
-            keys += [("forced point", key) for key in self.id.tolist()]
-        draws = correlated_draws(covariance, keys, int(size), check_seed(seed))
-        if point:
-            return (self.flux_point.value + draws[:, len(self) :]) * FNU
-        return (self.flux.value + draws[:, : len(self)]) * FNU
+        draws = correlated_draws(self.covariance, keys, size, check_seed(seed))
+        return (self.flux.value + draws) * FNU
 
     def correlation(self, first, second):
         """
@@ -261,11 +247,10 @@ class ForcedPhotometryResult(Tabular):
         """
         rows = []
         for key in (first, second):
-            found = np.flatnonzero(self.id == key)
-            if len(found) == 0:
+            if not np.any(self.id == key):
                 msg = f"no source with the id {key!r}"
                 raise KeyError(msg)
-            rows.append(found[0])
+            rows.append(int(np.argmax(self.id == key)))
         errors = self.flux_err.value[rows]
         return float(self.covariance[rows[0], rows[1]] / np.prod(errors))
 
@@ -317,16 +302,14 @@ class ForcedPhotometryResult(Tabular):
         """
         flux, prefix = ("flux", "") if name is None else (name, f"{name}_")
         error, point = error_column(flux), f"{prefix}flux_point"
+        unknown = "Error by what is not known of the template"
         columns = {
             "id": (self.id, "Id of the catalog"),
             "sky": (self.sky, "Position of the catalog"),
             flux: (self.flux, "Total flux"),
             error: (self.flux_err, "1-sigma error of the flux"),
             f"{error}_noise": (self.flux_err_noise, "Error by the image's noise"),
-            f"{error}_template": (
-                self.flux_err_template,
-                "Error by what is not known of the template",
-            ),
+            f"{error}_template": (self.flux_err_template, unknown),
             f"{error}_psf": (self.flux_err_psf, "Error by that of the PSF"),
         }
         texts = {

@@ -6,7 +6,8 @@ import numpy as np
 import scipy.ndimage
 from photutils.segmentation import SegmentationImage
 
-from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_names
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,6 +139,5 @@ def dilation_rule(rule):
     """The rule of a name, or the rule itself."""
     if isinstance(rule, DilationRule):
         return rule
-    if rule not in DILATION_RULES:
-        raise unknown_name("dilation rule", rule, DILATION_RULES)
+    check_names([rule], "dilation rule", DILATION_RULES)
     return DILATION_RULES[rule]

@@ -7,6 +7,8 @@ import scipy.fft
 
 from miricigale.photometry._core.sampling import box_response
 from miricigale.photometry._core.shapes import INDEX_RANGE, shape_models
+from miricigale.photometry.cutouts import Cutout
+from miricigale.profiles import sersic_stamp
 
 #: What is known of shapes beforehand (mean and width): ln of the circularised half-light radius
 #: (arcsec), ln of the Sersic index, the two ellipticities, and the offset of the center (pixels).
@@ -51,6 +53,16 @@ class Shape:
         eta = np.hypot(g1, g2)
         return np.exp(self.parameters[2] + eta / 2), np.exp(-eta), 0.5 * np.arctan2(g2, g1)
 
+    def drawn(self, light, farthest):
+        """The profile on its grid (a `Cutout`), before the PSF, up to a semi-major axis (pixels) at most."""
+        radius, axis_ratio, angle = self.axes
+        x, y, _, log_index = self.parameters[:4]
+        stamp, origin = sersic_stamp(
+            x=x, y=y, total_flux=light, r_eff=radius, n=np.exp(log_index), axis_ratio=axis_ratio,
+            theta=angle, max_radius=farthest,
+        )  # fmt: skip
+        return Cutout(stamp, origin, convolved=False)
+
     def semi_major(self, size, origin):
         """Semi-major axis (pixels) of the ellipse through each pixel of an image at an origin (y, x)."""
         _, axis_ratio, angle = self.axes
@@ -74,19 +86,20 @@ class ShapeModels:
 
     def __init__(self, psf):
         self._psf = np.asarray(psf, float)
+        #: Half-width of the PSF (pixels).
+        self.reach = self._psf.shape[0] / 2
         self._transforms = {}
 
     def _transform(self, size):
-        found = self._transforms.get(size)
-        if found is None:
+        if size not in self._transforms:
             padded = np.zeros((size, size))
             middle = self._psf.shape[0] // 2
             half = min(middle, size // 2 - 1)
             cut = self._psf[middle - half : middle + half + 1, middle - half : middle + half + 1]
             padded[: 2 * half + 1, : 2 * half + 1] = cut
-            found = scipy.fft.rfft2(np.roll(padded, (-half, -half), axis=(0, 1)))
-            self._transforms[size] = found
-        return found
+            shifted = np.roll(padded, (-half, -half), axis=(0, 1))
+            self._transforms[size] = scipy.fft.rfft2(shifted)
+        return self._transforms[size]
 
     def profiles(self, shape, parameters, derivatives=0):
         """
@@ -95,9 +108,8 @@ class ShapeModels:
         Parameters are those of `~miricigale.photometry._core.shapes.shape_models`.
         """
         size = _period(shape)
-        return shape_models(
-            self._transform(size), size, shape, parameters, derivatives=derivatives
-        )  # fmt: skip
+        psf = self._transform(size)
+        return shape_models(psf, size, shape, parameters, derivatives=derivatives)
 
     def convolve(self, images, origin, shape):
         """
@@ -147,17 +159,13 @@ class ShapeFitter(ShapeModels):
             None where no profile of positive light fits.
         """
         mean, width = self._expected(xy), np.array(_WIDTHS)
+        half = _HALF if start is None else _half_width(start.parameters)
+        inner = self._stamp(data, weight, mean, half)
         if start is None:
-            half, parameters = _HALF, mean.copy()
-            inner = self._stamp(data, weight, mean, half)
-            sizes = mean[2] + np.array(_STARTS)
-            costs = []
-            for parameters[2] in sizes:
-                costs.append(_amplitude(inner.models(parameters, 0)[0], inner)[1])
-            parameters[2] = sizes[int(np.argmin(costs))]
+            starts = [mean + [0, 0, step, 0, 0, 0] for step in _STARTS]
+            parameters = min(starts, key=lambda one: _misfit(one, inner))
         else:
-            half, parameters = _half_width(start.parameters), start.parameters
-            inner = self._stamp(data, weight, mean, half)
+            parameters = start.parameters
         extended = _minimum(inner, parameters, mean, width, 6)
         if extended is not None and start is None and _half_width(extended[1]) > half:
             inner = self._stamp(data, weight, mean, _half_width(extended[1]))
@@ -169,7 +177,7 @@ class ShapeFitter(ShapeModels):
         start[2] = -30.0
         share = 0.0
         # a point that is far worse in the same place need not be moved to the best one
-        if _amplitude(inner.models(start, 0)[0], inner)[1] < -2 * evidence + _FAR_BELOW:
+        if _misfit(start, inner) < -2 * evidence + _FAR_BELOW:
             point = _minimum(inner, start, mean, width, 2)
             odds = np.inf if point is None else evidence - point[2]
             share = 1.0 / (1.0 + np.exp(np.clip(odds, -50, 50)))
@@ -223,12 +231,12 @@ def _period(shape):
     return scipy.fft.next_fast_len(int(_PERIOD * max(shape)), True)
 
 
-def _amplitude(model, stamp):
-    """Light of a model of unit light that fits best, and the chi^2 then."""
-    scaled = stamp.whitened(model[None])[0]
+def _misfit(parameters, stamp):
+    """Chi^2 of a profile with the light that fits best."""
+    (scaled,) = stamp.whitened(stamp.models(parameters, 0))
     power = scaled @ scaled
     flux = (scaled @ stamp.white) / power if power > 0 else 0.0
-    return flux, float(np.sum((stamp.white - flux * scaled) ** 2))
+    return float(np.sum((stamp.white - flux * scaled) ** 2))
 
 
 def _minimum(stamp, start, mean, width, n_free):

@@ -11,18 +11,23 @@ from photutils.segmentation import SegmentationImage
 
 from miricigale.photometry.arrays import image_arrays, pixel_scale
 from miricigale.photometry.catalogs import OPTIONAL, catalog_sources, joined_sky, sersic_rows
-from miricigale.photometry.cutouts import Cutout, own_segments, sersic_cutouts
-from miricigale.photometry.light import FineImage, cutouts
+from miricigale.photometry.cutouts import Cutout, own_segments
+from miricigale.photometry.light import cutouts
 from miricigale.photometry.priors import check_labels, labels_at
 from miricigale.photometry.shapes import not_fitted
 from miricigale.photometry.sky_noise import warn_of_sky
 from miricigale.photometry.wcs_text import grid_text, text_grid
+from miricigale.profiles import ellipse_to_pixels, sersic_stamp
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
+from miricigale.utils.options import check_choice
 from miricigale.utils.parallel import single_threaded, threads
 from miricigale.utils.tables import unique_ids
 from miricigale.utils.unified import read_write
 from miricigale.utils.units import ANGLE
+
+#: Arrays with a row for each source, and least signal-to-noise of a segment whose shape is looked at.
+_ROWS, _MIN_SNR = ("id", "sersic", "flags", "snr", "fitted"), 5.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -84,30 +89,26 @@ class SourceTemplates:
     def __post_init__(self):
         n = len(self.id)
         object.__setattr__(self, "light", tuple(self.light))
+        unique_ids(self.id, "id")
         nothing = {
             "sersic": np.full((n, 4), np.nan), "flags": np.zeros(n, int), "snr": np.full(n, np.nan),
             "fitted": not_fitted(n),
         }  # fmt: skip
-        for name, value in nothing.items():
-            if getattr(self, name) is None:
-                object.__setattr__(self, name, value)
-        shapes = {"sersic": (n, 4), **dict.fromkeys(("flags", "snr", "fitted", *OPTIONAL), (n,))}
-        for name, shape in shapes.items():
+        for name in (*_ROWS, *OPTIONAL, "psf"):
             value = getattr(self, name)
-            if value is not None and np.shape(value) != shape:
-                raise argument_error(name, f"of shape {shape}", np.shape(value))
+            value = nothing.get(name) if value is None else np.array(value)
+            if value is None:
+                continue
+            shape = (n, 4) if name == "sersic" else (n,)
+            if name != "psf" and value.shape != shape:
+                raise argument_error(name, f"of shape {shape}", value.shape)
+            value.flags.writeable = False
+            object.__setattr__(self, name, value)
         if len(self.light) != n or len(self.sky) != n:
             lengths = f"{len(self.sky)} and {len(self.light)}"
             raise argument_error("sky, light", f"{n} each, as many as ids", lengths)
         if self.wcs is None and any(one is not None for one in self.light):
             raise argument_error("wcs", "the grid that the light is on", "None")
-        unique_ids(self.id, "id")
-        for name in ("id", "sersic", "flags", "snr", "fitted", "psf", *OPTIONAL):
-            value = getattr(self, name)
-            if value is not None:
-                value = np.array(value)
-                value.flags.writeable = False
-                object.__setattr__(self, name, value)
 
     @classmethod
     def from_images(
@@ -118,7 +119,6 @@ class SourceTemplates:
         *,
         psf,
         template="auto",
-        min_snr=5.0,
         wings=True,
         n_threads=None,
     ):
@@ -141,9 +141,8 @@ class SourceTemplates:
             package's PSFs on the sky. For kernels that is their ``source``.
         template : {"auto", "cutout"}, optional
             ``"auto"`` decides for each source whether it is a point, a Sersic profile or what the
-            image shows; ``"cutout"`` takes the image wherever there is a segment.
-        min_snr : float, optional
-            Least signal-to-noise of a segment for ``"auto"``.
+            image shows, if the signal-to-noise of its segment is at least 5; ``"cutout"`` takes the image
+            wherever there is a segment.
         wings : bool, optional
             Whether cutouts are carried on beyond their core by a profile; otherwise they are the
             segments as they are.
@@ -160,31 +159,29 @@ class SourceTemplates:
         ValueError, TypeError, `~astropy.units.UnitsError`
             If an input does not fit; the message says which.
         """
-        if template not in ("auto", "cutout"):
-            raise argument_error("template", "'auto' or 'cutout'", repr(template))
-        if not min_snr >= 0:
-            raise argument_error("min_snr", "at least 0", min_snr)
+        check_choice(template, "template", ("auto", "cutout"))
         known = catalog_sources(catalog)
         fine = image_arrays(highres, "highres")
         segments = _segments(segmentation, fine.flux.shape)
         scale = pixel_scale(highres.wcs)
         psf = _psf_array(psf, scale)
-        xy = np.stack(highres.wcs.world_to_pixel(known.sky), axis=-1).reshape(-1, 2)
+        xy = np.stack(highres.wcs.world_to_pixel(known["sky"]), axis=-1).reshape(-1, 2)
         warn_of_sky(fine, segments)
-        here, _ = labels_at(segments, xy)
-        if known.label is not None:
-            check_labels(known.label, here, "catalog['label']")
-        label, flags = own_segments(segments, here if known.label is None else known.label, xy)
+        label, _ = labels_at(segments, xy)
+        if "label" in catalog.colnames:
+            check_labels(np.asarray(catalog["label"]), label, "catalog['label']")
+            label = catalog["label"]
+        label, flags = own_segments(segments, label, xy)
         with threads(n_threads) as executor, single_threaded():
             light, more, snr, fitted = cutouts(
-                FineImage(fine.flux, fine.sigma**2, psf, scale), segments, label, xy,
+                fine.flux, fine.sigma**2, psf, scale, segments, label, xy,
                 select=template == "auto", wings=wings,
-                min_snr=min_snr if template == "auto" else 0.0,
+                min_snr=_MIN_SNR if template == "auto" else 0.0,
                 executor=executor,
             )  # fmt: skip
         return cls(
-            **known.kept(), light=light, flags=flags | more, snr=snr, fitted=fitted, wcs=highres.wcs, psf=psf,
-            meta=provenance(template=template, min_snr=float(min_snr), wings=bool(wings)),
+            **known, light=light, flags=flags | more, snr=snr, fitted=fitted, wcs=highres.wcs, psf=psf,
+            meta=provenance(template=template, min_snr=_MIN_SNR, wings=bool(wings)),
         )  # fmt: skip
 
     @classmethod
@@ -213,18 +210,14 @@ class SourceTemplates:
         ValueError, TypeError, `~astropy.units.UnitsError`
             If an input does not fit; the message says which.
         """
-        if template not in ("psf", "sersic"):
-            raise argument_error("template", "'psf' or 'sersic'", repr(template))
+        check_choice(template, "template", ("psf", "sersic"))
         known = catalog_sources(catalog)
-        n = len(known.id)
         rows = sersic_rows(catalog) if template == "sersic" else None
-        return cls(
-            **known.kept(), light=(None,) * n, sersic=rows, wcs=wcs,
-            meta=provenance(template=template),
-        )  # fmt: skip
+        meta = provenance(template=template)
+        return cls(**known, light=(None,) * len(known["id"]), sersic=rows, wcs=wcs, meta=meta)
 
     @classmethod
-    def from_arrays(cls, arrays, corners, catalog, *, wcs, convolved=True, noise=None):
+    def from_arrays(cls, arrays, corners, catalog, *, wcs, convolved=True):
         """
         Take pictures of the sources that others made.
 
@@ -241,9 +234,6 @@ class SourceTemplates:
         convolved : bool or array_like of bool, shape (n,), optional
             Whether arrays show the sources through the high-resolution PSF (as that image does)
             or as they are, integrated over the pixels.
-        noise : array_like, shape (n,), optional
-            Sum of the variances of each array's noise, in units of its total squared: what
-            noise adds to a template's power, and is taken off.
 
         Returns
         -------
@@ -255,15 +245,12 @@ class SourceTemplates:
             If an array has no positive total or values that are not finite, or numbers differ.
         """
         known = catalog_sources(catalog)
-        n = len(known.id)
+        n = len(known["id"])
         arrays, corners = list(arrays), np.asarray(corners)
         if len(arrays) != n or corners.shape != (n, 2) or corners.dtype.kind not in "iu":
             got = f"{len(arrays)} arrays, corners {corners.dtype} of shape {corners.shape}"
             raise argument_error("arrays, corners", f"{n} each, as many as sources", got)
         convolved = np.broadcast_to(np.asarray(convolved, bool), n)
-        noise = np.zeros(n) if noise is None else np.asarray(noise, float)
-        if noise.shape != (n,) or not np.all(noise >= 0):
-            raise argument_error("noise", f"{n} numbers that are not negative", noise)
         light = []
         for k, one in enumerate(arrays):
             data = None if one is None else np.asarray(one, float)
@@ -271,14 +258,12 @@ class SourceTemplates:
                 total = data.sum() if data.ndim == 2 else np.nan
                 if not (np.isfinite(total) and total > 0):
                     wanted = "two-dimensional, finite and of positive total"
-                    got = f"shape {data.shape} and total {total} of source {known.id[k]}"
+                    got = f"shape {data.shape} and total {total} of source {known['id'][k]}"
                     raise argument_error("arrays", wanted, got)
                 at = tuple(int(c) for c in corners[k])
-                data = Cutout(data / total, at, float(noise[k]), bool(convolved[k]))
+                data = Cutout(data / total, at, convolved=bool(convolved[k]))
             light.append(data)
-        return cls(
-            **known.kept(), light=light, wcs=wcs, meta=provenance(template="arrays"),
-        )  # fmt: skip
+        return cls(**known, light=light, wcs=wcs, meta=provenance(template="arrays"))
 
     @classmethod
     def concatenate(cls, parts):
@@ -308,25 +293,18 @@ class SourceTemplates:
         grids = [one.wcs for one in parts if one.wcs is not None]
         if any(not _same_grid(one, grids[0]) for one in grids[1:]):
             raise argument_error("parts", "on one grid", "different ones")
-
-        def joined(name):
-            return np.concatenate([getattr(one, name) for one in parts])
-
         psfs = [one.psf for one in parts if one.psf is not None]
-        meta = dict(parts[0].meta)
         names = {str(one.meta.get("template")): None for one in parts}
-        meta["template"] = ", ".join(names)
+        rows = {}
+        for name in (*_ROWS, *OPTIONAL):
+            values = [getattr(one, name) for one in parts]
+            if all(one is not None for one in values):
+                rows[name] = np.concatenate(values)
         return cls(
-            id=joined("id"),
-            sky=joined_sky([one.sky for one in parts]),
+            **rows, sky=joined_sky([one.sky for one in parts]),
             light=sum((one.light for one in parts), ()),
-            sersic=joined("sersic"), flags=joined("flags"), snr=joined("snr"), fitted=joined("fitted"),
             wcs=grids[0] if grids else None, psf=psfs[0] if psfs else None,
-            **{
-                name: joined(name) for name in OPTIONAL
-                if all(getattr(one, name) is not None for one in parts)
-            },
-            meta=meta,
+            meta={**parts[0].meta, "template": ", ".join(names)},
         )  # fmt: skip
 
     def __len__(self):
@@ -335,9 +313,8 @@ class SourceTemplates:
     def __getitem__(self, rows):
         """Some of the sources, by a slice, a mask or an array of row numbers."""
         rows = np.atleast_1d(np.arange(len(self))[rows])
-        names = ["id", "sky", "sersic", "flags", "snr", "fitted"]
-        names += [name for name in OPTIONAL if getattr(self, name) is not None]
-        some = {name: getattr(self, name)[rows] for name in names}
+        names = [name for name in (*_ROWS, *OPTIONAL) if getattr(self, name) is not None]
+        some = {name: getattr(self, name)[rows] for name in ("sky", *names)}
         return dataclasses.replace(self, light=tuple(self.light[k] for k in rows), **some)
 
     def __repr__(self):
@@ -373,11 +350,18 @@ class SourceTemplates:
         """
         light = list(self.light)
         rows = np.flatnonzero(np.isfinite(self.sersic[:, 0]))
-        if len(rows):
-            jacobian = _pixels_per_arcsec(self.sky[rows[0]], grid)
-            found = sersic_cutouts(self.sersic[rows], xy[rows], jacobian)
-            for k, one in zip(rows, found, strict=True):
-                light[k] = one
+        jacobian = _pixels_per_arcsec(self.sky[rows[0]], grid) if len(rows) else None
+        for k in rows:
+            radius, index, ratio, angle = self.sersic[k]
+            r_eff, q, theta = ellipse_to_pixels(
+                jacobian, radius=radius, axis_ratio=ratio, position_angle=angle
+            )
+            # cut at the isophote of 99.5 % of the light
+            stamp, origin = sersic_stamp(
+                x=xy[k, 0], y=xy[k, 1], r_eff=float(r_eff), n=index, axis_ratio=float(q),
+                theta=float(theta),
+            )  # fmt: skip
+            light[k] = Cutout(stamp, origin, convolved=False)
         return light
 
     def __getstate__(self):
@@ -416,12 +400,8 @@ def _psf_array(psf, scale):
 
 def _pixels_per_arcsec(sky, wcs):
     """Jacobian [dx, dy] = J @ [east, north] of a WCS at a position."""
-    x, y = wcs.world_to_pixel(sky)
-    columns = []
-    for angle in (90, 0):
-        moved = sky.directional_offset_by(angle * u.deg, 1 * u.arcsec)
-        columns.append(np.array(wcs.world_to_pixel(moved)) - [x, y])
-    return np.stack(columns, axis=1)
+    moved = sky.directional_offset_by([90, 0] * u.deg, 1 * u.arcsec)
+    return np.array(wcs.world_to_pixel(moved)) - np.array(wcs.world_to_pixel(sky))[:, None]
 
 
 def _same_grid(one, other):

@@ -64,8 +64,8 @@ def psf_photometry(image, psf, catalog, *, pa=None, max_shift=0.1 * u.arcsec):
     Stetson 1987, PASP 99, 191; Bradley et al., photutils (https://photutils.readthedocs.io).
     """
     arrays = image_arrays(image, "image")
-    known = catalog_sources(catalog)
-    n, ids, sky = len(known.id), known.id, catalog["sky"]
+    ids, sky = catalog_sources(catalog)["id"], catalog["sky"]
+    n = len(ids)
     scale = pixel_scale(image.wcs)
     model = psf_mosaic(
         psf, scale * ANGLE, pa, grid_angle=grid_angle(image.wcs, arrays.flux.shape), resampling=None

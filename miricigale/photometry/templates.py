@@ -2,6 +2,8 @@
 
 import dataclasses
 import functools
+from collections.abc import Callable
+from concurrent.futures import Executor
 
 import numpy as np
 import scipy.fft
@@ -90,26 +92,25 @@ class FineTemplates:
             return found[0]
         return sum(w[:, None, None] * one for w, one in zip(weights.T[used], found, strict=True))
 
+    def _size(self, cutout):
+        """Size (y, x) of what a cutout is convolved with."""
+        return (self.kernel if cutout.convolved else self.target).shape[1:]
+
     def shape(self, cutout):
         """Shape of the transform for a cutout, rounded up so that many share it."""
-        array = self.kernel if cutout.convolved else self.target
         return tuple(
             scipy.fft.next_fast_len(-(-(n + m - 1 + 2 * RIM) // 16) * 16, True)
-            for n, m in zip(cutout.data.shape, array.shape[1:], strict=True)
+            for n, m in zip(cutout.data.shape, self._size(cutout), strict=True)
         )
 
     def corner(self, cutout):
-        """Fine pixel (y, x) of the first coefficient of a convolved cutout."""
-        half = (self.kernel if cutout.convolved else self.target).shape[1] // 2
-        return cutout.origin[0] - half - RIM, cutout.origin[1] - half - RIM
+        """Fine pixel (x, y) of the first coefficient of a convolved cutout."""
+        return np.array(cutout.origin[::-1]) - self._size(cutout)[0] // 2 - RIM
 
     def sides_of(self, cutout):
         """First and last fine (x, y) that the light of a convolved cutout reaches."""
-        y, x = self.corner(cutout)
-        array = self.kernel if cutout.convolved else self.target
-        h, w = cutout.data.shape
-        first = np.array([x, y]) + RIM - 1.0
-        return first, first + [w + array.shape[2], h + array.shape[1]]
+        first = self.corner(cutout) + RIM - 1.0
+        return first, first + np.add(cutout.data.shape, self._size(cutout))[::-1]
 
     def coefficients(self, group, shape, weights):
         """Convolve cutouts of one shape, returning an array of shape (n, *shape)."""
@@ -137,18 +138,32 @@ class Block:
         return self.first + len(self.box)
 
     @property
+    def end(self):
+        """Row of the image after the last that a stamp reaches."""
+        return int((self.box[:, 0] + self.box[:, 2]).max())
+
+    @property
     def stamps(self):
         """Values, boxes and starts, as the kernels take them."""
         return self.values, self.box, self.start
 
+    def some(self, part):
+        """The same of a slice of the block's rows."""
+        return self.values, self.box[part], self.start[part.start : part.stop + 1]
+
     def parts(self):
         """Slices of the block's own rows (0 for its first), of some hundred thousand pixels each."""
-        first, n = 0, len(self.box)
-        while first < n:
-            last = int(np.searchsorted(self.start, self.start[first] + _PART, side="right")) - 1
-            last = min(max(last, first + 1), n)
-            yield slice(first, last)
-            first = last
+        return _pieces(self.start, _PART)
+
+
+def _pieces(start, size):
+    """Slices of stamps that begin at ``start`` in a flat array, of some ``size`` pixels each."""
+    first, n = 0, len(start) - 1
+    while first < n:
+        last = int(np.searchsorted(start, start[first] + size, side="right")) - 1
+        last = min(max(last, first + 1), n)
+        yield slice(first, last)
+        first = last
 
 
 def batches(shapes):
@@ -180,6 +195,7 @@ class BankSources:
     poly: np.ndarray
 
 
+@dataclasses.dataclass(eq=False, repr=False)
 class TemplateBank:
     """
     All templates of an image, made block by block and kept only if memory allows.
@@ -201,11 +217,18 @@ class TemplateBank:
         Threads that the bank's `map` works with.
     """
 
-    def __init__(self, fine, sources, shape, *, max_bytes=1.5e9, weigh=None, executor=None):
-        self._fine, self._sources, self._weigh = fine, sources, weigh
-        self._weights = np.ones((len(sources.cutout), 1)) if weigh is None else weigh(sources.xy)
-        self._shape, self._max_bytes, self.executor = shape, max_bytes, executor
-        box = self._boxes(shape)
+    fine: FineTemplates
+    sources: BankSources
+    shape: tuple
+    max_bytes: float = 1.5e9
+    weigh: Callable | None = None
+    executor: Executor | None = None
+
+    def __post_init__(self):
+        sources = self.sources
+        n = len(sources.cutout)
+        self._weights = np.ones((n, 1)) if self.weigh is None else self.weigh(sources.xy)
+        box = self._boxes(self.shape)
         self.order = np.argsort(box[:, 0], kind="stable")
         self.box = np.ascontiguousarray(box[self.order])
         self.start = np.concatenate([[0], np.cumsum(self.box[:, 2] * self.box[:, 3])])
@@ -213,66 +236,60 @@ class TemplateBank:
 
     def _boxes(self, shape):
         """Boxes on the image that hold the fine stamps, cut to the image."""
-        fine, n = self._fine, len(self._sources.cutout)
+        fine, n = self.fine, len(self.sources.cutout)
         low, high = np.empty((n, 2)), np.empty((n, 2))
         half = fine.target.shape[1] // 2 + 1
-        for k, cutout in enumerate(self._sources.cutout):
+        for k, cutout in enumerate(self.sources.cutout):
             if cutout is None:
-                low[k] = self._sources.fine_xy[k] - half
-                high[k] = self._sources.fine_xy[k] + half
+                low[k] = self.sources.fine_xy[k] - half
+                high[k] = self.sources.fine_xy[k] + half
                 continue
             sides = np.array([fine.sides_of(one) for one in cutout.layers])
             low[k], high[k] = sides[:, 0].min(axis=0), sides[:, 1].max(axis=0)
         # corners of the fine rectangle through the inverse of the linear map
-        matrix = np.linalg.inv(self._sources.poly[:, :, 1:3])
+        matrix = np.linalg.inv(self.sources.poly[:, :, 1:3])
         corners = np.stack(
             [
-                np.stack([a[:, 0], b[:, 1]], axis=-1) - self._sources.poly[:, :, 0]
+                np.stack([a[:, 0], b[:, 1]], axis=-1) - self.sources.poly[:, :, 0]
                 for a in (low, high)
                 for b in (low, high)
             ]
         )
         offset = np.einsum("kij,ckj->cki", matrix, corners)
-        first = offset.min(axis=0) + self._sources.xy
-        last = offset.max(axis=0) + self._sources.xy
+        first = offset.min(axis=0) + self.sources.xy
+        last = offset.max(axis=0) + self.sources.xy
         limit = np.array(shape)[::-1]
         first = np.clip(np.floor(first), 0, limit).astype(int)
         last = np.clip(np.ceil(last) + 1, 0, limit).astype(int)
         size = np.maximum(last - first, 0)
         return np.stack([first[:, 1], first[:, 0], size[:, 1], size[:, 0]], axis=1)
 
-    def _of(self, sources, **changes):
-        """A bank of other sources."""
-        form = {"max_bytes": self._max_bytes, "weigh": self._weigh}
-        form |= {"fine": self._fine, "shape": self._shape, "executor": self.executor}
-        return TemplateBank(sources=sources, **{**form, **changes})
-
     def shifted(self, shift):
         """Make the bank of the same sources moved by (dx, dy) image pixels."""
-        return self._of(dataclasses.replace(self._sources, xy=self._sources.xy + shift))
+        moved = dataclasses.replace(self.sources, xy=self.sources.xy + shift)
+        return dataclasses.replace(self, sources=moved)
 
     def with_points(self, xy, poly):
         """Make the bank of the same sources and, after them, of point sources at positions."""
-        old = self._sources
-        return self._of(
-            BankSources(
-                [*old.cutout, *[None] * len(xy)],
-                np.concatenate([old.fine_xy, poly[:, :, 0]]),
-                np.concatenate([old.xy, xy]),
-                np.concatenate([old.poly, poly]),
-            )
+        old = self.sources
+        more = BankSources(
+            [*old.cutout, *[None] * len(xy)],
+            np.concatenate([old.fine_xy, poly[:, :, 0]]),
+            np.concatenate([old.xy, xy]),
+            np.concatenate([old.poly, poly]),
         )
+        return dataclasses.replace(self, sources=more)
 
     def at_resolution(self, rows, cutout):
         """Make the bank of cutouts that have the image's resolution, at some of the sources."""
-        one, old = np.ones((1, 1)), self._sources
+        one, old = np.ones((1, 1)), self.sources
         sources = BankSources(cutout, old.fine_xy[rows], old.xy[rows], old.poly[rows])
-        fine = dataclasses.replace(self._fine, kernel=one, target=one)
-        return self._of(sources, fine=fine, weigh=None)
+        fine = dataclasses.replace(self.fine, kernel=one, target=one)
+        return dataclasses.replace(self, sources=sources, fine=fine, weigh=None)
 
     def parts(self, rows):
         """The cutouts of some rows, None for points."""
-        return [self._sources.cutout[k] for k in self.order[rows]]
+        return [self.sources.cutout[k] for k in self.order[rows]]
 
     def forget(self):
         """Free the templates that are kept; they are made anew if they are needed again."""
@@ -285,49 +302,38 @@ class TemplateBank:
     @property
     def xy(self):
         """Positions of the sources on the image, in the order of the rows."""
-        return self._sources.xy[self.order]
-
-    @property
-    def n_values(self):
-        """Number of pixels of all stamps."""
-        return int(self.start[-1])
+        return self.sources.xy[self.order]
 
     def noise_terms(self):
         """Sum over unit-weight pixels of the templates' variance, by row."""
-        noise = np.array([0.0 if one is None else one.noise for one in self._sources.cutout])
-        area = np.abs(np.linalg.det(self._sources.poly[:, :, 1:3]))
-        return (noise * area * self._fine.kernel_power(self._weights))[self.order]
+        noise = np.array([0.0 if one is None else one.noise for one in self.sources.cutout])
+        area = np.abs(np.linalg.det(self.sources.poly[:, :, 1:3]))
+        return (noise * area * self.fine.kernel_power(self._weights))[self.order]
 
     def full_light(self):
         """Light of a whole point source, by row."""
-        return (self._weights @ self._fine.target.sum(axis=(1, 2)))[self.order]
+        return (self._weights @ self.fine.target.sum(axis=(1, 2)))[self.order]
 
     def blocks(self):
         """Yield all templates in order, as `Block` of some tens of MB each."""
         if self._kept is not None:
             yield from self._kept
             return
-        keep = 4.0 * self.n_values <= self._max_bytes
-        kept = []
-        limit = 16 * _PART
-        first, n = 0, len(self.order)
-        while first < n:
-            last = int(np.searchsorted(self.start, self.start[first] + limit, side="right")) - 1
-            last = min(max(last, first + 1), n)
-            block = self._make(first, last)
+        keep, kept = 4.0 * self.start[-1] <= self.max_bytes, []
+        for rows in _pieces(self.start, 16 * _PART):
+            block = self._make(rows.start, rows.stop)
             if keep:
                 kept.append(block)
             yield block
-            first = last
         if keep:
             self._kept = kept
 
     def _make(self, first, last):
-        fine = self._fine
+        fine = self.fine
         start = self.start[first : last + 1] - self.start[first]
         block = Block(first, self.box[first:last], start, np.zeros(int(start[-1]), np.float32))
         sources = self.order[first:last]
-        cutout = [self._sources.cutout[k] for k in sources]
+        cutout = [self.sources.cutout[k] for k in sources]
         points = np.flatnonzero([one is None for one in cutout])
         layers = [
             (row, one) for row, all_of in enumerate(cutout) if all_of for one in all_of.layers
@@ -337,11 +343,11 @@ class TemplateBank:
         def add(coefficients, which, amplitude, rows, origin):
             # sums of a piece in double precision, where each stamp begins anew
             box = block.box[rows]
-            poly = self._sources.poly[sources[rows]]
+            poly = self.sources.poly[sources[rows]]
             poly[:, :, 0] -= origin
             begin = np.concatenate([[0], np.cumsum(box[:, 2] * box[:, 3])])
             sums = np.zeros(int(begin[-1]))
-            center = self._sources.xy[sources[rows]]
+            center = self.sources.xy[sources[rows]]
             sample_stamps(coefficients, which, amplitude, center, poly, box, begin, sums)
             for k, low, high in zip(rows, begin[:-1], begin[1:], strict=True):
                 block.values[start[k] : start[k + 1]] += sums[low:high]
@@ -352,14 +358,14 @@ class TemplateBank:
                 return
             point, which = fine.points(weights[rows])
             middle = (np.array(point.shape[2:0:-1]) - 1) / 2
-            origin = self._sources.fine_xy[sources[rows]] - middle
+            origin = self.sources.fine_xy[sources[rows]] - middle
             add(point, which, np.ones(len(rows)), rows, origin)
 
         def add_cutouts(batch):
             (*shape, _, _), members = batch
             rows = np.array([layers[k][0] for k in members])
             group = [layers[k][1] for k in members]
-            origin = np.array([fine.corner(one)[::-1] for one in group])
+            origin = np.array([fine.corner(one) for one in group])
             found = fine.coefficients(group, tuple(shape), weights[rows])
             add(found, np.arange(len(rows)), np.ones(len(rows)), rows, origin)
 

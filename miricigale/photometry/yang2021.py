@@ -126,23 +126,12 @@ class Yang2021Photometer:
         templates = dataclasses.replace(templates, light=light)
         scaled = image.multiply(self.scaling, handle_meta="first_found")
         result = self._photometer.measure(scaled, templates=templates)
-        totals = {}
-        for field in dataclasses.fields(result):
-            value = getattr(result, field.name)
-            if field.name.startswith("flux") and value is not None:
-                totals[field.name] = value * self.aperture
-            elif field.name.endswith("covariance") and value is not None:
-                totals[field.name] = value * self.aperture**2
-        return dataclasses.replace(
-            result,
-            **totals,
-            meta={
-                **result.meta,
-                "method": "yang2021",
-                "f_scaling": self.scaling,
-                "f_aper": self.aperture,
-            },
-        )
+        # no components, no fluxes that must be positive
+        names = ("flux", "flux_err", "flux_err_noise", "flux_err_template", "flux_err_psf")
+        totals = {name: getattr(result, name) * self.aperture for name in names}
+        totals["covariance"] = result.covariance * self.aperture**2
+        meta = {"method": "yang2021", "f_scaling": self.scaling, "f_aper": self.aperture}
+        return dataclasses.replace(result, **totals, meta=result.meta | meta)
 
 
 def _require_same_pixels(image, highres):

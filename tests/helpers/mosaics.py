@@ -4,9 +4,11 @@ import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData, StdDevUncertainty
+from astropy.table import QTable
 
 from helpers.light import gaussian, gaussian_image
-from miricigale.instrument import pixel_area_map
+from miricigale.instrument import north_up_wcs, pixel_area_map
+from miricigale.photometry import ErrorSettings, ForcedPhotometer
 from miricigale.psf import MatchingKernel
 
 CENTER = SkyCoord(53.1, -27.8, unit="deg")
@@ -52,3 +54,53 @@ def positions(rng, n, half):
 kernel = MatchingKernel.from_psfs(
     gaussian_image(67, HI / FINE), gaussian_image(67, LO / FINE), pixel_scale=FINE * u.arcsec
 )
+
+
+def places(east, north=0.0):
+    """Positions some arcsec east and north of the center."""
+    east, north = np.broadcast_arrays(east, north)
+    return CENTER.spherical_offsets_by(east * u.arcsec, north * u.arcsec)
+
+
+def lattice(rng, side, spacing, jitter):
+    """East and north (arcsec) of ``side`` x ``side`` places, each moved by up to ``jitter``."""
+    at = (np.arange(side) - (side - 1) / 2) * spacing
+    return [a.ravel() + rng.uniform(-jitter, jitter, side**2) for a in np.meshgrid(at, at)]
+
+
+def picture(sky, flux, shape, *, scale=0.11, width=LO, sigma=0.01, rng=None):
+    """An image of Gaussians that is north up, with noise if there is a generator to draw it."""
+    wcs = north_up_wcs(CENTER, scale * u.arcsec, shape)
+    light = render(sky, flux, width, wcs, shape)
+    noise = 0.0 if rng is None else rng.normal(0, sigma, shape)
+    return as_ccd(light + noise, wcs, sigma)
+
+
+def measured(image, catalog, **options):
+    """Forced photometry of points, of a catalog or of positions."""
+    catalog = QTable({"sky": catalog}) if isinstance(catalog, SkyCoord) else catalog
+    photometer = ForcedPhotometer(kernel, template="psf", **options)
+    return photometer.measure(image, catalog=catalog)
+
+
+#: Errors of white noise as it is stated.
+WHITE = ErrorSettings(correlated_noise=False)
+
+
+def stamps_of(bank, shape):
+    """The stamps of a bank of templates on whole images, in the order of its rows."""
+    found = np.zeros((len(bank.order), *shape))
+    for block in bank.blocks():
+        for k, (y, x, h, w) in enumerate(block.box):
+            stamp = block.values[block.start[k] : block.start[k + 1]].reshape(h, w)
+            found[block.first + k, y : y + h, x : x + w] = stamp
+    return found
+
+
+def disks(sky, wcs, shape, radius, labels=None):
+    """Segments that are disks of a radius (pixels) about positions, with labels from 1 by default."""
+    found, (y, x) = np.zeros(shape, np.int32), np.indices(shape)
+    labels = np.arange(1, len(sky) + 1) if labels is None else labels
+    for label, a, b in zip(labels, *wcs.world_to_pixel(sky), strict=True):
+        found[np.hypot(x - a, y - b) < radius] = label
+    return found

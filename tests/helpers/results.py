@@ -1,8 +1,11 @@
-"""Comparison of results of fits."""
+"""Comparison of results."""
 
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 
 import numpy as np
+from astropy.coordinates import SkyCoord
+from astropy.nddata import CCDData
+from astropy.table import Table
 
 from miricigale.fitting import FitResults
 
@@ -35,3 +38,35 @@ def assert_same_tables(one, two):
         assert one[name].info.description == two[name].info.description, name
         assert getattr(one[name], "unit", None) == getattr(two[name], "unit", None), name
         np.testing.assert_array_equal(np.asarray(one[name]), np.asarray(two[name]), name)
+
+
+def assert_equal_values(name, mine, theirs, skip=("wcs",)):
+    """Two values are the same in every bit, whatever they are; fields of some names are left out."""
+    assert type(mine) is type(theirs), name
+    if isinstance(mine, SkyCoord):
+        for one in ("ra", "dec"):
+            np.testing.assert_array_equal(*(getattr(sky.icrs, one).deg for sky in (mine, theirs)))
+    elif isinstance(mine, CCDData):
+        assert (mine.unit, mine.meta) == (theirs.unit, theirs.meta)
+        x = np.array([0.0, 100.0])
+        places = (one.wcs.pixel_to_world_values(x, x) for one in (mine, theirs))
+        np.testing.assert_array_equal(*places)
+        for one in ("data", "mask", "uncertainty"):
+            assert_equal_values(name, getattr(mine, one), getattr(theirs, one))
+    elif isinstance(mine, Table):
+        assert mine.colnames == theirs.colnames
+        for column in mine.colnames:
+            assert_equal_values(column, mine[column], theirs[column])
+    elif is_dataclass(mine):
+        for one in (field.name for field in fields(mine) if field.name not in skip):
+            assert_equal_values(one, getattr(mine, one), getattr(theirs, one))
+    elif isinstance(mine, tuple):
+        for one, other in zip(mine, theirs, strict=True):
+            assert_equal_values(name, one, other)
+    elif mine is None or isinstance(mine, (dict, int, str)):
+        assert mine == theirs, name
+    else:
+        assert getattr(mine, "unit", None) == getattr(theirs, "unit", None)
+        arrays = (getattr(one, "array", one) for one in (mine, theirs))
+        arrays = [one.toarray() if hasattr(one, "toarray") else np.asarray(one) for one in arrays]
+        np.testing.assert_array_equal(*arrays, err_msg=name, strict=True)

@@ -1,12 +1,10 @@
 import types
 
-import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
 
 from helpers import mosaics
-from miricigale.instrument import north_up_wcs
 
 
 @pytest.fixture(scope="session")
@@ -20,8 +18,6 @@ def field():
     rng = np.random.default_rng(4)
     sky = mosaics.positions(rng, 60, 12.0)
     flux = 10 ** rng.uniform(0, 2, 60)
-    wcs = north_up_wcs(mosaics.CENTER, 0.11 * u.arcsec, (260, 260))
-    light = mosaics.render(sky, flux, mosaics.LO, wcs, (260, 260))
-    image = mosaics.as_ccd(light, wcs, 0.01)
+    image = mosaics.picture(sky, flux, (260, 260))
     catalog = QTable({"id": np.arange(100, 160), "sky": sky})
-    return types.SimpleNamespace(image=image, catalog=catalog, flux=flux, wcs=wcs, sky=sky)
+    return types.SimpleNamespace(image=image, catalog=catalog, flux=flux, wcs=image.wcs, sky=sky)

@@ -52,23 +52,6 @@ def test_spline_and_pixel_response_of_a_gaussian():
     assert_allclose(mean, average(at - 31.3, a) * average(at - 31.3, b), atol=1e-4)
 
 
-def test_jacobian_keeps_the_sum():
-    # a Gaussian on a stretched and curved grid
-    n = 64
-    y, x = np.mgrid[:n, :n] - 32
-    image = np.exp(-0.5 * (x**2 + y**2) / 3.0**2)
-    coefficients = convolve_batch(image[None], 1 / spline_response((n, n)), (n, n))
-    poly = np.array(
-        [[[32.0, 1.7, 0.2, 0.004, 0.002, -0.003], [32.0, -0.3, 1.6, 0.001, 0.0, 0.005]]]
-    )
-    out = np.zeros(41 * 41)
-    box, start = np.array([[0, 0, 41, 41]]), np.array([0, out.size])
-    sample_stamps(
-        coefficients, np.zeros(1, int), np.ones(1), np.array([[20.2, 19.7]]), poly, box, start, out
-    )
-    assert_allclose(out.sum(), image.sum(), rtol=1e-4)
-
-
 def crowded_matrix(n=900, size=300, seed=0):
     """Normal matrix of Gaussian templates of rms 3 px, scattered at random."""
     rng = np.random.default_rng(seed)

@@ -2,11 +2,9 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.nddata import CCDData
-from astropy.utils.exceptions import AstropyDeprecationWarning
 from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
-from miricigale.instrument import north_up_wcs
 from miricigale.photometry import (
     DETECTION_PRESETS,
     DilationRule,
@@ -19,16 +17,9 @@ from miricigale.photometry import (
 @pytest.fixture(scope="module")
 def deep(tools):
     rng = np.random.default_rng(3)
-    shape = (500, 500)
-    wcs = north_up_wcs(tools.CENTER, 0.06 * u.arcsec, shape)
-    grid = np.linspace(-11, 11, 5)
-    dx, dy = (a.ravel() for a in np.meshgrid(grid, grid))
-    sky = tools.CENTER.spherical_offsets_by(dx * u.arcsec, dy * u.arcsec)
-    flux = np.geomspace(2, 200, 25)
-    sigma = 0.01 / (tools.FINE**2 * tools.SR * 1e12)
-    clean = tools.render(sky, flux, 0.15, wcs, shape)
-    noisy = tools.as_ccd(clean + rng.normal(0, sigma, shape), wcs, sigma)
-    return sky, flux, noisy
+    sky, flux = tools.places(*tools.lattice(rng, 5, 5.5, 0.0)), np.geomspace(2, 200, 25)
+    form = {"scale": tools.FINE, "sigma": 0.01 / (tools.FINE**2 * tools.SR * 1e12), "rng": rng}
+    return sky, flux, tools.picture(sky, flux, (500, 500), width=0.15, **form)
 
 
 def test_all_sources_are_found_where_they_are(deep):
@@ -73,11 +64,9 @@ def test_mask_background_and_missing_uncertainty(deep):
 
 
 def test_empty_image(tools):
-    rng = np.random.default_rng(0)
-    wcs = north_up_wcs(tools.CENTER, 0.06 * u.arcsec, (100, 100))
-    segmentation, catalog = detect_sources(
-        tools.as_ccd(rng.normal(size=(100, 100)), wcs, 1.0), threshold=5
-    )
+    form = {"scale": 0.06, "sigma": 1.0, "rng": np.random.default_rng(0)}
+    image = tools.picture(tools.places([0.0]), [0.0], (100, 100), **form)
+    segmentation, catalog = detect_sources(image, threshold=5)
     assert len(catalog) == 0
     assert catalog["flux"].unit == u.uJy
     assert segmentation.data.max() == 0
@@ -85,11 +74,11 @@ def test_empty_image(tools):
 
 def test_bad_settings(deep):
     _, _, image = deep
-    with pytest.raises(KeyError, match="no detection preset 'deep'; known: default"):
-        detect_sources(image, preset="deep")
+    message = "no detection preset 'deep'; known: default"
+    refuses(message, detect_sources, image, preset="deep", error=KeyError)
     refuses("'threshold' must be positive", detect_sources, image, threshold=-1)
-    with pytest.raises(ValueError, match="'image' must be an image with a celestial WCS"):
-        detect_sources(CCDData(np.ones((20, 20)), unit="MJy/sr"))
+    plain = CCDData(np.ones((20, 20)), unit="MJy/sr")
+    refuses("'image' must be an image with a celestial WCS", detect_sources, plain)
 
 
 def disk(shape, x, y, radius):
@@ -148,20 +137,16 @@ def test_dilated_detections_hold_more_of_their_light(deep):
     # faint sources lose most where segments end at an isophote
     assert np.median(lost[:5]) > 0.15
     assert abs(np.median(left)) < 0.02
-    with pytest.raises(KeyError, match="no dilation rule 'twice'; known: area"):
-        detect_sources(image, dilation="twice")
+    message = "no dilation rule 'twice'; known: area"
+    refuses(message, detect_sources, image, dilation="twice", error=KeyError)
     refuses("'factors' must be 1 numbers of at least 1", DilationRule, factors=0.5)
 
 
 def test_purity_of_noise_and_of_sources(tools):
-    rng = np.random.default_rng(7)
-    shape = (600, 600)
-    wcs = north_up_wcs(tools.CENTER, 0.06 * u.arcsec, shape)
-    noise = rng.normal(0, 1, shape)
-    options = {"preset": "yang2021", "n_pixels": 20}
-    table = detection_purity(
-        tools.as_ccd(noise, wcs, 1.0), snr_edges=[0, 2.5, 3, 3.5, np.inf], **options
-    )
+    rng, options = np.random.default_rng(7), {"preset": "yang2021", "n_pixels": 20}
+    form = {"scale": tools.FINE, "width": 0.15, "sigma": 1.0}
+    noise = tools.picture(tools.places([]), [], (600, 600), rng=rng, **form)
+    table = detection_purity(noise, snr_edges=[0, 2.5, 3, 3.5, np.inf], **options)
     # noise alone: as many on either side, so the purity is zero within its error
     assert table["n_positive"].sum() == table.meta["n_positive"] > 150
     error = np.sqrt(1 / table["n_positive"] + 1 / np.maximum(table["n_negative"], 1))
@@ -169,7 +154,8 @@ def test_purity_of_noise_and_of_sources(tools):
     # forty sources of a known place among it: what is not one of them is spurious
     sky = tools.positions(rng, 40, 16.0)
     flux = 10 ** rng.uniform(1.0, 2.0, 40) * 10 * tools.FINE**2 * tools.SR * 1e12
-    image = tools.as_ccd(noise + tools.render(sky, flux, 0.15, wcs, shape), wcs, 1.0)
+    image = tools.picture(sky, flux, (600, 600), **form)
+    image.data += noise.data
     _, found = detect_sources(image, **options)
     table = detection_purity(image, snr_edges=[0, 2.5, 3, 4, 5, np.inf], **options)
     separation = found["sky"].match_to_catalog_sky(sky)[1].arcsec
@@ -183,8 +169,8 @@ def test_purity_of_noise_and_of_sources(tools):
     assert table["purity_low"][-1] > 0.85
     error = np.hypot(table["purity_high"] - table["purity"], 1 / np.sqrt(table["n_positive"]))
     assert np.all(np.abs(table["purity"] - true) < 3 * error)
-    with pytest.raises(ValueError, match="'snr_edges' must be two numbers or more that ascend"):
-        detection_purity(image, snr_edges=[3, 2])
+    message = "'snr_edges' must be two numbers or more that ascend"
+    refuses(message, detection_purity, image, snr_edges=[3, 2])
 
 
 def test_settings_stated_on_other_pixels_find_the_same(tools):
@@ -192,26 +178,12 @@ def test_settings_stated_on_other_pixels_find_the_same(tools):
     areas = []
     for scale, size in ((0.06, 300), (0.03, 600)):
         rng = np.random.default_rng(2)
-        wcs = north_up_wcs(tools.CENTER, scale * u.arcsec, (size, size))
-        grid = np.linspace(-6, 6, 4)
-        dx, dy = (a.ravel() for a in np.meshgrid(grid, grid))
-        sky = tools.CENTER.spherical_offsets_by(dx * u.arcsec, dy * u.arcsec)
-        clean = tools.render(sky, np.full(16, 10.0), 0.15, wcs, (size, size))
-        sigma = 0.3 * 0.06 / scale
-        image = tools.as_ccd(clean + rng.normal(0, sigma, clean.shape), wcs, sigma)
+        sky = tools.places(*tools.lattice(rng, 4, 4.0, 0.0))
+        form = {"scale": scale, "sigma": 0.3 * 0.06 / scale, "rng": rng}
+        image = tools.picture(sky, np.full(16, 10.0), (size, size), width=0.15, **form)
         _, found = detect_sources(image, threshold=1.5, n_pixels=16, stated_on=0.06 * u.arcsec)
         index, separation, _ = sky.match_to_catalog_sky(found["sky"])
         assert separation.arcsec.max() < 0.05
         assert len(found) == 16
         areas.append(np.median(found["n_pixels"][index]) * scale**2)
     assert_allclose(areas[1], areas[0], rtol=0.05)
-
-
-def test_the_former_name_of_the_area_works(deep):
-    image = deep[2]
-    with pytest.warns(AstropyDeprecationWarning, match="min_area"):
-        _, old = detect_sources(image, threshold=1.0, min_area=12)
-    _, new = detect_sources(image, threshold=1.0, n_pixels=12)
-    assert len(old) == len(new)
-    with pytest.warns(AstropyDeprecationWarning, match="min_area"):
-        assert detection_purity(image, min_area=12).meta["n_pixels"] == 12

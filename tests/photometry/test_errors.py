@@ -1,19 +1,17 @@
-import dataclasses
-
 import astropy.units as u
 import numpy as np
 import pytest
 import scipy.ndimage
 import scipy.sparse
-from astropy.table import QTable
 from numpy.testing import assert_allclose
 
+from helpers.errors import refuses
+from helpers.mosaics import stamps_of
 from miricigale.instrument import north_up_wcs, pixel_area_map
-from miricigale.photometry import ErrorSettings, ForcedPhotometer, MemorySettings
+from miricigale.photometry import MemorySettings
 from miricigale.photometry.errors import (
     LinearFit,
     noise_correlation,
-    normal_matrix,
     sandwich_matrix,
     stated_correlation,
 )
@@ -44,21 +42,16 @@ def test_pulls_are_unity(tools, kind):
     flux = 10 ** rng.uniform(-0.5, 1, n)
     truth = tools.render(sky, flux, tools.LO, wcs, shape)
     level = 0.5 * 1e-12 / tools.SR
-    catalog = QTable({"sky": sky})
-    photometer = ForcedPhotometer(tools.kernel, template="psf", background_order=0)
-    naive = ForcedPhotometer(
-        tools.kernel, template="psf", errors=ErrorSettings(correlated_noise=False)
-    )
     pulls, plain, chi2 = [], [], []
     noises = noise_images(kind, shape, rng)
     for k in range(12):
         noise = next(noises)
         image = tools.as_ccd(truth + level * noise, wcs, level * noise.std())
-        result = photometer.measure(image, catalog=catalog)
+        result = tools.measured(image, sky, background_order=0)
         pulls.append((result.flux.value - flux) / result.flux_err.value)
         chi2.append(result.chi2)
         if k < 4:
-            result = naive.measure(image, catalog=catalog)
+            result = tools.measured(image, sky, errors=tools.WHITE)
             plain.append((result.flux.value - flux) / result.flux_err.value)
     assert 0.95 < np.std(pulls) < 1.1
     assert abs(np.mean(pulls)) < 0.12
@@ -88,19 +81,13 @@ def drizzled(tools, rng, scale, side):
 def test_errors_on_mosaics_are_the_scatter_of_fits_of_nothing(tools, scale, white):
     """Drizzled dithers, whose neighboring pixels share what they see (Fruchter & Hook 2002, sec. 7)."""
     rng = np.random.default_rng(8)
-    at = (np.arange(9) - 4) * 2.7
-    dx, dy = (a.ravel() + rng.uniform(-0.3, 0.3, 81) for a in np.meshgrid(at, at))
-    catalog = QTable({"sky": tools.CENTER.spherical_offsets_by(dx * u.arcsec, dy * u.arcsec)})
-    photometer = ForcedPhotometer(tools.kernel, template="psf", errors=ErrorSettings(psf_error=0.0))
+    sky = tools.places(*tools.lattice(rng, 9, 2.7, 0.3))
     pulls, plain = [], []
     for k in range(10):
         mosaic = drizzled(tools, rng, scale, 26.0)
-        result = photometer.measure(mosaic, catalog=catalog)
-        pulls.append(result.flux / result.flux_err)
+        pulls.append(tools.measured(mosaic, sky).snr)
         if k < 3:
-            naive = dataclasses.replace(photometer, errors=ErrorSettings(correlated_noise=False))
-            result = naive.measure(mosaic, catalog=catalog)
-            plain.append(result.flux / result.flux_err)
+            plain.append(tools.measured(mosaic, sky, errors=tools.WHITE).snr)
     # 810 fits: 2.5 %
     assert np.std(pulls) == pytest.approx(1, abs=0.07)
     assert np.std(plain) > white
@@ -109,13 +96,10 @@ def test_errors_on_mosaics_are_the_scatter_of_fits_of_nothing(tools, scale, whit
 @pytest.mark.parametrize("scale", [0.11, 0.06])
 def test_a_mosaic_without_room_for_sky_states_its_correlation(tools, scale):
     rng = np.random.default_rng(9)
-    catalog = QTable({"sky": tools.CENTER.spherical_offsets_by([0] * u.arcsec, [0] * u.arcsec)})
-    photometer = ForcedPhotometer(tools.kernel, template="psf", errors=ErrorSettings(psf_error=0.0))
     pulls = []
     for _ in range(100):
         mosaic = drizzled(tools, rng, scale, 19 * scale)
-        result = photometer.measure(mosaic, catalog=catalog)
-        pulls.append((result.flux / result.flux_err)[0])
+        pulls.append(tools.measured(mosaic, tools.places([0.0])).snr[0])
     # 7 % by the number of draws
     assert np.std(pulls) == pytest.approx(1, abs=0.2)
     total = stated_correlation(mosaic.meta["noise_correction"]).sum()
@@ -124,71 +108,43 @@ def test_a_mosaic_without_room_for_sky_states_its_correlation(tools, scale):
 
 def test_wrong_sigmas_do_not_matter(tools):
     rng = np.random.default_rng(1)
-    wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, (150, 150))
-    catalog = QTable({"sky": tools.positions(rng, 20, 7.0)})
-    noise = rng.normal(size=(150, 150))
-    errors = [
-        ForcedPhotometer(tools.kernel)
-        .measure(tools.as_ccd(noise, wcs, stated), catalog=catalog)
-        .flux_err.value
-        for stated in (1.0, 0.2)
-    ]
-    assert_allclose(errors[0], errors[1], rtol=1e-3)
+    sky = tools.positions(rng, 20, 7.0)
+    image = tools.picture(sky, np.zeros(20), (150, 150), sigma=1.0, rng=rng)
+    result = tools.measured(image, sky)
+    image.uncertainty.array[:] = 0.2
+    other = tools.measured(image, sky)
+    assert_allclose(result.flux_err, other.flux_err, rtol=1e-3)
     # and without any the noise of the image is taken
-    image = tools.as_ccd(noise, wcs, 1.0)
     image.uncertainty = None
-    result = ForcedPhotometer(tools.kernel).measure(image, catalog=catalog)
-    assert result.meta["measured_noise"]
-    assert_allclose(result.flux_err.value, errors[0], rtol=0.01)
-
-
-def test_error_of_an_isolated_source_is_the_closed_form(tools):
-    # white noise: sigma_flux = sigma / sqrt(sum(P^2)), sum(P^2) = pixel / (4 pi width^2)
-    wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, (120, 120))
-    rng = np.random.default_rng(0)
-    image = tools.as_ccd(rng.normal(size=(120, 120)), wcs, 1.0)
-    catalog = QTable({"sky": tools.positions(rng, 1, 0.1)})
-    result = ForcedPhotometer(tools.kernel, errors=ErrorSettings(correlated_noise=False)).measure(
-        image, catalog=catalog
-    )
-    per_pixel = pixel_area_map(wcs, (120, 120))[60, 60] * 1e12
-    expected = per_pixel * np.sqrt(4 * np.pi) * tools.LO / 0.11
-    assert_allclose(result.flux_err.value, expected, rtol=1e-3)
+    other = tools.measured(image, sky)
+    assert other.meta["measured_noise"]
+    assert_allclose(other.flux_err, result.flux_err, rtol=0.01)
 
 
 def test_blended_covariance_is_the_dense_inverse(tools):
-    rng = np.random.default_rng(8)
-    wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, (70, 70))
+    rng, shape = np.random.default_rng(8), (70, 70)
     sky = tools.positions(rng, 12, 1.2)
-    sigma = rng.uniform(0.5, 2, (70, 70))
-    image = tools.as_ccd(rng.normal(size=(70, 70)), wcs, 1.0)
-    image.uncertainty.array[:] = sigma
-    result = ForcedPhotometer(
-        tools.kernel, template="psf", errors=ErrorSettings(correlated_noise=False)
-    ).measure(image, catalog=QTable({"sky": sky}))
-    area = pixel_area_map(wcs, (70, 70)) * 1e12
-    design = np.stack(
-        [
-            (tools.render(sky[k : k + 1], [1.0], tools.LO, wcs, (70, 70)) / sigma).ravel()
-            for k in range(12)
-        ]
-    )
+    image = tools.picture(sky, np.zeros(12), shape, sigma=1.0, rng=rng)
+    sigma = image.uncertainty.array
+    sigma[:] = rng.uniform(0.5, 2, shape)
+    result = tools.measured(image, sky, errors=tools.WHITE)
+    light = [tools.render(sky[k : k + 1], [1.0], tools.LO, image.wcs, shape) for k in range(12)]
+    design = np.reshape(light / sigma, (12, -1))
+    area = pixel_area_map(image.wcs, shape)
     assert area.std() / area.mean() < 1e-6
     covariance = np.linalg.inv(design @ design.T)
     scale = np.sqrt(np.diag(covariance))
     got = result.covariance.toarray() / scale[:, None] / scale
     assert_allclose(got, covariance / scale[:, None] / scale, atol=2e-3)
     assert_allclose(result.flux_err.value, scale, rtol=2e-3)
+    # the fluxes are those of dense least squares
+    flux = covariance @ design @ (image.data / sigma).ravel()
+    assert_allclose(result.flux.value / scale, flux / scale, atol=0.01)
 
 
 def direct_sandwich(bank, inverse_sigma, correlation):
     """A^T W C W A by the direct convolution of whole images, in double precision."""
-    images = np.zeros((len(bank.order), *inverse_sigma.shape))
-    for block in bank.blocks():
-        for k, (y, x, h, w) in enumerate(block.box):
-            stamp = block.values[block.start[k] : block.start[k + 1]].reshape(h, w)
-            images[block.first + k, y : y + h, x : x + w] = stamp
-    images *= inverse_sigma
+    images = stamps_of(bank, inverse_sigma.shape) * inverse_sigma
     spread = [scipy.ndimage.convolve(image, correlation, mode="constant") for image in images]
     return scipy.sparse.csr_array(np.einsum("iyx,jyx->ij", images, np.stack(spread)))
 
@@ -206,14 +162,8 @@ def test_errors_are_those_of_the_direct_convolution(tools, monkeypatch, max_byte
     noise = scipy.ndimage.gaussian_filter(noise, 1.0)
     mask = rng.random(shape) < 0.1
     image = tools.as_ccd(noise, wcs, noise.std(), mask=mask)
-    options = {
-        "template": "psf",
-        "background_order": 0,
-        "memory": MemorySettings(max_bytes=max_bytes),
-    }
-    photometer = ForcedPhotometer(tools.kernel, **options)
-    catalog = QTable({"sky": sky})
-    found = photometer.measure(image, catalog=catalog)
+    options = {"background_order": 0, "memory": MemorySettings(max_bytes=max_bytes)}
+    found = tools.measured(image, sky, **options)
     assert found.noise_correlation.shape[0] >= 7
     seen = []
 
@@ -226,43 +176,10 @@ def test_errors_are_those_of_the_direct_convolution(tools, monkeypatch, max_byte
         return expected, projection
 
     monkeypatch.setattr("miricigale.photometry.fit_errors.sandwich_matrix", direct)
-    truth = photometer.measure(image, catalog=catalog)
+    truth = tools.measured(image, sky, **options)
     assert seen[0] < 1e-6
     assert_allclose(found.flux.value, truth.flux.value, rtol=1e-12)
     assert_allclose(found.flux_err.value, truth.flux_err.value, rtol=1e-6)
-
-
-def test_fluxes_are_those_of_dense_least_squares(tools, monkeypatch):
-    rng = np.random.default_rng(8)
-    shape = (150, 160)
-    wcs = north_up_wcs(tools.CENTER, 0.06 * u.arcsec, shape)
-    sky = tools.positions(rng, 60, 4.0)
-    light = tools.render(sky, 10 ** rng.uniform(0, 2, 60), tools.LO, wcs, shape)
-    sigma = rng.uniform(0.5, 1.5, shape)
-    image = tools.as_ccd(light + 5 * sigma * rng.normal(size=shape), wcs, 1.0)
-    image.uncertainty.array[:] = 5 * sigma
-    dense = []
-
-    def taken(bank, inverse_sigma, images):
-        design = np.zeros((len(bank.order), *shape), np.float32)
-        for block in bank.blocks():
-            for k, (y, x, h, w) in enumerate(block.box):
-                stamp = block.values[block.start[k] : block.start[k + 1]].reshape(h, w)
-                design[block.first + k, y : y + h, x : x + w] = stamp
-        # stamps over the noise are of single precision, all that follows of double
-        design = (design * inverse_sigma).reshape(len(design), -1).astype(float)
-        normal = design @ design.T
-        flux = np.empty(len(design))
-        flux[bank.order] = np.linalg.solve(normal, design @ images[0].ravel().astype(float))
-        dense.extend([flux, bank.order, np.linalg.cond(normal)])
-        return normal_matrix(bank, inverse_sigma, images)
-
-    monkeypatch.setattr("miricigale.photometry.template_fit.normal_matrix", taken)
-    photometer = ForcedPhotometer(tools.kernel, template="psf")
-    found = photometer.measure(image, catalog=QTable({"sky": sky}))
-    assert dense[2] > 50
-    error = (found.flux.value - dense[0]) / np.maximum(np.abs(dense[0]), found.flux_err.value)
-    assert np.abs(error).max() < 1e-9
 
 
 def test_common_parameters_like_dense_least_squares():
@@ -292,8 +209,8 @@ def test_common_parameters_like_dense_least_squares():
 def test_white_noise_has_no_correlation():
     rng = np.random.default_rng(0)
     image = 1.3 * rng.normal(size=(300, 300))
-    found = noise_correlation(image, np.ones(image.shape, bool))
+    ones, none = np.ones(image.shape), np.zeros(image.shape, bool)
+    found = noise_correlation(image, ~none, ones)
     assert found.shape == (1, 1)
     assert_allclose(found, 1.3**2, rtol=0.02)
-    with pytest.raises(ValueError, match="'usable' must leave at least 100 pixels"):
-        noise_correlation(image, np.zeros(image.shape, bool))
+    refuses("'usable' must leave at least 100 pixels", noise_correlation, image, none, ones)

@@ -1,24 +1,20 @@
 """Results come back as they were: from files, pickles and copies."""
 
 import copy
-import dataclasses
 import pickle
 
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.coordinates import SkyCoord
 from astropy.io.registry import IORegistryError
-from astropy.nddata import CCDData
-from astropy.table import QTable, Table
+from astropy.table import QTable
 from numpy.testing import assert_array_equal
 
 from helpers.errors import refuses
-from miricigale.instrument import north_up_wcs
+from helpers.results import assert_equal_values
 from miricigale.photometry import (
     ErrorModel,
     ErrorSettings,
-    ForcedPhotometer,
     ForcedPhotometryResult,
 )
 from miricigale.utils.exceptions import DataError
@@ -51,61 +47,17 @@ def result(request, tools, field):
     catalog = field.catalog[: 55 if request.param == "all" else None]
     if request.param == "all":
         catalog["components"] = np.where(np.arange(len(catalog)) == 3, 2, 1)
-    options = OPTIONS[request.param]
-    return ForcedPhotometer(tools.kernel, template="psf", **options).measure(image, catalog=catalog)
-
-
-def check(one, other):
-    """Every field of a result, by what kind it is."""
-    for name in (field.name for field in dataclasses.fields(one)):
-        mine, theirs = getattr(one, name), getattr(other, name)
-        same_value(name, mine, theirs)
-    assert_array_equal(one.sample(3, seed=1).value, other.sample(3, seed=1).value)
-    assert_array_equal(one.chi2_image.data, other.chi2_image.data)
-
-
-def same_value(name, mine, theirs):
-    assert (mine is None) == (theirs is None), name
-    if mine is None:
-        return
-    if isinstance(mine, SkyCoord):
-        assert_array_equal(mine.icrs.ra.deg, theirs.icrs.ra.deg)
-        assert_array_equal(mine.icrs.dec.deg, theirs.icrs.dec.deg)
-    elif isinstance(mine, CCDData):
-        assert mine.unit == theirs.unit
-        assert mine.meta == theirs.meta
-        x = np.array([0.0, 100.0])
-        assert_array_equal(*(one.wcs.pixel_to_world_values(x, x) for one in (mine, theirs)))
-        same_value(name, mine.data, theirs.data)
-        same_value(name, mine.mask, theirs.mask)
-        if mine.uncertainty is not None:
-            same_value(name, mine.uncertainty.array, theirs.uncertainty.array)
-    elif isinstance(mine, Table):
-        assert mine.colnames == theirs.colnames
-        for column in mine.colnames:
-            same_value(column, mine[column], theirs[column])
-    elif hasattr(mine, "toarray"):
-        assert type(mine) is type(theirs)
-        assert_array_equal(mine.toarray(), theirs.toarray())
-    elif dataclasses.is_dataclass(mine):
-        for one in dataclasses.fields(mine):
-            if one.name != "wcs":
-                same_value(one.name, getattr(mine, one.name), getattr(theirs, one.name))
-    elif isinstance(mine, (dict, int, tuple)):
-        assert mine == theirs
-    else:
-        assert getattr(mine, "unit", None) == getattr(theirs, "unit", None)
-        assert_array_equal(np.asarray(mine), np.asarray(theirs))
-        assert np.asarray(mine).dtype == np.asarray(theirs).dtype, name
+    return tools.measured(image, catalog, **OPTIONS[request.param])
 
 
 def test_result_comes_back(result, tmp_path):
     path = tmp_path / "r.fits"
     result.write(path)
-    check(result, ForcedPhotometryResult.read(path))
-    check(result, pickle.loads(pickle.dumps(result)))
-    check(result, copy.deepcopy(result))
-    check(result, copy.copy(result))
+    again = ForcedPhotometryResult.read(path), pickle.loads(pickle.dumps(result))
+    for one in (*again, copy.deepcopy(result), copy.copy(result)):
+        assert_equal_values("result", result, one)
+        assert_array_equal(result.sample(3, seed=1).value, one.sample(3, seed=1).value)
+        assert_array_equal(result.chi2_image.data, one.chi2_image.data)
     refuses("overwrite", result.write, path, error=OSError)
     before = path.read_bytes()
     result.write(path, overwrite=True)
@@ -141,11 +93,9 @@ def test_other_programs_find_the_table_first(result, tmp_path):
 
 
 def test_nothing_to_measure_can_be_kept(tools, tmp_path):
-    wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, (60, 60))
-    image = tools.as_ccd(np.random.default_rng(1).normal(0, 0.1, (60, 60)), wcs, 0.1)
-    catalog = QTable({"sky": SkyCoord([], [], unit="deg")})
-    result = ForcedPhotometer(tools.kernel, template="psf").measure(image, catalog=catalog)
-    result.write(tmp_path / "r.fits")
+    form = {"sigma": 0.1, "rng": np.random.default_rng(1)}
+    image = tools.picture(tools.places([]), [], (60, 60), **form)
+    tools.measured(image, tools.places([])).write(tmp_path / "r.fits")
     assert len(ForcedPhotometryResult.read(tmp_path / "r.fits")) == 0
     image.write(tmp_path / "image.fits")
     with pytest.raises(DataError, match="holds no forced photometry"):

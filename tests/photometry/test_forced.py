@@ -8,6 +8,7 @@ from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
+from helpers.light import gaussian_image
 from miricigale.instrument import imager_wcs, north_up_wcs, pixel_area_map
 from miricigale.photometry import (
     ErrorSettings,
@@ -26,9 +27,7 @@ def flagged(result, flag):
 
 
 def test_noiseless_point_sources_come_back_exactly(tools, field):
-    result = ForcedPhotometer(tools.kernel, template="psf").measure(
-        field.image, catalog=field.catalog
-    )
+    result = tools.measured(field.image, field.catalog)
     assert_allclose(result.flux.to_value(u.uJy), field.flux, rtol=1e-6, atol=1e-6)
     assert np.abs(result.residual_image.data).max() < 1e-6 * field.image.data.max()
     assert list(result.id) == list(field.catalog["id"])
@@ -42,18 +41,15 @@ def test_noiseless_point_sources_come_back_exactly(tools, field):
 
 @pytest.mark.parametrize("grid", ["fine", "turned", "distorted"])
 def test_flux_does_not_depend_on_the_grid(tools, field, grid):
-    if grid == "fine":
-        shape = (480, 480)
-        wcs = north_up_wcs(tools.CENTER, 0.06 * u.arcsec, shape)
-    elif grid == "turned":
-        shape = (340, 340)
-        wcs = north_up_wcs(tools.CENTER, 0.13 * u.arcsec, shape)
+    shape = {"fine": (480, 480), "turned": (340, 340), "distorted": (1024, 1032)}[grid]
+    if grid == "distorted":
+        wcs = imager_wcs(tools.CENTER, 71 * u.deg)
+    else:
+        wcs = north_up_wcs(tools.CENTER, (0.06 if grid == "fine" else 0.13) * u.arcsec, shape)
+    if grid == "turned":
         c, s = np.cos(0.6), np.sin(0.6)
         wcs.wcs.pc = [[c, -s], [s, c]]
         wcs.wcs.set()
-    else:
-        shape = (1024, 1032)
-        wcs = imager_wcs(tools.CENTER, 71 * u.deg)
     data = tools.render(field.sky, field.flux, tools.LO, wcs, shape)
     # the scene itself conserves flux on this grid
     assert_allclose((data * pixel_area_map(wcs, shape)).sum() * 1e12, field.flux.sum(), rtol=1e-6)
@@ -68,22 +64,15 @@ def galaxies(tools, noise=0.002, n=30, seed=7, spacing=3.2):
     """Isolated Gaussian galaxies, as the two images show them."""
     rng = np.random.default_rng(seed)
     side = int(np.ceil(np.sqrt(n)))
-    grid = (np.arange(side) - (side - 1) / 2) * spacing
-    dx, dy = (a.ravel()[:n] + rng.uniform(-0.2, 0.2, n) for a in np.meshgrid(grid, grid))
-    sky = tools.CENTER.spherical_offsets_by(dx * u.arcsec, dy * u.arcsec)
-    size = rng.uniform(0.05, 0.25, n)
-    bright = np.full(n, 20.0)
-    flux = 10 ** rng.uniform(0.5, 2, n)
+    sky = tools.places(*(one[:n] for one in tools.lattice(rng, side, spacing, 0.2)))
+    size, flux = rng.uniform(0.05, 0.25, n), 10 ** rng.uniform(0.5, 2, n)
     half = int((side + 1.5) * spacing / 2 / tools.FINE)
-    fine = north_up_wcs(tools.CENTER, tools.FINE * u.arcsec, (2 * half, 2 * half))
-    high = tools.render(sky, bright, np.hypot(size, tools.HI), fine, (2 * half, 2 * half))
-    per_pixel = tools.FINE**2 * tools.SR * 1e12
-    sigma = noise / per_pixel
-    high = tools.as_ccd(high + rng.normal(0, sigma, high.shape), fine, sigma)
+    sigma, sharp = noise / (tools.FINE**2 * tools.SR * 1e12), np.hypot(size, tools.HI)
+    form = {"scale": tools.FINE, "width": sharp, "sigma": sigma, "rng": rng}
+    high = tools.picture(sky, np.full(n, 20.0), (2 * half, 2 * half), **form)
     n_low = int(2 * half * tools.FINE / 0.11)
-    wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, (n_low, n_low))
-    low = tools.render(sky, flux, np.hypot(size, tools.LO), wcs, (n_low, n_low))
-    return sky, flux, high, tools.as_ccd(low, wcs, 0.01)
+    low = tools.picture(sky, flux, (n_low, n_low), width=np.hypot(size, tools.LO))
+    return sky, flux, high, low
 
 
 def test_extended_sources_through_kernel_and_cutouts(tools):
@@ -96,10 +85,7 @@ def test_extended_sources_through_kernel_and_cutouts(tools):
     assert abs(np.median(ratio) - 1) < 0.005
     assert_allclose(ratio, 1, atol=0.02)
     # a point-source template does not know that they are extended
-    point = ForcedPhotometer(tools.kernel, template="psf").measure(
-        low, catalog=QTable({"sky": sky})
-    )
-    assert np.median(point.flux.value / flux) < 0.9
+    assert np.median(tools.measured(low, sky).flux.value / flux) < 0.9
 
 
 @pytest.mark.parametrize(("noise", "snr", "bias"), [(0.05, 40, 0.06), (0.16, 20, 0.1)])
@@ -123,48 +109,46 @@ def test_noisy_templates(tools, noise, snr, bias):
     assert np.median(np.concatenate(as_they_are)) < 1 - bias / 2
 
 
-def test_template_column_says_what_was_used(tools):
+def test_templates_and_flags_say_what_was_used(tools):
     sky, _, high, low = galaxies(tools, noise=0.01, n=9)
-    segmentation, _ = detect_sources(high, threshold=1.0, n_pixels=10)
-    blank = tools.CENTER.spherical_offsets_by(1.6 * u.arcsec, 1.6 * u.arcsec)
-    far = tools.CENTER.spherical_offsets_by(1.0 * u.deg, 0 * u.deg)
-    catalog = QTable({"sky": joined_sky([sky, blank.reshape(1), far.reshape(1)])})
-    result = ForcedPhotometer(tools.kernel).measure(low, high, segmentation, catalog)
+    segmentation, detected = detect_sources(high, threshold=1.0, n_pixels=10)
+    # a blank place, one that is far off, and a second source on a segment
+    double = sky[0].spherical_offsets_by(0.15 * u.arcsec, 0 * u.arcsec).reshape(1)
+    catalog = QTable({"sky": joined_sky([sky, tools.places([1.6, 3600.0], [1.6, 0.0]), double])})
+    photometer = ForcedPhotometer(tools.kernel)
+    result = photometer.measure(low, high, segmentation, catalog)
     # Gaussians of this significance are profiles of index 1/2
-    assert result.template.tolist() == ["sersic"] * 9 + ["point", "none"]
+    assert result.template.tolist() == ["sersic"] * 9 + ["point", "none", "point"]
     assert np.all(result.template_snr[:9] > 20)
     assert np.isnan(result.template_snr[9:]).all()
-    as_asked = ForcedPhotometer(tools.kernel, template="cutout")
-    result = as_asked.measure(low, high, segmentation, catalog)
-    assert result.template.tolist() == ["cutout"] * 9 + ["point", "none"]
+    assert np.flatnonzero(flagged(result, ForcedFlags.NO_SEGMENT)).tolist() == [9]
+    assert np.flatnonzero(flagged(result, ForcedFlags.SHARED_SEGMENT)).tolist() == [11]
+    assert np.flatnonzero(np.isnan(result.flux)).tolist() == [10]
     table = result.to_table("miri.f770w")
     assert_array_equal(table["miri.f770w_template"], result.template)
     assert_array_equal(table["miri.f770w_template_snr"], result.template_snr)
+    as_asked = ForcedPhotometer(tools.kernel, template="cutout")
+    result = as_asked.measure(low, high, segmentation, catalog)
+    assert result.template.tolist() == ["cutout"] * 9 + ["point", "none", "point"]
+    # a detection's own table gives its labels
+    assert not photometer.measure(low, high, segmentation, detected).flags.any()
 
 
 def test_poor_fits_and_unexplained_neighbours_are_flagged(tools):
-    rng = np.random.default_rng(8)
-    wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, (200, 200))
-    east = np.array([-6.0, -2.0, 2.0, 6.0])
-    sky = tools.CENTER.spherical_offsets_by(east * u.arcsec, np.zeros(4) * u.arcsec)
-    flux = np.full(4, 40.0)
     # the first is as the catalogue says, the second is wider; the third has a companion at 0.9
     # arcsec, the fourth one at 2.5 arcsec (the PSF's full width is 0.59 arcsec)
-    width = np.hypot(tools.LO, [0.0, 0.25, 0.0, 0.0])
-    more = tools.CENTER.spherical_offsets_by([2.0, 6.0] * u.arcsec, [0.9, 2.5] * u.arcsec)
-    data = tools.render(sky, flux, width, wcs, (200, 200))
-    data += tools.render(more, np.full(2, 20.0), tools.LO, wcs, (200, 200))
-    sigma = 0.1
-    image = tools.as_ccd(data + rng.normal(0, sigma, data.shape), wcs, sigma)
-    photometer = ForcedPhotometer(tools.kernel, template="psf")
-    result = photometer.measure(image, catalog=QTable({"sky": sky}))
+    sky = tools.places([-6.0, -2.0, 2.0, 6.0])
+    every = joined_sky([sky, tools.places([2.0, 6.0], [0.9, 2.5])])
+    form = {"width": np.hypot(tools.LO, [0.0, 0.25, 0.0, 0.0, 0.0, 0.0]), "sigma": 0.1}
+    flux = [40.0] * 4 + [20.0] * 2
+    image = tools.picture(every, flux, (200, 200), rng=np.random.default_rng(8), **form)
+    result = tools.measured(image, sky)
     assert result.snr.min() > 100
     assert flagged(result, ForcedFlags.POOR_FIT).tolist() == [False, True, True, False]
     neighbour = flagged(result, ForcedFlags.UNEXPLAINED_NEIGHBOR)
     assert neighbour.tolist() == [False, False, True, False]
     # with all sources in the catalogue nothing is left
-    catalog = QTable({"sky": joined_sky([sky, more])})
-    result = photometer.measure(image, catalog=catalog)
+    result = tools.measured(image, every)
     assert not flagged(result, ForcedFlags.UNEXPLAINED_NEIGHBOR).any()
     assert flagged(result, ForcedFlags.POOR_FIT).tolist() == [False, True, *[False] * 4]
 
@@ -224,13 +208,10 @@ def test_noise_in_the_template_is_taken_off_the_diagonal(tools):
     from miricigale.photometry.cutouts import Cutout
     from miricigale.photometry.templates import BankSources, FineTemplates, TemplateBank
 
-    rng = np.random.default_rng(2)
+    rng, sigma, n = np.random.default_rng(2), 0.02, 200
     fine = FineTemplates(tools.kernel.array, tools.kernel.target)
-    y, x = np.mgrid[-9:10, -9:10]
-    light = np.exp(-0.5 * (x**2 + y**2) / 2.0**2)
+    light = gaussian_image(19, 2.0)
     light /= light.sum()
-    sigma = 0.02
-    n = 200
     noisy = [light + rng.normal(0, sigma, light.shape) for _ in range(n)]
     parts = [Cutout(a, (20, 20), noise=sigma**2 * light.size) for a in [light, *noisy]]
     poly = np.zeros((n + 1, 2, 6))
@@ -249,21 +230,6 @@ def test_noise_in_the_template_is_taken_off_the_diagonal(tools):
     assert_allclose(np.mean(power[1:] - terms[1:]), power[0], rtol=0.02)
 
 
-def test_blank_positions_and_shared_segments_are_point_sources(tools):
-    sky, _, high, low = galaxies(tools, n=9)
-    segmentation, detected = detect_sources(high, threshold=1.0, n_pixels=10)
-    blank = tools.CENTER.spherical_offsets_by(1.6 * u.arcsec, 1.6 * u.arcsec)
-    double = sky[0].spherical_offsets_by(0.15 * u.arcsec, 0 * u.arcsec)
-    catalog = QTable({"sky": joined_sky([sky, blank.reshape(1), double.reshape(1)])})
-    result = ForcedPhotometer(tools.kernel).measure(low, high, segmentation, catalog)
-    assert flagged(result, ForcedFlags.NO_SEGMENT).tolist() == [False] * 9 + [True, False]
-    assert flagged(result, ForcedFlags.SHARED_SEGMENT).sum() == 1
-    assert np.isfinite(result.flux.value).all()
-    # a detection's own table gives its labels
-    result = ForcedPhotometer(tools.kernel).measure(low, high, segmentation, detected)
-    assert not result.flags.any()
-
-
 def test_sersic_templates(tools):
     from miricigale.profiles import sersic_image
 
@@ -280,9 +246,7 @@ def test_sersic_templates(tools):
                      n=rows["n"][k], axis_ratio=rows["q"][k], theta=np.radians(90 + rows["pa"][k]))
         for k in range(n)
     )  # fmt: skip
-    from scipy.ndimage import gaussian_filter
-
-    scene = gaussian_filter(scene, tools.LO / tools.FINE, truncate=8, mode="constant")
+    scene = scipy.ndimage.gaussian_filter(scene, tools.LO / tools.FINE, truncate=8, mode="constant")
     image = tools.as_ccd(scene / (pixel_area_map(wcs, shape) * 1e12), wcs, 0.01)
     catalog = QTable(
         {"sky": sky, "profile": ["sersic"] * n, "half_light_radius": rows["r"] * u.arcsec,
@@ -302,11 +266,9 @@ def test_background_and_shift_are_found(tools, field):
     assert_allclose(result.shift.to_value(u.arcsec), [-0.06, -0.03], atol=2e-4)
     assert_allclose(result.background.to_value("MJy/sr"), 0.7, atol=1e-4)
     assert_allclose(result.flux.value, field.flux, rtol=2e-3, atol=2e-3)
+    settings["max_shift"] = 0.02 * u.arcsec
     with pytest.warns(MiricigaleWarning, match="beyond 'max_shift'"):
-        result = ForcedPhotometer(
-            tools.kernel, background_order=0, max_shift=0.02 * u.arcsec
-        ).measure(image, catalog=field.catalog)
-    assert result.shift is None
+        assert tools.measured(image, field.catalog, **settings).shift is None
 
 
 def test_masked_pixels_do_not_count(tools, field):
@@ -315,7 +277,7 @@ def test_masked_pixels_do_not_count(tools, field):
     data = field.image.data.copy()
     data[mask] = np.where(rng.random(mask.sum()) < 0.5, 1e6, np.nan)
     image = tools.as_ccd(data, field.wcs, 0.01, mask=mask)
-    result = ForcedPhotometer(tools.kernel, template="psf").measure(image, catalog=field.catalog)
+    result = tools.measured(image, field.catalog)
     assert_allclose(result.flux.value, field.flux, rtol=1e-5, atol=1e-5)
     assert flagged(result, ForcedFlags.MASKED).mean() > 0.9
     assert np.isnan(result.residual_image.data[mask]).all()
@@ -323,15 +285,8 @@ def test_masked_pixels_do_not_count(tools, field):
 
 
 def test_edges_and_absent_data(tools):
-    wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, (120, 120))
-    west = [0.0, 6.55, 7.2, 9.0, 600.0]
-    north = [0.0, -3.0, 0.0, 3.0, 0.0]
-    sky = tools.CENTER.spherical_offsets_by(-np.array(west) * u.arcsec, north * u.arcsec)
-    flux = np.full(5, 50.0)
-    image = tools.as_ccd(tools.render(sky, flux, tools.LO, wcs, (120, 120)), wcs, 0.01)
-    result = ForcedPhotometer(tools.kernel, template="psf").measure(
-        image, catalog=QTable({"sky": sky})
-    )
+    sky = tools.places([0.0, -6.55, -7.2, -9.0, -600.0], [0.0, -3.0, 0.0, 3.0, 0.0])
+    result = tools.measured(tools.picture(sky, np.full(5, 50.0), (120, 120)), sky)
     assert flagged(result, ForcedFlags.EDGE).tolist() == [False, True, True, True, True]
     assert flagged(result, ForcedFlags.NO_DATA).tolist() == [False, False, True, True, True]
     assert_allclose(result.flux.value[:2], 50.0, rtol=1e-3)
@@ -343,14 +298,8 @@ def test_edges_and_absent_data(tools):
 
 
 def test_blends_are_flagged_and_twins_not_counted_twice(tools):
-    wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, (120, 120))
-    offset = np.array([0.0, 0.15, 3.0, 3.0])
-    sky = tools.CENTER.spherical_offsets_by(offset * u.arcsec, np.zeros(4) * u.arcsec)
-    flux = np.array([10.0, 20.0, 30.0, 0.0])
-    image = tools.as_ccd(tools.render(sky, flux, tools.LO, wcs, (120, 120)), wcs, 0.01)
-    result = ForcedPhotometer(tools.kernel, template="psf").measure(
-        image, catalog=QTable({"sky": sky})
-    )
+    sky, flux = tools.places([0.0, 0.15, 3.0, 3.0]), np.array([10.0, 20.0, 30.0, 0.0])
+    result = tools.measured(tools.picture(sky, flux, (120, 120)), sky)
     assert flagged(result, ForcedFlags.BLENDED).tolist() == [True, True, False, False]
     assert flagged(result, ForcedFlags.DEGENERATE).tolist() == [False, False, False, True]
     assert_allclose(result.flux.value[:3], flux[:3], rtol=1e-4)
@@ -365,9 +314,7 @@ def test_files_in_place_of_memory_change_nothing(tools, field, tmp_path):
     image = tools.as_ccd(field.image.data + noise, field.wcs, 0.3, mask=noise > 0.7)
     options = {"background_order": 0, "max_shift": 0.1 * u.arcsec, "second_pass": True}
     one, other = (
-        ForcedPhotometer(tools.kernel, memory=MemorySettings(scratch=folder), **options).measure(
-            image, catalog=field.catalog[:-5]
-        )
+        tools.measured(image, field.catalog[:-5], memory=MemorySettings(scratch=folder), **options)
         for folder in (None, tmp_path)
     )
     assert len(one.new_sources) > 0
@@ -420,12 +367,8 @@ def test_integration_over_pixels(tools):
     gx, gy = (np.diff(0.5 * erf((edges - p) * scale / tools.LO / np.sqrt(2))) for p in (x, y))
     image = tools.as_ccd(100.0 * gy[:, None] * gx / (pixel_area_map(wcs, (n, n)) * 1e12), wcs, 0.1)
     catalog = QTable({"sky": sky.reshape(1)})
-    flux = [
-        ForcedPhotometer(tools.kernel, integrate=flag).measure(image, catalog=catalog).flux.value[0]
-        for flag in (True, False)
-    ]
-    assert_allclose(flux[0], 100.0, rtol=1e-5)
-    assert flux[1] < 97.5
+    assert_allclose(tools.measured(image, catalog, integrate=True).flux.value, 100.0, rtol=1e-5)
+    assert tools.measured(image, catalog).flux.value[0] < 97.5
 
 
 @pytest.mark.parametrize(
@@ -449,18 +392,15 @@ def test_bad_settings_are_refused(tools, change, error, text):
 
 def test_bad_inputs_are_refused(tools, field):
     photometer = ForcedPhotometer(tools.kernel)
-    with pytest.raises(ValueError, match="'image' must be a CCDData"):
-        photometer.measure(field.image.data, catalog=field.catalog)
-    with pytest.raises(ValueError, match="'catalog' must be a table with positions"):
-        photometer.measure(field.image, catalog=QTable({"ra": [1]}))
-    with pytest.raises(ValueError, match="'highres' must be on the kernel's pixels"):
-        photometer.measure(field.image, field.image, catalog=field.catalog)
-    wrong = CCDData(field.image.data, unit="adu", wcs=field.wcs)
-    with pytest.raises(u.UnitsError, match="'image' must be convertible to MJy / sr"):
-        photometer.measure(wrong, catalog=field.catalog)
-    bare = MatchingKernel(tools.kernel.array, pixel_scale=0.06 * u.arcsec)
-    with pytest.raises(ValueError, match="'kernel' must be a MatchingKernel with its PSFs for"):
-        ForcedPhotometer(bare, template="sersic")
+    image, catalog = field.image, field.catalog
+    wrong = CCDData(image.data, unit="adu", wcs=field.wcs)
+    for given, message, error in (
+        ((image.data, None, None, catalog), "'image' must be a CCDData", ValueError),
+        ((image, None, None, {"ra": [1]}), "'catalog' must be a table with posi", ValueError),
+        ((image, image, None, catalog), "'highres' must be on the kernel's pixels", ValueError),
+        ((wrong, None, None, catalog), "'image' must be convertible to MJy / sr", u.UnitsError),
+    ):
+        refuses(message, photometer.measure, *given, error=error)
 
 
 def test_positions_that_are_not_known_are_flagged(tools, field):
@@ -468,34 +408,24 @@ def test_positions_that_are_not_known_are_flagged(tools, field):
     ra = catalog["sky"].ra.deg.copy()
     ra[[3, 7]] = np.nan
     catalog["sky"] = SkyCoord(ra, catalog["sky"].dec.deg, unit="deg")
-    result = ForcedPhotometer(tools.kernel, template="psf").measure(field.image, catalog=catalog)
+    result = tools.measured(field.image, catalog)
     lost = flagged(result, ForcedFlags.NO_DATA)
     assert np.flatnonzero(lost).tolist() == np.flatnonzero(np.isnan(result.flux)).tolist() == [3, 7]
     assert not result.crowded[lost].any()
-    away = QTable({"sky": tools.CENTER.spherical_offsets_by([1] * u.deg, [0] * u.deg)})
     with pytest.warns(MiricigaleWarning, match="none of the 1 sources is on or near"):
-        result = ForcedPhotometer(tools.kernel, template="psf").measure(field.image, catalog=away)
+        result = tools.measured(field.image, tools.places([3600.0]))
     assert flagged(result, ForcedFlags.NO_DATA).all()
 
 
 def test_arrays_with_the_mistakes_of_files(tools):
     """A background, areas of zeros and labels of another map, without files."""
     rng, shape = np.random.default_rng(6), (400, 400)
-    wcs = north_up_wcs(tools.CENTER, tools.FINE * u.arcsec, shape)
-    steps = (np.arange(5) - 2) * 4.0
-    sky = tools.CENTER.spherical_offsets_by(
-        *(np.array(np.meshgrid(steps, steps)).reshape(2, -1) * u.arcsec)
-    )
-    flux, noise = np.geomspace(3, 30, 25), 5e-3
+    sky, flux = tools.places(*tools.lattice(rng, 5, 4.0, 0.0)), np.geomspace(3, 30, 25)
+    form = {"scale": tools.FINE, "sigma": 5e-3, "rng": rng}
     sharp, wide = (
-        tools.as_ccd(
-            tools.render(sky, flux, width, wcs, shape) + rng.normal(0, noise, shape), wcs, noise
-        )
-        for width in (tools.HI, tools.LO)
+        tools.picture(sky, flux, shape, width=width, **form) for width in (tools.HI, tools.LO)
     )
-    labels, (y, x) = np.zeros(shape, int), np.indices(shape)
-    for k, (a, b) in enumerate(zip(*wcs.world_to_pixel(sky), strict=True), 1):
-        labels[(x - a) ** 2 + (y - b) ** 2 < 60] = k
+    labels = tools.disks(sky, sharp.wcs, shape, np.sqrt(60))
     catalog = QTable({"sky": sky, "label": np.arange(1, 26)})
     photometer = ForcedPhotometer(tools.kernel)
     assert_allclose(photometer.measure(wide, sharp, labels, catalog).flux.value, flux, rtol=0.03)
@@ -509,31 +439,21 @@ def test_arrays_with_the_mistakes_of_files(tools):
     assert str(said[0].message).startswith("'highres' has a sky of 10")
     filled = wide.copy()
     filled.data[:, :90] = 0
-    with pytest.warns(
-        MiricigaleWarning, match="'image' has 36000 pixels in areas that are exactly"
-    ):
+    with pytest.warns(MiricigaleWarning, match="has 36000 pixels in areas that are exactly"):
         result = photometer.measure(filled, sharp, labels, catalog)
     good = np.isfinite(result.flux.value) & (result.coverage > 0.5)
     assert np.count_nonzero(good) == 20
     assert_allclose(result.flux.value[good], flux[good], rtol=0.05)
     catalog["label"] = np.roll(catalog["label"], 1)
-    with pytest.raises(
-        ValueError, match=r"'catalog\['label'\]' must be labels of .*25 of 25 sources"
-    ):
-        photometer.measure(wide, sharp, labels, catalog)
+    message = r"'catalog\['label'\]' must be labels of .*25 of 25 sources"
+    refuses(message, photometer.measure, wide, sharp, labels, catalog)
 
 
 def test_a_kernel_alone_measures_segments(tools, field):
     """Without PSFs the templates are the segments: what they hold, by closed form."""
-    wcs = north_up_wcs(tools.CENTER, tools.FINE * u.arcsec, (500, 500))
-    highres = tools.as_ccd(
-        tools.render(field.sky, field.flux, tools.HI, wcs, (500, 500)), wcs, 1e-3
-    )
-    labels, (y, x) = np.zeros((500, 500), int), np.indices((500, 500))
-    kept = np.arange(0, 60, 2)
-    for k in kept:
-        a, b = wcs.world_to_pixel(field.sky[k])
-        labels[(x - a) ** 2 + (y - b) ** 2 < 64] = k + 1
+    form, kept = {"scale": tools.FINE, "width": tools.HI, "sigma": 1e-3}, np.arange(0, 60, 2)
+    highres = tools.picture(field.sky, field.flux, (500, 500), **form)
+    labels = tools.disks(field.sky[kept], highres.wcs, (500, 500), 8, kept + 1)
     bare = MatchingKernel.from_array(
         tools.kernel.array / tools.kernel.array.sum(), pixel_scale=tools.FINE * u.arcsec
     )
@@ -546,5 +466,6 @@ def test_a_kernel_alone_measures_segments(tools, field):
     assert np.flatnonzero(~lost).tolist() == kept.tolist()
     assert np.isnan(result.flux[lost]).all()
     assert np.isfinite(result.flux[~lost]).all()
-    with pytest.raises(ValueError, match="'kernel' must be a MatchingKernel with its PSFs for"):
-        ForcedPhotometer(bare, template="psf")
+    for kind in ("psf", "sersic"):
+        message = "'kernel' must be a MatchingKernel with its PSFs for"
+        refuses(message, ForcedPhotometer, bare, template=kind)

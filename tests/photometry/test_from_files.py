@@ -9,18 +9,15 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.io import fits
-from astropy.nddata import CCDData, StdDevUncertainty
 from astropy.table import QTable, Table
 
-from helpers.errors import refuses
 from helpers.light import gaussian_image
-from helpers.mosaics import render
+from helpers.mosaics import disks, render
 from miricigale.cli import main
 from miricigale.instrument import north_up_wcs, pixel_area_map
 from miricigale.instrument.image_files import write_image
 from miricigale.photometry import ForcedFlags, read_mosaic
-from miricigale.photometry.kernel_files import read_kernel
-from miricigale.utils.exceptions import DataError, MiricigaleWarning
+from miricigale.utils.exceptions import MiricigaleWarning
 
 CENTER = SkyCoord(34.3, -5.1, unit="deg")
 #: Pixels and rms of the PSFs of image and prior, arcsec.
@@ -55,10 +52,7 @@ def files(tmp_path_factory):
     low, high = (260, 262), (470, 474)
     image_wcs = north_up_wcs(CENTER, COARSE * u.arcsec, low)
     prior_wcs = north_up_wcs(CENTER, FINE * u.arcsec, high)
-    labels = np.zeros(high, np.int32)
-    y, x = np.indices(high)
-    for one, a, b in zip(ids, *prior_wcs.world_to_pixel(sky), strict=True):
-        labels[(x - a) ** 2 + (y - b) ** 2 < 64] = one
+    labels = disks(sky, prior_wcs, high, 8, ids)
     noise = 0.005
     data = points(sky, flux, WIDE, image_wcs, low) + rng.normal(0, noise, low)
     prior = points(sky, 3 * flux, SHARP, prior_wcs, high) + rng.normal(0, 0.002, high)
@@ -189,45 +183,6 @@ def test_our_own_files_are_read(files, tmp_path):
     assert again.meta["filter"] == "miri.f770w"
 
 
-@pytest.mark.slow
-def test_model_psfs_are_turned_to_the_angle_of_the_aperture(tmp_path):
-    """Our own files, without options but filter and angle; sources on centers of both grids."""
-    from miricigale.psf import hst_psf, miri_psf, psf_image, psf_mosaic
-
-    places, flux = np.array([[-4.8, -3.6], [3.6, 3.6], [-2.4, 6.0]]), np.array([10.0, 20.0, 5.0])
-    coarse, rng = 0.12, np.random.default_rng(3)
-    wide = psf_mosaic(miri_psf("miri.f770w"), coarse * u.arcsec, 75 * u.deg)
-    for name, scale, n, model, light, noise, filter_ in (
-        ("image.fits", coarse, 241, wide, flux, 0.002, "miri.f770w"),
-        ("prior.fits", FINE, 481, hst_psf(), flux + 5, 0.002, "wfc3.f160w"),
-    ):
-        wcs, data = north_up_wcs(CENTER, scale * u.arcsec, (n, n)), rng.normal(0, noise, (n, n))
-        stamp = psf_image(model, pixel_scale=scale * u.arcsec, shape=n)
-        for (x, y), one in zip(places / scale, light, strict=True):
-            # no light comes back from the other side
-            moved = np.roll(stamp, (round(y), round(x)), axis=(0, 1))
-            data += one * moved
-        area = pixel_area_map(wcs, (n, n)) * 1e12
-        error = StdDevUncertainty(noise / area)
-        meta = {"filter": filter_}
-        write_image(CCDData(data / area, unit="MJy/sr", wcs=wcs, uncertainty=error, meta=meta),
-                    tmp_path / name)  # fmt: skip
-    sky = CENTER.spherical_offsets_by(*(places.T * [[-1], [1]] * u.arcsec))
-    files = [str(tmp_path / name) for name in ("image.fits", "prior.fits")]
-    output = tmp_path / "out.ecsv"
-    command = ["photometry", "--filter", "miri.f770w", "--no-progress", "-o", str(output), *files]
-    found = {}
-    for angle in (75, 30):
-        assert main([*command, "--pa-aper", str(angle), "--overwrite"]) == 0
-        table = QTable.read(output)
-        index, separation, _ = sky.match_to_catalog_sky(table["sky"])
-        assert separation.max() < 0.05 * u.arcsec
-        found[angle] = table[index]
-    np.testing.assert_allclose(found[75]["miri.f770w"].to_value(u.uJy), flux, rtol=0.01)
-    # the six spikes stand elsewhere at another angle
-    assert np.all(found[30]["miri.f770w_chi2"] > 2 * found[75]["miri.f770w_chi2"])
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -250,6 +205,7 @@ def test_model_psfs_are_turned_to_the_angle_of_the_aperture(tmp_path):
         ({"psf": None, "filter": "nircam.f480m"}, "there is no model PSF for nircam.f480m"),
         ({"kernel": "psf"}, "'psf' must be left out where a kernel is given"),
         ({"kernel": "segmentation", "psf": None, "highres-psf": None}, "cannot be read as a kernel"),
+        ({"kernel": "segmentation", "psf": None, "highres-psf": None}, "square with an odd number of pixels"),
         ({"psf": "segmentation"}, "seg.fits cannot be read as a PSF"),
         ({"psf": "cube"}, "must be an image with a PSF, got the shape"),
         ({"output": "out.txt"}, "'output' must be a table (.ecsv, .fits, .fits.gz)"),
@@ -265,23 +221,16 @@ def test_what_does_not_fit_is_refused_before_the_work(
     Path("there.ecsv").write_text("")
     data, header = fits.getdata(files.paths["highres"], header=True)
     made = {**files.paths, "cube": files.paths["highres-psf"].partition("[")[0]}
-    for name in ("f770w", "f444w", "far", "plain", "moved", "mirrored"):
-        own = header.copy()
-        if name == "f770w":
-            own["FILTER"], own["INSTRUME"] = "F770W", "MIRI"
-        elif name == "f444w":
-            own["FILTER"] = "F444W"
-        elif name == "far":
-            own["CRVAL1"] += 1
-        elif name == "moved":
-            own["CRPIX1"] += 2
-        elif name == "mirrored":
-            own["CDELT1"] *= -1
-        else:
-            del own["CTYPE*"]
-        whole = name == "moved"
-        kept = np.ones(data.shape, np.int32) if whole else data
-        fits.writeto(f"{name}.fits", kept, own)
+    for name, own in {
+        "f770w": {"FILTER": "F770W", "INSTRUME": "MIRI"},
+        "f444w": {"FILTER": "F444W"},
+        "far": {"CRVAL1": header["CRVAL1"] + 1},
+        "moved": {"CRPIX1": header["CRPIX1"] + 2},
+        "mirrored": {"CDELT1": -header["CDELT1"]},
+        "plain": {"CTYPE1": "", "CTYPE2": ""},
+    }.items():
+        kept = np.ones(data.shape, np.int32) if name == "moved" else data
+        fits.writeto(f"{name}.fits", kept, fits.Header({**header, **own}))
         made[name] = f"{name}.fits"
     if "f770w" in changes.values() and "psf" in changes:
         fits.setval("f770w.fits", "FILTER", value="F430M")
@@ -303,19 +252,6 @@ def test_an_angle_other_than_the_headers_is_refused(files, tmp_path, capsys):
     command = arguments(files, output, image=path, psf=None)
     assert main([*command, "--pa-aper", "40"]) == 2
     assert "'pa_aper' must be PA_APER of" in capsys.readouterr().err
-
-
-def test_kernels_that_are_none_are_refused(files):
-    from miricigale.psf import gaussian_psf
-
-    sharp = gaussian_psf(0.2 * u.arcsec, pixel_scale=FINE * u.arcsec, fov=3 * u.arcsec)
-    options = {"highres_psf": sharp, "pixel_scale": FINE * u.arcsec}
-    for name, data, message in (
-        ("even", np.ones((4, 4)) / 16, "square with an odd number of pixels, got shape"),
-        ("sum", np.ones((5, 5)), "a kernel whose sum is 1, got a sum of 25"),
-    ):
-        path = files.save(f"{name}.fits", data)
-        refuses(message, read_kernel, path, error=DataError, **options)
 
 
 def test_a_real_field_agrees_with_another_program(data_file, tmp_path, capsys):

@@ -48,9 +48,8 @@ def drawn(n, scale, sky, flux):
     y, x = np.mgrid[:n, :n]
     data = rng.normal(0, NOISE[scale], (n, n))
     for at, value in zip(np.transpose(wcs.world_to_pixel(sky)), flux, strict=True):
-        data += CircularGaussianPRF(x_0=at[0], y_0=at[1], flux=value, fwhm=FWHM[scale] / scale)(
-            x, y
-        )
+        star = CircularGaussianPRF(x_0=at[0], y_0=at[1], flux=value, fwhm=FWHM[scale] / scale)
+        data += star(x, y)
     error = StdDevUncertainty(np.full((n, n), NOISE[scale]))
     return CCDData(data, unit="uJy", wcs=wcs, uncertainty=error)
 
@@ -134,9 +133,8 @@ def test_what_is_no_image_or_kernel_is_named(images, psfs, sky):
     refuses("'kernel, psf' must be one of them given, got neither", ForcedPhotometer)
     kernel = MatchingKernel.identity(psfs["psf"])
     refuses("one of them given, got both", ForcedPhotometer, kernel, psf=psfs["psf"])
-    refuses(
-        "'highres_psf' must be given with 'psf'", ForcedPhotometer, kernel, highres_psf=psfs["psf"]
-    )
+    sharp = {"highres_psf": psfs["psf"]}
+    refuses("'highres_psf' must be given with 'psf'", ForcedPhotometer, kernel, **sharp)
     refuses("'kernel' must be a MatchingKernel or a KernelField", ForcedPhotometer, psfs["psf"])
     refuses("'angle' must be given to 'MatchingKernel.identity'", ForcedPhotometer, psf="F770W")
     refuses("'psf' must be a PSF on pixels of known size", ForcedPhotometer, psf=np.ones((9, 9)))
@@ -149,11 +147,8 @@ def test_results_are_indexed_like_their_table(images, psfs, sky):
     result = ForcedPhotometer(psf=psfs["psf"]).measure(images[0], sky)
     np.testing.assert_array_equal(result["flux"].value, result.flux.value)
     assert result[3]["id"] == result.loc[4]["id"] == 4
-    assert [len(part) for part in (result[:5], result[result.snr > 0], result[[1, 2]])] == [
-        5,
-        16,
-        2,
-    ]
+    parts = result[:5], result[result.snr > 0], result[[1, 2]]
+    assert [len(part) for part in parts] == [5, 16, 2]
     assert list(result.columns) == result.to_table().colnames
     frame = result.to_pandas()
     np.testing.assert_allclose(frame["ra"], sky.ra.deg)
@@ -161,12 +156,8 @@ def test_results_are_indexed_like_their_table(images, psfs, sky):
     np.testing.assert_allclose(result.magnitude.value, 23.9 - 2.5 * np.log10(result.flux.value))
     assert result.flag_names()[0] == []
     assert "sources: 16" in result.summary()
-    refuses(
-        "no column 'fluxx'; known: .*; did you mean 'flux'",
-        result.__getitem__,
-        "fluxx",
-        error=KeyError,
-    )
+    message = "no column 'fluxx'; known: .*; did you mean 'flux'"
+    refuses(message, result.__getitem__, "fluxx", error=KeyError)
     assert result.residual is result.residual_image
 
 
@@ -200,12 +191,8 @@ def test_psf_files_of_stpsf(tmp_path, psfs):
 def test_errors_of_an_exposure():
     exposure = Exposure("F770W", time=1 * u.h)
     model = ErrorModel.from_exposure(exposure)
-    same = ErrorModel.from_exposure(
-        "JWST/MIRI.F770W",
-        exposure.exposure_time,
-        n_integrations=exposure.n_integrations,
-        frame_time=exposure.frame_time,
-    )
+    form = {name: getattr(exposure, name) for name in ("n_integrations", "frame_time")}
+    same = ErrorModel.from_exposure("JWST/MIRI.F770W", exposure.exposure_time, **form)
     for name in ("F770W", "miri.f770w", Filter("F770W")):
         assert model.limiting_flux(name) == same.limiting_flux("miri.f770w")
     assert ErrorModel.from_depths({"IRAC1": 26.0}).filters == ("irac.ch1",)

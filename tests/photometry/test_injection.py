@@ -7,10 +7,8 @@ from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
-from miricigale.instrument import north_up_wcs
 from miricigale.photometry import (
     ErrorCalibration,
-    ErrorSettings,
     ForcedPhotometer,
     SourceTemplates,
     calibrate_errors,
@@ -56,28 +54,27 @@ def test_few_sources_are_one_bin_and_fewer_none(tmp_path):
     again = ErrorCalibration.read(tmp_path / "c.ecsv")
     assert_allclose(again.bins["factor"], calibration.bins["factor"], rtol=1e-12)
     QTable({"a": [1]}).write(tmp_path / "other.ecsv")
-    with pytest.raises(DataError, match="is no calibration of errors"):
-        ErrorCalibration.read(tmp_path / "other.ecsv")
+    message, path = "is not a calibration of errors", tmp_path / "other.ecsv"
+    refuses(message, ErrorCalibration.read, path, error=DataError)
 
 
 @pytest.fixture(scope="module")
 def points(tools):
     """Forty points on white noise."""
     rng = np.random.default_rng(5)
-    wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, (300, 300))
     sky, flux = tools.positions(rng, 40, 14.0), 10 ** rng.uniform(0, 2, 40)
-    light = tools.render(sky, flux, tools.LO, wcs, (300, 300))
-    noise = rng.normal(0, 0.5, (300, 300))
-    return light + noise, wcs, QTable({"sky": sky})
+    return tools.picture(sky, flux, (300, 300), sigma=0.5, rng=rng), QTable({"sky": sky})
+
+
+@pytest.fixture(scope="module")
+def photometer(tools):
+    return ForcedPhotometer(tools.kernel, template="psf", errors=tools.WHITE)
 
 
 @pytest.mark.parametrize("stated", [0.5, 0.2])
-def test_injected_points_tell_understated_errors(tools, points, stated):
-    data, wcs, catalog = points
-    image = tools.as_ccd(data, wcs, stated)
-    photometer = ForcedPhotometer(
-        tools.kernel, template="psf", errors=ErrorSettings(correlated_noise=False)
-    )
+def test_injected_points_tell_understated_errors(tools, points, photometer, stated):
+    catalog = points[1]
+    image = tools.as_ccd(points[0].data, points[0].wcs, stated)
     before = image.data.copy()
     calibration = calibrate_errors(photometer, image, catalog=catalog, n_trials=8, seed=3)
     assert_array_equal(image.data, before)
@@ -99,12 +96,9 @@ def test_injected_points_tell_understated_errors(tools, points, stated):
 def test_galaxies_are_injected_into_the_prior_too(tools):
     rng = np.random.default_rng(7)
     sky, size = tools.positions(rng, 25, 13.0), rng.uniform(0.05, 0.3, 25)
-    images = []
-    for psf, scale, n, noise in ((tools.HI, 0.06, 540, 2.0), (tools.LO, 0.11, 300, 0.2)):
-        wcs = north_up_wcs(tools.CENTER, scale * u.arcsec, (n, n))
-        light = tools.render(sky, np.full(25, 20.0), np.hypot(psf, size), wcs, (n, n))
-        images.append(tools.as_ccd(light + rng.normal(0, noise, (n, n)), wcs, noise))
-    high, low = images
+    flux, wide, sharp = np.full(25, 20.0), np.hypot(tools.LO, size), np.hypot(tools.HI, size)
+    high = tools.picture(sky, flux, (540, 540), scale=0.06, width=sharp, sigma=2.0, rng=rng)
+    low = tools.picture(sky, flux, (300, 300), width=wide, sigma=0.2, rng=rng)
     segments, found = detect_sources(high)
     # labels are then those at the positions
     found.remove_column("label")
@@ -132,31 +126,19 @@ def test_galaxies_are_injected_into_the_prior_too(tools):
     assert 0.6 < 1.4826 * np.median(np.abs(pull)) < 1.5
 
 
-def test_rendered_sources_are_measured_as_they_are(tools, points):
-    _, wcs, catalog = points
-    empty = tools.as_ccd(np.zeros((300, 300)), wcs, 0.1)
-    photometer = ForcedPhotometer(
-        tools.kernel, template="psf", errors=ErrorSettings(correlated_noise=False)
-    )
-    flux = np.arange(1.0, 41.0) * u.uJy
-    light = photometer.render(empty, SourceTemplates.from_catalog(catalog), flux)
-    image = tools.as_ccd(light.to_value("MJy/sr"), wcs, 0.1)
-    assert_allclose(photometer.measure(image, catalog=catalog).flux, flux, rtol=1e-5)
-    with pytest.raises(ValueError, match="'flux' must be 40 fluxes"):
-        photometer.render(empty, SourceTemplates.from_catalog(catalog), flux[:3])
+def test_rendered_sources_are_measured_as_they_are(tools, points, photometer):
+    image, catalog = points
+    templates, flux = SourceTemplates.from_catalog(catalog), np.arange(1.0, 41.0) * u.uJy
+    light = photometer.render(image, templates, flux)
+    drawn = tools.as_ccd(light.to_value("MJy/sr"), image.wcs, 0.1)
+    assert_allclose(photometer.measure(drawn, catalog=catalog).flux, flux, rtol=1e-5)
+    refuses("'flux' must be 40 fluxes", photometer.render, image, templates, flux[:3])
 
 
-@pytest.mark.parametrize(
-    ("options", "name"),
-    [
-        ({"n_trials": 0}, "n_trials"),
-        ({"n_sources": 0}, "n_sources"),
-    ],
-)
-def test_options_out_of_range_are_named(tools, points, options, name):
-    data, wcs, catalog = points
-    photometer = ForcedPhotometer(tools.kernel, template="psf")
-    with pytest.raises(ValueError, match=f"'{name}' must be"):
-        calibrate_errors(photometer, tools.as_ccd(data, wcs, 0.5), catalog=catalog, **options)
-    with pytest.raises(ValueError, match="'photometer' must be a ForcedPhotometer"):
-        calibrate_errors(None, tools.as_ccd(data, wcs, 0.5), catalog=catalog)
+def test_options_out_of_range_are_named(points, photometer):
+    image, catalog = points
+    for name in ("n_trials", "n_sources"):
+        options = {"catalog": catalog, name: 0}
+        refuses(f"'{name}' must be", calibrate_errors, photometer, image, **options)
+    message = "'photometer' must be a ForcedPhotometer"
+    refuses(message, calibrate_errors, None, image, catalog=catalog)

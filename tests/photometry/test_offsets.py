@@ -1,16 +1,12 @@
 """Maps of offsets and backgrounds that vary, on scenes that were distorted by a known amount."""
 
-import warnings
-
 import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
 from numpy.testing import assert_allclose
 
-from miricigale.instrument import north_up_wcs
 from miricigale.photometry import ForcedPhotometer, read_mosaic, read_prior
-from miricigale.photometry.fields import SmoothField, legendre_terms
 from miricigale.utils.exceptions import MiricigaleWarning
 
 SHAPE, SIGMA = (400, 400), 0.02
@@ -19,35 +15,28 @@ SHAPE, SIGMA = (400, 400), 0.02
 def distorted(tools, n=100, square=0.0, wrong=0):
     """Points on a grid, their offsets (x, y) in arcsec up to 0.1 across the field, and the image."""
     rng = np.random.default_rng(3)
-    wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, SHAPE)
-    side = (np.arange(10) - 4.5) * 4.0
-    east, north = (a.ravel()[:n] + rng.uniform(-1, 1, n) for a in np.meshgrid(side, side))
+    east, north = (one[:n] for one in tools.lattice(rng, 10, 4.0, 1.0))
     flux = 10 ** rng.uniform(0, 1.7, n)
     a, b = east / 22, north / 22
     d_east = 0.05 * a + 0.02 * b + 0.03 + square * a**2
     d_north = -0.04 * a + 0.05 * b - 0.01
-    sky = tools.CENTER.spherical_offsets_by(east * u.arcsec, north * u.arcsec)
     # some do not stand where the catalogue says
     away = np.where(np.arange(n) < wrong, 0.15, 0.0)
-    there = tools.CENTER.spherical_offsets_by(
-        (east + d_east + away) * u.arcsec, (north + d_north) * u.arcsec
-    )
-    data = tools.render(there, flux, tools.LO, wcs, SHAPE) + rng.normal(0, SIGMA, SHAPE)
+    there = tools.places(east + d_east + away, north + d_north)
+    image = tools.picture(there, flux, SHAPE, sigma=SIGMA, rng=rng)
     # +x is west
-    return sky, flux, np.stack([-d_east, d_north], axis=1), tools.as_ccd(data, wcs, SIGMA)
+    return tools.places(east, north), flux, np.stack([-d_east, d_north], axis=1), image
 
 
-OPTIONS = {"template": "psf", "max_shift": 0.3 * u.arcsec}
+OPTIONS = {"max_shift": 0.3 * u.arcsec}
 
 
 @pytest.mark.parametrize(("order", "square", "wrong"), [(1, 0.0, 0), (1, 0.0, 12), (2, 0.04, 0)])
 def test_distortion_is_recovered(tools, order, square, wrong):
     sky, flux, offset, image = distorted(tools, square=square, wrong=wrong)
     catalog = QTable({"id": np.arange(100, 200), "sky": sky})
-    plain = ForcedPhotometer(tools.kernel, template="psf").measure(image, catalog=catalog)
-    result = ForcedPhotometer(tools.kernel, offset_order=order, **OPTIONS).measure(
-        image, catalog=catalog
-    )
+    plain = tools.measured(image, catalog)
+    result = tools.measured(image, catalog, offset_order=order, **OPTIONS)
     found = result.offset_map.evaluate(sky).to_value(u.arcsec)
     assert np.ptp(offset, axis=0).min() > 0.08
     assert_allclose(found, offset, atol=2e-3)
@@ -68,25 +57,22 @@ def test_distortion_is_recovered(tools, order, square, wrong):
 
 def test_too_few_sources_lower_the_order(tools):
     sky, _, _, image = distorted(tools, n=6)
-    photometer = ForcedPhotometer(tools.kernel, offset_order=2, **OPTIONS)
     with pytest.warns(MiricigaleWarning, match="order 2 needs 18 .* got 6: order 0 is taken"):
-        result = photometer.measure(image, catalog=QTable({"sky": sky}))
+        result = tools.measured(image, sky, offset_order=2, **OPTIONS)
     assert result.offset_map.field.order == 0
 
 
 def test_without_bright_sources_there_is_one_shift(tools):
     sky, _, offset, image = distorted(tools, n=2)
-    photometer = ForcedPhotometer(tools.kernel, offset_order=1, **OPTIONS)
     with pytest.warns(MiricigaleWarning, match="at least 3 .* got 2: one shift"):
-        result = photometer.measure(image, catalog=QTable({"sky": sky}))
+        result = tools.measured(image, sky, offset_order=1, **OPTIONS)
     assert result.offset_map is None
     assert_allclose(result.shift.value, offset.mean(axis=0), atol=0.01)
 
 
 def test_new_sources_of_a_distorted_image_are_in_the_catalogue_s_frame(tools):
     sky, flux, _, image = distorted(tools)
-    photometer = ForcedPhotometer(tools.kernel, offset_order=1, second_pass=True, **OPTIONS)
-    result = photometer.measure(image, catalog=QTable({"sky": sky[5:]}))
+    result = tools.measured(image, sky[5:], offset_order=1, second_pass=True, **OPTIONS)
     assert len(result.new_sources) == 5
     row, separation, _ = sky[:5].match_to_catalog_sky(result.new_sources["sky"])
     assert separation.max() < 0.02 * u.arcsec
@@ -100,10 +86,7 @@ def test_background_that_varies(tools, field):
     sky = 0.4 + 0.3 * (x / nx) - 0.2 * (y / ny) ** 2 + 0.1 * (x / nx) * (y / ny)
     image = tools.as_ccd(field.image.data + sky, field.wcs, 0.01)
     constant, varying = (
-        ForcedPhotometer(tools.kernel, template="psf", background_order=order).measure(
-            image, catalog=field.catalog
-        )
-        for order in (0, 2)
+        tools.measured(image, field.catalog, background_order=order) for order in (0, 2)
     )
     assert np.abs(constant.flux.value - field.flux).max() > 0.3
     assert_allclose(varying.flux.value, field.flux, rtol=1e-5, atol=1e-5)
@@ -112,19 +95,7 @@ def test_background_that_varies(tools, field):
     assert np.abs(varying.residual_image.data).max() < 1e-5 * field.image.data.max()
 
 
-def test_terms_are_those_of_a_polynomial():
-    y, x = np.mgrid[:7, :9]
-    terms = legendre_terms(x, y, (7, 9), 2)
-    assert len(terms) == 6
-    assert max(np.abs(one).max() for one in terms) <= 1
-    # Legendre's polynomials, written out
-    u, v = (2 * x + 1) / 9 - 1, (2 * y + 1) / 7 - 1
-    expected = [np.ones((7, 9)), u, v, 1.5 * u**2 - 0.5, u * v, 1.5 * v**2 - 0.5]
-    assert_allclose(terms, [np.broadcast_to(one, (7, 9)) for one in expected], atol=1e-12)
-    field = SmoothField(np.eye(6), (7, 9), 2)
-    assert_allclose(field(2, 4), [one[4, 2] for one in terms], rtol=1e-12)
-
-
+@pytest.mark.filterwarnings("ignore")  # the scale of the weights, the kernel's centre
 def test_real_images_are_aligned(data_file):
     """F770W of PRIMER-UDS against F444W: within a tenth of a native pixel (0.11 arcsec)."""
     from astropy.io import fits
@@ -133,18 +104,15 @@ def test_real_images_are_aligned(data_file):
 
     uds = data_file("uds")
     start, psfs = f"{uds}/uds-test-", f"{uds}/psf/uds-test-f444w"
-    with warnings.catch_warnings():
-        # the scale of the weights, the kernel's centre
-        warnings.simplefilter("ignore")
-        image, prior = (
-            read_mosaic(f"{start}{band}_sci.fits.gz", weight=f"{start}{band}_wht.fits.gz")
-            for band in ("f770w", "f444w")
-        )
-        segments, sources = read_prior(prior, segmentation=f"{start}LW_seg.fits.gz")
-        kernel, psf = (
-            fits.getdata(f"{psfs}_{name}.fits.gz").mean(axis=0) for name in ("kernel_f770w", "psf")
-        )
-        kernel = MatchingKernel.from_array(kernel, pixel_scale=0.04 * u.arcsec, source=psf)
+    image, prior = (
+        read_mosaic(f"{start}{band}_sci.fits.gz", weight=f"{start}{band}_wht.fits.gz")
+        for band in ("f770w", "f444w")
+    )
+    segments, sources = read_prior(prior, segmentation=f"{start}LW_seg.fits.gz")
+    kernel, psf = (
+        fits.getdata(f"{psfs}_{name}.fits.gz").mean(axis=0) for name in ("kernel_f770w", "psf")
+    )
+    kernel = MatchingKernel.from_array(kernel, pixel_scale=0.04 * u.arcsec, source=psf)
     options = {"background_order": 0, "max_shift": 0.2 * u.arcsec}
     one, mapped = (
         ForcedPhotometer(kernel, offset_order=order, **options).measure(

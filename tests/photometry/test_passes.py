@@ -8,6 +8,7 @@ import pytest
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
+from helpers.errors import refuses
 from miricigale.instrument import north_up_wcs
 from miricigale.photometry import ErrorSettings, ForcedFlags, ForcedPhotometer, detect_sources
 from miricigale.photometry.catalogs import joined_sky
@@ -17,32 +18,23 @@ def flagged(flags, flag):
     return (np.asarray(flags) & int(flag)) != 0
 
 
-def grid(rng, n, spacing, jitter):
-    side = (np.arange(int(np.sqrt(n))) - (np.sqrt(n) - 1) / 2) * spacing
-    return np.array([a.ravel() + rng.uniform(-jitter, jitter, n) for a in np.meshgrid(side, side)])
-
-
 @pytest.fixture(scope="module")
 def crowd(tools):
     """Eighty-one points of which fifty have a companion at 0.45 to 1.2 arcsec, and two hidden ones apart."""
     rng = np.random.default_rng(1)
-    shape, sigma = (360, 360), 0.05
-    wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, shape)
-    east, north = grid(rng, 81, 4.0, 0.4)
+    east, north = tools.lattice(rng, 9, 4.0, 0.4)
     distance, angle = rng.uniform(0.45, 1.2, 50), rng.uniform(0, 2 * np.pi, 50)
     flux = 10 ** rng.uniform(0.7, 1.7, 81)
     hidden_flux = np.append(flux[:50] * 10 ** rng.uniform(-0.6, 0.1, 50), [3.0, 8.0])
-    sky = tools.CENTER.spherical_offsets_by(east * u.arcsec, north * u.arcsec)
-    hidden = tools.CENTER.spherical_offsets_by(
-        np.append(east[:50] + distance * np.cos(angle), [-18.0, 2.0]) * u.arcsec,
-        np.append(north[:50] + distance * np.sin(angle), [2.0, 18.0]) * u.arcsec,
+    sky = tools.places(east, north)
+    hidden = tools.places(
+        np.append(east[:50] + distance * np.cos(angle), [-18.0, 2.0]),
+        np.append(north[:50] + distance * np.sin(angle), [2.0, 18.0]),
     )
-    data = tools.render(
-        joined_sky([sky, hidden]), np.append(flux, hidden_flux), tools.LO, wcs, shape
-    )
-    image = tools.as_ccd(data + rng.normal(0, sigma, shape), wcs, sigma)
+    every = joined_sky([sky, hidden]), np.append(flux, hidden_flux)
+    image = tools.picture(*every, (360, 360), sigma=0.05, rng=rng)
     return types.SimpleNamespace(
-        sky=sky, flux=flux, hidden=hidden, hidden_flux=hidden_flux, image=image, wcs=wcs
+        sky=sky, flux=flux, hidden=hidden, hidden_flux=hidden_flux, image=image
     )
 
 
@@ -56,12 +48,13 @@ def test_second_pass_finds_what_the_catalogue_lacks(tools, crowd, moved):
         for one in (crowd.sky, crowd.hidden)
     )
     catalog = QTable({"id": ids, "sky": sky})
-    options = {"template": "psf", "max_shift": 0.3 * u.arcsec if moved else None}
-    first = ForcedPhotometer(tools.kernel, **options).measure(crowd.image, catalog=catalog)
-    assert first.new_sources is None
-    result = ForcedPhotometer(tools.kernel, second_pass=True, **options).measure(
-        crowd.image, catalog=catalog
+    first, result = (
+        tools.measured(
+            crowd.image, catalog, second_pass=flag, max_shift=0.3 * u.arcsec if moved else None
+        )
+        for flag in (False, True)
     )
+    assert first.new_sources is None
     new = result.new_sources
     row, separation, _ = truth.match_to_catalog_sky(new["sky"])
     assert len(new) == 52
@@ -83,18 +76,13 @@ def test_second_pass_finds_what_the_catalogue_lacks(tools, crowd, moved):
     assert 0.85 < pulls.std() < 1.15
     assert not flagged(result.flags, ForcedFlags.UNEXPLAINED_NEIGHBOR).any()
     # the errors are those of a catalogue that has them all
-    full = ForcedPhotometer(tools.kernel, template="psf").measure(
-        crowd.image, catalog=QTable({"sky": joined_sky([crowd.sky, crowd.hidden])})
-    )
+    full = tools.measured(crowd.image, joined_sky([crowd.sky, crowd.hidden]))
     assert_allclose(result.flux_err.value, full.flux_err.value[:81], rtol=0.05)
 
 
 def test_second_pass_with_nothing_to_find_changes_nothing(tools, field):
     plain, twice = (
-        ForcedPhotometer(tools.kernel, template="psf", second_pass=flag).measure(
-            field.image, catalog=field.catalog
-        )
-        for flag in (False, True)
+        tools.measured(field.image, field.catalog, second_pass=flag) for flag in (False, True)
     )
     assert_array_equal(twice.flux.value, plain.flux.value)
     assert len(twice.new_sources) == 0
@@ -103,9 +91,8 @@ def test_second_pass_with_nothing_to_find_changes_nothing(tools, field):
 
 def test_ids_that_are_text_do_not_clash(tools, crowd):
     names = np.array([f"source {k}" for k in range(80)] + ["new-2"])
-    result = ForcedPhotometer(tools.kernel, template="psf", second_pass=True).measure(
-        crowd.image, catalog=QTable({"id": names, "sky": crowd.sky})
-    )
+    catalog = QTable({"id": names, "sky": crowd.sky})
+    result = tools.measured(crowd.image, catalog, second_pass=True)
     assert result.new_sources["id"][:3].tolist() == ["new-1", "new-3", "new-4"]
 
 
@@ -114,19 +101,16 @@ def nuclei(tools):
     """Galaxies with and without a point in their middle that the high-resolution image does not show."""
     rng = np.random.default_rng(1)
     n, half = 25, int(10.5 / tools.FINE)
-    sky = tools.CENTER.spherical_offsets_by(*(grid(rng, n, 3.2, 0.2) * u.arcsec))
+    sky = tools.places(*tools.lattice(rng, 5, 3.2, 0.2))
     size = np.append(rng.uniform(0.2, 0.4, n - 1), 0.0)
-    wcs = north_up_wcs(tools.CENTER, tools.FINE * u.arcsec, (2 * half, 2 * half))
-    sigma = 0.01 / (tools.FINE**2 * tools.SR * 1e12)
-    high = tools.render(sky, np.full(n, 20.0), np.hypot(size, tools.HI), wcs, (2 * half, 2 * half))
-    high = tools.as_ccd(high + rng.normal(0, sigma, high.shape), wcs, sigma)
+    sharp, wide = np.hypot(size, tools.HI), np.hypot(size, tools.LO)
+    form = {"scale": tools.FINE, "sigma": 0.01 / (tools.FINE**2 * tools.SR * 1e12), "rng": rng}
+    high = tools.picture(sky, np.full(n, 20.0), (2 * half, 2 * half), width=sharp, **form)
     shape = (int(2 * half * tools.FINE / 0.11),) * 2
-    wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, shape)
     host = 10 ** rng.uniform(1, 1.7, n)
     point = np.where(np.arange(n) < 8, 0.0, host * rng.uniform(0.3, 1, n))
-    low = tools.render(sky, host, np.hypot(size, tools.LO), wcs, shape)
-    low += tools.render(sky, point, tools.LO, wcs, shape)
-    low = tools.as_ccd(low + rng.normal(0, 0.02, shape), wcs, 0.02)
+    low = tools.picture(sky, host, shape, width=wide, sigma=0.02, rng=rng)
+    low.data += tools.render(sky, point, tools.LO, low.wcs, shape)
     segmentation, _ = detect_sources(high, threshold=1.0, n_pixels=10)
     return types.SimpleNamespace(
         sky=sky, host=host, point=point, images=(low, high, segmentation), n=n
@@ -196,28 +180,24 @@ def test_the_catalogue_says_who_has_two_components(tools, nuclei):
     assert flagged(result.flags, ForcedFlags.ONE_COMPONENT).tolist() == [False] * 24 + [True]
     assert_allclose(result.flux.value[24], nuclei.host[24] + nuclei.point[24], rtol=0.01)
     catalog["components"] = 3
-    with pytest.raises(ValueError, match="column 'components' of 1 and 2"):
-        ForcedPhotometer(tools.kernel).measure(*nuclei.images, catalog)
+    photometer = ForcedPhotometer(tools.kernel)
+    refuses("column 'components' of 1 and 2", photometer.measure, *nuclei.images, catalog)
 
 
 def test_covariance_of_two_components_is_that_of_least_squares(tools):
     # one Gaussian galaxy and a point, of known templates, on white noise: (A^T A)^-1 by hand
-    shape, sigma, width = (121, 121), 0.05, 0.35
+    shape, sigma, width, sky = (121, 121), 0.05, 0.35, tools.places([0.0])
+    sharp, wide = np.hypot(width, tools.HI), np.hypot(width, tools.LO)
+    high = tools.picture(sky, [1.0], (221, 221), scale=tools.FINE, width=sharp)
+    high.uncertainty.array[:] = high.data.max() * 1e-6
     wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, shape)
-    fine = north_up_wcs(tools.CENTER, tools.FINE * u.arcsec, (221, 221))
-    sky = tools.CENTER.reshape(1)
-    high = tools.render(sky, [1.0], np.hypot(width, tools.HI), fine, (221, 221))
-    high = tools.as_ccd(high, fine, high.max() * 1e-6)
-    templates = [
-        tools.render(sky, [1.0], one, wcs, shape) for one in (np.hypot(width, tools.LO), tools.LO)
-    ]
+    templates = [tools.render(sky, [1.0], one, wcs, shape) for one in (wide, tools.LO)]
     matrix = np.array([[np.sum(a * b) for b in templates] for a in templates]) / sigma**2
     expected = np.linalg.inv(matrix)
     image = tools.as_ccd(30 * templates[0] + 12 * templates[1], wcs, sigma)
     catalog = QTable({"sky": sky, "components": [2]})
-    result = ForcedPhotometer(
-        tools.kernel, template="cutout", wings=False, errors=ErrorSettings(correlated_noise=False)
-    ).measure(image, high, np.ones((221, 221), int), catalog)
+    photometer = ForcedPhotometer(tools.kernel, template="cutout", wings=False, errors=tools.WHITE)
+    result = photometer.measure(image, high, np.ones((221, 221), int), catalog)
     assert_allclose(result.flux.value, 42, rtol=2e-3)
     assert_allclose(result.flux_point.value, 12, rtol=0.01)
     assert_allclose(result.flux_point_err.value**2, expected[1, 1], rtol=0.01)

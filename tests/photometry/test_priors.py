@@ -102,9 +102,8 @@ def test_what_is_not_measured_is_said(prior, tmp_path):
     image, labels, sky = prior
     seg = save(tmp_path, labels, image.wcs)
     short = write_csv(tmp_path / "a.csv", IDS[:3], sky[:3])
-    with pytest.warns(
-        MiricigaleWarning, match=r"1 segments of .* belong to no source .*\(ids 42\)"
-    ):
+    message = r"1 segments of .* belong to no source .*\(ids 42\)"
+    with pytest.warns(MiricigaleWarning, match=message):
         _, sources = read_prior(image, segmentation=seg, catalog=short)
     assert len(sources) == 3
     away = SkyCoord([*sky, sky[0].directional_offset_by(0 * u.deg, 5 * u.arcmin)])

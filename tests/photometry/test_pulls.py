@@ -3,7 +3,6 @@
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.nddata import CCDData, StdDevUncertainty
 
 from miricigale.instrument import north_up_wcs, pixel_area_map
 from miricigale.photometry import ErrorSettings, ForcedPhotometer, detect_sources
@@ -44,8 +43,7 @@ def images(tools, sources):
 def pulls(tools):
     """Pulls of 25 sources, two in five of them blended, with and without the templates' errors."""
     rng = np.random.default_rng(6)
-    at = (np.arange(4) - 1.5) * 3.4
-    dx, dy = (a.ravel() + rng.uniform(-0.2, 0.2, 16) for a in np.meshgrid(at, at))
+    dx, dy = tools.lattice(rng, 4, 3.4, 0.2)
     dx, dy = np.append(dx, dx[:8] + 0.65), np.append(dy, dy[:8] - 0.35)
     rows = []
     for k in range(24):
@@ -55,16 +53,15 @@ def pulls(tools):
             {"radius": radius, "n": rng.uniform(0.6, 3.0), "g1": rng.uniform(-0.3, 0.3),
              "g2": rng.uniform(-0.3, 0.3), "high": high, "flux": high * 10 ** rng.uniform(-0.4, 0.8)}
         )  # fmt: skip
-    sky = tools.CENTER.spherical_offsets_by(dx * u.arcsec, dy * u.arcsec)
+    sky = tools.places(dx, dy)
     flux = np.array([one["flux"] for one in rows])
     scenes = images(tools, {"sky": sky, "rows": rows})
-    psfs = [
-        moffat(w).drawImage(nx=101, ny=101, scale=FINE, method="auto").array for w in (0.18, 0.35)
-    ]
-    # the image's PSF has the response of its own pixel
-    box = galsim.Convolve(moffat(0.35), galsim.Pixel(COARSE))
-    psfs[1] = box.drawImage(nx=101, ny=101, scale=FINE, method="no_pixel").array
-    kernel = MatchingKernel.from_psfs(*(p.astype(float) for p in psfs), pixel_scale=FINE * u.arcsec)
+    # PSFs have the response of the images' own pixels
+    boxes = (galsim.Pixel(scale) for scale in (FINE, COARSE))
+    lights = (galsim.Convolve(moffat(w), one) for w, one in zip((0.18, 0.35), boxes, strict=True))
+    form = {"nx": 101, "ny": 101, "scale": FINE, "method": "no_pixel"}
+    psfs = (one.drawImage(**form).array.astype(float) for one in lights)
+    kernel = MatchingKernel.from_psfs(*psfs, pixel_scale=FINE * u.arcsec)
     photometer = ForcedPhotometer(
         kernel, errors=ErrorSettings(correlated_noise=False, psf_error=0.0)
     )
@@ -72,10 +69,9 @@ def pulls(tools):
     for draw in range(DRAWS):
         noisy = []
         for (light, wcs), noise in zip(scenes, (PRIOR_NOISE, NOISE), strict=True):
-            area = pixel_area_map(wcs, light.shape) * 1e12
-            data = (light + rng.normal(0, noise, light.shape)) / area
-            sigma = StdDevUncertainty(noise / area)
-            noisy.append(CCDData(data, unit="MJy/sr", wcs=wcs, uncertainty=sigma))
+            area = np.median(pixel_area_map(wcs, light.shape)) * 1e12
+            data = light + rng.normal(0, noise, light.shape)
+            noisy.append(tools.as_ccd(data / area, wcs, noise / area))
         segments, seen = detect_sources(noisy[0])
         index, distance, _ = sky.match_to_catalog_sky(seen["sky"])
         alone = np.bincount(index, minlength=len(seen))[index] == 1

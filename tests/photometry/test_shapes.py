@@ -4,8 +4,9 @@ import scipy.fft
 import scipy.ndimage
 from numpy.testing import assert_allclose
 
+from helpers.light import gaussian_image
 from miricigale.photometry._core.shapes import shape_models
-from miricigale.photometry.light import FineImage, cutouts
+from miricigale.photometry.light import cutouts
 from miricigale.photometry.shapes import ShapeFitter
 from miricigale.profiles import sersic_image
 
@@ -14,17 +15,12 @@ WIDTH = 1.4  # rms width of the PSF in pixels
 
 
 def gaussian_psf(n=61, width=WIDTH):
-    x = np.arange(n) - n // 2
-    line = np.exp(-0.5 * (x / width) ** 2)
-    psf = line[:, None] * line
+    psf = gaussian_image(n, width)
     return psf / psf.sum()
 
 
 def transform(size, width=WIDTH):
-    x = scipy.fft.fftfreq(size, 1 / size)
-    line = np.exp(-0.5 * (x / width) ** 2)
-    psf = line[:, None] * line
-    return scipy.fft.rfft2(psf / psf.sum())
+    return scipy.fft.rfft2(scipy.fft.ifftshift(gaussian_image(size, width, 0.5, 0.5)))
 
 
 def galaxy(shape, x, y, *, r_eff, n, q=1.0, theta=0.0, flux=1.0, fine=5):
@@ -48,8 +44,7 @@ def test_gaussian_and_its_convolution():
     image = shape_models(
         transform(128, psf_width), 128, (61, 61), parameters, derivatives=0
     )[0]  # fmt: skip
-    y, x = np.indices((61, 61))
-    truth = np.exp(-0.5 * ((x - 30.3) ** 2 + (y - 29.6) ** 2) / sigma**2) / (2 * np.pi * sigma**2)
+    truth = gaussian_image(61, sigma, 0.3, -0.4)
     assert_allclose(image, truth, atol=1e-5 * truth.max())
 
 
@@ -102,8 +97,7 @@ def test_noiseless_galaxies_are_recovered(n, r_eff, q):
 def test_points_are_told_from_galaxies(snr, share):
     rng = np.random.default_rng(snr)
     fitter = ShapeFitter(gaussian_psf(), SCALE)
-    y, x = np.indices((41, 41))
-    point = np.exp(-0.5 * ((x - 20.2) ** 2 + (y - 19.7) ** 2) / WIDTH**2) / (2 * np.pi * WIDTH**2)
+    point = gaussian_image(41, WIDTH, 0.2, -0.3)
     wide = galaxy((41, 41), 20.2, 19.7, r_eff=4.0, n=1.0, q=0.7)
     found = {}
     for name, image in (("point", point), ("galaxy", wide)):
@@ -121,8 +115,7 @@ def test_points_are_told_from_galaxies(snr, share):
 
 
 def test_no_light_gives_no_shape():
-    y, x = np.indices((41, 41))
-    hole = -np.exp(-0.5 * ((x - 20) ** 2 + (y - 20) ** 2) / 9.0)
+    hole = -50 * gaussian_image(41, 3.0)
     assert ShapeFitter(gaussian_psf(), SCALE).fit(hole, np.full((41, 41), 50.0), (20, 20)) is None
 
 
@@ -131,26 +124,21 @@ def one_cutout(image, sigma, **options):
     options = {"min_snr": 5.0} | options
     variance = np.full(image.shape, sigma**2)
     xy = np.array([[40.0, 40.0]])
-    fine = FineImage(image, variance, gaussian_psf(), SCALE)
-    parts, flags, *_ = cutouts(fine, labels, np.array([1]), xy, **options)
+    fine = image, variance, gaussian_psf(), SCALE
+    parts, flags, *_ = cutouts(*fine, labels, np.array([1]), xy, **options)
     assert flags[0] == 0
     return parts[0]
 
 
 def test_template_is_the_simplest_that_explains_the_image():
-    rng = np.random.default_rng(2)
-    y, x = np.indices((81, 81))
-
-    def point(px, py):
-        return np.exp(-0.5 * ((x - px) ** 2 + (y - py) ** 2) / WIDTH**2) / (2 * np.pi * WIDTH**2)
-
     sigma = 0.002
-    noise = rng.normal(0, sigma, (81, 81))
-    assert one_cutout(point(40, 40) + noise, sigma) is None
+    noise = np.random.default_rng(2).normal(0, sigma, (81, 81))
+    assert one_cutout(gaussian_image(81, WIDTH) + noise, sigma) is None
     profile = galaxy((81, 81), 40, 40, r_eff=5.0, n=1.5, q=0.6)
     assert one_cutout(profile + noise, sigma).kind == "sersic"
     # two knots are no profile
-    knots = 0.6 * profile + 0.2 * point(36, 41) + 0.2 * point(45, 38)
+    knots = sum(gaussian_image(81, WIDTH, *at) for at in ((-4, 1), (5, -2)))
+    knots = 0.6 * profile + 0.2 * knots
     cutout = one_cutout(knots + noise, sigma)
     assert cutout.kind == "cutout"
     # what is asked for is done even if a profile would do
@@ -202,8 +190,8 @@ def test_wings_of_a_bulge_and_a_disk_are_what_is_seen():
     # a segment that ends where there is much light still
     labels = (truth > 25 * sigma).astype(int)
     variance, xy = np.full(shape, sigma**2), np.array([[80.0, 80.0]])
-    fine = FineImage(image, variance, gaussian_psf(), SCALE)
-    (cutout,), *_ = cutouts(fine, labels, np.array([1]), xy, min_snr=5.0)
+    fine = image, variance, gaussian_psf(), SCALE
+    (cutout,), *_ = cutouts(*fine, labels, np.array([1]), xy, min_snr=5.0)
     assert cutout.kind == "cutout"
     radius = np.hypot(*(np.indices(shape) - 80))
     template = seen(cutout, shape)
@@ -223,8 +211,8 @@ def test_neighbors_do_not_add_to_each_others_wings():
     bright = scipy.ndimage.gaussian_filter(image, 1.5) > sigma
     labels = np.where(bright, 1 + np.argmax(alone, axis=0), 0)
     variance = np.full(shape, sigma**2)
-    fine = FineImage(image, variance, gaussian_psf(121), SCALE)
-    parts, flags, *_ = cutouts(fine, labels, np.array([1, 2]), places, min_snr=5.0)
+    fine = image, variance, gaussian_psf(121), SCALE
+    parts, flags, *_ = cutouts(*fine, labels, np.array([1, 2]), places, min_snr=5.0)
     assert not flags.any()
     # fluxes by least squares, each pixel the same
     matrix = np.stack([seen(one, shape).ravel() for one in parts], axis=1)

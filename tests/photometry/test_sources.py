@@ -10,6 +10,8 @@ from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
+from helpers.light import gaussian_image
+from helpers.results import assert_equal_values
 from miricigale.instrument import imager_wcs, north_up_wcs
 from miricigale.photometry import (
     ErrorSettings,
@@ -31,45 +33,24 @@ def scene(tools):
     """Galaxies (Gaussians of known width) and points, on a prior and on two bands."""
     rng = np.random.default_rng(5)
     n = 16
-    grid = (np.arange(4) - 1.5) * 3.2
-    dx, dy = (a.ravel() + rng.uniform(-0.2, 0.2, n) for a in np.meshgrid(grid, grid))
-    sky = tools.CENTER.spherical_offsets_by(dx * u.arcsec, dy * u.arcsec)
+    sky = tools.places(*tools.lattice(rng, 4, 3.2, 0.2))
     size = np.where(np.arange(n) % 4 == 0, 0.0, rng.uniform(0.1, 0.25, n))
-    fine = north_up_wcs(tools.CENTER, tools.FINE * u.arcsec, (290, 290))
-    high = tools.render(sky, np.full(n, 20.0), np.hypot(size, tools.HI), fine, (290, 290))
-    sigma = 0.02 / (tools.FINE**2 * tools.SR * 1e12)
-    high = tools.as_ccd(high + rng.normal(0, sigma, high.shape), fine, sigma)
+    sharp, wide = np.hypot(size, tools.HI), np.hypot(size, tools.LO)
+    form = {"scale": tools.FINE, "sigma": 0.02 / (tools.FINE**2 * tools.SR * 1e12), "rng": rng}
+    high = tools.picture(sky, np.full(n, 20.0), (290, 290), width=sharp, **form)
     images, flux = {}, {}
-    for name, scale, shape in (("one", 0.11, (158, 158)), ("two", 0.07, (249, 249))):
+    for name, form in (("one", (0.11, (158, 158))), ("two", (0.07, (249, 249)))):
         flux[name] = 10 ** rng.uniform(0.5, 2, n)
-        wcs = north_up_wcs(tools.CENTER, scale * u.arcsec, shape)
-        light = tools.render(sky, flux[name], np.hypot(size, tools.LO), wcs, shape)
-        images[name] = tools.as_ccd(light + rng.normal(0, 1.0, shape), wcs, 1.0)
+        scale, shape = form
+        images[name] = tools.picture(
+            sky, flux[name], shape, scale=scale, width=wide, sigma=1.0, rng=rng
+        )
     segmentation, detected = detect_sources(high, threshold=1.0, n_pixels=10)
     assert len(detected) == n
     templates = SourceTemplates.from_images(
         high, segmentation, detected, psf=tools.kernel.source, n_threads=2
     )
     return high, segmentation, detected, templates, images, sky, flux
-
-
-def assert_same(one, other):
-    for name in ("id", "flags", "snr", "sersic", "psf"):
-        assert_array_equal(getattr(one, name), getattr(other, name))
-    for name in one.fitted.dtype.names:
-        assert_array_equal(one.fitted[name], other.fitted[name])
-    assert_array_equal(one.sky.ra.deg, other.sky.ra.deg)
-    assert_array_equal(one.sky.dec.deg, other.sky.dec.deg)
-    for a, b in zip(one.light, other.light, strict=True):
-        assert (a is None) == (b is None)
-        if a is None:
-            continue
-        assert len(a.layers) == len(b.layers)
-        for first, second in zip(a.layers, b.layers, strict=True):
-            assert_array_equal(first.data, second.data)
-            assert first.data.dtype == second.data.dtype
-            kept = "origin", "noise", "convolved"
-            assert [getattr(first, k) for k in kept] == [getattr(second, k) for k in kept]
 
 
 @pytest.mark.parametrize("way", ["file", "pickle"])
@@ -84,12 +65,8 @@ def test_templates_come_back_bit_for_bit(scene, tmp_path, way):
             back = SourceTemplates.read(path)
         else:
             back = pickle.loads(pickle.dumps(one))
-        assert_same(one, back)
-        assert back.meta == one.meta
-        x = np.array([0.0, 100.0, 289.0])
-        assert_array_equal(
-            back.wcs.pixel_to_world_values(x, x[::-1]), high.wcs.pixel_to_world_values(x, x[::-1])
-        )
+        assert_equal_values(way, one, back)
+        assert grid_text(back.wcs) == grid_text(high.wcs)
 
 
 def test_files_of_the_first_layout_are_read(scene, tmp_path):
@@ -104,10 +81,8 @@ def test_files_of_the_first_layout_are_read(scene, tmp_path):
         rest = [hdu for hdu in hdus[1:] if hdu.name != "TEXT"]
         fits.HDUList([primary, *rest]).writeto(tmp_path / "old.fits")
     back = SourceTemplates.read(tmp_path / "old.fits")
-    assert_same(one, back)
-    assert back.meta == one.meta
-    x = np.array([0.0, 289.0])
-    assert_array_equal(*(t.wcs.pixel_to_world_values(x, x) for t in (one, back)))
+    assert_equal_values("templates", one, back)
+    assert grid_text(back.wcs) == grid_text(one.wcs)
 
 
 def test_one_set_of_templates_serves_all_bands(tools, scene):
@@ -149,13 +124,13 @@ def test_rows_off_the_image_change_nothing(tools, scene):
     assert np.isnan(other.flux[-1])
     # some of the rows, in another order
     rows = np.array([5, 2, 9])
-    assert_same(templates[rows], all_of[rows])
+    assert_equal_values("rows", templates[rows], all_of[rows], skip=("meta", "wcs"))
 
 
 def test_components_of_one_source(tools):
     # a galaxy with a point in its middle, each given by hand, on a noiseless image
     wcs = north_up_wcs(tools.CENTER, tools.FINE * u.arcsec, (200, 200))
-    sky = SkyCoord([tools.CENTER.spherical_offsets_by(0.3 * u.arcsec, 0.1 * u.arcsec)])
+    sky = tools.places([0.3], [0.1])
     x, y = (float(v[0]) for v in wcs.world_to_pixel(sky))
     light, (y0, x0) = sersic_stamp(x=x, y=y, r_eff=5.0, n=1.0, axis_ratio=0.6, theta=0.4)
     galaxy = SourceTemplates.from_arrays(
@@ -180,11 +155,9 @@ def test_components_of_one_source(tools):
 
 def test_grids_survive_as_text(tools):
     wcs = north_up_wcs(tools.CENTER, tools.FINE * u.arcsec, (290, 290))
-    turned = wcs.deepcopy()
+    turned, (c, s) = wcs.deepcopy(), (np.cos(0.3), np.sin(0.3))
     turned.wcs.crval = [53.1 + 1e-13, -27.8 / 3]
-    turned.wcs.cd = (
-        0.06 / 3600 * np.array([[-np.cos(0.3), np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
-    )
+    turned.wcs.cd = np.array([[-c, s], [s, c]]) * 0.06 / 3600
     turned.wcs.set()
     x = np.array([0.0, 100.0, 289.0])
     for one in (wcs, turned):
@@ -200,30 +173,27 @@ def test_grids_survive_as_text(tools):
 def test_what_does_not_fit_is_refused(tools, scene, tmp_path):
     high, segmentation, detected, templates, images, *_ = scene
     photometer = ForcedPhotometer(tools.kernel)
-    with pytest.raises(ValueError, match="'templates' must be given alone"):
-        photometer.measure(images["one"], catalog=detected, templates=templates)
-    with pytest.raises(TypeError, match="'templates' must be SourceTemplates"):
-        photometer.measure(images["one"], templates=detected)
     coarse = north_up_wcs(tools.CENTER, 0.03 * u.arcsec, (9, 9))
-    other = SourceTemplates.from_arrays([np.ones((3, 3))], [(0, 0)], detected[:1], wcs=coarse)
-    with pytest.raises(ValueError, match="'templates' must be on the kernel's pixels"):
-        photometer.measure(images["one"], templates=other)
+    first, joined = {"corners": [(0, 0)], "catalog": detected[:1], "wcs": coarse}, [templates] * 2
+    other = SourceTemplates.from_arrays([np.ones((3, 3))], **first)
+    image, measure = images["one"], photometer.measure
+    both = {"catalog": detected, "templates": templates}
+    refuses("'templates' must be given alone", measure, image, **both)
+    refuses("must be SourceTemplates", measure, image, templates=detected, error=TypeError)
+    refuses("'templates' must be on the kernel's pixels", measure, image, templates=other)
     refuses("'parts' must be on one grid", SourceTemplates.concatenate, [templates, other])
-    with pytest.raises(ValueError, match="'id' must be a table whose ids are unique"):
-        SourceTemplates.concatenate([templates, templates])
-    with pytest.raises(ValueError, match="'arrays' must be two-dimensional, finite"):
-        SourceTemplates.from_arrays([-np.ones((3, 3))], [(0, 0)], detected[:1], wcs=coarse)
-    with pytest.raises(ValueError, match="'psf' must be an ImagePSF, or an array that is odd"):
-        SourceTemplates.from_images(high, segmentation, detected, psf=np.ones((4, 4)))
-    with pytest.raises(ValueError, match="'kernels' must be one for each image"):
-        measure_bands(images, {"one": tools.kernel}, templates)
+    refuses("'id' must be a table whose ids are unique", SourceTemplates.concatenate, joined)
+    refuses("two-dimensional, finite", SourceTemplates.from_arrays, [-np.ones((3, 3))], **first)
+    made = SourceTemplates.from_images
+    refuses("an array that is odd", made, high, segmentation, detected, psf=np.ones((4, 4)))
+    refuses("must be one for each image", measure_bands, images, {"one": tools.kernel}, templates)
     wide = gaussian_psf(0.5 * u.arcsec, pixel_scale=tools.FINE * u.arcsec, fov=3 * u.arcsec)
     blurred = SourceTemplates.from_images(high, segmentation, detected, psf=wide)
     with pytest.warns(MiricigaleWarning, match="is it of the same image"):
         photometer.measure(images["one"], templates=blurred)
-    high.write(tmp_path / "image.fits")
-    with pytest.raises(DataError, match="holds no templates of sources"):
-        SourceTemplates.read(tmp_path / "image.fits")
+    path = tmp_path / "image.fits"
+    high.write(path)
+    refuses("holds no templates of sources", SourceTemplates.read, path, error=DataError)
 
 
 def test_psf_that_changes_over_the_field(tools):
@@ -239,13 +209,10 @@ def test_psf_that_changes_over_the_field(tools):
     y = np.repeat(np.linspace(20, 170, 5), 12) + rng.uniform(-3, 3, 60)
     sky, flux = wcs.pixel_to_world(x, y), 10 ** rng.uniform(1, 2, 60)
     size = np.where(np.arange(60) % 2 == 0, 0.0, 0.2)
-    low = tools.render(sky, flux, np.hypot(width(x), size), wcs, shape)
-    low = tools.as_ccd(low, wcs, 0.01)
-    fine_shape = (350, 772)
-    fine = north_up_wcs(tools.CENTER, tools.FINE * u.arcsec, fine_shape)
-    sigma = 0.003 / (tools.FINE**2 * tools.SR * 1e12)
-    high = tools.render(sky, np.full(60, 20.0), np.hypot(tools.HI, size), fine, fine_shape)
-    high = tools.as_ccd(high + rng.normal(0, sigma, fine_shape), fine, sigma)
+    low = tools.picture(sky, flux, shape, width=np.hypot(width(x), size))
+    form = {"scale": tools.FINE, "sigma": 0.003 / (tools.FINE**2 * tools.SR * 1e12), "rng": rng}
+    sharp = np.hypot(tools.HI, size)
+    high = tools.picture(sky, np.full(60, 20.0), (350, 772), width=sharp, **form)
     segmentation, _ = detect_sources(high, threshold=1.0, n_pixels=10)
     templates = SourceTemplates.from_images(
         high, segmentation, QTable({"sky": sky}), psf=tools.kernel.source
@@ -254,12 +221,9 @@ def test_psf_that_changes_over_the_field(tools):
     assert points.tolist() == (size == 0).tolist()
 
     def kernel(at):
-        r = (np.arange(67) - 33) * tools.FINE
-        lo = np.exp(-0.5 * (r[:, None] ** 2 + r**2) / width(at) ** 2)
-        lo *= tools.FINE**2 / (2 * np.pi * width(at) ** 2)
-        return MatchingKernel.from_psfs(
-            tools.kernel.source, lo, pixel_scale=tools.FINE * u.arcsec, regularization=1e-4
-        )
+        psfs = tools.kernel.source, gaussian_image(67, width(at) / tools.FINE)
+        form = {"pixel_scale": tools.FINE * u.arcsec, "regularization": 1e-4}
+        return MatchingKernel.from_psfs(*psfs, **form)
 
     nodes = np.linspace(0, shape[1] - 1, 5)
     everywhere = [(a, b) for a in nodes for b in (0, 189)]

@@ -4,12 +4,12 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
-from astropy.wcs import WCS
 from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
-from miricigale.instrument import north_up_wcs
-from miricigale.photometry import ErrorSettings, ForcedPhotometer, psf_photometry
+from helpers.light import gaussian, gaussian_image
+from helpers.scenes import tan_wcs
+from miricigale.photometry import psf_photometry
 from miricigale.psf import gaussian_psf, make_psf
 
 SCALE = 0.11
@@ -18,10 +18,7 @@ SCALE = 0.11
 @pytest.fixture(scope="module")
 def psf(tools):
     # integrated over no pixel, as the images are made
-    n = 161
-    x = (np.arange(n) - n // 2) * SCALE / 4
-    data = np.exp(-0.5 * (x[:, None] ** 2 + x**2) / tools.LO**2)
-    data *= 16 * (SCALE / 4) ** 2 / (2 * np.pi * tools.LO**2)
+    data = 16 * gaussian_image(161, 4 * tools.LO / SCALE)
     return make_psf(data, pixel_scale=SCALE * u.arcsec, oversampling=4, frame="sky")
 
 
@@ -29,19 +26,13 @@ def psf(tools):
 def stars(tools):
     """Isolated stars with white noise, one masked, one off the image."""
     rng = np.random.default_rng(8)
-    shape = (300, 300)
-    wcs = north_up_wcs(tools.CENTER, SCALE * u.arcsec, shape)
-    grid = np.linspace(-13, 13, 9)
-    dx, dy = (a.ravel() + rng.uniform(-0.05, 0.05, 81) for a in np.meshgrid(grid, grid))
+    dx, dy = tools.lattice(rng, 9, 3.25, 0.05)
     dx[-1] = 60.0
-    sky = tools.CENTER.spherical_offsets_by(dx * u.arcsec, dy * u.arcsec)
-    flux = 10 ** rng.uniform(1, 2.5, 81)
+    sky, flux = tools.places(dx, dy), 10 ** rng.uniform(1, 2.5, 81)
     sigma = 0.02 / (SCALE**2 * tools.SR * 1e12)
-    image = tools.as_ccd(
-        tools.render(sky, flux, tools.LO, wcs, shape) + rng.normal(0, sigma, shape), wcs, sigma
-    )
-    x, y = wcs.world_to_pixel(sky[0])
-    image.mask = np.zeros(shape, bool)
+    image = tools.picture(sky, flux, (300, 300), sigma=sigma, rng=rng)
+    x, y = image.wcs.world_to_pixel(sky[0])
+    image.mask = np.zeros(image.shape, bool)
     image.mask[int(y) - 12 : int(y) + 13, int(x) - 12 : int(x) + 13] = True
     return image, QTable({"id": np.arange(81) + 500, "sky": sky}), flux
 
@@ -74,9 +65,7 @@ def test_stars_come_back_with_true_errors_and_every_row_stays(stars, psf):
 def test_it_agrees_with_forced_photometry(tools, stars, psf):
     image, catalog, _ = stars
     fixed = psf_photometry(image, psf, catalog, max_shift=None)
-    forced = ForcedPhotometer(
-        tools.kernel, template="psf", errors=ErrorSettings(correlated_noise=False)
-    ).measure(image, catalog=catalog)
+    forced = tools.measured(image, catalog, errors=tools.WHITE)
     good = np.isfinite(fixed["flux"].value)
     assert good.sum() == 79
     assert np.all(fixed["shift"][good] == 0)
@@ -87,26 +76,16 @@ def test_it_agrees_with_forced_photometry(tools, stars, psf):
 
 
 def test_the_psf_is_turned_to_the_image(tools):
-    # an elliptical star on an image whose +y points 30 degrees east of north
-    wcs = WCS(naxis=2)
-    wcs.wcs.ctype = "RA---TAN", "DEC--TAN"
-    wcs.wcs.crval, wcs.wcs.crpix = (53.1, -27.8), (61, 61)
-    c, s = np.cos(np.radians(30)), np.sin(np.radians(30))
-    wcs.wcs.cd = np.array([[-c, s], [s, c]]) * SCALE / 3600
+    # an elliptical star, drawn out along north, on an image whose +y points 30 degrees east of north
+    def star(east, north):
+        return gaussian(east / 0.2, north / 0.4, 1.0) / 0.08
+
+    wcs = tan_wcs((121, 121), SCALE, pa=30.0)
     sky = wcs.pixel_to_world(60.3, 59.8)
-    yy, xx = np.indices((121, 121))
-    world = wcs.pixel_to_world(xx, yy)
-    east, north = (v.to_value(u.arcsec) for v in sky.spherical_offsets_to(world))
-    wide, narrow = 0.4, 0.2
-    # 50 uJy, drawn out along north
-    light = np.exp(-0.5 * ((north / wide) ** 2 + (east / narrow) ** 2)) / (
-        2 * np.pi * wide * narrow
-    )
+    light = star(*tools.offsets(sky, wcs, *np.indices((121, 121))))
     image = tools.as_ccd(light * 50e-12 / tools.SR, wcs, 0.01)
-    n = 201
-    g = (np.arange(n) - n // 2) * SCALE / 4
-    data = np.exp(-0.5 * ((g[:, None] / wide) ** 2 + (g / narrow) ** 2))
-    data *= 16 * (SCALE / 4) ** 2 / (2 * np.pi * wide * narrow)
+    g = (np.arange(201) - 100) * SCALE / 4
+    data = SCALE**2 * star(g, g[:, None])
     catalog = QTable({"sky": sky.reshape(1)})
     north_up = make_psf(data, pixel_scale=SCALE * u.arcsec, oversampling=4, frame="sky")
     assert_allclose(psf_photometry(image, north_up, catalog)["flux"].value, 50, rtol=0.01)
@@ -120,7 +99,7 @@ def test_the_psf_is_turned_to_the_image(tools):
 
 def test_neighbors_are_told_and_options_checked(tools, stars, psf):
     image, catalog, _ = stars
-    two = QTable({"sky": tools.CENTER.spherical_offsets_by([0, 0.6] * u.arcsec, [0, 0] * u.arcsec)})
+    two = QTable({"sky": tools.places([0, 0.6])})
     assert psf_photometry(image, psf, two)["neighbor"].tolist() == [True, True]
     narrow = gaussian_psf(0.3 * u.arcsec, pixel_scale=0.03 * u.arcsec, fov=3 * u.arcsec)
     # a PSF on other pixels is brought to the image's

@@ -1,16 +1,14 @@
 """Templates that may change: what is open, the fit with it, and the errors of fluxes by it and by the PSF."""
 
-import types
-
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 from numpy.testing import assert_allclose
 from scipy.signal import fftconvolve
 
-from miricigale.instrument import north_up_wcs
+from helpers.light import gaussian, gaussian_image
+from helpers.mosaics import stamps_of
 from miricigale.photometry import ErrorSettings, ForcedPhotometer, detect_sources
 from miricigale.photometry.cutouts import Cutout
 from miricigale.photometry.shapes import not_fitted
@@ -34,25 +32,21 @@ def record(sigma, widths, *, point=0.0):
     return found[0]
 
 
-def pixels(n, sigma, x=None, y=None):
-    at = np.arange(n) - n // 2 if x is None else np.arange(n)
-    x, y = (0.0 if x is None else x), (0.0 if y is None else y)
-    one = [np.exp(-0.5 * ((at - c) / sigma) ** 2) for c in (y, x)]
-    return np.outer(*one) / (2 * np.pi * sigma**2)
-
-
 @pytest.fixture(scope="module")
 def changes():
     """PSFs of rms 1.5 and 4 pixels."""
-    return TemplateChanges(pixels(41, 1.5), pixels(61, 4.0), 0.0)
+    return TemplateChanges(gaussian_image(41, 1.5), gaussian_image(61, 4.0), 0.0)
+
+
+def below(cutout, sigma):
+    """The source, as a Gaussian of rms ``sigma`` at the image's resolution, on the pixels of a cutout."""
+    y, x = np.indices(cutout.data.shape)
+    return gaussian(x + cutout.origin[1] - 120.2, y + cutout.origin[0] - 69.7, sigma)
 
 
 def own(change, sigma):
     """Change of ln flux of an isolated source of rms ``sigma`` at the image's resolution."""
-    y, x = np.indices(change.cutout.data.shape)
-    x0, y0 = change.cutout.origin[::-1]
-    template = pixels(301, sigma, 120.2, 69.7)
-    cut = template[y + y0, x + x0]
+    cut = below(change.cutout, sigma)
     return np.sum(cut * change.cutout.data) / np.sum(cut**2) - change.light
 
 
@@ -86,11 +80,7 @@ def test_between_point_and_profile_the_other_counts_by_its_probability(changes):
     assert_allclose(chosen.cutout.data, point.cutout.data, atol=1e-9)
     assert_allclose(mean.cutout.data, chosen.cutout.data * 0.1 / 0.3, atol=1e-9)
     assert_allclose(mean_of_point.cutout.data, -mean.cutout.data, atol=1e-9)
-    template = pixels(301, np.sqrt(32.0), 120.2, 69.7)
-    y, x = np.indices(chosen.cutout.data.shape)
-    x0, y0 = chosen.cutout.origin[::-1]
-    other = pixels(301, 4.0, 120.2, 69.7)
-    expected = 0.3 * (other - template)[y + y0, x + x0]
+    expected = 0.3 * (below(chosen.cutout, 4.0) - below(chosen.cutout, np.sqrt(32.0)))
     assert_allclose(chosen.cutout.data, expected, atol=2e-3 * np.abs(expected).max())
 
 
@@ -100,22 +90,17 @@ def test_the_mean_of_possible_sizes_is_another_template(changes):
     found, _ = changes.of(PROFILE, record(4.0, [0, 0, width, 0, 0, 0]), 1e-3)
     assert [one.fixed for one in found] == [False, True]
     mean = found[1].cutout
-    y, x = np.indices(mean.data.shape)
-    at = y + mean.origin[0], x + mean.origin[1]
-    template = pixels(301, np.hypot(4.0, 4.0), 120.2, 69.7)[at]
     # by Gauss-Hermite quadrature
     nodes, weights = np.polynomial.hermite_e.hermegauss(9)
-    drawn = [
-        pixels(301, np.hypot(4.0 * np.exp(width * one), 4.0), 120.2, 69.7)[at] for one in nodes
-    ]
-    expected = np.tensordot(weights / weights.sum(), drawn, axes=1) - template
+    drawn = [below(mean, np.hypot(4.0 * np.exp(width * one), 4.0)) for one in nodes]
+    expected = np.tensordot(weights / weights.sum(), drawn, axes=1) - below(mean, np.sqrt(32.0))
     assert_allclose(mean.data, expected, atol=0.1 * np.abs(expected).max())
     assert_allclose(mean.data.sum(), 0, atol=1e-3)
 
 
 def test_noise_of_the_image_in_the_core(changes):
     """A template that is the image all over: the noise of its light and of its fit."""
-    image = pixels(51, 3.0)
+    image = gaussian_image(51, 3.0)
     rest = Cutout(image, (45, 95))
     # a profile of no light, all of the image being the rest
     template = Cutout(np.zeros((3, 3)), (69, 119), 1e-8 * image.size, convolved=False, rest=rest)
@@ -123,7 +108,7 @@ def test_noise_of_the_image_in_the_core(changes):
     found, noise = changes.of(template, one, 1e-6)
     assert found == []
     # drawn: unit light from noisy pixels, blurred to the resolution, fitted to the true template
-    blur = pixels(51, np.sqrt(16 - 1.5**2))
+    blur = gaussian_image(51, np.sqrt(16 - 1.5**2))
     true = fftconvolve(image, blur, "same")
     rng = np.random.default_rng(3)
     ratio = []
@@ -135,7 +120,7 @@ def test_noise_of_the_image_in_the_core(changes):
 
 
 def test_sizes_differ_between_bands():
-    free = TemplateChanges(pixels(41, 1.5), pixels(61, 4.0), 0.05)
+    free = TemplateChanges(gaussian_image(41, 1.5), gaussian_image(61, 4.0), 0.05)
     (change,), _ = free.of(PROFILE, record(3.0, np.zeros(6)), 1e-6)
     assert abs(own(change, 5.0)) == pytest.approx(0.05 * 9 / 25, rel=0.01)
     # a point has no size
@@ -146,43 +131,31 @@ def test_sizes_differ_between_bands():
 def blend(tools):
     """Three galaxies, two of them blended, on a noisy prior and a noisy image."""
     rng = np.random.default_rng(2)
-    dx, dy = np.array([[-4.0, 3.0, 3.55], [0.0, -0.3, 0.3]]) * u.arcsec
-    sky = tools.CENTER.spherical_offsets_by(dx, dy)
+    sky = tools.places([-4.0, 3.0, 3.55], [0.0, -0.3, 0.3])
     widths, flux = np.array([0.25, 0.3, 0.2]), np.array([20.0, 40.0, 10.0])
-    noise = 0.15
-    images = []
-    for psf, scale, n in ((tools.HI, 0.06, 260), (tools.LO, 0.11, 150)):
-        wcs = north_up_wcs(tools.CENTER, scale * u.arcsec, (n, n))
-        light = tools.render(sky, flux, np.hypot(psf, widths), wcs, (n, n))
-        images.append(tools.as_ccd(light + rng.normal(0, noise, (n, n)), wcs, noise))
-        noise = 0.05
-    high, low = images
-    segments, found = detect_sources(high)
-    photometer = ForcedPhotometer(
-        tools.kernel, errors=ErrorSettings(psf_error=0.0, correlated_noise=False), n_threads=1
+    high, low = (
+        tools.picture(
+            sky, flux, (n, n), scale=scale, width=np.hypot(psf, widths), sigma=noise, rng=rng
+        )
+        for psf, scale, n, noise in ((tools.HI, 0.06, 260, 0.15), (tools.LO, 0.11, 150, 0.05))
     )
-    return types.SimpleNamespace(
-        photometer=photometer,
-        low=low,
-        high=high,
-        segments=segments,
-        found=found,
-        sky=sky,
-        flux=flux,
-    )
+    return low, high, *detect_sources(high)
 
 
-def test_terms_add_in_quadrature_and_are_columns(blend):
-    arguments = blend.low, blend.high, blend.segments, blend.found
-    result = ForcedPhotometer(
-        blend.photometer.kernel, errors=ErrorSettings(psf_error=0.024, correlated_noise=False)
-    ).measure(*arguments)
+def settings(**options):
+    return ErrorSettings(**{"psf_error": 0.0, "correlated_noise": False, **options})
+
+
+def test_terms_add_in_quadrature_and_are_columns(tools, blend):
+    plain, result = (
+        ForcedPhotometer(tools.kernel, errors=settings(psf_error=one)).measure(*blend)
+        for one in (0.0, 0.024)
+    )
     terms = [result.flux_err_noise, result.flux_err_template, result.flux_err_psf]
     # peaks of the noise have no flux of which a part could be wrong
     assert all(np.all(term[result.flux > 1 * u.uJy] > 0) for term in terms)
     assert_allclose(result.flux_err, np.sqrt(sum(term**2 for term in terms)), rtol=1e-12)
     assert_allclose(np.sqrt(result.covariance.diagonal()), result.flux_err.value, rtol=1e-9)
-    plain = blend.photometer.measure(*arguments)
     assert_allclose(plain.flux_err_noise, result.flux_err_noise, rtol=1e-12)
     assert_allclose(plain.flux_err_template, result.flux_err_template, rtol=1e-12)
     assert np.all(plain.flux_err_psf == 0)
@@ -196,17 +169,7 @@ def test_terms_add_in_quadrature_and_are_columns(blend):
     assert_allclose(more[pair], np.outer(psf, psf)[pair], rtol=1e-6)
 
 
-def images(bank, shape):
-    """The stamps of a bank on whole images, in the order of its rows."""
-    found = np.zeros((len(bank.order), *shape))
-    for block in bank.blocks():
-        for k, (y0, x0, ny, nx) in enumerate(block.box):
-            stamp = block.values[block.start[k] : block.start[k + 1]].reshape(ny, nx)
-            found[block.first + k, y0 : y0 + ny, x0 : x0 + nx] = stamp
-    return found.reshape(len(found), -1)
-
-
-def test_a_blend_is_solved_as_by_dense_algebra(blend, monkeypatch):
+def test_a_blend_is_solved_as_by_dense_algebra(tools, blend, monkeypatch):
     """Least squares with the changes as columns and their priors as rows, all pixels written out."""
     from miricigale.photometry import forced
 
@@ -218,15 +181,16 @@ def test_a_blend_is_solved_as_by_dense_algebra(blend, monkeypatch):
         return original(fit, *args, **kwargs)
 
     monkeypatch.setattr(forced, "package", keep)
-    arguments = blend.low, blend.high, blend.segments, blend.found
-    result = blend.photometer.measure(*arguments)
-    exact = ForcedPhotometer(
-        blend.photometer.kernel,
-        errors=ErrorSettings(psf_error=0.0, correlated_noise=False, size_scatter=None),
-    ).measure(*arguments)
+    result, exact = (
+        ForcedPhotometer(tools.kernel, errors=settings(size_scatter=one)).measure(*blend)
+        for one in (0.1, None)
+    )
     fit = kept[0]
-    shape = blend.low.shape
-    templates, changes = images(fit.bank, shape)[fit.rows], images(fit.free.bank, shape)
+    templates, changes = (
+        stamps_of(one, blend[0].shape).reshape(len(one.order), -1)
+        for one in (fit.bank, fit.free.bank)
+    )
+    templates = templates[fit.rows]
     member = fit.bank.order[fit.rows]
     assert len(fit.free.owner) >= 4
     columns = fit.free.basis.T @ np.concatenate([templates, changes])
@@ -258,20 +222,10 @@ def test_a_blend_is_solved_as_by_dense_algebra(blend, monkeypatch):
 @pytest.mark.parametrize("width", [0.0, 0.25])
 def test_psf_error_is_what_a_wide_psf_does(tools, width):
     """Fluxes with a PSF that is too wide, against the stated error for that width."""
-    wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, (150, 150))
-    sky = SkyCoord([tools.CENTER])
-    image = tools.as_ccd(
-        tools.render(sky, [100.0], np.hypot(tools.LO, width), wcs, (150, 150)), wcs, 0.01
-    )
-    x = (np.arange(101) - 50) * tools.FINE
-
-    def psf(sigma):
-        one = np.exp(-0.5 * (x / sigma) ** 2)
-        return np.outer(one, one) / one.sum() ** 2
-
-    kernel = MatchingKernel.from_psfs(
-        psf(tools.HI), psf(1.03 * tools.LO), pixel_scale=tools.FINE * u.arcsec
-    )
+    sky = tools.places([0.0])
+    image = tools.picture(sky, [100.0], (150, 150), width=np.hypot(tools.LO, width))
+    psfs = (gaussian_image(101, one / tools.FINE) for one in (tools.HI, 1.03 * tools.LO))
+    kernel = MatchingKernel.from_psfs(*psfs, pixel_scale=tools.FINE * u.arcsec)
     catalog = QTable({"sky": sky})
     template = "psf"
     if width:
@@ -280,9 +234,7 @@ def test_psf_error_is_what_a_wide_psf_does(tools, width):
         catalog["sersic_index"] = [0.5]
         catalog["axis_ratio"] = [1.0]
         catalog["position_angle"] = [0.0] * u.deg
-    photometer = ForcedPhotometer(
-        kernel, template=template, errors=ErrorSettings(psf_error=0.03, correlated_noise=False)
-    )
+    photometer = ForcedPhotometer(kernel, template=template, errors=settings(psf_error=0.03))
     result = photometer.measure(image, catalog=catalog)
     # Gaussians: d ln flux / d ln width is 1 for points
     assert result.flux.value[0] - 100 == pytest.approx(result.flux_err_psf.value[0], rel=0.05)
@@ -291,24 +243,23 @@ def test_psf_error_is_what_a_wide_psf_does(tools, width):
 def test_pulls_of_galaxies_on_a_noisy_prior(tools):
     """Gaussian galaxies and points of template signal-to-noise 8 to 40, bright on the image."""
     rng = np.random.default_rng(12)
-    grid = np.arange(-3, 4) * 5.0
-    dx, dy = (a.ravel() + rng.uniform(-0.3, 0.3, 49) for a in np.meshgrid(grid, grid))
-    sky = tools.CENTER.spherical_offsets_by(dx * u.arcsec, dy * u.arcsec)
+    sky = tools.places(*tools.lattice(rng, 7, 5.0, 0.3))
     size = np.where(rng.random(49) < 0.25, 0.0, rng.uniform(0.1, 0.35, 49))
     flux = 10 ** rng.uniform(0.7, 1.4, 49) * (0.4 + size) / 0.5
     pulls, exact = [], []
-    wcs = [north_up_wcs(tools.CENTER, s * u.arcsec, (n, n)) for s, n in ((0.06, 660), (0.11, 360))]
-    truth = [
-        tools.render(sky, flux, np.hypot(psf, size), one, (n, n))
-        for one, psf, n in zip(wcs, (tools.HI, tools.LO), (660, 360), strict=True)
-    ]
-    photometer = ForcedPhotometer(tools.kernel, errors=ErrorSettings(correlated_noise=False))
-    plain = ForcedPhotometer(
-        tools.kernel, errors=ErrorSettings(correlated_noise=False, size_scatter=None)
+    photometer, plain = (
+        ForcedPhotometer(
+            tools.kernel, errors=ErrorSettings(correlated_noise=False, size_scatter=one)
+        )
+        for one in (0.1, None)
     )
     for _ in range(3):
-        high = tools.as_ccd(truth[0] + rng.normal(0, 2.5, (660, 660)), wcs[0], 2.5)
-        low = tools.as_ccd(truth[1] + rng.normal(0, 0.1, (360, 360)), wcs[1], 0.1)
+        high, low = (
+            tools.picture(
+                sky, flux, (n, n), scale=scale, width=np.hypot(psf, size), sigma=noise, rng=rng
+            )
+            for psf, scale, n, noise in ((tools.HI, 0.06, 660, 2.5), (tools.LO, 0.11, 360, 0.1))
+        )
         segments, found = detect_sources(high)
         index, distance, _ = sky.match_to_catalog_sky(found["sky"])
         near = distance < 0.3 * u.arcsec

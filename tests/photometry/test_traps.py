@@ -10,8 +10,10 @@ import pytest
 from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.table import Table
+from astropy.wcs import WCS
 
 from helpers.errors import refuses
+from helpers.mosaics import disks
 from miricigale.instrument import north_up_wcs, pixel_area_map
 from miricigale.photometry import MosaicFile, read_mosaic
 from miricigale.photometry.from_files import measure_files
@@ -36,6 +38,18 @@ def brightness(data, wcs):
     return data / pixel_area_map(wcs, data.shape) / 1e12
 
 
+def drawn(rng, name, model, sky, flux):
+    """Points with noise on the pixels of the image or the prior, uJy in each pixel."""
+    scale, n = SIZE[name]
+    data = rng.normal(0, NOISE[name], (n, n))
+    at = north_up_wcs(CENTER, scale * ARCSEC, (n, n)).world_to_pixel(sky)
+    for light, x, y in zip(flux, *at, strict=True):
+        i, j = round(float(x)), round(float(y))
+        form = {"pixel_scale": scale * ARCSEC, "shape": 2 * n + 1, "offset": (x - i, y - j)}
+        data += light * psf_image(model, **form)[n - j : 2 * n - j, n - i : 2 * n - i]
+    return data
+
+
 @pytest.fixture(scope="module")
 def field(tmp_path_factory):
     """Sixteen points with the PSFs of F770W at a roll of 75 deg and of F160W."""
@@ -54,21 +68,14 @@ def field(tmp_path_factory):
     made = types.SimpleNamespace(folder=folder, flux=flux, models=models)
     for name, model in models.items():
         scale, n = SIZE[name]
-        wcs, wide = north_up_wcs(CENTER, scale * ARCSEC, (n, n)), 2 * n + 1
-        data = rng.normal(0, NOISE[name], (n, n))
-        for light, x, y in zip(flux, *wcs.world_to_pixel(sky), strict=True):
-            i, j = round(float(x)), round(float(y))
-            stamp = psf_image(model, pixel_scale=scale * ARCSEC, shape=wide, offset=(x - i, y - j))
-            data += light * stamp[n - j : 2 * n - j, n - i : 2 * n - i]
+        wcs = north_up_wcs(CENTER, scale * ARCSEC, (n, n))
+        data = drawn(rng, name, model, sky, flux)
         header = wcs.to_header()
         header.update({"BUNIT": "MJy/sr", **headers[name]})
         error = brightness(np.full((n, n), NOISE[name]), wcs)
         hdus = [fits.PrimaryHDU(), fits.ImageHDU(brightness(data, wcs), header, name="SCI")]
         fits.HDUList([*hdus, fits.ImageHDU(error, name="ERR")]).writeto(folder / f"{name}.fits")
-    y, x = np.indices((n, n))
-    labels = np.zeros((n, n), np.int32)
-    for k, (a, b) in enumerate(zip(*wcs.world_to_pixel(sky), strict=True), 1):
-        labels[(x - a) ** 2 + (y - b) ** 2 < 100] = k
+    labels = disks(sky, wcs, (n, n), 10)
     fits.writeto(folder / "seg.fits", labels, wcs.to_header())
     made.catalog = Table({"id": np.arange(1, 17), "ra": sky.ra.deg, "dec": sky.dec.deg})
     made.catalog.write(folder / "cat.fits")
@@ -136,6 +143,18 @@ def test_psfs_on_cells_of_a_pixel_are_told_by_their_width(field, tmp_path):
     assert "'psf' is 6% narrower" in str(said[0].message)
 
 
+def test_model_psfs_are_turned_to_the_angle_of_the_aperture(field, tmp_path):
+    def turned(hdus):
+        hdus["SCI"].header["PA_APER"] = PA - 30
+
+    path = edited(field, tmp_path, "image", turned)
+    right, wrong = (measured(field, image=one) for one in (field.paths["image"], path))
+    np.testing.assert_allclose(np.median(right["miri.f770w"].value / field.flux), 1, atol=0.007)
+    # the six spikes stand elsewhere at another angle
+    bright = field.flux > 30
+    assert np.all(wrong["miri.f770w_chi2"][bright] > 2 * right["miri.f770w_chi2"][bright])
+
+
 def test_a_turned_psf_with_its_angle_is_right(field, tmp_path):
     drizzled = psf_mosaic(
         miri_psf("miri.f770w"), COARSE * ARCSEC, 0 * u.deg, grid_angle=0 * u.deg, oversampling=4
@@ -154,9 +173,8 @@ def test_kernels_of_other_pixels_filters_or_sums(field, tmp_path):
         found = fluxes(field, kernel=path)
     # a bare kernel of unit sum leaves out what lies beyond its grid
     np.testing.assert_allclose(np.median(found / field.flux), made.array.sum(), atol=0.01)
-    with pytest.raises(
-        DataError, match=r"kernel for pixels of 0\.04 arcsec, and those of the prior"
-    ):
+    message = r"kernel for pixels of 0\.04 arcsec, and those of the prior"
+    with pytest.raises(DataError, match=message):
         fluxes(field, kernel=saved(tmp_path, made.array / made.array.sum(), PIXSCALE=0.04))
     red = filter_psf("miri.f2100w", pixel_scale=COARSE * ARCSEC, pa=PA * u.deg)
     other = MatchingKernel.from_psfs(field.models["prior"], red, **given)
@@ -231,9 +249,7 @@ def test_labels_of_another_detection_are_not_taken(field, tmp_path):
     some = np.arange(17)
     some[[1, 2, 3]] = [2, 3, 1]
     fits.writeto(tmp_path / "some.fits", some[labels].astype(np.int32), header)
-    with pytest.warns(
-        MiricigaleWarning, match="are those of 3 of 16 sources that stand on another"
-    ):
+    with pytest.warns(MiricigaleWarning, match="those of 3 of 16 sources that stand on another"):
         fluxes(field, segmentation=tmp_path / "some.fits")
     # segments where no source is
     fits.writeto(tmp_path / "moved.fits", np.roll(labels, 30, axis=1), header)
@@ -252,40 +268,28 @@ def test_catalogs_of_other_fields_and_missing_positions(field, tmp_path, monkeyp
     found = fluxes(field, catalog=tmp_path / "gap.fits")
     assert np.flatnonzero(np.isnan(found)).tolist() == [3]
     monkeypatch.setattr("miricigale.photometry.mosaics.MosaicFile.read", unread)
-    for change, message in (
-        (
-            lambda ra: ra + 1,
-            r"none of the 16 sources of .*far.fits is on .*image.fits \('image'\): the",
-        ),
-        (lambda ra: ra / 15, "is ra in hours"),
-    ):
+    ra = field.catalog["ra"]
+    nowhere = r"none of the 16 sources of .*far.fits is on .*image.fits \('image'\): the"
+    for wrong, message in ((ra + 1, nowhere), (ra / 15, "is ra in hours")):
         catalog = field.catalog.copy()
-        catalog["ra"] = change(catalog["ra"])
+        catalog["ra"] = wrong
         catalog.write(tmp_path / "far.fits", overwrite=True)
         refuses(message, fluxes, field, catalog=tmp_path / "far.fits")
 
 
 def test_model_psfs_of_a_nircam_prior(field, tmp_path):
     """An image of points with NIRCam's model PSF, at the roll of its header."""
-    scale, n = SIZE["prior"]
-    wcs = north_up_wcs(CENTER, scale * ARCSEC, (n, n))
-    model = filter_psf("nircam.f444w", pixel_scale=scale * ARCSEC, pa=40 * u.deg)
+    model = filter_psf("nircam.f444w", pixel_scale=FINE * ARCSEC, pa=40 * u.deg)
     sky = SkyCoord(field.catalog["ra"], field.catalog["dec"], unit="deg")
-    data = np.random.default_rng(4).normal(0, NOISE["prior"], (n, n))
-    for light, x, y in zip(field.flux, *wcs.world_to_pixel(sky), strict=True):
-        i, j = round(float(x)), round(float(y))
-        stamp = psf_image(model, pixel_scale=scale * ARCSEC, shape=2 * n + 1, offset=(x - i, y - j))
-        data += 2 * light * stamp[n - j : 2 * n - j, n - i : 2 * n - i]
+    data = drawn(np.random.default_rng(4), "prior", model, sky, 2 * field.flux)
 
     def named(hdus):
-        hdus["SCI"].data[:] = brightness(data, wcs)
+        hdus["SCI"].data[:] = brightness(data, WCS(hdus["SCI"].header))
         hdus["SCI"].header.update(INSTRUME="NIRCAM", FILTER="F444W", PUPIL="CLEAR")
 
     path = edited(field, tmp_path, "prior", named)
-    with pytest.raises(
-        ValueError, match=r"'highres_pa_aper' must be given, .* \(or 'highres_psf'\)"
-    ):
-        fluxes(field, highres=path)
+    message = r"'highres_pa_aper' must be given, .* \(or 'highres_psf'\)"
+    refuses(message, fluxes, field, highres=path)
     found = fluxes(field, highres=path, highres_pa_aper=40 * u.deg, page=tmp_path / "page.html")
     assert "FWHM of the PSF (arcsec)" in (tmp_path / "page.html").read_text()
     np.testing.assert_allclose(np.median(found / field.flux), 1, atol=0.007)

@@ -7,47 +7,32 @@ from astropy.table import QTable
 from numpy.testing import assert_allclose
 from photutils.segmentation import SegmentationImage
 
-from miricigale.instrument import north_up_wcs
+from helpers.errors import refuses
+from helpers.light import gaussian_image
 from miricigale.photometry import Yang2021Photometer
 from miricigale.psf import make_psf
 
 SHAPE = (400, 400)
 
 
-def gaussian_psf_of(width, n=201):
-    """A PSF of 0.06 arcsec whose fraction of light is known."""
-    x = (np.arange(n) - n // 2) * 0.06
-    data = np.exp(-0.5 * (x[:, None] ** 2 + x**2) / width**2)
-    return make_psf(
-        data / data.sum(), pixel_scale=0.06 * u.arcsec, oversampling=1, frame="sky", enclosed=1.0
-    )
+def psf_of(*parts):
+    """Gaussians of some share of the light and width (arcsec) as a PSF of 0.06 arcsec that holds all light."""
+    data = sum(share * gaussian_image(201, width / 0.06) for share, width in parts)
+    return make_psf(data / data.sum(), pixel_scale=0.06 * u.arcsec, frame="sky", enclosed=1.0)
 
 
 @pytest.fixture(scope="module")
 def points(tools):
     """Bright points; a fifth of the wide PSF's light is in a halo of 0.9 arcsec."""
     rng = np.random.default_rng(1)
-    wcs = north_up_wcs(tools.CENTER, 0.06 * u.arcsec, SHAPE)
-    grid = np.linspace(-8, 8, 3)
-    dx, dy = (a.ravel() + rng.uniform(-0.1, 0.1, 9) for a in np.meshgrid(grid, grid))
-    sky = tools.CENTER.spherical_offsets_by(dx * u.arcsec, dy * u.arcsec)
-    flux = np.geomspace(10, 100, 9)
-    high = tools.as_ccd(tools.render(sky, flux, tools.HI, wcs, SHAPE), wcs, 1e-3)
-    low = tools.render(sky, 0.8 * flux, tools.LO, wcs, SHAPE)
-    low = tools.as_ccd(low + tools.render(sky, 0.2 * flux, 0.9, wcs, SHAPE), wcs, 0.01)
-    labels = np.zeros(SHAPE, int)
-    x, y = wcs.world_to_pixel(sky)
-    yy, xx = np.indices(SHAPE)
-    for k in range(9):
-        # 3 arcsec wide: all of the sharp light
-        labels[np.hypot(xx - x[k], yy - y[k]) < 15] = k + 1
+    sky, flux = tools.places(*tools.lattice(rng, 3, 8.0, 0.1)), np.geomspace(10, 100, 9)
+    high = tools.picture(sky, flux, SHAPE, scale=0.06, width=tools.HI, sigma=1e-3)
+    low = tools.picture(sky, 0.8 * flux, SHAPE, scale=0.06)
+    low.data += tools.render(sky, 0.2 * flux, 0.9, low.wcs, SHAPE)
+    # 1.8 arcsec wide: all of the sharp light
+    labels = tools.disks(sky, low.wcs, SHAPE, 15)
     catalog = QTable({"id": np.arange(1, 10), "label": np.arange(1, 10), "sky": sky})
-    psfs = [gaussian_psf_of(tools.HI)]
-    core, halo = (gaussian_psf_of(width).data for width in (tools.LO, 0.9))
-    psfs.append(make_psf(
-        0.8 * core + 0.2 * halo, pixel_scale=0.06 * u.arcsec, oversampling=1, frame="sky",
-        enclosed=1.0,
-    ))  # fmt: skip
+    psfs = psf_of((1.0, tools.HI)), psf_of((0.8, tools.LO), (0.2, 0.9))
     return psfs, low, high, SegmentationImage(labels), catalog, flux
 
 
@@ -87,11 +72,7 @@ def test_errors_are_white_and_templates_as_they_are(points, tools):
     assert_allclose(other.flux.value, result.flux.value, rtol=1e-6)
     assert_allclose(other.template_snr, result.template_snr / 100, rtol=1e-6)
     # segments of two widths, with 86 % of the light: nothing is added to them
-    small = segments.data.copy()
-    y, x = np.indices(SHAPE)
-    px, py = low.wcs.world_to_pixel(catalog["sky"])
-    for k in range(9):
-        small[(np.hypot(x - px[k], y - py[k]) > 2 * tools.HI / 0.06) & (small == k + 1)] = 0
+    small = tools.disks(catalog["sky"], low.wcs, SHAPE, 2 * tools.HI / 0.06)
     bare = photometer.measure(low, high, small, catalog)
     # templates are those segments of unit light: too sharp, and so too faint
     assert np.all(bare.flux.value < result.flux.value)
@@ -102,9 +83,7 @@ def test_the_image_must_be_on_the_prior_s_pixels(points, tools):
     photometer = Yang2021Photometer(*psfs)
     part = low[20:-30, 40:]
     assert np.isfinite(photometer.measure(part, high, segments, catalog).flux.value).sum() >= 6
-    wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, (200, 200))
-    coarse = tools.as_ccd(np.zeros((200, 200)), wcs, 1.0)
-    with pytest.raises(ValueError, match="'image' must be on the pixels of 'highres'"):
-        photometer.measure(coarse, high, segments, catalog)
-    with pytest.raises(ValueError, match="'scaling' must be positive"):
-        Yang2021Photometer(*psfs, scaling=0)
+    coarse = tools.picture(tools.places([0.0]), [0.0], (200, 200))
+    message = "'image' must be on the pixels of 'highres'"
+    refuses(message, photometer.measure, coarse, high, segments, catalog)
+    refuses("'scaling' must be positive", Yang2021Photometer, *psfs, scaling=0)
