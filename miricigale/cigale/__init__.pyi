@@ -1,6 +1,5 @@
 from .best_models import best_model_table as best_model_table
 from .best_models import write_best_models as write_best_models
-from .catalog import cigale_columns as cigale_columns
 from .catalog import read_cigale_catalog as read_cigale_catalog
 from .results import read_cigale_results as read_cigale_results
 from .results import write_cigale_results as write_cigale_results

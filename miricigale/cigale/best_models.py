@@ -65,9 +65,7 @@ def best_model_table(
     chain, mass = model.chain, values["mass"]
     derived = {name: quantity.value for name, quantity in spectra.derived.items()}
     stars, quantities = _stars(model, values)
-    parts = {}
-    for age in ("old", "young"):
-        parts[f"stellar.{age}"] = stars[age]
+    parts = {f"stellar.{age}": stars[age] for age in ("old", "young")}
     gas = model.component("nebular") is not None
     escaping = np.where(chain.wave < _LYMAN, values.get("f_esc", 1.0), 1.0)
     for kind in ("absorption", "lines", "continuum") if gas else ():
@@ -131,12 +129,8 @@ def _xrays(options, derived, values, disk):
     sources = xrays.galaxy(*(derived[name] for name in names), values["metallicity"])
     per_um = energy / _XRAY_WAVE  # keV for each um
     light = {"xray.galaxy": sum(one.spectrum(energy) for one in sources.values()) * per_um}
-    found = {
-        "xray.gam": xrays.photon_index,
-        "xray.E_cut": xrays.cutoff.to_value(u.keV),
-        "xray.det_lmxb": xrays.lmxb,
-        "xray.det_hmxb": xrays.hmxb,
-    }
+    found = {"xray.gam": xrays.photon_index, "xray.E_cut": xrays.cutoff.to_value(u.keV)}
+    found |= {"xray.det_lmxb": xrays.lmxb, "xray.det_hmxb": xrays.hmxb}
     if np.isfinite(slope * disk):
         sources["agn"] = corona = xrays.corona(disk, slope, values["inclination"])
         light["xray.agn"] = corona.spectrum(energy) * per_um
@@ -175,21 +169,19 @@ def _stars(model, values):
 
 def _attenuation(chain, parts, bands):
     """Attenuation of a galaxy's light in rest-frame bands, in mag."""
-    before = sum(
-        light for name, light in parts.items() if name.startswith(("stellar.", "nebular."))
-    )
-    after = before + sum(light for name, light in parts.items() if name.startswith("attenuation."))
-    out = {}
-    for band in bands:
-        name = filter_of_band(band)
-        if name is None:
-            continue
-        weights = Filter.from_name(name).weights(chain.wave) * chain.to_lnu
+
+    def light(*starts):
+        return sum(part for name, part in parts.items() if name.startswith(starts))
+
+    before, out = light("stellar.", "nebular."), {}
+    after = before + light("attenuation.")
+    for band in filter(filter_of_band, bands):
+        weights = Filter.from_name(filter_of_band(band)).weights(chain.wave) * chain.to_lnu
         out[f"attenuation.{band}"] = -2.5 * np.log10((weights @ after) / (weights @ before))
     return out
 
 
-def write_best_models(results, folder, *, modules=None, xray=None, overwrite=False):
+def write_best_models(results, folder, *, xray=None, overwrite=False):
     """
     Write the best model of every object as CIGALE does.
 
@@ -199,8 +191,6 @@ def write_best_models(results, folder, *, modules=None, xray=None, overwrite=Fal
         Results that know their model.
     folder : path-like
         Gets ``<id>_best_model.fits`` for each object that was fitted; made if it is not there.
-    modules : dict of str to str, optional
-        As for `best_model_table`; by default those of ``results.meta["cigale"]``.
     xray : dict, optional
         Options of `~miricigale.sed.with_xray_bands` with which the grid was made, for X-rays.
     overwrite : bool, optional
@@ -217,19 +207,16 @@ def write_best_models(results, folder, *, modules=None, xray=None, overwrite=Fal
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    modules = results.meta.get("cigale", {}).get("modules", {}) if modules is None else modules
-    paths = []
+    options, paths = {"modules": results.meta.get("cigale", {}).get("modules")}, []
     for one in results[results.fitted]:
-        own = one.distance is not None and np.isfinite(one.distance)
-        far = float(one.distance) * u.Mpc if own else None
+        if one.distance is not None:
+            known = np.isfinite(one.distance)
+            options["far"] = float(one.distance) * u.Mpc if known else None
         if xray:
-            xray = xray | {"alpha_ox": float(one.best.get("alpha_ox", np.nan))}
-        table = best_model_table(
-            one.model, best_parameters(one, one.model), modules=modules, far=far, xray=xray
-        )
-        table.meta["best.chi_square"] = float(one.chi2)
+            options["xray"] = xray | {"alpha_ox": float(one.best.get("alpha_ox", np.nan))}
+        table = best_model_table(one.model, best_parameters(one, one.model), **options)
+        meta, table.meta = table.meta | {"best.chi_square": float(one.chi2)}, {}
         path = folder / f"{np.asarray(one.ids).item()}_best_model.fits"
-        meta, table.meta = table.meta, {}
         hdu = fits.table_to_hdu(table)
         for name, value in meta.items():
             hdu.header[f"HIERARCH {name}"] = value

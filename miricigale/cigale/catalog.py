@@ -77,10 +77,6 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
     path = Path(path)
     bands = None if bands is None else list(bands)
     table = read_table(path, wanted="a catalog of CIGALE", cls=Table)
-    for name in ("id", "redshift"):
-        if name not in table.colnames:
-            msg = f"{path} has no column {name!r}, only {', '.join(table.colnames)}"
-            raise DataError(msg)
     chosen = _choose(path, table, bands)
     with_error = {error_column(name) for name in chosen}.intersection(bands or table.colnames)
     lines = [name for name in chosen if _is_flux_of_line(table[name])]
@@ -134,48 +130,19 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
     return out
 
 
-def cigale_columns(path):
-    """
-    Columns of a catalog in CIGALE's format by our names, for `~miricigale.scene.read_catalog`.
-
-    Parameters
-    ----------
-    path : path-like
-        As for `read_cigale_catalog`.
-
-    Returns
-    -------
-    columns : dict of str to str
-        Our name of each band that is known, and of its errors, to the file's.
-
-    Raises
-    ------
-    `~miricigale.utils.exceptions.DataError`
-        If the file cannot be read, or two bands are the same filter.
-    """
-    names = read_table(path, wanted="a catalog of CIGALE", cls=Table).colnames
-    try:
-        columns, _ = band_filters([name for name in names if not name.endswith("_err")], {})
-    except ValueError as err:
-        msg = f"{path}: {err}"
-        raise DataError(msg) from None
-    errors = {error_column(ours): error_column(theirs) for ours, theirs in columns.items()}
-    return columns | {ours: theirs for ours, theirs in errors.items() if theirs in names}
-
-
 def _choose(path, table, bands):
     """Bands to read."""
+    have = table.colnames
     if bands is None:
-        return [
+        bands = [
             name
-            for name in table.colnames
+            for name in have
             if name not in _OWN
-            and not name.endswith("_err")
-            and (error_column(name) in table.colnames or filter_of_band(name) or is_line(name))
+            and (error_column(name) in have or filter_of_band(name) or is_line(name))
         ]
-    lost = [name for name in bands if name not in table.colnames]
+    lost = [name for name in ("id", "redshift", *bands) if name not in have]
     if lost:
-        msg = f"{path} has no column {', '.join(lost)}; it has {', '.join(table.colnames)}"
+        msg = f"{path} has no column {', '.join(lost)}; it has {', '.join(have)}"
         raise DataError(msg)
     return [name for name in dict.fromkeys(bands) if not name.endswith("_err")]
 

@@ -7,10 +7,8 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.cigale.names import AGN_PARTS, cigale_names
-from miricigale.sed.chain import distinct
+from miricigale.fitting import Samples
 from miricigale.sed.grid_spectra import row_values
-from miricigale.sed.spectrum import distance
-from miricigale.sed.xray_bands import XRays, disk_2500
 from miricigale.utils.exceptions import ConfigError
 from miricigale.utils.store import replacing
 
@@ -19,64 +17,31 @@ _MOST = 2_000_000
 
 def save_models(setup, path, redshifts, *, overwrite):
     """See `CigaleSetup.save_models`."""
-    axes, xray = setup.axes(redshifts), setup.xray_bands()
-    if xray and setup.model().has_agn:
+    axes = setup.axes(redshifts)
+    if setup.xray_bands() and setup.model().has_agn:
         axes["alpha_ox"] = setup.xray["alpha_ox"]
     count = int(np.prod([len(values) for values in axes.values()], dtype=float))
     if count > _MOST:
         msg = f"{setup.path}: {count:,} models are more than the {_MOST:,} that are written"
         raise ConfigError(msg)
-    mesh = np.meshgrid(*axes.values(), indexing="ij")
-    rows = QTable({name: values.ravel() for name, values in zip(axes, mesh, strict=True)})
-    rows["mass"] = 1.0
-    bands = [name for name in (*setup.bands, *setup.predicted) if name not in xray]
-    # the last axis, the slope of X-rays, is none of the model
-    same = len(axes.get("alpha_ox", [0]))
-    models = setup.model().fluxes(rows[::same], setup.filters(bands))[np.arange(count) // same]
-    if xray:
-        _add_xrays(models, rows, setup)
-    out = QTable({"id": np.arange(count)})
-    for name, band in (setup.bands | setup.predicted).items():
-        out[band] = models[name].to(u.mJy)
+    every = setup.bands | setup.predicted
+    grid = setup.grid(list(every), redshifts)
+    shape = grid.redshift.size, grid.n_galaxies, max(grid.n_agn, 1), grid.frac_agn.size
+    index = np.indices(shape).reshape(4, -1).T
+    n, mass = len(index), np.where(grid.allowed[index[:, 0], index[:, 1]], 1.0, np.nan)
+    # each model as the only draw of an object, in the order of the file's parameters
+    models = Samples(grid, np.arange(n), np.zeros(n, int), index[:, None], mass[:, None])
+    models = models[np.lexsort([models.values(name)[:, 0].value for name in reversed(axes)])]
+    fluxes = models.fluxes(list(every))[:, 0]
+    out = QTable({"id": np.arange(n)})
+    for i, band in enumerate(every.values()):
+        out[band] = fluxes[:, i].to(u.mJy)
     for ours, (theirs, unit, factor) in cigale_names(setup.modules).items():
-        source = next((t for t in (models, rows) if ours in t.colnames), None)
-        if source is not None:
-            out[theirs] = np.asarray(getattr(source[ours], "value", source[ours])) * factor * unit
+        if ours in models.parameters:
+            out[theirs] = models.values(ours)[:, 0].value * factor * unit
     with replacing(path, overwrite=overwrite) as partial:
         out.write(partial, format="fits")
     return out
-
-
-def _add_xrays(models, rows, setup):
-    """Add X-ray fluxes to models, and what is known of their coronae."""
-    model = setup.model()
-    xrays = XRays(**{k: value for k, value in setup.xray.items() if k != "alpha_ox"})
-
-    def values(name):
-        return (
-            np.asarray(rows[name])
-            if name in rows.colnames
-            else np.full(len(rows), model.defaults[name])
-        )
-
-    quantities = ("sfr_100myr", "stellar_mass", "age_mass")
-    sources = xrays.galaxy(*(models[name].value for name in quantities), values("metallicity"))
-    if model.has_agn:
-        agn = model.component("agn")
-        names = [name for name in agn.parameters if name != "frac_agn"]
-        different, place = distinct(zip(*(values(name).tolist() for name in names), strict=True))
-        every = [model.defaults | dict(zip(names, row, strict=True)) for row in different]
-        disk = np.array([disk_2500(model.chain, agn, row) for row in every])[place]
-        disk = disk * models["accretion_power"].value
-        sources["agn"] = corona = xrays.corona(
-            disk, np.asarray(rows["alpha_ox"]), values("inclination")
-        )
-        models["l_2500"], models["l_2_10kev"] = disk * u.W / u.Hz, corona.power * u.W
-    nodes, place = np.unique(rows["redshift"], return_inverse=True)
-    far = distance(nodes, model.cosmology)
-    for name, band in setup.xray_bands().items():
-        seen = (one.dimming(band.value, nodes, far)[place] * one.power for one in sources.values())
-        models[name] = sum(seen) * u.uJy
 
 
 def with_agn_parts(grid, model):

@@ -1,7 +1,5 @@
 """What the modules of CIGALE are here: components, their options, axes of a grid."""
 
-from dataclasses import dataclass, field
-
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable, Table
@@ -30,20 +28,13 @@ _WITHOUT_EFFECT = {
 _OLD_NAMES = {"sfhdelayed": {"age": "age_main"}}
 
 
-@dataclass
 class Chain:
     """What came of the modules, by the names that it has in a `~miricigale.cigale.CigaleSetup`."""
 
-    components: list = field(default_factory=list)
-    parameters: dict = field(default_factory=dict)
-    redshift: object = None
-    modules: dict = field(default_factory=dict)
-    frac_agn_definition: str = "dust"
-    xray: dict = field(default_factory=dict)
-    max_dev_alpha_ox: float = 0.0
-    left_out: list = field(default_factory=list)
-    replaced: list = field(default_factory=list)
-    differs: list = field(default_factory=list)
+    def __init__(self):
+        self.components, self.parameters, self.modules, self.xray = [], {}, {}, {}
+        self.redshift, self.frac_agn_definition, self.max_dev_alpha_ox = None, "dust", 0.0
+        self.left_out, self.replaced, self.differs = [], [], []
 
 
 class Module:
@@ -57,6 +48,7 @@ class Module:
         self._lacking, self._factors = [], {}
 
     def label(self, key):
+        """Name of a parameter in messages."""
         return f"{self.name}.{key}"
 
     def has(self, key):
@@ -69,15 +61,22 @@ class Module:
         value = self._values.get(key, "")
         if value in ("", []):
             return None if default is None else np.atleast_1d(np.asarray(default, dtype=float))
-        try:
-            return parse_values(value, self.label(key))
-        except ValueError as err:
-            raise ConfigError(str(err)) from None
+        return parse_values(value, self.label(key))
 
     def text(self, key, default=""):
         self._taken.add(key)
         value = self._values.get(key, default)
         return value if isinstance(value, str) else ", ".join(value)
+
+    def pair(self, key, default, wanted):
+        """Two numbers, of which ``wanted`` says how they are written."""
+        text = self.text(key, default)
+        try:
+            first, second = map(float, text.replace("&", "/").split("/"))
+        except ValueError:
+            msg = f"{self.label(key)} must be {wanted}, got {text!r}"
+            raise ConfigError(msg) from None
+        return first, second
 
     def one(self, key, default):
         """A parameter that can have one value here: the first; others are left out."""
@@ -93,8 +92,7 @@ class Module:
         if number not in choices:
             first = next(iter(choices))
             self.chain.replaced.append(f"{self.label(key)} = {number:g} by {first}")
-            number = first
-        return choices[number]
+        return choices.get(number, next(iter(choices.values())))
 
     def ignore(self, *keys):
         """Take parameters that change nothing, or that another line of the report names."""
@@ -200,8 +198,11 @@ def _sfhfromfile(m):
 def _bc03(m):
     imf = _IMF.get(int(m.one("imf", 0)), "another")
     metallicity = m.numbers("metallicity", 0.02)
-    values = {"metallicity": ("metallicity", metallicity)}
-    values["separation_age"] = ("separation_age", np.array([m.one("separation_age", 10.0)]))
+    age = np.array([m.one("separation_age", 10.0)])
+    values = {
+        "metallicity": ("metallicity", metallicity),
+        "separation_age": ("separation_age", age),
+    }
 
     def covers(library):
         if imf.lower() not in library.imf.lower():
@@ -232,19 +233,15 @@ def _nebular(m):
                 m.chain.replaced.append(f"nebular.zgas = {have:g} by {got:g}")
         values["metallicity_gas"] = ("zgas", np.unique(nearest))
         options["gas"] = "free"
-    text = (
-        "Cloudy tables of another make: at one logU [O II] is 4 times, [O III] 1.4 times CIGALE's"
-    )
-    m.chain.differs.append(f"nebular: {text}")
+    text = "at one logU [O II] is 4 times, [O III] 1.4 times CIGALE's"
+    m.chain.differs.append(f"nebular: Cloudy tables of another make: {text}")
     m.add(c.Nebular, values, **options)
 
 
 def _metallicity(chain):
     """Metallicities of the stars."""
-    stars = next((x for x in chain.components if x.role == "stellar"), None)
-    if stars is None:
-        return np.zeros(0)
-    return chain.parameters.get("metallicity", np.array([stars.metallicity]))
+    stars = [part.metallicity for part in chain.components if part.role == "stellar"]
+    return chain.parameters.get("metallicity", np.array(stars))
 
 
 def _modified_starburst(m):
@@ -271,9 +268,8 @@ def _skirtor2016(m):
     laws = {0: "smc_wd01" if m.has("disk_type") else "smc", 1: "calzetti", 2: "gaskell"}
     law = m.option("law", 0, laws)
     if m.has("disk_type") and law in ("calzetti", "gaskell"):
-        m.chain.differs.append(
-            f"skirtor2016.law {law}: continued below 0.1 um, where CIGALE has grains"
-        )
+        text = "continued below 0.1 um, where CIGALE has grains"
+        m.chain.differs.append(f"skirtor2016.law {law}: {text}")
     options = {
         "polar_law": law,
         # files of older versions have no choice
@@ -293,48 +289,34 @@ def _skirtor2016(m):
 
 
 def _definition(m):
-    text = m.text("lambda_fracAGN", "0/0").replace(" ", "")
-    try:
-        low, high = (float(x) for x in text.split("/"))
-    except ValueError:
-        msg = f"skirtor2016.lambda_fracAGN must be two wavelengths as 3/1000, got {text!r}"
-        raise ConfigError(msg) from None
-    if (low, high) == (0.0, 0.0):
-        return "dust"
+    low, high = m.pair("lambda_fracAGN", "0/0", "two wavelengths as 3/1000")
     if 0.1 <= low < high <= 1000.0:
         return f"{low:g}-{high:g}um"
-    m.chain.replaced.append(f"skirtor2016.lambda_fracAGN = {text} by 0/0")
+    if (low, high) != (0.0, 0.0):
+        m.chain.replaced.append(f"skirtor2016.lambda_fracAGN = {low:g}/{high:g} by 0/0")
     return "dust"
 
 
 def _xray(m):
     """Options of `~miricigale.sed.with_xray_bands`; angles count since there is a parameter of them."""
-    text = m.text("angle_coef", "0 & 0").replace("/", "&")
-    try:
-        first, second = (float(part) for part in text.split("&"))
-    except ValueError:
-        msg = f"{m.label('angle_coef')} must be one pair of numbers as 0.5 & 0, got {text!r}"
-        raise ConfigError(msg) from None
     m.chain.modules["xray"] = m.name
     m.chain.xray = {
         "alpha_ox": m.numbers("alpha_ox", ALPHA_OX),
         "photon_index": m.one("gam", 1.8),
         "cutoff": m.one("E_cut", 300.0) * u.keV,
-        "angle_coefficients": (first, second),
+        "angle_coefficients": m.pair("angle_coef", "0 & 0", "one pair of numbers as 0.5 & 0"),
         "lmxb": m.one("det_lmxb", 0.0),
         "hmxb": m.one("det_hmxb", 0.0),
         "lmxb_index": m.one("gam_lmxb", 1.56),
         "hmxb_index": m.one("gam_hmxb", 2.0),
     }
     if not m.has("alpha_ox"):
-        m.chain.differs.append(
-            f"{m.name}: not in the file, the default here: alpha_ox = -1.9 to -1.1"
-        )
+        text = "not in the file, the default here: alpha_ox = -1.9 to -1.1"
+        m.chain.differs.append(f"{m.name}: {text}")
     m.chain.max_dev_alpha_ox = max(m.one("max_dev_alpha_ox", 0.2), 0.0)
     if m.chain.max_dev_alpha_ox:
-        m.chain.differs.append(
-            f"{m.label('max_dev_alpha_ox')}: by {N_DRAWS} draws of each posterior"
-        )
+        text = f"by {N_DRAWS} draws of each posterior"
+        m.chain.differs.append(f"{m.label('max_dev_alpha_ox')}: {text}")
 
 
 def _redshifting(m):
@@ -378,8 +360,6 @@ def read_modules(names, parameters, *, folder, libraries):
         module = Module(name, values, chain, folder=folder, libraries=libraries)
         try:
             _MODULES[name](module)
-        except ConfigError:
-            raise
         except (ValueError, TypeError) as err:
             msg = f"[[{name}]]: {err}"
             raise ConfigError(msg) from err

@@ -99,8 +99,5 @@ def cigale_names(modules=None):
 
 def unit_of(name):
     """Unit of a quantity of CIGALE's name; None if it is not known."""
-    for module in ("", *_OF_MODULE):
-        for theirs, unit, _ in cigale_names({"": module}).values():
-            if theirs == name:
-                return unit
-    return None
+    every = (cigale_names({"": module}).values() for module in ("", *_OF_MODULE))
+    return next((unit for names in every for theirs, unit, _ in names if theirs == name), None)

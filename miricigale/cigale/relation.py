@@ -7,7 +7,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.fitting import FitFlags
-from miricigale.fitting.quantities import draws_summary
+from miricigale.fitting.quantities import node_shares, put_draws
 from miricigale.fitting.samplers.run import chi2_at
 from miricigale.utils.exceptions import FitWarning
 from miricigale.utils.parallel import chunks
@@ -90,32 +90,26 @@ def _near(samples, most):
 def _distance(slope, light):
     """How far a slope is from the relation; NaN without a disk."""
     light = light.to_value(u.erg / u.s / u.Hz)
-    line = (
-        _JUST[0] * np.log10(light, where=light > 0, out=np.full(np.shape(light), np.nan)) + _JUST[1]
-    )
-    return np.abs(slope - line)
+    log_light = np.log10(light, where=light > 0, out=np.full(np.shape(light), np.nan))
+    return np.abs(slope - (_JUST[0] * log_light + _JUST[1]))
 
 
 def _best_is_near(results, i, most):
-    slope = results.best["alpha_ox"].value[i] if "alpha_ox" in results.best else None
-    slope = results.constants.get("alpha_ox") if slope is None else slope
+    best = results.best.get("alpha_ox")
+    slope = results.constants.get("alpha_ox") if best is None else best.value[i]
     return not _distance(slope, results.best["l_2500"][i]) > most
 
 
 def _summarize(results, new, i, index, values):
     """Posteriors of parameters, moments and quantiles of derived quantities of one object."""
-    n_z, n_f = new["pdf_2d"].shape[1:]
-    count = np.bincount(index[:, 0] * n_f + index[:, 3], minlength=n_z * n_f)
-    new["pdf_2d"][i] = count.reshape(n_z, n_f) / len(index)
+    new["pdf_2d"][i] = node_shares((index[:, 0], index[:, 3]), new["pdf_2d"].shape[1:])
     for name, axis in results.axes.items():
         found = values[name][np.isfinite(values[name])]
         node = np.argmin(np.abs(found[:, None] - axis.values), axis=1)
         # of parameters of an AGN that is not there the posterior is the prior
         rest = (len(index) - found.size) * axis.weights
         new["pdf"][name][i] = (np.bincount(node, minlength=axis.values.size) + rest) / len(index)
-    for j, name in enumerate(results.quantities):
-        found = draws_summary(values[name], with_log=np.isfinite(results.moments[i, j, 2]))
-        new["moments"][i, j], new["quantiles"][i, j] = found
+    put_draws(results, new, i, values)
 
 
 def _take_best(results, new, i, index, scale, flux, values):

@@ -9,17 +9,16 @@ from astropy.table import QTable, Table
 from miricigale.cigale.names import cigale_names, unit_of
 from miricigale.filters.band_names import cigale_band, filter_of_band
 from miricigale.fitting import FitFlags
-from miricigale.utils.exceptions import DataError, argument_error, unknown_name
+from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import read_table
+from miricigale.utils.options import check_names
 from miricigale.utils.store import replacing
 from miricigale.utils.tables import error_column
 
 _CHI2 = ("best.chi_square", "best.reduced_chi_square")
 
 
-def write_cigale_results(
-    results, path, *, variables=None, bands=None, modules=None, overwrite=False
-):
+def write_cigale_results(results, path, *, variables=None, overwrite=False):
     """
     Write results as CIGALE does, in ``results.fits`` or ``results.txt``.
 
@@ -32,12 +31,6 @@ def write_cigale_results(
     variables : iterable of str, optional
         For which of CIGALE's quantities there are columns ``bayes.X`` and ``bayes.X_err``; all
         that we have by default.
-    bands : dict of str to str, optional
-        Our filters to CIGALE's bands; by default those of ``results.meta["cigale"]``, or CIGALE's
-        present names, and ours where there is none.
-    modules : dict of str to str, optional
-        Role of a component to CIGALE's module, on which some names depend; by default those of
-        ``results.meta["cigale"]``.
     overwrite : bool, optional
         Whether a file that is there is replaced.
 
@@ -50,6 +43,7 @@ def write_cigale_results(
 
     Notes
     -----
+    Bands have the names of ``results.meta["cigale"]``, or CIGALE's present ones, and ours where there is none;
     ``left out``, ``replaced`` and ``differs`` of ``results.meta["cigale"]`` (`CigaleSetup.describe`) and the
     meaning of the flags stand as comments in the header, or in lines with ``#`` above a text table.
 
@@ -60,9 +54,7 @@ def write_cigale_results(
     mJy.
     """
     note = results.meta.get("cigale", {})
-    modules = note.get("modules", {}) if modules is None else modules
-    bands = {**note.get("bands", {}), **(bands or {})}
-    columns = _columns(results, cigale_names(modules), variables)
+    columns = _columns(results, cigale_names(note.get("modules")), variables)
     table = Table()
     table["id"] = np.array(results.ids)
     table["flags"] = np.array(results.flags)
@@ -70,9 +62,8 @@ def write_cigale_results(
         if mean is not None:
             table[f"bayes.{name}"] = u.Quantity(mean, unit)
             table[f"bayes.{name}_err"] = u.Quantity(std, unit)
+    bands = note.get("bands", {})
     written = {name: bands.get(name, cigale_band(name)) for name in results.filters}
-    if len(set(written.values())) < len(written):
-        raise argument_error("bands", "a different name for each filter", f"{written}")
     fluxes = results.predict()
     for name, band in written.items():
         table[f"bayes.{band}"] = fluxes[name].to(u.mJy)
@@ -104,28 +95,23 @@ def _columns(results, names, variables):
     if gas != ["free"]:
         # the gas has the metallicity of the stars
         constants.pop("metallicity_gas", None)
-    columns = {}
+    columns, zero = {}, np.where(results.fitted, 0.0, np.nan)
     for ours, (theirs, unit, factor) in names.items():
+        if ours in results.best:
+            # a redshift at one node of a grid is yet of each object
+            best = np.asarray(results.best[ours]) * factor
+        elif ours in constants:
+            best = np.where(results.fitted, constants[ours] * factor, np.nan)
+        else:
+            continue
+        mean, std = best, zero
         if ours in results.parameters:
             mean, std = (x.value * factor for x in (results.mean(ours), results.std(ours)))
-            columns[theirs] = (mean, std, np.asarray(results.best[ours]) * factor, unit)
-        elif ours in results.best:
-            # at one node of a grid, and yet of each object
-            value = np.asarray(results.best[ours]) * factor
-            columns[theirs] = (value, np.where(results.fitted, 0.0, np.nan), value, unit)
-        elif ours in constants:
-            value = np.where(results.fitted, constants[ours] * factor, np.nan)
-            columns[theirs] = (value, np.where(results.fitted, 0.0, np.nan), value, unit)
-    known = set(columns)
-    if variables is not None:
-        for name in variables:
-            if name not in known:
-                raise unknown_name("quantity of the results", name, known)
-        wanted = set(variables)
-        columns = {
-            name: (mean, std, best, unit) if name in wanted else (None, None, best, unit)
-            for name, (mean, std, best, unit) in columns.items()
-        }
+        columns[theirs] = (mean, std, best, unit)
+    wanted = columns if variables is None else variables
+    check_names(wanted, "quantity of the results", columns)
+    for name in columns.keys() - set(wanted):
+        columns[name] = (None, None, *columns[name][2:])
     return dict(sorted(columns.items()))
 
 
@@ -163,9 +149,7 @@ def read_cigale_results(path):
 def _unit(column):
     name = column.partition(".")[2]
     for text in (name, name.removesuffix("_err")):
-        unit = unit_of(text)
+        unit = unit_of(text) or (u.mJy if filter_of_band(text) is not None else None)
         if unit is not None:
             return unit
-        if filter_of_band(text) is not None:
-            return u.mJy
     return None

@@ -11,7 +11,8 @@ from miricigale.cigale.names import cigale_names
 from miricigale.cigale.setup import CigaleSetup
 from miricigale.filters.band_names import band_filters, xray_energies
 from miricigale.filters.given import given_filters
-from miricigale.utils.exceptions import CatalogWarning, ConfigError, argument_error
+from miricigale.utils.exceptions import CatalogWarning, ConfigError
+from miricigale.utils.options import check_choice
 from miricigale.utils.tables import error_column
 
 
@@ -53,8 +54,7 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
         Of all that is left out, replaced or different, in one message.
     """
     path = Path(path)
-    if libraries not in ("best", "bundled"):
-        raise argument_error("libraries", "'best' or 'bundled'", repr(libraries))
+    check_choice(libraries, "libraries", ("best", "bundled"))
     config = parse_ini(path)
     analysis = config["analysis_params"]
     names = given_filters(names)
@@ -62,13 +62,10 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
         msg = f"{path}: lists of models (parameters_file) are not read, grids are"
         raise ConfigError(msg)
     try:
+        modules, columns = config["sed_modules_params"], config["bands"]
         chain = read_modules(
-            config["sed_modules"],
-            config["sed_modules_params"],
-            folder=path.parent,
-            libraries=libraries,
+            config["sed_modules"], modules, folder=path.parent, libraries=libraries
         )
-        columns = config["bands"]
         bands, lost = band_filters(dict.fromkeys(c.removesuffix("_err") for c in columns), names)
         wanted = [band for band in analysis["bands"] if band not in bands.values()]
         predicted, more = band_filters(dict.fromkeys(wanted), names)
@@ -91,10 +88,14 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
     if dark or not hard:
         known -= {"xray.alpha_ox", "xray.agn_Lx_2to10keV", "agn.intrin_Lnu_2500A_30deg"}
     variables = analysis["variables"]
+    unknown = [f"band {name}" for name in dict.fromkeys([*lost, *more])]
+    if unknown:
+        # the last one says what to do
+        unknown[-1] += f" (no filter here: {GIVE_FILTER})"
     chain.left_out[:] = [
         *(f"module {x}" if "." not in x and " " not in x else x for x in chain.left_out),
         *(f"band {name} (no module xray)" for name in sorted(dark)),
-        *_bands_without_filter(dict.fromkeys([*lost, *more])),
+        *unknown,
         *(f"variable {x}" for x in variables if x not in known),
         *(f"property {x}" for x in config["properties"] if not x.endswith("_err")),
     ]
@@ -126,12 +127,6 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
     if text:
         warnings.warn(f"{path}:\n{text}", CatalogWarning, stacklevel=2)
     return setup
-
-
-def _bands_without_filter(bands):
-    """Items of what is left out; the last one says what to do."""
-    items = [f"band {band}" for band in bands]
-    return [*items[:-1], f"{items[-1]} (no filter here: {GIVE_FILTER})"] if items else []
 
 
 def fit_cigale(

@@ -168,13 +168,12 @@ class CigaleSetup:
         `~miricigale.utils.exceptions.ConfigError`
             If the configuration names no catalog.
         """
-        path = self.data_file if path is None else path
+        path = path or self.data_file
         if path is None:
             msg = f"{self.path} names no data_file"
             raise ConfigError(msg)
-        return read_cigale_catalog(
-            path, bands=self.columns, limits=self.limits, names=self.names, strict=strict
-        )
+        options = {"bands": self.columns, "limits": self.limits, "names": self.names}
+        return read_cigale_catalog(path, **options, strict=strict)
 
     def filters(self, names=None):
         """
@@ -194,6 +193,21 @@ class CigaleSetup:
         """X-ray bands among ``bands`` and ``predicted``: name to lowest and highest energy."""
         names = [name for name in (*self.bands, *self.predicted) if xray_energies(name)]
         return {name: xray_energies(name) * u.keV for name in names if name not in self.names}
+
+    def grid(self, names, redshifts=None):
+        """
+        Make the `~miricigale.sed.ModelGrid` of bands by our names; ``redshifts`` are those for `axes`.
+
+        Its AGN have the luminosities of their parts too if these are among the ``variables``.
+        """
+        model, xray = self.model(), self.xray_bands()
+        bands = self.filters([name for name in names if name not in xray])
+        grid = model.grid(self.axes(redshifts), bands)
+        parts = {theirs for _, theirs in AGN_PARTS.values()}
+        if parts.intersection(self.variables) or not self.variables:
+            grid = with_agn_parts(grid, model)
+        xray = {name: band for name, band in xray.items() if name in names}
+        return with_xray_bands(grid, model, xray, **self.xray) if xray else grid
 
     def fitter(self, photometry, *, compat="cigale", **options):
         """
@@ -217,20 +231,9 @@ class CigaleSetup:
         if not have:
             wanted = f"a table with at least one of the columns {list(self.bands)}"
             raise argument_error("photometry", wanted, f"columns {photometry.colnames}")
-        redshifts = photometry["redshift"] if "redshift" in photometry.colnames else None
-        xray, wanted = self.xray_bands(), [*have, *self.predicted]
-        bands = self.filters([name for name in wanted if name not in xray])
-        grid = self.model().grid(self.axes(redshifts), bands)
-        parts = {theirs for _, theirs in AGN_PARTS.values()}
-        if parts.intersection(self.variables) or not self.variables:
-            grid = with_agn_parts(grid, self.model())
-        xray = {name: band for name, band in xray.items() if name in wanted}
-        if xray:
-            grid = with_xray_bands(grid, self.model(), xray, **self.xray)
+        grid = self.grid([*have, *self.predicted], _column(photometry, "redshift"))
         options = {"model_error": self.additional_error} | options
-        if compat is not None:
-            options["compat"] = compat
-        return BayesFitter(grid, have, **options)
+        return BayesFitter(grid, have, compat=compat, **options)
 
     def fit(
         self, photometry, *, compat="cigale", executor=None, progress_bar=False, seed=0, **options
@@ -264,14 +267,13 @@ class CigaleSetup:
                 settings = dataclasses.replace(settings, redshift_tolerance=np.inf)
             options |= {"settings": settings}
         fitter = self.fitter(photometry, compat=compat, **options)
-        known = {"executor": executor, "progress_bar": progress_bar}
-        if "redshift" in photometry.colnames:
-            z = self.rounded(photometry["redshift"])
-        else:
-            z = np.full(len(photometry), np.nan)
+        parallel = {"executor": executor, "progress_bar": progress_bar}
+        known = _column(photometry, "redshift")
+        known = np.full(len(photometry), np.nan) if known is None else known
+        z = self.rounded(known)
 
         def fit(redshift=None):
-            found = fitter.fit(photometry, redshift=redshift, **known)
+            found = fitter.fit(photometry, redshift=redshift, **parallel)
             most = self.max_dev_alpha_ox if "l_2500" in found.quantities else 0.0
             if not most:
                 return found
@@ -282,19 +284,15 @@ class CigaleSetup:
             "configuration": self.path.name,
             "bands": self.bands | self.predicted,
             "modules": self.modules,
-            "left_out": list(self.left_out),
-            "replaced": list(self.replaced),
-            "differs": list(self.differs),
+            **{name: list(getattr(self, name)) for name in ("left_out", "replaced", "differs")},
         }
         meta = dict(results.meta) | {"cigale": note}
         model = self.model()
         results = dataclasses.replace(results, meta=meta, model=model)
-        known = photometry["redshift"] if "redshift" in photometry.colnames else z
-        far = photometry["distance"] if "distance" in photometry.colnames else None
         # objects over all redshifts of the file are where the model is
-        known = np.where(
-            np.isfinite(z), np.ma.filled(np.ma.asarray(known, dtype=float), np.nan), np.nan
-        )
+        known = np.ma.filled(np.ma.asarray(known, dtype=float), np.nan)
+        known = np.where(np.isfinite(z), known, np.nan)
+        far = _column(photometry, "distance")
         return at_their_distances(results, known, far, model.cosmology)
 
     def save_models(self, path, redshifts=None, *, overwrite=False):
@@ -325,15 +323,14 @@ class CigaleSetup:
         return save_models(self, path, redshifts, overwrite=overwrite)
 
     def write_results(self, results, path, *, overwrite=False):
-        """Write results as `write_cigale_results` does, with the names of this configuration."""
-        write_cigale_results(
-            results,
-            path,
-            variables=self.variables or None,
-            bands=self.bands | self.predicted,
-            modules=self.modules,
-            overwrite=overwrite,
-        )
+        """Write results as `write_cigale_results` does, with the variables of this configuration."""
+        variables = self.variables or None
+        write_cigale_results(results, path, variables=variables, overwrite=overwrite)
+
+
+def _column(table, name):
+    """A column of a table; None if it has none of this name."""
+    return table[name] if name in table.colnames else None
 
 
 def _by_redshift(fit, z, any_redshift):

@@ -14,7 +14,12 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from miricigale.fitting.interpolation import rows_of
-from miricigale.fitting.quantities import DERIVED_LEVELS, draws_summary
+from miricigale.fitting.quantities import (
+    DERIVED_LEVELS,
+    draws_summary,
+    node_shares,
+    put_draws,
+)
 from miricigale.fitting.samplers.run import best_scale, chi2_at, systematic_draws
 from miricigale.utils.random import stream
 
@@ -62,20 +67,13 @@ def between_nodes(models, engine, data, log_prior, n_draws, results):
         rng = np.random.default_rng(int(seeds[i]))
         one = _Object(models, engine, data[i : i + 1], wide.sigma[i], log_prior[i], rng)
         values, node, derived = one.population(index[i])
-        m = len(next(iter(values.values())))
         for j, name in enumerate(names):
-            pdf = new["pdf"][name]
-            pdf[i] = np.bincount(node[name], minlength=pdf.shape[1]) / m
+            new["pdf"][name][i] = node_shares((node[name],), new["pdf"][name].shape[1:])
             moments, quantiles = draws_summary(values[name])
             new["axis_moments"][i, j], new["axis_quantiles"][i, j] = moments[:2], quantiles
-        shape = new["pdf_2d"].shape[1:]
-        place = node["redshift"] * shape[1] + node.get("frac_agn", 0)
-        new["pdf_2d"][i] = np.bincount(place, minlength=shape[0] * shape[1]).reshape(shape) / m
-        for j, name in enumerate(results.quantities):
-            if name in derived:
-                with_log = np.isfinite(results.moments[i, j, 2])
-                found = draws_summary(derived[name], with_log=with_log)
-                new["moments"][i, j], new["quantiles"][i, j] = found
+        pair = node["redshift"], node.get("frac_agn", 0 * node["redshift"])
+        new["pdf_2d"][i] = node_shares(pair, new["pdf_2d"].shape[1:])
+        put_draws(results, new, i, derived)
     return results._changed(**new)
 
 
@@ -92,9 +90,8 @@ class _Object:
             self.known["redshift"] = data.redshift[0]
             del self.free["redshift"]
         elif "redshift" in self.free:
-            self.free["redshift"] = self.free["redshift"].with_weights(
-                np.exp(log_prior - log_prior.max())
-            )
+            weights = np.exp(log_prior - log_prior.max())
+            self.free["redshift"] = self.free["redshift"].with_weights(weights)
         self.size = 0.5
 
     def population(self, index):
@@ -126,9 +123,8 @@ class _Object:
         for name, axis in self.models.axes.items():
             if axis.kind in ("galaxy", "agn"):
                 # drawn from the prior where the model has none of its own
-                share = axis.share[:, g if axis.kind == "galaxy" else np.maximum(k, 0)].cumsum(
-                    axis=0
-                )
+                model = g if axis.kind == "galaxy" else np.maximum(k, 0)
+                share = axis.share[:, model].cumsum(axis=0)
                 node[name] = np.sum(rng.random(len(g)) * share[-1] >= share, axis=0)
         x = np.empty((len(z), len(self.free)))
         for j, (name, cells) in enumerate(self.free.items()):
@@ -137,10 +133,8 @@ class _Object:
 
     def _models(self, x):
         unit = ndtr(x)
-        values = {
-            name: cells.value(unit[:, j]) for j, (name, cells) in enumerate(self.free.items())
-        }
-        values |= {name: np.full(len(x), value) for name, value in self.known.items()}
+        values = {name: np.full(len(x), value) for name, value in self.known.items()}
+        values |= {n: cells.value(unit[:, j]) for j, (n, cells) in enumerate(self.free.items())}
         return self.models.models(values)
 
     def _likelihood(self, flux, z, sigma):

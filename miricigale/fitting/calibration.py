@@ -236,14 +236,12 @@ def measure_template_error(results, *, model_error=0.0, edges=None):
     flux, error, _, good = _residuals(results)
     error = np.hypot(error, np.array([own[name] for name in results.filters]) * flux)
     rest = _pivots(results.filters).value / (1.0 + results.best["redshift"].value[:, None])
-    wave, found = [], []
+    columns, wave, found = (flux, error, results.model_flux, results.model_flux_std), [], []
     for low, high in itertools.pairwise(edges):
         some = good & (rest >= low) & (rest < high)
-        if np.count_nonzero(some) < _N_BIN:
-            continue
-        wave.append(np.sqrt(low * high))
-        columns = flux, error, results.model_flux, results.model_flux_std
-        found.append(_excess(*(column[some] for column in columns)))
+        if np.count_nonzero(some) >= _N_BIN:
+            wave.append(np.sqrt(low * high))
+            found.append(_excess(*(column[some] for column in columns)))
     if not wave:
         raise argument_error("results", f"with {_N_BIN} fluxes of S/N above 5 in a bin", "fewer")
     return TemplateError(wave * WAVE, found)
@@ -322,15 +320,14 @@ def calibrate_zero_points(results, *, reference=None):
     if n[bands.index(reference)] < _N_BAND:
         wanted = f"a band with {_N_BAND} sources of S/N above 5"
         raise argument_error("reference", wanted, f"{reference} with {n[bands.index(reference)]}")
-    factor, scatter = np.ones(len(bands)), np.full(len(bands), np.nan)
-    for i in np.flatnonzero(n >= _N_BAND):
+    factor, scatter, known = np.ones(len(bands)), np.full(len(bands), np.nan), n >= _N_BAND
+    for i in np.flatnonzero(known):
         some = good[:, columns[i]]
         ratio = np.log(model[some, columns[i]] / flux[some, columns[i]])
         middle = np.median(ratio)
         factor[i] = np.exp(middle)
         # standard error of a median
         scatter[i] = np.sqrt(np.pi / (2.0 * n[i])) * np.median(np.abs(ratio - middle)) / _MEDIAN
-    known = n >= _N_BAND
     factor[known] /= factor[bands.index(reference)]
     texts = {
         "band": (np.array(bands), "band"),

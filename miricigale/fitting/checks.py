@@ -64,9 +64,9 @@ def mock_analysis(fitter, results, photometry, *, seed, model_error=False, **opt
         raise argument_error("photometry", "of the objects of 'results', in order", "others")
     if results.redshift_fixed and options.get("redshift") is None:
         raise argument_error("redshift", "given again: it was fixed in 'results'", "None")
-    noise = np.array(
-        [stream(seed, "mock", str(key)).normal(size=len(results.filters)) for key in results.ids]
-    ).reshape(results.flux.shape)
+    n_bands = len(results.filters)
+    noise = [stream(seed, "mock", str(key)).normal(size=n_bands) for key in results.ids]
+    noise = np.reshape(noise, results.flux.shape)
     error = results.sigma if model_error else results.flux_err
     used = np.isfinite(results.sigma) & results.fitted[:, None] & np.isfinite(error)
     change, drawn = used & ~results.limit, results.best_flux + noise * error
@@ -74,10 +74,8 @@ def mock_analysis(fitter, results, photometry, *, seed, model_error=False, **opt
     for name in filters:
         i = results.filters.index(name)
         mock[name] = np.where(change[:, i], drawn[:, i], flux_column(photometry, name)) * FNU
-    recovered = fitter.fit(mock, **options)
-    return MockResult(
-        results, recovered, mock, seed, {"seed": seed, "model_error": bool(model_error)}
-    )
+    meta = {"seed": seed, "model_error": bool(model_error)}
+    return MockResult(results, fitter.fit(mock, **options), mock, seed, meta)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -178,13 +176,9 @@ class MockResult:
         if self.truth.extensive(name):
             both = good & (true > 0) & (mean > 0)
             unit, difference = "dex", np.log10(mean[both] / true[both])
-        if not good.any():
-            return unit, 0, np.nan, np.nan, np.nan
-        offset, scatter = np.nan, np.nan
-        if difference.size:
-            offset, scatter = float(np.median(difference)), float(mad_std(difference))
-        coverage = float(np.mean(self._inside(name, good)))
-        return unit, int(np.count_nonzero(good)), offset, scatter, coverage
+        coverage = _statistic(np.mean, self._inside(name, good))
+        spread = (_statistic(function, difference) for function in (np.median, mad_std))
+        return unit, int(np.count_nonzero(good)), *spread, coverage
 
     def _inside(self, name, good):
         """Whether the truth of good objects lies in the 16-84 % interval."""
@@ -199,19 +193,10 @@ class MockResult:
         ends = self.recovered.percentile(name, _LEVELS).value[good]
         return (true >= ends[:, 0]) & (true <= ends[:, 1])
 
-    def plot(self, name, ax=None, **kwargs):
-        """Draw recovered against true values of a parameter; returns the axes."""
-        from miricigale.plotting.posteriors import plot_recovery
 
-        unit, log = self.truth.unit(name), self.truth.extensive(name)
-        kwargs = {"name": name, "unit": unit.to_string(), "log": log} | kwargs
-        return plot_recovery(
-            self.true(name).value,
-            self.recovered.mean(name).value,
-            self.recovered.std(name).value,
-            ax=ax,
-            **kwargs,
-        )
+def _statistic(function, values):
+    """A number that sums up some values; NaN of none."""
+    return float(function(values)) if len(values) else np.nan
 
 
 def leave_out(fitter, photometry, bands, *, separately=False, **options):
@@ -259,8 +244,7 @@ def leave_out(fitter, photometry, bands, *, separately=False, **options):
     groups = [(name,) for name in bands] if separately else [bands]
     fitted = [f for f in fitter.filters or fitter.bands if f in photometry.colnames]
     for group in groups:
-        left = [name for name in fitted if name not in group]
-        if len(left) < fitter.n_bands_min:
+        if len(set(fitted) - set(group)) < fitter.n_bands_min:
             wanted = f"such that n_bands_min = {fitter.n_bands_min} or more of {fitted} are left"
             raise argument_error("bands", wanted, f"{list(group)}")
     empty = [name for name, known in zip(bands, data.used.any(axis=0), strict=True) if not known]
@@ -271,11 +255,9 @@ def leave_out(fitter, photometry, bands, *, separately=False, **options):
         blank = QTable(photometry, copy=True)
         for name in group:
             blank[name] = np.full(len(blank), np.nan) * FNU
-            if f"{name}_limit" in blank.colnames:
-                blank[f"{name}_limit"] = np.zeros(len(blank), dtype=bool)
+            blank[f"{name}_limit"] = np.zeros(len(blank), dtype=bool)
         results |= dict.fromkeys(group, fitter.fit(blank, **options))
-    column = [fitter.bands.index(name) for name in bands]
-    fits = list(zip(results.values(), column, strict=True))
+    fits = [(found, found.filters.index(name)) for name, found in results.items()]
     return LeaveOutResult(
         bands=bands,
         flux=np.where(data.measured, data.flux, np.nan),
@@ -376,19 +358,7 @@ class LeaveOutResult:
 
     def _metric(self, i):
         good = np.isfinite(self.pull[:, i])
-        if not good.any():
-            return 0, np.nan, np.nan, np.nan, np.nan
         pull, flux, model = self.pull[good, i], self.flux[good, i], self.predicted[good, i]
-        ratio = flux[model > 0] / model[model > 0]
-        offset = float(np.median(ratio)) - 1.0 if ratio.size else np.nan
-        within = float(np.mean(np.abs(pull) <= 1.0))
-        return int(pull.size), offset, float(np.median(pull)), float(mad_std(pull)), within
-
-    def plot(self, band=None, ax=None, **kwargs):
-        """Draw the distribution of the pulls of one band, or of all; returns the axes."""
-        from miricigale.plotting.posteriors import plot_pulls
-
-        check_names(() if band is None else [band], "band that was left out", self.bands)
-        pull = self.pull if band is None else self.pull[:, self.bands.index(band)]
-        kwargs.setdefault("label", band)
-        return plot_pulls(pull.ravel(), ax=ax, **kwargs)
+        offset = _statistic(np.median, flux[model > 0] / model[model > 0]) - 1.0
+        spread = (_statistic(function, pull) for function in (np.median, mad_std))
+        return int(pull.size), offset, *spread, _statistic(np.mean, np.abs(pull) <= 1.0)

@@ -58,16 +58,19 @@ def fit_classes(path, output, *, quasars=False, stars=None, **options):
         # after the fit, which refuses what it cannot read before it loads the models
         from miricigale.sed import SEDModel, quasar_axes, template_grid
 
-        models = {}
+        options.pop("pairs", None)
         if quasars:
-            models["quasar"] = lambda _: (SEDModel.survey(), quasar_axes())
+            made = SEDModel.survey(), quasar_axes()
+            folder = Path(output) / "quasar"
+            found["quasar"] = fit_catalog(path, folder, models=lambda _: made, **options)
+        options.pop("redshift", None)
         if spectra is not None:
-            beyond = "rayleigh-jeans"
-            models["star"] = lambda bands: (template_grid(spectra, bands, beyond=beyond), None)
-        for name, make in models.items():
-            left = ("pairs", "redshift") if name == "star" else ("pairs",)
-            own = {key: value for key, value in options.items() if key not in left}
-            found[name] = fit_catalog(path, Path(output) / name, models=make, **own)
+
+            def templates(bands):
+                return template_grid(spectra, bands, beyond="rayleigh-jeans"), None
+
+            folder = Path(output) / "star"
+            found["star"] = fit_catalog(path, folder, models=templates, **options)
     return found
 
 
@@ -164,15 +167,14 @@ def classes_section(page, columns, names, ids, chi2):
         ax.hist(np.clip(ratio, -_SPAN, _SPAN), np.linspace(-_SPAN, _SPAN, 61), color="0.75")
         ax.axvline(0.0, color="0.3", lw=0.8)
         ax.set(xlabel=f"ln evidence, {name} over galaxy", ylabel="objects")
-    page.figure(
-        figure, "Evidence over that of galaxies; what is beyond stands in the outermost bins."
-    )
+    text = "Evidence over that of galaxies; what is beyond stands in the outermost bins."
+    page.figure(figure, text)
     surest = []
     for name in others:
         ratio, own = columns[f"log_ratio_{name}"], columns[f"reduced_chi2_{name}"]
         mine = np.flatnonzero(label == name)
         for i in mine[np.argsort(-ratio[mine], kind="stable")][:_LISTED]:
-            numbers = (f"{ratio[i]:+.1f}", f"{own[i]:.2f}", f"{chi2[i]:.2f}")
+            numbers = f"{ratio[i]:+.1f}", f"{own[i]:.2f}", f"{chi2[i]:.2f}"
             surest.append((str(ids[i]), name, *numbers))
     if surest:
         page.table(

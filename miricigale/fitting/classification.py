@@ -72,15 +72,13 @@ def class_columns(results, *, prior=None):
 
 def _check_same(whose, first, name, other):
     """Refuse fits of other objects or of other data."""
-    got = None
-    if len(first) != len(other) or np.any(np.asarray(first.ids) != np.asarray(other.ids)):
+    bands, got = first.fitted_filters, None
+    if not np.array_equal(first.ids, other.ids):
         got = "other objects"
-    elif set(first.fitted_filters) != set(other.fitted_filters):
+    elif set(bands) != set(other.fitted_filters):
         got = f"the bands {list(other.fitted_filters)}"
     else:
-        mine, theirs = (
-            [one.filters.index(band) for band in first.fitted_filters] for one in (first, other)
-        )
+        mine, theirs = ([one.filters.index(band) for band in bands] for one in (first, other))
         for values in ("flux", "flux_err", "limit"):
             a, b = getattr(first, values)[:, mine], getattr(other, values)[:, theirs]
             if not np.array_equal(a, b, equal_nan=values != "limit"):

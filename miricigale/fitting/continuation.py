@@ -91,9 +91,14 @@ class Continuation:
     @cached_property
     def errors(self):
         """Rms by band, (nb,), of ln flux, but for a factor, from nodes to edges of cells."""
-        flux = self.engine.galaxy[:, :: max(self.engine.grid.n_galaxies // 100, 1)]
+        flux = self.engine.galaxy[:, self._few]
         steps = (np.square(step) for step in self._steps(flux) if len(step))
         return np.sqrt(sum((np.median(one, axis=0) for one in steps), np.zeros(flux.shape[2])))
+
+    @property
+    def _few(self):
+        """Some hundred galaxies."""
+        return slice(None, None, max(self.engine.grid.n_galaxies // 100, 1))
 
     @cached_property
     def _same(self):
@@ -113,7 +118,7 @@ class Continuation:
                 yield part * self.nodes.kinds[kind].steps(name)
         if "frac_agn" in self.cells:
             frac = engine.grid.frac_agn
-            dust = engine.grid.dust_luminosity[:: max(self.engine.grid.n_galaxies // 100, 1), None]
+            dust = engine.grid.dust_luminosity[self._few, None]
             power = dust * frac / np.maximum(1.0 - frac, 1e-12)
             agn = np.median(engine.agn[z], axis=0)
             ln = np.log(some[z][:, None] + power[..., None] * agn + _TINY)
@@ -135,24 +140,18 @@ class Continuation:
     def at_redshift(self, redshift, node):
         """`GridEngine` of all models of the grid at one redshift; what else depends on it is that of a node."""
         engine, between = self.engine, self.finer.between(redshift)
-        template = engine.template_error
-        fluxes = {
-            kind: own.at_redshift(redshift, between, self._same[kind])
-            for kind, own in self.finer.kinds.items()
-        }
-        return replace(
-            engine,
-            **fluxes,
-            usable=engine.usable[node : node + 1],
-            template_error=None if template is None else template[node : node + 1],
-        )
+        new = {"usable": engine.usable[node : node + 1]}
+        for kind, own in self.finer.kinds.items():
+            new[kind] = own.at_redshift(redshift, between, self._same[kind])
+        if engine.template_error is not None:
+            new["template_error"] = engine.template_error[node : node + 1]
+        return replace(engine, **new)
 
     def fluxes(self, models):
         """Fluxes of one solar mass formed, shape (n, nb), and the AGN's power."""
-        frac = models.values.get(
-            "frac_agn", self.engine.grid.frac_agn[models.node.get("frac_agn", 0)]
-        )
-        return self.finer.fluxes(models.place, np.broadcast_to(frac, models.possible.shape))
+        at_node = self.engine.grid.frac_agn[models.node.get("frac_agn", 0)]
+        frac = np.broadcast_to(models.values.get("frac_agn", at_node), models.possible.shape)
+        return self.finer.fluxes(models.place, frac)
 
     def at_nodes(self, models, engine):
         """Fluxes at the nodes in whose cells models lie, by an engine of all redshifts or of one."""

@@ -29,7 +29,7 @@ from miricigale.utils.meta import provenance
 from miricigale.utils.parallel import chunks, parallel_map, single_threaded
 from miricigale.utils.random import check_seed
 from miricigale.utils.tables import error_column
-from miricigale.utils.units import FNU, check_count, is_number
+from miricigale.utils.units import FNU, check_count
 
 logger = logging.getLogger(__name__)
 
@@ -92,8 +92,6 @@ class BayesFitter(Interactive):
     n_bands_min : int, optional
         Objects with fewer usable bands, upper limits among them, are flagged and not fitted. One
         band at least must be no limit.
-    max_reduced_chi2 : float, optional
-        Above this reduced chi2 of the best model an object is flagged.
     compat : {"cigale"}, optional
         Reproduce choices of CIGALE that are not ours: no ``scale_error``, no result where the best
         chi2 is above 1417 (its weights, from which the best chi2 is not subtracted, all vanish;
@@ -154,13 +152,12 @@ class BayesFitter(Interactive):
         template_error=None,
         scale_error=None,
         n_bands_min=2,
-        max_reduced_chi2=100.0,
         compat=None,
         settings=None,
     ):
         on_grid = engine == "grid"
         kind = GridSettings if on_grid else SamplerSettings
-        settings = kind() if settings is None else settings
+        settings = settings or kind()
         if not isinstance(settings, kind):
             wanted = f"{kind.__name__} with engine={engine!r}"
             raise argument_error("settings", wanted, type(settings).__name__)
@@ -179,15 +176,12 @@ class BayesFitter(Interactive):
         if scale_error not in (None, True, False) or (compat and scale_error):
             wanted = "False with compat='cigale'" if compat else "True, False or None"
             raise argument_error("scale_error", wanted, repr(scale_error))
-        if not (is_number(max_reduced_chi2) and max_reduced_chi2 > 0):
-            raise argument_error("max_reduced_chi2", "positive", repr(max_reduced_chi2))
         self.engine, self.filters = engine, names
         self.model = None if isinstance(model, ModelGrid) else model
         scale_error = compat is None if scale_error is None else bool(scale_error)
         kind, more = (GridFit, of_grid) if on_grid else (SamplerFit, {"sampler": engine})
-        self.backend = kind.of_model(
-            model, filters, priors, settings, scale_error=scale_error, **more
-        )
+        more["scale_error"] = scale_error
+        self.backend = kind.of_model(model, filters, priors, settings, **more)
         self.bands, self.priors = self.backend.filters, self.backend.priors
         self.grid = self.backend.grid if on_grid else None
         if names is not None:
@@ -202,7 +196,6 @@ class BayesFitter(Interactive):
             per_band(error_floor, of_bands, "error_floor"),
             self.n_bands_min,
         )
-        self.max_reduced_chi2 = float(max_reduced_chi2)
 
     def _facts(self):
         return {
@@ -295,34 +288,38 @@ class BayesFitter(Interactive):
         `~astropy.units.UnitsError`
             If a flux column has no unit of flux density.
         """
-        photometry = self._table(photometry)
-        warn_of_codes(codes_of(photometry, self._reader.fitted(photometry)), "photometry", 2)
-        self.warn_of_bands(photometry, 2)
-        given = {"redshift": redshift, "redshift_prior": redshift_prior, "pairs": pairs}
+        known = {"redshift": redshift, "redshift_prior": redshift_prior}
         parallel = {"executor": executor, "progress_bar": progress_bar}
-        return self.fit_part(photometry, **given, seed=seed, chunk_size=chunk_size, **parallel)
+        options = {"pairs": pairs, "seed": seed, "chunk_size": chunk_size, "parallel": parallel}
+        return self.fit_part(self._table(photometry), **known, **options)
 
     __call__ = fit
 
     def _table(self, photometry):
-        """The catalog by our names; a band of ``filters`` that it lacks is a missing one of all objects."""
+        """
+        The catalog by our names, with what there is to warn of.
+
+        A band of ``filters`` that it lacks is a missing one of all objects.
+        """
         table = as_photometry(photometry, self.filters or self.bands)
         lost = [name for name in self.filters or () if name not in table.colnames]
-        if not lost or len(lost) == len(self.filters):
-            return table
-        text = f"the photometry has no {', '.join(lost)}: missing bands of all objects"
-        warnings.warn(text, FitWarning, stacklevel=3)
-        table = table.copy(copy_data=False)
-        for name in lost:
-            table[name] = table[error_column(name)] = np.full(len(table), np.nan) * FNU
+        if lost and len(lost) < len(self.filters):
+            text = f"the photometry has no {', '.join(lost)}: missing bands of all objects"
+            warnings.warn(text, FitWarning, stacklevel=3)
+            table = table.copy(copy_data=False)
+            for name in lost:
+                table[name] = table[error_column(name)] = np.full(len(table), np.nan) * FNU
+        warn_of_codes(codes_of(table, self._reader.fitted(table)), "photometry", 3)
+        self.warn_of_bands(table, 3)
         return table
 
-    def fit_part(self, photometry, *, pairs, seed, chunk_size=None, repeated=None, **options):
+    def fit_part(
+        self, photometry, *, pairs, seed, parallel, chunk_size=None, repeated=None, **known
+    ):
         """Do what `fit` does, without warnings; earlier parts of the catalog had the ``repeated`` rows."""
         size = self.backend.chunk_size if chunk_size is None else chunk_size
         size = check_count(size, "chunk_size")
         seed = None if self.engine == "grid" else check_seed(seed)
-        known = {name: options.pop(name) for name in ("redshift", "redshift_prior")}
         data, known, settings = self._prepare(photometry, **known, repeated=repeated)
         task = self.backend.task(pairs, seed, known)
         # the measured errors take no part, and what goes to other processes is kept small
@@ -331,13 +328,13 @@ class BayesFitter(Interactive):
         pieces = [(sent[some], known[some]) for some in rows]
         # for threads too, which share this setting with their process
         with single_threaded():
-            results = FitResults.concatenate(parallel_map(task, pieces, desc="fit", **options))
+            results = FitResults.concatenate(parallel_map(task, pieces, desc="fit", **parallel))
         logger.debug("fitted %d objects", len(data))
         settings |= {} if seed is None else {"seed": seed}
         fixed = settings["redshift"] == "fixed"
         edge = None if fixed else self.backend.edge_weight
         return results._changed(
-            flags=flags_of_fits(results, data.measured, self.max_reduced_chi2, edge),
+            flags=flags_of_fits(results, data.measured, edge),
             flux_err=data.flux_err,
             fitted_filters=tuple(settings["filters"]),
             redshift_fixed=fixed,
@@ -353,7 +350,7 @@ class BayesFitter(Interactive):
             text = f"{text}: {', '.join(unused)}"
             warnings.warn(text, FitWarning, stacklevel=stacklevel + 1)
 
-    def _prepare(self, photometry, *, redshift, redshift_prior, repeated=None):
+    def _prepare(self, photometry, redshift, redshift_prior, repeated=None):
         """Photometry with flags, what is known of the redshift of every object, and the settings."""
         filters = self._reader.fitted(photometry)
         if redshift is not None and redshift_prior is not None:
@@ -408,15 +405,9 @@ class BayesFitter(Interactive):
             msg = "draws of a sampler are in its results: fitter.fit(photometry).samples(id)"
             raise ValueError(msg)
         n_draws, seed = check_count(n_draws, "n_draws"), check_seed(seed)
-        photometry = self._table(photometry)
-        warn_of_codes(codes_of(photometry, self._reader.fitted(photometry)), "photometry", 2)
-        self.warn_of_bands(photometry, 2)
-        data, known, settings = self._prepare(
-            photometry, redshift=redshift, redshift_prior=redshift_prior
-        )
-        samples = self.backend.sample(
-            data, known, n_draws, seed, executor=executor, progress_bar=progress_bar
-        )
+        data, known, settings = self._prepare(self._table(photometry), redshift, redshift_prior)
+        parallel = {"executor": executor, "progress_bar": progress_bar}
+        samples = self.backend.sample(data, known, n_draws, seed, **parallel)
         cited = self.backend.provenance()["citations"]
         meta = provenance(citations=cited, fit=settings, seed=seed)
         return samples._changed(model=self.model, meta=meta)

@@ -5,11 +5,9 @@ import logging
 import warnings
 from pathlib import Path
 
-import numpy as np
-
-from miricigale.filters import Filter
 from miricigale.filters.catalog_files import MappedRows, as_catalog_map
 from miricigale.filters.photometry_table import band_columns
+from miricigale.fitting.likelihood import is_filter, unused_bands
 from miricigale.utils.exceptions import FitWarning, argument_error
 from miricigale.utils.row_files import open_rows
 from miricigale.utils.tables import error_column
@@ -89,49 +87,37 @@ def fit_catalog(
     unit = options.get("flux_unit")
     rows = open_catalog(path, chunk_rows, hdu=hdu, catalog_map=catalog_map, flux_unit=unit)
     names = rows.colnames
-    known = set(Filter.names())
-    bands = [
-        name
-        for name in names
-        if (name in known or name.startswith("sedpy.")) and error_column(name) in names
-    ]
+    bands = [name for name in names if is_filter(name) and error_column(name) in names]
     if not bands:
-        raise argument_error(
-            "photometry",
-            "a table with columns <filter> and <filter>_err ('miricigale filters' lists the names)",
-            f"columns {list(names)}",
-        )
+        wanted = "columns <filter> and <filter>_err ('miricigale filters' lists the names)"
+        raise argument_error("photometry", f"a table with {wanted}", f"columns {list(names)}")
     # heavy imports only after the file was checked
     from miricigale.fitting import BayesFitter, TemplateError, fit_file
-    from miricigale.fitting.likelihood import unused_bands
     from miricigale.sed import SEDModel
     from miricigale.sed.components import GalacticExtinction
 
     unused = unused_bands(rows.chunk(0), bands)
     if unused:
-        msg = (
-            f"bands of the photometry are not fitted, as their names ('miricigale filters') or "
-            f"errors are missing: {', '.join(unused)}"
-        )
+        why = "as their names ('miricigale filters') or errors are missing"
+        msg = f"bands of the photometry are not fitted, {why}: {', '.join(unused)}"
         warnings.warn(msg, FitWarning, stacklevel=2)
+    error, least = None, 0.1
     if axes == "survey":
-        model, nodes, least = SEDModel.survey(), SEDModel.survey_axes(), 0.0
-        error = TemplateError.survey() if model_error is None else None
+        model, nodes = SEDModel.survey(), SEDModel.survey_axes()
+        if model_error is None:
+            error, least = TemplateError.survey(), 0.0
     else:
-        model, nodes, least = SEDModel.yang2021(), SEDModel.yang2021_axes(axes), 0.1
-        error = None
+        model, nodes = SEDModel.yang2021(), SEDModel.yang2021_axes(axes)
     if models is not None:
         model, nodes = models(bands)
     elif error is not None:
-        log.warning(
-            "errors of the models: %.0f to %.0f %% of the flux by rest wavelength, measured on sources "
-            "of CEERS (TemplateError.survey)",
-            *(100 * np.array([error.error.min(), error.error.max()])),
-        )
+        part = 100 * error.error.min(), 100 * error.error.max()
+        text = "errors of the models: %.0f to %.0f %% of the flux by rest wavelength, measured on sources"
+        log.warning(f"{text} of CEERS (TemplateError.survey)", *part)
     if ebv and isinstance(model, SEDModel):
         dust = GalacticExtinction(ebv_galactic=ebv, beyond="transparent")
         model = SEDModel([*model.components, dust])
-    errors = {"model_error": least if model_error is None else model_error}
-    fitter = BayesFitter(model, bands, axes=nodes, template_error=error, **errors)
+    part = least if model_error is None else model_error
+    fitter = BayesFitter(model, bands, axes=nodes, template_error=error, model_error=part)
     options |= {"catalog_map": catalog_map, "hdu": hdu, "chunk_rows": chunk_rows}
     return fit_file(fitter, path, output, **options)

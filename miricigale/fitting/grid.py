@@ -104,9 +104,9 @@ class GridEngine:
     @property
     def n_models(self):
         """Number of different models that are evaluated or bounded."""
-        n_row = int(np.count_nonzero(self.usable))
         n_zero = int(self._zero_frac)
-        return n_row * (n_zero + self.grid.n_agn * (self.grid.frac_agn.size - n_zero))
+        n_each = n_zero + self.grid.n_agn * (self.grid.frac_agn.size - n_zero)
+        return int(np.count_nonzero(self.usable)) * n_each
 
     @property
     def size(self):
@@ -194,9 +194,8 @@ class GridEngine:
     def workspace(self, n_draws=0, joint=()):
         """Make the accumulators and work space of one worker (some tens of MB)."""
         size = (*self.size.values(), self.galaxy.shape[2])
-        return _core.make_sums(*size, n_draws, joint), *_core.make_workspace(
-            *size, int(self._zero_frac), _CAPACITY
-        )
+        space = _core.make_workspace(*size, int(self._zero_frac), _CAPACITY)
+        return _core.make_sums(*size, n_draws, joint), *space
 
     def fit(
         self,
@@ -240,7 +239,7 @@ class GridEngine:
         """
         n, n_bands = flux.shape
         data = np.where(np.isfinite(sigma), flux, 0.0)
-        inverse = np.zeros((n, n_bands)) if limit_sigma is None else 1.0 / limit_sigma
+        inverse = np.zeros((n, n_bands)) if limit is None else 1.0 / limit_sigma
         limit = np.where(inverse > 0, 0.0 if limit is None else limit, 0.0)
         log_prior = np.where(np.isfinite(log_prior), 2.0 * log_prior, -1e300)
         seeds = np.zeros(n, np.uint64) if seeds is None else np.array(seeds, np.uint64)
@@ -262,12 +261,10 @@ class GridEngine:
         for i in np.flatnonzero(log_prior.max(axis=1, initial=-1e300) > -1e200):
             target = _core.make_target(data[i], sigma[i], log_prior[i], self.template_error)
             limits = _core.make_limits(limit[i], inverse[i])
-            tables = self._tables_of(target)
+            given = self._tables_of(target), self._scales, self._request, target, limits
             sums.draws.state[0] = seeds[i]
             _core.clear(sums)
-            if target.norm[0] > 0.0 and _core.sum_up(
-                tables, self._scales, self._request, target, limits, *workspace, single=single
-            ):
+            if target.norm[0] > 0.0 and _core.sum_up(*given, *workspace, single=single):
                 self._summarize(target, limits, sums, out, i)
         return out
 

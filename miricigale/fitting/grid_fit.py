@@ -82,6 +82,7 @@ class GridFit:
         elif not isinstance(model, ModelGrid):
             raise argument_error("model", "a ModelGrid or an SEDModel", type(model).__name__)
         priors = grid_priors(grid, priors, prior_f=settings.prior_f)
+        bands = grid.filters if model is grid else filters
         engine = GridEngine(
             grid=grid,
             priors=priors,
@@ -89,9 +90,7 @@ class GridFit:
             galaxy=grid.galaxy,
             agn=grid.agn,
             usable=grid.allowed & (priors.galaxy > 0),
-            template_error=grid_errors(
-                template_error, grid.filters if model is grid else filters, grid.redshift
-            ),
+            template_error=grid_errors(template_error, bands, grid.redshift),
             mass_prior=sfr_log_prior(settings.sfr_prior, grid),
             rtol=float(settings.rtol),
             scale_error=scale_error,
@@ -130,12 +129,9 @@ class GridFit:
     @property
     def constants(self):
         """Parameters of the grid that have one value, which have no posterior: name to float."""
-        return {
-            name: float(plain(table[name])[0])
-            for table in (self.grid.galaxy_parameters, self.grid.agn_parameters)
-            for name in table.colnames
-            if name not in self.priors.axes and len(table)
-        }
+        tables = self.grid.galaxy_parameters, self.grid.agn_parameters
+        first = {name: plain(table[name])[:1] for table in tables for name in table.colnames}
+        return {n: float(v[0]) for n, v in first.items() if n not in self.priors.axes and v.size}
 
     def settings(self):
         """Return the settings of the fit as plain values."""
@@ -206,9 +202,8 @@ class GridFit:
         wanted = "of parameters of the grid ('sample' draws derived quantities jointly)"
         return check_pairs(pairs, self.priors.axes, self.constants, derived, wanted)
 
-    def task(self, pairs, seed, log_prior):
+    def task(self, pairs, _seed, _log_prior):
         """Function that fits a piece of the catalog; nothing is drawn, and the prior comes with it."""
-        del seed, log_prior
         return partial(self._fit_piece, self.check_pairs(pairs))
 
     def _fit_piece(self, pairs, piece):
@@ -269,10 +264,10 @@ class GridFit:
         if self.between is None:
             alone = np.minimum(out.galaxy.max(axis=1), pdf["redshift"].max(axis=1)) > _ALONE
             flags[alone & (out.galaxy.shape[1] > 1)] |= int(FitFlags.ONE_NODE)
+        if "frac_agn" in axes:
+            pdf["frac_agn"] = out.zf.sum(axis=1)
         for name, axis in axes.items():
-            if axis.kind == "frac_agn":
-                pdf[name] = out.zf.sum(axis=1)
-            elif axis.kind in ("galaxy", "agn"):
+            if axis.share is not None:
                 models = out.galaxy if axis.kind == "galaxy" else out.agn
                 # not a matrix product, whose last digits depend on how many rows there are
                 pdf[name] = np.einsum("ng,vg->nv", models, axis.share)
@@ -315,19 +310,17 @@ class GridFit:
     def _best(self, out):
         """Parameters and derived quantities of the best models: name to array."""
         grid = self.grid
-        ok = np.isfinite(out.chi2)
+        ok, known = np.isfinite(out.chi2), self.engine.quantities
         z, g, k, f = np.where(ok[:, None], out.index, 0).T
         frac = grid.frac_agn[f]
         values = {"redshift": grid.redshift[z], "frac_agn": frac}
         values |= {name: plain(column)[g] for name, column in grid.galaxy_parameters.items()}
-        for name, column in grid.agn_parameters.items():
+        for name, column in grid.agn_parameters.items() if grid.n_agn else ():
             # without AGN light there is no template
-            values[name] = np.where(frac > 0, plain(column)[k], np.nan) if grid.n_agn else None
+            values[name] = np.where(frac > 0, plain(column)[k], np.nan)
         best = {name: np.where(ok, values[name], np.nan) for name in self.priors.axes}
         scale = np.where(ok, out.best_scale, np.nan)
-        for name in self.engine.quantities.names:
-            best[name] = self.engine.quantities.evaluate(name, grid, g, k, frac, scale)
-        return best
+        return best | {n: known.evaluate(n, grid, g, k, frac, scale) for n in known.names}
 
     # ----------------------------------------------------------------------- draws
 
@@ -335,10 +328,8 @@ class GridFit:
         """`~miricigale.fitting.Samples` of objects; ``parallel`` is for `parallel_map`."""
         keys = [stream(seed, "fit", "draws", str(key)).integers(2**63) for key in data.ids]
         keys = np.array(keys, dtype=np.int64)
-        pieces = [
-            (data[rows], log_prior[rows], keys[rows])
-            for rows in list(chunks(len(data), 16)) or [slice(0, 0)]
-        ]
+        rows = list(chunks(len(data), 16)) or [slice(0, 0)]
+        pieces = [(data[some], log_prior[some], keys[some]) for some in rows]
         task = partial(_draw_piece, self.engine, n_draws)
         parts = parallel_map(task, pieces, desc="draws", **parallel)
         index, scale = (np.concatenate([part[i] for part in parts]) for i in (0, 1))

@@ -215,12 +215,10 @@ class Nodes:
         if of is not None:
             galaxy.insert(-1, of.galaxy)
             agn.append(of.agn)
-        kinds = {
-            kind: Kind.of_axes(
-                [a for a in axes.values() if a.kind == kind], grid.redshift, np.asarray(flux), rows
-            )
-            for kind, flux, rows in (("galaxy", grid.galaxy, galaxy), ("agn", grid.agn, agn))
-        }
+        kinds = {}
+        for kind, flux, rows in (("galaxy", grid.galaxy, galaxy), ("agn", grid.agn, agn)):
+            own = [axis for axis in axes.values() if axis.kind == kind]
+            kinds[kind] = Kind.of_axes(own, grid.redshift, np.asarray(flux), rows)
         axes = {name: replace(axis, share=None) for name, axis in axes.items()}
         return cls(axes, known, kinds, np.asarray(grid.allowed))
 
@@ -305,10 +303,8 @@ class Nodes:
     def those_of(self, grid, kind):
         """Which models of a kind are those of a grid with some of the nodes: shape (n_models,)."""
         own, other = self.kinds[kind], grid.kinds[kind]
-        places = [
-            np.abs(self.axes[name].values - grid.axes[name].values[:, None]).argmin(axis=1)
-            for name in own.names
-        ]
+        pairs = ((self.axes[name].values, grid.axes[name].values) for name in own.names)
+        places = [np.abs(mine - theirs[:, None]).argmin(axis=1) for mine, theirs in pairs]
         out = np.zeros(other.flux.shape[1], np.int64)
         if places:
             some = other.model >= 0
@@ -354,9 +350,8 @@ def finer_grid(model, grid, filters, constants, nodes):
         # the worst first, as far as there is memory
         for name in sorted((n for n in rms if rms[n] > _TOLERANCE), key=rms.get, reverse=True):
             halved = axes | {name: np.sort([*axes[name], *_middles(finer, name)])}
-            size = [
-                len(halved[n]) for n, a in nodes.axes.items() if a.kind in ("redshift", "galaxy")
-            ]
+            kinds = ("redshift", "galaxy")
+            size = [len(halved[n]) for n, a in nodes.axes.items() if a.kind in kinds]
             if 8 * len(filters) * np.prod(size) <= _LARGEST:
                 axes = halved
         if axes is before:

@@ -65,25 +65,24 @@ def read_results(path, *, rows=None):
     layouts, some = (_RESULTS, *_OLD_RESULTS), rows is not None
     with open_parts(path, layouts, wanted="fit results", memmap=some) as parts:
         text, table = parts.text, parts.table("RESULTS", rows=rows)
-        n = len(table)
-        columns = {
-            name: native(table[name]).reshape(n, *shape)
-            if name in table.colnames
-            else np.zeros((n, *shape))
-            for name, shape in text["shapes"].items()
-        }
+        columns = {}
+        for name, shape in text["shapes"].items():
+            full = native(table[name]) if name in table.colnames else np.zeros(0)
+            columns[name] = full.reshape(len(table), *shape)
         if parts.layout in _OLD_RESULTS:
             text = text | _old_facts(text["meta"].get("fit", {}), text["filters"])
         values = {name: tuple(text[name]) for name in _TUPLES}
-        values |= {name: text[name] for name in _FACTS}
-        values |= {name: array for name, array in columns.items() if ":" not in name}
-        for name in _DICTS:
-            own = (key for key in columns if key.startswith(f"{name}:"))
-            values[name] = {key.removeprefix(f"{name}:"): columns[key] for key in own}
+        values |= {name: text[name] for name in _FACTS} | {name: {} for name in _DICTS}
+        for key, array in columns.items():
+            name, _, part = key.partition(":")
+            if not part:
+                values[name] = array
+            elif name in _DICTS:
+                values[name][part] = array
         pairs = enumerate(text.get("pairs", ()))
         values["pairs"] = {tuple(names): columns[f"pair:{i}"] for i, names in pairs}
         values["units"] = tuple(u.Unit(unit) for unit in text["units"])
-        values["axes"] = _axes_from_plain(text["axes"])
+        values["axes"] = _axes_from_plain(text["axes"], {})
         results = FitResults(**values)
         return results._take(0) if text.get("single") else results
 
@@ -111,11 +110,8 @@ def write_samples(samples, path, *, overwrite=False):
         "n_draws": samples.n_draws,
     }
     table = Table(dict(samples._per_object()))
-    shares = {
-        f"SHARE{i}": np.asarray(axis.share, dtype=float)
-        for i, axis in enumerate(samples.axes.values())
-        if axis.share is not None
-    }
+    shares = {f"SHARE{i}": axis.share for i, axis in enumerate(samples.axes.values())}
+    shares = {name: np.asarray(x, dtype=float) for name, x in shares.items() if x is not None}
     parts = {"text": text, "arrays": shares, "tables": {"SAMPLES": table}}
     write_parts(path, _SAMPLES, shown=samples.to_table(), **parts, overwrite=overwrite)
 
@@ -126,15 +122,12 @@ def read_samples(path, grid, *, model=None):
         raise argument_error("grid", "the ModelGrid that was fitted", type(grid).__name__)
     with open_parts(path, (_SAMPLES,), wanted="samples") as parts:
         text, table = parts.text, parts.table("SAMPLES")
-        n, n_draws = len(table), int(text["n_draws"])
+        shape = len(table), int(text["n_draws"])
         columns = {name: native(table[name]) for name in ("ids", "flags", "index", "scale")}
-        columns["index"] = columns["index"].reshape(n, n_draws, 4)
-        columns["scale"] = columns["scale"].reshape(n, n_draws)
-        shares = {
-            name: parts.array(f"SHARE{i}")
-            for i, name in enumerate(text["axes"])
-            if f"SHARE{i}" in parts
-        }
+        columns["index"] = columns["index"].reshape(*shape, 4)
+        columns["scale"] = columns["scale"].reshape(shape)
+        names = {name: f"SHARE{i}" for i, name in enumerate(text["axes"])}
+        shares = {name: parts.array(key) for name, key in names.items() if key in parts}
         axes = _axes_from_plain(text["axes"], shares)
         known, whose, meta = text["grid"]["sha256"], text["grid"]["text"], text["meta"]
         # earlier files have it in the meta
@@ -151,17 +144,13 @@ def _axes_to_plain(axes):
     return {name: one | {"unit": u.Unit(one["unit"]).to_string()} for name, one in plain.items()}
 
 
-def _axes_from_plain(text, shares=None):
+def _axes_from_plain(text, shares):
     """Make axes of what `_axes_to_plain` returned; ``shares`` by name are part of them."""
+    kinds = {"values": np.array, "weights": np.array, "unit": u.Unit, "kind": str, "bounds": tuple}
     axes = {}
     for name, axis in text.items():
-        arrays = {key: np.array(axis[key]) for key in ("values", "weights")}
-        plain = {
-            "unit": u.Unit(axis["unit"]),
-            "kind": axis["kind"],
-            "bounds": tuple(axis["bounds"]),
-        }
-        axes[name] = GridAxis(name, **arrays, **plain, share=(shares or {}).get(name))
+        made = {key: kind(axis[key]) for key, kind in kinds.items()}
+        axes[name] = GridAxis(name, **made, share=shares.get(name))
     return axes
 
 
@@ -304,10 +293,10 @@ class FitResultsFiles:
 
     def __getitem__(self, key):
         """Return `FitResults` of a row or rows, or of an id that is text; others are not read."""
+        if isinstance(key, numbers.Integral):
+            return self[[key]][0]
         if isinstance(key, (slice, list)) or np.ndim(key):
             return self._rows(np.arange(len(self))[key])
-        if isinstance(key, numbers.Integral):
-            return self._rows(np.arange(len(self))[[key]])[0]
         return self._take(self.row(key))
 
     @property
@@ -358,8 +347,8 @@ class FitResultsFiles:
         meta = tables[0].meta
         for table in tables:
             table.meta = {}
-        out = tables[0] if len(tables) == 1 else vstack(tables, join_type="exact")
-        out.meta.update(meta)
+        out = vstack(tables, join_type="exact")
+        out.meta = meta
         return out
 
     def _tables(self, columns):

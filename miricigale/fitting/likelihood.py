@@ -11,8 +11,8 @@ from miricigale.utils.object_rows import ObjectRows, PerObject
 from miricigale.utils.tables import Flags, error_column, read_ids, require_columns
 from miricigale.utils.units import FNU, to_array
 
-#: S/N of the best model in all bands together below which an object is flagged.
-LOW_SIGNAL = 3.0
+#: S/N of the best model in all bands together below which an object is flagged, and reduced chi2 above which.
+LOW_SIGNAL, HIGH_CHI2 = 3.0, 100.0
 #: Least error in units of the flux: below it chi2 in double precision has no digits left.
 _LEAST_ERROR = 1e-6
 #: Least and largest error, and largest flux, in uJy; beyond, their squares are no numbers.
@@ -29,52 +29,44 @@ _KINDS = {"U": "text", "S": "text", "b": "true and false", "c": "complex numbers
 class FitFlags(Flags):
     """Flags of a fitted catalog; `FitFlags.UNFITTED` is the sum of those that prevent a fit."""
 
+    #: No usable band.
     NO_BAND = 1
-    """No usable band."""
+    #: Fewer usable bands, upper limits among them, than asked for.
     FEW_BANDS = 2
-    """Fewer usable bands, upper limits among them, than asked for."""
+    #: A flux whose error is zero, negative, not finite or beyond 1e-60 to 1e60 uJy; the band is left out.
     BAD_ERROR = 4
-    """A flux whose error is zero, negative, not finite or beyond 1e-60 to 1e60 uJy; the band is left
-    out."""
+    #: A fixed redshift was asked for and is missing, not finite or not positive.
     NO_REDSHIFT = 8
-    """A fixed redshift was asked for and is missing, not finite or not positive."""
+    #: The fixed redshift has no redshift of the grid within the tolerance.
     REDSHIFT_OUTSIDE = 16
-    """The fixed redshift has no redshift of the grid within the tolerance."""
+    #: The id occurred before; only its first row is fitted.
     DUPLICATE_ID = 32
-    """The id occurred before; only its first row is fitted."""
+    #: No model fits: the reduced chi2 of the best is above 100.
     HIGH_CHI2 = 64
-    """No model fits: the reduced chi2 of the best is above the limit."""
+    #: No model has a positive scale, the fluxes being zero or negative: the posterior is the prior.
     NO_SIGNAL = 128
-    """No model has a positive scale, the fluxes being zero or negative: the posterior is the prior."""
+    #: More than one per cent of the posterior lies on the first or last redshift.
     REDSHIFT_EDGE = 256
-    """More than one per cent of the posterior lies on the first or last redshift."""
+    #: No model is left by the age of the universe and the priors.
     NO_MODEL = 512
-    """No model is left by the age of the universe and the priors."""
-
+    #: A flux that is infinite or beyond 1e60 uJy; the band is left out.
     BAD_FLUX = 1024
-    """A flux that is infinite or beyond 1e60 uJy; the band is left out."""
-
+    #: Fewer fluxes than free parameters, the mass among them; limits are not counted.
     FEW_FOR_PARAMETERS = 2048
-    """Fewer fluxes than free parameters, the mass among them; limits are not counted."""
+    #: Upper limits and no flux: any model that is faint enough fits.
     ALL_LIMITS = 4096
-    """Upper limits and no flux: any model that is faint enough fits."""
-
+    #: With ``compat="cigale"``: the best chi2 is so high that every likelihood vanishes.
     NO_LIKELIHOOD = 8192
-    """With ``compat="cigale"``: the best chi2 is so high that every likelihood vanishes."""
-
+    #: The best model has S/N below 3 over all bands: take masses and luminosities from samples.
     LOW_SIGNAL = 16384
-    """The best model has S/N below 3 over all bands: take masses and luminosities from samples."""
-
+    #: More than 95 % of the posterior lies on one galaxy model at one redshift of the grid: it is coarse
+    #: for these data.
     ONE_NODE = 32768
-    """More than 95 % of the posterior lies on one galaxy model at one redshift of the grid: it is coarse
-    for these data."""
-
+    #: Less than 1 % of the posterior keeps ``max_dev_alpha_ox`` of CIGALE's module xray: the result is
+    #: without it.
     OFF_RELATION = 65536
-    """Less than 1 % of the posterior keeps ``max_dev_alpha_ox`` of CIGALE's module xray: the result is without
-    it."""
-
+    #: Bits with which a row has no result.
     UNFITTED = 1 | 2 | 8 | 16 | 32 | 512 | 4096 | 8192
-    """Bits with which a row has no result."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,16 +231,19 @@ def unused_bands(table, filters):
     A column is a band if it has an error ``<name>_err`` and both are in a unit of flux
     density, or if its name is that of a filter.
     """
-    known, columns = set(Filter.names()), set(table.colnames)
-    out = []
-    for name in table.colnames:
-        if name in filters:
-            continue
+    columns = set(table.colnames)
+
+    def measured(name):
         pair = (name, error_column(name))
-        measured = pair[1] in columns and all(_is_flux(table[c]) for c in pair)
-        if measured or name in known or name.startswith("sedpy."):
-            out.append(name)
-    return out
+        return columns.issuperset(pair) and all(_is_flux(table[column]) for column in pair)
+
+    others = (name for name in table.colnames if name not in filters)
+    return [name for name in others if is_filter(name) or measured(name)]
+
+
+def is_filter(name):
+    """Whether a column is called by a filter of the library."""
+    return name in Filter.names() or name.startswith("sedpy.")
 
 
 def _is_flux(column):
@@ -280,13 +275,9 @@ def limits(table, name):
         known = limit = np.zeros(len(table), dtype=bool)
     if plain.shape != (len(table),) or not np.all(known | mask):
         wanted = f"a table whose column {column!r} is boolean"
-        raise argument_error("photometry", wanted, _some(table[column]))
+        some = ", ".join(str(value) for value in values[:3])
+        raise argument_error("photometry", wanted, f"{some}, ...")
     return limit & ~mask
-
-
-def _some(column):
-    """First values of a column, for a message."""
-    return f"{', '.join(str(value) for value in column[:3])}, ..."
 
 
 def filter_names(argument, filters):
@@ -297,21 +288,17 @@ def filter_names(argument, filters):
 
 
 def per_band(value, filters, name):
-    """A setting by filter, dict of str to float: given as a number, by name or in their order."""
-    if isinstance(value, dict):
-        unknown = sorted(set(value) - set(filters))
-        if unknown:
-            raise argument_error(name, f"a dict with keys among {list(filters)}", f"{unknown}")
-        value = [value.get(f, 0.0) for f in filters]
-    if isinstance(value, (list, tuple)):
-        value = [float(to_array(v, u.dimensionless_unscaled, name, ndim=0)) for v in value]
+    """A setting by filter, dict of str to float: given as a number or by name."""
+    given = value if isinstance(value, dict) else dict.fromkeys(filters, value)
+    unknown = sorted(set(given) - set(filters))
+    if unknown:
+        raise argument_error(name, f"a dict with keys among {list(filters)}", f"{unknown}")
     # 10 % is 0.1
-    value = to_array(value, u.dimensionless_unscaled, name)
-    if value.shape not in ((), (len(filters),)):
-        raise argument_error(name, f"a number or {len(filters)} of them", f"shape {value.shape}")
-    if not np.all(np.isfinite(value) & (value >= 0)):
+    unit = u.dimensionless_unscaled
+    out = {f: float(to_array(given.get(f, 0.0), unit, name, ndim=0)) for f in filters}
+    if not all(np.isfinite(part) and part >= 0 for part in out.values()):
         raise argument_error(name, "finite and not negative", f"{value}")
-    return dict(zip(filters, np.broadcast_to(value, (len(filters),)).tolist(), strict=True))
+    return out
 
 
 def flux_column(table, name):
@@ -331,7 +318,7 @@ def flux_column(table, name):
     return array
 
 
-def flags_of_fits(results, measured, max_reduced_chi2, edge_weight):
+def flags_of_fits(results, measured, edge_weight):
     """
     Flags of results, with those that the fits show.
 
@@ -341,7 +328,7 @@ def flags_of_fits(results, measured, max_reduced_chi2, edge_weight):
     flags, fitted, pdf = np.array(results.flags), results.fitted, results.pdf["redshift"]
     signal = np.where(measured, results.best_flux / results.sigma, 0.0)
     with np.errstate(invalid="ignore"):
-        flags[fitted & (results.reduced_chi2 > max_reduced_chi2)] |= FitFlags.HIGH_CHI2
+        flags[fitted & (results.reduced_chi2 > HIGH_CHI2)] |= FitFlags.HIGH_CHI2
         flags[fitted & ~(results.best_scale > 0)] |= FitFlags.NO_SIGNAL
         faint = np.sqrt(np.sum(signal * signal, axis=1)) < LOW_SIGNAL
         flags[fitted & faint] |= FitFlags.LOW_SIGNAL

@@ -6,6 +6,8 @@ from miricigale.utils.exceptions import argument_error, unknown_name
 
 #: Letters of the engine's joint sums: redshift and fraction before galaxy, galaxy before AGN model.
 _LETTERS = {"redshift": "z", "frac_agn": "f", "galaxy": "g", "agn": "k"}
+#: Bins of the distribution of a derived quantity in draws.
+_N_BINS = 30
 #: The pair that every fit has.
 _ALWAYS = {"redshift", "frac_agn"}
 
@@ -82,20 +84,18 @@ def randomized_ranks(pdf, node, draw):
     return upto - own * np.asarray(draw)
 
 
-def bin_edges(values, bins, *, log=False):
+def bin_edges(values, *, log):
     """
-    Edges of bins, or those given: a number of bins lies between the least and the largest value.
+    Edges of 30 bins between the least and the largest value.
 
     They have equal widths, in the logarithm with ``log``, if all values are above 0.
     """
-    if np.ndim(bins):
-        return np.asarray(bins, dtype=float)
     low, high = np.nanmin(values), np.nanmax(values)
     # equal values get a narrow bin
     high = max(high, low + 1e-6 * max(abs(low), 1e-30))
     if not (log and low > 0):
-        return np.linspace(low, high, int(bins) + 1)
-    edges = np.geomspace(low, high, int(bins) + 1)
+        return np.linspace(low, high, _N_BINS + 1)
+    edges = np.geomspace(low, high, _N_BINS + 1)
     edges[[0, -1]] = low, high
     return edges
 
@@ -109,13 +109,13 @@ def check_pairs(pairs, axes, constant, derived, wanted):
     whatever its order, without redshift and AGN fraction, which every fit has. Unknown names are a
     `KeyError`, what is no pair of different parameters with several values a `ValueError`.
     """
-    if isinstance(pairs, (str, dict)) or not np.iterable(() if pairs is None else pairs):
-        raise argument_error("pairs", "a list of pairs of parameter names", repr(pairs))
-    out = {}
-    for pair in () if pairs is None else pairs:
+    pairs, of_names, out = () if pairs is None else pairs, "a list of pairs of parameter names", {}
+    if isinstance(pairs, (str, dict)) or not np.iterable(pairs):
+        raise argument_error("pairs", of_names, repr(pairs))
+    for pair in pairs:
         names = () if isinstance(pair, (str, dict)) or not np.iterable(pair) else tuple(pair)
         if len(names) != 2 or not all(isinstance(name, str) for name in names):
-            raise argument_error("pairs", "a list of pairs of parameter names", f"{pair!r} in it")
+            raise argument_error("pairs", of_names, f"{pair!r} in it")
         for name in names:
             if name in derived:
                 raise argument_error("pairs", wanted, repr(name))
@@ -160,8 +160,7 @@ def joint_tables(out, pairs, axes):
     for x, y in pairs:
         a, b = axes[x], axes[y]
         letters, turned = _letters(a, b)
-        if turned:
-            a, b = b, a
+        a, b = (b, a) if turned else (a, b)
         if letters[0] == letters[1]:
             table = _shared(out.galaxy if letters == "gg" else out.agn, a.share, b.share)
         else:
@@ -171,11 +170,8 @@ def joint_tables(out, pairs, axes):
             table = folded[letters, b.name]
             if a.share is not None:
                 table = _fold(table.swapaxes(1, 2), a.share).swapaxes(1, 2)
-        if turned:
-            table = table.swapaxes(1, 2)
-        table = np.array(table, order="C")
-        table[np.isnan(out.chi2)] = np.nan
-        tables[x, y] = table
+        tables[x, y] = np.array(table.swapaxes(1, 2) if turned else table, order="C")
+        tables[x, y][np.isnan(out.chi2)] = np.nan
     return tables
 
 

@@ -1,6 +1,6 @@
 """Priors of the parameters of a grid, in weights of the nodes, and what is known of redshifts."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import astropy.units as u
@@ -12,6 +12,9 @@ from miricigale.fitting.quantities import plain
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_choice, check_names
 from miricigale.utils.units import MASS, is_number, to_array
+
+#: Power, peak at magnitude 24 and its change with each magnitude of `magnitude_prior`.
+_POWER, _PEAK, _SLOPE = 0.90, 0.62, 0.066
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +129,7 @@ def _add_axis(axes, name, column, kind, priors, bounds, rows=None, nodes=None):
     if rows is not None:
         share[:, rows] = axis.weights[:, None]
         factor[rows] = values.size
-    axes[name] = GridAxis(name, values, unit, kind, axis.weights, share, axis.bounds)
+    axes[name] = replace(axis, share=share)
     return factor
 
 
@@ -141,7 +144,9 @@ def _axis(name, values, unit, kind, priors, bounds=(-np.inf, np.inf)):
             raise argument_error(argument, wanted, repr(prior))
         weights = 1.0 / values
     elif callable(prior) or hasattr(prior, "pdf"):
-        weights = _density(getattr(prior, "pdf", prior), values, argument)
+        density = getattr(prior, "pdf", prior)
+        weights = [density(value) for value in values.tolist()]
+        weights = to_array(weights, u.dimensionless_unscaled, argument)
     else:
         weights = to_array(prior, u.dimensionless_unscaled, argument)
     if weights.shape != values.shape:
@@ -150,17 +155,6 @@ def _axis(name, values, unit, kind, priors, bounds=(-np.inf, np.inf)):
     if not np.all(np.isfinite(weights) & (weights >= 0)) or not weights.sum() > 0:
         raise argument_error(argument, "finite, >= 0 and not all 0", f"{weights}")
     return GridAxis(name, values, unit, kind, weights / weights.sum(), None, bounds)
-
-
-def _density(function, values, argument):
-    """Values of a function of an array, or of one value at a time."""
-    try:
-        density = function(values)
-    except (TypeError, ValueError):
-        density = None
-    if np.shape(density) != values.shape:
-        density = [function(value) for value in values.tolist()]
-    return to_array(density, u.dimensionless_unscaled, argument)
 
 
 def _inert(grid):
@@ -194,27 +188,21 @@ def known_redshifts(photometry, redshift):
     return np.where(np.isfinite(values) & (values > 0), values, np.nan)
 
 
-def magnitude_prior(
-    magnitude, redshift=None, *, power=0.90, peak=0.62, slope=0.066, pivot=24.0 * u.ABmag
-):
+def magnitude_prior(magnitude, redshift=None):
     """
     Density of redshift of galaxies of a magnitude, for ``redshift_prior`` of `BayesFitter.fit`.
 
-    z^a exp(-(z / z_m)^a) with its peak at z_m = ``peak`` + ``slope`` (m - ``pivot``), the form of Benitez 2000
-    (ApJ 536, 571, eq. 24), without types. The defaults are the fit of greatest likelihood to the 2302 sources of
+    z^a exp(-(z / z_m)^a) with its peak at z_m = 0.62 + 0.066 (m - 24) and a = 0.90, the form of Benitez 2000
+    (ApJ 536, 571, eq. 24), without types. The numbers are the fit of greatest likelihood to the 2302 sources of
     CEERS of S/N above 3 in F160W, magnitude 20 to 28, whose redshifts Lisiecki et al. 2025 published; it is broad,
     with 16 and 84 % at redshift 0.5 and 2.6 at magnitude 24.5.
 
     Parameters
     ----------
     magnitude : `~astropy.units.Quantity`, shape (n,)
-        AB magnitudes in F160W, or fluxes; where it is not finite the prior is that of the pivot.
+        AB magnitudes in F160W, or fluxes; where it is not finite the prior is that of magnitude 24.
     redshift : array_like, shape (n_z,), optional
         Redshifts at which the density is given: 0 to 15 by default.
-    power, peak, slope : float, optional
-        a, and z_m at the pivot and its change with each magnitude.
-    pivot : `~astropy.units.Quantity`, optional
-        AB magnitude.
 
     Returns
     -------
@@ -227,19 +215,14 @@ def magnitude_prior(
     ------
     `~astropy.units.UnitsError`
         If magnitudes have no unit.
-    ValueError
-        If ``power`` or ``peak`` is not above 0.
     """
-    for name, value in (("power", power), ("peak", peak)):
-        if not value > 0:
-            raise argument_error(name, "above 0", repr(value))
     with np.errstate(divide="ignore", invalid="ignore"):
         values = u.Quantity(magnitude, subok=True).to(u.ABmag).value
-    apart = np.atleast_1d(values).astype(float) - u.Quantity(pivot, subok=True).to(u.ABmag).value
+    apart = np.atleast_1d(values).astype(float) - 24.0
     z = np.linspace(0.0, 15.0, 751) if redshift is None else np.asarray(redshift, dtype=float)
     # bright galaxies are not all at 0
-    top = np.maximum(peak + slope * np.where(np.isfinite(apart), apart, 0.0), 0.1 * peak)[:, None]
-    density = z**power * np.exp(-((z / top) ** power))
+    top = np.maximum(_PEAK + _SLOPE * np.where(np.isfinite(apart), apart, 0.0), 0.1 * _PEAK)
+    density = z**_POWER * np.exp(-((z / top[:, None]) ** _POWER))
     return z, density / np.trapezoid(density, z, axis=1)[:, None]
 
 
@@ -252,10 +235,10 @@ def sfr_log_prior(sfr_prior, grid):
     """
     if sfr_prior is None:
         return None
-    wanted = "a function of stellar mass and redshift, and a scatter in dex above 0"
-    pair = sfr_prior if isinstance(sfr_prior, tuple) and len(sfr_prior) == 2 else (None, None)
-    relation, scatter = pair
+    pair = isinstance(sfr_prior, tuple) and len(sfr_prior) == 2
+    relation, scatter = sfr_prior if pair else (None, None)
     if not (callable(relation) and is_number(scatter) and scatter > 0):
+        wanted = "a function of stellar mass and redshift, and a scatter in dex above 0"
         raise argument_error("sfr_prior", wanted, repr(sfr_prior))
     rate = grid.galaxy_properties["sfr_100myr"].to_value(u.Msun / u.yr / MASS)
     stars = plain(grid.galaxy_properties["stellar_mass"])
@@ -268,10 +251,9 @@ def expected_sfr(relation, mass, redshift):
     bad = ~((rate > 0) & np.isfinite(rate))
     if np.any(bad):
         # a rate of 0 would leave no galaxy any prior
-        values, mass, z = (
-            x[bad][0] for x in np.broadcast_arrays(rate, mass.to_value(MASS), redshift)
-        )
-        got = f"{values:g} Msun/yr at {mass:.3g} Msun and redshift {z:g}"
+        every = np.broadcast_arrays(rate, mass.to_value(MASS), redshift)
+        value, mass, z = (array[bad][0] for array in every)
+        got = f"{value:g} Msun/yr at {mass:.3g} Msun and redshift {z:g}"
         raise argument_error("sfr_prior", "a relation to rates above 0 and finite", got)
     return rate
 
@@ -294,10 +276,9 @@ def read_density(redshift_prior, n):
     wanted = "(redshifts of shape (n_z,), densities of shape (n_z,) or (n, n_z))"
     if not (isinstance(redshift_prior, tuple) and len(redshift_prior) == 2):
         raise argument_error("redshift_prior", wanted, type(redshift_prior).__name__)
-    nodes = _unmasked(redshift_prior[0], "redshift_prior[0]")
-    density = _unmasked(redshift_prior[1], "redshift_prior[1]")
-    shapes = f"shapes {nodes.shape} and {density.shape}"
+    nodes, density = (_unmasked(redshift_prior[i], f"redshift_prior[{i}]") for i in (0, 1))
     if nodes.ndim != 1 or nodes.size < 2 or density.shape not in (nodes.shape, (n, nodes.size)):
+        shapes = f"shapes {nodes.shape} and {density.shape}"
         raise argument_error("redshift_prior", wanted, shapes)
     if not np.all(np.diff(nodes) > 0) or not nodes[0] >= 0:
         raise argument_error("redshift_prior[0]", ">= 0 and ascending", f"{nodes}")

@@ -51,6 +51,21 @@ def draws_summary(value, *, with_log=True):
     return np.array([value.mean(), value.std(), log]), np.quantile(value, DERIVED_LEVELS)
 
 
+def put_draws(results, new, i, values):
+    """Put moments and quantiles of derived quantities of draws, by name, into arrays of results, row ``i``."""
+    for j, name in enumerate(results.quantities):
+        if name in values:
+            with_log = np.isfinite(results.moments[i, j, 2])
+            found = draws_summary(values[name], with_log=with_log)
+            new["moments"][i, j], new["quantiles"][i, j] = found
+
+
+def node_shares(nodes, shape):
+    """Part of the draws at each combination of nodes: arrays of indices, one for each axis of ``shape``."""
+    place = np.ravel_multi_index(nodes, shape)
+    return np.bincount(place, minlength=np.prod(shape)).reshape(shape) / len(place)
+
+
 def kept_percentiles(name, levels, kept):
     """
     Percentiles of a quantity, shape (n, n_levels), linear between its kept quantiles.
@@ -86,11 +101,8 @@ class ShapeQuantities:
             finite = np.flatnonzero(np.isfinite(row))
             order = finite[np.argsort(row[finite], kind="stable")]
             value = row[order]
-            if value.size == 0:
-                out.append((order, np.zeros(0, int), value))
-                continue
-            step = np.diff(value) > _SAME * (value[-1] - value[0])
-            start = np.concatenate([[0], np.flatnonzero(step) + 1])
+            width = np.ptp(value) if value.size else 0.0
+            start = np.flatnonzero(np.diff(value, prepend=-np.inf) > _SAME * width)
             out.append((order, start, value[start]))
         return out
 
@@ -102,9 +114,8 @@ class ShapeQuantities:
         quantiles, at ``levels``, those of the distribution over the different values, linear within each
         cell. Rows of NaN give NaN.
         """
-        n = len(weights)
-        out = np.full((n, len(self.names), 3), np.nan)
-        quantiles = np.full((n, len(self.names), len(levels)), np.nan)
+        shape = len(weights), len(self.names)
+        out, quantiles = np.full((*shape, 3), np.nan), np.full((*shape, len(levels)), np.nan)
         for i, (order, start, nodes) in enumerate(self._nodes):
             if nodes.size == 0:
                 continue
@@ -144,7 +155,7 @@ class OtherFraction:
         of_galaxy = "ir_luminosity" if by_dust else "dust_luminosity"
         of_agn = "ir_luminosity" if by_dust else "agn_power"
         tables = (grid.galaxy_properties, of_galaxy), (grid.agn_properties, of_agn)
-        if not grid.n_agn or any(column not in table.colnames for table, column in tables):
+        if not (grid.n_agn and all(column in table.colnames for table, column in tables)):
             return None
         galaxy, agn = (_in_watt(table[column])[0] for table, column in tables)
         reference = grid.dust_luminosity
@@ -245,21 +256,19 @@ class Quantities:
 
         Indices and numbers have one shape, and the values have it too; a scale of NaN gives NaN.
         """
-        i = self.names.index(name)
-        n_galaxy, n_agn, of = len(self.galaxy_scale), len(self.agn_scale), self.fraction
-        if i < n_galaxy:
+        i, n, of = self.names.index(name), len(self.galaxy_scale), self.fraction
+        if i < n:
             return scale * self.galaxy_scale[i][g]
-        if name in self.intensive:
-            if name in self.shape.names:
-                values = self.shape.values[i - n_galaxy - n_agn - 1][g]
-            else:
-                y = frac / (1.0 - frac) * of.galaxy[g] * of.agn[k]
-                values = y / (1.0 + y)
-            # no value where there is no model
+        # no value where there is no model
+        if name in self.shape.names:
+            values = self.shape.values[self.shape.names.index(name)][g]
             return np.where(np.isfinite(scale), values, np.nan)
+        if of is not None and name == of.name:
+            y = frac / (1.0 - frac) * of.galaxy[g] * of.agn[k]
+            return np.where(np.isfinite(scale), y / (1.0 + y), np.nan)
         power = scale * frac / (1.0 - frac) * grid.dust_luminosity[g]
-        if i < n_galaxy + n_agn:
-            return power * self.agn_scale[i - n_galaxy][k]
+        if i < n + len(self.agn_scale):
+            return power * self.agn_scale[i - n][k]
         mixed = scale * self.mixed_galaxy[g]
         return mixed + power * self.mixed_agn[k] if self.mixed_agn.size else mixed
 

@@ -441,13 +441,12 @@ class FitResults(FitRows):
         names = filter_names("filters", self.filters if filters is None else filters)
         check_names(names, "filter of the models", self.filters)
         for name in names:
-            mean, std, best = (
-                array[:, self.filters.index(name)] * FNU
-                for array in (some.model_flux, some.model_flux_std, some.best_flux)
-            )
-            columns[name] = (mean, "posterior mean of the model flux")
-            columns[error_column(name)] = (std, "its posterior standard deviation")
-            columns[f"{name}_best"] = (best, "flux of the best model")
+            for column, array, text in (
+                (name, some.model_flux, "posterior mean of the model flux"),
+                (error_column(name), some.model_flux_std, "its posterior standard deviation"),
+                (f"{name}_best", some.best_flux, "flux of the best model"),
+            ):
+                columns[column] = (array[:, self.filters.index(name)] * FNU, text)
         return described_table(columns, dict(self.meta))
 
     # ---------------------------------------------------------------- single objects

@@ -98,9 +98,9 @@ model : `~miricigale.sed.SEDModel`, optional
         if len(shape) != 2 or shape[0] != n or shape[1] < 1:
             raise argument_error("scale", f"of shape ({n}, n_draws)", f"{shape}")
         for name, wanted in (("index", (*shape, 4)), ("flags", (n,))):
-            if np.shape(getattr(self, name)) != wanted:
-                got = f"{np.shape(getattr(self, name))}"
-                raise argument_error(name, f"of shape {wanted}", got)
+            got = np.shape(getattr(self, name))
+            if got != wanted:
+                raise argument_error(name, f"of shape {wanted}", f"{got}")
         sizes = (grid.redshift.size, grid.n_galaxies, max(grid.n_agn, 1), grid.frac_agn.size)
         drawn = index[(index[:, :, 0] >= 0).all(axis=1)].reshape(-1, 4)
         if np.any(drawn < [0, 0, -1, 0]) or np.any(drawn >= sizes):
@@ -131,10 +131,8 @@ model : `~miricigale.sed.SEDModel`, optional
 
     @property
     def _fractions(self):
-        have = self._quantities.names
-        return [
-            name for name, parts in FRACTIONS.items() if all(part in have for part in parts[1:])
-        ]
+        have = set(self._quantities.names)
+        return [name for name, parts in FRACTIONS.items() if have.issuperset(parts[1:])]
 
     @property
     def parameters(self):
@@ -154,21 +152,18 @@ model : `~miricigale.sed.SEDModel`, optional
             return u.Unit(self.axes[name].unit)
         check_names([name], "parameter", self.parameters)
         known = self._quantities
-        if name in self._fractions:
+        if name in FRACTIONS:
             return u.dimensionless_unscaled
         return known.units[known.names.index(name)]
 
     def description(self, name):
         """One line on a parameter or derived quantity."""
         known = self._quantities
-        if name in FRACTIONS:
-            return FRACTIONS[name][0]
-        if name in known.names:
-            return known.descriptions[known.names.index(name)]
+        texts = dict(zip(known.names, known.descriptions, strict=True))
+        texts |= {name: parts[0] for name, parts in FRACTIONS.items()}
         for table in (self.grid.galaxy_parameters, self.grid.agn_parameters):
-            if name in table.colnames and table[name].info.description:
-                return table[name].info.description
-        return name
+            texts |= {one: table[one].info.description for one in table.colnames}
+        return texts.get(name) or name
 
     def values(self, name):
         """
@@ -195,8 +190,9 @@ model : `~miricigale.sed.SEDModel`, optional
         if axis is None:
             frac = grid.frac_agn[f]
             return self._quantities.evaluate(name, grid, g, np.maximum(k, 0), frac, self.scale)
-        if axis.kind in ("redshift", "frac_agn"):
-            return grid.redshift[z] if axis.kind == "redshift" else grid.frac_agn[f]
+        values = {"redshift": grid.redshift[z], "frac_agn": grid.frac_agn[f]}
+        if axis.kind in values:
+            return values[axis.kind]
         return self._of_axis(axis, g if axis.kind == "galaxy" else k)
 
     def _of_axis(self, axis, model):
@@ -265,7 +261,7 @@ model : `~miricigale.sed.SEDModel`, optional
 
     # -------------------------------------------------------------- distributions
 
-    def pdf(self, name, key, *, bins=30):
+    def pdf(self, name, key):
         """
         Distribution of a parameter or derived quantity of one object.
 
@@ -273,21 +269,19 @@ model : `~miricigale.sed.SEDModel`, optional
         ----------
         name, key : str and object
             A parameter or derived quantity, and the id of the object.
-        bins : int or array_like, optional
-            Number or edges of the bins of derived quantities. Those of parameters of the grid
-            are the cells around its nodes.
 
         Returns
         -------
         edges : `~astropy.units.Quantity`, shape (n_bins + 1,)
-            Bins of equal width, in the logarithm where a quantity scales with mass.
+            Of parameters of the grid the cells around its nodes; of derived quantities 30 bins of equal
+            width, in the logarithm where they scale with mass.
         weights : `~numpy.ndarray`, shape (n_bins,)
             Part of the draws in each.
         """
-        values, edges = self._binned(name, key, bins)
+        values, edges = self._binned(name, key)
         return edges * self.unit(name), np.histogram(values, edges)[0] / self.n_draws
 
-    def pdf_2d(self, a, b, key, *, bins=30):
+    def pdf_2d(self, a, b, key):
         """
         Joint distribution of two parameters or derived quantities of one object.
 
@@ -295,36 +289,31 @@ model : `~miricigale.sed.SEDModel`, optional
         ----------
         a, b : str
             Parameters or derived quantities.
-        key, bins : optional
-            See `pdf`.
+        key : object
+            Id of the object.
 
         Returns
         -------
         a_edges, b_edges : `~astropy.units.Quantity`, shapes (n_a + 1,) and (n_b + 1,)
-            Edges of the cells.
+            Edges of the cells; see `pdf`.
         weights : `~numpy.ndarray`, shape (n_a, n_b)
             Part of the draws in each; the draws without a value (parameters of an AGN that is
             not there) are in none.
         """
-        x, x_edges = self._binned(a, key, bins)
-        y, y_edges = self._binned(b, key, bins)
+        (x, x_edges), (y, y_edges) = (self._binned(name, key) for name in (a, b))
         part = np.full(self.n_draws, 1.0 / self.n_draws)
         weights = np.histogram2d(x, y, (x_edges, y_edges), weights=part)[0]
         return x_edges * self.unit(a), y_edges * self.unit(b), weights
 
-    def _binned(self, name, key, bins):
+    def _binned(self, name, key):
         """Values in the draws of an object, and edges of the cells."""
-        unit, values = self.unit(name), self.loc[key]._fitted_one().values(name).value
+        values, known = self.loc[key]._fitted_one().values(name).value, self._quantities
         if name in self.axes:
             return values, cell_edges(self.axes[name].values, self.axes[name].bounds)
-        if not np.isfinite(values).any() and not np.ndim(bins):
+        if not np.isfinite(values).any():
             raise argument_error("name", "one with values in the draws", repr(name))
-        bins = bins.to_value(unit) if hasattr(bins, "unit") else bins
-        return values, bin_edges(values, bins, log=self._extensive(name))
-
-    def _extensive(self, name):
-        known = self._quantities
-        return name in known.names and name not in known.intensive
+        extensive = name in known.names and name not in known.intensive
+        return values, bin_edges(values, log=extensive)
 
     # ---------------------------------------------------------- fluxes and spectra
 
@@ -455,11 +444,11 @@ model : `~miricigale.sed.SEDModel`, optional
         bands = [table[name] for name in table.colnames[1:]]
         return plot_sed_band(table["wave"], bands, ax=ax, rest=rest, **kwargs)
 
-    def plot_pdf2d(self, key, a="redshift", b="frac_agn", ax=None, *, bins=30, **kwargs):
+    def plot_pdf2d(self, key, a="redshift", b="frac_agn", ax=None, **kwargs):
         """Draw the joint distribution of two parameters of an object; returns the axes."""
         from miricigale.plotting.posteriors import plot_pdf_2d
 
-        a_edges, b_edges, weights = self.pdf_2d(a, b, key, bins=bins)
+        a_edges, b_edges, weights = self.pdf_2d(a, b, key)
         kwargs.setdefault("labels", tuple(labeled(name, self.unit(name)) for name in (a, b)))
         return plot_pdf_2d(a_edges.value, b_edges.value, weights, ax=ax, **kwargs)
 

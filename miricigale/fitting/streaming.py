@@ -14,6 +14,7 @@ from miricigale.filters.catalog_files import codes_of, joined_codes, warn_of_cod
 from miricigale.fitting.fitter import BayesFitter
 from miricigale.fitting.from_files import open_catalog
 from miricigale.fitting.io import FORMAT, FitFolder, open_results, part_ids, part_name
+from miricigale.fitting.likelihood import HIGH_CHI2
 from miricigale.utils.content import content_sha256
 from miricigale.utils.exceptions import CatalogWarning, OtherResultsError, argument_error
 from miricigale.utils.progress import progress
@@ -135,8 +136,7 @@ def fit_file(
     take = _pieces(rows, options, unit, fluxes)
     _check_ids(rows)
     given = {"hdu": hdu, "flux_unit": None if unit is None else unit.to_string()}
-    if catalog_map is not None:
-        given["map"] = rows.map.settings()
+    given |= {} if catalog_map is None else {"map": rows.map.settings()}
     job = _job(fitter, rows, options | {"seed": seed}, given)
     with FitFolder(path_out) as folder:
         _begin(folder, job, resume)
@@ -180,9 +180,8 @@ def _fit_parts(fitter, rows, take, folder, seed, executor, progress_bar):
                     if not n_new:
                         # which holds for all pieces: to the caller of fit_file
                         fitter.warn_of_bands(table, 3)
-                    results = fitter.fit_part(
-                        table, **options, seed=seed, repeated=repeated, executor=executor
-                    )
+                    options |= {"seed": seed, "parallel": {"executor": executor}}
+                    results = fitter.fit_part(table, **options, repeated=repeated)
                 n_new += 1
                 folder.save(name, results.write)
                 n_fitted = int(np.count_nonzero(results.fitted))
@@ -201,39 +200,35 @@ def _keys(ids):
 
 def _pieces(rows, options, unit, fluxes):
     """Function of the number of a piece: its table, and the arguments of `fit` that go with it."""
-    prior = options["redshift_prior"]
+    redshift, prior = options["redshift"], options["redshift_prior"]
     if prior is not None and (isinstance(prior, str) or len(prior) != 2):
         raise argument_error("redshift_prior", "redshifts and densities", repr(prior))
     nodes, density = (None, None) if prior is None else prior
-    redshift = _beside("redshift", options["redshift"], 1, rows.n_rows)
-    density = _beside("redshift_prior", density, 2, rows.n_rows)
+    for name, value in (("redshift", redshift), ("redshift_prior", density)):
+        if _is_of_rows(name, value) and len(value) != rows.n_rows:
+            raise argument_error(name, f"{rows.n_rows} values", f"shape {np.shape(value)}")
 
     def take(i):
         table, piece = rows.chunk(i), slice(*rows.span(i))
         for name in fluxes.intersection(table.colnames) if unit is not None else ():
             if table[name].unit is None:
                 table[name].unit = unit
-        given = options | {"redshift": redshift(piece)}
-        if prior is not None:
-            values = density(piece)
-            if isinstance(values, str):
-                require_columns(table, [values], "photometry")
-                values = table[values]
-            given["redshift_prior"] = (nodes, values)
+        given = options | {}
+        if _is_of_rows("redshift", redshift):
+            given["redshift"] = redshift[piece]
+        if isinstance(density, str):
+            require_columns(table, [density], "photometry")
+            given["redshift_prior"] = (nodes, table[density])
+        elif _is_of_rows("redshift_prior", density):
+            given["redshift_prior"] = (nodes, density[piece])
         return table, given
 
     return take
 
 
-def _beside(argument, value, ndim, n):
-    """Function of a slice of n rows: what was given for them, or for all (text, fewer dimensions)."""
-    if isinstance(value, str) or np.ndim(value) < ndim:
-        return lambda piece: value
-    if len(value) != n:
-        raise argument_error(argument, f"{n} values", f"shape {np.shape(value)}")
-    # rows are taken from it by number
-    value = np.array(value) if isinstance(value, (list, tuple)) else value
-    return lambda piece: value[piece]
+def _is_of_rows(name, value):
+    """Whether what is known of redshifts is given row by row, not for all or by a column."""
+    return not isinstance(value, str) and np.ndim(value) == (1 if name == "redshift" else 2)
 
 
 def _job(fitter, rows, options, given):
@@ -250,7 +245,7 @@ def _job(fitter, rows, options, given):
         "redshift": redshift if isinstance(redshift, str) else content_sha256(redshift),
         "redshift_prior": content_sha256(prior),
         "fitter": {name: content_sha256(value) for name, value in fitter.backend.content.items()},
-        "settings": fitter.settings() | {"max_reduced_chi2": fitter.max_reduced_chi2},
+        "settings": fitter.settings() | {"max_reduced_chi2": HIGH_CHI2},
     }
     job |= {"pairs": [list(names) for names in options["pairs"]]} if options["pairs"] else {}
     return job if options["seed"] is None else job | {"seed": options["seed"]}

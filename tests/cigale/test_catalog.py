@@ -4,11 +4,11 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable, Table
+from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
-from miricigale.cigale import cigale_columns, read_cigale_catalog
+from miricigale.cigale import read_cigale_catalog
 from miricigale.filters import Filter, cigale_band, filter_of_band
-from miricigale.scene import read_catalog
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
 
 TEXT = """\
@@ -30,9 +30,9 @@ def text_file(tmp_path):
 def test_millijansky_become_microjansky(text_file):
     table = read_cigale_catalog(text_file)
     assert table["irac.ch1"].unit == u.uJy
-    np.testing.assert_allclose(table["irac.ch1"][0].value, 2.0, rtol=1e-14)
-    np.testing.assert_allclose(table["irac.ch1_err"][0].value, 0.1, rtol=1e-14)
-    np.testing.assert_allclose(table["miri.f770w"][0].value, 3.0, rtol=1e-14)
+    assert_allclose(table["irac.ch1"][0].value, 2.0, rtol=1e-14)
+    assert_allclose(table["irac.ch1_err"][0].value, 0.1, rtol=1e-14)
+    assert_allclose(table["miri.f770w"][0].value, 3.0, rtol=1e-14)
     assert table["id"].tolist() == ["one", "two", "three", "four"]
     assert table.meta["cigale"]["bands"]["miri.f770w"] == "jwst.miri.F770W"
 
@@ -45,17 +45,15 @@ def test_missing_values(text_file):
     assert np.isnan(table["miri.f770w"].value).tolist() == [False, True, True, True]
     assert np.isnan(table["redshift"]).tolist() == [False, True, False, False]
     # a negative flux is a measurement
-    np.testing.assert_allclose(table["mips.24"][2].value, -10.0)
-    np.testing.assert_array_equal(
-        np.isnan(table["irac.ch1"].value), np.isnan(table["irac.ch1_err"].value)
-    )
+    assert_allclose(table["mips.24"][2].value, -10.0)
+    assert_array_equal(np.isnan(table["irac.ch1"].value), np.isnan(table["irac.ch1_err"].value))
 
 
 def test_negative_errors_are_upper_limits(text_file):
     table = read_cigale_catalog(text_file)
     assert table["mips.24_limit"].tolist() == [True, False, False, False]
-    np.testing.assert_allclose(table["mips.24"][0].value, 100.0)
-    np.testing.assert_allclose(table["mips.24_err"][0].value, 20.0)
+    assert_allclose(table["mips.24"][0].value, 100.0)
+    assert_allclose(table["mips.24_err"][0].value, 20.0)
     assert "irac.ch1_limit" not in table.colnames
 
     without = read_cigale_catalog(text_file, limits=False)
@@ -77,9 +75,7 @@ def test_all_formats_say_the_same(text_file, tmp_path, name):
         if column == "id":
             assert table["id"].tolist() == truth["id"].tolist()
         else:
-            np.testing.assert_allclose(
-                np.asarray(table[column]), np.asarray(truth[column]), rtol=1e-12
-            )
+            assert_allclose(np.asarray(table[column]), np.asarray(truth[column]), rtol=1e-12)
 
 
 def test_units_of_the_file_are_kept(tmp_path):
@@ -89,9 +85,9 @@ def test_units_of_the_file_are_kept(tmp_path):
     table["distance"] = [3.0, np.nan] * u.kpc
     table.write(tmp_path / "c.fits")
     got = read_cigale_catalog(tmp_path / "c.fits")
-    np.testing.assert_allclose(got["sedpy.galex_FUV"].value, [1e6, 2e6])
-    np.testing.assert_allclose(got["sedpy.galex_FUV_err"].value, [1e5, 2e5])
-    np.testing.assert_allclose(got["distance"][0].to_value(u.Mpc), 3e-3)
+    assert_allclose(got["sedpy.galex_FUV"].value, [1e6, 2e6])
+    assert_allclose(got["sedpy.galex_FUV_err"].value, [1e5, 2e5])
+    assert_allclose(got["distance"][0].to_value(u.Mpc), 3e-3)
 
     table["FUV"] = [1.0, 2.0] * u.m
     table.write(tmp_path / "d.fits")
@@ -104,12 +100,12 @@ def test_ten_per_cent_where_there_is_no_error(tmp_path):
     path.write_text("id redshift IRAC1 IRAC2 IRAC2_err\n1 1.0 -5e-3 1e-3 1e-4\n")
     with pytest.warns(MiricigaleWarning, match=r"10 % of the flux .*: IRAC1$"):
         table = read_cigale_catalog(path)
-    np.testing.assert_allclose(table["irac.ch1_err"].value, [0.5])
-    np.testing.assert_allclose(table["irac.ch2_err"].value, [0.1])
+    assert_allclose(table["irac.ch1_err"].value, [0.5])
+    assert_allclose(table["irac.ch2_err"].value, [0.1])
     # an error that is not among the bands is not used
     with pytest.warns(MiricigaleWarning, match="IRAC1, IRAC2"):
         table = read_cigale_catalog(path, bands=["IRAC1", "IRAC2"])
-    np.testing.assert_allclose(table["irac.ch2_err"].value, [0.1])
+    assert_allclose(table["irac.ch2_err"].value, [0.1])
 
 
 def test_what_is_left_out_is_named_once(tmp_path):
@@ -145,7 +141,7 @@ def test_only_the_bands_asked_for(text_file):
 @pytest.mark.parametrize(
     ("content", "wanted"),
     [
-        ("id IRAC1 IRAC1_err\n1 1 1\n", "no column 'redshift'"),
+        ("id IRAC1 IRAC1_err\n1 1 1\n", "no column redshift"),
         ("id redshift IRAC1 IRAC1_err spitzer.irac.ch1\n1 1 1 1 1\n", "IRAC1 and spitzer.irac.ch1"),
         ("id redshift xray\n1 1 1\n", "no band that is known"),
         ("id redshift IRAC1 IRAC1_err\n1 1 faint 1\n", "'IRAC1' holds something else"),
@@ -213,7 +209,7 @@ def test_refused(tmp_path, content, wanted):
 )
 def test_bands(band, name, pivot):
     assert filter_of_band(band) == name
-    np.testing.assert_allclose(Filter.from_name(name).pivot.value, pivot, rtol=0.03)
+    assert_allclose(Filter.from_name(name).pivot.value, pivot, rtol=0.03)
 
 
 def test_bands_without_a_curve():
@@ -226,25 +222,6 @@ def test_filters_find_their_way_back():
         assert filter_of_band(cigale_band(name)) == name
     assert cigale_band("miri.f770w") == "jwst.miri.F770W"
     assert cigale_band("acs.f850lp") == "hst.wfc.F850LP"
-
-
-def test_a_catalog_of_sources_in_cigales_names(tmp_path):
-    path = tmp_path / "sources.txt"
-    path.write_text(
-        "# id redshift ra dec IRAC1 IRAC1_err jwst.miri.F770W other\n"
-        "1 0.5 53.1 -27.8 5e-3 1e-3 3e-3 1\n"
-    )
-    columns = cigale_columns(path)
-    assert columns == {
-        "irac.ch1": "IRAC1",
-        "irac.ch1_err": "IRAC1_err",
-        "miri.f770w": "jwst.miri.F770W",
-    }
-    with pytest.warns(MiricigaleWarning, match="points"):
-        catalog = read_catalog(path, columns=columns, units={"flux": "mJy"})
-    np.testing.assert_allclose(catalog["irac.ch1_err"].to_value(u.uJy), [1])
-    path.write_text("id redshift IRAC1 irac_i1\n1 0.5 1 1\n")
-    refuses(r"are both the filter irac\.ch1", cigale_columns, path, error=DataError)
 
 
 def box(path, low, high):
@@ -298,4 +275,4 @@ def test_codes_and_limits_that_are_not_positive_are_missing(tmp_path):
     assert np.all(np.isnan(table["irac.ch1"]))
     assert "irac.ch1_limit" not in table.colnames
     assert table["irac.ch2_limit"].tolist() == [False, True, False]
-    np.testing.assert_array_equal(np.isnan(table["irac.ch2_err"]), [False, False, True])
+    assert_array_equal(np.isnan(table["irac.ch2_err"]), [False, False, True])

@@ -5,6 +5,7 @@ import warnings
 import numpy as np
 import pytest
 from astropy.io import fits
+from numpy.testing import assert_allclose
 
 from miricigale import conf
 from miricigale.cigale import best_model_table, read_cigale_results, read_pcigale_ini
@@ -65,7 +66,7 @@ def test_masses_are_at_the_distances_of_the_objects(tables):
     name = "bayes.stellar.m_star"
     dex = np.log10(numbers(ours, name) / numbers(theirs, name))
     assert np.diff(np.nanpercentile(dex, [16, 84])) / 2 < 0.1
-    np.testing.assert_allclose(
+    assert_allclose(
         numbers(ours, "best.universe.redshift")[np.isfinite(dex)],
         numbers(theirs, "best.universe.redshift")[np.isfinite(dex)],
     )
@@ -120,15 +121,15 @@ def ratio(ours, theirs, name, low, high):
 def test_dust_polar_dust_and_disk_of_best_models(pair):
     ours, theirs, header = pair
     # below, where starlight was taken from the templates, up to 1.5 %
-    np.testing.assert_allclose(ratio(ours, theirs, "dust", 3.1, 100), 1.0, atol=0.01)
-    np.testing.assert_allclose(ratio(ours, theirs, "dust", 100, 900), 1.0, atol=0.01)
+    assert_allclose(ratio(ours, theirs, "dust", 3.1, 100), 1.0, atol=0.01)
+    assert_allclose(ratio(ours, theirs, "dust", 100, 900), 1.0, atol=0.01)
     name = "agn.SKIRTOR2016_polar_dust"
     # dust of 100 K is dark at shorter wavelengths
-    np.testing.assert_allclose(ratio(ours, theirs, name, 25, 100), 1.0, atol=0.01)
-    np.testing.assert_allclose(ratio(ours, theirs, name, 100, 900), 1.0, atol=0.02)
+    assert_allclose(ratio(ours, theirs, name, 25, 100), 1.0, atol=0.01)
+    assert_allclose(ratio(ours, theirs, name, 100, 900), 1.0, atol=0.02)
     if header["agn.i"] < 90 - header["agn.oa"] and header["agn.oa"] == 40:
         disk = ratio(ours, theirs, "agn.SKIRTOR2016_disk", 0.13, 5)
-        np.testing.assert_allclose(disk, 1.0, atol=0.01)
+        assert_allclose(disk, 1.0, atol=0.01)
 
 
 def test_attenuation_of_best_models(pair):
@@ -143,7 +144,7 @@ def test_attenuation_of_best_models(pair):
             taken = np.array(table[f"attenuation.stellar.{age}"])
             through.append(1 + np.divide(taken, light, out=np.zeros(light.size), where=light > 0))
         there = np.interp(at, wave, through[0])[inside]
-        np.testing.assert_allclose(there, through[1][inside], rtol=0.01)
+        assert_allclose(there, through[1][inside], rtol=0.01)
 
 
 def test_columns_and_quantities_of_best_models(pair):

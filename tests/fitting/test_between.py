@@ -6,7 +6,9 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
+from numpy.testing import assert_allclose, assert_array_equal
 
+from helpers.grids import photometry_table
 from miricigale.fitting import BayesFitter, FitFlags, GridSettings
 from miricigale.sed import ModelGrid, SEDModel
 
@@ -64,12 +66,9 @@ def drawn():
     model, sfr = flux(**true)
     model, true["sfr"] = 1e10 * model, 1e10 * sfr
     true["mass"], true["beta"] = np.full(n, 1e10), 0.3 * true["tau"] - 2.0
-    table = QTable({"id": np.arange(n), "z": true["redshift"]})
-    for i, name in enumerate(BANDS):
-        error = SIGMA * model[:, i]
-        table[name] = (model[:, i] + error * rng.normal(size=n)) * u.uJy
-        table[f"{name}_err"] = error * u.uJy
-    return table, true
+    error = SIGMA * model
+    noise = error * rng.normal(size=model.shape[::-1]).T
+    return photometry_table(BANDS, model + noise, error, z=true["redshift"]), true
 
 
 def coverage(results, true, name):
@@ -87,7 +86,7 @@ def test_intervals_hold_the_truth_between_nodes(grid, drawn):
     assert coverage(nodes, true, "mass") < 0.4
     assert coverage(nodes, true, "sfr") < 0.4
     for name in results.axes:
-        np.testing.assert_allclose(results.pdf[name].sum(axis=1), 1)
+        assert_allclose(results.pdf[name].sum(axis=1), 1)
 
 
 def test_what_rests_on_one_node_is_flagged(grid, drawn):
@@ -107,7 +106,7 @@ def test_known_redshifts_are_those_of_the_catalog(grid, drawn):
     results = BayesFitter(grid, model_error=0.0, settings=GridSettings(interpolate=150)).fit(
         table, redshift="z"
     )
-    np.testing.assert_allclose(results.percentile("redshift", 0.5).value[:, 0], true["redshift"])
+    assert_allclose(results.percentile("redshift", 0.5).value[:, 0], true["redshift"])
     for name in ("tau", "ebv", "mass", "sfr"):
         assert abs(coverage(results, true, name) - 0.68) < 0.08, name
 
@@ -120,23 +119,20 @@ def test_chi2_and_evidence_are_those_at_the_known_redshift(grid):
     models = flux(z[:, None], tau, ebv)[0]
     true = 1e10 * models[np.arange(n), rng.integers(tau.size, size=n)]
     error = SIGMA * true
-    table = QTable({"id": np.arange(n)})
     observed = true + error * rng.normal(size=true.shape)
-    for i, name in enumerate(BANDS):
-        table[name] = observed[:, i] * u.uJy
-        table[f"{name}_err"] = error[:, i] * u.uJy
+    table = photometry_table(BANDS, observed, error)
     results = BayesFitter(grid, model_error=0.0, settings=GridSettings(interpolate=20)).fit(
         table, redshift=z
     )
     unit, data = models / error[:, None], (observed / error)[:, None]
     scale = np.sum(unit * data, axis=2) / np.sum(unit**2, axis=2)
     chi2 = np.sum((data - scale[..., None] * unit) ** 2, axis=2)
-    np.testing.assert_allclose(results.chi2, chi2.min(axis=1), rtol=1e-6)
-    np.testing.assert_allclose(results.best_scale, scale[np.arange(n), chi2.argmin(axis=1)])
-    np.testing.assert_allclose(results.best["redshift"], z)
+    assert_allclose(results.chi2, chi2.min(axis=1), rtol=1e-6)
+    assert_allclose(results.best_scale, scale[np.arange(n), chi2.argmin(axis=1)])
+    assert_allclose(results.best["redshift"], z)
     evidence = np.log(np.mean(np.exp(-0.5 * chi2), axis=1))
     evidence -= np.log(np.sqrt(2 * np.pi) * error).sum(axis=1)
-    np.testing.assert_allclose(results.log_evidence, evidence, rtol=1e-6)
+    assert_allclose(results.log_evidence, evidence, rtol=1e-6)
     nodes = BayesFitter(grid, model_error=0.0).fit(table, redshift=z)
     assert np.median(nodes.chi2) > 1.3 * np.median(results.chi2)
 
@@ -160,10 +156,7 @@ def test_masses_at_low_redshift_are_those_of_the_distance(grid):
         **part,
     )
     model = 1e9 * flux(np.array([0.02]), np.array([1.0]), np.array([0.1]))[0]
-    table = QTable({"id": [0]})
-    for i, name in enumerate(BANDS):
-        table[name] = model[:, i] * u.uJy
-        table[f"{name}_err"] = 0.05 * model[:, i] * u.uJy
+    table = photometry_table(BANDS, model, 0.05 * model)
     results = BayesFitter(near, model_error=0.0, settings=GridSettings(interpolate=50)).fit(
         table, redshift=0.02
     )
@@ -174,7 +167,7 @@ def test_the_same_objects_have_the_same_draws(grid, drawn):
     table, _ = drawn
     fitter = BayesFitter(grid, model_error=0.0, settings=GridSettings(interpolate=50))
     some, turned = fitter.fit(table[:6]), fitter.fit(table[:6][::-1])
-    np.testing.assert_array_equal(
+    assert_array_equal(
         some.percentile("mass", [0.16, 0.5]), turned.percentile("mass", [0.16, 0.5])[::-1]
     )
 
@@ -237,7 +230,7 @@ def test_interpolated_models_are_those_of_the_chain(chain, off_nodes):
     assert off[0] > 0.1
     assert off[1] < 0.02
     for name, within in (("stellar_mass", 0.005), ("sfr", 0.1), ("dust_luminosity", 0.05)):
-        np.testing.assert_allclose(derived[name], true[name].value, rtol=within)
+        assert_allclose(derived[name], true[name].value, rtol=within)
 
 
 def test_intervals_of_galaxies_and_agn(chain, off_nodes):
@@ -277,7 +270,7 @@ def test_known_redshifts_between_nodes_are_those_of_the_chain(chain):
     nodes = BayesFitter(grid, model_error=0.0).fit(table, redshift=known)
     assert np.all(nodes.chi2 > 10 * results.chi2)
     for name in ("age", "tau", "ebv"):
-        np.testing.assert_allclose(u.Quantity(results.best[name]).value, true[name].value)
+        assert_allclose(u.Quantity(results.best[name]).value, true[name].value)
 
 
 def test_a_finer_grid_is_of_the_model_that_made_the_grid(chain):

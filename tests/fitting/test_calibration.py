@@ -6,9 +6,10 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
+from numpy.testing import assert_array_less
 from scipy import stats
 
-from helpers.grids import cells
+from helpers.grids import cells, photometry_table
 from miricigale.fitting import BayesFitter
 from miricigale.fitting.posterior import randomized_ranks
 from miricigale.fitting.quantities import DERIVED_LEVELS
@@ -29,11 +30,7 @@ def _draw(grid, n, rng):
     total = rng.uniform(5.0, 60.0, n)
     s = total / np.sqrt(np.sum((model / sigma) ** 2, axis=1))
     flux = s[:, None] * model + sigma * rng.normal(size=model.shape)
-    table = QTable({"id": np.arange(n)})
-    for j, name in enumerate(grid.filters):
-        table[name] = flux[:, j] * u.uJy
-        table[f"{name}_err"] = np.full(n, sigma[j]) * u.uJy
-    return table, z, g, k, f, s
+    return photometry_table(grid.filters, flux, sigma), z, g, k, f, s
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +81,7 @@ def test_percentiles_of_the_distribution_linear_in_cells(fitted, name):
     below = np.mean(truth[:, None] < percentiles, axis=0)
     # five standard deviations of a binomial count
     error = np.sqrt(DERIVED_LEVELS * (1 - DERIVED_LEVELS) / N)
-    np.testing.assert_array_less(np.abs(below - DERIVED_LEVELS), 5 * error)
+    assert_array_less(np.abs(below - DERIVED_LEVELS), 5 * error)
     low, high = results.percentile(name, [0.16, 0.84]).value.T
     assert abs(np.mean((truth > low) & (truth < high)) - 0.68) < 0.03
 

@@ -6,9 +6,11 @@ import pytest
 from astropy.io.fits import BinTableHDU, Column
 from astropy.modeling.models import BlackBody
 from astropy.table import QTable, Table
+from numpy.testing import assert_allclose
 from scipy.special import logsumexp
 
 from helpers.errors import refuses
+from helpers.grids import photometry_table
 from miricigale.filters import FilterSet
 from miricigale.fitting import BayesFitter, FitFlags, TemplateError, compare_classes
 from miricigale.sed import SED, ModelGrid, SEDModel, quasar_axes, read_spectra, template_grid
@@ -27,10 +29,7 @@ def noisy(flux, signal_to_noise, seed, names, bands=BANDS):
     """Photometry of fluxes, shape (n, nb), in uJy."""
     error = flux / signal_to_noise
     flux = flux + error * np.random.default_rng(seed).normal(size=flux.shape)
-    table = QTable({"id": names})
-    for i, band in enumerate(bands):
-        table[band], table[f"{band}_err"] = flux[:, i] * u.uJy, error[:, i] * u.uJy
-    return table
+    return photometry_table(bands, flux, error, names)
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +80,7 @@ def test_upper_limits_and_files_of_template_grids(stars, tmp_path):
     table["acs.f606w_limit"] = [True]
     free, limited = (BayesFitter(g, model_error=0.05).fit(table) for g in (grid, again))
     assert limited.n_limits.tolist() == [1]
-    np.testing.assert_allclose(limited.log_evidence, free.log_evidence, rtol=1e-12)
+    assert_allclose(limited.log_evidence, free.log_evidence, rtol=1e-12)
     assert limited.best["template"].value.tolist() == [0]
 
 
@@ -120,15 +119,11 @@ def sources(n, seed):
         "frac_agn": rng.uniform(0.8, 0.99, n), "inclination": rng.uniform(10, 40, n),
         "disk_slope": rng.uniform(-0.3, 0.3, n), "ebv_polar": rng.uniform(0.0, 0.2, n),
     }  # fmt: skip
-    flux = [
-        np.column_stack([out[b].value for b in BANDS])
-        for out in (model.fluxes(QTable(table), BANDS) for table in (galaxies, quasars))
-    ]
+    tables = [model.fluxes(QTable(table), BANDS) for table in (galaxies, quasars)]
+    flux = [np.column_stack([table[b].value for b in BANDS]) for table in tables]
     temperatures = np.exp(rng.uniform(np.log(2700), np.log(12000), n))
-    flux.append(
-        template_grid({str(i): planck(t) for i, t in enumerate(temperatures)}, BANDS).galaxy[0]
-    )
-    flux = np.concatenate(flux)
+    stars = {str(i): planck(t) for i, t in enumerate(temperatures)}
+    flux = np.concatenate([*flux, template_grid(stars, BANDS).galaxy[0]])
     names = [f"{kind}{i}" for kind in ("galaxy", "quasar", "star") for i in range(n)]
     return noisy(10 * flux / flux[:, [2]], 20, seed, names)
 
@@ -145,7 +140,7 @@ def test_sources_of_known_class_are_sorted(fitters):
     # the probabilities are what the ratios say
     ratio = np.array([table["log_ratio_quasar"], table["log_ratio_star"]])
     wanted = 1.0 / (1.0 + np.exp(ratio).sum(axis=0))
-    np.testing.assert_allclose(table["probability_galaxy"], wanted, rtol=1e-9, atol=1e-300)
+    assert_allclose(table["probability_galaxy"], wanted, rtol=1e-9, atol=1e-300)
 
 
 def test_priors_of_classes_and_what_is_refused(fitters):
@@ -159,7 +154,7 @@ def test_priors_of_classes_and_what_is_refused(fitters):
     table = compare_classes(fits, prior=prior)
     odds, before = (t["probability_star"] / t["probability_quasar"] for t in (table, plain))
     some = (before > 1e-200) & np.isfinite(before)
-    np.testing.assert_allclose(odds[some], 7.0 * before[some], rtol=1e-9)
+    assert_allclose(odds[some], 7.0 * before[some], rtol=1e-9)
     # what has no band has no class
     assert fits["star"].flags[1] & FitFlags.NO_BAND
     assert table["class"][1] == ""
@@ -191,7 +186,7 @@ def test_spectra_of_files(tmp_path):
     assert list(spectra) == ["flat", "two[0]", "two[1]"]
     # F_lambda ~ wave^-2 is a flat F_nu: 1e-17 at 5000 Angstrom is 8.339 uJy
     for name, level in zip(spectra, (8.339, 8.339, 16.678), strict=True):
-        np.testing.assert_allclose(spectra[name].fnu.value, level, rtol=1e-3)
+        assert_allclose(spectra[name].fnu.value, level, rtol=1e-3)
     refuses(r"template 'flat'.*irac\.ch1", template_grid, spectra, BANDS)
     with pytest.warns(MiricigaleWarning, match="3 of 3 spectra continued to"):
         grid = template_grid(
@@ -227,8 +222,8 @@ def test_atmospheres_of_all_gravities_are_read(tmp_path):
     spectra = read_spectra(tmp_path)
     assert list(spectra) == ["ckp00_10000[g40]", "ckp00_10000[g45]"]
     low, high = (one.fnu.value for one in spectra.values())
-    np.testing.assert_allclose(high, 2 * low)
-    np.testing.assert_allclose(low, low[0])
+    assert_allclose(high, 2 * low)
+    assert_allclose(low, low[0])
 
 
 @pytest.mark.parametrize(

@@ -2,12 +2,13 @@
 
 import operator
 import pickle
-from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from multiprocessing import get_context
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from helpers.results import assert_same
 from miricigale.fitting import BayesFitter, fit_file
@@ -73,7 +74,7 @@ def test_two_dask_workers_give_the_numbers_of_one_process(grid, photometry, tmp_
         )
         table = results.to_table()
     for name, column in whole.to_table().items():
-        np.testing.assert_array_equal(np.asarray(table[name]), np.asarray(column), err_msg=name)
+        assert_array_equal(np.asarray(table[name]), np.asarray(column), err_msg=name)
 
 
 def test_processes_get_the_grid_once(grid, photometry):
@@ -85,20 +86,6 @@ def test_processes_get_the_grid_once(grid, photometry):
     assert len(executor.n_bytes) == 12
     # 8 objects, 20 bands and redshifts
     assert max(executor.n_bytes) < 5000
-
-
-class Plain(Executor):
-    """An executor of nobody's making."""
-
-    def submit(self, function, *args):
-        future = Future()
-        future.set_result(pickle.loads(pickle.dumps(function))(*args))
-        return future
-
-
-def test_any_executor_will_do(grid, photometry):
-    fitter = BayesFitter(grid)
-    assert_same(fitter.fit(photometry, executor=Plain()), fitter.fit(photometry))
 
 
 def test_a_fault_in_a_worker_is_reported_and_leaves_no_file(tmp_path, monkeypatch):

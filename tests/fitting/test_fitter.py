@@ -1,71 +1,19 @@
 import itertools
 import math
-from concurrent.futures import ProcessPoolExecutor
 
 import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import quad
 from scipy.stats import norm
 
 from helpers.errors import refuses
-from helpers.grids import cells
-from helpers.results import assert_same
+from helpers.grids import cells, photometry_table
 from miricigale.fitting import BayesFitter, FitFlags, GridSettings, SamplerSettings, leave_out
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import FitWarning
-
-
-@pytest.mark.slow
-def test_processes_change_nothing(grid, photometry):
-    import multiprocessing
-
-    fitter = BayesFitter(grid)
-    context = multiprocessing.get_context("spawn")
-    here = fitter.fit(photometry)
-    with ProcessPoolExecutor(1, mp_context=context) as pool:
-        alone = fitter.fit(photometry, executor=pool)
-    with ProcessPoolExecutor(2, mp_context=context) as pool:
-        assert_same(alone, fitter.fit(photometry, executor=pool, chunk_size=2))
-    # this process may have compiled the kernels, those load them: numba's last digits differ
-    np.testing.assert_allclose(here.pdf_2d, alone.pdf_2d, rtol=1e-12, atol=1e-18)
-    np.testing.assert_allclose(here.moments, alone.moments, rtol=1e-12)
-    np.testing.assert_allclose(here.quantiles, alone.quantiles, rtol=1e-12)
-
-
-def test_noiseless_models_are_found(grid, draw_photometry):
-    table, truth = draw_photometry(grid, 20, noise=1e-4)
-    results = BayesFitter(grid, model_error=0.0).fit(table)
-    for i, (z, g, _k, f, s) in enumerate(truth):
-        assert results.best["redshift"][i] == grid.redshift[z]
-        if grid.dust_luminosity[g] > 0:
-            assert results.best["frac_agn"][i] == grid.frac_agn[f]
-        assert results.best["tau"][i] == grid.galaxy_parameters["tau"][g]
-        assert results.best_scale[i] == pytest.approx(s, rel=1e-3)
-
-
-def test_units_of_the_photometry_do_not_matter(grid, photometry):
-    other = photometry.copy()
-    for name in other.colnames:
-        if name.startswith("band"):
-            other[name] = other[name].to(u.mJy)
-    one, two = BayesFitter(grid).fit(photometry), BayesFitter(grid).fit(other)
-    np.testing.assert_allclose(one.pdf_2d, two.pdf_2d, atol=1e-9)
-    np.testing.assert_allclose(one.moments[:, :, 0], two.moments[:, :, 0], rtol=1e-6)
-
-
-def test_fixed_redshift_by_column_and_by_value(grid, photometry, brute_force):
-    fitter = BayesFitter(grid)
-    by_column = fitter.fit(photometry, redshift="redshift")
-    assert np.all(by_column.best["redshift"] == photometry["redshift"])
-    np.testing.assert_allclose(by_column.std("redshift").value, 0.0, atol=1e-12)
-    assert_same(by_column, fitter.fit(photometry, redshift=photometry["redshift"]))
-    z = int(np.flatnonzero(grid.redshift == photometry["redshift"][0])[0])
-    log_prior = np.where(np.arange(grid.redshift.size) == z, 0.0, -np.inf)
-    want = brute_force(grid, by_column.flux[0], by_column.sigma[0], log_prior)
-    np.testing.assert_allclose(by_column.pdf_2d[0], want["zf"], atol=1e-6)
 
 
 def test_fixed_redshift_goes_to_the_nearest_node_or_is_flagged(grid, photometry):
@@ -73,17 +21,12 @@ def test_fixed_redshift_goes_to_the_nearest_node_or_is_flagged(grid, photometry)
     z[:5] = [0.23, np.nan, -1.0, 0.0, 9.0]
     results = BayesFitter(grid).fit(photometry, redshift=z)
     assert results.best["redshift"][0] == grid.redshift[0]
-    assert [FitFlags.names(f) for f in results.flags[1:5]] == [
-        ["no_redshift"],
-        ["no_redshift"],
-        ["no_redshift"],
-        ["redshift_outside"],
-    ]
+    names = [FitFlags.names(flag) for flag in results.flags[1:5]]
+    assert names == [["no_redshift"]] * 3 + [["redshift_outside"]]
     assert not results.fitted[1:5].any()
     assert results.fitted[5:].all()
-    strict = BayesFitter(grid, settings=GridSettings(redshift_tolerance=0.001)).fit(
-        photometry, redshift=z
-    )
+    fitter = BayesFitter(grid, settings=GridSettings(redshift_tolerance=0.001))
+    strict = fitter.fit(photometry, redshift=z)
     assert FitFlags.names(strict.flags[0]) == ["redshift_outside"]
 
 
@@ -110,21 +53,10 @@ def test_rows_that_cannot_be_fitted_stay_in_place(grid, draw_photometry):
     assert "no_signal" in names[5]
     assert "high_chi2" in names[6]
     assert list(results.ids) == list(table["id"])
-    np.testing.assert_array_equal(results.fitted, [0, 0, 1, 1, 0, 1, 1])
+    assert_array_equal(results.fitted, [0, 0, 1, 1, 0, 1, 1])
     out = results.to_table()
     assert "32 duplicate id" in out["flags"].info.description
     assert np.isnan(out["mass_mean"][0])
-
-
-def test_masked_fluxes_are_missing_bands(grid, photometry):
-    from astropy.utils.masked import Masked
-
-    table = photometry.copy()
-    mask = np.zeros(len(table), bool)
-    mask[2] = True
-    table["band1"] = Masked(table["band1"], mask)
-    results = BayesFitter(grid).fit(table)
-    assert np.isinf(results.sigma[2, 1])
 
 
 def test_a_band_that_is_not_fitted_is_predicted(grid, draw_photometry):
@@ -133,15 +65,7 @@ def test_a_band_that_is_not_fitted_is_predicted(grid, draw_photometry):
     results = BayesFitter(grid, model_error=0.0).fit(table)
     assert "band3" not in results.meta["fit"]["filters"]
     want = [s * grid.flux(z, g, k, f)[3] for z, g, k, f, s in truth]
-    np.testing.assert_allclose(results.predict(["band3"])["band3"].value, want, rtol=0.05)
-
-
-def test_model_error_is_added_in_quadrature(grid, photometry):
-    results = BayesFitter(grid, model_error={"band1": 0.2}, error_floor=0.05).fit(photometry)
-    used = np.isfinite(results.sigma)
-    err = np.maximum(results.flux_err, 0.05 * np.abs(results.flux))
-    extra = np.where(np.arange(6) == 1, 0.2, 0.0) * results.flux
-    np.testing.assert_allclose(results.sigma[used], np.hypot(err, extra)[used])
+    assert_allclose(results.predict(["band3"])["band3"].value, want, rtol=0.05)
 
 
 @pytest.mark.parametrize(
@@ -162,7 +86,6 @@ def test_model_error_is_added_in_quadrature(grid, photometry):
         ({"filters": []}, ValueError, "'filters' must be different names, at least one"),
         ({"priors": ["tau"]}, ValueError, "'priors' must be a dict of parameters, got list"),
         ({"n_bands_min": True}, ValueError, "'n_bands_min' must be an integer >= 1, got True"),
-        ({"max_reduced_chi2": "x"}, ValueError, "'max_reduced_chi2' must be positive, got 'x'"),
         ({"scale_error": "no"}, ValueError, "'scale_error' must be True, False or None, got 'no'"),
         ({"n_bands_min": 0}, ValueError, "'n_bands_min' must be an integer >= 1"),
         ({"axes": {"a": [1]}}, ValueError, "'axes' must be None when"),
@@ -175,10 +98,8 @@ def test_bad_options_are_named(grid, options, error, text):
 def test_bad_photometry_is_named(grid, photometry):
     fitter = BayesFitter(grid)
     refuses("'photometry' must be a table with at least one of", fitter.fit, QTable({"id": [1]}))
-    with pytest.raises(
-        ValueError, match=r"'photometry' must be a table with the columns \['band0_err'\]"
-    ):
-        fitter.fit(photometry[[n for n in photometry.colnames if n != "band0_err"]])
+    some = photometry[[name for name in photometry.colnames if name != "band0_err"]]
+    refuses(r"'photometry' must be a table with the columns \['band0_err'\]", fitter.fit, some)
     bare = photometry.copy()
     bare["band0"] = bare["band0"].value
     refuses("'photometry' column 'band0' must be convertible", fitter.fit, bare, error=u.UnitsError)
@@ -207,10 +128,8 @@ def test_what_is_no_table_is_named(grid, photometry, filters):
         fitter.fit(photometry[:2], redshift=["a", "b"])
     table = photometry.copy()
     table["band0"] = np.full(len(table), 22.0) * u.ABmag
-    with pytest.raises(
-        u.UnitsError, match=r"column 'band0_err' must be in mag, as 'band0' is, got uJy"
-    ):
-        fitter.fit(table)
+    wanted = r"column 'band0_err' must be in mag, as 'band0' is, got uJy"
+    refuses(wanted, fitter.fit, table, error=u.UnitsError)
 
 
 def test_catalogs_come_in_any_kind_of_table(grid, photometry, tmp_path):
@@ -238,18 +157,6 @@ def test_a_band_that_is_not_there_is_a_missing_band(grid, photometry):
     assert_array_equal(got.chi2, want.chi2)
 
 
-def test_infinite_fluxes_are_flagged(grid, photometry):
-    table = photometry.copy()
-    table["band0"][0], table["band1"][1] = np.inf * u.uJy, -np.inf * u.uJy
-    table["band2_err"][2] = np.inf * u.uJy
-    whole, results = (BayesFitter(grid).fit(t) for t in (photometry, table))
-    flags = np.asarray(results.flags)[:4]
-    assert [bool(f & FitFlags.BAD_FLUX) for f in flags] == [True, True, False, False]
-    assert [bool(f & FitFlags.BAD_ERROR) for f in flags] == [False, False, True, False]
-    assert np.isfinite(results.chi2[:4]).all()
-    assert (whole.n_bands - results.n_bands)[:4].tolist() == [1, 1, 1, 0]
-
-
 # ------------------------------------------------------------- densities of redshift, limits
 
 
@@ -271,22 +178,10 @@ def test_a_density_weighs_the_redshifts_by_its_integral_over_their_cells(
     flat = fitter.fit(table).pdf["redshift"]
     want = flat * weights
     got = fitter.fit(table, redshift_prior=(nodes, density)).pdf["redshift"]
-    np.testing.assert_allclose(got, want / want.sum(axis=1, keepdims=True), rtol=1e-7, atol=1e-13)
+    assert_allclose(got, want / want.sum(axis=1, keepdims=True), rtol=1e-7, atol=1e-13)
     # one for each object is the same, row by row
     each = fitter.fit(table, redshift_prior=(nodes, np.tile(density, (5, 1)))).pdf["redshift"]
-    np.testing.assert_array_equal(each, got)
-
-
-def test_a_narrow_density_is_a_known_redshift(make_grid, draw_photometry):
-    grid = make_grid(3, n_z=6)
-    fitter = BayesFitter(grid)
-    table, _ = draw_photometry(grid, 4, seed=2)
-    z = grid.redshift[2]
-    known = fitter.fit(table, redshift=np.full(4, z))
-    nodes = np.array([z - 1e-4, z, z + 1e-4])
-    dense = fitter.fit(table, redshift_prior=(nodes, np.array([0.0, 1.0, 0.0])))
-    np.testing.assert_allclose(dense.log_evidence, known.log_evidence, rtol=1e-12)
-    np.testing.assert_array_equal(dense.best_index, known.best_index)
+    assert_array_equal(each, got)
 
 
 def test_densities_that_cannot_be_used_are_flagged_or_refused(make_grid, draw_photometry):
@@ -312,17 +207,6 @@ def test_densities_that_cannot_be_used_are_flagged_or_refused(make_grid, draw_ph
         fitter.fit(table, redshift=1.0, redshift_prior=(nodes, density))
 
 
-def test_fewer_bands_than_parameters_are_flagged(make_grid, draw_photometry):
-    grid = make_grid(3)
-    table, _ = draw_photometry(grid, 2, seed=4)
-    for name in grid.filters[2:]:
-        table[name][0] = np.nan
-    got = BayesFitter(grid).fit(table)
-    assert got.fitted.all()
-    names = [FitFlags.names(flag) for flag in got.flags]
-    assert "few_for_parameters" in names[0]
-
-
 def test_choices_of_cigale(make_grid, draw_photometry):
     """No result where exp(-chi2 / 2) vanishes, no error below 5 %, no scatter of the scale."""
     grid = make_grid(3)
@@ -339,9 +223,9 @@ def test_choices_of_cigale(make_grid, draw_photometry):
     good = theirs.fitted
     for quantity in ("redshift", "frac_agn", "mass", "sfr"):
         mean, std = theirs.mean(quantity)[good], ours.std(quantity)[good]
-        np.testing.assert_array_equal(mean, ours.mean(quantity)[good])
+        assert_array_equal(mean, ours.mean(quantity)[good])
         want = np.maximum(std, 0.05 * np.abs(mean))
-        np.testing.assert_allclose(theirs.std(quantity)[good].value, want.value, rtol=1e-12)
+        assert_allclose(theirs.std(quantity)[good].value, want.value, rtol=1e-12)
     for options, match in (
         ({"compat": "prospector"}, "'compat' must be None or 'cigale'"),
         ({"compat": "cigale", "scale_error": True}, "'scale_error' must be False"),
@@ -356,10 +240,7 @@ def test_signal_to_noise_below_three_is_flagged(make_grid, signal):
     galaxy = np.flatnonzero(grid.allowed[1])[-1]
     model = grid.flux(1, galaxy, 0, 2)
     sigma = np.linalg.norm(model) / signal
-    table = QTable({"id": [1]})
-    for name, flux in zip(grid.filters, model, strict=True):
-        table[name] = [flux] * u.uJy
-        table[f"{name}_err"] = [sigma] * u.uJy
+    table = photometry_table(grid.filters, model, sigma)
     results = BayesFitter(grid, model_error=0.0).fit(table)
     assert results.chi2[0] == pytest.approx(0.0, abs=1e-9)
     assert bool(results.flags[0] & int(FitFlags.LOW_SIGNAL)) == (signal < 3.0)
@@ -381,11 +262,11 @@ def test_priors_may_be_distributions_and_functions_of_one_value(grid, photometry
         for prior in (normal, normal.pdf, density, of_one, density(nodes))
     ]
     for other in fits[1:]:
-        np.testing.assert_allclose(other.pdf["tau"], fits[0].pdf["tau"], rtol=1e-6)
+        assert_allclose(other.pdf["tau"], fits[0].pdf["tau"], rtol=1e-6)
     # the prior of tau is that of the mean posterior's ratio to one with a flat prior
     flat = BayesFitter(grid).fit(photometry).pdf["tau"] * normal.pdf(nodes)
     expected = flat / flat.sum(axis=1, keepdims=True)
-    np.testing.assert_allclose(fits[0].pdf["tau"], expected, rtol=1e-4, atol=1e-9)
+    assert_allclose(fits[0].pdf["tau"], expected, rtol=1e-4, atol=1e-9)
 
 
 @pytest.mark.parametrize(

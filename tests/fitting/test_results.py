@@ -4,8 +4,10 @@ import pytest
 from astropy.table import QTable
 from astropy.tests.helper import assert_quantity_allclose
 from matplotlib.figure import Figure
+from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
+from helpers.grids import photometry_table
 from helpers.results import assert_same_tables
 from miricigale.fitting import BayesFitter, FitResults
 from miricigale.fitting.posterior import cell_edges, cell_percentiles, moments
@@ -27,28 +29,11 @@ def test_table_has_units_descriptions_and_provenance(results, tmp_path):
     assert all(table[name].info.description for name in table.colnames)
     assert table.meta["fit"]["prior_f"] == "grid"
     assert "nobody" in table.meta["citations"]
-    np.testing.assert_array_equal(table["id"], results.ids)
+    assert_array_equal(table["id"], results.ids)
     path = tmp_path / "results.ecsv"
     table.write(path)
     again = QTable.read(path)
-    np.testing.assert_allclose(again["mass_mean"], table["mass_mean"])
-
-
-def test_sum_of_parts(results):
-    """The mean of a sum is the sum of the means."""
-    total = results.mean("ir_luminosity")
-    parts = results.mean("ir_luminosity_galaxy") + results.mean("ir_luminosity_agn")
-    np.testing.assert_allclose(total.value, parts.value, rtol=1e-9)
-
-
-def test_percentiles_are_ordered_and_bracket_the_mean(results):
-    for name in results.parameters:
-        p = results.percentile(name, [0.05, 0.16, 0.5, 0.84, 0.95]).value
-        assert np.all(np.diff(p, axis=1) >= 0), name
-    for name in ("redshift", "frac_agn", "mass", "stellar_mass"):
-        mean = results.mean(name).value
-        low, high = results.percentile(name, [0.001, 0.999]).value.T
-        assert np.all((mean >= low) & (mean <= high)), name
+    assert_allclose(again["mass_mean"], table["mass_mean"])
 
 
 def test_no_parameter_leaves_its_limits():
@@ -66,11 +51,8 @@ def test_no_parameter_leaves_its_limits():
         "frac_agn": [0.0, 0.5],
     }
     grid = model.grid(axes, bands, cache=False)
-    flux = 1e10 * grid.flux(0, np.arange(grid.n_galaxies)) * u.uJy
-    photometry = QTable({"id": np.arange(len(flux))})
-    for i, name in enumerate(bands):
-        photometry[name], photometry[f"{name}_err"] = flux[:, i], 0.05 * flux[:, i]
-    results = BayesFitter(grid).fit(photometry)
+    flux = 1e10 * grid.flux(0, np.arange(grid.n_galaxies))
+    results = BayesFitter(grid).fit(photometry_table(bands, flux, 0.05 * flux))
     assert set(axes) - {"redshift"} <= set(results.axes)
     for name in results.axes:
         low, high = model.parameters[name].bounds
@@ -89,9 +71,9 @@ def test_views_agree_with_the_catalog(results):
     assert view.chi2 == results.chi2[3]
     assert view.mean("mass") == results.mean("mass")[3]
     edges, weights = view.distribution("frac_agn")
-    np.testing.assert_allclose(edges, [0.0, 0.1, 0.35, 0.7, 1.0])
+    assert_allclose(edges, [0.0, 0.1, 0.35, 0.7, 1.0])
     assert weights.sum() == pytest.approx(1.0)
-    np.testing.assert_allclose(view.pdf_2d.sum(axis=0), weights, atol=1e-12)
+    assert_allclose(view.pdf_2d.sum(axis=0), weights, atol=1e-12)
     edges, weights = view.distribution("mass")
     assert edges.unit == u.Msun
     assert len(edges) == len(weights) + 1
@@ -109,7 +91,7 @@ def test_prediction_of_the_best_model(results, grid):
     z, g, k, f = results.best_index[0]
     want = results.best_scale[0] * grid.flux(z, g, k, f)
     got = [table[f"{name}_best"][0].value for name in grid.filters]
-    np.testing.assert_allclose(got, want, rtol=1e-12)
+    assert_allclose(got, want, rtol=1e-12)
     refuses("no filter of the models 'band9'", results.predict, ["band9"], error=KeyError)
 
 
@@ -119,7 +101,7 @@ def test_tails_that_are_not_kept_have_no_percentiles(results):
         refuses(f"{wanted}, got .*{level:g}", results.percentile, "mass", [0.5, level])
         refuses("for 'frac_agn_ir'", results[0].percentile, "frac_agn_ir", level)
     ends = results.percentile("mass", [0.001, 0.999])
-    np.testing.assert_array_equal(ends, results.quantiles[:, 0][:, [0, -1]] * u.Msun)
+    assert_array_equal(ends, results.quantiles[:, 0][:, [0, -1]] * u.Msun)
     # the distribution of a parameter is known in full: its first cell is uniform
     low, half = results.percentile("redshift", [1e-5, 2e-5])[0].value
     axis = results.axes["redshift"]
@@ -134,21 +116,11 @@ def test_write_and_read(results, tmp_path):
     results.write(path)
     again = FitResults.read(path)
     assert_same_tables(results.to_table(), again.to_table())
-    np.testing.assert_array_equal(results.pdf_2d, again.pdf_2d)
+    assert_array_equal(results.pdf_2d, again.pdf_2d)
     assert again.meta["fit"] == results.meta["fit"]
     assert again[5].best["mass"] == results[5].best["mass"]
     refuses("already exists", results.write, path, error=OSError)
     results.write(path, overwrite=True)
-
-
-def test_ids_may_be_text_and_the_grid_without_agn(make_grid, draw_photometry, tmp_path):
-    grid = make_grid(frac=[0.0])
-    table, _ = draw_photometry(grid, 3)
-    table["id"] = ["a", "b", "c1"]
-    results = BayesFitter(grid).fit(table)
-    assert "frac_agn" not in results.parameters
-    results.write(tmp_path / "r.fits")
-    assert FitResults.read(tmp_path / "r.fits")["c1"].chi2 == results["c1"].chi2
 
 
 def test_foreign_files_are_refused(grid, tmp_path):
@@ -169,9 +141,9 @@ def test_results_cannot_be_changed(results):
 
 
 def test_cells():
-    np.testing.assert_allclose(cell_edges([0, 1, 3]), [-0.5, 0.5, 2, 4])
-    np.testing.assert_allclose(cell_edges([0, 1, 3], (0, 3.5)), [0, 0.5, 2, 3.5])
-    np.testing.assert_allclose(cell_edges([2.0]), [2, 2])
+    assert_allclose(cell_edges([0, 1, 3]), [-0.5, 0.5, 2, 4])
+    assert_allclose(cell_edges([0, 1, 3], (0, 3.5)), [0, 0.5, 2, 3.5])
+    assert_allclose(cell_edges([2.0]), [2, 2])
 
 
 def test_percentiles_of_a_uniform_distribution():
@@ -180,7 +152,7 @@ def test_percentiles_of_a_uniform_distribution():
     pdf = np.full((2, 10), 0.1)
     pdf[1] = np.nan
     got = cell_percentiles(values, pdf, [0.05, 0.5, 0.999])
-    np.testing.assert_allclose(got[0], [0.5, 5.0, 9.99])
+    assert_allclose(got[0], [0.5, 5.0, 9.99])
     assert np.isnan(got[1]).all()
     mean, std = moments(values, pdf[:1])
     assert mean[0] == pytest.approx(5.0)
@@ -193,9 +165,9 @@ def test_results_draw_what_they_hold(results):
         assert results[2].plot_pdf(name, ax=ax) is ax
         edges, weights = results[2].distribution(name)
         density, drawn, _ = ax.patches[0].get_data()
-        np.testing.assert_array_equal(drawn, edges.value)
+        assert_array_equal(drawn, edges.value)
         width = np.diff(np.log10(drawn) if name == "mass" else drawn)
-        np.testing.assert_allclose(density * width, weights, atol=1e-12)
+        assert_allclose(density * width, weights, atol=1e-12)
         assert ax.get_xlabel() == label
     ax = Figure().subplots()
     assert results[2].plot_pdf2d(ax=ax) is ax
@@ -217,7 +189,7 @@ def test_rows_ids_and_columns(results, tmp_path):
     assert len(results.flag_names()) == len(results)
     results.write(tmp_path / "a.csv")
     back = QTable.read(tmp_path / "a.csv")
-    np.testing.assert_allclose(back["mass_p50"], table["mass_p50"].value)
+    assert_allclose(back["mass_p50"], table["mass_p50"].value)
     with pytest.raises(AttributeError, match="FitResults has no 'medain'; it has median"):
         results.medain  # noqa: B018
 
@@ -225,5 +197,5 @@ def test_rows_ids_and_columns(results, tmp_path):
 def test_the_picture_of_several_objects_is_masses_over_redshifts(results):
     ax = results.plot(ax=Figure().subplots())
     x, y = ax.lines[0].get_data()
-    np.testing.assert_allclose(x, 1 + results["redshift"].value)
-    np.testing.assert_allclose(y, results["mass"].to_value(u.Msun))
+    assert_allclose(x, 1 + results["redshift"].value)
+    assert_allclose(y, results["mass"].to_value(u.Msun))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import QTable
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import chi2
 
 from helpers.errors import refuses
@@ -81,17 +82,17 @@ def test_moments_and_percentiles_are_those_of_the_draws(samples):
     assert samples.mean("mass")[0].value == pytest.approx(mass.mean())
     assert samples.std("mass")[0].value == pytest.approx(mass.std())
     got = samples.percentile("mass", [0.16, 0.5])
-    np.testing.assert_allclose(got[0].value, np.percentile(mass, [16, 50]))
+    assert_allclose(got[0].value, np.percentile(mass, [16, 50]))
     assert np.isnan(got[3]).all()
     edges, weights = samples.pdf("age", 0)
     age = samples.values("age").value[0]
-    np.testing.assert_allclose(weights, [np.mean(age == x) for x in samples.axes["age"].values])
+    assert_allclose(weights, [np.mean(age == x) for x in samples.axes["age"].values])
     assert edges.unit == u.Gyr
-    a, b, joint = samples.pdf_2d("age", "mass", 0, bins=5)
-    assert joint.shape == (a.size - 1, b.size - 1) == (4, 5)
-    np.testing.assert_allclose(joint.sum(axis=1), weights)
-    edges, weights = samples.pdf("mass", 0, bins=[0.5, 1.0, 2.0] * (1e10 * u.Msun))
-    assert weights[0] == pytest.approx(np.mean((mass >= 0.5e10) & (mass < 1e10)))
+    a, b, joint = samples.pdf_2d("age", "mass", 0)
+    assert joint.shape == (a.size - 1, b.size - 1) == (4, 30)
+    assert_allclose(joint.sum(axis=1), weights)
+    edges, weights = samples.pdf("mass", 0)
+    assert weights[0] == pytest.approx(np.mean(mass < edges[1].to_value(u.Msun)))
 
 
 def test_parameters_without_effect_have_their_prior(real):
@@ -107,9 +108,7 @@ def test_parameters_without_effect_have_their_prior(real):
     assert abs(part - 0.75) < 5 * np.sqrt(0.75 * 0.25 / n)
     # the same in any company
     two = Samples(grid, ["y", "x"], [0, 0], np.repeat(index, 2, axis=0), np.ones((2, n)), axes=axes)
-    np.testing.assert_array_equal(
-        two["x"].values("temperature_polar"), one.values("temperature_polar")[0]
-    )
+    assert_array_equal(two["x"].values("temperature_polar"), one.values("temperature_polar")[0])
     index[..., 2:] = -1, 0
     none = Samples(grid, ["x"], [0], index, np.ones((1, n)))
     assert np.isnan(none.values("temperature_polar")).all()
@@ -134,22 +133,22 @@ def test_fluxes_in_bands_of_the_grid_and_others(real, model):
     got = real.fluxes(BANDS[1:3]).value
     z, g, k, f = real.index[0, 5]
     want = real.scale[0, 5] * real.grid.flux(z, g, k, f)[1:3]
-    np.testing.assert_allclose(got[0, 5], want, rtol=1e-12)
+    assert_allclose(got[0, 5], want, rtol=1e-12)
     # a grid made with the band has the same fluxes
     other = model.grid(AXES, ["miri.f1500w"], cache=False)
     want = Samples(other, real.ids, real.flags, real.index, real.scale).fluxes()
     table = real.predict(["miri.f1500w", "wfc3.f160w"])
-    np.testing.assert_allclose(real.fluxes(["miri.f1500w"]), want, rtol=1e-9)
+    assert_allclose(real.fluxes(["miri.f1500w"]), want, rtol=1e-9)
     mean = want[:, :, 0].mean(axis=1)
-    np.testing.assert_allclose(table["miri.f1500w"], mean, rtol=1e-9)
-    np.testing.assert_allclose(table["miri.f1500w_err"], want[:, :, 0].std(axis=1), rtol=1e-9)
+    assert_allclose(table["miri.f1500w"], mean, rtol=1e-9)
+    assert_allclose(table["miri.f1500w_err"], want[:, :, 0].std(axis=1), rtol=1e-9)
     p84 = np.percentile(want.value, 84, axis=1)[:, 0]
-    np.testing.assert_allclose(table["miri.f1500w_p84"].value, p84, rtol=1e-9)
+    assert_allclose(table["miri.f1500w_p84"].value, p84, rtol=1e-9)
     assert np.isnan(table["wfc3.f160w"][2])
     # filters that no library knows come in a set
     curve = FilterSet.from_names(["miri.f1500w"])[0]
     mine = FilterSet([dataclasses.replace(curve, name="mine")])
-    np.testing.assert_allclose(real.fluxes(mine), want, rtol=1e-9)
+    assert_allclose(real.fluxes(mine), want, rtol=1e-9)
 
 
 def test_spectra_against_single_models(real, model):
@@ -163,31 +162,31 @@ def test_spectra_against_single_models(real, model):
     wave, observed = real.spectra("b", rest=False)
     inside = (wave > 0.2 * u.um) & (wave < 500 * u.um)
     want = sed.fnu_at(wave[inside]).value
-    np.testing.assert_allclose(observed[j, inside].value, want, rtol=1e-9)
+    assert_allclose(observed[j, inside].value, want, rtol=1e-9)
     # in the rest frame the flux at 10 pc is L_nu / (4 pi d^2)
     wave, rest = real.spectra("b")
     near = sed.redshifted(0.0, cosmology=model.cosmology)
     red = wave > 0.13 * u.um  # where nothing is absorbed on the way
     area = 4 * np.pi * (10 * u.pc) ** 2
     got = (rest[j, red] / area).to_value(u.uJy)
-    np.testing.assert_allclose(got, near.fnu_at(wave[red]).value, rtol=1e-6)
+    assert_allclose(got, near.fnu_at(wave[red]).value, rtol=1e-6)
 
 
 def test_band_of_the_spectrum(real):
     table = real.sed_band("a", (0.16, 0.5, 0.84))
     _, spectra = real.spectra("a")
     assert table["p50"].unit == u.W / u.Hz
-    np.testing.assert_allclose(table["p50"].value, np.median(spectra.value, axis=0))
+    assert_allclose(table["p50"].value, np.median(spectra.value, axis=0))
     assert np.all(table["p16"] <= table["p84"])
     # equal draws have a band of no width, and it is the spectrum
     index = np.tile(real.index[:1, :1], (1, 10, 1))
     same = Samples(real.grid, ["s"], [0], index, np.full((1, 10), 1e10), real.model)
     band = same.sed_band("s", rest=False)
-    np.testing.assert_allclose(band["p16"].value, band["p84"].value, rtol=1e-12)
+    assert_allclose(band["p16"].value, band["p84"].value, rtol=1e-12)
     flux = SED(band["wave"], band["p50"], redshift=0.0)
     want = 1e10 * real.grid.flux(*index[0, 0])
     got = FilterSet.from_names(BANDS).synthetic_fluxes(flux).to_value(u.uJy)
-    np.testing.assert_allclose(got, want, rtol=1e-3)
+    assert_allclose(got, want, rtol=1e-3)
 
 
 def test_drawing(real):
@@ -204,10 +203,8 @@ def test_drawing(real):
 
 def test_what_is_refused(real, model, samples):
     args = (real.grid, real.ids, real.flags)
-    with pytest.raises(ValueError, match="'index' must be of shape"):
-        Samples(*args, real.index[:, :5], real.scale)
-    with pytest.raises(ValueError, match="'index' must be within the grid's"):
-        Samples(*args, real.index + 10, real.scale)
+    refuses("'index' must be of shape", Samples, *args, real.index[:, :5], real.scale)
+    refuses("'index' must be within the grid's", Samples, *args, real.index + 10, real.scale)
     with pytest.raises(KeyError, match="no object with the id 'd' among 3"):
         real.loc["d"]
     refuses("no parameter 'mood'", real.values, "mood", error=KeyError)
@@ -231,12 +228,12 @@ def test_write_and_read(real, model, tmp_path):
     # parameters without effect too, which are drawn from their prior
     assert_same_tables(one, two)
     assert again.meta == one.meta == two.meta
-    np.testing.assert_array_equal(again.fluxes(), real.fluxes())
-    np.testing.assert_array_equal(again.spectra("a")[1], real.spectra("a")[1])
+    assert_array_equal(again.fluxes(), real.fluxes())
+    assert_array_equal(again.spectra("a")[1], real.spectra("a")[1])
     # the grid may have been on disk too
     real.grid.write(tmp_path / "grid.fits")
     grid = type(real.grid).read(tmp_path / "grid.fits")
-    np.testing.assert_array_equal(Samples.read(path, grid).values("mass"), real.values("mass"))
+    assert_array_equal(Samples.read(path, grid).values("mass"), real.values("mass"))
     refuses("already exists", real.write, path, error=OSError)
     real["b"].write(path, overwrite=True)
     assert list(Samples.read(path, real.grid).ids) == ["b"]
@@ -266,34 +263,19 @@ def test_draws_with_a_prior_keep_it_in_files(make_grid, draw_photometry, tmp_pat
     drawn = fitter.sample(draw_photometry(grid, 2)[0], 500, seed=4)
     drawn.write(tmp_path / "s.fits")
     again = Samples.read(tmp_path / "s.fits", grid)
-    np.testing.assert_array_equal(
-        again.values("temperature_polar"), drawn.values("temperature_polar")
-    )
+    assert_array_equal(again.values("temperature_polar"), drawn.values("temperature_polar"))
     assert again.meta == drawn.meta
-
-
-def test_draws_of_the_fitter_have_its_posterior(grid, photometry):
-    fitter = BayesFitter(grid)
-    results = fitter.fit(photometry)
-    n = 2000
-    samples = fitter.sample(photometry, n, seed=4)
-    assert isinstance(samples, Samples)
-    np.testing.assert_array_equal(samples.ids, results.ids)
-    for name in ("redshift", "frac_agn", "tau", "tau97", "mass", "sfr", "ir_luminosity"):
-        error = results.std(name).value / np.sqrt(n)
-        apart = np.abs(samples.mean(name).value - results.mean(name).value)
-        np.testing.assert_array_less(apart, 5 * error + 1e-9 * results.mean(name).value)
 
 
 def test_draws_are_those_of_the_object_whatever_its_company(grid, photometry):
     fitter = BayesFitter(grid)
     whole = fitter.sample(photometry, 50, seed=4)
     turned = fitter.sample(photometry[::-1], 50, seed=4)
-    np.testing.assert_array_equal(whole.index, turned.index[::-1])
-    np.testing.assert_array_equal(whole.scale, turned.scale[::-1])
+    assert_array_equal(whole.index, turned.index[::-1])
+    assert_array_equal(whole.scale, turned.scale[::-1])
     with ThreadPoolExecutor(2) as pool:
         spread = fitter.sample(photometry, 50, seed=4, executor=pool)
-    np.testing.assert_array_equal(whole.scale, spread.scale)
+    assert_array_equal(whole.scale, spread.scale)
     other = fitter.sample(photometry, 50, seed=5)
     assert np.any(whole.index != other.index)
     for bad in (0, 1.5, True):

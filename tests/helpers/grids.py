@@ -3,6 +3,7 @@
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
+from numpy.testing import assert_allclose
 from scipy.stats import norm
 
 from miricigale.sed import ModelGrid
@@ -65,6 +66,16 @@ def make_grid(seed=0, *, n_z=4, n_tau=5, n_age=4, polar=(0.0, 0.1, 0.3), frac=No
     )
 
 
+def photometry_table(names, flux, err, ids=None, **columns):
+    """Photometry of fluxes and errors in uJy, shape (n, nb), or (nb,) of one object."""
+    flux = np.atleast_2d(flux)
+    err = np.broadcast_to(err, flux.shape)
+    table = QTable({"id": np.arange(len(flux)) if ids is None else ids} | columns)
+    for i, name in enumerate(names):
+        table[name], table[f"{name}_err"] = flux[:, i] * u.uJy, err[:, i] * u.uJy
+    return table
+
+
 def draw_photometry(grid, n, seed=1, *, noise=0.1, missing=0.0, mass=(9.5, 11.0)):
     """Models of a grid with noise: table of photometry, true indices and masses."""
     rng = np.random.default_rng(seed)
@@ -80,10 +91,7 @@ def draw_photometry(grid, n, seed=1, *, noise=0.1, missing=0.0, mass=(9.5, 11.0)
         flux[i] = model + err[i] * rng.normal(size=n_b)
         truth.append((z, g, k, f, s))
     flux[rng.random(flux.shape) < missing] = np.nan
-    table = QTable({"id": np.arange(n)})
-    for j, name in enumerate(grid.filters):
-        table[name] = flux[:, j] * u.uJy
-        table[f"{name}_err"] = err[:, j] * u.uJy
+    table = photometry_table(grid.filters, flux, err)
     table["redshift"] = [grid.redshift[t[0]] for t in truth]
     return table, truth
 
@@ -291,3 +299,57 @@ def brute_force(
         "values": values,
         "weights": like,
     }
+
+
+#: Grids (options of `make_grid`) and fitters that are compared with plain sums, by name.
+CASES = {
+    "default": ({}, {}),
+    "priors": (
+        {},
+        {
+            "priors": {
+                "redshift": lambda z: z * np.exp(-z),
+                "age": "log",
+                "ebv_polar": [0.5, 1.0, 2.0],
+                "temperature_polar": [1.0, 3.0],
+            }
+        },
+    ),
+    "prior_f by width": ({}, {}),
+    "no galaxy-only models": ({"frac": [0.1, 0.5, 0.95]}, {}),
+    "no AGN": ({"frac": [0.0]}, {}),
+    "one redshift": ({"n_z": 1}, {}),
+    "no scale error": ({}, {"scale_error": False}),
+}
+
+
+def assert_plain(
+    results, grid, *, rtol, atol=1e-12, floor=1.0, std_rtol=None, known=None, **options
+):
+    """
+    Every sum of results is that of `brute_force`, to ``rtol``; posteriors also to ``atol``.
+
+    Quantities are so to 1e-9 of the largest times ``floor``, for those of an AGN that is not there are not
+    worth their digits. ``known`` are the redshifts of a fit at known ones, ``options`` those of `brute_force`.
+    """
+    assert np.all(results.fitted)
+    std_rtol = 1e3 * rtol if std_rtol is None else std_rtol
+    parameters = list(free_parameters(grid, options.get("priors")))
+    for i in range(len(results)):
+        log_prior = None
+        if known is not None:
+            log_prior = np.where(grid.redshift == known[i], 0.0, -np.inf)
+        want = brute_force(grid, results.flux[i], results.sigma[i], log_prior, **options)
+        assert_allclose(results.chi2[i], want["chi2"], rtol=1e-9, atol=1e-9)
+        assert tuple(results.best_index[i])[:2] == tuple(want["index"])[:2]
+        constant = np.log(results.sigma[i][np.isfinite(results.sigma[i])]).sum()
+        constant += 0.5 * results.n_bands[i] * np.log(2 * np.pi)
+        assert_allclose(results.log_evidence[i] + constant, want["log_sum"], rtol=0, atol=1e-5)
+        assert_allclose(results.pdf_2d[i], want["zf"], rtol=rtol, atol=atol)
+        for name, kind, _, share, _ in parameters:
+            assert_allclose(results.pdf[name][i], share @ want[kind], rtol=rtol, atol=atol)
+        scale, (mean, std) = 1e-9 * np.abs(want["mean"]).max(), results.moments[i, :, :2].T
+        assert_allclose(mean, want["mean"], rtol=rtol, atol=floor * scale)
+        assert_allclose(std, want["std"], rtol=std_rtol, atol=1e2 * scale)
+        assert_allclose(results.model_flux[i], want["band"], rtol=max(rtol, 1e-7))
+        assert_allclose(results.model_flux_std[i], want["band_std"], rtol=1e-4)

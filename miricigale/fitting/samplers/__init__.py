@@ -9,6 +9,7 @@ import numpy as np
 
 from miricigale.utils.optional import require
 from miricigale.utils.options import check_names
+from miricigale.utils.parallel import chunks
 
 #: What to cite for them.
 CITATIONS = {
@@ -137,14 +138,11 @@ class Lockstep:
         items = list(items)
         out = []
         with ThreadPoolExecutor(self.size) as threads:
-            for first in range(0, len(items), self.size):
-                part = items[first : first + self.size]
+            for rows in chunks(len(items), self.size):
+                part = items[rows]
                 self._asked, self._answers, self._running = {}, {}, len(part)
-                tasks = [
-                    threads.submit(self._run, function, number, item)
-                    for number, item in enumerate(part)
-                ]
-                out += [task.result() for task in tasks]
+                run = partial(self._run, function)
+                out += list(threads.map(run, range(len(part)), part))
         return out
 
     def evaluate(self, point):

@@ -83,9 +83,7 @@ class SamplerFit:
         values = self.space.values(points)
         rows = [{name: float(v[i]) for name, v in values.items()} for i in range(_FEW_TRIALS)]
         for component in self.model.components:
-            if not component.refuses:
-                continue
-            why = [component.invalid(row) for row in rows]
+            why = [component.invalid(row) for row in rows] if component.refuses else [None]
             if all(why):
                 names = [name for name in component.parameters if name in self.space.free]
                 wanted = f"values that {component.name!r} has, such as a list of them"
@@ -111,15 +109,12 @@ class SamplerFit:
 
     def settings(self):
         """Return the settings of the fit as plain values."""
-        request = self.request
-        fixed = self.space.fixed.items()
+        request, fixed = self.request, self.space.fixed.items()
         return {
             "priors": {name: str(prior) for name, prior in self.space.free.items()},
             "mass": "profile" if self.profile else "parameter",
             "scale_error": self.scale_error,
-            "n_live": request.n_live,
-            "n_effective": request.n_effective,
-            "max_calls": request.max_calls,
+            **{name: getattr(request, name) for name in ("n_live", "n_effective", "max_calls")},
             "options": {name: str(value) for name, value in request.options.items()},
             "constants": {name: v for name, v in fixed if name not in ("mass", "redshift")},
         }
@@ -182,14 +177,12 @@ class SamplerFit:
         kinds = {} if agn is None else dict.fromkeys(agn.parameters, "agn")
         kinds |= {"redshift": "redshift", "frac_agn": "frac_agn"}
         axes = {}
-        for name in dict.fromkeys(("redshift", *self.space.free)):
-            if name == "mass":
-                continue
-            if name == "redshift":
-                unit, cells = 1, redshift_axis(spaces, self._limits, n_cells)
-            else:
-                unit, cells = model.parameters[name].unit, self.space.free[name].cells(n_cells)
-            nodes, weights, bounds = cells
+        cells = {"redshift": redshift_axis(spaces, self._limits, n_cells)}
+        for name, prior in self.space.free.items():
+            if name not in ("mass", "redshift"):
+                cells[name] = prior.cells(n_cells)
+        for name, (nodes, weights, bounds) in cells.items():
+            unit = 1 if name == "redshift" else model.parameters[name].unit
             kind = kinds.get(name, "galaxy")
             axes[name] = GridAxis(name, nodes, unit, kind, weights, None, bounds)
         return axes
@@ -223,8 +216,7 @@ class SamplerFit:
             found = self._sample(data._take(row), spaces[row], seed, axes, pairs)
             if found is None:
                 flags[row] |= int(FitFlags.NO_MODEL)
-                continue
-            for name, value in found.items():
+            for name, value in (found or {}).items():
                 if isinstance(value, dict):
                     for key, array in out[name].items():
                         array[row] = value[key]
@@ -289,11 +281,8 @@ class SamplerFit:
             if self.profile and self.scale_error:
                 std = np.sqrt(calls.of("variance", call))
                 scale = positive_normal(scale, std, stream(seed, "scale", key))
-            values = {
-                name: np.full(len(call), value)
-                for name, value in space.fixed.items()
-                if name in axes
-            }
+            fixed = space.fixed.items()
+            values = {name: np.full(len(call), value) for name, value in fixed if name in axes}
             values |= calls.of("parameters", call)
             of_best = {name: np.array([array[0]]) for name, array in values.items()}
             of_best |= calls.of("parameters", best)
@@ -317,10 +306,8 @@ class SamplerFit:
         """Derived quantities of models of given masses, from those for one solar mass."""
         columns = self.columns
         out = {"mass": scale}
-        out |= {
-            name: array * scale if columns[name].extensive else array
-            for name, array in derived.items()
-        }
+        for name, array in derived.items():
+            out[name] = array * scale if columns[name].extensive else array
         other = [name for name, column in columns.items() if column.of == "xray"]
         if other:
             # these are not proportional to mass
@@ -343,17 +330,17 @@ class SamplerFit:
             return sums.reshape(size[x], size[y])
 
         columns = [values[name] for name in axes] + list(derived.values())
-        parts = [_summary(array, weight) for array in columns]
-        n_axes, mean, n_draws = len(axes), weight @ flux, self.request.n_draws
-        drawn = rng.permutation(systematic_draws(weight, n_draws, rng))
+        moments, quantiles = zip(*(_summary(array, weight) for array in columns), strict=True)
+        n, mean = len(axes), weight @ flux
+        drawn = rng.permutation(systematic_draws(weight, self.request.n_draws, rng))
         return {
             "pdf": {n: np.bincount(cells[n], weight, minlength=size[n]) for n in axes},
             "pdf_2d": joint("redshift", "frac_agn"),
             "pairs": {(x, y): joint(x, y) for x, y in pairs},
-            "axis_moments": [moments[:2] for moments, _ in parts[:n_axes]],
-            "axis_quantiles": [quantiles for _, quantiles in parts[:n_axes]],
-            "moments": [moments for moments, _ in parts[n_axes:]],
-            "quantiles": [quantiles for _, quantiles in parts[n_axes:]],
+            "axis_moments": [one[:2] for one in moments[:n]],
+            "axis_quantiles": quantiles[:n],
+            "moments": moments[n:],
+            "quantiles": quantiles[n:],
             "draws": np.column_stack(columns)[drawn],
             "model_flux": mean,
             "model_flux_std": np.sqrt(weight @ np.square(flux - mean)),
@@ -374,10 +361,8 @@ def _summary(values, weight):
     values, weight = values[good], weight[good] / weight[good].sum()
     mean = weight @ values
     std = np.sqrt(weight @ np.square(values - mean))
-    positive = values > 0
-    log_mean = np.nan
-    if positive.any():
-        log_mean = weight[positive] @ np.log10(values[positive]) / weight[positive].sum()
+    lit = values > 0
+    log_mean = weight[lit] @ np.log10(values[lit]) / weight[lit].sum() if lit.any() else np.nan
     order = np.argsort(values, kind="stable")
     middle = np.cumsum(weight[order]) - 0.5 * weight[order]
     return np.array([mean, std, log_mean]), np.interp(DERIVED_LEVELS, middle, values[order])

@@ -185,10 +185,7 @@ def make_prior(name, prior, parameter):
     or what lies outside the bounds of the parameter.
     """
     argument = f"priors[{name!r}]"
-    wanted = "(low, high), (low, high, 'log'), 'flat', 'log', values, a distribution or a number"
-    if isinstance(prior, str):
-        if prior not in ("flat", "log"):
-            raise argument_error(argument, wanted, repr(prior))
+    if isinstance(prior, str) and prior in ("flat", "log"):
         return _interval(argument, *parameter.bounds, prior)
     if hasattr(prior, "ppf") and hasattr(prior, "cdf"):
         law = Continuous(*parameter.bounds, prior)
@@ -197,27 +194,20 @@ def make_prior(name, prior, parameter):
             text = f"with weight from {law.low} to {law.high}"
             raise argument_error(argument, text, str(law))
         return law
-    if isinstance(prior, tuple):
-        if len(prior) == 3 and prior[2] in ("log", "flat"):
-            return _interval(argument, *_ends(argument, prior[:2], parameter), prior[2])
-        if len(prior) != 2:
-            raise argument_error(argument, wanted, repr(prior))
-        if np.ndim(prior[0]) == 1 and np.ndim(prior[1]) == 1:
-            return _choice(argument, *prior, parameter)
-        return _interval(argument, *_ends(argument, prior, parameter), "flat")
-    if np.ndim(prior) == 1:
+    if not isinstance(prior, tuple) and np.ndim(prior) == 1:
         return _choice(argument, prior, np.ones(len(prior)), parameter)
     try:
-        return parameter.check(prior)
+        if not isinstance(prior, tuple):
+            return parameter.check(prior)
+        if len(prior) == 2 and np.ndim(prior[0]) == np.ndim(prior[1]) == 1:
+            return _choice(argument, *prior, parameter)
+        if len(prior) == 2 or (len(prior) == 3 and prior[2] in ("log", "flat")):
+            low, high, kind = (*prior, "flat")[:3]
+            return _interval(argument, parameter.check(low), parameter.check(high), kind)
     except TypeError:
-        raise argument_error(argument, wanted, repr(prior)) from None
-
-
-def _ends(argument, pair, parameter):
-    try:
-        return [parameter.check(value) for value in pair]
-    except TypeError:
-        raise argument_error(argument, "a pair of numbers", repr(pair)) from None
+        pass
+    wanted = "(low, high), (low, high, 'log'), 'flat', 'log', values, a distribution or a number"
+    raise argument_error(argument, wanted, repr(prior))
 
 
 def _interval(argument, low, high, kind):
@@ -261,12 +251,8 @@ class Space:
         check_names(priors, "parameter", declared)
         made = {name: make_prior(name, priors[name], declared[name]) for name in priors}
         free = {name: made[name] for name in declared if not _number(made.get(name, 0.0))}
-        fixed = {
-            name: made.get(name, parameter.default)
-            for name, parameter in declared.items()
-            if name not in free
-        }
-        return cls(free, fixed)
+        every = {name: made.get(name, parameter.default) for name, parameter in declared.items()}
+        return cls(free, {name: every[name] for name in every if name not in free})
 
     def with_prior(self, name, prior):
         """Copy in which a parameter has another prior, or a value."""
