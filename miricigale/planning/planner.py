@@ -70,23 +70,25 @@ class Plan:
             (`~miricigale.depth.sensitivity`) and ``limit_used`` (the errors that are drawn, points), and
             ``saturates``, the magnitude at which a point does.
         """
-        rows = [
-            {
-                "filter": name,
-                "time": np.round(plan.time.to(u.s), 1),
-                "groups": plan.exposure.n_groups,
-                "integrations": plan.exposure.n_integrations,
-                "dithers": plan.n_dithers,
+        columns = (
+            "filter",
+            "time",
+            "groups",
+            "integrations",
+            "dithers",
+            "background",
+            "sky_in_well",
+        )
+        columns += ("limit_etc", "limit", "limit_used", "saturates", "n_saturated")
+        rows = []
+        for name, plan in self.bands.items():
+            row = plan.numbers() | {
                 "background": np.round(plan.background, 2),
-                "sky_in_well": round(float(plan.sky_fraction), 3),
-                "limit_etc": np.round(plan.calculator, 2),
-                "limit": np.round(plan.limit, 2),
                 "limit_used": np.round(plan.errors().limiting_magnitude(name), 2),
                 "saturates": np.round(plan.saturation, 1),
                 "n_saturated": int(np.count_nonzero(self.sources[f"{name}_saturated"])),
             }
-            for name, plan in self.bands.items()
-        ]
+            rows.append({column: row[column] for column in columns})
         return QTable(rows)
 
 

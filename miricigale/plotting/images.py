@@ -3,19 +3,8 @@
 import numpy as np
 
 from miricigale.plotting.axes import TRUE, add_borders, new_figure, resolve_axes
-
-__all__ = [
-    "add_colorbar",
-    "color_image",
-    "mark_sky",
-    "plot_color",
-    "plot_footprint",
-    "plot_image",
-    "plot_model_residual",
-    "plot_offsets",
-    "plot_segmentation",
-]
-
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_choice
 
 #: Color of lines over an image.
 _LINES = "#c2410c"
@@ -130,9 +119,7 @@ def plot_image(
     """
     from matplotlib.colors import AsinhNorm, Normalize
 
-    if stretch not in ("asinh", "linear"):
-        msg = f"'stretch' must be 'asinh' or 'linear', got {stretch!r}"
-        raise ValueError(msg)
+    check_choice(stretch, "stretch", ("asinh", "linear"))
     ax = resolve_axes(ax)
     image = np.asarray(image, float)
     low, high = _limits(image) if limits is None else limits
@@ -183,8 +170,7 @@ def plot_model_residual(
         _, ax = new_figure(1, 3, size=(4.2, 3.9))
     ax = np.ravel(np.asarray(ax, dtype=object))
     if len(ax) != 3:
-        msg = f"'ax' must be three axes, got {len(ax)}"
-        raise ValueError(msg)
+        raise argument_error("ax", "three axes", len(ax))
     image, model = np.asarray(image, float), np.asarray(model, float)
     residual = image - model
     noise = _robust(residual)[1]
@@ -400,8 +386,7 @@ def plot_segmentation(image, labels, *, ax=None, pixel_scale=1.0, center=None, *
     """
     image, labels = np.asarray(image), np.asarray(labels)
     if image.shape != labels.shape:
-        msg = f"'labels' must be of the image's shape {image.shape}, got {labels.shape}"
-        raise ValueError(msg)
+        raise argument_error("labels", f"of the image's shape {image.shape}", labels.shape)
     ax = plot_image(image, ax=ax, pixel_scale=pixel_scale, center=center, **kwargs)
     left, _, bottom, _ = _extent(image.shape, pixel_scale, center)
     y, x = (np.arange(n + 1) * pixel_scale for n in image.shape)
