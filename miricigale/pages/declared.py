@@ -67,38 +67,38 @@ class SectionWriter:
         self.report, self.texts = report, texts
         self._section = None
 
-    def sentence(self, name, **facts):
+    def sentence(self, name, /, **facts):
         """Return a sentence of the current section, filled with the facts of all and further ones."""
         return sentence(self.texts[self._section][name], self.facts | facts)
 
-    def notice(self, name, **facts):
+    def notice(self, name, /, **facts):
         """Add a sentence of ``[notices]`` to what stands above the first section."""
         self.report.notices.append(sentence(self.texts["notices"][name], self.facts | facts))
 
-    def section(self, name, text="text", **facts):
+    def section(self, name, text="text", /, **facts):
         """Begin a section, with the paragraph ``text`` where it has that."""
         self._section = name
         paragraph = self.sentence(text, **facts) if text in self.texts[name] else ""
         self.report.section(sentence(self.texts[name]["title"], self.facts | facts), paragraph)
 
-    def text(self, name, **facts):
+    def text(self, name, /, **facts):
         """Add a paragraph."""
         self.report.text(self.sentence(name, **facts))
 
-    def items(self, values, name="items", **facts):
+    def items(self, values, /, **facts):
         """Add headline numbers: label, and how it is taken from values by name; unknown ones are left out."""
         self.report.items(
             (sentence(label, self.facts | facts), cell_of(values, column))
-            for label, *column in self.texts[self._section][name]
+            for label, *column in self.texts[self._section]["items"]
             if column[0] in values
         )
 
-    def figure(self, name, figure, **facts):
+    def figure(self, name, figure, /, **facts):
         """Add a figure with its caption, unless there is none."""
         if figure is not None:
             self.report.figure(figure, self.sentence(name, **facts))
 
-    def table(self, name, rows, **facts):
+    def table(self, name, rows, /, **facts):
         """Add a table as it is declared, from dictionaries; without columns it has all of their keys."""
         table, rows, facts = self.texts[self._section][name], list(rows), self.facts | facts
         keys = list(rows[0]) if rows else ()

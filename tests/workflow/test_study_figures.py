@@ -11,7 +11,6 @@ from helpers.figures import error_bars, legend_texts, line_data
 from helpers.runs import made_up_kernel, noise_image
 from helpers.studies import BANDS, mock_study
 from miricigale.evaluation import completeness, study_confusion, xray_fluxes
-from miricigale.plotting.posteriors import plot_sed_fit
 from miricigale.sed import SED
 from miricigale.workflow.page import band_figures, pictures, source_figures, study_figures
 
@@ -216,49 +215,3 @@ def test_spectra_are_in_order_of_their_fraction(study):
     marks = [line[0, 0] for line in line_data(ax, ":")]
     np.testing.assert_allclose(marks, features[features < 38])
     assert {"F770W", "F2100W"} < {text.get_text() for text in ax.texts}
-
-
-class Fit:
-    """A fit of one source with Gaussian posteriors of a width."""
-
-    chi2, n_bands, filters = 3.0, 3, ("irac.ch1", "irac.ch2", "miri.f770w")
-    edges = {"redshift": np.linspace(0, 4, 41), "frac_agn": np.linspace(0, 1, 11)}
-    best = {"redshift": 1.5 * u.one, "frac_agn": 0.4 * u.one}
-    loc = property(lambda self: {7: self})
-
-    def __init__(self, width):
-        z, f = (0.5 * (edges[1:] + edges[:-1]) for edges in self.edges.values())
-        log = ((z[:, None] - 1.5) / width) ** 2 + ((f - 0.4) / width) ** 2
-        self.weights = np.exp(-0.5 * log) / np.exp(-0.5 * log).sum()
-
-    def distribution(self, axis):
-        return self.edges[axis] * u.one, self.weights.sum(axis=1 if axis == "redshift" else 0)
-
-    def joint_pdf(self, *_):
-        return self.weights
-
-    def best_sed(self, model, **_):
-        return SED([1, 10] * u.um, [1, 2] * u.uJy)
-
-    def plot_sed(self, *, model, **options):
-        flux = [1.0, 2.0, 3.0] * u.uJy
-        return plot_sed_fit([1.0, 5.0, 10.0] * u.um, flux, 0.1 * flux, 1.1 * flux, **options)
-
-
-def test_a_fit_has_residuals_and_posteriors_with_one_range():
-    row = {"id": 7, "redshift": 1.5, "frac_agn": 0.4}
-    figure = source_figures.example_figure({"all": Fit(0.1), "none": Fit(0.5)}, row, 7, None)
-    upper, lower, redshift, fraction, first, second = figure.axes
-    assert upper.get_title().startswith("source 7: injected z = 1.500")
-    assert lower.get_ylabel().startswith("residual")
-    for ax in (redshift, fraction):
-        peaks = [patch.get_data().values.max() for patch in ax.patches]
-        assert peaks == pytest.approx([1.0, 1.0, 1.0])
-    assert legend_texts(redshift) == ["with MIRI", "without MIRI", "truth"]
-    # as wide as the wider of the two
-    low, high = redshift.get_xlim()
-    assert low < 0.5
-    assert high > 2.5
-    assert first.get_xlim() == second.get_xlim()
-    assert first.get_ylim() == second.get_ylim()
-    assert first.get_title() == "with MIRI"

@@ -174,8 +174,9 @@ def write_comparison(page, reasons, sentences):
     for row in table:
         mark = {"=": "", "~": "about "}.get(row["relation"], f"{row['relation']} ")
         second_hand = "" if row["source"] else " [?]"
-        error = 0.5 * (row["high"] - row["low"])
-        form = f"{{:.3g}} ± {error:.2g}" if np.isfinite(error) else ".3g"
+        low, high = row["low"], row["high"]
+        known = np.isfinite([low, high]).all()
+        form = f"{{:.3g}} ± {0.5 * (high - low):.2g}" if known else ".3g"
         cells = {
             "paper": f"{mark}{row['paper']:.3g}{second_hand}",
             "ours": number(row["ours"], form, "not measured in this study"),

@@ -144,7 +144,7 @@ def _write_redshifts(page, rows):
 def _write_fractions(page, rows):
     """AGN fractions."""
     study = page.study
-    page.section("fractions", text="truths" if len(study.truths) > 1 else "text")
+    page.section("fractions", "truths" if len(study.truths) > 1 else "text")
     if sum(one.frac_agn is not None and one.sample.any() for one in study.truths) > 1:
         page.figure("bins", study_figures.fraction_bins_figure(study))
     page.figure("means", study_figures.histogram_figure(study, "fraction"))
