@@ -2,6 +2,7 @@
 
 import astropy.units as u
 import numpy as np
+from astropy.nddata import block_reduce
 from astropy.wcs.utils import proj_plane_pixel_scales
 
 from miricigale.evaluation import sigma_mad
@@ -20,13 +21,6 @@ def filled(image):
     if image.mask is not None:
         data[np.asarray(image.mask, bool)] = np.nan
     return data
-
-
-def binned(data, factor):
-    """Means of squares of pixels; NaN where one of them is."""
-    ny, nx = (n // factor * factor for n in data.shape)
-    blocks = data[:ny, :nx].reshape(ny // factor, factor, nx // factor, factor)
-    return blocks.mean(axis=(1, 3))
 
 
 def _scale(image):
@@ -60,7 +54,7 @@ def field_figure(images, prior, names):
     corners = images[0].wcs.pixel_to_world([x0 - 0.5, x1 - 0.5], [y0 - 0.5, y1 - 0.5])
     x, y = (np.round(v + 0.5).astype(int).clip(0) for v in prior.wcs.world_to_pixel(corners))
     factor = max(1, round(_scale(images[0]) / _scale(prior)))
-    field = binned(filled(prior)[y[0] : y[1], x[0] : x[1]], factor)
+    field = block_reduce(filled(prior)[y[0] : y[1], x[0] : x[1]], factor, np.mean)
     labels = [band_label(name) for name in names]
     color = len(planes) == 3
     n = 2 if color else 1 + len(planes)
@@ -76,7 +70,7 @@ def field_figure(images, prior, names):
         parts = zip(("blue", "green", "red"), labels, strict=False)
         title = ", ".join(f"{label} {color}" for color, label in parts)
         # binned, to reduce the noise of single pixels in the color image
-        planes = [binned(plane, 2) for plane in planes]
+        planes = [block_reduce(plane, 2, np.mean) for plane in planes]
         options = {"stretch": 4.0, "softening": 7.0, "title": title}
         plot_color(*planes[::-1], ax=axes[1], pixel_scale=2 * _scale(images[0]), **options)
     else:
