@@ -270,14 +270,12 @@ class Planner:
             table[f"{name}_saturated"] = self.sources[name] >= plan.saturation.to(u.uJy)
         return table
 
-    def compare(self, sets=None, *, measured=None):
+    def compare(self, *, measured=None):
         """
-        Evaluate the existing bands alone and each set of bands.
+        Evaluate the existing bands alone and each set of bands of the configuration.
 
         Parameters
         ----------
-        sets : iterable of str, optional
-            Sets as in ``[exposures] sets``; those of the configuration by default.
         measured : `~astropy.table.QTable`, optional
             As for `photometry`.
 
@@ -287,7 +285,7 @@ class Planner:
             The existing bands first.
         """
         plans = [self.evaluate((), name=EXISTING)]
-        for name in self.config.exposures.sets if sets is None else sets:
+        for name in self.config.exposures.sets:
             short = name.replace("miri.", "").replace(" ", "")
             bands = self.config.set_bands(name)
             plans.append(self.evaluate(bands, name=short, measured=measured))

@@ -229,19 +229,16 @@ def plot_offsets(xy, offset, field, *, used=None, ax=None, title=None):
     return ax
 
 
-def color_image(red, green, blue, *, scale=None, softening=8.0, stretch=6.0):
+def color_image(red, green, blue):
     """
     Make a color image whose hues do not depend on brightness.
+
+    Each image is divided by its own noise, so that the sky is gray.
 
     Parameters
     ----------
     red, green, blue : array_like, shape (ny, nx)
         Images on the same pixels. A pixel with NaN in one of them is black.
-    scale : (float, float, float), optional
-        Factors for the three; by default each is divided by its own noise, so that the
-        sky is gray.
-    softening, stretch : float, optional
-        Q and linear stretch of Lupton et al., in units of the noise.
 
     Returns
     -------
@@ -263,17 +260,17 @@ def color_image(red, green, blue, *, scale=None, softening=8.0, stretch=6.0):
         msg = f"'red', 'green', 'blue' must be of one shape, got {[p.shape for p in planes]}"
         raise ValueError(msg)
     scaled = []
-    for k, plane in enumerate(planes):
+    for plane in planes:
         middle, sigma = _robust(plane)
-        factor = 1 / sigma if scale is None else scale[k]
-        scaled.append(np.nan_to_num((plane - middle) * factor, nan=0.0))
-    image = make_lupton_rgb(*scaled, minimum=-1.0, stretch=stretch, Q=softening)
+        scaled.append(np.nan_to_num((plane - middle) * (1 / sigma), nan=0.0))
+    # stretch is in units of the noise
+    image = make_lupton_rgb(*scaled, minimum=-1.0, stretch=4.0, Q=7.0)
     # a color of two bands would be a wrong one
     image[np.any(np.isnan(planes), axis=0)] = 0
     return image
 
 
-def plot_color(red, green, blue, *, ax=None, pixel_scale=1.0, title=None, center=None, **kwargs):
+def plot_color(red, green, blue, *, ax=None, pixel_scale=1.0, title=None, center=None):
     """
     Draw a color image on axes in arcsec.
 
@@ -283,15 +280,13 @@ def plot_color(red, green, blue, *, ax=None, pixel_scale=1.0, title=None, center
         As in `color_image`.
     ax, pixel_scale, title, center : optional
         As in `plot_image`.
-    **kwargs
-        Passed to `color_image`.
 
     Returns
     -------
     ax : `~matplotlib.axes.Axes`
     """
     ax = resolve_axes(ax)
-    _draw(color_image(red, green, blue, **kwargs), ax, pixel_scale, title, center)
+    _draw(color_image(red, green, blue), ax, pixel_scale, title, center)
     return ax
 
 

@@ -71,8 +71,7 @@ def field_figure(images, prior, names):
         title = ", ".join(f"{label} {color}" for color, label in parts)
         # binned, to reduce the noise of single pixels in the color image
         planes = [block_reduce(plane, 2, np.mean) for plane in planes]
-        options = {"stretch": 4.0, "softening": 7.0, "title": title}
-        plot_color(*planes[::-1], ax=axes[1], pixel_scale=2 * _scale(images[0]), **options)
+        plot_color(*planes[::-1], ax=axes[1], pixel_scale=2 * _scale(images[0]), title=title)
     else:
         for ax, plane, image, label in zip(axes[1:], planes, images, labels, strict=False):
             plot_image(plane, ax=ax, pixel_scale=_scale(image), title=label, **gray)
