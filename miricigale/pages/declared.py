@@ -52,6 +52,11 @@ class SectionWriter:
     """
     Fills a page with declared sections.
 
+    A section has a ``title``, sentences by name (``text`` is its paragraph), ``items`` (headline numbers: label,
+    and how `~miricigale.pages.cell_of` takes the value), and tables by name: ``columns`` (header, and the same of
+    the cells), ``caption``, ``empty`` and ``text`` as of `~miricigale.pages.Page.table`. Words in braces are filled
+    with facts.
+
     Parameters
     ----------
     report : `~miricigale.pages.Page`
