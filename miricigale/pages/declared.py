@@ -54,8 +54,8 @@ class SectionWriter:
 
     A section has a ``title``, sentences by name (``text`` is its paragraph), ``items`` (headline numbers: label,
     and how `~miricigale.pages.cell_of` takes the value), and tables by name: ``columns`` (header, and the same of
-    the cells), ``caption``, ``empty`` and ``text`` as of `~miricigale.pages.Page.table`. Words in braces are filled
-    with facts.
+    the cells), ``caption``, ``empty`` and ``text`` as of `~miricigale.pages.Page.table`. Words in braces are
+    filled with facts.
 
     Parameters
     ----------
