@@ -8,8 +8,6 @@ import numpy as np
 from astropy.table import QTable, vstack
 
 from miricigale.fitting import BayesFitter
-from miricigale.photometry import ErrorModel
-from miricigale.photometry.surveys import fractional_error
 from miricigale.planning.accuracy import accuracy
 from miricigale.planning.config import PlanConfig
 from miricigale.planning.exposures import RunErrors, band_plans, wall_clock
@@ -17,6 +15,7 @@ from miricigale.planning.sample import make_sample
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import error_column, require_columns
+from miricigale.workflow.stages.fits import existing_errors
 from miricigale.workflow.stages.sample import detected_bands
 
 #: Name of the fit without MIRI.
@@ -159,12 +158,8 @@ class Planner:
     @functools.cached_property
     def _existing(self):
         """Mock photometry in the existing bands, the same for every plan."""
-        fit = self.config.fit
-        errors = ErrorModel.from_depths(
-            dict(zip(fit.bands, fit.depths, strict=True)),
-            fractional={name: fractional_error(name) for name in fit.bands},
-        )
-        return errors.perturb(self.sources[["id", *fit.bands]], seed=self.config.plan.seed)
+        columns = self.sources[["id", *self.config.fit.bands]]
+        return existing_errors(self.config.fit).perturb(columns, seed=self.config.plan.seed)
 
     def photometry(self, plans, measured=None):
         """

@@ -139,6 +139,14 @@ def match_sources(context, unit):
     context.save_table(f"{unit}/matched.ecsv", matched)
 
 
+def existing_errors(fit):
+    """Errors (`~miricigale.photometry.ErrorModel`) of the existing bands of a section ``[fit]``."""
+    return photometry.ErrorModel.from_depths(
+        dict(zip(fit.bands, fit.depths, strict=True)),
+        fractional={name: fractional_error(name) for name in fit.bands},
+    )
+
+
 def mock_photometry(config, truth, matched, *, seed, zero_point=0.0):
     """
     Photometry of the fitted sample (``selection`` 0): mock existing bands, measured MIRI bands.
@@ -147,11 +155,7 @@ def mock_photometry(config, truth, matched, *, seed, zero_point=0.0):
     on ``seed``, its id and the band only. The light of existing bands is higher or lower by the share
     ``zero_point``, of which the fits do not know.
     """
-    bands = config.fit.bands
-    errors = photometry.ErrorModel.from_depths(
-        dict(zip(bands, config.fit.depths, strict=True)),
-        fractional={name: fractional_error(name) for name in bands},
-    )
+    bands, errors = config.fit.bands, existing_errors(config.fit)
     sample = np.asarray(matched["selection"]) == 0
     name = "zero_point_existing"
     light = Perturbation({name: zero_point}, seed).fluxes(name, truth[["id", *bands]], bands)
