@@ -7,7 +7,6 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable, vstack
 
-from miricigale.fitting import BayesFitter
 from miricigale.planning.accuracy import accuracy
 from miricigale.planning.config import PlanConfig
 from miricigale.planning.exposures import RunErrors, band_plans, wall_clock
@@ -15,7 +14,7 @@ from miricigale.planning.sample import make_sample
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import error_column, require_columns
-from miricigale.workflow.stages.fits import existing_errors
+from miricigale.workflow.stages.fits import existing_errors, study_fitter
 from miricigale.workflow.stages.sample import detected_bands
 
 #: Name of the fit without MIRI.
@@ -230,12 +229,8 @@ class Planner:
         known = self.band_plans(share)
         plans = {band: known[band] for band in bands}
         photometry = self.photometry(plans.values(), measured)
-        fitter = BayesFitter(
-            SEDModel.yang2021(),
-            [*config.fit.bands, *bands],
-            axes=SEDModel.yang2021_axes(config.fit.axes),
-            model_error=config.fit.model_error,
-        )
+        axes = SEDModel.yang2021_axes(config.fit.axes)
+        fitter = study_fitter(config.fit, bands, axes=axes)
         results = fitter.fit(photometry, executor=self.executor)
         table = self._results(results, photometry, plans)
         pointings = config.exposures.pointings if pointings is None else pointings

@@ -214,6 +214,12 @@ def fit_sample(context, name, **options):
     return truth, matched, mock
 
 
+def study_fitter(fit, bands, **options):
+    """`BayesFitter` in the existing bands of a section ``[fit]`` and further ones."""
+    options = {"model_error": fit.model_error} | options
+    return fitting.BayesFitter(sed.SEDModel.yang2021(), [*fit.bands, *bands], **options)
+
+
 def fit_mock(context, mock, bands, *, given=None, **options):
     """
     Fit mock photometry in the existing and in further bands as the study does.
@@ -235,12 +241,7 @@ def fit_mock(context, mock, bands, *, given=None, **options):
     -------
     results : `~miricigale.fitting.FitResults`
     """
-    fit = context.config.fit
-    fitter = fitting.BayesFitter(
-        sed.SEDModel.yang2021(),
-        [*fit.bands, *bands],
-        **({"model_error": fit.model_error} | options),
-    )
+    fitter = study_fitter(context.config.fit, bands, **options)
     with ThreadPoolExecutor(context.n_threads) as executor:
         given = {"executor": executor, "progress_bar": context.progress_bar} | (given or {})
         return fitter.fit(mock, **given)
