@@ -1,5 +1,7 @@
 """How faint a point source an exposure reaches through an aperture: the closed form."""
 
+import itertools
+
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
@@ -11,6 +13,7 @@ from miricigale.instrument import frame_time, imager_filters
 from miricigale.psf import MIRI_PIXEL_SCALE, instrument_psf, miri_psf, psf_image
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
+from miricigale.utils.options import check_least, check_positive
 from miricigale.utils.units import ANGLE, SURFACE_BRIGHTNESS, TIME, to_array
 
 # positions of the source's center within the pixel, per axis, over which is averaged
@@ -62,20 +65,11 @@ def _extraction(radius, annulus, psf, correlation, filter):
     scale = MIRI_PIXEL_SCALE.value
     edges = None if annulus is None else tuple(edge / scale for edge in annulus)
     values = []
-    for dy in _PHASES:
-        for dx in _PHASES:
-            weights = extraction_weights(radius / scale, edges, offset=(dx, dy))
-            share = psf_image(
-                psf, pixel_scale=MIRI_PIXEL_SCALE, shape=weights.shape, offset=(dx, dy)
-            )
-            values.append(
-                (
-                    np.sum(weights * share),
-                    noise_power(weights),
-                    np.sum(weights**2 * share),
-                    noise_power(weights, correlation),
-                )
-            )
+    for offset in itertools.product(_PHASES, _PHASES):
+        weights = extraction_weights(radius / scale, edges, offset=offset)
+        share = psf_image(psf, pixel_scale=MIRI_PIXEL_SCALE, shape=weights.shape, offset=offset)
+        light, shot = np.sum(weights * share), np.sum(weights**2 * share)
+        values.append((light, noise_power(weights), shot, noise_power(weights, correlation)))
     return np.mean(values, axis=0)
 
 
@@ -165,14 +159,11 @@ def aperture_noise(
     seconds = float(to_array(time, TIME, "time", ndim=0, finite=True))
     groups = setup.n_groups if n_groups is None else n_groups
     step = frame_time(readout, subarray).to_value(TIME)
-    for name, value, good, wanted in (
-        ("n_sigma", n_sigma, n_sigma > 0, "positive"),
-        ("correlation", correlation, 0 <= correlation <= 30, "from 0 to 30 pixels"),
-        ("n_dithers", n_dithers, n_dithers >= 1, "at least 1"),
-        ("n_groups", n_groups, groups >= 2 and int(groups) == groups, "an integer of at least 2"),
-    ):
-        if not good:
-            raise argument_error(name, wanted, value)
+    check_positive(n_sigma, "n_sigma")
+    check_least(n_dithers, "n_dithers", 1)
+    check_least(groups, "n_groups", 2, whole=True)
+    if not 0 <= correlation <= 30:
+        raise argument_error("correlation", "from 0 to 30 pixels", correlation)
     if seconds < groups * step * (1 - 1e-9):
         wanted = f"at least one integration of {groups} groups, {groups * step:.4g} s"
         raise argument_error("time", wanted, time)
@@ -251,6 +242,15 @@ def sensitivity(filter, time=1e4 * u.s, *, n_sigma=10.0, residual=None, **option
     return found["flux"] * u.uJy
 
 
+#: Columns of `sensitivity_table` by what `aperture_noise` calls them.
+_COLUMNS = {
+    "noise": "white",
+    "residual": "residual",
+    "limit_white": "flux_white",
+    "limit": "flux",
+}
+
+
 def sensitivity_table(filters=None, time=1e4 * u.s, *, residual="etc", n_sigma=10.0, **options):
     """
     Limits of several filters, compared with those of the exposure time calculator.
@@ -283,22 +283,14 @@ def sensitivity_table(filters=None, time=1e4 * u.s, *, residual="etc", n_sigma=1
     seconds = float(to_array(time, TIME, "time", ndim=0, finite=True))
     rows = []
     for name in names:
-        row = aperture_noise(name, time, n_sigma=n_sigma, residual=residual, **options)
-        rows.append(
-            (
-                etc_setup(name).filter,
-                row["radius"] * ANGLE,
-                row["light"],
-                row["background"] * SURFACE_BRIGHTNESS,
-                row["white"] * u.uJy,
-                row["residual"] * u.uJy,
-                row["flux_white"] * u.uJy,
-                row["flux"] * u.uJy,
-                scaled_limit(name, time, n_sigma=n_sigma, version="4.0"),
-                scaled_limit(name, time, n_sigma=n_sigma, version="2.0"),
-            )
-        )
-    columns = ("filter", "radius", "light", "background", "noise", "residual")
-    columns += ("limit_white", "limit", "etc_40", "etc_20")
+        found = aperture_noise(name, time, n_sigma=n_sigma, residual=residual, **options)
+        row = {"filter": etc_setup(name).filter, "radius": found["radius"] * ANGLE}
+        row |= {"light": found["light"], "background": found["background"] * SURFACE_BRIGHTNESS}
+        for column, key in _COLUMNS.items():
+            row[column] = found[key] * u.uJy
+        for version in ("4.0", "2.0"):
+            limit = scaled_limit(name, time, n_sigma=n_sigma, version=version)
+            row[f"etc_{version.replace('.', '')}"] = limit
+        rows.append(row)
     meta = provenance(time=seconds, n_sigma=float(n_sigma), residual=str(residual))
-    return QTable(rows=rows, names=columns, meta=meta)
+    return QTable(rows, meta=meta)

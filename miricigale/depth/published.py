@@ -81,17 +81,15 @@ def etc_setup(filter):
     0.42 arcsec, 106 groups, 10001 s
     """
     name = _short(filter)
-    common, row = table("etc")["setup"], table("etc")["filters"][name]
-    radius = common["radius_per_um"] * row["wavelength"] * u.arcsec
+    common, counts = table("etc")["setup"], dict(table("etc")["filters"][name])
+    radius = common["radius_per_um"] * counts.pop("wavelength") * u.arcsec
     return EtcSetup(
         filter=f"miri.{name}",
         radius=radius,
         annulus=radius * common["annulus"],
         subtract_annulus=common["subtract_annulus"],
         readout=common["readout"],
-        n_groups=row["n_groups"],
-        n_integrations=row["n_integrations"],
-        n_exposures=row["n_exposures"],
+        **counts,
     )
 
 

@@ -5,6 +5,7 @@ import dataclasses
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from miricigale.instrument import Exposure, electron_rate, miri_detector
 from miricigale.utils.exceptions import argument_error
@@ -16,8 +17,8 @@ SKY_FRACTION = 0.6
 #: Group of a pixel that is never full.
 NEVER = 2**31 - 1
 
-#: Pixels around a source's own in which its brightest is looked for.
-_REACH = 1
+#: Side of the square of pixels around a source's own in which its brightest is looked for.
+_SIDE = 3
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -191,13 +192,9 @@ def _sources(sources, rate, group, limit, exposure):
         on = (x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)
     table = QTable({name: sources[name][on] for name in ("id", "x", "y")})
     column, row = (np.rint(v[on]).astype(int) for v in (x, y))
-    peak = np.zeros(len(table))
-    first = np.full(len(table), NEVER)
-    for dy in range(-_REACH, _REACH + 1):
-        for dx in range(-_REACH, _REACH + 1):
-            r, c = np.clip(row + dy, 0, ny - 1), np.clip(column + dx, 0, nx - 1)
-            peak = np.fmax(peak, rate[r, c])
-            first = np.minimum(first, group[r, c])
+    brightest = maximum_filter(np.nan_to_num(rate), _SIDE, mode="nearest")
+    peak = np.maximum(brightest[row, column], 0.0)
+    first = minimum_filter(group, _SIDE, mode="nearest")[row, column]
     table["peak_rate"] = peak * u.electron / u.s
     table["peak_fraction"] = _filled(peak, exposure, limit)
     table["saturated"] = first <= exposure.n_groups

@@ -22,7 +22,6 @@ from .coverage import posterior_ranks as posterior_ranks
 from .estimates import Estimate as Estimate
 from .estimates import bootstrap as bootstrap
 from .infrared import PAH_FEATURES as PAH_FEATURES
-from .infrared import equivalent_width as equivalent_width
 from .infrared import feature_magnitude as feature_magnitude
 from .infrared import feature_redshifts as feature_redshifts
 from .infrared import feature_residuals as feature_residuals
@@ -45,7 +44,6 @@ from .numbers import study_numbers as study_numbers
 from .paper import PUBLISHED as PUBLISHED
 from .paper import PublishedNumber as PublishedNumber
 from .paper import compare_with_paper as compare_with_paper
-from .paper import comparison_rows as comparison_rows
 from .population import AGNPopulation as AGNPopulation
 from .population import agn_fraction as agn_fraction
 from .population import galaxy_mass_function as galaxy_mass_function

@@ -63,7 +63,7 @@ def confusion(true, found):
         were found in it, unknown ones among them) and ``purity`` (share of those found in the class that are of
         it), each with its 68 % (Wilson) interval ``_low`` and ``_high``.
     """
-    true, found = one_by_one(true, found, ("true", "found"), dtypes=(str, str))
+    true, found = one_by_one(str, true=true, found=found)
     counts = {
         name: np.array([np.sum((true == own) & (found == name)) for own in CLASS_NAMES])
         for name in (*CLASS_NAMES, "unknown")
@@ -119,7 +119,7 @@ def selection_quality(wanted, selected):
     >>> quality.completeness.value, quality.purity.value
     (0.5, 1.0)
     """
-    wanted, selected = one_by_one(wanted, selected, ("wanted", "selected"), dtypes=(bool, bool))
+    wanted, selected = one_by_one(bool, wanted=wanted, selected=selected)
     both = np.count_nonzero(wanted & selected)
     return SelectionQuality(
         Estimate.of_fraction(both, np.count_nonzero(wanted)),

@@ -88,29 +88,6 @@ def mid_infrared_fractions(model, parameters):
     return out
 
 
-def equivalent_width(wave, light):
-    """
-    Equivalent width of features over the power law through the two ends of a range.
-
-    Parameters
-    ----------
-    wave : `~astropy.units.Quantity`, shape (n,)
-        Rest wavelengths of the range, ascending, such as 5.95 to 6.55 um for the feature at 6.2 um.
-    light : array-like, shape (n,)
-        F_nu or L_nu.
-
-    Returns
-    -------
-    width : `~astropy.units.Quantity`
-        In um, positive in emission.
-    """
-    x = to_array(wave, WAVE, "wave", ndim=1)
-    light = u.Quantity(light).value
-    continuum = np.exp(np.interp(np.log(x), np.log(x[[0, -1]]), np.log(light[[0, -1]])))
-    excess = light / continuum - 1.0
-    return np.trapezoid(excess, x) * WAVE
-
-
 def feature_magnitude(width, redshift, filter_width):
     """
     Magnitudes by which a feature within a broad band makes a source brighter.

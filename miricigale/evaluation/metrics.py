@@ -12,15 +12,13 @@ from miricigale.utils.exceptions import argument_error
 OUTLIER = 0.15
 
 
-def one_by_one(first, second, names, *, dtypes=(float, float)):
-    """Two 1-D arrays of one length; an error by their ``names`` if they are not."""
-    first, second = np.asarray(first, dtypes[0]), np.asarray(second, dtypes[1])
+def one_by_one(dtype=float, **arrays):
+    """Two 1-D arrays of one length, of a type; an error by their names if they are not."""
+    (name, first), (other, second) = arrays.items()
+    first, second = np.asarray(first, dtype), np.asarray(second, dtype)
     if first.shape != second.shape or first.ndim != 1:
-        raise argument_error(
-            names[1],
-            f"a 1-D array as long as '{names[0]}'",
-            f"shapes {first.shape} and {second.shape}",
-        )
+        got = f"shapes {first.shape} and {second.shape}"
+        raise argument_error(other, f"a 1-D array as long as '{name}'", got)
     return first, second
 
 
@@ -124,7 +122,7 @@ def photoz_metrics(z_true, z_fit):
     ValueError
         If the shapes differ.
     """
-    z_true, z_fit = one_by_one(z_true, z_fit, ("z_true", "z_fit"))
+    z_true, z_fit = one_by_one(z_true=z_true, z_fit=z_fit)
     good = np.isfinite(z_true) & np.isfinite(z_fit)
     delta = (z_fit[good] - z_true[good]) / (1 + z_true[good])
     n_out = int(np.count_nonzero(np.abs(delta) > OUTLIER))
@@ -178,7 +176,7 @@ def recovery_metrics(true, measured, *, relative=False):
     -------
     metrics : `RecoveryMetrics`
     """
-    true, measured = one_by_one(true, measured, ("true", "measured"))
+    true, measured = one_by_one(true=true, measured=measured)
     with np.errstate(divide="ignore", invalid="ignore"):
         delta = (measured - true) / true if relative else measured - true
     good = np.isfinite(delta)
@@ -209,7 +207,7 @@ def running_median(x, y, *, size=20):
     x_mid, y_mid, y_sigma : `~numpy.ndarray`, shape (n_bins,)
         Medians and `sigma_mad` in each bin.
     """
-    x, y = one_by_one(x, y, ("x", "y"))
+    x, y = one_by_one(x=x, y=y)
     if size < 1:
         raise argument_error("size", "at least 1", size)
     good = np.isfinite(x) & np.isfinite(y)

@@ -8,7 +8,6 @@ import numpy as np
 
 from miricigale.evaluation.estimates import Estimate
 from miricigale.evaluation.quantities import QUANTITIES, SHARES, measure
-from miricigale.pages import Missing
 from miricigale.utils.exceptions import unknown_name
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import described_rows
@@ -144,25 +143,7 @@ def compare_with_paper(study, *, seed, n_draws=1000, reasons=None):
             + (ours.value * ours.completeness if right else np.nan, sigma)
             + (_verdict(one, ours, sigma, why), one.definition, one.source)
         )
-    texts = {
-        "key": "Name of the number",
-        "section": "Part of the paper",
-        "description": "What it is",
-        "relation": "= equal, ~ about, < and > bounds",
-        "paper": "Yang et al. 2021",
-        "paper_err": "Its error or range, 0 if none is known",
-        "ours": "The study's",
-        "low": "Lower end of its 68 % interval",
-        "high": "Upper end of its 68 % interval",
-        "n": "Sources",
-        "completeness": "Share of the sources of the field that it is of",
-        "of_all": "Share of right sources among all of the field",
-        "sigma": "Difference in units of its error; 0 where a bound holds",
-        "verdict": "Whether they agree, and why not",
-        "definition": "How it is taken",
-        "source": "Where the paper's number was read; empty if it is second hand",
-    }
-    return described_rows(rows, texts)
+    return described_rows(rows, _TABLE["columns"])
 
 
 def _difference(one, ours):
@@ -195,36 +176,3 @@ def _verdict(one, ours, sigma, why):
     if abs(sigma) < _AGREES:
         return f"agrees ({sigma:+.1f} sigma)"
     return f"differs by {sigma:+.1f} sigma: {why or 'open'}"
-
-
-def comparison_rows(table):
-    """
-    Rows for a table of a report.
-
-    Parameters
-    ----------
-    table : `~astropy.table.QTable`
-        Of `compare_with_paper`.
-
-    Returns
-    -------
-    rows : list of tuple
-        Section, description, paper (with ``[?]`` if second hand), ours with its error, completeness and
-        verdict: text, or `~miricigale.pages.Missing`.
-    """
-    rows = []
-    for row in table:
-        mark = {"=": "", "~": "about "}.get(row["relation"], f"{row['relation']} ")
-        paper = f"{mark}{row['paper']:.3g}{'' if row['source'] else ' [?]'}"
-        ours, ends = row["ours"], (row["low"], row["high"])
-        error = 0.5 * (ends[1] - ends[0]) if np.isfinite(ends).all() else np.nan
-        if not np.isfinite(ours):
-            ours = Missing("not measured in this study")
-        elif np.isfinite(error):
-            ours = f"{ours:.3g} ± {error:.2g}"
-        else:
-            ours = f"{ours:.3g}"
-        share = row["completeness"]
-        share = f"{100 * share:.0f} %" if np.isfinite(share) else Missing("not a sample's number")
-        rows.append((row["section"], row["description"], paper, ours, share, row["verdict"]))
-    return rows

@@ -126,7 +126,8 @@ def completeness(values, found, edges):
         A row for each bin: ``low``, ``high``, ``n``, ``n_found``, ``share`` and its 68 % (Wilson) interval
         ``share_low``, ``share_high``, NaN in bins without sources.
     """
-    values, found = _checked(values, found)
+    values, found = one_by_one(values=values, found=found)
+    found = found > 0
     edges = np.asarray(edges, float)
     if edges.ndim != 1 or edges.size < 2 or np.any(np.diff(edges) <= 0):
         raise argument_error("edges", "ascending", edges)
@@ -166,7 +167,8 @@ def half_complete(values, found):
     value : float
         NaN if all or none were found, or the curve passes one half nowhere within the values.
     """
-    values, found = _checked(values, found)
+    values, found = one_by_one(values=values, found=found)
+    found = found > 0
     good = np.isfinite(values)
     values, found = values[good], found[good]
     if not found.any() or found.all():
@@ -191,7 +193,3 @@ def half_complete(values, found):
         return np.nan
     half = center + width * ndtri(0.5 / top)
     return float(half) if values.min() <= half <= values.max() else np.nan
-
-
-def _checked(values, found):
-    return one_by_one(values, found, ("values", "found"), dtypes=(float, bool))

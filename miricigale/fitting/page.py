@@ -1,5 +1,6 @@
 """The page of a fitted catalog: redshifts, how well models fit, fractions, examples, what was left out."""
 
+import dataclasses
 from pathlib import Path
 
 import astropy.units as u
@@ -13,7 +14,7 @@ from miricigale.fitting.classes import classes_of, classes_section
 from miricigale.fitting.from_files import open_catalog
 from miricigale.fitting.likelihood import unused_bands
 from miricigale.fitting.page_numbers import fit_numbers, known_redshifts
-from miricigale.pages import Page, number
+from miricigale.pages import Page, SectionWriter, declared
 from miricigale.plotting.axes import WIDTH, new_figure
 from miricigale.plotting.comparison import plot_redshifts
 
@@ -26,20 +27,8 @@ _FEW = 5
 _LONG = 200
 #: AGN fraction above which an object counts as one with an AGN.
 _SOME_AGN = 0.2
-#: What flags say where more than a tenth of the objects have them.
-_WIDESPREAD = {
-    FitFlags.HIGH_CHI2: "have no model that fits (reduced chi2 above the limit): errors that are too small, "
-    "zero points, wrong columns or units, or models not theirs.",
-    FitFlags.REDSHIFT_EDGE: "reach the first or last redshift of the grid.",
-}
-#: Columns on flux over model and on pulls, and their formats.
-_RATIOS = {
-    "flux / model": ".3f",
-    "16 %": ".2f",
-    "84 %": ".2f",
-    "median pull": "+.2f",
-    "beyond 3 sigma": ".1f %",
-}
+#: Flags that are notices where more than a tenth of the objects have them.
+_WIDESPREAD = {"high_chi2": FitFlags.HIGH_CHI2, "redshift_edge": FitFlags.REDSHIFT_EDGE}
 
 
 def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None):
@@ -79,28 +68,27 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None):
     if columns is not None:
         # fits of stars and quasars with galaxies say nothing about the fit
         found = found[np.isin(columns["class"], ["galaxy", ""])]
-    page = Page(
-        f"Fits of {Path(path).name}",
-        subtitle=f"{len(results)} objects, {len(found.meta['filters'])} bands",
-        notices=_notices(found),
+    page = SectionWriter(
+        Page(
+            f"Fits of {Path(path).name}",
+            subtitle=f"{len(results)} objects, {len(found.meta['filters'])} bands",
+        ),
+        declared("miricigale.fitting"),
     )
-    page.section("Summary")
-    if columns is not None:
-        others = " or ".join(list(classes)[1:])
-        page.text(
-            f"{len(found)} of {len(results)} objects are no {others} by their evidence. All but the "
-            "examples and what was left out is of these."
-        )
+    _notices(page, found)
+    others = " or ".join(list(classes)[1:])
+    facts = {"n": len(found), "n_all": len(results), "others": others}
+    page.section("summary", "classes" if others else "text", **facts)
     _summary(page, found)
     if columns is not None:
-        classes_section(page, columns, list(classes), every["ids"], every["chi2"])
+        classes_section(page.report, columns, list(classes), every["ids"], every["chi2"])
     _redshifts(page, found)
     _goodness(page, found)
     _physics(page, found)
     _examples(page, results, every)
     _left_out(page, rows, every)
     _settings(page, results)
-    return page
+    return page.report
 
 
 def _bands(found):
@@ -110,47 +98,30 @@ def _bands(found):
         yield name, ratio[np.isfinite(ratio)].astype(float), pull[np.isfinite(pull)]
 
 
-def _notices(found):
-    if len(found) and not found["good"].any():
-        return ["No object was fitted; the flags below say why."]
-    lines, flags = [], found["flags"][found["good"]]
-    for flag, text in _WIDESPREAD.items():
-        share = _mean(flags & int(flag) != 0)
+def _notices(page, found):
+    good = found["good"]
+    if len(found) and not good.any():
+        page.notice("nothing")
+        return
+    for name, flag in _WIDESPREAD.items():
+        share = _mean(found["flags"][good] & int(flag) != 0)
         if share > 0.1:
-            lines.append(f"{100 * share:.0f} % of the objects {text}")
+            page.notice(name, share=100 * share)
     for name, ratio, _ in _bands(found):
         if ratio.size >= 30 and not 0.8 < np.median(ratio) < 1.25:
-            lines.append(
-                f"{name}: fluxes are {np.median(ratio):.2f} times those of the best models in the median of "
-                f"{ratio.size} objects: look at its zero point and unit."
-            )
-    return lines
+            page.notice("band", band=name, ratio=np.median(ratio), n=ratio.size)
 
 
 def _summary(page, found):
-    good, none = found[found["good"]], "no object was fitted"
-    numbers = [
-        ("bands of an object, median", _median(good["n_bands"]), ".0f"),
-        ("reduced chi2, median", _median(good["chi2"]), ".2f"),
-    ]
+    good = found[found["good"]]
+    values = {"n": len(found), "n_good": len(good), "n_clean": np.count_nonzero(good["flags"] == 0)}
+    values |= {"n_bands": _median(good["n_bands"]), "chi2": _median(good["chi2"])}
     if not found.meta["fixed"]:
         low, z, high = good["z"].T
-        width = _median((high - low) / 2 / (1 + z))
-        numbers += [
-            ("redshift, median", _median(z), ".2f"),
-            ("half width of z over 1 + z, median", width, ".3f"),
-        ]
+        values |= {"z": _median(z), "width": _median((high - low) / 2 / (1 + z))}
     if np.isfinite(found["frac"]).any():
-        label = f"with 84 % of the posterior above fracAGN {_SOME_AGN:g}"
-        numbers.append((label, _mean(good["frac"][:, 0] > _SOME_AGN), ".0f %"))
-    page.items(
-        [
-            ("objects", len(found)),
-            ("fitted", len(good)),
-            ("without any flag", int(np.count_nonzero(good["flags"] == 0))),
-            *((label, number(value, spec, none)) for label, value, spec in numbers),
-        ]
-    )
+        values["agn"] = _mean(good["frac"][:, 0] > _SOME_AGN)
+    page.items(values, some_agn=_SOME_AGN)
 
 
 def _median(values):
@@ -173,34 +144,23 @@ def _draw_counts(ax, xlabel, bins, samples):
 
 
 def _redshifts(page, found):
+    page.section("redshifts", "given" if found.meta["fixed"] else "text")
     if found.meta["fixed"]:
-        page.section("Redshifts", "Redshifts were given; they were not fitted.")
         return
-    page.section("Redshifts")
-    samples, text = {"fitted": found["z"][found["good"], 1]}, "Fitted redshifts (posterior medians)"
+    samples = {"fitted": found["z"][found["good"], 1]}
     some, name = found["good"] & np.isfinite(found["z_known"]), found.meta["known"]
     figure, axes = new_figure(1, 1 + some.any(), size=(WIDTH / 2, 4.2))
     if some.any():
         z, (low, middle, high) = found["z_known"][some], found["z"][some].T
-        metrics = photoz_metrics(z, middle)
-        inside = np.mean((low <= z) & (z <= high))
-        page.items(
-            [
-                (f"objects with {name}", len(z)),
-                ("bias, median of dz / (1 + z)", f"{metrics.bias:+.3f}"),
-                ("sigma_MAD of dz / (1 + z)", f"{metrics.sigma_mad:.3f}"),
-                ("outliers, above 0.15", f"{100 * metrics.outlier_fraction:.1f} %"),
-                ("in their 16-84 % interval (68 % wanted)", f"{100 * inside:.0f} %"),
-            ]
-        )
+        metrics = dataclasses.asdict(photoz_metrics(z, middle))
+        page.items(metrics | {"n": len(z), "inside": np.mean((low <= z) & (z <= high))}, name=name)
         step = _step(len(z))
         plot_redshifts(z[::step], middle[::step], ax=axes[0, 0])
         axes[0, 0].set(xlabel=name, ylabel="fitted redshift (median)")
         samples[name] = z
-        text += f" against {name}; dashed lines are |dz| = 0.15 (1 + z)"
     bins = np.histogram_bin_edges(np.concatenate(list(samples.values())), 40)
     _draw_counts(axes[0, -1], "redshift", bins, samples)
-    page.figure(figure, f"{text}.")
+    page.figure("compared" if some.any() else "alone", figure, name=name)
 
 
 def _step(n):
@@ -209,11 +169,7 @@ def _step(n):
 
 
 def _goodness(page, found):
-    page.section(
-        "How well models fit",
-        "Reduced chi2 is that of the best model over bands less one, with the model error in the errors. "
-        "A median ratio far from 1 in one band indicates a wrong zero point, unit or curve.",
-    )
+    page.section("goodness")
     figure, ((ax, of_bands),) = new_figure(1, 2, size=(WIDTH / 2, 3.6))
     chi2, bins = found["chi2"][found["good"]], np.geomspace(1e-2, 1e3, 51)
     label = "reduced chi2 (those beyond in the outermost bins)"
@@ -222,25 +178,21 @@ def _goodness(page, found):
     if len(chi2):
         ax.axvline(np.median(chi2), color=_COLOR, lw=1, label="median")
         ax.legend(frameon=False)
-    rows, none = [], "no flux was fitted"
-    bands = sorted(_bands(found), key=lambda band: _pivot(band[0]))
-    for k, (name, ratio, pull) in enumerate(bands):
-        low, mid, high = np.percentile(ratio, [16, 50, 84]) if ratio.size else [np.nan] * 3
+    rows = []
+    for name, ratio, pull in sorted(_bands(found), key=lambda band: _pivot(band[0])):
+        low, middle, high = np.percentile(ratio, [16, 50, 84]) if ratio.size else [np.nan] * 3
         if ratio.size >= _FEW:
-            limits = [[mid - low], [high - mid]]
-            of_bands.errorbar(k, mid, limits, fmt="o", color=_COLOR, ms=4, lw=1)
-        values = (mid, low, high, _median(pull), _mean(np.abs(pull) > 3))
-        texts = [number(v, spec, none) for v, spec in zip(values, _RATIOS.values(), strict=True)]
-        rows.append((name, f"{_pivot(name):.3g}", ratio.size, *texts))
+            limits = [[middle - low], [high - middle]]
+            of_bands.errorbar(len(rows), middle, limits, fmt="o", color=_COLOR, ms=4, lw=1)
+        row = {"band": name, "um": _pivot(name), "n": ratio.size}
+        row |= {"low": low, "middle": middle, "high": high}
+        rows.append(row | {"pull": _median(pull), "beyond": _mean(np.abs(pull) > 3)})
     of_bands.axhline(1.0, color="0.6", lw=0.8)
-    of_bands.set_xticks(range(len(bands)), [name for name, *_ in bands], rotation=90, fontsize=7)
+    names = [row["band"] for row in rows]
+    of_bands.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
     of_bands.set(ylabel="flux over that of the best model", ylim=(0.4, 1.8))
-    page.figure(
-        figure,
-        f"Reduced chi2, and measured over model flux in bands of {_FEW} or more fluxes: median, 16-84 % (in full "
-        "in the table).",
-    )
-    page.table(rows, header=("band", "um", "fluxes", *_RATIOS))
+    page.figure("figure", figure, few=_FEW)
+    page.table("table", rows)
 
 
 def _pivot(name):
@@ -253,7 +205,7 @@ def _physics(page, found):
     with_agn = np.isfinite(found["frac"]).any()
     if not len(found):
         return
-    page.section("Masses and AGN" if with_agn else "Masses")
+    page.section("physics", and_agn=" and AGN" if with_agn else "")
     figure, axes = new_figure(1, 1 + with_agn, size=(WIDTH / 2, 3.6))
     drawn, ax = found[:: _step(len(found))], axes[0, 0]
     mass, strong = np.log10(drawn["mass"][:, 1]), drawn["frac"][:, 0] > _SOME_AGN
@@ -263,26 +215,21 @@ def _physics(page, found):
         ax.plot(drawn["z"][rows, 1], mass[rows], ".", ms=4, color=color, label=label)
     low, high = np.percentile(mass, [0.5, 99.5])
     ax.set(xlabel="redshift", ylabel="log stellar mass (Msun)", ylim=(low - 0.5, high + 0.5))
-    text = "Stellar masses (posterior medians)"
     if with_agn:
         ax.legend(frameon=False, fontsize=8)
         samples = {"posterior median": found["frac"][:, 1], "16th percentile": found["frac"][:, 0]}
         _draw_counts(axes[0, 1], "fracAGN", np.linspace(0, 1, 26), samples)
         axes[0, 1].set(yscale="log")
-        text += " and AGN fractions"
-    page.figure(figure, f"{text}.")
+    page.figure("figure", figure, and_fractions=" and AGN fractions" if with_agn else "")
     if with_agn:
-        page.text(
-            "A fraction above 0 is no detection of an AGN: see the guide, Is my AGN real? Without data beyond "
-            "3 um at rest the fraction is what the prior makes it."
-        )
+        page.text("agn")
 
 
 def _examples(page, results, found):
     chosen = _choose(found)
     if not chosen:
         return
-    page.section("Examples")
+    page.section("examples")
     filters = FilterSet(next(iter(results.parts())).filters)
     figure, axes = new_figure(-(-len(chosen) // 2), 2, size=(WIDTH / 2, 3.3))
     picked = results[np.array([row for row, _ in chosen])]
@@ -293,10 +240,7 @@ def _examples(page, results, found):
         ax.set_title(title, fontsize="small")
     for ax in axes.ravel()[len(chosen) :]:
         ax.remove()
-    page.figure(
-        figure,
-        "Measured fluxes (points; open where they were not fitted), best model (line) and its fluxes (squares).",
-    )
+    page.figure("figure", figure)
 
 
 def _choose(found):
@@ -320,36 +264,27 @@ def _choose(found):
 
 
 def _left_out(page, rows, found):
-    page.section(
-        "What was left out",
-        "Each row of the catalog is a row of the results, flagged if not fitted.",
-    )
+    page.section("left_out")
     filters, bad = found.meta["filters"], found["unusable"].sum(axis=0)
-    counts = [f"{name} {n}" for name, n in zip(filters, bad, strict=True) if n]
     lines = {
-        "bands that were not fitted, for want of a filter or of errors: {}": unused_bands(
-            rows.chunk(0), list(filters)
-        ),
-        "bands without a flux in any object: {}": [
-            name for name, ratio, _ in _bands(found) if not ratio.size
-        ],
-        "fluxes with an error that is no error (0, negative or infinite): {}; where negative errors "
-        "mark upper limits, 'limits = true' in the map of --map says so": counts,
+        "unused": unused_bands(rows.chunk(0), list(filters)),
+        "empty": [name for name, ratio, _ in _bands(found) if not ratio.size],
+        "errors": [f"{name} {n}" for name, n in zip(filters, bad, strict=True) if n],
     }
     entries = list(rows.messages()) if isinstance(rows, MappedRows) else []
-    entries += [line.format(", ".join(names)) for line, names in lines.items() if names]
-    page.bullets(entries or ["No column and no number of the catalog."])
-    counts = [("none", "", int(np.count_nonzero(found["flags"] == 0)))]
+    entries += [page.sentence(k, names=", ".join(names)) for k, names in lines.items() if names]
+    page.report.bullets(entries or [page.sentence("nothing")])
+    counts = [{"flag": "none", "meaning": "", "objects": np.count_nonzero(found["flags"] == 0)}]
     for value, (name, meaning) in FitFlags.meanings().items():
-        n = int(np.count_nonzero(found["flags"] & value))
+        n = np.count_nonzero(found["flags"] & value)
         if n:
             fitted = "" if not value & int(FitFlags.UNFITTED) else " Not fitted."
-            counts.append((f"{value} {name}", f"{meaning}{fitted}", n))
-    page.table(counts, header=("flag", "meaning", "objects"), text=2)
+            counts.append({"flag": f"{value} {name}", "meaning": meaning + fitted, "objects": n})
+    page.table("flags", counts)
 
 
 def _settings(page, results):
-    page.section("What was fitted")
+    page.section("settings")
     first = next(iter(results.parts()))
     settings = {name: v for name, v in first.meta.get("fit", {}).items() if name != "filters"}
     if results.model is not None:
@@ -359,7 +294,7 @@ def _settings(page, results):
         ends = f"from {axis.values[0]:g} to {axis.values[-1]:g} {u.Unit(axis.unit)}"
         rows[f"axis {name}"] = f"{axis.values.size} {ends}".strip()
     shorten = {name: f"{text[:_LONG]} ..." for name, text in rows.items() if len(text) >= _LONG}
-    page.table((rows | shorten).items(), header=("", ""), text=2)
+    page.report.table((rows | shorten).items(), header=("", ""), text=2)
 
 
 def _plain(value):

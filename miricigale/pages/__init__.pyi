@@ -1,3 +1,6 @@
+from .declared import SectionWriter as SectionWriter
+from .declared import declared as declared
+from .declared import sentence as sentence
 from .page import Page as Page
 from .rendering import render as render
 from .values import Link as Link

@@ -5,7 +5,7 @@ from pathlib import Path
 from markupsafe import Markup
 
 from miricigale.pages.rendering import image_of, macros, render
-from miricigale.pages.values import Missing, cell_of
+from miricigale.pages.values import Missing
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.store import replacing
 
@@ -31,7 +31,7 @@ class Page:
     def __init__(self, title, *, subtitle="", notices=(), dpi=110):
         self.title = title
         self.subtitle = subtitle
-        self.notices = tuple(notices)
+        self.notices = list(notices)
         self.dpi = dpi
         self._sections = []
 
@@ -49,10 +49,6 @@ class Page:
     def text(self, text):
         """Add a paragraph of plain text."""
         self._add("text", text)
-
-    def links(self, text, pairs):
-        """Add a sentence and links to files near the page: (label, address) pairs of text."""
-        self._add("links", text, list(pairs))
 
     def bullets(self, entries):
         """Add a list of lines of plain text."""
@@ -112,26 +108,6 @@ class Page:
         ]
         words = range(text) if isinstance(text, int) else text
         return self._add("table", shown, header, set(words), caption, marks)
-
-    def entries(self, entries, columns=None, **options):
-        """
-        Add a table with a row for each entry and declared columns.
-
-        Parameters
-        ----------
-        entries : iterable of mapping
-            What the rows are of.
-        columns : dict of str to object, optional
-            Header of each column, and how its cells are taken from the entries (see
-            `~miricigale.pages.cell_of`); by default all keys of the entries, in their order.
-        **options
-            Passed to `table`.
-        """
-        entries = list(entries)
-        if columns is None:
-            columns = {key: key for key in entries[0]} if entries else {}
-        rows = [[cell_of(entry, column) for column in columns.values()] for entry in entries]
-        self.table(rows, header=tuple(columns), **options)
 
     def figure(self, figure, caption=""):
         """

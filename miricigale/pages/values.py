@@ -46,7 +46,7 @@ class Link:
         return Markup("<a href='{}'>{}</a>").format(self.address, self.text)
 
 
-def number(value, spec, reason, *, error=None, scale=1):
+def number(value, spec, reason, *, error=None):
     """
     Return the text of a number, or `Missing` where it is none.
 
@@ -61,8 +61,6 @@ def number(value, spec, reason, *, error=None, scale=1):
         Why it is missing.
     error : float, optional
         Error of a number with a format without braces, written after ``±`` where it is finite.
-    scale : float, optional
-        Factor applied before writing.
 
     Returns
     -------
@@ -81,9 +79,9 @@ def number(value, spec, reason, *, error=None, scale=1):
     if value is None or not np.isfinite(value):
         return Missing(reason)
     if "{" in spec:
-        return spec.format(scale * value)
+        return spec.format(value)
     spec, share, unit = spec.partition(" %")
-    scale = 100 * scale if share else scale
+    scale = 100 if share else 1
     text = f"{scale * value:{spec}}"
     if error is not None and np.isfinite(error):
         text += f" ± {scale * error:{spec.lstrip('+')}}"
@@ -98,18 +96,16 @@ def cell_of(entry, column):
     ----------
     entry : mapping
         What the row is of.
-    column : str, tuple or callable
+    column : sequence of str
         Key of the entry, for numbers followed by format and reason (see `number`), and after these
-        the key of the error where it has one; or a function of the entry.
+        the key of the error where it has one.
 
     Returns
     -------
     cell : object
         Text, a number, `Link` or `Missing`.
     """
-    if callable(column):
-        return column(entry)
-    key, *form = (column,) if isinstance(column, str) else column
+    key, *form = column
     if not form:
         return entry[key]
     spec, reason, *error = form

@@ -6,7 +6,7 @@ import astropy.units as u
 import numpy as np
 from astropy.stats import mad_std
 
-from miricigale.pages import Page, number
+from miricigale.pages import Missing, Page, SectionWriter, declared
 from miricigale.photometry import ForcedFlags
 from miricigale.photometry.arrays import pixel_scale
 from miricigale.plotting.axes import new_figure
@@ -28,87 +28,52 @@ def photometry_page(result, filter_, image, highres, kernel, pulls=None, segment
     `~miricigale.photometry.read_mosaic`, ``kernel`` is between them; ``pulls`` are flux over error at
     empty positions, and ``segments`` (int array) those of the prior, whose outlines are drawn.
     """
-    good = np.isfinite(result.flux.value)
-    snr = result.snr
-    page = Page(
-        f"Forced photometry: {filter_}",
-        subtitle=" on the prior ".join(Path(one.meta["source"]).name for one in (image, highres)),
-        notices=_notices(result, image, highres, kernel, pulls),
+    sources = " on the prior ".join(Path(one.meta["source"]).name for one in (image, highres))
+    page = SectionWriter(
+        Page(f"Forced photometry: {filter_}", subtitle=sources), declared("miricigale.photometry")
     )
-    page.section("Summary")
-    errors = result.flux_err[good & (result.flags == 0)]
-    depth = np.nan if not len(errors) else (5 * np.median(errors)).to_value(u.ABmag)
-    none, rms = "no source was measured without a flag", _pulls_rms(pulls)
-    page.items(
-        [
-            ("sources of the prior", len(result)),
-            ("measured", int(np.count_nonzero(good))),
-            ("above 5 sigma", int(np.count_nonzero(good & (snr > 5)))),
-            ("5 sigma of the median source without flags, AB", number(depth, ".2f", none)),
-            ("pulls at empty positions, robust rms", number(rms, ".2f", "no empty positions")),
-            *_fitted(result),
-        ]
-    )
-    page.section(
-        "Image, model and residual",
-        "The residual is drawn from -5 to 5 times its own noise; pixels without data are white.",
-    )
-    page.figure(_whole(result), "The whole image.")
+    _notices(page, result, image, highres, kernel, pulls)
+    _summary(page, result, pulls)
+    page.section("images")
+    page.figure("whole", _whole(result))
     for k, what in _examples(result):
-        page.figure(_zoom(result, highres, segments, k), what)
-    page.section("Magnitudes")
-    page.figure(_magnitudes(result, filter_), "Measured sources by magnitude, and their errors.")
+        facts = {"id": result.id[k], "snr": result.snr[k], "chi2": result.chi2[k]}
+        page.figure("source", _zoom(result, highres, segments, k), what=what, **facts)
+    page.section("magnitudes")
+    page.figure("figure", _magnitudes(result, filter_))
     if pulls is not None:
-        page.section(
-            "Errors at empty positions",
-            "Point sources were fitted to the residual image where no source is: flux over error "
-            "should scatter by 1 around 0.",
-        )
+        page.section("pulls")
         figure, axes = new_figure(1, 1, size=(5.6, 3.4))
         plot_pulls(pulls, ax=axes[0, 0], limit=6.0).set_xlabel("flux / error")
-        page.figure(figure, f"{len(pulls)} positions and a Gaussian of width 1.")
+        page.figure("figure", figure, n=len(pulls))
     _flag_table(page, result)
     _source_table(page, result)
     _input_table(page, image, highres, kernel)
-    return page
+    return page.report
 
 
-def _notices(result, image, highres, kernel, pulls):
-    lines = []
+def _notices(page, result, image, highres, kernel, pulls):
     if kernel.target is None:
-        lines.append(
-            "The kernel has no PSFs: sources are their segments as they are, without wings, and those "
-            "without a segment are not measured."
-        )
+        page.notice("no_psfs")
     bright = np.nan_to_num(result.snr) > _BRIGHT
     poor = bright & (result.flags & int(ForcedFlags.POOR_FIT) != 0)
     n, n_poor = np.count_nonzero(bright), np.count_nonzero(poor)
     if n >= 5 and n_poor > 0.5 * n:
-        lines.append(
-            f"{n_poor} of the {n} sources above {_BRIGHT:g} sigma leave residuals above the noise: "
-            "the PSFs or the shapes on the prior are not theirs to that precision."
-        )
+        page.notice("poor", n_poor=n_poor, n=n, bright=_BRIGHT)
     for what, one in (("image", image), ("prior", highres)):
         scale = one.meta.get("noise_scale")
         if one.meta.get("n_filled"):
-            lines.append(
-                f"{one.meta['n_filled']} pixels of the {what} are in areas that are exactly 0: they "
-                "were taken as without data."
-            )
+            page.notice("filled", n=one.meta["n_filled"], what=what)
         if one.uncertainty is None:
-            lines.append(f"The {what} has no map of the noise; it was measured on the image.")
+            page.notice("no_noise", what=what)
         elif scale is not None and not 0.1 < scale < 10:
             done = "were scaled by it" if "weight_scale" in one.meta else "were kept"
-            lines.append(
-                f"The noise of the {what} is {scale:.4g} times what its map says; the errors {done}."
-            )
-    if abs(highres.meta.get("sky_over_noise", 0.0)) > 1:
-        level = highres.meta["sky_over_noise"]
-        lines.append(f"The prior has a sky of {level:.3g} times its noise, in the templates too.")
-    rms = _pulls_rms(pulls)
+            page.notice("noise", what=what, scale=scale, done=done)
+    level, rms = highres.meta.get("sky_over_noise", 0.0), _pulls_rms(pulls)
+    if abs(level) > 1:
+        page.notice("sky", level=level)
     if pulls is not None and len(pulls) >= 100 and not 0.8 < rms < 1.25:
-        lines.append(f"Pulls at empty positions scatter by {rms:.2f} instead of 1.")
-    return lines
+        page.notice("pulls", rms=rms)
 
 
 def _pulls_rms(pulls):
@@ -116,15 +81,23 @@ def _pulls_rms(pulls):
     return float(mad_std(values)) if len(values) else np.nan
 
 
-def _fitted(result):
-    items = []
+def _summary(page, result, pulls):
+    good = np.isfinite(result.flux.value)
+    errors = result.flux_err[good & (result.flags == 0)]
+    values = {
+        "n": len(result),
+        "n_measured": np.count_nonzero(good),
+        "n_detected": np.count_nonzero(good & (result.snr > 5)),
+        "depth": (5 * np.median(errors)).to_value(u.ABmag) if len(errors) else np.nan,
+        "rms": _pulls_rms(pulls),
+    }
     if result.background is not None:
-        value = f"{result.background.value:.3g} ± {result.background_err.value:.1g}"
-        items.append(("background that was fitted, MJy/sr", value))
+        background, error = result.background.value, result.background_err.value
+        values["background"] = f"{background:.3g} ± {error:.1g}"
     if result.shift is not None:
-        value = ", ".join(f"{one:.3f}" for one in result.shift.value)
-        items.append(("shift of the image along x, y, arcsec", value))
-    return items
+        values["shift"] = ", ".join(f"{one:.3f}" for one in result.shift.value)
+    page.section("summary")
+    page.items(values)
 
 
 def _whole(result):
@@ -141,7 +114,7 @@ def _whole(result):
 
 
 def _examples(result):
-    """Sources to be shown, with captions: the best without flags, and the worst fit."""
+    """Sources to be shown, and why: the best without flags, and the worst fit."""
     snr = np.nan_to_num(result.snr, nan=-np.inf)
     good = np.isfinite(result.snr)
     clean = good & (result.flags == 0)
@@ -152,9 +125,7 @@ def _examples(result):
     poor = good & (result.flags & int(ForcedFlags.POOR_FIT) != 0)
     if poor.any():
         chosen["the poorest fit"] = np.argmax(np.where(poor, result.chi2, -np.inf))
-    for what, k in chosen.items():
-        numbers = f"signal-to-noise {snr[k]:.0f}, chi2 {result.chi2[k]:.1f}"
-        yield int(k), f"Around source {result.id[k]}, {what}: {numbers}."
+    return [(int(k), what) for what, k in chosen.items()]
 
 
 def _zoom(result, highres, segments, k, size=12.0):
@@ -216,84 +187,57 @@ def _magnitudes(result, filter_):
 
 
 def _flag_table(page, result):
-    page.section("Flags", "Nothing is dropped: a source may have several flags, or none.")
-    rows = [("none", "", "usable", int(np.count_nonzero(result.flags == 0)))]
+    page.section("flags")
+    counts = [("none", "", "usable", np.count_nonzero(result.flags == 0))]
     for value, (name, meaning) in ForcedFlags.meanings().items():
-        count = int(np.count_nonzero(result.flags & value))
+        count = np.count_nonzero(result.flags & value)
         lost = value in (ForcedFlags.NO_DATA, ForcedFlags.DEGENERATE)
-        rows.append((f"{value} {name}", meaning, "not measured" if lost else "usable", count))
-    crowded = "a neighbor within 2 arcsec brighter than the magnitude + 1 (a column of its own)"
-    rows.append(("crowded", crowded, "usable", int(np.count_nonzero(result.crowded))))
-    page.table(rows, header=("flag", "meaning", "flux", "sources"), text=3)
+        counts.append((f"{value} {name}", meaning, "not measured" if lost else "usable", count))
+    crowded = np.count_nonzero(result.crowded)
+    counts.append(("crowded", page.sentence("crowded"), "usable", crowded))
+    header = ("flag", "meaning", "flux", "sources")
+    page.table("table", (dict(zip(header, row, strict=True)) for row in counts))
 
 
 def _source_table(page, result):
     order = np.argsort(np.nan_to_num(-result.flux.value, nan=np.inf), kind="stable")[:_ROWS]
-    text = f"The {len(order)} brightest of {len(result)}; all are in the table that was written. "
-    text += "Residual is what the fit left in the core over what it took there."
-    page.section("Brightest sources", text)
-    shown = result.to_table()[order]
-    shown["AB"] = ab_magnitude(result.flux)[order]
-    page.entries(shown, _SOURCE_COLUMNS, text=3, empty="The catalog has no source.")
-
-
-#: Columns of the table of sources.
-_LOST = "not measured"
-_SOURCE_COLUMNS = {
-    "id": lambda row: str(row["id"]),
-    "flags": lambda row: ", ".join(ForcedFlags.names(row["flags"])).replace("_", " ") or "none",
-    "template": lambda row: str(row["template"]),
-    "RA": lambda row: f"{row['sky'].ra.deg:.5f}",
-    "Dec": lambda row: f"{row['sky'].dec.deg:.5f}",
-    "flux (uJy)": lambda row: number(row["flux"].value, ".4g", _LOST),
-    "error": lambda row: number(row["flux_err"].value, ".2g", _LOST),
-    "AB": ("AB", ".2f", "no positive flux"),
-    "S/N": ("snr", ".1f", _LOST),
-    "chi2": ("chi2", ".2f", _LOST),
-    "residual": ("residual_fraction", "+.2f", _LOST),
-}
+    page.section("sources", n=len(order), n_all=len(result))
+    table = result.to_table()[order]
+    table["mag"] = ab_magnitude(result.flux)[order]
+    rows = []
+    for one in table:
+        row = {name: getattr(one[name], "value", one[name]) for name in table.colnames}
+        flags = ", ".join(ForcedFlags.names(row["flags"])).replace("_", " ") or "none"
+        position = {"ra": f"{one['sky'].ra.deg:.5f}", "dec": f"{one['sky'].dec.deg:.5f}"}
+        rows.append(row | {"flags": flags, **position})
+    page.table("table", rows)
 
 
 def _input_table(page, image, highres, kernel):
-    page.section("What was read")
-    none, psfs = "not stated or not done", kernel.meta.get("psfs", {})
-    cells = []
-    for one, psf in ((image, "psf"), (highres, "highres_psf")):
-        facts = {**one.meta, **{f"psf_{key}": text for key, text in psfs.get(psf, {}).items()}}
-        facts["pixels"] = f"{one.data.shape[1]} x {one.data.shape[0]}"
-        facts["pixel_scale"] = f"{pixel_scale(one.wcs):.4f}"
-        cells.append([_text(facts.get(key), none) for key in _FACTS])
-    page.table(zip(_FACTS.values(), *cells, strict=True), header=("", "image", "prior"), text=3)
-    origin = kernel.meta.get("file", "made from two PSFs")
+    page.section("inputs")
+    psfs, facts = kernel.meta.get("psfs", {}), {}
+    for what, one, psf in (("image", image, "psf"), ("prior", highres, "highres_psf")):
+        facts[what] = {**one.meta, **{f"psf_{key}": v for key, v in psfs.get(psf, {}).items()}}
+        facts[what]["pixels"] = f"{one.data.shape[1]} x {one.data.shape[0]}"
+        facts[what]["pixel_scale"] = f"{pixel_scale(one.wcs):.4f}"
+    page.table(
+        "table",
+        [
+            {"fact": label, **{what: _text(known.get(key)) for what, known in facts.items()}}
+            for key, label in page.texts["inputs"]["facts"].items()
+        ],
+    )
     page.text(
-        f"Kernel: {kernel.array.shape[0]} x {kernel.array.shape[0]} pixels of "
-        f"{kernel.pixel_scale.value:.4g} arcsec, sum {kernel.array.sum():.4f}, noise gain "
-        f"{kernel.noise_gain:.3f}, {origin}."
+        "kernel",
+        size=kernel.array.shape[0],
+        scale=kernel.pixel_scale.value,
+        sum=kernel.array.sum(),
+        gain=kernel.noise_gain,
+        origin=kernel.meta.get("file", "made from two PSFs"),
     )
 
 
-def _text(value, reason):
+def _text(value):
     if value is None:
-        return number(None, "", reason)
+        return Missing("not stated or not done")
     return f"{value:.5g}" if isinstance(value, float) else value
-
-
-#: What is shown of the files that were read.
-_FACTS = {
-    "source": "file",
-    "filter": "filter",
-    "source_unit": "unit of the pixels",
-    "calibration": "calibration",
-    "noise": "noise",
-    "noise_scale": "noise on the sky over that of the map",
-    "weight_scale": "factor on the errors of the weights",
-    "sky_over_noise": "median sky over noise",
-    "background_box": "box of the background that was subtracted (pixels)",
-    "pa_aper": "PA_APER (deg)",
-    "n_masked": "pixels without data",
-    "pixels": "pixels",
-    "pixel_scale": "pixel (arcsec)",
-    "psf_from": "PSF",
-    "psf_fwhm": "FWHM of the PSF (arcsec)",
-    "psf_enclosed": "light on the grid of the PSF",
-}

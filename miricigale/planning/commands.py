@@ -28,39 +28,20 @@ def plan_table(*, quick=False):
     """
     from astropy.coordinates import SkyCoord
 
-    from miricigale.depth import proposal_limit, saturation_forecast, scaled_limit, sensitivity
-    from miricigale.instrument import ceers_exposures, psf_fwhm
+    from miricigale.depth import proposal_limit
+    from miricigale.instrument import background_level, ceers_exposures, psf_fwhm
+    from miricigale.planning import BandPlan
+    from miricigale.planning.config import NoiseSection
 
     exposures = ceers_exposures(SkyCoord(0 * u.deg, 0 * u.deg), 0 * u.deg, quick=quick)
-    rows = []
+    noise, rows = NoiseSection(residual="etc"), []
     for name in dict.fromkeys(e.filter for e in exposures):
         mine = [e for e in exposures if e.filter == name]
-        first, time = mine[0], u.Quantity([e.exposure_time for e in mine]).sum()
-        limit = sensitivity(
-            name,
-            time,
-            n_sigma=5,
-            residual="etc",
-            n_groups=first.n_groups,
-            n_dithers=len(mine),
-            readout=first.readout,
-            subarray=first.subarray,
-        )
-        rows.append(
-            {
-                "filter": name,
-                "groups": first.n_groups,
-                "integrations": first.n_integrations,
-                "dithers": len(mine),
-                "time": np.round(time.to(u.s), 1),
-                "sky_in_well": round(float(saturation_forecast(first)), 3),
-                "limit_etc": np.round(scaled_limit(name, time).to(u.ABmag), 2),
-                "limit": np.round(limit.to(u.ABmag), 2),
-                "limit_proposal": np.round(proposal_limit(name), 2),
-                "fwhm": psf_fwhm(name),
-            }
-        )
-    return QTable(rows)
+        row = BandPlan(mine[0], len(mine), background_level(name), noise).numbers()
+        row["limit_proposal"] = np.round(proposal_limit(name), 2)
+        rows.append(row | {"fwhm": psf_fwhm(name)})
+    order = ["filter", "groups", "integrations", "dithers", "time", "sky_in_well"]
+    return QTable(rows)[[*order, "limit_etc", "limit", "limit_proposal", "fwhm"]]
 
 
 def write_plan(config, folder, *, executor=None, progress_bar=False):

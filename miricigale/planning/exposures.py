@@ -17,6 +17,7 @@ from miricigale.depth import (
 )
 from miricigale.instrument import Exposure, frame_time
 from miricigale.photometry import ErrorModel
+from miricigale.planning.config import NoiseSection
 from miricigale.utils.exceptions import ConfigError, DataError
 from miricigale.workflow.background import band_background
 
@@ -67,13 +68,35 @@ class BandPlan:
     @functools.cached_property
     def limit(self):
         """5-sigma AB limit of point sources in the calculator's aperture, by `~miricigale.depth.sensitivity`."""
-        residual = self.noise.residual
-        return _limit(self.exposure, self.n_dithers, self.background, residual).to(u.ABmag)
+        limit = sensitivity(
+            self.filter,
+            self.time,
+            n_sigma=5,
+            background=self.background,
+            residual=self.noise.residual or None,
+            n_dithers=self.n_dithers,
+            n_groups=self.exposure.n_groups,
+            readout=self.exposure.readout,
+            subarray=self.exposure.subarray,
+        )
+        return limit.to(u.ABmag)
 
-    @property
-    def calculator(self):
-        """The exposure time calculator's limit (low background), scaled by the root of the time."""
-        return scaled_limit(self.filter, self.time).to(u.ABmag)
+    def numbers(self):
+        """
+        Time, frames, filling of the well and limits, as a row of a table.
+
+        ``limit_etc`` is the exposure time calculator's limit (low background), scaled by the root of the time.
+        """
+        return {
+            "filter": self.filter,
+            "time": np.round(self.time.to(u.s), 1),
+            "groups": self.exposure.n_groups,
+            "integrations": self.exposure.n_integrations,
+            "dithers": self.n_dithers,
+            "sky_in_well": round(float(self.sky_fraction), 3),
+            "limit_etc": np.round(scaled_limit(self.filter, self.time).to(u.ABmag), 2),
+            "limit": np.round(self.limit, 2),
+        }
 
     @functools.cached_property
     def saturation(self):
@@ -147,28 +170,14 @@ class RunErrors:
             msg = f"the run of [noise] has no band {plan.filter}; it has {known}"
             raise ConfigError(msg)
         background = study_background(self.config, plan.filter)
-        own = _limit(exposures[0], len(exposures), background, self.config.detector.residual)
-        ratio = float((plan.limit.to(u.uJy) / own).decompose())
+        noise = NoiseSection(residual=self.config.detector.residual)
+        own = BandPlan(exposures[0], len(exposures), background, noise)
+        ratio = float((plan.limit.to(u.uJy) / own.limit.to(u.uJy)).decompose())
         table = self.errors.to_table()
         table = table[table["filter"] == plan.filter]
         sigma = table["sigma"]
         table["sigma"] = np.sqrt(sigma**2 + (ratio**2 - 1) * np.min(sigma) ** 2)
         return ErrorModel.from_table(table)
-
-
-def _limit(exposure, n_dithers, background, residual):
-    """5-sigma flux of point sources in the calculator's aperture, of several dithers."""
-    return sensitivity(
-        exposure.filter,
-        n_dithers * exposure.exposure_time,
-        n_sigma=5,
-        background=background,
-        residual=residual or None,
-        n_dithers=n_dithers,
-        n_groups=exposure.n_groups,
-        readout=exposure.readout,
-        subarray=exposure.subarray,
-    )
 
 
 def background_options(config):

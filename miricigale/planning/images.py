@@ -18,6 +18,7 @@ from miricigale.utils.random import stream
 from miricigale.utils.store import replacing
 from miricigale.utils.tables import error_column
 from miricigale.workflow.config import StudyConfig
+from miricigale.workflow.derived import rows_of
 from miricigale.workflow.sections import (
     DetectorSection,
     ExposureSection,
@@ -74,10 +75,9 @@ def images_catalog(planner):
         return catalog
     rng = stream(config.plan.seed, "plan", "neighbors")
     fractions = agn_mix(config.agn, len(catalog), rng)
-    place = {key: row for row, key in enumerate(np.asarray(catalog["id"]).tolist())}
-    rows = [place[key] for key in np.asarray(planner.sources["id"]).tolist()]
-    fractions[rows] = np.asarray(planner.sources["frac_agn"], float)
-    catalog["frac_agn"] = fractions
+    own = dict(zip(planner.sources["id"], planner.sources["frac_agn"], strict=True))
+    pairs = zip(catalog["id"], fractions, strict=True)
+    catalog["frac_agn"] = [float(own.get(key, value)) for key, value in pairs]
     return catalog
 
 
@@ -185,14 +185,13 @@ def image_sample(planner, folder, *, executor=None, progress_bar=False):
     )
     truth = truth_names(study)[-1]
     matched = QTable.read(folder / truth / "matched.ecsv")
-    place = {key: row for row, key in enumerate(np.asarray(matched["id"]).tolist())}
-    rows = np.array([place[key] for key in np.asarray(planner.sources["id"]).tolist()], int)
-    selection = np.asarray(matched["selection"])[rows]
+    matched = rows_of(matched, planner.sources["id"])
+    selection = np.asarray(matched["selection"])
     usable = (selection & int(_UNUSABLE)) == 0
     measured = QTable({"id": planner.sources["id"]})
     for name in study.exposures.filters:
         for column in (name, error_column(name)):
-            values = matched[column].to_value(u.uJy)[rows]
+            values = matched[column].to_value(u.uJy)
             measured[column] = np.where(usable, values, np.nan) * u.uJy
     in_field = (selection & int(SampleFlags.OUTSIDE_FIELD)) == 0
     return ImagedSample(measured, in_field, usable, ErrorModel.read(folder / "errors.ecsv"))

@@ -7,9 +7,6 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable, vstack
 
-from miricigale.fitting import BayesFitter
-from miricigale.photometry import ErrorModel
-from miricigale.photometry.surveys import fractional_error
 from miricigale.planning.accuracy import accuracy
 from miricigale.planning.config import PlanConfig
 from miricigale.planning.exposures import RunErrors, band_plans, wall_clock
@@ -17,6 +14,7 @@ from miricigale.planning.sample import make_sample
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import error_column, require_columns
+from miricigale.workflow.stages.fits import existing_errors, study_fitter
 from miricigale.workflow.stages.sample import detected_bands
 
 #: Name of the fit without MIRI.
@@ -70,23 +68,25 @@ class Plan:
             (`~miricigale.depth.sensitivity`) and ``limit_used`` (the errors that are drawn, points), and
             ``saturates``, the magnitude at which a point does.
         """
-        rows = [
-            {
-                "filter": name,
-                "time": np.round(plan.time.to(u.s), 1),
-                "groups": plan.exposure.n_groups,
-                "integrations": plan.exposure.n_integrations,
-                "dithers": plan.n_dithers,
+        columns = (
+            "filter",
+            "time",
+            "groups",
+            "integrations",
+            "dithers",
+            "background",
+            "sky_in_well",
+        )
+        columns += ("limit_etc", "limit", "limit_used", "saturates", "n_saturated")
+        rows = []
+        for name, plan in self.bands.items():
+            row = plan.numbers() | {
                 "background": np.round(plan.background, 2),
-                "sky_in_well": round(float(plan.sky_fraction), 3),
-                "limit_etc": np.round(plan.calculator, 2),
-                "limit": np.round(plan.limit, 2),
                 "limit_used": np.round(plan.errors().limiting_magnitude(name), 2),
                 "saturates": np.round(plan.saturation, 1),
                 "n_saturated": int(np.count_nonzero(self.sources[f"{name}_saturated"])),
             }
-            for name, plan in self.bands.items()
-        ]
+            rows.append({column: row[column] for column in columns})
         return QTable(rows)
 
 
@@ -157,12 +157,8 @@ class Planner:
     @functools.cached_property
     def _existing(self):
         """Mock photometry in the existing bands, the same for every plan."""
-        fit = self.config.fit
-        errors = ErrorModel.from_depths(
-            dict(zip(fit.bands, fit.depths, strict=True)),
-            fractional={name: fractional_error(name) for name in fit.bands},
-        )
-        return errors.perturb(self.sources[["id", *fit.bands]], seed=self.config.plan.seed)
+        columns = self.sources[["id", *self.config.fit.bands]]
+        return existing_errors(self.config.fit).perturb(columns, seed=self.config.plan.seed)
 
     def photometry(self, plans, measured=None):
         """
@@ -233,12 +229,8 @@ class Planner:
         known = self.band_plans(share)
         plans = {band: known[band] for band in bands}
         photometry = self.photometry(plans.values(), measured)
-        fitter = BayesFitter(
-            SEDModel.yang2021(),
-            [*config.fit.bands, *bands],
-            axes=SEDModel.yang2021_axes(config.fit.axes),
-            model_error=config.fit.model_error,
-        )
+        axes = SEDModel.yang2021_axes(config.fit.axes)
+        fitter = study_fitter(config.fit, bands, axes=axes)
         results = fitter.fit(photometry, executor=self.executor)
         table = self._results(results, photometry, plans)
         pointings = config.exposures.pointings if pointings is None else pointings
@@ -268,14 +260,12 @@ class Planner:
             table[f"{name}_saturated"] = self.sources[name] >= plan.saturation.to(u.uJy)
         return table
 
-    def compare(self, sets=None, *, measured=None):
+    def compare(self, *, measured=None):
         """
-        Evaluate the existing bands alone and each set of bands.
+        Evaluate the existing bands alone and each set of bands of the configuration.
 
         Parameters
         ----------
-        sets : iterable of str, optional
-            Sets as in ``[exposures] sets``; those of the configuration by default.
         measured : `~astropy.table.QTable`, optional
             As for `photometry`.
 
@@ -285,7 +275,7 @@ class Planner:
             The existing bands first.
         """
         plans = [self.evaluate((), name=EXISTING)]
-        for name in self.config.exposures.sets if sets is None else sets:
+        for name in self.config.exposures.sets:
             short = name.replace("miri.", "").replace(" ", "")
             bands = self.config.set_bands(name)
             plans.append(self.evaluate(bands, name=short, measured=measured))

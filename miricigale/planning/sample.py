@@ -5,13 +5,18 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.refdata import resources
-from miricigale.sed import ModelFlags, SEDModel
-from miricigale.utils.exceptions import ConfigError, DataError, argument_error
+from miricigale.sed import SEDModel
+from miricigale.utils.exceptions import ConfigError, argument_error
 from miricigale.utils.random import stream
 from miricigale.utils.tables import require_columns
 from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.stages.inputs import bright_sources, fit_seds, study_catalog
-from miricigale.workflow.stages.truth import add_agn, add_field_agn, galaxy_parameters
+from miricigale.workflow.stages.truth import (
+    add_agn,
+    add_field_agn,
+    galaxy_parameters,
+    library_fluxes,
+)
 
 #: Stellar populations may not be older than the universe: the fit's ages, Gyr, are cut to this share.
 _AGE_SHARE = 0.95
@@ -88,14 +93,7 @@ def make_sample(config, bands, *, executor=None):
     else:
         add_agn(sources, 0.0, seed)
         sources["frac_agn"] = agn_mix(config.agn, len(sources), rng) if given is None else given
-    light = model.fluxes(sources, list(bands))
-    lacking = (np.asarray(light["flags"]) & int(ModelFlags.NOT_IN_LIBRARY)) > 0
-    if np.any(lacking):
-        msg = (
-            f"{np.count_nonzero(lacking)} of {len(light)} sources have parameters that the registered "
-            f"libraries lack ({'; '.join(model.meta['libraries'])})"
-        )
-        raise DataError(msg)
+    light = library_fluxes(model, sources, list(bands))
     for name in bands:
         sources[name] = light[name]
     usable = np.all([np.isfinite(sources[name].value) for name in bands], axis=0)

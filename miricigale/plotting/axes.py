@@ -2,21 +2,6 @@
 
 import numpy as np
 
-__all__ = [
-    "MEASURED",
-    "SECOND",
-    "STYLES",
-    "TRUE",
-    "WIDTH",
-    "add_borders",
-    "label_outer",
-    "legend",
-    "new_figure",
-    "panel_columns",
-    "panels",
-    "resolve_axes",
-]
-
 #: Inches across the figures of a page, which are shown at one width, so that letters have one size.
 WIDTH = 10.5
 #: Colors of truth, of what is measured and of a second measurement.

@@ -4,51 +4,8 @@ import numpy as np
 
 from miricigale.plotting.axes import MEASURED, SECOND, TRUE, legend, resolve_axes
 
-__all__ = [
-    "plot_counts",
-    "plot_error_function",
-    "plot_magnitudes",
-    "plot_offsets",
-    "plot_redshifts",
-    "plot_relation",
-]
-
 #: dz / (1 + z) beyond which a redshift is an outlier.
 _OUTLIER = 0.15
-
-
-def plot_magnitudes(true, measured, *, ax=None, lost=None, title=None):
-    """
-    Measured against true magnitude, with the line of equality.
-
-    Parameters
-    ----------
-    true, measured : array-like, shape (n,)
-        AB magnitudes; NaN is not drawn.
-    ax : `~matplotlib.axes.Axes`, optional
-        Axes to draw on.
-    lost : array-like, optional
-        True magnitudes of sources without a measurement, drawn as ticks at the bottom.
-    title : str, optional
-        Title.
-
-    Returns
-    -------
-    ax : `~matplotlib.axes.Axes`
-    """
-    ax = resolve_axes(ax)
-    true, measured = np.asarray(true), np.asarray(measured)
-    good = np.isfinite(true) & np.isfinite(measured)
-    ax.plot(true[good], measured[good], ".", ms=3.5, color=MEASURED, alpha=0.7)
-    if np.any(good):
-        low, high = np.percentile(np.concatenate([true[good], measured[good]]), [0, 99.5])
-        ax.plot([low - 0.3, high + 0.3], [low - 0.3, high + 0.3], color=TRUE, lw=1)
-        ax.set(xlim=(low - 0.3, high + 0.3), ylim=(high + 0.3, low - 0.3))
-    if lost is not None and len(lost):
-        at_bottom = {"transform": ax.get_xaxis_transform()}
-        ax.plot(lost, np.full(len(lost), 0.02), "|", color=TRUE, ms=6, **at_bottom)
-    ax.set(xlabel="true magnitude (AB)", ylabel="measured magnitude (AB)", title=title)
-    return ax
 
 
 def plot_offsets(true, offset, *, running=None, ax=None, title=None, limit=1.0):
@@ -191,33 +148,4 @@ def plot_relation(x, y, *, lines=(), ax=None, labels=("", "")):
     ax.set(xlabel=labels[0], ylabel=labels[1])
     if lines:
         legend(ax)
-    return ax
-
-
-def plot_counts(edges, counts, counts_err, *, ax=None, title=None):
-    """
-    Differential number counts with their Poisson errors.
-
-    Parameters
-    ----------
-    edges : array-like, shape (m + 1,)
-        Magnitudes.
-    counts, counts_err : array-like, shape (m,)
-        Per square degree and magnitude.
-    ax : `~matplotlib.axes.Axes`, optional
-        Axes to draw on.
-    title : str, optional
-        Title.
-
-    Returns
-    -------
-    ax : `~matplotlib.axes.Axes`
-    """
-    ax = resolve_axes(ax)
-    edges, counts = np.asarray(edges), np.asarray(counts)
-    good = counts > 0
-    mid = 0.5 * (edges[1:] + edges[:-1])
-    errors = np.asarray(counts_err)[good]
-    ax.errorbar(mid[good], counts[good], errors, fmt="o", ms=4, color=MEASURED, lw=1)
-    ax.set(xlabel="magnitude (AB)", ylabel=r"N (deg$^{-2}$ mag$^{-1}$)", yscale="log", title=title)
     return ax

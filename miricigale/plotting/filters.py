@@ -2,8 +2,6 @@
 
 from miricigale.plotting.axes import legend, resolve_axes
 
-__all__ = ["plot_filters"]
-
 
 def plot_filters(curves, ax=None, **kwargs):
     """

@@ -3,19 +3,8 @@
 import numpy as np
 
 from miricigale.plotting.axes import TRUE, add_borders, new_figure, resolve_axes
-
-__all__ = [
-    "add_colorbar",
-    "color_image",
-    "mark_sky",
-    "plot_color",
-    "plot_footprint",
-    "plot_image",
-    "plot_model_residual",
-    "plot_offsets",
-    "plot_segmentation",
-]
-
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_choice
 
 #: Color of lines over an image.
 _LINES = "#c2410c"
@@ -130,9 +119,7 @@ def plot_image(
     """
     from matplotlib.colors import AsinhNorm, Normalize
 
-    if stretch not in ("asinh", "linear"):
-        msg = f"'stretch' must be 'asinh' or 'linear', got {stretch!r}"
-        raise ValueError(msg)
+    check_choice(stretch, "stretch", ("asinh", "linear"))
     ax = resolve_axes(ax)
     image = np.asarray(image, float)
     low, high = _limits(image) if limits is None else limits
@@ -183,8 +170,7 @@ def plot_model_residual(
         _, ax = new_figure(1, 3, size=(4.2, 3.9))
     ax = np.ravel(np.asarray(ax, dtype=object))
     if len(ax) != 3:
-        msg = f"'ax' must be three axes, got {len(ax)}"
-        raise ValueError(msg)
+        raise argument_error("ax", "three axes", len(ax))
     image, model = np.asarray(image, float), np.asarray(model, float)
     residual = image - model
     noise = _robust(residual)[1]
@@ -243,19 +229,16 @@ def plot_offsets(xy, offset, field, *, used=None, ax=None, title=None):
     return ax
 
 
-def color_image(red, green, blue, *, scale=None, softening=8.0, stretch=6.0):
+def color_image(red, green, blue):
     """
     Make a color image whose hues do not depend on brightness.
+
+    Each image is divided by its own noise, so that the sky is gray.
 
     Parameters
     ----------
     red, green, blue : array_like, shape (ny, nx)
         Images on the same pixels. A pixel with NaN in one of them is black.
-    scale : (float, float, float), optional
-        Factors for the three; by default each is divided by its own noise, so that the
-        sky is gray.
-    softening, stretch : float, optional
-        Q and linear stretch of Lupton et al., in units of the noise.
 
     Returns
     -------
@@ -277,17 +260,17 @@ def color_image(red, green, blue, *, scale=None, softening=8.0, stretch=6.0):
         msg = f"'red', 'green', 'blue' must be of one shape, got {[p.shape for p in planes]}"
         raise ValueError(msg)
     scaled = []
-    for k, plane in enumerate(planes):
+    for plane in planes:
         middle, sigma = _robust(plane)
-        factor = 1 / sigma if scale is None else scale[k]
-        scaled.append(np.nan_to_num((plane - middle) * factor, nan=0.0))
-    image = make_lupton_rgb(*scaled, minimum=-1.0, stretch=stretch, Q=softening)
+        scaled.append(np.nan_to_num((plane - middle) * (1 / sigma), nan=0.0))
+    # stretch is in units of the noise
+    image = make_lupton_rgb(*scaled, minimum=-1.0, stretch=4.0, Q=7.0)
     # a color of two bands would be a wrong one
     image[np.any(np.isnan(planes), axis=0)] = 0
     return image
 
 
-def plot_color(red, green, blue, *, ax=None, pixel_scale=1.0, title=None, center=None, **kwargs):
+def plot_color(red, green, blue, *, ax=None, pixel_scale=1.0, title=None, center=None):
     """
     Draw a color image on axes in arcsec.
 
@@ -297,15 +280,13 @@ def plot_color(red, green, blue, *, ax=None, pixel_scale=1.0, title=None, center
         As in `color_image`.
     ax, pixel_scale, title, center : optional
         As in `plot_image`.
-    **kwargs
-        Passed to `color_image`.
 
     Returns
     -------
     ax : `~matplotlib.axes.Axes`
     """
     ax = resolve_axes(ax)
-    _draw(color_image(red, green, blue, **kwargs), ax, pixel_scale, title, center)
+    _draw(color_image(red, green, blue), ax, pixel_scale, title, center)
     return ax
 
 
@@ -400,8 +381,7 @@ def plot_segmentation(image, labels, *, ax=None, pixel_scale=1.0, center=None, *
     """
     image, labels = np.asarray(image), np.asarray(labels)
     if image.shape != labels.shape:
-        msg = f"'labels' must be of the image's shape {image.shape}, got {labels.shape}"
-        raise ValueError(msg)
+        raise argument_error("labels", f"of the image's shape {image.shape}", labels.shape)
     ax = plot_image(image, ax=ax, pixel_scale=pixel_scale, center=center, **kwargs)
     left, _, bottom, _ = _extent(image.shape, pixel_scale, center)
     y, x = (np.arange(n + 1) * pixel_scale for n in image.shape)

@@ -7,15 +7,6 @@ import numpy as np
 
 from miricigale.plotting.axes import add_borders, legend, resolve_axes
 
-__all__ = [
-    "plot_pdf",
-    "plot_pdf_2d",
-    "plot_pulls",
-    "plot_recovery",
-    "plot_sed_band",
-    "plot_sed_fit",
-]
-
 #: Upper limits: a bar, and an arrow down from it.
 _ARROW = {"fmt": "_", "uplims": True, "color": "tab:blue", "markersize": 10, "zorder": 4}
 

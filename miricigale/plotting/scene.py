@@ -5,8 +5,6 @@ import numpy as np
 from miricigale.plotting.axes import resolve_axes
 from miricigale.plotting.images import add_colorbar
 
-__all__ = ["plot_scene"]
-
 
 def plot_scene(image, *, ax=None, marks=None, label="", **kwargs):
     """

@@ -4,8 +4,6 @@ import numpy as np
 
 from miricigale.plotting.axes import resolve_axes
 
-__all__ = ["plot_spectrum"]
-
 
 def plot_spectrum(wave, fnu, ax=None, **kwargs):
     """

@@ -11,7 +11,7 @@ from astropy.table import Table
 
 from miricigale.detector import Ramp
 from miricigale.instrument import ImageFacts
-from miricigale.pages import Page
+from miricigale.pages import Page, SectionWriter, declared
 from miricigale.plotting.axes import WIDTH, new_figure
 from miricigale.plotting.images import plot_image
 from miricigale.reduction import (
@@ -108,7 +108,9 @@ def reduce_files(
         except _ERRORS as err:
             row["reason"] = _reason(err)
             log.warning("%s is left out: %s", path, row["reason"])
-    page = Page("Reduction", subtitle=f"{len(paths)} files")
+    page = SectionWriter(
+        Page("Reduction", subtitle=f"{len(paths)} files"), declared("miricigale.reduction")
+    )
     for name, members in sorted(done.items()):
         row = {"file": f"mosaic_{name.rpartition('.')[2]}.fits", "filter": name}
         rows.append(row | {"status": "failed", "reason": ""})
@@ -123,7 +125,7 @@ def reduce_files(
     table = Table(rows=[list(row.values()) for row in rows], names=list(rows[0]))
     table.write(folder / "files.ecsv", overwrite=True)
     _list(page, table)
-    page.write(folder / "index.html")
+    page.report.write(folder / "index.html")
     return table
 
 
@@ -221,19 +223,17 @@ def _show(page, path, members, notes):
     """Put the mosaic and its exposures on the page."""
     file = read_images(path)[0]
     image, meta = file.image, file.image.meta
-    name = meta["filter"].rpartition(".")[2].upper()
-    page.section(name, " ".join(f"{note}." for note in notes))
+    band = meta["filter"].rpartition(".")[2].upper()
+    page.section("mosaic", band=band, notes=" ".join(f"{note}." for note in notes))
     good = ~image.mask
-    sigma = float(np.median(image.uncertainty.array[good])) if good.any() else np.nan
-    page.items(
-        [
-            ("exposures", len(members)),
-            ("exposure time", f"{meta.get('exposure_time', np.nan):.6g} s"),
-            ("error of the median pixel", f"{sigma:.4g} MJy/sr"),
-            ("background of the exposures", _levels(members)),
-        ]
-    )
-    page.text(f"References that all have: {_references(meta)}.")
+    values = {
+        "n": len(members),
+        "exposure_time": meta.get("exposure_time"),
+        "error": np.median(image.uncertainty.array[good]) if good.any() else np.nan,
+        "background": _levels(members),
+    }
+    page.items(values)
+    page.text("references", references=_references(meta))
     ny, nx = image.shape
     _, axes = new_figure(1, 2, size=(WIDTH / 2, max(2.5, min(6.0, WIDTH / 2 * ny / nx))))
     scale = meta["pixel_scale"]
@@ -243,7 +243,7 @@ def _show(page, path, members, notes):
     count = np.squeeze(file.planes["CON"]).astype(float)
     title = "exposures of each pixel"
     plot_image(count, ax=axes[0, 1], pixel_scale=scale, title=title, **options)
-    page.figure(axes[0, 0].figure, f"Mosaic {path.name}, background subtracted, and its exposures.")
+    page.figure("figure", axes[0, 0].figure, file=path.name)
 
 
 def _levels(members):
@@ -264,11 +264,7 @@ def _references(meta):
 
 def _list(page, table):
     """Put the table of the files on the page."""
-    page.section("Files")
-    failed = int(np.count_nonzero(table["status"] == "failed"))
-    page.table(
-        [tuple(str(row[name]) for name in table.colnames) for row in table],
-        header=table.colnames,
-        text=4,
-        caption=f"{failed} failed." if failed else "",
-    )
+    page.section("files")
+    failed = np.count_nonzero(table["status"] == "failed")
+    rows = [dict(zip(row.colnames, map(str, row.values()), strict=True)) for row in table]
+    page.table("table", rows, failed=f"{failed} failed." if failed else "")

@@ -22,15 +22,21 @@ from miricigale.sed import SEDModel
 NAMES = np.array(["agn", "composite", "galaxy"])
 
 
-def rings(n, seed=1):
-    """AGN within 0.1 dex of a point, composites at 0.2-0.3, galaxies at 0.5-0.8."""
+def rings(n, seed=1, *, edges=(0.0, 0.1, 0.2, 0.3, 0.5, 0.8), center=(0.2, 0.1), side=1.0):
+    """AGN, composites and galaxies between radii about a point; AGN on a part of the circle only."""
     rng = np.random.default_rng(seed)
     kind = np.repeat([0, 1, 2], n)
-    low, high = np.array([[0.0, 0.1], [0.2, 0.3], [0.5, 0.8]])[kind].T
+    low, high = np.reshape(edges, (3, 2))[kind].T
     radius = rng.uniform(low, high)
-    angle = rng.uniform(0, 2 * np.pi, kind.size)
-    center = np.array([0.2, 0.1])
+    reach = np.where(kind == 0, side, 1.0) * np.pi
+    angle = rng.uniform(-reach, reach)
     return center + radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1), NAMES[kind]
+
+
+def fluxes_of(colors):
+    """Fluxes in the bands a, b and c of colors log a / b and log c / b."""
+    a, c = 10 ** np.transpose(colors) * u.uJy
+    return QTable({"a": a, "b": np.ones(a.size) * u.uJy, "c": c})
 
 
 def test_circles_find_rings():
@@ -47,20 +53,12 @@ def test_circles_find_rings():
 def test_center_is_found_where_it_is_not_the_median_of_the_agn():
     """AGN fill one side of the inner circle only, as those with silicate absorption do."""
 
-    def drawn(n, seed):
-        rng = np.random.default_rng(seed)
-        kind = np.repeat([0, 1, 2], n)
-        low, high = np.array([[0.2, 0.3], [0.38, 0.48], [0.6, 0.9]])[kind].T
-        radius = rng.uniform(low, high)
-        reach = np.where(kind == 0, 0.5, 1.0) * np.pi
-        angle = rng.uniform(-reach, reach)
-        return radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1), NAMES[kind]
-
-    colors, classes = drawn(300, 1)
+    kind = {"edges": (0.2, 0.3, 0.38, 0.48, 0.6, 0.9), "center": (0, 0), "side": 0.5}
+    colors, classes = rings(300, 1, **kind)
     circles = ColorCircles.fit(colors, classes)
     assert np.median(colors[classes == "agn"][:, 0]) > 0.15
     assert circles.center == pytest.approx((0.0, 0.0), abs=0.12)
-    fresh, truth = drawn(300, 2)
+    fresh, truth = rings(300, 2, **kind)
     assert np.mean(circles.classify(fresh) == truth) > 0.9
     # those about the median of the AGN do not
     near = np.hypot(*(fresh - np.median(colors[classes == "agn"], axis=0)).T)
@@ -78,9 +76,7 @@ def test_colors_are_logs_of_ratios():
 def test_sources_are_classified_by_circles_of_others():
     colors, classes = rings(200)
     window = ColorWindow(0.75, 1.25, ("a", "b"), ("c", "b"))
-    flux = 10**colors
-    fluxes = QTable({"a": flux[:, 0] * u.uJy, "b": np.ones(600) * u.uJy, "c": flux[:, 1] * u.uJy})
-    z = np.full(600, 1.0)
+    fluxes, z = fluxes_of(colors), np.full(600, 1.0)
     z[:5] = 3.0
     found = color_classes(fluxes, z, classes, windows=[window], seed=1)
     assert found[:5].tolist() == ["unknown"] * 5
@@ -94,9 +90,7 @@ def test_sources_are_classified_by_circles_of_others():
 def test_rows_of_one_source_stay_together():
     """Each source twice, with classes that have nothing to do with colors: its copy must not help."""
     rng = np.random.default_rng(3)
-    flux = 10 ** rng.normal(0, 0.3, (300, 2))
-    flux = np.concatenate([flux, flux])
-    fluxes = QTable({"a": flux[:, 0] * u.uJy, "b": np.ones(600) * u.uJy, "c": flux[:, 1] * u.uJy})
+    fluxes = fluxes_of(np.tile(rng.normal(0, 0.3, (300, 2)), (2, 1)))
     classes = np.tile(rng.choice(NAMES, 300), 2)
     window = ColorWindow(0, 2, ("a", "b"), ("c", "b"))
     groups = np.tile(np.arange(300), 2)

@@ -57,8 +57,7 @@ def test_bare_numbers_are_refused_by_name():
         (number_counts, ([23.0] * u.ABmag, area, [23, 24]), r"'flux' .* uJy, got mag\(AB\)"),
         (integrated_light, (flux, area, 15), "'wavelength' must be a quantity convertible to Hz"),
     ):
-        with pytest.raises((ValueError, u.UnitsError), match=message):
-            function(*arguments)
+        refuses(message, function, *arguments, error=(ValueError, u.UnitsError))
 
 
 def test_hidden_star_formation_at_published_values():

@@ -20,29 +20,18 @@ def rows(ranks, **kwargs):
     return coverage_table({"x": ranks}, **kwargs)
 
 
-def test_right_posteriors_cover_as_they_say():
-    true, values = gaussian_case(4000)
+@pytest.mark.parametrize(("bias", "width"), [(0.0, 1.0), (0.0, 0.5), (1.0, 1.0)])
+def test_coverage_is_that_of_gaussians(bias, width):
+    true, values = gaussian_case(4000, bias=bias, width=width)
     table = rows(posterior_ranks(true, values, LEVELS))
-    assert table["share"][0] == pytest.approx(0.68, abs=0.02)
-    assert table["share"][1] == pytest.approx(0.95, abs=0.01)
+    reach = width * norm.ppf(0.5 + np.array([0.34, 0.475]))
+    expected = norm.cdf(reach - bias) - norm.cdf(-reach - bias)
+    np.testing.assert_allclose(table["share"], expected, atol=0.02)
     assert np.all((table["share_low"] < table["share"]) & (table["share"] < table["share_high"]))
-    assert table["mean_rank"][0] == pytest.approx(0.5, abs=0.02)
-    assert table["p_uniform"][0] > 0.01
-
-
-def test_narrow_posteriors_cover_too_little():
-    """Half the width: a central 68.27 % interval is one of half a sigma, 38.3 %."""
-    true, values = gaussian_case(4000, width=0.5)
-    table = rows(posterior_ranks(true, values, LEVELS), levels=(0.6827,))
-    assert table["share"][0] == pytest.approx(0.383, abs=0.025)
-    assert table["p_uniform"][0] < 1e-6
-
-
-def test_biased_posteriors_have_low_ranks():
-    true, values = gaussian_case(4000, bias=1.0)
-    table = rows(posterior_ranks(true, values, LEVELS))
-    # P(x + 1 < y) of two unit Gaussians
-    assert table["mean_rank"][0] == pytest.approx(norm.cdf(-1 / np.sqrt(2)), abs=0.02)
+    expected = norm.cdf(-bias / np.hypot(1, width))
+    assert table["mean_rank"][0] == pytest.approx(expected, abs=0.02)
+    # uniform where the posteriors are right
+    assert (table["p_uniform"][0] > 0.01) == ((bias, width) == (0, 1))
 
 
 def test_truths_on_nodes_have_uniform_ranks_by_drawing_within_their_cell():

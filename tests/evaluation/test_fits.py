@@ -6,13 +6,7 @@ import pytest
 from astropy.table import QTable
 
 from helpers.studies import BANDS, LIMITS
-from miricigale.evaluation import (
-    StudyResults,
-    TruthResults,
-    coverage_table,
-    measure,
-    posterior_ranks,
-)
+from miricigale.evaluation import coverage_table, posterior_ranks
 from miricigale.fitting import BayesFitter
 from miricigale.photometry import ErrorModel
 from miricigale.photometry.surveys import YANG2021_DEPTHS
@@ -38,8 +32,7 @@ def case():
     truth["frac_agn"] = rng.choice([0.0, 0.2, 0.4, 0.6, 0.8], N)
     truth["mass"] = 10 ** rng.uniform(9.5, 11, N)
     light = model.fluxes(truth, [*OTHERS, *BANDS])
-    for name in ("l_6um", "accretion_power", "wfc3.f160w"):
-        truth[name] = light[name]
+    truth["accretion_power"] = light["accretion_power"]
     errors = ErrorModel.from_depths(
         dict(YANG2021_DEPTHS) | LIMITS, fractional=dict.fromkeys([*OTHERS, *BANDS], 0.03)
     )
@@ -49,16 +42,11 @@ def case():
         name: BayesFitter(model, [*OTHERS, *bands], axes=axes, model_error=error).fit(mock)
         for name, bands, error in (("all", BANDS, 0), ("none", (), 0), ("wide", BANDS, 0.1))
     }
-    matched = QTable({"id": truth["id"], "selection": np.zeros(N, int)})
-    matched["n_detected"] = np.full(N, 6)
-    for name in BANDS:
-        matched[name], matched[f"{name}_err"] = mock[name], mock[f"{name}_err"]
-        matched[f"{name}_true"] = light[name].to(u.uJy)
-    return truth, matched, fits
+    return truth, fits
 
 
 def ranks_of(case, fit):
-    truth, _, fits = case
+    truth, fits = case
     ranks = {}
     for name in ("redshift", "frac_agn", "accretion_power"):
         values, levels = fits[fit].cdf(name)
@@ -85,20 +73,3 @@ def test_posteriors_with_an_error_that_the_models_do_not_have_are_too_wide(case)
         ranks = {fit: ranks_of(case, fit)[name] for fit in ("wide", "all")}
         wide, right = coverage_table(ranks, levels=(0.68,))["share"]
         assert wide > right
-
-
-def test_numbers_of_fits_with_and_without_miri(case):
-    truth, matched, fits = case
-    tables = {name: results.to_table() for name, results in fits.items()}
-    one = TruthResults("mixed", None, truth, matched, tables, np.ones(N, bool))
-    study = StudyResults((one,), BANDS)
-
-    def got(quantity, band_set="all"):
-        return measure(study, quantity, truth=one, band_set=band_set, seed=1, n_draws=200)
-
-    for quantity in ("z_scatter", "frac_scatter", "width", "power_scatter"):
-        assert got(quantity).value < got(quantity, "none").value
-    assert abs(got("frac_offset").value) < 0.02
-    assert abs(got("power_offset").value) < 0.1
-    assert got("width_ratio").value > 2
-    assert got("class_share").value > 0.85

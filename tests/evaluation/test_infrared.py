@@ -4,7 +4,6 @@ import pytest
 from astropy.table import QTable
 
 from miricigale.evaluation import (
-    equivalent_width,
     feature_magnitude,
     feature_redshifts,
     feature_residuals,
@@ -52,13 +51,6 @@ def test_mid_infrared_fractions_rise_with_the_fraction_and_are_shares_of_the_spe
     galaxy = parts.components["stellar"].fnu + parts.components["dust"].fnu
     light = [abs(np.trapezoid(fnu[use].value, nu[use])) for fnu in (parts.fnu, galaxy)]
     assert got[2] == pytest.approx(1 - light[1] / light[0], abs=0.01)
-
-
-def test_equivalent_width_over_a_power_law_between_the_ends():
-    wave = np.linspace(5.95, 6.55, 601) * u.um
-    line = 1 + 4 * np.exp(-0.5 * ((wave.value - 6.22) / 0.04) ** 2)
-    got = equivalent_width(wave, wave.value**2.5 * line * u.uJy)
-    assert got.to_value(u.um) == pytest.approx(4 * 0.04 * np.sqrt(2 * np.pi), rel=1e-3)
 
 
 def test_feature_in_f1500w_is_that_of_the_paper():

@@ -6,7 +6,6 @@ from astropy.table import QTable
 
 from helpers.errors import refuses
 from miricigale.evaluation import AssociationFlags, associate, match_truth
-from miricigale.utils.tables import match_sky
 
 
 @pytest.fixture
@@ -28,15 +27,6 @@ def test_every_truth_row_stays_and_pairs_are_one_to_one(truth):
     assert np.isnan(table["miri.f770w"][[0, 2]]).all()
     assert table["miri.f770w_flags"].tolist() == [0, 4, 0]
     assert table["separation"][1].to_value(u.arcsec) == pytest.approx(0.36, rel=1e-3)
-
-
-def test_a_row_goes_to_the_nearest_reference_only():
-    reference = SkyCoord([0.0, 0.4] * u.arcsec, [0, 0] * u.arcsec)
-    index, separation = match_sky(
-        SkyCoord([0.3] * u.arcsec, [0] * u.arcsec), reference, radius=1 * u.arcsec
-    )
-    assert index.tolist() == [-1, 0]
-    assert separation[1].to_value(u.arcsec) == pytest.approx(0.1)
 
 
 def test_what_cannot_be_matched_is_named(truth):

@@ -28,18 +28,21 @@ def lx(log_l):
 # ------------------------------------------------------------------- published functions
 
 
-def test_luminosity_function_by_hand():
-    # at the break and z = 0 half of A, Ueda et al. 2014, table 4
-    assert xray_luminosity_function(lx(43.97), 0.0).to_value(DENSITY) == pytest.approx(2.91e-6 / 2)
-    # 10^44 at z = 1, before the cut-off at 1.86 x 10^(0.29 (44 - 44.61)) = 1.238: (1 + z)^4.78
-    x = 10**0.03
-    wanted = 2.91e-6 / (x**0.96 + x**2.71) * 2**4.78
-    assert xray_luminosity_function(lx(44), 1.0).to_value(DENSITY) == pytest.approx(wanted)
-    # 10^45 at z = 4: cut-offs at 1.86 and 3
-    x = 10**1.03
-    evolution = 2.86 ** (4.78 + 0.84) * (4 / 2.86) ** -1.5 * (5 / 4) ** -6.2
+@pytest.mark.parametrize(
+    ("log_l", "z", "evolution"),
+    [
+        (43.97, 0.0, 1.0),
+        # before the cut-off at 1.86 x 10^(0.29 (44 - 44.61)) = 1.238
+        (44.0, 1.0, 2**4.78),
+        # cut-offs at 1.86 and 3
+        (45.0, 4.0, 2.86 ** (4.78 + 0.84) * (4 / 2.86) ** -1.5 * (5 / 4) ** -6.2),
+    ],
+)
+def test_luminosity_function_by_hand(log_l, z, evolution):
+    # Ueda et al. 2014, table 4
+    x = 10 ** (log_l - 43.97)
     wanted = 2.91e-6 / (x**0.96 + x**2.71) * evolution
-    assert xray_luminosity_function(lx(45), 4.0).to_value(DENSITY) == pytest.approx(wanted)
+    assert xray_luminosity_function(lx(log_l), z).to_value(DENSITY) == pytest.approx(wanted)
 
 
 @pytest.mark.parametrize("log_l", [42.0, 43.0, 44.2, 45.5])

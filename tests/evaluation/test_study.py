@@ -15,7 +15,6 @@ from miricigale.evaluation import (
     StudyResults,
     TruthResults,
     compare_with_paper,
-    comparison_rows,
     measure,
     photoz_metrics,
     selection_table,
@@ -234,18 +233,8 @@ def test_a_study_beside_the_paper(study):
     right, one = row["class.0"], study.at(0.0)
     assert right["of_all"] == pytest.approx(right["ours"] * right["completeness"])
     assert right["completeness"] == pytest.approx(one.sample.sum() / one.field.sum())
-    rows = comparison_rows(table)
-    assert len(rows) == len(table)
-    texts = dict(zip(table["key"], rows, strict=True))
-    assert texts["power_scatter"][2] == "about 0.3"
-    assert texts["outliers.all"][2] == "0.015 [?]"
-    assert str(texts["frac_scatter.0.4.all"][3]) == "–"
-    assert "±" in texts["outliers.all"][3]
-
-
-def test_reasons_are_of_published_numbers(study):
-    with pytest.raises(KeyError, match="no published number 'outliers'"):
-        compare_with_paper(study, seed=1, reasons={"outliers": "?"})
+    unknown = {"seed": 1, "reasons": {"outliers": "?"}}
+    refuses("no published number 'outliers'", compare_with_paper, study, error=KeyError, **unknown)
 
 
 def test_tables_of_other_sources_are_refused():

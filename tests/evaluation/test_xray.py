@@ -2,7 +2,6 @@ import astropy.units as u
 import numpy as np
 import pytest
 from scipy.special import ndtr, ndtri
-from scipy.stats import norm
 
 from helpers.errors import refuses
 from miricigale.evaluation import (
@@ -39,12 +38,14 @@ def test_completeness_of_a_table_by_hand():
     np.testing.assert_allclose(table["share"], [0.5, 1.0, np.nan])
 
 
-@pytest.mark.parametrize("width", [0.05, 0.3])
-def test_half_of_the_sources_are_found_at_the_limit(width):
+@pytest.mark.parametrize(("width", "top"), [(0.05, 1.0), (0.3, 1.0), (0.3, 0.88)])
+def test_half_of_the_sources_are_found_at_the_limit(width, top):
+    """Where the share itself is one half, not half of that of the bright ones, of which some are lost."""
     rng = np.random.default_rng(1)
-    x = rng.uniform(-18, -14, 3000)
-    found = rng.uniform(size=x.size) < norm.cdf((x + 16.2) / width)
-    assert half_complete(x, found) == pytest.approx(-16.2, abs=0.05)
+    x = rng.uniform(-18, -13.5, 4000)
+    found = rng.uniform(size=x.size) < top * ndtr((x + 16.2) / width)
+    wanted = -16.2 + width * ndtri(0.5 / top)
+    assert half_complete(x, found) == pytest.approx(wanted, abs=0.05)
 
 
 def test_a_sharp_limit_lies_between_the_last_lost_and_the_first_found():
@@ -62,12 +63,3 @@ def test_there_is_no_limit_where_all_or_none_are_found():
 def test_refuses():
     refuses("'found' must be a 1-D array as long as 'values'", half_complete, [1.0], [True, False])
     refuses("'edges' must be ascending", completeness, [1.0], [True], [1.0, 0.0])
-
-
-def test_half_of_the_sources_is_half_where_some_bright_ones_are_lost():
-    rng = np.random.default_rng(2)
-    x = rng.uniform(-18, -13, 4000)
-    chance = 0.88 * ndtr((x + 16.5) / 0.3)
-    # where the share itself is one half, not half of that of the bright ones
-    wanted = -16.5 + 0.3 * ndtri(0.5 / 0.88)
-    assert half_complete(x, rng.random(x.size) < chance) == pytest.approx(wanted, abs=0.05)

@@ -26,7 +26,7 @@ BANDS = ["miri.f770w", "miri.f1500w"]
 SETTINGS = {
     "sample": {"n_sources": 60},
     "catalog": {"mag_limit": 24.0},
-    "exposures": {"bands": BANDS, "time": [900.0, 1500.0], "dithers": [2, 3], "sets": ["f770w"]},
+    "exposures": {"bands": BANDS, "time": [900.0, 1500.0], "dithers": [2, 3], "sets": ["all"]},
     "sed": {"axes": "quick"},
     "fit": {"axes": "quick"},
     "images": {"enabled": True},
@@ -109,15 +109,6 @@ def test_images_have_the_background_of_the_plan(tmp_path):
             assert study_background(study, name) == plan.background
 
 
-def test_what_images_cannot_do_is_refused():
-    for section, key, value, text in (
-        ("exposures", "readout", "SLOWR1", r"readout must be FASTR1 with \[images\]"),
-        ("sample", "luminosity_function", "lf.ecsv", "luminosity_function must be left out"),
-    ):
-        with pytest.raises(ConfigError, match=rf"\[{section}\] {text}"):
-            load_plan(overrides={"images": {"enabled": True}, section: {key: value}})
-
-
 @pytest.fixture(scope="module")
 def imaged(planner):
     """Made-up images: six times the noise of the plan, and 5 % of light lost; two thirds are usable."""
@@ -147,8 +138,8 @@ def test_noise_of_images_against_that_of_the_plan(planner, imaged):
 
 
 def test_differences_are_of_the_same_sources(planner, imaged):
-    plans = planner.compare(["all"])
-    others = planner.compare(["all"], measured=imaged.measured)
+    plans = planner.compare()
+    others = planner.compare(measured=imaged.measured)
     # existing bands have no images
     np.testing.assert_array_equal(
         plans[0].sources["redshift_mean"], others[0].sources["redshift_mean"]

@@ -3,9 +3,7 @@ import pytest
 
 from helpers.figures import error_bars, legend_texts, line_data
 from miricigale.plotting.comparison import (
-    plot_counts,
     plot_error_function,
-    plot_magnitudes,
     plot_offsets,
     plot_redshifts,
     plot_relation,
@@ -14,19 +12,6 @@ from miricigale.plotting.comparison import (
 
 def labels(ax):
     return ax.get_xlabel(), ax.get_ylabel()
-
-
-def test_magnitudes_leave_out_what_is_not_measured(ax):
-    true = np.array([20.0, 22.0, 24.0])
-    assert plot_magnitudes(true, [20.1, np.nan, 23.9], ax=ax, lost=[25.0], title="F770W") is ax
-    np.testing.assert_allclose(line_data(ax, ".")[0], [[20, 20.1], [24, 23.9]])
-    (equality,) = (one.get_xydata() for one in ax.lines if one.get_marker() == "None")
-    np.testing.assert_array_equal(equality[:, 0], equality[:, 1])
-    assert line_data(ax, "|")[0][0, 0] == 25.0
-    # bright sources are at the top
-    assert ax.get_ylim()[0] > ax.get_ylim()[1]
-    assert ax.get_title() == "F770W"
-    assert labels(ax) == ("true magnitude (AB)", "measured magnitude (AB)")
 
 
 def test_offsets_beyond_the_limit_are_triangles_at_its_edge(ax):
@@ -94,13 +79,3 @@ def test_points_and_the_relations_over_them(ax):
     assert legend_texts(ax) == ["law", "rule"]
     assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
     assert labels(ax) == ("M", "SFR")
-
-
-def test_counts_stand_in_the_middle_of_their_bins(ax):
-    assert plot_counts([20, 21, 22], [5.0, 0.0], [1.0, 0.0], ax=ax, title="counts") is ax
-    ((xy, low, high),) = error_bars(ax)
-    np.testing.assert_allclose(xy, [[20.5, 5.0]])
-    np.testing.assert_allclose((low, high), ([4.0], [6.0]))
-    assert ax.get_yscale() == "log"
-    assert labels(ax) == ("magnitude (AB)", r"N (deg$^{-2}$ mag$^{-1}$)")
-    assert ax.get_title() == "counts"

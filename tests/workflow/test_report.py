@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from astropy.table import QTable
 
+from helpers.figures import legend_texts
 from helpers.runs import (
     AREA,
     SCALE,
@@ -20,12 +21,14 @@ from helpers.runs import (
     small_config,
 )
 from miricigale.evaluation import PUBLISHED
+from miricigale.fitting import FitResults
 from miricigale.sed import SEDModel
 from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.page.labels import three_bands
 from miricigale.workflow.page.numbers import above_proposal, as_ceers, as_paper
 from miricigale.workflow.page.pictures import field_figure, residual_figure
 from miricigale.workflow.page.provenance import sources_to_cite, stand_ins
+from miricigale.workflow.page.source_figures import example_figure
 from miricigale.workflow.stages.sample import footprint_area, in_field
 from miricigale.workflow.truths import FIELD
 
@@ -329,3 +332,19 @@ def test_a_source_is_cited_once():
     metas = [{"citations": ["A 2001, ApJ 1, 2"]}, {"citations": ["A 2001", "B 2002"]}, {}]
     assert sources_to_cite([], metas) == ["A 2001, ApJ 1, 2", "B 2002"]
     assert sources_to_cite(["torus.parametric"], [])[0].startswith("Stalevski")
+
+
+def test_posteriors_with_and_without_miri_have_one_range(reports):
+    folder = reports["truths"].parent / "agn40"
+    results = {name: FitResults.read(folder / f"fits_{name}.fits") for name in ("all", "none")}
+    row = QTable.read(folder / "truth.ecsv")[3]
+    figure = example_figure(results, row, row["id"], SEDModel.yang2021())
+    upper, lower, redshift, fraction, first, second = figure.axes
+    assert upper.get_title().startswith(f"source {row['id']}: injected z = {row['redshift']:.3f}")
+    assert lower.get_ylabel().startswith("residual")
+    for ax in (redshift, fraction):
+        peaks = [patch.get_data().values.max() for patch in ax.patches]
+        assert peaks == pytest.approx([1.0, 1.0, 1.0])
+    assert legend_texts(redshift) == ["with MIRI", "without MIRI", "truth"]
+    assert (first.get_xlim(), first.get_ylim()) == (second.get_xlim(), second.get_ylim())
+    assert first.get_title() == "with MIRI"

@@ -9,6 +9,7 @@ from miricigale.filters import Filter
 from miricigale.plotting.axes import (
     MEASURED,
     SECOND,
+    TRUE,
     WIDTH,
     label_outer,
     legend,
@@ -16,9 +17,7 @@ from miricigale.plotting.axes import (
     panels,
 )
 from miricigale.plotting.comparison import (
-    plot_counts,
     plot_error_function,
-    plot_magnitudes,
     plot_offsets,
     plot_relation,
 )
@@ -38,12 +37,16 @@ def magnitude_figure(table, bands):
     known = np.concatenate([values[np.isfinite(values)] for values in true.values()])
     high = known.max(initial=20) + 1.5
     for name, ax in axes.items():
+        ax.plot(true[name], measured[name], ".", ms=3.5, color=MEASURED, alpha=0.7)
+        ax.axline((high, high), slope=1, color=TRUE, lw=1)
         lost = true[name][np.isfinite(true[name]) & ~(measured[name] < high)]
-        plot_magnitudes(true[name], measured[name], ax=ax, lost=lost, title=band_label(name))
+        at_bottom = {"transform": ax.get_xaxis_transform()}
+        ax.plot(lost, np.full(len(lost), 0.02), "|", color=TRUE, ms=6, **at_bottom)
+        ax.set_title(band_label(name))
     low = known.min(initial=high)
     bright = np.nanmin(np.concatenate([*measured.values(), [low]]))
     ax.set(xlim=(low - 0.4, high - 1.1), ylim=(high, min(low, bright) - 0.4))
-    label_outer(axes)
+    label_outer(axes, "true magnitude (AB)", "measured magnitude (AB)")
     return figure
 
 
@@ -234,6 +237,9 @@ def counts_figure(galaxies, bands, area):
     edges = np.arange(15, 30.1, 0.5)
     for name, ax in axes.items():
         counts, error = (v.to_value(u.deg**-2) for v in number_counts(galaxies[name], area, edges))
-        plot_counts(edges, counts, error, ax=ax, title=band_label(name))
-    label_outer(axes)
+        good = counts > 0
+        middle = 0.5 * (edges[1:] + edges[:-1])[good]
+        ax.errorbar(middle, counts[good], error[good], fmt="o", ms=4, color=MEASURED, lw=1)
+        ax.set(yscale="log", title=band_label(name))
+    label_outer(axes, "magnitude (AB)", r"N (deg$^{-2}$ mag$^{-1}$)")
     return figure

@@ -1,33 +1,25 @@
 """Sections on the images of the reference truth: headline, field, detections."""
 
 import numpy as np
+from markupsafe import Markup
 
-from miricigale.pages import cell_of, number
+from miricigale.pages import number
 from miricigale.workflow.page import pictures, study_figures
-from miricigale.workflow.page.declared import sentence, texts_of
-from miricigale.workflow.page.labels import SET_LABELS, browse, three_bands
+from miricigale.workflow.page.labels import browse, three_bands
 from miricigale.workflow.stages.exposures import study_exposures, study_pointings
 from miricigale.workflow.stages.images import measured_mosaic, reducer_of
 
 
 def write_summary(page, truths):
     """Headline numbers, and links to the sources of each truth."""
-    m, sky, texts = page.metrics, page.first.name, texts_of("summary")
-    linked = m | {"n_sample": browse(sky, m["n_sample"], show="sample")}
-    facts = {"min_detected": page.config.fit.min_detected}
-    cells = [(header, facts, linked, column) for header, *column in texts["items"]]
-    cells += [
-        (header, {"set": SET_LABELS[unit]}, m["fits"][unit], column)
-        for header, *column in texts["fits"]
-        for unit in ("all", "none")
-        if unit in m["fits"]
-    ]
+    m = page.metrics
+    values = m | {"n_sample": browse(page.first.name, m["n_sample"], show="sample")}
+    for unit, fit in m["fits"].items():
+        values |= {f"{key}_{unit}": value for key, value in fit.items()}
     page.section("summary")
-    page.report.items(
-        (sentence(header, facts), cell_of(entry, column)) for header, facts, entry, column in cells
-    )
-    links = [browse(name, name) for name in truths]
-    page.report.links("The sources one by one:", [(link.text, link.address) for link in links])
+    page.items(values, min_detected=page.config.fit.min_detected)
+    links = Markup(", ").join(browse(name, name) for name in truths)
+    page.text("sources", links=links)
 
 
 def write_images(page, mosaics):

@@ -4,7 +4,7 @@ from urllib.parse import quote, urlencode
 
 from miricigale.filters import Filter
 from miricigale.pages import Link
-from miricigale.plotting.comparison import MEASURED, SECOND
+from miricigale.plotting.axes import MEASURED, SECOND
 from miricigale.workflow.truths import CATALOG
 
 #: Sets of bands: what they are called, and their colors.

@@ -10,11 +10,11 @@ from miricigale.evaluation import (
     TruthResults,
     color_estimates,
     compare_with_paper,
-    comparison_rows,
     mid_infrared_fractions,
 )
 from miricigale.evaluation.paper import ONE_FIELD
-from miricigale.workflow.page.declared import sentence, texts_of
+from miricigale.pages import number, sentence
+from miricigale.workflow.page.declared import texts_of
 from miricigale.workflow.stages.conditions import ConditionFlags, has_flag
 from miricigale.workflow.stages.sample import matched_errors
 
@@ -170,6 +170,16 @@ def write_comparison(page, reasons, sentences):
     table = compare_with_paper(page.study, seed=page.context.seed, reasons=reasons)
     page.numbers("paper", table)
     page.report.bullets(sentences)
-    header = ("part", "number", "paper", "here", "completeness", "verdict")
-    caption = page.sentence("table")
-    page.report.table(comparison_rows(table), header=header, caption=caption, text=(0, 1, 5))
+    rows = []
+    for row in table:
+        mark = {"=": "", "~": "about "}.get(row["relation"], f"{row['relation']} ")
+        second_hand = "" if row["source"] else " [?]"
+        low, high = row["low"], row["high"]
+        known = np.isfinite([low, high]).all()
+        form = f"{{:.3g}} ± {0.5 * (high - low):.2g}" if known else ".3g"
+        cells = {
+            "paper": f"{mark}{row['paper']:.3g}{second_hand}",
+            "ours": number(row["ours"], form, "not measured in this study"),
+        }
+        rows.append({name: row[name] for name in table.colnames} | cells)
+    page.table("table", rows)

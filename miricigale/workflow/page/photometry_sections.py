@@ -21,7 +21,7 @@ def write_photometry(page):
     """Measured against true fluxes, and the point sources."""
     own_steps = page.config.photometry.method == "yang2021"
     matched, points, bands = page.tables.matched, page.tables.points, page.metrics["bands"]
-    page.section("photometry", text="yang2021" if own_steps else "text")
+    page.section("photometry", "yang2021" if own_steps else "text")
     kernels = {n: MatchingKernel.read(page.context.path(f"kernel_{n}.fits")) for n in page.bands}
     page.figure("convolution", pictures.convolution_figure(kernels))
     table = matched[page.tables.inside & np.asarray(matched["matched"])]

@@ -2,14 +2,17 @@
 
 import astropy.units as u
 import numpy as np
+from astropy.nddata import block_reduce
 from astropy.wcs.utils import proj_plane_pixel_scales
 
 from miricigale.evaluation import sigma_mad
-from miricigale.plotting.axes import WIDTH, new_figure
+from miricigale.plotting.axes import MEASURED, SECOND, TRUE, WIDTH, legend, new_figure
 from miricigale.plotting.images import mark_sky, plot_color, plot_image, plot_model_residual
-from miricigale.plotting.measurements import background_figure, encircled_energy_figure
 from miricigale.psf.wiener import energy_error
 from miricigale.workflow.page.labels import band_label
+
+#: Error of the encircled energy (%) that counts as small.
+_SMALL_ERROR = 4
 
 
 def filled(image):
@@ -18,13 +21,6 @@ def filled(image):
     if image.mask is not None:
         data[np.asarray(image.mask, bool)] = np.nan
     return data
-
-
-def binned(data, factor):
-    """Means of squares of pixels; NaN where one of them is."""
-    ny, nx = (n // factor * factor for n in data.shape)
-    blocks = data[:ny, :nx].reshape(ny // factor, factor, nx // factor, factor)
-    return blocks.mean(axis=(1, 3))
 
 
 def _scale(image):
@@ -58,7 +54,7 @@ def field_figure(images, prior, names):
     corners = images[0].wcs.pixel_to_world([x0 - 0.5, x1 - 0.5], [y0 - 0.5, y1 - 0.5])
     x, y = (np.round(v + 0.5).astype(int).clip(0) for v in prior.wcs.world_to_pixel(corners))
     factor = max(1, round(_scale(images[0]) / _scale(prior)))
-    field = binned(filled(prior)[y[0] : y[1], x[0] : x[1]], factor)
+    field = block_reduce(filled(prior)[y[0] : y[1], x[0] : x[1]], factor, np.mean)
     labels = [band_label(name) for name in names]
     color = len(planes) == 3
     n = 2 if color else 1 + len(planes)
@@ -74,9 +70,8 @@ def field_figure(images, prior, names):
         parts = zip(("blue", "green", "red"), labels, strict=False)
         title = ", ".join(f"{label} {color}" for color, label in parts)
         # binned, to reduce the noise of single pixels in the color image
-        planes = [binned(plane, 2) for plane in planes]
-        options = {"stretch": 4.0, "softening": 7.0, "title": title}
-        plot_color(*planes[::-1], ax=axes[1], pixel_scale=2 * _scale(images[0]), **options)
+        planes = [block_reduce(plane, 2, np.mean) for plane in planes]
+        plot_color(*planes[::-1], ax=axes[1], pixel_scale=2 * _scale(images[0]), title=title)
     else:
         for ax, plane, image, label in zip(axes[1:], planes, images, labels, strict=False):
             plot_image(plane, ax=ax, pixel_scale=_scale(image), title=label, **gray)
@@ -120,9 +115,13 @@ def residual_figure(images, names, *, size=220):
     return figure
 
 
+#: Most strips of a profile along an axis of an image.
+_N_STRIPS = 24
+
+
 def subtraction_figure(rate, cal, reducer):
     """
-    An exposure before and after its background was subtracted.
+    An exposure before and after its background was subtracted, with profiles along both axes.
 
     ``rate`` and ``cal`` are the slopes and the calibrated image, ``reducer`` that of the run.
     """
@@ -135,7 +134,39 @@ def subtraction_figure(rate, cal, reducer):
     (y0, x0), (y1, x1) = used.min(axis=0), used.max(axis=0) + 1
     before, after = before[y0:y1, x0:x1], after[y0:y1, x0:x1]
     sources = after > 3 * sigma_mad(after[np.isfinite(after)])
-    return background_figure(before, after, pixel_scale=_scale(cal), mask=sources)
+    figure, axes = new_figure(1, 3, size=(3.5, 3.5), width_ratios=(1, 1, 0.85))
+    last, scale = axes[0, 2], _scale(cal)
+    for ax, title, image, color in (
+        (axes[0, 0], "before", before, SECOND),
+        (axes[0, 1], "after", after, MEASURED),
+    ):
+        options = {"pixel_scale": scale, "colorbar": "MJy/sr", "stretch": "linear"}
+        plot_image(image, ax=ax, title=title, **options)
+        sky = np.where(sources, np.nan, image)
+        level = np.nanmedian(sky)
+        number = f"{level:.0f}" if abs(level) >= 10 else f"{level:.2g}"
+        for axis, style in ((0, "-"), (1, "--")):
+            x, y = _profile(sky, axis)
+            place = (x - 0.5 * image.shape[1 - axis]) * scale
+            label = f"{title} ({number}), along {'xy'[axis]}"
+            last.plot(place, y - level, style, color=color, lw=1.3, label=label)
+    axes[0, 1].set_ylabel("")
+    last.axhline(0, color=TRUE, lw=0.8)
+    last.set(xlabel="position (arcsec)", ylabel="median of strips - that of all (MJy/sr)")
+    low, high = last.get_ylim()
+    # space for the legend
+    last.set_ylim(low, high + 0.45 * (high - low))
+    legend(last, fontsize=7, loc="upper left")
+    return figure
+
+
+def _profile(image, axis):
+    """Medians of strips of an image across an axis (0: along x), and their middles in pixels."""
+    size = image.shape[1 - axis]
+    edges = np.unique(np.linspace(0, size, min(_N_STRIPS, size) + 1).astype(int))
+    strips = np.split(image, edges[1:-1], axis=1 - axis)
+    values = [np.nanmedian(s) if np.isfinite(s).any() else np.nan for s in strips]
+    return 0.5 * (edges[1:] + edges[:-1]), np.array(values)
 
 
 def convolution_figure(kernels):
@@ -144,11 +175,27 @@ def convolution_figure(kernels):
 
     ``kernels`` are `~miricigale.psf.MatchingKernel` with their PSFs, by band.
     """
+    from matplotlib import colormaps
+
     reach = min(k.target.shape[0] // 2 * k.pixel_scale.to_value(u.arcsec) for k in kernels.values())
     radius = np.linspace(0.03, min(2.5, reach), 60)
-    before, after = {}, {}
-    for name, kernel in kernels.items():
+    figure, axes = new_figure(1, 2, size=(5.25, 3.4), sharex=True)
+    left, right = axes[0]
+    most, steps = _SMALL_ERROR, np.linspace(0.0, 0.82, max(len(kernels), 2))
+    for k, (name, kernel) in enumerate(kernels.items()):
         pixels = radius / kernel.pixel_scale.to_value(u.arcsec)
-        before[band_label(name)] = energy_error(kernel.source, kernel.target, pixels)
-        after[band_label(name)] = kernel.encircled_energy_error(radius * u.arcsec)
-    return encircled_energy_figure(radius, before, after)
+        before = 100 * energy_error(kernel.source, kernel.target, pixels)
+        after = 100 * kernel.encircled_energy_error(radius * u.arcsec)
+        style = {"color": colormaps["viridis"](steps[k]), "ls": ("-", "--")[k % 2], "lw": 1.6}
+        left.plot(radius, before, label=band_label(name), **style)
+        right.plot(radius, after, **style)
+        most = max(most, np.nanmax(np.abs(after)))
+    for ax, when in ((left, "before"), (right, "after")):
+        ax.axhline(0, color=TRUE, lw=0.8)
+        ax.set_title(f"{when} convolution", fontsize="medium")
+        ax.set_xlabel("radius (arcsec)")
+    right.axhspan(-_SMALL_ERROR, _SMALL_ERROR, color="0.92", zorder=0)
+    right.set_ylim(-1.15 * most, 1.15 * most)
+    left.set_ylabel("difference of encircled energy (%)")
+    legend(left, ncols=2)
+    return figure

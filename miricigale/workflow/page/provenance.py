@@ -6,10 +6,11 @@ from pathlib import Path
 import astropy.units as u
 import numpy as np
 
+from miricigale.pages import sentence
 from miricigale.refdata import citations, resource, resources
 from miricigale.utils.meta import provenance
 from miricigale.workflow.background import background_text
-from miricigale.workflow.page.declared import sentence, texts_of
+from miricigale.workflow.page.declared import texts_of
 from miricigale.workflow.page.labels import band_label
 from miricigale.workflow.stages.exposures import (
     IMAGE_RESOURCES,
@@ -75,45 +76,41 @@ def library_rows(model):
 
 
 def catalog_facts(config, catalog):
-    """What the sources that were taken are, and how their SEDs are fitted: pairs of text."""
+    """What the sources that were taken are, and how their SEDs are fitted: dict of text."""
     options, limit = config.catalog, config.sed.max_wavelength
     # the folder of a user's file is not part of the result
     source = f"{Path(options.source).name}, the user's file"
     if options.source in resources():
         source = f"{options.source}: {resource(options.source).title}"
     bands = catalog_bands(catalog)
+    descriptions = [catalog[name].info.description for name in bands]
+    described = "; ".join(dict.fromkeys(text for text in descriptions if text is not None))
+    fluxes = f"; the description in the file: {described}"
+    if not described:
+        fluxes = ", as the file gives them, without a description"
     fitted, longest = input_bands(catalog, limit)
-    described = dict.fromkeys(
-        text for name in bands if (text := catalog[name].info.description) is not None
-    )
-    fluxes = f"{len(bands)} bands, as the file gives them, without a description"
-    if described:
-        fluxes = f"{len(bands)} bands; the description in the file: {'; '.join(described)}"
-    prior = config.highres.filter
     own = [name for name, errors in fitted.items() if errors]
     guess = f"{100 * config.sed.catalog_error:g} % error each"
     if not own:
         how = f" (pivot up to {limit:g} µm), {guess}, for the catalog gives none"
-    elif len(own) == len(fitted):
-        how = ", with the catalog's errors"
     else:
-        how = f", with the catalog's errors in {', '.join(own)}; {guess} in the others"
+        others = "" if len(own) == len(fitted) else f" in {', '.join(own)}; {guess} in the others"
+        how = f", with the catalog's errors{others}"
     if longest > limit:
         how += "; the dust's alpha is fitted too"
-    if prior in bands:
-        how += f"; each SED is scaled to the flux in {prior}"
-    facts = [
-        ("source", source),
-        ("cut", f"{options.mag_column} <= {options.mag_limit:g}, {len(catalog)} sources"),
-        ("fluxes", fluxes),
-        ("input SEDs fitted to", f"{', '.join(fitted)}{how}"),
-    ]
+    if config.highres.filter in bands:
+        how += f"; each SED is scaled to the flux in {config.highres.filter}"
+    facts = {
+        "source": source,
+        "cut": f"{options.mag_column} <= {options.mag_limit:g}, {len(catalog)} sources",
+        "fluxes": f"{len(bands)} bands{fluxes}",
+        "input SEDs fitted to": ", ".join(fitted) + how,
+    }
     if "redshift_source" in catalog.colnames:
         kinds, counts = np.unique(np.asarray(catalog["redshift_source"], str), return_counts=True)
-        text = ", ".join(f"{n} {kind}" for kind, n in zip(kinds, counts, strict=True))
-        facts.append(("redshifts", text))
-    facts.append(("stars", f"{np.count_nonzero(catalog['star'])}"))
-    return facts
+        pairs = zip(kinds, counts, strict=True)
+        facts["redshifts"] = ", ".join(f"{n} {kind}" for kind, n in pairs)
+    return facts | {"stars": str(np.count_nonzero(catalog["star"]))}
 
 
 def versions(*metas):
@@ -151,7 +148,7 @@ def write_exposures(page):
     page.table("exposures", exposure_kinds(config, forecasts, page.metrics["bands"]))
     page.report.text(f"Dithers: {dithers_text(config)}. {_background_sentence(config)}.")
     catalog = context.table("catalog.ecsv")
-    page.report.table(catalog_facts(config, catalog), header=("catalog", ""), text=2)
+    page.report.table(catalog_facts(config, catalog).items(), header=("catalog", ""), text=2)
 
 
 def _background_sentence(config):

@@ -10,7 +10,7 @@ from miricigale.evaluation import (
 )
 from miricigale.filters import Filter
 from miricigale.pages import Missing, number
-from miricigale.workflow.page import study_figures
+from miricigale.workflow.page import source_figures, study_figures
 from miricigale.workflow.page.labels import (
     SET_LABELS,
     band_label,
@@ -83,14 +83,14 @@ def _write_examples(page):
         return
     if "mass" in page.first.truth.colnames:
         link = browse(page.first.name, key, key)
-        page.figure("spectra", study_figures.spectra_figure(study, key, page.model), source=link)
+        page.figure("spectra", source_figures.spectra_figure(study, key, page.model), source=link)
     chosen = [one for fraction in EXAMPLES if (one := study.at(fraction)) is not None]
     for one in chosen or [page.first]:
         key = keys.get(one.name)
         if key is not None:
             row = one.truth[np.asarray(one.truth["id"]) == key][0]
             results = page.every[one.name].results
-            figure = study_figures.example_figure(results, row, key, page.model)
+            figure = source_figures.example_figure(results, row, key, page.model)
             link = browse(one.name, key, key)
             page.figure("fit", figure, truth=truth_label(one), source=link)
 
@@ -125,7 +125,9 @@ def _write_redshifts(page, rows):
     """Photometric redshifts."""
     page.section("redshifts")
     if len(page.tables.sample):
-        figure = study_figures.redshift_figure(page.tables.sample, page.tables.fits)
+        true = page.tables.sample["redshift"]
+        fits = {SET_LABELS[unit]: (true, fit) for unit, fit in page.tables.fits.items()}
+        figure = study_figures.redshift_figure(fits)
         page.figure("scatter", figure)
     page.figure("errors", study_figures.histogram_figure(page.study, "redshift"))
     page.table("table", rows)
@@ -142,7 +144,7 @@ def _write_redshifts(page, rows):
 def _write_fractions(page, rows):
     """AGN fractions."""
     study = page.study
-    page.section("fractions", text="truths" if len(study.truths) > 1 else "text")
+    page.section("fractions", "truths" if len(study.truths) > 1 else "text")
     if sum(one.frac_agn is not None and one.sample.any() for one in study.truths) > 1:
         page.figure("bins", study_figures.fraction_bins_figure(study))
     page.figure("means", study_figures.histogram_figure(study, "fraction"))

@@ -1,7 +1,5 @@
 """Figures of the fits of all truths and of what is known of their sources."""
 
-import functools
-
 import astropy.units as u
 import numpy as np
 
@@ -22,35 +20,31 @@ from miricigale.evaluation import (
     xray_fluxes,
 )
 from miricigale.filters import Filter
-from miricigale.plotting.axes import label_outer, panels
-from miricigale.plotting.comparison import plot_redshifts
-from miricigale.plotting.examples import fit_figure, sequence_figure
-from miricigale.plotting.measurements import features_figure, offsets_figure
-from miricigale.plotting.truths import (
-    classes_figure,
-    colors_figure,
-    completeness_figure,
-    fractions_figure,
-    histograms_figure,
-    luminosity_figure,
-    ranks_figure,
-    recovery_figure,
+from miricigale.plotting.axes import (
+    MEASURED,
+    SECOND,
+    STYLES,
+    TRUE,
+    label_outer,
+    legend,
+    new_figure,
+    panels,
 )
-from miricigale.utils.units import FNU, ab_magnitude
+from miricigale.plotting.comparison import plot_offsets, plot_redshifts
+from miricigale.utils.units import ab_magnitude
 from miricigale.workflow.page.labels import (
     SET_LABELS,
     band_label,
-    by_wavelength,
     class_label,
     parameter_label,
     truth_label,
 )
-from miricigale.workflow.page.numbers import MIPS_LIMIT
+from miricigale.workflow.page.numbers import FEWEST, MIPS_LIMIT
 
-#: fracAGN of the spectra that are drawn over each other.
-SEQUENCE = (0.0, 0.2, 0.4, 0.6, 0.8, 0.99)
 #: Classes that sources are found in, as columns of tables.
 CLASS_COLUMNS = (*CLASS_NAMES, "unknown")
+#: Bins of the histograms of ranks.
+_RANK_BINS = 10
 #: PAH features that are looked for in the residuals.
 FEATURES = PAH_FEATURES[1:3]
 
@@ -84,26 +78,36 @@ _HISTOGRAMS = {
 
 
 def histogram_figure(study, quantity):
-    """Histograms of ``"redshift"`` errors, or the ``"fraction"`` of the AGN or its ``"width"``, by truth."""
+    """
+    Histograms of ``"redshift"`` errors, or the ``"fraction"`` of the AGN or its ``"width"``, by truth.
+
+    A step line for each set of bands; values beyond the bins are counted in the outermost ones.
+    """
     values, bins, xlabel, true = _HISTOGRAMS[quantity]
     truths = {truth_label(one): one for one in study.truths if one.sample.any()}
-    return histograms_figure(
-        {
-            title: {label: values(one, name) for name, label in _both(one).items()}
-            for title, one in truths.items()
-        },
-        bins,
-        xlabel=xlabel,
-        truth={title: true(one) for title, one in truths.items()},
-    )
+    figure, axes = panels(truths, sharex=True)
+    ends = 0.5 * (bins[[0, -2]] + bins[[1, -1]])
+    for title, ax in axes.items():
+        one = truths[title]
+        for (name, label), (color, _) in zip(_both(one).items(), STYLES, strict=False):
+            inside = np.clip(values(one, name), *ends)
+            style = {"histtype": "step", "color": color, "lw": 1.6}
+            ax.hist(inside[np.isfinite(inside)], bins, label=label, **style)
+        if true(one) is not None:
+            ax.axvline(true(one), color=TRUE, lw=1, ls="--", label="truth")
+        ax.set_xlim(bins[0], bins[-1])
+        legend(ax)
+    label_outer(axes, xlabel, "sources")
+    return figure
 
 
-def redshift_figure(truth, fits):
-    """Fitted against true redshifts, by set of bands."""
-    figure, axes = panels([SET_LABELS[unit] for unit in fits], height=4.7)
-    for (title, ax), table in zip(axes.items(), fits.values(), strict=True):
-        error, z = table["redshift_std"], table["redshift_mean"]
-        plot_redshifts(truth["redshift"], z, z_err=error, ax=ax, title=title)
+def redshift_figure(fits):
+    """Fitted against true redshifts: by title, the true ones, and the table of the fit."""
+    figure, axes = panels(fits, height=4.7)
+    for title, ax in axes.items():
+        true, table = fits[title]
+        plot_redshifts(true, table["redshift_mean"], z_err=table["redshift_std"], ax=ax)
+        ax.set_title(title)
     label_outer(axes)
     return figure
 
@@ -111,176 +115,198 @@ def redshift_figure(truth, fits):
 def fraction_bins_figure(study):
     """Median and scatter of fitted against injected fracAGN, by bin of redshift."""
     truths = [one for one in study.truths if one.frac_agn is not None and one.sample.any()]
-    values = {}
+    names, values = _both(truths[0]), {}
     for low, high in REDSHIFT_BINS:
-        own = {}
-        for name, label in _both(truths[0]).items():
+        title = f"{low:g} < z < {high:g}" if np.isfinite(high) else f"z > {low:g}"
+        for name in names:
             rows = []
             for one in truths:
                 z = one.true("redshift")
                 found = one.fitted(name, "frac_agn_mean")[(z >= low) & (z < high)]
                 found = found[np.isfinite(found)]
                 # a scatter of fewer says nothing
-                if found.size >= 5:
+                if found.size >= FEWEST:
                     rows.append((one.frac_agn, np.median(found), sigma_mad(found)))
             if rows:
-                own[label] = tuple(np.array(rows).T)
-        if own:
-            values[f"{low:g} < z < {high:g}" if np.isfinite(high) else f"z > {low:g}"] = own
-    return fractions_figure(values)
+                values.setdefault(title, {})[names[name]] = np.transpose(rows)
+    figure, axes = panels(values, height=3.1, sharex=True, sharey=True)
+    for title, ax in axes.items():
+        ax.plot([0, 1], [0, 1], color=TRUE, lw=1)
+        count = len(values[title])
+        for k, (label, (true, median, scatter)) in enumerate(values[title].items()):
+            color, marker = STYLES[k]
+            # side by side, so that the bars do not cover each other
+            place = true + 0.015 * (k - 0.5 * (count - 1))
+            style = {"fmt": marker, "ms": 4.5, "color": color, "lw": 1.2}
+            ax.errorbar(place, median, scatter, label=label, **style)
+        ax.set(xlim=(-0.07, 1.07), ylim=(-0.12, 1.12))
+        legend(ax, loc="upper left")
+    label_outer(axes, "injected fracAGN", "fitted fracAGN")
+    return figure
 
 
 def disk_figure(study):
-    """Fitted against true accretion power of each truth with AGN; None if there is no such."""
-    values, notes = {}, {}
-    unit = u.erg / u.s
+    """
+    Fitted against true accretion power of each truth with AGN, with a factor of two marked.
+
+    None if there is no such truth.
+    """
+    values, unit = {}, u.erg / u.s
     for one in study.truths:
         if "all" not in one.fits or "accretion_power" not in one.truth.colnames:
             continue
         error = one.power_error("all")
         error = error[np.isfinite(error)]
         if error.size:
-            fitted = one.fits["all"]["accretion_power_mean"]
-            true = one.truth["accretion_power"][one.sample]
-            label = truth_label(one)
-            values[label] = (true.to_value(unit), fitted.to_value(unit))
-            notes[label] = (
-                f"median {np.median(error):+.2f} dex, scatter {sigma_mad(error):.2f} dex ({error.size})"
-            )
+            true = one.truth["accretion_power"][one.sample].to_value(unit)
+            fitted = one.fits["all"]["accretion_power_mean"].to_value(unit)
+            good = (true > 0) & (fitted > 0) & np.isfinite(true * fitted)
+            note = f"median {np.median(error):+.2f} dex, scatter {sigma_mad(error):.2f} dex ({error.size})"
+            values[truth_label(one)] = (true[good], fitted[good], note)
     if not values:
         return None
-    return recovery_figure(values, label="disk luminosity (erg/s)", notes=notes)
+    figure, axes = panels(values, height=3.3, sharex=True, sharey=True)
+    every = np.concatenate([v for true, fitted, _ in values.values() for v in (true, fitted)])
+    ends = np.percentile(every, [0.5, 99.5]) * [0.5, 2]
+    for label, ax in axes.items():
+        true, fitted, note = values[label]
+        ax.loglog(true, fitted, ".", ms=4, color=MEASURED, alpha=0.6)
+        ax.text(0.04, 0.95, note, transform=ax.transAxes, fontsize=8, va="top")
+        ax.plot(ends, ends, color=TRUE, lw=1)
+        ax.fill_between(ends, ends / 2, ends * 2, color=TRUE, alpha=0.12, lw=0)
+        ax.set(xlim=ends, ylim=ends)
+    label_outer(axes, "true disk luminosity (erg/s)", "fitted disk luminosity (erg/s)")
+    return figure
 
 
 def xray_figure(study, seed):
-    """X-ray fluxes of the injected AGN of the field and of those in the sample; None without any."""
+    """
+    X-ray fluxes of the injected AGN of the field and of those in the sample, and the share found beneath.
+
+    With the limits of other surveys (dotted where they are estimates) and the flux of 50 % completeness; None
+    without an AGN.
+    """
     truths = study.with_agn or study.truths
     truths = [one for one in truths if "l_6um" in one.truth.colnames]
-    fluxes = [xray_fluxes(one)[one.field] for one in truths]
-    values = np.concatenate([[], *fluxes])
+    values = np.concatenate([[], *(xray_fluxes(one)[one.field] for one in truths)])
     found = np.concatenate([np.zeros(0, bool), *(one.sample[one.field] for one in truths)])
     good = np.isfinite(values)
     if not found[good].any():
         return None
     ends = np.percentile(values[good], [0.5, 99.5])
-    edges = np.arange(np.floor(4 * ends[0]) / 4, np.ceil(4 * ends[1]) / 4 + 0.01, 0.25)
-    half = None
-    if study.with_agn:
-        half = measure(study, "xray_half", truth=None, seed=seed)
-        half = (half.value, half.low, half.high)
-    return completeness_figure(
-        completeness(values, found, edges),
-        xlabel=r"log X-ray flux, 0.5-7 keV (erg s$^{-1}$ cm$^{-2}$)",
-        limits=[
-            (np.log10(one.flux.value), f"{one.survey}, {one.kind}", one.checked)
-            for one in XRAY_LIMITS
-        ],
-        half=half,
-    )
+    bins = np.arange(np.floor(4 * ends[0]) / 4, np.ceil(4 * ends[1]) / 4 + 0.01, 0.25)
+    table = completeness(values, found, bins)
+    figure, axes = new_figure(2, 1, size=(7.0, 2.6), sharex=True, height_ratios=(1.5, 1))
+    upper, lower = axes[:, 0]
+    upper.stairs(table["n"], bins, color=TRUE, lw=1.6, label="all")
+    upper.stairs(table["n_found"], bins, color=MEASURED, fill=True, alpha=0.35, label="found")
+    upper.stairs(table["n_found"], bins, color=MEASURED, lw=1.6)
+    some = table[table["n"] > 0]
+    place = 0.5 * (some["low"] + some["high"])
+    lower.vlines(place, some["share_low"], some["share_high"], color=MEASURED, lw=1.2)
+    lower.plot(place, some["share"], "o", ms=4, color=MEASURED)
+    lower.axhline(0.5, color=TRUE, lw=0.8, ls="--")
+    half = measure(study, "xray_half", truth=None, seed=seed) if study.with_agn else None
+    for ax in (upper, lower):
+        if half is not None and np.isfinite(half.value):
+            ax.axvspan(half.low, half.high, color=MEASURED, alpha=0.15, lw=0)
+            ax.axvline(half.value, color=MEASURED, lw=1.2, label="50 % of these")
+        for one, color in zip(XRAY_LIMITS, (SECOND, "0.2", "#15803d"), strict=True):
+            style = {"color": color, "ls": "-" if one.checked else ":", "lw": 1.6}
+            ax.axvline(np.log10(one.flux.value), label=f"{one.survey}, {one.kind}", **style)
+    # above the axes, which are full of lines
+    legend(upper, loc="lower left", bbox_to_anchor=(0, 1), ncols=3)
+    upper.set(ylabel="sources", xlim=(bins[0], bins[-1]))
+    xlabel = r"log X-ray flux, 0.5-7 keV (erg s$^{-1}$ cm$^{-2}$)"
+    lower.set(ylabel="share found", xlabel=xlabel, ylim=(-0.05, 1.08))
+    return figure
 
 
 def detection_figure(study):
     """Infrared luminosities of the reference truth against redshift, and which are detected."""
     one = study.truths[0]
-    table = one.truth
-    least = min(2, len(study.bands))
+    table, least = one.truth, min(2, len(study.bands))
     named = "two or more MIRI bands" if least == 2 else "the MIRI band"
-    seen = one.field & (np.asarray(one.matched["n_detected"]) >= least)
+    seen = np.asarray(one.matched["n_detected"]) >= least
     groups = {f"detected in {named}": seen}
     if "mips.24" in table.colnames:
         with np.errstate(invalid="ignore"):
-            bright = ab_magnitude(table["mips.24"]) < MIPS_LIMIT
-        groups["MIPS 24 µm above its limit"] = one.field & bright
-    power = np.where(one.field, table["ir_luminosity"].to_value(u.Lsun), np.nan)
-    rate = 1 / sfr_to_infrared_luminosity(1 * u.Msun / u.yr).to_value(u.Lsun)
+            groups["MIPS 24 µm above its limit"] = ab_magnitude(table["mips.24"]) < MIPS_LIMIT
+    z, power = np.asarray(table["redshift"], float), table["ir_luminosity"].to_value(u.Lsun)
+    good = one.field & (power > 0) & np.isfinite(z)
+    figure, axes = new_figure(size=(7.0, 4.4))
+    ax = axes[0, 0]
+    rest = good & ~np.any(list(groups.values()), axis=0)
+    ax.semilogy(z[rest], power[rest], ".", ms=4, color="0.75", label="not detected", zorder=1)
+    for k, (name, rows) in enumerate(groups.items()):
+        color, marker = STYLES[k]
+        style = {"ms": 3 + 2.5 * k, "color": color, "mfc": "none" if k else color, "alpha": 0.75}
+        ax.plot(z[good & rows], power[good & rows], marker, label=name, **style)
+    if good.any():
+        low, high = np.percentile(power[good], [1, 100])
+        ax.set(xlim=(0, 1.03 * z[good].max()), ylim=(0.5 * low, 2 * high))
+    ax.set(xlabel="redshift", ylabel=r"L$_\mathrm{IR}$ (L$_\odot$)")
     # of light of AGN it is no star-formation rate
-    sfr = (rate, r"SFR (M$_\odot$/yr), Kennicutt 1998") if one.frac_agn == 0 else None
-    return luminosity_figure(np.asarray(table["redshift"], float), power, groups, sfr=sfr)
+    if one.frac_agn == 0:
+        rate = 1 / sfr_to_infrared_luminosity(1 * u.Msun / u.yr).to_value(u.Lsun)
+        right = ax.secondary_yaxis("right", functions=(lambda v: v * rate, lambda v: v / rate))
+        right.set_ylabel(r"SFR (M$_\odot$/yr), Kennicutt 1998")
+    # above the axes, which are full of points
+    legend(ax, loc="lower left", bbox_to_anchor=(0, 1), ncols=4)
+    return figure
 
 
 def shape_figure(study):
     """Magnitude errors of sources above 5 sigma by band and shape, crowded ones marked."""
-    one = study.truths[0]
+    one, groups = study.truths[0], {}
     labels = {"point": "points", "n < 2": "n < 2", "n >= 2": "n ≥ 2"}
-    groups, marked = {}, {}
     for band in study.bands:
-        true, error = one.matched[f"{band}_true"], one.magnitude_error(band)
-        bright = one.field & one.is_bright(band)
+        mag, error = ab_magnitude(one.matched[f"{band}_true"]), one.magnitude_error(band)
+        bright = one.field & one.is_bright(band) & np.isfinite(mag) & np.isfinite(error)
         for shape, rows in one.shapes.items():
-            name, rows = f"{band_label(band)}, {labels[shape]}", bright & rows
-            groups[name] = (ab_magnitude(true[rows]), error[rows])
-            marked[name] = one.crowded[band][rows]
-    return offsets_figure(groups, marked=marked)
-
-
-def spectra_figure(study, key, model):
-    """Spectra of one source with AGN of several fractions; ``model`` is one with AGN."""
-    values = {}
-    for one in (*study.with_agn[:1], study.truths[0]):
-        row = one.truth[np.asarray(one.truth["id"]) == key][0]
-        values |= {name: row[name] for name in row.colnames if name in model.parameters}
-    redshift = float(values["redshift"])
-    spectra = {}
-    for fraction in SEQUENCE:
-        sed = model.evaluate(**{**values, "frac_agn": fraction})
-        wave = sed.wave.to_value(u.um)
-        # the whole range of the bands, and of the features that are marked
-        shown = (wave > 0.3) & (wave < 40)
-        spectra[fraction] = sed.fnu.to_value(FNU)[shown]
-    bands = {}
-    for name in by_wavelength(study.bands):
-        band = Filter.from_name(name)
-        middle, half = band.pivot.to_value(u.um), 0.5 * band.width.to_value(u.um)
-        bands[band_label(name)] = (middle - half, middle + half)
-    options = {"bands": bands, "features": PAH_FEATURES.value, "redshift": redshift}
-    return sequence_figure(wave[shown], spectra, **options)
-
-
-def example_figure(results, row, key, model):
-    """
-    One source: photometry with the best model and residuals, and posteriors of redshift and fracAGN.
-
-    ``results`` has a `~miricigale.fitting.FitResults` for each set of bands, "all" among them; "none" is
-    drawn too if it is there. ``row`` of the truth has ``redshift`` and ``frac_agn``; ``model`` is that of
-    the fits.
-    """
-    best = results["all"].loc[key]
-    parts, posteriors, joint = {}, {}, {}
-    for name in ("all", "none"):
-        one = results[name].loc[key] if name in results else None
-        if one is None or not np.isfinite(one.chi2):
-            continue
-        label = SET_LABELS[name]
-        posteriors[label] = tuple(one.distribution(axis) for axis in ("redshift", "frac_agn"))
-        joint[label] = one.joint_pdf("redshift", "frac_agn")
-        if name == "none":
-            other = one.best_sed(model)
-            parts["best model without MIRI"] = (other.wave, other.fnu)
-    redshift, fraction = (best.best[axis].value for axis in ("redshift", "frac_agn"))
-    if fraction > 0:
-        total, galaxy = best.best_sed(model), best.best_sed(model, frac_agn=0.0)
-        parts["galaxy of the best model"] = (galaxy.wave, galaxy.fnu)
-        parts["AGN of the best model"] = (total.wave, total.fnu - galaxy.fnu)
-    draw_fit = functools.partial(
-        best.plot_sed,
-        model=model,
-        parts=parts,
-        groups=["MIRI" if n.startswith("miri.") else "existing bands" for n in best.filters],
-        title=f"source {key}: injected z = {row['redshift']:.3f}, fracAGN = {row['frac_agn']:.2g}; "
-        f"best model with MIRI: z = {redshift:.3f}, fracAGN = {fraction:g}, "
-        f"chi2 = {best.chi2:.1f} in {best.n_bands} bands",
-    )
-    truth = (float(row["redshift"]), float(row["frac_agn"]))
-    return fit_figure(draw_fit, posteriors, joint, truth=truth)
+            rows = bright & rows
+            title = f"{band_label(band)}, {labels[shape]} ({np.count_nonzero(rows)})"
+            groups[title] = (mag[rows], error[rows], one.crowded[band][rows])
+    figure, axes = panels(groups, height=3.1, sharex=True, sharey=True)
+    for title, ax in axes.items():
+        mag, error, crowded = groups[title]
+        plot_offsets(mag, error, ax=ax)
+        ax.set_title(title, fontsize="medium")
+        place = np.clip(error[crowded], -0.97, 0.97)
+        ax.plot(mag[crowded], place, "o", ms=6, mfc="none", mec="0.35", mew=0.7)
+        if mag.size:
+            text = f"median {np.median(error):+.3f}"
+            ax.text(0.96, 0.95, text, transform=ax.transAxes, ha="right", va="top", fontsize=8)
+    label_outer(axes)
+    return figure
 
 
 def class_figure(table):
-    """Shares found of each class, of a table of `~miricigale.evaluation.study_confusion`."""
+    """
+    Shares of the sources of each true class that are found in each class.
+
+    ``table`` is one of `~miricigale.evaluation.study_confusion`.
+    """
     found = [name for name in CLASS_COLUMNS if name in table.colnames]
-    rows = [row for row in table if row["n"]]
-    counts = np.array([[row[name] for name in found] for row in rows], float)
-    names = [class_label(row["class"]) for row in rows]
-    return classes_figure(counts, names, found=[class_label(name) for name in found])
+    table = table[table["n"] > 0]
+    counts = np.transpose([table[name] for name in found])
+    total = counts.sum(axis=1, keepdims=True)
+    share = np.divide(counts, total, out=np.zeros(counts.shape), where=total > 0)
+    figure, axes = new_figure(size=(1.3 + 1.1 * len(found), 1.0 + 0.8 * len(table)))
+    ax = axes[0, 0]
+    ax.imshow(share, cmap="Oranges", vmin=0, vmax=1.2, aspect="auto")
+    for (i, j), value in np.ndenumerate(share):
+        text = f"{100 * value:.0f} %\n{counts[i, j]}"
+        ax.text(j, i, text, ha="center", va="center", fontsize=9)
+    for axis, label, names in (
+        (ax.xaxis, "found as", found),
+        (ax.yaxis, "true class", table["class"]),
+    ):
+        axis.set_ticks(range(len(names)), [class_label(name) for name in names])
+        axis.set_label_text(label)
+    ax.tick_params(length=0)
+    ax.spines[:].set_visible(False)
+    return figure
 
 
 def color_figure(study, shares):
@@ -290,25 +316,38 @@ def color_figure(study, shares):
     ``shares`` are true AGN shares of the 5-15 um light by name of the truth, of all sources; None if no
     range has an AGN.
     """
-    planes, labels = {}, {}
     share = np.concatenate([shares[one.name] for one in study.truths])
     redshift = np.concatenate([np.asarray(one.truth["redshift"], float) for one in study.truths])
     sample = np.concatenate([one.sample for one in study.truths]) & np.isfinite(share)
+    planes = {}
     for window in COLOR_WINDOWS:
         colors = np.concatenate([window.colors(one.matched) for one in study.truths])
         rows = sample & (redshift >= window.z_low) & (redshift < window.z_high)
         rows &= np.isfinite(colors).all(axis=1)
         classes = classify(share[rows], limits=KIRKPATRICK_LIMITS)
-        if CLASS_NAMES[2] not in classes:
-            continue
-        circles = ColorCircles.fit(colors[rows], classes)
-        title = f"{window.z_low:g} < z < {window.z_high:g}"
-        shown = [class_label(name) for name in classes.tolist()]
-        planes[title] = (colors[rows], shown, circles.center, (circles.inner, circles.outer))
-        labels[title] = tuple(
-            f"log {band_label(a)} / {band_label(b)}" for a, b in (window.x, window.y)
-        )
-    return colors_figure(planes, labels=labels) if planes else None
+        if CLASS_NAMES[2] in classes:
+            title = f"{window.z_low:g} < z < {window.z_high:g}"
+            planes[title] = (window, colors[rows], classes)
+    if not planes:
+        return None
+    from matplotlib.patches import Circle
+
+    figure, axes = panels(planes, height=3.4)
+    for title, ax in axes.items():
+        window, colors, classes = planes[title]
+        labels = {class_label(name): name for name in classes.tolist()}
+        for label, (color, marker) in zip(sorted(labels), STYLES, strict=False):
+            rows = classes == labels[label]
+            ax.plot(*colors[rows].T, marker, ms=3.5, color=color, alpha=0.55, label=label)
+        circles = ColorCircles.fit(colors, classes)
+        for radius, line in ((circles.inner, "-"), (circles.outer, "--")):
+            style = {"fill": False, "color": "black", "lw": 1.3, "ls": line, "zorder": 5}
+            ax.add_patch(Circle(circles.center, radius, **style))
+        xlabel, ylabel = (f"log {band_label(a)} / {band_label(b)}" for a, b in (window.x, window.y))
+        ax.set(xlabel=xlabel, ylabel=ylabel)
+        ax.set_aspect("equal", adjustable="datalim")
+    legend(axes[next(iter(planes))], loc="upper left")
+    return figure
 
 
 def band_residuals(results, bands):
@@ -328,21 +367,54 @@ def band_residuals(results, bands):
 
 
 def residual_figure(redshift, residuals):
-    """Residuals of the fit in each band (`band_residuals`) against redshift, with PAH features."""
-    ranges = {}
-    for band in residuals:
-        own = Filter.from_name(band)
-        ranges[band_label(band)] = {
-            f"{rest.value:g} µm": feature_redshifts(rest, own.pivot, own.width) for rest in FEATURES
-        }
-    values = {band_label(band): (redshift, values) for band, values in residuals.items()}
-    return features_figure(values, ranges)
+    """
+    Residuals of the fit in each band (`band_residuals`) against redshift.
+
+    Redshifts at which a PAH feature is within the band are shaded, with the median there.
+    """
+    figure, axes = panels(residuals, height=2.9, sharex=True, sharey=True)
+    for k, (band, ax) in enumerate(axes.items()):
+        own, good = Filter.from_name(band), np.isfinite(redshift) & np.isfinite(residuals[band])
+        z, residual = redshift[good], residuals[band][good]
+        plot_offsets(z, residual, ax=ax, limit=0.6)
+        ax.set_title(band_label(band), fontsize="medium")
+        for rest, color in zip(FEATURES, (SECOND, "#15803d"), strict=True):
+            low, high = feature_redshifts(rest, own.pivot, own.width)
+            if high > low:
+                ax.axvspan(low, high, color=color, alpha=0.12, lw=0, label=f"{rest.value:g} µm")
+                inside = residual[(z >= low) & (z < high)]
+                if inside.size > 2:
+                    ax.plot([low, high], [np.median(inside)] * 2, color=color, lw=2)
+        if k == 0:
+            legend(ax, loc="upper right", ncols=2)
+    label_outer(axes, "redshift", "measured - model (mag)")
+    return figure
 
 
 def rank_figure(ranks):
-    """Ranks of the truth in the posteriors: dict of (set, parameter) to arrays."""
+    """
+    Histograms of the ranks of the truth in the posteriors, with what chance allows.
+
+    ``ranks`` are arrays by set of bands and parameter, in which NaN is left out.
+    """
     by_name = {}
     for (unit, name), values in ranks.items():
         if unit in ("all", "none"):
             by_name.setdefault(parameter_label(name), {})[SET_LABELS[unit]] = values
-    return ranks_figure(by_name)
+    figure, axes = panels(by_name, height=2.6, sharex=True)
+    for label, ax in axes.items():
+        most = 0
+        for k, (name, values) in enumerate(by_name[label].items()):
+            n, edges = np.histogram(values[np.isfinite(values)], _RANK_BINS, (0, 1))
+            most = max(most, n.sum())
+            style = {"color": STYLES[k][0], "lw": 1.6, "ls": ("-", "--")[k]}
+            ax.stairs(n * _RANK_BINS / max(n.sum(), 1), edges, label=name, **style)
+        if most:
+            # binomial, of a uniform distribution
+            error = np.sqrt((_RANK_BINS - 1) / most)
+            ax.axhspan(1 - error, 1 + error, color="0.88", zorder=0)
+        ax.axhline(1, color=TRUE, lw=0.8)
+        ax.set(xlim=(0, 1), ylim=(0, max(2.0, 1.05 * ax.get_ylim()[1])))
+        legend(ax, loc="upper center")
+    label_outer(axes, "rank of the truth", "density")
+    return figure

@@ -2,14 +2,14 @@
 
 import functools
 
-from miricigale.workflow.page.declared import sentence, texts_of
+from miricigale.pages import SectionWriter, declared
 from miricigale.workflow.page.labels import band_label, three_bands, truth_label
 from miricigale.workflow.page.numbers import FEWEST, MIPS_LIMIT
 
 
-class DeclaredPage:
+class DeclaredPage(SectionWriter):
     """
-    A page that is filled with what ``sections.toml`` declares: titles, paragraphs, captions and tables.
+    A page of a run that is filled with what ``sections.toml`` declares.
 
     Parameters
     ----------
@@ -20,53 +20,13 @@ class DeclaredPage:
     """
 
     def __init__(self, report, context):
-        self.report, self.context, self.config = report, context, context.config
-        self._section = None
-
-    @property
-    def facts(self):
-        """What all sentences say of the run: dict of str to values."""
-        return {}
-
-    def sentence(self, name, **facts):
-        """Return a sentence of the current section, filled with facts of the run and further ones."""
-        return sentence(texts_of(self._section)[name], self.facts | facts)
-
-    def section(self, name, text="text", **facts):
-        """Begin a section, with the paragraph ``text`` where it has that."""
-        self._section = name
-        paragraph = self.sentence(text, **facts) if text in texts_of(name) else ""
-        self.report.section(texts_of(name)["title"], paragraph)
+        super().__init__(report, declared("miricigale.workflow.page", "sections.toml"))
+        self.context, self.config = context, context.config
 
     def numbers(self, name, table, **facts):
         """Save numbers as ``report/<name>.ecsv``, and begin the section on them."""
         self.context.save_table(f"report/{name}.ecsv", table)
         self.section(name, **facts)
-
-    def text(self, name, **facts):
-        """Add a paragraph."""
-        self.report.text(self.sentence(name, **facts))
-
-    def figure(self, name, figure, **facts):
-        """Add a figure with its caption, unless there is none."""
-        if figure is not None:
-            self.report.figure(figure, self.sentence(name, **facts))
-
-    def table(self, name, rows, **facts):
-        """Add a table as it is declared, from dictionaries; without columns it has all of their keys."""
-        table, rows, facts = texts_of(self._section)[name], list(rows), self.facts | facts
-        columns = {
-            sentence(header, facts): tuple(column)
-            for header, *column in table.get("columns", ())
-            if rows and column[0] in rows[0]
-        }
-        self.report.entries(
-            rows,
-            columns or None,
-            caption=sentence(table["caption"], facts),
-            empty=sentence(table.get("empty", ""), facts),
-            text=table.get("text", 1),
-        )
 
 
 class StudyPage(DeclaredPage):

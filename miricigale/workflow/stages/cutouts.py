@@ -3,12 +3,13 @@
 import dataclasses
 
 import numpy as np
+from astropy.nddata import block_reduce
 from astropy.wcs.utils import proj_plane_pixel_scales
 from PIL import Image
 
 from miricigale.evaluation import sigma_mad
 from miricigale.utils.parallel import chunks
-from miricigale.workflow.page.pictures import binned, filled
+from miricigale.workflow.page.pictures import filled
 from miricigale.workflow.stages.images import measured_mosaic
 
 #: Side of the pictures, and the finest pixels of those of the bands, in arcsec.
@@ -48,7 +49,9 @@ class _Panels:
         scale = float(proj_plane_pixel_scales(first.wcs)[0] * 3600)
         factor = max(1, round(finest / scale))
         bad = ~np.isfinite(filled(first))
-        planes = [binned(np.where(bad, np.nan, filled(image)), factor) for image in images]
+        planes = [
+            block_reduce(np.where(bad, np.nan, filled(image)), factor, np.mean) for image in images
+        ]
         n = 2 * round(0.5 * BOX / (factor * scale)) + 1
         return cls(
             tuple(np.pad(p.astype(np.float32), n, constant_values=np.nan) for p in planes),

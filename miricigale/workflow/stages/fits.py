@@ -139,6 +139,14 @@ def match_sources(context, unit):
     context.save_table(f"{unit}/matched.ecsv", matched)
 
 
+def existing_errors(fit):
+    """Errors (`~miricigale.photometry.ErrorModel`) of the existing bands of a section ``[fit]``."""
+    return photometry.ErrorModel.from_depths(
+        dict(zip(fit.bands, fit.depths, strict=True)),
+        fractional={name: fractional_error(name) for name in fit.bands},
+    )
+
+
 def mock_photometry(config, truth, matched, *, seed, zero_point=0.0):
     """
     Photometry of the fitted sample (``selection`` 0): mock existing bands, measured MIRI bands.
@@ -147,11 +155,7 @@ def mock_photometry(config, truth, matched, *, seed, zero_point=0.0):
     on ``seed``, its id and the band only. The light of existing bands is higher or lower by the share
     ``zero_point``, of which the fits do not know.
     """
-    bands = config.fit.bands
-    errors = photometry.ErrorModel.from_depths(
-        dict(zip(bands, config.fit.depths, strict=True)),
-        fractional={name: fractional_error(name) for name in bands},
-    )
+    bands, errors = config.fit.bands, existing_errors(config.fit)
     sample = np.asarray(matched["selection"]) == 0
     name = "zero_point_existing"
     light = Perturbation({name: zero_point}, seed).fluxes(name, truth[["id", *bands]], bands)
@@ -210,6 +214,12 @@ def fit_sample(context, name, **options):
     return truth, matched, mock
 
 
+def study_fitter(fit, bands, **options):
+    """`BayesFitter` in the existing bands of a section ``[fit]`` and further ones."""
+    options = {"model_error": fit.model_error} | options
+    return fitting.BayesFitter(sed.SEDModel.yang2021(), [*fit.bands, *bands], **options)
+
+
 def fit_mock(context, mock, bands, *, given=None, **options):
     """
     Fit mock photometry in the existing and in further bands as the study does.
@@ -231,12 +241,7 @@ def fit_mock(context, mock, bands, *, given=None, **options):
     -------
     results : `~miricigale.fitting.FitResults`
     """
-    fit = context.config.fit
-    fitter = fitting.BayesFitter(
-        sed.SEDModel.yang2021(),
-        [*fit.bands, *bands],
-        **({"model_error": fit.model_error} | options),
-    )
+    fitter = study_fitter(context.config.fit, bands, **options)
     with ThreadPoolExecutor(context.n_threads) as executor:
         given = {"executor": executor, "progress_bar": context.progress_bar} | (given or {})
         return fitter.fit(mock, **given)

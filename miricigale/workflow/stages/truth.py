@@ -130,6 +130,20 @@ def add_field_agn(table, model, band, seed):
         table[name] = drawn[name]
 
 
+def library_fluxes(model, parameters, bands):
+    """Fluxes of models; a `DataError` if the registered libraries lack parameters of some."""
+    light = model.fluxes(parameters, bands)
+    lacking = np.count_nonzero(light["flags"] & int(sed.ModelFlags.NOT_IN_LIBRARY))
+    if lacking:
+        msg = (
+            f"{lacking} of {len(light)} sources have parameters that the "
+            f"registered libraries lack ({'; '.join(model.meta['libraries'])}): register whole "
+            "libraries with 'miricigale data add', or remove these"
+        )
+        raise DataError(msg)
+    return light
+
+
 def _truth_plan(config, unit):
     """The truth; libraries of its models where they are others than those of the fits; content of its files."""
     values = study_truths(config)[unit].values()
@@ -175,15 +189,7 @@ def make_truth(context, name):
         models = model, other
         parameters = perturbed_parameters(effects, parameters, models, prior, seed=context.seed)
         model = other
-    light = model.fluxes(parameters, bands)
-    lacking = np.count_nonzero(light["flags"] & int(sed.ModelFlags.NOT_IN_LIBRARY))
-    if lacking:
-        msg = (
-            f"{lacking} of {len(light)} sources have parameters that the "
-            f"registered libraries lack ({'; '.join(model.meta['libraries'])}): register whole "
-            "libraries with 'miricigale data add', or remove these"
-        )
-        raise DataError(msg)
+    light = library_fluxes(model, parameters, bands)
     light.rename_column("flags", "sed_flags")
     star = np.asarray(catalog["star"], bool)
     if np.any(star):

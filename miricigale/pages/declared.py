@@ -1,0 +1,121 @@
+"""Sections of a page as a TOML file declares them: titles, paragraphs, headline numbers, captions and columns."""
+
+import functools
+import tomllib
+from importlib import resources
+
+from markupsafe import Markup
+
+from miricigale.pages.values import cell_of
+
+
+@functools.cache
+def declared(package, file="page.toml"):
+    """
+    Read what is declared of a page.
+
+    Parameters
+    ----------
+    package : str
+        Package that has the file.
+    file : str, optional
+        Its name.
+
+    Returns
+    -------
+    texts : dict of str to dict
+        Sentences and tables by section.
+    """
+    return tomllib.loads((resources.files(package) / file).read_text("utf-8"))
+
+
+def sentence(text, facts):
+    """
+    Return a sentence with facts in place of the names in braces.
+
+    Parameters
+    ----------
+    text : str
+        The sentence.
+    facts : dict
+        What stands in it, by name.
+
+    Returns
+    -------
+    text : `~markupsafe.Markup`
+        Links among the facts stay links, all else is escaped.
+    """
+    return Markup.escape(" ".join(text.split())).format_map(facts)
+
+
+class SectionWriter:
+    """
+    Fills a page with declared sections.
+
+    A section has a ``title``, sentences by name (``text`` is its paragraph), ``items`` (headline numbers: label,
+    and how `~miricigale.pages.cell_of` takes the value), and tables by name: ``columns`` (header, and the same of
+    the cells), ``caption``, ``empty`` and ``text`` as of `~miricigale.pages.Page.table`. Words in braces are
+    filled with facts.
+
+    Parameters
+    ----------
+    report : `~miricigale.pages.Page`
+        The page.
+    texts : dict of str to dict
+        Of `declared`.
+    """
+
+    #: What all sentences say: dict of str to values.
+    facts = {}
+
+    def __init__(self, report, texts):
+        self.report, self.texts = report, texts
+        self._section = None
+
+    def sentence(self, name, /, **facts):
+        """Return a sentence of the current section, filled with the facts of all and further ones."""
+        return sentence(self.texts[self._section][name], self.facts | facts)
+
+    def notice(self, name, /, **facts):
+        """Add a sentence of ``[notices]`` to what stands above the first section."""
+        self.report.notices.append(sentence(self.texts["notices"][name], self.facts | facts))
+
+    def section(self, name, text="text", /, **facts):
+        """Begin a section, with the paragraph ``text`` where it has that."""
+        self._section = name
+        paragraph = self.sentence(text, **facts) if text in self.texts[name] else ""
+        self.report.section(sentence(self.texts[name]["title"], self.facts | facts), paragraph)
+
+    def text(self, name, /, **facts):
+        """Add a paragraph."""
+        self.report.text(self.sentence(name, **facts))
+
+    def items(self, values, /, **facts):
+        """Add headline numbers: label, and how it is taken from values by name; unknown ones are left out."""
+        self.report.items(
+            (sentence(label, self.facts | facts), cell_of(values, column))
+            for label, *column in self.texts[self._section]["items"]
+            if column[0] in values
+        )
+
+    def figure(self, name, figure, /, **facts):
+        """Add a figure with its caption, unless there is none."""
+        if figure is not None:
+            self.report.figure(figure, self.sentence(name, **facts))
+
+    def table(self, name, rows, /, **facts):
+        """Add a table as it is declared, from dictionaries; without columns it has all of their keys."""
+        table, rows, facts = self.texts[self._section][name], list(rows), self.facts | facts
+        keys = list(rows[0]) if rows else ()
+        columns = {
+            sentence(header, facts): column
+            for header, *column in table.get("columns", [(key, key) for key in keys])
+            if column[0] in keys
+        }
+        self.report.table(
+            [[cell_of(row, column) for column in columns.values()] for row in rows],
+            header=tuple(columns),
+            caption=sentence(table.get("caption", ""), facts),
+            empty=sentence(table.get("empty", ""), facts),
+            text=table.get("text", 1),
+        )

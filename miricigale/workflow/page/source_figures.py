@@ -1,0 +1,155 @@
+"""Figures of single sources: a fit with its posteriors with and without MIRI, spectra by AGN fraction."""
+
+import astropy.units as u
+import numpy as np
+
+from miricigale.evaluation import PAH_FEATURES
+from miricigale.filters import Filter
+from miricigale.plotting.axes import MEASURED, SECOND, TRUE, WIDTH, legend, new_figure
+from miricigale.plotting.posteriors import plot_pdf_2d
+from miricigale.plotting.spectra import plot_spectrum
+from miricigale.utils.units import FNU
+from miricigale.workflow.page.labels import SET_LABELS, band_label, by_wavelength
+
+#: fracAGN of the spectra that are drawn over each other.
+SEQUENCE = (0.0, 0.2, 0.4, 0.6, 0.8, 0.99)
+#: Sets of bands whose posteriors are drawn: color, line style and colors of the plane.
+_SETS = {"all": (MEASURED, "-", "Oranges"), "none": (SECOND, "--", "Blues")}
+_AXES = {"redshift": "redshift", "frac_agn": "fracAGN"}
+
+
+def spectra_figure(study, key, model):
+    """
+    Spectra of one source with AGN of several fractions, with bands and PAH features marked.
+
+    ``model`` is one with AGN.
+    """
+    from matplotlib import colormaps
+
+    values = {}
+    for one in (*study.with_agn[:1], study.truths[0]):
+        row = one.truth[np.asarray(one.truth["id"]) == key][0]
+        values |= {name: row[name] for name in row.colnames if name in model.parameters}
+    figure, axes = new_figure(size=(8.5, 4.4))
+    ax, light = axes[0, 0], []
+    for fraction, shade in zip(SEQUENCE, np.linspace(0.0, 0.85, len(SEQUENCE)), strict=True):
+        sed = model.evaluate(**{**values, "frac_agn": fraction})
+        wave = sed.wave.to_value(u.um)
+        # the whole range of the bands, and of the features that are marked
+        shown = (wave > 0.3) & (wave < 40)
+        wave, flux = wave[shown], sed.fnu.to_value(FNU)[shown]
+        style = {"color": colormaps["plasma"](shade), "lw": 1.6}
+        plot_spectrum(wave, flux, ax=ax, label=f"fracAGN {fraction:g}", **style)
+        light.append(flux[flux > 0])
+    top = np.concatenate(light).max()
+    bottom = max(np.concatenate(light).min(), 1e-5 * top)
+    span = np.log10(top / bottom)
+    ax.set_xlim(wave.min(), wave.max())
+    ax.set_ylim(bottom * 10 ** (-0.12 * span), top * 10 ** (0.1 * span))
+    for k, name in enumerate(by_wavelength(study.bands)):
+        band = Filter.from_name(name)
+        middle, half = band.pivot.to_value(u.um), 0.5 * band.width.to_value(u.um)
+        ends, y = [middle - half, middle + half], bottom * 10 ** ((-0.08 + 0.05 * (k % 2)) * span)
+        ax.plot(ends, [y, y], color="0.55", lw=5, solid_capstyle="butt", zorder=0)
+        above = {"xytext": (0, 5), "textcoords": "offset points"}
+        place = (np.sqrt(ends[0] * ends[1]), y)
+        ax.annotate(band_label(name), place, ha="center", fontsize=7, **above)
+    redshift = float(values["redshift"])
+    for rest in PAH_FEATURES.value:
+        place = rest * (1 + redshift)
+        if wave.min() < place < wave.max():
+            ax.axvline(place, color=TRUE, lw=0.7, ls=":")
+            at_top = {"transform": ax.get_xaxis_transform(), "ha": "right", "va": "top"}
+            ax.text(place, 0.98, f"{rest:g}", rotation=90, fontsize=7, color=TRUE, **at_top)
+    ax.set_title(f"z = {redshift:g}", fontsize="medium")
+    legend(ax, loc="upper left")
+    return figure
+
+
+def example_figure(results, row, key, model):
+    """
+    One source: photometry with the best model and residuals, and posteriors of redshift and fracAGN.
+
+    ``results`` has a `~miricigale.fitting.FitResults` for each set of bands, "all" among them; "none" is
+    drawn too if it is there. ``row`` of the truth has ``redshift`` and ``frac_agn``; ``model`` is that of
+    the fits.
+    """
+    from matplotlib.figure import Figure
+
+    fits = {name: results[name].loc[key] for name in _SETS if name in results}
+    fits = {name: one for name, one in fits.items() if np.isfinite(one.chi2)}
+    figure = Figure(figsize=(WIDTH, 7.2), layout="constrained")
+    grid = figure.add_gridspec(3, 4, height_ratios=(2.6, 0.9, 2.6))
+    upper = figure.add_subplot(grid[0, :])
+    lower = figure.add_subplot(grid[1, :], sharex=upper)
+    _draw_fit((upper, lower), results["all"].loc[key], fits.get("none"), row, model)
+    upper.set_xlabel("")
+    upper.tick_params(labelbottom=False)
+    low, high = upper.get_ylim()
+    upper.set_ylim(low, high * (high / low) ** 0.3)
+    legend(upper, loc="upper left", ncols=3)
+    for k, (axis, label) in enumerate(_AXES.items()):
+        ax = figure.add_subplot(grid[2, k])
+        _draw_posteriors(ax, {name: one.distribution(axis) for name, one in fits.items()})
+        ax.axvline(row[axis], ymax=0.6, color="0.2", ls=":", lw=1.4, label="truth")
+        ax.set_xlabel(label)
+        if k == 0:
+            ax.set_ylabel("posterior density (peak 1)")
+            legend(ax, loc="upper left")
+    planes = []
+    for k, (name, one) in enumerate(fits.items()):
+        ax = figure.add_subplot(grid[2, 2 + k])
+        edges = [u.Quantity(one.distribution(axis)[0]).value for axis in _AXES]
+        truth = tuple(float(row[axis]) for axis in _AXES)
+        style = {"labels": tuple(_AXES.values()), "truth": truth, "cmap": _SETS[name][2]}
+        plot_pdf_2d(*edges, one.joint_pdf(*_AXES), ax=ax, **style)
+        ax.set_title(SET_LABELS[name], fontsize="medium")
+        planes.append(ax)
+    # both planes alike, so that the areas can be compared
+    xlim, ylim = [ax.get_xlim() for ax in planes], [ax.get_ylim() for ax in planes]
+    for ax in planes:
+        ax.set(xlim=(np.min(xlim), np.max(xlim)), ylim=(np.min(ylim), np.max(ylim)))
+    for ax in planes[1:]:
+        ax.set_ylabel("")
+    return figure
+
+
+def _draw_fit(ax, best, without, row, model):
+    """Photometry and residuals on a pair of axes, with the best models, parts of them, and the truth in words."""
+    parts = {}
+    if without is not None:
+        other = without.best_sed(model)
+        parts["best model without MIRI"] = (other.wave, other.fnu)
+    redshift, fraction = (best.best[axis].value for axis in _AXES)
+    if fraction > 0:
+        total, galaxy = best.best_sed(model), best.best_sed(model, frac_agn=0.0)
+        parts["galaxy of the best model"] = (galaxy.wave, galaxy.fnu)
+        parts["AGN of the best model"] = (total.wave, total.fnu - galaxy.fnu)
+    best.plot_sed(
+        ax=ax,
+        model=model,
+        parts=parts,
+        groups=["MIRI" if n.startswith("miri.") else "existing bands" for n in best.filters],
+        title=f"source {row['id']}: injected z = {row['redshift']:.3f}, fracAGN = {row['frac_agn']:.2g}; "
+        f"best model with MIRI: z = {redshift:.3f}, fracAGN = {fraction:g}, "
+        f"chi2 = {best.chi2:.1f} in {best.n_bands} bands",
+    )
+
+
+def _draw_posteriors(ax, distributions):
+    """One-dimensional posteriors over each other, each with its peak at 1; the axis holds 99.8 % of each."""
+    ends = []
+    for name, (edges, weights) in distributions.items():
+        edges, weights = u.Quantity(edges).value, np.asarray(weights, float)
+        color, line, _ = _SETS[name]
+        width = np.diff(edges)
+        density = np.divide(weights, width, out=np.zeros(width.size), where=width > 0)
+        density = density / max(density.max(), 1e-300)
+        if not ends:
+            ax.stairs(density, edges, fill=True, alpha=0.2, color=color)
+        ax.stairs(density, edges, color=color, lw=1.6, ls=line, label=SET_LABELS[name])
+        total = np.cumsum(weights) / weights.sum()
+        inside = np.flatnonzero((total > 1e-3) & (np.r_[0, total[:-1]] < 1 - 1e-3))
+        ends += [edges[inside[0]], edges[inside[-1] + 1]]
+    margin = 0.06 * (max(ends) - min(ends))
+    ax.set(xlim=(min(ends) - margin, max(ends) + margin), ylim=(0, 1.75))
