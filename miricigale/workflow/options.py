@@ -33,16 +33,16 @@ class Limits:
     """
 
     low: float | None = None
-    high: float | None = None
-    choices: tuple | None = None
+    high: float = math.inf
+    choices: tuple = ()
     single: bool = False
     unique: bool = False
 
     def __str__(self):
-        names = ", ".join(self.choices or ())
+        names = ", ".join(self.choices)
         if self.low is None:
             return f" One of {names}." if names else ""
-        span = f"at least {self.low}" if self.high is None else f"{self.low} to {self.high}"
+        span = f"{self.low} to {self.high}" if self.high < math.inf else f"at least {self.low}"
         return f" ({span} or {names})" if names else f" ({span})"
 
 
@@ -238,21 +238,18 @@ def _checked(label, value, hint, limits):
         return value
     if isinstance(hint, types.UnionType):
         # a number within the limits, or one of the names
-        named = isinstance(value, str)
-        hint = str if named else float
-        limits = Limits(choices=limits.choices) if named else Limits(limits.low, limits.high)
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        hint = str if isinstance(value, str) else float
+    if hint is float and type(value) is int:
         value = float(value)
     if type(value) is not hint:
         raise _wrong(label, f"of type {hint.__name__}", value)
     if hint is float and not math.isfinite(value):
         raise _wrong(label, "a finite number", value)
     low, high, choices = limits.low, limits.high, limits.choices
-    if choices and value not in choices:
+    if hint is str and choices and value not in choices:
         raise _wrong(label, f"one of {list(choices)}", value)
-    # the negated comparison also refuses NaN
-    if (low is not None and not value >= low) or (high is not None and not value <= high):
-        wanted = f"at least {low}" if high is None else f"between {low} and {high}"
+    if hint is not str and low is not None and not low <= value <= high:
+        wanted = f"between {low} and {high}" if high < math.inf else f"at least {low}"
         raise _wrong(label, wanted, value)
     return value
 

@@ -87,8 +87,7 @@ def band_conditions(matched, name):
     field = ~has_flag(matched, "selection", SampleFlags.OUTSIDE_FIELD | SampleFlags.NO_MODEL)
     lost = has_flag(matched, column, ConditionFlags.NOT_MEASURED)
     flux, true = matched[name].value, matched[f"{name}_true"].value
-    with np.errstate(invalid="ignore"):
-        bright = true > 5 * matched[f"{name}_formal_err"].value
+    bright = true > 5 * matched[f"{name}_formal_err"].value
     counts = {
         "n_field": int(np.count_nonzero(field)),
         "n_not_measured": int(np.count_nonzero(field & lost)),
@@ -117,8 +116,7 @@ def detection_counts(detections, bands):
         field & has_flag(detections, f"{bands[0]}_condition", flag)
         for flag in (ConditionFlags.SPURIOUS, ConditionFlags.AMBIGUOUS)
     )
-    with np.errstate(invalid="ignore"):
-        bright = {n: detections[n] > 5 * detections[error_column(n)] for n in bands}
+    bright = {n: detections[n] > 5 * detections[error_column(n)] for n in bands}
     return {
         "n": len(detections),
         "n_field": int(field.sum()),

@@ -172,22 +172,11 @@ def truth_bands(config):
     return tuple(f"{truth}/{name}" for truth in truth_names(config) for name in band_names(config))
 
 
-def bands_of_truth(config, unit):
-    """Units of `truth_bands` of the truth with which a unit begins."""
-    truth = unit.partition("/")[0]
-    return tuple(f"{truth}/{name}" for name in band_names(config))
-
-
 def exposures_of(config, unit=""):
     """Exposures by name of a unit that ends with the name of an exposure or of a band; all without one."""
     name = unit.rpartition("/")[2]
     every = study_exposures(config)
     return {own: e for own, e in every.items() if not name or name in (own, e.filter)}
-
-
-def dithers_of_band(config, unit):
-    """Units of `exposure_units` of a unit of `truth_bands`."""
-    return tuple(f"{unit.partition('/')[0]}/{name}" for name in exposures_of(config, unit))
 
 
 def exposure_plan(config, unit=""):

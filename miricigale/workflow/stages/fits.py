@@ -13,7 +13,6 @@ from miricigale.workflow.perturbation import Perturbation
 from miricigale.workflow.stages.conditions import ConditionFlags, add_conditions, any_condition
 from miricigale.workflow.stages.exposures import (
     GRID,
-    bands_of_truth,
     pointing_exposures,
     pointing_time,
 )
@@ -27,7 +26,6 @@ from miricigale.workflow.stages.sample import (
 )
 from miricigale.workflow.truths import (
     band_sets,
-    of_truth,
     reference,
     study_truths,
     truth_names,
@@ -73,32 +71,22 @@ class _Field:
         return noise
 
 
-#: What is matched: a truth, and the mosaics and photometry of its bands.
-_MATCHED = {"truth": of_truth, "mosaics": bands_of_truth, "photometry": bands_of_truth}
-
-
 @stage(
     "errors",
     "error function",
     version=4,
-    needs={
-        name: lambda config, _, select=select: select(config, reference(config))
-        for name, select in _MATCHED.items()
-    },
+    needs=("truth", "mosaics", "photometry"),
+    within=reference,
     sections=(*GRID, "errors", "photometry.match_radius"),
     plan=lambda config, _: reference(config),
 )
 def make_errors(context, _):
     """Stage 12: error function of every band, of the matched sources of the reference truth."""
     config, field = context.config, _Field(context, context.plan)
-    errors = matched_errors(
-        field.matched,
-        field.inside,
-        config.exposures.filters,
-        statistic=config.errors.statistic,
-        bin_size=config.errors.bin_size,
-        noise=field.noise(config),
-    )
+    options = {name: getattr(config.errors, name) for name in ("statistic", "bin_size")}
+    options["noise"] = field.noise(config)
+    bands = config.exposures.filters
+    errors = matched_errors(field.matched, field.inside, bands, **options)
     context.save_result("errors.ecsv", errors)
 
 
@@ -106,7 +94,7 @@ def make_errors(context, _):
     "matches",
     "match to the truth",
     version=2,
-    needs={**_MATCHED, "errors": None},
+    needs=("truth", "mosaics", "photometry", "errors"),
     sections=(*GRID, "errors.coverage", "photometry.match_radius", "fit.min_detected", "fit.axes"),
     units=truth_names,
     plan=fit_plan,
@@ -178,14 +166,13 @@ def _fit_plan(config, unit):
     "fits",
     "fit",
     version=5,
-    needs={"truth": of_truth, "matches": of_truth},
+    needs=("truth", "matches"),
     sections=FIT_SECTIONS,
     resources=sed_resources,
     plan=_fit_plan,
     units=lambda config: tuple(
         f"{of}/{name}" for of in truth_names(config) for name in config.fit.sets
     ),
-    kernels=("fit",),
 )
 def fit_photometry(context, unit):
     """Stage 13: fit the detected sources of a truth with a set of the MIRI bands."""
@@ -210,7 +197,7 @@ def fit_sample(context, name, **options):
     return truth, matched, mock
 
 
-def fit_mock(context, mock, bands, *, given=None, **options):
+def fit_mock(context, mock, bands, *, redshift=None, **options):
     """
     Fit mock photometry in the existing and in further bands as the study does.
 
@@ -222,8 +209,8 @@ def fit_mock(context, mock, bands, *, given=None, **options):
         As of `mock_photometry`.
     bands : iterable of str
         Bands that join the existing ones.
-    given : dict, optional
-        Further arguments of ``BayesFitter.fit``.
+    redshift : array-like, optional
+        Redshifts that are not fitted.
     **options
         Further arguments of `~miricigale.fitting.BayesFitter`, or others than the study's.
 
@@ -238,5 +225,5 @@ def fit_mock(context, mock, bands, *, given=None, **options):
         **({"model_error": fit.model_error} | options),
     )
     with ThreadPoolExecutor(context.n_threads) as executor:
-        given = {"executor": executor, "progress_bar": context.progress_bar} | (given or {})
-        return fitter.fit(mock, **given)
+        show = context.progress_bar
+        return fitter.fit(mock, redshift=redshift, executor=executor, progress_bar=show)

@@ -60,7 +60,6 @@ _MEASURED = (
     sections=(*_SKY, *_MEASURED, "highres.pixel_scale", "variants", "report"),
     resources=lambda: (*sed_resources(), *EXPOSURE_RESOURCES),
     plan=exposure_plan,
-    kernels=("fit",),
 )
 def make_report(context, _):
     """Stage 14: the page with its figures, and the numbers as JSON."""
