@@ -159,17 +159,15 @@ class Configuration:
             type, or a value outside its limits.
         """
         base = base or cls()
-        sections = {field.name: getattr(base, field.name) for field in dataclasses.fields(base)}
-        unknown = sorted(set(values) - set(sections))
-        if unknown:
-            msg = f"unknown section {unknown}; known: {sorted(sections)}"
+        known = [field.name for field in dataclasses.fields(base)]
+        if unknown := sorted(set(values).difference(known)):
+            msg = f"unknown section {unknown}; known: {sorted(known)}"
             raise ConfigError(msg)
-        for name, entries in values.items():
-            if not isinstance(entries, dict):
-                label = f"[{name}]"
-                raise _wrong(label, "a section", entries)
-            sections[name] = _replace_section(name, sections[name], entries)
-        return cls(**sections)
+        sections = {
+            name: _replace_section(name, getattr(base, name), entries)
+            for name, entries in values.items()
+        }
+        return dataclasses.replace(base, **sections)
 
     @classmethod
     def from_texts(cls, texts, overrides=None):
@@ -207,14 +205,16 @@ def _shown(value):
 
 
 def _replace_section(name, section, entries):
+    label = f"[{name}]"
+    if not isinstance(entries, dict):
+        raise _wrong(label, "a section", entries)
     fields = {field.name: field for field in dataclasses.fields(section)}
-    unknown = sorted(set(entries) - set(fields))
-    if unknown:
-        msg = f"[{name}] does not know {unknown}; known: {sorted(fields)}"
+    if unknown := sorted(set(entries) - set(fields)):
+        msg = f"{label} does not know {unknown}; known: {sorted(fields)}"
         raise ConfigError(msg)
     hints = typing.get_type_hints(type(section))
     changes = {
-        key: _checked(f"[{name}] {key}", value, hints[key], _limits_of(fields[key]))
+        key: _checked(f"{label} {key}", value, hints[key], _limits_of(fields[key]))
         for key, value in entries.items()
     }
     return dataclasses.replace(section, **changes)

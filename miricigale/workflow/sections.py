@@ -333,7 +333,7 @@ class PhotometrySection(Section):
     n_pixels
         Least number of connected pixels of a detection.
     regularization
-        Regularization of the matching kernels: auto, yang2021 (0.03) or a number.
+        Regularization of the matching kernels: a number, auto, or yang2021 (0.03).
     match_radius
         Radius of the match to the truth in arcsec.
     rivals
@@ -343,7 +343,7 @@ class PhotometrySection(Section):
     method: str = option("package", choices=("package", "yang2021"))
     threshold: float = option(0.25, low=0.01, high=100.0)
     n_pixels: int = option(60, low=1, high=10000)
-    regularization: str = "auto"
+    regularization: float | str = option("auto", low=1e-6, choices=("auto", "yang2021"))
     match_radius: float = option(0.5, low=0.05, high=3.0)
     rivals: bool = False
 

@@ -44,15 +44,15 @@ class _Field:
         self.detections = joined_photometry(tables)
         self.matched = evaluation.match_truth(self.truth, self.detections, bands, radius=radius)
         self.association = evaluation.associate(self.truth, self.detections, radius=radius)
-        mosaics = {}
+        mosaics = []
         for band in bands:
-            path = f"{name}/mosaic_{band}.fits"
-            mosaics[band], n_images = context.image(path, "n_images")
-            exposure = pointing_exposures(config, band)[0]
-            seen = mean_coverage(self.truth["sky"], mosaics[band], n_images)
-            self.matched[f"{band}_time"] = seen * exposure.exposure_time
-        self.inside = in_field(self.truth["sky"], mosaics.values())
-        self.detections["in_field"] = in_field(self.detections["sky"], mosaics.values())
+            mosaic, n_images = context.image(f"{name}/mosaic_{band}.fits", "n_images")
+            mosaics.append(mosaic)
+            seen = mean_coverage(self.truth["sky"], mosaic, n_images)
+            time = pointing_exposures(config, band)[0].exposure_time
+            self.matched[f"{band}_time"] = seen * time
+        self.inside = in_field(self.truth["sky"], mosaics)
+        self.detections["in_field"] = in_field(self.detections["sky"], mosaics)
 
     def noise(self, config):
         """
@@ -119,8 +119,8 @@ def match_sources(context, unit):
     )
     add_conditions(matched, bands, suffix="_true")
     detections["association"] = np.zeros(len(detections), int)
-    here = np.asarray(association["second"]) >= 0
-    detections["association"][association["second"][here]] = association["reasons"][here]
+    here = association[np.asarray(association["second"]) >= 0]
+    detections["association"][here["second"]] = here["reasons"]
     add_conditions(detections, bands, detections=True)
     context.save_table(f"{unit}/association.ecsv", association)
     context.save_table(f"{unit}/photometry.ecsv", detections)

@@ -293,11 +293,11 @@ def measured_mosaic(config):
 )
 def make_kernel(context, name):
     """Stage 10: the kernel from the high-resolution image to the mosaic of one band."""
-    config, value = context.config, context.config.photometry.regularization
+    config = context.config
     kernel = psf.MatchingKernel.from_psfs(
         prior_psf(config),
         mosaic_psf(config, name, config.reduction.pixel_scale),
         pixel_scale=config.highres.pixel_scale * u.arcsec,
-        regularization=value if value in ("auto", "yang2021") else float(value),
+        regularization=config.photometry.regularization,
     )
     context.save_result(f"kernel_{name}.fits", kernel)
