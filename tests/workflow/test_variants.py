@@ -204,7 +204,7 @@ def test_the_report_says_what_each_costs(tmp_path):
     numbers = variants.write_variants(DeclaredPage(report, context), matched, {BAND: 22.15})
     page = report.to_html()
     assert "residual noise</td>" in page
-    assert "without the gradient the limit changes by +0.00 ± 0.00 mag" in page
+    assert "without the gradient</td>" in page
     np.testing.assert_array_equal(
         QTable.read(tmp_path / "report" / "variants.ecsv")["limit"], numbers["limit"]
     )
