@@ -84,9 +84,7 @@ def check_study(config):
             prior_psf(config)
 
 
-def run_study(
-    config, folder, *, executor=None, redo=False, until=None, again=None, progress_bar=False
-):
+def run_study(config, folder, **options):
     """
     Run all stages of a study in a folder; what stands there and is current is kept.
 
@@ -96,16 +94,10 @@ def run_study(
         The configuration; see `~miricigale.workflow.load_config`.
     folder : path-like
         Folder of the products: new, empty, or that of an earlier run.
-    executor : `concurrent.futures.Executor`, optional
-        Does exposures, bands and fits side by side; an executor of processes is best
-        (`~miricigale.utils.parallel.process_pool`). The products are the same bytes.
-    redo : bool, optional
-        Whether what another configuration made in this folder is done again.
-    until, again : str, optional
-        A stage or a pattern of units (``"mosaics"``, ``"fits:agn20/*"``): only these and what they need
-        are done; these are done again.
-    progress_bar : bool, optional
-        Whether progress is shown.
+    **options
+        ``executor``, ``redo``, ``until``, ``again`` and ``progress_bar`` of `~miricigale.workflow.StudyRunner`; an
+        executor of processes is best (`~miricigale.utils.parallel.process_pool`). The products are the
+        same bytes.
 
     Returns
     -------
@@ -122,16 +114,5 @@ def run_study(
         If the configuration names what does not exist or leaves nothing to do.
     """
     check_study(config)
-    runner = StudyRunner(
-        config,
-        folder,
-        study_stages,
-        executor=executor,
-        redo=redo,
-        until=until,
-        again=again,
-        disk=disk_use(config),
-        prepare=compile_missing,
-        progress_bar=progress_bar,
-    )
-    return runner.run().path("report/index.html")
+    options = {"disk": disk_use(config), "prepare": compile_missing, **options}
+    return StudyRunner(config, folder, study_stages, **options).run().path("report/index.html")

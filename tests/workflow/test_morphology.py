@@ -11,13 +11,12 @@ from astropy.table import QTable
 
 from helpers import scenes
 from helpers.errors import refuses
-from helpers.runs import STAGES, do_stage
+from helpers.runs import STAGES, do_stage, one_band
 from helpers.scenes import catalog_at
 from miricigale.psf import gaussian_psf
 from miricigale.scene import Scene
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import ConfigError, DataError, MiricigaleWarning
-from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.morphology import (
     MIN_RADIUS,
     RealGalaxies,
@@ -267,15 +266,9 @@ def test_a_study_paints_the_light_of_an_image(tmp_path, monkeypatch):
     table["mag_f160w"] = 20.0
     table.remove_column(BAND)
     table.write(tmp_path / "mine.ecsv")
-    config = StudyConfig.from_dict(
-        {
-            "catalog": {"source": str(tmp_path / "mine.ecsv")},
-            "sed": {"axes": "quick"},
-            "exposures": {"filters": [BAND], "kind": "rates"},
-            "fit": {"min_detected": 1},
-            "perturb": {"effects": "cutouts", "cutouts": str(tmp_path / "galaxies.fits")},
-        }
-    )
+    perturb = {"effects": "cutouts", "cutouts": str(tmp_path / "galaxies.fits")}
+    catalog, sed = {"source": str(tmp_path / "mine.ecsv")}, {"axes": "quick"}
+    config = one_band(BAND, kind="rates", catalog=catalog, sed=sed, perturb=perturb)
     run = functools.partial(do_stage, config, tmp_path)
     for name, unit in (("catalog", ""), ("seds", ""), ("truth", "agn00")):
         run(name, unit)

@@ -12,7 +12,7 @@ from miricigale.refdata import locate
 from miricigale.utils.exceptions import ConfigError, DataError, MiricigaleWarning, OtherResultsError
 from miricigale.workflow.config import StudyConfig, load_config
 from miricigale.workflow.engine.runner import StudyRunner, check_disk
-from miricigale.workflow.engine.stage import Stage, related, stage
+from miricigale.workflow.engine.stage import Stage, related
 from miricigale.workflow.engine.store import ProductStore
 from miricigale.workflow.stages import study_stages
 
@@ -346,19 +346,6 @@ def test_a_product_of_a_stage_that_is_not_declared_cannot_be_read(folder):
         refuses(text, run_stages, folder, *stages, error=RuntimeError)
     run_stages(folder, first, Stage("last", read, "last", needs=("first",)), redo=True)
     assert (folder / "sum.txt").read_text() == "ab"
-
-
-def test_a_stage_is_declared_beside_its_function():
-    @stage("name", "title", needs=("other",), resources=lambda: ["a", "b"], version=3)
-    def make(context, unit):
-        return context, unit
-
-    assert (make.name, make.title, make.needs, make.version) == ("name", "title", ("other",), 3)
-    assert make.resource_names() == ("a", "b")
-    assert make.function(1, 2) == (1, 2)
-    names = [one.name for one in study_stages()]
-    assert names[:3] == ["catalog", "seds", "truth"]
-    assert len(set(names)) == len(names) == 18
 
 
 @pytest.mark.parametrize(
