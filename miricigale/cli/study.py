@@ -125,15 +125,10 @@ def _bands_of(args, values):
 
 def compile_all(args):
     """Compile all kernels."""
-    from miricigale.utils.parallel import parallel_map, threads
-    from miricigale.workflow.warmup import JOBS, compile_apart, describe_job, is_compiled
+    from miricigale.utils.parallel import thread_count
+    from miricigale.workflow.warmup import compile_missing
 
-    names = [name for name in JOBS if not is_compiled(name)]
-    for name in names:
-        print(describe_job(name), flush=True)
-    with threads() as executor:
-        kept = parallel_map(compile_apart, names, executor=executor)
-    if not all(kept):
+    if not compile_missing(thread_count()):
         print("miricigale: compiled code cannot be kept; set NUMBA_CACHE_DIR", file=sys.stderr)
         return 1
     print("all kernels are compiled")

@@ -4,7 +4,6 @@ import dataclasses
 from typing import ClassVar
 
 from miricigale.instrument import CEERS_FILTERS, imager_filters, readout_patterns
-from miricigale.utils.exceptions import unknown_name
 from miricigale.workflow.background import check_levels
 from miricigale.workflow.options import Configuration, Section, option, read_text
 from miricigale.workflow.sections import CatalogSection, FitBasics, RunBasics, SedSection
@@ -102,7 +101,7 @@ class ExposureSection(Section):
         Pointings side by side.
     """
 
-    bands: tuple[str, ...] = option(CEERS_FILTERS, unique=True)
+    bands: tuple[str, ...] = option(CEERS_FILTERS, choices=imager_filters(), unique=True)
     time: tuple[float, ...] = option(
         (1665.0, 1665.0, 1665.0, 1665.0, 1665.0, 4662.0), low=0.0, single=True
     )
@@ -253,8 +252,6 @@ class PlanConfig(Configuration):
     ------
     `~miricigale.utils.exceptions.ConfigError`
         If lists that belong together have different lengths, or values contradict each other.
-    KeyError
-        If a band is none of MIRI's imager.
     """
 
     heading: ClassVar = (
@@ -277,9 +274,6 @@ class PlanConfig(Configuration):
     def __post_init__(self):
         exposures, agn, n = self.exposures, self.agn, len(self.exposures.bands)
         self.check(n, "exposures.bands", "must name at least one filter")
-        for name in exposures.bands:
-            if name not in imager_filters():
-                raise unknown_name("imaging filter", name, imager_filters())
         wanted = f"must have one number, or one per band ({n})"
         for key in ("depth" if exposures.depth else "time", "dithers"):
             self.check_length(f"exposures.{key}", (1, n), wanted)

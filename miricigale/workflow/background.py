@@ -4,6 +4,7 @@ import functools
 
 import astropy.units as u
 import numpy as np
+from astropy.coordinates import SkyCoord
 
 from miricigale.depth import sky_background
 from miricigale.utils.units import SURFACE_BRIGHTNESS
@@ -80,17 +81,16 @@ def band_background(filter, filters, levels, *, position=None, date=""):
     level = of_filter(levels, list(filters).index(filter))
     if level not in _PERCENTILES:
         return sky_background(filter, _read(level))
-    if position is None:
-        return sky_background(filter, level)
-    return _at(filter, level, float(position.icrs.ra.deg), float(position.icrs.dec.deg), date)
+    place = None if position is None else (position.icrs.ra.deg, position.icrs.dec.deg)
+    return _named(filter, level, place, date)
 
 
 @functools.lru_cache(maxsize=64)
-def _at(filter, level, ra, dec, date):
-    """Background at a position: asked for by every exposure, and some time to evaluate for a day."""
-    from astropy.coordinates import SkyCoord
-
-    return sky_background(filter, level, position=SkyCoord(ra, dec, unit="deg"), date=date or None)
+def _named(filter, level, place, date):
+    """Background of a named level: asked for by every exposure, and some time to evaluate for a day."""
+    if place is None:
+        return sky_background(filter, level)
+    return sky_background(filter, level, position=SkyCoord(*place, unit="deg"), date=date or None)
 
 
 def background_text(filters, levels, *, position=None, date=""):

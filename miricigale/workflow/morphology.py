@@ -87,8 +87,6 @@ def add_clumps(catalog, filter, *, share, seed, point=None):
     ----------
     Wuyts et al. 2012, ApJ 753, 114 (up to 20 % of the star formation in clumps off the centers).
     """
-    if share == 0:
-        return catalog
     checked = check_catalog(catalog, filters=[filter])
     clumpy = _sersic(checked) & (checked["sersic_index"] <= CLUMPY_INDEX)
     rows = np.flatnonzero(clumpy)
@@ -98,20 +96,17 @@ def add_clumps(catalog, filter, *, share, seed, point=None):
     inner = np.nan_to_num(np.asarray(catalog[point], float)) if point else np.zeros(len(catalog))
     flux = catalog[filter]
     given = np.where(clumpy, share * (1 - inner), 0.0)
-    smooth = catalog.copy()
-    smooth[filter] = flux * (1 - given)
-    if point:
-        # the same light in the point
-        smooth[point] = inner / (1 - given)
     owner = np.repeat(rows, [len(one[0]) for one in drawn])
     light, east, north = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
-    clumps = catalog[owner]
+    smooth, clumps = catalog.copy(), catalog[owner]
+    smooth[filter] = flux * (1 - given)
     clumps["id"] = _new_ids(np.asarray(catalog["id"]), owner)
     clumps["profile"] = np.full(len(owner), "point")
     clumps["sky"] = catalog["sky"][owner].spherical_offsets_by(east * ANGLE, north * ANGLE)
     clumps[filter] = flux[owner] * given[owner] * light
     if point:
-        clumps[point] = np.zeros(len(owner))
+        # the same light in the point
+        smooth[point], clumps[point] = inner / (1 - given), np.zeros(len(owner))
     return vstack([smooth, clumps], metadata_conflicts="silent")
 
 
@@ -306,10 +301,9 @@ def stamps_of_sources(catalog, galaxies, *, of, seed):
     ids = np.asarray(checked["id"]).tolist()
     stamps = {ids[row]: one for row, one in stamps.items() if one is not None}
     if not stamps:
-        how = "lies on a galaxy of" if of == "own" else "is like one of the galaxies of"
         msg = (
-            f"none of the {len(rows)} Sersic profiles of the catalog {how} the image of [perturb] cutouts "
-            f"(signal-to-noise of {MIN_SNR:g}, away from edges and masked pixels)"
+            f"none of the {len(rows)} Sersic profiles of the catalog has a galaxy on the image of [perturb] "
+            f"cutouts (signal-to-noise of {MIN_SNR:g}, away from edges and masked pixels)"
         )
         raise DataError(msg)
     log.info("%d of %d Sersic profiles have the light of real galaxies", len(stamps), len(rows))

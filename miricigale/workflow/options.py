@@ -33,16 +33,16 @@ class Limits:
     """
 
     low: float | None = None
-    high: float | None = None
-    choices: tuple | None = None
+    high: float = math.inf
+    choices: tuple = ()
     single: bool = False
     unique: bool = False
 
     def __str__(self):
-        names = ", ".join(self.choices or ())
+        names = ", ".join(self.choices)
         if self.low is None:
             return f" One of {names}." if names else ""
-        span = f"at least {self.low}" if self.high is None else f"{self.low} to {self.high}"
+        span = f"{self.low} to {self.high}" if self.high < math.inf else f"at least {self.low}"
         return f" ({span} or {names})" if names else f" ({span})"
 
 
@@ -159,17 +159,15 @@ class Configuration:
             type, or a value outside its limits.
         """
         base = base or cls()
-        sections = {field.name: getattr(base, field.name) for field in dataclasses.fields(base)}
-        unknown = sorted(set(values) - set(sections))
-        if unknown:
-            msg = f"unknown section {unknown}; known: {sorted(sections)}"
+        known = [field.name for field in dataclasses.fields(base)]
+        if unknown := sorted(set(values).difference(known)):
+            msg = f"unknown section {unknown}; known: {sorted(known)}"
             raise ConfigError(msg)
-        for name, entries in values.items():
-            if not isinstance(entries, dict):
-                label = f"[{name}]"
-                raise _wrong(label, "a section", entries)
-            sections[name] = _replace_section(name, sections[name], entries)
-        return cls(**sections)
+        sections = {
+            name: _replace_section(name, getattr(base, name), entries)
+            for name, entries in values.items()
+        }
+        return dataclasses.replace(base, **sections)
 
     @classmethod
     def from_texts(cls, texts, overrides=None):
@@ -207,14 +205,16 @@ def _shown(value):
 
 
 def _replace_section(name, section, entries):
+    label = f"[{name}]"
+    if not isinstance(entries, dict):
+        raise _wrong(label, "a section", entries)
     fields = {field.name: field for field in dataclasses.fields(section)}
-    unknown = sorted(set(entries) - set(fields))
-    if unknown:
-        msg = f"[{name}] does not know {unknown}; known: {sorted(fields)}"
+    if unknown := sorted(set(entries) - set(fields)):
+        msg = f"{label} does not know {unknown}; known: {sorted(fields)}"
         raise ConfigError(msg)
     hints = typing.get_type_hints(type(section))
     changes = {
-        key: _checked(f"[{name}] {key}", value, hints[key], _limits_of(fields[key]))
+        key: _checked(f"{label} {key}", value, hints[key], _limits_of(fields[key]))
         for key, value in entries.items()
     }
     return dataclasses.replace(section, **changes)
@@ -238,21 +238,18 @@ def _checked(label, value, hint, limits):
         return value
     if isinstance(hint, types.UnionType):
         # a number within the limits, or one of the names
-        named = isinstance(value, str)
-        hint = str if named else float
-        limits = Limits(choices=limits.choices) if named else Limits(limits.low, limits.high)
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        hint = str if isinstance(value, str) else float
+    if hint is float and type(value) is int:
         value = float(value)
     if type(value) is not hint:
         raise _wrong(label, f"of type {hint.__name__}", value)
     if hint is float and not math.isfinite(value):
         raise _wrong(label, "a finite number", value)
     low, high, choices = limits.low, limits.high, limits.choices
-    if choices and value not in choices:
+    if hint is str and choices and value not in choices:
         raise _wrong(label, f"one of {list(choices)}", value)
-    # the negated comparison also refuses NaN
-    if (low is not None and not value >= low) or (high is not None and not value <= high):
-        wanted = f"at least {low}" if high is None else f"between {low} and {high}"
+    if hint is not str and low is not None and not low <= value <= high:
+        wanted = f"between {low} and {high}" if high < math.inf else f"at least {low}"
         raise _wrong(label, wanted, value)
     return value
 

@@ -5,7 +5,7 @@ What a docstring says of a key is its comment in files of configurations and its
 """
 
 from miricigale.filters import SURVEYS
-from miricigale.instrument import CEERS_FILTERS
+from miricigale.instrument import CEERS_FILTERS, imager_filters
 from miricigale.photometry import YANG2021_DEPTHS
 from miricigale.workflow.options import Section, option, require
 from miricigale.workflow.truths import ALL, CATALOG, EFFECTS, EXPERIMENTS, FIELD, SETS, VARIANTS
@@ -199,15 +199,15 @@ class ExposureSection(Section):
         Exposure of a .pointing file (column Exp) of each filter, where their dithers differ.
     """
 
-    filters: tuple[str, ...] = option(CEERS_FILTERS, unique=True)
+    filters: tuple[str, ...] = option(CEERS_FILTERS, choices=imager_filters(), unique=True)
     plan: str = option("ceers", choices=("ceers", "quick"))
     kind: str = option("ramps", choices=("ramps", "rates"))
-    n_groups: tuple[int, ...] = ()
-    n_integrations: tuple[int, ...] = ()
-    n_dithers: tuple[int, ...] = ()
+    n_groups: tuple[int, ...] = option((), low=1)
+    n_integrations: tuple[int, ...] = option((), low=1)
+    n_dithers: tuple[int, ...] = option((), low=1)
     dithers: tuple[str, ...] = option((), single=True)
     dither_observation: int = option(0, low=0)
-    dither_exposures: tuple[int, ...] = ()
+    dither_exposures: tuple[int, ...] = option((), low=1)
 
 
 class SceneSection(Section):
@@ -333,7 +333,7 @@ class PhotometrySection(Section):
     n_pixels
         Least number of connected pixels of a detection.
     regularization
-        Regularization of the matching kernels: auto, yang2021 (0.03) or a number.
+        Regularization of the matching kernels: a number, auto, or yang2021 (0.03).
     match_radius
         Radius of the match to the truth in arcsec.
     rivals
@@ -343,7 +343,7 @@ class PhotometrySection(Section):
     method: str = option("package", choices=("package", "yang2021"))
     threshold: float = option(0.25, low=0.01, high=100.0)
     n_pixels: int = option(60, low=1, high=10000)
-    regularization: str = "auto"
+    regularization: float | str = option("auto", low=1e-6, choices=("auto", "yang2021"))
     match_radius: float = option(0.5, low=0.05, high=3.0)
     rivals: bool = False
 

@@ -3,12 +3,10 @@
 import collections
 from pathlib import Path
 
-import astropy.units as u
 import numpy as np
 
 from miricigale.depth import saturation_forecast
 from miricigale.filters import Filter
-from miricigale.instrument import imager_filters
 from miricigale.photometry.kernel_files import file_place
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow.disk import disk_use
@@ -19,6 +17,7 @@ from miricigale.workflow.stages import study_stages
 from miricigale.workflow.stages.exposures import grid_of, study_background, study_exposures
 from miricigale.workflow.stages.inputs import study_catalog
 from miricigale.workflow.truths import CATALOG
+from miricigale.workflow.warmup import compile_missing
 
 #: Sources that a field must have for an error function to be measured.
 MIN_SOURCES = 3
@@ -43,21 +42,13 @@ def check_study(config):
         path = getattr(config.perturb, key)
         good = not path or Path(file_place(path)[0]).expanduser().is_file()
         config.check(good, f"perturb.{key}", "must be a file")
-    for name, names, known, wanted in (
-        ("fit.bands", config.fit.bands, Filter.names(), "that 'miricigale filters' lists"),
-        (
-            "exposures.filters",
-            config.exposures.filters,
-            imager_filters(),
-            f"out of {list(imager_filters())}",
-        ),
-    ):
-        unknown = sorted(set(names).difference(known))
-        config.check(not unknown, name, f"must be filters {wanted}", unknown)
+    unknown = sorted(set(config.fit.bands).difference(Filter.names()))
+    wanted = "must be filters that 'miricigale filters' lists"
+    config.check(not unknown, "fit.bands", wanted, unknown)
     with of_option("[exposures]", KeyError, ValueError):
         exposures = study_exposures(config)
     number = collections.Counter(exposure.filter for exposure in exposures.values())
-    few = [name for name in number if number[name] < 3]
+    few = [name for name, n in number.items() if n < 3]
     good = config.reduction.background != "dithers" or not few
     wanted = "must have three exposures of each filter to be 'dithers'"
     config.check(good, "reduction.background", wanted, few)
@@ -85,18 +76,15 @@ def check_study(config):
             f"{MIN_SOURCES} are needed"
         )
         raise ConfigError(msg)
-    if config.highres == HighresSection():
-        # known to have a PSF; the check below takes seconds where it has to be compiled first
-        return
-    from miricigale.psf import hst_psf
+    # that of the default is known to have a PSF; to make one may take seconds
+    if config.highres != HighresSection():
+        from miricigale.workflow.stages.images import prior_psf
 
-    with of_option("[highres] filter:", KeyError, ValueError):
-        hst_psf(config.highres.filter, pixel_scale=config.highres.pixel_scale * u.arcsec)
+        with of_option("[highres] filter:", KeyError, ValueError):
+            prior_psf(config)
 
 
-def run_study(
-    config, folder, *, executor=None, redo=False, until=None, again=None, progress_bar=False
-):
+def run_study(config, folder, **options):
     """
     Run all stages of a study in a folder; what stands there and is current is kept.
 
@@ -106,16 +94,10 @@ def run_study(
         The configuration; see `~miricigale.workflow.load_config`.
     folder : path-like
         Folder of the products: new, empty, or that of an earlier run.
-    executor : `concurrent.futures.Executor`, optional
-        Does exposures, bands and fits side by side; an executor of processes is best
-        (`~miricigale.utils.parallel.process_pool`). The products are the same bytes.
-    redo : bool, optional
-        Whether what another configuration made in this folder is done again.
-    until, again : str, optional
-        A stage or a pattern of units (``"mosaics"``, ``"fits:agn20/*"``): only these and what they need
-        are done; these are done again.
-    progress_bar : bool, optional
-        Whether progress is shown.
+    **options
+        ``executor``, ``redo``, ``until``, ``again`` and ``progress_bar`` of `~miricigale.workflow.StudyRunner`; an
+        executor of processes is best (`~miricigale.utils.parallel.process_pool`). The products are the
+        same bytes.
 
     Returns
     -------
@@ -132,15 +114,5 @@ def run_study(
         If the configuration names what does not exist or leaves nothing to do.
     """
     check_study(config)
-    runner = StudyRunner(
-        config,
-        folder,
-        study_stages,
-        executor=executor,
-        redo=redo,
-        until=until,
-        again=again,
-        disk=disk_use(config),
-        progress_bar=progress_bar,
-    )
-    return runner.run().path("report/index.html")
+    options = {"disk": disk_use(config), "prepare": compile_missing, **options}
+    return StudyRunner(config, folder, study_stages, **options).run().path("report/index.html")

@@ -7,7 +7,7 @@ from miricigale.filters import Filter
 #: Sets of MIRI bands that join the existing ones in a fit: Yang et al. 2021, section 4.
 SETS = ("all", "none", "blue", "red")
 #: Further fits of each sample.
-EXPERIMENTS = ("free_agn", "far_infrared", "no_model_error", "known_redshift", "samplers")
+EXPERIMENTS = ("free_agn", "far_infrared", "no_model_error", "known_redshift")
 #: In place of a fracAGN: AGN as in a real field.
 FIELD = "field"
 #: In place of a fracAGN: that of each source, in the column ``frac_agn`` of the catalog.
@@ -133,21 +133,6 @@ def truth_names(config):
 def reference(config):
     """Name of the truth that gives the prior image and the error functions."""
     return truth_names(config)[0]
-
-
-def of_reference(config, _):
-    """The reference truth, as ``needs`` of a stage takes it."""
-    return (reference(config),)
-
-
-def itself(_, unit):
-    """The unit of the same name, as ``needs`` of a stage takes it."""
-    return (unit,)
-
-
-def of_truth(config, unit):
-    """The truth of a unit that begins with its name, as ``needs`` of a stage takes it."""
-    return (unit.partition("/")[0],)
 
 
 def band_sets(config):

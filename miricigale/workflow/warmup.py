@@ -6,7 +6,7 @@ will need and keeps it on disk; the run then only loads it. What is compiled alr
 marker files, without numba.
 """
 
-import dataclasses
+import contextlib
 import hashlib
 import importlib.metadata
 import logging
@@ -17,9 +17,10 @@ import sys
 import threading
 from pathlib import Path
 
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.parallel import thread_pool
 
-log = logging.getLogger(__name__)
+# shown by the command line at any verbosity
+log = logging.getLogger("miricigale.utils.compilation")
 
 _PACKAGE = Path(__file__).resolve().parent.parent
 
@@ -48,45 +49,35 @@ def _fit():
 def _images():
     import astropy.units as u
     from astropy.coordinates import SkyCoord
-    from astropy.table import QTable
 
     from miricigale.instrument import Exposure, north_up_wcs
     from miricigale.reduction import RampSettings, Reducer
     from miricigale.workflow.config import load_config
     from miricigale.workflow.stages.images import expose_and_reduce, prior_image, reducer_of
+    from miricigale.workflow.stages.points import point_catalog
 
     center = SkyCoord(53.1344 * u.deg, -27.83444 * u.deg)
     # options that are off by default call further kernels
     overrides = {"detector": {"residual": 0.01}}
     config = load_config("goodss", quick=True, overrides=overrides)
-    galaxy_and_star = QTable(
-        {
-            "id": [1, 2],
-            "sky": SkyCoord(center.ra + [0, 1] * u.arcsec, center.dec + [0, 1] * u.arcsec),
-            "redshift": [1.0, 0.0],
-            "profile": ["sersic", "point"],
-            "half_light_radius": [0.3, 0.0] * u.arcsec,
-            "sersic_index": [1.5, 1.0],
-            "axis_ratio": [0.6, 1.0],
-            "position_angle": [30.0, 0.0] * u.deg,
-            "miri.f770w": [3.0, 5.0] * u.uJy,
-            "wfc3.f160w": [3.0, 5.0] * u.uJy,
-        }
-    )
-    exposures = Exposure(
+    exposure = Exposure(
         "miri.f770w", n_groups=12, subarray="SUB64", pointing=center, roll=0 * u.deg
-    ).dithered("ceers", 2)
-    options, ramps, images = {"seed": 1, "n_threads": 2}, [], []
+    )
+    catalog = point_catalog(exposure, 3 * u.uJy, config.highres.filter, spacing=100, seed=1)[:2]
+    # a galaxy and a star
+    catalog["sky"] = center.directional_offset_by(45 * u.deg, [0, 1.4] * u.arcsec)
+    catalog["profile"] = ["sersic", "point"]
+    catalog["half_light_radius"] = [0.3, 0.0] * u.arcsec
+    ramps, images = [], []
     for n in (1, 2):
-        for exposure in exposures:
-            own = dataclasses.replace(exposure, n_integrations=n)
-            _, cal = expose_and_reduce(config, own, galaxy_and_star, keep=ramps.append, **options)
-            images.append(cal)
+        for one in exposure.replace(n_integrations=n).dithered("ceers", 2):
+            options = {"seed": 1, "n_threads": 2, "keep": ramps.append}
+            images.append(expose_and_reduce(config, one, catalog, **options)[1])
     # low thresholds, so that few pixels contain large jumps
     Reducer(jump_threshold=2.0, ramps=RampSettings(neighbor_threshold=2.0)).fit_ramp(ramps[0])
     grid = north_up_wcs(center, 0.06 * u.arcsec, (128, 128))
     reducer_of(config).drizzle(images, grid)
-    prior_image(config, galaxy_and_star, grid, seed=1)
+    prior_image(config, catalog, grid, seed=1)
 
 
 def _photometry():
@@ -134,16 +125,26 @@ JOBS = {
 }
 
 
-def _check(name):
-    if name not in JOBS:
-        raise argument_error("name", f"one of {', '.join(JOBS)}", repr(name))
-    return name
+def compile_missing(n_threads):
+    """
+    Compile what is not compiled yet, each job in a process of its own.
 
+    Parameters
+    ----------
+    n_threads : int
+        Jobs side by side.
 
-def describe_job(name):
-    """One line that says what is compiled, and for how long."""
-    _, what, seconds = JOBS[_check(name)]
-    return f"compiling {what}, once for each installation, up to {seconds} s"
+    Returns
+    -------
+    is_kept : bool
+        Whether all kernels are on disk.
+    """
+    names = [name for name in JOBS if not is_compiled(name)]
+    for name in names:
+        _, what, seconds = JOBS[name]
+        log.info("compiling %s, once for each installation, up to %d s", what, seconds)
+    with thread_pool(n_threads) as executor:
+        return all(list(executor.map(compile_apart, names)))
 
 
 def compile_job(name):
@@ -152,13 +153,11 @@ def compile_job(name):
 
     Returns whether they are.
     """
-    JOBS[_check(name)][0]()
+    JOBS[name][0]()
     path = _marker(name)
-    try:
+    with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
-    except OSError:
-        log.debug("%s cannot be written", path)
     return is_compiled(name)
 
 
@@ -187,7 +186,7 @@ def compile_apart(name):
     )
     with subprocess.Popen(
         # -P: do not import modules from the current working directory
-        [sys.executable, "-P", "-c", code, _check(name), str(_PACKAGE.parent)],
+        [sys.executable, "-P", "-c", code, name, str(_PACKAGE.parent)],
         # the pipe closes when this process ends, even if it is killed
         stdin=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
@@ -201,7 +200,7 @@ def compile_apart(name):
 
 def is_compiled(name):
     """Whether the kernels of a job were compiled by this installation, on this machine."""
-    marker = _marker(_check(name))
+    marker = _marker(name)
     # the cache may have been emptied without removing the marker
     folder = _PACKAGE if marker.parent.name == "__pycache__" else _numba_folder()
     return marker.is_file() and any(folder.rglob("*.nbi"))

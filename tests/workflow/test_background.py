@@ -108,10 +108,10 @@ def test_what_is_no_background_is_refused(scene, message):
 
 
 def test_a_plan_refuses_the_same():
-    with pytest.raises(ConfigError, match=r"\[background\] level must have one level"):
-        plan(level=["low", "low", "low"])
-    with pytest.raises(ConfigError, match="must be left out with a date"):
-        plan(level="high", date="2027-05-01", **COSMOS)
+    text = r"\[background\] level must have one level"
+    refuses(text, plan, error=ConfigError, level=["low"] * 3)
+    day = {"date": "2027-05-01", **COSMOS}
+    refuses("must be left out with a date", plan, error=ConfigError, level="high", **day)
 
 
 def test_a_day_that_cannot_be_is_refused_before_anything_is_made(monkeypatch):
@@ -167,13 +167,8 @@ def test_backgrounds_of_dithers_are_those_of_the_detector():
     }  # fmt: skip
     images, left = [], {}
     for method in ("dithers", "masked"):
-        config = StudyConfig.from_dict(
-            {
-                "exposures": exposures,
-                "fit": {"min_detected": 1},
-                "reduction": {"background": method},
-            }
-        )
+        values = {"fit": {"min_detected": 1}, "reduction": {"background": method}}
+        config = StudyConfig.from_dict({"exposures": exposures, **values})
         if not images:
             for e in study_exposures(config).values():
                 y, x = np.indices(e.shape)
@@ -196,13 +191,7 @@ def test_backgrounds_of_dithers_are_those_of_the_detector():
 
 
 def test_backgrounds_of_dithers_take_three_of_them():
-    config = StudyConfig.from_dict(
-        {
-            "exposures": {"filters": BANDS, "n_dithers": [3, 2]},
-            "reduction": {"background": "dithers"},
-        }
-    )
-    with pytest.raises(
-        ConfigError, match=r"^\[reduction\] background must have three .* \['miri.f2100w'\]"
-    ):
-        check_study(config)
+    exposures = {"filters": BANDS, "n_dithers": [3, 2]}
+    values = {"exposures": exposures, "reduction": {"background": "dithers"}}
+    text = r"^\[reduction\] background must have three .* \['miri.f2100w'\]"
+    refuses(text, check_study, StudyConfig.from_dict(values), error=ConfigError)

@@ -1,7 +1,5 @@
 import io
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 
 import astropy.units as u
@@ -64,15 +62,13 @@ def test_a_catalog_that_is_none_is_refused(capsys, tmp_path):
 
 
 def test_keys_are_set_on_the_command_line(capsys):
-    command = ["run", "goodss", "--print-config", "--set", "sed.frac_agn=[0.0, 0.4]"]
-    command += [
-        "--set",
+    command = ["run", "goodss", "--print-config", "--seed", "4"]
+    for text in (
+        "sed.frac_agn=[0.0, 0.4]",
         "exposures.plan=quick",
-        "--set",
         "catalog.source='my file.ecsv'",
-        "--seed",
-        "4",
-    ]
+    ):
+        command += ["--set", text]
     assert main(command) == 0
     out = capsys.readouterr().out
     for line in ("frac_agn = [0.0, 0.4]", 'plan = "quick"', 'source = "my file.ecsv"', "seed = 4"):
@@ -86,23 +82,14 @@ def test_keys_are_set_on_the_command_line(capsys):
         assert reason in capsys.readouterr().err
 
 
-def test_an_empty_sample_is_refused(capsys, tmp_path):
-    config = tmp_path / "my.toml"
-    config.write_text("[catalog]\nmag_limit = 12.0\n")
-    assert main(["run", str(config), "-o", str(tmp_path / "run"), "--no-progress"]) == 2
-    assert "mag_limit leaves none of the 1308 sources" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("[highres]\nfilter = 'nircam.f200w'\n", "[highres] filter: "),
         ("[pointing]\nra = 10.0\n", "[pointing] at RA 10.0"),
         ("[scene]\nbackground_scale = 50.0\n", "the sky fills"),
-        (
-            "[exposures]\nfilters = ['miri.f560x', 'miri.f770w']\n",
-            "[exposures] filters must be filters out of",
-        ),
+        ("[catalog]\nmag_limit = 12.0\n", "mag_limit leaves none of the 1308 sources"),
+        ("[exposures]\nfilters = ['miri.f560x']\n", "[exposures] filters must be one of"),
         ("[fit]\nbands = ['megacam.x']\ndepths = [25.0]\n", "[fit] bands must be filters that"),
     ],
 )
@@ -155,15 +142,6 @@ def test_help_and_version(capsys):
     assert main([]) == 2
     assert "run a study" in capsys.readouterr().out
     assert main(["--version"]) == 0
-
-
-def test_importing_the_package_opens_nothing_heavy():
-    code = (
-        "import sys, miricigale; "
-        "print([m for m in ('numba', 'scipy', 'photutils', 'matplotlib', 'synphot') if m in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
 
 
 def test_every_command_has_two_examples_that_it_can_read():

@@ -26,26 +26,11 @@ N = 13
 
 
 def config_of(*names, frac_agn=(0.4,)):
-    return StudyConfig.from_dict(
-        {
-            "exposures": {"filters": FILTERS},
-            "sed": {"frac_agn": list(frac_agn)},
-            "fit": {
-                "bands": [
-                    "megacam.r",
-                    "acs.f814w",
-                    "wfc3.f160w",
-                    "irac.ch1",
-                    "irac.ch2",
-                    "mips.24",
-                ],
-                "depths": [27.2, 28.2, 27.6, 23.9, 24.2, 19.3],
-                "axes": "quick",
-                "sets": ["all"],
-                "experiments": list(names),
-            },
-        }
-    )
+    bands = ["megacam.r", "acs.f814w", "wfc3.f160w", "irac.ch1", "irac.ch2", "mips.24"]
+    fit = {"bands": bands, "depths": [27.2, 28.2, 27.6, 23.9, 24.2, 19.3], "axes": "quick"}
+    fit |= {"sets": ["all"], "experiments": list(names)}
+    exposures, sed = {"filters": FILTERS}, {"frac_agn": list(frac_agn)}
+    return StudyConfig.from_dict({"exposures": exposures, "sed": sed, "fit": fit})
 
 
 @pytest.fixture(scope="module")
@@ -92,10 +77,6 @@ def found(folder):
 
 def read(folder, name):
     return QTable.read(folder / "agn40" / "experiments" / f"{name}.ecsv")
-
-
-def tables_of(folder):
-    return {"agn40": StudyTables(Context(config_of(), folder), "agn40")}
 
 
 def test_all_fit_the_sample_of_the_study(found):
@@ -178,71 +159,45 @@ def test_numbers_of_perfect_fits(truth):
         assert_allclose(numbers[name], value, atol=1e-9, err_msg=name)
 
 
+def page_of(folder, *names):
+    """The section of the page on experiments."""
+    report, context = Page("made up"), Context(config_of(*names), folder)
+    study = StudyTables(Context(config_of(), folder), "agn40")
+    experiments.write_experiments(DeclaredPage(report, context), {"agn40": study})
+    return report.to_html()
+
+
 def test_the_section_of_the_page(folder):
-    context, report = Context(config_of(*FAST), folder), Page("made up")
-    experiments.write_experiments(DeclaredPage(report, context), tables_of(folder))
-    report.write(folder / "page.html")
-    page = (folder / "page.html").read_text()
+    page = page_of(folder, *FAST)
     for name in ("study", *FAST):
         assert texts_of("experiments")["labels"][name] in page
     numbers = QTable.read(folder / "report" / "experiments.ecsv")
     assert list(numbers["experiment"]) == ["study", *FAST]
     assert np.all(numbers["n"] == N - 1)
-    report = Page("made up")
-    experiments.write_experiments(
-        DeclaredPage(report, Context(config_of(), folder)), tables_of(folder)
-    )
-    report.write(folder / "none.html")
-    assert "Further fits" not in (folder / "none.html").read_text()
-
-
-def test_without_a_sampler_there_is_a_sentence(folder, monkeypatch):
-    monkeypatch.setattr(experiments, "SAMPLERS", ("no_such_sampler",))
-    config = config_of("samplers")
-    do_stage(config, folder, "experiments", "agn40/samplers")
-    assert len(read(folder, "samplers")) == 0
-    report = Page("made up")
-    experiments.write_experiments(DeclaredPage(report, Context(config, folder)), tables_of(folder))
-    report.write(folder / "left.html")
-    assert "Neither nautilus nor dynesty is installed" in (folder / "left.html").read_text()
+    assert "Further fits" not in page_of(folder)
 
 
 def test_a_subset_is_spread_over_the_sample(folder, monkeypatch):
     monkeypatch.setattr(experiments, "N_FREE", 3)
-    config = config_of("free_agn")
     kept = read(folder, "free_agn")
-    do_stage(config, folder, "experiments", "agn40/free_agn")
+    do_stage(config_of("free_agn"), folder, "experiments", "agn40/free_agn")
     few = read(folder, "free_agn")
     assert len(few) == 3
     assert list(few["id"][[0, -1]]) == [1, N]
     same = kept[np.isin(kept["id"], few["id"])]
     assert_allclose(few["frac_agn_mean"], same["frac_agn_mean"], rtol=1e-6)
-    report = Page("made up")
-    experiments.write_experiments(DeclaredPage(report, Context(config, folder)), tables_of(folder))
+    page_of(folder, "free_agn")
     numbers = QTable.read(folder / "report" / "experiments.ecsv")
     assert list(numbers["n_sources"]) == [N - 1, 3, 3]
 
 
-@pytest.mark.slow
-def test_a_sampler_agrees_with_the_grid(folder, monkeypatch):
-    pytest.importorskip("nautilus")
-    monkeypatch.setattr(experiments, "N_SAMPLED", 1)
-    options = {"n_live": 150, "n_effective": 300, "max_calls": 20_000}
-    monkeypatch.setattr(experiments, "SAMPLER_OPTIONS", options)
-    do_stage(config_of("samplers"), folder, "experiments", "agn40/samplers")
-    (row,) = read(folder, "samplers")
-    (grid,) = QTable.read(folder / "agn40" / "fits_all.ecsv")[:1]
-    for name in ("redshift", "frac_agn"):
-        width = np.hypot(row[f"{name}_std"], grid[f"{name}_std"])
-        assert abs(row[f"{name}_mean"] - grid[f"{name}_mean"]) < width
-
-
 def test_experiments_are_chosen_by_name():
-    units = STAGES["experiments"].unit_names(config_of("samplers", "free_agn", frac_agn=(0.0, 0.4)))
-    assert units == ("agn00/samplers", "agn00/free_agn", "agn40/samplers", "agn40/free_agn")
+    names = ("known_redshift", "free_agn")
+    units = STAGES["experiments"].unit_names(config_of(*names, frac_agn=(0.0, 0.4)))
+    assert units == tuple(f"{of}/{name}" for of in ("agn00", "agn40") for name in names)
     assert STAGES["experiments"].unit_names(config_of()) == ()
     refuses("experiments", config_of, "free", error=ConfigError)
-    refuses("must not repeat", config_of, "samplers", "samplers", error=ConfigError)
+    refuses("must not repeat", config_of, "free_agn", "free_agn", error=ConfigError)
     texts = texts_of("experiments")
     assert set(texts["labels"]) == {"study", *EXPERIMENTS}
     assert set(texts["sentences"]) == set(EXPERIMENTS)

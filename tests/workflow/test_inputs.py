@@ -32,16 +32,21 @@ def galaxies():
     return catalog_at(sky, redshift=0.8, mag_f160w=20.0, **light)
 
 
+def do_inputs(config, folder, *first):
+    """The stages up to the truth."""
+    for name, unit in (*first, ("seds", ""), ("truth", "agn00")):
+        do_stage(config, folder, name, unit)
+    return QTable.read(folder / "agn00" / "truth.ecsv")
+
+
 def run(folder, table, **sed):
     """The first stages; returns the fit of the inputs, their truth and what the report says."""
     table.write(folder / "mine.ecsv")
     config = StudyConfig.from_dict(
         {"catalog": {"source": str(folder / "mine.ecsv")}, "fit": {"model_error": 0.02}, "sed": sed}
     )
-    for name, unit in (("catalog", ""), ("seds", ""), ("truth", "agn00")):
-        do_stage(config, folder, name, unit)
+    truth = do_inputs(config, folder, ("catalog", ""))
     facts = dict(catalog_facts(config, check_catalog(table)))
-    truth = QTable.read(folder / "agn00" / "truth.ecsv")
     return config, FitResults.read(folder / "input_seds.fits"), truth, facts["input SEDs fitted to"]
 
 
@@ -110,25 +115,15 @@ def test_a_catalog_of_ones_own_by_a_map_of_columns(galaxies, tmp_path):
     path = tmp_path / "mine.csv"
     path.write_text("\n".join(rows) + "\n")
     columns = ["id=ID", "redshift=zphot", "wfc3.f160w=F_H"]
-    config = StudyConfig.from_dict(
-        {
-            "catalog": {
-                "source": str(path),
-                "columns": columns,
-                "units": ["flux=mJy", "half_light_radius=arcsec"],
-                "mag_limit": 21.0,
-            },
-            "sed": {"axes": "quick"},
-        }
-    )
+    options = {"source": str(path), "columns": columns, "mag_limit": 21.0}
+    options["units"] = ["flux=mJy", "half_light_radius=arcsec"]
+    config = StudyConfig.from_dict({"catalog": options, "sed": {"axes": "quick"}})
     with (
         pytest.warns(MiricigaleWarning, match="1 of 4 sources have no usable flux"),
         pytest.warns(MiricigaleWarning, match=r"taken as missing, .* 1 of 4 \(-99\)"),
     ):
         do_stage(config, tmp_path, "catalog")
-    for name, unit in (("seds", ""), ("truth", "agn00")):
-        do_stage(config, tmp_path, name, unit)
-    truth = QTable.read(tmp_path / "agn00" / "truth.ecsv")
+    truth = do_inputs(config, tmp_path)
     # 23.9 - 2.5 log(10) = 21.4 is below the limit; the source without a flux stays, and has none
     assert list(truth["id"]) == [2, 3, 4]
     np.testing.assert_allclose(truth["wfc3.f160w"].value[:2], [20, 30], rtol=1e-6)
@@ -156,8 +151,7 @@ def test_magnitudes_and_text_ids_give_the_inputs_of_the_fluxes(galaxies, tmp_pat
         pytest.warns(MiricigaleWarning, match="2 of 2 sources are points"),
     ):
         do_stage(config, tmp_path, "catalog")
-    for name, unit in (("seds", ""), ("truth", "agn00")):
-        do_stage(config, tmp_path, name, unit)
+    truth = do_inputs(config, tmp_path)
     catalog = QTable.read(tmp_path / "catalog.ecsv")
     assert catalog["flags"].tolist() == [0, CatalogFlags.MISSING_CODE]
     np.testing.assert_allclose(catalog[SHORT[0]].value, galaxies[SHORT[0]].value)
@@ -168,7 +162,7 @@ def test_magnitudes_and_text_ids_give_the_inputs_of_the_fluxes(galaxies, tmp_pat
         results.flux_err / results.flux,
         0.05 * np.log(10) / 2.5 * np.where(np.isnan(results.flux), np.nan, 1),
     )
-    assert QTable.read(tmp_path / "agn00" / "truth.ecsv")["id"].tolist() == ["a-1", "a-2"]
+    assert truth["id"].tolist() == ["a-1", "a-2"]
 
 
 @pytest.mark.parametrize("key", ["columns", "units"])

@@ -134,35 +134,14 @@ def test_no_stage_of_the_analysis_knows_of_them():
     assert STAGES["kernels"].plan(other, BAND) == STAGES["kernels"].plan(plain, BAND)
 
 
-def test_zero_point_scales_the_fluxes_of_one_band():
-    table = sources()
-    signs = set()
-    for seed in range(8):
-        changed = Perturbation({"zero_point": 0.02}, seed).catalog(table, BAND)
-        ratio = (changed[BAND] / table[BAND]).value
-        np.testing.assert_allclose(np.abs(ratio - 1), 0.02, rtol=1e-9)
-        assert np.ptp(ratio) < 1e-12
-        signs.add(ratio[0] > 1)
-        for name in set(table.colnames) - {BAND, "sky"}:
-            assert np.all(changed[name] == table[name])
-        assert np.all(changed["sky"].separation(table["sky"]) < 1e-9 * u.arcsec)
-    assert signs == {True, False}
-
-
 def test_astrometry_shifts_a_band_as_a_whole():
-    table = sources()
-    shift = Perturbation({"astrometry": 0.03}, SEED)
-    changed = {name: shift.catalog(table, name) for name in BANDS}
-    angles = {}
-    for name, moved in changed.items():
-        np.testing.assert_allclose(
-            moved["sky"].separation(table["sky"]).to_value(u.mas), 30, rtol=1e-4
-        )
-        angle = table["sky"].position_angle(moved["sky"]).to_value(u.deg)
-        assert np.ptp(angle) < 0.1
-        angles[name] = angle[0]
-        assert np.all(moved[name] == table[name])
-    assert abs(angles[BANDS[0]] - angles[BANDS[1]]) > 1
+    sky, shift = sources()["sky"], Perturbation({"astrometry": 0.03}, SEED)
+    moved = [shift.catalog(sources(), name)["sky"] for name in BANDS]
+    for own in moved:
+        np.testing.assert_allclose(own.separation(sky).to_value(u.mas), 30, rtol=1e-4)
+    angles = np.array([sky.position_angle(own).to_value(u.deg) for own in moved])
+    assert np.all(np.ptp(angles, axis=1) < 0.1)
+    assert abs(angles[0, 0] - angles[1, 0]) > 1
 
 
 def test_zero_points_of_existing_bands_are_in_the_fluxes_that_are_fitted():
@@ -189,9 +168,6 @@ def test_zero_points_of_existing_bands_are_in_the_fluxes_that_are_fitted():
     assert len({ratio[0] > 1 for ratio in ratios.values()}) == 2
     for band in BANDS:
         np.testing.assert_array_equal(mock[0.02][band], mock[0][band])
-    same = mock_photometry(config, truth, matched, seed=SEED)
-    for name in same.colnames:
-        np.testing.assert_array_equal(same[name], mock[0][name])
     # of the skies that have it only; it is no part of the images
     config = config_of(["psf", "zero_point_existing"], of=0.4)
     plans = {unit: STAGES["fits"].plan(config, unit) for unit in STAGES["fits"].unit_names(config)}

@@ -14,7 +14,6 @@ from helpers.runs import (
     AREA,
     SCALE,
     SHAPE,
-    do_stage,
     make_run,
     noise_image,
     sky_image,
@@ -24,7 +23,6 @@ from miricigale.evaluation import PUBLISHED
 from miricigale.fitting import FitResults
 from miricigale.sed import SEDModel
 from miricigale.workflow.config import StudyConfig
-from miricigale.workflow.page.labels import three_bands
 from miricigale.workflow.page.numbers import above_proposal, as_ceers, as_paper
 from miricigale.workflow.page.pictures import field_figure, residual_figure
 from miricigale.workflow.page.provenance import sources_to_cite, stand_ins
@@ -228,12 +226,6 @@ def test_numbers_beside_the_paper_are_measured_where_the_run_has_them(reports):
     assert "mismatch between simulator and pipeline" in verdict["f_scaling.f770w"]
 
 
-def test_the_same_products_give_the_same_bytes(reports):
-    before = {path.name: path.read_bytes() for path in reports["one"].iterdir()}
-    do_stage(small_config(["miri.f1000w"]), reports["one"].parent, "report")
-    assert before == {path.name: path.read_bytes() for path in reports["one"].iterdir()}
-
-
 def test_bands_above_the_limits_of_the_proposal_are_counted():
     """25.5 AB in F770W and 24.8 in F1000W, of the CEERS proposal as Yang et al. 2021 quote it."""
     truth = QTable()
@@ -241,13 +233,6 @@ def test_bands_above_the_limits_of_the_proposal_are_counted():
         truth[f"miri.{name}"] = (values * u.ABmag).to(u.uJy)
     assert above_proposal(truth, truth.colnames).tolist() == [2, 1, 0]
     assert above_proposal(truth, ["miri.f560w"]) is None
-
-
-def test_bands_of_a_picture():
-    assert three_bands(["miri.f770w"]) == ["miri.f770w"]
-    assert three_bands(["miri.f2100w", "miri.f770w"]) == ["miri.f770w", "miri.f2100w"]
-    names = [f"miri.f{n}w" for n in (2550, 560, 770, 1000, 1130, 1280, 1500, 1800, 2100)]
-    assert three_bands(names) == ["miri.f560w", "miri.f1280w", "miri.f2550w"]
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])

@@ -41,6 +41,13 @@ def start(folder, *words, **options):
     )
 
 
+def ended(process, status=0):
+    """What a process says that ends with a status."""
+    _, message = process.communicate(timeout=120)
+    assert process.returncode == status, message
+    return message
+
+
 def wait_for(path, process, text=""):
     """Wait until a file stands (and has a text), or the process has ended."""
     deadline = time.monotonic() + 60
@@ -63,9 +70,7 @@ def group_lives(group):
 def undisturbed(tmp_path_factory):
     """Products of a toy study that nobody stopped."""
     folder = tmp_path_factory.mktemp("undisturbed") / "run"
-    process = start(folder)
-    _, message = process.communicate(timeout=120)
-    assert process.returncode == 0, message
+    ended(start(folder))
     return contents(folder)
 
 
@@ -85,9 +90,7 @@ def test_a_run_that_is_killed_thirteen_times_ends_with_the_same_bytes(tmp_path, 
         for product, data in contents(folder).items():
             if ".partial-" not in product:
                 assert data == undisturbed[product]
-    process = start(folder)
-    _, message = process.communicate(timeout=120)
-    assert process.returncode == 0, message
+    ended(start(folder))
     assert contents(folder) == undisturbed
 
 
@@ -98,14 +101,11 @@ def test_a_second_run_in_the_folder_is_refused_and_the_first_one_goes_on(tmp_pat
     # however slow the second one starts
     first.send_signal(signal.SIGSTOP)
     try:
-        second = start(folder)
-        _, message = second.communicate(timeout=120)
+        message = ended(start(folder), 1)
     finally:
         first.send_signal(signal.SIGCONT)
-    assert second.returncode == 1
     assert f"{folder} is in use by a run: process {first.pid} on" in message
-    _, message = first.communicate(timeout=120)
-    assert first.returncode == 0, message
+    ended(first)
     assert contents(folder) == undisturbed
 
 
@@ -117,21 +117,16 @@ def test_a_configuration_that_changes_before_a_killed_run_goes_on(tmp_path, undi
     process.communicate(timeout=60)
     before = contents(folder)
     # what units c and d depend on is refused, and nothing is touched
-    process = start(folder, "2.0")
-    _, message = process.communicate(timeout=60)
-    assert process.returncode == 1
+    message = ended(start(folder, "2.0"), 1)
     assert "[scene] background_scale: 1.0 -> 2.0" in message
     assert "redo=True to replace it" in message
     assert contents(folder) == before
     times = {name: (folder / name).stat().st_mtime_ns for name in before if name[0] in "ab"}
     assert len(times) == 6
-    process = start(folder, "2.0", "redo")
-    _, message = process.communicate(timeout=120)
-    assert process.returncode == 0, message
+    ended(start(folder, "2.0", "redo"))
     # units a and b stand as they were made; all that depends is that of a new run
     assert {name: (folder / name).stat().st_mtime_ns for name in times} == times
-    process = start(tmp_path / "new", "2.0")
-    process.communicate(timeout=120)
+    ended(start(tmp_path / "new", "2.0"))
     assert contents(folder) == contents(tmp_path / "new")
     changed = {name for name, data in contents(folder).items() if data != undisturbed[name]}
     assert changed == {f"{unit}/{k}.txt" for unit in "cd" for k in range(3)} | {"second.txt"}

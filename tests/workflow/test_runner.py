@@ -11,11 +11,25 @@ from helpers.errors import refuses
 from miricigale.refdata import locate
 from miricigale.utils.exceptions import ConfigError, DataError, MiricigaleWarning, OtherResultsError
 from miricigale.workflow.config import StudyConfig, load_config
-from miricigale.workflow.engine import runner
 from miricigale.workflow.engine.runner import StudyRunner, check_disk
-from miricigale.workflow.engine.stage import Stage, stage
+from miricigale.workflow.engine.stage import Stage, related
 from miricigale.workflow.engine.store import ProductStore
 from miricigale.workflow.stages import study_stages
+
+
+def write(context, unit):
+    """A stage that writes its unit."""
+    name = unit or "all"
+    context.save(f"{name}.txt", lambda path: path.write_text(name))
+
+
+def run_stages(folder, *stages, config=None, **options):
+    return StudyRunner(config or StudyConfig(), folder, stages, **options).run()
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return tmp_path / "run"
 
 
 class Recorder:
@@ -37,49 +51,52 @@ class Recorder:
         context.save("second.txt", lambda path: path.write_text(text))
 
     def stages(self, version=1):
+        parts = {"sections": ("scene",), "units": lambda _: "ab", "version": version}
         return (
-            Stage(
-                "first",
-                self.first,
-                "first",
-                sections=("scene",),
-                units=lambda _: "ab",
-                version=version,
-            ),
+            Stage("first", self.first, "first", **parts),
             Stage("second", self.second, "second", needs=("first",)),
         )
 
-    def run(self, folder, config=None, *, redo=False, **kwargs):
+    def run(self, folder, config=None, *, version=1, **options):
         self.ran.clear()
-        StudyRunner(config or StudyConfig(), folder, self.stages(**kwargs), redo=redo).run()
+        run_stages(folder, *self.stages(version), config=config, **options)
         return list(self.ran)
 
 
-def test_a_second_run_does_nothing(tmp_path):
+@pytest.fixture
+def recorder(folder):
+    """The recorder of a run that is finished."""
     recorder = Recorder()
-    assert recorder.run(tmp_path / "run") == ["first:a", "first:b", "second"]
-    assert recorder.run(tmp_path / "run") == []
+    assert recorder.run(folder) == ["first:a", "first:b", "second"]
+    return recorder
 
 
-def test_an_interrupted_run_goes_on_where_it_was(tmp_path):
+def test_an_interrupted_run_goes_on_where_it_was(folder):
     recorder = Recorder(fail_at="b")
     with pytest.raises(KeyboardInterrupt):
-        recorder.run(tmp_path / "run")
+        recorder.run(folder)
     recorder.fail_at = None
-    assert recorder.run(tmp_path / "run") == ["first:b", "second"]
-    assert not (tmp_path / "run" / "run.lock").exists()
+    assert recorder.run(folder) == ["first:b", "second"]
+    assert not (folder / "run.lock").exists()
+    assert recorder.run(folder) == []
+    # also while what was lost is made again
+    (folder / "first_b.txt").unlink()
+    recorder.fail_at = "b"
+    with pytest.raises(KeyboardInterrupt):
+        recorder.run(folder)
+    recorder.fail_at = None
+    assert recorder.run(folder) == ["first:b"]
 
 
 @pytest.mark.filterwarnings("default")
-def test_a_fact_is_warned_of_once_a_run_and_kept_for_each_unit(tmp_path, caplog):
+def test_a_fact_is_warned_of_once_a_run_and_kept_for_each_unit(folder, caplog):
     def warn(context, unit):
         warnings.warn(f"3 sources are faint in {unit!r}", MiricigaleWarning, stacklevel=2)
         if unit == "b":
             warnings.warn("the field is crowded", MiricigaleWarning, stacklevel=2)
 
-    stages = (Stage("one", warn, "one", units=lambda _: "abc"),)
     with pytest.warns(MiricigaleWarning) as caught:
-        store = StudyRunner(StudyConfig(), tmp_path / "run", stages).run()
+        store = run_stages(folder, Stage("one", warn, "one", units=lambda _: "abc"))
     texts = ["3 sources are faint in 'a'", "the field is crowded"]
     assert [str(one.message) for one in caught] == texts
     assert "2 more such warnings of other units" in caplog.text
@@ -87,27 +104,26 @@ def test_a_fact_is_warned_of_once_a_run_and_kept_for_each_unit(tmp_path, caplog)
 
 
 @pytest.mark.filterwarnings("default")
-def test_warnings_before_an_error_are_shown(tmp_path):
+def test_warnings_before_an_error_are_shown(folder):
     def fail(context, unit):
         warnings.warn("the field is crowded", MiricigaleWarning, stacklevel=2)
         raise ValueError("no sources")
 
-    run = StudyRunner(StudyConfig(), tmp_path / "run", (Stage("one", fail, "one"),)).run
-    with pytest.warns(MiricigaleWarning, match="crowded"), pytest.raises(ValueError, match="no so"):
-        run()
+    with pytest.warns(MiricigaleWarning, match="crowded"):
+        refuses("no sources", run_stages, folder, Stage("one", fail, "one"))
 
 
-def test_only_what_depends_on_a_change_is_done_again(tmp_path):
-    recorder = Recorder()
-    recorder.run(tmp_path / "run")
-    other = StudyConfig.from_dict({"fit": {"model_error": 0.2}})
-    assert recorder.run(tmp_path / "run", other) == []
+def test_only_what_depends_on_a_change_is_done_again(folder, recorder):
+    def run(values, **options):
+        return recorder.run(folder, StudyConfig.from_dict(values), **options)
+
+    assert run({"fit": {"model_error": 0.2}}) == []
     # the second stage's input did not change although the first was done again
-    other = StudyConfig.from_dict({"scene": {"background_scale": 2.0}})
-    assert recorder.run(tmp_path / "run", other, redo=True) == ["first:a", "first:b"]
-    other = StudyConfig.from_dict({"run": {"seed": 7}})
-    assert recorder.run(tmp_path / "run", other, redo=True) == ["first:a", "first:b", "second"]
-    assert recorder.run(tmp_path / "run", other, redo=True, version=2) == ["first:a", "first:b"]
+    changed = {"scene": {"background_scale": 2.0}}
+    assert run(changed, redo=True) == ["first:a", "first:b"]
+    seed = {"run": {"seed": 7}}
+    assert run(seed, redo=True) == ["first:a", "first:b", "second"]
+    assert run(seed, redo=True, version=2) == ["first:a", "first:b"]
 
 
 @pytest.mark.parametrize(
@@ -118,82 +134,70 @@ def test_only_what_depends_on_a_change_is_done_again(tmp_path):
         ({}, 2, "by another version of the package, its data or the catalog"),
     ],
 )
-def test_nothing_is_done_again_unasked(tmp_path, values, version, reason):
-    recorder = Recorder()
-    recorder.run(tmp_path / "run")
-    before = {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}
-    other = StudyConfig.from_dict(values)
-    with pytest.raises(
-        OtherResultsError, match=rf"3 finished steps.*{reason}.*first \(2\), second; "
-    ):
-        recorder.run(tmp_path / "run", other, version=version)
+def test_nothing_is_done_again_unasked(folder, recorder, values, version, reason):
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    call = {"config": StudyConfig.from_dict(values), "version": version}
+    text = rf"3 finished steps.*{reason}.*first \(2\), second; "
+    refuses(text, recorder.run, folder, error=OtherResultsError, **call)
     assert recorder.ran == []
-    assert {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()} == before
-    assert recorder.run(tmp_path / "run", other, version=version, redo=True)[:2] == [
-        "first:a",
-        "first:b",
-    ]
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    assert recorder.run(folder, **call, redo=True)[:2] == ["first:a", "first:b"]
 
 
-def test_an_edited_configuration_is_not_overwritten(tmp_path):
-    recorder, folder = Recorder(), tmp_path / "run"
-    recorder.run(folder)
+def test_an_edited_configuration_is_not_overwritten(folder, recorder):
     path = folder / "config.toml"
     edited = path.read_text().replace("min_detected = 2", "min_detected = 3 # mine")
     path.write_text(edited)
     refuses(r"config\.toml was edited since", recorder.run, folder, error=OtherResultsError)
+    # whatever else there is to say
+    other = StudyConfig.from_dict({"run": {"seed": 7}})
+    text = r"was edited since.*3 finished steps"
+    refuses(text, recorder.run, folder, other, error=OtherResultsError)
     assert path.read_text() == edited
+    # nor is what was kept the first time
+    for name, text in (("edited", edited), ("edited2", edited.replace("mine", "mine again"))):
+        path.write_text(text)
+        recorder.run(folder, redo=True)
+        assert (folder / f"config.{name}.toml").read_text() == text
+        assert load_config(path) == StudyConfig()
+    assert (folder / "config.edited.toml").read_text() == edited
     # it is used when it is asked for, and stays as it was written
+    path.write_text(edited)
     assert recorder.run(folder, load_config(path)) == []
     assert path.read_text() == edited
-    recorder.run(folder, redo=True)
-    assert (folder / "config.edited.toml").read_text() == edited
-    assert load_config(path) == StudyConfig()
-    # whatever else there is to say
-    path.write_text(edited)
-    with pytest.raises(OtherResultsError, match=r"was edited since.*3 finished steps"):
-        recorder.run(folder, StudyConfig.from_dict({"run": {"seed": 7}}))
-    # nor is what was kept the first time
-    path.write_text(edited.replace("mine", "mine again"))
-    recorder.run(folder, redo=True)
-    assert (folder / "config.edited.toml").read_text() == edited
-    assert "mine again" in (folder / "config.edited2.toml").read_text()
 
 
-def test_a_configuration_of_which_no_checksum_is_known_is_kept(tmp_path):
-    recorder, folder = Recorder(), tmp_path / "run"
-    recorder.run(folder)
-    values = json.loads((folder / "manifest.json").read_text())
-    # as an earlier version wrote it
-    (folder / "manifest.json").write_text(json.dumps({"stages": values["stages"]}))
-    (folder / ".manifest.copy.json").unlink()
+def test_a_configuration_of_which_the_manifest_says_nothing_is_kept(folder, recorder):
+    stages = json.loads((folder / "manifest.json").read_text())["stages"]
+
+    def forget():
+        # as an earlier version wrote it
+        (folder / "manifest.json").write_text(json.dumps({"stages": stages}))
+        (folder / ".manifest.copy.json").unlink()
+
+    forget()
     assert recorder.run(folder) == []
-    (folder / "manifest.json").write_text(json.dumps({"stages": values["stages"]}))
-    (folder / ".manifest.copy.json").unlink()
+    forget()
     before = (folder / "config.toml").read_text()
     other = StudyConfig.from_dict({"fit": {"model_error": 0.2}})
-    with pytest.raises(OtherResultsError, match=r"edited since .*or that run was of an earlier"):
-        recorder.run(folder, other)
+    text = r"edited since .*or that run was of an earlier"
+    refuses(text, recorder.run, folder, other, error=OtherResultsError)
     assert recorder.run(folder, other, redo=True) == []
     assert (folder / "config.edited.toml").read_text() == before
 
 
 @pytest.mark.parametrize("values", [{}, {"threads": 1}, {"memory": 0.5}])
-def test_a_finished_run_writes_nothing(tmp_path, monkeypatch, values):
-    recorder, folder = Recorder(), tmp_path / "run"
-    recorder.run(folder)
+def test_a_finished_run_writes_nothing(folder, recorder, monkeypatch, values):
     before = {p.name: p.stat().st_mtime_ns for p in folder.iterdir()}
     # not even a lock: the disk may be full, the folder read-only
     monkeypatch.setattr(shutil, "disk_usage", lambda _: types.SimpleNamespace(free=0))
     monkeypatch.setattr(ProductStore, "__enter__", None)
     config = StudyConfig.from_dict({"run": values})
-    StudyRunner(config, folder, recorder.stages(), disk={"first": 10**12}).run()
+    recorder.run(folder, config, disk={"first": 10**12})
     assert {p.name: p.stat().st_mtime_ns for p in folder.iterdir()} == before
 
 
-def test_what_stands_needs_no_disk_again(tmp_path, monkeypatch):
-    recorder, folder = Recorder(), tmp_path / "run"
-    recorder.run(folder)
+def test_what_stands_needs_no_disk_again(folder, recorder, monkeypatch):
     (folder / "second.txt").unlink()
     # what a unit wrote before it was stopped is replaced, so that it needs no more either
     (folder / "part").mkdir()
@@ -201,66 +205,42 @@ def test_what_stands_needs_no_disk_again(tmp_path, monkeypatch):
     size = sum(path.stat().st_size for path in folder.rglob("*.*") if path.is_file())
     assert size > 20_000
     monkeypatch.setattr(shutil, "disk_usage", lambda _: types.SimpleNamespace(free=9_000))
-    with pytest.raises(DataError, match="the run needs about"):
-        StudyRunner(
-            StudyConfig(), folder, recorder.stages(), disk={"first": size, "second": 10_000}
-        ).run()
-    StudyRunner(
-        StudyConfig(), folder, recorder.stages(), disk={"first": size, "second": 9_000}
-    ).run()
-    assert recorder.ran[-1] == "second"
+    disk = {"first": size, "second": 10_000}
+    refuses("the run needs about", recorder.run, folder, error=DataError, disk=disk)
+    assert recorder.run(folder, disk={"first": size, "second": 9_000}) == ["second"]
 
 
-def test_of_a_part_of_the_steps_the_disk_of_that_part_counts(tmp_path, monkeypatch, capsys):
-    recorder, folder = Recorder(), tmp_path / "run"
+def test_of_a_part_of_the_steps_the_disk_of_that_part_counts(folder, monkeypatch, capsys):
+    recorder = Recorder()
     monkeypatch.setattr(shutil, "disk_usage", lambda _: types.SimpleNamespace(free=15_000_000))
     options = {"disk": {"first": 20_000_000, "second": 5_000_000, "no stage": 10**12}}
-    runner = StudyRunner(
-        StudyConfig(), folder, recorder.stages(), until="first:a", progress_bar=True, **options
-    )
-    runner.run()
+    assert recorder.run(folder, until="first:a", progress_bar=True, **options) == ["first:a"]
     text = capsys.readouterr().err
     assert "1 of 1 steps to do, which take about 0.01 GB" in text
     assert "(0.0 GB are free)" in text
     message = (
         r"needs about 0.02 GB in .*, only 0.0\d GB are free; free some space, choose another folder"
     )
-    with pytest.raises(DataError, match=message):
-        StudyRunner(StudyConfig(), folder, recorder.stages(), **options).run()
-    assert recorder.ran == ["first:a"]
+    refuses(message, recorder.run, folder, error=DataError, **options)
+    assert recorder.ran == []
 
 
 @pytest.mark.parametrize("name", ["first_a.txt", "first_b.txt", "second.txt"])
-def test_a_deleted_product_makes_only_itself_anew(tmp_path, name):
-    recorder = Recorder()
-    recorder.run(tmp_path / "run")
-    (tmp_path / "run" / name).unlink()
-    made = name.removesuffix(".txt").replace("_", ":")
-    assert recorder.run(tmp_path / "run") == [made]
+def test_a_deleted_product_makes_only_itself_anew(folder, recorder, name):
+    (folder / name).unlink()
+    assert recorder.run(folder) == [name.removesuffix(".txt").replace("_", ":")]
 
 
-def test_a_redo_of_a_lost_product_that_is_stopped_goes_on(tmp_path):
-    recorder = Recorder()
-    recorder.run(tmp_path / "run")
-    (tmp_path / "run" / "first_b.txt").unlink()
-    recorder.fail_at = "b"
-    with pytest.raises(KeyboardInterrupt):
-        recorder.run(tmp_path / "run")
-    recorder.fail_at = None
-    assert recorder.run(tmp_path / "run") == ["first:b"]
-
-
-def test_a_change_of_the_packages_own_plan_is_seen(tmp_path):
+def test_a_change_of_the_packages_own_plan_is_seen(folder):
     ran = []
 
     def function(context, _):
-        ran.append(1)
-        context.save("x.txt", lambda path: path.write_text("x"))
+        ran.append(context.plan)
 
     for groups in (200, 200, 100):
-        stage = Stage("one", function, "one", plan=lambda _, __, n=groups: {"n_groups": n})
-        StudyRunner(StudyConfig(), tmp_path / "run", [stage], redo=True).run()
-    assert len(ran) == 2
+        plan = {"plan": lambda _, __, n=groups: {"n_groups": n}}
+        run_stages(folder, Stage("one", function, "one", **plan), redo=True)
+    assert ran == [{"n_groups": 200}, {"n_groups": 100}]
 
 
 def test_other_reference_data_make_other_exposures(tmp_path, monkeypatch):
@@ -301,9 +281,7 @@ def test_other_reference_data_make_other_exposures(tmp_path, monkeypatch):
     ],
     ids=["removed", "truncated", "flipped", "edited"],
 )
-def test_a_damaged_product_is_named_and_made_again(tmp_path, caplog, damage, text):
-    recorder, folder = Recorder(), tmp_path / "run"
-    recorder.run(folder)
+def test_a_damaged_product_is_named_and_made_again(folder, recorder, caplog, damage, text):
     path = folder / "first_a.txt"
     whole = path.read_bytes()
     assert len(whole) == 10
@@ -328,66 +306,68 @@ def test_a_damaged_product_is_named_and_made_again(tmp_path, caplog, damage, tex
     assert any("4.txt (missing) and 4 more" in line for line in caplog.messages)
 
 
-def test_products_that_no_longer_belong_are_removed(tmp_path):
-    def function(context, unit):
-        context.save(f"{unit}.txt", lambda path: path.write_text(unit))
-
-    stages = [[Stage("one", function, "one", units=lambda _, u=units: u)] for units in ("ab", "a")]
-    StudyRunner(StudyConfig(), tmp_path / "run", stages[0]).run()
-    with pytest.raises(OtherResultsError, match="1 finished steps of another run"):
-        StudyRunner(StudyConfig(), tmp_path / "run", stages[1]).run()
-    assert (tmp_path / "run" / "b.txt").exists()
-    StudyRunner(StudyConfig(), tmp_path / "run", stages[1], redo=True).run()
-    assert (tmp_path / "run" / "a.txt").exists()
-    assert not (tmp_path / "run" / "b.txt").exists()
+def test_products_that_no_longer_belong_are_removed(folder):
+    stages = [Stage("one", write, "one", units=lambda _, u=units: u) for units in ("ab", "a")]
+    run_stages(folder, stages[0])
+    text = "1 finished steps of another run"
+    refuses(text, run_stages, folder, stages[1], error=OtherResultsError)
+    assert (folder / "b.txt").exists()
+    run_stages(folder, stages[1], redo=True)
+    assert (folder / "a.txt").exists()
+    assert not (folder / "b.txt").exists()
 
 
-def test_a_stage_that_reads_what_it_has_not_declared_is_an_error(tmp_path):
-    stage = Stage("one", lambda context, _: context.config.scene, "one", sections=("run.name",))
-    with pytest.raises(RuntimeError, match=r"stage 'one' reads \[scene\] without declaring it"):
-        StudyRunner(StudyConfig(), tmp_path / "run", [stage]).run()
-    stage = Stage(
-        "one", lambda context, _: context.config.run.keep_level1b, "one", sections=("run.name",)
-    )
-    with pytest.raises(AttributeError, match="keep_level1b"):
-        StudyRunner(StudyConfig(), tmp_path / "run", [stage]).run()
+@pytest.mark.parametrize(
+    ("read", "error", "message"),
+    [
+        (
+            lambda config: config.scene,
+            RuntimeError,
+            r"stage 'one' reads \[scene\] without declaring",
+        ),
+        (lambda config: config.run.keep_level1b, AttributeError, "keep_level1b"),
+    ],
+)
+def test_a_stage_that_reads_what_it_has_not_declared_is_an_error(folder, read, error, message):
+    stage = Stage("one", lambda context, _: read(context.config), "one", sections=("run.name",))
+    refuses(message, run_stages, folder, stage, error=error)
 
 
-def test_a_product_of_a_stage_that_is_not_declared_cannot_be_read(tmp_path):
-    def make(context, unit):
-        context.save(f"{unit}.txt", lambda path: path.write_text(unit))
-
+def test_a_product_of_a_stage_that_is_not_declared_cannot_be_read(folder):
     def read(context, _):
         text = "".join(context.path(f"{unit}.txt").read_text() for unit in "ab")
         context.save("sum.txt", lambda path: path.write_text(text))
 
-    first = Stage("first", make, "first", units=lambda _: "ab")
+    first = Stage("first", write, "first", units=lambda _: "ab")
     between = Stage("between", lambda context, _: None, "between", needs=("first",))
     for needs in ((), ("between",)):
-        stages = [first, between, Stage("last", read, "last", needs=needs)]
-        with pytest.raises(RuntimeError, match=r"stage 'last' reads 'a\.txt' without declaring"):
-            StudyRunner(StudyConfig(), tmp_path / "run", stages).run()
-    StudyRunner(
-        StudyConfig(), tmp_path / "run", [first, Stage("last", read, "last", needs=("first",))],
-        redo=True,
-    ).run()  # fmt: skip
-    assert (tmp_path / "run" / "sum.txt").read_text() == "ab"
+        stages = first, between, Stage("last", read, "last", needs=needs)
+        text = r"stage 'last' reads 'a\.txt' without declaring"
+        refuses(text, run_stages, folder, *stages, error=RuntimeError)
+    run_stages(folder, first, Stage("last", read, "last", needs=("first",)), redo=True)
+    assert (folder / "sum.txt").read_text() == "ab"
 
 
-def test_a_stage_is_declared_beside_its_function():
-    @stage("name", "title", needs=("other",), resources=lambda: ["a", "b"], version=3)
-    def make(context, unit):
-        return context, unit
+@pytest.mark.parametrize(
+    ("first", "second", "known"),
+    [
+        ("sky/band", "sky/band", True),
+        ("sky/band", "sky", True),
+        ("sky/band", "band", True),
+        ("sky/band", "sky/band-1", True),
+        ("sky/band", "", True),
+        ("sky/band", "sky/other", False),
+        ("sky/band", "other", False),
+        ("sky/band", "sky/band2-1", False),
+        ("sky", "sky+psf", False),
+        ("sky", "band", False),
+    ],
+)
+def test_units_belong_together_by_the_parts_of_their_names(first, second, known):
+    assert related(first, second) == related(second, first) == known
 
-    assert (make.name, make.title, make.needs, make.version) == ("name", "title", ("other",), 3)
-    assert make.resource_names() == ("a", "b")
-    assert make.function(1, 2) == (1, 2)
-    names = [one.name for one in study_stages()]
-    assert names[:3] == ["catalog", "seds", "truth"]
-    assert len(set(names)) == len(names) == 18
 
-
-def test_a_unit_depends_on_the_units_that_it_reads_only(tmp_path):
+def test_a_unit_depends_on_the_units_that_it_reads_only(folder):
     ran, texts = [], {"a": "1", "b": "1"}
 
     def first(context, unit):
@@ -403,17 +383,13 @@ def test_a_unit_depends_on_the_units_that_it_reads_only(tmp_path):
 
     def run(units):
         ran.clear()
-        stages = [
-            Stage("first", first, "first", units=lambda _: units, plan=lambda _, unit: texts[unit]),
-            Stage(
-                "second",
-                second,
-                "second",
-                units=lambda _: units,
-                needs={"first": lambda _, unit: (unit,)},
-            ),
-        ]
-        StudyRunner(StudyConfig(), tmp_path / "run", stages, redo=True).run()
+        parts = {"units": lambda _: units}
+        plan = {"plan": lambda _, unit: texts[unit]}
+        stages = (
+            Stage("first", first, "first", **parts, **plan),
+            Stage("second", second, "second", needs=("first",), **parts),
+        )
+        run_stages(folder, *stages, redo=True)
         return sorted(ran)
 
     assert run("a") == ["first:a", "second:a"]
@@ -424,50 +400,41 @@ def test_a_unit_depends_on_the_units_that_it_reads_only(tmp_path):
     assert run("ab") == []
 
 
-def test_a_part_of_the_stages_and_units(tmp_path):
+def test_a_part_of_the_stages_and_units(folder):
     ran = []
 
     def make(context, unit):
         ran.append(unit or "all")
-        context.save(f"{unit or 'all'}.txt", lambda path: path.write_text("same"))
+        write(context, unit)
 
-    stages = [
-        Stage("first", make, "first", units=lambda _: ("a/1", "b/1", "b/2")),
-        Stage(
-            "second",
-            make,
-            "second",
-            units=lambda _: ("a", "b"),
-            needs={"first": lambda _, unit: (f"{unit}/1",)},
-        ),
+    stages = (
+        Stage("first", make, "first", units=lambda _: ("a/1", "b/1", "c/2")),
+        Stage("second", make, "second", units=lambda _: ("a", "b"), needs=("first",)),
         Stage("third", make, "third", needs=("second",)),
-    ]
+    )
 
     def run(**options):
         ran.clear()
-        StudyRunner(StudyConfig(), tmp_path / "run", stages, **options).run()
+        run_stages(folder, *stages, **options)
         return list(ran)
 
     assert run(until="second:b") == ["b/1", "b"]
     # what is left out is not taken for another run's
-    assert run(until="first") == ["a/1", "b/2"]
+    assert run(until="first") == ["a/1", "c/2"]
     assert run() == ["a", "all"]
-    assert run(until="first:b/*", again="first") == ["b/1", "b/2"]
+    assert run(until="first:[bc]/*", again="first") == ["b/1", "c/2"]
     # the same bytes: what follows stands
     assert run(again="first:a/*") == ["a/1"]
     assert run() == []
     wanted = "'until' is 'fourth', which is no stage and matches no unit .*; stages: first, second, third;"
     refuses(wanted, run, error=ConfigError, until="fourth")
-    with pytest.raises(
-        ConfigError, match="nothing of 'again', 'second', is among what 'until', 'first', needs"
-    ):
-        run(until="first", again="second")
+    wanted = "nothing of 'again', 'second', is among what 'until', 'first', needs"
+    refuses(wanted, run, error=ConfigError, until="first", again="second")
 
 
-def test_stages_must_come_after_what_they_need(tmp_path):
+def test_stages_must_come_after_what_they_need(folder):
     stage = Stage("second", print, "second", needs=("first",))
-    with pytest.raises(ConfigError, match="stage 'second' needs"):
-        StudyRunner(StudyConfig(), tmp_path, [stage])
+    refuses("stage 'second' needs", run_stages, folder, stage, error=ConfigError)
 
 
 def test_a_full_disk_is_text_before_the_run(tmp_path):
@@ -485,8 +452,8 @@ def units_side_by_side(n_units, **options):
             state.now += 1
             state.most = max(state.most, state.now)
             state.order.append(unit[:1])
-        threading.Event().wait(0.05)
-        context.save(f"{unit}.txt", lambda path: path.write_text(unit))
+        threading.Event().wait(0.1)
+        write(context, unit)
         with lock:
             state.now -= 1
 
@@ -496,34 +463,35 @@ def units_side_by_side(n_units, **options):
     memory = options.pop("memory", None)
     stages = (
         Stage("a", work, "a", units=names("a"), memory=memory),
-        Stage("b", work, "b", units=names("b"), needs=("a",), memory=memory),
+        Stage("between", lambda *_: None, "between", needs=("a",)),
+        Stage("b", work, "b", units=names("b"), needs=("between",), memory=memory),
         Stage("c", work, "c", units=names("c"), memory=memory),
     )
     return state, stages
 
 
 @pytest.mark.parametrize(("threads", "gigabytes", "most"), [(3, 4.0, 3), (3, 2.5, 2), (1, 4.0, 1)])
-def test_units_run_side_by_side_within_threads_and_memory(tmp_path, threads, gigabytes, most):
+def test_units_run_side_by_side_within_threads_and_memory(folder, threads, gigabytes, most):
     state, stages = units_side_by_side(4, memory=lambda _, __: 1_000_000_000)
     config = StudyConfig.from_dict({"run": {"threads": threads, "memory": gigabytes}})
     with ThreadPoolExecutor(4) as executor:
-        store = StudyRunner(config, tmp_path / "run", stages, executor=executor).run()
+        store = run_stages(folder, *stages, config=config, executor=executor)
     assert state.most == most
-    assert len(store.records) == 12
+    assert len(store.records) == 13
     # b waits for all of a; c for nobody
     last_a = max(k for k, letter in enumerate(state.order) if letter == "a")
     assert state.order.index("b") > last_a
 
 
-def test_a_unit_larger_than_the_memory_runs_alone(tmp_path):
+def test_a_unit_larger_than_the_memory_runs_alone(folder):
     state, stages = units_side_by_side(3, memory=lambda _, __: 10_000_000_000)
     config = StudyConfig.from_dict({"run": {"threads": 3, "memory": 1.0}})
     with ThreadPoolExecutor(3) as executor:
-        StudyRunner(config, tmp_path / "run", stages, executor=executor).run()
+        run_stages(folder, *stages, config=config, executor=executor)
     assert state.most == 1
 
 
-def test_what_runs_beside_a_unit_that_fails_is_kept(tmp_path):
+def test_what_runs_beside_a_unit_that_fails_is_kept(folder):
     begun = threading.Event()
 
     def work(context, unit):
@@ -533,17 +501,17 @@ def test_what_runs_beside_a_unit_that_fails_is_kept(tmp_path):
             raise ValueError(msg)
         begun.set()
         threading.Event().wait(0.1)
-        context.save(f"{unit}.txt", lambda path: path.write_text(unit))
+        write(context, unit)
 
     stage = Stage("one", work, "one", units=lambda _: ("bad", "good", "late"))
     config = StudyConfig.from_dict({"run": {"threads": 2}})
     with ThreadPoolExecutor(2) as executor, pytest.raises(ValueError, match="no such light") as err:
-        StudyRunner(config, tmp_path / "run", [stage], executor=executor).run()
+        run_stages(folder, stage, config=config, executor=executor)
     assert "in stage one:bad" in err.value.__notes__
-    assert set(ProductStore(tmp_path / "run").records) == {"one:good"}
+    assert set(ProductStore(folder).records) == {"one:good"}
 
 
-def test_the_first_of_several_errors_is_raised(tmp_path):
+def test_the_first_of_several_errors_is_raised(folder):
     both, failed = threading.Barrier(2), threading.Event()
 
     def work(context, unit):
@@ -563,56 +531,24 @@ def test_the_first_of_several_errors_is_raised(tmp_path):
             return future
 
     config = StudyConfig.from_dict({"run": {"threads": 2}})
-    with Submits(2) as executor, pytest.raises(ValueError, match="first"):
-        StudyRunner(config, tmp_path / "run", [stage], executor=executor).run()
+    with Submits(2) as executor:
+        refuses("first", run_stages, folder, stage, config=config, executor=executor)
 
 
-def test_a_process_that_died_before_a_unit_began_is_text(tmp_path):
+def test_a_process_that_died_before_a_unit_began_is_text(folder):
     class Broken(Executor):
         def submit(self, *_, **__):
             raise BrokenExecutor
 
-    stage = Stage("one", None, "one")
-    with pytest.raises(DataError, match="a process ended during one"):
-        StudyRunner(StudyConfig(), tmp_path / "run", [stage], executor=Broken()).run()
+    stage, text = Stage("one", None, "one"), "a process ended during one"
+    refuses(text, run_stages, folder, stage, error=DataError, executor=Broken())
 
 
-def test_kernels_are_compiled_before_what_calls_them(tmp_path, monkeypatch, caplog):
+def test_what_prepares_a_run_comes_before_its_first_unit(folder):
     order = []
-    caplog.set_level("INFO", logger="miricigale.utils.compilation")
-
-    def work(context, _):
-        order.append(context.stage_name)
-        context.save(f"{context.stage_name}.txt", lambda path: path.write_text("x"))
-
-    def compile_apart(name):
-        threading.Event().wait(0.05)
-        order.append(f"compiled {name}")
-        if name == "photometry":
-            msg = "numba cannot"
-            raise ValueError(msg)
-
-    monkeypatch.setattr(runner, "compile_apart", compile_apart)
-    monkeypatch.setattr(runner, "is_compiled", lambda name: name == "images")
-
-    def stage(name, *kernels):
-        def function(context, unit):
-            context.stage_name = name
-            work(context, unit)
-
-        return Stage(name, function, name, kernels=kernels)
-
-    stages = (stage("a", "fit"), stage("b"), stage("c", "photometry"), stage("d", "images"))
-    config = StudyConfig.from_dict({"run": {"threads": 4}})
-    for expected in ({"a", "b", "c", "d", "compiled fit", "compiled photometry"}, set()):
-        with ThreadPoolExecutor(4) as executor:
-            StudyRunner(config, tmp_path / "run", stages, executor=executor).run()
-        assert set(order) == expected
-        if order:
-            assert order.index("compiled fit") < order.index("a")
-            # one that fails is compiled where it is called
-            assert order.index("compiled photometry") < order.index("c")
-        order.clear()
-    # never silent, also where no progress is shown
-    text = [line for line in caplog.messages if line.startswith("compiling")]
-    assert len(text) == 2
+    stage = Stage("one", lambda *_: order.append("one"), "one")
+    config = StudyConfig.from_dict({"run": {"threads": 3}})
+    for _ in range(2):
+        # a finished run prepares nothing
+        run_stages(folder, stage, config=config, prepare=order.append)
+        assert order == [3, "one"]

@@ -200,15 +200,6 @@ def test_the_page_needs_nothing_from_outside(run):
     assert len(list((report / "sources/agn00").glob("*.js"))) == -(-24 // CHUNK)
 
 
-def test_the_same_products_give_the_same_bytes(run):
-    report = run[0] / "report"
-    paths = [*report.glob("sources-*.html"), *(report / "sources/agn00").iterdir()]
-    before = [path.read_bytes() for path in paths]
-    do_stage(small_config(BANDS), run[0], "sources", "agn00")
-    assert before == [path.read_bytes() for path in paths]
-    assert len(before) == 3
-
-
 def test_pictures_show_the_sky_about_the_source():
     data = np.random.default_rng(3).normal(size=SHAPE)
     # 10 pixels east and 15 north of the source

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 import miricigale
-from helpers.errors import refuses
 from miricigale.workflow import warmup
 
 ROOT = Path(miricigale.__file__).parent.parent
@@ -32,6 +31,7 @@ FIT = """
 from miricigale.workflow import warmup
 warmup.compile_job("fit")
 """
+APART = "from miricigale.workflow.warmup import compile_apart\ncompile_apart('images')"
 REAL = """
 import astropy.units as u
 from astropy.table import QTable
@@ -89,9 +89,8 @@ def test_what_is_compiled_is_known(cache, monkeypatch):
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
 def test_compilation_ends_with_the_process_that_asked_for_it(tmp_path):
-    code = "from miricigale.workflow.warmup import compile_apart\ncompile_apart('images')"
     env = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(tmp_path)}
-    parent = subprocess.Popen([sys.executable, "-c", code], env=env)
+    parent = subprocess.Popen([sys.executable, "-c", APART], env=env)
     children = Path(f"/proc/{parent.pid}/task/{parent.pid}/children")
     deadline = time.monotonic() + 60
     while not children.read_text().split() and time.monotonic() < deadline:
@@ -110,9 +109,8 @@ def test_compilation_ends_with_the_process_that_asked_for_it(tmp_path):
 
 def test_nothing_is_imported_from_the_folder_of_the_call(tmp_path):
     (tmp_path / "platform.py").write_text("import os\nopen('ran', 'w')\nos._exit(0)\n")
-    code = "from miricigale.workflow.warmup import compile_apart\ncompile_apart('images')"
     env = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-    command = [sys.executable, "-P", "-c", code]
+    command = [sys.executable, "-P", "-c", APART]
     with subprocess.Popen(command, env=env, cwd=tmp_path) as parent:
         # the first kernel is kept long after all imports
         while parent.poll() is None and not list(tmp_path.glob("cache/*/*.nbi")):
@@ -121,9 +119,20 @@ def test_nothing_is_imported_from_the_folder_of_the_call(tmp_path):
     assert not (tmp_path / "ran").exists()
 
 
-def test_unknown_jobs_are_refused():
-    for function in (warmup.is_compiled, warmup.compile_job, warmup.compile_apart):
-        refuses("'name' must be one of fit, images", function, "fits")
+def test_what_is_missing_is_compiled_and_said(monkeypatch, caplog):
+    caplog.set_level("INFO", logger="miricigale.utils.compilation")
+    done = []
+    monkeypatch.setattr(warmup, "is_compiled", lambda name: name == "images")
+    monkeypatch.setattr(warmup, "compile_apart", lambda name: done.append(name) or name == "fit")
+    # one is not kept
+    assert not warmup.compile_missing(2)
+    assert sorted(done) == ["fit", "photometry"]
+    assert [line.split(",")[0] for line in caplog.messages] == [
+        "compiling model spectra and their fit", "compiling photometry"
+    ]  # fmt: skip
+    monkeypatch.setattr(warmup, "is_compiled", lambda name: True)
+    assert warmup.compile_missing(2)
+    assert len(done) == 2
 
 
 def test_kernels_run_where_nothing_can_be_kept(tmp_path):

@@ -10,9 +10,6 @@ from miricigale.utils.progress import on_terminal, print_line, progress
 
 log = logging.getLogger(__name__)
 
-# shown by the command line at any verbosity
-_compilation_log = logging.getLogger("miricigale.utils.compilation")
-
 
 class Display:
     """A bar on a terminal, otherwise a line for each stage, or nothing."""
@@ -38,13 +35,6 @@ class Display:
         self._facts[fact] += 1
         if self._facts[fact] == 1:
             warnings.warn(text, category, stacklevel=2)
-
-    def compilation(self, text):
-        """Say what is compiled, also where no progress is shown."""
-        if self._lines or self.is_bar:
-            print_line(text)
-        else:
-            _compilation_log.info(text)
 
     def begin(self, titles):
         self._bar.set_description(", ".join(titles))

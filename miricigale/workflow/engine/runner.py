@@ -11,7 +11,6 @@ import os
 from pathlib import Path
 
 from miricigale.refdata.locate import fingerprint
-from miricigale.utils.content import file_sha256
 from miricigale.utils.exceptions import (
     ConfigError,
     OtherResultsError,
@@ -23,7 +22,6 @@ from miricigale.workflow.engine.display import Display
 from miricigale.workflow.engine.schedule import Task, run_tasks
 from miricigale.workflow.engine.stage import run_unit
 from miricigale.workflow.engine.store import CONFIG, ProductStore, check_disk
-from miricigale.workflow.warmup import JOBS, compile_apart, describe_job, is_compiled
 
 log = logging.getLogger(__name__)
 
@@ -45,10 +43,6 @@ class _Job:
     @property
     def key(self):
         return self.stage.key(self.unit)
-
-    @property
-    def title(self):
-        return f"{self.stage.title}{' ' + self.unit if self.unit else ''}"
 
     def needed(self, config, units):
         """Keys of all units that this one reads."""
@@ -83,6 +77,8 @@ class StudyRunner:
         yet); what needs it follows if its products change.
     disk : dict of str to int, optional
         By stage: bytes that its products take, all units together.
+    prepare : callable, optional
+        Called with the number of threads before the first unit is done, such as to compile.
     progress_bar : bool, optional
         Whether progress is shown: a bar on a terminal, otherwise a line for each stage.
 
@@ -104,6 +100,7 @@ class StudyRunner:
         until=None,
         again=None,
         disk=None,
+        prepare=None,
         progress_bar=False,
     ):
         self.config = config
@@ -112,7 +109,7 @@ class StudyRunner:
         self.stages = tuple(stages() if callable(stages) else stages)
         self.executor = executor
         self.redo = redo
-        self.disk = dict(disk or {})
+        self.disk, self.prepare = dict(disk or {}), prepare
         self.progress_bar = progress_bar
         self.n_threads = thread_count(config.run.threads or None)
         self.units = {stage.name: stage.unit_names(config) for stage in self.stages}
@@ -171,10 +168,6 @@ class StudyRunner:
         }
         if stage.plan is not None:
             values["plan"] = stage.plan(self.config, unit)
-        source = Path(self.config.catalog.source).expanduser()
-        if "catalog" in stage.sections and source.is_file():
-            # the content of a user's file may change
-            values["catalog"] = file_sha256(source)
         text = json.dumps(values, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
@@ -255,7 +248,9 @@ class StudyRunner:
             for key, state in states.items():
                 if state in ("surplus", "again"):
                     store.drop(key)
-            self._execute(store, states)
+            if n_left and self.prepare is not None:
+                self.prepare(self.n_threads)
+            self._execute(store)
         return store
 
     def _products_bytes(self):
@@ -267,21 +262,20 @@ class StudyRunner:
 
     def _config_stands(self, store):
         """Whether manifest and ``config.toml`` say what this run does."""
-        return store.config == _values(self.config) and self._file_stands(store)
+        values = _values(self.config)
+        return store.config == values == _values_of(store.path(CONFIG))
 
-    def _file_stands(self, store):
-        """Whether the ``config.toml`` in the folder says what this run does."""
-        try:
-            return _values(load_config(store.path(CONFIG))) == _values(self.config)
-        except (ConfigError, OSError, ValueError):
-            return False
+    def _edited_config(self, store):
+        """Path of a ``config.toml`` that says neither what this run does nor what the last one did, or None."""
+        path = store.path(CONFIG)
+        known = store.config, _values(self.config)
+        return path if path.is_file() and _values_of(path) not in known else None
 
     def _refuse_replacing(self, store, states):
         if self.redo:
             return
         reasons = []
-        edited = store.edited_config()
-        if edited is not None and not self._file_stands(store):
+        if edited := self._edited_config(store):
             reasons.append(
                 f"{edited} was edited since the run that made this folder (or that run was of an "
                 f"earlier version), and this run has another configuration, which would replace it: "
@@ -331,28 +325,25 @@ class StudyRunner:
     def _write_config(self, store):
         if self._config_stands(store):
             return
-        stands, edited = self._file_stands(store), store.edited_config()
-        if edited is not None and not stands:
+        if edited := self._edited_config(store):
             names = (f"config.edited{n if n > 1 else ''}.toml" for n in itertools.count(1))
             kept = next(k for k in map(edited.with_name, names) if not os.path.lexists(k))
             os.replace(edited, kept)
             log.warning("the edited %s is kept as %s", edited, kept.name)
-        store.begin(_values(self.config), self.config.to_toml(), write=not stands)
+        store.facts["config"] = values = _values(self.config)
+        if _values_of(store.path(CONFIG)) != values:
+            store.save(CONFIG, lambda path: path.write_text(self.config.to_toml(), "utf-8"))
+        store.write_manifest()
 
     def _tell(self, text):
         if self.progress_bar:
             print_line(text)
 
-    def _execute(self, store, states):
+    def _execute(self, store):
         """Do all units, each when what it needs is done."""
         with Display(self.progress_bar, len(self.jobs)) as display:
-            begun = [job.stage for job in self.jobs if states[job.key] != "current"]
-            kernels = {name for stage in begun for name in stage.kernels}
             run_tasks(
-                [
-                    *(_compilation(name, display) for name in JOBS if name in kernels),
-                    *(self._task(job, store, display) for job in self.jobs),
-                ],
+                [self._task(job, store, display) for job in self.jobs],
                 executor=self.executor,
                 n_threads=self.n_threads,
                 memory=self.config.run.memory * 1e9 or 0.5 * available_memory(),
@@ -397,24 +388,12 @@ class StudyRunner:
 
         return Task(
             job.key,
-            job.title,
+            f"{stage.title} {job.unit}".strip(),
             begin,
             finish,
-            needs=needed | {f"compile {name}" for name in stage.kernels},
+            needs=needed,
             memory=stage.memory(self.config, job.unit) if stage.memory else _MEMORY,
         )
-
-
-def _compilation(name, display):
-    """Compile what is not compiled yet; a failure only means that it is done where it is called."""
-
-    def begin(submit, _):
-        if is_compiled(name):
-            return None
-        display.compilation(describe_job(name))
-        return submit(compile_apart, name)
-
-    return Task(f"compile {name}", "compilation", begin, memory=_MEMORY, is_optional=True)
 
 
 def _values(config):
@@ -423,6 +402,14 @@ def _values(config):
     # threads and memory do not change products
     del values["run"]["threads"], values["run"]["memory"]
     return values
+
+
+def _values_of(path):
+    """The same of a file; none where it is missing or cannot be read."""
+    try:
+        return _values(load_config(path))
+    except (ConfigError, OSError, ValueError):
+        return {}
 
 
 def _summary(keys):

@@ -1,13 +1,10 @@
 """Tasks that need each other, side by side within a number of threads and an amount of memory."""
 
 import dataclasses
-import logging
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
 
 from miricigale.utils.exceptions import DataError
-
-log = logging.getLogger(__name__)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -24,23 +21,20 @@ class Task:
     begin : callable
         Called with ``submit`` of an executor and a number of threads when all that it needs is
         complete; gives a future, or None if there is nothing to do.
-    finish : callable, optional
+    finish : callable
         Called with what the future gives.
     needs : frozenset of str, optional
         Groups that must be complete before; those of which there is no task are.
     memory : int, optional
         Bytes that it takes.
-    is_optional : bool, optional
-        Whether the others continue if it fails.
     """
 
     group: str
     title: str
     begin: Callable
-    finish: Callable | None = None
+    finish: Callable
     needs: frozenset = frozenset()
     memory: int = 0
-    is_optional: bool = False
 
 
 class _Inline(Executor):
@@ -100,28 +94,17 @@ def run_tasks(tasks, *, executor=None, n_threads=1, memory=float("inf"), report=
                     report([other.title for other in running.values()])
         elif running:
             for future in wait(running, return_when=FIRST_COMPLETED).done:
-                failed = _finish(running.pop(future), future)
+                task = running.pop(future)
+                failed = future.exception()
+                if isinstance(failed, BrokenExecutor):
+                    raise _died(task) from failed
+                if failed is None:
+                    task.finish(future.result())
                 error = error or failed
         elif error is not None:
             raise error
         else:
             return
-
-
-def _finish(task, future):
-    """Take the result of a task; what it raised, if that ends the run."""
-    try:
-        result = future.result()
-    except BrokenExecutor as err:
-        raise _died(task) from err
-    except Exception as err:
-        if not task.is_optional:
-            return err
-        log.debug("%s: %s", task.title, err)
-        return None
-    if task.finish is not None:
-        task.finish(result)
-    return None
 
 
 def _died(task):

@@ -1,6 +1,7 @@
 """A stage of the study, and what it sees of the run."""
 
 import dataclasses
+import functools
 import socket
 import time
 import types
@@ -29,10 +30,10 @@ class Stage:
         Called as ``function(context, unit)``; saves its products through the context.
     title : str
         What it does, for the progress line.
-    needs : tuple of str or dict of str to callable
-        Stages whose products it reads; reading another product is an error. A function is called
-        with the configuration and the unit, and gives the units of that stage that are read; all
-        are without one (None).
+    needs : tuple of str
+        Stages whose products it reads; reading another product is an error. Of these a unit reads the
+        units that are parts of it, or it of them (see `related`): ``"sky/band"`` those named
+        ``"sky"``, ``"band"``, ``"sky/band"`` and ``"sky/band-1"``, and a stage's only one.
     sections : tuple of str
         Sections (``"scene"``) or keys (``"run.keep_level1b"``) of the configuration that it
         reads; reading another one is an error.
@@ -42,28 +43,29 @@ class Stage:
         Raised when the stage's own algorithm changes its products.
     units : callable, optional
         Called with the configuration; names of the pieces that are done and resumed one
-        by one.
+        by one, in parts joined by ``/``.
+    within : callable, optional
+        Called with the configuration; a part that counts as one of the name of each unit in
+        what it reads.
     plan : callable, optional
         Called with the configuration and the unit; plain values that the stage takes from the
         package (the exposures of a named plan, the axes of a named grid) or from a part of the
         configuration, so that a change of those is seen. The stage has them as ``context.plan``.
     memory : callable, optional
         Called with the configuration and the unit; about how many bytes it takes to do it.
-    kernels : tuple of str, optional
-        Groups of compiled kernels (`miricigale.workflow.warmup`) that it calls.
     """
 
     name: str
     function: Callable
     title: str
-    needs: tuple | dict = ()
+    needs: tuple = ()
     sections: tuple = ()
     resources: tuple | Callable = ()
     version: int = 1
     units: Callable | None = None
+    within: Callable | None = None
     plan: Callable | None = None
     memory: Callable | None = None
-    kernels: tuple = ()
 
     def unit_names(self, config):
         """Names of the pieces; a single empty one for a stage that has none."""
@@ -87,13 +89,12 @@ class Stage:
         keys : dict of str to list of str
             By stage: keys of its units in the manifest.
         """
-        select = self.needs if isinstance(self.needs, dict) else dict.fromkeys(self.needs)
+        own = f"{self.within(config)}/{unit}" if self.within else unit
         return {
             name: [
-                f"{name}:{part}" if part else name
-                for part in (choose(config, unit) if choose else units[name])
+                f"{name}:{other}" if other else name for other in units[name] if related(own, other)
             ]
-            for name, choose in select.items()
+            for name in self.needs
         }
 
     def resource_names(self):
@@ -103,6 +104,22 @@ class Stage:
     def key(self, unit):
         """Name of a piece in the manifest."""
         return f"{self.name}:{unit}" if unit else self.name
+
+
+def related(first, second):
+    """
+    Return whether all parts of one of two units are parts of the other.
+
+    A part with a number (``"band-1"``) is a part of that without (``"band"``).
+    """
+    parts = _parts(first), _parts(second)
+    return parts[0] <= parts[1] or parts[1] <= parts[0]
+
+
+@functools.cache
+def _parts(unit):
+    names = [name for name in unit.split("/") if name]
+    return frozenset([*names, *(name.rpartition("-")[0] or name for name in names)])
 
 
 def stage(name, title, **declaration):

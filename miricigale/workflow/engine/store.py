@@ -1,13 +1,10 @@
 """The folder of a run: its products, the record of what stands, and the configuration."""
 
-import hashlib
 import shutil
 from pathlib import Path
 
-from miricigale.utils.content import file_sha256
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.folder import RecordFolder
-from miricigale.workflow.config import present_names
 
 CONFIG = "config.toml"
 
@@ -30,39 +27,11 @@ class ProductStore(RecordFolder):
     @property
     def config(self):
         """Plain values of the configuration that the products were made with; None if not known."""
-        config = self.facts.get("config")
-        return config and {name: present_names(name, values) for name, values in config.items()}
+        return self.facts.get("config")
 
     def check_record(self, record):
         super().check_record(record)
         float(record["seconds"])
-
-    def begin(self, values, text, *, write):
-        """
-        Note the configuration of the run that begins, and write it as ``config.toml``.
-
-        Parameters
-        ----------
-        values : dict
-            Plain values of all sections.
-        text : str
-            The file.
-        write : bool
-            Whether it is written; otherwise the one that stands says the same.
-        """
-        data = text.encode()
-        if write:
-            self.save(CONFIG, lambda path: path.write_bytes(data))
-        self.facts.update(config=values, config_sha256=hashlib.sha256(data).hexdigest())
-        self.write_manifest()
-
-    def edited_config(self):
-        """Path of ``config.toml`` if it is not what the last run is known to have written, or None."""
-        path = self.path(CONFIG)
-        # earlier versions noted none: it may have been edited
-        if path.is_file() and file_sha256(path) != self.facts.get("config_sha256"):
-            return path
-        return None
 
     def checksums(self, keys):
         """Checksums of all products of units by their keys; those that are not done have none."""

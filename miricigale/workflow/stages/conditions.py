@@ -87,21 +87,13 @@ def band_conditions(matched, name):
     field = ~has_flag(matched, "selection", SampleFlags.OUTSIDE_FIELD | SampleFlags.NO_MODEL)
     lost = has_flag(matched, column, ConditionFlags.NOT_MEASURED)
     flux, true = matched[name].value, matched[f"{name}_true"].value
-    with np.errstate(invalid="ignore"):
-        bright = true > 5 * matched[f"{name}_formal_err"].value
-    counts = {
-        "n_field": int(np.count_nonzero(field)),
-        "n_not_measured": int(np.count_nonzero(field & lost)),
-    }
+    bright = true > 5 * matched[f"{name}_formal_err"].value
+    counts = {"n_field": int(field.sum()), "n_not_measured": int((field & lost).sum())}
     for group, rows in _groups(np.asarray(matched[column])).items():
         rows = rows & field & ~lost
         found = recovery_metrics(true[rows & bright], flux[rows & bright], relative=True)
-        counts[group] = {
-            "n": int(np.count_nonzero(rows)),
-            "n_bright": found.n,
-            "median": found.median,
-            "scatter": found.sigma_mad,
-        }
+        numbers = {"n_bright": found.n, "median": found.median, "scatter": found.sigma_mad}
+        counts[group] = {"n": int(rows.sum()), **numbers}
     return counts
 
 
@@ -112,13 +104,10 @@ def detection_counts(detections, bands):
     ``n``, ``n_field`` and of these ``n_spurious``, ``n_ambiguous``, and by band the spurious ones above
     five formal errors (``n_spurious_bright``).
     """
-    field = np.asarray(detections["in_field"], bool)
-    spurious, ambiguous = (
-        field & has_flag(detections, f"{bands[0]}_condition", flag)
-        for flag in (ConditionFlags.SPURIOUS, ConditionFlags.AMBIGUOUS)
-    )
-    with np.errstate(invalid="ignore"):
-        bright = {n: detections[n] > 5 * detections[error_column(n)] for n in bands}
+    field, column = np.asarray(detections["in_field"], bool), f"{bands[0]}_condition"
+    spurious = field & has_flag(detections, column, ConditionFlags.SPURIOUS)
+    ambiguous = field & has_flag(detections, column, ConditionFlags.AMBIGUOUS)
+    bright = {n: detections[n] > 5 * detections[error_column(n)] for n in bands}
     return {
         "n": len(detections),
         "n_field": int(field.sum()),

@@ -28,7 +28,7 @@ class _Panels:
     Images on one grid that are shown with one stretch.
 
     ``planes`` are padded by ``n``, the side of the pictures in pixels, with NaN; ``sigma`` is the noise of
-    a pixel, and ``ruler`` the plane whose brightest pixel ends the stretch.
+    a pixel of the last, and the brightest pixel of the middle one ends the stretch.
     """
 
     planes: tuple
@@ -36,15 +36,10 @@ class _Panels:
     shape: tuple
     n: int
     sigma: float
-    ruler: int
 
     @classmethod
-    def of_images(cls, images, *, finest=0.0, noise=0, ruler=0):
-        """
-        Of images with the mask of the first, averaged to pixels of about ``finest`` arcsec or larger.
-
-        ``noise`` is the image whose noise is measured.
-        """
+    def of_images(cls, images, *, finest=0.0):
+        """Of images with the mask of the first, averaged to pixels of about ``finest`` arcsec or larger."""
         first = images[0]
         scale = float(proj_plane_pixel_scales(first.wcs)[0] * 3600)
         factor = max(1, round(finest / scale))
@@ -58,8 +53,7 @@ class _Panels:
             first.wcs[::factor, ::factor],
             planes[0].shape,
             n,
-            float(sigma_mad(planes[noise][np.isfinite(planes[noise])])),
-            ruler,
+            float(sigma_mad(planes[-1][np.isfinite(planes[-1])])),
         )
 
     def squares(self, sky):
@@ -85,7 +79,7 @@ class _Panels:
             Value of the darkest shade.
         """
         squares = self.squares(sky)
-        brightest = np.nan_to_num(squares[:, self.ruler], nan=-np.inf).max(axis=(1, 2))
+        brightest = np.nan_to_num(squares[:, len(self.planes) // 2], nan=-np.inf).max(axis=(1, 2))
         tops = np.maximum(HIGHEST * self.sigma, brightest)
         soft = SOFTENING * self.sigma
         low, high = np.arcsinh(LOWEST / SOFTENING), np.arcsinh(tops / soft)[:, None, None, None]
@@ -109,38 +103,28 @@ class Cutouts:
     def __init__(self, prior, bands):
         self.prior = _Panels.of_images([prior])
         self.bands = {
-            name: _Panels.of_images(images, finest=FINEST, noise=2, ruler=1)
-            for name, images in bands.items()
+            name: _Panels.of_images(images, finest=FINEST) for name, images in bands.items()
         }
 
     @classmethod
     def read(cls, context, truth):
         """Of the images of a truth, those that were measured."""
         suffix, _ = measured_mosaic(context.config)
-        return cls(
-            context.image("f160w.fits"),
-            {
-                name: [
-                    context.image(f"{truth}/mosaic_{name}{suffix}.fits"),
-                    context.image(f"{truth}/photometry/{name}_model.fits"),
-                    context.image(f"{truth}/photometry/{name}_residual.fits"),
-                ]
-                for name in context.config.exposures.filters
-            },
-        )
-
-    @property
-    def _side(self):
-        """Pixels of the pictures of the bands."""
-        return max(panels.n for panels in self.bands.values())
+        paths = f"mosaic_{{}}{suffix}", "photometry/{}_model", "photometry/{}_residual"
+        bands = {
+            name: [context.image(f"{truth}/{path.format(name)}.fits") for path in paths]
+            for name in context.config.exposures.filters
+        }
+        return cls(context.image("f160w.fits"), bands)
 
     def describe(self):
         """Where the pictures are in a sheet, in pixels, and their stretch: plain values."""
+        side = max(panels.n for panels in self.bands.values())
         return {
             "box": BOX,
             "prior": self.prior.n,
-            "side": self._side,
-            "height": max(self.prior.n, 3 * self._side),
+            "side": side,
+            "height": max(self.prior.n, 3 * side),
             "unit": "MJy/sr",
             "sigma": [float(f"{p.sigma:.3g}") for p in (self.prior, *self.bands.values())],
             "softening": SOFTENING,
@@ -174,10 +158,9 @@ class Cutouts:
         tops : `~numpy.ndarray`, shape (n, n_bands + 1)
             Values at which the stretches of the prior and of each band end, in the unit of the images.
         """
-        layout, side = self.describe(), self._side
-        strips = np.full(
-            (len(sky), layout["height"], self.prior.n + side * len(self.bands)), N_GRAY, np.uint8
-        )
+        layout = self.describe()
+        side, width = layout["side"], self.prior.n + layout["side"] * len(self.bands)
+        strips = np.full((len(sky), layout["height"], width), N_GRAY, np.uint8)
         shades, tops = self.prior.shades(sky)
         strips[:, : self.prior.n, : self.prior.n] = shades[:, 0]
         limits = [tops]

@@ -1,12 +1,8 @@
-"""Further fits of the samples of a study: freed AGN, far infrared, samplers, without model error."""
-
-import importlib.util
+"""Further fits of the samples of a study: freed AGN, far infrared, without model error."""
 
 import numpy as np
-from astropy.table import QTable
-from scipy import stats
 
-from miricigale import fitting, photometry, sed
+from miricigale import photometry, sed
 from miricigale.evaluation import (
     fraction_interval,
     photoz_metrics,
@@ -20,19 +16,13 @@ from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.page.declared import texts_of
 from miricigale.workflow.page.numbers import true_ranks
 from miricigale.workflow.stages.fits import FIT_SECTIONS, fit_mock, fit_sample
-from miricigale.workflow.stages.inputs import sed_resources
-from miricigale.workflow.truths import of_truth, study_truths
+from miricigale.workflow.stages.inputs import plain_axes, sed_resources
+from miricigale.workflow.truths import study_truths
 
 #: Most sources of each truth that are fitted with a freed torus.
 N_FREE = 100
-#: Sources of all truths together that are fitted by a sampler, and its settings.
-N_SAMPLED = 20
-SAMPLER_OPTIONS = {"n_live": 200, "n_effective": 1000, "max_calls": 60_000}
-#: Samplers in the order of preference.
-SAMPLERS = ("nautilus", "dynesty")
-#: Parameters whose posteriors are ranked, and compared between a sampler and the grid.
+#: Parameters whose posteriors are ranked.
 RANKED = ("redshift", "frac_agn")
-_NO_SAMPLER = "Neither nautilus nor dynesty is installed (pip install nautilus-sampler)."
 #: What Yang et al. 2021 fix, freed; the fixed values (70 deg, 1, 1) are nodes or within. To stay below
 #: a hundred million models the other axes of the AGN are thinner than in the study.
 _FREED = {"inclination": (60.0, 70.0, 90.0), "p": (0.0, 1.0), "q": (0.0, 1.0)}
@@ -45,11 +35,8 @@ _THINNER = {
 
 def experiment_units(config):
     """Names of the experiments, ``<truth>/<experiment>``, of the truths without perturbations."""
-    return tuple(f"{of}/{name}" for of in _truths(config) for name in config.fit.experiments)
-
-
-def _truths(config):
-    return [name for name, truth in study_truths(config).items() if not truth.perturbations]
+    known = [name for name, truth in study_truths(config).items() if not truth.perturbations]
+    return tuple(f"{of}/{name}" for of in known for name in config.fit.experiments)
 
 
 def experiment_axes(name, kind):
@@ -64,21 +51,12 @@ def experiment_axes(name, kind):
 def _experiment_plan(config, unit):
     """What an experiment takes from the package, for hashing."""
     name = unit.partition("/")[2]
-    axes = experiment_axes(name, config.fit.axes)
-    plan = {"axes": {key: list(values) for key, values in axes.items()}}
+    plan = {"axes": plain_axes(experiment_axes(name, config.fit.axes))}
     if name == "free_agn":
         plan["n"] = N_FREE
-    elif name == "samplers":
-        plan |= {"n": -(-N_SAMPLED // len(_truths(config))), "options": dict(SAMPLER_OPTIONS)}
-        plan["sampler"] = _sampler()
     elif name == "far_infrared":
         plan["depths"] = dict(HERSCHEL_DEPTHS)
     return plan
-
-
-def _sampler():
-    """The sampler that is installed; None without one."""
-    return next((name for name in SAMPLERS if importlib.util.find_spec(name)), None)
 
 
 def far_infrared_photometry(sample, *, seed):
@@ -100,12 +78,11 @@ def far_infrared_photometry(sample, *, seed):
 @stage(
     "experiments",
     "further fit",
-    needs={"truth": of_truth, "matches": of_truth},
+    needs=("truth", "matches"),
     sections=FIT_SECTIONS,
     resources=sed_resources,
     plan=_experiment_plan,
     units=experiment_units,
-    kernels=("fit",),
 )
 def fit_experiment(context, unit):
     """Fit the sample of a truth, with all MIRI bands, in another way than the study does."""
@@ -113,7 +90,7 @@ def fit_experiment(context, unit):
     of, name = unit.split("/")
     truth, matched, mock = fit_sample(context, of)
     sample = truth[np.asarray(matched["selection"]) == 0]
-    bands, given = list(config.exposures.filters), {}
+    bands, redshift = list(config.exposures.filters), None
     options = {"axes": {key: np.array(values) for key, values in plan["axes"].items()}}
     if "n" in plan and len(mock) > plan["n"]:
         rows = np.linspace(0, len(mock) - 1, plan["n"]).round().astype(int)
@@ -124,35 +101,12 @@ def fit_experiment(context, unit):
         for column in light.colnames:
             mock[column] = light[column]
     elif name == "known_redshift":
-        given["redshift"] = np.asarray(sample["redshift"], float)
+        redshift = np.asarray(sample["redshift"], float)
     elif name == "no_model_error":
         options["model_error"] = 0.0
-    elif name == "samplers":
-        if plan["sampler"] is None:
-            left = QTable({"id": sample["id"][:0]}, meta={"left_out": _NO_SAMPLER})
-            context.save_table(f"{of}/experiments/{name}.ecsv", left)
-            return
-        priors = sampler_priors(options["axes"])
-        settings = fitting.SamplerSettings(**plan["options"])
-        options = {"engine": plan["sampler"], "priors": priors, "settings": settings}
-        # samplers are Python: threads gain nothing
-        given = {"seed": context.seed, "executor": None}
-    results = fit_mock(context, mock, bands, given=given, **options)
+    results = fit_mock(context, mock, bands, redshift=redshift, **options)
     context.save_result(f"{of}/experiments/{name}.fits", results)
     context.save_table(f"{of}/experiments/{name}.ecsv", _ranked(results, sample, context.seed))
-
-
-def sampler_priors(axes):
-    """
-    Continuous priors over the axes of a grid, as flat as its nodes are dense.
-
-    In ln(1 + z), and in the logarithm of tau; flat in all others.
-    """
-    priors = {name: (values[0], values[-1]) for name, values in axes.items()}
-    priors["tau"] = (*priors["tau"], "log")
-    low, high = priors["redshift"]
-    priors["redshift"] = stats.loguniform(1 + low, 1 + high, loc=-1)
-    return priors
 
 
 def _ranked(results, sample, seed):
@@ -193,11 +147,9 @@ def experiment_numbers(sample, table):
     width = np.asarray(table["frac_agn_std"], float)
     power = np.full(len(true), np.nan)
     if "accretion_power" in true.colnames and "accretion_power_mean" in table.colnames:
-        measured = table["accretion_power_mean"]
-        truth = true["accretion_power"].to_value(measured.unit)
         with np.errstate(divide="ignore", invalid="ignore"):
-            power = np.log10(measured.value / np.where(truth > 0, truth, np.nan))
-    power = recovery_metrics(np.zeros(power.size), np.where(np.isfinite(power), power, np.nan))
+            power = np.log10(table["accretion_power_mean"] / true["accretion_power"]).value
+    power = recovery_metrics(np.zeros(power.size), power)
     found = {
         "n": photoz.n,
         "photoz_sigma_mad": np.nan if known else photoz.sigma_mad,
@@ -216,21 +168,6 @@ def experiment_numbers(sample, table):
     return found
 
 
-def _sampler_numbers(grid, sampled):
-    """Means of a sampler minus those of the grid in units of its widths, and widths over widths."""
-    found = {}
-    for name in RANKED:
-        width = np.asarray(grid[f"{name}_std"], float)
-        shift = np.asarray(sampled[f"{name}_mean"] - grid[f"{name}_mean"], float) / width
-        ratio = np.asarray(sampled[f"{name}_std"], float) / width
-        found |= {
-            f"{name}_median": np.nanmedian(np.abs(shift)),
-            f"{name}_most": np.nanmax(np.abs(shift)),
-        }
-        found[f"{name}_widths"] = np.nanmedian(ratio)
-    return found
-
-
 def write_experiments(page, every):
     """
     Write the section on the further fits; ``every`` are the ``StudyTables`` of all truths by name.
@@ -240,20 +177,14 @@ def write_experiments(page, every):
     context, names = page.context, page.config.fit.experiments
     if not names:
         return
-    rows, pairs, left = [], [], {}
+    rows = []
     for of, study in every.items():
         own = _ranked(study.results["all"], study.sample, context.seed)
         fits = [("study", own)]
         for name, table in context.tables(f"{of}/experiments", names).items():
-            if "left_out" in table.meta:
-                left[name] = table.meta["left_out"]
-                continue
-            same = rows_of(own, table["id"])
             if 0 < len(table) < len(own):
-                fits.append(("study", same))
+                fits.append(("study", rows_of(own, table["id"])))
             fits.append((name, table))
-            if name == "samplers" and len(table):
-                pairs.append({"truth": of, "n": len(table), **_sampler_numbers(same, table)})
         for name, table in fits:
             rows.append((of, name, len(table), experiment_numbers(study.sample, table)))
     texts = {"truth": "Sky", "experiment": "Fit", "n_sources": "Sources"}
@@ -264,7 +195,3 @@ def write_experiments(page, every):
     page.numbers("experiments", numbers, sentences=sentence(sentences, {"n_free": N_FREE}))
     labels = declared["labels"]
     page.table("table", [dict(row) | {"fit": labels[row["experiment"]]} for row in numbers])
-    if pairs:
-        page.table("samplers", pairs)
-    for name, why in left.items():
-        page.text("left", fit=labels[name], why=why)

@@ -2,6 +2,7 @@
 
 import functools
 import math
+import operator
 from pathlib import Path
 
 import astropy.units as u
@@ -58,10 +59,8 @@ def _dithers(options, k):
     """Dithers of a filter, the name of a pattern or offsets in arcsec as pairs, and where they are from."""
     name = of_filter(options.dithers or ("ceers",), k)
     if name in dither_patterns():
-        text = (
-            f"the package's pattern {name!r}, of the form of the observatory's but not its digits"
-        )
-        return name, text
+        form = "of the form of the observatory's but not its digits"
+        return name, f"the package's pattern {name!r}, {form}"
     path, part = Path(name).expanduser(), {}
     wanted = f"must be a file or one of {list(dither_patterns())}"
     require(path.is_file(), "exposures", "dithers", wanted, repr(name))
@@ -172,12 +171,6 @@ def truth_bands(config):
     return tuple(f"{truth}/{name}" for truth in truth_names(config) for name in band_names(config))
 
 
-def bands_of_truth(config, unit):
-    """Units of `truth_bands` of the truth with which a unit begins."""
-    truth = unit.partition("/")[0]
-    return tuple(f"{truth}/{name}" for name in band_names(config))
-
-
 def exposures_of(config, unit=""):
     """Exposures by name of a unit that ends with the name of an exposure or of a band; all without one."""
     name = unit.rpartition("/")[2]
@@ -185,21 +178,11 @@ def exposures_of(config, unit=""):
     return {own: e for own, e in every.items() if not name or name in (own, e.filter)}
 
 
-def dithers_of_band(config, unit):
-    """Units of `exposure_units` of a unit of `truth_bands`."""
-    return tuple(f"{unit.partition('/')[0]}/{name}" for name in exposures_of(config, unit))
-
-
 def exposure_plan(config, unit=""):
     """Plain values of the exposures of a unit, a filter, or the whole study, for hashing."""
-    counts = ("readout", "n_groups", "n_integrations", "subarray")
+    counts = operator.attrgetter("readout", "n_groups", "n_integrations", "subarray")
     return {
-        name: [
-            *(getattr(e, k) for k in counts),
-            e.pointing.ra.deg,
-            e.pointing.dec.deg,
-            e.roll.value,
-        ]
+        name: [*counts(e), e.pointing.ra.deg, e.pointing.dec.deg, e.roll.value]
         for name, e in exposures_of(config, unit).items()
     }
 

@@ -13,7 +13,6 @@ from miricigale.workflow.perturbation import Perturbation
 from miricigale.workflow.stages.conditions import ConditionFlags, add_conditions, any_condition
 from miricigale.workflow.stages.exposures import (
     GRID,
-    bands_of_truth,
     pointing_exposures,
     pointing_time,
 )
@@ -27,7 +26,6 @@ from miricigale.workflow.stages.sample import (
 )
 from miricigale.workflow.truths import (
     band_sets,
-    of_truth,
     reference,
     study_truths,
     truth_names,
@@ -46,15 +44,15 @@ class _Field:
         self.detections = joined_photometry(tables)
         self.matched = evaluation.match_truth(self.truth, self.detections, bands, radius=radius)
         self.association = evaluation.associate(self.truth, self.detections, radius=radius)
-        mosaics = {}
+        mosaics = []
         for band in bands:
-            path = f"{name}/mosaic_{band}.fits"
-            mosaics[band], n_images = context.image(path, "n_images")
-            exposure = pointing_exposures(config, band)[0]
-            seen = mean_coverage(self.truth["sky"], mosaics[band], n_images)
-            self.matched[f"{band}_time"] = seen * exposure.exposure_time
-        self.inside = in_field(self.truth["sky"], mosaics.values())
-        self.detections["in_field"] = in_field(self.detections["sky"], mosaics.values())
+            mosaic, n_images = context.image(f"{name}/mosaic_{band}.fits", "n_images")
+            mosaics.append(mosaic)
+            seen = mean_coverage(self.truth["sky"], mosaic, n_images)
+            time = pointing_exposures(config, band)[0].exposure_time
+            self.matched[f"{band}_time"] = seen * time
+        self.inside = in_field(self.truth["sky"], mosaics)
+        self.detections["in_field"] = in_field(self.detections["sky"], mosaics)
 
     def noise(self, config):
         """
@@ -73,32 +71,22 @@ class _Field:
         return noise
 
 
-#: What is matched: a truth, and the mosaics and photometry of its bands.
-_MATCHED = {"truth": of_truth, "mosaics": bands_of_truth, "photometry": bands_of_truth}
-
-
 @stage(
     "errors",
     "error function",
     version=4,
-    needs={
-        name: lambda config, _, select=select: select(config, reference(config))
-        for name, select in _MATCHED.items()
-    },
+    needs=("truth", "mosaics", "photometry"),
+    within=reference,
     sections=(*GRID, "errors", "photometry.match_radius"),
     plan=lambda config, _: reference(config),
 )
 def make_errors(context, _):
     """Stage 12: error function of every band, of the matched sources of the reference truth."""
     config, field = context.config, _Field(context, context.plan)
-    errors = matched_errors(
-        field.matched,
-        field.inside,
-        config.exposures.filters,
-        statistic=config.errors.statistic,
-        bin_size=config.errors.bin_size,
-        noise=field.noise(config),
-    )
+    options = {name: getattr(config.errors, name) for name in ("statistic", "bin_size")}
+    options["noise"] = field.noise(config)
+    bands = config.exposures.filters
+    errors = matched_errors(field.matched, field.inside, bands, **options)
     context.save_result("errors.ecsv", errors)
 
 
@@ -106,7 +94,7 @@ def make_errors(context, _):
     "matches",
     "match to the truth",
     version=2,
-    needs={**_MATCHED, "errors": None},
+    needs=("truth", "mosaics", "photometry", "errors"),
     sections=(*GRID, "errors.coverage", "photometry.match_radius", "fit.min_detected", "fit.axes"),
     units=truth_names,
     plan=fit_plan,
@@ -131,8 +119,8 @@ def match_sources(context, unit):
     )
     add_conditions(matched, bands, suffix="_true")
     detections["association"] = np.zeros(len(detections), int)
-    here = np.asarray(association["second"]) >= 0
-    detections["association"][association["second"][here]] = association["reasons"][here]
+    here = association[np.asarray(association["second"]) >= 0]
+    detections["association"][here["second"]] = here["reasons"]
     add_conditions(detections, bands, detections=True)
     context.save_table(f"{unit}/association.ecsv", association)
     context.save_table(f"{unit}/photometry.ecsv", detections)
@@ -182,14 +170,13 @@ def _fit_plan(config, unit):
     "fits",
     "fit",
     version=5,
-    needs={"truth": of_truth, "matches": of_truth},
+    needs=("truth", "matches"),
     sections=FIT_SECTIONS,
     resources=sed_resources,
     plan=_fit_plan,
     units=lambda config: tuple(
         f"{of}/{name}" for of in truth_names(config) for name in config.fit.sets
     ),
-    kernels=("fit",),
 )
 def fit_photometry(context, unit):
     """Stage 13: fit the detected sources of a truth with a set of the MIRI bands."""
@@ -220,7 +207,7 @@ def study_fitter(fit, bands, **options):
     return fitting.BayesFitter(sed.SEDModel.yang2021(), [*fit.bands, *bands], **options)
 
 
-def fit_mock(context, mock, bands, *, given=None, **options):
+def fit_mock(context, mock, bands, *, redshift=None, **options):
     """
     Fit mock photometry in the existing and in further bands as the study does.
 
@@ -232,8 +219,8 @@ def fit_mock(context, mock, bands, *, given=None, **options):
         As of `mock_photometry`.
     bands : iterable of str
         Bands that join the existing ones.
-    given : dict, optional
-        Further arguments of ``BayesFitter.fit``.
+    redshift : array-like, optional
+        Redshifts that are not fitted.
     **options
         Further arguments of `~miricigale.fitting.BayesFitter`, or others than the study's.
 
@@ -243,5 +230,5 @@ def fit_mock(context, mock, bands, *, given=None, **options):
     """
     fitter = study_fitter(context.config.fit, bands, **options)
     with ThreadPoolExecutor(context.n_threads) as executor:
-        given = {"executor": executor, "progress_bar": context.progress_bar} | (given or {})
-        return fitter.fit(mock, **given)
+        show = context.progress_bar
+        return fitter.fit(mock, redshift=redshift, executor=executor, progress_bar=show)

@@ -17,7 +17,6 @@ from miricigale.workflow.stages.exposures import (
     KERNEL,
     band_exposures,
     band_names,
-    dithers_of_band,
     exposure_memory,
     exposure_plan,
     exposure_units,
@@ -29,7 +28,7 @@ from miricigale.workflow.stages.exposures import (
     study_exposures,
     truth_bands,
 )
-from miricigale.workflow.truths import CUTOUTS, of_reference, of_truth, reference, study_truths
+from miricigale.workflow.truths import CUTOUTS, reference, study_truths
 
 log = logging.getLogger(__name__)
 
@@ -57,13 +56,11 @@ def reducer_of(config, n_threads=None):
 
 
 def background_of(config, exposure):
-    """The background of an exposure, which those of a pointing share."""
-    options = config.scene
+    """The background of an exposure, which those of a pointing share: it moves with the telescope."""
     return scene.Background(
         study_background(config, exposure.filter),
-        gradient=options.background_gradient / u.arcmin,
-        position_angle=options.gradient_angle * u.deg,
-        # it moves with the telescope
+        gradient=config.scene.background_gradient / u.arcmin,
+        position_angle=config.scene.gradient_angle * u.deg,
         center=pointing_of(config, exposure),
     )
 
@@ -111,8 +108,7 @@ def expose_and_reduce(
     differ = perturbation or Perturbation({}, seed)
     sky = scene.Scene(
         differ.catalog(catalog, exposure.filter),
-        filter=exposure.filter,
-        wcs=exposure.wcs,
+        exposure=exposure,
         psf=differ.psf(exposure.filter),
         cutouts=differ.stamps,
         background=background_of(config, exposure),
@@ -153,13 +149,12 @@ def _sky_plan(config, unit):
     "exposures",
     "exposure",
     version=11,
-    needs={"truth": of_truth},
+    needs=("truth",),
     sections=(*IMAGES, "run.keep_level1b"),
     resources=EXPOSURE_RESOURCES,
     units=exposure_units,
     plan=_sky_plan,
     memory=exposure_memory,
-    kernels=("images",),
 )
 def make_exposure(context, unit):
     """Stages 4 to 7 of one exposure: scene, ramp, rate, calibrated image."""
@@ -198,12 +193,11 @@ def make_exposure(context, unit):
     "mosaics",
     "mosaic",
     version=8,
-    needs={"exposures": dithers_of_band},
+    needs=("exposures",),
     sections=(*GRID, "reduction", "highres.pixel_scale"),
     units=truth_bands,
     plan=exposure_plan,
     memory=mosaic_memory,
-    kernels=("images",),
 )
 def make_mosaic(context, unit):
     """Stage 8: drizzle the dithers of one band, on its own grid and on the prior's."""
@@ -238,12 +232,12 @@ DETECTION = ("photometry.threshold", "photometry.n_pixels")
     "highres",
     "high-resolution image",
     version=3,
-    needs={"truth": of_reference},
+    needs=("truth",),
+    within=reference,
     sections=(*GRID, "highres", *DETECTION),
     resources=("filters.sedpy",),
     plan=lambda config, _: {"exposures": exposure_plan(config), "truth": reference(config)},
     memory=mosaic_memory,
-    kernels=("images",),
 )
 def make_highres(context, _):
     """Stage 9: the high-resolution image, its segmentation and the detected sources."""
@@ -264,20 +258,11 @@ def prior_psf(config):
 
 def prior_image(config, catalog, wcs, *, seed):
     """High-resolution image of a catalog, its segmentation and the detected sources."""
-    options = config.highres
-    image = scene.highres_image(
-        catalog,
-        filter=options.filter,
-        wcs=wcs,
-        psf=prior_psf(config),
-        depth=options.depth * u.ABmag,
-        seed=seed,
-    )
-    detection = config.photometry
-    segmentation, detected = photometry.detect_sources(
-        image, threshold=detection.threshold, n_pixels=detection.n_pixels
-    )
-    return image, segmentation, detected
+    filter, depth = config.highres.filter, config.highres.depth * u.ABmag
+    sky = {"filter": filter, "wcs": wcs, "psf": prior_psf(config), "depth": depth}
+    image = scene.highres_image(catalog, **sky, seed=seed)
+    limits = {name: getattr(config.photometry, name) for name in ("threshold", "n_pixels")}
+    return image, *photometry.detect_sources(image, **limits)
 
 
 def mosaic_psf(config, name, scale):
@@ -305,15 +290,14 @@ def measured_mosaic(config):
     resources=IMAGE_RESOURCES,
     units=band_names,
     plan=exposure_plan,
-    kernels=("images", "photometry"),
 )
 def make_kernel(context, name):
     """Stage 10: the kernel from the high-resolution image to the mosaic of one band."""
-    config, value = context.config, context.config.photometry.regularization
+    config = context.config
     kernel = psf.MatchingKernel.from_psfs(
         prior_psf(config),
         mosaic_psf(config, name, config.reduction.pixel_scale),
         pixel_scale=config.highres.pixel_scale * u.arcsec,
-        regularization=value if value in ("auto", "yang2021") else float(value),
+        regularization=config.photometry.regularization,
     )
     context.save_result(f"kernel_{name}.fits", kernel)

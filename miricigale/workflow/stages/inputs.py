@@ -11,6 +11,7 @@ from miricigale.filters import Filter
 from miricigale.refdata import resources
 from miricigale.refdata.locate import fingerprint
 from miricigale.scene import read_catalog
+from miricigale.utils.content import file_sha256
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import ab_magnitude
@@ -33,14 +34,14 @@ def input_axes(kind, *, dust=False):
     return fitted if dust else fitted | {"alpha": np.array([2.0])}
 
 
-def _plain_axes(axes):
+def plain_axes(axes):
     """Plain values of a grid's axes, for hashing."""
     return {name: list(values) for name, values in axes.items()}
 
 
 def fit_plan(config, _):
     """The axes of the final fit, for hashing."""
-    return _plain_axes(sed.SEDModel.yang2021_axes(config.fit.axes))
+    return plain_axes(sed.SEDModel.yang2021_axes(config.fit.axes))
 
 
 def sed_resources():
@@ -94,22 +95,23 @@ def _catalog(options, state):
 
 def _input_plan(config, _):
     """Axes of the input fit, and the bands whose errors a user's catalog has, for hashing."""
-    plan = _plain_axes(input_axes(config.sed.axes))
+    plan = plain_axes(input_axes(config.sed.axes))
     if config.catalog.source not in resources():
-        catalog = study_catalog(config.catalog)
-        bands, _ = input_bands(catalog, config.sed.max_wavelength)
-        own = [name for name, errors in bands.items() if errors]
-        plan |= {"own errors": own} if own else {}
+        bands, _ = input_bands(study_catalog(config.catalog), config.sed.max_wavelength)
+        plan["own errors"] = [name for name, errors in bands.items() if errors]
     return plan
+
+
+def _content(source):
+    """Checksum of a catalog: the content of a user's file may change."""
+    return fingerprint(source) if source in resources() else file_sha256(Path(source).expanduser())
 
 
 @stage(
     "catalog",
     "catalog",
     sections=("catalog", "highres.filter"),
-    plan=lambda config, _: (
-        fingerprint(config.catalog.source) if config.catalog.source in resources() else ""
-    ),
+    plan=lambda config, _: _content(config.catalog.source),
 )
 def make_catalog(context, _):
     """Stage 1: read the catalog and cut it at the faint limit."""
@@ -145,7 +147,6 @@ def bright_sources(catalog, options, prior):
     sections=("sed.axes", "sed.catalog_error", "sed.max_wavelength", "fit.model_error"),
     resources=sed_resources,
     plan=_input_plan,
-    kernels=("fit",),
 )
 def fit_inputs(context, _):
     """Stage 2: fit a galaxy grid to the catalog's fluxes at the known redshifts."""

@@ -13,7 +13,6 @@ from miricigale.workflow.stages.exposures import (
     truth_bands,
 )
 from miricigale.workflow.stages.images import measured_mosaic, mosaic_psf, prior_psf
-from miricigale.workflow.truths import itself
 
 
 @stage(
@@ -23,7 +22,6 @@ from miricigale.workflow.truths import itself
     needs=("highres",),
     sections=("highres.filter", "highres.pixel_scale"),
     memory=mosaic_memory,
-    kernels=("photometry",),
 )
 def make_templates(context, _):
     """Stage 11, once for all bands: what the detected sources look like on the prior."""
@@ -37,18 +35,12 @@ def make_templates(context, _):
     "photometry",
     "forced photometry",
     version=5,
-    needs={
-        "mosaics": itself,
-        "highres": None,
-        "kernels": lambda config, unit: (unit.partition("/")[2],),
-        "templates": None,
-    },
+    needs=("mosaics", "highres", "kernels", "templates"),
     sections=(*KERNEL, "photometry.method"),
     resources=IMAGE_RESOURCES,
     units=truth_bands,
     plan=exposure_plan,
     memory=mosaic_memory,
-    kernels=("photometry",),
 )
 def measure_photometry(context, unit):
     """Stage 11: forced photometry of one band, on its own grid or by the steps of Yang et al. 2021."""

@@ -1,25 +1,17 @@
 """Perturbed truths: the accuracy that unknown properties of the sky cost, a section of the report."""
 
-from pathlib import Path
-
 import numpy as np
 from astropy.table import Table
 
 from miricigale.evaluation import bootstrap
 from miricigale.evaluation.estimates import median, outlier_share, scatter
-from miricigale.pages import Missing, number, sentence
-from miricigale.workflow.page.declared import texts_of
+from miricigale.pages import Missing, number
 from miricigale.workflow.page.labels import band_label, by_wavelength
 from miricigale.workflow.page.numbers import bright_isolated
-from miricigale.workflow.truths import ALL, CUTOUTS, EFFECTS
-
-#: Samples drawn for an error.
-N_DRAWS = 1000
+from miricigale.workflow.truths import ALL, EFFECTS
 
 #: Name of what no effect has changed.
 NONE = "none"
-#: Sizes of effects that the page gives in percent.
-_SHARES = ("psf_width", "flat", "gain", "linearity", "zero_point", "zero_point_existing", "clumps")
 _LABELS = {NONE: "none", **EFFECTS, ALL: "all together"}
 
 
@@ -86,44 +78,27 @@ def perturbation_costs(truths, every, bands, *, seed):
         skies = {t.name.removeprefix(f"{base}+"): t.name for t in perturbed if t.base == base}
         for name, (kind, band, statistic) in _quantities(bands).items():
             ids, known = _errors(every[base], kind, band)
-            plain = bootstrap(statistic, known, seed=seed, n_draws=N_DRAWS)
+            plain = bootstrap(statistic, known, seed=seed)
             rows.append((base, NONE, name, plain.n, plain.value, plain.error, np.nan, np.nan))
             for which, sky in skies.items():
                 own_ids, own = _errors(every[sky], kind, band)
                 _, first, second = np.intersect1d(ids, own_ids, return_indices=True)
-                cost = _cost(statistic, known[first], own[second], seed)
+                pair = known[first], own[second]
+                value = bootstrap(statistic, pair[1], seed=seed)
+                change = bootstrap(lambda a, b, of=statistic: of(b) - of(a), *pair, seed=seed)
+                cost = value.n, value.value, value.error, change.value, change.error
                 rows.append((base, which, name, *cost))
     names = ["truth", "perturbation", "quantity", "n", "value", "value_err", "change", "change_err"]
     return Table(rows=rows, names=names) if rows else Table(names=names)
 
 
-def _cost(statistic, known, own, seed):
-    """Number of pairs, statistic of the second, its error, its change and the change's error."""
-    value = bootstrap(statistic, own, seed=seed, n_draws=N_DRAWS)
-    change = bootstrap(
-        lambda first, second: statistic(second) - statistic(first),
-        known,
-        own,
-        seed=seed,
-        n_draws=N_DRAWS,
-    )
-    return value.n, value.value, value.error, change.value, change.error
-
-
 def write_perturbed(page, truths, every):
     """Write the section with one table, if there are perturbed truths."""
-    config, options = page.config, page.config.perturb
+    config = page.config
     table = perturbation_costs(truths, every, config.exposures.filters, seed=page.context.seed)
     if len(table) == 0:
         return
-    sizes = {name: 100 * getattr(options, name) for name in _SHARES}
-    sizes |= {"astrometry": 1000 * options.astrometry, "image": Path(options.cutouts).name}
-    effects = {name for truth in truths.values() for name, _ in truth.perturbations}
-    shapes = {"clumps": "clumps", CUTOUTS: f"cutouts_{options.cutouts_of}"}
-    texts = texts_of("perturbations")
-    shown = "; ".join(texts[label] for name, label in shapes.items() if name in effects)
-    shapes = sentence(f" ({shown})", sizes) if shown else ""
-    page.numbers("perturbations", table, shapes=shapes, **sizes)
+    page.numbers("perturbations", table, size=config.perturb)
     rows = {}
     for row in table:
         known = {"sky": row["truth"], "perturbation": _LABELS[row["perturbation"]]}

@@ -67,7 +67,6 @@ def point_catalog(exposure, band_flux, prior, *, spacing, seed):
     units=lambda config: band_names(config) if config.point_sources.enabled else (),
     plan=exposure_plan,
     memory=exposure_memory,
-    kernels=("images", "photometry"),
 )
 def measure_point_sources(context, name):
     """Simulate, reduce and measure bright point sources in one band, as the study does."""

@@ -29,7 +29,7 @@ from miricigale.workflow.page.provenance import stand_ins, write_exposures, writ
 from miricigale.workflow.page.result_sections import write_results
 from miricigale.workflow.page.study_page import StudyPage
 from miricigale.workflow.stages import experiments, perturbed, rivals, variants
-from miricigale.workflow.stages.exposures import EXPOSURE_RESOURCES, GRID, exposure_plan
+from miricigale.workflow.stages.exposures import EXPOSURE_RESOURCES, IMAGES, exposure_plan
 from miricigale.workflow.stages.inputs import sed_resources
 from miricigale.workflow.stages.sample import footprint_area
 from miricigale.workflow.truths import reference, study_truths
@@ -40,16 +40,8 @@ log = logging.getLogger(__name__)
 #: Stages whose products are read: of the images, and of the measurements.
 _IMAGES = ("exposures", "mosaics", "highres", "kernels", "points", "variants")
 _TABLES = ("catalog", "truth", "photometry", "errors", "matches", "rivals", "fits", "experiments")
-#: Sections of the configuration on the sky and the images, and on the measurements.
-_SKY = (*GRID, "run.name", "catalog", "sed", "scene", "detector", "highres.filter", "perturb")
-_MEASURED = (
-    "photometry.method",
-    "photometry.rivals",
-    "reduction",
-    "fit",
-    "errors",
-    "point_sources",
-)
+#: Sections of the configuration on the measurements.
+_MEASURED = ("highres", "photometry", "errors", "fit", "point_sources", "perturb", "variants")
 
 
 @stage(
@@ -57,10 +49,9 @@ _MEASURED = (
     "report",
     version=7,
     needs=(*_IMAGES, *_TABLES),
-    sections=(*_SKY, *_MEASURED, "highres.pixel_scale", "variants", "report"),
+    sections=("run.name", "catalog", "sed", *IMAGES, *_MEASURED, "report"),
     resources=lambda: (*sed_resources(), *EXPOSURE_RESOURCES),
     plan=exposure_plan,
-    kernels=("fit",),
 )
 def make_report(context, _):
     """Stage 14: the page with its figures, and the numbers as JSON."""

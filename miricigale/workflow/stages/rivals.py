@@ -22,7 +22,7 @@ from miricigale.workflow.stages.exposures import (
 )
 from miricigale.workflow.stages.measure import measure_band
 from miricigale.workflow.stages.sample import SampleFlags, in_field
-from miricigale.workflow.truths import itself, of_reference, reference
+from miricigale.workflow.truths import reference
 
 #: Methods that are compared: name of the columns, and what the page calls them.
 RIVALS = {
@@ -42,14 +42,8 @@ SIZE_RANGES = ((0.0, 0.2), (0.2, 0.4), (0.4, 0.8), (0.8, np.inf))
     "rivals",
     "rival photometry",
     version=2,
-    needs={
-        "truth": of_reference,
-        "mosaics": lambda config, band: (f"{reference(config)}/{band}",),
-        "highres": None,
-        "kernels": itself,
-        "templates": None,
-        "matches": of_reference,
-    },
+    needs=("truth", "mosaics", "highres", "kernels", "templates", "matches"),
+    within=reference,
     sections=(*KERNEL, "photometry.method", "photometry.match_radius"),
     resources=IMAGE_RESOURCES,
     units=lambda config: band_names(config) if config.photometry.rivals else (),
@@ -57,7 +51,6 @@ SIZE_RANGES = ((0.0, 0.2), (0.2, 0.4), (0.4, 0.8), (0.8, np.inf))
         "truth": reference(config),
         "exposures": exposure_plan(config, band),
     },
-    kernels=("photometry",),
 )
 def measure_rivals(context, name):
     """Measure a band of the reference truth by the other method and as Source Extractor does."""
@@ -72,15 +65,13 @@ def measure_rivals(context, name):
     blind = photometry.source_extractor_photometry(mosaic)
     n_blind = np.count_nonzero(in_field(blind["sky"], [mosaic])) if len(blind) else 0
     table = rival_table(truth, matched, name, own=own, inside=in_field(truth["sky"], [mosaic]))
-    for method, measured, column in (
-        (other, forced, "flux"),
-        ("source_extractor", blind, "flux_best"),
-    ):
+    found = {other: (forced, "flux"), "source_extractor": (blind, "flux_best")}
+    for method, (measured, column) in found.items():
         rows = QTable({"id": np.arange(len(measured)), "sky": measured["sky"]})
         rows[name], rows[error_column(name)] = measured[column], measured[error_column(column)]
         rows["flags"] = np.zeros(len(rows), int)
-        found = match_truth(truth, rows, [name], radius=radius)
-        table[method], table[error_column(method)] = found[name], found[error_column(name)]
+        near = match_truth(truth, rows, [name], radius=radius)
+        table[method], table[error_column(method)] = near[name], near[error_column(name)]
     table.meta.update(method=own, n_source_extractor=int(n_blind))
     context.save_table(f"rivals/{name}.ecsv", table)
 
@@ -119,20 +110,22 @@ def _groups(table):
     """Rows of a table of a band by group: kind and name of the group, and which rows."""
     usable = np.asarray(table["field"]) & ~np.asarray(table["edge"])
     snr, crowded = np.asarray(table["snr"], float), np.asarray(table["crowded"])
-    with np.errstate(invalid="ignore"):
-        bright = usable & (snr > 5)
-        yield "all", "above 5 sigma", bright
-        for low, high in SNR_RANGES:
-            name = f"{low:g} to {high:g}" if np.isfinite(high) else f"above {low:g}"
-            yield "true S/N", name, usable & (snr > low) & (snr <= high)
+    size, shape = table["half_light_radius"].value, np.asarray(table["shape"])
+    bright = usable & (snr > 5)
+    yield "all", "above 5 sigma", bright
+    for low, high in SNR_RANGES:
+        yield "true S/N", _range_name(low, high), usable & (snr > low) & (snr <= high)
     for name in ("point", "n < 2", "n >= 2"):
-        yield "shape", name, bright & (np.asarray(table["shape"]) == name)
-    size, point = table["half_light_radius"].value, np.asarray(table["shape"]) == "point"
+        yield "shape", name, bright & (shape == name)
     for low, high in SIZE_RANGES:
-        name = f"{low:g} to {high:g} arcsec" if np.isfinite(high) else f"above {low:g} arcsec"
-        yield "half-light radius", name, bright & ~point & (size >= low) & (size < high)
+        inside = (shape != "point") & (size >= low) & (size < high)
+        yield "half-light radius", f"{_range_name(low, high)} arcsec", bright & inside
     yield "neighbors", "isolated", bright & ~crowded
     yield "neighbors", "crowded", bright & crowded
+
+
+def _range_name(low, high):
+    return f"{low:g} to {high:g}" if np.isfinite(high) else f"above {low:g}"
 
 
 def rival_numbers(tables):
@@ -161,10 +154,9 @@ def rival_numbers(tables):
                 ratio = recovery_metrics(true, flux, relative=True)
                 with np.errstate(invalid="ignore", divide="ignore"):
                     pulls = recovery_metrics(np.zeros(true.size), (flux - true) / error)
-                sizes = true.size, ratio.n
-                ratios = ratio.median, ratio.median_err, ratio.sigma_mad
-                pair = pulls.median, pulls.sigma_mad
-                found.append((band, kind, group, method, *sizes, *ratios, *pair))
+                numbers = ratio.median, ratio.median_err, ratio.sigma_mad
+                numbers += pulls.median, pulls.sigma_mad
+                found.append((band, kind, group, method, true.size, ratio.n, *numbers))
     return described_rows(found, texts_of("rivals")["numbers"])
 
 
@@ -189,9 +181,8 @@ def rival_counts(table):
 def _se_offset(table, seed):
     """Source Extractor minus template fit (mag) of sources above 5 sigma: an `Estimate`."""
     blind, forced = table["source_extractor"].value, table["yang2021"].value
-    with np.errstate(invalid="ignore"):
-        good = np.asarray(table["field"]) & (np.asarray(table["snr"], float) > 5)
-        good &= (blind > 0) & (forced > 0)
+    good = np.asarray(table["field"]) & (np.asarray(table["snr"], float) > 5)
+    good &= (blind > 0) & (forced > 0)
     delta = -2.5 * np.log10(blind[good] / forced[good])
     return bootstrap(median, delta, seed=seed)
 

@@ -86,8 +86,7 @@ def footprint_area(images):
 
 def detected_bands(table, bands):
     """Number of bands in which each source is above five times its error."""
-    with np.errstate(invalid="ignore"):
-        return sum((table[name] > 5 * table[error_column(name)]).astype(int) for name in bands)
+    return sum((table[name] > 5 * table[error_column(name)]).astype(int) for name in bands)
 
 
 def add_selection(matched, truth, bands, *, inside, min_detected, redshifts):

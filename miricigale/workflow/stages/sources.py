@@ -19,10 +19,9 @@ from miricigale.workflow.page.labels import SET_COLORS, SET_LABELS, band_label
 from miricigale.workflow.page.numbers import StudyTables
 from miricigale.workflow.stages.conditions import ConditionFlags, any_condition
 from miricigale.workflow.stages.cutouts import Cutouts
-from miricigale.workflow.stages.exposures import bands_of_truth
 from miricigale.workflow.stages.inputs import sed_resources
 from miricigale.workflow.stages.sample import SampleFlags
-from miricigale.workflow.truths import of_truth, truth_names
+from miricigale.workflow.truths import truth_names
 
 #: Sources whose details and pictures are in one file.
 CHUNK = 32
@@ -43,29 +42,11 @@ FLAGS = {
 @stage(
     "sources",
     "source browser",
-    needs={
-        "truth": of_truth,
-        "mosaics": bands_of_truth,
-        "highres": None,
-        "photometry": bands_of_truth,
-        "matches": of_truth,
-        "fits": lambda config, unit: [f"{unit}/{name}" for name in config.fit.sets],
-    },
-    sections=(
-        "run.name",
-        "exposures.filters",
-        "highres.filter",
-        "highres.pixel_scale",
-        "photometry.method",
-        "reduction.pixel_scale",
-        "fit.bands",
-        "fit.sets",
-        "report.pictures",
-    ),
+    needs=("truth", "mosaics", "highres", "photometry", "matches", "fits"),
+    sections=("run.name", "exposures", "highres", "photometry", "reduction", "fit", "report"),
     resources=sed_resources,
     units=truth_names,
     plan=lambda config, _: list(truth_names(config)),
-    kernels=("fit",),
 )
 def make_sources(context, name):
     """Stage 14, in addition: the page of a truth, and what it shows of its sources, `CHUNK` in a file."""
@@ -127,13 +108,10 @@ class _Sources(StudyTables):
         # with and without MIRI: the sets in the table and the figure of the spectrum
         both = [unit for unit in ("all", "none") if unit in self.results]
         self.compared = both or list(self.results)[:2]
-        every = list(self.results.values())
-        self.units = {
-            parameter: every[0].unit(parameter)
-            for parameter in every[0].parameters
-            if parameter in truth.colnames
-            and all(parameter in results.parameters for results in every)
-        }
+        # all sets are fitted with the same model
+        fitted = next(iter(self.results.values()))
+        known = [name for name in fitted.parameters if name in truth.colnames]
+        self.units = {name: fitted.unit(name) for name in known}
         # columns without a unit are in that of the parameter
         self.parameters = np.transpose(
             [u.Quantity(truth[key], unit, dtype=float).value for key, unit in self.units.items()]
@@ -180,8 +158,7 @@ class _Sources(StudyTables):
         for unit in self.compared:
             fits = self.fits[unit]
             for parameter in DRAWN:
-                if (mean := f"{parameter}_mean") in fits.colnames:
-                    columns[f"{parameter}_{unit}"] = self.of_sources(fits[mean])
+                columns[f"{parameter}_{unit}"] = self.of_sources(fits[f"{parameter}_mean"])
             columns[f"chi2_{unit}"] = self.of_sources(self.results[unit].reduced_chi2)
         for band in self.miri:
             flux, error = self._measured(band)
@@ -211,7 +188,7 @@ class _Sources(StudyTables):
             ],
             "wave": _rounded(np.sqrt(self.edges[1:] * self.edges[:-1])),
             "pdf_edges": {
-                unit: {key: _rounded(found.distribution(key)[0].value) for key in _drawn(found)}
+                unit: {key: _rounded(found.distribution(key)[0].value) for key in DRAWN}
                 for unit, found in self.results.items()
             },
             "parameters": [{"name": key, "unit": str(unit)} for key, unit in self.units.items()],
@@ -244,7 +221,7 @@ class _Sources(StudyTables):
                 [_rounded(moment(name).to_value(own)) for moment in (one.mean, one.std)]
                 for name, own in self.units.items()
             ],
-            "pdf": {name: _weights(one.pdf[name]) for name in _drawn(one)},
+            "pdf": {name: _weights(one.pdf[name]) for name in DRAWN},
         }
         if unit in self.compared:
             best = one.best_sed(self.model)
@@ -252,11 +229,6 @@ class _Sources(StudyTables):
             # thousandths of log10
             fit["spectrum"] = [round(1000 * np.log10(x)) if x > 0 else None for x in means]
         return fit
-
-
-def _drawn(results):
-    """Those of the drawn parameters that a fit has posteriors of."""
-    return [name for name in DRAWN if name in results.axes]
 
 
 def _weights(pdf):

@@ -53,16 +53,14 @@ def galaxy_parameters(config, catalog, best, *, seed):
             table[name] = best[f"{name}_best"]
     if "alpha" not in table.colnames:
         # the bands of the fit do not show it
-        low, high = config.sed.alpha
-        streams = (stream(seed, "truth", "alpha", str(key)) for key in table["id"])
+        values = low, high = config.sed.alpha
         if config.sed.alpha_draw == "nodes":
             nodes = sed.SEDModel.yang2021_axes("fit")["alpha"]
-            nodes = nodes[(nodes >= low) & (nodes <= high)]
+            values = list(nodes[(nodes >= low) & (nodes <= high)])
             wanted = "must hold a node of the fit's grid with alpha_draw = 'nodes'"
-            require(len(nodes), "sed", "alpha", wanted, [low, high])
-            table["alpha"] = [rng.choice(nodes) for rng in streams]
-        else:
-            table["alpha"] = [rng.uniform(low, high) for rng in streams]
+            require(values, "sed", "alpha", wanted, [low, high])
+        streams = (stream(seed, "truth", "alpha", str(key)) for key in table["id"])
+        table["alpha"] = [_draw(rng, values) for rng in streams]
     model, prior = sed.SEDModel.yang2021(agn=False), config.highres.filter
     if prior in catalog.colnames:
         fitted, measured = model.fluxes(table, [prior])[prior], catalog[prior]
@@ -103,9 +101,8 @@ def catalog_fractions(catalog):
     values = np.asarray(catalog["frac_agn"], float)
     bad = values[~((values >= 0) & (values <= 0.99))]
     wanted = "'catalog' needs a column frac_agn of values between 0 and 0.99"
-    require(
-        not len(bad), "sed", "frac_agn", wanted, f"{len(bad)} of {len(values)} others, {bad[:3]}"
-    )
+    got = f"{len(bad)} of {len(values)} others, {bad[:3]}"
+    require(not len(bad), "sed", "frac_agn", wanted, got)
     return values
 
 
@@ -147,14 +144,14 @@ def library_fluxes(model, parameters, bands):
 def _truth_plan(config, unit):
     """The truth; libraries of its models where they are others than those of the fits; content of its files."""
     values = study_truths(config)[unit].values()
-    if CUTOUTS in values.get("perturbations", {}):
-        files = values["perturbations"][CUTOUTS]
+    effects = values.get("perturbations", {})
+    if CUTOUTS in effects:
+        files = effects[CUTOUTS]
         paths = [file_place(files[key])[0] for key in ("image", "psf") if files[key]]
         values["files"] = [file_sha256(Path(path).expanduser()) for path in paths]
-    model = perturbed_model(values.get("perturbations", {}), agn=values["frac_agn"] != 0)
-    if model is None:
-        return values
-    return values | {"libraries": {name: fingerprint(name) for name in model.resources}}
+    if model := perturbed_model(effects, agn=values["frac_agn"] != 0):
+        values["libraries"] = {name: fingerprint(name) for name in model.resources}
+    return values
 
 
 @stage(
@@ -166,7 +163,6 @@ def _truth_plan(config, unit):
     resources=sed_resources,
     units=truth_names,
     plan=_truth_plan,
-    kernels=("fit",),
 )
 def make_truth(context, name):
     """Stage 3: the best-fit SED (and its AGN) of each source through every band."""
@@ -180,12 +176,10 @@ def make_truth(context, name):
     model = sed.SEDModel.yang2021(agn=frac_agn != 0)
     if frac_agn == FIELD:
         add_field_agn(parameters, model, bands[0], context.seed)
-    elif frac_agn == CATALOG:
-        add_agn(parameters, catalog_fractions(catalog), context.seed)
-    elif frac_agn > 0:
-        add_agn(parameters, frac_agn, context.seed)
-    other = perturbed_model(effects, agn=model.has_agn)
-    if other is not None:
+    elif model.has_agn:
+        shares = catalog_fractions(catalog) if frac_agn == CATALOG else frac_agn
+        add_agn(parameters, shares, context.seed)
+    if other := perturbed_model(effects, agn=model.has_agn):
         models = model, other
         parameters = perturbed_parameters(effects, parameters, models, prior, seed=context.seed)
         model = other

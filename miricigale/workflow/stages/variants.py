@@ -3,11 +3,9 @@
 import astropy.units as u
 import numpy as np
 from astropy.stats import biweight_scale
-from markupsafe import Markup
 
 from miricigale import psf, scene
 from miricigale.evaluation import Estimate, match_truth
-from miricigale.pages import number
 from miricigale.photometry.error_curves import limiting_flux, measured_curve
 from miricigale.utils.random import stream
 from miricigale.utils.tables import described_rows, error_column
@@ -15,7 +13,7 @@ from miricigale.workflow.derived import changed_config
 from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.page.band_figures import variant_figure
 from miricigale.workflow.page.declared import texts_of
-from miricigale.workflow.page.labels import band_label, by_wavelength
+from miricigale.workflow.page.labels import band_label
 from miricigale.workflow.stages.exposures import (
     EXPOSURE_RESOURCES,
     IMAGES,
@@ -32,10 +30,8 @@ from miricigale.workflow.stages.images import (
 )
 from miricigale.workflow.stages.measure import joined_photometry, measure_band
 from miricigale.workflow.stages.sample import SampleFlags
-from miricigale.workflow.truths import itself, of_reference, reference, variant_changes
+from miricigale.workflow.truths import reference, variant_changes
 
-#: Why a scatter has no change: of the study itself, or unknown.
-_SAME = "compared with itself, or no limit"
 #: Draws of the sources for the errors of limits.
 N_DRAWS = 100
 #: What images are called: where the key is on, and where it is off.
@@ -52,7 +48,8 @@ _OUT = SampleFlags.OUTSIDE_FIELD | SampleFlags.STAR | SampleFlags.NO_MODEL
     "variants",
     "variant images",
     version=3,
-    needs={"truth": of_reference, "highres": None, "kernels": itself, "templates": None},
+    needs=("truth", "highres", "kernels", "templates"),
+    within=reference,
     sections=(*IMAGES, "highres", "photometry.method", "photometry.match_radius"),
     resources=EXPOSURE_RESOURCES,
     units=lambda config: band_names(config) if config.variants.images else (),
@@ -61,7 +58,6 @@ _OUT = SampleFlags.OUTSIDE_FIELD | SampleFlags.STAR | SampleFlags.NO_MODEL
         "exposures": exposure_plan(config, unit),
         "changes": variant_changes(config),
     },
-    kernels=("images", "photometry"),
 )
 def measure_variants(context, band):
     """Expose, reduce and measure a band of the reference truth with one setting changed at a time."""
@@ -72,18 +68,16 @@ def measure_variants(context, band):
     options = {"filter": band, "psf": psf.miri_psf(band), "n_threads": context.n_threads}
     lights = [scene.Scene(truth, wcs=e.wcs, **options).render() for e in exposures]
     suffix, _ = measured_mosaic(config)
+    common = {"seed": context.seed, "n_threads": context.n_threads}
     for name, changes in plan["changes"].items():
         # all by rates, also where the study simulates ramps
         changes = {**changes, "exposures": {"kind": "rates"}}
         own = changed_config(config, (*IMAGES, "highres"), changes)
-        imager, images = imager_of(own), []
+        images = []
         for exposure, light in zip(exposures, lights, strict=True):
             image = light.copy()
             image.data += background_of(own, exposure).image(exposure.wcs, exposure.shape)
-            _, cal = expose_image(
-                own, imager, image, exposure, seed=context.seed, n_threads=context.n_threads
-            )
-            images.append(cal)
+            images.append(expose_image(own, imager_of(own), image, exposure, **common)[1])
         mosaic = next(one for label, one, _ in mosaics_of(own, images) if label == suffix)
         result = measure_band(context, mosaic, band, config.photometry.method).to_table()
         radius = config.photometry.match_radius * u.arcsec
@@ -215,27 +209,8 @@ def write_variants(page, matched, limits):
     page.numbers("variants", table)
     labels = {name: variant_label(name, changes) for name in (STUDY, *changes)}
     page.figure("figure", variant_figure(table, labels))
-    by_rates = " by rates" if RATES in changes else ""
-    page.table("table", variant_entries(table, changes), by_rates=by_rates)
-    if "gradient" in changes:
-        _write_gradient(page, table, changes)
+    page.table("table", variant_entries(table, changes))
     return table
-
-
-def _write_gradient(page, table, changes):
-    """Add a sentence on the effect of the gradient in the longest band, if it is known."""
-    band = by_wavelength(set(table["band"]))[-1]
-    effects = []
-    for row in table[table["band"] == band]:
-        if row["images"] in ("gradient", "plane") and np.isfinite(row["limit_change"]):
-            limit, scatter = (
-                number(row[key], spec, _SAME, error=row[f"{key}_err"])
-                for key, spec in (("limit_change", "+.2f"), ("scatter_change", "+.1f %"))
-            )
-            label = variant_label(row["images"], changes)
-            effects.append(page.sentence("effect", images=label, limit=limit, scatter=scatter))
-    if effects:
-        page.text("gradient", band=band_label(band), effects=Markup("; ").join(effects))
 
 
 def add_reasons(reasons, table, config):
