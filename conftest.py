@@ -8,6 +8,10 @@ from pathlib import Path
 
 import pytest
 
+# processes are forked, stopped by signals and limited there, which Windows does not know
+POSIX = ("integration/test_study.py", "utils/test_lock.py", "workflow/test_robust.py")
+collect_ignore = [f"tests/{name}" for name in POSIX] if os.name == "nt" else []
+
 
 def pytest_configure(config):
     # figures belong to no window

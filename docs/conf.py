@@ -4,6 +4,7 @@ import doctest
 import importlib.metadata
 import os
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -98,6 +99,19 @@ def draw_figures(app):
         plt.close("all")
 
 
+def draft_changes(app):
+    """Join the fragments of the next release, as towncrier will, for the page of changes."""
+    command = [sys.executable, "-m", "towncrier", "build", "--draft"]
+    command += ["--version", version, "--date", "unreleased"]
+    text = subprocess.run(
+        command, cwd=Path(app.srcdir).parent, check=True, stdout=subprocess.PIPE, text=True
+    ).stdout
+    path = Path(app.srcdir) / "_build" / "unreleased.rst"
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+
+
 def setup(app):
     """Add what these pages need to Sphinx."""
     app.connect("builder-inited", draw_figures)
+    app.connect("builder-inited", draft_changes)

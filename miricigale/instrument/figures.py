@@ -10,7 +10,7 @@ from miricigale.refdata import locate
 @functools.cache
 def table(name="imager"):
     """A table of the instrument (``imager``, ``siaf``, ``etc``) as a dict."""
-    return tomllib.loads(locate(f"instrument.{name}").read_text())
+    return tomllib.loads(locate(f"instrument.{name}").read_text(encoding="utf-8"))
 
 
 def imager_filters():

@@ -62,7 +62,7 @@ def resources():
     -------
     records : dict of str to `Resource`
     """
-    text = (importlib_resources.files("miricigale.refdata") / "resources.toml").read_text()
+    text = (importlib_resources.files("miricigale.refdata") / "resources.toml").read_text("utf-8")
     return {name: Resource(name=name, **entry) for name, entry in tomllib.loads(text).items()}
 
 

@@ -17,7 +17,7 @@ import sys
 import threading
 from pathlib import Path
 
-from miricigale.utils.parallel import thread_pool
+from miricigale.utils.parallel import threads
 
 # shown by the command line at any verbosity
 log = logging.getLogger("miricigale.utils.compilation")
@@ -143,7 +143,7 @@ def compile_missing(n_threads):
     for name in names:
         _, what, seconds = JOBS[name]
         log.info("compiling %s, once for each installation, up to %d s", what, seconds)
-    with thread_pool(n_threads) as executor:
+    with threads(n_threads) as executor:
         return all(list(executor.map(compile_apart, names)))
 
 

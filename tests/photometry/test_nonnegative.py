@@ -31,9 +31,10 @@ def test_solution_is_that_of_lawson_and_hanson(overlap, n_common):
         normal = scipy.sparse.csr_array(a.T @ a)
         fit = LinearFit(normal, a.T @ data, a.T @ common, common.T @ common, common.T @ data)
         found = nonnegative_fluxes(fit, len(fit.rhs))
-        # free parameters as the difference of two that are not negative
-        expected, _ = scipy.optimize.nnls(np.hstack([a, common, -common]), data)
-        assert_allclose(found, expected[:n], atol=1e-7 * max(1, np.abs(expected).max()))
+        # in the space that free parameters cannot reach
+        beside = np.eye(len(data)) - common @ np.linalg.pinv(common)
+        expected, _ = scipy.optimize.nnls(beside @ a, beside @ data)
+        assert_allclose(found, expected, atol=1e-7 * max(1, np.abs(expected).max()))
         # conditions of Karush, Kuhn and Tucker
         rest = data - a @ found
         rest = rest - common @ np.linalg.lstsq(common, rest)[0] if n_common else rest

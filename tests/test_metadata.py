@@ -1,0 +1,51 @@
+"""What is said of the package in several files is the same in all of them."""
+
+import configparser
+import re
+import tomllib
+from pathlib import Path
+
+from packaging.requirements import Requirement
+from packaging.version import Version
+
+ROOT = Path(__file__).parents[1]
+SETUP = configparser.ConfigParser()
+SETUP.read(ROOT / "setup.cfg", encoding="utf-8")
+EXTRAS = SETUP["options.extras_require"]
+
+
+def requirements(text):
+    return [Requirement(line) for line in text.split("\n") if line]
+
+
+def test_oldestdeps_are_the_lower_bounds():
+    tox = (ROOT / "tox.ini").read_text(encoding="utf-8")
+    pinned = dict(re.findall(r"^ +oldestdeps: ([\w-]+)==(\S+)$", tox, re.MULTILINE))
+    bounds = {
+        item.name: specifier.version
+        for item in requirements(SETUP["options"]["install_requires"] + EXTRAS["test"])
+        for specifier in item.specifier
+    }
+    assert {name: Version(number) for name, number in pinned.items()} == {
+        name: Version(number) for name, number in bounds.items()
+    }
+
+
+def test_extras_are_documented():
+    page = (ROOT / "docs/install.rst").read_text(encoding="utf-8")
+    documented = dict(re.findall(r"^``(\w+)`` {2,}(.*)$", page, re.MULTILINE))
+    assert sorted(documented) == sorted(EXTRAS)
+    (everything,) = requirements(EXTRAS["all"])
+    assert set(re.findall(r"``(\w+)``", documented["all"])) == everything.extras
+
+
+def test_citation_has_the_version_of_the_last_release():
+    changes = (ROOT / "CHANGES.rst").read_text(encoding="utf-8")
+    released = re.search(r"^(\d\S*) \((\d{4}-\d\d-\d\d)\)$", changes, re.MULTILINE)
+    scm = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]
+    version, date = (
+        released.groups() if released else (scm["setuptools_scm"]["fallback_version"], None)
+    )
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    stated = dict(re.findall(r"^(version|date-released): (\S+)$", citation, re.MULTILINE))
+    assert (stated["version"], stated.get("date-released")) == (version, date)
