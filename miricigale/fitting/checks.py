@@ -193,6 +193,15 @@ class MockResult:
         ends = self.recovered.percentile(name, _LEVELS).value[good]
         return (true >= ends[:, 0]) & (true <= ends[:, 1])
 
+    def plot(self, name="redshift", ax=None, **kwargs):
+        """Draw recovered against true values of a parameter; returns the axes."""
+        from miricigale.plotting.posteriors import plot_recovery
+
+        found, unit = self.recovered, self.truth.unit(name).to_string()
+        kwargs = {"name": name, "unit": unit, "log": self.truth.extensive(name), "ax": ax} | kwargs
+        values = (self.true(name), found.mean(name), found.std(name))
+        return plot_recovery(*(quantity.value for quantity in values), **kwargs)
+
 
 def _statistic(function, values):
     """A number that sums up some values; NaN of none."""
@@ -362,3 +371,11 @@ class LeaveOutResult:
         offset = _statistic(np.median, flux[model > 0] / model[model > 0]) - 1.0
         spread = (_statistic(function, pull) for function in (np.median, mad_std))
         return int(pull.size), offset, *spread, _statistic(np.mean, np.abs(pull) <= 1.0)
+
+    def plot(self, band=None, ax=None, **kwargs):
+        """Draw the distribution of the pulls of one band, or of all; returns the axes."""
+        from miricigale.plotting.posteriors import plot_pulls
+
+        check_names(() if band is None else [band], "band that was left out", self.bands)
+        pull = self.pull if band is None else self.pull[:, self.bands.index(band)]
+        return plot_pulls(pull.ravel(), ax=ax, **{"label": band, **kwargs})

@@ -134,6 +134,8 @@ class Scene(Interactive):
             raise argument_error("wcs", "a WCS with its pixel_shape", "one without")
         name = str(getattr(filter, "name", filter))
         self._wcs, self._filter = wcs, find_filter(name) or name
+        #: The exposure that the image is for, or None; `~miricigale.detector.Detector.expose` asks for it.
+        self.exposure = exposure
         if isinstance(catalog, str) and catalog in resources():
             catalog = read_catalog(catalog)
         sources = as_sources(catalog, self._filter)

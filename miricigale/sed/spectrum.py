@@ -132,6 +132,11 @@ class SED(Frozen, Interactive):
         return self.meta.get("derived", {})
 
     @property
+    def rest_wavelength(self):
+        """Wavelengths at the source, um."""
+        return self.wave / (1.0 + self.redshift)
+
+    @property
     def frequency(self):
         """Observed frequencies, Hz."""
         return self.wave.to(u.Hz, u.spectral())

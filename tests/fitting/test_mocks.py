@@ -7,6 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
 from miricigale.fitting import BayesFitter, leave_out, mock_analysis
+from miricigale.plotting.axes import new_figure
 
 
 @pytest.fixture(scope="module")
@@ -148,3 +149,13 @@ def test_nothing_left_to_fit_or_to_compare_is_refused(fitter, catalog):
     assert np.isfinite(leave_out(fitter, table, ["band5"]).predicted).any()
     assert len(leave_out(fitter, catalog[:0], ["band1"])) == 0
     refuses("'fitter' must be a BayesFitter, got dict", leave_out, {}, catalog, ["band1"])
+
+
+def test_drawing(mock, fitter, catalog):
+    ax = new_figure()[1][0, 0]
+    assert mock.plot("mass", ax=ax) is ax
+    assert ax.get_xscale() == "log"
+    assert "Gyr" in mock.plot("age", ax=new_figure()[1][0, 0]).get_xlabel()
+    out = leave_out(fitter, catalog[:50], ["band1"])
+    assert out.plot("band1", ax=new_figure()[1][0, 0]).get_xlim() == (-5, 5)
+    refuses("no band that was left out 'band2'", out.plot, "band2", error=KeyError)
