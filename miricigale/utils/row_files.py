@@ -131,8 +131,10 @@ class _FitsRows(RowFile):
         wanted = self._hdu.upper() if isinstance(self._hdu, str) else self._hdu
         chosen = [i for i in tables if wanted in (None, i, hdus[i].name)]
         if len(chosen) != 1:
-            asked = "'hdu' says which is meant" if wanted is None else f"{wanted!r} is none of them"
-            msg = f"{self.path} has {len(tables)} binary tables; {asked}"
+            what = f"no binary table in extension {wanted!r}"
+            if wanted is None:
+                what = f"{len(tables)} binary tables; 'hdu' says which is meant"
+            msg = f"{self.path} has {what}"
             raise DataError(msg)
         return hdus[chosen[0]]
 

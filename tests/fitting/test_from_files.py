@@ -173,7 +173,7 @@ def test_ctrl_c_keeps_what_is_finished(catalog, tmp_path, capsys, monkeypatch):
     ("options", "message"),
     [
         (["--redshift", "z_phot"], "'redshift' must be a column among"),
-        (["--hdu", "SECOND"], "has no extension 'SECOND'"),
+        (["--hdu", "SECOND"], "no binary table in extension 'SECOND'"),
         (["--chunk-rows", "0"], "'chunk_rows' must be an integer >= 1, got 0"),
         (["--pairs", "age:mood"], "no parameter for 'pairs' 'mood'; known: age"),
         (["--flux-unit", "mag"], "'flux_unit' must be convertible to uJy, got mag"),
