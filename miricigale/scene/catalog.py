@@ -60,9 +60,10 @@ class CatalogFlags(Flags):
     NO_FLUX = 32  # no band has a positive flux (with a positive error, where it has errors)
     MISSING_CODE = 64  # a flux or error was a number that stands for no value, such as -99
 
-
-#: What makes a Sersic profile be drawn as a point.
-UNUSABLE_PROFILE = sum(flag for flag in CatalogFlags if flag.name.startswith("BAD_"))
+    @classmethod
+    def unusable_profile(cls):
+        """The bits that make a Sersic profile be drawn as a point."""
+        return cls.BAD_RADIUS | cls.BAD_INDEX | cls.BAD_AXIS_RATIO | cls.BAD_ANGLE
 
 
 def _plain(table, name, unit, argument):

@@ -15,7 +15,7 @@ from miricigale.profiles import ellipse_to_pixels
 from miricigale.psf import InstrumentPSF, PSFGrid, as_psf, miri_psf
 from miricigale.refdata import resources
 from miricigale.scene.background import Background
-from miricigale.scene.catalog import UNUSABLE_PROFILE, as_sources, check_catalog
+from miricigale.scene.catalog import CatalogFlags, as_sources, check_catalog
 from miricigale.scene.catalog_files import read_catalog
 from miricigale.scene.cutouts import Cutout
 from miricigale.scene.render import Painter
@@ -298,7 +298,7 @@ class Scene(Interactive):
         valid = np.isfinite(flux) & (flux >= 0)
         flags[~valid] |= SceneFlags.NO_FLUX
         sersic = catalog["profile"] == "sersic"
-        spoilt = (catalog["flags"] & UNUSABLE_PROFILE) != 0
+        spoilt = (catalog["flags"] & int(CatalogFlags.unusable_profile())) != 0
         flags[sersic & spoilt] |= SceneFlags.DRAWN_AS_POINT
         sersic &= ~spoilt
 

@@ -131,14 +131,6 @@ def test_units_must_be_said_where_the_file_has_none(plain, tmp_path):
     assert catalog["wfc3.f160w"][0].to_value(u.uJy) == pytest.approx(1)
 
 
-def test_zero_point_as_a_unit(plain, tmp_path):
-    path = write(plain, tmp_path / "c.csv")
-    with pytest.warns(MiricigaleWarning):
-        catalog = read_catalog(path, columns=COLUMNS, units={"flux": "0.3631 uJy"})
-    # 25 AB is 0.3631 uJy
-    assert catalog["wfc3.f160w"].to(u.ABmag)[0].value == pytest.approx(25 + 7.5, abs=1e-3)
-
-
 def test_blanks_are_missing(tmp_path):
     path = tmp_path / "c.csv"
     path.write_text(

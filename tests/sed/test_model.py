@@ -74,12 +74,6 @@ def test_dust_excess_needs_dust():
     refuses("no parameter 'dust_excess'", model.evaluate, error=KeyError, dust_excess=2.0)
 
 
-def test_parts_sum_to_the_whole(model):
-    parts = model.evaluate(age=2.0, frac_agn=0.5, redshift=2.5)
-    total = sum(s.fnu for name, s in parts.components.items() if name != "stellar_intrinsic")
-    assert_quantity_allclose(total, parts.fnu, rtol=1e-10, atol=1e-30 * u.uJy)
-
-
 def test_flux_scales_with_mass_and_inverse_square_of_distance(filters):
     cosmology = FlatLambdaCDM(H0=35.2, Om0=0.272)  # twice as far
     near, far = SEDModel.yang2021(), SEDModel.yang2021(cosmology=cosmology)
@@ -91,22 +85,14 @@ def test_flux_scales_with_mass_and_inverse_square_of_distance(filters):
 
 
 @pytest.mark.parametrize("fraction", [0.1, 0.6, 0.99])
-def test_agn_fraction_means_what_its_definition_says(fraction):
-    for definition, name in (("dust", "frac_agn_dust"), ("3-1000um", "frac_agn_ir")):
-        model = SEDModel.yang2021(frac_agn_definition=definition)
-        parts = model.evaluate(frac_agn=fraction, age=3.0, redshift=0.5)
-        assert parts.derived[name].value == pytest.approx(fraction, rel=1e-10)
-        # the same from the spectra
-        rest = parts.wave.value / 1.5
-        inside = (rest >= 3 * (1 - 1e-9)) & (rest <= 1000 * (1 + 1e-9))
-        power = {
-            key: -np.trapezoid(sed.fnu.value[inside], 1 / rest[inside])
-            for key, sed in parts.components.items()
-        }
-        agn = sum(power[f"agn_{part}"] for part in ("disk", "torus", "polar"))
-        share = agn / (agn + power["stellar"] + power["dust"])
-        # trapezoids in frequency here, in wavelength there
-        assert parts.derived["frac_agn_ir"].value == pytest.approx(share, abs=1e-3)
+@pytest.mark.parametrize(
+    ("definition", "name"), [("dust", "frac_agn_dust"), ("3-1000um", "frac_agn_ir")]
+)
+def test_agn_fraction_means_what_its_definition_says(fraction, definition, name):
+    """The same from the spectra: `test_a_fraction_of_the_light_in_any_range`."""
+    model = SEDModel.yang2021(frac_agn_definition=definition)
+    got = model.derived(frac_agn=fraction, age=3.0, redshift=0.5)
+    assert got[name].value == pytest.approx(fraction, rel=1e-10)
 
 
 def test_six_micron_luminosity_from_the_spectrum(model):
@@ -512,8 +498,8 @@ def test_a_fraction_of_the_light_in_any_range(span):
     assert spectra.derived["agn_power"].value == pytest.approx(
         table["agn_power"][0].value, rel=1e-6
     )
-    accretion = grid.agn_properties["accretion_power"][0] * 3 / 7 * grid.dust_luminosity[1] * 1e10
-    assert accretion == pytest.approx(spectra.derived["accretion_power"].value, rel=1e-5)
+    accretion = grid.agn_properties["accretion_power"][0].value * 3 / 7 * grid.dust_luminosity[1]
+    assert 1e10 * accretion == pytest.approx(spectra.derived["accretion_power"].value, rel=1e-5)
     for wrong in ("20-5um", "0.01-20um", "ir"):
         with pytest.raises(
             ValueError, match="'frac_agn_definition' must be one of 'dust' and ranges"

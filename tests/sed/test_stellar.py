@@ -166,6 +166,21 @@ def test_delayed_composites_follow_from_the_exponential_ones(composite, name):
             assert abs(ratio) < (0.05 if dying else 0.01), (time, center)
 
 
+@pytest.mark.parametrize("name", COMPOSITES)
+def test_masses_and_rates_of_delayed_composites(composite, name):
+    source, part = composite("tau01"), composite(name)
+    for quantity in ("mass", "remnants"):
+        age, table = ssp_of(source, source.quantities[quantity])
+        for time in TIMES[1:]:
+            row = int(np.argmin(np.abs(part.age / 1e6 - time)))
+            mine, rate = with_ssp(part, row, age, table)
+            assert mine == pytest.approx(part.quantities[quantity][row], rel=0.02)
+            if part.quantities["sfr"][row] > 1e-15:
+                # ours is the rate 1 Myr before, in a sum of steps that makes up half a step
+                n, tau = part.age[row] / 1e6, part.tau / 1e6
+                assert rate == pytest.approx(part.quantities["sfr"][row], rel=2 / n + 1.5 / tau)
+
+
 @pytest.mark.parametrize("name", ["delayed0.5", "delayed1", "delayed3"])
 def test_living_mass_against_the_composites(composite, stars, name):
     """Kroupa 2016 (ours) and Chabrier 2003 without remnants: 0.07 apart at most."""

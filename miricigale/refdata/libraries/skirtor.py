@@ -210,9 +210,8 @@ def _check_columns(wave, table, seen, inclination, unit, source):
     power = np.trapezoid(transparent / wave, wave) / unit
     law = mu * (1.0 + 2.0 * mu) / 3.0 * 18.0 / 7.0
     if abs(power - law) > 0.02:
-        what = f"has a transparent disk of {power:.4g} of 1e11 Lsun at 10 Mpc, wanted {law:.4g} at"
-        what = f"{what} inclination {inclination:g}: another unit than W/m2 (lambda F_lambda)?"
-        raise data_error(source, what)
+        got = f"{power:.4g} of 1e11 Lsun at 10 Mpc, wanted {law:.4g} at inclination {inclination:g}"
+        raise data_error(source, f"has a transparent disk of {got}: another unit than W/m2?")
 
 
 # ------------------------------------------------------------------ lightningpy's file

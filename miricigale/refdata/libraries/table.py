@@ -50,7 +50,7 @@ class LibraryTable:
     Raises
     ------
     ValueError
-        If shapes, names or units do not fit together, wavelengths or axes are not finite or
+        If shapes or names do not fit together, wavelengths or axes are not finite or
         not in order, or two rows have the same values of all axes.
     """
 
@@ -107,12 +107,12 @@ class LibraryTable:
 
     @functools.cached_property
     def levels(self):
-        """Different values of each axis, ascending: dict of name to `~numpy.ndarray`."""
+        """Different values of each axis, ascending: dict of name to `~numpy.ndarray`, read-only."""
         levels = {}
         for name, column in self.axes.items():
             found = np.unique(column)
             gap = _SAME * np.maximum(np.abs(found[1:]), np.abs(found[:-1]))
-            levels[name] = found[np.append(True, np.diff(found) > gap)]
+            levels[name] = frozen_array(found[np.append(True, np.diff(found) > gap)])
         return levels
 
     def _codes(self, axis, values):
