@@ -119,61 +119,51 @@ def _usable(charge, extra, first, limit, g0, g1):
     return g1 - g0 - 1 if group >= g1 else max(group - g0 - 1, 0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _entry(entries, n, y, x, when):
-    """
-    Entry of a group in the list of a pixel; a new one, of the n-th place, has no charge.
-
-    Returns its place, and how many entries there are.
-    """
-    head, link, slot, charge, cut = entries
-    before, i = -1, head[y, x]
-    while i >= 0 and slot[i] < when:
-        before, i = i, link[i]
-    if i < 0 or slot[i] != when:
-        link[n], slot[n], charge[n], cut[n] = i, when, 0.0, 0
-        i, n = n, n + 1
-        if before < 0:
-            head[y, x] = i
-        else:
-            link[before] = i
-    return i, n
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
 def _list(rate, hits, electrons):
     """
     Lists of what comes into each pixel, one entry for a group.
 
     Returns the first entry of each pixel (-1: none), and of the entries (n,) the next one, the
-    group, the electrons and what is done to it; and their number.
+    group and the electrons; in arrays with room for 64 more.
     """
-    head, size = np.full(rate.shape, -1, np.int32), electrons.size
-    link, slot = np.empty(size, np.int32), np.empty(size, np.int32)
-    entries = head, link, slot, np.empty(size), np.empty(size, np.uint8)
+    ny, nx = rate.shape
+    head, tail = np.full((ny, nx), -1, np.int32), np.empty((ny, nx), np.int32)
+    size = electrons.size + 64
+    link, slot, charge = np.empty(size, np.int32), np.empty(size, np.int32), np.empty(size)
     n = 0
-    for i in range(size):
-        y, x = hits[1, i], hits[2, i]
-        if rate[y, x] == rate[y, x]:
-            k, n = _entry(entries, n, y, x, hits[0, i])
-            entries[3][k] += electrons[i]
-    return entries, n
+    for i in range(electrons.size):
+        when, y, x = hits[0, i], hits[1, i], hits[2, i]
+        if rate[y, x] != rate[y, x]:
+            continue
+        if head[y, x] >= 0 and slot[tail[y, x]] == when:
+            charge[tail[y, x]] += electrons[i]
+            continue
+        if head[y, x] < 0:
+            head[y, x] = n
+        else:
+            link[tail[y, x]] = n
+        tail[y, x] = n
+        link[n], slot[n], charge[n] = -1, when, electrons[i]
+        n += 1
+    return head, link, slot, charge, n
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _find(rate, variance, mean, entries, n, groups, noise, truth, jump, rng):
     """
-    Jumps that the fit finds, (n_jump, 5) as from `fit_rows`; their entries are cut.
+    Jumps that the fit finds, (n_jump, 5) as from `fit_rows`, and which entries are cut by it.
 
     The statistic of a jump is its expected value plus a standard normal number, which is
     independent of the slope: the fit is the best linear one.
     """
     ny, nx = rate.shape
-    head, link, slot, charge, cut = entries
+    head, link, slot, charge = entries
     _, n_group, g0, g1 = groups
     step, s, inv_gain = noise
     limit, dn = truth
     n_diff = g1 - g0 - 1
+    cut = np.zeros(link.size, np.uint8)
     jumps = np.empty((n, 5))
     n_jump = 0
     for y in range(ny):
@@ -202,21 +192,14 @@ def _find(rate, variance, mean, entries, n, groups, noise, truth, jump, rng):
                         jumps[n_jump, 4] = t
                         n_jump += 1
                 i = link[i]
-    return jumps[:n_jump].copy()
+    return jumps[:n_jump].copy(), cut
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _cut_neighbors(rate, entries, n, jumps, own, groups, neighbor):
-    """Cut the entries beside large jumps (``own``), or new ones without charge; returns all entries."""
+def _cut_neighbors(rate, entries, cut, n, jumps, own, groups, neighbor):
+    """Cut the entries beside large jumps (``own``), or new ones without charge; returns what may grow."""
     ny, nx = rate.shape
-    head, link, slot, charge, cut = entries
-    # each jump has four neighbors
-    more = 4 * jumps.shape[0]
-    link = np.append(link, np.empty(more, np.int32))
-    slot = np.append(slot, np.empty(more, np.int32))
-    charge = np.append(charge, np.empty(more))
-    cut = np.append(cut, np.empty(more, np.uint8))
-    entries = head, link, slot, charge, cut
+    head, link, slot, charge = entries
     _, n_group, g0, _ = groups
     for m in range(jumps.shape[0]):
         if own[m] < neighbor:
@@ -227,9 +210,21 @@ def _cut_neighbors(rate, entries, n, jumps, own, groups, neighbor):
             x = int(jumps[m, 1]) + (side == 2) - (side == 3)
             if not (0 <= y < ny and 0 <= x < nx and rate[y, x] == rate[y, x]):
                 continue
-            i, n = _entry(entries, n, y, x, when)
+            before, i = -1, head[y, x]
+            while i >= 0 and slot[i] < when:
+                before, i = i, link[i]
+            if i < 0 or slot[i] != when:
+                if n == link.size:
+                    link, slot = np.append(link, link), np.append(slot, slot)
+                    charge, cut = np.append(charge, charge), np.append(cut, cut)
+                link[n], slot[n], charge[n], cut[n] = i, when, 0.0, 0
+                i, n = n, n + 1
+                if before < 0:
+                    head[y, x] = i
+                else:
+                    link[before] = i
             cut[i] |= _NEIGHBOR
-    return entries
+    return link, slot, charge, cut
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -267,12 +262,14 @@ def hit_slopes(mean, hits, electrons, groups, noise, truth, thresholds, rng, out
     rate, var_poisson, var_read, n_used, n_jump, dq = out
     ny, nx = rate.shape
     n_diff = g1 - g0 - 1
-    entries, n = _list(rate, hits, electrons)
+    head, link, slot, charge, n = _list(rate, hits, electrons)
+    entries = head, link, slot, charge
     variance = var_poisson + var_read
-    jumps = _find(rate, variance, mean, entries, n, groups, noise, truth, jump, rng)
+    jumps, cut = _find(rate, variance, mean, entries, n, groups, noise, truth, jump, rng)
     own_jumps = own_charge(jumps, nx, n_diff)
-    entries = _cut_neighbors(rate, entries, n, jumps, own_jumps, groups, neighbor)
-    head, link, slot, charge, cut = entries
+    link, slot, charge, cut = _cut_neighbors(
+        rate, entries, cut, n, jumps, own_jumps, groups, neighbor
+    )
     # segments that are not whole integrations; hits that stay: segment, difference, charge
     lengths = np.empty(n_int * (n_diff + 1) + 1, np.int64)
     kept = np.empty((n_int * n_group, 3))
