@@ -189,9 +189,8 @@ class _References:
         """Anomaly of each group and integration, of references and settings together."""
         own = self._maps.reset
         n_int, n_group = offsets.shape
-        total = np.broadcast_to(
-            offsets[:, :, None, None].astype(np.float32), (n_int, n_group, *self._shape)
-        ).copy()
+        total = np.zeros((n_int, n_group, *self._shape), np.float32)
+        total += offsets[:, :, None, None].astype(np.float32)
         if own is not None:
             many = min(own.shape[1], n_group)
             for k in range(n_int):

@@ -47,11 +47,6 @@ class Alignment:
     n_matched: int
     scatter: u.Quantity
 
-    @property
-    def error(self):
-        """Standard error of the shift, in one coordinate; 0 of an image that stands where it is."""
-        return self.scatter / np.sqrt(max(self.n_matched, 1))
-
 
 def align_to_catalog(image, catalog, *, radius=1 * u.arcsec):
     """

@@ -30,6 +30,8 @@ from miricigale.instrument import (
 from miricigale.instrument.image_files import json_meta
 from miricigale.reduction.assumed import middle_of
 from miricigale.reduction.images import flagged_image, plain_flags, plain_mask, sigma
+from miricigale.reduction.reference_maps import TYPES
+from miricigale.reduction.references import ReferenceFiles
 from miricigale.utils.exceptions import argument_error, data_error
 from miricigale.utils.files import open_fits, write_fits
 from miricigale.utils.meta import undated
@@ -49,14 +51,6 @@ _META = {
     "NGROUPS": "n_groups", "NINTS": "n_integrations", "TGROUP": "group_time",
     "PHOTMJSR": "photmjsr", "PA_APER": "pa_aper", "XPOSURE": "exposure_time",
     "EFFEXPTM": "exposure_time", "RA_REF": "ra", "DEC_REF": "dec", "ROLL_REF": "roll",
-}  # fmt: skip
-
-
-#: Keywords that name the references of the pipeline.
-_REFERENCES = {
-    "R_MASK": "mask", "R_SATURA": "saturation", "R_SUPERB": "bias", "R_RESET": "reset",
-    "R_LINEAR": "linearity", "R_DARK": "dark", "R_GAIN": "gain", "R_READNO": "read_noise",
-    "R_FLAT": "flat", "R_PHOTOM": "photom",
 }  # fmt: skip
 
 
@@ -265,7 +259,9 @@ def _meta(header, path):
     meta["steps"] = sorted(steps_done(header))
     if (day := middle_of(header)) is not None:
         meta["day"] = day
-    for keyword, name in _REFERENCES.items():
+    for name in ReferenceFiles.names():
+        # the first six letters of the type in CRDS
+        keyword = f"R_{TYPES.get(name, name)[:6].upper()}"
         if keyword in header:
             meta[f"reference_{name}"] = str(header[keyword]).removeprefix("crds://")
     meta["source"] = path.name

@@ -220,17 +220,15 @@ def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None):
     n_images = np.zeros(shape, np.uint8)
     before = np.zeros(shape, np.float32)
     for im, weight, (x, y) in zip(images, weights, pixel_maps, strict=True):
-        if not overlaps((x, y), shape):
-            continue
-        mask = plain_mask(im)
-        weight = np.where(mask, 0.0, np.asarray(weight) / unit_weight).astype(np.float32)
-        if not weight.any():
+        # an image of many may reach a small part of the grid
+        part = _extent((x, y), shape)
+        weight = np.where(plain_mask(im), 0.0, np.asarray(weight) / unit_weight)
+        weight = weight.astype(np.float32)
+        if part is None or not weight.any():
             continue
         variance = np.square(np.asarray(sigma(im), float))
         variance = np.where(weight > 0, variance, 0.0).astype(np.float32)
         _add(sink, im, weight, (x, y), wcs, pixfrac, data2=variance)
-        # an image of many may reach a small part of the grid
-        part = _extent((x, y), shape)
         n_images[part] += sink.out_wht[part] > before[part]
         before[part] = sink.out_wht[part]
 

@@ -209,8 +209,8 @@ def fit_groups(
         drift, bias = bias[0, 0] + drift, np.zeros((1, 1))
     reset = _groups(maps.reset, "reset", data.shape)
     dark = _groups(maps.dark, "dark", data.shape, least=last_group)
-    flagged = _flagged(group_dq, data.shape, last_group, usable)
-    group_dq = np.zeros((1, 0, 1, 1), np.uint8) if flagged is None else _plain(group_dq)
+    flagged = _flagged(group_dq, data.shape, last_group) & usable
+    group_dq = _plain(group_dq if flagged.any() else np.zeros((1, 0, 1, 1), np.uint8))
 
     data = _plain(data)
     variance = np.square(read_noise) + (1 / 12 if data.dtype.kind in "iu" else 0.0)
@@ -221,7 +221,7 @@ def fit_groups(
     noise = (np.maximum(variance, 1e-6), poisson_factor / gain, np.square(slow_noise))
     fit = (first_group, last_group, noise, 1 / group_time, jump)
     # pixels whose groups have flags are fitted one by one
-    plain = usable if flagged is None else usable & ~flagged
+    plain = usable & ~flagged
 
     def fit_block(rows):
         events = fit_rows(ramp, plain, rows.start, rows.stop, fit, out)
@@ -240,9 +240,7 @@ def fit_groups(
             showers = find_showers(
                 data, events, usable, shower, first_group=first_group, last_group=last_group
             )
-        parts = list(_neighbors(events, neighbor, usable, n_diff, showers))
-        if flagged is not None:
-            parts += list(_uncut(flagged & usable, parts))
+        parts = list(_again(events, neighbor, usable, n_diff, showers, flagged))
         parallel_map(refit_block, parts, executor=executor)
 
     return fit_result(*out, events, first_group)
@@ -295,19 +293,19 @@ def _groups(values, name, shape, *, least=0):
     return _plain(values)
 
 
-def _flagged(group_dq, shape, last_group, usable):
-    """Pixels of which a group has a flag that forbids its use; None if there is none."""
+def _flagged(group_dq, shape, last_group):
+    """Pixels of which a group has a flag that forbids its use."""
+    seen = np.zeros(shape[2:], bool)
     if group_dq is None:
-        return None
+        return seen
     group_dq = np.asarray(group_dq)
     if group_dq.shape != shape or group_dq.dtype != np.uint8:
         got = f"{group_dq.dtype}, shape {group_dq.shape}"
         raise argument_error("group_dq", f"uint8, of shape {shape}", got)
-    seen = np.zeros(shape[2:], bool)
     wanted = np.uint8(DO_NOT_USE | SATURATED | JUMP)
     for k, g in np.ndindex(shape[0], last_group):
         seen |= (group_dq[k, g] & wanted) != 0
-    return seen if (seen & usable).any() else None
+    return seen
 
 
 def fit_result(rate, var_poisson, var_read, n_used, n_jump, flags, events, first_group):
@@ -326,17 +324,16 @@ def threshold(value, name):
     return np.inf if value is None else float(value)
 
 
-def _neighbors(events, threshold, usable, n_diff, showers):
+def _again(events, threshold, usable, n_diff, showers, flagged):
     """
-    Yield the pixels beside large jumps, and those of showers, and where they are to be cut.
+    Yield the pixels that are fitted once more, and where they are to be cut.
 
-    Each part is the argument of one call of the kernel: rows, columns, start of each
-    pixel's cuts, and the cuts. Pixels keep the cuts that they found themselves.
+    They lie beside large jumps or in showers, or their groups have flags. Each part is the argument of
+    one call of the kernel: rows, columns, start of each pixel's cuts, and the cuts. Pixels keep the cuts
+    that they found themselves.
     """
     ny, nx = usable.shape
     large = events[own_charge(events, nx, n_diff) >= threshold].astype(np.int64)
-    if len(large) == 0 and showers[0].size == 0:
-        return
     cut = large[:, 2] * n_diff + large[:, 3]
     pixels = [showers[0] * nx + showers[1]]
     cuts = [showers[2] * n_diff + showers[3]]
@@ -354,24 +351,9 @@ def _neighbors(events, threshold, usable, n_diff, showers):
     cuts = np.concatenate([cuts, own[again, 2] * n_diff + own[again, 3]])
     order = np.lexsort((cuts, pixels))
     pixels, cuts = pixels[order], cuts[order]
-    unique, start = np.unique(pixels, return_index=True)
-    start = np.append(start, len(pixels))
+    unique = np.union1d(pixels, np.flatnonzero(flagged))
+    start = np.append(np.searchsorted(pixels, unique), len(pixels))
     for part in chunks(len(unique), _PIXELS):
-        first = start[part.start]
-        yield (
-            unique[part] // nx,
-            unique[part] % nx,
-            start[part.start : part.stop + 1] - first,
-            cuts[first : start[part.stop]],
-        )
-
-
-def _uncut(mask, parts):
-    """Yield the pixels of a mask that no part has, without cuts, as `_neighbors` does."""
-    rest = mask.copy()
-    for ys, xs, _, _ in parts:
-        rest[ys, xs] = False
-    ys, xs = np.nonzero(rest)
-    for part in chunks(ys.size, _PIXELS):
-        start = np.zeros(part.stop - part.start + 1, np.int64)
-        yield ys[part], xs[part], start, np.zeros(0, np.int64)
+        first, last = start[part.start], start[part.stop]
+        y, x = np.divmod(unique[part], nx)
+        yield y, x, start[part.start : part.stop + 1] - first, cuts[first:last]

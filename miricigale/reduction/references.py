@@ -17,16 +17,8 @@ SLOPES = ("mask", "saturation", "linearity", "dark", "gain", "read_noise")
 BRIGHTNESS = ("flat", "photom")
 
 #: Steps of the pipeline after which a reference is not needed any more.
-STEP_OF = {
-    "mask": "dq_init",
-    "saturation": "saturation",
-    "bias": "superbias",
-    "reset": "reset",
-    "linearity": "linearity",
-    "dark": "dark",
-    "flat": "flat",
-    "photom": "photom",
-}
+STEP_OF = {"mask": "dq_init", "bias": "superbias"}
+STEP_OF |= {name: name for name in ("saturation", "reset", "linearity", "dark", *BRIGHTNESS)}
 
 #: References that may be numbers instead of files, with their units.
 _NUMBERS = {"gain": "e-/DN", "read_noise": "DN", "bias": "DN", "saturation": "DN"}

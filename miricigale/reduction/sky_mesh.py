@@ -1,5 +1,6 @@
 """Brightness of the sky in boxes of an image, and the smooth surface through them."""
 
+import copy
 import dataclasses
 import math
 
@@ -266,8 +267,7 @@ class SkyMesh:
 
     def measured(self, sources):
         """The same of an image with other sources masked."""
-        out = object.__new__(SkyMesh)
-        out.__dict__.update(self.__dict__)
+        out = copy.copy(self)
         out._measure(sources)
         return out
 

@@ -11,7 +11,6 @@ from astropy.nddata import CCDData
 from helpers.errors import refuses
 from miricigale.detector import (
     ADConversion,
-    BadPixels,
     Bias,
     CosmicRays,
     Dark,
@@ -267,18 +266,6 @@ def test_effects_take_the_place_of_their_kind():
     # settings of the detector stay
     properties = miri_detector().replace(gain=2.0)
     assert Detector.miri_imager(properties=properties).without(Dark).properties is properties
-
-
-def test_detector_says_what_it_does(detector):
-    names = [type(effect).__name__ for effect in detector.effects]
-    assert " ".join(names) == (
-        "Photons Dark InterpixelCapacitance CosmicRays BadPixels ReferencePixels Saturation "
-        "Nonlinearity Bias ReadNoise ADConversion"
-    )
-    assert "CosmicRays(flux=None" in repr(detector)
-    bare = Detector.miri_imager(Residual(0.01)).without(CosmicRays, BadPixels)
-    assert type(bare.effects[0]).__name__ == "Residual"
-    assert len(bare.effects) == 10
 
 
 def test_ramp_does_not_change(make_exposure, make_sky, detector):

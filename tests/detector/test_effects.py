@@ -27,15 +27,6 @@ def empty(block):
     return np.zeros(block.ramp_shape, np.float32)
 
 
-def test_dark_charge(make_block):
-    block = make_block(n_groups=50, subarray="SUB256")
-    ramp = Dark().apply(empty(block), block)
-    n = ramp[0, 0].size
-    mean = 0.2 * 50 * 0.3
-    assert ramp[0, -1].mean() == pytest.approx(mean, abs=5 * np.sqrt(mean / n))
-    assert Dark(current=0).apply(empty(block), block).max() == 0
-
-
 def test_integrations_are_independent(make_block):
     block = make_block(n_groups=4, n_integrations=3, subarray="SUB256")
     last = Dark(current=100).apply(empty(block), block)[:, -1].reshape(3, -1)

@@ -95,15 +95,6 @@ def test_it_is_linear_in_what_was_before(make_exposure, make_sky):
     assert total == pytest.approx(1.5e5 * unit, abs=5 * np.sqrt(1.5e5 * unit / 256**2))
 
 
-def test_time_that_passes_is_a_longer_gap(make_exposure, make_sky):
-    exposure = make_exposure(n_groups=3)
-    sky, effect = make_sky(exposure, 0.0), Persistence(amplitudes=(0.01,), times=(5.0,))
-    latent = latent_of(exposure, 1e6, 4 * u.s)
-    later = counts(exposure, sky, effect, latent.after(1 * u.min))
-    other = counts(exposure, sky, effect, latent_of(exposure, 1e6, 64 * u.s))
-    np.testing.assert_array_equal(later, other)
-
-
 def test_a_saturated_star_comes_back_in_the_next_exposure(make_exposure, make_sky):
     exposure = make_exposure(n_groups=40)
     image = make_sky(exposure, 5.0)

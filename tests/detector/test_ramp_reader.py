@@ -9,7 +9,7 @@ from astropy.time import Time
 from helpers.errors import refuses
 from helpers.real import real_file
 from miricigale.detector import Detector, Ramp, ramp_reader
-from miricigale.instrument import DQ, STEPS, steps_done
+from miricigale.instrument import DQ
 from miricigale.utils.exceptions import DataError
 
 GROUND = "real/ramps/MIRI_5582_89_S_20180308-010230_SCE1_pipe.fits.gz"
@@ -90,12 +90,6 @@ def test_exposures_larger_than_the_memory_are_refused_before_they_begin(
     exposure = make_exposure(n_groups=200)
     with pytest.raises(MemoryError, match=r"expose fewer groups, or write it by 'expose_to'"):
         Detector.miri_imager().expose(make_sky(exposure, 1.0), exposure, seed=1)
-
-
-def test_steps_are_those_that_are_complete():
-    header = fits.Header({"S_LINEAR": "COMPLETE", "S_DARK": "SKIPPED", "S_JUMP": " complete "})
-    assert steps_done(header) == {"linearity", "jump"}
-    assert steps_done(header) <= set(STEPS.values())
 
 
 def test_a_ramp_of_a_ground_test():

@@ -25,7 +25,7 @@ EVERYTHING = (
     CosmicRays(shower_fraction=0.2),
     Residual(0.01),
     ReadNoise(pink=2.0),
-    Persistence(),
+    Persistence((0.01,), (np.float32(20),)),
     ResetAnomaly(),
     ResetDecay(),
     FirstFrame(),

@@ -204,13 +204,3 @@ def test_image3_conserves_the_fluxes(folder, observations, mosaic, psf):
     np.testing.assert_allclose(ratio[~spoilt], 1, atol=0.01)
     np.testing.assert_allclose(ratio[spoilt], 1, atol=0.03)
     assert np.mean(ratio) == pytest.approx(1, abs=2e-3)
-
-
-def test_the_pipelines_own_catalog_agrees(folder, observations, image3):
-    catalog = Table.read(folder / "mosaic_cat.ecsv")
-    truth = observations[0].truth
-    assert len(catalog) == len(truth)
-    index, separation, _ = truth["sky"].match_to_catalog_sky(catalog["sky_centroid"])
-    assert np.all(separation < 0.03 * u.arcsec)
-    ratio = catalog["aper_total_flux"].quantity[index] / truth["flux_total"]
-    assert np.median(ratio.to_value("")) == pytest.approx(1, abs=0.01)

@@ -22,8 +22,9 @@ SHAPE = (400, 420)
 
 def subtracted(image, **options):
     """Image less its background, and that."""
-    background = estimate_background(image)
-    return remove_background(image, background, **options), background
+    negative = {name: options.pop(name) for name in list(options) if name.startswith("negative")}
+    background = estimate_background(image, **options)
+    return remove_background(image, background, **negative), background
 
 
 @pytest.fixture
@@ -150,20 +151,11 @@ def test_masked_pixels_do_not_count(noise):
         ({"method": "median"}, "'method' must be 'masked' or 'sep', got 'median'"),
         ({"box": 2}, "'box' must be at least 4"),
         ({"box": 7.5}, "'box' must be at least 4, an integer"),
-    ],
-)
-def test_bad_options_are_named(noise, options, match):
-    refuses(match, estimate_background, make(noise), **options)
-
-
-@pytest.mark.parametrize(
-    ("options", "match"),
-    [
         ({"negative_noise": "mine"}, "'negative_noise' must be 'larger' or 'background'"),
         ({"negative_threshold": 0}, "'negative_threshold' must be positive or None"),
     ],
 )
-def test_bad_options_of_negative_pixels_are_named(noise, options, match):
+def test_bad_options_are_named(noise, options, match):
     refuses(match, subtracted, make(noise), **options)
 
 

@@ -85,9 +85,7 @@ def test_the_reducer_takes_backgrounds_of_dithers_in_its_second_pass():
         background=BackgroundSettings("dithers"), mosaics=MosaicSettings(outlier_threshold=None)
     )
     pairs = [reducer.subtract_background(im) for im in images]
-    result = reducer.combine(
-        [im for im, _ in pairs], [b for _, b in pairs], pixel_scale=0.11 * ANGLE
-    )
+    result = reducer.combine([im for im, _ in pairs], [b for _, b in pairs])
     assert not result.notes
     for im, background, raw in zip(result.images, result.backgrounds, images, strict=True):
         whole = im.data + background.level
@@ -101,7 +99,6 @@ def test_bad_input_is_named():
     images, _, _ = dithers(3)
     refuses("'images' must be at least three dithers, got 2", dither_backgrounds, images[:2])
     refuses("'backgrounds' must be one for each of 3 images", dither_backgrounds, images, [])
-    refuses("'method' must be 'masked' or 'sep' or 'dithers'", BackgroundSettings, "none")
 
 
 def test_medians_leave_out_what_is_not_known():

@@ -71,24 +71,6 @@ def test_pure_read_noise_has_the_variance_of_least_squares(n):
     np.testing.assert_allclose(fit.rate.ravel(), lines, atol=2e-4)
 
 
-@pytest.mark.parametrize(
-    ("rate", "n_int", "n_group"),
-    [(0.3, 1, 20), (1.0, 1, 2), (1.0, 1, 100), (25.0, 1, 50), (400.0, 4, 10), (400.0, 1, 2)],
-)
-def test_pulls_are_standard_normal_and_there_is_no_bias(rate, n_int, n_group):
-    data = simulate(np.full((200, 200), rate), n_int, n_group, seed=11)
-    fit = fitted(data, **OPTIONS)
-    good = np.isfinite(fit.rate)
-    assert good.mean() > 0.9999
-    pull = ((fit.rate - rate) / fit.error)[good]
-    assert 0.97 < pull.std() < 1.03
-    mean_error = fit.error[good].mean() / np.sqrt(good.sum())
-    # 0.1 %, or what so many pixels can tell
-    assert abs(fit.rate[good].mean() - rate) < max(1e-3 * rate, 4 * mean_error)
-    if rate >= 25:
-        assert abs(fit.rate[good].mean() / rate - 1) < 1e-3
-
-
 def test_statistic_of_a_jump_is_the_drop_of_chi_squared():
     n_group = 12
     data = simulate(np.full((1, 1), 8.0), 2, n_group, dtype=np.float32, seed=3)

@@ -154,10 +154,8 @@ def test_without_references_it_is_refused(ramp, real, references):
     assert rate.meta["reference_gain"] == "4 e-/DN of the simulated detector"
     rate = Reducer(properties=OTHER, skip_first=9).fit_ramp(ramp)
     assert rate.meta["reference_gain"] == "5.5 e-/DN of the simulated detector"
-    with pytest.raises(
-        ValueError, match=r"'references' must be complete for slopes .* none for dark"
-    ):
-        Reducer(references=references.replace(dark=None)).fit_ramp(real)
+    reducer = Reducer(references=references.replace(dark=None))
+    refuses("'references' must be complete for slopes .* none for dark", reducer.fit_ramp, real)
     partial = references.replace(dark=None, incomplete=True)
     with pytest.warns(MiricigaleWarning, match="slopes without references for dark"):
         rate = Reducer(references=partial).fit_ramp(real)
@@ -227,8 +225,8 @@ def test_what_a_file_had_done_to_it_is_not_done_twice(exposure, real, references
 def test_files_for_something_else_are_refused(exposure, real, references, tmp_path):
     def refused(name, kind, array, match, **keywords):
         path = write_reference(tmp_path / f"{kind}.fits", kind, exposure, array, **keywords)
-        with pytest.raises(DataError, match=match):
-            Reducer(references=references.replace(**{name: path})).fit_ramp(real)
+        reducer = Reducer(references=references.replace(**{name: path}))
+        refuses(match, reducer.fit_ramp, real, error=DataError)
 
     flat = np.ones(exposure.shape)
     refused("gain", "gain", flat, "its DETECTOR is MIRIFULONG, not MIRIMAGE", DETECTOR="MIRIFULONG")
@@ -283,10 +281,9 @@ def test_the_conversion_follows_time_as_the_pipeline_has_it(exposure, tmp_path):
     old = {"TIMECOEFF": {"amplitude": 0.2, "tau": 250.0, "t0": 59500.0}}
     old = write_photom(tmp_path / "c.fits", rows, times=old)
     assert read_photom(old, exposure, day) == pytest.approx(0.5 + 0.2 * np.exp(-2), rel=1e-6)
-    with pytest.raises(DataError, match="depends on time, and the exposure does not state when"):
-        read_photom(old, exposure, None)
-    with pytest.raises(DataError, match="has no row for F560W and SUB256"):
-        read_photom(plain, exposure.replace(filter="miri.f560w"), None)
+    refuses("the exposure does not state when", read_photom, old, exposure, None, error=DataError)
+    other, wanted = exposure.replace(filter="miri.f560w"), "has no row for F560W and SUB256"
+    refuses(wanted, read_photom, plain, other, None, error=DataError)
 
 
 def test_integrations_apart(real, references):

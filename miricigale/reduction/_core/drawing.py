@@ -176,13 +176,14 @@ def _find(rate, variance, mean, entries, n, groups, noise, truth, jump, rng):
                 if 1 <= j <= n_diff and not full:
                     slope, share = rate[y, x] * step, variance[y, x] * step * step
                     q = charge[i] * dn
-                    weight, leverage = difference_weight(j, n_diff, slope * inv_gain, s)
-                    t = q * math.sqrt(max(leverage - weight * weight * share, 0.0))
-                    if 0.5 * jump < t < 2.0 * jump:
-                        # the fit takes its weights from a slope that the hit has raised
-                        v = (slope + weight * share * q) * inv_gain
+                    v, t = slope * inv_gain, 0.0
+                    for _ in range(2):
                         weight, leverage = difference_weight(j, n_diff, v, s)
                         t = q * math.sqrt(max(leverage - weight * weight * share, 0.0))
+                        if not 0.5 * jump < t < 2.0 * jump:
+                            break
+                        # the fit takes its weights from a slope that the hit has raised
+                        v = (slope + weight * share * q) * inv_gain
                     t += rng.standard_normal()
                     if abs(t) > jump:
                         cut[i] = _OWN
