@@ -252,13 +252,10 @@ def test_wide_bins_follow_errors_of_known_form():
         rng = np.random.default_rng(seed)
         true = 10 ** rng.uniform(-1, 3, 1200)
         seen = true + rng.normal(size=true.size) * np.hypot(0.3, 0.1 * true)
-        model = ErrorModel.from_tables(
-            QTable({"miri.f770w": true * u.uJy}),
-            QTable({"miri.f770w": seen * u.uJy}),
-            bin_size=60,
-        )
+        tables = (QTable({BAND: values * u.uJy}) for values in (true, seen))
+        model = ErrorModel.from_tables(*tables, bin_size=60)
         flux = np.geomspace(0.15, 500, 60)
-        sigma = model.sigma(flux * u.uJy, "miri.f770w").value
+        sigma = model.sigma(flux * u.uJy, BAND).value
         # 60 sources give the scatter to 15 %, the straight lines between bins add to that
         assert np.median(np.abs(sigma / np.hypot(0.3, 0.1 * flux) - 1)) < 0.15
         nodes = model.curves["miri.f770w"]

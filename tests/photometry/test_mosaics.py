@@ -212,11 +212,8 @@ def test_pixels_without_data_are_masked(write):
 def test_a_background_is_subtracted_where_asked_for(write):
     rng = np.random.default_rng(2)
     y, _ = np.indices(SHAPE)
-    path = write(
-        5 + 0.0005 * y + rng.normal(0, 0.1, SHAPE),
-        BUNIT="MJy/sr",
-        planes={"ERR": np.full(SHAPE, 0.1)},
-    )
+    data, error = 5 + 0.0005 * y + rng.normal(0, 0.1, SHAPE), np.full(SHAPE, 0.1)
+    path = write(data, BUNIT="MJy/sr", planes={"ERR": error})
     assert read_mosaic(path).meta["sky_over_noise"] > 40
     image = read_mosaic(path, background_box=30)
     assert abs(image.meta["sky_over_noise"]) < 0.3
