@@ -5,8 +5,8 @@ import dataclasses
 import astropy.units as u
 import numpy as np
 import scipy.ndimage
-import scipy.stats
 from astropy.coordinates import SkyCoord
+from astropy.stats import poisson_conf_interval
 from photutils.segmentation import SegmentationImage, make_2dgaussian_kernel
 
 from miricigale.photometry.arrays import image_arrays, pixel_scale
@@ -222,13 +222,10 @@ def detection_purity(image, *, snr_edges=None, preset="yang2021", **settings):
         raise argument_error("snr_edges", "two numbers or more that ascend", snr_edges)
     counts = [np.histogram(snr, edges)[0] for snr in (positive, negative)]
     n_positive, n_negative = counts
+    fewest, most = poisson_conf_interval(n_negative, interval="frequentist-confidence")
     with np.errstate(divide="ignore", invalid="ignore"):
-        limits = (
-            scipy.stats.chi2.ppf(0.8413, 2 * (n_negative + 1)) / 2,
-            np.where(n_negative > 0, scipy.stats.chi2.ppf(0.1587, 2 * n_negative) / 2, 0.0),
-        )
         purity, low, high = (
-            np.where(n_positive > 0, 1 - n / n_positive, np.nan) for n in (n_negative, *limits)
+            np.where(n_positive > 0, 1 - n / n_positive, np.nan) for n in (n_negative, most, fewest)
         )
         above = [np.cumsum(n[::-1])[::-1] for n in counts]
         purity_above = np.where(above[0] > 0, 1 - above[1] / above[0], np.nan)

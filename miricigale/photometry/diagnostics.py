@@ -43,15 +43,7 @@ def diagnose(fit, xy):
     # where the measured noise is above that of the uncertainty, it is the measure
     lag = 0 if correlation is None else correlation.shape[0] // 2
     variance = 1.0 if correlation is None else max(1.0, correlation[lag, lag])
-    peaks = residual_peaks(
-        residual,
-        model,
-        fit.inverse_sigma,
-        fit.psf_width,
-        xy + fit.displacement(xy),
-        new=fit.arrays.new,
-        executor=fit.bank.executor,
-    )
+    peaks = residual_peaks(fit, residual, model, xy + fit.displacement(xy))
     poor = chi2 > POOR_CHI2 * variance
     if fit.free is not None:
         # what the high-resolution image shows is not what is fitted here

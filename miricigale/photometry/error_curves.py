@@ -8,7 +8,8 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.filters import as_photometry
-from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_names
 from miricigale.utils.tables import described_table, error_column, require_columns
 from miricigale.utils.units import FNU
 
@@ -179,10 +180,9 @@ def flux_table(photometry, filters, known):
         wanted = f"a table with at least one of the columns {list(known)}"
         raise argument_error("photometry", wanted, f"columns {photometry.colnames}")
     require_columns(photometry, filters, "photometry", units=dict.fromkeys(filters, FNU))
+    check_names(filters, "band of this error model", known)
     table = QTable(photometry, copy=True)
     for name in filters:
-        if name not in known:
-            raise unknown_name("band of this error model", name, known)
         table[name] = u.Quantity(table[name]).to(FNU)
     return table, filters
 

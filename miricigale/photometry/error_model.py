@@ -25,6 +25,7 @@ from miricigale.photometry.surveys import YANG2021_DEPTHS, fractional_error
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.meta import provenance
+from miricigale.utils.options import check_choice, check_least, check_positive
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import error_column, require_columns
 from miricigale.utils.unified import read_write
@@ -134,10 +135,8 @@ class ErrorModel(Interactive):
         ----------
         Yang et al. 2021, ApJ 908, 144, section 4.2.
         """
-        if statistic not in STATISTICS:
-            raise argument_error("statistic", f"one of {sorted(STATISTICS)}", repr(statistic))
-        if int(bin_size) < 3:
-            raise argument_error("bin_size", "at least 3", bin_size)
+        check_choice(statistic, "statistic", STATISTICS)
+        check_least(bin_size, "bin_size", 3)
         if filters is None:
             filters = common_bands(truth, measured)
         filters = list(filters)
@@ -290,8 +289,7 @@ class ErrorModel(Interactive):
             In uJy; NaN if no flux reaches it up to the brightest that was measured.
             Errors are held constant below the faintest.
         """
-        if not n_sigma > 0:
-            raise argument_error("n_sigma", "positive", n_sigma)
+        check_positive(n_sigma, "n_sigma")
         return limiting_flux(self._curve(filter), n_sigma) * FNU
 
     def limiting_magnitude(self, filter, n_sigma=5.0):

@@ -86,9 +86,7 @@ def _sandwich(fit, correlation):
     middle, border = sandwich_matrix(fit.bank, fit.inverse_sigma, correlation, spread)
     middle, border = middle[keep][:, keep], border[keep]
     if fit.free is not None:
-        middle, border = fit.free.sandwich(
-            fit.bank, keep, fit.inverse_sigma, correlation, middle, border, spread
-        )
+        middle, border = fit.free.sandwich(fit, correlation, middle, border, spread)
     corner = np.array([[inner(a, b) for b in spread] for a in white])
     return middle, border, corner.reshape(len(white), len(white))
 

@@ -12,6 +12,7 @@ from miricigale.photometry.errors import (
     normal_matrix,
     sandwich_matrix,
 )
+from miricigale.photometry.template_changes import TemplateChanges
 from miricigale.utils.parallel import parallel_map
 
 #: Changes whose root of the sum of squares over the noise is below this are left out: they can move
@@ -92,34 +93,28 @@ class FreeTemplates:
             )
         return filling.tocsr()
 
-    def sandwich(self, bank, rows, inverse_sigma, correlation, middle, border, images):
+    def sandwich(self, fit, correlation, middle, border, images):
         """
         Extend the sandwich of correlated noise of the templates, ``middle`` and ``border``, by the changes.
 
-        ``rows`` are those of the templates that were fitted; the rest is as for
-        `~miricigale.photometry.errors.sandwich_matrix`.
+        ``fit`` is that of the templates; the rest is as for `~miricigale.photometry.errors.sandwich_matrix`.
         """
+        inverse_sigma = fit.inverse_sigma
         own, more = sandwich_matrix(self.bank, inverse_sigma, correlation, images)
-        cross = cross_matrix(bank, self.bank, inverse_sigma, correlation).tocsr()[rows]
+        cross = cross_matrix(fit.bank, self.bank, inverse_sigma, correlation).tocsr()[fit.rows]
         return _joined(middle, cross, own, self.basis), _below(border, more, self.basis)
 
 
-def free_templates(plain, bank, rows, fitted, changes, images, inverse_sigma):
+def free_templates(fit, fitted):
     """
     Fit templates anew that may change as far as they are not known.
 
     Parameters
     ----------
-    plain : `~miricigale.photometry.errors.LinearFit`
+    fit : `~miricigale.photometry.template_fit.TemplateFit`
         The fit of templates that are taken as they are.
-    bank, rows
-        The templates, and those rows of theirs that were fitted, shape (n,).
     fitted : `~numpy.ndarray` of `~miricigale.photometry.shapes.FITTED`, shape (n,)
-        What is known of each.
-    changes : `~miricigale.photometry.template_changes.TemplateChanges`
-        Finds how they may change.
-    images, inverse_sigma
-        Whitened image, and whitened columns that are common to all sources; 1 / sigma, zero where masked.
+        What is known of each of its n rows that were fitted.
 
     Returns
     -------
@@ -133,6 +128,9 @@ def free_templates(plain, bank, rows, fitted, changes, images, inverse_sigma):
     of a change. This is linear in f_k and f_k a_j; the latter have the prior variance f_k^2, for which the
     flux of the plain fit is taken.
     """
+    plain, bank, rows = fit.fit, fit.bank, fit.rows
+    kernel, size_scatter = fit.settings.mean_kernel, fit.settings.errors.size_scatter
+    changes = TemplateChanges(kernel.source, kernel.target, size_scatter)
     snr = np.abs(plain.flux) * np.sqrt(plain.matrix.diagonal())
     known = np.isfinite(fitted["parameters"][:, 0])
     wanted = np.flatnonzero(known & (snr > _LEAST) & (plain.flux > 0))
@@ -152,19 +150,20 @@ def free_templates(plain, bank, rows, fitted, changes, images, inverse_sigma):
     owner = owner[other.order]
     fixed = np.array([one.fixed for one in every], bool)[other.order]
     basis = _basis(len(rows), owner, np.array([one.light for one in every])[other.order], fixed)
-    own, projection, _, _ = normal_matrix(other, inverse_sigma, images)
-    cross = cross_matrix(bank, other, inverse_sigma).tocsr()[rows]
+    images = [fit.arrays.whitened(one) for one in (fit.arrays.flux, *fit.columns)]
+    own, projection, _, _ = normal_matrix(other, fit.inverse_sigma, images)
+    cross = cross_matrix(bank, other, fit.inverse_sigma).tocsr()[rows]
     owner = owner[~fixed]
     prior = np.concatenate([np.zeros(len(rows)), plain.flux[owner] ** -2.0])
     matrix = _joined(plain.matrix, cross, own, basis) + scipy.sparse.diags_array(prior)
-    fit = LinearFit(
+    free = LinearFit(
         matrix.tocsr(),
         _below(plain.rhs, projection[:, 0], basis),
         _below(plain.border, projection[:, 1:], basis),
         plain.corner,
         plain.corner_rhs,
     )
-    return FreeTemplates(fit, other, len(rows), basis, owner, prior, noise)
+    return FreeTemplates(free, other, len(rows), basis, owner, prior, noise)
 
 
 def _basis(n, owner, light, fixed):

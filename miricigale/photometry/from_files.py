@@ -242,15 +242,18 @@ def _middle(header):
     return header.wcs.pixel_to_world((nx - 1) / 2, (ny - 1) / 2).icrs
 
 
+def _inside(sky, header):
+    """Whether some positions are on an image."""
+    from miricigale.photometry.arrays import sky_pixels
+
+    return np.isfinite(sky_pixels(sky, header.wcs, header.shape, 0.0)).any()
+
+
 def _overlap(one, other):
     """Whether some of a coarse grid of pixels of one image are on the other."""
-    from astropy.wcs.utils import pixel_to_pixel
-
     axes = [np.linspace(0, n - 1, 15) for n in one.shape]
     y, x = (grid.ravel() for grid in np.meshgrid(*axes, indexing="ij"))
-    x, y = pixel_to_pixel(one.wcs, other.wcs, x, y)
-    ny, nx = other.shape
-    return bool(np.any((x > -0.5) & (x < nx - 0.5) & (y > -0.5) & (y < ny - 0.5)))
+    return _inside(one.wcs.pixel_to_world(x, y), other)
 
 
 def _check_psfs(image, highres, kernel):
@@ -277,21 +280,16 @@ def _check_catalog(path, image, highres):
     """Refuse a catalog of another field."""
     from astropy.coordinates import SkyCoord
 
-    from miricigale.photometry.arrays import sky_pixels
     from miricigale.photometry.priors import read_catalog
 
     sky = read_catalog(path)["sky"]
-
-    def inside(sky, header):
-        return np.isfinite(sky_pixels(sky, header.wcs, header.shape, 0.0)).any()
-
     for what, file in (("image", image), ("highres", highres)):
-        if inside(sky, file.header):
+        if _inside(sky, file.header):
             continue
         msg = f"none of the {len(sky)} sources of {path} is on {file.path} ('{what}')"
         known = np.isfinite(sky.ra.deg)
         hours = SkyCoord(15 * sky.ra[known], sky.dec[known])
-        if inside(hours, file.header):
+        if _inside(hours, file.header):
             msg += ": is ra in hours? Wanted are degrees, or a column with a unit"
         elif known.any():
             first = sky[known][0].to_string("decimal", precision=4)

@@ -246,7 +246,7 @@ class _Field:
         """Copies of the prior's sources, with their segments."""
         wcs = self.highres.wcs
         places = np.array(wcs.world_to_pixel(self.image.wcs.pixel_to_world(*at.T))).T
-        data, labels = np.zeros(self.labels.shape), self.labels.copy()
+        data, labels, first = np.zeros(self.labels.shape), self.labels.copy(), self.labels.max() + 1
         rows, light = [], []
         for (x, y), total in zip(places, flux, strict=True):
             donor = self.donors[rng.integers(len(self.donors))]
@@ -260,38 +260,32 @@ class _Field:
             # another source there would own the light
             if np.any(free[donor.mask] != 0):
                 continue
-            parameters = donor.parameters + [*shift, 0, 0, 0, 0]
-            self._paint(data, parameters, donor.light)
-            label = int(labels.max()) + 1
-            labels[cut][donor.mask] = label
-            rows.append((label, cut, donor, total))
-            shape = Shape(1.0, parameters, 0.0, None)
+            shape = Shape(donor.light, donor.parameters + [*shift, 0, 0, 0, 0], 0.0, None)
+            self._paint(data, shape)
+            labels[cut][donor.mask] = first + len(rows)
+            rows.append((total, donor.point, corner + (np.array([w, h]) - 1) / 2))
             light.append(shape.drawn(1.0, max(self.models.reach, 2 * shape.axes[0])))
         if not rows:
             raise argument_error("image", "large enough for sources", "none")
+        flux, point, middle = (np.array(one) for one in zip(*rows, strict=True))
         # positions are those that detection would find
-        own = np.zeros(labels.shape, int)
-        for k, (label, cut, *_) in enumerate(rows, 1):
-            own[cut][labels[cut] == label] = k
-        middle = np.array([(c[1].start + c[1].stop, c[0].start + c[0].stop) for _, c, *_ in rows])
-        x, y = bright_centroids(self.fine.flux + data, own, (middle - 1).T / 2)
+        own = np.maximum(labels - (first - 1), 0)
+        x, y = bright_centroids(self.fine.flux + data, own, middle.T)
         catalog = QTable({"sky": wcs.pixel_to_world(x, y).transform_to(self.sky.frame)})
-        catalog["label"] = [label for label, *_ in rows]
-        flux = np.array([total for *_, total in rows])
-        kinds = ["point" if donor.point else "galaxy" for _, _, donor, _ in rows]
+        catalog["label"] = first + np.arange(len(rows))
+        kinds = np.where(point, "point", "galaxy")
         truth = SourceTemplates(
             id=np.arange(len(rows)), sky=catalog["sky"].icrs, light=light, wcs=wcs
         )  # fmt: skip
         highres = _with_light(self.highres, data / self.fine.area * SURFACE_BRIGHTNESS)
-        return _Injected(catalog, truth, flux, np.array(kinds, "U6"), highres, labels)
+        return _Injected(catalog, truth, flux, kinds, highres, labels)
 
-    def _paint(self, image, parameters, light):
+    def _paint(self, image, shape):
         """Add a profile, seen through the sharp PSF, to an image."""
-        reach = np.exp(parameters[2] + 0.5 * np.hypot(*parameters[4:]))
-        half = int(np.clip(np.ceil(8 * reach), _HALF, _MOST))
-        x, y = np.rint(parameters[:2]).astype(int)
-        moved = parameters - [x - half, y - half, 0, 0, 0, 0]
-        stamp = light * self.models.profiles((2 * half + 1,) * 2, moved)[0]
+        half = int(np.clip(np.ceil(8 * shape.axes[0]), _HALF, _MOST))
+        x, y = np.rint(shape.parameters[:2]).astype(int)
+        moved = shape.parameters - [x - half, y - half, 0, 0, 0, 0]
+        stamp = shape.flux * self.models.profiles((2 * half + 1,) * 2, moved)[0]
         y0, x0 = max(y - half, 0), max(x - half, 0)
         target = image[y0 : y + half + 1, x0 : x + half + 1]
         i, j = y0 - (y - half), x0 - (x - half)

@@ -25,24 +25,18 @@ class ResidualPeaks:
     full_width: float  # Full width at half maximum of the PSF, in pixels.
 
 
-def residual_peaks(residual, model, inverse_sigma, width, xy, *, new=None, executor=None):
+def residual_peaks(fit, residual, model, xy):
     """
     Find positive peaks of the residual that are sources of their own (`ResidualPeaks`).
 
     Parameters
     ----------
+    fit : `~miricigale.photometry.template_fit.TemplateFit`
+        The fit.
     residual, model : `~numpy.ndarray`, shape (ny, nx)
-        What the fit left and what it took, light per pixel.
-    inverse_sigma : `~numpy.ndarray`, shape (ny, nx)
-        Inverse of the noise, zero for pixels that do not count.
-    width : float
-        Rms width of a Gaussian like the PSF, in pixels.
+        What it left and what it took, light per pixel.
     xy : `~numpy.ndarray`, shape (n, 2)
         Positions of all sources; NaN for those far outside.
-    new : callable, optional
-        Makes an image of zeros like the residual.
-    executor : `concurrent.futures.Executor`, optional
-        Threads to work with.
 
     Notes
     -----
@@ -52,12 +46,13 @@ def residual_peaks(residual, model, inverse_sigma, width, xy, *, new=None, execu
     nearest source, if that is within two full widths, has more than half as much light is that
     source's own. Of two peaks within 0.7 full widths the brighter one counts.
     """
+    inverse_sigma, width = fit.inverse_sigma, fit.psf_width
     full_width = 2.0 * np.sqrt(2.0 * np.log(2.0)) * width
     placed = xy[np.isfinite(xy).all(axis=1)]
     if not inverse_sigma.any():
         return ResidualPeaks(np.empty((0, 2), int), np.empty((0, 2)), np.empty(0), full_width)
     # fluxes of point sources by least squares, as if each stood alone: signal over power
-    snr, power = _matched(residual, inverse_sigma, width, new, executor)
+    snr, power = _matched(fit, residual)
     usable = power > 0
     # what is a thousandth of the stated noise is that of the arithmetic
     noise = max(mad_std(_some(snr, usable)), 1e-3)
@@ -112,9 +107,10 @@ def _radius(width):
     return int(4.0 * width + 0.5)
 
 
-def _matched(residual, inverse_sigma, width, new, executor):
+def _matched(fit, residual):
     """Signal-to-noise and power of point sources at all pixels, both zero where too little of them is seen."""
-    snr, power = (np.zeros_like(residual) if new is None else new() for _ in range(2))
+    snr, power, executor = fit.arrays.new(), fit.arrays.new(), fit.bank.executor
+    inverse_sigma, width = fit.inverse_sigma, fit.psf_width
     halo = _radius(width)
 
     def strip(part):

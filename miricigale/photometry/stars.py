@@ -20,6 +20,10 @@ from miricigale.utils.units import ANGLE, FNU, positive
 _NO_OVERLAP = next(f.bit_value for f in PSF_FLAGS.FLAG_DEFINITIONS if f.name == "no_overlap")
 
 
+#: Columns of photutils that are kept.
+_FITTED = ("flux_fit", "flux_err", "x_fit", "y_fit", "reduced_chi2", "qfit", "cfit")
+
+
 def psf_photometry(image, psf, catalog, *, pa=None, max_shift=0.1 * u.arcsec):
     """
     Fit a PSF to stars one by one (`photutils.psf.PSFPhotometry`), on squares of four times its FWHM.
@@ -80,14 +84,11 @@ def psf_photometry(image, psf, catalog, *, pa=None, max_shift=0.1 * u.arcsec):
         bound = positive(max_shift, ANGLE, "max_shift") / scale
     xy = sky_pixels(sky, image.wcs, arrays.flux.shape, side / 2)
     rows = np.flatnonzero(np.isfinite(xy[:, 0]))
-    names = ("flux", "flux_err", "x_fit", "y_fit", "chi2", "qfit", "cfit")
-    found = {name: np.full(n, np.nan) for name in names}
-    flags = np.full(n, _NO_OVERLAP)
+    found, flags = {name: np.full(n, np.nan) for name in _FITTED}, np.full(n, _NO_OVERLAP)
     if len(rows):
         fitted = _fit(arrays, model, xy[rows], side, bound, width.value / scale)
-        keys = ("flux_fit", "flux_err", "x_fit", "y_fit", "reduced_chi2", "qfit", "cfit")
-        for name, key in zip(names, keys, strict=True):
-            found[name][rows] = np.ma.filled(np.ma.asarray(fitted[key], float), np.nan)
+        for name, values in found.items():
+            values[rows] = np.ma.filled(np.ma.asarray(fitted[name], float), np.nan)
         flags[rows] = fitted["flags"]
     if max_shift is None:
         # errors of a position that is kept are none; its place is
@@ -100,12 +101,12 @@ def psf_photometry(image, psf, catalog, *, pa=None, max_shift=0.1 * u.arcsec):
     columns = {
         "id": (ids, "Id of the catalog"),
         "sky": (sky, "Position of the catalog"),
-        "flux": (found["flux"] * FNU, "Flux of the PSF"),
+        "flux": (found["flux_fit"] * FNU, "Flux of the PSF"),
         "flux_err": (found["flux_err"] * FNU, "Its error for noise that is not correlated"),
         "x_fit": (found["x_fit"], "Fitted position, 0-based"),
         "y_fit": (found["y_fit"], "Fitted position, 0-based"),
         "shift": (shift * ANGLE, "From the position of the catalog to the fitted one"),
-        "chi2": (found["chi2"], "Reduced chi^2"),
+        "chi2": (found["reduced_chi2"], "Reduced chi^2"),
         "qfit": (found["qfit"], "Sum of absolute residuals over the flux"),
         "cfit": (found["cfit"], "Residual of the central pixel over the flux"),
         "neighbor": (near, "Another row is within the fitted square: the flux is not its own"),

@@ -11,7 +11,6 @@ from miricigale.photometry.errors import LinearFit, normal_matrix
 from miricigale.photometry.fields import legendre_terms
 from miricigale.photometry.free_templates import free_templates
 from miricigale.photometry.shapes import not_fitted
-from miricigale.photometry.template_changes import TemplateChanges
 from miricigale.utils.exceptions import PhotometryWarning
 from miricigale.utils.parallel import chunks
 from miricigale.utils.units import ANGLE
@@ -148,19 +147,7 @@ class TemplateFit:
         lone = np.setdiff1d(np.arange(len(known)), hosts)
         known["covariance"][lone, 1:3] = 0.0
         known["covariance"][lone, :, 1:3] = 0.0
-        self.free = free_templates(
-            self.fit,
-            self.bank,
-            self.rows,
-            known[self.bank.order[self.rows]],
-            TemplateChanges(
-                self.settings.mean_kernel.source,
-                self.settings.mean_kernel.target,
-                self.settings.errors.size_scatter,
-            ),
-            [self.arrays.whitened(one) for one in (self.arrays.flux, *self.columns)],
-            self.inverse_sigma,
-        )
+        self.free = free_templates(self, known[self.bank.order[self.rows]])
         if self.free is not None:
             self.flux[self.rows] = self.free.flux
 

@@ -104,3 +104,12 @@ def disks(sky, wcs, shape, radius, labels=None):
     for label, a, b in zip(labels, *wcs.world_to_pixel(sky), strict=True):
         found[np.hypot(x - a, y - b) < radius] = label
     return found
+
+
+def pair(sky, flux, size, shapes, sigmas, rng):
+    """A prior and an image, with noise, of Gaussian galaxies of some widths (rms, arcsec)."""
+    forms = zip((FINE, 0.11), (HI, LO), shapes, sigmas, strict=True)
+    return [
+        picture(sky, flux, (n, n), scale=scale, width=np.hypot(psf, size), sigma=sigma, rng=rng)
+        for scale, psf, n, sigma in forms
+    ]

@@ -135,10 +135,6 @@ def test_the_pixel_counts_once_in_the_scale(tools, width):
     correction = aperture_correction(psf, 0.3 * u.arcsec, pixel_scale=0.11 * u.arcsec)
     assert_allclose(table["median"] * correction, 1, atol=0.003)
     # a square of side a is as wide as a Gaussian of a / sqrt(12)
-    radius = 0.4 * u.arcsec
     total = np.hypot(width, 0.11 / np.sqrt(12))
-    assert_allclose(
-        encircled_energy(psf, radius, pixel_scale=0.11 * u.arcsec),
-        1 - np.exp(-0.5 * (0.4 / total) ** 2),
-        rtol=3e-3,
-    )
+    energy = encircled_energy(psf, 0.4 * u.arcsec, pixel_scale=0.11 * u.arcsec)
+    assert_allclose(energy, 1 - np.exp(-0.5 * (0.4 / total) ** 2), rtol=3e-3)

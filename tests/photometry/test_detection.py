@@ -16,8 +16,8 @@ from miricigale.photometry import (
 
 @pytest.fixture(scope="module")
 def deep(tools):
-    rng = np.random.default_rng(3)
-    sky, flux = tools.places(*tools.lattice(rng, 5, 5.5, 0.0)), np.geomspace(2, 200, 25)
+    rng, at = np.random.default_rng(3), np.meshgrid(*[np.linspace(-11, 11, 5)] * 2)
+    sky, flux = tools.places(*(one.ravel() for one in at)), np.geomspace(2, 200, 25)
     form = {"scale": tools.FINE, "sigma": 0.01 / (tools.FINE**2 * tools.SR * 1e12), "rng": rng}
     return sky, flux, tools.picture(sky, flux, (500, 500), width=0.15, **form)
 

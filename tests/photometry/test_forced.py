@@ -339,12 +339,9 @@ def test_threads_do_not_change_a_bit(tools, monkeypatch, n_threads):
     noise = np.random.default_rng(3).normal(0, 0.5, low.data.shape)
     low.data[:] += scipy.ndimage.gaussian_filter(noise, 1.0)
     segmentation, _ = detect_sources(high, threshold=1.0, n_pixels=10)
-    alone, shared = (
-        ForcedPhotometer(tools.kernel, background_order=0, n_threads=n).measure(
-            low, high, segmentation, QTable({"sky": sky})
-        )
-        for n in (1, n_threads)
-    )
+    photometer = ForcedPhotometer(tools.kernel, background_order=0)
+    arguments = low, high, segmentation, QTable({"sky": sky})
+    alone, shared = (photometer.replace(n_threads=n).measure(*arguments) for n in (1, n_threads))
     assert alone.noise_correlation.shape[0] > 1
     assert np.isfinite(alone.flux.value).all()
     for name in ("flux", "flux_err", "background", "background_err"):

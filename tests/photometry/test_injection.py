@@ -96,9 +96,7 @@ def test_injected_points_tell_understated_errors(tools, points, photometer, stat
 def test_galaxies_are_injected_into_the_prior_too(tools):
     rng = np.random.default_rng(7)
     sky, size = tools.positions(rng, 25, 13.0), rng.uniform(0.05, 0.3, 25)
-    flux, wide, sharp = np.full(25, 20.0), np.hypot(tools.LO, size), np.hypot(tools.HI, size)
-    high = tools.picture(sky, flux, (540, 540), scale=0.06, width=sharp, sigma=2.0, rng=rng)
-    low = tools.picture(sky, flux, (300, 300), width=wide, sigma=0.2, rng=rng)
+    high, low = tools.pair(sky, np.full(25, 20.0), size, (540, 300), (2.0, 0.2), rng)
     segments, found = detect_sources(high)
     # labels are then those at the positions
     found.remove_column("label")

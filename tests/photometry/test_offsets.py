@@ -113,11 +113,9 @@ def test_real_images_are_aligned(data_file):
         fits.getdata(f"{psfs}_{name}.fits.gz").mean(axis=0) for name in ("kernel_f770w", "psf")
     )
     kernel = MatchingKernel.from_array(kernel, pixel_scale=0.04 * u.arcsec, source=psf)
-    options = {"background_order": 0, "max_shift": 0.2 * u.arcsec}
+    photometer = ForcedPhotometer(kernel, background_order=0, max_shift=0.2 * u.arcsec)
     one, mapped = (
-        ForcedPhotometer(kernel, offset_order=order, **options).measure(
-            image, prior, segments, sources
-        )
+        photometer.replace(offset_order=order).measure(image, prior, segments, sources)
         for order in (None, 0)
     )
     found = mapped.offset_map.evaluate(sources["sky"][0]).to_value(u.arcsec)

@@ -103,12 +103,9 @@ def test_points_are_told_from_galaxies(snr, share):
     for name, image in (("point", point), ("galaxy", wide)):
         # significance of the best filter
         sigma = np.sqrt(np.sum(image**2)) / snr
-        fits = [
-            fitter.fit(
-                image + rng.normal(0, sigma, image.shape), np.full((41, 41), 1 / sigma), (20, 20)
-            )
-            for _ in range(40)
-        ]
+        weight = np.full((41, 41), 1 / sigma)
+        drawn = (image + rng.normal(0, sigma, image.shape) for _ in range(40))
+        fits = [fitter.fit(one, weight, (20, 20)) for one in drawn]
         found[name] = np.mean([one is not None and one.point > 0.5 for one in fits])
     assert found["point"] >= share
     assert found["galaxy"] <= 1 - share

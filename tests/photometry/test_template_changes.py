@@ -133,12 +133,7 @@ def blend(tools):
     rng = np.random.default_rng(2)
     sky = tools.places([-4.0, 3.0, 3.55], [0.0, -0.3, 0.3])
     widths, flux = np.array([0.25, 0.3, 0.2]), np.array([20.0, 40.0, 10.0])
-    high, low = (
-        tools.picture(
-            sky, flux, (n, n), scale=scale, width=np.hypot(psf, widths), sigma=noise, rng=rng
-        )
-        for psf, scale, n, noise in ((tools.HI, 0.06, 260, 0.15), (tools.LO, 0.11, 150, 0.05))
-    )
+    high, low = tools.pair(sky, flux, widths, (260, 150), (0.15, 0.05), rng)
     return low, high, *detect_sources(high)
 
 
@@ -247,19 +242,11 @@ def test_pulls_of_galaxies_on_a_noisy_prior(tools):
     size = np.where(rng.random(49) < 0.25, 0.0, rng.uniform(0.1, 0.35, 49))
     flux = 10 ** rng.uniform(0.7, 1.4, 49) * (0.4 + size) / 0.5
     pulls, exact = [], []
-    photometer, plain = (
-        ForcedPhotometer(
-            tools.kernel, errors=ErrorSettings(correlated_noise=False, size_scatter=one)
-        )
-        for one in (0.1, None)
-    )
+    photometer = ForcedPhotometer(tools.kernel, errors=tools.WHITE)
+    errors = ErrorSettings(correlated_noise=False, size_scatter=None)
+    plain = photometer.replace(errors=errors)
     for _ in range(3):
-        high, low = (
-            tools.picture(
-                sky, flux, (n, n), scale=scale, width=np.hypot(psf, size), sigma=noise, rng=rng
-            )
-            for psf, scale, n, noise in ((tools.HI, 0.06, 660, 2.5), (tools.LO, 0.11, 360, 0.1))
-        )
+        high, low = tools.pair(sky, flux, size, (660, 360), (2.5, 0.1), rng)
         segments, found = detect_sources(high)
         index, distance, _ = sky.match_to_catalog_sky(found["sky"])
         near = distance < 0.3 * u.arcsec
