@@ -8,6 +8,7 @@ import pytest
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
+from helpers.errors import refuses
 from helpers.grids import photometry_table
 from miricigale.fitting import BayesFitter, FitFlags, GridSettings
 from miricigale.sed import ModelGrid, SEDModel
@@ -71,6 +72,12 @@ def drawn():
     return photometry_table(BANDS, model + noise, error, z=true["redshift"]), true
 
 
+def interpolated(grid, n, finer=None):
+    """A fit with n models between the nodes of each object."""
+    settings = GridSettings(interpolate=n, finer=finer)
+    return BayesFitter(grid, model_error=0.0, settings=settings)
+
+
 def coverage(results, true, name):
     low, high = results.percentile(name, [0.16, 0.84]).value.T
     return np.mean((true[name] >= low) & (true[name] <= high))
@@ -78,7 +85,7 @@ def coverage(results, true, name):
 
 def test_intervals_hold_the_truth_between_nodes(grid, drawn):
     table, true = drawn
-    results = BayesFitter(grid, model_error=0.0, settings=GridSettings(interpolate=150)).fit(table)
+    results = interpolated(grid, 150).fit(table)
     nodes = BayesFitter(grid, model_error=0.0).fit(table)
     for name in ("redshift", "tau", "ebv", "mass", "sfr", "beta"):
         # three times the binomial error of 300 objects
@@ -103,9 +110,7 @@ def test_what_rests_on_one_node_is_flagged(grid, drawn):
 def test_known_redshifts_are_those_of_the_catalog(grid, drawn):
     """Also where they lie between nodes; the rest is then that of these redshifts."""
     table, true = drawn
-    results = BayesFitter(grid, model_error=0.0, settings=GridSettings(interpolate=150)).fit(
-        table, redshift="z"
-    )
+    results = interpolated(grid, 150).fit(table, redshift="z")
     assert_allclose(results.percentile("redshift", 0.5).value[:, 0], true["redshift"])
     for name in ("tau", "ebv", "mass", "sfr"):
         assert abs(coverage(results, true, name) - 0.68) < 0.08, name
@@ -121,9 +126,7 @@ def test_chi2_and_evidence_are_those_at_the_known_redshift(grid):
     error = SIGMA * true
     observed = true + error * rng.normal(size=true.shape)
     table = photometry_table(BANDS, observed, error)
-    results = BayesFitter(grid, model_error=0.0, settings=GridSettings(interpolate=20)).fit(
-        table, redshift=z
-    )
+    results = interpolated(grid, 20).fit(table, redshift=z)
     unit, data = models / error[:, None], (observed / error)[:, None]
     scale = np.sum(unit * data, axis=2) / np.sum(unit**2, axis=2)
     chi2 = np.sum((data - scale[..., None] * unit) ** 2, axis=2)
@@ -140,10 +143,6 @@ def test_chi2_and_evidence_are_those_at_the_known_redshift(grid):
 def test_masses_at_low_redshift_are_those_of_the_distance(grid):
     """Half way between redshift 0.01 and 0.04 the distance is not half way in ln(1 + z)."""
     galaxy = flux(np.array([0.01, 0.04])[:, None], np.array([1.0, 3.0]), np.array([0.1, 0.1]))[0]
-    part = {
-        "galaxy_parameters": grid.galaxy_parameters[[0, 6]],
-        "agn": np.zeros((2, 0, len(BANDS))),
-    }
     near = replace(
         grid,
         redshift=np.array([0.01, 0.04]),
@@ -153,23 +152,21 @@ def test_masses_at_low_redshift_are_those_of_the_distance(grid):
         galaxy_properties=grid.galaxy_properties[[0, 6]],
         galaxy_shape=grid.galaxy_shape[[0, 6]],
         axes={"redshift": [0.01, 0.04], "tau": [1.0, 3.0]},
-        **part,
+        galaxy_parameters=grid.galaxy_parameters[[0, 6]],
+        agn=np.zeros((2, 0, len(BANDS))),
     )
     model = 1e9 * flux(np.array([0.02]), np.array([1.0]), np.array([0.1]))[0]
     table = photometry_table(BANDS, model, 0.05 * model)
-    results = BayesFitter(near, model_error=0.0, settings=GridSettings(interpolate=50)).fit(
-        table, redshift=0.02
-    )
+    results = interpolated(near, 50).fit(table, redshift=0.02)
     assert results.best_scale[0] == pytest.approx(1e9, rel=1e-3)
 
 
 def test_the_same_objects_have_the_same_draws(grid, drawn):
     table, _ = drawn
-    fitter = BayesFitter(grid, model_error=0.0, settings=GridSettings(interpolate=50))
+    fitter = interpolated(grid, 50)
     some, turned = fitter.fit(table[:6]), fitter.fit(table[:6][::-1])
-    assert_array_equal(
-        some.percentile("mass", [0.16, 0.5]), turned.percentile("mass", [0.16, 0.5])[::-1]
-    )
+    levels = [0.16, 0.5]
+    assert_array_equal(some.percentile("mass", levels), turned.percentile("mass", levels)[::-1])
 
 
 OPTICAL = ["megacam.u", "acs.f606w", "acs.f814w", "wfc3.f125w", "wfc3.f160w", "irac.ch1"]
@@ -221,8 +218,7 @@ def test_interpolated_models_are_those_of_the_chain(chain, off_nodes):
     want = np.column_stack([fluxes[name].value for name in CHAIN_BANDS])
     off = []
     for finer in (None, model):
-        fitter = BayesFitter(grid, settings=GridSettings(interpolate=1, finer=finer))
-        models = fitter.backend.between
+        models = interpolated(grid, 1, finer).backend.between
         flux, power = models.fluxes(models.models(values))
         ratio = np.log(flux * 1e10 / want)
         off.append(np.sqrt(np.mean(np.minimum(np.abs(ratio), 0.3) ** 2)))
@@ -236,8 +232,7 @@ def test_interpolated_models_are_those_of_the_chain(chain, off_nodes):
 def test_intervals_of_galaxies_and_agn(chain, off_nodes):
     """Of models of the chain, two-sided; ``benchmarks/intervals.py`` measures more of them."""
     (model, grid), (table, true, _) = chain, off_nodes
-    fitter = BayesFitter(grid, model_error=0.0, settings=GridSettings(interpolate=300, finer=model))
-    results = fitter.fit(table)
+    results = interpolated(grid, 300, model).fit(table)
     nodes = BayesFitter(grid, model_error=0.0).fit(table)
     names = ("redshift", "frac_agn", "stellar_mass", "sfr", "dust_luminosity")
     held = {}
@@ -262,9 +257,7 @@ def test_known_redshifts_between_nodes_are_those_of_the_chain(chain):
     for name in CHAIN_BANDS:
         table[name], table[f"{name}_err"] = fluxes[name], 0.02 * fluxes[name]
     known = np.array(true["redshift"])
-    results = BayesFitter(
-        grid, model_error=0.0, settings=GridSettings(interpolate=20, finer=model)
-    ).fit(table, redshift=known)
+    results = interpolated(grid, 20, model).fit(table, redshift=known)
     # fluxes are good to half a percent, a quarter of their errors
     assert np.all(results.chi2 < len(CHAIN_BANDS) / 10)
     nodes = BayesFitter(grid, model_error=0.0).fit(table, redshift=known)
@@ -276,11 +269,8 @@ def test_known_redshifts_between_nodes_are_those_of_the_chain(chain):
 def test_a_finer_grid_is_of_the_model_that_made_the_grid(chain):
     model, grid = chain
     other = SEDModel.yang2021(libraries="bundled", frac_agn_definition="3-1000um")
-    with pytest.raises(ValueError, match="'finer' must be the model that made the grid"):
-        BayesFitter(grid, settings=GridSettings(interpolate=10, finer=other))
+    refuses("'finer' must be the model that made the grid", interpolated, grid, 10, other)
+    refuses("'finer' must be an SEDModel", interpolated, grid, 10, grid)
+    settings = GridSettings(interpolate=10, finer=other)
     with pytest.raises(ValueError, match="'finer' must be left out when 'model' is an SEDModel"):
-        BayesFitter(
-            model, CHAIN_BANDS, axes=CHAIN, settings=GridSettings(interpolate=10, finer=other)
-        )
-    with pytest.raises(ValueError, match="'finer' must be an SEDModel"):
-        BayesFitter(grid, settings=GridSettings(interpolate=10, finer=grid))
+        BayesFitter(model, CHAIN_BANDS, axes=CHAIN, settings=settings)

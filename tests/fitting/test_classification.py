@@ -188,10 +188,9 @@ def test_spectra_of_files(tmp_path):
     for name, level in zip(spectra, (8.339, 8.339, 16.678), strict=True):
         assert_allclose(spectra[name].fnu.value, level, rtol=1e-3)
     refuses(r"template 'flat'.*irac\.ch1", template_grid, spectra, BANDS)
+    bands = ["wfc3.f125w", "miri.f770w", "miri.f1500w"]
     with pytest.warns(MiricigaleWarning, match="3 of 3 spectra continued to"):
-        grid = template_grid(
-            spectra, ["wfc3.f125w", "miri.f770w", "miri.f1500w"], beyond="rayleigh-jeans"
-        )
+        grid = template_grid(spectra, bands, beyond="rayleigh-jeans")
     ratio = grid.galaxy[0, 0, 1] / grid.galaxy[0, 0, 2]
     assert ratio == pytest.approx((15.065 / 7.639) ** 2, rel=0.02)
     (folder / "none.txt").write_text("wave flux\n1 nan\n2 1\n")
@@ -234,12 +233,9 @@ def test_atmospheres_of_all_gravities_are_read(tmp_path):
 def test_units_as_stsci_writes_them(tmp_path, units, scale):
     """The Pickles atlas says ANGSTROMS and FLAM, which FITS does not know: no warning, and no flux lost."""
     wave = np.linspace(4000, 6000, 201) * (1e-4 if units[0] == "MICRONS" else 1.0)
-    columns = [
-        Column(name, "D", unit=unit, array=array)
-        for name, unit, array in zip(
-            ("WAVELENGTH", "FLUX"), units, (wave, np.full(201, scale)), strict=True
-        )
-    ]
+    arrays = {"WAVELENGTH": wave, "FLUX": np.full(201, scale)}
+    pairs = zip(arrays, units, strict=True)
+    columns = [Column(name, "D", unit=unit, array=arrays[name]) for name, unit in pairs]
     BinTableHDU.from_columns(columns).writeto(tmp_path / "pickles_1.fits")
     (sed,) = read_spectra(tmp_path).values()
     assert sed.wave[100].to_value("Angstrom") == pytest.approx(5000)

@@ -236,9 +236,8 @@ def test_fluxes_behind_the_milky_way_give_the_galaxies_in_front_of_it(catalog, t
         for column in (name, f"{name}_err"):
             table[column] = table[column] * 10 ** (-0.4 * lost[name][0].value)
     table.write(tmp_path / "cat.fits")
-    results = fit_catalog(
-        tmp_path / "cat.fits", tmp_path / "out", axes="quick", redshift="z_spec", ebv=0.3
-    )
+    options = {"axes": "quick", "redshift": "z_spec", "ebv": 0.3}
+    results = fit_catalog(tmp_path / "cat.fits", tmp_path / "out", **options)
     found = results.to_table(["mass_best", "chi2_best"])
     assert_allclose(found["mass_best"].to_value(u.Msun), 1e10, rtol=0.03)
     assert np.all(found["chi2_best"] < 0.1)
@@ -254,9 +253,8 @@ def test_a_catalog_is_sorted_into_galaxies_quasars_and_stars(
     for temperature in (3000, 5000, 9000):
         fnu = BlackBody(temperature * u.K)(wave) * u.sr
         flam = fnu.to(u.erg / u.s / u.cm**2 / u.AA, u.spectral_density(wave))
-        np.savetxt(
-            folder / f"t{temperature}.dat", np.column_stack([wave.to_value(u.AA), flam.value])
-        )
+        columns = np.column_stack([wave.to_value(u.AA), flam.value])
+        np.savetxt(folder / f"t{temperature}.dat", columns)
     grid = template_grid(read_spectra(folder), list(BANDS))
     rows = QTable({"id": [6, 7], "z_spec": [np.nan, np.nan]})
     for i, name in enumerate(BANDS):

@@ -101,12 +101,8 @@ def test_percentiles_of_derived_quantities(make_grid, draw_photometry, brute_for
             total = np.cumsum(weights[order])
             got = results.percentile(name, levels)[i].value
             # where the distribution jumps, either side will do
-            low = values[order][
-                np.minimum(np.searchsorted(total, np.subtract(levels, 4e-3)), order.size - 1)
-            ]
-            high = values[order][
-                np.minimum(np.searchsorted(total, np.add(levels, 4e-3)), order.size - 1)
-            ]
+            places = (np.searchsorted(total, np.add(levels, d)) for d in (-4e-3, 4e-3))
+            low, high = (values[order][np.minimum(p, order.size - 1)] for p in places)
             assert np.all(got >= low * 10**-0.011 - 1e-300), (name, i)
             assert np.all(got <= high * 10**0.011), (name, i)
 

@@ -69,9 +69,8 @@ def test_with_upper_limits_and_known_redshifts(make_grid, draw_photometry, brute
     for i in range(len(table)):
         known = np.where(np.arange(grid.redshift.size) == truth[i][0], 0.0, -np.inf)
         for results, log_prior in ((free, None), (fixed, known)):
-            weights = brute_force(
-                grid, results.flux[i], results.sigma[i], log_prior, results.limit[i]
-            )["weights"]
+            data = results.flux[i], results.sigma[i], log_prior, results.limit[i]
+            weights = brute_force(grid, *data)["weights"]
             for x, y in pairs:
                 want = plain(grid, weights, x, y)
                 assert_allclose(results.joint_pdf(x, y)[i], want, rtol=0, atol=1e-9)
@@ -110,9 +109,8 @@ def test_merged_models_are_as_all_of_them_apart(make_grid, draw_photometry):
     )
     table, _ = draw_photometry(apart, 5, noise=0.3)
     priors = {"temperature_polar": [1.0, 3.0], "law": [2.0, 1.0]}
-    one, two = (
-        BayesFitter(grid, settings=GridSettings(rtol=0), priors=priors) for grid in (merged, apart)
-    )
+    options = {"settings": GridSettings(rtol=0), "priors": priors}
+    one, two = (BayesFitter(grid, **options) for grid in (merged, apart))
     pairs = free_pairs(two)
     one, two = one.fit(table, pairs=pairs), two.fit(table, pairs=pairs)
     assert {"ebv_polar", "temperature_polar", "law"} < set(one.axes)
@@ -138,11 +136,8 @@ def test_marginals_are_the_posteriors_of_each(results):
     assert len(results.pairs) == 20  # of 7 parameters 21, one of which is always there
     for x, y in results.pairs:
         table = results.pairs[x, y]
-        assert table.shape == (
-            len(results),
-            results.axes[x].values.size,
-            results.axes[y].values.size,
-        )
+        size = (results.axes[name].values.size for name in (x, y))
+        assert table.shape == (len(results), *size)
         assert_allclose(table.sum(axis=2), results.pdf[x], rtol=0, atol=1e-6)
         assert_allclose(table.sum(axis=1), results.pdf[y], rtol=0, atol=1e-6)
         assert np.isnan(table[3]).all()

@@ -48,22 +48,18 @@ def test_posterior_is_the_sum_over_models_with_the_errors_of_their_redshifts(gri
     """With 1 / sigma of every band in the likelihood, which is that of normal deviates."""
     error = TemplateError([0.1, 0.3, 1.0, 3.0, 10.0] * u.um, [0.5, 0.1, 0.02, 0.3, 1.0])
     table, _ = draw_photometry(grid, 6, seed=3, noise=0.3)
-    fitter = BayesFitter(
-        grid, model_error=0.0, template_error=error, settings=GridSettings(rtol=0.0)
-    )
-    results = fitter.fit(table)
+    options = {"model_error": 0.0, "settings": GridSettings(rtol=0.0)}
+    results = BayesFitter(grid, template_error=error, **options).fit(table)
     index = np.meshgrid(*(np.arange(n) for n in (5, 9, grid.n_agn, 4)), indexing="ij")
     model = grid.flux(*index)
-    part = np.interp(
-        np.log(PIVOTS / (1 + grid.redshift[:, None])), np.log(error.wave.value), error.error
-    )
+    rest = PIVOTS / (1 + grid.redshift[:, None])
+    part = np.interp(np.log(rest), np.log(error.wave.value), error.error)
     count = np.where(grid.allowed[:, :, None, None], grid.agn_multiplicity[:, None], 0)
     for i in range(6):
         flux, own = results.flux[i], results.flux_err[i]
         sigma = np.hypot(own, part * flux)[:, None, None, None]
-        scale = np.maximum(np.sum(model * flux / sigma**2, -1), 0) / np.sum(
-            (model / sigma) ** 2, -1
-        )
+        scale = np.maximum(np.sum(model * flux / sigma**2, -1), 0)
+        scale /= np.sum((model / sigma) ** 2, -1)
         chi2 = np.sum(((flux - scale[..., None] * model) / sigma) ** 2, -1)
         log_like = -0.5 * chi2 - np.log(sigma).sum(-1)
         weight = count * np.exp(log_like - log_like.max())
@@ -225,22 +221,20 @@ def test_prior_of_star_formation_given_mass_and_redshift(make_grid):
     grid = make_grid(3, n_z=2, n_tau=2, n_age=1, frac=[0.0, 0.3])
     galaxy, rate = np.repeat(grid.galaxy[:, :1], 2, axis=1), np.array([1e-9, 4e-10])
     properties = QTable({"stellar_mass": [0.5, 0.8], "sfr_100myr": rate / u.yr})
-    grid = replace(
-        grid, galaxy=galaxy, galaxy_properties=properties, dust_luminosity=np.full(2, 1e29)
-    )
+    grid = replace(grid, galaxy=galaxy, galaxy_properties=properties)
+    grid = replace(grid, dust_luminosity=np.full(2, 1e29))
     flux = 1e10 * galaxy[1, 0]
     table = photometry_table(grid.filters, flux, 0.5 * flux)
 
     def relation(mass, redshift):
         return 10 ** (0.8 * np.log10(mass / u.Msun) - 7.0 + redshift) * u.Msun / u.yr
 
-    fitter = BayesFitter(
-        grid, model_error=0.0, settings=GridSettings(sfr_prior=(relation, 0.3), rtol=0.0)
-    )
-    fits = (
-        fitter.fit(table),
-        BayesFitter(grid, model_error=0.0, settings=GridSettings(rtol=0.0)).fit(table),
-    )
+    def fitted_with(prior):
+        settings = GridSettings(sfr_prior=prior, rtol=0.0)
+        return BayesFitter(grid, model_error=0.0, settings=settings)
+
+    fitter = fitted_with((relation, 0.3))
+    fits = fitter.fit(table), fitted_with(None).fit(table)
     # which redshift it is stays with the fluxes
     assert_allclose(fits[0].pdf["redshift"], fits[1].pdf["redshift"], rtol=1e-6)
     known = fitter.fit(table, redshift=grid.redshift[1])
@@ -252,15 +246,11 @@ def test_prior_of_star_formation_given_mass_and_redshift(make_grid):
     assert part == pytest.approx(prior[0] / prior.sum(), abs=5 * np.sqrt(0.25 / 4000))
     with pytest.raises(ValueError, match="'sfr_prior' must be a function"):
         BayesFitter(grid, settings=GridSettings(sfr_prior=relation))
-    bare = BayesFitter(
-        grid, settings=GridSettings(sfr_prior=(lambda mass, z: relation(mass, z).value, 0.3))
-    )
+    bare = fitted_with((lambda mass, z: relation(mass, z).value, 0.3))
     refuses("'sfr_prior' must be a quantity", bare.fit, table, error=u.UnitsError)
     for factor, got in ((np.nan, "nan"), (0.0, "0"), (-1.0, "-"), (np.inf, "inf")):
-        settings = GridSettings(sfr_prior=(lambda m, z, x=factor: x * relation(m, z), 0.3))
-        nothing = BayesFitter(grid, settings=settings)
+        nothing = fitted_with((lambda m, z, x=factor: x * relation(m, z), 0.3))
         refuses(f"'sfr_prior' must be .* above 0 and finite, got {got}", nothing.fit, table)
-    with pytest.raises(
-        ValueError, match="'settings' must be SamplerSettings with engine='nautilus'"
-    ):
-        BayesFitter(None, ["acs.f606w"], engine="nautilus", settings=GridSettings())
+    wanted = "'settings' must be SamplerSettings with engine='nautilus'"
+    options = {"engine": "nautilus", "settings": GridSettings()}
+    refuses(wanted, BayesFitter, None, ["acs.f606w"], **options)

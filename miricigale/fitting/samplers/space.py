@@ -196,14 +196,15 @@ def make_prior(name, prior, parameter):
         return law
     if not isinstance(prior, tuple) and np.ndim(prior) == 1:
         return _choice(argument, prior, np.ones(len(prior)), parameter)
+    pair = isinstance(prior, tuple) and len(prior) == 2
+    if pair and np.ndim(prior[0]) == np.ndim(prior[1]) == 1:
+        return _choice(argument, *prior, parameter)
     try:
-        if not isinstance(prior, tuple):
-            return parameter.check(prior)
-        if len(prior) == 2 and np.ndim(prior[0]) == np.ndim(prior[1]) == 1:
-            return _choice(argument, *prior, parameter)
-        if len(prior) == 2 or (len(prior) == 3 and prior[2] in ("log", "flat")):
+        if pair or (isinstance(prior, tuple) and len(prior) == 3 and prior[2] in ("log", "flat")):
             low, high, kind = (*prior, "flat")[:3]
             return _interval(argument, parameter.check(low), parameter.check(high), kind)
+        if not isinstance(prior, (tuple, str)):
+            return parameter.check(prior)
     except TypeError:
         pass
     wanted = "(low, high), (low, high, 'log'), 'flat', 'log', values, a distribution or a number"
