@@ -6,7 +6,7 @@ import pytest
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable, Table
 
-from helpers.runs import STAGES, do_stage
+from helpers.runs import do_stage
 from helpers.scenes import catalog_at
 from miricigale.fitting import FitResults
 from miricigale.scene import CatalogFlags, check_catalog
@@ -92,7 +92,7 @@ def test_new_errors_make_other_inputs(galaxies, tmp_path):
         table.write(path)
         config = StudyConfig.from_dict({"catalog": {"source": str(path)}})
         runner = StudyRunner(config, tmp_path, study_stages)
-        return runner.digest(STAGES["seds"], "", Nothing())
+        return runner.digest("seds", Nothing())
 
     table = galaxies.copy()
     table["nircam.f200w_err"] = 0.01 * table["nircam.f200w"]

@@ -252,11 +252,8 @@ def test_other_reference_data_make_other_exposures(tmp_path, monkeypatch):
     def digests():
         stages = [s for s in study_stages() if s.name in ("exposures", "points", "kernels")]
         runner = StudyRunner(StudyConfig(), tmp_path / "run", study_stages())
-        units = [next(iter(stage.units(runner.config))) for stage in stages]
-        return {
-            stage.name: runner.digest(stage, unit, Nothing())
-            for stage, unit in zip(stages, units, strict=True)
-        }
+        keys = {stage.name: stage.key(stage.units(runner.config)[0]) for stage in stages}
+        return {name: runner.digest(key, Nothing()) for name, key in keys.items()}
 
     monkeypatch.delenv("MIRICIGALE_DATA", raising=False)
     before = digests()

@@ -33,23 +33,6 @@ _REMEDY = "redo=True to replace it"
 _NAMED = 5
 
 
-@dataclasses.dataclass(frozen=True)
-class _Job:
-    """One unit of one stage."""
-
-    stage: object
-    unit: str
-
-    @property
-    def key(self):
-        return self.stage.key(self.unit)
-
-    def needed(self, config, units):
-        """Keys of all units that this one reads."""
-        groups = self.stage.needed(config, self.unit, units).values()
-        return frozenset(itertools.chain.from_iterable(groups))
-
-
 class StudyRunner:
     """
     Runs a study in a folder.
@@ -113,8 +96,7 @@ class StudyRunner:
         self.progress_bar = progress_bar
         self.n_threads = thread_count(config.run.threads or None)
         self.units = {stage.name: stage.unit_names(config) for stage in self.stages}
-        every = [_Job(stage, unit) for stage in self.stages for unit in self.units[stage.name]]
-        self._keys = [job.key for job in every]
+        self._parts = {s.key(unit): (s, unit) for s in self.stages for unit in self.units[s.name]}
         seen = set()
         for stage in self.stages:
             missing = set(stage.needs) - seen
@@ -122,11 +104,15 @@ class StudyRunner:
                 msg = f"stage {stage.name!r} needs {sorted(missing)}, which do not come before it"
                 raise ConfigError(msg)
             seen.add(stage.name)
-        chosen = set(self._keys) if until is None else self._matching(until, "until")
-        for job in reversed(every):
-            if job.key in chosen:
-                chosen |= job.needed(config, self.units)
-        self.jobs = [job for job in every if job.key in chosen]
+        self._needed = {
+            key: frozenset(itertools.chain(*stage.needed(config, unit, self.units).values()))
+            for key, (stage, unit) in self._parts.items()
+        }
+        chosen = set(self._parts) if until is None else self._matching(until, "until")
+        for key in reversed(self._parts):
+            if key in chosen:
+                chosen |= self._needed[key]
+        self.keys = [key for key in self._parts if key in chosen]
         self._again = set() if again is None else self._matching(again, "again") & chosen
         if again is not None and not self._again:
             msg = f"nothing of 'again', {again!r}, is among what 'until', {until!r}, needs"
@@ -136,24 +122,25 @@ class StudyRunner:
         """Keys of units by stage or pattern."""
         keys = {
             key
-            for key in self._keys
+            for key in self._parts
             if key.partition(":")[0] == pattern or fnmatch.fnmatchcase(key, pattern)
         }
         if not keys:
             msg = (
                 f"'{argument}' is {pattern!r}, which is no stage and matches no unit of this configuration; "
-                f"stages: {', '.join(self.units)}; a unit: {self._keys[-1]}"
+                f"stages: {', '.join(self.units)}; a unit: {next(reversed(self._parts))}"
             )
             raise ConfigError(msg)
         return keys
 
-    def digest(self, stage, unit, store):
+    def digest(self, key, store):
         """
         Hash of everything that a stage's products depend on.
 
         That is its own version, its sections of the configuration (and the seed), the
         checksums of the products it reads and of its reference data.
         """
+        stage, unit = self._parts[key]
         values = {
             "stage": stage.name,
             "unit": unit,
@@ -190,23 +177,21 @@ class StudyRunner:
         """
         states = {}
         moved = set()
-        for job in self.jobs:
-            record = store.records.get(job.key)
+        for key in self.keys:
+            record = store.records.get(key)
             if record is None:
                 state = "new"
-            elif job.key in self._again:
+            elif key in self._again:
                 state = "again"
-            elif moved.intersection(job.needed(self.config, self.units)) or record[
-                "hash"
-            ] != self.digest(job.stage, job.unit, store):
+            elif moved & self._needed[key] or record["hash"] != self.digest(key, store):
                 state = "changed"
             else:
                 # making them again gives the same bytes, so that dependent stages stay current
-                state = "current" if store.is_whole(job.key) else "lost"
-            states[job.key] = state
+                state = "current" if store.is_whole(key) else "lost"
+            states[key] = state
             if state in ("new", "changed"):
-                moved.add(job.key)
-        return states | {key: "surplus" for key in store.records if key not in self._keys}
+                moved.add(key)
+        return states | {key: "surplus" for key in store.records if key not in self._parts}
 
     def run(self):
         """
@@ -230,18 +215,18 @@ class StudyRunner:
         states = self.forecast(store)
         if store.is_sound and set(states.values()) <= {"current"} and self._config_stands(store):
             # nothing is written: a finished run can be called on a full or read-only disk
-            self._tell(f"{self.config.run.name}: all {len(self.jobs)} steps stand")
+            self._tell(f"{self.config.run.name}: all {len(self.keys)} steps stand")
             return store
         with store:
             states = self.forecast(store)
             self._refuse_replacing(store, states)
             self._warn_of_faults(store, states)
-            n_left = sum(states[job.key] != "current" for job in self.jobs)
+            n_left = sum(states[key] != "current" for key in self.keys)
             if n_left:
                 needed = max(0, self._products_bytes() - store.standing_bytes())
                 free = check_disk(self.folder, needed)
                 self._tell(
-                    f"{self.config.run.name}: {n_left} of {len(self.jobs)} steps to do, which take "
+                    f"{self.config.run.name}: {n_left} of {len(self.keys)} steps to do, which take "
                     f"about {needed / 1e9:.2f} GB in {self.folder}/ ({free / 1e9:.1f} GB are free)"
                 )
             self._write_config(store)
@@ -255,7 +240,7 @@ class StudyRunner:
 
     def _products_bytes(self):
         """Bytes that the products of the units take that are wanted."""
-        wanted = collections.Counter(job.stage.name for job in self.jobs)
+        wanted = collections.Counter(self._parts[key][0].name for key in self.keys)
         return int(
             sum(self.disk.get(name, 0) * n / len(self.units[name]) for name, n in wanted.items())
         )
@@ -341,29 +326,28 @@ class StudyRunner:
 
     def _execute(self, store):
         """Do all units, each when what it needs is done."""
-        with Display(self.progress_bar, len(self.jobs)) as display:
+        with Display(self.progress_bar, len(self.keys)) as display:
             run_tasks(
-                [self._task(job, store, display) for job in self.jobs],
+                [self._task(key, store, display) for key in self.keys],
                 executor=self.executor,
                 n_threads=self.n_threads,
                 memory=self.config.run.memory * 1e9 or 0.5 * available_memory(),
                 report=display.begin,
             )
 
-    def _task(self, job, store, display):
-        stage = job.stage
-        needed = job.needed(self.config, self.units)
+    def _task(self, key, store, display):
+        (stage, unit), needed = self._parts[key], self._needed[key]
         inline = self.executor is None
         digest = None
 
         def begin(submit, n_threads):
             nonlocal digest
-            digest = self.digest(stage, job.unit, store)
-            if store.is_current(job.key, digest):
+            digest = self.digest(key, store)
+            if store.is_current(key, digest):
                 display.finish(stage, self.config, 0.0)
                 return None
-            if store.records.get(job.key, {}).get("hash") != digest:
-                store.drop(job.key)
+            if store.records.get(key, {}).get("hash") != digest:
+                store.drop(key)
             return submit(
                 run_unit,
                 self.config,
@@ -371,7 +355,7 @@ class StudyRunner:
                 self.folder.absolute(),
                 self._source,
                 stage.name,
-                job.unit,
+                unit,
                 inputs=list(store.checksums(needed)),
                 n_threads=n_threads,
                 progress_bar=display.is_bar and inline,
@@ -380,19 +364,19 @@ class StudyRunner:
         def finish(result):
             products, seconds, warned = result
             notes = {"warnings": [text for _, text in warned]} if warned else {}
-            store.finish(job.key, digest, products, seconds=round(seconds, 2), **notes)
+            store.finish(key, digest, products, seconds=round(seconds, 2), **notes)
             for category, text in warned:
                 display.warn(category, text)
-            log.debug("%s took %.1f s", job.key, seconds)
+            log.debug("%s took %.1f s", key, seconds)
             display.finish(stage, self.config, seconds)
 
         return Task(
-            job.key,
-            f"{stage.title} {job.unit}".strip(),
+            key,
+            f"{stage.title} {unit}".strip(),
             begin,
             finish,
             needs=needed,
-            memory=stage.memory(self.config, job.unit) if stage.memory else _MEMORY,
+            memory=stage.memory(self.config, unit) if stage.memory else _MEMORY,
         )
 
 
