@@ -1,6 +1,5 @@
 """Catalogs of photometry as CIGALE reads them."""
 
-import warnings
 from pathlib import Path
 
 import astropy.units as u
@@ -9,7 +8,7 @@ from astropy.table import QTable, Table
 
 from miricigale.filters.band_names import band_filters, filter_of_band, is_line
 from miricigale.filters.given import given_filters
-from miricigale.utils.exceptions import CatalogWarning, DataError
+from miricigale.utils.exceptions import CatalogWarning, DataError, warn
 from miricigale.utils.files import read_table
 from miricigale.utils.missing import negative_errors, plain_floats, without_codes
 from miricigale.utils.tables import error_column
@@ -126,7 +125,7 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
         msg = f"{path}: {text}"
         raise DataError(msg)
     if text:
-        warnings.warn(f"{path}: {text}", CatalogWarning, stacklevel=2)
+        warn(f"{path}: {text}", CatalogWarning)
     return out
 
 

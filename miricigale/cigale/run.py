@@ -1,6 +1,5 @@
 """Runs of CIGALE from their files: configuration to setup, catalog to results."""
 
-import warnings
 from pathlib import Path
 
 from miricigale.cigale.best_models import write_best_models
@@ -11,7 +10,7 @@ from miricigale.cigale.names import cigale_names
 from miricigale.cigale.setup import CigaleSetup
 from miricigale.filters.band_names import band_filters, xray_energies
 from miricigale.filters.given import given_filters
-from miricigale.utils.exceptions import CatalogWarning, ConfigError
+from miricigale.utils.exceptions import CatalogWarning, ConfigError, warn
 from miricigale.utils.options import check_choice
 from miricigale.utils.tables import error_column
 
@@ -125,7 +124,7 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
         msg = f"{path}:\n{text}"
         raise ConfigError(msg)
     if text:
-        warnings.warn(f"{path}:\n{text}", CatalogWarning, stacklevel=2)
+        warn(f"{path}:\n{text}", CatalogWarning)
     return setup
 
 

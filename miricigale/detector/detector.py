@@ -3,7 +3,6 @@
 import dataclasses
 import logging
 import math
-import warnings
 from pathlib import Path
 from typing import ClassVar
 
@@ -23,7 +22,7 @@ from miricigale.detector.latent import checked_previous
 from miricigale.detector.ramp import Ramp
 from miricigale.detector.work import Work
 from miricigale.instrument import DetectorProperties, miri_detector
-from miricigale.utils.exceptions import DetectorWarning, argument_error
+from miricigale.utils.exceptions import DetectorWarning, argument_error, warn
 from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_kind
@@ -392,7 +391,7 @@ class Detector(Interactive):
         forecast = SaturationForecast.from_rate(light, exposure, limit, sources)
         if forecast.sky_too_bright:
             message = _sky_message(exposure, forecast.sky_fraction)
-            warnings.warn(message, DetectorWarning, stacklevel=2)
+            warn(message, DetectorWarning)
         return forecast
 
     def _acting(self, included):
@@ -426,7 +425,7 @@ class Detector(Interactive):
         )
         message = _sky_message(exposure, fraction)
         if fraction >= 1:
-            warnings.warn(message, DetectorWarning, stacklevel=4)
+            warn(message, DetectorWarning)
         elif fraction > SKY_FRACTION:
             logger.warning(message)
         return fraction

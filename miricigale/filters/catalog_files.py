@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from miricigale.filters.catalog_map import CatalogMap
-from miricigale.utils.exceptions import CatalogWarning, argument_error
+from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
 from miricigale.utils.files import read_table
 from miricigale.utils.missing import plain_floats, without_codes
 from miricigale.utils.tables import error_column
@@ -65,7 +65,7 @@ def read_catalog_photometry(path, catalog_map=None, *, hdu=None, **options):
     _, lost = catalog_map.names(table.colnames, path.name)
     table, coded = catalog_map.convert(table, path.name)
     for text in catalog_messages(lost, coded):
-        warnings.warn(f"{path.name}: {text}", CatalogWarning, stacklevel=2)
+        warn(f"{path.name}: {text}", CatalogWarning)
     return table
 
 
@@ -134,14 +134,14 @@ def codes_of(table, bands):
     return coded
 
 
-def warn_of_codes(coded, where, stacklevel):
+def warn_of_codes(coded, where):
     """Warn of what `codes_of` found, by band and count, for fits that take the numbers as they are."""
     found = {name: values for name, values in coded.items() if np.any(~np.isnan(values))}
     for text in catalog_messages(
         (), found, "look like numbers that stand for no value, and are fitted as they are"
     ):
         how = "NaN is a missing band; read_catalog_photometry, or --map, makes them so"
-        warnings.warn(f"{where}: {text} ({how})", CatalogWarning, stacklevel=stacklevel + 1)
+        warn(f"{where}: {text} ({how})", CatalogWarning)
 
 
 def joined_codes(pieces):

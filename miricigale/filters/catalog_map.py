@@ -3,7 +3,6 @@
 import dataclasses
 import tomllib
 import types
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -15,7 +14,13 @@ from astropy.table import QTable
 from miricigale.filters.band_names import eazy_filter
 from miricigale.filters.filter import Filter
 from miricigale.filters.surveys import SURVEYS, is_band
-from miricigale.utils.exceptions import CatalogWarning, DataError, argument_error, unknown_name
+from miricigale.utils.exceptions import (
+    CatalogWarning,
+    DataError,
+    argument_error,
+    unknown_name,
+    warn,
+)
 from miricigale.utils.missing import negative_errors, plain_floats, without_codes
 from miricigale.utils.options import check_choice, check_names
 from miricigale.utils.tables import error_column
@@ -234,7 +239,7 @@ class CatalogMap:
         asked = _unit(asked, name)
         if has is not None and has != asked and not (has == u.mag and _is_ab(asked)):
             msg = f"{argument}: {name!r} taken in {asked}, the file says {has}"
-            warnings.warn(msg, CatalogWarning, stacklevel=5)
+            warn(msg, CatalogWarning)
         return asked
 
     def _set_unit(self, table, name, argument):

@@ -1,7 +1,6 @@
 """Catalogs of measured fluxes, however their columns are called."""
 
 import re
-import warnings
 
 import astropy.units as u
 import numpy as np
@@ -11,7 +10,7 @@ from miricigale.filters.band_names import find_filter
 from miricigale.filters.catalog_files import catalog_messages
 from miricigale.filters.catalog_map import CatalogMap
 from miricigale.filters.library import FILTERS
-from miricigale.utils.exceptions import CatalogWarning, argument_error
+from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
 from miricigale.utils.tables import as_table, error_column
 
 # what stands before or after the band in names of fluxes, magnitudes and their errors
@@ -76,7 +75,7 @@ def as_photometry(data, bands, argument="photometry"):
     catalog_map = CatalogMap(units=dict.fromkeys(magnitudes, u.ABmag))
     coded = {name: catalog_map.set_band(out, name, 1.0, argument) for name in magnitudes}
     for text in catalog_messages((), coded):
-        warnings.warn(f"{argument}: {text}", CatalogWarning, stacklevel=3)
+        warn(f"{argument}: {text}", CatalogWarning)
     return out
 
 

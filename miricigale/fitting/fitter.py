@@ -1,7 +1,6 @@
 """BayesFitter: posteriors of galaxy and AGN parameters from broad-band photometry."""
 
 import logging
-import warnings
 
 import numpy as np
 
@@ -23,7 +22,7 @@ from miricigale.fitting.samplers import get_sampler
 from miricigale.fitting.samplers.fit import SamplerFit
 from miricigale.fitting.settings import GridSettings, SamplerSettings
 from miricigale.sed import ModelGrid, yang2021_axes
-from miricigale.utils.exceptions import FitWarning, argument_error
+from miricigale.utils.exceptions import FitWarning, argument_error, warn
 from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.meta import provenance
 from miricigale.utils.parallel import chunks, parallel_map, single_threaded
@@ -305,12 +304,12 @@ class BayesFitter(Interactive):
         lost = [name for name in self.filters or () if name not in table.colnames]
         if lost and len(lost) < len(self.filters):
             text = f"the photometry has no {', '.join(lost)}: missing bands of all objects"
-            warnings.warn(text, FitWarning, stacklevel=3)
+            warn(text, FitWarning)
             table = table.copy(copy_data=False)
             for name in lost:
                 table[name] = table[error_column(name)] = np.full(len(table), np.nan) * FNU
-        warn_of_codes(codes_of(table, self._reader.fitted(table)), "photometry", 3)
-        self.warn_of_bands(table, 3)
+        warn_of_codes(codes_of(table, self._reader.fitted(table)), "photometry")
+        self.warn_of_bands(table)
         return table
 
     def fit_part(
@@ -342,13 +341,13 @@ class BayesFitter(Interactive):
             meta=provenance(fit=settings, **self.backend.provenance()),
         )
 
-    def warn_of_bands(self, photometry, stacklevel):
+    def warn_of_bands(self, photometry):
         """Warn of bands that are not fitted, if the fitter does not name those that are."""
         unused = unused_bands(photometry, self._reader.fitted(photometry))
         if unused and self.filters is None:
             text = "bands of the photometry that the grid lacks are not fitted"
             text = f"{text}: {', '.join(unused)}"
-            warnings.warn(text, FitWarning, stacklevel=stacklevel + 1)
+            warn(text, FitWarning)
 
     def _prepare(self, photometry, redshift, redshift_prior, repeated=None):
         """Photometry with flags, what is known of the redshift of every object, and the settings."""

@@ -2,13 +2,12 @@
 
 import dataclasses
 import logging
-import warnings
 from pathlib import Path
 
 from miricigale.filters.catalog_files import MappedRows, as_catalog_map
 from miricigale.filters.photometry_table import band_columns
 from miricigale.fitting.likelihood import is_filter, unused_bands
-from miricigale.utils.exceptions import FitWarning, argument_error
+from miricigale.utils.exceptions import FitWarning, argument_error, warn
 from miricigale.utils.row_files import open_rows
 from miricigale.utils.tables import error_column
 
@@ -100,7 +99,7 @@ def fit_catalog(
     if unused:
         why = "as their names ('miricigale filters') or errors are missing"
         msg = f"bands of the photometry are not fitted, {why}: {', '.join(unused)}"
-        warnings.warn(msg, FitWarning, stacklevel=2)
+        warn(msg, FitWarning)
     error, least = None, 0.1
     if axes == "survey":
         model, nodes = SEDModel.survey(), SEDModel.survey_axes()

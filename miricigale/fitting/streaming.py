@@ -5,7 +5,6 @@ import importlib.metadata
 import json
 import logging
 import os
-import warnings
 
 import astropy.units as u
 import numpy as np
@@ -16,7 +15,7 @@ from miricigale.fitting.from_files import open_catalog
 from miricigale.fitting.io import FORMAT, FitFolder, open_results, part_ids, part_name
 from miricigale.fitting.likelihood import HIGH_CHI2
 from miricigale.utils.content import content_sha256
-from miricigale.utils.exceptions import CatalogWarning, OtherResultsError, argument_error
+from miricigale.utils.exceptions import CatalogWarning, OtherResultsError, argument_error, warn
 from miricigale.utils.progress import progress
 from miricigale.utils.random import check_seed
 from miricigale.utils.store import plain_value
@@ -128,10 +127,10 @@ def fit_file(
     options = {"redshift": redshift, "redshift_prior": redshift_prior, "pairs": pairs}
     if catalog_map is None:
         pieces = (codes_of(rows.chunk(i), fitter.bands) for i in range(rows.n_chunks))
-        warn_of_codes(joined_codes(pieces), rows.path.name, 2)
+        warn_of_codes(joined_codes(pieces), rows.path.name)
     else:
         for text in rows.messages():
-            warnings.warn(f"{rows.path.name}: {text}", CatalogWarning, stacklevel=2)
+            warn(f"{rows.path.name}: {text}", CatalogWarning)
     fluxes = {c for name in fitter.bands for c in (name, error_column(name))}
     take = _pieces(rows, options, unit, fluxes)
     _check_ids(rows)
@@ -179,7 +178,7 @@ def _fit_parts(fitter, rows, take, folder, seed, executor, progress_bar):
                     repeated = np.array([key in seen for key in keys], dtype=bool)
                     if not n_new:
                         # which holds for all pieces: to the caller of fit_file
-                        fitter.warn_of_bands(table, 3)
+                        fitter.warn_of_bands(table)
                     options |= {"seed": seed, "parallel": {"executor": executor}}
                     results = fitter.fit_part(table, **options, repeated=repeated)
                 n_new += 1

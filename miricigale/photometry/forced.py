@@ -2,7 +2,6 @@
 
 import dataclasses
 import os
-import warnings
 
 import astropy.units as u
 import numpy as np
@@ -26,7 +25,7 @@ from miricigale.photometry.settings import ErrorSettings, MemorySettings
 from miricigale.photometry.sky_noise import warn_of_background
 from miricigale.photometry.sources import SourceTemplates
 from miricigale.psf import KernelField, MatchingKernel
-from miricigale.utils.exceptions import PhotometryWarning, argument_error
+from miricigale.utils.exceptions import PhotometryWarning, argument_error, warn
 from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.options import check_choice
 from miricigale.utils.parallel import single_threaded, thread_count, threads
@@ -178,7 +177,7 @@ class ForcedPhotometer(Interactive):
                 "the kernel has no PSFs: sources are their segments as they are, without wings, and "
                 "those without a segment are not measured"
             )
-            warnings.warn(msg, PhotometryWarning, stacklevel=3)
+            warn(msg, PhotometryWarning)
             # as far as it reaches, and as wide
             mean = dataclasses.replace(mean, source=mean.array, target=mean.array)
             changed |= {"template": "cutout", "wings": False, "mean_kernel": mean}
@@ -264,7 +263,7 @@ class ForcedPhotometer(Interactive):
             msg = (
                 f"none of the {len(sources.id)} sources is on or near 'image': nothing is measured"
             )
-            warnings.warn(msg, PhotometryWarning, stacklevel=2)
+            warn(msg, PhotometryWarning)
         if templates is None:
             templates = self._templates(highres, segmentation, catalog[place.near])
         else:
@@ -410,4 +409,4 @@ class ForcedPhotometer(Interactive):
                     f"the templates were made with a PSF whose peak holds {peaks[0]:.3g} of the light, the "
                     f"kernel is from one whose peak holds {peaks[1]:.3g}: is it of the same image?"
                 )
-                warnings.warn(msg, PhotometryWarning, stacklevel=3)
+                warn(msg, PhotometryWarning)

@@ -9,7 +9,7 @@ import astropy.units as u
 import numpy as np
 from astropy.io import fits
 
-from miricigale.utils.exceptions import DataError, PhotometryWarning, argument_error
+from miricigale.utils.exceptions import DataError, PhotometryWarning, argument_error, warn
 from miricigale.utils.files import open_fits, split_extension
 from miricigale.utils.optional import require
 
@@ -144,7 +144,7 @@ def read_wcs(header, hdus):
                 f"{hdus.filename()}: the coordinates in the header lack the distortion, which is in "
                 f"the extension ASDF: positions are pixels off. {err}"
             )
-            warnings.warn(msg, PhotometryWarning, stacklevel=3)
+            warn(msg, PhotometryWarning)
     return wcs
 
 

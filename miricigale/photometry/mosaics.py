@@ -6,7 +6,6 @@ import functools
 import json
 import logging
 import os
-import warnings
 
 import astropy.units as u
 import numpy as np
@@ -27,7 +26,7 @@ from miricigale.photometry.grids import (
     read_wcs,
 )
 from miricigale.photometry.sky_noise import mask_filled, sky_noise
-from miricigale.utils.exceptions import DataError, PhotometryWarning, argument_error
+from miricigale.utils.exceptions import DataError, PhotometryWarning, argument_error, warn
 from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
 
 _log = logging.getLogger(__name__)
@@ -284,7 +283,7 @@ class MosaicFile:
             zeros = float(np.mean(data[usable] == 0)) if usable.any() else 0.0
             extra = f", and {zeros:.0%} of its pixels are exactly 0" if zeros > 1e-3 else ""
             msg = f"{self.path} has no map of the noise, which will be measured on the image{extra}"
-            warnings.warn(msg, PhotometryWarning, stacklevel=2)
+            warn(msg, PhotometryWarning)
             meta["noise"] = "none"
         else:
             sigma = _sigma(kind, values)
@@ -426,4 +425,4 @@ def _note_scale(file, kind, scale):
             f"{file.path}: noise on the sky is {scale:.4g} times what the {kind} map says, {done}; "
             "is it the map of this image, in its unit?"
         )
-        warnings.warn(msg, PhotometryWarning, stacklevel=3)
+        warn(msg, PhotometryWarning)

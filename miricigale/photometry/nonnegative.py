@@ -1,11 +1,9 @@
 """Least squares with fluxes that are not negative."""
 
-import warnings
-
 import numpy as np
 
 from miricigale.photometry.errors import LinearFit
-from miricigale.utils.exceptions import PhotometryWarning
+from miricigale.utils.exceptions import PhotometryWarning, warn
 
 #: How often all wrong signs are changed at once without there being fewer, and steps in all.
 _PATIENCE, _STEPS = 3, 300
@@ -49,7 +47,7 @@ def nonnegative_fluxes(fit, n):
         flux, common = _solve(fit, fitted)
         gradient = fit.matrix @ flux + fit.border @ common - fit.rhs
     msg = f"no fluxes that are not negative were found in {_STEPS} steps: they are NaN"
-    warnings.warn(msg, PhotometryWarning, stacklevel=5)
+    warn(msg, PhotometryWarning)
     return np.full(n, np.nan)
 
 

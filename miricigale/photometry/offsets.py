@@ -1,7 +1,6 @@
 """Offsets of an image against a catalog: source by source, and as a smooth map."""
 
 import dataclasses
-import warnings
 
 import numpy as np
 import scipy.optimize
@@ -10,7 +9,7 @@ from astropy.table import QTable
 from miricigale.photometry.fields import SmoothField, legendre_terms, n_terms
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.template_fit import TemplateFit
-from miricigale.utils.exceptions import PhotometryWarning
+from miricigale.utils.exceptions import PhotometryWarning, warn
 from miricigale.utils.units import ANGLE
 
 #: Least signal-to-noise of sources whose offsets are measured, largest light of others relative to
@@ -168,7 +167,7 @@ def fit_offsets(arrays, bank, settings, catalog):
                 f"an offset map needs at least {_SOURCES} bright isolated sources within 'max_shift', "
                 f"got {np.count_nonzero(good)}: one shift is fitted to all sources instead"
             )
-            warnings.warn(msg, PhotometryWarning, stacklevel=5)
+            warn(msg, PhotometryWarning)
             return TemplateFit(arrays, bank, settings, search=True)
         member = fit.bank.order[rows]
         field, used = _robust_field(xy[member], offset, error, good, arrays.flux.shape, order)
@@ -184,7 +183,7 @@ def fit_offsets(arrays, bank, settings, catalog):
             f"{_SOURCES * n_terms(settings.offset_order)} bright isolated sources within 'max_shift', "
             f"got {np.count_nonzero(good)}: order {order} is taken"
         )
-        warnings.warn(msg, PhotometryWarning, stacklevel=5)
+        warn(msg, PhotometryWarning)
     near = catalog.near[member]
     table = QTable({"id": catalog.id[near], "sky": catalog.sky[near]})
     table["x_centroid"], table["y_centroid"] = xy[member].T

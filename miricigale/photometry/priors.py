@@ -2,12 +2,11 @@
 
 import logging
 import os
-import warnings
 
 import numpy as np
 
 from miricigale.photometry.grids import open_map
-from miricigale.utils.exceptions import CatalogWarning, DataError, argument_error
+from miricigale.utils.exceptions import CatalogWarning, DataError, argument_error, warn
 from miricigale.utils.positions import as_positions
 from miricigale.utils.tables import as_table, unique_ids
 
@@ -217,7 +216,7 @@ def check_labels(labels, here, what):
         raise argument_error(what, wanted, f"{text}: is it the map of another detection?")
     if wrong >= max(3, 0.1 * n):
         msg = f"the labels of {what} are those of {text}"
-        warnings.warn(msg, CatalogWarning, stacklevel=4)
+        warn(msg, CatalogWarning)
 
 
 def _labels(sources, segments, ids, wcs, catalog, segmentation):
@@ -242,7 +241,7 @@ def _labels(sources, segments, ids, wcs, catalog, segmentation):
     msg += f" of {segmentation} and are taken as points"
     if n_without > 0.5 * n_inside:
         msg += ": is it the map of another detection?"
-        warnings.warn(msg, CatalogWarning, stacklevel=3)
+        warn(msg, CatalogWarning)
     elif n_without:
         _log.info(msg)
     orphans = np.setdiff1d(np.arange(1, len(ids) + 1), label)
@@ -252,5 +251,5 @@ def _labels(sources, segments, ids, wcs, catalog, segmentation):
             f"{orphans.size} segments of {segmentation} belong to no source of {catalog} and are not "
             f"fitted (ids {some}{', ...' if orphans.size > 5 else ''})"
         )
-        warnings.warn(msg, CatalogWarning, stacklevel=3)
+        warn(msg, CatalogWarning)
     return label

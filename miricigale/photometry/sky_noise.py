@@ -1,11 +1,9 @@
 """The noise of an image on its source-free pixels, compared with its noise map."""
 
-import warnings
-
 import numpy as np
 from astropy.stats import mad_std
 
-from miricigale.utils.exceptions import PhotometryWarning, argument_error
+from miricigale.utils.exceptions import PhotometryWarning, argument_error, warn
 from miricigale.utils.units import FNU
 
 #: Pixels of the smallest area that counts as filled.
@@ -82,7 +80,7 @@ def mask_filled(values, usable, what):
             f"{what} has {n} pixels in areas that are exactly 0, though not masked, beside pixels with "
             "noise: they are taken as without data"
         )
-        warnings.warn(msg, PhotometryWarning, stacklevel=4)
+        warn(msg, PhotometryWarning)
         usable &= ~filled
     return n
 
@@ -165,7 +163,7 @@ def warn_of_background(result, kernel):
             f"about {added:.3g} to fluxes whose median error is {error:.3g}: subtract it, or give "
             "'background_order'"
         )
-        warnings.warn(msg, PhotometryWarning, stacklevel=5)
+        warn(msg, PhotometryWarning)
 
 
 def warn_of_sky(arrays, segments):
@@ -193,4 +191,4 @@ def warn_of_sky(arrays, segments):
             f"'highres' has a sky of {level / _median(arrays.sigma[free]):.3g} times its noise, "
             f"{part:.0%} of the light of the median segment: it goes into the templates; subtract it"
         )
-        warnings.warn(msg, PhotometryWarning, stacklevel=5)
+        warn(msg, PhotometryWarning)

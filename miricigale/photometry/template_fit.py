@@ -1,7 +1,5 @@
 """The fit of one image: all templates at once, with what they have in common."""
 
-import warnings
-
 import numpy as np
 import scipy.sparse
 
@@ -11,7 +9,7 @@ from miricigale.photometry.errors import LinearFit, normal_matrix
 from miricigale.photometry.fields import legendre_terms
 from miricigale.photometry.free_templates import free_templates
 from miricigale.photometry.shapes import not_fitted
-from miricigale.utils.exceptions import PhotometryWarning
+from miricigale.utils.exceptions import PhotometryWarning, warn
 from miricigale.utils.parallel import chunks
 from miricigale.utils.units import ANGLE
 
@@ -179,7 +177,7 @@ class TemplateFit:
                     f"a shift of {np.round(found * self.scale, 3)} arcsec is beyond 'max_shift' "
                     f"{self.settings.max_shift}: measured without a shift"
                 )
-                warnings.warn(msg, PhotometryWarning, stacklevel=6)
+                warn(msg, PhotometryWarning)
                 self._solve(plain, [])
                 return
             if np.hypot(*step) < 1e-3:

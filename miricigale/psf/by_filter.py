@@ -2,7 +2,6 @@
 
 import logging
 import math
-import warnings
 
 import astropy.units as u
 import numpy as np
@@ -14,7 +13,7 @@ from miricigale.psf.miri import MIRI_FILTERS, miri_psf
 from miricigale.psf.model import instrument_psf
 from miricigale.psf.nircam import NIRCAM_FILTERS, nircam_psf
 from miricigale.psf.resample import psf_image, psf_mosaic, rotate_psf
-from miricigale.utils.exceptions import PSFWarning, argument_error
+from miricigale.utils.exceptions import PSFWarning, argument_error, warn
 from miricigale.utils.units import ANGLE
 
 _log = logging.getLogger(__name__)
@@ -144,7 +143,7 @@ def checked_psf(
             f"'{argument}' is {ratio:.2g} times as wide (FWHM {width:.3g} arcsec) as the model of "
             f"{filter}, with which it is not compared: was the image brought to this resolution?"
         )
-        warnings.warn(msg, PSFWarning, stacklevel=2)
+        warn(msg, PSFWarning)
         return psf
     if not 1 / _OTHER_WIDTH < ratio < _OTHER_WIDTH:
         wanted = f"a PSF of {filter}, about {usual:.3g} arcsec wide (FWHM)"
@@ -160,7 +159,7 @@ def checked_psf(
             f"'{argument}' is {abs(ratio - 1):.0%} {word} (FWHM {width:.3g} arcsec) than the model of "
             f"{filter}: does it hold the pixel, the drizzling and no more?"
         )
-        warnings.warn(msg, PSFWarning, stacklevel=2)
+        warn(msg, PSFWarning)
     return _scaled(psf, float(stamp.sum()), filter, argument)
 
 
@@ -211,7 +210,7 @@ def _scaled(psf, expected, filter_, argument):
         f"{width:.3g} arcsec, as the model of {filter_} does ({expected:.3f})"
     )
     if abs(taken - held) > 0.01:
-        warnings.warn(msg, PSFWarning, stacklevel=3)
+        warn(msg, PSFWarning)
     else:
         _log.info(msg)
     return psf.replaced(psf.data * (taken / held), total_known=True)

@@ -1,7 +1,6 @@
 """PSFs as photutils models that know their pixel, their axes and what they include."""
 
 import functools
-import warnings
 
 import astropy.units as u
 import numpy as np
@@ -9,7 +8,7 @@ from astropy.nddata import NDData
 from photutils.psf import GriddedPSFModel, ImagePSF
 
 from miricigale.psf import _core
-from miricigale.utils.exceptions import PSFWarning, argument_error
+from miricigale.utils.exceptions import PSFWarning, argument_error, warn
 from miricigale.utils.unified import read_write
 from miricigale.utils.units import ANGLE, check_count, positive, to_array
 
@@ -284,7 +283,7 @@ def make_psf(data, *, pixel_scale, frame="sky", oversampling=1, enclosed=None, *
         factor = oversampling**2
         text = f"'data' sums to {total:.4g} with {oversampling} x {oversampling} cells per pixel: "
         text += f"multiplied by {factor} (a PSF sums to {factor} over the infinite plane)"
-        warnings.warn(text, PSFWarning, stacklevel=2)
+        warn(text, PSFWarning)
     data *= factor
     psf = InstrumentPSF(
         data, pixel_scale=pixel_scale, frame=frame, oversampling=oversampling, **facts

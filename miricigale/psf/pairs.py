@@ -1,7 +1,6 @@
 """What a matching kernel is made of, on one grid: centered, turned, normalized, or refused."""
 
 import logging
-import warnings
 
 import numpy as np
 from photutils.psf import GriddedPSFModel, ImagePSF
@@ -11,7 +10,7 @@ from miricigale.psf import _core
 from miricigale.psf.model import from_photutils, make_psf
 from miricigale.psf.resample import average_psf, centered_psf, psf_image, psf_mosaic, rotate_psf
 from miricigale.psf.wiener import checked_square, gaussian_gain
-from miricigale.utils.exceptions import PSFWarning, argument_error
+from miricigale.utils.exceptions import PSFWarning, argument_error, warn
 from miricigale.utils.units import ANGLE, to_array
 
 _log = logging.getLogger(__name__)
@@ -61,7 +60,7 @@ def psf_pair(hi, lo, scale, *, angles, grid_angle, resampling, extent, normalize
             text = ", ".join(f"{value:.3f} of '{name}'" for name, value in missing.items())
             text = f"light beyond the PSFs' grids, by their own sums and wings: {text}. The kernel "
             text += "is normalized to 1: fluxes lack what lies beyond. Give the PSFs' 'enclosed' "
-            warnings.warn(text + "(make_psf, read_psf) or 'normalize'", PSFWarning, 3)
+            warn(text + "(make_psf, read_psf) or 'normalize'", PSFWarning)
     energy = 1.0 if normalize else held[1]
     mended = {"energy": energy, "held": held, "centering": centering}
     return images[0] / held[0], images[1] * (energy / held[1]), mended
@@ -137,7 +136,7 @@ def ready_arrays(array, scale, **psfs):
     if not np.hypot(x - c, y - c) < 0.1:
         texts.append(f"stands ({x - c:.2f}, {y - c:.2f}) pixels off the center")
     for text in texts:
-        warnings.warn(f"the matching kernel {text}", PSFWarning, stacklevel=3)
+        warn(f"the matching kernel {text}", PSFWarning)
     images = {}
     for name, psf in psfs.items():
         if isinstance(psf, ImagePSF):

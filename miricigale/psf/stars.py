@@ -16,7 +16,7 @@ from photutils.psf import EPSFBuilder, EPSFStars, extract_stars
 from miricigale.psf.effects import EFFECTS
 from miricigale.psf.model import make_psf
 from miricigale.psf.resample import psf_image
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.exceptions import argument_error, warn
 from miricigale.utils.units import ANGLE, check_count, positive, to_array
 
 
@@ -181,7 +181,7 @@ def psf_from_stars(
     failed = int(result.n_excluded_stars)
     if failed:
         text = f"{failed} of {len(stamps)} stamps of stars could not be fitted and were left out"
-        warnings.warn(text, AstropyUserWarning, stacklevel=2)
+        warn(text, AstropyUserWarning)
     for one in caught:
         # photutils says which star; the count above says it once
         if not issubclass(one.category, (AstropyUserWarning, RuntimeWarning)):

@@ -2,13 +2,12 @@
 
 import logging
 import math
-import warnings
 
 import numpy as np
 from scipy.fft import fftshift, ifftshift, irfft2, next_fast_len, rfft2
 
 from miricigale.psf import _core
-from miricigale.utils.exceptions import PSFWarning, argument_error
+from miricigale.utils.exceptions import PSFWarning, argument_error, warn
 from miricigale.utils.options import check_positive
 
 _log = logging.getLogger(__name__)
@@ -168,6 +167,6 @@ def choose(regularization, make, source, target, tolerance):
     text += f"(limit {limits[0]:.4f}), negative pixels {best['negative_sum']:.3f} (limit "
     text += f"{limits[1]:.3f}), error of the encircled energy {best['max_error']:.4f}"
     if not allowed or best["max_error"] > _ERROR:
-        warnings.warn(text, PSFWarning, stacklevel=3)
+        warn(text, PSFWarning)
     _log.info(text)
     return mu, make(mu), best

@@ -1,7 +1,5 @@
 """What a `Reducer` takes the detector of an exposure for: its own constants, or reference files."""
 
-import warnings
-
 import numpy as np
 from astropy.time import Time
 from scipy.ndimage import convolve
@@ -10,7 +8,7 @@ from miricigale.detector import Charge, Ramp
 from miricigale.instrument import Exposure, ImageFacts, flat_field, photmjsr
 from miricigale.reduction.reference_maps import read_flat, read_photom
 from miricigale.reduction.references import BRIGHTNESS, SLOPES, STEP_OF, needed, own_maps
-from miricigale.utils.exceptions import ReferenceWarning, argument_error
+from miricigale.utils.exceptions import ReferenceWarning, argument_error, warn
 
 _OWN = "of the simulated detector"
 
@@ -152,7 +150,7 @@ def brightness_of(reducer, rate):
         used["flat"] = files.flat.name
     if "dark" not in facts.steps:
         msg = "the dark current is in the slopes still: it becomes a part of the background"
-        warnings.warn(msg, ReferenceWarning, stacklevel=4)
+        warn(msg, ReferenceWarning)
     conversion = read_photom(files.photom, exposure, facts.day)
     values = {"dark": 0.0, "flat": flat, "conversion": conversion, "flags": flags}
     meta = {f"reference_{name}": text for name, text in used.items()}

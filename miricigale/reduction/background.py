@@ -1,7 +1,6 @@
 """Smooth background of an image, with the sources masked, and how far it can be trusted."""
 
 import dataclasses
-import warnings
 
 import numpy as np
 from scipy.ndimage import binary_dilation
@@ -11,7 +10,7 @@ from miricigale.reduction.images import flag_pixels, plain_mask, sigma, with_dat
 from miricigale.reduction.sky_mask import cells_of, contamination, darkest, detect, grown, pixels_of
 from miricigale.reduction.sky_mesh import SkyMesh, sky_boxes
 from miricigale.utils import sep_tools
-from miricigale.utils.exceptions import ReductionWarning, argument_error
+from miricigale.utils.exceptions import ReductionWarning, argument_error, warn
 from miricigale.utils.options import check_choice, check_least, check_positive
 from miricigale.utils.tables import Flags
 
@@ -289,7 +288,7 @@ def warn_of(background, mask):
         f"{np.median(background.error[good]):.2g} ({100 * background.source_mask[good].mean():.0f} % of the "
         f"pixels are sources): {reasons}"
     )
-    warnings.warn(text, ReductionWarning, stacklevel=3)
+    warn(text, ReductionWarning)
 
 
 def _plain(data, mask, box, filter_size, correlation):

@@ -3,14 +3,13 @@
 import dataclasses
 import numbers
 import os
-import warnings
 from pathlib import Path
 
 import numpy as np
 
 from miricigale.reduction.measured_noise import measure_noise
 from miricigale.reduction.reference_maps import READERS
-from miricigale.utils.exceptions import ReferenceWarning, argument_error, data_error
+from miricigale.utils.exceptions import ReferenceWarning, argument_error, data_error, warn
 
 #: What slopes need, and what surface brightness needs beside them.
 SLOPES = ("mask", "saturation", "linearity", "dark", "gain", "read_noise")
@@ -167,7 +166,7 @@ def needed(references, header, steps, *, names, what):
         raise argument_error("references", wanted, f"none for {', '.join(missing)}")
     if missing:
         msg = f"{what} without references for {', '.join(missing)}: these steps are left out"
-        warnings.warn(msg, ReferenceWarning, stacklevel=5)
+        warn(msg, ReferenceWarning)
     return references
 
 
@@ -344,7 +343,7 @@ class ReferenceFiles:
                     "light is even and there are no reference pixels, which would separate slow noise of the "
                     "read-out from photons (measure_noise). Give 'gain' if it is known"
                 )
-                warnings.warn(msg, ReferenceWarning, stacklevel=4)
+                warn(msg, ReferenceWarning)
         if self.origin is not None:
             used["context"] = self.origin
         return DetectorMaps(**values, used=used)

@@ -1,7 +1,5 @@
 """Slopes of the ramps of an exposure: which groups take part, and what is taken off them."""
 
-import warnings
-
 import numpy as np
 
 from miricigale.detector import (
@@ -18,7 +16,7 @@ from miricigale.reduction.assumed import is_own
 from miricigale.reduction.drawn import draw_groups
 from miricigale.reduction.rampfit import fit_groups
 from miricigale.reduction.reference_pixels import reference_channels, reference_drift
-from miricigale.utils.exceptions import ReductionWarning, argument_error
+from miricigale.utils.exceptions import ReductionWarning, argument_error, warn
 
 # flags of a ramp's pixels that forbid a slope
 _UNUSABLE = DQ.DO_NOT_USE | DQ.NON_SCIENCE | DQ.REFERENCE_PIXEL | DQ.DEAD
@@ -154,5 +152,5 @@ def _anomaly(reducer, ramp, maps):
             f"the ramp shows {what} that this Reducer leaves in: "
             f"give it {remedy}'skip_first' groups to be left out"
         )
-        warnings.warn(msg, ReductionWarning, stacklevel=4)
+        warn(msg, ReductionWarning)
     return 0.0 if anomaly is None else anomaly.offsets(exposure.n_integrations, exposure.n_groups)

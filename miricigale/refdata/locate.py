@@ -3,7 +3,6 @@
 import importlib.metadata
 import json
 import os
-import warnings
 from importlib import resources as importlib_resources
 from pathlib import Path
 
@@ -12,7 +11,13 @@ from astropy import config as _config
 from miricigale.refdata.registry import resource
 from miricigale.utils.configuration import conf
 from miricigale.utils.content import file_sha256
-from miricigale.utils.exceptions import DataError, ReferenceWarning, argument_error, data_error
+from miricigale.utils.exceptions import (
+    DataError,
+    ReferenceWarning,
+    argument_error,
+    data_error,
+    warn,
+)
 from miricigale.utils.files import cached_by_file
 
 
@@ -160,7 +165,7 @@ def locate(name):
         and fingerprint_of(path) != record.sha256
     ):
         msg = f"resource {record.name!r} is taken from {path}, which differs from the bundled file"
-        warnings.warn(msg, ReferenceWarning, stacklevel=2)
+        warn(msg, ReferenceWarning)
     return path
 
 

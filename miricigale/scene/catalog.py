@@ -1,7 +1,5 @@
 """The catalog of sources: its columns, what is refused and what is flagged."""
 
-import warnings
-
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable, Table
@@ -9,7 +7,7 @@ from astropy.table import QTable, Table
 from miricigale.filters.photometry_table import as_photometry
 from miricigale.filters.surveys import is_band
 from miricigale.profiles import SERSIC_INDEX_RANGE
-from miricigale.utils.exceptions import CatalogWarning, argument_error
+from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
 from miricigale.utils.missing import plain_floats, without_codes
 from miricigale.utils.positions import as_positions
 from miricigale.utils.tables import (
@@ -180,7 +178,7 @@ def check_catalog(table, *, filters=(), wcs=None, argument="catalog"):
     catalog["flags"] = _flags(catalog)
     catalog["flags"].info.description = CatalogFlags.describe()
     for text in points:
-        warnings.warn(f"{argument}: {text}", CatalogWarning, stacklevel=3)
+        warn(f"{argument}: {text}", CatalogWarning)
     return catalog
 
 

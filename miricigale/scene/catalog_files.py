@@ -12,7 +12,7 @@ from miricigale.filters.catalog_files import as_catalog_map, catalog_messages
 from miricigale.filters.surveys import is_band
 from miricigale.refdata import locate, resources
 from miricigale.scene.catalog import CatalogFlags, check_catalog
-from miricigale.utils.exceptions import CatalogWarning, DataError, data_error
+from miricigale.utils.exceptions import CatalogWarning, DataError, data_error, warn
 from miricigale.utils.files import read_table
 from miricigale.utils.tables import error_column
 
@@ -100,7 +100,7 @@ def read_catalog(path, catalog_map=None, **options):
     # counts need an area that is right
     texts += list(_hours(table, catalog)) or _odd_units(catalog)
     for text in texts:
-        warnings.warn(f"{path.name}: {text}", CatalogWarning, stacklevel=2)
+        warn(f"{path.name}: {text}", CatalogWarning)
     return catalog
 
 

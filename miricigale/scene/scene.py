@@ -1,7 +1,6 @@
 """A noiseless image of a catalog of sources, and the truth that belongs to it."""
 
 import functools
-import warnings
 
 import astropy.units as u
 import numpy as np
@@ -20,7 +19,7 @@ from miricigale.scene.catalog_files import read_catalog
 from miricigale.scene.cutouts import Cutout
 from miricigale.scene.render import Painter
 from miricigale.scene.sky import local_jacobian, pixel_positions
-from miricigale.utils.exceptions import CatalogWarning, argument_error
+from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
 from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.meta import provenance
 from miricigale.utils.missing import plain_floats
@@ -240,7 +239,7 @@ class Scene(Interactive):
             f"{len(ids)} of {len(self._catalog)} sources are not painted: fluxes in {self._filter!r} "
             f"are {', '.join(counts)} (flag no_flux of the truth): ids {first}"
         )
-        warnings.warn(msg, CatalogWarning, stacklevel=3)
+        warn(msg, CatalogWarning)
 
     def _check_background(self, background):
         if background is None or isinstance(background, Background):

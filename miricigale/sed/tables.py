@@ -2,7 +2,6 @@
 
 import difflib
 import functools
-import warnings
 
 import astropy.units as u
 import numpy as np
@@ -18,7 +17,7 @@ from miricigale.sed.derived import (
     scaled_quantities,
 )
 from miricigale.sed.spectrum import SED, distance
-from miricigale.utils.exceptions import ModelWarning, argument_error
+from miricigale.utils.exceptions import ModelWarning, argument_error, warn
 from miricigale.utils.tables import Flags, as_table, described_table
 from miricigale.utils.units import FNU, WAVE
 
@@ -76,7 +75,7 @@ def _warn_of_slips(model, names):
         close = difflib.get_close_matches(name.lower(), lower, n=1, cutoff=0.85)
         if close:
             msg = f"column {name!r} is no parameter and left alone: is it {lower[close[0]]!r}?"
-            warnings.warn(msg, ModelWarning, stacklevel=4)
+            warn(msg, ModelWarning)
 
 
 def _keys(columns, names, rows):
@@ -146,7 +145,7 @@ def spectra(model, values):
             parts[f"agn_{name}"] = got["agn_power"] * getattr(agn, name)
     if values.get("frac_agn", 0.0) > 0.0 and got["agn_power"][0] == 0.0:
         msg = "frac_agn has no effect: the galaxy has no dust luminosity that it could refer to"
-        warnings.warn(msg, ModelWarning, stacklevel=3)
+        warn(msg, ModelWarning)
     far = distance(z, model.cosmology)
     scaled = scaled_quantities(model, got, np.array([values["mass"]]), z, far, values)
     factor = chain.sky(values) * (values["mass"] * float(dilution(z, far)))

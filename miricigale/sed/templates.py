@@ -11,7 +11,7 @@ from astropy.table import QTable, Table
 from miricigale.filters import FilterSet
 from miricigale.sed.grid import ModelGrid
 from miricigale.sed.spectrum import SED
-from miricigale.utils.exceptions import ModelWarning, argument_error, data_error
+from miricigale.utils.exceptions import ModelWarning, argument_error, data_error, warn
 from miricigale.utils.files import read_table
 from miricigale.utils.meta import provenance
 from miricigale.utils.missing import plain_floats
@@ -148,7 +148,7 @@ def template_grid(spectra, filters, *, beyond="error"):
         seds |= {name: _continued(seds[name]) for name in short}
         if short:
             msg = f"{len(short)} of {len(seds)} spectra continued to {last:.3g} with F_nu ~ wave^-2"
-            warnings.warn(msg, ModelWarning, stacklevel=2)
+            warn(msg, ModelWarning)
     flux = np.array([_fluxes(name, sed, filters) for name, sed in seds.items()])
     n = len(seds)
     number = np.arange(n, dtype=float)

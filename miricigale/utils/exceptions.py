@@ -1,6 +1,8 @@
 """Errors and warnings of the package, and the one way to word them."""
 
 import difflib
+import sys
+import warnings
 
 from astropy.utils.exceptions import AstropyUserWarning
 
@@ -20,6 +22,7 @@ __all__ = [
     "argument_error",
     "data_error",
     "unknown_name",
+    "warn",
 ]
 
 
@@ -111,3 +114,11 @@ def unknown_name(kind, name, known):
     close = difflib.get_close_matches(str(name).lower(), lower, n=1, cutoff=0.7)
     hint = f"; did you mean {lower[close[0]]!r}?" if close else ""
     return KeyError(f"no {kind} {name!r}; known: {', '.join(known)}{hint}")
+
+
+def warn(message, category):
+    """Warn at the line outside of the package that led here, however deep the call is."""
+    frame, level = sys._getframe(1), 2
+    while frame.f_back and frame.f_globals.get("__name__", "").startswith("miricigale."):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, category, stacklevel=level)

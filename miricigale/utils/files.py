@@ -15,7 +15,7 @@ from astropy.table import QTable
 from astropy.utils.exceptions import AstropyUserWarning
 
 from miricigale.utils.configuration import conf
-from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.exceptions import DataError, argument_error, warn
 from miricigale.utils.meta import fits_meta
 from miricigale.utils.positions import sky_as_angles
 
@@ -147,7 +147,7 @@ def _judge(caught):
             raise OSError(msg)
         # that data are missing is said by `_check_declared`, of packed files too
         if not text.startswith("File may have been trunc"):
-            warnings.warn(warning.message, stacklevel=3)
+            warn(warning.message)
 
 
 def _check_declared(path, hdus, n_bytes):

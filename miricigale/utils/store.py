@@ -10,6 +10,7 @@ import numpy as np
 
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import open_fits, table_hdu, write_fits, writing
+from miricigale.utils.meta import undated
 
 #: How the names of unfinished files begin.
 PARTIAL = ".partial-"
@@ -92,6 +93,8 @@ def write_parts(path, layout, *, shown=None, text=None, arrays=None, tables=None
 
     hdus = [fits.PrimaryHDU(header=fits.Header({"FORMAT": layout}))]
     if shown is not None:
+        shown = shown.copy(copy_data=False)
+        shown.meta = undated(shown.meta)
         hdus.append(table_hdu(shown))
         hdus[-1].name = "TABLE"
     if text is not None:

@@ -39,9 +39,8 @@ _PSF_WIDTH, _RIM = 10.0, 1.0
 #: Detection: in sigma, above the noise that would join galaxies; and the least share of the light of a part that
 #: is taken for another galaxy, so that clumps stay.
 DETECTION = {
-    "preset": "default",
+    "preset": dataclasses.replace(photometry.DETECTION_PRESETS["default"], contrast=0.1),
     "threshold": 2.0,
-    "contrast": 0.1,
     "stated_on": 0.06 * u.arcsec,
     "dilation": "area",
 }

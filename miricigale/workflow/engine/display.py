@@ -3,8 +3,8 @@
 import collections
 import logging
 import re
-import warnings
 
+from miricigale.utils.exceptions import warn
 from miricigale.utils.folder import MANIFEST
 from miricigale.utils.progress import on_terminal, print_line, progress
 
@@ -34,7 +34,7 @@ class Display:
         fact = re.sub(r"'[^']*'", "", text)
         self._facts[fact] += 1
         if self._facts[fact] == 1:
-            warnings.warn(text, category, stacklevel=2)
+            warn(text, category)
 
     def begin(self, titles):
         self._bar.set_description(", ".join(titles))

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from astropy.table import QTable
 
 from miricigale.instrument.image_files import read_image, write_image
-from miricigale.utils.exceptions import DataError
+from miricigale.utils.exceptions import DataError, warn
 from miricigale.utils.folder import FileFolder
 from miricigale.utils.meta import undated
 from miricigale.utils.parallel import single_threaded
@@ -291,7 +291,7 @@ def run_unit(config, folder, stages, name, unit, **options):
             stage.function(context, unit)
     except Exception as err:
         for one in caught:
-            warnings.warn(one.message, stacklevel=2)
+            warn(one.message)
         err.add_note(f"in stage {stage.key(unit)}")
         raise
     products = {product: context.products.describe(product) for product in context.saved}
