@@ -234,10 +234,8 @@ def test_a_truncated_file_is_refused(tmp_path, kept):
     whole = path.read_bytes()
     for size in {int(kept * len(whole)), 2880 * int(kept * len(whole) / 2880)}:
         path.write_bytes(whole[:size])
-        with pytest.raises(
-            DataError, match=r"x.fits (cannot be read as|is not a complete file of) library"
-        ):
-            open_library(path, NAME)
+        match = r"x.fits (cannot be read as|is not a complete file of) library"
+        refuses(match, open_library, path, NAME, error=DataError)
 
 
 def test_one_changed_bit_is_found(tmp_path):

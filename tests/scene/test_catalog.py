@@ -106,10 +106,8 @@ def test_refuses(table):
 
 
 def test_unreadable_files(tmp_path):
-    with pytest.raises(
-        DataError, match=r"no catalog 'catalog.cosmos': neither a file nor one of catalog.goodss"
-    ):
-        read_catalog("catalog.cosmos")
+    match = r"no catalog 'catalog.cosmos': neither a file nor one of catalog.goodss"
+    refuses(match, read_catalog, "catalog.cosmos", error=DataError)
     path = tmp_path / "broken.ecsv"
     path.write_text("# %ECSV 1.0\n# ---\nnonsense")
     refuses(r"broken\.ecsv cannot be read as a table", read_catalog, path, error=DataError)
@@ -151,10 +149,8 @@ def test_columns_called_by_a_filter_must_be_fluxes(table, tmp_path, name):
     name = name.replace("sepy", "sedpy.jwst_f770w")
     table[name] = [1.0, 2.0]
     table.write(tmp_path / "c.ecsv")
-    with pytest.raises(
-        u.UnitsError, match=rf"column '{name}' must be convertible to uJy, got None"
-    ):
-        read_catalog(tmp_path / "c.ecsv")
+    match = rf"column '{name}' must be convertible to uJy, got None"
+    refuses(match, read_catalog, tmp_path / "c.ecsv", error=u.UnitsError)
     table[name] = [20.0, 21.0] * u.ABmag
     refuses(rf"column '{name}' must be .* got mag\(AB\)", check_catalog, table, error=u.UnitsError)
     table.remove_column(name)

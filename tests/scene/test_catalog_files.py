@@ -117,10 +117,8 @@ def test_wrong_names_are_refused_with_the_right_ones(plain, tmp_path):
 
 def test_units_must_be_said_where_the_file_has_none(plain, tmp_path):
     path = write(plain, tmp_path / "c.csv")
-    with pytest.raises(
-        u.UnitsError, match=r"'wfc3\.f160w' must be .* uJy, got None: say it, such as units="
-    ):
-        read_catalog(path, columns=COLUMNS)
+    match = r"'wfc3\.f160w' must be .* uJy, got None: say it, such as units="
+    refuses(match, read_catalog, path, error=u.UnitsError, columns=COLUMNS)
     with pytest.raises(u.UnitsError, match="'half_light_radius' must be convertible to arcsec"):
         read_catalog(path, columns=COLUMNS | SHAPE, units={"flux": "mJy"})
     plain["FLUX_H"].unit = "uJy"

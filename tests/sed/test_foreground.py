@@ -126,10 +126,8 @@ def test_bands_beyond_the_long_end_may_be_taken_as_transparent():
 
 
 def test_r_v_outside_the_law():
-    with pytest.raises(
-        ValueError, match=r"'r_v' must be from 2\.3 to 5\.6 for the law G23, got 2\.1"
-    ):
-        GalacticExtinction(r_v=2.1)
+    match = r"'r_v' must be from 2\.3 to 5\.6 for the law G23, got 2\.1"
+    refuses(match, GalacticExtinction, r_v=2.1)
     part = GalacticExtinction()
     assert "from 2.3 to 5.6 for the law G23" in part.invalid(values_of(part, r_v=5.9))
     assert part.invalid(values_of(part)) is None

@@ -64,10 +64,8 @@ def test_foreign_and_truncated_files_are_refused(tmp_path):
     fits.PrimaryHDU(np.zeros(3)).writeto(tmp_path / "other.fits")
     (tmp_path / "text.fits").write_text("text")
     for name, text in (("text", ""), ("none", "no such file")):
-        with pytest.raises(
-            DataError, match=rf"{name}\.fits cannot be read as model grid data: {text}"
-        ):
-            ModelGrid.read(tmp_path / f"{name}.fits")
+        match = rf"{name}\.fits cannot be read as model grid data: {text}"
+        refuses(match, ModelGrid.read, tmp_path / f"{name}.fits", error=DataError)
     refuses("holds no model grid data", ModelGrid.read, tmp_path / "other.fits", error=DataError)
     make().write(tmp_path / "grid.fits")
     with fits.open(tmp_path / "grid.fits") as hdus:

@@ -146,10 +146,8 @@ def test_a_binary_file_cut_anywhere_is_refused(tmp_path, form):
     for cut in [0, 3, 4, 50, *rng.integers(60, needed, 40), needed - record, needed - 1]:
         path = tmp_path / f"cut_{cut}.ised"
         path.write_bytes(data[:cut])
-        with pytest.raises(
-            DataError, match=rf"cut_{cut}\.ised cannot be read as a file of GALAXEV"
-        ):
-            read_ised(path)
+        match = rf"cut_{cut}\.ised cannot be read as a file of GALAXEV"
+        refuses(match, read_ised, path, error=DataError)
 
 
 def test_a_text_file_cut_anywhere_is_refused(tmp_path):

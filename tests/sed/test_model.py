@@ -501,7 +501,5 @@ def test_a_fraction_of_the_light_in_any_range(span):
     accretion = grid.agn_properties["accretion_power"][0].value * 3 / 7 * grid.dust_luminosity[1]
     assert 1e10 * accretion == pytest.approx(spectra.derived["accretion_power"].value, rel=1e-5)
     for wrong in ("20-5um", "0.01-20um", "ir"):
-        with pytest.raises(
-            ValueError, match="'frac_agn_definition' must be one of 'dust' and ranges"
-        ):
-            SEDModel.yang2021(frac_agn_definition=wrong)
+        match = "'frac_agn_definition' must be one of 'dust' and ranges"
+        refuses(match, SEDModel.yang2021, frac_agn_definition=wrong)

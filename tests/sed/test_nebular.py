@@ -289,7 +289,5 @@ def test_refuses_a_foreign_file(tmp_path):
     fits.PrimaryHDU(np.ones(3)).writeto(path)
     with pytest.raises(DataError, match=r"other\.fits is not a table of nebular emission"):
         load_nebular(str(path))
-    with pytest.raises(
-        DataError, match=r"none\.fits cannot be read as a table of nebular emission"
-    ):
-        load_nebular(str(tmp_path / "none.fits"))
+    match = r"none\.fits cannot be read as a table of nebular emission"
+    refuses(match, load_nebular, str(tmp_path / "none.fits"), error=DataError)
