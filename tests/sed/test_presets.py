@@ -70,9 +70,8 @@ def test_a_torus_library_with_the_papers_values_is_taken(folder):
 
 def test_unknown_choice_and_absent_library_are_refused(folder):
     refuses("'libraries' must be one of", SEDModel.yang2021, libraries="mine")
-    model = SEDModel.from_dict(
-        {"components": [{"name": n} for n in ("delayed", "bc03", "calzetti", "dale2014")]}
-    )
+    parts = [{"name": n} for n in ("delayed", "bc03", "calzetti", "dale2014")]
+    model = SEDModel.from_dict({"components": parts})
     refuses(r"data add dust\.dale2014", model.evaluate, error=DataError, age=1.0)
 
 
@@ -90,8 +89,8 @@ def test_survey_axes_are_those_of_the_chain(folder):
     assert axes["ebv"][0] == 0
     assert axes["frac_agn"][0] == 0
     assert np.all(np.diff(np.log1p(axes["redshift"])) <= 0.02 + 1e-9)
-    axes |= {"tau": [0.5], "q_pah": [2.0], "redshift": [1.4]}
-    grid = model.grid(axes, ["wfc3.f160w", "miri.f770w"])
+    few = axes | {"tau": [0.5], "q_pah": [2.0], "redshift": [1.4]}
+    grid = model.grid(few, ["wfc3.f160w", "miri.f770w"])
     # seven ages, three bursts, two metallicities and slopes, eight color excesses; two tori of three depths
     assert (grid.n_galaxies, grid.n_agn) == (672, 6)
     for name, weights in SEDModel.survey_priors().items():

@@ -1,3 +1,5 @@
+import operator
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -94,7 +96,7 @@ def test_spectra_at_other_wavelengths_are_not_added():
     one = SED([1, 2] * u.um, [1, 1] * u.uJy)
     match = "'other' must be an SED at the same redshift and wavele"
     refuses(match, operator.add, one, SED([1, 3] * u.um, [1, 1] * u.uJy))
-    refuses("", operator.mul, one, "two", error=TypeError)
+    refuses(None, operator.mul, one, "two", error=TypeError)
 
 
 def test_a_spectrum_goes_to_specutils():

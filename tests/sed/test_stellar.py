@@ -6,6 +6,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import quad
 
 from helpers.components import values_of
+from helpers.errors import refuses
 from miricigale.refdata.libraries.ised import read_ised
 from miricigale.sed import _core
 from miricigale.sed.components import BC03, ConstantSFH, DelayedSFH

@@ -7,6 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import quad
 
 from helpers.errors import refuses
+from helpers.grids import photometry_table
 from miricigale.fitting import BayesFitter
 from miricigale.sed import COSMOLOGY, SEDModel, with_xray_bands
 from miricigale.sed.xray_bands import xray_filter
@@ -36,9 +37,8 @@ def flux_of(power_of_energy, low, high, z):
 
 def test_the_corona_hangs_on_the_disk_by_alpha_ox(model, grid):
     """L_nu(2 keV) = 10^(alpha_ox / 0.3838) L_nu(2500 A); the band is the integral over the cut power law."""
-    x = with_xray_bands(
-        grid, model, BANDS, alpha_ox=[-1.8, -1.4], photon_index=1.9, cutoff=200 * u.keV
-    )
+    options = {"alpha_ox": [-1.8, -1.4], "photon_index": 1.9, "cutoff": 200 * u.keV}
+    x = with_xray_bands(grid, model, BANDS, **options)
     assert x.filters == (*grid.filters, "soft", "hard")
     assert x.n_agn == 2 * grid.n_agn
     assert_array_equal(x.agn[:, ::2, :3], grid.agn)
@@ -73,7 +73,6 @@ def test_the_disk_at_2500_a_is_that_of_quasars(model, grid):
 def test_galaxies_shine_by_binaries_and_gas(model, grid):
     """Mezcua et al. 2018 (Fragos et al. 2013) by hand for solar stars, Mineo et al. 2012 for the gas."""
     x = with_xray_bands(grid, model, {"hard": [2, 10] * u.keV, "soft": [0.5, 2] * u.keV}, lmxb=0.3)
-    far = COSMOLOGY.luminosity_distance(0.5).to_value(u.m)
     for g in range(grid.n_galaxies):
         rate = grid.galaxy_properties["sfr_100myr"][g].to_value(1 / u.yr)
         mass = grid.galaxy_properties["stellar_mass"][g].value
