@@ -27,11 +27,10 @@ def folders(tmp_path, monkeypatch):
     """An empty data folder, no environment, and records of two user resources."""
     monkeypatch.delenv("MIRICIGALE_DATA", raising=False)
     common = {"kind": "user", "title": "T", "licence": "L", "citation": "C", "source": "a page"}
+    digest = hashlib.sha256(TEXT).hexdigest()
     records = {
-        "test.file": Resource(
-            name="test.file", file="sub/file.dat", sha256=hashlib.sha256(TEXT).hexdigest(), **common
-        ),
-        "test.package": Resource(name="test.package", **(common | {"kind": "package"})),
+        "test.file": Resource("test.file", **common, file="sub/file.dat", sha256=digest),
+        "test.package": Resource("test.package", **(common | {"kind": "package"})),
     }
     bundled = registry.resources()
     everything = {"instrument.siaf": bundled["instrument.siaf"], **records}

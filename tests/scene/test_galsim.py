@@ -9,9 +9,9 @@ from helpers import scenes
 galsim = pytest.importorskip("galsim", reason="needs galsim: pip install miricigale[galsim]")
 
 # GalSim's defaults are good to some 1e-3: ask for more than is tested
-SHARP = {"folding_threshold": 1e-4, "maxk_threshold": 1e-4, "maximum_fft_size": 32768}
-SHARP |= {"kvalue_accuracy": 1e-6, "xvalue_accuracy": 1e-6}
-SHARP = galsim.GSParams(integration_relerr=1e-8, integration_abserr=1e-10, **SHARP)
+ACCURACY = {"folding_threshold": 1e-4, "maxk_threshold": 1e-4, "maximum_fft_size": 32768}
+ACCURACY |= {"kvalue_accuracy": 1e-6, "xvalue_accuracy": 1e-6}
+SHARP = galsim.GSParams(integration_relerr=1e-8, integration_abserr=1e-10, **ACCURACY)
 
 
 def galaxy(n, radius, ratio, angle):

@@ -25,9 +25,8 @@ def make(*names, **options):
     return SEDModel([COMPONENTS.get(name)(**options.get(name, {})) for name in names])
 
 
-CHAINS = list(
-    itertools.product(available("sfh"), available("attenuation"), available("dust"), (False, True))
-)
+ROLES = [available(role) for role in ("sfh", "attenuation", "dust")]
+CHAINS = list(itertools.product(*ROLES, (False, True)))
 
 
 @pytest.mark.parametrize(("sfh", "attenuation", "dust", "gas"), CHAINS)

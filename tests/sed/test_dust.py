@@ -1,6 +1,4 @@
 import shutil
-import tarfile
-import zipfile
 
 import numpy as np
 import pytest
@@ -175,11 +173,8 @@ def test_source_trees_and_archives_are_read_alike(dale_folder, tmp_path):
     wanted = read_dale2014(dale_folder)
     tree = tmp_path / "cigale/database_builder/dale2014"
     shutil.copytree(dale_folder, tree)
-    with zipfile.ZipFile(tmp_path / "cigale.zip", "w") as archive:
-        for path in sorted(tree.iterdir()):
-            archive.write(path, path.relative_to(tmp_path))
-    with tarfile.open(tmp_path / "cigale.tar.gz", "w:gz") as archive:
-        archive.add(tmp_path / "cigale", "cigale")
+    for kind in ("zip", "gztar"):
+        shutil.make_archive(tmp_path / "cigale", kind, tmp_path, "cigale")
     for source in ("cigale", "cigale.zip", "cigale.tar.gz"):
         got = read_dale2014(tmp_path / source)
         assert got.meta["files"] == wanted.meta["files"]

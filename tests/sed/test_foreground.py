@@ -21,12 +21,10 @@ from miricigale.sed.foreground import (
     extinction_curve,
 )
 
-PAPER = (
-    ["megacam.u", "megacam.g", "megacam.r", "megacam.i", "megacam.z", "acs.f606w", "acs.f814w"]
-    + ["wfc3.f125w", "wfc3.f140w", "wfc3.f160w", "irac.ch1", "irac.ch2", "irac.ch3", "irac.ch4"]
-    + ["mips.24", "miri.f770w", "miri.f1000w", "miri.f1280w", "miri.f1500w", "miri.f1800w"]
-    + ["miri.f2100w"]
-)
+PAPER = [f"megacam.{band}" for band in "ugriz"] + ["acs.f606w", "acs.f814w", "mips.24"]
+PAPER += [f"wfc3.{band}" for band in ("f125w", "f140w", "f160w")]
+PAPER += [f"irac.ch{k}" for k in (1, 2, 3, 4)]
+PAPER += [f"miri.f{k}w" for k in (770, 1000, 1280, 1500, 1800, 2100)]
 
 
 # ------------------------------------------------------------------------------------ laws

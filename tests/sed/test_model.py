@@ -428,9 +428,8 @@ def test_a_fraction_of_the_light_in_any_range(span):
     assert sum(agn) / total == pytest.approx(0.3, rel=1e-6)
     bands = ["wfc3.f160w", "miri.f1500w"]
     table = model.fluxes(QTable({name: [value] for name, value in values.items()}), bands)
-    grid = model.grid(
-        {"redshift": [0.5], "age": [1.0, 3.0], "frac_agn": [0.0, 0.3]}, bands, cache=False
-    )
+    axes = {"redshift": [0.5], "age": [1.0, 3.0], "frac_agn": [0.0, 0.3]}
+    grid = model.grid(axes, bands, cache=False)
     one = grid.flux(0, 1, 0, 1) * 1e10
     assert_allclose([table[b][0].value for b in bands], one, rtol=1e-5)
     derived = spectra.derived

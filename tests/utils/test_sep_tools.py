@@ -9,7 +9,7 @@ from miricigale.utils import sep_tools
 @pytest.fixture
 def image():
     data = np.random.default_rng(1).normal(size=(120, 150))
-    return data + gaussians(data.shape, [30, 100, 105], [40, 80, 20], 60, 2.0)
+    return data + gaussians(data.shape, [30, 100, 105], [40, 80, 20], [60, 60, 60], 2.0)
 
 
 def test_byte_order_and_layout_do_not_matter(image):

@@ -71,10 +71,14 @@ def test_parts_come_back(tmp_path):
 def test_incomplete_and_foreign_files_are_named(tmp_path):
     path = tmp_path / "a.fits"
     write_parts(path, "test-1", arrays={"a": np.ones(3)})
-    with open_parts(path, ("test-1",), wanted="fit results") as parts:
-        refuses(r"a\.fits is not a complete file of fit results", parts.array, "b", error=DataError)
-    opened = open_parts(path, ("test-2",), wanted="fit results")
-    refuses(r"a\.fits holds no fit results", opened.__enter__, error=DataError)
+
+    def read(layout, name):
+        with open_parts(path, (layout,), wanted="fit results") as parts:
+            return parts.array(name)
+
+    match = r"a\.fits is not a complete file of fit results"
+    refuses(match, read, "test-1", "b", error=DataError)
+    refuses(r"a\.fits holds no fit results", read, "test-2", "a", error=DataError)
 
 
 class Number:
