@@ -16,13 +16,8 @@ from miricigale.utils.missing import without_codes
 from miricigale.utils.row_files import open_rows
 
 BAND = "wfc3.f160w"
-FORMATS = {
-    "csv": "ascii.csv",
-    "ecsv": "ascii.ecsv",
-    "fits": "fits",
-    "xml": "votable",
-    "txt": "ascii",
-}
+FORMATS = {"csv": "ascii.csv", "ecsv": "ascii.ecsv", "fits": "fits", "xml": "votable"}
+FORMATS["txt"] = "ascii"
 
 
 def write(table, path):
@@ -84,9 +79,8 @@ def test_numbers_that_stand_for_nothing_in_magnitudes():
     missing, no_error = without_codes(values, errors, magnitudes=True)
     assert missing.tolist() == [False, True, True, True, False, False, True, False, False]
     assert no_error.tolist()[5] is True
-    table, coded = convert(
-        {"id": np.arange(9), BAND: values, f"{BAND}_err": errors}, units={"flux": "ABmag"}
-    )
+    columns = {"id": np.arange(9), BAND: values, f"{BAND}_err": errors}
+    table, coded = convert(columns, units={"flux": "ABmag"})
     flux, error = (table[name].value for name in (BAND, f"{BAND}_err"))
     assert np.isnan(flux).tolist() == [False, True, True, True, False, False, True, True, False]
     # an error that is none leaves the flux; one that is not positive is for the fit to flag
@@ -141,70 +135,41 @@ def test_factors():
     refuses("no column of catalog 'totl'", convert, columns, error=KeyError, factor="totl")
 
 
-#: Columns of each survey, our names of them, and uJy in one of their units.
+#: Columns of each survey: places, uJy in one of their units, how fluxes become errors, fluxes of bands.
 NAMES = {
-    "candels": (
-        ("ID", "RA", "DEC", "CFHT_u_FLUX", "ACS_F606W_FLUX", "WFC3_F160W_FLUX", "WIRCAM_K_FLUX",
-         "NEWFIRM_J1_FLUX", "ISAAC_KS_FLUX", "IRAC_CH1_FLUX"),
-        "{}ERR",
-        ("megacam.u", "acs.f606w", "wfc3.f160w", "sedpy.cfht_wircam_Ks_8302", "newfirm.j1",
-         "sedpy.vlt_isaac_Ks", "irac.ch1"),
-        1.0,
-    ),
-    "3dhst": (
-        ("id", "ra", "dec", "f_F606W", "f_F125W", "f_F160W", "f_IRAC4"),
-        "e_{}",
-        ("acs.f606w", "wfc3.f125w", "wfc3.f160w", "irac.ch4"),
-        0.363078,
-    ),
-    "jades": (
-        ("ID", "RA", "DEC", "F090W_KRON_CONV", "F410M_KRON_CONV", "F814W_KRON_CONV"),
-        "{}_e",
-        ("nircam.f090w", "nircam.f410m", "acs.f814w"),
-        1e-3,
-    ),
-    "dja": (
-        ("id", "ra", "dec", "f606w_tot_1", "f115w_tot_1", "f444w-clear_tot_1", "f770w_tot_1"),
-        "dja",
-        ("acs.f606w", "nircam.f115w", "nircam.f444w", "miri.f770w"),
-        1.0,
-    ),
-    "cosmos2020": (
-        ("ID", "ALPHA_J2000", "DELTA_J2000", "CFHT_ustar_FLUX_APER2", "HSC_g_FLUX_APER2",
-         "UVISTA_Ks_FLUX_APER2", "SC_IB427_FLUX_APER2", "IRAC_CH1_FLUX"),
-        "cosmos",
-        ("megacam.u", "sedpy.hsc_g", "sedpy.vista_vircam_Ks", "sedpy.subaru_suprimecam_ia427",
-         "irac.ch1"),
-        1.0,
-    ),
-    "ceers": (
-        ("id", "redshift", "hst.wfc.F606W", "jwst.nircam.F444W", "jwst.miri.F770W"),
-        "{}_err",
-        ("acs.f606w", "nircam.f444w", "miri.f770w"),
-        1e3,
-    ),
+    "candels": ("ID RA DEC", 1.0, ("FLUX", "FLUXERR"), {
+        "megacam.u": "CFHT_u_FLUX", "acs.f606w": "ACS_F606W_FLUX", "wfc3.f160w": "WFC3_F160W_FLUX",
+        "sedpy.cfht_wircam_Ks_8302": "WIRCAM_K_FLUX", "newfirm.j1": "NEWFIRM_J1_FLUX",
+        "sedpy.vlt_isaac_Ks": "ISAAC_KS_FLUX", "irac.ch1": "IRAC_CH1_FLUX"}),
+    "3dhst": ("id ra dec", 0.363078, ("f_", "e_"), {
+        "acs.f606w": "f_F606W", "wfc3.f125w": "f_F125W", "wfc3.f160w": "f_F160W",
+        "irac.ch4": "f_IRAC4"}),
+    "jades": ("ID RA DEC", 1e-3, ("CONV", "CONV_e"), {
+        "nircam.f090w": "F090W_KRON_CONV", "nircam.f410m": "F410M_KRON_CONV",
+        "acs.f814w": "F814W_KRON_CONV"}),
+    "dja": ("id ra dec", 1.0, ("_tot_", "_etot_"), {
+        "acs.f606w": "f606w_tot_1", "nircam.f115w": "f115w_tot_1",
+        "nircam.f444w": "f444w-clear_tot_1", "miri.f770w": "f770w_tot_1"}),
+    "cosmos2020": ("ID ALPHA_J2000 DELTA_J2000", 1.0, ("FLUX", "FLUXERR"), {
+        "megacam.u": "CFHT_ustar_FLUX_APER2", "sedpy.hsc_g": "HSC_g_FLUX_APER2",
+        "sedpy.vista_vircam_Ks": "UVISTA_Ks_FLUX_APER2", "irac.ch1": "IRAC_CH1_FLUX",
+        "sedpy.subaru_suprimecam_ia427": "SC_IB427_FLUX_APER2"}),
+    "ceers": ("id redshift", 1e3, ("W", "W_err"), {
+        "acs.f606w": "hst.wfc.F606W", "nircam.f444w": "jwst.nircam.F444W",
+        "miri.f770w": "jwst.miri.F770W"}),
 }  # fmt: skip
-
-
-def _error(survey, name, pattern):
-    if survey == "3dhst":
-        return name.replace("f_", "e_", 1)
-    if survey == "dja":
-        return name.replace("_tot_", "_etot_")
-    return name.replace("FLUX", "FLUXERR") if survey == "cosmos2020" else pattern.format(name)
 
 
 @pytest.mark.parametrize("survey", sorted({*SURVEYS} - {"cigale"}))
 def test_columns_of_surveys(survey):
-    names, pattern, bands, in_ujy = NAMES[survey]
-    first = len(names) - len(bands)
-    table = Table({name: [k + 1.0] for k, name in enumerate(names)})
-    for name in names[first:]:
-        table[_error(survey, name, pattern)] = [0.5]
+    places, in_ujy, error, bands = NAMES[survey]
+    table = Table({name: [1.0] for name in places.split()})
+    for k, name in enumerate(bands.values()):
+        table[name], table[name.replace(*error)] = [k + 2.0], [0.5]
     out, _ = CatalogMap(survey=survey).convert(table)
     assert {"id", *bands} <= set(out.colnames)
     for k, band in enumerate(bands):
-        assert out[band][0].to_value(u.uJy) == pytest.approx((first + k + 1) * in_ujy, rel=1e-5)
+        assert out[band][0].to_value(u.uJy) == pytest.approx((k + 2) * in_ujy, rel=1e-5)
         assert out[f"{band}_err"][0].to_value(u.uJy) == pytest.approx(0.5 * in_ujy, rel=1e-5)
     if survey != "ceers":
         assert out["ra"].unit == u.deg
@@ -280,9 +245,8 @@ def test_pieces_are_the_whole(tmp_path, suffix):
     parts = [rows.chunk(i) for i in range(rows.n_chunks)]
     assert [len(part) for part in parts] == [3, 3, 1]
     for name in ("id", BAND):
-        assert_array_equal(
-            np.concatenate([np.asarray(p[name]) for p in parts]), np.asarray(whole[name])
-        )
+        joined = np.concatenate([np.asarray(part[name]) for part in parts])
+        assert_array_equal(joined, np.asarray(whole[name]))
 
 
 def test_the_real_part_of_ceers(data_file):
@@ -316,27 +280,20 @@ def test_real_magnitudes_of_goodss(data_file):
     assert np.median(ratio) == pytest.approx(1, abs=0.02)
 
 
-@pytest.mark.parametrize(
-    ("number", "name", "wavelength"),
-    [
-        (6, "acs.f814w", 8059.9),
-        (18, "irac.ch1", 35569.0),
-        (88, "megacam.u", 3828.0),
-        (131, "newfirm.h1", 15601.0),
-        (160, "sedpy.sdss_z0", 8946.7),
-        (205, "wfc3.f160w", 15396.0),
-        (208, "sedpy.wfc3_uvis_f275w", 2708.6),
-        (259, "sedpy.vista_vircam_Ks", 21503.0),
-        (325, "mips.24", 237589.0),
-        (377, "nircam.f444w", 44037.0),
-        (396, "miri.f770w", 76364.0),
-    ],
-)
-def test_translate_files_of_eazy(tmp_path, number, name, wavelength):
-    """Central wavelengths in Angstrom as ``FILTER.RES.latest.info`` has them by number."""
-    (tmp_path / "z.translate").write_text(
-        f"nr id\nzs z_spec\nflux_a F{number} # total\ndf_a E{number}\n"
-    )
+#: Names of numbers of EAZY, and the central wavelengths in Angstrom of FILTER.RES.latest.info.
+EAZY = {
+    6: ("acs.f814w", 8059.9), 18: ("irac.ch1", 35569.0), 88: ("megacam.u", 3828.0),
+    131: ("newfirm.h1", 15601.0), 160: ("sedpy.sdss_z0", 8946.7), 205: ("wfc3.f160w", 15396.0),
+    208: ("sedpy.wfc3_uvis_f275w", 2708.6), 259: ("sedpy.vista_vircam_Ks", 21503.0),
+    325: ("mips.24", 237589.0), 377: ("nircam.f444w", 44037.0), 396: ("miri.f770w", 76364.0),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("number", EAZY)
+def test_translate_files_of_eazy(tmp_path, number):
+    name, wavelength = EAZY[number]
+    lines = f"nr id\nzs z_spec\nflux_a F{number} # total\ndf_a E{number}\n"
+    (tmp_path / "z.translate").write_text(lines)
     (tmp_path / "cat.txt").write_text("# nr zs flux_a df_a\n7 1.5 2.0 0.1\n8 -1 -99 -99\n")
     units = {"flux": "0.3631 uJy"}  # zero point 25
     with pytest.warns(MiricigaleWarning, match="-99"):

@@ -3,9 +3,10 @@
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.table import MaskedColumn, QTable, Table
+from astropy.table import MaskedColumn, Table
 
 from helpers.errors import refuses
+from helpers.grids import photometry_table
 from miricigale.filters import as_photometry
 from miricigale.utils.exceptions import CatalogWarning
 
@@ -14,16 +15,8 @@ BANDS = ("miri.f770w", "wfc3.f160w")
 
 @pytest.fixture
 def catalog():
-    return QTable(
-        {
-            "id": ["a", "b"],
-            "miri.f770w": [1.0, 2.0] * u.uJy,
-            "miri.f770w_err": [0.1, 0.2] * u.uJy,
-            "wfc3.f160w": [3.0, 4.0] * u.uJy,
-            "wfc3.f160w_err": [0.3, 0.1] * u.uJy,
-            "F999X": [1, 2],
-        }
-    )
+    flux, error = [[1.0, 3.0], [2.0, 4.0]], [[0.1, 0.3], [0.2, 0.1]]
+    return photometry_table(BANDS, flux, error, ["a", "b"], F999X=[1, 2])
 
 
 def renamed(catalog, flux, error):
@@ -48,13 +41,9 @@ def test_a_table_by_our_names_is_itself(catalog):
 @pytest.mark.parametrize(
     ("flux", "error"),
     [
-        ("{}", "{}_err"),
-        ("{}", "e_{}"),
-        ("f_{}", "e_{}"),
-        ("flux_{}", "err_{}"),
-        ("{}_flux", "{}_flux_err"),
-        ("FLUX_{}", "FLUX_{}_ERR"),
-        ("{}", "{}_error"),
+        *(("{}", error) for error in ("{}_err", "{}_error", "e_{}")),
+        *(("f_{}", "e_{}"), ("flux_{}", "err_{}")),
+        *(("{}_flux", "{}_flux_err"), ("FLUX_{}", "FLUX_{}_ERR")),
     ],
 )
 def test_columns_are_called_in_many_ways(catalog, flux, error):

@@ -23,7 +23,7 @@ HEADER = (
     "    DithX    DithY    V2       V3       IdlX     IdlY   Level      Type      ExPar  DkPar   dDist"
 )
 ROW = (
-    "  1    1   {exp}    {dith} {aperture}              1 {name}  +80.48750  -69.49750   +0.000   +0.000"
+    "  1    1   {exp}    {dith} {aperture}              1 FIELD  +80.48750  -69.49750   +0.000   +0.000"
     "   {x:+.3f}   {y:+.3f}  -453.559 -373.814   {x:+.3f}   {y:+.3f} DITHER  {kind}        0      0  0.215"
 )
 
@@ -38,8 +38,7 @@ def pointing_list(path, rows_by_observation):
 
 
 def row(dith, x, y, *, exp=1, aperture="MIRIM_FULL", kind="SCIENCE"):
-    options = {"dith": dith, "x": x, "y": y, "exp": exp, "aperture": aperture, "kind": kind}
-    return {**options, "name": "FIELD"}
+    return {"dith": dith, "x": x, "y": y, "exp": exp, "aperture": aperture, "kind": kind}
 
 
 @pytest.mark.parametrize(
@@ -144,20 +143,17 @@ def test_tiles_meet_on_the_sky(overlap):
         # edges bend by a per cent of the field, and +x of the sky may be either way of the columns
         assert apart < 1.5 * u.arcsec
     mean = np.mean([tile.pointing.cartesian.xyz.value for tile in tiles], axis=0)
-    where = SkyCoord(*mean, representation_type="cartesian").spherical
-    found = SkyCoord(where.lon, where.lat)
+    found = SkyCoord(*mean, representation_type="cartesian")
     assert found.separation(center) < 0.01 * u.arcsec
 
 
 def test_exposures_of_a_list_with_dithers_of_their_own(tmp_path):
-    patterns = {
-        1: [(-1.446, 3.956), (3.771, -5.358), (1.035, 4.889)],
-        2: [(2.983, -21.46), (1.08, -11.849)],
-    }
+    patterns = {1: [(-1.446, 3.956), (3.771, -5.358), (1.035, 4.889)]}
+    patterns[2] = [(2.983, -21.46), (1.08, -11.849)]
     rows = [
-        row(dith, x, y, exp=exp, aperture="MIRIM_ILLUM")
+        row(dith, *offset, exp=exp, aperture="MIRIM_ILLUM")
         for exp, offsets in patterns.items()
-        for dith, (x, y) in enumerate(offsets, start=1)
+        for dith, offset in enumerate(offsets, start=1)
     ]
     path = pointing_list(tmp_path / "plan.pointing", {1: rows})
     for exp, offsets in patterns.items():
@@ -172,16 +168,16 @@ def test_tiles_have_one_pattern_or_none(tmp_path):
         text = ROW.format(**row(1, x, 1.0))
         return f"  1    {number}" + text[8:]
 
-    for name, x in (("same", 0.5), ("other", 0.7)):
-        lines = ["* Deep field (Obs 1)", HEADER, tile(1, 0.5), tile(2, x)]
-        (tmp_path / f"{name}.pointing").write_text("\n".join(lines))
-    assert_allclose(read_dithers(tmp_path / "same.pointing").value, [[0.5, 1.0]])
-    match = r"other\.pointing: tiles of the observation have dithers"
-    refuses(match, read_dithers, tmp_path / "other.pointing")
+    path, lines = tmp_path / "plan.pointing", ["* Deep field (Obs 1)", HEADER, tile(1, 0.5)]
+    path.write_text("\n".join([*lines, tile(2, 0.5)]))
+    assert_allclose(read_dithers(path).value, [[0.5, 1.0]])
+    path.write_text("\n".join([*lines, tile(2, 0.7)]))
+    refuses(r"plan\.pointing: tiles of the observation have dithers", read_dithers, path)
 
 
 OFFSETS = [[0, 0], [1, 2]] * u.arcsec
 BARE = QTable({"x_offset": [1.0], "y_offset": [1.0]})
+WANTED = r"offsets of shape \(3, 2"
 
 
 @pytest.mark.parametrize(
@@ -192,28 +188,10 @@ BARE = QTable({"x_offset": [1.0], "y_offset": [1.0]})
         (read_dithers, ["nothing.ecsv"], {}, DataError, "no file of dithers"),
         (dither_offsets, [BARE[["x_offset"]]], {}, ValueError, "'pattern' must be .*'y_offset'"),
         (dither_offsets, [BARE], {}, u.UnitsError, "'x_offset' must be convertible to arcsec"),
-        (
-            dither_offsets,
-            ["ceers", 3],
-            {"start": -1},
-            ValueError,
-            "'start' must be an integer >= 0",
-        ),
+        (dither_offsets, ["ceers"], {"start": -1}, ValueError, "'start' must be an integer >= 0"),
         (dither_offsets, ["spiral", 3], {}, KeyError, "no dither pattern 'spiral'; known: 4-point"),
-        (
-            dither_offsets,
-            [OFFSETS, 3],
-            {},
-            ValueError,
-            r"'pattern' must be offsets of shape \(3, 2",
-        ),
-        (
-            dither_offsets,
-            [OFFSETS, 2],
-            {"start": 1},
-            ValueError,
-            r"must be offsets of shape \(3, 2",
-        ),
+        (dither_offsets, [OFFSETS, 3], {}, ValueError, rf"'pattern' must be {WANTED}"),
+        (dither_offsets, [OFFSETS, 2], {"start": 1}, ValueError, f"must be {WANTED}"),
     ],
 )
 def test_refuses(function, args, options, error, match):

@@ -23,9 +23,8 @@ def test_the_legend_names_every_bit():
     header = dq_legend()
     assert header["DQBIT1"] == "SATURATED"
     names = {key[5:]: value for key, value in header.items() if key.startswith("DQBIT")}
-    assert {DQ[name]: 2 ** int(bit) for bit, name in names.items()} == {
-        flag: flag.value for flag in DQ if flag
-    }
+    bits = {DQ[name]: 2 ** int(bit) for bit, name in names.items()}
+    assert bits == {flag: flag.value for flag in DQ if flag}
 
 
 def test_planes_with_a_legend_are_read_as_they_are(tmp_path):

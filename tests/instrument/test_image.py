@@ -13,15 +13,9 @@ from miricigale.utils.meta import full_meta
 def test_an_image_is_written_and_read_by_astropy(tmp_path):
     wcs = WCS(naxis=2)
     wcs.wcs.ctype, wcs.wcs.crval, wcs.wcs.cdelt = ["RA---TAN", "DEC--TAN"], [53, -28], [-1e-5, 1e-5]
-    meta = {
-        "citations": ["Yang et al. 2021, ApJ 908, 144", "Gordon et al. 2025"] * 5,
-        "exposure": {"filter": "miri.f770w", "time": 1.5},
-        "noise_gain": np.float32(0.25),
-        "nothing": None,
-        "a_long_keyword": 7,
-        "filter": "miri.f770w",
-        "text": "x" * 300,
-    }
+    meta = {"citations": ["Yang et al. 2021, ApJ 908, 144", "Gordon et al. 2025"] * 5}
+    meta |= {"exposure": {"filter": "miri.f770w", "time": 1.5}, "noise_gain": np.float32(0.25)}
+    meta |= {"nothing": None, "a_long_keyword": 7, "filter": "miri.f770w", "text": "x" * 300}
     data = np.arange(12.0).reshape(3, 4)
     image = Image(data, unit="MJy/sr", wcs=wcs, meta=meta, mask=data > 10)
     image.uncertainty = StdDevUncertainty(data + 1)

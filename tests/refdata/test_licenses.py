@@ -54,12 +54,8 @@ def test_the_wheel_names_all_licenses_and_holds_their_texts():
     if wheel.read_text("WHEEL") is None or origin.get("dir_info", {}).get("editable"):
         pytest.skip("needs an installed wheel: an editable one is as old as its installation")
     licenses = [license_of(record) for record in BUNDLED.values()]
-    pairs = {
-        (identifier, package) for identifiers, package in licenses for identifier in identifiers
-    }
+    pairs = {(each, package) for identifiers, package in licenses for each in identifiers}
     stated = wheel.metadata["License-Expression"].split(" AND ")
     assert sorted(stated) == sorted({identifier for identifier, _ in pairs})
-    texts = {
-        str(path).partition("licenses/")[2] for path in wheel.files if "licenses/" in str(path)
-    }
+    texts = {str(path).partition("licenses/")[2] for path in wheel.files}
     assert {text_of(*pair) for pair in pairs} <= texts

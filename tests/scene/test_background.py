@@ -11,16 +11,15 @@ LEVEL = 10 * u.MJy / u.sr
 
 
 def test_grows_along_the_position_angle(wcs):
-    image = Background(LEVEL, gradient=0.6 / u.arcmin, position_angle=0 * u.deg).image(
-        wcs, (90, 100)
-    )
+    def image_at(angle):
+        background = Background(LEVEL, gradient=0.6 / u.arcmin, position_angle=angle * u.deg)
+        return background.image(wcs, (90, 100))
+
+    image, east = image_at(0), image_at(90)
     # north is up: 0.6 per arcmin over 0.11 arcsec pixels, nothing along x
     np.testing.assert_allclose(np.diff(image, axis=0), 10 * 0.6 * 0.11 / 60, rtol=1e-6)
     np.testing.assert_allclose(np.diff(image, axis=1), 0, atol=1e-9)
     assert image.mean() == pytest.approx(10, rel=1e-9)
-    east = Background(LEVEL, gradient=0.6 / u.arcmin, position_angle=90 * u.deg).image(
-        wcs, (90, 100)
-    )
     np.testing.assert_allclose(np.diff(east, axis=1), -10 * 0.6 * 0.11 / 60, rtol=1e-6)
 
 

@@ -7,6 +7,7 @@ from astropy.nddata import CCDData
 
 from helpers import scenes
 from helpers.errors import refuses
+from helpers.light import gaussian_image as gaussian
 from helpers.light import pixel_gaussian
 from miricigale.psf import hst_psf, miri_psf, psf_image
 from miricigale.scene import Cutout, Scene, deconvolve
@@ -14,15 +15,8 @@ from miricigale.scene import Cutout, Scene, deconvolve
 FINE = 0.06 * u.arcsec
 
 
-def gaussian(n, sigma, x=0.0, y=0.0):
-    """A Gaussian of unit light at pixel centers of a square with odd sides."""
-    at = np.arange(n) - n // 2
-    light = np.exp(-0.5 * ((at - x) ** 2 + (at[:, None] - y) ** 2) / sigma**2)
-    return light / (2 * np.pi * sigma**2)
-
-
 def test_the_blur_of_a_gaussian_is_undone():
-    sharp, blurred = gaussian(101, 5.0, 4.3, -2.1), gaussian(101, np.hypot(5.0, 1.5), 4.3, -2.1)
+    sharp, blurred = (gaussian(101, sigma, 4.3, -2.1) for sigma in (5.0, np.hypot(5.0, 1.5)))
     found = deconvolve(blurred, 5.0 * gaussian(31, 1.5))
     np.testing.assert_allclose(found, sharp, atol=1e-4 * sharp.max())
     assert found.sum() == pytest.approx(blurred.sum(), rel=1e-6)
@@ -46,9 +40,8 @@ def test_noise_grows_as_the_filter_says(gain):
 def test_a_stamp_of_hubble_becomes_the_galaxy_before_any_telescope():
     """Painted through the PSF of MIRI it is as the profile itself painted through it."""
     wcs = scenes.tan_wcs()
-    galaxy = scenes.make_catalog(
-        wcs, 50.2, 44.7, profile="sersic", radius=0.35, index=1.0, ratio=0.5, angle=30.0
-    )
+    shape = {"profile": "sersic", "radius": 0.35, "index": 1.0, "ratio": 0.5, "angle": 30.0}
+    galaxy = scenes.make_catalog(wcs, 50.2, 44.7, **shape)
     sharp_wcs = scenes.tan_wcs(shape=(151, 151), scale=0.06)
     sharp_wcs.wcs.crval = galaxy["sky"].ra.deg[0], galaxy["sky"].dec.deg[0]
     galaxy["wfc3.f160w"] = galaxy["miri.f770w"]

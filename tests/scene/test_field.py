@@ -8,6 +8,7 @@ from astropy.nddata import NDData
 from photutils.psf import GriddedPSFModel
 
 from helpers import scenes
+from helpers.errors import refuses
 from helpers.scenes import FILTER, light, make_scene
 from miricigale.instrument import aperture, imager_wcs
 from miricigale.psf import miri_psf_grid
@@ -16,23 +17,23 @@ from miricigale.scene import Cutout, Scene
 CORNERS = [(0, 0), (99, 0), (0, 89), (99, 89)]
 
 
+def grid_of(psfs, places):
+    data = np.stack([psf.data for psf in psfs])
+    return GriddedPSFModel(NDData(data, meta={"grid_xypos": places, "oversampling": 4}))
+
+
 @pytest.fixture(scope="module")
 def grid():
-    data = np.stack([scenes.gaussian_psf(sigma).data for sigma in (0.8, 1.0, 1.2, 1.6)])
-    return GriddedPSFModel(NDData(data, meta={"grid_xypos": CORNERS, "oversampling": 4}))
+    return grid_of([scenes.gaussian_psf(sigma) for sigma in (0.8, 1.0, 1.2, 1.6)], CORNERS)
 
 
 def test_galaxies_widen_by_the_local_psf(wcs, grid):
     """Variances add: the galaxy's and the mixture's of the PSFs at its center."""
-    catalog = scenes.make_catalog(
-        wcs, 60.0, 30.0, profile="sersic", radius=0.4, index=0.5, ratio=1.0
-    )
-    scene = make_scene(catalog, wcs, grid, enclosed=0.99999)
-    image = light(scene)
+    catalog = scenes.make_catalog(wcs, 60.0, 30.0, profile="sersic", radius=0.4, index=0.5)
+    image = light(make_scene(catalog, wcs, grid, enclosed=0.99999))
+    assert image.sum() == pytest.approx(10, rel=1e-4)
     y, x = np.mgrid[:90, :100]
-    total = image.sum()
-    assert total == pytest.approx(10, rel=1e-4)
-    variance = [np.sum(image * (x - 60) ** 2) / total, np.sum(image * (y - 30) ** 2) / total]
+    variance = [np.average(d**2, weights=image) for d in (x - 60, y - 30)]
     a, b = 60 / 99, 30 / 89
     weights = [(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b]
     own = (0.4 / 0.11) ** 2 / (2 * np.log(2))
@@ -43,8 +44,7 @@ def test_galaxies_widen_by_the_local_psf(wcs, grid):
 def test_many_places_and_the_lines_between_them(wcs):
     """On both sides of an inner row and column of PSFs, on them, and beyond the last ones."""
     places = [(x, y) for y in (10, 41.3, 80) for x in (15.2, 49.5, 70, 95)]
-    data = np.stack([scenes.gaussian_psf(0.9 + 0.05 * (k % 5)).data for k in range(12)])
-    grid = GriddedPSFModel(NDData(data, meta={"grid_xypos": places, "oversampling": 4}))
+    grid = grid_of([scenes.gaussian_psf(0.9 + 0.05 * (k % 5)) for k in range(12)], places)
     x = [49.3, 49.5, 49.9, 30.0, 97.0, 5.0, 82.1]
     y = [41.1, 60.0, 41.3, 41.5, 5.0, 70.2, 84.9]
     flux = np.arange(10.0, 80.0, 10.0)
@@ -62,24 +62,17 @@ def test_many_places_and_the_lines_between_them(wcs):
 
 def test_alike_psfs_are_one_psf(wcs, psf):
     """Points, galaxies and stamps of images, some over the edge."""
-    grid = GriddedPSFModel(
-        NDData(np.stack([psf.data] * 4), meta={"grid_xypos": CORNERS, "oversampling": 4})
-    )
-    catalog = scenes.make_catalog(
-        wcs,
-        [20.3, 99.2, 50.0, 3.0],
-        [15.2, 44.5, 70.9, 88.0],
-        profile=["point", "sersic", "cutout", "sersic"],
-        radius=[0, 0.8, 0, 0.2],
-        index=4.0,
-    )
+    grid = grid_of([psf] * 4, CORNERS)
+    x, y = [20.3, 99.2, 50.0, 3.0], [15.2, 44.5, 70.9, 88.0]
+    shapes = {"radius": [0, 0.8, 0, 0.2], "index": 4.0}
+    shapes["profile"] = ["point", "sersic", "cutout", "sersic"]
+    catalog = scenes.make_catalog(wcs, x, y, **shapes)
     stamps = {3: Cutout(np.ones((7, 9)), pixel_scale=0.08 * u.arcsec)}
     kind = {"filter": FILTER, "wcs": wcs, "cutouts": stamps}
     one, many = Scene(catalog, psf=psf, **kind), Scene(catalog, psf=grid, **kind)
     np.testing.assert_allclose(light(many), light(one), atol=1e-9 * light(one).max())
-    np.testing.assert_allclose(
-        many.truth["flux_in_image"].value, one.truth["flux_in_image"].value, rtol=1e-9
-    )
+    flux = [scene.truth["flux_in_image"].value for scene in (many, one)]
+    np.testing.assert_allclose(*flux, rtol=1e-9)
 
 
 def test_each_part_of_a_galaxy_has_the_psf_of_its_own_place(wcs, grid):
@@ -116,5 +109,5 @@ def test_the_imagers_psfs_belong_to_their_subarray():
     np.testing.assert_allclose(image[inner], expected[inner], atol=1e-4 * expected.max())
     assert scene.render().meta["psf_includes"] == ["jitter", "cruciform", "pixel", "ipc"]
     wcs = imager_wcs(field, 30 * u.deg, subarray="SUB128")
-    with pytest.raises(ValueError, match="'psf' must be a grid of places on this image, got those"):
-        make_scene(scenes.make_catalog(wcs, 30.2, 20.7), wcs, grid)
+    match = "'psf' must be a grid of places on this image, got those"
+    refuses(match, make_scene, scenes.make_catalog(wcs, 30.2, 20.7), wcs, grid)

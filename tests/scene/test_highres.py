@@ -10,6 +10,8 @@ from miricigale.scene import Scene, highres_image
 
 FILTER = "miri.f770w"
 SHAPE = (240, 250)
+#: uJy of one MJy/sr on a pixel of 0.06 arcsec
+AREA = (0.06 * u.arcsec).to_value(u.rad) ** 2 * 1e12
 
 
 @pytest.fixture
@@ -25,16 +27,14 @@ def catalog(fine):
 def test_noise_belongs_to_the_depth(fine, psf, catalog):
     image = highres_image(catalog, filter=FILTER, wcs=fine, psf=psf, depth=27 * u.ABmag, seed=4)
     truth = Scene(catalog, filter=FILTER, wcs=fine, psf=psf).render()
-    noise = (image.data - truth.data) * (0.06 * u.arcsec).to_value(u.rad) ** 2 * 1e12
+    noise = (image.data - truth.data) * AREA
     # blank apertures of the radius of the depth: a fifth of 27 AB = 0.0575 uJy
     y, x = np.mgrid[-3.5:4, -3.5:4]
     mask = np.hypot(x, y) <= 0.2 / 0.06
     blocks = noise[:240, :248].reshape(30, 8, 31, 8).swapaxes(1, 2)
     fluxes = (blocks * mask).sum(axis=(2, 3)) / np.sqrt(mask.sum() / (np.pi * (0.2 / 0.06) ** 2))
     assert fluxes.std() == pytest.approx(0.0575 / 5, rel=0.08)
-    assert np.std(noise) == pytest.approx(
-        np.mean(image.uncertainty.array) * (0.06 * u.arcsec).to_value(u.rad) ** 2 * 1e12, rel=0.02
-    )
+    assert np.std(noise) == pytest.approx(np.mean(image.uncertainty.array) * AREA, rel=0.02)
     assert image.unit == u.MJy / u.sr
     assert image.meta["seed"] == 4
 
@@ -52,8 +52,8 @@ def test_noise_does_not_know_the_sources(fine, psf, catalog):
 
 def test_refuses(fine, psf, catalog):
     kwargs = {"filter": FILTER, "wcs": fine, "psf": psf, "seed": 1}
-    with pytest.raises(u.UnitsError, match="'depth' must be a quantity convertible to uJy"):
-        highres_image(catalog, depth=27.0, **kwargs)
+    match = "'depth' must be a quantity convertible to uJy"
+    refuses(match, highres_image, catalog, error=u.UnitsError, depth=27.0, **kwargs)
     refuses("'depth' must be positive", highres_image, catalog, depth=-1 * u.uJy, **kwargs)
 
 
@@ -65,16 +65,13 @@ def test_f160w_mosaic_through_its_psf():
     y, x = np.mgrid[:201, :221]
     psf = hst_psf()
     image = highres_image(catalog, wcs=wcs, psf=psf, depth=28 * u.ABmag, seed=3)
-    area = (0.06 * u.arcsec).to_value(u.rad) ** 2 * 1e12
     r = np.hypot(x - 110, y - 100) * 0.06
-    radii = [0.3, 0.6, 1.2]
-    light = [np.sum(image.data[r < limit]) * area / 100 for limit in radii]
+    inside = [r < limit for limit in (0.3, 0.6, 1.2)]
+    light = [np.sum(image.data[part]) * AREA / 100 for part in inside]
     # whole pixels in the place of circles
-    energy = encircled_energy(
-        psf, [np.sqrt(np.sum(r < limit) / np.pi) * 0.06 for limit in radii] * u.arcsec
-    )
-    np.testing.assert_allclose(light, energy, atol=0.01)
+    radii = np.sqrt(np.sum(inside, axis=(1, 2)) / np.pi) * 0.06 * u.arcsec
+    np.testing.assert_allclose(light, encircled_energy(psf, radii), atol=0.01)
     # 28 AB is 5 sigma in an aperture of 0.2 arcsec
-    rms = 10 ** (-0.4 * (28 - 23.9)) / 5 / np.sqrt(np.pi * (0.2 / 0.06) ** 2) / area
+    rms = 10 ** (-0.4 * (28 - 23.9)) / 5 / np.sqrt(np.pi * (0.2 / 0.06) ** 2) / AREA
     assert np.std(image.data[r > 5]) == pytest.approx(rms, rel=0.03)
     assert image.meta["psf_includes"] == list(psf.includes)

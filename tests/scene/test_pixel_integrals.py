@@ -17,16 +17,9 @@ PIXEL = 0.11
 def painted(n, radius, ratio, x, y, theta, *, size, sigma, oversampling=4):
     """One galaxy of unit light, painted as far as double precision goes."""
     painter = Painter((size, size), scenes.gaussian_psf(sigma, oversampling), enclosed=0.999999)
-    image, in_image, _ = painter.paint(
-        x=np.array([x]),
-        y=np.array([y]),
-        flux=np.ones(1),
-        is_sersic=np.ones(1, dtype=bool),
-        r_eff=np.array([radius]),
-        n=np.array([n]),
-        axis_ratio=np.array([ratio]),
-        theta=np.array([theta]),
-    )
+    galaxy = {"x": x, "y": y, "r_eff": radius, "n": n, "axis_ratio": ratio, "theta": theta}
+    columns = {name: np.array([value]) for name, value in galaxy.items()}
+    image, in_image, _ = painter.paint(flux=np.ones(1), is_sersic=np.ones(1, bool), **columns)
     assert in_image[0] == pytest.approx(image.sum(), rel=1e-5)
     return image
 

@@ -8,21 +8,23 @@ from photutils.psf import ImagePSF
 
 from helpers import scenes
 from helpers.errors import refuses
+from helpers.light import pixel_gaussian
 from helpers.scenes import FILTER, light, make_scene, moments
 from miricigale.instrument import pixel_area_map
 from miricigale.scene import Background, Scene, SceneFlags
 from miricigale.utils.exceptions import MiricigaleWarning
 
 TURNED = scenes.gaussian_psf(frame="sky", angle=40.0 * u.deg)
+FINE = scenes.gaussian_psf(pixel_scale=0.06 * u.arcsec)
+RED = scenes.gaussian_psf(filter="miri.f2100w")
 
 
 def test_a_point_source_is_the_psf(wcs, psf):
     catalog = scenes.make_catalog(wcs, [40.37, 60.0], [30.81, 50.5], flux=[10.0, 3.0])
     image = light(make_scene(catalog, wcs, psf))
     y, x = np.mgrid[:90, :100]
-    expected = 0
-    for x0, y0, flux in ((40.37, 30.81, 10), (60.0, 50.5, 3)):
-        expected = expected + ImagePSF(psf.data, oversampling=4, x_0=x0, y_0=y0, flux=flux)(x, y)
+    stars = ((40.37, 30.81, 10), (60.0, 50.5, 3))
+    expected = sum(psf.evaluate(x, y, flux, x0, y0) for x0, y0, flux in stars)
     np.testing.assert_allclose(image, expected, atol=2e-6 * expected.max())
 
 
@@ -32,9 +34,7 @@ def test_placement_to_a_thousandth_of_the_peak(wcs, oversampling):
     psf = scenes.gaussian_psf(1.0, oversampling)
     catalog = scenes.make_catalog(wcs, 50.13, 44.62)
     image = light(make_scene(catalog, wcs, psf))
-    truth = 10 * np.outer(
-        scenes.pixel_gaussian(90, 44.62, 1.0), scenes.pixel_gaussian(100, 50.13, 1.0)
-    )
+    truth = 10 * np.outer(pixel_gaussian(90, 44.62, 1.0), pixel_gaussian(100, 50.13, 1.0))
     limit = 1e-3 if oversampling > 1 else 2e-2
     np.testing.assert_allclose(image, truth, atol=limit * truth.max())
 
@@ -43,15 +43,12 @@ def test_placement_to_a_thousandth_of_the_peak(wcs, oversampling):
 @pytest.mark.parametrize("ratio", [0.1, 0.4, 1.0])
 def test_gaussian_galaxy_adds_its_variance(wcs, psf, radius, ratio):
     # position angle 90 deg is along x on a north-up image
-    catalog = scenes.make_catalog(
-        wcs, 50.3, 44.7, profile="sersic", radius=radius, index=0.5, ratio=ratio, angle=90.0
-    )
+    shape = {"radius": radius, "index": 0.5, "ratio": ratio, "angle": 90.0}
+    catalog = scenes.make_catalog(wcs, 50.3, 44.7, profile="sersic", **shape)
     image = light(make_scene(catalog, wcs, psf, enclosed=0.99999))
     own = radius / 0.11 / np.sqrt(2 * np.log(2))
-    truth = 10 * np.outer(
-        scenes.pixel_gaussian(90, 44.7, np.hypot(0.85, ratio * own)),
-        scenes.pixel_gaussian(100, 50.3, np.hypot(0.85, own)),
-    )
+    rows = pixel_gaussian(90, 44.7, np.hypot(0.85, ratio * own))
+    truth = 10 * np.outer(rows, pixel_gaussian(100, 50.3, np.hypot(0.85, own)))
     np.testing.assert_allclose(image, truth, atol=1e-3 * truth.max())
 
 
@@ -59,9 +56,8 @@ def test_gaussian_galaxy_adds_its_variance(wcs, psf, radius, ratio):
 @pytest.mark.parametrize("pa", [0.0, 35.0, 200.0])
 def test_position_angles_land_right(psf, pa, parity):
     wcs = scenes.tan_wcs(pa=pa, parity=parity)
-    catalog = scenes.make_catalog(
-        wcs, 50.0, 45.0, profile="sersic", radius=0.5, index=1.0, ratio=0.2, angle=70.0
-    )
+    shape = {"radius": 0.5, "index": 1.0, "ratio": 0.2, "angle": 70.0}
+    catalog = scenes.make_catalog(wcs, 50.0, 45.0, profile="sersic", **shape)
     scene = make_scene(catalog, wcs, psf, max_radius=3 * u.arcsec)
     x0, y0, ((xx, xy), (_, yy)) = moments(light(scene))
     theta = 0.5 * np.arctan2(2 * xy, xx - yy)
@@ -75,9 +71,8 @@ def test_position_angles_land_right(psf, pa, parity):
 
 def test_distorted_positions_shapes_and_fluxes(psf):
     wcs = scenes.distorted_wcs()
-    catalog = scenes.make_catalog(
-        wcs, [15.0, 80.0], [20.0, 70.0], profile="sersic", radius=0.25, ratio=1.0, index=0.5
-    )
+    shape = {"profile": "sersic", "radius": 0.25, "index": 0.5}
+    catalog = scenes.make_catalog(wcs, [15.0, 80.0], [20.0, 70.0], **shape)
     scene = make_scene(catalog, wcs, psf)
     truth = scene.truth
     np.testing.assert_allclose(truth["x"], [15, 80], atol=1e-6)
@@ -88,25 +83,16 @@ def test_distorted_positions_shapes_and_fluxes(psf):
     own = 0.25 / np.sqrt(2 * np.log(2))
     t = np.linspace(0, 2 * np.pi, 16, endpoint=False)
     around = catalog["sky"][0].directional_offset_by(t * u.rad, own * u.arcsec)
-    px, py = wcs.world_to_pixel(around)
-    variance = 2 * np.array([np.mean((px - 15) ** 2), np.mean((py - 20) ** 2)])
+    variance = 2 * np.mean(np.subtract(wcs.world_to_pixel(around), [[15], [20]]) ** 2, axis=1)
     np.testing.assert_allclose(np.diag(got) - 0.85**2 - 1 / 12, variance, rtol=0.03)
 
 
 def test_light_is_conserved_with_background_and_edges(wcs, psf):
     rng = np.random.default_rng(3)
-    n = 40
-    catalog = scenes.make_catalog(
-        wcs,
-        rng.uniform(-8, 108, n),
-        rng.uniform(-8, 98, n),
-        flux=rng.uniform(0.1, 50, n),
-        profile=rng.choice(["sersic", "point"], n),
-        radius=rng.uniform(0.01, 1.0, n),
-        index=rng.uniform(0.3, 8, n),
-        ratio=rng.uniform(0.1, 1, n),
-        angle=rng.uniform(0, 180, n),
-    )
+    ranges = {"x": (-8, 108), "y": (-8, 98), "flux": (0.1, 50), "radius": (0.01, 1.0)}
+    ranges |= {"index": (0.3, 8), "ratio": (0.1, 1), "angle": (0, 180)}
+    columns = {name: rng.uniform(*ends, 40) for name, ends in ranges.items()}
+    catalog = scenes.make_catalog(wcs, profile=rng.choice(["sersic", "point"], 40), **columns)
     background = Background(2 * u.MJy / u.sr, gradient=0.05 / u.arcmin)
     scene = make_scene(catalog, wcs, psf, background=background)
     truth = scene.truth
@@ -132,15 +118,9 @@ def test_in_image_flux_is_the_sum_of_each_source_alone(wcs, psf):
 
 
 def test_flags_say_what_happened(wcs, psf):
-    catalog = scenes.make_catalog(
-        wcs,
-        [50.0, 20.0, 70.0, 30.0],
-        [45.0, 30.0, 60.0, 60.0],
-        flux=[10.0, np.nan, 10.0, -1.0],
-        profile="sersic",
-        index=[8.0, 1.0, 20.0, 1.0],
-        radius=1.0,
-    )
+    x, y = [50.0, 20.0, 70.0, 30.0], [45.0, 30.0, 60.0, 60.0]
+    columns = {"flux": [10.0, np.nan, 10.0, -1.0], "index": [8.0, 1.0, 20.0, 1.0], "radius": 1.0}
+    catalog = scenes.make_catalog(wcs, x, y, profile="sersic", **columns)
     text = f"2 of 4 sources are not painted: fluxes in '{FILTER}' are 1 NaN, 1 negative .*no_flux"
     with pytest.warns(MiricigaleWarning, match=text):
         scene = make_scene(catalog, wcs, psf, max_radius=4 * u.arcsec)
@@ -156,9 +136,7 @@ def test_flags_say_what_happened(wcs, psf):
 
 def test_sources_on_the_other_side_of_the_sky_do_no_harm(wcs, psf):
     catalog = scenes.make_catalog(wcs, [50.0, 20.0], [45.0, 30.0])
-    catalog["sky"] = SkyCoord(
-        [catalog["sky"].ra.deg[0], 233.0], [catalog["sky"].dec.deg[0], 27], unit="deg"
-    )
+    catalog["sky"][1] = SkyCoord(233.0, 27.0, unit="deg")
     scene = make_scene(catalog, wcs, psf)
     assert scene.truth["flags"].tolist() == [0, SceneFlags.OUTSIDE_IMAGE]
     assert np.all(np.isfinite(scene.render().data))
@@ -169,16 +147,9 @@ def test_sources_on_the_other_side_of_the_sky_do_no_harm(wcs, psf):
 def test_points_alone_are_those_with_a_galaxy(wcs, psf):
     # alone they are added one by one, with a galaxy convolved with it
     x, y = [20.3, 47.9, -1.2, 60.0, 61.5], [31.2, 12.6, 40.4, 60.0, 60.5]
-    points = scenes.make_catalog(wcs, x, y)
-    galaxy = scenes.make_catalog(wcs, [35.0], [38.0], profile="sersic", radius=0.3, index=1.0)
-    both = scenes.make_catalog(
-        wcs,
-        [*x, 35.0],
-        [*y, 38.0],
-        profile=["point"] * len(x) + ["sersic"],
-        radius=[0.0] * len(x) + [0.3],
-        index=1.0,
-    )
+    profiles = ["point"] * len(x) + ["sersic"]
+    both = scenes.make_catalog(wcs, [*x, 35.0], [*y, 38.0], profile=profiles, radius=0.3)
+    points, galaxy = both[:-1], both[-1:]
     three = [make_scene(one, wcs, psf) for one in (points, galaxy, both)]
     alone, extended, together = (scene.render().data for scene in three)
     # the grid of the transforms is in single precision
@@ -188,9 +159,8 @@ def test_points_alone_are_those_with_a_galaxy(wcs, psf):
 
 
 def test_the_same_on_any_number_of_threads(wcs, psf):
-    catalog = scenes.make_catalog(
-        wcs, [30.0, 60.0], [40.0, 50.0], profile="sersic", radius=0.5, index=4.0, ratio=0.4
-    )
+    shape = {"profile": "sersic", "radius": 0.5, "index": 4.0, "ratio": 0.4}
+    catalog = scenes.make_catalog(wcs, [30.0, 60.0], [40.0, 50.0], **shape)
 
     def light(n_threads):
         return make_scene(catalog, wcs, psf, n_threads=n_threads).render().data
@@ -226,26 +196,14 @@ def bare_wcs():
     ("options", "message"),
     [
         ({"filter": "miri.f1000w"}, "'catalog' must be a table with the columns"),
-        (
-            {"psf": np.ones(3)},
-            "'psf' must be a PSF or model of photutils, an astropy kernel or a 2D",
-        ),
+        ({"psf": np.ones(3)}, "'psf' must be a PSF or model of photutils, .* kernel or a 2D"),
         ({"psf": np.zeros((5, 5))}, "'psf' must be finite, with a positive sum"),
-        (
-            {"psf": scenes.gaussian_psf(pixel_scale=0.06 * u.arcsec)},
-            r"pixels of 0\.0600 arcsec where the WCS has 0\.1100",
-        ),
+        ({"psf": FINE}, r"pixels of 0\.0600 arcsec where the WCS has 0\.1100"),
         ({"psf": TURNED}, r"turned by 40\.0 deg"),
-        (
-            {"psf": scenes.gaussian_psf(filter="miri.f2100w")},
-            r"'psf' must be one of the filter miri\.f770w, got one",
-        ),
+        ({"psf": RED}, r"'psf' must be one of the filter miri\.f770w, got one"),
         ({"psf": ImagePSF(np.ones((8, 8)), oversampling=4)}, "'psf' must be centered on a node"),
         ({"background": 3.0}, "'background' must be a Background, a Quantity in MJy/sr or a level"),
-        (
-            {"background": -3 * u.MJy / u.sr},
-            r"'level' must be finite and not negative, got -3\.0 MJy",
-        ),
+        ({"background": -3 * u.MJy / u.sr}, r"'level' must be .* not negative, got -3\.0 MJy"),
         ({"wcs": bare_wcs()}, "'wcs' must be a WCS with its pixel_shape"),
         ({"n_threads": 0}, "'n_threads' must be at least 1 and an integer, got 0"),
         ({"n_threads": 1.5}, r"'n_threads' must be at least 1 and an integer, got 1\.5"),

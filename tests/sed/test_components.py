@@ -22,10 +22,6 @@ def test_sun_like_luminosity_of_an_old_population():
     assert 1.5 < living[row] * sun / visual < 4.0
 
 
-def test_metallicity_outside_the_table_is_refused(model):
-    refuses(r"'metallicity' must be one of 0\.0001, .* got 0\.03", model.evaluate, metallicity=0.03)
-
-
 @pytest.mark.parametrize("name", ["delayed0.5", "delayed1", "delayed3"])
 def test_delayed_composites_agree_with_those_of_bc03(data_file, name):
     """

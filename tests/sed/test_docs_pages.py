@@ -35,18 +35,16 @@ def build(folder, text):
     (source / "guide" / "data.rst").write_text(":orphan:\n\nData\n====\n")
     (source / "index.rst").write_text(text)
     command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "text"]
-    done = subprocess.run(
-        [*command, str(source), str(folder / "out")], capture_output=True, text=True
-    )
+    command += [str(source), str(folder / "out")]
+    done = subprocess.run(command, capture_output=True, text=True)
     page = folder / "out" / "index.txt"
     return done, " ".join(page.read_text().split()) if page.exists() else ""
 
 
 def test_the_directive_shows_what_every_component_declares(tmp_path):
     pytest.importorskip("sphinx")
-    blocks = [
-        f"{name}\n{'-' * len(name)}\n\n.. sed-component:: {name}\n" for name in COMPONENTS.names()
-    ]
+    block = "{0}\n------------------------\n\n.. sed-component:: {0}\n"
+    blocks = [block.format(name) for name in COMPONENTS.names()]
     done, page = build(tmp_path, "\n".join(["Title\n=====\n", *blocks, ".. sed-derived::\n"]))
     assert done.returncode == 0, done.stderr
     for name in COMPONENTS.names():
@@ -57,9 +55,8 @@ def test_the_directive_shows_what_every_component_declares(tmp_path):
         for values in cls.all_options().values():
             assert all(f'"{value}"' in page for value in values)
         if cls.resource:
-            record = resource(cls.resource)
-            added = f'"miricigale data add {record.name} PATH"' in page
-            assert added == (record.kind == "user")
+            added = f'"miricigale data add {cls.resource} PATH"' in page
+            assert added == (resource(cls.resource).kind == "user")
 
     assert all(f'"{name}"' in page for name in DERIVED)
 

@@ -14,20 +14,13 @@ from miricigale.utils.store import write_parts
 
 
 def make(**changes):
-    values = {
-        "filters": ("a", "b"),
-        "redshift": [0.1, 0.2],
-        "galaxy": np.ones((2, 3, 2)),
-        "agn": np.full((2, 1, 2), 0.5),
-        "dust_luminosity": [1.0, 2.0, 3.0],
-        "frac_agn": [0.0, 0.5],
-        "allowed": np.ones((2, 3), bool),
-        "galaxy_parameters": QTable({"tau": [1.0, 2.0, 3.0]}),
-        "agn_parameters": QTable({"tau97": [3.0]}),
-        "galaxy_properties": QTable({"sfr": [1.0, 2.0, 3.0]}),
-        "agn_properties": QTable({"accretion_power": [3.0]}),
-        "agn_multiplicity": [3],
-    }
+    values = {"filters": ("a", "b"), "redshift": [0.1, 0.2], "frac_agn": [0.0, 0.5]}
+    values |= {"galaxy": np.ones((2, 3, 2)), "agn": np.full((2, 1, 2), 0.5)}
+    values |= {"dust_luminosity": [1.0, 2.0, 3.0], "allowed": np.ones((2, 3), bool)}
+    values |= {"agn_multiplicity": [3], "agn_parameters": QTable({"tau97": [3.0]})}
+    values |= {"agn_properties": QTable({"accretion_power": [3.0]})}
+    for name, column in (("galaxy_parameters", "tau"), ("galaxy_properties", "sfr")):
+        values[name] = QTable({column: [1.0, 2.0, 3.0]})
     return ModelGrid(**(values | changes))
 
 
@@ -64,17 +57,15 @@ def test_foreign_and_truncated_files_are_refused(tmp_path):
     fits.PrimaryHDU(np.zeros(3)).writeto(tmp_path / "other.fits")
     (tmp_path / "text.fits").write_text("text")
     for name, text in (("text", ""), ("none", "no such file")):
-        with pytest.raises(
-            DataError, match=rf"{name}\.fits cannot be read as model grid data: {text}"
-        ):
-            ModelGrid.read(tmp_path / f"{name}.fits")
+        match = rf"{name}\.fits cannot be read as model grid data: {text}"
+        refuses(match, ModelGrid.read, tmp_path / f"{name}.fits", error=DataError)
     refuses("holds no model grid data", ModelGrid.read, tmp_path / "other.fits", error=DataError)
     make().write(tmp_path / "grid.fits")
     with fits.open(tmp_path / "grid.fits") as hdus:
         del hdus["GALAXY"]
         hdus.writeto(tmp_path / "part.fits")
-    with pytest.raises(DataError, match="not a complete file of model grid data"):
-        ModelGrid.read(tmp_path / "part.fits")
+    match = "not a complete file of model grid data"
+    refuses(match, ModelGrid.read, tmp_path / "part.fits", error=DataError)
 
 
 FACTS = {
@@ -113,11 +104,8 @@ def test_files_of_the_layout_before_are_read(tmp_path):
     arrays = ("redshift", "galaxy", "agn", "dust_luminosity", "frac_agn", "allowed")
     arrays = {name: getattr(grid, name) for name in (*arrays, "agn_multiplicity")}
     meta = {name: FACTS[name] for name in ("axes", "inert", "frac_agn_definition")}
-    text = {
-        "filters": grid.filters,
-        "meta": meta | FACTS["recipe"],
-        "descriptions": {n: dict.fromkeys(t.colnames, "words") for n, t in tables.items()},
-    }
+    text = {"filters": grid.filters, "meta": meta | FACTS["recipe"]}
+    text["descriptions"] = {n: dict.fromkeys(t.colnames, "words") for n, t in tables.items()}
     path = tmp_path / "old.fits"
     write_parts(path, "miricigale-modelgrid-2", text=text, arrays=arrays, tables=tables)
     old = ModelGrid.read(path)

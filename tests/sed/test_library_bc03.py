@@ -6,6 +6,7 @@ import pytest
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
+from helpers.components import values_of
 from helpers.errors import refuses
 from miricigale import conf
 from miricigale.refdata.libraries import add_library, write_library
@@ -38,19 +39,18 @@ def content(*, metallicity=0.02, law=0, slopes=(), age=AGE, wave=WAVE, text=TEXT
 def binary(parts, order="<", n_vectors=12):
     """Fortran's unformatted records, as GALAXEV writes them."""
 
+    def packed(item):
+        if isinstance(item, bytes):
+            return item
+        item = np.asarray(item)
+        return item.astype(order + item.dtype.str[1:]).tobytes()
+
     def record(*items):
-        data = b"".join(
-            x
-            if isinstance(x, bytes)
-            else np.asarray(x).astype(order + np.asarray(x).dtype.str[1:]).tobytes()
-            for x in items
-        )
-        size = np.array(len(data), dtype=order + "i4").tobytes()
+        data = b"".join(map(packed, items))
+        size = packed(np.int32(len(data)))
         return size + data + size
 
-    def integer(x):
-        return np.array(x, dtype="i4")
-
+    integer = np.int32
     text = parts["text"].ljust(80).encode()
     segments = [np.array([x, 0.1, 100, 0, 1, 1], dtype="f4") for x in parts["slopes"]]
     one = np.ones(4, dtype="f4")
@@ -137,36 +137,25 @@ def test_every_form_of_a_file_gives_what_was_written(write, form, zipped, name, 
     assert got.texts == (TEXT.format(0.02),) * 3
 
 
-@pytest.mark.parametrize("form", ["little", "big"])
-def test_a_binary_file_cut_anywhere_is_refused(tmp_path, form):
-    data = FORMS[form][1](content())
-    rng = np.random.default_rng(11)
-    record = 4 * AGE.size + 12
-    needed = len(data) - 2 * record  # the last two vectors need not be there
-    for cut in [0, 3, 4, 50, *rng.integers(60, needed, 40), needed - record, needed - 1]:
-        path = tmp_path / f"cut_{cut}.ised"
+@pytest.mark.parametrize("form", FORMS)
+def test_a_file_cut_anywhere_is_refused(write, form):
+    path = write(form=form)
+    data, record = path.read_bytes(), 4 * AGE.size + 12
+    # the last two vectors need not be there
+    needed = len(data) - 2 * record if form != "ascii" else int(0.98 * len(data))
+    cuts = np.random.default_rng(11).integers(60, needed, 40)
+    for cut in [0, 1, 3, 4, 50, *cuts, needed - record, needed - 1]:
         path.write_bytes(data[:cut])
-        with pytest.raises(
-            DataError, match=rf"cut_{cut}\.ised cannot be read as a file of GALAXEV"
-        ):
-            read_ised(path)
+        match = rf"{path.name} cannot be read as a file of GALAXEV"
+        refuses(match, read_ised, path, error=DataError)
 
 
-def test_a_text_file_cut_anywhere_is_refused(tmp_path):
-    data = ascii_text(content())
-    rng = np.random.default_rng(12)
-    for cut in [0, 1, *rng.integers(2, int(0.98 * len(data)), 40)]:
-        path = tmp_path / f"cut_{cut}.ised_ASCII"
-        path.write_bytes(data[:cut])
-        refuses(rf"cut_{cut}\.ised_ASCII cannot be read", read_ised, path, error=DataError)
-
-
-def test_a_compressed_file_cut_anywhere_is_refused(tmp_path):
-    data = gzip.compress(binary(content()))
+def test_a_compressed_file_cut_anywhere_is_refused(write):
+    path = write(zipped=True)
+    data = path.read_bytes()
     for cut in (10, len(data) // 2, len(data) - 1):
-        path = tmp_path / "cut.ised.gz"
         path.write_bytes(data[:cut])
-        refuses(r"cut\.ised\.gz cannot be read", read_ised, path, error=DataError)
+        refuses(r"\.ised\.gz cannot be read", read_ised, path, error=DataError)
 
 
 @pytest.mark.parametrize("data", [b"nothing of the kind\n" * 100, bytes(5000), b"12 of them\n"])
@@ -176,21 +165,21 @@ def test_foreign_files_are_refused(tmp_path, data):
     refuses(r"foreign\.ised cannot be read as a file of GALAXEV", read_ised, path, error=DataError)
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -1e-9])
-def test_impossible_spectra_are_refused(tmp_path, bad):
+@pytest.mark.parametrize(
+    ("row", "match"),
+    [
+        (np.full(WAVE.size, np.nan), "spectra must be finite"),
+        (np.full(WAVE.size, np.inf), "spectra must be finite"),
+        (np.full(WAVE.size, -1e-9), "spectra must be 0 or more"),
+        (np.ones(WAVE.size - 1), rf"record 7 must hold {WAVE.size} numbers, got"),
+    ],
+)
+def test_impossible_spectra_are_refused(tmp_path, row, match):
     parts = content()
-    parts["spectra"][3, 50] = bad
+    parts["spectra"] = [*parts["spectra"][:4], row.astype("f4"), *parts["spectra"][5:]]
     path = tmp_path / "bad.ised"
     path.write_bytes(binary(parts))
-    refuses(r"bad\.ised .* spectra must be (finite|0 or more)", read_ised, path, error=DataError)
-
-
-def test_a_record_of_another_length_is_refused(tmp_path):
-    parts = content()
-    parts["spectra"] = [row if i != 4 else row[:-1] for i, row in enumerate(parts["spectra"])]
-    path = tmp_path / "odd.ised"
-    path.write_bytes(binary(parts))
-    refuses(rf"record 7 must hold {WAVE.size} numbers, got", read_ised, path, error=DataError)
+    refuses(rf"bad\.ised .*{match}", read_ised, path, error=DataError)
 
 
 def test_composites_of_the_authors(data_file):
@@ -206,8 +195,6 @@ def test_composites_of_the_authors(data_file):
     assert_allclose(total, part.quantities["bolometric"][rows], rtol=0.01)
     delayed = read_ised(data_file("bc03/bc2003_lr_m62_chab_delayed1_dust00.ised.gz"))
     assert "delayed, tau 1 Gyr" in delayed.history
-    with pytest.raises(DataError, match=r"tau3_dust00.* composite population .*exponential"):
-        read_bc03(data_file("bc03/bc2003_lr_m62_chab_tau3_dust00.ised.gz"))
 
 
 # ---------------------------------------------------------------------- a library
@@ -322,8 +309,8 @@ def test_mixtures_are_refused(write, tmp_path, name, changes, match):
 def test_the_same_metallicity_twice_is_refused_but_a_pattern_picks_one(write, tmp_path):
     write()
     write(form="ascii")
-    with pytest.raises(DataError, match=r"the same metallicity as bc2003_lr_m62_chab_ssp\.ised,"):
-        read_bc03(tmp_path)
+    match = r"the same metallicity as bc2003_lr_m62_chab_ssp\.ised,"
+    refuses(match, read_bc03, tmp_path, error=DataError)
     assert len(read_bc03(tmp_path / "*_ssp.ised").meta["files"]) == 1
     refuses(r"wanted files .*got none", read_bc03, tmp_path / "*.none", error=DataError)
 
@@ -346,21 +333,14 @@ def test_component_gives_the_table_of_each_metallicity(registered):
     wave = registered.nodes()[visual]
     level = np.interp(wave, want["wave"] / 1e4, want["spectra"][4]) * 3.826e30
     assert spectra[4, visual] == pytest.approx(level, rel=1e-3)
-    assert_allclose(living, read_bc03_living(want), rtol=1e-6)
-    values = {n: p.default for n, p in registered.parameters.items()}
+    assert_allclose(living[1:], (want["vectors"][1] - want["vectors"][9])[1:], rtol=1e-6)
+    assert living[0] == 1.0
     assert registered.metallicities() == (0.004, 0.02, 0.05)
-    assert registered.invalid(values) is None
-    assert "must be one of 0.004, 0.02, 0.05, got 0.008" in registered.invalid(
-        values | {"metallicity": 0.008}
-    )
+    assert registered.invalid(values_of(registered)) is None
+    says = registered.invalid(values_of(registered, metallicity=0.008))
+    assert "must be one of 0.004, 0.02, 0.05, got 0.008" in says
     assert registered.settings["imf"] == registered.imf == "Chabrier"
     assert "Chabrier" in registered.library
-
-
-def read_bc03_living(parts):
-    out = parts["vectors"][1] - parts["vectors"][9]
-    out[0] = 1.0
-    return out
 
 
 def test_ionizing_photons_of_a_ramp(registered):

@@ -5,13 +5,13 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.cosmology import FlatLambdaCDM
-from astropy.table import QTable
+from astropy.table import QTable, hstack
 from astropy.tests.helper import assert_quantity_allclose
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
 from miricigale.filters import Filter, FilterSet
-from miricigale.sed import COSMOLOGY, ModelFlags, ModelGrid, Parameter, SEDModel, yang2021_axes
+from miricigale.sed import COSMOLOGY, ModelFlags, Parameter, SEDModel, yang2021_axes
 from miricigale.sed.component import register
 from miricigale.sed.components import (
     BC03,
@@ -23,17 +23,9 @@ from miricigale.sed.components import (
 )
 from miricigale.utils.exceptions import ConfigError, MiricigaleWarning
 
-AXES = {
-    "tau": [0.1, 1.0],
-    "age": [0.5, 5.0],
-    "ebv": [0.1, 0.7],
-    "alpha": [1.0, 2.0],
-    "tau97": [3.0, 7.0],
-    "ebv_polar": [0.0, 0.2],
-    "temperature_polar": [100.0, 300.0],
-    "frac_agn": [0.0, 0.4, 0.9],
-    "redshift": [0.01, 0.5, 2.0, 4.0],
-}
+AXES = {"tau": [0.1, 1.0], "age": [0.5, 5.0], "ebv": [0.1, 0.7], "alpha": [1.0, 2.0]}
+AXES |= {"tau97": [3.0, 7.0], "ebv_polar": [0.0, 0.2], "temperature_polar": [100.0, 300.0]}
+AXES |= {"frac_agn": [0.0, 0.4, 0.9], "redshift": [0.01, 0.5, 2.0, 4.0]}
 MASKED = np.ma.array([1.0, 2.0, 3.0], mask=[False, True, False])
 
 
@@ -59,11 +51,8 @@ def test_dust_excess_changes_the_dust_and_leaves_the_stars(model, filters):
     table = model.fluxes(rows, filters)
     for name in (*filters.names, "dust_luminosity", "ir_luminosity", "l_6um", "accretion_power"):
         assert table[name][0] == balanced[name][0]
-    assert_quantity_allclose(
-        u.Quantity([table[name][1] for name in filters.names]),
-        filters.synthetic_fluxes(more),
-        rtol=1e-6,
-    )
+    got = u.Quantity([table[name][1] for name in filters.names])
+    assert_quantity_allclose(got, filters.synthetic_fluxes(more), rtol=1e-6)
     assert_quantity_allclose(table["ir_luminosity"][1], more.derived["ir_luminosity"])
     assert table["dust_luminosity"][2] == 0
     assert table["flags"].tolist() == [0, 0, ModelFlags.NO_AGN_POWER]
@@ -98,9 +87,8 @@ def test_agn_fraction_means_what_its_definition_says(fraction, definition, name)
 def test_six_micron_luminosity_from_the_spectrum(model):
     parts = model.evaluate(frac_agn=0.7, age=3.0, redshift=1.0)
     agn = sum(parts.components[f"agn_{n}"].fnu_at(12 * u.um) for n in ("disk", "torus", "polar"))
-    far = COSMOLOGY.luminosity_distance(1.0)
     nu = (12 * u.um).to(u.Hz, u.spectral())
-    want = (nu * agn * 4 * np.pi * far**2).to(u.W)
+    want = (nu * agn * 4 * np.pi * COSMOLOGY.luminosity_distance(1.0) ** 2).to(u.W)
     assert_quantity_allclose(parts.derived["l_6um"], want, rtol=1e-6)
 
 
@@ -173,16 +161,8 @@ def test_order_of_the_list_does_not_matter():
 
 
 def test_from_dict():
-    model = SEDModel.from_dict(
-        {
-            "components": [
-                {"name": "delayed", "tau": 0.3},
-                {"name": "bc03"},
-                {"name": "calzetti", "slope": -0.2},
-                {"name": "dl07", "q_pah": 1.12},
-            ]
-        }
-    )
+    parts = [{"name": "delayed", "tau": 0.3}, {"name": "bc03"}, {"name": "calzetti"}]
+    model = SEDModel.from_dict({"components": [*parts, {"name": "dl07", "q_pah": 1.12}]})
     assert model.parameters["tau"].default == 0.3
     assert model.parameters["q_pah"].default == 1.12
 
@@ -223,33 +203,18 @@ def test_models_and_spectra_survive_copying_and_pickling(model, make):
 def test_three_ways_to_a_flux_agree(model, filters, grid):
     """grid() == fluxes() == evaluate() + FilterSet."""
     rng = np.random.default_rng(3)
-    rows, want = [], []
-    while len(rows) < 12:
-        z, g = rng.integers(len(grid.redshift)), rng.integers(grid.n_galaxies)
-        a, f = rng.integers(grid.n_agn), rng.integers(len(grid.frac_agn))
-        if not grid.allowed[z, g]:
-            continue
-        row = {n: grid.galaxy_parameters[n][g] for n in grid.galaxy_parameters.colnames}
-        row |= {n: grid.agn_parameters[n][a] for n in grid.agn_parameters.colnames}
-        row |= {"redshift": grid.redshift[z], "frac_agn": grid.frac_agn[f], "mass": 1e10 * u.Msun}
-        rows.append(row)
-        want.append(1e10 * grid.flux(z, g, a, f))
-    table = QTable(rows)
+    z, g = rng.permutation(np.argwhere(grid.allowed))[:12].T
+    a, f = rng.integers(grid.n_agn, size=12), rng.integers(len(grid.frac_agn), size=12)
+    table = hstack([grid.galaxy_parameters[g], grid.agn_parameters[a]])
+    table["redshift"], table["frac_agn"] = grid.redshift[z], grid.frac_agn[f]
+    table["mass"] = 1e10 * u.Msun
     got = model.fluxes(table, filters)
-    for i, row in enumerate(rows):
-        direct = filters.synthetic_fluxes(model.evaluate(**row)).value
-        listed = np.array([got[name][i].value for name in filters.names])
-        assert_allclose(listed, want[i], rtol=1e-6)
-        assert_allclose(direct, want[i], rtol=1e-6)
-        g = np.flatnonzero(
-            np.all(
-                [grid.galaxy_parameters[n] == row[n] for n in grid.galaxy_parameters.colnames],
-                axis=0,
-            )
-        )[0]
-        assert_quantity_allclose(
-            got["dust_luminosity"][i], 1e10 * grid.dust_luminosity[g] * u.W, rtol=1e-10
-        )
+    for i, row in enumerate(table):
+        want = 1e10 * grid.flux(z[i], g[i], a[i], f[i])
+        assert_allclose([got[name][i].value for name in filters.names], want, rtol=1e-6)
+        assert_allclose(filters.synthetic_fluxes(model.evaluate(**row)).value, want, rtol=1e-6)
+    dust = 1e10 * grid.dust_luminosity[g] * u.W
+    assert_quantity_allclose(got["dust_luminosity"], dust, rtol=1e-10)
     assert np.all(got["flags"] == 0)
 
 
@@ -276,40 +241,16 @@ def test_grid_without_agn(model, filters):
     assert grid.frac_agn.tolist() == [0.0]
 
 
-def test_grid_survives_writing(grid, tmp_path):
-    grid.write(tmp_path / "grid.fits")
-    back = ModelGrid.read(tmp_path / "grid.fits")
-    for name in ("redshift", "galaxy", "agn", "dust_luminosity", "frac_agn", "allowed"):
-        assert_array_equal(getattr(back, name), getattr(grid, name))
-    assert back.filters == grid.filters
-    for name, values in grid.axes.items():
-        assert_array_equal(back.axes[name], values)
-    for name in ("inert", "bounds", "recipe", "frac_agn_definition"):
-        assert getattr(back, name) == getattr(grid, name)
-    for name in grid.galaxy_properties.colnames:
-        assert_quantity_allclose(back.galaxy_properties[name], grid.galaxy_properties[name])
-    assert back.n_models == grid.n_models
-
-
 def test_rows_that_cannot_be_evaluated_are_flagged(model, filters):
-    table = QTable(
-        {
-            "id": [11, 12, 13, 14, 15],
-            "age": [1.0, 7.0, 1.0, 1.0, 1.0] * u.Gyr,
-            "redshift": [1.0, 2.0, np.nan, 1.0, 1.0],
-            "ebv": [0.1, 0.1, 0.1, 9.0, 0.1] * u.mag,
-            "metallicity": [0.02, 0.02, 0.02, 0.02, 0.03],
-        }
-    )
+    table = QTable({"id": [11, 12, 13, 14, 15], "age": [1.0, 7.0, 1.0, 1.0, 1.0] * u.Gyr})
+    table["redshift"] = [1.0, 2.0, np.nan, 1.0, 1.0]
+    table["ebv"] = [0.1, 0.1, 0.1, 9.0, 0.1] * u.mag
+    table["metallicity"] = [0.02, 0.02, 0.02, 0.02, 0.03]
     got = model.fluxes(table, filters)
     assert got["id"].tolist() == [11, 12, 13, 14, 15]
-    assert [ModelFlags.names(f) for f in got["flags"]] == [
-        [],
-        ["older_than_universe"],
-        ["not_finite"],
-        ["out_of_bounds"],
-        ["not_in_library"],
-    ]
+    f = ModelFlags
+    wanted = [0, f.OLDER_THAN_UNIVERSE, f.NOT_FINITE, f.OUT_OF_BOUNDS, f.NOT_IN_LIBRARY]
+    assert got["flags"].tolist() == wanted
     assert np.isfinite(got["irac.ch1"][0])
     assert np.all(np.isnan(got["irac.ch1"][1:]))
     assert np.all(np.isnan(got["sfr"][1:]))
@@ -369,8 +310,7 @@ def test_tables_of_parameters_are_checked(model, filters):
 
 def box(low, high, name="box"):
     """A top hat."""
-    wave = [0.99 * low, low, high, 1.01 * high] * u.um
-    return Filter(wave, [0.0, 1.0, 1.0, 0.0], name=name)
+    return Filter([low, high] * u.um, [1.0, 1.0], name=name)
 
 
 def test_a_band_beyond_the_spectrum_is_flagged_and_alone_not_a_number():
@@ -399,8 +339,8 @@ def test_an_agn_without_dust_to_refer_to_is_said(model, filters):
 
 def test_a_band_with_the_name_of_another_column_is_refused(model):
     for name in ("sfr", "id", "flags"):
-        with pytest.raises(ValueError, match="without names of other columns"):
-            model.fluxes(QTable({"redshift": [1.0]}), FilterSet([box(1.0, 2.0, name)]))
+        bands = FilterSet([box(1.0, 2.0, name)])
+        refuses("without names of other columns", model.fluxes, QTable({"redshift": [1.0]}), bands)
 
 
 def test_columns_come_in_any_kind_of_table(model, filters, tmp_path):
@@ -480,28 +420,22 @@ def test_a_fraction_of_the_light_in_any_range(span):
     model = SEDModel.yang2021(frac_agn_definition=f"{span[0]:g}-{span[1]:g}um")
     values = {"redshift": 0.5, "age": 3.0, "frac_agn": 0.3, "mass": 1e10}
     spectra = model.evaluate(**values)
-    light = {}
-    for name in ("total", "agn_disk", "agn_torus", "agn_polar"):
-        sed = spectra if name == "total" else spectra.components[name]
-        wave = sed.wave.value / 1.5
-        inside = (wave >= span[0] * (1 - 1e-9)) & (wave <= span[1] * (1 + 1e-9))
-        light[name] = np.trapezoid(sed.fnu.value[inside] / wave[inside] ** 2, wave[inside])
-    agn = light["agn_disk"] + light["agn_torus"] + light["agn_polar"]
-    assert agn / light["total"] == pytest.approx(0.3, rel=1e-6)
+    wave = spectra.wave.value / 1.5
+    inside = (wave >= span[0] * (1 - 1e-9)) & (wave <= span[1] * (1 + 1e-9))
+    parts = [spectra, *(spectra.components[f"agn_{n}"] for n in ("disk", "torus", "polar"))]
+    fnu = np.array([part.fnu.value[inside] for part in parts])
+    total, *agn = np.trapezoid(fnu / wave[inside] ** 2, wave[inside])
+    assert sum(agn) / total == pytest.approx(0.3, rel=1e-6)
     bands = ["wfc3.f160w", "miri.f1500w"]
     table = model.fluxes(QTable({name: [value] for name, value in values.items()}), bands)
-    grid = model.grid(
-        {"redshift": [0.5], "age": [1.0, 3.0], "frac_agn": [0.0, 0.3]}, bands, cache=False
-    )
+    axes = {"redshift": [0.5], "age": [1.0, 3.0], "frac_agn": [0.0, 0.3]}
+    grid = model.grid(axes, bands, cache=False)
     one = grid.flux(0, 1, 0, 1) * 1e10
     assert_allclose([table[b][0].value for b in bands], one, rtol=1e-5)
-    assert spectra.derived["agn_power"].value == pytest.approx(
-        table["agn_power"][0].value, rel=1e-6
-    )
+    derived = spectra.derived
+    assert_quantity_allclose(derived["agn_power"], table["agn_power"][0], rtol=1e-6)
     accretion = grid.agn_properties["accretion_power"][0].value * 3 / 7 * grid.dust_luminosity[1]
-    assert 1e10 * accretion == pytest.approx(spectra.derived["accretion_power"].value, rel=1e-5)
+    assert 1e10 * accretion == pytest.approx(derived["accretion_power"].value, rel=1e-5)
     for wrong in ("20-5um", "0.01-20um", "ir"):
-        with pytest.raises(
-            ValueError, match="'frac_agn_definition' must be one of 'dust' and ranges"
-        ):
-            SEDModel.yang2021(frac_agn_definition=wrong)
+        match = "'frac_agn_definition' must be one of 'dust' and ranges"
+        refuses(match, SEDModel.yang2021, frac_agn_definition=wrong)

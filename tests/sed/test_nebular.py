@@ -1,9 +1,12 @@
+import re
+
 import astropy.units as u
 import numpy as np
 import pytest
 from astropy.io import fits
 from numpy.testing import assert_allclose
 
+from helpers.components import values_of
 from helpers.errors import refuses
 from miricigale.sed import _core
 from miricigale.sed.components import BC03
@@ -44,7 +47,7 @@ def constant_rate(age, duration):
 
 
 def full(gas, **values):
-    return {n: p.default for n, p in gas.parameters.items()} | {"metallicity": 0.02} | values
+    return values_of(gas, **({"metallicity": 0.02} | values))
 
 
 def one_photon(gas, method="lines", at=2.0, **values):
@@ -133,8 +136,7 @@ def test_wavelengths_are_those_of_the_laboratory_in_vacuum(gas):
         "ArII-6.985um": 6.98527, "SIV-10.51um": 10.5105, "NeII-12.81um": 12.81355,
         "NeIII-15.56um": 15.5551, "SIII-18.71um": 18.7130, "CII-157.7um": 157.7409,
     }  # fmt: skip
-    for name, value in published.items():
-        assert wave[name] == pytest.approx(value, rel=2e-5), name
+    assert {name: wave[name] for name in published} == pytest.approx(published, rel=2e-5)
 
 
 # ------------------------------------------------------------ stars, energy, calibration
@@ -169,9 +171,7 @@ def test_gas_follows_the_ionizing_photons(gas):
     one = gas.spectra(age, weights, photons, values)
     assert_allclose(gas.spectra(age, 3 * weights, photons, values), 3 * one)
     assert_allclose(gas.spectra(age, weights, 0.2 * photons, values), 0.2 * one)
-    parts = [
-        gas.spectra(age, np.where(k, weights, 0), photons, values) for k in (age < 5, age >= 5)
-    ]
+    parts = [gas.spectra(age, weights * k, photons, values) for k in (age < 5, age >= 5)]
     assert_allclose(parts[0] + parts[1], one, rtol=1e-12)
     assert not gas.spectra(age, 0 * weights, photons, values).any()
 
@@ -241,8 +241,7 @@ def test_gas_may_have_its_own_metallicity(gas):
 def test_says_why_values_cannot_be_evaluated(options, values, text):
     component = Nebular(**options)
     assert component.invalid(full(component)) is None
-    with pytest.raises(ValueError, match=text):
-        raise ValueError(component.invalid(full(component, **values)))
+    assert re.search(text, component.invalid(full(component, **values)))
 
 
 # ----------------------------------------------------------------------------- drawing
@@ -279,17 +278,14 @@ def test_line_width_is_a_setting_with_a_unit():
     assert Nebular(line_width=0.5 * u.Unit("1000 km / s")).line_width == pytest.approx(500.0)
     assert Nebular(line_width=150.0).settings == {"gas": "stellar", "line_width": 150.0}
     refuses(r"'line_width' must be from 1\.0 to 3000\.0 km / s, got 0", Nebular, line_width=0.0)
-    with pytest.raises(u.UnitsError, match="'line_width' must be convertible to km / s"):
-        Nebular(line_width=3.0 * u.um)
-    refuses("'gas' must be one of stellar, free", Nebular, gas="ionized")
+    match = "'line_width' must be convertible to km / s"
+    refuses(match, Nebular, error=u.UnitsError, line_width=3.0 * u.um)
 
 
 def test_refuses_a_foreign_file(tmp_path):
     path = tmp_path / "other.fits"
     fits.PrimaryHDU(np.ones(3)).writeto(path)
-    with pytest.raises(DataError, match=r"other\.fits is not a table of nebular emission"):
-        load_nebular(str(path))
-    with pytest.raises(
-        DataError, match=r"none\.fits cannot be read as a table of nebular emission"
-    ):
-        load_nebular(str(tmp_path / "none.fits"))
+    match = r"other\.fits is not a table of nebular emission"
+    refuses(match, load_nebular, str(path), error=DataError)
+    match = r"none\.fits cannot be read as a table of nebular emission"
+    refuses(match, load_nebular, str(tmp_path / "none.fits"), error=DataError)

@@ -42,6 +42,6 @@ def test_every_component_declares_unit_bounds_doc_and_reference(name):
     assert cls.reference
     for parameter in cls.declared().values():
         assert isinstance(parameter.unit, u.UnitBase)
-        assert parameter.bounds[0] < parameter.bounds[1]
-        assert parameter.bounds[0] <= parameter.default <= parameter.bounds[1]
+        low, high = parameter.bounds
+        assert low <= parameter.default <= high > low
         assert parameter.doc.endswith(".")

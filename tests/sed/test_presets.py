@@ -58,12 +58,8 @@ def test_a_torus_library_with_the_papers_values_is_taken(folder):
     rows = np.array(np.meshgrid(*axes.values(), indexing="ij")).reshape(len(axes), -1)
     spectra = {n: np.tile(np.exp(-np.log(wave / x) ** 2) / wave, (rows.shape[1], 1))
                for n, x in (("disk", 0.2), ("dust", 20.0))}  # fmt: skip
-    table = LibraryTable(
-        name="torus.skirtor2016",
-        wave=wave,
-        axes=dict(zip(axes, rows, strict=True)),
-        spectra=spectra,
-    )
+    columns = dict(zip(axes, rows, strict=True))
+    table = LibraryTable("torus.skirtor2016", wave, columns, spectra)
     write_library(table, folder / resource("torus.skirtor2016").file)
     model = SEDModel.yang2021()
     assert names(model)["agn"] == "skirtor2016"
@@ -74,9 +70,8 @@ def test_a_torus_library_with_the_papers_values_is_taken(folder):
 
 def test_unknown_choice_and_absent_library_are_refused(folder):
     refuses("'libraries' must be one of", SEDModel.yang2021, libraries="mine")
-    model = SEDModel.from_dict(
-        {"components": [{"name": n} for n in ("delayed", "bc03", "calzetti", "dale2014")]}
-    )
+    parts = [{"name": n} for n in ("delayed", "bc03", "calzetti", "dale2014")]
+    model = SEDModel.from_dict({"components": parts})
     refuses(r"data add dust\.dale2014", model.evaluate, error=DataError, age=1.0)
 
 
@@ -94,9 +89,8 @@ def test_survey_axes_are_those_of_the_chain(folder):
     assert axes["ebv"][0] == 0
     assert axes["frac_agn"][0] == 0
     assert np.all(np.diff(np.log1p(axes["redshift"])) <= 0.02 + 1e-9)
-    grid = model.grid(
-        axes | {"tau": [0.5], "q_pah": [2.0], "redshift": [1.4]}, ["wfc3.f160w", "miri.f770w"]
-    )
+    few = axes | {"tau": [0.5], "q_pah": [2.0], "redshift": [1.4]}
+    grid = model.grid(few, ["wfc3.f160w", "miri.f770w"])
     # seven ages, three bursts, two metallicities and slopes, eight color excesses; two tori of three depths
     assert (grid.n_galaxies, grid.n_agn) == (672, 6)
     for name, weights in SEDModel.survey_priors().items():

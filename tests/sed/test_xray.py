@@ -21,14 +21,10 @@ FULL, HARD = [0.5, 7] * u.keV, [2, 10] * u.keV
 # ----------------------------------------------------------------------------- Stern 2015
 
 
-@pytest.mark.parametrize(
-    ("log_six", "log_x"),
-    # 40.981 + 1.024 x - 0.047 x^2 by hand
-    [(41, 40.981), (42, 41.958), (44, 43.630), (46, 44.926), (47, 45.433)],
-)
-def test_stern_by_hand(log_six, log_x):
-    got = stern2015(10.0**log_six * ERG).to_value(ERG)
-    assert np.log10(got) == pytest.approx(log_x, abs=1e-9)
+def test_stern_by_hand():
+    # 40.981 + 1.024 x - 0.047 x^2
+    got = stern2015([1e41, 1e42, 1e44, 1e46, 1e47] * ERG).to_value(ERG)
+    assert_allclose(np.log10(got), [40.981, 41.958, 43.630, 44.926, 45.433], rtol=0, atol=1e-9)
 
 
 def test_stern_agrees_with_the_relation_of_fiore_2009_at_seyferts():
@@ -39,13 +35,10 @@ def test_stern_agrees_with_the_relation_of_fiore_2009_at_seyferts():
 
 def test_stern_agrees_with_the_bilinear_relation_of_quasars():
     """Chen et al. 2017: log L_X = 0.84 (log L_6um - 45) + 44.60 below 44.79, 0.40 and 44.51 above."""
-    for log_six in (44.0, 44.5, 45.0, 45.5, 46.0):
-        if log_six < 44.79:
-            want = 0.84 * (log_six - 45) + 44.60
-        else:
-            want = 0.40 * (log_six - 45) + 44.51
-        got = np.log10(stern2015(10**log_six * ERG).to_value(ERG))
-        assert got == pytest.approx(want, abs=0.3)
+    log_six = np.array([44.0, 44.5, 45.0, 45.5, 46.0]) - 45
+    want = np.where(log_six < -0.21, 0.84 * log_six + 44.60, 0.40 * log_six + 44.51)
+    got = np.log10(stern2015(10 ** (log_six + 45) * ERG).to_value(ERG))
+    assert_allclose(got, want, rtol=0, atol=0.3)
 
 
 def test_stern_takes_any_shape_and_no_light_is_no_x_ray():
@@ -166,7 +159,3 @@ def test_empty_band_is_invalid():
     assert part.invalid(values_of(part)) is None
     why = part.invalid(values_of(part, xray_low=8.0))
     assert why == "'xray_high' must be above 'xray_low', got 8 to 7 keV"
-
-
-def test_component_refuses_unknown_laws():
-    refuses("'law' must be one of stern2015, got 'mateos2015'", XRay, law="mateos2015")

@@ -24,18 +24,13 @@ print(outer(1), sum(outer.stats.cache_hits.values()))
 
 def test_a_kernel_is_compiled_again_when_one_that_it_calls_has_changed(tmp_path):
     """numba alone looks at the file of the caller only, and would go on with the former callee."""
-    files = {
-        "__init__.py": "",
-        "first/__init__.py": "",
-        "first/_core.py": CALLEE.format(1),
-        "second/__init__.py": "",
-        "second/_core/__init__.py": "",
-        "second/_core/kernels.py": CALLER,
-    }
-    for name, text in files.items():
-        path = tmp_path / "toy" / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
+    toy = tmp_path / "toy"
+    for folder in ("first", "second/_core"):
+        (toy / folder).mkdir(parents=True)
+    for folder in ("", "first", "second", "second/_core"):
+        (toy / folder / "__init__.py").touch()
+    (toy / "first/_core.py").write_text(CALLEE.format(1))
+    (toy / "second/_core/kernels.py").write_text(CALLER)
 
     def ask():
         command = [sys.executable, "-c", ASK]
@@ -44,6 +39,6 @@ def test_a_kernel_is_compiled_again_when_one_that_it_calls_has_changed(tmp_path)
 
     assert ask() == ["20", "0"]
     assert ask() == ["20", "1"]
-    (tmp_path / "toy/first/_core.py").write_text(CALLEE.format(2))
+    (toy / "first/_core.py").write_text(CALLEE.format(2))
     assert ask() == ["30", "0"]
     assert ask() == ["30", "1"]

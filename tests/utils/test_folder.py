@@ -2,8 +2,6 @@
 
 import json
 
-import pytest
-
 from helpers.errors import refuses
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.folder import RecordFolder
@@ -17,10 +15,8 @@ class Parts(RecordFolder):
     def parse(self, values):
         if values.get("format") != "parts-1":
             return super().parse(values)
-        records = {
-            name: {"hash": "old", "products": {name: dict(record)}}
-            for name, record in values["parts"].items()
-        }
+        parts = values["parts"].items()
+        records = {name: {"hash": "old", "products": {name: dict(part)}} for name, part in parts}
         return {"job": values["job"]}, records
 
 
@@ -102,8 +98,6 @@ def test_an_earlier_layout_stays_readable(tmp_path):
 def test_messages_say_whose_folder_it_is(tmp_path):
     (tmp_path / "mine").write_text("x")
     refuses("is no fit's folder; choose another folder", Parts, tmp_path, error=DataError)
-    with (
-        Parts(tmp_path / "fit"),
-        pytest.raises(DataError, match=r"is in use by a fit: .* remove .*fit\.lock"),
-    ):
-        Parts(tmp_path / "fit").__enter__()
+    match, other = r"is in use by a fit: .* remove .*fit\.lock", Parts(tmp_path / "fit")
+    with Parts(tmp_path / "fit"):
+        refuses(match, other.__enter__, error=DataError)

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+from subprocess import PIPE
 
 import pytest
 
@@ -23,12 +24,8 @@ HOLD = """
 
 
 def start(code, *args):
-    return subprocess.Popen(
-        [sys.executable, "-c", textwrap.dedent(code), *map(str, args)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
+    command = [sys.executable, "-c", textwrap.dedent(code), *map(str, args)]
+    return subprocess.Popen(command, stdin=PIPE, stdout=PIPE, text=True)
 
 
 @pytest.fixture
@@ -56,6 +53,10 @@ def leave(folder, **changes):
     return text
 
 
+def refused(match, folder):
+    refuses(match, FolderLock(folder).__enter__, error=DataError)
+
+
 def test_a_lock_is_there_while_it_is_held_and_alone(tmp_path):
     with FolderLock(tmp_path, name="fit.lock", purpose="fit") as held:
         assert names(tmp_path) == [".fit.lock", "fit.lock"]
@@ -69,8 +70,7 @@ def test_a_lock_is_there_while_it_is_held_and_alone(tmp_path):
 
 def test_another_process_keeps_out_until_it_ends(tmp_path, holder):
     wanted = rf"process {holder.pid} on .*, started 20.* UTC; if .* remove .*run\.lock"
-    with pytest.raises(DataError, match=wanted), FolderLock(tmp_path):
-        pass
+    refused(wanted, tmp_path)
     assert content(tmp_path)["pid"] == holder.pid
     holder.communicate("")
     with FolderLock(tmp_path):
@@ -130,8 +130,7 @@ def test_a_forked_child_does_not_free_the_lock_of_its_parent(tmp_path):
     process = start(code, tmp_path)
     try:
         assert process.stdout.readline() == "waited\n"
-        with pytest.raises(DataError, match=f"process {process.pid} "), FolderLock(tmp_path):
-            pass
+        refused(f"process {process.pid} ", tmp_path)
     finally:
         process.communicate("")
     assert process.returncode == 0
@@ -142,8 +141,7 @@ def test_a_forked_child_does_not_free_the_lock_of_its_parent(tmp_path):
 def test_a_lock_of_another_host_is_never_taken_for_dead(tmp_path, changes):
     text = leave(tmp_path, pid=2**22 + 1, **changes)
     wanted = r"on another host: process 4194305 on .*if that process is gone, remove .*run\.lock"
-    with pytest.raises(DataError, match=wanted), FolderLock(tmp_path):
-        pass
+    refused(wanted, tmp_path)
     assert (tmp_path / "run.lock").read_text() == text
 
 
@@ -157,8 +155,7 @@ def test_what_cannot_be_read_is_taken_over(tmp_path, text):
 def test_a_removed_file_does_not_free_the_lock(tmp_path):
     with FolderLock(tmp_path) as first:
         first.path.unlink()
-        with pytest.raises(DataError, match="in use"), FolderLock(tmp_path):
-            pass
+        refused("in use", tmp_path)
     assert names(tmp_path) == [".run.lock"]
 
 

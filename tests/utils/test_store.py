@@ -45,12 +45,8 @@ def test_parts_come_back(tmp_path):
     path = tmp_path / "a.fits"
     table = QTable({"id": ["a", "bb"], "flux": [1.0, np.nan] * u.uJy, "n": np.array([3, 4])})
     table.meta["citations"] = ["x" * 100]
-    arrays = {
-        "pdf": np.arange(24.0).reshape(2, 3, 4),
-        "used": np.array([True, False]),
-        "wave": [1.5, 2.5] * u.um,
-        "none": np.zeros((0, 3)),
-    }
+    arrays = {"pdf": np.arange(24.0).reshape(2, 3, 4), "used": np.array([True, False])}
+    arrays |= {"wave": [1.5, 2.5] * u.um, "none": np.zeros((0, 3))}
     text = {"meta": {"n": np.int64(3), "values": np.arange(3.0), "text": "\u03bb"}}
     write_parts(path, "test-1", text=text, arrays=arrays, tables={"rows": table})
     refuses("overwrite", write_parts, path, "test-1", error=OSError)
@@ -75,16 +71,14 @@ def test_parts_come_back(tmp_path):
 def test_incomplete_and_foreign_files_are_named(tmp_path):
     path = tmp_path / "a.fits"
     write_parts(path, "test-1", arrays={"a": np.ones(3)})
-    with (
-        pytest.raises(DataError, match=r"a\.fits is not a complete file of fit results"),
-        open_parts(path, ("test-1",), wanted="fit results") as parts,
-    ):
-        parts.array("b")
-    with (
-        pytest.raises(DataError, match=r"a\.fits holds no fit results"),
-        open_parts(path, ("test-2",), wanted="fit results"),
-    ):
-        pass
+
+    def read(layout, name):
+        with open_parts(path, (layout,), wanted="fit results") as parts:
+            return parts.array(name)
+
+    match = r"a\.fits is not a complete file of fit results"
+    refuses(match, read, "test-1", "b", error=DataError)
+    refuses(r"a\.fits holds no fit results", read, "test-2", "a", error=DataError)
 
 
 class Number:
@@ -113,7 +107,7 @@ def test_read_and_write_are_unified_methods(tmp_path):
     Number(4.0).write(tmp_path / "b.dat", format="fits")
     assert Number.read(str(tmp_path / "b.dat"), format="fits").value == 4.0
     for name in ("a.ecsv", "b.dat"):
-        with pytest.raises(IORegistryError, match=rf"{name} must end in one of \.fits"):
-            Number(5.0).write(tmp_path / name)
+        match = rf"{name} must end in one of \.fits"
+        refuses(match, Number(5.0).write, tmp_path / name, error=IORegistryError)
     assert "Read a number from" in Number.read.__doc__
     refuses(r"c\.fits", Number.read, tmp_path / "c.fits", error=DataError)
