@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 
 from miricigale.detector._core.charge import add_poisson
@@ -67,10 +68,10 @@ def test_table_of_one_mean_is_the_distribution(mean):
     cdf = stats.poisson.cdf(least + np.arange(n), mean)
     # of large means scipy's own function is good to 1e-12
     atol = 2e-15 if mean < 10 else 2e-12
-    np.testing.assert_allclose(steps[: n - 1] / 2.0**53, cdf[:-1], rtol=0, atol=atol)
+    assert_allclose(steps[: n - 1] / 2.0**53, cdf[:-1], rtol=0, atol=atol)
     assert stats.poisson.cdf(least - 1, mean) < 1e-18
     entries = np.arange(guide.size) * (2**53 // guide.size)
-    np.testing.assert_array_equal(guide, np.searchsorted(steps[:n], entries, side="right"))
+    assert_array_equal(guide, np.searchsorted(steps[:n], entries, side="right"))
 
 
 def test_groups_of_any_means_are_poisson_and_independent():
@@ -112,7 +113,7 @@ def test_a_pixel_draws_the_same_beside_other_rows():
     whole, part = np.zeros((2, 50, 6, 90), np.float32), np.zeros((2, 50, 2, 90), np.float32)
     add_poisson(whole, mean, KEY, 100)
     add_poisson(part, np.ascontiguousarray(mean[3:5]), KEY, 103)
-    np.testing.assert_array_equal(whole[:, :, 3:5], part)
+    assert_array_equal(whole[:, :, 3:5], part)
 
 
 def test_dark_columns_leave_the_draws_of_others_alone():
@@ -123,13 +124,13 @@ def test_dark_columns_leave_the_draws_of_others_alone():
     bright = mean[0] > 0
     assert not ramp[..., ~bright].any()
     add_poisson(alone[..., : bright.sum()], mean[:, bright], KEY, 0)
-    np.testing.assert_array_equal(ramp[..., bright], alone[..., : bright.sum()])
+    assert_array_equal(ramp[..., bright], alone[..., : bright.sum()])
 
 
 def test_enormous_means_stay_finite():
     ramp = np.zeros((1, 3, 1, 4), np.float32)
     add_poisson(ramp, np.full((1, 4), 1e15), KEY, 0)
-    np.testing.assert_allclose(ramp[0, -1], 3e9, rtol=1e-3)
+    assert_allclose(ramp[0, -1], 3e9, rtol=1e-3)
 
 
 def test_rounding_and_limits_of_the_converter():

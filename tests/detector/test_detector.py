@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData
+from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
 from miricigale.detector import (
@@ -47,11 +48,9 @@ def test_mean_variance_and_covariance_of_a_ramp(make_exposure, make_sky):
     # signal in DN grows evenly; groups share the photons of the earlier one
     expected = np.minimum.outer(order, order) * step / gain
     expected += np.eye(8) * (noise**2 + 1 / 12)
-    np.testing.assert_allclose(
-        counts.mean(axis=1), order * step, atol=5 * np.sqrt(expected.max() / n)
-    )
+    assert_allclose(counts.mean(axis=1), order * step, atol=5 * np.sqrt(expected.max() / n))
     scale = np.sqrt(np.outer(expected.diagonal(), expected.diagonal()))
-    np.testing.assert_allclose((np.cov(counts) - expected) / scale, 0, atol=5 * np.sqrt(2 / n))
+    assert_allclose((np.cov(counts) - expected) / scale, 0, atol=5 * np.sqrt(2 / n))
     differences = np.diff(counts, axis=0)
     variance = step / gain + 2 * (noise**2 + 1 / 12)
     assert differences.var() == pytest.approx(variance, rel=5 * np.sqrt(3 / differences.size))
@@ -70,9 +69,9 @@ def test_same_seed_same_counts_on_any_threads_and_blocks(
     for samples in (1, 136 * 10 * 7, 10**9):
         set_block_size(samples)
         other = detector.expose(sky, exposure, seed=5, n_threads=3)
-        np.testing.assert_array_equal(other.data, one.data)
-        np.testing.assert_array_equal(other.pixel_dq, one.pixel_dq)
-        np.testing.assert_array_equal(other.group_dq, one.group_dq)
+        assert_array_equal(other.data, one.data)
+        assert_array_equal(other.pixel_dq, one.pixel_dq)
+        assert_array_equal(other.group_dq, one.group_dq)
 
 
 def test_seeds_filters_and_dithers_differ(make_exposure, make_sky):
@@ -80,7 +79,7 @@ def test_seeds_filters_and_dithers_differ(make_exposure, make_sky):
     sky = make_sky(exposure, 100.0)
     noise = Detector((Photons(), Nonlinearity(), Bias(), ReadNoise(), ADConversion()))
     first = noise.expose(sky, exposure, seed=1).data
-    np.testing.assert_array_equal(noise.expose(sky, exposure, seed=1).data, first)
+    assert_array_equal(noise.expose(sky, exposure, seed=1).data, first)
     assert np.mean(noise.expose(sky, exposure, seed=2).data != first) > 0.8
     assert np.mean(noise.expose(sky, exposure.replace(dither=1), seed=1).data != first) > 0.8
     red = make_exposure("miri.f1000w", n_groups=2)
@@ -211,7 +210,7 @@ def test_other_units_of_surface_brightness(make_exposure, make_sky):
     sky = make_sky(exposure, 100.0)
     other = CCDData(sky.data * 1e6, unit="Jy/sr", meta=sky.meta)
     detector = Detector(PLAIN)
-    np.testing.assert_array_equal(
+    assert_array_equal(
         detector.expose(other, exposure, seed=1).data, detector.expose(sky, exposure, seed=1).data
     )
 
@@ -246,7 +245,7 @@ def test_effects_of_other_kinds_act_where_they_are_put(make_exposure, make_sky):
     sky = make_sky(exposure, 100.0)
     plain = Detector(chain).expose(sky, exposure, seed=1)
     double = Detector((chain[0], Doubling(), chain[1])).expose(sky, exposure, seed=1)
-    np.testing.assert_array_equal(double.data, 2 * plain.data)
+    assert_array_equal(double.data, 2 * plain.data)
     assert double.shows(Doubling)
     assert not plain.shows(Doubling)
 
@@ -291,7 +290,7 @@ def test_copies_of_a_ramp_do_not_change_either(make_exposure, make_sky, detector
     assert other.effects == ramp.effects
     assert other.meta == ramp.meta
     for name in ("data", "pixel_dq", "group_dq"):
-        np.testing.assert_array_equal(getattr(other, name), getattr(ramp, name))
+        assert_array_equal(getattr(other, name), getattr(ramp, name))
         assert not getattr(other, name).flags.writeable
     with pytest.raises(AttributeError, match="a ramp does not change"):
         other.mask = None

@@ -3,6 +3,7 @@
 import astropy.units as u
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from scipy.integrate import quad
 
 from helpers.errors import refuses
@@ -41,8 +42,8 @@ def test_nothing_before_leaves_nothing(make_exposure, make_sky):
     plain = Detector.miri_imager().expose(sky, exposure, seed=2)
     for previous in (None, [], latent_of(exposure, 0.0)):
         ramp = with_effect.expose(sky, exposure, seed=2, previous=previous)
-        np.testing.assert_array_equal(ramp.data, plain.data)
-        np.testing.assert_array_equal(ramp.group_dq, plain.group_dq)
+        assert_array_equal(ramp.data, plain.data)
+        assert_array_equal(ramp.group_dq, plain.group_dq)
 
 
 def test_what_comes_free_is_the_integral_of_the_decay(make_exposure):

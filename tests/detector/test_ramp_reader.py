@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.time import Time
+from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
 from helpers.real import real_file
@@ -54,9 +55,9 @@ def test_reads_what_a_step_of_the_pipeline_saved(tmp_path):
     path = tmp_path / "jw_linearity.fits"
     data, pixel_dq, group_dq = stage(path)
     ramp = Ramp.read(path)
-    np.testing.assert_array_equal(ramp.data, data)
-    np.testing.assert_array_equal(ramp.group_dq, group_dq)
-    np.testing.assert_array_equal(ramp.pixel_dq[:, 4:], pixel_dq[:, 4:])
+    assert_array_equal(ramp.data, data)
+    assert_array_equal(ramp.group_dq, group_dq)
+    assert_array_equal(ramp.pixel_dq[:, 4:], pixel_dq[:, 4:])
     assert np.all(ramp.pixel_dq[:, :4] & DQ.REFERENCE_PIXEL)
     assert ramp.steps == {"dq_init", "saturation", "linearity"}
     assert not ramp.simulated
@@ -64,7 +65,7 @@ def test_reads_what_a_step_of_the_pipeline_saved(tmp_path):
     assert ramp.group_time == 0.0851
     assert ramp.header["DATE-OBS"] == "2022-07-01"
     second = ramp.integration(1)
-    np.testing.assert_array_equal(second.data[0], data[1])
+    assert_array_equal(second.data[0], data[1])
     assert second.exposure.n_integrations == 1
     assert second.steps == ramp.steps
     refuses("'number' must be from 0 to 1, got 2", ramp.integration, 2)
@@ -97,7 +98,7 @@ def test_a_ramp_of_a_ground_test():
     path = real_file(GROUND)
     ramp = Ramp.read(path)
     with fits.open(path) as hdus:
-        np.testing.assert_array_equal(ramp.data, hdus["SCI"].data)
+        assert_array_equal(ramp.data, hdus["SCI"].data)
     exposure = ramp.exposure
     assert (exposure.filter, exposure.pointing, exposure.wcs) == (None, None, None)
     assert (exposure.readout, exposure.subarray) == ("FASTR1", "SUB64")
@@ -149,7 +150,7 @@ def test_a_real_ramp_keeps_its_keywords(tmp_path):
         assert hdus[-1].name == "ASDF"
     back = Ramp.read(path)
     assert not back.simulated
-    np.testing.assert_array_equal(back.data, ramp.data)
+    assert_array_equal(back.data, ramp.data)
 
 
 def test_times_of_the_integrations(make_exposure, make_sky, tmp_path):
@@ -159,11 +160,11 @@ def test_times_of_the_integrations(make_exposure, make_sky, tmp_path):
     path = ramp.write(tmp_path / "a_uncal.fits", start=start)
     with fits.open(path) as hdus:
         table, header = hdus["INT_TIMES"].data, hdus[0].header
-        np.testing.assert_array_equal(table["integration_number"], [1, 2, 3])
+        assert_array_equal(table["integration_number"], [1, 2, 3])
         begin, end = table["int_start_MJD_UTC"], table["int_end_MJD_UTC"]
         # five frames, and one for the reset between integrations
         frame = exposure.frame_time.to_value("day")
-        np.testing.assert_allclose(end - begin, 5 * frame, rtol=1e-5)
-        np.testing.assert_allclose(np.diff(begin), 6 * frame, rtol=1e-5)
+        assert_allclose(end - begin, 5 * frame, rtol=1e-5)
+        assert_allclose(np.diff(begin), 6 * frame, rtol=1e-5)
         assert begin[0] == pytest.approx(start.mjd, abs=1e-9)
         assert end[-1] == pytest.approx(header["EXPEND"], abs=1e-9)

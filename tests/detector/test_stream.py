@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.time import Time
+from numpy.testing import assert_array_equal
 
 from miricigale.detector import (
     CosmicRays,
@@ -48,8 +49,8 @@ def test_the_file_is_the_same_with_every_effect(make_exposure, make_sky, tmp_pat
         tmp_path / "b_uncal.fits", sky, exposure, start=start, n_threads=3, **options
     )
     back = Ramp.read(two)
-    np.testing.assert_array_equal(back.data, held.data)
-    np.testing.assert_array_equal(back.pixel_dq, held.pixel_dq)
+    assert_array_equal(back.data, held.data)
+    assert_array_equal(back.pixel_dq, held.pixel_dq)
     assert back.effects == held.effects == detector.effects
     assert {k: v for k, v in back.meta.items() if k != "created"} == {
         k: v for k, v in held.meta.items() if k != "created"

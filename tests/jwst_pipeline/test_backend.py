@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from astropy.io import fits
+from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
 from helpers.exposures import exposure_of, sky_of
@@ -49,7 +50,7 @@ def test_it_gives_the_rates_and_their_errors(exposure, sky, ramp):
     for these in (good & (sky.data < 2 * SKY), good & (sky.data > 2 * SKY)):
         assert rate.image.data[these].sum() == pytest.approx(truth[these].sum(), rel=5e-3)
     total = rate.planes["VAR_POISSON"] + rate.planes["VAR_RNOISE"]
-    np.testing.assert_allclose(total[good], rate.image.uncertainty.array[good] ** 2, rtol=1e-3)
+    assert_allclose(total[good], rate.image.uncertainty.array[good] ** 2, rtol=1e-3)
     assert rate.image.meta["reference_gain"] == "4 e-/DN of the simulated detector"
     # what comes after does not know the difference
     image, background = Reducer(backend="jwst").subtract_background(Reducer().calibrate(rate.image))

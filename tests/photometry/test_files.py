@@ -73,8 +73,7 @@ def test_names_say_what_is_written(result, tmp_path):
     result.write(tmp_path / "r.csv")
     assert_array_equal(QTable.read(tmp_path / "r.csv")["flux"], result.flux.value)
     for name in ("r.txt", "r"):
-        with pytest.raises(ValueError, match=r"a file ending in one of \.fits"):
-            result.write(tmp_path / name)
+        refuses(r"a file ending in one of \.fits", result.write, tmp_path / name)
         assert not (tmp_path / name).exists()
     with pytest.raises(IORegistryError):
         ForcedPhotometryResult.read(tmp_path / "r.ecsv")

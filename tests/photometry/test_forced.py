@@ -7,7 +7,7 @@ from astropy.nddata import CCDData
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
-from helpers.errors import refuses
+from helpers.errors import refuses, warned
 from helpers.light import gaussian_image
 from miricigale.instrument import imager_wcs, north_up_wcs, pixel_area_map
 from miricigale.photometry import (
@@ -454,8 +454,7 @@ def test_a_kernel_alone_measures_segments(tools, field):
     bare = MatchingKernel.from_array(
         tools.kernel.array / tools.kernel.array.sum(), pixel_scale=tools.FINE * u.arcsec
     )
-    with pytest.warns(MiricigaleWarning, match="kernel has no PSFs: sources are their segments"):
-        photometer = ForcedPhotometer(bare)
+    photometer = warned("kernel has no PSFs: sources are their segments", ForcedPhotometer, bare)
     catalog = field.catalog.copy()
     catalog["label"] = np.where(np.isin(np.arange(60), kept), np.arange(60) + 1, 0)
     result = photometer.measure(field.image, highres, labels, catalog)

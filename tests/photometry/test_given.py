@@ -10,6 +10,7 @@ from astropy.nddata import CCDData, NDData, StdDevUncertainty
 from astropy.table import QTable
 from astropy.wcs import WCS
 from matplotlib.figure import Figure
+from numpy.testing import assert_allclose, assert_array_equal
 from photutils.psf import CircularGaussianPRF
 
 from helpers.errors import refuses
@@ -77,8 +78,8 @@ def photometer(psfs):
 
 def test_the_kernel_is_that_of_the_psfs(photometer, psfs):
     made = MatchingKernel.from_psfs(psfs["highres_psf"], psfs["psf"], pixel_scale=0.03 * u.arcsec)
-    np.testing.assert_array_equal(photometer.kernel.array, made.array)
-    np.testing.assert_array_equal(photometer.replace(positive=True).kernel.array, made.array)
+    assert_array_equal(photometer.kernel.array, made.array)
+    assert_array_equal(photometer.replace(positive=True).kernel.array, made.array)
 
 
 def test_points_need_a_psf_and_positions(images, psfs, sky, flux):
@@ -90,7 +91,7 @@ def test_points_need_a_psf_and_positions(images, psfs, sky, flux):
         assert np.abs(pulls).max() < 4
         assert np.sqrt(np.mean(pulls**2)) < 1.6
     by_hand = points.measure(images[0], sky)
-    np.testing.assert_array_equal(by_hand.flux.value, result.flux.value)
+    assert_array_equal(by_hand.flux.value, result.flux.value)
 
 
 def forms(image, folder):
@@ -113,11 +114,11 @@ def forms(image, folder):
 @pytest.mark.filterwarnings("ignore:.*belong to no source of the catalog")
 def test_images_of_any_form_give_the_same(images, photometer, sky, flux, tmp_path):
     expected = photometer.measure(*images, catalog=sky)
-    np.testing.assert_allclose(expected.flux.value, flux, rtol=0.03)
+    assert_allclose(expected.flux.value, flux, rtol=0.03)
     for pair in zip(*(forms(image, tmp_path) for image in images), strict=True):
         result = photometer(*pair, catalog=sky)
-        np.testing.assert_allclose(result.flux.value, expected.flux.value, rtol=1e-4)
-        np.testing.assert_allclose(result.flux_err.value, expected.flux_err.value, rtol=1e-3)
+        assert_allclose(result.flux.value, expected.flux.value, rtol=1e-4)
+        assert_allclose(result.flux_err.value, expected.flux_err.value, rtol=1e-3)
 
 
 def test_sources_are_detected_where_none_are_given(images, photometer, sky, flux):
@@ -126,7 +127,7 @@ def test_sources_are_detected_where_none_are_given(images, photometer, sky, flux
     assert len(result) == len(detected)
     index, separation, _ = sky.match_to_catalog_sky(result.sky)
     assert separation.max() < 0.05 * u.arcsec
-    np.testing.assert_allclose(result.flux.value[index], flux, rtol=0.03)
+    assert_allclose(result.flux.value[index], flux, rtol=0.03)
 
 
 def test_what_is_no_image_or_kernel_is_named(images, psfs, sky):
@@ -145,15 +146,15 @@ def test_what_is_no_image_or_kernel_is_named(images, psfs, sky):
 
 def test_results_are_indexed_like_their_table(images, psfs, sky):
     result = ForcedPhotometer(psf=psfs["psf"]).measure(images[0], sky)
-    np.testing.assert_array_equal(result["flux"].value, result.flux.value)
+    assert_array_equal(result["flux"].value, result.flux.value)
     assert result[3]["id"] == result.loc[4]["id"] == 4
     parts = result[:5], result[result.snr > 0], result[[1, 2]]
     assert [len(part) for part in parts] == [5, 16, 2]
     assert list(result.columns) == result.to_table().colnames
     frame = result.to_pandas()
-    np.testing.assert_allclose(frame["ra"], sky.ra.deg)
+    assert_allclose(frame["ra"], sky.ra.deg)
     assert list(frame.columns[:3]) == ["id", "ra", "dec"]
-    np.testing.assert_allclose(result.magnitude.value, 23.9 - 2.5 * np.log10(result.flux.value))
+    assert_allclose(result.magnitude.value, 23.9 - 2.5 * np.log10(result.flux.value))
     assert result.flag_names()[0] == []
     assert "sources: 16" in result.summary()
     message = "no column 'fluxx'; known: .*; did you mean 'flux'"
@@ -165,16 +166,16 @@ def test_a_kernel_is_applied_and_drawn(psfs, images):
     kernel = MatchingKernel.from_psfs(psfs["highres_psf"], psfs["psf"])
     assert kernel.pixel_scale == 0.03 * u.arcsec
     convolved = kernel(images[1])
-    np.testing.assert_array_equal(convolved.data, kernel.apply(images[1].data))
+    assert_array_equal(convolved.data, kernel.apply(images[1].data))
     assert (convolved.unit, convolved.uncertainty) == (u.uJy, None)
     lines = kernel.plot(ax=Figure().subplots()).lines
     curves = {line.get_label(): line.get_ydata() for line in lines}
     # the closed form of a Gaussian
     radius = lines[0].get_xdata()
-    np.testing.assert_allclose(curves["convolved"], curves["wide PSF"], atol=5e-3)
+    assert_allclose(curves["convolved"], curves["wide PSF"], atol=5e-3)
     sigma = psfs["highres_psf"].fwhm.value / np.sqrt(8 * np.log(2))
     truth = 1 - np.exp(-0.5 * (radius / sigma) ** 2)
-    np.testing.assert_allclose(curves["sharp PSF"], truth, atol=0.02)
+    assert_allclose(curves["sharp PSF"], truth, atol=0.02)
     refuses("'array' must be a square array", MatchingKernel, psfs["psf"], pixel_scale=1 * u.arcsec)
 
 

@@ -6,9 +6,9 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.io import fits
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
-from helpers.errors import refuses
+from helpers.errors import refuses, warned
 from miricigale.instrument import north_up_wcs, pixel_area_map
 from miricigale.photometry import MosaicFile, read_mosaic, weight_scale
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
@@ -129,8 +129,7 @@ def test_maps_must_be_those_of_the_image(write, tmp_path):
         (write(np.ones((5, 5)), "small.fits"), r"the weight of .*\) has the shape \(5, 5\)"),
         (write(np.zeros(SHAPE), "zero.fits"), "no usable pixel"),
     ):
-        with pytest.raises(DataError, match=message):
-            read_mosaic(path, weight=weight)
+        refuses(message, read_mosaic, path, weight=weight, error=DataError)
     flat = write(np.ones(SHAPE), "flat.fits", BUNIT="uJy")
     with (
         pytest.warns(MiricigaleWarning, match="noise on the sky is 0 times"),
@@ -223,14 +222,13 @@ def test_a_background_is_subtracted_where_asked_for(write):
 def test_a_real_i2d_file_of_the_jwst_pipeline(data_file):
     path = next(data_file("real/i2d").glob("*04101*_i2d.fits"))
     # a nebula has no empty sky
-    with pytest.warns(MiricigaleWarning, match="times what the error map says"):
-        image = read_mosaic(path)
+    image = warned("times what the error map says", read_mosaic, path)
     assert image.meta["filter"] == "miri.f1130w"
     assert image.meta["pa_aper"] == pytest.approx(273.2125, abs=1e-3)
     data = fits.getdata(path, "SCI")
     good = ~image.mask
     assert 0.8 < good.mean() < 1
-    np.testing.assert_array_equal(image.data[good], data[good])
+    assert_array_equal(image.data[good], data[good])
     # the pipeline's nominal area of a pixel, which is constant, and the WCS's
     area = np.median(pixel_area_map(image.wcs, data.shape))
     assert area == pytest.approx(fits.getval(path, "PIXAR_SR", "SCI"), rel=0.005)
@@ -249,8 +247,7 @@ def test_maps_in_another_unit_than_the_image_are_converted(write, kind):
     assert_allclose(read_mosaic(path, **{kind: plain}).uncertainty.array, 0.1, rtol=1e-5)
     other = write(np.full(SHAPE, 0.1) ** power, "other.fits", BUNIT="ELECTRONS/S")
     message = r"other.fits .* is in 'ELECTRONS/S', and the image in 'MJy/"
-    with pytest.raises(DataError, match=message):
-        read_mosaic(path, **{kind: other})
+    refuses(message, read_mosaic, path, error=DataError, **{kind: other})
     # what the caller states holds for both
     counts = write(rng.normal(0, 0.1, SHAPE), "counts.fits", BUNIT="ELECTRONS/S")
     assert read_mosaic(counts, unit="MJy/sr", **{kind: other}).meta["noise_scale"] == pytest.approx(
@@ -278,7 +275,7 @@ def test_stored_forms_give_the_same_image(write, tmp_path, kind):
     one, other = read_mosaic(path), read_mosaic(tmp_path / "other.fits")
     assert one.data.dtype == np.dtype("=f4")
     assert other.data.dtype.isnative
-    np.testing.assert_allclose(other.data, one.data, atol=0.05 * one.uncertainty.array.max())
+    assert_allclose(other.data, one.data, atol=0.05 * one.uncertainty.array.max())
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from astropy.io import fits
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
-from helpers.errors import refuses
+from helpers.errors import refuses, warned
 from helpers.light import gaussian_image
 from helpers.results import assert_equal_values
 from miricigale.instrument import imager_wcs, north_up_wcs
@@ -25,7 +25,7 @@ from miricigale.photometry import (
 from miricigale.photometry.wcs_text import grid_text, text_grid
 from miricigale.profiles import sersic_stamp
 from miricigale.psf import KernelField, MatchingKernel, gaussian_psf
-from miricigale.utils.exceptions import DataError, MiricigaleWarning
+from miricigale.utils.exceptions import DataError
 
 
 @pytest.fixture(scope="module")
@@ -190,8 +190,7 @@ def test_what_does_not_fit_is_refused(tools, scene, tmp_path):
     refuses("must be one for each image", measure_bands, images, {"one": tools.kernel}, templates)
     wide = gaussian_psf(0.5 * u.arcsec, pixel_scale=tools.FINE * u.arcsec, fov=3 * u.arcsec)
     blurred = SourceTemplates.from_images(high, segmentation, detected, psf=wide)
-    with pytest.warns(MiricigaleWarning, match="is it of the same image"):
-        photometer.measure(images["one"], templates=blurred)
+    warned("is it of the same image", photometer.measure, images["one"], templates=blurred)
     path = tmp_path / "image.fits"
     high.write(path)
     refuses("holds no templates of sources", SourceTemplates.read, path, error=DataError)

@@ -1,6 +1,7 @@
 import astropy.units as u
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
 from helpers.light import gaussian_image
@@ -59,7 +60,7 @@ def test_cruciform_takes_the_stated_fraction_and_keeps_the_rest(name):
     assert out[1200, 1200] == pytest.approx(1 - fraction, abs=0.003)
     # e-folding of 25 pixels
     assert out[1200, 1200 + 400] / out[1200, 1200 + 300] == pytest.approx(np.exp(-1), rel=1e-6)
-    np.testing.assert_allclose(out, out.T, atol=1e-15)
+    assert_allclose(out, out.T, atol=1e-15)
 
 
 def test_cruciform_does_not_depend_on_the_oversampling():

@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.nddata import NDData
+from numpy.testing import assert_allclose, assert_array_equal
 from photutils.psf import GriddedPSFModel, ImagePSF
 
 from helpers.errors import refuses
@@ -77,7 +78,7 @@ def test_optics_at_a_position_are_those_of_the_warped_pupil(name, oversampling):
         for wave in band_quantiles(name, 9)
     ]
     truth = np.mean(images, axis=0) * oversampling**2
-    np.testing.assert_allclose(got.data, truth, atol=2e-3 * truth.max())
+    assert_allclose(got.data, truth, atol=2e-3 * truth.max())
     assert got.enclosed == pytest.approx(truth.sum() / oversampling**2, abs=1e-3)
     # the square pixel's image is no such thing
     square = miri_psf(name, includes=(), **kind)
@@ -93,7 +94,7 @@ def test_widths_on_the_sky_are_the_same_all_over_the_field():
         assert psf.pixel_scale.value == pytest.approx(
             np.sqrt(abs(np.linalg.det(local_pixel(*position))))
         )
-        np.testing.assert_allclose(encircled_energy(psf, radii), reference, atol=2e-3)
+        assert_allclose(encircled_energy(psf, radii), reference, atol=2e-3)
 
 
 def test_cross_leans_to_the_middle_of_the_array():
@@ -128,9 +129,9 @@ def test_grid_is_photutils_model_and_says_what_it_is(grid):
     assert "fwhm" not in grid.meta
     for k, (x, y) in enumerate(grid.grid_xypos):
         alone = miri_psf("miri.f770w", position=(x, y), **SMALL)
-        np.testing.assert_array_equal(grid.data[k], alone.data)
+        assert_array_equal(grid.data[k], alone.data)
         here = psf_at(grid, x, y)
-        np.testing.assert_allclose(here.data, alone.data, rtol=1e-12)
+        assert_allclose(here.data, alone.data, rtol=1e-12)
         assert here.pixel_scale.value == pytest.approx(alone.pixel_scale.value)
         assert here.fwhm.value == pytest.approx(alone.fwhm.value)
         assert here.position == (x, y)
@@ -141,9 +142,7 @@ def test_between_the_places_it_is_what_photutils_evaluates(grid, x, y):
     yy, xx = np.mgrid[-8:9, -8:9]
     expected = grid.evaluate(xx + x, yy + y, 1.0, x, y)
     here = psf_at(grid, x, y)
-    np.testing.assert_allclose(
-        here.evaluate(xx, yy, 1.0, 0.0, 0.0), expected, atol=1e-5 * expected.max()
-    )
+    assert_allclose(here.evaluate(xx, yy, 1.0, 0.0, 0.0), expected, atol=1e-5 * expected.max())
     assert grid_weights(grid, x, y).sum() == pytest.approx(1)
 
 
@@ -151,7 +150,7 @@ def test_grid_of_a_subarray_counts_its_pixels():
     corner = aperture("BRIGHTSKY").origin
     one = miri_psf("miri.f1000w", position=(20, 30), subarray="BRIGHTSKY", **SMALL)
     full = miri_psf("miri.f1000w", position=(20 + corner[0], 30 + corner[1]), **SMALL)
-    np.testing.assert_allclose(one.data, full.data, atol=1e-9)
+    assert_allclose(one.data, full.data, atol=1e-9)
     part = miri_psf_grid("miri.f1000w", n_psfs=4, subarray="BRIGHTSKY", **SMALL)
     assert np.ptp(part.grid_xypos, axis=0).tolist() == [511, 511]
 
@@ -163,7 +162,7 @@ def test_dithers_of_a_source_average_on_the_mosaic(grid):
         psf_mosaic(psf_at(grid, *p), 0.06 * u.arcsec, 40 * u.deg, 3 * u.arcsec) for p in places
     ]
     mean = average_psf(parts)
-    np.testing.assert_allclose(mean.data, np.mean([p.data for p in parts], axis=0), rtol=1e-12)
+    assert_allclose(mean.data, np.mean([p.data for p in parts], axis=0), rtol=1e-12)
     assert mean.frame == "sky"
 
 
@@ -173,7 +172,7 @@ def test_f160w_over_a_mosaic_of_two_rolls():
     grid = psf_grid([a, b, a, b], [(0, 0), (900, 0), (0, 900), (900, 900)])
     assert grid.pixel_scale.value == pytest.approx(0.06)
     middle = psf_at(grid, 450, 10)
-    np.testing.assert_allclose(middle.data, 0.5 * (a.data + b.data), rtol=1e-12)
+    assert_allclose(middle.data, 0.5 * (a.data + b.data), rtol=1e-12)
 
 
 PSF = gaussian_psf(0.3 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=2 * u.arcsec)

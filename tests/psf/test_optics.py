@@ -1,6 +1,7 @@
 import astropy.units as u
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
 from helpers.light import gaussian_image
@@ -36,7 +37,7 @@ def test_rectangle_covers_cells_by_exact_fractions():
     row = np.array([0, 0, 0.25, 1, 1, 0.5, 0, 0])
     expected = np.zeros((8, 8))
     expected[2:5] = row
-    np.testing.assert_allclose(coverage, expected, atol=1e-12)
+    assert_allclose(coverage, expected, atol=1e-12)
 
 
 def test_airy_pattern_of_a_circular_aperture(disk):
@@ -76,7 +77,7 @@ def test_transform_equals_the_fourier_sum():
         pupil, 0.2, 1e-5, np.arange(16) * 1e-5 / 3.2, np.arange(16) * 1e-5 / 3.2, dtype=complex
     )
     expected = np.abs(np.fft.fft2(pupil)) ** 2 / np.sum(pupil**2) / 16**2
-    np.testing.assert_allclose(image, expected, atol=1e-15)
+    assert_allclose(image, expected, atol=1e-15)
 
 
 def test_radial_sums_of_a_gaussian():
@@ -85,13 +86,13 @@ def test_radial_sums_of_a_gaussian():
     radii = np.array([20.0, 2.0, 5.0, 11.3])
     expected = 1 - np.exp(-0.5 * radii**2 / s**2)
     # (a Gaussian sampled, not averaged, over the pixels)
-    np.testing.assert_allclose(_core.radial_sums(image, 50.0, 50.0, radii), expected, rtol=3e-3)
+    assert_allclose(_core.radial_sums(image, 50.0, 50.0, radii), expected, rtol=3e-3)
 
 
 def test_radial_sums_of_a_flat_image_are_areas():
     radii = np.array([0.0, 0.3, 0.5, 1.0, 1.7, 3.3, 8.0, 12.0, 17.7, 40.0])
     sums = _core.radial_sums(np.ones((101, 101)), 50.0, 50.0, radii)
-    np.testing.assert_allclose(sums, np.pi * radii**2, rtol=1e-3, atol=0.01)
+    assert_allclose(sums, np.pi * radii**2, rtol=1e-3, atol=0.01)
 
 
 def test_collecting_areas():
@@ -107,7 +108,7 @@ def test_jwst_has_18_segments_and_a_strut_along_v3():
     column = pupil.amplitude[:, 127]
     assert column[230] < 0.1  # the upper strut blocks the B1 segment
     # symmetric about V3
-    np.testing.assert_allclose(pupil.amplitude, pupil.amplitude[:, ::-1], atol=0.13)
+    assert_allclose(pupil.amplitude, pupil.amplitude[:, ::-1], atol=0.13)
 
 
 def test_v3_lies_clockwise_of_the_image_axis():
@@ -134,7 +135,7 @@ def test_wavefront_has_its_rms_and_no_tilt(rms):
 def test_wavefront_is_the_seeds():
     pupil = jwst_pupil(128)
     a, b, c = (pupil.wavefront_error(75.0, seed=s) for s in (1, 1, 2))
-    np.testing.assert_array_equal(a, b)
+    assert_array_equal(a, b)
     assert np.abs(a - c).max() > 50
 
 
@@ -163,7 +164,7 @@ def test_image_stands_on_the_middle_cell_whatever_the_wavefront():
     still = optics.polychromatic_psf(pupil, opd, [7.7], step=0.03, n=61)
     tilted = optics.polychromatic_psf(pupil, opd + tilt, [7.7], step=0.03, n=61)
     assert np.unravel_index(still.argmax(), still.shape) == (30, 30)
-    np.testing.assert_allclose(tilted, still, atol=1e-4 * still.max())
+    assert_allclose(tilted, still, atol=1e-4 * still.max())
 
 
 def test_bad_arguments_are_named():

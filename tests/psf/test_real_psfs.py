@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.wcs import WCS
+from numpy.testing import assert_allclose, assert_array_equal
 from photutils.psf import ImagePSF
 from scipy.signal import fftconvolve
 
-from helpers.errors import refuses
+from helpers.errors import refuses, warned
 from helpers.light import gaussian_image
 from miricigale.psf import (
     MatchingKernel,
@@ -48,11 +49,11 @@ def assert_is_the_gaussian_kernel(kernel):
     n = kernel.array.shape[0]
     expected = expected_kernel(n)
     # the automatic regularization keeps the error of the encircled energy below 0.001
-    np.testing.assert_allclose(kernel.array, expected, rtol=0, atol=0.03 * expected.max())
+    assert_allclose(kernel.array, expected, rtol=0, atol=0.03 * expected.max())
     assert kernel.array.sum() == pytest.approx(1, abs=1e-6)
     # and what comes out of it is the wide PSF where it should stand
     image = kernel.apply(gaussian_image(n, HI))
-    np.testing.assert_allclose(image, gaussian_image(n, LO), rtol=0, atol=5e-3 * image.max())
+    assert_allclose(image, gaussian_image(n, LO), rtol=0, atol=5e-3 * image.max())
     # a point of unit flux keeps it
     point = np.zeros((2 * n + 1, 2 * n + 1))
     point[n, n] = 1.0
@@ -68,9 +69,9 @@ def test_off_center_and_even_arrays_give_the_centered_kernel(n, off):
     # the moving itself costs less than the regularization
     m = kernel.array.shape[0]
     straight = kernel_of(gaussian_image(m, HI), gaussian_image(m, LO))
-    np.testing.assert_allclose(kernel.array, straight.array, atol=5e-4 * kernel.array.max())
+    assert_allclose(kernel.array, straight.array, atol=5e-4 * kernel.array.max())
     found = np.array(kernel.meta["centering"]["lo"]) / SCALE.value
-    np.testing.assert_allclose(found, off, atol=2e-3)
+    assert_allclose(found, off, atol=2e-3)
 
 
 def test_off_center_psfs_keep_their_angles():
@@ -132,7 +133,7 @@ def test_truncated_wings_are_said_and_the_kernel_has_unit_sum():
         kernel_of(hi / hi.sum(), lo / lo.sum())
     words = str(caught[0].message).split("wings: ")[1].split()
     truth = [1 / np.sqrt(1 + (50.5 / core) ** 2) for core in (2.0, 4.0)]
-    np.testing.assert_allclose([float(words[0]), float(words[3])], truth, rtol=0.15)
+    assert_allclose([float(words[0]), float(words[3])], truth, rtol=0.15)
 
 
 def test_exchanged_psfs_are_refused():
@@ -159,7 +160,7 @@ def test_gridded_models_need_a_position():
     refuses(match, kernel_of, hi, grid)
     gains = [kernel_of(hi, psf_at(grid, x, 30)).noise_gain for x in (0, 100)]
     variances = np.array([(w**2 - 0.1**2) / (8 * np.log(2)) for w in (0.28, 0.36)]) / 0.04**2
-    np.testing.assert_allclose(gains, 1 / np.sqrt(4 * np.pi * variances), rtol=0.01)
+    assert_allclose(gains, 1 / np.sqrt(4 * np.pi * variances), rtol=0.01)
 
 
 def test_artefacts_of_resampling_make_no_stripes(tmp_path):
@@ -211,8 +212,7 @@ def test_scale_and_angle_come_from_the_header(tmp_path):
     fits.writeto(
         path, gaussian_image(51, 4 * HI), fits.Header({"PIXELSCL": 0.0275}), overwrite=True
     )
-    with pytest.warns(MiricigaleWarning, match="sums to"):
-        psf = read_psf(path, frame="detector", oversampling=4)
+    psf = warned("sums to", read_psf, path, frame="detector", oversampling=4)
     assert psf.pixel_scale.value == pytest.approx(0.11)
     fits.writeto(path, gaussian_image(51, HI), overwrite=True)
     refuses("'pixel_scale' must be given where the header", read_psf, path, frame="sky")
@@ -232,20 +232,18 @@ def test_roll_of_the_header_turns_the_psf(tmp_path):
     xx, yy, xy = ((kernel.target * p).sum() / total for p in (x**2, y**2, x * y))
     assert np.degrees(0.5 * np.arctan2(2 * xy, xx - yy)) == pytest.approx(35, abs=0.2)
     given = kernel_of(hi, psf, lo_angle=35 * u.deg)
-    np.testing.assert_array_equal(given.array, kernel.array)
+    assert_array_equal(given.array, kernel.array)
 
 
 def test_ready_kernels_are_taken(tmp_path):
     array = expected_kernel(41)
     kernel = MatchingKernel.from_array(array, pixel_scale=SCALE, source=gaussian_image(41, HI))
-    np.testing.assert_allclose(
-        kernel.target, gaussian_image(41, LO), atol=1e-4 * kernel.target.max()
-    )
+    assert_allclose(kernel.target, gaussian_image(41, LO), atol=1e-4 * kernel.target.max())
     bare = MatchingKernel.from_array(array, pixel_scale=SCALE)
     assert bare.source is None
     with pytest.warns(MiricigaleWarning, match=r"summed to 0\.9430 and was brought to 1"):
         mended = MatchingKernel.from_array(0.943 * array / array.sum(), pixel_scale=SCALE)
-    np.testing.assert_allclose(mended.array, array / array.sum(), rtol=1e-12)
+    assert_allclose(mended.array, array / array.sum(), rtol=1e-12)
     assert mended.meta["sum"] == pytest.approx(0.943)
     psfs = {"source": gaussian_image(41, LO), "target": gaussian_image(41, HI)}
     for data, options, match in (
@@ -260,7 +258,7 @@ def test_ready_kernels_are_taken(tmp_path):
     path = tmp_path / "kernels.fits"
     fits.writeto(path, np.stack([np.zeros_like(array), array]), fits.Header({"PIXSCALE": 0.04}))
     read = MatchingKernel.read(path, ext=0, plane=1)
-    np.testing.assert_allclose(read.array, array / array.sum())
+    assert_allclose(read.array, array / array.sum())
     assert read.pixel_scale.value == 0.04
     other = {"ext": 0, "plane": 1, "pixel_scale": 0.06 * u.arcsec}
     refuses(r"'pixel_scale' must be 0\.04 arcsec by the header", MatchingKernel.read, path, **other)
@@ -273,8 +271,8 @@ def test_kernels_of_regions_blend():
     kernels = [kernel_of(hi, lo, regularization=1e-4) for lo in wide]
     mean = MatchingKernel.blend(kernels, [3, 1])
     direct = kernel_of(hi, 0.75 * wide[0] + 0.25 * wide[1], regularization=1e-4)
-    np.testing.assert_allclose(mean.array, direct.array, atol=1e-7)
-    np.testing.assert_allclose(mean.target, direct.target, atol=1e-7)
+    assert_allclose(mean.array, direct.array, atol=1e-7)
+    assert_allclose(mean.target, direct.target, atol=1e-7)
     assert mean.meta["weights"] == [0.75, 0.25]
     other = kernels[0].cropped(1 * u.arcsec)
     refuses("'kernels' must be alike", MatchingKernel.blend, [kernels[0], other])

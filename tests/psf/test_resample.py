@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 from astropy.nddata import NDData
 from astropy.wcs import WCS
+from numpy.testing import assert_allclose, assert_array_equal
 from photutils.psf import GriddedPSFModel, ImagePSF
 
 from helpers.errors import refuses
@@ -64,17 +65,15 @@ def test_quarter_turns_move_pixels_and_agree_with_interpolation(quarter):
     psf = blob(3.0, 7.0)
     exact = rotate_psf(psf, 90.0 * quarter * u.deg)
     near = rotate_psf(psf, (90.0 * quarter + 1e-7) * u.deg)
-    np.testing.assert_allclose(np.sort(exact.data, axis=None), np.sort(psf.data, axis=None))
-    np.testing.assert_allclose(near.data, exact.data, atol=1e-6)
+    assert_allclose(np.sort(exact.data, axis=None), np.sort(psf.data, axis=None))
+    assert_allclose(near.data, exact.data, atol=1e-6)
 
 
 def test_turning_conserves_light_and_encircled_energy():
     psf = miri_psf("miri.f770w", fov=12 * u.arcsec)
     radii = [0.2, 0.5, 1.0, 3.0, 5.5] * u.arcsec
     turned = rotate_psf(psf, 33 * u.deg)
-    np.testing.assert_allclose(
-        encircled_energy(turned, radii), encircled_energy(psf, radii), atol=1e-3
-    )
+    assert_allclose(encircled_energy(turned, radii), encircled_energy(psf, radii), atol=1e-3)
     assert turned.enclosed == pytest.approx(psf.enclosed, abs=5e-3)
     assert turned.fwhm.value == pytest.approx(psf.fwhm.value, rel=1e-3)
     assert turned.includes == psf.includes
@@ -109,7 +108,7 @@ def test_second_moments_turn_with_the_angle(pa):
     """Position angles grow counter-clockwise where north is up and east left."""
     own = 0.11**2 * turned(np.diag([2.2**2, 1.1**2]), 20.0)
     psf = rotate_psf(long_gaussian(20.0), pa * u.deg)
-    np.testing.assert_allclose(sky_moments(psf), turned(own, pa), atol=1e-4 * own.max())
+    assert_allclose(sky_moments(psf), turned(own, pa), atol=1e-4 * own.max())
 
 
 def test_second_moments_of_a_mosaic_of_dithers():
@@ -121,7 +120,7 @@ def test_second_moments_of_a_mosaic_of_dithers():
     alike = psf_mosaic(psf, 0.06 * u.arcsec, rolls * u.deg)
     mean = average_psf([psf_mosaic(psf, 0.06 * u.arcsec, r * u.deg) for r in rolls])
     for one in (alike, mean):
-        np.testing.assert_allclose(sky_moments(one), truth, atol=5e-4 * truth.max())
+        assert_allclose(sky_moments(one), truth, atol=5e-4 * truth.max())
 
 
 def test_image_is_the_model_evaluated():
@@ -131,7 +130,7 @@ def test_image_is_the_model_evaluated():
     y, x = np.indices(image.shape)
     x, y = (x - 25 - 0.3) * 0.06 / scale, (y - 20 + 0.2) * 0.06 / scale
     expected = psf.evaluate(x, y, 1.0, 0.0, 0.0) * (0.06 / scale) ** 2
-    np.testing.assert_allclose(image, expected, atol=1e-5 * image.max())
+    assert_allclose(image, expected, atol=1e-5 * image.max())
 
 
 def test_drizzle_adds_the_drop_and_the_pixel():
@@ -165,7 +164,7 @@ def test_mosaic_psf_is_what_dithered_pixels_average_to():
     mosaic = psf_mosaic(psf, 0.06 * u.arcsec)
     binned = total[3:327, 3:327].reshape(54, 6, 54, 6).sum((1, 3))
     expected = psf_image(mosaic, pixel_scale=0.06 * u.arcsec, shape=54)
-    np.testing.assert_allclose(binned, expected, atol=2e-3 * expected.max())
+    assert_allclose(binned, expected, atol=2e-3 * expected.max())
 
 
 def test_takes_over_photutils_models():
@@ -173,13 +172,13 @@ def test_takes_over_photutils_models():
     bare = ImagePSF(psf.data, oversampling=4)
     kind = {"pixel_scale": 0.11 * u.arcsec, "frame": "detector", "includes": ("pixel",)}
     again = from_photutils(bare, **kind)
-    np.testing.assert_array_equal(again.data, psf.data)
+    assert_array_equal(again.data, psf.data)
     assert list(again.includes) == ["pixel"]
     positions = [(0, 0), (0, 100), (100, 0), (100, 100)]
     stack = np.stack([psf.data * f for f in (0.8, 0.9, 0.9, 1.0)])
     grid = GriddedPSFModel(NDData(stack, meta={"grid_xypos": positions, "oversampling": 4}))
     there = from_photutils(grid, x=50, y=50, **kind)
-    np.testing.assert_allclose(there.data, 0.9 * psf.data, rtol=1e-6, atol=1e-9)
+    assert_allclose(there.data, 0.9 * psf.data, rtol=1e-6, atol=1e-9)
     refuses("given for a GriddedPSFModel", from_photutils, grid, **kind)
     refuses("'model' must be a PSF or model of photutils", from_photutils, "psf", **kind)
 
@@ -194,7 +193,7 @@ def test_reads_any_fits_image(tmp_path):
     ).writeto(path)
     kind = {"pixel_scale": 0.11 * u.arcsec, "oversampling": 4, "frame": "detector"}
     one = read_psf(path, ext=1, plane=1, enclosed=0.9, **kind)
-    np.testing.assert_allclose(one.data, 0.9 * psf.data, rtol=1e-5, atol=1e-7)
+    assert_allclose(one.data, 0.9 * psf.data, rtol=1e-5, atol=1e-7)
     assert one.enclosed == pytest.approx(0.9)
     refuses("a file with a 2D image in extension 0", read_psf, path, **kind)
     refuses("'data' must be normalized to 16", read_psf, path, ext=1, plane=1, **kind)

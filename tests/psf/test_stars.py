@@ -7,6 +7,7 @@ from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData, NDData, StdDevUncertainty
 from astropy.table import Table
 from astropy.wcs import WCS
+from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
 from miricigale.psf import encircled_energy, fwhm, miri_psf, psf_from_stars
@@ -68,9 +69,7 @@ def test_width_and_energy_come_back(truth, measured):
     assert fwhm(measured).value == pytest.approx(fwhm(truth).value, rel=0.01)
     gauss = fwhm(truth, method="gaussian").value
     assert fwhm(measured, method="gaussian").value == pytest.approx(gauss, rel=0.01)
-    np.testing.assert_allclose(
-        encircled_energy(measured, RADII), encircled_energy(truth, RADII), atol=0.005
-    )
+    assert_allclose(encircled_energy(measured, RADII), encircled_energy(truth, RADII), atol=0.005)
 
 
 def test_image_stands_as_the_truth_does(truth, measured):
@@ -107,9 +106,7 @@ def test_sky_positions_serve_all_images_and_bad_pixels_are_left_out(truth, field
     psf = psf_from_stars(spoilt, sky, enclosed=truth, frame="detector")
     assert psf.pixel_scale.value == pytest.approx(SCALE, rel=1e-6)
     assert psf.meta["n_stamps"] == 63
-    np.testing.assert_allclose(
-        encircled_energy(psf, RADII), encircled_energy(measured, RADII), atol=0.01
-    )
+    assert_allclose(encircled_energy(psf, RADII), encircled_energy(measured, RADII), atol=0.01)
 
 
 def test_stars_near_edges_are_counted(truth, field):

@@ -2,6 +2,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
+from numpy.testing import assert_array_equal
 
 from helpers.errors import refuses
 from helpers.exposures import FIELD as CENTER
@@ -63,7 +64,7 @@ def test_offsets_are_taken_off_to_ten_mas(stars, turn):
         if not turn:
             assert alignment.east.value == pytest.approx(-east, abs=0.01)
             assert alignment.north.value == pytest.approx(-north, abs=0.01)
-        np.testing.assert_array_equal(aligned.data, image.data)
+        assert_array_equal(aligned.data, image.data)
 
 
 def test_dithers_are_aligned_to_the_first(stars):

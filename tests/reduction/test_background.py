@@ -2,6 +2,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
+from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
 from helpers.exposures import gaussians
@@ -133,7 +134,7 @@ def test_far_negative_pixels_are_masked_with_the_reason(noise):
     assert image.mask[50, 60]
     assert image.mask.sum() == 1
     assert image.meta["background"] == pytest.approx(7, abs=0.02)
-    np.testing.assert_allclose(image.data + background.level, noise + 7, atol=1e-4)
+    assert_allclose(image.data + background.level, noise + 7, atol=1e-4)
     everything, _ = subtracted(make(noise + 7), negative_threshold=None)
     assert not everything.mask.any()
 
@@ -226,8 +227,8 @@ def test_the_plain_mesh_is_that_of_sep(noise):
     data = noise + blobs(SHAPE, 100, 30, 2) + 20
     background = estimate_background(make(data), method="sep", box=32, filter_size=3)
     level, rms = sep_tools.background(data, None, 32, 3)
-    np.testing.assert_array_equal(background.level, level.astype(np.float32))
-    np.testing.assert_array_equal(background.rms, rms.astype(np.float32))
+    assert_array_equal(background.level, level.astype(np.float32))
+    assert_array_equal(background.rms, rms.astype(np.float32))
     assert not background.source_mask.any()
 
 
@@ -239,4 +240,4 @@ def test_the_plain_mask_of_negative_pixels_is_by_key_and_counted(noise):
     assert not image.mask[51, 90]
     plain, background = subtracted(make(noise + 7, error=error), negative_noise="background")
     assert plain.meta["n_negative"] == 2
-    np.testing.assert_array_equal(plain.mask, plain.data < -10 * background.rms)
+    assert_array_equal(plain.mask, plain.data < -10 * background.rms)

@@ -2,6 +2,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.nddata import CCDData, StdDevUncertainty
+from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
 from miricigale.instrument import DQ, field_mask, flat_field, photmjsr, psf_fwhm
@@ -36,9 +37,9 @@ def test_uniform_sky_comes_out_uniform(rate):
     cal = calibrate(rate, **OPTIONS)
     good = ~cal.mask
     factor = photmjsr("miri.f1000w", gain=4.0)
-    np.testing.assert_allclose(cal.data[good], 20 * factor, rtol=1e-5)
+    assert_allclose(cal.data[good], 20 * factor, rtol=1e-5)
     expected = 0.1 * factor / flat_field("miri.f1000w")[good]
-    np.testing.assert_allclose(cal.uncertainty.array[good], expected, rtol=1e-5)
+    assert_allclose(cal.uncertainty.array[good], expected, rtol=1e-5)
     assert cal.unit == "MJy/sr"
     assert cal.meta["photmjsr"] == pytest.approx(factor)
 
@@ -47,8 +48,8 @@ def test_pixels_off_the_field_are_masked_with_the_reason(rate):
     cal = calibrate(rate, **OPTIONS)
     outside = (cal.flags & DQ.NON_SCIENCE) != 0
     reference = (cal.flags & DQ.REFERENCE_PIXEL) != 0
-    np.testing.assert_array_equal(outside, ~field_mask() & ~reference)
-    np.testing.assert_array_equal(cal.mask, ~field_mask() | reference)
+    assert_array_equal(outside, ~field_mask() & ~reference)
+    assert_array_equal(cal.mask, ~field_mask() | reference)
 
 
 def test_refuses_what_is_no_rate(rate):

@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData, StdDevUncertainty
+from numpy.testing import assert_allclose, assert_array_equal
 from reproject import reproject_exact
 
 from helpers.errors import refuses
@@ -44,8 +45,8 @@ def test_pixel_map_is_the_wcs():
     rng = np.random.default_rng(0)
     ys, xs = rng.integers(0, 1024, 3000), rng.integers(0, 1032, 3000)
     expected = outside.all_world2pix(*inside.all_pix2world(xs, ys, 0), 0)
-    np.testing.assert_allclose(x[ys, xs], expected[0], atol=1e-5)
-    np.testing.assert_allclose(y[ys, xs], expected[1], atol=1e-5)
+    assert_allclose(x[ys, xs], expected[0], atol=1e-5)
+    assert_allclose(y[ys, xs], expected[1], atol=1e-5)
 
 
 @pytest.mark.parametrize("scale", [0.06, 0.11])
@@ -58,8 +59,8 @@ def test_agrees_with_reproject_exact(scale):
     expected, footprint = reproject_exact((data, wcs), out, shape_out=shape)
     inner = footprint > 0.9999
     assert inner.mean() > 0.4
-    np.testing.assert_allclose(mosaic.image.data[inner], expected[inner], atol=2e-3)
-    np.testing.assert_array_equal(mosaic.image.mask, np.isnan(mosaic.image.data))
+    assert_allclose(mosaic.image.data[inner], expected[inner], atol=2e-3)
+    assert_array_equal(mosaic.image.mask, np.isnan(mosaic.image.data))
     assert np.all(mosaic.image.flags[mosaic.image.mask] == DQ.NON_SCIENCE | DQ.DO_NOT_USE)
 
 
@@ -150,7 +151,7 @@ def test_masked_pixels_and_nan_have_no_weight():
     data[20, 20] = np.nan
     mosaic = drizzle_images([make(data, wcs, mask=mask)], mosaic_wcs([wcs], 0.06 * u.arcsec))
     good = ~mosaic.image.mask
-    np.testing.assert_allclose(mosaic.image.data[good], 5.0, rtol=1e-5)
+    assert_allclose(mosaic.image.data[good], 5.0, rtol=1e-5)
     x, y = mosaic.image.wcs.world_to_pixel(wcs.pixel_to_world(82, 72))
     assert mosaic.image.mask[round(float(y)), round(float(x))]
     assert np.all(mosaic.weight[~good] == 0)
@@ -193,7 +194,7 @@ def test_outliers_are_masked_and_stars_are_not():
     for im, (ys, xs, stars) in zip(out, where, strict=True):
         flagged = (im.flags & DQ.OUTLIER) != 0
         assert flagged[ys, xs].mean() > 0.9
-        np.testing.assert_array_equal(flagged, im.mask)
+        assert_array_equal(flagged, im.mask)
         flagged[ys, xs] = False
         assert flagged[stars].mean() < 0.002
         assert flagged.sum() < 5
@@ -217,15 +218,15 @@ def test_outliers_of_fields_side_by_side_are_those_of_each_field():
     together = reject_outliers(every, grid)
     alone = [im for images in fields for im in reject_outliers(images, grid)]
     for one, two, place in zip(together, alone, places + places, strict=True):
-        np.testing.assert_array_equal(one.mask, two.mask)
+        assert_array_equal(one.mask, two.mask)
         assert one.mask[place]
     mosaic = drizzle_images(every, grid)
     # each pixel has the images of its own field
     assert mosaic.n_images.max() == 3
     single = drizzle_images(fields[1], grid)
     inside = single.n_images > 0
-    np.testing.assert_array_equal(mosaic.n_images[inside], single.n_images[inside])
-    np.testing.assert_allclose(mosaic.image.data[inside], single.image.data[inside], atol=1e-5)
+    assert_array_equal(mosaic.n_images[inside], single.n_images[inside])
+    assert_allclose(mosaic.image.data[inside], single.image.data[inside], atol=1e-5)
 
 
 def test_refuses_what_cannot_be_put_together():

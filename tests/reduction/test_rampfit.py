@@ -2,6 +2,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import norm
 
 from helpers.errors import refuses
@@ -64,11 +65,11 @@ def test_pure_read_noise_has_the_variance_of_least_squares(n):
     # no photon noise: each DN stands for a great many electrons
     fit = fitted(data, **{**OPTIONS, "gain": 1e15}, jump_threshold=None)
     expected = 12 * READ**2 / (n * (n**2 - 1) * DT**2)
-    np.testing.assert_allclose(fit.var_read, expected, rtol=1e-4)
+    assert_allclose(fit.var_read, expected, rtol=1e-4)
     assert np.all(fit.var_poisson < 1e-4 * expected)
     # and the slope is that of an unweighted line
     lines = np.polyfit(np.arange(n) * DT, data.reshape(n, -1).astype(float), 1)[0]
-    np.testing.assert_allclose(fit.rate.ravel(), lines, atol=2e-4)
+    assert_allclose(fit.rate.ravel(), lines, atol=2e-4)
 
 
 def test_statistic_of_a_jump_is_the_drop_of_chi_squared():
@@ -129,10 +130,10 @@ def test_neighbors_of_a_large_jump_are_cut_at_the_same_group():
     expected[3, 4] = DQ.JUMP_DET
     for y, x in ((2, 4), (4, 4), (3, 3), (3, 5)):
         expected[y, x] = DQ.JUMP_DET | DQ.JUMP_NEIGHBOR
-    np.testing.assert_array_equal(fit.flags, expected)
+    assert_array_equal(fit.flags, expected)
     assert np.all(fit.n_used[expected > 0] == 28)
     alone = fitted(data, **OPTIONS, neighbor_threshold=None)
-    np.testing.assert_array_equal(alone.flags == DQ.JUMP_DET, expected == DQ.JUMP_DET)
+    assert_array_equal(alone.flags == DQ.JUMP_DET, expected == DQ.JUMP_DET)
 
 
 def test_what_leaked_into_a_pixel_does_not_cut_its_neighbors():
@@ -181,7 +182,7 @@ def test_linearity_polynomial_is_undone():
         bias=detector.bias,
         linearity=detector.nonlinearity,
     )
-    np.testing.assert_allclose(fit.rate, rate, rtol=1e-5)
+    assert_allclose(fit.rate, rate, rtol=1e-5)
 
 
 def test_result_does_not_depend_on_threads_or_on_the_rest_of_the_frame():
@@ -197,9 +198,9 @@ def test_result_does_not_depend_on_threads_or_on_the_rest_of_the_frame():
     part = fitted(data[:, :, 20:70], **OPTIONS, neighbor_threshold=None)
     whole = fitted(data, **OPTIONS, neighbor_threshold=None)
     for name in ("rate", "var_poisson", "var_read", "n_used", "n_jump", "flags"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(three, name))
-        np.testing.assert_array_equal(getattr(part, name), getattr(whole, name)[20:70])
-    np.testing.assert_array_equal(one.jumps, three.jumps)
+        assert_array_equal(getattr(one, name), getattr(three, name))
+        assert_array_equal(getattr(part, name), getattr(whole, name)[20:70])
+    assert_array_equal(one.jumps, three.jumps)
 
 
 def test_reference_columns_follow_the_drift():
@@ -209,7 +210,7 @@ def test_reference_columns_follow_the_drift():
     mask = np.zeros((64, 40), bool)
     mask[:, :4] = mask[:, -4:] = True
     found = reference_drift(data, mask)
-    np.testing.assert_allclose(found, drift - drift.mean(), atol=5 * READ / np.sqrt(512))
+    assert_allclose(found, drift - drift.mean(), atol=5 * READ / np.sqrt(512))
     assert np.all(reference_drift(data, np.zeros_like(mask)) == 0)
 
 
@@ -238,7 +239,7 @@ def test_maps_give_each_pixel_what_its_own_constants_give():
     usable = np.ones(shape, bool)
     usable[1, 1] = False
     maps["gain"][1, 1] = np.nan
-    np.testing.assert_array_equal(
+    assert_array_equal(
         fitted(data, usable=usable, **{**options, **maps}).rate[usable], fit.rate[usable]
     )
     refuses("'gain' must be positive, got 1 pixels", fitted, data, **{**options, **maps})
@@ -254,7 +255,7 @@ def test_reset_anomaly_and_dark_are_taken_off_by_group_and_integration():
     spoilt[:, :4] += reset[[0, 1, 1]]
     options = {**OPTIONS, "jump_threshold": None}
     fit = fitted(spoilt, reset=reset, dark=dark, **options)
-    np.testing.assert_allclose(fit.rate, truth, rtol=2e-4, atol=2e-4)
+    assert_allclose(fit.rate, truth, rtol=2e-4, atol=2e-4)
     refuses("'dark' must be of shape", fitted, data=spoilt, dark=dark[:, :9], **options)
 
 
@@ -315,7 +316,7 @@ def test_drift_of_channels_and_rows_is_taken_off_as_in_the_official_pipeline():
     mask = np.zeros((40, 24), bool)
     mask[:, :4] = mask[:, -4:] = True
     drift = reference_channels(data, mask)
-    np.testing.assert_allclose(data - np.tile(drift, 6), expected, atol=1e-9)
+    assert_allclose(data - np.tile(drift, 6), expected, atol=1e-9)
     # a part of the frame, with the first row odd and columns on one side
     half = reference_channels(data[:, :, 1:, :12], mask[1:, :12], origin=(0, 1))
     assert half.shape == (2, 4, 39, 4)
@@ -405,9 +406,9 @@ def test_jumps_and_slopes_are_those_of_the_plain_form(n_int, n_group):
         found = {(y, x, k, int(g) + 1) for k, c in enumerate(cut) for g in np.flatnonzero(c)}
         assert {j for j in jumps if j[:2] == (y, x)} == found
         n_found += len(found)
-        np.testing.assert_allclose(fit.rate[y, x] * DT, slope, rtol=2e-6, atol=1e-5)
-        np.testing.assert_allclose(fit.error[y, x] ** 2 * DT**2, variance, rtol=2e-6)
-        np.testing.assert_allclose(fit.var_poisson[y, x] * DT**2, photon, rtol=1e-5, atol=1e-9)
+        assert_allclose(fit.rate[y, x] * DT, slope, rtol=2e-6, atol=1e-5)
+        assert_allclose(fit.error[y, x] ** 2 * DT**2, variance, rtol=2e-6)
+        assert_allclose(fit.var_poisson[y, x] * DT**2, photon, rtol=1e-5, atol=1e-9)
         flags = int(fit.flags[y, x])
         assert bool(flags & DQ.JUMP_DET) == bool(found)
         assert bool(flags & DQ.SATURATED) == (min(lengths) < n_group)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData, StdDevUncertainty
+from numpy.testing import assert_array_equal
 from scipy.ndimage import convolve
 
 from helpers.errors import refuses
@@ -91,7 +92,7 @@ def test_flags_tell_why(tmp_path):
         assert 5e-4 < bad.mean() < 2e-3
         assert np.all(np.isnan(rate.data[bad]))
         # nothing is masked without a reason
-        np.testing.assert_array_equal(image.mask, (why & DQ.DO_NOT_USE) != 0)
+        assert_array_equal(image.mask, (why & DQ.DO_NOT_USE) != 0)
         assert np.all(why[image.mask] != DQ.DO_NOT_USE)
     assert np.all(cal.mask[~field_mask()])
     assert rate.unit == "adu / s"
@@ -137,7 +138,7 @@ def test_the_whole_way_keeps_fluxes_and_errors(field):
     assert mosaic.meta["n_exposures"] == 4
     assert mosaic.meta["exposure_time"] == pytest.approx(sum(e.exposure_time.value for e in exps))
     assert mosaic.meta["pa_aper"] == [e.pa_aper.value for e in exps]
-    np.testing.assert_array_equal(mosaic.mask, (result.weight == 0) | np.isnan(mosaic.data))
+    assert_array_equal(mosaic.mask, (result.weight == 0) | np.isnan(mosaic.data))
     for background in result.backgrounds:
         assert np.median(background.level) == pytest.approx(SKY, rel=2e-3)
 

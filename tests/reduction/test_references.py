@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from numpy.polynomial import Polynomial
+from numpy.testing import assert_allclose, assert_array_equal
 
-from helpers.errors import refuses
+from helpers.errors import refuses, warned
 from helpers.exposures import exposure_of, sky_of
 from helpers.real import real_file
 from helpers.references import write_photom, write_reference
@@ -128,7 +129,7 @@ def test_another_detector_comes_out_right_with_its_references(exposure, real, ra
     assert {"linearity", "dark", "flat", "photom"} <= set(cal.meta["steps"])
     # who made the ramp does not matter then
     same = reducer.replace(ramps=RampSettings(ipc=False)).fit_ramp(ramp)
-    np.testing.assert_array_equal(same.data, rate.data)
+    assert_array_equal(same.data, rate.data)
 
 
 def test_a_bias_of_its_own_stands_before_the_polynomial(exposure, real, references, tmp_path):
@@ -140,10 +141,10 @@ def test_a_bias_of_its_own_stands_before_the_polynomial(exposure, real, referenc
         linearity=write_reference(tmp_path / "linearity.fits", "linearity", exposure, above),
     )
     one, two = (Reducer(references=r).fit_ramp(real) for r in (references, other))
-    np.testing.assert_allclose(two.data, one.data, rtol=2e-3, atol=2e-3)
+    assert_allclose(two.data, one.data, rtol=2e-3, atol=2e-3)
     assert two.meta["reference_bias"] == "bias.fits"
     number = Reducer(references=other.replace(bias=OTHER.bias)).fit_ramp(real)
-    np.testing.assert_array_equal(number.data, two.data)
+    assert_array_equal(number.data, two.data)
 
 
 def test_without_references_it_is_refused(ramp, real, references):
@@ -157,8 +158,7 @@ def test_without_references_it_is_refused(ramp, real, references):
     reducer = Reducer(references=references.replace(dark=None))
     refuses("'references' must be complete for slopes .* none for dark", reducer.fit_ramp, real)
     partial = references.replace(dark=None, incomplete=True)
-    with pytest.warns(MiricigaleWarning, match="slopes without references for dark"):
-        rate = Reducer(references=partial).fit_ramp(real)
+    rate = warned("slopes without references for dark", Reducer(references=partial).fit_ramp, real)
     assert rate.meta["reference_dark"] == "none"
     with pytest.warns(MiricigaleWarning, match="the dark current is in the slopes still"):
         Reducer(references=partial, cosmic_rays=False).calibrate(rate)
@@ -217,7 +217,7 @@ def test_what_a_file_had_done_to_it_is_not_done_twice(exposure, real, references
     both = ~whole.mask & ~rest.mask & (whole.data > 0)
     assert both.mean() > 0.95
     assert np.abs(rest.data - whole.data)[both].max() < 0.02 * whole.data[both].max()
-    np.testing.assert_allclose(rest.data[both], whole.data[both], rtol=0.01, atol=0.05)
+    assert_allclose(rest.data[both], whole.data[both], rtol=0.01, atol=0.05)
     assert rest.meta["reference_linearity"] == "done before"
     assert set(steps) <= set(rest.meta["steps"])
 
@@ -297,4 +297,4 @@ def test_integrations_apart(real, references):
     error = np.hypot(rates[0].uncertainty.array, rates[1].uncertainty.array)[good]
     assert np.std(difference / error) == pytest.approx(1, abs=0.03)
     mean = 0.5 * (rates[0].data + rates[1].data)[good]
-    np.testing.assert_allclose(mean, whole.data[good], rtol=0.01, atol=0.02)
+    assert_allclose(mean, whole.data[good], rtol=0.01, atol=0.02)
