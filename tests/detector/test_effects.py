@@ -14,10 +14,15 @@ from miricigale.detector import (
     CosmicRays,
     Dark,
     Detector,
+    FirstFrame,
     InterpixelCapacitance,
+    LastFrame,
     Nonlinearity,
+    Persistence,
     ReadNoise,
     ReferencePixels,
+    ResetAnomaly,
+    ResetDecay,
     Residual,
     Saturation,
 )
@@ -127,13 +132,12 @@ def test_saturation_stops_and_flags(make_block):
 def test_linearize_undoes_the_nonlinearity(make_block):
     block = make_block(n_groups=2)
     electrons = np.linspace(0, 210e3, 2 * 64 * 72)
-    ramp = Nonlinearity().apply(electrons.astype(np.float32).reshape(block.ramp_shape), block)
+    charge = electrons.astype(np.float32).reshape(block.ramp_shape)
+    ramp = Nonlinearity().apply(charge.copy(), block)
     assert np.all(ramp.ravel()[1:] <= electrons[1:] / 4)
     linear = miri_detector().linearize(ramp).ravel()
     assert_allclose(linear, electrons / 4, atol=0.02)
-    ramp = Nonlinearity(linear=True).apply(
-        electrons.astype(np.float32).reshape(block.ramp_shape), block
-    )
+    ramp = Nonlinearity(linear=True).apply(charge.copy(), block)
     assert_allclose(ramp.ravel(), electrons / 4, atol=0.01)
 
 
@@ -218,26 +222,27 @@ def test_residual_by_name_has_the_amplitude_of_the_filter(make_block, name):
     refuses("no residual preset 'flat'; known: etc", Residual, "flat", error=KeyError)
 
 
-@pytest.mark.parametrize(
-    ("effect", "name"),
-    [
-        (lambda: Residual(0.5), "amplitude"),
-        (lambda: Residual(0.01, correlation=-1), "correlation"),
-        (lambda: CosmicRays(leakage=0.3), "leakage"),
-        (lambda: CosmicRays(shower_fraction=2), "shower_fraction"),
-        (lambda: CosmicRays(track_max=1000), "track_max"),
-        (lambda: CosmicRays(flux=-1.0), "flux"),
-        (lambda: CosmicRays(yield_dex=np.nan), "yield_dex"),
-        (lambda: CosmicRays(shower_sigma=0), "shower_sigma"),
-        (lambda: Dark(current=-0.2), "current"),
-        (lambda: BadPixels(hot_current=np.inf), "hot_current"),
-        (lambda: Saturation(full_well=0), "full_well"),
-        (lambda: Bias(level=np.nan), "level"),
-        (lambda: Bias(reset_noise=-1), "reset_noise"),
-        (lambda: ReadNoise(sigma=-6), "sigma"),
-        (lambda: ReadNoise(pink=np.nan), "pink"),
-        (lambda: ReadNoise(octaves=0), "octaves"),
-    ],
-)
-def test_errors_name_the_argument(effect, name):
-    refuses(f"'{name}' must be", effect)
+#: Values out of range, by effect and argument.
+WRONG = {
+    Residual: {"amplitude": [0.5], "correlation": [-1]},
+    CosmicRays: {"leakage": [0.3], "shower_fraction": [2], "track_max": [1000], "flux": [-1.0],
+                 "yield_dex": [np.nan], "shower_sigma": [0]},
+    Dark: {"current": [-0.2]},
+    BadPixels: {"hot_current": [np.inf]},
+    Saturation: {"full_well": [0]},
+    Bias: {"level": [np.nan], "reset_noise": [-1]},
+    ReadNoise: {"sigma": [-6], "pink": [np.nan], "octaves": [0]},
+    Persistence: {"amplitudes": [(-0.1, 0.2)], "times": [(0, 1)]},
+    ResetAnomaly: {"amplitudes": [(), (np.nan,)], "groups": [0]},
+    ResetDecay: {"share": [1.0], "groups": [np.nan]},
+    FirstFrame: {"offset": [np.inf]},
+    LastFrame: {"coupling": [1.5], "offset": [np.nan]},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("effect", WRONG)
+def test_errors_name_the_argument(effect):
+    needed = {"amplitude": 0.01} if effect is Residual else {}
+    for name, values in WRONG[effect].items():
+        for value in values:
+            refuses(f"'{name}' must be", effect, **{**needed, name: value})

@@ -156,20 +156,3 @@ def test_they_stand_between_response_and_bias():
     assert effects[start : start + 6] == (Nonlinearity(), *resets, Bias())
     # and none of them is there unless it is asked for
     assert len(Detector.miri_imager().effects) == len(effects) - 5
-
-
-@pytest.mark.parametrize(
-    ("make", "name"),
-    [
-        (lambda: ResetAnomaly(amplitudes=()), "amplitudes"),
-        (lambda: ResetAnomaly(amplitudes=(np.nan,)), "amplitudes"),
-        (lambda: ResetAnomaly(groups=0), "groups"),
-        (lambda: ResetDecay(share=1.0), "share"),
-        (lambda: ResetDecay(groups=np.nan), "groups"),
-        (lambda: FirstFrame(offset=np.inf), "offset"),
-        (lambda: LastFrame(coupling=1.5), "coupling"),
-        (lambda: LastFrame(offset=np.nan), "offset"),
-    ],
-)
-def test_errors_name_the_argument(make, name):
-    refuses(f"'{name}' must be", make)
