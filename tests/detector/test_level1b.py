@@ -10,6 +10,7 @@ from astropy.wcs import WCS
 from numpy.testing import assert_array_equal
 
 from helpers.errors import refuses
+from helpers.references import POINTED, imager_keywords
 from miricigale.detector import (
     Detector,
     LastFrame,
@@ -55,12 +56,10 @@ def test_header_is_what_the_pipeline_asks_for(ramp, tmp_path):
         assert hdus["ASDF"].data["ASDF_METADATA"][0].tobytes().startswith(b"#ASDF 1.0.0\n")
         assert hdus["SIM_PIXELDQ"].data.dtype == np.uint32
     # what Detector1 and Image2 fail without (measured by removing keywords)
-    for key in ("DATE-OBS", "TIME-OBS", "TFRAME", "NFRAMES", "SUBARRAY", "SUBSTRT1", "SUBSTRT2"):
-        assert key in primary
-    for key in ("SUBSIZE1", "SUBSIZE2", "DATAMODL", "EXP_TYPE", "INSTRUME", "DETECTOR", "FILTER"):
-        assert key in primary
-    for key in ("RA_REF", "DEC_REF", "ROLL_REF", "V2_REF", "V3_REF", "VPARITY", "V3I_YANG"):
-        assert key in science
+    needed = {"DATE-OBS", "TIME-OBS", "TFRAME", "NFRAMES", "SUBARRAY", "SUBSTRT1", "SUBSTRT2"}
+    needed |= {"SUBSIZE1", "SUBSIZE2", "DATAMODL", "EXP_TYPE", "INSTRUME", "DETECTOR", "FILTER"}
+    assert needed <= set(primary)
+    assert {*POINTED, "V2_REF", "V3_REF", "VPARITY", "V3I_YANG"} <= set(science)
     assert primary["DATE-OBS"] == "2023-01-02"
     assert primary["TIME-OBS"].startswith("03:04:05")
     assert (primary["NINTS"], primary["NGROUPS"], primary["FILTER"]) == (2, 3, "F1500W")
@@ -98,21 +97,11 @@ def test_only_counts_are_written(make_exposure, tmp_path):
 
 def foreign(path, *, drop=(), primary=None, data=None):
     """A level-1b file as another program would write it, with standard keywords only."""
-    head = {
-        "INSTRUME": "MIRI",
-        "EXP_TYPE": "MIR_IMAGE",
-        "FILTER": "F770W",
-        "READPATT": "FASTR1",
-        "SUBARRAY": "SUB64",
-        "NINTS": 1,
-        "NGROUPS": 4,
-    }
-    head.update(primary or {})
-    science = {"RA_REF": 214.9, "DEC_REF": 52.9, "ROLL_REF": 120.0}
+    head = imager_keywords(**(primary or {}))
     data = np.arange(4 * 64 * 72, dtype=np.uint16).reshape(1, 4, 64, 72) if data is None else data
     hdus = fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(data, name="SCI")])
     hdus[0].header.update({k: v for k, v in head.items() if k not in drop})
-    hdus[1].header.update({k: v for k, v in science.items() if k not in drop})
+    hdus[1].header.update({k: v for k, v in POINTED.items() if k not in drop})
     hdus.writeto(path)
     return path
 

@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
 from helpers.real import real_file
+from helpers.references import POINTED, imager_keywords
 from miricigale.detector import Detector, Ramp, ramp_reader
 from miricigale.instrument import DQ
 from miricigale.utils.exceptions import DataError
@@ -16,9 +17,9 @@ from miricigale.utils.exceptions import DataError
 GROUND = "real/ramps/MIRI_5582_89_S_20180308-010230_SCE1_pipe.fits.gz"
 
 
-def stage(path, *, steps=("S_DQINIT", "S_SATURA", "S_LINEAR"), shape=(2, 4, 64, 72), primary=None):
+def stage(path):
     """A file as a step of the pipeline would save it: floats, with flags."""
-    rng = np.random.default_rng(1)
+    rng, shape = np.random.default_rng(1), (2, 4, 64, 72)
     data = rng.normal(12000, 5, shape).astype(np.float32)
     pixel_dq = np.zeros(shape[2:], np.uint32)
     pixel_dq[5, 6] = DQ.HOT | DQ.DO_NOT_USE
@@ -27,26 +28,11 @@ def stage(path, *, steps=("S_DQINIT", "S_SATURA", "S_LINEAR"), shape=(2, 4, 64, 
     group_dq[:, -1] = DQ.DO_NOT_USE
     hdus = fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(data, name="SCI")])
     hdus += [fits.ImageHDU(pixel_dq, name="PIXELDQ"), fits.ImageHDU(group_dq, name="GROUPDQ")]
-    hdus[0].header.update(
-        {
-            "INSTRUME": "MIRI",
-            "DETECTOR": "MIRIMAGE",
-            "EXP_TYPE": "MIR_IMAGE",
-            "FILTER": "F560W",
-            "READPATT": "FASTR1",
-            "SUBARRAY": "SUB64",
-            "NINTS": 10,
-            "INTSTART": 5,
-            "INTEND": 6,
-            "NGROUPS": shape[1],
-            "TGROUP": 0.0851,
-            "DATE-OBS": "2022-07-01",
-            **dict.fromkeys(steps, "COMPLETE"),
-            "S_DARK": "SKIPPED",
-            **(primary or {}),
-        }
-    )
-    hdus[1].header.update({"RA_REF": 214.9, "DEC_REF": 52.9, "ROLL_REF": 120.0})
+    steps = dict.fromkeys(("S_DQINIT", "S_SATURA", "S_LINEAR"), "COMPLETE") | {"S_DARK": "SKIPPED"}
+    given = {"INTSTART": 5, "INTEND": 6, "TGROUP": 0.0851, "DATE-OBS": "2022-07-01", **steps}
+    given |= {"FILTER": "F560W", "DETECTOR": "MIRIMAGE", "NINTS": 10}
+    hdus[0].header.update(imager_keywords(**given))
+    hdus[1].header.update(POINTED)
     hdus.writeto(path)
     return data, pixel_dq, group_dq
 

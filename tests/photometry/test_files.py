@@ -11,28 +11,16 @@ from astropy.table import QTable
 from numpy.testing import assert_array_equal
 
 from helpers.errors import refuses
+from helpers.mosaics import WHITE
 from helpers.results import assert_equal_values
-from miricigale.photometry import (
-    ErrorModel,
-    ErrorSettings,
-    ForcedPhotometryResult,
-)
+from miricigale.photometry import ErrorModel, ForcedPhotometryResult
 from miricigale.utils.exceptions import DataError
 
+SHIFT = {"max_shift": 0.2 * u.arcsec}
 OPTIONS = {
     "plain": {},
-    "all": {
-        "background_order": 1,
-        "max_shift": 0.2 * u.arcsec,
-        "components": 2,
-        "second_pass": True,
-        "positive": True,
-    },
-    "map": {
-        "max_shift": 0.2 * u.arcsec,
-        "offset_order": 0,
-        "errors": ErrorSettings(correlated_noise=False),
-    },
+    "all": {"background_order": 1, "components": 2, "second_pass": True, "positive": True, **SHIFT},
+    "map": {"offset_order": 0, "errors": WHITE, **SHIFT},
 }
 
 

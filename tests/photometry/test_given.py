@@ -4,38 +4,28 @@ import astropy.units as u
 import numpy as np
 import pandas as pd
 import pytest
-from astropy.coordinates import SkyCoord
-from astropy.io import fits
 from astropy.nddata import CCDData, NDData, StdDevUncertainty
 from astropy.table import QTable
-from astropy.wcs import WCS
 from matplotlib.figure import Figure
 from numpy.testing import assert_allclose, assert_array_equal
 from photutils.psf import CircularGaussianPRF
 
 from helpers.errors import refuses
+from helpers.scenes import tan_wcs
 from miricigale.filters import Filter
 from miricigale.instrument import Exposure, pixel_area_map
 from miricigale.photometry import ErrorModel, ForcedPhotometer, detect_sources
-from miricigale.psf import MatchingKernel, gaussian_psf, make_psf, read_psf
+from miricigale.psf import MatchingKernel, gaussian_psf
 
 NOISE = {0.03: 0.002, 0.09: 0.01}
 FWHM = {0.03: 0.12, 0.09: 0.27}
-
-
-def grid(n, scale):
-    wcs = WCS(naxis=2)
-    wcs.wcs.ctype, wcs.wcs.crval = ["RA---TAN", "DEC--TAN"], [150.1, 2.2]
-    wcs.wcs.crpix, wcs.wcs.cdelt = [(n + 1) / 2] * 2, [-scale / 3600, scale / 3600]
-    wcs.pixel_shape = (n, n)
-    return wcs
 
 
 @pytest.fixture(scope="module")
 def sky():
     rng = np.random.default_rng(2)
     x, y = (v.ravel() + rng.uniform(-1, 1, 16) for v in np.meshgrid(*[np.linspace(12, 84, 4)] * 2))
-    return grid(96, 0.09).pixel_to_world(x, y)
+    return tan_wcs((96, 96), 0.09).pixel_to_world(x, y)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +35,7 @@ def flux():
 
 def drawn(n, scale, sky, flux):
     """Points with Gaussian PSFs, a flux in uJy in each pixel."""
-    wcs, rng = grid(n, scale), np.random.default_rng(4)
+    wcs, rng = tan_wcs((n, n), scale), np.random.default_rng(4)
     y, x = np.mgrid[:n, :n]
     data = rng.normal(0, NOISE[scale], (n, n))
     for at, value in zip(np.transpose(wcs.world_to_pixel(sky)), flux, strict=True):
@@ -179,16 +169,6 @@ def test_a_kernel_is_applied_and_drawn(psfs, images):
     refuses("'array' must be a square array", MatchingKernel, psfs["psf"], pixel_scale=1 * u.arcsec)
 
 
-def test_psf_files_of_stpsf(tmp_path, psfs):
-    data = psfs["psf"].data
-    header = fits.Header({"PIXELSCL": 0.09 / 4, "OVERSAMP": 4})
-    fits.writeto(tmp_path / "psf.fits", data, header)
-    psf = read_psf(tmp_path / "psf.fits")
-    assert (psf.frame, psf.oversampling[0]) == ("detector", 4)
-    assert psf.pixel_scale.value == pytest.approx(0.09)
-    assert make_psf(np.ones((5, 5)) / 25, pixel_scale=1 * u.arcsec, enclosed=1.0).frame == "sky"
-
-
 def test_errors_of_an_exposure():
     exposure = Exposure("F770W", time=1 * u.h)
     model = ErrorModel.from_exposure(exposure)
@@ -206,11 +186,3 @@ def test_catalogs_of_pandas_with_missing_positions(images, psfs, sky):
     result = ForcedPhotometer(psf=psfs["psf"]).measure(images[0], catalog=catalog)
     assert result.id[0] == 100
     assert np.flatnonzero(~np.isfinite(result.flux.value)).tolist() == [2]
-
-
-def test_positions_that_are_none(images, psfs):
-    points = ForcedPhotometer(psf=psfs["psf"])
-    refuses("a table with positions", points.measure, images[0], catalog={"flux": [1.0]})
-    far = SkyCoord([10.0], [10.0], unit="deg")
-    with pytest.warns(match="none of the 1 sources is on or near"):
-        points.measure(images[0], far)

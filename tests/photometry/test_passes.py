@@ -9,13 +9,10 @@ from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
+from helpers.mosaics import flagged
 from miricigale.instrument import north_up_wcs
 from miricigale.photometry import ErrorSettings, ForcedFlags, ForcedPhotometer, detect_sources
 from miricigale.photometry.catalogs import joined_sky
-
-
-def flagged(flags, flag):
-    return (np.asarray(flags) & int(flag)) != 0
 
 
 @pytest.fixture(scope="module")
@@ -156,11 +153,10 @@ def test_points_are_where_the_galaxies_are(tools, nuclei):
     # positions of a catalog that are wrong by 30 mas are no positions of nuclei
     rng = np.random.default_rng(3)
     east, north = rng.normal(0, 0.03, (2, nuclei.n)) * u.arcsec
-    number = np.where((np.arange(nuclei.n) >= 8) & (np.arange(nuclei.n) < 24), 2, 1)
-    double = number == 2
+    double = (np.arange(nuclei.n) >= 8) & (np.arange(nuclei.n) < 24)
     photometer = ForcedPhotometer(tools.kernel, errors=ErrorSettings(size_scatter=None))
     for sky in (nuclei.sky, nuclei.sky.spherical_offsets_by(east, north)):
-        catalog = QTable({"sky": sky, "components": number})
+        catalog = QTable({"sky": sky, "components": np.where(double, 2, 1)})
         result = photometer.measure(*nuclei.images, catalog)
         ratio = result.flux_point.value[double] / nuclei.point[double]
         assert_allclose(ratio, 1, atol=0.06)
@@ -173,9 +169,8 @@ def test_the_catalogue_says_who_has_two_components(tools, nuclei):
     number = np.where(np.arange(nuclei.n) % 2 == 0, 2, 1)
     catalog = QTable({"sky": nuclei.sky, "components": number})
     result = ForcedPhotometer(tools.kernel).measure(*nuclei.images, catalog)
-    assert_array_equal(
-        np.isfinite(result.flux_point.value), (number == 2) & (np.arange(nuclei.n) < 24)
-    )
+    double = (number == 2) & (np.arange(nuclei.n) < 24)
+    assert_array_equal(np.isfinite(result.flux_point.value), double)
     # a point on top of a point
     assert flagged(result.flags, ForcedFlags.ONE_COMPONENT).tolist() == [False] * 24 + [True]
     assert_allclose(result.flux.value[24], nuclei.host[24] + nuclei.point[24], rtol=0.01)

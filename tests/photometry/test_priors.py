@@ -86,15 +86,12 @@ def test_segments_belong_by_id_or_by_position(prior, tmp_path):
     seg = save(tmp_path, labels, image.wcs)
     # one source just beyond its own segment keeps it by its id
     moved = SkyCoord([sky[0].directional_offset_by(0 * u.deg, 1 * u.arcsec), *sky[1:]])
-    segments, sources = read_prior(
-        image, segmentation=seg, catalog=write_csv(tmp_path / "a.csv", IDS, moved)
-    )
+    path = write_csv(tmp_path / "a.csv", IDS, moved)
+    segments, sources = read_prior(image, segmentation=seg, catalog=path)
     assert_array_equal(segments == sources["label"][0], labels == IDS[0])
     # ids of another catalogue say nothing of the segments
-    foreign = np.array([7, 42, 150605, 5])
-    segments, sources = read_prior(
-        image, segmentation=seg, catalog=write_csv(tmp_path / "b.csv", foreign, sky)
-    )
+    path = write_csv(tmp_path / "b.csv", [7, 42, 150605, 5], sky)
+    segments, sources = read_prior(image, segmentation=seg, catalog=path)
     for row, one in zip(sources, IDS, strict=True):
         assert_array_equal(segments == row["label"], labels == one)
 

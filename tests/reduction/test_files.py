@@ -83,10 +83,8 @@ def test_a_rate_of_the_pipeline(tmp_path, exposure, unit):
 
 
 def test_errors_come_from_variances_where_there_are_no_others(tmp_path, exposure):
-    variances = {
-        "VAR_POISSON": np.full(exposure.shape, 0.09),
-        "VAR_RNOISE": np.full(exposure.shape, 0.16),
-    }
+    plane = np.ones(exposure.shape)
+    variances = {"VAR_POISSON": 0.09 * plane, "VAR_RNOISE": 0.16 * plane}
     rate_file(tmp_path / "a_rate.fits", exposure, ERR=None, **variances)
     (file,) = read_images(tmp_path / "a_rate.fits")
     assert_allclose(file.image.uncertainty.array, 0.5, rtol=1e-6)

@@ -9,6 +9,7 @@ from scipy.ndimage import convolve
 
 from helpers.errors import refuses
 from helpers.exposures import exposure_of, image_of, sky_of
+from helpers.mosaics import render
 from miricigale.detector import (
     BadPixels,
     CosmicRays,
@@ -105,18 +106,6 @@ def test_flags_tell_why(tmp_path):
     assert np.median(cal.data[good]) == pytest.approx(SKY, rel=5e-3)
 
 
-def stars(exp, positions, fluxes, *, width=1.2):
-    """Gaussian stars, uJy, in MJy/sr."""
-    ny, nx = exp.shape
-    light = np.zeros(exp.shape)
-    area = pixel_area_map(exp.wcs, exp.shape)
-    yy, xx = np.mgrid[:ny, :nx]
-    for x, y, flux in zip(*exp.wcs.world_to_pixel(positions), fluxes, strict=True):
-        stamp = np.exp(-0.5 * ((xx - x) ** 2 + (yy - y) ** 2) / width**2)
-        light += flux * 1e-12 * stamp / stamp.sum() / area
-    return light
-
-
 @pytest.fixture(scope="module")
 def field():
     exps = [exposure(d) for d in range(4)]
@@ -124,7 +113,7 @@ def field():
     grid += np.random.default_rng(2).uniform(-4, 4, grid.shape)
     positions = exps[0].wcs.pixel_to_world(*grid)
     fluxes = np.full(grid.shape[1], 30.0)
-    ramps = [expose(SKY + stars(e, positions, fluxes), e) for e in exps]
+    ramps = [expose(SKY + render(positions, fluxes, 0.132, e.wcs, e.shape), e) for e in exps]
     return exps, positions, fluxes, ramps
 
 
