@@ -41,16 +41,11 @@ def set_block_size(monkeypatch):
 def make_block(make_exposure):
     """What an effect works on: all rows of an exposure before the first effect."""
 
-    def make(band="miri.f770w", *, seed=1, properties=None, **options):
+    def make(band="miri.f770w", *, seed=1, **options):
         exposure = make_exposure(band, **options)
         shape = (exposure.n_integrations, exposure.n_groups, *exposure.shape)
-        return Block(
-            exposure,
-            properties or miri_detector(),
-            slice(0, exposure.shape[0]),
-            np.zeros(exposure.shape, np.uint32),
-            np.zeros(shape, np.uint8),
-            stream_key(seed, exposure, "test"),
-        )
+        rows, key = slice(0, exposure.shape[0]), stream_key(seed, exposure, "test")
+        flags = np.zeros(exposure.shape, np.uint32), np.zeros(shape, np.uint8)
+        return Block(exposure, miri_detector(), rows, *flags, key)
 
     return make

@@ -176,11 +176,8 @@ def with_meta(path, new, meta):
 def test_effects_of_earlier_files_and_of_other_packages_are_read(ramp, tmp_path):
     # as their repr, in the meta dictionary
     first = ramp.write(tmp_path / "a_uncal.fits")
-    texts = [
-        "Photons(flat=True)",
-        "ResetAnomaly(amplitudes=(-3.0,), groups=4.0)",
-        "Glow(rate=-2.5)",
-    ]
+    reset = "ResetAnomaly(amplitudes=(-3.0,), groups=4.0)"
+    texts = ["Photons(flat=True)", reset, "Glow(rate=-2.5)"]
     old = Ramp.read(with_meta(first, tmp_path / "old.fits", {"seed": 9, "effects": texts}))
     other = OtherEffect("Glow", (("rate", -2.5),))
     assert old.effects == (Photons(), ResetAnomaly((-3.0,)), other)

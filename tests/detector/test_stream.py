@@ -22,16 +22,9 @@ from miricigale.detector import (
     Residual,
 )
 
-EVERYTHING = (
-    CosmicRays(shower_fraction=0.2),
-    Residual(0.01),
-    ReadNoise(pink=2.0),
-    Persistence((0.01,), (np.float32(20),)),
-    ResetAnomaly(),
-    ResetDecay(),
-    FirstFrame(),
-    LastFrame(),
-)
+RESETS = Persistence((0.01,), (np.float32(20),)), ResetAnomaly(), ResetDecay()
+FRAMES = FirstFrame(), LastFrame()
+EVERYTHING = CosmicRays(shower_fraction=0.2), Residual(0.01), ReadNoise(pink=2.0), *RESETS, *FRAMES
 
 
 def test_the_file_is_the_same_with_every_effect(make_exposure, make_sky, tmp_path, set_block_size):

@@ -148,14 +148,10 @@ def test_image2_gives_surface_brightness_positions_and_fluxes(folder, observatio
         unusable = ~use | ~np.isfinite(data)
         light = np.where(unusable, 0.0, data - each.sky) * area * 1e12
         truth = each.truth
-        fit = PSFPhotometry(core, (9, 9))(
-            light,
-            error=np.where(unusable, np.inf, error * area * 1e12),
-            mask=unusable,
-            init_params=Table(
-                {"x": truth["x"], "y": truth["y"], "flux": truth["flux_total"].value}
-            ),
-        )
+        start = Table({"x": truth["x"], "y": truth["y"], "flux": truth["flux_total"].value})
+        error = np.where(unusable, np.inf, error * area * 1e12)
+        measure = PSFPhotometry(core, (9, 9))
+        fit = measure(light, error=error, mask=unusable, init_params=start)
         assert np.all(np.hypot(fit["x_fit"] - truth["x"], fit["y_fit"] - truth["y"]) < 0.03)
         ratio = fit["flux_fit"] / truth["flux_total"].value
         assert np.mean(ratio) == pytest.approx(1, abs=5e-3)

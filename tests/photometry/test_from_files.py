@@ -114,11 +114,8 @@ def test_catalog_kernel_and_the_plain_form(files, tmp_path):
     """A kernel of others alone, a catalog, and the two files without options, packed."""
     from miricigale.psf import MatchingKernel
 
-    made = MatchingKernel.from_psfs(
-        gaussian_image(61, SHARP / FINE),
-        gaussian_image(61, WIDE / FINE),
-        pixel_scale=FINE * u.arcsec,
-    )
+    psfs = (gaussian_image(61, width / FINE) for width in (SHARP, WIDE))
+    made = MatchingKernel.from_psfs(*psfs, pixel_scale=FINE * u.arcsec)
     kernel = files.save("kernel.fits", made.array)
     made.write(files.folder / "own.fits")
     catalog = files.folder / "catalog.csv"

@@ -156,12 +156,8 @@ def test_weights_become_errors_and_other_maps_stay(write):
     sigma = np.where(np.indices(SHAPE)[1] < 70, 0.1, 0.3)
     data = rng.normal(size=SHAPE) * sigma
     path = write(data, BUNIT="MJy/sr")
-    maps = {
-        "error": sigma,
-        "variance": sigma**2,
-        "inverse_variance": sigma**-2,
-        "weight": (0.5 / sigma) ** 2,
-    }
+    maps = {"error": sigma, "variance": sigma**2, "inverse_variance": sigma**-2}
+    maps["weight"] = (0.5 / sigma) ** 2
     for kind, values in maps.items():
         image = read_mosaic(path, **{kind: write(values, f"{kind}.fits")})
         tolerance = 0.03 if kind == "weight" else 1e-5

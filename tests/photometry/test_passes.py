@@ -45,12 +45,9 @@ def test_second_pass_finds_what_the_catalogue_lacks(tools, crowd, moved):
         for one in (crowd.sky, crowd.hidden)
     )
     catalog = QTable({"id": ids, "sky": sky})
-    first, result = (
-        tools.measured(
-            crowd.image, catalog, second_pass=flag, max_shift=0.3 * u.arcsec if moved else None
-        )
-        for flag in (False, True)
-    )
+    options = {"max_shift": 0.3 * u.arcsec if moved else None}
+    first = tools.measured(crowd.image, catalog, **options)
+    result = tools.measured(crowd.image, catalog, second_pass=True, **options)
     assert first.new_sources is None
     new = result.new_sources
     row, separation, _ = truth.match_to_catalog_sky(new["sky"])

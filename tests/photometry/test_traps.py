@@ -58,14 +58,10 @@ def field(tmp_path_factory):
     steps = (np.arange(4) - 1.5) * 5.0
     places = np.array(np.meshgrid(steps, steps)).reshape(2, -1) + rng.uniform(-0.7, 0.7, (2, 16))
     sky, flux = CENTER.spherical_offsets_by(*(places * ARCSEC)), np.geomspace(2, 50, 16)
-    models = {
-        "image": psf_mosaic(miri_psf("miri.f770w"), COARSE * ARCSEC, PA * u.deg),
-        "prior": hst_psf(),
-    }
-    headers = {
-        "image": {"INSTRUME": "MIRI", "FILTER": "F770W", "PA_APER": PA},
-        "prior": {"INSTRUME": "WFC3", "FILTER": "F160W"},
-    }
+    models = {"image": psf_mosaic(miri_psf("miri.f770w"), COARSE * ARCSEC, PA * u.deg)}
+    models["prior"] = hst_psf()
+    headers = {"image": {"INSTRUME": "MIRI", "FILTER": "F770W", "PA_APER": PA}}
+    headers["prior"] = {"INSTRUME": "WFC3", "FILTER": "F160W"}
     made = types.SimpleNamespace(folder=folder, flux=flux, models=models)
     for name, model in models.items():
         scale, n = SIZE[name]
@@ -80,12 +76,8 @@ def field(tmp_path_factory):
     fits.writeto(folder / "seg.fits", labels, wcs.to_header())
     made.catalog = Table({"id": np.arange(1, 17), "ra": sky.ra.deg, "dec": sky.dec.deg})
     made.catalog.write(folder / "cat.fits")
-    made.paths = {
-        "image": folder / "image.fits",
-        "highres": folder / "prior.fits",
-        "segmentation": folder / "seg.fits",
-        "catalog": folder / "cat.fits",
-    }
+    names = {"image": "image", "highres": "prior", "segmentation": "seg", "catalog": "cat"}
+    made.paths = {key: folder / f"{name}.fits" for key, name in names.items()}
     return made
 
 
@@ -311,10 +303,8 @@ def test_model_and_residual_are_written_with_their_coordinates(field, tmp_path):
 
 def test_poor_fits_of_the_bright_stand_on_the_page_and_warnings_are_shown_once(field, tmp_path):
     """The PSF of another band, said to be that of a smoothed image."""
-    wide = psf_image(
-        filter_psf("miri.f1500w", pixel_scale=COARSE * ARCSEC, pa=PA * u.deg),
-        pixel_scale=COARSE * ARCSEC, shape=91,
-    )  # fmt: skip
+    form = {"pixel_scale": COARSE * ARCSEC}
+    wide = psf_image(filter_psf("miri.f1500w", **form, pa=PA * u.deg), **form, shape=91)
     command = [sys.executable, "-m", "miricigale", "photometry", "--no-progress", "--threads", "1"]
     for name, path in field.paths.items():
         command += [f"--{name}", path]

@@ -23,17 +23,9 @@ from miricigale.psf.miri import _miri_data
 from miricigale.psf.telescope import Telescope, band_quantiles
 
 # jwst-docs, MIRI Point Spread Functions, table 1 (commissioning, PID 1028)
-IN_FLIGHT = {
-    "miri.f560w": 0.207,
-    "miri.f770w": 0.269,
-    "miri.f1000w": 0.328,
-    "miri.f1130w": 0.375,
-    "miri.f1280w": 0.420,
-    "miri.f1500w": 0.488,
-    "miri.f1800w": 0.591,
-    "miri.f2100w": 0.674,
-    "miri.f2550w": 0.803,
-}
+BANDS = [f"miri.f{number}w" for number in (560, 770, 1000, 1130, 1280, 1500, 1800, 2100, 2550)]
+WIDTHS = 0.207, 0.269, 0.328, 0.375, 0.420, 0.488, 0.591, 0.674, 0.803
+IN_FLIGHT = dict(zip(BANDS, WIDTHS, strict=True))
 
 # stpsf 2.2.0: MIRI().psf_grid(num_psfs=1, oversample=4, fov_pixels=91, nlambda=9) with no
 # wavefront error (pupilopd=None, no instrument error) and no pupil shift

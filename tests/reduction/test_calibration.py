@@ -14,13 +14,8 @@ from miricigale.reduction.images import flagged_image
 
 SHAPE = (1024, 1032)
 FILTER = "miri.f1000w"
-OPTIONS = {
-    "filter": FILTER,
-    "subarray": "FULL",
-    "dark": 0.05,
-    "flat": flat_field(FILTER),
-    "conversion": photmjsr(FILTER, gain=4.0),
-}
+OPTIONS = {"filter": FILTER, "subarray": "FULL", "dark": 0.05, "flat": flat_field(FILTER)}
+OPTIONS["conversion"] = photmjsr(FILTER, gain=4.0)
 
 
 @pytest.fixture(scope="module")

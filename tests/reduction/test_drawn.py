@@ -167,20 +167,13 @@ def test_errors_follow_the_light_up_to_saturation():
 
 def test_what_the_reduction_assumes_need_not_be_true():
     known = miri_detector()
-    true = known.replace(
-        gain=1.01 * known.gain,
-        read_noise=1.3 * known.read_noise,
-        nonlinearity=(0.0, 1.0, *(1.3 * c for c in known.nonlinearity[2:])),
-    )
+    curve = (0.0, 1.0, *(1.3 * c for c in known.nonlinearity[2:]))
+    noise = {"gain": 1.01 * known.gain, "read_noise": 1.3 * known.read_noise}
+    options = {"properties": known.replace(**noise, nonlinearity=curve), "without": (CosmicRays,)}
     exposure = mode_of("miri.f770w", 60, 1)
     light = np.broadcast_to(np.geomspace(1, 200, exposure.shape[1]), exposure.shape)
-    (fitted, drawn), truth = both(
-        exposure,
-        light,
-        properties=true,
-        without=(CosmicRays,),
-        reducer=Reducer(references="simulated"),
-    )
+    reducer = Reducer(references="simulated")
+    (fitted, drawn), truth = both(exposure, light, reducer=reducer, **options)
     for columns in np.array_split(np.arange(1, exposure.shape[1] - 1), 8):
         off = [(fit.rate - truth)[1:-1, columns] for fit in (fitted, drawn)]
         mean = [np.nanmean(o / truth[1:-1, columns]) for o in off]

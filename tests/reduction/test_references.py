@@ -17,14 +17,8 @@ from miricigale.reduction.reference_maps import read_photom
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
 
 SKY = 12.0
-OTHER = miri_detector().replace(
-    gain=5.5,
-    read_noise=8.0,
-    bias=9000.0,
-    dark_current=0.9,
-    full_well=250e3,
-    nonlinearity=(0.0, 1.0, 3e-6, 4e-11),
-)
+NOISE = {"gain": 5.5, "read_noise": 8.0, "bias": 9000.0, "dark_current": 0.9}
+OTHER = miri_detector().replace(**NOISE, full_well=250e3, nonlinearity=(0.0, 1.0, 3e-6, 4e-11))
 
 
 @pytest.fixture(scope="module")
