@@ -60,9 +60,8 @@ def test_same_seed_same_counts_on_any_threads_and_blocks(
     make_exposure, make_sky, detector, set_block_size
 ):
     exposure = make_exposure(n_groups=5, n_integrations=2, subarray="SUB128")
-    detector = Detector.miri_imager(
-        CosmicRays(shower_fraction=0.2), Residual(0.01), ReadNoise(pink=2.0)
-    )
+    effects = CosmicRays(shower_fraction=0.2), Residual(0.01), ReadNoise(pink=2.0)
+    detector = Detector.miri_imager(*effects)
     # without 'ipc' in the image, neighbors across blocks are coupled
     sky = make_sky(exposure, 30.0, includes=())
     one = detector.expose(sky, exposure, seed=5, n_threads=1)
@@ -183,9 +182,8 @@ def test_refuses_images_of_another_place_or_filter(make_exposure, make_sky, dete
     for other in (moved, rolled, away):
         refuses("'image' must be where the exposure points", detector.expose, image, other)
     # 1" on the sky is nine pixels of 0.11"
-    image.wcs = exposure.replace(
-        pointing=exposure.pointing.directional_offset_by(40 * u.deg, 1 * u.arcsec)
-    ).wcs
+    beside = exposure.pointing.directional_offset_by(40 * u.deg, 1 * u.arcsec)
+    image.wcs = exposure.replace(pointing=beside).wcs
     refuses(r"got one 9\.\d+ pixels off", detector.forecast, image, exposure)
     image.wcs = exposure.wcs
     image.meta["filter"] = "miri.f1000w"
@@ -198,9 +196,8 @@ def test_other_units_of_surface_brightness(make_exposure, make_sky):
     sky = make_sky(exposure, 100.0)
     other = CCDData(sky.data * 1e6, unit="Jy/sr", meta=sky.meta)
     detector = Detector(PLAIN)
-    assert_array_equal(
-        detector.expose(other, exposure, seed=1).data, detector.expose(sky, exposure, seed=1).data
-    )
+    ramps = (detector.expose(image, exposure, seed=1) for image in (other, sky))
+    assert_array_equal(*(ramp.data for ramp in ramps))
 
 
 def test_refuses_wrong_effects():
@@ -246,9 +243,8 @@ def test_effects_take_the_place_of_their_kind():
     assert other.effects[other.effects.index(Persistence()) - 1] == CosmicRays()
     assert other.effects[other.effects.index(LastFrame()) + 1] == Bias()
     assert len(other.effects) == len(detector.effects) + 3
-    assert (
-        other.without(Residual, Persistence, LastFrame).replaced(Dark()).effects == detector.effects
-    )
+    back = other.without(Residual, Persistence, LastFrame).replaced(Dark())
+    assert back.effects == detector.effects
     assert Detector.miri_imager(Dark(current=2.0)).effects == detector.replaced(Dark(2.0)).effects
     # settings of the detector stay
     properties = miri_detector().replace(gain=2.0)

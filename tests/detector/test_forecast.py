@@ -151,9 +151,8 @@ def test_sources_off_the_image_and_without_a_place(make_exposure, make_sky, plai
     exposure = make_exposure(n_groups=3)
     sky = make_sky(exposure, 1.0)
     nx = exposure.shape[1]
-    told = plain.forecast(
-        sky, exposure, sources=sources_at([-0.6, -0.4, nx - 0.6, nx, np.nan], [1.0, 1, 1, 1, 1])
-    )
+    there = sources_at([-0.6, -0.4, nx - 0.6, nx, np.nan], [1.0, 1, 1, 1, 1])
+    told = plain.forecast(sky, exposure, sources=there)
     assert told.sources["id"].tolist() == [101, 102]
     assert len(plain.forecast(sky, exposure).sources) == 0
     refuses("'sources' must", plain.forecast, sky, exposure, sources=QTable({"id": [1]}))

@@ -116,9 +116,8 @@ def test_a_saturated_star_comes_back_in_the_next_exposure(make_exposure, make_sk
 
 def test_reference_and_bad_pixels_are_not_remembered(make_exposure, make_sky):
     exposure = make_exposure(n_groups=3, subarray="SUB64")
-    ramp = (
-        Detector.miri_imager().without(CosmicRays).expose(make_sky(exposure, 2e4), exposure, seed=0)
-    )
+    detector = Detector.miri_imager().without(CosmicRays)
+    ramp = detector.expose(make_sky(exposure, 2e4), exposure, seed=0)
     latent = Latent.from_ramp(ramp, 1 * u.s, threshold=0)
     out = ramp.pixel_dq & np.uint32(DQ.REFERENCE_PIXEL | DQ.DO_NOT_USE) != 0
     assert out.any()

@@ -8,7 +8,6 @@ from astropy.time import Time
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
-from helpers.real import real_file
 from helpers.references import POINTED, imager_keywords
 from miricigale.detector import Detector, Ramp, ramp_reader
 from miricigale.instrument import DQ
@@ -79,9 +78,9 @@ def test_exposures_larger_than_the_memory_are_refused_before_they_begin(
         Detector.miri_imager().expose(make_sky(exposure, 1.0), exposure, seed=1)
 
 
-def test_a_ramp_of_a_ground_test(tmp_path):
+def test_a_ramp_of_a_ground_test(data_file, tmp_path):
     # 5 integrations of 50 groups, without filter, pointing, instrument and kind of exposure
-    path = real_file(GROUND)
+    path = data_file(GROUND)
     ramp = Ramp.read(path)
     with fits.open(path) as hdus:
         assert_array_equal(ramp.data, hdus["SCI"].data)

@@ -110,9 +110,8 @@ def test_the_decay_is_told_and_gone_with_the_first_groups(make_exposure, make_sk
     ("band", "n_groups", "n_integrations"), [("miri.f770w", 20, 2), ("miri.f2100w", 10, 4)]
 )
 def test_the_rate_does_not_know_of_them(make_exposure, make_sky, band, n_groups, n_integrations):
-    exposure = make_exposure(
-        band, n_groups=n_groups, n_integrations=n_integrations, subarray="SUB256"
-    )
+    mode = {"n_groups": n_groups, "n_integrations": n_integrations}
+    exposure = make_exposure(band, subarray="SUB256", **mode)
     sky = make_sky(exposure, background_level(band).value, includes=())
     plain = Detector.miri_imager().without(CosmicRays, BadPixels)
     spoilt = plain.replaced(ResetAnomaly(), FirstFrame(), LastFrame())

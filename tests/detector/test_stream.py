@@ -45,9 +45,7 @@ def test_the_file_is_the_same_with_every_effect(make_exposure, make_sky, tmp_pat
     assert_array_equal(back.data, held.data)
     assert_array_equal(back.pixel_dq, held.pixel_dq)
     assert back.effects == held.effects == detector.effects
-    assert {k: v for k, v in back.meta.items() if k != "created"} == {
-        k: v for k, v in held.meta.items() if k != "created"
-    }
+    assert back.meta == {**held.meta, "created": back.meta["created"]}
     # card by card, but for the moments at which they were made
     with fits.open(one) as first, fits.open(two) as second:
         first.verify("exception")

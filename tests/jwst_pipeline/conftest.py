@@ -74,11 +74,10 @@ def observe(exposures, catalog, folder, *, detector=None):
     """Scene, detector, file: our own part of the chain, at its defaults."""
     psf = miri_psf(exposures[0].filter)
     background = Background.low_zodi(exposures[0].filter, center=exposures[0].pointing)
-    detector = Detector.miri_imager() if detector is None else detector
+    detector = detector or Detector.miri_imager()
     for exposure in exposures:
-        scene = Scene(
-            catalog, filter=exposure.filter, wcs=exposure.wcs, psf=psf, background=background
-        )
+        form = {"filter": exposure.filter, "wcs": exposure.wcs, "psf": psf}
+        scene = Scene(catalog, background=background, **form)
         image = scene.render()
         ramp = detector.expose(image, exposure, seed=20)
         path = ramp.write(folder / f"simulated_{exposure.dither + 1}_uncal.fits")

@@ -58,9 +58,8 @@ def test_encircled_energy_and_scale_of_point_sources(tools, stars):
     radii = [0.2, 0.5, 1.0] * u.arcsec
     table = encircled_flux(image, sky, flux * u.uJy, radii)
     assert_allclose(table["median"], 1 - np.exp(-0.5 * (radii.value / tools.LO) ** 2), atol=0.003)
-    psf = gaussian_psf(
-        tools.LO * np.sqrt(8 * np.log(2)) * u.arcsec, pixel_scale=0.06 * u.arcsec, fov=5 * u.arcsec
-    )
+    fwhm = tools.LO * np.sqrt(8 * np.log(2)) * u.arcsec
+    psf = gaussian_psf(fwhm, pixel_scale=0.06 * u.arcsec, fov=5 * u.arcsec)
     factor, error = flux_scaling(image, sky, flux * u.uJy, psf)
     assert abs(factor - 1) < 4 * error < 0.02
     factor, _ = flux_scaling(image, sky, flux / 0.9 * u.uJy, psf)

@@ -279,9 +279,8 @@ def test_errors_where_the_exposure_is_longer(simulated):
     # rows of no known noise do not count
     some = {BAND: np.where(np.arange(len(true)) < 3000, noise, np.nan)}
     first = ErrorModel.from_tables(truth, measured, bin_size=600, noise=some).curves[BAND]
-    own = ErrorModel.from_tables(
-        truth[:3000], measured[:3000], bin_size=600, noise={BAND: noise[:3000]}
-    ).curves[BAND]
-    assert_allclose(first.error, own.error)
+    own = {"bin_size": 600, "noise": {BAND: noise[:3000]}}
+    alone = ErrorModel.from_tables(truth[:3000], measured[:3000], **own).curves[BAND]
+    assert_allclose(first.error, alone.error)
     with pytest.raises(ValueError, match="'noise' must be a factor for each of 4 rows"):
         model.assign(table, noise={BAND: np.ones(3)})

@@ -407,9 +407,8 @@ def test_arrays_with_the_mistakes_of_files(tools):
     rng, shape = np.random.default_rng(6), (400, 400)
     sky, flux = tools.places(*tools.lattice(rng, 5, 4.0, 0.0)), np.geomspace(3, 30, 25)
     form = {"scale": tools.FINE, "sigma": 5e-3, "rng": rng}
-    sharp, wide = (
-        tools.picture(sky, flux, shape, width=width, **form) for width in (tools.HI, tools.LO)
-    )
+    sharp = tools.picture(sky, flux, shape, width=tools.HI, **form)
+    wide = tools.picture(sky, flux, shape, **form)
     labels = tools.disks(sky, sharp.wcs, shape, np.sqrt(60))
     catalog = QTable({"sky": sky, "label": np.arange(1, 26)})
     photometer = ForcedPhotometer(tools.kernel)
@@ -431,9 +430,8 @@ def test_a_kernel_alone_measures_segments(tools, field):
     form, kept = {"scale": tools.FINE, "width": tools.HI, "sigma": 1e-3}, np.arange(0, 60, 2)
     highres = tools.picture(field.sky, field.flux, (500, 500), **form)
     labels = tools.disks(field.sky[kept], highres.wcs, (500, 500), 8, kept + 1)
-    bare = MatchingKernel.from_array(
-        tools.kernel.array / tools.kernel.array.sum(), pixel_scale=tools.FINE * u.arcsec
-    )
+    array = tools.kernel.array / tools.kernel.array.sum()
+    bare = MatchingKernel.from_array(array, pixel_scale=tools.FINE * u.arcsec)
     photometer = warned("kernel has no PSFs: sources are their segments", ForcedPhotometer, bare)
     catalog = field.catalog.copy()
     catalog["label"] = np.where(np.isin(np.arange(60), kept), np.arange(60) + 1, 0)

@@ -153,9 +153,8 @@ def test_without_a_segmentation_sources_are_detected(files, tmp_path):
 def test_sources_that_the_prior_lacks_are_the_last_rows(files, tmp_path):
     labels, header = fits.getdata(files.paths["segmentation"], header=True)
     lost = np.argsort(-files.flux)[[2, 5]]
-    fits.writeto(
-        tmp_path / "seg.fits", np.where(np.isin(labels, files.ids[lost]), 0, labels), header
-    )
+    labels[np.isin(labels, files.ids[lost])] = 0
+    fits.writeto(tmp_path / "seg.fits", labels, header)
     output = tmp_path / "out.fits"
     command = arguments(files, output, segmentation=tmp_path / "seg.fits")
     assert main([*command, "--second-pass", "--background-order", "1"]) == 0

@@ -236,9 +236,8 @@ def test_maps_in_another_unit_than_the_image_are_converted(write, kind):
         read_mosaic(path, **{kind: other})
     # what the caller states holds for both
     counts = write(rng.normal(0, 0.1, SHAPE), "counts.fits", BUNIT="ELECTRONS/S")
-    assert read_mosaic(counts, unit="MJy/sr", **{kind: other}).meta["noise_scale"] == pytest.approx(
-        1, rel=0.03
-    )
+    image = read_mosaic(counts, unit="MJy/sr", **{kind: other})
+    assert image.meta["noise_scale"] == pytest.approx(1, rel=0.03)
 
 
 @pytest.mark.parametrize("kind", ["packed", "compressed", "integers", "big"])

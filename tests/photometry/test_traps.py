@@ -95,10 +95,13 @@ def fluxes(field, **options):
     return measured(field, **options)["miri.f770w"].to_value(u.uJy)
 
 
-def edited(field, tmp_path, name, change):
+def edited(field, tmp_path, name, change=None, *, add=0.0, **header):
     path = tmp_path / f"{name}.fits"
     with fits.open(field.folder / f"{name}.fits") as hdus:
-        change(hdus)
+        hdus["SCI"].data += add
+        hdus["SCI"].header.update(header)
+        if change:
+            change(hdus)
         hdus.writeto(path)
     return path
 
@@ -136,10 +139,7 @@ def test_psfs_on_cells_of_a_pixel_are_told_by_their_width(field, tmp_path):
 
 
 def test_model_psfs_are_turned_to_the_angle_of_the_aperture(field, tmp_path):
-    def turned(hdus):
-        hdus["SCI"].header["PA_APER"] = PA - 30
-
-    path = edited(field, tmp_path, "image", turned)
+    path = edited(field, tmp_path, "image", PA_APER=PA - 30)
     right, wrong = (measured(field, image=one) for one in (field.paths["image"], path))
     assert_allclose(np.median(right["miri.f770w"].value / field.flux), 1, atol=0.007)
     # the six spikes stand elsewhere at another angle
@@ -148,9 +148,8 @@ def test_model_psfs_are_turned_to_the_angle_of_the_aperture(field, tmp_path):
 
 
 def test_a_turned_psf_with_its_angle_is_right(field, tmp_path):
-    drizzled = psf_mosaic(
-        miri_psf("miri.f770w"), COARSE * ARCSEC, 0 * u.deg, grid_angle=0 * u.deg, oversampling=4
-    )
+    form = {"grid_angle": 0 * u.deg, "oversampling": 4}
+    drizzled = psf_mosaic(miri_psf("miri.f770w"), COARSE * ARCSEC, 0 * u.deg, **form)
     data = psf_image(drizzled, pixel_scale=COARSE / 3 * ARCSEC, shape=301)
     path = saved(tmp_path, data, PIXSCALE=COARSE / 3)
     found = fluxes(field, psf=path, psf_angle=PA * u.deg)
@@ -191,14 +190,11 @@ def test_kernels_of_other_pixels_filters_or_sums(field, tmp_path):
 
 
 def test_a_background_is_fitted_or_said(field, tmp_path):
-    def raised(hdus):
-        hdus["SCI"].data += 0.05
-
-    path = edited(field, tmp_path, "image", raised)
+    path = edited(field, tmp_path, "image", add=0.05)
     assert_allclose(np.median(fluxes(field, image=path) / field.flux), 1, atol=0.007)
     with pytest.warns(MiricigaleWarning, match=r"a background of 0\.05\d* MJy / sr between"):
         fluxes(field, image=path, background_order=None)
-    prior = edited(field, tmp_path, "prior", lambda hdus: hdus["SCI"].data.__iadd__(0.06))
+    prior = edited(field, tmp_path, "prior", add=0.06)
     warned("'highres' has a sky of 2.* times its noise", fluxes, field, highres=prior)
 
 
@@ -272,11 +268,11 @@ def test_model_psfs_of_a_nircam_prior(field, tmp_path):
     sky = SkyCoord(field.catalog["ra"], field.catalog["dec"], unit="deg")
     data = drawn(np.random.default_rng(4), "prior", model, sky, 2 * field.flux)
 
-    def named(hdus):
+    def drawn_anew(hdus):
         hdus["SCI"].data[:] = brightness(data, WCS(hdus["SCI"].header))
-        hdus["SCI"].header.update(INSTRUME="NIRCAM", FILTER="F444W", PUPIL="CLEAR")
 
-    path = edited(field, tmp_path, "prior", named)
+    named = {"INSTRUME": "NIRCAM", "FILTER": "F444W", "PUPIL": "CLEAR"}
+    path = edited(field, tmp_path, "prior", drawn_anew, **named)
     message = r"'highres_pa_aper' must be given, .* \(or 'highres_psf'\)"
     refuses(message, fluxes, field, highres=path)
     found = fluxes(field, highres=path, highres_pa_aper=40 * u.deg, page=tmp_path / "page.html")

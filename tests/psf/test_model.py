@@ -70,10 +70,8 @@ def test_a_plain_model_of_photutils_lacks_its_pixel():
 
 def test_fields_of_kernels_are_copied_pickled_and_written(tmp_path):
     kind = {"pixel_scale": 0.06 * u.arcsec, "fov": 2 * u.arcsec}
-    sharp = gaussian_psf(0.2 * u.arcsec, **kind)
-    kernels = [
-        MatchingKernel.from_psfs(sharp, gaussian_psf(w * u.arcsec, **kind)) for w in (0.4, 0.5)
-    ]
+    sharp, *wide = (gaussian_psf(width * u.arcsec, **kind) for width in (0.2, 0.4, 0.5))
+    kernels = [MatchingKernel.from_psfs(sharp, psf) for psf in wide]
     field = KernelField(kernels, SkyCoord([53.0, 53.1], [-27.0, -27.0], unit="deg"), "nearest")
     field.write(tmp_path / "field.fits")
     places = SkyCoord([53.01, 53.09], [-27.0, -27.01], unit="deg")

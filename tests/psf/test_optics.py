@@ -31,9 +31,8 @@ def test_airy_pattern_of_a_circular_aperture(disk):
     wavelength = 2.0e-6
     unit = wavelength / disk.diameter
     axis = np.linspace(-4, 4, 801) * unit
-    image = _core.matrix_dft_intensity(
-        disk.amplitude, disk.step, wavelength, axis, axis, power=disk.amplitude.sum()
-    )
+    form = {"theta_x": axis, "theta_y": axis, "power": disk.amplitude.sum()}
+    image = _core.matrix_dft_intensity(disk.amplitude, disk.step, wavelength, **form)
     profile = image[400, 400:] / image[400, 400]
     x = axis[400:] / unit
     half = np.interp(-0.5, -profile[:80], x[:80])

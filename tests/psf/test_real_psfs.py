@@ -25,6 +25,7 @@ from miricigale.psf import (
 from miricigale.utils.exceptions import MiricigaleWarning
 
 SCALE = 0.04 * u.arcsec
+SKY = {"pixel_scale": SCALE, "frame": "sky"}
 kernel_of = functools.partial(MatchingKernel.from_psfs, pixel_scale=SCALE)
 HI, LO = 1.7, 3.0  # rms of the two PSFs in pixels
 
@@ -76,10 +77,8 @@ def test_off_center_and_even_arrays_give_the_centered_kernel(n, off):
 
 def test_off_center_psfs_keep_their_angles():
     """The core is put on the axis before the PSF is turned about it."""
-    psfs = [
-        make_psf(gaussian_image(61, s, 1.2, -0.9), pixel_scale=SCALE, frame="detector")
-        for s in (HI, LO)
-    ]
+    kind = {"pixel_scale": SCALE, "frame": "detector"}
+    psfs = [make_psf(gaussian_image(61, s, 1.2, -0.9), **kind) for s in (HI, LO)]
     angles = {"hi_angle": 20 * u.deg, "lo_angle": [20, 140] * u.deg}
     kernel = kernel_of(*psfs, **angles)
     assert_is_the_gaussian_kernel(kernel)
@@ -102,15 +101,14 @@ def test_oversampled_psf_of_unit_sum_is_scaled_and_said():
 @pytest.mark.parametrize("factor", [0.5, 0.02, 7.0])
 def test_sums_that_are_no_fraction_are_refused_unless_scaled(factor):
     data = factor * gaussian_image(51, HI)
-    kind = {"pixel_scale": SCALE, "frame": "sky"}
-    refuses(r"'data' must be .*'enclosed' given", make_psf, data, **kind)
+    refuses(r"'data' must be .*'enclosed' given", make_psf, data, **SKY)
     lo = gaussian_image(51, LO)
     refuses("'hi' must be a PSF whose sum is the fraction of light", kernel_of, data, lo)
     kernel = kernel_of(data, lo, normalize=True)
     assert_is_the_gaussian_kernel(kernel)
-    psf = make_psf(data, **kind, enclosed=0.97)
+    psf = make_psf(data, **SKY, enclosed=0.97)
     assert psf.enclosed == pytest.approx(0.97)
-    refuses("'enclosed' must be above 0 and at most 1", make_psf, data, **kind, enclosed=1.5)
+    refuses("'enclosed' must be above 0 and at most 1", make_psf, data, **SKY, enclosed=1.5)
 
 
 def test_truncated_wings_are_said_and_the_kernel_has_unit_sum():
@@ -124,9 +122,7 @@ def test_truncated_wings_are_said_and_the_kernel_has_unit_sum():
     absolute = kernel_of(hi, lo, normalize=False)
     assert absolute.array.sum() == pytest.approx(lo.sum(), abs=1e-9)
     # known fractions stay as they are, without a warning
-    known = [
-        make_psf(d, pixel_scale=SCALE, frame="sky", enclosed=e) for d, e in ((hi, 0.96), (lo, 0.93))
-    ]
+    known = make_psf(hi, **SKY, enclosed=0.96), make_psf(lo, **SKY, enclosed=0.93)
     assert kernel_of(*known).array.sum() == pytest.approx(0.93)
     # scaled to 1 on their own grids, the wings alone show it: the light beyond the circle
     with pytest.warns(MiricigaleWarning, match="light beyond the PSFs' grids") as caught:
@@ -150,12 +146,9 @@ def test_exchanged_psfs_are_refused():
 
 def test_gridded_models_need_a_position():
     """By position: a kernel for each place."""
-    hi = gaussian_psf(0.1 * u.arcsec, pixel_scale=SCALE, fov=2 * u.arcsec)
-    wide = [0.28, 0.28, 0.36, 0.36]
-    grid = psf_grid(
-        [gaussian_psf(w * u.arcsec, pixel_scale=SCALE, fov=2 * u.arcsec) for w in wide],
-        [(0, 0), (0, 100), (100, 0), (100, 100)],
-    )
+    kind, widths = {"pixel_scale": SCALE, "fov": 2 * u.arcsec}, (0.1, 0.28, 0.28, 0.36, 0.36)
+    hi, *wide = (gaussian_psf(width * u.arcsec, **kind) for width in widths)
+    grid = psf_grid(wide, [(0, 0), (0, 100), (100, 0), (100, 100)])
     match = r"'lo' must be an ImagePSF or an array \(psf_at .*, got PSFGrid"
     refuses(match, kernel_of, hi, grid)
     gains = [kernel_of(hi, psf_at(grid, x, 30)).noise_gain for x in (0, 100)]

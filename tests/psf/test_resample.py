@@ -126,9 +126,8 @@ def test_image_is_the_model_evaluated():
 def test_drizzle_adds_the_drop_and_the_pixel():
     """Variances of boxes add: (native^2 + mosaic^2) / 12 per axis, at any angle."""
     psf = gaussian_psf(0.4 * u.arcsec, pixel_scale=0.11 * u.arcsec, fov=6 * u.arcsec)
-    detector = make_psf(
-        psf.data, pixel_scale=0.11 * u.arcsec, oversampling=4, frame="detector", includes=["pixel"]
-    )
+    kind = {"pixel_scale": 0.11 * u.arcsec, "oversampling": 4, "frame": "detector"}
+    detector = make_psf(psf.data, **kind, includes=["pixel"])
     for pixfrac in (1.0, 0.6):
         mosaic = psf_mosaic(detector, 0.06 * u.arcsec, 30 * u.deg, pixfrac=pixfrac)
         expected = 0.4**2 / (8 * np.log(2)) + ((0.11 * pixfrac) ** 2 + 0.06**2) / 12

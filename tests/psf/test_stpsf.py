@@ -1,4 +1,6 @@
 import os
+import sys
+import types
 from pathlib import Path
 
 import astropy.units as u
@@ -48,28 +50,16 @@ def data(tmp_path, monkeypatch):
 
 
 def test_says_what_is_missing(monkeypatch):
-    monkeypatch.delenv("STPSF_PATH", raising=False)
-    refuses("STPSF_PATH", stpsf_psf, "miri.f770w", error=DataError)
-    refuses("'n_psfs' must be a square number, got 3", stpsf_grid, "miri.f770w", n_psfs=3)
-
-
-def test_names_the_package_that_is_missing(monkeypatch):
-    import sys
-
-    monkeypatch.setenv("STPSF_PATH", "/nowhere")
-    monkeypatch.setitem(sys.modules, "stpsf", None)
-    refuses(r"miricigale\[stpsf\]", stpsf_psf, "miri.f770w", error=ImportError)
-
-
-def test_says_why_the_data_do_not_do(monkeypatch):
-    import sys
-    import types
-
     def refuse():
         msg = "STPSF data package has version 1.5.0, but 2.1.0 is needed.\nSee ..."
         raise OSError(msg)
 
+    monkeypatch.delenv("STPSF_PATH", raising=False)
+    refuses("STPSF_PATH", stpsf_psf, "miri.f770w", error=DataError)
+    refuses("'n_psfs' must be a square number, got 3", stpsf_grid, "miri.f770w", n_psfs=3)
     monkeypatch.setenv("STPSF_PATH", "/nowhere")
+    monkeypatch.setitem(sys.modules, "stpsf", None)
+    refuses(r"miricigale\[stpsf\]", stpsf_psf, "miri.f770w", error=ImportError)
     monkeypatch.setitem(sys.modules, "stpsf", types.SimpleNamespace(MIRI=refuse))
     match = r"cannot use the data of STPSF_PATH: .* 2\.1\.0 is needed\.$"
     refuses(match, stpsf_psf, "miri.f770w", error=DataError)

@@ -82,9 +82,8 @@ def test_sources_of_the_mosaic_are_masked_where_no_image_shows_them():
 
 def test_the_reducer_takes_backgrounds_of_dithers_in_its_second_pass():
     images, _, ripple = dithers()
-    reducer = Reducer(
-        background=BackgroundSettings("dithers"), mosaics=MosaicSettings(outlier_threshold=None)
-    )
+    mosaics = MosaicSettings(outlier_threshold=None)
+    reducer = Reducer(background=BackgroundSettings("dithers"), mosaics=mosaics)
     pairs = [reducer.subtract_background(im) for im in images]
     result = reducer.combine([im for im, _ in pairs], [b for _, b in pairs])
     assert not result.notes

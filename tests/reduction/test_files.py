@@ -10,7 +10,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses, warned
 from helpers.exposures import exposure_of, sky_of
-from helpers.real import real_file
 from helpers.references import imager_keywords, write_photom, write_reference
 from miricigale.detector import CosmicRays, Detector, Ramp
 from miricigale.instrument import DQ, ImageFacts
@@ -114,8 +113,8 @@ def test_what_was_done_to_a_rate_is_not_done_again(tmp_path, exposure):
 
 
 @pytest.mark.filterwarnings("ignore::astropy.wcs.FITSFixedWarning")
-def test_a_real_image_of_the_pipeline():
-    path = real_file(I2D)
+def test_a_real_image_of_the_pipeline(data_file):
+    path = data_file(I2D)
     (file,) = read_images(path)
     with fits.open(path) as hdus:
         assert_array_equal(file.image.data, hdus["SCI"].data)
@@ -139,8 +138,8 @@ def test_a_real_image_of_the_pipeline():
     assert tuple(note.split(" cannot")[0] for note in result.notes) == wanted
 
 
-def test_real_rates_of_integrations_and_their_mean():
-    path = real_file(RATEINTS)
+def test_real_rates_of_integrations_and_their_mean(data_file):
+    path = data_file(RATEINTS)
     files = read_images(path)
     with fits.open(path) as hdus:
         data, dq = hdus["SCI"].data, hdus["DQ"].data.astype(np.int64)

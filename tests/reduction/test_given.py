@@ -92,9 +92,8 @@ def test_a_method_stands_for_its_settings():
 
 
 def test_a_detector_of_defaults():
-    assert [type(effect) for effect in Detector().effects] == [
-        type(effect) for effect in Detector.miri_imager().effects
-    ]
+    plain, imager = (map(type, one.effects) for one in (Detector(), Detector.miri_imager()))
+    assert list(plain) == list(imager)
     assert Detector().gain == Detector().properties.gain
     with pytest.raises(AttributeError, match="Detector has no 'expse'; it has expose"):
         Detector().expse  # noqa: B018

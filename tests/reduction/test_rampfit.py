@@ -201,9 +201,8 @@ def test_maps_give_each_pixel_what_its_own_constants_give():
     usable = np.ones(shape, bool)
     usable[1, 1] = False
     maps["gain"][1, 1] = np.nan
-    assert_array_equal(
-        fitted(data, usable=usable, **{**options, **maps}).rate[usable], fit.rate[usable]
-    )
+    again = fitted(data, usable=usable, **{**options, **maps})
+    assert_array_equal(again.rate[usable], fit.rate[usable])
     refuses("'gain' must be positive, got 1 pixels", fitted, data, **{**options, **maps})
 
 

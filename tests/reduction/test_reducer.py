@@ -228,10 +228,8 @@ def test_refuses_what_does_not_belong_together():
     reducer = Reducer(properties=DetectorProperties())
     refuses("'images' must be at least one image, got none", Reducer().combine, [], [])
     refuses("'ramps' must be at least one ramp", reducer.run, [])
-    ramps = [
-        expose(5.0, exposure(n_groups=2, filt=f), without=[CosmicRays])
-        for f in ("miri.f770w", "miri.f1000w")
-    ]
+    exposures = [exposure(n_groups=2, filt=filt) for filt in ("miri.f770w", FILTER)]
+    ramps = [expose(5.0, one, without=[CosmicRays]) for one in exposures]
     refuses(r"'ramps' must be of one filter \(miri.f770w\)", reducer.run, ramps)
     bare = CCDData(np.ones((4, 4)), unit="adu / s", uncertainty=StdDevUncertainty(np.ones((4, 4))))
     refuses("'rate' must be an image whose meta has 'filter'", reducer.calibrate, bare)

@@ -8,7 +8,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses, warned
 from helpers.exposures import exposure_of, sky_of
-from helpers.real import real_file
 from helpers.references import nameless, write_photom, write_reference
 from miricigale.detector import CosmicRays, Detector, InterpixelCapacitance, Ramp, ResetAnomaly
 from miricigale.instrument import DQ, field_mask, flat_field, miri_detector, photmjsr
@@ -199,7 +198,7 @@ def test_what_a_file_had_done_to_it_is_not_done_twice(exposure, real, references
     assert set(steps) <= set(rest.meta["steps"])
 
 
-def test_files_for_something_else_are_refused(exposure, real, references, tmp_path):
+def test_files_for_something_else_are_refused(exposure, real, references, data_file, tmp_path):
     def refused(name, kind, array, match, **keywords):
         path = write_reference(tmp_path / f"{kind}.fits", kind, exposure, array, **keywords)
         reducer = Reducer(references=references.replace(**{name: path}))
@@ -215,7 +214,7 @@ def test_files_for_something_else_are_refused(exposure, real, references, tmp_pa
     refused("dark", "dark", few, "it has 12 groups, and the ramp 30")
     refused("linearity", "linearity", flat, "must hold coefficients")
     # a real one, of another part of the detector
-    path = real_file("miri_facts/jwst_miri_readnoise_SLITLESSPRISM.fits")
+    path = data_file("miri_facts/jwst_miri_readnoise_SLITLESSPRISM.fits")
     with pytest.raises(DataError, match="and not SUB256"):
         Reducer(references=references.replace(read_noise=path)).fit_ramp(real)
     refuses("'gain' must be the path of a file, got nowhere", ReferenceFiles, gain="nowhere.fits")
