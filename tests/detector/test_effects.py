@@ -2,6 +2,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 
 from helpers.errors import refuses
@@ -13,10 +14,15 @@ from miricigale.detector import (
     CosmicRays,
     Dark,
     Detector,
+    FirstFrame,
     InterpixelCapacitance,
+    LastFrame,
     Nonlinearity,
+    Persistence,
     ReadNoise,
     ReferencePixels,
+    ResetAnomaly,
+    ResetDecay,
     Residual,
     Saturation,
 )
@@ -104,7 +110,7 @@ def test_bad_and_reference_pixels(make_block):
     ramp = np.full(block.ramp_shape, 100, np.float32)
     ramp = ReferencePixels().apply(BadPixels(hot_current=1e4).apply(ramp, block), block)
     bad = bad_pixel_mask()
-    np.testing.assert_array_equal(block.pixel_dq & DQ.DO_NOT_USE != 0, bad)
+    assert_array_equal(block.pixel_dq & DQ.DO_NOT_USE != 0, bad)
     assert np.all(ramp[:, :, block.pixel_dq & DQ.DEAD != 0] == 0)
     assert np.all(ramp[:, -1][:, block.pixel_dq & DQ.HOT != 0] > 1e5)
     reference = block.pixel_dq & DQ.REFERENCE_PIXEL != 0
@@ -126,14 +132,13 @@ def test_saturation_stops_and_flags(make_block):
 def test_linearize_undoes_the_nonlinearity(make_block):
     block = make_block(n_groups=2)
     electrons = np.linspace(0, 210e3, 2 * 64 * 72)
-    ramp = Nonlinearity().apply(electrons.astype(np.float32).reshape(block.ramp_shape), block)
+    charge = electrons.astype(np.float32).reshape(block.ramp_shape)
+    ramp = Nonlinearity().apply(charge.copy(), block)
     assert np.all(ramp.ravel()[1:] <= electrons[1:] / 4)
     linear = miri_detector().linearize(ramp).ravel()
-    np.testing.assert_allclose(linear, electrons / 4, atol=0.02)
-    ramp = Nonlinearity(linear=True).apply(
-        electrons.astype(np.float32).reshape(block.ramp_shape), block
-    )
-    np.testing.assert_allclose(ramp.ravel(), electrons / 4, atol=0.01)
+    assert_allclose(linear, electrons / 4, atol=0.02)
+    ramp = Nonlinearity(linear=True).apply(charge.copy(), block)
+    assert_allclose(ramp.ravel(), electrons / 4, atol=0.01)
 
 
 def test_bias_and_reset_noise(make_block):
@@ -152,7 +157,7 @@ def test_read_noise(make_block):
     ramp = ReadNoise().apply(empty(block), block)
     assert ramp.std() == pytest.approx(6, rel=5 / np.sqrt(2 * ramp.size))
     pink = ReadNoise(sigma=0, pink=3.0).apply(empty(block), block)
-    np.testing.assert_array_equal(pink[..., 0], pink[..., 4])
+    assert_array_equal(pink[..., 0], pink[..., 4])
 
 
 def test_pink_noise_has_as_much_power_in_every_octave(make_block):
@@ -163,7 +168,7 @@ def test_pink_noise_has_as_much_power_in_every_octave(make_block):
     lags = 2 ** np.arange(9)
     growth = np.diff([np.mean((drift[lag:] - drift[:-lag]) ** 2) for lag in lags])
     # two rows share what changes more slowly than they are apart: 2 sigma^2 / 16 an octave
-    np.testing.assert_allclose(growth, 2 * 4.0**2 / 16, rtol=0.15)
+    assert_allclose(growth, 2 * 4.0**2 / 16, rtol=0.15)
     # the slowest octaves, 32768 rows long, are drawn 8 times for each of 4 outputs
     assert drift.std() == pytest.approx(4.0, rel=0.1)
 
@@ -171,13 +176,11 @@ def test_pink_noise_has_as_much_power_in_every_octave(make_block):
 def test_coupling_keeps_a_flat_field_and_spreads_a_point(make_block):
     block = make_block(n_groups=2)
     flat = InterpixelCapacitance().apply(np.full(block.ramp_shape, 1000, np.float32), block)
-    np.testing.assert_allclose(flat, 1000, rtol=1e-6)
+    assert_allclose(flat, 1000, rtol=1e-6)
     ramp = empty(block)
     ramp[:, :, 30, 40] = 1000
     ramp = InterpixelCapacitance().apply(ramp, block)
-    np.testing.assert_allclose(
-        ramp[0, 0, 29:32, 39:42] / 1000, miri_detector().ipc_kernel, rtol=1e-6
-    )
+    assert_allclose(ramp[0, 0, 29:32, 39:42] / 1000, miri_detector().ipc_kernel, rtol=1e-6)
 
 
 @pytest.mark.parametrize("correlation", [0.0, 1.0, 3.0])
@@ -186,14 +189,14 @@ def test_residual_is_fixed_on_the_detector(make_block, correlation):
     one, two = make_block(seed=1, subarray="SUB256"), make_block(seed=2, subarray="SUB256")
     light = np.full(one.exposure.shape, 100.0)
     pattern = effect.apply(light, one)
-    np.testing.assert_array_equal(pattern, effect.apply(light, two))
+    assert_array_equal(pattern, effect.apply(light, two))
     n_independent = light.size / max(1, 4 * np.pi * correlation**2)
     assert pattern.std() == pytest.approx(1, rel=5 / np.sqrt(2 * n_independent))
     other = make_block("miri.f1000w", subarray="SUB256")
     assert np.abs(effect.apply(light, other) - pattern).max() > 1
     # and it does not know blocks
     part = Block(one.exposure, one.properties, slice(50, 60), None, None, one.key)
-    np.testing.assert_allclose(effect.apply(light[50:60], part), pattern[50:60], rtol=1e-12)
+    assert_allclose(effect.apply(light[50:60], part), pattern[50:60], rtol=1e-12)
 
 
 @pytest.mark.parametrize("correlation", [0.0, 1.3])
@@ -205,7 +208,7 @@ def test_sub_arrays_see_their_part_of_the_residual(make_block, subarray, correla
     full, part = make_block(subarray="FULL", n_groups=2), make_block(subarray=subarray, n_groups=2)
     whole = effect.apply(np.ones(full.exposure.shape), full)
     own = effect.apply(np.ones(part.exposure.shape), part)
-    np.testing.assert_allclose(own - 1, whole[rows, columns] - 1, rtol=1e-9, atol=1e-14)
+    assert_allclose(own - 1, whole[rows, columns] - 1, rtol=1e-9, atol=1e-14)
 
 
 @pytest.mark.parametrize("name", ["miri.f560w", "miri.f2550w"])
@@ -219,26 +222,27 @@ def test_residual_by_name_has_the_amplitude_of_the_filter(make_block, name):
     refuses("no residual preset 'flat'; known: etc", Residual, "flat", error=KeyError)
 
 
-@pytest.mark.parametrize(
-    ("effect", "name"),
-    [
-        (lambda: Residual(0.5), "amplitude"),
-        (lambda: Residual(0.01, correlation=-1), "correlation"),
-        (lambda: CosmicRays(leakage=0.3), "leakage"),
-        (lambda: CosmicRays(shower_fraction=2), "shower_fraction"),
-        (lambda: CosmicRays(track_max=1000), "track_max"),
-        (lambda: CosmicRays(flux=-1.0), "flux"),
-        (lambda: CosmicRays(yield_dex=np.nan), "yield_dex"),
-        (lambda: CosmicRays(shower_sigma=0), "shower_sigma"),
-        (lambda: Dark(current=-0.2), "current"),
-        (lambda: BadPixels(hot_current=np.inf), "hot_current"),
-        (lambda: Saturation(full_well=0), "full_well"),
-        (lambda: Bias(level=np.nan), "level"),
-        (lambda: Bias(reset_noise=-1), "reset_noise"),
-        (lambda: ReadNoise(sigma=-6), "sigma"),
-        (lambda: ReadNoise(pink=np.nan), "pink"),
-        (lambda: ReadNoise(octaves=0), "octaves"),
-    ],
-)
-def test_errors_name_the_argument(effect, name):
-    refuses(f"'{name}' must be", effect)
+#: Values out of range, by effect and argument.
+WRONG = {
+    Residual: {"amplitude": [0.5], "correlation": [-1]},
+    CosmicRays: {"leakage": [0.3], "shower_fraction": [2], "track_max": [1000], "flux": [-1.0],
+                 "yield_dex": [np.nan], "shower_sigma": [0]},
+    Dark: {"current": [-0.2]},
+    BadPixels: {"hot_current": [np.inf]},
+    Saturation: {"full_well": [0]},
+    Bias: {"level": [np.nan], "reset_noise": [-1]},
+    ReadNoise: {"sigma": [-6], "pink": [np.nan], "octaves": [0]},
+    Persistence: {"amplitudes": [(-0.1, 0.2)], "times": [(0, 1)]},
+    ResetAnomaly: {"amplitudes": [(), (np.nan,)], "groups": [0]},
+    ResetDecay: {"share": [1.0], "groups": [np.nan]},
+    FirstFrame: {"offset": [np.inf]},
+    LastFrame: {"coupling": [1.5], "offset": [np.nan]},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("effect", WRONG)
+def test_errors_name_the_argument(effect):
+    needed = {"amplitude": 0.01} if effect is Residual else {}
+    for name, values in WRONG[effect].items():
+        for value in values:
+            refuses(f"'{name}' must be", effect, **{**needed, name: value})

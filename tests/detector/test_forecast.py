@@ -4,8 +4,9 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
+from numpy.testing import assert_allclose, assert_array_equal
 
-from helpers.errors import refuses
+from helpers.errors import refuses, warned
 from miricigale.depth import forecast_table
 from miricigale.depth.saturation import NEVER, saturation_group
 from miricigale.detector import (
@@ -59,7 +60,7 @@ def test_it_is_the_closed_form(make_exposure, make_sky, plain):
     assert told.sky_group == 150
     assert told.sources["group"].tolist() == [5, 21, 0]
     assert told.sources["saturated"].tolist() == [True, True, False]
-    np.testing.assert_allclose(told.sources["peak_fraction"], [30 / 4.5, 30 / 20.2, 30 / 31])
+    assert_allclose(told.sources["peak_fraction"], [30 / 4.5, 30 / 20.2, 30 / 31])
     assert told.saturated["id"].tolist() == [100, 101]
     assert told.n_pixels == 2
     assert "sky fills 20 % of the well; saturated: 2 pixel(s), 2 source(s)" in told.describe()
@@ -89,7 +90,7 @@ def test_the_exposure_saturates_as_told(make_exposure, make_sky):
     assert np.count_nonzero(clear) > 100
     assert 20 < np.count_nonzero(told.sources["saturated"][clear]) < np.count_nonzero(clear) - 20
     for integration in first:
-        np.testing.assert_array_equal(integration[clear], told.sources["group"][clear])
+        assert_array_equal(integration[clear], told.sources["group"][clear])
     assert np.any(first[0][use] > 1)
     # and all of the pixels that fill, not those of sources alone
     assert abs(np.count_nonzero(full[0, -1]) - told.n_pixels) <= np.count_nonzero(use & ~clear)
@@ -119,8 +120,7 @@ def test_flat_dark_and_bad_pixels(make_exposure, make_sky):
     expected = 100.0 / photmjsr(FILTER) * gain * flat + dark
     assert told.sky_rate.to_value("electron / s") == pytest.approx(expected, rel=1e-3)
     # light beyond all measure fills every pixel that counts
-    with pytest.warns(MiricigaleWarning, match="of the full well"):
-        told = detector.forecast(make_sky(exposure, 1e8), exposure)
+    told = warned("of the full well", detector.forecast, make_sky(exposure, 1e8), exposure)
     ramp = detector.expose(make_sky(exposure, 1.0), exposure, seed=0)
     assert told.n_pixels == np.count_nonzero(ramp.pixel_dq == 0)
 
@@ -151,9 +151,8 @@ def test_sources_off_the_image_and_without_a_place(make_exposure, make_sky, plai
     exposure = make_exposure(n_groups=3)
     sky = make_sky(exposure, 1.0)
     nx = exposure.shape[1]
-    told = plain.forecast(
-        sky, exposure, sources=sources_at([-0.6, -0.4, nx - 0.6, nx, np.nan], [1.0, 1, 1, 1, 1])
-    )
+    there = sources_at([-0.6, -0.4, nx - 0.6, nx, np.nan], [1.0, 1, 1, 1, 1])
+    told = plain.forecast(sky, exposure, sources=there)
     assert told.sources["id"].tolist() == [101, 102]
     assert len(plain.forecast(sky, exposure).sources) == 0
     refuses("'sources' must", plain.forecast, sky, exposure, sources=QTable({"id": [1]}))

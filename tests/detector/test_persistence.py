@@ -3,6 +3,7 @@
 import astropy.units as u
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from scipy.integrate import quad
 
 from helpers.errors import refuses
@@ -41,8 +42,8 @@ def test_nothing_before_leaves_nothing(make_exposure, make_sky):
     plain = Detector.miri_imager().expose(sky, exposure, seed=2)
     for previous in (None, [], latent_of(exposure, 0.0)):
         ramp = with_effect.expose(sky, exposure, seed=2, previous=previous)
-        np.testing.assert_array_equal(ramp.data, plain.data)
-        np.testing.assert_array_equal(ramp.group_dq, plain.group_dq)
+        assert_array_equal(ramp.data, plain.data)
+        assert_array_equal(ramp.group_dq, plain.group_dq)
 
 
 def test_what_comes_free_is_the_integral_of_the_decay(make_exposure):
@@ -79,20 +80,15 @@ def test_the_ramp_follows_the_decay(make_exposure, make_sky):
     assert variance == pytest.approx(expected[0, -1], rel=5 * np.sqrt(2 / got[0, 0].size))
 
 
-def test_it_is_linear_in_what_was_before(make_exposure, make_sky):
+def test_several_exposures_add_up(make_exposure, make_sky):
     exposure = make_exposure(n_groups=4, subarray="SUB256")
     sky, effect = make_sky(exposure, 0.0), Persistence(amplitudes=(0.01,), times=(5.0,))
-    means = [
-        counts(exposure, sky, effect, latent_of(exposure, rate))[0, -1].mean()
-        for rate in (5e4, 1e5, 2e5)
-    ]
     unit = effect.released(exposure, 10 * u.s)[0].sum()
-    for rate, mean in zip((5e4, 1e5, 2e5), means, strict=True):
-        assert mean == pytest.approx(rate * unit, abs=5 * np.sqrt(rate * unit / 256**2))
-    # several exposures add up
-    two = [latent_of(exposure, 1e5), latent_of(exposure, 5e4)]
-    total = counts(exposure, sky, effect, two)[0, -1].mean()
-    assert total == pytest.approx(1.5e5 * unit, abs=5 * np.sqrt(1.5e5 * unit / 256**2))
+    for rates in ([5e4], [2e5], [1e5, 5e4]):
+        previous = [latent_of(exposure, rate) for rate in rates]
+        mean = counts(exposure, sky, effect, previous)[0, -1].mean()
+        expected = sum(rates) * unit
+        assert mean == pytest.approx(expected, abs=5 * np.sqrt(expected / 256**2))
 
 
 def test_a_saturated_star_comes_back_in_the_next_exposure(make_exposure, make_sky):
@@ -120,9 +116,8 @@ def test_a_saturated_star_comes_back_in_the_next_exposure(make_exposure, make_sk
 
 def test_reference_and_bad_pixels_are_not_remembered(make_exposure, make_sky):
     exposure = make_exposure(n_groups=3, subarray="SUB64")
-    ramp = (
-        Detector.miri_imager().without(CosmicRays).expose(make_sky(exposure, 2e4), exposure, seed=0)
-    )
+    detector = Detector.miri_imager().without(CosmicRays)
+    ramp = detector.expose(make_sky(exposure, 2e4), exposure, seed=0)
     latent = Latent.from_ramp(ramp, 1 * u.s, threshold=0)
     out = ramp.pixel_dq & np.uint32(DQ.REFERENCE_PIXEL | DQ.DO_NOT_USE) != 0
     assert out.any()
@@ -149,16 +144,5 @@ def test_refuses_what_cannot_be_remembered(make_exposure, make_sky):
     refuses("'rate' must be nowhere negative", Latent, np.array([[-1.0]]) * RATE, 1 * u.s)
     refuses("'gap' must be at least 0 s", Latent, np.ones((2, 2)) * RATE, -1 * u.s)
     refuses("'gap'", Latent, np.ones((2, 2)) * RATE, 1 * u.m, error=u.UnitsError)
-
-
-@pytest.mark.parametrize(
-    ("options", "name"),
-    [
-        ({"amplitudes": (0.1, 0.2, 0.3)}, "amplitudes, times"),
-        ({"amplitudes": (), "times": ()}, "amplitudes, times"),
-        ({"amplitudes": (-0.1, 0.2)}, "amplitudes"),
-        ({"times": (0, 1)}, "times"),
-    ],
-)
-def test_errors_name_the_argument(options, name):
-    refuses(f"'{name}' must be", Persistence, **options)
+    for amplitudes in ((0.1, 0.2, 0.3), ()):
+        refuses("'amplitudes, times' must be", Persistence, amplitudes, amplitudes[:2])

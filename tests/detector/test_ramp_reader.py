@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.time import Time
+from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
-from helpers.real import real_file
+from helpers.references import POINTED, imager_keywords
 from miricigale.detector import Detector, Ramp, ramp_reader
 from miricigale.instrument import DQ
 from miricigale.utils.exceptions import DataError
@@ -15,9 +16,9 @@ from miricigale.utils.exceptions import DataError
 GROUND = "real/ramps/MIRI_5582_89_S_20180308-010230_SCE1_pipe.fits.gz"
 
 
-def stage(path, *, steps=("S_DQINIT", "S_SATURA", "S_LINEAR"), shape=(2, 4, 64, 72), primary=None):
+def stage(path):
     """A file as a step of the pipeline would save it: floats, with flags."""
-    rng = np.random.default_rng(1)
+    rng, shape = np.random.default_rng(1), (2, 4, 64, 72)
     data = rng.normal(12000, 5, shape).astype(np.float32)
     pixel_dq = np.zeros(shape[2:], np.uint32)
     pixel_dq[5, 6] = DQ.HOT | DQ.DO_NOT_USE
@@ -26,26 +27,11 @@ def stage(path, *, steps=("S_DQINIT", "S_SATURA", "S_LINEAR"), shape=(2, 4, 64, 
     group_dq[:, -1] = DQ.DO_NOT_USE
     hdus = fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(data, name="SCI")])
     hdus += [fits.ImageHDU(pixel_dq, name="PIXELDQ"), fits.ImageHDU(group_dq, name="GROUPDQ")]
-    hdus[0].header.update(
-        {
-            "INSTRUME": "MIRI",
-            "DETECTOR": "MIRIMAGE",
-            "EXP_TYPE": "MIR_IMAGE",
-            "FILTER": "F560W",
-            "READPATT": "FASTR1",
-            "SUBARRAY": "SUB64",
-            "NINTS": 10,
-            "INTSTART": 5,
-            "INTEND": 6,
-            "NGROUPS": shape[1],
-            "TGROUP": 0.0851,
-            "DATE-OBS": "2022-07-01",
-            **dict.fromkeys(steps, "COMPLETE"),
-            "S_DARK": "SKIPPED",
-            **(primary or {}),
-        }
-    )
-    hdus[1].header.update({"RA_REF": 214.9, "DEC_REF": 52.9, "ROLL_REF": 120.0})
+    steps = dict.fromkeys(("S_DQINIT", "S_SATURA", "S_LINEAR"), "COMPLETE") | {"S_DARK": "SKIPPED"}
+    given = {"INTSTART": 5, "INTEND": 6, "TGROUP": 0.0851, "DATE-OBS": "2022-07-01", **steps}
+    given |= {"FILTER": "F560W", "DETECTOR": "MIRIMAGE", "NINTS": 10}
+    hdus[0].header.update(imager_keywords(**given))
+    hdus[1].header.update(POINTED)
     hdus.writeto(path)
     return data, pixel_dq, group_dq
 
@@ -54,9 +40,9 @@ def test_reads_what_a_step_of_the_pipeline_saved(tmp_path):
     path = tmp_path / "jw_linearity.fits"
     data, pixel_dq, group_dq = stage(path)
     ramp = Ramp.read(path)
-    np.testing.assert_array_equal(ramp.data, data)
-    np.testing.assert_array_equal(ramp.group_dq, group_dq)
-    np.testing.assert_array_equal(ramp.pixel_dq[:, 4:], pixel_dq[:, 4:])
+    assert_array_equal(ramp.data, data)
+    assert_array_equal(ramp.group_dq, group_dq)
+    assert_array_equal(ramp.pixel_dq[:, 4:], pixel_dq[:, 4:])
     assert np.all(ramp.pixel_dq[:, :4] & DQ.REFERENCE_PIXEL)
     assert ramp.steps == {"dq_init", "saturation", "linearity"}
     assert not ramp.simulated
@@ -64,7 +50,7 @@ def test_reads_what_a_step_of_the_pipeline_saved(tmp_path):
     assert ramp.group_time == 0.0851
     assert ramp.header["DATE-OBS"] == "2022-07-01"
     second = ramp.integration(1)
-    np.testing.assert_array_equal(second.data[0], data[1])
+    assert_array_equal(second.data[0], data[1])
     assert second.exposure.n_integrations == 1
     assert second.steps == ramp.steps
     refuses("'number' must be from 0 to 1, got 2", ramp.integration, 2)
@@ -92,18 +78,28 @@ def test_exposures_larger_than_the_memory_are_refused_before_they_begin(
         Detector.miri_imager().expose(make_sky(exposure, 1.0), exposure, seed=1)
 
 
-def test_a_ramp_of_a_ground_test():
+def test_a_ramp_of_a_ground_test(data_file, tmp_path):
     # 5 integrations of 50 groups, without filter, pointing, instrument and kind of exposure
-    path = real_file(GROUND)
+    path = data_file(GROUND)
     ramp = Ramp.read(path)
     with fits.open(path) as hdus:
-        np.testing.assert_array_equal(ramp.data, hdus["SCI"].data)
+        assert_array_equal(ramp.data, hdus["SCI"].data)
     exposure = ramp.exposure
     assert (exposure.filter, exposure.pointing, exposure.wcs) == (None, None, None)
     assert (exposure.readout, exposure.subarray) == ("FASTR1", "SUB64")
     assert ramp.group_time == 0.085
-    assert not ramp.simulated
     refuses("'exposure' must be one with a filter, got None", exposure.pointing_keywords)
+    # its keywords stay
+    path = ramp.write(tmp_path / "jpl_uncal.fits")
+    with fits.open(path) as hdus:
+        header = hdus[0].header
+        assert (header["ORIGIN"], header["FILENAME"]) == ("JPL", "jpl_uncal.fits")
+        assert "FILTER" not in header
+        assert hdus[-1].name == "ASDF"
+    back = Ramp.read(path)
+    assert not ramp.simulated
+    assert not back.simulated
+    assert_array_equal(back.data, ramp.data)
 
 
 def test_an_exposure_of_nothing_is_not_simulated(make_exposure, make_sky):
@@ -138,20 +134,6 @@ def test_flags_of_another_shape_are_refused(tmp_path):
     refuses(r"flags of shape \(2, 4, 64, 72\) in GROUPDQ", Ramp.read, path, error=DataError)
 
 
-def test_a_real_ramp_keeps_its_keywords(tmp_path):
-    ramp = Ramp.read(real_file(GROUND))
-    path = ramp.write(tmp_path / "jpl_uncal.fits")
-    with fits.open(path) as hdus:
-        header = hdus[0].header
-        assert header["ORIGIN"] == "JPL"
-        assert header["FILENAME"] == "jpl_uncal.fits"
-        assert "FILTER" not in header
-        assert hdus[-1].name == "ASDF"
-    back = Ramp.read(path)
-    assert not back.simulated
-    np.testing.assert_array_equal(back.data, ramp.data)
-
-
 def test_times_of_the_integrations(make_exposure, make_sky, tmp_path):
     exposure = make_exposure(n_groups=5, n_integrations=3)
     start = Time("2023-01-02T03:04:05", scale="utc")
@@ -159,11 +141,11 @@ def test_times_of_the_integrations(make_exposure, make_sky, tmp_path):
     path = ramp.write(tmp_path / "a_uncal.fits", start=start)
     with fits.open(path) as hdus:
         table, header = hdus["INT_TIMES"].data, hdus[0].header
-        np.testing.assert_array_equal(table["integration_number"], [1, 2, 3])
+        assert_array_equal(table["integration_number"], [1, 2, 3])
         begin, end = table["int_start_MJD_UTC"], table["int_end_MJD_UTC"]
         # five frames, and one for the reset between integrations
         frame = exposure.frame_time.to_value("day")
-        np.testing.assert_allclose(end - begin, 5 * frame, rtol=1e-5)
-        np.testing.assert_allclose(np.diff(begin), 6 * frame, rtol=1e-5)
+        assert_allclose(end - begin, 5 * frame, rtol=1e-5)
+        assert_allclose(np.diff(begin), 6 * frame, rtol=1e-5)
         assert begin[0] == pytest.approx(start.mjd, abs=1e-9)
         assert end[-1] == pytest.approx(header["EXPEND"], abs=1e-9)

@@ -5,7 +5,7 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData, StdDevUncertainty
 
-from miricigale.instrument import Exposure
+from miricigale.instrument import Exposure, imager_wcs
 
 FIELD = SkyCoord(53.1344, -27.8344, unit="deg")
 
@@ -14,6 +14,16 @@ def exposure_of(band="miri.f1000w", **options):
     """An exposure of the field, of SUB256 unless ``options`` say otherwise."""
     options = {"subarray": "SUB256", "pointing": FIELD, "roll": 30 * u.deg, **options}
     return Exposure(band, **options)
+
+
+def imager_part(pointing, origin, shape, angle=30.0):
+    """Coordinates of a part of the distorted imager."""
+    wcs = imager_wcs(pointing, angle * u.deg)
+    wcs.wcs.crpix = wcs.wcs.crpix - origin
+    wcs.sip = type(wcs.sip)(wcs.sip.a, wcs.sip.b, wcs.sip.ap, wcs.sip.bp, wcs.wcs.crpix)
+    wcs.pixel_shape = shape[::-1]
+    wcs.wcs.set()
+    return wcs
 
 
 def sky_of(exposure, light, **meta):

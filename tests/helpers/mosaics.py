@@ -113,3 +113,8 @@ def pair(sky, flux, size, shapes, sigmas, rng):
         picture(sky, flux, (n, n), scale=scale, width=np.hypot(psf, size), sigma=sigma, rng=rng)
         for scale, psf, n, sigma in forms
     ]
+
+
+def flagged(flags, flag):
+    """Which sources have a flag."""
+    return (np.asarray(flags) & int(flag)) != 0

@@ -3,9 +3,10 @@
 import numpy as np
 from astropy.io import fits
 
+from miricigale.detector import Ramp
 from miricigale.instrument import DQ
 
-__all__ = ["KINDS", "write_cache", "write_reference"]
+__all__ = ["KINDS", "POINTED", "imager_keywords", "nameless", "write_cache", "write_reference"]
 
 #: Reference types and the extension of their arrays.
 KINDS = {
@@ -19,6 +20,19 @@ KINDS = {
     "readnoise": "SCI",
     "flat": "SCI",
 }
+
+
+#: Where a file of the imager points.
+POINTED = {"RA_REF": 214.9, "DEC_REF": 52.9, "ROLL_REF": 120.0}
+
+
+def imager_keywords(**changes):
+    """What a file of the imager needs in its header, but for these."""
+    known = {
+        "INSTRUME": "MIRI", "EXP_TYPE": "MIR_IMAGE", "FILTER": "F770W", "READPATT": "FASTR1",
+        "SUBARRAY": "SUB64", "NINTS": 1, "NGROUPS": 4,
+    }  # fmt: skip
+    return known | changes
 
 
 def write_reference(path, kind, exposure, array=None, *, dq=None, legend=None, **keywords):
@@ -114,3 +128,11 @@ def write_cache(folder, rules, *, context="jwst_0001.pmap"):
     del header["instrument"]
     write(context, header, f"{{\n    'MIRI' : {imap!r},\n}}")
     return folder
+
+
+def nameless(ramp, folder):
+    """A ramp from a file that does not tell who made it."""
+    with fits.open(ramp.write(folder / "jw_uncal.fits")) as hdus:
+        kept = fits.HDUList([hdu for hdu in hdus if not hdu.name.startswith("SIM_")])
+        kept.writeto(folder / "other_uncal.fits")
+    return Ramp.read(folder / "other_uncal.fits")

@@ -12,6 +12,7 @@ import pytest
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
+from helpers.scenes import catalog_at
 from miricigale.detector import Detector
 from miricigale.instrument import Exposure, pixel_to_sky
 from miricigale.psf import miri_psf
@@ -65,27 +66,18 @@ def run_stage(stage, folder, files, crds, *, keep_ramp=False):
 
 def star_field(base, x, y, flux):
     """Stars on given pixels of an exposure."""
-    n = len(x)
-    table = QTable({"id": np.arange(1, n + 1)})
-    table["sky"] = pixel_to_sky(x, y, base.pointing, base.roll, subarray=base.subarray)
-    table["redshift"] = np.zeros(n)
-    table["profile"] = np.full(n, "point")
-    table["half_light_radius"] = np.zeros(n) * u.arcsec
-    table["sersic_index"] = table["axis_ratio"] = np.ones(n)
-    table["position_angle"] = np.zeros(n) * u.deg
-    table[base.filter] = flux * u.uJy
-    return table
+    sky = pixel_to_sky(x, y, base.pointing, base.roll, subarray=base.subarray)
+    return catalog_at(sky, redshift=0.0, **{base.filter: flux * u.uJy})
 
 
 def observe(exposures, catalog, folder, *, detector=None):
     """Scene, detector, file: our own part of the chain, at its defaults."""
     psf = miri_psf(exposures[0].filter)
     background = Background.low_zodi(exposures[0].filter, center=exposures[0].pointing)
-    detector = Detector.miri_imager() if detector is None else detector
+    detector = detector or Detector.miri_imager()
     for exposure in exposures:
-        scene = Scene(
-            catalog, filter=exposure.filter, wcs=exposure.wcs, psf=psf, background=background
-        )
+        form = {"filter": exposure.filter, "wcs": exposure.wcs, "psf": psf}
+        scene = Scene(catalog, background=background, **form)
         image = scene.render()
         ramp = detector.expose(image, exposure, seed=20)
         path = ramp.write(folder / f"simulated_{exposure.dither + 1}_uncal.fits")

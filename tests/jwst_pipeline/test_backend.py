@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
-from astropy.io import fits
+from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
 from helpers.exposures import exposure_of, sky_of
+from helpers.references import nameless
 from miricigale.detector import Detector, FirstFrame, LastFrame, Ramp, ResetAnomaly
 from miricigale.instrument import DQ, flat_field, miri_detector, photmjsr
 from miricigale.reduction import Reducer, ReferenceFiles
@@ -49,7 +50,7 @@ def test_it_gives_the_rates_and_their_errors(exposure, sky, ramp):
     for these in (good & (sky.data < 2 * SKY), good & (sky.data > 2 * SKY)):
         assert rate.image.data[these].sum() == pytest.approx(truth[these].sum(), rel=5e-3)
     total = rate.planes["VAR_POISSON"] + rate.planes["VAR_RNOISE"]
-    np.testing.assert_allclose(total[good], rate.image.uncertainty.array[good] ** 2, rtol=1e-3)
+    assert_allclose(total[good], rate.image.uncertainty.array[good] ** 2, rtol=1e-3)
     assert rate.image.meta["reference_gain"] == "4 e-/DN of the simulated detector"
     # what comes after does not know the difference
     image, background = Reducer(backend="jwst").subtract_background(Reducer().calibrate(rate.image))
@@ -93,11 +94,7 @@ def test_references_and_resets_are_those_of_the_settings(exposure, sky, tmp_path
     assert 0.95 < np.std(pull) < 1.1
     assert abs(np.mean(pull)) < 0.03
     # a file that does not say who made it
-    path = ramp.write(tmp_path / "jw_uncal.fits")
-    with fits.open(path) as hdus:
-        kept = fits.HDUList([h for h in hdus if not h.name.startswith("SIM_")])
-        kept.writeto(tmp_path / "other_uncal.fits")
-    real = Ramp.read(tmp_path / "other_uncal.fits")
+    real = nameless(ramp, tmp_path)
     refuses("'references' must be given for slopes", Reducer(backend="jwst").fit_ramp, real)
     files = ReferenceFiles(gain=other.gain, read_noise=other.read_noise, incomplete=True)
     with pytest.warns(UserWarning, match="slopes without references for mask, saturation"):

@@ -14,6 +14,7 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 from astropy.wcs import WCS
+from numpy.testing import assert_allclose
 from photutils.aperture import CircularAnnulus, CircularAperture, aperture_photometry
 from photutils.centroids import centroid_2dg, centroid_sources
 from photutils.psf import ImagePSF, PSFPhotometry
@@ -124,8 +125,8 @@ def test_image2_has_our_world_coordinates(folder, observations, image2):
             with datamodels.open(each.product(folder, "cal")) as model:
                 sky = each.truth["sky"]
                 x, y = model.meta.wcs.world_to_pixel_values(sky.ra.deg, sky.dec.deg)
-        np.testing.assert_allclose(x, each.truth["x"], atol=1e-3)
-        np.testing.assert_allclose(y, each.truth["y"], atol=1e-3)
+        assert_allclose(x, each.truth["x"], atol=1e-3)
+        assert_allclose(y, each.truth["y"], atol=1e-3)
 
 
 def test_image2_gives_surface_brightness_positions_and_fluxes(folder, observations, image2, psf):
@@ -143,20 +144,14 @@ def test_image2_gives_surface_brightness_positions_and_fluxes(folder, observatio
         assert data[use].sum() == pytest.approx(each.light[use].sum(), rel=2e-3)
         # brightness times the local area is light: the calibration file's map says which
         area = header["PIXAR_SR"] * fits.getdata(path, "AREA")
-        np.testing.assert_allclose(
-            area, pixel_area_map(each.exposure.wcs, each.exposure.shape), rtol=1e-5
-        )
+        assert_allclose(area, pixel_area_map(each.exposure.wcs, each.exposure.shape), rtol=1e-5)
         unusable = ~use | ~np.isfinite(data)
         light = np.where(unusable, 0.0, data - each.sky) * area * 1e12
         truth = each.truth
-        fit = PSFPhotometry(core, (9, 9))(
-            light,
-            error=np.where(unusable, np.inf, error * area * 1e12),
-            mask=unusable,
-            init_params=Table(
-                {"x": truth["x"], "y": truth["y"], "flux": truth["flux_total"].value}
-            ),
-        )
+        start = Table({"x": truth["x"], "y": truth["y"], "flux": truth["flux_total"].value})
+        error = np.where(unusable, np.inf, error * area * 1e12)
+        measure = PSFPhotometry(core, (9, 9))
+        fit = measure(light, error=error, mask=unusable, init_params=start)
         assert np.all(np.hypot(fit["x_fit"] - truth["x"], fit["y_fit"] - truth["y"]) < 0.03)
         ratio = fit["flux_fit"] / truth["flux_total"].value
         assert np.mean(ratio) == pytest.approx(1, abs=5e-3)
@@ -201,6 +196,6 @@ def test_image3_conserves_the_fluxes(folder, observations, mosaic, psf):
     ratio = flux / observations[0].truth["flux_total"].value
     spoilt = core_taken_for_outlier(folder, observations)
     assert np.mean(spoilt) < 0.05
-    np.testing.assert_allclose(ratio[~spoilt], 1, atol=0.01)
-    np.testing.assert_allclose(ratio[spoilt], 1, atol=0.03)
+    assert_allclose(ratio[~spoilt], 1, atol=0.01)
+    assert_allclose(ratio[spoilt], 1, atol=0.03)
     assert np.mean(ratio) == pytest.approx(1, abs=2e-3)

@@ -28,9 +28,8 @@ def test_moments_of_draws_are_those_of_the_covariance(tools):
     error = np.sqrt(np.diag(cov))
     draws = draws.to_value(u.uJy)[:, :7]
     assert_allclose((draws.mean(axis=0) - flux) / error, 0, atol=4 / np.sqrt(size))
-    assert_allclose(
-        np.cov(draws.T) / np.outer(error, error), cov / np.outer(error, error), atol=0.025
-    )
+    scale = np.outer(error, error)
+    assert_allclose(np.cov(draws.T) / scale, cov / scale, atol=0.025)
     assert result.correlation(10, 11) < -0.5
     assert_allclose(result.correlation(10, 11), np.corrcoef(draws.T)[0, 1], atol=0.02)
     assert abs(result.correlation(10, 16)) < 1e-12
@@ -56,9 +55,8 @@ def test_draws_depend_on_the_seed_alone(tools):
 def test_covariances_that_are_not_positive_keep_their_variances():
     # neighbours alone of a chain with correlations of -0.8: eigenvalues below zero
     n = 30
-    covariance = scipy.sparse.diags_array(
-        [np.full(n - 1, -0.8), np.ones(n), np.full(n - 1, -0.8)], offsets=[-1, 0, 1]
-    ).tocsr()
+    diagonals = np.full(n - 1, -0.8), np.ones(n), np.full(n - 1, -0.8)
+    covariance = scipy.sparse.diags_array(diagonals, offsets=[-1, 0, 1]).tocsr()
     assert np.linalg.eigvalsh(covariance.toarray()).min() < 0
     draws = correlated_draws(covariance * 4.0, [(k,) for k in range(n)], 20_000, 5)
     found = np.cov(draws.T)

@@ -27,7 +27,7 @@ def simulated():
     return truth, measured
 
 
-def test_statistics_of_gaussian_errors(simulated):
+def test_statistics_and_limits_of_gaussian_errors(simulated):
     flux = np.array([0.3, 2.0, 30.0])
     expected = np.hypot(0.1, 0.05 * flux)
     robust = ErrorModel.from_tables(*simulated, bin_size=600)
@@ -35,6 +35,12 @@ def test_statistics_of_gaussian_errors(simulated):
     paper = ErrorModel.from_tables(*simulated, bin_size=600, statistic="median_abs")
     # the median of |x| is 0.6745 sigma
     assert_allclose(paper.sigma(flux * u.uJy, BAND).value, 0.67449 * expected, rtol=0.08)
+    # f = 5 sqrt(0.1^2 + (0.05 f)^2)
+    exact = 5 * 0.1 / np.sqrt(1 - 25 * 0.05**2)
+    assert_allclose(robust.limiting_flux(BAND).value, exact, rtol=0.06)
+    assert robust.limiting_magnitude(BAND).unit == u.ABmag
+    # a signal-to-noise above that of the fractional error is never reached
+    assert np.isnan(robust.limiting_magnitude(BAND, 100).value)
 
 
 def test_the_papers_error_function_is_the_median_of_each_bin():
@@ -55,16 +61,6 @@ def test_the_papers_error_function_is_the_median_of_each_bin():
     pooled = ErrorModel.from_tables(truth, measured).curves[BAND]
     assert np.all(np.diff(pooled.error) >= -1e-12)
     assert np.any(np.diff(nodes.error) < 0)
-
-
-def test_limit_is_where_the_signal_to_noise_is_reached(simulated):
-    model = ErrorModel.from_tables(*simulated, bin_size=600)
-    # f = 5 sqrt(0.1^2 + (0.05 f)^2)
-    exact = 5 * 0.1 / np.sqrt(1 - 25 * 0.05**2)
-    assert_allclose(model.limiting_flux(BAND).value, exact, rtol=0.06)
-    assert model.limiting_magnitude(BAND).unit == u.ABmag
-    # a signal-to-noise above that of the fractional error is never reached
-    assert np.isnan(model.limiting_magnitude(BAND, 100).value)
 
 
 def test_outside_of_the_bins_errors_are_constant_and_flagged(simulated):
@@ -168,18 +164,11 @@ def test_a_residual_pattern_falls_with_dithers_and_not_with_time():
     assert variance(1000, residual="etc") > variance(1000)
 
 
-@pytest.mark.parametrize(
-    ("options", "name"),
-    [
-        ({"n_dithers": 0}, "n_dithers"),
-        ({"n_integrations": 1.5}, "n_integrations"),
-        ({"residual": 0.5}, "residual"),
-        ({"mosaic": 0 * u.arcsec}, "mosaic"),
-        ({"size": -1 * u.arcsec}, "size"),
-    ],
-)
-def test_what_an_exposure_cannot_be_is_named(options, name):
-    refuses(f"'{name}' must be", ErrorModel.from_exposure, BAND, 1000 * u.s, **options)
+def test_what_an_exposure_cannot_be_is_named():
+    wrong = {"n_dithers": 0, "n_integrations": 1.5, "residual": 0.5}
+    wrong |= {"mosaic": 0 * u.arcsec, "size": -1 * u.arcsec}
+    for name, value in wrong.items():
+        refuses(f"'{name}' must be", ErrorModel.from_exposure, BAND, 1000 * u.s, **{name: value})
 
 
 def test_perturbed_fluxes_have_the_stated_scatter():
@@ -290,9 +279,8 @@ def test_errors_where_the_exposure_is_longer(simulated):
     # rows of no known noise do not count
     some = {BAND: np.where(np.arange(len(true)) < 3000, noise, np.nan)}
     first = ErrorModel.from_tables(truth, measured, bin_size=600, noise=some).curves[BAND]
-    own = ErrorModel.from_tables(
-        truth[:3000], measured[:3000], bin_size=600, noise={BAND: noise[:3000]}
-    ).curves[BAND]
-    assert_allclose(first.error, own.error)
+    own = {"bin_size": 600, "noise": {BAND: noise[:3000]}}
+    alone = ErrorModel.from_tables(truth[:3000], measured[:3000], **own).curves[BAND]
+    assert_allclose(first.error, alone.error)
     with pytest.raises(ValueError, match="'noise' must be a factor for each of 4 rows"):
         model.assign(table, noise={BAND: np.ones(3)})

@@ -11,28 +11,16 @@ from astropy.table import QTable
 from numpy.testing import assert_array_equal
 
 from helpers.errors import refuses
+from helpers.mosaics import WHITE
 from helpers.results import assert_equal_values
-from miricigale.photometry import (
-    ErrorModel,
-    ErrorSettings,
-    ForcedPhotometryResult,
-)
+from miricigale.photometry import ErrorModel, ForcedPhotometryResult
 from miricigale.utils.exceptions import DataError
 
+SHIFT = {"max_shift": 0.2 * u.arcsec}
 OPTIONS = {
     "plain": {},
-    "all": {
-        "background_order": 1,
-        "max_shift": 0.2 * u.arcsec,
-        "components": 2,
-        "second_pass": True,
-        "positive": True,
-    },
-    "map": {
-        "max_shift": 0.2 * u.arcsec,
-        "offset_order": 0,
-        "errors": ErrorSettings(correlated_noise=False),
-    },
+    "all": {"background_order": 1, "components": 2, "second_pass": True, "positive": True, **SHIFT},
+    "map": {"offset_order": 0, "errors": WHITE, **SHIFT},
 }
 
 
@@ -73,8 +61,7 @@ def test_names_say_what_is_written(result, tmp_path):
     result.write(tmp_path / "r.csv")
     assert_array_equal(QTable.read(tmp_path / "r.csv")["flux"], result.flux.value)
     for name in ("r.txt", "r"):
-        with pytest.raises(ValueError, match=r"a file ending in one of \.fits"):
-            result.write(tmp_path / name)
+        refuses(r"a file ending in one of \.fits", result.write, tmp_path / name)
         assert not (tmp_path / name).exists()
     with pytest.raises(IORegistryError):
         ForcedPhotometryResult.read(tmp_path / "r.ecsv")

@@ -7,8 +7,11 @@ from astropy.nddata import CCDData
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
-from helpers.errors import refuses
-from helpers.light import gaussian_image
+from helpers.errors import refuses, warned
+from helpers.light import gaussian_image, pixel_gaussian
+from helpers.mosaics import flagged
+from helpers.results import assert_equal_values
+from helpers.scenes import catalog_at
 from miricigale.instrument import imager_wcs, north_up_wcs, pixel_area_map
 from miricigale.photometry import (
     ErrorSettings,
@@ -20,10 +23,6 @@ from miricigale.photometry import (
 from miricigale.photometry.catalogs import joined_sky
 from miricigale.psf import MatchingKernel
 from miricigale.utils.exceptions import MiricigaleWarning
-
-
-def flagged(result, flag):
-    return (result.flags & int(flag)) != 0
 
 
 def test_noiseless_point_sources_come_back_exactly(tools, field):
@@ -121,8 +120,8 @@ def test_templates_and_flags_say_what_was_used(tools):
     assert result.template.tolist() == ["sersic"] * 9 + ["point", "none", "point"]
     assert np.all(result.template_snr[:9] > 20)
     assert np.isnan(result.template_snr[9:]).all()
-    assert np.flatnonzero(flagged(result, ForcedFlags.NO_SEGMENT)).tolist() == [9]
-    assert np.flatnonzero(flagged(result, ForcedFlags.SHARED_SEGMENT)).tolist() == [11]
+    assert np.flatnonzero(flagged(result.flags, ForcedFlags.NO_SEGMENT)).tolist() == [9]
+    assert np.flatnonzero(flagged(result.flags, ForcedFlags.SHARED_SEGMENT)).tolist() == [11]
     assert np.flatnonzero(np.isnan(result.flux)).tolist() == [10]
     table = result.to_table("miri.f770w")
     assert_array_equal(table["miri.f770w_template"], result.template)
@@ -144,13 +143,13 @@ def test_poor_fits_and_unexplained_neighbours_are_flagged(tools):
     image = tools.picture(every, flux, (200, 200), rng=np.random.default_rng(8), **form)
     result = tools.measured(image, sky)
     assert result.snr.min() > 100
-    assert flagged(result, ForcedFlags.POOR_FIT).tolist() == [False, True, True, False]
-    neighbour = flagged(result, ForcedFlags.UNEXPLAINED_NEIGHBOR)
+    assert flagged(result.flags, ForcedFlags.POOR_FIT).tolist() == [False, True, True, False]
+    neighbour = flagged(result.flags, ForcedFlags.UNEXPLAINED_NEIGHBOR)
     assert neighbour.tolist() == [False, False, True, False]
     # with all sources in the catalogue nothing is left
     result = tools.measured(image, every)
-    assert not flagged(result, ForcedFlags.UNEXPLAINED_NEIGHBOR).any()
-    assert flagged(result, ForcedFlags.POOR_FIT).tolist() == [False, True, *[False] * 4]
+    assert not flagged(result.flags, ForcedFlags.UNEXPLAINED_NEIGHBOR).any()
+    assert flagged(result.flags, ForcedFlags.POOR_FIT).tolist() == [False, True, *[False] * 4]
 
 
 def sersic_galaxies(tools, index, seed, noise, n_side=5, spacing=5.4):
@@ -238,20 +237,20 @@ def test_sersic_templates(tools):
     wcs = north_up_wcs(tools.CENTER, tools.FINE * u.arcsec, shape)
     sky = tools.positions(rng, n, 6.0)
     x, y = wcs.world_to_pixel(sky)
-    rows = {"r": rng.uniform(0.2, 0.5, n), "n": rng.uniform(0.8, 2, n)}
-    rows |= {"q": rng.uniform(0.4, 1, n), "pa": rng.uniform(0, 180, n)}
+    radius, index, ratio, pa = rng.uniform(
+        [[0.2], [0.8], [0.4], [0]], [[0.5], [2], [1], [180]], (4, n)
+    )
     flux = 10 ** rng.uniform(1, 2, n)
     scene = sum(
-        sersic_image(shape, x=x[k], y=y[k], total_flux=flux[k], r_eff=rows["r"][k] / tools.FINE,
-                     n=rows["n"][k], axis_ratio=rows["q"][k], theta=np.radians(90 + rows["pa"][k]))
+        sersic_image(shape, x=x[k], y=y[k], total_flux=flux[k], r_eff=radius[k] / tools.FINE,
+                     n=index[k], axis_ratio=ratio[k], theta=np.radians(90 + pa[k]))
         for k in range(n)
     )  # fmt: skip
     scene = scipy.ndimage.gaussian_filter(scene, tools.LO / tools.FINE, truncate=8, mode="constant")
     image = tools.as_ccd(scene / (pixel_area_map(wcs, shape) * 1e12), wcs, 0.01)
-    catalog = QTable(
-        {"sky": sky, "profile": ["sersic"] * n, "half_light_radius": rows["r"] * u.arcsec,
-         "sersic_index": rows["n"], "axis_ratio": rows["q"], "position_angle": rows["pa"] * u.deg}
-    )  # fmt: skip
+    forms = {"half_light_radius": radius * u.arcsec, "position_angle": pa * u.deg}
+    forms |= {"profile": "sersic", "sersic_index": index, "axis_ratio": ratio}
+    catalog = catalog_at(sky, **forms)
     result = ForcedPhotometer(tools.kernel, template="sersic").measure(image, catalog=catalog)
     assert_allclose(result.flux.value / flux, 1, atol=0.02)
 
@@ -279,7 +278,7 @@ def test_masked_pixels_do_not_count(tools, field):
     image = tools.as_ccd(data, field.wcs, 0.01, mask=mask)
     result = tools.measured(image, field.catalog)
     assert_allclose(result.flux.value, field.flux, rtol=1e-5, atol=1e-5)
-    assert flagged(result, ForcedFlags.MASKED).mean() > 0.9
+    assert flagged(result.flags, ForcedFlags.MASKED).mean() > 0.9
     assert np.isnan(result.residual_image.data[mask]).all()
     assert_allclose(result.coverage, 0.8, atol=0.15)
 
@@ -287,8 +286,8 @@ def test_masked_pixels_do_not_count(tools, field):
 def test_edges_and_absent_data(tools):
     sky = tools.places([0.0, -6.55, -7.2, -9.0, -600.0], [0.0, -3.0, 0.0, 3.0, 0.0])
     result = tools.measured(tools.picture(sky, np.full(5, 50.0), (120, 120)), sky)
-    assert flagged(result, ForcedFlags.EDGE).tolist() == [False, True, True, True, True]
-    assert flagged(result, ForcedFlags.NO_DATA).tolist() == [False, False, True, True, True]
+    assert flagged(result.flags, ForcedFlags.EDGE).tolist() == [False, True, True, True, True]
+    assert flagged(result.flags, ForcedFlags.NO_DATA).tolist() == [False, False, True, True, True]
     assert_allclose(result.flux.value[:2], 50.0, rtol=1e-3)
     assert np.isnan(result.flux.value[2:]).all()
     assert np.isnan(result.flux_err.value[2:]).all()
@@ -300,8 +299,8 @@ def test_edges_and_absent_data(tools):
 def test_blends_are_flagged_and_twins_not_counted_twice(tools):
     sky, flux = tools.places([0.0, 0.15, 3.0, 3.0]), np.array([10.0, 20.0, 30.0, 0.0])
     result = tools.measured(tools.picture(sky, flux, (120, 120)), sky)
-    assert flagged(result, ForcedFlags.BLENDED).tolist() == [True, True, False, False]
-    assert flagged(result, ForcedFlags.DEGENERATE).tolist() == [False, False, False, True]
+    assert flagged(result.flags, ForcedFlags.BLENDED).tolist() == [True, True, False, False]
+    assert flagged(result.flags, ForcedFlags.DEGENERATE).tolist() == [False, False, False, True]
     assert_allclose(result.flux.value[:3], flux[:3], rtol=1e-4)
     assert result.covariance[0, 1] < 0
     # a source without light of its own is crowded by any neighbour
@@ -318,11 +317,8 @@ def test_files_in_place_of_memory_change_nothing(tools, field, tmp_path):
         for folder in (None, tmp_path)
     )
     assert len(one.new_sources) > 0
-    for name in ("flux", "flux_err", "background", "shift"):
-        assert_array_equal(getattr(one, name).value, getattr(other, name).value)
-    assert_array_equal(one.flags, other.flags)
+    assert_equal_values("result", one, other, skip=("wcs", "meta"))
     for name in ("model_image", "residual_image"):
-        assert_array_equal(getattr(one, name).data, getattr(other, name).data)
         assert isinstance(getattr(other, name).data.base, np.memmap)
         assert not isinstance(getattr(one, name).data.base, np.memmap)
     # nothing is left behind
@@ -344,24 +340,16 @@ def test_threads_do_not_change_a_bit(tools, monkeypatch, n_threads):
     alone, shared = (photometer.replace(n_threads=n).measure(*arguments) for n in (1, n_threads))
     assert alone.noise_correlation.shape[0] > 1
     assert np.isfinite(alone.flux.value).all()
-    for name in ("flux", "flux_err", "background", "background_err"):
-        assert_array_equal(getattr(shared, name).value, getattr(alone, name).value)
-    for name in ("chi2", "residual_fraction", "coverage", "flags", "noise_correlation"):
-        assert_array_equal(getattr(shared, name), getattr(alone, name))
-    assert_array_equal(shared.covariance.toarray(), alone.covariance.toarray())
-    assert_array_equal(shared.residual_image.data, alone.residual_image.data)
+    assert_equal_values("result", alone, shared, skip=("wcs", "meta"))
 
 
 def test_integration_over_pixels(tools):
     # a target without the pixel's response: pixels of the image are averages of the scene
-    from scipy.special import erf
-
     n, scale = 90, 0.2
     wcs = north_up_wcs(tools.CENTER, scale * u.arcsec, (n, n))
     sky = tools.CENTER.spherical_offsets_by(0.03 * u.arcsec, 0.05 * u.arcsec)
     x, y = wcs.world_to_pixel(sky)
-    edges = np.arange(n + 1) - 0.5
-    gx, gy = (np.diff(0.5 * erf((edges - p) * scale / tools.LO / np.sqrt(2))) for p in (x, y))
+    gx, gy = (pixel_gaussian(n, p, tools.LO / scale) for p in (x, y))
     image = tools.as_ccd(100.0 * gy[:, None] * gx / (pixel_area_map(wcs, (n, n)) * 1e12), wcs, 0.1)
     catalog = QTable({"sky": sky.reshape(1)})
     assert_allclose(tools.measured(image, catalog, integrate=True).flux.value, 100.0, rtol=1e-5)
@@ -406,34 +394,25 @@ def test_positions_that_are_not_known_are_flagged(tools, field):
     ra[[3, 7]] = np.nan
     catalog["sky"] = SkyCoord(ra, catalog["sky"].dec.deg, unit="deg")
     result = tools.measured(field.image, catalog)
-    lost = flagged(result, ForcedFlags.NO_DATA)
+    lost = flagged(result.flags, ForcedFlags.NO_DATA)
     assert np.flatnonzero(lost).tolist() == np.flatnonzero(np.isnan(result.flux)).tolist() == [3, 7]
     assert not result.crowded[lost].any()
     with pytest.warns(MiricigaleWarning, match="none of the 1 sources is on or near"):
         result = tools.measured(field.image, tools.places([3600.0]))
-    assert flagged(result, ForcedFlags.NO_DATA).all()
+    assert flagged(result.flags, ForcedFlags.NO_DATA).all()
 
 
 def test_arrays_with_the_mistakes_of_files(tools):
-    """A background, areas of zeros and labels of another map, without files."""
+    """Areas of zeros and labels of another map, without files."""
     rng, shape = np.random.default_rng(6), (400, 400)
     sky, flux = tools.places(*tools.lattice(rng, 5, 4.0, 0.0)), np.geomspace(3, 30, 25)
     form = {"scale": tools.FINE, "sigma": 5e-3, "rng": rng}
-    sharp, wide = (
-        tools.picture(sky, flux, shape, width=width, **form) for width in (tools.HI, tools.LO)
-    )
+    sharp = tools.picture(sky, flux, shape, width=tools.HI, **form)
+    wide = tools.picture(sky, flux, shape, **form)
     labels = tools.disks(sky, sharp.wcs, shape, np.sqrt(60))
     catalog = QTable({"sky": sky, "label": np.arange(1, 26)})
     photometer = ForcedPhotometer(tools.kernel)
     assert_allclose(photometer.measure(wide, sharp, labels, catalog).flux.value, flux, rtol=0.03)
-    raised = wide.add(0.05 * u.MJy / u.sr, handle_meta="first_found")
-    with pytest.warns(MiricigaleWarning, match="background of 0.05.* 'background_order'"):
-        photometer.measure(raised, sharp, labels, catalog)
-    fitted = ForcedPhotometer(tools.kernel, background_order=0)
-    assert_allclose(fitted.measure(raised, sharp, labels, catalog).flux.value, flux, rtol=0.03)
-    with pytest.warns(MiricigaleWarning) as said:
-        photometer.measure(wide, sharp.add(0.05 * u.MJy / u.sr), labels, catalog)
-    assert str(said[0].message).startswith("'highres' has a sky of 10")
     filled = wide.copy()
     filled.data[:, :90] = 0
     with pytest.warns(MiricigaleWarning, match="has 36000 pixels in areas that are exactly"):
@@ -451,15 +430,13 @@ def test_a_kernel_alone_measures_segments(tools, field):
     form, kept = {"scale": tools.FINE, "width": tools.HI, "sigma": 1e-3}, np.arange(0, 60, 2)
     highres = tools.picture(field.sky, field.flux, (500, 500), **form)
     labels = tools.disks(field.sky[kept], highres.wcs, (500, 500), 8, kept + 1)
-    bare = MatchingKernel.from_array(
-        tools.kernel.array / tools.kernel.array.sum(), pixel_scale=tools.FINE * u.arcsec
-    )
-    with pytest.warns(MiricigaleWarning, match="kernel has no PSFs: sources are their segments"):
-        photometer = ForcedPhotometer(bare)
+    array = tools.kernel.array / tools.kernel.array.sum()
+    bare = MatchingKernel.from_array(array, pixel_scale=tools.FINE * u.arcsec)
+    photometer = warned("kernel has no PSFs: sources are their segments", ForcedPhotometer, bare)
     catalog = field.catalog.copy()
     catalog["label"] = np.where(np.isin(np.arange(60), kept), np.arange(60) + 1, 0)
     result = photometer.measure(field.image, highres, labels, catalog)
-    lost = flagged(result, ForcedFlags.NO_SEGMENT)
+    lost = flagged(result.flags, ForcedFlags.NO_SEGMENT)
     assert np.flatnonzero(~lost).tolist() == kept.tolist()
     assert np.isnan(result.flux[lost]).all()
     assert np.isfinite(result.flux[~lost]).all()

@@ -10,6 +10,7 @@ import pytest
 from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.table import QTable, Table
+from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.light import gaussian_image
 from helpers.mosaics import disks, render
@@ -91,7 +92,7 @@ def test_files_become_a_catalog_that_can_be_fitted_and_a_page(files, tmp_path, f
     assert np.all(table["sky"].separation(files.sky) < 0.05 * u.arcsec)
     # the error of a point source on white noise, in closed form: sigma sqrt(4 pi) width / pixel
     expected = 0.005 * np.sqrt(4 * np.pi) * WIDE / COARSE
-    np.testing.assert_allclose(np.median(error), expected, rtol=0.05)
+    assert_allclose(np.median(error), expected, rtol=0.05)
     # errors are of the image's noise; PSFs and templates are good to a percent
     pulls = (flux - files.flux) / np.hypot(error, 0.01 * files.flux)
     assert np.abs(pulls).max() < 4
@@ -113,11 +114,8 @@ def test_catalog_kernel_and_the_plain_form(files, tmp_path):
     """A kernel of others alone, a catalog, and the two files without options, packed."""
     from miricigale.psf import MatchingKernel
 
-    made = MatchingKernel.from_psfs(
-        gaussian_image(61, SHARP / FINE),
-        gaussian_image(61, WIDE / FINE),
-        pixel_scale=FINE * u.arcsec,
-    )
+    psfs = (gaussian_image(61, width / FINE) for width in (SHARP, WIDE))
+    made = MatchingKernel.from_psfs(*psfs, pixel_scale=FINE * u.arcsec)
     kernel = files.save("kernel.fits", made.array)
     made.write(files.folder / "own.fits")
     catalog = files.folder / "catalog.csv"
@@ -134,8 +132,8 @@ def test_catalog_kernel_and_the_plain_form(files, tmp_path):
         table = QTable.read(output)
         assert list(table["id"]) == list(files.ids[order])
         found.append(table[BAND].to_value(u.uJy))
-        np.testing.assert_allclose(found[-1], files.flux[order], rtol=0.03, atol=0.2)
-    np.testing.assert_allclose(*found, rtol=0.01, atol=0.02)
+        assert_allclose(found[-1], files.flux[order], rtol=0.03, atol=0.2)
+    assert_allclose(*found, rtol=0.01, atol=0.02)
 
 
 def test_without_a_segmentation_sources_are_detected(files, tmp_path):
@@ -149,15 +147,14 @@ def test_without_a_segmentation_sources_are_detected(files, tmp_path):
     table = QTable.read(output)
     assert list(table["id"]) == list(files.ids)
     ours = table[BAND].to_value(u.uJy)
-    np.testing.assert_allclose(ours, files.flux, rtol=0.05, atol=0.2)
+    assert_allclose(ours, files.flux, rtol=0.05, atol=0.2)
 
 
 def test_sources_that_the_prior_lacks_are_the_last_rows(files, tmp_path):
     labels, header = fits.getdata(files.paths["segmentation"], header=True)
     lost = np.argsort(-files.flux)[[2, 5]]
-    fits.writeto(
-        tmp_path / "seg.fits", np.where(np.isin(labels, files.ids[lost]), 0, labels), header
-    )
+    labels[np.isin(labels, files.ids[lost])] = 0
+    fits.writeto(tmp_path / "seg.fits", labels, header)
     output = tmp_path / "out.fits"
     command = arguments(files, output, segmentation=tmp_path / "seg.fits")
     assert main([*command, "--second-pass", "--background-order", "1"]) == 0
@@ -170,16 +167,16 @@ def test_sources_that_the_prior_lacks_are_the_last_rows(files, tmp_path):
     index, separation, _ = files.sky[lost].match_to_catalog_sky(table["sky"][23:])
     assert separation.max() < 0.05 * u.arcsec
     found = table["irac.ch4"][23:][index].to_value(u.uJy)
-    np.testing.assert_allclose(found, files.flux[lost], rtol=0.02)
+    assert_allclose(found, files.flux[lost], rtol=0.02)
 
 
 def test_our_own_files_are_read(files, tmp_path):
     image = read_mosaic(files.paths["image"], weight=files.paths["weight"], filter="miri.f770w")
     write_image(image, tmp_path / "own.fits")
     again = read_mosaic(tmp_path / "own.fits")
-    np.testing.assert_array_equal(again.data, image.data)
-    np.testing.assert_array_equal(again.uncertainty.array, image.uncertainty.array)
-    np.testing.assert_array_equal(again.mask, image.mask)
+    assert_array_equal(again.data, image.data)
+    assert_array_equal(again.uncertainty.array, image.uncertainty.array)
+    assert_array_equal(again.mask, image.mask)
     assert again.meta["filter"] == "miri.f770w"
 
 

@@ -6,9 +6,9 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.io import fits
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
-from helpers.errors import refuses
+from helpers.errors import refuses, warned
 from miricigale.instrument import north_up_wcs, pixel_area_map
 from miricigale.photometry import MosaicFile, read_mosaic, weight_scale
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
@@ -49,8 +49,9 @@ def total(image):
 #: Keywords, options and counts of one uJy. The AB zero point of PHOTFLAM and PHOTPLAM is that of the
 #: HST data handbooks; one count a second of PHOTMJSR is a brightness.
 PIXEL_SR = (SCALE * np.pi / 648000) ** 2
-PHOTFLAM, PHOTPLAM = 1.9275e-20, 15369.0
-HST_ZERO = -2.5 * np.log10(PHOTFLAM) - 5 * np.log10(PHOTPLAM) - 2.408
+HST = {"PHOTFLAM": 1.9275e-20, "PHOTPLAM": 15369.0}
+HST_ZERO = -2.5 * np.log10(HST["PHOTFLAM"]) - 5 * np.log10(HST["PHOTPLAM"]) - 2.408
+HST_RATE = 10 ** (0.4 * (HST_ZERO - 23.9))
 UNITS = {
     "MJy/sr": ({"BUNIT": "MJy/sr"}, {}, 1e-12 / PIXEL_SR),
     "uJy": ({"BUNIT": "uJy"}, {}, 1.0),
@@ -61,16 +62,8 @@ UNITS = {
     "uJy/arcsec2": ({"BUNIT": "uJy/arcsec2"}, {}, 1 / SCALE**2),
     "counts": ({"BUNIT": "counts/s"}, {"zero_point": 25.0}, 10 ** (0.4 * (25.0 - 23.9))),
     "counts, in total": ({}, {"zero_point": 30 * u.ABmag}, 10 ** (0.4 * (30.0 - 23.9))),
-    "HST": (
-        {"BUNIT": "ELECTRONS/S", "PHOTFLAM": PHOTFLAM, "PHOTPLAM": PHOTPLAM},
-        {},
-        10 ** (0.4 * (HST_ZERO - 23.9)),
-    ),
-    "HST, in total": (
-        {"BUNIT": "ELECTRONS", "PHOTFLAM": PHOTFLAM, "PHOTPLAM": PHOTPLAM, "EXPTIME": 1200.0},
-        {},
-        1200 * 10 ** (0.4 * (HST_ZERO - 23.9)),
-    ),
+    "HST": ({"BUNIT": "ELECTRONS/S", **HST}, {}, HST_RATE),
+    "HST, in total": ({"BUNIT": "ELECTRONS", "EXPTIME": 1200.0, **HST}, {}, 1200 * HST_RATE),
     "JWST rate": ({"BUNIT": "DN/s", "PHOTMJSR": 0.25}, {}, 1e-12 / PIXEL_SR / 0.25),
 }
 
@@ -99,11 +92,7 @@ def test_a_source_has_its_flux_in_every_unit(write, name):
         ({"BUNIT": "COUNTS", "EXPTIME": 10.0}, {}, "neither PHOTMJSR nor PHOTFLAM: 'zero_point'"),
         ({"BUNIT": "mJy/beam"}, {}, "wanted is a surface brightness"),
         ({"BUNIT": "counts/s"}, {}, "neither PHOTMJSR nor PHOTFLAM: 'zero_point'"),
-        (
-            {"BUNIT": "DN/s", "PHOTMJSR": 1.0, "PHOTFLAM": 1e-20, "PHOTPLAM": 1e4},
-            {},
-            "both PHOTMJSR and PHOTFLAM",
-        ),
+        ({"BUNIT": "DN/s", "PHOTMJSR": 1.0, **HST}, {}, "both PHOTMJSR and PHOTFLAM"),
         ({"BUNIT": "uJy"}, {"zero_point": 23.9}, "'zero_point' must be left out"),
         ({"BUNIT": "uJy", "INSTRUME": "MIRI", "FILTER": "F770W"}, {"filter": "miri.f1000w"},
          "'filter' must be 'miri.f770w', the filter in .*image.fits"),
@@ -129,8 +118,7 @@ def test_maps_must_be_those_of_the_image(write, tmp_path):
         (write(np.ones((5, 5)), "small.fits"), r"the weight of .*\) has the shape \(5, 5\)"),
         (write(np.zeros(SHAPE), "zero.fits"), "no usable pixel"),
     ):
-        with pytest.raises(DataError, match=message):
-            read_mosaic(path, weight=weight)
+        refuses(message, read_mosaic, path, weight=weight, error=DataError)
     flat = write(np.ones(SHAPE), "flat.fits", BUNIT="uJy")
     with (
         pytest.warns(MiricigaleWarning, match="noise on the sky is 0 times"),
@@ -168,12 +156,8 @@ def test_weights_become_errors_and_other_maps_stay(write):
     sigma = np.where(np.indices(SHAPE)[1] < 70, 0.1, 0.3)
     data = rng.normal(size=SHAPE) * sigma
     path = write(data, BUNIT="MJy/sr")
-    maps = {
-        "error": sigma,
-        "variance": sigma**2,
-        "inverse_variance": sigma**-2,
-        "weight": (0.5 / sigma) ** 2,
-    }
+    maps = {"error": sigma, "variance": sigma**2, "inverse_variance": sigma**-2}
+    maps["weight"] = (0.5 / sigma) ** 2
     for kind, values in maps.items():
         image = read_mosaic(path, **{kind: write(values, f"{kind}.fits")})
         tolerance = 0.03 if kind == "weight" else 1e-5
@@ -223,14 +207,13 @@ def test_a_background_is_subtracted_where_asked_for(write):
 def test_a_real_i2d_file_of_the_jwst_pipeline(data_file):
     path = next(data_file("real/i2d").glob("*04101*_i2d.fits"))
     # a nebula has no empty sky
-    with pytest.warns(MiricigaleWarning, match="times what the error map says"):
-        image = read_mosaic(path)
+    image = warned("times what the error map says", read_mosaic, path)
     assert image.meta["filter"] == "miri.f1130w"
     assert image.meta["pa_aper"] == pytest.approx(273.2125, abs=1e-3)
     data = fits.getdata(path, "SCI")
     good = ~image.mask
     assert 0.8 < good.mean() < 1
-    np.testing.assert_array_equal(image.data[good], data[good])
+    assert_array_equal(image.data[good], data[good])
     # the pipeline's nominal area of a pixel, which is constant, and the WCS's
     area = np.median(pixel_area_map(image.wcs, data.shape))
     assert area == pytest.approx(fits.getval(path, "PIXAR_SR", "SCI"), rel=0.005)
@@ -253,9 +236,8 @@ def test_maps_in_another_unit_than_the_image_are_converted(write, kind):
         read_mosaic(path, **{kind: other})
     # what the caller states holds for both
     counts = write(rng.normal(0, 0.1, SHAPE), "counts.fits", BUNIT="ELECTRONS/S")
-    assert read_mosaic(counts, unit="MJy/sr", **{kind: other}).meta["noise_scale"] == pytest.approx(
-        1, rel=0.03
-    )
+    image = read_mosaic(counts, unit="MJy/sr", **{kind: other})
+    assert image.meta["noise_scale"] == pytest.approx(1, rel=0.03)
 
 
 @pytest.mark.parametrize("kind", ["packed", "compressed", "integers", "big"])
@@ -278,7 +260,7 @@ def test_stored_forms_give_the_same_image(write, tmp_path, kind):
     one, other = read_mosaic(path), read_mosaic(tmp_path / "other.fits")
     assert one.data.dtype == np.dtype("=f4")
     assert other.data.dtype.isnative
-    np.testing.assert_allclose(other.data, one.data, atol=0.05 * one.uncertainty.array.max())
+    assert_allclose(other.data, one.data, atol=0.05 * one.uncertainty.array.max())
 
 
 @pytest.fixture

@@ -35,13 +35,7 @@ def test_solution_is_that_of_lawson_and_hanson(overlap, n_common):
         beside = np.eye(len(data)) - common @ np.linalg.pinv(common)
         expected, _ = scipy.optimize.nnls(beside @ a, beside @ data)
         assert_allclose(found, expected, atol=1e-7 * max(1, np.abs(expected).max()))
-        # conditions of Karush, Kuhn and Tucker
-        rest = data - a @ found
-        rest = rest - common @ np.linalg.lstsq(common, rest)[0] if n_common else rest
-        slope = -a.T @ rest
         assert found.min() >= 0
-        assert slope[found == 0].min(initial=0) > -1e-7
-        assert_allclose(slope[found > 0], 0, atol=1e-7)
 
 
 def test_a_matrix_without_a_solution_warns():
@@ -59,9 +53,8 @@ def test_positive_fluxes_stand_beside_the_others(tools):
     flux = np.where(rng.random(n) < 0.5, 0.0, rng.exponential(1.0, n))
     image = tools.picture(sky, flux, shape, sigma=sigma, rng=rng)
     image.data += 0.5
-    plain, both = (
-        tools.measured(image, sky, background_order=0, positive=flag) for flag in (False, True)
-    )
+    plain = tools.measured(image, sky, background_order=0)
+    both = tools.measured(image, sky, background_order=0, positive=True)
     assert plain.flux_positive is None
     assert_array_equal(both.flux.value, plain.flux.value)
     assert (both.flux.value < 0).sum() > 5

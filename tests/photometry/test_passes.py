@@ -9,13 +9,10 @@ from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
+from helpers.mosaics import flagged
 from miricigale.instrument import north_up_wcs
 from miricigale.photometry import ErrorSettings, ForcedFlags, ForcedPhotometer, detect_sources
 from miricigale.photometry.catalogs import joined_sky
-
-
-def flagged(flags, flag):
-    return (np.asarray(flags) & int(flag)) != 0
 
 
 @pytest.fixture(scope="module")
@@ -42,18 +39,12 @@ def crowd(tools):
 def test_second_pass_finds_what_the_catalogue_lacks(tools, crowd, moved):
     ids = np.arange(300, 381)[::-1]
     # a catalogue that is wrong by (0.05, -0.03) arcsec lists new sources in its own frame
-    east, north = (0.05, -0.03) if moved else (0.0, 0.0)
-    sky, truth = (
-        one.spherical_offsets_by(east * u.arcsec, north * u.arcsec)
-        for one in (crowd.sky, crowd.hidden)
-    )
+    offset = ([0.05, -0.03] if moved else [0.0, 0.0]) * u.arcsec
+    sky, truth = (one.spherical_offsets_by(*offset) for one in (crowd.sky, crowd.hidden))
     catalog = QTable({"id": ids, "sky": sky})
-    first, result = (
-        tools.measured(
-            crowd.image, catalog, second_pass=flag, max_shift=0.3 * u.arcsec if moved else None
-        )
-        for flag in (False, True)
-    )
+    options = {"max_shift": 0.3 * u.arcsec if moved else None}
+    first = tools.measured(crowd.image, catalog, **options)
+    result = tools.measured(crowd.image, catalog, second_pass=True, **options)
     assert first.new_sources is None
     new = result.new_sources
     row, separation, _ = truth.match_to_catalog_sky(new["sky"])
@@ -81,9 +72,8 @@ def test_second_pass_finds_what_the_catalogue_lacks(tools, crowd, moved):
 
 
 def test_second_pass_with_nothing_to_find_changes_nothing(tools, field):
-    plain, twice = (
-        tools.measured(field.image, field.catalog, second_pass=flag) for flag in (False, True)
-    )
+    plain = tools.measured(field.image, field.catalog)
+    twice = tools.measured(field.image, field.catalog, second_pass=True)
     assert_array_equal(twice.flux.value, plain.flux.value)
     assert len(twice.new_sources) == 0
     assert twice.new_sources["flux"].unit == u.uJy
@@ -156,11 +146,10 @@ def test_points_are_where_the_galaxies_are(tools, nuclei):
     # positions of a catalog that are wrong by 30 mas are no positions of nuclei
     rng = np.random.default_rng(3)
     east, north = rng.normal(0, 0.03, (2, nuclei.n)) * u.arcsec
-    number = np.where((np.arange(nuclei.n) >= 8) & (np.arange(nuclei.n) < 24), 2, 1)
-    double = number == 2
+    double = (np.arange(nuclei.n) >= 8) & (np.arange(nuclei.n) < 24)
     photometer = ForcedPhotometer(tools.kernel, errors=ErrorSettings(size_scatter=None))
     for sky in (nuclei.sky, nuclei.sky.spherical_offsets_by(east, north)):
-        catalog = QTable({"sky": sky, "components": number})
+        catalog = QTable({"sky": sky, "components": np.where(double, 2, 1)})
         result = photometer.measure(*nuclei.images, catalog)
         ratio = result.flux_point.value[double] / nuclei.point[double]
         assert_allclose(ratio, 1, atol=0.06)
@@ -173,9 +162,8 @@ def test_the_catalogue_says_who_has_two_components(tools, nuclei):
     number = np.where(np.arange(nuclei.n) % 2 == 0, 2, 1)
     catalog = QTable({"sky": nuclei.sky, "components": number})
     result = ForcedPhotometer(tools.kernel).measure(*nuclei.images, catalog)
-    assert_array_equal(
-        np.isfinite(result.flux_point.value), (number == 2) & (np.arange(nuclei.n) < 24)
-    )
+    double = (number == 2) & (np.arange(nuclei.n) < 24)
+    assert_array_equal(np.isfinite(result.flux_point.value), double)
     # a point on top of a point
     assert flagged(result.flags, ForcedFlags.ONE_COMPONENT).tolist() == [False] * 24 + [True]
     assert_allclose(result.flux.value[24], nuclei.host[24] + nuclei.point[24], rtol=0.01)

@@ -6,11 +6,12 @@ import pytest
 from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.table import QTable, Table
+from numpy.testing import assert_array_equal
 
-from helpers.errors import refuses
+from helpers.errors import refuses, warned
 from miricigale.instrument import north_up_wcs
 from miricigale.photometry import read_prior
-from miricigale.utils.exceptions import DataError, MiricigaleWarning
+from miricigale.utils.exceptions import DataError
 
 SHAPE, SCALE = (200, 220), 0.06
 #: Ids as they come: large, with gaps, in no order.
@@ -49,7 +50,7 @@ def test_segments_of_any_ids_are_sources_at_their_bright_parts(prior, tmp_path):
     for row in sources:
         k = list(IDS).index(row["id"])
         assert row["sky"].separation(sky[k]) < 0.01 * u.arcsec
-        np.testing.assert_array_equal(segments == row["label"], labels == IDS[k])
+        assert_array_equal(segments == row["label"], labels == IDS[k])
 
 
 @pytest.mark.parametrize("form", ["fits", "ecsv", "csv", "cat", "skycoord"])
@@ -69,10 +70,10 @@ def test_catalogues_of_all_forms_keep_their_ids(prior, tmp_path, form):
     assert list(sources["id"]) == list(IDS)
     assert np.all(sources["sky"].separation(sky) < 1 * u.mas)
     for row, one in zip(sources, IDS, strict=True):
-        np.testing.assert_array_equal(segments == row["label"], labels == one)
+        assert_array_equal(segments == row["label"], labels == one)
     assert read_prior(image, catalog=path)[0] is None
     again, _ = read_prior(image, segmentation=labels, catalog=path)
-    np.testing.assert_array_equal(again, segments)
+    assert_array_equal(again, segments)
 
 
 def write_csv(path, ids, sky):
@@ -85,17 +86,14 @@ def test_segments_belong_by_id_or_by_position(prior, tmp_path):
     seg = save(tmp_path, labels, image.wcs)
     # one source just beyond its own segment keeps it by its id
     moved = SkyCoord([sky[0].directional_offset_by(0 * u.deg, 1 * u.arcsec), *sky[1:]])
-    segments, sources = read_prior(
-        image, segmentation=seg, catalog=write_csv(tmp_path / "a.csv", IDS, moved)
-    )
-    np.testing.assert_array_equal(segments == sources["label"][0], labels == IDS[0])
+    path = write_csv(tmp_path / "a.csv", IDS, moved)
+    segments, sources = read_prior(image, segmentation=seg, catalog=path)
+    assert_array_equal(segments == sources["label"][0], labels == IDS[0])
     # ids of another catalogue say nothing of the segments
-    foreign = np.array([7, 42, 150605, 5])
-    segments, sources = read_prior(
-        image, segmentation=seg, catalog=write_csv(tmp_path / "b.csv", foreign, sky)
-    )
+    path = write_csv(tmp_path / "b.csv", [7, 42, 150605, 5], sky)
+    segments, sources = read_prior(image, segmentation=seg, catalog=path)
     for row, one in zip(sources, IDS, strict=True):
-        np.testing.assert_array_equal(segments == row["label"], labels == one)
+        assert_array_equal(segments == row["label"], labels == one)
 
 
 def test_what_is_not_measured_is_said(prior, tmp_path):
@@ -103,8 +101,7 @@ def test_what_is_not_measured_is_said(prior, tmp_path):
     seg = save(tmp_path, labels, image.wcs)
     short = write_csv(tmp_path / "a.csv", IDS[:3], sky[:3])
     message = r"1 segments of .* belong to no source .*\(ids 42\)"
-    with pytest.warns(MiricigaleWarning, match=message):
-        _, sources = read_prior(image, segmentation=seg, catalog=short)
+    _, sources = warned(message, read_prior, image, segmentation=seg, catalog=short)
     assert len(sources) == 3
     away = SkyCoord([*sky, sky[0].directional_offset_by(0 * u.deg, 5 * u.arcmin)])
     longer = write_csv(tmp_path / "b.csv", [*IDS, 1], away)

@@ -9,7 +9,7 @@ from astropy.io import fits
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
-from helpers.errors import refuses
+from helpers.errors import refuses, warned
 from helpers.light import gaussian_image
 from helpers.results import assert_equal_values
 from miricigale.instrument import imager_wcs, north_up_wcs
@@ -25,7 +25,7 @@ from miricigale.photometry import (
 from miricigale.photometry.wcs_text import grid_text, text_grid
 from miricigale.profiles import sersic_stamp
 from miricigale.psf import KernelField, MatchingKernel, gaussian_psf
-from miricigale.utils.exceptions import DataError, MiricigaleWarning
+from miricigale.utils.exceptions import DataError
 
 
 @pytest.fixture(scope="module")
@@ -39,17 +39,14 @@ def scene(tools):
     form = {"scale": tools.FINE, "sigma": 0.02 / (tools.FINE**2 * tools.SR * 1e12), "rng": rng}
     high = tools.picture(sky, np.full(n, 20.0), (290, 290), width=sharp, **form)
     images, flux = {}, {}
-    for name, form in (("one", (0.11, (158, 158))), ("two", (0.07, (249, 249)))):
+    for name, scale, size in (("one", 0.11, 158), ("two", 0.07, 249)):
         flux[name] = 10 ** rng.uniform(0.5, 2, n)
-        scale, shape = form
-        images[name] = tools.picture(
-            sky, flux[name], shape, scale=scale, width=wide, sigma=1.0, rng=rng
-        )
+        form = {"scale": scale, "width": wide, "sigma": 1.0, "rng": rng}
+        images[name] = tools.picture(sky, flux[name], (size, size), **form)
     segmentation, detected = detect_sources(high, threshold=1.0, n_pixels=10)
     assert len(detected) == n
-    templates = SourceTemplates.from_images(
-        high, segmentation, detected, psf=tools.kernel.source, n_threads=2
-    )
+    options = {"psf": tools.kernel.source, "n_threads": 2}
+    templates = SourceTemplates.from_images(high, segmentation, detected, **options)
     return high, segmentation, detected, templates, images, sky, flux
 
 
@@ -134,9 +131,8 @@ def test_components_of_one_source(tools):
     sky = tools.places([0.3], [0.1])
     x, y = (float(v[0]) for v in wcs.world_to_pixel(sky))
     light, (y0, x0) = sersic_stamp(x=x, y=y, r_eff=5.0, n=1.0, axis_ratio=0.6, theta=0.4)
-    galaxy = SourceTemplates.from_arrays(
-        [7.0 * light], [(y0, x0)], QTable({"id": [1], "sky": sky}), wcs=wcs, convolved=False
-    )
+    given = [7.0 * light], [(y0, x0)], QTable({"id": [1], "sky": sky})
+    galaxy = SourceTemplates.from_arrays(*given, wcs=wcs, convolved=False)
     point = SourceTemplates.from_catalog(QTable({"id": [2], "sky": sky}))
     both = SourceTemplates.concatenate([galaxy, point])
     assert both.kind.tolist() == ["sersic", "point"]
@@ -162,10 +158,8 @@ def test_grids_survive_as_text(tools):
     turned.wcs.set()
     x = np.array([0.0, 100.0, 289.0])
     for one in (wcs, turned):
-        back = text_grid(grid_text(one))
-        assert_array_equal(
-            back.pixel_to_world_values(x, 3 * x), one.pixel_to_world_values(x, 3 * x)
-        )
+        grids = text_grid(grid_text(one)), one
+        assert_array_equal(*(grid.pixel_to_world_values(x, 3 * x) for grid in grids))
     distorted = imager_wcs(tools.CENTER, 71 * u.deg)
     back = text_grid(grid_text(distorted)).pixel_to_world_values(x, x)
     assert_allclose(back, distorted.pixel_to_world_values(x, x), rtol=0, atol=1e-9)
@@ -190,8 +184,7 @@ def test_what_does_not_fit_is_refused(tools, scene, tmp_path):
     refuses("must be one for each image", measure_bands, images, {"one": tools.kernel}, templates)
     wide = gaussian_psf(0.5 * u.arcsec, pixel_scale=tools.FINE * u.arcsec, fov=3 * u.arcsec)
     blurred = SourceTemplates.from_images(high, segmentation, detected, psf=wide)
-    with pytest.warns(MiricigaleWarning, match="is it of the same image"):
-        photometer.measure(images["one"], templates=blurred)
+    warned("is it of the same image", photometer.measure, images["one"], templates=blurred)
     path = tmp_path / "image.fits"
     high.write(path)
     refuses("holds no templates of sources", SourceTemplates.read, path, error=DataError)
@@ -215,9 +208,8 @@ def test_psf_that_changes_over_the_field(tools):
     sharp = np.hypot(tools.HI, size)
     high = tools.picture(sky, np.full(60, 20.0), (350, 772), width=sharp, **form)
     segmentation, _ = detect_sources(high, threshold=1.0, n_pixels=10)
-    templates = SourceTemplates.from_images(
-        high, segmentation, QTable({"sky": sky}), psf=tools.kernel.source
-    )
+    catalog, psf = QTable({"sky": sky}), tools.kernel.source
+    templates = SourceTemplates.from_images(high, segmentation, catalog, psf=psf)
     points = templates.kind == "point"
     assert points.tolist() == (size == 0).tolist()
 
@@ -228,9 +220,8 @@ def test_psf_that_changes_over_the_field(tools):
 
     nodes = np.linspace(0, shape[1] - 1, 5)
     everywhere = [(a, b) for a in nodes for b in (0, 189)]
-    field = KernelField(
-        [kernel(a) for a, _ in everywhere], wcs.pixel_to_world(*np.array(everywhere).T)
-    )
+    places = wcs.pixel_to_world(*np.array(everywhere).T)
+    field = KernelField([kernel(a) for a, _ in everywhere], places)
     result = ForcedPhotometer(field).measure(low, templates=templates)
     assert_allclose(result.flux.value / flux, 1, atol=5e-3)
     nearest = KernelField(field.kernels, field.sky, "nearest")

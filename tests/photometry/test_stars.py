@@ -50,9 +50,8 @@ def test_stars_come_back_with_true_errors_and_every_row_stays(stars, psf):
     assert 0.8 < pull.std() < 1.2
     assert abs(pull.mean()) < 4 / np.sqrt(len(good))
     # matched filter of a Gaussian in white noise: sigma sqrt(4 pi) width in pixels
-    assert_allclose(
-        table["flux_err"].value[good], 0.02 * np.sqrt(4 * np.pi) * 0.25 / SCALE, rtol=0.03
-    )
+    expected = 0.02 * np.sqrt(4 * np.pi) * 0.25 / SCALE
+    assert_allclose(table["flux_err"].value[good], expected, rtol=0.03)
     assert_allclose(table["chi2"][good], 1, atol=0.45)
     # its position: sqrt(2) width over signal-to-noise along either axis
     snr = flux[good] / table["flux_err"].value[good]

@@ -3,12 +3,12 @@
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.table import QTable
 from numpy.testing import assert_allclose
 from scipy.signal import fftconvolve
 
 from helpers.light import gaussian, gaussian_image
 from helpers.mosaics import stamps_of
+from helpers.scenes import catalog_at
 from miricigale.photometry import ErrorSettings, ForcedPhotometer, detect_sources
 from miricigale.photometry.cutouts import Cutout
 from miricigale.photometry.shapes import not_fitted
@@ -142,10 +142,8 @@ def settings(**options):
 
 
 def test_terms_add_in_quadrature_and_are_columns(tools, blend):
-    plain, result = (
-        ForcedPhotometer(tools.kernel, errors=settings(psf_error=one)).measure(*blend)
-        for one in (0.0, 0.024)
-    )
+    plain = ForcedPhotometer(tools.kernel, errors=settings()).measure(*blend)
+    result = ForcedPhotometer(tools.kernel, errors=settings(psf_error=0.024)).measure(*blend)
     terms = [result.flux_err_noise, result.flux_err_template, result.flux_err_psf]
     # peaks of the noise have no flux of which a part could be wrong
     assert all(np.all(term[result.flux > 1 * u.uJy] > 0) for term in terms)
@@ -176,10 +174,8 @@ def test_a_blend_is_solved_as_by_dense_algebra(tools, blend, monkeypatch):
         return original(fit, *args, **kwargs)
 
     monkeypatch.setattr(forced, "package", keep)
-    result, exact = (
-        ForcedPhotometer(tools.kernel, errors=settings(size_scatter=one)).measure(*blend)
-        for one in (0.1, None)
-    )
+    result = ForcedPhotometer(tools.kernel, errors=settings(size_scatter=0.1)).measure(*blend)
+    exact = ForcedPhotometer(tools.kernel, errors=settings(size_scatter=None)).measure(*blend)
     fit = kept[0]
     templates, changes = (
         stamps_of(one, blend[0].shape).reshape(len(one.order), -1)
@@ -221,14 +217,9 @@ def test_psf_error_is_what_a_wide_psf_does(tools, width):
     image = tools.picture(sky, [100.0], (150, 150), width=np.hypot(tools.LO, width))
     psfs = (gaussian_image(101, one / tools.FINE) for one in (tools.HI, 1.03 * tools.LO))
     kernel = MatchingKernel.from_psfs(*psfs, pixel_scale=tools.FINE * u.arcsec)
-    catalog = QTable({"sky": sky})
-    template = "psf"
-    if width:
-        template = "sersic"
-        catalog["half_light_radius"] = [HALF * width] * u.arcsec
-        catalog["sersic_index"] = [0.5]
-        catalog["axis_ratio"] = [1.0]
-        catalog["position_angle"] = [0.0] * u.deg
+    form = {"half_light_radius": HALF * width * u.arcsec, "sersic_index": 0.5}
+    catalog = catalog_at(sky, profile="sersic" if width else "point", **form)
+    template = "sersic" if width else "psf"
     photometer = ForcedPhotometer(kernel, template=template, errors=settings(psf_error=0.03))
     result = photometer.measure(image, catalog=catalog)
     # Gaussians: d ln flux / d ln width is 1 for points

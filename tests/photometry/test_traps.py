@@ -11,8 +11,9 @@ from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.table import Table
 from astropy.wcs import WCS
+from numpy.testing import assert_allclose
 
-from helpers.errors import refuses
+from helpers.errors import refuses, warned
 from helpers.mosaics import disks
 from miricigale.instrument import north_up_wcs, pixel_area_map
 from miricigale.photometry import MosaicFile, read_mosaic
@@ -57,14 +58,10 @@ def field(tmp_path_factory):
     steps = (np.arange(4) - 1.5) * 5.0
     places = np.array(np.meshgrid(steps, steps)).reshape(2, -1) + rng.uniform(-0.7, 0.7, (2, 16))
     sky, flux = CENTER.spherical_offsets_by(*(places * ARCSEC)), np.geomspace(2, 50, 16)
-    models = {
-        "image": psf_mosaic(miri_psf("miri.f770w"), COARSE * ARCSEC, PA * u.deg),
-        "prior": hst_psf(),
-    }
-    headers = {
-        "image": {"INSTRUME": "MIRI", "FILTER": "F770W", "PA_APER": PA},
-        "prior": {"INSTRUME": "WFC3", "FILTER": "F160W"},
-    }
+    models = {"image": psf_mosaic(miri_psf("miri.f770w"), COARSE * ARCSEC, PA * u.deg)}
+    models["prior"] = hst_psf()
+    headers = {"image": {"INSTRUME": "MIRI", "FILTER": "F770W", "PA_APER": PA}}
+    headers["prior"] = {"INSTRUME": "WFC3", "FILTER": "F160W"}
     made = types.SimpleNamespace(folder=folder, flux=flux, models=models)
     for name, model in models.items():
         scale, n = SIZE[name]
@@ -79,12 +76,8 @@ def field(tmp_path_factory):
     fits.writeto(folder / "seg.fits", labels, wcs.to_header())
     made.catalog = Table({"id": np.arange(1, 17), "ra": sky.ra.deg, "dec": sky.dec.deg})
     made.catalog.write(folder / "cat.fits")
-    made.paths = {
-        "image": folder / "image.fits",
-        "highres": folder / "prior.fits",
-        "segmentation": folder / "seg.fits",
-        "catalog": folder / "cat.fits",
-    }
+    names = {"image": "image", "highres": "prior", "segmentation": "seg", "catalog": "cat"}
+    made.paths = {key: folder / f"{name}.fits" for key, name in names.items()}
     return made
 
 
@@ -102,10 +95,13 @@ def fluxes(field, **options):
     return measured(field, **options)["miri.f770w"].to_value(u.uJy)
 
 
-def edited(field, tmp_path, name, change):
+def edited(field, tmp_path, name, change=None, *, add=0.0, **header):
     path = tmp_path / f"{name}.fits"
     with fits.open(field.folder / f"{name}.fits") as hdus:
-        change(hdus)
+        hdus["SCI"].data += add
+        hdus["SCI"].header.update(header)
+        if change:
+            change(hdus)
         hdus.writeto(path)
     return path
 
@@ -123,9 +119,8 @@ def test_psfs_of_any_sum_hold_what_the_model_does(field, tmp_path, width, total)
     data = psf_image(field.models["image"], pixel_scale=COARSE * ARCSEC, shape=width + 2)
     part = data[1:-1, 1:-1].sum()
     path = saved(tmp_path, data * total / data.sum())
-    with pytest.warns(MiricigaleWarning, match=f"'psf' sums to 1 and is taken to hold {part:.3f}"):
-        found = fluxes(field, psf=path)
-    np.testing.assert_allclose(np.median(found / field.flux), 1, atol=0.007)
+    found = warned(f"'psf' sums to 1 and is taken to hold {part:.3f}", fluxes, field, psf=path)
+    assert_allclose(np.median(found / field.flux), 1, atol=0.007)
 
 
 def test_psfs_on_cells_of_a_pixel_are_told_by_their_width(field, tmp_path):
@@ -144,35 +139,30 @@ def test_psfs_on_cells_of_a_pixel_are_told_by_their_width(field, tmp_path):
 
 
 def test_model_psfs_are_turned_to_the_angle_of_the_aperture(field, tmp_path):
-    def turned(hdus):
-        hdus["SCI"].header["PA_APER"] = PA - 30
-
-    path = edited(field, tmp_path, "image", turned)
+    path = edited(field, tmp_path, "image", PA_APER=PA - 30)
     right, wrong = (measured(field, image=one) for one in (field.paths["image"], path))
-    np.testing.assert_allclose(np.median(right["miri.f770w"].value / field.flux), 1, atol=0.007)
+    assert_allclose(np.median(right["miri.f770w"].value / field.flux), 1, atol=0.007)
     # the six spikes stand elsewhere at another angle
     bright = field.flux > 30
     assert np.all(wrong["miri.f770w_chi2"][bright] > 2 * right["miri.f770w_chi2"][bright])
 
 
 def test_a_turned_psf_with_its_angle_is_right(field, tmp_path):
-    drizzled = psf_mosaic(
-        miri_psf("miri.f770w"), COARSE * ARCSEC, 0 * u.deg, grid_angle=0 * u.deg, oversampling=4
-    )
+    form = {"grid_angle": 0 * u.deg, "oversampling": 4}
+    drizzled = psf_mosaic(miri_psf("miri.f770w"), COARSE * ARCSEC, 0 * u.deg, **form)
     data = psf_image(drizzled, pixel_scale=COARSE / 3 * ARCSEC, shape=301)
     path = saved(tmp_path, data, PIXSCALE=COARSE / 3)
     found = fluxes(field, psf=path, psf_angle=PA * u.deg)
-    np.testing.assert_allclose(np.median(found / field.flux), 1, atol=0.01)
+    assert_allclose(np.median(found / field.flux), 1, atol=0.01)
 
 
 def test_kernels_of_other_pixels_filters_or_sums(field, tmp_path):
     given = {"pixel_scale": FINE * ARCSEC}
     made = MatchingKernel.from_psfs(field.models["prior"], field.models["image"], **given)
     path = saved(tmp_path, 0.93 * made.array / made.array.sum(), "kernel.fits")
-    with pytest.warns(MiricigaleWarning, match=r"kernel summed to 0\.9300 and was brought to 1"):
-        found = fluxes(field, kernel=path)
+    found = warned(r"kernel summed to 0\.9300 and was brought to 1", fluxes, field, kernel=path)
     # a bare kernel of unit sum leaves out what lies beyond its grid
-    np.testing.assert_allclose(np.median(found / field.flux), made.array.sum(), atol=0.01)
+    assert_allclose(np.median(found / field.flux), made.array.sum(), atol=0.01)
     message = r"kernel for pixels of 0\.04 arcsec, and those of the prior"
     with pytest.raises(DataError, match=message):
         fluxes(field, kernel=saved(tmp_path, made.array / made.array.sum(), PIXSCALE=0.04))
@@ -200,16 +190,12 @@ def test_kernels_of_other_pixels_filters_or_sums(field, tmp_path):
 
 
 def test_a_background_is_fitted_or_said(field, tmp_path):
-    def raised(hdus):
-        hdus["SCI"].data += 0.05
-
-    path = edited(field, tmp_path, "image", raised)
-    np.testing.assert_allclose(np.median(fluxes(field, image=path) / field.flux), 1, atol=0.007)
+    path = edited(field, tmp_path, "image", add=0.05)
+    assert_allclose(np.median(fluxes(field, image=path) / field.flux), 1, atol=0.007)
     with pytest.warns(MiricigaleWarning, match=r"a background of 0\.05\d* MJy / sr between"):
         fluxes(field, image=path, background_order=None)
-    prior = edited(field, tmp_path, "prior", lambda hdus: hdus["SCI"].data.__iadd__(0.06))
-    with pytest.warns(MiricigaleWarning, match="'highres' has a sky of 2.* times its noise"):
-        fluxes(field, highres=prior)
+    prior = edited(field, tmp_path, "prior", add=0.06)
+    warned("'highres' has a sky of 2.* times its noise", fluxes, field, highres=prior)
 
 
 @pytest.mark.parametrize("name", ["image", "prior"])
@@ -224,8 +210,7 @@ def test_areas_filled_with_zero_have_no_data(field, tmp_path, name):
     path = edited(field, tmp_path, name, corner)
     n = SIZE[name][1]
     zero = np.count_nonzero(np.add(*np.indices((n, n))) < 0.5 * n)
-    with pytest.warns(MiricigaleWarning, match=f"has {zero} pixels in areas that are exactly 0"):
-        image = read_mosaic(path)
+    image = warned(f"has {zero} pixels in areas that are exactly 0", read_mosaic, path)
     assert np.count_nonzero(image.mask) == zero
     with pytest.warns(MiricigaleWarning, match="exactly 0"):
         table = measured(field, **{"image" if name == "image" else "highres": path})
@@ -234,7 +219,7 @@ def test_areas_filled_with_zero_have_no_data(field, tmp_path, name):
     assert np.count_nonzero(good) >= 13
     # a source that the prior does not show may be a galaxy as well as a point
     assert np.count_nonzero(snr < 5) <= 1
-    np.testing.assert_allclose((found / field.flux)[good & (snr >= 5)], 1, atol=0.05)
+    assert_allclose((found / field.flux)[good & (snr >= 5)], 1, atol=0.05)
     assert np.all(np.abs(found - field.flux)[snr < 5] < 3 * error[snr < 5])
 
 
@@ -244,7 +229,7 @@ def test_labels_of_another_detection_are_not_taken(field, tmp_path):
     order = np.append(0, np.random.default_rng(1).permutation(16) + 1)
     fits.writeto(tmp_path / "stale.fits", order[labels].astype(np.int32), header)
     found = fluxes(field, segmentation=tmp_path / "stale.fits")
-    np.testing.assert_allclose(np.median(found / field.flux), 1, atol=0.007)
+    assert_allclose(np.median(found / field.flux), 1, atol=0.007)
     # three of sixteen
     some = np.arange(17)
     some[[1, 2, 3]] = [2, 3, 1]
@@ -283,27 +268,26 @@ def test_model_psfs_of_a_nircam_prior(field, tmp_path):
     sky = SkyCoord(field.catalog["ra"], field.catalog["dec"], unit="deg")
     data = drawn(np.random.default_rng(4), "prior", model, sky, 2 * field.flux)
 
-    def named(hdus):
+    def drawn_anew(hdus):
         hdus["SCI"].data[:] = brightness(data, WCS(hdus["SCI"].header))
-        hdus["SCI"].header.update(INSTRUME="NIRCAM", FILTER="F444W", PUPIL="CLEAR")
 
-    path = edited(field, tmp_path, "prior", named)
+    named = {"INSTRUME": "NIRCAM", "FILTER": "F444W", "PUPIL": "CLEAR"}
+    path = edited(field, tmp_path, "prior", drawn_anew, **named)
     message = r"'highres_pa_aper' must be given, .* \(or 'highres_psf'\)"
     refuses(message, fluxes, field, highres=path)
     found = fluxes(field, highres=path, highres_pa_aper=40 * u.deg, page=tmp_path / "page.html")
     assert "FWHM of the PSF (arcsec)" in (tmp_path / "page.html").read_text()
-    np.testing.assert_allclose(np.median(found / field.flux), 1, atol=0.007)
+    assert_allclose(np.median(found / field.flux), 1, atol=0.007)
 
 
 def test_model_and_residual_are_written_with_their_coordinates(field, tmp_path):
     paths = {name: tmp_path / "new" / f"{name}.fits" for name in ("model", "residual")}
     fluxes(field, **paths)
     image = read_mosaic(field.paths["image"])
-    with pytest.warns(MiricigaleWarning, match="no map of the noise"):
-        model = read_mosaic(paths["model"])
+    model = warned("no map of the noise", read_mosaic, paths["model"])
     residual = read_mosaic(paths["residual"])
-    np.testing.assert_allclose(model.data + residual.data, image.data, rtol=1e-5, atol=1e-4)
-    np.testing.assert_allclose(residual.uncertainty.array, image.uncertainty.array, rtol=1e-5)
+    assert_allclose(model.data + residual.data, image.data, rtol=1e-5, atol=1e-4)
+    assert_allclose(residual.uncertainty.array, image.uncertainty.array, rtol=1e-5)
     assert 0.9 < np.std(residual.data / residual.uncertainty.array) < 1.1
     for one in (model, residual):
         assert one.wcs.wcs.compare(image.wcs.wcs, tolerance=1e-9)
@@ -315,10 +299,8 @@ def test_model_and_residual_are_written_with_their_coordinates(field, tmp_path):
 
 def test_poor_fits_of_the_bright_stand_on_the_page_and_warnings_are_shown_once(field, tmp_path):
     """The PSF of another band, said to be that of a smoothed image."""
-    wide = psf_image(
-        filter_psf("miri.f1500w", pixel_scale=COARSE * ARCSEC, pa=PA * u.deg),
-        pixel_scale=COARSE * ARCSEC, shape=91,
-    )  # fmt: skip
+    form = {"pixel_scale": COARSE * ARCSEC}
+    wide = psf_image(filter_psf("miri.f1500w", **form, pa=PA * u.deg), **form, shape=91)
     command = [sys.executable, "-m", "miricigale", "photometry", "--no-progress", "--threads", "1"]
     for name, path in field.paths.items():
         command += [f"--{name}", path]

@@ -1,6 +1,7 @@
 import astropy.units as u
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
 from helpers.light import gaussian_image
@@ -15,15 +16,16 @@ def moments(image):
     return total, (image.sum(0) @ axis**2) / total, (image.sum(1) @ axis**2) / total
 
 
-@pytest.mark.parametrize("oversampling", [3, 4])
-def test_pixel_response_is_a_box(oversampling):
-    """A box of width w adds w^2 / 12 to the variance and keeps the light."""
-    image = gaussian_image(121, 5.0)
-    out = effects.detector_response(image, oversampling=oversampling)
+@pytest.mark.parametrize(
+    ("oversampling", "options", "added"),
+    [(3, {}, 9 / 12), (4, {}, 16 / 12), (2, {"pixel": False, "jitter": 1.5}, 9.0)],
+)
+def test_variances_of_pixel_and_jitter_add(oversampling, options, added):
+    """A box of width w adds w^2 / 12 to the variance, and all keep the light."""
+    out = effects.detector_response(gaussian_image(121, 5.0), oversampling=oversampling, **options)
     total, vx, vy = moments(out)
     assert total == pytest.approx(1.0, abs=1e-9)
-    assert vx == pytest.approx(25 + oversampling**2 / 12, rel=1e-6)
-    assert vy == pytest.approx(25 + oversampling**2 / 12, rel=1e-6)
+    assert (vx, vy) == pytest.approx((25 + added, 25 + added), rel=1e-6)
 
 
 def test_interpixel_capacitance_moves_charge_to_the_neighbors():
@@ -35,14 +37,6 @@ def test_interpixel_capacitance_moves_charge_to_the_neighbors():
     for (dy, dx), value in expected.items():
         assert out[20 + dy, 20 + dx] == pytest.approx(value, abs=1e-12)
     assert out[20, 20] == pytest.approx(1 - 2 * 0.03 - 2 * 0.02 - 4 * 0.01, abs=1e-12)
-
-
-def test_jitter_adds_its_variance():
-    total, vx, _ = moments(
-        effects.detector_response(gaussian_image(121, 4.0), oversampling=2, pixel=False, jitter=1.5)
-    )
-    assert total == pytest.approx(1.0, abs=1e-9)
-    assert vx == pytest.approx(16 + 9, rel=1e-6)
 
 
 @pytest.mark.parametrize("name", ["miri.f560w", "miri.f770w"])
@@ -59,7 +53,7 @@ def test_cruciform_takes_the_stated_fraction_and_keeps_the_rest(name):
     assert out[1200, 1200] == pytest.approx(1 - fraction, abs=0.003)
     # e-folding of 25 pixels
     assert out[1200, 1200 + 400] / out[1200, 1200 + 300] == pytest.approx(np.exp(-1), rel=1e-6)
-    np.testing.assert_allclose(out, out.T, atol=1e-15)
+    assert_allclose(out, out.T, atol=1e-15)
 
 
 def test_cruciform_does_not_depend_on_the_oversampling():

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.io.registry import IORegistryError
+from numpy.testing import assert_array_equal
 from photutils.psf import ImagePSF
 
 from helpers.errors import refuses
@@ -34,7 +35,7 @@ TURNED = make_psf(
 
 def same(one, other):
     assert type(one) is type(other)
-    np.testing.assert_array_equal(one.data, other.data)
+    assert_array_equal(one.data, other.data)
     assert one.facts == other.facts
     assert one.meta == other.meta
 
@@ -69,10 +70,8 @@ def test_a_plain_model_of_photutils_lacks_its_pixel():
 
 def test_fields_of_kernels_are_copied_pickled_and_written(tmp_path):
     kind = {"pixel_scale": 0.06 * u.arcsec, "fov": 2 * u.arcsec}
-    sharp = gaussian_psf(0.2 * u.arcsec, **kind)
-    kernels = [
-        MatchingKernel.from_psfs(sharp, gaussian_psf(w * u.arcsec, **kind)) for w in (0.4, 0.5)
-    ]
+    sharp, *wide = (gaussian_psf(width * u.arcsec, **kind) for width in (0.2, 0.4, 0.5))
+    kernels = [MatchingKernel.from_psfs(sharp, psf) for psf in wide]
     field = KernelField(kernels, SkyCoord([53.0, 53.1], [-27.0, -27.0], unit="deg"), "nearest")
     field.write(tmp_path / "field.fits")
     places = SkyCoord([53.01, 53.09], [-27.0, -27.01], unit="deg")
@@ -80,10 +79,10 @@ def test_fields_of_kernels_are_copied_pickled_and_written(tmp_path):
         copy.deepcopy(field), pickle.loads(pickle.dumps(field)),
         KernelField.read(tmp_path / "field.fits"),
     ):  # fmt: skip
-        np.testing.assert_array_equal(one.weights(places), field.weights(places))
+        assert_array_equal(one.weights(places), field.weights(places))
         for mine, theirs in zip(one.kernels, field.kernels, strict=True):
-            np.testing.assert_array_equal(mine.array, theirs.array)
-            np.testing.assert_array_equal(mine.matched, theirs.matched)
+            assert_array_equal(mine.array, theirs.array)
+            assert_array_equal(mine.matched, theirs.matched)
             assert mine.regularization == theirs.regularization
             assert mine.meta["max_error"] == theirs.meta["max_error"]
             assert mine.pixel_scale == theirs.pixel_scale

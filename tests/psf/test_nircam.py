@@ -1,6 +1,7 @@
 import astropy.units as u
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
 from miricigale.psf import (
@@ -35,7 +36,7 @@ def test_energy_is_that_of_drizzled_psfs(data_file):
         for k in (9, 15, 19)
     ]
     ours = encircled_energy(psf_mosaic(nircam_psf("nircam.f444w"), scale, 0 * u.deg), radii)
-    np.testing.assert_allclose(ours, np.mean(real, axis=0), atol=0.03)
+    assert_allclose(ours, np.mean(real, axis=0), atol=0.03)
 
 
 def test_is_centered_normalized_and_says_what_it_is():

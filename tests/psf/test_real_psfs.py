@@ -6,12 +6,13 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.io import fits
-from astropy.wcs import WCS
+from numpy.testing import assert_allclose, assert_array_equal
 from photutils.psf import ImagePSF
 from scipy.signal import fftconvolve
 
-from helpers.errors import refuses
+from helpers.errors import refuses, warned
 from helpers.light import gaussian_image
+from helpers.scenes import tan_wcs
 from miricigale.psf import (
     MatchingKernel,
     from_photutils,
@@ -24,6 +25,7 @@ from miricigale.psf import (
 from miricigale.utils.exceptions import MiricigaleWarning
 
 SCALE = 0.04 * u.arcsec
+SKY = {"pixel_scale": SCALE, "frame": "sky"}
 kernel_of = functools.partial(MatchingKernel.from_psfs, pixel_scale=SCALE)
 HI, LO = 1.7, 3.0  # rms of the two PSFs in pixels
 
@@ -48,11 +50,11 @@ def assert_is_the_gaussian_kernel(kernel):
     n = kernel.array.shape[0]
     expected = expected_kernel(n)
     # the automatic regularization keeps the error of the encircled energy below 0.001
-    np.testing.assert_allclose(kernel.array, expected, rtol=0, atol=0.03 * expected.max())
+    assert_allclose(kernel.array, expected, rtol=0, atol=0.03 * expected.max())
     assert kernel.array.sum() == pytest.approx(1, abs=1e-6)
     # and what comes out of it is the wide PSF where it should stand
     image = kernel.apply(gaussian_image(n, HI))
-    np.testing.assert_allclose(image, gaussian_image(n, LO), rtol=0, atol=5e-3 * image.max())
+    assert_allclose(image, gaussian_image(n, LO), rtol=0, atol=5e-3 * image.max())
     # a point of unit flux keeps it
     point = np.zeros((2 * n + 1, 2 * n + 1))
     point[n, n] = 1.0
@@ -68,17 +70,15 @@ def test_off_center_and_even_arrays_give_the_centered_kernel(n, off):
     # the moving itself costs less than the regularization
     m = kernel.array.shape[0]
     straight = kernel_of(gaussian_image(m, HI), gaussian_image(m, LO))
-    np.testing.assert_allclose(kernel.array, straight.array, atol=5e-4 * kernel.array.max())
+    assert_allclose(kernel.array, straight.array, atol=5e-4 * kernel.array.max())
     found = np.array(kernel.meta["centering"]["lo"]) / SCALE.value
-    np.testing.assert_allclose(found, off, atol=2e-3)
+    assert_allclose(found, off, atol=2e-3)
 
 
 def test_off_center_psfs_keep_their_angles():
     """The core is put on the axis before the PSF is turned about it."""
-    psfs = [
-        make_psf(gaussian_image(61, s, 1.2, -0.9), pixel_scale=SCALE, frame="detector")
-        for s in (HI, LO)
-    ]
+    kind = {"pixel_scale": SCALE, "frame": "detector"}
+    psfs = [make_psf(gaussian_image(61, s, 1.2, -0.9), **kind) for s in (HI, LO)]
     angles = {"hi_angle": 20 * u.deg, "lo_angle": [20, 140] * u.deg}
     kernel = kernel_of(*psfs, **angles)
     assert_is_the_gaussian_kernel(kernel)
@@ -101,15 +101,14 @@ def test_oversampled_psf_of_unit_sum_is_scaled_and_said():
 @pytest.mark.parametrize("factor", [0.5, 0.02, 7.0])
 def test_sums_that_are_no_fraction_are_refused_unless_scaled(factor):
     data = factor * gaussian_image(51, HI)
-    kind = {"pixel_scale": SCALE, "frame": "sky"}
-    refuses(r"'data' must be .*'enclosed' given", make_psf, data, **kind)
-    with pytest.raises(ValueError, match="'hi' must be a PSF whose sum is the fraction of light"):
-        kernel_of(data, gaussian_image(51, LO))
-    kernel = kernel_of(data, gaussian_image(51, LO), normalize=True)
+    refuses(r"'data' must be .*'enclosed' given", make_psf, data, **SKY)
+    lo = gaussian_image(51, LO)
+    refuses("'hi' must be a PSF whose sum is the fraction of light", kernel_of, data, lo)
+    kernel = kernel_of(data, lo, normalize=True)
     assert_is_the_gaussian_kernel(kernel)
-    psf = make_psf(data, **kind, enclosed=0.97)
+    psf = make_psf(data, **SKY, enclosed=0.97)
     assert psf.enclosed == pytest.approx(0.97)
-    refuses("'enclosed' must be above 0 and at most 1", make_psf, data, **kind, enclosed=1.5)
+    refuses("'enclosed' must be above 0 and at most 1", make_psf, data, **SKY, enclosed=1.5)
 
 
 def test_truncated_wings_are_said_and_the_kernel_has_unit_sum():
@@ -123,16 +122,14 @@ def test_truncated_wings_are_said_and_the_kernel_has_unit_sum():
     absolute = kernel_of(hi, lo, normalize=False)
     assert absolute.array.sum() == pytest.approx(lo.sum(), abs=1e-9)
     # known fractions stay as they are, without a warning
-    known = [
-        make_psf(d, pixel_scale=SCALE, frame="sky", enclosed=e) for d, e in ((hi, 0.96), (lo, 0.93))
-    ]
+    known = make_psf(hi, **SKY, enclosed=0.96), make_psf(lo, **SKY, enclosed=0.93)
     assert kernel_of(*known).array.sum() == pytest.approx(0.93)
     # scaled to 1 on their own grids, the wings alone show it: the light beyond the circle
     with pytest.warns(MiricigaleWarning, match="light beyond the PSFs' grids") as caught:
         kernel_of(hi / hi.sum(), lo / lo.sum())
     words = str(caught[0].message).split("wings: ")[1].split()
     truth = [1 / np.sqrt(1 + (50.5 / core) ** 2) for core in (2.0, 4.0)]
-    np.testing.assert_allclose([float(words[0]), float(words[3])], truth, rtol=0.15)
+    assert_allclose([float(words[0]), float(words[3])], truth, rtol=0.15)
 
 
 def test_exchanged_psfs_are_refused():
@@ -149,17 +146,14 @@ def test_exchanged_psfs_are_refused():
 
 def test_gridded_models_need_a_position():
     """By position: a kernel for each place."""
-    hi = gaussian_psf(0.1 * u.arcsec, pixel_scale=SCALE, fov=2 * u.arcsec)
-    wide = [0.28, 0.28, 0.36, 0.36]
-    grid = psf_grid(
-        [gaussian_psf(w * u.arcsec, pixel_scale=SCALE, fov=2 * u.arcsec) for w in wide],
-        [(0, 0), (0, 100), (100, 0), (100, 100)],
-    )
+    kind, widths = {"pixel_scale": SCALE, "fov": 2 * u.arcsec}, (0.1, 0.28, 0.28, 0.36, 0.36)
+    hi, *wide = (gaussian_psf(width * u.arcsec, **kind) for width in widths)
+    grid = psf_grid(wide, [(0, 0), (0, 100), (100, 0), (100, 100)])
     match = r"'lo' must be an ImagePSF or an array \(psf_at .*, got PSFGrid"
     refuses(match, kernel_of, hi, grid)
     gains = [kernel_of(hi, psf_at(grid, x, 30)).noise_gain for x in (0, 100)]
     variances = np.array([(w**2 - 0.1**2) / (8 * np.log(2)) for w in (0.28, 0.36)]) / 0.04**2
-    np.testing.assert_allclose(gains, 1 / np.sqrt(4 * np.pi * variances), rtol=0.01)
+    assert_allclose(gains, 1 / np.sqrt(4 * np.pi * variances), rtol=0.01)
 
 
 def test_artefacts_of_resampling_make_no_stripes(tmp_path):
@@ -188,31 +182,24 @@ def test_artefacts_of_resampling_make_no_stripes(tmp_path):
     assert sharp.noise_gain > 10 * kernel.noise_gain
 
 
-def header(side=0.04, angle=30.0, flip=-1):
-    wcs = WCS(naxis=2)
-    wcs.wcs.ctype = ["RA---TAN", "DEC--TAN"]
-    a, s = np.radians(angle), side / 3600
-    wcs.wcs.cd = s * np.array([[flip * np.cos(a), np.sin(a)], [-flip * np.sin(a), np.cos(a)]])
-    return wcs.to_header()
-
-
 def test_scale_and_angle_come_from_the_header(tmp_path):
     path = tmp_path / "psf.fits"
-    fits.writeto(path, gaussian_image(51, HI), header())
+    fits.writeto(path, gaussian_image(51, HI), tan_wcs((1, 1), 0.04, pa=30.0).to_header())
     psf = read_psf(path, frame="sky")
     assert psf.pixel_scale.value == pytest.approx(0.04)
     assert psf.angle.value == pytest.approx(30)
     with pytest.raises(ValueError, match=r"'pixel_scale' must be 0\.04 arcsec by the header"):
         read_psf(path, frame="sky", pixel_scale=0.06 * u.arcsec)
     refuses(r"'angle' must be the header's, 30 deg", read_psf, path, frame="sky", angle=0 * u.deg)
-    fits.writeto(path, gaussian_image(51, HI), header(flip=1), overwrite=True)
+    mirrored = tan_wcs((1, 1), 0.04, pa=30.0, parity=1).to_header()
+    fits.writeto(path, gaussian_image(51, HI), mirrored, overwrite=True)
     refuses("'path' must be a file with east to the left", read_psf, path, frame="sky")
     # stpsf's, arcsec per cell
-    fits.writeto(
-        path, gaussian_image(51, 4 * HI), fits.Header({"PIXELSCL": 0.0275}), overwrite=True
-    )
-    with pytest.warns(MiricigaleWarning, match="sums to"):
-        psf = read_psf(path, frame="detector", oversampling=4)
+    stated = fits.Header({"PIXELSCL": 0.0275, "OVERSAMP": 4})
+    fits.writeto(path, gaussian_image(51, 4 * HI), stated, overwrite=True)
+    psf = warned("sums to", read_psf, path)
+    assert (psf.frame, psf.oversampling[0]) == ("detector", 4)
+    assert make_psf(gaussian_image(51, HI), pixel_scale=SCALE).frame == "sky"
     assert psf.pixel_scale.value == pytest.approx(0.11)
     fits.writeto(path, gaussian_image(51, HI), overwrite=True)
     refuses("'pixel_scale' must be given where the header", read_psf, path, frame="sky")
@@ -232,20 +219,18 @@ def test_roll_of_the_header_turns_the_psf(tmp_path):
     xx, yy, xy = ((kernel.target * p).sum() / total for p in (x**2, y**2, x * y))
     assert np.degrees(0.5 * np.arctan2(2 * xy, xx - yy)) == pytest.approx(35, abs=0.2)
     given = kernel_of(hi, psf, lo_angle=35 * u.deg)
-    np.testing.assert_array_equal(given.array, kernel.array)
+    assert_array_equal(given.array, kernel.array)
 
 
 def test_ready_kernels_are_taken(tmp_path):
     array = expected_kernel(41)
     kernel = MatchingKernel.from_array(array, pixel_scale=SCALE, source=gaussian_image(41, HI))
-    np.testing.assert_allclose(
-        kernel.target, gaussian_image(41, LO), atol=1e-4 * kernel.target.max()
-    )
+    assert_allclose(kernel.target, gaussian_image(41, LO), atol=1e-4 * kernel.target.max())
     bare = MatchingKernel.from_array(array, pixel_scale=SCALE)
     assert bare.source is None
     with pytest.warns(MiricigaleWarning, match=r"summed to 0\.9430 and was brought to 1"):
         mended = MatchingKernel.from_array(0.943 * array / array.sum(), pixel_scale=SCALE)
-    np.testing.assert_allclose(mended.array, array / array.sum(), rtol=1e-12)
+    assert_allclose(mended.array, array / array.sum(), rtol=1e-12)
     assert mended.meta["sum"] == pytest.approx(0.943)
     psfs = {"source": gaussian_image(41, LO), "target": gaussian_image(41, HI)}
     for data, options, match in (
@@ -260,7 +245,7 @@ def test_ready_kernels_are_taken(tmp_path):
     path = tmp_path / "kernels.fits"
     fits.writeto(path, np.stack([np.zeros_like(array), array]), fits.Header({"PIXSCALE": 0.04}))
     read = MatchingKernel.read(path, ext=0, plane=1)
-    np.testing.assert_allclose(read.array, array / array.sum())
+    assert_allclose(read.array, array / array.sum())
     assert read.pixel_scale.value == 0.04
     other = {"ext": 0, "plane": 1, "pixel_scale": 0.06 * u.arcsec}
     refuses(r"'pixel_scale' must be 0\.04 arcsec by the header", MatchingKernel.read, path, **other)
@@ -273,8 +258,8 @@ def test_kernels_of_regions_blend():
     kernels = [kernel_of(hi, lo, regularization=1e-4) for lo in wide]
     mean = MatchingKernel.blend(kernels, [3, 1])
     direct = kernel_of(hi, 0.75 * wide[0] + 0.25 * wide[1], regularization=1e-4)
-    np.testing.assert_allclose(mean.array, direct.array, atol=1e-7)
-    np.testing.assert_allclose(mean.target, direct.target, atol=1e-7)
+    assert_allclose(mean.array, direct.array, atol=1e-7)
+    assert_allclose(mean.target, direct.target, atol=1e-7)
     assert mean.meta["weights"] == [0.75, 0.25]
     other = kernels[0].cropped(1 * u.arcsec)
     refuses("'kernels' must be alike", MatchingKernel.blend, [kernels[0], other])
@@ -300,9 +285,8 @@ def test_real_drizzled_psfs(data_file, region):
     for image in (kernel.source, kernel.target):
         c = image.shape[0] // 2
         core = image[c - 4 : c + 5, c - 4 : c + 5]
-        axis = np.arange(-4, 5)
-        assert abs(core.sum(0) @ axis / core.sum()) < 0.06
-        assert abs(core.sum(1) @ axis / core.sum()) < 0.06
+        middle = np.array([core.sum(0), core.sum(1)]) @ np.arange(-4, 5) / core.sum()
+        assert np.abs(middle).max() < 0.06
     # light of the PSF after the convolution, as far as it stays on the grid
     matched = fftconvolve(kernel.source, kernel.array, mode="full").sum()
     assert matched == pytest.approx(1, abs=1e-6)

@@ -6,9 +6,10 @@ import pytest
 from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData, NDData, StdDevUncertainty
 from astropy.table import Table
-from astropy.wcs import WCS
+from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
+from helpers.scenes import tan_wcs
 from miricigale.psf import encircled_energy, fwhm, miri_psf, psf_from_stars
 
 SIZE, SCALE = 260, 0.1109
@@ -16,16 +17,6 @@ SIZE, SCALE = 260, 0.1109
 SPACING = 78
 DITHERS = [(0, 0), (6.5, 3.25), (-5.75, 4.5), (5.25, -6.75), (-3, -6.5), (1.5, 7.25), (-7, 0.75)]
 RADII = [0.2, 0.3, 0.5, 1.0, 1.5] * u.arcsec
-
-
-def tan_wcs(dx, dy):
-    wcs = WCS(naxis=2)
-    wcs.wcs.ctype = ["RA---TAN", "DEC--TAN"]
-    wcs.wcs.crval = [53.1, -27.8]
-    wcs.wcs.crpix = [SIZE / 2 + dx + 1, SIZE / 2 + dy + 1]
-    wcs.wcs.cd = SCALE / 3600 * np.array([[-1.0, 0.0], [0.0, 1.0]])
-    wcs.pixel_shape = (SIZE, SIZE)
-    return wcs
 
 
 @pytest.fixture(scope="module")
@@ -49,9 +40,9 @@ def field(truth):
             data[part] += truth.evaluate(x[part], y[part], f, x0, y0)
         sigma = np.sqrt(20**2 + data)
         data += rng.normal(0, sigma)
-        images.append(
-            CCDData(data, unit="DN/s", uncertainty=StdDevUncertainty(sigma), wcs=tan_wcs(dx, dy))
-        )
+        wcs = tan_wcs((SIZE, SIZE), SCALE)
+        wcs.wcs.crpix += dx, dy
+        images.append(CCDData(data, unit="DN/s", uncertainty=StdDevUncertainty(sigma), wcs=wcs))
         places = base + (dx, dy) + rng.normal(0, 0.2, (9, 2))
         tables.append(Table({"x": places[:, 0], "y": places[:, 1]}))
     sky = SkyCoord(*images[0].wcs.all_pix2world(base, 0).T, unit="deg")
@@ -68,9 +59,7 @@ def test_width_and_energy_come_back(truth, measured):
     assert fwhm(measured).value == pytest.approx(fwhm(truth).value, rel=0.01)
     gauss = fwhm(truth, method="gaussian").value
     assert fwhm(measured, method="gaussian").value == pytest.approx(gauss, rel=0.01)
-    np.testing.assert_allclose(
-        encircled_energy(measured, RADII), encircled_energy(truth, RADII), atol=0.005
-    )
+    assert_allclose(encircled_energy(measured, RADII), encircled_energy(truth, RADII), atol=0.005)
 
 
 def test_image_stands_as_the_truth_does(truth, measured):
@@ -107,9 +96,7 @@ def test_sky_positions_serve_all_images_and_bad_pixels_are_left_out(truth, field
     psf = psf_from_stars(spoilt, sky, enclosed=truth, frame="detector")
     assert psf.pixel_scale.value == pytest.approx(SCALE, rel=1e-6)
     assert psf.meta["n_stamps"] == 63
-    np.testing.assert_allclose(
-        encircled_energy(psf, RADII), encircled_energy(measured, RADII), atol=0.01
-    )
+    assert_allclose(encircled_energy(psf, RADII), encircled_energy(measured, RADII), atol=0.01)
 
 
 def test_stars_near_edges_are_counted(truth, field):

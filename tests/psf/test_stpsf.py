@@ -1,9 +1,12 @@
 import os
+import sys
+import types
 from pathlib import Path
 
 import astropy.units as u
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
 from miricigale.psf import encircled_energy, miri_psf, psf_at, stpsf_grid, stpsf_psf
@@ -47,28 +50,16 @@ def data(tmp_path, monkeypatch):
 
 
 def test_says_what_is_missing(monkeypatch):
-    monkeypatch.delenv("STPSF_PATH", raising=False)
-    refuses("STPSF_PATH", stpsf_psf, "miri.f770w", error=DataError)
-    refuses("'n_psfs' must be a square number, got 3", stpsf_grid, "miri.f770w", n_psfs=3)
-
-
-def test_names_the_package_that_is_missing(monkeypatch):
-    import sys
-
-    monkeypatch.setenv("STPSF_PATH", "/nowhere")
-    monkeypatch.setitem(sys.modules, "stpsf", None)
-    refuses(r"miricigale\[stpsf\]", stpsf_psf, "miri.f770w", error=ImportError)
-
-
-def test_says_why_the_data_do_not_do(monkeypatch):
-    import sys
-    import types
-
     def refuse():
         msg = "STPSF data package has version 1.5.0, but 2.1.0 is needed.\nSee ..."
         raise OSError(msg)
 
+    monkeypatch.delenv("STPSF_PATH", raising=False)
+    refuses("STPSF_PATH", stpsf_psf, "miri.f770w", error=DataError)
+    refuses("'n_psfs' must be a square number, got 3", stpsf_grid, "miri.f770w", n_psfs=3)
     monkeypatch.setenv("STPSF_PATH", "/nowhere")
+    monkeypatch.setitem(sys.modules, "stpsf", None)
+    refuses(r"miricigale\[stpsf\]", stpsf_psf, "miri.f770w", error=ImportError)
     monkeypatch.setitem(sys.modules, "stpsf", types.SimpleNamespace(MIRI=refuse))
     match = r"cannot use the data of STPSF_PATH: .* 2\.1\.0 is needed\.$"
     refuses(match, stpsf_psf, "miri.f770w", error=DataError)
@@ -83,9 +74,7 @@ def test_ours_is_like_stpsf(name):
     ours = miri_psf(name, wavefront_error=0 * u.nm, fov=9 * u.arcsec, calibration="stpsf")
     assert theirs.fwhm.value == pytest.approx(ours.fwhm.value, rel=0.01)
     radii = [0.2, 0.5, 1.0, 2.5] * u.arcsec
-    np.testing.assert_allclose(
-        encircled_energy(ours, radii), encircled_energy(theirs, radii), atol=0.017
-    )
+    assert_allclose(encircled_energy(ours, radii), encircled_energy(theirs, radii), atol=0.017)
     # orientation: the mirror image is much less alike in the wings
     r = 2.0 / 0.1109
     t = np.radians(np.arange(0, 360, 2.0))

@@ -2,24 +2,18 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
+from numpy.testing import assert_array_equal
 
 from helpers.errors import refuses
 from helpers.exposures import FIELD as CENTER
-from helpers.exposures import gaussians, image_of
-from miricigale.instrument import imager_wcs
+from helpers.exposures import gaussians, image_of, imager_part
 from miricigale.reduction import BackgroundSettings, Reducer, align_images, align_to_catalog
 
 SHAPE = (400, 420)
 
 
 def cut(pointing, angle=30.0):
-    """A part of the distorted imager."""
-    wcs = imager_wcs(pointing, angle * u.deg)
-    wcs.wcs.crpix = wcs.wcs.crpix - [480, 320]
-    wcs.sip = type(wcs.sip)(wcs.sip.a, wcs.sip.b, wcs.sip.ap, wcs.sip.bp, wcs.wcs.crpix)
-    wcs.pixel_shape = SHAPE[::-1]
-    wcs.wcs.set()
-    return wcs
+    return imager_part(pointing, (480, 320), SHAPE, angle)
 
 
 def observed(true, told, sky, peaks, rng):
@@ -63,7 +57,7 @@ def test_offsets_are_taken_off_to_ten_mas(stars, turn):
         if not turn:
             assert alignment.east.value == pytest.approx(-east, abs=0.01)
             assert alignment.north.value == pytest.approx(-north, abs=0.01)
-        np.testing.assert_array_equal(aligned.data, image.data)
+        assert_array_equal(aligned.data, image.data)
 
 
 def test_dithers_are_aligned_to_the_first(stars):
@@ -83,9 +77,8 @@ def test_dithers_are_aligned_to_the_first(stars):
     reducer = Reducer(background=BackgroundSettings("sep"))
     result = reducer.combine(images, [], align="dithers")
     # stars of images that lie 0.3 arcsec beside each other are outliers
-    count = [
-        sum(im.meta["n_outliers"] for im in r.images) for r in (result, reducer.combine(images, []))
-    ]
+    both = result, reducer.combine(images, [])
+    count = [sum(im.meta["n_outliers"] for im in one.images) for one in both]
     assert count[0] < 0.1 * count[1]
     wanted = "'align' must be a SkyCoord, 'dithers' or None"
     refuses(wanted, reducer.combine, images, [], align="gaia")

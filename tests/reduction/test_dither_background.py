@@ -1,6 +1,7 @@
 import warnings
 
 import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
 from helpers.exposures import FIELD, gaussians, image_of
@@ -81,15 +82,14 @@ def test_sources_of_the_mosaic_are_masked_where_no_image_shows_them():
 
 def test_the_reducer_takes_backgrounds_of_dithers_in_its_second_pass():
     images, _, ripple = dithers()
-    reducer = Reducer(
-        background=BackgroundSettings("dithers"), mosaics=MosaicSettings(outlier_threshold=None)
-    )
+    mosaics = MosaicSettings(outlier_threshold=None)
+    reducer = Reducer(background=BackgroundSettings("dithers"), mosaics=mosaics)
     pairs = [reducer.subtract_background(im) for im in images]
     result = reducer.combine([im for im, _ in pairs], [b for _, b in pairs])
     assert not result.notes
     for im, background, raw in zip(result.images, result.backgrounds, images, strict=True):
         whole = im.data + background.level
-        np.testing.assert_allclose(whole + im.meta["sky_offset"], raw.data, atol=1e-4)
+        assert_allclose(whole + im.meta["sky_offset"], raw.data, atol=1e-4)
         assert np.std((background.level - ripple)[~raw.mask]) < 0.1
     few = reducer.combine([im for im, _ in pairs[:2]], [b for _, b in pairs[:2]])
     assert any("it takes three" in note for note in few.notes)
@@ -109,5 +109,5 @@ def test_medians_leave_out_what_is_not_known():
     found, count = nan_median(stack)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        np.testing.assert_allclose(found, np.nanmedian(stack, axis=0), rtol=1e-6)
-    np.testing.assert_array_equal(count, np.isfinite(stack).sum(axis=0))
+        assert_allclose(found, np.nanmedian(stack, axis=0), rtol=1e-6)
+    assert_array_equal(count, np.isfinite(stack).sum(axis=0))

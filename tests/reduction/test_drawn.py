@@ -37,11 +37,10 @@ def both(exposure, light, *effects, seed=1, without=(), reducer=None, properties
     reducer = Reducer() if reducer is None else reducer
     detector = Detector.miri_imager(*effects, properties=properties).without(*without)
     image = sky_of(exposure, light)
-    charge = detector.collect(image, exposure, seed=seed)
-    fits = [
-        reducer.fit_groups(exposed)
-        for exposed in (detector.expose(image, exposure, seed=seed), charge)
-    ]
+    ramp, charge = (
+        make(image, exposure, seed=seed) for make in (detector.expose, detector.collect)
+    )
+    fits = [reducer.fit_groups(exposed) for exposed in (ramp, charge)]
     return fits, charge.mean / miri_detector().gain
 
 
@@ -67,10 +66,8 @@ def pulls(fit, truth):
     ],
 )
 def test_slopes_have_the_noise_of_the_fit(mode, effects, without):
-    exposure = mode_of(*mode)
-    (fitted, drawn), truth = both(
-        exposure, background_level(mode[0]).value, *effects, without=without
-    )
+    level = background_level(mode[0]).value
+    (fitted, drawn), truth = both(mode_of(*mode), level, *effects, without=without)
     assert_array_equal(np.isnan(inside(drawn.rate)), np.isnan(inside(fitted.rate)))
     good = np.isfinite(inside(drawn.rate))
     n = good.sum()
@@ -79,9 +76,8 @@ def test_slopes_have_the_noise_of_the_fit(mode, effects, without):
         assert 0.98 < pull.std() < 1.03
         # errors follow the slopes, which lowers the mean pull of short exposures
         assert abs(pull.mean()) < 0.02
-        assert abs(inside(fit.rate - truth)[good].mean()) < max(
-            5 * inside(fit.error)[good].mean() / np.sqrt(n), 1e-3 * np.nanmedian(truth)
-        )
+        off, error = (inside(one)[good].mean() for one in (fit.rate - truth, fit.error))
+        assert abs(off) < max(5 * error / np.sqrt(n), 1e-3 * np.nanmedian(truth))
         assert np.mean(np.abs(pull) > 5) < 1e-3
     ratio = inside(drawn.error)[good] / inside(fitted.error)[good]
     assert_allclose(np.median(ratio), 1, atol=2e-3)
@@ -91,9 +87,8 @@ def test_slopes_have_the_noise_of_the_fit(mode, effects, without):
         a, b = (inside(getattr(fit, part))[clean] for fit in (fitted, drawn))
         noise = np.hypot(a.std(), b.std()) / np.sqrt(clean.sum())
         assert_allclose(b.mean(), a.mean(), rtol=1e-3, atol=5 * noise)
-    assert_allclose(
-        inside(drawn.n_used)[good].mean(), inside(fitted.n_used)[good].mean(), rtol=1e-3
-    )
+    used = (inside(fit.n_used)[good].mean() for fit in (drawn, fitted))
+    assert_allclose(*used, rtol=1e-3)
 
 
 @pytest.mark.parametrize("mode", [F770W, F2100W])
@@ -118,9 +113,8 @@ def test_the_same_hits_are_found_and_cost_the_same(mode):
 
 def test_hits_that_are_not_cut_stay_where_they_are():
     reducer = Reducer(jump_threshold=None)
-    (fitted, drawn), truth = both(
-        mode_of(*F770W), background_level("miri.f770w").value, STORM, reducer=reducer
-    )
+    level = background_level("miri.f770w").value
+    (fitted, drawn), truth = both(mode_of(*F770W), level, STORM, reducer=reducer)
     assert len(drawn.jumps) == 0
     one, other = pulls(fitted, truth), pulls(drawn, truth)
     assert np.nanmean(one > 5) > 0.1
@@ -167,20 +161,13 @@ def test_errors_follow_the_light_up_to_saturation():
 
 def test_what_the_reduction_assumes_need_not_be_true():
     known = miri_detector()
-    true = known.replace(
-        gain=1.01 * known.gain,
-        read_noise=1.3 * known.read_noise,
-        nonlinearity=(0.0, 1.0, *(1.3 * c for c in known.nonlinearity[2:])),
-    )
+    curve = (0.0, 1.0, *(1.3 * c for c in known.nonlinearity[2:]))
+    noise = {"gain": 1.01 * known.gain, "read_noise": 1.3 * known.read_noise}
+    options = {"properties": known.replace(**noise, nonlinearity=curve), "without": (CosmicRays,)}
     exposure = mode_of("miri.f770w", 60, 1)
     light = np.broadcast_to(np.geomspace(1, 200, exposure.shape[1]), exposure.shape)
-    (fitted, drawn), truth = both(
-        exposure,
-        light,
-        properties=true,
-        without=(CosmicRays,),
-        reducer=Reducer(references="simulated"),
-    )
+    reducer = Reducer(references="simulated")
+    (fitted, drawn), truth = both(exposure, light, reducer=reducer, **options)
     for columns in np.array_split(np.arange(1, exposure.shape[1] - 1), 8):
         off = [(fit.rate - truth)[1:-1, columns] for fit in (fitted, drawn)]
         mean = [np.nanmean(o / truth[1:-1, columns]) for o in off]
@@ -199,9 +186,8 @@ def test_what_resets_do_is_undone_or_stays_as_in_the_ramps():
         (Reducer(reset_anomaly=ResetAnomaly()), False),
         (Reducer(skip_first=2, skip_last=1), True),
     ):
-        (fitted, drawn), truth = both(
-            exposure, level, *resets, without=(CosmicRays,), reducer=reducer
-        )
+        options = {"without": (CosmicRays,), "reducer": reducer}
+        (fitted, drawn), truth = both(exposure, level, *resets, **options)
         means = [np.nanmean(inside(fit.rate - truth)) for fit in (fitted, drawn)]
         sigma = np.nanmean(inside(fitted.error)) / 256
         assert_allclose(means[1], means[0], atol=6 * sigma)
@@ -213,18 +199,15 @@ def test_images_of_both_go_on_alike():
     exposure = mode_of("miri.f1000w", 20, 1)
     detector, reducer = Detector.miri_imager(), Reducer()
     image = sky_of(exposure, 11.5)
-    fitted, drawn = (
-        reducer.fit_ramp(make(image, exposure, seed=1))
-        for make in (detector.expose, detector.collect)
-    )
+    fitted = reducer.fit_ramp(detector.expose(image, exposure, seed=1))
+    drawn = reducer.fit_ramp(detector.collect(image, exposure, seed=1))
     assert drawn.unit == fitted.unit
     assert set(drawn.meta) == set(fitted.meta)
     changing = {"created", "n_jumps", "noise_correction"}
     for key in set(drawn.meta) - changing:
         assert drawn.meta[key] == fitted.meta[key]
-    assert drawn.meta["noise_correction"] == pytest.approx(
-        fitted.meta["noise_correction"], rel=1e-3
-    )
+    corrections = [image.meta["noise_correction"] for image in (drawn, fitted)]
+    assert_allclose(*corrections, rtol=1e-3)
     assert drawn.data.dtype == fitted.data.dtype
     assert drawn.flags.dtype == fitted.flags.dtype
     assert_array_equal(drawn.mask, (drawn.flags & DQ.DO_NOT_USE) != 0)

@@ -6,11 +6,11 @@ import pytest
 from astropy.io import fits
 from astropy.nddata import CCDData, StdDevUncertainty
 from astropy.wcs import WCS
+from numpy.testing import assert_allclose, assert_array_equal
 
-from helpers.errors import refuses
+from helpers.errors import refuses, warned
 from helpers.exposures import exposure_of, sky_of
-from helpers.real import real_file
-from helpers.references import write_photom, write_reference
+from helpers.references import imager_keywords, write_photom, write_reference
 from miricigale.detector import CosmicRays, Detector, Ramp
 from miricigale.instrument import DQ, ImageFacts
 from miricigale.reduction import (
@@ -20,7 +20,7 @@ from miricigale.reduction import (
     read_images,
     write_image,
 )
-from miricigale.utils.exceptions import DataError, MiricigaleWarning
+from miricigale.utils.exceptions import DataError
 
 I2D = "real/i2d/jw01288015001_04101_00001_mirimage_i2d.fits"
 RATEINTS = "real/ramps/MIRI_5582_89_S_20180308-010230_SCE1_pipe_rateints.fits.gz"
@@ -38,14 +38,10 @@ def rate_file(path, exposure, *, unit="DN/s", steps=("S_LINEAR", "S_DARK", "S_RA
     dq = np.zeros(exposure.shape, np.uint32)
     dq[10, 20], dq[11, 21] = DQ.DO_NOT_USE | DQ.OTHER_BAD_PIXEL, DQ.JUMP_DET
     primary = fits.PrimaryHDU()
-    primary.header.update(
-        {
-            "INSTRUME": "MIRI", "DETECTOR": "MIRIMAGE", "FILTER": "F1000W", "READPATT": "FASTR1",
-            "SUBARRAY": "SUB64", "NGROUPS": 12, "NINTS": 1, "TGROUP": 0.085, "EFFEXPTM": 1.02,
-            "EXPMID": 60000.5, "PATT_NUM": 2, "R_FLAT": "crds://jwst_miri_flat_0786.fits",
-            **dict.fromkeys(steps, "COMPLETE"),
-        }
-    )  # fmt: skip
+    given = {"DETECTOR": "MIRIMAGE", "FILTER": "F1000W", "NGROUPS": 12, "TGROUP": 0.085}
+    given |= {"EFFEXPTM": 1.02, "EXPMID": 60000.5, "PATT_NUM": 2}
+    given |= {"R_FLAT": "crds://jwst_miri_flat_0786.fits", **dict.fromkeys(steps, "COMPLETE")}
+    primary.header.update(imager_keywords(**given))
     pointed = {"RA_REF": 53.1344, "DEC_REF": -27.8344, "ROLL_REF": 30.0}
     science = fits.Header({"BUNIT": unit, **pointed})
     hdus = [primary, fits.ImageHDU(data, science, name="SCI")]
@@ -65,10 +61,10 @@ def test_a_rate_of_the_pipeline(tmp_path, exposure, unit):
     (file,) = read_images(path)
     image = file.image
     assert image.unit == u.adu / u.s
-    np.testing.assert_array_equal(image.data, data)
+    assert_array_equal(image.data, data)
     assert image.flags[10, 20] == DQ.DO_NOT_USE | DQ.OTHER_BAD_PIXEL
     assert image.flags[11, 21] == DQ.JUMP_DET
-    np.testing.assert_array_equal(np.argwhere(image.mask), [[10, 20]])
+    assert_array_equal(np.argwhere(image.mask), [[10, 20]])
     facts = ImageFacts.of(image)
     assert (facts.filter, facts.subarray, facts.day) == ("miri.f1000w", "SUB64", 60000.5)
     assert set(facts.steps) == {"linearity", "dark", "ramp_fit"}
@@ -82,13 +78,11 @@ def test_a_rate_of_the_pipeline(tmp_path, exposure, unit):
 
 
 def test_errors_come_from_variances_where_there_are_no_others(tmp_path, exposure):
-    variances = {
-        "VAR_POISSON": np.full(exposure.shape, 0.09),
-        "VAR_RNOISE": np.full(exposure.shape, 0.16),
-    }
+    plane = np.ones(exposure.shape)
+    variances = {"VAR_POISSON": 0.09 * plane, "VAR_RNOISE": 0.16 * plane}
     rate_file(tmp_path / "a_rate.fits", exposure, ERR=None, **variances)
     (file,) = read_images(tmp_path / "a_rate.fits")
-    np.testing.assert_allclose(file.image.uncertainty.array, 0.5, rtol=1e-6)
+    assert_allclose(file.image.uncertainty.array, 0.5, rtol=1e-6)
     assert set(file.planes) == {"VAR_POISSON", "VAR_RNOISE"}
     for name, options, match in (
         ("b", {"VAR_FLAT": np.ones((3, 4))}, r"must have \(64, 72\) pixels in VAR_FLAT"),
@@ -119,50 +113,44 @@ def test_what_was_done_to_a_rate_is_not_done_again(tmp_path, exposure):
 
 
 @pytest.mark.filterwarnings("ignore::astropy.wcs.FITSFixedWarning")
-def test_a_real_image_of_the_pipeline():
-    path = real_file(I2D)
+def test_a_real_image_of_the_pipeline(data_file):
+    path = data_file(I2D)
     (file,) = read_images(path)
     with fits.open(path) as hdus:
-        np.testing.assert_array_equal(file.image.data, hdus["SCI"].data)
-        np.testing.assert_array_equal(file.image.uncertainty.array, hdus["ERR"].data)
-        np.testing.assert_array_equal(file.planes["WHT"], hdus["WHT"].data)
+        assert_array_equal(file.image.data, hdus["SCI"].data)
+        assert_array_equal(file.image.uncertainty.array, hdus["ERR"].data)
+        assert_array_equal(file.planes["WHT"], hdus["WHT"].data)
         wcs = WCS(hdus["SCI"].header)
     assert file.image.unit == "MJy / sr"
-    np.testing.assert_array_equal(
-        file.image.mask, ~(file.planes["WHT"] > 0) | np.isnan(file.image.data)
-    )
+    assert_array_equal(file.image.mask, ~(file.planes["WHT"] > 0) | np.isnan(file.image.data))
     total = sum(file.planes[name] for name in ("VAR_POISSON", "VAR_RNOISE", "VAR_FLAT"))
     good = ~file.image.mask
     known = good & np.isfinite(total)
     assert known.sum() > 0.99 * good.sum()
-    np.testing.assert_allclose(file.image.uncertainty.array[known] ** 2, total[known], rtol=1e-4)
+    assert_allclose(file.image.uncertainty.array[known] ** 2, total[known], rtol=1e-4)
     assert file.image.wcs.pixel_to_world(3, 4).separation(wcs.pixel_to_world(3, 4)) < 1 * u.mas
     assert ImageFacts.of(file.image).filter == "miri.f1130w"
     assert file.image.meta["photmjsr"] == pytest.approx(1.188432)
     # a single one says what it lacks, and the light of the target fills the image
-    with pytest.warns(MiricigaleWarning, match="cannot be trusted to better than"):
-        result = Reducer().run([path], wcs=file.image.wcs)
+    result = warned("cannot be trusted to better than", Reducer().run, [path], wcs=file.image.wcs)
     assert result.rates == ()
-    assert [note.split(" cannot")[0] for note in result.notes] == [
-        "a single dither: outliers",
-        "1 of 1 backgrounds",
-        "the background of the mosaic",
-    ]
+    wanted = "a single dither: outliers", "1 of 1 backgrounds", "the background of the mosaic"
+    assert tuple(note.split(" cannot")[0] for note in result.notes) == wanted
 
 
-def test_real_rates_of_integrations_and_their_mean():
-    path = real_file(RATEINTS)
+def test_real_rates_of_integrations_and_their_mean(data_file):
+    path = data_file(RATEINTS)
     files = read_images(path)
     with fits.open(path) as hdus:
         data, dq = hdus["SCI"].data, hdus["DQ"].data.astype(np.int64)
         for number, file in enumerate(files):
-            np.testing.assert_array_equal(file.image.data, data[number])
-            np.testing.assert_array_equal(file.image.flags, dq[number])
+            assert_array_equal(file.image.data, data[number])
+            assert_array_equal(file.image.flags, dq[number])
             assert file.image.meta["integration"] == number
     assert files[0].image.wcs is None
     mean = open_exposure(path)
     good = ~mean.mask
-    np.testing.assert_allclose(mean.data[good], data.mean(axis=0)[good], rtol=1e-4, atol=1e-5)
+    assert_allclose(mean.data[good], data.mean(axis=0)[good], rtol=1e-4, atol=1e-5)
     assert mean.mask.mean() < 0.02
 
 
@@ -187,11 +175,11 @@ def test_files_that_are_written_are_read_by_others(tmp_path, exposure):
     assert wcs.pixel_to_world(60, 5).separation(expected) < 1e-3 * u.mas
     # nothing is lost on the way back
     (file,) = read_images(path)
-    np.testing.assert_array_equal(file.image.data, image.data)
-    np.testing.assert_array_equal(file.image.uncertainty.array, image.uncertainty.array)
-    np.testing.assert_array_equal(file.image.mask, image.mask)
-    np.testing.assert_array_equal(file.image.flags & ~1, image.flags & ~1)
-    np.testing.assert_array_equal(file.planes["BKG"], background.level)
+    assert_array_equal(file.image.data, image.data)
+    assert_array_equal(file.image.uncertainty.array, image.uncertainty.array)
+    assert_array_equal(file.image.mask, image.mask)
+    assert_array_equal(file.image.flags & ~1, image.flags & ~1)
+    assert_array_equal(file.planes["BKG"], background.level)
     assert file.image.meta["reference_gain"] == "4 e-/DN of the simulated detector"
     assert ImageFacts.of(file.image) == ImageFacts.of(image)
     # and a rate is calibrated as the one in memory
@@ -199,7 +187,7 @@ def test_files_that_are_written_are_read_by_others(tmp_path, exposure):
     with fits.open(tmp_path / "a_rate.fits") as hdus:
         assert hdus["SCI"].header["BUNIT"] == "DN/s"
     again = reducer.calibrate(open_exposure(tmp_path / "a_rate.fits"))
-    np.testing.assert_array_equal(again.data, reducer.calibrate(rate).data)
+    assert_array_equal(again.data, reducer.calibrate(rate).data)
     refuses("exists", write_image, image, path, error=OSError)
     other = {"SKY": background.level}
     refuses("named VAR_POISSON", write_image, image, tmp_path / "b.fits", planes=other)
@@ -224,11 +212,11 @@ def test_slopes_have_their_two_variances_and_those_of_each_integration(exposure,
     ramp = detector.expose(sky_of(exposure, 12.0), exposure, seed=2)
     reducer = Reducer(jump_threshold=None)
     rate = reducer.fit_ramp(ramp, planes=True)
-    np.testing.assert_array_equal(rate.image.data, reducer.fit_ramp(ramp).data)
+    assert_array_equal(rate.image.data, reducer.fit_ramp(ramp).data)
     back = read_images(write_image(rate, tmp_path / "a_rate.fits"))[0]
     good = ~back.image.mask
     total = back.planes["VAR_POISSON"] + back.planes["VAR_RNOISE"]
-    np.testing.assert_allclose(total[good], back.image.uncertainty.array[good] ** 2, rtol=1e-5)
+    assert_allclose(total[good], back.image.uncertainty.array[good] ** 2, rtol=1e-5)
     # without photons, the variance of a straight line through reads (a closed form)
     n, sigma = exposure.n_groups, np.hypot(ramp.properties.read_noise, np.sqrt(1 / 12))
     step = exposure.group_time.to_value("s")
@@ -243,12 +231,12 @@ def test_slopes_have_their_two_variances_and_those_of_each_integration(exposure,
         assert hdus[0].header["DATAMODL"] == "CubeModel"
     for number, (file, part) in enumerate(zip(read_images(path), parts, strict=True)):
         assert file.image.meta["integration"] == number
-        np.testing.assert_array_equal(file.image.data, part.image.data)
-        np.testing.assert_array_equal(file.planes["VAR_POISSON"], part.planes["VAR_POISSON"])
+        assert_array_equal(file.image.data, part.image.data)
+        assert_array_equal(file.planes["VAR_POISSON"], part.planes["VAR_POISSON"])
         seen = file.image.wcs.pixel_to_world(10, 20)
         assert seen.separation(exposure.wcs.pixel_to_world(10, 20)) < 1e-6 * u.arcsec
     # their mean is the slope of all, where nothing is cut
     mean = open_exposure(path)
-    np.testing.assert_allclose(mean.data[good], rate.image.data[good], rtol=0.02, atol=0.2)
+    assert_allclose(mean.data[good], rate.image.data[good], rtol=0.02, atol=0.2)
     wanted, mixed = "'image' must be integrations of one shape", [parts[0], parts[1].image]
     refuses(wanted, write_image, mixed, tmp_path / "b.fits")

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.table import Table
+from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
 from helpers.exposures import exposure_of, sky_of
@@ -57,10 +58,10 @@ def test_all_stages_and_filters_in_one_go(files, tmp_path, capsys):
     # the mosaic is that of the classes
     (file,) = read_images(out / "mosaic_f770w.fits")
     result = Reducer().run(files[:3])
-    np.testing.assert_allclose(file.image.data, result.mosaic.data, rtol=1e-5, atol=1e-5)
-    np.testing.assert_array_equal(file.planes["CON"][0], result.n_images)
-    np.testing.assert_allclose(file.planes["WHT"], result.weight, rtol=1e-6)
-    np.testing.assert_allclose(file.planes["BKG"], result.mosaic_background.level, rtol=1e-5)
+    assert_allclose(file.image.data, result.mosaic.data, rtol=1e-5, atol=1e-5)
+    assert_array_equal(file.planes["CON"][0], result.n_images)
+    assert_allclose(file.planes["WHT"], result.weight, rtol=1e-6)
+    assert_allclose(file.planes["BKG"], result.mosaic_background.level, rtol=1e-5)
     (cal,) = read_images(out / "f770w_0_cal.fits")
     level = background_level("miri.f770w").value
     assert np.median(cal.planes["BKG"]) == pytest.approx(level, rel=0.1)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.nddata import CCDData
+from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
 from miricigale.detector import Detector, Ramp
@@ -57,13 +58,13 @@ def test_images_of_ccddata_come_back(ramps, folder, tmp_path):
     back = open_exposure(path)
     assert equal(back, rate)
     assert np.array_equal(back.uncertainty.array, rate.uncertainty.array, equal_nan=True)
-    np.testing.assert_array_equal(back.flags, rate.flags)
-    np.testing.assert_array_equal(back.mask, rate.mask)
+    assert_array_equal(back.flags, rate.flags)
+    assert_array_equal(back.mask, rate.mask)
     assert (back.unit, back.meta) == (rate.unit, rate.meta)
     calibrated = Reducer().calibrate(path)
     assert equal(calibrated, Reducer().calibrate(rate))
     # and astropy reads it as it reads its own
-    np.testing.assert_array_equal(CCDData.read(path).mask, rate.mask)
+    assert_array_equal(CCDData.read(path).mask, rate.mask)
     assert equal(Reducer().mosaic(calibrated), Reducer().mosaic([calibrated]))
 
 
@@ -74,9 +75,7 @@ def test_a_result_is_written_and_drawn(ramps, tmp_path):
         assert {"SCI", "ERR", "DQ", "WHT", "CON", "BKG"} <= {hdu.name for hdu in hdus}
     back = read_images(path)[0].image
     assert equal(back, result.mosaic)
-    np.testing.assert_array_equal(
-        back.flags & ~int(DQ.DO_NOT_USE), result.mosaic.flags & ~int(DQ.DO_NOT_USE)
-    )
+    assert_array_equal(back.flags & ~int(DQ.DO_NOT_USE), result.mosaic.flags & ~int(DQ.DO_NOT_USE))
     # which leaves the image as it is
     assert "notes" not in result.mosaic.meta
     assert read_images(path)[0].image.meta["notes"] == list(result.notes)
@@ -93,9 +92,8 @@ def test_a_method_stands_for_its_settings():
 
 
 def test_a_detector_of_defaults():
-    assert [type(effect) for effect in Detector().effects] == [
-        type(effect) for effect in Detector.miri_imager().effects
-    ]
+    plain, imager = (map(type, one.effects) for one in (Detector(), Detector.miri_imager()))
+    assert list(plain) == list(imager)
     assert Detector().gain == Detector().properties.gain
     with pytest.raises(AttributeError, match="Detector has no 'expse'; it has expose"):
         Detector().expse  # noqa: B018
@@ -105,13 +103,13 @@ def test_a_detector_of_defaults():
 def test_integrations_and_pixels_of_a_ramp(ramps):
     ramp = ramps[0]
     assert isinstance(ramp[-1], Ramp)
-    np.testing.assert_array_equal(ramp[0].data, ramp.data[:1])
+    assert_array_equal(ramp[0].data, ramp.data[:1])
     with pytest.raises(IndexError, match="integration 1 of 1"):
         ramp[1]
     assert ramp.filter == "miri.f770w"
     ax = ramp.plot((40, 50), ax=plt.figure().subplots())
-    np.testing.assert_array_equal(ax.lines[0].get_ydata(), ramp.data[0, :, 50, 40])
-    np.testing.assert_allclose(ax.lines[0].get_xdata()[-1], ramp.exposure.integration_time.value)
+    assert_array_equal(ax.lines[0].get_ydata(), ramp.data[0, :, 50, 40])
+    assert_allclose(ax.lines[0].get_xdata()[-1], ramp.exposure.integration_time.value)
     refuses(r"'pixel' must be \(x, y\) below", ramp.plot, (500, 0))
     # without a pixel that of the source, whatever cosmic rays have hit
     place = ramp.plot(ax=plt.figure().subplots()).get_title().strip("pixel ()").split(", ")

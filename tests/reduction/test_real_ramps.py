@@ -12,7 +12,6 @@ import pytest
 from astropy.io import fits
 from scipy.ndimage import convolve
 
-from helpers.real import real_file
 from helpers.references import write_reference
 from miricigale.detector import Ramp
 from miricigale.reduction import Reducer, ReferenceFiles
@@ -32,14 +31,14 @@ def slopes(ramp, number, first, last):
 
 
 @pytest.fixture(scope="module")
-def ramp():
-    return Ramp.read(real_file(f"{STEM}.fits.gz"))
+def ramp(data_file):
+    return Ramp.read(data_file(f"{STEM}.fits.gz"))
 
 
 @pytest.fixture(scope="module")
-def pipeline():
+def pipeline(data_file):
     """Rates of the pipeline, and which are good: no flag, not at the edge where light is coupled in."""
-    with fits.open(real_file(f"{STEM}_rateints.fits.gz")) as hdus:
+    with fits.open(data_file(f"{STEM}_rateints.fits.gz")) as hdus:
         rates = hdus["SCI"].data.astype(float)
         good = hdus["DQ"].data == 0
     good[:, :, :5] = good[:, :, -1] = False
@@ -61,21 +60,18 @@ def test_later_integrations_have_the_slopes_of_the_pipeline(ramp, pipeline, deri
     rates, good = pipeline
     coefficients = np.zeros((3, 64, 72))
     coefficients[1], coefficients[2] = derivative[0], derivative[1] / 2
-    linearity = write_reference(
-        tmp_path / "linearity.fits", "linearity", ramp.exposure, coefficients
-    )
-    references = ReferenceFiles(
-        linearity=linearity, gain=5.5, read_noise="measured", incomplete=True
-    )
+    path = tmp_path / "linearity.fits"
+    linearity = write_reference(path, "linearity", ramp.exposure, coefficients)
+    known = {"linearity": linearity, "gain": 5.5, "read_noise": "measured"}
+    references = ReferenceFiles(**known, incomplete=True)
     # groups 4 to 49, as firstframe, rscd and lastframe left them
     reducer = Reducer(references=references, skip_first=3)
     with pytest.warns(MiricigaleWarning, match="mask, saturation, dark: these steps are left out"):
         found = reducer.fit_integrations(ramp)
     for number in (1, 2, 3, 4):
         use = good[number] & ~found[number].mask
-        assert np.median(found[number].data[use]) == pytest.approx(
-            np.median(rates[number][use]), rel=0.03
-        )
+        theirs = np.median(rates[number][use])
+        assert np.median(found[number].data[use]) == pytest.approx(theirs, rel=0.03)
         coupled = convolve(np.nan_to_num(found[number].data), COUPLING)[use]
         assert np.corrcoef(coupled, rates[number][use])[0, 1] > 0.97
         # both are estimates of the same slopes from the same counts
@@ -88,6 +84,5 @@ def test_later_integrations_have_the_slopes_of_the_pipeline(ramp, pipeline, deri
         np.median(p.data[g]) / np.median(f.data[g])
         for p, f, g in zip(plain, found, good, strict=True)
     ]
-    assert np.mean(ratio[1:]) == pytest.approx(
-        1 / (derivative[0] + derivative[1] * 11800), abs=0.06
-    )
+    expected = 1 / (derivative[0] + derivative[1] * 11800)
+    assert np.mean(ratio[1:]) == pytest.approx(expected, abs=0.06)

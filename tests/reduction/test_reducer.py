@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData, StdDevUncertainty
+from numpy.testing import assert_array_equal
 from scipy.ndimage import convolve
 
 from helpers.errors import refuses
 from helpers.exposures import exposure_of, image_of, sky_of
+from helpers.mosaics import render
 from miricigale.detector import (
     BadPixels,
     CosmicRays,
@@ -91,7 +93,7 @@ def test_flags_tell_why(tmp_path):
         assert 5e-4 < bad.mean() < 2e-3
         assert np.all(np.isnan(rate.data[bad]))
         # nothing is masked without a reason
-        np.testing.assert_array_equal(image.mask, (why & DQ.DO_NOT_USE) != 0)
+        assert_array_equal(image.mask, (why & DQ.DO_NOT_USE) != 0)
         assert np.all(why[image.mask] != DQ.DO_NOT_USE)
     assert np.all(cal.mask[~field_mask()])
     assert rate.unit == "adu / s"
@@ -104,18 +106,6 @@ def test_flags_tell_why(tmp_path):
     assert np.median(cal.data[good]) == pytest.approx(SKY, rel=5e-3)
 
 
-def stars(exp, positions, fluxes, *, width=1.2):
-    """Gaussian stars, uJy, in MJy/sr."""
-    ny, nx = exp.shape
-    light = np.zeros(exp.shape)
-    area = pixel_area_map(exp.wcs, exp.shape)
-    yy, xx = np.mgrid[:ny, :nx]
-    for x, y, flux in zip(*exp.wcs.world_to_pixel(positions), fluxes, strict=True):
-        stamp = np.exp(-0.5 * ((xx - x) ** 2 + (yy - y) ** 2) / width**2)
-        light += flux * 1e-12 * stamp / stamp.sum() / area
-    return light
-
-
 @pytest.fixture(scope="module")
 def field():
     exps = [exposure(d) for d in range(4)]
@@ -123,7 +113,7 @@ def field():
     grid += np.random.default_rng(2).uniform(-4, 4, grid.shape)
     positions = exps[0].wcs.pixel_to_world(*grid)
     fluxes = np.full(grid.shape[1], 30.0)
-    ramps = [expose(SKY + stars(e, positions, fluxes), e) for e in exps]
+    ramps = [expose(SKY + render(positions, fluxes, 0.132, e.wcs, e.shape), e) for e in exps]
     return exps, positions, fluxes, ramps
 
 
@@ -137,7 +127,7 @@ def test_the_whole_way_keeps_fluxes_and_errors(field):
     assert mosaic.meta["n_exposures"] == 4
     assert mosaic.meta["exposure_time"] == pytest.approx(sum(e.exposure_time.value for e in exps))
     assert mosaic.meta["pa_aper"] == [e.pa_aper.value for e in exps]
-    np.testing.assert_array_equal(mosaic.mask, (result.weight == 0) | np.isnan(mosaic.data))
+    assert_array_equal(mosaic.mask, (result.weight == 0) | np.isnan(mosaic.data))
     for background in result.backgrounds:
         assert np.median(background.level) == pytest.approx(SKY, rel=2e-3)
 
@@ -238,10 +228,8 @@ def test_refuses_what_does_not_belong_together():
     reducer = Reducer(properties=DetectorProperties())
     refuses("'images' must be at least one image, got none", Reducer().combine, [], [])
     refuses("'ramps' must be at least one ramp", reducer.run, [])
-    ramps = [
-        expose(5.0, exposure(n_groups=2, filt=f), without=[CosmicRays])
-        for f in ("miri.f770w", "miri.f1000w")
-    ]
+    exposures = [exposure(n_groups=2, filt=filt) for filt in ("miri.f770w", FILTER)]
+    ramps = [expose(5.0, one, without=[CosmicRays]) for one in exposures]
     refuses(r"'ramps' must be of one filter \(miri.f770w\)", reducer.run, ramps)
     bare = CCDData(np.ones((4, 4)), unit="adu / s", uncertainty=StdDevUncertainty(np.ones((4, 4))))
     refuses("'rate' must be an image whose meta has 'filter'", reducer.calibrate, bare)

@@ -3,20 +3,12 @@
 import pytest
 
 from helpers.errors import refuses
-from helpers.references import write_cache
+from helpers.references import imager_keywords, write_cache
 from miricigale.reduction import ReferenceCache
 from miricigale.utils.exceptions import DataError
 
-HEADER = {
-    "DETECTOR": "MIRIMAGE",
-    "FILTER": "F770W",
-    "BAND": "N/A",
-    "READPATT": "FASTR1",
-    "SUBARRAY": "SUB64",
-    "EXP_TYPE": "MIR_IMAGE",
-    "DATE-OBS": "2022-07-03",
-    "TIME-OBS": "12:30:00.500",
-}
+HEADER = imager_keywords(DETECTOR="MIRIMAGE", BAND="N/A")
+HEADER |= {"DATE-OBS": "2022-07-03", "TIME-OBS": "12:30:00.500"}
 
 DETECTOR = "('META.INSTRUMENT.DETECTOR',)"
 DATES = "('META.OBSERVATION.DATE', 'META.OBSERVATION.TIME')"
@@ -75,14 +67,11 @@ def chosen(folder, **header):
 
 def test_rules_choose_by_the_header(folder):
     assert chosen(folder) == {"gain": "flight.fits", "flat": "sub64.fits", "dark": "two.fits"}
-    assert chosen(folder, **{"DATE-OBS": "2018-03-08"}) == {
-        "gain": "ground.fits",
-        "flat": "sub64.fits",
-    }
+    ground = {"gain": "ground.fits"}
+    assert chosen(folder, **{"DATE-OBS": "2018-03-08"}) == {**ground, "flat": "sub64.fits"}
     # without a filter there is no flat field
-    assert chosen(folder, **{"DATE-OBS": "2021-03-08", "FILTER": "F560W"}) == {
-        "gain": "ground.fits", "dark": "one.fits"
-    }  # fmt: skip
+    other = {"DATE-OBS": "2021-03-08", "FILTER": "F560W"}
+    assert chosen(folder, **other) == {**ground, "dark": "one.fits"}
     # the generic file has one match less
     assert chosen(folder, SUBARRAY="FULL")["flat"] == "generic.fits"
     files = ReferenceCache(folder).find(HEADER)

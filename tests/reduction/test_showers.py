@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from scipy.ndimage import gaussian_filter
 
 from helpers.errors import refuses
@@ -55,7 +56,7 @@ def test_without_showers_nothing_else_is_cut():
     assert np.mean(changed) < 1e-3
     assert not np.any((fit.flags ^ plain.flags) & int(DQ.DO_NOT_USE))
     same = ~changed & np.isfinite(plain.rate) & (fit.n_used == plain.n_used)
-    np.testing.assert_array_equal(fit.rate[same], plain.rate[same])
+    assert_array_equal(fit.rate[same], plain.rate[same])
     assert np.std(smoothed_pull(fit, truth)[0]) == pytest.approx(1, abs=0.01)
 
 

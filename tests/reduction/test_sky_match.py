@@ -1,6 +1,7 @@
 import astropy.units as u
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.exposures import FIELD, gaussians, image_of
 from miricigale.instrument import DQ, mosaic_wcs, north_up_wcs
@@ -22,30 +23,26 @@ def test_levels_are_those_put_in_whatever_the_sources():
     levels = np.array([0.0, 0.8, -1.5, 0.3])
     sources = [(*rng.uniform(10, 150, 2), 10 ** rng.uniform(1, 3)) for _ in range(40)]
     shifts = [(0, 0), (13.4, 5.2), (-20.7, 9.1), (6.5, -30.3)]
-    images = [
-        dither(*shift, level, rng=rng, sources=sources)
-        for shift, level in zip(shifts, levels, strict=True)
-    ]
+    pairs = zip(shifts, levels, strict=True)
+    images = [dither(*shift, level, rng=rng, sources=sources) for shift, level in pairs]
     grid = mosaic_wcs([im.wcs for im in images], 0.11 * u.arcsec)
     offsets = sky_offsets(images, grid)
     # some 300 cells of 64 pixels: 0.01 each
-    np.testing.assert_allclose(offsets, levels - levels.mean(), atol=0.03)
+    assert_allclose(offsets, levels - levels.mean(), atol=0.03)
     assert offsets.sum() == pytest.approx(0, abs=1e-9)
     for im, raw, offset in zip(match_levels(images, grid), images, offsets, strict=True):
-        np.testing.assert_allclose(im.data + offset, raw.data)
+        assert_allclose(im.data + offset, raw.data)
         assert im.meta["sky_offset"] == pytest.approx(offset)
 
 
 def test_images_that_touch_by_way_of_others_are_matched_and_others_are_left():
     rng = np.random.default_rng(2)
     # a chain of three, and one far away
-    images = [
-        dither(dx, 0, level, rng=rng)
-        for dx, level in ((0, 0.0), (110, 1.0), (220, 3.0), (900, 50.0))
-    ]
+    steps = (0, 0.0), (110, 1.0), (220, 3.0), (900, 50.0)
+    images = [dither(dx, 0, level, rng=rng) for dx, level in steps]
     grid = mosaic_wcs([im.wcs for im in images], 0.11 * u.arcsec)
     offsets = sky_offsets(images, grid)
-    np.testing.assert_allclose(offsets[:3], np.array([0, 1, 3]) - 4 / 3, atol=0.1)
+    assert_allclose(offsets[:3], np.array([0, 1, 3]) - 4 / 3, atol=0.1)
     assert offsets[3] == pytest.approx(0, abs=1e-9)
 
 
@@ -54,16 +51,15 @@ def test_images_that_are_one_and_the_same_do_not_hide_the_others():
     one, other = (dither(dx, 0, level, rng=rng) for dx, level in ((0, 0.0), (20, 3.0)))
     grid = mosaic_wcs([one.wcs, other.wcs], 0.11 * u.arcsec)
     offsets = sky_offsets([one, one, other], grid)
-    np.testing.assert_allclose(offsets, [-1, -1, 2], atol=0.05)
-    np.testing.assert_array_equal(sky_offsets([one, one], grid), 0)
+    assert_allclose(offsets, [-1, -1, 2], atol=0.05)
+    assert_array_equal(sky_offsets([one, one], grid), 0)
 
 
 def test_levels_are_matched_before_outliers_are_searched():
     rng = np.random.default_rng(3)
     shifts = [(0, 0), (13, 5), (-20, 9), (6, -30)]
-    images = [
-        dither(*shift, level, rng=rng) for shift, level in zip(shifts, (0, 0, 0, 8), strict=True)
-    ]
+    pairs = zip(shifts, (0, 0, 0, 8), strict=True)
+    images = [dither(*shift, level, rng=rng) for shift, level in pairs]
     images[1].data[80, 80] += 30
     grid = mosaic_wcs([im.wcs for im in images], 0.11 * u.arcsec)
     mosaic, used = Reducer().drizzle(images, grid)
