@@ -9,7 +9,7 @@ from astropy.table import QTable, Table
 
 from miricigale.filters.band_names import band_filters, filter_of_band, is_line
 from miricigale.filters.given import given_filters
-from miricigale.utils.exceptions import CatalogWarning, DataError
+from miricigale.utils.exceptions import CatalogWarning, DataError, data_error
 from miricigale.utils.files import read_table
 from miricigale.utils.missing import negative_errors, plain_floats, without_codes
 from miricigale.utils.tables import error_column
@@ -87,8 +87,7 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
         msg = f"{path}: {err}"
         raise DataError(msg) from None
     if not filters:
-        msg = f"{path} has no band that is known here, of {', '.join(chosen) or 'none'}"
-        raise DataError(msg)
+        raise data_error(path, f"has no band that is known here, of {', '.join(chosen) or 'none'}")
     left_out = [*lost, *(f"{name} (line)" for name in lines)]
     own = {*_OWN, *chosen, *map(error_column, chosen)}
     other = [] if bands is not None else [name for name in table.colnames if name not in own]
@@ -142,8 +141,7 @@ def _choose(path, table, bands):
         ]
     lost = [name for name in ("id", "redshift", *bands) if name not in have]
     if lost:
-        msg = f"{path} has no column {', '.join(lost)}; it has {', '.join(have)}"
-        raise DataError(msg)
+        raise data_error(path, f"has no column {', '.join(lost)}; it has {', '.join(have)}")
     return [name for name in dict.fromkeys(bands) if not name.endswith("_err")]
 
 
@@ -184,8 +182,7 @@ def _numbers(path, table, name):
     try:
         return plain_floats(table[name], name, path)
     except ValueError:
-        msg = f"{path}: the column {name!r} holds something else than numbers"
-        raise DataError(msg) from None
+        raise data_error(path, f"has other than numbers in the column {name!r}") from None
 
 
 def _in_unit(path, table, name, values, default):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from miricigale.utils.exceptions import ConfigError, DataError
+from miricigale.utils.exceptions import ConfigError, DataError, data_error
 
 #: Settings other than those of the modules; empty ones count as not given.
 _SPEC = """\
@@ -57,8 +57,7 @@ def parse_ini(path):
             str(path), configspec=spec, encoding="utf-8", interpolation=False
         )
     except (OSError, UnicodeError, configobj.ConfigObjError) as err:
-        msg = f"{path} cannot be read as a configuration of CIGALE: {err}"
-        raise DataError(msg) from None
+        raise data_error(path, f"cannot be read as a configuration of CIGALE: {err}") from None
     analysis = config.get("analysis_params", {})
     if "sed_modules" not in config or not all(
         isinstance(section, dict) for section in (config.get("sed_modules_params"), analysis)

@@ -15,7 +15,13 @@ from astropy.table import QTable
 from miricigale.filters.band_names import eazy_filter
 from miricigale.filters.filter import Filter
 from miricigale.filters.surveys import SURVEYS, is_band
-from miricigale.utils.exceptions import CatalogWarning, DataError, argument_error, unknown_name
+from miricigale.utils.exceptions import (
+    CatalogWarning,
+    DataError,
+    argument_error,
+    data_error,
+    unknown_name,
+)
 from miricigale.utils.missing import negative_errors, plain_floats, without_codes
 from miricigale.utils.options import check_choice, check_names
 from miricigale.utils.tables import error_column
@@ -110,13 +116,11 @@ class CatalogMap:
                 return cls(columns=_translated(text, path))
             values = tomllib.loads(text)
         except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as err:
-            msg = f"{path} cannot be read as a map of columns: {err}"
-            raise DataError(msg) from err
+            raise data_error(path, f"cannot be read as a map of columns: {err}") from err
         known = [field.name for field in dataclasses.fields(cls)]
         unknown = sorted(set(values) - set(known))
         if unknown:
-            msg = f"{path} is no map of columns: it has {unknown}; known: {known}"
-            raise DataError(msg)
+            raise data_error(path, f"is no map of columns: it has {unknown}; known: {known}")
         return cls(**values)
 
     def settings(self):

@@ -9,7 +9,7 @@ import astropy.units as u
 import numpy as np
 from astropy.io import fits
 
-from miricigale.utils.exceptions import DataError, PhotometryWarning, argument_error
+from miricigale.utils.exceptions import DataError, PhotometryWarning, argument_error, data_error
 from miricigale.utils.files import open_fits, split_extension
 from miricigale.utils.optional import require
 
@@ -61,8 +61,8 @@ def find_image(hdus, extension, path, names):
         try:
             found = [hdus.index_of(extension)]
         except (KeyError, IndexError):
-            msg = f"{path}: there is no such extension, only {[hdu.name for hdu in hdus]}"
-            raise DataError(msg) from None
+            known = [hdu.name for hdu in hdus]
+            raise data_error(path, f"has no such extension, only {known}") from None
         if found[0] not in images:
             msg = f"{path} is no two-dimensional image, but of the shape {hdus[found[0]].shape}"
             raise DataError(msg)
@@ -71,13 +71,10 @@ def find_image(hdus, extension, path, names):
     found = named or images[:1]
     if not found:
         shapes = [getattr(hdu, "shape", ()) for hdu in hdus]
-        msg = f"{path} has no two-dimensional image, only {shapes}"
-        raise DataError(msg)
+        raise data_error(path, f"has no two-dimensional image, only {shapes}")
     if len(found) > 1:
-        msg = (
-            f"{path} has {len(found)} extensions {hdus[found[0]].name}; say which as {path}[NUMBER]"
-        )
-        raise DataError(msg)
+        what = f"has {len(found)} extensions {hdus[found[0]].name}"
+        raise data_error(path, f"{what}; say which as {path}[NUMBER]")
     return found[0]
 
 

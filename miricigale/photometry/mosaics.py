@@ -27,7 +27,7 @@ from miricigale.photometry.grids import (
     read_wcs,
 )
 from miricigale.photometry.sky_noise import mask_filled, sky_noise
-from miricigale.utils.exceptions import DataError, PhotometryWarning, argument_error
+from miricigale.utils.exceptions import DataError, PhotometryWarning, argument_error, data_error
 from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
 
 _log = logging.getLogger(__name__)
@@ -183,8 +183,7 @@ class MosaicFile:
             header, first = hdus[index].header, hdus[0].header
             wcs = read_wcs(header, hdus)
         if wcs is None:
-            msg = f"{self.path} has no celestial coordinates (WCS) in its header"
-            raise DataError(msg)
+            raise data_error(self.path, "has no celestial coordinates (WCS) in its header")
 
         def get(key):
             return header.get(key, first.get(key))

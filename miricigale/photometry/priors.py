@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 
 from miricigale.photometry.grids import open_map
-from miricigale.utils.exceptions import CatalogWarning, DataError, argument_error
+from miricigale.utils.exceptions import CatalogWarning, DataError, argument_error, data_error
 from miricigale.utils.positions import as_positions
 from miricigale.utils.tables import as_table, unique_ids
 
@@ -131,16 +131,14 @@ def _numbered(data, path):
         data = rounded
     data = data.astype(np.int64)
     if data.min(initial=0) < 0:
-        msg = f"{path} has negative ids, such as {data.min()}; 0 is the sky"
-        raise DataError(msg)
+        raise data_error(path, f"has negative ids, such as {data.min()}; 0 is the sky")
     values, labels = np.unique(data, return_inverse=True)
     labels = labels.reshape(data.shape).astype(np.int32)
     # the sky is 0 even where every pixel belongs to a segment
     if values[0] != 0:
         return labels + np.int32(1), values
     if len(values) == 1:
-        msg = f"{path} has no segment: all of its pixels are 0"
-        raise DataError(msg)
+        raise data_error(path, "has no segment: all of its pixels are 0")
     return labels, values[1:]
 
 
