@@ -9,7 +9,7 @@ from astropy.table import QTable, Table
 
 from miricigale.filters.band_names import band_filters, filter_of_band, is_line
 from miricigale.filters.given import given_filters
-from miricigale.utils.exceptions import CatalogWarning, DataError, data_error
+from miricigale.utils.exceptions import CatalogWarning, data_error
 from miricigale.utils.files import read_table
 from miricigale.utils.missing import negative_errors, plain_floats, without_codes
 from miricigale.utils.tables import error_column
@@ -84,8 +84,7 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
     try:
         filters, lost = band_filters([name for name in chosen if name not in lines], names)
     except ValueError as err:
-        msg = f"{path}: {err}"
-        raise DataError(msg) from None
+        raise data_error(path, f"cannot be used: {err}") from None
     if not filters:
         raise data_error(path, f"has no band that is known here, of {', '.join(chosen) or 'none'}")
     left_out = [*lost, *(f"{name} (line)" for name in lines)]
@@ -122,8 +121,7 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
     }
     text = "; ".join(f"{what}: {', '.join(which)}" for what, which in notes.items() if which)
     if strict and left_out:
-        msg = f"{path}: {text}"
-        raise DataError(msg)
+        raise data_error(path, f"cannot be used as a whole: {text}")
     if text:
         warnings.warn(f"{path}: {text}", CatalogWarning, stacklevel=2)
     return out
@@ -191,5 +189,5 @@ def _in_unit(path, table, name, values, default):
     try:
         return (values * u.Unit(unit)).to(default)
     except (u.UnitConversionError, TypeError, ValueError):
-        msg = f"{path}: the column {name!r} must be convertible to {default}, got {unit}"
-        raise DataError(msg) from None
+        what = f"cannot be used: column {name!r} must be convertible to {default}, got {unit}"
+        raise data_error(path, what) from None

@@ -13,7 +13,7 @@ from miricigale.fitting.results import CIGALE_LEAST_STD, FitResults
 from miricigale.fitting.samples import Samples
 from miricigale.sed import ModelGrid
 from miricigale.utils.content import content_sha256
-from miricigale.utils.exceptions import DataError, argument_error, data_error
+from miricigale.utils.exceptions import argument_error, data_error
 from miricigale.utils.files import open_fits
 from miricigale.utils.folder import RecordFolder
 from miricigale.utils.object_rows import ByID
@@ -222,11 +222,8 @@ def open_results(path, *, partial=False, model=None):
     """
     results = FitResultsFiles(path, model=model)
     if not (partial or results.complete):
-        msg = (
-            f"{path} holds {len(results.paths)} of {results.n_parts} parts: fit_file with the "
-            "same arguments resumes; partial=True opens what is there"
-        )
-        raise DataError(msg)
+        what = "fit_file with the same arguments resumes; partial=True opens what is there"
+        raise data_error(path, f"holds {len(results.paths)} of {results.n_parts} parts: {what}")
     return results
 
 

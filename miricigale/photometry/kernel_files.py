@@ -6,7 +6,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.photometry.grids import grid_angle
-from miricigale.utils.exceptions import DataError, argument_error, data_error
+from miricigale.utils.exceptions import argument_error, data_error
 from miricigale.utils.files import open_fits, split_extension
 from miricigale.utils.units import ANGLE, to_array
 
@@ -185,11 +185,8 @@ def read_kernel(path, *, pixel_scale, highres_psf=None):
         kernel.meta["file"] = str(path)
     wanted = pixel_scale.to_value(ANGLE)
     if stated is not None and abs(stated / wanted - 1) > 0.02:
-        msg = (
-            f"{path} is a kernel for pixels of {stated:.4g} arcsec, and those of the prior have "
-            f"{wanted:.4g} arcsec"
-        )
-        raise DataError(msg)
+        what = f"{stated:.4g} arcsec, and those of the prior have {wanted:.4g} arcsec"
+        raise data_error(path, f"is a kernel for pixels of {what}")
     return kernel
 
 

@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 
 from miricigale.photometry.grids import open_map
-from miricigale.utils.exceptions import CatalogWarning, DataError, argument_error, data_error
+from miricigale.utils.exceptions import CatalogWarning, argument_error, data_error
 from miricigale.utils.positions import as_positions
 from miricigale.utils.tables import as_table, unique_ids
 
@@ -122,12 +122,10 @@ def _numbered(data, path):
     if data.dtype.kind == "f":
         rounded = np.where(np.isfinite(data), np.rint(data), 0)
         if not np.array_equal(rounded, np.where(np.isfinite(data), data, 0)):
-            msg = f"{path} is no segmentation map: it has values that are no whole numbers"
-            raise DataError(msg)
+            raise data_error(path, "is no map of segments: it has values that are no whole numbers")
         # single precision holds no larger whole numbers
         if data.dtype.itemsize <= 4 and rounded.max(initial=0) > 2**24:
-            msg = f"{path} has ids above 2^24 in single precision, where they are not distinct"
-            raise DataError(msg)
+            raise data_error(path, "has ids above 2^24 in single precision: not distinct")
         data = rounded
     data = data.astype(np.int64)
     if data.min(initial=0) < 0:

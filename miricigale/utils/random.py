@@ -6,8 +6,6 @@ import numpy as np
 
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["check_seed", "stream", "text_key"]
-
 
 def text_key(text):
     """
