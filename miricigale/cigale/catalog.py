@@ -8,7 +8,11 @@ from astropy.table import QTable, Table
 
 from miricigale.filters.band_names import band_filters, filter_of_band, is_line
 from miricigale.filters.given import given_filters
-from miricigale.utils.exceptions import CatalogWarning, DataError, warn
+from miricigale.utils.exceptions import (
+    CatalogWarning,
+    data_error,
+    warn,
+)
 from miricigale.utils.files import read_table
 from miricigale.utils.missing import negative_errors, plain_floats, without_codes
 from miricigale.utils.tables import error_column
@@ -83,11 +87,9 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
     try:
         filters, lost = band_filters([name for name in chosen if name not in lines], names)
     except ValueError as err:
-        msg = f"{path}: {err}"
-        raise DataError(msg) from None
+        raise data_error(path, f"cannot be used: {err}") from None
     if not filters:
-        msg = f"{path} has no band that is known here, of {', '.join(chosen) or 'none'}"
-        raise DataError(msg)
+        raise data_error(path, f"has no band that is known here, of {', '.join(chosen) or 'none'}")
     left_out = [*lost, *(f"{name} (line)" for name in lines)]
     own = {*_OWN, *chosen, *map(error_column, chosen)}
     other = [] if bands is not None else [name for name in table.colnames if name not in own]
@@ -122,8 +124,7 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
     }
     text = "; ".join(f"{what}: {', '.join(which)}" for what, which in notes.items() if which)
     if strict and left_out:
-        msg = f"{path}: {text}"
-        raise DataError(msg)
+        raise data_error(path, f"cannot be used as a whole: {text}")
     if text:
         warn(f"{path}: {text}", CatalogWarning)
     return out
@@ -141,8 +142,7 @@ def _choose(path, table, bands):
         ]
     lost = [name for name in ("id", "redshift", *bands) if name not in have]
     if lost:
-        msg = f"{path} has no column {', '.join(lost)}; it has {', '.join(have)}"
-        raise DataError(msg)
+        raise data_error(path, f"has no column {', '.join(lost)}; it has {', '.join(have)}")
     return [name for name in dict.fromkeys(bands) if not name.endswith("_err")]
 
 
@@ -183,8 +183,7 @@ def _numbers(path, table, name):
     try:
         return plain_floats(table[name], name, path)
     except ValueError:
-        msg = f"{path}: the column {name!r} holds something else than numbers"
-        raise DataError(msg) from None
+        raise data_error(path, f"has other than numbers in the column {name!r}") from None
 
 
 def _in_unit(path, table, name, values, default):
@@ -193,5 +192,5 @@ def _in_unit(path, table, name, values, default):
     try:
         return (values * u.Unit(unit)).to(default)
     except (u.UnitConversionError, TypeError, ValueError):
-        msg = f"{path}: the column {name!r} must be convertible to {default}, got {unit}"
-        raise DataError(msg) from None
+        what = f"cannot be used: column {name!r} must be convertible to {default}, got {unit}"
+        raise data_error(path, what) from None

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from miricigale.utils.exceptions import ConfigError, DataError
+from miricigale.utils.exceptions import config_error, data_error
 
 #: Settings other than those of the modules; empty ones count as not given.
 _SPEC = """\
@@ -57,21 +57,20 @@ def parse_ini(path):
             str(path), configspec=spec, encoding="utf-8", interpolation=False
         )
     except (OSError, UnicodeError, configobj.ConfigObjError) as err:
-        msg = f"{path} cannot be read as a configuration of CIGALE: {err}"
-        raise DataError(msg) from None
+        raise data_error(path, f"cannot be read as a configuration of CIGALE: {err}") from None
     analysis = config.get("analysis_params", {})
     if "sed_modules" not in config or not all(
         isinstance(section, dict) for section in (config.get("sed_modules_params"), analysis)
     ):
-        msg = f"{path} is no configuration of CIGALE: no sed_modules, or no [sed_modules_params]"
-        raise DataError(msg)
+        what = "is no configuration of CIGALE: no sed_modules, or no [sed_modules_params]"
+        raise data_error(path, what)
     for section in (config, analysis):
         for key in [key for key, value in section.items() if value == ""]:
             del section[key]
     found = config.validate(validate.Validator(), preserve_errors=True)
     for sections, key, error in configobj.flatten_errors(config, found):
-        msg = f"{path}: {'.'.join([*sections, str(key)])}: {error or 'missing'}"
-        raise ConfigError(msg)
+        key = ".".join([*sections, str(key)])
+        raise config_error(path, f"is wrong at {key}: {error or 'missing'}")
     return config.dict()
 
 

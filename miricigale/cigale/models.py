@@ -9,7 +9,7 @@ from astropy.table import QTable
 from miricigale.cigale.names import AGN_PARTS, cigale_names
 from miricigale.fitting import Samples
 from miricigale.sed.grid_spectra import row_values
-from miricigale.utils.exceptions import ConfigError
+from miricigale.utils.exceptions import config_error
 from miricigale.utils.store import replacing
 
 _MOST = 2_000_000
@@ -22,8 +22,7 @@ def save_models(setup, path, redshifts, *, overwrite):
         axes["alpha_ox"] = setup.xray["alpha_ox"]
     count = int(np.prod([len(values) for values in axes.values()], dtype=float))
     if count > _MOST:
-        msg = f"{setup.path}: {count:,} models are more than the {_MOST:,} that are written"
-        raise ConfigError(msg)
+        raise config_error(setup.path, f"has {count:,} models; at most {_MOST:,} are written")
     every = setup.bands | setup.predicted
     grid = setup.grid(list(every), redshifts)
     shape = grid.redshift.size, grid.n_galaxies, max(grid.n_agn, 1), grid.frac_agn.size

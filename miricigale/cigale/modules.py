@@ -10,7 +10,7 @@ from miricigale.cigale.relation import N_DRAWS
 from miricigale.refdata import find_resource
 from miricigale.sed import components as c
 from miricigale.sed.xray_bands import ALPHA_OX
-from miricigale.utils.exceptions import ConfigError
+from miricigale.utils.exceptions import ConfigError, config_error
 from miricigale.utils.files import read_table
 
 #: Parameters of CIGALE that do not change a model's spectrum here or there.
@@ -74,8 +74,7 @@ class Module:
         try:
             first, second = map(float, text.replace("&", "/").split("/"))
         except ValueError:
-            msg = f"{self.label(key)} must be {wanted}, got {text!r}"
-            raise ConfigError(msg) from None
+            raise config_error(self.label(key), f"must be {wanted}, got {text!r}") from None
         return first, second
 
     def one(self, key, default):

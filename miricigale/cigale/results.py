@@ -9,7 +9,7 @@ from astropy.table import QTable, Table
 from miricigale.cigale.names import cigale_names, unit_of
 from miricigale.filters.band_names import cigale_band, filter_of_band
 from miricigale.fitting import FitFlags
-from miricigale.utils.exceptions import DataError
+from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import read_table
 from miricigale.utils.options import check_names
 from miricigale.utils.store import replacing
@@ -137,8 +137,7 @@ def read_cigale_results(path):
     table = read_table(path, wanted="results of CIGALE", cls=Table)
     missing = [name for name in ("id", *_CHI2) if name not in table.colnames]
     if missing:
-        msg = f"{path} is no table of CIGALE's results: no column {', '.join(missing)}"
-        raise DataError(msg)
+        raise data_error(path, f"is no table of CIGALE's results: no column {', '.join(missing)}")
     for name in table.colnames:
         column = table[name]
         if column.unit is None and name.startswith(("bayes.", "best.")) and name not in _CHI2:

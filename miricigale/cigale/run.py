@@ -10,7 +10,12 @@ from miricigale.cigale.names import cigale_names
 from miricigale.cigale.setup import CigaleSetup
 from miricigale.filters.band_names import band_filters, xray_energies
 from miricigale.filters.given import given_filters
-from miricigale.utils.exceptions import CatalogWarning, ConfigError, warn
+from miricigale.utils.exceptions import (
+    CatalogWarning,
+    ConfigError,
+    config_error,
+    warn,
+)
 from miricigale.utils.options import check_choice
 from miricigale.utils.tables import error_column
 
@@ -58,8 +63,7 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
     analysis = config["analysis_params"]
     names = given_filters(names)
     if config["parameters_file"]:
-        msg = f"{path}: lists of models (parameters_file) are not read, grids are"
-        raise ConfigError(msg)
+        raise config_error(path, "has lists of models (parameters_file), which are not read")
     try:
         modules, columns = config["sed_modules_params"], config["bands"]
         chain = read_modules(
@@ -69,18 +73,15 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
         wanted = [band for band in analysis["bands"] if band not in bands.values()]
         predicted, more = band_filters(dict.fromkeys(wanted), names)
     except (ConfigError, ValueError) as err:
-        msg = f"{path}: {err}"
-        raise ConfigError(msg) from err
+        raise config_error(path, f"cannot be used: {err}") from err
     hard = {x for x in (*bands, *predicted) if xray_energies(x) and x not in names}
     dark = set() if chain.xray else hard
     bands, predicted = ({k: v for k, v in x.items() if k not in dark} for x in (bands, predicted))
     if not bands:
-        msg = f"{path}: no band is known here, of {', '.join(lost) or 'none'}"
-        raise ConfigError(msg)
+        raise config_error(path, f"has no band that is known here, of {', '.join(lost) or 'none'}")
     for band in bands.values():
         if band not in columns:
-            msg = f"{path}: {error_column(band)} is among the bands, and {band} is not"
-            raise ConfigError(msg)
+            raise config_error(path, f"has {error_column(band)} among the bands, and not {band}")
     known = {theirs for theirs, *_ in cigale_names(chain.modules).values()}
     if chain.xray and not hard:
         chain.left_out.append(f"{chain.modules['xray']} (no band of it)")
@@ -167,8 +168,7 @@ def fit_cigale(
     if not isinstance(ini, CigaleSetup):
         setup = read_pcigale_ini(ini, libraries=libraries, names=names, strict=strict)
     if setup.method == "savefluxes":
-        msg = f"{setup.path} asks for the models (savefluxes): CigaleSetup.save_models writes them"
-        raise ConfigError(msg)
+        raise config_error(setup.path, "asks for savefluxes: CigaleSetup.save_models writes them")
     photometry = setup.catalog(strict=strict)
     results = setup.fit(photometry, **options)
     if output is not None:

@@ -18,7 +18,7 @@ from miricigale.filters.filter_set import FilterSet
 from miricigale.fitting import BayesFitter, FitResults, GridSettings
 from miricigale.sed import SEDModel
 from miricigale.sed.xray_bands import with_xray_bands, xray_filter
-from miricigale.utils.exceptions import ConfigError, argument_error
+from miricigale.utils.exceptions import argument_error, config_error
 from miricigale.utils.tables import require_columns
 
 
@@ -170,8 +170,7 @@ class CigaleSetup:
         """
         path = path or self.data_file
         if path is None:
-            msg = f"{self.path} names no data_file"
-            raise ConfigError(msg)
+            raise config_error(self.path, "names no data_file")
         options = {"bands": self.columns, "limits": self.limits, "names": self.names}
         return read_cigale_catalog(path, **options, strict=strict)
 

@@ -39,7 +39,7 @@ def open_product(path):
     """
     from astropy.io.registry import IORegistryError
 
-    from miricigale.utils.exceptions import DataError
+    from miricigale.utils.exceptions import DataError, data_error
 
     # of a reader for a file of another kind
     other = (OSError, ValueError, KeyError, TypeError, IORegistryError)
@@ -55,8 +55,7 @@ def open_product(path):
                 return read(path)
             except other:
                 continue
-    msg = f"{path} is no product, image or table that can be read"
-    raise DataError(msg)
+    raise data_error(path, "is no product, image or table that can be read")
 
 
 def show(args):

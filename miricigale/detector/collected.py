@@ -4,13 +4,14 @@ import dataclasses
 
 import numpy as np
 
+from miricigale.detector.effects.base import Timed
 from miricigale.detector.effects.readout import Bias, Nonlinearity, ReadNoise
 from miricigale.detector.effects.reset import FirstFrame, LastFrame, ResetAnomaly
 from miricigale.instrument import DetectorProperties, Exposure
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
-class Charge:
+class Charge(Timed):
     """
     What the pixels of one exposure collect, and how it is read.
 
@@ -56,17 +57,6 @@ class Charge:
     def shows(self, kind):
         """Whether an effect acted, as for `Ramp.shows`."""
         return self._effect(kind) is not None
-
-    @property
-    def group_time(self):
-        """Time between groups in s."""
-        return float(self.exposure.group_time.to_value("s"))
-
-    @property
-    def total_time(self):
-        """Time in s in which ``electrons`` were collected."""
-        e = self.exposure
-        return e.n_integrations * e.n_groups * e.group_time.to_value("s")
 
     @property
     def read_variance(self):

@@ -16,8 +16,8 @@ from miricigale.filters.filter import Filter
 from miricigale.filters.surveys import SURVEYS, is_band
 from miricigale.utils.exceptions import (
     CatalogWarning,
-    DataError,
     argument_error,
+    data_error,
     unknown_name,
     warn,
 )
@@ -115,13 +115,11 @@ class CatalogMap:
                 return cls(columns=_translated(text, path))
             values = tomllib.loads(text)
         except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as err:
-            msg = f"{path} cannot be read as a map of columns: {err}"
-            raise DataError(msg) from err
+            raise data_error(path, f"cannot be read as a map of columns: {err}") from err
         known = [field.name for field in dataclasses.fields(cls)]
         unknown = sorted(set(values) - set(known))
         if unknown:
-            msg = f"{path} is no map of columns: it has {unknown}; known: {known}"
-            raise DataError(msg)
+            raise data_error(path, f"is no map of columns: it has {unknown}; known: {known}")
         return cls(**values)
 
     def settings(self):
@@ -317,14 +315,15 @@ def _translated(text, path):
         elif kind in ("F", "E") and number.isdigit():
             name = eazy_filter(number)
             if name is None:
-                msg = f"{path}: no filter here for {theirs} {meaning} (of FILTER.RES.latest)"
-                raise DataError(msg)
+                raise data_error(
+                    path, f"has no filter here for {theirs} {meaning} (of FILTER.RES.latest)"
+                )
             columns[name if kind == "F" else error_column(name)] = theirs
         elif meaning and not meaning.upper().startswith("TOT"):
-            msg = (
-                f"{path}: {theirs} must be F or E and a number, id, z_spec or TOT, got {meaning!r}"
+            what = (
+                f"must have F or E and a number, id, z_spec or TOT after {theirs}, got {meaning!r}"
             )
-            raise DataError(msg)
+            raise data_error(path, what)
     return columns
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import astropy.units as u
 import numpy as np
 
-from miricigale.utils.exceptions import DataError
+from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import TABLE_FORMATS, read_table, unpacked_size
 
 # units that a header may name
@@ -42,11 +42,8 @@ def _of_table(path, unit):
     columns = [table[name] for name in table.colnames[:2]]
     has = getattr(columns[0], "unit", None) if columns else None
     if len(columns) < 2 or (unit is None and has is None):
-        msg = (
-            f"filter file {path} has not two columns, the first with a unit of wavelength: "
-            f"give 'unit' if it has none"
-        )
-        raise DataError(msg)
+        what = "has not two columns, the first with a unit of wavelength"
+        raise data_error(path, f"{what}: give 'unit' if it has none")
     wave = np.asarray(getattr(columns[0], "value", columns[0]), float)
     name = str(table.meta.get("name") or table.meta.get("NAME") or path.stem)
     return wave * u.Unit(unit or has), np.asarray(columns[1], float), name
@@ -57,23 +54,20 @@ def _of_text(path, unit):
     try:
         lines = path.read_text().splitlines()
     except (OSError, UnicodeDecodeError) as err:
-        msg = f"filter file {path} cannot be read: {err}"
-        raise DataError(msg) from None
+        raise data_error(path, f"cannot be read as a filter: {err}") from None
     comments = [line.lstrip("# ").strip() for line in lines if line.startswith("#")]
     try:
         data = np.array([line.split()[:2] for line in lines if line[:1] not in ("#", "")], float)
         wave, throughput = data.T
     except ValueError:
-        msg = f"filter file {path} has not two columns of numbers"
-        raise DataError(msg) from None
+        raise data_error(path, "is no filter: it has not two columns of numbers") from None
     # as in CIGALE's files, which are in Angstrom
     kinds = [text.lower() for text in comments[:3] if text.lower() in ("photon", "energy")]
     named = kinds and comments[0].lower() not in kinds
     if unit is None:
         found = _UNITS.search(" ".join(comments))
         if not kinds and found is None:
-            msg = f"filter file {path} does not state the unit of its wavelengths: give 'unit'"
-            raise DataError(msg)
+            raise data_error(path, "does not state the unit of its wavelengths: give 'unit'")
         unit = u.AA if kinds else _unit(found[1])
     order = np.argsort(wave)
     wave, throughput = wave[order], throughput[order]

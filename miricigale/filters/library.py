@@ -8,7 +8,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.refdata import Registry, citations
-from miricigale.utils.exceptions import DataError
+from miricigale.utils.exceptions import DataError, data_error
 from miricigale.utils.options import check_names
 from miricigale.utils.units import WAVE
 
@@ -56,8 +56,7 @@ def read_curve(curve):
         except (IndexError, ValueError):
             continue
     if len(rows) < 2:
-        msg = f"{path} holds no filter curve"
-        raise DataError(msg)
+        raise data_error(path, "holds no filter curve")
     wave, throughput = np.array(rows).T
     wave, index = np.unique(wave, return_index=True)
     throughput = throughput[index]

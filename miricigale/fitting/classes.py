@@ -137,7 +137,7 @@ def classes_section(page, columns, names, ids, chi2):
 
     Parameters
     ----------
-    page : `~miricigale.pages.Page`
+    page : `~miricigale.pages.SectionWriter`
         Gets the section.
     columns : dict of str to `~numpy.ndarray`, shape (n,)
         As `classes_of` returned them.
@@ -147,19 +147,15 @@ def classes_section(page, columns, names, ids, chi2):
         Ids and reduced chi2 of the galaxies.
     """
     label, others = columns["class"], names[1:]
-    page.section(
-        f"Galaxy, {' or '.join(others)}",
-        "The class is that of the highest evidence, all classes being taken as equally frequent: priors of your "
-        "own go into compare_classes. Log ratios are ln of the evidence over that of galaxies; 5 is 150 to 1.",
-    )
+    page.section("classes", others=" or ".join(others))
     rows = []
     for name in names:
         mine, own = label == name, chi2 if name == "galaxy" else columns[f"reduced_chi2_{name}"]
         sure = columns[f"probability_{name}"][mine] > 1.0 / (1.0 + np.exp(-_SURE))
-        middle = np.median(own[mine]) if mine.any() else np.nan
-        rows.append((name, int(mine.sum()), int(sure.sum()), number(middle, ".2f", "no object")))
-    rows.append(("not fitted with all classes", int(np.sum(label == "")), "", ""))
-    page.table(rows, header=("class", "objects", "of them beyond 150 to 1", "reduced chi2, median"))
+        middle = number(np.median(own[mine]) if mine.any() else np.nan, ".2f", "no object")
+        rows.append({"class": name, "n": mine.sum(), "sure": sure.sum(), "chi2": middle})
+    lost = {"class": "not fitted with all classes", "n": np.sum(label == "")}
+    page.table("counts", [*rows, lost | {"sure": "", "chi2": ""}])
     figure, axes = new_figure(1, len(others), size=(WIDTH / 2, 3.2))
     for ax, name in zip(axes[0], others, strict=True):
         ratio = columns[f"log_ratio_{name}"]
@@ -167,19 +163,13 @@ def classes_section(page, columns, names, ids, chi2):
         ax.hist(np.clip(ratio, -_SPAN, _SPAN), np.linspace(-_SPAN, _SPAN, 61), color="0.75")
         ax.axvline(0.0, color="0.3", lw=0.8)
         ax.set(xlabel=f"ln evidence, {name} over galaxy", ylabel="objects")
-    text = "Evidence over that of galaxies; what is beyond stands in the outermost bins."
-    page.figure(figure, text)
+    page.figure("figure", figure)
     surest = []
     for name in others:
         ratio, own = columns[f"log_ratio_{name}"], columns[f"reduced_chi2_{name}"]
         mine = np.flatnonzero(label == name)
         for i in mine[np.argsort(-ratio[mine], kind="stable")][:_LISTED]:
-            numbers = f"{ratio[i]:+.1f}", f"{own[i]:.2f}", f"{chi2[i]:.2f}"
-            surest.append((str(ids[i]), name, *numbers))
+            row = {"id": str(ids[i]), "class": name, "ratio": ratio[i]}
+            surest.append(row | {"own": own[i], "galaxy": chi2[i]})
     if surest:
-        page.table(
-            surest,
-            header=("id", "class", "ln ratio to galaxy", "its reduced chi2", "that of the galaxy"),
-            caption=f"Up to {_LISTED} objects of each class, the surest first.",
-            text=2,
-        )
+        page.table("surest", surest, n=_LISTED)

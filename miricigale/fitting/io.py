@@ -13,7 +13,7 @@ from miricigale.fitting.results import CIGALE_LEAST_STD, FitResults
 from miricigale.fitting.samples import Samples
 from miricigale.sed import ModelGrid
 from miricigale.utils.content import content_sha256
-from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.exceptions import argument_error, data_error
 from miricigale.utils.files import open_fits
 from miricigale.utils.folder import RecordFolder
 from miricigale.utils.object_rows import ByID
@@ -222,11 +222,8 @@ def open_results(path, *, partial=False, model=None):
     """
     results = FitResultsFiles(path, model=model)
     if not (partial or results.complete):
-        msg = (
-            f"{path} holds {len(results.paths)} of {results.n_parts} parts: fit_file with the "
-            "same arguments resumes; partial=True opens what is there"
-        )
-        raise DataError(msg)
+        what = "fit_file with the same arguments resumes; partial=True opens what is there"
+        raise data_error(path, f"holds {len(results.paths)} of {results.n_parts} parts: {what}")
     return results
 
 
@@ -251,8 +248,7 @@ class FitResultsFiles:
         self.model = model
         folder = FitFolder(path)
         if not folder.facts:
-            msg = f"{path} holds no results of fit_file (no manifest)"
-            raise DataError(msg)
+            raise data_error(path, "holds no results of fit_file (no manifest)")
         #: What was fitted, and how.
         self.job = folder.facts["job"]
         self.n_parts = max(1, -(-self.job["catalogue"]["rows"] // self.job["chunk_rows"]))
@@ -261,8 +257,7 @@ class FitResultsFiles:
         self.paths = tuple(self.path / name for name in names if name in parts)
         for item in self.paths:
             if not item.is_file():
-                msg = f"{self.path} has lost {item.name}, which its manifest names"
-                raise DataError(msg)
+                raise data_error(self.path, f"has lost {item.name}, which its manifest names")
         self._records = tuple(parts[item.name] for item in self.paths)
 
     def __repr__(self):
@@ -353,8 +348,7 @@ class FitResultsFiles:
 
     def _tables(self, columns):
         if not self.paths:
-            msg = f"{self.path} holds no part yet"
-            raise DataError(msg)
+            raise data_error(self.path, "holds no part yet")
         for part in self.parts():
             table = part.to_table()
             check_names(columns or (), "column", table.colnames)

@@ -81,7 +81,7 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None):
     page.section("summary", "classes" if others else "text", **facts)
     _summary(page, found)
     if columns is not None:
-        classes_section(page.report, columns, list(classes), every["ids"], every["chi2"])
+        classes_section(page, columns, list(classes), every["ids"], every["chi2"])
     _redshifts(page, found)
     _goodness(page, found)
     _physics(page, found)

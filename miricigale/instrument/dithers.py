@@ -10,7 +10,7 @@ import numpy as np
 from astropy.table import Table
 
 from miricigale.instrument.siaf import aperture, imager_columns
-from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.exceptions import DataError, argument_error, data_error
 from miricigale.utils.files import read_table, unpacked_size
 from miricigale.utils.options import check_names
 from miricigale.utils.tables import require_columns
@@ -230,8 +230,7 @@ def _read_pointings(path, observation, exposure):
         offset = float(words[11]), float(words[12])
         places.setdefault((target, tile), {}).setdefault(dither, offset)
     if not found:
-        msg = f"{path} has no exposures of MIRIM apertures; it has {sorted(apertures)}"
-        raise DataError(msg)
+        raise data_error(path, f"has no exposures of MIRIM apertures; it has {sorted(apertures)}")
     exposures = found[_chosen("observation", observation, found)]
     patterns = {
         number: {tuple(offsets.values()) for offsets in places.values()}

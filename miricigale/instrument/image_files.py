@@ -8,7 +8,7 @@ from astropy.io import fits
 
 from miricigale.instrument import dq_planes, read_dq, with_own_bits
 from miricigale.instrument.image import Image
-from miricigale.utils.exceptions import DataError
+from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import open_fits, write_fits
 from miricigale.utils.meta import plain_text, undated
 
@@ -95,10 +95,8 @@ def _unit(header, path):
     except ValueError:
         pass
     got = f"BUNIT = {text!r}" if text else "none"
-    msg = (
-        f"{path} must state the unit of its pixels, such as MJy/sr, in the keyword BUNIT, got {got}"
-    )
-    raise DataError(msg)
+    wanted = "must state the unit of its pixels, such as MJy/sr, in the keyword BUNIT"
+    raise data_error(path, f"{wanted}, got {got}")
 
 
 def read_image(path, *, planes=()):
@@ -127,8 +125,7 @@ def read_image(path, *, planes=()):
 
     with open_fits(path, wanted="an image (FITS with SCI)") as hdus:
         if "SCI" not in hdus:
-            msg = f"{path} has no SCI extension, only {[hdu.name for hdu in hdus]}"
-            raise DataError(msg)
+            raise data_error(path, f"has no SCI extension, only {[hdu.name for hdu in hdus]}")
         header = hdus["SCI"].header
         wcs = WCS(header)
         error = np.array(hdus["ERR"].data, np.float32) if "ERR" in hdus else None

@@ -7,7 +7,7 @@ import warnings
 import astropy.units as u
 import numpy as np
 
-from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.exceptions import argument_error, data_error
 from miricigale.utils.units import SURFACE_BRIGHTNESS, ab_quantity
 
 #: Names of count rates in headers that are no units of astropy.
@@ -79,34 +79,24 @@ def calibration(path, text, zero_point, keywords):
             raise argument_error("zero_point", "a finite AB magnitude", zero_point)
         return zero.to(u.MJy), f"zero point {zero.value:g} AB"
     if unit is None or unit.is_equivalent(u.dimensionless_unscaled):
-        msg = (
-            f"{path} must state the unit of its pixels: 'unit' such as 'MJy/sr' or '10 nJy', or "
-            f"'zero_point'; what it states is {text!r}"
-        )
-        raise DataError(msg)
+        what = f"must state the unit of its pixels ('unit' or 'zero_point'); what it states is {text!r}"
+        raise data_error(path, what)
     time, said = 1.0, ""
     if any(unit.is_equivalent(base) for base in _BASES):
         time = keywords["EXPTIME"]
         if not time or not time > 0:
-            msg = (
-                f"{path} has pixels in {unit}, which is no rate, and its header no EXPTIME: counts need "
-                "'zero_point'"
-            )
-            raise DataError(msg)
+            what = "no rate, and its header no EXPTIME: counts need 'zero_point'"
+            raise data_error(path, f"has pixels in {unit}, {what}")
         unit, said = unit / u.s, f", EXPTIME {time:g} s"
     rate = next((base / u.s for base in _BASES if unit.is_equivalent(base / u.s)), None)
     if rate is None:
-        msg = (
-            f"{path} has pixels in {unit}, and wanted is a surface brightness, a flux in each pixel, "
-            "counts or a rate of counts"
-        )
-        raise DataError(msg)
+        what = "and wanted is a surface brightness, a flux, counts or a rate of counts"
+        raise data_error(path, f"has pixels in {unit}, {what}")
     scale = unit.to(rate) / time
     found = _header_calibrations(keywords)
     if len(found) != 1:
         what = "has both PHOTMJSR and PHOTFLAM" if found else "has neither PHOTMJSR nor PHOTFLAM"
-        msg = f"{path} has pixels in {unit} and its header {what}: 'zero_point' must be given"
-        raise DataError(msg)
+        raise data_error(path, f"has pixels in {unit}, its header {what}: give 'zero_point'")
     name, factor = found[0]
     return factor * scale, name + said
 

@@ -2,7 +2,7 @@
 
 from miricigale.photometry.error_calibration import ErrorCalibration
 from miricigale.photometry.error_model import ErrorModel
-from miricigale.utils.exceptions import DataError
+from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import read_table
 from miricigale.utils.store import replacing
 from miricigale.utils.unified import register
@@ -20,8 +20,7 @@ def _reader(cls, kind):
         try:
             return cls.from_table(table)
         except (TypeError, ValueError) as err:
-            msg = f"{path} is not {kind}: {err}"
-            raise DataError(msg) from err
+            raise data_error(path, f"is not {kind}: {err}") from err
 
     return read
 

@@ -19,6 +19,7 @@ from miricigale.photometry._core.stamps import (
     whiten_stamps,
 )
 from miricigale.photometry.templates import Block, batches
+from miricigale.utils.exceptions import argument_error
 from miricigale.utils.parallel import chunks, parallel_map
 
 
@@ -49,8 +50,7 @@ def noise_correlation(residual, usable, weight, *, executor=None):
     """
     usable = np.asarray(usable, bool)
     if np.count_nonzero(usable) < 100:
-        msg = f"'usable' must leave at least 100 pixels, got {np.count_nonzero(usable)}"
-        raise ValueError(msg)
+        raise argument_error("usable", "100 pixels or more", np.count_nonzero(usable))
 
     def rows(part):
         return residual[part] * weight[part]

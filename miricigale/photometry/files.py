@@ -19,6 +19,7 @@ from miricigale.photometry.results import ForcedPhotometryResult
 from miricigale.photometry.shapes import FITTED, not_fitted
 from miricigale.photometry.sources import SourceTemplates
 from miricigale.photometry.wcs_text import grid_text, text_grid
+from miricigale.utils.positions import sky_as_angles
 from miricigale.utils.store import native, open_parts, write_parts
 from miricigale.utils.tables import ascii_ids
 from miricigale.utils.unified import register
@@ -138,23 +139,14 @@ def _write_result(result, path, *, overwrite=False):
     fields = {"background_field": result.background_field}
     if result.offset_map is not None:
         fields["offset_map"] = result.offset_map.field
-        tables["offsets"] = _without_sky(result.offset_map.sources)
+        tables["offsets"] = sky_as_angles(result.offset_map.sources)
     if result.new_sources is not None:
-        tables["new"] = _without_sky(result.new_sources)
+        tables["new"] = sky_as_angles(result.new_sources)
     for name, field in fields.items():
         if field is not None:
             text[name] = {**dataclasses.asdict(field)}
     parts = {"shown": result.to_table(), "text": text, "arrays": arrays, "tables": tables}
     write_parts(path, "forced-photometry-1", **parts, overwrite=overwrite)
-
-
-def _without_sky(table):
-    table = table.copy()
-    angles = _sky_columns(table["sky"])
-    table.remove_column("sky")
-    for name, values in angles.items():
-        table[name] = values
-    return table
 
 
 def _read_result(path):

@@ -1,7 +1,6 @@
 """Images in FITS files of any origin: which extension, which filter, which pixels on the sky."""
 
 import contextlib
-import os
 import re
 import warnings
 
@@ -9,7 +8,12 @@ import astropy.units as u
 import numpy as np
 from astropy.io import fits
 
-from miricigale.utils.exceptions import DataError, PhotometryWarning, argument_error, warn
+from miricigale.utils.exceptions import (
+    PhotometryWarning,
+    argument_error,
+    data_error,
+    warn,
+)
 from miricigale.utils.files import open_fits, split_extension
 from miricigale.utils.optional import require
 
@@ -61,23 +65,19 @@ def find_image(hdus, extension, path, names):
         try:
             found = [hdus.index_of(extension)]
         except (KeyError, IndexError):
-            msg = f"{path}: there is no such extension, only {[hdu.name for hdu in hdus]}"
-            raise DataError(msg) from None
+            known = [hdu.name for hdu in hdus]
+            raise data_error(path, f"has no such extension, only {known}") from None
         if found[0] not in images:
-            msg = f"{path} is no two-dimensional image, but of the shape {hdus[found[0]].shape}"
-            raise DataError(msg)
+            raise data_error(path, f"is no two-dimensional image: {hdus[found[0]].shape}")
         return found[0]
     named = [k for k in images if hdus[k].name in names]
     found = named or images[:1]
     if not found:
         shapes = [getattr(hdu, "shape", ()) for hdu in hdus]
-        msg = f"{path} has no two-dimensional image, only {shapes}"
-        raise DataError(msg)
+        raise data_error(path, f"has no two-dimensional image, only {shapes}")
     if len(found) > 1:
-        msg = (
-            f"{path} has {len(found)} extensions {hdus[found[0]].name}; say which as {path}[NUMBER]"
-        )
-        raise DataError(msg)
+        what = f"has {len(found)} extensions {hdus[found[0]].name}"
+        raise data_error(path, f"{what}; say which as {path}[NUMBER]")
     return found[0]
 
 
@@ -98,11 +98,10 @@ def open_map(path, wanted, role, names, image):
     with open_image(path, wanted) as (hdus, extension):
         hdu = hdus[find_image(hdus, extension, path, names)]
         if hdu.shape != shape:
-            msg = (
-                f"{path} ({role}) has the shape {hdu.shape}, and {image_path} has {shape}: they are not "
-                "on the same pixels"
+            what = (
+                f"({role}) has the shape {hdu.shape}, {image_path} {shape}: not on the same pixels"
             )
-            raise DataError(msg)
+            raise data_error(path, what)
         own = read_wcs(hdu.header, hdus)
         if own is not None:
             check_same_grid(own, wcs, shape, path, image_path)
@@ -166,8 +165,7 @@ def _asdf_wcs(header, hdus):
         with asdf.open(io.BytesIO(content)) as tree:
             exact = tree["meta"]["wcs"]
     except (KeyError, ValueError) as err:
-        msg = f"{hdus.filename()} has no coordinates (gwcs) in its extension ASDF: {err}"
-        raise DataError(msg) from err
+        raise data_error(hdus.filename(), f"has no gwcs in its extension ASDF: {err}") from err
     box = tuple((-0.5, header[f"NAXIS{k}"] - 0.5) for k in (1, 2))
     return WCS(exact.to_fits_sip(bounding_box=box, max_pix_error=0.01))
 
@@ -223,8 +221,5 @@ def check_same_grid(wcs, reference, shape, path, reference_path):
     distance = np.hypot(there[0] - x, there[1] - y)
     if not np.all(distance <= 0.1):
         far = np.nanmax(distance) if np.isfinite(distance).any() else np.inf
-        msg = (
-            f"{os.fspath(path)} is not on the pixels of {os.fspath(reference_path)}: by their "
-            f"coordinates they are up to {far:.4g} pixels apart"
-        )
-        raise DataError(msg)
+        what = f"is not on the pixels of {reference_path}: by their coordinates up to {far:.4g} pixels apart"
+        raise data_error(path, what)

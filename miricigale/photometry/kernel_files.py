@@ -6,7 +6,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.photometry.grids import grid_angle
-from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.exceptions import argument_error, data_error
 from miricigale.utils.files import open_fits, split_extension
 from miricigale.utils.units import ANGLE, to_array
 
@@ -37,18 +37,16 @@ def _planes(path, wanted):
         try:
             hdu = hdus[extension]
         except (KeyError, IndexError):
-            msg = f"{path}: there is no such extension, only {[hdu.name for hdu in hdus]}"
-            raise DataError(msg) from None
+            known = [hdu.name for hdu in hdus]
+            raise data_error(path, f"has no such extension, only {known}") from None
         data = hdu.data
         shape = getattr(data, "shape", None)
         if shape is None or len(shape) != (2 if plane is None else 3):
             kind = "an image" if plane is None else "a cube"
             hint = "; say FILE[EXTENSION,PLANE] or FILE[EXTENSION,mean] of a cube"
-            msg = f"{path} must be {kind} with {wanted}, got the shape {shape}{hint}"
-            raise DataError(msg)
+            raise data_error(path, f"must be {kind} with {wanted}, got the shape {shape}{hint}")
         if isinstance(plane, int) and plane >= shape[0]:
-            msg = f"{path}: the cube has the planes 0 to {shape[0] - 1}"
-            raise DataError(msg)
+            raise data_error(path, f"is a cube with the planes 0 to {shape[0] - 1}")
         chosen = data[None] if plane is None else data if plane == "mean" else data[plane][None]
         return np.array(chosen, dtype=float), hdu.header.copy()
 
@@ -92,8 +90,7 @@ def _read_psf(file, argument):
     kept = []
     for data in planes:
         if not np.all(np.isfinite(data)) or not data.max() > 0 or not data.sum() > 0:
-            msg = f"{path} is no PSF: it has no light, or pixels that are not finite"
-            raise DataError(msg)
+            raise data_error(path, "is no PSF: it has no light, or pixels that are not finite")
         total = float(data.sum())
         # the model PSF says which fraction of the light its array holds
         scaled = known and not 0.8 < total < 0.995
@@ -102,8 +99,7 @@ def _read_psf(file, argument):
         try:
             psf = make_psf(data / total if scaled else data, origin=_centered(data), **form)
         except ValueError as err:
-            msg = f"{path} cannot be read as a PSF: {err}"
-            raise DataError(msg) from err
+            raise data_error(path, f"cannot be read as a PSF: {err}") from err
         n = 2 * (min(data.shape) // 2) - 1
         middle = psf_image(psf, pixel_scale=cell * ANGLE, shape=n)
         middle = middle / middle.sum() if scaled else middle
@@ -185,16 +181,12 @@ def read_kernel(path, *, pixel_scale, highres_psf=None):
                 planes.mean(axis=0), pixel_scale=pixel_scale, source=highres_psf
             )
         except ValueError as err:
-            msg = f"{path} cannot be read as a kernel: {err}"
-            raise DataError(msg) from err
+            raise data_error(path, f"cannot be read as a kernel: {err}") from err
         kernel.meta["file"] = str(path)
     wanted = pixel_scale.to_value(ANGLE)
     if stated is not None and abs(stated / wanted - 1) > 0.02:
-        msg = (
-            f"{path} is a kernel for pixels of {stated:.4g} arcsec, and those of the prior have "
-            f"{wanted:.4g} arcsec"
-        )
-        raise DataError(msg)
+        what = f"{stated:.4g} arcsec, and those of the prior have {wanted:.4g} arcsec"
+        raise data_error(path, f"is a kernel for pixels of {what}")
     return kernel
 
 

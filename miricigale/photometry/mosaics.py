@@ -26,7 +26,12 @@ from miricigale.photometry.grids import (
     read_wcs,
 )
 from miricigale.photometry.sky_noise import mask_filled, sky_noise
-from miricigale.utils.exceptions import DataError, PhotometryWarning, argument_error, warn
+from miricigale.utils.exceptions import (
+    PhotometryWarning,
+    argument_error,
+    data_error,
+    warn,
+)
 from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
 
 _log = logging.getLogger(__name__)
@@ -182,8 +187,7 @@ class MosaicFile:
             header, first = hdus[index].header, hdus[0].header
             wcs = read_wcs(header, hdus)
         if wcs is None:
-            msg = f"{self.path} has no celestial coordinates (WCS) in its header"
-            raise DataError(msg)
+            raise data_error(self.path, "has no celestial coordinates (WCS) in its header")
 
         def get(key):
             return header.get(key, first.get(key))
@@ -293,8 +297,8 @@ class MosaicFile:
         if filled:
             meta["n_filled"] = filled
         if not usable.any():
-            msg = f"{self.path} has no usable pixel: all are masked, not finite or without weight"
-            raise DataError(msg)
+            what = "has no usable pixel: all are masked, not finite or without weight"
+            raise data_error(self.path, what)
         data *= factor
         if self.background_box is not None:
             from miricigale.utils.sep_tools import background
@@ -311,8 +315,7 @@ class MosaicFile:
             meta["noise_scale"] = float(f"{scale:.6g}")
         if kind == "weight":
             if not scale > 0:
-                msg = f"{self.path}: the scale of its weights is unknown, for its sky is constant"
-                raise DataError(msg)
+                raise data_error(self.path, "has weights of unknown scale, for its sky is constant")
             meta["weight_scale"] = meta["noise_scale"]
             sigma *= sigma.dtype.type(scale)
         meta["sky_over_noise"] = float(f"{level / (scale or 1):.4g}")
@@ -385,11 +388,11 @@ def _in_unit(hdu, kind, unit, path):
     try:
         factor = have.to(wanted**power)
     except u.UnitConversionError:
-        msg = (
-            f"{path} (the {kind.replace('_', ' ')}) is in {text!r}, and the image in "
-            f"{unit!r}: give 'unit' if a header is wrong"
+        role = kind.replace("_", " ")
+        what = (
+            f"(the {role}) is in {text!r}, the image in {unit!r}: give 'unit' if a header is wrong"
         )
-        raise DataError(msg) from None
+        raise data_error(path, what) from None
     _log.info("%s: from %s to %s", path, have, wanted**power)
     return values * values.dtype.type(factor)
 

@@ -6,7 +6,12 @@ import os
 import numpy as np
 
 from miricigale.photometry.grids import open_map
-from miricigale.utils.exceptions import CatalogWarning, DataError, argument_error, warn
+from miricigale.utils.exceptions import (
+    CatalogWarning,
+    argument_error,
+    data_error,
+    warn,
+)
 from miricigale.utils.positions import as_positions
 from miricigale.utils.tables import as_table, unique_ids
 
@@ -121,25 +126,21 @@ def _numbered(data, path):
     if data.dtype.kind == "f":
         rounded = np.where(np.isfinite(data), np.rint(data), 0)
         if not np.array_equal(rounded, np.where(np.isfinite(data), data, 0)):
-            msg = f"{path} is no segmentation map: it has values that are no whole numbers"
-            raise DataError(msg)
+            raise data_error(path, "is no map of segments: it has values that are no whole numbers")
         # single precision holds no larger whole numbers
         if data.dtype.itemsize <= 4 and rounded.max(initial=0) > 2**24:
-            msg = f"{path} has ids above 2^24 in single precision, where they are not distinct"
-            raise DataError(msg)
+            raise data_error(path, "has ids above 2^24 in single precision: not distinct")
         data = rounded
     data = data.astype(np.int64)
     if data.min(initial=0) < 0:
-        msg = f"{path} has negative ids, such as {data.min()}; 0 is the sky"
-        raise DataError(msg)
+        raise data_error(path, f"has negative ids, such as {data.min()}; 0 is the sky")
     values, labels = np.unique(data, return_inverse=True)
     labels = labels.reshape(data.shape).astype(np.int32)
     # the sky is 0 even where every pixel belongs to a segment
     if values[0] != 0:
         return labels + np.int32(1), values
     if len(values) == 1:
-        msg = f"{path} has no segment: all of its pixels are 0"
-        raise DataError(msg)
+        raise data_error(path, "has no segment: all of its pixels are 0")
     return labels, values[1:]
 
 

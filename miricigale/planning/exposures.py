@@ -18,7 +18,7 @@ from miricigale.depth import (
 from miricigale.instrument import Exposure, frame_time
 from miricigale.photometry import ErrorModel
 from miricigale.planning.config import NoiseSection
-from miricigale.utils.exceptions import ConfigError, DataError
+from miricigale.utils.exceptions import ConfigError, data_error
 from miricigale.workflow.background import band_background
 
 #: The plan needs no direction; an `Exposure` has one.
@@ -156,8 +156,7 @@ class RunErrors:
         folder = Path(folder).expanduser()
         for name in ("errors.ecsv", "config.toml"):
             if not (folder / name).is_file():
-                msg = f"[noise] run = {str(folder)!r} has no {name}"
-                raise DataError(msg)
+                raise data_error(folder, f"([noise] run) has no {name}")
         return cls(ErrorModel.read(folder / "errors.ecsv"), load_config(folder / "config.toml"))
 
     def scaled(self, plan):

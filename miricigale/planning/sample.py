@@ -6,7 +6,7 @@ from astropy.table import QTable
 
 from miricigale.refdata import resources
 from miricigale.sed import SEDModel
-from miricigale.utils.exceptions import ConfigError, argument_error
+from miricigale.utils.exceptions import ConfigError, argument_error, config_error
 from miricigale.utils.random import stream
 from miricigale.utils.tables import require_columns
 from miricigale.workflow.config import StudyConfig
@@ -104,8 +104,7 @@ def make_sample(config, bands, *, executor=None):
 
 def _cut(table, chosen, what):
     if not np.any(chosen):
-        msg = f"{what} leaves none of the {len(table)} sources"
-        raise ConfigError(msg)
+        raise config_error(what, f"leaves none of the {len(table)} sources")
     return table[chosen]
 
 

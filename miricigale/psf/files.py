@@ -11,7 +11,7 @@ from astropy.wcs import WCS
 from miricigale.psf.kernel_field import KernelField
 from miricigale.psf.kernels import MatchingKernel
 from miricigale.psf.model import InstrumentPSF, make_psf
-from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.exceptions import argument_error, data_error
 from miricigale.utils.files import open_fits, write_fits
 from miricigale.utils.store import native, open_parts, plain_value, replacing, write_parts
 from miricigale.utils.unified import register
@@ -185,8 +185,7 @@ def _read_kernel(path, *, ext=None, plane=None, pixel_scale=None, source=None):
         return MatchingKernel.from_array(data, pixel_scale=pixel_scale, source=source)
     with open_fits(path, wanted="a matching kernel") as hdus:
         if "KERNEL" not in hdus:
-            msg = f"{path} has no KERNEL extension, only {[hdu.name for hdu in hdus]}"
-            raise DataError(msg)
+            raise data_error(path, f"has no KERNEL extension, only {[hdu.name for hdu in hdus]}")
         header = hdus["KERNEL"].header
         try:
             return MatchingKernel(
@@ -197,8 +196,7 @@ def _read_kernel(path, *, ext=None, plane=None, pixel_scale=None, source=None):
                 **{k: native(hdus[k].data) for k in ("source", "target") if k.upper() in hdus},
             )
         except (KeyError, TypeError, ValueError) as err:
-            msg = f"{path} is not a complete matching kernel: {err}"
-            raise DataError(msg) from err
+            raise data_error(path, f"is not a complete matching kernel: {err}") from err
 
 
 def _write_field(field, path, *, overwrite=False):

@@ -12,7 +12,11 @@ from miricigale.filters.catalog_files import as_catalog_map, catalog_messages
 from miricigale.filters.surveys import is_band
 from miricigale.refdata import locate, resources
 from miricigale.scene.catalog import CatalogFlags, check_catalog
-from miricigale.utils.exceptions import CatalogWarning, DataError, data_error, warn
+from miricigale.utils.exceptions import (
+    CatalogWarning,
+    DataError,
+    warn,
+)
 from miricigale.utils.files import read_table
 from miricigale.utils.tables import error_column
 
@@ -87,8 +91,6 @@ def read_catalog(path, catalog_map=None, **options):
     with warnings.catch_warnings():
         warnings.simplefilter("error", UnitsWarning)
         table = read_table(path, wanted="a table")
-    if not table.colnames:
-        raise data_error(path, "cannot be read as a table: it has no columns")
     _, lost = catalog_map.names(table.colnames, path.name)
     table, coded = catalog_map.convert(table, path.name)
     _flags_of_stars(table)

@@ -8,7 +8,7 @@ import astropy.units as u
 from miricigale.refdata import Registry, locate
 from miricigale.refdata.locate import fingerprint_of
 from miricigale.sed.parameter import Parameter
-from miricigale.utils.exceptions import ConfigError, argument_error
+from miricigale.utils.exceptions import ConfigError, argument_error, config_error
 
 #: What a component does, in the order in which light meets it.
 ROLES = ("sfh", "stellar", "nebular", "attenuation", "dust", "agn", "xray", "igm", "foreground")
@@ -185,8 +185,7 @@ class Component:
 def read_config(config):
     """Components and other options of a model from plain values; see `SEDModel.from_dict`."""
     if not isinstance(config, Mapping):
-        msg = f"[sed] must be a table of keys, got {type(config).__name__}"
-        raise ConfigError(msg)
+        raise config_error("[sed]", f"must be a table of keys, got {type(config).__name__}")
     unknown = set(config) - {"components", "frac_agn_definition"}
     if unknown:
         msg = f"[sed] does not know {sorted(unknown)}; known: components, frac_agn_definition"
@@ -201,6 +200,5 @@ def read_config(config):
         try:
             parts.append(COMPONENTS.get(defaults.pop("name", "(none)"))(**defaults))
         except (KeyError, TypeError, ValueError, u.UnitsError) as err:
-            msg = f"[sed] component {entry}: {err.args[0]}"
-            raise ConfigError(msg) from err
+            raise config_error("[sed]", f"component {entry}: {err.args[0]}") from err
     return parts, {name: value for name, value in config.items() if name != "components"}

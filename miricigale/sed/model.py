@@ -14,7 +14,7 @@ from miricigale.sed.grid import fraction_span
 from miricigale.sed.grid_cache import cached_grid
 from miricigale.sed.parameter import Parameter
 from miricigale.sed.spectrum import COSMOLOGY
-from miricigale.utils.exceptions import ConfigError, argument_error, unknown_name
+from miricigale.utils.exceptions import argument_error, config_error, unknown_name
 from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.meta import provenance
 from miricigale.utils.units import WAVE
@@ -121,8 +121,7 @@ class SEDModel(Interactive):
         try:
             return cls(parts, **options)
         except ValueError as err:
-            msg = f"[sed] {err}"
-            raise ConfigError(msg) from err
+            raise config_error("[sed]", f"{err}") from err
 
     @classmethod
     def yang2021(cls, *, agn=True, xray=False, igm="meiksin2006", libraries="best", **options):

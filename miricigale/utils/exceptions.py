@@ -6,25 +6,6 @@ import warnings
 
 from astropy.utils.exceptions import AstropyUserWarning
 
-__all__ = [
-    "CatalogWarning",
-    "ConfigError",
-    "DataError",
-    "DetectorWarning",
-    "FitWarning",
-    "MiricigaleWarning",
-    "ModelWarning",
-    "OtherResultsError",
-    "PSFWarning",
-    "PhotometryWarning",
-    "ReductionWarning",
-    "ReferenceWarning",
-    "argument_error",
-    "data_error",
-    "unknown_name",
-    "warn",
-]
-
 
 class ConfigError(ValueError):
     """A run configuration that cannot be used; the message names section and key."""
@@ -90,6 +71,11 @@ class FitWarning(MiricigaleWarning):
 def argument_error(name, wanted, got):
     """Make the `ValueError` that names an argument, what was wanted and what came."""
     return ValueError(f"'{name}' must be {wanted}, got {got}")
+
+
+def config_error(where, what):
+    """Make the `ConfigError` that says where a configuration is wrong (section, key or file), and how."""
+    return ConfigError(f"{where} {what}")
 
 
 def data_error(path, what):

@@ -7,7 +7,7 @@ import operator
 from pathlib import Path, PurePosixPath
 
 from miricigale.utils.content import file_sha256
-from miricigale.utils.exceptions import DataError
+from miricigale.utils.exceptions import DataError, data_error
 from miricigale.utils.files import writing
 from miricigale.utils.lock import FolderLock
 from miricigale.utils.store import PARTIAL, replacing
@@ -57,8 +57,7 @@ class FileFolder:
         for part in parts:
             path = path / part
             if path.is_symlink():
-                msg = f"{path} is a symbolic link; products must lie in {self.folder} itself"
-                raise DataError(msg)
+                raise data_error(path, f"is a symbolic link; products must lie in {self.folder}")
         return path
 
     def save(self, name, writer):
@@ -224,11 +223,9 @@ class RecordFolder(FileFolder):
                 # another process began between the two looks
                 self._load()
                 return
-            msg = (
-                f"{self.folder} exists, is not empty and is no {self.purpose}'s folder; "
-                f"{self.remedy}"
+            raise data_error(
+                self.folder, f"is not empty and is no {self.purpose}'s folder; {self.remedy}"
             )
-            raise DataError(msg)
 
     def __enter__(self):
         self.folder.mkdir(parents=True, exist_ok=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from miricigale.utils.exceptions import DataError
+from miricigale.utils.exceptions import DataError, data_error
 from miricigale.utils.store import replacing
 
 # a child that a killed process has just forked holds the lock until it runs; in seconds
@@ -55,8 +55,7 @@ class FolderLock:
         except Timeout:
             raise self._refusal() from None
         except PermissionError as err:
-            msg = f"{self.folder} is locked by {self._lock.lock_file}, which this user may not open"
-            raise DataError(msg) from err
+            raise data_error(self._lock.lock_file, "is a lock that this user may not open") from err
         try:
             # where locks are not passed on to other hosts the file alone says who was first
             if _is_elsewhere(self._owner()):

@@ -9,8 +9,6 @@ from astropy.coordinates import SkyCoord
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing import plain_floats, without_codes
 
-__all__ = ["as_position", "as_positions", "sky_as_angles"]
-
 _WANTED = "one SkyCoord, text such as '150.1 +2.2' or '10h00m24s +02d12m00s', or (ra, dec) in deg"
 #: Columns of right ascension and declination, in lower case and without ``_j2000``.
 _PAIRS = (

@@ -6,8 +6,6 @@ import numpy as np
 
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["check_seed", "stream", "text_key"]
-
 
 def text_key(text):
     """
@@ -62,10 +60,7 @@ def stream(seed, *key):
     """
     words = []
     for part in key:
-        number = part if isinstance(part, (int, np.integer)) else text_key(part)
-        number = int(number)
-        if number < 0:
-            number += 2**64
+        number = int(part) if isinstance(part, (int, np.integer)) else text_key(part)
         # spawn keys are sequences of 32-bit words: two for each part, whatever its size
-        words += [(number >> 32) & 0xFFFFFFFF, number & 0xFFFFFFFF]
+        words += divmod(number % 2**64, 2**32)
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=tuple(words)))

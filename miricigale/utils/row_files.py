@@ -11,7 +11,7 @@ from astropy.io import fits
 from astropy.table import QTable
 
 from miricigale.utils.content import file_sha256
-from miricigale.utils.exceptions import DataError
+from miricigale.utils.exceptions import DataError, data_error
 from miricigale.utils.files import open_fits, read_table
 from miricigale.utils.store import plain_value, replacing
 from miricigale.utils.units import check_count
@@ -134,8 +134,7 @@ class _FitsRows(RowFile):
             what = f"no binary table in extension {wanted!r}"
             if wanted is None:
                 what = f"{len(tables)} binary tables; 'hdu' says which is meant"
-            msg = f"{self.path} has {what}"
-            raise DataError(msg)
+            raise data_error(self.path, f"has {what}")
         return hdus[chosen[0]]
 
     def _read(self, rows):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from miricigale.utils.exceptions import DataError
+from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import open_fits, table_hdu, write_fits, writing
 from miricigale.utils.meta import undated
 
@@ -151,13 +151,11 @@ def open_parts(path, layouts, *, wanted, memmap=False, earlier=None):
         layout = header.get("FORMAT")
         known = layout in layouts or (layout is None and earlier is not None and earlier in header)
         if not known:
-            msg = f"{path} holds no {wanted} (no FORMAT = {layouts[0]!r} in its header)"
-            raise DataError(msg)
+            raise data_error(path, f"holds no {wanted} (no FORMAT = {layouts[0]!r} in its header)")
         try:
             yield Parts(hdus, layout)
         except (KeyError, IndexError, TypeError, ValueError) as err:
-            msg = f"{path} is not a complete file of {wanted}: {err}"
-            raise DataError(msg) from err
+            raise data_error(path, f"is not a complete file of {wanted}: {err}") from err
 
 
 class Parts:

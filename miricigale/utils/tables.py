@@ -14,19 +14,6 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_least
 from miricigale.utils.units import ANGLE, to_array
 
-__all__ = [
-    "Flags",
-    "as_table",
-    "ascii_ids",
-    "described_rows",
-    "described_table",
-    "error_column",
-    "match_sky",
-    "read_ids",
-    "require_columns",
-    "unique_ids",
-]
-
 
 class Flags(enum.IntFlag):
     """Base of the flag sets: an IntFlag whose members' docs `describe` lists."""

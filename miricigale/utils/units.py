@@ -7,27 +7,6 @@ import numpy as np
 
 from miricigale.utils.exceptions import argument_error
 
-__all__ = [
-    "ANGLE",
-    "DN",
-    "FNU",
-    "LUMINOSITY",
-    "MASS",
-    "RATE",
-    "SURFACE_BRIGHTNESS",
-    "TIME",
-    "WAVE",
-    "Frozen",
-    "ab_magnitude",
-    "ab_quantity",
-    "check_count",
-    "frozen_array",
-    "frozen_quantity",
-    "is_number",
-    "positive",
-    "to_array",
-]
-
 #: Units declared once; every array inside the package is in one of these.
 WAVE = u.um
 FNU = u.uJy

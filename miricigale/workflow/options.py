@@ -12,7 +12,7 @@ import types
 import typing
 from pathlib import Path
 
-from miricigale.utils.exceptions import ConfigError
+from miricigale.utils.exceptions import ConfigError, config_error
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,8 +83,7 @@ def of_option(label, *errors):
     except ConfigError:
         raise
     except errors as err:
-        msg = f"{label} {err.args[0]}"
-        raise ConfigError(msg) from err
+        raise config_error(label, f"{err.args[0]}") from err
 
 
 def read_text(path):
@@ -210,8 +209,7 @@ def _replace_section(name, section, entries):
         raise _wrong(label, "a section", entries)
     fields = {field.name: field for field in dataclasses.fields(section)}
     if unknown := sorted(set(entries) - set(fields)):
-        msg = f"{label} does not know {unknown}; known: {sorted(fields)}"
-        raise ConfigError(msg)
+        raise config_error(label, f"does not know {unknown}; known: {sorted(fields)}")
     hints = typing.get_type_hints(type(section))
     changes = {
         key: _checked(f"{label} {key}", value, hints[key], _limits_of(fields[key]))
@@ -233,8 +231,7 @@ def _checked(label, value, hint, limits):
         item = typing.get_args(hint)[0]
         value = tuple(_checked(label, entry, item, limits) for entry in value)
         if limits.unique and len(set(value)) != len(value):
-            msg = f"{label} must not repeat, got {list(value)}"
-            raise ConfigError(msg)
+            raise config_error(label, f"must not repeat, got {list(value)}")
         return value
     if isinstance(hint, types.UnionType):
         # a number within the limits, or one of the names

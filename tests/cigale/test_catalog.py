@@ -144,7 +144,7 @@ def test_only_the_bands_asked_for(text_file):
         ("id IRAC1 IRAC1_err\n1 1 1\n", "no column redshift"),
         ("id redshift IRAC1 IRAC1_err spitzer.irac.ch1\n1 1 1 1 1\n", "IRAC1 and spitzer.irac.ch1"),
         ("id redshift xray\n1 1 1\n", "no band that is known"),
-        ("id redshift IRAC1 IRAC1_err\n1 1 faint 1\n", "'IRAC1' holds something else"),
+        ("id redshift IRAC1 IRAC1_err\n1 1 faint 1\n", "other than numbers in the column 'IRAC1'"),
     ],
 )
 def test_refused(tmp_path, content, wanted):

@@ -448,7 +448,7 @@ def test_one_message_names_all_that_is_left_out(tmp_path):
         ("metallicity = 0.02", "metallicity = -1 , -2", None),
         ("parameters_file =", "parameters_file = models.txt", "parameters_file"),
         ("IRAC1, IRAC1_err, F770W, F770W_err", "F770W, jwst.miri.F770W", "both the filter miri"),
-        ("IRAC1, IRAC1_err", "IRAC1_err", "IRAC1 is not"),
+        ("IRAC1, IRAC1_err", "IRAC1_err", "not IRAC1"),
         ("lambda_fracAGN = 0/0", "lambda_fracAGN = all", "two wavelengths"),
         ("lim_flag = noscaling", "lim_flag = perhaps", "lim_flag"),
         ("additionalerror = 0.05", "additionalerror = -1", "additionalerror"),
@@ -647,7 +647,7 @@ def test_all_models_are_saved(tmp_path):
         tmp_path, ("pdf_analysis", "savefluxes"), ("fracAGN = 0.0, 0.5, 0.9", "fracAGN = 0.0, 0.5")
     )
     setup = quiet(path)
-    refuses(r"savefluxes\): CigaleSetup.save_models", fit_cigale, setup, error=ConfigError)
+    refuses(r"savefluxes: CigaleSetup.save_models", fit_cigale, setup, error=ConfigError)
     table = setup.save_models(tmp_path / "models-block-0.fits", [0.5])
     # 2 tau x 2 ages x 2 E(B-V) x 2 tau97 x 2 inclinations x 2 fractions
     assert len(table) == 64

@@ -189,4 +189,4 @@ def test_white_noise_has_no_correlation():
     found = noise_correlation(image, ~none, ones)
     assert found.shape == (1, 1)
     assert_allclose(found, 1.3**2, rtol=0.02)
-    refuses("'usable' must leave at least 100 pixels", noise_correlation, image, none, ones)
+    refuses("'usable' must be 100 pixels or more", noise_correlation, image, none, ones)

@@ -9,8 +9,23 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.random import stream
 
 
+class Timed:
+    """Times of the exposure that something is of, as plain numbers."""
+
+    @property
+    def group_time(self):
+        """Time between the groups in s."""
+        return float(self.exposure.group_time.to_value("s"))
+
+    @property
+    def total_time(self):
+        """Time in s during which charge is collected, in all integrations."""
+        exposure = self.exposure
+        return exposure.n_integrations * exposure.n_groups * exposure.group_time.to_value("s")
+
+
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
-class Block:
+class Block(Timed):
     """
     Where and when an effect acts: some full rows of one exposure.
 
@@ -39,17 +54,6 @@ class Block:
     group_dq: np.ndarray
     key: np.ndarray
     previous: tuple = ()
-
-    @property
-    def group_time(self):
-        """Time between the groups in s."""
-        return self.exposure.group_time.to_value("s")
-
-    @property
-    def total_time(self):
-        """Time during which charge is collected in all integrations in s."""
-        exposure = self.exposure
-        return exposure.n_integrations * exposure.n_groups * exposure.group_time.to_value("s")
 
     @property
     def reference(self):

@@ -14,8 +14,6 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import cached_by_file
 from miricigale.utils.units import frozen_array
 
-__all__ = ["AGN", "AGNTemplates", "Skirtor2016", "TorusSpectra"]
-
 #: Law ``smc`` with the extinction of grains in its place below 0.1 um.
 _GRAINS = "smc_wd01"
 _GRAINS_BELOW = 0.1  # um

@@ -12,8 +12,6 @@ from miricigale.sed.parameter import Parameter
 from miricigale.utils.files import cached_by_file
 from miricigale.utils.units import frozen_array
 
-__all__ = ["Casey2012", "Dale2014", "DraineLi2007", "DraineLi2007Alpha", "DustEmission"]
-
 
 class DustEmission(Component):
     """Base: `template` gives a spectrum that integrates to 1."""

@@ -10,8 +10,6 @@ from miricigale.sed.component import Component, register
 from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import cached_by_file
 
-__all__ = ["IGM", "Inoue2014", "Madau1995", "Meiksin2006"]
-
 # n = 2 ... 10: of the lines beyond, each is at most 1.6 % of Lyman alpha in optical depth
 _N_LINES = 9
 

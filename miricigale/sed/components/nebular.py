@@ -13,8 +13,6 @@ from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import cached_by_file, open_fits
 from miricigale.utils.units import frozen_array
 
-__all__ = ["Nebular"]
-
 _KM_S = 1e-9 * _core.LIGHT  # speed of light
 _WIDTH = Parameter(300.0, (1.0, 3000.0), "Full width of the lines at half maximum.", unit="km / s")
 _WIDTH.name = "line_width"

@@ -15,8 +15,6 @@ from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import cached_by_file
 from miricigale.utils.units import frozen_array
 
-__all__ = ["ParametricTorus"]
-
 
 @register
 class ParametricTorus(AGN):

@@ -14,8 +14,6 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import read_table
 from miricigale.utils.units import to_array
 
-__all__ = ["ConstantSFH", "DelayedSFH", "DoubleExponentialSFH", "StarFormationHistory", "TableSFH"]
-
 _RATE = u.Msun / u.yr
 
 

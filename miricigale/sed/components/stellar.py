@@ -12,8 +12,6 @@ from miricigale.sed.parameter import Parameter
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import frozen_array
 
-__all__ = ["BC03", "BC03Library", "StellarPopulations"]
-
 _OLDEST = 14000  # Myr, more steps than any history has
 
 

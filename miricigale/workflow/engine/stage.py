@@ -11,7 +11,10 @@ from collections.abc import Callable
 from astropy.table import QTable
 
 from miricigale.instrument.image_files import read_image, write_image
-from miricigale.utils.exceptions import DataError, warn
+from miricigale.utils.exceptions import (
+    data_error,
+    warn,
+)
 from miricigale.utils.folder import FileFolder
 from miricigale.utils.meta import undated
 from miricigale.utils.parallel import single_threaded
@@ -277,10 +280,8 @@ def run_unit(config, folder, stages, name, unit, **options):
         If this machine does not see the folder.
     """
     if not folder.is_dir():
-        msg = (
-            f"{folder} is not on {socket.gethostname()}: all workers must see the folder of the run"
-        )
-        raise DataError(msg)
+        where = socket.gethostname()
+        raise data_error(folder, f"is not on {where}: all workers must see the folder of the run")
     (stage,) = (s for s in (stages() if callable(stages) else stages) if s.name == name)
     context = Context(config, folder, stage=stage, unit=unit, **options)
     begin = time.perf_counter()

@@ -1,7 +1,5 @@
 """The stages of the study, each declared beside its function."""
 
-__all__ = ["study_stages"]
-
 
 def study_stages():
     """
