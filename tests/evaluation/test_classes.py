@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
 from miricigale.evaluation import (
@@ -20,8 +21,8 @@ def test_confusion_of_a_table_by_hand():
     assert table["n"].tolist() == [4, 2, 4]
     counts = [table[name].tolist() for name in (*CLASS_NAMES, "unknown")]
     assert counts == [[3, 0, 0], [0, 1, 1], [1, 0, 3], [0, 1, 0]]
-    np.testing.assert_allclose(table["completeness"], [3 / 4, 1 / 2, 3 / 4])
-    np.testing.assert_allclose(table["purity"], [1, 1 / 2, 3 / 4])
+    assert_allclose(table["completeness"], [3 / 4, 1 / 2, 3 / 4])
+    assert_allclose(table["purity"], [1, 1 / 2, 3 / 4])
     assert np.all(table["completeness_low"] <= table["completeness"])
     assert np.all(table["completeness_high"] >= table["completeness"])
 

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.stats import norm
 
 from helpers.errors import refuses
@@ -26,7 +27,7 @@ def test_coverage_is_that_of_gaussians(bias, width):
     table = rows(posterior_ranks(true, values, LEVELS))
     reach = width * norm.ppf(0.5 + np.array([0.34, 0.475]))
     expected = norm.cdf(reach - bias) - norm.cdf(-reach - bias)
-    np.testing.assert_allclose(table["share"], expected, atol=0.02)
+    assert_allclose(table["share"], expected, atol=0.02)
     assert np.all((table["share_low"] < table["share"]) & (table["share"] < table["share_high"]))
     expected = norm.cdf(-bias / np.hypot(1, width))
     assert table["mean_rank"][0] == pytest.approx(expected, abs=0.02)
@@ -52,13 +53,13 @@ def test_truths_on_nodes_have_uniform_ranks_by_drawing_within_their_cell():
 def test_ranks_by_hand():
     values, levels = [0.0, 1.0, 3.0], [0.0, 0.4, 1.0]
     got = posterior_ranks([0.5, 2.0, -1.0, 4.0, np.nan, 3.0], values, levels)
-    np.testing.assert_allclose(got, [0.2, 0.7, 0.0, 1.0, np.nan, 1.0])
+    assert_allclose(got, [0.2, 0.7, 0.0, 1.0, np.nan, 1.0])
 
 
 def test_a_step_of_the_posterior_has_the_ranks_of_its_height():
     """A third of the posterior is at 0, as of the power of an AGN that may be none."""
     values, levels = [0.0, 0.0, 1.0, 2.0], [0.001, 1 / 3, 2 / 3, 0.999]
-    np.testing.assert_allclose(posterior_ranks([0.0, 1.0], values, levels), [1 / 6, 2 / 3])
+    assert_allclose(posterior_ranks([0.0, 1.0], values, levels), [1 / 6, 2 / 3])
     drawn = posterior_ranks(np.zeros(3000), values, levels, seed=1)
     assert (drawn.min(), drawn.max()) == pytest.approx((0, 1 / 3), abs=0.002)
     assert drawn.mean() == pytest.approx(1 / 6, abs=0.01)
@@ -69,7 +70,7 @@ def test_a_step_of_the_posterior_has_the_ranks_of_its_height():
 def test_posteriors_that_do_not_exist_have_no_rank():
     levels = np.array([[0.0, 0.5, 1.0], [np.nan] * 3])
     got = posterior_ranks([1.0, 1.0], [0.0, 1.0, 2.0], levels)
-    np.testing.assert_allclose(got, [0.5, np.nan])
+    assert_allclose(got, [0.5, np.nan])
     table = coverage_table({"none": [np.nan]})
     assert table["n"].tolist() == [0, 0]
     assert np.isnan(table["share"]).all()

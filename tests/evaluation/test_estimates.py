@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
 from miricigale.evaluation import Estimate, bootstrap, sigma_mad
@@ -88,7 +89,7 @@ def test_columns_of_other_lengths_are_refused():
 def test_sigma_mad_by_hand_and_along_an_axis():
     assert np.isnan(sigma_mad([]))
     table = np.array([[1, 2, 3, 4, 100], [0, 0, 0, 0, 0]], float)
-    np.testing.assert_allclose(sigma_mad(table, axis=-1), [1.48, 0.0])
+    assert_allclose(sigma_mad(table, axis=-1), [1.48, 0.0])
     table[0, 4] = np.nan
-    np.testing.assert_allclose(sigma_mad(table, axis=-1, ignore_nan=True), [1.48, 0.0])
+    assert_allclose(sigma_mad(table, axis=-1, ignore_nan=True), [1.48, 0.0])
     assert np.isnan(sigma_mad(table[0]))

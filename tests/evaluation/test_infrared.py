@@ -2,6 +2,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
+from numpy.testing import assert_allclose
 
 from miricigale.evaluation import (
     feature_magnitude,
@@ -27,7 +28,7 @@ def test_share_of_power_laws_by_hand():
 def test_share_of_many_spectra_and_of_none():
     flat = np.ones(WAVE.size)
     total = np.stack([flat, 2 * flat, 0 * flat])
-    np.testing.assert_allclose(light_share(WAVE, total, 0.5 * total), [0.5, 0.5, np.nan])
+    assert_allclose(light_share(WAVE, total, 0.5 * total), [0.5, 0.5, np.nan])
 
 
 def test_share_refuses_a_band_beyond_the_spectrum():

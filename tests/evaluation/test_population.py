@@ -6,6 +6,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
+from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
 from miricigale.evaluation import (
@@ -96,7 +97,7 @@ def test_mass_function_agrees_with_another():
     x = 10 ** (log_mass - 10.54)
     other = np.log(10) * x * np.exp(-x) * (10**-2.72 * x**0.30 + 10**-3.17 * x**-1.45)
     got = galaxy_mass_function(10**log_mass * u.Msun, 1.125).to_value(DENSITY)
-    np.testing.assert_allclose(np.log10(got), np.log10(other), atol=0.15)
+    assert_allclose(np.log10(got), np.log10(other), atol=0.15)
 
 
 # ------------------------------------------------------------------------- populations
@@ -113,7 +114,7 @@ def test_over_all_galaxies_the_agn_are_those_of_the_luminosity_function(z, compt
     number = np.trapezoid(hosts[:, None] * chance, dx=0.003, axis=0)
     wanted = xray_luminosity_function(lx(log_l), z).to_value(DENSITY)
     wanted *= 1 + compton_thick * xray_obscured_fraction(lx(log_l), z)
-    np.testing.assert_allclose(number, wanted, rtol=5e-3)
+    assert_allclose(number, wanted, rtol=5e-3)
 
 
 @pytest.fixture(scope="module")
@@ -162,7 +163,7 @@ def test_drawn_absorption(agn):
 
 
 def test_drawn_light_at_six_micron(agn):
-    np.testing.assert_allclose(
+    assert_allclose(
         stern2015(agn["l_6um"]).to_value(ERG), agn["l_2_10kev"].to_value(ERG), rtol=1e-9
     )
     assert np.all((agn["l_6um"] > 0) == agn["has_agn"])
@@ -177,8 +178,8 @@ def test_a_source_has_its_agn_whatever_else_there_is(galaxies, agn):
     # another limit leaves those above it
     bright = AGNPopulation(min_luminosity=lx(43)).draw(table[rows], seed=20210211)
     above = agn["l_2_10kev"][rows] > lx(43)
-    np.testing.assert_array_equal(bright["has_agn"], above)
-    np.testing.assert_allclose(
+    assert_array_equal(bright["has_agn"], above)
+    assert_allclose(
         bright["l_2_10kev"][above].value, agn["l_2_10kev"][rows][above].value, rtol=0.05
     )
     other = AGNPopulation().draw(table[rows], seed=1)
@@ -232,5 +233,5 @@ def test_fraction_gives_the_luminosity(definition):
     table["frac_agn"] = agn_fraction(wanted, half)
     assert table["frac_agn"][2] == 0
     got = model.fluxes(table, ["miri.f770w"])["l_6um"]
-    np.testing.assert_allclose(got.to_value(u.W), wanted.value, rtol=1e-9)
+    assert_allclose(got.to_value(u.W), wanted.value, rtol=1e-9)
     assert np.isnan(agn_fraction(1 * u.W, 0 * u.W))

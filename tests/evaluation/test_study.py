@@ -5,6 +5,7 @@ import dataclasses
 import astropy.units as u
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
 from helpers.studies import BANDS, FITS, LIMITS, mock_study, mock_truth
@@ -137,7 +138,7 @@ def test_magnitudes_by_shape_and_crowding():
 def test_xray_fluxes_are_those_of_the_relation(study):
     one = study.at(0.6)
     flux = yang2021_xray_flux(one.truth["l_6um"][:3], one.truth["redshift"][:3])
-    np.testing.assert_allclose(10 ** xray_fluxes(one)[:3], flux.value)
+    assert_allclose(10 ** xray_fluxes(one)[:3], flux.value)
     assert np.isnan(xray_fluxes(study.at(0.0))).all()
     half = got(study, "xray_half", truth=0.6)
     found = one.sample[one.field]
@@ -167,7 +168,7 @@ def test_all_numbers_of_all_fits(study):
     # a number has its own stream: its error does not depend on what else there is
     alone = study_numbers(dataclasses.replace(study, truths=study.truths[1:2]), seed=3, n_draws=50)
     both = table[table["truth"] == "agn20"]
-    np.testing.assert_array_equal(both["low"], alone["low"])
+    assert_array_equal(both["low"], alone["low"])
 
 
 def test_confusion_of_a_study(study):

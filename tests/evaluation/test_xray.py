@@ -1,6 +1,7 @@
 import astropy.units as u
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.special import ndtr, ndtri
 
 from helpers.errors import refuses
@@ -35,7 +36,7 @@ def test_completeness_of_a_table_by_hand():
     table = completeness([0.5, 0.6, 1.5, 1.6, 1.7, 5.0], [1, 0, 1, 1, 1, 1], [0, 1, 2, 3])
     assert table["n"].tolist() == [2, 3, 0]
     assert table["n_found"].tolist() == [1, 3, 0]
-    np.testing.assert_allclose(table["share"], [0.5, 1.0, np.nan])
+    assert_allclose(table["share"], [0.5, 1.0, np.nan])
 
 
 @pytest.mark.parametrize(("width", "top"), [(0.05, 1.0), (0.3, 1.0), (0.3, 0.88)])

@@ -9,7 +9,7 @@ from astropy.table import QTable
 from numpy.testing import assert_array_less
 from scipy import stats
 
-from helpers.grids import cells, photometry_table
+from helpers.grids import cells, make_grid, photometry_table
 from miricigale.fitting import BayesFitter
 from miricigale.fitting.posterior import randomized_ranks
 from miricigale.fitting.quantities import DERIVED_LEVELS
@@ -34,7 +34,7 @@ def _draw(grid, n, rng):
 
 
 @pytest.fixture(scope="module")
-def fitted(make_grid):
+def fitted():
     grid = make_grid(11, n_z=8, n_tau=6, n_age=4, frac=np.append(np.arange(5) * 0.2, 0.95))
     rng = np.random.default_rng(4)
     # six values that several galaxies have, and as many as there are galaxies

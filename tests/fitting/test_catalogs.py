@@ -9,6 +9,7 @@ from astropy.table import Column, MaskedColumn, QTable, Table
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
+from helpers.grids import brute_force, draw_photometry, make_grid
 from miricigale.fitting import (
     BayesFitter,
     FitFlags,
@@ -21,7 +22,7 @@ from miricigale.utils.exceptions import MiricigaleWarning
 
 
 @pytest.fixture
-def catalog(grid, draw_photometry):
+def catalog(grid):
     return draw_photometry(grid, 6, noise=0.1)[0]
 
 
@@ -196,7 +197,7 @@ def test_errors_may_be_per_cent(grid, catalog):
 
 @pytest.mark.parametrize("limited", [False, True])
 @pytest.mark.parametrize("flux", [0.0, -0.3, 1e-158, 1e-250])
-def test_without_signal_the_posterior_is_the_prior(make_grid, draw_photometry, flux, limited):
+def test_without_signal_the_posterior_is_the_prior(flux, limited):
     """No model has light, all have the same chi2: sum (F / sigma)^2."""
     grid = make_grid(3)
     table, _ = draw_photometry(grid, 3)
@@ -229,9 +230,7 @@ def test_without_signal_the_posterior_is_the_prior(make_grid, draw_photometry, f
     assert drawn.fitted.all()
 
 
-def test_the_best_model_has_the_lowest_chi2_of_those_that_matter(
-    make_grid, draw_photometry, brute_force
-):
+def test_the_best_model_has_the_lowest_chi2_of_those_that_matter():
     """Whatever its prior with ``rtol=0``; else none is left out that has weight."""
     grid = make_grid(5, n_tau=8)
     table, truth = draw_photometry(grid, 8, noise=0.3)
@@ -301,7 +300,7 @@ def test_codes_beyond_all_measurements_are_left_out(grid, catalog, column, code)
 
 
 @pytest.mark.parametrize("noise", [1e-8, 1e-12, 1e-30])
-def test_fluxes_without_noise_give_their_model_back(make_grid, draw_photometry, noise):
+def test_fluxes_without_noise_give_their_model_back(noise):
     grid = make_grid(2)
     table, truth = draw_photometry(grid, 20, noise=1e-300)
     for name in grid.filters:

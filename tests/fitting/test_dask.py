@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
+from helpers.grids import draw_photometry, make_grid
 from helpers.results import assert_same
 from miricigale.fitting import BayesFitter, fit_file
 from miricigale.utils.parallel import parallel_map
@@ -28,13 +29,13 @@ class Weighing(ProcessPoolExecutor):
 
 
 @pytest.fixture
-def grid(make_grid):
+def grid():
     # half a megabyte, as pickled
     return make_grid(n_z=20, n_tau=12, n_age=12, n_b=20)
 
 
 @pytest.fixture
-def photometry(grid, draw_photometry):
+def photometry(grid):
     return draw_photometry(grid, 90, missing=0.1)[0]
 
 

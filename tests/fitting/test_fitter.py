@@ -10,7 +10,7 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 from helpers.errors import refuses
-from helpers.grids import cells, photometry_table
+from helpers.grids import cells, draw_photometry, make_grid, photometry_table
 from miricigale.fitting import BayesFitter, FitFlags, GridSettings, SamplerSettings, leave_out
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import FitWarning
@@ -30,7 +30,7 @@ def test_fixed_redshift_goes_to_the_nearest_node_or_is_flagged(grid, photometry)
     assert FitFlags.names(strict.flags[0]) == ["redshift_outside"]
 
 
-def test_rows_that_cannot_be_fitted_stay_in_place(grid, draw_photometry):
+def test_rows_that_cannot_be_fitted_stay_in_place(grid):
     table, _ = draw_photometry(grid, 7, noise=0.05)
     for name in grid.filters:
         table[name][0] = np.nan * u.uJy
@@ -59,7 +59,7 @@ def test_rows_that_cannot_be_fitted_stay_in_place(grid, draw_photometry):
     assert np.isnan(out["mass_mean"][0])
 
 
-def test_a_band_that_is_not_fitted_is_predicted(grid, draw_photometry):
+def test_a_band_that_is_not_fitted_is_predicted(grid):
     table, truth = draw_photometry(grid, 10, noise=1e-3)
     table.remove_columns(["band3", "band3_err"])
     results = BayesFitter(grid, model_error=0.0).fit(table)
@@ -160,9 +160,7 @@ def test_a_band_that_is_not_there_is_a_missing_band(grid, photometry):
 # ------------------------------------------------------------- densities of redshift, limits
 
 
-def test_a_density_weighs_the_redshifts_by_its_integral_over_their_cells(
-    make_grid, draw_photometry
-):
+def test_a_density_weighs_the_redshifts_by_its_integral_over_their_cells():
     """Posterior with p(z) = posterior with a flat prior times the integrals, by quadrature."""
     grid = make_grid(3, n_z=6)
     fitter = BayesFitter(grid, settings=GridSettings(rtol=0))
@@ -184,7 +182,7 @@ def test_a_density_weighs_the_redshifts_by_its_integral_over_their_cells(
     assert_array_equal(each, got)
 
 
-def test_densities_that_cannot_be_used_are_flagged_or_refused(make_grid, draw_photometry):
+def test_densities_that_cannot_be_used_are_flagged_or_refused():
     grid = make_grid(3, n_z=6)
     fitter = BayesFitter(grid)
     table, _ = draw_photometry(grid, 4, seed=2)
@@ -207,7 +205,7 @@ def test_densities_that_cannot_be_used_are_flagged_or_refused(make_grid, draw_ph
         fitter.fit(table, redshift=1.0, redshift_prior=(nodes, density))
 
 
-def test_choices_of_cigale(make_grid, draw_photometry):
+def test_choices_of_cigale():
     """No result where exp(-chi2 / 2) vanishes, no error below 5 %, no scatter of the scale."""
     grid = make_grid(3)
     table, _ = draw_photometry(grid, 4, seed=4)
@@ -234,7 +232,7 @@ def test_choices_of_cigale(make_grid, draw_photometry):
 
 
 @pytest.mark.parametrize("signal", [1.0, 2.9, 3.1, 30.0])
-def test_signal_to_noise_below_three_is_flagged(make_grid, signal):
+def test_signal_to_noise_below_three_is_flagged(signal):
     """Photometry that is a model of the grid has the S/N of its fluxes in quadrature."""
     grid = make_grid(2)
     galaxy = np.flatnonzero(grid.allowed[1])[-1]

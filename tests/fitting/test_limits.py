@@ -13,8 +13,11 @@ from scipy.stats import norm
 
 from helpers.errors import refuses
 from helpers.grids import (
+    brute_force,
     cells,
+    draw_photometry,
     free_parameters,
+    make_grid,
     model_priors,
     other_fraction,
     photometry_table,
@@ -120,9 +123,7 @@ CASES = {
         ("bright", "known"),
     ],
 )
-def test_all_options_at_once_equal_the_plain_sums(
-    case, redshift, make_grid, draw_photometry, brute_force
-):
+def test_all_options_at_once_equal_the_plain_sums(case, redshift):
     of_grid, options = CASES[case]
     grid = make_grid(3, **of_grid)
     scale_error = options.get("scale_error", True)
@@ -180,7 +181,7 @@ def test_all_options_at_once_equal_the_plain_sums(
 
 
 @pytest.mark.parametrize("noise", [0.01, 0.1, 0.5, 5.0])
-def test_pruning_loses_no_more_than_asked(noise, make_grid, draw_photometry):
+def test_pruning_loses_no_more_than_asked(noise):
     grid = make_grid(7, n_tau=12, n_age=9)
     table = draw_photometry(grid, 10, seed=3, noise=noise, missing=0.1)[0]
     table = add_limits(table, grid, part=0.4)
@@ -194,7 +195,7 @@ def test_pruning_loses_no_more_than_asked(noise, make_grid, draw_photometry):
     assert_allclose(pruned.moments[..., 1], whole.moments[..., 1], rtol=2e-6)
 
 
-def test_one_model_has_the_posterior_of_the_text_book(make_grid):
+def test_one_model_has_the_posterior_of_the_text_book():
     """Detection 10 +- 1, limit 8 +- 0.5 on twice as bright a band: the minimum by scipy."""
     from scipy.optimize import minimize_scalar
 
@@ -222,7 +223,7 @@ def test_one_model_has_the_posterior_of_the_text_book(make_grid):
 
 
 @pytest.mark.parametrize("noise", [0.02, 0.5, 10.0])
-def test_samplers_and_grid_define_limits_alike(noise, make_grid, draw_photometry):
+def test_samplers_and_grid_define_limits_alike(noise):
     """Chi2, scale and its variance of single models, by the function that samplers call."""
     grid = make_grid(n_z=1, n_tau=1, n_age=1, frac=[0.0])
     table = add_limits(draw_photometry(grid, 40, seed=6, noise=noise)[0], grid, part=0.5)
@@ -237,7 +238,7 @@ def test_samplers_and_grid_define_limits_alike(noise, make_grid, draw_photometry
         assert results.std("mass")[i].value == pytest.approx(np.sqrt(variance[0]), rel=1e-6)
 
 
-def test_percentiles_of_the_other_fraction(make_grid, draw_photometry, brute_force):
+def test_percentiles_of_the_other_fraction():
     """The weight of every model is spread over its cell of the fraction."""
     grid = make_grid(3, n_tau=8, n_age=6)
     fitter = BayesFitter(grid, settings=GridSettings(rtol=0))
@@ -274,7 +275,7 @@ def test_percentiles_of_the_other_fraction(make_grid, draw_photometry, brute_for
 
 
 @pytest.mark.parametrize("error", [1e-9, 1e-12, 1e-30])
-def test_a_limit_without_error_is_a_wall(make_grid, draw_photometry, error):
+def test_a_limit_without_error_is_a_wall(error):
     """As sigma goes to 0 the best scale of every model is that of the detections or the wall's."""
     grid = make_grid(3)
     table = draw_photometry(grid, 8, seed=2)[0]
@@ -310,7 +311,7 @@ def test_a_limit_without_error_is_a_wall(make_grid, draw_photometry, error):
         MaskedColumn([True, True, True], mask=[False, True, False]),
     ],
 )
-def test_how_limits_may_be_written(make_grid, draw_photometry, column):
+def test_how_limits_may_be_written(column):
     grid = make_grid(3)
     table = draw_photometry(grid, 3, seed=2)[0]
     table["band1_limit"] = column
@@ -320,14 +321,14 @@ def test_how_limits_may_be_written(make_grid, draw_photometry, column):
 @pytest.mark.parametrize(
     "column", [[0.5, 0.0, 1.0], ["yes", "no", "no"], [1, 0, 1] * u.uJy, [np.nan, 1.0, 0.0]]
 )
-def test_what_is_not_boolean_is_refused(make_grid, draw_photometry, column):
+def test_what_is_not_boolean_is_refused(column):
     grid = make_grid(3)
     table = draw_photometry(grid, 3, seed=2)[0]
     table["band1_limit"] = column
     refuses("whose column 'band1_limit' is boolean, got", BayesFitter(grid).fit, table)
 
 
-def test_flags_and_counts(make_grid, draw_photometry):
+def test_flags_and_counts():
     grid = make_grid(3)
     table = draw_photometry(grid, 6, seed=4)[0]
     limit = np.zeros((6, 6), bool)
@@ -357,7 +358,7 @@ def test_flags_and_counts(make_grid, draw_photometry):
     assert results[1].n_limits == 5
 
 
-def test_negative_models_have_no_limits(make_grid, draw_photometry):
+def test_negative_models_have_no_limits():
     from dataclasses import replace
 
     grid = make_grid(3)
@@ -375,7 +376,7 @@ def test_negative_models_have_no_limits(make_grid, draw_photometry):
 
 
 @pytest.fixture(scope="module")
-def catalog(grid, draw_photometry):
+def catalog(grid):
     table = draw_photometry(grid, 60, seed=8, noise=0.15, missing=0.1)[0]
     return add_limits(table, grid, part=0.25)
 

@@ -6,12 +6,13 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
+from helpers.grids import draw_photometry
 from miricigale.fitting import BayesFitter, leave_out, mock_analysis
 from miricigale.plotting.axes import new_figure
 
 
 @pytest.fixture(scope="module")
-def catalog(grid, draw_photometry):
+def catalog(grid):
     return draw_photometry(grid, 400, seed=8, noise=0.15, missing=0.1)[0]
 
 
@@ -50,7 +51,7 @@ def test_recovery_is_calibrated(mock):
     assert row["tau97"]["n"] == with_agn < 400
 
 
-def test_without_noise_the_truth_comes_back(grid, draw_photometry):
+def test_without_noise_the_truth_comes_back(grid):
     table, truth = draw_photometry(grid, 30, seed=2, noise=1e-4)
     fitter = BayesFitter(grid, model_error=0.0)
     results = fitter.fit(table)

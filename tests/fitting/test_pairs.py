@@ -11,7 +11,7 @@ from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
-from helpers.grids import CASES, free_parameters
+from helpers.grids import CASES, brute_force, draw_photometry, free_parameters, make_grid
 from helpers.results import assert_same
 from miricigale.fitting import BayesFitter, FitResults, GridSettings, fit_file, open_results
 
@@ -35,9 +35,7 @@ def plain(grid, weights, x, y, priors=None):
 
 @pytest.mark.parametrize("case", [*CASES, "CIGALE"])
 @pytest.mark.parametrize(("rtol", "atol"), [(0.0, 1e-9), (1e-6, 1e-6)])
-def test_every_pair_is_the_sum_over_all_models(
-    case, rtol, atol, make_grid, draw_photometry, brute_force
-):
+def test_every_pair_is_the_sum_over_all_models(case, rtol, atol):
     of_grid, options = CASES.get(case, ({}, {}))
     of_fitter = options | ({"compat": "cigale"} if case == "CIGALE" else {})
     grid = make_grid(3, **of_grid)
@@ -57,7 +55,7 @@ def test_every_pair_is_the_sum_over_all_models(
             )
 
 
-def test_with_upper_limits_and_known_redshifts(make_grid, draw_photometry, brute_force):
+def test_with_upper_limits_and_known_redshifts():
     grid = make_grid(6)
     fitter = BayesFitter(grid, settings=GridSettings(rtol=0), n_bands_min=2)
     table, truth = draw_photometry(grid, 4, seed=8, noise=0.3)
@@ -76,7 +74,7 @@ def test_with_upper_limits_and_known_redshifts(make_grid, draw_photometry, brute
                 assert_allclose(results.joint_pdf(x, y)[i], want, rtol=0, atol=1e-9)
 
 
-def test_merged_models_are_as_all_of_them_apart(make_grid, draw_photometry):
+def test_merged_models_are_as_all_of_them_apart():
     """A torus that stands for two temperatures times two laws, against the four one by one."""
     rng = np.random.default_rng(4)
     some = make_grid(4)
@@ -238,7 +236,7 @@ def test_errors_name_the_argument(fitter, photometry, pairs, error, message):
     refuses(message, fitter.fit, photometry, error=error, pairs=pairs)
 
 
-def test_one_value_has_no_joint_posterior(make_grid, draw_photometry):
+def test_one_value_has_no_joint_posterior():
     grid = make_grid(n_z=1, n_tau=1)
     fitter = BayesFitter(grid, priors={"tau": [1.0]})
     table, _ = draw_photometry(grid, 1)

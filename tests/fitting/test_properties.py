@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.special import log_ndtr
 
-from helpers.grids import photometry_table
+from helpers.grids import make_grid, photometry_table
 from helpers.results import assert_same
 from miricigale.fitting import BayesFitter, FitFlags, GridSettings
 from miricigale.fitting.quantities import DERIVED_LEVELS
@@ -70,7 +70,7 @@ def assert_same_moments(got, want, rtol):
 
 
 @pytest.fixture(scope="module", params=[1, 2, 3])
-def wild(request, make_grid):
+def wild(request):
     grid = make_grid(request.param)
     return grid, wild_photometry(grid, seed=request.param)
 
@@ -150,7 +150,7 @@ def test_order_pieces_and_executors_change_nothing(wild):
 
 
 @pytest.mark.parametrize("factor", [1e-9, 0.37, 1e6])
-def test_brighter_and_heavier_is_the_same(make_grid, factor):
+def test_brighter_and_heavier_is_the_same(factor):
     """All fluxes and errors times a factor: masses times it, everything else as it was."""
     grid = make_grid(5)
     table = wild_photometry(grid, 100, seed=4, units=False)

@@ -12,6 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import chi2
 
 from helpers.errors import refuses
+from helpers.grids import brute_force, draw_photometry, make_grid
 from helpers.results import assert_same_tables
 from miricigale.filters import FilterSet
 from miricigale.fitting import BayesFitter, GridSettings, Samples
@@ -257,7 +258,7 @@ def test_files_that_are_no_samples_are_refused(real, grid, samples, tmp_path):
     refuses(r"absent\.fits", Samples.read, tmp_path / "absent.fits", grid, error=DataError)
 
 
-def test_draws_with_a_prior_keep_it_in_files(make_grid, draw_photometry, tmp_path):
+def test_draws_with_a_prior_keep_it_in_files(tmp_path):
     grid = make_grid()
     fitter = BayesFitter(grid, priors={"temperature_polar": [1.0, 3.0]})
     drawn = fitter.sample(draw_photometry(grid, 2)[0], 500, seed=4)
@@ -282,7 +283,7 @@ def test_draws_are_those_of_the_object_whatever_its_company(grid, photometry):
         refuses("'n_draws' must be an integer >= 1", fitter.sample, photometry, bad, seed=1)
 
 
-def test_draws_have_the_joint_posterior_of_all_models(make_grid, draw_photometry, brute_force):
+def test_draws_have_the_joint_posterior_of_all_models():
     """Frequencies of (galaxy, torus, fraction) against the weights of all models, by chi2."""
     grid = make_grid(3)
     table, _ = draw_photometry(grid, 3, seed=5)

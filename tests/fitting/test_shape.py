@@ -8,6 +8,7 @@ import pytest
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
+from helpers.grids import brute_force
 from helpers.results import assert_same
 from miricigale.fitting import BayesFitter, FitResults, GridSettings
 from miricigale.fitting.posterior import cell_percentiles
@@ -42,7 +43,7 @@ def results(fitter, photometry):
     return fitter.fit(photometry)
 
 
-def test_mean_and_scatter_against_every_model(fitter, results, brute_force):
+def test_mean_and_scatter_against_every_model(fitter, results):
     table = fitter.grid.galaxy_shape
     for row in range(3):
         want = brute_force(fitter.grid, results.flux[row], results.sigma[row])["galaxy"]

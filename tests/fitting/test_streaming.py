@@ -13,6 +13,7 @@ from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
+from helpers.grids import draw_photometry
 from helpers.results import assert_joined, assert_same, assert_same_tables
 from miricigale.fitting import BayesFitter, FitFlags, fit_file, open_results
 from miricigale.utils.exceptions import DataError
@@ -52,7 +53,7 @@ def fitter(grid):
 
 
 @pytest.fixture
-def catalog(grid, draw_photometry):
+def catalog(grid):
     """Photometry with gaps, useless rows and ids that occur again, near and far."""
     table = draw_photometry(grid, 150, missing=0.15)[0]
     ids = [f"{'n' * (1 + i % 5)}{i}" for i in range(150)]

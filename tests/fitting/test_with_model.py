@@ -8,7 +8,7 @@ from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
-from helpers.grids import other_fraction, photometry_table
+from helpers.grids import draw_photometry, other_fraction, photometry_table
 from miricigale.fitting import BayesFitter, FitResults
 from miricigale.sed import SEDModel
 
@@ -30,7 +30,7 @@ def fitter():
     return BayesFitter(SEDModel.yang2021(), NAMES, axes=AXES)
 
 
-def test_the_best_spectrum_has_the_best_fluxes(fitter, draw_photometry, tmp_path):
+def test_the_best_spectrum_has_the_best_fluxes(fitter, tmp_path):
     from miricigale.filters import FilterSet
 
     table, _ = draw_photometry(fitter.grid, 4, noise=0.02)
@@ -47,7 +47,7 @@ def test_the_best_spectrum_has_the_best_fluxes(fitter, draw_photometry, tmp_path
     assert_allclose(sed.fnu.value, results[0].best_sed().fnu.value)
 
 
-def test_every_combination_of_values_counts_as_one_model(draw_photometry):
+def test_every_combination_of_values_counts_as_one_model():
     # as in CIGALE: without AGN light, each torus and each polar dust is a model of its own
     axes = {
         "redshift": np.array([0.8, 1.0]),
@@ -81,7 +81,7 @@ def test_every_combination_of_values_counts_as_one_model(draw_photometry):
 @pytest.mark.parametrize(
     ("definition", "name"), [("dust", "frac_agn_ir"), ("3-1000um", "frac_agn_dust")]
 )
-def test_agn_fraction_in_the_other_definition(definition, name, draw_photometry):
+def test_agn_fraction_in_the_other_definition(definition, name):
     """That of the spectrum of the best model, and of draws, also without dust in the galaxy."""
     model = SEDModel.yang2021(libraries="bundled", frac_agn_definition=definition)
     axes = AXES | {"ebv": np.array([0.0, 0.4]), "frac_agn": np.array([0.0, 0.1, 0.6])}
@@ -118,7 +118,7 @@ def test_agn_fraction_in_the_other_definition(definition, name, draw_photometry)
     assert samples.description(name) in column.info.description
 
 
-def test_plot_sed(fitter, draw_photometry):
+def test_plot_sed(fitter):
     import matplotlib.pyplot as plt
 
     table, _ = draw_photometry(fitter.grid, 1, noise=0.05)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable
+from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
 from miricigale.photometry import ErrorModel
@@ -75,8 +76,8 @@ def test_the_sky_has_the_fluxes_of_the_sample(planner, study):
     truth = QTable.read(folder / "catalog" / "truth.ecsv")
     rows = [np.flatnonzero(truth["id"] == key)[0] for key in planner.sources["id"]]
     for name in planner.bands:
-        np.testing.assert_allclose(truth[name][rows], planner.sources[name], rtol=1e-10)
-    np.testing.assert_array_equal(truth["frac_agn"][rows], planner.sources["frac_agn"])
+        assert_allclose(truth[name][rows], planner.sources[name], rtol=1e-10)
+    assert_array_equal(truth["frac_agn"][rows], planner.sources["frac_agn"])
     others = np.setdiff1d(np.arange(len(truth)), rows)
     galaxies = others[~np.asarray(truth["star"][others], bool)]
     assert np.mean(truth["frac_agn"][galaxies] == 0) == pytest.approx(0.5, abs=0.1)
@@ -141,19 +142,17 @@ def test_differences_are_of_the_same_sources(planner, imaged):
     plans = planner.compare()
     others = planner.compare(measured=imaged.measured)
     # existing bands have no images
-    np.testing.assert_array_equal(
-        plans[0].sources["redshift_mean"], others[0].sources["redshift_mean"]
-    )
+    assert_array_equal(plans[0].sources["redshift_mean"], others[0].sources["redshift_mean"])
     table = paired_numbers(planner, plans, others, imaged)
     assert set(table["plan"]) == {"all"}
     assert table["n"][0] <= np.count_nonzero(imaged.usable)
-    np.testing.assert_allclose(table["difference"], table["images"] - table["noise"], atol=1e-12)
+    assert_allclose(table["difference"], table["images"] - table["noise"], atol=1e-12)
     known = table[table["difference_err"] > 0]
-    np.testing.assert_allclose(known["sigma"], known["difference"] / known["difference_err"])
+    assert_allclose(known["sigma"], known["difference"] / known["difference_err"])
     # larger errors, wider posteriors
     width = table[table["number"] == "frac_width"][0]
     assert width["difference"] > 0
     # the same plan against itself differs by nothing
     same = paired_numbers(planner, plans, plans, imaged)
-    np.testing.assert_array_equal(same["difference"], 0)
+    assert_array_equal(same["difference"], 0)
     assert np.isnan(same["sigma"]).all()

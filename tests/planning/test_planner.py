@@ -6,6 +6,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
+from numpy.testing import assert_allclose, assert_array_equal
 
 from miricigale.cli import main
 from miricigale.planning import Planner, area_table, comparison_table, load_plan
@@ -58,7 +59,7 @@ def test_noise_is_that_of_the_errors(planner):
     extended = planner.sources["size"] > 0.3 * u.arcsec
     assert np.all(own[extended] > point[extended])
     round_ = planner.sources["size"] == 0
-    np.testing.assert_allclose(own[round_], point[round_])
+    assert_allclose(own[round_], point[round_])
 
 
 def test_draws_belong_to_source_and_band_and_no_thread_changes_them(planner, plans):
@@ -68,7 +69,7 @@ def test_draws_belong_to_source_and_band_and_no_thread_changes_them(planner, pla
     mine = plans[2].sources
     assert list(again.bands) == ["miri.f770w"]
     for name in mine.colnames:
-        np.testing.assert_array_equal(mine[name], again.sources[name])
+        assert_array_equal(mine[name], again.sources[name])
     seeded = Planner(load_plan(overrides=SETTINGS | {"plan": {"seed": 5}}))
     assert list(seeded.sources["id"]) != list(planner.sources["id"])
 

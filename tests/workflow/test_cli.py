@@ -3,9 +3,9 @@ import shlex
 from pathlib import Path
 
 import astropy.units as u
-import numpy as np
 import pytest
 from astropy.table import Table
+from numpy.testing import assert_array_equal
 
 from miricigale.cli import main
 from miricigale.cli.options import declarations, make_parser
@@ -252,4 +252,4 @@ def test_a_catalog_comes_from_standard_input(tmp_path, monkeypatch):
     assert (tmp_path / "fits-input.csv").read_bytes() == text
     found, same = (Table.read(tmp_path / name / "table.fits") for name in ("fits", "same"))
     for column in ("id", "redshift_p50", "chi2_best"):
-        np.testing.assert_array_equal(found[column], same[column])
+        assert_array_equal(found[column], same[column])

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable
+from numpy.testing import assert_allclose
 
 from miricigale.instrument import ceers_exposures
 from miricigale.utils.exceptions import ConfigError, DataError
@@ -84,7 +85,7 @@ def test_without_a_file_exposures_are_those_of_the_plan():
 def test_each_filter_is_at_the_dithers_of_its_exposure(listed):
     config = config_of(dithers=str(listed), dither_observation=5, dither_exposures=[1, 2])
     for band, offsets in zip(BANDS, PATTERNS.values(), strict=True):
-        np.testing.assert_allclose(offsets_of(config, band), offsets, atol=1e-4)
+        assert_allclose(offsets_of(config, band), offsets, atol=1e-4)
     # groups and integrations stay those of the plan
     assert {e.n_groups for e in study_exposures(config).values()} == {200, 10}
     assert dithers_text(config) == (
@@ -93,16 +94,16 @@ def test_each_filter_is_at_the_dithers_of_its_exposure(listed):
     )
     other = config_of(dithers=str(listed), dither_observation=6)
     for band in BANDS:
-        np.testing.assert_allclose(offsets_of(other, band), [[0.5, -0.5]], atol=1e-4)
+        assert_allclose(offsets_of(other, band), [[0.5, -0.5]], atol=1e-4)
 
 
 def test_files_patterns_and_numbers_of_each_filter(table):
     config = config_of(dithers=[str(table), "4-point"], n_dithers=[1, 3])
-    np.testing.assert_allclose(offsets_of(config, BANDS[0]), [[0, 0]], atol=1e-4)
+    assert_allclose(offsets_of(config, BANDS[0]), [[0, 0]], atol=1e-4)
     assert len(offsets_of(config, BANDS[1])) == 3
     config = config_of(dithers=str(table))
     for band in BANDS:
-        np.testing.assert_allclose(offsets_of(config, band), [[0, 0], [2.5, 3.0]], atol=1e-4)
+        assert_allclose(offsets_of(config, band), [[0, 0], [2.5, 3.0]], atol=1e-4)
     # a band without a plan needs its groups only
     config = config_of(["miri.f560w"], dithers=str(table), n_groups=[50])
     assert len(study_exposures(config)) == 2

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable, Table
+from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.runs import do_stage
 from helpers.scenes import catalog_at
@@ -53,7 +54,7 @@ def run(folder, table, **sed):
 def test_without_errors_short_bands_get_five_percent(galaxies, tmp_path):
     _, results, truth, told = run(tmp_path, galaxies.copy())
     assert list(results.filters) == SHORT
-    np.testing.assert_allclose(results.flux_err, 0.05 * results.flux)
+    assert_allclose(results.flux_err, 0.05 * results.flux)
     assert "mips.24" not in told
     assert "5 % error each, for the catalog gives none" in told
     # drawn, each its own
@@ -68,11 +69,11 @@ def test_the_catalogs_own_errors_are_used_beyond_three_micron_too(galaxies, tmp_
     _, results, truth, told = run(tmp_path, table)
     assert list(results.filters) == [*SHORT, *LONG]
     wanted = np.array([0.01, 0.02, 0.05, 0.03])
-    np.testing.assert_allclose(results.flux_err / results.flux, [wanted, wanted], rtol=1e-6)
+    assert_allclose(results.flux_err / results.flux, [wanted, wanted], rtol=1e-6)
     assert "the catalog's errors in nircam.f090w, nircam.f150w, mips.24; 5 % error each" in told
     assert "alpha is fitted too" in told
     # 24 um shows the dust: alpha is that of the fit, and the flux comes back
-    np.testing.assert_array_equal(truth["alpha"], ALPHA)
+    assert_array_equal(truth["alpha"], ALPHA)
 
 
 def test_a_flux_whose_error_is_not_positive_is_left_out(galaxies, tmp_path):
@@ -126,7 +127,7 @@ def test_a_catalog_of_ones_own_by_a_map_of_columns(galaxies, tmp_path):
     truth = do_inputs(config, tmp_path)
     # 23.9 - 2.5 log(10) = 21.4 is below the limit; the source without a flux stays, and has none
     assert list(truth["id"]) == [2, 3, 4]
-    np.testing.assert_allclose(truth["wfc3.f160w"].value[:2], [20, 30], rtol=1e-6)
+    assert_allclose(truth["wfc3.f160w"].value[:2], [20, 30], rtol=1e-6)
     assert np.isnan(truth["wfc3.f160w"][2])
     assert np.isnan(truth["miri.f770w"][2])
     # one band gives every galaxy light in all others
@@ -154,11 +155,11 @@ def test_magnitudes_and_text_ids_give_the_inputs_of_the_fluxes(galaxies, tmp_pat
     truth = do_inputs(config, tmp_path)
     catalog = QTable.read(tmp_path / "catalog.ecsv")
     assert catalog["flags"].tolist() == [0, CatalogFlags.MISSING_CODE]
-    np.testing.assert_allclose(catalog[SHORT[0]].value, galaxies[SHORT[0]].value)
+    assert_allclose(catalog[SHORT[0]].value, galaxies[SHORT[0]].value)
     results = FitResults.read(tmp_path / "input_seds.fits")
     assert results.ids.tolist() == ["a-1", "a-2"]
     assert results.n_bands.tolist() == [3, 2]
-    np.testing.assert_allclose(
+    assert_allclose(
         results.flux_err / results.flux,
         0.05 * np.log(10) / 2.5 * np.where(np.isnan(results.flux), np.nan, 1),
     )

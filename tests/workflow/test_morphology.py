@@ -8,6 +8,7 @@ import pytest
 from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData
 from astropy.table import QTable
+from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers import scenes
 from helpers.errors import refuses
@@ -62,7 +63,7 @@ def test_clumps_follow_the_light_of_their_galaxies():
     table = disks()
     painted = add_clumps(table, BAND, share=0.2, seed=SEED)
     smooth, clumps = painted[: len(table)], painted[len(table) :]
-    np.testing.assert_allclose(smooth[BAND], 0.8 * table[BAND])
+    assert_allclose(smooth[BAND], 0.8 * table[BAND])
     assert len(np.unique(painted["id"])) == len(painted)
     assert set(clumps["profile"]) == {"point"}
     # galaxies are 0.002 deg from each other
@@ -70,7 +71,7 @@ def test_clumps_follow_the_light_of_their_galaxies():
     numbers = np.bincount(owner)
     assert (numbers.min(), numbers.max()) == (3, 12)
     light = np.bincount(owner, weights=clumps[BAND].value)
-    np.testing.assert_allclose(light, 0.2 * table[BAND].value)
+    assert_allclose(light, 0.2 * table[BAND].value)
     major, minor = in_own_axes(table, clumps, owner)
     radius = np.hypot(major, minor)
     # an exponential disk has half of its light within 1, 90 % within 2.318 (x = 3.890 of 1.678)
@@ -85,13 +86,11 @@ def test_clumps_are_those_of_a_source_in_every_band():
     table = disks(30)
     first = add_clumps(table, BAND, share=0.2, seed=SEED)
     other = add_clumps(table, "miri.f1500w", share=0.2, seed=SEED)
-    np.testing.assert_array_equal(first["sky"].ra, other["sky"].ra)
-    np.testing.assert_allclose(other["miri.f1500w"], 3 * first[BAND])
+    assert_array_equal(first["sky"].ra, other["sky"].ra)
+    assert_allclose(other["miri.f1500w"], 3 * first[BAND])
     # of the id, not of the row
     part = add_clumps(table[20:], BAND, share=0.2, seed=SEED)
-    np.testing.assert_array_equal(
-        part["sky"].ra[10:], first["sky"].ra[len(first) - len(part) + 10 :]
-    )
+    assert_array_equal(part["sky"].ra[10:], first["sky"].ra[len(first) - len(part) + 10 :])
 
 
 def test_ids_may_be_text(field, tmp_path):
@@ -114,13 +113,13 @@ def test_only_the_disks_are_clumpy_and_points_keep_their_light():
     table["half_light_radius"][2] = np.nan * u.arcsec
     table["share"] = [0.5, 0.5, 0.5, 0.5]
     painted = add_clumps(table, BAND, share=0.2, seed=SEED, point="share")
-    np.testing.assert_allclose(painted[BAND][:3], table[BAND][:3])
+    assert_allclose(painted[BAND][:3], table[BAND][:3])
     assert painted[BAND].sum().value == pytest.approx(table[BAND].sum().value)
     # clumps take of the galaxy's half only
     assert painted[BAND][3].value == pytest.approx(0.9 * table[BAND][3].value)
     in_points = (painted[BAND] * painted["share"])[3].value
     assert in_points == pytest.approx(0.5 * table[BAND][3].value)
-    np.testing.assert_array_equal(painted["share"][4:], 0)
+    assert_array_equal(painted["share"][4:], 0)
     assert add_clumps(table[:3], BAND, share=0.2, seed=SEED)[BAND].sum() == table[BAND][:3].sum()
 
 
@@ -215,7 +214,7 @@ def test_drawn_galaxies_have_size_place_and_turn_of_the_source(field):
     )
     stamps = stamps_of_sources(table, galaxies, of="any", seed=SEED)
     again = stamps_of_sources(table, galaxies, of="any", seed=SEED)
-    np.testing.assert_array_equal(stamps[1].data, again[1].data)
+    assert_array_equal(stamps[1].data, again[1].data)
     radius = 0.7 * np.sqrt(0.5)
     assert stamps[1].half_light_radius.to_value(u.arcsec) == pytest.approx(radius, rel=1e-9)
     x, y, (xx, yy, xy) = moments(paint(table, stamps, wcs, BAND), 60, 60, 20)
@@ -246,7 +245,7 @@ def test_stamps_come_back_from_their_file(field, tmp_path):
     back = read_stamps(tmp_path / "stamps.fits")
     assert list(back) == list(stamps)
     for key, stamp in stamps.items():
-        np.testing.assert_allclose(back[key].data, stamp.data, rtol=1e-6)
+        assert_allclose(back[key].data, stamp.data, rtol=1e-6)
         assert back[key].pixel_scale == stamp.pixel_scale
         assert back[key].angle == stamp.angle
         assert back[key].center == stamp.center
@@ -278,7 +277,7 @@ def test_a_study_paints_the_light_of_an_image(tmp_path, monkeypatch):
         QTable.read(tmp_path / name / "truth.ecsv") for name in ("agn00", "agn00+cutouts")
     )
     for name in (BAND, PRIOR, "profile", "mass"):
-        np.testing.assert_array_equal(own[name], known[name])
+        assert_array_equal(own[name], known[name])
     # the fourth, faint on the image, is not
     assert list(read_stamps(tmp_path / "agn00+cutouts" / "stamps.fits")) == [1, 2, 3]
     assert not (tmp_path / "agn00" / "stamps.fits").exists()
@@ -327,7 +326,7 @@ def test_real_galaxies_of_an_image_with_its_psf(data_file):
         for f in (lambda stamp: stamp.data.sum(), lambda stamp: stamp.half_light_radius.value)
     )
     # light comes in from the wings
-    np.testing.assert_allclose(sums[1] / sums[0], 1.03, atol=0.08)
+    assert_allclose(sums[1] / sums[0], 1.03, atol=0.08)
     assert np.all(radii[1] < radii[0])
     # in quadrature the PSF's own: Gaussian of its width at least
     less = np.sqrt(radii[0] ** 2 - radii[1] ** 2)

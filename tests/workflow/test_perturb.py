@@ -8,6 +8,7 @@ import pytest
 from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData
 from astropy.table import QTable
+from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
 from helpers.runs import STAGES
@@ -138,7 +139,7 @@ def test_astrometry_shifts_a_band_as_a_whole():
     sky, shift = sources()["sky"], Perturbation({"astrometry": 0.03}, SEED)
     moved = [shift.catalog(sources(), name)["sky"] for name in BANDS]
     for own in moved:
-        np.testing.assert_allclose(own.separation(sky).to_value(u.mas), 30, rtol=1e-4)
+        assert_allclose(own.separation(sky).to_value(u.mas), 30, rtol=1e-4)
     angles = np.array([sky.position_angle(own).to_value(u.deg) for own in moved])
     assert np.all(np.ptp(angles, axis=1) < 0.1)
     assert abs(angles[0, 0] - angles[1, 0]) > 1
@@ -163,11 +164,11 @@ def test_zero_points_of_existing_bands_are_in_the_fluxes_that_are_fitted():
     }
     ratios = {band: (mock[0.02][band] / mock[0][band]).value for band in bands}
     for band, ratio in ratios.items():
-        np.testing.assert_allclose(np.abs(ratio - 1), 0.02, rtol=1e-6)
+        assert_allclose(np.abs(ratio - 1), 0.02, rtol=1e-6)
         assert np.ptp(ratio) < 1e-9, band
     assert len({ratio[0] > 1 for ratio in ratios.values()}) == 2
     for band in BANDS:
-        np.testing.assert_array_equal(mock[0.02][band], mock[0][band])
+        assert_array_equal(mock[0.02][band], mock[0][band])
     # of the skies that have it only; it is no part of the images
     config = config_of(["psf", "zero_point_existing"], of=0.4)
     plans = {unit: STAGES["fits"].plan(config, unit) for unit in STAGES["fits"].unit_names(config)}
@@ -179,7 +180,7 @@ def test_zero_points_of_existing_bands_are_in_the_fluxes_that_are_fitted():
 def test_nothing_changes_without_effects():
     nothing, table = Perturbation({}, SEED), sources()
     assert nothing.catalog(table, BAND) is table
-    np.testing.assert_array_equal(nothing.psf(BAND).data, miri_psf(BAND).data)
+    assert_array_equal(nothing.psf(BAND).data, miri_psf(BAND).data)
     assert nothing.detector == miri_detector()
     assert nothing.point_column(BAND) is None
     image = CCDData(np.ones((1024, 1032)), unit="MJy/sr")
@@ -254,21 +255,21 @@ def test_models_of_sources_change_in_one_part(effect):
     plain, own = (model.fluxes(rows, bands) for model, rows in ((known, table), (other, changed)))
     ratio = {name: (own[name] / plain[name]).value for name in bands}
     # the prior's light is that of before; the AGN takes little part in it
-    np.testing.assert_allclose(ratio[PRIOR], 1, atol=0.02)
-    np.testing.assert_allclose(own["frac_agn_dust"], 0.4)
+    assert_allclose(ratio[PRIOR], 1, atol=0.02)
+    assert_allclose(own["frac_agn_dust"], 0.4)
     power = (own["dust_luminosity"] / plain["dust_luminosity"]).value
     if effect == "stars":
         assert np.std(ratio["acs.f435w"]) > 0.02
         assert np.all((power > 0.5) & (power < 5))
     else:
-        np.testing.assert_allclose(ratio["acs.f435w"], 1, atol=0.02)
+        assert_allclose(ratio["acs.f435w"], 1, atol=0.02)
         # dust of near galaxies shows in the prior too
-        np.testing.assert_allclose(power, 1, rtol=0.01)
+        assert_allclose(power, 1, rtol=0.01)
         assert np.abs(ratio["miri.f2100w"] - 1).max() > 0.05
     # drawn for each source, by its id
     part = perturbed_parameters([effect], table[5:], (known, other), PRIOR, seed=SEED)
     for name in part.colnames:
-        np.testing.assert_allclose(part[name], changed[name][5:], rtol=1e-9)
+        assert_allclose(part[name], changed[name][5:], rtol=1e-9)
 
 
 def test_an_agn_as_a_point_keeps_the_light():
@@ -278,7 +279,7 @@ def test_an_agn_as_a_point_keeps_the_light():
     alone["frac_agn"] = 0.0
     for band in BANDS:
         galaxy, both = (model.fluxes(rows, [band])[band].value for rows in (alone, table))
-        np.testing.assert_allclose((1 - shares[f"{band}_point"]) * both, galaxy, rtol=1e-9)
+        assert_allclose((1 - shares[f"{band}_point"]) * both, galaxy, rtol=1e-9)
     assert np.all(shares[f"{BAND}_point"] > 0.05)
     catalog = sources()
     for name, share in shares.items():
@@ -295,11 +296,9 @@ def test_an_agn_as_a_point_keeps_the_light():
             agn=differ.point_column(BAND),
         )
         images[bool(effects)], truths[bool(effects)] = sky.render().data, sky.truth
-    np.testing.assert_array_equal(truths[True]["id"], catalog["id"])
-    np.testing.assert_allclose(truths[True]["flux_total"], catalog[BAND])
-    np.testing.assert_allclose(
-        truths[True]["flux_in_image"], truths[False]["flux_in_image"], rtol=0.02
-    )
+    assert_array_equal(truths[True]["id"], catalog["id"])
+    assert_allclose(truths[True]["flux_total"], catalog[BAND])
+    assert_allclose(truths[True]["flux_in_image"], truths[False]["flux_in_image"], rtol=0.02)
     assert images[True].sum() == pytest.approx(images[False].sum(), rel=0.01)
     assert images[True].max() > 1.2 * images[False].max()
 
@@ -359,9 +358,9 @@ NO_SIZE = {
 def test_effects_without_size_leave_every_bit(chain):
     plain, none = chain({}), chain(NO_SIZE)
     for first, second in zip(plain[:2], none[:2], strict=True):
-        np.testing.assert_array_equal(first.data, second.data)
-        np.testing.assert_array_equal(first.uncertainty.array, second.uncertainty.array)
-        np.testing.assert_array_equal(first.mask, second.mask)
+        assert_array_equal(first.data, second.data)
+        assert_array_equal(first.uncertainty.array, second.uncertainty.array)
+        assert_array_equal(first.mask, second.mask)
     config = config_of(["zero_point_existing"], zero_point_existing=0.0)
     assert STAGES["fits"].plan(config, "agn00+zero_point_existing/all") == STAGES["fits"].plan(
         config, "agn00/all"
@@ -378,29 +377,29 @@ def test_each_effect_reaches_the_calibrated_image_in_its_size(chain):
     # fluxes as of stars that are by 2 % brighter, and nothing else
     zero = changed({"zero_point": 0.02})
     sign = np.sign(zero[0][0] / light[0] - 1)
-    np.testing.assert_allclose(zero[0] / light, 1 + 0.02 * sign, atol=0.002)
-    np.testing.assert_allclose(stars(chain({}, 1 + 0.02 * sign)[1], places)[0], zero[0], rtol=1e-6)
-    np.testing.assert_allclose(zero[1:3], [x, y], atol=0.005)
+    assert_allclose(zero[0] / light, 1 + 0.02 * sign, atol=0.002)
+    assert_allclose(stars(chain({}, 1 + 0.02 * sign)[1], places)[0], zero[0], rtol=1e-6)
+    assert_allclose(zero[1:3], [x, y], atol=0.005)
     # the conversion takes DN for as many electrons as before
-    np.testing.assert_allclose(changed({"gain": 0.01})[0] / light, 1 / 1.01, atol=0.002)
+    assert_allclose(changed({"gain": 0.01})[0] / light, 1 / 1.01, atol=0.002)
     # 30 mas of 110 mas pixels, all in one direction
     moved = changed({"astrometry": 0.03})
     step = np.array([moved[1] - x, moved[2] - y]) * 0.11
     # the weight pulls the center back to the old place: by the share of its width in both
     pull = 1.0 / (1.0 - width / (2 * 1.5**2))
     length = np.hypot(*step) * pull
-    np.testing.assert_allclose(length, 0.03, rtol=0.25)
+    assert_allclose(length, 0.03, rtol=0.25)
     assert np.ptp(np.arctan2(step[1], step[0])) < 0.2
-    np.testing.assert_allclose(moved[0] / light, 1, atol=0.003)
+    assert_allclose(moved[0] / light, 1, atol=0.003)
     # wider or narrower, with the same light
     wide = changed({"psf_width": 0.1})
     assert len(set(np.sign(wide[3] - width))) == 1
     assert np.all(np.abs(wide[3] / width - 1) > 0.03)
-    np.testing.assert_allclose(wide[0] / light, 1, atol=0.02)
+    assert_allclose(wide[0] / light, 1, atol=0.02)
     # another wavefront: other shapes, the same light
     other = changed({"psf": None})
     assert np.any(np.abs(other[3] / width - 1) > 1e-4)
-    np.testing.assert_allclose(other[0] / light, 1, atol=0.01)
+    assert_allclose(other[0] / light, 1, atol=0.01)
 
 
 def test_another_flat_takes_the_place_of_the_known_one(chain):
@@ -478,4 +477,4 @@ def test_costs_are_changes_of_the_same_sources(tmp_path):
     assert "<th class=n>F770W offset</th>" in page
     assert "<td>agn40</td><td>zero point, MIRI</td><td class=n>+2.0 % (+2.0 ± 0.0 %)</td>" in page
     written = QTable.read(tmp_path / "report" / "perturbations.ecsv")
-    np.testing.assert_array_equal(written["change"], table["change"])
+    assert_array_equal(written["change"], table["change"])

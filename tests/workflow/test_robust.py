@@ -13,6 +13,7 @@ import pytest
 from astropy.nddata import CCDData
 from astropy.table import QTable
 
+from helpers.errors import refuses
 from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.engine.runner import StudyRunner
 from miricigale.workflow.engine.stage import Context, Stage
@@ -152,8 +153,7 @@ def test_a_write_that_the_system_cuts_off_is_named_and_leaves_what_stood(tmp_pat
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
     try:
-        with pytest.raises(OSError, match=rf"{tmp_path}/{name}"):
-            products(context)[name](name)
+        refuses(rf"{tmp_path}/{name}", products(context)[name], name, error=OSError)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert (tmp_path / name).read_text() == "what stood"

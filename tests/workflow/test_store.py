@@ -43,8 +43,7 @@ def test_no_product_lies_outside_the_folder(folder, name):
     name = name.format(victim=victim)
     text = (folder / "manifest.json").read_text()
     (folder / "manifest.json").write_text(text.replace("part/product.txt", json.dumps(name)[1:-1]))
-    with pytest.raises(DataError, match="is not the name of a product"):
-        ProductStore(folder)
+    refuses("is not the name of a product", ProductStore, folder, error=DataError)
     assert victim.read_text() == "mine"
 
 

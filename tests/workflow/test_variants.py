@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable
+from numpy.testing import assert_array_equal
 
 from helpers.errors import refuses
 from helpers.points import PRIOR, point_catalog, save_prior
@@ -199,7 +200,7 @@ def test_the_report_says_what_each_costs(tmp_path):
     page = report.to_html()
     assert "residual noise</td>" in page
     assert "without the gradient</td>" in page
-    np.testing.assert_array_equal(
+    assert_array_equal(
         QTable.read(tmp_path / "report" / "variants.ecsv")["limit"], numbers["limit"]
     )
     reasons = {"limit.f2100w": "another field", "limit.f770w": "other"}
