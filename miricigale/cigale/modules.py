@@ -226,7 +226,7 @@ def _nebular(m):
         m.chain.left_out.append("nebular.ne")
     options = {"line_width": m.one("lines_width", 300.0), "gas": "stellar"}
     if zgas is not None and not np.array_equal(zgas, stellar):
-        known = np.array(c.Nebular().table.metallicities)
+        known = np.unique(c.Nebular().table.metallicity)
         nearest = known[np.argmin(np.abs(np.log(zgas[:, None] / known)), axis=1)]
         for have, got in zip(zgas, nearest, strict=True):
             if abs(got / have - 1.0) > 1e-3:
