@@ -1,4 +1,3 @@
-import itertools
 import math
 
 import astropy.units as u
@@ -6,11 +5,10 @@ import numpy as np
 import pytest
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
-from scipy.integrate import quad
 from scipy.stats import norm
 
 from helpers.errors import refuses
-from helpers.grids import cells, draw_photometry, make_grid, photometry_table
+from helpers.grids import cell_integrals, draw_photometry, make_grid, photometry_table
 from miricigale.fitting import BayesFitter, FitFlags, GridSettings, SamplerSettings, leave_out
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import FitWarning
@@ -45,13 +43,10 @@ def test_rows_that_cannot_be_fitted_stay_in_place(grid):
     table["band0_err"][6] = 1e-3 * table["band0"][6]
     results = BayesFitter(grid, model_error=0.0).fit(table)
     names = [FitFlags.names(f) for f in results.flags]
-    assert names[0] == ["no_band"]
-    assert names[1] == ["few_bands"]
-    assert "bad_error" in names[2]
+    assert [names[i] for i in (0, 1, 4)] == [["no_band"], ["few_bands"], ["duplicate_id"]]
+    for i, name in ((2, "bad_error"), (5, "no_signal"), (6, "high_chi2")):
+        assert name in names[i]
     assert results.n_bands[2] == 4
-    assert names[4] == ["duplicate_id"]
-    assert "no_signal" in names[5]
-    assert "high_chi2" in names[6]
     assert list(results.ids) == list(table["id"])
     assert_array_equal(results.fitted, [0, 0, 1, 1, 0, 1, 1])
     out = results.to_table()
@@ -98,9 +93,9 @@ def test_bad_options_are_named(grid, options, error, text):
 def test_bad_photometry_is_named(grid, photometry):
     fitter = BayesFitter(grid)
     refuses("'photometry' must be a table with at least one of", fitter.fit, QTable({"id": [1]}))
-    some = photometry[[name for name in photometry.colnames if name != "band0_err"]]
+    some, bare = photometry.copy(), photometry.copy()
+    del some["band0_err"]
     refuses(r"'photometry' must be a table with the columns \['band0_err'\]", fitter.fit, some)
-    bare = photometry.copy()
     bare["band0"] = bare["band0"].value
     refuses("'photometry' column 'band0' must be convertible", fitter.fit, bare, error=u.UnitsError)
     refuses("'redshift' must be a column among", fitter.fit, photometry, redshift="z_best")
@@ -119,13 +114,10 @@ def test_a_prior_that_leaves_nothing_is_flagged(grid, photometry):
 @pytest.mark.parametrize("filters", [None, ["band0", "band1"]])
 def test_what_is_no_table_is_named(grid, photometry, filters):
     fitter = BayesFitter(grid, filters)
-    for bad, wanted in (
-        (None, "a table, a dict of columns, .* got NoneType"),
-        ({"id": [1]}, "a table with"),
-    ):
-        refuses(f"'photometry' must be {wanted}", fitter.fit, bad)
-    with pytest.raises(ValueError, match=r"'redshift' must be numbers, got \['a', 'b'\]"):
-        fitter.fit(photometry[:2], redshift=["a", "b"])
+    refuses("'photometry' must be a table, a dict of columns, .* got NoneType", fitter.fit, None)
+    refuses("'photometry' must be a table with", fitter.fit, {"id": [1]})
+    text = r"'redshift' must be numbers, got \['a', 'b'\]"
+    refuses(text, fitter.fit, photometry[:2], redshift=["a", "b"])
     table = photometry.copy()
     table["band0"] = np.full(len(table), 22.0) * u.ABmag
     wanted = r"column 'band0_err' must be in mag, as 'band0' is, got uJy"
@@ -167,14 +159,7 @@ def test_a_density_weighs_the_redshifts_by_its_integral_over_their_cells():
     table, _ = draw_photometry(grid, 5, seed=2)
     nodes = np.array([0.0, 0.4, 0.9, 2.0, 9.0])
     density = np.array([0.1, 2.0, 0.3, 0.5, 0.0])
-    z = grid.redshift
-    edges = cells(z, (0.0, np.inf))
-    weights = [
-        quad(lambda x: np.interp(x, nodes, density, right=0.0), a, b, points=nodes[1:-1])[0]
-        for a, b in itertools.pairwise(edges)
-    ]
-    flat = fitter.fit(table).pdf["redshift"]
-    want = flat * weights
+    want = fitter.fit(table).pdf["redshift"] * cell_integrals(grid.redshift, nodes, density)
     got = fitter.fit(table, redshift_prior=(nodes, density)).pdf["redshift"]
     assert_allclose(got, want / want.sum(axis=1, keepdims=True), rtol=1e-7, atol=1e-13)
     # one for each object is the same, row by row
@@ -189,10 +174,8 @@ def test_densities_that_cannot_be_used_are_flagged_or_refused():
     nodes = np.array([0.0, 50.0, 51.0])
     density = np.array([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0], [np.nan, 1.0, 1.0], [0.0, 0.0, 0.0]])
     got = fitter.fit(table, redshift_prior=(nodes, density))
-    names = [set(FitFlags.names(flag)) for flag in got.flags]
-    assert "no_model" in names[1]
-    assert "no_redshift" in names[2]
-    assert "no_redshift" in names[3]
+    for flag, name in zip(got.flags[1:], ("no_model", "no_redshift", "no_redshift"), strict=True):
+        assert name in FitFlags.names(flag)
     assert got.fitted.tolist() == [True, False, False, False]
     for prior, match in (
         ((nodes, density[:2]), "'redshift_prior' must be"),
@@ -201,8 +184,8 @@ def test_densities_that_cannot_be_used_are_flagged_or_refused():
         ("p_z", "'redshift_prior' must be"),
     ):
         refuses(match, fitter.fit, table, redshift_prior=prior)
-    with pytest.raises(ValueError, match="must not be given both"):
-        fitter.fit(table, redshift=1.0, redshift_prior=(nodes, density))
+    both = {"redshift": 1.0, "redshift_prior": (nodes, density)}
+    refuses("must not be given both", fitter.fit, table, **both)
 
 
 def test_choices_of_cigale():
@@ -284,12 +267,11 @@ def test_settings_that_mean_nothing_are_refused(options, message):
 
 
 def test_weights_and_pieces_have_no_unit_and_no_fraction(grid, photometry):
-    with pytest.raises(u.UnitsError, match=r"'priors\['tau'\]' must be convertible to"):
-        BayesFitter(grid, priors={"tau": np.ones(5) * u.Gyr})
+    fitter, priors = BayesFitter(grid), {"tau": np.ones(5) * u.Gyr}
+    text = r"'priors\['tau'\]' must be convertible to"
+    refuses(text, BayesFitter, grid, priors=priors, error=u.UnitsError)
     for size in (2.5, "a", True):
-        with pytest.raises(ValueError, match="'chunk_size' must be an integer >= 1"):
-            BayesFitter(grid).fit(photometry, chunk_size=size)
-    with pytest.raises(ValueError, match="'filters' must be a list of names or a FilterSet"):
-        BayesFitter(grid).fit(photometry).predict("band0")
-    with pytest.raises(ValueError, match="'bands' must be different names"):
-        leave_out(BayesFitter(grid), photometry, ["band1", "band1"])
+        refuses("'chunk_size' must be an integer >= 1", fitter.fit, photometry, chunk_size=size)
+    results, text = fitter.fit(photometry), "'filters' must be a list of names or a FilterSet"
+    refuses(text, results.predict, "band0")
+    refuses("'bands' must be different names", leave_out, fitter, photometry, 2 * ["band1"])

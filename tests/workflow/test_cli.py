@@ -38,8 +38,8 @@ def test_the_configuration_can_be_printed_and_given_back(capsys, tmp_path):
     [
         (["run", "cosmos"], "no preset 'cosmos'; known: goodss"),
         (["run", "absent.toml"], "no configuration file absent.toml"),
-        (["fit", "absent.ecsv"], "no table absent.ecsv"),
-        (["data", "add", "nothing", "x"], "no resource 'nothing'; known:"),
+        (["fit", "absent.ecsv"], "absent.ecsv cannot be read as a catalog: no such file"),
+        (["data", "add", "nothing", "x"], "no library 'nothing'; known:"),
         (["photometry", "a.fits", "b.fits", *SETTINGS], "a.fits cannot be read as an image"),
     ],
 )

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from miricigale.cli import main
+from helpers.commands import command
 
 TOY = Path(__file__).with_name("toy_study.py")
 
@@ -14,17 +14,10 @@ TOY = Path(__file__).with_name("toy_study.py")
 def run(folder, *arguments):
     """Status, messages and products of a toy study."""
     pytest.importorskip("distributed", reason="dask.distributed is not installed")
-    done = subprocess.run(
-        [sys.executable, TOY, folder, "2", *arguments],
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    products = {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in folder.rglob("*.txt")
-        if ".partial-" not in path.name
-    }
+    words = [sys.executable, TOY, folder, "2", *arguments]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=300)
+    paths = [path for path in folder.rglob("*.txt") if ".partial-" not in path.name]
+    products = {str(path.relative_to(folder)): path.read_bytes() for path in paths}
     return done.returncode, done.stderr, products
 
 
@@ -54,7 +47,7 @@ def test_workers_that_die_are_replaced_or_named_and_the_run_resumes(tmp_path):
 
 def test_a_scheduler_that_is_none_is_named(tmp_path, capsys):
     pytest.importorskip("distributed", reason="dask.distributed is not installed")
-    command = ["run", "goodss", "--quick", "-o", str(tmp_path / "run"), "--scheduler", "nowhere"]
-    assert main([*command, "--no-progress"]) == 2
-    assert "there is no dask scheduler at 'nowhere'" in capsys.readouterr().err
+    words = ["run", "goodss", "--quick", "-o", tmp_path / "run", "--scheduler", "nowhere"]
+    told = command(capsys, *words, "--no-progress", status=2)
+    assert "there is no dask scheduler at 'nowhere'" in told.err
     assert not (tmp_path / "run").exists()
