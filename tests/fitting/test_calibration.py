@@ -38,15 +38,9 @@ def fitted():
     grid = make_grid(11, n_z=8, n_tau=6, n_age=4, frac=np.append(np.arange(5) * 0.2, 0.95))
     rng = np.random.default_rng(4)
     # six values that several galaxies have, and as many as there are galaxies
-    grid = dataclasses.replace(
-        grid,
-        galaxy_shape=QTable(
-            {
-                "a_v": np.sqrt(grid.galaxy_parameters["tau"].value) * u.mag,
-                "u_v": rng.normal(0.5, 0.7, grid.n_galaxies) * u.mag,
-            }
-        ),
-    )
+    shape = QTable({"a_v": np.sqrt(grid.galaxy_parameters["tau"].value) * u.mag})
+    shape["u_v"] = rng.normal(0.5, 0.7, grid.n_galaxies) * u.mag
+    grid = dataclasses.replace(grid, galaxy_shape=shape)
     drawn = _draw(grid, N, rng)
     results = BayesFitter(grid, model_error=0.0).fit(drawn[0])
     assert results.fitted.all()
