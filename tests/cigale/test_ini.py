@@ -348,11 +348,11 @@ def test_history_from_a_file(tmp_path):
     normalise = True
 [analysis_params]
 """
-    path = write(
-        tmp_path,
+    changes = (
         ("[analysis_params]\n", section),
         ("sed_modules = sfhdelayed", "sed_modules = sfhfromfile"),
     )
+    path = write(tmp_path, *changes)
     setup = quiet(path)
     assert_array_equal(setup.parameters["sfh_index"], [0, 1])
     sfh = setup.components[0]
@@ -617,9 +617,8 @@ def test_parts_of_the_agn_have_posteriors(run, tmp_path):
 
 
 def test_all_models_are_saved(tmp_path):
-    path = write(
-        tmp_path, ("pdf_analysis", "savefluxes"), ("fracAGN = 0.0, 0.5, 0.9", "fracAGN = 0.0, 0.5")
-    )
+    fractions = "fracAGN = 0.0, 0.5, 0.9", "fracAGN = 0.0, 0.5"
+    path = write(tmp_path, ("pdf_analysis", "savefluxes"), fractions)
     setup = quiet(path)
     refuses(r"savefluxes\): CigaleSetup.save_models", fit_cigale, setup, error=ConfigError)
     table = setup.save_models(tmp_path / "models-block-0.fits", [0.5])
@@ -664,11 +663,8 @@ def test_text_and_fits_say_the_same(run, tmp_path):
 
 def test_known_and_unknown_redshifts(run, tmp_path):
     path, fluxes, _ = run
-    path = write(
-        tmp_path,
-        ("redshift =\n", "redshift = 0.5, 0.9, 1.3\n"),
-        ("redshift_decimals = 1", "redshift_decimals = 2"),
-    )
+    digits = "redshift_decimals = 1", "redshift_decimals = 2"
+    path = write(tmp_path, ("redshift =\n", "redshift = 0.5, 0.9, 1.3\n"), digits)
     setup = quiet(path)
     # the first is known, to the nearest node; the second is not; the third is at a wrong one
     catalog = tmp_path / "galaxies.txt"
@@ -839,10 +835,8 @@ def test_models_with_x_rays_are_saved(tmp_path):
         assert band[i] == pytest.approx(wanted, rel=1e-4)
     # what AGN add to the same galaxy
     galaxy = ["sfh.tau_main", "sfh.age_main", "attenuation.E_BV_lines"]
-    dark = {
-        tuple(table[name][i].value for name in galaxy): band[i]
-        for i in np.flatnonzero(fraction == 0)
-    }
+    dim = np.flatnonzero(fraction == 0)
+    dark = {tuple(table[name][i].value for name in galaxy): band[i] for i in dim}
     for i in np.flatnonzero(fraction == 0.5)[::7]:
         slope, disk = table["xray.alpha_ox"][i].value, table["agn.intrin_Lnu_2500A_30deg"][i].value
         shape = corona(slope, disk, table["agn.i"][i].value)

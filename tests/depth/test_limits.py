@@ -108,9 +108,8 @@ def test_faint_limits_are_linear_and_bright_ones_count_their_own_photons(psf):
     assert_quantity_allclose(three, 3 * one, rtol=0.005)
     # no sky: 10^4 electrons for 100 sigma, in the light of the aperture
     quiet = DetectorProperties(gain=4.0, read_noise=0.0, dark_current=0.0, full_well=1e12)
-    dark = sensitivity(
-        NAME, n_sigma=100, background=0 * u.MJy / u.sr, n_groups=1000, detector=quiet, psf=psf
-    )
+    kind = {"background": 0 * u.MJy / u.sr, "n_groups": 1000, "detector": quiet, "psf": psf}
+    dark = sensitivity(NAME, n_sigma=100, **kind)
     radius = etc_setup(NAME).radius
     area = MIRI_PIXEL_SCALE.to_value(u.rad) ** 2 * 1e12
     collected = dark.value * 4 / photmjsr(NAME, gain=4.0) / area * 1e4
@@ -132,9 +131,8 @@ def test_annulus_adds_its_noise_and_takes_off_wings(psf):
 @pytest.mark.parametrize("name", imager_filters())
 def test_residual_gives_the_published_limits(name):
     # ETC 4.0 (JWST user documentation, MIRI Sensitivity), digits cut off there
-    published = dict(
-        zip(imager_filters(), [0.13, 0.24, 0.46, 1.02, 0.83, 1.18, 2.42, 4.70, 15.3], strict=True)
-    )
+    digits = [0.13, 0.24, 0.46, 1.02, 0.83, 1.18, 2.42, 4.70, 15.3]
+    published = dict(zip(imager_filters(), digits, strict=True))
     psf = miri_psf(name, oversampling=2, fov=9 * u.arcsec)
     limit = sensitivity(name, etc_setup(name).time, residual="etc", psf=psf).value
     assert_allclose(limit, published[name], rtol=0.10)

@@ -146,9 +146,8 @@ def test_colors_tell_models_apart():
         "frac_agn": frac,
     })  # fmt: skip
     fluxes = model.fluxes(table, COLOR_WINDOWS[0].bands)
-    true = classify(
-        np.where(frac > 0, mid_infrared_fractions(model, table), 0.0), limits=KIRKPATRICK_LIMITS
-    )
+    shares = np.where(frac > 0, mid_infrared_fractions(model, table), 0.0)
+    true = classify(shares, limits=KIRKPATRICK_LIMITS)
     kind = {"windows": COLOR_WINDOWS[:1], "groups": np.repeat(np.arange(n), 4)}
     found = color_classes(fluxes, table["redshift"], true, seed=1, **kind)
     shares = [np.mean(found[true == name] == name) for name in NAMES]

@@ -26,9 +26,8 @@ def test_speagle_main_sequence_at_published_values():
 
 def test_kennicutt_relation_in_solar_units():
     # Kennicutt 1998: 1 Msun/yr is 5.8e9 Lsun
-    assert sfr_to_infrared_luminosity(1 * u.Msun / u.yr).to_value(u.Lsun) == pytest.approx(
-        5.8e9, rel=0.01
-    )
+    luminosity = sfr_to_infrared_luminosity(1 * u.Msun / u.yr).to_value(u.Lsun)
+    assert luminosity == pytest.approx(5.8e9, rel=0.01)
 
 
 def test_counts_conserve_sources():

@@ -51,11 +51,8 @@ def brute_force(first, second, radius):
     """Status of every row of two lists of flat positions, by their distances alone."""
     distance = np.hypot(*(first[:, None] - second[None]).T).T
     near = distance < radius
-    pairs = {
-        (i, j)
-        for i, j in np.argwhere(near)
-        if distance[i].argmin() == j and distance[:, j].argmin() == i
-    }
+    nearest = distance.argmin(axis=1), distance.argmin(axis=0)
+    pairs = {(i, j) for i, j in np.argwhere(near) if nearest[0][i] == j and nearest[1][j] == i}
     return near, pairs
 
 

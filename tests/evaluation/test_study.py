@@ -126,9 +126,8 @@ def test_magnitudes_by_shape_and_crowding():
     for name in ("n < 2", "point"):
         kept = got(study, "shape_offset", option=name)
         assert kept.value == pytest.approx(0, abs=4 * kept.error)
-    scatter = {
-        name: got(study, "magnitude_scatter", option=name) for name in ("crowded", "isolated")
-    }
+    kinds = ("crowded", "isolated")
+    scatter = {name: got(study, "magnitude_scatter", option=name) for name in kinds}
     assert scatter["crowded"].value > 1.5 * scatter["isolated"].value
     shares = [got(study, "shape_share", option=name).value for name in ("point", "n < 2", "n >= 2")]
     assert sum(shares) == pytest.approx(1)

@@ -70,9 +70,8 @@ def test_two_dask_workers_give_the_numbers_of_one_process(grid, photometry, tmp_
         assert len(n_done) == 2
         assert min(n_done.values()) > 0
         photometry.write(tmp_path / "catalog.fits")
-        results = fit_file(
-            fitter, tmp_path / "catalog.fits", tmp_path / "out", chunk_rows=50, executor=executor
-        )
+        options = {"chunk_rows": 50, "executor": executor}
+        results = fit_file(fitter, tmp_path / "catalog.fits", tmp_path / "out", **options)
         table = results.to_table()
     for name, column in whole.to_table().items():
         assert_array_equal(np.asarray(table[name]), np.asarray(column), err_msg=name)

@@ -174,13 +174,8 @@ def test_galaxies_without_dust_where_fractions_refer_to_all_infrared_light(frac,
     galaxy["dust_luminosity"] = dust * u.W / u.Msun
     agn = QTable(grid.agn_properties)
     agn["agn_power"] = np.linspace(0.8, 1.2, grid.n_agn)
-    grid = replace(
-        grid,
-        dust_luminosity=galaxy["ir_luminosity"].value,
-        galaxy_properties=galaxy,
-        agn_properties=agn,
-        frac_agn_definition="3-1000um",
-    )
+    parts = {"galaxy_properties": galaxy, "agn_properties": agn, "frac_agn_definition": "3-1000um"}
+    grid = replace(grid, dust_luminosity=galaxy["ir_luminosity"].value, **parts)
     # tori so bright that no AGN at all fits best
     grid = replace(grid, agn=grid.agn * 1e3)
     table, _ = draw_photometry(grid, 6, seed=5, noise=0.1)

@@ -119,7 +119,7 @@ def test_what_is_no_table_is_named(grid, photometry, filters):
     text = r"'redshift' must be numbers, got \['a', 'b'\]"
     refuses(text, fitter.fit, photometry[:2], redshift=["a", "b"])
     table = photometry.copy()
-    table["band0"], table["band0_err"] = 22.0 * u.ABmag, 1.0 * u.K
+    table["band0"], table["band0_err"] = np.full(12, 22.0) * u.ABmag, np.ones(12) * u.K
     wanted = "column 'band0_err' must be convertible to uJy, got K"
     refuses(wanted, fitter.fit, table, error=u.UnitsError)
 

@@ -41,12 +41,8 @@ PRIORS = {
     "ebv_polar": lambda x: np.exp(-3 * x),
     "temperature_polar": [1.0, 3.0],
 }
-EVERYTHING = {
-    "model_error": ERROR,
-    "error_floor": FLOOR,
-    "priors": PRIORS,
-    "settings": GridSettings(rtol=0),
-}
+EVERYTHING = {"model_error": ERROR, "error_floor": FLOOR, "priors": PRIORS}
+EVERYTHING["settings"] = GridSettings(rtol=0)
 
 
 def add_limits(table, grid, part=0.3, seed=0):
@@ -161,9 +157,8 @@ def test_pruning_loses_no_more_than_asked(noise):
     grid = make_grid(7, n_tau=12, n_age=9)
     table = draw_photometry(grid, 10, seed=3, noise=noise, missing=0.1)[0]
     table = add_limits(table, grid, part=0.4)
-    whole, pruned = (
-        BayesFitter(grid, settings=GridSettings(rtol=rtol)).fit(table) for rtol in (0, 1e-6)
-    )
+    fitters = [BayesFitter(grid, settings=GridSettings(rtol=rtol)) for rtol in (0, 1e-6)]
+    whole, pruned = (fitter.fit(table) for fitter in fitters)
     for name in ("pdf_2d", "log_evidence"):
         assert_allclose(getattr(pruned, name), getattr(whole, name), atol=1e-6)
     assert_allclose(pruned.chi2, whole.chi2, rtol=1e-12)

@@ -49,10 +49,8 @@ def test_every_pair_is_the_sum_over_all_models(case, rtol, atol):
         data = results.flux[i], results.sigma[i]
         weights = brute_force(grid, *data, prior_f=prior_f, **options)["weights"]
         for x, y in pairs:
-            got, want = (
-                results.joint_pdf(x, y)[i],
-                plain(grid, weights, x, y, options.get("priors")),
-            )
+            got = results.joint_pdf(x, y)[i]
+            want = plain(grid, weights, x, y, options.get("priors"))
             assert_allclose(got, want, rtol=0, atol=atol, err_msg=f"{x}, {y}")
 
 

@@ -21,14 +21,9 @@ def with_shape(grid):
     tau = grid.galaxy_parameters["tau"].value
     color = rng.normal(0, 1, tau.size)
     color[::4] = -np.inf
-    table = QTable(
-        {
-            "a_v": tau * u.mag,
-            "u_v": color * u.mag,
-            "beta": np.full(tau.size, -2.0) * u.dimensionless_unscaled,
-            "age_mass": grid.galaxy_parameters["age"] * 0.7,
-        }
-    )
+    table = QTable({"a_v": tau * u.mag, "u_v": color * u.mag})
+    table["beta"] = np.full(tau.size, -2.0) * u.dimensionless_unscaled
+    table["age_mass"] = grid.galaxy_parameters["age"] * 0.7
     table["a_v"].info.description = "attenuation"
     return dataclasses.replace(grid, galaxy_shape=table)
 

@@ -16,12 +16,9 @@ from miricigale.utils.exceptions import ConfigError
 from miricigale.utils.parallel import threads
 
 BANDS = ["miri.f770w", "miri.f1500w"]
-SETTINGS = {
-    "sample": {"n_sources": 60},
-    "exposures": {"bands": BANDS, "time": 1665.0, "dithers": 3, "sets": ["all", "f770w"]},
-    "survey": {"areas": [1, 4]},
-    "fit": {"axes": "quick"},
-}
+EXPOSURES = {"bands": BANDS, "time": 1665.0, "dithers": 3, "sets": ["all", "f770w"]}
+SETTINGS = {"sample": {"n_sources": 60}, "exposures": EXPOSURES, "fit": {"axes": "quick"}}
+SETTINGS["survey"] = {"areas": [1, 4]}
 
 
 @pytest.fixture(scope="module")
@@ -47,9 +44,8 @@ def test_the_sample_has_the_mix_of_the_configuration(planner):
 def test_noise_is_that_of_the_errors(planner):
     """Pulls of the mock fluxes are those of a normal distribution, in each band and of each size."""
     table = planner.photometry(planner.band_plans().values())
-    pulls = np.array(
-        [((table[n] - planner.sources[n]) / table[f"{n}_err"]).value for n in planner.bands]
-    )
+    off = {name: table[name] - planner.sources[name] for name in planner.bands}
+    pulls = np.array([(off[name] / table[f"{name}_err"]).value for name in planner.bands])
     assert np.mean(pulls) == pytest.approx(0, abs=5 / np.sqrt(pulls.size))
     assert np.std(pulls) == pytest.approx(1, abs=5 / np.sqrt(2 * pulls.size))
     # extended sources have larger errors than points of the same flux

@@ -122,11 +122,8 @@ def test_bands_that_were_not_fitted_are_open(pair):
     flux = np.array([1.0, 2.0, 3.0]) * u.uJy
     top, bottom = plot_sed_fit(WAVE, flux, 0.1 * flux, flux, used=[True, False, True], ax=pair)
     for axes, lines in ((top, [bar.lines[0] for bar in top.containers]), (bottom, bottom.lines)):
-        styles = {
-            tuple(line.get_xdata()): line.get_fillstyle()
-            for line in lines
-            if line.get_marker() == "o"
-        }
+        points = [line for line in lines if line.get_marker() == "o"]
+        styles = {tuple(line.get_xdata()): line.get_fillstyle() for line in points}
         assert styles == {(1.0, 15.0): "full", (4.0,): "none"}, axes
 
 
@@ -169,19 +166,15 @@ def test_percentiles_are_bands_about_a_line(ax, rest):
             at = corners[corners[:, 0] == x, 1]
             assert (at.min(), at.max()) == pytest.approx((low * s * y, high * s * y))
     assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
-    x_label, y_label = (
-        ("rest wavelength (µm)", r"$\nu L_\nu$ (W)")
-        if rest
-        else ("observed wavelength (µm)", "flux density (µJy)")
-    )
+    x_label = "rest wavelength (µm)" if rest else "observed wavelength (µm)"
+    y_label = r"$\nu L_\nu$ (W)" if rest else "flux density (µJy)"
     assert (ax.get_xlabel(), ax.get_ylabel()) == (x_label, y_label)
     assert ax.lines[0].get_label() == "median"
 
 
 def test_two_percentiles_are_one_band_that_has_the_label(ax):
-    plot_sed_band(
-        WAVE, [np.ones(3) * u.uJy, 2 * np.ones(3) * u.uJy], ax=ax, rest=False, label="68 %"
-    )
+    bands = [np.ones(3) * u.uJy, 2 * np.ones(3) * u.uJy]
+    plot_sed_band(WAVE, bands, ax=ax, rest=False, label="68 %")
     assert len(ax.lines) == 0
     assert [band.get_label() for band in ax.collections] == ["68 %"]
 

@@ -38,9 +38,8 @@ COSMOS = {"ra": 150.1, "dec": 2.2}
 
 
 def study(**scene):
-    return StudyConfig.from_dict(
-        {"exposures": {"filters": BANDS}, "pointing": COSMOS, "scene": scene}
-    )
+    sections = {"exposures": {"filters": BANDS}, "pointing": COSMOS}
+    return StudyConfig.from_dict({**sections, "scene": scene})
 
 
 def plan(**background):

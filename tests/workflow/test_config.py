@@ -115,9 +115,7 @@ def test_every_key_is_explained_and_nothing_else(config):
 
 
 def test_all_text_comes_back_from_toml():
-    nasty = [chr(i) for i in range(0x100)] + list(
-        "\u0100\u2028\ud7ff\ue000\ufeff\uffff😀\U0010ffff"
-    )
+    nasty = [*map(chr, range(0x100)), *"\u0100\u2028\ud7ff\ue000\ufeff\uffff😀\U0010ffff"]
     rng = np.random.default_rng(1)
     texts = ["", '"""', "\\", "C:\\new", "\\u007f", *nasty]
     texts += ["".join(rng.choice(nasty, size=12)) for _ in range(300)]

@@ -110,9 +110,8 @@ def test_a_catalog_of_ones_own_by_a_map_of_columns(galaxies, tmp_path):
     # the prior's band alone, in mJy and under other names; -99 stands for what is missing
     rows = ["ID,ra,dec,zphot,F_H,profile,half_light_radius,sersic_index,axis_ratio,position_angle"]
     flux = [0.01, 0.02, 0.03, -99.0]
-    rows += [
-        f"{k},53.1{k},-27.8,0.8,{value},point,0,1,1,0" for k, value in enumerate(flux, start=1)
-    ]
+    rest = "point,0,1,1,0"
+    rows += [f"{k},53.1{k},-27.8,0.8,{value},{rest}" for k, value in enumerate(flux, start=1)]
     path = tmp_path / "mine.csv"
     path.write_text("\n".join(rows) + "\n")
     columns = ["id=ID", "redshift=zphot", "wfc3.f160w=F_H"]

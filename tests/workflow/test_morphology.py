@@ -133,18 +133,13 @@ def image_of_galaxies(*, psf_sigma=1.2, noise=0.002):
     )  # fmt: skip
     table["profile"][4] = "point"
     table[PRIOR] = table[BAND]
-    psf = gaussian_psf(
-        2.3548 * psf_sigma * PIXEL * u.arcsec, pixel_scale=PIXEL * u.arcsec, fov=4 * u.arcsec
-    )
+    width = 2.3548 * psf_sigma * PIXEL * u.arcsec
+    psf = gaussian_psf(width, pixel_scale=PIXEL * u.arcsec, fov=4 * u.arcsec)
     clumpy = add_clumps(table, PRIOR, share=0.4, seed=2)
     image = Scene(clumpy, filter=PRIOR, wcs=wcs, psf=psf).render()
     data = image.data + noise * np.random.default_rng(1).normal(size=image.shape)
-    return (
-        CCDData(data, unit="MJy/sr", wcs=wcs, mask=np.zeros(data.shape, bool)),
-        psf,
-        table,
-        clumpy,
-    )
+    mask = np.zeros(data.shape, bool)
+    return CCDData(data, unit="MJy/sr", wcs=wcs, mask=mask), psf, table, clumpy
 
 
 @pytest.fixture(scope="module")
@@ -155,9 +150,7 @@ def field():
 
 def paint(catalog, stamps, wcs, band):
     catalog = catalog.copy()
-    catalog["profile"] = np.where(
-        np.isin(catalog["id"], list(stamps)), "cutout", catalog["profile"]
-    )
+    catalog["profile"][np.isin(catalog["id"], list(stamps))] = "cutout"
     psf = scenes.gaussian_psf(sigma=1.3)
     return Scene(catalog, filter=band, wcs=wcs, psf=psf, cutouts=stamps).render().data
 
@@ -209,9 +202,8 @@ def test_drawn_galaxies_have_size_place_and_turn_of_the_source(field):
     assert len(galaxies.resolved) == 3
     assert np.all(np.asarray(galaxies.resolved["radius"], float) > MIN_RADIUS)
     wcs = scenes.tan_wcs(shape=(120, 120))
-    table = scenes.make_catalog(
-        wcs, 60.0, 60.0, profile="sersic", radius=0.7, ratio=0.5, angle=70.0
-    )
+    shape = {"profile": "sersic", "radius": 0.7, "ratio": 0.5, "angle": 70.0}
+    table = scenes.make_catalog(wcs, 60.0, 60.0, **shape)
     stamps = stamps_of_sources(table, galaxies, of="any", seed=SEED)
     again = stamps_of_sources(table, galaxies, of="any", seed=SEED)
     assert_array_equal(stamps[1].data, again[1].data)
@@ -224,9 +216,8 @@ def test_drawn_galaxies_have_size_place_and_turn_of_the_source(field):
     assert angle == pytest.approx(70, abs=12)
     # nothing is like it
     table["half_light_radius"] = 8.0 * u.arcsec
-    refuses(
-        NONE.format(1), stamps_of_sources, table, galaxies, error=DataError, of="any", seed=SEED
-    )
+    options = {"error": DataError, "of": "any", "seed": SEED}
+    refuses(NONE.format(1), stamps_of_sources, table, galaxies, **options)
 
 
 def test_masked_galaxies_and_those_at_the_edge_are_not_used():
@@ -273,9 +264,8 @@ def test_a_study_paints_the_light_of_an_image(tmp_path, monkeypatch):
         run(name, unit)
     with pytest.warns(MiricigaleWarning, match="has no map of the noise"):
         run("truth", "agn00+cutouts")
-    known, own = (
-        QTable.read(tmp_path / name / "truth.ecsv") for name in ("agn00", "agn00+cutouts")
-    )
+    paths = (tmp_path / name / "truth.ecsv" for name in ("agn00", "agn00+cutouts"))
+    known, own = map(QTable.read, paths)
     for name in (BAND, PRIOR, "profile", "mass"):
         assert_array_equal(own[name], known[name])
     # the fourth, faint on the image, is not
@@ -315,11 +305,8 @@ def test_real_galaxies_of_an_image_with_its_psf(data_file):
         galaxies, plain = RealGalaxies.read(path, psf=psf), RealGalaxies.read(path)
     assert galaxies.psf.fwhm.to_value(u.arcsec) == pytest.approx(0.16, abs=0.02)
     assert plain.psf is None
-    labels = [
-        label
-        for label in range(1, len(plain._found[2]) + 1)
-        if plain.cutout(label) is not None and galaxies.cutout(label) is not None
-    ]
+    every, both = range(1, len(plain._found[2]) + 1), (plain, galaxies)
+    labels = [label for label in every if all(one.cutout(label) is not None for one in both)]
     assert len(labels) > 15
     sums, radii = (
         np.transpose([[f(one.cutout(label)) for one in (plain, galaxies)] for label in labels])

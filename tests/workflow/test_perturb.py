@@ -144,9 +144,8 @@ def test_zero_points_of_existing_bands_are_in_the_fluxes_that_are_fitted():
         matched[band], matched[f"{band}_err"] = truth[PRIOR], 0.1 * truth[PRIOR]
     fit = {"bands": bands, "depths": [40.0] * len(bands)}
     config = StudyConfig.from_dict({"fit": fit}, base=config_of([]))
-    plain, changed = (
-        mock_photometry(config, truth, matched, seed=SEED, zero_point=size) for size in (0, 0.02)
-    )
+    arguments = (config, truth, matched)
+    plain, changed = (mock_photometry(*arguments, seed=SEED, zero_point=z) for z in (0, 0.02))
     ratios = {band: (changed[band] / plain[band]).value for band in bands}
     for band, ratio in ratios.items():
         assert_allclose(np.abs(ratio - 1), 0.02, rtol=1e-6)

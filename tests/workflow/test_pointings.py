@@ -27,9 +27,8 @@ BAND = "miri.f770w"
 
 
 def field(**pointing):
-    return StudyConfig.from_dict(
-        {"pointing": pointing, "exposures": {"filters": [BAND, "miri.f2100w"]}}
-    )
+    exposures = {"filters": [BAND, "miri.f2100w"]}
+    return StudyConfig.from_dict({"pointing": pointing, "exposures": exposures})
 
 
 def test_one_pointing_is_what_it_was():
@@ -38,9 +37,8 @@ def test_one_pointing_is_what_it_was():
     assert (center.ra.deg, center.dec.deg) == (config.pointing.ra, config.pointing.dec)
     exposures = study_exposures(config)
     # the dithers of CEERS
-    assert list(exposures) == [f"{BAND}-{k}" for k in range(3)] + [
-        f"miri.f2100w-{k}" for k in range(6)
-    ]
+    names = [*(f"{BAND}-{k}" for k in range(3)), *(f"miri.f2100w-{k}" for k in range(6))]
+    assert list(exposures) == names
 
 
 @pytest.mark.parametrize("pointing", [{"tiles": [2, 3]}, {"centers": [f"{k} 5" for k in range(6)]}])

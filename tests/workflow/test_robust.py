@@ -23,11 +23,8 @@ TOY = Path(__file__).with_name("toy_study.py")
 
 def contents(folder):
     """Bytes of all products by name."""
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in sorted(folder.rglob("*.txt"))
-        if path.is_file()
-    }
+    paths = [path for path in sorted(folder.rglob("*.txt")) if path.is_file()]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
 
 
 def start(folder, *words, **options):

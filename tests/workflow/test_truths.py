@@ -32,12 +32,8 @@ def make_truths(folder, **sed):
     columns = {"redshift": parameters["redshift"], "mag_f160w": 20.0}
     table = catalog_at(sky, **columns, **{name: light[name] for name in bands})
     table.write(folder / "mine.ecsv", overwrite=True)
-    config = StudyConfig.from_dict(
-        {
-            "catalog": {"source": str(folder / "mine.ecsv")},
-            "sed": {"frac_agn": FRACTIONS, "axes": "quick", **sed},
-        }
-    )
+    sed = {"frac_agn": FRACTIONS, "axes": "quick", **sed}
+    config = StudyConfig.from_dict({"catalog": {"source": str(folder / "mine.ecsv")}, "sed": sed})
     for name in ("catalog", "seds", "truth"):
         for unit in STAGES[name].unit_names(config):
             do_stage(config, folder, name, unit)
@@ -101,9 +97,8 @@ def test_dust_of_the_main_sequence_leaves_the_stars(truths, tmp_path):
     assert_allclose(ratio, dusty["dust_excess"], rtol=1e-9)
     # light of the dust alone, far from the stars
     far = dusty["redshift"] < 1.0
-    assert_allclose(
-        (dusty["mips.24"] / plain["mips.24"])[far], dusty["dust_excess"][far], rtol=0.02
-    )
+    ratio = dusty["mips.24"] / plain["mips.24"]
+    assert_allclose(ratio[far], dusty["dust_excess"][far], rtol=0.02)
 
 
 def test_the_dusts_alpha_is_drawn_from_nodes(tmp_path):
