@@ -229,15 +229,8 @@ def test_foreign_files_are_refused(tmp_path, content, wanted):
 
 def test_axes_in_our_units(tmp_path):
     axes = quiet(write(tmp_path)).axes([0.52, 0.48, 1.26, np.nan, -1])
-    wanted = {
-        "tau": [0.5, 5.0],
-        "age": [1.0, 5.0],
-        "ebv_lines": [0.5, 1.0],
-        "tau97": [3.0, 7.0],
-        "inclination": [30.0, 70.0],
-        "frac_agn": [0.0, 0.5, 0.9],
-        "redshift": [0.5, 1.3],
-    }
+    wanted = {"tau": [0.5, 5.0], "age": [1.0, 5.0], "ebv_lines": [0.5, 1.0], "tau97": [3.0, 7.0]}
+    wanted |= {"inclination": [30.0, 70.0], "frac_agn": [0.0, 0.5, 0.9], "redshift": [0.5, 1.3]}
     assert set(axes) == set(wanted)
     for name, values in wanted.items():
         assert_allclose(axes[name], values, rtol=1e-12)
@@ -268,23 +261,13 @@ def test_parameters_and_options_of_the_chain(tmp_path):
     assert setup.predicted == {"miri.f2100w": "jwst.miri.F2100W"}
 
 
-@pytest.mark.parametrize(
-    ("text", "definition", "replaced"),
-    [
-        ("0/0", "dust", False),
-        ("3/1000", "3-1000um", False),
-        ("3.0 / 1000.", "3-1000um", False),
-        ("5/20", "5-20um", False),
-        ("0.01/20", "dust", True),
-    ],
-)
-def test_definition_of_the_fraction(tmp_path, text, definition, replaced):
-    setup = quiet(write(tmp_path, ("lambda_fracAGN = 0/0", f"lambda_fracAGN = {text}")))
-    assert setup.model().frac_agn_definition == definition
-    assert any(f"lambda_fracAGN = {text}" in x for x in setup.replaced) is replaced
-
-
-def test_flag_of_limits(tmp_path):
+def test_definition_of_the_fraction_and_flag_of_limits(tmp_path):
+    known = {"0/0": "dust", "3/1000": "3-1000um", "3.0 / 1000.": "3-1000um", "5/20": "5-20um"}
+    for text, definition in (known | {"0.01/20": "dust"}).items():
+        setup = quiet(write(tmp_path, ("lambda_fracAGN = 0/0", f"lambda_fracAGN = {text}")))
+        assert setup.model().frac_agn_definition == definition
+        replaced = any(f"lambda_fracAGN = {text}" in x for x in setup.replaced)
+        assert replaced == (text not in known)
     for flag, wanted in {"True": True, "full": True, "False": False, "none": False}.items():
         path = write(tmp_path, ("lim_flag = noscaling", f"lim_flag = {flag}"))
         assert quiet(path).limits is wanted
@@ -348,11 +331,8 @@ def test_history_from_a_file(tmp_path):
     normalise = True
 [analysis_params]
 """
-    changes = (
-        ("[analysis_params]\n", section),
-        ("sed_modules = sfhdelayed", "sed_modules = sfhfromfile"),
-    )
-    path = write(tmp_path, *changes)
+    modules = "sed_modules = sfhdelayed", "sed_modules = sfhfromfile"
+    path = write(tmp_path, ("[analysis_params]\n", section), modules)
     setup = quiet(path)
     assert_array_equal(setup.parameters["sfh_index"], [0, 1])
     sfh = setup.components[0]

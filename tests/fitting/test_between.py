@@ -15,11 +15,8 @@ from miricigale.sed import ModelGrid, SEDModel
 
 BANDS = tuple(f"band{i}" for i in range(8))
 PLACE = np.linspace(-1.0, 1.0, len(BANDS))
-AXES = {
-    "redshift": np.array([0.5, 0.8, 1.16, 1.6]),
-    "tau": np.array([1.0, 2.0, 3.0]),
-    "ebv": np.array([0.1, 0.4, 0.7]),
-}
+AXES = {"redshift": [0.5, 0.8, 1.16, 1.6], "tau": [1.0, 2.0, 3.0], "ebv": [0.1, 0.4, 0.7]}
+AXES = {name: np.array(values) for name, values in AXES.items()}
 SIGMA = 0.05
 
 
@@ -172,15 +169,10 @@ OPTICAL = ["megacam.u", "acs.f606w", "acs.f814w", "wfc3.f125w", "wfc3.f160w", "i
 INFRARED = ["miri.f770w", "miri.f1000w", "miri.f1280w", "miri.f1500w", "miri.f1800w", "miri.f2100w"]
 CHAIN_BANDS = [*OPTICAL, *INFRARED]
 CHAIN = {
-    "redshift": np.expm1(np.linspace(np.log(1.2), np.log(4.0), 16)),
-    "tau": [0.1, 1.0, 5.0],
-    "age": [0.5, 1.0, 2.0],
-    "ebv": [0.1, 0.4, 0.8],
-    "alpha": [1.0, 2.5],
-    "ebv_polar": [0.0, 0.3],
-    "temperature_polar": [100.0, 300.0],
-    "frac_agn": [0.0, 0.3, 0.6, 0.9],
-}
+    "redshift": np.expm1(np.linspace(np.log(1.2), np.log(4.0), 16)), "tau": [0.1, 1.0, 5.0],
+    "age": [0.5, 1.0, 2.0], "ebv": [0.1, 0.4, 0.8], "alpha": [1.0, 2.5], "ebv_polar": [0.0, 0.3],
+    "temperature_polar": [100.0, 300.0], "frac_agn": [0.0, 0.3, 0.6, 0.9],
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")

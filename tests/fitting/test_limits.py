@@ -33,14 +33,10 @@ from miricigale.fitting import (
 ERROR = {"band0": 0.1, "band1": 0.05, "band3": 0.2}
 FLOOR = {"band2": 0.15, "band3": 0.02}
 PRIORS = {
-    "redshift": lambda z: z * np.exp(-z),
-    "frac_agn": [4.0, 2.0, 1.0, 3.0],
-    "tau": [1.0, 0.0, 2.0, 3.0, 0.5],
-    "age": "log",
-    "tau97": [0.3, 0.7],
-    "ebv_polar": lambda x: np.exp(-3 * x),
+    "redshift": lambda z: z * np.exp(-z), "frac_agn": [4.0, 2.0, 1.0, 3.0], "age": "log",
+    "tau": [1.0, 0.0, 2.0, 3.0, 0.5], "tau97": [0.3, 0.7], "ebv_polar": lambda x: np.exp(-3 * x),
     "temperature_polar": [1.0, 3.0],
-}
+}  # fmt: skip
 EVERYTHING = {"model_error": ERROR, "error_floor": FLOOR, "priors": PRIORS}
 EVERYTHING["settings"] = GridSettings(rtol=0)
 
@@ -255,32 +251,23 @@ def test_a_limit_without_error_is_a_wall(error):
         assert results.chi2[i] == pytest.approx(chi2.min(), rel=1e-4, abs=1e-4)
 
 
-@pytest.mark.parametrize(
-    "column",
-    [
+def test_how_limits_may_be_written():
+    grid = make_grid(3)
+    fitter, table = BayesFitter(grid), draw_photometry(grid, 3, seed=2)[0]
+    text, masked = ["True", "false", "T"], MaskedColumn([True] * 3, mask=[False, True, False])
+    for column in (
         [True, False, True],
         [1, 0, 1],
         [1.0, 0.0, 1.0],
-        ["True", "false", "T"],
+        text,
         ["1", "", "true"],
-        MaskedColumn([True, True, True], mask=[False, True, False]),
-    ],
-)
-def test_how_limits_may_be_written(column):
-    grid = make_grid(3)
-    table = draw_photometry(grid, 3, seed=2)[0]
-    table["band1_limit"] = column
-    assert BayesFitter(grid).fit(table).limit[:, 1].tolist() == [True, False, True]
-
-
-@pytest.mark.parametrize(
-    "column", [[0.5, 0.0, 1.0], ["yes", "no", "no"], [1, 0, 1] * u.uJy, [np.nan, 1.0, 0.0]]
-)
-def test_what_is_not_boolean_is_refused(column):
-    grid = make_grid(3)
-    table = draw_photometry(grid, 3, seed=2)[0]
-    table["band1_limit"] = column
-    refuses("whose column 'band1_limit' is boolean, got", BayesFitter(grid).fit, table)
+        masked,
+    ):
+        table["band1_limit"] = column
+        assert fitter.fit(table).limit[:, 1].tolist() == [True, False, True]
+    for column in ([0.5, 0.0, 1.0], ["yes", "no", "no"], [1, 0, 1] * u.uJy, [np.nan, 1.0, 0.0]):
+        table["band1_limit"] = column
+        refuses("whose column 'band1_limit' is boolean, got", fitter.fit, table)
 
 
 FLAGS = ({"all_limits"}, {"few_for_parameters"}, {"bad_error"}, {"all_limits", "few_bands"})

@@ -20,14 +20,8 @@ from miricigale.sed import SED, SEDModel
 from miricigale.utils.exceptions import DataError
 
 BANDS = ["acs.f606w", "wfc3.f160w", "miri.f770w", "miri.f2100w"]
-AXES = {
-    "redshift": np.array([0.5, 1.0, 1.5]),
-    "age": np.array([1.0, 3.0]),
-    "ebv": np.array([0.1, 0.4]),
-    "frac_agn": np.array([0.0, 0.3, 0.8]),
-    "ebv_polar": np.array([0.0, 0.2]),
-    "temperature_polar": np.array([100.0, 200.0]),
-}
+AXES = {"redshift": [0.5, 1.0, 1.5], "age": [1.0, 3.0], "ebv": [0.1, 0.4]}
+AXES |= {"frac_agn": [0.0, 0.3, 0.8], "ebv_polar": [0.0, 0.2], "temperature_polar": [100.0, 200.0]}
 
 
 def values_at(grid, index):

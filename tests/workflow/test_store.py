@@ -24,20 +24,10 @@ def folder(tmp_path):
     return tmp_path / "run"
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "../victim",
-        "{victim}",
-        "part/../../victim",
-        "..",
-        ".",
-        "",
-        "part//product.txt",
-        "a\\..\\b",
-        "C:x",
-    ],
-)
+OUTSIDE = r"../victim {victim} part/../../victim .. . part//product.txt a\..\b C:x"
+
+
+@pytest.mark.parametrize("name", ["", *OUTSIDE.split()])
 def test_no_product_lies_outside_the_folder(folder, name):
     victim = folder.parent / "victim"
     name = name.format(victim=victim)
@@ -71,20 +61,13 @@ def test_a_product_cannot_be_written_through_a_link(tmp_path):
     assert not list((tmp_path / "outside").iterdir())
 
 
+PRODUCTS = '{"y": {"sha256": "", "bytes": 1e999}}'
+STAGES = ('{"x": {}}', "[1]", f'{{"x": {{"hash": "", "seconds": 0, "products": {PRODUCTS}}}}}')
+DAMAGED = [None, "", "[]", "{", "[" * 100_000, *(f'{{"stages": {one}}}' for one in STAGES)]
+
+
 @pytest.mark.parametrize("name", ["manifest.json", ".manifest.copy.json"])
-@pytest.mark.parametrize(
-    "text",
-    [
-        None,
-        "",
-        "[]",
-        "{",
-        "[" * 100_000,
-        '{"stages": {"x": {}}}',
-        '{"stages": [1]}',
-        '{"stages": {"x": {"hash": "", "seconds": 0, "products": {"y": {"sha256": "", "bytes": 1e999}}}}}',
-    ],
-)
+@pytest.mark.parametrize("text", DAMAGED)
 def test_a_lost_or_damaged_manifest_is_replaced_by_its_copy(folder, name, text):
     whole = (folder / "manifest.json").read_text()
     if text is None:
