@@ -1,7 +1,6 @@
 """Runs that are killed, damaged or out of disk: nothing is lost, nothing is taken for whole."""
 
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -46,6 +45,14 @@ def ended(process, status=0):
     return message
 
 
+def killed(folder, name, text=""):
+    """Start a study, and kill it when a file stands (and has a text)."""
+    process = start(folder)
+    wait_for(folder / name, process, text)
+    process.kill()
+    process.communicate(timeout=60)
+
+
 def wait_for(path, process, text=""):
     """Wait until a file stands (and has a text), or the process has ended."""
     deadline = time.monotonic() + 60
@@ -80,10 +87,7 @@ def test_a_run_that_is_killed_thirteen_times_ends_with_the_same_bytes(tmp_path, 
         "b/2.txt", "c/0.txt", "c/1.txt", "d/0.txt", "d/2.txt", "second.txt",
     ]  # fmt: skip
     for name in moments:
-        process = start(folder)
-        wait_for(folder / name, process)
-        process.kill()
-        process.communicate(timeout=60)
+        killed(folder, name)
         # whatever carries its name is whole
         for product, data in contents(folder).items():
             if ".partial-" not in product:
@@ -109,10 +113,7 @@ def test_a_second_run_in_the_folder_is_refused_and_the_first_one_goes_on(tmp_pat
 
 def test_a_configuration_that_changes_before_a_killed_run_goes_on(tmp_path, undisturbed):
     folder = tmp_path / "run"
-    process = start(folder)
-    wait_for(folder / ".manifest.journal", process, '"first:c"')
-    process.kill()
-    process.communicate(timeout=60)
+    killed(folder, ".manifest.journal", '"first:c"')
     before = contents(folder)
     # what units c and d depend on is refused, and nothing is touched
     message = ended(start(folder, "2.0"), 1)
@@ -143,16 +144,11 @@ def products(context):
 
 
 @pytest.mark.parametrize("name", ["image.fits", "table.ecsv", "table.fits", "page.html"])
-def test_a_write_that_the_system_cuts_off_is_named_and_leaves_what_stood(tmp_path, name):
-    """Files that may not grow beyond 100 kB, as on a disk that fills while they are written."""
+def test_a_write_that_the_system_cuts_off_is_named_and_leaves_what_stood(tmp_path, name, full_disk):
     context = Context(StudyConfig(), tmp_path)
     (tmp_path / name).write_text("what stood")
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
-    try:
+    with full_disk(100_000):
         refuses(rf"{tmp_path}/{name}", products(context)[name], name, error=OSError)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert (tmp_path / name).read_text() == "what stood"
     assert [path.name for path in tmp_path.iterdir()] == [name]
     assert context.saved == []
@@ -186,11 +182,9 @@ def toy(folder):
         text = "".join(context.path(f"{unit}.txt").read_text() for unit in "abc")
         context.save("second.txt", lambda path: path.write_text(text))
 
-    stages = (
-        Stage("first", first, "first", units=lambda _: "abc"),
-        Stage("second", second, "second", needs=("first",)),
-    )
-    StudyRunner(StudyConfig(), folder, stages).run()
+    one = Stage("first", first, "first", units=lambda _: "abc")
+    two = Stage("second", second, "second", needs=("first",))
+    StudyRunner(StudyConfig(), folder, (one, two)).run()
 
 
 def refusal(folder):
