@@ -118,10 +118,9 @@ def test_faint_limits_are_linear_and_bright_ones_count_their_own_photons(psf):
 
 def test_annulus_adds_its_noise_and_takes_off_wings(psf):
     radius, inner, outer = 1.0, 4.0, np.sqrt(4.0**2 + 1.0**2 / 0.5)
-    known = sensitivity(NAME, n_sigma=1e-3, psf=psf, aperture=radius * u.arcsec)
-    measured = sensitivity(
-        NAME, n_sigma=1e-3, psf=psf, aperture=radius * u.arcsec, annulus=[inner, outer] * u.arcsec
-    )
+    kind = {"n_sigma": 1e-3, "psf": psf, "aperture": radius * u.arcsec}
+    known = sensitivity(NAME, **kind)
+    measured = sensitivity(NAME, **kind, annulus=[inner, outer] * u.arcsec)
     light = encircled_energy(psf, radius * u.arcsec)
     wings = np.diff(encircled_energy(psf, [inner, outer] * u.arcsec))[0] / 2
     # half as noisy as the aperture: its area is twice as large
@@ -190,6 +189,9 @@ def test_noise_is_that_of_simulated_and_reduced_exposures(residual, n_exposures,
     assert_allclose(np.std(sums - np.median(sums)), expected, rtol=0.09)
 
 
+WIDE = gaussian_psf(0.3 * u.arcsec, pixel_scale=0.11 * u.arcsec, fov=6 * u.arcsec)
+
+
 @pytest.mark.parametrize(
     ("options", "name"),
     [
@@ -206,10 +208,7 @@ def test_noise_is_that_of_simulated_and_reduced_exposures(residual, n_exposures,
         ({"correlation": -1}, "correlation"),
         ({"background": -1 * u.MJy / u.sr}, "background"),
         ({"detector": 3}, "detector"),
-        (
-            {"psf": gaussian_psf(0.3 * u.arcsec, pixel_scale=0.11 * u.arcsec, fov=6 * u.arcsec)},
-            "psf",
-        ),
+        ({"psf": WIDE}, "psf"),
     ],
 )
 def test_errors_name_the_argument(options, name, psf):
@@ -217,9 +216,9 @@ def test_errors_name_the_argument(options, name, psf):
 
 
 def test_unknown_names_list_the_known():
-    with pytest.raises(KeyError, match="no residual preset 'sky'; known: etc"):
-        sensitivity(NAME, residual="sky")
-    with pytest.raises(ValueError, match=r"'psf' must be one of the filter miri\.f770w, got one"):
-        sensitivity("miri.f770w", psf=miri_psf("miri.f560w"))
+    text = "no residual preset 'sky'; known: etc"
+    refuses(text, sensitivity, NAME, error=KeyError, residual="sky")
+    text = r"'psf' must be one of the filter miri\.f770w, got one"
+    refuses(text, sensitivity, "miri.f770w", psf=miri_psf("miri.f560w"))
     refuses("no imaging filter", sensitivity, "miri.f600w", error=KeyError)
     refuses("'time' must be", sensitivity, NAME, 1e4, error=u.UnitsError)

@@ -113,19 +113,3 @@ def test_percentiles_of_derived_quantities():
             low, high = (values[order][np.minimum(p, order.size - 1)] for p in places)
             assert np.all(got >= low * 10**-0.011 - 1e-300), (name, i)
             assert np.all(got <= high * 10**0.011), (name, i)
-
-
-def test_galaxies_alone_weigh_one_over_the_number_of_fractions():
-    """If the AGN emits in no used band every fraction fits alike: the posterior is the prior."""
-    from dataclasses import replace
-
-    grid = make_grid(4)
-    dark = replace(grid, agn=np.zeros_like(grid.agn))
-    table, _ = draw_photometry(dark, 3)
-    results = BayesFitter(dark).fit(table)
-    assert_allclose(results.pdf["frac_agn"], 0.25, rtol=1e-6)
-    assert_allclose(results.pdf["temperature_polar"], 0.5, rtol=1e-6)
-    assert_allclose(results.pdf["ebv_polar"], 1 / 3, rtol=1e-6)
-    uniform = BayesFitter(dark, settings=GridSettings(prior_f="uniform")).fit(table)
-    width = np.diff([0.0, 0.1, 0.35, 0.7, 1.0])
-    assert_allclose(uniform.pdf["frac_agn"][0], width, rtol=1e-6)

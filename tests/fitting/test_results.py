@@ -10,7 +10,7 @@ from helpers.errors import refuses
 from helpers.grids import photometry_table
 from helpers.results import assert_same, assert_same_tables
 from miricigale.fitting import BayesFitter, FitResults
-from miricigale.fitting.posterior import cell_edges, cell_percentiles, moments
+from miricigale.fitting.posterior import cell_edges
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import DataError
 
@@ -135,19 +135,6 @@ def test_cells():
     assert_allclose(cell_edges([0, 1, 3]), [-0.5, 0.5, 2, 4])
     assert_allclose(cell_edges([0, 1, 3], (0, 3.5)), [0, 0.5, 2, 3.5])
     assert_allclose(cell_edges([2.0]), [2, 2])
-
-
-def test_percentiles_of_a_uniform_distribution():
-    """Equal weights on equal cells: the percentiles are linear in the level."""
-    values = np.arange(10) + 0.5
-    pdf = np.full((2, 10), 0.1)
-    pdf[1] = np.nan
-    got = cell_percentiles(values, pdf, [0.05, 0.5, 0.999])
-    assert_allclose(got[0], [0.5, 5.0, 9.99])
-    assert np.isnan(got[1]).all()
-    mean, std = moments(values, pdf[:1])
-    assert mean[0] == pytest.approx(5.0)
-    assert std[0] == pytest.approx(np.sqrt(99 / 12))
 
 
 def test_results_draw_what_they_hold(results):

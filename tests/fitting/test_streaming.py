@@ -144,8 +144,8 @@ def test_csv_has_the_unit_that_is_given(fitter, catalog, tmp_path):
 def test_a_stopped_fit_is_resumed(fitter, on_disk, catalog, tmp_path):
     arguments = (fitter, *on_disk)
     whole = fitter.fit(catalog)
-    stopped = {"chunk_rows": 40, "executor": Counting(stop=3)}
-    refuses("", fit_file, *arguments, error=Stopped, **stopped)
+    with pytest.raises(Stopped):
+        fit_file(*arguments, chunk_rows=40, executor=Counting(stop=3))
     text = r"holds 2 of 4 parts: fit_file .* resumes"
     refuses(text, open_results, tmp_path / "out", error=DataError)
     there = open_results(tmp_path / "out", partial=True)

@@ -11,18 +11,17 @@ from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
+from helpers.runs import do_stage
 from miricigale.photometry import ErrorModel
 from miricigale.planning import Planner, load_plan, paired_bands, paired_numbers
 from miricigale.planning.exposures import band_plans
 from miricigale.planning.images import ImagedSample, images_catalog, images_study
 from miricigale.scene import read_catalog
 from miricigale.utils.exceptions import ConfigError
-from miricigale.workflow import Context, StudyConfig
-from miricigale.workflow.stages import study_stages
+from miricigale.workflow import StudyConfig
 from miricigale.workflow.stages.exposures import band_exposures, study_background
 from miricigale.workflow.study import check_study
 
-STAGES = {stage.name: stage for stage in study_stages()}
 BANDS = ["miri.f770w", "miri.f1500w"]
 SETTINGS = {
     "sample": {"n_sources": 60},
@@ -46,7 +45,7 @@ def study(planner, tmp_path_factory):
     images_catalog(planner).write(folder / "images.ecsv")
     config = images_study(planner, folder / "images.ecsv")
     for name, unit in (("catalog", ""), ("seds", ""), ("truth", "catalog"), ("truth", "agn00")):
-        STAGES[name].function(Context(config, folder, stage=STAGES[name], unit=unit), unit)
+        do_stage(config, folder, name, unit)
     return config, folder
 
 
@@ -90,12 +89,13 @@ def test_a_catalog_whose_fractions_cannot_be_is_refused(planner, tmp_path):
     catalog = images_catalog(planner)
     catalog["frac_agn"][3] = 1.5
     catalog.write(tmp_path / "images.ecsv")
-    config = images_study(planner, tmp_path / "images.ecsv")
-    with pytest.raises(ConfigError, match=r"between 0 and 0\.99, got 1 of \d+ others, \[1\.5\]"):
-        check_study(config)
     read_catalog("catalog.goodss").write(tmp_path / "plain.ecsv")
-    config = images_study(planner, tmp_path / "plain.ecsv")
-    refuses("needs a column frac_agn in the catalog", check_study, config, error=ConfigError)
+    for name, text in (
+        ("images.ecsv", r"between 0 and 0\.99, got 1 of \d+ others, \[1\.5\]"),
+        ("plain.ecsv", "needs a column frac_agn in the catalog"),
+    ):
+        config = images_study(planner, tmp_path / name)
+        refuses(text, check_study, config, error=ConfigError)
 
 
 def test_images_have_the_background_of_the_plan(tmp_path):

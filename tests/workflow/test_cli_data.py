@@ -17,14 +17,10 @@ NAME = "test.library"
 
 def read(path):
     spectra = np.loadtxt(path, ndmin=2)
-    return LibraryTable(
-        name=NAME,
-        wave=np.arange(1.0, 1.0 + spectra.shape[1]),
-        axes={"k": np.arange(float(len(spectra)))},
-        spectra={"dust": spectra},
-        meta={"files": {path.name: file_sha256(path)}},
-        summary=("numbers of nobody",),
-    )
+    axes = {"wave": np.arange(1.0, 1.0 + spectra.shape[1])}
+    axes["axes"] = {"k": np.arange(float(len(spectra)))}
+    facts = {"meta": {"files": {path.name: file_sha256(path)}}, "summary": ("numbers of nobody",)}
+    return LibraryTable(name=NAME, spectra={"dust": spectra}, **axes, **facts)
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ from astropy.coordinates import SkyCoord
 from astropy.table import QTable, Table
 from numpy.testing import assert_allclose, assert_array_equal
 
+from helpers.errors import refuses
 from helpers.runs import do_stage
 from helpers.scenes import catalog_at
 from miricigale.fitting import FitResults
@@ -43,16 +44,15 @@ def do_inputs(config, folder, *first):
 def run(folder, table, **sed):
     """The first stages; returns the fit of the inputs, their truth and what the report says."""
     table.write(folder / "mine.ecsv")
-    config = StudyConfig.from_dict(
-        {"catalog": {"source": str(folder / "mine.ecsv")}, "fit": {"model_error": 0.02}, "sed": sed}
-    )
+    sections = {"catalog": {"source": str(folder / "mine.ecsv")}, "fit": {"model_error": 0.02}}
+    config = StudyConfig.from_dict({**sections, "sed": sed})
     truth = do_inputs(config, folder, ("catalog", ""))
     facts = dict(catalog_facts(config, check_catalog(table)))
-    return config, FitResults.read(folder / "input_seds.fits"), truth, facts["input SEDs fitted to"]
+    return FitResults.read(folder / "input_seds.fits"), truth, facts["input SEDs fitted to"]
 
 
 def test_without_errors_short_bands_get_five_percent(galaxies, tmp_path):
-    _, results, truth, told = run(tmp_path, galaxies.copy())
+    results, truth, told = run(tmp_path, galaxies.copy())
     assert list(results.filters) == SHORT
     assert_allclose(results.flux_err, 0.05 * results.flux)
     assert "mips.24" not in told
@@ -66,7 +66,7 @@ def test_the_catalogs_own_errors_are_used_beyond_three_micron_too(galaxies, tmp_
     table = galaxies.copy()
     for k, name in enumerate((*SHORT[:2], *LONG)):
         table[f"{name}_err"] = (0.01 + 0.01 * k) * table[name]
-    _, results, truth, told = run(tmp_path, table)
+    results, truth, told = run(tmp_path, table)
     assert list(results.filters) == [*SHORT, *LONG]
     wanted = np.array([0.01, 0.02, 0.05, 0.03])
     assert_allclose(results.flux_err / results.flux, [wanted, wanted], rtol=1e-6)
@@ -79,8 +79,7 @@ def test_the_catalogs_own_errors_are_used_beyond_three_micron_too(galaxies, tmp_
 def test_a_flux_whose_error_is_not_positive_is_left_out(galaxies, tmp_path):
     table = galaxies.copy()
     table["nircam.f200w_err"] = [-1, 0.01] * table["nircam.f200w"]
-    _, results, _, _ = run(tmp_path, table)
-    assert results.n_bands.tolist() == [2, 3]
+    assert run(tmp_path, table)[0].n_bands.tolist() == [2, 3]
 
 
 def test_new_errors_make_other_inputs(galaxies, tmp_path):
@@ -102,8 +101,12 @@ def test_new_errors_make_other_inputs(galaxies, tmp_path):
 
 
 def test_no_band_is_refused(galaxies, tmp_path):
-    with pytest.raises(ConfigError, match="leaves none of the catalog's bands"):
-        run(tmp_path, galaxies.copy(), max_wavelength=0.5)
+    text, options = "leaves none of the catalog's bands", {"max_wavelength": 0.5}
+    refuses(text, run, tmp_path, galaxies.copy(), error=ConfigError, **options)
+    # nor is a map without pairs
+    for key in ("columns", "units"):
+        text, values = rf"\[catalog\] {key} must have the form 'name=value'", {key: ["redshift"]}
+        refuses(text, StudyConfig.from_dict, {"catalog": values}, error=ConfigError)
 
 
 def test_a_catalog_of_ones_own_by_a_map_of_columns(galaxies, tmp_path):
@@ -158,14 +161,6 @@ def test_magnitudes_and_text_ids_give_the_inputs_of_the_fluxes(galaxies, tmp_pat
     results = FitResults.read(tmp_path / "input_seds.fits")
     assert results.ids.tolist() == ["a-1", "a-2"]
     assert results.n_bands.tolist() == [3, 2]
-    assert_allclose(
-        results.flux_err / results.flux,
-        0.05 * np.log(10) / 2.5 * np.where(np.isnan(results.flux), np.nan, 1),
-    )
+    wanted = 0.05 * np.log(10) / 2.5 * np.where(np.isnan(results.flux), np.nan, 1)
+    assert_allclose(results.flux_err / results.flux, wanted)
     assert truth["id"].tolist() == ["a-1", "a-2"]
-
-
-@pytest.mark.parametrize("key", ["columns", "units"])
-def test_a_map_without_pairs_is_refused(key):
-    with pytest.raises(ConfigError, match=rf"\[catalog\] {key} must have the form 'name=value'"):
-        StudyConfig.from_dict({"catalog": {key: ["redshift"]}})
