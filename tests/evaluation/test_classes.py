@@ -45,8 +45,7 @@ def test_purity_falls_with_the_share_of_wanted_sources_and_completeness_does_not
         assert quality.completeness.value == pytest.approx(0.9)
         assert quality.purity.value == pytest.approx(purity)
 
-
-def test_nothing_selected_has_no_purity():
+    # nothing selected has no purity
     quality = selection_quality([True, False], [False, False])
     assert np.isnan(quality.purity.value)
     assert quality.completeness.value == 0
@@ -54,5 +53,5 @@ def test_nothing_selected_has_no_purity():
 
 def test_other_lengths_are_refused():
     refuses("'found' must be a 1-D array as long as 'true'", confusion, ["agn"], [])
-    with pytest.raises(ValueError, match="'selected' must be a 1-D array as long as 'wanted'"):
-        selection_quality([True], [True, False])
+    text = "'selected' must be a 1-D array as long as 'wanted'"
+    refuses(text, selection_quality, [True], [True, False])

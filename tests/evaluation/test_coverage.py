@@ -17,14 +17,10 @@ def gaussian_case(n, *, bias=0.0, width=1.0, seed=1):
     return true, measured[:, None] + width * norm.ppf(LEVELS)
 
 
-def rows(ranks, **kwargs):
-    return coverage_table({"x": ranks}, **kwargs)
-
-
 @pytest.mark.parametrize(("bias", "width"), [(0.0, 1.0), (0.0, 0.5), (1.0, 1.0)])
 def test_coverage_is_that_of_gaussians(bias, width):
     true, values = gaussian_case(4000, bias=bias, width=width)
-    table = rows(posterior_ranks(true, values, LEVELS))
+    table = coverage_table({"x": posterior_ranks(true, values, LEVELS)})
     reach = width * norm.ppf(0.5 + np.array([0.34, 0.475]))
     expected = norm.cdf(reach - bias) - norm.cdf(-reach - bias)
     assert_allclose(table["share"], expected, atol=0.02)
@@ -43,7 +39,7 @@ def test_truths_on_nodes_have_uniform_ranks_by_drawing_within_their_cell():
     edges = np.r_[0, nodes[:-1] + 0.5, 10]
     cdf = np.linspace(0, 1, 12)
     true = nodes[node].astype(float)
-    drawn = rows(posterior_ranks(true, edges, cdf, seed=1))
+    drawn = coverage_table({"x": posterior_ranks(true, edges, cdf, seed=1)})
     assert drawn["share"][0] == pytest.approx(0.68, abs=0.03)
     assert drawn["p_uniform"][0] > 0.01
     # without it the first node always has the rank 0
@@ -77,7 +73,7 @@ def test_posteriors_that_do_not_exist_have_no_rank():
 
 
 def test_refuses():
-    with pytest.raises(ValueError, match="'values' must be of one shape"):
-        posterior_ranks([1.0, 2.0], np.zeros((3, 4)), np.zeros(4))
+    arguments = ([1.0, 2.0], np.zeros((3, 4)), np.zeros(4))
+    refuses("'values' must be of one shape", posterior_ranks, *arguments)
     refuses("'ranks' must be between 0 and 1", coverage_table, {"x": [1.5]})
     refuses("'levels' must be between 0 and 1", coverage_table, {}, levels=(68,))

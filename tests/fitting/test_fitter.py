@@ -238,10 +238,8 @@ def test_priors_may_be_distributions_and_functions_of_one_value(grid, photometry
     def of_one(tau):
         return math.exp(-0.5 * ((tau - 1.5) / 0.7) ** 2)
 
-    fits = [
-        BayesFitter(grid, priors={"tau": prior}).fit(photometry)
-        for prior in (normal, normal.pdf, density, of_one, density(nodes))
-    ]
+    priors = (normal, normal.pdf, density, of_one, density(nodes))
+    fits = [BayesFitter(grid, priors={"tau": prior}).fit(photometry) for prior in priors]
     for other in fits[1:]:
         assert_allclose(other.pdf["tau"], fits[0].pdf["tau"], rtol=1e-6)
     # the prior of tau is that of the mean posterior's ratio to one with a flat prior

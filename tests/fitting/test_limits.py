@@ -130,9 +130,8 @@ def test_all_options_at_once_equal_the_plain_sums(case, redshift):
     assert_allclose(fitter.priors.galaxy / fitter.priors.galaxy.sum(), galaxy)
     assert_allclose(fitter.priors.agn / fitter.priors.agn.sum(), agn)
     for i in np.flatnonzero(results.fitted):
-        want = brute_force(
-            grid, flux[i], sigma[i], log_prior[i], limit[i], priors=PRIORS, scale_error=scale_error
-        )
+        kind = {"priors": PRIORS, "scale_error": scale_error}
+        want = brute_force(grid, flux[i], sigma[i], log_prior[i], limit[i], **kind)
         compare(results, fitter, i, want, sigma[i], limit[i])
         # the fraction in its second definition, from luminosities
         share = other_fraction(grid)[1]

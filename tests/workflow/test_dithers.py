@@ -19,10 +19,8 @@ from miricigale.workflow.study import check_study
 
 BANDS = ["miri.f770w", "miri.f2100w"]
 #: Dithers of the filters in exposures of their own, as APT's list has them.
-FIRST, SECOND = (
-    [(-1.446, 3.956), (3.771, -5.358), (1.035, 4.889)],
-    [(2.983, -2.146), (1.08, -1.849)],
-)
+FIRST = [(-1.446, 3.956), (3.771, -5.358), (1.035, 4.889)]
+SECOND = [(2.983, -2.146), (1.08, -1.849)]
 PATTERNS = {1: FIRST, 2: SECOND}
 LINE = (
     "  1    1   {exp}    {dith} MIRIM_ILLUM               1 CEERS  +12.00000  +12.00000   +0.000   +0.000 "

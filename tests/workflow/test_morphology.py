@@ -166,10 +166,8 @@ def test_galaxies_have_their_own_light(field):
     owner = np.argmin([row.separation(table["sky"]) for row in clumpy["sky"]], axis=1)
     clumpy = clumpy[owner < 3]
     table = table[:3]
-    known, found, smooth = (
-        paint(rows, chosen, wcs, BAND)
-        for rows, chosen in ((clumpy, {}), (table, stamps), (table, {}))
-    )
+    pairs = (clumpy, {}), (table, stamps), (table, {})
+    known, found, smooth = (paint(rows, chosen, wcs, BAND) for rows, chosen in pairs)
     # as they are, and not as their profiles
     error, change = (np.abs(image - known).sum() / known.sum() for image in (found, smooth))
     assert change > 0.2

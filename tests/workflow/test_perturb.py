@@ -66,9 +66,8 @@ def test_each_effect_is_one_more_truth():
         "name": "agn40+zero_point", "frac_agn": 0.4, "perturbations": {"zero_point": 0.02}
     }  # fmt: skip
     assert list(truths["agn40+all"].values()["perturbations"]) == list(EFFECTS)
-    assert dict(truths["agn40+cutouts"].perturbations) == {
-        "cutouts": {"image": "mine.fits", "psf": "", "of": "own"}
-    }
+    cutouts = {"image": "mine.fits", "psf": "", "of": "own"}
+    assert dict(truths["agn40+cutouts"].perturbations) == {"cutouts": cutouts}
     # without an image there is no such sky
     assert "agn00+cutouts" not in study_truths(config_of())
     # of the reference unless it is said; alone it is all that there is
@@ -259,10 +258,8 @@ def test_an_agn_as_a_point_keeps_the_light():
         catalog[name] = share
     exposure = Exposure(BAND, pointing=catalog["sky"][0], roll=0 * u.deg, n_groups=10)
     options = {"filter": BAND, "wcs": exposure.wcs, "psf": miri_psf(BAND, fov=8 * u.arcsec)}
-    skies = [
-        Scene(catalog, agn=Perturbation(effects, SEED).point_column(BAND), **options)
-        for effects in ({}, {"point_agn": None})
-    ]
+    differ = (Perturbation(effects, SEED) for effects in ({}, {"point_agn": None}))
+    skies = [Scene(catalog, agn=one.point_column(BAND), **options) for one in differ]
     plain, pointed = (sky.render().data for sky in skies)
     known, truth = (sky.truth for sky in skies)
     assert_array_equal(truth["id"], catalog["id"])

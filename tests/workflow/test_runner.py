@@ -59,10 +59,8 @@ class Recorder:
 
     def stages(self, version=1):
         parts = {"sections": ("scene",), "units": lambda _: "ab", "version": version}
-        return (
-            Stage("first", self.first, "first", **parts),
-            Stage("second", self.second, "second", needs=("first",)),
-        )
+        first = Stage("first", self.first, "first", **parts)
+        return first, Stage("second", self.second, "second", needs=("first",))
 
     def run(self, folder, config=None, *, version=1, **options):
         self.ran.clear()

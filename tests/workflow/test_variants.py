@@ -47,10 +47,9 @@ def test_each_variant_switches_one_thing_over():
     scene, plane = {"background_gradient": 0.0}, {"background_plane": False}
     sections = {"detector": {"residual": 1e-3}, "scene": scene, "reduction": plane}
     other = config_of(["plane", "residual"], **sections)
-    assert variant_changes(other) == {
-        "residual": {"detector": {"residual": 0.0}},
-        "plane": {"reduction": {"background_plane": True}},
-    }
+    residual, plane = {"residual": 0.0}, {"background_plane": True}
+    wanted = {"residual": {"detector": residual}, "plane": {"reduction": plane}}
+    assert variant_changes(other) == wanted
     ramps = config_of("gradient", kind="ramps", scene={"background_gradient": 0.0})
     gradient = {"scene": {"background_gradient": 0.05}}
     assert variant_changes(ramps) == {"rates": {}, "gradient": gradient}
