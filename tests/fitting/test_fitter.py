@@ -103,14 +103,6 @@ def test_bad_photometry_is_named(grid, photometry):
     refuses("'filters' and 'axes' must be given", BayesFitter, SEDModel.yang2021())
 
 
-def test_a_prior_that_leaves_nothing_is_flagged(grid, photometry):
-    from dataclasses import replace
-
-    none = replace(grid, allowed=np.zeros_like(grid.allowed))
-    results = BayesFitter(none).fit(photometry)
-    assert all(FitFlags.names(f) == ["no_model"] for f in results.flags)
-
-
 @pytest.mark.parametrize("filters", [None, ["band0", "band1"]])
 def test_what_is_no_table_is_named(grid, photometry, filters):
     fitter = BayesFitter(grid, filters)

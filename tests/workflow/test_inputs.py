@@ -1,5 +1,7 @@
 """Input SEDs: whose errors are used, which bands are fitted, and what is drawn."""
 
+from types import SimpleNamespace
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -83,16 +85,14 @@ def test_a_flux_whose_error_is_not_positive_is_left_out(galaxies, tmp_path):
 
 
 def test_new_errors_make_other_inputs(galaxies, tmp_path):
-    class Nothing:
-        def checksums(self, name):
-            return {}
+    nothing = SimpleNamespace(checksums=lambda name: {})
 
     def digest(name, table):
         path = tmp_path / f"{name}.ecsv"
         table.write(path)
         config = StudyConfig.from_dict({"catalog": {"source": str(path)}})
         runner = StudyRunner(config, tmp_path, study_stages)
-        return runner.digest("seds", Nothing())
+        return runner.digest("seds", nothing)
 
     table = galaxies.copy()
     table["nircam.f200w_err"] = 0.01 * table["nircam.f200w"]

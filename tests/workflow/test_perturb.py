@@ -190,11 +190,12 @@ def test_gain_and_linearity_are_those_of_the_detector_only():
 def test_flat_is_that_of_another_detector():
     exposure = Exposure(BAND, pointing=sources()["sky"][0], roll=0 * u.deg, n_groups=10)
     known = flat_field(BAND)
-    seen, tenth = (
-        Perturbation({"flat": size}, SEED).with_flat(image, exposure).data * known / 5
-        for size in (1.0, 0.1)
-        for image in [CCDData(np.full(exposure.shape, 5.0), unit="MJy/sr")]
-    )
+
+    def flat_of(size):
+        image = CCDData(np.full(exposure.shape, 5.0), unit="MJy/sr")
+        return Perturbation({"flat": size}, SEED).with_flat(image, exposure).data * known / 5
+
+    seen, tenth = flat_of(1.0), flat_of(0.1)
     # pixels by 1 %, independent of those that the reduction divides by
     inner = np.s_[:, 4:-4]
     pixels = [np.diff(flat[inner]).ravel() for flat in (seen, known)]

@@ -246,15 +246,13 @@ def test_a_change_of_the_packages_own_plan_is_seen(folder):
 
 def test_other_reference_data_make_other_exposures(tmp_path, monkeypatch):
     # what residual = "etc" means stands in a file, not in the configuration
-    class Nothing:
-        def checksums(self, name):
-            return {}
+    nothing = types.SimpleNamespace(checksums=lambda name: {})
 
     def digests():
         stages = [s for s in study_stages() if s.name in ("exposures", "points", "kernels")]
         runner = StudyRunner(StudyConfig(), tmp_path / "run", study_stages())
         keys = {stage.name: stage.key(stage.units(runner.config)[0]) for stage in stages}
-        return {name: runner.digest(key, Nothing()) for name, key in keys.items()}
+        return {name: runner.digest(key, nothing) for name, key in keys.items()}
 
     monkeypatch.delenv("MIRICIGALE_DATA", raising=False)
     before = digests()
