@@ -49,14 +49,11 @@ def test_half_of_the_sources_are_found_at_the_limit(width, top):
     assert half_complete(x, found) == pytest.approx(wanted, abs=0.05)
 
 
-def test_a_sharp_limit_lies_between_the_last_lost_and_the_first_found():
+def test_a_limit_lies_between_the_last_lost_and_the_first_found_if_there_are_both():
     x = np.arange(20.0)
     assert 7 <= half_complete(x, x > 7.5) <= 8
-
-
-def test_there_is_no_limit_where_all_or_none_are_found():
-    assert np.isnan(half_complete([1.0, 2.0], [True, True]))
-    assert np.isnan(half_complete([1.0, 2.0], [False, False]))
+    for found in (True, False):
+        assert np.isnan(half_complete([1.0, 2.0], [found, found]))
     # none too where the share does not depend on it
     assert np.isnan(half_complete(np.arange(400.0), np.arange(400) % 4 > 0))
 

@@ -56,10 +56,9 @@ def test_two_dask_workers_give_the_numbers_of_one_process(grid, photometry, tmp_
     distributed = pytest.importorskip("distributed")
     fitter = BayesFitter(grid)
     whole = elsewhere(fitter, photometry) if processes else fitter.fit(photometry)
+    options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
     with (
-        distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, processes=processes, dashboard_address=None
-        ) as cluster,
+        distributed.LocalCluster(processes=processes, **options) as cluster,
         distributed.Client(cluster) as client,
     ):
         assert len(client.scheduler_info()["workers"]) == 2

@@ -1,6 +1,5 @@
 """Fits from file to file: the numbers of one call, in pieces that a later call resumes from."""
 
-import csv
 import json
 from concurrent.futures import Executor, Future
 from dataclasses import replace
@@ -120,22 +119,17 @@ def test_text_tables_are_read_by_rows(fitter, catalog, in_pieces):
         assert_joined(results.parts(), whole)
 
 
-def test_csv_has_the_unit_that_is_given(fitter, catalog, tmp_path):
+def test_csv_has_the_unit_that_is_given(fitter, catalog, in_pieces, tmp_path):
     whole = fitter.fit(catalog)
-    path = tmp_path / "catalog.csv"
-    with open(path, "w", newline="") as stream:
-        writer = csv.writer(stream)
-        writer.writerow(catalog.colnames)
-        for row in catalog:
-            flux = [repr(float(row[c].to_value(u.nJy))) for c in catalog.colnames[1:-1]]
-            writer.writerow([row["id"], *flux, row["redshift"]])
-    results = fit_file(fitter, path, tmp_path / "out", chunk_rows=40, flux_unit=u.nJy)
+    for name in catalog.colnames[1:-1]:
+        catalog[name] = catalog[name].to(u.nJy)
+    results = in_pieces(catalog, kind="csv", flux_unit=u.nJy)
     assert len(list(results.parts())) == 4
     table, wanted = results.to_table(), whole.to_table()
     assert_array_equal(table["flags"], wanted["flags"])
     for name in ("redshift_mean", "mass_mean"):
         assert_allclose(table[name].value, wanted[name].value, rtol=1e-9)
-    arguments = (fit_file, fitter, path, tmp_path / "no unit")
+    arguments = (fit_file, fitter, tmp_path / "catalog.csv", tmp_path / "no unit")
     refuses("must be convertible to uJy", *arguments, error=u.UnitsError, chunk_rows=40)
     text = "'flux_unit' must be convertible to uJy, got mag"
     refuses(text, *arguments, error=u.UnitsError, flux_unit="mag")

@@ -19,14 +19,11 @@ def written(tmp_path, config):
     return load_config(path)
 
 
-@pytest.mark.parametrize(
-    "config",
-    [
-        {"quick": True},
-        *({"overrides": {"detector": {"residual": value}}} for value in (0.01, 0, "etc")),
-        {"overrides": {"catalog": {"source": "été 😀 \x9c.fits"}}},
-    ],
-)
+RESIDUALS = [{"overrides": {"detector": {"residual": value}}} for value in (0.01, 0, "etc")]
+SOURCE = {"overrides": {"catalog": {"source": "été 😀 \x9c.fits"}}}
+
+
+@pytest.mark.parametrize("config", [{"quick": True}, *RESIDUALS, SOURCE])
 def test_a_printed_configuration_comes_back_the_same(tmp_path, config):
     made = load_config("goodss", **config)
     assert written(tmp_path, made) == made
