@@ -3,7 +3,6 @@
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData
 from astropy.tests.helper import assert_quantity_allclose
 from numpy.testing import assert_allclose
@@ -11,13 +10,13 @@ from photutils.aperture import ApertureStats, CircularAnnulus, CircularAperture
 from scipy.ndimage import gaussian_filter
 
 from helpers.errors import refuses
+from helpers.exposures import exposure_of
 from miricigale.depth import etc_limit, etc_setup, sensitivity, sensitivity_table
 from miricigale.depth.limits import extraction_weights
 from miricigale.depth.noise import noise_power, ramp_variance
 from miricigale.detector import BadPixels, CosmicRays, Detector, Residual
 from miricigale.instrument import (
     DetectorProperties,
-    Exposure,
     background_level,
     imager_filters,
     photmjsr,
@@ -159,8 +158,7 @@ def test_table_scales_the_calculators_limits(psf):
 @pytest.mark.parametrize(("residual", "n_exposures"), [(None, 1), (0.004, 1), (0.004, 8)])
 def test_noise_is_that_of_simulated_and_reduced_exposures(residual, n_exposures, annulus):
     name, radius, n_groups = "miri.f2100w", 0.25 * u.arcsec, 12
-    place = {"pointing": SkyCoord(53.1, -27.8, unit="deg"), "roll": 0 * u.deg}
-    exposure = Exposure(name, n_groups=n_groups, subarray="SUB256", **place)
+    exposure = exposure_of(name, n_groups=n_groups)
     detector = Detector.miri_imager().without(CosmicRays, BadPixels)
     if residual:
         detector = detector.replaced(Residual(residual))

@@ -77,8 +77,7 @@ def test_agn_fraction_in_the_other_definition(definition, name):
     results, samples = fitter.fit(table), fitter.sample(table, 3000, seed=2)
     assert results.parameters[-1] == name
     for result in results:
-        sed = result.best_sed()
-        derived = sed.meta["derived"]
+        derived = result.best_sed().meta["derived"]
         assert result.best[name].value == pytest.approx(derived[name].value, abs=1e-9)
         if result.best["frac_agn"] > 0 and derived["dust_luminosity"].value > 0:
             assert result.best[name] != result.best["frac_agn"]

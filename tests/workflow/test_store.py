@@ -85,8 +85,8 @@ def test_a_lost_or_damaged_manifest_is_replaced_by_its_copy(folder, name, text):
 def test_without_any_manifest_nothing_is_taken_for_a_product(folder):
     for name in ("manifest.json", ".manifest.copy.json"):
         (folder / name).write_text("{")
-    with pytest.raises(DataError, match=r"neither manifest\.json nor \.manifest\.copy\.json in"):
-        ProductStore(folder)
+    text = r"neither manifest\.json nor \.manifest\.copy\.json in"
+    refuses(text, ProductStore, folder, error=DataError)
     for name in ("manifest.json", ".manifest.copy.json"):
         (folder / name).unlink()
     refuses("is no run's folder", ProductStore, folder, error=DataError)
