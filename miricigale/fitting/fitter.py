@@ -305,12 +305,13 @@ class BayesFitter(Interactive):
         lost = [name for name in self.filters or () if name not in table.colnames]
         if lost and len(lost) < len(self.filters):
             text = f"the photometry has no {', '.join(lost)}: missing bands of all objects"
-            warnings.warn(text, FitWarning, stacklevel=3)
+            # the line that called the public method, beyond the frame of `checked_calls`
+            warnings.warn(text, FitWarning, stacklevel=4)
             table = table.copy(copy_data=False)
             for name in lost:
                 table[name] = table[error_column(name)] = np.full(len(table), np.nan) * FNU
-        warn_of_codes(codes_of(table, self._reader.fitted(table)), "photometry", 3)
-        self.warn_of_bands(table, 3)
+        warn_of_codes(codes_of(table, self._reader.fitted(table)), "photometry", 4)
+        self._warn_of_bands(table, 4)
         return table
 
     def fit_part(
@@ -342,7 +343,7 @@ class BayesFitter(Interactive):
             meta=provenance(fit=settings, **self.backend.provenance()),
         )
 
-    def warn_of_bands(self, photometry, stacklevel):
+    def _warn_of_bands(self, photometry, stacklevel):
         """Warn of bands that are not fitted, if the fitter does not name those that are."""
         unused = unused_bands(photometry, self._reader.fitted(photometry))
         if unused and self.filters is None:

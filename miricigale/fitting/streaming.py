@@ -179,7 +179,7 @@ def _fit_parts(fitter, rows, take, folder, seed, executor, progress_bar):
                     repeated = np.array([key in seen for key in keys], dtype=bool)
                     if not n_new:
                         # which holds for all pieces: to the caller of fit_file
-                        fitter.warn_of_bands(table, 3)
+                        fitter._warn_of_bands(table, 3)
                     options |= {"seed": seed, "parallel": {"executor": executor}}
                     results = fitter.fit_part(table, **options, repeated=repeated)
                 n_new += 1
