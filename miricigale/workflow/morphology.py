@@ -38,13 +38,7 @@ MIN_SNR, MIN_RADIUS, SIZE_FACTORS = 50.0, 0.15, (0.5, 2.0)
 _PSF_WIDTH, _RIM = 10.0, 1.0
 #: Detection: in sigma, above the noise that would join galaxies; and the least share of the light of a part that
 #: is taken for another galaxy, so that clumps stay.
-DETECTION = {
-    "preset": "default",
-    "threshold": 2.0,
-    "contrast": 0.1,
-    "stated_on": 0.06 * u.arcsec,
-    "dilation": "area",
-}
+DETECTION = {"threshold": 2.0, "n_pixels": 10, "fwhm": 3.0, "contrast": 0.1}
 #: Galaxies of the most similar axis ratio out of which one is drawn.
 N_LIKE = 5
 _LAYOUT = "miricigale stamps 1"
@@ -181,7 +175,9 @@ class RealGalaxies:
     @functools.cached_property
     def _found(self):
         """Light before the PSF, labels, detections, pixels that may be used and boxes of the labels."""
-        segments, table = photometry.detect_sources(self.image, **DETECTION)
+        preset = photometry.DetectionPreset(**DETECTION)
+        options = {"stated_on": 0.06 * u.arcsec, "dilation": "area"}
+        segments, table = photometry.detect_sources(self.image, preset=preset, **options)
         usable = np.isfinite(self.image.data)
         if self.image.mask is not None:
             usable &= ~np.asarray(self.image.mask, bool)

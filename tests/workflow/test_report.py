@@ -161,7 +161,8 @@ SAID = {
     "IMF Kroupa (inferred) | torus: torus.parametric; torus.skirtor2016 is not registered | "
     "(products: 1.2) | photutils | numba | Somebody 2001, with page | Bruzual & Charlot 2003 | "
     "Momcheva et al. 2016 | seed 20210211 | 22.8 in 4662 s | CEERS proposal, for other exposures | "
-    f"in the {AREA:.2f} square arcmin that all bands have imaged",
+    f"in the {AREA:.2f} square arcmin that all bands have imaged | "
+    "it grows by 5 % of that for each arcmin toward position angle 45 deg",
     # in order of wavelength, whatever the order of the configuration
     "four": "F560W, F1800W, F2550W (the shortest, the middle and the longest",
     "truths": "Injected fracAGN 0, source | Injected fracAGN 0.4, source | Spectra of source | "
