@@ -91,8 +91,8 @@ def test_units_of_the_file_are_kept(tmp_path):
 
     table["FUV"] = [1.0, 2.0] * u.m
     table.write(tmp_path / "d.fits")
-    with pytest.raises(DataError, match="'FUV' must be convertible to mJy"):
-        read_cigale_catalog(tmp_path / "d.fits")
+    text = "'FUV' must be convertible to mJy"
+    refuses(text, read_cigale_catalog, tmp_path / "d.fits", error=DataError)
 
 
 def test_ten_per_cent_where_there_is_no_error(tmp_path):
@@ -164,10 +164,7 @@ def test_refused(tmp_path, content, wanted):
         ("sdss.up", "sedpy.sdss_u0", 0.356),
         ("sdss.zp", "sedpy.sdss_z0", 0.893),
         ("megacam_u", "megacam.u", 0.38),
-        ("cfht.megacam.u", "megacam.u", 0.38),
-        ("hst.wfc.F814W", "acs.f814w", 0.805),
         ("ACS_F606W", "acs.f606w", 0.592),
-        ("hst.wfc3.F160W", "wfc3.f160w", 1.537),
         ("hst.wfc3.F275W", "sedpy.wfc3_uvis_f275w", 0.271),
         ("F336W_UVIS_CHIP2", "sedpy.wfc3_uvis_f336w", 0.335),
         ("J_2mass", "sedpy.twomass_J", 1.24),
@@ -176,13 +173,10 @@ def test_refused(tmp_path, content, wanted):
         ("ukirt.wfcam.K", "sedpy.ukirt_wfcam_K", 2.2),
         ("WISE3", "sedpy.wise_w3", 12.08),
         ("IRAC4", "irac.ch4", 7.87),
-        ("spitzer.irac.ch1", "irac.ch1", 3.55),
         ("MIPS1", "mips.24", 23.68),
         ("spitzer.mips.70", "mips.70", 71.4),
         ("F770W", "miri.f770w", 7.64),
-        ("jwst.miri.F2100W", "miri.f2100w", 20.8),
         ("F444W", "nircam.f444w", 4.42),
-        ("jwst.nircam.F150W", "nircam.f150w", 1.50),
         ("PACS_green", "sedpy.herschel_pacs_100", 100.0),
         ("herschel.pacs.160", "sedpy.herschel_pacs_160", 160.0),
         ("PLW", "sedpy.herschel_spire_500", 500.0),
@@ -247,29 +241,22 @@ def test_a_band_takes_the_filter_that_is_given(tmp_path):
     assert "sedpy.wise_w3" in table.colnames
 
 
-@pytest.mark.parametrize(
-    ("given", "error", "wanted"),
-    [
+def test_a_wrong_filter_is_refused_when_it_is_read(tmp_path):
+    path = tmp_path / "galaxies.txt"
+    path.write_text("# id redshift IRAS1 IRAS1_err\na 0.5 3 0.1\n")
+    for given, error, wanted in (
         ("none.dat", DataError, "none.dat cannot be read"),
         ("miri.f707w", KeyError, "miri.f770w"),
         (12.0, ValueError, r"'IRAS1' must be a Filter, .* got float"),
-    ],
-)
-def test_a_wrong_filter_is_refused_when_it_is_read(tmp_path, given, error, wanted):
-    path = tmp_path / "galaxies.txt"
-    path.write_text("# id redshift IRAS1 IRAS1_err\na 0.5 3 0.1\n")
-    refuses(wanted, read_cigale_catalog, path, error=error, names={"IRAS1": given})
+    ):
+        refuses(wanted, read_cigale_catalog, path, error=error, names={"IRAS1": given})
 
 
 def test_codes_and_limits_that_are_not_positive_are_missing(tmp_path):
     """-99.99 with -99.99, as real catalogs have it, is no upper limit of -99.99 mJy."""
     path = tmp_path / "galaxies.txt"
-    path.write_text(
-        "# id redshift IRAC1 IRAC1_err IRAC2 IRAC2_err\n"
-        "a 0.5 -99.99 -99.99 2 0.1\n"
-        "b 0.5 -1e-3 -1e-4 2 -0.1\n"
-        "c 0.5 0 -1e-4 2 -99.9\n"
-    )
+    rows = ("a 0.5 -99.99 -99.99 2 0.1", "b 0.5 -1e-3 -1e-4 2 -0.1", "c 0.5 0 -1e-4 2 -99.9")
+    path.write_text("\n".join(["# id redshift IRAC1 IRAC1_err IRAC2 IRAC2_err", *rows, ""]))
     with pytest.warns(MiricigaleWarning, match="limits that are not positive: IRAC1 2"):
         table = read_cigale_catalog(path)
     assert np.all(np.isnan(table["irac.ch1"]))

@@ -3,7 +3,6 @@
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData
 from astropy.tests.helper import assert_quantity_allclose
 from numpy.testing import assert_allclose
@@ -11,13 +10,13 @@ from photutils.aperture import ApertureStats, CircularAnnulus, CircularAperture
 from scipy.ndimage import gaussian_filter
 
 from helpers.errors import refuses
+from helpers.exposures import exposure_of
 from miricigale.depth import etc_limit, etc_setup, sensitivity, sensitivity_table
 from miricigale.depth.limits import extraction_weights
 from miricigale.depth.noise import noise_power, ramp_variance
 from miricigale.detector import BadPixels, CosmicRays, Detector, Residual
 from miricigale.instrument import (
     DetectorProperties,
-    Exposure,
     background_level,
     imager_filters,
     photmjsr,
@@ -108,9 +107,8 @@ def test_faint_limits_are_linear_and_bright_ones_count_their_own_photons(psf):
     assert_quantity_allclose(three, 3 * one, rtol=0.005)
     # no sky: 10^4 electrons for 100 sigma, in the light of the aperture
     quiet = DetectorProperties(gain=4.0, read_noise=0.0, dark_current=0.0, full_well=1e12)
-    dark = sensitivity(
-        NAME, n_sigma=100, background=0 * u.MJy / u.sr, n_groups=1000, detector=quiet, psf=psf
-    )
+    kind = {"background": 0 * u.MJy / u.sr, "n_groups": 1000, "detector": quiet, "psf": psf}
+    dark = sensitivity(NAME, n_sigma=100, **kind)
     radius = etc_setup(NAME).radius
     area = MIRI_PIXEL_SCALE.to_value(u.rad) ** 2 * 1e12
     collected = dark.value * 4 / photmjsr(NAME, gain=4.0) / area * 1e4
@@ -119,10 +117,9 @@ def test_faint_limits_are_linear_and_bright_ones_count_their_own_photons(psf):
 
 def test_annulus_adds_its_noise_and_takes_off_wings(psf):
     radius, inner, outer = 1.0, 4.0, np.sqrt(4.0**2 + 1.0**2 / 0.5)
-    known = sensitivity(NAME, n_sigma=1e-3, psf=psf, aperture=radius * u.arcsec)
-    measured = sensitivity(
-        NAME, n_sigma=1e-3, psf=psf, aperture=radius * u.arcsec, annulus=[inner, outer] * u.arcsec
-    )
+    kind = {"n_sigma": 1e-3, "psf": psf, "aperture": radius * u.arcsec}
+    known = sensitivity(NAME, **kind)
+    measured = sensitivity(NAME, **kind, annulus=[inner, outer] * u.arcsec)
     light = encircled_energy(psf, radius * u.arcsec)
     wings = np.diff(encircled_energy(psf, [inner, outer] * u.arcsec))[0] / 2
     # half as noisy as the aperture: its area is twice as large
@@ -132,9 +129,8 @@ def test_annulus_adds_its_noise_and_takes_off_wings(psf):
 @pytest.mark.parametrize("name", imager_filters())
 def test_residual_gives_the_published_limits(name):
     # ETC 4.0 (JWST user documentation, MIRI Sensitivity), digits cut off there
-    published = dict(
-        zip(imager_filters(), [0.13, 0.24, 0.46, 1.02, 0.83, 1.18, 2.42, 4.70, 15.3], strict=True)
-    )
+    digits = [0.13, 0.24, 0.46, 1.02, 0.83, 1.18, 2.42, 4.70, 15.3]
+    published = dict(zip(imager_filters(), digits, strict=True))
     psf = miri_psf(name, oversampling=2, fov=9 * u.arcsec)
     limit = sensitivity(name, etc_setup(name).time, residual="etc", psf=psf).value
     assert_allclose(limit, published[name], rtol=0.10)
@@ -162,8 +158,7 @@ def test_table_scales_the_calculators_limits(psf):
 @pytest.mark.parametrize(("residual", "n_exposures"), [(None, 1), (0.004, 1), (0.004, 8)])
 def test_noise_is_that_of_simulated_and_reduced_exposures(residual, n_exposures, annulus):
     name, radius, n_groups = "miri.f2100w", 0.25 * u.arcsec, 12
-    place = {"pointing": SkyCoord(53.1, -27.8, unit="deg"), "roll": 0 * u.deg}
-    exposure = Exposure(name, n_groups=n_groups, subarray="SUB256", **place)
+    exposure = exposure_of(name, n_groups=n_groups)
     detector = Detector.miri_imager().without(CosmicRays, BadPixels)
     if residual:
         detector = detector.replaced(Residual(residual))
@@ -192,6 +187,9 @@ def test_noise_is_that_of_simulated_and_reduced_exposures(residual, n_exposures,
     assert_allclose(np.std(sums - np.median(sums)), expected, rtol=0.09)
 
 
+WIDE = gaussian_psf(0.3 * u.arcsec, pixel_scale=0.11 * u.arcsec, fov=6 * u.arcsec)
+
+
 @pytest.mark.parametrize(
     ("options", "name"),
     [
@@ -208,10 +206,7 @@ def test_noise_is_that_of_simulated_and_reduced_exposures(residual, n_exposures,
         ({"correlation": -1}, "correlation"),
         ({"background": -1 * u.MJy / u.sr}, "background"),
         ({"detector": 3}, "detector"),
-        (
-            {"psf": gaussian_psf(0.3 * u.arcsec, pixel_scale=0.11 * u.arcsec, fov=6 * u.arcsec)},
-            "psf",
-        ),
+        ({"psf": WIDE}, "psf"),
     ],
 )
 def test_errors_name_the_argument(options, name, psf):
@@ -219,9 +214,9 @@ def test_errors_name_the_argument(options, name, psf):
 
 
 def test_unknown_names_list_the_known():
-    with pytest.raises(KeyError, match="no residual preset 'sky'; known: etc"):
-        sensitivity(NAME, residual="sky")
-    with pytest.raises(ValueError, match=r"'psf' must be one of the filter miri\.f770w, got one"):
-        sensitivity("miri.f770w", psf=miri_psf("miri.f560w"))
+    text = "no residual preset 'sky'; known: etc"
+    refuses(text, sensitivity, NAME, error=KeyError, residual="sky")
+    text = r"'psf' must be one of the filter miri\.f770w, got one"
+    refuses(text, sensitivity, "miri.f770w", psf=miri_psf("miri.f560w"))
     refuses("no imaging filter", sensitivity, "miri.f600w", error=KeyError)
     refuses("'time' must be", sensitivity, NAME, 1e4, error=u.UnitsError)

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
 from miricigale.evaluation import (
@@ -20,8 +21,8 @@ def test_confusion_of_a_table_by_hand():
     assert table["n"].tolist() == [4, 2, 4]
     counts = [table[name].tolist() for name in (*CLASS_NAMES, "unknown")]
     assert counts == [[3, 0, 0], [0, 1, 1], [1, 0, 3], [0, 1, 0]]
-    np.testing.assert_allclose(table["completeness"], [3 / 4, 1 / 2, 3 / 4])
-    np.testing.assert_allclose(table["purity"], [1, 1 / 2, 3 / 4])
+    assert_allclose(table["completeness"], [3 / 4, 1 / 2, 3 / 4])
+    assert_allclose(table["purity"], [1, 1 / 2, 3 / 4])
     assert np.all(table["completeness_low"] <= table["completeness"])
     assert np.all(table["completeness_high"] >= table["completeness"])
 
@@ -44,8 +45,7 @@ def test_purity_falls_with_the_share_of_wanted_sources_and_completeness_does_not
         assert quality.completeness.value == pytest.approx(0.9)
         assert quality.purity.value == pytest.approx(purity)
 
-
-def test_nothing_selected_has_no_purity():
+    # nothing selected has no purity
     quality = selection_quality([True, False], [False, False])
     assert np.isnan(quality.purity.value)
     assert quality.completeness.value == 0
@@ -53,5 +53,5 @@ def test_nothing_selected_has_no_purity():
 
 def test_other_lengths_are_refused():
     refuses("'found' must be a 1-D array as long as 'true'", confusion, ["agn"], [])
-    with pytest.raises(ValueError, match="'selected' must be a 1-D array as long as 'wanted'"):
-        selection_quality([True], [True, False])
+    text = "'selected' must be a 1-D array as long as 'wanted'"
+    refuses(text, selection_quality, [True], [True, False])

@@ -4,6 +4,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
+from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
 from helpers.studies import mock_study
@@ -70,7 +71,7 @@ def test_colors_are_logs_of_ratios():
     window = ColorWindow(0, 1, ("a", "b"), ("c", "b"))
     assert window.bands == ("a", "b", "c")
     fluxes = QTable({"a": [10.0, 1] * u.uJy, "b": [1.0, -1] * u.uJy, "c": [1e-3, 1] * u.mJy})
-    np.testing.assert_allclose(window.colors(fluxes), [[1, 0], [np.nan, np.nan]])
+    assert_allclose(window.colors(fluxes), [[1, 0], [np.nan, np.nan]])
 
 
 def test_sources_are_classified_by_circles_of_others():
@@ -95,7 +96,7 @@ def test_rows_of_one_source_stay_together():
     window = ColorWindow(0, 2, ("a", "b"), ("c", "b"))
     groups = np.tile(np.arange(300), 2)
     found = color_classes(fluxes, np.ones(600), classes, windows=[window], groups=groups, seed=1)
-    np.testing.assert_array_equal(found[:300], found[300:])
+    assert_array_equal(found[:300], found[300:])
 
 
 def test_colors_of_a_study():
@@ -145,9 +146,8 @@ def test_colors_tell_models_apart():
         "frac_agn": frac,
     })  # fmt: skip
     fluxes = model.fluxes(table, COLOR_WINDOWS[0].bands)
-    true = classify(
-        np.where(frac > 0, mid_infrared_fractions(model, table), 0.0), limits=KIRKPATRICK_LIMITS
-    )
+    shares = np.where(frac > 0, mid_infrared_fractions(model, table), 0.0)
+    true = classify(shares, limits=KIRKPATRICK_LIMITS)
     kind = {"windows": COLOR_WINDOWS[:1], "groups": np.repeat(np.arange(n), 4)}
     found = color_classes(fluxes, table["redshift"], true, seed=1, **kind)
     shares = [np.mean(found[true == name] == name) for name in NAMES]

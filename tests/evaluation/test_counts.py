@@ -2,6 +2,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
+from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
 from miricigale.evaluation import (
@@ -16,18 +17,14 @@ from miricigale.evaluation import (
 from miricigale.sed import COSMOLOGY
 
 
-def test_speagle_main_sequence_at_published_values():
+def test_main_sequence_and_kennicutt_relation_at_published_values():
     # Speagle et al. 2014, equation 28, evaluated by hand at t = 5 Gyr and M = 10^10.5
     expected = 10 ** ((0.84 - 0.13) * 10.5 - (6.51 - 0.55))
     sfr = main_sequence_sfr(10**10.5 * u.Msun, 5 * u.Gyr)
     assert sfr.to_value(u.Msun / u.yr) == pytest.approx(expected)
-
-
-def test_kennicutt_relation_in_solar_units():
     # Kennicutt 1998: 1 Msun/yr is 5.8e9 Lsun
-    assert sfr_to_infrared_luminosity(1 * u.Msun / u.yr).to_value(u.Lsun) == pytest.approx(
-        5.8e9, rel=0.01
-    )
+    luminosity = sfr_to_infrared_luminosity(1 * u.Msun / u.yr).to_value(u.Lsun)
+    assert luminosity == pytest.approx(5.8e9, rel=0.01)
 
 
 def test_counts_conserve_sources():
@@ -44,8 +41,8 @@ def test_integrated_light_in_closed_form():
     light, error = integrated_light([4.0, 4.0] * u.Jy, 8e-6 * u.sr, 15 * u.um)
     assert light.to_value(u.nW / u.m**2 / u.sr) == pytest.approx(199.86, rel=1e-4)
     assert (error / light).to_value(u.one) == pytest.approx(1 / np.sqrt(2))
-    with pytest.raises(ValueError, match="'flux' must be finite values, got 1 that are NaN"):
-        integrated_light([np.nan, 1] * u.Jy, 1 * u.sr, 15 * u.um)
+    text = "'flux' must be finite values, got 1 that are NaN"
+    refuses(text, integrated_light, [np.nan, 1] * u.Jy, 1 * u.sr, 15 * u.um)
 
 
 def test_bare_numbers_are_refused_by_name():
@@ -60,13 +57,10 @@ def test_bare_numbers_are_refused_by_name():
         refuses(message, function, *arguments, error=(ValueError, u.UnitsError))
 
 
-def test_hidden_star_formation_at_published_values():
+def test_hidden_star_formation_and_colors_at_published_values():
     # Whitaker et al. 2017, abstract: half at 10^9.4 Msun, more than 90 % above 10^10.5
     assert dust_obscured_fraction(10**9.4 * u.Msun) == pytest.approx(0.5, abs=0.01)
     assert dust_obscured_fraction(10**10.5 * u.Msun) > 0.9
-
-
-def test_colors_of_old_and_of_dusty_galaxies():
     # an old population, a dusty one as red in U - V, a blue one; the lines of Whitaker et al. 2011
     u_v, v_j = [1.8, 1.8, 0.8] * u.mag, [1.0, 1.9, 0.6] * u.mag
     assert uvj_quiescent(u_v, v_j, 1.0).tolist() == [True, False, False]
@@ -78,11 +72,12 @@ def test_colors_of_old_and_of_dusty_galaxies():
 @pytest.fixture
 def galaxies():
     """Star-forming galaxies of one mass, one that is quiescent, and a star."""
-    n = 2000
-    table = QTable({"id": np.arange(n), "redshift": np.full(n, 1.0)})
-    table["stellar_mass"] = np.full(n, 10**10.5) * u.Msun
-    table["dust_luminosity"] = np.full(n, 1e36) * u.W
-    table["u_v"], table["v_j"] = np.full(n, 1.0) * u.mag, np.full(n, 1.0) * u.mag
+    ones = np.ones(2000)
+    table = QTable(
+        {"id": np.arange(2000), "redshift": ones, "stellar_mass": 10**10.5 * ones * u.Msun}
+    )
+    table["dust_luminosity"] = 1e36 * ones * u.W
+    table["u_v"], table["v_j"] = ones * u.mag, ones * u.mag
     table["u_v"][0] = 1.8 * u.mag
     table["redshift"][1], table["stellar_mass"][1] = 0.0, np.nan
     return table
@@ -102,9 +97,7 @@ def test_dust_on_the_main_sequence(galaxies):
     assert got.std() == pytest.approx(0.2, rel=0.07)
     exact = main_sequence_dust(galaxies, seed=5, scatter=0.0)["dust_luminosity"][-1]
     assert exact.to_value(u.erg / u.s) == pytest.approx(10**wanted)
-    np.testing.assert_allclose(
-        dust["dust_excess"], dust["dust_luminosity"] / galaxies["dust_luminosity"]
-    )
+    assert_allclose(dust["dust_excess"], dust["dust_luminosity"] / galaxies["dust_luminosity"])
     # a source's draw does not depend on the others
     few = main_sequence_dust(galaxies[100:103], seed=5)
     assert np.all(few["dust_luminosity"] == dust["dust_luminosity"][100:103])

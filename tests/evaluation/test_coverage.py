@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.stats import norm
 
 from helpers.errors import refuses
@@ -16,17 +17,13 @@ def gaussian_case(n, *, bias=0.0, width=1.0, seed=1):
     return true, measured[:, None] + width * norm.ppf(LEVELS)
 
 
-def rows(ranks, **kwargs):
-    return coverage_table({"x": ranks}, **kwargs)
-
-
 @pytest.mark.parametrize(("bias", "width"), [(0.0, 1.0), (0.0, 0.5), (1.0, 1.0)])
 def test_coverage_is_that_of_gaussians(bias, width):
     true, values = gaussian_case(4000, bias=bias, width=width)
-    table = rows(posterior_ranks(true, values, LEVELS))
+    table = coverage_table({"x": posterior_ranks(true, values, LEVELS)})
     reach = width * norm.ppf(0.5 + np.array([0.34, 0.475]))
     expected = norm.cdf(reach - bias) - norm.cdf(-reach - bias)
-    np.testing.assert_allclose(table["share"], expected, atol=0.02)
+    assert_allclose(table["share"], expected, atol=0.02)
     assert np.all((table["share_low"] < table["share"]) & (table["share"] < table["share_high"]))
     expected = norm.cdf(-bias / np.hypot(1, width))
     assert table["mean_rank"][0] == pytest.approx(expected, abs=0.02)
@@ -42,7 +39,7 @@ def test_truths_on_nodes_have_uniform_ranks_by_drawing_within_their_cell():
     edges = np.r_[0, nodes[:-1] + 0.5, 10]
     cdf = np.linspace(0, 1, 12)
     true = nodes[node].astype(float)
-    drawn = rows(posterior_ranks(true, edges, cdf, seed=1))
+    drawn = coverage_table({"x": posterior_ranks(true, edges, cdf, seed=1)})
     assert drawn["share"][0] == pytest.approx(0.68, abs=0.03)
     assert drawn["p_uniform"][0] > 0.01
     # without it the first node always has the rank 0
@@ -52,13 +49,13 @@ def test_truths_on_nodes_have_uniform_ranks_by_drawing_within_their_cell():
 def test_ranks_by_hand():
     values, levels = [0.0, 1.0, 3.0], [0.0, 0.4, 1.0]
     got = posterior_ranks([0.5, 2.0, -1.0, 4.0, np.nan, 3.0], values, levels)
-    np.testing.assert_allclose(got, [0.2, 0.7, 0.0, 1.0, np.nan, 1.0])
+    assert_allclose(got, [0.2, 0.7, 0.0, 1.0, np.nan, 1.0])
 
 
 def test_a_step_of_the_posterior_has_the_ranks_of_its_height():
     """A third of the posterior is at 0, as of the power of an AGN that may be none."""
     values, levels = [0.0, 0.0, 1.0, 2.0], [0.001, 1 / 3, 2 / 3, 0.999]
-    np.testing.assert_allclose(posterior_ranks([0.0, 1.0], values, levels), [1 / 6, 2 / 3])
+    assert_allclose(posterior_ranks([0.0, 1.0], values, levels), [1 / 6, 2 / 3])
     drawn = posterior_ranks(np.zeros(3000), values, levels, seed=1)
     assert (drawn.min(), drawn.max()) == pytest.approx((0, 1 / 3), abs=0.002)
     assert drawn.mean() == pytest.approx(1 / 6, abs=0.01)
@@ -69,14 +66,14 @@ def test_a_step_of_the_posterior_has_the_ranks_of_its_height():
 def test_posteriors_that_do_not_exist_have_no_rank():
     levels = np.array([[0.0, 0.5, 1.0], [np.nan] * 3])
     got = posterior_ranks([1.0, 1.0], [0.0, 1.0, 2.0], levels)
-    np.testing.assert_allclose(got, [0.5, np.nan])
+    assert_allclose(got, [0.5, np.nan])
     table = coverage_table({"none": [np.nan]})
     assert table["n"].tolist() == [0, 0]
     assert np.isnan(table["share"]).all()
 
 
 def test_refuses():
-    with pytest.raises(ValueError, match="'values' must be of one shape"):
-        posterior_ranks([1.0, 2.0], np.zeros((3, 4)), np.zeros(4))
+    arguments = ([1.0, 2.0], np.zeros((3, 4)), np.zeros(4))
+    refuses("'values' must be of one shape", posterior_ranks, *arguments)
     refuses("'ranks' must be between 0 and 1", coverage_table, {"x": [1.5]})
     refuses("'levels' must be between 0 and 1", coverage_table, {}, levels=(68,))

@@ -2,7 +2,9 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
+from numpy.testing import assert_allclose
 
+from helpers.errors import refuses
 from miricigale.evaluation import (
     feature_magnitude,
     feature_redshifts,
@@ -23,16 +25,11 @@ def test_share_of_power_laws_by_hand():
     own = np.log(3)
     assert got == pytest.approx(own / (own + 1 / 5 - 1 / 15), rel=1e-5)
 
-
-def test_share_of_many_spectra_and_of_none():
-    flat = np.ones(WAVE.size)
-    total = np.stack([flat, 2 * flat, 0 * flat])
-    np.testing.assert_allclose(light_share(WAVE, total, 0.5 * total), [0.5, 0.5, np.nan])
-
-
-def test_share_refuses_a_band_beyond_the_spectrum():
-    with pytest.raises(ValueError, match="'band' must be two ascending wavelengths in 1-100 um"):
-        light_share(WAVE, WAVE.value, WAVE.value, band=[5, 150] * u.um)
+    # of many spectra and of none
+    total = np.stack([second, 2 * second, 0 * second])
+    assert_allclose(light_share(WAVE, total, 0.5 * total), [0.5, 0.5, np.nan])
+    text = "'band' must be two ascending wavelengths in 1-100 um"
+    refuses(text, light_share, WAVE, WAVE.value, WAVE.value, band=[5, 150] * u.um)
 
 
 def test_mid_infrared_fractions_rise_with_the_fraction_and_are_shares_of_the_spectra():
@@ -82,9 +79,8 @@ def test_residuals_where_the_feature_is_in_the_band():
     z = rng.uniform(0, 3, 2000)
     residual = rng.normal(0, 0.1, z.size)
     residual[(z > 1.25) & (z < 1.75)] -= 0.3
-    inside, outside = feature_residuals(
-        residual, z, feature=6.2 * u.um, pivot=15.5 * u.um, filter_width=3.1 * u.um, seed=1
-    )
+    kind = {"feature": 6.2 * u.um, "pivot": 15.5 * u.um, "filter_width": 3.1 * u.um}
+    inside, outside = feature_residuals(residual, z, **kind, seed=1)
     assert inside.value == pytest.approx(-0.3, abs=4 * inside.error)
     assert outside.value == pytest.approx(0, abs=4 * outside.error)
     assert inside.n + outside.n == 2000

@@ -5,6 +5,7 @@ import dataclasses
 import astropy.units as u
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
 from helpers.studies import BANDS, FITS, LIMITS, mock_study, mock_truth
@@ -125,9 +126,8 @@ def test_magnitudes_by_shape_and_crowding():
     for name in ("n < 2", "point"):
         kept = got(study, "shape_offset", option=name)
         assert kept.value == pytest.approx(0, abs=4 * kept.error)
-    scatter = {
-        name: got(study, "magnitude_scatter", option=name) for name in ("crowded", "isolated")
-    }
+    kinds = ("crowded", "isolated")
+    scatter = {name: got(study, "magnitude_scatter", option=name) for name in kinds}
     assert scatter["crowded"].value > 1.5 * scatter["isolated"].value
     shares = [got(study, "shape_share", option=name).value for name in ("point", "n < 2", "n >= 2")]
     assert sum(shares) == pytest.approx(1)
@@ -137,7 +137,7 @@ def test_magnitudes_by_shape_and_crowding():
 def test_xray_fluxes_are_those_of_the_relation(study):
     one = study.at(0.6)
     flux = yang2021_xray_flux(one.truth["l_6um"][:3], one.truth["redshift"][:3])
-    np.testing.assert_allclose(10 ** xray_fluxes(one)[:3], flux.value)
+    assert_allclose(10 ** xray_fluxes(one)[:3], flux.value)
     assert np.isnan(xray_fluxes(study.at(0.0))).all()
     half = got(study, "xray_half", truth=0.6)
     found = one.sample[one.field]
@@ -167,7 +167,7 @@ def test_all_numbers_of_all_fits(study):
     # a number has its own stream: its error does not depend on what else there is
     alone = study_numbers(dataclasses.replace(study, truths=study.truths[1:2]), seed=3, n_draws=50)
     both = table[table["truth"] == "agn20"]
-    np.testing.assert_array_equal(both["low"], alone["low"])
+    assert_array_equal(both["low"], alone["low"])
 
 
 def test_confusion_of_a_study(study):

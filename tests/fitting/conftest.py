@@ -4,21 +4,6 @@ from helpers import grids
 
 
 @pytest.fixture(scope="session")
-def make_grid():
-    return grids.make_grid
-
-
-@pytest.fixture(scope="session")
-def draw_photometry():
-    return grids.draw_photometry
-
-
-@pytest.fixture(scope="session")
-def brute_force():
-    return grids.brute_force
-
-
-@pytest.fixture(scope="session")
 def grid():
     return grids.make_grid()
 

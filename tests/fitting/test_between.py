@@ -15,11 +15,8 @@ from miricigale.sed import ModelGrid, SEDModel
 
 BANDS = tuple(f"band{i}" for i in range(8))
 PLACE = np.linspace(-1.0, 1.0, len(BANDS))
-AXES = {
-    "redshift": np.array([0.5, 0.8, 1.16, 1.6]),
-    "tau": np.array([1.0, 2.0, 3.0]),
-    "ebv": np.array([0.1, 0.4, 0.7]),
-}
+AXES = {"redshift": [0.5, 0.8, 1.16, 1.6], "tau": [1.0, 2.0, 3.0], "ebv": [0.1, 0.4, 0.7]}
+AXES = {name: np.array(values) for name, values in AXES.items()}
 SIGMA = 0.05
 
 
@@ -56,14 +53,19 @@ def grid():
     )
 
 
+def anywhere(values, n, rng):
+    """Draws of any node, anywhere in its cell between the outermost nodes."""
+    values = np.asarray(values)
+    edges = np.concatenate([values[:1], 0.5 * (values[1:] + values[:-1]), values[-1:]])
+    node = rng.integers(values.size, size=n)
+    return edges[node] + np.diff(edges)[node] * rng.random(n)
+
+
 @pytest.fixture(scope="module")
 def drawn():
-    """300 objects drawn from the prior: any node, anywhere in its cell between the outermost nodes."""
-    rng, n, true = np.random.default_rng(8), 300, {}
-    for name, values in AXES.items():
-        edges = np.concatenate([values[:1], 0.5 * (values[1:] + values[:-1]), values[-1:]])
-        node = rng.integers(values.size, size=n)
-        true[name] = edges[node] + np.diff(edges)[node] * rng.random(n)
+    """300 objects drawn from the prior."""
+    rng, n = np.random.default_rng(8), 300
+    true = {name: anywhere(values, n, rng) for name, values in AXES.items()}
     model, sfr = flux(**true)
     model, true["sfr"] = 1e10 * model, 1e10 * sfr
     true["mass"], true["beta"] = np.full(n, 1e10), 0.3 * true["tau"] - 2.0
@@ -80,7 +82,8 @@ def interpolated(grid, n, finer=None):
 
 def coverage(results, true, name):
     low, high = results.percentile(name, [0.16, 0.84]).value.T
-    return np.mean((true[name] >= low) & (true[name] <= high))
+    values = u.Quantity(true[name]).value
+    return np.mean((values >= low) & (values <= high))
 
 
 def test_intervals_hold_the_truth_between_nodes(grid, drawn):
@@ -142,19 +145,12 @@ def test_chi2_and_evidence_are_those_at_the_known_redshift(grid):
 
 def test_masses_at_low_redshift_are_those_of_the_distance(grid):
     """Half way between redshift 0.01 and 0.04 the distance is not half way in ln(1 + z)."""
-    galaxy = flux(np.array([0.01, 0.04])[:, None], np.array([1.0, 3.0]), np.array([0.1, 0.1]))[0]
-    near = replace(
-        grid,
-        redshift=np.array([0.01, 0.04]),
-        galaxy=galaxy,
-        dust_luminosity=np.full(2, 1e27),
-        allowed=np.ones((2, 2), bool),
-        galaxy_properties=grid.galaxy_properties[[0, 6]],
-        galaxy_shape=grid.galaxy_shape[[0, 6]],
-        axes={"redshift": [0.01, 0.04], "tau": [1.0, 3.0]},
-        galaxy_parameters=grid.galaxy_parameters[[0, 6]],
-        agn=np.zeros((2, 0, len(BANDS))),
-    )
+    z, tau = np.array([0.01, 0.04]), np.array([1.0, 3.0])
+    parts = {"redshift": z, "galaxy": flux(z[:, None], tau, np.array([0.1, 0.1]))[0]}
+    parts |= {"allowed": grid.allowed[:2, :2], "agn": grid.agn[:2]}
+    for name in ("dust_luminosity", "galaxy_properties", "galaxy_shape", "galaxy_parameters"):
+        parts[name] = getattr(grid, name)[[0, 6]]
+    near = replace(grid, **parts, axes={"redshift": z, "tau": tau})
     model = 1e9 * flux(np.array([0.02]), np.array([1.0]), np.array([0.1]))[0]
     table = photometry_table(BANDS, model, 0.05 * model)
     results = interpolated(near, 50).fit(table, redshift=0.02)
@@ -173,15 +169,10 @@ OPTICAL = ["megacam.u", "acs.f606w", "acs.f814w", "wfc3.f125w", "wfc3.f160w", "i
 INFRARED = ["miri.f770w", "miri.f1000w", "miri.f1280w", "miri.f1500w", "miri.f1800w", "miri.f2100w"]
 CHAIN_BANDS = [*OPTICAL, *INFRARED]
 CHAIN = {
-    "redshift": np.expm1(np.linspace(np.log(1.2), np.log(4.0), 16)),
-    "tau": [0.1, 1.0, 5.0],
-    "age": [0.5, 1.0, 2.0],
-    "ebv": [0.1, 0.4, 0.8],
-    "alpha": [1.0, 2.5],
-    "ebv_polar": [0.0, 0.3],
-    "temperature_polar": [100.0, 300.0],
-    "frac_agn": [0.0, 0.3, 0.6, 0.9],
-}
+    "redshift": np.expm1(np.linspace(np.log(1.2), np.log(4.0), 16)), "tau": [0.1, 1.0, 5.0],
+    "age": [0.5, 1.0, 2.0], "ebv": [0.1, 0.4, 0.8], "alpha": [1.0, 2.5], "ebv_polar": [0.0, 0.3],
+    "temperature_polar": [100.0, 300.0], "frac_agn": [0.0, 0.3, 0.6, 0.9],
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -196,11 +187,7 @@ def off_nodes(chain):
     """80 models of the chain, of any node, anywhere in its cell, with S/N 10."""
     model, rng, n, true = chain[0], np.random.default_rng(4), 80, QTable()
     for name, values in CHAIN.items():
-        values = np.asarray(values)
-        edges = np.concatenate([values[:1], 0.5 * (values[1:] + values[:-1]), values[-1:]])
-        node = rng.integers(values.size, size=n)
-        value = edges[node] + np.diff(edges)[node] * rng.random(n)
-        true[name] = value * model.parameters[name].unit
+        true[name] = anywhere(values, n, rng) * model.parameters[name].unit
     fluxes = model.fluxes(true, CHAIN_BANDS)
     table = QTable({"id": np.arange(n), "z": true["redshift"]})
     for name in CHAIN_BANDS:
@@ -237,12 +224,10 @@ def test_intervals_of_galaxies_and_agn(chain, off_nodes):
     names = ("redshift", "frac_agn", "stellar_mass", "sfr", "dust_luminosity")
     held = {}
     for name in names:
-        low, high = results.percentile(name, [0.16, 0.84]).T
-        held[name] = np.mean((true[name] >= low) & (true[name] <= high))
+        held[name] = coverage(results, true, name)
         # three times the binomial error of 80 objects
         assert abs(held[name] - 0.68) < 0.157, name
-        low, high = nodes.percentile(name, [0.16, 0.84]).T
-        assert np.mean((true[name] >= low) & (true[name] <= high)) < held[name], name
+        assert coverage(nodes, true, name) < held[name], name
     assert abs(np.mean(list(held.values())) - 0.68) < 0.1
 
 
@@ -271,6 +256,6 @@ def test_a_finer_grid_is_of_the_model_that_made_the_grid(chain):
     other = SEDModel.yang2021(libraries="bundled", frac_agn_definition="3-1000um")
     refuses("'finer' must be the model that made the grid", interpolated, grid, 10, other)
     refuses("'finer' must be an SEDModel", interpolated, grid, 10, grid)
-    settings = GridSettings(interpolate=10, finer=other)
-    with pytest.raises(ValueError, match="'finer' must be left out when 'model' is an SEDModel"):
-        BayesFitter(model, CHAIN_BANDS, axes=CHAIN, settings=settings)
+    options = {"axes": CHAIN, "settings": GridSettings(interpolate=10, finer=other)}
+    text = "'finer' must be left out when 'model' is an SEDModel"
+    refuses(text, BayesFitter, model, CHAIN_BANDS, **options)

@@ -9,7 +9,7 @@ from astropy.table import QTable
 from numpy.testing import assert_array_less
 from scipy import stats
 
-from helpers.grids import cells, photometry_table
+from helpers.grids import cells, make_grid, photometry_table
 from miricigale.fitting import BayesFitter
 from miricigale.fitting.posterior import randomized_ranks
 from miricigale.fitting.quantities import DERIVED_LEVELS
@@ -34,19 +34,13 @@ def _draw(grid, n, rng):
 
 
 @pytest.fixture(scope="module")
-def fitted(make_grid):
+def fitted():
     grid = make_grid(11, n_z=8, n_tau=6, n_age=4, frac=np.append(np.arange(5) * 0.2, 0.95))
     rng = np.random.default_rng(4)
     # six values that several galaxies have, and as many as there are galaxies
-    grid = dataclasses.replace(
-        grid,
-        galaxy_shape=QTable(
-            {
-                "a_v": np.sqrt(grid.galaxy_parameters["tau"].value) * u.mag,
-                "u_v": rng.normal(0.5, 0.7, grid.n_galaxies) * u.mag,
-            }
-        ),
-    )
+    shape = QTable({"a_v": np.sqrt(grid.galaxy_parameters["tau"].value) * u.mag})
+    shape["u_v"] = rng.normal(0.5, 0.7, grid.n_galaxies) * u.mag
+    grid = dataclasses.replace(grid, galaxy_shape=shape)
     drawn = _draw(grid, N, rng)
     results = BayesFitter(grid, model_error=0.0).fit(drawn[0])
     assert results.fitted.all()
@@ -91,5 +85,3 @@ def test_mass(fitted):
     kept = results.quantiles[:, results.quantities.index("mass")]
     rank = np.array([np.interp(x, row, DERIVED_LEVELS) for x, row in zip(s, kept, strict=True)])
     _check(rank, "mass")
-    low, high = results.percentile("mass", [0.16, 0.84]).value.T
-    assert abs(np.mean((s > low) & (s < high)) - 0.68) < 0.03

@@ -93,22 +93,19 @@ def fitters(stars):
         "tau97": [5.0], "frac_agn": [0.0, 0.3, 0.7], "redshift": z,
     }  # fmt: skip
     quasars = quasar_axes() | {"redshift": z, "tau97": [5.0]}
-    return {
-        "galaxy": BayesFitter(model, BANDS, axes=galaxies, model_error=0.1),
-        "quasar": BayesFitter(model, BANDS, axes=quasars, model_error=0.1),
-        "star": BayesFitter(template_grid(stars, BANDS), model_error=0.1),
-    }
+    galaxy, quasar = (
+        BayesFitter(model, BANDS, axes=axes, model_error=0.1) for axes in (galaxies, quasars)
+    )
+    star = BayesFitter(template_grid(stars, BANDS), model_error=0.1)
+    return {"galaxy": galaxy, "quasar": quasar, "star": star}
 
 
 def sources(n, seed):
     """Galaxies, quasars and stars between the nodes of the grids, S/N 20, as bright in F160W."""
     rng, model = np.random.default_rng(seed), SEDModel.survey()
     z = np.expm1(rng.uniform(0.2, 1.6, (2, n)))
-    both = {
-        "q_pah": rng.uniform(0.5, 4.5, n),
-        "tau97": rng.uniform(3, 11, n),
-        "mass": np.full(n, 1e10),
-    }
+    both = {"q_pah": rng.uniform(0.5, 4.5, n), "tau97": rng.uniform(3, 11, n)}
+    both["mass"] = np.full(n, 1e10)
     galaxies = both | {
         "redshift": z[0], "tau": 10 ** rng.uniform(-1, 0.3, n), "ebv": rng.uniform(0, 0.7, n),
         "age": np.minimum(10 ** rng.uniform(-1, 0.5, n), 0.8 * model.cosmology.age(z[0]).value),
@@ -160,14 +157,15 @@ def test_priors_of_classes_and_what_is_refused(fitters):
     assert table["class"][1] == ""
     assert np.isnan(table["probability_star"][1])
     refuses("two classes", compare_classes, {"star": fits["star"]})
-    with pytest.raises(ValueError, match="'star' of the same data as 'quasar', got other objects"):
-        compare_classes(fits | {"star": fits["star"][:3]})
     brighter = data.copy()
     brighter["wfc3.f125w"] = 1.01 * brighter["wfc3.f125w"]
-    with pytest.raises(ValueError, match="got other values of 'flux'"):
-        compare_classes(fits | {"star": fitters["star"].fit(brighter)})
-    fewer = BayesFitter(fitters["star"].grid, BANDS[1:]).fit(data)
-    refuses("got the bands", compare_classes, fits | {"star": fewer})
+    fewer = BayesFitter(fitters["star"].grid, BANDS[1:])
+    for other, text in (
+        (fits["star"][:3], "'star' of the same data as 'quasar', got other objects"),
+        (fitters["star"].fit(brighter), "got other values of 'flux'"),
+        (fewer.fit(data), "got the bands"),
+    ):
+        refuses(text, compare_classes, fits | {"star": other})
     for prior, text in (({"star": 1}, "of the classes"), ({"star": 0, "quasar": 0}, "not all 0")):
         refuses(text, compare_classes, fits, prior=prior)
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
+from helpers.grids import draw_photometry, make_grid
 from helpers.results import assert_same
 from miricigale.fitting import BayesFitter, fit_file
 from miricigale.utils.parallel import parallel_map
@@ -28,13 +29,13 @@ class Weighing(ProcessPoolExecutor):
 
 
 @pytest.fixture
-def grid(make_grid):
+def grid():
     # half a megabyte, as pickled
     return make_grid(n_z=20, n_tau=12, n_age=12, n_b=20)
 
 
 @pytest.fixture
-def photometry(grid, draw_photometry):
+def photometry(grid):
     return draw_photometry(grid, 90, missing=0.1)[0]
 
 
@@ -55,10 +56,9 @@ def test_two_dask_workers_give_the_numbers_of_one_process(grid, photometry, tmp_
     distributed = pytest.importorskip("distributed")
     fitter = BayesFitter(grid)
     whole = elsewhere(fitter, photometry) if processes else fitter.fit(photometry)
+    options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
     with (
-        distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, processes=processes, dashboard_address=None
-        ) as cluster,
+        distributed.LocalCluster(processes=processes, **options) as cluster,
         distributed.Client(cluster) as client,
     ):
         assert len(client.scheduler_info()["workers"]) == 2
@@ -69,9 +69,8 @@ def test_two_dask_workers_give_the_numbers_of_one_process(grid, photometry, tmp_
         assert len(n_done) == 2
         assert min(n_done.values()) > 0
         photometry.write(tmp_path / "catalog.fits")
-        results = fit_file(
-            fitter, tmp_path / "catalog.fits", tmp_path / "out", chunk_rows=50, executor=executor
-        )
+        options = {"chunk_rows": 50, "executor": executor}
+        results = fit_file(fitter, tmp_path / "catalog.fits", tmp_path / "out", **options)
         table = results.to_table()
     for name, column in whole.to_table().items():
         assert_array_equal(np.asarray(table[name]), np.asarray(column), err_msg=name)

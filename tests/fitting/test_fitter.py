@@ -1,4 +1,3 @@
-import itertools
 import math
 
 import astropy.units as u
@@ -6,11 +5,10 @@ import numpy as np
 import pytest
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
-from scipy.integrate import quad
 from scipy.stats import norm
 
 from helpers.errors import refuses
-from helpers.grids import cells, photometry_table
+from helpers.grids import cell_integrals, draw_photometry, make_grid, photometry_table
 from miricigale.fitting import BayesFitter, FitFlags, GridSettings, SamplerSettings, leave_out
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import FitWarning
@@ -30,7 +28,7 @@ def test_fixed_redshift_goes_to_the_nearest_node_or_is_flagged(grid, photometry)
     assert FitFlags.names(strict.flags[0]) == ["redshift_outside"]
 
 
-def test_rows_that_cannot_be_fitted_stay_in_place(grid, draw_photometry):
+def test_rows_that_cannot_be_fitted_stay_in_place(grid):
     table, _ = draw_photometry(grid, 7, noise=0.05)
     for name in grid.filters:
         table[name][0] = np.nan * u.uJy
@@ -45,13 +43,10 @@ def test_rows_that_cannot_be_fitted_stay_in_place(grid, draw_photometry):
     table["band0_err"][6] = 1e-3 * table["band0"][6]
     results = BayesFitter(grid, model_error=0.0).fit(table)
     names = [FitFlags.names(f) for f in results.flags]
-    assert names[0] == ["no_band"]
-    assert names[1] == ["few_bands"]
-    assert "bad_error" in names[2]
+    assert [names[i] for i in (0, 1, 4)] == [["no_band"], ["few_bands"], ["duplicate_id"]]
+    for i, name in ((2, "bad_error"), (5, "no_signal"), (6, "high_chi2")):
+        assert name in names[i]
     assert results.n_bands[2] == 4
-    assert names[4] == ["duplicate_id"]
-    assert "no_signal" in names[5]
-    assert "high_chi2" in names[6]
     assert list(results.ids) == list(table["id"])
     assert_array_equal(results.fitted, [0, 0, 1, 1, 0, 1, 1])
     out = results.to_table()
@@ -59,7 +54,7 @@ def test_rows_that_cannot_be_fitted_stay_in_place(grid, draw_photometry):
     assert np.isnan(out["mass_mean"][0])
 
 
-def test_a_band_that_is_not_fitted_is_predicted(grid, draw_photometry):
+def test_a_band_that_is_not_fitted_is_predicted(grid):
     table, truth = draw_photometry(grid, 10, noise=1e-3)
     table.remove_columns(["band3", "band3_err"])
     results = BayesFitter(grid, model_error=0.0).fit(table)
@@ -98,9 +93,9 @@ def test_bad_options_are_named(grid, options, error, text):
 def test_bad_photometry_is_named(grid, photometry):
     fitter = BayesFitter(grid)
     refuses("'photometry' must be a table with at least one of", fitter.fit, QTable({"id": [1]}))
-    some = photometry[[name for name in photometry.colnames if name != "band0_err"]]
+    some, bare = photometry.copy(), photometry.copy()
+    del some["band0_err"]
     refuses(r"'photometry' must be a table with the columns \['band0_err'\]", fitter.fit, some)
-    bare = photometry.copy()
     bare["band0"] = bare["band0"].value
     refuses("'photometry' column 'band0' must be convertible", fitter.fit, bare, error=u.UnitsError)
     refuses("'redshift' must be a column among", fitter.fit, photometry, redshift="z_best")
@@ -108,28 +103,16 @@ def test_bad_photometry_is_named(grid, photometry):
     refuses("'filters' and 'axes' must be given", BayesFitter, SEDModel.yang2021())
 
 
-def test_a_prior_that_leaves_nothing_is_flagged(grid, photometry):
-    from dataclasses import replace
-
-    none = replace(grid, allowed=np.zeros_like(grid.allowed))
-    results = BayesFitter(none).fit(photometry)
-    assert all(FitFlags.names(f) == ["no_model"] for f in results.flags)
-
-
 @pytest.mark.parametrize("filters", [None, ["band0", "band1"]])
 def test_what_is_no_table_is_named(grid, photometry, filters):
     fitter = BayesFitter(grid, filters)
-    for bad, wanted in (
-        (None, "a table, a dict of columns, .* got NoneType"),
-        ({"id": [1]}, "a table with"),
-    ):
-        refuses(f"'photometry' must be {wanted}", fitter.fit, bad)
-    with pytest.raises(ValueError, match=r"'redshift' must be numbers, got \['a', 'b'\]"):
-        fitter.fit(photometry[:2], redshift=["a", "b"])
+    refuses("'photometry' must be a table, a dict of columns, .* got NoneType", fitter.fit, None)
+    refuses("'photometry' must be a table with", fitter.fit, {"id": [1]})
+    text = r"'redshift' must be numbers, got \['a', 'b'\]"
+    refuses(text, fitter.fit, photometry[:2], redshift=["a", "b"])
     table = photometry.copy()
-    table["band0"] = np.full(len(table), 22.0) * u.ABmag
-    table["band0_err"] = np.full(len(table), 1.0) * u.K
-    wanted = r"column 'band0_err' must be convertible to uJy, got K"
+    table["band0"], table["band0_err"] = np.full(12, 22.0) * u.ABmag, np.ones(12) * u.K
+    wanted = "column 'band0_err' must be convertible to uJy, got K"
     refuses(wanted, fitter.fit, table, error=u.UnitsError)
 
 
@@ -161,23 +144,14 @@ def test_a_band_that_is_not_there_is_a_missing_band(grid, photometry):
 # ------------------------------------------------------------- densities of redshift, limits
 
 
-def test_a_density_weighs_the_redshifts_by_its_integral_over_their_cells(
-    make_grid, draw_photometry
-):
+def test_a_density_weighs_the_redshifts_by_its_integral_over_their_cells():
     """Posterior with p(z) = posterior with a flat prior times the integrals, by quadrature."""
     grid = make_grid(3, n_z=6)
     fitter = BayesFitter(grid, settings=GridSettings(rtol=0))
     table, _ = draw_photometry(grid, 5, seed=2)
     nodes = np.array([0.0, 0.4, 0.9, 2.0, 9.0])
     density = np.array([0.1, 2.0, 0.3, 0.5, 0.0])
-    z = grid.redshift
-    edges = cells(z, (0.0, np.inf))
-    weights = [
-        quad(lambda x: np.interp(x, nodes, density, right=0.0), a, b, points=nodes[1:-1])[0]
-        for a, b in itertools.pairwise(edges)
-    ]
-    flat = fitter.fit(table).pdf["redshift"]
-    want = flat * weights
+    want = fitter.fit(table).pdf["redshift"] * cell_integrals(grid.redshift, nodes, density)
     got = fitter.fit(table, redshift_prior=(nodes, density)).pdf["redshift"]
     assert_allclose(got, want / want.sum(axis=1, keepdims=True), rtol=1e-7, atol=1e-13)
     # one for each object is the same, row by row
@@ -185,17 +159,15 @@ def test_a_density_weighs_the_redshifts_by_its_integral_over_their_cells(
     assert_array_equal(each, got)
 
 
-def test_densities_that_cannot_be_used_are_flagged_or_refused(make_grid, draw_photometry):
+def test_densities_that_cannot_be_used_are_flagged_or_refused():
     grid = make_grid(3, n_z=6)
     fitter = BayesFitter(grid)
     table, _ = draw_photometry(grid, 4, seed=2)
     nodes = np.array([0.0, 50.0, 51.0])
     density = np.array([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0], [np.nan, 1.0, 1.0], [0.0, 0.0, 0.0]])
     got = fitter.fit(table, redshift_prior=(nodes, density))
-    names = [set(FitFlags.names(flag)) for flag in got.flags]
-    assert "no_model" in names[1]
-    assert "no_redshift" in names[2]
-    assert "no_redshift" in names[3]
+    for flag, name in zip(got.flags[1:], ("no_model", "no_redshift", "no_redshift"), strict=True):
+        assert name in FitFlags.names(flag)
     assert got.fitted.tolist() == [True, False, False, False]
     for prior, match in (
         ((nodes, density[:2]), "'redshift_prior' must be"),
@@ -204,11 +176,11 @@ def test_densities_that_cannot_be_used_are_flagged_or_refused(make_grid, draw_ph
         ("p_z", "'redshift_prior' must be"),
     ):
         refuses(match, fitter.fit, table, redshift_prior=prior)
-    with pytest.raises(ValueError, match="must not be given both"):
-        fitter.fit(table, redshift=1.0, redshift_prior=(nodes, density))
+    both = {"redshift": 1.0, "redshift_prior": (nodes, density)}
+    refuses("must not be given both", fitter.fit, table, **both)
 
 
-def test_choices_of_cigale(make_grid, draw_photometry):
+def test_choices_of_cigale():
     """No result where exp(-chi2 / 2) vanishes, no error below 5 %, no scatter of the scale."""
     grid = make_grid(3)
     table, _ = draw_photometry(grid, 4, seed=4)
@@ -235,7 +207,7 @@ def test_choices_of_cigale(make_grid, draw_photometry):
 
 
 @pytest.mark.parametrize("signal", [1.0, 2.9, 3.1, 30.0])
-def test_signal_to_noise_below_three_is_flagged(make_grid, signal):
+def test_signal_to_noise_below_three_is_flagged(signal):
     """Photometry that is a model of the grid has the S/N of its fluxes in quadrature."""
     grid = make_grid(2)
     galaxy = np.flatnonzero(grid.allowed[1])[-1]
@@ -258,10 +230,8 @@ def test_priors_may_be_distributions_and_functions_of_one_value(grid, photometry
     def of_one(tau):
         return math.exp(-0.5 * ((tau - 1.5) / 0.7) ** 2)
 
-    fits = [
-        BayesFitter(grid, priors={"tau": prior}).fit(photometry)
-        for prior in (normal, normal.pdf, density, of_one, density(nodes))
-    ]
+    priors = (normal, normal.pdf, density, of_one, density(nodes))
+    fits = [BayesFitter(grid, priors={"tau": prior}).fit(photometry) for prior in priors]
     for other in fits[1:]:
         assert_allclose(other.pdf["tau"], fits[0].pdf["tau"], rtol=1e-6)
     # the prior of tau is that of the mean posterior's ratio to one with a flat prior
@@ -287,12 +257,11 @@ def test_settings_that_mean_nothing_are_refused(options, message):
 
 
 def test_weights_and_pieces_have_no_unit_and_no_fraction(grid, photometry):
-    with pytest.raises(u.UnitsError, match=r"'priors\['tau'\]' must be convertible to"):
-        BayesFitter(grid, priors={"tau": np.ones(5) * u.Gyr})
+    fitter, priors = BayesFitter(grid), {"tau": np.ones(5) * u.Gyr}
+    text = r"'priors\['tau'\]' must be convertible to"
+    refuses(text, BayesFitter, grid, priors=priors, error=u.UnitsError)
     for size in (2.5, "a", True):
-        with pytest.raises(ValueError, match="'chunk_size' must be an integer >= 1"):
-            BayesFitter(grid).fit(photometry, chunk_size=size)
-    with pytest.raises(ValueError, match="'filters' must be a list of names or a FilterSet"):
-        BayesFitter(grid).fit(photometry).predict("band0")
-    with pytest.raises(ValueError, match="'bands' must be different names"):
-        leave_out(BayesFitter(grid), photometry, ["band1", "band1"])
+        refuses("'chunk_size' must be an integer >= 1", fitter.fit, photometry, chunk_size=size)
+    results, text = fitter.fit(photometry), "'filters' must be a list of names or a FilterSet"
+    refuses(text, results.predict, "band0")
+    refuses("'bands' must be different names", leave_out, fitter, photometry, 2 * ["band1"])

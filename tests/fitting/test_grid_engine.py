@@ -5,7 +5,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from helpers.grids import CASES, assert_plain, derived_quantities, photometry_table
+from helpers.grids import (
+    CASES,
+    assert_plain,
+    brute_force,
+    derived_quantities,
+    draw_photometry,
+    make_grid,
+    photometry_table,
+)
 from miricigale.fitting import BayesFitter, GridSettings
 
 MORE = {
@@ -21,7 +29,7 @@ MORE = {
 
 
 @pytest.mark.parametrize("case", [*CASES, *MORE])
-def test_every_sum_equals_the_plain_one(case, make_grid, draw_photometry):
+def test_every_sum_equals_the_plain_one(case):
     of_grid, of_fitter = (CASES | MORE)[case]
     grid = make_grid(3, **of_grid)
     prior_f = "uniform" if case == "prior_f by width" else "grid"
@@ -33,7 +41,7 @@ def test_every_sum_equals_the_plain_one(case, make_grid, draw_photometry):
 
 @pytest.mark.parametrize("noise", [1e-3, 0.03, 0.3, 3.0, 30.0])
 @pytest.mark.parametrize("model_error", [0.0, 0.1])
-def test_pruning_loses_no_more_than_asked(noise, model_error, make_grid, draw_photometry):
+def test_pruning_loses_no_more_than_asked(noise, model_error):
     grid = make_grid(7, n_tau=12, n_age=9)
     table, _ = draw_photometry(grid, 8, seed=11, noise=noise, missing=0.2)
     # the first row: nothing but noise, mostly negative
@@ -45,7 +53,7 @@ def test_pruning_loses_no_more_than_asked(noise, model_error, make_grid, draw_ph
 
 
 @pytest.mark.parametrize("n_bands", [1, 2, 3])
-def test_few_bands(n_bands, make_grid, draw_photometry, brute_force):
+def test_few_bands(n_bands):
     """With one band every model fits; with two, galaxy and torus are nearly parallel."""
     grid = make_grid(2)
     table, _ = draw_photometry(grid, 4, seed=4)
@@ -61,7 +69,7 @@ def test_few_bands(n_bands, make_grid, draw_photometry, brute_force):
             assert_allclose(results.pdf["redshift"][i], allowed / allowed.sum())
 
 
-def test_a_grid_of_one_model_has_the_closed_form(make_grid):
+def test_a_grid_of_one_model_has_the_closed_form():
     """s = sum(m F / sigma^2) / sum(m^2 / sigma^2), sigma_s = sum(m^2 / sigma^2)^(-1/2)."""
     grid = make_grid(n_z=1, n_tau=1, n_age=1, frac=[0.0])
     rng = np.random.default_rng(0)
@@ -85,7 +93,7 @@ def test_a_grid_of_one_model_has_the_closed_form(make_grid):
     assert results.fitted.all()
 
 
-def test_percentiles_of_derived_quantities(make_grid, draw_photometry, brute_force):
+def test_percentiles_of_derived_quantities():
     """Histogram of 0.01 dex against the sorted values of all models."""
     grid = make_grid(5, n_tau=12, n_age=9)
     fitter = BayesFitter(grid, scale_error=False)
@@ -105,19 +113,3 @@ def test_percentiles_of_derived_quantities(make_grid, draw_photometry, brute_for
             low, high = (values[order][np.minimum(p, order.size - 1)] for p in places)
             assert np.all(got >= low * 10**-0.011 - 1e-300), (name, i)
             assert np.all(got <= high * 10**0.011), (name, i)
-
-
-def test_galaxies_alone_weigh_one_over_the_number_of_fractions(make_grid, draw_photometry):
-    """If the AGN emits in no used band every fraction fits alike: the posterior is the prior."""
-    from dataclasses import replace
-
-    grid = make_grid(4)
-    dark = replace(grid, agn=np.zeros_like(grid.agn))
-    table, _ = draw_photometry(dark, 3)
-    results = BayesFitter(dark).fit(table)
-    assert_allclose(results.pdf["frac_agn"], 0.25, rtol=1e-6)
-    assert_allclose(results.pdf["temperature_polar"], 0.5, rtol=1e-6)
-    assert_allclose(results.pdf["ebv_polar"], 1 / 3, rtol=1e-6)
-    uniform = BayesFitter(dark, settings=GridSettings(prior_f="uniform")).fit(table)
-    width = np.diff([0.0, 0.1, 0.35, 0.7, 1.0])
-    assert_allclose(uniform.pdf["frac_agn"][0], width, rtol=1e-6)

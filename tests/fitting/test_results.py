@@ -8,9 +8,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
 from helpers.grids import photometry_table
-from helpers.results import assert_same_tables
+from helpers.results import assert_same, assert_same_tables
 from miricigale.fitting import BayesFitter, FitResults
-from miricigale.fitting.posterior import cell_edges, cell_percentiles, moments
+from miricigale.fitting.posterior import cell_edges
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import DataError
 
@@ -22,10 +22,9 @@ def results(grid, photometry):
 
 def test_table_has_units_descriptions_and_provenance(results, tmp_path):
     table = results.to_table()
-    assert table["mass_mean"].unit == u.Msun
-    assert table["sfr_p50"].unit == u.Msun / u.yr
-    assert table["accretion_power_std"].unit == u.W
-    assert table["age_p84"].unit == u.Gyr
+    units = {"mass_mean": u.Msun, "sfr_p50": u.Msun / u.yr, "age_p84": u.Gyr}
+    for name, unit in (units | {"accretion_power_std": u.W}).items():
+        assert table[name].unit == unit
     assert all(table[name].info.description for name in table.colnames)
     assert table.meta["fit"]["prior_f"] == "grid"
     assert "nobody" in table.meta["citations"]
@@ -40,16 +39,9 @@ def test_no_parameter_leaves_its_limits():
     """Reddening and time are not negative; a cell about the lowest node would reach below 0."""
     model = SEDModel.yang2021(libraries="bundled")
     bands = ["acs.f606w", "wfc3.f160w", "miri.f770w", "miri.f2100w"]
-    axes = {
-        "redshift": [1.0],
-        "tau": [0.1, 1.0] * u.Gyr,
-        "age": [0.1, 1.0] * u.Gyr,
-        "ebv": [0.0, 0.4] * u.mag,
-        "slope": [-0.4, 0.0],
-        "ebv_polar": [0.0, 0.3] * u.mag,
-        "temperature_polar": [100.0, 300.0] * u.K,
-        "frac_agn": [0.0, 0.5],
-    }
+    axes = {"redshift": [1.0], "slope": [-0.4, 0.0], "frac_agn": [0.0, 0.5]}
+    axes |= {"tau": [0.1, 1.0] * u.Gyr, "age": [0.1, 1.0] * u.Gyr, "ebv": [0.0, 0.4] * u.mag}
+    axes |= {"ebv_polar": [0.0, 0.3] * u.mag, "temperature_polar": [100.0, 300.0] * u.K}
     grid = model.grid(axes, bands, cache=False)
     flux = 1e10 * grid.flux(0, np.arange(grid.n_galaxies))
     results = BayesFitter(grid).fit(photometry_table(bands, flux, 0.05 * flux))
@@ -116,9 +108,8 @@ def test_write_and_read(results, tmp_path):
     results.write(path)
     again = FitResults.read(path)
     assert_same_tables(results.to_table(), again.to_table())
-    assert_array_equal(results.pdf_2d, again.pdf_2d)
+    assert_same(again, results)
     assert again.meta["fit"] == results.meta["fit"]
-    assert again[5].best["mass"] == results[5].best["mass"]
     refuses("already exists", results.write, path, error=OSError)
     results.write(path, overwrite=True)
 
@@ -129,8 +120,8 @@ def test_foreign_files_are_refused(grid, tmp_path):
     refuses("holds no fit results", FitResults.read, path, error=DataError)
     path.write_text("text")
     for name in ("grid.fits", "none.fits"):
-        with pytest.raises(DataError, match=f"{name} cannot be read as fit results: "):
-            FitResults.read(tmp_path / name)
+        text = f"{name} cannot be read as fit results: "
+        refuses(text, FitResults.read, tmp_path / name, error=DataError)
 
 
 def test_results_cannot_be_changed(results):
@@ -144,19 +135,6 @@ def test_cells():
     assert_allclose(cell_edges([0, 1, 3]), [-0.5, 0.5, 2, 4])
     assert_allclose(cell_edges([0, 1, 3], (0, 3.5)), [0, 0.5, 2, 3.5])
     assert_allclose(cell_edges([2.0]), [2, 2])
-
-
-def test_percentiles_of_a_uniform_distribution():
-    """Equal weights on equal cells: the percentiles are linear in the level."""
-    values = np.arange(10) + 0.5
-    pdf = np.full((2, 10), 0.1)
-    pdf[1] = np.nan
-    got = cell_percentiles(values, pdf, [0.05, 0.5, 0.999])
-    assert_allclose(got[0], [0.5, 5.0, 9.99])
-    assert np.isnan(got[1]).all()
-    mean, std = moments(values, pdf[:1])
-    assert mean[0] == pytest.approx(5.0)
-    assert std[0] == pytest.approx(np.sqrt(99 / 12))
 
 
 def test_results_draw_what_they_hold(results):

@@ -12,6 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import chi2
 
 from helpers.errors import refuses
+from helpers.grids import brute_force, draw_photometry, make_grid
 from helpers.results import assert_same_tables
 from miricigale.filters import FilterSet
 from miricigale.fitting import BayesFitter, GridSettings, Samples
@@ -19,14 +20,17 @@ from miricigale.sed import SED, SEDModel
 from miricigale.utils.exceptions import DataError
 
 BANDS = ["acs.f606w", "wfc3.f160w", "miri.f770w", "miri.f2100w"]
-AXES = {
-    "redshift": np.array([0.5, 1.0, 1.5]),
-    "age": np.array([1.0, 3.0]),
-    "ebv": np.array([0.1, 0.4]),
-    "frac_agn": np.array([0.0, 0.3, 0.8]),
-    "ebv_polar": np.array([0.0, 0.2]),
-    "temperature_polar": np.array([100.0, 200.0]),
-}
+AXES = {"redshift": [0.5, 1.0, 1.5], "age": [1.0, 3.0], "ebv": [0.1, 0.4]}
+AXES |= {"frac_agn": [0.0, 0.3, 0.8], "ebv_polar": [0.0, 0.2], "temperature_polar": [100.0, 200.0]}
+
+
+def values_at(grid, index):
+    """Values of the parameters of a draw."""
+    z, g, k, f = index
+    values = {"redshift": grid.redshift[z], "frac_agn": grid.frac_agn[f]}
+    for table, row in ((grid.galaxy_parameters, g), (grid.agn_parameters, k)):
+        values |= {name: table[name][row] for name in table.colnames}
+    return values
 
 
 def draw_models(grid, n=3, draws=40, seed=0):
@@ -116,17 +120,12 @@ def test_parameters_without_effect_have_their_prior(real):
 
 
 def test_fractions_in_both_definitions(real, model):
-    ir, dust = real.values("frac_agn_ir").value, real.values("frac_agn_dust").value
+
     for i, j in ((0, 3), (1, 11)):
-        z, g, k, f = real.index[i, j]
-        grid = real.grid
-        values = {"redshift": grid.redshift[z], "frac_agn": grid.frac_agn[f]}
-        for table, row in ((grid.galaxy_parameters, g), (grid.agn_parameters, k)):
-            values |= {name: table[name][row] for name in table.colnames}
-        derived = model.derived(**values)
-        assert ir[i, j] == pytest.approx(derived["frac_agn_ir"].value, rel=1e-9)
-        assert dust[i, j] == pytest.approx(derived["frac_agn_dust"].value, rel=1e-9)
-        assert real.values("a_v")[i, j].value == pytest.approx(derived["a_v"].value, rel=1e-9)
+        derived = model.derived(**values_at(real.grid, real.index[i, j]))
+        for name in ("frac_agn_ir", "frac_agn_dust", "a_v"):
+            got = real.values(name)[i, j].value
+            assert got == pytest.approx(derived[name].value, rel=1e-9), name
 
 
 def test_fluxes_in_bands_of_the_grid_and_others(real, model):
@@ -153,12 +152,7 @@ def test_fluxes_in_bands_of_the_grid_and_others(real, model):
 
 def test_spectra_against_single_models(real, model):
     i, j = 1, 4
-    z, g, k, f = real.index[i, j]
-    grid = real.grid
-    values = {"redshift": grid.redshift[z], "frac_agn": grid.frac_agn[f]}
-    for table, row in ((grid.galaxy_parameters, g), (grid.agn_parameters, k)):
-        values |= {name: table[name][row] for name in table.colnames}
-    sed = model.evaluate(**values, mass=real.scale[i, j])
+    sed = model.evaluate(**values_at(real.grid, real.index[i, j]), mass=real.scale[i, j])
     wave, observed = real.spectra("b", rest=False)
     inside = (wave > 0.2 * u.um) & (wave < 500 * u.um)
     want = sed.fnu_at(wave[inside]).value
@@ -208,10 +202,10 @@ def test_what_is_refused(real, model, samples):
     with pytest.raises(KeyError, match="no object with the id 'd' among 3"):
         real.loc["d"]
     refuses("no parameter 'mood'", real.values, "mood", error=KeyError)
-    with pytest.raises(ValueError, match="'model' must be an SEDModel"):
-        Samples(*args, real.index, real.scale).predict(["miri.f1500w"])
-    with pytest.raises(ValueError, match="'model' must be the one of the grid \\(components"):
-        real.with_model(SEDModel.yang2021(agn=False)).sed_band("a")
+    bare = Samples(*args, real.index, real.scale)
+    refuses("'model' must be an SEDModel", bare.predict, ["miri.f1500w"])
+    other = real.with_model(SEDModel.yang2021(agn=False))
+    refuses(r"'model' must be the one of the grid \(components", other.sed_band, "a")
     refuses(r"'key' must be .* got 'c' \(no_band\)", real.sed_band, "c")
     refuses("'filters' must be a list", real.predict, "miri.f770w")
     refuses("'levels' must be between 0 and 1", real.sed_band, "a", (16, 84))
@@ -244,20 +238,21 @@ def test_files_that_are_no_samples_are_refused(real, grid, samples, tmp_path):
     samples.write(path)
     with fits.open(path) as hdus:
         assert hdus[0].header["FORMAT"] == "miricigale-samples-1"
-    with pytest.raises(ValueError, match="'grid' must be the one of the samples, <ModelGrid 4 red"):
-        Samples.read(path, real.grid)
-    with pytest.raises(ValueError, match="'grid' must be the ModelGrid that was fitted, got str"):
-        Samples.read(path, "grid.fits")
+    text = "'grid' must be the one of the samples, <ModelGrid 4 red"
+    refuses(text, Samples.read, path, real.grid)
+    text = "'grid' must be the ModelGrid that was fitted, got str"
+    refuses(text, Samples.read, path, "grid.fits")
+    half = tmp_path / "half.fits"
     with fits.open(path) as hdus:
-        fits.HDUList([hdus[0], hdus["TEXT"]]).writeto(tmp_path / "half.fits")
-    with pytest.raises(DataError, match=r"half\.fits is not a complete file of samples"):
-        Samples.read(tmp_path / "half.fits", grid)
+        fits.HDUList([hdus[0], hdus["TEXT"]]).writeto(half)
+    text = r"half\.fits is not a complete file of samples"
+    refuses(text, Samples.read, half, grid, error=DataError)
     grid.write(path, overwrite=True)
     refuses("holds no samples", Samples.read, path, grid, error=DataError)
     refuses(r"absent\.fits", Samples.read, tmp_path / "absent.fits", grid, error=DataError)
 
 
-def test_draws_with_a_prior_keep_it_in_files(make_grid, draw_photometry, tmp_path):
+def test_draws_with_a_prior_keep_it_in_files(tmp_path):
     grid = make_grid()
     fitter = BayesFitter(grid, priors={"temperature_polar": [1.0, 3.0]})
     drawn = fitter.sample(draw_photometry(grid, 2)[0], 500, seed=4)
@@ -282,7 +277,7 @@ def test_draws_are_those_of_the_object_whatever_its_company(grid, photometry):
         refuses("'n_draws' must be an integer >= 1", fitter.sample, photometry, bad, seed=1)
 
 
-def test_draws_have_the_joint_posterior_of_all_models(make_grid, draw_photometry, brute_force):
+def test_draws_have_the_joint_posterior_of_all_models():
     """Frequencies of (galaxy, torus, fraction) against the weights of all models, by chi2."""
     grid = make_grid(3)
     table, _ = draw_photometry(grid, 3, seed=5)

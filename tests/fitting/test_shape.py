@@ -8,6 +8,7 @@ import pytest
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
+from helpers.grids import brute_force
 from helpers.results import assert_same
 from miricigale.fitting import BayesFitter, FitResults, GridSettings
 from miricigale.fitting.posterior import cell_percentiles
@@ -20,14 +21,9 @@ def with_shape(grid):
     tau = grid.galaxy_parameters["tau"].value
     color = rng.normal(0, 1, tau.size)
     color[::4] = -np.inf
-    table = QTable(
-        {
-            "a_v": tau * u.mag,
-            "u_v": color * u.mag,
-            "beta": np.full(tau.size, -2.0) * u.dimensionless_unscaled,
-            "age_mass": grid.galaxy_parameters["age"] * 0.7,
-        }
-    )
+    table = QTable({"a_v": tau * u.mag, "u_v": color * u.mag})
+    table["beta"] = np.full(tau.size, -2.0) * u.dimensionless_unscaled
+    table["age_mass"] = grid.galaxy_parameters["age"] * 0.7
     table["a_v"].info.description = "attenuation"
     return dataclasses.replace(grid, galaxy_shape=table)
 
@@ -42,7 +38,7 @@ def results(fitter, photometry):
     return fitter.fit(photometry)
 
 
-def test_mean_and_scatter_against_every_model(fitter, results, brute_force):
+def test_mean_and_scatter_against_every_model(fitter, results):
     table = fitter.grid.galaxy_shape
     for row in range(3):
         want = brute_force(fitter.grid, results.flux[row], results.sigma[row])["galaxy"]
@@ -60,15 +56,11 @@ def test_mean_and_scatter_against_every_model(fitter, results, brute_force):
 
 def test_a_quantity_that_equals_a_parameter_has_its_posterior(results):
     """A_V is tau here: the two differ in the distance of the kept levels only."""
-    for part in ("mean", "std"):
-        got, want = getattr(results, part)("a_v").value, getattr(results, part)("tau").value
-        assert_allclose(got, want, rtol=1e-9)
-    levels = [0.16, 0.5, 0.84]
-    got = results.percentile("a_v", levels).value
-    assert_allclose(got, results.percentile("tau", levels).value, rtol=1e-9)
-
-
-def test_a_single_value_has_no_scatter(results):
+    for part in (results.mean, results.std):
+        assert_allclose(part("a_v").value, part("tau").value, rtol=1e-9)
+    got, want = (results.percentile(name, [0.16, 0.5, 0.84]).value for name in ("a_v", "tau"))
+    assert_allclose(got, want, rtol=1e-9)
+    # a single value has no scatter
     assert_allclose(results.mean("beta").value, -2.0, rtol=1e-12)
     assert_array_equal(results.percentile("beta", 0.3).value, -2.0)
     assert_allclose(results.std("beta").value, 0.0, atol=1e-12)

@@ -1,6 +1,5 @@
 """Fits from file to file: the numbers of one call, in pieces that a later call resumes from."""
 
-import csv
 import json
 from concurrent.futures import Executor, Future
 from dataclasses import replace
@@ -13,6 +12,7 @@ from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
+from helpers.grids import draw_photometry
 from helpers.results import assert_joined, assert_same, assert_same_tables
 from miricigale.fitting import BayesFitter, FitFlags, fit_file, open_results
 from miricigale.utils.exceptions import DataError
@@ -52,7 +52,7 @@ def fitter(grid):
 
 
 @pytest.fixture
-def catalog(grid, draw_photometry):
+def catalog(grid):
     """Photometry with gaps, useless rows and ids that occur again, near and far."""
     table = draw_photometry(grid, 150, missing=0.15)[0]
     ids = [f"{'n' * (1 + i % 5)}{i}" for i in range(150)]
@@ -73,12 +73,23 @@ def on_disk(catalog, tmp_path):
     return tmp_path / "catalog.fits", tmp_path / "out"
 
 
+@pytest.fixture
+def in_pieces(fitter, tmp_path):
+    """Fit a catalog from a file of some kind, in a folder that begins anew."""
+
+    def fit(catalog, *, kind="fits", chunk_rows=40, delimiter=None, **options):
+        path = tmp_path / f"catalog.{kind}"
+        catalog.write(path, overwrite=True, **({"delimiter": delimiter} if delimiter else {}))
+        options = {"chunk_rows": chunk_rows, "resume": False, **options}
+        return fit_file(fitter, path, tmp_path / "out", **options)
+
+    return fit
+
+
 @pytest.mark.parametrize("chunk_rows", [1, 7, 64, 100, 1000])
-def test_the_pieces_are_one_fit_bit_for_bit(fitter, catalog, tmp_path, chunk_rows):
+def test_the_pieces_are_one_fit_bit_for_bit(fitter, catalog, in_pieces, chunk_rows):
     catalog = catalog[: 25 * chunk_rows]
-    catalog.write(tmp_path / "catalog.fits")
-    whole = fitter.fit(catalog)
-    results = fit_file(fitter, tmp_path / "catalog.fits", tmp_path / "out", chunk_rows=chunk_rows)
+    whole, results = fitter.fit(catalog), in_pieces(catalog, chunk_rows=chunk_rows)
     assert len(results.paths) == -(-len(catalog) // chunk_rows)
     assert_joined(results.parts(), whole)
     twice = (whole.flags & FitFlags.DUPLICATE_ID) > 0
@@ -86,64 +97,42 @@ def test_the_pieces_are_one_fit_bit_for_bit(fitter, catalog, tmp_path, chunk_row
 
 
 @pytest.mark.parametrize("how", ["column", "values", "prior", "priors", "prior column"])
-def test_redshifts_go_with_their_rows(fitter, catalog, tmp_path, how):
-    rng = np.random.default_rng(3)
+def test_redshifts_go_with_their_rows(fitter, catalog, in_pieces, how):
     nodes = np.linspace(0.0, 3.0, 7)
-    density = rng.uniform(0.1, 1.0, (len(catalog), 7))
-    options, options_file = {}, None
-    if how == "column":
-        options = {"redshift": "redshift"}
-    elif how == "values":
-        options = {"redshift": catalog["redshift"].tolist()}
-    elif how == "prior":
-        options = {"redshift_prior": (nodes, density[0])}
-    else:
-        options = {"redshift_prior": (nodes, density)}
-        if how == "prior column":
-            catalog["p_z"] = density
-            options_file = {"redshift_prior": (nodes, "p_z")}
-    catalog.write(tmp_path / "catalog.fits")
-    whole = fitter.fit(catalog, **options)
-    results = fit_file(
-        fitter,
-        tmp_path / "catalog.fits",
-        tmp_path / "out",
-        chunk_rows=40,
-        **(options_file or options),
-    )
-    assert_joined(results.parts(), whole)
+    catalog["p_z"] = density = np.random.default_rng(3).uniform(0.1, 1.0, (len(catalog), 7))
+    each = {"redshift_prior": (nodes, density)}
+    options = {
+        "column": {"redshift": "redshift"},
+        "values": {"redshift": catalog["redshift"].tolist()},
+        "prior": {"redshift_prior": (nodes, density[0])},
+        "prior column": {"redshift_prior": (nodes, "p_z")},
+    }.get(how, each)
+    whole = fitter.fit(catalog, **(each if how == "prior column" else options))
+    assert_joined(in_pieces(catalog, **options).parts(), whole)
 
 
-def test_text_tables_are_read_by_rows(fitter, catalog, tmp_path):
+def test_text_tables_are_read_by_rows(fitter, catalog, in_pieces):
     catalog["note"] = [f'a "note"\nof {i} lines' for i in range(len(catalog))]
     whole = fitter.fit(catalog)
     for delimiter in (" ", ","):
-        catalog.write(tmp_path / "catalog.ecsv", delimiter=delimiter, overwrite=True)
-        results = fit_file(
-            fitter, tmp_path / "catalog.ecsv", tmp_path / "out", chunk_rows=40, resume=False
-        )
+        results = in_pieces(catalog, kind="ecsv", delimiter=delimiter)
         assert_joined(results.parts(), whole)
 
 
-def test_csv_has_the_unit_that_is_given(fitter, catalog, tmp_path):
+def test_csv_has_the_unit_that_is_given(fitter, catalog, in_pieces, tmp_path):
     whole = fitter.fit(catalog)
-    path = tmp_path / "catalog.csv"
-    with open(path, "w", newline="") as stream:
-        writer = csv.writer(stream)
-        writer.writerow(catalog.colnames)
-        for row in catalog:
-            flux = [repr(float(row[c].to_value(u.nJy))) for c in catalog.colnames[1:-1]]
-            writer.writerow([row["id"], *flux, row["redshift"]])
-    results = fit_file(fitter, path, tmp_path / "out", chunk_rows=40, flux_unit=u.nJy)
+    for name in catalog.colnames[1:-1]:
+        catalog[name] = catalog[name].to(u.nJy)
+    results = in_pieces(catalog, kind="csv", flux_unit=u.nJy)
     assert len(list(results.parts())) == 4
     table, wanted = results.to_table(), whole.to_table()
     assert_array_equal(table["flags"], wanted["flags"])
     for name in ("redshift_mean", "mass_mean"):
         assert_allclose(table[name].value, wanted[name].value, rtol=1e-9)
-    with pytest.raises(u.UnitsError, match="must be convertible to uJy"):
-        fit_file(fitter, path, tmp_path / "no unit", chunk_rows=40)
-    with pytest.raises(u.UnitsError, match="'flux_unit' must be convertible to uJy, got mag"):
-        fit_file(fitter, path, tmp_path / "no unit", flux_unit="mag")
+    arguments = (fit_file, fitter, tmp_path / "catalog.csv", tmp_path / "no unit")
+    refuses("must be convertible to uJy", *arguments, error=u.UnitsError, chunk_rows=40)
+    text = "'flux_unit' must be convertible to uJy, got mag"
+    refuses(text, *arguments, error=u.UnitsError, flux_unit="mag")
 
 
 def test_a_stopped_fit_is_resumed(fitter, on_disk, catalog, tmp_path):
@@ -151,8 +140,8 @@ def test_a_stopped_fit_is_resumed(fitter, on_disk, catalog, tmp_path):
     whole = fitter.fit(catalog)
     with pytest.raises(Stopped):
         fit_file(*arguments, chunk_rows=40, executor=Counting(stop=3))
-    with pytest.raises(DataError, match=r"holds 2 of 4 parts: fit_file .* resumes"):
-        open_results(tmp_path / "out")
+    text = r"holds 2 of 4 parts: fit_file .* resumes"
+    refuses(text, open_results, tmp_path / "out", error=DataError)
     there = open_results(tmp_path / "out", partial=True)
     assert (len(there), there.complete) == (80, False)
     assert len(there.to_table()) == 80
@@ -186,18 +175,16 @@ def test_a_full_disk_is_reported_with_the_file_and_left_behind(
 ):
     path, out = on_disk
     whole = fitter.fit(catalog)
-    with (
-        pytest.raises(OSError, match=r"part-00000\.fits"),
-        full_disk(20000),
-    ):
-        fit_file(fitter, path, out, chunk_rows=80)
+    arguments = (fit_file, fitter, path, out)
+    with full_disk(20000):
+        refuses(r"part-00000\.fits", *arguments, error=OSError, chunk_rows=80)
     assert sorted(item.name for item in out.iterdir()) == MANIFESTS
-    with pytest.raises(OSError, match=r"fit\.lock"), full_disk(10):
-        fit_file(fitter, path, out, chunk_rows=80)
+    with full_disk(10):
+        refuses(r"fit\.lock", *arguments, error=OSError, chunk_rows=80)
     results = fit_file(fitter, path, out, chunk_rows=80)
     assert_joined(results.parts(), whole)
-    with pytest.raises(OSError, match=r"table\.fits'?$"), full_disk(20000):
-        results.write_table(tmp_path / "table.fits")
+    with full_disk(20000):
+        refuses(r"table\.fits'?$", results.write_table, tmp_path / "table.fits", error=OSError)
     assert sorted(item.name for item in tmp_path.iterdir()) == ["catalog.fits", "out"]
 
 
@@ -207,8 +194,8 @@ def test_parts_of_another_fit_are_refused(fitter, grid, on_disk, catalog):
     same = {"chunk_rows": 80, "redshift": "redshift"}
 
     def refused(match, fitter=fitter, **changes):
-        with pytest.raises(ValueError, match=rf"holds results of another fit: .*{match}"):
-            fit_file(fitter, path, out, **(same | changes))
+        text = rf"holds results of another fit: .*{match}"
+        refuses(text, fit_file, fitter, path, out, **(same | changes))
 
     # the same grid, made again, is the same
     fit_file(BayesFitter(replace(grid, meta=dict(grid.meta)), error_floor=0.01), path, out, **same)
@@ -250,10 +237,9 @@ def test_a_call_that_failed_at_once_binds_no_other(fitter, catalog, tmp_path):
     assert len(results) == len(catalog)
 
 
-def test_results_are_read_as_if_they_were_one(fitter, catalog, tmp_path):
-    catalog.write(tmp_path / "catalog.fits")
+def test_results_are_read_as_if_they_were_one(fitter, catalog, in_pieces, tmp_path):
     whole = fitter.fit(catalog)
-    fit_file(fitter, tmp_path / "catalog.fits", tmp_path / "out", chunk_rows=40)
+    in_pieces(catalog)
     results = open_results(tmp_path / "out")
     assert (len(results), results.complete) == (150, True)
     assert repr(results).startswith("<FitResultsFiles of 150 objects, ")
@@ -267,10 +253,9 @@ def test_results_are_read_as_if_they_were_one(fitter, catalog, tmp_path):
         assert_same(results[chosen], want)
     with pytest.raises(KeyError, match="no object with the id 'nobody' among 150"):
         results["nobody"]
-    wanted = whole.to_table()
-    results.write_table(tmp_path / "table.fits")
-    with pytest.raises(OSError, match="overwrite=True replaces it"):
-        results.write_table(tmp_path / "table.fits")
+    wanted, path = whole.to_table(), tmp_path / "table.fits"
+    results.write_table(path)
+    refuses("overwrite=True replaces it", results.write_table, path, error=OSError)
     written = QTable.read(tmp_path / "table.fits", character_as_bytes=False, mask_invalid=False)
     for table in (results.to_table(), written):
         assert_same_tables(table, wanted)
@@ -290,6 +275,16 @@ def test_a_catalog_without_rows_has_results_without_rows(fitter, catalog, tmp_pa
         assert len(QTable.read(tmp_path / "table.fits")) == 0
 
 
+def refused_at_once(match, fitter, path):
+    """The rows of a file are named, and nothing is fitted or written."""
+    executor, out = Counting(), path.parent / "out"
+    with pytest.raises(ValueError, match=match) as info:
+        fit_file(fitter, path, out, chunk_rows=40, flux_unit="uJy", executor=executor)
+    assert info.value.__notes__ == [f"in rows 120 to 149 of {path}"]
+    assert executor.n_tasks == 0
+    assert not out.exists()
+
+
 @pytest.mark.parametrize("suffix", ["ecsv", "csv"])
 def test_ids_that_parts_cannot_hold_are_refused_at_once(fitter, catalog, tmp_path, suffix):
     name = "Kümmel 3"
@@ -298,12 +293,7 @@ def test_ids_that_parts_cannot_hold_are_refused_at_once(fitter, catalog, tmp_pat
     catalog["id"] = ids
     path = tmp_path / f"catalog.{suffix}"
     catalog.write(path)
-    executor = Counting()
-    with pytest.raises(ValueError, match=rf"'photometry' must be ASCII.* got '{name}'") as info:
-        fit_file(fitter, path, tmp_path / "out", chunk_rows=40, flux_unit="uJy", executor=executor)
-    assert info.value.__notes__ == [f"in rows 120 to 149 of {path}"]
-    assert executor.n_tasks == 0
-    assert not (tmp_path / "out").exists()
+    refused_at_once(rf"'photometry' must be ASCII.* got '{name}'", fitter, path)
     # in memory they are as good as others
     assert fitter.fit(catalog)[name].ids == name
 
@@ -312,19 +302,12 @@ def test_ids_that_parts_cannot_hold_are_refused_at_once(fitter, catalog, tmp_pat
     ("start", "match"),
     [("é".encode(), "'photometry' must be ASCII.* got 'é"), (b"\xe9n", "bytes of text in UTF-8")],
 )
-def test_ids_in_fits_that_are_no_ascii_are_refused_at_once(fitter, catalog, tmp_path, start, match):
-    path = tmp_path / "catalog.fits"
-    catalog.write(path)
-    key = catalog["id"][149].encode()
+def test_ids_in_fits_that_are_no_ascii_are_refused_at_once(fitter, on_disk, catalog, start, match):
+    path, key = on_disk[0], catalog["id"][149].encode()
     data = path.read_bytes()
     assert data.count(key) == 1
     path.write_bytes(data.replace(key, start + key[2:]))
-    executor = Counting()
-    with pytest.raises(ValueError, match=match) as info:
-        fit_file(fitter, path, tmp_path / "out", chunk_rows=40, executor=executor)
-    assert info.value.__notes__ == [f"in rows 120 to 149 of {path}"]
-    assert executor.n_tasks == 0
-    assert not (tmp_path / "out").exists()
+    refused_at_once(match, fitter, path)
 
 
 def test_a_fit_that_was_killed_at_its_first_moment_is_resumed(fitter, on_disk):
@@ -381,16 +364,12 @@ def test_links_are_not_followed(fitter, on_disk, tmp_path):
     assert (tmp_path / "victim").read_text() == "mine"
 
 
-def test_numbers_as_ids(fitter, catalog, tmp_path):
+def test_numbers_as_ids(fitter, catalog, in_pieces):
     for kind in (np.uint64, np.int32, float):
         ids = np.arange(150).astype(kind)
         ids[100] = ids[2]
         catalog["id"] = ids
-        catalog.write(tmp_path / "catalog.fits", overwrite=True)
-        results = fit_file(
-            fitter, tmp_path / "catalog.fits", tmp_path / "out", chunk_rows=40, resume=False
-        )
-        assert_joined(results.parts(), fitter.fit(catalog))
+        assert_joined(in_pieces(catalog).parts(), fitter.fit(catalog))
 
 
 def test_what_cannot_be_read_by_rows_is_refused(fitter, catalog, tmp_path):
@@ -422,8 +401,8 @@ def test_what_cannot_be_read_by_rows_is_refused(fitter, catalog, tmp_path):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.tex").write_text("mine")
     for resume in (True, False):
-        with pytest.raises(DataError, match="is not empty and is no fit's folder"):
-            fit_file(fitter, good, tmp_path / "full", resume=resume)
+        arguments = (fit_file, fitter, good, tmp_path / "full")
+        refuses("is not empty and is no fit", *arguments, error=DataError, resume=resume)
     assert (tmp_path / "full" / "thesis.tex").read_text() == "mine"
     refuses("need a folder of their own", fit_file, fitter, good, good, error=DataError)
 

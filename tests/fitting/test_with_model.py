@@ -8,21 +8,14 @@ from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
-from helpers.grids import other_fraction, photometry_table
+from helpers.grids import draw_photometry, other_fraction, photometry_table
 from miricigale.fitting import BayesFitter, FitResults
 from miricigale.sed import SEDModel
 
 NAMES = ["acs.f606w", "acs.f814w", "wfc3.f125w", "wfc3.f160w", "irac.ch1", "irac.ch2"]
 NAMES += ["miri.f770w", "miri.f1000w", "miri.f1500w", "miri.f2100w"]
-AXES = {
-    "redshift": np.array([0.5, 1.0, 1.5, 2.0]),
-    "tau": np.array([0.5, 3.0]),
-    "age": np.array([1.0, 3.0]),
-    "ebv": np.array([0.1, 0.4]),
-    "frac_agn": np.array([0.0, 0.3, 0.8]),
-    "ebv_polar": np.array([0.0, 0.2]),
-    "temperature_polar": np.array([100.0, 200.0]),
-}
+AXES = {"redshift": [0.5, 1.0, 1.5, 2.0], "tau": [0.5, 3.0], "age": [1.0, 3.0], "ebv": [0.1, 0.4]}
+AXES |= {"frac_agn": [0.0, 0.3, 0.8], "ebv_polar": [0.0, 0.2], "temperature_polar": [100.0, 200.0]}
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +23,7 @@ def fitter():
     return BayesFitter(SEDModel.yang2021(), NAMES, axes=AXES)
 
 
-def test_the_best_spectrum_has_the_best_fluxes(fitter, draw_photometry, tmp_path):
+def test_the_best_spectrum_has_the_best_fluxes(fitter, tmp_path):
     from miricigale.filters import FilterSet
 
     table, _ = draw_photometry(fitter.grid, 4, noise=0.02)
@@ -47,17 +40,11 @@ def test_the_best_spectrum_has_the_best_fluxes(fitter, draw_photometry, tmp_path
     assert_allclose(sed.fnu.value, results[0].best_sed().fnu.value)
 
 
-def test_every_combination_of_values_counts_as_one_model(draw_photometry):
+def test_every_combination_of_values_counts_as_one_model():
     # as in CIGALE: without AGN light, each torus and each polar dust is a model of its own
-    axes = {
-        "redshift": np.array([0.8, 1.0]),
-        "ebv": np.array([0.1, 0.4]),
-        "alpha": np.array([1.0, 2.5]),
-        "frac_agn": np.array([0.0, 0.1, 0.4]),
-        "tau97": np.array([3.0, 7.0, 11.0]),
-        "ebv_polar": np.array([0.0, 0.2]),
-        "temperature_polar": np.array([100.0, 300.0]),
-    }
+    axes = {"redshift": [0.8, 1.0], "ebv": [0.1, 0.4], "alpha": [1.0, 2.5], "ebv_polar": [0.0, 0.2]}
+    axes |= {"frac_agn": [0.0, 0.1, 0.4], "tau97": [3.0, 7.0, 11.0]}
+    axes["temperature_polar"] = [100.0, 300.0]
     model = SEDModel.yang2021(libraries="bundled")
     fitter = BayesFitter(model, NAMES, axes=axes)
     table, _ = draw_photometry(fitter.grid, 4, noise=0.3)
@@ -81,17 +68,16 @@ def test_every_combination_of_values_counts_as_one_model(draw_photometry):
 @pytest.mark.parametrize(
     ("definition", "name"), [("dust", "frac_agn_ir"), ("3-1000um", "frac_agn_dust")]
 )
-def test_agn_fraction_in_the_other_definition(definition, name, draw_photometry):
+def test_agn_fraction_in_the_other_definition(definition, name):
     """That of the spectrum of the best model, and of draws, also without dust in the galaxy."""
     model = SEDModel.yang2021(libraries="bundled", frac_agn_definition=definition)
-    axes = AXES | {"ebv": np.array([0.0, 0.4]), "frac_agn": np.array([0.0, 0.1, 0.6])}
+    axes = AXES | {"ebv": [0.0, 0.4], "frac_agn": [0.0, 0.1, 0.6]}
     fitter = BayesFitter(model, NAMES, axes=axes)
     table, _ = draw_photometry(fitter.grid, 12, noise=0.1)
     results, samples = fitter.fit(table), fitter.sample(table, 3000, seed=2)
     assert results.parameters[-1] == name
     for result in results:
-        sed = result.best_sed()
-        derived = sed.meta["derived"]
+        derived = result.best_sed().meta["derived"]
         assert result.best[name].value == pytest.approx(derived[name].value, abs=1e-9)
         if result.best["frac_agn"] > 0 and derived["dust_luminosity"].value > 0:
             assert result.best[name] != result.best["frac_agn"]
@@ -118,7 +104,7 @@ def test_agn_fraction_in_the_other_definition(definition, name, draw_photometry)
     assert samples.description(name) in column.info.description
 
 
-def test_plot_sed(fitter, draw_photometry):
+def test_plot_sed(fitter):
     import matplotlib.pyplot as plt
 
     table, _ = draw_photometry(fitter.grid, 1, noise=0.05)

@@ -1,9 +1,12 @@
 """Small random grids, and plain sums over all their models, which fits are held against."""
 
+import itertools
+
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 from numpy.testing import assert_allclose
+from scipy.integrate import quad
 from scipy.stats import norm
 
 from miricigale.sed import ModelGrid
@@ -109,6 +112,13 @@ def cells(values, bounds):
     middle = (values[1:] + values[:-1]) / 2
     first, last = 2 * values[0] - middle[0], 2 * values[-1] - middle[-1]
     return np.array([max(first, bounds[0]), *middle, min(last, bounds[1])])
+
+
+def cell_integrals(values, nodes, density):
+    """Integrals over the cells of redshifts of a density that is linear between its nodes."""
+    edges = cells(values, (0.0, np.inf))
+    options = {"args": (nodes, density), "points": nodes[1:-1]}
+    return np.array([quad(np.interp, a, b, **options)[0] for a, b in itertools.pairwise(edges)])
 
 
 def node_weights(values, prior):

@@ -10,9 +10,8 @@ IMAGES = {"images": {"enabled": True}}
 
 
 def test_the_text_gives_the_configuration_back(tmp_path):
-    config = load_plan(
-        overrides={"exposures": {"bands": ["miri.f770w"], "time": 900, "dithers": 2}}
-    )
+    exposures = {"bands": ["miri.f770w"], "time": 900, "dithers": 2}
+    config = load_plan(overrides={"exposures": exposures})
     path = tmp_path / "plan.toml"
     path.write_text(config.to_toml())
     assert load_plan(path) == config

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from helpers.figures import legend_texts, line_data
 from miricigale.filters import FilterSet
@@ -10,7 +11,7 @@ def test_curves_are_drawn_with_their_names(ax):
     curves = [([1, 2, 3], [0.1, 0.5, 0.2], "one"), ([2, 4], [0.3, 0.4], "two")]
     assert plot_filters(iter(curves), ax=ax, linestyle="--") is ax
     for got, (wave, throughput, _) in zip(line_data(ax, "--"), curves, strict=True):
-        np.testing.assert_array_equal(got, np.transpose([wave, throughput]))
+        assert_array_equal(got, np.transpose([wave, throughput]))
     assert legend_texts(ax) == ["one", "two"]
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("wavelength (µm)", "throughput")
 

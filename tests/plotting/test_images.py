@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import AsinhNorm, Normalize
 from matplotlib.figure import Figure
+from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
 from helpers.figures import line_data
@@ -42,7 +43,7 @@ def test_axes_are_in_arcsec_about_the_middle(image, ax):
 def test_an_image_is_drawn_as_it_is(image, ax):
     plot_image(image, ax=ax, title="F770W", colorbar="MJy/sr", cmap="magma", softening=3.0)
     (drawn,) = ax.images
-    np.testing.assert_array_equal(drawn.get_array(), image)
+    assert_array_equal(drawn.get_array(), image)
     assert drawn.origin == "lower"
     assert drawn.get_cmap().name == "magma"
     assert isinstance(drawn.norm, AsinhNorm)
@@ -67,7 +68,7 @@ def test_ticks_of_a_color_bar_stand_apart_and_are_plain_numbers(image, ax, top):
     places = np.sort([drawn.norm(tick) for tick in bar.get_ticks()])
     assert np.diff(places).min() > 0.08
     texts = [text.get_text() for text in bar.ax.get_yticklabels()]
-    np.testing.assert_allclose(np.array(texts, float), bar.get_ticks(), rtol=0.05)
+    assert_allclose(np.array(texts, float), bar.get_ticks(), rtol=0.05)
     assert not any("e" in text for text in texts)
     assert bar.ax.get_ylabel() == "flux"
 
@@ -140,15 +141,15 @@ def test_offsets_are_arrows_over_those_of_the_map(ax):
     xy, offset = [[10.0, 20.0], [50.0, 30.0], [70.0, 40.0]], [[0.01, 0.0], [0.0, 0.02], [9.0, 9.0]]
     assert plot_offsets(xy, offset, Field(), used=[True, True, False], ax=ax, title="map") is ax
     smooth, arrows = ax.collections
-    np.testing.assert_allclose(smooth.U, 0.01 + 1e-4 * smooth.X)
-    np.testing.assert_allclose(smooth.V, -0.02)
+    assert_allclose(smooth.U, 0.01 + 1e-4 * smooth.X)
+    assert_allclose(smooth.V, -0.02)
     # every tenth pixel of the longer side
     assert np.diff(np.unique(smooth.X)) == pytest.approx(10.0)
-    np.testing.assert_allclose(arrows.get_offsets(), xy[:2])
-    np.testing.assert_allclose(np.transpose([arrows.U, arrows.V]), offset[:2])
+    assert_allclose(arrows.get_offsets(), xy[:2])
+    assert_allclose(np.transpose([arrows.U, arrows.V]), offset[:2])
     # one scale for both
     assert arrows.scale == smooth.scale
-    np.testing.assert_allclose(line_data(ax, "x"), [xy[2:]])
+    assert_allclose(line_data(ax, "x"), [xy[2:]])
     assert (ax.get_xlim(), ax.get_ylim()) == ((-0.5, 119.5), (-0.5, 59.5))
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("x (pixels)", "y (pixels)")
     (key,) = ax.artists

@@ -3,6 +3,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from matplotlib.lines import CARETDOWNBASE
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import norm
 
 from helpers.figures import error_bars, legend_texts, line_data
@@ -28,7 +29,7 @@ def pair():
 def test_density_integrates_to_one(ax):
     assert plot_pdf([0.0, 1.0, 3.0], [0.5, 0.5], ax=ax, label="x", truth=1.0) is ax
     values, edges, _ = ax.patches[0].get_data()
-    np.testing.assert_array_equal(edges, [0.0, 1.0, 3.0])
+    assert_array_equal(edges, [0.0, 1.0, 3.0])
     assert np.sum(values * np.diff(edges)) == pytest.approx(1.0)
     assert line_data(ax, "--")[0][:, 0].tolist() == [1.0, 1.0]
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("x", "probability density")
@@ -38,8 +39,8 @@ def test_density_integrates_to_one(ax):
 def test_a_logarithmic_density_is_one_in_dex(ax):
     plot_pdf([1.0, 10.0, 1000.0] * u.Gyr, [0.5, 0.5], ax=ax, label="age", log=True)
     values, edges, _ = ax.patches[0].get_data()
-    np.testing.assert_allclose(values, [0.5, 0.25])
-    np.testing.assert_array_equal(edges, [1.0, 10.0, 1000.0])
+    assert_allclose(values, [0.5, 0.25])
+    assert_array_equal(edges, [1.0, 10.0, 1000.0])
     assert ax.get_xscale() == "log"
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("age (Gyr)", "probability density per dex")
 
@@ -59,11 +60,11 @@ def test_outline_holds_the_stated_part(ax):
     # a single cell: four sides
     sides = np.array(ax.collections[-1].get_segments())
     assert sides.shape == (4, 2, 2)
-    np.testing.assert_array_equal(np.unique(sides[..., 0]), [2.0, 3.0])
-    np.testing.assert_array_equal(np.unique(sides[..., 1]), [1.0, 2.0])
+    assert_array_equal(np.unique(sides[..., 0]), [2.0, 3.0])
+    assert_array_equal(np.unique(sides[..., 1]), [1.0, 2.0])
     # cells of unit area
-    np.testing.assert_array_equal(ax.collections[0].get_array(), weights.T)
-    np.testing.assert_array_equal(line_data(ax, "x"), [[[2.5, 1.5]]])
+    assert_array_equal(ax.collections[0].get_array(), weights.T)
+    assert_array_equal(line_data(ax, "x"), [[[2.5, 1.5]]])
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("a", "b")
 
 
@@ -92,13 +93,13 @@ def test_photometry_with_and_without_residuals(ax, pair):
     assert (top, bottom) == pair
     assert (top.get_xscale(), top.get_yscale()) == ("log", "log")
     xy, low, high = error_bars(top)[0]
-    np.testing.assert_allclose(xy, [[1.0, 1.0]])
-    np.testing.assert_allclose((low, high), ([0.9], [1.1]))
-    np.testing.assert_allclose(line_data(top, "s")[0], [[1, 1.1], [4, 0.5], [15, 3.0]])
+    assert_allclose(xy, [[1.0, 1.0]])
+    assert_allclose((low, high), ([0.9], [1.1]))
+    assert_allclose(line_data(top, "s")[0], [[1, 1.1], [4, 0.5], [15, 3.0]])
     # a flux that is not positive: two errors
-    np.testing.assert_allclose(line_data(top, "v")[0], [[4.0, 2.0]])
+    assert_allclose(line_data(top, "v")[0], [[4.0, 2.0]])
     pulls = line_data(bottom, "o")[0]
-    np.testing.assert_allclose(pulls, [[1.0, -1.0], [4.0, -1.0], [15.0, np.nan]])
+    assert_allclose(pulls, [[1.0, -1.0], [4.0, -1.0], [15.0, np.nan]])
     assert top.get_title() == "x"
     assert top.get_ylabel() == "flux density (µJy)"
     assert bottom.get_ylabel() == "residual (sigma)"
@@ -121,11 +122,8 @@ def test_bands_that_were_not_fitted_are_open(pair):
     flux = np.array([1.0, 2.0, 3.0]) * u.uJy
     top, bottom = plot_sed_fit(WAVE, flux, 0.1 * flux, flux, used=[True, False, True], ax=pair)
     for axes, lines in ((top, [bar.lines[0] for bar in top.containers]), (bottom, bottom.lines)):
-        styles = {
-            tuple(line.get_xdata()): line.get_fillstyle()
-            for line in lines
-            if line.get_marker() == "o"
-        }
+        points = [line for line in lines if line.get_marker() == "o"]
+        styles = {tuple(line.get_xdata()): line.get_fillstyle() for line in points}
         assert styles == {(1.0, 15.0): "full", (4.0,): "none"}, axes
 
 
@@ -146,8 +144,8 @@ def test_parts_and_groups_stand_in_the_legend(ax):
     assert labels[:2] == ["best model", "AGN"]
     assert {"old", "MIRI"} < set(labels)
     drawn = {line.get_label(): line.get_xydata() for line in ax.lines}
-    np.testing.assert_allclose(drawn["best model"], np.transpose([WAVE.value, flux.value]))
-    np.testing.assert_allclose(drawn["AGN"], np.transpose([WAVE.value, 0.1 * flux.value]))
+    assert_allclose(drawn["best model"], np.transpose([WAVE.value, flux.value]))
+    assert_allclose(drawn["AGN"], np.transpose([WAVE.value, 0.1 * flux.value]))
     points = {bar.get_label(): bar.lines[0] for bar in ax.containers}
     assert points["old"].get_xdata().tolist() == [1.0, 4.0]
     assert points["MIRI"].get_xdata().tolist() == [15.0]
@@ -161,26 +159,22 @@ def test_percentiles_are_bands_about_a_line(ax, rest):
     assert plot_sed_band(WAVE, bands, ax=ax, rest=rest, label="median") is ax
     # nu L_nu in W, or F_nu in uJy
     scale = 299792458e6 / WAVE.value if rest else np.full(3, 1e3)
-    np.testing.assert_allclose(ax.lines[0].get_xydata().T, [WAVE.value, scale * [1.0, 2.0, 4.0]])
+    assert_allclose(ax.lines[0].get_xydata().T, [WAVE.value, scale * [1.0, 2.0, 4.0]])
     for drawn, low, high in zip(ax.collections, (0.5, 0.8), (2.0, 1.3), strict=True):
         corners = drawn.get_paths()[0].vertices
         for x, s, y in zip(WAVE.value, scale, (1.0, 2.0, 4.0), strict=True):
             at = corners[corners[:, 0] == x, 1]
             assert (at.min(), at.max()) == pytest.approx((low * s * y, high * s * y))
     assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
-    x_label, y_label = (
-        ("rest wavelength (µm)", r"$\nu L_\nu$ (W)")
-        if rest
-        else ("observed wavelength (µm)", "flux density (µJy)")
-    )
+    x_label = "rest wavelength (µm)" if rest else "observed wavelength (µm)"
+    y_label = r"$\nu L_\nu$ (W)" if rest else "flux density (µJy)"
     assert (ax.get_xlabel(), ax.get_ylabel()) == (x_label, y_label)
     assert ax.lines[0].get_label() == "median"
 
 
 def test_two_percentiles_are_one_band_that_has_the_label(ax):
-    plot_sed_band(
-        WAVE, [np.ones(3) * u.uJy, 2 * np.ones(3) * u.uJy], ax=ax, rest=False, label="68 %"
-    )
+    bands = [np.ones(3) * u.uJy, 2 * np.ones(3) * u.uJy]
+    plot_sed_band(WAVE, bands, ax=ax, rest=False, label="68 %")
     assert len(ax.lines) == 0
     assert [band.get_label() for band in ax.collections] == ["68 %"]
 
@@ -193,10 +187,10 @@ def test_recovered_values_stand_over_the_true_ones(ax, log):
         true, mean, std = [*true, 0.0, 3.0], [*mean, 2.0, -1.0], [*std, 0.1, 0.1]
     assert plot_recovery(true, mean, std, ax=ax, name="age", unit="Gyr", log=log) is ax
     ((xy, low, high),) = error_bars(ax)
-    np.testing.assert_allclose(xy, [[1.0, 1.1], [4.0, 3.8]])
-    np.testing.assert_allclose((low, high), ([1.0, 3.5], [1.2, 4.1]))
+    assert_allclose(xy, [[1.0, 1.1], [4.0, 3.8]])
+    assert_allclose((low, high), ([1.0, 3.5], [1.2, 4.1]))
     (equality,) = line_data(ax, "-")
-    np.testing.assert_array_equal(equality, [[1.0, 1.0], [4.0, 4.0]])
+    assert_array_equal(equality, [[1.0, 1.0], [4.0, 4.0]])
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("true age (Gyr)", "recovered age (Gyr)")
     assert (ax.get_xscale(), ax.get_yscale()) == 2 * ("log" if log else "linear",)
 
@@ -205,7 +199,7 @@ def test_pulls_are_a_density_beside_the_gaussian(ax):
     pull = [0.1, 0.2, -0.3, 9.0, -7.0, np.nan]
     assert plot_pulls(pull, ax=ax, label="F770W") is ax
     x, y = ax.lines[0].get_data()
-    np.testing.assert_allclose(y, norm.pdf(x))
+    assert_allclose(y, norm.pdf(x))
     # half a sigma wide, the outermost with all that lies beyond: two, one, and one at each end
     corners = ax.patches[0].get_xy()
     for place, n in ((0.25, 2), (-0.25, 1), (4.75, 1), (-4.75, 1), (2.25, 0)):

@@ -1,5 +1,6 @@
 import numpy as np
 from matplotlib.colors import AsinhNorm
+from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.figures import line_data
 from miricigale.plotting.scene import plot_scene
@@ -11,12 +12,12 @@ IMAGE[10, 20] = 8.0
 def test_an_image_is_drawn_about_its_median_with_marks(ax):
     assert plot_scene(IMAGE, ax=ax, marks=([1.0, 7.0], [2.0, 3.0]), label="MJy/sr") is ax
     (drawn,) = ax.images
-    np.testing.assert_array_equal(drawn.get_array(), IMAGE - np.median(IMAGE))
+    assert_array_equal(drawn.get_array(), IMAGE - np.median(IMAGE))
     assert isinstance(drawn.norm, AsinhNorm)
     assert drawn.origin == "lower"
     low, high = np.percentile(IMAGE, [2, 99.9]) - np.median(IMAGE)
-    np.testing.assert_allclose((drawn.norm.vmin, drawn.norm.vmax), (low, high))
-    np.testing.assert_array_equal(line_data(ax, "o")[0], [[1.0, 2.0], [7.0, 3.0]])
+    assert_allclose((drawn.norm.vmin, drawn.norm.vmax), (low, high))
+    assert_array_equal(line_data(ax, "o")[0], [[1.0, 2.0], [7.0, 3.0]])
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("x [pixel]", "y [pixel]")
     # the label states what was subtracted
     assert drawn.colorbar.ax.get_ylabel() == f"MJy/sr - {np.median(IMAGE):.4g}"
@@ -25,7 +26,7 @@ def test_an_image_is_drawn_about_its_median_with_marks(ax):
 def test_limits_of_the_colors_are_those_asked_for(ax):
     plot_scene(IMAGE, ax=ax, vmin=4.0, vmax=6.0, cmap="viridis", label="MJy/sr")
     (drawn,) = ax.images
-    np.testing.assert_array_equal(drawn.get_array(), IMAGE)
+    assert_array_equal(drawn.get_array(), IMAGE)
     assert (drawn.norm.vmin, drawn.norm.vmax) == (4.0, 6.0)
     assert drawn.get_cmap().name == "viridis"
     assert drawn.colorbar.ax.get_ylabel() == "MJy/sr"

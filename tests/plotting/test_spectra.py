@@ -1,4 +1,5 @@
 import numpy as np
+from numpy.testing import assert_array_equal
 
 from miricigale.plotting.spectra import plot_spectrum
 
@@ -6,8 +7,8 @@ from miricigale.plotting.spectra import plot_spectrum
 def test_a_spectrum_on_logarithmic_axes_leaves_out_what_is_not_positive(ax):
     assert plot_spectrum([1.0, 2.0, 4.0], [3.0, -1.0, 0.0], ax=ax, label="model") is ax
     (line,) = ax.lines
-    np.testing.assert_array_equal(line.get_xdata(), [1.0, 2.0, 4.0])
-    np.testing.assert_array_equal(line.get_ydata(), [3.0, np.nan, np.nan])
+    assert_array_equal(line.get_xdata(), [1.0, 2.0, 4.0])
+    assert_array_equal(line.get_ydata(), [3.0, np.nan, np.nan])
     assert line.get_label() == "model"
     assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("observed wavelength (µm)", r"$F_\nu$ (µJy)")

@@ -18,7 +18,6 @@ from miricigale.planning.exposures import band_plans
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow.background import background_text
 from miricigale.workflow.config import StudyConfig, load_config
-from miricigale.workflow.page.provenance import _background_sentence
 from miricigale.workflow.stages.exposures import (
     background_options,
     study_background,
@@ -38,9 +37,8 @@ COSMOS = {"ra": 150.1, "dec": 2.2}
 
 
 def study(**scene):
-    return StudyConfig.from_dict(
-        {"exposures": {"filters": BANDS}, "pointing": COSMOS, "scene": scene}
-    )
+    sections = {"exposures": {"filters": BANDS}, "pointing": COSMOS}
+    return StudyConfig.from_dict({**sections, "scene": scene})
 
 
 def plan(**background):
@@ -84,9 +82,8 @@ def test_a_level_is_what_it_says_in_any_unit():
     config = study(background=["12.5 MJy/sr", "0.3 GJy / sr"])
     assert study_background(config, BANDS[0]).value == pytest.approx(12.5)
     assert study_background(config, BANDS[1]).value == pytest.approx(300.0)
-    assert background_text(**background_options(config)) == (
-        "F770W: 12.5 MJy / sr, as given; F2100W: 300 MJy / sr, as given"
-    )
+    told = background_text(**background_options(config))
+    assert told == "F770W: 12.5 MJy / sr, as given; F2100W: 300 MJy / sr, as given"
 
 
 @pytest.mark.parametrize(
@@ -116,33 +113,29 @@ def test_a_plan_refuses_the_same():
 
 def test_a_day_that_cannot_be_is_refused_before_anything_is_made(monkeypatch):
     # the Sun is near to the field then
-    overrides = {"pointing": COSMOS, "scene": {"background_date": "2027-08-20"}}
-    with pytest.raises(ConfigError, match=r"\[scene\] background: 'date' must be a day on which"):
-        check_study(load_config("goodss", quick=True, overrides=overrides))
+    def refused(text, date):
+        overrides = {"pointing": COSMOS, "scene": {"background_date": date}}
+        config = load_config("goodss", quick=True, overrides=overrides)
+        refuses(rf"\[scene\] background: {text}", check_study, config, error=ConfigError)
+
+    refused("'date' must be a day on which", "2027-08-20")
     monkeypatch.setitem(sys.modules, "zodipy", None)
-    overrides["scene"]["background_date"] = "2027-05-01"
-    with pytest.raises(ConfigError, match=r"\[scene\] background: .*miricigale\[background\]"):
-        check_study(load_config("goodss", quick=True, overrides=overrides))
+    refused(r".*miricigale\[background\]", "2027-05-01")
 
 
 def test_the_report_says_which_and_from_where():
-    low = _background_sentence(study())
-    assert "telescope and low zodiacal light (Rigby et al. 2023, jwst_backgrounds)" in low
-    assert low.endswith("grows by 5 % of that for each arcmin toward position angle 45 deg")
-    medium = study(
-        background="medium", background_of="pointing", background_scale=1.5, background_gradient=0.0
+    def told(**scene):
+        return background_text(**background_options(study(**scene)))
+
+    assert "telescope and low zodiacal light (Rigby et al. 2023, jwst_backgrounds)" in told()
+    place, source = "RA 150.1000, Dec 2.2000", "(Kelsall et al. 1998 by ZodiPy)"
+    assert told(background="medium", background_of="pointing") == (
+        "telescope and medium zodiacal light, the 50th percentile over the days on which "
+        f"{place} can be seen {source}"
     )
-    assert _background_sentence(medium) == (
-        "Background at the center of the field: telescope and medium zodiacal light, the 50th percentile "
-        "over the days on which RA 150.1000, Dec 2.2000 can be seen (Kelsall et al. 1998 by ZodiPy), times "
-        "1.5; it is the same everywhere"
-    )
-    assert "of the sky" not in _background_sentence(study(background="high"))
-    assert "90th percentile over the sky" in _background_sentence(study(background="high"))
-    day = background_text(**background_options(study(background_date="2027-05-01")))
-    assert day == (
-        "telescope and zodiacal light of 2027-05-01 at RA 150.1000, Dec 2.2000 (Kelsall et al. 1998 by ZodiPy)"
-    )
+    assert "90th percentile over the sky" in told(background="high")
+    day = told(background_date="2027-05-01")
+    assert day == f"telescope and zodiacal light of 2027-05-01 at {place} {source}"
 
 
 def test_images_have_the_background_that_was_asked_for():

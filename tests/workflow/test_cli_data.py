@@ -6,8 +6,8 @@ import sys
 import numpy as np
 import pytest
 
+from helpers.commands import command
 from miricigale import conf
-from miricigale.cli import main
 from miricigale.refdata import Resource, locate, registry
 from miricigale.refdata.libraries import READERS, LibraryTable
 from miricigale.refdata.locate import file_sha256
@@ -17,14 +17,10 @@ NAME = "test.library"
 
 def read(path):
     spectra = np.loadtxt(path, ndmin=2)
-    return LibraryTable(
-        name=NAME,
-        wave=np.arange(1.0, 1.0 + spectra.shape[1]),
-        axes={"k": np.arange(float(len(spectra)))},
-        spectra={"dust": spectra},
-        meta={"files": {path.name: file_sha256(path)}},
-        summary=("numbers of nobody",),
-    )
+    axes = {"wave": np.arange(1.0, 1.0 + spectra.shape[1])}
+    axes["axes"] = {"k": np.arange(float(len(spectra)))}
+    facts = {"meta": {"files": {path.name: file_sha256(path)}}, "summary": ("numbers of nobody",)}
+    return LibraryTable(name=NAME, spectra={"dust": spectra}, **axes, **facts)
 
 
 @pytest.fixture
@@ -33,12 +29,9 @@ def folder(tmp_path, monkeypatch):
     record = Resource(NAME, "user", "A test", "Free", "Nobody 2030", "a page", file="sed/x.fits")
     known = registry.resources()
     everything = {name: known[name] for name in ("ssp.bc03", "filters.sedpy")} | {NAME: record}
-    for module in (
-        registry,
-        importlib.import_module("miricigale.refdata.check"),
-        sys.modules["miricigale.refdata"],
-    ):
-        monkeypatch.setattr(module, "resources", lambda: everything)
+    importlib.import_module("miricigale.refdata.check")
+    for name in ("registry.resources", "check.resources", "resources"):
+        monkeypatch.setattr(f"miricigale.refdata.{name}", lambda: everything)
     monkeypatch.setitem(READERS, NAME, read)
     (tmp_path / "good.txt").write_text("1 2 3\n4 5 6\n")
     (tmp_path / "bad.txt").write_text("1 2 3\nnumbers?\n")
@@ -47,35 +40,24 @@ def folder(tmp_path, monkeypatch):
 
 
 def test_a_library_is_added_listed_and_checked(folder, capsys):
-    assert main(["data", "list", NAME]) == 0
-    text = capsys.readouterr().out
+    text = command(capsys, "data", "list", NAME).out
     assert "test.library (user): absent; miricigale data add test.library PATH" in text
     assert "source: a page" in text
-    assert main(["data", "add", NAME, str(folder / "good.txt")]) == 0
-    captured = capsys.readouterr()
-    assert "numbers of nobody" in captured.out
-    assert "2 of each kind: dust" in captured.out
-    assert file_sha256(folder / "good.txt") in captured.out
+    told = command(capsys, "data", "add", NAME, folder / "good.txt")
+    for part in ("numbers of nobody", "2 of each kind: dust", file_sha256(folder / "good.txt")):
+        assert part in told.out
     # no terminal, no bar
-    assert captured.err == ""
+    assert told.err == ""
     path = locate(NAME)
-    assert main(["data", "list", NAME]) == 0
-    text = capsys.readouterr().out
+    text = command(capsys, "data", "list", NAME).out
     for part in (f"test.library (user): {path}", "A test", "license: Free", "cite: Nobody 2030"):
         assert part in text
-    assert main(["data", "check"]) == 0
-    assert f"ok              {path}" in capsys.readouterr().out
-
-
-def test_damage_is_an_exit_status(folder, capsys):
-    main(["data", "add", NAME, str(folder / "good.txt")])
-    path = locate(NAME)
+    assert f"ok              {path}" in command(capsys, "data", "check").out
+    # damage is an exit status
     path.write_bytes(path.read_bytes()[:-2880])
-    capsys.readouterr()
-    assert main(["data", "check"]) == 1
-    captured = capsys.readouterr()
-    assert f"damaged         {path}" in captured.out
-    assert captured.err == f"miricigale: not as they should be: {NAME}\n"
+    told = command(capsys, "data", "check", status=1)
+    assert f"damaged         {path}" in told.out
+    assert told.err == f"miricigale: not as they should be: {NAME}\n"
 
 
 @pytest.mark.parametrize(
@@ -89,12 +71,11 @@ def test_damage_is_an_exit_status(folder, capsys):
 )
 def test_refusals_are_one_sentence_on_stderr(folder, capsys, arguments, message):
     name, path = arguments
-    assert main(["data", "add", name, str(folder / path)]) == 2
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.startswith("miricigale: ")
-    assert message in captured.err
-    assert captured.err.count("\n") == 1
+    told = command(capsys, "data", "add", name, folder / path, status=2)
+    assert told.out == ""
+    assert told.err.startswith("miricigale: ")
+    assert message in told.err
+    assert told.err.count("\n") == 1
     assert not (folder / "data" / "sed" / "x.fits").exists()
 
 
@@ -103,18 +84,17 @@ def test_a_stop_changes_nothing(folder, capsys, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setitem(READERS, NAME, stop)
-    assert main(["data", "add", NAME, str(folder / "good.txt")]) == 130
-    assert "nothing was changed" in capsys.readouterr().err
+    told = command(capsys, "data", "add", NAME, folder / "good.txt", status=130)
+    assert "nothing was changed" in told.err
 
 
 def test_steps_are_shown_on_a_terminal(folder, capsys, monkeypatch):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    assert main(["data", "add", NAME, str(folder / "good.txt")]) == 0
-    text = capsys.readouterr().err
+    text = command(capsys, "data", "add", NAME, folder / "good.txt").err
     assert "test.library: reading" in text
     assert "test.library: checking" in text
 
 
 def test_an_unknown_name_is_told(folder, capsys):
-    assert main(["data", "list", "nonsense"]) == 1
-    assert "no resource has 'nonsense' in its name" in capsys.readouterr().err
+    told = command(capsys, "data", "list", "nonsense", status=1)
+    assert "no resource has 'nonsense' in its name" in told.err

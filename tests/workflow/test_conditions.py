@@ -29,12 +29,11 @@ def make():
     found[BAND] = [10.0, 30.0, 10.0, 10.0, 9.0, np.nan, 8.0] * u.uJy
     found[f"{BAND}_err"] = np.ones(7) * u.uJy
     found[f"{BAND}_flags"] = [0, 0, ForcedFlags.EDGE | ForcedFlags.BLENDED, 0, 0, 4, 0]
-    return truth, found
+    return truth, found, match_truth(truth, found, [BAND], radius=0.5 * u.arcsec)
 
 
 def test_each_condition_has_its_own_code():
-    truth, found = make()
-    matched = match_truth(truth, found, [BAND], radius=0.5 * u.arcsec)
+    truth, found, matched = make()
     add_conditions(matched, [BAND], suffix="_true")
     flags = ConditionFlags
     assert list(matched[f"{BAND}_condition"]) == [
@@ -52,8 +51,7 @@ def test_each_condition_has_its_own_code():
 
 
 def test_counts_add_up_to_the_sources_of_the_field():
-    truth, found = make()
-    matched = match_truth(truth, found, [BAND], radius=0.5 * u.arcsec)
+    _, found, matched = make()
     matched[f"{BAND}_formal_err"] = matched[f"{BAND}_err"]
     matched["selection"] = [0, 0, 0, 0, 16, 8]
     add_conditions(matched, [BAND], suffix="_true")

@@ -19,14 +19,11 @@ def written(tmp_path, config):
     return load_config(path)
 
 
-@pytest.mark.parametrize(
-    "config",
-    [
-        {"quick": True},
-        *({"overrides": {"detector": {"residual": value}}} for value in (0.01, 0, "etc")),
-        {"overrides": {"catalog": {"source": "été 😀 \x9c.fits"}}},
-    ],
-)
+RESIDUALS = [{"overrides": {"detector": {"residual": value}}} for value in (0.01, 0, "etc")]
+SOURCE = {"overrides": {"catalog": {"source": "été 😀 \x9c.fits"}}}
+
+
+@pytest.mark.parametrize("config", [{"quick": True}, *RESIDUALS, SOURCE])
 def test_a_printed_configuration_comes_back_the_same(tmp_path, config):
     made = load_config("goodss", **config)
     assert written(tmp_path, made) == made
@@ -115,9 +112,7 @@ def test_every_key_is_explained_and_nothing_else(config):
 
 
 def test_all_text_comes_back_from_toml():
-    nasty = [chr(i) for i in range(0x100)] + list(
-        "\u0100\u2028\ud7ff\ue000\ufeff\uffff😀\U0010ffff"
-    )
+    nasty = [*map(chr, range(0x100)), *"\u0100\u2028\ud7ff\ue000\ufeff\uffff😀\U0010ffff"]
     rng = np.random.default_rng(1)
     texts = ["", '"""', "\\", "C:\\new", "\\u007f", *nasty]
     texts += ["".join(rng.choice(nasty, size=12)) for _ in range(300)]

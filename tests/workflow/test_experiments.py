@@ -120,10 +120,8 @@ def test_far_infrared_fluxes_are_of_the_truth_and_tell_the_dust(truth, found):
     # 3 sigma of Magnelli et al. 2013 are 0.6 mJy
     limit = 10 ** (-0.4 * (experiments.HERSCHEL_DEPTHS["sedpy.herschel_pacs_100"] - 23.9))
     assert_allclose(limit * 3 / 5, 600, rtol=0.01)
-    width = [
-        np.median(found[n]["dust_luminosity_std"] / found[n]["dust_luminosity_mean"])
-        for n in ("far_infrared", "study")
-    ]
+    tables = (found[name] for name in ("far_infrared", "study"))
+    width = [np.median(t["dust_luminosity_std"] / t["dust_luminosity_mean"]) for t in tables]
     assert width[0] < width[1]
 
 

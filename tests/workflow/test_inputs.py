@@ -1,11 +1,15 @@
 """Input SEDs: whose errors are used, which bands are fitted, and what is drawn."""
 
+from types import SimpleNamespace
+
 import astropy.units as u
 import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable, Table
+from numpy.testing import assert_allclose, assert_array_equal
 
+from helpers.errors import refuses
 from helpers.runs import do_stage
 from helpers.scenes import catalog_at
 from miricigale.fitting import FitResults
@@ -42,18 +46,17 @@ def do_inputs(config, folder, *first):
 def run(folder, table, **sed):
     """The first stages; returns the fit of the inputs, their truth and what the report says."""
     table.write(folder / "mine.ecsv")
-    config = StudyConfig.from_dict(
-        {"catalog": {"source": str(folder / "mine.ecsv")}, "fit": {"model_error": 0.02}, "sed": sed}
-    )
+    sections = {"catalog": {"source": str(folder / "mine.ecsv")}, "fit": {"model_error": 0.02}}
+    config = StudyConfig.from_dict({**sections, "sed": sed})
     truth = do_inputs(config, folder, ("catalog", ""))
     facts = dict(catalog_facts(config, check_catalog(table)))
-    return config, FitResults.read(folder / "input_seds.fits"), truth, facts["input SEDs fitted to"]
+    return FitResults.read(folder / "input_seds.fits"), truth, facts["input SEDs fitted to"]
 
 
 def test_without_errors_short_bands_get_five_percent(galaxies, tmp_path):
-    _, results, truth, told = run(tmp_path, galaxies.copy())
+    results, truth, told = run(tmp_path, galaxies.copy())
     assert list(results.filters) == SHORT
-    np.testing.assert_allclose(results.flux_err, 0.05 * results.flux)
+    assert_allclose(results.flux_err, 0.05 * results.flux)
     assert "mips.24" not in told
     assert "5 % error each, for the catalog gives none" in told
     # drawn, each its own
@@ -65,34 +68,31 @@ def test_the_catalogs_own_errors_are_used_beyond_three_micron_too(galaxies, tmp_
     table = galaxies.copy()
     for k, name in enumerate((*SHORT[:2], *LONG)):
         table[f"{name}_err"] = (0.01 + 0.01 * k) * table[name]
-    _, results, truth, told = run(tmp_path, table)
+    results, truth, told = run(tmp_path, table)
     assert list(results.filters) == [*SHORT, *LONG]
     wanted = np.array([0.01, 0.02, 0.05, 0.03])
-    np.testing.assert_allclose(results.flux_err / results.flux, [wanted, wanted], rtol=1e-6)
+    assert_allclose(results.flux_err / results.flux, [wanted, wanted], rtol=1e-6)
     assert "the catalog's errors in nircam.f090w, nircam.f150w, mips.24; 5 % error each" in told
     assert "alpha is fitted too" in told
     # 24 um shows the dust: alpha is that of the fit, and the flux comes back
-    np.testing.assert_array_equal(truth["alpha"], ALPHA)
+    assert_array_equal(truth["alpha"], ALPHA)
 
 
 def test_a_flux_whose_error_is_not_positive_is_left_out(galaxies, tmp_path):
     table = galaxies.copy()
     table["nircam.f200w_err"] = [-1, 0.01] * table["nircam.f200w"]
-    _, results, _, _ = run(tmp_path, table)
-    assert results.n_bands.tolist() == [2, 3]
+    assert run(tmp_path, table)[0].n_bands.tolist() == [2, 3]
 
 
 def test_new_errors_make_other_inputs(galaxies, tmp_path):
-    class Nothing:
-        def checksums(self, name):
-            return {}
+    nothing = SimpleNamespace(checksums=lambda name: {})
 
     def digest(name, table):
         path = tmp_path / f"{name}.ecsv"
         table.write(path)
         config = StudyConfig.from_dict({"catalog": {"source": str(path)}})
         runner = StudyRunner(config, tmp_path, study_stages)
-        return runner.digest("seds", Nothing())
+        return runner.digest("seds", nothing)
 
     table = galaxies.copy()
     table["nircam.f200w_err"] = 0.01 * table["nircam.f200w"]
@@ -101,17 +101,20 @@ def test_new_errors_make_other_inputs(galaxies, tmp_path):
 
 
 def test_no_band_is_refused(galaxies, tmp_path):
-    with pytest.raises(ConfigError, match="leaves none of the catalog's bands"):
-        run(tmp_path, galaxies.copy(), max_wavelength=0.5)
+    text, options = "leaves none of the catalog's bands", {"max_wavelength": 0.5}
+    refuses(text, run, tmp_path, galaxies.copy(), error=ConfigError, **options)
+    # nor is a map without pairs
+    for key in ("columns", "units"):
+        text, values = rf"\[catalog\] {key} must have the form 'name=value'", {key: ["redshift"]}
+        refuses(text, StudyConfig.from_dict, {"catalog": values}, error=ConfigError)
 
 
 def test_a_catalog_of_ones_own_by_a_map_of_columns(galaxies, tmp_path):
     # the prior's band alone, in mJy and under other names; -99 stands for what is missing
     rows = ["ID,ra,dec,zphot,F_H,profile,half_light_radius,sersic_index,axis_ratio,position_angle"]
     flux = [0.01, 0.02, 0.03, -99.0]
-    rows += [
-        f"{k},53.1{k},-27.8,0.8,{value},point,0,1,1,0" for k, value in enumerate(flux, start=1)
-    ]
+    rest = "point,0,1,1,0"
+    rows += [f"{k},53.1{k},-27.8,0.8,{value},{rest}" for k, value in enumerate(flux, start=1)]
     path = tmp_path / "mine.csv"
     path.write_text("\n".join(rows) + "\n")
     columns = ["id=ID", "redshift=zphot", "wfc3.f160w=F_H"]
@@ -126,7 +129,7 @@ def test_a_catalog_of_ones_own_by_a_map_of_columns(galaxies, tmp_path):
     truth = do_inputs(config, tmp_path)
     # 23.9 - 2.5 log(10) = 21.4 is below the limit; the source without a flux stays, and has none
     assert list(truth["id"]) == [2, 3, 4]
-    np.testing.assert_allclose(truth["wfc3.f160w"].value[:2], [20, 30], rtol=1e-6)
+    assert_allclose(truth["wfc3.f160w"].value[:2], [20, 30], rtol=1e-6)
     assert np.isnan(truth["wfc3.f160w"][2])
     assert np.isnan(truth["miri.f770w"][2])
     # one band gives every galaxy light in all others
@@ -154,18 +157,10 @@ def test_magnitudes_and_text_ids_give_the_inputs_of_the_fluxes(galaxies, tmp_pat
     truth = do_inputs(config, tmp_path)
     catalog = QTable.read(tmp_path / "catalog.ecsv")
     assert catalog["flags"].tolist() == [0, CatalogFlags.MISSING_CODE]
-    np.testing.assert_allclose(catalog[SHORT[0]].value, galaxies[SHORT[0]].value)
+    assert_allclose(catalog[SHORT[0]].value, galaxies[SHORT[0]].value)
     results = FitResults.read(tmp_path / "input_seds.fits")
     assert results.ids.tolist() == ["a-1", "a-2"]
     assert results.n_bands.tolist() == [3, 2]
-    np.testing.assert_allclose(
-        results.flux_err / results.flux,
-        0.05 * np.log(10) / 2.5 * np.where(np.isnan(results.flux), np.nan, 1),
-    )
+    wanted = 0.05 * np.log(10) / 2.5 * np.where(np.isnan(results.flux), np.nan, 1)
+    assert_allclose(results.flux_err / results.flux, wanted)
     assert truth["id"].tolist() == ["a-1", "a-2"]
-
-
-@pytest.mark.parametrize("key", ["columns", "units"])
-def test_a_map_without_pairs_is_refused(key):
-    with pytest.raises(ConfigError, match=rf"\[catalog\] {key} must have the form 'name=value'"):
-        StudyConfig.from_dict({"catalog": {key: ["redshift"]}})

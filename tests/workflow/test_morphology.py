@@ -8,6 +8,7 @@ import pytest
 from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData
 from astropy.table import QTable
+from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers import scenes
 from helpers.errors import refuses
@@ -62,7 +63,7 @@ def test_clumps_follow_the_light_of_their_galaxies():
     table = disks()
     painted = add_clumps(table, BAND, share=0.2, seed=SEED)
     smooth, clumps = painted[: len(table)], painted[len(table) :]
-    np.testing.assert_allclose(smooth[BAND], 0.8 * table[BAND])
+    assert_allclose(smooth[BAND], 0.8 * table[BAND])
     assert len(np.unique(painted["id"])) == len(painted)
     assert set(clumps["profile"]) == {"point"}
     # galaxies are 0.002 deg from each other
@@ -70,7 +71,7 @@ def test_clumps_follow_the_light_of_their_galaxies():
     numbers = np.bincount(owner)
     assert (numbers.min(), numbers.max()) == (3, 12)
     light = np.bincount(owner, weights=clumps[BAND].value)
-    np.testing.assert_allclose(light, 0.2 * table[BAND].value)
+    assert_allclose(light, 0.2 * table[BAND].value)
     major, minor = in_own_axes(table, clumps, owner)
     radius = np.hypot(major, minor)
     # an exponential disk has half of its light within 1, 90 % within 2.318 (x = 3.890 of 1.678)
@@ -85,13 +86,11 @@ def test_clumps_are_those_of_a_source_in_every_band():
     table = disks(30)
     first = add_clumps(table, BAND, share=0.2, seed=SEED)
     other = add_clumps(table, "miri.f1500w", share=0.2, seed=SEED)
-    np.testing.assert_array_equal(first["sky"].ra, other["sky"].ra)
-    np.testing.assert_allclose(other["miri.f1500w"], 3 * first[BAND])
+    assert_array_equal(first["sky"].ra, other["sky"].ra)
+    assert_allclose(other["miri.f1500w"], 3 * first[BAND])
     # of the id, not of the row
     part = add_clumps(table[20:], BAND, share=0.2, seed=SEED)
-    np.testing.assert_array_equal(
-        part["sky"].ra[10:], first["sky"].ra[len(first) - len(part) + 10 :]
-    )
+    assert_array_equal(part["sky"].ra[10:], first["sky"].ra[len(first) - len(part) + 10 :])
 
 
 def test_ids_may_be_text(field, tmp_path):
@@ -114,13 +113,13 @@ def test_only_the_disks_are_clumpy_and_points_keep_their_light():
     table["half_light_radius"][2] = np.nan * u.arcsec
     table["share"] = [0.5, 0.5, 0.5, 0.5]
     painted = add_clumps(table, BAND, share=0.2, seed=SEED, point="share")
-    np.testing.assert_allclose(painted[BAND][:3], table[BAND][:3])
+    assert_allclose(painted[BAND][:3], table[BAND][:3])
     assert painted[BAND].sum().value == pytest.approx(table[BAND].sum().value)
     # clumps take of the galaxy's half only
     assert painted[BAND][3].value == pytest.approx(0.9 * table[BAND][3].value)
     in_points = (painted[BAND] * painted["share"])[3].value
     assert in_points == pytest.approx(0.5 * table[BAND][3].value)
-    np.testing.assert_array_equal(painted["share"][4:], 0)
+    assert_array_equal(painted["share"][4:], 0)
     assert add_clumps(table[:3], BAND, share=0.2, seed=SEED)[BAND].sum() == table[BAND][:3].sum()
 
 
@@ -134,18 +133,13 @@ def image_of_galaxies(*, psf_sigma=1.2, noise=0.002):
     )  # fmt: skip
     table["profile"][4] = "point"
     table[PRIOR] = table[BAND]
-    psf = gaussian_psf(
-        2.3548 * psf_sigma * PIXEL * u.arcsec, pixel_scale=PIXEL * u.arcsec, fov=4 * u.arcsec
-    )
+    width = 2.3548 * psf_sigma * PIXEL * u.arcsec
+    psf = gaussian_psf(width, pixel_scale=PIXEL * u.arcsec, fov=4 * u.arcsec)
     clumpy = add_clumps(table, PRIOR, share=0.4, seed=2)
     image = Scene(clumpy, filter=PRIOR, wcs=wcs, psf=psf).render()
     data = image.data + noise * np.random.default_rng(1).normal(size=image.shape)
-    return (
-        CCDData(data, unit="MJy/sr", wcs=wcs, mask=np.zeros(data.shape, bool)),
-        psf,
-        table,
-        clumpy,
-    )
+    mask = np.zeros(data.shape, bool)
+    return CCDData(data, unit="MJy/sr", wcs=wcs, mask=mask), psf, table, clumpy
 
 
 @pytest.fixture(scope="module")
@@ -156,9 +150,7 @@ def field():
 
 def paint(catalog, stamps, wcs, band):
     catalog = catalog.copy()
-    catalog["profile"] = np.where(
-        np.isin(catalog["id"], list(stamps)), "cutout", catalog["profile"]
-    )
+    catalog["profile"][np.isin(catalog["id"], list(stamps))] = "cutout"
     psf = scenes.gaussian_psf(sigma=1.3)
     return Scene(catalog, filter=band, wcs=wcs, psf=psf, cutouts=stamps).render().data
 
@@ -174,10 +166,8 @@ def test_galaxies_have_their_own_light(field):
     owner = np.argmin([row.separation(table["sky"]) for row in clumpy["sky"]], axis=1)
     clumpy = clumpy[owner < 3]
     table = table[:3]
-    known, found, smooth = (
-        paint(rows, chosen, wcs, BAND)
-        for rows, chosen in ((clumpy, {}), (table, stamps), (table, {}))
-    )
+    pairs = (clumpy, {}), (table, stamps), (table, {})
+    known, found, smooth = (paint(rows, chosen, wcs, BAND) for rows, chosen in pairs)
     # as they are, and not as their profiles
     error, change = (np.abs(image - known).sum() / known.sum() for image in (found, smooth))
     assert change > 0.2
@@ -210,12 +200,11 @@ def test_drawn_galaxies_have_size_place_and_turn_of_the_source(field):
     assert len(galaxies.resolved) == 3
     assert np.all(np.asarray(galaxies.resolved["radius"], float) > MIN_RADIUS)
     wcs = scenes.tan_wcs(shape=(120, 120))
-    table = scenes.make_catalog(
-        wcs, 60.0, 60.0, profile="sersic", radius=0.7, ratio=0.5, angle=70.0
-    )
+    shape = {"profile": "sersic", "radius": 0.7, "ratio": 0.5, "angle": 70.0}
+    table = scenes.make_catalog(wcs, 60.0, 60.0, **shape)
     stamps = stamps_of_sources(table, galaxies, of="any", seed=SEED)
     again = stamps_of_sources(table, galaxies, of="any", seed=SEED)
-    np.testing.assert_array_equal(stamps[1].data, again[1].data)
+    assert_array_equal(stamps[1].data, again[1].data)
     radius = 0.7 * np.sqrt(0.5)
     assert stamps[1].half_light_radius.to_value(u.arcsec) == pytest.approx(radius, rel=1e-9)
     x, y, (xx, yy, xy) = moments(paint(table, stamps, wcs, BAND), 60, 60, 20)
@@ -225,9 +214,8 @@ def test_drawn_galaxies_have_size_place_and_turn_of_the_source(field):
     assert angle == pytest.approx(70, abs=12)
     # nothing is like it
     table["half_light_radius"] = 8.0 * u.arcsec
-    refuses(
-        NONE.format(1), stamps_of_sources, table, galaxies, error=DataError, of="any", seed=SEED
-    )
+    options = {"error": DataError, "of": "any", "seed": SEED}
+    refuses(NONE.format(1), stamps_of_sources, table, galaxies, **options)
 
 
 def test_masked_galaxies_and_those_at_the_edge_are_not_used():
@@ -246,7 +234,7 @@ def test_stamps_come_back_from_their_file(field, tmp_path):
     back = read_stamps(tmp_path / "stamps.fits")
     assert list(back) == list(stamps)
     for key, stamp in stamps.items():
-        np.testing.assert_allclose(back[key].data, stamp.data, rtol=1e-6)
+        assert_allclose(back[key].data, stamp.data, rtol=1e-6)
         assert back[key].pixel_scale == stamp.pixel_scale
         assert back[key].angle == stamp.angle
         assert back[key].center == stamp.center
@@ -274,11 +262,10 @@ def test_a_study_paints_the_light_of_an_image(tmp_path, monkeypatch):
         run(name, unit)
     with pytest.warns(MiricigaleWarning, match="has no map of the noise"):
         run("truth", "agn00+cutouts")
-    known, own = (
-        QTable.read(tmp_path / name / "truth.ecsv") for name in ("agn00", "agn00+cutouts")
-    )
+    paths = (tmp_path / name / "truth.ecsv" for name in ("agn00", "agn00+cutouts"))
+    known, own = map(QTable.read, paths)
     for name in (BAND, PRIOR, "profile", "mass"):
-        np.testing.assert_array_equal(own[name], known[name])
+        assert_array_equal(own[name], known[name])
     # the fourth, faint on the image, is not
     assert list(read_stamps(tmp_path / "agn00+cutouts" / "stamps.fits")) == [1, 2, 3]
     assert not (tmp_path / "agn00" / "stamps.fits").exists()
@@ -316,18 +303,15 @@ def test_real_galaxies_of_an_image_with_its_psf(data_file):
         galaxies, plain = RealGalaxies.read(path, psf=psf), RealGalaxies.read(path)
     assert galaxies.psf.fwhm.to_value(u.arcsec) == pytest.approx(0.16, abs=0.02)
     assert plain.psf is None
-    labels = [
-        label
-        for label in range(1, len(plain._found[2]) + 1)
-        if plain.cutout(label) is not None and galaxies.cutout(label) is not None
-    ]
+    every, both = range(1, len(plain._found[2]) + 1), (plain, galaxies)
+    labels = [label for label in every if all(one.cutout(label) is not None for one in both)]
     assert len(labels) > 15
     sums, radii = (
         np.transpose([[f(one.cutout(label)) for one in (plain, galaxies)] for label in labels])
         for f in (lambda stamp: stamp.data.sum(), lambda stamp: stamp.half_light_radius.value)
     )
     # light comes in from the wings
-    np.testing.assert_allclose(sums[1] / sums[0], 1.03, atol=0.08)
+    assert_allclose(sums[1] / sums[0], 1.03, atol=0.08)
     assert np.all(radii[1] < radii[0])
     # in quadrature the PSF's own: Gaussian of its width at least
     less = np.sqrt(radii[0] ** 2 - radii[1] ** 2)

@@ -27,9 +27,8 @@ BAND = "miri.f770w"
 
 
 def field(**pointing):
-    return StudyConfig.from_dict(
-        {"pointing": pointing, "exposures": {"filters": [BAND, "miri.f2100w"]}}
-    )
+    exposures = {"filters": [BAND, "miri.f2100w"]}
+    return StudyConfig.from_dict({"pointing": pointing, "exposures": exposures})
 
 
 def test_one_pointing_is_what_it_was():
@@ -38,9 +37,8 @@ def test_one_pointing_is_what_it_was():
     assert (center.ra.deg, center.dec.deg) == (config.pointing.ra, config.pointing.dec)
     exposures = study_exposures(config)
     # the dithers of CEERS
-    assert list(exposures) == [f"{BAND}-{k}" for k in range(3)] + [
-        f"miri.f2100w-{k}" for k in range(6)
-    ]
+    names = [*(f"{BAND}-{k}" for k in range(3)), *(f"miri.f2100w-{k}" for k in range(6))]
+    assert list(exposures) == names
 
 
 @pytest.mark.parametrize("pointing", [{"tiles": [2, 3]}, {"centers": [f"{k} 5" for k in range(6)]}])
@@ -56,9 +54,8 @@ def test_every_exposure_of_a_field_is_its_own(pointing):
     assert len({str(one) for one in exposure_plan(config).values()}) == len(exposures)
     for name in config.exposures.filters:
         own = [e for e in exposures.values() if e.filter == name]
-        assert [pointing_of(config, e) for e in own] == [
-            center for center in centers for _ in range(len(own) // 6)
-        ]
+        found = [pointing_of(config, e) for e in own]
+        assert found == [center for center in centers for _ in range(len(own) // 6)]
         # the time of one pointing, not of the field
         one = sum(e.exposure_time for e in single.values() if e.filter == name)
         assert_allclose(pointing_time(config, name).to_value(u.s), one.to_value(u.s))
@@ -73,10 +70,8 @@ def test_tiles_make_one_field_about_the_center():
     # north-up boxes about fields that are turned: the sum of both sides' projections
     angle = np.radians(next(iter(study_exposures(config).values())).pa_aper.value)
     wide, high = 2 * 0.85 * (last - first), 0.85 * 1024
-    expected = [
-        abs(wide * np.cos(angle)) + abs(high * np.sin(angle)),
-        abs(wide * np.sin(angle)) + abs(high * np.cos(angle)),
-    ]
+    cos, sin = abs(np.cos(angle)), abs(np.sin(angle))
+    expected = [abs(wide) * cos + high * sin, abs(wide) * sin + high * cos]
     assert_allclose(steps, expected, rtol=0.02)
     middle = grid_of(config, 0.11).pixel_to_world(*(0.5 * (sides - 1)))
     alone = grid_of(field(ra=0.001), 0.11).pixel_to_world(*(0.5 * (single - 1)))

@@ -1,7 +1,6 @@
 """Runs that are killed, damaged or out of disk: nothing is lost, nothing is taken for whole."""
 
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -13,6 +12,7 @@ import pytest
 from astropy.nddata import CCDData
 from astropy.table import QTable
 
+from helpers.errors import refuses
 from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.engine.runner import StudyRunner
 from miricigale.workflow.engine.stage import Context, Stage
@@ -22,11 +22,8 @@ TOY = Path(__file__).with_name("toy_study.py")
 
 def contents(folder):
     """Bytes of all products by name."""
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in sorted(folder.rglob("*.txt"))
-        if path.is_file()
-    }
+    paths = [path for path in sorted(folder.rglob("*.txt")) if path.is_file()]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
 
 
 def start(folder, *words, **options):
@@ -46,6 +43,14 @@ def ended(process, status=0):
     _, message = process.communicate(timeout=120)
     assert process.returncode == status, message
     return message
+
+
+def killed(folder, name, text=""):
+    """Start a study, and kill it when a file stands (and has a text)."""
+    process = start(folder)
+    wait_for(folder / name, process, text)
+    process.kill()
+    process.communicate(timeout=60)
 
 
 def wait_for(path, process, text=""):
@@ -82,10 +87,7 @@ def test_a_run_that_is_killed_thirteen_times_ends_with_the_same_bytes(tmp_path, 
         "b/2.txt", "c/0.txt", "c/1.txt", "d/0.txt", "d/2.txt", "second.txt",
     ]  # fmt: skip
     for name in moments:
-        process = start(folder)
-        wait_for(folder / name, process)
-        process.kill()
-        process.communicate(timeout=60)
+        killed(folder, name)
         # whatever carries its name is whole
         for product, data in contents(folder).items():
             if ".partial-" not in product:
@@ -111,10 +113,7 @@ def test_a_second_run_in_the_folder_is_refused_and_the_first_one_goes_on(tmp_pat
 
 def test_a_configuration_that_changes_before_a_killed_run_goes_on(tmp_path, undisturbed):
     folder = tmp_path / "run"
-    process = start(folder)
-    wait_for(folder / ".manifest.journal", process, '"first:c"')
-    process.kill()
-    process.communicate(timeout=60)
+    killed(folder, ".manifest.journal", '"first:c"')
     before = contents(folder)
     # what units c and d depend on is refused, and nothing is touched
     message = ended(start(folder, "2.0"), 1)
@@ -145,17 +144,11 @@ def products(context):
 
 
 @pytest.mark.parametrize("name", ["image.fits", "table.ecsv", "table.fits", "page.html"])
-def test_a_write_that_the_system_cuts_off_is_named_and_leaves_what_stood(tmp_path, name):
-    """Files that may not grow beyond 100 kB, as on a disk that fills while they are written."""
+def test_a_write_that_the_system_cuts_off_is_named_and_leaves_what_stood(tmp_path, name, full_disk):
     context = Context(StudyConfig(), tmp_path)
     (tmp_path / name).write_text("what stood")
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
-    try:
-        with pytest.raises(OSError, match=rf"{tmp_path}/{name}"):
-            products(context)[name](name)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    with full_disk(100_000):
+        refuses(rf"{tmp_path}/{name}", products(context)[name], name, error=OSError)
     assert (tmp_path / name).read_text() == "what stood"
     assert [path.name for path in tmp_path.iterdir()] == [name]
     assert context.saved == []
@@ -189,11 +182,9 @@ def toy(folder):
         text = "".join(context.path(f"{unit}.txt").read_text() for unit in "abc")
         context.save("second.txt", lambda path: path.write_text(text))
 
-    stages = (
-        Stage("first", first, "first", units=lambda _: "abc"),
-        Stage("second", second, "second", needs=("first",)),
-    )
-    StudyRunner(StudyConfig(), folder, stages).run()
+    one = Stage("first", first, "first", units=lambda _: "abc")
+    two = Stage("second", second, "second", needs=("first",))
+    StudyRunner(StudyConfig(), folder, (one, two)).run()
 
 
 def refusal(folder):

@@ -27,6 +27,13 @@ def run_stages(folder, *stages, config=None, **options):
     return StudyRunner(config or StudyConfig(), folder, stages, **options).run()
 
 
+def run_side_by_side(folder, *stages, threads, pool=ThreadPoolExecutor, **run):
+    """Run stages in some threads at once."""
+    config = StudyConfig.from_dict({"run": {"threads": threads, **run}})
+    with pool(4) as executor:
+        return run_stages(folder, *stages, config=config, executor=executor)
+
+
 @pytest.fixture
 def folder(tmp_path):
     return tmp_path / "run"
@@ -52,10 +59,8 @@ class Recorder:
 
     def stages(self, version=1):
         parts = {"sections": ("scene",), "units": lambda _: "ab", "version": version}
-        return (
-            Stage("first", self.first, "first", **parts),
-            Stage("second", self.second, "second", needs=("first",)),
-        )
+        first = Stage("first", self.first, "first", **parts)
+        return first, Stage("second", self.second, "second", needs=("first",))
 
     def run(self, folder, config=None, *, version=1, **options):
         self.ran.clear()
@@ -102,15 +107,13 @@ def test_a_fact_is_warned_of_once_a_run_and_kept_for_each_unit(folder, caplog):
     assert "2 more such warnings of other units" in caplog.text
     assert store.records["one:b"]["warnings"] == ["3 sources are faint in 'b'", texts[1]]
 
-
-@pytest.mark.filterwarnings("default")
-def test_warnings_before_an_error_are_shown(folder):
+    # those before an error too
     def fail(context, unit):
-        warnings.warn("the field is crowded", MiricigaleWarning, stacklevel=2)
+        warn(context, "b")
         raise ValueError("no sources")
 
     with pytest.warns(MiricigaleWarning, match="crowded"):
-        refuses("no sources", run_stages, folder, Stage("one", fail, "one"))
+        refuses("no sources", run_stages, folder, Stage("two", fail, "two"), redo=True)
 
 
 def test_only_what_depends_on_a_change_is_done_again(folder, recorder):
@@ -218,9 +221,7 @@ def test_of_a_part_of_the_steps_the_disk_of_that_part_counts(folder, monkeypatch
     text = capsys.readouterr().err
     assert "1 of 1 steps to do, which take about 0.01 GB" in text
     assert "(0.0 GB are free)" in text
-    message = (
-        r"needs about 0.02 GB in .*, only 0.0\d GB are free; free some space, choose another folder"
-    )
+    message = r"needs about 0.02 GB in .*, only 0.0\d GB are free; free some space, choose another"
     refuses(message, recorder.run, folder, error=DataError, **options)
     assert recorder.ran == []
 
@@ -245,15 +246,13 @@ def test_a_change_of_the_packages_own_plan_is_seen(folder):
 
 def test_other_reference_data_make_other_exposures(tmp_path, monkeypatch):
     # what residual = "etc" means stands in a file, not in the configuration
-    class Nothing:
-        def checksums(self, name):
-            return {}
+    nothing = types.SimpleNamespace(checksums=lambda name: {})
 
     def digests():
         stages = [s for s in study_stages() if s.name in ("exposures", "points", "kernels")]
         runner = StudyRunner(StudyConfig(), tmp_path / "run", study_stages())
         keys = {stage.name: stage.key(stage.units(runner.config)[0]) for stage in stages}
-        return {name: runner.digest(key, Nothing()) for name, key in keys.items()}
+        return {name: runner.digest(key, nothing) for name, key in keys.items()}
 
     monkeypatch.delenv("MIRICIGALE_DATA", raising=False)
     before = digests()
@@ -314,20 +313,13 @@ def test_products_that_no_longer_belong_are_removed(folder):
     assert not (folder / "b.txt").exists()
 
 
-@pytest.mark.parametrize(
-    ("read", "error", "message"),
-    [
-        (
-            lambda config: config.scene,
-            RuntimeError,
-            r"stage 'one' reads \[scene\] without declaring",
-        ),
+def test_a_stage_that_reads_what_it_has_not_declared_is_an_error(folder):
+    for read, error, message in (
+        (lambda config: config.scene, RuntimeError, r"'one' reads \[scene\] without declaring"),
         (lambda config: config.run.keep_level1b, AttributeError, "keep_level1b"),
-    ],
-)
-def test_a_stage_that_reads_what_it_has_not_declared_is_an_error(folder, read, error, message):
-    stage = Stage("one", lambda context, _: read(context.config), "one", sections=("run.name",))
-    refuses(message, run_stages, folder, stage, error=error)
+    ):
+        stage = Stage("one", lambda c, _, f=read: f(c.config), "one", sections=("run.name",))
+        refuses(message, run_stages, folder, stage, error=error)
 
 
 def test_a_product_of_a_stage_that_is_not_declared_cannot_be_read(folder):
@@ -337,31 +329,25 @@ def test_a_product_of_a_stage_that_is_not_declared_cannot_be_read(folder):
 
     first = Stage("first", write, "first", units=lambda _: "ab")
     between = Stage("between", lambda context, _: None, "between", needs=("first",))
+    text = r"stage 'last' reads 'a\.txt' without declaring"
     for needs in ((), ("between",)):
-        stages = first, between, Stage("last", read, "last", needs=needs)
-        text = r"stage 'last' reads 'a\.txt' without declaring"
-        refuses(text, run_stages, folder, *stages, error=RuntimeError)
+        last = Stage("last", read, "last", needs=needs)
+        refuses(text, run_stages, folder, first, between, last, error=RuntimeError)
     run_stages(folder, first, Stage("last", read, "last", needs=("first",)), redo=True)
     assert (folder / "sum.txt").read_text() == "ab"
 
 
 @pytest.mark.parametrize(
-    ("first", "second", "known"),
+    ("first", "known", "others"),
     [
-        ("sky/band", "sky/band", True),
-        ("sky/band", "sky", True),
-        ("sky/band", "band", True),
-        ("sky/band", "sky/band-1", True),
-        ("sky/band", "", True),
-        ("sky/band", "sky/other", False),
-        ("sky/band", "other", False),
-        ("sky/band", "sky/band2-1", False),
-        ("sky", "sky+psf", False),
-        ("sky", "band", False),
+        ("sky/band", True, ("sky/band", "sky", "band", "sky/band-1", "")),
+        ("sky/band", False, ("sky/other", "other", "sky/band2-1")),
+        ("sky", False, ("sky+psf", "band")),
     ],
 )
-def test_units_belong_together_by_the_parts_of_their_names(first, second, known):
-    assert related(first, second) == related(second, first) == known
+def test_units_belong_together_by_the_parts_of_their_names(first, known, others):
+    for second in others:
+        assert related(first, second) == related(second, first) == known, second
 
 
 def test_a_unit_depends_on_the_units_that_it_reads_only(folder):
@@ -380,13 +366,10 @@ def test_a_unit_depends_on_the_units_that_it_reads_only(folder):
 
     def run(units):
         ran.clear()
-        parts = {"units": lambda _: units}
-        plan = {"plan": lambda _, unit: texts[unit]}
-        stages = (
-            Stage("first", first, "first", **parts, **plan),
-            Stage("second", second, "second", needs=("first",), **parts),
-        )
-        run_stages(folder, *stages, redo=True)
+        options = {"units": lambda _: units, "plan": lambda _, unit: texts[unit]}
+        one = Stage("first", first, "first", **options)
+        two = Stage("second", second, "second", needs=("first",), units=options["units"])
+        run_stages(folder, one, two, redo=True)
         return sorted(ran)
 
     assert run("a") == ["first:a", "second:a"]
@@ -427,11 +410,8 @@ def test_a_part_of_the_stages_and_units(folder):
     refuses(wanted, run, error=ConfigError, until="fourth")
     wanted = "nothing of 'again', 'second', is among what 'until', 'first', needs"
     refuses(wanted, run, error=ConfigError, until="first", again="second")
-
-
-def test_stages_must_come_after_what_they_need(folder):
-    stage = Stage("second", print, "second", needs=("first",))
-    refuses("stage 'second' needs", run_stages, folder, stage, error=ConfigError)
+    # stages must come after what they need
+    refuses("stage 'second' needs", run_stages, folder, *stages[1:], error=ConfigError)
 
 
 def test_a_full_disk_is_text_before_the_run(tmp_path):
@@ -439,8 +419,12 @@ def test_a_full_disk_is_text_before_the_run(tmp_path):
     check_disk(tmp_path / "not" / "yet", 1)
 
 
-def units_side_by_side(n_units, **options):
-    """The largest number of units that ran at once, and the order in which stages began."""
+@pytest.mark.parametrize(
+    ("threads", "memory", "each", "most"),
+    # the last units are larger than the memory
+    [(3, 4.0, 1.0, 3), (3, 2.5, 1.0, 2), (1, 4.0, 1.0, 1), (3, 1.0, 10.0, 1)],
+)
+def test_units_run_side_by_side_within_threads_and_memory(folder, threads, memory, each, most):
     state = types.SimpleNamespace(now=0, most=0, order=[])
     lock = threading.Lock()
 
@@ -454,38 +438,19 @@ def units_side_by_side(n_units, **options):
         with lock:
             state.now -= 1
 
-    def names(letter):
-        return lambda _: [f"{letter}{k}" for k in range(n_units)]
+    def stage(name, needs=()):
+        units, size = [f"{name}{k}" for k in range(4)], 1e9 * each
+        parts = {"units": lambda _: units, "memory": lambda _, __: size}
+        return Stage(name, work, name, needs=needs, **parts)
 
-    memory = options.pop("memory", None)
-    stages = (
-        Stage("a", work, "a", units=names("a"), memory=memory),
-        Stage("between", lambda *_: None, "between", needs=("a",)),
-        Stage("b", work, "b", units=names("b"), needs=("between",), memory=memory),
-        Stage("c", work, "c", units=names("c"), memory=memory),
-    )
-    return state, stages
-
-
-@pytest.mark.parametrize(("threads", "gigabytes", "most"), [(3, 4.0, 3), (3, 2.5, 2), (1, 4.0, 1)])
-def test_units_run_side_by_side_within_threads_and_memory(folder, threads, gigabytes, most):
-    state, stages = units_side_by_side(4, memory=lambda _, __: 1_000_000_000)
-    config = StudyConfig.from_dict({"run": {"threads": threads, "memory": gigabytes}})
-    with ThreadPoolExecutor(4) as executor:
-        store = run_stages(folder, *stages, config=config, executor=executor)
+    between = Stage("between", lambda *_: None, "between", needs=("a",))
+    stages = (stage("a"), between, stage("b", ("between",)), stage("c"))
+    store = run_side_by_side(folder, *stages, threads=threads, memory=memory)
     assert state.most == most
     assert len(store.records) == 13
     # b waits for all of a; c for nobody
     last_a = max(k for k, letter in enumerate(state.order) if letter == "a")
     assert state.order.index("b") > last_a
-
-
-def test_a_unit_larger_than_the_memory_runs_alone(folder):
-    state, stages = units_side_by_side(3, memory=lambda _, __: 10_000_000_000)
-    config = StudyConfig.from_dict({"run": {"threads": 3, "memory": 1.0}})
-    with ThreadPoolExecutor(3) as executor:
-        run_stages(folder, *stages, config=config, executor=executor)
-    assert state.most == 1
 
 
 def test_what_runs_beside_a_unit_that_fails_is_kept(folder):
@@ -501,9 +466,8 @@ def test_what_runs_beside_a_unit_that_fails_is_kept(folder):
         write(context, unit)
 
     stage = Stage("one", work, "one", units=lambda _: ("bad", "good", "late"))
-    config = StudyConfig.from_dict({"run": {"threads": 2}})
-    with ThreadPoolExecutor(2) as executor, pytest.raises(ValueError, match="no such light") as err:
-        run_stages(folder, stage, config=config, executor=executor)
+    with pytest.raises(ValueError, match="no such light") as err:
+        run_side_by_side(folder, stage, threads=2)
     assert "in stage one:bad" in err.value.__notes__
     assert set(ProductStore(folder).records) == {"one:good"}
 
@@ -527,9 +491,7 @@ def test_the_first_of_several_errors_is_raised(folder):
                 future.add_done_callback(lambda _: threading.Timer(0.2, failed.set).start())
             return future
 
-    config = StudyConfig.from_dict({"run": {"threads": 2}})
-    with Submits(2) as executor:
-        refuses("first", run_stages, folder, stage, config=config, executor=executor)
+    refuses("first", run_side_by_side, folder, stage, threads=2, pool=Submits)
 
 
 def test_a_process_that_died_before_a_unit_began_is_text(folder):

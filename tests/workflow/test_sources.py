@@ -264,9 +264,8 @@ def test_the_page_opens_in_a_browser(run, tmp_path):
         BROWSER, "--headless=new", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path}",
         "--virtual-time-budget=4000", "--dump-dom", f"{page}#{key}?show=all&redshift=0..9",
     ]  # fmt: skip
-    done = subprocess.run(
-        command, capture_output=True, text=True, timeout=120, check=True, env=dict(os.environ)
-    )
+    options = {"capture_output": True, "text": True, "timeout": 120, "check": True}
+    done = subprocess.run(command, env=dict(os.environ), **options)
     assert f"<h2>Source {key}</h2>" in done.stdout
     assert f"{len(entries)} of {len(entries)} sources" in done.stdout
     # two posteriors and the spectra of two fits, each with its truth or its fluxes

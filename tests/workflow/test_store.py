@@ -24,27 +24,16 @@ def folder(tmp_path):
     return tmp_path / "run"
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "../victim",
-        "{victim}",
-        "part/../../victim",
-        "..",
-        ".",
-        "",
-        "part//product.txt",
-        "a\\..\\b",
-        "C:x",
-    ],
-)
+OUTSIDE = r"../victim {victim} part/../../victim .. . part//product.txt a\..\b C:x"
+
+
+@pytest.mark.parametrize("name", ["", *OUTSIDE.split()])
 def test_no_product_lies_outside_the_folder(folder, name):
     victim = folder.parent / "victim"
     name = name.format(victim=victim)
     text = (folder / "manifest.json").read_text()
     (folder / "manifest.json").write_text(text.replace("part/product.txt", json.dumps(name)[1:-1]))
-    with pytest.raises(DataError, match="is not the name of a product"):
-        ProductStore(folder)
+    refuses("is not the name of a product", ProductStore, folder, error=DataError)
     assert victim.read_text() == "mine"
 
 
@@ -72,20 +61,13 @@ def test_a_product_cannot_be_written_through_a_link(tmp_path):
     assert not list((tmp_path / "outside").iterdir())
 
 
+PRODUCTS = '{"y": {"sha256": "", "bytes": 1e999}}'
+STAGES = ('{"x": {}}', "[1]", f'{{"x": {{"hash": "", "seconds": 0, "products": {PRODUCTS}}}}}')
+DAMAGED = [None, "", "[]", "{", "[" * 100_000, *(f'{{"stages": {one}}}' for one in STAGES)]
+
+
 @pytest.mark.parametrize("name", ["manifest.json", ".manifest.copy.json"])
-@pytest.mark.parametrize(
-    "text",
-    [
-        None,
-        "",
-        "[]",
-        "{",
-        "[" * 100_000,
-        '{"stages": {"x": {}}}',
-        '{"stages": [1]}',
-        '{"stages": {"x": {"hash": "", "seconds": 0, "products": {"y": {"sha256": "", "bytes": 1e999}}}}}',
-    ],
-)
+@pytest.mark.parametrize("text", DAMAGED)
 def test_a_lost_or_damaged_manifest_is_replaced_by_its_copy(folder, name, text):
     whole = (folder / "manifest.json").read_text()
     if text is None:
@@ -103,8 +85,8 @@ def test_a_lost_or_damaged_manifest_is_replaced_by_its_copy(folder, name, text):
 def test_without_any_manifest_nothing_is_taken_for_a_product(folder):
     for name in ("manifest.json", ".manifest.copy.json"):
         (folder / name).write_text("{")
-    with pytest.raises(DataError, match=r"neither manifest\.json nor \.manifest\.copy\.json in"):
-        ProductStore(folder)
+    text = r"neither manifest\.json nor \.manifest\.copy\.json in"
+    refuses(text, ProductStore, folder, error=DataError)
     for name in ("manifest.json", ".manifest.copy.json"):
         (folder / name).unlink()
     refuses("is no run's folder", ProductStore, folder, error=DataError)

@@ -6,6 +6,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
+from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.figures import error_bars, legend_texts, line_data
 from helpers.runs import made_up_kernel, noise_image
@@ -49,8 +50,8 @@ def test_fractions_stand_beside_each_other_with_their_scatter(study):
     assert first[1, 1] == pytest.approx(middle)
     scatter = 1.48 * np.median(np.abs(values - middle))
     assert 0.5 * (high - low)[1] == pytest.approx(scatter)
-    np.testing.assert_allclose(second[:, 0] - first[:, 0], 0.015)
-    np.testing.assert_allclose(0.5 * (second + first)[:, 0], [0, 0.2, 0.6, 0.99])
+    assert_allclose(second[:, 0] - first[:, 0], 0.015)
+    assert_allclose(0.5 * (second + first)[:, 0], [0, 0.2, 0.6, 0.99])
     assert legend_texts(ax) == ["with MIRI", "without MIRI"]
 
 
@@ -59,9 +60,9 @@ def test_recovered_luminosities_lie_about_the_line_of_equality(study):
     assert len(figure.axes) == 3
     for one, ax in zip(study.with_agn, figure.axes, strict=True):
         true = one.truth["accretion_power"][one.sample].to_value(u.erg / u.s)
-        np.testing.assert_allclose(line_data(ax, ".")[0][:, 0], true)
+        assert_allclose(line_data(ax, ".")[0][:, 0], true)
         (equality,) = (line.get_xydata() for line in ax.lines if line.get_marker() == "None")
-        np.testing.assert_array_equal(equality[:, 0], equality[:, 1])
+        assert_array_equal(equality[:, 0], equality[:, 1])
         assert ax.texts[0].get_text().startswith("median -0.")
     assert study_figures.disk_figure(mock_study((0.0,))) is None
 
@@ -73,10 +74,10 @@ def test_xray_counts_stand_above_the_shares_found(study):
     values = np.concatenate([xray_fluxes(one)[one.field] for one in study.with_agn])
     found = np.concatenate([one.sample[one.field] for one in study.with_agn])
     table = completeness(values, found, bins)
-    np.testing.assert_array_equal(upper.patches[0].get_data().values, table["n"])
-    np.testing.assert_array_equal(upper.patches[1].get_data().values, table["n_found"])
+    assert_array_equal(upper.patches[0].get_data().values, table["n"])
+    assert_array_equal(upper.patches[1].get_data().values, table["n_found"])
     some = table[table["n"] > 0]
-    np.testing.assert_allclose(line_data(lower, "o")[0][:, 1], some["share"])
+    assert_allclose(line_data(lower, "o")[0][:, 1], some["share"])
     # estimates are dotted
     assert len(line_data(upper, ":")) == 2
     assert "50 % of these" in legend_texts(upper)
@@ -88,15 +89,15 @@ def test_luminosities_with_an_axis_of_star_formation(study):
     (ax,), one = figure.axes, study.truths[0]
     seen = one.field & (np.asarray(one.matched["n_detected"]) >= 2)
     drawn = line_data(ax, "o")[0]
-    np.testing.assert_allclose(drawn[:, 0], one.truth["redshift"][seen])
-    np.testing.assert_allclose(drawn[:, 1], one.truth["ir_luminosity"][seen].value)
+    assert_allclose(drawn[:, 0], one.truth["redshift"][seen])
+    assert_allclose(drawn[:, 1], one.truth["ir_luminosity"][seen].value)
     labels = ["not detected", "detected in two or more MIRI bands", "MIPS 24 µm above its limit"]
     assert legend_texts(ax) == labels
     (right,) = ax.child_axes
     figure.draw_without_rendering()
     # Kennicutt 1998: 4.5e-44 Msun / yr for each erg / s
     rate = 4.5e-44 * (1 * u.Lsun).to_value(u.erg / u.s)
-    np.testing.assert_allclose(right.get_ylim(), np.array(ax.get_ylim()) * rate)
+    assert_allclose(right.get_ylim(), np.array(ax.get_ylim()) * rate)
 
 
 def test_offsets_by_shape_have_their_median_and_circles(study):
@@ -109,7 +110,7 @@ def test_offsets_by_shape_have_their_median_and_circles(study):
     assert ax.texts[0].get_text() == f"median {np.median(error[rows]):+.3f}"
     (circles,) = line_data(ax, "o")
     expected = np.clip(error[rows & one.crowded[BANDS[0]]], -0.97, 0.97)
-    np.testing.assert_allclose(circles[:, 1], expected)
+    assert_allclose(circles[:, 1], expected)
 
 
 def test_classes_say_shares_and_numbers(study):
@@ -137,7 +138,7 @@ def test_uniform_ranks_have_the_density_one():
     ranks = {("all", "redshift"): np.r_[np.arange(0.05, 1, 0.1), np.nan]}
     ranks |= {("all", "frac_agn"): np.zeros(8), ("blue", "frac_agn"): np.zeros(8)}
     first, second = study_figures.rank_figure(ranks).axes
-    np.testing.assert_allclose(first.patches[0].get_data().values, 1.0)
+    assert_allclose(first.patches[0].get_data().values, 1.0)
     assert second.patches[0].get_data().values[0] == pytest.approx(10)
     assert second.get_ylim()[1] > 10
     assert (first.get_title(), second.get_title()) == ("redshift", "fracAGN")
@@ -161,15 +162,15 @@ def test_magnitudes_and_counts_are_those_of_the_sources():
     table = QTable({"miri.f770w": flux, "miri.f770w_true": np.abs(flux)})
     (ax,) = band_figures.magnitude_figure(table, ["miri.f770w"]).axes
     magnitudes = [[23.9, 23.9], [21.4, 21.4], [18.9, 18.9]]
-    np.testing.assert_allclose(line_data(ax, ".")[0][:3], magnitudes)
+    assert_allclose(line_data(ax, ".")[0][:3], magnitudes)
     # a source without a positive flux is a tick
     assert line_data(ax, "|")[0][0, 0] == pytest.approx(23.9)
     # bright sources are at the top
     assert ax.get_ylim()[0] > ax.get_ylim()[1]
     (ax,) = band_figures.counts_figure(table[:3], ["miri.f770w"], 1 * u.deg**2).axes
     ((xy, low, high),) = error_bars(ax)
-    np.testing.assert_allclose(xy, [[18.75, 2.0], [21.25, 2.0], [23.75, 2.0]])
-    np.testing.assert_allclose((low, high), (np.zeros(3), np.full(3, 4.0)), atol=1e-12)
+    assert_allclose(xy, [[18.75, 2.0], [21.25, 2.0], [23.75, 2.0]])
+    assert_allclose((low, high), (np.zeros(3), np.full(3, 4.0)), atol=1e-12)
 
 
 def test_encircled_energy_is_in_percent():
@@ -177,7 +178,7 @@ def test_encircled_energy_is_in_percent():
     left, right = pictures.convolution_figure({"miri.f770w": kernel}).axes
     radius, percent = right.lines[0].get_xydata().T
     expected = kernel.encircled_energy_error(radius * u.arcsec)
-    np.testing.assert_allclose(percent, 100 * expected)
+    assert_allclose(percent, 100 * expected)
     assert legend_texts(left) == ["F770W"]
 
 
@@ -208,10 +209,10 @@ def test_spectra_are_in_order_of_their_fraction(study):
     (ax,) = source_figures.spectra_figure(study, 3, model).axes
     curves = [line for line in ax.lines if len(line.get_xdata()) == 50]
     for line, fraction in zip(curves, (0, 0.2, 0.4, 0.6, 0.8, 0.99), strict=True):
-        np.testing.assert_allclose(line.get_ydata(), (1 + fraction) * wave)
+        assert_allclose(line.get_ydata(), (1 + fraction) * wave)
     # features are redshifted, and left out beyond the spectrum
     redshift = study.truths[0].truth["redshift"][3]
     features = np.array([3.3, 6.2, 7.7, 8.6, 11.3, 12.7]) * (1 + redshift)
     marks = [line[0, 0] for line in line_data(ax, ":")]
-    np.testing.assert_allclose(marks, features[features < 38])
+    assert_allclose(marks, features[features < 38])
     assert {"F770W", "F2100W"} < {text.get_text() for text in ax.texts}

@@ -27,10 +27,7 @@ def kernels(subpackage):
                     found[f"{name}.{key}"] = (len(value.signatures), misses)
     return found
 """
-FIT = """
-from miricigale.workflow import warmup
-warmup.compile_job("fit")
-"""
+FIT = "from miricigale.workflow import warmup\nwarmup.compile_job('fit')"
 APART = "from miricigale.workflow.warmup import compile_apart\ncompile_apart('images')"
 REAL = """
 import astropy.units as u
@@ -48,13 +45,16 @@ SEDModel.yang2021().evaluate(redshift=1.0, frac_agn=0.3)
 """
 
 
-def python(code, cache, **env):
+def with_cache(cache):
+    """The environment of a process with a cache of its own."""
+    return {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(cache)}
+
+
+def python(code, cache):
     """Run code in a process of its own with a cache of its own."""
-    env = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(cache), **env}
-    done = subprocess.run(
-        [sys.executable, "-W", "error::RuntimeWarning", "-c", KERNELS + code],
-        cwd=cache, env=env, capture_output=True, text=True, timeout=900, check=False,
-    )  # fmt: skip
+    command = [sys.executable, "-W", "error::RuntimeWarning", "-c", KERNELS + code]
+    options = {"capture_output": True, "text": True, "timeout": 900, "check": False}
+    done = subprocess.run(command, cwd=cache, env=with_cache(cache), **options)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -89,8 +89,7 @@ def test_what_is_compiled_is_known(cache, monkeypatch):
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
 def test_compilation_ends_with_the_process_that_asked_for_it(tmp_path):
-    env = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(tmp_path)}
-    parent = subprocess.Popen([sys.executable, "-c", APART], env=env)
+    parent = subprocess.Popen([sys.executable, "-c", APART], env=with_cache(tmp_path))
     children = Path(f"/proc/{parent.pid}/task/{parent.pid}/children")
     deadline = time.monotonic() + 60
     while not children.read_text().split() and time.monotonic() < deadline:
@@ -109,8 +108,7 @@ def test_compilation_ends_with_the_process_that_asked_for_it(tmp_path):
 
 def test_nothing_is_imported_from_the_folder_of_the_call(tmp_path):
     (tmp_path / "platform.py").write_text("import os\nopen('ran', 'w')\nos._exit(0)\n")
-    env = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-    command = [sys.executable, "-P", "-c", APART]
+    command, env = [sys.executable, "-P", "-c", APART], with_cache(tmp_path / "cache")
     with subprocess.Popen(command, env=env, cwd=tmp_path) as parent:
         # the first kernel is kept long after all imports
         while parent.poll() is None and not list(tmp_path.glob("cache/*/*.nbi")):
@@ -127,9 +125,8 @@ def test_what_is_missing_is_compiled_and_said(monkeypatch, caplog):
     # one is not kept
     assert not warmup.compile_missing(2)
     assert sorted(done) == ["fit", "photometry"]
-    assert [line.split(",")[0] for line in caplog.messages] == [
-        "compiling model spectra and their fit", "compiling photometry"
-    ]  # fmt: skip
+    told = [line.split(",")[0] for line in caplog.messages]
+    assert told == ["compiling model spectra and their fit", "compiling photometry"]
     monkeypatch.setattr(warmup, "is_compiled", lambda name: True)
     assert warmup.compile_missing(2)
     assert len(done) == 2

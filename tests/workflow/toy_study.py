@@ -38,10 +38,8 @@ def brightness(config, unit):
 
 
 def stages():
-    return (
-        Stage("first", first, "first", units=lambda _: "abcd", plan=brightness),
-        Stage("second", second, "second", needs=("first",)),
-    )
+    one = Stage("first", first, "first", units=lambda _: "abcd", plan=brightness)
+    return one, Stage("second", second, "second", needs=("first",))
 
 
 def main(folder, n_processes, *options):
