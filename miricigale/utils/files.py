@@ -147,7 +147,7 @@ def _judge(caught):
             raise OSError(msg)
         # that data are missing is said by `_check_declared`, of packed files too
         if not text.startswith("File may have been trunc"):
-            warn(warning.message)
+            warn(warning.message, warning.category)
 
 
 def _check_declared(path, hdus, n_bytes):

@@ -292,7 +292,7 @@ def run_unit(config, folder, stages, name, unit, **options):
             stage.function(context, unit)
     except Exception as err:
         for one in caught:
-            warn(one.message)
+            warn(one.message, one.category)
         err.add_note(f"in stage {stage.key(unit)}")
         raise
     products = {product: context.products.describe(product) for product in context.saved}
