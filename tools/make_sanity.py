@@ -19,7 +19,14 @@ from miricigale.instrument.image_files import read_image
 from miricigale.pages import cell_of, number
 from miricigale.sed import SEDModel
 from miricigale.workflow import Context, load_config
-from miricigale.workflow.page import band_figures, labels, pictures, provenance, study_figures
+from miricigale.workflow.page import (
+    band_figures,
+    labels,
+    pictures,
+    provenance,
+    source_figures,
+    study_figures,
+)
 from miricigale.workflow.page.declared import texts_of
 from miricigale.workflow.page.numbers import StudyTables
 from miricigale.workflow.page.paper import study_results
@@ -37,9 +44,9 @@ def rst_table(header, rows):
     return "\n".join([line, text[0], line, *text[1:], line])
 
 
-def shown(value, spec, **options):
+def shown(value, spec, scale=1):
     """A number, or a dash where the metrics have none."""
-    return str(number(value, spec, "", **options))
+    return str(number(None if value is None else scale * value, spec, ""))
 
 
 def main():
@@ -75,9 +82,11 @@ def main():
         "counts": band_figures.counts_figure(galaxies, bands, area),
         "offsets": band_figures.offset_figure(inside, bands, magnitudes),
         "errors": band_figures.error_figure(errors, bands, limits),
-        "redshifts": study_figures.redshift_figure(sample, fits),
+        "redshifts": study_figures.redshift_figure(
+            {name: (sample["redshift"], table) for name, table in fits.items()}
+        ),
         "fractions": study_figures.histogram_figure(study, "fraction"),
-        "example": study_figures.example_figure(results, row, typical, model),
+        "example": source_figures.example_figure(results, row, typical, model),
         "color": pictures.field_figure(
             [read_image(run / sky / f"mosaic_{name}.fits") for name in chosen],
             read_image(run / "f160w.fits"),
