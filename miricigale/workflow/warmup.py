@@ -17,7 +17,7 @@ import sys
 import threading
 from pathlib import Path
 
-from miricigale.utils.parallel import threads
+from miricigale.utils.parallel import parallel_map, threads
 
 # shown by the command line at any verbosity
 log = logging.getLogger("miricigale.utils.compilation")
@@ -144,7 +144,7 @@ def compile_missing(n_threads):
         _, what, seconds = JOBS[name]
         log.info("compiling %s, once for each installation, up to %d s", what, seconds)
     with threads(n_threads) as executor:
-        return all(list(executor.map(compile_apart, names)))
+        return all(parallel_map(compile_apart, names, executor=executor))
 
 
 def compile_job(name):
