@@ -150,7 +150,7 @@ GUESSES = [
         'm.Filter.from_file("f.dat")',
         "Filter has no 'from_file'; it has from_name",
     ),
-    ("filter as a table file", 'm.Filter("F770W").write(tmp_path / "f.parquet")', None),
+    ("filter as a table file", 'm.Filter("F770W").write(tmp_path / "f.vot")', None),
     (
         "fluxes by keywords",
         "MODEL.fluxes(redshift=1, filters=['F770W'])",
