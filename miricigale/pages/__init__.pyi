@@ -1,6 +1,6 @@
-from .declared import SectionWriter as SectionWriter
-from .declared import declared as declared
-from .declared import sentence as sentence
+from .sections import SectionWriter as SectionWriter
+from .sections import declared as declared
+from .sections import sentence as sentence
 from .page import Page as Page
 from .rendering import render as render
 from .values import Link as Link
