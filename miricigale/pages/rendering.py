@@ -34,7 +34,7 @@ def render(template, **values):
 
 def image_of(figure, dpi):
     """
-    Draw a matplotlib figure, and clear it.
+    Draw a matplotlib figure.
 
     Parameters
     ----------
@@ -66,7 +66,6 @@ def image_of(figure, dpi):
     with rc_context({"svg.hashsalt": "miricigale"}):
         figure.savefig(buffer, **options)
     width = round(dpi * figure.get_figwidth())
-    figure.clear()
     return f"data:image/{kind};base64,{base64.b64encode(buffer.getvalue()).decode()}", width
 
 
