@@ -12,7 +12,7 @@ from pathlib import Path
 
 from astropy.io import fits
 from astropy.table import QTable
-from astropy.utils.exceptions import AstropyUserWarning
+from astropy.utils.exceptions import AstropyDeprecationWarning, AstropyUserWarning
 
 from miricigale.utils.configuration import conf
 from miricigale.utils.exceptions import DataError, argument_error, warn
@@ -146,7 +146,9 @@ def _judge(caught):
             msg = "truncated or damaged: " + " ".join(text.splitlines()[1].split())
             raise OSError(msg)
         # that data are missing is said by `_check_declared`, of packed files too
-        if not text.startswith("File may have been trunc"):
+        # and what astropy calls of its own that it will drop is nothing to the user
+        own = issubclass(warning.category, AstropyDeprecationWarning)
+        if not own and not text.startswith("File may have been trunc"):
             warn(warning.message, warning.category)
 
 
