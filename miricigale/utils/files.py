@@ -146,7 +146,7 @@ def _judge(caught):
             msg = "truncated or damaged: " + " ".join(text.splitlines()[1].split())
             raise OSError(msg)
         # that data are missing is said by `_check_declared`, of packed files too
-        # and what astropy calls of its own that it will drop is nothing to the user
+        # deprecations within astropy do not concern the user
         own = issubclass(warning.category, AstropyDeprecationWarning)
         if not own and not text.startswith("File may have been trunc"):
             warn(warning.message, warning.category)
