@@ -44,7 +44,8 @@ def test_slope_is_the_generalized_least_squares_line(rate, n, step, read):
     design = np.column_stack([np.ones(n), time])
     expected = np.linalg.inv(design.T @ inverse @ design)[1, 1]
     variance = ramp_variance(rate, n_groups=n, group_time=step, read_noise=read)
-    assert_allclose(variance, expected, rtol=1e-6)
+    # with next to no photons the inverse of the matrix has fewer digits
+    assert_allclose(variance, expected, rtol=1e-9 if rate > 1 else 1e-6)
     if read == 0:
         # the first group is lost as the zero, and nothing else
         assert_allclose(variance, rate / ((n - 1) * step))

@@ -23,7 +23,9 @@ def test_coverage_is_that_of_gaussians(bias, width):
     table = coverage_table({"x": posterior_ranks(true, values, LEVELS)})
     reach = width * norm.ppf(0.5 + np.array([0.34, 0.475]))
     expected = norm.cdf(reach - bias) - norm.cdf(-reach - bias)
-    assert_allclose(table["share"], expected, atol=0.02)
+    close = 0.01 if (bias, width) == (0.0, 1.0) else 0.02
+    assert_allclose(table["share"][0], expected[0], atol=0.02)
+    assert_allclose(table["share"][1], expected[1], atol=close)
     assert np.all((table["share_low"] < table["share"]) & (table["share"] < table["share_high"]))
     expected = norm.cdf(-bias / np.hypot(1, width))
     assert table["mean_rank"][0] == pytest.approx(expected, abs=0.02)
