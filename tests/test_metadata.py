@@ -3,6 +3,7 @@
 import configparser
 import re
 import tomllib
+from importlib import resources
 from pathlib import Path
 
 from packaging.requirements import Requirement
@@ -29,6 +30,13 @@ def test_oldestdeps_are_the_lower_bounds():
     assert {name: Version(number) for name, number in pinned.items()} == {
         name: Version(number) for name, number in bounds.items()
     }
+
+
+def test_the_installed_package_has_every_file_of_the_tree():
+    tree, installed = ROOT / "miricigale", resources.files("miricigale")
+    files = {path.relative_to(tree) for path in tree.rglob("*") if path.is_file()}
+    wanted = {path for path in files if "__pycache__" not in path.parts}
+    assert sorted(path for path in wanted if not (installed / path).is_file()) == []
 
 
 def test_extras_are_documented():
