@@ -3,6 +3,7 @@
 import contextlib
 import os
 import shutil
+import sys
 import tempfile
 from pathlib import Path
 
@@ -10,6 +11,8 @@ import pytest
 
 # processes are forked, stopped by signals and limited there, which Windows does not know
 POSIX = ("integration/test_study.py", "utils/test_lock.py", "workflow/test_robust.py")
+# scripts of the gallery, which tests/test_docs.py runs, and the pages that Sphinx makes of them
+collect_ignore_glob = ["docs/examples/*", "docs/how_to/*", "docs/tutorials/*", "docs/_build/*"]
 collect_ignore = [f"tests/{name}" for name in POSIX] if os.name == "nt" else []
 
 
@@ -25,6 +28,14 @@ def pytest_configure(config):
 
 def pytest_unconfigure(config):
     shutil.rmtree(config.own_folder, ignore_errors=True)
+
+
+@pytest.fixture(autouse=True)
+def close_figures():
+    """Close the figures that a test or a page has drawn."""
+    yield
+    if "matplotlib.pyplot" in sys.modules:
+        sys.modules["matplotlib.pyplot"].close("all")
 
 
 @pytest.fixture(scope="session")

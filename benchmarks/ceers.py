@@ -145,7 +145,7 @@ def time_known(grid, used, table, n=2000):
 
 def worst_tenth(results, table, bands, true):
     """What the tenth with the largest errors in redshift has in common: medians of it and of all."""
-    middle = results.percentile("redshift", 0.5).value.reshape(-1)
+    middle = results.percentile("redshift", 0.5).value
     off = np.abs(middle - true) / (1 + true)
     worst = off >= np.quantile(off, 0.9)
     flux = {b: table[b].to_value(u.uJy) for b in bands}

@@ -1,5 +1,5 @@
 """
-What it costs that the analysis does not know the sky: the table of docs/guide/workflow.rst.
+What it costs that the analysis does not know the sky: the table of docs/method/workflow.rst.
 
     python benchmarks/perturbed.py FOLDER [--set perturb.cutouts=IMAGE.fits --set perturb.cutouts_of=any]
 

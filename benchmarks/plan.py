@@ -3,7 +3,7 @@ The plan of the CEERS exposures, compared with what the imaging run of the same 
 
     python benchmarks/plan.py [--sources 500]
 
-No AGN, as in the run of docs/sanity.rst; prints each number of both and the processor time.
+No AGN, as in the run of docs/accuracy/study.rst; prints each number of both and the processor time.
 """
 
 import argparse
@@ -15,7 +15,7 @@ from miricigale.evaluation import Estimate
 from miricigale.planning import Planner, load_plan
 from miricigale.utils.parallel import threads
 
-#: docs/sanity.rst: 342 sources. The run's errors are the plan's, scaled to as many sources, and of shares
+#: docs/accuracy/study.rst: 342 sources. The run's errors are the plan's, scaled to as many sources, and of shares
 #: those of its own counts.
 N_RUN = 342
 RUN = {

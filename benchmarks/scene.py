@@ -2,7 +2,7 @@
 Time the rendering of scenes and measure their accuracy.
 
 Run as ``python benchmarks/scene.py``; prints a table of wall-clock and CPU times (after compiling)
-and the errors that docs/guide/scene.rst quotes.
+and the errors that docs/accuracy/scene.rst quotes.
 """
 
 import resource

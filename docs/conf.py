@@ -1,15 +1,15 @@
 """Sphinx configuration."""
 
-import doctest
 import importlib.metadata
 import os
-import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 from sphinx_astropy.conf.v2 import *  # noqa: F403
 from sphinx_astropy.conf.v2 import exclude_patterns, extensions
+from sphinx_gallery.sorting import ExplicitOrder
 
 project = "miricigale"
 author = "The miricigale developers"
@@ -20,21 +20,66 @@ version = ".".join(release.split(".")[:2])
 # the directive of the pages about components
 sys.path.insert(0, str(Path(__file__).parent / "_ext"))
 
-# what these pages do not use
+# what these pages do not use; equations are MathML, which needs no script and no network
 extensions = [
     name
     for name in extensions
     if name
     not in (
-        "matplotlib.sphinxext.plot_directive",
+        "sphinx.ext.mathjax",
         "sphinx.ext.inheritance_diagram",
         "sphinx.ext.todo",
         "sphinx_astropy.ext.changelog_links",
         "sphinx_astropy.ext.generate_config",
     )
 ]
-extensions.append("sed_component")
-exclude_patterns = [*exclude_patterns, "changes/*"]
+extensions += [
+    "flag_table",
+    "mathml",
+    "sed_component",
+    "sphinx_design",
+    "sphinx_gallery.gen_gallery",
+]
+exclude_patterns = [*exclude_patterns, "changes/*", "examples/*"]
+html_static_path = ["_static"]
+html_css_files = ["miricigale.css"]
+html_search_scorer = str(Path(__file__).parent / "_static" / "scorer.js")
+html_favicon = "_static/logo.svg"
+
+# the scripts of ``examples`` become pages with their figures, notebooks and scripts to download
+# they run in a copy, where the files that they write stay
+_EXAMPLES = Path(__file__).parent / "_build" / "examples"
+shutil.rmtree(_EXAMPLES, ignore_errors=True)
+shutil.copytree(Path(__file__).parent / "examples", _EXAMPLES)
+sphinx_gallery_conf = {
+    "examples_dirs": ["_build/examples/tutorials", "_build/examples/how_to"],
+    "gallery_dirs": ["tutorials", "how_to"],
+    "filename_pattern": r"\.py$",
+    "within_subsection_order": "FileNameSortKey",
+    "nested_sections": True,
+    "subsection_order": ExplicitOrder(
+        [
+            f"_build/examples/how_to/{theme}"
+            for theme in ("plan", "measure", "fit", "simulate", "reduce", "models", "run")
+        ]
+    ),
+    "remove_config_comments": True,
+    "abort_on_example_error": True,
+    "show_signature": False,
+    "show_memory": False,
+    "min_reported_time": 1e6,
+    "reference_url": {"miricigale": None},
+    "doc_module": ("miricigale",),
+    "backreferences_dir": None,
+    "plot_gallery": os.environ.get("MIRICIGALE_GALLERY", "1") == "1",
+}
+# figures of the pages about methods are drawn by their code
+plot_html_show_formats = False
+plot_html_show_source_link = False
+plot_include_source = False
+plot_formats = [("png", 110)]
+plot_rcparams = {"figure.figsize": (7, 4), "figure.constrained_layout.use": True}
+plot_apply_rcparams = True
 
 # links to other packages are made where the pages are published; elsewhere no network is needed
 if os.environ.get("READTHEDOCS") == "True":
@@ -61,10 +106,13 @@ html_title = f"miricigale {version}"
 html_last_updated_fmt = None
 html_copy_source = False
 html_show_sourcelink = False
-html_sidebars = {
-    name: [] for name in ("index", "install", "quickstart", "dataflow", "tutorials/*", "changes")
-}
+html_sidebars = {"index": []}
 html_theme_options = {
+    "logo": {
+        "image_light": "_static/logo.svg",
+        "image_dark": "_static/logo.svg",
+        "text": "miricigale",
+    },
     "header_links_before_dropdown": 8,
     "icon_links": [],
     "navbar_persistent": ["search-button"],
@@ -73,30 +121,6 @@ html_theme_options = {
     "show_nav_level": 1,
     "show_toc_level": 2,
 }
-
-
-def draw_figures(app):
-    """Run the tutorial, saving the current figure wherever the page has an image of it."""
-    import matplotlib
-
-    matplotlib.use("agg")
-    import matplotlib.pyplot as plt
-
-    page = Path(app.srcdir) / "tutorials" / "by_hand.rst"
-    folder = Path(app.srcdir) / "_build" / "figures"
-    folder.mkdir(parents=True, exist_ok=True)
-    image = r"^\.\. image:: /_build/figures/(\S+)$"
-    pieces = re.split(image, page.read_text(encoding="utf-8"), flags=re.MULTILINE)
-    codes, names = pieces[0::2], pieces[1::2]
-    paths = [folder / name for name in names]
-    if all(path.exists() and path.stat().st_mtime > page.stat().st_mtime for path in paths):
-        return
-    namespace = {}
-    for code, path in zip(codes, paths, strict=False):
-        for example in doctest.DocTestParser().get_examples(code):
-            exec(compile(example.source, page.name, "exec"), namespace)
-        plt.gcf().savefig(path, dpi=110, bbox_inches="tight")
-        plt.close("all")
 
 
 def draft_changes(app):
@@ -113,5 +137,4 @@ def draft_changes(app):
 
 def setup(app):
     """Add what these pages need to Sphinx."""
-    app.connect("builder-inited", draw_figures)
     app.connect("builder-inited", draft_changes)

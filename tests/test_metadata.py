@@ -6,6 +6,7 @@ import tomllib
 from importlib import resources
 from pathlib import Path
 
+import pytest
 from packaging.requirements import Requirement
 from packaging.version import Version
 
@@ -32,11 +33,31 @@ def test_oldestdeps_are_the_lower_bounds():
     }
 
 
+def test_recipe_requires_what_the_package_requires():
+    path = ROOT / "recipe/meta.yaml"
+    if not path.is_file():
+        pytest.skip("the source archive has no recipe")
+    recipe = path.read_text(encoding="utf-8").replace("matplotlib-base", "matplotlib")
+    stated = re.findall(r"^    - ([\w-]+) >=([\w.]+)$", recipe.split("  run:\n")[1], re.MULTILINE)
+    python = SETUP["options"]["python_requires"].removeprefix(">=")
+    wanted = requirements(SETUP["options"]["install_requires"])
+    bounds = {item.name: bound.version for item in wanted for bound in item.specifier}
+    assert dict(stated) == bounds | {"python": python}
+    assert f"license: {SETUP['metadata']['license_expression']}\n" in recipe
+
+
 def test_the_installed_package_has_every_file_of_the_tree():
     tree, installed = ROOT / "miricigale", resources.files("miricigale")
     files = {path.relative_to(tree) for path in tree.rglob("*") if path.is_file()}
     wanted = {path for path in files if "__pycache__" not in path.parts}
     assert sorted(path for path in wanted if not (installed / path).is_file()) == []
+
+
+def test_no_module_has_the_name_of_what_it_gives():
+    """Attributes of a package are looked up by name: a module of that name hides the function."""
+    pattern = re.compile(r"^from \.(\w+) import \1 as", re.MULTILINE)
+    stubs = sorted((ROOT / "miricigale").rglob("*.pyi"))
+    assert [path for path in stubs if pattern.search(path.read_text(encoding="utf-8"))] == []
 
 
 def test_extras_are_documented():

@@ -198,7 +198,7 @@ def band_mean(wave, throughput, fnu):
 
 def imager(wave, level):
     lines = [
-        "# Figures of the MIRI imager; sources in tools/make_instrument.py and docs/guide/instrument.rst.",
+        "# Figures of the MIRI imager; sources in tools/make_instrument.py and docs/method/instrument.rst.",
         DETECTOR,
         "# Frame times in s",
     ]

@@ -1,5 +1,5 @@
 """
-Make the pictures and tables of docs/sanity.rst from a finished run.
+Make the pictures and tables of docs/accuracy/study.rst from a finished run.
 
     miricigale run goodss -o RUN
     python tools/make_sanity.py RUN

@@ -2,12 +2,13 @@
 Directives that show what the code declares, so that no page repeats it by hand.
 
 ``.. sed-component:: NAME`` shows a component of a model: class, role, reference, the data that
-it reads, options and parameters; a name that is not registered is an error of the build.
+it reads, options, parameters and a figure; a name that is not registered is an error of the build.
 ``.. sed-derived::`` shows the table of derived quantities.
 """
 
 import re
 
+from component_figure import VARIED
 from docutils.statemachine import StringList
 from sphinx.util.docutils import SphinxDirective
 
@@ -15,7 +16,14 @@ from miricigale import sed
 from miricigale.refdata import resource
 from miricigale.sed import COMPONENTS, DERIVED, components
 
-__all__ = ["SEDComponent", "SEDDerived", "component_lines", "derived_lines", "setup"]
+__all__ = [
+    "SEDComponent",
+    "SEDDerived",
+    "component_lines",
+    "derived_lines",
+    "figure_lines",
+    "setup",
+]
 
 _KINDS = {
     "bundled": "comes with the package",
@@ -52,9 +60,9 @@ def component_lines(name):
     home = components if cls.__module__.startswith(components.__name__) else sed
     where = home.__name__ if hasattr(home, cls.__name__) else cls.__module__
     fields = [
-        ("Component", f"``{name}``, :class:`~{where}.{cls.__name__}`"),
+        ("Name", f"``{name}``, :class:`~{where}.{cls.__name__}`"),
         ("Role", f"``{cls.role}``"),
-        ("Reference", escape(cls.reference) or "–"),
+        ("Paper", escape(cls.reference) or "–"),
     ]
     if cls.resource:
         fields += _data_fields(resource(cls.resource))
@@ -86,6 +94,34 @@ def component_lines(name):
     return [*lines, ""]
 
 
+def figure_lines(name):
+    """
+    Figure of a component, as lines of reStructuredText.
+
+    Components whose data users bring have a sentence in its place.
+
+    Parameters
+    ----------
+    name : str
+        The component's ``name``.
+
+    Returns
+    -------
+    lines : list of str
+    """
+    if name not in VARIED:
+        return ["No figure here: the component needs data of yours.", ""]
+    return [
+        ".. plot::",
+        f"   :alt: {name} for some values of its parameters",
+        f"   :caption: ``{name}`` for some values of its parameters, the others at their defaults.",
+        "",
+        "   from component_figure import draw",
+        f"   draw({name!r})",
+        "",
+    ]
+
+
 def derived_lines():
     """Derived quantities, as lines of reStructuredText."""
     rows = [
@@ -102,9 +138,12 @@ def _data_fields(record):
         source = escape(record.source)
         fields += [
             ("Source", source),
-            ("Registration", f"``miricigale data add {record.name} PATH``; see :doc:`/guide/data`"),
+            (
+                "Register",
+                f"``miricigale data add {record.name} PATH``; see :doc:`/method/data`",
+            ),
         ]
-    fields += [("Licence", escape(record.licence)), ("To cite", escape(record.citation))]
+    fields += [("License", escape(record.licence)), ("Cite", escape(record.citation))]
     return fields
 
 
@@ -126,7 +165,7 @@ class SEDComponent(SphinxDirective):
     def run(self):
         """Nodes of the fields and tables."""
         try:
-            lines = component_lines(self.arguments[0])
+            lines = component_lines(self.arguments[0]) + figure_lines(self.arguments[0])
         except KeyError as err:
             raise self.error(str(err.args[0])) from err
         source = f"sed-component {self.arguments[0]}"
@@ -145,6 +184,7 @@ class SEDDerived(SphinxDirective):
 
 def setup(app):
     """Add the directives to Sphinx."""
+    app.setup_extension("matplotlib.sphinxext.plot_directive")
     app.add_directive("sed-component", SEDComponent)
     app.add_directive("sed-derived", SEDDerived)
     return {"version": "1", "parallel_read_safe": True, "parallel_write_safe": True}

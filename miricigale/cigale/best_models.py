@@ -59,6 +59,16 @@ def best_model_table(
     ------
     KeyError, ValueError
         As `~miricigale.sed.SEDModel.values`.
+
+    Examples
+    --------
+    >>> from miricigale.cigale import best_model_table
+    >>> from miricigale.sed import SEDModel
+    >>> table = best_model_table(SEDModel.yang2021(), {"redshift": 0.05, "frac_agn": 0.4})
+    >>> table.colnames[:4]
+    ['wavelength', 'Fnu', 'L_lambda_total', 'stellar.old']
+    >>> round(table.meta["agn.fracAGN"], 2)
+    0.4
     """
     values = model.values(parameters)
     spectra = model.evaluate(**parameters)
@@ -204,6 +214,23 @@ def write_best_models(results, folder, *, xray=None, overwrite=False):
     ------
     OSError
         If a file is there and ``overwrite`` is not given.
+
+    Examples
+    --------
+    >>> from miricigale import BayesFitter, ErrorModel, SEDModel
+    >>> bands = ["acs.f814w", "wfc3.f160w", "irac.ch1", "miri.f770w"]
+    >>> model = SEDModel.yang2021(agn=False)
+    >>> truth = {"id": ["a", "b"], "redshift": [0.5, 1.0], "age": [1.0, 3.0], "mass": [1e10, 1e10]}
+    >>> errors = ErrorModel.from_depths(dict.fromkeys(bands, 29.0))
+    >>> photometry = errors.perturb(model.fluxes(truth, bands), seed=1)
+    >>> axes = {"redshift": [0.4, 0.5, 0.9, 1.0, 1.1], "age": [1.0, 3.0], "ebv": [0.1, 0.3]}
+    >>> fitter = BayesFitter(model, bands, axes=axes)
+    >>> from tempfile import TemporaryDirectory
+    >>> from miricigale.cigale import write_best_models
+    >>> with TemporaryDirectory() as folder:
+    ...     paths = write_best_models(fitter.fit(photometry), folder)
+    >>> [path.name for path in paths]
+    ['a_best_model.fits', 'b_best_model.fits']
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)

@@ -76,6 +76,21 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
     -----
     Missing is a flux or error that is NaN, masked, below -9990, or -99, -99.9, -99.99, -999 and the like in the
     file's unit, an error of 0, and an upper limit that is not positive.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> from astropy.table import Table
+    >>> from miricigale.cigale import read_cigale_catalog
+    >>> rows = Table({"id": ["a"], "redshift": [1.3], "IRAC1": [2.0e-3], "IRAC1_err": [1e-4]})
+    >>> with TemporaryDirectory() as folder:
+    ...     rows.write(f"{folder}/galaxies.txt", format="ascii")
+    ...     table = read_cigale_catalog(f"{folder}/galaxies.txt")
+    >>> print(table["id", "irac.ch1"])
+     id irac.ch1
+          uJy
+    --- --------
+      a      2.0
     """
     path = Path(path)
     bands = None if bands is None else list(bands)

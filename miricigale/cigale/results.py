@@ -52,6 +52,24 @@ def write_cigale_results(results, path, *, variables=None, overwrite=False):
     ``best.reduced_chi_square`` (by the number of bands less one); ``best.X``, quantities of the best model, also
     of parameters that have one value; ``best.<band>``. Units are CIGALE's: Myr, Msun, Msun/yr, W, mag, nm, deg,
     mJy.
+
+    Examples
+    --------
+    >>> from miricigale import BayesFitter, ErrorModel, SEDModel
+    >>> bands = ["acs.f814w", "wfc3.f160w", "irac.ch1", "miri.f770w"]
+    >>> model = SEDModel.yang2021(agn=False)
+    >>> truth = {"id": ["a", "b"], "redshift": [0.5, 1.0], "age": [1.0, 3.0], "mass": [1e10, 1e10]}
+    >>> errors = ErrorModel.from_depths(dict.fromkeys(bands, 29.0))
+    >>> photometry = errors.perturb(model.fluxes(truth, bands), seed=1)
+    >>> axes = {"redshift": [0.4, 0.5, 0.9, 1.0, 1.1], "age": [1.0, 3.0], "ebv": [0.1, 0.3]}
+    >>> fitter = BayesFitter(model, bands, axes=axes)
+    >>> from tempfile import TemporaryDirectory
+    >>> from miricigale.cigale import read_cigale_results, write_cigale_results
+    >>> with TemporaryDirectory() as folder:
+    ...     write_cigale_results(fitter.fit(photometry), f"{folder}/results.fits")
+    ...     table = read_cigale_results(f"{folder}/results.fits")
+    >>> table["bayes.stellar.m_star"].unit
+    Unit("solMass")
     """
     note = results.meta.get("cigale", {})
     columns = _columns(results, cigale_names(note.get("modules")), variables)
@@ -133,6 +151,12 @@ def read_cigale_results(path):
     ------
     `~miricigale.utils.exceptions.DataError`
         If the file is missing or something else.
+
+    Examples
+    --------
+    >>> from miricigale.cigale import read_cigale_results
+    >>> table = read_cigale_results("out/results.fits")  # doctest: +SKIP
+    >>> table["id", "bayes.stellar.m_star", "best.reduced_chi_square"]  # doctest: +SKIP
     """
     table = read_table(path, wanted="results of CIGALE", cls=Table)
     missing = [name for name in ("id", *_CHI2) if name not in table.colnames]

@@ -56,6 +56,12 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
     -----
     `~miricigale.utils.exceptions.CatalogWarning`
         Of all that is left out, replaced or different, in one message.
+
+    Examples
+    --------
+    >>> from miricigale.cigale import read_pcigale_ini
+    >>> setup = read_pcigale_ini("pcigale.ini")  # doctest: +SKIP
+    >>> results = setup.fit(setup.catalog())  # doctest: +SKIP
     """
     path = Path(path)
     check_choice(libraries, "libraries", ("best", "bundled"))

@@ -70,6 +70,12 @@ class CigaleSetup:
         Options of `~miricigale.sed.with_xray_bands`; empty without X-rays.
     max_dev_alpha_ox : float
         Largest distance from the relation of Just et al. 2007; 0 for any.
+
+    Examples
+    --------
+    >>> from miricigale.cigale import read_pcigale_ini
+    >>> setup = read_pcigale_ini("pcigale.ini")  # doctest: +SKIP
+    >>> grid = setup.model().grid(setup.axes([0.5, 1.0]), list(setup.bands))  # doctest: +SKIP
     """
 
     path: Path

@@ -79,8 +79,11 @@ def show(args):
     from matplotlib import pyplot as plt
 
     plt.switch_backend("agg")
+    # a figure of its own, not the one of a session that calls this
+    plt.figure()
     product.plot()
     plt.gcf().savefig(picture, dpi=120)
+    plt.close()
     print(f"picture: {picture}")
     return 0
 

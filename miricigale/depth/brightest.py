@@ -26,6 +26,14 @@ def saturation_flux(exposure, *, background=None, psf=None, detector=None):
     -------
     flux : `~astropy.units.Quantity`
         In uJy; 0 if the sky alone fills the well.
+
+    Examples
+    --------
+    >>> from miricigale.depth import saturation_flux
+    >>> from miricigale.instrument import Exposure
+    >>> exposure = Exposure("F770W", n_groups=30)
+    >>> print(f"{saturation_flux(exposure).to('mJy'):.1f}")
+    0.6 mJy
     """
     noise = ExposureNoise(
         filter=exposure.filter,

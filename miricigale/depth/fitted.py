@@ -98,6 +98,14 @@ def fitted_noise(
     normalized to sum(W P) = 1: the sky comes in with sum(W^2), the source's own photons with
     sum(W^2 P), the pattern with sum(W_i W_j rho_ij). Ramps are fitted optimally, as in
     `sensitivity`.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.depth import fitted_noise
+    >>> sky, photon = fitted_noise("miri.f770w", 3000 * u.s)
+    >>> print(f"error of a faint source: {sky:.4f} uJy")
+    error of a faint source: 0.0184 uJy
     """
     seconds = positive(time, u.s, "time")
     for name, value in (("n_integrations", n_integrations), ("n_dithers", n_dithers)):

@@ -44,6 +44,15 @@ class ExposureNoise:
     ------
     ValueError
         If the background is negative or the detector is none.
+
+    Examples
+    --------
+    >>> from miricigale.depth import ExposureNoise
+    >>> noise = ExposureNoise(
+    ...     filter="miri.f770w", background=None, n_groups=100, group_time=2.775, n_ramps=4
+    ... )
+    >>> print(f"{noise.rate:.1f} electrons / s, error {noise.variance() ** 0.5:.2f}")
+    56.4 electrons / s, error 0.23
     """
 
     filter: str

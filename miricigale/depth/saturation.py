@@ -45,6 +45,20 @@ class SaturationForecast:
         (electrons per second of its brightest pixel, everything in it included);
         ``peak_fraction`` of the well by the last group; ``saturated``, whether it is full
         by then; ``group``, in which it first is (0 if it is not).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.table import Table
+    >>> from miricigale.depth import SaturationForecast
+    >>> from miricigale.instrument import Exposure
+    >>> rate = np.full((20, 20), 50.0)
+    >>> rate[10, 10] = 5000.0
+    >>> star = Table({"id": [7], "x": [10.0], "y": [10.0]})
+    >>> exposure = Exposure("F770W", n_groups=50)
+    >>> forecast = SaturationForecast.from_rate(rate, exposure, 2e5, star)
+    >>> forecast.n_pixels, forecast.sources["group"].tolist()
+    (1, [15])
     """
 
     exposure: Exposure
@@ -138,6 +152,15 @@ def saturation_forecast(exposure, *, background=None, detector=None):
     -------
     fraction : float or `~numpy.ndarray`
         Of the full well; above 0.6 little of the well is left for sources.
+
+    Examples
+    --------
+    >>> from miricigale.depth import saturation_forecast
+    >>> from miricigale.instrument import Exposure
+    >>> for name in ("F770W", "F2100W"):
+    ...     print(f"{name} {saturation_forecast(Exposure(name, n_groups=60)):.2f}")
+    F770W 0.04
+    F2100W 1.58
     """
     detector = miri_detector() if detector is None else detector
     rate = electron_rate(exposure.filter, background, detector=detector)
@@ -155,6 +178,12 @@ def saturation_time(filter, *, background=None, detector=None):
     -------
     time : `~astropy.units.Quantity`
         In s.
+
+    Examples
+    --------
+    >>> from miricigale.depth import saturation_time
+    >>> print(f"{saturation_time('F770W'):.0f}, {saturation_time('F2550W'):.0f}")
+    3722 s, 57 s
     """
     detector = miri_detector() if detector is None else detector
     return detector.full_well / electron_rate(filter, background, detector=detector) * u.s
@@ -224,6 +253,23 @@ def forecast_table(forecasts):
     ------
     ValueError
         If there are none.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.table import Table
+    >>> from miricigale.depth import SaturationForecast, forecast_table
+    >>> from miricigale.instrument import Exposure
+    >>> rate = np.full((20, 20), 50.0)
+    >>> rate[10, 10] = 5000.0
+    >>> star = Table({"id": [7], "x": [10.0], "y": [10.0]})
+    >>> exposure = Exposure("F770W", n_groups=50)
+    >>> forecast = SaturationForecast.from_rate(rate, exposure, 2e5, star)
+    >>> table = forecast_table([forecast])
+    >>> print(table["filter", "n_groups", "n_pixels", "n_sources", "first_group"])
+      filter   n_groups n_pixels n_sources first_group
+    ---------- -------- -------- --------- -----------
+    miri.f770w       50        1         1          15
     """
     forecasts = list(forecasts)
     if not forecasts:

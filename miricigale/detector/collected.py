@@ -41,6 +41,17 @@ class Charge(Timed):
         Of what the read-out draws.
     meta : dict
         Where it came from.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from miricigale import Detector, Exposure
+    >>> exposure = Exposure("F770W", n_groups=10, subarray="SUB64", pointing="53 -27")
+    >>> sky = np.full(exposure.shape, 5.0) * u.MJy / u.sr
+    >>> charge = Detector.miri_imager().collect(sky, exposure, seed=1)
+    >>> print(f"{np.nanmedian(charge.mean):.1f} electrons per second")
+    56.8 electrons per second
     """
 
     exposure: Exposure

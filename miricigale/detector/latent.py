@@ -40,6 +40,23 @@ class Latent(Frozen):
     -----
     To let time pass: ``latent.after(t)`` is the same exposure a time t later. Several
     exposures before add up (``previous=[...]`` of `~miricigale.detector.Detector.expose`).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from miricigale import Detector, Exposure
+    >>> exposure = Exposure("F770W", n_groups=10, subarray="SUB64", pointing="53 -27")
+    >>> sky = np.full(exposure.shape, 5.0) * u.MJy / u.sr
+    >>> from miricigale.detector import Latent, Persistence
+    >>> detector = Detector.miri_imager(Persistence())
+    >>> bright = sky.copy()
+    >>> bright[32, 36] = 1e6 * u.MJy / u.sr
+    >>> latent = Latent.from_ramp(
+    ...     detector.expose(bright, exposure, seed=1), gap=60 * u.s
+    ... )
+    >>> latent.after(5 * u.min)
+    <Latent SUB64: 9 of 64 x 72 pixels, 360 s ago>
     """
 
     rate: u.Quantity

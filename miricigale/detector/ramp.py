@@ -72,6 +72,20 @@ class Ramp(Interactive, NDData):
     ------
     ValueError
         If a shape is not that of the exposure, a dtype is another or a step is not known.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from miricigale import Detector, Exposure
+    >>> exposure = Exposure("F770W", n_groups=10, subarray="SUB64", pointing="53 -27")
+    >>> sky = np.full(exposure.shape, 5.0) * u.MJy / u.sr
+    >>> ramp = Detector.miri_imager().expose(sky, exposure, seed=1)
+    >>> ramp
+    <Ramp miri.f770w: 1 integration(s) x 10 groups, 64 x 72 pixels, uint16>
+    >>> path = ramp.write("sub64_uncal.fits")  # doctest: +SKIP
+    >>> ramp.integration(0).shape
+    (1, 10, 64, 72)
     """
 
     _other_names: ClassVar[dict] = {

@@ -34,6 +34,12 @@ def classify(frac_agn, *, limits=CLASS_LIMITS):
     References
     ----------
     Yang et al. 2021, ApJ 908, 144, section 5; Kirkpatrick et al. 2017, ApJ 849, 111.
+
+    Examples
+    --------
+    >>> from miricigale.evaluation import classify
+    >>> classify([0.02, 0.3, 0.8]).tolist()
+    ['galaxy', 'composite', 'agn']
     """
     frac_agn = np.asarray(frac_agn, float)
     if np.any((frac_agn < 0) | (frac_agn > 1)):
@@ -62,6 +68,18 @@ def confusion(true, found):
         in each class and as ``unknown``, ``completeness`` (share of the sources of the class that
         were found in it, unknown ones among them) and ``purity`` (share of those found in the class that are of
         it), each with its 68 % (Wilson) interval ``_low`` and ``_high``.
+
+    Examples
+    --------
+    >>> from miricigale.evaluation import confusion
+    >>> true = ["galaxy", "galaxy", "agn", "agn"]
+    >>> table = confusion(true, ["galaxy", "agn", "agn", "unknown"])
+    >>> print(table["class", "n", "galaxy", "agn", "unknown", "completeness"])
+      class    n  galaxy agn unknown completeness
+    --------- --- ------ --- ------- ------------
+       galaxy   2      1   1       0          0.5
+    composite   0      0   0       0          nan
+          agn   2      0   1       1          0.5
     """
     true, found = one_by_one(str, true=true, found=found)
     counts = {
@@ -90,6 +108,13 @@ class SelectionQuality:
     ----------
     completeness, purity : `~miricigale.evaluation.Estimate`
         Share of the wanted sources that are selected, and of the selected that are wanted.
+
+    Examples
+    --------
+    >>> from miricigale.evaluation import selection_quality
+    >>> quality = selection_quality([True, True, False, False], [True, True, True, False])
+    >>> print(f"{quality.completeness.value:.2f} {quality.purity.value:.2f}")
+    1.00 0.67
     """
 
     completeness: Estimate

@@ -27,6 +27,15 @@ class ColorWindow:
         The redshifts.
     x, y : tuple of str
         Bands of the two colors: log10 of the flux ratio of the first to the second.
+
+    Examples
+    --------
+    >>> from miricigale.evaluation import COLOR_WINDOWS
+    >>> window = COLOR_WINDOWS[0]
+    >>> window.z_low, window.z_high
+    (0.75, 1.25)
+    >>> window.bands
+    ('miri.f1000w', 'miri.f770w', 'miri.f1500w', 'miri.f1800w')
     """
 
     z_low: float
@@ -73,6 +82,13 @@ class ColorCircles:
         Colors of the center.
     inner, outer : float
         Radii in dex.
+
+    Examples
+    --------
+    >>> from miricigale.evaluation import ColorCircles
+    >>> circles = ColorCircles(center=(0.3, 0.0), inner=0.1, outer=0.3)
+    >>> print(circles.classify([[0.3, 0.05], [0.1, 0.0], [-0.4, 0.2]]))
+    ['agn' 'composite' 'galaxy']
     """
 
     center: tuple
@@ -174,6 +190,22 @@ def color_classes(fluxes, redshift, classes, *, windows=COLOR_WINDOWS, groups=No
     -------
     found : `~numpy.ndarray` of str, shape (n,)
         ``"unknown"`` for sources in no window or without positive fluxes.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropy.table import QTable
+    >>> from miricigale.evaluation import COLOR_WINDOWS, color_classes
+    >>> rng = np.random.default_rng(1)
+    >>> classes = np.repeat(["galaxy", "agn"], 100)
+    >>> fluxes = QTable({b: rng.lognormal(0, 0.05, 200) for b in COLOR_WINDOWS[0].bands})
+    >>> fluxes["miri.f1000w"][100:] *= 3
+    >>> fluxes = QTable({b: fluxes[b] * u.uJy for b in fluxes.colnames})
+    >>> first = COLOR_WINDOWS[:1]
+    >>> found = color_classes(fluxes, np.ones(200), classes, windows=first, seed=1)
+    >>> print(f"{np.mean(found == classes):.2f}")
+    1.00
     """
     redshift, classes = np.asarray(redshift, float), np.asarray(classes, str)
     found = np.full(redshift.size, "unknown", dtype="<U9")

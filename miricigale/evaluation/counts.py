@@ -37,6 +37,13 @@ def main_sequence_sfr(stellar_mass, age_of_universe):
     References
     ----------
     Speagle et al. 2014, ApJS 214, 15, equation 28.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.evaluation import main_sequence_sfr
+    >>> print(f"{main_sequence_sfr(3e10 * u.Msun, 5.9 * u.Gyr):.0f}")
+    22 solMass / yr
     """
     log_mass = np.log10(to_array(stellar_mass, u.Msun, "stellar_mass"))
     age = to_array(age_of_universe, u.Gyr, "age_of_universe")
@@ -60,6 +67,13 @@ def sfr_to_infrared_luminosity(sfr):
     References
     ----------
     Kennicutt 1998, ARA&A 36, 189, equation 4: SFR = 4.5e-44 L_IR [erg/s].
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.evaluation import sfr_to_infrared_luminosity
+    >>> print(f"{sfr_to_infrared_luminosity(10 * u.Msun / u.yr):.2e}")
+    5.81e+10 solLum
     """
     return (to_array(sfr, u.Msun / u.yr, "sfr") / 4.5e-44 * u.erg / u.s).to(u.Lsun)
 
@@ -81,6 +95,13 @@ def dust_obscured_fraction(stellar_mass):
     References
     ----------
     Whitaker et al. 2017, ApJ 850, 208, equation 1.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.evaluation import dust_obscured_fraction
+    >>> print(dust_obscured_fraction([1e9, 1e10, 1e11] * u.Msun).round(2))
+    [0.29 0.8  0.97]
     """
     log_mass = np.log10(to_array(stellar_mass, MASS, "stellar_mass"))
     return 1.0 / (1.0 + 1.96e9 * np.exp(-2.277 * log_mass))
@@ -105,6 +126,13 @@ def uvj_quiescent(u_v, v_j, redshift):
     References
     ----------
     Whitaker et al. 2011, ApJ 735, 86, equation 15; used to z = 3.5 there, its last bin beyond.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.evaluation import uvj_quiescent
+    >>> uvj_quiescent([1.0, 1.9] * u.mag, [1.0, 1.0] * u.mag, 1.0).tolist()
+    [False, True]
     """
     u_v, v_j = to_array(u_v, u.mag, "u_v"), to_array(v_j, u.mag, "v_j")
     z = to_array(redshift, u.dimensionless_unscaled, "redshift")
@@ -144,6 +172,23 @@ def main_sequence_dust(table, *, seed, scatter=0.2):
     ------
     ValueError, `~astropy.units.UnitsError`
         If a column is missing or has a wrong unit, an id is there twice, or ``scatter`` is negative.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.table import QTable
+    >>> from miricigale.evaluation import main_sequence_dust
+    >>> table = QTable({"id": [1, 2], "redshift": [1.0, 1.0]})
+    >>> table["stellar_mass"] = [3e10, 3e10] * u.Msun
+    >>> table["dust_luminosity"] = [1e10, 1e10] * u.Lsun
+    >>> table["u_v"], table["v_j"] = [1.0, 1.9] * u.mag, [1.0, 1.0] * u.mag
+    >>> dust = main_sequence_dust(table, seed=1)
+    >>> dust["dust_excess"] = dust["dust_excess"].round(1)
+    >>> print(dust["id", "quiescent", "dust_excess"])
+     id quiescent dust_excess
+    --- --------- -----------
+      1     False         9.4
+      2      True         1.0
     """
     units = {"stellar_mass": MASS, "dust_luminosity": LUMINOSITY, "u_v": u.mag, "v_j": u.mag}
     require_columns(table, ("id", "redshift", *units), "table", units=units)
@@ -189,6 +234,15 @@ def number_counts(flux, area, edges):
     -------
     counts, counts_err : `~astropy.units.Quantity`, shape (m,)
         Sources per square degree and magnitude, and the Poisson error (sqrt n).
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.evaluation import number_counts
+    >>> flux = [1, 2, 2, 5, 40] * u.uJy
+    >>> counts, errors = number_counts(flux, 2 * u.arcmin**2, [22, 23, 24])
+    >>> print(counts.round(0))
+    [1800. 5400.] 1 / deg2
     """
     edges = np.asarray(edges, float)
     if edges.ndim != 1 or np.any(np.diff(edges) <= 0):
@@ -218,6 +272,14 @@ def integrated_light(flux, area, wavelength):
     light, light_err : `~astropy.units.Quantity`
         nu I_nu in nW / m2 / sr, and the Poisson error of the sources' number, weighted by
         flux (cosmic variance is not in it).
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.evaluation import integrated_light
+    >>> light, error = integrated_light([50, 120, 400] * u.uJy, 2 * u.arcmin**2, 15 * u.um)
+    >>> print(f"{light:.2f} +- {error.value:.2f}")
+    0.67 nW / (sr m2) +- 0.50
     """
     flux = to_array(flux, FNU, "flux", ndim=1, finite=True) * FNU
     area = _solid_angle(area) * u.deg**2

@@ -39,6 +39,12 @@ def posterior_ranks(true, values, levels, *, seed=None):
     ------
     ValueError
         If the shapes do not agree.
+
+    Examples
+    --------
+    >>> from miricigale.evaluation import posterior_ranks
+    >>> posterior_ranks([0.25, 0.75], [0.0, 0.5, 1.0], [0.0, 0.8, 1.0]).tolist()
+    [0.4, 0.9]
     """
     true = np.asarray(true, float)
     try:
@@ -96,6 +102,18 @@ def coverage_table(ranks, *, levels=(0.68, 0.95)):
     ------
     ValueError
         If a level or rank is not between 0 and 1.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.evaluation import coverage_table
+    >>> table = coverage_table({"redshift": np.linspace(0, 1, 101)})
+    >>> table.round(2)
+    >>> print(table["name", "n", "level", "share", "mean_rank"])
+      name    n  level share mean_rank
+    -------- --- ----- ----- ---------
+    redshift 101  0.68  0.68       0.5
+    redshift 101  0.95  0.94       0.5
     """
     levels = np.atleast_1d(np.asarray(levels, float))
     if not np.all((levels > 0) & (levels < 1)):

@@ -27,6 +27,13 @@ class Estimate:
         Sources that it is of.
     n_all : int, optional
         Sources that it would be of if all had been found; unknown by default.
+
+    Examples
+    --------
+    >>> from miricigale.evaluation import Estimate
+    >>> share = Estimate.of_fraction(12, 40, n_all=80)
+    >>> print(f"{share.value:.2f} +- {share.error:.2f}, of {share.completeness:.0%} of all")
+    0.30 +- 0.07, of 50% of all
     """
 
     value: float

@@ -35,6 +35,16 @@ def light_share(wave, total, part, *, band=(5.0, 15.0) * u.um):
     ------
     ValueError
         If the band is not within the wavelengths.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from miricigale.evaluation import light_share
+    >>> wave = np.linspace(3, 20, 100) * u.um
+    >>> total = np.ones(100) * u.uJy
+    >>> print(f"{light_share(wave, total, 0.3 * total):.2f}")
+    0.30
     """
     x = to_array(wave, WAVE, "wave", ndim=1)
     low, high = to_array(band, WAVE, "band", ndim=1)
@@ -73,6 +83,16 @@ def mid_infrared_fractions(model, parameters):
     -------
     fractions : `~numpy.ndarray`, shape (n,)
         NaN for rows that cannot be evaluated.
+
+    Examples
+    --------
+    >>> from astropy.table import QTable
+    >>> from miricigale.evaluation import mid_infrared_fractions
+    >>> from miricigale.sed import SEDModel
+    >>> model = SEDModel.yang2021(libraries="bundled")
+    >>> table = QTable({"frac_agn": [0.0, 0.3], "redshift": [1.0, 1.0], "mass": [1e10, 1e10]})
+    >>> print(mid_infrared_fractions(model, table).round(2))
+    [0.  0.3]
     """
     names = [name for name in parameters.colnames if name in model.parameters]
     out = np.full(len(parameters), np.nan)
@@ -135,6 +155,14 @@ def feature_redshifts(feature, pivot, filter_width):
     -------
     low, high : float
         Not below 0.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.evaluation import feature_redshifts
+    >>> low, high = feature_redshifts(6.2 * u.um, 15.06 * u.um, 2.92 * u.um)
+    >>> print(f"{low:.2f} to {high:.2f}")
+    1.19 to 1.66
     """
     rest = positive(feature, WAVE, "feature")
     middle = positive(pivot, WAVE, "pivot")
@@ -164,6 +192,18 @@ def feature_residuals(residual, redshift, *, feature, pivot, filter_width, seed)
     -------
     inside, outside : `~miricigale.evaluation.Estimate`
         Medians of the sources at redshifts with and without the feature in the band.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from miricigale.evaluation import feature_residuals
+    >>> z = np.linspace(0.5, 3, 50)
+    >>> residual = np.where((z > 1.2) & (z < 1.65), -0.2, 0.0)
+    >>> band = {"pivot": 15.06 * u.um, "filter_width": 2.92 * u.um}
+    >>> inside, outside = feature_residuals(residual, z, feature=6.2 * u.um, seed=1, **band)
+    >>> inside.value, outside.value
+    (-0.2, 0.0)
     """
     residual, redshift = np.asarray(residual, float), np.asarray(redshift, float)
     low, high = feature_redshifts(feature, pivot, filter_width)

@@ -17,7 +17,17 @@ from miricigale.utils.units import ANGLE, FNU, to_array
 
 
 class AssociationFlags(Flags):
-    """Why rows of two catalogs are no plain match."""
+    """
+    Why rows of two catalogs are no plain match.
+
+    Examples
+    --------
+    >>> from miricigale.evaluation import AssociationFlags
+    >>> AssociationFlags(5)
+    <AssociationFlags.SEVERAL_SECOND|NOT_MUTUAL: 5>
+    >>> AssociationFlags.NONE_NEAR.value
+    8
+    """
 
     #: More than one row of the second catalog is within the radius of the row of the first.
     SEVERAL_SECOND = 1
@@ -68,6 +78,21 @@ def associate(first, second, *, radius):
     Partners are two rows that are each other's nearest within the radius. They are ``matched`` if neither has
     another candidate, otherwise ``ambiguous``. A row without a partner is ``ambiguous`` if it has
     candidates, and ``unmatched`` if it has none.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.coordinates import SkyCoord
+    >>> from miricigale.evaluation import associate
+    >>> first = SkyCoord([0.0, 9.0] * u.arcsec, [0, 0] * u.arcsec)
+    >>> second = SkyCoord([0.1, 20.0] * u.arcsec, [0, 0] * u.arcsec)
+    >>> table = associate(first, second, radius=0.5 * u.arcsec)
+    >>> print(table["first", "second", "status"])
+    first second   status
+    ----- ------ ---------
+        0      0   matched
+        1     -1 unmatched
+       -1      1 unmatched
     """
     limit = float(to_array(radius, ANGLE, "radius", ndim=0))
     if not limit > 0:
@@ -95,7 +120,7 @@ def associate(first, second, *, radius):
         counts[f"n_{other}"] = (near_by, text)
         reasons[here] |= near.reasons(k)[rows[k][here]]
     separation = np.append(near.separation, np.full(len(alone), np.nan))
-    columns |= ids | {"separation": (separation * ANGLE, "Of the partners")} | counts
+    columns |= ids | {"separation": (separation * ANGLE, "Distance between the partners")} | counts
     # of rows with a partner neither of the two reasons is set
     status = np.where(reasons == 0, 0, np.where(reasons & (_NONE | _LOST), 2, 1))
     columns["status"] = (np.array(_STATUS)[status], "matched, ambiguous or unmatched")
@@ -185,6 +210,24 @@ def match_truth(truth, measured, bands, *, radius=0.5 * u.arcsec):
         If a column is missing or ``bands`` is one name.
     `~astropy.units.UnitsError`
         If a flux column or ``radius`` has a wrong unit or none.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.table import QTable
+    >>> from miricigale.evaluation import match_truth
+    >>> truth = QTable({"id": [1, 2], "sky": SkyCoord([0, 9] * u.arcsec, [0, 0] * u.arcsec)})
+    >>> truth["miri.f770w"] = [5, 2] * u.uJy
+    >>> measured = QTable({"id": [7], "sky": SkyCoord([0.1] * u.arcsec, [0] * u.arcsec)})
+    >>> measured["miri.f770w"], measured["miri.f770w_err"] = [5.2] * u.uJy, [0.1] * u.uJy
+    >>> table = match_truth(truth, measured, ["miri.f770w"])
+    >>> print(table["id", "measured_id", "miri.f770w_true", "miri.f770w"])
+     id measured_id miri.f770w_true miri.f770w
+                          uJy          uJy
+    --- ----------- --------------- ----------
+      1           7             5.0        5.2
+      2          -1             2.0        nan
     """
     if isinstance(bands, str):
         raise argument_error("bands", "a list of filter names", repr(bands))

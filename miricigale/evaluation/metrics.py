@@ -43,6 +43,12 @@ def sigma_mad(values, *, axis=None, ignore_nan=False):
     References
     ----------
     Yang et al. 2021, ApJ 908, 144, section 5 (sigma_MAD).
+
+    Examples
+    --------
+    >>> from miricigale.evaluation import sigma_mad
+    >>> sigma_mad([1.0, 2.0, 3.0, 4.0, 100.0])
+    1.48
     """
     values = np.asarray(values, float)
     if values.size == 0:
@@ -66,6 +72,12 @@ def fraction_interval(n_success, n_total):
     -------
     fraction, low, high : float
         NaN where ``n_total`` is zero.
+
+    Examples
+    --------
+    >>> from miricigale.evaluation import fraction_interval
+    >>> print("{:.2f} ({:.2f} to {:.2f})".format(*fraction_interval(3, 10)))
+    0.30 (0.18 to 0.46)
     """
     if n_total == 0:
         return np.nan, np.nan, np.nan
@@ -92,6 +104,15 @@ class PhotozMetrics:
         Share with abs(dz) above `OUTLIER` and its 68 % interval.
     n_outliers : int
         Their number.
+
+    Examples
+    --------
+    >>> from miricigale.evaluation import photoz_metrics
+    >>> metrics = photoz_metrics([1.0, 2.0, 0.5], [1.02, 2.9, 0.5])
+    >>> metrics.n, metrics.n_outliers
+    (3, 1)
+    >>> print(f"{metrics.outlier_fraction:.2f} ({metrics.outlier_low:.2f} to {metrics.outlier_high:.2f})")
+    0.33 (0.14 to 0.61)
     """
 
     n: int
@@ -121,6 +142,13 @@ def photoz_metrics(z_true, z_fit):
     ------
     ValueError
         If the shapes differ.
+
+    Examples
+    --------
+    >>> from miricigale.evaluation import photoz_metrics
+    >>> metrics = photoz_metrics([1.0, 2.0, 0.5], [1.02, 2.9, 0.5])
+    >>> print(f"bias {metrics.bias:.3f}, outliers {metrics.n_outliers} of {metrics.n}")
+    bias 0.010, outliers 1 of 3
     """
     z_true, z_fit = one_by_one(z_true=z_true, z_fit=z_fit)
     good = np.isfinite(z_true) & np.isfinite(z_fit)
@@ -152,6 +180,13 @@ class RecoveryMetrics:
         Median of measured minus true, and its standard error (1.253 sigma / sqrt n).
     sigma_mad : float
         Robust scatter of the difference.
+
+    Examples
+    --------
+    >>> from miricigale.evaluation import recovery_metrics
+    >>> metrics = recovery_metrics([1.0, 2.0, 4.0], [1.1, 2.3, 4.0], relative=True)
+    >>> print(f"{metrics.median:.2f} +- {metrics.median_err:.2f}")
+    0.10 +- 0.05
     """
 
     n: int
@@ -175,6 +210,13 @@ def recovery_metrics(true, measured, *, relative=False):
     Returns
     -------
     metrics : `RecoveryMetrics`
+
+    Examples
+    --------
+    >>> from miricigale.evaluation import recovery_metrics
+    >>> metrics = recovery_metrics([1.0, 2.0, 4.0], [1.1, 2.3, 4.0])
+    >>> print(f"{metrics.median:.2f} +- {metrics.median_err:.2f}, scatter {metrics.sigma_mad:.2f}")
+    0.10 +- 0.11, scatter 0.15
     """
     true, measured = one_by_one(true=true, measured=measured)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -206,6 +248,15 @@ def running_median(x, y, *, size=20):
     -------
     x_mid, y_mid, y_sigma : `~numpy.ndarray`, shape (n_bins,)
         Medians and `sigma_mad` in each bin.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.evaluation import running_median
+    >>> x = np.arange(40.0)
+    >>> middle, median, error = running_median(x, 2 * x)
+    >>> print(median)
+    [19. 59.]
     """
     x, y = one_by_one(x=x, y=y)
     if size < 1:

@@ -32,6 +32,27 @@ def study_numbers(study, *, seed, n_draws=500):
     table : `~astropy.table.QTable`
         ``truth``, ``band_set``, ``quantity``, ``z_low``, ``z_high``, ``value``, ``low``, ``high`` (68 %), ``n``
         and ``completeness``, the share of the sources of the field that the number is of.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.table import QTable
+    >>> from miricigale.evaluation import StudyResults, TruthResults
+    >>> ids, zero = np.arange(4), np.zeros(4)
+    >>> truth = QTable({"id": ids, "redshift": zero + 1, "frac_agn": zero})
+    >>> matched = QTable({"id": ids, "selection": zero, "n_detected": zero + 2})
+    >>> fit = QTable({"id": ids, "redshift_mean": [1.0, 1.02, 0.98, 1.8]})
+    >>> fit["frac_agn_mean"] = [0.01, 0.03, 0.02, 0.3]
+    >>> fit["frac_agn_std"] = 0.05
+    >>> field = np.ones(4, bool)
+    >>> one = TruthResults("agn00", 0.0, truth, matched, {"all": fit}, field)
+    >>> study = StudyResults((one,), ("miri.f770w",))
+    >>> from miricigale.evaluation import study_numbers
+    >>> table = study_numbers(study, seed=1, n_draws=50)
+    >>> print(table["band_set", "quantity", "value", "n"][0])
+    band_set  quantity  value  n
+    -------- ---------- ----- ---
+         all z_outliers  0.25   4
     """
     seed = check_seed(seed)
     rows = []
@@ -87,6 +108,28 @@ def study_confusion(study, band_set="all"):
     -------
     table : `~astropy.table.QTable`
         As `~miricigale.evaluation.confusion`: sources of the field that were not fitted are ``unknown``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.table import QTable
+    >>> from miricigale.evaluation import StudyResults, TruthResults
+    >>> ids, zero = np.arange(4), np.zeros(4)
+    >>> truth = QTable({"id": ids, "redshift": zero + 1, "frac_agn": zero})
+    >>> matched = QTable({"id": ids, "selection": zero, "n_detected": zero + 2})
+    >>> fit = QTable({"id": ids, "redshift_mean": [1.0, 1.02, 0.98, 1.8]})
+    >>> fit["frac_agn_mean"] = [0.01, 0.03, 0.02, 0.3]
+    >>> fit["frac_agn_std"] = 0.05
+    >>> field = np.ones(4, bool)
+    >>> one = TruthResults("agn00", 0.0, truth, matched, {"all": fit}, field)
+    >>> study = StudyResults((one,), ("miri.f770w",))
+    >>> from miricigale.evaluation import study_confusion
+    >>> print(study_confusion(study)["class", "n", "galaxy", "composite", "agn"])
+      class    n  galaxy composite agn
+    --------- --- ------ --------- ---
+       galaxy   4      3         1   0
+    composite   0      0         0   0
+          agn   0      0         0   0
     """
     truths = [one for one in study.truths if one.frac_agn is not None and band_set in one.fits]
     true = [classify(np.asarray(one.truth["frac_agn"], float))[one.field] for one in truths]
@@ -111,6 +154,27 @@ def selection_table(one, *, limits=CLASS_LIMITS):
     table : `~astropy.table.QTable`
         A row for each band set and limit: ``band_set``, ``limit``, ``n_wanted``, ``n_selected``,
         ``completeness``, ``purity`` and their 68 % (Wilson) intervals ``_low`` and ``_high``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.table import QTable
+    >>> from miricigale.evaluation import StudyResults, TruthResults
+    >>> ids, zero = np.arange(4), np.zeros(4)
+    >>> truth = QTable({"id": ids, "redshift": zero + 1, "frac_agn": zero})
+    >>> matched = QTable({"id": ids, "selection": zero, "n_detected": zero + 2})
+    >>> fit = QTable({"id": ids, "redshift_mean": [1.0, 1.02, 0.98, 1.8]})
+    >>> fit["frac_agn_mean"] = [0.01, 0.03, 0.02, 0.3]
+    >>> fit["frac_agn_std"] = 0.05
+    >>> field = np.ones(4, bool)
+    >>> one = TruthResults("agn00", 0.0, truth, matched, {"all": fit}, field)
+    >>> study = StudyResults((one,), ("miri.f770w",))
+    >>> from miricigale.evaluation import selection_table
+    >>> table = selection_table(one, limits=[0.1])
+    >>> print(table["band_set", "limit", "n_wanted", "n_selected", "purity"])
+    band_set limit n_wanted n_selected purity
+    -------- ----- -------- ---------- ------
+         all   0.1        0          1    0.0
     """
     true = np.asarray(one.truth["frac_agn"], float)[one.field]
     pairs = [(band_set, limit) for band_set in one.fits for limit in limits]

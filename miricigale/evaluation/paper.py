@@ -49,6 +49,13 @@ class PublishedNumber:
         Where it was read; without, it is second hand, marked ``[?]``.
     why : str, optional
         Why a study may differ.
+
+    Examples
+    --------
+    >>> from miricigale.evaluation import PUBLISHED
+    >>> one = next(one for one in PUBLISHED if one.key == "power_scatter")
+    >>> one.value, one.source
+    (0.3, 'abstract')
     """
 
     key: str

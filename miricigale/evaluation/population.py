@@ -109,6 +109,13 @@ def xray_obscured_fraction(l_x, redshift):
     References
     ----------
     Ueda et al. 2014, ApJ 786, 104, section 3.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.evaluation import xray_obscured_fraction
+    >>> print(xray_obscured_fraction([1e42, 1e44, 1e45] * u.erg / u.s, 1.0).round(2))
+    [0.57 0.54 0.3 ]
     """
     return _psi(_log_luminosity(l_x), _redshift(redshift))
 
@@ -133,6 +140,13 @@ def galaxy_mass_function(stellar_mass, redshift):
     References
     ----------
     Davidzon et al. 2017, A&A 605, A70, table 1.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.evaluation import galaxy_mass_function
+    >>> print(f"{galaxy_mass_function(1e10 * u.Msun, 1.0):.2e}")
+    4.10e-03 1 / (dex Mpc3)
     """
     log_mass = np.log10(to_array(stellar_mass, MASS, "stellar_mass"))
     return _smf(log_mass, _redshift(redshift)) * _DENSITY
@@ -156,6 +170,13 @@ def agn_fraction(l_6um, reference):
     frac_agn : `~numpy.ndarray`
         From 0; NaN where ``reference`` is not positive (no dust luminosity to refer to) and the
         AGN shall have a luminosity.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.evaluation import agn_fraction
+    >>> agn_fraction([0, 1, 3] * u.Lsun, 1 * u.Lsun).tolist()
+    [0.0, 0.5, 0.75]
     """
     wanted = to_array(l_6um, LUMINOSITY, "l_6um")
     half = to_array(reference, LUMINOSITY, "reference")

@@ -289,6 +289,24 @@ def measure(study, quantity, *, truth=0.0, band_set="all", option=None, seed, n_
     ------
     KeyError
         If there is no such quantity.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.table import QTable
+    >>> from miricigale.evaluation import StudyResults, TruthResults
+    >>> ids, zero = np.arange(4), np.zeros(4)
+    >>> truth = QTable({"id": ids, "redshift": zero + 1, "frac_agn": zero})
+    >>> matched = QTable({"id": ids, "selection": zero, "n_detected": zero + 2})
+    >>> fit = QTable({"id": ids, "redshift_mean": [1.0, 1.02, 0.98, 1.8]})
+    >>> fit["frac_agn_mean"] = [0.01, 0.03, 0.02, 0.3]
+    >>> fit["frac_agn_std"] = 0.05
+    >>> field = np.ones(4, bool)
+    >>> one = TruthResults("agn00", 0.0, truth, matched, {"all": fit}, field)
+    >>> study = StudyResults((one,), ("miri.f770w",))
+    >>> from miricigale.evaluation import measure
+    >>> measure(study, "z_outliers", seed=1).value
+    0.25
     """
     if quantity not in _MEASURES:
         raise unknown_name("quantity", quantity, _MEASURES)

@@ -41,6 +41,24 @@ class TruthResults:
     ------
     ValueError
         If the tables do not have the same sources.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.table import QTable
+    >>> from miricigale.evaluation import StudyResults, TruthResults
+    >>> ids, zero = np.arange(4), np.zeros(4)
+    >>> truth = QTable({"id": ids, "redshift": zero + 1, "frac_agn": zero})
+    >>> matched = QTable({"id": ids, "selection": zero, "n_detected": zero + 2})
+    >>> fit = QTable({"id": ids, "redshift_mean": [1.0, 1.02, 0.98, 1.8]})
+    >>> fit["frac_agn_mean"] = [0.01, 0.03, 0.02, 0.3]
+    >>> fit["frac_agn_std"] = 0.05
+    >>> field = np.ones(4, bool)
+    >>> one = TruthResults("agn00", 0.0, truth, matched, {"all": fit}, field)
+    >>> one
+    <TruthResults 'agn00', 4 fitted>
+    >>> one.redshift_error("all").round(3).tolist()
+    [0.0, 0.01, -0.01, 0.4]
     """
 
     name: str
@@ -146,6 +164,25 @@ class StudyResults:
         time calculator for these exposures.
     extra : dict of str to `Estimate`, optional
         Numbers by key that are of other products: detection, point sources, Source Extractor.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.table import QTable
+    >>> from miricigale.evaluation import StudyResults, TruthResults
+    >>> ids, zero = np.arange(4), np.zeros(4)
+    >>> truth = QTable({"id": ids, "redshift": zero + 1, "frac_agn": zero})
+    >>> matched = QTable({"id": ids, "selection": zero, "n_detected": zero + 2})
+    >>> fit = QTable({"id": ids, "redshift_mean": [1.0, 1.02, 0.98, 1.8]})
+    >>> fit["frac_agn_mean"] = [0.01, 0.03, 0.02, 0.3]
+    >>> fit["frac_agn_std"] = 0.05
+    >>> field = np.ones(4, bool)
+    >>> one = TruthResults("agn00", 0.0, truth, matched, {"all": fit}, field)
+    >>> study = StudyResults((one,), ("miri.f770w",))
+    >>> study.at(0.0)
+    <TruthResults 'agn00', 4 fitted>
+    >>> study.with_agn
+    ()
     """
 
     truths: tuple

@@ -35,6 +35,15 @@ class XRayLimit:
     checked : bool
         Whether the number itself was read in the reference; otherwise it is an estimate from what
         the reference says.
+
+    Examples
+    --------
+    >>> from miricigale.evaluation import XRAY_LIMITS
+    >>> for limit in XRAY_LIMITS:
+    ...     print(limit.survey, limit.kind, limit.flux)
+    CDF-S 7 Ms center 1.9e-17 erg / (s cm2)
+    CDF-S 7 Ms 50 % 1.2e-16 erg / (s cm2)
+    EGS 800 ks 50 % 3e-16 erg / (s cm2)
     """
 
     survey: str
@@ -102,6 +111,14 @@ def xray_luminosity_at(flux, redshift):
     -------
     luminosity : `~astropy.units.Quantity`
         In erg / s.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.evaluation import xray_luminosity_at
+    >>> limit = 1e-16 * u.erg / u.s / u.cm**2
+    >>> print(f"{xray_luminosity_at(limit, 2.0):.1e}")
+    3.5e+42 erg / s
     """
     unit = u.erg / u.s
     return (flux / xray_flux(1 * unit, redshift, transmission=_TRANSMISSION)).to(u.one) * unit
@@ -125,6 +142,18 @@ def completeness(values, found, edges):
     table : `~astropy.table.QTable`
         A row for each bin: ``low``, ``high``, ``n``, ``n_found``, ``share`` and its 68 % (Wilson) interval
         ``share_low``, ``share_high``, NaN in bins without sources.
+
+    Examples
+    --------
+    >>> from miricigale.evaluation import completeness
+    >>> magnitude = [24.2, 24.4, 25.3, 25.6, 25.9]
+    >>> table = completeness(magnitude, [True, True, True, False, False], [24, 25, 26])
+    >>> table.round(2)
+    >>> print(table["low", "high", "n", "n_found", "share"])
+    low  high  n  n_found share
+    ---- ---- --- ------- -----
+    24.0 25.0   2       2   1.0
+    25.0 26.0   3       1  0.33
     """
     values, found = one_by_one(values=values, found=found)
     found = found > 0
@@ -166,6 +195,16 @@ def half_complete(values, found):
     -------
     value : float
         NaN if all or none were found, or the curve passes one half nowhere within the values.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.evaluation import half_complete
+    >>> rng = np.random.default_rng(1)
+    >>> log_flux = rng.uniform(0, 2, 1000)
+    >>> found = log_flux + rng.normal(0, 0.1, 1000) > 1
+    >>> print(f"{half_complete(log_flux, found):.2f}")
+    1.00
     """
     values, found = one_by_one(values=values, found=found)
     found = found > 0

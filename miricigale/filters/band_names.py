@@ -59,6 +59,12 @@ def find_filter(text):
     -------
     name : str or None
         A name for `~miricigale.filters.Filter.from_name`; None if there is no such curve here.
+
+    Examples
+    --------
+    >>> from miricigale.filters import find_filter
+    >>> find_filter("JWST/MIRI.F770W"), find_filter("sdss_r")
+    ('miri.f770w', 'sedpy.sdss_r0')
     """
     lower = text.lower()
     alone = _ALONE.fullmatch(lower)
@@ -127,6 +133,12 @@ def filter_of_band(band):
     -------
     name : str or None
         A name for `~miricigale.filters.Filter.from_name`; None if there is no such curve here.
+
+    Examples
+    --------
+    >>> from miricigale.filters import filter_of_band
+    >>> filter_of_band("IRAC1"), filter_of_band("VISTA_Ks")
+    ('irac.ch1', 'sedpy.vista_vircam_Ks')
     """
     if _is_here(band):
         return band
@@ -171,6 +183,12 @@ def cigale_band(name):
     -------
     band : str
         CIGALE's name; ``name`` itself where CIGALE has none that we know.
+
+    Examples
+    --------
+    >>> from miricigale.filters import cigale_band
+    >>> cigale_band("miri.f770w"), cigale_band("irac.ch1")
+    ('jwst.miri.F770W', 'spitzer.irac.ch1')
     """
     names, rules, _ = _tables()
     for band, ours in names.items():

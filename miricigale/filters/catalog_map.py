@@ -68,6 +68,15 @@ class CatalogMap:
         If ``columns`` or ``units`` name a filter that there is not, or ``survey`` is unknown.
     ValueError
         If two columns are one of the file, or something is no dict or no truth value.
+
+    Examples
+    --------
+    >>> from astropy.table import Table
+    >>> from miricigale.filters import CatalogMap
+    >>> catalog_map = CatalogMap({"wfc3.f160w": "H"}, units={"flux": "ABmag"}, missing=[0])
+    >>> table, coded = catalog_map.convert(Table({"H": [23.9, 21.4, -99.0]}))
+    >>> table["wfc3.f160w"]
+    <Quantity [ 1., 10., nan] uJy>
     """
 
     columns: Mapping = dataclasses.field(default_factory=dict)

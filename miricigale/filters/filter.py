@@ -203,7 +203,7 @@ class Filter(Frozen, Interactive):
 
     @classmethod
     def read(cls, path, *, name=None, unit=None):
-        """
+        r"""
         Read a filter from a file.
 
         Parameters
@@ -226,6 +226,16 @@ class Filter(Frozen, Interactive):
         ------
         `~miricigale.utils.exceptions.DataError`
             If the file is missing, has not two columns of numbers, or no unit of the wavelengths is known.
+
+        Examples
+        --------
+        >>> import pathlib, tempfile
+        >>> import astropy.units as u
+        >>> from miricigale.filters import Filter
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "mine.txt"
+        >>> _ = path.write_text("9.0 0\n9.5 0.8\n10.5 0.8\n11.0 0\n")
+        >>> Filter.read(path, unit=u.um)
+        <Filter mine: pivot 9.9896 um, width 1.500 um>
         """
         wave, throughput, found = read_curve(path, unit)
         return cls(wave, throughput, name or found, meta={"source": Path(path).name})
@@ -402,6 +412,15 @@ class Filter(Frozen, Interactive):
         References
         ----------
         Bessell & Murphy 2012, PASP, 124, 140, equation A15.
+
+        Examples
+        --------
+        >>> import astropy.units as u
+        >>> import numpy as np
+        >>> from miricigale import Filter
+        >>> wave = np.linspace(5.0, 12.0, 300) * u.um
+        >>> Filter("F770W").synthetic_flux(wave, wave.value**2 * u.uJy).round(2)
+        <Quantity 58.36 uJy>
         """
         wave, fnu = spectrum_arrays(sed if flux is None else (sed, flux), [self])
         first, part = self._weights(wave, UNCOVERED)

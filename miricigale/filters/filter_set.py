@@ -145,6 +145,14 @@ class FilterSet(Interactive):
         -------
         fluxes : `~astropy.units.Quantity`, shape (n_filters,)
             In uJy.
+
+        Examples
+        --------
+        >>> from miricigale import SEDModel
+        >>> from miricigale.filters import FilterSet
+        >>> sed = SEDModel.yang2021(libraries="bundled")(redshift=1.0, mass=1e10)
+        >>> FilterSet(["F160W", "F770W", "F2100W"]).synthetic_fluxes(sed).round(2)
+        <Quantity [ 4.44,  7.29, 55.42] uJy>
         """
         wave, fnu = spectrum_arrays(sed, self.filters)
         return self.weights(wave) @ fnu * FNU
@@ -185,13 +193,29 @@ def filter_table(pattern=""):
     -------
     table : `~astropy.table.QTable`
         ``name``, ``pivot`` and ``width`` (um).
+
+    Examples
+    --------
+    >>> from miricigale.filters import filter_table
+    >>> print(filter_table("wfc3"))
+       name    pivot width
+                 um    um
+    ---------- ----- -----
+    wfc3.f098m 0.986 0.157
+    wfc3.f105w 1.055 0.265
+    wfc3.f110w 1.153 0.443
+    wfc3.f125w 1.249 0.285
+    wfc3.f140w 1.392 0.384
+    wfc3.f160w 1.537 0.268
     """
     return _table([Filter.from_name(name) for name in Filter.names() if pattern.lower() in name])
 
 
 def _table(filters):
     widths = {key: [getattr(f, key).value for f in filters] * WAVE for key in ("pivot", "width")}
-    return QTable({"name": np.array([f.name for f in filters], dtype=str), **widths})
+    table = QTable({"name": np.array([f.name for f in filters], dtype=str), **widths})
+    table["pivot"].info.format = table["width"].info.format = ".3f"
+    return table
 
 
 def _each(item):

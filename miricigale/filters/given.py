@@ -35,6 +35,16 @@ def as_filter(given, name=None, *, unit=None):
         If a file cannot be read as a filter.
     ValueError
         If it is something else.
+
+    Examples
+    --------
+    >>> import synphot
+    >>> from miricigale.filters import as_filter
+    >>> as_filter("IRAC 3.6")
+    <Filter irac.ch1: pivot 3.5508 um, width 0.684 um>
+    >>> box = synphot.SpectralElement(synphot.models.Box1D, x_0=50000, width=4000)
+    >>> as_filter(box, "box")
+    <Filter box: pivot 4.9987 um, width 0.400 um>
     """
     if isinstance(given, Filter):
         return given

@@ -25,6 +25,8 @@ _MAGNITUDE = re.compile(
 # columns that are the only band asked for
 _ALONE = ("flux", "flux_density", "fnu", "f_nu", "mag", "magnitude", "abmag")
 _IDS = ("id", "number", "source_id", "objid")
+# after the name of a band: whether its flux is an upper limit
+_LIMIT = "_limit"
 
 
 def as_photometry(data, bands, argument="photometry"):
@@ -59,6 +61,13 @@ def as_photometry(data, bands, argument="photometry"):
     -----
     `~miricigale.utils.exceptions.CatalogWarning`
         Of magnitudes such as 99 or -99, which stand for no value and become NaN.
+
+    Examples
+    --------
+    >>> from miricigale.filters import as_photometry
+    >>> table = as_photometry({"mag_F770W": [23.9], "e_mag_F770W": [0.1]}, ["miri.f770w"])
+    >>> table["miri.f770w"], table["miri.f770w_err"].round(3)
+    (<Quantity [1.] uJy>, <Quantity [0.092] uJy>)
     """
     table, bands = as_table(data, argument), tuple(bands)
     names = _our_names(table.colnames, bands, argument)
@@ -103,7 +112,7 @@ def band_columns(colnames, argument="photometry"):
     fluxes = [name for name in colnames if not _MAGNITUDE.match(name)]
     found = _our_names(fluxes, FILTERS.names(), argument)
     both = [name for name in found if error_column(name) in found]
-    kept = {*both, *map(error_column, both)}
+    kept = {*both, *map(error_column, both), *(f"{name}{_LIMIT}" for name in both)}
     return {theirs: ours for ours, theirs in found.items() if ours in kept and ours != theirs}
 
 
@@ -121,6 +130,10 @@ def _our_names(colnames, bands, argument):
             wanted = f"a table with one column for {ours!r}"
             raise argument_error(argument, wanted, f"{found[ours]!r} and {theirs!r}")
         found[ours] = theirs
+    for theirs in colnames:
+        band = theirs.endswith(_LIMIT) and _band_of(theirs.removesuffix(_LIMIT), bands)
+        if band in bands and f"{band}{_LIMIT}" not in colnames:
+            found[f"{band}{_LIMIT}"] = theirs
     alone = [name for name in colnames if name.lower() in _ALONE]
     if len(bands) == len(alone) == 1 and bands[0] not in found:
         found[bands[0]] = alone[0]

@@ -55,6 +55,16 @@ class TemplateError:
         If wavelengths have no unit of length.
     ValueError
         If wavelengths do not ascend from above 0, or errors are negative, not finite or not as many.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.fitting import TemplateError
+    >>> error = TemplateError([0.1, 1.0, 10.0] * u.um, [0.15, 0.05, 0.30])
+    >>> error([0.1, 3.0] * u.um).round(3)
+    array([0.15 , 0.169])
+    >>> TemplateError.survey()([0.5, 8.0] * u.um).round(3)
+    array([0.066, 0.536])
     """
 
     wave: u.Quantity
@@ -170,6 +180,13 @@ def measure_band_errors(left, template_error, *, longest=2.5 * u.um):
     ------
     ValueError
         If redshifts were free, or there are fewer than 30 fluxes of S/N above 5.
+
+    Examples
+    --------
+    >>> from miricigale.fitting import leave_out, measure_band_errors
+    >>> miri = ["miri.f560w", "miri.f770w"]
+    >>> left = leave_out(fitter, photometry, miri, redshift="z_spec")  # doctest: +SKIP
+    >>> factor, part = measure_band_errors(left, template_error)  # doctest: +SKIP
     """
     longest = to_array(longest, WAVE, "longest", ndim=0)
     for results in left.results.values():
@@ -230,6 +247,22 @@ def measure_template_error(results, *, model_error=0.0, edges=None):
     ValueError
         If redshifts were free, no bin has 10 fluxes of S/N above 5, or ``model_error`` names an
         unknown band.
+
+    Examples
+    --------
+    >>> from miricigale.fitting import measure_template_error
+    >>> import numpy as np
+    >>> from miricigale import BayesFitter, ErrorModel, SEDModel
+    >>> bands = ["acs.f814w", "wfc3.f160w", "irac.ch1", "miri.f770w"]
+    >>> model = SEDModel.yang2021(agn=False)
+    >>> truth = {"redshift": np.full(40, 0.5), "age": np.linspace(1, 5, 40), "mass": np.full(40, 1e10)}
+    >>> errors = ErrorModel.from_depths(dict.fromkeys(bands, 29.0), fractional=0.05)
+    >>> photometry = errors.perturb(model.fluxes(truth, bands), seed=1)
+    >>> axes = {"redshift": [0.5], "age": [1.0, 2.0, 3.0, 4.0, 5.0], "ebv": [0.1, 0.3, 0.5]}
+    >>> fitter = BayesFitter(model, bands, axes=axes, model_error=0.0)
+    >>> results = fitter.fit(photometry, redshift=np.full(40, 0.5))
+    >>> measure_template_error(results).error.max().round(2)
+    np.float64(0.01)
     """
     edges = to_array(_EDGES * WAVE if edges is None else edges, WAVE, "edges", ndim=1)
     own = per_band(model_error, results.filters, "model_error")
@@ -274,6 +307,22 @@ def measure_priors(results):
     References
     ----------
     Dempster, Laird & Rubin 1977, JRSS B 39, 1.
+
+    Examples
+    --------
+    >>> from miricigale.fitting import measure_priors
+    >>> import numpy as np
+    >>> from miricigale import BayesFitter, ErrorModel, SEDModel
+    >>> bands = ["acs.f814w", "wfc3.f160w", "irac.ch1", "miri.f770w"]
+    >>> model = SEDModel.yang2021(agn=False)
+    >>> truth = {"redshift": np.full(40, 0.5), "age": np.linspace(1, 5, 40), "mass": np.full(40, 1e10)}
+    >>> errors = ErrorModel.from_depths(dict.fromkeys(bands, 29.0), fractional=0.05)
+    >>> photometry = errors.perturb(model.fluxes(truth, bands), seed=1)
+    >>> axes = {"redshift": [0.5], "age": [1.0, 2.0, 3.0, 4.0, 5.0], "ebv": [0.1, 0.3, 0.5]}
+    >>> fitter = BayesFitter(model, bands, axes=axes, model_error=0.0)
+    >>> results = fitter.fit(photometry, redshift=np.full(40, 0.5))
+    >>> measure_priors(results)["ebv"].round(2)
+    array([0., 1., 0.])
     """
     _check_known(results)
     if not results.fitted.any():
@@ -309,6 +358,30 @@ def calibrate_zero_points(results, *, reference=None):
         If the reference is no band that was fitted.
     ValueError
         If redshifts were free, or the reference has fewer than 30 sources of S/N above 5.
+
+    Examples
+    --------
+    >>> from miricigale.fitting import calibrate_zero_points
+    >>> import numpy as np
+    >>> from miricigale import BayesFitter, ErrorModel, SEDModel
+    >>> bands = ["acs.f814w", "wfc3.f160w", "irac.ch1", "miri.f770w"]
+    >>> model = SEDModel.yang2021(agn=False)
+    >>> truth = {"redshift": np.full(40, 0.5), "age": np.linspace(1, 5, 40), "mass": np.full(40, 1e10)}
+    >>> errors = ErrorModel.from_depths(dict.fromkeys(bands, 29.0), fractional=0.05)
+    >>> photometry = errors.perturb(model.fluxes(truth, bands), seed=1)
+    >>> axes = {"redshift": [0.5], "age": [1.0, 2.0, 3.0, 4.0, 5.0], "ebv": [0.1, 0.3, 0.5]}
+    >>> fitter = BayesFitter(model, bands, axes=axes, model_error=0.0)
+    >>> photometry["irac.ch1"] *= 0.8
+    >>> results = fitter.fit(photometry, redshift=np.full(40, 0.5))
+    >>> points = calibrate_zero_points(results, reference="wfc3.f160w")
+    >>> points.round(2)
+    >>> print(points)
+       band     n  factor factor_err
+    ---------- --- ------ ----------
+     acs.f814w  40   1.08       0.01
+    wfc3.f160w  40    1.0       0.01
+      irac.ch1  40   1.21       0.01
+    miri.f770w  40   1.08       0.01
     """
     flux, _, model, good = _residuals(results)
     bands = list(results.fitted_filters)
@@ -358,6 +431,16 @@ def apply_zero_points(photometry, zero_points):
     ------
     ValueError
         If a column is missing.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.table import QTable
+    >>> from miricigale.fitting import apply_zero_points
+    >>> photometry = QTable({"id": [1], "miri.f770w": [2.0] * u.uJy, "miri.f770w_err": [0.1] * u.uJy})
+    >>> points = QTable({"band": ["miri.f770w"], "factor": [1.05]})
+    >>> print(apply_zero_points(photometry, points)["miri.f770w"])
+    [2.1] uJy
     """
     require_columns(zero_points, ["band", "factor"], "zero_points")
     names, values = map(str, zero_points["band"]), map(float, zero_points["factor"])

@@ -55,6 +55,24 @@ def mock_analysis(fitter, results, photometry, *, seed, model_error=False, **opt
     ValueError
         If photometry and results are of different objects, or the redshifts were fixed and are
         not given.
+
+    Examples
+    --------
+    >>> from miricigale.fitting import mock_analysis
+    >>> from miricigale import BayesFitter, ErrorModel, SEDModel
+    >>> bands = ["acs.f814w", "wfc3.f160w", "irac.ch1", "miri.f770w"]
+    >>> model = SEDModel.yang2021(agn=False)
+    >>> truth = {"id": ["a", "b"], "redshift": [0.5, 1.0], "age": [1.0, 3.0], "mass": [1e10, 1e10]}
+    >>> errors = ErrorModel.from_depths(dict.fromkeys(bands, 29.0))
+    >>> photometry = errors.perturb(model.fluxes(truth, bands), seed=1)
+    >>> axes = {"redshift": [0.4, 0.5, 0.9, 1.0, 1.1], "age": [1.0, 3.0], "ebv": [0.1, 0.3]}
+    >>> fitter = BayesFitter(model, bands, axes=axes)
+    >>> results = fitter.fit(photometry)
+    >>> mock = mock_analysis(fitter, results, photometry, seed=1)
+    >>> print(mock.metrics(["mass"])["parameter", "n"])
+    parameter  n
+    --------- ---
+         mass   2
     """
     seed = check_seed(seed)
     filters = results.fitted_filters
@@ -93,6 +111,23 @@ class MockResult:
         Of the ranks of truths within their cells.
     meta : dict, optional
         Settings.
+
+    Examples
+    --------
+    >>> from miricigale.fitting import mock_analysis
+    >>> from miricigale import BayesFitter, ErrorModel, SEDModel
+    >>> bands = ["acs.f814w", "wfc3.f160w", "irac.ch1", "miri.f770w"]
+    >>> model = SEDModel.yang2021(agn=False)
+    >>> truth = {"id": ["a", "b"], "redshift": [0.5, 1.0], "age": [1.0, 3.0], "mass": [1e10, 1e10]}
+    >>> errors = ErrorModel.from_depths(dict.fromkeys(bands, 29.0))
+    >>> photometry = errors.perturb(model.fluxes(truth, bands), seed=1)
+    >>> axes = {"redshift": [0.4, 0.5, 0.9, 1.0, 1.1], "age": [1.0, 3.0], "ebv": [0.1, 0.3]}
+    >>> fitter = BayesFitter(model, bands, axes=axes)
+    >>> mock = mock_analysis(fitter, fitter.fit(photometry), photometry, seed=1)
+    >>> mock
+    <MockResult of 2 objects, 2 fitted>
+    >>> mock.true("redshift")
+    <Quantity [0.5, 1. ]>
     """
 
     truth: object
@@ -239,6 +274,21 @@ def leave_out(fitter, photometry, bands, *, separately=False, **options):
     ValueError
         If the photometry does not have it, no object is measured in it, or too few bands are left
         to fit (``n_bands_min`` of the fitter).
+
+    Examples
+    --------
+    >>> from miricigale.fitting import leave_out
+    >>> from miricigale import BayesFitter, ErrorModel, SEDModel
+    >>> bands = ["acs.f814w", "wfc3.f160w", "irac.ch1", "miri.f770w"]
+    >>> model = SEDModel.yang2021(agn=False)
+    >>> truth = {"id": ["a", "b"], "redshift": [0.5, 1.0], "age": [1.0, 3.0], "mass": [1e10, 1e10]}
+    >>> errors = ErrorModel.from_depths(dict.fromkeys(bands, 29.0))
+    >>> photometry = errors.perturb(model.fluxes(truth, bands), seed=1)
+    >>> axes = {"redshift": [0.4, 0.5, 0.9, 1.0, 1.1], "age": [1.0, 3.0], "ebv": [0.1, 0.3]}
+    >>> fitter = BayesFitter(model, bands, axes=axes)
+    >>> leave_out(fitter, photometry, ["irac.ch1"]).pull.round(1)
+    array([[-0.9],
+           [ 0.1]])
     """
     if not isinstance(fitter, BayesFitter):
         raise argument_error("fitter", "a BayesFitter", type(fitter).__name__)
@@ -293,6 +343,23 @@ class LeaveOutResult:
         bands.
     results : dict of str to `FitResults`
         By band, the fit without it.
+
+    Examples
+    --------
+    >>> from miricigale.fitting import leave_out
+    >>> from miricigale import BayesFitter, ErrorModel, SEDModel
+    >>> bands = ["acs.f814w", "wfc3.f160w", "irac.ch1", "miri.f770w"]
+    >>> model = SEDModel.yang2021(agn=False)
+    >>> truth = {"id": ["a", "b"], "redshift": [0.5, 1.0], "age": [1.0, 3.0], "mass": [1e10, 1e10]}
+    >>> errors = ErrorModel.from_depths(dict.fromkeys(bands, 29.0))
+    >>> photometry = errors.perturb(model.fluxes(truth, bands), seed=1)
+    >>> axes = {"redshift": [0.4, 0.5, 0.9, 1.0, 1.1], "age": [1.0, 3.0], "ebv": [0.1, 0.3]}
+    >>> fitter = BayesFitter(model, bands, axes=axes)
+    >>> result = leave_out(fitter, photometry, ["irac.ch1"])
+    >>> result
+    <LeaveOutResult of 2 objects, without irac.ch1>
+    >>> result.to_table().colnames[:3]
+    ['id', 'irac.ch1', 'irac.ch1_err']
     """
 
     bands: tuple

@@ -36,6 +36,27 @@ def compare_classes(results, *, prior=None):
     ValueError
         If there are fewer than two classes, they are fits of other objects, fluxes or bands, or a prior is
         negative, not finite, or 0 for all classes.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.modeling.models import BlackBody
+    >>> from miricigale.fitting import compare_classes
+    >>> from miricigale.sed import SED, template_grid
+    >>> from miricigale import BayesFitter, ErrorModel, SEDModel
+    >>> bands = ["acs.f814w", "wfc3.f160w", "irac.ch1", "miri.f770w"]
+    >>> model = SEDModel.yang2021(agn=False)
+    >>> truth = {"id": ["a", "b"], "redshift": [0.5, 1.0], "age": [1.0, 3.0], "mass": [1e10, 1e10]}
+    >>> errors = ErrorModel.from_depths(dict.fromkeys(bands, 29.0))
+    >>> photometry = errors.perturb(model.fluxes(truth, bands), seed=1)
+    >>> axes = {"redshift": [0.4, 0.5, 0.9, 1.0, 1.1], "age": [1.0, 3.0], "ebv": [0.1, 0.3]}
+    >>> fitter = BayesFitter(model, bands, axes=axes)
+    >>> wave = np.geomspace(0.3, 30, 500) * u.um
+    >>> stars = {"5000 K": SED(wave, BlackBody(5000 * u.K)(wave) * u.sr)}
+    >>> star = BayesFitter(template_grid(stars, bands)).fit(photometry)
+    >>> table = compare_classes({"galaxy": fitter.fit(photometry), "star": star})
+    >>> table["class"].tolist()
+    ['galaxy', 'galaxy']
     """
     columns = class_columns(results, prior=prior)
     first = next(iter(results.values()))

@@ -121,21 +121,28 @@ class BayesFitter(Interactive):
         If an option is of the wrong kind or of another engine, a prior is none, or leaves values that
         the libraries of the model do not have; or if ``finer`` of the settings did not make the grid.
 
-    Examples
-    --------
-    >>> from miricigale.fitting import BayesFitter, SamplerSettings
-    >>> fitter = BayesFitter(grid)  # doctest: +SKIP
-    >>> fitter.fit(photometry).to_table()["id", "redshift_mean"]  # doctest: +SKIP
-    >>> priors = {"redshift": (0.01, 6), "tau": (0.1, 10, "log"), "age": (0.1, 13), "ebv": (0, 1)}
-    >>> settings = SamplerSettings(n_live=300)
-    >>> fitter = BayesFitter(  # doctest: +SKIP
-    ...     model, bands, priors=priors, engine="nautilus", settings=settings
-    ... )
-    >>> results = fitter.fit(photometry, seed=1)  # doctest: +SKIP
-
     References
     ----------
     .. [1] Boquien et al. 2019, A&A 622, A103, section 4.3
+
+    Examples
+    --------
+    >>> from miricigale import BayesFitter, ErrorModel, SEDModel
+    >>> bands = ["acs.f814w", "wfc3.f160w", "irac.ch1", "miri.f770w"]
+    >>> model = SEDModel.yang2021(agn=False)
+    >>> truth = {"id": ["a", "b"], "redshift": [0.5, 1.0], "age": [1.0, 3.0], "mass": [1e10, 1e10]}
+    >>> errors = ErrorModel.from_depths(dict.fromkeys(bands, 29.0))
+    >>> photometry = errors.perturb(model.fluxes(truth, bands), seed=1)
+    >>> axes = {"redshift": [0.4, 0.5, 0.9, 1.0, 1.1], "age": [1.0, 3.0], "ebv": [0.1, 0.3]}
+    >>> fitter = BayesFitter(model, bands, axes=axes)
+    >>> fitter.fit(photometry).mean("redshift").round(1)
+    <Quantity [0.5, 1. ]>
+
+    A sampler takes continuous parameters:
+
+    >>> priors = {"redshift": (0.01, 6), "tau": (0.1, 10, "log"), "age": (0.1, 13), "ebv": (0, 1)}
+    >>> fitter = BayesFitter(model, bands, priors=priors, engine="nautilus")  # doctest: +SKIP
+    >>> results = fitter.fit(photometry, seed=1)  # doctest: +SKIP
     """
 
     def __init__(

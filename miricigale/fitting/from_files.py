@@ -82,6 +82,12 @@ def fit_catalog(
         If there is no such file, or it cannot be read by rows.
     ValueError
         If no column is a flux in a known filter that has an error.
+
+    Examples
+    --------
+    >>> from miricigale.fitting import fit_catalog
+    >>> results = fit_catalog("catalog.fits", "fits", axes="survey")  # doctest: +SKIP
+    >>> results.to_table(["id", "redshift_p50", "mass_p50"])  # doctest: +SKIP
     """
     unit = options.get("flux_unit")
     rows = open_catalog(path, chunk_rows, hdu=hdu, catalog_map=catalog_map, flux_unit=unit)

@@ -219,6 +219,12 @@ def open_results(path, *, partial=False, model=None):
     ------
     `~miricigale.utils.exceptions.DataError`
         If the folder holds no such results, or parts are missing.
+
+    Examples
+    --------
+    >>> from miricigale.fitting import open_results
+    >>> results = open_results("fits")  # doctest: +SKIP
+    >>> results.to_table(["id", "mass_p50"])  # doctest: +SKIP
     """
     results = FitResultsFiles(path, model=model)
     if not (partial or results.complete):
@@ -241,6 +247,13 @@ class FitResultsFiles:
         The folder.
     model : `~miricigale.sed.SEDModel`, optional
         The model the grid was made from.
+
+    Examples
+    --------
+    >>> from miricigale.fitting import open_results
+    >>> results = open_results("fits")  # doctest: +SKIP
+    >>> for part in results.parts():  # doctest: +SKIP
+    ...     print(len(part), part.reduced_chi2.mean())
     """
 
     def __init__(self, path, *, model=None):

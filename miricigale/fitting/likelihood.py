@@ -27,7 +27,17 @@ _KINDS = {"U": "text", "S": "text", "b": "true and false", "c": "complex numbers
 
 
 class FitFlags(Flags):
-    """Flags of a fitted catalog; `FitFlags.UNFITTED` is the sum of those that prevent a fit."""
+    """
+    Flags of a fitted catalog; `FitFlags.UNFITTED` is the sum of those that prevent a fit.
+
+    Examples
+    --------
+    >>> from miricigale.fitting import FitFlags
+    >>> FitFlags(16384 | 32768)
+    <FitFlags.LOW_SIGNAL|ONE_NODE: 49152>
+    >>> FitFlags.UNFITTED & FitFlags.ALL_LIMITS     # such a row has no result
+    <FitFlags.ALL_LIMITS: 4096>
+    """
 
     #: No usable band.
     NO_BAND = 1

@@ -215,6 +215,14 @@ def magnitude_prior(magnitude, redshift=None):
     ------
     `~astropy.units.UnitsError`
         If magnitudes have no unit.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.fitting import magnitude_prior
+    >>> z, density = magnitude_prior([21.0, 26.0] * u.ABmag)
+    >>> z[density.argmax(axis=1)].round(1)
+    array([0.4, 0.8])
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         values = u.Quantity(magnitude, subok=True).to(u.ABmag).value

@@ -30,7 +30,7 @@ _PARTS = {
     "p16": "16th percentile",
     "p50": "median",
     "p84": "84th percentile",
-    "best": "best model's value",
+    "best": "value of the best model",
 }
 
 
@@ -114,6 +114,23 @@ class FitResults(FitRows):
         The model that was fitted; not written to files.
     meta : dict, optional
         Provenance and the settings of the fit, for people.
+
+    Examples
+    --------
+    >>> from miricigale import BayesFitter, ErrorModel, SEDModel
+    >>> bands = ["acs.f814w", "wfc3.f160w", "irac.ch1", "miri.f770w"]
+    >>> model = SEDModel.yang2021(agn=False)
+    >>> truth = {"id": ["a", "b"], "redshift": [0.5, 1.0], "age": [1.0, 3.0], "mass": [1e10, 1e10]}
+    >>> errors = ErrorModel.from_depths(dict.fromkeys(bands, 29.0))
+    >>> photometry = errors.perturb(model.fluxes(truth, bands), seed=1)
+    >>> axes = {"redshift": [0.4, 0.5, 0.9, 1.0, 1.1], "age": [1.0, 3.0], "ebv": [0.1, 0.3]}
+    >>> fitter = BayesFitter(model, bands, axes=axes)
+    >>> results = fitter.fit(photometry)
+    >>> results
+    <FitResults of 2 objects, 2 fitted, 4 bands>
+    >>> results["b"].mean("redshift").round(2)
+    <Quantity 1.01>
+    >>> edges, weights = results["b"].distribution("redshift")
     """
 
     ids: PerObject
@@ -292,7 +309,7 @@ class FitResults(FitRows):
 
         Returns
         -------
-        percentiles : `~astropy.units.Quantity`, shape (n, n_levels)
+        percentiles : `~astropy.units.Quantity`, shape (n, n_levels); (n,) for a single level
             For parameters of the grid from the distribution that is linear within each cell.
 
         Raises
@@ -302,7 +319,7 @@ class FitResults(FitRows):
         ValueError
             If a level is outside.
         """
-        levels = check_levels(levels)
+        single, levels = np.ndim(levels) == 0, check_levels(levels)
         some = self._several()
         kept = some._kept(name, "quantiles")
         if kept is None:
@@ -310,6 +327,7 @@ class FitResults(FitRows):
             out = cell_percentiles(axis.values, some.pdf[name], levels, axis.bounds)
         else:
             out = kept_percentiles(name, levels, kept)
+        out = out[:, 0] if single else out
         return (out[0] if self.isscalar else out) * self.unit(name)
 
     def distribution(self, name):

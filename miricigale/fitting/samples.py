@@ -61,6 +61,22 @@ class Samples(FitRows):
     ------
     ValueError
         If shapes do not agree or an index is not one of the grid.
+
+    Examples
+    --------
+    >>> from miricigale import BayesFitter, ErrorModel, SEDModel
+    >>> bands = ["acs.f814w", "wfc3.f160w", "irac.ch1", "miri.f770w"]
+    >>> model = SEDModel.yang2021(agn=False)
+    >>> truth = {"id": ["a", "b"], "redshift": [0.5, 1.0], "age": [1.0, 3.0], "mass": [1e10, 1e10]}
+    >>> errors = ErrorModel.from_depths(dict.fromkeys(bands, 29.0))
+    >>> photometry = errors.perturb(model.fluxes(truth, bands), seed=1)
+    >>> axes = {"redshift": [0.4, 0.5, 0.9, 1.0, 1.1], "age": [1.0, 3.0], "ebv": [0.1, 0.3]}
+    >>> fitter = BayesFitter(model, bands, axes=axes)
+    >>> samples = fitter.sample(photometry, 100, seed=1)
+    >>> samples
+    <Samples of 2 objects, 100 draws each>
+    >>> samples["b"].mean("redshift").round(1)
+    <Quantity 1.>
     """
 
     grid: object
@@ -253,11 +269,12 @@ model : `~miricigale.sed.SEDModel`, optional
         name : str
             A parameter or derived quantity.
         levels : array_like, shape (n_levels,)
-            Levels in (0, 1), of percentiles of shape (n, n_levels).
+            Levels in (0, 1), of percentiles of shape (n, n_levels); (n,) for a single level.
         """
         values = self.values(name)
-        levels = check_levels(levels)
-        return np.moveaxis(np.quantile(values.value, levels, axis=-1), 0, -1) * values.unit
+        single, levels = np.ndim(levels) == 0, check_levels(levels)
+        out = np.moveaxis(np.quantile(values.value, levels, axis=-1), 0, -1) * values.unit
+        return out[..., 0] if single else out
 
     # -------------------------------------------------------------- distributions
 

@@ -43,6 +43,12 @@ class GridSettings:
     ------
     ValueError
         If a value is of the wrong kind, or goes with another one that was not given.
+
+    Examples
+    --------
+    >>> from miricigale.fitting import GridSettings
+    >>> GridSettings(prior_f="uniform", redshift_tolerance=0.05)
+    GridSettings(prior_f='uniform', ...)
     """
 
     prior_f: str = "grid"
@@ -91,6 +97,12 @@ class SamplerSettings:
     ------
     TypeError, ValueError
         If a number is not a whole number, or too small.
+
+    Examples
+    --------
+    >>> from miricigale.fitting import SamplerSettings
+    >>> SamplerSettings(n_live=1000, options={"n_networks": 4})
+    SamplerSettings(..., n_live=1000, ...)
     """
 
     predict: tuple = ()

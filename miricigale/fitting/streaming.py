@@ -107,6 +107,12 @@ def fit_file(
     ValueError
         What `BayesFitter.fit` raises; if an id is no ASCII text, which FITS cannot hold,
         before anything is fitted. A note names the rows.
+
+    Examples
+    --------
+    >>> from miricigale.fitting import fit_file
+    >>> results = fit_file(fitter, "catalog.fits", "fits", redshift="z_spec")  # doctest: +SKIP
+    >>> results.write_table("table.fits")  # doctest: +SKIP
     """
     if not isinstance(fitter, BayesFitter):
         raise argument_error("fitter", "a BayesFitter", type(fitter).__name__)
@@ -171,7 +177,7 @@ def _fit_parts(fitter, rows, take, folder, seed, executor, progress_bar):
                 keys = _keys(part_ids(folder.path(name)))
             else:
                 if name in folder.records:
-                    logger.warning("%s is damaged and is made again", folder.path(name))
+                    logger.warning("%s is missing or damaged and is made again", folder.path(name))
                 with _noted(rows, i):
                     table, options = take(i)
                     keys = _keys(read_ids(table))

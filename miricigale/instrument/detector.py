@@ -53,6 +53,13 @@ class DetectorProperties:
     ValueError
         If a figure is not positive, or the non-linearity polynomial does not rise up to the
         full well.
+
+    Examples
+    --------
+    >>> from miricigale.instrument import DetectorProperties
+    >>> detector = DetectorProperties(gain=5.5, read_noise=8.0)
+    >>> print(f"{detector.saturation_dn:.0f} DN above the bias")
+    38182 DN above the bias
     """
 
     gain: float = 4.0
@@ -158,6 +165,13 @@ def miri_detector():
     detector : `DetectorProperties`
         In-flight figures of the user documentation; the non-linearity has the measured
         size and a smooth form of our own.
+
+    Examples
+    --------
+    >>> from miricigale.instrument import miri_detector
+    >>> detector = miri_detector()
+    >>> detector.gain, detector.read_noise, detector.full_well
+    (4.0, 6.0, 210000.0)
     """
     return DetectorProperties(**table()["detector"])
 
@@ -205,6 +219,13 @@ def flat_field(filter, *, subarray="FULL", seed=_SEED):
         Mean 1 over the full frame; 1 % from pixel to pixel, as much across the field;
         1 in the reference columns. Read-only, and always the same: it is our own,
         drawn once, and no measurement.
+
+    Examples
+    --------
+    >>> from miricigale.instrument import flat_field
+    >>> flat = flat_field("miri.f770w")
+    >>> print(f"{flat.mean():.3f} +- {flat.std():.3f}")
+    1.000 +- 0.012
     """
     filter_row(filter)
     return _full_flat(str(filter), check_seed(seed))[aperture(subarray).slices]
@@ -234,6 +255,12 @@ def bad_pixel_mask(*, subarray="FULL"):
     -------
     mask : `~numpy.ndarray` of bool, shape (ny, nx)
         True where bad. Read-only, and always the same; reference pixels are not bad.
+
+    Examples
+    --------
+    >>> from miricigale.instrument import bad_pixel_mask
+    >>> print(f"{100 * bad_pixel_mask().mean():.2f} % of the pixels")
+    0.10 % of the pixels
     """
     return _full_bad_pixels()[aperture(subarray).slices]
 
@@ -247,6 +274,12 @@ def reference_pixel_mask(*, subarray="FULL"):
     Returns
     -------
     mask : `~numpy.ndarray` of bool, shape (ny, nx)
+
+    Examples
+    --------
+    >>> from miricigale.instrument import reference_pixel_mask
+    >>> print(reference_pixel_mask()[0].sum(), "columns")
+    8 columns
     """
     n, n_columns = miri_detector().reference_columns, aperture("FULL").shape[1]
     return ~_columns_mask(n, n_columns - n, subarray)
@@ -272,5 +305,11 @@ def field_mask(*, subarray="FULL"):
     -------
     mask : `~numpy.ndarray` of bool, shape (ny, nx)
         True where the sky is seen.
+
+    Examples
+    --------
+    >>> from miricigale.instrument import field_mask
+    >>> print(f"{100 * field_mask().mean():.0f} % of the array")
+    65 % of the array
     """
     return _columns_mask(*imager_columns(), subarray)

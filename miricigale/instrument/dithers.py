@@ -73,7 +73,15 @@ def _points(pattern):
 
 
 def dither_patterns():
-    """Names of the patterns."""
+    """
+    Names of the patterns.
+
+    Examples
+    --------
+    >>> from miricigale.instrument import dither_patterns
+    >>> dither_patterns()
+    ('ceers', '4-point', 'none', 'cycling-small', 'cycling-medium', 'cycling-large')
+    """
     return (*_PATTERNS, *_CYCLING)
 
 
@@ -107,6 +115,15 @@ def dither_offsets(pattern, n=None, *, start=0):
         If there is no such pattern.
     ValueError
         If ``n`` is smaller than 1, or with ``start`` larger than a table of offsets.
+
+    Examples
+    --------
+    >>> from miricigale.instrument import dither_offsets
+    >>> dither_offsets("4-point").round(2)
+    <Quantity [[ 1.1 ,  1.67],
+               [-1.16,  1.73],
+               [-1.1 , -1.73],
+               [ 1.16, -1.67]] arcsec>
     """
     n = None if n is None else check_count(n, "n")
     start = check_count(start, "start", 0)
@@ -150,6 +167,13 @@ def tile_offsets(n_x, n_y, *, overlap=0.1):
     ------
     ValueError
         If a number is smaller than 1, or ``overlap`` is out of its range.
+
+    Examples
+    --------
+    >>> from miricigale.instrument import tile_offsets
+    >>> tile_offsets(2, 1, overlap=0.1).round(1)
+    <Quantity [[-33.2,   0. ],
+               [ 33.2,   0. ]] arcsec>
     """
     n_x, n_y = check_count(n_x, "n_x"), check_count(n_y, "n_y")
     if not 0 <= overlap < 1:
@@ -198,6 +222,13 @@ def read_dithers(path, *, observation=None, exposure=None):
         If a list has several observations with such rows, or exposures with other dithers, and none,
         or another, is asked for; if tiles of a mosaic have other dithers than one another; or if a table
         comes with an observation or an exposure, which it has not.
+
+    Examples
+    --------
+    >>> from miricigale.instrument import Exposure, read_dithers
+    >>> offsets = read_dithers("program.pointing", observation=3)  # doctest: +SKIP
+    >>> exposure = Exposure("F770W", n_groups=100, pointing="53.1 -27.8")
+    >>> dithers = exposure.dithered(offsets)  # doctest: +SKIP
     """
     path = Path(path).expanduser()
     if not path.is_file():

@@ -18,45 +18,57 @@ class DQ(Flags):
     References
     ----------
     JWST pipeline documentation, data quality flags (``stdatamodels.jwst.datamodels.dqflags``).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.instrument import DQ
+    >>> DQ.names(5)
+    ['do_not_use', 'jump_det']
+    >>> int(DQ.JUMP_DET)
+    4
+    >>> flags = np.array([0, 4, 5])
+    >>> (flags & int(DQ.DO_NOT_USE)) != 0
+    array([False, False,  True])
     """
 
     GOOD = 0
-    DO_NOT_USE = 2**0
+    DO_NOT_USE = 2**0  # Must not be used.
     #: Groups from the first saturated one on are left out.
     SATURATED = 2**1
     #: A ramp that is split at one or more jumps.
     JUMP_DET = 2**2
-    DROPOUT = 2**3
+    DROPOUT = 2**3  # Data lost in transmission.
     #: Disagrees with the other dithers.
     OUTLIER = 2**4
-    PERSISTENCE = 2**5
-    AD_FLOOR = 2**6
-    CHARGELOSS = 2**7
-    UNRELIABLE_ERROR = 2**8
+    PERSISTENCE = 2**5  # High persistence.
+    AD_FLOOR = 2**6  # At or below the floor of the A/D converter.
+    CHARGELOSS = 2**7  # Charge has migrated to neighbors.
+    UNRELIABLE_ERROR = 2**8  # The error may be larger than stated.
     #: Sees no sky: reference pixels, those behind the coronagraph masks, mosaics without data.
     NON_SCIENCE = 2**9
-    DEAD = 2**10
-    HOT = 2**11
-    WARM = 2**12
-    LOW_QE = 2**13
-    RC = 2**14
-    TELEGRAPH = 2**15
-    NONLINEAR = 2**16
-    BAD_REF_PIXEL = 2**17
-    NO_FLAT_FIELD = 2**18
-    NO_GAIN_VALUE = 2**19
-    NO_LIN_CORR = 2**20
-    NO_SAT_CHECK = 2**21
-    UNRELIABLE_BIAS = 2**22
-    UNRELIABLE_DARK = 2**23
-    UNRELIABLE_SLOPE = 2**24
-    UNRELIABLE_FLAT = 2**25
-    OPEN = 2**26
-    ADJ_OPEN = 2**27
-    FLUX_ESTIMATED = 2**28
-    MSA_FAILED_OPEN = 2**29
-    OTHER_BAD_PIXEL = 2**30
-    REFERENCE_PIXEL = 2**31
+    DEAD = 2**10  # Dead pixel.
+    HOT = 2**11  # Hot pixel.
+    WARM = 2**12  # Warm pixel.
+    LOW_QE = 2**13  # Low quantum efficiency.
+    RC = 2**14  # RC pixel: the signal decays between reads.
+    TELEGRAPH = 2**15  # Telegraph pixel: the signal jumps between two levels.
+    NONLINEAR = 2**16  # Highly non-linear pixel.
+    BAD_REF_PIXEL = 2**17  # Reference pixel that cannot be used.
+    NO_FLAT_FIELD = 2**18  # Flat field is not known.
+    NO_GAIN_VALUE = 2**19  # Gain is not known.
+    NO_LIN_CORR = 2**20  # Linearity correction is not available.
+    NO_SAT_CHECK = 2**21  # Saturation level is not known.
+    UNRELIABLE_BIAS = 2**22  # Large variance of the bias.
+    UNRELIABLE_DARK = 2**23  # Large variance of the dark current.
+    UNRELIABLE_SLOPE = 2**24  # Large variance of the slope.
+    UNRELIABLE_FLAT = 2**25  # Large variance of the flat field.
+    OPEN = 2**26  # Open pixel: its charge goes to its neighbors.
+    ADJ_OPEN = 2**27  # Next to an open pixel.
+    FLUX_ESTIMATED = 2**28  # Flux estimated because data are missing or bad.
+    MSA_FAILED_OPEN = 2**29  # Light from a shutter of NIRSpec that failed open.
+    OTHER_BAD_PIXEL = 2**30  # Any other bad pixel.
+    REFERENCE_PIXEL = 2**31  # Reference pixel.
     #: Split where a neighbor had a large jump.
     JUMP_NEIGHBOR = 2**32
     #: No slope: saturated from the start, or not fitted.
@@ -92,6 +104,13 @@ def dq_legend():
     -------
     header : `~astropy.io.fits.Header`
         ``DQSCHEME`` = ``'JWST'``, and the name of each bit n in ``DQBITn``.
+
+    Examples
+    --------
+    >>> from miricigale.instrument import dq_legend
+    >>> header = dq_legend()
+    >>> header["DQBIT2"]
+    'JUMP_DET'
     """
     from astropy.io import fits
 
@@ -118,6 +137,14 @@ def dq_planes(flags):
         ``DQ``, the 32 bits that JWST has; then ``DQ_OWN``, those above, if any is set.
     plane : `~numpy.ndarray` of uint32 or uint8
     header : `~astropy.io.fits.Header`
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.instrument import DQ, dq_planes
+    >>> flags = np.array([[0, int(DQ.JUMP_DET | DQ.JUMP_NEIGHBOR)]])
+    >>> [(name, plane.tolist()) for name, plane, header in dq_planes(flags)]
+    [('DQ', [[0, 4]]), ('DQ_OWN', [[0, 1]])]
     """
     from astropy.io import fits
 
@@ -129,7 +156,24 @@ def dq_planes(flags):
 
 
 def with_own_bits(flags, hdus):
-    """Flags of a plane DQ with the bits above 31 that a file has in ``DQ_OWN``."""
+    """
+    Flags of a plane DQ with the bits above 31 that a file has in ``DQ_OWN``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.io import fits
+    >>> from miricigale.instrument import DQ, dq_planes, with_own_bits
+    >>> flags = np.array([[int(DQ.JUMP_DET | DQ.JUMP_NEIGHBOR)]])
+    >>> hdus = [fits.PrimaryHDU()]
+    >>> hdus += [
+    ...     fits.ImageHDU(plane, header, name=name)
+    ...     for name, plane, header in dq_planes(flags)
+    ... ]
+    >>> joined = with_own_bits(hdus[1].data.astype(np.int64), fits.HDUList(hdus))
+    >>> DQ.names(int(joined[0, 0]))
+    ['jump_det', 'jump_neighbor']
+    """
     if "DQ_OWN" not in hdus:
         return flags
     return flags | (np.asarray(hdus["DQ_OWN"].data).astype(np.int64) << 32)
@@ -155,6 +199,18 @@ def read_dq(hdu):
     `~miricigale.utils.exceptions.DataError`
         If the legend is another one, or there is none and bits are set that earlier versions
         did not have.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.io import fits
+    >>> from miricigale.instrument import DQ, dq_planes, read_dq
+    >>> name, plane, header = next(
+    ...     dq_planes(np.array([[0, int(DQ.DO_NOT_USE | DQ.HOT)]]))
+    ... )
+    >>> flags = read_dq(fits.ImageHDU(plane, header, name=name))
+    >>> DQ.names(int(flags[0, 1]))
+    ['do_not_use', 'hot']
     """
     flags = np.asarray(hdu.data).astype(np.int64)
     scheme = hdu.header.get("DQSCHEME")

@@ -44,7 +44,15 @@ _QUICK["miri.f2100w"] = (10, 7, 2)
 
 
 def readout_patterns():
-    """Names of the readout patterns."""
+    """
+    Names of the readout patterns.
+
+    Examples
+    --------
+    >>> from miricigale.instrument import readout_patterns
+    >>> readout_patterns()
+    ('FASTR1', 'SLOWR1')
+    """
     return tuple(table()["readout"])
 
 
@@ -63,6 +71,12 @@ def frame_time(readout="FASTR1", subarray="FULL"):
     -------
     time : `~astropy.units.Quantity`
         In s. Both patterns have one frame in a group.
+
+    Examples
+    --------
+    >>> from miricigale.instrument import frame_time
+    >>> frame_time().round(3), frame_time("FASTR1", "SUB64").round(3)
+    (<Quantity 2.775 s>, <Quantity 0.085 s>)
     """
     times = table()["readout"]
     check_names([readout], "readout pattern", times)
@@ -429,6 +443,16 @@ def ceers_exposures(pointing, roll, *, filters=None, quick=False):
     References
     ----------
     Yang et al. 2021, ApJ, 908, 144, section 2.
+
+    Examples
+    --------
+    >>> from astropy.coordinates import SkyCoord
+    >>> import astropy.units as u
+    >>> from miricigale.instrument import ceers_exposures
+    >>> field = SkyCoord(214.9, 52.9, unit="deg")
+    >>> exposures = ceers_exposures(field, 0 * u.deg, filters=["miri.f770w"])
+    >>> len(exposures), exposures[0].exposure_time
+    (3, <Quantity 555. s>)
     """
     filters = CEERS_FILTERS if filters is None else tuple(filters)
     check_names(filters, "band of the survey", CEERS_FILTERS)

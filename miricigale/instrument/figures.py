@@ -14,7 +14,15 @@ def table(name="imager"):
 
 
 def imager_filters():
-    """Names of the nine imaging filters, blue to red."""
+    """
+    Names of the nine imaging filters, blue to red.
+
+    Examples
+    --------
+    >>> from miricigale.instrument import imager_filters
+    >>> imager_filters()[:3]
+    ('miri.f560w', 'miri.f770w', 'miri.f1000w')
+    """
     return tuple(f"miri.{name}" for name in table()["filters"])
 
 

@@ -16,6 +16,15 @@ class Image(Interactive, CCDData):
     ``write`` and ``to_hdu`` put numbers and short text on cards, and all of it as JSON on the card ``META``; the
     data are the primary HDU, with uncertainty and mask as extensions, as astropy has them, and flags as
     JWST has them (``DQ``).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.instrument import Image
+    >>> image = Image(np.ones((4, 4)), unit="MJy/sr", meta={"dithers": [0, 1, 2]})
+    >>> image.write("image.fits")  # doctest: +SKIP
+    >>> image.meta["dithers"]
+    [0, 1, 2]
     """
 
     def _facts(self):
@@ -46,7 +55,7 @@ class Image(Interactive, CCDData):
         """
         from miricigale.plotting.scene import plot_scene
 
-        label = f"{self.meta.get('filter') or ''} [{self.unit.to_string('vounit')}]".strip()
+        label = f"{self.meta.get('filter') or ''} ({self.unit})".strip()
         return plot_scene(self.data, ax=ax, label=label, **kwargs)
 
     def to_hdu(self, *args, **kwargs):

@@ -40,6 +40,16 @@ class ImageFacts:
     ------
     ValueError
         If a value is of another kind; the message names the key of the meta dictionary.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.nddata import CCDData
+    >>> from miricigale.instrument import ImageFacts
+    >>> meta = {"filter": "miri.f770w", "psf_includes": "pixel, ipc"}
+    >>> facts = ImageFacts.of(CCDData(np.ones((4, 4)), unit="MJy/sr", meta=meta))
+    >>> facts.filter, facts.psf_includes
+    ('miri.f770w', ('pixel', 'ipc'))
     """
 
     filter: str | None = None

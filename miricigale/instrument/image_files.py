@@ -63,6 +63,15 @@ def write_image(image, path, *, planes=None, rounded=False):
     rounded : bool, optional
         Whether SCI and ERR are rounded to 1/2048 of the median of ERR, for a third of the size;
         otherwise every bit is kept.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.nddata import CCDData, StdDevUncertainty
+    >>> from miricigale.instrument import write_image
+    >>> error = StdDevUncertainty(np.full((4, 4), 0.1))
+    >>> image = CCDData(np.ones((4, 4)), unit="MJy/sr", uncertainty=error)
+    >>> write_image(image, "image.fits", planes={"dq": np.zeros((4, 4), np.int64)})  # doctest: +SKIP
     """
     header = image.wcs.to_header(relax=True) if image.wcs is not None else fits.Header()
     header["BUNIT"] = image.unit.to_string("fits")
@@ -119,6 +128,12 @@ def read_image(path, *, planes=()):
     ------
     `~miricigale.utils.exceptions.DataError`
         If the file is missing, or has no SCI extension or no unit of an image.
+
+    Examples
+    --------
+    >>> from miricigale.instrument import read_image
+    >>> image = read_image("exposures/miri.f770w-0.fits")  # doctest: +SKIP
+    >>> image, dq = read_image("exposures/miri.f770w-0.fits", planes=["dq"])  # doctest: +SKIP
     """
     from astropy.nddata import StdDevUncertainty
     from astropy.wcs import WCS

@@ -46,6 +46,19 @@ def steps_done(header):
     -------
     steps : frozenset of str
         Names of `STEPS` whose keyword says COMPLETE.
+
+    Examples
+    --------
+    >>> from astropy.io.fits import Header
+    >>> from miricigale.instrument import steps_done
+    >>> sorted(
+    ...     steps_done(
+    ...         Header(
+    ...             {"S_DARK": "COMPLETE", "S_LINEAR": "COMPLETE", "S_JUMP": "SKIPPED"}
+    ...         )
+    ...     )
+    ... )
+    ['dark', 'linearity']
     """
     return frozenset(
         step
@@ -69,6 +82,18 @@ def joined_header(hdus, name="SCI"):
     -------
     header : `~astropy.io.fits.Header`
         Those of the primary header, and of the extension what it lacks, but for the layout of the file.
+
+    Examples
+    --------
+    >>> from astropy.io import fits
+    >>> from miricigale.instrument import joined_header
+    >>> primary = fits.PrimaryHDU()
+    >>> primary.header["FILTER"] = "F770W"
+    >>> science = fits.ImageHDU(name="SCI")
+    >>> science.header["BUNIT"] = "MJy/sr"
+    >>> header = joined_header(fits.HDUList([primary, science]))
+    >>> header["FILTER"], header["BUNIT"]
+    ('F770W', 'MJy/sr')
     """
     header = hdus[0].header.copy(strip=True)
     science = hdus[name].header.copy(strip=True) if name in hdus else fits.Header()
@@ -96,6 +121,16 @@ def exposure_keywords(header):
         None where the header says nothing; without a filter also where the light was blocked.
     dither : int
         Position in the pattern of dithers, from 0.
+
+    Examples
+    --------
+    >>> from astropy.io.fits import Header
+    >>> from miricigale.instrument import exposure_keywords
+    >>> header = Header(
+    ...     {"FILTER": "F770W", "READPATT": "FASTR1", "SUBARRAY": "FULL", "PATT_NUM": 2}
+    ... )
+    >>> exposure_keywords(header)
+    ('miri.f770w', 'FASTR1', 'FULL', 1)
     """
     name, pattern, part = (
         str(header.get(key, "")).strip() for key in ("FILTER", "READPATT", "SUBARRAY")

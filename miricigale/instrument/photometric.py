@@ -39,6 +39,12 @@ def photmjsr(filter, *, gain=None):
     The bundled values are those at 3.1 e-/DN; they equal, to their three digits, the
     electron rate 1e-20 A Omega integral(T dlambda / lambda) / h (SI, per MJy/sr) for the
     collecting area 25.4 m2, the mean pixel and the measured photon conversion efficiency T.
+
+    Examples
+    --------
+    >>> from miricigale.instrument import photmjsr
+    >>> round(photmjsr("miri.f770w", gain=3.1), 3)
+    0.272
     """
     gain = miri_detector().gain if gain is None else float(gain)
     check_positive(gain, "gain")
@@ -72,6 +78,15 @@ def background_level(filter, *, zodi="low"):
     References
     ----------
     Rigby et al. 2023, PASP, 135, 048002; jwst_backgrounds, thermal curve v4.0.
+
+    Examples
+    --------
+    >>> from miricigale.instrument import background_level
+    >>> (
+    ...     background_level("miri.f770w").round(2),
+    ...     background_level("miri.f770w", zodi=2.0).round(2),
+    ... )
+    (<Quantity 4.93 MJy / sr>, <Quantity 8.54 MJy / sr>)
     """
     row = filter_row(filter)
     return (row["thermal"] + _zodi_factor(zodi) * row["zodi"]) * SURFACE_BRIGHTNESS
@@ -103,6 +118,13 @@ def background_spectrum(wave, *, zodi="low"):
     ------
     ValueError
         If a wavelength lies outside the thermal curve.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.instrument import background_spectrum
+    >>> background_spectrum([8, 15, 25] * u.um).round(1)
+    <Quantity [  5.9,  38.4, 852. ] MJy / sr>
     """
     from astropy.modeling.physical_models import BlackBody
 
@@ -132,6 +154,12 @@ def psf_fwhm(filter):
     -------
     fwhm : `~astropy.units.Quantity`
         In arcsec (JWST program 1028).
+
+    Examples
+    --------
+    >>> from miricigale.instrument import psf_fwhm
+    >>> psf_fwhm("miri.f770w")
+    <Quantity 0.269 arcsec>
     """
     return filter_row(filter)["fwhm"] * u.arcsec
 
@@ -150,6 +178,12 @@ def electrons_per_brightness(filter, detector=None):
     Returns
     -------
     electrons : float
+
+    Examples
+    --------
+    >>> from miricigale.instrument import electrons_per_brightness
+    >>> print(f"{electrons_per_brightness('miri.f770w'):.2f}")
+    11.40
     """
     gain = (miri_detector() if detector is None else detector).gain
     return gain / photmjsr(filter, gain=gain)
@@ -172,6 +206,12 @@ def electron_rate(filter, background=None, *, detector=None):
     -------
     rate : float or `~numpy.ndarray`
         Electrons per second, dark current included.
+
+    Examples
+    --------
+    >>> from miricigale.instrument import electron_rate
+    >>> print(f"{electron_rate('miri.f770w'):.1f} electrons per second")
+    56.4 electrons per second
     """
     detector = miri_detector() if detector is None else detector
     level = background_level(filter) if background is None else background

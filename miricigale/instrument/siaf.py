@@ -40,6 +40,13 @@ class Aperture:
         Angle of the ideal +y axis from +V3 towards +V2, deg.
     parity : int
         -1 when ideal +x points to -V2.
+
+    Examples
+    --------
+    >>> from miricigale.instrument import aperture
+    >>> sub64 = aperture("SUB64")
+    >>> sub64.origin, sub64.shape
+    ((0, 778), (64, 72))
     """
 
     name: str
@@ -59,12 +66,28 @@ class Aperture:
 
 
 def subarrays():
-    """Names of the sub-arrays, ``"FULL"`` first."""
+    """
+    Names of the sub-arrays, ``"FULL"`` first.
+
+    Examples
+    --------
+    >>> from miricigale.instrument import subarrays
+    >>> subarrays()
+    ('FULL', 'BRIGHTSKY', 'SUB256', 'SUB128', 'SUB64')
+    """
     return tuple(table("siaf")["subarrays"])
 
 
 def imager_columns():
-    """First and last (excluded) column of the full frame that sees the sky through the filters."""
+    """
+    First and last (excluded) column of the full frame that sees the sky through the filters.
+
+    Examples
+    --------
+    >>> from miricigale.instrument import imager_columns
+    >>> imager_columns()
+    (359, 1027)
+    """
     return tuple(table("siaf")["imager_columns"])
 
 
@@ -86,6 +109,12 @@ def aperture(name="FULL"):
     ------
     KeyError
         If there is no such sub-array; the message lists the known ones.
+
+    Examples
+    --------
+    >>> from miricigale.instrument import aperture
+    >>> aperture("BRIGHTSKY").shape
+    (512, 512)
     """
     siaf = table("siaf")
     check_names([name], "sub-array", siaf["subarrays"])
@@ -132,6 +161,13 @@ def pixel_to_v2v3(x, y, *, subarray="FULL"):
     -------
     v2, v3 : `~numpy.ndarray`
         In arcsec.
+
+    Examples
+    --------
+    >>> from miricigale.instrument import pixel_to_v2v3
+    >>> v2, v3 = pixel_to_v2v3(692.5, 511.5)
+    >>> print(f"{v2:.1f}, {v3:.1f} arcsec")
+    -453.3, -373.7 arcsec
     """
     full, part = aperture("FULL"), aperture(subarray)
     x = np.asarray(x, dtype=float) + part.origin[0] - full.reference[0]
@@ -165,6 +201,15 @@ def attitude_matrix(ra, dec, roll, *, v2, v3):
     References
     ----------
     JWST-STScI-001550, "Description and use of the JWST Science Instrument Aperture File".
+
+    Examples
+    --------
+    >>> from miricigale.instrument import aperture, attitude_matrix, v2v3_to_sky
+    >>> full = aperture("FULL")
+    >>> matrix = attitude_matrix(53.1, -27.8, 35.0, v2=full.v2, v3=full.v3)
+    >>> ra, dec = v2v3_to_sky(full.v2, full.v3, matrix)
+    >>> print(f"{ra:.4f} {dec:.4f}")
+    53.1000 -27.8000
     """
     ra, dec, roll = np.radians([ra, dec, roll])
     # astropy turns the axes, not the vectors
@@ -204,6 +249,15 @@ def v2v3_to_sky(v2, v3, matrix):
     -------
     ra, dec : `~numpy.ndarray`
         In deg, ra in 0-360.
+
+    Examples
+    --------
+    >>> from miricigale.instrument import attitude_matrix, pixel_to_v2v3, v2v3_to_sky
+    >>> v2, v3 = pixel_to_v2v3(100.0, 200.0)
+    >>> matrix = attitude_matrix(53.1, -27.8, 35.0, v2=-453.0, v3=-373.0)
+    >>> ra, dec = v2v3_to_sky(v2, v3, matrix)
+    >>> print(f"{ra:.3f} {dec:.3f}")
+    53.109 -27.819
     """
     vector = unit_vector(np.asarray(v2) * _ARCSEC, np.asarray(v3) * _ARCSEC)
     vector = np.tensordot(matrix, vector, axes=1)

@@ -46,6 +46,15 @@ def pixel_to_sky(x, y, pointing, roll, *, subarray="FULL"):
     Returns
     -------
     sky : `~astropy.coordinates.SkyCoord`
+
+    Examples
+    --------
+    >>> from astropy.coordinates import SkyCoord
+    >>> import astropy.units as u
+    >>> from miricigale.instrument import pixel_to_sky
+    >>> field = SkyCoord(53.1, -27.8, unit="deg")
+    >>> pixel_to_sky(692.5, 511.5, field, 35 * u.deg).to_string(precision=3)
+    '53.100 -27.800'
     """
     ra, dec = _radec(pointing, "pointing")
     roll = float(to_array(roll, u.deg, "roll", ndim=0))
@@ -128,6 +137,15 @@ def imager_wcs(pointing, roll, *, subarray="FULL"):
     References
     ----------
     Shupe et al. 2005, ASP Conf. 347, 491 (SIP).
+
+    Examples
+    --------
+    >>> from astropy.coordinates import SkyCoord
+    >>> import astropy.units as u
+    >>> from miricigale.instrument import imager_wcs
+    >>> wcs = imager_wcs(SkyCoord(53.1, -27.8, unit="deg"), 35 * u.deg)
+    >>> wcs.pixel_to_world(692.5, 511.5).to_string(precision=3)
+    '53.100 -27.800'
     """
     ra, dec = _radec(pointing, "pointing")
     roll = float(to_array(roll, u.deg, "roll", ndim=0, finite=True))
@@ -172,6 +190,18 @@ def tangent_offset(pointing, x_offset, y_offset, pa):
     Returns
     -------
     position : `~astropy.coordinates.SkyCoord`
+
+    Examples
+    --------
+    >>> from astropy.coordinates import SkyCoord
+    >>> import astropy.units as u
+    >>> from miricigale.instrument import tangent_offset
+    >>> field = SkyCoord(53.1, 0.0, unit="deg")
+    >>> moved = tangent_offset(
+    ...     field, 0 * u.arcsec, 36 * u.arcsec, pa=90 * u.deg
+    ... )  # +y is east
+    >>> moved.to_string(precision=3)
+    '53.110 0.000'
     """
     ra, dec = (np.radians(angle) for angle in _radec(pointing, "pointing"))
     x = to_array(x_offset, u.rad, "x_offset")
@@ -203,6 +233,16 @@ def pixel_area_map(wcs, shape, out=None):
     -------
     area : `~numpy.ndarray`, shape (ny, nx)
         In sr. The Jacobian of the WCS on a coarse grid, joined by bicubic splines.
+
+    Examples
+    --------
+    >>> from astropy.coordinates import SkyCoord
+    >>> import astropy.units as u
+    >>> from miricigale.instrument import imager_wcs, pixel_area_map
+    >>> wcs = imager_wcs(SkyCoord(53.1, -27.8, unit="deg"), 0 * u.deg, subarray="SUB64")
+    >>> area = pixel_area_map(wcs, (64, 72)) * u.sr
+    >>> area.mean().to("arcsec2").round(5)
+    <Quantity 0.01213 arcsec2>
     """
     from scipy.interpolate import RectBivariateSpline, make_interp_spline
 
@@ -254,6 +294,17 @@ def north_up_wcs(center, pixel_scale, shape):
     -------
     wcs : `~astropy.wcs.WCS`
         With ``pixel_shape`` (nx, ny).
+
+    Examples
+    --------
+    >>> from astropy.coordinates import SkyCoord
+    >>> import astropy.units as u
+    >>> from miricigale.instrument import north_up_wcs
+    >>> wcs = north_up_wcs(
+    ...     SkyCoord(53.1, -27.8, unit="deg"), 0.06 * u.arcsec, (300, 400)
+    ... )
+    >>> wcs.pixel_shape
+    (400, 300)
     """
     ra, dec = _radec(center, "center")
     scale = positive(pixel_scale, u.deg, "pixel_scale")
@@ -286,6 +337,17 @@ def mosaic_wcs(exposures, pixel_scale):
     ------
     ValueError
         If there are no exposures, or a WCS has no shape.
+
+    Examples
+    --------
+    >>> from astropy.coordinates import SkyCoord
+    >>> import astropy.units as u
+    >>> from miricigale.instrument import Exposure, mosaic_wcs
+    >>> exposure = Exposure(
+    ...     "F770W", n_groups=10, pointing=SkyCoord(53.1, -27.8, unit="deg")
+    ... )
+    >>> mosaic_wcs(exposure.dithered("ceers", 3), 0.06 * u.arcsec).pixel_shape
+    (2136, 2072)
     """
     from astropy.wcs import WCS
 

@@ -45,6 +45,25 @@ def aperture_photometry(image, sky, diameter):
     ------
     ValueError
         If the diameter is not positive.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.nddata import CCDData
+    >>> from miricigale.instrument import north_up_wcs
+    >>> from miricigale.photometry import aperture_photometry
+    >>> from miricigale.psf import gaussian_psf, psf_image
+    >>> psf = gaussian_psf(0.4 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=4 * u.arcsec)
+    >>> sky = SkyCoord([53.1], [-27.8], unit="deg")
+    >>> wcs = north_up_wcs(sky[0], 0.1 * u.arcsec, (61, 61))
+    >>> light = psf_image(psf, pixel_scale=0.1 * u.arcsec, shape=61)
+    >>> noise = np.random.default_rng(1).normal(0, 0.01, (61, 61))
+    >>> image = CCDData(2 * light + noise, unit="uJy", wcs=wcs)
+    >>> table = aperture_photometry(image, sky, 0.6 * u.arcsec)
+    >>> print(f"{table['flux'][0]:.2f} +- {table['flux_err'][0]:.2f}")
+    1.58 uJy +- 0.05 uJy
     """
     arrays = image_arrays(image, "image")
     size = positive(diameter, ANGLE, "diameter")
@@ -52,7 +71,7 @@ def aperture_photometry(image, sky, diameter):
     flux, flux_err, coverage = circle_sums(arrays, xy, size / 2 / pixel_scale(image.wcs))
     columns = {
         "flux": (flux * FNU, f"Light in a circle of {size:.4g} arcsec diameter"),
-        "flux_err": (flux_err * FNU, "Its error for noise that is not correlated"),
+        "flux_err": (flux_err * FNU, "1-sigma error, if the noise is not correlated"),
         "coverage": (coverage, "Fraction of the aperture on usable pixels"),
     }
     return described_table(columns)
@@ -103,6 +122,25 @@ def source_extractor_photometry(image, *, preset="yang2021_miri", stated_on=0.06
     References
     ----------
     Yang et al. 2021, ApJ 908, 144, appendix (the settings); Bertin & Arnouts 1996.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.nddata import CCDData
+    >>> from miricigale.instrument import north_up_wcs
+    >>> from miricigale.photometry import source_extractor_photometry
+    >>> from miricigale.psf import gaussian_psf, psf_image
+    >>> psf = gaussian_psf(0.4 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=4 * u.arcsec)
+    >>> sky = SkyCoord([53.1], [-27.8], unit="deg")
+    >>> wcs = north_up_wcs(sky[0], 0.1 * u.arcsec, (61, 61))
+    >>> light = psf_image(psf, pixel_scale=0.1 * u.arcsec, shape=61)
+    >>> noise = np.random.default_rng(1).normal(0, 0.01, (61, 61))
+    >>> image = CCDData(2 * light + noise, unit="uJy", wcs=wcs)
+    >>> table = source_extractor_photometry(image)
+    >>> print(f"{len(table)} source, {table['flux_aper'][0]:.2f} in the circle")
+    1 source, 2.28 uJy in the circle
     """
     segmentation, catalog = detect_sources(
         image, preset=preset, subtract_background=True, box=_BACKGROUND[0],
@@ -128,7 +166,7 @@ def source_extractor_photometry(image, *, preset="yang2021_miri", stated_on=0.06
     ):
         catalog[name], catalog[f"{name}_err"] = flux * FNU, error * FNU
         catalog[name].info.description = text
-        catalog[f"{name}_err"].info.description = "Error for noise that is not correlated"
+        catalog[f"{name}_err"].info.description = "1-sigma error, if the noise is not correlated"
     return catalog
 
 

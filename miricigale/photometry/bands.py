@@ -35,6 +35,30 @@ def measure_bands(images, kernels, templates, **options):
     ------
     ValueError, TypeError, `~astropy.units.UnitsError`
         If a band has no kernel or an input does not fit; a note names the band.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.nddata import CCDData
+    >>> from astropy.table import QTable
+    >>> from miricigale.instrument import north_up_wcs
+    >>> from miricigale.photometry import ForcedPhotometer, SourceTemplates, measure_bands
+    >>> from miricigale.psf import gaussian_psf, psf_image
+    >>> psf = gaussian_psf(0.4 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=4 * u.arcsec)
+    >>> sky = SkyCoord([53.1], [-27.8], unit="deg")
+    >>> wcs = north_up_wcs(sky[0], 0.1 * u.arcsec, (61, 61))
+    >>> light = psf_image(psf, pixel_scale=0.1 * u.arcsec, shape=61)
+    >>> noise = np.random.default_rng(1).normal(0, 0.01, (61, 61))
+    >>> image = CCDData(2 * light + noise, unit="uJy", wcs=wcs)
+    >>> templates = SourceTemplates.from_catalog(QTable({"sky": sky}))
+    >>> images = {"miri.f770w": image, "miri.f1000w": image.multiply(2)}
+    >>> kernels = dict.fromkeys(images, ForcedPhotometer(psf=psf))
+    >>> for name, result in measure_bands(images, kernels, templates).items():
+    ...     print(f"{name} {result.flux[0]:.2f}")
+    miri.f770w 2.02 uJy
+    miri.f1000w 4.05 uJy
     """
     missing = sorted(set(images) ^ set(kernels))
     if missing:
@@ -74,6 +98,22 @@ def join_bands(results):
     ------
     ValueError
         If there is no band.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.table import QTable
+    >>> from miricigale.photometry import join_bands
+    >>> sky = SkyCoord([53.10, 53.11], [-27.8, -27.8], unit="deg")
+    >>> blue = QTable({"id": [1, 2], "sky": sky, "flux": [1.0, 2.0] * u.uJy})
+    >>> red = QTable({"id": [2], "sky": sky[1:], "flux": [3.0] * u.uJy})
+    >>> print(join_bands({"miri.f770w": blue, "miri.f1500w": red})["id", "miri.f770w", "miri.f1500w"])
+     id miri.f770w miri.f1500w
+           uJy         uJy
+    --- ---------- -----------
+      1        1.0         nan
+      2        2.0         3.0
     """
     if not results:
         raise argument_error("results", "at least one band", "none")

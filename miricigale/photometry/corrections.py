@@ -38,6 +38,25 @@ def encircled_flux(image, sky, flux, radii):
     References
     ----------
     Yang et al. 2021, ApJ 908, 144, section 3.2 (EEF_PT).
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.nddata import CCDData
+    >>> from miricigale.instrument import north_up_wcs
+    >>> from miricigale.photometry import encircled_flux
+    >>> from miricigale.psf import gaussian_psf, psf_image
+    >>> psf = gaussian_psf(0.4 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=4 * u.arcsec)
+    >>> sky = SkyCoord([53.1], [-27.8], unit="deg")
+    >>> wcs = north_up_wcs(sky[0], 0.1 * u.arcsec, (61, 61))
+    >>> light = psf_image(psf, pixel_scale=0.1 * u.arcsec, shape=61)
+    >>> noise = np.random.default_rng(1).normal(0, 0.01, (61, 61))
+    >>> image = CCDData(2 * light + noise, unit="uJy", wcs=wcs)
+    >>> table = encircled_flux(image, sky, [2] * u.uJy, [0.2, 0.4] * u.arcsec)
+    >>> table["median"].round(2)
+    array([0.49, 0.95])
     """
     arrays = image_arrays(image, "image")
     true = to_array(flux, FNU, "flux", ndim=1)
@@ -89,6 +108,25 @@ def flux_scaling(image, sky, flux, psf, *, fraction=0.8):
     References
     ----------
     Yang et al. 2021, ApJ 908, 144, section 3.2 (f_scaling).
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.nddata import CCDData
+    >>> from miricigale.instrument import north_up_wcs
+    >>> from miricigale.photometry import flux_scaling
+    >>> from miricigale.psf import gaussian_psf, psf_image
+    >>> psf = gaussian_psf(0.4 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=4 * u.arcsec)
+    >>> sky = SkyCoord([53.1], [-27.8], unit="deg")
+    >>> wcs = north_up_wcs(sky[0], 0.1 * u.arcsec, (61, 61))
+    >>> light = psf_image(psf, pixel_scale=0.1 * u.arcsec, shape=61)
+    >>> noise = np.random.default_rng(1).normal(0, 0.01, (61, 61))
+    >>> image = CCDData(2 * light + noise, unit="uJy", wcs=wcs)
+    >>> factor, error = flux_scaling(image, sky, [2] * u.uJy, psf)
+    >>> print(f"{factor:.2f}")
+    0.99
     """
     radius = radius_of_encircled_energy(psf, fraction)
     table = encircled_flux(image, sky, flux, u.Quantity([radius]))
@@ -118,6 +156,15 @@ def aperture_correction(psf, radius, *, pixel_scale=None):
     -------
     factor : float or `~numpy.ndarray`
         1 / (encircled energy).
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.photometry import aperture_correction
+    >>> from miricigale.psf import miri_psf
+    >>> psf = miri_psf("F1500W", fov=6 * u.arcsec)
+    >>> aperture_correction(psf, [0.5, 1.0] * u.arcsec).round(3)
+    array([1.469, 1.223])
     """
     energy = np.asarray(encircled_energy(psf, radius, pixel_scale=pixel_scale), float)
     if np.any(energy <= 0):

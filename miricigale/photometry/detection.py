@@ -22,7 +22,15 @@ from miricigale.utils.units import ANGLE, FNU, positive
 
 
 class DetectionFlags(Flags):
-    """Flags of detections, those of Source Extractor and sep."""
+    """
+    Flags of detections, those of Source Extractor and sep.
+
+    Examples
+    --------
+    >>> from miricigale.photometry import DetectionFlags
+    >>> DetectionFlags.names(3)
+    ['merged', 'truncated']
+    """
 
     #: Deblended from a neighbor, or blended with one.
     MERGED = 1
@@ -47,6 +55,14 @@ class DetectionPreset:
         Width of the Gaussian detection filter in pixels, None or 0 for none.
     n_levels, contrast : optional
         Number of levels and contrast of the deblending (contrast 1 is none).
+
+    Examples
+    --------
+    >>> from miricigale.photometry import DETECTION_PRESETS, DetectionPreset
+    >>> DETECTION_PRESETS["yang2021"]
+    DetectionPreset(threshold=0.25, n_pixels=60, fwhm=5.0, n_levels=32, contrast=0.005)
+    >>> DetectionPreset(threshold=1.5, n_pixels=10, fwhm=3).on_pixels(0.5)
+    DetectionPreset(threshold=3.0, n_pixels=2, fwhm=1.5, n_levels=32, contrast=0.005)
     """
 
     threshold: float
@@ -145,6 +161,25 @@ def detect_sources(
     References
     ----------
     Bertin & Arnouts 1996, A&AS 117, 393; Barbary 2016, JOSS 1, 58.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.nddata import CCDData
+    >>> from miricigale.instrument import north_up_wcs
+    >>> from miricigale.photometry import detect_sources
+    >>> from miricigale.psf import gaussian_psf, psf_image
+    >>> psf = gaussian_psf(0.4 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=4 * u.arcsec)
+    >>> sky = SkyCoord([53.1], [-27.8], unit="deg")
+    >>> wcs = north_up_wcs(sky[0], 0.1 * u.arcsec, (61, 61))
+    >>> light = psf_image(psf, pixel_scale=0.1 * u.arcsec, shape=61)
+    >>> noise = np.random.default_rng(1).normal(0, 0.01, (61, 61))
+    >>> image = CCDData(2 * light + noise, unit="uJy", wcs=wcs)
+    >>> segments, sources = detect_sources(image, preset="default")
+    >>> print(f"{len(sources)} source, signal-to-noise {sources['snr'][0]:.0f}")
+    1 source, signal-to-noise 26
     """
     arrays, settings = _prepared(
         image, preset, subtract_background=subtract_background, box=box, filter_size=filter_size,
@@ -206,6 +241,28 @@ def detection_purity(image, *, snr_edges=None, preset="yang2021", **settings):
     References
     ----------
     Gehrels 1986, ApJ 303, 336 (Poisson intervals).
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.nddata import CCDData
+    >>> from miricigale.instrument import north_up_wcs
+    >>> from miricigale.photometry import detection_purity
+    >>> from miricigale.psf import gaussian_psf, psf_image
+    >>> psf = gaussian_psf(0.4 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=4 * u.arcsec)
+    >>> sky = SkyCoord([53.1], [-27.8], unit="deg")
+    >>> wcs = north_up_wcs(sky[0], 0.1 * u.arcsec, (61, 61))
+    >>> light = psf_image(psf, pixel_scale=0.1 * u.arcsec, shape=61)
+    >>> noise = np.random.default_rng(1).normal(0, 0.01, (61, 61))
+    >>> image = CCDData(2 * light + noise, unit="uJy", wcs=wcs)
+    >>> table = detection_purity(image, preset="default", snr_edges=[5, 10, 100])
+    >>> print(table["snr_low", "n_positive", "n_negative"])
+    snr_low n_positive n_negative
+    ------- ---------- ----------
+        5.0          0          0
+       10.0          1          0
     """
     arrays, settings = _prepared(image, preset, **settings)
     positive, negative = (
@@ -339,13 +396,13 @@ def _catalog(objects, found, labels, arrays, meta):
     columns = {
         "id": (index, "Number of the detection"),
         "label": (index, "Label in the segmentation image"),
-        "sky": (sky.icrs, "Position of the bright part"),
+        "sky": (sky.icrs, "Position: centroid of the bright part"),
         "x_centroid": (x, "Centroid of the bright part, 0-based"),
         "y_centroid": (y, "Centroid of the bright part, 0-based"),
-        "flux": (total * FNU, "Light in the segment"),
-        "flux_err": (noise * FNU, "Its error for noise that is not correlated"),
-        "semimajor_axis": (objects["a"] * scale * ANGLE, "Rms along the major axis"),
-        "semiminor_axis": (objects["b"] * scale * ANGLE, "Rms along the minor axis"),
+        "flux": (total * FNU, "Flux in the segment"),
+        "flux_err": (noise * FNU, "1-sigma error, if the noise is not correlated"),
+        "semimajor_axis": (objects["a"] * scale * ANGLE, "Rms of the light along the major axis"),
+        "semiminor_axis": (objects["b"] * scale * ANGLE, "Rms of the light along the minor axis"),
         "orientation": (
             np.degrees(objects["theta"]) * u.deg,
             "Direction of the major axis, +x to +y",

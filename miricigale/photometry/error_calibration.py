@@ -40,6 +40,21 @@ class ErrorCalibration:
         ``factor`` (within which 68.27 % of the pulls are) and ``factor_err``.
     meta : dict
         Provenance.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropy.table import QTable
+    >>> from miricigale.photometry import ErrorCalibration
+    >>> rng = np.random.default_rng(1)
+    >>> error = np.full(2000, 0.1) * u.uJy
+    >>> known = QTable({"flux_true": np.full(2000, 2.0) * u.uJy, "flux_err": error})
+    >>> known["flux"] = known["flux_true"] + 1.5 * error * rng.normal(size=2000)
+    >>> known["flux_err_noise"] = error
+    >>> calibration = ErrorCalibration.from_sources(known)
+    >>> calibration.factor([2] * u.uJy, [0.1] * u.uJy).round(1)
+    array([1.5])
     """
 
     io_module: ClassVar[str] = "miricigale.photometry.error_files"

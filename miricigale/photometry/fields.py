@@ -39,6 +39,14 @@ class SmoothField:
         The image's.
     order : int
         Of the polynomial.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.photometry import SmoothField
+    >>> field = SmoothField(np.array([1.0, 0.2, 0.0]), (100, 100), 1)
+    >>> field(np.array([0, 99]), np.array([0, 0])).round(3)
+    array([0.802, 1.198])
     """
 
     coefficients: np.ndarray

@@ -14,6 +14,14 @@ class ForcedFlags(Flags):
     Flags of forced photometry, added up bit by bit.
 
     A flux is NaN where ``NO_DATA`` or ``DEGENERATE`` is set, and usable otherwise.
+
+    Examples
+    --------
+    >>> from miricigale.photometry import ForcedFlags
+    >>> ForcedFlags.names(96)
+    ['no_segment', 'noisy_segment']
+    >>> print(ForcedFlags.POOR_FIT.value, ForcedFlags.meanings()[1])
+    256 ('edge', "More than a tenth of the template's light falls off the image.")
     """
 
     #: More than a tenth of the template's light falls off the image.

@@ -126,6 +126,25 @@ class ForcedPhotometer(Interactive):
     ----------
     Merlin et al. 2015, A&A 582, A15 (T-PHOT); Yang et al. 2021, ApJ 908, 144, section 3.4;
     Fuller 1987, Measurement Error Models (errors in variables).
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.nddata import CCDData
+    >>> from miricigale.instrument import north_up_wcs
+    >>> from miricigale.photometry import ForcedPhotometer
+    >>> from miricigale.psf import gaussian_psf, psf_image
+    >>> psf = gaussian_psf(0.4 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=4 * u.arcsec)
+    >>> sky = SkyCoord([53.1], [-27.8], unit="deg")
+    >>> wcs = north_up_wcs(sky[0], 0.1 * u.arcsec, (61, 61))
+    >>> light = psf_image(psf, pixel_scale=0.1 * u.arcsec, shape=61)
+    >>> noise = np.random.default_rng(1).normal(0, 0.01, (61, 61))
+    >>> image = CCDData(2 * light + noise, unit="uJy", wcs=wcs)
+    >>> result = ForcedPhotometer(psf=psf).measure(image, sky)
+    >>> print(f"{result.flux[0]:.2f} +- {result.flux_err[0]:.2f}")
+    2.02 uJy +- 0.06 uJy
     """
 
     kernel: object = None

@@ -94,6 +94,13 @@ def measure_files(
     ValueError
         If an argument contradicts a header, the images do not overlap or
         seem to be swapped, a PSF is missing, or a result cannot be written.
+
+    Examples
+    --------
+    >>> from miricigale.photometry import measure_files
+    >>> table = measure_files(
+    ...     "f770w_i2d.fits", "f444w_i2d.fits", output="f770w.ecsv", page="f770w.html"
+    ... )  # doctest: +SKIP
     """
     image, highres = (
         one if isinstance(one, MosaicFile) else MosaicFile(one) for one in (image, highres)

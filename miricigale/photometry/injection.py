@@ -14,13 +14,13 @@ from miricigale.photometry.detection import bright_centroids
 from miricigale.photometry.error_calibration import ErrorCalibration
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.forced import ForcedPhotometer
+from miricigale.photometry.mosaics import as_mosaic
 from miricigale.photometry.priors import labels_at
 from miricigale.photometry.shapes import Shape, ShapeModels
 from miricigale.photometry.sources import SourceTemplates
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.progress import progress
 from miricigale.utils.random import check_seed, stream
-from miricigale.utils.tables import require_columns
 from miricigale.utils.units import FNU, SURFACE_BRIGHTNESS, check_count
 
 #: Radius (fine pixels) of a profile that is as good as a point.
@@ -89,12 +89,36 @@ def calibrate_errors(
     -----
     Injected galaxies have the shapes of the fits, so that what no profile describes (arms, clumps) is not in the
     scatter; their positions are those that detection finds.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.nddata import CCDData, StdDevUncertainty
+    >>> from miricigale.instrument import north_up_wcs
+    >>> from miricigale.photometry import ForcedPhotometer, calibrate_errors
+    >>> from miricigale.psf import gaussian_psf
+    >>> psf = gaussian_psf(0.4 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=4 * u.arcsec)
+    >>> sky = SkyCoord([53.1], [-27.8], unit="deg")
+    >>> wcs = north_up_wcs(sky[0], 0.1 * u.arcsec, (61, 61))
+    >>> noise, error = np.random.default_rng(1).normal(0, 0.5, (61, 61)), np.full((61, 61), 0.5)
+    >>> image = CCDData(noise, unit="MJy / sr", wcs=wcs, uncertainty=StdDevUncertainty(error))
+    >>> options = {"catalog": sky, "n_trials": 8, "n_sources": 5, "seed": 1}
+    >>> calibration = calibrate_errors(ForcedPhotometer(psf=psf), image, **options)
+    >>> calibration.bins["factor"].info.format = ".1f"
+    >>> print(calibration.bins["n", "factor"])
+     n  factor
+    --- ------
+     40    0.9
+     40    1.1
     """
     if not isinstance(photometer, ForcedPhotometer) or photometer.template == "sersic":
         wanted = "a ForcedPhotometer whose template is 'auto', 'cutout' or 'psf'"
         raise argument_error("photometer", wanted, repr(photometer))
     n_trials = check_count(n_trials, "n_trials")
-    require_columns(catalog, ["sky"], "catalog")
+    image = as_mosaic(image, "image")
+    highres, segmentation, catalog = photometer._prior(image, highres, segmentation, catalog)
     seed = check_seed(seed)
     if n_sources is None:
         n_sources = max(10, len(catalog) // 7)

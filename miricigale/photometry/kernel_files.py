@@ -63,11 +63,13 @@ def _centered(data):
 
 def _read_psf(file, argument):
     """A PSF of a file, or the mean of several, with its center in the middle."""
-    from miricigale.psf import MODEL_FILTERS, average_psf, make_psf, psf_image
-    from miricigale.psf.files import header_grid
+    from miricigale.psf import MODEL_FILTERS, average_psf, make_psf, psf_image, read_psf
+    from miricigale.psf.files import header_grid, is_written
 
     path, header = file.psf, file.header
     known = header.filter in MODEL_FILTERS
+    if split_extension(path)[1] is None and is_written(path):
+        return _compared(read_psf(path), header, argument) if known else read_psf(path)
     planes, stated = _planes(path, "a PSF")
     cell, turn = header_grid(stated)
     if file.psf_scale is not None:

@@ -92,6 +92,16 @@ def as_mosaic(image, argument="image"):
     ------
     ValueError
         If it is nothing of these, or has no unit.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropy.nddata import NDData
+    >>> from miricigale.photometry import as_mosaic
+    >>> image = as_mosaic(NDData(np.zeros((4, 4)), unit=u.MJy / u.sr))
+    >>> type(image).__name__, image.unit
+    ('CCDData', Unit("MJy / sr"))
     """
     if isinstance(image, CCDData):
         return image
@@ -144,6 +154,13 @@ class MosaicFile:
         Pixel of the PSF and position angle of its +y; by default those of its header, or else of the image.
     pa_aper : `~astropy.units.Quantity`, optional
         Position angle of the detector's +y axis, if the header does not state it.
+
+    Examples
+    --------
+    >>> from miricigale.photometry import MosaicFile, measure_files
+    >>> image = MosaicFile("f770w_sci.fits", weight="f770w_wht.fits", filter="F770W")
+    >>> prior = MosaicFile("f444w_sci.fits", weight="f444w_wht.fits", filter="F444W")
+    >>> table = measure_files(image, prior)  # doctest: +SKIP
     """
 
     path: object

@@ -36,6 +36,21 @@ class OffsetMap:
         (dx, dy) in arcsec.
     wcs : `~astropy.wcs.WCS`
         The image's.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.table import QTable
+    >>> import astropy.units as u
+    >>> from miricigale.instrument import north_up_wcs
+    >>> from miricigale.photometry import OffsetMap, SmoothField
+    >>> sky = SkyCoord(53.1, -27.8, unit="deg")
+    >>> wcs = north_up_wcs(sky, 0.1 * u.arcsec, (101, 101))
+    >>> field = SmoothField(np.array([[0.02, -0.01], [0.005, 0], [0, 0]]), (101, 101), 1)
+    >>> offsets = OffsetMap(QTable({"used": [True]}), field, wcs)
+    >>> offsets.evaluate(sky).round(3)
+    <Quantity [ 0.02, -0.01] arcsec>
     """
 
     sources: QTable

@@ -48,6 +48,15 @@ def crowded(sky, flux, *, radius=2 * u.arcsec):
     References
     ----------
     Yang et al. 2021, ApJ 908, 144, section 4.1.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.coordinates import SkyCoord
+    >>> from miricigale.photometry import crowded
+    >>> sky = SkyCoord([53.1, 53.1003, 53.2], [-27.8] * 3, unit="deg")
+    >>> crowded(sky, [1.0, 9.0, 5.0] * u.uJy)
+    array([ True, False, False])
     """
     found = np.zeros(len(sky), bool)
     known = np.flatnonzero(np.isfinite(sky.spherical.lon) & np.isfinite(sky.spherical.lat))
@@ -126,6 +135,29 @@ class ForcedPhotometryResult(Tabular):
         Full width at half maximum of a Gaussian as peaked as the image's PSF, in arcsec.
     meta : dict
         Settings and provenance.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.nddata import CCDData
+    >>> from miricigale.instrument import north_up_wcs
+    >>> from miricigale.photometry import ForcedPhotometer
+    >>> from miricigale.psf import gaussian_psf, psf_image
+    >>> psf = gaussian_psf(0.4 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=4 * u.arcsec)
+    >>> sky = SkyCoord([53.1], [-27.8], unit="deg")
+    >>> wcs = north_up_wcs(sky[0], 0.1 * u.arcsec, (61, 61))
+    >>> light = psf_image(psf, pixel_scale=0.1 * u.arcsec, shape=61)
+    >>> noise = np.random.default_rng(1).normal(0, 0.01, (61, 61))
+    >>> image = CCDData(2 * light + noise, unit="uJy", wcs=wcs)
+    >>> result = ForcedPhotometer(psf=psf).measure(image, sky)
+    >>> result
+    <ForcedPhotometryResult 1 sources, 1 measured>
+    >>> print(f"{result.magnitude[0]:.2f}, signal-to-noise {result.snr[0]:.0f}")
+    23.13 mag(AB), signal-to-noise 34
+    >>> result.sample(3, seed=1)[:, 0].round(2)
+    <Quantity [2.07, 2.03, 2.13] uJy>
     """
 
     io_module: ClassVar[str] = "miricigale.photometry.files"
@@ -302,15 +334,21 @@ class ForcedPhotometryResult(Tabular):
         """
         flux, prefix = ("flux", "") if name is None else (name, f"{name}_")
         error, point = error_column(flux), f"{prefix}flux_point"
-        unknown = "Error by what is not known of the template"
+        unknown = "Part of the error from the uncertainty of the template"
         columns = {
             "id": (self.id, "Id of the catalog"),
             "sky": (self.sky, "Position of the catalog"),
             flux: (self.flux, "Total flux"),
             error: (self.flux_err, "1-sigma error of the flux"),
-            f"{error}_noise": (self.flux_err_noise, "Error by the image's noise"),
+            f"{error}_noise": (
+                self.flux_err_noise,
+                "Part of the error from the noise of the image",
+            ),
             f"{error}_template": (self.flux_err_template, unknown),
-            f"{error}_psf": (self.flux_err_psf, "Error by that of the PSF"),
+            f"{error}_psf": (
+                self.flux_err_psf,
+                "Part of the error from the uncertainty of the PSF",
+            ),
         }
         texts = {
             "flags": ForcedFlags.describe(),

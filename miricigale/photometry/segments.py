@@ -35,6 +35,13 @@ class DilationRule:
     ----------
     De Santis et al. 2007, New Astronomy 12, 271 (growth by a factor of the area, between a
     least and a largest area); Galametz et al. 2013, ApJS 206, 10 (growth that depends on the area).
+
+    Examples
+    --------
+    >>> from miricigale.photometry import DilationRule
+    >>> rule = DilationRule(areas=(0.5, 5), factors=(3, 1.5), min_area=0.8)
+    >>> rule.area([0.1, 0.5, 5, 20]).round(2)
+    array([ 0.8,  1.5,  7.5, 30. ])
     """
 
     areas: tuple = (1.0,)
@@ -98,6 +105,16 @@ def dilate_segments(segmentation, rule, *, pixel_scale, mask=None):
         If there is no such rule.
     ValueError
         If shapes differ.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.photometry import dilate_segments
+    >>> segments = np.zeros((50, 50), int)
+    >>> segments[20:25, 20:25] = 1
+    >>> grown = dilate_segments(segments, "area", pixel_scale=0.1)
+    >>> int(segments.sum()), int(grown.areas[0])
+    (25, 101)
     """
     rule = dilation_rule(rule)
     labels = np.asarray(getattr(segmentation, "data", segmentation))

@@ -31,6 +31,12 @@ class ErrorSettings:
     ------
     ValueError
         If a fraction is not from 0 to 1.
+
+    Examples
+    --------
+    >>> from miricigale.photometry import ErrorSettings
+    >>> ErrorSettings(psf_error=0.02)
+    ErrorSettings(correlated_noise=True, size_scatter=0.1, psf_error=0.02)
     """
 
     correlated_noise: bool = True
@@ -61,6 +67,12 @@ class MemorySettings:
     ------
     ValueError
         If the folder does not exist.
+
+    Examples
+    --------
+    >>> from miricigale.photometry import MemorySettings
+    >>> MemorySettings(max_bytes=4e9)
+    MemorySettings(max_bytes=4000000000.0, scratch=None)
     """
 
     max_bytes: float = 1.5e9

@@ -34,6 +34,15 @@ def weight_scale(data, weight, *, mask=None):
     ------
     ValueError
         If shapes differ or no pixel is usable.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.photometry import weight_scale
+    >>> data = np.random.default_rng(1).normal(0, 0.3, (200, 200))
+    >>> weight = np.full(data.shape, 4.0)
+    >>> round(weight_scale(data, weight), 2)
+    0.59
     """
     data, weight = np.asarray(data, float), np.asarray(weight, float)
     if data.ndim != 2 or data.shape != weight.shape:

@@ -68,6 +68,21 @@ class SourceTemplates:
         1, or 2 for sources that are fitted with a point on top of their template.
     meta : dict
         Settings and provenance.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.table import QTable
+    >>> from miricigale.photometry import SourceTemplates
+    >>> sky = SkyCoord([53.10, 53.11], [-27.8, -27.8], unit="deg")
+    >>> sources = QTable({"id": [1, 2], "sky": sky, "profile": ["sersic", "point"]})
+    >>> sources["half_light_radius"] = [0.3, 0.0] * u.arcsec
+    >>> sources["sersic_index"], sources["axis_ratio"] = [1.5, 1.0], [0.7, 1.0]
+    >>> sources["position_angle"] = [30, 0] * u.deg
+    >>> SourceTemplates.from_catalog(sources, template="sersic")
+    <SourceTemplates 2 sources: 1 point, 1 sersic>
     """
 
     io_module: ClassVar[str] = "miricigale.photometry.files"

@@ -66,6 +66,26 @@ def psf_photometry(image, psf, catalog, *, pa=None, max_shift=0.1 * u.arcsec):
     References
     ----------
     Stetson 1987, PASP 99, 191; Bradley et al., photutils (https://photutils.readthedocs.io).
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.nddata import CCDData
+    >>> from astropy.table import QTable
+    >>> from miricigale.instrument import north_up_wcs
+    >>> from miricigale.photometry import psf_photometry
+    >>> from miricigale.psf import gaussian_psf, psf_image
+    >>> psf = gaussian_psf(0.4 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=4 * u.arcsec)
+    >>> sky = SkyCoord([53.1], [-27.8], unit="deg")
+    >>> wcs = north_up_wcs(sky[0], 0.1 * u.arcsec, (61, 61))
+    >>> light = psf_image(psf, pixel_scale=0.1 * u.arcsec, shape=61)
+    >>> noise = np.random.default_rng(1).normal(0, 0.01, (61, 61))
+    >>> image = CCDData(2 * light + noise, unit="uJy", wcs=wcs)
+    >>> table = psf_photometry(image, psf, QTable({"sky": sky}))
+    >>> print(f"{table['flux'][0]:.2f} +- {table['flux_err'][0]:.2f}")
+    2.02 uJy +- 0.06 uJy
     """
     arrays = image_arrays(image, "image")
     ids, sky = catalog_sources(catalog)["id"], catalog["sky"]
@@ -102,7 +122,7 @@ def psf_photometry(image, psf, catalog, *, pa=None, max_shift=0.1 * u.arcsec):
         "id": (ids, "Id of the catalog"),
         "sky": (sky, "Position of the catalog"),
         "flux": (found["flux_fit"] * FNU, "Flux of the PSF"),
-        "flux_err": (found["flux_err"] * FNU, "Its error for noise that is not correlated"),
+        "flux_err": (found["flux_err"] * FNU, "1-sigma error, if the noise is not correlated"),
         "x_fit": (found["x_fit"], "Fitted position, 0-based"),
         "y_fit": (found["y_fit"], "Fitted position, 0-based"),
         "shift": (shift * ANGLE, "From the position of the catalog to the fitted one"),

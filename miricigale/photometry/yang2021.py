@@ -60,6 +60,17 @@ class Yang2021Photometer:
     References
     ----------
     Yang et al. 2021, ApJ 908, 144, sections 3.2 to 3.4; Merlin et al. 2015, A&A 582, A15 (T-PHOT).
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.photometry import Yang2021Photometer
+    >>> from miricigale.psf import gaussian_psf
+    >>> form = {"pixel_scale": 0.06 * u.arcsec, "fov": 4 * u.arcsec}
+    >>> sharp, wide = (gaussian_psf(width * u.arcsec, **form) for width in (0.2, 1.6))
+    >>> paper = Yang2021Photometer(sharp, wide, scaling=0.99)
+    >>> print(f"f_aper = {paper.aperture:.3f}, kernel of sum {paper.kernel.array.sum():.2f}")
+    f_aper = 1.096, kernel of sum 1.00
     """
 
     def __init__(self, source, target, *, scaling=1.0, n_threads=None):

@@ -25,6 +25,12 @@ def plan_table(*, quick=False):
         calculator's scaled by the root of the time; ``limit``, of these exposures by
         `~miricigale.depth.sensitivity` with the residual pattern
         (``residual="etc"``); ``limit_proposal``, of the survey's proposal.
+
+    Examples
+    --------
+    >>> from miricigale.planning import plan_table  # doctest: +SKIP
+    >>> table = plan_table(quick=True)["filter", "groups", "dithers", "time", "limit"]  # doctest: +SKIP
+    >>> print(table[:2])  # doctest: +SKIP
     """
     from astropy.coordinates import SkyCoord
 
@@ -66,6 +72,11 @@ def write_plan(config, folder, *, executor=None, progress_bar=False):
     -------
     comparison : `~astropy.table.QTable`
         See `~miricigale.planning.comparison_table`.
+
+    Examples
+    --------
+    >>> from miricigale.planning import load_plan, write_plan  # doctest: +SKIP
+    >>> write_plan(load_plan("plan.toml"), "plan")["plan", "time", "merit"]  # doctest: +SKIP
     """
     from miricigale.planning import Planner, area_table, comparison_table, write_page
 

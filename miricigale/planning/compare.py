@@ -47,6 +47,12 @@ def comparison_table(planner, plans):
         ranked. Of ``[survey] rank = "agn"`` that is ``n_agn`` times the purity for each hour; of ``"frac_agn"``
         and ``"redshift"`` the inverse variance of the means that is gained over the existing bands,
         relative to these and for each hour: ((scatter without / scatter with)^2 - 1) / hours.
+
+    Examples
+    --------
+    >>> from miricigale.planning import Planner, comparison_table  # doctest: +SKIP
+    >>> planner = Planner()  # doctest: +SKIP
+    >>> comparison_table(planner, planner.compare())["plan", "time", "merit"]  # doctest: +SKIP
     """
     chosen = planner.common(plans)
     rows = [_row(planner, plan, planner.accuracy(plan, chosen)) for plan in plans]
@@ -86,6 +92,12 @@ def area_table(planner, plans):
     table : `~astropy.table.QTable`
         As `comparison_table`, with ``pointings`` for the name and without a merit; the numbers are of the
         sources that each plan detects itself.
+
+    Examples
+    --------
+    >>> from miricigale.planning import Planner, area_table, load_plan  # doctest: +SKIP
+    >>> planner = Planner(load_plan(overrides={"survey": {"areas": [1, 4]}}))  # doctest: +SKIP
+    >>> area_table(planner, planner.divide())["pointings", "area", "n_agn"]  # doctest: +SKIP
     """
     rows = [_row(planner, plan, planner.accuracy(plan)) for plan in plans]
     for row in rows:

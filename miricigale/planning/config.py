@@ -252,6 +252,15 @@ class PlanConfig(Configuration):
     ------
     `~miricigale.utils.exceptions.ConfigError`
         If lists that belong together have different lengths, or values contradict each other.
+
+    Examples
+    --------
+    >>> from miricigale.planning import PlanConfig
+    >>> config = PlanConfig()
+    >>> config.exposures.bands[:3], config.exposures.time[:3]
+    (('miri.f770w', 'miri.f1000w', 'miri.f1280w'), (1665.0, 1665.0, 1665.0))
+    >>> config.set_bands("f1500w,f770w")
+    ('miri.f770w', 'miri.f1500w')
     """
 
     heading: ClassVar = (
@@ -334,6 +343,14 @@ def load_plan(path=None, *, overrides=None):
     ------
     `~miricigale.utils.exceptions.ConfigError`
         If the file is missing, not TOML, or holds an unknown or wrong key.
+
+    Examples
+    --------
+    >>> from miricigale.planning import load_plan
+    >>> exposures = {"bands": ["miri.f770w"], "time": 900, "dithers": 4}
+    >>> config = load_plan(overrides={"exposures": exposures})
+    >>> config.exposures.time
+    (900.0,)
     """
     texts = [] if path is None else [(str(path), read_text(path))]
     return PlanConfig.from_texts(texts, overrides)

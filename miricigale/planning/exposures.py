@@ -42,6 +42,15 @@ class BandPlan:
         Kind of the errors.
     run : `RunErrors`, optional
         With ``noise.kind = "run"``.
+
+    Examples
+    --------
+    >>> from miricigale.planning import Planner, load_plan
+    >>> exposures = {"bands": ["miri.f770w"], "time": 900, "dithers": 4}
+    >>> planner = Planner(load_plan(overrides={"exposures": exposures}))
+    >>> plan = planner.band_plans()["miri.f770w"]
+    >>> print(f"{plan.time:.0f}, 5 sigma at {plan.limit:.2f}")
+    899 s, 5 sigma at 25.45 mag(AB)
     """
 
     exposure: Exposure
@@ -272,6 +281,15 @@ def wall_clock(plans, options, *, pointings=1):
     -------
     time : `~astropy.units.Quantity`
         In hours.
+
+    Examples
+    --------
+    >>> from miricigale.planning import Planner, load_plan, wall_clock
+    >>> exposures = {"bands": ["miri.f770w"], "time": 900, "dithers": 4}
+    >>> planner = Planner(load_plan(overrides={"exposures": exposures}))
+    >>> plans = planner.band_plans().values()
+    >>> print(f"{wall_clock(plans, planner.config.overheads, pointings=2):.2f}")
+    1.72 h
     """
     seconds = 0.0
     for plan in plans:

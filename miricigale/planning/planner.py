@@ -45,6 +45,13 @@ class Plan:
         Time that the observatory charges for all pointings, h.
     area : `~astropy.units.Quantity`
         Of all pointings, square arcmin.
+
+    Examples
+    --------
+    >>> from miricigale.planning import Planner, load_plan  # doctest: +SKIP
+    >>> planner = Planner(load_plan(overrides={"sample": {"n_sources": 100}}))  # doctest: +SKIP
+    >>> plan = planner.evaluate(["miri.f770w", "miri.f1500w"])  # doctest: +SKIP
+    >>> plan.band_table()["filter", "time", "limit_used"]  # doctest: +SKIP
     """
 
     name: str

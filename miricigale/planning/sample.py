@@ -57,6 +57,13 @@ def make_sample(config, bands, *, executor=None):
     ------
     `~miricigale.utils.exceptions.ConfigError`
         If the cuts leave no source.
+
+    Examples
+    --------
+    >>> from miricigale.planning import load_plan, make_sample  # doctest: +SKIP
+    >>> config = load_plan(overrides={"sample": {"n_sources": 100}})  # doctest: +SKIP
+    >>> sources = make_sample(config, ["wfc3.f160w", "miri.f770w"])  # doctest: +SKIP
+    >>> sources["redshift", "frac_agn", "miri.f770w"]  # doctest: +SKIP
     """
     options, seed = config.sample, config.plan.seed
     study = StudyConfig(catalog=config.catalog, sed=config.sed)

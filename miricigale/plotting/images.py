@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from miricigale.plotting.axes import TRUE, add_borders, new_figure, resolve_axes
+from miricigale.plotting.axes import TRUE, add_borders, resolve_axes
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_choice
 
@@ -151,7 +151,7 @@ def plot_model_residual(
     image, model : array_like, shape (ny, nx)
         The residual is their difference.
     ax : sequence of three `~matplotlib.axes.Axes`, optional
-        Axes to draw on; a new figure (``ax[0].figure``) by default.
+        Axes to draw on; a new figure of pyplot by default.
     limits : (float, float), optional
         As in `plot_image`, those of the image by default. The residual is drawn from -5 to
         5 sigma of its own noise.
@@ -167,7 +167,9 @@ def plot_model_residual(
     ax : `~numpy.ndarray` of three `~matplotlib.axes.Axes`
     """
     if ax is None:
-        _, ax = new_figure(1, 3, size=(4.2, 3.9))
+        import matplotlib.pyplot as plt
+
+        _, ax = plt.subplots(1, 3, figsize=(12.6, 3.9), layout="constrained")
     ax = np.ravel(np.asarray(ax, dtype=object))
     if len(ax) != 3:
         raise argument_error("ax", "three axes", len(ax))

@@ -59,7 +59,8 @@ def plot_pdf(edges, weights, *, ax=None, label=None, truth=None, log=False, **kw
     if label is not None:
         text = "" if unit == u.dimensionless_unscaled else f" ({unit.to_string()})"
         ax.set_xlabel(f"{label}{text}")
-    ax.set(ylabel="probability density" + (" per dex" if log else ""), ylim=(0, None))
+    ax.set_ylabel("probability density" + (" per dex" if log else ""))
+    ax.set_ylim(0, None, auto=True)
     return ax
 
 

@@ -35,10 +35,13 @@ def plot_scene(image, *, ax=None, marks=None, label="", **kwargs):
     options = {"origin": "lower", "cmap": "gray", "interpolation": "nearest"}
     if "norm" not in kwargs and not {"vmin", "vmax"} & set(kwargs):
         # about the median: a bright background does not hide the sources
-        image, label = image - middle, f"{label} - {middle:.4g}" if label else label
-        options["norm"] = AsinhNorm(width, vmin=low - middle, vmax=max(high - middle, width))
+        if abs(middle) > width:
+            image = image - middle
+            low, high = low - middle, high - middle
+            label = f"{label}, minus {middle:.3g}" if label else label
+        options["norm"] = AsinhNorm(width, vmin=low, vmax=max(high, width))
     drawn = ax.imshow(image, **{**options, **kwargs})
-    ax.set(xlabel="x [pixel]", ylabel="y [pixel]")
+    ax.set(xlabel="x (pixel)", ylabel="y (pixel)")
     add_colorbar(drawn, label)
     if marks is not None:
         ax.plot(*marks, "o", mfc="none", mec="tab:orange", ms=5, mew=0.6)

@@ -22,6 +22,17 @@ def ellipse_to_pixels(jacobian, *, radius, axis_ratio, position_angle):
     -------
     radius, axis_ratio, theta : `~numpy.ndarray`
         Pixels, ratio and radians from +x toward +y, in (-pi/2, pi/2].
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.profiles import ellipse_to_pixels
+    >>> north_up = np.array([[-10.0, 0.0], [0.0, 10.0]])  # pixels of 0.1 arcsec, east to the left
+    >>> a, ratio, theta = ellipse_to_pixels(
+    ...     north_up, radius=0.5, axis_ratio=0.4, position_angle=np.radians(30.0)
+    ... )
+    >>> print(f"{a:.1f} pixels, ratio {ratio:.1f}, {np.degrees(theta):.0f} deg from +x")
+    5.0 pixels, ratio 0.4, -60 deg from +x
     """
     direction = np.pi / 2 - np.asarray(position_angle, dtype=float)
     jacobian = np.asarray(jacobian, dtype=float)

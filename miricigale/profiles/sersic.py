@@ -69,7 +69,15 @@ def sersic_enclosed_fraction(radius, n):
 
 
 def sersic_radius(fraction, n):
-    """Radius (over the half-light radius) that encloses a fraction; inverse of `sersic_enclosed_fraction`."""
+    """
+    Radius (over the half-light radius) that encloses a fraction; inverse of `sersic_enclosed_fraction`.
+
+    Examples
+    --------
+    >>> from miricigale.profiles import sersic_radius
+    >>> sersic_radius([0.5, 0.9], 4.0).round(3)
+    array([1.   , 5.549])
+    """
     n = np.asarray(n, dtype=float)
     return (
         (scipy.special.gammaincinv(2 * n, np.asarray(fraction, dtype=float)) / sersic_bn(n)) ** n
@@ -222,6 +230,13 @@ def sersic_stamp(*, x, y, total_flux=1.0, r_eff, n, axis_ratio=1.0, theta=0.0, m
         Light in each pixel.
     origin : tuple of int
         Row and column of the stamp's first pixel in the frame of ``x`` and ``y``.
+
+    Examples
+    --------
+    >>> from miricigale.profiles import sersic_stamp
+    >>> stamp, origin = sersic_stamp(x=40.2, y=55.0, r_eff=2.0, n=1.0)
+    >>> stamp.shape, origin, round(float(stamp.sum()), 3)
+    ((19, 19), (46, 31), 0.998)
     """
     _check(total_flux, r_eff, n, axis_ratio)
     radius = min(r_eff * sersic_radius(_IN_STAMP, n), max_radius)

@@ -65,6 +65,11 @@ def stpsf_grid(
     References
     ----------
     Perrin et al. 2014, Proc. SPIE 9143, 91433X.
+
+    Examples
+    --------
+    >>> from miricigale.psf import stpsf_grid
+    >>> grid = stpsf_grid("miri.f770w", n_psfs=9)  # doctest: +SKIP
     """
     if round(n_psfs**0.5) ** 2 != n_psfs:
         raise argument_error("n_psfs", "a square number", n_psfs)
@@ -112,6 +117,11 @@ def stpsf_psf(filter, *, x=515.0, y=511.0, **options):
     psf : `~photutils.psf.ImagePSF`
         In the detector frame, with jitter, cruciform, pixel and interpixel capacitance.
         stpsf keeps the light that the cruciform scatters out of its grid inside of it.
+
+    Examples
+    --------
+    >>> from miricigale.psf import stpsf_psf
+    >>> psf = stpsf_psf("miri.f770w", x=200, y=800)  # doctest: +SKIP
     """
     grid = stpsf_grid(filter, **options)
     return psf_at(grid, x, y)

@@ -61,6 +61,14 @@ def filter_psf(filter, *, pixel_scale, pa=None, grid_angle=0.0 * u.deg, resampli
         If there is no model for the filter.
     ValueError
         If the position angle is missing.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.psf import filter_psf
+    >>> psf = filter_psf("F1500W", pixel_scale=0.11 * u.arcsec, pa=35 * u.deg)
+    >>> print(f"{psf.fwhm:.3f}, frame {psf.frame!r}")
+    0.521 arcsec, frame 'sky'
     """
     filter = known_filter(filter, MODEL_FILTERS, "model PSF for the filter")
     if filter in WFC3_FILTERS:
@@ -118,6 +126,16 @@ def checked_psf(
     `~miricigale.utils.exceptions.PSFWarning`
         If the light was scaled by more than 0.01, the PSF is narrower by more than 5 % or
         wider by more than 15 %, or the image seems to be smoothed.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.psf import checked_psf, gaussian_psf
+    >>> psf = gaussian_psf(1.2 * u.arcsec, pixel_scale=0.11 * u.arcsec, fov=4 * u.arcsec)
+    >>> checked_psf(psf, "F1500W")
+    Traceback (most recent call last):
+    ...
+    ValueError: 'psf' must be a PSF of F1500W, about 0.521 arcsec wide (FWHM), got one of 1.2 arcsec...
     """
     psf = instrument_psf(psf, argument)
     scale = psf.pixel_scale if pixel_scale is None else pixel_scale

@@ -61,6 +61,15 @@ def cruciform_fraction(filter_name, *, calibration="flight"):
     -------
     fraction : float
         Scattered over scattered plus direct light.
+
+    Examples
+    --------
+    >>> from miricigale.psf import cruciform_fraction
+    >>> for name in ("miri.f560w", "miri.f770w", "miri.f2100w"):
+    ...     print(f"{name} {cruciform_fraction(name):.3f}")
+    miri.f560w 0.153
+    miri.f770w 0.055
+    miri.f2100w 0.000
     """
     inner = jwst_constants()["cruciform_inner_radius"]
     outside = math.exp(-inner / _FOLDING)

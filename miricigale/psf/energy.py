@@ -39,6 +39,14 @@ def encircled_energy(psf, radius, *, pixel_scale=None):
     ------
     ValueError
         If a radius is negative or its circle leaves the grid.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.psf import encircled_energy, gaussian_psf
+    >>> psf = gaussian_psf(0.3 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=4 * u.arcsec)
+    >>> encircled_energy(psf, [0.15, 0.3, 0.6] * u.arcsec).round(3)
+    array([0.499, 0.937, 1.   ])
     """
     psf = instrument_psf(psf)
     data = psf.data
@@ -77,6 +85,14 @@ def radius_of_encircled_energy(psf, fraction):
     ------
     ValueError
         If the grid does not hold the fraction.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.psf import gaussian_psf, radius_of_encircled_energy
+    >>> psf = gaussian_psf(0.3 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=4 * u.arcsec)
+    >>> print(f"{radius_of_encircled_energy(psf, 0.5):.3f}")
+    0.150 arcsec
     """
     psf = instrument_psf(psf)
     cells = np.arange(0.0, psf.half_width / psf.cell, 0.25)
@@ -113,6 +129,14 @@ def fwhm(psf, *, method="half_maximum"):
     ------
     ValueError
         If the method is unknown.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.psf import fwhm, gaussian_psf
+    >>> psf = gaussian_psf(0.3 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=4 * u.arcsec)
+    >>> print(f"{fwhm(psf):.3f}, {fwhm(psf, method='gaussian'):.3f}")
+    0.300 arcsec, 0.300 arcsec
     """
     psf = instrument_psf(psf)
     check_choice(method, "method", ("half_maximum", "gaussian"))
@@ -158,6 +182,19 @@ def psf_table(psfs, *, radii=(0.5, 1.0, 1.5, 2.5, 5.0) * u.arcsec):
         Columns ``filter``, ``frame``, ``angle`` (NaN on the detector), ``includes``, ``fwhm``,
         ``fwhm_gaussian``, ``fwhm_flight`` (NaN but for MIRI's filters), ``r80`` (NaN if the
         grid holds less), ``enclosed`` and ``eef_<radius>``, with units and descriptions.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.psf import miri_psf, psf_table
+    >>> table = psf_table([miri_psf("F1500W", fov=6 * u.arcsec)], radii=[0.5, 1] * u.arcsec)
+    >>> for name in ("fwhm", "fwhm_flight", "eef_0.5", "eef_1"):
+    ...     table[name].info.format = ".3f"
+    >>> print(table["filter", "fwhm", "fwhm_flight", "eef_0.5", "eef_1"])
+       filter    fwhm  fwhm_flight eef_0.5 eef_1
+                arcsec    arcsec
+    ----------- ------ ----------- ------- -----
+    miri.f1500w  0.513       0.488   0.681 0.818
     """
     psfs = [instrument_psf(psf, f"psfs[{i}]") for i, psf in enumerate(psfs)]
     names = [psf.filter or "" for psf in psfs]

@@ -30,6 +30,16 @@ def psf_grid(psfs, positions):
     ------
     ValueError
         If the PSFs differ, or the positions are no rectangular grid.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.psf import gaussian_psf, psf_at, psf_grid
+    >>> form = {"pixel_scale": 0.1 * u.arcsec, "fov": 2 * u.arcsec}
+    >>> psfs = [gaussian_psf(width * u.arcsec, **form) for width in (0.3, 0.3, 0.4, 0.4)]
+    >>> grid = psf_grid(psfs, [(0, 0), (0, 100), (100, 0), (100, 100)])
+    >>> print(f"{psf_at(grid, 50, 20).fwhm:.3f}")
+    0.331 arcsec
     """
     psfs = list(psfs)
     positions = np.asarray(positions, dtype=float)
@@ -118,6 +128,16 @@ def grid_weights(grid, x, y):
     weights : `~numpy.ndarray`, shape (N, n_psfs)
         Bilinear, at most four of a row not zero; each row has the sum 1. The columns are in
         the order of ``grid.data``.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.psf import gaussian_psf, grid_weights, psf_grid
+    >>> form = {"pixel_scale": 0.1 * u.arcsec, "fov": 2 * u.arcsec}
+    >>> psfs = [gaussian_psf(width * u.arcsec, **form) for width in (0.3, 0.3, 0.4, 0.4)]
+    >>> grid = psf_grid(psfs, [(0, 0), (0, 100), (100, 0), (100, 100)])
+    >>> grid_weights(grid, [50], [0])
+    array([[0.5, 0.5, 0. , 0. ]])
     """
     x, y = np.broadcast_arrays(np.atleast_1d(np.asarray(x, float)), np.asarray(y, float))
     where = np.asarray(grid.grid_xypos, dtype=float)
@@ -151,6 +171,14 @@ def psf_at(grid, x, y):
     ------
     TypeError
         If it is something else, such as a gridded model of photutils' own.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.psf import miri_psf_grid, psf_at
+    >>> grid = miri_psf_grid("F1500W", n_psfs=4, fov=3 * u.arcsec, oversampling=2)
+    >>> print(f"{psf_at(grid, 359, 0).pixel_scale:.4f}")
+    0.1092 arcsec
     """
     if not isinstance(grid, PSFGrid):
         got = type(grid).__name__

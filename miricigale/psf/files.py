@@ -117,10 +117,14 @@ def read_psf(
         If the file is missing or no FITS.
     ValueError
         If there is no 2D image there, or scale or angle are unknown or not the header's.
+
+    Examples
+    --------
+    >>> from miricigale.psf import read_psf
+    >>> psf = read_psf("f770w_psf.fits", ext=1, enclosed=0.95)  # doctest: +SKIP
     """
-    with open_fits(path, wanted="a PSF") as hdus:
-        if hdus[0].header.get("FORMAT") == _LAYOUT:
-            return _read_psf(path)
+    if is_written(path):
+        return _read_psf(path)
     data, header, pixel_scale, turn = fits_image(
         path, ext, plane, pixel_scale, wanted="a PSF", oversampling=oversampling
     )
@@ -144,6 +148,12 @@ def read_psf(
         angle=0.0 * u.deg if angle is None else angle,
         **{**options, "meta": {"file": str(path), **options.get("meta", {})}},
     )
+
+
+def is_written(path):
+    """Whether `InstrumentPSF.write` made a file."""
+    with open_fits(path, wanted="a PSF") as hdus:
+        return hdus[0].header.get("FORMAT") == _LAYOUT
 
 
 def _write_psf(psf, path, *, overwrite=False):

@@ -102,6 +102,14 @@ def hst_psf(
     ----------
     Krist, Hook & Stoehr 2011, SPIE 8127, 81270J; Skelton et al. 2014, ApJS 214, 24
     (mosaics of 0.06 arcsec pixels).
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.psf import hst_psf
+    >>> psf = hst_psf("F160W", fov=4 * u.arcsec)
+    >>> print(f"{psf.fwhm:.3f}")
+    0.200 arcsec
     """
     name = known_filter(filter, WFC3_FILTERS, "PSF for the filter")
     oversampling, width = checked_grid(oversampling, fov, 10.0)

@@ -66,6 +66,17 @@ class InstrumentPSF(ImagePSF):
     ------
     ValueError
         If the frame is unknown, or the pixel or the oversampling is not positive.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from miricigale.psf import InstrumentPSF
+    >>> y, x = np.mgrid[-20:21, -20:21]
+    >>> data = np.exp(-0.5 * (x**2 + y**2) / 9) / (2 * np.pi * 9)
+    >>> psf = InstrumentPSF(data, pixel_scale=0.06 * u.arcsec, frame="sky")
+    >>> print(f"{psf.fwhm:.3f}, {psf.enclosed:.3f} of the light on the grid")
+    0.424 arcsec, 1.000 of the light on the grid
     """
 
     io_module = "miricigale.psf.files"
@@ -192,6 +203,14 @@ class PSFGrid(GriddedPSFModel):
         Those of the PSFs, in the order of ``data``.
     meta : dict
         That of the first PSF.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.psf import miri_psf_grid
+    >>> grid = miri_psf_grid("F1500W", n_psfs=4, fov=3 * u.arcsec, oversampling=2)
+    >>> grid.grid_xypos.tolist()
+    [[359.0, 0.0], [1026.0, 0.0], [359.0, 1023.0], [1026.0, 1023.0]]
     """
 
     def __init__(self, psfs, positions):
@@ -227,6 +246,16 @@ def instrument_psf(psf, argument="psf"):
     ------
     ValueError
         If it is something else.
+
+    Examples
+    --------
+    >>> from photutils.psf import ImagePSF
+    >>> import numpy as np
+    >>> from miricigale.psf import instrument_psf
+    >>> instrument_psf(ImagePSF(np.ones((5, 5))))
+    Traceback (most recent call last):
+    ...
+    ValueError: 'psf' must be a PSF on pixels of known size ..., got ImagePSF
     """
     if not isinstance(psf, InstrumentPSF):
         wanted = "a PSF on pixels of known size (see miricigale.psf.from_photutils and make_psf)"
@@ -268,6 +297,17 @@ def make_psf(data, *, pixel_scale, frame="sky", oversampling=1, enclosed=None, *
     -----
     `~miricigale.utils.exceptions.PSFWarning`
         If an oversampled PSF of unit sum is scaled.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from miricigale.psf import make_psf
+    >>> y, x = np.mgrid[-20:21, -20:21]
+    >>> stamp = np.exp(-0.5 * (x**2 + y**2) / 9)
+    >>> psf = make_psf(stamp, pixel_scale=0.06 * u.arcsec, enclosed=0.95)
+    >>> print(f"{psf.fwhm:.3f}, {psf.enclosed:.2f}")
+    0.424 arcsec, 0.95
     """
     data = np.array(data, dtype=float)
     if data.ndim != 2 or not np.all(np.isfinite(data)) or not data.sum() > 0:
@@ -326,6 +366,14 @@ def as_psf(psf, argument="psf"):
     ------
     ValueError
         If it is nothing of these, or holds no light.
+
+    Examples
+    --------
+    >>> from photutils.psf import GaussianPSF
+    >>> from miricigale.psf import as_psf
+    >>> psf = as_psf(GaussianPSF(x_fwhm=3, y_fwhm=3))
+    >>> psf.oversampling.tolist()
+    [4, 4]
     """
     if isinstance(psf, (ImagePSF, GriddedPSFModel)):
         return psf
@@ -373,6 +421,15 @@ def from_photutils(model, *, x=None, y=None, **options):
     ------
     ValueError
         If the model is of another kind, or a gridded model comes without a position.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from photutils.psf import GaussianPSF
+    >>> from miricigale.psf import from_photutils
+    >>> psf = from_photutils(GaussianPSF(x_fwhm=3, y_fwhm=3), pixel_scale=0.1 * u.arcsec)
+    >>> print(f"{psf.fwhm:.3f}")
+    0.300 arcsec
     """
     model = as_psf(model, "model")
     oversampling = np.atleast_1d(model.oversampling)

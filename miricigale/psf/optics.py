@@ -44,6 +44,16 @@ class Pupil:
         Side of the grid in m.
     angle : float
         Angle of the telescope's own y axis from the image's y axis, clockwise, in deg.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.psf import jwst_pupil
+    >>> pupil = jwst_pupil(128)
+    >>> opd = pupil.wavefront_error(75, seed=1)
+    >>> light = pupil.amplitude > 0.5
+    >>> print(f"{pupil.diameter:.2f} m, {opd[light].std():.0f} nm")
+    6.62 m, 75 nm
     """
 
     amplitude: np.ndarray
@@ -144,6 +154,13 @@ def jwst_pupil(n=384, *, angle=4.83544897):
     ------
     ValueError
         If ``n`` is too small to resolve the struts.
+
+    Examples
+    --------
+    >>> from miricigale.psf import jwst_pupil
+    >>> pupil = jwst_pupil(128)
+    >>> pupil.amplitude.shape, int(pupil.segments.max())
+    ((128, 128), 18)
     """
     check_least(n, "n", 64)
     constants = jwst_constants()
@@ -197,6 +214,13 @@ def hst_pupil(n=256, *, angle=45.0):
     References
     ----------
     Krist, Hook & Stoehr 2011, SPIE 8127, 81270J (Tiny Tim).
+
+    Examples
+    --------
+    >>> from miricigale.psf import hst_pupil
+    >>> pupil = hst_pupil(128)
+    >>> print(f"{pupil.diameter:.2f} m across, {pupil.amplitude.mean():.2f} of the grid open")
+    2.40 m across, 0.64 of the grid open
     """
     diameter = 2.4
     radius, step = 0.5 * diameter, diameter / n

@@ -78,6 +78,14 @@ def rotate_psf(psf, angle=None, *, grid_angle=0.0 * u.deg):
     -----
     With north up and east left a position angle grows counter-clockwise, and so does the
     turn.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.psf import miri_psf, rotate_psf
+    >>> psf = rotate_psf(miri_psf("F1500W", fov=6 * u.arcsec), 35 * u.deg)
+    >>> psf.frame, psf.meta["telescope_angle"]
+    ('sky', 35.0)
     """
     psf = instrument_psf(psf)
     grid = _degrees(grid_angle, "grid_angle")
@@ -111,6 +119,15 @@ def average_psf(psfs):
     ------
     ValueError
         If the list is empty, or the PSFs differ.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.psf import average_psf, gaussian_psf
+    >>> form = {"pixel_scale": 0.1 * u.arcsec, "fov": 4 * u.arcsec}
+    >>> both = average_psf([gaussian_psf(width * u.arcsec, **form) for width in (0.3, 0.4)])
+    >>> print(f"{both.fwhm:.3f}")
+    0.331 arcsec
     """
     psfs = list(psfs)
     if not psfs:
@@ -164,6 +181,15 @@ def psf_image(psf, *, pixel_scale, shape, offset=(0.0, 0.0)):
     ------
     ValueError
         If the pixel or the shape is not positive.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.psf import gaussian_psf, psf_image
+    >>> psf = gaussian_psf(0.3 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=4 * u.arcsec)
+    >>> image = psf_image(psf, pixel_scale=0.06 * u.arcsec, shape=31)
+    >>> print(f"{image.max():.4f} of the light in the middle pixel, {image.sum():.3f} in all")
+    0.0353 of the light in the middle pixel, 1.000 in all
     """
     psf = instrument_psf(psf)
     scale = positive(pixel_scale, ANGLE, "pixel_scale")
@@ -224,6 +250,15 @@ def psf_mosaic(
     References
     ----------
     Fruchter & Hook 2002, PASP 114, 144.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.psf import miri_psf, psf_mosaic
+    >>> psf = miri_psf("F1500W", fov=6 * u.arcsec)
+    >>> mosaic = psf_mosaic(psf, 0.06 * u.arcsec, pa=35 * u.deg)
+    >>> print(f"{psf.fwhm:.3f} -> {mosaic.fwhm:.3f}")
+    0.513 arcsec -> 0.518 arcsec
     """
     psf = instrument_psf(psf)
     check_choice(resampling, "resampling", ("drizzle", None))

@@ -24,6 +24,14 @@ def gaussian_psf(fwhm, *, pixel_scale, oversampling=4, fov):
     -------
     psf : `~photutils.psf.ImagePSF`
         Of the surface brightness (no pixel response); sky frame, where it has no angle.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.psf import gaussian_psf
+    >>> psf = gaussian_psf(0.3 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=4 * u.arcsec)
+    >>> print(f"{psf.fwhm:.3f}, {psf.data.shape}")
+    0.300 arcsec, (161, 161)
     """
     sigma = float(to_array(fwhm, ANGLE, "fwhm")) / math.sqrt(8 * math.log(2))
     scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))

@@ -157,6 +157,21 @@ def psf_from_stars(
     References
     ----------
     Anderson & King 2000, PASP 112, 1360; Anderson 2016, WFC3 ISR 2016-12.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropy.nddata import NDData
+    >>> from astropy.table import Table
+    >>> from miricigale.psf import psf_from_stars
+    >>> y, x = np.mgrid[:80, :80]
+    >>> stars = Table({"x": [20.0, 60.3, 19.6, 60.5], "y": [20.0, 20.5, 60.4, 59.8]})
+    >>> light = [np.exp(-((x - a) ** 2 + (y - b) ** 2) / 8) for a, b in stars.iterrows()]
+    >>> form = {"pixel_scale": 0.1 * u.arcsec, "fov": 3 * u.arcsec, "oversampling": 1}
+    >>> psf = psf_from_stars(NDData(sum(light)), stars, **form)
+    >>> print(f"{psf.fwhm:.2f} of {psf.meta['n_stamps']} stars")
+    0.47 arcsec of 4 stars
     """
     images = _checked_images(images)
     scale = _pixel_scale(images, pixel_scale)

@@ -19,8 +19,8 @@ from .mosaic import Mosaic as Mosaic
 from .mosaic import drizzle_images as drizzle_images
 from .mosaic import noise_correction as noise_correction
 from .mosaic import pixel_map as pixel_map
-from .mosaic import reject_outliers as reject_outliers
 from .mosaic import weight_map as weight_map
+from .outliers import reject_outliers as reject_outliers
 from .rampfit import RampFit as RampFit
 from .rampfit import fit_groups as fit_groups
 from .reducer import Reducer as Reducer

@@ -39,6 +39,20 @@ class Alignment:
         Sources that were used.
     scatter : `~astropy.units.Quantity`
         Of one source about the solution, in one coordinate.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.reduction import Alignment
+    >>> solution = Alignment(
+    ...     east=12 * u.mas,
+    ...     north=-5 * u.mas,
+    ...     rotation=0 * u.deg,
+    ...     n_matched=14,
+    ...     scatter=6 * u.mas,
+    ... )
+    >>> solution.east, solution.n_matched
+    (<Quantity 12. mas>, 14)
     """
 
     east: u.Quantity
@@ -78,6 +92,26 @@ def align_to_catalog(image, catalog, *, radius=1 * u.arcsec):
     position within ``radius`` vote for a shift; what agrees with the most frequent to 0.1 arcsec is fitted
     by least squares, clipped at three standard deviations; a rotation is fitted too with ten sources or
     more. A wrong scale would be one of the distortion, and is not looked for.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale import Detector, Exposure, Reducer
+    >>> from miricigale.scene import Scene
+    >>> first = Exposure("F770W", n_groups=20, subarray="SUB128", pointing="53 -27")
+    >>> sky = first.wcs.pixel_to_world([30, 60, 100, 80], [40, 90, 60, 100])
+    >>> stars = {"id": [1, 2, 3, 4], "ra": sky.ra.deg, "dec": sky.dec.deg}
+    >>> stars |= {"F770W": [500] * 4 * u.uJy, "profile": ["point"] * 4}
+    >>> charge = Detector.miri_imager().collect(
+    ...     Scene(stars, first, background="low"), seed=1
+    ... )
+    >>> reducer = Reducer()
+    >>> image = reducer.calibrate(reducer.fit_ramp(charge))
+    >>> image.wcs.wcs.crval[1] += 0.2 / 3600  # wrong by 0.2 arcsec
+    >>> from miricigale.reduction import align_to_catalog
+    >>> corrected, solution = align_to_catalog(image, sky)
+    >>> print(f"{solution.north.to(u.arcsec):.1f}, {solution.n_matched} stars")
+    -0.2 arcsec, 4 stars
     """
     x, y = _sources(image, "image")
     return _aligned(image, x, y, _positions(catalog), positive(radius, ANGLE, "radius"), "image")
@@ -107,6 +141,26 @@ def align_images(images, catalog=None, *, radius=1 * u.arcsec):
     ------
     ValueError
         As of `align_to_catalog`, naming the image by its place in the list; or if there are no images.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale import Detector, Exposure, Reducer
+    >>> from miricigale.scene import Scene
+    >>> first = Exposure("F770W", n_groups=20, subarray="SUB128", pointing="53 -27")
+    >>> sky = first.wcs.pixel_to_world([30, 60, 100, 80], [40, 90, 60, 100])
+    >>> stars = {"id": [1, 2, 3, 4], "ra": sky.ra.deg, "dec": sky.dec.deg}
+    >>> stars |= {"F770W": [500] * 4 * u.uJy, "profile": ["point"] * 4}
+    >>> charge = Detector.miri_imager().collect(
+    ...     Scene(stars, first, background="low"), seed=1
+    ... )
+    >>> reducer = Reducer()
+    >>> image = reducer.calibrate(reducer.fit_ramp(charge))
+    >>> image.wcs.wcs.crval[1] += 0.2 / 3600  # wrong by 0.2 arcsec
+    >>> from miricigale.reduction import align_images
+    >>> images, solutions = align_images([image], sky)
+    >>> print(f"{solutions[0].north.to(u.arcsec):.1f}, {solutions[0].n_matched} stars")
+    -0.2 arcsec, 4 stars
     """
     images = list(images)
     if not images:

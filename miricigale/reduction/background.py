@@ -31,7 +31,15 @@ _REMAINDER = 2.0
 
 
 class BackgroundFlags(Flags):
-    """Why a background cannot be trusted."""
+    """
+    Why a background cannot be trusted.
+
+    Examples
+    --------
+    >>> from miricigale.reduction import BackgroundFlags
+    >>> BackgroundFlags.names(BackgroundFlags.FEW_SKY | BackgroundFlags.CONTAMINATED)
+    ['few_sky', 'contaminated']
+    """
 
     GOOD = 0
     FEW_SKY = 1
@@ -63,6 +71,31 @@ class Background:
         Size of the boxes in pixels, and of the median filter in boxes.
     flags : `BackgroundFlags`
         Why it cannot be trusted; 0 where nothing speaks against it.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.nddata import CCDData, StdDevUncertainty
+    >>> from miricigale.instrument import north_up_wcs
+    >>> field = SkyCoord(53, -27, unit="deg")
+    >>> wcs = north_up_wcs(field, 0.11 * u.arcsec, (100, 100))
+    >>> rng = np.random.default_rng(1)
+    >>> error = StdDevUncertainty(np.full((100, 100), 0.1))
+    >>> images = [
+    ...     CCDData(
+    ...         rng.normal(level, 0.1, (100, 100)),
+    ...         unit="MJy/sr",
+    ...         uncertainty=error,
+    ...         wcs=wcs,
+    ...     )
+    ...     for level in (5.0, 5.2, 5.1)
+    ... ]
+    >>> from miricigale.reduction import estimate_background
+    >>> background = estimate_background(images[0])
+    >>> print(f"{np.median(background.level):.2f} MJy/sr, flags {background.flags}")
+    5.00 MJy/sr, flags 0
     """
 
     level: np.ndarray
@@ -156,6 +189,30 @@ def estimate_background(
     References
     ----------
     Detection in tiers of smoothing, from wide to narrow, follows Bagley et al. 2023, ApJL 946, L12, sec. 3.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.nddata import CCDData, StdDevUncertainty
+    >>> from miricigale.instrument import north_up_wcs
+    >>> field = SkyCoord(53, -27, unit="deg")
+    >>> wcs = north_up_wcs(field, 0.11 * u.arcsec, (100, 100))
+    >>> rng = np.random.default_rng(1)
+    >>> error = StdDevUncertainty(np.full((100, 100), 0.1))
+    >>> images = [
+    ...     CCDData(
+    ...         rng.normal(level, 0.1, (100, 100)),
+    ...         unit="MJy/sr",
+    ...         uncertainty=error,
+    ...         wcs=wcs,
+    ...     )
+    ...     for level in (5.0, 5.2, 5.1)
+    ... ]
+    >>> from miricigale.reduction import estimate_background
+    >>> estimate_background(images[0], box=32)
+    <Background median 4.997 +- 0.0016, rms 0.1002, 0.0 % masked as sources>
     """
     check_choice(method, "method", ("masked", "sep"))
     check_least(box, "box", 4, whole=True)
@@ -330,6 +387,31 @@ def remove_background(image, background, *, negative_threshold=10.0, negative_no
     ------
     ValueError
         If an option is out of range, or the errors are asked for and the image has none.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.nddata import CCDData, StdDevUncertainty
+    >>> from miricigale.instrument import north_up_wcs
+    >>> field = SkyCoord(53, -27, unit="deg")
+    >>> wcs = north_up_wcs(field, 0.11 * u.arcsec, (100, 100))
+    >>> rng = np.random.default_rng(1)
+    >>> error = StdDevUncertainty(np.full((100, 100), 0.1))
+    >>> images = [
+    ...     CCDData(
+    ...         rng.normal(level, 0.1, (100, 100)),
+    ...         unit="MJy/sr",
+    ...         uncertainty=error,
+    ...         wcs=wcs,
+    ...     )
+    ...     for level in (5.0, 5.2, 5.1)
+    ... ]
+    >>> from miricigale.reduction import estimate_background, remove_background
+    >>> image = remove_background(images[0], estimate_background(images[0]))
+    >>> print(f"{image.meta['background']:.2f} MJy/sr")
+    5.00 MJy/sr
     """
     check_choice(negative_noise, "negative_noise", ("larger", "background"))
     check_positive(negative_threshold, "negative_threshold", optional=True)

@@ -52,6 +52,31 @@ def find_cosmic_rays(image, *, fwhm):
     References
     ----------
     van Dokkum 2001, PASP 113, 1420; McCully et al. 2018, astroscrappy.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.nddata import CCDData, StdDevUncertainty
+    >>> from miricigale.instrument import north_up_wcs
+    >>> field = SkyCoord(53, -27, unit="deg")
+    >>> wcs = north_up_wcs(field, 0.11 * u.arcsec, (100, 100))
+    >>> rng = np.random.default_rng(1)
+    >>> error = StdDevUncertainty(np.full((100, 100), 0.1))
+    >>> images = [
+    ...     CCDData(
+    ...         rng.normal(level, 0.1, (100, 100)),
+    ...         unit="MJy/sr",
+    ...         uncertainty=error,
+    ...         wcs=wcs,
+    ...     )
+    ...     for level in (5.0, 5.2, 5.1)
+    ... ]
+    >>> from miricigale.reduction import find_cosmic_rays
+    >>> images[0].data[50, 40] += 20
+    >>> np.argwhere(find_cosmic_rays(images[0], fwhm=2.4)).tolist()
+    [[50, 40]]
     """
     check_positive(fwhm, "fwhm")
     mask = plain_mask(image)
@@ -130,6 +155,27 @@ def calibrate(
     ------
     ValueError
         If the image is not in DN/s, or not of the shape of the sub-array.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from miricigale import Detector, Exposure, Reducer
+    >>> exposure = Exposure("F770W", n_groups=20, subarray="SUB64", pointing="53 -27")
+    >>> sky = np.full(exposure.shape, 5.0) * u.MJy / u.sr
+    >>> ramp = Detector.miri_imager().expose(sky, exposure, seed=1)
+    >>> from miricigale.instrument import photmjsr
+    >>> from miricigale.reduction import calibrate
+    >>> cal = calibrate(
+    ...     Reducer().fit_ramp(ramp),
+    ...     filter="miri.f770w",
+    ...     subarray="SUB64",
+    ...     dark=0.05,
+    ...     flat=1.0,
+    ...     conversion=photmjsr("miri.f770w"),
+    ... )
+    >>> print(f"{np.nanmedian(cal.data):.1f} {cal.unit}")
+    5.0 MJy / sr
     """
     if rate.unit is None or not rate.unit.is_equivalent(RATE):
         raise argument_error("rate", f"in {RATE}", f"unit {rate.unit}")

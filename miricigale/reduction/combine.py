@@ -5,7 +5,8 @@ from miricigale.reduction.align import align_images
 from miricigale.reduction.background import BackgroundFlags, estimate_background, remove_background
 from miricigale.reduction.dither_background import dither_backgrounds, restored
 from miricigale.reduction.images import check_images, check_overlap, own_grid
-from miricigale.reduction.mosaic import drizzle_images, pixel_map, reject_outliers, weight_map
+from miricigale.reduction.mosaic import drizzle_images, pixel_map, weight_map
+from miricigale.reduction.outliers import reject_outliers
 from miricigale.reduction.results import ReductionResult
 from miricigale.reduction.sky_match import match_levels
 from miricigale.utils.exceptions import argument_error

@@ -8,7 +8,8 @@ from scipy.ndimage import binary_dilation
 from miricigale.instrument import DQ
 from miricigale.reduction.background import estimate_background, warn_of
 from miricigale.reduction.images import check_images, own_grid, plain_mask, with_data
-from miricigale.reduction.mosaic import drizzle_images, nan_median, pixel_map
+from miricigale.reduction.mosaic import drizzle_images, pixel_map
+from miricigale.reduction.outliers import nan_median
 from miricigale.reduction.sky_mesh import sky_boxes
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.parallel import chunks
@@ -63,6 +64,27 @@ def dither_backgrounds(images, backgrounds=None, *, wcs=None):
     ----------
     Dicken et al. 2024, A&A 689, A5, sec. 10.2 (other dithers in place of all, and their limits); Yang et al. 2023,
     ApJL 956, L12 (CEERS); Ostlin et al. 2025, A&A 696, A57 (MIDIS).
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale import Detector, Exposure, Reducer
+    >>> from miricigale.scene import Scene
+    >>> first = Exposure("F770W", n_groups=20, subarray="SUB64", pointing="53 -27")
+    >>> star = {"id": [1], "ra": [53], "dec": [-27], "profile": ["point"]}
+    >>> star["F770W"] = [500] * u.uJy
+    >>> def exposed(exposure):
+    ...     scene = Scene(star, exposure, background="low")
+    ...     return Detector.miri_imager().collect(scene, seed=1)
+    >>> from miricigale.reduction import dither_backgrounds
+    >>> reducer = Reducer()
+    >>> dithers = first.dithered("cycling-medium", 3)
+    >>> cals = [
+    ...     reducer.calibrate(reducer.fit_ramp(exposed(dither))) for dither in dithers
+    ... ]
+    >>> backgrounds = dither_backgrounds(cals)
+    >>> print(f"{backgrounds[0].level.mean():.1f} MJy/sr")
+    4.9 MJy/sr
     """
     images = list(images)
     if len(images) < 3:

@@ -70,6 +70,18 @@ class ImageFile:
         ``WHT``, ``CON`` and ``BKG``.
     header : `~astropy.io.fits.Header`
         Keywords of the primary header and of SCI.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from miricigale import Detector, Exposure, Reducer
+    >>> exposure = Exposure("F770W", n_groups=20, subarray="SUB64", pointing="53 -27")
+    >>> sky = np.full(exposure.shape, 5.0) * u.MJy / u.sr
+    >>> ramp = Detector.miri_imager().expose(sky, exposure, seed=1)
+    >>> file = Reducer().fit_ramp(ramp, planes=True)
+    >>> print(file.image.unit, sorted(file.planes))
+    adu / s ['VAR_POISSON', 'VAR_RNOISE']
     """
 
     image: CCDData
@@ -109,6 +121,19 @@ def read_images(path):
     those of the FITS header; of a file without them, that of the gwcs in its ASDF extension (with
     the package ``gwcs``); of a rate, whose header has their linear part only, those of the
     imager at its pointing.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from miricigale import Detector, Exposure, Reducer
+    >>> exposure = Exposure("F770W", n_groups=20, subarray="SUB64", pointing="53 -27")
+    >>> sky = np.full(exposure.shape, 5.0) * u.MJy / u.sr
+    >>> ramp = Detector.miri_imager().expose(sky, exposure, seed=1)
+    >>> from miricigale.reduction import read_images, write_image
+    >>> rate = Reducer().fit_ramp(ramp, planes=True)
+    >>> path = write_image(rate, "sub64_rate.fits")  # doctest: +SKIP
+    >>> read_images("sub64_rate.fits")[0].image.unit  # doctest: +SKIP
     """
     path = Path(path)
     with open_fits(path, wanted=_WANTED) as hdus:
@@ -173,6 +198,11 @@ def open_exposure(path):
     ------
     `~miricigale.utils.exceptions.DataError`
         If it is neither.
+
+    Examples
+    --------
+    >>> from miricigale.reduction import open_exposure
+    >>> exposure = open_exposure("jw01180001001_02101_00001_mirimage_uncal.fits")  # doctest: +SKIP
     """
     with open_fits(path, wanted=_WANTED) as hdus:
         ramp = "SCI" in hdus and hdus["SCI"].header.get("NAXIS") == 4
@@ -324,6 +354,18 @@ def write_image(image, path, *, planes=None, overwrite=False):
         If the file exists and ``overwrite`` is False.
     ValueError
         If a plane has another name or shape, or integrations do not belong together.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from miricigale import Detector, Exposure, Reducer
+    >>> exposure = Exposure("F770W", n_groups=20, subarray="SUB64", pointing="53 -27")
+    >>> sky = np.full(exposure.shape, 5.0) * u.MJy / u.sr
+    >>> ramp = Detector.miri_imager().expose(sky, exposure, seed=1)
+    >>> from miricigale.reduction import write_image
+    >>> rates = Reducer().fit_integrations(ramp, planes=True)
+    >>> path = write_image(rates, "sub64_rateints.fits")  # doctest: +SKIP
     """
     path = Path(path)
     image, planes, wcs = _joined(image, planes or {})

@@ -81,6 +81,14 @@ def reduce_files(
     ------
     ValueError
         If there are no paths, or two files have one name.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from miricigale.reduction import ReferenceCache, Reducer, reduce_files
+    >>> reducer = Reducer(references=ReferenceCache("/data/crds"))  # doctest: +SKIP
+    >>> files = sorted(Path().glob("*_uncal.fits"))
+    >>> table = reduce_files(files, "reduced", reducer=reducer)  # doctest: +SKIP
     """
     paths = [Path(path) for path in paths]
     reducer = Reducer() if reducer is None else reducer

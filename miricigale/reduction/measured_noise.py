@@ -50,6 +50,13 @@ class MeasuredNoise:
     slow_noise : float
         Standard deviation that the read-out adds from one group to the next, DN; zero where there are
         no reference pixels to show it.
+
+    Examples
+    --------
+    >>> from miricigale.reduction import MeasuredNoise
+    >>> noise = MeasuredNoise(read_noise=6.1, gain=4.2, gain_err=0.3)
+    >>> noise.gain
+    4.2
     """
 
     read_noise: float
@@ -112,6 +119,24 @@ def measure_noise(ramp):
     References
     ----------
     Janesick 2007, Photon Transfer, SPIE Press.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from miricigale import Detector, Exposure
+    >>> from miricigale.reduction import measure_noise
+    >>> exposure = Exposure(
+    ...     "F1500W",
+    ...     n_groups=60,
+    ...     n_integrations=2,
+    ...     subarray="SUB128",
+    ...     pointing="53 -27",
+    ... )
+    >>> sky = np.full(exposure.shape, 400.0) * u.MJy / u.sr
+    >>> noise = measure_noise(Detector.miri_imager().expose(sky, exposure, seed=1))
+    >>> print(f"read noise {noise.read_noise:.1f} DN")
+    read noise 6.0 DN
     """
     n_int, n_group = ramp.shape[:2]
     if n_group < 9:

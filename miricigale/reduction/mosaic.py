@@ -1,4 +1,4 @@
-"""Dithers to one image: outlier rejection and drizzle."""
+"""Dithers to one image by drizzling."""
 
 import dataclasses
 
@@ -8,13 +8,11 @@ from astropy.wcs import NoConvergence
 from astropy.wcs.utils import proj_plane_pixel_area
 from drizzle.resample import Drizzle
 from scipy.interpolate import RectBivariateSpline
-from scipy.ndimage import map_coordinates
 
 from miricigale.instrument import DQ, ImageFacts
 from miricigale.reduction.images import (
     check_images,
     check_overlap,
-    flag_pixels,
     flagged_image,
     overlaps,
     plain_mask,
@@ -22,15 +20,9 @@ from miricigale.reduction.images import (
 )
 from miricigale.utils import sep_tools
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_positive
-from miricigale.utils.parallel import chunks
 
-# rows of a grid of which the median of many images is taken together
-_ROWS = 256
 # pixels of the boxes by which the variance that gives weights is smoothed
 _WEIGHT_BOX = 32
-# steepest differences to its neighbors by which a pixel may differ from the other dithers
-_DERIVATIVE = 1.2
 # nodes of the grid on which a distorted WCS is evaluated; between them bicubic splines
 _NODES = 49
 
@@ -48,6 +40,30 @@ class Mosaic:
         Sum of the inverse variances that went into each pixel (area-weighted).
     n_images : `~numpy.ndarray` of uint8, shape (ny, nx)
         Number of inputs that touch each pixel.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.nddata import CCDData, StdDevUncertainty
+    >>> from miricigale.instrument import north_up_wcs
+    >>> field = SkyCoord(53, -27, unit="deg")
+    >>> wcs = north_up_wcs(field, 0.11 * u.arcsec, (100, 100))
+    >>> rng = np.random.default_rng(1)
+    >>> error = StdDevUncertainty(np.full((100, 100), 0.1))
+    >>> images = [
+    ...     CCDData(
+    ...         rng.normal(level, 0.1, (100, 100)),
+    ...         unit="MJy/sr",
+    ...         uncertainty=error,
+    ...         wcs=wcs,
+    ...     )
+    ...     for level in (5.0, 5.2, 5.1)
+    ... ]
+    >>> from miricigale.reduction import drizzle_images
+    >>> drizzle_images(images, wcs)
+    <Mosaic 100 x 100 pixels of 3 images>
     """
 
     image: CCDData
@@ -81,6 +97,32 @@ def pixel_map(wcs_in, wcs_out, shape):
     ------
     ValueError
         If the distortion of ``wcs_out`` cannot be inverted there.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.nddata import CCDData, StdDevUncertainty
+    >>> from miricigale.instrument import north_up_wcs
+    >>> field = SkyCoord(53, -27, unit="deg")
+    >>> wcs = north_up_wcs(field, 0.11 * u.arcsec, (100, 100))
+    >>> rng = np.random.default_rng(1)
+    >>> error = StdDevUncertainty(np.full((100, 100), 0.1))
+    >>> images = [
+    ...     CCDData(
+    ...         rng.normal(level, 0.1, (100, 100)),
+    ...         unit="MJy/sr",
+    ...         uncertainty=error,
+    ...         wcs=wcs,
+    ...     )
+    ...     for level in (5.0, 5.2, 5.1)
+    ... ]
+    >>> from miricigale.reduction import pixel_map
+    >>> finer = north_up_wcs(field, 0.055 * u.arcsec, (200, 200))
+    >>> x, y = pixel_map(wcs, finer, (100, 100))
+    >>> x[0, :3].round(2)
+    array([0.5, 2.5, 4.5])
     """
     ny, nx = shape
     smooth = not any(
@@ -130,6 +172,30 @@ def weight_map(source):
     The variance of a pixel is estimated from its own counts: weights by it would favor
     pixels that fluctuated low, and lower the mosaic by about sigma^2 / rate. It is smoothed
     by boxes of 32 pixels (their clipped modes, and medians of 3 x 3 boxes).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.nddata import CCDData, StdDevUncertainty
+    >>> from miricigale.instrument import north_up_wcs
+    >>> field = SkyCoord(53, -27, unit="deg")
+    >>> wcs = north_up_wcs(field, 0.11 * u.arcsec, (100, 100))
+    >>> rng = np.random.default_rng(1)
+    >>> error = StdDevUncertainty(np.full((100, 100), 0.1))
+    >>> images = [
+    ...     CCDData(
+    ...         rng.normal(level, 0.1, (100, 100)),
+    ...         unit="MJy/sr",
+    ...         uncertainty=error,
+    ...         wcs=wcs,
+    ...     )
+    ...     for level in (5.0, 5.2, 5.1)
+    ... ]
+    >>> from miricigale.reduction import weight_map
+    >>> print(f"{weight_map(images[0]).mean():.0f} per (MJy/sr)^2")
+    100 per (MJy/sr)^2
     """
     mask = plain_mask(source)
     variance = np.square(np.asarray(sigma(source), float))
@@ -163,6 +229,12 @@ def noise_correction(pixfrac, ratio):
     References
     ----------
     Fruchter & Hook 2002, PASP 114, 144, eqs. 9 and 10.
+
+    Examples
+    --------
+    >>> from miricigale.reduction import noise_correction
+    >>> print(f"{noise_correction(pixfrac=1.0, ratio=0.06 / 0.11):.2f}")
+    2.24
     """
     r = pixfrac / ratio
     return r / (1 - 1 / (3 * r)) if r >= 1 else 1 / (1 - r / 3)
@@ -199,6 +271,32 @@ def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None):
     ValueError
         If there are no images, they are not surface brightness of one unit and filter, or
         the output has no shape or lies elsewhere on the sky.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.nddata import CCDData, StdDevUncertainty
+    >>> from miricigale.instrument import north_up_wcs
+    >>> field = SkyCoord(53, -27, unit="deg")
+    >>> wcs = north_up_wcs(field, 0.11 * u.arcsec, (100, 100))
+    >>> rng = np.random.default_rng(1)
+    >>> error = StdDevUncertainty(np.full((100, 100), 0.1))
+    >>> images = [
+    ...     CCDData(
+    ...         rng.normal(level, 0.1, (100, 100)),
+    ...         unit="MJy/sr",
+    ...         uncertainty=error,
+    ...         wcs=wcs,
+    ...     )
+    ...     for level in (5.0, 5.2, 5.1)
+    ... ]
+    >>> from miricigale.reduction import drizzle_images
+    >>> finer = north_up_wcs(field, 0.06 * u.arcsec, (180, 180))
+    >>> mosaic = drizzle_images(images, finer)
+    >>> print(f"{np.nanmean(mosaic.image.data):.2f} MJy/sr")
+    5.10 MJy/sr
     """
     images = list(images)
     check_images(images, wcs)
@@ -221,14 +319,14 @@ def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None):
     before = np.zeros(shape, np.float32)
     for im, weight, (x, y) in zip(images, weights, pixel_maps, strict=True):
         # an image of many may reach a small part of the grid
-        part = _extent((x, y), shape)
+        part = extent_of((x, y), shape)
         weight = np.where(plain_mask(im), 0.0, np.asarray(weight) / unit_weight)
         weight = weight.astype(np.float32)
         if part is None or not weight.any():
             continue
         variance = np.square(np.asarray(sigma(im), float))
         variance = np.where(weight > 0, variance, 0.0).astype(np.float32)
-        _add(sink, im, weight, (x, y), wcs, pixfrac, data2=variance)
+        add_image(sink, im, weight, (x, y), wcs, pixfrac, data2=variance)
         n_images[part] += sink.out_wht[part] > before[part]
         before[part] = sink.out_wht[part]
 
@@ -257,7 +355,7 @@ def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None):
     return Mosaic(out, (weight * np.float32(unit_weight)).astype(np.float32), n_images)
 
 
-def _add(sink, im, weight, pixel_map, wcs, pixfrac=1.0, **planes):
+def add_image(sink, im, weight, pixel_map, wcs, pixfrac=1.0, **planes):
     """Drizzle an image onto a grid."""
     sink.add_image(
         np.where(weight > 0, im.data, 0.0).astype(np.float32),
@@ -271,83 +369,7 @@ def _add(sink, im, weight, pixel_map, wcs, pixfrac=1.0, **planes):
     )
 
 
-def reject_outliers(images, wcs, *, threshold=5.0, weights=None, pixel_maps=None):
-    """
-    Mask pixels that disagree with the other dithers.
-
-    Parameters
-    ----------
-    images : list of `~astropy.nddata.CCDData`
-        Background-subtracted images; fewer than three are returned as they are.
-    wcs : `~astropy.wcs.WCS`
-        Grid on which they are compared; best with pixels of about the detector's size.
-    threshold : float, optional
-        In sigma of the pixel (with the noise of the median).
-    weights, pixel_maps : list, optional
-        As in `drizzle_images`.
-
-    Returns
-    -------
-    images : list of `~astropy.nddata.CCDData`
-        With `DQ.OUTLIER` set and masked; ``meta["n_outliers"]`` counts them. Only
-        pixels that at least three images cover are judged.
-
-    Notes
-    -----
-    Each image is drizzled alone, the median of these is interpolated back to the pixels of
-    each image (linearly), and compared there. Beyond the noise a pixel may differ by 1.2 times the
-    steepest difference to its four neighbors in the median image: point sources are sampled
-    differently in each dither.
-
-    References
-    ----------
-    Fruchter & Hook 2002, PASP 114, 144, sec. 5 (without the second pass on neighbors).
-    """
-    images = list(images)
-    check_images(images, wcs)
-    check_positive(threshold, "threshold")
-    if len(images) < 3:
-        return images
-    weights = [weight_map(im) for im in images] if weights is None else weights
-    if pixel_maps is None:
-        pixel_maps = [pixel_map(im.wcs, wcs, im.shape) for im in images]
-    median, count = _median_of(images, wcs, weights, pixel_maps)
-    # where too few images overlap there is nothing to compare with
-    judged = count >= 3
-    share = np.where(judged, 1.5 / np.maximum(count, 1), 0.0).astype(np.float32)
-    steep = np.zeros_like(median)
-    for axis in (0, 1):
-        step = np.abs(np.diff(median, axis=axis))
-        low, high = [slice(None)] * 2, [slice(None)] * 2
-        low[axis], high[axis] = slice(None, -1), slice(1, None)
-        steep[tuple(low)] = np.fmax(steep[tuple(low)], step)
-        steep[tuple(high)] = np.fmax(steep[tuple(high)], step)
-    median = np.where(judged, median, 0.0)
-    ny, nx = median.shape
-    # between four pixels of the grid that all can be compared with
-    between = judged[:-1, :-1] & judged[:-1, 1:] & judged[1:, :-1] & judged[1:, 1:]
-    out = []
-    for im, (x, y) in zip(images, pixel_maps, strict=True):
-        column, row = (np.floor(np.nan_to_num(v, nan=-1)).astype(int) for v in (x, y))
-        inside = (column >= 0) & (column < nx - 1) & (row >= 0) & (row < ny - 1)
-        column[~inside] = row[~inside] = 0
-        coords = np.array([y, x])
-        options = {"order": 1, "mode": "constant", "cval": 0.0}
-        expected = map_coordinates(median, coords, **options)
-        slope = map_coordinates(np.nan_to_num(steep), coords, **options)
-        known = inside & between[row, column]
-        # that of the median too, of as many images as there are at this place
-        noise = sigma(im) * np.sqrt(1 + share[row, column])
-        with np.errstate(invalid="ignore"):
-            far = np.abs(im.data - expected) > threshold * noise + _DERIVATIVE * slope
-        outlier = far & known & ~plain_mask(im)
-        flagged = flag_pixels(im, outlier, DQ.OUTLIER | DQ.DO_NOT_USE)
-        flagged.meta["n_outliers"] = int(np.count_nonzero(outlier))
-        out.append(flagged)
-    return out
-
-
-def _extent(pixel_map, shape):
+def extent_of(pixel_map, shape):
     """Rows and columns of a grid that an image reaches, or None: it lies beside the grid."""
     if not overlaps(pixel_map, shape):
         return None
@@ -357,48 +379,6 @@ def _extent(pixel_map, shape):
         slice(max(0, int(low)), min(n, int(high) + 1))
         for (low, high), n in zip(ends, shape, strict=True)
     )
-
-
-def _median_of(images, wcs, weights, pixel_maps):
-    """
-    Median and number of images on each pixel of a grid, each image drizzled alone.
-
-    Each is kept where it lies and the rows are taken in strips, for a field of many pointings
-    has many images, few of which overlap.
-    """
-    shape = wcs.pixel_shape[::-1]
-    parts = []
-    for im, weight, (x, y) in zip(images, weights, pixel_maps, strict=True):
-        extent = _extent((x, y), shape)
-        if extent is not None:
-            rows, columns = extent
-            size = rows.stop - rows.start, columns.stop - columns.start
-            sink = Drizzle(kernel="square", fillval="NAN", out_shape=size, disable_ctx=True)
-            weight = np.where(plain_mask(im), 0.0, weight / (np.max(weight) or 1.0))
-            moved = x - columns.start, y - rows.start
-            _add(sink, im, weight.astype(np.float32), moved, wcs)
-            parts.append((rows, columns, sink.out_img))
-    median, count = np.full(shape, np.nan, np.float32), np.zeros(shape, np.int16)
-    for strip in chunks(shape[0], _ROWS):
-        here = [part for part in parts if part[0].start < strip.stop and part[0].stop > strip.start]
-        if not here:
-            continue
-        stack = np.full((len(here), strip.stop - strip.start, shape[1]), np.nan, np.float32)
-        for plane, (rows, columns, alone) in zip(stack, here, strict=True):
-            first, last = max(rows.start, strip.start), min(rows.stop, strip.stop)
-            own = slice(first - rows.start, last - rows.start)
-            plane[first - strip.start : last - strip.start, columns] = alone[own]
-        median[strip], count[strip] = nan_median(stack)
-    return median, count
-
-
-def nan_median(stack):
-    """Median along the first axis of what is not NaN (NaN of nothing), and how many values it has."""
-    # sorting puts NaN last
-    ordered, count = np.sort(stack, axis=0), np.isfinite(stack).sum(axis=0)
-    middle = np.maximum(count - 1, 0) // 2, np.minimum(count // 2, stack.shape[0] - 1)
-    low, high = (np.take_along_axis(ordered, i[None], axis=0)[0] for i in middle)
-    return 0.5 * (low + high), count
 
 
 def _scale(wcs):

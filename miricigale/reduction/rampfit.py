@@ -52,6 +52,18 @@ class RampFit:
     jumps : `~numpy.ndarray`, shape (n_jumps,)
         Every jump found: structured array with ``y``, ``x``, ``integration``, ``group`` (the
         first after the jump) and signed ``significance`` in sigma.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from miricigale import Detector, Exposure, Reducer
+    >>> exposure = Exposure("F770W", n_groups=20, subarray="SUB64", pointing="53 -27")
+    >>> sky = np.full(exposure.shape, 5.0) * u.MJy / u.sr
+    >>> ramp = Detector.miri_imager().expose(sky, exposure, seed=1)
+    >>> fit = Reducer().fit_groups(ramp)
+    >>> print(f"{np.nanmedian(fit.rate):.1f} +- {np.nanmedian(fit.error):.1f} DN/s")
+    14.2 +- 3.0 DN/s
     """
 
     rate: np.ndarray
@@ -178,6 +190,18 @@ def fit_groups(
     ----------
     Brandt 2024a, PASP 136, 045004; 2024b, PASP 136, 045005; Hu & O'Connell 1996, J. Phys. A
     29, 1511 (inverse of a tridiagonal Toeplitz matrix).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.reduction import DetectorMaps, fit_groups
+    >>> groups = np.zeros((1, 20, 4, 4), np.uint16)
+    >>> groups += np.arange(0, 200, 10, dtype=np.uint16)[:, None, None]
+    >>> groups[:, 12:, 2, 3] += 500  # a hit
+    >>> maps = DetectorMaps(gain=4.0, read_noise=6.0)
+    >>> fit = fit_groups(groups, maps, group_time=2.0)
+    >>> print(f"{fit.rate[2, 3]:.2f} DN/s, jump in group {fit.jumps['group'][0]}")
+    5.00 DN/s, jump in group 12
     """
     data = np.asarray(data)
     if data.ndim != 4:

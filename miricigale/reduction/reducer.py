@@ -232,7 +232,7 @@ class Reducer(Interactive):
         rates = []
         for number in progress(range(ramp.shape[0]), show=progress_bar, desc="integrations"):
             part, own = ramp.integration(number), maps.integration(number)
-            rates.append(rate_image(self, part, own, fit_slopes(self, part, own)))
+            rates.append(rate_image(self, part, own, fit_slopes(self, part, own, first=number)))
             rates[-1].image.meta["integration"] = number
         return rates if planes else [rate.image for rate in rates]
 

@@ -61,6 +61,12 @@ class ReferenceCache:
     References
     ----------
     CRDS user's guide, https://jwst-crds.stsci.edu/static/users_guide.
+
+    Examples
+    --------
+    >>> from miricigale.reduction import ReferenceCache, Reducer
+    >>> references = ReferenceCache("/data/crds", context="jwst_1364.pmap")  # doctest: +SKIP
+    >>> reducer = Reducer(references=references)  # doctest: +SKIP
     """
 
     folder: object = None

@@ -27,6 +27,17 @@ def reference_drift(data, reference):
     drift : `~numpy.ndarray`, shape (n_int, n_group)
         Mean of each group's reference pixels minus the mean over all groups, DN; zeros if
         there is no reference pixel.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.reduction import reference_drift
+    >>> reference = np.zeros((6, 16), bool)
+    >>> reference[:, :4] = True
+    >>> data = np.full((1, 3, 6, 16), 100.0)
+    >>> data[:, 2] += 6.0  # a drift in the last group
+    >>> reference_drift(data, reference)
+    array([[-2., -2.,  4.]])
     """
     columns = np.flatnonzero(reference.any(axis=0))
     if columns.size == 0:
@@ -69,6 +80,17 @@ def reference_channels(data, reference, *, origin=(0, 0)):
     References
     ----------
     JWST pipeline documentation, reference pixel correction (MIRI).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.reduction import reference_channels
+    >>> reference = np.zeros((6, 16), bool)
+    >>> reference[:, :4] = reference[:, -4:] = True
+    >>> data = np.full((1, 3, 6, 16), 100.0)
+    >>> data[:, 2] += 5.0  # a drift in the last group
+    >>> reference_channels(data, reference)[0, :, 0].tolist()
+    [[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0], [5.0, 5.0, 5.0, 5.0]]
     """
     n_int, n_group, ny, nx = data.shape
     columns = np.flatnonzero(reference.any(axis=0))

@@ -50,6 +50,13 @@ class DetectorMaps:
         Flags of pixels, bits as in `~miricigale.instrument.DQ`.
     used : dict of str to str
         The file or the constant that each came from, by the names of `ReferenceFiles`.
+
+    Examples
+    --------
+    >>> from miricigale.reduction import DetectorMaps
+    >>> maps = DetectorMaps(gain=4.0, read_noise=6.0, bias=11000.0)
+    >>> maps.gain, maps.linearity
+    (4.0, (0.0, 1.0))
     """
 
     gain: object

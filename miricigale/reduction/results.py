@@ -42,6 +42,24 @@ class ReductionResult(Interactive):
         What was subtracted from the mosaic in the second pass.
     notes : tuple of str
         What could not be done.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale import Detector, Exposure, Reducer
+    >>> from miricigale.scene import Scene
+    >>> first = Exposure("F770W", n_groups=20, subarray="SUB64", pointing="53 -27")
+    >>> star = {"id": [1], "ra": [53], "dec": [-27], "profile": ["point"]}
+    >>> star["F770W"] = [500] * u.uJy
+    >>> def exposed(exposure):
+    ...     scene = Scene(star, exposure, background="low")
+    ...     return Detector.miri_imager().collect(scene, seed=1)
+    >>> result = Reducer().run(
+    ...     [exposed(dither) for dither in first.dithered("ceers", 3)]
+    ... )
+    >>> result
+    <ReductionResult miri.f770w: 3 dithers, mosaic 96 x 121>
+    >>> path = result.write("mosaic.fits")  # doctest: +SKIP
     """
 
     rates: tuple

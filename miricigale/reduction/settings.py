@@ -36,6 +36,12 @@ class RampSettings:
     ------
     ValueError
         If an option is out of range.
+
+    Examples
+    --------
+    >>> from miricigale.reduction import RampSettings, Reducer
+    >>> Reducer(ramps=RampSettings(shower_threshold=5)).ramps.neighbor_threshold
+    10.0
     """
 
     neighbor_threshold: float | None = 10.0
@@ -74,6 +80,13 @@ class BackgroundSettings:
     ------
     ValueError
         If an option is out of range.
+
+    Examples
+    --------
+    >>> from miricigale.reduction import BackgroundSettings, Reducer
+    >>> plain = BackgroundSettings("sep", box=32, negative_noise="background")
+    >>> Reducer(background=plain).background.box
+    32
     """
 
     method: str = "masked"
@@ -126,6 +139,14 @@ class MosaicSettings:
     ------
     ValueError
         If an option is out of range.
+
+    Examples
+    --------
+    >>> from miricigale.reduction import MosaicSettings, Reducer
+    >>> Reducer(
+    ...     mosaics=MosaicSettings(pixfrac=0.8, outlier_threshold=4)
+    ... ).mosaics.pixfrac
+    0.8
     """
 
     match_sky: bool = True

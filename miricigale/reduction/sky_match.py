@@ -44,6 +44,30 @@ def sky_offsets(images, wcs, *, pixel_maps=None):
     References
     ----------
     As the method "match" of the step ``skymatch`` of the JWST pipeline, with cells in place of sky polygons.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.nddata import CCDData, StdDevUncertainty
+    >>> from miricigale.instrument import north_up_wcs
+    >>> field = SkyCoord(53, -27, unit="deg")
+    >>> wcs = north_up_wcs(field, 0.11 * u.arcsec, (100, 100))
+    >>> rng = np.random.default_rng(1)
+    >>> error = StdDevUncertainty(np.full((100, 100), 0.1))
+    >>> images = [
+    ...     CCDData(
+    ...         rng.normal(level, 0.1, (100, 100)),
+    ...         unit="MJy/sr",
+    ...         uncertainty=error,
+    ...         wcs=wcs,
+    ...     )
+    ...     for level in (5.0, 5.2, 5.1)
+    ... ]
+    >>> from miricigale.reduction import sky_offsets
+    >>> sky_offsets(images, wcs).round(2)
+    array([-0.1,  0.1,  0. ])
     """
     images = list(images)
     check_images(images, wcs)
@@ -109,6 +133,30 @@ def match_levels(images, wcs, *, pixel_maps=None):
     -------
     images : list of `~astropy.nddata.CCDData`
         Of one level where they overlap; ``meta["sky_offset"]`` is what was taken off.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.nddata import CCDData, StdDevUncertainty
+    >>> from miricigale.instrument import north_up_wcs
+    >>> field = SkyCoord(53, -27, unit="deg")
+    >>> wcs = north_up_wcs(field, 0.11 * u.arcsec, (100, 100))
+    >>> rng = np.random.default_rng(1)
+    >>> error = StdDevUncertainty(np.full((100, 100), 0.1))
+    >>> images = [
+    ...     CCDData(
+    ...         rng.normal(level, 0.1, (100, 100)),
+    ...         unit="MJy/sr",
+    ...         uncertainty=error,
+    ...         wcs=wcs,
+    ...     )
+    ...     for level in (5.0, 5.2, 5.1)
+    ... ]
+    >>> from miricigale.reduction import match_levels
+    >>> [round(float(image.data.mean()), 2) for image in match_levels(images, wcs)]
+    [5.1, 5.1, 5.1]
     """
     images = list(images)
     offsets = sky_offsets(images, wcs, pixel_maps=pixel_maps)

@@ -22,7 +22,7 @@ from miricigale.utils.exceptions import ReductionWarning, argument_error, warn
 _UNUSABLE = DQ.DO_NOT_USE | DQ.NON_SCIENCE | DQ.REFERENCE_PIXEL | DQ.DEAD
 
 
-def fit_slopes(reducer, ramp, maps, progress_bar=False):
+def fit_slopes(reducer, ramp, maps, progress_bar=False, *, first=0):
     """
     Fit the ramps of an exposure with a known detector.
 
@@ -36,6 +36,8 @@ def fit_slopes(reducer, ramp, maps, progress_bar=False):
         What the detector is taken for.
     progress_bar : bool, optional
         Whether a progress bar is shown.
+    first : int, optional
+        Which integration of the exposure the ramp begins with, from 0.
 
     Returns
     -------
@@ -55,7 +57,7 @@ def fit_slopes(reducer, ramp, maps, progress_bar=False):
     if skip_first + skip_last > n_group - 2:
         msg = f"at most {n_group - 2} groups together for {n_group} groups"
         raise argument_error("skip_first, skip_last", msg, f"{skip_first}, {skip_last}")
-    drift = _anomaly(reducer, ramp, maps)
+    drift = _anomaly(reducer, ramp, maps, first)
     if reducer.backend == "jwst":
         offsets = np.broadcast_to(drift, (exposure.n_integrations, n_group))
         fit = fit_steps(reducer, ramp, maps, reset=offsets, skipped=(skip_first, skip_last))
@@ -140,7 +142,7 @@ def _drift(reducer, ramp, reference, drift):
     return np.broadcast_to(drift, ramp.shape[:2])[:, :, None, None] + found
 
 
-def _anomaly(reducer, ramp, maps):
+def _anomaly(reducer, ramp, maps, first):
     """Offset of each group after a reset, DN, in addition to that of the references."""
     exposure, anomaly, left = ramp.exposure, reducer.reset_anomaly, []
     if ramp.shows(ResetDecay) and exposure.n_integrations > 1:
@@ -153,4 +155,6 @@ def _anomaly(reducer, ramp, maps):
             f"give it {remedy}'skip_first' groups to be left out"
         )
         warn(msg, ReductionWarning)
-    return 0.0 if anomaly is None else anomaly.offsets(exposure.n_integrations, exposure.n_groups)
+    if anomaly is None:
+        return 0.0
+    return anomaly.offsets(first + exposure.n_integrations, exposure.n_groups)[first:]

@@ -1,8 +1,8 @@
 from .check import ResourceState as ResourceState
 from .check import check_resources as check_resources
-from .locate import cache_folder as cache_folder
-from .locate import find_resource as find_resource
-from .locate import locate as locate
+from .lookup import cache_folder as cache_folder
+from .lookup import find_resource as find_resource
+from .lookup import locate as locate
 from .registry import Registry as Registry
 from .registry import Resource as Resource
 from .registry import citations as citations

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from miricigale.refdata.locate import file_sha256, find_place, stored_record
+from miricigale.refdata.lookup import file_sha256, find_place, stored_record
 from miricigale.refdata.registry import resources
 from miricigale.utils.exceptions import DataError
 
@@ -23,6 +23,13 @@ class ResourceState(NamedTuple):
         Path, or source if absent.
     message : str
         What is wrong, or empty.
+
+    Examples
+    --------
+    >>> from miricigale.refdata import check_resources
+    >>> state = next(row for row in check_resources() if row.name == "ssp.bc03")
+    >>> state.state
+    'ok'
     """
 
     name: str
@@ -47,6 +54,12 @@ def check_resources():
     -------
     rows : list of `ResourceState`
         One for each record.
+
+    Examples
+    --------
+    >>> from miricigale.refdata import check_resources
+    >>> [row.name for row in check_resources() if row.bad]
+    []
     """
     return [_state(record) for record in resources().values()]
 

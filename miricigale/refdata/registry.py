@@ -38,6 +38,13 @@ class Resource:
         ISO date.
     notes : str, optional
         Accuracy, caveats.
+
+    Examples
+    --------
+    >>> from miricigale.refdata import resource
+    >>> one = resource("torus.skirtor2016")
+    >>> one.kind, one.citation
+    ('user', 'Stalevski et al. 2012, MNRAS 420, 2756; Stalevski et al. 2016, MNRAS 458, 2288')
     """
 
     name: str
@@ -61,6 +68,12 @@ def resources():
     Returns
     -------
     records : dict of str to `Resource`
+
+    Examples
+    --------
+    >>> from miricigale.refdata import resources
+    >>> sorted(resources())[:3]
+    ['catalog.goodss', 'dust.dale2014', 'dust.dl07']
     """
     text = (importlib_resources.files("miricigale.refdata") / "resources.toml").read_text("utf-8")
     return {name: Resource(name=name, **entry) for name, entry in tomllib.loads(text).items()}
@@ -74,6 +87,12 @@ def resource(name):
     ------
     KeyError
         If there is no such resource; the message lists the known ones.
+
+    Examples
+    --------
+    >>> from miricigale.refdata import resource
+    >>> resource("ssp.bc03").kind
+    'bundled'
     """
     try:
         return resources()[name]
@@ -82,7 +101,15 @@ def resource(name):
 
 
 def citations(*names):
-    """What to cite for the named resources, as a sorted list without repeats."""
+    """
+    What to cite for the named resources, as a sorted list without repeats.
+
+    Examples
+    --------
+    >>> from miricigale.refdata import citations
+    >>> citations("igm.inoue2014")
+    ['Inoue et al. 2014, MNRAS 442, 1805']
+    """
     return sorted({resource(name).citation for name in names})
 
 
@@ -94,6 +121,14 @@ class Registry:
     ----------
     kind : str
         What is registered, for messages ("filter").
+
+    Examples
+    --------
+    >>> from miricigale.refdata import Registry
+    >>> registry = Registry("color")
+    >>> registry.register("red", lambda name: (1, 0, 0), citation="none")
+    >>> registry.names(), registry.get("red")
+    (['red'], (1, 0, 0))
     """
 
     def __init__(self, kind):

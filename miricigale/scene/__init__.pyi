@@ -6,6 +6,8 @@ from .catalog import check_catalog as check_catalog
 from .catalog_files import read_catalog as read_catalog
 from .cutouts import Cutout as Cutout
 from .deconvolution import deconvolve as deconvolve
+from .example import ExampleField as ExampleField
+from .example import example_field as example_field
 from .highres import depth_to_rms as depth_to_rms
 from .highres import highres_image as highres_image
 from .render import Painter as Painter

@@ -33,6 +33,16 @@ class Background:
     ------
     ValueError
         If the level is negative or not finite.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.scene import Background
+    >>> tilted = Background(5 * u.MJy / u.sr, gradient=0.05 / u.arcmin)
+    >>> tilted.level
+    <Quantity 5. MJy / sr>
+    >>> Background.low_zodi("F770W").level.round(2)
+    <Quantity 4.93 MJy / sr>
     """
 
     level: u.Quantity

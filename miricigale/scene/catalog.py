@@ -48,7 +48,18 @@ PROFILES = ("sersic", "point", "cutout")
 
 
 class CatalogFlags(Flags):
-    """What is wrong with a row of a catalog; the row is kept."""
+    """
+    What is wrong with a row of a catalog; the row is kept.
+
+    Examples
+    --------
+    >>> from miricigale.scene import CatalogFlags, read_catalog
+    >>> CatalogFlags.names(CatalogFlags.NO_FLUX)
+    ['no_flux']
+    >>> catalog = read_catalog("catalog.goodss")
+    >>> CatalogFlags.names(int(max(catalog["flags"])))
+    ['no_redshift']
+    """
 
     BAD_RADIUS = 1  # a Sersic profile without a positive radius: drawn as a point
     BAD_INDEX = 2  # index outside the range that profiles are made for: drawn as a point
@@ -90,6 +101,15 @@ def as_sources(data, filter, argument="catalog"):
     -------
     table : `~astropy.table.QTable`
         A copy.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.table import Table
+    >>> from miricigale.scene import as_sources
+    >>> table = Table({"ID": [1], "F770W": [3] * u.uJy, "re": [0.4] * u.arcsec})
+    >>> as_sources(table, "miri.f770w").colnames
+    ['id', 'miri.f770w', 'half_light_radius']
     """
     table = QTable(as_photometry(data, [filter], argument), copy=True)
     for ours, others in _OTHER_NAMES.items():
@@ -137,6 +157,21 @@ def check_catalog(table, *, filters=(), wcs=None, argument="catalog"):
     -----
     `~miricigale.utils.exceptions.CatalogWarning`
         If there is no column ``profile``, with the number of sources that are points.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.table import QTable
+    >>> from miricigale.scene import check_catalog
+    >>> table = QTable({"id": [1, 2], "ra": [53.1, 53.2], "dec": [-27.8, -27.9]})
+    >>> table["miri.f770w"] = [3e-6, 5e-6] * u.Jy
+    >>> table["profile"] = "point"
+    >>> check_catalog(table)["id", "miri.f770w", "profile", "flags"].pprint()
+     id miri.f770w profile flags
+           uJy
+    --- ---------- ------- -----
+      1        3.0   point    16
+      2        5.0   point    16
     """
     if not isinstance(table, Table):
         raise argument_error(argument, "a table", type(table).__name__)

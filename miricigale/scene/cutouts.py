@@ -47,6 +47,16 @@ class Cutout(Frozen):
     -----
     The stamp is taken for the light outside the telescope: the scene's PSF blurs it once
     more. A stamp of another telescope brings that one's PSF, and its noise, with it.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from miricigale.scene import Cutout
+    >>> y, x = np.mgrid[-20:21, -20:21]
+    >>> light = np.exp(-np.hypot(x, y) / 4)
+    >>> Cutout(light, pixel_scale=0.06 * u.arcsec, angle=30 * u.deg)
+    <Cutout 41 x 41 pixels of 0.06 arcsec, angle 30 deg>
     """
 
     data: np.ndarray

@@ -35,6 +35,16 @@ def deconvolve(image, psf, *, max_gain=3.0):
     ValueError
         If an array is not finite and two-dimensional, the PSF has an even side or no light, or
         ``max_gain`` is below 1.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.scene import deconvolve
+    >>> y, x = np.mgrid[-30:31, -30:31]
+    >>> wide, psf = (np.exp(-0.5 * (x**2 + y**2) / s**2) for s in (5.0, 2.0))
+    >>> sharp = deconvolve(wide, psf)
+    >>> print(f"width {np.sqrt(sharp.sum() / (2 * np.pi * sharp.max())):.2f} pixels")
+    width 4.58 pixels
     """
     image, psf = (np.asarray(array, dtype=float) for array in (image, psf))
     for name, array in (("image", image), ("psf", psf)):

@@ -77,6 +77,19 @@ def highres_image(catalog, *, filter="wfc3.f160w", wcs, psf, depth=_DEPTH, seed=
     References
     ----------
     Stefanon et al. 2017, ApJS 229, 32 (depth of the CANDELS/EGS F160W image).
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.instrument import north_up_wcs
+    >>> from miricigale.psf import filter_psf
+    >>> from miricigale.scene import highres_image, read_catalog
+    >>> catalog = read_catalog("catalog.goodss")
+    >>> wcs = north_up_wcs(catalog["sky"][600], 0.06 * u.arcsec, (100, 100))
+    >>> psf = filter_psf("wfc3.f160w", pixel_scale=0.06 * u.arcsec, pa=0 * u.deg)
+    >>> image = highres_image(catalog, wcs=wcs, psf=psf, depth=27.6 * u.ABmag, seed=1)
+    >>> print(image.shape, image.unit)
+    (100, 100) MJy / sr
     """
     scene = Scene(catalog, filter=filter, wcs=wcs, psf=psf, **options)
     image = scene.render()

@@ -44,6 +44,27 @@ class Painter:
         Largest semi-major axis of that isophote in pixels.
     n_threads : int, optional
         Threads; as many as there are processors if not given. The image does not depend on it.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from miricigale.psf import miri_psf
+    >>> from miricigale.scene import Painter
+    >>> painter = Painter((64, 64), miri_psf("F770W", fov=4 * u.arcsec))
+    >>> places = {
+    ...     "x": np.array([31.0]),
+    ...     "y": np.array([31.0]),
+    ...     "flux": np.array([100.0]),
+    ... }
+    >>> shapes = {
+    ...     name: np.array([1.0]) for name in ("r_eff", "n", "axis_ratio", "theta")
+    ... }
+    >>> image, in_image, kept = painter.paint(
+    ...     **places, is_sersic=np.array([False]), **shapes
+    ... )
+    >>> print(f"{image.sum():.1f} of 100")
+    90.5 of 100
     """
 
     shape: tuple

@@ -35,7 +35,15 @@ _UJY_TO_MJY = 1e-12
 
 
 class SceneFlags(Flags):
-    """What happened to a source on its way into an image."""
+    """
+    What happened to a source on its way into an image.
+
+    Examples
+    --------
+    >>> from miricigale.scene import SceneFlags
+    >>> SceneFlags.names(SceneFlags.CUT_PROFILE)
+    ['cut_profile']
+    """
 
     OUTSIDE_IMAGE = 1  # its center is on no pixel
     NEAR_EDGE = 2  # its center is on the image, but less than 95 % of its painted light
@@ -102,6 +110,20 @@ class Scene(Interactive):
     painted on one grid with the oversampling of the PSF and convolved once. Fluxes are
     conserved: ``sum(brightness * pixel area)`` of the image less its background is the sum
     of ``flux_in_image`` of the truth.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale import Exposure
+    >>> from miricigale.scene import Scene
+    >>> exposure = Exposure("F770W", n_groups=50, subarray="SUB64", pointing="53 -27")
+    >>> star = {"id": [1], "ra": [53], "dec": [-27], "profile": ["point"]}
+    >>> star["F770W"] = [20] * u.uJy
+    >>> scene = Scene(star, exposure, background="low")
+    >>> scene
+    <Scene miri.f770w: 1 sources on 72 x 64 pixels>
+    >>> print(f"{scene.truth['flux_in_image'][0]:.1f}")
+    18.9 uJy
     """
 
     def __init__(
@@ -437,7 +459,7 @@ class Scene(Interactive):
         if sources:
             shown = (truth["flags"] & int(SceneFlags.OUTSIDE_IMAGE)) == 0
             marks = truth["x"][shown], truth["y"][shown]
-        label = f"{self._filter} [MJy/sr]"
+        label = f"{self._filter} (MJy / sr)"
         image = self.render().data
         if self._background is not None and not background:
             image = image - self._background.image(self._wcs, self._shape)

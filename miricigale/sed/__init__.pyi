@@ -1,6 +1,7 @@
 from . import components as components
 from .component import ROLES as ROLES
 from .component import Component as Component
+from .component import register as register
 from .derived import DERIVED as DERIVED
 from .derived import Derived as Derived
 from .foreground import GalacticExtinction as GalacticExtinction

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import astropy.units as u
 
 from miricigale.refdata import Registry, locate
-from miricigale.refdata.locate import fingerprint_of
+from miricigale.refdata.lookup import fingerprint_of
 from miricigale.sed.parameter import Parameter
 from miricigale.utils.exceptions import ConfigError, argument_error, config_error
 
@@ -28,6 +28,22 @@ def register(cls):
     ------
     ValueError
         If it has no name, no known role, or the name of another component.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.sed import COMPONENTS, Parameter, register
+    >>> from miricigale.sed.components import Attenuation
+    >>> @register
+    ... class Gray(Attenuation):
+    ...     name = "gray_example"
+    ...     tau = Parameter(0.5, (0.0, 10.0), "Optical depth at all wavelengths.")
+    ...
+    ...     def factors(self, wave, values):
+    ...         factor = np.full(wave.shape, np.exp(-values["tau"]))
+    ...         return factor, factor
+    >>> COMPONENTS.get("gray_example")(tau=1.0)
+    Gray(tau=1)
     """
     if not cls.name:
         raise argument_error("name", "a name", f"{cls.name!r} of {cls.__name__}")
@@ -67,6 +83,15 @@ class Component:
         If a name is neither a parameter nor an option.
     ValueError
         If a value is outside its bounds or not one of the option's.
+
+    Examples
+    --------
+    >>> from miricigale.sed.components import DraineLi2007
+    >>> dust = DraineLi2007(q_pah=1.12)
+    >>> dust
+    DraineLi2007(u_min=1, gamma=0.02, q_pah=1.12)
+    >>> dust.parameters["q_pah"].bounds
+    (0.47, 4.58)
     """
 
     name = ""

@@ -11,7 +11,15 @@ from miricigale.utils.units import LUMINOSITY, MASS
 
 @dataclass(frozen=True)
 class Derived:
-    """One derived quantity: unit, description, whether it scales with mass, and of what."""
+    """
+    One derived quantity: unit, description, whether it scales with mass, and of what.
+
+    Examples
+    --------
+    >>> from miricigale.sed import DERIVED
+    >>> DERIVED["sfr_100myr"].unit, DERIVED["l_6um"].text
+    (Unit("solMass / yr"), 'nu L_nu of the AGN at 6 um, as seen')
+    """
 
     unit: u.UnitBase
     text: str

@@ -144,6 +144,15 @@ class GalacticExtinction(Component):
     ------
     ValueError
         If the law is not defined for the default of ``r_v``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.sed import GalacticExtinction
+    >>> dust = GalacticExtinction()
+    >>> light = dust.transmission(np.array([0.55, 7.7]), {"ebv_galactic": 0.1, "r_v": 3.1})
+    >>> (-2.5 * np.log10(light)).round(3)  # magnitudes
+    array([0.31 , 0.009])
     """
 
     name = "galactic_extinction"
@@ -256,6 +265,17 @@ def color_excess(sky, dust_map, *, scale=1.0):
     ------
     ValueError
         If the map has no number, or a negative one, at a position; the message says how many.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.coordinates import SkyCoord
+    >>> from miricigale.sed import color_excess
+    >>> class Everywhere:
+    ...     def query(self, sky):
+    ...         return 0.01 + 0.0 * sky.ra.deg
+    >>> color_excess(SkyCoord([53.1, 53.2], [-27.8, -27.9], unit="deg"), Everywhere(), scale=0.86)
+    <Quantity [0.0086, 0.0086] mag>
     """
     if not hasattr(dust_map, "query"):
         raise argument_error("dust_map", "a map with a method query(sky)", type(dust_map).__name__)
@@ -363,6 +383,15 @@ def deredden(photometry, ebv, filters, *, law="G23", r_v=3.1, sed=None, beyond="
         many as rows, or if the meta say that the table is corrected already.
     `~astropy.units.UnitsError`
         If a flux or an error is in magnitudes or in no unit.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.table import QTable
+    >>> from miricigale.sed import deredden
+    >>> table = QTable({"acs.f606w": [1.0, 2.0] * u.uJy})
+    >>> deredden(table, [0.01, 0.1] * u.mag, ["acs.f606w"])["acs.f606w"].round(3)
+    <Quantity [1.027, 2.612] uJy>
     """
     bands = FilterSet(filters)
     if not isinstance(photometry, Table):

@@ -120,6 +120,17 @@ class ModelGrid(Frozen):
     ------
     ValueError
         If shapes, order or ranges do not agree.
+
+    Examples
+    --------
+    >>> from miricigale import SEDModel
+    >>> model = SEDModel.yang2021(libraries="bundled")
+    >>> axes = {"redshift": [0.5, 1.0], "age": [1.0, 3.0], "frac_agn": [0.0, 0.5]}
+    >>> grid = model.grid(axes, ["miri.f770w", "miri.f1500w"], cache=False)
+    >>> grid
+    <ModelGrid 2 redshifts x 2 galaxies x 1 AGN x 2 fractions, 2 bands, 8 models>
+    >>> (1e10 * grid.flux(z=1, galaxy=0, agn=0, frac=1)).round(2)  # uJy for 1e10 Msun formed
+    array([ 21.95, 135.24])
     """
 
     filters: tuple

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from miricigale.filters import filter as filter_curves
-from miricigale.refdata.locate import cache_folder, fingerprint_of
+from miricigale.refdata.lookup import cache_folder, fingerprint_of
 from miricigale.sed import chain
 from miricigale.sed.grid import ModelGrid
 from miricigale.utils.configuration import conf

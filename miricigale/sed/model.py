@@ -116,6 +116,13 @@ class SEDModel(Interactive):
         ------
         `~miricigale.utils.exceptions.ConfigError`
             If a key, component or parameter is unknown.
+
+        Examples
+        --------
+        >>> from miricigale import SEDModel
+        >>> parts = [{"name": "delayed", "tau": 0.5}, {"name": "bc03"}, {"name": "smc"}]
+        >>> SEDModel.from_dict({"components": parts})
+        <SEDModel delayed -> bc03 -> smc>
         """
         parts, options = read_config(config)
         try:
@@ -150,6 +157,12 @@ class SEDModel(Interactive):
             ``meta["libraries"]`` says which and why.
         **options
             ``frac_agn_definition`` and ``cosmology``, as for the class.
+
+        Examples
+        --------
+        >>> from miricigale import SEDModel
+        >>> SEDModel.yang2021(libraries="bundled", igm="inoue2014")
+        <SEDModel delayed -> bc03 -> calzetti -> dl07_alpha -> parametric_torus -> inoue2014>
         """
         return cls._preset(
             presets.yang2021_components(agn=agn, xray=xray, igm=igm, libraries=libraries), options
@@ -168,6 +181,12 @@ class SEDModel(Interactive):
         ----------
         agn, igm, libraries, **options
             As for `yang2021`.
+
+        Examples
+        --------
+        >>> from miricigale import SEDModel
+        >>> SEDModel.survey(libraries="bundled", agn=False)
+        <SEDModel delayed -> bc03 -> nebular -> calzetti -> dl07 -> meiksin2006>
         """
         return cls._preset(
             presets.survey_components(agn=agn, igm=igm, libraries=libraries), options
@@ -343,6 +362,16 @@ class SEDModel(Interactive):
         ------
         KeyError, ValueError
             See `values`.
+
+        Examples
+        --------
+        >>> from miricigale import SEDModel
+        >>> model = SEDModel.yang2021(libraries="bundled")
+        >>> sed = model.evaluate(age=3.0, ebv=0.2, frac_agn=0.3, redshift=1.0, mass=3e10)
+        >>> sorted(sed.components)
+        ['agn_disk', 'agn_polar', 'agn_torus', 'dust', 'stellar', 'stellar_intrinsic']
+        >>> print(f"{sed.derived['sfr_100myr']:.2f}")
+        5.79 solMass / yr
         """
         return tables.spectra(self, self.values(parameters))
 
@@ -382,6 +411,14 @@ class SEDModel(Interactive):
         -----
         `~miricigale.utils.exceptions.ModelWarning`
             If a column's name is within a letter or two of a parameter's.
+
+        Examples
+        --------
+        >>> from miricigale import SEDModel
+        >>> model = SEDModel.yang2021(libraries="bundled")
+        >>> rows = {"redshift": [0.5, 1.0], "age": [3.0, 3.0], "ebv": [0.1, 0.3]}
+        >>> model.fluxes(rows, ["miri.f770w"])["miri.f770w"].round(2)
+        <Quantity [6.57, 2.42] uJy>
         """
         return tables.flux_table(self, table, self._bands(filters))
 
@@ -411,6 +448,14 @@ class SEDModel(Interactive):
             If an axis is not a parameter.
         ValueError
             If values do not ascend, are outside their bounds or not in the library.
+
+        Examples
+        --------
+        >>> from miricigale import SEDModel
+        >>> model = SEDModel.yang2021(libraries="bundled")
+        >>> axes = {"redshift": [0.5, 1.0], "ebv": [0.1, 0.3, 0.5]}
+        >>> model.grid(axes, ["miri.f770w"], cache=False)
+        <ModelGrid 2 redshifts x 3 galaxies x 0 AGN x 1 fractions, 1 bands, 6 models>
         """
         axes = gridding.check_axes(self, axes)
         filters = self._bands(filters)

@@ -31,6 +31,14 @@ class Parameter:
     ------
     ValueError
         If the default is outside the bounds.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.sed import Parameter
+    >>> age = Parameter(1.0, (0.001, 13.7), "Age of the galaxy.", unit="Gyr")
+    >>> age.check(300 * u.Myr)
+    0.3
     """
 
     def __init__(self, default, bounds, doc, *, unit=""):

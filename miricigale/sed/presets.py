@@ -120,6 +120,13 @@ def yang2021_axes(kind="fit"):
     -------
     axes : dict of str to `~numpy.ndarray`
         In the units of the parameters (Gyr, mag, K); to be changed at will.
+
+    Examples
+    --------
+    >>> from miricigale.sed import yang2021_axes
+    >>> axes = yang2021_axes("quick")
+    >>> axes["tau"], axes["frac_agn"]
+    (array([0.1, 1. , 5. ]), array([0.  , 0.2 , 0.4 , 0.6 , 0.8 , 0.99]))
     """
     if kind not in ("fit", "galaxy", "quick"):
         raise argument_error("kind", "'fit', 'galaxy' or 'quick'", repr(kind))
@@ -139,6 +146,13 @@ def survey_axes():
     -------
     axes : dict of str to `~numpy.ndarray`
         In the units of the parameters (Gyr, mag, K); to be changed at will.
+
+    Examples
+    --------
+    >>> from miricigale.sed import survey_axes
+    >>> axes = survey_axes()
+    >>> axes["tau"], axes["f_burst"], axes["redshift"].size
+    (array([0.1, 0.5, 3. ]), array([0.  , 0.03, 0.3 ]), 104)
     """
     return _values("survey_axes")
 
@@ -157,6 +171,13 @@ def survey_priors():
     -------
     priors : dict of str to `~numpy.ndarray`
         Weights of the values of each axis.
+
+    Examples
+    --------
+    >>> from miricigale.sed import survey_priors
+    >>> survey_priors()["frac_agn"]
+    array([8.018e-01, 1.079e-01, 5.650e-02, 2.260e-02, 8.100e-03, 2.800e-03,
+           3.000e-04])
     """
     return _values("survey_priors")
 
@@ -173,6 +194,13 @@ def quasar_axes():
     -------
     axes : dict of str to `~numpy.ndarray`
         In the units of the parameters (Gyr, mag, deg, K); to be changed at will.
+
+    Examples
+    --------
+    >>> from miricigale.sed import quasar_axes
+    >>> axes = quasar_axes()
+    >>> axes["ebv_polar"], axes["frac_agn"]
+    (array([0.  , 0.05, 0.1 , 0.2 , 0.4 ]), array([0.7  , 0.85 , 0.93 , 0.97 , 0.99 , 0.997]))
     """
     return _values("quasar_axes")
 

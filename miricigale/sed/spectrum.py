@@ -206,6 +206,13 @@ class SED(Frozen, Interactive):
         Returns
         -------
         sed : `SED`
+
+        Examples
+        --------
+        >>> from miricigale import SEDModel
+        >>> sed = SEDModel.yang2021(libraries="bundled")(redshift=0.5, mass=1e10)
+        >>> sed.redshifted(2.0).synthetic_flux("F1500W").round(2)
+        <Quantity 1.67 uJy>
         """
         stretch = (1.0 + redshift) / (1.0 + self.redshift)
         ratio = distance(self.redshift, cosmology) / distance(redshift, cosmology)

@@ -25,12 +25,22 @@ BLOCK = 128  # rows worked out together: their spectra fit into the processor's 
 
 
 class ModelFlags(Flags):
-    """Why a model could not be evaluated."""
+    """
+    Why a model could not be evaluated.
 
-    NOT_FINITE = 1
-    OUT_OF_BOUNDS = 2
-    OLDER_THAN_UNIVERSE = 4
-    NOT_IN_LIBRARY = 8
+    Examples
+    --------
+    >>> from miricigale.sed import ModelFlags
+    >>> ModelFlags.OLDER_THAN_UNIVERSE.value
+    4
+    >>> ModelFlags.names(20)
+    ['older_than_universe', 'not_covered']
+    """
+
+    NOT_FINITE = 1  # A parameter is NaN or infinite.
+    OUT_OF_BOUNDS = 2  # A parameter is outside its declared bounds.
+    OLDER_THAN_UNIVERSE = 4  # The stars are older than the universe at this redshift.
+    NOT_IN_LIBRARY = 8  # The library of spectra has no entry for these parameters.
     NOT_COVERED = 16
     """A band reaches beyond the spectrum; it alone is NaN."""
     NO_AGN_POWER = 32

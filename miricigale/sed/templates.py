@@ -29,7 +29,7 @@ _END = 0.95
 
 
 def read_spectra(path):
-    """
+    r"""
     Read spectra, such as those of a library of stars.
 
     Parameters
@@ -50,6 +50,15 @@ def read_spectra(path):
     ------
     `~miricigale.utils.exceptions.DataError`
         If there is no file, one is no spectrum or lacks values, or two have the same name but for their suffix.
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> from miricigale.sed import read_spectra
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "star.txt"  # Angstrom, F_lambda
+    >>> _ = path.write_text("4000 2e-15\n20000 5e-16\n300000 1e-20\n")
+    >>> read_spectra(path)
+    {'star': <SED 3 points, 0.4 um to 30 um, redshift 0>}
     """
     path = Path(path).expanduser()
     files = [path]
@@ -132,6 +141,19 @@ def template_grid(spectra, filters, *, beyond="error"):
     -----
     `~miricigale.utils.exceptions.ModelWarning`
         Of spectra that are continued.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from miricigale.sed import SED, template_grid
+    >>> wave = np.geomspace(0.3, 40.0, 500) * u.um
+    >>> spectra = {f"slope {s}": SED(wave, wave.value**s * u.uJy) for s in (-2, 0, 2)}
+    >>> grid = template_grid(spectra, ["wfc3.f160w", "miri.f770w"])
+    >>> grid.meta["templates"], grid.galaxy[0].round(3)
+    (['slope -2', 'slope 0', 'slope 2'], array([[1.921, 0.079],
+           [1.   , 1.   ],
+           [0.078, 1.922]]))
     """
     if beyond not in ("error", "rayleigh-jeans"):
         raise argument_error("beyond", "'error' or 'rayleigh-jeans'", repr(beyond))

@@ -213,6 +213,16 @@ class XRay(Component):
     linear in luminosity: it takes that of the whole galaxy, not of a solar mass.
 
     Yang et al. 2021 have Gamma 1.8, 0.5-7 keV and ``xray_transmission`` 0.5.
+
+    Examples
+    --------
+    >>> from miricigale import SEDModel
+    >>> from miricigale.sed import XRay
+    >>> paper = SEDModel.yang2021(libraries="bundled")
+    >>> model = SEDModel([*paper.components, XRay(xray_transmission=0.5)])
+    >>> flux = model.derived(frac_agn=0.4, redshift=2.0, mass=3e10)["xray_flux"]
+    >>> print(f"{flux.to('erg / (s cm2)'):.2g}")
+    1.2e-15 erg / (s cm2)
     """
 
     name = "xray"

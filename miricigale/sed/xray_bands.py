@@ -142,6 +142,17 @@ def with_xray_bands(grid, model, bands, *, alpha_ox=ALPHA_OX, **options):
     ----------
     Yang et al. 2020, MNRAS 491, 740; Yang et al. 2022, ApJ 927, 192 (X-CIGALE); Mezcua et al. 2018, MNRAS 478,
     2576; Mineo et al. 2012, MNRAS 426, 1870; Just et al. 2007, ApJ 665, 1004.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale import SEDModel
+    >>> from miricigale.sed import with_xray_bands
+    >>> model = SEDModel.yang2021(libraries="bundled")
+    >>> axes = {"redshift": [1.0], "frac_agn": [0.0, 0.5]}
+    >>> grid = model.grid(axes, ["miri.f770w"], cache=False)
+    >>> with_xray_bands(grid, model, {"chandra_hard": [2, 7] * u.keV}).filters
+    ('miri.f770w', 'chandra_hard')
     """
     energies = {name: check_band(band, f"bands[{name!r}]") for name, band in bands.items()}
     taken = set(energies) & set(grid.filters)

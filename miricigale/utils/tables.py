@@ -43,7 +43,8 @@ class Flags(enum.IntFlag):
         for member in cls:
             before = re.search(rf"((?: *#: .*\n)+) *{member.name} = ", source)
             after = re.search(rf'\b{member.name} = [^\n]*\n *"""(.*?)"""', source, flags=re.DOTALL)
-            text = (before or after)[1] if before or after else ""
+            beside = re.search(rf"\b{member.name} = [^\n#]*# (.*)", source)
+            text = next((one[1] for one in (before, after, beside) if one), "")
             plain = text.replace("#:", "").replace("``", "")
             found[member.value] = member.name.lower().replace("_", " "), " ".join(plain.split())
         return found

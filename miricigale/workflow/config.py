@@ -41,6 +41,15 @@ class StudyConfig(Configuration):
     ------
     `~miricigale.utils.exceptions.ConfigError`
         If lists that belong together have different lengths.
+
+    Examples
+    --------
+    >>> from miricigale.workflow import StudyConfig, load_config
+    >>> config = load_config("goodss")
+    >>> config.highres.filter, config.fit.min_detected
+    ('wfc3.f160w', 2)
+    >>> print(config.to_toml().splitlines()[0])
+    # miricigale run configuration; 'miricigale run FILE' takes it back
     """
 
     heading: ClassVar = "# miricigale run configuration; 'miricigale run FILE' takes it back"
@@ -120,7 +129,15 @@ class StudyConfig(Configuration):
 
 
 def preset_names():
-    """Names of the configurations that come with the package."""
+    """
+    Names of the configurations that come with the package.
+
+    Examples
+    --------
+    >>> from miricigale.workflow import preset_names
+    >>> preset_names()
+    ['goodss', 'yang2021']
+    """
     folder = resources.files("miricigale.workflow") / "presets"
     names = (Path(entry.name) for entry in folder.iterdir() if entry.name.endswith(".toml"))
     return sorted(path.stem for path in names if "." not in path.stem)
@@ -150,6 +167,13 @@ def load_config(source, *, quick=False, overrides=None):
         If the file is missing, not TOML, or holds an unknown or wrong key.
     KeyError
         If there is no such preset.
+
+    Examples
+    --------
+    >>> from miricigale.workflow import load_config
+    >>> config = load_config("goodss", quick=True, overrides={"sed": {"frac_agn": 0.4}})
+    >>> config.exposures.plan, config.sed.frac_agn
+    ('quick', (0.4,))
     """
     source = str(source)
     if source.endswith(".toml"):

@@ -23,6 +23,13 @@ def disk_use(config):
     -------
     n_bytes : dict of str to int
         By stage, all units together; stages of small tables only are left out.
+
+    Examples
+    --------
+    >>> from miricigale.workflow import disk_use, load_config
+    >>> use = disk_use(load_config("goodss", quick=True))
+    >>> print(f"{sum(use.values()) / 1e6:.0f} MB")
+    261 MB
     """
     exposures, truths = study_exposures(config), len(study_truths(config))
     pixels = {name: math.prod(e.shape) for name, e in exposures.items()}
@@ -36,7 +43,7 @@ def disk_use(config):
     n, n_imaged = len(catalog), _n_imaged(config, catalog, native)
     n_redshifts = len(np.unique(np.round(np.asarray(catalog["redshift"], float) / REDSHIFT_STEP)))
     pictured = min(n_imaged, config.report.pictures)
-    # bytes for each pixel and source, measured (docs/guide/workflow.rst)
+    # bytes for each pixel and source, measured (docs/accuracy/running.rst)
     exposed = 3.5 * sum(pixels.values())
     if config.run.keep_level1b:
         # counts, the planes that only a simulation knows, and slopes

@@ -37,6 +37,11 @@ def check_study(config):
     `~miricigale.utils.exceptions.ConfigError`
         If a filter is unknown, a file is missing, the high-resolution image has no PSF, the sky fills the
         well, or fewer than `MIN_SOURCES` sources of the catalog fall in the field.
+
+    Examples
+    --------
+    >>> from miricigale.workflow import check_study, load_config
+    >>> check_study(load_config("goodss", quick=True))
     """
     for key in ("cutouts", "cutouts_psf"):
         path = getattr(config.perturb, key)
@@ -112,6 +117,12 @@ def run_study(config, folder, **options):
         If the folder is another's, in use, or on a disk that is too full.
     `~miricigale.utils.exceptions.ConfigError`, KeyError, ValueError
         If the configuration names what does not exist or leaves nothing to do.
+
+    Examples
+    --------
+    >>> from miricigale.workflow import load_config, run_study  # doctest: +SKIP
+    >>> config = load_config("goodss", quick=True)  # doctest: +SKIP
+    >>> run_study(config, "goodss-quick", until="mosaics")  # doctest: +SKIP
     """
     check_study(config)
     options = {"disk": disk_use(config), "prepare": compile_missing, **options}

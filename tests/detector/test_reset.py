@@ -131,6 +131,18 @@ def test_the_rate_does_not_know_of_them(make_exposure, make_sky, band, n_groups,
     assert abs(np.nanmean(left.rate) / np.mean(clean.rate[good]) - 1) > 5e-3
 
 
+def test_each_integration_has_its_own_anomaly(make_exposure, make_sky):
+    exposure = make_exposure(n_groups=12, n_integrations=3)
+    anomaly = ResetAnomaly(amplitudes=(-60.0, -20.0, 10.0))
+    sky = make_sky(exposure, 300.0)
+    clean = Reducer().fit_integrations(noiseless().expose(sky, exposure, seed=1))
+    ramp = noiseless(anomaly).expose(sky, exposure, seed=1)
+    for rate, wanted in zip(
+        Reducer(reset_anomaly=anomaly).fit_integrations(ramp), clean, strict=True
+    ):
+        assert_allclose(np.nanmedian(rate.data), np.nanmedian(wanted.data), rtol=3e-3)
+
+
 def test_an_anomaly_that_stays_is_told(make_exposure, make_sky):
     exposure = make_exposure(n_groups=5)
     detector = Detector.miri_imager(ResetAnomaly())

@@ -8,6 +8,7 @@ from astropy.table import MaskedColumn, Table
 from helpers.errors import refuses
 from helpers.grids import photometry_table
 from miricigale.filters import as_photometry
+from miricigale.filters.photometry_table import band_columns
 from miricigale.utils.exceptions import CatalogWarning
 
 BANDS = ("miri.f770w", "wfc3.f160w")
@@ -74,6 +75,14 @@ def test_magnitudes_become_fluxes(catalog):
     np.testing.assert_allclose(got["miri.f770w_err"].value, [0.0921034, 0.1842068], rtol=1e-6)
     masked = Table({"mag_F770W": MaskedColumn([23.9, 1.0], mask=[False, True])})
     assert np.isnan(as_photometry(masked, BANDS)["miri.f770w"].value).tolist() == [False, True]
+
+
+def test_limits_are_found_by_any_name_of_their_band(catalog):
+    table = renamed(catalog, "{}", "{}_err")
+    table["F770W_limit"] = [True, False]
+    assert as_photometry(table, BANDS)["miri.f770w_limit"].tolist() == [True, False]
+    named = band_columns(table.colnames)
+    assert named["F770W_limit"] == "miri.f770w_limit"
 
 
 def test_magnitudes_that_stand_for_no_value_become_missing_bands():

@@ -121,7 +121,8 @@ def test_a_votable_in_magnitudes_by_a_map(catalog, tmp_path, capsys):
     mine, theirs = (QTable.read(tmp_path / one / "table.fits") for one in ("one", "two"))
     assert mine["id"].tolist() == [f"obj-{k}" for k in range(1, 6)]
     for name in ("redshift_mean", "frac_agn_mean", "mass_best", "reduced_chi2"):
-        assert_allclose(mine[name], theirs[name], rtol=1e-9)
+        # chi-square is the difference of sums of some thousands
+        assert_allclose(mine[name], theirs[name], rtol=1e-9, atol=1e-15)
     assert mine["n_bands"].tolist() == [6, 5, 6, 6, 6]
     told = command(capsys, *argv, "--map", "candels", status=2)
     assert "a table with columns of 'candels'" in told.err

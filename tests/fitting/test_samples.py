@@ -87,6 +87,7 @@ def test_moments_and_percentiles_are_those_of_the_draws(samples):
     assert samples.std("mass")[0].value == pytest.approx(mass.std())
     got = samples.percentile("mass", [0.16, 0.5])
     assert_allclose(got[0].value, np.percentile(mass, [16, 50]))
+    assert_array_equal(samples.percentile("mass", 0.5), got[:, 1])
     assert np.isnan(got[3]).all()
     edges, weights = samples.pdf("age", 0)
     age = samples.values("age").value[0]

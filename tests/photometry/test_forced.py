@@ -1,4 +1,5 @@
 import astropy.units as u
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import scipy.ndimage
@@ -36,6 +37,7 @@ def test_noiseless_point_sources_come_back_exactly(tools, field):
     with pytest.raises(AttributeError):
         result.flux = None
     assert [ax.get_title() for ax in result.plot()] == ["image", "model", "residual"]
+    plt.close()
 
 
 @pytest.mark.parametrize("grid", ["fine", "turned", "distorted"])

@@ -113,6 +113,12 @@ def saved(tmp_path, data, name="psf.fits", **header):
     return tmp_path / name
 
 
+def test_psfs_that_the_package_wrote_are_taken_as_they_are(field, tmp_path):
+    field.models["image"].write(tmp_path / "own.fits")
+    found = fluxes(field, psf=tmp_path / "own.fits")
+    assert_allclose(found, fluxes(field), rtol=1e-6)
+
+
 @pytest.mark.parametrize(("width", "total"), [(17, 1.0), (17, 0.5), (91, 1.0), (91, 40.0)])
 def test_psfs_of_any_sum_hold_what_the_model_does(field, tmp_path, width, total):
     """The light of a PSF within 1.9 arcsec is 0.85 of all."""

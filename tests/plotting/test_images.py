@@ -1,3 +1,4 @@
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from matplotlib.colors import AsinhNorm, Normalize
@@ -80,9 +81,13 @@ def test_constant_and_empty_images_draw(ax):
 
 def test_residual_is_image_minus_model(image):
     axes = plot_model_residual(image, image - 1.0, unit="MJy/sr")
+    # pyplot's, which a session shows
+    assert plt.gcf() is axes[0].figure
+    plt.close()
     assert len(axes) == 3
     assert np.allclose(axes[2].images[0].get_array(), 1.0)
-    norm = plot_model_residual(image, image + 3.0)[2].images[0].norm
+    other = Figure().subplots(1, 3)
+    norm = plot_model_residual(image, image + 3.0, ax=other)[2].images[0].norm
     assert norm.vmin == -norm.vmax
     assert axes[0].images[0].norm.vmax == axes[1].images[0].norm.vmax
     refuses("'ax' must be three axes", plot_model_residual, image, image, ax=[axes[0]])

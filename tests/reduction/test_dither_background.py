@@ -13,7 +13,7 @@ from miricigale.reduction import (
     dither_backgrounds,
     estimate_background,
 )
-from miricigale.reduction.mosaic import nan_median
+from miricigale.reduction.outliers import nan_median
 from miricigale.utils.units import ANGLE
 
 SHAPE = (192, 200)

@@ -83,7 +83,7 @@ def test_a_result_is_written_and_drawn(ramps, tmp_path):
     assert result.image is result.mosaic
     assert "dithers: 3" in result.summary()
     ax = result.plot()
-    assert "[MJy" in ax.images[0].colorbar.ax.get_ylabel()
+    assert "(MJy / sr)" in ax.images[0].colorbar.ax.get_ylabel()
 
 
 def test_a_method_stands_for_its_settings():

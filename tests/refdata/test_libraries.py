@@ -35,7 +35,7 @@ from miricigale.refdata.libraries import (
     verify_library,
     write_library,
 )
-from miricigale.refdata.locate import file_sha256, fingerprint, record_path, stored_record
+from miricigale.refdata.lookup import file_sha256, fingerprint, record_path, stored_record
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.store import PARTIAL
 

@@ -16,7 +16,7 @@ from miricigale.refdata import (
     locate,
     registry,
 )
-from miricigale.refdata.locate import data_folder, fingerprint, record_path
+from miricigale.refdata.lookup import data_folder, fingerprint, record_path
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
 
 TEXT = b"some numbers\n"

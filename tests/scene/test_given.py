@@ -97,6 +97,15 @@ def test_a_detector_takes_a_scene(exposure):
     np.testing.assert_array_equal(ramps[0].data, ramps[1].data)
 
 
+@pytest.mark.parametrize("band", ["F770W", "F2550W"])
+def test_bright_points_on_no_sky_are_exposed(band):
+    """The splines of the PSF undershoot by some 1e-5 of the peak."""
+    exposure = Exposure(band, n_groups=3, pointing="53.131 -27.831", subarray="SUB256")
+    stars = {"ra": [53.1301, 53.1317], "dec": [-27.8312, -27.8301], "profile": "point"}
+    ramp = Detector().expose(Scene(stars | {band: [200, 100] * u.uJy}, exposure), seed=1)
+    assert ramp.shape == (1, 3, 256, 256)
+
+
 def test_what_lacks_is_named(exposure):
     for catalog, options, message in (
         ({"F770W": FLUX * u.uJy}, {}, "a table with positions: 'sky'"),

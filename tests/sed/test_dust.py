@@ -265,7 +265,7 @@ def test_total_infrared_luminosity_from_three_bands(real_dale):
 
 
 def test_starlight_matters_only_below_three_micron(real_dale):
-    """What docs/guide/sed/dale2014.rst states: 22 % at 2 um, 0.4 % at most beyond 5 um."""
+    """What docs/method/sed/dale2014.rst states: 22 % at 2 um, 0.4 % at most beyond 5 um."""
     wave = real_dale.wave
     removed, kept = (real_dale.spectra[name] for name in ("removed", "kept"))
     assert np.all(np.abs(kept[:, 0] / removed[:, 0] - 1.28) < 0.02)

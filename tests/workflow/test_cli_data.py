@@ -10,7 +10,7 @@ from helpers.commands import command
 from miricigale import conf
 from miricigale.refdata import Resource, locate, registry
 from miricigale.refdata.libraries import READERS, LibraryTable
-from miricigale.refdata.locate import file_sha256
+from miricigale.refdata.lookup import file_sha256
 
 NAME = "test.library"
 

@@ -45,6 +45,17 @@ class Block(Timed):
         Key words of the random streams of this effect in this exposure.
     previous : tuple of `~miricigale.detector.Latent`, optional
         Exposures taken before, which `Persistence` remembers.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.detector import Block, Photons
+    >>> from miricigale.instrument import Exposure, miri_detector
+    >>> exposure = Exposure("F770W", n_groups=5, subarray="SUB64")
+    >>> block = Block(exposure, miri_detector(), slice(0, 64), None, None, None)
+    >>> rate = Photons(flat=False).expected(np.full((64, 72), 5.0), block)
+    >>> print(f"{rate[0, 0]:.1f} electrons per second")
+    57.0 electrons per second
     """
 
     exposure: Exposure
@@ -115,6 +126,20 @@ class Effect:
 
     ``halo`` is how many rows beside a row an effect reads; ``included_as`` is the name
     under which an image's ``psf_includes`` may say that the effect is in it already.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from dataclasses import dataclass
+    >>> from miricigale.detector import ADConversion, Detector, Effect, Photons
+    >>> @dataclass(frozen=True)
+    ... class Glow(Effect):
+    ...     rate: float = 2.0
+    ...     def apply(self, ramp, block):
+    ...         time = block.group_time * (1 + np.arange(ramp.shape[1]))
+    ...         return ramp + self.rate * time[:, None, None]
+    >>> Detector((Photons(), Glow(rate=5.0), ADConversion())).effects[1]
+    Glow(rate=5.0)
     """
 
     halo = 0
@@ -197,6 +222,12 @@ class OtherEffect(Effect):
         Name of its class.
     settings : tuple of (str, object)
         Its settings.
+
+    Examples
+    --------
+    >>> from miricigale.detector import OtherEffect
+    >>> OtherEffect("Glow", (("rate", 2.0),)).record()
+    {'effect': 'Glow', 'rate': 2.0}
     """
 
     name: str

@@ -28,6 +28,20 @@ class Dark(Effect):
     ----------
     current : float, optional
         Electrons per second; that of the detector's properties if not given.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from miricigale import Detector, Exposure
+    >>> exposure = Exposure("F770W", n_groups=10, subarray="SUB64", pointing="53 -27")
+    >>> sky = np.full(exposure.shape, 5.0) * u.MJy / u.sr
+    >>> from miricigale.detector import Dark
+    >>> charge = Detector.miri_imager(Dark(current=100.0)).collect(
+    ...     0 * sky, exposure, seed=1
+    ... )
+    >>> print(f"{np.nanmedian(charge.mean):.1f} electrons per second")
+    100.0 electrons per second
     """
 
     current: float | None = None
@@ -55,6 +69,20 @@ class InterpixelCapacitance(Effect):
     Coupling of a pixel's voltage to its eight neighbors.
 
     Left out where the image's ``psf_includes`` holds ``"ipc"``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.detector import Block, InterpixelCapacitance
+    >>> from miricigale.instrument import Exposure, miri_detector
+    >>> exposure = Exposure("F770W", n_groups=5, subarray="SUB64")
+    >>> block = Block(exposure, miri_detector(), slice(0, 3), None, None, None)
+    >>> rate = np.zeros((3, 3))
+    >>> rate[1, 1] = 100.0
+    >>> InterpixelCapacitance().expected(rate, block).round(1)
+    array([[ 1.3,  2.4,  1.3],
+           [ 3.3, 83.4,  3.3],
+           [ 1.3,  2.4,  1.3]])
     """
 
     halo = 1
@@ -108,6 +136,21 @@ class CosmicRays(Effect):
         Median charge of a shower in electrons.
     shower_sigma : float, optional
         Its Gaussian width in pixels; painted to three times that.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from miricigale import Detector, Exposure
+    >>> exposure = Exposure("F770W", n_groups=10, subarray="SUB64", pointing="53 -27")
+    >>> sky = np.full(exposure.shape, 5.0) * u.MJy / u.sr
+    >>> from miricigale.detector import CosmicRays
+    >>> quiet, active = (
+    ...     Detector.miri_imager(CosmicRays(flux=flux)).collect(sky, exposure, seed=1)
+    ...     for flux in (0.0, 1e-6)
+    ... )
+    >>> len(quiet.hit_electrons), len(active.hit_electrons)
+    (0, 5)
     """
 
     flux: float | None = None
@@ -193,6 +236,16 @@ class Persistence(Effect):
     JWST User Documentation, MIRI detector performance, table 1 (latent images below 1 %);
     Rieke et al. 2015, PASP 127, 665; Vasan et al. 2025, arXiv:2512.15477 (a deficit of 1.7 %
     after saturation at F2100W, over hours: of the other sign, and not simulated).
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.detector import Persistence
+    >>> from miricigale.instrument import Exposure
+    >>> exposure = Exposure("F770W", n_groups=4, subarray="SUB64")
+    >>> released = Persistence().released(exposure, gap=30 * u.s)
+    >>> (1e3 * released / exposure.group_time.value).round(2)
+    array([[4.01, 4.01, 4.  , 3.99]])
     """
 
     amplitudes: tuple = (0.006, 0.002)
@@ -273,6 +326,21 @@ class BadPixels(Effect):
     ----------
     hot_current : float, optional
         Additional dark current of hot pixels in electrons per second.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from miricigale import Detector, Exposure
+    >>> exposure = Exposure("F770W", n_groups=10, subarray="SUB64", pointing="53 -27")
+    >>> sky = np.full(exposure.shape, 5.0) * u.MJy / u.sr
+    >>> from miricigale.detector import BadPixels
+    >>> from miricigale.instrument import DQ
+    >>> ramp = Detector.miri_imager(BadPixels(hot_current=500.0)).expose(
+    ...     sky, exposure, seed=1
+    ... )
+    >>> print(np.count_nonzero(ramp.pixel_dq & int(DQ.HOT)), "hot pixel")
+    1 hot pixel
     """
 
     hot_current: float = 300.0
@@ -310,6 +378,18 @@ class ReferencePixels(Effect):
 
     They share bias, drift and read noise with the others, and are flagged
     REFERENCE_PIXEL and NON_SCIENCE.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from miricigale import Detector, Exposure
+    >>> from miricigale.instrument import DQ
+    >>> exposure = Exposure("F770W", n_groups=3, subarray="SUB128", pointing="53 -27")
+    >>> sky = np.full(exposure.shape, 5.0) * u.MJy / u.sr
+    >>> ramp = Detector.miri_imager().expose(sky, exposure, seed=1)
+    >>> print(np.count_nonzero(ramp.pixel_dq[0] & int(DQ.REFERENCE_PIXEL)), "columns")
+    4 columns
     """
 
     def apply(self, ramp, block):
@@ -332,6 +412,15 @@ class Saturation(Effect):
     ----------
     full_well : float, optional
         In electrons; that of the detector's properties if not given.
+
+    Examples
+    --------
+    >>> from miricigale.detector import Saturation
+    >>> from miricigale.instrument import miri_detector
+    >>> print(f"{Saturation().limit(miri_detector()):.0f} electrons")
+    210000 electrons
+    >>> Saturation(full_well=1e5)
+    Saturation(full_well=100000.0)
     """
 
     full_well: float | None = None

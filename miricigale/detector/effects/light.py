@@ -31,6 +31,20 @@ class Residual(Effect):
         Gaussian width of the pattern's correlation in pixels; 0 for white.
     pattern : int, optional
         Which random pattern: a property of the detector, apart from the exposure's seed.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from miricigale import Detector, Exposure
+    >>> exposure = Exposure("F770W", n_groups=10, subarray="SUB64", pointing="53 -27")
+    >>> sky = np.full(exposure.shape, 5.0) * u.MJy / u.sr
+    >>> from miricigale.detector import Residual
+    >>> detector = Detector.miri_imager(Residual(0.01, correlation=0))
+    >>> plain = Detector.miri_imager().collect(sky, exposure, seed=1)
+    >>> uneven = detector.collect(sky, exposure, seed=1)
+    >>> print(f"{np.nanstd(uneven.mean / plain.mean):.2f}")
+    0.01
     """
 
     amplitude: float | str
@@ -81,6 +95,20 @@ class Photons(Effect):
     ----------
     flat : bool, optional
         Whether the flat field of the instrument multiplies the light.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from miricigale import Detector, Exposure
+    >>> exposure = Exposure("F770W", n_groups=10, subarray="SUB64", pointing="53 -27")
+    >>> sky = np.full(exposure.shape, 5.0) * u.MJy / u.sr
+    >>> from miricigale.detector import ADConversion, Photons
+    >>> ramp = Detector((Photons(flat=False), ADConversion())).expose(
+    ...     sky, exposure, seed=1
+    ... )
+    >>> print(f"{ramp.data[0, -1].mean():.0f} electrons in the last group")
+    48 electrons in the last group
     """
 
     flat: bool = True

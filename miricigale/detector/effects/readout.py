@@ -28,6 +28,14 @@ class Nonlinearity(Effect):
     ----------
     linear : bool, optional
         Whether the response is taken as linear: the gain alone.
+
+    Examples
+    --------
+    >>> from miricigale.detector import Nonlinearity
+    >>> from miricigale.instrument import miri_detector
+    >>> response = Nonlinearity().response(50000.0, miri_detector())
+    >>> print(f"50000 linear DN read {response:.0f} DN")
+    50000 linear DN read 47967 DN
     """
 
     linear: bool = False
@@ -65,6 +73,12 @@ class Bias(Effect):
     reset_noise : float, optional
         Standard deviation of the level from reset to reset (kTC noise), in DN. It is the
         same for all groups of an integration.
+
+    Examples
+    --------
+    >>> from miricigale.detector import Bias, Detector
+    >>> Detector.miri_imager(Bias(level=10000.0, reset_noise=8.0)).effects[8]
+    Bias(level=10000.0, reset_noise=8.0)
     """
 
     level: float | None = None
@@ -108,6 +122,26 @@ class ReadNoise(Effect):
         output (four outputs, to which columns belong in turn).
     octaves : int, optional
         Over how many octaves of time, from one row upwards, the 1/f part reaches.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from miricigale import Detector, Exposure
+    >>> exposure = Exposure("F770W", n_groups=10, subarray="SUB64", pointing="53 -27")
+    >>> sky = np.full(exposure.shape, 5.0) * u.MJy / u.sr
+    >>> from miricigale.detector import ADConversion, Bias, Nonlinearity, Photons
+    >>> from miricigale.detector import ReadNoise
+    >>> effects = (
+    ...     Photons(),
+    ...     Nonlinearity(),
+    ...     Bias(),
+    ...     ReadNoise(sigma=10.0),
+    ...     ADConversion(),
+    ... )
+    >>> dark = Detector(effects).expose(0 * sky, exposure, seed=1)
+    >>> print(f"{dark.data.std():.1f} DN")
+    10.0 DN
     """
 
     sigma: float | None = None
@@ -138,7 +172,19 @@ class ReadNoise(Effect):
 
 @dataclasses.dataclass(frozen=True)
 class ADConversion(Effect):
-    """Rounding to unsigned 16-bit numbers; out of range flagged AD_FLOOR or SATURATED."""
+    """
+    Rounding to unsigned 16-bit numbers; out of range flagged AD_FLOOR or SATURATED.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from miricigale import Detector, Exposure
+    >>> exposure = Exposure("F770W", n_groups=10, subarray="SUB64", pointing="53 -27")
+    >>> sky = np.full(exposure.shape, 5.0) * u.MJy / u.sr
+    >>> Detector.miri_imager().expose(sky, exposure, seed=1).data.dtype
+    dtype('uint16')
+    """
 
     def limit(self, properties):
         """Charge that reads the highest number; infinite where the full well reads less."""

@@ -44,6 +44,14 @@ class ResetAnomaly(Effect):
     groups : float, optional
         Number of groups in which the offset falls by a factor e. The default, 4, leaves
         3 % at the 15th group.
+
+    Examples
+    --------
+    >>> from miricigale.detector import ResetAnomaly
+    >>> anomaly = ResetAnomaly(amplitudes=(-40.0, -10.0))
+    >>> anomaly.offsets(n_integrations=2, n_groups=4).round(1)
+    array([[-40. , -31.2, -24.3, -18.9],
+           [-10. ,  -7.8,  -6.1,  -4.7]])
     """
 
     amplitudes: tuple = (-30.0, -20.0)
@@ -100,6 +108,13 @@ class ResetDecay(Effect):
         of later integrations are low by what decays and goes with that signal.
     groups : float, optional
         Number of groups in which the offset falls by a factor e; of our own.
+
+    Examples
+    --------
+    >>> from miricigale.detector import Detector, ResetDecay
+    >>> detector = Detector.miri_imager(ResetDecay(share=-0.01))
+    >>> detector.effects[8]
+    ResetDecay(share=-0.01, groups=2.0)
     """
 
     share: float = -0.005
@@ -131,6 +146,13 @@ class FirstFrame(Effect):
     ----------
     offset : float, optional
         In DN, of every pixel; of our own.
+
+    Examples
+    --------
+    >>> from miricigale.detector import Detector, FirstFrame
+    >>> detector = Detector.miri_imager(FirstFrame(offset=-20.0))
+    >>> detector.effects[8]
+    FirstFrame(offset=-20.0)
     """
 
     offset: float = -15.0
@@ -160,6 +182,13 @@ class LastFrame(Effect):
         In DN, of every pixel but those of the first pair; of our own.
     coupling : float, optional
         Share of the neighboring pair's signal that is lost; of our own.
+
+    Examples
+    --------
+    >>> from miricigale.detector import Detector, LastFrame
+    >>> detector = Detector.miri_imager(LastFrame(offset=-20.0))
+    >>> detector.effects[8]
+    LastFrame(offset=-20.0, coupling=0.005)
     """
 
     offset: float = -10.0

@@ -7,7 +7,7 @@ import numpy as np
 
 from miricigale.refdata.libraries.ised import read_ised
 from miricigale.refdata.libraries.table import LibraryTable
-from miricigale.refdata.locate import file_sha256
+from miricigale.refdata.lookup import file_sha256
 from miricigale.utils.exceptions import data_error
 
 #: Of GALAXEV, in W: its files are in this unit (3.826e33 erg/s).

@@ -7,7 +7,7 @@ import numpy as np
 
 from miricigale.refdata.libraries.members import is_archive, members
 from miricigale.refdata.libraries.table import LibraryTable
-from miricigale.refdata.locate import locate
+from miricigale.refdata.lookup import locate
 from miricigale.refdata.tables import load_ssp
 from miricigale.utils.exceptions import data_error
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from miricigale.refdata.libraries.table import LibraryTable, verify_library, write_library
-from miricigale.refdata.locate import data_folder, file_sha256, record_path, stored_record
+from miricigale.refdata.lookup import data_folder, file_sha256, record_path, stored_record
 from miricigale.refdata.registry import resource
 from miricigale.utils.exceptions import DataError, data_error, unknown_name
 from miricigale.utils.progress import progress

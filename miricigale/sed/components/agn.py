@@ -36,6 +36,15 @@ class TorusSpectra:
         Disk light seen at the inclination, direct and scattered.
     dust : `~numpy.ndarray`
         Dust emission seen at the inclination.
+
+    Examples
+    --------
+    >>> from miricigale.sed.components import ParametricTorus
+    >>> torus = ParametricTorus(inclination=30.0)
+    >>> values = {name: par.default for name, par in torus.parameters.items()}
+    >>> spectra = torus.torus_spectra(torus.nodes(), values)
+    >>> round(float(spectra.disk.max() / spectra.face_on.max()), 2)  # seen at 30 deg
+    0.8
     """
 
     face_on: np.ndarray
@@ -54,6 +63,16 @@ class AGNTemplates:
         The parts as seen; torus + polar integrate to 1 W.
     accretion_power : float
         Luminosity of the disk over all directions, in W for each W of dust emission.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.sed.components import ParametricTorus
+    >>> torus = ParametricTorus()
+    >>> values = {name: par.default for name, par in torus.parameters.items()}
+    >>> parts = torus.templates(torus.nodes(), values)
+    >>> round(float(np.trapezoid(parts.torus + parts.polar, torus.nodes())), 4)  # W
+    1.0
     """
 
     disk: np.ndarray
@@ -79,6 +98,14 @@ class AGN(Component):
 
     The disk (option ``disk``) is a power law between breaks; ``disk_slope`` changes its slope
     in the optical and keeps its power. The torus's emission does not follow such changes.
+
+    Examples
+    --------
+    >>> from miricigale.sed.components import AGN
+    >>> AGN.all_options()["polar_law"]
+    ('smc', 'calzetti', 'gaskell', 'smc_wd01')
+    >>> [name for name in AGN.declared() if name.endswith("polar")]
+    ['ebv_polar', 'temperature_polar', 'emissivity_polar']
     """
 
     role = "agn"
@@ -188,6 +215,15 @@ class Skirtor2016(AGN):
     inclination 0, from which ``accretion_power`` follows.
 
     Parameters of the torus take the library's values only; `missing` names those without.
+
+    Examples
+    --------
+    >>> from miricigale.sed.components import Skirtor2016
+    >>> torus = Skirtor2016(disk="schartmann2005", disk_slope=-0.36)
+    >>> torus.settings
+    {'polar_law': 'smc', 'disk': 'schartmann2005'}
+    >>> torus.missing(q=[0.0, 1.0])  # doctest: +SKIP
+    {'q': (0.0,)}
     """
 
     name = "skirtor2016"

@@ -71,7 +71,19 @@ def _dimmed(wave, amount, law, *shape):
 
 
 class Attenuation(Component):
-    """Base: `factors` gives transmissions for young and old stars, `gas_factor` that for gas."""
+    """
+    Base: `factors` gives transmissions for young and old stars, `gas_factor` that for gas.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.sed.components import CalzettiLeitherer
+    >>> law = CalzettiLeitherer(ebv=0.3)
+    >>> values = {name: par.default for name, par in law.parameters.items()}
+    >>> young, old = law.factors(np.array([0.15, 0.55, 2.2]), values)
+    >>> young.round(3)
+    array([0.058, 0.327, 0.903])
+    """
 
     role = "attenuation"
 
@@ -163,6 +175,16 @@ class CalzettiLeitherer(_Starburst, _Screen):
         ``uv_bump``. Without a bump they are the same.
     **defaults
         New defaults of parameters.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.sed.components import CalzettiLeitherer
+    >>> law = CalzettiLeitherer(ebv=0.3, uv_bump=3.0)
+    >>> values = {name: par.default for name, par in law.parameters.items()}
+    >>> young, old = law.factors(np.array([0.15, 0.2175, 0.55]), values)
+    >>> (-2.5 * np.log10(young)).round(2)  # magnitudes
+    array([3.09, 3.39, 1.2 ])
     """
 
     name = "calzetti"
@@ -195,6 +217,16 @@ class ModifiedStarburst(_Starburst):
         0.0912 um and below.
     **defaults
         New defaults of parameters.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.sed.components import ModifiedStarburst
+    >>> law = ModifiedStarburst(ebv_lines=0.5)
+    >>> values = {name: par.default for name, par in law.parameters.items()}
+    >>> gas = law.gas_factor(np.array([0.4863, 0.6565]), values)  # H beta and H alpha
+    >>> (-2.5 * np.log10(gas)).round(2)  # magnitudes
+    array([1.83, 1.26])
     """
 
     name = "modified_starburst"
@@ -241,6 +273,16 @@ class SMC(_Screen):
         with silicates and R_V = 2.93.
     **defaults
         New defaults of parameters.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.sed.components import SMC
+    >>> law = SMC(ebv=0.1)
+    >>> values = {name: par.default for name, par in law.parameters.items()}
+    >>> young, old = law.factors(np.array([0.15, 0.55]), values)
+    >>> (-2.5 * np.log10(young)).round(2)  # magnitudes
+    array([1.35, 0.28])
     """
 
     name = "smc"
@@ -259,6 +301,16 @@ class CharlotFall(Attenuation):
     Charlot & Fall 2000 with free slopes: stars below 10 Myr are behind both, older ones behind
     the interstellar medium, A(lambda) = A_V (lambda / 0.55 um)^slope. Nothing is dimmed at 0.0912
     um and below. Defaults are CIGALE's.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.sed.components import CharlotFall
+    >>> law = CharlotFall(av_ism=0.6, mu=0.3)
+    >>> values = {name: par.default for name, par in law.parameters.items()}
+    >>> young, old = law.factors(np.array([0.55]), values)
+    >>> print(f"A_V {-2.5 * np.log10(young[0]):.2f} (young), {-2.5 * np.log10(old[0]):.2f} (old)")
+    A_V 2.00 (young), 0.60 (old)
     """
 
     name = "charlot_fall"

@@ -14,7 +14,17 @@ from miricigale.utils.units import frozen_array
 
 
 class DustEmission(Component):
-    """Base: `template` gives a spectrum that integrates to 1."""
+    """
+    Base: `template` gives a spectrum that integrates to 1.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.sed.components import Casey2012
+    >>> dust = Casey2012()
+    >>> round(float(np.trapezoid(dust.template(dust.nodes()), dust.nodes())), 3)  # W
+    1.0
+    """
 
     role = "dust"
 
@@ -72,6 +82,13 @@ class Dale2014(DustEmission):
     ``starlight`` says whether the starlight that CIGALE's builder takes away near 2 um is
     taken away here (``"removed"``) or not (``"kept"``). The files are the user's to bring:
     ``miricigale data add dust.dale2014 PATH``.
+
+    Examples
+    --------
+    >>> from miricigale.sed.components import Dale2014
+    >>> Dale2014(alpha=2.5)
+    Dale2014(alpha=2.5, starlight='removed')
+    >>> Dale2014().template([7.7, 100.0], alpha=2.5)  # doctest: +SKIP
     """
 
     name = "dale2014"
@@ -94,7 +111,7 @@ B = (26.68, 6.246, 1.905e-4, 7.243e-5)
 
 
 #: Steps of 0.014 in ln(wavelength) where there is only the power law, of 0.0052 where the
-#: spectrum bends: see docs/guide/sed/casey2012.rst for what straight lines between them cost.
+#: spectrum bends: see docs/accuracy/sed_components.rst for what straight lines between them cost.
 NODES = np.append(np.geomspace(1.0, 3.0, 80)[:-1], np.geomspace(3.0, 3000.0, 1330))
 NODES.flags.writeable = False
 
@@ -107,6 +124,16 @@ class Casey2012(DustEmission):
     S_nu = [1 - exp(-(200 um / l)^beta)] B_nu(T) + N l^alpha exp(-(l / l_c)^2); l_c is 3/4 of
     L(alpha, T), the wavelength where the slope of the blackbody is alpha, and N is such that
     the power law without its cut-off meets the blackbody at l_c, as in CIGALE.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.sed.components import Casey2012
+    >>> dust = Casey2012(temperature_dust=45.0)
+    >>> print(f"power law below {dust.turnover(alpha_mir=2.0, temperature_dust=45.0):.1f} um")
+    power law below 47.6 um
+    >>> dust.template(np.array([24.0, 100.0, 350.0]), temperature_dust=45.0)  # W/um for 1 W
+    array([5.39931252e-03, 5.47689776e-03, 5.68961165e-05])
     """
 
     name = "casey2012"
@@ -171,6 +198,16 @@ class DraineLi2007(_DraineLi):
     The mass fraction 1 - gamma is heated by U_min, gamma by dM/dU ~ U^-2 from U_min to 1e6.
     Between tabulated q_PAH and U_min the spectra per dust mass are interpolated (linear in
     q_PAH, linear in log U with the power scaled by U).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.sed.components import DraineLi2007
+    >>> wave = np.array([7.7, 100.0])
+    >>> for q_pah in (0.47, 4.58):
+    ...     print(q_pah, DraineLi2007().template(wave, q_pah=q_pah))  # W/um for 1 W
+    0.47 [0.01031519 0.00605012]
+    4.58 [0.0669307  0.00467543]
     """
 
     name = "dl07"
@@ -214,6 +251,15 @@ class DraineLi2007Alpha(_DraineLi):
     it: 0.10 dex rms in 5-25 um and 0.06 dex beyond for alpha from 1 to 3.5. MIRI bands differ
     by up to 0.4 mag, the 3.3 um feature by 1 mag. It is **no substitute for Dale et al. 2014**
     in a paper.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.sed.components import DraineLi2007Alpha
+    >>> dust = DraineLi2007Alpha()
+    >>> warm, cold = (dust.template(np.array([24.0, 160.0]), alpha=a) for a in (1.0, 2.5))
+    >>> print(f"24 over 160 um: {warm[0] / warm[1]:.1f} (warm), {cold[0] / cold[1]:.1f} (cold)")
+    24 over 160 um: 35.4 (warm), 1.1 (cold)
     """
 
     name = "dl07_alpha"

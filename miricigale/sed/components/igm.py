@@ -24,6 +24,15 @@ class IGM(Component):
 
     Lines absorb from their rest wavelength to (1 + z) times it, so nothing is absorbed at z = 0 or
     longward of Lyman alpha.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.sed.components import Inoue2014, Madau1995, Meiksin2006
+    >>> wave = np.array([0.44])  # um, observed; the source is at z = 3
+    >>> laws = (Inoue2014(), Madau1995(), Meiksin2006())
+    >>> [round(float(law.transmission(wave, 3.0)[0]), 2) for law in laws]
+    [0.76, 0.73, 0.78]
     """
 
     role = "igm"
@@ -59,7 +68,16 @@ class IGM(Component):
 
 @register
 class Meiksin2006(IGM):
-    """Meiksin 2006 in CIGALE's reading (see ``miricigale.sed._core.meiksin_transmission``)."""
+    """
+    Meiksin 2006 in CIGALE's reading (see ``miricigale.sed._core.meiksin_transmission``).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.sed.components import Meiksin2006
+    >>> Meiksin2006().transmission(np.array([0.36, 0.44, 0.50]), 3.0).round(3)  # um, z = 3
+    array([0.497, 0.782, 1.   ])
+    """
 
     name = "meiksin2006"
     reference = "Meiksin 2006, MNRAS 365, 807"
@@ -70,7 +88,16 @@ class Meiksin2006(IGM):
 
 @register
 class Madau1995(IGM):
-    """Madau 1995: four Lyman lines and the continuum approximation of footnote 3."""
+    """
+    Madau 1995: four Lyman lines and the continuum approximation of footnote 3.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.sed.components import Madau1995
+    >>> Madau1995().transmission(np.array([0.36, 0.44, 0.50]), 3.0).round(3)  # um, z = 3
+    array([0.466, 0.735, 1.   ])
+    """
 
     name = "madau1995"
     reference = "Madau 1995, ApJ 441, 18"
@@ -89,6 +116,13 @@ class Inoue2014(IGM):
     Inoue et al. 2014: 39 Lyman lines and the continuum, of the forest and of damped systems.
 
     Table 2 with equations 20 to 22 for the lines, equations 25 to 29 for the continuum.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.sed.components import Inoue2014
+    >>> Inoue2014().transmission(np.array([0.36, 0.44, 0.50]), 3.0).round(3)  # um, z = 3
+    array([0.546, 0.758, 1.   ])
     """
 
     name = "inoue2014"

@@ -112,6 +112,17 @@ class Nebular(Component):
     ------
     ValueError
         If a value is outside its bounds or not one of the option's.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.sed.components import Nebular
+    >>> gas = Nebular(log_u=-2.5)
+    >>> values = {name: par.default for name, par in gas.parameters.items()} | {"metallicity": 0.02}
+    >>> one = np.ones(1)  # a population of 3 Myr with 1e53 ionizing photons per second
+    >>> lines = gas.lines(3.0 * one, one, 1e53 * one, values)
+    >>> print(f"H-alpha over H-beta {lines['H-alpha'] / lines['H-beta']:.2f}")
+    H-alpha over H-beta 2.82
     """
 
     name = "nebular"

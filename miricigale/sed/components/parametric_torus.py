@@ -36,6 +36,14 @@ class ParametricTorus(AGN):
     ``radius_ratio`` is the outer end of the integral. Angles outside 20-60 deg are refused: the
     form, fitted at 40 deg, would send out more light face on than any surface can, or take
     less than nothing from the disk.
+
+    Examples
+    --------
+    >>> from miricigale.sed.components import ParametricTorus
+    >>> torus = ParametricTorus(tau97=7.0, inclination=30.0)
+    >>> values = {name: par.default for name, par in torus.parameters.items()}
+    >>> print(f"the torus takes {torus.absorbed_share(values):.2f} of the disk's light")
+    the torus takes 0.36 of the disk's light
     """
 
     name = "parametric_torus"

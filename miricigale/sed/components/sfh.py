@@ -18,7 +18,16 @@ _RATE = u.Msun / u.yr
 
 
 class StarFormationHistory(Component):
-    """Base: `history` gives rates that form one solar mass."""
+    """
+    Base: `history` gives rates that form one solar mass.
+
+    Examples
+    --------
+    >>> from miricigale.sed.components import ConstantSFH
+    >>> sfh = ConstantSFH(age=0.5)
+    >>> sfh.steps({"age": 0.5}), sfh.role
+    (500, 'sfh')
+    """
 
     role = "sfh"
     age = Parameter(
@@ -72,6 +81,15 @@ class DelayedSFH(BurstHistory):
 
     ``SFR_t = t exp(-t / tau) / tau^2`` for t = 0, 1, ... age - 1 Myr, and an exponential burst
     in the last ``age_burst`` that makes the fraction ``f_burst`` of all stars.
+
+    Examples
+    --------
+    >>> from miricigale.sed.components import DelayedSFH
+    >>> sfh = DelayedSFH(tau=0.5, age=2.0)
+    >>> values = {name: par.default for name, par in sfh.parameters.items()}
+    >>> rate = sfh.history(values)
+    >>> print(f"the rate peaks at {rate.argmax()} of {rate.size} Myr")
+    the rate peaks at 500 of 2000 Myr
     """
 
     name = "delayed"
@@ -89,6 +107,15 @@ class DoubleExponentialSFH(BurstHistory):
     ``SFR_t = exp(-t / tau)`` for t = 0, 1, ... age - 1 Myr, rising where ``tau`` is negative,
     and an exponential burst in the last ``age_burst`` that makes the fraction ``f_burst`` of
     all stars.
+
+    Examples
+    --------
+    >>> from miricigale.sed.components import DoubleExponentialSFH
+    >>> sfh = DoubleExponentialSFH(tau=3.0, f_burst=0.1, age_burst=0.1)
+    >>> values = {name: par.default for name, par in sfh.parameters.items()}
+    >>> rate = sfh.history(values)
+    >>> print(f"the burst raises the rate {rate[-100] / rate[-101]:.1f} times")
+    the burst raises the rate 3.9 times
     """
 
     name = "double_exponential"
@@ -112,7 +139,16 @@ class DoubleExponentialSFH(BurstHistory):
 
 @register
 class ConstantSFH(StarFormationHistory):
-    """Constant star-formation rate."""
+    """
+    Constant star-formation rate.
+
+    Examples
+    --------
+    >>> from miricigale.sed.components import ConstantSFH
+    >>> rate = ConstantSFH().history({"age": 0.1})  # Msun/yr for one solar mass
+    >>> rate.size, round(float(rate[0]) * 1e8, 3)
+    (100, 1.0)
+    """
 
     name = "constant"
     reference = "Kennicutt 1998, ARA&A 36, 189"
@@ -149,6 +185,16 @@ class TableSFH(StarFormationHistory):
         If times do not ascend, or a value is negative, masked or not finite.
     `~astropy.units.UnitsError`
         If a column has no unit or a wrong one.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.table import QTable
+    >>> from miricigale.sed.components import TableSFH
+    >>> rates = [1.0, 5.0, 0.5] * u.Msun / u.yr
+    >>> sfh = TableSFH(QTable({"time": [0, 200, 300] * u.Myr, "sfr": rates}))
+    >>> sfh.age, sfh.history({"age": 0.4, "sfh_index": 0}).size  # Gyr, steps
+    (0.4, 400)
     """
 
     name = "sfh_table"

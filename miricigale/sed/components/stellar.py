@@ -16,7 +16,17 @@ _OLDEST = 14000  # Myr, more steps than any history has
 
 
 class StellarPopulations(Component):
-    """Base: a table of SSPs by metallicity, age and wavelength."""
+    """
+    Base: a table of SSPs by metallicity, age and wavelength.
+
+    Examples
+    --------
+    >>> from miricigale.sed.components import BC03, ConstantSFH
+    >>> stars, history = BC03(), ConstantSFH().history({"age": 0.1})
+    >>> young, old = stars.age_weights(history, {"metallicity": 0.02, "separation_age": 10.0})
+    >>> print(f"{young.sum():.1f} of the mass is younger than 10 Myr")
+    0.1 of the mass is younger than 10 Myr
+    """
 
     role = "stellar"
 
@@ -132,6 +142,16 @@ class BC03(StellarPopulations):
     seventh, 0.1, whose populations below 300 Myr lack most of their light. The surviving mass
     leaves out remnants. Yang et al. 2021 use BC03 of 2003 with a Chabrier IMF: light for each
     solar mass differs by 0.03 dex, ionizing photons by 0.12 dex.
+
+    Examples
+    --------
+    >>> from miricigale.sed.components import BC03
+    >>> stars = BC03()
+    >>> stars.metallicities()
+    (0.0001, 0.0004, 0.004, 0.008, 0.02, 0.05)
+    >>> age, spectra, surviving = stars.table(0.02)
+    >>> print(f"{surviving[-1]:.2f} Msun of 1 Msun survive {age[-1] / 1e3:.1f} Gyr")
+    0.44 Msun of 1 Msun survive 14.0 Gyr
     """
 
     name = "bc03"
@@ -164,6 +184,13 @@ class BC03Library(StellarPopulations):
 
     ``miricigale data add ssp.bc03_user PATH`` reads them. Metallicities that the files do not
     have are refused rather than interpolated. The surviving mass leaves out remnants.
+
+    Examples
+    --------
+    >>> from miricigale.sed.components import BC03Library
+    >>> BC03Library(metallicity=0.008)
+    BC03Library(separation_age=10, metallicity=0.008)
+    >>> BC03Library().table(0.008)  # doctest: +SKIP
     """
 
     name = "bc03_library"

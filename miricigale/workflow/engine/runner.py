@@ -10,7 +10,7 @@ import logging
 import os
 from pathlib import Path
 
-from miricigale.refdata.locate import fingerprint
+from miricigale.refdata.lookup import fingerprint
 from miricigale.utils.exceptions import (
     ConfigError,
     OtherResultsError,
@@ -70,6 +70,12 @@ class StudyRunner:
     `~miricigale.utils.exceptions.ConfigError`
         If a stage comes before what it needs, ``until`` or ``again`` match nothing, or nothing that is
         asked for again is among what is done.
+
+    Examples
+    --------
+    >>> from miricigale.workflow import StudyRunner, load_config, study_stages  # doctest: +SKIP
+    >>> runner = StudyRunner(load_config("goodss", quick=True), "study", study_stages)  # doctest: +SKIP
+    >>> store = runner.run()  # doctest: +SKIP
     """
 
     def __init__(

@@ -56,6 +56,13 @@ class Stage:
         configuration, so that a change of those is seen. The stage has them as ``context.plan``.
     memory : callable, optional
         Called with the configuration and the unit; about how many bytes it takes to do it.
+
+    Examples
+    --------
+    >>> from miricigale.workflow import study_stages
+    >>> stage = study_stages()[4]
+    >>> stage.name, stage.needs
+    ('mosaics', ('exposures',))
     """
 
     name: str

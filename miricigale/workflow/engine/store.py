@@ -19,6 +19,15 @@ class ProductStore(RecordFolder):
     ----------
     folder : path-like
         Made when something is written, if it does not exist.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from miricigale.workflow import ProductStore
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     store = ProductStore(folder)
+    ...     print(store.records)
+    {}
     """
 
     records_name = "stages"

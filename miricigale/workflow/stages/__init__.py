@@ -8,6 +8,12 @@ def study_stages():
     Returns
     -------
     stages : tuple of `~miricigale.workflow.engine.stage.Stage`
+
+    Examples
+    --------
+    >>> from miricigale.workflow import study_stages
+    >>> [stage.name for stage in study_stages()][:5]
+    ['catalog', 'seds', 'truth', 'exposures', 'mosaics']
     """
     from miricigale.workflow.stages import (
         experiments,

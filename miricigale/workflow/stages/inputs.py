@@ -9,7 +9,7 @@ from astropy.table import QTable
 from miricigale import fitting, sed
 from miricigale.filters import Filter
 from miricigale.refdata import resources
-from miricigale.refdata.locate import fingerprint
+from miricigale.refdata.lookup import fingerprint
 from miricigale.scene import read_catalog
 from miricigale.utils.content import file_sha256
 from miricigale.utils.exceptions import argument_error

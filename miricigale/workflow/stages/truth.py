@@ -8,7 +8,7 @@ from astropy.table import QTable, hstack
 from miricigale import fitting, sed
 from miricigale.evaluation import AGNPopulation, agn_fraction, main_sequence_dust
 from miricigale.photometry.kernel_files import file_place
-from miricigale.refdata.locate import fingerprint
+from miricigale.refdata.lookup import fingerprint
 from miricigale.utils.content import file_sha256
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.meta import provenance

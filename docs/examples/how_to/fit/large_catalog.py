@@ -1,0 +1,93 @@
+"""
+Fit a large catalog and resume
+==============================
+
+Your catalog is larger than memory, or the fit takes hours. You want it on disk, in parts, and to resume it after
+it was stopped.
+"""
+
+# %%
+# A catalog of 1000 simulated galaxies at known redshifts, as a FITS file.
+
+from pathlib import Path
+
+import astropy.units as u
+import matplotlib.pyplot as plt
+import numpy as np
+from astropy.table import QTable
+
+from miricigale import BayesFitter, SEDModel
+from miricigale.fitting import fit_file, open_results
+
+bands = [
+    "acs.f606w",
+    "acs.f814w",
+    "wfc3.f125w",
+    "wfc3.f160w",
+    "irac.ch1",
+    "miri.f770w",
+]
+rng = np.random.default_rng(12)
+n = 1000
+model = SEDModel.yang2021(agn=False)
+axes = SEDModel.yang2021_axes("galaxy")
+grid = model.grid(axes, bands)
+iz = rng.integers(5, 40, n)
+galaxy = [rng.choice(np.flatnonzero(grid.allowed[i])) for i in iz]
+flux = 10 ** rng.uniform(9, 11, (n, 1)) * grid.flux(iz, galaxy)
+catalog = QTable({"id": np.arange(n), "z_spec": grid.redshift[iz]})
+for i, band in enumerate(bands):
+    catalog[band] = flux[:, i] * (1 + 0.1 * rng.normal(size=n)) * u.uJy
+    catalog[f"{band}_err"] = 0.1 * flux[:, i] * u.uJy
+catalog.write("catalog.fits", overwrite=True)
+
+# %%
+# ``chunk_rows`` objects are in memory at a time and become one file of results. ``resume=False`` replaces what an
+# earlier fit left in the folder.
+
+fitter = BayesFitter(grid)
+options = {"chunk_rows": 250, "redshift": "z_spec"}
+results = fit_file(fitter, "catalog.fits", "fits", resume=False, **options)
+results
+
+# %%
+# A part is lost, as after a crash. The same call fits what is missing, and nothing else. Results of other settings
+# are refused in this folder.
+
+Path("fits/part-00002.fits").unlink()
+results = fit_file(fitter, "catalog.fits", "fits", **options)
+sorted(path.name for path in Path("fits").glob("part-*.fits"))
+
+# %%
+# Open the folder later, and take some columns. ``results.write_table("table.fits")`` joins everything in one FITS
+# file.
+
+results = open_results("fits")
+table = results.to_table(["id", "redshift_best", "mass_p50", "sfr_p50", "flags"])
+table["redshift_best"].info.format = ".3f"
+table["mass_p50"].info.format = table["sfr_p50"].info.format = ".2g"
+table[:4]
+
+# %%
+# Star-formation rate over stellar mass of the catalog.
+
+fig, ax = plt.subplots(figsize=(6, 4.5), layout="constrained")
+mass, sfr = table["mass_p50"].value, np.maximum(table["sfr_p50"].value, 1e-3)
+points = ax.scatter(mass, sfr, c=table["redshift_best"], s=4)
+ax.set(xscale="log", yscale="log", ylim=(1e-3, 1e4))
+ax.set(
+    xlabel="stellar mass formed (solar masses)",
+    ylabel="star-formation rate (Msun / yr)",
+)
+fig.colorbar(points, label="redshift")
+plt.show()
+
+# %%
+# The command does the same. Ctrl-C stops it; the same command resumes it, and the joined table is
+# ``fits/table.fits``:
+#
+# .. code-block:: console
+#
+#    $ miricigale fit catalog.fits -o fits --redshift z_spec --threads 8 --chunk-rows 250
+#
+# The tutorial :doc:`/tutorials/large_catalogs` has threads, processes and clusters.

@@ -1,0 +1,90 @@
+"""
+Fit your catalog in AB magnitudes
+=================================
+
+You have a catalog with column names of your own, AB magnitudes, and gaps where a source was not measured. You want
+to fit it without renaming anything.
+"""
+
+# %%
+# Here a CSV file with simulated magnitudes stands for your catalog.
+
+import matplotlib.pyplot as plt
+
+from miricigale import BayesFitter, SEDModel
+from miricigale.filters import read_catalog_photometry
+
+catalog = """\
+name,V,dV,I,dI,J,dJ,H,dH,ch1,dch1,F770,dF770,F1500,dF1500
+EGS-1,25.42,0.05,24.53,0.04,23.24,0.03,22.80,0.03,21.62,0.05,21.75,0.06,20.48,0.08
+EGS-2,24.11,0.03,23.40,0.03,22.83,0.03,22.57,0.03,21.93,0.05,22.30,0.08,20.91,0.10
+EGS-3,26.20,0.08,25.61,0.07,24.41,0.05,23.98,0.04,,,23.33,0.15,,
+"""
+with open("mine.csv", "w") as file:
+    file.write(catalog)
+
+# %%
+# ``columns`` gives each filter your name of its column, ``units`` the unit. Errors of magnitudes become errors of
+# fluxes. Blank fields are missing bands; so are -99, 99 and the like, which a warning counts.
+
+columns = {
+    "id": "name",
+    "acs.f606w": "V",
+    "acs.f814w": "I",
+    "wfc3.f125w": "J",
+    "wfc3.f160w": "H",
+    "irac.ch1": "ch1",
+    "miri.f770w": "F770",
+    "miri.f1500w": "F1500",
+}
+bands = [name for name in columns if name != "id"]
+columns |= {f"{band}_err": f"d{columns[band]}" for band in bands}
+units = {"flux": "ABmag"}
+photometry = read_catalog_photometry("mine.csv", columns=columns, units=units)
+table = photometry["id", "wfc3.f160w", "wfc3.f160w_err", "irac.ch1"]
+table.round(3)
+table
+
+# %%
+# The table goes to the fitter as it is. The grid ``survey_axes`` is the one for real galaxies.
+
+model = SEDModel.survey()
+fitter = BayesFitter(model, bands, axes=SEDModel.survey_axes())
+results = fitter.fit(photometry)
+columns = ["id", "redshift_p50", "mass_p50", "frac_agn_p50", "chi2_best"]
+table = results.to_table()[columns]
+for name in table.colnames[1:]:
+    table[name].info.format = ".2g" if name == "mass_p50" else ".2f"
+table
+
+# %%
+# Look at the fit of a source.
+
+fig, axes = plt.subplots(
+    2, 1, sharex=True, height_ratios=[3, 1], figsize=(7, 5), layout="constrained"
+)
+results["EGS-1"].plot_sed(axes)
+axes[0].set(xlim=(0.4, 30), ylim=(0.05, 100))
+plt.show()
+
+# %%
+# The command line reads the same map from a file:
+#
+# .. code-block:: console
+#
+#    $ miricigale fit mine.csv --map mine.toml --axes survey -o fits
+#
+# with ``mine.toml``:
+#
+# .. code-block:: toml
+#
+#    [columns]
+#    id = "name"
+#    "wfc3.f160w" = "H"
+#    "wfc3.f160w_err" = "dH"
+#
+#    [units]
+#    flux = "ABmag"
+#
+# Catalogs of CANDELS, 3D-HST, JADES, DJA, COSMOS2020 and CEERS have ready maps: ``read_catalog_photometry(path,
+# "candels")``. See :doc:`/method/filters`.

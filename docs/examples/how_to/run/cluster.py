@@ -1,0 +1,75 @@
+"""
+Run on a cluster or many cores
+==============================
+
+You have several cores, or several machines with a shared disk. You want a study, or a fit of a large catalog, to
+use them. The results do not depend on the number of workers.
+"""
+
+# %%
+# Commands use all cores of the machine; ``--threads`` limits them. With a dask scheduler they use its workers
+# (``pip install miricigale[dask]``):
+#
+# .. code-block:: console
+#
+#    $ miricigale run goodss --threads 4
+#    $ dask scheduler
+#    $ dask worker tcp://host:8786 --nthreads 1
+#    $ miricigale run goodss -o /shared/study --scheduler tcp://host:8786
+#
+# In Python you bring an executor. Fits run well in threads:
+
+from concurrent.futures import ThreadPoolExecutor
+
+import matplotlib.pyplot as plt
+import numpy as np
+from astropy.table import QTable
+
+from miricigale import BayesFitter, ErrorModel, SEDModel
+
+model, errors = SEDModel.yang2021(), ErrorModel.yang2021()
+rng = np.random.default_rng(1)
+n = 200
+parameters = QTable({"id": np.arange(n), "redshift": rng.uniform(0.3, 3, n)})
+parameters["frac_agn"] = rng.choice([0.0, 0.4], n)
+parameters["mass"] = 3e10
+light = model.fluxes(parameters, list(errors.filters))
+photometry = errors.perturb(light["id", *errors.filters], seed=1)
+
+fitter = BayesFitter(model, list(errors.filters), axes="quick")
+results = {}
+for n_workers in (1, 2, 4):
+    with ThreadPoolExecutor(n_workers) as executor:
+        results[n_workers] = fitter.fit(photometry, executor=executor)
+
+# %%
+# The answers are the same, for any number of workers:
+
+first = results[1].mean("frac_agn")
+for n_workers, one in results.items():
+    difference = np.max(np.abs(one.mean("frac_agn") - first))
+    print(f"{n_workers} workers: largest difference {difference:g}")
+
+ax = plt.subplots(figsize=(5.5, 5), layout="constrained")[1]
+for n_workers, marker in {1: "o", 4: "x"}.items():
+    z = results[n_workers].mean("redshift")
+    label = f"{n_workers} workers"
+    ax.plot(parameters["redshift"], z, marker, mfc="none", label=label)
+ax.set(xlabel="true redshift", ylabel="redshift")
+ax.legend()
+plt.show()
+
+# %%
+# A study uses processes. Each of them imports your script, so that the call must stand under ``__main__``:
+#
+# .. code-block:: python
+#
+#    from miricigale.utils.parallel import process_pool
+#    from miricigale.workflow import load_config, run_study
+#
+#    if __name__ == "__main__":
+#        with process_pool(4) as executor:
+#            run_study(load_config("goodss"), "study", executor=executor)
+#
+# Set ``[run] memory`` in the configuration, or fewer threads, if memory is short. See :doc:`/method/workflow` and
+# :doc:`/tutorials/large_catalogs`.

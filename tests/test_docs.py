@@ -1,0 +1,83 @@
+"""Pages are short and show something, and the scripts of the gallery run and draw."""
+
+import importlib
+import inspect
+import re
+import runpy
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import pytest
+
+DOCS = Path(__file__).parents[1] / "docs"
+BUILT = {"_build", "changes", "how_to", "tutorials", "api", "sg_execution_times.rst"}
+PAGES = [
+    path
+    for path in sorted(DOCS.rglob("*.rst"))
+    if not BUILT.intersection(path.relative_to(DOCS).parts)
+]
+SCRIPTS = sorted((DOCS / "examples").rglob("*.py"))
+SUBPACKAGES = ("filters", "sed", "scene", "detector", "reduction", "photometry", "fitting")
+
+
+def name_of(path):
+    return str(path.relative_to(DOCS).with_suffix(""))
+
+
+def code_of(text):
+    """Lines of code of a page: of its blocks and prompts, without their indentation."""
+    indent, options = None, False
+    for line in text.split("\n"):
+        bare = line.lstrip()
+        if indent is not None and bare and len(line) - len(bare) <= indent:
+            indent = None
+        # options of a directive end at an empty line
+        options = options and bool(bare)
+        if (indent is not None and not options) or bare.startswith((">>> ", "... ")):
+            yield bare
+        # text of a list stands beside its number
+        bare = re.sub(r"^(\d+\.|[-*]) ", "", bare)
+        is_block = re.match(r"\.\. (code-block|plot|doctest)::", bare)
+        if indent is None and (is_block or (bare.endswith("::") and not bare.startswith(".."))):
+            indent, options = len(line) - len(bare), True
+
+
+@pytest.mark.parametrize("path", SCRIPTS, ids=name_of)
+def test_example_runs_and_draws(path, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(plt, "show", lambda: None)
+    before = set(plt.get_fignums())
+    try:
+        runpy.run_path(str(path), run_name="__main__")
+        drawn = set(plt.get_fignums()) - before
+    finally:
+        plt.close("all")
+    assert drawn
+    lines = path.read_text(encoding="utf-8").split("\n")
+    assert len(lines) <= 250
+    code = [line for line in lines if not line.startswith("#")]
+    assert max(map(len, code[code.index('"""', 1) :])) <= 84
+
+
+@pytest.mark.parametrize("path", PAGES, ids=name_of)
+def test_page_is_short_and_prints_no_truth_values(path):
+    text = path.read_text(encoding="utf-8")
+    assert text.count("\n") <= 250
+    assert [line for line in code_of(text) if len(line) > 84] == []
+    prompts = re.findall(r"^ *>>> .*\n(?: *\.\.\. .*\n)*( *(?:True|False)\n)", text, re.MULTILINE)
+    assert prompts == []
+
+
+@pytest.mark.parametrize("path", sorted((DOCS / "method").rglob("*.rst")), ids=name_of)
+def test_page_of_a_method_has_a_figure(path):
+    text = path.read_text(encoding="utf-8")
+    assert re.search(r"^ *\.\. (plot|figure|image|sed-component)::", text, re.MULTILINE)
+
+
+@pytest.mark.parametrize("name", SUBPACKAGES)
+def test_public_objects_have_examples(name):
+    package = importlib.import_module(f"miricigale.{name}")
+    objects = {label: getattr(package, label) for label in package.__all__}
+    documented = {k: v for k, v in objects.items() if inspect.isclass(v) or inspect.isroutine(v)}
+    without = [k for k, v in documented.items() if ">>>" not in (inspect.getdoc(v) or "")]
+    assert without == []

@@ -1,0 +1,113 @@
+"""Pages to look things up in have every flag and column."""
+
+import ast
+import importlib.util
+import inspect
+import pkgutil
+import re
+import textwrap
+from pathlib import Path
+
+import miricigale
+from miricigale.utils.tables import Flags
+
+DOCS = Path(__file__).parents[1] / "docs"
+OPTIONAL = ("_stpsf", "_jwst", "__main__")
+
+
+def load(name):
+    spec = importlib.util.spec_from_file_location(name, DOCS / "_ext" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+lookup = load("lookup")
+
+
+def blocks(page, directive):
+    """Contents of the directives of a page."""
+    text = (DOCS / page).read_text(encoding="utf-8")
+    found = re.findall(rf"^\.\. {directive}::.*\n((?:\n|   .*\n)+)", text, re.MULTILINE)
+    return [textwrap.dedent(block).strip("\n") for block in found]
+
+
+def test_every_class_of_flags_is_on_its_page():
+    for module in pkgutil.walk_packages(miricigale.__path__, "miricigale."):
+        if not module.name.endswith(OPTIONAL):
+            importlib.import_module(module.name)
+    text = (DOCS / "flags.rst").read_text(encoding="utf-8")
+    shown = [path.rpartition(".") for path in re.findall(r"\.\. flag-table:: (\S+)", text)]
+    classes = [getattr(importlib.import_module(module), name) for module, _, name in shown]
+    packaged = [one for one in Flags.__subclasses__() if one.__module__.startswith("miricigale.")]
+    assert {one.__qualname__ for one in classes} == {one.__qualname__ for one in packaged}
+
+
+def test_every_flag_has_a_meaning():
+    for one in Flags.__subclasses__():
+        if not one.__module__.startswith("miricigale."):
+            continue
+        texts = {value: text for value, (_, text) in one.meanings().items()}
+        assert [one(value) for value, text in texts.items() if not text] == []
+        assert [text for _, _, text in lookup.flag_rows(one) if not text.endswith(".")] == []
+        assert inspect.getdoc(one)
+
+
+def test_columns_of_tables_have_a_meaning():
+    names, found = {}, {}
+    for block in blocks("columns.rst", "column-table"):
+        rows = lookup.column_rows(lookup.run_block(block, names))
+        assert [name for name, _, text in rows if not text] == []
+        found |= {name: text for name, _, text in rows}
+    assert {"flux_err_template", "redshift_p50", "mass_logmean", "<band>_true"} <= set(found)
+
+
+def pattern(node, names):
+    """Regular expression of the text that an expression makes; anything where it is not literal."""
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        return re.sub(r"%(\\?-?[\d.]*[a-z])", ".+?", re.escape(node.value).replace("%%", "%"))
+    if isinstance(node, ast.JoinedStr):
+        return "".join(
+            pattern(one, names) if isinstance(one, ast.Constant) else ".*?" for one in node.values
+        )
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+        given = [pattern(one, names) for one in node.args]
+        if node.func.id == "argument_error" and len(given) == 3:
+            return f"'{given[0]}' must be {given[1]}, got {given[2]}"
+        if node.func.id in ("data_error", "config_error") and len(given) == 2:
+            return " ".join(given)
+        if node.func.id == "unknown_name" and len(given) == 3:
+            return f"no {given[0]} '.+?'; (known: |the nearest of \\d+ are )"
+    return names.get(node.id, ".+?") if isinstance(node, ast.Name) else ".+?"
+
+
+def texts(source):
+    """Regular expressions of the longer texts of a module."""
+    for scope in ast.walk(ast.parse(source)):
+        names = {}
+        if not isinstance(scope, ast.FunctionDef):
+            continue
+        for node in ast.walk(scope):
+            if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+                names[node.targets[0].id] = pattern(node.value, names)
+        for node in ast.walk(scope):
+            if isinstance(node, ast.JoinedStr | ast.Constant | ast.Call):
+                text = pattern(node, names)
+                yield re.sub(r"(\\? )+", " +", text)
+
+
+def letters(text):
+    return len(re.sub(r"\W|_", "", text))
+
+
+def test_messages_of_troubleshooting_are_those_of_the_code():
+    messages = [" ".join(one.split()) for one in blocks("troubleshooting.rst", "code-block")]
+    assert len(messages) >= 25
+    missing = {message.removeprefix("text ") for message in messages}
+    for path in Path(miricigale.__file__).parent.rglob("*.py"):
+        for text in set(texts(path.read_text(encoding="utf-8"))):
+            # a text of few letters fits anything
+            missing -= {
+                one for one in missing if letters(text) > letters(one) / 3 and re.search(text, one)
+            }
+    assert sorted(missing) == []
