@@ -24,7 +24,7 @@ THRESHOLD = -9990.0
 DEFAULT_ERROR = 0.1
 
 #: What a warning says of bands without a filter.
-GIVE_FILTER = "names={'band': a Filter, the name of one, or the path of its file} gives it one"
+GIVE_FILTER = "names={'band': a Filter, a name, such as 'xray_boxcar_0p5to2keV', or the path of a file} gives one"
 
 _OWN = ("id", "redshift", "distance")
 

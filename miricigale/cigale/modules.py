@@ -342,6 +342,10 @@ _MODULES = {
 }
 
 
+#: Modules without which stars or the AGN would be left out, and which stand in their place.
+_INSTEAD = {"m2005": "bc03 (a table is bundled)", "fritz2006": "skirtor2016 (a torus is bundled)"}
+
+
 def read_modules(names, parameters, *, folder, libraries):
     """
     Take modules of CIGALE, in order, for components: a `Chain`.
@@ -352,6 +356,9 @@ def read_modules(names, parameters, *, folder, libraries):
     """
     chain = Chain()
     for name in names:
+        if name in _INSTEAD:
+            msg = f"{name} is not here, and what it is for would be lacking: take {_INSTEAD[name]}"
+            raise ConfigError(msg)
         if name not in _MODULES:
             chain.left_out.append(name)
             continue

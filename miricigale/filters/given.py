@@ -2,12 +2,16 @@
 
 import os
 
+import astropy.constants as const
 import astropy.units as u
+import numpy as np
 
-from miricigale.filters.band_names import find_filter
+from miricigale.filters.band_names import find_filter, xray_energies
 from miricigale.filters.filter import Filter
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import TABLE_FORMATS
+
+_KEV = (const.h * const.c).to_value(u.keV * u.um)
 
 
 def as_filter(given, name=None, *, unit=None):
@@ -66,5 +70,21 @@ def _is_path(text):
 
 
 def given_filters(names):
-    """Filters that a user of CIGALE gave for bands, a dict by the band of what `as_filter` takes."""
-    return {band: as_filter(given, band, unit=u.AA) for band, given in (names or {}).items()}
+    """
+    Filters that a user of CIGALE gave for bands, a dict by the band of what `as_filter` takes.
+
+    An X-ray band by its name (``xray_boxcar_0p5to2keV``) is a filter of that name, by which `xray_energies` knows
+    it; a curve at its wavelengths is refused.
+    """
+    return {band: _given(band, given) for band, given in (names or {}).items()}
+
+
+def _given(band, given):
+    ends = xray_energies(given) if isinstance(given, str) else None
+    if ends is not None:
+        return Filter(_KEV / np.array(ends)[::-1] * u.um, [1.0, 1.0], name=given)
+    found = as_filter(given, band, unit=u.AA)
+    if found.wave[0].to_value(u.um) < _KEV / 0.1:  # X-rays
+        wanted = "the energies of an X-ray band, such as 'xray_boxcar_0p5to2keV'"
+        raise argument_error("names", wanted, f"a curve of X-rays for {band!r}")
+    return found

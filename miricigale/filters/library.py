@@ -1,4 +1,4 @@
-"""The library of filter curves: names, and where astro-sedpy keeps each."""
+"""The library of filter curves: names, and where astro-sedpy, or our own table, keeps each."""
 
 import importlib.metadata
 from importlib.util import find_spec
@@ -7,7 +7,7 @@ from pathlib import Path
 import astropy.units as u
 import numpy as np
 
-from miricigale.refdata import Registry, citations
+from miricigale.refdata import Registry, citations, locate
 from miricigale.utils.exceptions import DataError, data_error
 from miricigale.utils.options import check_names
 from miricigale.utils.units import WAVE
@@ -41,16 +41,23 @@ def curve_folder():
     return Path(spec.origin).parent / "data" / "filters"
 
 
+def _resource(curve):
+    return f"filters.{curve.partition('.')[0]}" if "." in curve else _RESOURCE
+
+
 def read_curve(curve):
     """
-    Read a curve of astro-sedpy: wavelengths in um, ascending, photon response, and how many values
-    were negative (noise of the measurement) and are set to 0.
+    Read a curve of astro-sedpy, or one of ours (whose names have a dot): wavelengths in um, ascending, photon
+    response, and how many values were negative (noise of the measurement) and are set to 0.
     """
-    path = curve_folder() / f"{curve}.par"
+    bundled = "." in curve
+    path = locate(_resource(curve)) if bundled else curve_folder() / f"{curve}.par"
     # the files are yanny tables; in some the rows lack the leading table name
     rows = []
     for line in path.read_text(encoding="latin-1").splitlines():
         words = line.split("#")[0].split()
+        if bundled and words[:1] != [curve]:
+            continue
         try:
             rows.append((float(words[-2]), float(words[-1])))
         except (IndexError, ValueError):
@@ -70,9 +77,11 @@ def _load(name):
     metadata = {} if name.startswith(SEDPY) else FILTERS.metadata(name)
     curve = metadata.pop("curve", name.removeprefix(SEDPY))
     wave, throughput, n_negative = read_curve(curve)
+    resource = _resource(curve)
+    version = importlib.metadata.version("astro-sedpy")
     meta = {
-        "source": f"astro-sedpy {importlib.metadata.version('astro-sedpy')}, {curve}",
-        "citations": citations(_RESOURCE),
+        "source": f"{f'astro-sedpy {version}' if resource == _RESOURCE else resource}, {curve}",
+        "citations": citations(resource),
         "flux_convention": metadata.pop("flux_convention", "AB"),
     }
     if n_negative:
@@ -105,6 +114,9 @@ def _register():
             add(f"{instrument}.{band}", f"{prefix}{band}")
     for band, number in (("u", 9301), ("g", 9401), ("r", 9601), ("i", 9701), ("z", 9801)):
         add(f"megacam.{band}", f"cfht_megacam_{band}s_{number}")
+        add(f"megacam2015.{band}", f"megacam2015.{band}")
+    for band in "zyjhk":
+        add(f"wfcam.{band}", f"wfcam.{band}" if band in "zy" else f"ukirt_wfcam_{band.upper()}")
     for band in ("j1", "j2", "j3", "h1", "h2", "k"):
         add(f"newfirm.{band}", f"mayall_newfirm_{band.upper()}")
     for band, wave in _IRAC.items():

@@ -366,7 +366,8 @@ class BayesFitter(Interactive):
         self.backend.check_data(data)
         flags = np.array(data.flags)
         known, n_free, kind = self.backend.redshifts(photometry, redshift, redshift_prior, flags)
-        few = (data.measured.sum(axis=1) < n_free) & ((flags & int(FitFlags.UNFITTED)) == 0)
+        seen = np.sum(data.measured & (data.flux >= 2.0 * data.flux_err), axis=1)
+        few = (seen < min(n_free, 3 - (kind == "fixed"))) & ((flags & int(FitFlags.UNFITTED)) == 0)
         flags[few] |= int(FitFlags.FEW_FOR_PARAMETERS)
         settings = self.settings(filters) | {"redshift": kind}
         settings["unused_bands"] = unused_bands(photometry, filters)

@@ -49,7 +49,7 @@ def fit_catalog(
         ``<filter>_err`` by any usual name of the filter, or with columns that ``catalog_map`` gives these names.
     output : path-like
         Folder of the results.
-    axes : {"fit", "quick", "survey"}, optional
+    axes : {"fit", "quick", "survey", "far-infrared"}, optional
         Model grid; see `miricigale.sed.yang2021_axes` and `miricigale.sed.survey_axes`.
     models : callable, optional
         Function of the bands (a list of str) that returns the `~miricigale.sed.SEDModel` and its axes in place of
@@ -111,6 +111,8 @@ def fit_catalog(
         model, nodes = SEDModel.survey(), SEDModel.survey_axes()
         if model_error is None:
             error, least = TemplateError.survey(), 0.0
+    elif axes == "far-infrared":
+        model, nodes = SEDModel.survey(), SEDModel.survey_axes(axes)
     else:
         model, nodes = SEDModel.yang2021(), SEDModel.yang2021_axes(axes)
     if models is not None:

@@ -61,7 +61,8 @@ class FitFlags(Flags):
     NO_MODEL = 512
     #: A flux that is infinite or beyond 1e60 uJy; the band is left out.
     BAD_FLUX = 1024
-    #: Fewer fluxes than free parameters, the mass among them; limits are not counted.
+    #: Fewer than three fluxes of 2 sigma or more (two if the redshift is known), or than free parameters if these
+    #: are fewer: but for mass, redshift and a color the posterior is the prior. Limits are not counted.
     FEW_FOR_PARAMETERS = 2048
     #: Upper limits and no flux: any model that is faint enough fits.
     ALL_LIMITS = 4096

@@ -45,34 +45,36 @@ COLORS = {"nuv_r": ("nuv", "r"), "u_v": ("u", "v"), "v_j": ("v", "j")}
 STELLAR = ("sfh", "stellar", "nebular")
 GALAXY = (STELLAR, ("attenuation",), ("dust",))
 SKY = ("igm", "foreground")
-MAX_HISTORIES = 128  # stars of so many histories are kept
+MAX_HISTORIES = 128  # stars of so many histories, those made last, are kept
 #: Results that each of these methods of `Chain` keeps.
 MAX_KEPT = 256
-_KEEPING = ("_populations", "factors", "dust", "agn_templates", "sky_transmission")
+_KEEPING = "names _hat _populations _glow factors dust agn_templates sky_transmission"
+_OF_STARS = "dust_power stellar_mass sfr sfr_10myr sfr_100myr age_mass age_light"
 
 
 @dataclass(frozen=True, eq=False)
 class Stars:
     """
-    Light of stars and of the gas they ionize, for one solar mass formed.
+    Light of stars of n histories and of the gas they ionize, for one solar mass formed.
 
-    Spectra are L_lambda in W/um; ``nebular_young`` and ``nebular_old`` are the gas's part
-    of ``young`` and ``old``; ``dust_power`` in W is what dust takes of the ionizing light;
-    ``visual`` is L_lambda at 0.55 um; ages are in Gyr, rates in Msun/yr, masses in Msun.
+    Spectra, shape (n, n_wave), are L_lambda in W/um; ``nebular_young`` and ``nebular_old`` are the
+    gas's part of ``young`` and ``old``; the others have shape (n,): ``dust_power`` in W is what dust
+    takes of the ionizing light; ``visual`` is L_lambda at 0.55 um; ages are in Gyr, rates in Msun/yr,
+    masses in Msun.
     """
 
     young: np.ndarray
     old: np.ndarray
     nebular_young: np.ndarray | None
     nebular_old: np.ndarray | None
-    dust_power: float
-    visual: float
-    stellar_mass: float
-    sfr: float
-    sfr_10myr: float
-    sfr_100myr: float
-    age_mass: float
-    age_light: float
+    dust_power: np.ndarray
+    visual: np.ndarray
+    stellar_mass: np.ndarray
+    sfr: np.ndarray
+    sfr_10myr: np.ndarray
+    sfr_100myr: np.ndarray
+    age_mass: np.ndarray
+    age_light: np.ndarray
 
 
 def distinct(items):
@@ -120,7 +122,7 @@ class Chain:
         self.log_wave = np.log(wave)
         self.weights = _core.trapezoid_weights(wave)
         self.to_lnu = wave**2 / _core.LIGHT
-        self._ionizing = wave < _core.LYMAN_LIMIT
+        self._hard = int(np.searchsorted(wave, _core.LYMAN_LIMIT))  # these ionize hydrogen
         self.at = {
             x: int(np.searchsorted(wave, x * (1 - 1e-9))) for x in (SIX, VISUAL, *INFRARED, *span)
         }
@@ -131,9 +133,9 @@ class Chain:
         self._names = {
             role: tuple(part.parameters) if part else () for role, part in self.by_role.items()
         }
-        self._stars = {}
+        self._kept = ({}, None)
         # what was made last is kept, by its arguments, as long as the chain lives
-        for name in _KEEPING:
+        for name in _KEEPING.split():
             setattr(self, name, functools.lru_cache(MAX_KEPT)(getattr(self, name)))
 
     def _functionals(self):
@@ -166,74 +168,77 @@ class Chain:
 
     # ------------------------------------------------------------------ stars
 
-    def _populations(self, metallicity):
-        """Ages, spectra on our grid, surviving mass and ionizing photons of one metallicity."""
-        stellar = self.by_role["stellar"]
-        age, spectra, surviving = stellar.table(metallicity)
-        matrix = _core.hat_matrix(np.asarray(stellar.nodes()), self.wave)
-        spectra = np.ascontiguousarray((matrix @ np.asarray(spectra, dtype=float).T).T)
-        ionizing = stellar.ionizing(metallicity) if self.by_role["nebular"] else None
-        return age, spectra, surviving, ionizing
+    def _hat(self, role):
+        """Matrix that interpolates spectra at a component's nodes on our grid."""
+        return _core.hat_matrix(np.asarray(self.by_role[role].nodes()), self.wave)
 
-    @functools.cached_property
-    def _nebular_hat(self):
-        return _core.hat_matrix(np.asarray(self.by_role["nebular"].nodes()), self.wave)
+    def _populations(self, metallicity):
+        """Ages, spectra on our grid, surviving mass of one metallicity, and photons by age of the gas's table."""
+        stellar, nebular = self.by_role["stellar"], self.by_role["nebular"]
+        age, spectra, surviving = stellar.table(metallicity)
+        spectra = np.ascontiguousarray(
+            (self._hat("stellar") @ np.asarray(spectra, dtype=float).T).T
+        )
+        photons = np.diag(stellar.ionizing(metallicity)) if nebular else ()
+        photons = [_core.photons_by_age(age, row, nebular.table.age) for row in photons]
+        return age, spectra, surviving, np.array(photons)
+
+    def _glow(self, key):
+        """Light of the gas on our grid for one photon, by a key of the stellar roles without history."""
+        spectra = self.by_role["nebular"].by_photon(self._dict(key, *STELLAR[1:]))
+        return np.ascontiguousarray((self._hat("nebular") @ spectra.T).T)
 
     def stars(self, keys):
-        """`Stars` of several histories at once, by their keys: list, the same one for the same key."""
-        known = {key: self._stars[key] for key in keys if key in self._stars}
-        new = [key for key in dict.fromkeys(keys) if key not in known]
-        values = [self._dict(key, *STELLAR) for key in new]
-        for metallicity in {v["metallicity"] for v in values}:
-            rows = [i for i, v in enumerate(values) if v["metallicity"] == metallicity]
-            made = self._make_stars(metallicity, [values[i] for i in rows])
-            known.update(zip([new[i] for i in rows], made, strict=True))
-        # histories that follow on one another share what was made last
-        self._stars = dict(list((self._stars | known).items())[-MAX_HISTORIES:])
-        return [known[key] for key in keys]
+        """
+        `Stars` of the different histories among keys, and which of them each key has.
 
-    def _make_stars(self, metallicity, values):
-        age, spectra, surviving, ionizing = self._populations(metallicity)
+        Sums are made row by row: what a history gives does not depend on what is asked for with it.
+        """
+        place, stars = self._kept
+        if not all(key in place for key in keys):
+            different, rows = distinct(keys)
+            stars = self._make_stars([self._dict(key, *STELLAR) for key in different])
+            if len(different) <= MAX_HISTORIES:  # those that follow may share them
+                self._kept = ({key: row for row, key in enumerate(different)}, stars)
+            return stars, rows
+        return stars, np.array([place[key] for key in keys], dtype=np.int64)
+
+    def _make_stars(self, values):
         sfh, stellar, nebular = (self.by_role[r] for r in STELLAR)
+        n = len(values)
+        light = np.zeros((2, n, self.wave.size))
+        gas = None if nebular is None else np.zeros_like(light)
+        out = {name: np.zeros(n) for name in _OF_STARS.split()}
         histories = [sfh.history(v) for v in values]
-        pairs = [stellar.age_weights(h, v) for h, v in zip(histories, values, strict=True)]
-        young, old = (np.array([pair[i] for pair in pairs]) for i in (0, 1))
-        # sums row by row: what is kept does not depend on what was asked for with it
-        young_light, old_light = (_core.weighted_sums(w, spectra) for w in (young, old))
-        both = young + old
-        bright = both * spectra[:, self.at[VISUAL]]
-        light = bright.sum(axis=1)
-        age_light = (bright * age).sum(axis=1) / np.where(light > 0, light, np.nan) * 1e-3
-        age_mass = (both * age).sum(axis=1) / both.sum(axis=1) * 1e-3
-        mass = (both * surviving).sum(axis=1)
-        for i, (v, h) in enumerate(zip(values, histories, strict=True)):
-            parts = [young_light[i], old_light[i]]
-            gas, dusty = [None, None], 0.0
-            if nebular is not None:
-                hard = sum(self.weights @ (part * self._ionizing) for part in parts)
-                dusty = v["f_dust"] * float(hard)
-                passed = np.where(self._ionizing, v["f_esc"], 1.0)
-                gas = [
-                    self._nebular_hat @ nebular.spectra(age, w, ionizing, v)
-                    for w in (young[i], old[i])
-                ]
-                parts = [part * passed + glow for part, glow in zip(parts, gas, strict=True)]
-            for part in (*parts, *(glow for glow in gas if glow is not None)):
-                part.flags.writeable = False
-            yield Stars(
-                young=parts[0],
-                old=parts[1],
-                nebular_young=gas[0],
-                nebular_old=gas[1],
-                dust_power=dusty,
-                visual=float((parts[0] + parts[1])[self.at[VISUAL]]),
-                stellar_mass=float(mass[i]),
-                sfr=float(h[-1]),
-                sfr_10myr=float(h[-10:].mean()),
-                sfr_100myr=float(h[-100:].mean()),
-                age_mass=float(age_mass[i]),
-                age_light=float(age_light[i]),
-            )
+        keys, kind = distinct([self.key(v, *STELLAR[1:]) for v in values])
+        for i, key in enumerate(keys):
+            rows, v = np.flatnonzero(kind == i), self._dict(key, *STELLAR[1:])
+            age, spectra, surviving, ionizing = self._populations(v["metallicity"])
+            some = [histories[row] for row in rows]
+            every, end = np.concatenate([*some, [0.0]]), np.cumsum([h.size for h in some])
+            weights = stellar.masses(every, end, v)
+            out["sfr"][rows] = every[end - 1]
+            for last in (10, 100):
+                steps = np.minimum(np.diff(end, prepend=0), last)
+                ends = np.column_stack([end - steps, end]).ravel()
+                out[f"sfr_{last}myr"][rows] = np.add.reduceat(every, ends)[::2] / steps
+            both = weights.sum(axis=0)
+            bright = both * spectra[:, self.at[VISUAL]]
+            total = np.where(bright.any(axis=1), bright.sum(axis=1), np.nan)
+            out["age_light"][rows] = (bright * age).sum(axis=1) / total * 1e-3
+            out["age_mass"][rows] = (both * age).sum(axis=1) / both.sum(axis=1) * 1e-3
+            out["stellar_mass"][rows] = (both * surviving).sum(axis=1)
+            for part, own in enumerate(weights):
+                light[part, rows] = _core.weighted_sums(own, spectra)
+                if gas is not None:
+                    hard = light[part, rows, : self._hard] * self.weights[: self._hard]
+                    out["dust_power"][rows] += v["f_dust"] * hard.sum(axis=1)
+                    light[part, rows, : self._hard] *= v["f_esc"]
+                    photons = _core.weighted_sums(own, ionizing)
+                    gas[part, rows] = _core.weighted_sums(photons, self._glow(key))
+        light += 0.0 if gas is None else gas
+        visual = light[:, :, self.at[VISUAL]].sum(axis=0)
+        return Stars(*light, *((None, None) if gas is None else gas), visual=visual, **out)
 
     # ------------------------------------------------------- attenuation and dust
 
@@ -246,13 +251,15 @@ class Chain:
         gas = attenuation.gas_factor(self.wave, values) if self.by_role["nebular"] else None
         return *attenuation.factors(self.wave, values), gas
 
-    def attenuated(self, stars, keys, dust_keys=None, out=None):
+    def attenuated(self, stars, rows, keys, dust_keys=None, out=None):
         """
         Starlight of n galaxies behind dust, and the power that dust took.
 
         Parameters
         ----------
-        stars : sequence of `Stars`
+        stars : `Stars`
+        rows : `~numpy.ndarray` of int, shape (n,)
+            Which of the stars each galaxy has.
         keys, dust_keys : sequence of tuple
             Keys of ``attenuation``, and of ``dust`` if its light is to be added.
         out : `~numpy.ndarray`, shape (n, n_wave), optional
@@ -263,39 +270,41 @@ class Chain:
         light, absorbed : `~numpy.ndarray`, shape (n, n_wave) and (n,)
             L_lambda in W/um, and W.
         """
-        n, none = len(stars), np.zeros((0, self.wave.size))
-        some, star = distinct(stars)
+        n, none = len(rows), np.zeros((0, self.wave.size))
+        some = slice(int(rows.min()), int(rows.max()) + 1)
         different, dim = distinct(keys)
         dust, dusty = np.zeros((1, self.wave.size)), np.zeros(n, dtype=np.int64)
         if dust_keys is not None:
             dust_keys, dusty = distinct(dust_keys)
-            dust = np.array([self.dust(key) for key in dust_keys])
-        parts = [np.array([getattr(s, age) for s in some]) for age in ("young", "old")]
+            dust = self.dusts(dust_keys)
+        parts = [stars.young[some], stars.old[some], none]
         *dims, gas = zip(*map(self.factors, different), strict=True)
-        parts, dims = [*parts, none], [*map(np.array, dims), none]
+        dims = [*map(np.array, dims), none]
         if gas[0] is not None:
-            young, old = (
-                np.array([getattr(s, f"nebular_{a}") for s in some]) for a in ("young", "old")
-            )
+            young, old = stars.nebular_young[some], stars.nebular_old[some]
             parts = [parts[0] - young, parts[1] - old, young + old]
             dims[2] = np.array(gas)
-        extra = np.array([s.dust_power for s in some])
         out = np.empty((n, self.wave.size)) if out is None else out
         absorbed = np.empty(n)
         _core.mix_light(
-            self.weights, *parts, star, *dims, dim, extra, dust, dusty, out, absorbed
+            self.weights, *parts, rows - some.start, *dims, dim, stars.dust_power[some], dust, dusty, out, absorbed
         )  # fmt: skip
         return out, absorbed
 
-    def dust(self, key):
-        """Dust spectrum in W/um for one watt, by the key of ``dust``; zeros without the component."""
-        if self.by_role["dust"] is None:
-            return np.zeros(self.wave.size)
-        template = self.by_role["dust"].template(self.wave, **self._dict(key, "dust"))
+    def dusts(self, keys):
+        """Dust spectra in W/um for one watt, by keys of ``dust``; zeros without the component."""
+        component = self.by_role["dust"]
+        if component is None:
+            return np.zeros((len(keys), self.wave.size))
+        columns = dict(zip(self.names("dust"), np.array(keys).T, strict=True))
+        spectra = np.ascontiguousarray((self._hat("dust") @ component.spectra(columns).T).T)
         # one watt on this grid too, where the step at the first node is a slope
-        template = template / (self.weights @ template)
-        template.flags.writeable = False
-        return template
+        spectra /= (spectra * self.weights).sum(axis=1, keepdims=True)
+        return spectra
+
+    def dust(self, key):
+        """One of `dusts`."""
+        return self.dusts([key])[0]
 
     # ------------------------------------------------------------- AGN and the sky
 
@@ -315,13 +324,17 @@ class Chain:
         """`~miricigale.sed.components.AGNTemplates` for a dict of values, whatever its fraction."""
         return self.agn_templates(self.agn_key(values))
 
-    def sky_transmission(self, redshift, key):
-        """Transmission between the source and us, by the key of ``igm`` and ``foreground``."""
-        observed, values = self.wave * (1.0 + redshift), self._dict(key, *SKY)
+    def sky_transmission(self, redshift, key, first=0, last=None):
+        """
+        Transmission between the source and us, by the key of ``igm`` and ``foreground``.
+
+        Given at the rest wavelengths from number ``first`` to ``last``, that one not included.
+        """
+        observed, values = self.wave[first:last] * (1.0 + redshift), self._dict(key, *SKY)
         igm, foreground = (self.by_role[role] for role in SKY)
-        out = np.ones(self.wave.size)
+        out = np.ones(observed.size)
         if igm is not None:
-            own = {name: values[name] for name in igm.parameters}
+            own = {name: values[name] for name in self.names("igm")}
             out = igm.transmission(observed, redshift, **own)
         if foreground is not None:
             out = out * foreground.transmission(observed, values)

@@ -135,6 +135,7 @@ class Component:
         super().__setattr__(name, value)
 
     @classmethod
+    @functools.cache
     def declared(cls):
         """Parameters as declared in the class bodies, base classes first."""
         bodies = [vars(base).items() for base in reversed(cls.__mro__)]

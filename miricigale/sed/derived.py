@@ -70,27 +70,27 @@ _LOG_UV = np.log10(np.mean(UV_WINDOWS, axis=1))
 _BAND = {name: i for i, name in enumerate(COLOR_BANDS)}
 
 
-def galaxy_quantities(stars, absorbed, sums, reference_row=0):
+def galaxy_quantities(stars, rows, absorbed, sums, reference_row=0):
     """
     Derived quantities of n galaxies for one solar mass formed, in the units of `DERIVED`.
 
-    ``stars`` are their `~miricigale.sed.chain.Stars`, ``absorbed``, shape (n,), the power in W that dust took,
-    ``sums``, shape (n, n_functional), their light times ``Chain.functionals``; ``reference`` is the light
-    that AGN fractions refer to, and not in `DERIVED`.
+    ``stars`` are `~miricigale.sed.chain.Stars`, of which each galaxy has one of ``rows``, shape (n,);
+    ``absorbed``, shape (n,), is the power in W that dust took, ``sums``, shape (n, n_functional), their light
+    times ``Chain.functionals``; ``reference`` is the light that AGN fractions refer to, and not in `DERIVED`.
     """
     n = len(_LOG_UV)
     visual, windows, bands = sums[:, 1], sums[:, 2 : 2 + n], sums[:, 2 + n :]
     with np.errstate(divide="ignore", invalid="ignore"):
         logs = np.log10(windows)
         magnitude = -2.5 * np.log10(bands)
-        a_v = 2.5 * np.log10(np.array([s.visual for s in stars]) / visual)
+        a_v = 2.5 * np.log10(stars.visual[rows] / visual)
     step = _LOG_UV - _LOG_UV.mean()
     out = {
-        name: np.array([getattr(s, name) for s in stars])
+        name: getattr(stars, name)[rows]
         for name in ("stellar_mass", "sfr", "sfr_10myr", "sfr_100myr", "age_mass", "age_light")
     }
     out |= {
-        "stellar_mass_formed": np.ones(len(stars)),
+        "stellar_mass_formed": np.ones(len(rows)),
         "dust_luminosity": absorbed,
         "ir_luminosity": sums[:, 0],
         "reference": sums[:, reference_row],

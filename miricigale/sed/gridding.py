@@ -11,11 +11,13 @@ from miricigale.sed.derived import DERIVED, galaxy_quantities
 from miricigale.sed.grid import ModelGrid
 from miricigale.sed.spectrum import distance
 from miricigale.sed.tables import BLOCK, dilution, seen_agn
-from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.exceptions import ModelWarning, argument_error, unknown_name, warn
 from miricigale.utils.tables import described_table
+from miricigale.utils.units import WAVE
 
 #: Roles whose parameters shape the galaxy.
 GALAXY_ROLES = sum(GALAXY, ())
+_COLD = 30.0  # um at rest, beyond which dust heated by the mean field shines
 
 
 def check_axes(model, axes):
@@ -39,6 +41,15 @@ def check_axes(model, axes):
     if "redshift" not in out:
         raise argument_error("axes", "with 'redshift'", sorted(axes))
     return out
+
+
+def warn_of_one_field(model, axes, filters):
+    """Warn of far-infrared bands where all dust is in the same field of starlight, ``u_min``."""
+    reach = _COLD * (1.0 + axes["redshift"][0])
+    far = [band.name for band in filters if band.pivot.to_value(WAVE) > reach]
+    if far and "u_min" in model.parameters and len(axes.get("u_min", [1.0])) == 1:
+        msg = f"'u_min' of the dust has one value, which fixes the temperature of what {', '.join(far)} see; "
+        warn(msg + "survey_axes('far-infrared') has more (--axes far-infrared)", ModelWarning)
 
 
 def _names(model, roles):
@@ -80,16 +91,17 @@ class _Galaxies:
     def __init__(self, model, rows):
         chain = self.chain = model.chain
         stars, dims, dusts = ([chain.key(row, *roles) for row in rows] for roles in GALAXY)
-        self._stars = chain.stars(stars)
+        self._stars, self._rows = chain.stars(stars)
         # many galaxies: their spectra are in memory once
-        pairs, self.light_rows = distinct(zip(self._stars, dims, strict=True))
+        pairs, self.light_rows = distinct(zip(self._rows.tolist(), dims, strict=True))
         self.starlight, absorbed = np.empty((len(pairs), chain.wave.size)), np.empty(len(pairs))
         for first in range(0, len(pairs), BLOCK):
             part = slice(first, first + BLOCK)
-            stars, keys = zip(*pairs[part], strict=True)
-            _, absorbed[part] = chain.attenuated(stars, keys, out=self.starlight[part])
+            rows, keys = zip(*pairs[part], strict=True)
+            out = self.starlight[part]
+            _, absorbed[part] = chain.attenuated(self._stars, np.array(rows), keys, out=out)
         dusts, self.dust_rows = distinct(dusts)
-        self.dust = np.array(list(map(chain.dust, dusts)))
+        self.dust = chain.dusts(dusts)
         self.absorbed = absorbed[self.light_rows]
 
     def sums(self, weights):
@@ -101,7 +113,8 @@ class _Galaxies:
     def quantities(self):
         """Derived quantities: dict of arrays, one value for each galaxy."""
         sums = self.sums(self.chain.functionals.T)
-        return galaxy_quantities(self._stars, self.absorbed, sums, self.chain.reference_row)
+        row = self.chain.reference_row
+        return galaxy_quantities(self._stars, self._rows, self.absorbed, sums, row)
 
 
 def _galaxy_tables(quantities):
@@ -121,11 +134,10 @@ def _galaxy_tables(quantities):
 
 
 def _agn_table(model, parts):
-    """Properties of AGN for one watt of what the fraction refers to, and the scale to it."""
-    seen = seen_agn(model.chain, parts)
-    scale = np.ones(len(parts))
-    if model.frac_agn_definition != "dust":
-        scale = 1.0 / seen["reference"]
+    """L_nu and properties of AGN for one watt of what the fraction refers to."""
+    spectra, seen = seen_agn(model.chain, parts)
+    dusty = model.frac_agn_definition == "dust"
+    scale = np.ones(len(parts)) if dusty else 1.0 / seen["reference"]
     values = {
         "agn_power": np.ones(len(parts)),
         "agn_luminosity": seen["luminosity"],
@@ -135,7 +147,7 @@ def _agn_table(model, parts):
     }
     texts = {name: DERIVED[name].text for name in values}
     texts["ir_luminosity"] = "3-1000 um light of the AGN"
-    return scale, described_table(
+    return model.chain.lnu(spectra) * scale[:, None], described_table(
         {
             name: (column * scale * u.one, f"{texts[name]}, W for each W of AGN power")
             for name, column in values.items()
@@ -167,8 +179,7 @@ def model_grid(model, axes, filters):
         _refuse_invalid(model, [defaults | row for row in every], ("agn",))
         agn_rows, count, inert = _distinct_agn(agn_component, every)
         parts = [chain.agn(row) for row in agn_rows]
-        scale, properties_of_agn = _agn_table(model, parts)
-        agn_spectra = chain.lnu(np.array([t.total for t in parts])) * scale[:, None]
+        agn_spectra, properties_of_agn = _agn_table(model, parts)
         nuclei = {
             "frac_agn": frac_agn,
             "agn_parameters": _parameter_table(agn_parameters, agn_rows),

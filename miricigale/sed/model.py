@@ -200,9 +200,9 @@ class SEDModel(Interactive):
         return model
 
     @staticmethod
-    def survey_axes():
+    def survey_axes(kind="survey"):
         """Axes for real galaxies; see `miricigale.sed.survey_axes`."""
-        return presets.survey_axes()
+        return presets.survey_axes(kind)
 
     @staticmethod
     def survey_priors():
@@ -449,6 +449,11 @@ class SEDModel(Interactive):
         ValueError
             If values do not ascend, are outside their bounds or not in the library.
 
+        Warns
+        -----
+        `~miricigale.utils.exceptions.ModelWarning`
+            If a band is beyond 30 um at rest, and ``u_min`` of the dust has one value.
+
         Examples
         --------
         >>> from miricigale import SEDModel
@@ -459,6 +464,7 @@ class SEDModel(Interactive):
         """
         axes = gridding.check_axes(self, axes)
         filters = self._bands(filters)
+        gridding.warn_of_one_field(self, axes, filters)
         if not cache:
             return gridding.model_grid(self, axes, filters)
         return cached_grid(self, axes, filters, gridding.model_grid)

@@ -21,7 +21,7 @@ from miricigale.utils.exceptions import ModelWarning, argument_error, warn
 from miricigale.utils.tables import Flags, as_table, described_table
 from miricigale.utils.units import FNU, WAVE
 
-BLOCK = 128  # rows worked out together: their spectra fit into the processor's cache
+BLOCK = 64  # rows worked out together: their spectra fit into the processor's cache
 
 
 class ModelFlags(Flags):
@@ -53,9 +53,9 @@ def dilution(redshift, far):
 
 
 def seen_agn(chain, parts):
-    """Sums over AGN templates that the derived quantities need: dict of arrays."""
+    """Spectra of AGN templates, and the sums over them that the derived quantities need: dict of arrays."""
     total = np.array([t.total for t in parts])
-    return {
+    return total, {
         "infrared": total @ chain.functionals[0],
         "reference": chain.reference(total),
         "luminosity": total @ chain.weights,
@@ -131,24 +131,27 @@ def _stack(filters):
 def spectra(model, values):
     """The spectrum of one model with its parts and derived quantities; see `SEDModel.evaluate`."""
     chain, z = model.chain, values["redshift"]
-    (stars,), dim = chain.stars([chain.key(values, *STELLAR)]), chain.key(values, "attenuation")
-    (starlight,), absorbed = chain.attenuated([stars], [dim])
+    (stars, rows), dim = (
+        chain.stars([chain.key(values, *STELLAR)]),
+        chain.key(values, "attenuation"),
+    )
+    (starlight,), absorbed = chain.attenuated(stars, rows, [dim])
     absorbed *= values.get("dust_excess", 1.0)
     dust = absorbed * chain.dust(chain.key(values, "dust"))
     spectrum = starlight + dust
-    parts = {"stellar_intrinsic": stars.young + stars.old, "stellar": starlight}
+    parts = {"stellar_intrinsic": (stars.young + stars.old)[rows[0]], "stellar": starlight}
     if stars.nebular_young is not None:
         young, old, gas = chain.factors(dim)
-        nebular = stars.nebular_young * (young if gas is None else gas)
-        nebular += stars.nebular_old * (old if gas is None else gas)
+        nebular = stars.nebular_young[rows[0]] * (young if gas is None else gas)
+        nebular += stars.nebular_old[rows[0]] * (old if gas is None else gas)
         parts |= {"stellar": starlight - nebular, "nebular": nebular}
     parts["dust"] = dust
     sums = spectrum[None] @ chain.functionals.T
-    got = galaxy_quantities([stars], absorbed, sums, chain.reference_row)
+    got = galaxy_quantities(stars, rows, absorbed, sums, chain.reference_row)
     if model.has_agn:
         agn, fraction = chain.agn(values), values["frac_agn"]
         ratio = np.array([fraction / (1.0 - fraction)])
-        seen = seen_agn(chain, [agn])
+        _, seen = seen_agn(chain, [agn])
         got |= agn_quantities(model.frac_agn_definition, ratio, got, seen)
         spectrum = spectrum + got["agn_power"] * agn.total
         for name in ("disk", "torus", "polar"):
@@ -183,6 +186,7 @@ class _Blocks:
         self.model, self.values, self.far = model, values, far
         self.chain = model.chain
         self.bands = bands
+        self.span = np.array([bands[1].min(), bands[1].max()])
         self._light = np.empty((BLOCK, self.chain.wave.size))
 
     def _keys(self, rows, *roles):
@@ -192,15 +196,15 @@ class _Blocks:
         """Light of galaxies, and their derived quantities."""
         chain = self.chain
         stars, dims, dusts = (self._keys(rows, *roles) for roles in GALAXY)
-        stars = chain.stars(stars)
-        light, absorbed = chain.attenuated(stars, dims, dusts, self._light[: len(rows)])
+        stars, which = chain.stars(stars)
+        light, absorbed = chain.attenuated(stars, which, dims, dusts, self._light[: len(rows)])
         if "dust_excess" in self.values:
             excess = self.values["dust_excess"][rows]
             for i in np.flatnonzero(excess != 1.0):
                 light[i] += (excess[i] - 1.0) * absorbed[i] * chain.dust(dusts[i])
             absorbed *= excess
         sums = light @ chain.functionals.T
-        return light, galaxy_quantities(stars, absorbed, sums, chain.reference_row)
+        return light, galaxy_quantities(stars, which, absorbed, sums, chain.reference_row)
 
     def agn(self, rows):
         """Spectra of AGN for one watt, which of them each row has, and their sums."""
@@ -215,8 +219,8 @@ class _Blocks:
         parts = list(map(chain.agn_templates, keys))
         # the others have the first one, at no power
         which[active] = place[index]
-        seen = {name: array[which] for name, array in seen_agn(chain, parts).items()}
-        return np.array([t.total for t in parts]), which, seen
+        spectra, seen = seen_agn(chain, parts)
+        return spectra, which, {name: array[which] for name, array in seen.items()}
 
     def run(self, rows):
         """Fluxes in uJy and derived quantities of rows, masses included."""
@@ -233,7 +237,12 @@ class _Blocks:
             power = derived["agn_power"]
         names = ("redshift", *chain.names(*SKY))
         different, sky = distinct(_keys(values, names, rows))
-        dim = np.array([chain.sky_transmission(key[0], key[1:]) for key in different])
+        dim = np.ones((len(different), chain.wave.size))
+        # nobody looks at what lies beyond all bands
+        edges = np.array([self.span / (1.0 + key[0]) for key in different])
+        edges = np.maximum(np.searchsorted(chain.wave, edges) + [-1, 1], 0).tolist()
+        for out, key, (a, b) in zip(dim, different, edges, strict=True):
+            out[a:b] = chain.sky_transmission(key[0], key[1:], a, b)
         flux = np.empty((n, self.bands[0].size - 1))
         scale = mass * dilution(z, self.far[rows])
         _core.block_fluxes(

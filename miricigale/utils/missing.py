@@ -26,9 +26,11 @@ def without_codes(values, errors=None, *, magnitudes=False, further=()):
     Returns
     -------
     missing, no_error : `~numpy.ndarray` of bool, shape (n,)
-        Values that are missing: -99, -999 and the like; in magnitudes 99 and the like too, and 0 with an
-        error that is not positive or without errors; in fluxes 99 and the like with the same number for the
-        error, and 0 with an error of 0. Errors that are missing though the value may be there.
+        Values that are missing: -99, -999 and the like, unless the error is one of their size (0.2 to 100 times),
+        as of noise in nJy; in magnitudes 99 and the like too, and 0 with an error that is not positive or without
+        errors; in fluxes 99 and the like with the same number for the error, and 0 with an error of 0. Errors that
+        are missing though the value may be there: a negative code, unless the value is one to ten times as large
+        and positive, as limits are.
     """
     code, further = _is_code(values), np.asarray(list(further), float)
     named = np.isin(values, further)
@@ -36,10 +38,12 @@ def without_codes(values, errors=None, *, magnitudes=False, further=()):
     if errors is None:
         zero = (values == 0) if magnitudes else none
         return (code & (magnitudes | (values < 0))) | zero | named, none
-    same = errors == values
-    no_error = (_is_code(errors) & ((errors < 0) | magnitudes | same)) | np.isin(errors, further)
+    same, size, sigma = errors == values, np.abs(values), np.abs(errors)
+    coded, noise = _is_code(errors), (errors >= 0.2 * size) & (errors <= 100.0 * size)
+    limit = (values >= sigma) & (values <= 10.0 * sigma)
+    no_error = (coded & (((errors < 0) & ~limit) | magnitudes | same)) | np.isin(errors, further)
     zero = (values == 0) & (~(errors > 0) if magnitudes else errors == 0)
-    missing = (code & ((values < 0) | magnitudes | same)) | zero | named
+    missing = (code & (((values < 0) & (coded | ~noise)) | magnitudes | same)) | zero | named
     return missing, no_error
 
 

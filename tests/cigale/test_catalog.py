@@ -170,7 +170,7 @@ def test_refused(tmp_path, content, wanted):
         ("J_2mass", "sedpy.twomass_J", 1.24),
         ("2mass.Ks", "sedpy.twomass_Ks", 2.16),
         ("vista.vircam.Ks", "sedpy.vista_vircam_Ks", 2.15),
-        ("ukirt.wfcam.K", "sedpy.ukirt_wfcam_K", 2.2),
+        ("ukirt.wfcam.K", "wfcam.k", 2.2),
         ("WISE3", "sedpy.wise_w3", 12.08),
         ("IRAC4", "irac.ch4", 7.87),
         ("MIPS1", "mips.24", 23.68),

@@ -407,7 +407,9 @@ def test_one_message_names_all_that_is_left_out(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "wanted"),
     [
-        ("sfhdelayed, bc03", "sfhperiodic, m2005", "sfh, stellar .*sfhperiodic, m2005"),
+        ("sfhdelayed, bc03", "sfhperiodic, sfhperiodic", "sfh, stellar .*sfhperiodic, sfhperiodic"),
+        ("sfhdelayed, bc03", "sfhdelayed, m2005", "m2005 is not here, .* take bc03"),
+        ("skirtor2016,", "fritz2006,", "fritz2006 is not here, .* take skirtor2016"),
         ("tau_main = 500, 5e3", "tau_main = 500, fast", r"sfhdelayed.tau_main = 500, fast"),
         # a parameter by another name does not become the default
         ("tau_main = 500, 5e3", "tau = 500, 5e3", r"sfhdelayed.tau: .* tau_main"),
@@ -787,6 +789,20 @@ def corona(alpha_ox, l_2500, inclination):
     seen = (1 + np.cos(np.radians(inclination))) / (1 + np.cos(np.radians(30)))
     two = 10 ** (alpha_ox / 0.3838) * l_2500 * seen / H_KEV
     return lambda energy: two * (energy / 2) ** -0.7 * np.exp(-(energy - 2) / 200)
+
+
+def test_x_ray_bands_of_any_name(tmp_path):
+    """A band that a user added to CIGALE by a curve is given by its energies."""
+    ini = with_xrays(tmp_path, (BAND, "xraybandpass1"))
+    setup = quiet(ini, names={"xraybandpass1": BAND})
+    assert setup.bands[BAND] == "xraybandpass1"
+    assert_allclose(setup.xray_bands()[BAND].to_value(u.keV), [0.5, 2.0])
+    with pytest.warns(MiricigaleWarning, match="xraybandpass1 .*'xray_boxcar_0p5to2keV', or"):
+        read(ini)
+    curve = tmp_path / "xraybandpass1.dat"
+    curve.write_text("# xraybandpass1\n# energy\n# 0.5-2 keV\n6.2 1\n24.8 1\n")
+    names = {"xraybandpass1": str(curve)}
+    refuses("'xray_boxcar_.*, got a curve of X-rays for 'xraybandpass1'", read, ini, names=names)
 
 
 def test_models_with_x_rays_are_saved(tmp_path):

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
 from miricigale.filters import SURVEYS, CatalogMap, Filter, read_catalog_photometry
-from miricigale.filters.catalog_files import MappedRows
+from miricigale.filters.catalog_files import MappedRows, codes_of
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
 from miricigale.utils.missing import without_codes
 from miricigale.utils.row_files import open_rows
@@ -309,3 +309,16 @@ def test_translate_files_that_cannot_be_used(tmp_path):
     for line, said in (("flux F22", "no filter here for flux F22"), ("flux G205", "got 'G205'")):
         path.write_text(f"{line}\n")
         refuses(said, CatalogMap.read, path, error=DataError)
+
+
+def test_codes_are_told_from_noise_and_from_limits():
+    """In nJy a flux of -99 is within the noise of 50, and 99 may be the 1 sigma of a limit of 300."""
+    flux = [-99.0, -99.0, -99.0, -99.0, -99.9, 300.0, 5.0, -0.3]
+    error = [50.0, 0.0099, -99.99, 1e10, -99.0, -99.0, -99.0, 0.0099]
+    table = Table({"wfc3.f160w": flux, "wfc3.f160w_err": error})
+    out, coded = CatalogMap(units={"flux": "nJy"}, limits=True).convert(table)
+    kept = np.isfinite(out["wfc3.f160w"]) & np.isfinite(out["wfc3.f160w_err"])
+    assert kept.tolist() == [True, False, False, False, False, True, False, True]
+    assert np.flatnonzero(out["wfc3.f160w_limit"]).tolist() == [5]
+    assert np.isnan(coded["wfc3.f160w"]).tolist() == kept.tolist()
+    assert np.isnan(codes_of(table, ["wfc3.f160w"])["wfc3.f160w"]).tolist() == kept.tolist()

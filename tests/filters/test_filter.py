@@ -207,7 +207,7 @@ OTHERS = {
     "irac.ch4": ["IRAC/irac_tr4_2004-08-09.dat"], "mips.24": ["MIPS1", "Spitzer/MIPS.24mu"],
     "nircam.f444w": ["jwst_nircam_f444w"], "sedpy.twomass_Ks": ["2mass_Ks"],
     "sedpy.twomass_J": ["2MASS/2MASS.J"], "sedpy.vista_vircam_Ks": ["Paranal/VISTA.Ks"],
-    "sedpy.ukirt_wfcam_K": ["UKIRT/UKIDSS.K"], "sedpy.sdss_r0": ["SDSS r", "SLOAN/SDSS.r"],
+    "wfcam.k": ["UKIRT/UKIDSS.K"], "megacam2015.g": ["g.MP9402"], "sedpy.sdss_r0": ["SDSS r", "SLOAN/SDSS.r"],
     "sedpy.galex_FUV": ["GALEX/GALEX.FUV"], "sedpy.wise_w3": ["WISE/WISE.W3"],
     "sedpy.herschel_pacs_100": ["pacs.green"], "sedpy.herschel_spire_250": ["Herschel/SPIRE.PSW"],
     None: ["f_F160W", "r", "Ks"],
@@ -230,3 +230,15 @@ def test_what_is_no_spectrum_is_named():
     # less than 1e-4 of the weight is missing
     sed = spectrum(np.array([8.0001, 20.0]), np.full(2, 7.0))
     assert_quantity_allclose(box().synthetic_flux(sed), 7 * u.uJy)
+
+
+def test_bundled_curves_are_where_they_are_published():
+    # CFHT, MegaPrime's filters of 2015: center and width of the glass in um
+    for band, center, width in (("g", 0.475, 0.154), ("r", 0.640, 0.148), ("i", 0.776, 0.155)):
+        curve = Filter.from_name(f"megacam2015.{band}")
+        inside = curve.wave.value[curve.throughput > 0.5 * curve.throughput.max()]
+        assert_allclose(inside[[0, -1]], [center - width / 2, center + width / 2], atol=0.004)
+    # Hewett et al. 2006, MNRAS 367, 454, table 1: effective wavelengths, with atmosphere and detector
+    published = {"z": 0.8817, "y": 1.0305, "j": 1.2483, "h": 1.6313, "k": 2.2010}
+    for band, wave in published.items():
+        assert_allclose(Filter.from_name(f"wfcam.{band}").pivot.value, wave, rtol=6e-3)

@@ -269,6 +269,20 @@ def test_how_limits_may_be_written():
         refuses("whose column 'band1_limit' is boolean, got", fitter.fit, table)
 
 
+def test_few_are_fewer_than_three_fluxes_above_two_sigma():
+    """Two at a known redshift; how many of its parameters a grid varies does not matter."""
+    grid = make_grid(3)
+    table = draw_photometry(grid, 3, seed=4)[0]
+    for j, name in enumerate(grid.filters):
+        seen = np.array([j < 1, j < 2, j < 3])
+        table[f"{name}_err"] = table[name] / np.where(seen, 2.1, 1.9)
+    table["z"] = grid.redshift[[0, 0, 0]]
+    for options, wanted in (({}, [1, 1, 0]), ({"redshift": "z"}, [1, 0, 0])):
+        flags = BayesFitter(grid).fit(table, **options).flags
+        few = (flags & int(FitFlags.FEW_FOR_PARAMETERS)) > 0
+        assert few.tolist() == [bool(value) for value in wanted]
+
+
 FLAGS = ({"all_limits"}, {"few_for_parameters"}, {"bad_error"}, {"all_limits", "few_bands"})
 
 

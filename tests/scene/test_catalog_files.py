@@ -84,7 +84,7 @@ def test_a_catalog_of_cigale(tmp_path):
 
 def test_wrong_names_are_refused_with_the_right_ones(plain, tmp_path):
     path = write(plain, tmp_path / "c.csv")
-    match = r"no filter 'wfc3\.f161w'; the nearest of 63 are wfc3\.f160w"
+    match = r"no filter 'wfc3\.f161w'; the nearest of 73 are wfc3\.f160w"
     refuses(match, read_catalog, path, error=KeyError, columns={"wfc3.f161w": "FLUX_H"})
     for columns, units, message in (
         ({"wfc3.f160w": "FLUX_h"}, {}, r"no column of c\.csv .*'FLUX_h'.*did you mean 'FLUX_H'"),

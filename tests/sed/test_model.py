@@ -439,3 +439,25 @@ def test_a_fraction_of_the_light_in_any_range(span):
     for wrong in ("20-5um", "0.01-20um", "ir"):
         match = "'frac_agn_definition' must be one of 'dust' and ranges"
         refuses(match, SEDModel.yang2021, frac_agn_definition=wrong)
+
+
+def test_rows_that_share_nothing_are_those_of_single_models(filters):
+    """Two metallicities, gas of all kinds, dust and redshifts of their own, more rows than a block has."""
+    rng, n = np.random.default_rng(8), 70
+    model = SEDModel.survey(libraries="bundled")
+    table = {"redshift": rng.uniform(0.05, 6.0, n), "age": rng.uniform(0.01, 0.9, n)}
+    table |= {"tau": rng.uniform(0.05, 5.0, n), "metallicity": rng.choice([0.004, 0.02], n)}
+    table |= {"f_esc": rng.uniform(0, 0.5, n), "f_dust": rng.uniform(0, 0.5, n)}
+    table |= {"log_u": rng.uniform(-3, -1, n), "ebv": rng.uniform(0, 1, n)}
+    table |= {"u_min": rng.uniform(0.1, 25, n), "gamma": rng.uniform(0, 1, n)}
+    table |= {"q_pah": rng.uniform(0.5, 4.5, n), "frac_agn": rng.choice([0.0, 0.3], n)}
+    got = model.fluxes(table, filters)
+    for i in range(0, n, 3):
+        sed = model.evaluate(**{name: values[i] for name, values in table.items()})
+        wanted = filters.synthetic_fluxes(sed).value
+        mine = [got[name][i].value for name in filters.names]
+        assert_allclose(mine, wanted, rtol=1e-6)
+        alone = model.fluxes({name: values[i : i + 1] for name, values in table.items()}, filters)
+        assert_allclose([alone[name][0].value for name in filters.names], mine, rtol=1e-13)
+        for name, value in sed.derived.items():
+            assert_allclose(got[name][i].value, value.value, rtol=1e-9, atol=1e-12)

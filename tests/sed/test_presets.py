@@ -6,7 +6,7 @@ from miricigale import conf
 from miricigale.refdata import resource
 from miricigale.refdata.libraries import LibraryTable, add_library, write_library
 from miricigale.sed import SEDModel
-from miricigale.utils.exceptions import DataError
+from miricigale.utils.exceptions import DataError, ModelWarning
 
 
 @pytest.fixture
@@ -97,3 +97,29 @@ def test_survey_axes_are_those_of_the_chain(folder):
         assert weights.shape == axes[name].shape
         assert weights.sum() == pytest.approx(1, abs=1e-3)
     assert np.all(grid.galaxy > 0)
+
+
+def test_far_infrared_axes_follow_the_cold_dust(folder):
+    """Its temperature goes as U^(1/6): a grid of one U_min warns."""
+    model, bands = (
+        SEDModel.survey(agn=False),
+        ["sedpy.herschel_pacs_100", "sedpy.herschel_spire_250"],
+    )
+    few = {"redshift": [0.5], "ebv": [0.5], "gamma": [0.0], "q_pah": [2.0], "age": [0.5]}
+    few = {name: few.get(name, axis) for name, axis in SEDModel.survey_axes("far-infrared").items()}
+    few = {name: axis for name, axis in few.items() if name in model.parameters}
+    grid = model.grid(few, bands, cache=False)
+    ratio = (grid.galaxy[0, :, 0] / grid.galaxy[0, :, 1]).reshape(-1, 4)
+    # grains of one temperature, 18 K U^(1/6) (U of 0.5 to 25), change more than a mixture with small ones
+    short, long = (
+        1.0 / np.expm1(14388 / (wave / 1.5 * 18.0 * np.array([0.5, 25.0]) ** (1 / 6)))
+        for wave in (100.0, 250.0)
+    )
+    cold, warm = short / long
+    change = ratio[:, 3] / ratio[:, 0]
+    assert np.all(np.diff(ratio, axis=1) > 0)
+    assert np.all((change > 5.0) & (change < warm / cold))
+    with pytest.warns(ModelWarning, match="'u_min' .* one value, .*herschel_pacs_100"):
+        model.grid(few | {"u_min": [1.0]}, bands, cache=False)
+    with pytest.raises(ValueError, match="'kind' must be 'survey' or 'far-infrared'"):
+        SEDModel.survey_axes("infrared")

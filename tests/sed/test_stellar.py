@@ -133,7 +133,8 @@ def with_ssp(part, row, age, table):
     """What our history code makes of a table at the age of a row of a delayed composite."""
     n, tau = round(part.age[row] / 1e6), part.tau / 1e6
     history = _core.delayed_history(n, tau)
-    weights = _core.split_by_age(history, 10, age, *_core.age_steps(age, n)).sum(axis=0)
+    steps = _core.age_steps(age, n)
+    weights = _core.split_by_age(history, np.array([n]), 10, age, *steps).sum(axis=0)[0]
     # the composites form 1 Msun in infinite time
     formed = 1 - (1 + n / tau) * np.exp(-n / tau)
     return weights @ table * formed, history[-1] * formed

@@ -35,6 +35,7 @@ from miricigale.sed._core.nodes import (
     merge_nodes,
     photon_weights,
     trapezoid_weights,
+    wave_key,
 )
 from miricigale.sed._core.polar import (
     DISK_MEAN,

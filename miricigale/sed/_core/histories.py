@@ -146,14 +146,24 @@ def _moments(history, first, last):
 
 
 @njit(cache=True)
-def split_by_age(history, n_young, age, runs, mixed, indptr, indices, data):
+def split_by_age(histories, end, n_young, age, runs, mixed, indptr, indices, data):
     """
-    Masses in Msun at tabulated ages, of young and of old stars, shape (2, n_age).
+    Masses in Msun at tabulated ages, of young and of old stars, shape (2, n, n_age).
 
-    ``history`` holds rates in Msun/yr in steps of 1 Myr, oldest first, of which the last ``n_young``
-    are young; ``runs`` and the following are `age_steps` of ``age``, for as many steps or more.
+    ``histories`` holds n histories one after the other, each ending before one of ``end``: rates in Msun/yr in
+    steps of 1 Myr, oldest first, of which the last ``n_young`` are young; ``runs`` and the
+    following are `age_steps` of ``age``, for as many steps or more.
     """
-    mass = np.zeros((2, age.size))
+    mass = np.zeros((2, end.size, age.size))
+    for i in range(end.size):
+        history = histories[end[i - 1] if i else 0 : end[i]]
+        _split(history, n_young, age, runs, mixed, indptr, indices, data, mass[:, i])
+    return mass
+
+
+@njit(cache=True)
+def _split(history, n_young, age, runs, mixed, indptr, indices, data, mass):
+    """One history of `split_by_age`; adds to ``mass``, shape (2, n_age)."""
     n = history.size
     for r in range(runs.shape[1]):
         cell = runs[2, r]
@@ -174,4 +184,3 @@ def split_by_age(history, n_young, age, runs, mixed, indptr, indices, data):
         formed = 1e6 * history[n - 1 - k]
         for j in range(indptr[i], indptr[i + 1]):
             mass[0 if k < n_young else 1, indices[j]] += data[j] * formed
-    return mass

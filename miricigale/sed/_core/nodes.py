@@ -13,6 +13,19 @@ def merge_nodes(parts):
     return nodes[keep]
 
 
+_LAST = [(None, b"")]  # the wavelengths that were asked for last, and their bytes
+
+
+def wave_key(wave):
+    """Bytes of wavelengths, for caches; of an array that stays as it is the same object, hashed once."""
+    last, key = _LAST[0]
+    if last is not wave:
+        key = np.ascontiguousarray(wave, dtype=float).tobytes()
+        if not np.asarray(wave).flags.writeable:
+            _LAST[0] = wave, key
+    return key
+
+
 def trapezoid_weights(wave):
     """Weights of the trapezoid rule: ``weights @ spectrum`` is its integral."""
     weights = np.zeros(wave.size)

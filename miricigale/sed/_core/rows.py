@@ -24,12 +24,19 @@ def weighted_sums(weights, spectra):
         last = min(first + _TILE, n_wave)
         for i in range(weights.shape[0]):
             total = out[i, first:last]
-            for a in range(weights.shape[1]):
-                weight = weights[i, a]
-                if weight != 0.0:
-                    part = spectra[a, first:last]
-                    for j in range(last - first):
-                        total[j] += weight * part[j]
+            some = np.flatnonzero(weights[i])
+            four = some.size - some.size % 4
+            for k in range(0, four, 4):  # added one after the other, whatever their number
+                a, b, c, d = some[k], some[k + 1], some[k + 2], some[k + 3]
+                w, x, y, z = weights[i, a], weights[i, b], weights[i, c], weights[i, d]
+                p, q = spectra[a, first:last], spectra[b, first:last]
+                r, s = spectra[c, first:last], spectra[d, first:last]
+                for j in range(last - first):
+                    total[j] = (((total[j] + w * p[j]) + x * q[j]) + y * r[j]) + z * s[j]
+            for k in range(four, some.size):
+                w, p = weights[i, some[k]], spectra[some[k], first:last]
+                for j in range(last - first):
+                    total[j] += w * p[j]
     return out
 
 
@@ -104,12 +111,16 @@ def block_fluxes(
     """
     observed, log_observed = np.empty(wave.size), np.empty(wave.size)
     fnu = np.empty(wave.size)
+    low, high = band.min(), band.max()
     for i in range(z.size):
         k, p, s = which[i], power[i], sky[i]
         stretch = 1.0 + z[i]
         log_stretch = math.log(stretch)
         for j in range(wave.size):
             observed[j] = wave[j] * stretch
+        # what no band looks at is left out
+        begin = max(np.searchsorted(observed, low, side="right") - 1, 0)
+        for j in range(begin, min(np.searchsorted(observed, high) + 1, wave.size)):
             log_observed[j] = log_wave[j] + log_stretch
             total = light[i, j]
             if p > 0.0:

@@ -165,7 +165,7 @@ class AGN(Component):
         base = self.torus_spectra(wave, values)
         opening = values["opening_angle"]
         parts, power, total = _core.add_polar(
-            _polar_grid(wave.tobytes(), self.polar_law), base.face_on, base.disk, base.dust,
+            _polar_grid(_core.wave_key(wave), self.polar_law), base.face_on, base.disk, base.dust,
             float(values["ebv_polar"]), float(values["temperature_polar"]),
             float(values["emissivity_polar"]), _core.polar_share(opening),
             values["inclination"] <= 90.0 - opening,
@@ -256,7 +256,7 @@ class Skirtor2016(AGN):
 
     def torus_spectra(self, wave, values):
         axes = tuple([float(values[name]) for name in SKIRTOR_AXES])
-        return _torus(self.path, wave.tobytes(), self.disk, float(values["disk_slope"]), axes)
+        return _torus(self.path, _core.wave_key(wave), self.disk, float(values["disk_slope"]), axes)
 
 
 def _fine(wave):

@@ -60,8 +60,7 @@ def _exponents(wave, law, *shape):
 
 def _dimmed(wave, amount, law, *shape):
     """10^(-0.4 k amount), as a new array that cannot be written to."""
-    key = np.ascontiguousarray(wave, dtype=float).tobytes()
-    first, last, part = _exponents(key, law, *shape)
+    first, last, part = _exponents(_core.wave_key(wave), law, *shape)
     out = np.ones(np.shape(wave))
     flat = out.reshape(-1)[first:last]
     np.multiply(part, amount, out=flat)

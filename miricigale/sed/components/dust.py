@@ -44,6 +44,11 @@ class DustEmission(Component):
         """
         raise NotImplementedError
 
+    def spectra(self, columns):
+        """Row by row what `spectrum` gives, for columns of values of shape (n,): shape (n, n_node)."""
+        rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+        return np.array([self.spectrum(dict(zip(columns, row, strict=True))) for row in rows])
+
     def template(self, wave, **values):
         """
         Spectrum for one watt.
@@ -65,6 +70,33 @@ class DustEmission(Component):
         return np.interp(wave, nodes, spectrum / np.trapezoid(spectrum, nodes), left=0, right=0)
 
 
+class _Mixture(DustEmission):
+    """
+    Base: weighted sums of tabulated spectra.
+
+    ``mixture`` of a subclass gives weights, shape (n, n_table), for columns of values, and the spectra, shape
+    (n_table, n_node).
+    """
+
+    def spectra(self, columns):
+        return _core.weighted_sums(*self.mixture(columns))
+
+    def spectrum(self, values):
+        return self.spectra({name: np.array([value]) for name, value in values.items()})[0]
+
+
+def _between(axis, values):
+    """Weights, shape (n, n_axis), of the linear interpolation between ascending nodes."""
+    cell, part = _core.cells(axis, values)
+    out, rows, part = (
+        np.zeros((values.size, axis.size)),
+        np.arange(values.size),
+        np.clip(part, 0, 1),
+    )
+    out[rows, cell], out[rows, cell + 1] = 1.0 - part, part
+    return out
+
+
 @functools.lru_cache(maxsize=4)
 def _sequence(library, column):
     """Alphas and spectra of an open library, in memory."""
@@ -73,7 +105,7 @@ def _sequence(library, column):
 
 
 @register
-class Dale2014(DustEmission):
+class Dale2014(_Mixture):
     """
     Dale et al. 2014 without AGN: dust mass goes as dM ~ U^-alpha dU in the intensity U.
 
@@ -100,10 +132,9 @@ class Dale2014(DustEmission):
     def nodes(self):
         return open_library(self.path, self.resource).wave
 
-    def spectrum(self, values):
+    def mixture(self, columns):
         alphas, spectra = _sequence(open_library(self.path, self.resource), self.starlight)
-        low, part = _core.cells(alphas, values["alpha"])
-        return (1.0 - part) * spectra[low] + part * spectra[low + 1]
+        return _between(alphas, columns["alpha"]), spectra
 
 
 #: Constants of L(alpha, T) in um^1/2, um^1/2, 1 / (um K), 1 / (um K), of Casey 2012.
@@ -182,7 +213,7 @@ def load_dl07(path):
     return read_images(path, names, wanted="a Draine & Li table")
 
 
-class _DraineLi(DustEmission):
+class _DraineLi(_Mixture):
     reference = "Draine & Li 2007, ApJ 657, 810"
     resource = "dust.dl07"
 
@@ -227,19 +258,13 @@ class DraineLi2007(_DraineLi):
         lump = least * np.log(U_MAX / least) / (1.0 - least / U_MAX)
         return float((1.0 - gamma) * least + gamma * lump)
 
-    def spectrum(self, values):
-        table = load_dl07(self.path)
-        q_low, q_part = _cell(table["qpah"], values["q_pah"])
-        u_low, u_part = _cell(np.log(table["umin"]), np.log(values["u_min"]))
-        out = 0.0
-        for j, weight in ((u_low, 1.0 - u_part), (u_low + 1, u_part)):
-            scale = weight * values["u_min"] / table["umin"][j]
-            for i, share in ((q_low, 1.0 - q_part), (q_low + 1, q_part)):
-                single = table["single"][i, j] * table["single_power"][i, j]
-                lump = table["powerlaw"][i, j] * table["powerlaw_power"][i, j]
-                mixture = (1.0 - values["gamma"]) * single + values["gamma"] * lump
-                out = out + share * scale * mixture
-        return out
+    def mixture(self, columns):
+        table, u_min = load_dl07(self.path), columns["u_min"]
+        share = _between(table["qpah"], columns["q_pah"])
+        scale = _between(np.log(table["umin"]), np.log(u_min)) * u_min[:, None] / table["umin"]
+        weight = (share[:, :, None] * scale[:, None]).reshape(u_min.size, -1)
+        gamma = columns["gamma"][:, None]
+        return np.hstack([(1.0 - gamma) * weight, gamma * weight]), _by_mass(self.path)
 
 
 @register
@@ -266,16 +291,15 @@ class DraineLi2007Alpha(_DraineLi):
     reference = "Draine & Li 2007, ApJ 657, 810; alpha after Dale et al. 2014, ApJ 784, 83"
     alpha = Parameter(2.0, (1.0, 3.5), "Slope of dust mass in intensity, as Dale's alpha.")
 
-    def spectrum(self, values):
-        path = self.path
-        intensity, cool, warm = _alpha_tables(path)
-        step = values["alpha"] - 2.0
+    def mixture(self, columns):
+        intensity, spectra = _alpha_tables(self.path)
+        step = columns["alpha"][:, None] - 2.0
         slope = ALPHA_SLOPE[0] + ALPHA_SLOPE[1] * step + ALPHA_SLOPE[2] * step**2
         log_u = np.log10(intensity)
         edges = _logistic((log_u - ALPHA_U[0]) / 0.05) * _logistic((ALPHA_U[1] - log_u) / 0.05)
         weight = intensity ** (1.0 - slope) * edges
         rich = _logistic((ALPHA_U_PAH - log_u) / 0.1)
-        return (weight * rich) @ cool + (weight * (1.0 - rich)) @ warm
+        return np.hstack([weight * rich, weight * (1.0 - rich)]), spectra
 
 
 #: Ends of log U, where PAHs are destroyed (log U), and the slope's polynomial in alpha - 2.
@@ -288,9 +312,14 @@ def _logistic(x):
     return 1.0 / (1.0 + np.exp(-np.clip(x, -500, 500)))
 
 
-def _cell(axis, value):
-    low, part = _core.cells(axis, value)
-    return low, np.clip(part, 0.0, 1.0)
+@cached_by_file(maxsize=2)
+def _by_mass(path):
+    """Spectra per dust mass of single intensities at each q_PAH and U_min, then those of power laws."""
+    table, parts = load_dl07(path), []
+    for kind in ("single", "powerlaw"):
+        spectra = (table[kind] * table[f"{kind}_power"][..., None])[:, : table["umin"].size]
+        parts.append(spectra.reshape(-1, spectra.shape[-1]))
+    return np.concatenate(parts)
 
 
 @cached_by_file(maxsize=2)
@@ -299,8 +328,8 @@ def _alpha_tables(path):
     table = load_dl07(path)
     intensity = np.geomspace(0.1, U_MAX, 141)
     matrix = _core.hat_matrix(np.log(table["u"]), np.clip(np.log(intensity), None, np.log(U_MAX)))
-    out = [intensity]
+    out = []
     for q in (-1, 0):
         mass = table["single"][q] * table["single_power"][q][:, None]
         out.append(np.exp(matrix @ np.log(np.maximum(mass, 1e-300))))
-    return out
+    return intensity, np.concatenate(out)

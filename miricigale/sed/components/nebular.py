@@ -194,6 +194,24 @@ class Nebular(Component):
             )
         return None
 
+    def by_photon(self, values):
+        """
+        Light for each ionizing photon per second of stars of the ages of `table`.
+
+        Parameters
+        ----------
+        values : dict
+            Values of all parameters, the metallicity of the stars among them.
+
+        Returns
+        -------
+        spectra : `~numpy.ndarray`, shape (n_age, n_node)
+            L_lambda in W/um at `nodes`.
+        """
+        share = _core.absorbed_share(values["f_esc"], values["f_dust"])
+        emission = self.table.emission(self._metallicity(values), values["log_u"])
+        return share * (self._drawn[1] @ emission.T).T
+
     def _emission(self, age, weights, ionizing, values):
         """Continuum in W/um and lines in W, one after the other."""
         table = self.table

@@ -66,7 +66,8 @@ class ParametricTorus(AGN):
 
     def torus_spectra(self, wave, values):
         shape = _shape(values)
-        return _torus(self.path, wave.tobytes(), self.disk, float(values["disk_slope"]), shape)
+        slope, key = float(values["disk_slope"]), _core.wave_key(wave)
+        return _torus(self.path, key, self.disk, slope, shape)
 
     def absorbed_share(self, values):
         """Share of the disk's light, over all directions, that neither passes nor is scattered."""

@@ -103,12 +103,17 @@ class StellarPopulations(Component):
             Solar masses formed less and more than ``separation_age`` ago, spread over the
             table: a step is the mean of ten interpolations in age.
         """
-        age = self.table(values["metallicity"])[0]
-        if history.size > _OLDEST:
-            raise argument_error("history", f"of at most {_OLDEST} steps", history.size)
-        steps = _steps(age.tobytes())
-        young, old = _core.split_by_age(history, round(values["separation_age"]), age, *steps)
+        young, old = self.masses(history, np.array([history.size]), values)[:, 0]
         return young, old
+
+    def masses(self, histories, end, values):
+        """`age_weights` of n histories one after the other, each until one of ``end``: shape (2, n, n_age)."""
+        age = self.table(values["metallicity"])[0]
+        longest = np.diff(end, prepend=0).max()
+        if longest > _OLDEST:
+            raise argument_error("history", f"of at most {_OLDEST} steps", longest)
+        young = round(values["separation_age"])
+        return _core.split_by_age(histories, end, young, age, *_steps(age.tobytes()))
 
     def nearest(self, metallicity):
         """Of `metallicities`, the nearest in the logarithm."""
