@@ -23,7 +23,9 @@ def fit(args):
                 args.photometry,
                 args.output,
                 **chosen(args, "quasars stars"),
-                **chosen(args, "axes redshift model_error pairs flux_unit catalog_map ebv"),
+                **chosen(
+                    args, "axes redshift model_error outliers pairs flux_unit catalog_map ebv"
+                ),
                 **chosen(args, "chunk_rows resume"),
                 hdu=hdu,
                 executor=executor,

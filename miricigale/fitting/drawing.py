@@ -80,6 +80,8 @@ def plot_sed(results, ax=None, *, model=None, filters=None, **kwargs):
     """
     Draw photometry, upper limits (as arrows), best model and residuals of a single object.
 
+    Bands that are wrong with a probability above a half have another symbol.
+
     Parameters
     ----------
     ax : `~matplotlib.axes.Axes` or pair of them, optional
@@ -105,6 +107,8 @@ def plot_sed(results, ax=None, *, model=None, filters=None, **kwargs):
         sed = results.best_sed(model)
         kwargs.setdefault("spectrum", (sed.wave, sed.fnu))
     used = np.isfinite(results.sigma)
+    if results.outlier is not None and np.any(results.outlier > 0.5):
+        kwargs.setdefault("groups", np.where(results.outlier > 0.5, "looks wrong", "fluxes"))
     text = f"{results.ids}: z = {results.best['redshift'].value:.3f}"
     kwargs.setdefault("title", f"{text}, chi2 = {results.chi2:.1f} in {results.n_bands} bands")
     return plot_sed_fit(

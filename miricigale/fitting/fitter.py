@@ -85,6 +85,11 @@ class BayesFitter(Interactive):
     template_error : `~miricigale.fitting.TemplateError`, optional
         Of a grid: error of the models by rest wavelength, added in quadrature too; what it does to the
         normalization of the likelihood counts. ``sigma`` of the results has that of the best model.
+    outliers : float or dict of str to float, optional
+        Of a grid: prior fraction of wrong fluxes and limits, for all bands or by filter, at least 0 and below 1.
+        Each is then a mixture of the stated error and a broad one (`miricigale.fitting.mixture`);
+        ``outlier`` of the results, ``<band>_outlier`` in tables, is how likely a band is wrong. Not with
+        ``compat`` or ``interpolate``. ``rtol`` is then at least 1e-3, unless it is 0.
     scale_error : bool, optional
         Whether the uncertainty of each model's own scale is part of the posterior of masses,
         luminosities and fluxes: so by default, but CIGALE leaves it out.
@@ -156,6 +161,7 @@ class BayesFitter(Interactive):
         model_error=0.1,
         error_floor=0.0,
         template_error=None,
+        outliers=None,
         scale_error=None,
         n_bands_min=2,
         compat=None,
@@ -169,6 +175,7 @@ class BayesFitter(Interactive):
             raise argument_error("settings", wanted, type(settings).__name__)
         axes = yang2021_axes(axes) if isinstance(axes, str) else axes
         of_grid = {"axes": axes, "template_error": template_error, "compat": compat}
+        of_grid["outliers"] = outliers
         if not on_grid:
             for name, value in of_grid.items():
                 if value is not None:

@@ -33,6 +33,7 @@ def fit_catalog(
     axes="fit",
     models=None,
     model_error=None,
+    outliers=None,
     catalog_map=None,
     ebv=0.0,
     hdu=None,
@@ -57,6 +58,8 @@ def fit_catalog(
     model_error : float, optional
         Relative model error: 0.1 by default; with ``axes="survey"`` it takes the place of
         `miricigale.fitting.TemplateError.survey`, which is then the default.
+    outliers : float or dict of str to float, optional
+        Prior fraction of wrong fluxes; see `miricigale.fitting.BayesFitter`.
     catalog_map : `~miricigale.filters.CatalogMap`, str or path-like, optional
         Names and units of the catalog; the name of a survey, or a file: TOML, or a translate file of EAZY.
     ebv : float, optional
@@ -125,6 +128,8 @@ def fit_catalog(
         dust = GalacticExtinction(ebv_galactic=ebv, beyond="transparent")
         model = SEDModel([*model.components, dust])
     part = least if model_error is None else model_error
-    fitter = BayesFitter(model, bands, axes=nodes, template_error=error, model_error=part)
+    fitter = BayesFitter(
+        model, bands, axes=nodes, template_error=error, model_error=part, outliers=outliers
+    )
     options |= {"catalog_map": catalog_map, "hdu": hdu, "chunk_rows": chunk_rows}
     return fit_file(fitter, path, output, **options)

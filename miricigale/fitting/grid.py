@@ -8,6 +8,7 @@ import numpy as np
 from scipy.special import log_ndtr, logsumexp, ndtr, ndtri
 
 from miricigale.fitting import _core
+from miricigale.fitting.mixture import BandMixture, Tangents
 from miricigale.fitting.posterior import cell_edges
 from miricigale.fitting.priors import GridPriors
 from miricigale.fitting.quantities import DERIVED_LEVELS, Quantities
@@ -21,6 +22,8 @@ _SAFETY = 0.1
 _TAIL = 10.0
 #: Part of ``rtol`` times its share below which a pair adds nothing to the scatter of fluxes.
 _THIN = 1e-4
+#: Least ``rtol``, unless it is 0, of fits with wrong bands.
+_LOOSE = 1e-3
 #: Least ``rtol`` with which pairs of little weight are evaluated in single precision.
 _SINGLE = 5e-7
 
@@ -49,6 +52,8 @@ _AXES = {
     # models drawn from the posterior, their scales and the variances of these
     "draw_index": "d4",
     "draw_scale": "d2",
+    # how likely each band is wrong
+    "outlier": "b",
 }
 #: These arrays, not a number or -1 in rows that were not fitted; ``joint`` are joint posteriors that were
 #: asked for, by two of the letters z, g, k and f.
@@ -88,6 +93,8 @@ class GridEngine:
         is good to some 1e-7.
     scale_error : bool
         Whether the variance of each model's own scale is part of the posterior.
+    mixture : `~miricigale.fitting.mixture.BandMixture`, optional
+        Prior fractions of wrong fluxes.
     """
 
     grid: ModelGrid
@@ -100,6 +107,7 @@ class GridEngine:
     mass_prior: object = None
     rtol: float = 1e-6
     scale_error: bool = True
+    mixture: BandMixture | None = None
 
     @property
     def n_models(self):
@@ -119,7 +127,12 @@ class GridEngine:
         """How far 2 ln(posterior) of a model may lie below the best: 2 ln(100 n_models / rtol)."""
         if self.rtol == 0:
             return 1e9
-        return 2.0 * np.log(max(self.n_models, 1) * _TAIL / (_SAFETY * self.rtol))
+        return 2.0 * np.log(max(self.n_models, 1) * _TAIL / (_SAFETY * self._rtol))
+
+    @property
+    def _rtol(self):
+        # with wrong bands more redshifts matter, and tangents are not as good as that
+        return self.rtol if self.mixture is None or self.rtol == 0 else max(self.rtol, _LOOSE)
 
     @cached_property
     def _tables(self):
@@ -191,6 +204,10 @@ class GridEngine:
         agn[:, :n_agn] = np.vstack([known.agn_scale, known.mixed_agn])
         return _core.make_scales(np.vstack([known.galaxy_scale, known.mixed_galaxy]), agn)
 
+    @cached_property
+    def _tangents(self):
+        return Tangents.of_tables(self.mixture, self._tables)
+
     def workspace(self, n_draws=0, joint=()):
         """Make the accumulators and work space of one worker (some tens of MB)."""
         size = (*self.size.values(), self.galaxy.shape[2])
@@ -257,15 +274,26 @@ class GridEngine:
         )
         workspace = self.workspace(n_draws, joint) if workspace is None else workspace
         sums = workspace[0]
-        single = self.rtol >= _SINGLE
+        single = self._rtol >= _SINGLE
+        broad = None if self.mixture is None else self.mixture.broad(data, sigma)
         for i in np.flatnonzero(log_prior.max(axis=1, initial=-1e300) > -1e200):
-            target = _core.make_target(data[i], sigma[i], log_prior[i], self.template_error)
-            limits = _core.make_limits(limit[i], inverse[i])
+            target = stated = _core.make_target(
+                data[i], sigma[i], log_prior[i], self.template_error
+            )
+            limits = _core.make_limits(limit[i], inverse[i], getattr(self.mixture, "part", None))
+            if broad is not None:
+                more = limit[i], limit_sigma[i] if limits is not None else None
+                target, wrong = self._tangents.touch(
+                    stated, log_prior[i], sigma[i], broad[i], *more
+                )
             given = self._tables_of(target), self._scales, self._request, target, limits
             sums.draws.state[0] = seeds[i]
             _core.clear(sums)
             if target.norm[0] > 0.0 and _core.sum_up(*given, *workspace, single=single):
-                self._summarize(target, limits, sums, out, i)
+                self._summarize(stated, target, limits, sums, out, i)
+                if broad is not None:
+                    used = np.isfinite(sigma[i]) | (inverse[i] > 0)
+                    out.outlier[i] = np.where(used, out.zf[i].sum(axis=1) @ wrong, np.nan)
         return out
 
     def _tables_of(self, target):
@@ -287,7 +315,7 @@ class GridEngine:
         log[rows, :n_galaxy] = np.where(found > -1e200, 2.0 * found, -1e300)
         return tables._replace(log_usable=log)
 
-    def _summarize(self, target, limits, sums, out, i):
+    def _summarize(self, stated, target, limits, sums, out, i):
         """Fill row i of the output."""
         total = sums.total[0]
         z, g, k, f = out.index[i] = sums.index
@@ -299,7 +327,7 @@ class GridEngine:
             model = model + power * self.agn[z, k]
         out.best_flux[i] = model
         # from the residuals: |F|^2_w - R would lose digits
-        chi2 = np.sum(target.weight[z] * (target.flux - model) ** 2)
+        chi2 = np.sum(stated.weight[z] * (target.flux - model) ** 2)
         norm = target.top
         if limits is not None:
             faint = limits.level - model[limits.bands] * limits.inverse
@@ -362,9 +390,9 @@ class GridEngine:
     def _request(self):
         return _core.Request(
             delta=float(self.delta),
-            rtol=_SAFETY * self.rtol,
+            rtol=_SAFETY * self._rtol,
             tail=_TAIL,
-            thin=_THIN * self.rtol,
+            thin=_THIN * self._rtol,
             scale_error=float(self.scale_error),
         )
 

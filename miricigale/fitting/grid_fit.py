@@ -12,6 +12,7 @@ from miricigale.fitting.continuation import Continuation
 from miricigale.fitting.grid import GridEngine
 from miricigale.fitting.interpolation import Nodes, finer_grid
 from miricigale.fitting.likelihood import FitFlags
+from miricigale.fitting.mixture import BandMixture
 from miricigale.fitting.posterior import check_pairs, joint_names, joint_tables
 from miricigale.fitting.priors import (
     density_log_prior,
@@ -61,7 +62,17 @@ class GridFit:
 
     @classmethod
     def of_model(
-        cls, model, filters, priors, settings, *, axes, scale_error, compat, template_error
+        cls,
+        model,
+        filters,
+        priors,
+        settings,
+        *,
+        axes,
+        scale_error,
+        compat,
+        template_error,
+        outliers,
     ):
         """Make a grid if it is none, work out its priors and derived quantities, set the engine up."""
         check_choice(compat, "compat", (None, "cigale"))
@@ -81,6 +92,8 @@ class GridFit:
             raise argument_error("axes", "None when 'model' is a ModelGrid", "a value")
         elif not isinstance(model, ModelGrid):
             raise argument_error("model", "a ModelGrid or an SEDModel", type(model).__name__)
+        if outliers is not None and (compat or interpolate):
+            raise argument_error("outliers", "None with 'compat' or 'interpolate'", f"{outliers}")
         priors = grid_priors(grid, priors, prior_f=settings.prior_f)
         bands = grid.filters if model is grid else filters
         engine = GridEngine(
@@ -94,6 +107,7 @@ class GridFit:
             mass_prior=sfr_log_prior(settings.sfr_prior, grid),
             rtol=float(settings.rtol),
             scale_error=scale_error,
+            mixture=BandMixture.of_bands(outliers, bands),
         )
         out = cls(engine, replace(settings, finer=None), compat, template_error)
         # a single model has nothing between
@@ -148,6 +162,10 @@ class GridFit:
         if error is not None:
             wave = error.wave.value.tolist()
             out["template_error"] = {"wave": wave, "error": error.error.tolist()}
+        if self.engine.mixture is not None:
+            out["outliers"] = dict(
+                zip(self.filters, self.engine.mixture.part.tolist(), strict=True)
+            )
         if prior is not None:
             relation, scatter, z = prior.args[:3]
             # a function is known by its values at some masses
@@ -304,6 +322,7 @@ class GridFit:
             model_flux_std=out.band[:, 1],
             best_flux=out.best_flux,
             constants=self.constants,
+            outlier=None if self.engine.mixture is None else out.outlier,
             least_std=CIGALE_LEAST_STD if self.compat == "cigale" else 0.0,
         )
 

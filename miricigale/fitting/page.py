@@ -271,6 +271,9 @@ def _left_out(page, rows, found):
         "empty": [name for name, ratio, _ in _bands(found) if not ratio.size],
         "errors": [f"{name} {n}" for name, n in zip(filters, bad, strict=True) if n],
     }
+    if "wrong" in found.colnames:
+        wrong = zip(filters, found["wrong"].sum(axis=0), strict=True)
+        lines["wrong"] = [f"{name} {n}" for name, n in wrong if n]
     entries = list(rows.messages()) if isinstance(rows, MappedRows) else []
     entries += [page.sentence(k, names=", ".join(names)) for k, names in lines.items() if names]
     page.report.bullets(entries or [page.sentence("nothing")])

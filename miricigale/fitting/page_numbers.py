@@ -51,6 +51,8 @@ def _numbers(part):
         # a flux whose error is NaN is a missing band, and no mistake
         "unusable": np.isfinite(flux) & ~np.isfinite(part.sigma[:, bands]) & ~np.isnan(error),
     }
+    if part.outlier is not None:
+        out["wrong"] = part.outlier[:, bands] > 0.5
     for name, of in (("z", "redshift"), ("frac", "frac_agn"), ("mass", "stellar_mass")):
         values = np.full((n, 3), np.nan)
         if of in part.parameters:

@@ -54,7 +54,8 @@ class FitResults(FitRows):
     n_bands : `~numpy.ndarray` of int, shape (n,)
         Number of bands used, upper limits among them.
     chi2 : `~numpy.ndarray`, shape (n,)
-        Chi2 of the best model, model error and the terms of upper limits included.
+        Chi2 of the best model, model error and the terms of upper limits included; with the stated errors of
+        all bands, wrong ones too.
     log_evidence : `~numpy.ndarray`, shape (n,)
         Of the grid ln of the sum of prior * likelihood (fluxes in uJy), each model at its best scale;
         otherwise the sampler's ln(evidence).
@@ -108,6 +109,8 @@ class FitResults(FitRows):
     distance : `~numpy.ndarray`, shape (n,), optional
         Distances in Mpc that masses and luminosities are for, where they are not those of the redshifts; NaN
         where they are.
+    outlier : `~numpy.ndarray`, shape (n, nb), optional
+        How likely each band is wrong, of a fit with ``outliers``; NaN in bands not used.
     least_std : float, optional
         Part of the mean below which no standard deviation is given (CIGALE: 0.05).
     model : `~miricigale.sed.SEDModel`, optional
@@ -169,6 +172,7 @@ class FitResults(FitRows):
     fitted_filters: tuple | None = None
     redshift_fixed: bool = False
     distance: PerObject = None
+    outlier: PerObject = None
     constants: dict = field(default_factory=dict)
     least_std: float = 0.0
     model: object = None
@@ -410,7 +414,8 @@ class FitResults(FitRows):
             ``log_evidence_err``, ``n_calls``, ``n_effective``, ``converged``), and for each
             parameter and derived quantity ``<name>_mean``, ``_std``, ``_p16``, ``_p50``, ``_p84``
             and ``_best``; derived quantities that scale with mass also have ``_logmean``, the mean
-            of log10 (dex, in their unit).
+            of log10 (dex, in their unit). Of a fit with ``outliers``, for each band
+            ``<band>_outlier``, how likely it is wrong.
         """
         some = self._several()
         columns = {
@@ -437,6 +442,10 @@ class FitResults(FitRows):
                 log_mean = some.moments[:, some._quantity(name), 2] * u.dex
                 text = f"posterior mean of log10 of {meaning}, in {unit.to_string()}"
                 columns[f"{name}_logmean"] = (log_mean, text)
+        if some.outlier is not None:
+            for name in some.fitted_filters:
+                value = some.outlier[:, some.filters.index(name)]
+                columns[f"{name}_outlier"] = (value, f"how likely {name} is wrong")
         return described_table(columns, dict(self.meta))
 
     def predict(self, filters=None):

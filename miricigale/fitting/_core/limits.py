@@ -104,6 +104,29 @@ def _limit(u):
 
 
 @njit(**PART)
+def _mixed(u, wrong, i):
+    """
+    `_limit`, of one that is wrong with the prior probability wrong[i]: (1 - p) P + p.
+
+    It is not convex, and where it is not no second derivative is returned, so that steps are of the detections.
+    """
+    if wrong is None:
+        return _limit(u)
+    first, second, third, factor, exponent = _limit(u)
+    real = type(u)
+    zero, one, p = real(0.0), real(1.0), real(wrong[i])
+    good = (one - p) * factor * exponential(max(exponent, real(-80.0)))
+    some = p > zero
+    total = good + p if some else one
+    share = good / total if some else one
+    second = share * (second - (one - share) * first * first)
+    return (
+        share * first, max(second, zero), third if share == one else zero,
+        total if some else factor, zero if some else exponent,
+    )  # fmt: skip
+
+
+@njit(**PART)
 def _step(s, g, d, h):
     """
     Step to a lower chi2 from a scale s.
@@ -140,7 +163,7 @@ def limited_scale(p, q, limits):
             m = limits.slope[i]
             u = s * m - limits.level[i]
             if u > _NOTHING:
-                first, second, third, factor, exponent = _limit(u)
+                first, second, third, factor, exponent = _mixed(u, limits.wrong, i)
                 g += first * m
                 d += second * m * m
                 h += third * m * m * m
@@ -157,7 +180,7 @@ def limited_scale(p, q, limits):
 
 
 @njit(**PART)
-def _best_scales(buffer, work, terms, limit, c, level, reference, close):
+def _best_scales(buffer, work, terms, limit, c, level, wrong, reference, close):
     """
     Fill the scales that minimize chi2 at one fraction, and what goes with them.
 
@@ -187,7 +210,7 @@ def _best_scales(buffer, work, terms, limit, c, level, reference, close):
             top = real(level[j])
             for i in range(BLOCK):
                 m = galaxy[i] + ratio * agn[i]
-                first, second, third, factor, exponent = _limit(terms[_S + i] * m - top)
+                first, second, third, factor, exponent = _mixed(terms[_S + i] * m - top, wrong, j)
                 terms[_G + i] += first * m
                 terms[_D + i] += second * m * m
                 terms[_H + i] += third * m * m * m
@@ -279,10 +302,13 @@ def limited_likelihoods(of_frac, lanes, limits, reference, scale_error, record, 
             continue
         if single:
             _best_scales(
-                buffer, work, lanes.limited32, lanes.limit32, c, level, zero_level, _CLOSE_32
-            )
+                buffer, work, lanes.limited32, lanes.limit32, c, level, limits.wrong, zero_level,
+                _CLOSE_32,
+            )  # fmt: skip
         else:
-            _best_scales(buffer, work, work[_TERMS:], lanes.limit, c, level, zero_level, _CLOSE)
+            _best_scales(
+                buffer, work, work[_TERMS:], lanes.limit, c, level, limits.wrong, zero_level, _CLOSE
+            )
         for i in range(BLOCK):
             whole = work[_DETECTED + i]
             whole = whole if whole > 0.0 else max(work[_SCALE + i], NO_LIGHT)

@@ -131,6 +131,9 @@ class Limits(NamedTuple):
     inverse: np.ndarray  # float64 (n_limits,): 1 / sigma
     slope: np.ndarray  # float64 (n_limits,), scratch: one model's fluxes over sigma
     dark: float  # sum of the limits' terms of chi2 for a model without light
+    wrong: (
+        np.ndarray | None
+    )  # float64 (n_limits,): prior fraction of wrong ones; None of no mixture
 
 
 class Histograms(NamedTuple):

@@ -8,6 +8,7 @@ from scipy.special import log_ndtr
 from miricigale.fitting._core import structs as at
 from miricigale.fitting._core.histogram import N_BINS, N_SHARE, clear_rows
 from miricigale.fitting._core.limits import LIMITED_SIZE
+from miricigale.fitting._core.mixture import Few
 from miricigale.fitting._core.pairs import GROUP, ROWS
 from miricigale.fitting._core.single import single_size
 from miricigale.fitting._core.structs import (
@@ -147,6 +148,16 @@ def make_target(flux, sigma, log_prior, template_error=None):
         weight = 1.0 / (np.square(sigma) + more)
         norm = np.sum(weight * flux * flux, axis=1)
         level = -norm - np.log1p(more / np.square(sigma)).sum(axis=1)
+    return _bundle(flux, weight, norm, level, log_prior, bands)
+
+
+def weighed(flux, weight, level, log_prior, bands):
+    """Bundle data with weights of their own, shape (nz, nb); ``level`` is added to -chi2 at each redshift."""
+    norm = np.sum(weight * flux * flux, axis=1)
+    return _bundle(flux, weight, norm, level - norm, log_prior, bands)
+
+
+def _bundle(flux, weight, norm, level, log_prior, bands):
     used = weight[:, bands]
     with np.errstate(divide="ignore", invalid="ignore"):
         root32 = np.sqrt(used / used.max(axis=1, keepdims=True, initial=0.0)).astype(np.float32)
@@ -158,11 +169,23 @@ def make_target(flux, sigma, log_prior, template_error=None):
     return Target(flux, weight, log_prior, bands, root32, data32, norm, level, float(top))
 
 
-def make_limits(limit, inverse):
-    """Bundle the upper limits of one object; None if it has none."""
+def make_limits(limit, inverse, wrong=None):
+    """Bundle the upper limits of one object, wrong by these prior fractions; None if it has none."""
     bands = np.flatnonzero(inverse > 0)
     if bands.size == 0:
         return None
     level = limit[bands] * inverse[bands]
-    dark = float(-2.0 * log_ndtr(level).sum())
-    return Limits(bands, level, inverse[bands], np.empty(bands.size), dark)
+    log = log_ndtr(level)
+    if wrong is not None:
+        wrong = wrong[bands]
+        log = np.log((1.0 - wrong) * np.exp(log) + wrong, where=wrong > 0, out=log)
+    dark = float(-2.0 * log.sum())
+    return Limits(bands, level, inverse[bands], np.empty(bands.size), dark, wrong)
+
+
+def make_few(index, flux, ratio):
+    """Bundle galaxies with work space for `find_models`."""
+    (n_bands, n), n_agn = flux.shape[1:], ratio.shape[1]
+    shapes = (n_bands, n), (n_agn, n_bands), (n_agn + 2, n), (4, n)
+    work = [aligned(*shape, dtype=np.float32) for shape in shapes]
+    return Few(index, flux, ratio, *work, aligned(n_bands), aligned(n_bands))
