@@ -238,7 +238,7 @@ class _Blocks:
         names = ("redshift", *chain.names(*SKY))
         different, sky = distinct(_keys(values, names, rows))
         dim = np.ones((len(different), chain.wave.size))
-        # nobody looks at what lies beyond all bands
+        # the sky is needed where a band is
         edges = np.array([self.span / (1.0 + key[0]) for key in different])
         edges = np.maximum(np.searchsorted(chain.wave, edges) + [-1, 1], 0).tolist()
         for out, key, (a, b) in zip(dim, different, edges, strict=True):
