@@ -1,17 +1,16 @@
 """
 Redshifts of real galaxies with `SEDModel.survey`: CEERS sources in HST, NIRCam and MIRI bands.
 
-    MIRICIGALE_DATA=../shared/data python benchmarks/ceers.py [--n 386] [--grid grid.fits] [--flat] [--mocks]
-        [--times] [--sampler 200 interpolate|nautilus]
+    MIRICIGALE_DATA=../shared/data python benchmarks/ceers.py [--grid grid.fits] [--mocks] [--times]
+        [--sampler 200 interpolate|nautilus]
 
 The catalog is the part of that of Lisiecki et al. 2025 in $MIRICIGALE_DATA/ceers; of it sources with S/N above
-5 in two MIRI bands and five others. Published redshifts in steps of 0.025 are photometric, from the same HST and
-NIRCam bands; the others, nearly all of F160W < 24, where 3D-HST has grism redshifts, are shown apart.
-Template error, zero points, priors of all parameters and the errors of the MIRI bands (which the catalog measured
-apart) are measured on one half and used on the other, and the other way round; ``--flat`` leaves the priors flat.
-``--mocks`` fits the best models with noise of these errors again: what chi2 is if errors are right. ``--sampler``
-fits some sources with continuous parameters too, and does nothing else. The last lines are what
-`TemplateError.survey` and `SEDModel.survey_priors` hold: means of both halves.
+5 in seven bands and redshift 0.1 to 5.5. Shown are 600 at random, those with S/N above 5 in two MIRI bands, and of
+these the ones whose published redshifts are not in steps of 0.025: those in steps are photometric, from the same
+HST and NIRCam bands; the others are nearly all of F160W < 24, where 3D-HST has grism redshifts.
+Each half of the sources is fitted with `calibrate` of the other, and without. ``--mocks`` fits the best models
+with noise of these errors again: what chi2 is if errors are right. ``--sampler`` fits some sources with continuous
+parameters too, and does nothing else.
 """
 
 import argparse
@@ -31,13 +30,8 @@ from miricigale.fitting import (
     FitResults,
     GridSettings,
     SamplerSettings,
-    TemplateError,
-    apply_zero_points,
-    calibrate_zero_points,
-    leave_out,
-    measure_band_errors,
-    measure_priors,
-    measure_template_error,
+    SurveyCalibration,
+    calibrate,
     mock_analysis,
 )
 from miricigale.sed import ModelGrid, SEDModel
@@ -46,56 +40,19 @@ OUTLIER = 0.15
 
 
 def sample(path):
-    """Sources of the catalog, and all bands."""
+    """Sources of the catalog, all bands, and in how many of MIRI each has S/N above 5."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         table = read_catalog_photometry(path, "ceers")
     bands = [name for name in table.colnames if f"{name}_err" in table.colnames]
     for name in bands:
         # -99 is no error
-        table[f"{name}_err"][~(table[f"{name}_err"] > 0)] = np.nan
-    signal = np.array([np.nan_to_num((table[b] / table[f"{b}_err"]).value) for b in bands])
-    miri = np.array([b.startswith("miri") for b in bands])
-    good = ((signal[miri] > 5).sum(0) >= 2) & ((signal[~miri] > 5).sum(0) >= 5)
-    return table[good], bands
-
-
-def calibrated(grid, bands, table, flat):
-    """
-    Template error, errors of MIRI bands, zero points and priors, of sources at their published redshifts.
-
-    Priors and zero points are those of fits with errors of 10 % (30 % in MIRI). The errors of MIRI are those of
-    what HST and NIRCam predict, and the template error is what residuals have beside them; a few turns, for each
-    needs the other. Zero points stay in the template error, which is for catalogs of which they are not known.
-    """
-    miri = [b for b in bands if b.startswith("miri")]
-    errors = {b: 0.3 if b in miri else 0.1 for b in bands}
-    priors = None
-    for _ in range(1 if flat else 6):
-        fit = BayesFitter(grid, bands, model_error=errors, priors=priors).fit(
-            table, redshift="redshift"
-        )
-        priors, before = None if flat else measure_priors(fit), priors
-    error, points = measure_template_error(fit), calibrate_zero_points(fit, reference="wfc3.f160w")
-    measured = [b for b in miri if np.any(table[f"{b}_err"] > 0)]
-    for _ in range(5):
-        fitter = BayesFitter(grid, bands, model_error=0.0, template_error=error, priors=before)
-        left = leave_out(fitter, table, measured, redshift="redshift")
-        factor, part = measure_band_errors(left, error)
-        own = dict.fromkeys(miri, part)
-        fitter = BayesFitter(grid, bands, model_error=own, template_error=error, priors=before)
-        fit = fitter.fit(with_errors(table, factor), redshift="redshift")
-        error = measure_template_error(fit, model_error=own)
-    return error, (factor, part), points, before
-
-
-def with_errors(table, factor):
-    """The catalog with the errors of its MIRI bands multiplied."""
-    table = table.copy()
-    for name in table.colnames:
-        if name.startswith("miri") and name.endswith("_err"):
-            table[name] *= factor
-    return table
+        none = ~(table[f"{name}_err"] > 0)
+        table[name][none] = table[f"{name}_err"][none] = np.nan
+    signal = np.array([np.nan_to_num((table[b] / table[f"{b}_err"]).value) for b in bands]) > 5
+    miri, z = np.array([b.startswith("miri") for b in bands]), np.asarray(table["redshift"], float)
+    good = (signal.sum(axis=0) >= 7) & (z > 0.1) & (z < 5.5)
+    return table[good], bands, signal[miri].sum(axis=0)[good]
 
 
 def row(label, results, true, rows):
@@ -112,9 +69,10 @@ def row(label, results, true, rows):
 def chi2_parts(results, bands, rows):
     """Medians over objects of the mean squared pull below and above 3 um."""
     pivot = np.array([one.pivot.to_value(u.um) for one in FilterSet.from_names(bands)])
+    columns = [results.filters.index(band) for band in bands]
     pull = (results.flux - results.best_flux) / results.sigma
     pull[~np.isfinite(results.sigma)] = np.nan
-    out = []
+    pull, out = pull[:, columns], []
     for part in (pivot < 3, pivot >= 3):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -122,18 +80,14 @@ def chi2_parts(results, bands, rows):
     return out
 
 
-def time_known(grid, used, table, n=2000):
+def time_known(fitter, table, n=2000):
     """Print CPU times at known redshifts, of rows of the catalog with new noise."""
     rng = np.random.default_rng(7)
     table = table[rng.integers(len(table), size=n)]
     table["id"] = np.arange(n)
-    for name in used:
-        table[name] += (
-            np.nan_to_num(rng.normal(size=n) * table[f"{name}_err"].to_value(u.uJy)) * u.uJy
-        )
-    own = {name: 0.2 if name.startswith("miri") else 0.0 for name in used}
-    error, priors = TemplateError.survey(), SEDModel.survey_priors()
-    fitter = BayesFitter(grid, used, model_error=own, template_error=error, priors=priors)
+    for name in fitter.bands:
+        noise = rng.normal(size=n) * table[f"{name}_err"].to_value(u.uJy)
+        table[name] += np.nan_to_num(noise) * u.uJy
     fitter.fit(table[:8], redshift="redshift")
     start = time.process_time()
     fitter.fit(table, redshift="redshift")
@@ -186,7 +140,7 @@ def compare(table, grid, n, engine):
     errors = {b: 0.3 if b.startswith("miri") else 0.06 for b in bands}
     ours = BayesFitter(grid, bands, model_error=errors).fit(table)
     if engine == "interpolate":
-        settings = GridSettings(interpolate=400, finer=SEDModel.survey())
+        settings = GridSettings(finer=SEDModel.survey())
         fitter = BayesFitter(grid, bands, model_error=errors, settings=settings)
     else:
         fitter = BayesFitter(
@@ -221,18 +175,15 @@ def compare(table, grid, n, engine):
 def main():
     """Print the tables."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("--n", type=int, help="sources, drawn at random (all)")
     parser.add_argument("--grid", type=Path, help="keep the grid in this file")
-    parser.add_argument("--flat", action="store_true", help="priors that are flat in the nodes")
     parser.add_argument(
         "--times", action="store_true", help="of each object, and of the plain loop"
     )
     parser.add_argument("--mocks", action="store_true", help="what chi2 is if errors are right")
     parser.add_argument("--sampler", nargs=2, metavar=("N", "ENGINE"), help="fit N with a sampler")
     args = parser.parse_args()
-    table, bands = sample(Path(os.environ["MIRICIGALE_DATA"]) / "ceers/ceers_photometry_part.fits")
-    if args.n:
-        table = table[np.sort(np.random.default_rng(1).permutation(len(table))[: args.n])]
+    path = Path(os.environ["MIRICIGALE_DATA"]) / "ceers/ceers_photometry_part.fits"
+    table, bands, n_miri = sample(path)
     start = time.process_time()
     if args.grid and args.grid.exists():
         grid = ModelGrid.read(args.grid)
@@ -242,74 +193,78 @@ def main():
             grid.write(args.grid)
     print(f"{grid}, {time.process_time() - start:.0f} s")
     if args.sampler:
-        compare(table, grid, int(args.sampler[0]), args.sampler[1])
+        compare(table[n_miri >= 2], grid, int(args.sampler[0]), args.sampler[1])
         return
-    halves = [table[h::2] for h in (0, 1)]
-    found = [calibrated(grid, bands, half, args.flat) for half in halves]
-    print("band, factor of each half")
-    for a, b in zip(found[0][2], found[1][2], strict=True):
-        print(f"  {a['band']:14s} {a['factor']:.3f} {b['factor']:.3f} +- {a['factor_err']:.3f}")
-    for factor, part in (one[1] for one in found):
-        print(f"errors of MIRI: {factor:.2f} times those of the catalog and {100 * part:.0f} %")
+    halves, start = [np.arange(h, len(table), 2) for h in (0, 1)], time.process_time()
+    found = [
+        calibrate(BayesFitter(grid, bands), table[half], reference="wfc3.f160w", name=f"half {h}")
+        for h, half in enumerate(halves)
+    ]
+    print(f"calibrations of {len(table)} sources: {time.process_time() - start:.0f} s of CPU")
+    print("band           zero points   errors times  of the flux    wrong")
+    for a, b in zip(found[0].bands, found[1].bands, strict=True):
+        each = [
+            [one[name] for name in list(a.colnames)[2:] if name[-3:] != "err"] for one in (a, b)
+        ]
+        print(f"{a['band']:14s}", *(f"{x:6.3f} {y:6.3f} " for x, y in zip(*each, strict=True)))
+    for name in found[0].priors:
+        print(name, *(one.priors[name][1].round(3) for one in found))
+    error = [one.template_error for one in found]
+    for wave, *each in zip(error[0].wave, error[0].error, error[1](error[0].wave), strict=True):
+        print(f"{wave:7.3f} {each[0]:.3f} {each[1]:.3f}")
+    true = np.asarray(table["redshift"], float)
+    apart = np.abs(true / 0.025 - np.round(true / 0.025)) > 1e-3
+    chosen = np.random.default_rng(5).choice(len(table), 600, replace=False)
+    samples = {"two in MIRI": n_miri >= 2, "  of them not in steps of 0.025": (n_miri >= 2) & apart}
+    samples = {"random": np.isin(np.arange(len(table)), chosen), **samples}
+    some = np.any(list(samples.values()), axis=0)
     optical = [b for b in bands if not b.startswith("miri")]
-    true = np.concatenate([np.asarray(half["redshift"], float) for half in halves])
-    steps = true / 0.025
-    apart = np.abs(steps - np.round(steps)) > 1e-3
-    whole = np.ones(true.size, bool)
-    joined = {name: np.concatenate([half[name] for half in halves]) for name in table.colnames}
     print("\n                                      n     bias sigma_MAD  out.,%  in 68 %")
     for label, used in (("HST, NIRCam", optical), ("HST, NIRCam, MIRI", bands)):
-        parts, mocks, known, times, spent = [], [], [], [], 0.0
-        for h, half in enumerate(halves):
-            error, (factor, part), points, priors = found[1 - h]
-            half = with_errors(apply_zero_points(half, points), factor)
-            own = {name: part if name.startswith("miri") else 0.0 for name in used}
-            fitter = BayesFitter(grid, used, model_error=own, template_error=error, priors=priors)
-            start = time.process_time()
-            parts.append(fitter.fit(half))
-            spent += time.process_time() - start
-            if args.times:
-                times.extend(time_each(fitter, half))
-            if args.mocks:
-                mock = mock_analysis(fitter, parts[-1], half, seed=1, model_error=True)
-                mocks.append(mock.recovered)
-                at = {"redshift": "redshift"}
-                fit = fitter.fit(half, **at)
-                known.append(mock_analysis(fitter, fit, half, seed=1, model_error=True, **at))
-        results = FitResults.concatenate(parts)
-        row(label, results, true, whole)
-        row("  redshifts not in steps of 0.025", results, true, apart)
-        row("  in steps", results, true, ~apart)
-        mean = 1e3 * spent / len(true)
-        print(
-            f"  {mean:.0f} ms of CPU an object; reduced chi2 {np.median(results.reduced_chi2):.2f}"
-        )
+        for what in ("as given, errors of 10 %", "SurveyCalibration.survey()", "calibrated"):
+            parts, rows, mocks, known, times, spent = [], [], [], [], [], 0.0
+            for half, other in zip(halves, found[::-1], strict=True):
+                mine = half[some[half]]
+                use = {"as": None, "Su": SurveyCalibration.survey(), "ca": other}[what[:2]]
+                fitter, part = BayesFitter(grid, used, calibration=use), table[mine]
+                start = time.process_time()
+                parts.append(fitter.fit(part))
+                spent += time.process_time() - start
+                rows.append(mine)
+                if args.times and use is other:
+                    times.extend(time_each(fitter, part[:60]))
+                if args.mocks and use is other:
+                    mock = mock_analysis(fitter, parts[-1], part, seed=1, model_error=True)
+                    mocks.append(mock.recovered)
+                    at = {"redshift": "redshift"}
+                    fit = fitter.fit(part, **at)
+                    known.append(mock_analysis(fitter, fit, part, seed=1, model_error=True, **at))
+            results, rows = FitResults.concatenate(parts), np.concatenate(rows)
+            print(f"{label}, {what}: {1e3 * spent / rows.size:.0f} ms of CPU an object")
+            for name, mask in samples.items():
+                row(name, results, true[rows], mask[rows])
         if args.times:
             print(
                 f"  one by one: median {np.median(times):.0f} ms, 95 % {np.quantile(times, 0.95):.0f} ms"
             )
-            time_known(grid, used, table)
+            time_known(fitter, table)
         groups = {"": parts, " of mocks": mocks}
         groups |= {" at known redshifts": [one.truth for one in known]}
         groups |= {" of mocks at known redshifts": [one.recovered for one in known]}
-        for what, some in groups.items():
-            if some:
-                one = FitResults.concatenate(some)
-                below, above = chi2_parts(one, bands, whole)
+        for what, fits in groups.items():
+            if fits:
+                one = FitResults.concatenate(fits)
+                below, above = chi2_parts(one, used, np.ones(len(one), bool))
                 text = f"{below:.2f} below 3 um, {above:.2f} above"
                 print(f"  median of mean squared pulls{what}: {text}")
     print("\nworst tenth, with MIRI: medians                  all")
-    worst_tenth(results, joined, bands, true)
+    miri = (n_miri >= 2)[rows]
+    worst_tenth(results[miri], table[rows][miri], bands, true[rows][miri])
     if args.times:
         model = SEDModel.yang2021(libraries="bundled")
         n_models = model.grid(SEDModel.yang2021_axes(), ["wfc3.f160w"]).n_allowed
         seconds = loop_time(None, n_models, 21)
         print(f"plain loop over the grid of Yang et al. 2021: {seconds:.2f} s an object")
-    error = np.mean([one[0](found[0][0].wave) for one in found], axis=0)
-    print("TemplateError.survey", found[0][0].wave.value.round(2).tolist(), error.round(3).tolist())
-    if not args.flat:
-        for name in found[0][3]:
-            print(name, np.mean([one[3][name] for one in found], axis=0).round(3).tolist())
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from miricigale.fitting import BayesFitter
+from miricigale.fitting import BayesFitter, GridSettings
 from miricigale.sed import ModelGrid, SEDModel
 
 # 5-sigma depths, AB (Stefanon et al. 2017, FIDEL, CEERS)
@@ -139,7 +139,7 @@ def main():
     print(f"{grid!r}, {grid.n_allowed:,} allowed, made in {time.time() - start:.1f} s")
     first, cached = compile_time()
     print(f"first call {first:.1f} s, from the cache {cached:.1f} s")
-    fitter = BayesFitter(grid)
+    fitter = BayesFitter(grid, settings=GridSettings(interpolate=0))
     print(
         f"{'case':32s} {'median':>7s} {'mean':>7s} {'95 %':>7s} {'max':>7s}  ms an object, one core"
     )
@@ -165,6 +165,16 @@ def main():
     fitter.fit(table, redshift="redshift")
     spent = 1e3 * (time.process_time() - start) / options.n
     print(f"{'21 bands, known redshift':32s} {'':7s} {spent:7.2f}")
+    between = BayesFitter(grid)
+    between.fit(table[:1])
+    for label, known in (
+        ("21 bands, between nodes", None),
+        ("known redshift, between", "redshift"),
+    ):
+        start = time.process_time()
+        between.fit(table, redshift=known)
+        spent = 1e3 * (time.process_time() - start) / options.n
+        print(f"{label:32s} {'':7s} {spent:7.2f}")
     few = with_limits(grid, table[: max(options.n // 8, 2)])
     # limits have kernels of their own, which the first call compiles
     fitter.fit(few[:1])

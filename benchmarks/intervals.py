@@ -1,12 +1,16 @@
 """
-How often intervals hold the truth where it lies between the nodes of a grid, as a fitter's prior has it.
+How often intervals hold the truth where it lies between the nodes of a grid, and what that costs.
 
-    python benchmarks/intervals.py [--n 300] [--draws 0 400] [--grid small|large] [--seed 7] [--model-error 0.1]
+    python benchmarks/intervals.py [--n 300] [--draws 0 200] [--grid small|large|survey] [--finer] [--seed 7]
+                                   [--model-error 0.1] [--scattered]
 
 Objects are models drawn from the prior: of any node, anywhere in its cell between the outermost nodes, computed by
-the chain itself, with S/N 10 in 21 bands, u* to MIPS 24. They are not scattered by the model error of the fit,
-which stands for what the models of a grid are off by. ``--draws`` is ``interpolate`` of the fitter. Grids have 0.8
-and 69 million models. Printed are the parts of the truths in 68 and 95 % intervals, and their binomial errors.
+the chain itself, with S/N 10 in 21 bands, u* to MIPS 24, or for the axes of surveys in 14 of HST, NIRCam and MIRI.
+They are not scattered by the model error of the fit, which stands for what the models of a grid are off by, unless
+``--scattered``. ``--draws`` is ``interpolate`` of the fitter, ``--finer`` makes a finer grid. Grids have 0.8, 69
+and 17.6 million models. Printed are the parts of the truths in 68 and 95 % intervals, their binomial errors,
+milliseconds of CPU an object, in one call and one object a call, seconds to make the fitter, and the plain loop of
+``benchmarks/fit.py``.
 """
 
 import argparse
@@ -15,6 +19,7 @@ import time
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
+from fit import loop_time
 
 from miricigale.fitting import BayesFitter, FitFlags, GridSettings
 from miricigale.fitting.posterior import cell_edges
@@ -25,6 +30,12 @@ BANDS = [
     "wfc3.f125w", "wfc3.f140w", "wfc3.f160w", "irac.ch1", "irac.ch2", "irac.ch3", "irac.ch4", "mips.24",
     "miri.f770w", "miri.f1000w", "miri.f1280w", "miri.f1500w", "miri.f1800w", "miri.f2100w",
 ]  # fmt: skip
+SURVEY_BANDS = [
+    "acs.f606w", "acs.f814w", "wfc3.f125w", "wfc3.f160w", "nircam.f115w", "nircam.f150w", "nircam.f200w",
+    "nircam.f277w", "nircam.f356w", "nircam.f410m", "nircam.f444w", "miri.f560w", "miri.f770w", "miri.f1000w",
+]  # fmt: skip
+#: Parameters that the chain has at the nodes alone.
+AT_NODES = ("metallicity",)
 SMALL = {
     "tau": [0.1, 0.5, 1.0, 5.0],
     "age": [0.5, 1.0, 3.0, 5.0],
@@ -59,22 +70,25 @@ def drawn(fitter, n, rng):
         elif name != "redshift":
             node = rng.choice(axis.values.size, n, p=axis.weights)
         out[name] = edges[node] + np.diff(edges)[node] * rng.random(n)
+        if name in AT_NODES:
+            out[name] = axis.values[node]
     return out
 
 
-def objects(fitter, model, n, rng):
-    """Photometry with noise, and true values by name."""
-    values = drawn(fitter, 2 * n, rng)
+def objects(fitter, model, n, rng, extra):
+    """Photometry with noise of 10 % and of a further part, and true values by name."""
+    values, bands = drawn(fitter, 2 * n, rng), list(fitter.bands)
+    values |= {name: np.full(2 * n, value) for name, value in fitter.backend.constants.items()}
     true = QTable({k: v * (model.parameters[k].unit or u.one) for k, v in values.items()})
-    fluxes = model.fluxes(true, BANDS)
+    fluxes = model.fluxes(true, bands)
     # some are older than the universe, though their node is not
     good = np.flatnonzero(np.isfinite(fluxes["sfr"].value))[:n]
     true, fluxes = true[good], fluxes[good]
     for name in NAMES[2:]:
         true[name] = fluxes[name]
     table = QTable({"id": np.arange(n)})
-    for name in BANDS:
-        table[name] = fluxes[name] * (1.0 + 0.1 * rng.normal(size=n))
+    for name in bands:
+        table[name] = fluxes[name] * (1.0 + np.hypot(0.1, extra) * rng.normal(size=n))
         table[f"{name}_err"] = 0.1 * fluxes[name]
     return table, true
 
@@ -89,35 +103,52 @@ def main():
     """Print the table."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--n", type=int, default=300)
-    parser.add_argument("--draws", type=int, nargs="+", default=[0, 400])
-    parser.add_argument("--grid", choices=("small", "large"), default="small")
+    parser.add_argument("--draws", type=int, nargs="+", default=[0, 200])
+    parser.add_argument("--grid", choices=("small", "large", "survey"), default="small")
+    parser.add_argument("--finer", action="store_true")
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--model-error", type=float, default=0.1)
+    parser.add_argument("--scattered", action="store_true")
     args = parser.parse_args()
-    model = SEDModel.yang2021(libraries="bundled")
-    grid = model.grid(SMALL if args.grid == "small" else LARGE, BANDS)
+    if args.grid == "survey":
+        model, axes, bands = SEDModel.survey(), SEDModel.survey_axes(), SURVEY_BANDS
+    else:
+        model, bands = SEDModel.yang2021(libraries="bundled"), BANDS
+        axes = SMALL if args.grid == "small" else LARGE
+    grid = model.grid(axes, bands)
     print(grid)
     options = {"model_error": args.model_error}
-    rng = np.random.default_rng(args.seed)
-    table, true = objects(BayesFitter(grid, BANDS, **options), model, args.n, rng)
+    rng, n = np.random.default_rng(args.seed), args.n
+    nodes = BayesFitter(grid, bands, **options, settings=GridSettings(interpolate=0))
+    table, true = objects(nodes, model, n, rng, args.scattered * args.model_error)
     for part in (0.68, 0.95):
-        error = 100 * np.sqrt(part * (1 - part) / args.n)
-        print(f"parts of {args.n} truths in {100 * part:.0f} % intervals, +- {error:.1f} %")
-    print(f"draws    ms {' '.join(f'{name:>16s}' for name in NAMES)}  on one node")
+        error = 100 * np.sqrt(part * (1 - part) / n)
+        print(f"parts of {n} truths in {100 * part:.0f} % intervals, +- {error:.1f} %")
+    print(f"draws  ms   one  made {' '.join(f'{name:>16s}' for name in NAMES)}  on one node")
     for n_draws in args.draws:
-        finer = model if n_draws else None
+        start = time.time()
+        finer = model if n_draws and args.finer else None
         settings = GridSettings(interpolate=n_draws, finer=finer)
-        fitter = BayesFitter(grid, BANDS, settings=settings, **options)
+        fitter = BayesFitter(grid, bands, settings=settings, **options)
+        made = time.time() - start
+        # kernels are compiled, and models prepared, once
+        fitter.fit(table[:1])
         start = time.process_time()
         results = fitter.fit(table)
-        spent = 1e3 * (time.process_time() - start) / args.n
+        spent = 1e3 * (time.process_time() - start) / n
+        start = time.process_time()
+        for i in range(min(n, 50)):
+            fitter.fit(table[i : i + 1])
+        single = 1e3 * (time.process_time() - start) / min(n, 50)
         parts = [[100 * held(results, true, name, p) for p in (0.68, 0.95)] for name in NAMES]
         alone = np.mean((results.flags & int(FitFlags.ONE_NODE)) != 0)
         print(
-            f"{n_draws:5d} {spent:5.0f} {' '.join(f'{a:9.1f} {b:6.1f}' for a, b in parts)} "
-            f"{100 * alone:11.0f}%",
+            f"{n_draws:5d} {spent:4.0f} {single:4.0f} {made:5.1f} "
+            f"{' '.join(f'{a:9.1f} {b:6.1f}' for a, b in parts)} {100 * alone:11.1f}%",
             flush=True,
         )
+    loop = loop_time(grid, grid.n_allowed, len(bands))
+    print(f"the plain loop over all models takes {loop:.2f} s an object")
 
 
 if __name__ == "__main__":

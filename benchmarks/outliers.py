@@ -20,9 +20,12 @@ from ceers import sample
 from fit import loop_time
 
 from miricigale import BayesFitter, SEDModel
-from miricigale.fitting import TemplateError
+from miricigale.fitting import GridSettings, TemplateError
 from miricigale.fitting.posterior import cell_percentiles
 from miricigale.sed import ModelGrid
+
+#: The exact sum is over the nodes.
+NODES = {"settings": GridSettings(interpolate=0)}
 
 BANDS = [
     "acs.f606w", "acs.f814w", "nircam.f115w", "nircam.f150w", "nircam.f200w", "nircam.f277w",
@@ -90,7 +93,7 @@ def real(path, grid_path):
     ):  # fmt: skip
         errors = {name: error if name.startswith("miri") else 0.0 for name in names}
         for part in (None, 0.03, 0.05, 0.1):
-            given = {"model_error": errors, "template_error": TemplateError.survey()}
+            given = {"model_error": errors, "template_error": TemplateError.survey(), **NODES}
             fitter = BayesFitter(grid, names, outliers=part, **given)
             fitter.fit(table[:2])
             start = time.process_time()
@@ -120,7 +123,7 @@ def main():
         return
     n, rng = options.n, np.random.default_rng(7)
     grid = SEDModel.survey().grid(AXES, BANDS)
-    given = {"model_error": 0.0, "template_error": TemplateError.survey()}
+    given = {"model_error": 0.0, "template_error": TemplateError.survey(), **NODES}
     fitter = BayesFitter(grid, BANDS, outliers=options.part, **given)
     plain = BayesFitter(grid, BANDS, **given)
     error = fitter.backend.engine.template_error

@@ -22,11 +22,9 @@ def fit(args):
             found = fit_classes(
                 args.photometry,
                 args.output,
-                **chosen(args, "quasars stars"),
-                **chosen(
-                    args, "axes redshift model_error outliers pairs flux_unit catalog_map ebv"
-                ),
-                **chosen(args, "chunk_rows resume"),
+                **chosen(args, "quasars red_dots stars"),
+                **chosen(args, "axes redshift model_error outliers calibration calibrate"),
+                **chosen(args, "interpolate pairs flux_unit catalog_map ebv chunk_rows resume"),
                 hdu=hdu,
                 executor=executor,
                 progress_bar=not args.no_progress,

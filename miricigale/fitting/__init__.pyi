@@ -14,9 +14,13 @@ from .from_files import fit_catalog as fit_catalog
 from .io import FitResultsFiles as FitResultsFiles
 from .io import open_results as open_results
 from .likelihood import FitFlags as FitFlags
+from .priors import MassFunction as MassFunction
+from .priors import agn_fraction_prior as agn_fraction_prior
 from .priors import magnitude_prior as magnitude_prior
 from .results import FitResults as FitResults
 from .samples import Samples as Samples
 from .settings import GridSettings as GridSettings
 from .settings import SamplerSettings as SamplerSettings
 from .streaming import fit_file as fit_file
+from .survey import SurveyCalibration as SurveyCalibration
+from .survey import calibrate as calibrate

@@ -24,13 +24,12 @@ _N_BAND, _N_BIN = 30, 10
 _MEDIAN = 0.6744897501960817
 #: How many times their errors fluxes scatter by that are something else's.
 _WIDE = 5.0
+#: Shortest rest wavelength in um at which others predict a band: young stars and dust vary most below.
+_SHORTEST = 0.4
 #: Largest template error that is looked for.
 _MOST = 10.0
 #: Edges in um of the bins of rest wavelength; wider where few bands fall.
 _EDGES = (0.09, 0.17, 0.22, 0.28, 0.36, 0.45, 0.6, 0.8, 1.1, 1.5, 2.0, 2.6, 3.6, 5.5, 12.0)
-#: What `measure_template_error` found with `_EDGES`; see `TemplateError.survey`.
-_SURVEY = (0.120, 0.089, 0.084, 0.090, 0.069, 0.065, 0.057, 0.062, 0.065, 0.049)
-_SURVEY += (0.045, 0.081, 0.243, 0.544)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +63,7 @@ class TemplateError:
     >>> error([0.1, 3.0] * u.um).round(3)
     array([0.15 , 0.169])
     >>> TemplateError.survey()([0.5, 8.0] * u.um).round(3)
-    array([0.066, 0.536])
+    array([0.059, 0.47 ])
     """
 
     wave: u.Quantity
@@ -84,19 +83,12 @@ class TemplateError:
         wave = to_array(wave, WAVE, "wave")
         return np.interp(np.log(wave), np.log(self.wave.to_value(WAVE)), self.error)
 
-    @classmethod
-    def survey(cls):
-        """
-        Template error of `~miricigale.sed.SEDModel.survey`.
+    @staticmethod
+    def survey():
+        """Template error of `~miricigale.sed.SEDModel.survey`: that of `SurveyCalibration.survey`."""
+        from miricigale.fitting.survey import SurveyCalibration
 
-        Measured by `measure_template_error` (``benchmarks/ceers.py``) on 386 sources of CEERS (Finkelstein et
-        al. 2023, ApJL 946, L13) in HST, NIRCam and MIRI bands as published by Lisiecki et al. 2025, with S/N
-        above 5 in two MIRI bands and five others, at the published redshifts, most of which are photometric:
-        the mean of two halves of the sample. The errors of MIRI bands are not in it (`measure_band_errors`: 3.7
-        times those of that catalog, and 20 % of the flux); the scatter of zero points from band to band is.
-        """
-        edges = np.array(_EDGES)
-        return cls(np.sqrt(edges[1:] * edges[:-1]) * WAVE, _SURVEY)
+        return SurveyCalibration.survey().template_error
 
 
 def _pivots(filters):
@@ -128,6 +120,11 @@ def _residuals(results):
         good = results.fitted[:, None] & np.isfinite(results.sigma) & ~results.limit & (model > 0)
         good &= flux > _LEAST_SIGNAL * error
     return flux, error, model, good
+
+
+def _rest(results):
+    """Rest wavelengths in um of the bands of all objects, shape (n, nb)."""
+    return _pivots(results.filters).value / (1.0 + results.best["redshift"].value[:, None])
 
 
 def _excess(flux, error, model, scatter):
@@ -188,15 +185,23 @@ def measure_band_errors(left, template_error, *, longest=2.5 * u.um):
     >>> left = leave_out(fitter, photometry, miri, redshift="z_spec")  # doctest: +SKIP
     >>> factor, part = measure_band_errors(left, template_error)  # doctest: +SKIP
     """
-    longest = to_array(longest, WAVE, "longest", ndim=0)
+    found = error_of_bands(left, template_error, to_array(longest, WAVE, "longest", ndim=0))
+    if found is None:
+        raise argument_error("left", f"with {_N_BAND} fluxes of S/N above 5", "fewer")
+    return found
+
+
+def error_of_bands(left, template_error, longest=2.5):
+    """Do what `measure_band_errors` does, with a wavelength in um; None where fluxes are too few."""
     for results in left.results.values():
         _check_known(results)
     z = np.array([left.results[name].best["redshift"].value for name in left.bands])
     rest = _pivots(left.bands).value / (1.0 + z.T)
     with np.errstate(invalid="ignore"):
-        good = (left.predicted > 0) & (left.flux > _LEAST_SIGNAL * left.flux_err) & (rest < longest)
+        good = (left.predicted > 0) & (left.flux > _LEAST_SIGNAL * left.flux_err)
+        good &= (rest > _SHORTEST) & (rest < longest)
     if np.count_nonzero(good) < _N_BAND:
-        raise argument_error("left", f"with {_N_BAND} fluxes of S/N above 5", "fewer")
+        return None
     model, err = left.predicted[good], left.flux_err[good]
     fixed = np.square(left.predicted_std[good])
     fixed += np.square(template_error(rest[good] * WAVE) * model)
@@ -204,7 +209,7 @@ def measure_band_errors(left, template_error, *, longest=2.5 * u.um):
 
     def unlikely(logs):
         variance = fixed + np.square(np.exp(logs[0]) * err) + np.square(np.exp(logs[1]) * model)
-        share = 0.5 * expit(logs[2])
+        share = max(0.5 * expit(logs[2]), 1e-300)
         terms = [
             np.log(part / wide) - 0.5 * (np.log(variance) + square / (wide * wide * variance))
             for part, wide in ((1.0 - share, 1.0), (share, _WIDE))
@@ -268,7 +273,7 @@ def measure_template_error(results, *, model_error=0.0, edges=None):
     own = per_band(model_error, results.filters, "model_error")
     flux, error, _, good = _residuals(results)
     error = np.hypot(error, np.array([own[name] for name in results.filters]) * flux)
-    rest = _pivots(results.filters).value / (1.0 + results.best["redshift"].value[:, None])
+    rest = _rest(results)
     columns, wave, found = (flux, error, results.model_flux, results.model_flux_std), [], []
     for low, high in itertools.pairwise(edges):
         some = good & (rest >= low) & (rest < high)
@@ -331,7 +336,7 @@ def measure_priors(results):
     return {name: results.pdf[name][results.fitted].mean(axis=0) for name in names}
 
 
-def calibrate_zero_points(results, *, reference=None):
+def calibrate_zero_points(results, *, reference=None, longest=None):
     """
     Measure what the fluxes of each band want to be multiplied by to agree with the best models.
 
@@ -345,6 +350,9 @@ def calibrate_zero_points(results, *, reference=None):
         Of a fit at known redshifts.
     reference : str, optional
         Band whose factor is 1; by default that of the most sources.
+    longest : `~astropy.units.Quantity`, optional
+        Longest rest wavelength of the fluxes that are taken, such as 2.5 um, beyond which models of dust are
+        less sure than zero points.
 
     Returns
     -------
@@ -384,6 +392,8 @@ def calibrate_zero_points(results, *, reference=None):
     miri.f770w  40   1.08       0.01
     """
     flux, _, model, good = _residuals(results)
+    if longest is not None:
+        good &= _rest(results) < to_array(longest, WAVE, "longest", ndim=0)
     bands = list(results.fitted_filters)
     columns = [results.filters.index(name) for name in bands]
     n = good[:, columns].sum(axis=0)

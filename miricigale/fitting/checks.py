@@ -8,8 +8,9 @@ from astropy.stats import mad_std
 from astropy.table import QTable
 
 from miricigale.fitting.fitter import BayesFitter
-from miricigale.fitting.likelihood import FitFlags, PhotometryReader, flux_column
+from miricigale.fitting.likelihood import FitFlags, flux_column
 from miricigale.fitting.posterior import randomized_ranks
+from miricigale.fitting.pulls import without_warnings
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_names
 from miricigale.utils.random import check_seed, stream
@@ -90,8 +91,9 @@ def mock_analysis(fitter, results, photometry, *, seed, model_error=False, **opt
     change, drawn = used & ~results.limit, results.best_flux + noise * error
     mock = QTable(photometry, copy=True)
     for name in filters:
-        i = results.filters.index(name)
-        mock[name] = np.where(change[:, i], drawn[:, i], flux_column(photometry, name)) * FNU
+        i, point = results.filters.index(name), fitter.zero_points.get(name, 1.0)
+        measured = drawn[:, i] / point
+        mock[name] = np.where(change[:, i], measured, flux_column(photometry, name)) * FNU
     meta = {"seed": seed, "model_error": bool(model_error)}
     return MockResult(results, fitter.fit(mock, **options), mock, seed, meta)
 
@@ -243,6 +245,7 @@ def _statistic(function, values):
     return float(function(values)) if len(values) else np.nan
 
 
+@without_warnings()
 def leave_out(fitter, photometry, bands, *, separately=False, **options):
     """
     Fit without some bands, and compare what is measured there with what the rest predicts.
@@ -298,8 +301,7 @@ def leave_out(fitter, photometry, bands, *, separately=False, **options):
     if len(set(bands)) < len(bands):
         raise argument_error("bands", "different names", f"{list(bands)}")
     check_names(bands, "filter of the models", fitter.bands)
-    zero = dict.fromkeys(bands, 0.0)
-    data = PhotometryReader(bands, bands, zero, zero, 1).read(photometry)
+    data = fitter.read_bands(photometry, bands)
     groups = [(name,) for name in bands] if separately else [bands]
     fitted = [f for f in fitter.filters or fitter.bands if f in photometry.colnames]
     for group in groups:

@@ -8,6 +8,7 @@ import numpy as np
 
 from miricigale.fitting.classification import class_columns
 from miricigale.fitting.from_files import fit_catalog
+from miricigale.fitting.pulls import without_warnings
 from miricigale.pages import number
 from miricigale.plotting.axes import WIDTH, new_figure
 from miricigale.utils.row_files import write_rows
@@ -16,13 +17,15 @@ from miricigale.utils.row_files import write_rows
 _LISTED = 10
 #: ln ratio beyond which a class is called sure (odds of 150 to 1).
 _SURE = 5.0
+#: Redshifts of little red dots.
+RED_DOT_REDSHIFTS = np.expm1(np.arange(np.log(3.0), np.log(10.0), 0.03))
 #: ln ratios that a drawing spans.
 _SPAN = 60.0
 
 
-def fit_classes(path, output, *, quasars=False, stars=None, **options):
+def fit_classes(path, output, *, quasars=False, red_dots=False, stars=None, **options):
     """
-    Fit a catalog with galaxies and, where asked for, with quasars and stars.
+    Fit a catalog with galaxies and, where asked for, with quasars, little red dots and stars.
 
     Parameters
     ----------
@@ -33,6 +36,8 @@ def fit_classes(path, output, *, quasars=False, stars=None, **options):
     quasars : bool, optional
         Whether type-1 AGN are fitted: `~miricigale.sed.SEDModel.survey` with `~miricigale.sed.quasar_axes`, into
         the folder ``quasar`` of ``output``.
+    red_dots : bool, optional
+        Whether `~miricigale.sed.red_dots` at redshifts of 2 to 9 are fitted, into the folder ``red_dot``.
     stars : path-like, optional
         Spectra of stars (`~miricigale.sed.read_spectra`), into the folder ``star``; those that end before the
         bands do are continued as `~miricigale.sed.template_grid` does with a warning.
@@ -40,7 +45,7 @@ def fit_classes(path, output, *, quasars=False, stars=None, **options):
     Returns
     -------
     found : dict of str to `~miricigale.fitting.FitResultsFiles`
-        ``galaxy``, ``quasar``, ``star``.
+        ``galaxy``, ``quasar``, ``red_dot``, ``star``.
 
     Warns
     -----
@@ -55,22 +60,35 @@ def fit_classes(path, output, *, quasars=False, stars=None, **options):
         spectra = read_spectra(stars)
     with _each_once():
         found = {"galaxy": fit_catalog(path, output, **options)}
+        if options.pop("calibrate", None) is not None:
+            options["calibration"] = Path(output) / "calibration.ecsv"
         # after the fit, which refuses what it cannot read before it loads the models
         from miricigale.sed import SEDModel, quasar_axes, template_grid
+        from miricigale.sed import red_dots as shapes
 
         options.pop("pairs", None)
-        if quasars:
-            made = SEDModel.survey(), quasar_axes()
-            folder = Path(output) / "quasar"
-            found["quasar"] = fit_catalog(path, folder, models=lambda _: made, **options)
-        options.pop("redshift", None)
-        if spectra is not None:
+        # what is of another class has large residuals
+        with without_warnings():
+            if quasars:
+                made = SEDModel.survey(), quasar_axes()
+                folder = Path(output) / "quasar"
+                found["quasar"] = fit_catalog(path, folder, models=lambda _: made, **options)
+            if red_dots:
 
-            def templates(bands):
-                return template_grid(spectra, bands, beyond="rayleigh-jeans"), None
+                def dots(bands):
+                    return template_grid(shapes(), bands, redshift=RED_DOT_REDSHIFTS), None
 
-            folder = Path(output) / "star"
-            found["star"] = fit_catalog(path, folder, models=templates, **options)
+                found["red_dot"] = fit_catalog(
+                    path, Path(output) / "red_dot", models=dots, **options
+                )
+            options.pop("redshift", None)
+            if spectra is not None:
+
+                def templates(bands):
+                    return template_grid(spectra, bands, beyond="rayleigh-jeans"), None
+
+                folder = Path(output) / "star"
+                found["star"] = fit_catalog(path, folder, models=templates, **options)
     return found
 
 

@@ -1,62 +1,33 @@
-"""Grids with what lies between their nodes: the prior there, and models that a finer grid may have."""
+"""
+Grids with what lies between their nodes, and the posteriors of objects there.
+
+A population of models begins as draws from models that fill the prior, by a power of the likelihood. From there it
+is led to the likelihood in steps, at each of which it is weighed, resampled and moved (sequential Monte Carlo: Del
+Moral et al. 2006, JRSS B 68, 411), along differences of members (ter Braak 2006, Stat. Comput. 16, 239; in some
+parameters at a time: Vrugt et al. 2009, Int. J. Nonlin. Sci. Num. Sim. 10, 273).
+"""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.stats import qmc
 
+from miricigale.fitting import _core
 from miricigale.fitting.grid import GridEngine
-from miricigale.fitting.interpolation import Nodes, Place, less_factor
+from miricigale.fitting.interpolation import Nodes
 from miricigale.fitting.posterior import cell_edges
+from miricigale.fitting.samplers.run import systematic_draws
+from miricigale.utils.random import stream
 
-#: Least flux, and least part of a prior.
-_TINY, _LEAST = 1e-290, 1e-9
-#: Part of the steps of AGN light that widens errors: some AGN have little light compared with the galaxy's.
-_OF_AGN = 0.25
-
-
-@dataclass(frozen=True, eq=False)
-class Cells:
-    """Cells around the nodes of an axis, none beyond the outermost: n + 1 edges, and the prior below each."""
-
-    edges: np.ndarray
-    below: np.ndarray
-
-    @classmethod
-    def of_nodes(cls, values, weights):
-        """Around nodes with prior weights."""
-        edges = cell_edges(values)
-        edges[[0, -1]] = values[[0, -1]]
-        return cls(edges, None).with_weights(weights)
-
-    def with_weights(self, weights):
-        """Copy with other prior weights of the nodes."""
-        total = np.concatenate([[0.0], np.cumsum(weights)])
-        return Cells(self.edges, total / total[-1])
-
-    def of(self, value):
-        """Nodes in whose cells values lie."""
-        place = np.searchsorted(self.edges, value, side="right") - 1
-        return np.clip(place, 0, self.edges.size - 2)
-
-    def cumulative(self, node, part):
-        """Cumulative prior part of the way through cells of nodes, inside (0, 1)."""
-        prior = self.below[node] + part * (self.below[node + 1] - self.below[node])
-        return np.clip(prior, _LEAST, 1.0 - _LEAST)
-
-    def value(self, prior):
-        """Values at which the cumulative prior is the one given."""
-        return np.interp(prior, self.below, self.edges)
-
-
-@dataclass(frozen=True, eq=False)
-class Models:
-    """Models between the nodes: values by name, nodes in whose cells they lie, and where among the finer nodes."""
-
-    values: dict
-    node: dict
-    place: Place
-    possible: np.ndarray  # (n,) of bool
+#: Models that fill the prior, as a power of 2: of all redshifts, and of that of an object.
+_LIBRARY, _AT_REDSHIFT = 17, 13
+#: Moves of each member at every step; how often they are kept under the likelihood itself, and moves before that.
+_MOVES, _KEPT, _NEXT = 10, 6, 14
+#: Part of a population that the weights of a step may leave effective.
+_EFFECTIVE = 0.9
+#: Every so many of the kept say how likely a band is wrong.
+_SOME = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,96 +48,177 @@ class Continuation:
     nodes: Nodes
     finer: Nodes
 
-    @property
-    def axes(self):
-        """`~miricigale.fitting.priors.GridAxis` of each parameter with several values or a prior, by name."""
-        return self.engine.priors.axes
-
     @cached_property
     def cells(self):
-        """`Cells` of each axis with several values, by name."""
-        axes = self.axes.items()
-        return {n: Cells.of_nodes(a.values, a.weights) for n, a in axes if a.values.size > 1}
+        """Edges of the cells around nodes of redshift, AGN fraction, axes of galaxies and of AGN: dict by name."""
+        kinds, out = self.nodes.kinds, {}
+        for name in ("redshift", "frac_agn", *kinds["galaxy"].names, *kinds["agn"].names):
+            axis = self.engine.priors.axes.get(name)
+            values = self.engine.grid.frac_agn if axis is None else axis.values
+            out[name] = cell_edges(values)
+            # none beyond the outermost
+            out[name][[0, -1]] = values[[0, -1]]
+        return out
 
     @cached_property
-    def errors(self):
-        """Rms by band, (nb,), of ln flux, but for a factor, from nodes to edges of cells."""
-        flux = self.engine.galaxy[:, self._few]
-        steps = (np.square(step) for step in self._steps(flux) if len(step))
-        return np.sqrt(sum((np.median(one, axis=0) for one in steps), np.zeros(flux.shape[2])))
-
-    @property
-    def _few(self):
-        """Some hundred galaxies."""
-        return slice(None, None, max(self.engine.grid.n_galaxies // 100, 1))
+    def space(self):
+        """`_core.Space` of the cells."""
+        finer, size = self.finer, np.array([len(e) - 1 for e in self.cells.values()], np.int64)
+        edge, log_prior = np.zeros((len(size), max(size) + 1)), np.zeros((len(size), max(size)))
+        for i, (name, edges) in enumerate(self.cells.items()):
+            edge[i, : len(edges)] = edges
+            axis = self.engine.priors.axes.get(name)
+            if axis is not None and axis.kind in ("frac_agn", "agn"):
+                none = np.full(size[i], _core.NEVER)
+                log_prior[i, : size[i]] = np.log(axis.weights, where=axis.weights > 0, out=none)
+        lit, galaxy = finer.kinds["galaxy"].lit[-1], self.nodes.kinds["galaxy"].model.ravel()
+        of_finer = finer.log_z, np.array(finer.allowed), *finer.kernels.values(), int(lit)
+        return _core.Space(size, edge, log_prior, galaxy, *of_finer)
 
     @cached_property
-    def _same(self):
-        """Which of the finer models are those of the grid, by kind."""
-        return {kind: self.finer.those_of(self.nodes, kind) for kind in self.finer.kinds}
+    def library(self):
+        """Models that fill the prior: places, (n, n_axes), their fluxes, cells and ln(prior)."""
+        return self._filled(qmc.Sobol(len(self.cells), seed=1).random_base2(_LIBRARY), 0.0)
 
-    def _steps(self, some):
-        """Half the changes of ln flux, but for a factor, between nodes: (m, nb) along each axis."""
-        engine, z = self.engine, len(some) // 2
-        if len(some) > 1:
-            low, high = np.log(np.maximum(some[z - 1 : z + 1], _TINY))
-            yield 0.5 * less_factor(high - low)
-        for name in self.cells:
-            kind = self.axes[name].kind
-            if kind in self.nodes.kinds:
-                part = 1.0 if kind == "galaxy" else np.sqrt(_OF_AGN)
-                yield part * self.nodes.kinds[kind].steps(name)
-        if "frac_agn" in self.cells:
-            frac = engine.grid.frac_agn
-            dust = engine.grid.dust_luminosity[self._few, None]
-            power = dust * frac / np.maximum(1.0 - frac, 1e-12)
-            agn = np.median(engine.agn[z], axis=0)
-            ln = np.log(some[z][:, None] + power[..., None] * agn + _TINY)
-            steps = 0.5 * less_factor(np.diff(ln, axis=1))
-            # where the AGN outshines the galaxy few steps do
-            yield np.sqrt(np.mean(np.square(steps), axis=(0, 1)))[None]
+    def _filled(self, x, redshift):
+        n, n_bands = len(x), self.engine.galaxy.shape[2]
+        made = np.empty((n, n_bands), np.float32), np.empty((n, 2), np.int64), np.empty(n)
+        _core.fill_library(self.space, x, redshift, self._work(), *made)
+        return x, *made
 
-    def models(self, values):
-        """`Models` of values by name, shape (n,), some of which may be missing: these have the only node."""
-        n, axes = len(next(iter(values.values()))), self.axes
-        node = {name: np.zeros(n, np.int64) for name in axes}
-        node |= {name: self.cells[name].of(value) for name, value in values.items()}
-        z = axes["redshift"].values
-        place = self.finer.place(values, values.get("redshift", np.full(n, z[0])))
-        galaxy = self.nodes.kinds["galaxy"].models(node)
-        usable = (galaxy >= 0) & self.engine.usable[node["redshift"], galaxy]
-        return Models(values, node, place, usable & self.finer.possible(place))
+    def _work(self):
+        return _core.make_work(len(self.cells), self.finer.kinds["galaxy"].flux.shape[2])
+
+    @cached_property
+    def _values(self):
+        """Values of the models of the grid by kind: dicts by name; of those with several values the first."""
+        out = {}
+        for kind, own in self.nodes.kinds.items():
+            models, first = np.unique(own.model, return_index=True)
+            place = np.unravel_index(first[models >= 0], own.model.shape) if own.names else ()
+            known = zip(own.names, place, strict=True)
+            out[kind] = {name: self.nodes.axes[name].values[i] for name, i in known}
+        return out
 
     def at_redshift(self, redshift, node):
         """`GridEngine` of all models of the grid at one redshift; what else depends on it is that of a node."""
-        engine, between = self.engine, self.finer.between(redshift)
-        new = {"usable": engine.usable[node : node + 1]}
-        for kind, own in self.finer.kinds.items():
-            new[kind] = own.at_redshift(redshift, between, self._same[kind])
-        if engine.template_error is not None:
-            new["template_error"] = engine.template_error[node : node + 1]
+        engine, new = self.engine, {"usable": self.engine.usable[node : node + 1]}
+        for kind, values in self._values.items():
+            z = np.full(getattr(engine, kind).shape[1], redshift)
+            new[kind] = self.finer.one_kind(kind, values, z)[0][None] if z.size else engine.agn[:1]
+        error, density, prior = engine.template_error, engine.density, engine.mass_prior
+        new["template_error"] = None if error is None else error[node : node + 1]
+        if density is not None:
+            new["density"] = replace(density, table=density.table[node : node + 1])
+        new["mass_prior"] = prior and (lambda formed, _: prior(formed, [node]))
         return replace(engine, **new)
 
-    def fluxes(self, models):
-        """Fluxes of one solar mass formed, shape (n, nb), and the AGN's power."""
-        at_node = self.engine.grid.frac_agn[models.node.get("frac_agn", 0)]
-        frac = np.broadcast_to(models.values.get("frac_agn", at_node), models.possible.shape)
-        return self.finer.fluxes(models.place, frac)
+    def draw(self, n_draws, ids, redshifts, found, i, target, limits, log_usable, wrong):
+        """
+        Draw models between the nodes from the posterior of an object.
 
-    def at_nodes(self, models, engine):
-        """Fluxes at the nodes in whose cells models lie, by an engine of all redshifts or of one."""
-        node, kinds = models.node, self.nodes.kinds
-        galaxy = np.maximum(kinds["galaxy"].models(node), 0)
-        z = node["redshift"] if len(engine.galaxy) > 1 else 0 * galaxy
-        flux = engine.galaxy[z, galaxy]
-        if engine.agn.shape[1]:
-            frac = engine.grid.frac_agn[node["frac_agn"]]
-            power = engine.grid.dust_luminosity[galaxy] * frac / np.maximum(1.0 - frac, 1e-12)
-            flux = flux + power[:, None] * engine.agn[z, kinds["agn"].models(node)]
-        return flux
+        Parameters
+        ----------
+        n_draws : int
+            Members of the population.
+        ids, redshifts : `~numpy.ndarray`, shape (n,)
+            Ids of objects, on which alone draws depend, and their redshifts; 0 if these are free.
+        found : dict
+            Gets, at ``i``, values of parameters, nodes in whose cells these are, and derived quantities (dicts of
+            str to arrays), and how likely each band is wrong (None for all if no model is possible), and the part
+            of moves of members that were taken.
+        i, target, limits, log_usable, wrong
+            What `GridEngine.fit` says of the object.
+        """
+        redshift, rng = float(redshifts[i]), stream(0, "between", str(ids[i]))
+        one = _core.Object(target, limits, wrong and self._mixture(*wrong), log_usable, redshift)
+        free = np.flatnonzero(self.space.size > 1)
+        free = free[free > 0] if redshift else free
+        state = rng.integers(2**63, size=1, dtype=np.uint64)
+        places, *models = self.library
+        if redshift:
+            places, *models = self._filled(places[: 2**_AT_REDSHIFT], redshift)
+        known, work = np.empty((2, len(places))), self._work()
+        _core.rate(one._replace(limits=None, mixture=None), *models, known)
+        some, power = _next_step(known[1], known[0], 0.0, n_draws, n_draws, rng)
+        x, now, kept = places[some], np.empty((n_draws, 5)), []
+        by = power * known[1, some]
 
-    def describe(self, models, power, scale):
-        """Values of parameters and derived quantities of models of given scales: dicts by name."""
-        axes, node = self.axes, models.node
-        values = {name: models.values.get(name, a.values[node[name]]) for name, a in axes.items()}
-        return values, self.finer.describe(models.place, power, scale)
+        def move(power, rounds):
+            return _core.move(self.space, one, free, state, power, rounds, x, now, work)
+
+        move(1.0, 0)
+        while True:
+            by = np.where(now[:, 0] > 0.5 * _core.NEVER, -by, _core.NEVER)
+            if np.all(by == _core.NEVER):
+                found[i] = None, 0.0
+                return
+            some, power = _next_step(now[:, 1], by, power, _EFFECTIVE * n_draws, n_draws, rng)
+            x, now = x[some], now[some]
+            if power == 1.0:
+                break
+            move(power, _MOVES)
+            by = power * now[:, 1]
+        taken = 0.0
+        for _ in range(_KEPT):
+            taken += move(1.0, _NEXT) / (_KEPT * _NEXT * n_draws)
+            kept.append(np.hstack([x, now[:, 2:]]))
+        found[i] = self._describe(np.concatenate(kept).T, one, wrong, rng), taken
+
+    def _mixture(self, stated, sigma, broad):
+        """`_core.Mixture` of an object."""
+        used, part = stated.bands, self.engine.mixture.part[stated.bands]
+        narrow, wide = stated.weight[:, used], broad[used]
+        odds = part / (1.0 - part) / np.sqrt(narrow) / wide
+        # of fluxes in units of the errors without that of templates
+        level = 0.5 * np.log(narrow * np.square(sigma[used])).sum(axis=1)
+        return _core.Mixture(narrow, wide**-2.0, odds, level, np.zeros(len(broad)))
+
+    def _describe(self, kept, one, wrong, rng):
+        *places, scale, variance, power = kept
+        values, node, share, rare = {}, {}, None, slice(None, None, _SOME)
+        for (name, edges), x in zip(self.cells.items(), places, strict=True):
+            y = x * (len(edges) - 1)
+            node[name] = np.minimum(y.astype(np.int64), len(edges) - 2)
+            values[name] = edges[node[name]] + (y - node[name]) * np.diff(edges)[node[name]]
+        if one.redshift:
+            values["redshift"] = np.full(len(scale), one.redshift)
+        scale = self.engine.drawn_scale(scale, variance, rng)
+        if wrong:
+            some = {name: value[rare] for name, value in values.items()}
+            flux = self.finer.fluxes(some, some["redshift"], some["frac_agn"])[0]
+            z, flux = 0 if one.redshift else node["redshift"][rare], flux * scale[rare, None]
+            share = self.engine.mixture.shares(flux, wrong[0], wrong[2], one.limits, z)
+        derived = self.finer.describe(values, values["redshift"], power, scale)
+        return values, node, derived, share
+
+    def __getstate__(self):
+        # what is made of these is made again after unpickling
+        return {name: self.__dict__[name] for name in self.__dataclass_fields__}
+
+
+def _next_step(like, log, power, wanted, n, rng):
+    """
+    Draw n of some models by a weight of exp(log + power * like), the power being the largest that leaves enough.
+
+    That is an effective number ``wanted``; the power grows in any case, to 1 at most. Returned are the models,
+    shape (n,), and the power.
+    """
+    # some of many say how wide the likelihood is
+    few = slice(None, None, max(len(like) // 8192, 1))
+    part = wanted * len(like[few]) / len(like)
+
+    def weight(to, some=slice(None)):
+        value = log[some] + to * like[some]
+        return np.exp(np.maximum(value - value.max(), -700.0))
+
+    def enough(to):
+        w = weight(to, few)
+        return np.sum(w) ** 2 >= part * np.sum(w * w)
+
+    low, high = max(power, 1e-4), 1.0
+    for _ in range(0 if enough(1.0) else 10):
+        middle = np.sqrt(low * high)
+        low, high = (middle, high) if enough(middle) else (low, middle)
+    power = 1.0 if enough(1.0) else min(1.02 * low, 1.0)
+    return systematic_draws(weight(power), n, rng), power

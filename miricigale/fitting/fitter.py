@@ -1,6 +1,7 @@
 """BayesFitter: posteriors of galaxy and AGN parameters from broad-band photometry."""
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from miricigale.fitting.likelihood import (
     unused_bands,
 )
 from miricigale.fitting.priors import known_redshifts
+from miricigale.fitting.pulls import warn_of_pulls
 from miricigale.fitting.results import FitResults
 from miricigale.fitting.samplers import get_sampler
 from miricigale.fitting.samplers.fit import SamplerFit
@@ -80,8 +82,8 @@ class BayesFitter(Interactive):
         Parameter name to values, for a grid of a model (see `~miricigale.sed.SEDModel.grid`); or a name for
         `~miricigale.sed.yang2021_axes`, such as ``"quick"``.
     model_error, error_floor : float or dict of str to float, optional
-        Part of the flux that is added to its error in quadrature, and least relative error of a flux,
-        for all or by filter.
+        Part of the flux that is added to its error in quadrature, 0.1 by default, and least relative error of a
+        flux, for all or by filter.
     template_error : `~miricigale.fitting.TemplateError`, optional
         Of a grid: error of the models by rest wavelength, added in quadrature too; what it does to the
         normalization of the likelihood counts. ``sigma`` of the results has that of the best model.
@@ -89,7 +91,11 @@ class BayesFitter(Interactive):
         Of a grid: prior fraction of wrong fluxes and limits, for all bands or by filter, at least 0 and below 1.
         Each is then a mixture of the stated error and a broad one (`miricigale.fitting.mixture`);
         ``outlier`` of the results, ``<band>_outlier`` in tables, is how likely a band is wrong. Not with
-        ``compat`` or ``interpolate``. ``rtol`` is then at least 1e-3, unless it is 0.
+        ``compat``. ``rtol`` is then at least 1e-3, unless it is 0.
+    calibration : `~miricigale.fitting.SurveyCalibration`, optional
+        Of a grid: zero points and errors of the bands, by which fluxes and errors are multiplied (so are those in
+        the results), and in place of what is not given here, priors, ``template_error``, ``model_error``,
+        ``outliers`` and ``mass_function`` of the settings.
     scale_error : bool, optional
         Whether the uncertainty of each model's own scale is part of the posterior of masses,
         luminosities and fluxes: so by default, but CIGALE leaves it out.
@@ -97,7 +103,7 @@ class BayesFitter(Interactive):
         Objects with fewer usable bands, upper limits among them, are flagged and not fitted. One
         band at least must be no limit.
     compat : {"cigale"}, optional
-        Reproduce choices of CIGALE that are not ours: no ``scale_error``, no result where the best
+        Reproduce choices of CIGALE that are not ours: no ``scale_error``, nodes alone, no result where the best
         chi2 is above 1417 (its weights, from which the best chi2 is not subtracted, all vanish;
         flagged ``NO_LIKELIHOOD``), and no standard deviation below 5 % of the mean.
     settings : `GridSettings` or `SamplerSettings`, optional
@@ -139,7 +145,7 @@ class BayesFitter(Interactive):
     >>> errors = ErrorModel.from_depths(dict.fromkeys(bands, 29.0))
     >>> photometry = errors.perturb(model.fluxes(truth, bands), seed=1)
     >>> axes = {"redshift": [0.4, 0.5, 0.9, 1.0, 1.1], "age": [1.0, 3.0], "ebv": [0.1, 0.3]}
-    >>> fitter = BayesFitter(model, bands, axes=axes)
+    >>> fitter = BayesFitter(model, bands, axes=axes, model_error=0.02)
     >>> fitter.fit(photometry).mean("redshift").round(1)
     <Quantity [0.5, 1. ]>
 
@@ -158,15 +164,17 @@ class BayesFitter(Interactive):
         priors=None,
         engine="grid",
         axes=None,
-        model_error=0.1,
+        model_error=None,
         error_floor=0.0,
         template_error=None,
         outliers=None,
+        calibration=None,
         scale_error=None,
         n_bands_min=2,
         compat=None,
         settings=None,
     ):
+        self._given = {name: value for name, value in locals().items() if name != "self"}
         on_grid = engine == "grid"
         kind = GridSettings if on_grid else SamplerSettings
         settings = settings or kind()
@@ -174,7 +182,8 @@ class BayesFitter(Interactive):
             wanted = f"{kind.__name__} with engine={engine!r}"
             raise argument_error("settings", wanted, type(settings).__name__)
         axes = yang2021_axes(axes) if isinstance(axes, str) else axes
-        of_grid = {"axes": axes, "template_error": template_error, "compat": compat}
+        of_grid = {"axes": axes, "compat": compat, "calibration": calibration}
+        of_grid["template_error"] = template_error
         of_grid["outliers"] = outliers
         if not on_grid:
             for name, value in of_grid.items():
@@ -189,6 +198,12 @@ class BayesFitter(Interactive):
         if scale_error not in (None, True, False) or (compat and scale_error):
             wanted = "False with compat='cigale'" if compat else "True, False or None"
             raise argument_error("scale_error", wanted, repr(scale_error))
+        self.calibration = calibration
+        if calibration is not None:
+            if template_error is None:
+                of_grid["template_error"] = calibration.template_error
+            if settings.mass_function is None:
+                settings = replace(settings, mass_function=calibration.mass_function)
         self.engine, self.filters = engine, names
         self.model = None if isinstance(model, ModelGrid) else model
         scale_error = compat is None if scale_error is None else bool(scale_error)
@@ -202,13 +217,33 @@ class BayesFitter(Interactive):
             self.filters = names
         of_bands = self.bands if on_grid else names
         self.n_bands_min = check_count(n_bands_min, "n_bands_min")
+        self.zero_points, factors = {}, {}
+        if calibration is not None:
+            self.zero_points = calibration.of_bands("zero_point", of_bands, 1.0)
+            factors["error_factor"] = calibration.of_bands("error_factor", of_bands, 1.0)
+            if model_error is None:
+                model_error = calibration.of_bands("error_part", of_bands, 0.0)
         self._reader = PhotometryReader(
             self.bands,
             names,
-            per_band(model_error, of_bands, "model_error"),
+            per_band(0.1 if model_error is None else model_error, of_bands, "model_error"),
             per_band(error_floor, of_bands, "error_floor"),
             self.n_bands_min,
+            self.zero_points,
+            **factors,
         )
+
+    def changed(self, **options):
+        """Fitter of the same models with other options, named as for `BayesFitter`."""
+        given = self._given | options
+        if self.grid is not None:
+            given |= {"model": self.grid, "axes": None}
+        new = type(self)(**given)
+        known = getattr(self.backend, "between", None)
+        if known and new.backend.between:
+            # the finer grid is that of the same models
+            new.backend = replace(new.backend, between=replace(known, engine=new.backend.engine))
+        return new
 
     def _facts(self):
         return {
@@ -287,7 +322,9 @@ class BayesFitter(Interactive):
             If ``filters`` was not given and the photometry has bands (names of filters, or columns
             in a unit of flux density that have an error) that the grid lacks. Bands that
             are not fitted are also in ``meta["fit"]["unused_bands"]`` of the results. And of numbers that
-            look like codes for a missing value, such as -99 or 99 with an error of 99, by band and count.
+            look like codes for a missing value, such as -99 or 99 with an error of 99, by band and count. And of
+            bands whose fluxes of S/N above 5, 30 at least, scatter about what the other bands predict by more than
+            1.5 times their errors (`miricigale.fitting.pulls`).
 
         Raises
         ------
@@ -304,11 +341,13 @@ class BayesFitter(Interactive):
         known = {"redshift": redshift, "redshift_prior": redshift_prior}
         parallel = {"executor": executor, "progress_bar": progress_bar}
         options = {"pairs": pairs, "seed": seed, "chunk_size": chunk_size, "parallel": parallel}
-        return self.fit_part(self._table(photometry), **known, **options)
+        results = self.fit_part(self.table_of(photometry), **known, **options)
+        warn_of_pulls(results)
+        return results
 
     __call__ = fit
 
-    def _table(self, photometry):
+    def table_of(self, photometry):
         """
         The catalog by our names, with what there is to warn of.
 
@@ -354,6 +393,18 @@ class BayesFitter(Interactive):
             model=self.model,
             meta=provenance(fit=settings, **self.backend.provenance()),
         )
+
+    def _calibrated(self):
+        """Settings that a calibration has beside those of the fitter."""
+        if self.calibration is None:
+            return {}
+        factors = {"zero_point": self.zero_points, "error_factor": self._reader.error_factor}
+        return {"calibration": self.calibration.name, **factors}
+
+    def read_bands(self, photometry, bands):
+        """Photometry (`~miricigale.fitting.likelihood.FitData`) of bands, with zero points and its own errors."""
+        zero = dict.fromkeys(bands, 0.0)
+        return PhotometryReader(bands, bands, zero, zero, 1, self.zero_points).read(photometry)
 
     def warn_of_bands(self, photometry):
         """Warn of bands that are not fitted, if the fitter does not name those that are."""
@@ -419,7 +470,7 @@ class BayesFitter(Interactive):
             msg = "draws of a sampler are in its results: fitter.fit(photometry).samples(id)"
             raise ValueError(msg)
         n_draws, seed = check_count(n_draws, "n_draws"), check_seed(seed)
-        data, known, settings = self._prepare(self._table(photometry), redshift, redshift_prior)
+        data, known, settings = self._prepare(self.table_of(photometry), redshift, redshift_prior)
         parallel = {"executor": executor, "progress_bar": progress_bar}
         samples = self.backend.sample(data, known, n_draws, seed, **parallel)
         cited = self.backend.provenance()["citations"]
@@ -434,5 +485,6 @@ class BayesFitter(Interactive):
             "model_error": dict(self._reader.model_error),
             "error_floor": dict(self._reader.error_floor),
             "n_bands_min": self.n_bands_min,
+            **self._calibrated(),
             **self.backend.settings(),
         }

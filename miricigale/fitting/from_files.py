@@ -4,6 +4,9 @@ import dataclasses
 import logging
 from pathlib import Path
 
+import numpy as np
+from astropy.table import vstack
+
 from miricigale.filters.catalog_files import MappedRows, as_catalog_map
 from miricigale.filters.photometry_table import band_columns
 from miricigale.fitting.likelihood import is_filter, unused_bands
@@ -26,6 +29,13 @@ def open_catalog(path, chunk_rows, *, hdu=None, catalog_map=None, flux_unit=None
     return rows
 
 
+def give_units(table, fluxes, unit):
+    """Give flux columns that have no unit one; None gives none."""
+    for name in fluxes.intersection(table.colnames) if unit is not None else ():
+        if table[name].unit is None:
+            table[name].unit = unit
+
+
 def fit_catalog(
     path,
     output,
@@ -34,8 +44,11 @@ def fit_catalog(
     models=None,
     model_error=None,
     outliers=None,
+    calibration=None,
+    calibrate=None,
     catalog_map=None,
     ebv=0.0,
+    interpolate=200,
     hdu=None,
     chunk_rows=10000,
     **options,
@@ -57,15 +70,22 @@ def fit_catalog(
         those of ``axes``, or a `~miricigale.sed.ModelGrid` and None; ``axes`` says whose errors are taken then.
     model_error : float, optional
         Relative model error: 0.1 by default; with ``axes="survey"`` it takes the place of
-        `miricigale.fitting.TemplateError.survey`, which is then the default.
+        `miricigale.fitting.SurveyCalibration.survey`, which is then the default.
     outliers : float or dict of str to float, optional
         Prior fraction of wrong fluxes; see `miricigale.fitting.BayesFitter`.
+    calibration : `~miricigale.fitting.SurveyCalibration` or path-like, optional
+        Zero points, errors and priors, or the file of them. With ``models`` its priors are left out.
+    calibrate : str, optional
+        Column of known redshifts, with which all of that is measured first: see `miricigale.fitting.calibrate`.
+        It is written to ``calibration.ecsv`` in ``output``, from where a resumed fit takes it.
     catalog_map : `~miricigale.filters.CatalogMap`, str or path-like, optional
         Names and units of the catalog; the name of a survey, or a file: TOML, or a translate file of EAZY.
     ebv : float, optional
         Color excess E(B-V) of the Milky Way, in mag, behind which all models but given grids are put
         (`~miricigale.sed.components.GalacticExtinction`, law of Gordon et al. 2023, none beyond 32 um). For one
         that differs from source to source see `~miricigale.sed.foreground.deredden`.
+    interpolate : int, optional
+        Models between the nodes for each object, as in `miricigale.fitting.GridSettings`; 0: nodes alone.
     hdu, chunk_rows, **options
         As for `miricigale.fitting.fit_file`, such as ``redshift``, a column of known redshifts, and
         ``resume``.
@@ -100,7 +120,7 @@ def fit_catalog(
         wanted = "columns <filter> and <filter>_err ('miricigale filters' lists the names)"
         raise argument_error("photometry", f"a table with {wanted}", f"columns {list(names)}")
     # heavy imports only after the file was checked
-    from miricigale.fitting import BayesFitter, TemplateError, fit_file
+    from miricigale.fitting import BayesFitter, GridSettings, SurveyCalibration, fit_file
     from miricigale.sed import SEDModel
     from miricigale.sed.components import GalacticExtinction
 
@@ -109,27 +129,54 @@ def fit_catalog(
         why = "as their names ('miricigale filters') or errors are missing"
         msg = f"bands of the photometry are not fitted, {why}: {', '.join(unused)}"
         warn(msg, FitWarning)
-    error, least = None, 0.1
-    if axes == "survey":
-        model, nodes = SEDModel.survey(), SEDModel.survey_axes()
-        if model_error is None:
-            error, least = TemplateError.survey(), 0.0
-    elif axes == "far-infrared":
+    if axes in ("survey", "far-infrared"):
         model, nodes = SEDModel.survey(), SEDModel.survey_axes(axes)
     else:
         model, nodes = SEDModel.yang2021(), SEDModel.yang2021_axes(axes)
+    if calibration is None and axes == "survey" and model_error is None:
+        calibration = SurveyCalibration.survey()
+    elif calibration is not None and not isinstance(calibration, SurveyCalibration):
+        calibration = SurveyCalibration.read(calibration)
     if models is not None:
         model, nodes = models(bands)
-    elif error is not None:
-        part = 100 * error.error.min(), 100 * error.error.max()
-        text = "errors of the models: %.0f to %.0f %% of the flux by rest wavelength, measured on sources"
-        log.warning(f"{text} of CEERS (TemplateError.survey)", *part)
+        calibration = calibration and calibration.without_priors()
     if ebv and isinstance(model, SEDModel):
         dust = GalacticExtinction(ebv_galactic=ebv, beyond="transparent")
         model = SEDModel([*model.components, dust])
-    part = least if model_error is None else model_error
-    fitter = BayesFitter(
-        model, bands, axes=nodes, template_error=error, model_error=part, outliers=outliers
-    )
+    given = {"model_error": model_error, "outliers": outliers, "calibration": calibration}
+    given["settings"] = GridSettings(interpolate=interpolate)
+    fitter = BayesFitter(model, bands, axes=nodes, **given)
+    if calibrate is not None:
+        given = {name: options.get(name) for name in ("flux_unit", "executor")}
+        fitter = _calibrated(
+            fitter, rows, calibrate, Path(output), options.get("resume", True), **given
+        )
+    if models is None and fitter.calibration is not None:
+        error = 100 * fitter.calibration.template_error.error
+        text = "calibration of %s: errors of the models %.0f to %.0f %% of the flux, priors of %s"
+        named = ", ".join(fitter.calibration.priors) or "nothing"
+        log.warning(text, fitter.calibration.name, error.min(), error.max(), named)
     options |= {"catalog_map": catalog_map, "hdu": hdu, "chunk_rows": chunk_rows}
     return fit_file(fitter, path, output, **options)
+
+
+def _calibrated(fitter, rows, column, output, resume, *, flux_unit, executor):
+    """Fitter with the calibration by known redshifts of a catalog, measured unless it is there."""
+    from miricigale.fitting.priors import known_redshifts
+    from miricigale.fitting.pulls import without_warnings
+    from miricigale.fitting.survey import SurveyCalibration, calibrate, with_calibration
+
+    path, name = output / "calibration.ecsv", f"{rows.path.name} by {column} ({rows.sha256[:8]})"
+    found = SurveyCalibration.read(path) if resume and path.exists() else None
+    if found is None or found.name != name:
+        known = []
+        for table in map(rows.chunk, range(rows.n_chunks)):
+            give_units(table, {c for b in fitter.bands for c in (b, error_column(b))}, flux_unit)
+            known.append(table[np.isfinite(known_redshifts(table, column))])
+        table = vstack(known, metadata_conflicts="silent")
+        with without_warnings():
+            # the fit of the catalog warns of it
+            found = calibrate(fitter, table, redshift=column, name=name, executor=executor)
+        output.mkdir(parents=True, exist_ok=True)
+        found.write(path, overwrite=True)
+    return with_calibration(fitter, found)

@@ -26,6 +26,8 @@ _THIN = 1e-4
 _LOOSE = 1e-3
 #: Least ``rtol`` with which pairs of little weight are evaluated in single precision.
 _SINGLE = 5e-7
+#: Least variance of a scale.
+_TINY = 1e-290
 
 
 #: What a fit of n objects returns, by the axes of each array after that of the objects: z redshifts, g
@@ -84,6 +86,8 @@ class GridEngine:
     mass_prior : callable, optional
         Of solar masses formed, shape (n, nG), and the n redshifts they are at, as indices: ln of a factor of
         the priors of galaxies. Taken at the mass that each galaxy has without AGN, for each object.
+    density : `~miricigale.fitting.priors.MassPrior`, optional
+        Prior of mass and redshift, at the same masses.
     rtol : float
         Relative error that pruning may cause. The weight of what is left out is bounded to a
         tenth of it, and what it could add to the variance of any derived quantity to
@@ -105,6 +109,7 @@ class GridEngine:
     usable: np.ndarray
     template_error: np.ndarray | None = None
     mass_prior: object = None
+    density: object = None
     rtol: float = 1e-6
     scale_error: bool = True
     mixture: BandMixture | None = None
@@ -177,6 +182,7 @@ class GridEngine:
             galaxy32=galaxy32,
             agn32=(self.agn / agn_unit).astype(np.float32, order="C"),
             galaxy_unit=np.array(unit[:, :, 0], order="C"),
+            agn_unit=np.array(agn_unit[:, :, 0], order="C"),
             log_usable=log_usable,
             of_galaxy=of_galaxy,
             of_agn=of_agn,
@@ -226,6 +232,7 @@ class GridEngine:
         seeds=None,
         joint=(),
         workspace=None,
+        each=None,
     ):
         """
         Fit objects.
@@ -249,6 +256,10 @@ class GridEngine:
         workspace : tuple, optional
             What `workspace` returned for this ``n_draws`` and ``joint``, for use by one thread at
             a time; made if not given.
+        each : callable, optional
+            Called with the row of each object that was fitted, its data, its limits (or None), 2 ln(prior) of the
+            galaxies, shape (nz, nG), and, if bands may be wrong (else None), its data with stated errors, these
+            errors and the broad ones, shape (nb,).
 
         Returns
         -------
@@ -286,7 +297,8 @@ class GridEngine:
                 target, wrong = self._tangents.touch(
                     stated, log_prior[i], sigma[i], broad[i], *more
                 )
-            given = self._tables_of(target), self._scales, self._request, target, limits
+            tables, target = self._of_masses(target, workspace[2])
+            given = tables, self._scales, self._request, target, limits
             sums.draws.state[0] = seeds[i]
             _core.clear(sums)
             if target.norm[0] > 0.0 and _core.sum_up(*given, *workspace, single=single):
@@ -294,13 +306,28 @@ class GridEngine:
                 if broad is not None:
                     used = np.isfinite(sigma[i]) | (inverse[i] > 0)
                     out.outlier[i] = np.where(used, out.zf[i].sum(axis=1) @ wrong, np.nan)
+                if each is not None:
+                    wrong = None if broad is None else (stated, sigma[i], broad[i])
+                    each(i, target, limits, tables.log_usable, wrong)
         return out
 
-    def _tables_of(self, target):
-        """Tables with the priors that galaxies have at the masses they would have in an object."""
+    def _of_masses(self, target, space):
+        """Tables and data with the priors of galaxies, and of redshifts, at the masses that an object has."""
         tables = self._tables
+        if self.density is not None:
+            change, out = np.empty(target.log_prior.size), np.empty(tables.log_usable.shape)
+            table, stars = self.density.table, np.zeros(out.shape[1])
+            stars[: self.size["g"]] = self.density.log_stars
+            per_dex = self.density.per_dex
+            _core.weigh_masses(tables, target, space.pq, stars, table, per_dex, out, change)
+            tables = tables._replace(log_usable=out)
+            # the evidence is that of a prior of redshift with the sum that it had
+            prior = 0.5 * (target.log_prior - target.level)
+            change += logsumexp(prior) - logsumexp(prior + change)
+            log_prior = np.where(target.log_prior > -1e200, target.log_prior + 2 * change, -1e300)
+            target = target._replace(log_prior=log_prior)
         if self.mass_prior is None:
-            return tables
+            return tables, target
         log, n_galaxy = tables.log_usable.copy(), self.size["g"]
         rows = np.flatnonzero(target.log_prior > -1e200)
         galaxy, weight = self.galaxy[rows], target.weight[rows]
@@ -313,7 +340,7 @@ class GridEngine:
             # how much of the prior a redshift has is not for this factor to say
             found += (logsumexp(plain, axis=1) - logsumexp(found, axis=1))[:, None]
         log[rows, :n_galaxy] = np.where(found > -1e200, 2.0 * found, -1e300)
-        return tables._replace(log_usable=log)
+        return tables._replace(log_usable=log), target
 
     def _summarize(self, stated, target, limits, sums, out, i):
         """Fill row i of the output."""
@@ -379,12 +406,16 @@ class GridEngine:
             rng = np.random.default_rng(int(seeds[i]))
             drawn = rng.choice(prior.size, size=n_draws, p=prior)
             index[i, :, 2] = np.where(index[i, :, 2] < 0, drawn, index[i, :, 2])
-            if self.scale_error:
-                error = np.sqrt(out.draw_scale[i, :, 1])
-                low = ndtr(-scale[i] / error)
-                uniform = 1.0 - rng.random(n_draws)
-                scale[i] += error * ndtri(low + (1.0 - low) * uniform)
+            scale[i] = self.drawn_scale(scale[i], out.draw_scale[i, :, 1], rng)
         return index, scale
+
+    def drawn_scale(self, scale, variance, rng):
+        """Scales drawn from the Gaussians about best ones, as far as they are positive; or these themselves."""
+        if not self.scale_error:
+            return scale
+        error = np.sqrt(np.maximum(variance, _TINY))
+        low = ndtr(-scale / error)
+        return scale + error * ndtri(low + (1.0 - low) * (1.0 - rng.random(len(scale))))
 
     @cached_property
     def _request(self):

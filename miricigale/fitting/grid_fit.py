@@ -11,10 +11,11 @@ from miricigale.fitting.calibration import TemplateError, grid_errors
 from miricigale.fitting.continuation import Continuation
 from miricigale.fitting.grid import GridEngine
 from miricigale.fitting.interpolation import Nodes, finer_grid
-from miricigale.fitting.likelihood import FitFlags
+from miricigale.fitting.likelihood import FitFlags, filter_names
 from miricigale.fitting.mixture import BandMixture
 from miricigale.fitting.posterior import check_pairs, joint_names, joint_tables
 from miricigale.fitting.priors import (
+    MassPrior,
     density_log_prior,
     expected_sfr,
     fixed_log_prior,
@@ -73,10 +74,12 @@ class GridFit:
         compat,
         template_error,
         outliers,
+        calibration,
     ):
         """Make a grid if it is none, work out its priors and derived quantities, set the engine up."""
         check_choice(compat, "compat", (None, "cigale"))
-        finer, interpolate = settings.finer, settings.interpolate
+        finer = settings.finer
+        interpolate = 0 if compat == "cigale" else settings.interpolate
         grid = model
         if isinstance(model, SEDModel):
             if axes is None or filters is None:
@@ -92,10 +95,15 @@ class GridFit:
             raise argument_error("axes", "None when 'model' is a ModelGrid", "a value")
         elif not isinstance(model, ModelGrid):
             raise argument_error("model", "a ModelGrid or an SEDModel", type(model).__name__)
-        if outliers is not None and (compat or interpolate):
-            raise argument_error("outliers", "None with 'compat' or 'interpolate'", f"{outliers}")
+        if outliers is not None and compat:
+            raise argument_error("outliers", "None with 'compat'", f"{outliers}")
+        if calibration is not None:
+            known = {name: axis.values for name, axis in grid_priors(grid).axes.items()}
+            priors = calibration.grid_priors(known) | (priors or {})
         priors = grid_priors(grid, priors, prior_f=settings.prior_f)
         bands = grid.filters if model is grid else filters
+        if calibration is not None and outliers is None and not compat:
+            outliers = calibration.of_bands("outlier", filter_names("filters", bands), 0.0)
         engine = GridEngine(
             grid=grid,
             priors=priors,
@@ -105,13 +113,15 @@ class GridFit:
             usable=grid.allowed & (priors.galaxy > 0),
             template_error=grid_errors(template_error, bands, grid.redshift),
             mass_prior=sfr_log_prior(settings.sfr_prior, grid),
+            density=MassPrior.of_grid(settings.mass_function, grid),
             rtol=float(settings.rtol),
             scale_error=scale_error,
             mixture=BandMixture.of_bands(outliers, bands),
         )
         out = cls(engine, replace(settings, finer=None), compat, template_error)
-        # a single model has nothing between
-        if not interpolate or all(axis.values.size == 1 for axis in priors.axes.values()):
+        # neither a single model nor templates have anything between
+        several = {name for name, axis in priors.axes.items() if axis.values.size > 1}
+        if not interpolate or not several or "template" in several:
             return out
         nodes = finest = Nodes.of_grid(grid, priors.axes)
         if finer is not None:
@@ -166,6 +176,8 @@ class GridFit:
             out["outliers"] = dict(
                 zip(self.filters, self.engine.mixture.part.tolist(), strict=True)
             )
+        if self.engine.density is not None:
+            out["mass_function"] = repr(self.engine.density.mass_function)
         if prior is not None:
             relation, scatter, z = prior.args[:3]
             # a function is known by its values at some masses
@@ -238,25 +250,26 @@ class GridFit:
         step = 1 if own else max(1, min(_JOINT_SIZE // max(each, 1), len(data)))
         parts = []
         for rows in list(chunks(len(data), step)) or [slice(0, 0)]:
-            some, prior, engine = data[rows], log_prior[rows], self.engine
-            if own and len(some):
-                engine, prior, results = self._at_redshift(some, prior, joint, pairs)
-            else:
-                results = self._results(some, engine.fit(**some.of_engine(prior), **options), pairs)
+            some, prior, found = data[rows], log_prior[rows], {}
             if self.between is not None:
-                n_draws = self.given.interpolate
-                results = between_nodes(self.between, engine, some, prior, n_draws, results)
-            parts.append(results)
+                known = some.redshift if own else np.zeros(len(some))
+                given = self.given.interpolate, some.ids, known, found
+                options["each"] = partial(self.between.draw, *given)
+            if own and len(some):
+                results = self._at_redshift(some, prior, joint, pairs, options)
+            else:
+                out = self.engine.fit(**some.of_engine(prior), **options)
+                results = self._results(some, out, pairs)
+            parts.append(results if self.between is None else between_nodes(found, results))
         return FitResults.concatenate(parts)
 
-    def _at_redshift(self, data, log_prior, joint, pairs):
-        """Engine and prior at an object's own redshift, and results, which stand at the nearest node."""
+    def _at_redshift(self, data, log_prior, joint, pairs, options):
+        """Results at an object's own redshift, which stand at the nearest node."""
         z, n_z = float(data.redshift[0]), log_prior.shape[1]
         fitted = np.isfinite(log_prior).any()
         node = int(np.argmax(log_prior[0]))
         engine = self.between.at_redshift(z if fitted else self.grid.redshift[0], node)
-        log_prior = log_prior[:, node : node + 1]
-        out = engine.fit(**data.of_engine(log_prior), joint=joint)
+        out = engine.fit(**data.of_engine(log_prior[:, node : node + 1]), joint=joint, **options)
         if fitted:
             out.index[:, 0] = node
         here = (np.arange(n_z) == node)[:, None]
@@ -267,8 +280,8 @@ class GridFit:
         joint = {k: all_redshifts(v) if k[0] == "z" else v for k, v in out.joint.items()}
         out = out._replace(zf=all_redshifts(out.zf), joint=joint)
         results = self._results(data, out, pairs)
-        best = results.best | {"redshift": np.where(np.isfinite(out.chi2), z, np.nan)}
-        return engine, log_prior, results._changed(best=best)
+        best = results.best | {"redshift": 0.0 * results.best["redshift"] + z}
+        return results._changed(best=best)
 
     def _results(self, data, out, pairs):
         """From models to parameters and derived quantities."""

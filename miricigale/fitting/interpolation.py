@@ -1,13 +1,13 @@
 """
 Models between the nodes of a grid, interpolated from the nodes around them.
 
-Logarithms of fluxes and of what is derived from models are parabolas through three nodes of each parameter
-(products of those of all parameters), on a scale of the parameter on which they are nearly straight. That of flux
+Logarithms of fluxes and of what is derived from models are parabolas through three nodes of each parameter, with
+products of the steps along two, on a scale of the parameter on which they are nearly straight. That of flux
 times z^2, without the distance at low redshift, is linear in ln(1 + z) between two redshifts. AGN fraction and
 mass enter in closed form. Nothing is said of what lies beyond the outermost nodes.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -20,8 +20,8 @@ from miricigale.sed import ModelFlags
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import MASS
 
-#: Powers of a parameter that may be its scale; those below 0 with the sign changed.
-_POWERS = (1.0, 0.5, 0.1, -0.5)
+#: Powers of a parameter, 1 or parts by 2, that may be its scale; those below 0 with the sign changed.
+_POWERS = (1.0, 0.5, 0.125, -0.5, -1.0)
 #: Fluxes below this part of a model's brightest band are interpolated as if they were it.
 _DARK = 1e-12
 #: Fluxes below this part of it are not compared with the chain.
@@ -30,63 +30,12 @@ _FAINT = 1e-6
 _TINY = 1e-290
 #: Largest ln of a number.
 _LARGE = 690.0
-#: Largest change of ln flux from the nearest node that is followed.
-_STEEP = 5.0
+#: Most times that a finer grid is made.
+_ROUNDS = 3
 #: Errors count up to this: fluxes that change by more between nodes are faint.
 _MOST = 0.1
-#: Rms error of interpolated ln flux along an axis of a finer grid, and the bytes that its table may fill.
-_TOLERANCE, _LARGEST = 0.005, 1 << 27
-#: Most times that the cells of an axis are halved.
-_HALVINGS = 4
-
-
-@dataclass(frozen=True, eq=False)
-class Scale:
-    """Nodes of an axis, and the power of the parameter on which models are nearest to straight."""
-
-    values: np.ndarray
-    power: float = 1.0
-
-    @cached_property
-    def scaled(self):
-        """The nodes on the scale."""
-        return _scaled(self.values, self.power)
-
-    def around(self, value):
-        """Nodes nearest to values, first of the three around, both (n,), and the weights of these, (n, 3)."""
-        node = np.searchsorted(0.5 * (self.values[1:] + self.values[:-1]), value, side="right")
-        n, x = self.values.size, _scaled(value, self.power)
-        first = np.clip(node - 1, 0, max(n - 3, 0))
-        out = np.zeros((len(x), 3))
-        used = range(min(n, 3))
-        for i in used:
-            out[:, i] = 1.0
-            for j in used:
-                if j != i:
-                    a, b = self.scaled[first + i], self.scaled[first + j]
-                    out[:, i] *= (x - b) / (a - b)
-        return node, first, out
-
-
-@dataclass(frozen=True, eq=False)
-class Place:
-    """Where n models lie between the nodes: dicts by name of axis."""
-
-    near: dict  # nearest nodes
-    weights: dict  # first of the nodes around, and their weights
-    redshift: np.ndarray
-    between: tuple  # nodes of redshift, the others, and the part of the way to those
-
-
-def rows_of(value, some):
-    """Some rows of an array, or of all arrays in a dict, a sequence or a dataclass."""
-    if isinstance(value, np.ndarray):
-        return value[some]
-    if isinstance(value, dict):
-        return {name: rows_of(one, some) for name, one in value.items()}
-    if isinstance(value, (list, tuple)):
-        return tuple(rows_of(one, some) for one in value)
-    return type(value)(*(rows_of(getattr(value, item.name), some) for item in fields(value)))
+#: Rms error of interpolated ln flux along an axis of a finer grid, and most galaxies or AGN at all redshifts.
+_TOLERANCE, _LARGEST = 0.005, 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +44,7 @@ class Kind:
 
     names: tuple
     model: np.ndarray  # (n_1, n_2, ...), -1 where there is none
-    flux: np.ndarray  # (nz, n_models, nb): ln(flux z^2)
+    flux: np.ndarray  # (nz, n_models, nb + 1): ln(flux z^2), and the last row
     rows: np.ndarray  # (1, n_models, n_rows): ln where lit
     lit: np.ndarray  # (n_rows,): which have a logarithm
 
@@ -104,9 +53,12 @@ class Kind:
         """Of n models with fluxes (nz, n, nb) and other numbers (n_rows, n)."""
         n = flux.shape[1]
         model = np.full([a.values.size for a in axes], -1 if axes else 0)
-        for i in range(n) if axes else ():
+        if axes:
+            model[tuple(a.share.argmax(axis=0) for a in axes)] = np.arange(n)
             # a model without effect of a parameter stands for all its values
-            model[np.ix_(*(np.flatnonzero(a.share[:, i] > 0) for a in axes))] = i
+            many = sum(np.count_nonzero(a.share, axis=0) for a in axes) > len(axes)
+            for i in np.flatnonzero(many):
+                model[np.ix_(*(np.flatnonzero(a.share[:, i] > 0) for a in axes))] = i
         top = flux.max(axis=-1, keepdims=True, initial=0.0)
         flux = np.log(np.maximum(flux, np.maximum(_DARK * top, _TINY)))
         flux += _two_ln(redshift)[:, None, None]
@@ -114,79 +66,21 @@ class Kind:
         lit = np.all(rows > 0, axis=1)
         with np.errstate(divide="ignore"):
             rows = np.where(lit[:, None], np.log(rows), rows)
-        return cls(tuple(a.name for a in axes), model, flux, rows.T[None].copy(), lit)
+        rows = rows.T[None].copy()
+        flux = np.concatenate([flux, np.repeat(rows[:, :, -1:], len(flux), axis=0)], axis=2)
+        return cls(tuple(a.name for a in axes), model, flux, rows, lit)
 
-    def models(self, node):
-        """Models of nodes, -1 where there is none."""
-        return self.model[tuple(node[name] for name in self.names)] + 0 * node["redshift"]
-
-    def fluxes(self, place):
-        """Interpolated fluxes, shape (n, nb)."""
-        z, other, part = place.between
-        ln = self._sum(self.flux, place, z, other, part)
-        here = self.flux[place.near["redshift"], np.maximum(self.models(place.near), 0)]
-        ln = here + np.clip(ln - here, -_STEEP, _STEEP)
-        return np.exp(ln - _two_ln(place.redshift)[:, None])
-
-    def at_redshift(self, redshift, between, models):
-        """Fluxes of some of the models at a redshift: (1, n, nb)."""
-        z, other, part = between
-        ln = (1.0 - part) * self.flux[z, models] + part * self.flux[other, models]
-        return np.exp(ln - _two_ln(redshift))[None]
-
-    def values(self, place, rows=slice(None)):
-        """Interpolated rows, shape (n_rows, n)."""
-        out = self.numbers(np.ascontiguousarray(self.rows[:, :, rows]), place)
-        lit = self.lit[rows][:, None]
-        return np.where(lit, np.exp(np.clip(out, -_LARGE, _LARGE)), np.maximum(out, 0.0))
-
-    def numbers(self, table, place):
-        """Interpolate a table of models at all redshifts, (1, n_models, n_rows), as it is: (n_rows, n)."""
-        z = np.zeros_like(place.between[0])
-        return self._sum(table, place, z, z, np.zeros(z.size)).T
-
-    @cached_property
-    def _around(self):
-        """Steps from one value of each axis to the next, and choices of one of three nodes with their offsets."""
-        shape = np.array(self.model.shape, np.int64)
-        stride = np.array([shape[a + 1 :].prod() for a in range(shape.size)], np.int64)
-        few = np.minimum(shape, 3)
-        choice = np.indices(few).reshape(shape.size, few.prod()).T.astype(np.int64)
-        return stride, choice, choice @ stride
-
-    def _sum(self, table, place, z, other, part):
-        n, (stride, choice, offset) = z.size, self._around
-        first, weight = np.zeros(n, np.int64), np.zeros((n, len(self.names), 3))
-        for a, name in enumerate(self.names):
-            node, weight[:, a] = place.weights[name]
-            first += node * stride[a]
-        out, model = np.empty((n, table.shape[2])), self.model.ravel()
-        _core.sum_nodes(table, z, other, part, model, first, choice, offset, weight, out)
-        return out
-
-    def bends(self, name, x):
-        """
-        How far middle nodes of an axis are off the straight lines between their neighbors on a scale ``x``.
-
-        Of ln flux but for a factor, shape (m, nb), and of what else is interpolated, (m, n_rows).
-        """
-        table = np.moveaxis(self.model, self.names.index(name), 0).reshape(x.size, -1)
-        out = []
-        for numbers in (self.flux[len(self.flux) // 2], self.rows[0][:, self.lit]):
-            parts = []
+    def bent(self, name, x):
+        """How far, on average, middle nodes of an axis are off lines between their neighbors on a scale ``x``."""
+        table, out = np.moveaxis(self.model, self.names.index(name), 0).reshape(x.size, -1), 0.0
+        # ln flux but for a factor, and what else is interpolated
+        two = self.flux[len(self.flux) // 2, :, :-1], self.rows[0][:, self.lit]
+        for k, numbers in enumerate(two):
             for i, t in enumerate((x[1:-1] - x[:-2]) / (x[2:] - x[:-2])):
                 low, here, high = table[i : i + 3, (table[i : i + 3] >= 0).all(axis=0)]
-                parts.append(numbers[here] - (1.0 - t) * numbers[low] - t * numbers[high])
-            out.append(np.concatenate(parts))
-        return less_factor(out[0]), out[1]
-
-    def steps(self, name):
-        """Half of the change of ln flux, but for a factor, between neighbors: (m, nb)."""
-        table = np.moveaxis(self.model, self.names.index(name), 0)
-        low, high = table[:-1].ravel(), table[1:].ravel()
-        both = (low >= 0) & (high >= 0) & (low != high)
-        flux = self.flux[len(self.flux) // 2]
-        return 0.5 * less_factor(flux[high[both]] - flux[low[both]])
+                off = numbers[here] - (1.0 - t) * numbers[low] - t * numbers[high]
+                out += np.abs(off if k else less_factor(off)).mean() if off.size else 0.0
+        return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,73 +116,76 @@ class Nodes:
         axes = {name: replace(axis, share=None) for name, axis in axes.items()}
         return cls(axes, known, kinds, np.asarray(grid.allowed))
 
-    @property
-    def redshift(self):
-        """Nodes of redshift."""
-        return self.axes["redshift"].values
+    def with_kind(self, kind, other):
+        """With the models of a kind, their axes and the redshifts of others."""
+        axes = {n: a for n, a in other.axes.items() if a.kind in ("redshift", kind)}
+        first, kinds = other if kind == "galaxy" else self, self.kinds | {kind: other.kinds[kind]}
+        return Nodes(self.axes | axes, first.quantities, kinds, first.allowed)
 
     @cached_property
-    def scales(self):
-        """`Scale` of each axis of galaxies and AGN with several values, by name."""
+    def kernels(self):
+        """`_core.Kind` of galaxies and of AGN, by kind."""
         out = {}
-        for name, axis in self.axes.items():
-            values, power = axis.values, 1.0
-            if axis.kind not in self.kinds or values.size == 1:
-                continue
-            if values.size > 2 and values[0] >= 0:
-                powers = [p for p in _POWERS if p > 0 or values[0] > 0]
-                power = min(powers, key=lambda p, axis=axis: self._bent(axis, p))
-            out[name] = Scale(values, power)
+        for label, kind in self.kinds.items():
+            size = np.array([len(self.axes[name].values) for name in kind.names], np.int64)
+            scaled, power = np.zeros((len(size), max(size, default=1))), np.ones(len(size))
+            for a, name in enumerate(kind.names):
+                values = self.axes[name].values
+                if values.size > 2 and values[0] >= 0:
+                    powers = [p for p in _POWERS if p > 0 or values[0] > 0]
+                    power[a] = powers[
+                        np.argmin([kind.bent(name, _scaled(values, p)) for p in powers])
+                    ]
+                scaled[a, : values.size] = _scaled(values, power[a])
+            out[label] = _core.Kind(kind.flux, kind.model.ravel(), size, scaled, power)
         return out
 
-    def _bent(self, axis, power):
-        bends = self.kinds[axis.kind].bends(axis.name, _scaled(axis.values, power))
-        return sum(np.abs(bend).mean() for bend in bends if bend.size)
+    @cached_property
+    def log_z(self):
+        """ln(1 + z) of the nodes."""
+        return np.log1p(self.axes["redshift"].values)
 
-    def place(self, values, redshift):
-        """`Place` of values by name, shape (n,), at redshifts; what has none is at the only node of its axis."""
-        near, weights = {}, {}
-        for name, axis in self.axes.items():
-            near[name] = np.zeros(len(redshift), np.int64)
-            if name in self.scales:
-                inside = np.clip(values[name], *axis.values[[0, -1]])
-                near[name], *weights[name] = self.scales[name].around(inside)
-            elif axis.kind in self.kinds:
-                weights[name] = near[name], np.tile([1.0, 0.0, 0.0], (len(redshift), 1))
-        between = self.between(redshift)
-        near["redshift"] = np.where(between[2] > 0.5, between[1], between[0])
-        return Place(near, weights, redshift, between)
+    def numbers(self, kind, values, redshift, table=None):
+        """Interpolate ln flux, or a table of the models, (1, n_models, n_rows), at values by name: (n, n_rows)."""
+        own, n, n_fluxes = self.kinds[kind], len(redshift), 0
+        if table is None:
+            table, n_fluxes = own.flux, own.flux.shape[2] - 1
+        places = np.empty((n, len(own.names)))
+        for i, name in enumerate(own.names):
+            places[:, i] = values.get(name, self.axes[name].values[0])
+        out, work = np.empty((n, table.shape[2])), _core.make_work(len(own.names), table.shape[2])
+        given = self.kernels[kind], table, self.log_z, places, np.array(redshift, float)
+        _core.interpolate(*given, n_fluxes, work, out)
+        return out
 
-    def between(self, redshift):
-        """Nodes below redshifts, the next ones, and the part of the way to those; beyond the last too."""
-        x, nodes = np.log1p(redshift), np.log1p(self.redshift)
-        z = np.clip(np.searchsorted(nodes, x) - 1, 0, max(nodes.size - 2, 0))
-        if nodes.size == 1:
-            return z, z, np.zeros(np.shape(z))
-        return z, z + 1, (x - nodes[z]) / np.diff(nodes)[z]
+    def one_kind(self, kind, values, redshift):
+        """Fluxes of models of a kind, shape (n, nb), and what they are interpolated with, (n,)."""
+        ln, lit = self.numbers(kind, values, redshift), self.kinds[kind].lit[-1]
+        more = np.exp(ln[:, -1]) if lit else np.maximum(ln[:, -1], 0.0)
+        return np.exp(ln[:, :-1] - _two_ln(redshift)[:, None]), more
 
-    def possible(self, place):
-        """Whether the nearest galaxies exist."""
-        galaxy = self.kinds["galaxy"].models(place.near)
-        return (galaxy >= 0) & self.allowed[place.near["redshift"], galaxy]
-
-    def fluxes(self, place, frac):
+    def fluxes(self, values, redshift, frac):
         """Fluxes of one solar mass formed, shape (n, nb), with AGN of given fractions, and their power."""
-        galaxy = self.kinds["galaxy"]
-        flux, power = galaxy.fluxes(place), np.zeros(len(frac))
+        flux, dust = self.one_kind("galaxy", values, redshift)
+        power = frac / np.maximum(1.0 - frac, 1e-12) * dust
         if np.any(frac > 0):
-            power = frac / (1.0 - frac) * galaxy.values(place, slice(-1, None))[0]
-            flux = flux + power[:, None] * self.kinds["agn"].fluxes(place)
+            flux = flux + power[:, None] * self.one_kind("agn", values, redshift)[0]
         return flux, power
 
-    def describe(self, place, power, scale):
+    def rows(self, kind, values, redshift):
+        """Rows of a kind at values by name: (n_rows, n)."""
+        own = self.kinds[kind]
+        out = self.numbers(kind, values, redshift, own.rows)
+        return np.where(own.lit, np.exp(np.clip(out, -_LARGE, _LARGE)), np.maximum(out, 0.0)).T
+
+    def describe(self, values, redshift, power, scale):
         """Derived quantities of models of given AGN power and scale: dict by name."""
         known, of = self.quantities, self.quantities.fraction
-        galaxy, n, out = self.kinds["galaxy"].values(place), len(known.galaxy_scale), {}
+        n, out, galaxy = len(known.galaxy_scale), {}, self.rows("galaxy", values, redshift)
         out.update(zip(known.names, scale * galaxy[:n], strict=False))
         total = scale * galaxy[n]
         if self.kinds["agn"].flux.shape[1]:
-            agn, more = self.kinds["agn"].values(place), len(known.agn_scale)
+            agn, more = self.rows("agn", values, redshift), len(known.agn_scale)
             out.update(zip(known.names[n:], scale * power * agn[:more], strict=False))
             total, n = total + scale * power * agn[more], n + more
             if of is not None:
@@ -296,19 +193,8 @@ class Nodes:
                 y = odds * galaxy[-2] * agn[-1]
                 out[of.name] = y / (1.0 + y)
         out[known.names[n]] = total
-        shape = self.kinds["galaxy"].numbers(known.shape.values.T[None].copy(), place)
-        out.update(zip(known.shape.names, shape, strict=True))
-        return out
-
-    def those_of(self, grid, kind):
-        """Which models of a kind are those of a grid with some of the nodes: shape (n_models,)."""
-        own, other = self.kinds[kind], grid.kinds[kind]
-        pairs = ((self.axes[name].values, grid.axes[name].values) for name in own.names)
-        places = [np.abs(mine - theirs[:, None]).argmin(axis=1) for mine, theirs in pairs]
-        out = np.zeros(other.flux.shape[1], np.int64)
-        if places:
-            some = other.model >= 0
-            out[other.model[some]] = own.model[np.ix_(*places)][some]
+        shape = self.numbers("galaxy", values, redshift, known.shape.values.T[None].copy())
+        out.update(zip(known.shape.names, shape.T, strict=True))
         return out
 
 
@@ -343,24 +229,39 @@ def finer_grid(model, grid, filters, constants, nodes):
     if not error(nodes) < 1e-3:
         wanted = "the model that made the grid"
         raise argument_error("finer", wanted, "one with other fluxes at its nodes")
-    finer = nodes
-    for _ in range(_HALVINGS):
-        before = axes
-        rms = {name: error(finer, name) for name in ("redshift", *finer.scales)}
-        # the worst first, as far as there is memory
-        for name in sorted((n for n in rms if rms[n] > _TOLERANCE), key=rms.get, reverse=True):
-            halved = axes | {name: np.sort([*axes[name], *_middles(finer, name)])}
-            kinds = ("redshift", "galaxy")
-            size = [len(halved[n]) for n, a in nodes.axes.items() if a.kind in kinds]
-            if 8 * len(filters) * np.prod(size) <= _LARGEST:
-                axes = halved
-        if axes is before:
-            break
-        finer = Nodes.of_grid(model.grid(axes, filters))
+    finer, kinds = nodes, {name: a.kind for name, a in nodes.axes.items()}
+    own = {
+        kind: [name for name in kinds if kinds[name] in ("redshift", kind)] for kind in nodes.kinds
+    }
+
+    def size(axes, kind):
+        return np.prod([len(axes[name]) for name in own[kind]])
+
+    # large tables are left as they are: those of finer grids would take tens of seconds
+    large = [own[kind] for kind in own if size(axes, kind) > _LARGEST / 4]
+    halved = sorted(set().union(*own.values()).difference(*large))
+    for _ in range(_ROUNDS):
+        # the error along an axis is that of its own cells
+        rms, halved, changed = {name: error(finer, name) for name in halved}, set(), set()
+        while any(value > _TOLERANCE for value in rms.values()):
+            name = max(rms, key=rms.get)
+            more = axes | {name: np.sort([*axes[name], *_middles(axes[name], name)])}
+            made = {kind for kind in own if name in own[kind]}
+            if max(size(more, kind) for kind in made) > _LARGEST:
+                del rms[name]
+                continue
+            # with the square of the cells; more slowly with features that cross bands, and dust that may be absent
+            axes, halved, changed = more, halved | {name}, changed | made
+            rms[name] *= 0.25 if made == {"galaxy"} else 0.5
+        for kind in changed:
+            # one kind at a time: all models of the other would be made for nothing
+            others = {*own} - {kind}
+            some = {n: v[:1] if kinds.get(n, kind) in others else v for n, v in axes.items()}
+            finer = finer.with_kind(kind, Nodes.of_grid(model.grid(some, filters)))
     return finer
 
 
-def _chain_rms(model, filters, constants, frac_agn, nodes, name=None, n=300):
+def _chain_rms(model, filters, constants, frac_agn, nodes, name=None, n=100):
     """
     Rms of interpolated ln flux, but for a factor, at random nodes, or anywhere between those of an axis.
 
@@ -380,8 +281,7 @@ def _chain_rms(model, filters, constants, frac_agn, nodes, name=None, n=300):
     if np.any(flags & int(ModelFlags.NOT_IN_LIBRARY)) and name is not None:
         return 0.0
     frac = values.get("frac_agn", np.full(n, frac_agn[0]))
-    place = nodes.place(values, values["redshift"])
-    flux = nodes.fluxes(place, frac)[0]
+    flux = nodes.fluxes(values, values["redshift"], frac)[0]
     true = np.column_stack([true[band].value for band in true.colnames[: flux.shape[1]]])
     good = np.isfinite(true).all(axis=1)
     top = _FAINT * true[good].max(axis=1, keepdims=True)
@@ -389,9 +289,8 @@ def _chain_rms(model, filters, constants, frac_agn, nodes, name=None, n=300):
     return np.sqrt(np.mean(np.minimum(np.abs(less_factor(np.log(ratio))), _MOST) ** 2))
 
 
-def _middles(nodes, name):
+def _middles(values, name):
     """Half way between the nodes of an axis."""
-    values = nodes.axes[name].values
     if name == "redshift":
         return np.expm1(0.5 * (np.log1p(values[1:]) + np.log1p(values[:-1])))
     return 0.5 * (values[1:] + values[:-1])

@@ -9,7 +9,7 @@ import numpy as np
 from astropy.table import Table, vstack
 
 from miricigale.fitting.priors import GridAxis
-from miricigale.fitting.results import CIGALE_LEAST_STD, FitResults
+from miricigale.fitting.results import FitResults
 from miricigale.fitting.samples import Samples
 from miricigale.sed import ModelGrid
 from miricigale.utils.content import content_sha256
@@ -25,11 +25,8 @@ from miricigale.utils.unified import register
 
 #: Layout of a folder of `fit_file`.
 FORMAT = "miricigale-fitparts-2"
-_OLD_FORMAT = "miricigale-fitparts-1"
 
 _RESULTS = "miricigale-fitresults-4"
-#: Files of the formats before: their settings are in the meta; those of 2 have no pairs.
-_OLD_RESULTS = ("miricigale-fitresults-3", "miricigale-fitresults-2")
 _SAMPLES = "miricigale-samples-1"
 _DICTS = ("pdf", "best")
 _TUPLES = ("filters", "quantities", "descriptions", "intensive", "fitted_filters")
@@ -62,15 +59,13 @@ def write_results(results, path, *, overwrite=False):
 
 def read_results(path, *, rows=None):
     """Read results, all or these rows (a list or array); see `~miricigale.fitting.FitResults`."""
-    layouts, some = (_RESULTS, *_OLD_RESULTS), rows is not None
-    with open_parts(path, layouts, wanted="fit results", memmap=some) as parts:
+    mapped = rows is not None
+    with open_parts(path, (_RESULTS,), wanted="fit results", memmap=mapped) as parts:
         text, table = parts.text, parts.table("RESULTS", rows=rows)
         columns = {}
         for name, shape in text["shapes"].items():
             full = native(table[name]) if name in table.colnames else np.zeros(0)
             columns[name] = full.reshape(len(table), *shape)
-        if parts.layout in _OLD_RESULTS:
-            text = text | _old_facts(text["meta"].get("fit", {}), text["filters"])
         values = {name: tuple(text[name]) for name in _TUPLES}
         values |= {name: text[name] for name in _FACTS} | {name: {} for name in _DICTS}
         for key, array in columns.items():
@@ -79,22 +74,12 @@ def read_results(path, *, rows=None):
                 values[name] = array
             elif name in _DICTS:
                 values[name][part] = array
-        pairs = enumerate(text.get("pairs", ()))
+        pairs = enumerate(text["pairs"])
         values["pairs"] = {tuple(names): columns[f"pair:{i}"] for i, names in pairs}
         values["units"] = tuple(u.Unit(unit) for unit in text["units"])
         values["axes"] = _axes_from_plain(text["axes"], {})
         results = FitResults(**values)
         return results._take(0) if text.get("single") else results
-
-
-def _old_facts(fit, filters):
-    """Facts that files of earlier formats have in the settings of their meta."""
-    return {
-        "fitted_filters": fit.get("filters", filters),
-        "redshift_fixed": fit.get("redshift") == "fixed",
-        "constants": fit.get("constants", {}),
-        "least_std": CIGALE_LEAST_STD if fit.get("compat") == "cigale" else 0.0,
-    }
 
 
 def write_samples(samples, path, *, overwrite=False):
@@ -130,8 +115,7 @@ def read_samples(path, grid, *, model=None):
         shares = {name: parts.array(key) for name, key in names.items() if key in parts}
         axes = _axes_from_plain(text["axes"], shares)
         known, whose, meta = text["grid"]["sha256"], text["grid"]["text"], text["meta"]
-        # earlier files have it in the meta
-        seed = int(text.get("seed", meta.get("seed", 0)))
+        seed = int(text["seed"])
     if content_sha256(grid) != known:
         raise argument_error("grid", f"the one of the samples, {whose}", f"another, {grid!r}")
     samples = Samples(grid=grid, model=model, meta=meta, axes=axes, seed=seed, **columns)
@@ -174,17 +158,14 @@ class FitFolder(RecordFolder):
     purpose = "fit"
     lock_name = "fit.lock"
     records_name = "parts"
+    inputs = ("calibration.ecsv",)
     remedy = "results of fit_file need a folder of their own"
 
     def parse(self, values):
-        """Facts and records; those of the layout before say sizes and checksums by themselves."""
+        """Facts and records, of which the facts are complete."""
         facts, parts = super().parse(values)
         facts["job"]["catalogue"]["rows"], facts["job"]["chunk_rows"]
-        if facts["format"] == _OLD_FORMAT:
-            for name, part in parts.items():
-                product = {key: part.pop(key) for key in ("sha256", "bytes")}
-                part |= {"hash": "", "products": {name: product}}
-        return facts | {"format": FORMAT}, parts
+        return facts, parts
 
 
 def part_name(i):

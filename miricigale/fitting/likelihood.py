@@ -1,6 +1,6 @@
 """From a catalog of photometry to fluxes, errors and flags that a fit can use, and the flags of fits."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import astropy.units as u
 import numpy as np
@@ -13,6 +13,8 @@ from miricigale.utils.units import FNU, to_array
 
 #: S/N of the best model in all bands together below which an object is flagged, and reduced chi2 above which.
 LOW_SIGNAL, HIGH_CHI2 = 3.0, 100.0
+#: Stellar mass in solar masses below which an object is flagged.
+LOW_MASS = 3e6
 #: Least error in units of the flux: below it chi2 in double precision has no digits left.
 _LEAST_ERROR = 1e-6
 #: Least and largest error, and largest flux, in uJy; beyond, their squares are no numbers.
@@ -70,12 +72,15 @@ class FitFlags(Flags):
     NO_LIKELIHOOD = 8192
     #: The best model has S/N below 3 over all bands: take masses and luminosities from samples.
     LOW_SIGNAL = 16384
-    #: More than 95 % of the posterior lies on one galaxy model at one redshift of the grid: it is coarse
-    #: for these data.
+    #: Few models carry the posterior. On nodes alone: more than 95 % of it lies on one galaxy model at one
+    #: redshift. Between the nodes: less than 1 % of the moves of the models were taken.
     ONE_NODE = 32768
     #: Less than 1 % of the posterior keeps ``max_dev_alpha_ox`` of CIGALE's module xray: the result is
     #: without it.
     OFF_RELATION = 65536
+    #: The median stellar mass is below 3e6 solar masses at a redshift that was fitted, as of few sources that a
+    #: survey detects: rather another redshift, a star, or a little red dot.
+    LOW_MASS = 131072
     #: Bits with which a row has no result.
     UNFITTED = 1 | 2 | 8 | 16 | 32 | 512 | 4096 | 8192
 
@@ -156,6 +161,8 @@ class PhotometryReader:
         flux, by filter.
     n_bands_min : int
         Objects with fewer usable bands are flagged.
+    zero_point, error_factor : dict of str to float, optional
+        What fluxes and errors of a filter are multiplied by, and errors besides; 1 by default.
     """
 
     bands: tuple
@@ -163,6 +170,8 @@ class PhotometryReader:
     model_error: dict
     error_floor: dict
     n_bands_min: int
+    zero_point: dict = field(default_factory=dict)
+    error_factor: dict = field(default_factory=dict)
 
     def fitted(self, table):
         """Bands of a catalog that are fitted: tuple of str."""
@@ -210,7 +219,9 @@ class PhotometryReader:
         flags = np.zeros(n, dtype=int)
         for name in filters:
             i, floor = self.bands.index(name), self.error_floor[name]
-            f, e = flux_column(table, name), flux_column(table, error_column(name))
+            point = self.zero_point.get(name, 1.0)
+            f = point * flux_column(table, name)
+            e = point * self.error_factor.get(name, 1.0) * flux_column(table, error_column(name))
             has_flux = np.abs(f) < _LARGE
             known = (e > _SMALL) & (e < _LARGE)
             flags[~np.isnan(f) & ~has_flux] |= int(FitFlags.BAD_FLUX)
@@ -346,5 +357,7 @@ def flags_of_fits(results, measured, edge_weight):
         if edge_weight is not None and pdf.shape[1] > 2:
             edge = np.maximum(pdf[:, 0], pdf[:, -1]) > edge_weight
             flags[fitted & edge] |= FitFlags.REDSHIFT_EDGE
+        if edge_weight is not None and "stellar_mass" in results.quantities:
+            flags[fitted & (results.median("stellar_mass").value < LOW_MASS)] |= FitFlags.LOW_MASS
     flags[~fitted & ((flags & FitFlags.UNFITTED) == 0)] |= FitFlags.NO_SIGNAL
     return flags

@@ -107,6 +107,15 @@ class BandMixture:
                 wrong = np.where(some, expit(bad - good), wrong)
         return log.sum(axis=-1), wrong
 
+    def shares(self, model, target, broad, limits, z):
+        """How likely each band is wrong, shape (nb,), over models, (n, nb), at nodes ``z`` of redshift."""
+        with np.errstate(divide="ignore"):
+            own = 1.0 / np.sqrt(target.weight[z])
+        more = np.array([np.zeros(len(broad)), np.full(len(broad), np.inf)])
+        if limits is not None:
+            more[:, limits.bands] = limits.level / limits.inverse, 1.0 / limits.inverse
+        return self.log_likelihood(model, target.flux, own, broad, *more)[1].mean(axis=0)
+
 
 @dataclass(frozen=True, eq=False)
 class Tangents:
@@ -131,20 +140,17 @@ class Tangents:
     def of_tables(cls, bands, tables):
         """Choose galaxies of every redshift, spread over all axes."""
         n_z, n_galaxy, n_bands = tables.galaxy.shape
-        n_agn = tables.agn.shape[1]
-        n = n_galaxy
-        n_wide = -(-n // _core.BLOCK) * _core.BLOCK
+        n_wide = -(-n_galaxy // _core.BLOCK) * _core.BLOCK
         order = np.argsort(np.arange(n_galaxy) * _GOLDEN % 1.0, kind="stable")
         index = np.zeros((n_z, n_wide), np.int64)
         flux = _core.aligned(n_z, n_bands, n_wide, dtype=np.float32)
-        ratio = _core.aligned(n_z, n_agn, n_wide, dtype=np.float32)
-        unit = agn_units(tables.agn)
+        ratio = _core.aligned(n_z, tables.agn.shape[1], n_wide, dtype=np.float32)
         for z in range(n_z):
-            some = order[tables.log_usable[z, order] > -1e200][:n]
+            some = order[tables.log_usable[z, order] > -1e200]
             index[z, : some.size] = some
             flux[z, :, : some.size] = tables.galaxy32[z][:, some]
             size = tables.of_galaxy[0, some] / tables.galaxy_unit[z, some]
-            ratio[z, :, : some.size] = np.clip(size * unit[z][:, None], 0.0, 1e15)
+            ratio[z, :, : some.size] = np.clip(size * tables.agn_unit[z, :, None], 0.0, 1e15)
         return cls(bands, tables, (index, flux, ratio))
 
     def touch(self, target, log_prior, sigma, broad, limit=None, limit_sigma=None):
@@ -184,12 +190,9 @@ class Tangents:
         _core.find_models(
             tables, target, few, odds, narrow**2, rise - log_prior, np.array(ends), sizes, *found
         )
-        z = np.arange(n_z)
-        model = scale[:, :1] * tables.galaxy[z, np.maximum(index[:, 0], 0)]
+        model = scale[:, :1] * tables.galaxy[np.arange(n_z), np.maximum(index[:, 0], 0)]
         some = np.flatnonzero(index[:, 1] >= 0)
-        k = index[some, 1]
-        power = scale[some, 1] / agn_units(tables.agn)[some, k]
-        model[some] += power[:, None] * tables.agn[some, k]
+        model[some] += scale[some, 1:] * tables.agn[some, index[some, 1]]
         square = np.square(target.flux - model)[:, bands]
         full = np.full((n_z, len(sigma)), np.inf)
         full[:, bands] = own
@@ -202,9 +205,3 @@ class Tangents:
         level = 2.0 * log - rise
         level += np.sum(weight[:, bands] * square, axis=1)
         return _core.weighed(target.flux, weight, level, log_prior, bands), wrong
-
-
-def agn_units(agn):
-    """Largest flux of every AGN model, shape (nz, nA); 1 where there is none."""
-    top = agn.max(axis=-1, initial=0.0)
-    return np.where(top > 0, top, 1.0)

@@ -83,6 +83,7 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None):
     if columns is not None:
         classes_section(page, columns, list(classes), every["ids"], every["chi2"])
     _redshifts(page, found)
+    _calibration(page, results.path / "calibration.ecsv")
     _goodness(page, found)
     _physics(page, found)
     _examples(page, results, every)
@@ -161,6 +162,22 @@ def _redshifts(page, found):
     bins = np.histogram_bin_edges(np.concatenate(list(samples.values())), 40)
     _draw_counts(axes[0, -1], "redshift", bins, samples)
     page.figure("compared" if some.any() else "alone", figure, name=name)
+
+
+def _calibration(page, path):
+    """What ``--calibrate`` measured: redshifts of halves, and the bands."""
+    if not path.exists():
+        return
+    from miricigale.fitting.survey import SurveyCalibration
+
+    found = SurveyCalibration.read(path)
+    page.section("calibration", name=found.name)
+    page.table("scores", _rows(found.scores))
+    page.table("bands", _rows(found.bands))
+
+
+def _rows(table):
+    return [dict(zip(table.colnames, row, strict=True)) for row in table.iterrows()]
 
 
 def _step(n):

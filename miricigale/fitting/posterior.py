@@ -71,6 +71,21 @@ def cell_percentiles(values, pdf, levels, bounds=(-np.inf, np.inf)):
     return out
 
 
+def cell_shares(values, pdf, low, high, bounds=(-np.inf, np.inf)):
+    """
+    Part of distributions that are linear within each cell of `cell_edges` from ``low`` to ``high``.
+
+    Nodes (k,), their weights (m, k), limits (m,): shape (m,). Rows of NaN give NaN.
+    """
+    edges = cell_edges(values, bounds)
+    upto = np.pad(np.cumsum(pdf, axis=1), ((0, 0), (1, 0)))
+    ends = [
+        np.interp(at, edges, row) for row, at in zip(upto, np.stack([low, high], 1), strict=True)
+    ]
+    with np.errstate(invalid="ignore"):
+        return np.diff(np.reshape(ends, (-1, 2)), axis=1)[:, 0] / upto[:, -1]
+
+
 def randomized_ranks(pdf, node, draw):
     """
     Ranks of true values that lie on nodes, shape (m,), uniform if the posteriors are right.

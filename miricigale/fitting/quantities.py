@@ -48,7 +48,9 @@ def draws_summary(value, *, with_log=True):
         return np.full(3, np.nan), np.full(DERIVED_LEVELS.size, np.nan)
     lit = value[value > 0]
     log = np.mean(np.log10(lit)) if with_log and lit.size else np.nan
-    return np.array([value.mean(), value.std(), log]), np.quantile(value, DERIVED_LEVELS)
+    place = DERIVED_LEVELS * (value.size - 1)
+    quantiles = np.interp(place, np.arange(value.size), np.sort(value))
+    return np.array([value.mean(), value.std(), log]), quantiles
 
 
 def put_draws(results, new, i, values):

@@ -9,7 +9,13 @@ import numpy as np
 
 from miricigale.fitting import drawing
 from miricigale.fitting.likelihood import FitFlags, filter_names
-from miricigale.fitting.posterior import cell_edges, cell_percentiles, check_levels, moments
+from miricigale.fitting.posterior import (
+    cell_edges,
+    cell_percentiles,
+    cell_shares,
+    check_levels,
+    moments,
+)
 from miricigale.fitting.quantities import DERIVED_LEVELS, kept_percentiles
 from miricigale.fitting.rows import FitRows
 from miricigale.utils.interactive import checked_calls
@@ -22,6 +28,9 @@ from miricigale.utils.units import FNU
 _LEVELS = (0.16, 0.5, 0.84)
 #: Part of the mean below which CIGALE gives no standard deviation.
 CIGALE_LEAST_STD = 0.05
+#: Error of a redshift over 1 + z beyond which it is called an outlier.
+_OUTLIER = 0.15
+_ODDS = f"probability that redshift_p50 is within {_OUTLIER} (1 + z) of the redshift"
 #: Objects that a notebook shows.
 _SHOWN = 20
 _PARTS = {
@@ -127,12 +136,12 @@ class FitResults(FitRows):
     >>> errors = ErrorModel.from_depths(dict.fromkeys(bands, 29.0))
     >>> photometry = errors.perturb(model.fluxes(truth, bands), seed=1)
     >>> axes = {"redshift": [0.4, 0.5, 0.9, 1.0, 1.1], "age": [1.0, 3.0], "ebv": [0.1, 0.3]}
-    >>> fitter = BayesFitter(model, bands, axes=axes)
+    >>> fitter = BayesFitter(model, bands, axes=axes, model_error=0.02)
     >>> results = fitter.fit(photometry)
     >>> results
     <FitResults of 2 objects, 2 fitted, 4 bands>
     >>> results["b"].mean("redshift").round(2)
-    <Quantity 1.01>
+    <Quantity 1.02>
     >>> edges, weights = results["b"].distribution("redshift")
     """
 
@@ -368,6 +377,23 @@ class FitResults(FitRows):
         first = np.full((*weights.shape[:-1], 1), 0.0 if name in self.axes else DERIVED_LEVELS[0])
         return edges, np.concatenate([first, first + np.cumsum(weights, axis=-1)], axis=-1)
 
+    @property
+    def redshift_odds(self):
+        r"""
+        How likely the median redshift is no outlier: array, shape (n,).
+
+        The odds of Benitez 2000 (ApJ 536, 571, section 4.2), the posterior in a window about the redshift given,
+        with the window of outliers: the probability that :math:`|z_{50} - z| / (1 + z) < 0.15` for the redshift
+        z, from the distribution that is linear within each cell of the redshifts. NaN at known redshifts.
+        """
+        some = self._several()
+        out = np.full(len(some), np.nan)
+        if "redshift" in self.axes and not self.redshift_fixed:
+            z, axis = some.median("redshift").value, self.axes["redshift"]
+            low, high = (z - _OUTLIER) / (1.0 + _OUTLIER), (z + _OUTLIER) / (1.0 - _OUTLIER)
+            out = cell_shares(axis.values, some.pdf["redshift"], low, high, axis.bounds)
+        return out[0] if self.isscalar else out
+
     def joint_pdf(self, x, y):
         """
         Joint posteriors of two parameters, summed over all models.
@@ -415,7 +441,7 @@ class FitResults(FitRows):
             parameter and derived quantity ``<name>_mean``, ``_std``, ``_p16``, ``_p50``, ``_p84``
             and ``_best``; derived quantities that scale with mass also have ``_logmean``, the mean
             of log10 (dex, in their unit). Of a fit with ``outliers``, for each band
-            ``<band>_outlier``, how likely it is wrong.
+            ``<band>_outlier``, how likely it is wrong. With free redshifts `redshift_odds`.
         """
         some = self._several()
         columns = {
@@ -442,6 +468,8 @@ class FitResults(FitRows):
                 log_mean = some.moments[:, some._quantity(name), 2] * u.dex
                 text = f"posterior mean of log10 of {meaning}, in {unit.to_string()}"
                 columns[f"{name}_logmean"] = (log_mean, text)
+            if name == "redshift" and not some.redshift_fixed:
+                columns["redshift_odds"] = (some.redshift_odds, _ODDS)
         if some.outlier is not None:
             for name in some.fitted_filters:
                 value = some.outlier[:, some.filters.index(name)]

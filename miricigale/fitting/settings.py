@@ -28,12 +28,18 @@ class GridSettings:
         A function of stellar mass and redshift (a `~astropy.units.Quantity`, and an array that
         broadcasts with it) to a star-formation rate, and a scatter in dex. The prior of the galaxies of each
         redshift is multiplied by that log-normal distribution of their rate over the last 100 Myr, at the mass
-        that fits best without AGN, and keeps its sum. Not with ``interpolate``.
+        that fits best without AGN, and keeps its sum.
+    mass_function : callable, optional
+        A function of stellar mass (a `~astropy.units.Quantity`) and redshift, which broadcast, to a density
+        for each dex of mass and comoving volume, with any factor, such as `MassFunction`. Times the comoving
+        volume it multiplies the priors of galaxies and redshifts, at the mass that fits best without AGN (to 0.01
+        dex). Priors of redshift (``priors``, ``redshift_prior``) multiply it too: leave them flat, or
+        volume counts twice.
     interpolate : int, optional
-        Number of models drawn between the nodes for each object, with fluxes interpolated from the
+        Number of models that are moved between the nodes for each object, with fluxes interpolated from the
         nodes around, by sequential Monte Carlo (Del Moral et al. 2006); posteriors, means and
         percentiles are theirs. Known redshifts are then those of the catalog, in chi2, the evidence and the
-        best model too. 400 suffice for 68 % intervals. 0: the nodes alone.
+        best model too. 0: the nodes alone, as with ``compat="cigale"`` and for templates.
     finer : `~miricigale.sed.SEDModel`, optional
         With ``interpolate``: the model that made the grid, of which a finer grid is made, between whose nodes
         fluxes are good to 0.5 % along each axis. Not needed where a model is fitted. Without it fluxes are
@@ -55,7 +61,8 @@ class GridSettings:
     redshift_tolerance: float | None = None
     rtol: float = 1e-6
     sfr_prior: tuple | None = None
-    interpolate: int = 0
+    mass_function: object = None
+    interpolate: int = 200
     finer: SEDModel | None = None
 
     def __post_init__(self):
@@ -64,8 +71,7 @@ class GridSettings:
         near = self.redshift_tolerance
         if near is not None and not (is_number(near) and near >= 0):
             raise argument_error("redshift_tolerance", ">= 0", repr(near))
-        if check_count(self.interpolate, "interpolate", least=0) and self.sfr_prior is not None:
-            raise argument_error("sfr_prior", "None with 'interpolate'", repr(self.sfr_prior))
+        check_count(self.interpolate, "interpolate", least=0)
         if self.finer is not None and not (self.interpolate and isinstance(self.finer, SEDModel)):
             wanted = "an SEDModel" if self.interpolate else "None without 'interpolate'"
             raise argument_error("finer", wanted, repr(self.finer))

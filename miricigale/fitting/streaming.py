@@ -11,9 +11,10 @@ import numpy as np
 
 from miricigale.filters.catalog_files import codes_of, joined_codes, warn_of_codes
 from miricigale.fitting.fitter import BayesFitter
-from miricigale.fitting.from_files import open_catalog
+from miricigale.fitting.from_files import give_units, open_catalog
 from miricigale.fitting.io import FORMAT, FitFolder, open_results, part_ids, part_name
 from miricigale.fitting.likelihood import HIGH_CHI2
+from miricigale.fitting.pulls import warn_of_pulls
 from miricigale.utils.content import content_sha256
 from miricigale.utils.exceptions import CatalogWarning, OtherResultsError, argument_error, warn
 from miricigale.utils.progress import progress
@@ -94,8 +95,8 @@ def fit_file(
     Warns
     -----
     `~miricigale.utils.exceptions.CatalogWarning`
-        What `BayesFitter.fit` warns of, once. Numbers that look like codes for a missing value are counted
-        before anything is fitted, and with ``catalog_map`` what it takes as missing.
+        What `BayesFitter.fit` warns of, once, of scatter by the first part. Numbers that look like codes for a
+        missing value are counted before anything is fitted, and with ``catalog_map`` what it takes as missing.
 
     Raises
     ------
@@ -187,6 +188,8 @@ def _fit_parts(fitter, rows, take, folder, seed, executor, progress_bar):
                         fitter.warn_of_bands(table)
                     options |= {"seed": seed, "parallel": {"executor": executor}}
                     results = fitter.fit_part(table, **options, repeated=repeated)
+                    if not n_new:
+                        warn_of_pulls(results)
                 n_new += 1
                 folder.save(name, results.write)
                 n_fitted = int(np.count_nonzero(results.fitted))
@@ -215,9 +218,7 @@ def _pieces(rows, options, unit, fluxes):
 
     def take(i):
         table, piece = rows.chunk(i), slice(*rows.span(i))
-        for name in fluxes.intersection(table.colnames) if unit is not None else ():
-            if table[name].unit is None:
-                table[name].unit = unit
+        give_units(table, fluxes, unit)
         given = options | {}
         if _is_of_rows("redshift", redshift):
             given["redshift"] = redshift[piece]

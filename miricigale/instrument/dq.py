@@ -79,23 +79,6 @@ class DQ(Flags):
     NEGATIVE = 2**35
 
 
-#: What the bits of planes without a legend mean, lowest first: files of earlier versions.
-_WITHOUT_LEGEND = (
-    DQ.DO_NOT_USE,
-    DQ.REFERENCE_PIXEL | DQ.NON_SCIENCE | DQ.DO_NOT_USE,
-    DQ.SATURATED,
-    DQ.SATURATED | DQ.NO_SLOPE | DQ.DO_NOT_USE,
-    DQ.JUMP_DET,
-    DQ.JUMP_DET | DQ.JUMP_NEIGHBOR,
-    DQ.NO_SLOPE | DQ.DO_NOT_USE,
-    DQ.NON_SCIENCE | DQ.DO_NOT_USE,
-    DQ.COSMIC_RAY | DQ.DO_NOT_USE,
-    DQ.NEGATIVE | DQ.DO_NOT_USE,
-    DQ.OUTLIER | DQ.DO_NOT_USE,
-    DQ.NON_SCIENCE | DQ.DO_NOT_USE,
-)
-
-
 def dq_legend():
     """
     Return header cards with the meaning of the bits of a plane.
@@ -186,8 +169,7 @@ def read_dq(hdu):
     Parameters
     ----------
     hdu : `~astropy.io.fits.ImageHDU`
-        With the cards of `dq_legend`. A plane without them is one of an earlier version, whose
-        bits had other values: they are translated.
+        With the cards of `dq_legend`.
 
     Returns
     -------
@@ -197,8 +179,7 @@ def read_dq(hdu):
     Raises
     ------
     `~miricigale.utils.exceptions.DataError`
-        If the legend is another one, or there is none and bits are set that earlier versions
-        did not have.
+        If it has no legend, or another one.
 
     Examples
     --------
@@ -212,14 +193,8 @@ def read_dq(hdu):
     >>> DQ.names(int(flags[0, 1]))
     ['do_not_use', 'hot']
     """
-    flags = np.asarray(hdu.data).astype(np.int64)
     scheme = hdu.header.get("DQSCHEME")
-    if scheme == "JWST":
-        return flags
-    if scheme is not None or np.any(flags >> len(_WITHOUT_LEGEND)):
+    if scheme != "JWST":
         msg = f"extension {hdu.name} holds flags of another kind (DQSCHEME {scheme})"
         raise DataError(msg)
-    out = np.zeros_like(flags)
-    for bit, meaning in enumerate(_WITHOUT_LEGEND):
-        out[(flags >> bit) & 1 != 0] |= int(meaning)
-    return out
+    return np.asarray(hdu.data).astype(np.int64)

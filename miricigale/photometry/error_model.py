@@ -38,6 +38,14 @@ def _band(name):
 
 
 @checked_calls
+def add_noise(photometry, name, sigma, seed):
+    """Add noise of known errors, shape (n,), to the fluxes of a band in place; draws belong to ``id`` or row."""
+    keys = photometry["id"] if "id" in photometry.colnames else np.arange(len(photometry))
+    noise = [stream(seed, "photometry", name, str(key)).standard_normal() for key in keys]
+    photometry[name] = photometry[name] + np.array(noise) * sigma
+    photometry[error_column(name)] = sigma
+
+
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class ErrorModel(Interactive):
     """
@@ -368,12 +376,8 @@ class ErrorModel(Interactive):
         """
         table, filters = flux_table(photometry, filters, self.filters)
         seed = check_seed(seed)
-        keys = table["id"] if "id" in table.colnames else np.arange(len(table))
         for name in filters:
-            sigma = self.sigma(table[name], name)
-            noise = [stream(seed, "photometry", name, str(key)).standard_normal() for key in keys]
-            table[name] = table[name] + np.array(noise) * sigma
-            table[error_column(name)] = sigma
+            add_noise(table, name, self.sigma(table[name], name), seed)
         return table
 
     def to_table(self):

@@ -1,7 +1,6 @@
 """What photometry keeps in files: results and templates."""
 
 import dataclasses
-import json
 
 import astropy.units as u
 import numpy as np
@@ -65,12 +64,8 @@ def _write_templates(templates, path, *, overwrite=False):
 
 
 def _read_templates(path):
-    wanted = "templates of sources"
-    with open_parts(path, ("source-templates-2",), wanted=wanted, earlier="META") as parts:
+    with open_parts(path, ("source-templates-2",), wanted="templates of sources") as parts:
         text = parts.text
-        if parts.layout is None:
-            header = parts.header
-            text = {"meta": json.loads(header["META"]), "grid": header.get("GRID")}
         columns, rows = (_columns(parts.table(name)) for name in ("sources", "layers"))
         pixels = parts.array("pixels") if "pixels" in parts else np.empty(0)
         light = [None] * len(columns["id"])
@@ -105,7 +100,7 @@ def _read_templates(path):
 _ROWS = [
     "flux", "flux_err", "flux_err_noise", "flux_err_template", "flux_err_psf", "flags", "coverage",
     "chi2", "residual_fraction", "template", "template_snr", "crowded", "x", "y", "flux_point",
-    "flux_point_err", "flux_positive",
+    "flux_point_err",
 ]  # fmt: skip
 _QUANTITIES = ("background", "background_err", "shift", "shift_err", "psf_fwhm")
 _MATRICES = ("covariance", "joint_covariance")
@@ -154,7 +149,7 @@ def _read_result(path):
         text = parts.text
         wcs = text_grid(text["wcs"])
         columns = _table(parts, "sources")
-        found = {name: columns[name] for name in columns.colnames if name != "sky"}
+        found = {name: columns[name] for name in ("id", *_ROWS) if name in columns.colnames}
         for name, (value, unit) in text["quantities"].items():
             found[name] = value * u.Unit(unit)
         n = len(columns)

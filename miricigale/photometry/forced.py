@@ -90,9 +90,6 @@ class ForcedPhotometer(Interactive):
     second_pass : bool, optional
         Whether peaks of the residual that the catalog lacks are fitted together with it, as
         points; they are listed in ``new_sources`` of the result.
-    positive : bool, optional
-        Whether the solution without negative fluxes is given too (``flux_positive``). All else belongs to
-        the fluxes without that condition, which alone have no bias.
     errors : `ErrorSettings`, optional
         What the errors are made of.
     memory : `MemorySettings`, optional
@@ -159,7 +156,6 @@ class ForcedPhotometer(Interactive):
     integrate: bool = False
     components: int = 1
     second_pass: bool = False
-    positive: bool = False
     errors: ErrorSettings = dataclasses.field(default_factory=ErrorSettings)
     memory: MemorySettings = dataclasses.field(default_factory=MemorySettings)
     n_threads: int | None = None

@@ -8,6 +8,7 @@ import astropy.units as u
 import numpy as np
 from astropy.io import fits
 
+from miricigale.instrument.image_files import asdf_wcs
 from miricigale.utils.exceptions import (
     PhotometryWarning,
     argument_error,
@@ -15,7 +16,6 @@ from miricigale.utils.exceptions import (
     warn,
 )
 from miricigale.utils.files import open_fits, split_extension
-from miricigale.utils.optional import require
 
 
 class Opened(fits.HDUList):
@@ -134,10 +134,10 @@ def read_wcs(header, hdus):
     if "ASDF" not in hdus:
         return wcs if wcs.has_celestial else None
     if not wcs.has_celestial:
-        return _asdf_wcs(header, hdus)
+        return asdf_wcs(header, hdus)
     if is_exposure(lambda key: header.get(key, hdus[0].header.get(key))) and wcs.sip is None:
         try:
-            return _asdf_wcs(header, hdus)
+            return asdf_wcs(header, hdus)
         except ImportError as err:
             msg = (
                 f"{hdus.filename()}: the coordinates in the header lack the distortion, which is in "
@@ -150,24 +150,6 @@ def read_wcs(header, hdus):
 def is_exposure(get):
     """Whether a header (``get(keyword)``) is that of a single exposure of JWST, not resampled."""
     return get("S_WCS") == "COMPLETE" and get("S_RESAMP") != "COMPLETE"
-
-
-def _asdf_wcs(header, hdus):
-    """The gwcs of JWST's pipeline as FITS polynomials."""
-    import io
-
-    from astropy.wcs import WCS
-
-    require("gwcs", extra="gwcs")
-    asdf = require("asdf", extra="gwcs")
-    content = np.asarray(hdus["ASDF"].data["ASDF_METADATA"][0]).tobytes()
-    try:
-        with asdf.open(io.BytesIO(content)) as tree:
-            exact = tree["meta"]["wcs"]
-    except (KeyError, ValueError) as err:
-        raise data_error(hdus.filename(), f"has no gwcs in its extension ASDF: {err}") from err
-    box = tuple((-0.5, header[f"NAXIS{k}"] - 0.5) for k in (1, 2))
-    return WCS(exact.to_fits_sip(bounding_box=box, max_pix_error=0.01))
 
 
 def filter_name(get):

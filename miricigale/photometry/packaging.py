@@ -14,7 +14,6 @@ from miricigale.photometry.diagnostics import source_flags
 from miricigale.photometry.fields import SmoothField, n_terms
 from miricigale.photometry.fit_errors import fit_covariances
 from miricigale.photometry.flags import ForcedFlags
-from miricigale.photometry.nonnegative import nonnegative_fluxes
 from miricigale.photometry.residual_sources import unexplained_neighbors
 from miricigale.photometry.results import ForcedPhotometryResult, crowded
 from miricigale.utils.meta import provenance
@@ -83,12 +82,6 @@ def package(fit, diagnostics, new_xy, catalog, meta):
     columns["residual_fraction"] = left
     for name, error in zip(_TERMS, flux_err, strict=True):
         columns[f"flux_err{name}"] = error * FNU
-    if fit.settings.positive:
-        positive = np.full(n_all, np.nan)
-        if len(fit.rows):
-            positive[place[fit.rows]] = 0.0
-            np.add.at(positive, place[fit.rows], nonnegative_fluxes(*fit.solution))
-        columns["flux_positive"] = positive * FNU
     new = None
     if fit.settings.second_pass:
         names = ("flux", "flux_err", "flags", "coverage", "chi2")

@@ -125,8 +125,6 @@ class ForcedPhotometryResult(Tabular):
         None where no second components were asked for.
     joint_covariance : `~scipy.sparse.csr_array`, shape (2 n, 2 n), or None
         In uJy^2: of all ``flux``, then of all ``flux_point``.
-    flux_positive : `~astropy.units.Quantity`, shape (n,), or None
-        The fluxes of least chi-square of which none is negative (neither component's is).
     new_sources : `~astropy.table.QTable` or None
         What the catalog lacks, fitted with it: ``id`` (none of the catalog's), ``sky``,
         ``x_centroid``, ``y_centroid``, ``flux``, ``flux_err``, ``snr``, ``flags``, ``coverage`` and
@@ -192,7 +190,6 @@ class ForcedPhotometryResult(Tabular):
     flux_point: u.Quantity | None = None
     flux_point_err: u.Quantity | None = None
     joint_covariance: scipy.sparse.csr_array | None = None
-    flux_positive: u.Quantity | None = None
     new_sources: QTable | None = None
     psf_fwhm: u.Quantity | None = None
     meta: dict = dataclasses.field(default_factory=dict)
@@ -364,9 +361,6 @@ class ForcedPhotometryResult(Tabular):
         if self.flux_point is not None:
             columns[point] = self.flux_point, "Flux of the point on top of the template"
             columns[error_column(point)] = self.flux_point_err, "1-sigma error of the point's flux"
-        if self.flux_positive is not None:
-            text = "Total flux if no flux may be negative; its error is not known"
-            columns[f"{prefix}flux_positive"] = self.flux_positive, text
         return described_table(columns, dict(self.meta))
 
     def plot(self, ax=None, **kwargs):

@@ -213,14 +213,9 @@ class TemplateFit:
         return np.sqrt(target.sum() / (2 * np.pi * target.max())) * fine / self.scale
 
     @property
-    def solution(self):
-        """The linear fit that the fluxes are from, and how many of its unknowns are fluxes."""
-        return (self.fit if self.free is None else self.free.fit), len(self.rows)
-
-    @property
     def common(self):
         """The common parameters, shape (g,)."""
-        return self.solution[0].common
+        return (self.fit if self.free is None else self.free.fit).common
 
     def add_background(self, image, factor=1.0):
         """Add the fitted background, in uJy per pixel, times a factor to an image in place."""

@@ -77,6 +77,13 @@ class AgnSection(Section):
     threshold: float = option(0.5, low=0.0, high=1.0)
 
 
+#: Exposure times and dithers of CEERS by band.
+_CEERS = {
+    "time": dict.fromkeys(CEERS_FILTERS, 1665.0) | {"miri.f2100w": 4662.0},
+    "dithers": dict.fromkeys(CEERS_FILTERS, 3) | {"miri.f2100w": 6},
+}
+
+
 class ExposureSection(Section):
     """
     The MIRI bands, and how long each is exposed.
@@ -86,7 +93,8 @@ class ExposureSection(Section):
     bands
         MIRI filters.
     time
-        Exposure time (s) of each band in a pointing, all dithers; one for all.
+        Exposure time (s) of each band in a pointing, all dithers; one for all. By default that of CEERS, as the
+        dithers, and for bands that it does not have that of F770W.
     depth
         5-sigma AB depth of each band instead of a time.
     dithers
@@ -102,15 +110,22 @@ class ExposureSection(Section):
     """
 
     bands: tuple[str, ...] = option(CEERS_FILTERS, choices=imager_filters(), unique=True)
-    time: tuple[float, ...] = option(
-        (1665.0, 1665.0, 1665.0, 1665.0, 1665.0, 4662.0), low=0.0, single=True
-    )
+    time: tuple[float, ...] = option(tuple(_CEERS["time"].values()), low=0.0, single=True)
     depth: tuple[float, ...] = option((), low=10.0, high=40.0, single=True)
-    dithers: tuple[int, ...] = option((3, 3, 3, 3, 3, 6), low=1, high=500, single=True)
+    dithers: tuple[int, ...] = option(
+        tuple(_CEERS["dithers"].values()), low=1, high=500, single=True
+    )
     readout: str = option("FASTR1", choices=readout_patterns())
     max_fill: float = option(0.6, low=0.05, high=0.95)
     sets: tuple[str, ...] = ("all",)
     pointings: int = option(1, low=1, high=10000)
+
+    def __post_init__(self):
+        # other bands have the exposures of these, if nothing else is said
+        for key, known in _CEERS.items() if self.bands != CEERS_FILTERS else ():
+            if getattr(self, key) == tuple(known.values()):
+                values = tuple(known.get(name, known["miri.f770w"]) for name in self.bands)
+                object.__setattr__(self, key, values)
 
 
 class BackgroundSection(Section):

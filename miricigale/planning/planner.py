@@ -165,7 +165,8 @@ class Planner:
     def _existing(self):
         """Mock photometry in the existing bands, the same for every plan."""
         columns = self.sources[["id", *self.config.fit.bands]]
-        return existing_errors(self.config.fit).perturb(columns, seed=self.config.plan.seed)
+        depths = dict(zip(self.config.fit.bands, self.config.fit.depths, strict=True))
+        return existing_errors(depths).perturb(columns, seed=self.config.plan.seed)
 
     def photometry(self, plans, measured=None):
         """
@@ -237,7 +238,7 @@ class Planner:
         plans = {band: known[band] for band in bands}
         photometry = self.photometry(plans.values(), measured)
         axes = SEDModel.yang2021_axes(config.fit.axes)
-        fitter = study_fitter(config.fit, bands, axes=axes)
+        fitter = study_fitter(config.fit, [*config.fit.bands, *bands], axes=axes)
         results = fitter.fit(photometry, executor=self.executor)
         table = self._results(results, photometry, plans)
         pointings = config.exposures.pointings if pointings is None else pointings

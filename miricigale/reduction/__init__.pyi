@@ -6,7 +6,6 @@ from .background import BackgroundFlags as BackgroundFlags
 from .background import estimate_background as estimate_background
 from .background import remove_background as remove_background
 from .calibration import calibrate as calibrate
-from .calibration import find_cosmic_rays as find_cosmic_rays
 from .dither_background import dither_backgrounds as dither_backgrounds
 from .files import ImageFile as ImageFile
 from .files import open_exposure as open_exposure

@@ -1,7 +1,6 @@
 """Images of the pipeline's later stages as files: rates, calibrated images, mosaics."""
 
 import dataclasses
-import io
 import json
 import warnings
 from collections.abc import Mapping
@@ -27,7 +26,7 @@ from miricigale.instrument import (
     subarrays,
     with_own_bits,
 )
-from miricigale.instrument.image_files import json_meta
+from miricigale.instrument.image_files import asdf_wcs, json_meta
 from miricigale.reduction.assumed import middle_of
 from miricigale.reduction.images import flagged_image, plain_flags, plain_mask, sigma
 from miricigale.reduction.reference_maps import TYPES
@@ -35,7 +34,6 @@ from miricigale.reduction.references import ReferenceFiles
 from miricigale.utils.exceptions import argument_error, data_error
 from miricigale.utils.files import open_fits, write_fits
 from miricigale.utils.meta import undated
-from miricigale.utils.optional import require
 from miricigale.utils.parallel import check_memory
 from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS
 
@@ -310,19 +308,11 @@ def _wcs(hdus, header, meta):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FITSFixedWarning)
         wcs = WCS(science, naxis=2)
-    if wcs.has_celestial:
-        wcs.pixel_shape = (science["NAXIS1"], science["NAXIS2"])
-        return wcs
-    if "ASDF" not in hdus or not done:
-        return None
-    require("gwcs", extra="jwst")
-    asdf = require("asdf", extra="jwst")
-    stored = io.BytesIO(hdus["ASDF"].data.field(0)[0].tobytes())
-    with asdf.open(stored) as tree:
-        shape = (science["NAXIS1"], science["NAXIS2"])
-        box = ((-0.5, shape[0] - 0.5), (-0.5, shape[1] - 0.5))
-        wcs = WCS(tree["meta"]["wcs"].to_fits_sip(bounding_box=box))
-    wcs.pixel_shape = shape
+    if not wcs.has_celestial:
+        if "ASDF" not in hdus or not done:
+            return None
+        wcs = asdf_wcs(science, hdus)
+    wcs.pixel_shape = (science["NAXIS1"], science["NAXIS2"])
     return wcs
 
 

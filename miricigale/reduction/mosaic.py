@@ -390,7 +390,7 @@ def _meta(images):
     """What the inputs say of themselves, put together."""
     metas = [im.meta for im in images]
     meta = {"n_exposures": len(images)}
-    for key in ("exposure_time", "n_cosmic_rays", "n_negative", "n_outliers"):
+    for key in ("exposure_time", "n_negative", "n_outliers"):
         if all(key in m for m in metas):
             meta[key] = sum(m[key] for m in metas)
     for key in ("pa_aper", "dither", "background"):

@@ -87,10 +87,6 @@ class Reducer(Interactive):
         The settling after a reset, which is subtracted from the groups; none if not given.
     ramps : `RampSettings`, optional
         How ramps are fitted.
-    cosmic_rays : bool, optional
-        Whether residual cosmic rays are searched on the slope image (`find_cosmic_rays`). Off: ramps of 30
-        groups keep at most one hit in a full frame, and what the search flags lies in the wings of stars
-        (``benchmarks/cosmic_rays.py``). Of use in ramps of a few groups.
     background : `BackgroundSettings` or str, optional
         How backgrounds are estimated, or the method alone (``"dithers"``).
     mosaics : `MosaicSettings`, optional
@@ -125,7 +121,6 @@ class Reducer(Interactive):
     skip_last: int | None = None
     reset_anomaly: ResetAnomaly | None = None
     ramps: RampSettings = field(default_factory=RampSettings)
-    cosmic_rays: bool = False
     background: BackgroundSettings = field(default_factory=BackgroundSettings)
     mosaics: MosaicSettings = field(default_factory=MosaicSettings)
     references: object = None
@@ -240,8 +235,7 @@ class Reducer(Interactive):
         """
         Turn slopes into surface brightness.
 
-        Dark subtraction, flat field, photometric conversion, mask of the field and of
-        residual cosmic rays. The background stays.
+        Dark subtraction, flat field, photometric conversion and mask of the field. The background stays.
 
         Parameters
         ----------
@@ -260,7 +254,7 @@ class Reducer(Interactive):
                 raise argument_error("rate", f"an image whose meta has {key!r}", "none")
         brightness, used = brightness_of(self, rate)
         where = {"filter": facts.filter, "subarray": facts.subarray}
-        cal = calibrate(rate, **where, **brightness, cosmic_rays=self.cosmic_rays)
+        cal = calibrate(rate, **where, **brightness)
         cal.meta.update(used)
         return cal
 

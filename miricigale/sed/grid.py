@@ -18,7 +18,7 @@ DEFINITIONS = ("dust", "3-1000um")
 _SPAN = re.compile(r"(\d+(?:\.\d+)?)-(\d+(?:\.\d+)?)um")
 
 #: Layouts of files; in the second the facts that decide stood in the meta.
-_LAYOUTS = ("miricigale-modelgrid-3", "miricigale-modelgrid-2")
+_LAYOUT = "miricigale-modelgrid-3"
 _TABLES = (
     "galaxy_parameters",
     "agn_parameters",
@@ -38,8 +38,6 @@ _ARRAYS = {
     "allowed": (u.one, bool, "zg"),
     "agn_multiplicity": (u.one, np.int64, "a"),
 }
-#: What a model and the grids that it made have in common.
-RECIPE = ("components", "options", "imf", "frac_agn_definition", "cosmology")
 _FACTS = ("axes", "inert", "bounds", "frac_agn_definition", "recipe")
 
 
@@ -273,13 +271,12 @@ def _write(grid, path, *, overwrite=False):
     for name, (unit, *_) in _ARRAYS.items():
         array = getattr(grid, name)
         arrays[name] = array if unit == u.one else u.Quantity(array, unit, copy=False)
-    write_parts(path, _LAYOUTS[0], text=text, arrays=arrays, tables=tables, overwrite=overwrite)
+    write_parts(path, _LAYOUT, text=text, arrays=arrays, tables=tables, overwrite=overwrite)
 
 
 def _read(path):
-    with open_parts(path, _LAYOUTS, wanted="model grid data") as parts:
+    with open_parts(path, (_LAYOUT,), wanted="model grid data") as parts:
         text = parts.text
-        facts = text if parts.layout == _LAYOUTS[0] else _former_facts(text["meta"])
         # FITS cannot hold arrays without elements, those of AGN
         arrays = {n: parts.array(n) for n in _ARRAYS if n in parts}
         tables = {
@@ -291,27 +288,8 @@ def _read(path):
             **arrays,
             **tables,
             meta=text["meta"],
-            **{name: facts[name] for name in _FACTS},
+            **{name: text[name] for name in _FACTS},
         )
-
-
-def _former_facts(meta):
-    """Take the facts of a file of the layout before out of its meta."""
-    from miricigale.sed.presets import COMPONENTS
-
-    bounds = {}
-    for text in meta.get("components", ()):
-        name = text.partition(": ")[2].partition(" (")[0]
-        if name in COMPONENTS:
-            declared = COMPONENTS.get(name).declared()
-            bounds |= {key: parameter.bounds for key, parameter in declared.items()}
-    return {
-        "axes": meta.pop("axes", {}),
-        "inert": meta.pop("inert", ()),
-        "bounds": bounds,
-        "frac_agn_definition": meta.get("frac_agn_definition", DEFINITIONS[0]),
-        "recipe": {name: meta[name] for name in RECIPE if name in meta},
-    }
 
 
 def _described(table, descriptions):

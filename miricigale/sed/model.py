@@ -205,11 +205,6 @@ class SEDModel(Interactive):
         return presets.survey_axes(kind)
 
     @staticmethod
-    def survey_priors():
-        """Priors of these axes, measured on CEERS; see `miricigale.sed.survey_priors`."""
-        return presets.survey_priors()
-
-    @staticmethod
     def yang2021_axes(kind="fit"):
         """Axes of the grids of Yang et al. 2021; see `miricigale.sed.yang2021_axes`."""
         return presets.yang2021_axes(kind)

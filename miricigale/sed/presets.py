@@ -172,31 +172,6 @@ def survey_axes(kind="survey"):
     return _values(f"{kind.replace('-', '_')}_axes")
 
 
-def survey_priors():
-    """
-    Priors of the values of `survey_axes`, for ``priors`` of `~miricigale.fitting.BayesFitter`.
-
-    How often they occur among 386 sources of CEERS with S/N above 5 in two MIRI bands and five others, at
-    published redshifts most of which are photometric (the sample of `~miricigale.fitting.TemplateError.survey`):
-    the mean of two halves, each by five steps of `~miricigale.fitting.measure_priors` (``benchmarks/ceers.py``).
-    Redshifts and tori stay flat. Eight in ten have no AGN light that could be seen: leave ``frac_agn`` out, or put
-    in your own, where AGN are what is looked for. Another depth or selection has other galaxies.
-
-    Returns
-    -------
-    priors : dict of str to `~numpy.ndarray`
-        Weights of the values of each axis.
-
-    Examples
-    --------
-    >>> from miricigale.sed import survey_priors
-    >>> survey_priors()["frac_agn"]
-    array([8.018e-01, 1.079e-01, 5.650e-02, 2.260e-02, 8.100e-03, 2.800e-03,
-           3.000e-04])
-    """
-    return _values("survey_priors")
-
-
 def quasar_axes():
     """
     Axes of type-1 AGN that outshine their galaxies, for the chain of `SEDModel.survey`.

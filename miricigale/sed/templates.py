@@ -1,7 +1,8 @@
-"""Grids of given spectra at redshift 0, such as those of stars: each has a scale and nothing else."""
+"""Grids of given spectra, such as those of stars: each has a scale and nothing else."""
 
 import re
 import warnings
+from itertools import product
 from pathlib import Path
 
 import astropy.units as u
@@ -9,6 +10,7 @@ import numpy as np
 from astropy.table import QTable, Table
 
 from miricigale.filters import FilterSet
+from miricigale.sed.components.igm import Meiksin2006
 from miricigale.sed.grid import ModelGrid
 from miricigale.sed.spectrum import SED
 from miricigale.utils.exceptions import ModelWarning, argument_error, data_error, warn
@@ -26,6 +28,9 @@ _UNITS |= {"flam": _FLAM, "fnu": _FLAM * u.AA / u.Hz}
 _FAR = 100.0  # um
 #: Part of the wavelengths at the end of a spectrum whose mean its continuation starts from.
 _END = 0.95
+#: Balmer's limit in um; slopes of little red dots below and above it, where these end, and those of F_nu beyond.
+_BALMER = 0.3645
+_RED_DOTS = (-2.5, -2.0, -1.5), (0, 0.5, 1, 1.5, 2, 2.5), (0.7, 1.0, 1.4), (-1, 0, 1)
 
 
 def read_spectra(path):
@@ -110,9 +115,9 @@ def _unit(column, default):
     return default if column.unit is None else _UNITS.get(str(column.unit).lower(), column.unit)
 
 
-def template_grid(spectra, filters, *, beyond="error"):
+def template_grid(spectra, filters, *, beyond="error", redshift=None):
     """
-    A grid of given spectra at redshift 0, for `~miricigale.fitting.BayesFitter`.
+    A grid of given spectra, for `~miricigale.fitting.BayesFitter`: at redshift 0, or at redshifts.
 
     Parameters
     ----------
@@ -124,13 +129,16 @@ def template_grid(spectra, filters, *, beyond="error"):
         What is done with spectra that end before the bands do: they are refused, or continued with
         F_nu ~ wave^-2 to 100 um, with a warning. That holds within some percent for stars of 3500 K and
         above; for brown dwarfs and stars in dust it does not.
+    redshift : array_like, shape (n_z,), optional
+        Ascending redshifts at which the spectra, by wavelength at rest, are seen, behind the intergalactic medium
+        (`~miricigale.sed.components.Meiksin2006`); by default they are taken as they are.
 
     Returns
     -------
     grid : `ModelGrid`
-        One redshift, 0; as galaxies the templates, numbered by the parameter ``template``, each with a mean flux
-        of 1 uJy in the bands; no AGN. The scale of a fit (``mass`` of its results) is the mean flux in uJy.
-        ``meta["templates"]`` has the names.
+        One redshift, 0, or those given; as galaxies the templates, numbered by the parameter ``template``, each
+        with a mean flux of 1 uJy in the bands; no AGN. The scale of a fit (``mass`` of its results) is the mean
+        flux in uJy. ``meta["templates"]`` has the names.
 
     Raises
     ------
@@ -171,21 +179,75 @@ def template_grid(spectra, filters, *, beyond="error"):
         if short:
             msg = f"{len(short)} of {len(seds)} spectra continued to {last:.3g} with F_nu ~ wave^-2"
             warn(msg, ModelWarning)
-    flux = np.array([_fluxes(name, sed, filters) for name, sed in seds.items()])
+    z = np.zeros(1) if redshift is None else np.array(redshift, dtype=float, ndmin=1)
+    if z.ndim != 1 or not (np.all(np.diff(z) > 0) and z[0] >= 0 and np.isfinite(z[-1])):
+        raise argument_error("redshift", "finite, ascending and >= 0", f"{redshift}")
+    if redshift is None:
+        flux = np.array([[_fluxes(name, sed, filters) for name, sed in seds.items()]])
+    else:
+        flux = np.array([_seen(seds.values(), one, filters) for one in z])
+    mean = flux.mean(axis=-1, keepdims=True)
     n = len(seds)
     number = np.arange(n, dtype=float)
     templates = QTable({"template": number * u.one})
     templates["template"].info.description = "number of the template"
     return ModelGrid(
         filters=filters.names,
-        redshift=np.zeros(1),
-        galaxy=flux[None] / flux.mean(axis=1)[:, None],
+        redshift=z,
+        galaxy=np.divide(flux, mean, out=np.ones_like(flux), where=mean > 0),
         dust_luminosity=np.zeros(n),
-        allowed=np.ones((1, n), bool),
+        allowed=mean[..., 0] > 0,
         galaxy_parameters=templates,
         meta=provenance(templates=list(seds)),
-        axes={"redshift": np.zeros(1), "template": number},
+        axes={"redshift": z, "template": number},
     )
+
+
+def red_dots():
+    """
+    Spectra of little red dots, for `template_grid` at redshifts: broken power laws of the shape of a V.
+
+    F_lambda falls in the ultraviolet, with slopes of -2.5 to -1.5, and from Balmer's limit, 0.3645 um, is flat or
+    rises, with slopes of 0 to 2.5: within the bounds by which Kocevski et al. 2025 (ApJ 986, 126) select them, and
+    with the bend where Setton et al. 2024 (arXiv:2411.03424) find it. From 0.7, 1 or 1.4 um on F_nu has a slope of
+    -1, 0 or 1: little hot dust, or none. No lines; no light below 0.0912 um.
+
+    Returns
+    -------
+    spectra : dict of str to `SED`
+        162 of them, by wavelength at rest, 0.005 to 300 um.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.sed import red_dots, template_grid
+    >>> template_grid(red_dots(), ["nircam.f150w", "nircam.f444w"], redshift=[5.0, 6.0])
+    <ModelGrid 2 redshifts x 162 galaxies x 0 AGN x 1 fractions, 2 bands, 324 models>
+    """
+    # finely where bands of a survey are, at redshifts of 2 to 9
+    wave = np.unique(
+        np.concatenate([np.geomspace(0.005, 300, 800), np.geomspace(0.0912, 1.5, 1200)])
+    )
+    out = {}
+    for blue, red, turn, far in product(*_RED_DOTS):
+        fnu = (wave / _BALMER) ** (np.where(wave < _BALMER, blue, red) + 2.0)
+        end = (turn / _BALMER) ** (red + 2.0) * (wave / turn) ** far
+        fnu = np.where(wave < 0.0912, 0.0, np.where(wave < turn, fnu, end))
+        out[f"{blue:g} {red:g} {turn:g} {far:g}"] = SED(wave * WAVE, fnu * FNU)
+    return out
+
+
+def _seen(seds, redshift, filters):
+    """Fluxes of spectra at a redshift, of any scale: shape (n, n_filters)."""
+    out, known, igm = [], {}, Meiksin2006()
+    for sed in seds:
+        wave = sed.rest_wavelength.to_value(WAVE) * (1.0 + redshift)
+        # spectra often have the same wavelengths
+        key = wave.tobytes()
+        if key not in known:
+            known[key] = filters.weights(wave) * igm.transmission(wave, redshift)
+        out.append(known[key] @ sed.fnu.to_value(FNU))
+    return np.array(out)
 
 
 def _continued(sed):

@@ -102,9 +102,13 @@ def unknown_name(kind, name, known):
     return KeyError(f"no {kind} {name!r}; known: {', '.join(known)}{hint}")
 
 
+#: Modules that are not the caller of a public function.
+_INNER = ("miricigale.", "contextlib")
+
+
 def warn(message, category):
     """Warn at the line outside of the package that led here, however deep the call is."""
     frame, level = sys._getframe(1), 2
-    while frame.f_back and frame.f_globals.get("__name__", "").startswith("miricigale."):
+    while frame.f_back and frame.f_globals.get("__name__", "").startswith(_INNER):
         frame, level = frame.f_back, level + 1
     warnings.warn(message, category, stacklevel=level)

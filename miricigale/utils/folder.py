@@ -126,6 +126,7 @@ class RecordFolder(FileFolder):
 
     #: Whose folder it is, for messages; the name of its lock; and the name of the records in it.
     purpose = "run"
+    inputs = ()
     lock_name = "run.lock"
     records_name = "records"
     #: What to do about a folder that cannot be used.
@@ -214,7 +215,7 @@ class RecordFolder(FileFolder):
             )
             raise DataError(msg)
         # what was killed at its first moment leaves these
-        ours = (self.lock_name, f".{self.lock_name}", PARTIAL)
+        ours = (self.lock_name, f".{self.lock_name}", PARTIAL, *self.inputs)
         if self.folder.exists() and (
             not self.folder.is_dir()
             or any(not entry.name.startswith(ours) for entry in self.folder.iterdir())

@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import pickle
 import signal
+import sys
 import tempfile
 import threading
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
@@ -283,13 +284,16 @@ class _SingleThreaded:
     def __init__(self):
         self._lock = threading.Lock()
         self._users, self._limits = 0, []
+        self._pools, self._known = None, 0
 
     def __enter__(self):
         with self._lock:
             self._users += 1
-            # not only the first: libraries may have been loaded since
-            if any(pool["num_threads"] > 1 for pool in threadpoolctl.threadpool_info()):
-                self._limits.append(threadpoolctl.threadpool_limits(1))
+            # libraries may have been loaded since; looking for them takes milliseconds
+            if self._known != len(sys.modules):
+                self._pools, self._known = threadpoolctl.ThreadpoolController(), len(sys.modules)
+            if any(pool["num_threads"] > 1 for pool in self._pools.info()):
+                self._limits.append(self._pools.limit(limits=1))
 
     def __exit__(self, *exc):
         with self._lock:

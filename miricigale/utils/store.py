@@ -118,7 +118,7 @@ def write_parts(path, layout, *, shown=None, text=None, arrays=None, tables=None
 
 
 @contextlib.contextmanager
-def open_parts(path, layouts, *, wanted, memmap=False, earlier=None):
+def open_parts(path, layouts, *, wanted, memmap=False):
     """
     Open a file that `write_parts` wrote; what is wrong with it in the ``with`` block names it.
 
@@ -132,9 +132,6 @@ def open_parts(path, layouts, *, wanted, memmap=False, earlier=None):
         What the file should hold, for the message, such as ``"fit results"``.
     memmap : bool, optional
         Whether arrays stay on the disk until they are used.
-    earlier : str, optional
-        Keyword of the primary header by which files from before layouts had names are known; their
-        layout is None.
 
     Yields
     ------
@@ -147,13 +144,10 @@ def open_parts(path, layouts, *, wanted, memmap=False, earlier=None):
         (a `KeyError`, `IndexError`, `TypeError` or `ValueError`).
     """
     with open_fits(path, wanted=wanted, memmap=memmap) as hdus:
-        header = hdus[0].header
-        layout = header.get("FORMAT")
-        known = layout in layouts or (layout is None and earlier is not None and earlier in header)
-        if not known:
+        if hdus[0].header.get("FORMAT") not in layouts:
             raise data_error(path, f"holds no {wanted} (no FORMAT = {layouts[0]!r} in its header)")
         try:
-            yield Parts(hdus, layout)
+            yield Parts(hdus)
         except (KeyError, IndexError, TypeError, ValueError) as err:
             raise data_error(path, f"is not a complete file of {wanted}: {err}") from err
 
@@ -166,21 +160,17 @@ class Parts:
     ----------
     hdus : `~astropy.io.fits.HDUList`
         The open file.
-    layout : str or None
-        Its layout.
 
     Attributes
     ----------
-    layout : str or None
+    layout : str
         Name and version of the layout.
-    header : `~astropy.io.fits.Header`
-        The primary header.
     text : dict
         The text, empty if there is none.
     """
 
-    def __init__(self, hdus, layout):
-        self._hdus, self.layout, self.header = hdus, layout, hdus[0].header
+    def __init__(self, hdus):
+        self._hdus, self.layout = hdus, hdus[0].header["FORMAT"]
         self._names = {hdu.name for hdu in hdus}
         self.text = {}
         if _TEXT in self._names:

@@ -5,6 +5,7 @@ from importlib import resources
 from pathlib import Path
 from typing import ClassVar
 
+from miricigale.refdata import resources as known_resources
 from miricigale.utils.exceptions import ConfigError, unknown_name
 from miricigale.workflow.background import check_levels
 from miricigale.workflow.options import Configuration, read_text
@@ -112,6 +113,9 @@ class StudyConfig(Configuration):
             self.check(good, "reduction.backend", f"must be 'native' {rates}")
         wanted = f"must be at most the number of MIRI filters ({n})"
         self.check(fit.min_detected <= n, "fit.min_detected", wanted)
+        good = fit.depths or not fit.bands or self.catalog.source not in known_resources()
+        wanted = f"must have one number per band ({len(fit.bands)}), for the catalog has no errors"
+        self.check(good, "fit.depths", wanted)
         photometry, fine = self.photometry, self.highres.pixel_scale == 0.06
         good = photometry.method != "yang2021" or fine
         self.check(good, "highres.pixel_scale", "must be 0.06 with method = 'yang2021'")

@@ -286,8 +286,6 @@ class ReductionSection(Section):
         Who fits the ramps: own, or the steps of the official pipeline (jwst, to be installed).
     jump_threshold
         Jump detection threshold in sigma.
-    residual_cosmic_rays
-        Whether hits that ramps kept are searched on single images (L.A.Cosmic).
     background
         Background: about masked sources, the plain mesh of sep, or that of the other dithers (three or
         more).
@@ -309,7 +307,6 @@ class ReductionSection(Section):
 
     backend: str = option("native", choices=("native", "jwst"))
     jump_threshold: float = option(5.0, low=2.0, high=50.0)
-    residual_cosmic_rays: bool = False
     background: str = option("masked", choices=("masked", "sep", "dithers"))
     background_box: int = option(64, low=8, high=512)
     background_filter: int = option(3, low=1, high=15)
@@ -394,7 +391,7 @@ class FitBasics(Section):
     def __post_init__(self):
         n = len(self.bands)
         wanted = f"must have one number per band ({n})"
-        require(len(self.depths) == n, "fit", "depths", wanted, len(self.depths))
+        require(len(self.depths) in (0, n), "fit", "depths", wanted, len(self.depths))
 
 
 class FitSection(FitBasics):
@@ -403,12 +400,20 @@ class FitSection(FitBasics):
 
     Parameters
     ----------
+    bands
+        Existing bands: by default all of the catalog that are not simulated, and of the bundled catalogs
+        those of Yang et al. 2021.
+    depths
+        Their 5-sigma AB depths; without any each source has the errors of the catalog, and no flux where it has
+        none.
     sets
         Sets of the MIRI bands that are fitted with the existing ones.
     experiments
         Further fits of each sample with all MIRI bands.
     """
 
+    bands: tuple[str, ...] = ()
+    depths: tuple[float, ...] = ()
     sets: tuple[str, ...] = option(("all", "none"), choices=SETS, unique=True)
     experiments: tuple[str, ...] = option((), choices=EXPERIMENTS, unique=True)
 

@@ -15,7 +15,7 @@ from miricigale.workflow.options import of_option
 from miricigale.workflow.sections import HighresSection
 from miricigale.workflow.stages import study_stages
 from miricigale.workflow.stages.exposures import grid_of, study_background, study_exposures
-from miricigale.workflow.stages.inputs import study_catalog
+from miricigale.workflow.stages.inputs import existing_bands, study_catalog
 from miricigale.workflow.truths import CATALOG
 from miricigale.workflow.warmup import compile_missing
 
@@ -47,7 +47,7 @@ def check_study(config):
         path = getattr(config.perturb, key)
         good = not path or Path(file_place(path)[0]).expanduser().is_file()
         config.check(good, f"perturb.{key}", "must be a file")
-    unknown = sorted(set(config.fit.bands).difference(Filter.names()))
+    unknown = sorted(set(existing_bands(config)).difference(Filter.names()))
     wanted = "must be filters that 'miricigale filters' lists"
     config.check(not unknown, "fit.bands", wanted, unknown)
     with of_option("[exposures]", KeyError, ValueError):

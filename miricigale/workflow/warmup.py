@@ -11,11 +11,12 @@ import hashlib
 import importlib.metadata
 import logging
 import os
-import platform
 import subprocess
 import sys
 import threading
 from pathlib import Path
+
+import llvmlite.binding as llvm
 
 from miricigale.utils.parallel import parallel_map, threads
 
@@ -226,21 +227,13 @@ def _numba_folder():
 def _key():
     """What the compiled code depends on: the sources as numba sees them, packages, processor."""
     package = _PACKAGE
-    parts = [str(package), sys.version, _processor(), os.environ.get("NUMBA_CPU_NAME", "")]
+    processor = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
+    parts = [str(package), sys.version, *processor, os.environ.get("NUMBA_CPU_NAME", "")]
     parts += [importlib.metadata.version(name) for name in ("numba", "llvmlite", "numpy")]
     for path in sorted([*package.glob("*/_core.py"), *package.glob("*/_core/*.py")]):
         state = path.stat()
         parts.append(f"{path.relative_to(package)} {state.st_size} {state.st_mtime_ns}")
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
-
-
-def _processor():
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return f"{platform.machine()} {platform.processor()}"
-    wanted = ("model name", "flags", "Features", "CPU part")
-    return "\n".join(dict.fromkeys(line for line in lines if line.startswith(wanted)))
 
 
 def compile_and_end(name):

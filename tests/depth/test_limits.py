@@ -166,7 +166,7 @@ def test_noise_is_that_of_simulated_and_reduced_exposures(residual, n_exposures,
     level = background_level(name).value
     meta = {"psf_includes": ["pixel", "ipc"]}
     sky = CCDData(np.full(exposure.shape, level), unit="MJy/sr", meta=meta)
-    reducer = Reducer(cosmic_rays=False, jump_threshold=None)
+    reducer = Reducer(jump_threshold=None)
     # the same pattern in each, other photons
     ramps = (detector.expose(sky, exposure, seed=k) for k in range(n_exposures))
     mean = np.mean([reducer.calibrate(reducer.fit_ramp(one)).data for one in ramps], axis=0)

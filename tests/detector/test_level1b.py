@@ -172,17 +172,16 @@ def with_meta(path, new, meta):
     return new
 
 
-def test_effects_of_earlier_files_and_of_other_packages_are_read(ramp, tmp_path):
-    # as their repr, in the meta dictionary
+def test_effects_of_other_packages_are_read(ramp, tmp_path):
     first = ramp.write(tmp_path / "a_uncal.fits")
-    reset = "ResetAnomaly(amplitudes=(-3.0,), groups=4.0)"
-    texts = ["Photons(flat=True)", reset, "Glow(rate=-2.5)"]
-    old = Ramp.read(with_meta(first, tmp_path / "old.fits", {"seed": 9, "effects": texts}))
+    reset = {"effect": "ResetAnomaly", "amplitudes": [-3.0], "groups": 4.0}
+    records = [{"effect": "Photons", "flat": True}, reset, {"effect": "Glow", "rate": -2.5}]
+    old = Ramp.read(with_meta(first, tmp_path / "old.fits", {"seed": 9, "effects": records}))
     other = OtherEffect("Glow", (("rate", -2.5),))
     assert old.effects == (Photons(), ResetAnomaly((-3.0,)), other)
     assert old.meta == {"seed": 9}
     assert Ramp.read(old.write(tmp_path / "new.fits")).effects == old.effects
-    for record in ("Dark(", {"effect": "Dark", "x": 1}):
+    for record in ("Dark()", {"effect": "Dark", "x": 1}):
         broken = with_meta(first, tmp_path / "broken.fits", {"effects": [record]})
         wanted = r"broken\.fits cannot be read as a ramp of the MIRI imager"
         refuses(wanted, Ramp.read, broken, error=DataError)

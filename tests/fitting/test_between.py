@@ -74,10 +74,10 @@ def drawn():
     return photometry_table(BANDS, model + noise, error, z=true["redshift"]), true
 
 
-def interpolated(grid, n, finer=None):
+def interpolated(grid, n, finer=None, model_error=0.0):
     """A fit with n models between the nodes of each object."""
     settings = GridSettings(interpolate=n, finer=finer)
-    return BayesFitter(grid, model_error=0.0, settings=settings)
+    return BayesFitter(grid, model_error=model_error, settings=settings)
 
 
 def coverage(results, true, name):
@@ -89,7 +89,7 @@ def coverage(results, true, name):
 def test_intervals_hold_the_truth_between_nodes(grid, drawn):
     table, true = drawn
     results = interpolated(grid, 150).fit(table)
-    nodes = BayesFitter(grid, model_error=0.0).fit(table)
+    nodes = interpolated(grid, 0).fit(table)
     for name in ("redshift", "tau", "ebv", "mass", "sfr", "beta"):
         # three times the binomial error of 300 objects
         assert abs(coverage(results, true, name) - 0.68) < 0.08, name
@@ -101,12 +101,12 @@ def test_intervals_hold_the_truth_between_nodes(grid, drawn):
 
 def test_what_rests_on_one_node_is_flagged(grid, drawn):
     table, _ = drawn
-    nodes = BayesFitter(grid, model_error=0.0).fit(table)
+    nodes = interpolated(grid, 0).fit(table)
     alone = (nodes.flags & int(FitFlags.ONE_NODE)) != 0
     top = np.minimum(nodes.pdf["redshift"].max(1), nodes.pdf["tau"].max(1))
     assert np.all(top[alone] > 0.95)
     assert alone.sum() > 50
-    wide = BayesFitter(grid, model_error=1.0).fit(table)
+    wide = interpolated(grid, 0, model_error=1.0).fit(table)
     assert not np.any(wide.flags & int(FitFlags.ONE_NODE))
 
 
@@ -139,7 +139,7 @@ def test_chi2_and_evidence_are_those_at_the_known_redshift(grid):
     evidence = np.log(np.mean(np.exp(-0.5 * chi2), axis=1))
     evidence -= np.log(np.sqrt(2 * np.pi) * error).sum(axis=1)
     assert_allclose(results.log_evidence, evidence, rtol=1e-6)
-    nodes = BayesFitter(grid, model_error=0.0).fit(table, redshift=z)
+    nodes = interpolated(grid, 0).fit(table, redshift=z)
     assert np.median(nodes.chi2) > 1.3 * np.median(results.chi2)
 
 
@@ -205,11 +205,12 @@ def test_interpolated_models_are_those_of_the_chain(chain, off_nodes):
     want = np.column_stack([fluxes[name].value for name in CHAIN_BANDS])
     off = []
     for finer in (None, model):
-        models = interpolated(grid, 1, finer).backend.between
-        flux, power = models.fluxes(models.models(values))
+        models = interpolated(grid, 1, finer).backend.between.finer
+        flux, power = models.fluxes(values, values["redshift"], values["frac_agn"])
         ratio = np.log(flux * 1e10 / want)
         off.append(np.sqrt(np.mean(np.minimum(np.abs(ratio), 0.3) ** 2)))
-        derived = models.describe(models.models(values), power, np.full(len(want), 1e10))[1]
+        mass = np.full(len(want), 1e10)
+        derived = models.describe(values, values["redshift"], power, mass)
     assert off[0] > 0.1
     assert off[1] < 0.02
     for name, within in (("stellar_mass", 0.005), ("sfr", 0.1), ("dust_luminosity", 0.05)):
@@ -220,7 +221,7 @@ def test_intervals_of_galaxies_and_agn(chain, off_nodes):
     """Of models of the chain, two-sided; ``benchmarks/intervals.py`` measures more of them."""
     (model, grid), (table, true, _) = chain, off_nodes
     results = interpolated(grid, 300, model).fit(table)
-    nodes = BayesFitter(grid, model_error=0.0).fit(table)
+    nodes = interpolated(grid, 0).fit(table)
     names = ("redshift", "frac_agn", "stellar_mass", "sfr", "dust_luminosity")
     held = {}
     for name in names:
@@ -245,7 +246,7 @@ def test_known_redshifts_between_nodes_are_those_of_the_chain(chain):
     results = interpolated(grid, 20, model).fit(table, redshift=known)
     # fluxes are good to half a percent, a quarter of their errors
     assert np.all(results.chi2 < len(CHAIN_BANDS) / 10)
-    nodes = BayesFitter(grid, model_error=0.0).fit(table, redshift=known)
+    nodes = interpolated(grid, 0).fit(table, redshift=known)
     assert np.all(nodes.chi2 > 10 * results.chi2)
     for name in ("age", "tau", "ebv"):
         assert_allclose(u.Quantity(results.best[name]).value, true[name].value)

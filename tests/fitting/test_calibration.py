@@ -9,8 +9,7 @@ from astropy.table import QTable
 from numpy.testing import assert_array_less
 from scipy import stats
 
-from helpers.grids import cells, make_grid, photometry_table
-from miricigale.fitting import BayesFitter
+from helpers.grids import cells, make_grid, node_fitter, photometry_table
 from miricigale.fitting.posterior import randomized_ranks
 from miricigale.fitting.quantities import DERIVED_LEVELS
 
@@ -42,7 +41,7 @@ def fitted():
     shape["u_v"] = rng.normal(0.5, 0.7, grid.n_galaxies) * u.mag
     grid = dataclasses.replace(grid, galaxy_shape=shape)
     drawn = _draw(grid, N, rng)
-    results = BayesFitter(grid, model_error=0.0).fit(drawn[0])
+    results = node_fitter(grid, model_error=0.0).fit(drawn[0])
     assert results.fitted.all()
     return grid, results, drawn[1:], rng
 

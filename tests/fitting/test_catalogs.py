@@ -9,7 +9,7 @@ from astropy.table import Column, MaskedColumn, QTable, Table
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
-from helpers.grids import brute_force, draw_photometry, make_grid
+from helpers.grids import brute_force, draw_photometry, make_grid, node_fitter
 from miricigale.fitting import (
     BayesFitter,
     FitFlags,
@@ -41,7 +41,7 @@ def wider(catalog):
 
 
 def test_bands_that_the_grid_lacks_are_named(grid, catalog, wider):
-    fitter = BayesFitter(grid)
+    fitter = node_fitter(grid)
     text = r"are not fitted: hst\.f606w, miri\.f560w$"
     with pytest.warns(MiricigaleWarning, match=text) as record:
         results = fitter.fit(wider)
@@ -56,7 +56,7 @@ def test_bands_that_the_grid_lacks_are_named(grid, catalog, wider):
         warnings.simplefilter("error")
         alone = fitter.fit(catalog)
         # who names the bands knows
-        chosen = BayesFitter(grid, ["band0", "band1", "band2"]).fit(wider)
+        chosen = node_fitter(grid, ["band0", "band1", "band2"]).fit(wider)
     assert alone.meta["fit"]["unused_bands"] == []
     assert_array_equal(alone.chi2, results.chi2)
     unused = ["band3", "band4", "band5", "hst.f606w", "miri.f560w"]
@@ -66,7 +66,7 @@ def test_bands_that_the_grid_lacks_are_named(grid, catalog, wider):
 def test_a_catalog_on_disk_is_warned_of_once(grid, wider, tmp_path):
     wider.write(tmp_path / "cat.fits")
     with pytest.warns(MiricigaleWarning, match="hst.f606w") as record:
-        results = fit_file(BayesFitter(grid), tmp_path / "cat.fits", tmp_path / "o", chunk_rows=2)
+        results = fit_file(node_fitter(grid), tmp_path / "cat.fits", tmp_path / "o", chunk_rows=2)
     assert [w.filename for w in record if issubclass(w.category, MiricigaleWarning)] == [__file__]
     for part in results.parts():
         assert part.meta["fit"]["unused_bands"] == ["hst.f606w", "miri.f560w"]
@@ -80,20 +80,20 @@ def test_masked_ids_are_refused(grid, catalog, tmp_path, kind):
     table = Table(catalog)
     table["id"] = MaskedColumn(np.arange(6).astype(kind), mask=[0, 0, 0, 0, 1, 0])
     match = "'photometry' must be a table with an id in every row, got 1 masked or empty"
-    refuses(rf"{match}, the first in row 4 \(from 0\)", BayesFitter(grid).fit, table)
+    refuses(rf"{match}, the first in row 4 \(from 0\)", node_fitter(grid).fit, table)
     if kind is str:
         # as some files have them
         table["id"] = [*"abcd", "", "f"]
-        refuses(match, BayesFitter(grid).fit, table)
+        refuses(match, node_fitter(grid).fit, table)
         table.write(tmp_path / "cat.ecsv")
         with pytest.raises(ValueError, match=match) as error:
-            fit_file(BayesFitter(grid), tmp_path / "cat.ecsv", tmp_path / "o", chunk_rows=3)
+            fit_file(node_fitter(grid), tmp_path / "cat.ecsv", tmp_path / "o", chunk_rows=3)
         assert "in rows 3 to 5 of" in error.value.__notes__[0]
 
 
 def test_text_ids_are_text_wherever_they_come_from(grid, catalog, tmp_path):
     catalog["id"] = [f"g{i}" for i in range(6)]
-    fitter = BayesFitter(grid)
+    fitter = node_fitter(grid)
     want, drawn = fitter.fit(catalog), fitter.sample(catalog, 5, seed=1)
     catalog.write(tmp_path / "cat.fits")
     read = Table.read(tmp_path / "cat.fits", character_as_bytes=True)
@@ -126,7 +126,7 @@ def test_text_ids_are_text_wherever_they_come_from(grid, catalog, tmp_path):
 @pytest.mark.parametrize("name", ["Kümmel 3", "b "])
 def test_ids_that_fits_files_cannot_hold_are_named(grid, catalog, tmp_path, name):
     catalog["id"] = ["a", "b", name, "c", "d", "e"]
-    fitter = BayesFitter(grid)
+    fitter = node_fitter(grid)
     results, samples = fitter.fit(catalog), fitter.sample(catalog, 2, seed=1)
     for item in (results, samples):
         assert item[name] is not None
@@ -140,7 +140,7 @@ def test_ids_of_any_number_survive_files(grid, catalog, tmp_path, dtype):
     ids = np.array([1, 2, 3, 4, top - 1, top], dtype=known)
     table = Table(catalog)
     table["id"] = ids
-    fitter = BayesFitter(grid)
+    fitter = node_fitter(grid)
     results, samples = fitter.fit(table), fitter.sample(table, 2, seed=1)
     assert not np.any(results.flags & int(FitFlags.DUPLICATE_ID))
     results.write(tmp_path / "r.fits")
@@ -153,11 +153,11 @@ def test_ids_of_any_number_survive_files(grid, catalog, tmp_path, dtype):
 def test_bytes_that_are_no_text_are_refused(grid, catalog):
     table = Table(catalog)
     table["id"] = np.array([b"a", "ä".encode("latin1"), b"c", b"d", b"e", b"f"])
-    refuses(r"bytes of text in UTF-8, got b'\\xe4'", BayesFitter(grid).fit, table)
+    refuses(r"bytes of text in UTF-8, got b'\\xe4'", node_fitter(grid).fit, table)
 
 
 def test_masked_redshifts_are_missing(grid, catalog):
-    fitter = BayesFitter(grid)
+    fitter = node_fitter(grid)
     z = np.array(catalog["redshift"], dtype=float)
     mask = np.arange(6) == 2
     want = fitter.fit(catalog, redshift=np.where(mask, np.nan, z))
@@ -171,7 +171,7 @@ def test_masked_redshifts_are_missing(grid, catalog):
 
 
 def test_masked_densities_are_missing(grid, catalog):
-    fitter = BayesFitter(grid)
+    fitter = node_fitter(grid)
     nodes = np.linspace(0.0, 3.0, 31)
     density = np.ma.array(np.ones((6, 31)), mask=np.zeros((6, 31), dtype=bool))
     density[3, 7:9] = np.ma.masked
@@ -184,9 +184,9 @@ def test_masked_densities_are_missing(grid, catalog):
 
 
 def test_errors_may_be_per_cent(grid, catalog):
-    want = BayesFitter(grid, model_error=0.2, error_floor={"band1": 0.3}).fit(catalog)
+    want = node_fitter(grid, model_error=0.2, error_floor={"band1": 0.3}).fit(catalog)
     floor = {"band1": 30 * u.percent}
-    got = BayesFitter(grid, model_error=20 * u.percent, error_floor=floor).fit(catalog)
+    got = node_fitter(grid, model_error=20 * u.percent, error_floor=floor).fit(catalog)
     assert_allclose(got.sigma, want.sigma, rtol=1e-12)
     for bad, error, text in (
         (0.1 * u.uJy, u.UnitsError, "be convertible to"),
@@ -207,7 +207,7 @@ def test_without_signal_the_posterior_is_the_prior(flux, limited):
     if limited:
         table["band5"][1] = 1.0 * table["band5_err"][1]
         table["band5_limit"] = [False, True, False]
-    fitter = BayesFitter(grid, priors={"tau": weights}, model_error=0.0)
+    fitter = node_fitter(grid, priors={"tau": weights}, model_error=0.0)
     results = fitter.fit(table)
     assert list(results.ids) == [0, 1, 2]
     assert results.fitted.all()
@@ -240,7 +240,7 @@ def test_the_best_model_has_the_lowest_chi2_of_those_that_matter():
         weights[g // 4] = 1e-30
         for rtol in (0.0, 1e-6):
             priors = {"tau": weights}
-            fitter = BayesFitter(grid, priors=priors, settings=GridSettings(rtol=rtol))
+            fitter = node_fitter(grid, priors=priors, settings=GridSettings(rtol=rtol))
             results = fitter.fit(table[i : i + 1])
             want = brute_force(grid, results.flux[0], results.sigma[0], priors=priors)
             if rtol == 0.0:
@@ -258,14 +258,14 @@ def test_the_best_model_has_the_lowest_chi2_of_those_that_matter():
 def test_tables_of_any_kind_are_the_same_fit(grid, catalog, tmp_path):
     """Plain columns with units, other units, files, NaN that files mask."""
     catalog["band1"][2] = np.nan
-    want = BayesFitter(grid).fit(catalog)
+    want = node_fitter(grid).fit(catalog)
     plain = Table(catalog)
     catalog.write(tmp_path / "cat.fits")
     catalog.write(tmp_path / "cat.ecsv")
     tables = [plain, Table(plain, masked=True)]
     tables += [cls.read(tmp_path / f"cat.{x}") for cls in (Table, QTable) for x in ("fits", "ecsv")]
     for table in tables:
-        got = BayesFitter(grid).fit(table)
+        got = node_fitter(grid).fit(table)
         assert_allclose(got.chi2, want.chi2, rtol=1e-12)
         assert_array_equal(got.flags, want.flags)
         assert_array_equal(got.n_bands, want.n_bands)
@@ -277,7 +277,7 @@ def test_fluxes_are_numbers(grid, catalog):
     for kind, values in columns.items():
         table["band1"] = Column(values, unit="uJy")
         match = f"'photometry' must be a table with numbers in column 'band1', got {kind}"
-        refuses(match, BayesFitter(grid).fit, table)
+        refuses(match, node_fitter(grid).fit, table)
 
 
 @pytest.mark.parametrize(
@@ -291,7 +291,7 @@ def test_codes_beyond_all_measurements_are_left_out(grid, catalog, column, code)
     missing = catalog.copy()
     missing[column][1] = np.nan
     catalog[column][1] = code * u.uJy
-    fitter = BayesFitter(grid)
+    fitter = node_fitter(grid)
     got, want = fitter.fit(catalog), fitter.fit(missing)
     assert_array_equal(got.flags, want.flags | np.where(np.arange(6) == 1, int(flag), 0))
     for name in ("chi2", "log_evidence", "moments", "n_bands"):
@@ -304,7 +304,7 @@ def test_fluxes_without_noise_give_their_model_back(noise):
     table, truth = draw_photometry(grid, 20, noise=1e-300)
     for name in grid.filters:
         table[f"{name}_err"] = noise * table[name]
-    fitter = BayesFitter(grid, model_error=0.0)
+    fitter = node_fitter(grid, model_error=0.0)
     results = fitter.fit(table)
     mass = np.array([model[-1] for model in truth])
     assert_allclose(results.mean("mass").value, mass, rtol=1e-6)
@@ -334,11 +334,11 @@ def coded(catalog):
 def test_numbers_that_look_like_codes_are_reported_before_the_fit(grid, catalog, tmp_path):
     wanted = r": look like .* as they are: band1 2 of 6 \(-999, -99\); band2 1 of 6 \(99\)"
     with pytest.warns(MiricigaleWarning, match=f"photometry{wanted}") as record:
-        BayesFitter(grid).fit(coded(catalog))
+        node_fitter(grid).fit(coded(catalog))
     assert [one.filename for one in record] == [__file__]
     # those of a whole file are counted
     path = tmp_path / "catalog.fits"
     coded(catalog).write(path)
     with pytest.warns(MiricigaleWarning, match=rf"catalog\.fits{wanted}") as record:
-        fit_file(BayesFitter(grid), path, tmp_path / "out", chunk_rows=2)
+        fit_file(node_fitter(grid), path, tmp_path / "out", chunk_rows=2)
     assert len(record) == 1

@@ -13,7 +13,17 @@ from helpers.errors import refuses
 from helpers.grids import photometry_table
 from miricigale.filters import FilterSet
 from miricigale.fitting import BayesFitter, FitFlags, TemplateError, compare_classes
-from miricigale.sed import SED, ModelGrid, SEDModel, quasar_axes, read_spectra, template_grid
+from miricigale.fitting.pulls import without_warnings
+from miricigale.sed import (
+    SED,
+    ModelGrid,
+    SEDModel,
+    quasar_axes,
+    read_spectra,
+    red_dots,
+    template_grid,
+)
+from miricigale.sed.components import Meiksin2006
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
 
 BANDS = ["acs.f606w", "wfc3.f125w", "wfc3.f160w", "irac.ch1", "miri.f770w", "miri.f1500w"]
@@ -128,7 +138,8 @@ def sources(n, seed):
 def test_sources_of_known_class_are_sorted(fitters):
     """At S/N 20 in six bands nine of ten of each class are found, stars always (Planck's law is narrow)."""
     n = 20
-    table = compare_classes({name: f.fit(sources(n, 11)) for name, f in fitters.items()})
+    with without_warnings():
+        table = compare_classes({name: f.fit(sources(n, 11)) for name, f in fitters.items()})
     right = np.char.startswith(table["id"].astype(str), table["class"].astype(str))
     galaxy, quasar, star = right.reshape(3, n).sum(axis=1)
     assert galaxy >= 0.9 * n
@@ -138,6 +149,57 @@ def test_sources_of_known_class_are_sorted(fitters):
     ratio = np.array([table["log_ratio_quasar"], table["log_ratio_star"]])
     wanted = 1.0 / (1.0 + np.exp(ratio).sum(axis=0))
     assert_allclose(table["probability_galaxy"], wanted, rtol=1e-9, atol=1e-300)
+
+
+def test_spectra_at_redshifts_are_seen_behind_the_medium():
+    """A power law is the same at any redshift but for what hydrogen absorbs of it."""
+    wave = np.geomspace(0.01, 40, 3000)
+    spectra = {"a": SED(wave * u.um, wave**0.7 * u.uJy), "b": planck(5000) * 1e-9}
+    bands = ["acs.f606w", "nircam.f200w", "nircam.f444w"]
+    grid = template_grid({"a": spectra["a"]}, bands, redshift=[1.0, 4.0])
+    here = template_grid({"a": spectra["a"]}, bands).galaxy[0, 0]
+    assert_allclose(grid.galaxy[:, 0, 1] / grid.galaxy[:, 0, 2], here[1] / here[2], rtol=1e-4)
+    seen = SED(wave * 5 * u.um, Meiksin2006().transmission(wave * 5, 4.0) * wave**0.7 * u.uJy)
+    flux = FilterSet.from_names(bands).synthetic_fluxes(seen)
+    assert_allclose(grid.galaxy[1, 0], flux / flux.mean(), rtol=1e-6)
+    assert grid.galaxy[1, 0, 0] < 0.8 * here[0] * grid.galaxy[1, 0, 1] / here[1]
+    refuses("'redshift' must be finite, asc", template_grid, spectra, bands, redshift=[2, 1])
+
+
+def test_little_red_dots_are_no_dwarfs(fitters):
+    """Broken power laws between the nodes, with a line, are red dots, at 0.15 of 1 + z; galaxies stay such."""
+    bands = [
+        "acs.f814w",
+        "nircam.f115w",
+        "nircam.f150w",
+        "nircam.f277w",
+        "nircam.f444w",
+        "miri.f770w",
+    ]
+    z, wave = np.linspace(4.6, 7.4, 12), np.geomspace(0.03, 5, 4000)
+    fnu = np.where(wave < 0.3645, (wave / 0.3645) ** -0.2, (np.minimum(wave, 0.9) / 0.3645) ** 3.2)
+    fnu += 0.2 * fnu.max() * (np.abs(wave / 0.6563 - 1) < 0.003)
+    grid = template_grid({"dot": SED(wave * u.um, fnu * u.uJy)}, bands, redshift=z)
+    dots = noisy(grid.galaxy[:, 0], 12, 3, z.astype(str), bands)
+    error = {"model_error": 0.1}
+    shapes = template_grid(red_dots(), bands, redshift=np.expm1(np.arange(1.1, 2.3, 0.04)))
+    classes = {"red_dot": BayesFitter(shapes, **error)}
+    axes = {name: axis.values for name, axis in fitters["galaxy"].priors.axes.items()}
+    axes |= {"redshift": np.expm1(np.arange(0.02, 2.1, 0.05))}
+    model = SEDModel.survey()
+    classes = {"galaxy": BayesFitter(model, bands, axes=axes, **error)} | classes
+    with without_warnings():
+        found = {name: fitter.fit(dots) for name, fitter in classes.items()}
+    assert np.sum(compare_classes(found)["class"] == "red_dot") >= 11
+    middle = found["red_dot"].median("redshift").value
+    assert np.median(np.abs(middle - z) / (1 + z)) < 0.15
+    grid, rng = classes["galaxy"].grid, np.random.default_rng(5)
+    z, galaxy = rng.permutation(np.argwhere(grid.allowed))[:40].T
+    flux = grid.galaxy[z, galaxy]
+    table = noisy(flux / flux.mean(axis=1, keepdims=True), 12, 6, np.arange(40), bands)
+    with without_warnings():
+        found = {name: fitter.fit(table) for name, fitter in classes.items()}
+    assert np.sum(compare_classes(found)["class"] == "galaxy") >= 38
 
 
 def test_priors_of_classes_and_what_is_refused(fitters):

@@ -8,8 +8,15 @@ import pytest
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
-from helpers.grids import assert_plain, brute_force, draw_photometry, make_grid, photometry_table
-from miricigale.fitting import BayesFitter, GridSettings
+from helpers.grids import (
+    assert_plain,
+    brute_force,
+    draw_photometry,
+    make_grid,
+    node_fitter,
+    photometry_table,
+)
+from miricigale.fitting import GridSettings
 from miricigale.fitting import grid as engine_module
 
 #: As accurate as pruning leaves the sums.
@@ -24,7 +31,7 @@ def test_known_redshifts_of_bright_objects():
     """
     grid = make_grid(9, n_tau=12, n_age=9)
     table, truth = draw_photometry(grid, 12, seed=8, noise=1e-3)
-    fitter = BayesFitter(grid, model_error=0.0)
+    fitter = node_fitter(grid, model_error=0.0)
     redshift = [grid.redshift[t[0]] for t in truth]
     results = fitter.fit(table, redshift=redshift)
     assert_plain(results, grid, **PRUNED | {"rtol": 1e-5, "atol": 1e-5}, known=redshift)
@@ -39,12 +46,12 @@ def test_priors_that_leave_little():
     table, _ = draw_photometry(grid, 4, seed=2, noise=0.3)
     for rtol in (0.0, 1e-6):
         settings = GridSettings(rtol=rtol)
-        results = BayesFitter(grid, priors=priors, settings=settings).fit(table)
+        results = node_fitter(grid, priors=priors, settings=settings).fit(table)
         assert_plain(results, grid, **PRUNED, priors=priors)
         for name in priors:
             assert np.all(results.pdf[name][:, np.equal(priors[name], 0)] == 0), name
     priors = {"frac_agn": [1.0, 0.0, 0.0, 0.0]}
-    assert_plain(BayesFitter(grid, priors=priors).fit(table), grid, **PRUNED, priors=priors)
+    assert_plain(node_fitter(grid, priors=priors).fit(table), grid, **PRUNED, priors=priors)
 
 
 def test_a_heavy_prior_of_no_agn():
@@ -52,7 +59,7 @@ def test_a_heavy_prior_of_no_agn():
     grid = make_grid(5, n_tau=12, n_age=9, frac=np.append(0.0, np.linspace(0.05, 0.95, 19)))
     priors = {"frac_agn": np.append(1.0, np.full(19, 1e-4))}
     table, _ = draw_photometry(grid, 4, seed=2, noise=0.3)
-    assert_plain(BayesFitter(grid, priors=priors).fit(table), grid, **PRUNED, priors=priors)
+    assert_plain(node_fitter(grid, priors=priors).fit(table), grid, **PRUNED, priors=priors)
 
 
 def test_several_lists_equal_one(monkeypatch):
@@ -62,11 +69,11 @@ def test_several_lists_equal_one(monkeypatch):
     pairs = [("age", "tau97"), ("tau", "frac_agn"), ("redshift", "age"), ("redshift", "tau97")]
     pairs += [("frac_agn", "tau97")]
     for rtol, tolerance in ((0.0, 1e-11), (1e-6, 1e-6)):
-        fitter = BayesFitter(grid, settings=GridSettings(rtol=rtol))
+        fitter = node_fitter(grid, settings=GridSettings(rtol=rtol))
         want, drawn = fitter.fit(table, pairs=pairs), fitter.sample(table, 400, seed=1)
         with monkeypatch.context() as patch:
             patch.setattr(engine_module, "_CAPACITY", 1)
-            short = BayesFitter(grid, settings=GridSettings(rtol=rtol))
+            short = node_fitter(grid, settings=GridSettings(rtol=rtol))
             got, others = short.fit(table, pairs=pairs), short.sample(table, 400, seed=1)
         assert_allclose(got.pdf_2d, want.pdf_2d, rtol=tolerance, atol=tolerance)
         assert_allclose(got.log_evidence, want.log_evidence, atol=tolerance)
@@ -96,7 +103,7 @@ def test_models_without_light_in_the_used_bands(rtol):
     table, _ = draw_photometry(grid, 4, seed=4, noise=0.5)
     for name in grid.filters[3:]:
         del table[name], table[f"{name}_err"]
-    fitter = BayesFitter(dark, settings=GridSettings(rtol=rtol), model_error=0.0)
+    fitter = node_fitter(dark, settings=GridSettings(rtol=rtol), model_error=0.0)
     results = fitter.fit(table)
     assert results.fitted.all()
     n_fractions = grid.frac_agn.size
@@ -128,7 +135,7 @@ def test_a_lightless_redshift_of_high_prior_hides_no_other():
     dark = replace(grid, galaxy=galaxy, agn=agn)
     table, _ = draw_photometry(replace(grid, agn=agn), 3, seed=1, noise=0.1)
     table = table["id", "band0", "band0_err", "band1", "band1_err"]
-    results = BayesFitter(dark).fit(table)
+    results = node_fitter(dark).fit(table)
     assert results.fitted.all()
     assert np.all(results.pdf["redshift"][:, :2].sum(axis=1) > 0.9)
 
@@ -147,7 +154,7 @@ def test_percentiles_where_the_most_likely_model_has_no_light():
     unit = 1e8
     flux = unit * np.array([[-0.5, -0.5, -0.5, 0.1, 0.1, 0.1]])
     table = photometry_table(grid.filters, flux, unit)
-    fitter = BayesFitter(grid, priors={"redshift": [0.6, 0.4]}, model_error=0.0, scale_error=False)
+    fitter = node_fitter(grid, priors={"redshift": [0.6, 0.4]}, model_error=0.0, scale_error=False)
     results = fitter.fit(table)
     model = galaxy[1, 0]
     scale = np.sum(model * flux) / np.sum(model**2)
@@ -172,7 +179,7 @@ def test_galaxies_without_dust_where_fractions_refer_to_all_infrared_light(frac,
     # tori so bright that no AGN at all fits best
     grid = replace(grid, agn=grid.agn * 1e3)
     table, _ = draw_photometry(grid, 6, seed=5, noise=0.1)
-    fitter = BayesFitter(grid, settings=GridSettings(rtol=rtol))
+    fitter = node_fitter(grid, settings=GridSettings(rtol=rtol))
     results = fitter.fit(table)
     for i in range(len(table)):
         want = brute_force(grid, results.flux[i], results.sigma[i])
@@ -193,7 +200,7 @@ def test_signal_to_noise_of_a_million_and_its_inverse(noise):
     table, truth = draw_photometry(grid, 6, seed=3, noise=noise)
     # measurements are never all negative by chance
     table["band0"] = np.abs(table["band0"])
-    results = BayesFitter(grid, model_error=0.0).fit(table)
+    results = node_fitter(grid, model_error=0.0).fit(table)
     assert results.fitted.all()
     assert np.all(np.isfinite(results.moments[:, :, :2]))
     assert_allclose(results.pdf_2d.sum(axis=(1, 2)), 1.0, rtol=1e-12)

@@ -12,9 +12,10 @@ from helpers.grids import (
     derived_quantities,
     draw_photometry,
     make_grid,
+    node_fitter,
     photometry_table,
 )
-from miricigale.fitting import BayesFitter, GridSettings
+from miricigale.fitting import GridSettings
 
 MORE = {
     "many fractions": ({"frac": np.append(np.arange(10) * 0.1, 0.99)}, {}),
@@ -33,7 +34,7 @@ def test_every_sum_equals_the_plain_one(case):
     of_grid, of_fitter = (CASES | MORE)[case]
     grid = make_grid(3, **of_grid)
     prior_f = "uniform" if case == "prior_f by width" else "grid"
-    fitter = BayesFitter(grid, settings=GridSettings(prior_f, rtol=0), **of_fitter)
+    fitter = node_fitter(grid, settings=GridSettings(prior_f, rtol=0), **of_fitter)
     table, _ = draw_photometry(grid, 6, seed=5, missing=0.2)
     options = {k: v for k, v in of_fitter.items() if k not in ("model_error", "error_floor")}
     assert_plain(fitter.fit(table), grid, rtol=1e-9, prior_f=prior_f, **options)
@@ -48,7 +49,7 @@ def test_pruning_loses_no_more_than_asked(noise, model_error):
     for name in grid.filters:
         table[name][0] = -abs(table[name][0])
     table[grid.filters[0]][0] = abs(table[f"{grid.filters[0]}_err"][0])
-    fitter = BayesFitter(grid, model_error=model_error, settings=GridSettings(rtol=1e-6))
+    fitter = node_fitter(grid, model_error=model_error, settings=GridSettings(rtol=1e-6))
     assert_plain(fitter.fit(table), grid, rtol=1e-5, atol=1e-6, floor=1e6)
 
 
@@ -59,7 +60,7 @@ def test_few_bands(n_bands):
     table, _ = draw_photometry(grid, 4, seed=4)
     for name in grid.filters[n_bands:]:
         table[name] = np.nan * table[name]
-    fitter = BayesFitter(grid, n_bands_min=1)
+    fitter = node_fitter(grid, n_bands_min=1)
     results = fitter.fit(table)
     for i in range(4):
         want = brute_force(grid, results.flux[i], results.sigma[i])
@@ -79,7 +80,7 @@ def test_a_grid_of_one_model_has_the_closed_form():
     table = photometry_table(grid.filters, flux, err, ["only"])
     for name in grid.filters:
         table[f"{name}_err"] = table[f"{name}_err"].to(u.mJy)
-    results = BayesFitter(grid, model_error=0.05).fit(table)
+    results = node_fitter(grid, model_error=0.05).fit(table)
     variance = err**2 + (0.05 * flux) ** 2
     q = np.sum(model**2 / variance)
     scale = np.sum(model * flux / variance) / q
@@ -96,7 +97,7 @@ def test_a_grid_of_one_model_has_the_closed_form():
 def test_percentiles_of_derived_quantities():
     """Histogram of 0.01 dex against the sorted values of all models."""
     grid = make_grid(5, n_tau=12, n_age=9)
-    fitter = BayesFitter(grid, scale_error=False)
+    fitter = node_fitter(grid, scale_error=False)
     table, _ = draw_photometry(grid, 6, seed=2, noise=0.6)
     results = fitter.fit(table)
     levels = [0.16, 0.5, 0.84]

@@ -17,12 +17,12 @@ from helpers.grids import (
     free_parameters,
     make_grid,
     model_priors,
+    node_fitter,
     other_fraction,
     photometry_table,
 )
 from helpers.results import assert_joined
 from miricigale.fitting import (
-    BayesFitter,
     FitFlags,
     GridSettings,
     fit_file,
@@ -105,7 +105,7 @@ def test_all_options_at_once_equal_the_plain_sums(case, redshift):
     of_grid, options, _ = CASES[case]
     grid = make_grid(3, **of_grid)
     scale_error = options.get("scale_error", True)
-    fitter = BayesFitter(grid, **EVERYTHING, scale_error=scale_error)
+    fitter = node_fitter(grid, **EVERYTHING, scale_error=scale_error)
     noise = options.get("noise", 0.15)
     table = draw_photometry(grid, 8, seed=5, noise=noise, missing=0.15)[0]
     table = add_limits(table, grid)
@@ -152,7 +152,7 @@ def test_pruning_loses_no_more_than_asked(noise):
     grid = make_grid(7, n_tau=12, n_age=9)
     table = draw_photometry(grid, 10, seed=3, noise=noise, missing=0.1)[0]
     table = add_limits(table, grid, part=0.4)
-    fitters = [BayesFitter(grid, settings=GridSettings(rtol=rtol)) for rtol in (0, 1e-6)]
+    fitters = [node_fitter(grid, settings=GridSettings(rtol=rtol)) for rtol in (0, 1e-6)]
     whole, pruned = (fitter.fit(table) for fitter in fitters)
     for name in ("pdf_2d", "log_evidence"):
         assert_allclose(getattr(pruned, name), getattr(whole, name), atol=1e-6)
@@ -176,7 +176,7 @@ def test_one_model_has_the_posterior_of_the_text_book():
         return ((1.0 - s) / 0.1) ** 2 - 2 * terms
 
     best = minimize_scalar(chi2, bounds=(0.5, 1.0), method="bounded", options={"xatol": 1e-10})
-    results = BayesFitter(grid, model_error=0.0).fit(table)
+    results = node_fitter(grid, model_error=0.0).fit(table)
     assert results.chi2[0] == pytest.approx(best.fun, rel=1e-9)
     assert results.best_scale[0] == pytest.approx(best.x * mass, rel=1e-6)
     step = 1e-4
@@ -191,7 +191,7 @@ def test_one_model_has_the_posterior_of_the_text_book():
 def test_percentiles_of_the_other_fraction():
     """The weight of every model is spread over its cell of the fraction."""
     grid = make_grid(3, n_tau=8, n_age=6)
-    fitter = BayesFitter(grid, settings=GridSettings(rtol=0))
+    fitter = node_fitter(grid, settings=GridSettings(rtol=0))
     table = add_limits(draw_photometry(grid, 8, seed=7, noise=0.4)[0], grid, part=0.2)
     results = fitter.fit(table)
     edges = cells(grid.frac_agn, (0.0, 1.0))
@@ -233,7 +233,7 @@ def test_a_limit_without_error_is_a_wall(error):
     table["band4"] = wall * u.uJy
     table["band4_err"] = error * wall * u.uJy
     table["band4_limit"] = True
-    fitter = BayesFitter(grid, model_error=0.0, settings=GridSettings(rtol=0))
+    fitter = node_fitter(grid, model_error=0.0, settings=GridSettings(rtol=0))
     results = fitter.fit(table)
     assert np.all(results.best_flux[:, 4] <= wall * (1 + 1e-8))
     assert np.all(results.model_flux[:, 4] <= wall * (1 + 1e-8))
@@ -252,7 +252,7 @@ def test_a_limit_without_error_is_a_wall(error):
 
 def test_how_limits_may_be_written():
     grid = make_grid(3)
-    fitter, table = BayesFitter(grid), draw_photometry(grid, 3, seed=2)[0]
+    fitter, table = node_fitter(grid), draw_photometry(grid, 3, seed=2)[0]
     text, masked = ["True", "false", "T"], MaskedColumn([True] * 3, mask=[False, True, False])
     for column in (
         [True, False, True],
@@ -278,7 +278,7 @@ def test_few_are_fewer_than_three_fluxes_above_two_sigma():
         table[f"{name}_err"] = table[name] / np.where(seen, 2.1, 1.9)
     table["z"] = grid.redshift[[0, 0, 0]]
     for options, wanted in (({}, [1, 1, 0]), ({"redshift": "z"}, [1, 0, 0])):
-        flags = BayesFitter(grid).fit(table, **options).flags
+        flags = node_fitter(grid).fit(table, **options).flags
         few = (flags & int(FitFlags.FEW_FOR_PARAMETERS)) > 0
         assert few.tolist() == [bool(value) for value in wanted]
 
@@ -301,7 +301,7 @@ def test_flags_and_counts():
     for name in grid.filters[1:]:
         table[name][3] = np.nan
     table["band0_limit"][3] = True
-    results = BayesFitter(grid).fit(table)
+    results = node_fitter(grid).fit(table)
     names = [FitFlags.names(flag) for flag in results.flags[:4]]
     for own, wanted in zip(names, FLAGS, strict=True):
         assert wanted <= set(own)
@@ -321,7 +321,7 @@ def test_negative_models_have_no_limits():
     grid = make_grid(3)
     galaxy = grid.galaxy.copy()
     galaxy[0, 0, 2] *= -1
-    fitter = BayesFitter(replace(grid, galaxy=galaxy))
+    fitter = node_fitter(replace(grid, galaxy=galaxy))
     table = draw_photometry(grid, 3, seed=4)[0]
     table["band1_limit"] = True
     assert fitter.fit(table).fitted.all()
@@ -341,7 +341,7 @@ def catalog(grid):
 @pytest.mark.parametrize("kind", ["fits", "ecsv", "csv"])
 def test_catalogs_on_disk(grid, catalog, tmp_path, kind):
     """In text as 1 and 0, or True and False."""
-    fitter, path, plain = BayesFitter(grid), tmp_path / f"catalog.{kind}", catalog.copy()
+    fitter, path, plain = node_fitter(grid), tmp_path / f"catalog.{kind}", catalog.copy()
     for name in plain.colnames if kind == "csv" else ():
         plain[name] = getattr(plain[name], "value", plain[name])
         if name.endswith("_limit"):
@@ -353,7 +353,7 @@ def test_catalogs_on_disk(grid, catalog, tmp_path, kind):
 
 
 def test_samples_follow_the_posterior(grid, catalog):
-    fitter = BayesFitter(grid)
+    fitter = node_fitter(grid)
     results = fitter.fit(catalog)
     n = 4000
     samples = fitter.sample(catalog, n, seed=1)
@@ -372,7 +372,7 @@ def test_samples_follow_the_posterior(grid, catalog):
 
 
 def test_mocks_perturb_fluxes_and_keep_limits(grid, catalog):
-    fitter = BayesFitter(grid, model_error=0.0)
+    fitter = node_fitter(grid, model_error=0.0)
     results = fitter.fit(catalog)
     mock = mock_analysis(fitter, results, catalog, seed=5)
     pulls = []
@@ -392,7 +392,7 @@ def test_mocks_perturb_fluxes_and_keep_limits(grid, catalog):
 
 
 def test_bands_left_out_have_predictions_but_no_pull_for_limits(grid, catalog):
-    fitter = BayesFitter(grid)
+    fitter = node_fitter(grid)
     out = leave_out(fitter, catalog, ["band2"])
     limit = np.array(catalog["band2_limit"])
     found = out.results["band2"]

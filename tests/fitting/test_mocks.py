@@ -6,8 +6,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
-from helpers.grids import draw_photometry
-from miricigale.fitting import BayesFitter, leave_out, mock_analysis
+from helpers.grids import draw_photometry, node_fitter
+from miricigale.fitting import leave_out, mock_analysis
 from miricigale.plotting.axes import new_figure
 
 
@@ -18,7 +18,7 @@ def catalog(grid):
 
 @pytest.fixture(scope="module")
 def fitter(grid):
-    return BayesFitter(grid, model_error=0.0)
+    return node_fitter(grid, model_error=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def test_recovery_is_calibrated(mock):
 
 def test_without_noise_the_truth_comes_back(grid):
     table, truth = draw_photometry(grid, 30, seed=2, noise=1e-4)
-    fitter = BayesFitter(grid, model_error=0.0)
+    fitter = node_fitter(grid, model_error=0.0)
     results = fitter.fit(table)
     mock = mock_analysis(fitter, results, table, seed=1)
     out = mock.to_table()

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import norm
 
 from helpers.errors import refuses
-from helpers.grids import draw_photometry, make_grid
+from helpers.grids import draw_photometry, make_grid, node_fitter
 from miricigale.fitting import BayesFitter, FitResults, GridSettings
 from miricigale.fitting.mixture import BandMixture
 
@@ -72,8 +72,8 @@ def by_hand(grid, results, i):
 def test_posterior_is_that_of_the_mixture(grid, table):
     """Evidence to 0.1, redshifts and fractions to 0.04 in weight, probabilities to 0.02 (rms)."""
     options = {"model_error": 0.02, "settings": GridSettings(rtol=0.0)}
-    results = BayesFitter(grid, outliers=PART, **options).fit(table)
-    plain = BayesFitter(grid, **options).fit(table)
+    results = node_fitter(grid, outliers=PART, **options).fit(table)
+    plain = node_fitter(grid, **options).fit(table)
     count = np.where(grid.allowed[:, :, None, None], grid.agn_multiplicity[:, None], 0)
     every = 8 * 9 * 4 * grid.agn_multiplicity.sum()
     far, change, worse = [], [], []
@@ -91,7 +91,7 @@ def test_posterior_is_that_of_the_mixture(grid, table):
     assert max(far) < 0.04
     assert max(worse) > 0.9
     # pairs of little weight in single precision
-    single = BayesFitter(grid, outliers=PART, model_error=0.02).fit(table)
+    single = node_fitter(grid, outliers=PART, model_error=0.02).fit(table)
     assert_allclose(single.pdf_2d, results.pdf_2d, atol=2e-3)
     assert np.sqrt(np.mean(np.square(change))) < 0.02
 
@@ -127,7 +127,7 @@ def test_a_band_that_cannot_be_is_found_and_does_no_harm(grid):
     bad["wfc3.f125w"] *= 20.0
     without = good.copy()
     without["wfc3.f125w_err"][:] = np.nan
-    fitter = BayesFitter(grid, outliers=0.05, model_error=0.02)
+    fitter = node_fitter(grid, outliers=0.05, model_error=0.02)
     results, left = fitter.fit(bad), fitter.fit(without)
     assert np.all(results.outlier[:, 2] > 0.99)
     assert np.all(np.isnan(left.outlier[:, 2]))
@@ -138,24 +138,24 @@ def test_a_band_that_cannot_be_is_found_and_does_no_harm(grid):
 
 
 def test_none_are_wrong_without_prior_fraction(grid, table):
-    plain = BayesFitter(grid).fit(table)
+    plain = node_fitter(grid).fit(table)
     for none in (0.0, dict.fromkeys(BANDS, 0.0)):
-        results = BayesFitter(grid, outliers=none).fit(table)
+        results = node_fitter(grid, outliers=none).fit(table)
         assert results.outlier is None
         for name in ("chi2", "log_evidence", "pdf_2d", "moments", "quantiles"):
             assert_array_equal(getattr(results, name), getattr(plain, name))
-    results = BayesFitter(grid, outliers={"miri.f770w": 0.1}).fit(table)
+    results = node_fitter(grid, outliers={"miri.f770w": 0.1}).fit(table)
     assert np.all(np.delete(results.outlier, 4, axis=1) == 0)
 
 
 def test_columns_and_files(grid, table, tmp_path):
-    fitter = BayesFitter(grid, outliers=PART)
+    fitter = node_fitter(grid, outliers=PART)
     results = fitter.fit(table)
     with ThreadPoolExecutor(3) as executor:
         parallel = fitter.fit(table, executor=executor, chunk_size=2)
     assert_array_equal(parallel.outlier, results.outlier)
     assert_array_equal(results.to_table()["miri.f770w_outlier"], results.outlier[:, 4])
-    assert "miri.f770w_outlier" not in BayesFitter(grid).fit(table).to_table().colnames
+    assert "miri.f770w_outlier" not in node_fitter(grid).fit(table).to_table().colnames
     results.write(tmp_path / "fits.fits")
     again = FitResults.read(tmp_path / "fits.fits")
     assert_array_equal(again.outlier, results.outlier)
@@ -165,7 +165,7 @@ def test_columns_and_files(grid, table, tmp_path):
 def test_known_redshifts(grid):
     good, _ = draw_photometry(grid, 6, seed=9, noise=0.03)
     good["miri.f770w"] *= 0.05
-    results = BayesFitter(grid, outliers=0.05).fit(good, redshift="redshift")
+    results = node_fitter(grid, outliers=0.05).fit(good, redshift="redshift")
     assert np.all(results.outlier[:, 4] > 0.9)
 
 
@@ -173,5 +173,3 @@ def test_what_makes_no_sense_is_refused(grid):
     for given, text in ((1.0, "below 1"), (-0.1, "not negative"), ({"band": 0.1}, "keys among")):
         refuses(f"outliers.*{text}", BayesFitter, grid, outliers=given)
     refuses("outliers.*compat", BayesFitter, grid, outliers=0.1, compat="cigale")
-    between = GridSettings(interpolate=100)
-    refuses("outliers.*interpolate", BayesFitter, grid, outliers=0.1, settings=between)

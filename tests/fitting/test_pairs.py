@@ -6,14 +6,20 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from astropy.io import fits
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
-from helpers.grids import CASES, brute_force, draw_photometry, free_parameters, make_grid
+from helpers.grids import (
+    CASES,
+    brute_force,
+    draw_photometry,
+    free_parameters,
+    make_grid,
+    node_fitter,
+)
 from helpers.results import assert_same
-from miricigale.fitting import BayesFitter, FitResults, GridSettings, fit_file, open_results
+from miricigale.fitting import FitResults, GridSettings, fit_file, open_results
 
 
 def free_pairs(fitter):
@@ -40,7 +46,7 @@ def test_every_pair_is_the_sum_over_all_models(case, rtol, atol):
     of_fitter = options | ({"compat": "cigale"} if case == "CIGALE" else {})
     grid = make_grid(3, **of_grid)
     prior_f = "uniform" if case == "prior_f by width" else "grid"
-    fitter = BayesFitter(grid, settings=GridSettings(prior_f, rtol=rtol), **of_fitter)
+    fitter = node_fitter(grid, settings=GridSettings(prior_f, rtol=rtol), **of_fitter)
     table, _ = draw_photometry(grid, 4, seed=5, missing=0.2, noise=0.3)
     pairs = free_pairs(fitter)
     results = fitter.fit(table, pairs=pairs)
@@ -56,7 +62,7 @@ def test_every_pair_is_the_sum_over_all_models(case, rtol, atol):
 
 def test_with_upper_limits_and_known_redshifts():
     grid = make_grid(6)
-    fitter = BayesFitter(grid, settings=GridSettings(rtol=0), n_bands_min=2)
+    fitter = node_fitter(grid, settings=GridSettings(rtol=0), n_bands_min=2)
     table, truth = draw_photometry(grid, 4, seed=8, noise=0.3)
     table["band1_limit"] = [True, True, False, True]
     table["band4_limit"] = [False, True, True, False]
@@ -100,7 +106,7 @@ def test_merged_models_are_as_all_of_them_apart():
     table, _ = draw_photometry(apart, 5, noise=0.3)
     priors = {"temperature_polar": [1.0, 3.0], "law": [2.0, 1.0]}
     options = {"settings": GridSettings(rtol=0), "priors": priors}
-    one, two = (BayesFitter(grid, **options) for grid in (merged, apart))
+    one, two = (node_fitter(grid, **options) for grid in (merged, apart))
     pairs = free_pairs(two)
     one, two = one.fit(table, pairs=pairs), two.fit(table, pairs=pairs)
     assert {"ebv_polar", "temperature_polar", "law"} < set(one.axes)
@@ -110,7 +116,7 @@ def test_merged_models_are_as_all_of_them_apart():
 
 @pytest.fixture(scope="module")
 def fitter(grid):
-    return BayesFitter(grid)
+    return node_fitter(grid)
 
 
 @pytest.fixture(scope="module")
@@ -166,12 +172,6 @@ def test_files_keep_them(results, tmp_path):
     results.write(tmp_path / "new.fits")
     assert_same(FitResults.read(tmp_path / "new.fits"), results)
     assert_same(results.with_model(None), results)
-    # what the version before wrote has none
-    replace(results, pairs={}).write(tmp_path / "old.fits")
-    fits.setval(tmp_path / "old.fits", "FORMAT", value="miricigale-fitresults-2")
-    old = FitResults.read(tmp_path / "old.fits")
-    assert old.pairs == {}
-    assert_array_equal(old.joint_pdf("redshift", "frac_agn"), results.pdf_2d)
 
 
 def test_from_file_to_file(fitter, photometry, tmp_path):
@@ -203,7 +203,7 @@ def test_cigale_forgets_them_where_its_weights_vanish(grid, photometry):
     table = QTable(photometry[:2], copy=True)
     for name in grid.filters:
         table[f"{name}_err"][0] = 1e-9 * table[name][0]
-    fitter = BayesFitter(grid, compat="cigale", model_error=0.0)
+    fitter = node_fitter(grid, compat="cigale", model_error=0.0)
     results = fitter.fit(table, pairs=[("age", "redshift")])
     assert np.isnan(results.joint_pdf("age", "redshift")[0]).all()
     assert results.joint_pdf("age", "redshift")[1].sum() == pytest.approx(1.0)
@@ -228,12 +228,12 @@ def test_errors_name_the_argument(fitter, photometry, pairs, error, message):
 
 def test_one_value_has_no_joint_posterior():
     grid = make_grid(n_z=1, n_tau=1)
-    fitter = BayesFitter(grid, priors={"tau": [1.0]})
+    fitter = node_fitter(grid, priors={"tau": [1.0]})
     table, _ = draw_photometry(grid, 1)
     for own, pair, name in (
         (fitter, ("redshift", "age"), "redshift"),
         (fitter, ("tau", "age"), "tau"),
-        (BayesFitter(grid), ("age", "tau"), "tau"),
+        (node_fitter(grid), ("age", "tau"), "tau"),
     ):
         refuses(f"several values, got '{name}', which has one", own.fit, table, pairs=[pair])
 

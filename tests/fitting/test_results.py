@@ -1,3 +1,5 @@
+import dataclasses
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -7,9 +9,9 @@ from matplotlib.figure import Figure
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
-from helpers.grids import photometry_table
+from helpers.grids import node_fitter, photometry_table
 from helpers.results import assert_same, assert_same_tables
-from miricigale.fitting import BayesFitter, FitResults
+from miricigale.fitting import FitResults
 from miricigale.fitting.posterior import cell_edges
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import DataError
@@ -17,7 +19,7 @@ from miricigale.utils.exceptions import DataError
 
 @pytest.fixture(scope="module")
 def results(grid, photometry):
-    return BayesFitter(grid).fit(photometry)
+    return node_fitter(grid).fit(photometry)
 
 
 def test_table_has_units_descriptions_and_provenance(results, tmp_path):
@@ -44,7 +46,7 @@ def test_no_parameter_leaves_its_limits():
     axes |= {"ebv_polar": [0.0, 0.3] * u.mag, "temperature_polar": [100.0, 300.0] * u.K}
     grid = model.grid(axes, bands, cache=False)
     flux = 1e10 * grid.flux(0, np.arange(grid.n_galaxies))
-    results = BayesFitter(grid).fit(photometry_table(bands, flux, 0.05 * flux))
+    results = node_fitter(grid).fit(photometry_table(bands, flux, 0.05 * flux))
     assert set(axes) - {"redshift"} <= set(results.axes)
     for name in results.axes:
         low, high = model.parameters[name].bounds
@@ -55,6 +57,23 @@ def test_no_parameter_leaves_its_limits():
         assert edges[-1].value <= high
     # what may be negative is not cut at 0
     assert results[0].distribution("slope")[0][-1].value == pytest.approx(0.2)
+
+
+def test_odds_of_redshifts_are_the_posterior_in_the_window_of_outliers(grid, photometry, results):
+    """Flat, narrow, of two peaks, and not fitted: the window is cut out of the cells in closed form."""
+    axis = dataclasses.replace(results.axes["redshift"], values=np.array([0.5, 1.5, 2.5, 3.5]))
+    pdf = np.array([[0.25] * 4, [0, 1, 0, 0], [0.3, 0, 0, 0.7], [np.nan] * 4])
+    some = results[:4]
+    axes, pdf = some.axes | {"redshift": axis}, some.pdf | {"redshift": pdf}
+    made = some._changed(axes=axes, pdf=pdf)
+    # about medians of 2, 1.5 and 3.29, whose window holds all of the upper peak
+    flat, narrow = (2.15 / 0.85 - 1.85 / 1.15) / 4, 1.65 / 0.85 - 1.35 / 1.15
+    wanted = [flat, narrow, 0.7, np.nan]
+    assert_allclose(made.to_table()["redshift_odds"], wanted, rtol=1e-12)
+    assert made[1].redshift_odds == pytest.approx(narrow)
+    known = node_fitter(grid).fit(photometry, redshift=np.full(len(photometry), grid.redshift[0]))
+    assert "redshift_odds" not in known.to_table().colnames
+    assert np.isnan(known.redshift_odds).all()
 
 
 def test_views_agree_with_the_catalog(results):

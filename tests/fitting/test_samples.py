@@ -12,10 +12,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import chi2
 
 from helpers.errors import refuses
-from helpers.grids import brute_force, draw_photometry, make_grid
+from helpers.grids import brute_force, draw_photometry, make_grid, node_fitter
 from helpers.results import assert_same_tables
 from miricigale.filters import FilterSet
-from miricigale.fitting import BayesFitter, GridSettings, Samples
+from miricigale.fitting import GridSettings, Samples
 from miricigale.sed import SED, SEDModel
 from miricigale.utils.exceptions import DataError
 
@@ -107,7 +107,7 @@ def test_parameters_without_effect_have_their_prior(real):
     no_dust = int(np.flatnonzero(grid.agn_parameters["ebv_polar"].value == 0)[0])
     index = np.zeros((1, n, 4), int)
     index[..., 2], index[..., 3] = no_dust, 1
-    axes = BayesFitter(grid, priors={"temperature_polar": [1.0, 3.0]}).priors.axes
+    axes = node_fitter(grid, priors={"temperature_polar": [1.0, 3.0]}).priors.axes
     one = Samples(grid, ["x"], [0], index, np.ones((1, n)), axes=axes)
     part = np.mean(one.values("temperature_polar").value == 200.0)
     assert abs(part - 0.75) < 5 * np.sqrt(0.75 * 0.25 / n)
@@ -255,7 +255,7 @@ def test_files_that_are_no_samples_are_refused(real, grid, samples, tmp_path):
 
 def test_draws_with_a_prior_keep_it_in_files(tmp_path):
     grid = make_grid()
-    fitter = BayesFitter(grid, priors={"temperature_polar": [1.0, 3.0]})
+    fitter = node_fitter(grid, priors={"temperature_polar": [1.0, 3.0]})
     drawn = fitter.sample(draw_photometry(grid, 2)[0], 500, seed=4)
     drawn.write(tmp_path / "s.fits")
     again = Samples.read(tmp_path / "s.fits", grid)
@@ -264,7 +264,7 @@ def test_draws_with_a_prior_keep_it_in_files(tmp_path):
 
 
 def test_draws_are_those_of_the_object_whatever_its_company(grid, photometry):
-    fitter = BayesFitter(grid)
+    fitter = node_fitter(grid)
     whole = fitter.sample(photometry, 50, seed=4)
     turned = fitter.sample(photometry[::-1], 50, seed=4)
     assert_array_equal(whole.index, turned.index[::-1])
@@ -282,7 +282,7 @@ def test_draws_have_the_joint_posterior_of_all_models():
     """Frequencies of (galaxy, torus, fraction) against the weights of all models, by chi2."""
     grid = make_grid(3)
     table, _ = draw_photometry(grid, 3, seed=5)
-    fitter = BayesFitter(grid, settings=GridSettings(rtol=0))
+    fitter = node_fitter(grid, settings=GridSettings(rtol=0))
     results = fitter.fit(table)
     n = 20_000
     samples = fitter.sample(table, n, seed=9)

@@ -8,9 +8,9 @@ import pytest
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
-from helpers.grids import brute_force
+from helpers.grids import brute_force, node_fitter
 from helpers.results import assert_same
-from miricigale.fitting import BayesFitter, FitResults, GridSettings
+from miricigale.fitting import FitResults, GridSettings
 from miricigale.fitting.posterior import cell_percentiles
 from miricigale.fitting.quantities import DERIVED_LEVELS, ShapeQuantities
 
@@ -30,7 +30,7 @@ def with_shape(grid):
 
 @pytest.fixture(scope="module")
 def fitter(grid):
-    return BayesFitter(with_shape(grid), settings=GridSettings(rtol=0))
+    return node_fitter(with_shape(grid), settings=GridSettings(rtol=0))
 
 
 @pytest.fixture(scope="module")

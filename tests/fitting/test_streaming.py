@@ -1,6 +1,5 @@
 """Fits from file to file: the numbers of one call, in pieces that a later call resumes from."""
 
-import json
 from concurrent.futures import Executor, Future
 from dataclasses import replace
 
@@ -12,9 +11,10 @@ from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
-from helpers.grids import draw_photometry
+from helpers.grids import draw_photometry, node_fitter
 from helpers.results import assert_joined, assert_same, assert_same_tables
-from miricigale.fitting import BayesFitter, FitFlags, fit_file, open_results
+from miricigale.fitting import FitFlags, fit_file, open_results
+from miricigale.fitting.io import FitFolder
 from miricigale.utils.exceptions import DataError
 
 MANIFESTS = [".fit.lock", ".manifest.copy.json", "manifest.json"]
@@ -48,7 +48,7 @@ def grid(grid):
 
 @pytest.fixture
 def fitter(grid):
-    return BayesFitter(grid, error_floor=0.01)
+    return node_fitter(grid, error_floor=0.01)
 
 
 @pytest.fixture
@@ -198,15 +198,15 @@ def test_parts_of_another_fit_are_refused(fitter, grid, on_disk, catalog):
         refuses(text, fit_file, fitter, path, out, **(same | changes))
 
     # the same grid, made again, is the same
-    fit_file(BayesFitter(replace(grid, meta=dict(grid.meta)), error_floor=0.01), path, out, **same)
+    fit_file(node_fitter(replace(grid, meta=dict(grid.meta)), error_floor=0.01), path, out, **same)
     refused("chunk_rows", chunk_rows=79)
     refused("redshift", redshift=None)
     refused("redshift", redshift=np.array(catalog["redshift"]))
-    refused("model_error", BayesFitter(grid, error_floor=0.01, model_error=0.2))
-    refused("error_floor", BayesFitter(grid))
-    refused("priors", BayesFitter(grid, error_floor=0.01, priors={"tau": "log"}))
+    refused("model_error", node_fitter(grid, error_floor=0.01, model_error=0.2))
+    refused("error_floor", node_fitter(grid))
+    refused("priors", node_fitter(grid, error_floor=0.01, priors={"tau": "log"}))
     other = replace(grid, galaxy=grid.galaxy * (1 + 1e-15 * np.arange(6)))
-    refused("grid", BayesFitter(other, error_floor=0.01))
+    refused("grid", node_fitter(other, error_floor=0.01))
     catalog["band0"][0] *= 1.01
     catalog.write(path, overwrite=True)
     refused(r"catalogue\.sha256")
@@ -218,11 +218,10 @@ def test_parts_of_another_fit_are_refused(fitter, grid, on_disk, catalog):
 def test_parts_of_another_version_are_refused_with_what_to_do(fitter, on_disk):
     path, out = on_disk
     fit_file(fitter, path, out)
-    old_manifest(out)
-    manifest = json.loads((out / "manifest.json").read_text())
-    manifest["versions"]["miricigale"] = "0.1"
-    manifest["job"]["settings"]["former"] = 1
-    (out / "manifest.json").write_text(json.dumps(manifest))
+    with FitFolder(out) as folder:
+        folder.facts["versions"]["miricigale"] = "0.1"
+        folder.facts["job"]["settings"]["former"] = 1
+        folder.write_manifest()
     match = r"settings.former differ; give another folder, or resume=False .* of miricigale 0.1, "
     refuses(match + r".*open_results\(path, partial=True\) reads them", fit_file, fitter, path, out)
     assert len(open_results(out, partial=True)) == 150
@@ -318,32 +317,6 @@ def test_a_fit_that_was_killed_at_its_first_moment_is_resumed(fitter, on_disk):
     (out / ".partial-1-manifest.json").write_text("{")
     assert len(fit_file(fitter, path, out)) == 150
     assert sorted(item.name for item in out.iterdir()) == [*MANIFESTS, "part-00000.fits"]
-
-
-def old_manifest(out):
-    """Turn the manifest of a folder to that of the layout before, which has no checksum."""
-    new = json.loads((out / "manifest.json").read_text())
-    parts = {
-        name: {key: part[key] for key in ("rows", "fitted")} | part["products"][name]
-        for name, part in new["parts"].items()
-    }
-    old = {"format": "miricigale-fitparts-1", "versions": new["versions"], "job": new["job"]}
-    (out / "manifest.json").write_text(json.dumps(old | {"parts": parts}))
-    (out / ".manifest.copy.json").unlink()
-
-
-def test_folders_of_the_layout_before_are_read(fitter, on_disk):
-    path, out = on_disk
-    want = fit_file(fitter, path, out, chunk_rows=80).to_table(["id", "mass_mean"])
-    old_manifest(out)
-    results = open_results(out)
-    assert repr(results).startswith("<FitResultsFiles of 150 objects, 146 fitted, 2 parts")
-    got = results.to_table(["id", "mass_mean"])
-    assert got["id"].tolist() == want["id"].tolist()
-    assert_array_equal(got["mass_mean"].value, want["mass_mean"].value)
-    executor = Counting()
-    fit_file(fitter, path, out, chunk_rows=80, executor=executor)
-    assert executor.n_tasks == 0
 
 
 def test_links_are_not_followed(fitter, on_disk, tmp_path):

@@ -9,7 +9,7 @@ from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
-from helpers.grids import draw_photometry, make_grid, photometry_table
+from helpers.grids import draw_photometry, make_grid, node_fitter, photometry_table
 from miricigale.filters import FilterSet
 from miricigale.fitting import (
     BayesFitter,
@@ -35,9 +35,9 @@ def grid():
 
 def test_one_that_is_everywhere_the_same_is_a_model_error(grid):
     table, _ = draw_photometry(grid, 8, noise=0.1)
-    plain = BayesFitter(grid, model_error=0.2).fit(table)
+    plain = node_fitter(grid, model_error=0.2).fit(table)
     same = TemplateError([0.1, 10.0] * u.um, [0.2, 0.2])
-    ours = BayesFitter(grid, model_error=0.0, template_error=same).fit(table)
+    ours = node_fitter(grid, model_error=0.0, template_error=same).fit(table)
     assert_allclose(ours.pdf_2d, plain.pdf_2d, atol=1e-9)
     for name in ("chi2", "log_evidence", "sigma", "best_flux"):
         assert_allclose(getattr(ours, name), getattr(plain, name), rtol=1e-9)
@@ -49,7 +49,7 @@ def test_posterior_is_the_sum_over_models_with_the_errors_of_their_redshifts(gri
     error = TemplateError([0.1, 0.3, 1.0, 3.0, 10.0] * u.um, [0.5, 0.1, 0.02, 0.3, 1.0])
     table, _ = draw_photometry(grid, 6, seed=3, noise=0.3)
     options = {"model_error": 0.0, "settings": GridSettings(rtol=0.0)}
-    results = BayesFitter(grid, template_error=error, **options).fit(table)
+    results = node_fitter(grid, template_error=error, **options).fit(table)
     index = np.meshgrid(*(np.arange(n) for n in (5, 9, grid.n_agn, 4)), indexing="ij")
     model = grid.flux(*index)
     rest = PIVOTS / (1 + grid.redshift[:, None])
@@ -108,12 +108,12 @@ def test_errors_of_models_and_of_bands_are_each_counted_once():
     known = {"redshift": grid.redshift[z]}
     error = TemplateError([1.0] * u.um, [0.1])
     for _ in range(6):
-        fitter = BayesFitter(grid, model_error=0.0, template_error=error)
+        fitter = node_fitter(grid, model_error=0.0, template_error=error)
         left = leave_out(fitter, table, ["wfc3.f160w"], **known)
         factor, part = measure_band_errors(left, error, longest=0.75 * u.um)
         right, parts = QTable(table, copy=True), {"wfc3.f160w": part}
         right["wfc3.f160w_err"] *= factor
-        fit = BayesFitter(grid, model_error=parts, template_error=error).fit(right, **known)
+        fit = node_fitter(grid, model_error=parts, template_error=error).fit(right, **known)
         edges = [0.15, 0.3, 0.6, 0.75, 1.1, 1.4, 20.0] * u.um
         error = measure_template_error(fit, model_error=parts, edges=edges)
     # some 5 and 4 % of the values are their own errors
@@ -130,7 +130,7 @@ def test_zero_points_are_found_and_applied(residuals):
     factors = dict(zip(BANDS, (1.0, 1.0, 1.0, 0.9, 1.0, 1.0), strict=True))
     wrong = apply_zero_points(table, QTable({"band": BANDS, "factor": [*factors.values()]}))
     error = TemplateError([1.99, 2.01] * u.um, [0.05, 0.3])
-    fitter = BayesFitter(grid, model_error=0.0, template_error=error)
+    fitter = node_fitter(grid, model_error=0.0, template_error=error)
     for _ in range(4):
         points = calibrate_zero_points(fitter.fit(wrong, redshift=z), reference="acs.f606w")
         wrong = apply_zero_points(wrong, points)
@@ -146,7 +146,7 @@ def test_zero_points_are_found_and_applied(residuals):
 
 
 def test_free_redshifts_and_bad_errors_are_refused(grid):
-    results = BayesFitter(grid).fit(draw_photometry(grid, 2)[0])
+    results = node_fitter(grid).fit(draw_photometry(grid, 2)[0])
     refuses("known redshifts", calibrate_zero_points, results)
     refuses("known redshifts", measure_template_error, results)
     refuses("'wave' must be ascending", TemplateError, [2.0, 1.0] * u.um, [0.1, 0.1])
@@ -168,7 +168,7 @@ def test_errors_of_bands_are_distinguished_from_those_of_models(residuals):
         # one flux in thirty is something else's
         scattered[name][::30] *= 1.7
     error = TemplateError([1.99, 2.01] * u.um, [0.05, 0.3])
-    fitter = BayesFitter(grid, model_error=0.0, template_error=error)
+    fitter = node_fitter(grid, model_error=0.0, template_error=error)
     left = leave_out(fitter, scattered, bands, redshift=z)
     assert_allclose(measure_band_errors(left, error), [3, 0.1], rtol=0.12)
     refuses("known redshifts", measure_band_errors, leave_out(fitter, scattered[:50], bands), error)
@@ -189,7 +189,7 @@ def test_how_often_values_occur_is_measured():
     table = photometry_table(grid.filters, flux, err)
     priors, shares = None, []
     for _ in range(30):
-        fitter = BayesFitter(grid, model_error=0.0, priors=priors)
+        fitter = node_fitter(grid, model_error=0.0, priors=priors)
         priors = measure_priors(fitter.fit(table, redshift=grid.redshift[z]))
         shares.append(priors["tau"][0])
     assert abs(shares[0] - np.mean(kind == 0)) > 0.05
@@ -223,7 +223,7 @@ def test_prior_of_star_formation_given_mass_and_redshift():
 
     def fitted_with(prior):
         settings = GridSettings(sfr_prior=prior, rtol=0.0)
-        return BayesFitter(grid, model_error=0.0, settings=settings)
+        return node_fitter(grid, model_error=0.0, settings=settings)
 
     fitter = fitted_with((relation, 0.3))
     fits = fitter.fit(table), fitted_with(None).fit(table)
@@ -237,7 +237,7 @@ def test_prior_of_star_formation_given_mass_and_redshift():
     part = np.mean(draws.to_table()["tau"] == grid.galaxy_parameters["tau"][0])
     assert part == pytest.approx(prior[0] / prior.sum(), abs=5 * np.sqrt(0.25 / 4000))
     with pytest.raises(ValueError, match="'sfr_prior' must be a function"):
-        BayesFitter(grid, settings=GridSettings(sfr_prior=relation))
+        node_fitter(grid, settings=GridSettings(sfr_prior=relation))
     bare = fitted_with((lambda mass, z: relation(mass, z).value, 0.3))
     refuses("'sfr_prior' must be a quantity", bare.fit, table, error=u.UnitsError)
     for factor, got in ((np.nan, "nan"), (0.0, "0"), (-1.0, "-"), (np.inf, "inf")):

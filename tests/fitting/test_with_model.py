@@ -8,7 +8,7 @@ from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
-from helpers.grids import draw_photometry, other_fraction, photometry_table
+from helpers.grids import draw_photometry, node_fitter, other_fraction, photometry_table
 from miricigale.fitting import BayesFitter, FitResults
 from miricigale.sed import SEDModel
 
@@ -46,7 +46,7 @@ def test_every_combination_of_values_counts_as_one_model():
     axes |= {"frac_agn": [0.0, 0.1, 0.4], "tau97": [3.0, 7.0, 11.0]}
     axes["temperature_polar"] = [100.0, 300.0]
     model = SEDModel.yang2021(libraries="bundled")
-    fitter = BayesFitter(model, NAMES, axes=axes)
+    fitter = node_fitter(model, NAMES, axes=axes)
     table, _ = draw_photometry(fitter.grid, 4, noise=0.3)
     results = fitter.fit(table)
     models = QTable(rows=list(itertools.product(*axes.values())), names=list(axes))
@@ -72,7 +72,7 @@ def test_agn_fraction_in_the_other_definition(definition, name):
     """That of the spectrum of the best model, and of draws, also without dust in the galaxy."""
     model = SEDModel.yang2021(libraries="bundled", frac_agn_definition=definition)
     axes = AXES | {"ebv": [0.0, 0.4], "frac_agn": [0.0, 0.1, 0.6]}
-    fitter = BayesFitter(model, NAMES, axes=axes)
+    fitter = node_fitter(model, NAMES, axes=axes)
     table, _ = draw_photometry(fitter.grid, 12, noise=0.1)
     results, samples = fitter.fit(table), fitter.sample(table, 3000, seed=2)
     assert results.parameters[-1] == name

@@ -1,6 +1,7 @@
 """Small random grids, and plain sums over all their models, which fits are held against."""
 
 import itertools
+from dataclasses import replace
 
 import astropy.units as u
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import quad
 from scipy.stats import norm
 
+from miricigale.fitting import BayesFitter, GridSettings
 from miricigale.sed import ModelGrid
 
 
@@ -363,3 +365,9 @@ def assert_plain(
         assert_allclose(std, want["std"], rtol=std_rtol, atol=1e2 * scale)
         assert_allclose(results.model_flux[i], want["band"], rtol=max(rtol, 1e-7))
         assert_allclose(results.model_flux_std[i], want["band_std"], rtol=1e-4)
+
+
+def node_fitter(*args, settings=None, **options):
+    """Fitter of the nodes alone: models of random grids have nothing between them."""
+    settings = replace(settings or GridSettings(), interpolate=0)
+    return BayesFitter(*args, settings=settings, **options)

@@ -13,6 +13,7 @@ from miricigale.workflow import Context
 from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.stages import study_stages
 from miricigale.workflow.stages.exposures import study_exposures
+from miricigale.workflow.stages.inputs import existing_bands
 from miricigale.workflow.stages.truth import add_agn, add_field_agn
 from miricigale.workflow.truths import CATALOG, FIELD, study_truths
 
@@ -147,7 +148,7 @@ def _save_truth(made, one, parameters, sky, rng):
         add_agn(parameters, np.linspace(0, 0.9, count), 1)
     elif one.frac_agn > 0:
         add_agn(parameters, one.frac_agn, 1)
-    bands = [*config.fit.bands, *filters]
+    bands = [*existing_bands(config), *filters]
     truth = SEDModel.yang2021(agn=one.frac_agn != 0).fluxes(parameters, bands)
     truth["sky"], truth["star"] = sky, np.zeros(count, bool)
     truth["profile"], truth["sersic_index"] = "sersic", np.linspace(0.5, 4, count)

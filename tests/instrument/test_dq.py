@@ -34,17 +34,6 @@ def test_planes_with_a_legend_are_read_as_they_are(tmp_path):
         np.testing.assert_array_equal(read_dq(hdus["DQ"]), flags)
 
 
-def test_planes_of_earlier_versions_are_translated():
-    # reference, saturated, saturated from the start, jump, outlier and bad pixel
-    old = np.array([[2, 4, 4 + 8 + 64], [16, 1024 + 1, 0]], np.uint32)
-    gone = DQ.SATURATED | DQ.NO_SLOPE | DQ.DO_NOT_USE
-    new = [
-        [DQ.REFERENCE_PIXEL | DQ.NON_SCIENCE | DQ.DO_NOT_USE, DQ.SATURATED, gone],
-        [DQ.JUMP_DET, DQ.OUTLIER | DQ.DO_NOT_USE, 0],
-    ]
-    np.testing.assert_array_equal(read_dq(fits.ImageHDU(old, name="DQ")), new)
-
-
 def test_flags_of_another_kind_are_refused():
     unknown = fits.ImageHDU(np.array([[2**20]]), name="DQ")
     refuses("DQ holds flags of another kind", read_dq, unknown, error=DataError)

@@ -19,7 +19,7 @@ from miricigale.utils.exceptions import DataError
 SHIFT = {"max_shift": 0.2 * u.arcsec}
 OPTIONS = {
     "plain": {},
-    "all": {"background_order": 1, "components": 2, "second_pass": True, "positive": True, **SHIFT},
+    "all": {"background_order": 1, "components": 2, "second_pass": True, **SHIFT},
     "map": {"offset_order": 0, "errors": WHITE, **SHIFT},
 }
 

@@ -69,7 +69,7 @@ def photometer(psfs):
 def test_the_kernel_is_that_of_the_psfs(photometer, psfs):
     made = MatchingKernel.from_psfs(psfs["highres_psf"], psfs["psf"], pixel_scale=0.03 * u.arcsec)
     assert_array_equal(photometer.kernel.array, made.array)
-    assert_array_equal(photometer.replace(positive=True).kernel.array, made.array)
+    assert_array_equal(photometer.replace(second_pass=True).kernel.array, made.array)
 
 
 def test_points_need_a_psf_and_positions(images, psfs, sky, flux):

@@ -1,11 +1,9 @@
-import json
 import pickle
 
 import astropy.units as u
 import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
-from astropy.io import fits
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -64,22 +62,6 @@ def test_templates_come_back_bit_for_bit(scene, tmp_path, way):
             back = pickle.loads(pickle.dumps(one))
         assert_equal_values(way, one, back)
         assert grid_text(back.wcs) == grid_text(high.wcs)
-
-
-def test_files_of_the_first_layout_are_read(scene, tmp_path):
-    # text stood in the primary header, and the layout had no name
-    *_, templates, _, _, _ = scene
-    one = templates[:5]
-    one.write(tmp_path / "new.fits")
-    with fits.open(tmp_path / "new.fits") as hdus:
-        primary = fits.PrimaryHDU()
-        primary.header["META"] = json.dumps(one.meta)
-        primary.header["GRID"] = json.loads(bytes(hdus["TEXT"].data))["grid"]
-        rest = [hdu for hdu in hdus[1:] if hdu.name != "TEXT"]
-        fits.HDUList([primary, *rest]).writeto(tmp_path / "old.fits")
-    back = SourceTemplates.read(tmp_path / "old.fits")
-    assert_equal_values("templates", one, back)
-    assert grid_text(back.wcs) == grid_text(one.wcs)
 
 
 def test_one_set_of_templates_serves_all_bands(tools, scene):

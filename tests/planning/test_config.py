@@ -61,3 +61,12 @@ def test_sets_are_in_order_of_wavelength_by_any_name():
 
 def test_a_file_that_is_not_there_is_named():
     refuses(r"no configuration file .*absent\.toml", load_plan, "absent.toml", error=ConfigError)
+
+
+def test_bands_alone_have_the_exposures_of_ceers():
+    """Yang et al. 2021: 1665 s in three dithers, 4662 s in six at 21 um."""
+    config = load_plan(overrides={"exposures": {"bands": ["miri.f1500w", "miri.f2100w"]}})
+    assert config.exposures.time == (1665.0, 4662.0)
+    assert config.exposures.dithers == (3, 6)
+    other = {"bands": ["miri.f560w"], "time": 600}
+    assert load_plan(overrides={"exposures": other}).exposures.time == (600,)

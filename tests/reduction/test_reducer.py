@@ -83,7 +83,7 @@ def test_pulls_of_simulated_exposures(filt, n_groups, n_integrations, sky):
 def test_flags_tell_why(tmp_path):
     exp = exposure(subarray="FULL", n_groups=3)
     ramp = expose(SKY, exp)
-    reducer = Reducer(cosmic_rays=False)
+    reducer = Reducer()
     rate = reducer.fit_ramp(ramp)
     cal = reducer.calibrate(rate)
     for image in (rate, cal):

@@ -89,7 +89,7 @@ def test_the_last_group_is_left_out_where_nothing_says_that_it_is_good(real, ram
 
 
 def test_another_detector_comes_out_right_with_its_references(exposure, real, ramp, references):
-    reducer = Reducer(references=references, skip_first=0, skip_last=0, cosmic_rays=False)
+    reducer = Reducer(references=references, skip_first=0, skip_last=0)
     rate = reducer.fit_ramp(real)
     truth = SKY / photmjsr(exposure.filter, gain=OTHER.gain)
     truth = truth * flat_field(exposure.filter, subarray="SUB256")
@@ -145,7 +145,7 @@ def test_without_references_it_is_refused(ramp, real, references):
     rate = warned("slopes without references for dark", Reducer(references=partial).fit_ramp, real)
     assert rate.meta["reference_dark"] == "none"
     with pytest.warns(MiricigaleWarning, match="the dark current is in the slopes still"):
-        Reducer(references=partial, cosmic_rays=False).calibrate(rate)
+        Reducer(references=partial).calibrate(rate)
     refuses("must be given for surface brightness", Reducer().calibrate, rate)
 
 

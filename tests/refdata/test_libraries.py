@@ -84,27 +84,6 @@ def test_what_is_written_comes_back(tmp_path):
     assert [p.name for p in path.parent.iterdir()] == ["x.fits"]
 
 
-def test_files_of_the_layout_before_are_read(tmp_path):
-    """There the kinds of spectra were versions of one extension, in the order of the text."""
-    library = make()
-    kinds = {name: list(getattr(library, name)) for name in ("axes", "values", "spectra")}
-    text = kinds | {"name": NAME, "units": library.units, "meta": library.meta, "summary": ["s"]}
-    data = np.frombuffer(json.dumps(text).encode(), dtype=np.uint8)
-    columns = [fits.Column(n, "D", array=c) for n, c in (library.axes | library.values).items()]
-    hdus = [
-        fits.PrimaryHDU(header=fits.Header({"FORMAT": "miricigale-library-1"})),
-        fits.ImageHDU(library.wave, name="WAVE"),
-        fits.BinTableHDU.from_columns(columns, name="ROWS"),
-        fits.ImageHDU(data, name="TEXT"),
-    ]
-    for k, spectra in enumerate(library.spectra.values()):
-        hdus.append(fits.ImageHDU(spectra, name="SPECTRA", ver=k + 1))
-    fits.HDUList(hdus).writeto(tmp_path / "x.fits", checksum=True)
-    found = verify_library(tmp_path / "x.fits", NAME)
-    same(found, library)
-    assert found.summary == ("s",)
-
-
 def test_other_programs_read_it(tmp_path):
     """A FITS reader finds images with units, a table of axes, and checksums that hold."""
     path = tmp_path / "x.fits"

@@ -10,7 +10,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from helpers.errors import refuses
 from miricigale.sed import ModelGrid
 from miricigale.utils.exceptions import DataError
-from miricigale.utils.store import write_parts
 
 
 def make(**changes):
@@ -94,21 +93,3 @@ def test_facts_that_decide_are_attributes_and_survive_writing_copying_and_pickli
         assert other.meta == {"note": "for people"}
         assert_array_equal(other.galaxy, grid.galaxy)
         assert not other.galaxy.flags.writeable
-
-
-def test_files_of_the_layout_before_are_read(tmp_path):
-    """There the facts stood in the meta, and bounds were those of the components that it names."""
-    grid = make()
-    tables = ("galaxy_parameters", "agn_parameters", "galaxy_properties", "agn_properties")
-    tables = {name: getattr(grid, name) for name in (*tables, "galaxy_shape")}
-    arrays = ("redshift", "galaxy", "agn", "dust_luminosity", "frac_agn", "allowed")
-    arrays = {name: getattr(grid, name) for name in (*arrays, "agn_multiplicity")}
-    meta = {name: FACTS[name] for name in ("axes", "inert", "frac_agn_definition")}
-    text = {"filters": grid.filters, "meta": meta | FACTS["recipe"]}
-    text["descriptions"] = {n: dict.fromkeys(t.colnames, "words") for n, t in tables.items()}
-    path = tmp_path / "old.fits"
-    write_parts(path, "miricigale-modelgrid-2", text=text, arrays=arrays, tables=tables)
-    old = ModelGrid.read(path)
-    same_facts(old)
-    assert old.galaxy_parameters["tau"].info.description == "words"
-    assert_array_equal(old.agn, grid.agn)

@@ -20,6 +20,8 @@ from miricigale.workflow import StudyRunner
 from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.page.provenance import catalog_facts
 from miricigale.workflow.stages import study_stages
+from miricigale.workflow.stages.fits import mock_photometry
+from miricigale.workflow.stages.inputs import existing_bands
 
 SHORT, LONG = ["nircam.f090w", "nircam.f150w", "nircam.f200w"], ["mips.24"]
 ALPHA = [1.5, 2.5]
@@ -50,14 +52,15 @@ def run(folder, table, **sed):
     config = StudyConfig.from_dict({**sections, "sed": sed})
     truth = do_inputs(config, folder, ("catalog", ""))
     facts = dict(catalog_facts(config, check_catalog(table)))
-    return FitResults.read(folder / "input_seds.fits"), truth, facts["input SEDs fitted to"]
+    told = f"{facts['input SEDs fitted to']}; {facts['fitted in the end']}"
+    return FitResults.read(folder / "input_seds.fits"), truth, told
 
 
 def test_without_errors_short_bands_get_five_percent(galaxies, tmp_path):
     results, truth, told = run(tmp_path, galaxies.copy())
     assert list(results.filters) == SHORT
     assert_allclose(results.flux_err, 0.05 * results.flux)
-    assert "mips.24" not in told
+    assert "mips.24" not in told.split(";")[0]
     assert "5 % error each, for the catalog gives none" in told
     # drawn, each its own
     assert np.all((truth["alpha"] >= 1.5) & (truth["alpha"] <= 2.5))
@@ -76,6 +79,33 @@ def test_the_catalogs_own_errors_are_used_beyond_three_micron_too(galaxies, tmp_
     assert "alpha is fitted too" in told
     # 24 um shows the dust: alpha is that of the fit, and the flux comes back
     assert_array_equal(truth["alpha"], ALPHA)
+
+
+def test_the_fit_has_the_bands_errors_and_gaps_of_the_catalog(galaxies, tmp_path):
+    """Source by source; what has no flux has none in the fit, and other draws have the same errors."""
+    table = galaxies[[0, 1, 0, 1] * 50]
+    table["id"] = np.arange(200)
+    offsets = 20 * np.array(np.divmod(np.arange(200), 20)) * u.arcsec
+    table["sky"] = galaxies["sky"][0].spherical_offsets_by(*offsets)
+    for name in (*SHORT, *LONG):
+        table[name] = 0.1 * table[name]
+    table["nircam.f090w_err"] = np.linspace(0.01, 0.2, 200) * table["nircam.f090w"]
+    table["nircam.f150w_err"] = np.where(np.arange(200) % 4, 0.1, -1.0) * table["nircam.f150w"]
+    table["nircam.f200w"][7] = np.nan
+    _, truth, told = run(tmp_path, table)
+    config = StudyConfig.from_dict({"catalog": {"source": str(tmp_path / "mine.ecsv")}})
+    matched = QTable({"selection": np.zeros(200, int)})
+    for name in (*config.exposures.filters,):
+        matched[name] = matched[f"{name}_err"] = np.ones(200) * u.uJy
+    mock = mock_photometry(config, truth, matched, seed=1)
+    assert list(existing_bands(config)) == [*SHORT, *LONG]
+    assert_allclose(mock["nircam.f090w_err"], table["nircam.f090w_err"])
+    pull = (mock["nircam.f090w"] - truth["nircam.f090w"]) / table["nircam.f090w_err"]
+    assert np.std(pull.value) == pytest.approx(1, abs=0.15)
+    assert np.isnan(mock["nircam.f150w"]).nonzero()[0].tolist() == list(range(0, 200, 4))
+    assert np.isnan(mock["nircam.f200w"]).nonzero()[0].tolist() == [7]
+    assert_allclose(mock["mips.24_err"], 0.05 * table["mips.24"])
+    assert "4 existing bands, with the errors of each source in the catalog" in told
 
 
 def test_a_flux_whose_error_is_not_positive_is_left_out(galaxies, tmp_path):

@@ -1,6 +1,5 @@
 """The order in which the effects act, and what it says of a tuple of them."""
 
-import ast
 import itertools
 
 from miricigale.detector.effects.base import Effect, OtherEffect, stream_key
@@ -46,18 +45,14 @@ def effect_from_record(record):
 
     Parameters
     ----------
-    record : dict or str
-        A record; or, in files of earlier versions, the effect's repr.
+    record : dict
+        A record.
 
     Returns
     -------
     effect : `Effect`
         `OtherEffect` where it is none of `ORDER`.
     """
-    if isinstance(record, str):
-        call = ast.parse(record, mode="eval").body
-        record = {word.arg: ast.literal_eval(word.value) for word in call.keywords}
-        record["effect"] = call.func.id
     settings = dict(record)
     name = settings.pop("effect")
     for kind in ORDER:

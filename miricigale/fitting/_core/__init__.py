@@ -5,14 +5,25 @@ Kernels of the grid fit: arrays in, arrays out.
 pairs of galaxy and AGN model that can matter are listed by their bounds (`pairs`, down to those of
 `floors`), evaluated side by side (`lanes`, `single` in single precision, `limits` with upper
 limits) and summed up (`sums`, `histogram`); `summarize` turns the sums into moments and quantiles.
-`sum_nodes` (`between`) interpolates models, `find_models` (`mixture`) finds wrong bands.
+ `weigh_masses` (`masses`) puts a prior of mass in, `find_models` (`mixture`) finds wrong bands.
+`interpolate` (`between`) and `move` (`population`) are of models between the nodes.
 `structs` says what the kernels take, `rows` where it stands there, `workspace` makes it.
 """
 
-from miricigale.fitting._core.between import sum_nodes
+from miricigale.fitting._core.between import Kind, interpolate, make_work
 from miricigale.fitting._core.evaluate import sum_up
 from miricigale.fitting._core.histogram import PER_DEX, make_scales, summarize
+from miricigale.fitting._core.masses import weigh_masses
 from miricigale.fitting._core.mixture import find_models
+from miricigale.fitting._core.population import (
+    NEVER,
+    Mixture,
+    Object,
+    Space,
+    fill_library,
+    move,
+    rate,
+)
 from miricigale.fitting._core.structs import BLOCK, Request, Tables
 from miricigale.fitting._core.workspace import (
     JOINT,

@@ -4,7 +4,7 @@ Models that fit with some bands wrong: one at each redshift, by expectation and 
 The likelihood of a band is a mixture of the stated error and a broad one. With the share q of the broad
 part the best model is that of weights v = 1 - q + q v0, v0 the broad weight over the stated one, and q
 follows from the model (Dempster et al. 1977). Where that ends depends on where it begins: with
-all bands good, as at the redshift before, and with the bands, or neighbors of them, whose loss pays most.
+all bands good, and with the bands, or neighbors of them, whose loss pays most.
 """
 
 from typing import NamedTuple
@@ -149,7 +149,7 @@ def find_models(tables, target, few, odds, base, offset, ends, sizes, share, low
     """
     n_used, n_agn = target.bands.size, few.agn.shape[0]
     start, model = few.share, few.model
-    before, top_all = np.int64(-1), _HUGE
+    top_all = _HUGE
     for stage in range(len(sizes)):
         n = sizes[stage]
         near, top_all = top_all + (_NEAR if stage == 1 else _NEARER), _HUGE
@@ -168,18 +168,12 @@ def find_models(tables, target, few, odds, base, offset, ends, sizes, share, low
             lowest[z], ratio, own, least = _HUGE, few.ratio[z], odds[z], _HUGE
             for j in range(n_used):
                 least = min(least, -2.0 * np.log(max(own[j], 1e-30)))
-            for begin in range(3 if stage == 0 else 1):
-                if begin == 2 and lowest[z] < least:
+            for begin in range(2 if stage == 0 else 1):
+                if begin == 1 and lowest[z] < least:
                     continue
-                other = 0.0
                 for j in range(n_used):
                     start[j] = share[z, j] if stage > 0 else 1.0
-                    if begin == 1 and before >= 0:
-                        start[j] = max(share[before, j], v0[j])
-                    other = max(other, abs(start[j] - share[z, j]))
-                if begin == 1 and other < 0.5:
-                    continue
-                if begin == 2:
+                if begin == 1:
                     _take_out(few, n, ratio, data, norm, own, v0, n_used, ends, start)
                 for _ in range(_STEPS):
                     _sum(few, n, data, start, n_used)
@@ -222,8 +216,7 @@ def find_models(tables, target, few, odds, base, offset, ends, sizes, share, low
                             share[z, j] = start[j]
                         index[z, 0], index[z, 1] = place, k
                         scale[z, 0] = s * unit / tables.galaxy_unit[z, place]
-                        scale[z, 1] = s * x * unit
+                        scale[z, 1] = s * x * unit / tables.agn_unit[z, k] if k >= 0 else 0.0
                     if change < _STILL:
                         break
-            before = z
             top_all = min(top_all, lowest[z] + offset[z])

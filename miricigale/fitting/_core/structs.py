@@ -70,6 +70,7 @@ class Tables(NamedTuple):
     galaxy32: np.ndarray  # float32 (nz, nb, n_padded), each galaxy in its own unit
     agn32: np.ndarray  # float32 (nz, nA, nb), each AGN model in its own unit
     galaxy_unit: np.ndarray  # float64 (nz, nG): these units, uJy / Msun
+    agn_unit: np.ndarray  # float64 (nz, nA): and uJy / W
     log_usable: np.ndarray  # float64 (nz, n_padded): 2 ln(prior) where usable, else -1e300
     of_galaxy: np.ndarray  # float64 (4, n_padded)
     of_agn: np.ndarray  # float64 (3, nA)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from filelock import FileLock
 
 from miricigale.refdata.libraries.table import LibraryTable, verify_library, write_library
 from miricigale.refdata.lookup import data_folder, file_sha256, record_path, stored_record
@@ -16,11 +17,6 @@ from miricigale.refdata.registry import resource
 from miricigale.utils.exceptions import DataError, data_error, unknown_name
 from miricigale.utils.progress import progress
 from miricigale.utils.store import PARTIAL, replacing
-
-try:
-    import fcntl
-except ImportError:  # no such locks on Windows
-    fcntl = None
 
 #: What reads the distributed files of a library: a function, or ``"module:function"``,
 #: imported on first use; called with a `~pathlib.Path`, it gives a `LibraryTable`.
@@ -144,23 +140,13 @@ def _locked(target):
     """
     Keep other processes from writing the same file; wait if one does.
 
-    What an interrupted process left half written is removed. The lock is advisory
-    (``flock``); where the system has none two processes that add the same resource at the
-    same moment may leave a record that does not fit the file, which `check_resources` reports.
+    What an interrupted process left half written is removed.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
-    with open(target.with_name(f".{target.name}.lock"), "ab") as handle:
-        held = fcntl is not None
-        try:
-            if held:
-                fcntl.flock(handle, fcntl.LOCK_EX)
-        except OSError:
-            # some network file systems have no locks
-            held = False
-        if held:
-            # no other process writes: these are left over from ones that ended
-            for path in target.parent.glob(f"{PARTIAL}*-{target.name}*"):
-                path.unlink(missing_ok=True)
+    with FileLock(target.with_name(f".{target.name}.lock")):
+        # no other process writes: these are left over from ones that ended
+        for path in target.parent.glob(f"{PARTIAL}*-{target.name}*"):
+            path.unlink(missing_ok=True)
         yield
 
 

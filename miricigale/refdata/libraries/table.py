@@ -14,8 +14,8 @@ from miricigale.utils.files import cached_by_file, open_fits
 from miricigale.utils.store import open_parts, write_parts
 from miricigale.utils.units import WAVE, frozen_array, to_array
 
-#: Layouts of files; in the first the kinds of spectra were versions of one extension.
-_LAYOUTS = ("miricigale-library-2", "miricigale-library-1")
+#: Layout of files.
+_LAYOUT = "miricigale-library-2"
 
 #: Values of an axis that differ by less than this, relatively, are the same.
 _SAME = 1e-6
@@ -236,7 +236,7 @@ def write_library(library, path):
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     text |= {"name": library.name, "meta": library.meta}
-    write_parts(path, _LAYOUTS[0], text=text, arrays=arrays, tables={"ROWS": rows}, overwrite=True)
+    write_parts(path, _LAYOUT, text=text, arrays=arrays, tables={"ROWS": rows}, overwrite=True)
 
 
 def _extension(kind):
@@ -285,20 +285,17 @@ _lock = threading.Lock()
 def _open(path, name):
     wanted = f"library {name!r} (made by 'miricigale data add')"
     # the mapping lives as long as the arrays that use it
-    with open_parts(path, _LAYOUTS, wanted=wanted, memmap=True) as parts:
+    with open_parts(path, (_LAYOUT,), wanted=wanted, memmap=True) as parts:
         text = parts.text
         if text["name"] != name:
             raise data_error(path, f"holds {text['name']!r}, not {name!r}")
-        rows, kinds = parts.table("ROWS"), text["spectra"]
-        places = map(_extension, kinds)
-        if parts.layout == _LAYOUTS[1]:
-            places = [("SPECTRA", k) for k in range(1, len(kinds) + 1)]
+        rows = parts.table("ROWS")
         return LibraryTable(
             name=name,
             wave=parts.array("WAVE"),
             axes={n: np.asarray(rows[n]) for n in text["axes"]},
             values={n: np.asarray(rows[n]) for n in text["values"]},
-            spectra={n: parts.mapped(place) for n, place in zip(kinds, places, strict=True)},
+            spectra={n: parts.mapped(_extension(n)) for n in text["spectra"]},
             units=text["units"],
             meta=text["meta"],
             summary=tuple(text["summary"]),

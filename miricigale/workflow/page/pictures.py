@@ -126,8 +126,7 @@ def subtraction_figure(rate, cal, reducer):
     ``rate`` and ``cal`` are the slopes and the calibrated image, ``reducer`` that of the run.
     """
     after = filled(cal)
-    # cosmic rays are among the pixels that the calibrated image masks
-    before = reducer.replace(cosmic_rays=False).calibrate(rate)
+    before = reducer.calibrate(rate)
     before = np.where(np.isfinite(after), filled(before), np.nan)
     # the part of the detector that sees the sky
     used = np.argwhere(np.isfinite(after))

@@ -20,7 +20,7 @@ from miricigale.workflow.stages.exposures import (
     study_exposures,
     study_pointings,
 )
-from miricigale.workflow.stages.inputs import catalog_bands, input_bands
+from miricigale.workflow.stages.inputs import DUST_SHOWS, catalog_bands, existing_bands, input_bands
 
 
 def exposure_kinds(config, forecasts, bands):
@@ -58,7 +58,8 @@ def stand_ins(config, model):
     chosen += ["rates"] if config.exposures.kind == "rates" else []
     rays = ", read-out and cosmic rays" if config.detector.cosmic_rays else " and read-out"
     facts = {"rays": rays, "residual": residual}
-    return [sentence(texts[name], facts) for name in (*chosen, "existing")]
+    chosen.append("existing" if all(existing_bands(config).values()) else "own")
+    return [sentence(texts[name], facts) for name in chosen]
 
 
 def library_rows(model):
@@ -96,8 +97,8 @@ def catalog_facts(config, catalog):
     else:
         others = "" if len(own) == len(fitted) else f" in {', '.join(own)}; {guess} in the others"
         how = f", with the catalog's errors{others}"
-    if longest > limit:
-        how += "; the dust's alpha is fitted too"
+    if longest > DUST_SHOWS:
+        how += "; the dust's alpha is fitted too, of sources with a flux there"
     if config.highres.filter in bands:
         how += f"; each SED is scaled to the flux in {config.highres.filter}"
     facts = {
@@ -106,6 +107,12 @@ def catalog_facts(config, catalog):
         "fluxes": f"{len(bands)} bands{fluxes}",
         "input SEDs fitted to": ", ".join(fitted) + how,
     }
+    existing = existing_bands(config)
+    of = (
+        "with depths" if all(existing.values()) else "with the errors of each source in the catalog"
+    )
+    of = f"{len(existing)} existing bands, {of} ({', '.join(existing)})"
+    facts["fitted in the end"] = f"{of}, and {len(config.exposures.filters)} of MIRI"
     if "redshift_source" in catalog.colnames:
         kinds, counts = np.unique(np.asarray(catalog["redshift_source"], str), return_counts=True)
         pairs = zip(kinds, counts, strict=True)

@@ -6,6 +6,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale import evaluation, fitting, photometry, sed
+from miricigale.photometry.error_model import add_noise
 from miricigale.photometry.surveys import fractional_error
 from miricigale.utils.tables import error_column
 from miricigale.workflow.engine.stage import stage
@@ -16,7 +17,7 @@ from miricigale.workflow.stages.exposures import (
     pointing_exposures,
     pointing_time,
 )
-from miricigale.workflow.stages.inputs import fit_plan, sed_resources
+from miricigale.workflow.stages.inputs import existing_bands, fit_plan, sed_resources
 from miricigale.workflow.stages.measure import joined_photometry
 from miricigale.workflow.stages.sample import (
     add_selection,
@@ -127,27 +128,30 @@ def match_sources(context, unit):
     context.save_table(f"{unit}/matched.ecsv", matched)
 
 
-def existing_errors(fit):
-    """Errors (`~miricigale.photometry.ErrorModel`) of the existing bands of a section ``[fit]``."""
-    return photometry.ErrorModel.from_depths(
-        dict(zip(fit.bands, fit.depths, strict=True)),
-        fractional={name: fractional_error(name) for name in fit.bands},
-    )
+def existing_errors(depths):
+    """Errors (`~miricigale.photometry.ErrorModel`) of existing bands of some depths, by band."""
+    fractional = {name: fractional_error(name) for name in depths}
+    return photometry.ErrorModel.from_depths(depths, fractional=fractional)
 
 
 def mock_photometry(config, truth, matched, *, seed, zero_point=0.0):
     """
     Photometry of the fitted sample (``selection`` 0): mock existing bands, measured MIRI bands.
 
+    Existing bands without a depth have the errors that the truth has of the catalog, no flux where it has none.
     ``truth`` and ``matched`` have the same sources row by row; the noise of a source in a band depends
     on ``seed``, its id and the band only. The light of existing bands is higher or lower by the share
     ``zero_point``, of which the fits do not know.
     """
-    bands, errors = config.fit.bands, existing_errors(config.fit)
+    limits = existing_bands(config)
+    bands = list(limits)
     sample = np.asarray(matched["selection"]) == 0
     name = "zero_point_existing"
     light = Perturbation({name: zero_point}, seed).fluxes(name, truth[["id", *bands]], bands)
-    table = errors.perturb(light[sample], seed=seed)
+    deep = {band: limit for band, limit in limits.items() if limit is not None}
+    table = existing_errors(deep).perturb(light[sample], seed=seed) if deep else light[sample]
+    for band in (band for band in bands if band not in deep):
+        add_noise(table, band, truth[error_column(band)][sample], seed)
     for name in config.exposures.filters:
         for column in (name, error_column(name)):
             table[column] = matched[column][sample]
@@ -155,7 +159,14 @@ def mock_photometry(config, truth, matched, *, seed, zero_point=0.0):
 
 
 #: What fits of mock photometry read of the configuration.
-FIT_SECTIONS = ("fit.bands", "fit.depths", "fit.axes", "fit.model_error", "exposures.filters")
+FIT_SECTIONS = (
+    "catalog",
+    "fit.bands",
+    "fit.depths",
+    "fit.axes",
+    "fit.model_error",
+    "exposures.filters",
+)
 
 
 def _fit_plan(config, unit):
@@ -202,9 +213,11 @@ def fit_sample(context, name, **options):
 
 
 def study_fitter(fit, bands, **options):
-    """`BayesFitter` in the existing bands of a section ``[fit]`` and further ones."""
-    options = {"model_error": fit.model_error} | options
-    return fitting.BayesFitter(sed.SEDModel.yang2021(), [*fit.bands, *bands], **options)
+    """`BayesFitter` in bands, with the model error of a section ``[fit]``."""
+    # galaxies of a study are models of the nodes
+    settings = fitting.GridSettings(interpolate=0)
+    options = {"model_error": fit.model_error, "settings": settings} | options
+    return fitting.BayesFitter(sed.SEDModel.yang2021(), bands, **options)
 
 
 def fit_mock(context, mock, bands, *, redshift=None, **options):
@@ -228,6 +241,7 @@ def fit_mock(context, mock, bands, *, redshift=None, **options):
     -------
     results : `~miricigale.fitting.FitResults`
     """
+    bands = [*existing_bands(context.config), *bands]
     fitter = study_fitter(context.config.fit, bands, **options)
     with ThreadPoolExecutor(context.n_threads) as executor:
         show = context.progress_bar

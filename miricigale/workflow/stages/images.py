@@ -39,7 +39,6 @@ def reducer_of(config, n_threads=None):
     return reduction.Reducer(
         backend=options.backend,
         jump_threshold=options.jump_threshold,
-        cosmic_rays=options.residual_cosmic_rays,
         background=reduction.BackgroundSettings(
             options.background,
             box=options.background_box,

@@ -8,6 +8,7 @@ from astropy.table import QTable
 
 from miricigale import fitting, sed
 from miricigale.filters import Filter
+from miricigale.photometry import YANG2021_DEPTHS
 from miricigale.refdata import resources
 from miricigale.refdata.lookup import fingerprint
 from miricigale.scene import read_catalog
@@ -20,14 +21,16 @@ from miricigale.workflow.options import require
 
 #: Redshifts closer than this share a node of the grid of the input fit.
 REDSHIFT_STEP = 0.01
+#: Pivot wavelength in um beyond which bands tell dusts apart.
+DUST_SHOWS = 5.0
 
 
 def input_axes(kind, *, dust=False):
     """
     Axes of the fit of the input SEDs but redshift, of the grid ``"galaxy"`` or ``"quick"``.
 
-    Those of Yang et al. 2021, but one value of the dust's alpha unless ``dust``: bands shorter than a
-    few um do not constrain it, and a fit would run to the edge of the grid (see `make_truth`).
+    Those of Yang et al. 2021, but one value of the dust's alpha unless ``dust``: bands shorter than 5 um
+    do not constrain it, and a fit would run to the edge of the grid (see `make_truth`).
     """
     axes = sed.SEDModel.yang2021_axes(kind)
     fitted = {name: axes[name] for name in ("tau", "age", "ebv", "alpha")}
@@ -68,6 +71,40 @@ def input_bands(catalog, max_wavelength):
         if own or pivot <= max_wavelength:
             bands[name], longest = own, max(longest, pivot)
     return bands, longest
+
+
+def measured_error(catalog, name, catalog_error):
+    """Errors of a catalog's band: its own, NaN where not positive, or without any a part of the flux."""
+    if error_column(name) not in catalog.colnames:
+        return np.abs(catalog[name]) * catalog_error
+    error = catalog[error_column(name)]
+    # a flux without a positive error is treated as missing
+    return np.where(error.value > 0, error.value, np.nan) * error.unit
+
+
+def existing_bands(config):
+    """
+    Bands that are fitted beside those that are simulated: dict of name to 5-sigma AB depth.
+
+    The depth is None where each source has the error of the catalog.
+    """
+    fit, catalog = config.fit, config.catalog
+    if fit.bands:
+        return dict.fromkeys(fit.bands) | dict(zip(fit.bands, fit.depths, strict=False))
+    if catalog.source in resources():
+        return dict(YANG2021_DEPTHS)
+    new = config.exposures.filters
+    return dict.fromkeys(b for b in catalog_bands(study_catalog(catalog)) if b not in new)
+
+
+def shows_dust(catalog, options):
+    """Whether each source has a flux beyond `DUST_SHOWS` in a band that its SED is fitted to, shape (n,)."""
+    shown = np.zeros(len(catalog), bool)
+    for name in input_bands(catalog, options.max_wavelength)[0]:
+        if Filter.from_name(name).pivot.value > DUST_SHOWS:
+            error = measured_error(catalog, name, options.catalog_error)
+            shown |= np.isfinite(catalog[name] + error)
+    return shown
 
 
 def study_catalog(options):
@@ -171,23 +208,17 @@ def fit_seds(catalog, options, *, model_error, executor=None, progress_bar=False
     require(bands, "sed", "max_wavelength", wanted, options.max_wavelength)
     photometry = QTable({"id": catalog["id"]})
     photometry["redshift"] = np.asarray(catalog["redshift"], float)
-    for name, own in bands.items():
+    for name in bands:
         photometry[name] = catalog[name]
-        if own:
-            error = catalog[error_column(name)].value
-            # a flux without a positive error is treated as missing
-            error = np.where(error > 0, error, np.nan) * catalog[error_column(name)].unit
-        else:
-            error = np.abs(catalog[name]) * options.catalog_error
-        photometry[error_column(name)] = error
+        photometry[error_column(name)] = measured_error(catalog, name, options.catalog_error)
     nodes = np.unique(np.round(photometry["redshift"] / REDSHIFT_STEP) * REDSHIFT_STEP)
-    axes = input_axes(options.axes, dust=longest > options.max_wavelength)
+    axes = input_axes(options.axes, dust=longest > DUST_SHOWS)
     fitter = fitting.BayesFitter(
         sed.SEDModel.yang2021(agn=False),
         list(bands),
         axes=axes | {"redshift": nodes[nodes > 0]},
         model_error=model_error,
-        settings=fitting.GridSettings(redshift_tolerance=REDSHIFT_STEP),
+        settings=fitting.GridSettings(redshift_tolerance=REDSHIFT_STEP, interpolate=0),
         # a single band is enough for a flux
         n_bands_min=1,
     )

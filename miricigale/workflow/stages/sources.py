@@ -19,7 +19,7 @@ from miricigale.workflow.page.labels import SET_COLORS, SET_LABELS, band_label
 from miricigale.workflow.page.numbers import StudyTables
 from miricigale.workflow.stages.conditions import ConditionFlags, any_condition
 from miricigale.workflow.stages.cutouts import Cutouts
-from miricigale.workflow.stages.inputs import sed_resources
+from miricigale.workflow.stages.inputs import existing_bands, sed_resources
 from miricigale.workflow.stages.sample import SampleFlags
 from miricigale.workflow.truths import truth_names
 
@@ -43,7 +43,16 @@ FLAGS = {
     "sources",
     "source browser",
     needs=("truth", "mosaics", "highres", "photometry", "matches", "fits"),
-    sections=("run.name", "exposures", "highres", "photometry", "reduction", "fit", "report"),
+    sections=(
+        "run.name",
+        "catalog",
+        "exposures",
+        "highres",
+        "photometry",
+        "reduction",
+        "fit",
+        "report",
+    ),
     resources=sed_resources,
     units=truth_names,
     plan=lambda config, _: list(truth_names(config)),
@@ -101,7 +110,10 @@ class _Sources(StudyTables):
         config, truth = context.config, self.truth
         self.model, self.prior = sed.SEDModel.yang2021(), config.highres.filter
         self.miri = tuple(config.exposures.filters)
-        self.bands = (*(band for band in config.fit.bands if band not in self.miri), *self.miri)
+        self.bands = (
+            *(band for band in existing_bands(config) if band not in self.miri),
+            *self.miri,
+        )
         self.pivots = np.array([Filter.from_name(band).pivot.value for band in self.bands])
         self.edges = np.geomspace(0.7 * self.pivots.min(), 1.4 * self.pivots.max(), N_WAVE + 1)
         self.sampled = np.asarray(self.matched["selection"]) == 0

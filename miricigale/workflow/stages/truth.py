@@ -13,16 +13,23 @@ from miricigale.utils.content import file_sha256
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.meta import provenance
 from miricigale.utils.random import stream
+from miricigale.utils.tables import error_column
 from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.morphology import RealGalaxies, stamps_of_sources, write_stamps
 from miricigale.workflow.options import require
 from miricigale.workflow.perturbation import perturbed_model, perturbed_parameters, point_columns
-from miricigale.workflow.stages.inputs import catalog_bands, sed_resources
+from miricigale.workflow.stages.inputs import (
+    catalog_bands,
+    existing_bands,
+    measured_error,
+    sed_resources,
+    shows_dust,
+)
 from miricigale.workflow.stages.stars import star_fluxes
 from miricigale.workflow.truths import CATALOG, CUTOUTS, FIELD, study_truths, truth_names
 
 #: What the models of the galaxies depend on beside their fits.
-MODELS = ("sed.alpha", "sed.alpha_draw", "sed.infrared")
+MODELS = ("sed.alpha", "sed.alpha_draw", "sed.infrared", "sed.max_wavelength", "sed.catalog_error")
 GALAXY_PARAMETERS = ("tau", "age", "ebv", "alpha", "metallicity")
 #: Inclinations (deg) of AGN seen through the torus, after Yang et al. 2021, and of the others.
 EDGE_ON, FACE_ON = (60.0, 70.0, 80.0, 90.0), (0.0, 10.0, 20.0, 30.0, 40.0)
@@ -51,7 +58,10 @@ def galaxy_parameters(config, catalog, best, *, seed):
     for name in (*GALAXY_PARAMETERS, "mass"):
         if f"{name}_best" in best.colnames:
             table[name] = best[f"{name}_best"]
-    if "alpha" not in table.colnames:
+    shown = np.zeros(len(table), bool)
+    if "alpha" in table.colnames:
+        shown = shows_dust(catalog, config.sed)
+    if not shown.all():
         # the bands of the fit do not show it
         values = low, high = config.sed.alpha
         if config.sed.alpha_draw == "nodes":
@@ -60,7 +70,8 @@ def galaxy_parameters(config, catalog, best, *, seed):
             wanted = "must hold a node of the fit's grid with alpha_draw = 'nodes'"
             require(values, "sed", "alpha", wanted, [low, high])
         streams = (stream(seed, "truth", "alpha", str(key)) for key in table["id"])
-        table["alpha"] = [_draw(rng, values) for rng in streams]
+        drawn = np.array([_draw(rng, values) for rng in streams], float)
+        table["alpha"] = np.where(shown, table["alpha"], drawn) if shown.any() else drawn
     model, prior = sed.SEDModel.yang2021(agn=False), config.highres.filter
     if prior in catalog.colnames:
         fitted, measured = model.fluxes(table, [prior])[prior], catalog[prior]
@@ -159,7 +170,13 @@ def _truth_plan(config, unit):
     "model fluxes",
     version=3,
     needs=("catalog", "seds"),
-    sections=(*MODELS, "exposures.filters", "fit.bands", "highres.filter"),
+    sections=(
+        *MODELS,
+        "catalog",
+        "exposures.filters",
+        "fit",
+        "highres.filter",
+    ),
     resources=sed_resources,
     units=truth_names,
     plan=_truth_plan,
@@ -172,7 +189,8 @@ def make_truth(context, name):
     best = fitting.FitResults.read(context.path("input_seds.fits")).to_table()
     parameters = galaxy_parameters(config, catalog, best, seed=context.seed)
     prior = config.highres.filter
-    bands = list(dict.fromkeys([*config.fit.bands, *config.exposures.filters, prior]))
+    existing = existing_bands(config)
+    bands = list(dict.fromkeys([*existing, *config.exposures.filters, prior]))
     model = sed.SEDModel.yang2021(agn=frac_agn != 0)
     if frac_agn == FIELD:
         add_field_agn(parameters, model, bands[0], context.seed)
@@ -190,6 +208,9 @@ def make_truth(context, name):
         stars = star_fluxes(catalog[star], catalog_bands(catalog), bands)
         for band in bands:
             light[band][star] = stars[band]
+    for band in (name for name, limit in existing.items() if limit is None):
+        error = measured_error(catalog, band, config.sed.catalog_error)
+        light[error_column(band)] = np.where(np.isfinite(catalog[band]), error, np.nan * error.unit)
     # what a column frac_agn of the catalog says is of the truth of that name only
     own = {"frac_agn", *light.colnames, *parameters.colnames}
     known = catalog[[c for c in catalog.colnames if c not in own and "." not in c]]

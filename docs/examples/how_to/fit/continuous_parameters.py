@@ -33,17 +33,16 @@ for band in bands:
     photometry[f"{band}_err"] = error
 
 # %%
-# ``interpolate`` draws models between the nodes of the grid, whose fluxes are interpolated. ``finer`` is the model
-# that made the grid: it refines the grid until fluxes between its nodes are good to 0.5 %.
+# A fit draws models between the nodes of the grid, whose fluxes are interpolated; with ``interpolate=0`` it does
+# not. ``finer`` is the model that made the grid: it refines the grid until fluxes between its nodes are good to
+# 0.5 %. If a model is fitted instead of a grid, this happens by itself.
 
 axes = SEDModel.yang2021_axes("galaxy") | {"tau": [1.0]}
 axes["redshift"] = np.expm1(np.arange(np.log(1.6), np.log(2.5), 0.03))
 grid = model.grid(axes, bands)
 fitters = {
-    "nodes": BayesFitter(grid, model_error=0),
-    "between": BayesFitter(
-        grid, model_error=0, settings=GridSettings(interpolate=400, finer=model)
-    ),
+    "nodes": BayesFitter(grid, model_error=0, settings=GridSettings(interpolate=0)),
+    "between": BayesFitter(grid, model_error=0, settings=GridSettings(finer=model)),
 }
 fits = {label: fitter.fit(photometry) for label, fitter in fitters.items()}
 rows = []

@@ -10,6 +10,8 @@ You have a catalog in which some sources are stars or quasars. You want to know 
 # stars. Black bodies represent the stars here; use spectra of a library for real ones:
 # ``read_spectra("pickles/")``.
 
+import warnings
+
 import astropy.units as u
 import matplotlib.pyplot as plt
 import numpy as np
@@ -19,6 +21,7 @@ from astropy.table import QTable, vstack
 from miricigale import SED, BayesFitter, FilterSet, SEDModel
 from miricigale.fitting import compare_classes
 from miricigale.sed import quasar_axes, template_grid
+from miricigale.utils.exceptions import FitWarning
 
 bands = ["acs.f606w", "acs.f814w", "wfc3.f125w", "wfc3.f160w", "irac.ch1"]
 bands += ["miri.f560w", "miri.f770w", "miri.f1000w", "miri.f1500w", "miri.f2100w"]
@@ -53,8 +56,10 @@ for band in bands:
     photometry[f"{band}_err"] = error
 
 # %%
-# Fit the same photometry with the models of each class and compare the evidences.
+# Fit the same photometry with the models of each class and compare the evidences. Fits of sources of another class
+# may warn of bands that scatter, which is left out here.
 
+warnings.simplefilter("ignore", FitWarning)
 axes = SEDModel.survey_axes() | {
     "f_burst": [0.0],
     "metallicity": [0.02],

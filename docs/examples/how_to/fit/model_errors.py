@@ -93,4 +93,5 @@ plt.show()
 
 # %%
 # ``TemplateError.survey()`` is the error of ``SEDModel.survey()``, measured on CEERS; ``miricigale fit --axes
-# survey`` uses it. See :doc:`/method/fitting_errors`, also for errors of bands and zero points.
+# survey`` uses it. :func:`~miricigale.fitting.calibrate` measures such an error with zero points, errors of bands
+# and priors: :doc:`photometric_redshifts`. See also :doc:`/method/fitting_errors`.

@@ -73,9 +73,8 @@ for threshold in (4.0, 4.5, 5.0, 7.0):
 QTable(rows=rows, names=["threshold (sigma)", "jumps", "without a hit"])
 
 # %%
-# For showers around large hits use ``Reducer(ramps=RampSettings(shower_threshold=5))``; for hits that ramps of
-# few groups keep, ``Reducer(cosmic_rays=True)``. Dithers reject what is left
-# (`~miricigale.reduction.reject_outliers`).
+# For showers around large hits use ``Reducer(ramps=RampSettings(shower_threshold=5))``. Dithers reject what is
+# left (`~miricigale.reduction.reject_outliers`).
 #
 # See :doc:`/method/reduction_slopes` for the statistic, and :doc:`/accuracy/reduction_real` for recall and
 # precision.

@@ -1,0 +1,217 @@
+"""Populations of models between the nodes of a grid that follow the posterior of an object."""
+
+import math
+from collections import namedtuple
+
+from miricigale.fitting._core.between import add_up, find_nodes, place_between
+from miricigale.fitting._core.functions import exponential
+from miricigale.fitting._core.limits import limited_scale
+from miricigale.fitting._core.structs import KERNEL, NO_LIGHT, PART
+from miricigale.fitting._core.sums import _uniform
+from miricigale.utils.compilation import njit
+
+#: ln of what has no probability, and below which there is none.
+NEVER, _NONE = -1e300, -1e200
+
+#: What populations move in: a unit interval for each axis (redshift, AGN fraction, those of galaxies, those of
+#: AGN), in which all cells are equally wide: their number, int64 (n_axes,), edges, (n_axes, n_largest + 1), and
+#: ln(prior) of those of AGN and their fractions, (n_axes, n_largest); the galaxies of all cells, int64, flat (-1:
+#: none); of the nodes between which models are interpolated ln(1 + z), (nz,), which galaxies may be used, (nz,
+#: n_models), the `Kind` of galaxies, whose last column is the dust luminosity or, if ``lit``, its ln, and of AGN.
+Space = namedtuple("Space", "size edge log_prior cells log_z allowed galaxy agn lit")
+#: An object: `Target`, `Limits` or None, `Mixture` or None, 2 ln(prior) of galaxies, (nz, nG), and its redshift,
+#: 0 if that is free.
+Object = namedtuple("Object", "target limits mixture log_usable redshift")
+#: Bands that may be wrong, of the used ones: 1 / sigma^2 of the stated error, (nz, n_used), and of the broad
+#: one, (n_used,); odds of the latter without a residual, (nz, n_used); ln of the likelihood where none is wrong
+#: and there are no residuals, (nz,); scratch, (nb,).
+Mixture = namedtuple("Mixture", "narrow broad odds level weight")
+#: Most steps to the scale with bands that may be wrong, and the square of the last one over the scale's error.
+_STEPS, _CLOSE = 10, 1e-4
+
+
+@njit(**PART)
+def _best_scale(flux, weight, target, limits):
+    """
+    Best scale of a model for weights of the bands, R, variance of the scale, and chi2 of the fluxes.
+
+    R is chi2 of no model less that of this one, and chi2 of the fluxes is less that of no model.
+    """
+    p, q = 0.0, 0.0
+    for b in target.bands:
+        wm = weight[b] * flux[b]
+        p += wm * target.flux[b]
+        q += wm * flux[b]
+    if limits is not None:
+        for i in range(len(limits.bands)):
+            limits.slope[i] = flux[limits.bands[i]] * limits.inverse[i]
+        s, r, variance = limited_scale(p, q, limits)
+        return s, r, variance, s * (q * s - 2.0 * p)
+    q = max(q, NO_LIGHT)
+    s = max(p, 0.0) / q
+    return s, s * p, 1.0 / q, -s * p
+
+
+@njit(**PART)
+def _likelihood(flux, z, target, limits, mixture):
+    """
+    Best scale of a model, ln of the likelihood there but for a constant, and the variance of the scale.
+
+    All that is known of the data is in here: ``z`` is the redshift that errors are of. With bands that may be
+    wrong the scale follows from how likely each of them is, and that from the scale.
+    """
+    s, r, variance, chi2 = _best_scale(flux, target.weight[z], target, limits)
+    log = 0.5 * (r + target.level[z])
+    if mixture is not None:
+        weight, product = mixture.weight, 1.0
+        for _ in range(_STEPS):
+            log, product = mixture.level[z], 1.0
+            if limits is not None:
+                log += 0.5 * (r - limits.dark + chi2)
+            for j, b in enumerate(target.bands):
+                d = target.flux[b] - s * flux[b]
+                narrow, broad, odds = mixture.narrow[z, j], mixture.broad[j], mixture.odds[z, j]
+                some = odds > 0.0
+                good = exponential(max(0.5 * (broad - narrow) * d * d, -600.0)) if some else 1.0
+                log -= 0.5 * (broad if some else narrow) * d * d
+                product *= good + odds
+                weight[b] = (good * narrow + odds * broad) / (good + odds)
+            before = s
+            s, r, variance, chi2 = _best_scale(flux, weight, target, limits)
+            if (s - before) ** 2 < _CLOSE * variance:
+                break
+        log += math.log(product)
+    return s, log, variance
+
+
+@njit(**PART)
+def _prior(one, z, g):
+    """Ln(prior) of a galaxy at a redshift, and where that stands."""
+    z = 0 if one.redshift > 0.0 else z
+    if g < 0 or one.target.log_prior[z] < _NONE or one.log_usable[z, g] < _NONE:
+        return NEVER, z
+    return 0.5 * (one.target.log_prior[z] - one.target.level[z] + one.log_usable[z, g]), z
+
+
+@njit(**PART)
+def _model(space, x, redshift, work):
+    """
+    Put fluxes of a place, and then its AGN power, into ``work.flux[0]``.
+
+    Returned are the node of redshift and the galaxy in whose cells it is (-1: there is none), and ln(prior) but
+    for theirs.
+    """
+    log_prior, g, node, galaxy = 0.0, 0, 0, space.galaxy
+    for c in range(len(space.size)):
+        n = space.size[c]
+        y = x[c] * n
+        k = min(int(y), n - 1)
+        work.value[c] = space.edge[c, k] + (y - k) * (space.edge[c, k + 1] - space.edge[c, k])
+        log_prior += space.log_prior[c, k]
+        if c == 0:
+            node = k
+        elif 2 <= c < 2 + len(galaxy.size):
+            g = g * n + k
+    z_true = redshift if redshift > 0.0 else work.value[0]
+    z, part = place_between(space.log_z, len(space.log_z), math.log1p(z_true))
+    count, near = find_nodes(galaxy, work.value[2:], work)
+    if count == 0 or not space.allowed[min(z + int(part > 0.5), len(space.log_z) - 1), near]:
+        return node, -1, log_prior
+    flux = work.flux[0]
+    last = len(flux) - 1
+    add_up(galaxy.table, z, part, count, work, flux, last)
+    power = exponential(flux[last]) if space.lit else max(flux[last], 0.0)
+    power *= work.value[1] / max(1.0 - work.value[1], 1e-12)
+    nearer = -2.0 * math.log(max(z_true, 1e-6))
+    for b in range(last):
+        flux[b] = exponential(flux[b] + nearer)
+    if power > 0.0:
+        more = work.flux[1]
+        count, _ = find_nodes(space.agn, work.value[2 + len(galaxy.size) :], work)
+        add_up(space.agn.table, z, part, count, work, more, last)
+        for b in range(last):
+            flux[b] += power * exponential(more[b] + nearer)
+        if count == 0:
+            return node, -1, log_prior
+    flux[last] = power
+    return node, space.cells[g], log_prior
+
+
+@njit(**KERNEL)
+def fill_library(space, x, redshift, work, flux, index, prior):
+    """Fluxes of places, (n, n_bands); nodes of redshift and galaxies (-1: none), (n, 2)."""
+    for i in range(len(x)):
+        index[i, 0], index[i, 1], prior[i] = _model(space, x[i], redshift, work)
+        for b in range(flux.shape[1]):
+            flux[i, b] = work.flux[0, b]
+
+
+@njit(**KERNEL)
+def rate(one, flux, index, prior, known):
+    """Ln of prior and, but for limits and wrong bands, of the likelihood of a library: ``known``, shape (2, n)."""
+    target = one.target
+    for i in range(len(index)):
+        log, z = _prior(one, index[i, 0], index[i, 1])
+        p, q = 0.0, NO_LIGHT
+        for b in target.bands:
+            wm = target.weight[z, b] * flux[i, b]
+            p += wm * target.flux[b]
+            q += wm * flux[i, b]
+        like = 0.5 * (max(p, 0.0) ** 2 / q + target.level[z])
+        known[0, i], known[1, i] = log + prior[i], like
+
+
+@njit(**PART)
+def _evaluate(space, one, x, work):
+    """Ln of the prior and of the likelihood of a place, its scale and the variance of that."""
+    z, g, prior = _model(space, x, one.redshift, work)
+    log, z = _prior(one, z, g)
+    if log < _NONE:
+        return NEVER, 0.0, 0.0, 0.0
+    s, like, variance = _likelihood(work.flux[0], z, one.target, one.limits, one.mixture)
+    return prior + log, like, s, variance
+
+
+@njit(**PART)
+def _propose(x, i, free, state, new):
+    """
+    Move a member along the difference of two others, in some of the axes, from the end of one to its begin.
+
+    So the way back is as likely; reflected at the ends it would not be, where axes are correlated.
+    """
+    n = len(x)
+    a, b = int(_uniform(state) * n) % n, int(_uniform(state) * n) % n
+    # a third of the axes, two or all
+    part = (1 + int(_uniform(state) * 3.0) % 3) / 3.0
+    far = 2.38 * math.sqrt(_uniform(state) / (2.0 * max(part * len(free), 1.0)))
+    # from one peak to another
+    far = 1.0 if _uniform(state) < 0.1 else far
+    for c in range(x.shape[1]):
+        new[c] = x[i, c]
+    for c in free:
+        if _uniform(state) <= part:
+            y = new[c] + far * (x[a, c] - x[b, c]) + 1e-3 * (_uniform(state) - 0.5)
+            new[c] = y - math.floor(y)
+
+
+@njit(**KERNEL)
+def move(space, one, free, state, power, rounds, x, known, work):
+    """
+    Move all members of a population, ``x`` of shape (n, n_axes), so many times under a power of the likelihood.
+
+    ``known``, shape (n, 5), has ln of prior and likelihood, scale, its variance and AGN power; it is filled first
+    if there are no rounds. Returned is the number of moves that were taken.
+    """
+    taken = 0
+    for turn in range(max(rounds, 1) * len(x)):
+        i = turn % len(x)
+        _propose(x, i, free[: len(free) * min(rounds, 1)], state, work.new)
+        prior, like, s, v = _evaluate(space, one, work.new, work)
+        rise = prior - known[i, 0] + power * (like - known[i, 1])
+        if rounds == 0 or (prior > _NONE and math.log(_uniform(state)) < rise):
+            taken += 1
+            for c in range(x.shape[1]):
+                x[i, c] = work.new[c]
+            known[i, 0], known[i, 1], known[i, 2], known[i, 3] = prior, like, s, v
+            known[i, 4] = work.flux[0, len(work.flux[0]) - 1]
+    return taken

@@ -1,0 +1,185 @@
+"""Posteriors between nodes, with each likelihood and prior, against plain sums over models in closed form."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.cosmology import FlatLambdaCDM
+from astropy.table import QTable
+from scipy.special import log_ndtr
+
+from fitting.test_between import AXES, flux
+from helpers.grids import photometry_table
+from miricigale.fitting import BayesFitter, GridSettings, TemplateError
+from miricigale.sed import ModelGrid
+
+BANDS = (
+    "acs.f606w", "acs.f814w", "wfc3.f125w", "wfc3.f160w", "irac.ch1", "irac.ch2", "miri.f770w",
+    "miri.f1000w",
+)  # fmt: skip
+#: Objects, places in each cell, errors of fluxes over these, prior fraction of wrong bands.
+N, FINE, NOISE, PART = 5, 8, 0.15, 0.1
+ERROR = TemplateError([0.1, 0.3, 0.8, 2.0, 10.0] * u.um, [0.5, 0.02, 0.05, 0.3, 0.6])
+SCATTER = 0.3
+#: Of the logarithm of scales.
+STEP = 0.04
+
+
+def density(mass, z):
+    return (mass / (1e10 * u.Msun)) ** (4.0 - 2.0 * z)
+
+
+def relation(mass, z):
+    return 0.06 * (1 + z) ** 2 * mass / (1e10 * u.yr)
+
+
+@pytest.fixture(scope="module")
+def grid():
+    """The galaxies of `test_between`, with names of real bands."""
+    tau, ebv = (x.ravel() for x in np.meshgrid(AXES["tau"], AXES["ebv"], indexing="ij"))
+    galaxy, sfr = flux(AXES["redshift"][:, None], tau, ebv)
+    properties = {"sfr": sfr / u.yr, "sfr_100myr": sfr / u.yr, "stellar_mass": 0.6 + 0.1 * tau}
+    return ModelGrid(
+        filters=BANDS,
+        redshift=AXES["redshift"],
+        galaxy=galaxy,
+        dust_luminosity=np.full(9, 1e27),
+        allowed=np.ones((4, 9), bool),
+        galaxy_parameters=QTable({"tau": tau * u.Gyr, "ebv": ebv * u.mag}),
+        galaxy_properties=QTable(properties),
+        axes=AXES,
+    )
+
+
+@pytest.fixture(scope="module")
+def objects():
+    """Redshifts, fluxes with noise, and errors."""
+    rng = np.random.default_rng(5)
+    true = {name: rng.uniform(*values[[0, -1]], N) for name, values in AXES.items()}
+    model = 1e10 * flux(**true)[0]
+    return true["redshift"], model * (1 + NOISE * rng.normal(size=model.shape)), NOISE * model
+
+
+def fine(values):
+    """Places in the cells of an axis, equally many in each, and the nodes of these."""
+    edges = np.concatenate([values[:1], 0.5 * (values[1:] + values[:-1]), values[-1:]])
+    places = edges[:-1, None] + np.diff(edges)[:, None] * (np.arange(FINE) + 0.5) / FINE
+    return places.ravel(), np.repeat(np.arange(values.size), FINE)
+
+
+def likelihood(observed, sigma, model, limit, part, error):
+    """Best scales of models, ln of the likelihoods there (on a grid of scales), and errors of the scales."""
+    own = np.hypot(sigma, error * observed)
+    # a broad error is that of a band and its neighbors
+    measured, wide = np.flatnonzero(~limit), np.ones(len(BANDS))
+    size = np.pad(observed[measured], 1)
+    size = np.maximum(size[1:-1], np.maximum(size[:-2], size[2:]))
+    wide[measured] = np.hypot(10 * sigma[measured], size)
+
+    def log_likelihood(scale):
+        apart = observed - scale[:, None] * model
+        log = (1 - part) * np.exp(-0.5 * (apart / own) ** 2) / own
+        log = log + part * np.exp(-0.5 * (apart / wide) ** 2) / wide
+        log = np.log(np.maximum(log, 1e-300))
+        below = log_ndtr((apart / sigma)[:, limit])
+        log[:, limit] = np.log(np.maximum((1 - part) * np.exp(below) + part, 1e-300))
+        return log.sum(axis=1)
+
+    weight = np.where(limit, 0.0, own**-2.0)
+    plain = np.sum(weight * model * observed, axis=1) / np.sum(weight * model**2, axis=1)
+    steps = np.exp(np.arange(-1.5, 1.0, STEP))
+    every = np.array([log_likelihood(step * plain) for step in steps])
+    best = np.clip(every.argmax(axis=0), 1, len(steps) - 2)
+    low, top, high = (every[best + i, np.arange(len(model))] for i in (-1, 0, 1))
+    bend = np.minimum(low + high - 2 * top, -1e-9)
+    part = np.clip(-0.5 * (high - low) / bend, -1, 1)
+    scale = plain * steps[best] * np.exp(part * STEP)
+    return scale, top + 0.25 * (high - low) * part, scale * np.minimum(STEP / np.sqrt(-bend), 1)
+
+
+def by_hand(observed, sigma, known, *, limit=None, part=0.0, error=None, prior=None):
+    """Means and standard deviations of redshift, tau, E(B-V) and mass of one object."""
+    places, nodes = zip(*(fine(values) for values in AXES.values()), strict=True)
+    if known is not None:
+        near = np.abs(AXES["redshift"] - known).argmin()
+        places, nodes = ([known], *places[1:]), ([near], *nodes[1:])
+    z, tau, ebv = (x.ravel() for x in np.meshgrid(*places, indexing="ij"))
+    z_node, i, j = (x.ravel() for x in np.meshgrid(*nodes, indexing="ij"))
+    limit = np.zeros(len(BANDS), bool) if limit is None else limit
+    error = 0.0 if error is None else error[z_node]
+    model = flux(z, tau, ebv)[0]
+    scale, log, spread = likelihood(observed, sigma, model, limit, part, error)
+    if prior is not None:
+        # at the masses that nodes have
+        z_of = AXES["redshift"] if known is None else np.full(4, known)
+        t, e = (x.ravel() for x in np.meshgrid(AXES["tau"], AXES["ebv"], indexing="ij"))
+        node, sfr = flux(z_of[:, None], t, e)
+        formed = np.sum(node * observed / sigma**2, 2) / np.sum(node**2 / sigma**2, 2)
+        log = log + prior(formed * (0.6 + 0.1 * t), formed * sfr)[z_node, 3 * i + j]
+    p = np.exp(log - log.max()) / np.exp(log - log.max()).sum()
+    mean = np.array([p @ x for x in (z, tau, ebv, scale)])
+    square = np.array([p @ x**2 for x in (z, tau, ebv, np.hypot(scale, spread))])
+    return mean, np.sqrt(np.maximum(square - mean**2, 1e-20))
+
+
+def of_density(stars, _):
+    z = AXES["redshift"]
+    edges = np.concatenate([[2 * z[0] - z[1], *z, 2 * z[-1] - z[-2]]])
+    cells = 0.5 * (edges[2:] - edges[:-2])
+    volume = FlatLambdaCDM(70, 0.3).differential_comoving_volume(z).value * cells
+    return (4.0 - 2.0 * z[:, None]) * np.log(stars / 1e10) + np.log(volume)[:, None]
+
+
+def of_relation(stars, sfr):
+    expected = 0.06 * (1 + AXES["redshift"][:, None]) ** 2 * stars / 1e10
+    log = -0.5 * (np.log10(sfr / expected) / SCATTER) ** 2
+    return log - np.log(np.exp(log).sum(axis=1, keepdims=True))
+
+
+LIMIT = np.isin(np.arange(len(BANDS)), (0, 5))
+#: Options of the fitter and of its settings, of the sum by hand, and whether redshifts are known.
+CASES = {
+    "errors of templates": ({"template_error": ERROR}, {}, {"error": True}, False),
+    "limits": ({}, {}, {"limit": LIMIT}, False),
+    "outliers": ({"outliers": PART}, {}, {"part": PART}, False),
+    "outliers, known": ({"outliers": PART}, {}, {"part": PART}, True),
+    "outliers, limits, errors": (
+        {"outliers": PART, "template_error": ERROR}, {},
+        {"part": PART, "limit": LIMIT, "error": True}, False,
+    ),
+    "masses": ({}, {"mass_function": density}, {"prior": of_density}, False),
+    "masses, known": ({}, {"mass_function": density}, {"prior": of_density}, True),
+    "rates": ({}, {"sfr_prior": (relation, SCATTER)}, {"prior": of_relation}, False),
+    "rates, known": ({}, {"sfr_prior": (relation, SCATTER)}, {"prior": of_relation}, True),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_posteriors_are_those_of_every_model(grid, objects, case):
+    options, settings, given, fixed = CASES[case]
+    z, observed, sigma = objects
+    observed = observed.copy()
+    if "part" in given:
+        observed[:, 6] *= [0.2, 4.0, 1.0, 0.1, 3.0]
+    table = photometry_table(BANDS, observed, sigma)
+    for name in np.array(BANDS)[given.get("limit", np.zeros(len(BANDS), bool))]:
+        table[f"{name}_limit"] = True
+    settings = GridSettings(interpolate=800, rtol=0.0, **settings)
+    fitter = BayesFitter(grid, model_error=0.0, settings=settings, **options)
+    results = fitter.fit(table, redshift=z if fixed else None)
+    error = fitter.backend.engine.template_error
+    names = [*AXES, "mass"][fixed:]
+    far, wide, without = [], [], []
+    for i in range(N):
+        known = z[i] if fixed else None
+        mine = given | ({"error": error} if "error" in given else {})
+        mean, std = (x[fixed:] for x in by_hand(observed[i], sigma[i], known, **mine))
+        plain = by_hand(observed[i], sigma[i], known)[0][fixed:]
+        found = [results.mean(name).value[i] for name in names]
+        far.append((found - mean) / std)
+        wide.append(np.array([results.std(name).value[i] for name in names]) / std - 1)
+        without.append((plain - mean) / std)
+    # 800 models, moved six times, leave errors of some hundredths
+    assert np.abs(far).max() < 0.1
+    assert np.sqrt(np.mean(np.square(far))) < 0.04
+    assert np.abs(wide).max() < 0.15
+    assert np.abs(without).max() > 0.15
