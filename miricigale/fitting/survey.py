@@ -22,6 +22,7 @@ from miricigale.fitting.priors import MassFunction, agn_fraction_prior, known_re
 from miricigale.fitting.pulls import without_warnings
 from miricigale.refdata import locate
 from miricigale.utils.exceptions import DataError, FitWarning, argument_error, warn
+from miricigale.utils.files import read_table
 from miricigale.utils.tables import described_rows, described_table, require_columns
 from miricigale.utils.units import WAVE
 
@@ -162,7 +163,7 @@ class SurveyCalibration:
         `~miricigale.utils.exceptions.DataError`
             If it is another file.
         """
-        table = QTable.read(path, format="ascii.ecsv")
+        table = read_table(path, wanted="a calibration of a survey", form="ascii.ecsv")
         meta = table.meta
         if meta.get("kind") != _NAME:
             msg = f"{path} is no calibration of a survey (SurveyCalibration.write)"
@@ -201,8 +202,8 @@ def calibrate(
     errors of an instrument about what the others predict (`measure_band_errors`), and how many fluxes of a band
     are wrong (``outlier``). Each of two halves of the sources, every other one, is measured by itself, and
     fitted with free redshifts with what was found on the other: the scores. What is returned is the mean of
-    both, with half of their difference as error. It takes some 20 times the time of a fit of the sources at
-    their redshifts, and twice that of a fit with free redshifts.
+    both, with half of their difference as error. These are six fits of the sources at their redshifts, on nodes,
+    five more for each instrument that is measured apart, and two with free redshifts.
 
     Parameters
     ----------

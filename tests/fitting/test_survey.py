@@ -20,6 +20,7 @@ from miricigale.fitting import (
 from miricigale.fitting.survey import SurveyCalibration, calibrate
 from miricigale.sed import SEDModel
 from miricigale.sed.spectrum import COSMOLOGY
+from miricigale.utils.exceptions import DataError
 
 
 def test_prior_of_mass_and_redshift():
@@ -117,6 +118,9 @@ def test_calibration_finds_what_was_done_to_a_catalog(survey, tmp_path):
     assert_allclose(
         fits[1].flux[:, 4], table["nircam.f277w"][:5].value * rows["nircam.f277w"]["zero_point"]
     )
+    (tmp_path / "other.ecsv").write_text("no table", encoding="utf-8")
+    text = "other.ecsv.*a calibration of a survey"
+    refuses(text, SurveyCalibration.read, tmp_path / "other.ecsv", error=DataError)
     mock = mock_analysis(
         fitter.changed(calibration=found, model_error=None), fits[0], table[:5], seed=1
     )
