@@ -84,6 +84,8 @@ class Case:
     model_error: float = 0.1
     prior_f: str = "grid"
     fixed_redshift: bool = False
+    interpolate: int = 0  # models between the nodes, as in the runs none
+    agn_error: float = 0.0  # of the AGN's light, between the nodes
 
 
 #: Parameters of the AGN: the value that the fit fixes, or None for its nodes.
@@ -149,6 +151,11 @@ CASES = {
     "nodes-model-error-0": Case(nodes=ALPHAS, redshift_nodes=True, model_error=0.0),
     "prior-uniform": Case(prior_f="uniform"),
     "redshift-fixed": Case(fixed_redshift=True),
+    # between the nodes, with an error of the light of AGN
+    "between": Case(interpolate=200),
+    **{
+        f"agn-error-{100 * e:.0f}": Case(interpolate=200, agn_error=e) for e in (0.1, 0.2, 0.3, 0.5)
+    },
 }
 
 
@@ -275,10 +282,10 @@ def observe(truth, limits, seed, *, deeper=0.0, error_scale=1.0):
 
 
 @functools.cache
-def fitter_of(dust, torus, miri, model_error, prior_f):
+def fitter_of(dust, torus, miri, model_error, **options):
     """The fitter with a set of the bands of MIRI, kept for the next case."""
     bands = [*YANG2021_DEPTHS, *SETS[miri]]
-    settings = GridSettings(prior_f=prior_f)
+    settings = GridSettings(**options)
     model = model_of(dust, torus)
     return BayesFitter(model, bands, axes=AXES, model_error=model_error, settings=settings)
 
@@ -295,13 +302,15 @@ def fit(case, frac_agn, miri, seed):
     if not case.noise:
         for band in BANDS:
             photometry[band] = truth[band]
-    fitter = fitter_of(
-        case.dust_of_fit or case.dust, case.torus, miri, case.model_error, case.prior_f
-    )
+    options = {name: getattr(case, name) for name in ("prior_f", "interpolate", "agn_error")}
+    dust = case.dust_of_fit or case.dust
+    fitter = fitter_of(dust, case.torus, miri, case.model_error, **options)
     truth = truth[detected]
     known = nearest(truth["redshift"], AXES["redshift"]) if case.fixed_redshift else None
     results = fitter.fit(photometry[detected], redshift=known)
     found = results.to_table()
+    low, high = results.percentile("redshift", (0.16, 0.84)).value.T
+    inside = (truth["redshift"] >= low) & (truth["redshift"] <= high)
     true = truth["accretion_power"] if frac_agn > 0 else np.nan * u.W
     values = {
         "frac": found["frac_agn_mean"],
@@ -310,6 +319,7 @@ def fit(case, frac_agn, miri, seed):
         "best": found["frac_agn_best"] == 0,
         "z_true": truth["redshift"],
         "z": found["redshift_mean"],
+        "inside": inside,
         "power": (found["accretion_power_mean"] / true).to_value(u.one),
     }
     for name, column in values.items():
@@ -329,7 +339,8 @@ def line(name, frac_agn, miri, table):
         f"{name:29s} {frac_agn:4.2f} {miri:4s} {frac.n:5d} {shares[0]:4.2f} {shares[1]:4.2f} "
         f"{frac.median:+7.4f} {frac.sigma_mad:7.4f} {np.median(table['width']):6.3f} "
         f"{np.mean(table['zero']):5.2f} {np.mean(table['best']):5.2f} {np.mean(right):5.2f} "
-        f"{z.sigma_mad:7.4f} {z.n_outliers:3d} ({100 * z.outlier_fraction:4.1f} %)"
+        f"{z.sigma_mad:7.4f} {z.n_outliers:3d} ({100 * z.outlier_fraction:4.1f} %) "
+        f"{100 * np.mean(table['inside']):3.0f} %"
     )
     if frac_agn > 0:
         power = recovery_metrics(np.zeros(len(table)), np.log10(table["power"]))
@@ -339,7 +350,7 @@ def line(name, frac_agn, miri, table):
 
 HEADER = (
     f"{'case':29s} {'f':>4s} {'MIRI':4s} {'n':>5s} {'H<26':4s} {'<25':>4s} {'median':>7s} {'scatter':7s} "
-    f"{'width':>6s} {'P(0)':>5s} best0 class {'dz':>7s} outliers      power"
+    f"{'width':>6s} {'P(0)':>5s} best0 class {'dz':>7s} outliers     68 %  power"
 )
 
 

@@ -38,7 +38,10 @@ def main():
     config = load_plan(
         overrides={
             "sample": {"n_sources": args.sources},
-            "agn": {"frac_agn": 0.0, "shares": 1.0},
+            "agn": {"frac_agn": 0.0},
+            # as in the run: two bands, and no noise beyond that of the simulation
+            "fit": {"min_detected": 2},
+            "noise": {"excess": 1.0},
         }
     )
     with threads() as executor:

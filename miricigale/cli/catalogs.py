@@ -24,7 +24,9 @@ def fit(args):
                 args.output,
                 **chosen(args, "quasars red_dots stars"),
                 **chosen(args, "axes redshift model_error outliers calibration calibrate"),
-                **chosen(args, "interpolate pairs flux_unit catalog_map ebv chunk_rows resume"),
+                **chosen(
+                    args, "interpolate agn_error pairs flux_unit catalog_map ebv chunk_rows resume"
+                ),
                 hdu=hdu,
                 executor=executor,
                 progress_bar=not args.no_progress,

@@ -15,7 +15,8 @@ def reduce(args):
         if not path.is_file():
             msg = f"no file {path}"
             raise DataError(msg)
-    settings = chosen(args, "backend skip_first skip_last") | {"n_threads": args.threads}
+    settings = chosen(args, "backend background skip_first skip_last")
+    settings |= {"n_threads": args.threads, "jump_threshold": args.jump_threshold or None}
     table = reduce_files(
         args.files,
         args.output,

@@ -103,6 +103,7 @@ def plan(args):
     for name in table.colnames[1:]:
         table[name].info.format = ".3g"
     table.pprint_all()
+    print(comparison.meta["answer"])
     print(f"done in {time.monotonic() - begin:.0f} s; page: {folder / 'plan.html'}")
     return 0
 
@@ -112,12 +113,10 @@ def _bands_of(args, values):
     from miricigale.instrument.figures import imager_filter
     from miricigale.planning.config import ExposureSection
 
-    known = ExposureSection()
     names = [imager_filter(name) for name in args.bands]
     found = {"exposures.bands": names}
     if args.config is None and not {"exposures.time", "exposures.depth"} & set(values):
-        times = dict(zip(known.bands, known.time, strict=True))
-        found["exposures.time"] = [times.get(name, known.time[0]) for name in names]
+        found["exposures.time"] = ExposureSection(bands=tuple(names)).by_band("time")
         text = ", ".join(f"{t:g} s" for t in found["exposures.time"])
         print(f"exposed as in CEERS: {text}", file=sys.stderr)
     return found | {"exposures.dithers": values.get("exposures.dithers", [4])}

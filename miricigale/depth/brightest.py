@@ -42,6 +42,7 @@ def saturation_flux(exposure, *, background=None, psf=None, detector=None):
         group_time=exposure.group_time.to_value(u.s),
         n_ramps=1,
         detector=detector,
+        subarray=exposure.subarray,
     )
     psf = miri_psf(exposure.filter) if psf is None else psf
     peak = float(psf_image(psf, pixel_scale=MIRI_PIXEL_SCALE, shape=(3, 3))[1, 1])

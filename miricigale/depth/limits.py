@@ -187,6 +187,7 @@ def aperture_noise(
         group_time=step,
         n_ramps=seconds / (groups * step),
         detector=detector,
+        subarray=subarray,
     )
     if noise.rate * groups * step >= noise.detector.full_well:
         wanted = "so few that the sky does not fill the well"

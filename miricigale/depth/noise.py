@@ -11,7 +11,6 @@ from miricigale.depth.published import residual_amplitude
 from miricigale.instrument import (
     DetectorProperties,
     background_level,
-    electron_rate,
     electrons_per_brightness,
     miri_detector,
 )
@@ -39,6 +38,8 @@ class ExposureNoise:
         Integrations of all exposures together.
     detector : `~miricigale.instrument.DetectorProperties` or None
         `~miricigale.instrument.miri_detector` if None.
+    subarray : str
+        Whose response counts.
 
     Raises
     ------
@@ -61,6 +62,7 @@ class ExposureNoise:
     group_time: float
     n_ramps: float
     detector: DetectorProperties | None = None
+    subarray: str = "FULL"
 
     def __post_init__(self):
         detector = miri_detector() if self.detector is None else self.detector
@@ -76,18 +78,23 @@ class ExposureNoise:
     @property
     def rate(self):
         """Electrons per second of sky and dark current."""
-        return float(electron_rate(self.filter, self.background, detector=self.detector))
+        return float(self.sky + self.detector.dark_current)
 
     @property
     def sky(self):
         """Electrons per second of the sky alone."""
-        return self.background.value * electrons_per_brightness(self.filter, self.detector)
+        return self.background.value * self._electrons
 
     @property
     def electrons(self):
         """Electrons per second of 1 uJy in a pixel."""
         area = MIRI_PIXEL_SCALE.to_value(u.rad) ** 2 * 1e12
-        return electrons_per_brightness(self.filter, self.detector) / area
+        return self._electrons / area
+
+    @property
+    def _electrons(self):
+        """Electrons per second of 1 MJy/sr."""
+        return electrons_per_brightness(self.filter, self.detector, subarray=self.subarray)
 
     def variance(self, more=0.0):
         """

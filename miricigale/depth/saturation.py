@@ -163,7 +163,8 @@ def saturation_forecast(exposure, *, background=None, detector=None):
     F2100W 1.58
     """
     detector = miri_detector() if detector is None else detector
-    rate = electron_rate(exposure.filter, background, detector=detector)
+    part = {"detector": detector, "subarray": exposure.subarray}
+    rate = electron_rate(exposure.filter, background, **part)
     fraction = _filled(rate, exposure, detector.full_well)
     return float(fraction) if np.ndim(fraction) == 0 else fraction
 

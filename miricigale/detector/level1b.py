@@ -249,7 +249,8 @@ def _append(partial, times, pixel_dq, effects, meta, properties):
     if effects is not None:
         meta["effects"] = [effect.record() for effect in effects]
     if properties is not None:
-        meta["properties"] = dataclasses.asdict(properties)
+        # a response of no rows is not said
+        meta["properties"] = {k: v for k, v in dataclasses.asdict(properties).items() if v != ()}
     text = json.dumps(meta, default=plain_value).encode()
     with fits.open(partial, mode="append") as hdus:
         if times is not None:

@@ -1,15 +1,11 @@
 from .classes import CLASS_NAMES as CLASS_NAMES
-from .classes import KIRKPATRICK_LIMITS as KIRKPATRICK_LIMITS
 from .classes import SelectionQuality as SelectionQuality
 from .classes import classify as classify
 from .classes import confusion as confusion
 from .classes import selection_quality as selection_quality
-from .colors import COLOR_WINDOWS as COLOR_WINDOWS
-from .colors import ColorCircles as ColorCircles
-from .colors import ColorWindow as ColorWindow
-from .colors import color_classes as color_classes
-from .colors import color_estimates as color_estimates
+from .counts import CEERS_DUST as CEERS_DUST
 from .counts import PUBLISHED_LIGHT as PUBLISHED_LIGHT
+from .counts import ceers_dust as ceers_dust
 from .counts import dust_obscured_fraction as dust_obscured_fraction
 from .counts import integrated_light as integrated_light
 from .counts import main_sequence_dust as main_sequence_dust
@@ -25,8 +21,6 @@ from .infrared import PAH_FEATURES as PAH_FEATURES
 from .infrared import feature_magnitude as feature_magnitude
 from .infrared import feature_redshifts as feature_redshifts
 from .infrared import feature_residuals as feature_residuals
-from .infrared import light_share as light_share
-from .infrared import mid_infrared_fractions as mid_infrared_fractions
 from .match import AssociationFlags as AssociationFlags
 from .match import associate as associate
 from .match import match_truth as match_truth

@@ -12,8 +12,6 @@ from miricigale.utils.tables import described_table
 #: Names in order of rising fracAGN, and the limits between them.
 CLASS_NAMES = ("galaxy", "composite", "agn")
 CLASS_LIMITS = (0.1, 0.4)
-#: Limits of the AGN's share of the 5-15 um light: Kirkpatrick et al. 2017, ApJ 849, 111 (second hand).
-KIRKPATRICK_LIMITS = (0.3, 0.7)
 
 
 def classify(frac_agn, *, limits=CLASS_LIMITS):

@@ -5,6 +5,7 @@ import numpy as np
 
 from miricigale.sed import COSMOLOGY
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_names
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import described_table, require_columns, unique_ids
 from miricigale.utils.units import FNU, LUMINOSITY, MASS, ab_magnitude, to_array
@@ -16,6 +17,14 @@ PUBLISHED_LIGHT = (
     ("miri.f2100w", 24.0, 60.0, 1.9, 0.6, 0.6, "Papovich et al. 2004, ApJS 154, 70"),
     ("miri.f2100w", 24.0, 0.0, 2.7, 0.7, 1.1, "Papovich et al. 2004, extrapolated"),
 )
+#: Dust of galaxies of CEERS relative to the energy balance of fits to HST and NIRCam bands, by dust component:
+#: log10 of ``dust_excess`` at 10^10.3 Msun and above, its slope per dex of mass down to 10^8.5 Msun, its scatter
+#: in dex; mean and scatter of quiescent galaxies; strength of the 3.3 um feature; sources. Measured by
+#: benchmarks/dust_colors.py.
+CEERS_DUST = {
+    "dl07_alpha": (0.07, 0.43, 0.30, -1.18, 1.02, 0.1, 96),
+    "dale2014": (0.04, 0.50, 0.31, -0.49, 0.85, 1.0, 105),
+}
 
 
 def main_sequence_sfr(stellar_mass, age_of_universe):
@@ -190,28 +199,89 @@ def main_sequence_dust(table, *, seed, scatter=0.2):
       1     False         9.4
       2      True         1.0
     """
-    units = {"stellar_mass": MASS, "dust_luminosity": LUMINOSITY, "u_v": u.mag, "v_j": u.mag}
-    require_columns(table, ("id", "redshift", *units), "table", units=units)
     if not (np.isfinite(scatter) and scatter >= 0):
         raise argument_error("scatter", "finite and >= 0", scatter)
-    ids, seed = unique_ids(table["id"], "table"), check_seed(seed)
-    mass = to_array(u.Quantity(table["stellar_mass"]), MASS, "stellar_mass")
-    dust = to_array(u.Quantity(table["dust_luminosity"]), LUMINOSITY, "dust_luminosity")
-    z = np.asarray(table["redshift"], float)
-    galaxy = (mass > 0) & (z > 0) & (dust > 0) & np.isfinite(mass * z * dust)
-    quiescent = galaxy & uvj_quiescent(u.Quantity(table["u_v"]), u.Quantity(table["v_j"]), z)
-    rows = np.flatnonzero(galaxy & ~quiescent)
+    ids, z, mass, dust, galaxy, quiescent = _dusty_galaxies(table)
+    seed, rows = check_seed(seed), np.flatnonzero(galaxy & ~quiescent)
     hidden = mass[rows] * u.Msun
     sfr = main_sequence_sfr(hidden, COSMOLOGY.age(z[rows])).value * dust_obscured_fraction(hidden)
     offset = [stream(seed, "main sequence", str(ids[row])).normal() for row in rows]
     infrared = 10.0 ** (np.log10(sfr) + 43.41 + scatter * np.array(offset)) * u.erg / u.s
     excess = np.ones(len(ids))
     excess[rows] = np.maximum(infrared.to_value(LUMINOSITY) / dust[rows], 1.0)
+    return _dust_table(ids, quiescent, dust, excess)
+
+
+def ceers_dust(table, component, *, seed):
+    """
+    Dust luminosities of galaxies that have the dust colors of CEERS.
+
+    Drawn from the distribution in ``CEERS_DUST``: log10 of ``dust_excess`` is normal about a mean that rises
+    with the mass from 10^8.5 to 10^10.3 Msun; galaxies that are quiescent by their colors (`uvj_quiescent`) have a
+    lower mean and more scatter.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        As for `main_sequence_dust`.
+    component : {"dl07_alpha", "dale2014"}
+        Dust component of the model.
+    seed : int, `~numpy.random.Generator` or None
+        Each source has its own stream by its id.
+
+    Returns
+    -------
+    dust : `~astropy.table.QTable`
+        As of `main_sequence_dust`.
+
+    Raises
+    ------
+    KeyError
+        If nothing is known of ``component``.
+    ValueError, `~astropy.units.UnitsError`
+        If a column is missing or has a wrong unit, or an id is there twice.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.table import QTable
+    >>> from miricigale.evaluation import ceers_dust
+    >>> table = QTable({"id": [1, 2], "redshift": [1.0, 1.0]})
+    >>> table["stellar_mass"] = [3e10, 3e10] * u.Msun
+    >>> table["dust_luminosity"] = [1e10, 1e10] * u.Lsun
+    >>> table["u_v"], table["v_j"] = [1.0, 1.9] * u.mag, [1.0, 1.0] * u.mag
+    >>> print(ceers_dust(table, "dl07_alpha", seed=1)["dust_excess"].round(2))
+    [2.83 0.38]
+    """
+    check_names([component], "dust component", CEERS_DUST)
+    ids, _, mass, dust, galaxy, quiescent = _dusty_galaxies(table)
+    high, slope, scatter, low, wide = CEERS_DUST[component][:5]
+    seed, rows, excess = check_seed(seed), np.flatnonzero(galaxy), np.ones(len(ids))
+    offset = [stream(seed, "dust", str(ids[row])).normal() for row in rows]
+    passive, below = quiescent[rows], np.clip(np.log10(mass[rows]), 8.5, 10.3) - 10.3
+    mean = np.where(passive, low, high + slope * below)
+    excess[rows] = 10.0 ** (mean + np.where(passive, wide, scatter) * np.array(offset))
+    return _dust_table(ids, quiescent, dust, excess)
+
+
+def _dusty_galaxies(table):
+    """Ids, redshifts, masses in Msun and dust luminosities in W of a table; which are galaxies, and quiescent."""
+    units = {"stellar_mass": MASS, "dust_luminosity": LUMINOSITY, "u_v": u.mag, "v_j": u.mag}
+    require_columns(table, ("id", "redshift", *units), "table", units=units)
+    mass = to_array(u.Quantity(table["stellar_mass"]), MASS, "stellar_mass")
+    dust = to_array(u.Quantity(table["dust_luminosity"]), LUMINOSITY, "dust_luminosity")
+    z = np.asarray(table["redshift"], float)
+    galaxy = (mass > 0) & (z > 0) & (dust > 0) & np.isfinite(mass * z * dust)
+    quiescent = galaxy & uvj_quiescent(u.Quantity(table["u_v"]), u.Quantity(table["v_j"]), z)
+    return unique_ids(table["id"], "table"), z, mass, dust, galaxy, quiescent
+
+
+def _dust_table(ids, quiescent, dust, excess):
     return described_table(
         {
             "id": (ids, None),
             "quiescent": (quiescent, "whether the colors U - V and V - J are quiescent"),
-            "dust_luminosity": (dust * excess * LUMINOSITY, "dust luminosity by the main sequence"),
+            "dust_luminosity": (dust * excess * LUMINOSITY, "dust luminosity that was drawn"),
             "dust_excess": (excess, "its ratio to the power that attenuation takes"),
         }
     )

@@ -57,6 +57,11 @@ class Estimate:
         """Share of ``success`` among ``total`` sources, with its Wilson interval."""
         return cls(*fraction_interval(int(success), int(total)), int(total), n_all)
 
+    @classmethod
+    def of_count(cls, n):
+        """Number of sources, with the root of it as error."""
+        return cls(float(n), n - np.sqrt(n), n + np.sqrt(n), int(n))
+
 
 def median(values):
     """Median along the last axis without NaN: a statistic for `bootstrap`."""

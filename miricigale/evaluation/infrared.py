@@ -1,111 +1,13 @@
-"""Infrared light of galaxies and AGN: shares of a component, and features seen in broad bands."""
+"""Infrared light of galaxies and AGN: features seen in broad bands."""
 
 import astropy.units as u
 import numpy as np
 
 from miricigale.evaluation.estimates import bootstrap, median
-from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import WAVE, positive, to_array
 
 #: Rest wavelengths of the strong features of polycyclic aromatic hydrocarbons.
 PAH_FEATURES = (3.3, 6.2, 7.7, 8.6, 11.3, 12.7) * u.um
-#: Components of a model that are the AGN's.
-_AGN_PARTS = ("agn_disk", "agn_torus", "agn_polar")
-
-
-def light_share(wave, total, part, *, band=(5.0, 15.0) * u.um):
-    """
-    Share of a component in the light between two wavelengths.
-
-    Parameters
-    ----------
-    wave : `~astropy.units.Quantity`, shape (n,)
-        Rest wavelengths, ascending.
-    total, part : `~astropy.units.Quantity` or array-like, shape (..., n)
-        F_nu or L_nu of the whole and of the component, in one unit.
-    band : `~astropy.units.Quantity`, shape (2,), optional
-        Ends; by default those of the AGN fraction of Kirkpatrick et al. 2017.
-
-    Returns
-    -------
-    share : float or `~numpy.ndarray`, shape (...)
-        NaN where there is no light.
-
-    Raises
-    ------
-    ValueError
-        If the band is not within the wavelengths.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> import numpy as np
-    >>> from miricigale.evaluation import light_share
-    >>> wave = np.linspace(3, 20, 100) * u.um
-    >>> total = np.ones(100) * u.uJy
-    >>> print(f"{light_share(wave, total, 0.3 * total):.2f}")
-    0.30
-    """
-    x = to_array(wave, WAVE, "wave", ndim=1)
-    low, high = to_array(band, WAVE, "band", ndim=1)
-    if not x[0] <= low < high <= x[-1]:
-        raise argument_error("band", f"two ascending wavelengths in {x[0]:g}-{x[-1]:g} um", band)
-    unit = u.Quantity(total).unit
-    inner = x[(x > low) & (x < high)]
-    grid = np.concatenate([[low], inner, [high]])
-
-    def light(fnu):
-        values = u.Quantity(fnu).to_value(unit)
-        rows = values.reshape(-1, x.size)
-        at_grid = np.array([np.interp(grid, x, row) for row in rows])
-        # dnu = c dlambda / lambda^2
-        out = np.trapezoid(at_grid / grid**2, grid, axis=1)
-        return out.reshape(values.shape[:-1])
-
-    whole, own = light(total), light(part)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(whole > 0, own / whole, np.nan)[()]
-
-
-def mid_infrared_fractions(model, parameters):
-    """
-    AGN shares of the rest 5-15 um light of models: the AGN fraction of Kirkpatrick et al. 2017.
-
-    Parameters
-    ----------
-    model : `~miricigale.sed.SEDModel`
-        The model.
-    parameters : `~astropy.table.Table`
-        A row for each source, columns by parameter name; others are left alone. Of the table of a
-        fit the columns ``<name>_best`` have to be renamed first.
-
-    Returns
-    -------
-    fractions : `~numpy.ndarray`, shape (n,)
-        NaN for rows that cannot be evaluated.
-
-    Examples
-    --------
-    >>> from astropy.table import QTable
-    >>> from miricigale.evaluation import mid_infrared_fractions
-    >>> from miricigale.sed import SEDModel
-    >>> model = SEDModel.yang2021(libraries="bundled")
-    >>> table = QTable({"frac_agn": [0.0, 0.3], "redshift": [1.0, 1.0], "mass": [1e10, 1e10]})
-    >>> print(mid_infrared_fractions(model, table).round(2))
-    [0.  0.3]
-    """
-    names = [name for name in parameters.colnames if name in model.parameters]
-    out = np.full(len(parameters), np.nan)
-    for k, row in enumerate(parameters):
-        try:
-            spectra = model.evaluate(**{name: row[name] for name in names})
-        except ValueError:
-            # outside of the libraries, or without a mass
-            continue
-        total, parts = spectra, spectra.components
-        agn = sum((parts[name].fnu for name in _AGN_PARTS if name in parts), start=0 * total.fnu)
-        out[k] = light_share(total.wave / (1 + total.redshift), total.fnu, agn)
-    return out
 
 
 def feature_magnitude(width, redshift, filter_width):

@@ -35,8 +35,10 @@ class PublishedNumber:
         Part of the paper's results.
     error : float, optional
         The paper's error or range; none by default.
+    tolerance : float, optional
+        Largest difference that counts as none, of numbers without errors.
     relation : str, optional
-        ``"="``, ``"~"`` (about), ``"<"`` or ``">"`` (a bound).
+        ``"="``, ``"~"`` (about), ``"<"`` (a bound of the size, on both sides) or ``">"`` (a bound).
     truth : float or None, optional
         Injected AGN fraction; None for those above 0 together.
     band_set : str, optional
@@ -46,7 +48,7 @@ class PublishedNumber:
     definition : str, optional
         How it is taken.
     source : str, optional
-        Where it was read; without, it is second hand, marked ``[?]``.
+        Section or figure of the paper in which it stands.
     why : str, optional
         Why a study may differ.
 
@@ -55,7 +57,7 @@ class PublishedNumber:
     >>> from miricigale.evaluation import PUBLISHED
     >>> one = next(one for one in PUBLISHED if one.key == "power_scatter")
     >>> one.value, one.source
-    (0.3, 'abstract')
+    (0.3, 'abstract, section 3.3.4')
     """
 
     key: str
@@ -64,6 +66,7 @@ class PublishedNumber:
     text: str
     section: str
     error: float = 0.0
+    tolerance: float = 0.0
     relation: str = "="
     truth: float | None = 0.0
     band_set: str = "all"
@@ -178,8 +181,10 @@ def _verdict(one, ours, sigma, why):
     if one.relation in "<>" and sigma == 0:
         return "within the bound"
     if not np.isfinite(sigma):
-        same = np.isclose(ours.value, one.value, rtol=0.02)
-        return "agrees" if same else f"differs by {ours.value - one.value:+.3g}: {why or 'open'}"
+        delta = (abs(ours.value) if one.relation == "<" else ours.value) - one.value
+        if abs(delta) <= one.tolerance:
+            return f"agrees (to {one.tolerance:g})"
+        return f"differs by {delta:+.3g}: {why or 'open'}"
     if abs(sigma) < _AGREES:
         return f"agrees ({sigma:+.1f} sigma)"
     return f"differs by {sigma:+.1f} sigma: {why or 'open'}"

@@ -12,16 +12,16 @@ from miricigale.evaluation.estimates import scatter as _scatter
 from miricigale.evaluation.infrared import feature_magnitude
 from miricigale.evaluation.metrics import OUTLIER
 from miricigale.evaluation.study import TruthResults
-from miricigale.evaluation.xray import half_complete, yang2021_xray_flux
+from miricigale.evaluation.xray import half_complete, xray_luminosity_at, yang2021_xray_flux
 from miricigale.filters import Filter
 from miricigale.utils.exceptions import unknown_name
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import ab_magnitude
 
 #: Bins of redshift.
-REDSHIFT_BINS = ((0.0, 1.0), (1.0, 2.0), (2.0, 3.0), (3.0, np.inf))
-#: Fewest draws of statistics that are fits themselves.
-_FEW_DRAWS = 100
+REDSHIFT_BINS = ((0.0, 0.2), (0.2, 1.0), (1.0, 2.0), (2.0, 3.0), (3.0, np.inf))
+#: Fewest draws of statistics that are fits themselves, and sources of a bin of the paper's error function.
+_FEW_DRAWS, _FEW = 100, 30
 
 
 def _share(found, n_all=None):
@@ -71,6 +71,25 @@ def _size(values):
     return np.abs(_median(values))
 
 
+def _size_median(values):
+    return _median(np.abs(values))
+
+
+def _trend(values, statistic):
+    """Ratio of a statistic at one AGN fraction to that at another, of the same sources."""
+
+    def measure(study, _, band_set, option, draws):
+        ends = [study.at(frac) for frac in option]
+        if None in ends or any(band_set not in one.fits for one in ends):
+            return Estimate(np.nan)
+        columns = [one.of_catalog(values(one, band_set)) for one in ends]
+        # a source has its two values side by side
+        ratio = lambda both: statistic(both[..., ::2]) / statistic(both[..., 1::2])  # noqa: E731
+        return draws(ratio, np.stack(columns, axis=1))
+
+    return measure
+
+
 _DZ, _DF = TruthResults.redshift_error, TruthResults.fraction_error
 
 
@@ -94,50 +113,53 @@ def _etc_limit(study, one, band_set, band, draws):
     return Estimate(float(study.etc_limits.get(band, np.nan)))
 
 
-def _limit_offset(study, one, band_set, band, draws):
-    """Limit of the error function minus that of the calculator: negative where it is shallower."""
-    limits = (study.limits.get(band, np.nan), study.etc_limits.get(band, np.nan))
-    return Estimate(float(limits[0] - limits[1]))
+def _limit_offset(study, one, band_set, option, draws):
+    """Limit of the error function minus another or the calculator's: negative where it is shallower."""
+    band, other = option if isinstance(option, tuple) else (option, None)
+    other = study.etc_limits.get(band, np.nan) if other is None else other
+    return Estimate(float(study.limits.get(band, np.nan) - other))
 
 
-def _shape_share(study, one, _, option, draws):
-    """Share of the sources of the field by shape."""
-    return _share(one.shapes[option][one.field])
+def _known(study, one, band, kinds):
+    crowds = any("crowded" in kind for kind in kinds)
+    return band in study.bands and (not crowds or band in one.crowded)
 
 
-def _errors_of(study, one, rows):
-    """Magnitude errors of sources whose true flux is above 5 sigma, shape (n, n_bands), NaN of others."""
-    columns = [
-        np.where(rows(band) & one.field & one.is_bright(band), one.magnitude_error(band), np.nan)
-        for band in study.bands
-    ]
-    return np.stack(columns, axis=1)
+def _of_kind(one, band, kind):
+    """Sources by shape or with a bright neighbor in a band; with "not " before it the others."""
+    if kind.startswith("not "):
+        return ~_of_kind(one, band, kind.removeprefix("not "))
+    return one.crowded[band] if kind == "crowded" else one.shapes[kind]
 
 
-def _shape_offset(study, one, _, option, draws):
-    """Median of measured minus true magnitude by shape, of all bands together."""
-    shape = one.shapes[option]
-    n_all = int(np.count_nonzero(shape & one.field))
-    return draws(_median, _errors_of(study, one, lambda band: shape), n_all=n_all)
-
-
-def _crowded(one, band, crowded=True):
-    return one.crowded.get(band, np.zeros(len(one.truth), bool)) == crowded
-
-
-def _crowded_share(study, one, band_set, option, draws):
-    """Share of the sources of the field that are crowded in any band."""
-    if not one.crowded:
+def _kind_share(study, one, _, option, draws):
+    """Share of a kind among the sources above 5 sigma in a band."""
+    band, kind = option
+    if not _known(study, one, band, [kind]):
         return Estimate(np.nan)
-    return _share(np.any([_crowded(one, band)[one.field] for band in study.bands], axis=0))
+    return _share(_of_kind(one, band, kind)[one.field & one.is_bright(band)])
 
 
-def _magnitude_scatter(study, one, _, option, draws):
-    """Scatter of measured minus true magnitude, crowded or isolated, of all bands together."""
-    if not one.crowded:
-        return Estimate(np.nan)
-    values = _errors_of(study, one, lambda band: _crowded(one, band, option == "crowded"))
-    return draws(_scatter, values)
+def _kind_errors(statistic):
+    """Of measured minus true magnitude in a band of the sources above 5 sigma that are of all kinds."""
+
+    def measure(study, one, _, option, draws):
+        band, *kinds = option
+        if not _known(study, one, band, kinds):
+            return Estimate(np.nan)
+        rows = np.logical_and.reduce([one.field, *(_of_kind(one, band, kind) for kind in kinds)])
+        bright = rows & one.is_bright(band)
+        n_all = int(np.count_nonzero(rows))
+        return draws(statistic, one.magnitude_error(band)[bright], n_all=n_all)
+
+    return measure
+
+
+def _bright_error(study, one, _, band, draws):
+    """Median size of measured minus true magnitude of the 30 brightest of the field in a band."""
+    rows = np.flatnonzero(one.field & np.isfinite(one.magnitude_error(band)))
+    order = np.argsort(-one.matched[f"{band}_true"][rows])
+    return draws(_size_median, one.magnitude_error(band)[rows[order[:_FEW]]])
 
 
 def _signal_to_noise(study, one, _, band, draws):
@@ -209,6 +231,14 @@ def _xray_half(study, one, band_set, option, draws):
     return draws(statistic, np.stack(columns, axis=1), np.stack(found, axis=1), n_draws=n_draws)
 
 
+def _xray_luminosity(study, one, band_set, redshift, draws):
+    """Log of the luminosity (2-10 keV, erg/s) at a redshift of that flux, before absorption."""
+    half = _xray_half(study, one, band_set, None, draws)
+    flux = 10.0 ** np.array([half.value, half.low, half.high]) * u.erg / u.s / u.cm**2
+    values = np.log10(xray_luminosity_at(flux, redshift).value)
+    return Estimate(*(float(value) for value in values), half.n, half.n_all)
+
+
 def _feature(study, one, band_set, option, draws):
     """Magnitudes that a feature of given equivalent width (um) adds to a band at a redshift."""
     band, width, redshift = option
@@ -221,17 +251,18 @@ _MEASURES = {
     "detected_share": ("share detected in two or more MIRI bands", _detected_share),
     "mips_share": ("share above the limit of MIPS 24", _mips_share),
     "etc_limit": ("5-sigma limit of the calculator (AB)", _etc_limit),
-    "limit_offset": ("5-sigma limit minus the calculator's (mag)", _limit_offset),
-    "shape_share": ("share of the sources", _shape_share),
-    "shape_offset": ("median measured - true magnitude", _shape_offset),
-    "crowded_share": ("share of crowded sources", _crowded_share),
-    "magnitude_scatter": ("sigma_MAD of measured - true magnitude", _magnitude_scatter),
+    "limit_offset": ("5-sigma limit minus another (mag)", _limit_offset),
+    "kind_share": ("share of the sources above 5 sigma", _kind_share),
+    "magnitude_offset": ("median measured - true magnitude", _kind_errors(_median)),
+    "magnitude_scatter": ("sigma_MAD of measured - true magnitude", _kind_errors(_scatter)),
+    "bright_error": ("median size of measured - true magnitude, brightest 30", _bright_error),
     "signal_to_noise": ("median S/N", _signal_to_noise),
     "z_outliers": ("photo-z outliers", _outlier_share),
     "z_bias": ("median dz/(1+z)", _of_sample(_DZ, _median)),
     "z_scatter": ("sigma_MAD of dz/(1+z)", _of_sample(_DZ, _scatter)),
     "z_outlier_ratio": ("photo-z outliers without over with MIRI", _ratio(_DZ, outlier_share)),
     "z_scatter_ratio": ("sigma_MAD of dz/(1+z) without over with MIRI", _ratio(_DZ, _scatter)),
+    "z_scatter_trend": ("sigma_MAD of dz/(1+z), fracAGN over fracAGN", _trend(_DZ, _scatter)),
     "frac_offset": ("median fracAGN - true", _of_sample(_DF, _median)),
     "frac_scatter": ("sigma_MAD of fracAGN", _of_sample(_DF, _scatter)),
     "frac_offset_ratio": ("median fracAGN - true without over with MIRI", _ratio(_DF, _size)),
@@ -240,23 +271,29 @@ _MEASURES = {
     "width_ratio": ("posterior width of fracAGN without over with MIRI", _ratio(_width, _median)),
     "power_offset": ("median log accretion power - true (dex)", _power(_median)),
     "power_scatter": ("sigma_MAD of log accretion power (dex)", _power(_scatter)),
+    "power_scatter_trend": (
+        "sigma_MAD of log accretion power, fracAGN over fracAGN",
+        _trend(TruthResults.power_error, _scatter),
+    ),
     "class_share": ("share found in its true class", _class_share),
     "feature": ("magnitudes that a feature adds to a band", _feature),
     "xray_half": ("log X-ray flux of 50 % completeness", _xray_half),
+    "xray_luminosity": ("log X-ray luminosity of 50 % completeness", _xray_luminosity),
 }
 #: Names of the quantities that are taken from the tables, and what they are.
 QUANTITIES = {name: text for name, (text, _) in _MEASURES.items()}
 #: Those that are shares of sources.
 SHARES = tuple(name for name in QUANTITIES if name.endswith("_share")) + ("z_outliers",)
 #: Those that are of several truths together if none is named.
-_OF_ALL = ("power_offset", "power_scatter", "xray_half")
+_OF_ALL = ("power_offset", "power_scatter", "xray_half", "xray_luminosity")
+_TRENDS = ("z_scatter_trend", "power_scatter_trend")
 #: Those of a fit, and those of a band.
 OF_FITS = (
     *("z_outliers", "z_bias", "z_scatter", "z_outlier_ratio", "z_scatter_ratio"),
     *("frac_offset", "frac_offset_ratio", "frac_scatter", "frac_scatter_ratio"),
     *("width", "width_ratio", "power_offset", "power_scatter", "class_share"),
 )
-_OF_BANDS = ("etc_limit", "limit_offset", "signal_to_noise")
+_OF_BANDS = ("etc_limit", "bright_error", "signal_to_noise")
 
 
 def measure(study, quantity, *, truth=0.0, band_set="all", option=None, seed, n_draws=1000):
@@ -311,7 +348,7 @@ def measure(study, quantity, *, truth=0.0, band_set="all", option=None, seed, n_
     if quantity not in _MEASURES:
         raise unknown_name("quantity", quantity, _MEASURES)
     one = study.at(truth) if isinstance(truth, (int, float)) else truth
-    if one is None and not (truth is None and quantity in _OF_ALL):
+    if one is None and not (truth is None and quantity in _OF_ALL + _TRENDS):
         return Estimate(np.nan)
     lacks_fit = one is not None and quantity in OF_FITS and band_set not in one.fits
     if lacks_fit or (quantity in _OF_BANDS and option not in study.bands):

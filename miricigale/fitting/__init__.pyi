@@ -14,8 +14,8 @@ from .from_files import fit_catalog as fit_catalog
 from .io import FitResultsFiles as FitResultsFiles
 from .io import open_results as open_results
 from .likelihood import FitFlags as FitFlags
-from .priors import MassFunction as MassFunction
-from .priors import agn_fraction_prior as agn_fraction_prior
+from .populations import MassFunction as MassFunction
+from .populations import agn_fraction_prior as agn_fraction_prior
 from .priors import magnitude_prior as magnitude_prior
 from .results import FitResults as FitResults
 from .samples import Samples as Samples

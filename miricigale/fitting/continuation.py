@@ -42,11 +42,14 @@ class Continuation:
     nodes, finer : `~miricigale.fitting.interpolation.Nodes`
         Its models, and those of a grid with more nodes between which models are interpolated: of the same, if
         there is none.
+    agn_error : float
+        Error of the AGN's light as a part of it.
     """
 
     engine: GridEngine
     nodes: Nodes
     finer: Nodes
+    agn_error: float = 0.0
 
     @cached_property
     def cells(self):
@@ -131,7 +134,8 @@ class Continuation:
             What `GridEngine.fit` says of the object.
         """
         redshift, rng = float(redshifts[i]), stream(0, "between", str(ids[i]))
-        one = _core.Object(target, limits, wrong and self._mixture(*wrong), log_usable, redshift)
+        mixture = wrong and self._mixture(*wrong)
+        one = _core.Object(target, limits, mixture, log_usable, redshift, self.agn_error)
         free = np.flatnonzero(self.space.size > 1)
         free = free[free > 0] if redshift else free
         state = rng.integers(2**63, size=1, dtype=np.uint64)

@@ -49,6 +49,7 @@ def fit_catalog(
     catalog_map=None,
     ebv=0.0,
     interpolate=200,
+    agn_error=0.0,
     hdu=None,
     chunk_rows=10000,
     **options,
@@ -84,8 +85,9 @@ def fit_catalog(
         Color excess E(B-V) of the Milky Way, in mag, behind which all models but given grids are put
         (`~miricigale.sed.components.GalacticExtinction`, law of Gordon et al. 2023, none beyond 32 um). For one
         that differs from source to source see `~miricigale.sed.foreground.deredden`.
-    interpolate : int, optional
-        Models between the nodes for each object, as in `miricigale.fitting.GridSettings`; 0: nodes alone.
+    interpolate, agn_error : optional
+        Models between the nodes for each object (0: nodes alone), and the error of the light of AGN, as in
+        `miricigale.fitting.GridSettings`.
     hdu, chunk_rows, **options
         As for `miricigale.fitting.fit_file`, such as ``redshift``, a column of known redshifts, and
         ``resume``.
@@ -144,7 +146,7 @@ def fit_catalog(
         dust = GalacticExtinction(ebv_galactic=ebv, beyond="transparent")
         model = SEDModel([*model.components, dust])
     given = {"model_error": model_error, "outliers": outliers, "calibration": calibration}
-    given["settings"] = GridSettings(interpolate=interpolate)
+    given["settings"] = GridSettings(interpolate=interpolate, agn_error=agn_error)
     fitter = BayesFitter(model, bands, axes=nodes, **given)
     if calibrate is not None:
         given = {name: options.get(name) for name in ("flux_unit", "executor")}

@@ -86,7 +86,7 @@ class GridEngine:
     mass_prior : callable, optional
         Of solar masses formed, shape (n, nG), and the n redshifts they are at, as indices: ln of a factor of
         the priors of galaxies. Taken at the mass that each galaxy has without AGN, for each object.
-    density : `~miricigale.fitting.priors.MassPrior`, optional
+    density : `~miricigale.fitting.populations.MassPrior`, optional
         Prior of mass and redshift, at the same masses.
     rtol : float
         Relative error that pruning may cause. The weight of what is left out is bounded to a

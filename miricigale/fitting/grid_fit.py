@@ -13,15 +13,13 @@ from miricigale.fitting.grid import GridEngine
 from miricigale.fitting.interpolation import Nodes, finer_grid
 from miricigale.fitting.likelihood import FitFlags, filter_names
 from miricigale.fitting.mixture import BandMixture
+from miricigale.fitting.populations import MassPrior, expected_sfr, sfr_log_prior
 from miricigale.fitting.posterior import check_pairs, joint_names, joint_tables
 from miricigale.fitting.priors import (
-    MassPrior,
     density_log_prior,
-    expected_sfr,
     fixed_log_prior,
     grid_priors,
     known_redshifts,
-    sfr_log_prior,
 )
 from miricigale.fitting.quantities import Quantities, plain
 from miricigale.fitting.results import CIGALE_LEAST_STD, FitResults
@@ -128,7 +126,7 @@ class GridFit:
             same = isinstance(filters, FilterSet) and tuple(filters.names) == grid.filters
             bands = filters if same else grid.filters
             finest = finer_grid(finer, grid, bands, out.constants, nodes)
-        return replace(out, between=Continuation(engine, nodes, finest))
+        return replace(out, between=Continuation(engine, nodes, finest, float(settings.agn_error)))
 
     @property
     def grid(self):
@@ -167,6 +165,7 @@ class GridFit:
             "compat": self.compat,
             "n_models": int(self.engine.n_models),
             "interpolate": 0 if between is None else int(self.given.interpolate),
+            "agn_error": 0.0 if between is None else between.agn_error,
             "constants": self.constants,
         }
         if error is not None:

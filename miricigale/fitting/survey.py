@@ -18,7 +18,8 @@ from miricigale.fitting.calibration import (
     measure_template_error,
 )
 from miricigale.fitting.checks import leave_out
-from miricigale.fitting.priors import MassFunction, agn_fraction_prior, known_redshifts
+from miricigale.fitting.populations import MassFunction, agn_fraction_prior
+from miricigale.fitting.priors import known_redshifts
 from miricigale.fitting.pulls import without_warnings
 from miricigale.refdata import locate
 from miricigale.utils.exceptions import DataError, FitWarning, argument_error, warn
@@ -165,22 +166,28 @@ class SurveyCalibration:
         """
         table = read_table(path, wanted="a calibration of a survey", form="ascii.ecsv")
         meta = table.meta
+        msg = f"{path} is no calibration of a survey (SurveyCalibration.write)"
         if meta.get("kind") != _NAME:
-            msg = f"{path} is no calibration of a survey (SurveyCalibration.write)"
             raise DataError(msg)
-        error, mass, scores = meta["template_error"], meta.get("mass_function"), meta.get("scores")
-        return cls(
-            name=meta["name"],
-            bands=described_table({n: (table[n], t) for n, t in _COLUMNS.items()}),
-            template_error=TemplateError(error["um"] * WAVE, error["error"]),
-            priors={
-                n: (np.array(p["values"]), np.array(p["weights"]))
-                for n, p in meta["priors"].items()
-            },
-            mass_function=None if mass is None else MassFunction(**mass),
-            scores=None if scores is None else QTable(scores),
-            errors={name: np.array(e) for name, e in meta.get("errors", {}).items()},
-        )
+        try:
+            error, mass, scores = (
+                meta.get(name) for name in ("template_error", "mass_function", "scores")
+            )
+            return cls(
+                name=meta["name"],
+                bands=described_table({n: (table[n], t) for n, t in _COLUMNS.items()}),
+                template_error=TemplateError(error["um"] * WAVE, error["error"]),
+                priors={
+                    n: (np.array(p["values"]), np.array(p["weights"]))
+                    for n, p in meta["priors"].items()
+                },
+                mass_function=None if mass is None else MassFunction(**mass),
+                scores=None if scores is None else QTable(scores),
+                errors={name: np.array(e) for name, e in meta.get("errors", {}).items()},
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            msg = f"{msg}, or a damaged one: {error!r}"
+            raise DataError(msg) from error
 
 
 def calibrate(

@@ -6,7 +6,7 @@ import functools
 import numpy as np
 from numpy.polynomial import polynomial as poly
 
-from miricigale.instrument.figures import filter_row, table
+from miricigale.instrument.figures import filter_row, imager_filter, table
 from miricigale.instrument.siaf import aperture, imager_columns
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_least, check_positive
@@ -47,6 +47,9 @@ class DetectorProperties:
         Hits per um2 per second.
     adc_bits : int
         Bits of the converter.
+    response : tuple of (str, str, float)
+        Count rate of light over that of `photmjsr`, by filter and sub-array, as
+        `~miricigale.reduction.imager_response` gives it for a day; 1 if there are no rows.
 
     Raises
     ------
@@ -73,6 +76,7 @@ class DetectorProperties:
     pixel_pitch: float = 25.0
     cosmic_ray_flux: float = 0.0
     adc_bits: int = 16
+    response: tuple = ()
 
     def __post_init__(self):
         for name in ("gain", "full_well", "pixel_pitch", "adc_bits"):
@@ -82,6 +86,10 @@ class DetectorProperties:
         coefficients = tuple(float(c) for c in self.nonlinearity)
         object.__setattr__(self, "nonlinearity", coefficients)
         object.__setattr__(self, "ipc", tuple(float(c) for c in self.ipc))
+        rows = tuple((str(f), str(part), float(value)) for f, part, value in self.response)
+        object.__setattr__(self, "response", rows)
+        for *_, value in rows:
+            check_positive(value, "response")
         if len(self.ipc) != 3:
             raise argument_error("ipc", "three shares", self.ipc)
         if coefficients[:2] != (0.0, 1.0):
@@ -105,6 +113,31 @@ class DetectorProperties:
         center = 1 - 2 * horizontal - 2 * vertical - 4 * diagonal
         edge = [diagonal, vertical, diagonal]
         return np.array([edge, [horizontal, center, horizontal], edge])
+
+    def relative_response(self, filter, subarray="FULL"):
+        """
+        Count rate of light over that of `photmjsr`.
+
+        Parameters
+        ----------
+        filter, subarray : str
+            Of the exposure.
+
+        Returns
+        -------
+        response : float
+
+        Raises
+        ------
+        ValueError
+            If ``response`` has rows, and none for them.
+        """
+        wanted = (imager_filter(filter), subarray)
+        known = {row[:2]: row[2] for row in self.response} or {wanted: 1.0}
+        if wanted not in known:
+            what = f"with {' and '.join(wanted)}"
+            raise argument_error("response", what, f"{len(known)} others")
+        return known[wanted]
 
     def linearize(self, dn):
         """

@@ -84,16 +84,23 @@ def frame_time(readout="FASTR1", subarray="FULL"):
     return times[readout][subarray] * u.s
 
 
-def _counts_of(filter, time, frame, n_integrations, max_fill=0.6):
-    """Groups and integrations of an exposure that lasts a time; the integrations may be given."""
+def _counts_of(filter, time, frame, n_integrations, max_fill=0.6, max_groups=100):
+    """Groups and integrations whose time is nearest to the wanted one; the integrations may be given."""
     seconds = float(to_array(time, u.s, "time", ndim=0, finite=True))
     frames = round(seconds / frame.value)
     if frames < 2:
         raise argument_error("time", f"at least two frames of {frame}", time)
+    choices = [n_integrations]
     if n_integrations is None:
-        fills = miri_detector().full_well / electron_rate(filter)
-        n_integrations = math.ceil(frames / max(2, math.floor(max_fill * fills / frame.value)))
-    return max(2, round(frames / n_integrations)), n_integrations
+        fills = miri_detector().full_well / electron_rate(filter) / frame.value
+        longest = min(
+            max(2, math.floor(max_fill * fills)), check_count(max_groups, "max_groups", 2)
+        )
+        least = math.ceil(frames / longest)
+        # one more, or up to a tenth, if they come nearer
+        choices = range(least, least + max(2, least // 10 + 1))
+    counts = [(max(2, round(frames / n)), n) for n in choices]
+    return min(counts, key=lambda pair: abs(math.prod(pair) - frames))
 
 
 @checked_calls
@@ -107,7 +114,8 @@ class Exposure(Interactive):
     filter : str, `~miricigale.filters.Filter` or None
         Such as ``"F770W"`` or ``"miri.f770w"``; None where it is not known, as in ground tests.
     time : `~astropy.units.Quantity`, optional
-        Wanted exposure time in place of ``n_groups``, as for `from_time`.
+        Wanted exposure time in place of ``n_groups``; `from_time` splits it, and ``exposure_time`` is what
+        comes of it.
     readout : str, optional
         Readout pattern, ``"FASTR1"`` or ``"SLOWR1"``.
     n_groups : int, optional
@@ -138,7 +146,7 @@ class Exposure(Interactive):
     >>> import astropy.units as u
     >>> from miricigale import Exposure
     >>> Exposure("F770W", time=1 * u.hour, pointing="150.1 +2.2")
-    <Exposure miri.f770w: FASTR1, 2 x 648 groups, 3596.4 s, FULL at 150.1 +2.2, roll 0 deg>
+    <Exposure miri.f770w: FASTR1, 13 x 100 groups, 3607.5 s, FULL at 150.1 +2.2, roll 0 deg>
     """
 
     filter: str | None
@@ -220,28 +228,37 @@ class Exposure(Interactive):
         return values | {"exposure time": self.exposure_time}
 
     @classmethod
-    def from_time(cls, filter, time, *, max_fill=0.6, **options):
+    def from_time(cls, filter, time, *, max_fill=0.6, max_groups=100, **options):
         """
         Make the exposure of a filter that lasts a given time.
+
+        It has equal integrations, as few as the two limits allow, or one or a tenth more where their time is
+        nearer to the wanted one. ``exposure_time`` says what it is.
 
         Parameters
         ----------
         filter : str
             Such as ``"miri.f770w"``.
         time : `~astropy.units.Quantity`
-            Wanted exposure time; the nearest number of groups is taken.
+            Wanted exposure time, without the resets between integrations.
         max_fill : float, optional
-            The exposure is split into as many equal integrations as keep the sky of the
-            low background below this fraction of the full well.
+            Largest fraction of the full well that the sky of the low background fills.
+        max_groups : int, optional
+            Largest number of groups in an integration. Deep MIRI imaging has 100 or so; beyond 180 in
+            FASTR1 STScI advises another pattern [1]_.
         **options
             Other arguments of `Exposure` than the counts.
 
         Returns
         -------
         exposure : `Exposure`
+
+        References
+        ----------
+        .. [1] JWST User Documentation, "MIRI Detector Readout FASTR1".
         """
         frame = cls(filter, n_groups=2, **options).frame_time
-        n_groups, n_integrations = _counts_of(filter, time, frame, None, max_fill)
+        n_groups, n_integrations = _counts_of(filter, time, frame, None, max_fill, max_groups)
         return cls(filter, n_groups=n_groups, n_integrations=n_integrations, **options)
 
     def replace(self, **changes):

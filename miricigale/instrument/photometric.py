@@ -164,7 +164,7 @@ def psf_fwhm(filter):
     return filter_row(filter)["fwhm"] * u.arcsec
 
 
-def electrons_per_brightness(filter, detector=None):
+def electrons_per_brightness(filter, detector=None, *, subarray="FULL"):
     """
     Electrons per second and pixel of 1 MJy/sr, where the flat field is 1.
 
@@ -174,6 +174,8 @@ def electrons_per_brightness(filter, detector=None):
         One of `imager_filters`.
     detector : `DetectorProperties`, optional
         `miri_detector` if not given.
+    subarray : str, optional
+        One of `subarrays`; its response counts if that of the detector does.
 
     Returns
     -------
@@ -185,11 +187,12 @@ def electrons_per_brightness(filter, detector=None):
     >>> print(f"{electrons_per_brightness('miri.f770w'):.2f}")
     11.40
     """
-    gain = (miri_detector() if detector is None else detector).gain
-    return gain / photmjsr(filter, gain=gain)
+    detector = miri_detector() if detector is None else detector
+    response = detector.relative_response(filter, subarray)
+    return response * detector.gain / photmjsr(filter, gain=detector.gain)
 
 
-def electron_rate(filter, background=None, *, detector=None):
+def electron_rate(filter, background=None, *, detector=None, subarray="FULL"):
     """
     Charge that a pixel of the sky collects.
 
@@ -199,8 +202,8 @@ def electron_rate(filter, background=None, *, detector=None):
         One of `imager_filters`.
     background : `~astropy.units.Quantity`, optional
         Surface brightness; the low background of the filter if not given.
-    detector : `DetectorProperties`, optional
-        `miri_detector` if not given.
+    detector, subarray : optional
+        As for `electrons_per_brightness`.
 
     Returns
     -------
@@ -216,4 +219,5 @@ def electron_rate(filter, background=None, *, detector=None):
     detector = miri_detector() if detector is None else detector
     level = background_level(filter) if background is None else background
     level = to_array(level, SURFACE_BRIGHTNESS, "background")
-    return level * electrons_per_brightness(filter, detector) + detector.dark_current
+    electrons = electrons_per_brightness(filter, detector, subarray=subarray)
+    return level * electrons + detector.dark_current

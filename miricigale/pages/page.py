@@ -1,5 +1,6 @@
 """One self-contained HTML page: text, tables and figures, no outside file."""
 
+import contextlib
 from pathlib import Path
 
 from markupsafe import Markup
@@ -35,11 +36,37 @@ class Page:
         self.dpi = dpi
         self._sections = []
 
-    def section(self, title, text=""):
-        """Begin a section with an optional paragraph."""
-        self._sections.append((title, []))
+    def section(self, title, text="", *, closed=""):
+        """Begin a section with an optional paragraph; a ``closed`` one shows that line until it is opened."""
+        self._sections.append((title, [], closed))
         if text:
             self.text(text)
+
+    @contextlib.contextmanager
+    def folded(self, title):
+        """
+        Fold what is added to the section within the block, until a reader opens it; printed pages have all of it.
+
+        Parameters
+        ----------
+        title : str
+            The line that stays: what it holds.
+
+        Examples
+        --------
+        >>> from miricigale.pages import Page
+        >>> page = Page("Limits")
+        >>> with page.folded("How the limits were made"):
+        ...     page.text("As the root of the time.")
+        >>> page.to_html().count("<summary>How the limits were made</summary>")
+        1
+        """
+        if not self._sections:
+            self.section("")
+        parts = self._sections[-1][1]
+        first = len(parts)
+        yield
+        parts[first:] = [macros().folded(title, parts[first:])]
 
     def _add(self, macro, *values):
         if not self._sections:
@@ -50,9 +77,9 @@ class Page:
         """Add a paragraph of plain text."""
         self._add("text", text)
 
-    def bullets(self, entries):
-        """Add a list of lines of plain text."""
-        self._add("bullets", list(entries))
+    def bullets(self, entries, *, box=False):
+        """Add a list of lines of plain text, in a ``box`` where a reader has to know them."""
+        self._add("notices" if box else "bullets", list(entries))
 
     def items(self, pairs):
         """Add headline numbers: (label, value) pairs of text; a value may be `Missing`."""

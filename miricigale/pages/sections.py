@@ -1,5 +1,6 @@
 """Sections of a page as a TOML file declares them: titles, paragraphs, headline numbers, captions and columns."""
 
+import contextlib
 import functools
 import tomllib
 from importlib import resources
@@ -54,8 +55,9 @@ class SectionWriter:
 
     A section has a ``title``, sentences by name (``text`` is its paragraph), ``items`` (headline numbers: label,
     and how `~miricigale.pages.cell_of` takes the value), and tables by name: ``columns`` (header, and the same of
-    the cells), ``caption``, ``empty`` and ``text`` as of `~miricigale.pages.Page.table`. Words in braces are
-    filled with facts.
+    the cells), ``caption``, ``empty`` and ``text`` as of `~miricigale.pages.Page.table`. Figures and tables with a
+    line in ``folded`` stand behind it, and a section with ``closed`` as a whole. Words in braces are filled with
+    facts.
 
     Parameters
     ----------
@@ -84,7 +86,16 @@ class SectionWriter:
         """Begin a section, with the paragraph ``text`` where it has that."""
         self._section = name
         paragraph = self.sentence(text, **facts) if text in self.texts[name] else ""
-        self.report.section(sentence(self.texts[name]["title"], self.facts | facts), paragraph)
+        title, closed = (self.texts[name].get(key, "") for key in ("title", "closed"))
+        title = sentence(title, self.facts | facts)
+        self.report.section(title, paragraph, closed=sentence(closed, self.facts | facts))
+
+    def folding(self, name, /, **facts):
+        """Return a context whose figures and tables are folded, if the section folds what is called so."""
+        title = self.texts[self._section].get("folded", {}).get(name)
+        if title is None:
+            return contextlib.nullcontext()
+        return self.report.folded(sentence(title, self.facts | facts))
 
     def text(self, name, /, **facts):
         """Add a paragraph."""
@@ -101,7 +112,8 @@ class SectionWriter:
     def figure(self, name, figure, /, **facts):
         """Add a figure with its caption, unless there is none."""
         if figure is not None:
-            self.report.figure(figure, self.sentence(name, **facts))
+            with self.folding(name, **facts):
+                self.report.figure(figure, self.sentence(name, **facts))
 
     def table(self, name, rows, /, **facts):
         """Add a table as it is declared, from dictionaries; without columns it has all of their keys."""
@@ -112,10 +124,11 @@ class SectionWriter:
             for header, *column in table.get("columns", [(key, key) for key in keys])
             if column[0] in keys
         }
-        self.report.table(
-            [[cell_of(row, column) for column in columns.values()] for row in rows],
-            header=tuple(columns),
-            caption=sentence(table.get("caption", ""), facts),
-            empty=sentence(table.get("empty", ""), facts),
-            text=table.get("text", 1),
-        )
+        with self.folding(name, **facts):
+            self.report.table(
+                [[cell_of(row, column) for column in columns.values()] for row in rows],
+                header=tuple(columns),
+                caption=sentence(table.get("caption", ""), facts),
+                empty=sentence(table.get("empty", ""), facts),
+                text=table.get("text", 1),
+            )

@@ -167,6 +167,11 @@ def _checked(image, name):
         spread = mad_std(np.asarray(data[usable], float)) if usable.any() else 0.0
         noise = np.broadcast_to(np.float64(spread), data.shape), factor
     else:
+        # which takes the size of what is below 0
+        negative = np.count_nonzero(np.asarray(image.uncertainty.array)[usable] < 0)
+        if negative:
+            wanted = "an image with uncertainties of 0 (no data) or more"
+            raise argument_error(name, wanted, f"{negative} pixels below 0")
         given = image.uncertainty.represent_as(StdDevUncertainty)
         scale = factor if given.unit is None else (1 * given.unit).to_value(unit)
         noise = np.asarray(given.array), float(scale)

@@ -82,6 +82,29 @@ def _statistics(fit, residual):
     return out
 
 
+def _cut_by_rim(usable, boxes):
+    """
+    Boxes (row, column, height, width; inside the image) whose unusable pixels are mostly beyond the image's data.
+
+    That is before the first or after the last usable pixel of a row or column: of a mosaic whose footprint is
+    turned against its pixels, what is not exposed.
+    """
+    found, ends = np.zeros(len(boxes), bool), []
+    if not len(boxes):
+        return found
+    for one in (usable, usable.T):
+        some, n = one.any(axis=1), one.shape[1]
+        first, last = one.argmax(axis=1), n - 1 - one[:, ::-1].argmax(axis=1)
+        ends.append((np.where(some, first, n), np.where(some, last, -1)))
+    (left, right), (low, high) = ends
+    for k, (y, x, ny, nx) in enumerate(boxes):
+        rows, columns = np.ogrid[y : y + ny, x : x + nx]
+        beyond = (columns < left[rows]) | (columns > right[rows])
+        beyond |= (rows < low[columns]) | (rows > high[columns])
+        found[k] = np.sum(beyond) > 0.5 * np.sum(~usable[y : y + ny, x : x + nx])
+    return found
+
+
 def source_flags(fit, diagnostics, place, flux, blending):
     """
     Flags, (n,), that follow from a fit, and the fraction of each template on usable pixels.
@@ -102,5 +125,8 @@ def source_flags(fit, diagnostics, place, flux, blending):
         (place[diagnostics.poor], ForcedFlags.POOR_FIT),
     ):
         flags[rows] |= int(flag)
+    cut = np.flatnonzero(fit.main & (flags[place] & int(ForcedFlags.MASKED) > 0))
+    cut = cut[_cut_by_rim(fit.arrays.usable, fit.bank.box[cut])]
+    flags[place[cut]] |= int(ForcedFlags.EDGE)
     flags[np.isnan(flux) & (flags & int(ForcedFlags.DEGENERATE) == 0)] |= int(ForcedFlags.NO_DATA)
     return flags, coverage

@@ -216,7 +216,7 @@ class ErrorModel(Interactive):
             Part of the flux that is added in quadrature.
         **options
             ``background``, ``size``, ``psf``, ``n_integrations``, ``frame_time``, ``n_dithers``,
-            ``residual`` and ``mosaic``, as for `~miricigale.depth.fitted_noise`.
+            ``residual``, ``mosaic``, ``excess`` and ``detector``, as for `~miricigale.depth.fitted_noise`.
 
         Returns
         -------

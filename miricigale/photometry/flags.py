@@ -21,10 +21,10 @@ class ForcedFlags(Flags):
     >>> ForcedFlags.names(96)
     ['no_segment', 'noisy_segment']
     >>> print(ForcedFlags.POOR_FIT.value, ForcedFlags.meanings()[1])
-    256 ('edge', "More than a tenth of the template's light falls off the image.")
+    256 ('edge', "More than a tenth of the template's light falls off the image or its footprint.")
     """
 
-    #: More than a tenth of the template's light falls off the image.
+    #: More than a tenth of the template's light falls off the image or its footprint.
     EDGE = 1
     #: More than a tenth of the template's light falls on masked pixels.
     MASKED = 2

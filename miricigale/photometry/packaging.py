@@ -16,11 +16,16 @@ from miricigale.photometry.fit_errors import fit_covariances
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.residual_sources import unexplained_neighbors
 from miricigale.photometry.results import ForcedPhotometryResult, crowded
+from miricigale.utils.exceptions import PhotometryWarning, warn
 from miricigale.utils.meta import provenance
+from miricigale.utils.parallel import chunks
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS
 
 #: Names of the errors of a flux after ``flux_err``: their sum, and its terms.
 _TERMS = ("", "_noise", "_template", "_psf")
+
+#: Fewest sources above so many sigma with which there is a warning of an offset, and relative error of templates.
+_FEWEST, _BRIGHT, _TEMPLATE = 5, 10.0, 0.1
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -106,11 +111,51 @@ def package(fit, diagnostics, new_xy, catalog, meta):
             pixel_scale=round(fit.scale, 6),
             correlated_noise=diagnostics.correlation is not None,
             measured_noise=fit.arrays.measured_noise,
+            **_measured_offset(fit, diagnostics, np.count_nonzero(flux > _BRIGHT * flux_err[0])),
         ),
         **_components(fit, catalog, joint, place, n_all),
         **_common(fit, common),
         **_images(fit, diagnostics, {k: v for k, v in meta.items() if k == "filter"}),
     )
+
+
+def _measured_offset(fit, diagnostics, n_bright):
+    """
+    How far the image lies from its templates by the residuals, and the error of that: for the meta dictionary.
+
+    In arcsec along x and y of the image, to first order; the error is the jackknife's over strips of rows, which
+    has errors of single templates in it. There is a warning of what a fitted shift would have mended, if sources
+    are bright.
+    """
+    model, sums = diagnostics.model, []
+    for part in chunks(len(model), int(np.clip(len(model) // 16, 4, 256))):
+        # a row more on both sides for the gradient
+        first, last = max(part.start - 1, 0), min(part.stop + 1, len(model))
+        own, weight = slice(part.start - first, part.stop - first), fit.inverse_sigma[part]
+        # templates have errors too: the brightest shall not decide alone
+        weight = weight / np.hypot(1.0, _TEMPLATE * model[part] * weight)
+        columns = [-one[own] * weight for one in np.gradient(model[first:last])[::-1]]
+        columns = np.stack([*columns, diagnostics.residual[part] * weight]).reshape(3, -1)
+        sums.append(columns @ columns.T)
+    sums = np.array(sums, float)
+    # of all strips, and of all but each
+    every = np.concatenate([[sums.sum(axis=0)], sums.sum(axis=0) - sums])
+    normal = every[:, :2, :2]
+    if fit.shift is not None or fit.offset_map is not None or np.linalg.det(normal).min() <= 0:
+        return {}
+    found = np.linalg.solve(normal, every[:, :2, 2:])[..., 0]
+    offset, without = found[0], found[1:]
+    error = np.sqrt((len(sums) - 1) * np.var(without, axis=0))
+    # a twentieth of the PSF's width at half maximum
+    least = 0.05 * np.sqrt(8 * np.log(2)) * fit.psf_width
+    far = n_bright >= _FEWEST and np.any((np.abs(offset) > least) & (np.abs(offset) > 3 * error))
+    # a shift that was asked for and is too large has a warning of its own
+    if far and fit.settings.max_shift is None:
+        x, y = offset * fit.scale
+        msg = f"the image lies about {x:+.3f}, {y:+.3f} arcsec (x, y) from its templates: 'max_shift' fits that"
+        warn(msg, PhotometryWarning)
+    values = (offset * fit.scale).round(5).tolist(), (error * fit.scale).round(5).tolist()
+    return dict(zip(("offset", "offset_err"), values, strict=True))
 
 
 def _by_source(covariance, place, main, n):

@@ -94,6 +94,9 @@ def _summary(page, result, pulls):
     if result.background is not None:
         background, error = result.background.value, result.background_err.value
         values["background"] = f"{background:.3g} ± {error:.1g}"
+    if "offset" in result.meta:
+        both = zip(result.meta["offset"], result.meta["offset_err"], strict=True)
+        values["offset"] = ", ".join(f"{x:+.3f} ± {error:.3f}" for x, error in both)
     if result.shift is not None:
         values["shift"] = ", ".join(f"{one:.3f}" for one in result.shift.value)
     page.section("summary")

@@ -11,6 +11,36 @@ def _share(found, among):
     return np.sum(found, axis=-1) / np.sum(among, axis=-1)
 
 
+def sky_weights(sources, agn_limit):
+    """What each source counts for in one sky, shape (n,): an AGN one by all skies that its like are drawn from."""
+    agn = np.asarray(sources["frac_agn"], float) >= agn_limit
+    return np.where(agn, 1 / sources.meta.get("n_skies", 1), 1.0)
+
+
+def weighted_share(found, among):
+    """
+    Share of weights found, with its Wilson interval.
+
+    Parameters
+    ----------
+    found, among : array-like, shape (n,)
+        Weights of the sources found, 0 for others, and of all; without NaN.
+
+    Returns
+    -------
+    share : `~miricigale.evaluation.Estimate`
+        The interval is that of as many equal sources as have the variance of the weighted share.
+    """
+    total = np.sum(among)
+    if not total > 0:
+        return Estimate(np.nan)
+    value = np.sum(found) / total
+    variance = np.sum((found - value * among) ** 2) / total**2
+    like = value * (1 - value) / variance if variance > 0 else total**2 / np.sum(among**2)
+    interval = Estimate.of_fraction(round(value * like), max(round(like), 1))
+    return Estimate(value, interval.low, interval.high, np.count_nonzero(among))
+
+
 #: Statistic of each number, and the columns (`_columns`) that it is of.
 _NUMBERS = {
     "z_scatter": (scatter, "dz"),
@@ -28,18 +58,20 @@ def _columns(sources, agn_limit):
     """What the numbers are made of, by source."""
     z, f = (np.asarray(sources[name], float) for name in ("redshift", "frac_agn"))
     dz = (np.asarray(sources["redshift_mean"], float) - z) / (1 + z)
-    agn, selected = f >= agn_limit, np.asarray(sources["selected"], bool)
-    known = np.isfinite(dz)
+    weight, agn = sky_weights(sources, agn_limit), f >= agn_limit
+    # AGN of other skies are for completeness and purity
+    first = np.where(np.asarray(sources.columns.get("sky", 0)) > 0, np.nan, 1.0)
+    known = np.isfinite(dz * first)
     columns = {
-        "dz": dz,
+        "dz": first * dz,
         "known": known,
-        "outlier": np.where(known, np.abs(dz) > OUTLIER, np.nan),
-        "z_std": np.asarray(sources["redshift_std"], float) / (1 + z),
-        "df": np.asarray(sources["frac_agn_mean"], float) - f,
-        "f_std": sources["frac_agn_std"],
-        "agn": agn,
-        "selected": selected,
-        "found": agn & selected,
+        "outlier": known & (np.abs(dz) > OUTLIER),
+        "z_std": first * np.asarray(sources["redshift_std"], float) / (1 + z),
+        "df": first * (np.asarray(sources["frac_agn_mean"], float) - f),
+        "f_std": first * np.asarray(sources["frac_agn_std"], float),
+        "agn": weight * agn,
+        "selected": weight * np.asarray(sources["selected"], bool),
+        "found": weight * (agn & np.asarray(sources["selected"], bool)),
     }
     return {name: np.asarray(values, float) for name, values in columns.items()}
 
@@ -63,13 +95,13 @@ def accuracy(sources, *, agn_limit=0.4, seed=0):
         Of the posterior means ``z_scatter`` (sigma_MAD of dz/(1+z)), ``z_outliers`` (share with abs(dz)/(1+z)
         above 0.15), ``frac_bias`` and ``frac_scatter`` (median and sigma_MAD of the difference);
         ``z_width`` and ``frac_width``, median posterior standard deviations (of z over 1+z);
-        ``completeness`` and ``purity`` of the selected AGN.
+        ``completeness`` and ``purity`` of the selected AGN, the only ones for which AGN of other skies count.
     """
     columns, numbers = _columns(sources, agn_limit), {}
     for name, (statistic, *wanted) in _NUMBERS.items():
         values = [columns[key] for key in wanted]
         if statistic is _share:
-            numbers[name] = Estimate.of_fraction(*(np.nansum(one) for one in values))
+            numbers[name] = weighted_share(*values)
         else:
             numbers[name] = bootstrap(statistic, *values, seed=seed)
     return numbers

@@ -1,5 +1,6 @@
 """What `miricigale plan` does: the table of the CEERS exposures, and a plan with its files."""
 
+import dataclasses
 from pathlib import Path
 
 import astropy.units as u
@@ -79,6 +80,7 @@ def write_plan(config, folder, *, executor=None, progress_bar=False):
     >>> write_plan(load_plan("plan.toml"), "plan")["plan", "time", "merit"]  # doctest: +SKIP
     """
     from miricigale.planning import Planner, area_table, comparison_table, write_page
+    from miricigale.planning.page import answer
 
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
@@ -86,6 +88,8 @@ def write_plan(config, folder, *, executor=None, progress_bar=False):
     planner = Planner(config, executor=executor)
     plans = planner.compare()
     comparison = comparison_table(planner, plans)
+    comparison.meta |= {"answer": answer(planner, plans, comparison)}
+    comparison.meta |= {"noise": dataclasses.asdict(config.noise)}
     areas = area_table(planner, planner.divide()) if config.survey.areas else None
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "plan.toml").write_text(config.to_toml(), encoding="utf-8")

@@ -4,6 +4,8 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
+from miricigale.planning.accuracy import sky_weights, weighted_share
+
 
 def _row(planner, plan, numbers):
     """One row of both tables."""
@@ -11,17 +13,14 @@ def _row(planner, plan, numbers):
     row["n"] = numbers["z_scatter"].n
     for name, number in numbers.items():
         row |= {name: number.value, f"{name}_err": number.error}
-    row |= {"n_detected": np.nan, "n_agn": np.nan}
-    if not plan.bands:
-        return row
     # of all sources of the sample
     agn = np.asarray(plan.sources["frac_agn"]) >= planner.config.agn.limit
-    found = agn & np.asarray(plan.sources["selected"], bool)
-    least = max(1, min(planner.config.fit.min_detected, len(plan.bands)))
-    detected = np.asarray(plan.sources["n_detected"]) >= least
-    sources = planner.density * plan.area.to_value(u.arcmin**2)
-    row["n_detected"] = sources * np.mean(detected)
-    row["n_agn"] = sources * np.mean(found & detected)
+    detected, weight = planner.common([plan]), sky_weights(plan.sources, planner.config.agn.limit)
+    found = agn & detected & np.asarray(plan.sources["selected"], bool)
+    scale = planner.density * plan.area.to_value(u.arcmin**2) if plan.bands else np.nan
+    for name, chosen in (("n_detected", detected), ("n_agn", found), ("n_agn_true", agn)):
+        share = weighted_share(weight * chosen, weight)
+        row |= {name: scale * share.value, f"{name}_err": scale * share.error}
     return row
 
 
@@ -42,11 +41,12 @@ def comparison_table(planner, plans):
     -------
     table : `~astropy.table.QTable`
         ``plan``, ``time`` (h), ``area``, ``n`` (sources compared), the numbers of
-        `~miricigale.planning.accuracy.accuracy` with their errors, ``n_detected`` and ``n_agn`` (expected
-        in the area: sources detected, AGN detected and selected), and ``merit``, by which the rows are
-        ranked. Of ``[survey] rank = "agn"`` that is ``n_agn`` times the purity for each hour; of ``"frac_agn"``
-        and ``"redshift"`` the inverse variance of the means that is gained over the existing bands,
-        relative to these and for each hour: ((scatter without / scatter with)^2 - 1) / hours.
+        `~miricigale.planning.accuracy.accuracy` with their errors; expected in the area, with the binomial errors
+        of the sample, ``n_detected`` (sources detected), ``n_agn`` (AGN detected and selected) and
+        ``n_agn_true`` (all AGN); and ``merit``, by which the rows are ranked. Of ``[survey] rank = "agn"``
+        that is ``n_agn`` times the purity for each hour; of ``"frac_agn"`` and ``"redshift"`` the inverse
+        variance of the means that is gained over the existing bands, relative to these and for each hour:
+        ((scatter without / scatter with)^2 - 1) / hours.
 
     Examples
     --------

@@ -29,7 +29,8 @@ class SampleSection(Section):
     Parameters
     ----------
     n_sources
-        Sources drawn from it; 0 for all.
+        Sources drawn from the catalog; 0 for all. More than it has are galaxies of several skies, with other AGN
+        and noise (not with images).
     redshift
         Range of redshifts.
     luminosity
@@ -40,7 +41,7 @@ class SampleSection(Section):
         Table of log_luminosity, redshift, phi (per Mpc3 and dex) that the sample is drawn after.
     """
 
-    n_sources: int = option(500, low=0, high=100000)
+    n_sources: int = option(1000, low=0, high=1000000)
     redshift: tuple[float, ...] = option((0.01, 6.0), low=0.0, high=20.0)
     luminosity: tuple[float, ...] = option((0.0, 16.0), low=0.0, high=20.0)
     area: float = option(0.0, low=0.0)
@@ -53,27 +54,20 @@ class AgnSection(Section):
 
     Parameters
     ----------
-    field
-        Whether AGN are those of a real field, after an X-ray luminosity function.
     frac_agn
-        fracAGN of the sources, unless of a field or in a column frac_agn of the catalog.
+        fracAGN of a made-up mix; by default AGN are those of a column frac_agn of the catalog, or of a real field,
+        after an X-ray luminosity function.
     shares
-        Share of the sources of each.
+        Share of the sources of each fracAGN of the mix; equal ones by default.
     limit
         fracAGN from which a source is an AGN.
-    select
-        Selected by the probability of a fracAGN above the limit, or by the mean.
     threshold
-        Least probability of a selected source.
+        Least probability of a fracAGN above the limit of a selected source.
     """
 
-    field: bool = False
-    frac_agn: tuple[float, ...] = option(
-        (0.0, 0.2, 0.4, 0.6, 0.8, 0.99), low=0.0, high=0.99, single=True
-    )
-    shares: tuple[float, ...] = option((0.5, 0.1, 0.1, 0.1, 0.1, 0.1), low=0.0, single=True)
+    frac_agn: tuple[float, ...] = option((), low=0.0, high=0.99, single=True)
+    shares: tuple[float, ...] = option((), low=0.0, single=True)
     limit: float = option(0.4, low=0.01, high=0.99)
-    select: str = option("probability", choices=("probability", "mean"))
     threshold: float = option(0.5, low=0.0, high=1.0)
 
 
@@ -103,6 +97,12 @@ class ExposureSection(Section):
         Readout pattern.
     max_fill
         Largest share of the well that the sky fills.
+    max_groups
+        Largest number of groups in an integration.
+    photom
+        Photom reference of CRDS, for the response on a date (miricigale.reduction.imager_response).
+    date
+        That date.
     sets
         Sets of bands that are compared: all, or names joined by commas.
     pointings
@@ -110,22 +110,24 @@ class ExposureSection(Section):
     """
 
     bands: tuple[str, ...] = option(CEERS_FILTERS, choices=imager_filters(), unique=True)
-    time: tuple[float, ...] = option(tuple(_CEERS["time"].values()), low=0.0, single=True)
+    time: tuple[float, ...] = option((), low=0.0, single=True)
     depth: tuple[float, ...] = option((), low=10.0, high=40.0, single=True)
-    dithers: tuple[int, ...] = option(
-        tuple(_CEERS["dithers"].values()), low=1, high=500, single=True
-    )
+    dithers: tuple[int, ...] = option((), low=1, high=500, single=True)
     readout: str = option("FASTR1", choices=readout_patterns())
     max_fill: float = option(0.6, low=0.05, high=0.95)
+    max_groups: int = option(100, low=2)
+    photom: str = ""
+    date: str = ""
     sets: tuple[str, ...] = ("all",)
     pointings: int = option(1, low=1, high=10000)
 
-    def __post_init__(self):
-        # other bands have the exposures of these, if nothing else is said
-        for key, known in _CEERS.items() if self.bands != CEERS_FILTERS else ():
-            if getattr(self, key) == tuple(known.values()):
-                values = tuple(known.get(name, known["miri.f770w"]) for name in self.bands)
-                object.__setattr__(self, key, values)
+    def by_band(self, key):
+        """``"time"``, ``"depth"`` or ``"dithers"`` of each band; the default for other bands is F770W's."""
+        values = getattr(self, key)
+        if not values:
+            known = _CEERS[key]
+            values = [known.get(name, known["miri.f770w"]) for name in self.bands]
+        return tuple(values) * (len(self.bands) // len(values))
 
 
 class BackgroundSection(Section):
@@ -158,21 +160,24 @@ class NoiseSection(Section):
     Parameters
     ----------
     kind
-        Fit on the mosaic, aperture photometry, or the error function of a run.
+        Fit on the mosaic, or the error function of a run.
     run
         Folder of the run whose errors.ecsv is scaled, with kind = 'run'.
     residual
         Fraction of the sky that stays as a fixed pattern, or the calculator's.
     fractional
         Part of the flux added in quadrature (templates, blends).
+    excess
+        Factor on the noise of the sky of fitted sources, 1.4 by the limits of surveys in flight.
     sizes
         Whether errors grow with the half-light radii of the sources.
     """
 
-    kind: str = option("fitted", choices=("fitted", "aperture", "run"))
+    kind: str = option("fitted", choices=("fitted", "run"))
     run: str = ""
     residual: float | str = option(0.0, low=0.0, high=0.1, choices=("etc",))
     fractional: float = option(0.03, low=0.0, high=1.0)
+    excess: float = option(1.4, low=0.1, high=10.0)
     sizes: bool = True
 
 
@@ -272,7 +277,7 @@ class PlanConfig(Configuration):
     --------
     >>> from miricigale.planning import PlanConfig
     >>> config = PlanConfig()
-    >>> config.exposures.bands[:3], config.exposures.time[:3]
+    >>> config.exposures.bands[:3], config.exposures.by_band("time")[:3]
     (('miri.f770w', 'miri.f1000w', 'miri.f1280w'), (1665.0, 1665.0, 1665.0))
     >>> config.set_bands("f1500w,f770w")
     ('miri.f770w', 'miri.f1500w')
@@ -285,13 +290,14 @@ class PlanConfig(Configuration):
     plan: PlanSection = dataclasses.field(default_factory=PlanSection)
     catalog: CatalogSection = dataclasses.field(default_factory=CatalogSection)
     sample: SampleSection = dataclasses.field(default_factory=SampleSection)
-    sed: SedSection = dataclasses.field(default_factory=SedSection)
+    # dust that the models of the fit have, as in the presets of runs
+    sed: SedSection = dataclasses.field(default_factory=lambda: SedSection(infrared="fit"))
     agn: AgnSection = dataclasses.field(default_factory=AgnSection)
     exposures: ExposureSection = dataclasses.field(default_factory=ExposureSection)
     background: BackgroundSection = dataclasses.field(default_factory=BackgroundSection)
     noise: NoiseSection = dataclasses.field(default_factory=NoiseSection)
     images: ImageSection = dataclasses.field(default_factory=ImageSection)
-    fit: FitBasics = dataclasses.field(default_factory=FitBasics)
+    fit: FitBasics = dataclasses.field(default_factory=lambda: FitBasics(min_detected=1))
     survey: SurveySection = dataclasses.field(default_factory=SurveySection)
     overheads: OverheadSection = dataclasses.field(default_factory=OverheadSection)
 
@@ -300,13 +306,13 @@ class PlanConfig(Configuration):
         self.check(n, "exposures.bands", "must name at least one filter")
         wanted = f"must have one number, or one per band ({n})"
         for key in ("depth" if exposures.depth else "time", "dithers"):
-            self.check_length(f"exposures.{key}", (1, n), wanted)
+            self.check_length(f"exposures.{key}", (0, 1, n), wanted)
         if not exposures.depth:
-            least = min(exposures.time)
+            least = min(exposures.by_band("time"))
             self.check(least > 0, "exposures.time", "must be positive", least)
         wanted = f"must have one number per fracAGN ({len(agn.frac_agn)})"
-        self.check_length("agn.shares", (len(agn.frac_agn),), wanted)
-        self.check(sum(agn.shares) > 0, "agn.shares", "must not all be 0")
+        self.check_length("agn.shares", (0, len(agn.frac_agn)), wanted)
+        self.check(not agn.shares or sum(agn.shares) > 0, "agn.shares", "must not all be 0")
         good = self.sed.frac_agn == SedSection().frac_agn
         self.check(good, "sed.frac_agn", "must be left out: [agn] has the mix")
         for key in ("redshift", "luminosity"):

@@ -15,11 +15,13 @@ from miricigale.depth import (
     scaled_limit,
     sensitivity,
 )
-from miricigale.instrument import Exposure, frame_time
+from miricigale.instrument import Exposure, frame_time, miri_detector, psf_fwhm
 from miricigale.photometry import ErrorModel
 from miricigale.planning.config import NoiseSection
+from miricigale.reduction import imager_response
 from miricigale.utils.exceptions import ConfigError, data_error
 from miricigale.workflow.background import band_background
+from miricigale.workflow.options import of_option
 
 #: The plan needs no direction; an `Exposure` has one.
 _ANYWHERE = {"pointing": SkyCoord(0 * u.deg, 0 * u.deg), "roll": 0 * u.deg}
@@ -42,6 +44,8 @@ class BandPlan:
         Kind of the errors.
     run : `RunErrors`, optional
         With ``noise.kind = "run"``.
+    detector : `~miricigale.instrument.DetectorProperties`, optional
+        With the response of a day; `~miricigale.instrument.miri_detector` if not given.
 
     Examples
     --------
@@ -58,6 +62,7 @@ class BandPlan:
     background: u.Quantity
     noise: object
     run: object = None
+    detector: object = None
 
     @property
     def filter(self):
@@ -72,7 +77,11 @@ class BandPlan:
     @property
     def sky_fraction(self):
         """Share of the well that the sky fills by the end of an integration."""
-        return saturation_forecast(self.exposure, background=self.background)
+        return saturation_forecast(self.exposure, **self._light)
+
+    @property
+    def _light(self):
+        return {"background": self.background, "detector": self.detector}
 
     @functools.cached_property
     def limit(self):
@@ -81,7 +90,7 @@ class BandPlan:
             self.filter,
             self.time,
             n_sigma=5,
-            background=self.background,
+            **self._light,
             residual=self.noise.residual or None,
             n_dithers=self.n_dithers,
             n_groups=self.exposure.n_groups,
@@ -110,7 +119,34 @@ class BandPlan:
     @functools.cached_property
     def saturation(self):
         """AB magnitude at which a point source saturates."""
-        return saturation_flux(self.exposure, background=self.background).to(u.ABmag)
+        return saturation_flux(self.exposure, **self._light).to(u.ABmag)
+
+    def good_groups(self, flux, size=0.0 * u.arcsec):
+        """
+        Groups of an integration before the brightest pixel of a source is full.
+
+        Parameters
+        ----------
+        flux : `~astropy.units.Quantity`
+            Total fluxes.
+        size : `~astropy.units.Quantity`, optional
+            As in `errors`; it and the PSF count as Gaussians.
+
+        Returns
+        -------
+        n_groups : int or `~numpy.ndarray` of int
+            All of the exposure's where it is not full by the last; below 2 there is no slope.
+        """
+        wide = 1 + (size / psf_fwhm(self.filter)).to_value(u.dimensionless_unscaled) ** 2
+        light = (flux / self.saturation.to(u.uJy)).to_value(u.dimensionless_unscaled) / wide
+        filled = self.sky_fraction + (1 - self.sky_fraction) * light
+        n = self.exposure.n_groups
+        # a source without a flux fills nothing
+        return np.clip(np.ceil(np.nan_to_num(n / filled, nan=np.inf)) - 1, 0, n).astype(int)
+
+    def cut(self, n_groups):
+        """This plan with so many groups of each integration: what is left of one that saturates."""
+        return dataclasses.replace(self, exposure=self.exposure.replace(n_groups=int(n_groups)))
 
     def errors(self, size=0.0 * u.arcsec):
         """
@@ -127,19 +163,17 @@ class BandPlan:
         """
         if self.noise.kind == "run":
             return self.run.scaled(self)
-        if self.noise.kind == "aperture":
-            depths = {self.filter: self.limit}
-            return ErrorModel.from_depths(depths, fractional=self.noise.fractional)
         return ErrorModel.from_exposure(
             self.filter,
             self.time,
-            background=self.background,
+            **self._light,
             size=size,
             n_integrations=self.n_dithers * self.exposure.n_integrations,
             frame_time=self.exposure.frame_time,
             fractional=self.noise.fractional,
             n_dithers=self.n_dithers,
             residual=self.noise.residual or None,
+            excess=self.noise.excess,
         )
 
 
@@ -211,9 +245,19 @@ def _band_plan(filter, time, n_dithers, config, run):
         time / n_dithers,
         readout=options.readout,
         max_fill=options.max_fill / float(brighter),
+        max_groups=options.max_groups,
         **_ANYWHERE,
     )
-    return BandPlan(exposure, n_dithers, background, config.noise, run)
+    detector = _detector(options.photom, options.date)
+    return BandPlan(exposure, n_dithers, background, config.noise, run, detector)
+
+
+@functools.lru_cache(maxsize=8)
+def _detector(photom, date):
+    """The imager's detector, with the response of a day where one is given."""
+    with of_option("[exposures] photom, date:", ValueError):
+        response = imager_response(photom, date=date) if photom or date else ()
+    return miri_detector().replace(response=response)
 
 
 def _time_to(depth, filter, n_dithers, config, run):
@@ -250,15 +294,9 @@ def band_plans(config, *, share=1.0, run=None):
     -------
     plans : dict of str to `BandPlan`
     """
-    options, n = config.exposures, len(config.exposures.bands)
-    times = options.depth or options.time
-    plans = {}
-    for name, value, dithers in zip(
-        options.bands,
-        times * (n // len(times)),
-        options.dithers * (n // len(options.dithers)),
-        strict=True,
-    ):
+    options, plans = config.exposures, {}
+    values = options.by_band("depth" if options.depth else "time")
+    for name, value, dithers in zip(options.bands, values, options.by_band("dithers"), strict=True):
         time = _time_to(value, name, dithers, config, run) if options.depth else value * u.s
         plans[name] = _band_plan(name, share * time, dithers, config, run)
     return plans

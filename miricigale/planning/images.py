@@ -71,7 +71,7 @@ def images_catalog(planner):
     """
     config = planner.config
     catalog = study_catalog(config.catalog)
-    if config.agn.field or "frac_agn" in catalog.colnames:
+    if not config.agn.frac_agn or "frac_agn" in catalog.colnames:
         return catalog
     rng = stream(config.plan.seed, "plan", "neighbors")
     fractions = agn_mix(config.agn, len(catalog), rng)
@@ -119,7 +119,7 @@ def images_study(planner, source):
     fractions = (0.0,)
     if "frac_agn" in own.colnames or np.any(np.asarray(planner.sources["frac_agn"], float) > 0):
         fractions = (0.0, CATALOG)
-    if config.agn.field and "frac_agn" not in own.colnames:
+    if not (config.agn.frac_agn or "frac_agn" in own.colnames):
         fractions = (0.0, FIELD)
     run, exposures = config.plan, [plan.exposure for plan in plans.values()]
     return StudyConfig(
@@ -141,7 +141,7 @@ def images_study(planner, source):
             depths=fit.depths,
             axes=fit.axes,
             model_error=fit.model_error,
-            min_detected=min(fit.min_detected, len(plans)),
+            min_detected=planner.min_detected,
         ),
         point_sources=PointSourceSection(enabled=False),
     )

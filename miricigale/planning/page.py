@@ -1,9 +1,11 @@
 """The page of a plan: tables and figures."""
 
+import dataclasses
+
 import astropy.units as u
 import numpy as np
 
-from miricigale.pages import Page, SectionWriter, declared, number
+from miricigale.pages import Page, SectionWriter, declared, number, sentence
 from miricigale.planning.exposures import background_options
 from miricigale.plotting.axes import MEASURED, SECOND, TRUE, legend, new_figure
 from miricigale.workflow.background import background_text
@@ -34,22 +36,24 @@ def write_page(path, planner, plans, comparison, areas=None, images=None):
     config, miri = planner.config, [plan for plan in plans if plan.bands]
     best = next(plan for plan in miri if plan.name == comparison["plan"][1])
     every = max(miri, key=lambda plan: len(plan.bands))
-    subtitle = f"{len(planner.sources)} sources, seed {config.plan.seed}"
-    report = Page(f"Plan {config.plan.name}", subtitle=subtitle)
+    report = Page(f"Plan {config.plan.name}", subtitle=comparison.meta["answer"])
     page = SectionWriter(report, declared("miricigale.planning"))
     _notices(page, planner)
     page.section("sets")
     rows = list(_entries(comparison))
     page.items(rows[1])
     merit = page.texts["sets"]["merits"][config.survey.rank]
-    page.table("table", rows, n=rows[0]["n"], min_detected=config.fit.min_detected, merit=merit)
+    page.table("table", rows, n=rows[0]["n"], min_detected=planner.min_detected, merit=merit)
     page.figure("figure", _comparison_figure(comparison))
     _write_exposures(page, config, every)
     shown = list({plan.name: plan for plan in (plans[0], best, every)}.values())
     chosen = planner.common(plans)
     page.section("fits")
     fits = {plan.name: plan.sources[chosen] for plan in shown}
-    redshifts = {name: (table["redshift"], table) for name, table in fits.items()}
+    first = chosen & (np.asarray(planner.sources.columns.get("sky", 0)) == 0)
+    redshifts = {
+        plan.name: (plan.sources["redshift"][first], plan.sources[first]) for plan in shown
+    }
     page.figure("redshifts", redshift_figure(redshifts))
     page.figure("fractions", _fraction_figure(fits, config.agn.limit))
     if images is not None:
@@ -59,6 +63,27 @@ def write_page(path, planner, plans, comparison, areas=None, images=None):
         page.table("table", _entries(areas))
         page.figure("figure", _area_figure(areas))
     return report.write(path)
+
+
+def answer(planner, plans, comparison):
+    """What the best set reaches and finds, in one sentence."""
+    row = comparison[1]
+    plan = next(plan for plan in plans if plan.name == row["plan"])
+    bands, facts = plan.bands.values(), {"limit": planner.config.agn.limit}
+    facts["mix"] = " of a made-up mix" if planner.sources.meta.get("agn") == "mix" else ""
+    facts["bands"] = " + ".join(name.removeprefix("miri.").upper() for name in plan.bands)
+    for key, values in {
+        "times": [f"{band.time.to_value(u.s):.0f}" for band in bands],
+        "dithers": [str(band.n_dithers) for band in bands],
+        "limits": [f"{band.errors().limiting_magnitude(band.filter).value:.1f}" for band in bands],
+    }.items():
+        same = key != "limits" and len(set(values)) == 1
+        facts[key] = values[0] if same else ", ".join(values)
+    for name, spec in (("n_agn", ".1f"), ("n_agn_true", ".1f"), ("purity", ".0f %")):
+        facts[name] = number(row[name], spec, "not known", error=row[f"{name}_err"])
+    facts |= {"area": f"{plan.area.value:.1f}", "hours": f"{plan.time.to_value(u.h):.1f}"}
+    known = "text" if np.isfinite(row["n_agn"]) else "no_area"
+    return str(sentence(declared("miricigale.planning")["answer"][known], facts))
 
 
 def _entries(table):
@@ -77,14 +102,17 @@ def _entries(table):
 def _notices(page, planner):
     """What a reader has to know first."""
     config, agn = planner.config, planner.config.agn
+    skies = planner.sources.meta.get("n_skies", 1)
+    n = np.count_nonzero(np.asarray(planner.sources.columns.get("sky", 0)) == 0)
+    page.notice("skies" if skies > 1 else "sample", n=n, skies=skies, seed=config.plan.seed)
     page.notice("images" if config.images.enabled else "noise")
-    noise = config.noise
-    page.notice(f"errors_{noise.kind}", run=noise.run, fractional=100 * noise.fractional)
+    noise = dataclasses.asdict(config.noise)
+    page.notice(f"errors_{noise['kind']}", **noise | {"fractional": 100 * noise["fractional"]})
     page.notice("models", model_error=100 * config.fit.model_error)
     page.notice("hours")
     if planner.given is None:
-        mix = ", ".join(f"{f:g}: {s:.2g}" for f, s in zip(agn.frac_agn, agn.shares, strict=True))
-        page.notice("field" if agn.field else "mix", mix=mix)
+        mix = ", ".join(f"{value:g}" for value in agn.frac_agn)
+        page.notice(planner.sources.meta["agn"], mix=mix)
     page.notice("background", background=background_text(**background_options(config)))
     for library in planner.sources.meta.get("libraries", ()):
         page.notice("library", library=library)

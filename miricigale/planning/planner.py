@@ -39,8 +39,9 @@ class Plan:
     sources : `~astropy.table.QTable`
         A row for each source: ``id``, true ``redshift`` and ``frac_agn``, ``n_detected`` bands above 5
         sigma, posterior means and standard deviations (``redshift_mean``, ``redshift_std``,
-        ``frac_agn_mean``, ``frac_agn_std``), ``agn_probability`` of a fracAGN above the limit, and
-        ``selected``.
+        ``frac_agn_mean``, ``frac_agn_std``), ``agn_probability`` of a fracAGN above the limit,
+        ``selected``, and for each MIRI band ``<band>_saturated`` and ``<band>_missing``, whether it has no
+        flux there.
     time : `~astropy.units.Quantity`
         Time that the observatory charges for all pointings, h.
     area : `~astropy.units.Quantity`
@@ -72,8 +73,9 @@ class Plan:
         table : `~astropy.table.QTable`
             ``filter``, ``time`` of all dithers, ``groups``, ``integrations``, ``dithers``,
             ``background``, ``sky_in_well`` (share), the 5-sigma limits ``limit_etc`` (calculator), ``limit``
-            (`~miricigale.depth.sensitivity`) and ``limit_used`` (the errors that are drawn, points), and
-            ``saturates``, the magnitude at which a point does.
+            (`~miricigale.depth.sensitivity`) and ``limit_used`` (the errors that are drawn, points),
+            ``saturates``, the magnitude at which a point does, ``n_saturated`` sources of the sample and
+            ``n_missing`` of them without a flux.
         """
         columns = (
             "filter",
@@ -84,15 +86,16 @@ class Plan:
             "background",
             "sky_in_well",
         )
-        columns += ("limit_etc", "limit", "limit_used", "saturates", "n_saturated")
+        columns += ("limit_etc", "limit", "limit_used", "saturates", "n_saturated", "n_missing")
         rows = []
         for name, plan in self.bands.items():
             row = plan.numbers() | {
                 "background": np.round(plan.background, 2),
                 "limit_used": np.round(plan.errors().limiting_magnitude(name), 2),
                 "saturates": np.round(plan.saturation, 1),
-                "n_saturated": int(np.count_nonzero(self.sources[f"{name}_saturated"])),
             }
+            for what in ("saturated", "missing"):
+                row[f"n_{what}"] = int(np.count_nonzero(self.sources[f"{name}_{what}"]))
             rows.append({column: row[column] for column in columns})
         return QTable(rows)
 
@@ -152,6 +155,13 @@ class Planner:
         """Sources per square arcmin of which the sample is a part; NaN if not known."""
         return float(self.sources.meta.get("density", np.nan))
 
+    @property
+    def min_detected(self):
+        """MIRI bands in which a source is detected to count, the same for every set: at most the smallest's."""
+        config = self.config
+        smallest = min(len(config.set_bands(name)) for name in config.exposures.sets)
+        return max(1, min(config.fit.min_detected, smallest))
+
     @functools.cached_property
     def _run(self):
         noise = self.config.noise
@@ -193,20 +203,39 @@ class Planner:
         return table
 
     def _mock(self, plan):
-        """Fluxes of one band with the errors of each source's size, in the order of the sample."""
+        """
+        Fluxes of one band with the errors of each source's size, in the order of the sample.
+
+        Sources that saturate have the errors of the groups before, NaN where there is no slope.
+        """
         columns, seed = self.sources[["id", plan.filter]], self.config.plan.seed
-        noise = self.config.noise
-        if noise.kind != "fitted" or not noise.sizes or "size" not in self.sources.colnames:
-            return plan.errors().perturb(columns, seed=seed)
-        size = self.sources["size"].to_value(u.arcsec)
-        node = np.argmin(np.abs(size[:, None] - _SIZES), axis=1)
+        good, node = self._good_groups(plan), np.zeros(len(columns), int)
+        if self.config.noise.kind == "fitted" and self.config.noise.sizes:
+            node = np.argmin(np.abs(self._size[:, None] - _SIZES), axis=1)
+        # a power of two, so that few errors are computed
+        kept = 2 ** np.log2(np.maximum(good, 2)).astype(int)
+        kept[good == plan.exposure.n_groups] = plan.exposure.n_groups
         parts, rows = [], []
-        for k in np.unique(node):
-            here = np.flatnonzero(node == k)
-            parts.append(plan.errors(_SIZES[k] * u.arcsec).perturb(columns[here], seed=seed))
+        for k, n_groups in np.unique([node, kept], axis=1).T:
+            here = np.flatnonzero((node == k) & (kept == n_groups))
+            errors = plan.cut(n_groups).errors(_SIZES[k] * u.arcsec)
+            parts.append(errors.perturb(columns[here], seed=seed))
             rows.append(here)
         joined = vstack(parts, metadata_conflicts="silent")
-        return joined[np.argsort(np.concatenate(rows), kind="stable")]
+        joined = joined[np.argsort(np.concatenate(rows), kind="stable")]
+        for column in (plan.filter, error_column(plan.filter)):
+            joined[column][good < 2] = np.nan
+        return joined
+
+    @property
+    def _size(self):
+        """Widths of the sources in arcsec, 0 where they are not known."""
+        known = "size" in self.sources.colnames
+        return self.sources["size"].to_value(u.arcsec) if known else np.zeros(len(self.sources))
+
+    def _good_groups(self, plan):
+        """Groups before the sources of the sample saturate in a band."""
+        return plan.good_groups(self.sources[plan.filter], self._size * u.arcsec)
 
     def evaluate(self, bands=None, *, name=None, share=1.0, pointings=None, measured=None):
         """
@@ -251,7 +280,8 @@ class Planner:
     def _results(self, results, photometry, plans):
         """The table of sources of a `Plan`."""
         agn = self.config.agn
-        table = self.sources[["id", "redshift", "frac_agn"]]
+        own = ("id", "redshift", "frac_agn", "sky")
+        table = self.sources[[name for name in own if name in self.sources.colnames]]
         detected = detected_bands(photometry, list(plans)) if plans else np.zeros(len(table), int)
         table["n_detected"] = detected
         for name in ("redshift", "frac_agn"):
@@ -260,12 +290,10 @@ class Planner:
         nodes = np.asarray(u.Quantity(results.axes["frac_agn"].values).value)
         # the posterior's weight on the fractions of the grid from the limit on
         table["agn_probability"] = results.pdf["frac_agn"][:, nodes >= agn.limit - 1e-9].sum(axis=1)
-        selected = table["agn_probability"] >= agn.threshold
-        if agn.select == "mean":
-            selected = table["frac_agn_mean"] >= agn.limit
-        table["selected"] = selected
+        table["selected"] = table["agn_probability"] >= agn.threshold
         for name, plan in plans.items():
-            table[f"{name}_saturated"] = self.sources[name] >= plan.saturation.to(u.uJy)
+            table[f"{name}_saturated"] = self._good_groups(plan) < plan.exposure.n_groups
+            table[f"{name}_missing"] = ~np.isfinite(photometry[name])
         return table
 
     def compare(self, *, measured=None):
@@ -309,13 +337,9 @@ class Planner:
         ]
 
     def common(self, plans):
-        """Which sources are detected by one of the plans in as many bands as the fit wants."""
-        least = self.config.fit.min_detected
-        chosen = np.zeros(len(self.sources), bool)
-        for plan in plans:
-            if plan.bands:
-                chosen |= np.asarray(plan.sources["n_detected"]) >= min(least, len(plan.bands))
-        return chosen
+        """Which sources one of the plans detects in `min_detected` bands: more bands never make them fewer."""
+        detected = [np.asarray(plan.sources["n_detected"]) for plan in plans]
+        return np.max(detected, axis=0) >= self.min_detected
 
     def accuracy(self, plan, chosen=None):
         """

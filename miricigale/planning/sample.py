@@ -2,8 +2,9 @@
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
+from astropy.table import QTable, vstack
 
+from miricigale.evaluation import AGNPopulation
 from miricigale.refdata import resources
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import ConfigError, argument_error, config_error
@@ -18,6 +19,8 @@ from miricigale.workflow.stages.truth import (
     library_fluxes,
 )
 
+#: Sources whose AGN are drawn: those of some 200 pointings. AGN of others than the sample stand in it, too.
+_DRAWS = 76000
 #: Stellar populations may not be older than the universe: the fit's ages, Gyr, are cut to this share.
 _AGE_SHARE = 0.95
 
@@ -40,7 +43,7 @@ def make_sample(config, bands, *, executor=None):
     ----------
     config : `~miricigale.planning.PlanConfig`
         Sections ``catalog``, ``sample``, ``sed`` and ``agn`` are used. The catalog may have a column
-        ``frac_agn``, which takes the place of the mix of ``agn``.
+        ``frac_agn``, which takes the place of the AGN of a field and of the mix of ``agn``.
     bands : iterable of str
         Bands of the fluxes.
     executor : `concurrent.futures.Executor`, optional
@@ -51,7 +54,9 @@ def make_sample(config, bands, *, executor=None):
     sources : `~astropy.table.QTable`
         A row for each: ``id``, ``redshift``, ``frac_agn``, the other parameters, ``size`` (full width at
         half maximum) and the fluxes; ``meta["density"]`` is the number of all that the cuts leave
-        per square arcmin (NaN if the area is not known).
+        per square arcmin (NaN if the area is not known). With the AGN of a field ``sky`` is 0 for the sample,
+        and further rows are the AGN above the limit that the same galaxies have in other skies, all
+        together in ``meta["n_skies"]``.
 
     Raises
     ------
@@ -93,19 +98,32 @@ def make_sample(config, bands, *, executor=None):
     elif 0 < options.n_sources < len(sources):
         rows = rng.choice(len(sources), options.n_sources, replace=False)
         sources = sources[np.sort(rows)]
-    given = sources["frac_agn"] if "frac_agn" in sources.colnames else None
+    elif options.n_sources > len(sources) and not config.images.enabled:
+        # the same galaxies in other skies: with AGN and noise of their own
+        sources = sources[np.arange(options.n_sources) % len(sources)]
+        sources["template"], sources["id"] = sources["id"], np.arange(1, len(sources) + 1)
+    agn, given = "catalog", sources.columns.get("frac_agn")
+    if given is None:
+        agn = "mix" if config.agn.frac_agn else "field"
     model = SEDModel.yang2021()
-    if config.agn.field and given is None:
+    sources["sky"], n_skies = 0, 1
+    if agn == "field":
         add_field_agn(sources, model, next(iter(bands)), seed)
+        if not config.images.enabled:
+            n_skies += _DRAWS // len(sources)
+            others = _other_skies(sources, model, next(iter(bands)), n_skies - 1, config)
+            sources = vstack([sources, others], metadata_conflicts="silent")
     else:
         add_agn(sources, 0.0, seed)
-        sources["frac_agn"] = agn_mix(config.agn, len(sources), rng) if given is None else given
+        mixed = given is None
+        sources["frac_agn"] = agn_mix(config.agn, len(sources), rng) if mixed else given
     light = library_fluxes(model, sources, list(bands))
     for name in bands:
         sources[name] = light[name]
     usable = np.all([np.isfinite(sources[name].value) for name in bands], axis=0)
     sources = _cut(sources, usable, "the models")
-    sources.meta = {"density": density, "libraries": list(model.meta["libraries"])}
+    sources.meta = {"density": density, "agn": agn, "n_skies": n_skies}
+    sources.meta["libraries"] = list(model.meta["libraries"])
     return sources
 
 
@@ -113,6 +131,24 @@ def _cut(table, chosen, what):
     if not np.any(chosen):
         raise config_error(what, f"leaves none of the {len(table)} sources")
     return table[chosen]
+
+
+def _other_skies(sources, model, band, n_skies, config):
+    """AGN above the limit that the same galaxies have in other skies: ``sky`` from 1 on, ids of their own."""
+    n, seed = len(sources), config.plan.seed
+    rows, ids = np.arange(n * n_skies) % n, sources["id"]
+    others = sources[rows]
+    others["sky"] = 1 + np.arange(n * n_skies) // n
+    keys = [f"{key}-{sky}" for key, sky in zip(others["id"], others["sky"], strict=True)]
+    numbers = np.asarray(ids).dtype.kind in "iu"
+    others["id"] = np.max(ids) + 1 + np.arange(n * n_skies) if numbers else keys
+    light = QTable(others["id", "redshift"])
+    light["stellar_mass"] = model.fluxes(sources, [band])["stellar_mass"][rows]
+    # each id has draws of its own, so that these are the AGN that are added
+    others = others[AGNPopulation().draw(light, seed=seed)["has_agn"]]
+    if len(others):
+        add_field_agn(others, model, band, seed)
+    return others[np.asarray(others["frac_agn"]) >= config.agn.limit]
 
 
 def _sizes(catalog):
@@ -123,8 +159,8 @@ def _sizes(catalog):
 
 def agn_mix(options, n, rng):
     """AGN fractions in the shares of the configuration, in random order."""
-    shares = np.asarray(options.shares, float) / np.sum(options.shares)
-    edges = np.round(np.cumsum(shares) * n).astype(int)
+    shares = np.asarray(options.shares or np.ones(len(options.frac_agn)), float)
+    edges = np.round(np.cumsum(shares / shares.sum()) * n).astype(int)
     counts = np.diff(np.concatenate([[0], edges]))
     return rng.permutation(np.repeat(options.frac_agn, counts))
 

@@ -28,6 +28,7 @@ from .reference_pixels import reference_channels as reference_channels
 from .reference_pixels import reference_drift as reference_drift
 from .references import DetectorMaps as DetectorMaps
 from .references import ReferenceFiles as ReferenceFiles
+from .response import imager_response as imager_response
 from .results import ReductionResult as ReductionResult
 from .settings import BACKENDS as BACKENDS
 from .settings import BackgroundSettings as BackgroundSettings

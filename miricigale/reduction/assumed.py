@@ -58,7 +58,7 @@ def maps_of(reducer, ramp):
                 "give 'references' or 'properties' (references='simulated' takes it for miri_detector())"
             )
             raise ValueError(msg)
-        return own_maps(reducer.detector)
+        return own_maps(reducer.detector, _steps_of(ramp))
     if isinstance(ramp, Charge):
         wanted = "None or 'simulated' for a Charge, which has no counts"
         raise argument_error("references", wanted, repr(reducer.references))
@@ -85,12 +85,18 @@ def history_of(reducer, ramp, maps):
     """
     meta = {f"reference_{name}": text for name, text in maps.used.items()}
     if is_own(reducer, ramp):
-        return {"simulated": True, **meta}
+        done = {"steps": sorted({*_steps_of(ramp), "ramp_fit"})} if _steps_of(ramp) else {}
+        return {"simulated": True, **meta, **done}
     used = {STEP_OF.get(name) for name, text in maps.used.items() if text != "none"}
     meta["steps"] = sorted((used - {None}) | set(ramp.steps) | {"ramp_fit"})
     if (day := middle_of(ramp.header)) is not None:
         meta["day"] = day
     return {"simulated": False, **meta}
+
+
+def _steps_of(ramp):
+    """What another pipeline has done to a ramp."""
+    return getattr(ramp, "steps", frozenset())
 
 
 def brightness_of(reducer, rate):
@@ -124,9 +130,10 @@ def brightness_of(reducer, rate):
             # blurred as the image is: a uniform sky comes out uniform
             flat = convolve(flat, np.asarray(detector.ipc_kernel, np.float32), mode="nearest")
         values = {
-            "dark": detector.dark_current / detector.gain,
+            "dark": 0.0 if "dark" in facts.steps else detector.dark_current / detector.gain,
             "flat": flat,
-            "conversion": photmjsr(facts.filter, gain=detector.gain),
+            "conversion": photmjsr(facts.filter, gain=detector.gain)
+            / detector.relative_response(facts.filter, facts.subarray),
         }
         used = {"flat": f"flat field {_OWN}", "photom": f"conversion {_OWN}"}
         return values, {f"reference_{name}": text for name, text in used.items()}

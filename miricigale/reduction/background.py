@@ -136,9 +136,9 @@ def estimate_background(
     ----------
     image : `~astropy.nddata.CCDData`
         Any unit.
-    method : {"masked", "sep"}, optional
+    method : {"masked", "sep", "none"}, optional
         ``"sep"`` is the plain mesh of sep, as in Yang et al. 2021 with boxes of 32 pixels and a filter of 3:
-        sources are only clipped, and the other options have no meaning.
+        sources are only clipped, and the other options have no meaning; ``"none"`` is a level of 0.
     box, filter_size : int, optional
         Size of the boxes in pixels, and of the median filter in boxes.
     plane : bool, optional
@@ -214,7 +214,9 @@ def estimate_background(
     >>> estimate_background(images[0], box=32)
     <Background median 4.997 +- 0.0016, rms 0.1002, 0.0 % masked as sources>
     """
-    check_choice(method, "method", ("masked", "sep"))
+    check_choice(method, "method", ("masked", "sep", "none"))
+    if method == "none":
+        return known_background(np.zeros(image.shape, np.float32))
     check_least(box, "box", 4, whole=True)
     check_least(filter_size, "filter_size", 1, whole=True)
     mask = plain_mask(image)
@@ -231,6 +233,12 @@ def estimate_background(
     if warn:
         warn_of(background, mask)
     return background
+
+
+def known_background(level):
+    """`Background` of a level of which nothing else is known."""
+    unknown = np.broadcast_to(np.float32(np.nan), level.shape)
+    return Background(level, unknown, unknown, np.broadcast_to(False, level.shape), 1, 1)
 
 
 def _masked(data, mask, stated, mesh, correlation):

@@ -1,10 +1,12 @@
 """The images of one filter put together: aligned, on one level, without outliers, drizzled."""
 
+import numpy as np
+
 from miricigale.instrument import ImageFacts
 from miricigale.reduction.align import align_images
 from miricigale.reduction.background import BackgroundFlags, estimate_background, remove_background
 from miricigale.reduction.dither_background import dither_backgrounds, restored
-from miricigale.reduction.images import check_images, check_overlap, own_grid
+from miricigale.reduction.images import check_images, check_overlap, own_grid, with_data
 from miricigale.reduction.mosaic import drizzle_images, pixel_map, weight_map
 from miricigale.reduction.outliers import reject_outliers
 from miricigale.reduction.results import ReductionResult
@@ -91,8 +93,16 @@ def combine(reducer, images, backgrounds, rates, wcs, pixel_scale, align):
     if doubts:
         doubt = f"{len(doubts)} of {len(backgrounds)} backgrounds cannot be trusted"
         notes.append(f"{doubt} ({_reasons(doubts)})")
+    known = len(backgrounds) == len(images)
+    whole = [im.data + b.level for im, b in zip(images, backgrounds, strict=True)] if known else []
     drizzled, images = drizzle(reducer.mosaics, images, wcs)
     mosaic, mosaic_background = reducer.subtract_background(drizzled.image)
+    subtracted = mosaic_background.level
+    if known:
+        # of the exposures too, and what brought them to one level
+        taken = [with_data(im, data - im.data) for im, data in zip(images, whole, strict=True)]
+        levels = drizzle_images(taken, wcs, pixfrac=reducer.mosaics.pixfrac).image
+        subtracted = subtracted + np.where(levels.mask, 0, levels.data)
     if not mosaic_background.trusted:
         reasons = _reasons([mosaic_background])
         notes.append(f"the background of the mosaic cannot be trusted ({reasons})")
@@ -108,6 +118,7 @@ def combine(reducer, images, backgrounds, rates, wcs, pixel_scale, align):
         drizzled.weight,
         drizzled.n_images,
         mosaic_background,
+        subtracted,
         tuple(notes),
     )
 

@@ -21,11 +21,12 @@ from miricigale.reduction import (
     read_images,
     write_image,
 )
+from miricigale.reduction.background import known_background
 from miricigale.reduction.dither_background import restored
 from miricigale.utils.content import content_sha256, file_sha256
 from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.progress import progress
-from miricigale.utils.units import ANGLE, SURFACE_BRIGHTNESS, to_array
+from miricigale.utils.units import ANGLE, RATE, SURFACE_BRIGHTNESS, to_array
 
 log = logging.getLogger(__name__)
 
@@ -195,9 +196,10 @@ def _exposure(reducer, path, stem, key, resume, integrations):
     if reducer.references == "none" and not exposure.unit.is_equivalent(SURFACE_BRIGHTNESS):
         _write(exposure, rate, key, **planes)
         return None, "rate", slopes_only
-    slopes, image, background = reducer.reduce(exposure)
-    if slopes is not None:
-        _write(slopes, rate, key, **planes)
+    if exposure.unit.is_equivalent(RATE):
+        # there to stay where the brightness cannot be had
+        _write(exposure, rate, key, **planes)
+    _, image, background = reducer.reduce(exposure)
     _write(image, cal, key, BKG=background.level)
     return cal, "reduced", ""
 
@@ -213,7 +215,8 @@ def _mosaic(reducer, members, path, scale, settings, resume):
     if _kept(path, key, resume):
         return "kept", json.loads(read_images(path)[0].header["META"]).get("notes", [])
     files = [read_images(cal)[0] for cal, _ in members]
-    images, backgrounds = [file.image for file in files], []
+    images = [file.image for file in files]
+    backgrounds = [known_background(file.planes["BKG"]) for file in files]
     if reducer.background.method == "dithers" and len(files) >= 3:
         images, backgrounds = reducer.subtract_dithers(
             [restored(file.image, file.planes["BKG"]) for file in files]

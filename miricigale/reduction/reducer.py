@@ -15,7 +15,7 @@ from miricigale.reduction.background import estimate_background, remove_backgrou
 from miricigale.reduction.calibration import calibrate
 from miricigale.reduction.combine import combine, drizzle, subtract_dithers
 from miricigale.reduction.files import open_exposure
-from miricigale.reduction.images import own_grid
+from miricigale.reduction.images import own_grid, with_data
 from miricigale.reduction.reference_cache import ReferenceCache
 from miricigale.reduction.references import ReferenceFiles
 from miricigale.reduction.results import rate_image
@@ -240,7 +240,9 @@ class Reducer(Interactive):
         Parameters
         ----------
         rate : `~astropy.nddata.CCDData` or path-like
-            DN/s, from `fit_ramp` (its meta dictionary names filter and sub-array), or its file.
+            DN/s, from `fit_ramp` (its meta dictionary names filter and sub-array), or its file. An image that
+            the pipeline calibrated is calibrated again: its PHOTMJSR says by what it was multiplied, whatever
+            that version knew of the loss of response with time.
 
         Returns
         -------
@@ -252,6 +254,10 @@ class Reducer(Interactive):
         for key in ("filter", "subarray"):
             if getattr(facts, key) is None:
                 raise argument_error("rate", f"an image whose meta has {key!r}", "none")
+        if "photom" in facts.steps:
+            if not (before := rate.meta.get("photmjsr")):
+                raise argument_error("rate", "slopes, or an image with its PHOTMJSR", "neither")
+            rate = with_data(rate, rate.data / before, factor=1 / before, unit=RATE)
         brightness, used = brightness_of(self, rate)
         where = {"filter": facts.filter, "subarray": facts.subarray}
         cal = calibrate(rate, **where, **brightness)
@@ -351,7 +357,8 @@ class Reducer(Interactive):
         Returns
         -------
         rate : `~astropy.nddata.CCDData` or None
-            None if the exposure was calibrated before.
+            None if the exposure was calibrated before; given a photom reference (`ReferenceFiles`) it is
+            calibrated again, unless it was resampled.
         image : `~astropy.nddata.CCDData`
             MJy/sr, background subtracted.
         background : `Background`
@@ -367,6 +374,10 @@ class Reducer(Interactive):
         if not exposure.unit.is_equivalent(SURFACE_BRIGHTNESS):
             wanted = f"in {RATE} or {SURFACE_BRIGHTNESS}"
             raise argument_error("exposure", wanted, exposure.unit)
+        files, facts = self.references, ImageFacts.of(exposure)
+        given = isinstance(files, ReferenceFiles) and files.photom is not None
+        if given and "photom" in facts.steps and "resample" not in facts.steps:
+            exposure = self.calibrate(exposure)
         return None, *self.subtract_background(exposure)
 
     def run(self, ramps, *, wcs=None, pixel_scale=0.11 * ANGLE, align=None, progress_bar=False):

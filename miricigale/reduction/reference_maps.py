@@ -212,16 +212,25 @@ def read_photom(path, exposure, day):
     `~miricigale.utils.exceptions.DataError`
         If there is no row for them, or the time is needed and not known.
     """
-    short = exposure.filter.rpartition(".")[2].upper()
+    conversion, times = photom_row(path, exposure.filter, exposure.subarray)
+    if times and day is None:
+        what = "has a conversion that depends on time, and the exposure does not state when"
+        raise data_error(path, what)
+    return on_day(conversion, times, day)
+
+
+def photom_row(path, filter, subarray):
+    """Conversion of a filter and sub-array in a photom reference, and the rows of its dependence on time."""
+    short = filter.rpartition(".")[2].upper()
     with open_fits(path, wanted=_wanted("photom", "PHOTOM")) as hdus:
         _header(hdus, path, "photom", "PHOTOM")
         rows = hdus["PHOTOM"].data
         columns = (map(str.upper, map(str.strip, rows[key])) for key in ("filter", "subarray"))
         keys = list(zip(*columns, strict=True))
-        wanted = [(short, part) for part in (exposure.subarray, "GENERIC")]
+        wanted = [(short, part) for part in (subarray, "GENERIC")]
         known = [keys.index(key) for key in wanted if key in keys]
         if not known:
-            raise data_error(path, f"has no row for {short} and {exposure.subarray}")
+            raise data_error(path, f"has no row for {short} and {subarray}")
         conversion = float(rows["photmjsr"][known[0]])
         times = {
             name: {key.lower(): float(hdus[name].data[key][known[0]]) for key in hdus[name].data.names
@@ -229,33 +238,27 @@ def read_photom(path, exposure, day):
             for name in ("TIMECOEFF", *_TIMES) if name in hdus and hdus[name].data is not None
         }  # fmt: skip
     if not (np.isfinite(conversion) and conversion > 0):
-        what = f"has no conversion for {short} and {exposure.subarray}: {conversion}"
-        raise data_error(path, what)
-    if times and day is None:
-        what = "has a conversion that depends on time, and the exposure does not state when"
-        raise data_error(path, what)
-    if (old := times.pop("TIMECOEFF", None)) is not None:
-        conversion += old["amplitude"] * np.exp(-(day - old["t0"]) / old["tau"])
+        raise data_error(path, f"has no conversion for {short} and {subarray}: {conversion}")
+    return conversion, times
+
+
+def on_day(conversion, times, day):
+    """A conversion on a day (MJD): the tables of the pipeline divide it, the older one is added."""
     for name, row in times.items():
-        conversion /= _TIMES[name](day, **row)
+        if name == "TIMECOEFF":
+            conversion += row["amplitude"] * np.exp(-(day - row["t0"]) / row["tau"])
+        else:
+            conversion /= _TIMES[name](day, **row)
     return float(conversion)
-
-
-def _linear(day, t0, lossperyear):
-    return 1 - lossperyear * (day - t0) / 365
-
-
-def _exponential(day, t0, amplitude, tau, const):
-    return amplitude * np.exp(-(day - t0) / tau) + const
-
-
-def _power_law(day, t0, year1value, tsoft, alpha):
-    return (day - t0 + tsoft) ** alpha * year1value / (365 + tsoft) ** alpha
 
 
 #: Relative response by time, of the tables of a photom reference.
 _TIMES = {
-    "TIMECOEFF_LINEAR": _linear,
-    "TIMECOEFF_EXPONENTIAL": _exponential,
-    "TIMECOEFF_POWERLAW": _power_law,
+    "TIMECOEFF_LINEAR": lambda day, t0, lossperyear: 1 - lossperyear * (day - t0) / 365,
+    "TIMECOEFF_EXPONENTIAL": lambda day, t0, amplitude, tau, const: (
+        amplitude * np.exp(-(day - t0) / tau) + const
+    ),
+    "TIMECOEFF_POWERLAW": lambda day, t0, year1value, tsoft, alpha: (
+        (day - t0 + tsoft) ** alpha * year1value / (365 + tsoft) ** alpha
+    ),
 }

@@ -91,7 +91,7 @@ class DetectorMaps:
         return dataclasses.replace(self, **own)
 
 
-def own_maps(properties):
+def own_maps(properties, steps=()):
     """
     The package's own detector, for ramps that it simulated.
 
@@ -99,6 +99,8 @@ def own_maps(properties):
     ----------
     properties : `~miricigale.instrument.DetectorProperties`
         Of the detector.
+    steps : iterable of str, optional
+        What another pipeline has done to the ramp, which is not done again.
 
     Returns
     -------
@@ -115,14 +117,14 @@ def own_maps(properties):
         "gain": f"{properties.gain:.6g} e-/DN {own}",
         "read_noise": f"{properties.read_noise:.6g} DN {own}",
     }
-    return DetectorMaps(
-        gain=properties.gain,
-        read_noise=properties.read_noise,
-        bias=properties.bias,
-        saturation=limit,
-        linearity=properties.nonlinearity,
-        used=used,
-    )
+    values = {"bias": properties.bias, "saturation": limit, "linearity": properties.nonlinearity}
+    done = {name for name in used if STEP_OF.get(name) in steps}
+    if "linearity" in done:
+        # linear DN have their bias behind them
+        done.add("bias")
+    used |= dict.fromkeys(done, "done before")
+    values = {name: value for name, value in values.items() if name not in done}
+    return DetectorMaps(gain=properties.gain, read_noise=properties.read_noise, **values, used=used)
 
 
 def needed(references, header, steps, *, names, what):

@@ -40,6 +40,8 @@ class ReductionResult(Interactive):
         Number of dithers at each pixel of the mosaic.
     mosaic_background : `Background`
         What was subtracted from the mosaic in the second pass.
+    subtracted : `~numpy.ndarray`
+        On the mosaic, all that was subtracted from it and from the exposures: the plane BKG.
     notes : tuple of str
         What could not be done.
 
@@ -69,6 +71,7 @@ class ReductionResult(Interactive):
     weight: np.ndarray
     n_images: np.ndarray
     mosaic_background: Background
+    subtracted: np.ndarray
     notes: tuple = ()
 
     _other_names: ClassVar[dict] = {
@@ -127,7 +130,7 @@ class ReductionResult(Interactive):
         """
         mosaic = Image(self.mosaic, copy=False)
         mosaic.meta = {**self.mosaic.meta, "notes": list(self.notes)}
-        planes = {"WHT": self.weight, "CON": self.n_images, "BKG": self.mosaic_background.level}
+        planes = {"WHT": self.weight, "CON": self.n_images, "BKG": self.subtracted}
         return write_image(mosaic, path, planes=planes, overwrite=overwrite)
 
 

@@ -63,10 +63,10 @@ class BackgroundSettings:
 
     Parameters
     ----------
-    method : {"masked", "sep", "dithers"}, optional
+    method : {"masked", "sep", "dithers", "none"}, optional
         From the image's own sky, with the sources masked (`estimate_background`); by the plain mesh of sep, as in
-        Yang et al. 2021 (with ``box=32``); or, in `Reducer.run`, `Reducer.combine` and `Reducer.subtract_dithers`,
-        from the other dithers (`dither_backgrounds`).
+        Yang et al. 2021 (with ``box=32``); in `Reducer.run`, `Reducer.combine` and `Reducer.subtract_dithers`,
+        from the other dithers (`dither_backgrounds`); or none, which leaves light as wide as the image in.
     box, filter_size : int, optional
         Boxes in pixels, median filter in boxes.
     plane : bool, optional
@@ -98,7 +98,7 @@ class BackgroundSettings:
     negative_noise: str = "larger"
 
     def __post_init__(self):
-        check_choice(self.method, "method", ("masked", "sep", "dithers"))
+        check_choice(self.method, "method", ("masked", "sep", "dithers", "none"))
         check_least(self.box, "box", 4, whole=True)
         check_least(self.filter_size, "filter_size", 1, whole=True)
         check_positive(self.negative_threshold, "negative_threshold", optional=True)
@@ -107,7 +107,7 @@ class BackgroundSettings:
     @property
     def mesh(self):
         """Options of `estimate_background`: those of single images, also where dithers follow."""
-        method = "sep" if self.method == "sep" else "masked"
+        method = "masked" if self.method == "dithers" else self.method
         names = ("box", "filter_size", "plane")
         return {"method": method, **{name: getattr(self, name) for name in names}}
 

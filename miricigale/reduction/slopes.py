@@ -50,6 +50,10 @@ def fit_slopes(reducer, ramp, maps, progress_bar=False, *, first=0):
     """
     exposure, detector = ramp.exposure, reducer.detector
     dq = ramp.pixel_dq.astype(np.int64) | maps.pixel_dq
+    if not isinstance(ramp, Charge) and ramp.data.dtype.kind in "iu":
+        # counts of 0 are of pixels that were not read: the bias is thousands
+        unread = np.all((ramp.data[:, 0] == 0) & (ramp.data[:, -1] == 0), axis=0)
+        dq[unread] |= DQ.DO_NOT_USE | DQ.DEAD
     reference = (dq & DQ.REFERENCE_PIXEL) != 0
     usable = (dq & _UNUSABLE) == 0
     n_group = exposure.n_groups
@@ -80,7 +84,8 @@ def fit_slopes(reducer, ramp, maps, progress_bar=False, *, first=0):
             group_time=ramp.group_time,
             drift=_drift(reducer, ramp, reference, drift),
             usable=usable,
-            group_dq=None if ramp.simulated else ramp.group_dq,
+            # those of a simulated ramp are the truth, until a pipeline has found its own
+            group_dq=None if ramp.simulated and not ramp.steps else ramp.group_dq,
             first_group=part[0],
             last_group=part[1],
             jump_threshold=thresholds[0],

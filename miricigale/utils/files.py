@@ -314,7 +314,7 @@ def read_table(path, *, wanted, cls=QTable, form=None, hdu=None):
     """
     # astropy would take text for the table itself
     if not Path(path).is_file():
-        raise _unreadable(path, wanted, "no such file")
+        raise _unreadable(path, wanted, FileNotFoundError())
     unpacked_size(path)
     try:
         form = _table_format(path) if form is None else form
@@ -443,7 +443,7 @@ def writing(path):
 
 
 def _unreadable(path, wanted, err):
-    if isinstance(err, FileNotFoundError):
-        err = "no such file"
+    if isinstance(err, OSError) and not Path(path).is_file():
+        err = "it is a folder, wanted is a file" if Path(path).is_dir() else "no such file"
     lines = str(err).strip().splitlines() or [type(err).__name__]
     return DataError(f"{path} cannot be read as {wanted}: {lines[0]}")

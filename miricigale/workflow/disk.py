@@ -29,7 +29,7 @@ def disk_use(config):
     >>> from miricigale.workflow import disk_use, load_config
     >>> use = disk_use(load_config("goodss", quick=True))
     >>> print(f"{sum(use.values()) / 1e6:.0f} MB")
-    261 MB
+    273 MB
     """
     exposures, truths = study_exposures(config), len(study_truths(config))
     pixels = {name: math.prod(e.shape) for name, e in exposures.items()}
@@ -60,6 +60,11 @@ def disk_use(config):
         "exposures": truths * exposed + rates,
         "mosaics": truths * n_bands * 2.05 * (native + fine),
         "highres": 3.8 * fine,
+        "points": config.point_sources.enabled
+        * min(2, n_bands)
+        * 2.05
+        * measured
+        / len(study_pointings(config)),
         "kernels": n_bands * 2_950_000,
         "templates": 2.7 * fine + 9_400 * n_imaged,
         "photometry": truths * n_bands * (6 * measured + 250 * n_imaged),
@@ -67,7 +72,7 @@ def disk_use(config):
         "fits": truths * n_sets * 4_500 * n_imaged,
         "experiments": truths * len(config.fit.experiments) * 4_500 * n_imaged,
         "sources": truths * (600 * n + (6_000 + 4_100 * n_bands) * pictured),
-        "report": 6_200_000,
+        "report": 13_000_000,
     }
     return {name: int(n_bytes) for name, n_bytes in by_stage.items()}
 

@@ -153,7 +153,9 @@ class SedSection(Section):
         fracAGN of the injected sources, one simulated sky for each; the first gives the error functions.
         'field' draws AGN from a luminosity function, 'catalog' takes its column frac_agn.
     infrared
-        Dust luminosity: by energy balance of the fit, or of the star-forming main sequence.
+        Dust luminosity and colors: ceers draws those of real MIRI colors where no band of the fit shows the
+        dust; fit keeps the energy balance of the fit; main-sequence has at least those of the star-forming
+        main sequence.
     """
 
     axes: str = option("galaxy", choices=("galaxy", "quick"))
@@ -164,7 +166,7 @@ class SedSection(Section):
     frac_agn: tuple[float | str, ...] = option(
         (0.0,), low=0.0, high=0.99, choices=(FIELD, CATALOG), single=True, unique=True
     )
-    infrared: str = option("fit", choices=("fit", "main-sequence"))
+    infrared: str = option("ceers", choices=("ceers", "fit", "main-sequence"))
 
     def __post_init__(self):
         good = len(self.alpha) == 2 and 0 < self.alpha[0] <= self.alpha[1] <= 4
@@ -383,7 +385,7 @@ class FitBasics(Section):
     """
 
     bands: tuple[str, ...] = tuple(YANG2021_DEPTHS)
-    depths: tuple[float, ...] = tuple(YANG2021_DEPTHS.values())
+    depths: tuple[float, ...] = option(tuple(YANG2021_DEPTHS.values()), low=10.0, high=40.0)
     axes: str = option("fit", choices=("fit", "quick"))
     model_error: float = option(0.1, low=0.0, high=1.0)
     min_detected: int = option(2, low=0, high=9)
@@ -413,7 +415,7 @@ class FitSection(FitBasics):
     """
 
     bands: tuple[str, ...] = ()
-    depths: tuple[float, ...] = ()
+    depths: tuple[float, ...] = option((), low=10.0, high=40.0)
     sets: tuple[str, ...] = option(("all", "none"), choices=SETS, unique=True)
     experiments: tuple[str, ...] = option((), choices=EXPERIMENTS, unique=True)
 

@@ -7,7 +7,7 @@ from miricigale.filters import Filter
 #: Sets of MIRI bands that join the existing ones in a fit: Yang et al. 2021, section 4.
 SETS = ("all", "none", "blue", "red")
 #: Further fits of each sample.
-EXPERIMENTS = ("free_agn", "far_infrared", "no_model_error", "known_redshift")
+EXPERIMENTS = ("free_agn", "far_infrared", "no_model_error", "known_redshift", "between")
 #: In place of a fracAGN: AGN as in a real field.
 FIELD = "field"
 #: In place of a fracAGN: that of each source, in the column ``frac_agn`` of the catalog.

@@ -13,7 +13,7 @@ from helpers.errors import refuses
 from helpers.exposures import exposure_of
 from miricigale.depth import etc_limit, etc_setup, sensitivity, sensitivity_table
 from miricigale.depth.limits import extraction_weights
-from miricigale.depth.noise import noise_power, ramp_variance
+from miricigale.depth.noise import ExposureNoise, noise_power, ramp_variance
 from miricigale.detector import BadPixels, CosmicRays, Detector, Residual
 from miricigale.instrument import (
     DetectorProperties,
@@ -49,6 +49,19 @@ def test_slope_is_the_generalized_least_squares_line(rate, n, step, read):
     if read == 0:
         # the first group is lost as the zero, and nothing else
         assert_allclose(variance, rate / ((n - 1) * step))
+
+
+@pytest.mark.parametrize(("read", "level"), [(0.0, 500.0), (6.0, 0.0)])
+def test_ramps_apart_have_the_noise_of_the_closed_forms(read, level):
+    # two hours as one ramp and as 27: of photons alone each loses its zero, (n - 1) of n; of reads alone the
+    # error of a straight line is 12 / n (n^2 - 1) (Rieke 2007, Robberto 2014)
+    kind = DetectorProperties(gain=4.0, read_noise=read, dark_current=0.0)
+    form = {"filter": NAME, "background": level * u.MJy / u.sr, "detector": kind}
+    for n_ramps, n in ((1, 2592), (27, 96)):
+        noise = ExposureNoise(n_groups=n, group_time=2.775, n_ramps=n_ramps, **form)
+        of_reads = 12 * 24.0**2 / (n * (n**2 - 1) * 2.775**2)
+        expected = of_reads if read else noise.rate / ((n - 1) * 2.775)
+        assert_allclose(noise.variance(), expected / n_ramps, rtol=1e-6)
 
 
 @pytest.mark.parametrize("correlation", [None, 1.0])

@@ -5,7 +5,6 @@ from numpy.testing import assert_allclose
 from helpers.errors import refuses
 from miricigale.evaluation import (
     CLASS_NAMES,
-    KIRKPATRICK_LIMITS,
     classify,
     confusion,
     selection_quality,
@@ -30,7 +29,7 @@ def test_confusion_of_a_table_by_hand():
 def test_classes_have_the_published_limits():
     got = classify([0.0, 0.0999, 0.1, 0.39, 0.4, 1.0, np.nan]).tolist()
     assert got == ["galaxy"] * 2 + ["composite"] * 2 + ["agn"] * 2 + ["unknown"]
-    got = classify([0.2, 0.5, 0.8], limits=KIRKPATRICK_LIMITS)
+    got = classify([0.2, 0.5, 0.8], limits=(0.3, 0.7))
     assert got.tolist() == ["galaxy", "composite", "agn"]
     refuses("'frac_agn' must be between 0 and 1", classify, [1.2])
 

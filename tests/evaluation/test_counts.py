@@ -6,6 +6,7 @@ from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
 from miricigale.evaluation import (
+    ceers_dust,
     dust_obscured_fraction,
     integrated_light,
     main_sequence_dust,
@@ -110,3 +111,18 @@ def test_dust_emits_at_least_what_attenuation_took(galaxies):
         main_sequence_dust(galaxies, seed=1, scatter=-1)
     galaxies.remove_column("u_v")
     refuses(r"'table' must be .* columns \['u_v'\]", main_sequence_dust, galaxies, seed=1)
+
+
+def test_dust_of_ceers_rises_with_mass_and_is_rare_in_quiescent_galaxies(galaxies):
+    for mass, wanted in ((1e8, 0.07 - 0.43 * 1.8), (1e9, 0.07 - 0.43 * 1.3), (1e11, 0.07)):
+        galaxies["stellar_mass"] = np.full(len(galaxies), mass) * u.Msun
+        dust = ceers_dust(galaxies, "dl07_alpha", seed=5)
+        drawn = np.log10(dust["dust_excess"][~dust["quiescent"]][1:])
+        assert drawn.mean() == pytest.approx(wanted, abs=4 * 0.30 / np.sqrt(drawn.size))
+        assert drawn.std() == pytest.approx(0.30, rel=0.1)
+    galaxies["u_v"] = np.full(len(galaxies), 1.9) * u.mag
+    dust = ceers_dust(galaxies, "dale2014", seed=5)
+    assert np.median(np.log10(dust["dust_excess"])) == pytest.approx(-0.49, abs=0.1)
+    refuses(
+        "no dust component 'casey2012'", ceers_dust, galaxies, "casey2012", seed=1, error=KeyError
+    )

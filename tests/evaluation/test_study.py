@@ -77,6 +77,10 @@ def test_fractions_and_powers_come_out_as_drawn(study):
         offset = got(study, "power_offset", truth=truth)
         assert offset.value == pytest.approx(-0.1, abs=4 * offset.error)
         assert got(study, "power_scatter", truth=truth).value == pytest.approx(0.3, rel=0.1)
+    # the same at all fractions, if sources are drawn alike
+    for name, ends in (("z_scatter_trend", (0.99, 0.2)), ("power_scatter_trend", (0.6, 0.2))):
+        trend = got(study, name, option=ends)
+        assert trend.value == pytest.approx(1, abs=4 * trend.error)
     # no AGN has no power
     assert got(study, "power_offset", truth=0.0).n == 0
 
@@ -102,6 +106,8 @@ def test_detections_are_shares_of_the_field(study):
 
 def test_limits_and_signal_to_noise(study):
     assert got(study, "limit_offset", option=BANDS[0]).value == pytest.approx(-0.5)
+    other = got(study, "limit_offset", option=(BANDS[0], 24.0))
+    assert other.value == pytest.approx(LIMITS[BANDS[0]] - 0.5 - 24.0)
     assert got(study, "etc_limit", option=BANDS[1]).value == LIMITS[BANDS[1]]
     one = study.at(0.0)
     band = BANDS[3]
@@ -121,17 +127,25 @@ def test_magnitudes_by_shape_and_crowding():
         noise = 10 ** (-0.4 * rng.normal(0, np.where(one.crowded[name], 0.3, 0.1)))
         one.matched[name] = flux * noise
     study = StudyResults((one,), BANDS)
-    lost = got(study, "shape_offset", option="n >= 2")
+    lost = got(study, "magnitude_offset", option=(BANDS[3], "n >= 2"))
     assert lost.value == pytest.approx(-2.5 * np.log10(0.8), abs=4 * lost.error)
-    for name in ("n < 2", "point"):
-        kept = got(study, "shape_offset", option=name)
+    for name in ("n < 2", "point", "not n >= 2"):
+        kept = got(study, "magnitude_offset", option=(BANDS[3], name))
         assert kept.value == pytest.approx(0, abs=4 * kept.error)
-    kinds = ("crowded", "isolated")
-    scatter = {name: got(study, "magnitude_scatter", option=name) for name in kinds}
-    assert scatter["crowded"].value > 1.5 * scatter["isolated"].value
-    shares = [got(study, "shape_share", option=name).value for name in ("point", "n < 2", "n >= 2")]
+    for name, drawn in (("crowded", 0.3), ("not crowded", 0.1)):
+        scatter = got(study, "magnitude_scatter", option=(BANDS[3], name, "not n >= 2"))
+        assert scatter.value == pytest.approx(drawn, abs=4 * scatter.error)
+    kinds = ("point", "n < 2", "n >= 2")
+    shares = [got(study, "kind_share", option=(BANDS[3], name)).value for name in kinds]
     assert sum(shares) == pytest.approx(1)
-    assert got(study, "crowded_share").value == pytest.approx(1 - 0.85**6, abs=0.03)
+    crowded = got(study, "kind_share", option=(BANDS[3], "crowded"))
+    assert crowded.value == pytest.approx(0.15, abs=4 * crowded.error)
+    # half of Gaussian errors are within 0.6745 sigma
+    true = one.matched[f"{BANDS[3]}_true"]
+    one.matched[BANDS[3]] = true * 10 ** (-0.4 * rng.normal(0, 0.1, 3000))
+    error = got(study, "bright_error", option=BANDS[3])
+    assert error.n == 30
+    assert error.value == pytest.approx(0.6745 * 0.1, rel=0.5)
 
 
 def test_xray_fluxes_are_those_of_the_relation(study):
@@ -144,6 +158,10 @@ def test_xray_fluxes_are_those_of_the_relation(study):
     above = xray_fluxes(one)[one.field] > half.value
     assert found[above].mean() > 0.7
     assert half.low < half.value < half.high
+    # at redshift 2 1e-16 erg/s/cm2 in 0.5-7 keV, halved by absorption, are 10^42.54 erg/s in 2-10 keV:
+    # the paper's numbers (section 4.2)
+    luminosity = got(study, "xray_luminosity", truth=0.6, option=2.0)
+    assert luminosity.value - half.value == pytest.approx(42.54 + 16, abs=0.01)
 
 
 def test_what_a_study_lacks_is_nan(study):
@@ -205,17 +223,17 @@ def test_published_numbers_are_named_once_and_can_be_measured():
     assert len(set(keys)) == len(keys)
     assert {one.quantity for one in PUBLISHED} <= {*QUANTITIES, "extra"}
     assert {one.relation for one in PUBLISHED} <= set("=~<>")
-    by_key = {one.key: one.value for one in PUBLISHED}
-    # of the abstract: accretion power to 0.3 dex, redshifts and fractions better by 2 or more below
-    # z = 3, fractions of pure galaxies by about 100
-    read = {one.key: (one.relation, one.value, one.option) for one in PUBLISHED if one.source}
-    assert read == {
-        "power_scatter": ("~", 0.3, None),
-        "scatter_ratio": (">", 2.0, (0.0, 3.0)),
-        "frac_scatter_ratio": (">", 2.0, (0.0, 3.0)),
-        "frac_offset_ratio": ("~", 100.0, None),
-    }
-    assert by_key["frac_offset.0.none"] / by_key["frac_offset.0.all"] == pytest.approx(100)
+    # section 2.1; 3.2.2 and 4.3 of the text
+    by_key = {one.key: one for one in PUBLISHED}
+    limits = [by_key[f"etc.{band.removeprefix('miri.')}"].value for band in BANDS]
+    assert limits == [25.5, 24.8, 24.3, 23.8, 22.9, 22.8]
+    assert [by_key[f"scatter.{name}"].value for name in ("crowded", "isolated")] == [0.23, 0.17]
+    shares = [by_key[f"outliers.{name}"].value for name in ("none", "all", "blue", "red")]
+    assert shares == [0.1, 0.015, 0.037, 0.059]
+    assert by_key["frac_offset.0.none"].value / by_key["frac_offset.0.all"].value == pytest.approx(
+        100
+    )
+    assert all(one.source for one in PUBLISHED)
 
 
 def test_a_study_beside_the_paper(study):
@@ -229,7 +247,15 @@ def test_a_study_beside_the_paper(study):
     assert scaling["sigma"] == pytest.approx(-0.08 / np.hypot(0.01, 0.01))
     assert scaling["verdict"] == "differs by -5.7 sigma: no mismatch"
     assert row["frac_scatter.0.4.all"]["verdict"] == "not measured"
-    assert row["power_offset"]["verdict"].startswith("agrees (")
+    assert row["power_offset.0.6"]["verdict"].startswith("agrees (")
+    # limits are 0.5 mag shallower than the proposal's: a bound of 1 mag on both sides, and 0.95 mag
+    assert row["limit.f770w"]["verdict"] == "within the bound"
+    assert row["limit.f2100w"]["verdict"].startswith("differs by +0.45: ")
+    assert row["etc.f770w"]["verdict"] == "agrees (to 0.1)"
+    deep = {name: limit + 1.6 for name, limit in study.limits.items()}
+    table = compare_with_paper(dataclasses.replace(study, limits=deep), seed=1, n_draws=10)
+    deep = {r["key"]: r["verdict"] for r in table}
+    assert deep["limit.f770w"].startswith("differs by +0.1: ")
     right, one = row["class.0"], study.at(0.0)
     assert right["of_all"] == pytest.approx(right["ours"] * right["completeness"])
     assert right["completeness"] == pytest.approx(one.sample.sum() / one.field.sum())

@@ -183,3 +183,68 @@ def test_posteriors_are_those_of_every_model(grid, objects, case):
     assert np.sqrt(np.mean(np.square(far))) < 0.04
     assert np.abs(wide).max() < 0.15
     assert np.abs(without).max() > 0.15
+
+
+@pytest.mark.parametrize("part", [0.0, PART])
+def test_errors_of_agn_light_count_by_its_share(part):
+    """Weights of bands follow from each model, with bands that may be wrong too: summed over every model."""
+    agn_error, fractions, tau = 0.5, np.array([0.0, 0.3, 0.6, 0.9]), AXES["tau"]
+    place = np.linspace(-1, 1, len(BANDS))
+    galaxy, sfr = flux(AXES["redshift"][:, None], tau, np.full(3, 0.4))
+
+    def torus(z):
+        log = place * (1 + np.log1p(z)) - 2 * np.log(z)
+        return 2e-36 * np.exp(log)
+
+    grid = ModelGrid(
+        filters=BANDS,
+        redshift=AXES["redshift"],
+        galaxy=galaxy,
+        agn=torus(AXES["redshift"][:, None, None]),
+        agn_multiplicity=np.ones(1, int),
+        agn_parameters=QTable({"tau97": [5.0]}),
+        agn_properties=QTable({"luminosity": [1.0]}),
+        dust_luminosity=np.full(3, 1e27),
+        frac_agn=fractions,
+        allowed=np.ones((4, 3), bool),
+        galaxy_parameters=QTable({"tau": tau * u.Gyr}),
+        galaxy_properties=QTable({"sfr": sfr / u.yr}),
+        axes={"redshift": AXES["redshift"], "tau": tau, "frac_agn": fractions},
+    )
+    rng, z = np.random.default_rng(3), np.array([0.7, 1.0, 1.3])
+    true_f = np.array([0.1, 0.5, 0.8])
+    light = flux(z, np.array([1.5, 2.0, 2.5]), 0.4)[0]
+    shape = np.exp(0.15 * rng.normal(size=(3, 8)))
+    observed = light + (true_f / (1 - true_f) * 1e27)[:, None] * torus(z[:, None]) * shape
+    observed, sigma = 1e10 * observed, 0.1 * 1e10 * light
+    settings = GridSettings(interpolate=800, rtol=0.0, agn_error=agn_error)
+    options = {"outliers": part} if part else {}
+    fitter = BayesFitter(grid, model_error=0.0, settings=settings, **options)
+    results = fitter.fit(photometry_table(BANDS, observed, sigma), redshift=z)
+    (t, _), (f, cell) = fine(tau), fine(fractions)
+    t, f = (x.ravel() for x in np.meshgrid(t, f, indexing="ij"))
+    width = np.diff([0.0, 0.15, 0.45, 0.75, 0.9])
+    assert np.array_equal(np.bincount(cell), [FINE] * len(width))
+    for i in range(3):
+        one = flux(np.full(t.size, z[i]), t, np.full(t.size, 0.4))[0]
+        own = (f / (1 - f) * 1e27)[:, None] * torus(z[i])
+        model, share = one + own, own / (one + own)
+        error = np.hypot(sigma[i], agn_error * share * observed[i])
+        wide = np.pad(observed[i], 1)
+        wide = np.maximum(wide[1:-1], np.maximum(wide[:-2], wide[2:]))
+        wide = np.hypot(10 * sigma[i], wide)
+        scale = np.sum(model * observed[i] / error**2, 1) / np.sum(model**2 / error**2, 1)
+        every = []
+        steps = np.exp(np.arange(-1.0, 1.0, 0.01))
+        for step in steps:
+            apart = observed[i] - (step * scale)[:, None] * model
+            log = (1 - part) * np.exp(-0.5 * (apart / error) ** 2) / error
+            log = log + part * np.exp(-0.5 * (apart / wide) ** 2) / wide
+            every.append(np.log(np.maximum(log, 1e-300)).sum(1))
+        p = np.exp(np.max(every, axis=0) - np.max(every))
+        p /= p.sum()
+        for name, x in (("tau", t), ("frac_agn", f)):
+            mean = p @ x
+            std = np.sqrt(p @ x**2 - mean**2)
+            assert results.mean(name).value[i] == pytest.approx(mean, abs=0.1 * std)
+            assert results.std(name).value[i] == pytest.approx(std, rel=0.1)

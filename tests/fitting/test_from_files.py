@@ -293,14 +293,16 @@ def test_a_catalog_is_calibrated_by_its_known_redshifts(tmp_path, capsys, monkey
         table[f"{name}_err"] = 0.03 * point * fluxes[name]
     table["zphot"][-3:] = np.nan
     table.write(tmp_path / "cat.fits")
-    argv = fit(tmp_path / "cat.fits", "--calibrate", "zphot", "--z-spec", "zphot")
+    argv = fit(tmp_path / "cat.fits", "--calibrate", "zphot", "--z-spec", "zphot", "--red-dots")
     assert main(argv) == 0
     found = SurveyCalibration.read(tmp_path / "out" / "calibration.ecsv")
     points = dict(zip(found.bands["band"], found.bands["zero_point"], strict=True))
     assert points["acs.f814w"] == pytest.approx(1 / 0.85, abs=0.03)
     results = open_results(tmp_path / "out")
     first = next(iter(results.parts()))
-    assert_allclose(first.flux[:, 1], points["acs.f814w"] * table["acs.f814w"].value, rtol=1e-6)
+    # the other class has the same zero points
+    for some in (first, next(iter(open_results(tmp_path / "out" / "red_dot").parts()))):
+        assert_allclose(some.flux[:, 1], points["acs.f814w"] * table["acs.f814w"].value, rtol=1e-6)
     page = (tmp_path / "out" / "page.html").read_text()
     for text in ("cat.fits by zphot", "zero point", "in their 16-84 % interval"):
         assert text in page
@@ -310,3 +312,8 @@ def test_a_catalog_is_calibrated_by_its_known_redshifts(tmp_path, capsys, monkey
     assert main(fit(tmp_path / "cat.fits", *kept, out="again")) == 0
     again = next(iter(open_results(tmp_path / "again").parts()))
     assert_allclose(again.pdf["redshift"], first.pdf["redshift"])
+    # an error of the light of AGN widens what AGN are found
+    assert main(fit(tmp_path / "cat.fits", *kept, "--agn-error", "0.5", out="agn")) == 0
+    wide = next(iter(open_results(tmp_path / "agn").parts()))
+    assert wide.meta["fit"]["agn_error"] == 0.5
+    assert np.nanmax(np.abs(wide.pdf["frac_agn"] - again.pdf["frac_agn"])) > 0.05

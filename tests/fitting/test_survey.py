@@ -121,6 +121,10 @@ def test_calibration_finds_what_was_done_to_a_catalog(survey, tmp_path):
     (tmp_path / "other.ecsv").write_text("no table", encoding="utf-8")
     text = "other.ecsv.*a calibration of a survey"
     refuses(text, SurveyCalibration.read, tmp_path / "other.ecsv", error=DataError)
+    damaged = (tmp_path / "test.ecsv").read_text().replace("template_error", "templates")
+    (tmp_path / "other.ecsv").write_text(damaged, encoding="utf-8")
+    text = "other.ecsv is no calibration.*or a damaged one"
+    refuses(text, SurveyCalibration.read, tmp_path / "other.ecsv", error=DataError)
     mock = mock_analysis(
         fitter.changed(calibration=found, model_error=None), fits[0], table[:5], seed=1
     )

@@ -11,6 +11,7 @@ from miricigale.psf import MatchingKernel
 from miricigale.sed import SEDModel
 from miricigale.workflow import Context
 from miricigale.workflow.config import StudyConfig
+from miricigale.workflow.page.labels import end_bands
 from miricigale.workflow.stages import study_stages
 from miricigale.workflow.stages.exposures import study_exposures
 from miricigale.workflow.stages.inputs import existing_bands
@@ -116,6 +117,7 @@ def make_run(folder, filters, *, mass=3e10, points=False, report=True, text_ids=
     parameters["mass"] = np.geomspace(mass, 10 * mass, count) * u.Msun
     made.save_image("f160w.fits", noise_image(9, rim=0)[0])
     catalog = QTable({"id": parameters["id"], "sky": sky, "star": np.zeros(count, bool)})
+    catalog["redshift"] = parameters["redshift"]
     light = SEDModel.yang2021(agn=False).fluxes(parameters, ["wfc3.f160w"])
     catalog["wfc3.f160w"] = light["wfc3.f160w"]
     made.save_table("catalog.ecsv", catalog)
@@ -125,7 +127,10 @@ def make_run(folder, filters, *, mass=3e10, points=False, report=True, text_ids=
         bright["flux"] = bright["flux_true"] * np.array([0.98, 0.99, 1.0, 1.01, 5.0])
         bright["in_field"] = np.ones(5, bool)
         bright.meta.update(f_scaling=0.9987, f_scaling_err=0.001, f_aper=1.14)
+        bright["sky"] = sky[:5]
         made.save_table(f"points/{name}.ecsv", bright)
+        if name in end_bands(filters):
+            made.save_image(f"points/{name}_mosaic.fits", noise_image(5)[0])
     for one in study_truths(config).values():
         _save_truth(made, one, parameters, sky, rng)
     do_stage(config, folder, "errors")

@@ -78,6 +78,18 @@ def test_exposure_of_a_given_time_keeps_the_wells_open():
     assert (slow.n_groups, slow.n_integrations) == (21, 1)
 
 
+def test_long_exposures_are_ramps_as_observers_take_them():
+    two_hours = Exposure("F770W", time=2 * u.h)
+    nearest = min(abs(g * n - 2595) for g in range(2, 101) for n in (26, 27, 28))
+    assert (two_hours.n_groups, two_hours.n_integrations) == (96, 27)
+    assert abs(two_hours.exposure_time.value / 2.775 - 2595) == pytest.approx(nearest)
+    # a reset between two integrations
+    assert two_hours.duration.value == pytest.approx(2.775 * (27 * 96 + 26))
+    long = Exposure.from_time("F770W", 555 * u.s, max_groups=200)
+    assert (long.n_groups, long.n_integrations) == (200, 1)
+    refuses("'max_groups'", Exposure.from_time, "F770W", 1 * u.h, max_groups=1)
+
+
 def test_dithers_move_a_source_the_other_way():
     base = exposure()
     offsets = dither_offsets("ceers", 6).value
@@ -178,7 +190,8 @@ def test_time_in_place_of_groups():
     assert split.exposure_time.to_value(u.min) == pytest.approx(30, abs=0.3)
     # 111 frames of 2.775 s
     assert made.replace(time=308 * u.s).exposure_time.to_value(u.s) == pytest.approx(308, abs=3)
-    small = Exposure.from_time("F770W", 1 * u.min, readout="fastr1", subarray="sub64")
+    small = {"readout": "fastr1", "subarray": "sub64", "max_groups": 1000}
+    small = Exposure.from_time("F770W", 1 * u.min, **small)
     assert small.exposure_time.to_value(u.s) == pytest.approx(60, abs=0.1)
 
 

@@ -18,6 +18,8 @@ notices = {few = "{n} sources"}
 
 [bands]
 title = "{n} bands"
+closed = "made for {survey}"
+folded.plain = "All of {survey}"
 text = '''
 In
 two lines.'''
@@ -145,6 +147,14 @@ def test_sections_are_filled_as_they_are_declared():
         assert text in page
     assert "<figcaption>of &lt;CEERS&gt;</figcaption>" in page
     assert "<p>No band.</p>" in page
+    # what is folded stands behind its line, empty or not; the section is closed, others are open
+    assert (
+        len(re.findall("<summary>All of &lt;CEERS&gt;</summary>\n\\s*(?:<div|<p>No band)", page))
+        == 2
+    )
+    assert (
+        "<details><summary><h2>2 bands</h2> <span>made for &lt;CEERS&gt;</span></summary>" in page
+    )
 
 
 def test_tables_without_rows_are_sentences():

@@ -267,6 +267,11 @@ def test_background_and_shift_are_found(tools, field):
     assert_allclose(result.shift.to_value(u.arcsec), [-0.06, -0.03], atol=2e-4)
     assert_allclose(result.background.to_value("MJy/sr"), 0.7, atol=1e-4)
     assert_allclose(result.flux.value, field.flux, rtol=2e-3, atol=2e-3)
+    # half a pixel is noticed without that
+    with pytest.warns(MiricigaleWarning, match="arcsec .x, y. from its templates: 'max_shift'"):
+        plain = tools.measured(image, field.catalog, background_order=0)
+    assert_allclose(plain.meta["offset"], [-0.06, -0.03], rtol=0.3)
+    assert np.all(np.array(plain.meta["offset_err"]) < 0.01)
     settings["max_shift"] = 0.02 * u.arcsec
     with pytest.warns(MiricigaleWarning, match="beyond 'max_shift'"):
         assert tools.measured(image, field.catalog, **settings).shift is None
@@ -283,6 +288,22 @@ def test_masked_pixels_do_not_count(tools, field):
     assert flagged(result.flags, ForcedFlags.MASKED).mean() > 0.9
     assert np.isnan(result.residual_image.data[mask]).all()
     assert_allclose(result.coverage, 0.8, atol=0.15)
+
+
+def test_the_rim_of_a_turned_footprint_is_an_edge(tools):
+    """A mosaic that is turned against its pixels ends inside the array; a bad pixel is no edge."""
+    shape = (120, 120)
+    sky = tools.places([0.0, 3.0, -2.5], [0.0, 3.0, 1.0])
+    image = tools.picture(sky, np.full(3, 50.0), shape)
+    y, x = np.indices(shape)
+    x0, y0 = image.wcs.world_to_pixel(sky)
+    # through the second source, across the line from the first
+    turned = (x - x0[1]) * (x0[1] - x0[0]) + (y - y0[1]) * (y0[1] - y0[0]) > 0
+    bad = np.hypot(x - x0[2], y - y0[2]) < 2
+    image.data[turned | bad] = np.nan
+    result = tools.measured(image, sky)
+    assert flagged(result.flags, ForcedFlags.EDGE).tolist() == [False, True, False]
+    assert flagged(result.flags, ForcedFlags.MASKED).tolist() == [False, True, True]
 
 
 def test_edges_and_absent_data(tools):
@@ -381,11 +402,13 @@ def test_bad_inputs_are_refused(tools, field):
     photometer = ForcedPhotometer(tools.kernel)
     image, catalog = field.image, field.catalog
     wrong = CCDData(image.data, unit="adu", wcs=field.wcs)
+    below = tools.as_ccd(image.data, field.wcs, -0.01)
     for given, message, error in (
         ((image.data, None, None, catalog), "'image' must be a CCDData", ValueError),
         ((image, None, None, {"ra": [1]}), "'catalog' must be a table with posi", ValueError),
         ((image, image, None, catalog), "'highres' must be on the kernel's pixels", ValueError),
         ((wrong, None, None, catalog), "'image' must be convertible to MJy / sr", u.UnitsError),
+        ((below, None, None, catalog), "'image' must be an image with uncertainties", ValueError),
     ):
         refuses(message, photometer.measure, *given, error=error)
 

@@ -28,7 +28,7 @@ def test_the_text_gives_the_configuration_back(tmp_path):
         ({"exposures": {"dithers": [3, 3]}}, r"dithers must have one number"),
         ({"exposures": {"sets": ["f560w"]}}, r"sets must be 'all' or bands of"),
         ({"exposures": {"colour": 1}}, r"\[exposures\] does not know \['colour'\]"),
-        ({"agn": {"shares": [1.0]}}, r"shares must have one number per fracAGN \(6\)"),
+        ({"agn": {"shares": [1.0]}}, r"shares must have one number per fracAGN \(0\)"),
         ({"agn": {"frac_agn": 0.2, "shares": 0.0}}, r"shares must not all be 0"),
         ({"sample": {"redshift": [2.0, 1.0]}}, r"redshift must be two numbers in order"),
         ({"background": {"date": "2027-03-01"}}, r"date must come with a position"),
@@ -66,7 +66,11 @@ def test_a_file_that_is_not_there_is_named():
 def test_bands_alone_have_the_exposures_of_ceers():
     """Yang et al. 2021: 1665 s in three dithers, 4662 s in six at 21 um."""
     config = load_plan(overrides={"exposures": {"bands": ["miri.f1500w", "miri.f2100w"]}})
-    assert config.exposures.time == (1665.0, 4662.0)
-    assert config.exposures.dithers == (3, 6)
-    other = {"bands": ["miri.f560w"], "time": 600}
-    assert load_plan(overrides={"exposures": other}).exposures.time == (600,)
+    assert config.exposures.by_band("time") == (1665.0, 4662.0)
+    assert config.exposures.by_band("dithers") == (3, 6)
+    # numbers that are given stay, even where they are those of CEERS
+    six = [1665.0, 1665.0, 1665.0, 1665.0, 1665.0, 4662.0]
+    bands = [f"miri.f{n}w" for n in (560, 770, 1000, 2100, 1500, 1800)]
+    given = {"bands": bands, "time": six, "dithers": 4}
+    kept = load_plan(overrides={"exposures": given}).exposures
+    assert (kept.by_band("time"), kept.by_band("dithers")) == (tuple(six), (4,) * 6)

@@ -25,6 +25,7 @@ from miricigale.workflow.study import check_study
 BANDS = ["miri.f770w", "miri.f1500w"]
 SETTINGS = {
     "sample": {"n_sources": 60},
+    "agn": {"frac_agn": [0.0, 0.2, 0.4, 0.6, 0.8, 0.99], "shares": [5, 1, 1, 1, 1, 1]},
     "catalog": {"mag_limit": 24.0},
     "exposures": {"bands": BANDS, "time": [900.0, 1500.0], "dithers": [2, 3], "sets": ["all"]},
     "sed": {"axes": "quick"},
@@ -104,7 +105,8 @@ def test_images_have_the_background_of_the_plan(tmp_path):
         values = {"images": {"enabled": True}, "exposures": exposures, "background": background}
         config = load_plan(overrides=values)
         plans, sources = band_plans(config), QTable({"frac_agn": [0.0]})
-        planner = SimpleNamespace(config=config, band_plans=lambda p=plans: p, sources=sources)
+        planner = SimpleNamespace(config=config, sources=sources, min_detected=1)
+        planner.band_plans = lambda p=plans: p
         study = images_study(planner, tmp_path / "images.ecsv")
         for name, plan in plans.items():
             assert study_background(study, name) == plan.background

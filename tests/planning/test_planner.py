@@ -10,6 +10,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.commands import command
 from helpers.errors import refuses
+from miricigale.depth import saturation_flux
+from miricigale.instrument import psf_fwhm
+from miricigale.photometry import ErrorModel
 from miricigale.planning import Planner, area_table, comparison_table, load_plan
 from miricigale.planning.accuracy import accuracy
 from miricigale.planning.planner import EXISTING
@@ -20,6 +23,8 @@ BANDS = ["miri.f770w", "miri.f1500w"]
 EXPOSURES = {"bands": BANDS, "time": 1665.0, "dithers": 3, "sets": ["all", "f770w"]}
 SETTINGS = {"sample": {"n_sources": 60}, "exposures": EXPOSURES, "fit": {"axes": "quick"}}
 SETTINGS["survey"] = {"areas": [1, 4]}
+FIELD = dict(SETTINGS)
+SETTINGS["agn"] = {"frac_agn": [0.0, 0.2, 0.4, 0.6, 0.8, 0.99], "shares": [5, 1, 1, 1, 1, 1]}
 
 
 @pytest.fixture(scope="module")
@@ -59,6 +64,37 @@ def test_noise_is_that_of_the_errors(planner):
     assert_allclose(own[round_], point[round_])
 
 
+def test_sources_that_saturate_have_the_groups_before_or_no_flux(planner):
+    band = planner.band_plans()["miri.f770w"]
+    exposure = band.exposure
+    assert exposure.n_groups == 100
+    # points that fill the well in these groups, by the saturation of an exposure of so many
+    full = [2, 3, 17, 100, 120]
+    fluxes = [saturation_flux(exposure.replace(n_groups=g)).value for g in full] * u.uJy * 1.0001
+    assert band.good_groups(fluxes).tolist() == [1, 2, 16, 99, 100]
+    # as wide as the PSF a source of Gaussians has half the peak
+    fwhm = psf_fwhm(band.filter)
+    assert band.good_groups(2 * fluxes, fwhm).tolist() == [1, 2, 16, 99, 100]
+    sources = planner.sources.copy()
+    sources["miri.f770w"][:5], sources["size"][:5] = fluxes, 0 * u.arcsec
+    other = Planner(planner.config, sources=sources)
+    plan = other.evaluate(["miri.f770w"])
+    table = other.photometry([band])
+    assert plan.sources["miri.f770w_saturated"][:5].tolist() == [True] * 4 + [False]
+    assert plan.sources["miri.f770w_missing"].tolist() == [True] + [False] * 59
+    assert plan.band_table()["n_saturated", "n_missing"][0].as_void().tolist() == (4, 1)
+    assert np.isnan([table[name][0].value for name in ("miri.f770w", "miri.f770w_err")]).all()
+    # 2, 16 and 64 groups of 100 are exposures of so much less time, in as many ramps
+    for row, n_groups in ((1, 2), (2, 16), (3, 64), (4, 100)):
+        time = band.n_dithers * exposure.replace(n_groups=n_groups).exposure_time
+        given = {"n_integrations": 6, "fractional": 0.03, "excess": 1.4}
+        errors = ErrorModel.from_exposure("F770W", time, **given)
+        assert_allclose(table["miri.f770w_err"][row], errors.sigma(fluxes[row], "F770W"), rtol=1e-6)
+    # a source without its flux in MIRI is fitted with the existing bands
+    alone = other.evaluate(())
+    assert plan.sources["redshift_mean"][0] == pytest.approx(alone.sources["redshift_mean"][0])
+
+
 def test_draws_belong_to_source_and_band_and_no_thread_changes_them(planner, plans):
     with threads(2) as executor:
         other = Planner(planner.config, executor=executor)
@@ -78,6 +114,26 @@ def test_more_bands_make_better_fits(planner, plans):
     for name in ("z_width", "frac_width", "frac_scatter"):
         assert numbers["all"][name].value < numbers[EXISTING][name].value
     assert numbers["all"]["completeness"].value > 0.5
+
+
+def test_more_bands_never_lose_a_source_by_the_selection(planner, plans):
+    both, one = (planner.common([plan]) for plan in plans[1:])
+    assert np.all(both[one])
+    # a band is enough, and twice as many sets do not change that
+    measured = planner.photometry(planner.band_plans().values())
+    assert_array_equal(
+        both, np.any([measured[b] > 5 * measured[f"{b}_err"] for b in BANDS], axis=0)
+    )
+
+
+def test_counts_have_the_errors_of_the_sample(planner, plans):
+    """Binomial: the root of n p (1 - p), in the area."""
+    table, scale = comparison_table(planner, plans), planner.density * 74 * 113 / 3600
+    row = table[table["plan"] == "all"][0]
+    p = planner.common(plans[1:2]).mean()
+    assert row["n_detected"] == pytest.approx(scale * p)
+    assert row["n_detected_err"] == pytest.approx(scale * np.sqrt(p * (1 - p) / 60), rel=0.05)
+    assert row["n_agn_true"] == pytest.approx(scale * 24 / 60)
 
 
 def test_the_tables_rank_by_the_hour(planner, plans):
@@ -146,9 +202,34 @@ def test_a_luminosity_function_gives_the_sample(tmp_path):
 
 
 def test_a_field_has_few_agn_and_cuts_that_leave_nothing_are_named():
-    config = load_plan(overrides=SETTINGS | {"agn": {"field": True}, "sample": {"n_sources": 300}})
-    fractions = np.asarray(Planner(config).sources["frac_agn"])
-    assert 0 < np.mean(fractions > 0.1) < 0.15
+    fields = Planner(load_plan(overrides=FIELD | {"sample": {"n_sources": 6000}}))
+    first = fields.sources[fields.sources["sky"] == 0]
+    assert len(np.unique(fields.sources["id"])) == len(fields.sources) > len(first) == 6000
+    # by default: 4 to 8 a pointing are more than a tenth of the infrared light
+    pointing = fields.density * 74 * 113 / 3600
+    assert 4 < pointing * np.mean(first["frac_agn"] > 0.1) < 8
+    # galaxies of several skies: the same ones
+    assert np.sum(first["template"] == first["template"][0]) == 5
+    # AGN of further skies: above the limit only, as many in each as in the first
+    others, n_skies = fields.sources[6000:], fields.sources.meta["n_skies"]
+    assert np.all(others["frac_agn"] >= 0.4)
+    assert len(others) / (n_skies - 1) == pytest.approx(np.sum(first["frac_agn"] >= 0.4), rel=0.5)
+
+
+def test_agn_of_other_skies_count_by_their_share():
+    """Two skies, three AGN in each, four of six found; one galaxy of three is selected, too."""
+    fractions = [0.0, 0.0, 0.0, *[0.9] * 6]
+    table = QTable({"frac_agn": fractions, "sky": [0] * 6 + [1] * 3}, meta={"n_skies": 2})
+    table["redshift"], table["redshift_std"], table["frac_agn_std"] = 1.0, 0.1, 0.1
+    table["redshift_mean"], table["frac_agn_mean"] = [1.0] * 6 + [9.0] * 3, fractions
+    table["selected"] = [True, False, False, True, True, False, True, True, False]
+    numbers = accuracy(table, seed=1)
+    assert numbers["completeness"].value == pytest.approx(4 / 6)
+    assert numbers["purity"].value == pytest.approx(2 / (2 + 1))
+    # redshifts are those of the sample
+    assert numbers["z_outliers"].value == 0
+    # binomial, of six
+    assert numbers["completeness"].error == pytest.approx(np.sqrt(4 / 6 * 2 / 6 / 6), rel=0.1)
     none = load_plan(overrides={"sample": {"redshift": [11.0, 12.0]}})
     with pytest.raises(ConfigError, match=r"\[sample\] redshift leaves none of the"):
         _ = Planner(none).sources
@@ -161,6 +242,9 @@ def test_the_command_writes_a_page(tmp_path, capsys):
     told = command(capsys, "plan", "--config", path, "--sources", "30", "-o", folder)
     assert "existing bands" in told.out
     page = (folder / "plan.html").read_text()
+    # it opens with the answer, as the command ends
+    answer = re.search(r"A plan of F.*\(1665 s, 3 dithers\) reaches 5 sigma at .*", told.out)[0]
+    assert page.index(answer) < page.index("<li>")
     assert len(re.findall("<img ", page)) == 4
     assert "nan" not in re.sub(r"base64,[^']*", "", page)
     table = QTable.read(folder / "comparison.ecsv")

@@ -138,7 +138,7 @@ def test_masked_pixels_do_not_count(noise):
 @pytest.mark.parametrize(
     ("options", "match"),
     [
-        ({"method": "median"}, "'method' must be 'masked' or 'sep', got 'median'"),
+        ({"method": "median"}, "'method' must be 'masked' or 'sep' or 'none', got 'median'"),
         ({"box": 2}, "'box' must be at least 4"),
         ({"box": 7.5}, "'box' must be at least 4, an integer"),
         ({"negative_noise": "mine"}, "'negative_noise' must be 'larger' or 'background'"),

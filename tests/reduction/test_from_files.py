@@ -12,7 +12,14 @@ from helpers.exposures import exposure_of, sky_of
 from miricigale.cli import main
 from miricigale.detector import Detector
 from miricigale.instrument import background_level
-from miricigale.reduction import BackgroundSettings, Reducer, read_images, reduce_files, write_image
+from miricigale.reduction import (
+    BackgroundSettings,
+    Reducer,
+    ReferenceFiles,
+    read_images,
+    reduce_files,
+    write_image,
+)
 from miricigale.utils.exceptions import MiricigaleWarning
 
 
@@ -40,6 +47,11 @@ def files(tmp_path_factory):
     return [*paths, broken]
 
 
+def level_of(file):
+    """What was exposed, of a mosaic."""
+    return file.image.data + file.planes["BKG"]
+
+
 def test_all_stages_and_filters_in_one_go(files, tmp_path, capsys):
     out = tmp_path / "out"
     arguments = ["reduce", *map(str, files), "-o", str(out), "--no-progress"]
@@ -61,7 +73,16 @@ def test_all_stages_and_filters_in_one_go(files, tmp_path, capsys):
     assert_allclose(file.image.data, result.mosaic.data, rtol=1e-5, atol=1e-5)
     assert_array_equal(file.planes["CON"][0], result.n_images)
     assert_allclose(file.planes["WHT"], result.weight, rtol=1e-6)
-    assert_allclose(file.planes["BKG"], result.mosaic_background.level, rtol=1e-5)
+    assert_allclose(file.planes["BKG"], result.subtracted, rtol=1e-5)
+    # with what was subtracted it is the mosaic of what was exposed, however much that is
+    left = tmp_path / "left"
+    assert main([*arguments[:-2], str(left), "--background", "none", "--no-progress"]) == 1
+    (whole,) = read_images(left / "mosaic_f770w.fits")
+    both = ~file.image.mask & ~whole.image.mask
+    assert both.mean() > 0.5
+    apart = level_of(whole)[both] / level_of(file)[both] - 1
+    assert np.percentile(np.abs(apart), 99) < 1e-4
+    assert np.abs(whole.planes["BKG"][both]).max() < 0.1 * np.abs(file.planes["BKG"][both]).max()
     (cal,) = read_images(out / "f770w_0_cal.fits")
     level = background_level("miri.f770w").value
     assert np.median(cal.planes["BKG"]) == pytest.approx(level, rel=0.1)
@@ -117,6 +138,13 @@ def test_without_references_there_are_slopes_alone(files, tmp_path):
     assert file.image.unit == u.adu / u.s
     table = reduce_files(files[:1], tmp_path, reducer=Reducer(references="none"))
     assert list(table["status"]) == ["kept"]
+    # slopes are there too where a reference of the brightness is missing
+    some = ReferenceFiles(gain=4.0, read_noise=6.0, incomplete=True)
+    with pytest.warns(MiricigaleWarning, match="without references for"):
+        table = reduce_files(files[:1], tmp_path / "some", reducer=Reducer(references=some))
+    assert table["status"][0] == "failed"
+    assert "'photom'" in table["reason"][0]
+    assert read_images(tmp_path / "some" / "f770w_0_rate.fits")[0].image.unit == u.adu / u.s
 
 
 def test_slopes_of_each_integration_on_demand(tmp_path):

@@ -14,6 +14,7 @@ from miricigale.detector import (
     BadPixels,
     CosmicRays,
     Detector,
+    Ramp,
 )
 from miricigale.instrument import (
     DQ,
@@ -96,6 +97,14 @@ def test_flags_tell_why(tmp_path):
         assert_array_equal(image.mask, (why & DQ.DO_NOT_USE) != 0)
         assert np.all(why[image.mask] != DQ.DO_NOT_USE)
     assert np.all(cal.mask[~field_mask()])
+    # a pixel that was not read has counts of 0, and no slope
+    counts = ramp.data.copy()
+    counts[:, :, 300, 400] = 0
+    told = {name: getattr(ramp, name) for name in ("pixel_dq", "effects", "properties")}
+    unread = reducer.fit_ramp(Ramp(counts, exp, **told))
+    assert np.isnan(unread.data[300, 400])
+    assert unread.flags[300, 400] & DQ.DEAD
+    assert np.count_nonzero(unread.mask != rate.mask) == 1
     assert rate.unit == "adu / s"
     assert cal.unit == "MJy / sr"
     assert rate.wcs is not None

@@ -198,6 +198,33 @@ def test_what_a_file_had_done_to_it_is_not_done_twice(exposure, real, references
     assert set(steps) <= set(rest.meta["steps"])
 
 
+def test_what_was_done_to_a_simulated_ramp_is_not_done_twice(exposure):
+    """Linear, without dark, with a flagged jump, as a pipeline leaves a ramp of the package's detector."""
+    own = miri_detector()
+    detector = Detector.miri_imager().without(CosmicRays, InterpixelCapacitance)
+    ramp = detector.expose(sky_of(exposure, np.full(exposure.shape, 200.0)), exposure, seed=4)
+    linear = own.linearize(ramp.data - own.bias)
+    step = exposure.group_time.value * own.dark_current / own.gain
+    linear -= step * np.arange(1, 31)[:, None, None]
+    steps = ["dq_init", "saturation", "linearity", "dark", "refpix", "jump"]
+    group_dq, hit = np.zeros(ramp.shape, np.uint8), (slice(None), slice(12, None), 100, 110)
+    linear[hit] += 300.0
+    group_dq[:, 12, 100, 110] = DQ.JUMP_DET
+    told = {name: getattr(ramp, name) for name in ("pixel_dq", "effects", "properties")}
+    done = Ramp(linear.astype(np.float32), exposure, **told, group_dq=group_dq, steps=steps)
+    settings = {"ramps": RampSettings(reference_correction=False), "jump_threshold": None}
+    whole, rest = (Reducer(**settings).fit_ramp(one) for one in (ramp, done))
+    both = ~whole.mask & ~rest.mask
+    both[100, 110] = False
+    assert both.mean() > 0.9
+    dark = own.dark_current / own.gain
+    assert_allclose(rest.data[both] + dark, whole.data[both], rtol=2e-3, atol=0.02)
+    error = np.hypot(*(one.uncertainty.array[100, 110] for one in (whole, rest)))
+    assert abs(rest.data[100, 110] + dark - whole.data[100, 110]) < 4 * error
+    calibrated = [Reducer(**settings).calibrate(one).data[both] for one in (whole, rest)]
+    assert np.nanmedian(calibrated[1] / calibrated[0]) == pytest.approx(1, abs=2e-4)
+
+
 def test_files_for_something_else_are_refused(exposure, real, references, data_file, tmp_path):
     def refused(name, kind, array, match, **keywords):
         path = write_reference(tmp_path / f"{kind}.fits", kind, exposure, array, **keywords)

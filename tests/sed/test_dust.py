@@ -421,6 +421,19 @@ def test_pah_features_stand_out():
     assert np.all(rich[[1, 3]] > 3 * poor[[1, 3]])
 
 
+def test_without_the_feature_at_3_um_the_continuum_is_a_power_law():
+    dust = DraineLi2007Alpha()
+    wave, full = dust.nodes(), dust.spectrum({"alpha": 2.0, "pah_33": 1.0})
+    none, half = (dust.spectrum({"alpha": 2.0, "pah_33": part}) for part in (0.0, 0.5))
+    inside = (wave >= 3.0) & (wave < 3.65)
+    assert_allclose(none[~inside], full[~inside])
+    assert_allclose(half, (full + none) / 2)
+    # sums of power laws are not one, but nearly so
+    slope = np.diff(np.log(none[inside])) / np.diff(np.log(wave[inside]))
+    assert np.ptp(slope) < 0.2
+    assert full[inside].max() > 10 * none[inside].max()
+
+
 def test_a_foreign_table_is_refused(tmp_path):
     path = tmp_path / "other.fits"
     fits.PrimaryHDU(np.zeros((2, 2))).writeto(path)

@@ -50,6 +50,7 @@ def not_read(match, path, reader=open_fits):
 @pytest.mark.parametrize("reader", [open_fits, read_ecsv])
 def test_missing_and_foreign_files_are_named(tmp_path, reader):
     not_read("none.x cannot be read as a kernel: no such file", tmp_path / "none.x", reader)
+    not_read("cannot be read as a kernel: it is a folder, wanted is a file", tmp_path, reader)
     for text in ("", "not a file of that kind"):
         (tmp_path / "text.x").write_text(text)
         not_read(r"text\.x cannot be read as a kernel: \w", tmp_path / "text.x", reader)

@@ -20,7 +20,7 @@ from miricigale.workflow.stages import experiments
 from miricigale.workflow.truths import EXPERIMENTS
 
 FILTERS = ["miri.f770w", "miri.f1500w", "miri.f2100w"]
-FAST = ("far_infrared", "no_model_error", "known_redshift", "free_agn")
+FAST = ("far_infrared", "no_model_error", "known_redshift", "free_agn", "between")
 #: Sources, one of which is not in the sample.
 N = 13
 
@@ -104,6 +104,12 @@ def test_a_freed_torus_has_posteriors_of_its_own(found):
         assert np.all((mean >= low) & (mean <= high))
         assert np.all(u.Quantity(table[f"{name}_std"]).value > 0)
         assert f"{name}_mean" not in found["study"].colnames
+
+
+def test_fits_between_the_nodes_are_of_all_values(found):
+    """E(B-V) of a coarse grid has its posteriors on few nodes; between them they are wider."""
+    spread = [np.asarray(found[name]["ebv_std"], float) for name in ("study", "between")]
+    assert np.median(spread[1]) > np.median(spread[0])
 
 
 def test_far_infrared_fluxes_are_of_the_truth_and_tell_the_dust(truth, found):

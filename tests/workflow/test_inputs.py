@@ -22,6 +22,7 @@ from miricigale.workflow.page.provenance import catalog_facts
 from miricigale.workflow.stages import study_stages
 from miricigale.workflow.stages.fits import mock_photometry
 from miricigale.workflow.stages.inputs import existing_bands
+from miricigale.workflow.stages.sample import SampleFlags, add_selection
 
 SHORT, LONG = ["nircam.f090w", "nircam.f150w", "nircam.f200w"], ["mips.24"]
 ALPHA = [1.5, 2.5]
@@ -194,3 +195,25 @@ def test_magnitudes_and_text_ids_give_the_inputs_of_the_fluxes(galaxies, tmp_pat
     wanted = 0.05 * np.log(10) / 2.5 * np.where(np.isnan(results.flux), np.nan, 1)
     assert_allclose(results.flux_err / results.flux, wanted)
     assert truth["id"].tolist() == ["a-1", "a-2"]
+
+
+def test_sources_without_redshift_and_outside_of_the_grid_are_told_apart(galaxies):
+    redshift, star = [1.0, np.nan, 0.0, 9.0, np.nan], [False] * 4 + [True]
+    matched = QTable({"matched": np.ones(5, bool), "b_true": np.ones(5) * u.uJy})
+    matched["b"], matched["b_err"] = matched["b_true"], 0.1 * matched["b_true"]
+    truth = QTable({"redshift": redshift, "star": star})
+    options = {"inside": np.ones(5, bool), "min_detected": 1, "redshifts": np.array([0.01, 6.0])}
+    add_selection(matched, truth, ["b"], **options)
+    none = SampleFlags.NO_REDSHIFT
+    assert matched["selection"].tolist() == [
+        0,
+        none,
+        none,
+        SampleFlags.OUTSIDE_GRID,
+        SampleFlags.STAR,
+    ]
+    table = galaxies.copy()
+    table["redshift"] = [1.0, -99.0]
+    facts = catalog_facts(StudyConfig(), check_catalog(table))
+    assert facts["galaxies without redshift"].startswith("1: without a model SED")
+    assert facts["dust colors"].startswith("drawn from CEERS' distribution, measured on")

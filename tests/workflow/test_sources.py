@@ -271,3 +271,9 @@ def test_the_page_opens_in_a_browser(run, tmp_path):
     # two posteriors and the spectra of two fits, each with its truth or its fluxes
     assert done.stdout.count('class="truth"') == 2
     assert done.stdout.count("<canvas") == 1 + 3 * len(BANDS)
+    assert re.search(r"dust luminosity \(10[⁰¹²³⁴⁵⁶⁷⁸⁹]+ L☉\)", done.stdout)
+    # a filter that leaves the source out is named
+    assert 'role="status"></span>' in done.stdout
+    command[-1] = command[-1].replace("0..9", ">9")
+    done = subprocess.run(command, env=dict(os.environ), **options)
+    assert f'role="status">Source {key}, shown below, is not in the list' in done.stdout

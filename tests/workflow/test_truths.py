@@ -17,20 +17,22 @@ from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.truths import band_sets, study_truths
 
 N, PRIOR = 60, "wfc3.f160w"
+ENDS = (("", 1.0), ("_err", 0.1))
 FRACTIONS = [0.0, 0.4, 0.99, "field"]
 
 
-def make_truths(folder, **sed):
-    """Truths of a catalog of massive galaxies, of which many have an AGN."""
+def make_truths(folder, bands=None, **sed):
+    """Truths of a catalog of massive galaxies, of which many have an AGN; ``bands`` are further fluxes."""
     rng = np.random.default_rng(5)
     parameters = QTable({"redshift": rng.uniform(0.5, 2.5, N), "age": np.full(N, 1.0)})
     parameters["mass"] = 10 ** rng.uniform(10.8, 11.5, N)
     parameters["tau"], parameters["ebv"], parameters["alpha"] = 1.0, 0.3, 2.0
-    bands = ["acs.f606w", "acs.f814w", "wfc3.f125w", PRIOR]
-    light = SEDModel.yang2021(agn=False).fluxes(parameters, bands)
+    names = ["acs.f606w", "acs.f814w", "wfc3.f125w", PRIOR]
+    light = SEDModel.yang2021(agn=False).fluxes(parameters, names)
+    more = {f"{n}{end}": part * f for n, f in (bands or {}).items() for end, part in ENDS}
     sky = SkyCoord(53.1 + 0.001 * np.arange(N), np.full(N, -27.8), unit="deg")
     columns = {"redshift": parameters["redshift"], "mag_f160w": 20.0}
-    table = catalog_at(sky, **columns, **{name: light[name] for name in bands})
+    table = catalog_at(sky, **columns, **{name: light[name] for name in names}, **more)
     table.write(folder / "mine.ecsv", overwrite=True)
     sed = {"frac_agn": FRACTIONS, "axes": "quick", **sed}
     config = StudyConfig.from_dict({"catalog": {"source": str(folder / "mine.ecsv")}, "sed": sed})
@@ -87,9 +89,9 @@ def test_agn_of_the_field_have_the_luminosities_that_were_drawn(truths):
         assert_allclose(truth[name][~has], truths["agn00"][name][~has], rtol=1e-3)
 
 
-def test_dust_of_the_main_sequence_leaves_the_stars(truths, tmp_path):
+def test_dust_of_the_main_sequence_leaves_the_stars(tmp_path):
     dusty = make_truths(tmp_path, infrared="main-sequence")["agn00"]
-    plain = truths["agn00"]
+    plain = make_truths(tmp_path, infrared="fit", frac_agn=0.0)["agn00"]
     assert np.all(dusty["dust_excess"] >= 1)
     assert np.any(dusty["dust_excess"] > 1.5)
     assert_allclose(dusty["acs.f606w"], plain["acs.f606w"], rtol=1e-6)
@@ -99,6 +101,19 @@ def test_dust_of_the_main_sequence_leaves_the_stars(truths, tmp_path):
     far = dusty["redshift"] < 1.0
     ratio = dusty["miri.f2100w"] / plain["miri.f2100w"]
     assert_allclose(ratio[far], dusty["dust_excess"][far], rtol=0.02)
+
+
+def test_dust_is_that_of_ceers_where_no_band_shows_it(truths, tmp_path):
+    dusty = truths["agn00"]
+    # massive galaxies: log10 of the excess is 0.07 +- 0.30
+    excess = np.log10(dusty["dust_excess"])
+    assert np.mean(excess) == pytest.approx(0.07, abs=4 * 0.30 / np.sqrt(N))
+    assert set(dusty["pah_33"]) == {0.1}
+    bands = {"miri.f1500w": np.where(np.arange(N) < 2, 9.0, np.nan) * u.uJy}
+    shown = make_truths(tmp_path, frac_agn=0.0, bands=bands)["agn00"]
+    assert shown["dust_excess"][:2].tolist() == shown["pah_33"][:2].tolist() == [1, 1]
+    # a source's draw does not depend on the others
+    assert_allclose(shown["dust_excess"][2:], dusty["dust_excess"][2:])
 
 
 def test_the_dusts_alpha_is_drawn_from_nodes(tmp_path):

@@ -123,7 +123,8 @@ class Photons(Effect):
     def expected(self, array, block):
         """Electrons per second of the brightness (MJy/sr)."""
         exposure = block.exposure
-        rate = array * electrons_per_brightness(exposure.filter, block.properties)
+        part = {"subarray": exposure.subarray}
+        rate = array * electrons_per_brightness(exposure.filter, block.properties, **part)
         if self.flat:
-            rate = rate * flat_field(exposure.filter, subarray=exposure.subarray)[block.rows]
+            rate = rate * flat_field(exposure.filter, **part)[block.rows]
         return rate

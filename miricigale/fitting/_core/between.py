@@ -25,7 +25,7 @@ _STEEP = 5.0
 Kind = namedtuple("Kind", "table model size scaled power")
 #: Scratch arrays: values, (n_axes,); of each axis weights of two more nodes and the part of the way to the next,
 #: (n_axes, 3), and where these are in the list of models, int64; nodes of a model and their weights, (n_nodes,);
-#: fluxes of galaxy and AGN, (2, n_columns); a place, (n_axes,).
+#: fluxes of the model and of its AGN, and weights, (3, n_columns); a place, (n_axes,).
 Work = namedtuple("Work", "value part step row weight flux new")
 
 
@@ -34,7 +34,7 @@ def make_work(n_axes, n_columns):
     n = 1 + n_axes * (n_axes + 3) // 2
     part, step, row = np.zeros((n_axes, 3)), np.zeros((n_axes, 3), np.int64), np.zeros(n, np.int64)
     value, new = np.zeros((2, n_axes))
-    return Work(value, part, step, row, np.zeros(n), np.zeros((2, n_columns)), new)
+    return Work(value, part, step, row, np.zeros(n), np.zeros((3, n_columns)), new)
 
 
 @njit(**PART)

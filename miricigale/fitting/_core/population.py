@@ -19,9 +19,9 @@ NEVER, _NONE = -1e300, -1e200
 #: none); of the nodes between which models are interpolated ln(1 + z), (nz,), which galaxies may be used, (nz,
 #: n_models), the `Kind` of galaxies, whose last column is the dust luminosity or, if ``lit``, its ln, and of AGN.
 Space = namedtuple("Space", "size edge log_prior cells log_z allowed galaxy agn lit")
-#: An object: `Target`, `Limits` or None, `Mixture` or None, 2 ln(prior) of galaxies, (nz, nG), and its redshift,
-#: 0 if that is free.
-Object = namedtuple("Object", "target limits mixture log_usable redshift")
+#: An object: `Target`, `Limits` or None, `Mixture` or None, 2 ln(prior) of galaxies, (nz, nG), its redshift, 0 if
+#: that is free, and error of AGN light as a part of it.
+Object = namedtuple("Object", "target limits mixture log_usable redshift agn_error")
 #: Bands that may be wrong, of the used ones: 1 / sigma^2 of the stated error, (nz, n_used), and of the broad
 #: one, (n_used,); odds of the latter without a residual, (nz, n_used); ln of the likelihood where none is wrong
 #: and there are no residuals, (nz,); scratch, (nb,).
@@ -53,15 +53,42 @@ def _best_scale(flux, weight, target, limits):
 
 
 @njit(**PART)
-def _likelihood(flux, z, target, limits, mixture):
+def _widened(weight, b, flux, agn, target, agn_error):
+    """Part that is left of the weight of a band with an error of the AGN's light."""
+    if agn_error == 0.0 or flux[len(flux) - 1] <= 0.0:
+        return 1.0
+    return 1.0 / (1.0 + weight * (agn_error * agn[b] / flux[b] * target.flux[b]) ** 2)
+
+
+@njit(**PART)
+def _widen(flux, agn, z, target, agn_error, weight):
+    """
+    Weights of the bands with an error of the AGN's light: of measured fluxes, by its share of a model.
+
+    Returned is what 2 ln(likelihood) of no light changes by.
+    """
+    more = 0.0
+    for b in target.bands:
+        w = target.weight[z, b]
+        part = _widened(w, b, flux, agn, target, agn_error)
+        weight[b] = w * part
+        if part < 1.0:
+            more += math.log(part) + (1.0 - part) * w * target.flux[b] ** 2
+    return more
+
+
+@njit(**PART)
+def _likelihood(flux, agn, z, target, limits, mixture, agn_error, scratch):
     """
     Best scale of a model, ln of the likelihood there but for a constant, and the variance of the scale.
 
     All that is known of the data is in here: ``z`` is the redshift that errors are of. With bands that may be
-    wrong the scale follows from how likely each of them is, and that from the scale.
+    wrong the scale follows from how likely each of them is, and that from the scale. ``agn`` are the fluxes of the
+    AGN in the model, ``scratch`` has room for weights.
     """
-    s, r, variance, chi2 = _best_scale(flux, target.weight[z], target, limits)
-    log = 0.5 * (r + target.level[z])
+    more = _widen(flux, agn, z, target, agn_error, scratch)
+    s, r, variance, chi2 = _best_scale(flux, scratch, target, limits)
+    log = 0.5 * (r + target.level[z] + more)
     if mixture is not None:
         weight, product = mixture.weight, 1.0
         for _ in range(_STEPS):
@@ -71,6 +98,13 @@ def _likelihood(flux, z, target, limits, mixture):
             for j, b in enumerate(target.bands):
                 d = target.flux[b] - s * flux[b]
                 narrow, broad, odds = mixture.narrow[z, j], mixture.broad[j], mixture.odds[z, j]
+                part = _widened(narrow, b, flux, agn, target, agn_error)
+                if part < 1.0:
+                    narrow, odds, log = (
+                        narrow * part,
+                        odds / math.sqrt(part),
+                        log + 0.5 * math.log(part),
+                    )
                 some = odds > 0.0
                 good = exponential(max(0.5 * (broad - narrow) * d * d, -600.0)) if some else 1.0
                 log -= 0.5 * (broad if some else narrow) * d * d
@@ -130,7 +164,8 @@ def _model(space, x, redshift, work):
         count, _ = find_nodes(space.agn, work.value[2 + len(galaxy.size) :], work)
         add_up(space.agn.table, z, part, count, work, more, last)
         for b in range(last):
-            flux[b] += power * exponential(more[b] + nearer)
+            more[b] = power * exponential(more[b] + nearer)
+            flux[b] += more[b]
         if count == 0:
             return node, -1, log_prior
     flux[last] = power
@@ -168,7 +203,16 @@ def _evaluate(space, one, x, work):
     log, z = _prior(one, z, g)
     if log < _NONE:
         return NEVER, 0.0, 0.0, 0.0
-    s, like, variance = _likelihood(work.flux[0], z, one.target, one.limits, one.mixture)
+    s, like, variance = _likelihood(
+        work.flux[0],
+        work.flux[1],
+        z,
+        one.target,
+        one.limits,
+        one.mixture,
+        one.agn_error,
+        work.flux[2],
+    )
     return prior + log, like, s, variance
 
 

@@ -6,6 +6,7 @@
   const table = facts.table, bands = facts.bands, sets = facts.sets;
   const miri = bands.filter((band) => band.miri);
   const setOf = Object.fromEntries(sets.map((set) => [set.name, set]));
+  const DASHES = { none: "5 3", blue: "1.5 2", red: "8 2 1.5 2" };
   const ROW = 24;
   const KEPT = 40;
   const $ = (id) => document.getElementById(id);
@@ -126,7 +127,8 @@
   }
 
   function writeAddress() {
-    const text = address();
+    const text = address(), row = byId.get(state.id);
+    $("hidden").textContent = row && !listed.includes(row) ? "Source " + state.id + ", shown below, is not in the list: the filters leave it out." : "";
     if (text !== location.hash) history.replaceState(null, "", text);
     for (const link of $("truths").querySelectorAll("a")) link.hash = text;
   }
@@ -416,7 +418,7 @@
         if (value === null) return;
         path += (k && fit.spectrum[k - 1] !== null ? "L" : "M") + x(log(wave[k])).toFixed(1) + " " + y(value / 1000).toFixed(1);
       });
-      const style = { fill: "none", stroke: setOf[name].color, "stroke-width": 1.4, "stroke-dasharray": name === "none" ? "5 3" : null };
+      const style = { fill: "none", stroke: setOf[name].color, "stroke-width": 1.4, "stroke-dasharray": DASHES[name] };
       clip.append(draw("path", { d: path, ...style }));
       entries.unshift(["best model " + setOf[name].label, draw("line", { x1: 0, x2: 20, ...style })]);
     }
@@ -457,7 +459,9 @@
     return make("div", {},
       make("div", { class: "pair" }, drawn.filter(([name]) => name in facts.pdf_edges[first]).map(([name, label, truth]) => posterior(entry, name, label, truth))),
       make("p", { class: "note" }, sets.filter((set) => entry.fits[set.name]).map((set) => make("span", { style: "margin-right:1em;white-space:nowrap" },
-        make("span", { style: "color:" + set.color }, "▬ "), set.label)), make("span", {}, "┆ truth")));
+        draw("svg", { viewBox: "0 0 30 6", style: "display:inline;width:30px;height:6px;margin-right:.4em" },
+          draw("line", { x1: 0, x2: 30, y1: 3, y2: 3, stroke: set.color, "stroke-width": 2, "stroke-dasharray": DASHES[set.name] })), set.label)),
+        make("span", { style: "white-space:nowrap" }, "┆ truth")));
   }
 
   function posterior(entry, name, label, truth) {
@@ -489,7 +493,7 @@
       let path = "M" + x(edges[0]).toFixed(1) + " " + y(0);
       density.forEach((value, k) => { path += "V" + y(value).toFixed(1) + "H" + x(edges[k + 1]).toFixed(1); });
       const main = facts.compared.includes(set.name);
-      parts.push(draw("path", { d: path + "V" + y(0), fill: main ? set.color : "none", "fill-opacity": 0.13, stroke: set.color, "stroke-width": main ? 1.5 : 0.9 }, draw("title", {}, set.label)));
+      parts.push(draw("path", { d: path + "V" + y(0), fill: main ? set.color : "none", "fill-opacity": 0.13, stroke: set.color, "stroke-width": 1.5, "stroke-dasharray": DASHES[set.name] }, draw("title", {}, set.label)));
     }
     if (truth !== null && truth >= low && truth <= high) {
       parts.push(draw("line", { class: "truth", x1: x(truth), x2: x(truth), y1: top, y2: height - bottom, stroke: "#1c2330", "stroke-dasharray": "4 3" }, draw("title", {}, "truth " + number(truth))));
@@ -518,17 +522,30 @@
       make("tbody", {}, body)));
   }
 
+  // nominal solar luminosity (IAU 2015) in the units that luminosities come in
+  const SUN = { W: 3.828e26, "erg / s": 3.828e33 };
+  const raised = (power) => "10" + [...String(power)].map((c) => c === "-" ? "⁻" : "⁰¹²³⁴⁵⁶⁷⁸⁹"[c]).join("");
+
   function parameters(entry) {
     const own = sets.filter((set) => entry.fits && entry.fits[set.name]);
-    const body = facts.parameters.map((parameter, k) => make("tr", {},
-      make("td", { class: "t" }, parameter.name + (parameter.unit ? " (" + parameter.unit.replaceAll("solMass", "M☉") + ")" : "")),
-      make("td", {}, number(entry.parameters[k])),
-      own.map((set) => {
-        const [mean, std] = entry.fits[set.name].moments[k];
-        // what rounding leaves of a parameter with one value
-        const width = std !== null && std < 1e-6 * Math.abs(mean) ? 0 : std;
-        return make("td", {}, number(mean) + " ± " + number(width === null ? null : Number(width.toPrecision(2))));
-      })));
+    const body = facts.parameters.map((parameter, k) => {
+      const sun = SUN[parameter.unit] || 1, over = (value) => value === null ? null : value / sun;
+      const truth = over(entry.parameters[k]), moments = own.map((set) => entry.fits[set.name].moments[k].map(over));
+      // one power of ten for the row, and two digits of the error
+      const most = Math.max(...[truth, ...moments.map((pair) => pair[0])].map((value) => Math.abs(value || 0)));
+      const size = most > 0 ? Math.floor(Math.log10(most)) : 0, power = size > 4 || size < -3 ? size : 0;
+      const unit = sun === 1 ? parameter.unit.replaceAll("solMass", "M☉") : "L☉";
+      const label = [power ? raised(power) : "", unit].filter(Boolean).join(" "), cut = (value) => value === null ? null : value / 10 ** power;
+      return make("tr", {},
+        make("td", { class: "t" }, parameter.name.replaceAll("_", " ") + (label ? " (" + label + ")" : "")),
+        make("td", {}, number(cut(truth))),
+        moments.map(([mean, std]) => {
+          // what rounding leaves of a parameter with one value
+          const width = std !== null && std < 1e-6 * Math.abs(mean) ? 0 : cut(std);
+          const digits = width > 0 ? Math.max(0, Math.min(6, 1 - Math.floor(Math.log10(width)))) : undefined;
+          return make("td", {}, number(cut(mean), digits) + " ± " + number(width, digits));
+        }));
+    });
     return make("div", { class: "scrolls" }, make("table", { class: "values" },
       make("thead", {}, make("tr", {}, make("th", { class: "t" }, "parameter"), make("th", {}, "true"), own.map((set) => make("th", {}, set.label)))),
       make("tbody", {}, body)),

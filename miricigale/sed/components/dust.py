@@ -275,7 +275,7 @@ class DraineLi2007Alpha(_DraineLi):
     A mapping with eight constants, fitted to the sequence of Dale et al. 2014 and scored on
     it: 0.10 dex rms in 5-25 um and 0.06 dex beyond for alpha from 1 to 3.5. MIRI bands differ
     by up to 0.4 mag, the 3.3 um feature by 1 mag. It is **no substitute for Dale et al. 2014**
-    in a paper.
+    in a paper. Galaxies of CEERS have a tenth of its 3.3 um feature: ``pah_33`` scales that.
 
     Examples
     --------
@@ -290,22 +290,29 @@ class DraineLi2007Alpha(_DraineLi):
     name = "dl07_alpha"
     reference = "Draine & Li 2007, ApJ 657, 810; alpha after Dale et al. 2014, ApJ 784, 83"
     alpha = Parameter(2.0, (1.0, 3.5), "Slope of dust mass in intensity, as Dale's alpha.")
+    pah_33 = Parameter(1.0, (0.0, 2.0), "Strength of the 3.3 um feature.")
 
     def mixture(self, columns):
-        intensity, spectra = _alpha_tables(self.path)
+        intensity, spectra, plain = _alpha_tables(self.path)
         step = columns["alpha"][:, None] - 2.0
         slope = ALPHA_SLOPE[0] + ALPHA_SLOPE[1] * step + ALPHA_SLOPE[2] * step**2
         log_u = np.log10(intensity)
         edges = _logistic((log_u - ALPHA_U[0]) / 0.05) * _logistic((ALPHA_U[1] - log_u) / 0.05)
         weight = intensity ** (1.0 - slope) * edges
         rich = _logistic((ALPHA_U_PAH - log_u) / 0.1)
-        return np.hstack([weight * rich, weight * (1.0 - rich)]), spectra
+        weight = np.hstack([weight * rich, weight * (1.0 - rich)])
+        part = columns["pah_33"][:, None]
+        if np.all(part == 1.0):
+            return weight, spectra
+        return np.hstack([part * weight, (1.0 - part) * weight]), np.concatenate([spectra, plain])
 
 
 #: Ends of log U, where PAHs are destroyed (log U), and the slope's polynomial in alpha - 2.
 ALPHA_U = (0.20, 3.19)
 ALPHA_U_PAH = 1.373
 ALPHA_SLOPE = (2.415, 1.425, 0.5)
+#: Ends of the 3.3 um feature in um, between which its continuum is a power law.
+PAH_33 = (3.0, 3.65)
 
 
 def _logistic(x):
@@ -324,7 +331,7 @@ def _by_mass(path):
 
 @cached_by_file(maxsize=2)
 def _alpha_tables(path):
-    """Spectra per dust mass on an even grid in log U, PAH-rich and PAH-poor."""
+    """Spectra per dust mass on an even grid in log U, PAH-rich and PAH-poor, then without the 3.3 um feature."""
     table = load_dl07(path)
     intensity = np.geomspace(0.1, U_MAX, 141)
     matrix = _core.hat_matrix(np.log(table["u"]), np.clip(np.log(intensity), None, np.log(U_MAX)))
@@ -332,4 +339,11 @@ def _alpha_tables(path):
     for q in (-1, 0):
         mass = table["single"][q] * table["single_power"][q][:, None]
         out.append(np.exp(matrix @ np.log(np.maximum(mass, 1e-300))))
-    return intensity, np.concatenate(out)
+    spectra, log_wave = np.concatenate(out), np.log(table["wave"])
+    plain = spectra.copy()
+    feature = slice(*np.searchsorted(table["wave"], PAH_33))
+    ends = [feature.start, feature.stop]
+    share = (log_wave[feature] - log_wave[ends[0]]) / np.ptp(log_wave[ends])
+    low, high = np.log(np.maximum(spectra[:, ends], 1e-300)).T[:, :, None]
+    plain[:, feature] = np.exp(low + share * (high - low))
+    return intensity, spectra, plain

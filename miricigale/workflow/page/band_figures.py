@@ -194,6 +194,46 @@ def point_figure(points, bands):
     return figure
 
 
+def rival_figure(table):
+    """
+    Source Extractor in a band against the truth and against the template fit, with both error functions.
+
+    ``table`` is one of `~miricigale.workflow.stages.rivals.rival_table` with the fluxes of both.
+    """
+    names = ("flux_true", "source_extractor", "yang2021")
+    true, blind, forced = (ab_magnitude(table[name]) for name in names)
+    usable = np.asarray(table["field"]) & ~np.asarray(table["edge"]) & np.isfinite(true)
+    bright, spheroid = usable & (table["snr"] > 5), np.asarray(table["shape"]) == "n >= 2"
+    titles = ("Source Extractor", "error functions", "points and n < 2", "n ≥ 2")
+    figure, axes = panels(titles, height=3.1)
+    first, second, *lower = axes.values()
+    labels = ("Source Extractor (AB)", "Source Extractor - template fit (mag)")
+    for ax, x, y, rows, names in (
+        (first, true, blind - true, usable, ("true magnitude (AB)", "measured - true (mag)")),
+        (lower[0], blind, blind - forced, bright & ~spheroid, labels),
+        (lower[1], blind, blind - forced, bright & spheroid, labels),
+    ):
+        rows = rows & np.isfinite(y)
+        x, y, title = x[rows], y[rows], f"{ax.get_title()} ({np.count_nonzero(rows)})"
+        plot_offsets(x, y, running=running_median(x, y), ax=ax, title=title)
+        ax.set(xlabel=names[0], ylabel=names[1])
+        if y.size:
+            note = f"median {np.median(y):+.3f} mag"
+            ax.text(0.96, 0.95, note, transform=ax.transAxes, ha="right", va="top", fontsize=8)
+    lower[1].sharex(lower[0])
+    methods = (("template fit", forced, MEASURED), ("Source Extractor", blind, SECOND))
+    for label, found, color in methods:
+        rows = usable & np.isfinite(found)
+        x, y = true[rows], np.abs(found - true)[rows]
+        second.semilogy(x, y, ".", ms=3, color=color, alpha=0.3)
+        middle, error, _ = running_median(x, y)
+        second.plot(middle, error, color=color, lw=1.8, label=label)
+    second.axhline(0.2, color=TRUE, lw=0.8, ls="--")
+    second.set(ylim=(2e-3, 2), xlabel="true magnitude (AB)", ylabel="|measured - true| (mag)")
+    legend(second, loc="upper left")
+    return figure
+
+
 #: Least values that the figure of the inputs shows, and redshifts of its panels.
 LEAST_RATE, LEAST_MASS = 1e-3 * u.Msun / u.yr, 1e7 * u.Msun
 INPUT_REDSHIFTS = ((0.0, 1.0), (1.0, 2.0), (2.0, 3.0))

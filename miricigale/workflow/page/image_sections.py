@@ -5,21 +5,26 @@ from markupsafe import Markup
 
 from miricigale.pages import number
 from miricigale.workflow.page import pictures, study_figures
-from miricigale.workflow.page.labels import browse, three_bands
+from miricigale.workflow.page.labels import band_label, browse, color_bands, three_bands
 from miricigale.workflow.stages.exposures import study_exposures, study_pointings
 from miricigale.workflow.stages.images import measured_mosaic, reducer_of
 
 
-def write_summary(page, truths):
-    """Headline numbers, and links to the sources of each truth."""
+def write_summary(page, truths, numbers, caveats):
+    """What was found at each fracAGN, headline numbers, links to the sources of each truth, and ``caveats``."""
     m = page.metrics
     values = m | {"n_sample": browse(page.first.name, m["n_sample"], show="sample")}
     for unit, fit in m["fits"].items():
         values |= {f"{key}_{unit}": value for key, value in fit.items()}
     page.section("summary")
+    answer = study_figures.answer_figure(page.study, numbers)
+    if answer is not None:
+        page.figure("answer", answer)
     page.items(values, min_detected=page.config.fit.min_detected)
     links = Markup(", ").join(browse(name, name) for name in truths)
     page.text("sources", links=links)
+    page.text("caveats")
+    page.report.bullets(caveats, box=True)
 
 
 def write_images(page, mosaics):
@@ -27,14 +32,11 @@ def write_images(page, mosaics):
     config, image, sky = page.config, page.context.image, page.first.name
     chosen = three_bands(page.bands)
     page.section("images")
-    page.figure(
-        "color" if len(chosen) == 3 else "gray",
-        pictures.field_figure(
-            [mosaics[name] for name in chosen],
-            image("f160w.fits"),
-            [*chosen, config.highres.filter],
-        ),
-    )
+    colors = color_bands(page.bands)
+    field = [mosaics[name] for name in colors]
+    figure = pictures.field_figure(field, image("f160w.fits"), [*colors, config.highres.filter])
+    kind = {3: "color", 6: "colors"}.get(len(colors), "gray")
+    page.figure(kind, figure, bands=", ".join(map(band_label, colors)))
     unit = next(n for n, e in study_exposures(config).items() if e.filter == chosen[-1])
     rate, cal = (image(f"{sky}/exposures/{unit}_{kind}.fits") for kind in ("rate", "cal"))
     page.figure("subtraction", pictures.subtraction_figure(rate, cal, reducer_of(config)))
@@ -44,6 +46,9 @@ def write_images(page, mosaics):
         for n in chosen
     ]
     page.figure("residual", pictures.residual_figure(pairs, chosen))
+    middle = len(chosen) // 2
+    whole = pictures.residual_figure(pairs[middle:][:1], chosen[middle:][:1], size=None)
+    page.figure("maps", whole, band=band_label(chosen[middle]))
 
 
 def write_detections(page):
@@ -65,13 +70,12 @@ def write_detections(page):
         paper_sigma=page.sentence("paper_sigma") if page.config.errors.statistic == "mad" else "",
     )
     reasons = {name.replace("_", " "): n for name, n in m["n_left_out"].items()}
-    page.table(
-        "left_out",
-        [
-            {"reason": name, "sources": browse(page.first.name, n, show="all", flag=name)}
-            for name, n in reasons.items()
-        ],
-    )
+    outside = reasons.pop("outside field")
+    rows = [
+        {"reason": name, "sources": browse(page.first.name, n, flag=name)}
+        for name, n in reasons.items()
+    ]
+    page.table("left_out", rows, n_outside=outside)
     if page.first.field.any():
         page.figure("luminosity", study_figures.detection_figure(page.study))
 

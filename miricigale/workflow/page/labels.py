@@ -14,7 +14,7 @@ SET_LABELS = {
     "blue": "with the shorter half of MIRI",
     "red": "with the longer half of MIRI",
 }
-SET_COLORS = {"all": MEASURED, "none": SECOND, "blue": "tab:blue", "red": "tab:red"}
+SET_COLORS = {"all": MEASURED, "none": SECOND, "blue": "#0d9488", "red": "#a21caf"}
 _CLASS_LABELS = {"agn": "AGN", "unknown": "not in the fit"}
 _PARAMETER_LABELS = {"frac_agn": "fracAGN", "sfr_100myr": "SFR (100 Myr)"}
 
@@ -46,10 +46,21 @@ def by_wavelength(names):
     return sorted(names, key=lambda name: Filter.from_name(name).pivot)
 
 
+def end_bands(names):
+    """Return the shortest and the longest of some bands, or the only one."""
+    return by_wavelength(names)[:: max(1, len(names) - 1)]
+
+
 def three_bands(names):
     """Return the shortest, the middle and the longest of some bands, or all of fewer than three."""
     bands = by_wavelength(names)
     return bands if len(bands) < 3 else [bands[0], bands[len(bands) // 2], bands[-1]]
+
+
+def color_bands(names):
+    """Return the bands of color images: the shortest and the longest three of six or more, or as `three_bands`."""
+    bands = by_wavelength(names)
+    return three_bands(names) if len(bands) < 6 else [*bands[:3], *bands[-3:]]
 
 
 def browse(truth, text, source="", **filters):

@@ -290,6 +290,7 @@ def study_metrics(config, tables, area):
     """
     bands = config.exposures.filters
     field, selection = tables.field, np.asarray(tables.matched["selection"])
+    off = np.where(tables.inside, ~0, SampleFlags.OUTSIDE_FIELD)
     # with a single band, detections in that band are counted
     least = min(2, len(bands))
     return {
@@ -298,7 +299,9 @@ def study_metrics(config, tables, area):
         "n_matched": int((field & np.asarray(tables.matched["matched"])).sum()),
         "n_sample": int((selection == 0).sum()),
         "n_left_out": {
-            flag.name.lower(): int(np.count_nonzero(selection & flag)) for flag in SampleFlags
+            # what else a source outside of the field may be is no matter
+            flag.name.lower(): int(np.count_nonzero(selection & flag & off))
+            for flag in SampleFlags
         },
         "area": float(area.to_value(u.arcmin**2)),
         "as_paper": as_paper(config),

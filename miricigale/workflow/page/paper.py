@@ -1,16 +1,15 @@
 """All truths of a run compared with Yang et al. 2021: tables, numbers of other products, reasons."""
 
+import collections
+
 import numpy as np
 
 from miricigale.evaluation import (
-    COLOR_WINDOWS,
     PUBLISHED,
     Estimate,
     StudyResults,
     TruthResults,
-    color_estimates,
     compare_with_paper,
-    mid_infrared_fractions,
 )
 from miricigale.evaluation.paper import ONE_FIELD
 from miricigale.pages import number, sentence
@@ -57,39 +56,26 @@ def study_results(config, truths, every, metrics):
     )
 
 
-def agn_shares(study, model):
-    """
-    True AGN shares of the 5-15 um light of the fitted sources, by truth; NaN of all others.
-
-    Empty without the bands of the colors that they are for, or without an AGN.
-    """
-    needed = {band for window in COLOR_WINDOWS for band in window.bands}
-    if not needed <= set(study.bands) or len(study.truths) < 2:
-        return {}
-    shares = {}
-    for one in study.truths:
-        values = np.full(len(one.truth), np.nan)
-        agn = np.asarray(one.truth["frac_agn"], float) > 0
-        values[one.sample & ~agn] = 0.0
-        rows = one.sample & agn
-        if rows.any():
-            values[rows] = mid_infrared_fractions(model, one.truth[rows])
-        shares[one.name] = values
-    return shares
-
-
-def extra_numbers(study, metrics, shares, seed):
+def extra_numbers(study, metrics, kernels):
     """
     Numbers by key of `~miricigale.evaluation.PUBLISHED` that are not of the tables of the truths.
 
-    Of detection, bright point sources and colors; ``shares`` are those of `agn_shares`.
+    Of detection, kernels (`~miricigale.psf.MatchingKernel` by band) and bright point sources.
     """
     n, one = metrics["detections"]["n_field"], study.truths[0]
     found = np.asarray(one.matched["matched"], bool)[one.field]
     extra = {
-        "detected_catalog": Estimate(n, n - np.sqrt(n), n + np.sqrt(n), n),
+        "detected_catalog": Estimate.of_count(n),
         "matched_catalog": Estimate.of_fraction(np.count_nonzero(found), found.size),
     }
+    for one in study.truths:
+        if one.frac_agn is None:
+            n_agn = np.count_nonzero(one.field & (np.asarray(one.truth["frac_agn"]) > 0))
+            extra["agn.field"] = Estimate.of_count(n_agn)
+    off = {band: np.abs(one.encircled_energy_error()).max() for band, one in kernels.items()}
+    extra["kernels"] = Estimate(max(off.values()), n=len(off))
+    red = [value for band, value in off.items() if band != "miri.f770w"]
+    extra["kernels.red"] = Estimate(max(red, default=np.nan), n=len(red))
     points = {band: one for band, one in metrics["bands"].items() if "points_n" in one}
     for band, one in points.items():
         label, scaling, error = band.rpartition(".")[2], one["f_scaling"], one["f_scaling_err"]
@@ -102,8 +88,6 @@ def extra_numbers(study, metrics, shares, seed):
         if sizes:
             value, count = max(sizes)
             extra[key] = Estimate(value, n=count)
-    if shares:
-        extra |= color_estimates(study, shares, seed=seed)
     return extra
 
 
@@ -156,7 +140,7 @@ def reasons_of(config, metrics, model):
         topic = one.quantity if one.quantity != "extra" else one.key.partition(".")[0]
         if topic == "f_aper":
             reasons[one.key] = "a PSF with other wings; the factor is not applied"
-        if topic in ("feature", "f_scaling", "f_aper", "source_extractor"):
+        if topic in ("feature", "f_scaling", "f_aper", "source_extractor", "kernels", "errors"):
             continue
         # that the field is another one is among the run's own
         general = [part for part in one.why.split("; ") if part and part != ONE_FIELD]
@@ -165,21 +149,27 @@ def reasons_of(config, metrics, model):
     return reasons, [sentence(f"{short}: {text}", facts) for short, text in words.values()]
 
 
+#: What verdicts are in the plural, by their first words; others are as they stand.
+_VERDICTS = {"agrees": "agree", "differs": "differ"}
+
+
 def write_comparison(page, reasons, sentences):
     """The section with all numbers of Yang et al. 2021 and those of the run."""
     table = compare_with_paper(page.study, seed=page.context.seed, reasons=reasons)
-    page.numbers("paper", table)
-    page.report.bullets(sentences)
+    counts = collections.Counter(_VERDICTS.get(v.split()[0], v) for v in table["verdict"])
+    verdicts = ", ".join(f"{n} {verdict}" for verdict, n in counts.most_common())
+    page.numbers("paper", table, verdicts=verdicts)
+    with page.folding("differences", n_differences=len(sentences)):
+        page.report.bullets(sentences)
     rows = []
     for row in table:
         mark = {"=": "", "~": "about "}.get(row["relation"], f"{row['relation']} ")
-        second_hand = "" if row["source"] else " [?]"
         low, high = row["low"], row["high"]
         known = np.isfinite([low, high]).all()
         form = f"{{:.3g}} ± {0.5 * (high - low):.2g}" if known else ".3g"
         cells = {
-            "paper": f"{mark}{row['paper']:.3g}{second_hand}",
+            "paper": f"{mark}{row['paper']:.3g}",
             "ours": number(row["ours"], form, "not measured in this study"),
         }
         rows.append({name: row[name] for name in table.colnames} | cells)
-    page.table("table", rows)
+    page.table("table", rows, n_numbers=len(rows))

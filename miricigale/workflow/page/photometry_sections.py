@@ -4,11 +4,11 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.pages import number
-from miricigale.psf import MatchingKernel
 from miricigale.workflow.page import band_figures, pictures, study_figures
-from miricigale.workflow.page.labels import band_label
+from miricigale.workflow.page.labels import band_label, end_bands
 from miricigale.workflow.page.numbers import FEWEST
 from miricigale.workflow.stages.conditions import CONDITIONS, ConditionFlags
+from miricigale.workflow.stages.images import measured_mosaic, mosaic_psf
 
 #: How sources are marked in figures: bit, marker and label.
 _MARKS = (
@@ -22,8 +22,7 @@ def write_photometry(page):
     own_steps = page.config.photometry.method == "yang2021"
     matched, points, bands = page.tables.matched, page.tables.points, page.metrics["bands"]
     page.section("photometry", "yang2021" if own_steps else "text")
-    kernels = {n: MatchingKernel.read(page.context.path(f"kernel_{n}.fits")) for n in page.bands}
-    page.figure("convolution", pictures.convolution_figure(kernels))
+    page.figure("convolution", pictures.convolution_figure(page.kernels))
     table = matched[page.tables.inside & np.asarray(matched["matched"])]
     if len(table) == 0:
         page.text("no_match")
@@ -36,9 +35,21 @@ def write_photometry(page):
     if points:
         shown = {name: table[np.asarray(table["in_field"])] for name, table in points.items()}
         page.figure("points", band_figures.point_figure(shown, page.bands))
+        _write_energy(page, {name: shown[name] for name in end_bands(page.bands)})
     else:
         page.text("no_points")
     _write_conditions(page, page.metrics["detections"])
+
+
+def _write_energy(page, points):
+    """Images of point sources in the field, by band, and their encircled energy."""
+    points = {name: table for name, table in points.items() if len(table)}
+    if points:
+        _, scale = measured_mosaic(page.config)
+        mosaics = {name: page.context.image(f"points/{name}_mosaic.fits") for name in points}
+        psfs = {name: mosaic_psf(page.config, name, scale) for name in points}
+        named = " and ".join(map(band_label, points))
+        page.figure("energy", pictures.energy_figure(mosaics, points, psfs), named=named)
 
 
 def _write_conditions(page, found):

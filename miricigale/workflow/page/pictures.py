@@ -4,10 +4,13 @@ import astropy.units as u
 import numpy as np
 from astropy.nddata import block_reduce
 from astropy.wcs.utils import proj_plane_pixel_scales
+from scipy.ndimage import uniform_filter
 
 from miricigale.evaluation import sigma_mad
+from miricigale.photometry import encircled_flux
 from miricigale.plotting.axes import MEASURED, SECOND, TRUE, WIDTH, legend, new_figure
 from miricigale.plotting.images import mark_sky, plot_color, plot_image, plot_model_residual
+from miricigale.psf import encircled_energy, radius_of_encircled_energy
 from miricigale.psf.wiener import energy_error
 from miricigale.workflow.page.labels import band_label
 
@@ -39,44 +42,93 @@ def _directions(image):
     return found
 
 
+def _used(planes):
+    """Rows and columns of the pixels with data in any of some planes, as a pair of slices."""
+    used = np.argwhere(np.any([np.isfinite(plane) for plane in planes], axis=0))
+    return tuple(slice(a, b) for a, b in zip(used.min(axis=0), used.max(axis=0) + 1, strict=True))
+
+
+def _binned(plane, scale):
+    """A plane averaged to pixels of about 0.2 arcsec, which have less noise, and their size in arcsec."""
+    factor = max(1, round(0.2 / scale))
+    return block_reduce(plane, factor, np.mean), factor * scale
+
+
+#: Side of the squares that are shown larger, in arcsec, and S/N of a pixel beyond which it counts no more.
+_ZOOM, _BRIGHT = 10.0, 5.0
+
+
+def _zooms(planes, scale):
+    """Middles, in arcsec from that of the planes, of the exposed squares in which most is seen, four at most."""
+    size = round(_ZOOM / scale)
+    planes = [plane / sigma_mad(plane[np.isfinite(plane)]) for plane in planes]
+    light = sum(np.nan_to_num(np.clip(p, 0, _BRIGHT), nan=-_BRIGHT) for p in planes)
+    seen = uniform_filter(light, size, mode="constant", cval=-_BRIGHT * len(planes))
+    found = []
+    while seen.max() > 0 and len(found) < 4:
+        y, x = np.unravel_index(np.argmax(seen), seen.shape)
+        found.append((scale * (x - 0.5 * seen.shape[1]), scale * (y - 0.5 * seen.shape[0])))
+        # the next one does not overlap
+        seen[max(y - size, 0) : y + size, max(x - size, 0) : x + size] = 0
+    return found if len(found) == 4 else []
+
+
 def field_figure(images, prior, names):
     """
-    The field: the high-resolution image and a color image of three bands, or each band in gray.
+    The field: the high-resolution image and color images of three bands each, or each band in gray.
 
-    ``images`` are mosaics on one grid, the shortest wavelength first (other numbers than three are drawn
-    in gray); ``names`` are their bands and that of the prior.
+    With squares in which much is seen enlarged. ``images`` are mosaics on one grid, the shortest wavelength first
+    (one or two are drawn in gray); ``names`` are their bands and that of the prior.
     """
-    planes = [filled(image) for image in images]
-    used = np.argwhere(np.any([np.isfinite(plane) for plane in planes], axis=0))
-    (y0, x0), (y1, x1) = used.min(axis=0), used.max(axis=0) + 1
-    planes = [plane[y0:y1, x0:x1] for plane in planes]
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Rectangle
+
+    planes, labels = [filled(image) for image in images], [band_label(name) for name in names]
+    rows, columns = _used(planes)
+    planes = [plane[rows, columns] for plane in planes]
+    (height, width), scale = planes[0].shape, _scale(images[0])
     # the same part of the sky on the prior's own pixels
-    corners = images[0].wcs.pixel_to_world([x0 - 0.5, x1 - 0.5], [y0 - 0.5, y1 - 0.5])
-    x, y = (np.round(v + 0.5).astype(int).clip(0) for v in prior.wcs.world_to_pixel(corners))
-    factor = max(1, round(_scale(images[0]) / _scale(prior)))
+    ends = [[part.start - 0.5, part.stop - 0.5] for part in (columns, rows)]
+    x, y = prior.wcs.world_to_pixel(images[0].wcs.pixel_to_world(*ends))
+    x, y = (np.round(v + 0.5).astype(int).clip(0) for v in (x, y))
+    factor = max(1, round(scale / _scale(prior)))
     field = block_reduce(filled(prior)[y[0] : y[1], x[0] : x[1]], factor, np.mean)
-    labels = [band_label(name) for name in names]
-    color = len(planes) == 3
-    n = 2 if color else 1 + len(planes)
-    width = WIDTH / n
-    bar = 0 if color else 0.8
-    size = (width, (width - bar) * (y1 - y0) / (x1 - x0) + 0.4)
-    figure, axes = new_figure(1, n, size=size)
-    axes = axes.ravel()
+    color = len(planes) % 3 == 0
+    n = 1 + (len(planes) // 3 if color else len(planes))
+    zooms = _zooms(planes, scale) if color else []
+    across, panel = (4 if n == 2 else 2), WIDTH / n
+    sizes = [(panel - (0 if color else 0.8)) * height / width + 0.4]
+    sizes += [panel * len(zooms) / across**2] if zooms else []
+    figure = Figure(figsize=(WIDTH, sum(sizes)), layout="constrained")
+    grid = figure.add_gridspec(len(sizes), n, height_ratios=sizes)
+    axes = [figure.add_subplot(grid[0, k]) for k in range(n)]
     gray = {"colorbar": None if color else "MJy/sr"}
-    scale = factor * _scale(prior)
-    plot_image(field, ax=axes[0], pixel_scale=scale, title=f"{labels[-1]} (prior)", **gray)
-    if color:
-        parts = zip(("blue", "green", "red"), labels, strict=False)
-        title = ", ".join(f"{label} {color}" for color, label in parts)
-        # binned, to reduce the noise of single pixels in the color image
-        planes = [block_reduce(plane, 2, np.mean) for plane in planes]
-        plot_color(*planes[::-1], ax=axes[1], pixel_scale=2 * _scale(images[0]), title=title)
-    else:
-        for ax, plane, image, label in zip(axes[1:], planes, images, labels, strict=False):
-            plot_image(plane, ax=ax, pixel_scale=_scale(image), title=label, **gray)
+    options = {"pixel_scale": factor * _scale(prior), "title": f"{labels[-1]} (prior)"}
+    plot_image(field, ax=axes[0], **options, **gray)
+    for k, ax in enumerate(axes[1:]):
+        if color:
+            three = zip(("blue", "green", "red"), labels[3 * k : 3 * k + 3], strict=True)
+            title = ", ".join(f"{label} {color}" for color, label in three)
+            binned = [_binned(plane, scale) for plane in planes[3 * k : 3 * k + 3]]
+            colors = (plane for plane, _ in reversed(binned))
+            plot_color(*colors, ax=ax, pixel_scale=binned[0][1], title=title)
+        else:
+            plot_image(planes[k], ax=ax, pixel_scale=scale, title=labels[k], **gray)
     for k, ax in enumerate(axes):
-        mark_sky(ax, 20, **_directions(images[0]), color="white" if color and k else "black")
+        shade = "white" if color and k else "black"
+        mark_sky(ax, 20, **_directions(images[0]), color=shade)
+        ax.title.set_fontsize("medium")
+        places = grid[1, k].subgridspec(len(zooms) // across, across) if zooms else ()
+        for number, (place, (x, y)) in enumerate(zip(places, zooms, strict=True), start=1):
+            left, bottom = x - _ZOOM / 2, y - _ZOOM / 2
+            ax.add_patch(Rectangle((left, bottom), _ZOOM, _ZOOM, fc="none", ec=shade, lw=1))
+            ax.text(left + 1, bottom + _ZOOM - 1, number, color=shade, fontsize=7, va="top")
+            small, drawn = figure.add_subplot(place), ax.images[0]
+            style = {"norm": drawn.norm, "cmap": drawn.cmap, "extent": drawn.get_extent()}
+            small.imshow(drawn.get_array(), origin="lower", interpolation="nearest", **style)
+            ends = {"xlim": (left, left + _ZOOM), "ylim": (bottom, bottom + _ZOOM)}
+            small.set(**ends, xticks=[], yticks=[])
+            small.text(left + 0.5, bottom + _ZOOM - 0.5, number, color=shade, fontsize=8, va="top")
     return figure
 
 
@@ -84,33 +136,32 @@ def residual_figure(images, names, *, size=220):
     """
     Mosaic, model and residual of several bands, cut to the same crowded part of ``size`` pixels.
 
-    ``images`` are pairs of mosaic and model, all on one grid.
+    ``images`` are pairs of mosaic and model, all on one grid; without a ``size`` the whole field is shown.
     """
-    panel = WIDTH / 3
-    figure, axes = new_figure(len(images), 3, size=(panel, 0.8 * panel))
     # the model also covers pixels that were not exposed
-    model = np.where(np.isfinite(filled(images[0][0])), filled(images[0][1]), 0.0)
+    first = filled(images[0][0])
+    model = np.where(np.isfinite(first), filled(images[0][1]), 0.0)
     # the brightest part of the model, where deblending matters most
-    rows, columns = np.arange(0, model.shape[0], 60), np.arange(0, model.shape[1], 60)
-    light = np.sqrt(np.clip(model, 0, None))
-    smooth = np.add.reduceat(np.add.reduceat(light, rows, axis=0), columns, axis=1)
-    iy, ix = np.unravel_index(np.argmax(smooth), smooth.shape)
-    y0 = int(np.clip(iy * 60 - size // 2 + 30, 0, max(0, model.shape[0] - size)))
-    x0 = int(np.clip(ix * 60 - size // 2 + 30, 0, max(0, model.shape[1] - size)))
-    part = (slice(y0, y0 + size), slice(x0, x0 + size))
+    light = uniform_filter(np.sqrt(np.clip(model, 0, None)), size or 1)
+    middle = np.array(np.unravel_index(np.argmax(light), light.shape))
+    if size is None:
+        part = _used([first])
+    else:
+        start = np.clip(middle - size // 2, 0, np.maximum(np.array(model.shape) - size, 0))
+        part = tuple(slice(a, a + size) for a in start)
+    height, width = first[part].shape
+    panel = WIDTH / 3
+    figure, axes = new_figure(len(images), 3, size=(panel, 0.8 * panel * height / width))
     for row, (name, pair) in enumerate(zip(names, images, strict=True)):
         titles = ("mosaic", "model", "mosaic - model") if row == 0 else (None, None, None)
-        image, model = (filled(plane)[part] for plane in pair)
-        plot_model_residual(
-            image,
-            model,
-            ax=axes[row],
-            pixel_scale=_scale(pair[0]),
-            titles=titles,
-            unit="MJy/sr",
-        )
+        (image, model), scale = (filled(plane)[part] for plane in pair), _scale(pair[0])
+        model = np.where(np.isfinite(image), model, np.nan)
+        if size is None:
+            (image, _), (model, scale) = _binned(image, scale), _binned(model, scale)
+        options = {"titles": titles, "unit": "MJy/sr", "pixel_scale": scale}
+        plot_model_residual(image, model, ax=axes[row], **options)
         for ax in axes[row]:
-            mark_sky(ax, 5, **_directions(pair[0]))
+            mark_sky(ax, 5 if size else 20, **_directions(pair[0]))
         axes[row, 0].set_ylabel(band_label(name))
     return figure
 
@@ -129,9 +180,8 @@ def subtraction_figure(rate, cal, reducer):
     before = reducer.calibrate(rate)
     before = np.where(np.isfinite(after), filled(before), np.nan)
     # the part of the detector that sees the sky
-    used = np.argwhere(np.isfinite(after))
-    (y0, x0), (y1, x1) = used.min(axis=0), used.max(axis=0) + 1
-    before, after = before[y0:y1, x0:x1], after[y0:y1, x0:x1]
+    part = _used([after])
+    before, after = before[part], after[part]
     sources = after > 3 * sigma_mad(after[np.isfinite(after)])
     figure, axes = new_figure(1, 3, size=(3.5, 3.5), width_ratios=(1, 1, 0.85))
     last, scale = axes[0, 2], _scale(cal)
@@ -197,4 +247,41 @@ def convolution_figure(kernels):
     right.set_ylim(-1.15 * most, 1.15 * most)
     left.set_ylabel("difference of encircled energy (%)")
     legend(left, ncols=2)
+    return figure
+
+
+def energy_figure(mosaics, points, psfs):
+    """
+    Bright point sources of some bands, and their encircled energy before and after scaling against the PSF's.
+
+    By band: ``mosaics``, ``points`` (tables of the sources in the field, with ``f_scaling`` in their meta) and
+    ``psfs`` of the mosaics.
+    """
+    radius = np.linspace(0.1, 2.5, 49) * u.arcsec
+    figure, axes = new_figure(len(mosaics), 3, size=(WIDTH / 3, 4.2), width_ratios=(0.8, 1, 1))
+    for row, (name, image) in zip(axes, mosaics.items(), strict=True):
+        table, scale = points[name], _scale(image)
+        found = encircled_flux(image, table["sky"], table["flux_true"], radius)
+        own = encircled_energy(psfs[name], radius, pixel_scale=scale * u.arcsec)
+        data = filled(image)
+        data, size = _binned(data[_used([data])], scale)
+        plot_image(data, ax=row[0], pixel_scale=size, title=band_label(name))
+        mark_sky(row[0], 20, **_directions(image))
+        factor, x = table.meta["f_scaling"], radius.value
+        for label, values, color in (
+            ("as it is", found["median"], "black"),
+            (f"times f_scaling ({factor:.4f})", factor * found["median"], SECOND),
+        ):
+            row[1].plot(x, values, color=color, lw=1.4, label=label)
+            row[2].plot(x, 100 * (values - own), color=color, lw=1.4)
+        row[1].plot(x, own, color=MEASURED, lw=1.4, ls="--", label="PSF")
+        ends = [100 * (found["median"] + k * found["scatter"] - own) for k in (-1, 1)]
+        row[2].fill_between(x, *ends, color="0.85", lw=0)
+        row[2].axhline(0, color=MEASURED, lw=1.4, ls="--")
+        for ax in row[1:]:
+            ax.axvline(radius_of_encircled_energy(psfs[name], 0.8).value, color=MEASURED, ls="--")
+            ax.set_xlabel("radius (arcsec)")
+        row[1].set(ylim=(0, 1.03), ylabel="encircled energy")
+        row[2].set_ylabel("minus that of the PSF (%)")
+        legend(row[1], loc="lower right")
     return figure

@@ -6,6 +6,8 @@ from pathlib import Path
 import astropy.units as u
 import numpy as np
 
+from miricigale import sed
+from miricigale.evaluation import CEERS_DUST
 from miricigale.pages import sentence
 from miricigale.refdata import citations, resource, resources
 from miricigale.utils.meta import provenance
@@ -20,7 +22,12 @@ from miricigale.workflow.stages.exposures import (
     study_exposures,
     study_pointings,
 )
-from miricigale.workflow.stages.inputs import DUST_SHOWS, catalog_bands, existing_bands, input_bands
+from miricigale.workflow.stages.inputs import (
+    DUST_SHOWS,
+    catalog_bands,
+    existing_bands,
+    input_bands,
+)
 
 
 def exposure_kinds(config, forecasts, bands):
@@ -101,12 +108,20 @@ def catalog_facts(config, catalog):
         how += "; the dust's alpha is fitted too, of sources with a flux there"
     if config.highres.filter in bands:
         how += f"; each SED is scaled to the flux in {config.highres.filter}"
+    n_all, known = catalog.meta.get("n_sources"), np.asarray(catalog["redshift"], float) > 0
+    number = f"{len(catalog)} of {n_all}" if n_all else f"{len(catalog)}"
     facts = {
         "source": source,
-        "cut": f"{options.mag_column} <= {options.mag_limit:g}, {len(catalog)} sources",
+        "cut": f"{options.mag_column} <= {options.mag_limit:g}, {number} sources",
         "fluxes": f"{len(bands)} bands{fluxes}",
         "input SEDs fitted to": ", ".join(fitted) + how,
     }
+    if config.sed.infrared == "ceers":
+        n = CEERS_DUST[sed.SEDModel.yang2021(agn=False).component("dust").name][-1]
+        drawn = f"drawn from CEERS' distribution, measured on {n} sources"
+        facts["dust colors"] = f"{drawn}, where no band of the fit of the input SED shows the dust"
+    if none := np.count_nonzero(~known & ~np.asarray(catalog["star"], bool)):
+        facts["galaxies without redshift"] = f"{none}: without a model SED, and so on no image"
     existing = existing_bands(config)
     of = (
         "with depths" if all(existing.values()) else "with the errors of each source in the catalog"

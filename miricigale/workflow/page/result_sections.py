@@ -3,6 +3,7 @@
 import numpy as np
 
 from miricigale.evaluation import (
+    REDSHIFT_BINS,
     coverage_table,
     feature_residuals,
     selection_table,
@@ -32,12 +33,12 @@ COVERED = ("redshift", "frac_agn", "stellar_mass", "sfr_100myr", "dust_luminosit
 RANKED = ("redshift", "frac_agn", "stellar_mass")
 
 
-def write_results(page, numbers):
+def write_results(page, numbers, binned):
     """
     All sections on the fits; without a sample one sentence.
 
     ``numbers`` are those of the fits of the whole samples with their errors
-    (`~miricigale.workflow.page.numbers.whole_sample`).
+    (`~miricigale.workflow.page.numbers.whole_sample`), ``binned`` the table that they are of.
     """
     if not any(one.sample.any() for one in page.study.truths):
         left = page.metrics["n_left_out"].items()
@@ -46,7 +47,7 @@ def write_results(page, numbers):
         return
     _write_examples(page)
     rows = _fit_rows(page, numbers)
-    _write_redshifts(page, rows)
+    _write_redshifts(page, rows, binned)
     _write_fractions(page, rows)
     _write_figure(page, "disk", study_figures.disk_figure(page.study))
     several = ", of all truths together" if len(page.study.with_agn) > 1 else ""
@@ -121,7 +122,26 @@ def _fit_rows(page, numbers):
 _QUANTITIES = ("z_bias", "z_scatter", "z_outliers", "frac_offset", "frac_scatter", "width")
 
 
-def _write_redshifts(page, rows):
+def _binned_outliers(page, binned):
+    """Outliers without and with MIRI in each bin of true redshift, a row for each truth."""
+    rows = binned[np.asarray(binned["quantity"]) == "z_outliers"]
+    found = {(r["truth"], r["band_set"], r["z_low"], r["z_high"]): r for r in rows}
+    for one in page.study.truths:
+        if {"all", "none"} <= set(one.fits):
+            row = {"injected": truth_label(one)}
+            for k, span in enumerate(REDSHIFT_BINS):
+                both = [found[one.name, name, *span] for name in ("none", "all")]
+                shares = " and ".join(f"{100 * r['value']:.1f}" for r in both)
+                text = f"{shares} % ({both[0]['n']})" if both[0]["n"] else 0
+                where = {
+                    "show": "outliers",
+                    "redshift": "{:g}..{:g}".format(*span).removesuffix("inf"),
+                }
+                row[str(k)] = browse(one.name, text, **where) or "none"
+            yield row
+
+
+def _write_redshifts(page, rows, binned):
     """Photometric redshifts."""
     page.section("redshifts")
     if len(page.tables.sample):
@@ -131,8 +151,7 @@ def _write_redshifts(page, rows):
         page.figure("scatter", figure)
     page.figure("errors", study_figures.histogram_figure(page.study, "redshift"))
     page.table("table", rows)
-    if page.study.with_agn:
-        page.text("outliers")
+    page.table("bins", list(_binned_outliers(page, binned)))
     groups = [
         {"fit": SET_LABELS[unit], "group": group, **fit["conditions"][group]}
         for unit, fit in page.metrics["fits"].items()
@@ -145,8 +164,8 @@ def _write_fractions(page, rows):
     """AGN fractions."""
     study = page.study
     page.section("fractions", "truths" if len(study.truths) > 1 else "text")
-    if sum(one.frac_agn is not None and one.sample.any() for one in study.truths) > 1:
-        page.figure("bins", study_figures.fraction_bins_figure(study))
+    if len(page.tables.sample):
+        page.figure("differences", study_figures.histogram_figure(study, "difference"))
     page.figure("means", study_figures.histogram_figure(study, "fraction"))
     page.figure("widths", study_figures.histogram_figure(study, "width"))
     page.table("table", rows)
@@ -168,13 +187,13 @@ def _quality(row):
 
 
 def _write_classes(page):
-    """Classes by fracAGN and by colors, and selections in a realistic field."""
-    study, rows = page.study, []
+    """Classes by fracAGN, and selections in a realistic field."""
+    study, rows, tables = page.study, [], {}
     page.section("classes")
     for unit in ("all", "none"):
         if unit in page.first.fits and any(one.frac_agn is not None for one in study.truths):
             table, label = study_confusion(study, unit), SET_LABELS[unit]
-            page.figure("figure", study_figures.class_figure(table), set=label)
+            tables[label] = table
             found = {f"found {class_label(n)}": n for n in CLASS_COLUMNS if n in table.colnames}
             rows += [
                 {"fit": label, "true class": class_label(row["class"]), "sources": row["n"]}
@@ -183,9 +202,8 @@ def _write_classes(page):
                 for row in table
             ]
     if rows:
+        page.figure("figure", study_figures.class_figure(tables))
         page.table("table", rows)
-    if page.shares:
-        page.figure("colors", study_figures.color_figure(study, page.shares))
     for one in study.truths:
         if one.frac_agn is None and one.fits:
             rows = [

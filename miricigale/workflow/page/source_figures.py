@@ -6,6 +6,7 @@ import numpy as np
 from miricigale.evaluation import PAH_FEATURES
 from miricigale.filters import Filter
 from miricigale.plotting.axes import MEASURED, SECOND, TRUE, WIDTH, legend, new_figure
+from miricigale.plotting.filters import plot_filters
 from miricigale.plotting.posteriors import plot_pdf_2d
 from miricigale.plotting.spectra import plot_spectrum
 from miricigale.utils.units import FNU
@@ -20,7 +21,7 @@ _AXES = {"redshift": "redshift", "frac_agn": "fracAGN"}
 
 def spectra_figure(study, key, model):
     """
-    Spectra of one source with AGN of several fractions, with bands and PAH features marked.
+    Spectra of one source with AGN of several fractions, PAH features marked, above the curves of the filters.
 
     ``model`` is one with AGN.
     """
@@ -30,8 +31,8 @@ def spectra_figure(study, key, model):
     for one in (*study.with_agn[:1], study.truths[0]):
         row = one.truth[np.asarray(one.truth["id"]) == key][0]
         values |= {name: row[name] for name in row.colnames if name in model.parameters}
-    figure, axes = new_figure(size=(8.5, 4.4))
-    ax, light = axes[0, 0], []
+    figure, axes = new_figure(2, 1, size=(8.5, 2.6), sharex=True, height_ratios=(2.6, 1))
+    (ax, lower), light = axes[:, 0], []
     for fraction, shade in zip(SEQUENCE, np.linspace(0.0, 0.85, len(SEQUENCE)), strict=True):
         sed = model.evaluate(**{**values, "frac_agn": fraction})
         wave = sed.wave.to_value(u.um)
@@ -46,22 +47,21 @@ def spectra_figure(study, key, model):
     span = np.log10(top / bottom)
     ax.set_xlim(wave.min(), wave.max())
     ax.set_ylim(bottom * 10 ** (-0.12 * span), top * 10 ** (0.1 * span))
-    for k, name in enumerate(by_wavelength(study.bands)):
-        band = Filter.from_name(name)
-        middle, half = band.pivot.to_value(u.um), 0.5 * band.width.to_value(u.um)
-        ends, y = [middle - half, middle + half], bottom * 10 ** ((-0.08 + 0.05 * (k % 2)) * span)
-        ax.plot(ends, [y, y], color="0.55", lw=5, solid_capstyle="butt", zorder=0)
-        above = {"xytext": (0, 5), "textcoords": "offset points"}
-        place = (np.sqrt(ends[0] * ends[1]), y)
-        ax.annotate(band_label(name), place, ha="center", fontsize=7, **above)
+    bands = [Filter.from_name(name) for name in by_wavelength(study.bands)]
+    curves = [(one.wave.value, one.throughput, band_label(one.name)) for one in bands]
+    plot_filters(curves, ax=lower, lw=1.4)
+    legend(lower, loc="upper left", ncols=2, fontsize=7)
     redshift = float(values["redshift"])
     for rest in PAH_FEATURES.value:
         place = rest * (1 + redshift)
         if wave.min() < place < wave.max():
-            ax.axvline(place, color=TRUE, lw=0.7, ls=":")
+            for axis in (ax, lower):
+                axis.axvline(place, color=TRUE, lw=0.7, ls=":")
             at_top = {"transform": ax.get_xaxis_transform(), "ha": "right", "va": "top"}
             ax.text(place, 0.98, f"{rest:g}", rotation=90, fontsize=7, color=TRUE, **at_top)
     ax.set_title(f"z = {redshift:g}", fontsize="medium")
+    ax.set_xlabel("")
+    lower.set_xlabel("observed wavelength (µm)")
     legend(ax, loc="upper left")
     return figure
 

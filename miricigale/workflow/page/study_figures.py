@@ -5,13 +5,9 @@ import numpy as np
 
 from miricigale.evaluation import (
     CLASS_NAMES,
-    COLOR_WINDOWS,
-    KIRKPATRICK_LIMITS,
     PAH_FEATURES,
     REDSHIFT_BINS,
     XRAY_LIMITS,
-    ColorCircles,
-    classify,
     completeness,
     feature_redshifts,
     measure,
@@ -19,12 +15,14 @@ from miricigale.evaluation import (
     sigma_mad,
     xray_fluxes,
 )
+from miricigale.evaluation.estimates import outlier_share
 from miricigale.filters import Filter
 from miricigale.plotting.axes import (
     MEASURED,
     SECOND,
     STYLES,
     TRUE,
+    WIDTH,
     label_outer,
     legend,
     new_figure,
@@ -39,7 +37,7 @@ from miricigale.workflow.page.labels import (
     parameter_label,
     truth_label,
 )
-from miricigale.workflow.page.numbers import FEWEST, MIPS_LIMIT
+from miricigale.workflow.page.numbers import MIPS_LIMIT
 
 #: Classes that sources are found in, as columns of tables.
 CLASS_COLUMNS = (*CLASS_NAMES, "unknown")
@@ -54,11 +52,45 @@ def _both(one):
     return {name: SET_LABELS[name] for name in ("all", "none") if name in one.fits}
 
 
+def answer_figure(study, numbers):
+    """
+    Outliers and scatter of redshifts, and fitted fracAGN, against the injected one, with and without MIRI.
+
+    ``numbers`` are as for `~miricigale.workflow.page.result_sections.write_results`; None of one truth.
+    """
+    truths = [one for one in study.truths if one.frac_agn is not None and one.sample.any()]
+    if len(truths) < 2:
+        return None
+    figure, axes = panels(("redshift outliers (%)", "redshift scatter (%)", "fitted fracAGN"))
+    injected = np.array([one.frac_agn for one in truths])
+    for k, (name, label) in enumerate(_both(truths[0]).items()):
+        color, marker = STYLES[k]
+        place = injected + 0.012 * (k - 0.5)
+        for ax, quantity, scale in zip(
+            axes.values(), ("z_outliers", "z_scatter", "frac_offset"), (100, 100, 1), strict=True
+        ):
+            rows = [numbers[one.name, name, quantity] for one in truths]
+            value, low, high = (
+                scale * np.array([r[c] for r in rows]) for c in ("value", "low", "high")
+            )
+            if quantity == "frac_offset":
+                scatter = [numbers[one.name, name, "frac_scatter"]["value"] for one in truths]
+                value = value + injected
+                low, high = value - scatter, value + scatter
+            spread = np.abs([value - low, high - value])
+            style = {"fmt": marker, "ls": "-", "ms": 4.5, "color": color, "lw": 1.2}
+            ax.errorbar(place, value, spread, label=label, **style)
+            ax.set_xlabel("injected fracAGN")
+    list(axes.values())[-1].plot([0, 1], [0, 1], color=TRUE, lw=0.8, ls="--")
+    legend(next(iter(axes.values())), loc="upper left")
+    return figure
+
+
 #: Histograms: values of a truth and a set of bands, edges of bins, label, and the true value of a truth.
 _HISTOGRAMS = {
     "redshift": (
         lambda one, name: one.redshift_error(name),
-        np.linspace(-0.3, 0.3, 31),
+        np.linspace(-0.3, 0.3, 61),
         r"(z$_{\rm fit}$ - z) / (1 + z)",
         lambda one: 0.0,
     ),
@@ -74,6 +106,12 @@ _HISTOGRAMS = {
         "posterior width of fracAGN (std)",
         lambda one: None,
     ),
+    "difference": (
+        lambda one, name: one.fitted(name, "frac_agn_mean") - one.true("frac_agn"),
+        np.linspace(-0.2, 0.8, 26),
+        "fitted - true fracAGN",
+        lambda one: 0.0,
+    ),
 }
 
 
@@ -81,23 +119,41 @@ def histogram_figure(study, quantity):
     """
     Histograms of ``"redshift"`` errors, or the ``"fraction"`` of the AGN or its ``"width"``, by truth.
 
-    A step line for each set of bands; values beyond the bins are counted in the outermost ones.
+    Or of its ``"difference"`` to that of the first truth, by bin of redshift. A step line for each set of bands,
+    with median, scatter and, of redshifts, the share of outliers; values beyond the bins are counted in the
+    outermost ones.
     """
     values, bins, xlabel, true = _HISTOGRAMS[quantity]
-    truths = {truth_label(one): one for one in study.truths if one.sample.any()}
-    figure, axes = panels(truths, sharex=True)
+    shown = {truth_label(one): (one, (0, np.inf)) for one in study.truths if one.sample.any()}
+    if quantity == "difference":
+        one = study.truths[0]
+        labels = [f"{low:g} < z < {high:g}".removesuffix(" < inf") for low, high in REDSHIFT_BINS]
+        shown = {label: (one, span) for label, span in zip(labels, REDSHIFT_BINS, strict=True)}
+    figure, axes = panels(shown, sharex=True)
     ends = 0.5 * (bins[[0, -2]] + bins[[1, -1]])
     for title, ax in axes.items():
-        one = truths[title]
-        for (name, label), (color, _) in zip(_both(one).items(), STYLES, strict=False):
-            inside = np.clip(values(one, name), *ends)
-            style = {"histtype": "step", "color": color, "lw": 1.6}
-            ax.hist(inside[np.isfinite(inside)], bins, label=label, **style)
+        one, (low, high) = shown[title]
+        inside = (one.true("redshift") >= low) & (one.true("redshift") < high)
+        for k, (name, label) in enumerate(_both(one).items()):
+            some = values(one, name)[inside]
+            some = some[np.isfinite(some)]
+            color = STYLES[k][0]
+            ax.hist(np.clip(some, *ends), bins, label=label, histtype="step", color=color, lw=1.6)
+            if some.size:
+                note = f"{np.median(some):.3f} ± {sigma_mad(some):.3f}"
+                if quantity == "redshift":
+                    note += f"\n{100 * outlier_share(some):.1f} % outliers"
+                # away from the truth
+                x, side = (0.03, "left") if (true(one) or 0) > 0.5 else (0.97, "right")
+                at = {"transform": ax.transAxes, "va": "top", "ha": side, "fontsize": 7.5}
+                ax.text(x, 0.97 - 0.2 * k, note, color=color, **at)
         if true(one) is not None:
             ax.axvline(true(one), color=TRUE, lw=1, ls="--", label="truth")
-        ax.set_xlim(bins[0], bins[-1])
-        legend(ax)
+        # space for the numbers
+        ax.set(xlim=(bins[0], bins[-1]), ylim=(0, 1.3 * ax.get_ylim()[1]))
     label_outer(axes, xlabel, "sources")
+    handles = next(iter(axes.values())).get_legend_handles_labels()
+    figure.legend(*handles, loc="outside upper left", ncols=3, fontsize=8, frameon=False)
     return figure
 
 
@@ -109,39 +165,6 @@ def redshift_figure(fits):
         plot_redshifts(true, table["redshift_mean"], z_err=table["redshift_std"], ax=ax)
         ax.set_title(title)
     label_outer(axes)
-    return figure
-
-
-def fraction_bins_figure(study):
-    """Median and scatter of fitted against injected fracAGN, by bin of redshift."""
-    truths = [one for one in study.truths if one.frac_agn is not None and one.sample.any()]
-    names, values = _both(truths[0]), {}
-    for low, high in REDSHIFT_BINS:
-        title = f"{low:g} < z < {high:g}" if np.isfinite(high) else f"z > {low:g}"
-        for name in names:
-            rows = []
-            for one in truths:
-                z = one.true("redshift")
-                found = one.fitted(name, "frac_agn_mean")[(z >= low) & (z < high)]
-                found = found[np.isfinite(found)]
-                # a scatter of fewer says nothing
-                if found.size >= FEWEST:
-                    rows.append((one.frac_agn, np.median(found), sigma_mad(found)))
-            if rows:
-                values.setdefault(title, {})[names[name]] = np.transpose(rows)
-    figure, axes = panels(values, height=3.1, sharex=True, sharey=True)
-    for title, ax in axes.items():
-        ax.plot([0, 1], [0, 1], color=TRUE, lw=1)
-        count = len(values[title])
-        for k, (label, (true, median, scatter)) in enumerate(values[title].items()):
-            color, marker = STYLES[k]
-            # side by side, so that the bars do not cover each other
-            place = true + 0.015 * (k - 0.5 * (count - 1))
-            style = {"fmt": marker, "ms": 4.5, "color": color, "lw": 1.2}
-            ax.errorbar(place, median, scatter, label=label, **style)
-        ax.set(xlim=(-0.07, 1.07), ylim=(-0.12, 1.12))
-        legend(ax, loc="upper left")
-    label_outer(axes, "injected fracAGN", "fitted fracAGN")
     return figure
 
 
@@ -165,7 +188,7 @@ def disk_figure(study):
             values[truth_label(one)] = (true[good], fitted[good], note)
     if not values:
         return None
-    figure, axes = panels(values, height=3.3, sharex=True, sharey=True)
+    figure, axes = panels(values, height=2.7, sharex=True, sharey=True)
     every = np.concatenate([v for true, fitted, _ in values.values() for v in (true, fitted)])
     ends = np.percentile(every, [0.5, 99.5]) * [0.5, 2]
     for label, ax in axes.items():
@@ -196,7 +219,7 @@ def xray_figure(study, seed):
     ends = np.percentile(values[good], [0.5, 99.5])
     bins = np.arange(np.floor(4 * ends[0]) / 4, np.ceil(4 * ends[1]) / 4 + 0.01, 0.25)
     table = completeness(values, found, bins)
-    figure, axes = new_figure(2, 1, size=(7.0, 2.6), sharex=True, height_ratios=(1.5, 1))
+    figure, axes = new_figure(2, 1, size=(7.0, 2.2), sharex=True, height_ratios=(1.5, 1))
     upper, lower = axes[:, 0]
     upper.stairs(table["n"], bins, color=TRUE, lw=1.6, label="all")
     upper.stairs(table["n_found"], bins, color=MEASURED, fill=True, alpha=0.35, label="found")
@@ -234,7 +257,7 @@ def detection_figure(study):
             groups["MIPS 24 µm above its limit"] = ab_magnitude(table["mips.24"]) < MIPS_LIMIT
     z, power = np.asarray(table["redshift"], float), table["ir_luminosity"].to_value(u.Lsun)
     good = one.field & (power > 0) & np.isfinite(z)
-    figure, axes = new_figure(size=(7.0, 4.4))
+    figure, axes = new_figure(size=(7.0, 3.8))
     ax = axes[0, 0]
     rest = good & ~np.any(list(groups.values()), axis=0)
     ax.semilogy(z[rest], power[rest], ".", ms=4, color="0.75", label="not detected", zorder=1)
@@ -281,72 +304,30 @@ def shape_figure(study):
     return figure
 
 
-def class_figure(table):
+def class_figure(tables):
     """
-    Shares of the sources of each true class that are found in each class.
+    Shares of the sources of each true class that are found in each class, a panel for each set of bands.
 
-    ``table`` is one of `~miricigale.evaluation.study_confusion`.
+    ``tables`` are of `~miricigale.evaluation.study_confusion`, by the title of the panel.
     """
-    found = [name for name in CLASS_COLUMNS if name in table.colnames]
-    table = table[table["n"] > 0]
-    counts = np.transpose([table[name] for name in found])
-    total = counts.sum(axis=1, keepdims=True)
-    share = np.divide(counts, total, out=np.zeros(counts.shape), where=total > 0)
-    figure, axes = new_figure(size=(1.3 + 1.1 * len(found), 1.0 + 0.8 * len(table)))
-    ax = axes[0, 0]
-    ax.imshow(share, cmap="Oranges", vmin=0, vmax=1.2, aspect="auto")
-    for (i, j), value in np.ndenumerate(share):
-        text = f"{100 * value:.0f} %\n{counts[i, j]}"
-        ax.text(j, i, text, ha="center", va="center", fontsize=9)
-    for axis, label, names in (
-        (ax.xaxis, "found as", found),
-        (ax.yaxis, "true class", table["class"]),
-    ):
-        axis.set_ticks(range(len(names)), [class_label(name) for name in names])
-        axis.set_label_text(label)
-    ax.tick_params(length=0)
-    ax.spines[:].set_visible(False)
-    return figure
-
-
-def color_figure(study, shares):
-    """
-    Two colors of the fitted sources in each range of redshifts, with circles about the AGN.
-
-    ``shares`` are true AGN shares of the 5-15 um light by name of the truth, of all sources; None if no
-    range has an AGN.
-    """
-    share = np.concatenate([shares[one.name] for one in study.truths])
-    redshift = np.concatenate([np.asarray(one.truth["redshift"], float) for one in study.truths])
-    sample = np.concatenate([one.sample for one in study.truths]) & np.isfinite(share)
-    planes = {}
-    for window in COLOR_WINDOWS:
-        colors = np.concatenate([window.colors(one.matched) for one in study.truths])
-        rows = sample & (redshift >= window.z_low) & (redshift < window.z_high)
-        rows &= np.isfinite(colors).all(axis=1)
-        classes = classify(share[rows], limits=KIRKPATRICK_LIMITS)
-        if CLASS_NAMES[2] in classes:
-            title = f"{window.z_low:g} < z < {window.z_high:g}"
-            planes[title] = (window, colors[rows], classes)
-    if not planes:
-        return None
-    from matplotlib.patches import Circle
-
-    figure, axes = panels(planes, height=3.4)
-    for title, ax in axes.items():
-        window, colors, classes = planes[title]
-        labels = {class_label(name): name for name in classes.tolist()}
-        for label, (color, marker) in zip(sorted(labels), STYLES, strict=False):
-            rows = classes == labels[label]
-            ax.plot(*colors[rows].T, marker, ms=3.5, color=color, alpha=0.55, label=label)
-        circles = ColorCircles.fit(colors, classes)
-        for radius, line in ((circles.inner, "-"), (circles.outer, "--")):
-            style = {"fill": False, "color": "black", "lw": 1.3, "ls": line, "zorder": 5}
-            ax.add_patch(Circle(circles.center, radius, **style))
-        xlabel, ylabel = (f"log {band_label(a)} / {band_label(b)}" for a, b in (window.x, window.y))
-        ax.set(xlabel=xlabel, ylabel=ylabel)
-        ax.set_aspect("equal", adjustable="datalim")
-    legend(axes[next(iter(planes))], loc="upper left")
+    figure, axes = new_figure(1, len(tables), size=(WIDTH / 2, 3.4), sharey=True)
+    for ax, (title, table) in zip(axes[0], tables.items(), strict=True):
+        found = [name for name in CLASS_COLUMNS if name in table.colnames]
+        table = table[table["n"] > 0]
+        counts = np.transpose([table[name] for name in found])
+        total = counts.sum(axis=1, keepdims=True)
+        share = np.divide(counts, total, out=np.zeros(counts.shape), where=total > 0)
+        ax.imshow(share, cmap="Oranges", vmin=0, vmax=1.2, aspect="auto")
+        for (i, j), value in np.ndenumerate(share):
+            text = f"{100 * value:.0f} %\n{counts[i, j]}"
+            ax.text(j, i, text, ha="center", va="center", fontsize=9)
+        for axis, names in ((ax.xaxis, found), (ax.yaxis, table["class"])):
+            axis.set_ticks(range(len(names)), [class_label(name) for name in names])
+        ax.tick_params(length=0)
+        ax.spines[:].set_visible(False)
+        ax.set_title(title, fontsize="medium")
+        ax.set_xlabel("found as")
+    axes[0, 0].set_ylabel("true class")
     return figure
 
 

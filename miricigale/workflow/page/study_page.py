@@ -43,20 +43,20 @@ class StudyPage(DeclaredPage):
         The same.
     metrics : dict
         Plain numbers of the field, the bands and the fits (``report/metrics.json``).
-    shares : dict of str to `~numpy.ndarray`
-        True AGN shares of the 5-15 um light of all sources by truth, empty without AGN.
+    kernels : dict of str to `~miricigale.psf.MatchingKernel`
+        With their PSFs, by band.
     model : `~miricigale.sed.SEDModel`
         That of the fits.
     area : `~astropy.units.Quantity`
         Solid angle of the imaged field.
     """
 
-    def __init__(self, report, context, every, study, metrics, shares, model, area):
+    def __init__(self, report, context, every, study, metrics, kernels, model, area):
         super().__init__(report, context)
         self.every, self.study, self.first = every, study, study.truths[0]
         self.tables = every[self.first.name]
         self.bands = self.config.exposures.filters
-        self.metrics, self.shares, self.model, self.area = metrics, shares, model, area
+        self.metrics, self.kernels, self.model, self.area = metrics, kernels, model, area
 
     @functools.cached_property
     def facts(self):

@@ -11,7 +11,7 @@ from miricigale.workflow.stages.sample import SampleFlags
 class ConditionFlags(Flags):
     """Conditions of a source, or a detection, in a band; those of Yang et al. 2021 and doubtful matches."""
 
-    #: More than a tenth of its light falls off the image.
+    #: More than a tenth of its light falls off the image or its footprint.
     EDGE = 1
     #: A neighbor within 2 arcsec is brighter than its magnitude plus one.
     CROWDED = 2

@@ -8,6 +8,7 @@ from miricigale.evaluation import (
     photoz_metrics,
     recovery_metrics,
 )
+from miricigale.fitting import GridSettings
 from miricigale.pages import sentence
 from miricigale.photometry.surveys import HERSCHEL_DEPTHS
 from miricigale.utils.tables import described_rows
@@ -21,6 +22,8 @@ from miricigale.workflow.truths import study_truths
 
 #: Most sources of each truth that are fitted with a freed torus.
 N_FREE = 100
+#: Error of the light of AGN in the fits between the nodes.
+AGN_ERROR = 0.3
 #: Parameters whose posteriors are ranked.
 RANKED = ("redshift", "frac_agn")
 #: What Yang et al. 2021 fix, freed; the fixed values (70 deg, 1, 1) are nodes or within. To stay below
@@ -54,6 +57,8 @@ def _experiment_plan(config, unit):
     plan = {"axes": plain_axes(experiment_axes(name, config.fit.axes))}
     if name == "free_agn":
         plan["n"] = N_FREE
+    elif name == "between":
+        plan["agn_error"] = AGN_ERROR
     elif name == "far_infrared":
         plan["depths"] = dict(HERSCHEL_DEPTHS)
     return plan
@@ -104,6 +109,8 @@ def fit_experiment(context, unit):
         redshift = np.asarray(sample["redshift"], float)
     elif name == "no_model_error":
         options["model_error"] = 0.0
+    elif name == "between":
+        options["settings"] = GridSettings(agn_error=AGN_ERROR)
     results = fit_mock(context, mock, bands, redshift=redshift, **options)
     context.save_result(f"{of}/experiments/{name}.fits", results)
     context.save_table(f"{of}/experiments/{name}.ecsv", _ranked(results, sample, context.seed))
@@ -192,6 +199,10 @@ def write_experiments(page, every):
     numbers = described_rows([(*row, *values.values()) for *row, values in rows], texts)
     declared = texts_of("experiments")
     sentences = " ".join(declared["sentences"][name] for name in names)
-    page.numbers("experiments", numbers, sentences=sentence(sentences, {"n_free": N_FREE}))
+    page.numbers(
+        "experiments",
+        numbers,
+        sentences=sentence(sentences, {"n_free": N_FREE, "agn_error": AGN_ERROR}),
+    )
     labels = declared["labels"]
     page.table("table", [dict(row) | {"fit": labels[row["experiment"]]} for row in numbers])

@@ -152,9 +152,11 @@ def _content(source):
 )
 def make_catalog(context, _):
     """Stage 1: read the catalog and cut it at the faint limit."""
-    options = context.config.catalog
-    prior = context.config.highres.filter
-    context.save_table("catalog.ecsv", bright_sources(study_catalog(options), options, prior))
+    options, prior = context.config.catalog, context.config.highres.filter
+    catalog = study_catalog(options)
+    chosen = bright_sources(catalog, options, prior)
+    chosen.meta["n_sources"] = len(catalog)
+    context.save_table("catalog.ecsv", chosen)
 
 
 def bright_sources(catalog, options, prior):

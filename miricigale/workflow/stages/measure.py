@@ -34,7 +34,7 @@ def make_templates(context, _):
 @stage(
     "photometry",
     "forced photometry",
-    version=5,
+    version=6,
     needs=("mosaics", "highres", "kernels", "templates"),
     sections=(*KERNEL, "photometry.method"),
     resources=IMAGE_RESOURCES,

@@ -10,6 +10,7 @@ from miricigale.instrument import mosaic_wcs, tangent_offset
 from miricigale.utils.random import text_key
 from miricigale.utils.tables import error_column, match_sky
 from miricigale.workflow.engine.stage import stage
+from miricigale.workflow.page.labels import end_bands
 from miricigale.workflow.stages.exposures import (
     EXPOSURE_RESOURCES,
     IMAGES,
@@ -60,7 +61,7 @@ def point_catalog(exposure, band_flux, prior, *, spacing, seed):
 @stage(
     "points",
     "point sources",
-    version=7,
+    version=8,
     needs=("kernels",),
     sections=(*IMAGES, "highres", *DETECTION, "photometry.method", "point_sources"),
     resources=EXPOSURE_RESOURCES,
@@ -106,3 +107,5 @@ def measure_point_sources(context, name):
         )
     table.meta.update(factors)
     context.save_table(f"points/{name}.ecsv", table)
+    if name in end_bands(config.exposures.filters):
+        context.save_image(f"points/{name}_mosaic.fits", mosaic)

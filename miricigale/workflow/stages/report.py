@@ -9,6 +9,7 @@ import numpy as np
 from miricigale import sed
 from miricigale.evaluation import study_numbers
 from miricigale.pages import Page
+from miricigale.psf import MatchingKernel
 from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.page import paper
 from miricigale.workflow.page.image_sections import (
@@ -47,7 +48,7 @@ _MEASURED = ("highres", "photometry", "errors", "fit", "point_sources", "perturb
 @stage(
     "report",
     "report",
-    version=7,
+    version=9,
     needs=(*_IMAGES, *_TABLES),
     sections=("run.name", "catalog", "sed", *IMAGES, *_MEASURED, "report"),
     resources=lambda: (*sed_resources(), *EXPOSURE_RESOURCES),
@@ -66,13 +67,13 @@ def make_report(context, _):
     tables = {name: every[name] for name in known}
     others = rivals.read_rivals(context)
     study = paper.study_results(config, known, tables, metrics)
-    shares = paper.agn_shares(study, model)
-    extra = paper.extra_numbers(study, metrics, shares, context.seed)
+    kernels = {n: MatchingKernel.read(context.path(f"kernel_{n}.fits")) for n in bands}
+    extra = paper.extra_numbers(study, metrics, kernels)
     extra |= rivals.source_extractor_numbers(others, context.seed)
     study = dataclasses.replace(study, extra=extra)
     numbers = study_numbers(study, seed=context.seed, n_draws=300)
     context.save_table("report/numbers.ecsv", numbers)
-    numbers = whole_sample(numbers)
+    binned, numbers = numbers, whole_sample(numbers)
     metrics["truths"] = {
         name: truth_metrics(truth, tables[name], numbers, bands) for name, truth in known.items()
     }
@@ -87,11 +88,10 @@ def make_report(context, _):
             f"{metrics['n_field']} galaxies in {field_text(config)}, injected fracAGN "
             f"{', '.join(map(str, config.sed.frac_agn))}, seed {context.seed}"
         ),
-        notices=stand_ins(config, model),
         dpi=config.report.dpi,
     )
-    page = StudyPage(report, context, tables, study, metrics, shares, model, area)
-    write_summary(page, truths)
+    page = StudyPage(report, context, tables, study, metrics, kernels, model, area)
+    write_summary(page, truths, numbers, stand_ins(config, model))
     write_exposures(page)
     write_images(page, mosaics)
     write_detections(page)
@@ -101,7 +101,7 @@ def make_report(context, _):
     calculator = {name: entry["etc_limit"] for name, entry in metrics["bands"].items()}
     matched = page.tables.matched
     switched = variants.write_variants(page, matched, calculator)
-    write_results(page, numbers)
+    write_results(page, numbers, binned)
     experiments.write_experiments(page, tables)
     reasons, sentences = paper.reasons_of(config, metrics, model)
     variants.add_reasons(reasons, switched, config)

@@ -11,6 +11,7 @@ from miricigale.pages import Missing, number
 from miricigale.utils.tables import described_rows, error_column
 from miricigale.workflow.derived import NO_SOURCE
 from miricigale.workflow.engine.stage import stage
+from miricigale.workflow.page.band_figures import rival_figure
 from miricigale.workflow.page.declared import texts_of
 from miricigale.workflow.page.labels import band_label
 from miricigale.workflow.stages.conditions import ConditionFlags
@@ -171,9 +172,9 @@ def rival_counts(table):
     forced = field & np.isfinite(table[table.meta["method"]].value)
     blind = np.isfinite(table["source_extractor"].value)
     matched, missed = (int(np.count_nonzero(of)) for of in (field & blind, forced & ~blind))
-    counts = {"detected": int(table.meta["n_source_extractor"]), "matched": matched}
     return {
-        **{n: Estimate(float(k), k - np.sqrt(k), k + np.sqrt(k), k) for n, k in counts.items()},
+        "detected": Estimate.of_count(int(table.meta["n_source_extractor"])),
+        "matched": Estimate.of_count(matched),
         "missed": Estimate.of_fraction(missed, np.count_nonzero(forced)),
     }
 
@@ -208,7 +209,14 @@ def source_extractor_numbers(tables, seed):
         return {}
     table = tables[SE_BAND]
     numbers = rival_counts(table) | {"offset": _se_offset(table, seed)}
-    return {f"source_extractor.{name}": number for name, number in numbers.items()}
+    # errors of white noise in the paper's steps, as T-PHOT has them
+    flux, error = (table[name].value for name in ("yang2021", error_column("yang2021")))
+    bright = np.asarray(table["field"]) & (np.asarray(table["snr"], float) > 5)
+    pulls = np.abs((flux - table["flux_true"].value) / error)[bright]
+    white = bootstrap(lambda values: np.percentile(values, 99, axis=-1), pulls, seed=seed)
+    return {f"source_extractor.{name}": number for name, number in numbers.items()} | {
+        "errors.white": white
+    }
 
 
 def write_rivals(page, tables):
@@ -231,6 +239,8 @@ def write_rivals(page, tables):
             known = {"band": band_label(row["band"]), "above 5 sigma": row["n_group"]}
             pulls = number(row["pull_scatter"], ".1f", NO_SOURCE)
             bands.setdefault(row["band"], known).update({label: cell, f"pulls, {label}": pulls})
+    shown = SE_BAND if SE_BAND in tables else next(iter(tables))
+    page.figure("figure", rival_figure(tables[shown]), band=band_label(shown))
     page.table("groups", groups.values())
     page.table("bands", bands.values())
     rows = []

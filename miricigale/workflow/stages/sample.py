@@ -18,7 +18,7 @@ class SampleFlags(Flags):
     OUTSIDE_FIELD = 1
     #: A star.
     STAR = 2
-    #: No model SED (and so no flux) could be made.
+    #: No model SED could be made, and so no flux: it is on no image.
     NO_MODEL = 4
     #: Not found on the high-resolution image, or another source is nearer.
     NOT_MATCHED = 8
@@ -26,6 +26,8 @@ class SampleFlags(Flags):
     FEW_BANDS = 16
     #: Its redshift is outside of the grid of the fit.
     OUTSIDE_GRID = 32
+    #: A galaxy without a positive redshift, and so without a model.
+    NO_REDSHIFT = 64
 
 
 def values_at(sky, wcs, plane, *, off=0):
@@ -100,13 +102,15 @@ def add_selection(matched, truth, bands, *, inside, min_detected, redshifts):
     flags = np.zeros(len(matched), int)
     matched["n_detected"] = detected_bands(matched, bands)
     known = np.all([np.isfinite(matched[f"{name}_true"].value) for name in bands], axis=0)
+    redshift, star = np.asarray(truth["redshift"], float), np.asarray(truth["star"], bool)
     flags[~np.asarray(inside)] |= SampleFlags.OUTSIDE_FIELD
-    flags[np.asarray(truth["star"], bool)] |= SampleFlags.STAR
+    flags[star] |= SampleFlags.STAR
     flags[~known] |= SampleFlags.NO_MODEL
     flags[~matched["matched"]] |= SampleFlags.NOT_MATCHED
     flags[matched["n_detected"] < min_detected] |= SampleFlags.FEW_BANDS
-    redshift = np.asarray(truth["redshift"], float)
-    flags[~((redshift >= redshifts[0]) & (redshift <= redshifts[-1]))] |= SampleFlags.OUTSIDE_GRID
+    outside = (redshift < redshifts[0]) | (redshift > redshifts[-1])
+    flags[(redshift > 0) & outside] |= SampleFlags.OUTSIDE_GRID
+    flags[~(redshift > 0) & ~star] |= SampleFlags.NO_REDSHIFT
     matched["selection"] = flags
     matched["selection"].info.description = SampleFlags.describe()
 

@@ -42,6 +42,7 @@ FLAGS = {
 @stage(
     "sources",
     "source browser",
+    version=2,
     needs=("truth", "mosaics", "highres", "photometry", "matches", "fits"),
     sections=(
         "run.name",

@@ -6,7 +6,13 @@ import numpy as np
 from astropy.table import QTable, hstack
 
 from miricigale import fitting, sed
-from miricigale.evaluation import AGNPopulation, agn_fraction, main_sequence_dust
+from miricigale.evaluation import (
+    CEERS_DUST,
+    AGNPopulation,
+    agn_fraction,
+    ceers_dust,
+    main_sequence_dust,
+)
 from miricigale.photometry.kernel_files import file_place
 from miricigale.refdata.lookup import fingerprint
 from miricigale.utils.content import file_sha256
@@ -79,10 +85,16 @@ def galaxy_parameters(config, catalog, best, *, seed):
         ratio = np.where(usable, (measured / np.where(usable, fitted, 1 * fitted.unit)).value, 1.0)
         table["mass"] = table["mass"] * ratio
         table["prior_ratio"] = np.where(usable, ratio, np.nan)
-    if config.sed.infrared == "main-sequence":
-        light = model.fluxes(table, [prior])
+    if config.sed.infrared != "fit":
+        light, kind = model.fluxes(table, [prior]), model.component("dust").name
         light["redshift"] = table["redshift"]
-        table["dust_excess"] = main_sequence_dust(light, seed=seed)["dust_excess"]
+        if config.sed.infrared == "ceers":
+            excess = np.where(shown, 1.0, ceers_dust(light, kind, seed=seed)["dust_excess"])
+            if "pah_33" in model.parameters:
+                table["pah_33"] = np.where(shown, 1.0, CEERS_DUST[kind][5])
+        else:
+            excess = main_sequence_dust(light, seed=seed)["dust_excess"]
+        table["dust_excess"] = excess
     return table
 
 

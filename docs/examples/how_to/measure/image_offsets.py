@@ -9,6 +9,8 @@ measured and corrected in the fit.
 # %%
 # A simulated field. The WCS of F770W is wrong by 0.06 arcsec along x, and stretched.
 
+import warnings
+
 import astropy.units as u
 import matplotlib.pyplot as plt
 import numpy as np
@@ -29,10 +31,14 @@ galaxies = field.truth[field.truth["miri.f770w"] > 0.1 * u.uJy]
 templates = SourceTemplates.from_catalog(galaxies, template="sersic")
 
 # %%
-# ``max_shift`` fits one shift of the whole image; larger shifts are rejected.
+# A warning says how far the image lies from its templates. ``max_shift`` fits one shift of the whole image; larger
+# shifts are rejected.
 
 photometer = ForcedPhotometer(kernel)
-without = photometer.measure(image, templates=templates)
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    without = photometer.measure(image, templates=templates)
+print(caught[0].message)
 with_shift = photometer.replace(max_shift=0.3 * u.arcsec)
 shifted = with_shift.measure(image, templates=templates)
 print(f"shift (x, y): {shifted.shift.round(3)} +- {shifted.shift_err.round(3)}")

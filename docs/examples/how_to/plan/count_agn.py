@@ -69,6 +69,6 @@ ax.legend(fontsize="small", loc="upper left")
 plt.show()
 
 # %%
-# Whether a detected AGN is also recognized is a question for fits: ``miricigale plan --set agn.field=true`` gives
-# the number found times the purity. See :doc:`/method/populations` for the functions, and
+# Whether a detected AGN is also recognized is a question for fits: ``miricigale plan`` gives the number found and
+# the purity. See :doc:`/method/populations` for the functions, and
 # :doc:`/method/planning`.

@@ -55,6 +55,5 @@ plt.show()
 
 # %%
 # ``miricigale run`` writes such a forecast for each exposure before it is simulated, and ``miricigale plan``
-# counts the saturated sources of a plan (``saturates``, ``n_saturated`` of its table of exposures). See
-# :doc:`/method/planning` and
-# :doc:`/method/detector`.
+# counts the saturated sources of a plan (``saturates``, ``n_saturated`` of its table of exposures) and those that
+# have no flux for it (``n_missing``). See :doc:`/method/planning` and :doc:`/method/detector`.

@@ -7,9 +7,9 @@ redshifts and AGN fractions, and which finds more AGN in an hour of telescope ti
 """
 
 # %%
-# A plan draws galaxies of the bundled catalog, gives half of them an AGN, adds the noise of the exposures and
-# fits them, with and without MIRI. The numbers of sources are small here to be fast; take 500 or more. How many
-# AGN a real field holds needs ``{"agn": {"field": True}}`` in the overrides, and redshifts are restricted by
+# A plan draws galaxies of the bundled catalog, gives them AGN, adds the noise of the exposures and fits them, with
+# and without MIRI. By default the AGN are those of a real field, and 1000 sources or more are wanted. Here the
+# sources are few to be fast, with an AGN in every third. Redshifts are restricted by
 # ``{"sample": {"redshift": [1, 3]}}``.
 
 import matplotlib.pyplot as plt
@@ -25,6 +25,7 @@ exposures = {
 }
 overrides = {"exposures": exposures, "sample": {"n_sources": 120}}
 overrides["fit"] = {"axes": "quick"}
+overrides["agn"] = {"frac_agn": [0.0, 0.2, 0.4, 0.8], "shares": [6, 1, 1, 1]}
 planner = Planner(load_plan(overrides=overrides))
 plans = planner.compare()
 
