@@ -41,7 +41,7 @@ def explained(ours, theirs):
     if not theirs["verdict"].startswith("differs"):
         return "all"
     gone = (ours["ours"] - theirs["ours"]) / (ours["ours"] - ours["paper"])
-    return f"{100 * gone:.0f} %"
+    return f"{round(100 * gone)} %"
 
 
 def main():

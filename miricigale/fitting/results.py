@@ -375,7 +375,9 @@ class FitResults(FitRows):
         """
         edges, weights = self.distribution(name)
         first = np.full((*weights.shape[:-1], 1), 0.0 if name in self.axes else DERIVED_LEVELS[0])
-        return edges, np.concatenate([first, first + np.cumsum(weights, axis=-1)], axis=-1)
+        # rounding may lift a sum above 1
+        levels = np.minimum(first + np.cumsum(weights, axis=-1), 1.0)
+        return edges, np.concatenate([first, levels], axis=-1)
 
     @property
     def redshift_odds(self):

@@ -117,6 +117,12 @@ def test_tables_files_and_views(results, tmp_path):
         values, levels = results[0].cdf(name)
         middle = np.interp(0.5, levels, values.value)
         assert results[0].percentile(name, 0.5).value == pytest.approx(middle, rel=1e-9)
+    # weights that add up to 1 + 2e-16
+    draws = np.random.default_rng(0).random((1000, results.pdf["redshift"].shape[1]))
+    draws /= draws.sum(axis=1, keepdims=True)
+    draws = draws[np.cumsum(draws, axis=1)[:, -1] > 1][: len(results)]
+    lifted = results[: len(draws)]._changed(pdf=results[: len(draws)].pdf | {"redshift": draws})
+    assert lifted.cdf("redshift")[1].max() == 1
     results.write(tmp_path / "r.fits")
     again = FitResults.read(tmp_path / "r.fits")
     assert again.intensive == ("a_v", "u_v", "beta", "age_mass", "frac_agn_ir")
