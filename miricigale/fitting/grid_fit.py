@@ -93,6 +93,8 @@ class GridFit:
             raise argument_error("axes", "None when 'model' is a ModelGrid", "a value")
         elif not isinstance(model, ModelGrid):
             raise argument_error("model", "a ModelGrid or an SEDModel", type(model).__name__)
+        if settings.agn_error and compat:
+            raise argument_error("agn_error", "0 with 'compat'", f"{settings.agn_error}")
         if outliers is not None and compat:
             raise argument_error("outliers", "None with 'compat'", f"{outliers}")
         if calibration is not None:

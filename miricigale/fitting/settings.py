@@ -51,7 +51,8 @@ class GridSettings:
     agn_error : float, optional
         With ``interpolate``: error of the light of AGN as a part of it. In each band it counts by the share that
         the AGN has of a model, of the measured flux, beside all other errors; best models and evidences are
-        without it. The shapes of tori are known less well than those of galaxies: 0.3 where AGN outshine them.
+        without it, and so are grids of templates, which have no AGN. The shapes of tori are known less well than
+        those of galaxies: 0.3 where AGN outshine them.
 
     Raises
     ------

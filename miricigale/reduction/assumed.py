@@ -124,18 +124,19 @@ def brightness_of(reducer, rate):
     """
     facts = ImageFacts.of(rate)
     if reducer.references == "simulated" or (reducer.references is None and facts.simulated):
-        detector = reducer.detector
+        detector, flattened = reducer.detector, "flat" in facts.steps
         flat = flat_field(facts.filter, subarray=facts.subarray)
         if facts.ipc:
             # blurred as the image is: a uniform sky comes out uniform
             flat = convolve(flat, np.asarray(detector.ipc_kernel, np.float32), mode="nearest")
         values = {
             "dark": 0.0 if "dark" in facts.steps else detector.dark_current / detector.gain,
-            "flat": flat,
+            "flat": 1.0 if flattened else flat,
             "conversion": photmjsr(facts.filter, gain=detector.gain)
             / detector.relative_response(facts.filter, facts.subarray),
         }
-        used = {"flat": f"flat field {_OWN}", "photom": f"conversion {_OWN}"}
+        flat = "done before" if flattened else f"flat field {_OWN}"
+        used = {"flat": flat, "photom": f"conversion {_OWN}"}
         return values, {f"reference_{name}": text for name, text in used.items()}
     exposure = Exposure(
         facts.filter if facts.filter.startswith("miri.") else f"miri.{facts.band}",

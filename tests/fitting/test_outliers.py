@@ -173,3 +173,5 @@ def test_what_makes_no_sense_is_refused(grid):
     for given, text in ((1.0, "below 1"), (-0.1, "not negative"), ({"band": 0.1}, "keys among")):
         refuses(f"outliers.*{text}", BayesFitter, grid, outliers=given)
     refuses("outliers.*compat", BayesFitter, grid, outliers=0.1, compat="cigale")
+    given = {"settings": GridSettings(agn_error=0.3), "compat": "cigale"}
+    refuses("agn_error.*compat", BayesFitter, grid, **given)

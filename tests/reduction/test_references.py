@@ -12,6 +12,7 @@ from helpers.references import nameless, write_photom, write_reference
 from miricigale.detector import CosmicRays, Detector, InterpixelCapacitance, Ramp, ResetAnomaly
 from miricigale.instrument import DQ, field_mask, flat_field, miri_detector, photmjsr
 from miricigale.reduction import RampSettings, Reducer, ReferenceFiles
+from miricigale.reduction.images import with_data
 from miricigale.reduction.reference_maps import read_photom
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
 
@@ -223,6 +224,12 @@ def test_what_was_done_to_a_simulated_ramp_is_not_done_twice(exposure):
     assert abs(rest.data[100, 110] + dark - whole.data[100, 110]) < 4 * error
     calibrated = [Reducer(**settings).calibrate(one).data[both] for one in (whole, rest)]
     assert np.nanmedian(calibrated[1] / calibrated[0]) == pytest.approx(1, abs=2e-4)
+    # nor is a flat field divided by twice
+    flat = flat_field(exposure.filter, subarray=exposure.subarray)
+    flattened = with_data(rest, rest.data / flat, steps=[*rest.meta["steps"], "flat"])
+    again = Reducer(**settings).calibrate(flattened)
+    assert again.meta["reference_flat"] == "done before"
+    assert_allclose(again.data[both], calibrated[1], rtol=1e-5)
 
 
 def test_files_for_something_else_are_refused(exposure, real, references, data_file, tmp_path):
