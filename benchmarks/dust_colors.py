@@ -38,8 +38,9 @@ from miricigale.workflow.stages.truth import galaxy_parameters
 BANDS = [f"miri.f{n}w" for n in (560, 770, 1000, 1280, 1500, 1800)]
 ALPHA, EXCESS = np.linspace(1.5, 2.5, 5), np.linspace(-2.5, 2.0, 91)
 ERRORS, SCATTER, WRONG = 4.0, 0.12, 0.05
-#: log10 of stellar masses between which the mean excess rises, and least share of the dust in a flux.
-MASSES, DUSTY = (8.5, 10.3), 0.4
+#: log10 of stellar masses between which the mean rises, of specific star-formation rates, and least share of the
+#: dust in a flux.
+MASSES, RATES, DUSTY = (8.5, 10.3), (-12.0, -8.0), 0.4
 #: Fluxes (uJy) above which sources are counted.
 LEAST = (0.1, 0.2, 1.0, 10.0)
 SEDS = SimpleNamespace(axes="galaxy", catalog_error=0.05, max_wavelength=3.0)
@@ -74,7 +75,10 @@ class Sources:
             light[0],
             np.array(light[1:]).transpose(1, 2, 0) - light[0][..., None],
         )
-        self.mass = np.log10(got["stellar_mass"].value)
+        self.mass, balance = (np.log10(got[n].value) for n in ("stellar_mass", "dust_luminosity"))
+        self.balance = balance - np.log10(u.Lsun.to(u.W)) - self.mass
+        rate = np.log10(np.maximum(got["sfr_100myr"].value, 1e-9)) - self.mass
+        self.rate = np.clip(rate, *RATES)
         self.passive = uvj_quiescent(got["u_v"], got["v_j"], np.asarray(table["redshift"], float))
         self.library = model.component("dust").name
 
@@ -100,35 +104,35 @@ class Sources:
         return out
 
 
-def log_weights(values, mass, passive):
-    """Of each excess, shape (n, excess), for values as in CEERS_DUST but the last."""
-    mean = np.where(
-        passive, values[3], values[0] + values[1] * (np.clip(mass, *MASSES) - MASSES[1])
-    )
-    width = np.where(passive, values[4], values[2])
+def log_weights(values, sources, rows):
+    """Of each excess, shape (n, excess), for values as in CEERS_DUST but the last two."""
+    mass, passive = np.clip(sources.mass[rows], *MASSES) - MASSES[1], sources.passive[rows]
+    forming = values[0] + values[1] * mass + values[2] * (sources.rate[rows] + 9.3)
+    mean = np.where(passive, values[4], forming - sources.balance[rows])
+    width = np.where(passive, values[5], values[3])
     out = -0.5 * ((EXCESS - mean[:, None]) / width[:, None]) ** 2
     return out - logsumexp(out, axis=1, keepdims=True)
 
 
-def measure(likelihood, mass, passive):
+def measure(likelihood, sources, rows):
     """Values, errors, and log likelihood; quiescent galaxies have a prior of 0.7 dex, within 30 %."""
 
-    def loss(v):
-        values = np.array([v[0], v[1], np.exp(v[2]), v[3], np.exp(v[4])])
-        each = likelihood + log_weights(values, mass, passive)[:, None] - np.log(ALPHA.size)
-        prior = 0.5 * ((v[4] - np.log(0.7)) / 0.3) ** 2 + 0.5 * (v[2] - np.log(0.3)) ** 2
-        return prior - logsumexp(each, axis=(1, 2)).sum()
+    def values_of(v):
+        return np.array([*v[:3], np.exp(v[3]), v[4], np.exp(v[5])])
 
-    found = minimize(loss, [0.0, 0.3, np.log(0.3), -0.7, np.log(0.7)], method="BFGS")
-    v, error = found.x, np.sqrt(np.diag(found.hess_inv))
-    width = np.exp(v[[2, 4]])
-    values = np.array([v[0], v[1], width[0], v[3], width[1]])
-    return values, error * [1, 1, width[0], 1, width[1]], -found.fun
+    def loss(v):
+        each = likelihood[rows] + log_weights(values_of(v), sources, rows)[:, None]
+        prior = 0.5 * ((v[5] - np.log(0.7)) / 0.3) ** 2 + 0.5 * (v[3] - np.log(0.3)) ** 2
+        return prior - logsumexp(each - np.log(ALPHA.size), axis=(1, 2)).sum()
+
+    found = minimize(loss, [0.7, 0.4, 0.5, np.log(0.3), -0.7, np.log(0.7)], method="BFGS")
+    values, error = values_of(found.x), np.sqrt(np.diag(found.hess_inv))
+    return values, error * [1, 1, 1, values[3], 1, values[5]], -found.fun
 
 
 def draws(sources, rows, values, n, rng):
     """log10 of fluxes drawn for some sources, shape (source, n, band)."""
-    weight = np.exp(log_weights(values, sources.mass[rows], sources.passive[rows]))
+    weight = np.exp(log_weights(values, sources, rows))
     models, out = sources.models()[rows], []
     for w, model in zip(weight, models, strict=True):
         excess = rng.choice(EXCESS.size, n, p=w / w.sum())
@@ -143,7 +147,7 @@ def report(sources, drawn, balance):
     seen = noisy > 5 * sources.error[:, None]
     good = sources.flux > 5 * sources.error
     plain = np.log10(balance.stars + balance.dust[..., ALPHA.size // 2])
-    print("band          n   offset +-    scatter  without noise  balance: offset scatter")
+    print("band          n   offset +-    scatter  without noise +-  balance: offset scatter")
     for i, band in enumerate(BANDS):
         rows = np.flatnonzero(good[:, i])
         # median of those that would have been seen
@@ -152,9 +156,10 @@ def report(sources, drawn, balance):
         off, old = flux[rows, i] - best, flux[rows, i] - plain[rows, i]
         noise = np.sqrt(np.mean((sources.error / sources.flux / np.log(10))[rows, i] ** 2))
         s = mad_std(off)
+        wide = np.std([mad_std(rng.choice(off, off.size)) for _ in range(300)])
         print(
             f"{band:11s} {off.size:4d} {np.median(off):+8.3f} {1.25 * s / np.sqrt(off.size):.3f} {s:8.3f} "
-            f"{np.sqrt(max(s**2 - noise**2, 0)):10.3f} {np.median(old):+16.3f} {mad_std(old):8.3f}"
+            f"{np.sqrt(max(s**2 - noise**2, 0)):10.3f} {wide:.3f} {np.median(old):+13.3f} {mad_std(old):8.3f}"
         )
     print("color           n   real: 16, 50, 84 %        drawn")
     for a, b in ((0, 1), (2, 3), (2, 4), (3, 4), (3, 5), (4, 5)):
@@ -232,9 +237,7 @@ def main():
             ("half 0", seen & (half == 0)),
             ("half 1", seen & (half == 1)),
         ):
-            values, error, best = measure(
-                likelihood[some], sources.mass[some], sources.passive[some]
-            )
+            values, error, best = measure(likelihood, sources, some)
             text = " ".join(f"{x:+.2f} +- {e:.2f}" for x, e in zip(values, error, strict=True))
             n = f"{some.sum():4d} sources, {sources.passive[some].sum()} quiescent"
             print(f"{label:7s} {n}: {text}; ln L {best:.1f}")
@@ -243,7 +246,7 @@ def main():
     rng, drawn = np.random.default_rng(1), np.zeros((len(table), 400, len(BANDS)))
     for h in (0, 1):
         others, rows = seen & (half != h), np.flatnonzero(half == h)
-        values, _, _ = measure(likelihood[others], sources.mass[others], sources.passive[others])
+        values, _, _ = measure(likelihood, sources, others)
         drawn[rows] = draws(sources, rows, values, 400, rng)
     report(sources, drawn, Sources(table, 1.0))
 

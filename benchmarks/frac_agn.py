@@ -154,6 +154,12 @@ CASES = {
     # between the nodes, with an error of the light of AGN
     "between": Case(interpolate=200),
     **{
+        f"agn-error-30-model-error-{100 * e:.0f}": Case(
+            interpolate=200, agn_error=0.3, model_error=e
+        )
+        for e in (0.02, 0.05)
+    },
+    **{
         f"agn-error-{100 * e:.0f}": Case(interpolate=200, agn_error=e) for e in (0.1, 0.2, 0.3, 0.5)
     },
 }

@@ -39,8 +39,9 @@ def main():
         overrides={
             "sample": {"n_sources": args.sources},
             "agn": {"frac_agn": 0.0},
-            # as in the run: two bands, and no noise beyond that of the simulation
-            "fit": {"min_detected": 2},
+            # as in the run: two bands, energy balance, and no noise beyond that of the simulation
+            "sed": {"infrared": "fit"},
+            "fit": {"min_detected": 2, "dust_excess": ()},
             "noise": {"excess": 1.0},
         }
     )

@@ -13,8 +13,8 @@ from miricigale.utils.exceptions import (
     data_error,
     warn,
 )
-from miricigale.utils.files import read_table
 from miricigale.utils.missing import negative_errors, plain_floats, without_codes
+from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU
 

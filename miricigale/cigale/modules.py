@@ -5,27 +5,13 @@ import numpy as np
 from astropy.table import QTable, Table
 
 from miricigale.cigale.ini import parse_values
-from miricigale.cigale.names import cigale_names
+from miricigale.cigale.names import DECLARED, cigale_names
 from miricigale.cigale.relation import N_DRAWS
 from miricigale.refdata import find_resource
 from miricigale.sed import components as c
 from miricigale.sed.xray_bands import ALPHA_OX
 from miricigale.utils.exceptions import ConfigError, config_error
-from miricigale.utils.files import read_table
-
-#: Parameters of CIGALE that do not change a model's spectrum here or there.
-_WITHOUT_EFFECT = {
-    "sfhdelayed": ("sfr_A", "normalise"),
-    "sfh2exp": ("sfr_0", "normalise"),
-    "sfhfromfile": ("normalise",),
-    "dustatt_calzleit": ("filters",),
-    "dustatt_modified_CF00": ("filters",),
-    "dustatt_modified_starburst": ("filters",),
-    "redshifting": ("redshift",),
-}
-
-#: Names of parameters in files of older versions, and those of today.
-_OLD_NAMES = {"sfhdelayed": {"age": "age_main"}}
+from miricigale.utils.table_files import read_table
 
 
 class Chain:
@@ -42,9 +28,10 @@ class Module:
 
     def __init__(self, name, values, chain, *, folder, libraries):
         self.name, self.chain, self.folder, self.libraries = name, chain, folder, libraries
-        old = {k: new for k, new in _OLD_NAMES.get(name, {}).items() if new not in values}
+        old = DECLARED["old_parameters"].get(name, {})
+        old = {key: new for key, new in old.items() if new not in values}
         self._values = {old.get(key, key): value for key, value in values.items()}
-        self._taken = set(_WITHOUT_EFFECT.get(name, ()))
+        self._taken = set(DECLARED["without_effect"].get(name, ()))
         self._lacking, self._factors = [], {}
 
     def label(self, key):

@@ -18,7 +18,8 @@ from miricigale.filters.filter_set import FilterSet
 from miricigale.fitting import BayesFitter, FitResults, GridSettings
 from miricigale.sed import SEDModel
 from miricigale.sed.xray_bands import with_xray_bands, xray_filter
-from miricigale.utils.exceptions import argument_error, config_error
+from miricigale.utils.exceptions import config_error
+from miricigale.utils.options import check_that
 from miricigale.utils.tables import require_columns
 
 
@@ -135,13 +136,11 @@ class CigaleSetup:
         """
         nodes = self.redshift
         if nodes is None:
-            if redshifts is None:
-                wanted = "given where the configuration lists no redshifts"
-                raise argument_error("redshifts", wanted, "None")
+            wanted = "given where the configuration lists no redshifts"
+            check_that(redshifts is not None, "redshifts", wanted, "None")
             nodes = self.rounded(redshifts)
             nodes = np.unique(nodes[np.isfinite(nodes)])
-            if not nodes.size:
-                raise argument_error("redshifts", "with a redshift >= 0", "none")
+            check_that(nodes.size, "redshifts", "with a redshift >= 0", "none")
         return self.parameters | {"redshift": nodes}
 
     def rounded(self, redshifts):
@@ -233,9 +232,8 @@ class CigaleSetup:
         """
         require_columns(photometry, ["id"], "photometry")
         have = [name for name in self.bands if name in photometry.colnames]
-        if not have:
-            wanted = f"a table with at least one of the columns {list(self.bands)}"
-            raise argument_error("photometry", wanted, f"columns {photometry.colnames}")
+        wanted = f"a table with at least one of the columns {list(self.bands)}"
+        check_that(have, "photometry", wanted, f"columns {photometry.colnames}")
         grid = self.grid([*have, *self.predicted], _column(photometry, "redshift"))
         options = {"model_error": self.additional_error} | options
         return BayesFitter(grid, have, compat=compat, **options)

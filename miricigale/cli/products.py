@@ -3,6 +3,8 @@
 import warnings
 from pathlib import Path
 
+from miricigale.utils.options import check_that
+
 
 def _readers():
     """Functions that read a product, the most particular first."""
@@ -10,7 +12,7 @@ def _readers():
     from miricigale.photometry import ErrorModel, ForcedPhotometryResult, read_mosaic
     from miricigale.psf import InstrumentPSF, MatchingKernel, read_psf
     from miricigale.reduction import open_exposure
-    from miricigale.utils.files import read_table
+    from miricigale.utils.table_files import read_table
 
     classes = (FitResults, ForcedPhotometryResult, MatchingKernel, InstrumentPSF, ErrorModel)
     yield from (cls.read for cls in classes)
@@ -93,12 +95,10 @@ def psf(args):
     from miricigale.photometry import MosaicFile
     from miricigale.photometry.kernel_files import image_psf
     from miricigale.psf import MODEL_FILTERS
-    from miricigale.utils.exceptions import argument_error
 
     made = image_psf(MosaicFile(args.image, filter=args.filter, pa_aper=args.pa_aper))
-    if made is None:
-        wanted = f"an image of a filter with a model ({', '.join(MODEL_FILTERS)}) and its PA_APER"
-        raise argument_error("IMAGE", wanted, args.image)
+    wanted = f"an image of a filter with a model ({', '.join(MODEL_FILTERS)}) and its PA_APER"
+    check_that(made is not None, "IMAGE", wanted, args.image)
     made.write(args.output, overwrite=args.overwrite)
     print(f"{args.output}: FWHM {made.fwhm:.4f}, pixel {made.pixel_scale:.4f}")
     return 0

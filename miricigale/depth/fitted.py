@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter
 from miricigale.depth.noise import ExposureNoise, noise_power, pattern_amplitude
 from miricigale.psf import MIRI_PIXEL_SCALE, miri_psf, psf_image
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_positive
+from miricigale.utils.options import check_positive, check_that
 from miricigale.utils.units import ANGLE, positive, to_array
 
 #: Samples of a pixel's side, and pixels of the detector on which sources are weighed.
@@ -121,8 +121,7 @@ def fitted_noise(
     """
     seconds = positive(time, u.s, "time")
     for name, value in (("n_integrations", n_integrations), ("n_dithers", n_dithers)):
-        if int(value) != value or value < 1:
-            raise argument_error(name, "an integer of at least 1", value)
+        check_that(int(value) == value and value >= 1, name, "an integer of at least 1", value)
     step = float(to_array(frame_time, u.s, "frame_time"))
     n_frames = int(seconds / n_integrations / step * (1 + 1e-9))
     if n_frames < 2:
@@ -156,8 +155,7 @@ def fitted_noise(
 
 def _pixels(angle, name):
     value = float(to_array(angle, ANGLE, name)) / u.Quantity(MIRI_PIXEL_SCALE, ANGLE).value
-    if not 0 < value < 5:
-        raise argument_error(name, "positive and below 0.5 arcsec", angle)
+    check_that(0 < value < 5, name, "positive and below 0.5 arcsec", angle)
     return value
 
 
@@ -168,7 +166,6 @@ def _share(filter, psf, size):
     psf = miri_psf(filter) if psf is None else psf
     share = psf_image(psf, pixel_scale=pixel, shape=n + 1 - n % 2) * _SAMPLES**2
     width = float(to_array(size, ANGLE, "size"))
-    if not width >= 0:
-        raise argument_error("size", "at least 0", size)
+    check_that(width >= 0, "size", "at least 0", size)
     width = width / np.sqrt(8 * np.log(2)) / pixel.value
     return gaussian_filter(share, width) if width > 0 else share

@@ -13,7 +13,7 @@ from miricigale.instrument import frame_time, imager_filters
 from miricigale.psf import MIRI_PIXEL_SCALE, instrument_psf, miri_psf, psf_image
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
-from miricigale.utils.options import check_least, check_positive
+from miricigale.utils.options import check_least, check_positive, check_that
 from miricigale.utils.units import ANGLE, SURFACE_BRIGHTNESS, TIME, to_array
 
 # positions of the source's center within the pixel, per axis, over which is averaged
@@ -42,14 +42,12 @@ def _radii(aperture, annulus, setup):
     """Radii in arcsec, checked."""
     radius = setup.radius if aperture is None else aperture
     radius = float(to_array(radius, ANGLE, "aperture", ndim=0, finite=True))
-    if not 0 < radius < 8:
-        raise argument_error("aperture", "between 0 and 8 arcsec", aperture)
+    check_that(0 < radius < 8, "aperture", "between 0 and 8 arcsec", aperture)
     if annulus is None:
         return radius, None
     edges = to_array(annulus, ANGLE, "annulus", ndim=1, finite=True)
-    if edges.size != 2 or not radius <= edges[0] < edges[1] <= 10:
-        wanted = "an inner and outer radius outside the aperture, up to 10 arcsec"
-        raise argument_error("annulus", wanted, annulus)
+    wanted = "an inner and outer radius outside the aperture, up to 10 arcsec"
+    check_that(edges.size == 2 and radius <= edges[0] < edges[1] <= 10, "annulus", wanted, annulus)
     return radius, (float(edges[0]), float(edges[1]))
 
 
@@ -175,11 +173,9 @@ def aperture_noise(
     check_positive(n_sigma, "n_sigma")
     check_least(n_dithers, "n_dithers", 1)
     check_least(groups, "n_groups", 2, whole=True)
-    if not 0 <= correlation <= 30:
-        raise argument_error("correlation", "from 0 to 30 pixels", correlation)
-    if seconds < groups * step * (1 - 1e-9):
-        wanted = f"at least one integration of {groups} groups, {groups * step:.4g} s"
-        raise argument_error("time", wanted, time)
+    check_that(0 <= correlation <= 30, "correlation", "from 0 to 30 pixels", correlation)
+    wanted = f"at least one integration of {groups} groups, {groups * step:.4g} s"
+    check_that(seconds >= groups * step * (1 - 1e-9), "time", wanted, time)
     noise = ExposureNoise(
         filter=filter,
         background=background,
@@ -196,8 +192,7 @@ def aperture_noise(
 
     psf = miri_psf(filter) if psf is None else psf
     light, white, shot, pattern = _extraction(radius, edges, psf, correlation, filter)
-    if not light > 0:
-        raise argument_error("annulus", "such that light of the source is left", annulus)
+    check_that(light > 0, "annulus", "such that light of the source is left", annulus)
     shot_noise = n_sigma**2 * growth * shot / (light**2 * electrons)
     white_noise = n_sigma**2 * variance * white / (light * electrons) ** 2
     residual_noise = (n_sigma * amplitude * sky / (light * electrons)) ** 2 * pattern / n_dithers
@@ -257,12 +252,7 @@ def sensitivity(filter, time=1e4 * u.s, *, n_sigma=10.0, residual=None, **option
 
 
 #: Columns of `sensitivity_table` by what `aperture_noise` calls them.
-_COLUMNS = {
-    "noise": "white",
-    "residual": "residual",
-    "limit_white": "flux_white",
-    "limit": "flux",
-}
+_COLUMNS = {"noise": "white", "residual": "residual", "limit_white": "flux_white", "limit": "flux"}
 
 
 def sensitivity_table(filters=None, time=1e4 * u.s, *, residual="etc", n_sigma=10.0, **options):

@@ -16,6 +16,7 @@ from miricigale.instrument import (
 )
 from miricigale.psf import MIRI_PIXEL_SCALE
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
 
 
@@ -70,10 +71,8 @@ class ExposureNoise:
             raise argument_error("detector", "a DetectorProperties", repr(detector))
         level = background_level(self.filter) if self.background is None else self.background
         value = float(to_array(level, SURFACE_BRIGHTNESS, "background", ndim=0, finite=True))
-        if value < 0:
-            raise argument_error("background", "at least 0", self.background)
-        object.__setattr__(self, "detector", detector)
-        object.__setattr__(self, "background", value * SURFACE_BRIGHTNESS)
+        check_that(value >= 0, "background", "at least 0", self.background)
+        self.__dict__.update(detector=detector, background=value * SURFACE_BRIGHTNESS)
 
     @property
     def rate(self):

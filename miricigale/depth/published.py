@@ -7,7 +7,8 @@ import numpy as np
 
 from miricigale.instrument import frame_time, imager_filters
 from miricigale.instrument.figures import filter_row, imager_filter, table
-from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.exceptions import unknown_name
+from miricigale.utils.options import check_that
 from miricigale.utils.units import to_array
 
 
@@ -156,8 +157,7 @@ def scaled_limit(filter, time, *, n_sigma=5.0, version="4.0"):
     0.301 uJy, 25.20 mag(AB)
     """
     seconds = to_array(time, u.s, "time")
-    if not np.all(seconds > 0):
-        raise argument_error("time", "positive", time)
+    check_that(np.all(seconds > 0), "time", "positive", time)
     return etc_limit(filter, version) * (n_sigma / 10) * np.sqrt(1e4 / seconds)
 
 

@@ -9,6 +9,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from miricigale.instrument import Exposure, electron_rate, miri_detector
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.tables import require_columns
 
 #: Share of the full well above which the sky is reported.
@@ -273,8 +274,7 @@ def forecast_table(forecasts):
     miri.f770w       50        1         1          15
     """
     forecasts = list(forecasts)
-    if not forecasts:
-        raise argument_error("forecasts", "at least one forecast", "none")
+    check_that(forecasts, "forecasts", "at least one forecast", "none")
     for one in forecasts:
         if not isinstance(one, SaturationForecast):
             raise argument_error("forecasts", "made of SaturationForecast", repr(one))

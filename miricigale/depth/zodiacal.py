@@ -12,8 +12,9 @@ from miricigale.filters import Filter
 from miricigale.instrument import background_level
 from miricigale.instrument.figures import filter_row, imager_filter
 from miricigale.refdata import locate
-from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.exceptions import unknown_name
 from miricigale.utils.optional import require
+from miricigale.utils.options import check_that
 from miricigale.utils.positions import as_position
 from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
 
@@ -91,8 +92,7 @@ def zodiacal_factor(filter, level="medium", *, position=None, date=None):
     if position is not None:
         position = as_position(position, "position")
     if date is not None:
-        if position is None:
-            raise argument_error("date", "given with a position", date)
+        check_that(position is not None, "date", "given with a position", date)
         return _factor_on(name, position, Time(date))
     if level not in zodiacal_levels():
         raise unknown_name("level of the zodiacal light", level, zodiacal_levels())
@@ -142,11 +142,9 @@ def sky_background(filter, level="low", *, position=None, date=None):
     if isinstance(level, u.Quantity):
         filter_row(filter)
         value = float(to_array(level, SURFACE_BRIGHTNESS, "level", ndim=0, finite=True))
-        if value < 0:
-            raise argument_error("level", "at least 0", level)
+        check_that(value >= 0, "level", "at least 0", level)
         for name, given in (("position", position), ("date", date)):
-            if given is not None:
-                raise argument_error(name, "left out with a surface brightness", given)
+            check_that(given is None, name, "left out with a surface brightness", given)
         return value * SURFACE_BRIGHTNESS
     if level == "low" and position is None and date is None:
         return background_level(filter)
@@ -159,9 +157,8 @@ def _factor_on(name, position, date):
     sun = get_sun(date)
     angle = position.separation(SkyCoord(sun.ra, sun.dec)).deg
     near, far = _FIELD_OF_REGARD
-    if not near <= angle <= far:
-        wanted = f"a day on which the position is {near:g} to {far:g} deg from the Sun"
-        raise argument_error("date", wanted, f"{date.isot[:10]} ({angle:.0f} deg)")
+    wanted = f"a day on which the position is {near:g} to {far:g} deg from the Sun"
+    check_that(near <= angle <= far, "date", wanted, f"{date.isot[:10]} ({angle:.0f} deg)")
     zodipy = require("zodipy", extra="background")
     place = SkyCoord(position.ra, position.dec, obstime=date)
     light = zodipy.Model(Filter.from_name(name).pivot).evaluate(place, obspos="semb-l2")

@@ -7,7 +7,7 @@ import numpy as np
 from miricigale.detector.effects.base import Timed
 from miricigale.detector.effects.readout import Bias, Nonlinearity, ReadNoise
 from miricigale.detector.effects.reset import FirstFrame, LastFrame, ResetAnomaly
-from miricigale.instrument import DetectorProperties, Exposure
+from miricigale.instrument import DetectorProperties, Exposure, ExposureHistory
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -68,6 +68,11 @@ class Charge(Timed):
     def shows(self, kind):
         """Whether an effect acted, as for `Ramp.shows`."""
         return self._effect(kind) is not None
+
+    @property
+    def history(self):
+        """The package's Detector collected it, and nothing was done to it since."""
+        return ExposureHistory(origin="simulated")
 
     @property
     def read_variance(self):

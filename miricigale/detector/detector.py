@@ -25,7 +25,7 @@ from miricigale.instrument import DetectorProperties, miri_detector
 from miricigale.utils.exceptions import DetectorWarning, argument_error, warn
 from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.meta import provenance
-from miricigale.utils.options import check_kind
+from miricigale.utils.options import check_kind, check_that
 from miricigale.utils.parallel import check_memory
 from miricigale.utils.random import check_seed
 from miricigale.utils.units import SURFACE_BRIGHTNESS
@@ -134,9 +134,8 @@ class Detector(Interactive):
         chain = list(self.effects)
         for effect in effects:
             place = place_of(effect)
-            if place is None:
-                wanted = "of the package's kinds (make a Detector of a tuple with any other)"
-                raise argument_error("effects", wanted, repr(effect))
+            wanted = "of the package's kinds (make a Detector of a tuple with any other)"
+            check_that(place is not None, "effects", wanted, repr(effect))
             chain = [e for e in chain if place_of(e) != place]
             after = [i for i, e in enumerate(chain) if (place_of(e) or 0) > place]
             chain.insert(after[0] if after else len(chain), effect)

@@ -8,6 +8,7 @@ from astropy.wcs.utils import proj_plane_pixel_area
 
 from miricigale.instrument import Exposure, ImageFacts
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
 
 # pixels by which the image may lie off the exposure
@@ -31,8 +32,7 @@ def checked_light(image, exposure):
         sky than the exposure, masked pixels, or values that are not finite or that are negative.
     """
     exposure = getattr(image, "exposure", None) if exposure is None else exposure
-    if not isinstance(exposure, Exposure):
-        raise argument_error("exposure", "an Exposure", type(exposure).__name__)
+    check_that(isinstance(exposure, Exposure), "exposure", "an Exposure", type(exposure).__name__)
     exposure.check_sky()
     if hasattr(image, "render"):
         image = image.render()
@@ -43,9 +43,8 @@ def checked_light(image, exposure):
         msg = f"'image' must be {wanted}, got {type(image).__name__}"
         raise TypeError(msg)
     masked = np.count_nonzero(image.mask)
-    if masked:
-        wanted = "without masked pixels, as each of them collects light"
-        raise argument_error("image", wanted, f"{masked} of them")
+    wanted = "without masked pixels, as each of them collects light"
+    check_that(not masked, "image", wanted, f"{masked} of them")
     if image.data.shape != exposure.shape:
         raise argument_error("image", f"of the exposure's shape {exposure.shape}", image.data.shape)
     facts = ImageFacts.of(image)
@@ -72,6 +71,5 @@ def _check_place(image, exposure):
     wanted, have = (w.pixel_to_world(x, y) for w in (exposure.wcs, wcs))
     side = np.sqrt(proj_plane_pixel_area(exposure.wcs.celestial))
     off = float(np.max(wanted.separation(have).deg)) / side
-    if not off <= _PLACE:
-        wanted = "where the exposure points (each dither needs a scene on its own wcs)"
-        raise argument_error("image", wanted, f"one {off:.4g} pixels off")
+    wanted = "where the exposure points (each dither needs a scene on its own wcs)"
+    check_that(off <= _PLACE, "image", wanted, f"one {off:.4g} pixels off")

@@ -8,6 +8,7 @@ import numpy as np
 from miricigale.detector.ramp import Ramp
 from miricigale.instrument import DQ, aperture, miri_detector
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.units import TIME, Frozen, frozen_array, to_array
 
 # pixels of a ramp without information on the light
@@ -70,10 +71,9 @@ class Latent(Frozen):
         if np.any(rate < 0):
             raise argument_error("rate", "nowhere negative", rate.min())
         gap = float(to_array(self.gap, TIME, "gap", ndim=0, finite=True))
-        if gap < 0:
-            raise argument_error("gap", "at least 0 s", self.gap)
-        object.__setattr__(self, "rate", u.Quantity(frozen_array(rate), unit, copy=False))
-        object.__setattr__(self, "gap", gap * TIME)
+        check_that(gap >= 0, "gap", "at least 0 s", self.gap)
+        rate = u.Quantity(frozen_array(rate), unit, copy=False)
+        self.__dict__.update(rate=rate, gap=gap * TIME)
 
     @classmethod
     def from_ramp(cls, ramp, gap, *, threshold=0.1):
@@ -95,10 +95,8 @@ class Latent(Frozen):
         latent : `Latent`
             A saturated pixel counts as full at the end: its latent is a lower limit.
         """
-        if not isinstance(ramp, Ramp):
-            raise argument_error("ramp", "a Ramp", type(ramp).__name__)
-        if not 0 <= threshold <= 1:
-            raise argument_error("threshold", "a fraction of the full well", threshold)
+        check_that(isinstance(ramp, Ramp), "ramp", "a Ramp", type(ramp).__name__)
+        check_that(0 <= threshold <= 1, "threshold", "a fraction of the full well", threshold)
         properties = ramp.properties or miri_detector()
         level = properties.linearize(np.asarray(ramp.data[-1, -1], float) - properties.bias)
         charge = np.clip(properties.gain * level, 0, properties.full_well)

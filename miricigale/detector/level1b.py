@@ -19,13 +19,11 @@ from astropy.io import fits
 from astropy.table import Table
 from astropy.time import Time, TimeDelta
 
+from miricigale.instrument import kept_keywords, placed_keywords
+from miricigale.instrument.asdf_extension import asdf_extension, bytes_table
+from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.store import plain_value, replacing
-
-_ASDF = (
-    b"#ASDF 1.0.0\n#ASDF_STANDARD 1.6.0\n%YAML 1.1\n%TAG ! tag:stsci.edu:asdf/\n"
-    b"--- !core/asdf-1.1.0\nmeta: {}\n...\n"
-)
 
 _START = "2022-06-21T00:00:00"
 
@@ -42,110 +40,45 @@ def header(exposure, *, filename="", start=None):
     elif not isinstance(start, Time) or not start.isscalar:
         raise argument_error("start", "one astropy Time", repr(start))
     duration = TimeDelta(exposure.duration.to_value("s"), format="sec")
-    where = exposure.pointing_keywords()
-    frame = exposure.frame_time.to_value("s")
-    group = exposure.group_time.to_value("s")
-    date, clock = start.utc.isot.split("T")
-    name = exposure.filter.rsplit(".", 1)[-1].upper()
-    primary = {
-        # not the time of writing: the same exposure gives the same bytes
-        "DATE": ((start + duration).utc.isot, "UTC date at end of simulated exposure"),
-        "ORIGIN": ("miricigale", "simulated data"),
-        "TELESCOP": ("JWST", "telescope"),
-        "FILENAME": (filename, "name of the file"),
-        "DATAMODL": ("Level1bModel", "type of data model"),
-        "TITLE": ("simulated MIRI imaging", "proposal title"),
-        "DATE-OBS": (date, "UTC date at start of exposure"),
-        "TIME-OBS": (clock, "UTC time at start of exposure"),
-        "PROGRAM": ("01345", "program number"),
-        "OBSERVTN": ("001", "observation number"),
-        "VISIT": ("001", "visit number"),
-        "VISITGRP": ("01", "visit group identifier"),
-        "SEQ_ID": ("1", "parallel sequence identifier"),
-        "ACT_ID": ("01", "activity identifier"),
-        "EXPOSURE": (f"{exposure.dither + 1:05d}", "exposure request number"),
-        "OBS_ID": ("V01345001001P0000000001101", "programmatic observation identifier"),
-        "VISIT_ID": ("01345001001", "visit identifier"),
-        "TARGTYPE": ("FIXED", "type of target"),
-        "TARGCAT": ("SIM", "target name"),
-        "TARG_RA": (where["RA_REF"], "[deg] target RA"),
-        "TARG_DEC": (where["DEC_REF"], "[deg] target Dec"),
-        "INSTRUME": ("MIRI", "instrument"),
-        "DETECTOR": ("MIRIMAGE", "detector"),
-        "FILTER": (name, "filter"),
-        "BAND": ("N/A", "MRS band"),
-        "CHANNEL": ("N/A", "MRS channel"),
-        "EXP_TYPE": ("MIR_IMAGE", "type of data in the exposure"),
-        "EXPSTART": (start.utc.mjd, "[d] MJD at start of exposure"),
-        "EXPMID": ((start + duration / 2).utc.mjd, "[d] MJD at middle of exposure"),
-        "EXPEND": ((start + duration).utc.mjd, "[d] MJD at end of exposure"),
-        "READPATT": (exposure.readout, "readout pattern"),
-        "NINTS": (exposure.n_integrations, "number of integrations"),
-        "NGROUPS": (exposure.n_groups, "number of groups in an integration"),
-        "NFRAMES": (1, "number of frames in a group"),
-        "GROUPGAP": (0, "frames dropped between groups"),
-        "DRPFRMS1": (0, "frames dropped before the first group"),
-        "NSAMPLES": (9 if exposure.readout.startswith("SLOW") else 1, "A/D samples per read"),
-        "TSAMPLE": (10.0, "[us] time between samples"),
-        "TFRAME": (frame, "[s] time between frames"),
-        "TGROUP": (group, "[s] time between groups"),
-        "EFFINTTM": (exposure.integration_time.to_value("s"), "[s] effective integration time"),
-        "EFFEXPTM": (exposure.exposure_time.to_value("s"), "[s] effective exposure time"),
-        "DURATION": (exposure.duration.to_value("s"), "[s] duration of the exposure"),
-        "NRSTSTRT": (1, "resets at start of exposure"),
-        "NRESETS": (1, "resets between integrations"),
-        "ZEROFRAM": (False, "whether a zero frame was downlinked"),
-        "DATAPROB": (False, "whether there were data problems"),
-        "INTSTART": (1, "first integration in this file"),
-        "INTEND": (exposure.n_integrations, "last integration in this file"),
-        "SUBARRAY": (where["SUBARRAY"], "sub-array"),
-        "SUBSTRT1": (where["SUBSTRT1"], "first pixel along axis 1"),
-        "SUBSTRT2": (where["SUBSTRT2"], "first pixel along axis 2"),
-        "SUBSIZE1": (where["SUBSIZE1"], "pixels along axis 1"),
-        "SUBSIZE2": (where["SUBSIZE2"], "pixels along axis 2"),
-        "FASTAXIS": (1, "direction of fast readout"),
-        "SLOWAXIS": (2, "direction of slow readout"),
-        "PATT_NUM": (exposure.dither + 1, "position number in the dither pattern"),
-        "APERNAME": (f"MIRIM_{where['SUBARRAY']}", "SIAF aperture"),
-    }
     # as in real files, only the linear part of the WCS stands here
-    wcs = exposure.wcs.wcs
+    wcs, where = exposure.wcs.wcs, exposure.pointing_keywords()
     matrix = wcs.pc * np.asarray(wcs.cdelt)[:, None] if not wcs.has_cd() else wcs.cd
-    science = {
-        "BUNIT": ("DN", "unit of the data"),
-        "RADESYS": ("ICRS", "reference frame"),
-        "RA_V1": (where["RA_V1"], "[deg] RA of telescope V1 axis"),
-        "DEC_V1": (where["DEC_V1"], "[deg] Dec of telescope V1 axis"),
-        "PA_V3": (where["PA_V3"], "[deg] position angle of telescope V3 axis"),
-        "PA_APER": (where["PA_APER"], "[deg] position angle of the aperture"),
-        "VA_SCALE": (1.0, "velocity aberration scale factor"),
-        "WCSAXES": (2, "number of coordinate axes"),
-        "CTYPE1": ("RA---TAN", "first axis"),
-        "CTYPE2": ("DEC--TAN", "second axis"),
-        "CUNIT1": ("deg", "unit of the first axis"),
-        "CUNIT2": ("deg", "unit of the second axis"),
-        "CRPIX1": (float(wcs.crpix[0]), "reference pixel, axis 1"),
-        "CRPIX2": (float(wcs.crpix[1]), "reference pixel, axis 2"),
-        "CRVAL1": (float(wcs.crval[0]), "RA of the reference pixel"),
-        "CRVAL2": (float(wcs.crval[1]), "Dec of the reference pixel"),
-        "CDELT1": (1.0, "scale of axis 1"),
-        "CDELT2": (1.0, "scale of axis 2"),
-        "PC1_1": (float(matrix[0, 0]), "linear transformation"),
-        "PC1_2": (float(matrix[0, 1]), "linear transformation"),
-        "PC2_1": (float(matrix[1, 0]), "linear transformation"),
-        "PC2_2": (float(matrix[1, 1]), "linear transformation"),
-        "V2_REF": (where["V2_REF"], "[arcsec] V2 of the reference point"),
-        "V3_REF": (where["V3_REF"], "[arcsec] V3 of the reference point"),
-        "VPARITY": (where["VPARITY"], "parity between ideal x and V2"),
-        "V3I_YANG": (where["V3I_YANG"], "[deg] angle from V3 to ideal y"),
-        "RA_REF": (where["RA_REF"], "[deg] RA of the reference point"),
-        "DEC_REF": (where["DEC_REF"], "[deg] Dec of the reference point"),
-        "ROLL_REF": (where["ROLL_REF"], "[deg] V3 roll at the reference point"),
-    }
-    return tuple(
-        fits.Header([fits.Card(key, *value) for key, value in cards.items()])
-        for cards in (primary, science)
+    times = {
+        "TFRAME": exposure.frame_time, "TGROUP": exposure.group_time, "EFFINTTM": exposure.integration_time,
+        "EFFEXPTM": exposure.exposure_time, "DURATION": exposure.duration,
+    }  # fmt: skip
+    days = {"EXPSTART": start, "EXPMID": start + duration / 2, "EXPEND": start + duration}
+    n_int, number, name = (
+        exposure.n_integrations,
+        exposure.dither + 1,
+        exposure.filter.rpartition(".")[2],
     )
+    values = where | {
+        # not the time of writing: the same exposure gives the same bytes
+        "DATE": days["EXPEND"].utc.isot, "DATE-OBS": start.utc.isot[:10], "TIME-OBS": start.utc.isot[11:],
+        "FILENAME": filename, "FILTER": name.upper(), "READPATT": exposure.readout,
+        "TARG_RA": where["RA_REF"], "TARG_DEC": where["DEC_REF"], "APERNAME": f"MIRIM_{where['SUBARRAY']}",
+        "NINTS": n_int, "INTEND": n_int, "NGROUPS": exposure.n_groups,
+        "NSAMPLES": 9 if exposure.readout.startswith("SLOW") else 1,
+        "EXPOSURE": f"{number:05d}", "PATT_NUM": number,
+        **{name: time.to_value("s") for name, time in times.items()},
+        **{name: day.utc.mjd for name, day in days.items()},
+        **{f"CRPIX{i + 1}": float(wcs.crpix[i]) for i in range(2)},
+        **{f"CRVAL{i + 1}": float(wcs.crval[i]) for i in range(2)},
+        **{f"PC{i + 1}_{j + 1}": float(matrix[i, j]) for i, j in np.ndindex(2, 2)},
+    }  # fmt: skip
+    parts = declared("miricigale.detector", "level1b.toml")
+    return tuple(
+        fits.Header([(key, values.get(key, value), text) for key, (value, text) in part.items()])
+        for part in parts.values()
+    )
+
+
+def keywords(exposure):
+    """Keywords of an exposure in one header."""
+    primary, science = header(exposure)
+    primary.update(science)
+    return primary
 
 
 def write(path, ramp, *, start=None, filename=None, overwrite=False):
@@ -210,8 +143,8 @@ def row_writer(path, exposure, *, start=None, filename=None, overwrite=False, ob
     if observation is None:
         primary, science = header(exposure, filename=filename, start=start)
     else:
-        primary, science = observation.copy(), fits.Header({"BUNIT": "DN"})
-        primary["FILENAME"] = filename
+        primary, science = placed_keywords(kept_keywords(observation))
+        primary["FILENAME"], science["BUNIT"] = filename, "DN"
     begun = primary.get("EXPSTART")
     times = None if begun is None else _int_times(exposure, begun)
     shape = (exposure.n_integrations, exposure.n_groups, *exposure.shape)
@@ -240,14 +173,14 @@ def row_writer(path, exposure, *, start=None, filename=None, overwrite=False, ob
                             msg = f"{path} could not be written: is the disk full?"
                             raise OSError(msg)
 
-            yield write_rows, functools.partial(_append, partial, times)
+            yield write_rows, functools.partial(_append, partial, times, exposure.filter)
 
 
-def _append(partial, times, pixel_dq, effects, meta, properties):
+def _append(partial, times, name, pixel_dq, effects, meta, properties):
     """Add what level 1b does not know: flags, effects and provenance."""
     meta = dict(meta)
     if effects is not None:
-        meta["effects"] = [effect.record() for effect in effects]
+        meta |= {"filter": name, "effects": [effect.record() for effect in effects]}
     if properties is not None:
         # a response of no rows is not said
         meta["properties"] = {k: v for k, v in dataclasses.asdict(properties).items() if v != ()}
@@ -257,12 +190,6 @@ def _append(partial, times, pixel_dq, effects, meta, properties):
             hdus.append(times)
         hdus.append(fits.ImageHDU(np.asarray(pixel_dq), name="SIM_PIXELDQ"))
         if meta:
-            hdus.append(_bytes_table(text, "JSON", "SIM_META"))
+            hdus.append(bytes_table(text, "JSON", "SIM_META"))
         # the pipeline looks for it last
-        hdus.append(_bytes_table(_ASDF, "ASDF_METADATA", "ASDF"))
-
-
-def _bytes_table(text, column, name):
-    array = np.frombuffer(text, np.uint8)[None]
-    fields = [fits.Column(name=column, format=f"{array.size}B", array=array)]
-    return fits.BinTableHDU.from_columns(fields, name=name)
+        hdus.append(asdf_extension())

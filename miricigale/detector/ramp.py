@@ -9,10 +9,10 @@ from astropy.nddata import NDData
 
 from miricigale.detector import level1b, ramp_reader
 from miricigale.detector.effects.order import checked_effects
-from miricigale.instrument import DQ, STEPS, DetectorProperties
+from miricigale.instrument import DQ, STEPS, DetectorProperties, ExposureHistory
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import Interactive, checked_calls
-from miricigale.utils.options import check_kind
+from miricigale.utils.options import check_kind, check_that
 from miricigale.utils.units import DN
 
 
@@ -112,8 +112,7 @@ class Ramp(Interactive, NDData):
     ):
         data = np.asarray(data)
         shape = (exposure.n_integrations, exposure.n_groups, *exposure.shape)
-        if data.shape != shape:
-            raise argument_error("data", f"of the exposure's shape {shape}", data.shape)
+        check_that(data.shape == shape, "data", f"of the exposure's shape {shape}", data.shape)
         if data.dtype not in (np.uint16, np.float32):
             raise argument_error("data", "of dtype uint16 or float32", data.dtype)
         if pixel_dq is None:
@@ -156,6 +155,13 @@ class Ramp(Interactive, NDData):
         return self.effects is not None
 
     @property
+    def history(self):
+        """Who made the counts and what was done to them, `~miricigale.instrument.ExposureHistory`."""
+        header = self.header if self.observed else {}
+        history = ExposureHistory.from_header(header, recorded=self.simulated)
+        return history.replace(steps=self.steps)
+
+    @property
     def observed(self):
         """Whether the ramp has keywords of an observation, from its file."""
         return self._header is not None
@@ -165,9 +171,7 @@ class Ramp(Interactive, NDData):
         """A copy of the keywords of the observation, `~astropy.io.fits.Header`."""
         if self._header is not None:
             return self._header.copy()
-        primary, science = level1b.header(self.exposure)
-        primary.update(science)
-        return primary
+        return level1b.keywords(self.exposure)
 
     @property
     def group_time(self):
@@ -193,8 +197,7 @@ class Ramp(Interactive, NDData):
         ValueError
             If there is no such integration.
         """
-        if not 0 <= number < self.shape[0]:
-            raise argument_error("number", f"from 0 to {self.shape[0] - 1}", number)
+        check_that(0 <= number < self.shape[0], "number", f"from 0 to {self.shape[0] - 1}", number)
         part = slice(number, number + 1)
         values = self._values()
         if self.group_dq is not None:
@@ -242,8 +245,7 @@ class Ramp(Interactive, NDData):
             gathered[(self.pixel_dq & int(DQ.DO_NOT_USE)) != 0] = -np.inf
             pixel = np.unravel_index(np.argmax(gathered), gathered.shape)[::-1]
         x, y = (operator.index(number) for number in pixel)
-        if not (0 <= x < nx and 0 <= y < ny):
-            raise argument_error("pixel", f"(x, y) below ({nx}, {ny})", pixel)
+        check_that(0 <= x < nx and 0 <= y < ny, "pixel", f"(x, y) below ({nx}, {ny})", pixel)
         time = (np.arange(self.shape[1]) + 1) * self.group_time
         flags = None if self.group_dq is None else self.group_dq[:, :, y, x] != 0
         title = f"pixel ({x}, {y})"

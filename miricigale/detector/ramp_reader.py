@@ -13,6 +13,7 @@ from miricigale.instrument import (
     DQ,
     DetectorProperties,
     Exposure,
+    check_imager,
     exposure_keywords,
     joined_header,
     reference_pixel_mask,
@@ -67,7 +68,10 @@ def _read(path, hdus):
     if "SCI" not in hdus:
         raise data_error(path, "is no ramp: it has no SCI extension")
     header = joined_header(hdus)
-    _check_kind(path, header)
+    own = None
+    if "SIM_META" in hdus:
+        own = json.loads(hdus["SIM_META"].data["JSON"][0].tobytes())
+    check_imager(path, header, kinds=_KINDS, own=own)
     shape = _ramp_shape(path, hdus["SCI"].header)
     exposure = _exposure(path, header, shape)
     _check_header(path, header, exposure)
@@ -83,26 +87,14 @@ def _read(path, hdus):
         "header": header,
         "meta": {"origin": header.get("ORIGIN", "unknown"), "filename": path.name},
     }
-    if "SIM_META" in hdus:
-        values["meta"] = json.loads(hdus["SIM_META"].data["JSON"][0].tobytes())
+    if own is not None:
+        values["meta"] = own
+        own.pop("filter", None)
         if (records := values["meta"].pop("effects", None)) is not None:
             values["effects"] = [effect_from_record(record) for record in records]
         if (properties := values["meta"].pop("properties", None)) is not None:
             values["properties"] = DetectorProperties(**properties)
     return values | _flags(path, hdus, exposure, shape)
-
-
-def _check_kind(path, header):
-    """Refuse files of other instruments, detectors and kinds of exposures."""
-    instrument = header.get("INSTRUME", "MIRI" if "DETECTOR" in header else None)
-    kind = str(header.get("EXP_TYPE", "")).strip()
-    detector = header.get("DETECTOR", "MIRIMAGE")
-    if instrument != "MIRI" or detector != "MIRIMAGE" or kind not in _KINDS:
-        wanted = (
-            "must be an exposure of the MIRI imager (INSTRUME MIRI, DETECTOR MIRIMAGE, "
-            f"EXP_TYPE {' or '.join(_KINDS[:3])})"
-        )
-        raise data_error(path, f"{wanted}, got {instrument} {detector} {kind}")
 
 
 def _ramp_shape(path, head):
@@ -196,17 +188,18 @@ def _counts(hdu):
 
 def _flags(path, hdus, exposure, shape):
     """Flags of pixels and groups, as far as the file has them; reference pixels are always known."""
-    name = next((name for name in ("SIM_PIXELDQ", "PIXELDQ") if name in hdus), None)
-    if name is None:
-        pixel_dq = np.zeros(shape[2:], np.uint32)
-    else:
+    pixel_dq, found = (
+        np.zeros(shape[2:], np.uint32),
+        {"SIM_PIXELDQ", "PIXELDQ"} & {h.name for h in hdus},
+    )
+    for name in sorted(found):
         # unsigned 32 bits as FITS keeps them: BZERO 2^31
         stored = np.asarray(hdus[name].data).astype(np.int32).view(np.uint32)
-        pixel_dq = stored ^ np.uint32(2**31)
-    if pixel_dq.shape != shape[2:]:
-        wanted = f"must have flags of {shape[2:]} pixels in {name}"
-        raise data_error(path, f"{wanted}, got {pixel_dq.shape}")
-    if name != "SIM_PIXELDQ":
+        if stored.shape != shape[2:]:
+            wanted = f"must have flags of {shape[2:]} pixels in {name}"
+            raise data_error(path, f"{wanted}, got {stored.shape}")
+        pixel_dq = pixel_dq | (stored ^ np.uint32(2**31))
+    if "SIM_PIXELDQ" not in found:
         mask = reference_pixel_mask(subarray=exposure.subarray)
         pixel_dq = np.where(mask, pixel_dq | _REFERENCE, pixel_dq)
     values = {"pixel_dq": pixel_dq}

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from miricigale.evaluation.estimates import Estimate
+from miricigale.evaluation.estimates import Estimate, weighted_share
 from miricigale.evaluation.metrics import one_by_one
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import described_table
@@ -148,6 +148,42 @@ def selection_quality(wanted, selected):
         Estimate.of_fraction(both, np.count_nonzero(wanted)),
         Estimate.of_fraction(both, np.count_nonzero(selected)),
     )
+
+
+def sky_quality(galaxies, wanted, selected, weight):
+    """
+    Purity and completeness of a selection in skies in which the same galaxies stand more than once.
+
+    Parameters
+    ----------
+    galaxies : array-like, shape (n,)
+        The galaxy of each source.
+    wanted, selected : array-like of bool, shape (n,)
+        As for `selection_quality`.
+    weight : array-like, shape (n,)
+        What each source counts for.
+
+    Returns
+    -------
+    quality : `SelectionQuality`
+        With ``n`` sources, wanted or selected ones; the intervals are those of the galaxies, for the sources of
+        one are alike.
+
+    Examples
+    --------
+    >>> from miricigale.evaluation.classes import sky_quality
+    >>> wanted, selected = [True, True, False, False], [True, False, True, False]
+    >>> quality = sky_quality([1, 1, 2, 3], wanted, selected, [0.5, 0.5, 0.25, 0.25])
+    >>> print(f"{quality.completeness.value:.2f} {quality.purity.value:.2f}")
+    0.50 0.67
+    """
+    wanted, selected = one_by_one(bool, wanted=wanted, selected=selected)
+    number, shares = np.unique(galaxies, return_inverse=True)[1], []
+    for of in (wanted, selected):
+        found, among = (np.bincount(number, weight * one) for one in (wanted & selected, of))
+        share = weighted_share(found, among)
+        shares.append(dataclasses.replace(share, n=np.count_nonzero(of)))
+    return SelectionQuality(*shares)
 
 
 def quality_columns(qualities, completeness, purity):

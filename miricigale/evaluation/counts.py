@@ -17,13 +17,13 @@ PUBLISHED_LIGHT = (
     ("miri.f2100w", 24.0, 60.0, 1.9, 0.6, 0.6, "Papovich et al. 2004, ApJS 154, 70"),
     ("miri.f2100w", 24.0, 0.0, 2.7, 0.7, 1.1, "Papovich et al. 2004, extrapolated"),
 )
-#: Dust of galaxies of CEERS relative to the energy balance of fits to HST and NIRCam bands, by dust component:
-#: log10 of ``dust_excess`` at 10^10.3 Msun and above, its slope per dex of mass down to 10^8.5 Msun, its scatter
-#: in dex; mean and scatter of quiescent galaxies; strength of the 3.3 um feature; sources. Measured by
-#: benchmarks/dust_colors.py.
+#: Dust of galaxies of CEERS by dust component: log10 of its luminosity over the stellar mass (solar units) at
+#: 10^10.3 Msun and 10^-9.3 / yr, slope per dex of mass between 10^8.5 and 10^10.3 Msun, slope per dex of specific
+#: star-formation rate (100 Myr) between 10^-12 and 10^-8 / yr, scatter in dex; of quiescent galaxies mean and
+#: scatter of log10 of ``dust_excess``; strength of the 3.3 um feature; sources. By benchmarks/dust_colors.py.
 CEERS_DUST = {
-    "dl07_alpha": (0.07, 0.43, 0.30, -1.18, 1.02, 0.1, 96),
-    "dale2014": (0.04, 0.50, 0.31, -0.49, 0.85, 1.0, 105),
+    "dl07_alpha": (0.79, 0.56, 0.69, 0.21, -1.18, 1.02, 0.1, 96),
+    "dale2014": (0.78, 0.64, 0.74, 0.24, -0.49, 0.85, 1.0, 105),
 }
 
 
@@ -216,14 +216,14 @@ def ceers_dust(table, component, *, seed):
     """
     Dust luminosities of galaxies that have the dust colors of CEERS.
 
-    Drawn from the distribution in ``CEERS_DUST``: log10 of ``dust_excess`` is normal about a mean that rises
-    with the mass from 10^8.5 to 10^10.3 Msun; galaxies that are quiescent by their colors (`uvj_quiescent`) have a
-    lower mean and more scatter.
+    Drawn from the distribution in ``CEERS_DUST``: log10 of the luminosity over the mass is normal about a mean
+    that rises with the mass and the specific star-formation rate, whatever the fitted attenuation took; of
+    galaxies that are quiescent by their colors (`uvj_quiescent`) log10 of ``dust_excess`` is normal.
 
     Parameters
     ----------
     table : `~astropy.table.Table`
-        As for `main_sequence_dust`.
+        As for `main_sequence_dust`, and ``sfr_100myr``.
     component : {"dl07_alpha", "dale2014"}
         Dust component of the model.
     seed : int, `~numpy.random.Generator` or None
@@ -248,18 +248,23 @@ def ceers_dust(table, component, *, seed):
     >>> from miricigale.evaluation import ceers_dust
     >>> table = QTable({"id": [1, 2], "redshift": [1.0, 1.0]})
     >>> table["stellar_mass"] = [3e10, 3e10] * u.Msun
-    >>> table["dust_luminosity"] = [1e10, 1e10] * u.Lsun
+    >>> table["dust_luminosity"] = [1e11, 1e10] * u.Lsun
+    >>> table["sfr_100myr"] = [15.0, 0.1] * u.Msun / u.yr
     >>> table["u_v"], table["v_j"] = [1.0, 1.9] * u.mag, [1.0, 1.0] * u.mag
     >>> print(ceers_dust(table, "dl07_alpha", seed=1)["dust_excess"].round(2))
-    [2.83 0.38]
+    [3.42 0.38]
     """
     check_names([component], "dust component", CEERS_DUST)
     ids, _, mass, dust, galaxy, quiescent = _dusty_galaxies(table)
-    high, slope, scatter, low, wide = CEERS_DUST[component][:5]
+    require_columns(table, ["sfr_100myr"], "table", units={"sfr_100myr": u.Msun / u.yr})
+    at, by_mass, by_rate, scatter, low, wide = CEERS_DUST[component][:6]
     seed, rows, excess = check_seed(seed), np.flatnonzero(galaxy), np.ones(len(ids))
     offset = [stream(seed, "dust", str(ids[row])).normal() for row in rows]
-    passive, below = quiescent[rows], np.clip(np.log10(mass[rows]), 8.5, 10.3) - 10.3
-    mean = np.where(passive, low, high + slope * below)
+    passive, mass, balance = quiescent[rows], np.log10(mass[rows]), dust[rows] * LUMINOSITY
+    sfr = to_array(u.Quantity(table["sfr_100myr"]), u.Msun / u.yr, "sfr_100myr")[rows]
+    rate = np.clip(np.log10(np.maximum(sfr, 1e-9)) - mass, -12.0, -8.0)
+    forming = at + mass + by_mass * (np.clip(mass, 8.5, 10.3) - 10.3) + by_rate * (rate + 9.3)
+    mean = np.where(passive, low, forming - np.log10(balance.to_value(u.Lsun)))
     excess[rows] = 10.0 ** (mean + np.where(passive, wide, scatter) * np.array(offset))
     return _dust_table(ids, quiescent, dust, excess)
 

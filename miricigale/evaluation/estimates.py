@@ -78,6 +78,30 @@ def outlier_share(values):
     return np.mean(np.abs(values) > OUTLIER, axis=-1)
 
 
+def weighted_share(found, among):
+    """
+    Share of weights found, with its Wilson interval.
+
+    Parameters
+    ----------
+    found, among : array-like, shape (n,)
+        Weights of the sources found, 0 for others, and of all; without NaN.
+
+    Returns
+    -------
+    share : `Estimate`
+        The interval is that of as many equal sources as have the variance of the weighted share.
+    """
+    total = np.sum(among)
+    if not total > 0:
+        return Estimate(np.nan)
+    value = np.sum(found) / total
+    variance = np.sum((found - value * among) ** 2) / total**2
+    like = value * (1 - value) / variance if variance > 0 else total**2 / np.sum(among**2)
+    interval = Estimate.of_fraction(round(value * like), max(round(like), 1))
+    return Estimate(value, interval.low, interval.high, np.count_nonzero(among))
+
+
 def bootstrap(statistic, *columns, seed, n_draws=1000, n_all=None):
     """
     A statistic of a sample, with the scatter that it has in samples drawn with replacement.

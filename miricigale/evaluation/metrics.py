@@ -154,17 +154,9 @@ def photoz_metrics(z_true, z_fit):
     good = np.isfinite(z_true) & np.isfinite(z_fit)
     delta = (z_fit[good] - z_true[good]) / (1 + z_true[good])
     n_out = int(np.count_nonzero(np.abs(delta) > OUTLIER))
-    fraction, low, high = fraction_interval(n_out, delta.size)
-    return PhotozMetrics(
-        n=int(delta.size),
-        n_unusable=int(np.count_nonzero(~good)),
-        bias=float(np.median(delta)) if delta.size else np.nan,
-        sigma_mad=sigma_mad(delta),
-        outlier_fraction=fraction,
-        outlier_low=low,
-        outlier_high=high,
-        n_outliers=n_out,
-    )
+    bias = float(np.median(delta)) if delta.size else np.nan
+    scatter, share = sigma_mad(delta), fraction_interval(n_out, delta.size)
+    return PhotozMetrics(delta.size, int(np.sum(~good)), bias, scatter, *share, n_out)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -223,14 +215,10 @@ def recovery_metrics(true, measured, *, relative=False):
         delta = (measured - true) / true if relative else measured - true
     good = np.isfinite(delta)
     delta = delta[good]
-    sigma = sigma_mad(delta)
-    return RecoveryMetrics(
-        n=int(delta.size),
-        n_unusable=int(np.count_nonzero(~good)),
-        median=float(np.median(delta)) if delta.size else np.nan,
-        median_err=1.2533 * sigma / np.sqrt(delta.size) if delta.size else np.nan,
-        sigma_mad=sigma,
-    )
+    sigma, median, error = sigma_mad(delta), np.nan, np.nan
+    if delta.size:
+        median, error = float(np.median(delta)), 1.2533 * sigma / np.sqrt(delta.size)
+    return RecoveryMetrics(delta.size, int(np.sum(~good)), median, error, sigma)
 
 
 def running_median(x, y, *, size=20):

@@ -50,7 +50,9 @@ class PublishedNumber:
     source : str, optional
         Section or figure of the paper in which it stands.
     why : str, optional
-        Why a study may differ.
+        What explains the difference of the study of the preset, as measured.
+    n : int, optional
+        Sources of the paper's sample; by default as many as the study's.
 
     Examples
     --------
@@ -74,18 +76,17 @@ class PublishedNumber:
     definition: str = ""
     source: str = ""
     why: str = ""
+    n: int = 0
 
 
 _FILE = resources.files("miricigale.evaluation") / "yang2021.toml"
 _TABLE = tomllib.loads(_FILE.read_text(encoding="utf-8"))
-#: Reason for which any number of a sample differs.
-ONE_FIELD = _TABLE["texts"]["one_field"]
 
 
 def _published(fields):
     """A number from its fields in the file."""
-    for name in ("definition", "why"):
-        fields[name] = fields.get(name, "").format_map(_TABLE["texts"])
+    fields["definition"] = fields.get("definition", "").format_map(_TABLE["texts"])
+    fields["why"] = _TABLE["measured"].get(fields["key"], "")
     if fields.get("truth") == "above 0":
         fields["truth"] = None
     if isinstance(fields.get("option"), list):
@@ -157,7 +158,7 @@ def compare_with_paper(study, *, seed, n_draws=1000, reasons=None):
 
 
 def _difference(one, ours):
-    """Difference in units of its error; that of the paper is ours, where it has none, for a like sample."""
+    """Difference in units of its error; that of the paper is ours, where it has none, for its sample."""
     delta = ours.value - one.value
     if (one.relation == "<" and abs(ours.value) <= one.value) or (
         one.relation == ">" and delta >= 0
@@ -166,10 +167,11 @@ def _difference(one, ours):
     if one.relation == "<":
         delta = abs(ours.value) - one.value
     error = np.nan_to_num(ours.error)
-    published = one.error or error
+    size = one.n or ours.n or 1
+    published = one.error or error * np.sqrt((ours.n or size) / size)
     if one.quantity in SHARES and ours.n:
         # our interval is none for theirs where one of the shares is near 0 or 1
-        published = max(published, np.sqrt(one.value * (1 - one.value) / ours.n))
+        published = max(published, np.sqrt(one.value * (1 - one.value) / size))
     total = np.hypot(error, published)
     return float(delta / total) if total > 0 else np.nan
 

@@ -75,6 +75,10 @@ def _size_median(values):
     return _median(np.abs(values))
 
 
+def _high(values):
+    return np.nanpercentile(values, 84, axis=-1)
+
+
 def _trend(values, statistic):
     """Ratio of a statistic at one AGN fraction to that at another, of the same sources."""
 
@@ -254,6 +258,7 @@ _MEASURES = {
     "limit_offset": ("5-sigma limit minus another (mag)", _limit_offset),
     "kind_share": ("share of the sources above 5 sigma", _kind_share),
     "magnitude_offset": ("median measured - true magnitude", _kind_errors(_median)),
+    "magnitude_high": ("84th percentile of measured - true magnitude", _kind_errors(_high)),
     "magnitude_scatter": ("sigma_MAD of measured - true magnitude", _kind_errors(_scatter)),
     "bright_error": ("median size of measured - true magnitude, brightest 30", _bright_error),
     "signal_to_noise": ("median S/N", _signal_to_noise),

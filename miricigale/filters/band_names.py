@@ -1,11 +1,10 @@
 """Names of bands: of CIGALE, old and new, and of surveys, for ours."""
 
 import re
-import tomllib
 from functools import cache
-from importlib import resources as importlib_resources
 
 from miricigale.filters.library import FILTERS, SEDPY, curve_folder
+from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import unknown_name
 
 # between the parts of a name, and the endings of the files of curves
@@ -17,16 +16,9 @@ _XRAY = re.compile(r"xray_boxcar_(\d+(?:p\d+)?)to(\d+(?:p\d+)?)keV")
 
 
 @cache
-def _declared():
-    """What ``band_names.toml`` has."""
-    text = (importlib_resources.files("miricigale.filters") / "band_names.toml").read_text("utf-8")
-    return tomllib.loads(text)
-
-
-@cache
 def _tables():
     """Names without a rule, rules of CIGALE's names, and rules of names written in any way."""
-    tables = _declared()
+    tables = declared("miricigale.filters", "band_names.toml")
     rules = [(re.compile(rule), ours, *back) for rule, ours, *back in tables["rules"]]
     free = [(re.compile(rule, re.IGNORECASE), ours) for rule, ours in tables["free"]]
     return tables["names"], rules, free
@@ -114,7 +106,7 @@ def known_filter(given, known, kind="filter"):
 
 def eazy_filter(number):
     """Filter of a number in EAZY's ``FILTER.RES.latest``; None if there is no such curve here."""
-    groups = _declared()["eazy"].items()
+    groups = declared("miricigale.filters", "band_names.toml")["eazy"].items()
     return next((start + group[number] for start, group in groups if number in group), None)
 
 

@@ -9,8 +9,9 @@ import numpy as np
 
 from miricigale.filters.catalog_map import CatalogMap
 from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
-from miricigale.utils.files import read_table
+from miricigale.utils.files import reading
 from miricigale.utils.missing import plain_floats, without_codes
+from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import error_column
 
 #: Bands whose missing values are counted one by one in a message.
@@ -62,8 +63,9 @@ def read_catalog_photometry(path, catalog_map=None, *, hdu=None, **options):
     catalog_map = as_catalog_map(catalog_map, options)
     path = Path(path)
     table = read_table(path, wanted="a table", hdu=hdu)
-    _, lost = catalog_map.names(table.colnames, path.name)
-    table, coded = catalog_map.convert(table, path.name)
+    with reading(path, "a catalog"):
+        _, lost = catalog_map.names(table.colnames, path.name)
+        table, coded = catalog_map.convert(table, path.name)
     for text in catalog_messages(lost, coded):
         warn(f"{path.name}: {text}", CatalogWarning)
     return table

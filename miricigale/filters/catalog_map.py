@@ -22,7 +22,7 @@ from miricigale.utils.exceptions import (
     warn,
 )
 from miricigale.utils.missing import negative_errors, plain_floats, without_codes
-from miricigale.utils.options import check_choice, check_names
+from miricigale.utils.options import check_choice, check_names, check_that
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU
 
@@ -89,9 +89,8 @@ class CatalogMap:
     def __post_init__(self):
         for argument in ("columns", "units"):
             names = getattr(self, argument) or {}
-            if not isinstance(names, Mapping):
-                wanted = "a dict by our names of columns"
-                raise argument_error(argument, wanted, type(names).__name__)
+            wanted = "a dict by our names of columns"
+            check_that(isinstance(names, Mapping), argument, wanted, type(names).__name__)
             for name in names:
                 if "." in str(name) and not is_band(name):
                     band = str(name).removesuffix(error_column(""))
@@ -123,7 +122,7 @@ class CatalogMap:
             if path.suffix == ".translate":
                 return cls(columns=_translated(text, path))
             values = tomllib.loads(text)
-        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as err:
+        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as err:
             raise data_error(path, f"cannot be read as a map of columns: {err}") from err
         known = [field.name for field in dataclasses.fields(cls)]
         unknown = sorted(set(values) - set(known))
@@ -288,12 +287,10 @@ class CatalogMap:
         errors = np.where(missing | no_error, np.nan, errors)
         if self.limits:
             limit, nothing = negative_errors(flux, errors)
-            if f"{name}_limit" in table.colnames:
-                wanted = f"a table without '{name}_limit' where negative errors mark limits"
-                raise argument_error(argument, wanted, "both")
-            if ab and np.any(limit | nothing):
-                wanted = f"fluxes in {name!r} where negative errors mark limits"
-                raise argument_error(argument, wanted, "AB magnitudes")
+            wanted = f"a table without '{name}_limit' where negative errors mark limits"
+            check_that(f"{name}_limit" not in table.colnames, argument, wanted, "both")
+            wanted = f"fluxes in {name!r} where negative errors mark limits"
+            check_that(not (ab and np.any(limit | nothing)), argument, wanted, "AB magnitudes")
             code = np.where(nothing, values, code)
             table[name] = np.where(nothing, np.nan, flux * factor) * FNU
             table[f"{name}_limit"] = limit

@@ -7,7 +7,8 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.utils.exceptions import data_error
-from miricigale.utils.files import TABLE_FORMATS, read_table, unpacked_size
+from miricigale.utils.files import unpacked_size
+from miricigale.utils.table_files import TABLE_FORMATS, read_table
 
 # units that a header may name
 _UNITS = re.compile(r"\b(um|microns?|nm|AA|Angstroms?)\b", re.IGNORECASE)

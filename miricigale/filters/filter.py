@@ -14,8 +14,10 @@ from miricigale.filters.curve_files import read_curve
 from miricigale.filters.library import FILTERS, load_curve
 from miricigale.filters.spectra import check_wave, spectrum_arrays
 from miricigale.utils.exceptions import argument_error, unknown_name
-from miricigale.utils.files import write_table
+from miricigale.utils.files import reading
 from miricigale.utils.interactive import Interactive, checked_calls
+from miricigale.utils.options import check_that
+from miricigale.utils.table_files import write_table
 from miricigale.utils.units import FNU, WAVE, Frozen, frozen_array, frozen_quantity, to_array
 
 #: Version of the band averages: raised when the same curve gives other numbers.
@@ -112,8 +114,7 @@ class Filter(Frozen, Interactive):
             # the name first, as others have it
             wave, throughput, name = throughput, name, wave
         for argument, value in (("throughput", throughput), ("name", name)):
-            if value is None:
-                raise argument_error(argument, "given with 'wave'", "None")
+            check_that(value is not None, argument, "given with 'wave'", "None")
         wave = to_array(wave, WAVE, "wave", ndim=1, finite=True)
         throughput = to_array(throughput, u.one, "throughput", ndim=1, finite=True)
         if wave.size < 2 or wave.shape != throughput.shape:
@@ -124,10 +125,9 @@ class Filter(Frozen, Interactive):
         if np.any(throughput < 0) or not np.any(throughput > 0):
             raise argument_error("throughput", "not negative, and somewhere positive", throughput)
         wave, throughput = _padded(wave, throughput)
-        object.__setattr__(self, "wave", frozen_quantity(wave * WAVE, WAVE, "wave"))
-        object.__setattr__(self, "throughput", frozen_array(throughput))
-        object.__setattr__(self, "name", str(name))
-        object.__setattr__(self, "meta", dict(self.meta or {}))
+        wave, throughput = frozen_quantity(wave * WAVE, WAVE, "wave"), frozen_array(throughput)
+        meta = dict(self.meta or {})
+        self.__dict__.update(wave=wave, throughput=throughput, name=str(name), meta=meta)
         for argument, unit in (("reference_wavelength", WAVE), ("reference_temperature", u.K)):
             value = getattr(self, argument)
             if value is not None:
@@ -237,8 +237,9 @@ class Filter(Frozen, Interactive):
         >>> Filter.read(path, unit=u.um)
         <Filter mine: pivot 9.9896 um, width 1.500 um>
         """
-        wave, throughput, found = read_curve(path, unit)
-        return cls(wave, throughput, name or found, meta={"source": Path(path).name})
+        with reading(path, "a filter"):
+            wave, throughput, found = read_curve(path, unit)
+            return cls(wave, throughput, name or found, meta={"source": Path(path).name})
 
     def to_table(self):
         """The curve as a `~astropy.table.QTable` of ``wave`` (um) and ``throughput``."""
@@ -266,8 +267,7 @@ class Filter(Frozen, Interactive):
         filter : `Filter`
         """
         wave = bandpass.waveset
-        if wave is None:
-            raise argument_error("bandpass", "one with a wavelength set", bandpass)
+        check_that(wave is not None, "bandpass", "one with a wavelength set", bandpass)
         throughput = np.asarray(bandpass(wave).value, dtype=float)
         name = name or str(bandpass.meta.get("expr") or "synphot")
         return cls(wave, throughput, name=name, meta={"source": "synphot"})

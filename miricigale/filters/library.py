@@ -8,23 +8,12 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.refdata import Registry, citations, locate
+from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import DataError, data_error
 from miricigale.utils.options import check_names
 from miricigale.utils.units import WAVE
 
 _RESOURCE = "filters.sedpy"
-
-_MIRI = "f560w f770w f1000w f1130w f1280w f1500w f1800w f2100w f2550w"
-_NIRCAM = (
-    "f070w f090w f115w f140m f150w f150w2 f162m f182m f200w f210m f250m f277w f300m f322w2 "
-    "f335m f356w f360m f410m f430m f444w f460m f480m"
-)
-_ACS = "f435w f475w f555w f606w f625w f775w f814w f850lp"
-_WFC3 = "f098m f105w f110w f125w f140w f160w"
-
-# nominal wavelengths (um) at which the catalogs of Spitzer quote fluxes
-_IRAC = {"ch1": 3.550, "ch2": 4.493, "ch3": 5.731, "ch4": 7.872}
-_MIPS = {"24": 23.68, "70": 71.42, "160": 155.9}
 
 #: Prefix of the names that stand for any curve of astro-sedpy.
 SEDPY = "sedpy."
@@ -99,41 +88,19 @@ def load_curve(name):
 
 
 def _register():
+    """The registry of ``library.toml``."""
     registry = Registry("filter")
-
-    def add(name, curve, **metadata):
-        registry.register(name, _load, curve=curve, **metadata)
-
-    for instrument, prefix, bands in (
-        ("miri", "jwst_", _MIRI),
-        ("nircam", "jwst_", _NIRCAM),
-        ("acs", "acs_wfc_", _ACS),
-        ("wfc3", "wfc3_ir_", _WFC3),
-    ):
-        for band in bands.split():
-            add(f"{instrument}.{band}", f"{prefix}{band}")
-    for band, number in (("u", 9301), ("g", 9401), ("r", 9601), ("i", 9701), ("z", 9801)):
-        add(f"megacam.{band}", f"cfht_megacam_{band}s_{number}")
-        add(f"megacam2015.{band}", f"megacam2015.{band}")
-    for band in "zyjhk":
-        add(f"wfcam.{band}", f"wfcam.{band}" if band in "zy" else f"ukirt_wfcam_{band.upper()}")
-    for band in ("j1", "j2", "j3", "h1", "h2", "k"):
-        add(f"newfirm.{band}", f"mayall_newfirm_{band.upper()}")
-    for band, wave in _IRAC.items():
-        add(
-            f"irac.{band}",
-            f"spitzer_irac_{band}",
-            flux_convention="nu F_nu = const",
-            reference_wavelength=wave * WAVE,
-        )
-    for band, wave in _MIPS.items():
-        add(
-            f"mips.{band}",
-            f"spitzer_mips_{band}",
-            flux_convention="black body",
-            reference_wavelength=wave * WAVE,
-            reference_temperature=1e4 * u.K,
-        )
+    for instrument, group in declared("miricigale.filters", "library.toml").items():
+        bands, about = group["bands"], {}
+        if "flux_convention" in group:
+            about["flux_convention"] = group["flux_convention"]
+        for band in bands:
+            curve = group["curves"].format(band) if "curves" in group else bands[band]
+            if "reference_wavelength" in group:
+                about["reference_wavelength"] = group["reference_wavelength"][band] * WAVE
+            if "reference_temperature" in group:
+                about["reference_temperature"] = group["reference_temperature"] * u.K
+            registry.register(f"{instrument}.{band}", _load, curve=curve, **about)
     return registry
 
 

@@ -4,6 +4,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.units import FNU, WAVE, to_array
 
 
@@ -69,9 +70,8 @@ def spectrum_arrays(sed, bands):
         ndim=1,
         equivalencies=[] if plain else u.spectral_density(wave * WAVE),
     )
-    if wave.shape != fnu.shape:
-        got = f"{fnu.size} for {wave.size} wavelengths"
-        raise argument_error("sed.fnu", "as many values as sed.wave", got)
+    got = f"{fnu.size} for {wave.size} wavelengths"
+    check_that(wave.shape == fnu.shape, "sed.fnu", "as many values as sed.wave", got)
     return wave, fnu
 
 

@@ -12,7 +12,7 @@ from scipy.special import expit, ndtr
 from miricigale.filters import FilterSet
 from miricigale.fitting.likelihood import per_band
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_names
+from miricigale.utils.options import check_names, check_that
 from miricigale.utils.tables import described_table, error_column, require_columns
 from miricigale.utils.units import FNU, WAVE, frozen_array, to_array
 
@@ -75,8 +75,7 @@ class TemplateError:
             raise argument_error("wave", "ascending values above 0", f"{wave}")
         if error.shape != wave.shape or not np.all(np.isfinite(error) & (error >= 0)):
             raise argument_error("error", f"{wave.size} finite values, 0 or more", f"{error}")
-        object.__setattr__(self, "wave", frozen_array(wave) * WAVE)
-        object.__setattr__(self, "error", frozen_array(error))
+        self.__dict__.update(wave=frozen_array(wave) * WAVE, error=frozen_array(error))
 
     def __call__(self, wave):
         """Error at rest wavelengths (`~astropy.units.Quantity`): `~numpy.ndarray` of their shape."""
@@ -107,9 +106,8 @@ def grid_errors(template_error, filters, redshift):
 
 
 def _check_known(results):
-    if not results.redshift_fixed:
-        wanted = "of fits at known redshifts (redshift=...)"
-        raise argument_error("results", wanted, "redshifts that were free")
+    wanted = "of fits at known redshifts (redshift=...)"
+    check_that(results.redshift_fixed, "results", wanted, "redshifts that were free")
 
 
 def _residuals(results):
@@ -186,8 +184,7 @@ def measure_band_errors(left, template_error, *, longest=2.5 * u.um):
     >>> factor, part = measure_band_errors(left, template_error)  # doctest: +SKIP
     """
     found = error_of_bands(left, template_error, to_array(longest, WAVE, "longest", ndim=0))
-    if found is None:
-        raise argument_error("left", f"with {_N_BAND} fluxes of S/N above 5", "fewer")
+    check_that(found is not None, "left", f"with {_N_BAND} fluxes of S/N above 5", "fewer")
     return found
 
 
@@ -280,8 +277,7 @@ def measure_template_error(results, *, model_error=0.0, edges=None):
         if np.count_nonzero(some) >= _N_BIN:
             wave.append(np.sqrt(low * high))
             found.append(_excess(*(column[some] for column in columns)))
-    if not wave:
-        raise argument_error("results", f"with {_N_BIN} fluxes of S/N above 5 in a bin", "fewer")
+    check_that(wave, "results", f"with {_N_BIN} fluxes of S/N above 5 in a bin", "fewer")
     return TemplateError(wave * WAVE, found)
 
 
@@ -330,8 +326,7 @@ def measure_priors(results):
     array([0., 1., 0.])
     """
     _check_known(results)
-    if not results.fitted.any():
-        raise argument_error("results", "with fitted objects", "none")
+    check_that(results.fitted.any(), "results", "with fitted objects", "none")
     names = [name for name in results.axes if name != "redshift"]
     return {name: results.pdf[name][results.fitted].mean(axis=0) for name in names}
 

@@ -12,7 +12,7 @@ from miricigale.fitting.likelihood import FitFlags, flux_column
 from miricigale.fitting.posterior import randomized_ranks
 from miricigale.fitting.pulls import without_warnings
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_names
+from miricigale.utils.options import check_names, check_that
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import (
     described_rows,
@@ -293,13 +293,11 @@ def leave_out(fitter, photometry, bands, *, separately=False, **options):
     array([[-0.9],
            [ 0.1]])
     """
-    if not isinstance(fitter, BayesFitter):
-        raise argument_error("fitter", "a BayesFitter", type(fitter).__name__)
+    check_that(isinstance(fitter, BayesFitter), "fitter", "a BayesFitter", type(fitter).__name__)
     if isinstance(bands, str) or not len(bands):
         raise argument_error("bands", "a list of one or more names", repr(bands))
     bands = tuple(bands)
-    if len(set(bands)) < len(bands):
-        raise argument_error("bands", "different names", f"{list(bands)}")
+    check_that(len(set(bands)) == len(bands), "bands", "different names", list(bands))
     check_names(bands, "filter of the models", fitter.bands)
     data = fitter.read_bands(photometry, bands)
     groups = [(name,) for name in bands] if separately else [bands]

@@ -3,6 +3,7 @@
 import numpy as np
 
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.tables import described_table
 
 
@@ -65,8 +66,7 @@ def compare_classes(results, *, prior=None):
 
 def class_columns(results, *, prior=None):
     """Columns of `compare_classes` but the id: dict of name to values and description."""
-    if len(results) < 2:
-        raise argument_error("results", "a dict of two classes at least", f"{list(results)}")
+    check_that(len(results) >= 2, "results", "a dict of two classes at least", list(results))
     names = list(results)
     first = results[names[0]]
     for name in names[1:]:
@@ -104,16 +104,14 @@ def _check_same(whose, first, name, other):
             a, b = getattr(first, values)[:, mine], getattr(other, values)[:, theirs]
             if not np.array_equal(a, b, equal_nan=values != "limit"):
                 got = f"other values of {values!r}"
-    if got is not None:
-        raise argument_error("results", f"{name!r} of the same data as {whose!r}", got)
+    check_that(got is None, "results", f"{name!r} of the same data as {whose!r}", got)
 
 
 def _prior(prior, names, n):
     """Shares of the classes, shape (n_classes, n)."""
     if prior is None:
         return np.ones((len(names), n))
-    if set(prior) != set(names):
-        raise argument_error("prior", f"of the classes {names}", f"{sorted(prior)}")
+    check_that(set(prior) == set(names), "prior", f"of the classes {names}", sorted(prior))
     weight = np.array([np.broadcast_to(np.asarray(prior[name], float), (n,)) for name in names])
     if not np.all(np.isfinite(weight) & (weight >= 0)) or not np.all(weight.sum(axis=0) > 0):
         raise argument_error("prior", "finite, >= 0 and not all 0", f"{prior}")

@@ -19,6 +19,7 @@ from miricigale.fitting.interpolation import Nodes
 from miricigale.fitting.posterior import cell_edges
 from miricigale.fitting.samplers.run import systematic_draws
 from miricigale.utils.random import stream
+from miricigale.utils.units import Frozen
 
 #: Models that fill the prior, as a power of 2: of all redshifts, and of that of an object.
 _LIBRARY, _AT_REDSHIFT = 17, 13
@@ -31,7 +32,7 @@ _SOME = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Continuation:
+class Continuation(Frozen):
     """
     A grid with what lies between its nodes; picklable.
 
@@ -195,10 +196,6 @@ class Continuation:
             share = self.engine.mixture.shares(flux, wrong[0], wrong[2], one.limits, z)
         derived = self.finer.describe(values, values["redshift"], power, scale)
         return values, node, derived, share
-
-    def __getstate__(self):
-        # what is made of these is made again after unpickling
-        return {name: self.__dict__[name] for name in self.__dataclass_fields__}
 
 
 def _next_step(like, log, power, wanted, n, rng):

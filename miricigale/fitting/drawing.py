@@ -5,6 +5,7 @@ import numpy as np
 
 from miricigale.sed.spectrum import distance
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.tables import described_table
 from miricigale.utils.units import FNU
 
@@ -67,8 +68,7 @@ def best_sed(results, model=None, **changes):
         If no model is known or the object was not fitted.
     """
     model = results._one("best_sed").model if model is None else model
-    if model is None:
-        raise argument_error("model", "an SEDModel (these results know none)", "None")
+    check_that(model is not None, "model", "an SEDModel (these results know none)", "None")
     sed = model.evaluate(**best_parameters(results, model) | changes)
     if results.distance is None or not np.isfinite(results.distance) or "redshift" in changes:
         return sed

@@ -27,6 +27,7 @@ from miricigale.sed import ModelGrid, yang2021_axes
 from miricigale.utils.exceptions import FitWarning, argument_error, warn
 from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.meta import provenance
+from miricigale.utils.options import check_that
 from miricigale.utils.parallel import chunks, parallel_map, single_threaded
 from miricigale.utils.random import check_seed
 from miricigale.utils.tables import error_column
@@ -178,17 +179,14 @@ class BayesFitter(Interactive):
         on_grid = engine == "grid"
         kind = GridSettings if on_grid else SamplerSettings
         settings = settings or kind()
-        if not isinstance(settings, kind):
-            wanted = f"{kind.__name__} with engine={engine!r}"
-            raise argument_error("settings", wanted, type(settings).__name__)
+        wanted = f"{kind.__name__} with engine={engine!r}"
+        check_that(isinstance(settings, kind), "settings", wanted, type(settings).__name__)
         axes = yang2021_axes(axes) if isinstance(axes, str) else axes
         of_grid = {"axes": axes, "compat": compat, "calibration": calibration}
-        of_grid["template_error"] = template_error
-        of_grid["outliers"] = outliers
+        of_grid |= {"template_error": template_error, "outliers": outliers}
         if not on_grid:
             for name, value in of_grid.items():
-                if value is not None:
-                    raise argument_error(name, "left out with a sampler", repr(value))
+                check_that(value is None, name, "left out with a sampler", repr(value))
             get_sampler(engine)
         names = None if filters is None and on_grid else filter_names("filters", filters or ())
         predict = () if on_grid else filter_names("predict", settings.predict)

@@ -13,6 +13,7 @@ from miricigale.fitting.posterior import cell_edges
 from miricigale.fitting.priors import GridPriors
 from miricigale.fitting.quantities import DERIVED_LEVELS, Quantities
 from miricigale.sed import ModelGrid
+from miricigale.utils.units import Frozen
 
 #: Runs of up to 64 pairs listed at once by one worker (260 bytes each).
 _CAPACITY = 1 << 16
@@ -63,7 +64,7 @@ GridOutput = namedtuple("GridOutput", [*_AXES, "joint"])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class GridEngine:
+class GridEngine(Frozen):
     """
     Posterior of many objects over a factorized model grid.
 
@@ -432,11 +433,6 @@ class GridEngine:
         """Bands in which a model has negative flux."""
         negative = np.any(self.galaxy < 0, axis=(0, 1))
         return negative | np.any(self.agn < 0, axis=(0, 1))
-
-    def __getstate__(self):
-        # the prepared tables are made again after unpickling
-        names = self.__dataclass_fields__
-        return {name: value for name, value in self.__dict__.items() if name in names}
 
 
 def _unit(table):

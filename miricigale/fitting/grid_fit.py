@@ -27,7 +27,7 @@ from miricigale.fitting.samples import Samples
 from miricigale.fitting.settings import GridSettings
 from miricigale.sed import ModelGrid, SEDModel
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_choice
+from miricigale.utils.options import check_choice, check_that
 from miricigale.utils.parallel import chunks, parallel_map
 from miricigale.utils.random import stream
 from miricigale.utils.units import MASS
@@ -95,8 +95,7 @@ class GridFit:
             raise argument_error("model", "a ModelGrid or an SEDModel", type(model).__name__)
         if settings.agn_error and compat:
             raise argument_error("agn_error", "0 with 'compat'", f"{settings.agn_error}")
-        if outliers is not None and compat:
-            raise argument_error("outliers", "None with 'compat'", f"{outliers}")
+        check_that(outliers is None or not compat, "outliers", "None with 'compat'", outliers)
         if calibration is not None:
             known = {name: axis.values for name, axis in grid_priors(grid).axes.items()}
             priors = calibration.grid_priors(known) | (priors or {})

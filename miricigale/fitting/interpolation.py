@@ -17,7 +17,7 @@ from miricigale.fitting import _core
 from miricigale.fitting.priors import grid_priors
 from miricigale.fitting.quantities import Quantities
 from miricigale.sed import ModelFlags
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.units import MASS
 
 #: Powers of a parameter, 1 or parts by 2, that may be its scale; those below 0 with the sign changed.
@@ -226,9 +226,8 @@ def finer_grid(model, grid, filters, constants, nodes):
     axes = {name: [value] for name, value in constants.items()}
     axes |= {name: np.asarray(grid.axes.get(name, a.values)) for name, a in nodes.axes.items()}
     error = partial(_chain_rms, model, filters, constants, grid.frac_agn)
-    if not error(nodes) < 1e-3:
-        wanted = "the model that made the grid"
-        raise argument_error("finer", wanted, "one with other fluxes at its nodes")
+    wanted = "the model that made the grid"
+    check_that(error(nodes) < 1e-3, "finer", wanted, "one with other fluxes at its nodes")
     finer, kinds = nodes, {name: a.kind for name, a in nodes.axes.items()}
     own = {
         kind: [name for name in kinds if kinds[name] in ("redshift", kind)] for kind in nodes.kinds

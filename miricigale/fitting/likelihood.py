@@ -8,6 +8,7 @@ import numpy as np
 from miricigale.filters import Filter
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.object_rows import ObjectRows, PerObject
+from miricigale.utils.options import check_that
 from miricigale.utils.tables import Flags, error_column, read_ids, require_columns
 from miricigale.utils.units import FNU, to_array
 
@@ -179,9 +180,8 @@ class PhotometryReader:
         if self.filters is not None:
             return self.filters
         filters = tuple(name for name in self.bands if name in table.colnames)
-        if not filters:
-            wanted = f"a table with at least one of the columns {list(self.bands)}"
-            raise argument_error("photometry", wanted, f"columns {table.colnames}")
+        wanted = f"a table with at least one of the columns {list(self.bands)}"
+        check_that(filters, "photometry", wanted, f"columns {table.colnames}")
         return filters
 
     def read(self, table, repeated=None):
@@ -313,8 +313,7 @@ def per_band(value, filters, name):
     """A setting by filter, dict of str to float: given as a number or by name."""
     given = value if isinstance(value, dict) else dict.fromkeys(filters, value)
     unknown = sorted(set(given) - set(filters))
-    if unknown:
-        raise argument_error(name, f"a dict with keys among {list(filters)}", f"{unknown}")
+    check_that(not unknown, name, f"a dict with keys among {list(filters)}", unknown)
     # 10 % is 0.1
     unit = u.dimensionless_unscaled
     out = {f: float(to_array(given.get(f, 0.0), unit, name, ndim=0)) for f in filters}

@@ -17,7 +17,7 @@ from scipy.special import expit, log_ndtr
 from miricigale.filters import FilterSet
 from miricigale.fitting import _core
 from miricigale.fitting.likelihood import per_band
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 
 #: Least width of the broad part, in units of the stated error.
 _WIDE = 10.0
@@ -48,8 +48,7 @@ class BandMixture:
         names = tuple(getattr(filters, "names", filters))
         part = {} if outliers is None else per_band(outliers, names, "outliers")
         part = np.array(list(part.values()))
-        if np.any(part >= 1):
-            raise argument_error("outliers", "at least 0 and below 1", f"{outliers}")
+        check_that(np.all(part < 1), "outliers", "at least 0 and below 1", outliers)
         if not part.any():
             return None
         known = filters if isinstance(filters, FilterSet) else FilterSet.from_names(names)

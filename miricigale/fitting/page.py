@@ -14,9 +14,10 @@ from miricigale.fitting.classes import classes_of, classes_section
 from miricigale.fitting.from_files import open_catalog
 from miricigale.fitting.likelihood import unused_bands
 from miricigale.fitting.page_numbers import fit_numbers, known_redshifts
-from miricigale.pages import Page, SectionWriter, declared
+from miricigale.pages import Page, SectionWriter
 from miricigale.plotting.axes import WIDTH, new_figure
 from miricigale.plotting.comparison import plot_redshifts
+from miricigale.utils.declared import declared
 
 #: Examples on the page, and points in a drawing.
 _EXAMPLES, _POINTS = 6, 5000

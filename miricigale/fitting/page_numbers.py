@@ -3,8 +3,8 @@
 import numpy as np
 from astropy.table import Table, vstack
 
-from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing import plain_floats
+from miricigale.utils.options import check_that
 
 #: Columns that hold known redshifts, the first that is there.
 KNOWN_REDSHIFTS = ("z_spec", "zspec", "z_true", "redshift_spec", "redshift")
@@ -91,8 +91,7 @@ def known_redshifts(rows, name):
         name = next((one for one in KNOWN_REDSHIFTS if one in names), None)
     if name is None:
         return None, np.full(rows.n_rows, np.nan)
-    if name not in names:
-        raise argument_error("z_spec", f"one of the columns {list(names)}", repr(name))
+    check_that(name in names, "z_spec", f"one of the columns {list(names)}", repr(name))
     chunks = (rows.chunk(i) for i in range(rows.n_chunks))
     z = np.concatenate([plain_floats(chunk[name], name, "photometry") for chunk in chunks])
     return name, np.where(z > 0, z, np.nan)

@@ -10,6 +10,7 @@ from miricigale.fitting.posterior import cell_edges
 from miricigale.fitting.quantities import plain
 from miricigale.sed.spectrum import COSMOLOGY
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.units import MASS, is_number, to_array
 
 #: Of `agn_fraction_prior`: galaxies with lambda above 0.01, solar luminosities of dust for each solar mass of
@@ -111,9 +112,8 @@ class MassPrior:
         """Of a density, that of the comoving volume in the cell of each redshift; None without one."""
         if mass_function is None:
             return None
-        if not callable(mass_function):
-            wanted = "a function of stellar mass and redshift, such as MassFunction()"
-            raise argument_error("mass_function", wanted, repr(mass_function))
+        wanted = "a function of stellar mass and redshift, such as MassFunction()"
+        check_that(callable(mass_function), "mass_function", wanted, repr(mass_function))
         z, stars = grid.redshift, plain(grid.galaxy_properties["stellar_mass"])
         mass = 10.0 ** (np.arange(cls.last * cls.per_dex + 1) / cls.per_dex)
         density = mass_function(mass * MASS, z[:, None])

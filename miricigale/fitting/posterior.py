@@ -3,6 +3,7 @@
 import numpy as np
 
 from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.options import check_that
 
 #: Letters of the engine's joint sums: redshift and fraction before galaxy, galaxy before AGN model.
 _LETTERS = {"redshift": "z", "frac_agn": "f", "galaxy": "g", "agn": "k"}
@@ -40,10 +41,8 @@ def moments(values, pdf):
 def check_levels(levels):
     """Levels of percentiles as an array; a `ValueError` if one is not between 0 and 1."""
     levels = np.atleast_1d(np.asarray(levels, dtype=float))
-    if levels.ndim != 1:
-        raise argument_error("levels", "a number or a list of numbers", f"shape {levels.shape}")
-    if not np.all((levels > 0) & (levels < 1)):
-        raise argument_error("levels", "between 0 and 1", f"{levels}")
+    check_that(levels.ndim == 1, "levels", "a number or a list of numbers", f"shape {levels.shape}")
+    check_that(np.all((levels > 0) & (levels < 1)), "levels", "between 0 and 1", levels)
     return levels
 
 
@@ -132,16 +131,14 @@ def check_pairs(pairs, axes, constant, derived, wanted):
         if len(names) != 2 or not all(isinstance(name, str) for name in names):
             raise argument_error("pairs", of_names, f"{pair!r} in it")
         for name in names:
-            if name in derived:
-                raise argument_error("pairs", wanted, repr(name))
+            check_that(name not in derived, "pairs", wanted, repr(name))
             if name in constant or (name in axes and axes[name].values.size == 1):
                 several = "of parameters with several values"
                 raise argument_error("pairs", several, f"{name!r}, which has one")
             if name not in axes:
                 raise unknown_name("parameter for 'pairs'", name, axes)
         names = tuple(map(str, names))
-        if names[0] == names[1]:
-            raise argument_error("pairs", "of two different parameters", f"{names}")
+        check_that(names[0] != names[1], "pairs", "of two different parameters", names)
         if set(names) != _ALWAYS and names[::-1] not in out:
             out[names] = None
     return tuple(out)

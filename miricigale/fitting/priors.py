@@ -9,7 +9,7 @@ from miricigale.fitting.likelihood import FitFlags
 from miricigale.fitting.posterior import cell_edges
 from miricigale.fitting.quantities import plain
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_choice, check_names
+from miricigale.utils.options import check_choice, check_names, check_that
 from miricigale.utils.units import to_array
 
 #: Power, peak at magnitude 24 and its change with each magnitude of `magnitude_prior`.
@@ -138,9 +138,8 @@ def _axis(name, values, unit, kind, priors, bounds=(-np.inf, np.inf)):
     if prior is None:
         weights = np.ones(values.size)
     elif isinstance(prior, str):
-        if prior != "log" or not np.all(values > 0):
-            wanted = "a function, an array or 'log' (with values above 0)"
-            raise argument_error(argument, wanted, repr(prior))
+        wanted = "a function, an array or 'log' (with values above 0)"
+        check_that(prior == "log" and np.all(values > 0), argument, wanted, repr(prior))
         weights = 1.0 / values
     elif callable(prior) or hasattr(prior, "pdf"):
         density = getattr(prior, "pdf", prior)
@@ -176,13 +175,11 @@ def known_redshifts(photometry, redshift):
     """
     n = len(photometry)
     if isinstance(redshift, str):
-        if redshift not in photometry.colnames:
-            wanted = f"a column among {photometry.colnames}"
-            raise argument_error("redshift", wanted, repr(redshift))
+        wanted = f"a column among {photometry.colnames}"
+        check_that(redshift in photometry.colnames, "redshift", wanted, repr(redshift))
         redshift = photometry[redshift]
     values = _unmasked(redshift, "redshift")
-    if values.shape not in ((), (n,)):
-        raise argument_error("redshift", f"{n} values", f"shape {values.shape}")
+    check_that(values.shape in ((), (n,)), "redshift", f"{n} values", f"shape {values.shape}")
     values = np.broadcast_to(values, (n,))
     return np.where(np.isfinite(values) & (values > 0), values, np.nan)
 

@@ -7,7 +7,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.fitting.posterior import cell_percentiles
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.units import LUMINOSITY, MASS
 
 #: Levels at which the distributions of derived quantities are kept.
@@ -76,9 +76,8 @@ def kept_percentiles(name, levels, kept):
     these: nothing is known of the tails.
     """
     low, high = DERIVED_LEVELS[[0, -1]]
-    if np.any((levels < low) | (levels > high)):
-        wanted = f"from {low:g} to {high:g} for {name!r}, whose distribution is kept there"
-        raise argument_error("levels", wanted, f"{levels.tolist()}")
+    wanted = f"from {low:g} to {high:g} for {name!r}, whose distribution is kept there"
+    check_that(not np.any((levels < low) | (levels > high)), "levels", wanted, f"{levels.tolist()}")
     out = np.array([np.interp(levels, DERIVED_LEVELS, row) for row in kept])
     return out.reshape(len(kept), levels.size)
 

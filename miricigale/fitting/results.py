@@ -194,8 +194,8 @@ class FitResults(FitRows):
             object.__setattr__(self, "limit", np.zeros(np.shape(self.sigma), dtype=bool))
         if self.fitted_filters is None:
             object.__setattr__(self, "fitted_filters", tuple(self.filters))
-        best = {name: u.Quantity(value, self.unit(name)) for name, value in self.best.items()}
-        object.__setattr__(self, "best", best)
+        best = self.best.items()
+        self.__dict__["best"] = {name: u.Quantity(v, self.unit(name)) for name, v in best}
         super().__post_init__()
 
     def __repr__(self):

@@ -15,7 +15,7 @@ from miricigale.fitting.rows import FitRows
 from miricigale.sed import grid_spectra as spectra
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.object_rows import PerObject
-from miricigale.utils.options import check_names
+from miricigale.utils.options import check_names, check_that
 from miricigale.utils.random import stream
 from miricigale.utils.tables import described_table, error_column
 from miricigale.utils.unified import read_write
@@ -115,8 +115,7 @@ model : `~miricigale.sed.SEDModel`, optional
             raise argument_error("scale", f"of shape ({n}, n_draws)", f"{shape}")
         for name, wanted in (("index", (*shape, 4)), ("flags", (n,))):
             got = np.shape(getattr(self, name))
-            if got != wanted:
-                raise argument_error(name, f"of shape {wanted}", f"{got}")
+            check_that(got == wanted, name, f"of shape {wanted}", got)
         sizes = (grid.redshift.size, grid.n_galaxies, max(grid.n_agn, 1), grid.frac_agn.size)
         drawn = index[(index[:, :, 0] >= 0).all(axis=1)].reshape(-1, 4)
         if np.any(drawn < [0, 0, -1, 0]) or np.any(drawn >= sizes):
@@ -327,8 +326,7 @@ model : `~miricigale.sed.SEDModel`, optional
         values, known = self.loc[key]._fitted_one().values(name).value, self._quantities
         if name in self.axes:
             return values, cell_edges(self.axes[name].values, self.axes[name].bounds)
-        if not np.isfinite(values).any():
-            raise argument_error("name", "one with values in the draws", repr(name))
+        check_that(np.isfinite(values).any(), "name", "one with values in the draws", repr(name))
         extensive = name in known.names and name not in known.intensive
         return values, bin_edges(values, log=extensive)
 
@@ -364,8 +362,7 @@ model : `~miricigale.sed.SEDModel`, optional
         return out.reshape(*self.scale.shape, len(names)) * FNU
 
     def _model(self):
-        if self.model is None:
-            raise argument_error("model", "an SEDModel (these samples know none)", "None")
+        check_that(self.model is not None, "model", "an SEDModel (these samples know none)", "None")
         spectra.check_model(self.model, self.grid)
         return self.model
 

@@ -17,6 +17,7 @@ from miricigale.fitting.likelihood import HIGH_CHI2
 from miricigale.fitting.pulls import warn_of_pulls
 from miricigale.utils.content import content_sha256
 from miricigale.utils.exceptions import CatalogWarning, OtherResultsError, argument_error, warn
+from miricigale.utils.options import check_that
 from miricigale.utils.progress import progress
 from miricigale.utils.random import check_seed
 from miricigale.utils.store import plain_value
@@ -115,8 +116,7 @@ def fit_file(
     >>> results = fit_file(fitter, "catalog.fits", "fits", redshift="z_spec")  # doctest: +SKIP
     >>> results.write_table("table.fits")  # doctest: +SKIP
     """
-    if not isinstance(fitter, BayesFitter):
-        raise argument_error("fitter", "a BayesFitter", type(fitter).__name__)
+    check_that(isinstance(fitter, BayesFitter), "fitter", "a BayesFitter", type(fitter).__name__)
     if not isinstance(path_in, (str, os.PathLike)):
         raise argument_error("path_in", "the path of a catalog", type(path_in).__name__)
     if fitter.engine != "grid":

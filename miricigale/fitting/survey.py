@@ -23,7 +23,8 @@ from miricigale.fitting.priors import known_redshifts
 from miricigale.fitting.pulls import without_warnings
 from miricigale.refdata import locate
 from miricigale.utils.exceptions import DataError, FitWarning, argument_error, warn
-from miricigale.utils.files import read_table
+from miricigale.utils.options import check_that
+from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import described_rows, described_table, require_columns
 from miricigale.utils.units import WAVE
 
@@ -149,8 +150,7 @@ class SurveyCalibration:
             meta["mass_function"] = dataclasses.asdict(self.mass_function)
         meta["errors"] = {name: np.asarray(e).tolist() for name, e in self.errors.items()}
         if self.scores is not None:
-            columns = {n: self.scores[n].tolist() for n in self.scores.colnames}
-            meta["scores"] = columns
+            meta["scores"] = {n: self.scores[n].tolist() for n in self.scores.colnames}
         table = described_table({n: (self.bands[n], t) for n, t in _COLUMNS.items()}, meta)
         table.write(path, format="ascii.ecsv", overwrite=overwrite)
 
@@ -256,8 +256,7 @@ def calibrate(
     >>> calibration.scores  # doctest: +SKIP
     >>> calibration.write("calibration.ecsv")  # doctest: +SKIP
     """
-    if fitter.grid is None:
-        raise argument_error("fitter", "one with a grid", fitter.engine)
+    check_that(fitter.grid is not None, "fitter", "one with a grid", fitter.engine)
     table = fitter.table_of(photometry)
     z = known_redshifts(table, redshift)
     rows = np.flatnonzero(

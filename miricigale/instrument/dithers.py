@@ -11,8 +11,9 @@ from astropy.table import Table
 
 from miricigale.instrument.siaf import aperture, imager_columns
 from miricigale.utils.exceptions import DataError, argument_error, data_error
-from miricigale.utils.files import read_table, unpacked_size
+from miricigale.utils.files import reading, unpacked_size
 from miricigale.utils.options import check_names
+from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import require_columns
 from miricigale.utils.units import ANGLE, check_count, to_array
 
@@ -240,7 +241,8 @@ def read_dithers(path, *, observation=None, exposure=None):
     for name, given in (("observation", observation), ("exposure", exposure)):
         if given is not None:
             raise argument_error(name, "left out, but for a .pointing file", given)
-    return _table_offsets(read_table(path, wanted="a table"), path.name)
+    with reading(path, "a table"):
+        return _table_offsets(read_table(path, wanted="a table"), path.name)
 
 
 def _read_pointings(path, observation, exposure):

@@ -11,7 +11,7 @@ class ImageFacts:
     """
     What an image says of itself, as far as work depends on it.
 
-    Everything else in its meta dictionary is for people.
+    What was done to it is its `ExposureHistory`; everything else in its meta dictionary is for people.
 
     Parameters
     ----------
@@ -28,13 +28,6 @@ class ImageFacts:
         By how much sums over many pixels are noisier than their errors in quadrature.
     n_outliers : int, optional
         Pixels that disagreed with the other dithers; None if outliers were not searched for.
-    simulated : bool, optional
-        Whether the package's `~miricigale.detector.Detector` made the counts, so that its own
-        constants hold for them.
-    steps : tuple of str, optional
-        What was done to the image (`~miricigale.instrument.STEPS`); a text is taken apart.
-    day : float, optional
-        Middle of the exposure, MJD.
 
     Raises
     ------
@@ -58,24 +51,18 @@ class ImageFacts:
     ipc: bool = False
     noise_correction: float = 1.0
     n_outliers: int | None = None
-    simulated: bool = False
-    steps: tuple = ()
-    day: float | None = None
 
     def __post_init__(self):
-        for field in ("psf_includes", "steps"):
-            names = getattr(self, field)
-            if isinstance(names, str):
-                names = names.replace(",", " ").split()
-            object.__setattr__(self, field, tuple(str(name).lower() for name in names))
+        names = self.psf_includes
+        if isinstance(names, str):
+            names = names.replace(",", " ").split()
+        object.__setattr__(self, "psf_includes", tuple(str(name).lower() for name in names))
         for name, kind, wanted in (
             ("filter", str, "a name"),
             ("subarray", str, "a name"),
             ("ipc", (bool, numbers.Integral), "True or False"),
             ("noise_correction", numbers.Real, "a number"),
             ("n_outliers", numbers.Integral, "an integer"),
-            ("simulated", (bool, numbers.Integral), "True or False"),
-            ("day", numbers.Real, "a number"),
         ):
             value = getattr(self, name)
             if value is not None and not isinstance(value, kind):

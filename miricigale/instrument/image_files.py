@@ -1,6 +1,5 @@
 """Images of a run as FITS files."""
 
-import io
 import json
 
 import astropy.units as u
@@ -12,7 +11,6 @@ from miricigale.instrument.image import Image
 from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import open_fits, write_fits
 from miricigale.utils.meta import plain_text, undated
-from miricigale.utils.optional import require
 
 
 def json_meta(meta):
@@ -161,19 +159,3 @@ def read_image(path, *, planes=()):
             for name in planes
         ]
     return (image, *extra) if extra else image
-
-
-def asdf_wcs(header, hdus):
-    """The gwcs in the extension ASDF of JWST's pipeline, as FITS polynomials good to 0.01 pixels."""
-    from astropy.wcs import WCS
-
-    require("gwcs", extra="gwcs")
-    asdf = require("asdf", extra="gwcs")
-    content = np.asarray(hdus["ASDF"].data["ASDF_METADATA"][0]).tobytes()
-    try:
-        with asdf.open(io.BytesIO(content)) as tree:
-            exact = tree["meta"]["wcs"]
-    except (KeyError, ValueError) as err:
-        raise data_error(hdus.filename(), f"has no gwcs in its extension ASDF: {err}") from err
-    box = tuple((-0.5, header[f"NAXIS{k}"] - 0.5) for k in (1, 2))
-    return WCS(exact.to_fits_sip(bounding_box=box, max_pix_error=0.01))

@@ -65,7 +65,7 @@ def pixel_to_sky(x, y, pointing, roll, *, subarray="FULL"):
     return SkyCoord(*v2v3_to_sky(*pixel_to_v2v3(x, y, subarray=subarray), matrix), unit="deg")
 
 
-def _scaled_fit(x, y, values, order):
+def scaled_fit(x, y, values, order):
     """Least-squares polynomial without a constant, as a (order+1)^2 table."""
     sx, sy = np.abs(x).max(), np.abs(y).max()
     powers = [(i, n - i) for n in range(1, order + 1) for i in range(n, -1, -1)]
@@ -97,14 +97,14 @@ def _sip(subarray):
     vector = unit_vector(np.radians(ra), np.radians(dec))
     xi, eta = np.degrees(vector[1] / vector[0]), np.degrees(vector[2] / vector[0])
     dx, dy = (gx - part.reference[0]).ravel(), (gy - part.reference[1]).ravel()
-    forward = _scaled_fit(dx, dy, np.stack([xi.ravel(), eta.ravel()], axis=1), _SIP_ORDER)
+    forward = scaled_fit(dx, dy, np.stack([xi.ravel(), eta.ravel()], axis=1), _SIP_ORDER)
     cd = np.array([[t[1, 0], t[0, 1]] for t in forward])
     forward[:, 1, 0] = forward[:, 0, 1] = 0
     a, b = np.tensordot(np.linalg.inv(cd), forward, axes=1)
     # the inverse: pixel offsets as corrections of the linear ones
     plane = np.linalg.inv(cd) @ np.stack([xi.ravel(), eta.ravel()])
     shift = np.stack([dx - plane[0], dy - plane[1]], axis=1)
-    ap, bp = _scaled_fit(plane[0], plane[1], shift, _SIP_INVERSE_ORDER)
+    ap, bp = scaled_fit(plane[0], plane[1], shift, _SIP_INVERSE_ORDER)
     return cd, a, b, ap, bp
 
 

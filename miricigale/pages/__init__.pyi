@@ -1,7 +1,6 @@
 from .page import Page as Page
 from .rendering import render as render
 from .sections import SectionWriter as SectionWriter
-from .sections import declared as declared
 from .sections import sentence as sentence
 from .values import Link as Link
 from .values import Missing as Missing

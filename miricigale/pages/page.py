@@ -8,6 +8,7 @@ from markupsafe import Markup
 from miricigale.pages.rendering import image_of, macros, render
 from miricigale.pages.values import Missing
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.store import replacing
 
 
@@ -120,8 +121,7 @@ class Page:
             lengths = sorted({len(row) for row in rows})
             raise argument_error("rows", f"{len(header)} cells in each row", lengths)
         if not rows:
-            if not empty:
-                raise argument_error("rows", "at least one, or 'empty' for the sentence", "none")
+            check_that(empty, "rows", "at least one, or 'empty' for the sentence", "none")
             return self.text(empty)
         reasons = {cell.reason: cell for row in rows for cell in row if isinstance(cell, Missing)}
         # a single reason is not numbered

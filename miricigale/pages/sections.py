@@ -1,33 +1,10 @@
 """Sections of a page as a TOML file declares them: titles, paragraphs, headline numbers, captions and columns."""
 
 import contextlib
-import functools
-import tomllib
-from importlib import resources
 
 from markupsafe import Markup
 
 from miricigale.pages.values import cell_of
-
-
-@functools.cache
-def declared(package, file="page.toml"):
-    """
-    Read what is declared of a page.
-
-    Parameters
-    ----------
-    package : str
-        Package that has the file.
-    file : str, optional
-        Its name.
-
-    Returns
-    -------
-    texts : dict of str to dict
-        Sentences and tables by section.
-    """
-    return tomllib.loads((resources.files(package) / file).read_text("utf-8"))
 
 
 def sentence(text, facts):

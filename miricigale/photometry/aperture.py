@@ -4,6 +4,7 @@ import dataclasses
 
 import astropy.units as u
 import numpy as np
+from astropy.nddata import CCDData, StdDevUncertainty
 from photutils.aperture import ApertureStats, CircularAperture
 from photutils.background import LocalBackground, SExtractorBackground
 from photutils.segmentation import SourceCatalog
@@ -94,7 +95,9 @@ def circle_sums(arrays, xy, radius):
     return flux, np.sqrt(noise), coverage
 
 
-def source_extractor_photometry(image, *, preset="yang2021_miri", stated_on=0.06 * u.arcsec):
+def source_extractor_photometry(
+    image, *, preset="yang2021_miri", stated_on=0.06 * u.arcsec, weighted=True
+):
     """
     Detect and measure on one image, blind, as Source Extractor does.
 
@@ -110,6 +113,9 @@ def source_extractor_photometry(image, *, preset="yang2021_miri", stated_on=0.06
         See `~miricigale.photometry.detect_sources`.
     stated_on : `~astropy.units.Quantity` or None, optional
         Pixel scale for which settings in pixels are meant; None for the image's own.
+    weighted : bool, optional
+        Whether the image's mask and errors count. Otherwise it is taken as by default in the program: pixels
+        without data are 0, and the noise is one for all, the median rms of the background's boxes.
 
     Returns
     -------
@@ -142,17 +148,21 @@ def source_extractor_photometry(image, *, preset="yang2021_miri", stated_on=0.06
     >>> print(f"{len(table)} source, {table['flux_aper'][0]:.2f} in the circle")
     1 source, 2.28 uJy in the circle
     """
-    segmentation, catalog = detect_sources(
-        image, preset=preset, subtract_background=True, box=_BACKGROUND[0],
-        filter_size=_BACKGROUND[1], stated_on=stated_on,
-    )  # fmt: skip
     arrays = image_arrays(image, "image")
     ratio = 1.0
     if stated_on is not None:
         ratio = float(to_array(stated_on, ANGLE, "stated_on")) / pixel_scale(image.wcs)
     box = max(1, round(_BACKGROUND[0] * ratio))
-    level, _ = sep_background(arrays.flux, ~arrays.usable, box, _BACKGROUND[1])
+    empty = ~arrays.usable if weighted else None
+    level, rms = sep_background(arrays.flux, empty, box, _BACKGROUND[1])
     flux = arrays.flux - np.where(arrays.usable, level, 0.0)
+    if not weighted:
+        flux = arrays.flux - level
+        sigma = np.full(flux.shape, np.median(rms[rms > 0]))
+        arrays = dataclasses.replace(arrays, sigma=sigma, usable=sigma > 0)
+    data = np.where(arrays.usable, flux, np.nan)
+    own = CCDData(data, unit=FNU, uncertainty=StdDevUncertainty(arrays.sigma), wcs=image.wcs)
+    segmentation, catalog = detect_sources(own, preset=preset, stated_on=stated_on)
     values = [np.empty(0)] * 4
     if len(catalog):
         values = _measure(arrays, flux, segmentation, catalog, ratio)

@@ -3,8 +3,8 @@
 from miricigale.photometry.error_calibration import ErrorCalibration
 from miricigale.photometry.error_model import ErrorModel
 from miricigale.utils.exceptions import data_error
-from miricigale.utils.files import read_table
 from miricigale.utils.store import replacing
+from miricigale.utils.table_files import read_table
 from miricigale.utils.unified import register
 
 

@@ -8,7 +8,7 @@ import astropy.units as u
 import numpy as np
 from astropy.io import fits
 
-from miricigale.instrument.image_files import asdf_wcs
+from miricigale.instrument.asdf_extension import asdf_wcs
 from miricigale.utils.exceptions import (
     PhotometryWarning,
     argument_error,

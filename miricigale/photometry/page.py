@@ -6,12 +6,13 @@ import astropy.units as u
 import numpy as np
 from astropy.stats import mad_std
 
-from miricigale.pages import Missing, Page, SectionWriter, declared
+from miricigale.pages import Missing, Page, SectionWriter
 from miricigale.photometry import ForcedFlags
 from miricigale.photometry.arrays import pixel_scale
 from miricigale.plotting.axes import new_figure
 from miricigale.plotting.images import plot_image, plot_model_residual, plot_segmentation
 from miricigale.plotting.posteriors import plot_pulls
+from miricigale.utils.declared import declared
 from miricigale.utils.units import ab_magnitude
 
 #: Largest number of pixels across a drawing of a whole image, and rows of the table.

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from miricigale.evaluation import OUTLIER, Estimate, bootstrap
-from miricigale.evaluation.estimates import median, scatter
+from miricigale.evaluation import OUTLIER, bootstrap
+from miricigale.evaluation.estimates import median, scatter, weighted_share
 
 
 def _share(found, among):
@@ -15,30 +15,6 @@ def sky_weights(sources, agn_limit):
     """What each source counts for in one sky, shape (n,): an AGN one by all skies that its like are drawn from."""
     agn = np.asarray(sources["frac_agn"], float) >= agn_limit
     return np.where(agn, 1 / sources.meta.get("n_skies", 1), 1.0)
-
-
-def weighted_share(found, among):
-    """
-    Share of weights found, with its Wilson interval.
-
-    Parameters
-    ----------
-    found, among : array-like, shape (n,)
-        Weights of the sources found, 0 for others, and of all; without NaN.
-
-    Returns
-    -------
-    share : `~miricigale.evaluation.Estimate`
-        The interval is that of as many equal sources as have the variance of the weighted share.
-    """
-    total = np.sum(among)
-    if not total > 0:
-        return Estimate(np.nan)
-    value = np.sum(found) / total
-    variance = np.sum((found - value * among) ** 2) / total**2
-    like = value * (1 - value) / variance if variance > 0 else total**2 / np.sum(among**2)
-    interval = Estimate.of_fraction(round(value * like), max(round(like), 1))
-    return Estimate(value, interval.low, interval.high, np.count_nonzero(among))
 
 
 #: Statistic of each number, and the columns (`_columns`) that it is of.

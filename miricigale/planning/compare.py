@@ -4,7 +4,8 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from miricigale.planning.accuracy import sky_weights, weighted_share
+from miricigale.evaluation.estimates import weighted_share
+from miricigale.planning.accuracy import sky_weights
 
 
 def _row(planner, plan, numbers):

@@ -291,7 +291,7 @@ class PlanConfig(Configuration):
     catalog: CatalogSection = dataclasses.field(default_factory=CatalogSection)
     sample: SampleSection = dataclasses.field(default_factory=SampleSection)
     # dust that the models of the fit have, as in the presets of runs
-    sed: SedSection = dataclasses.field(default_factory=lambda: SedSection(infrared="fit"))
+    sed: SedSection = dataclasses.field(default_factory=SedSection)
     agn: AgnSection = dataclasses.field(default_factory=AgnSection)
     exposures: ExposureSection = dataclasses.field(default_factory=ExposureSection)
     background: BackgroundSection = dataclasses.field(default_factory=BackgroundSection)

@@ -141,6 +141,7 @@ def images_study(planner, source):
             depths=fit.depths,
             axes=fit.axes,
             model_error=fit.model_error,
+            dust_excess=fit.dust_excess,
             min_detected=planner.min_detected,
         ),
         point_sources=PointSourceSection(enabled=False),

@@ -5,9 +5,10 @@ import dataclasses
 import astropy.units as u
 import numpy as np
 
-from miricigale.pages import Page, SectionWriter, declared, number, sentence
+from miricigale.pages import Page, SectionWriter, number, sentence
 from miricigale.planning.exposures import background_options
 from miricigale.plotting.axes import MEASURED, SECOND, TRUE, legend, new_figure
+from miricigale.utils.declared import declared
 from miricigale.workflow.background import background_text
 from miricigale.workflow.page.study_figures import redshift_figure
 
@@ -108,7 +109,8 @@ def _notices(page, planner):
     page.notice("images" if config.images.enabled else "noise")
     noise = dataclasses.asdict(config.noise)
     page.notice(f"errors_{noise['kind']}", **noise | {"fractional": 100 * noise["fractional"]})
-    page.notice("models", model_error=100 * config.fit.model_error)
+    models = "models_ceers" if config.sed.infrared == "ceers" else "models"
+    page.notice(models, model_error=100 * config.fit.model_error)
     page.notice("hours")
     if planner.given is None:
         mix = ", ".join(f"{value:g}" for value in agn.frac_agn)

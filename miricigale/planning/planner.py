@@ -11,10 +11,10 @@ from miricigale.planning.accuracy import accuracy
 from miricigale.planning.config import PlanConfig
 from miricigale.planning.exposures import RunErrors, band_plans, wall_clock
 from miricigale.planning.sample import make_sample
-from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import error_column, require_columns
 from miricigale.workflow.stages.fits import existing_errors, study_fitter
+from miricigale.workflow.stages.inputs import fit_plan
 from miricigale.workflow.stages.sample import detected_bands
 
 #: Name of the fit without MIRI.
@@ -266,8 +266,8 @@ class Planner:
         known = self.band_plans(share)
         plans = {band: known[band] for band in bands}
         photometry = self.photometry(plans.values(), measured)
-        axes = SEDModel.yang2021_axes(config.fit.axes)
-        fitter = study_fitter(config.fit, [*config.fit.bands, *bands], axes=axes)
+        every = [*config.fit.bands, *bands]
+        fitter = study_fitter(config.fit, every, axes=fit_plan(config, name))
         results = fitter.fit(photometry, executor=self.executor)
         table = self._results(results, photometry, plans)
         pointings = config.exposures.pointings if pointings is None else pointings

@@ -4,7 +4,6 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable, vstack
 
-from miricigale.evaluation import AGNPopulation
 from miricigale.refdata import resources
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import ConfigError, argument_error, config_error
@@ -17,6 +16,7 @@ from miricigale.workflow.stages.truth import (
     add_field_agn,
     galaxy_parameters,
     library_fluxes,
+    other_skies,
 )
 
 #: Sources whose AGN are drawn: those of some 200 pointings. AGN of others than the sample stand in it, too.
@@ -83,6 +83,8 @@ def make_sample(config, bands, *, executor=None):
     ).to_table()
     sources = galaxy_parameters(study, catalog, results, seed=seed)
     sources["luminosity"] = results["dust_luminosity_best"].to(u.Lsun)
+    if "dust_excess" in sources.colnames:
+        sources["luminosity"] *= sources["dust_excess"]
     sources["size"] = _sizes(catalog)
     if "frac_agn" in catalog.colnames:
         sources["frac_agn"] = np.asarray(catalog["frac_agn"], float)
@@ -111,7 +113,8 @@ def make_sample(config, bands, *, executor=None):
         add_field_agn(sources, model, next(iter(bands)), seed)
         if not config.images.enabled:
             n_skies += _DRAWS // len(sources)
-            others = _other_skies(sources, model, next(iter(bands)), n_skies - 1, config)
+            options = {"least": config.agn.limit, "seed": seed}
+            others, _ = other_skies(sources, model, next(iter(bands)), n_skies - 1, **options)
             sources = vstack([sources, others], metadata_conflicts="silent")
     else:
         add_agn(sources, 0.0, seed)
@@ -131,24 +134,6 @@ def _cut(table, chosen, what):
     if not np.any(chosen):
         raise config_error(what, f"leaves none of the {len(table)} sources")
     return table[chosen]
-
-
-def _other_skies(sources, model, band, n_skies, config):
-    """AGN above the limit that the same galaxies have in other skies: ``sky`` from 1 on, ids of their own."""
-    n, seed = len(sources), config.plan.seed
-    rows, ids = np.arange(n * n_skies) % n, sources["id"]
-    others = sources[rows]
-    others["sky"] = 1 + np.arange(n * n_skies) // n
-    keys = [f"{key}-{sky}" for key, sky in zip(others["id"], others["sky"], strict=True)]
-    numbers = np.asarray(ids).dtype.kind in "iu"
-    others["id"] = np.max(ids) + 1 + np.arange(n * n_skies) if numbers else keys
-    light = QTable(others["id", "redshift"])
-    light["stellar_mass"] = model.fluxes(sources, [band])["stellar_mass"][rows]
-    # each id has draws of its own, so that these are the AGN that are added
-    others = others[AGNPopulation().draw(light, seed=seed)["has_agn"]]
-    if len(others):
-        add_field_agn(others, model, band, seed)
-    return others[np.asarray(others["frac_agn"]) >= config.agn.limit]
 
 
 def _sizes(catalog):

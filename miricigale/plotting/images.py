@@ -4,7 +4,7 @@ import numpy as np
 
 from miricigale.plotting.axes import TRUE, add_borders, resolve_axes
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_choice
+from miricigale.utils.options import check_choice, check_that
 
 #: Color of lines over an image.
 _LINES = "#c2410c"
@@ -171,8 +171,7 @@ def plot_model_residual(
 
         _, ax = plt.subplots(1, 3, figsize=(12.6, 3.9), layout="constrained")
     ax = np.ravel(np.asarray(ax, dtype=object))
-    if len(ax) != 3:
-        raise argument_error("ax", "three axes", len(ax))
+    check_that(len(ax) == 3, "ax", "three axes", len(ax))
     image, model = np.asarray(image, float), np.asarray(model, float)
     residual = image - model
     noise = _robust(residual)[1]

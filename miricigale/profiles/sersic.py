@@ -3,7 +3,7 @@
 import numpy as np
 import scipy
 
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 
 _IN_STAMP = 0.995  # of the light lies within the isophote that a stamp holds
 #: Indices that the images are made and tested for.
@@ -141,15 +141,11 @@ def parameter_rows(*, x, y, total_flux, r_eff, n, axis_ratio, theta):
 
 
 def _check(total_flux, r_eff, n, axis_ratio):
-    if not np.isfinite(total_flux):
-        raise argument_error("total_flux", "finite", total_flux)
-    if not (np.isfinite(r_eff) and r_eff > 0):
-        raise argument_error("r_eff", "positive", r_eff)
+    check_that(np.isfinite(total_flux), "total_flux", "finite", total_flux)
+    check_that(np.isfinite(r_eff) and r_eff > 0, "r_eff", "positive", r_eff)
     low, high = SERSIC_INDEX_RANGE
-    if not low <= n <= high:
-        raise argument_error("n", f"within {low} and {high}", n)
-    if not 0 < axis_ratio <= 1:
-        raise argument_error("axis_ratio", "above 0 and at most 1", axis_ratio)
+    check_that(low <= n <= high, "n", f"within {low} and {high}", n)
+    check_that(0 < axis_ratio <= 1, "axis_ratio", "above 0 and at most 1", axis_ratio)
 
 
 def sersic_image(shape, *, x, y, total_flux=1.0, r_eff, n, axis_ratio=1.0, theta=0.0):

@@ -8,8 +8,9 @@ from miricigale.psf.effects import EFFECTS
 from miricigale.psf.field import psf_at
 from miricigale.psf.miri import MIRI_PIXEL_SCALE
 from miricigale.psf.model import InstrumentPSF, PSFGrid
-from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.exceptions import DataError
 from miricigale.utils.optional import require
+from miricigale.utils.options import check_that
 from miricigale.utils.units import ANGLE, to_array
 
 
@@ -71,8 +72,7 @@ def stpsf_grid(
     >>> from miricigale.psf import stpsf_grid
     >>> grid = stpsf_grid("miri.f770w", n_psfs=9)  # doctest: +SKIP
     """
-    if round(n_psfs**0.5) ** 2 != n_psfs:
-        raise argument_error("n_psfs", "a square number", n_psfs)
+    check_that(round(n_psfs**0.5) ** 2 == n_psfs, "n_psfs", "a square number", n_psfs)
     instrument = _instrument(filter)
     pixels = to_array(fov, ANGLE, "fov") / MIRI_PIXEL_SCALE.value
     grid = instrument.psf_grid(

@@ -14,6 +14,7 @@ from miricigale.psf.model import instrument_psf
 from miricigale.psf.nircam import NIRCAM_FILTERS, nircam_psf
 from miricigale.psf.resample import psf_image, psf_mosaic, rotate_psf
 from miricigale.utils.exceptions import PSFWarning, argument_error, warn
+from miricigale.utils.options import check_that
 from miricigale.utils.units import ANGLE
 
 _log = logging.getLogger(__name__)
@@ -163,10 +164,9 @@ def checked_psf(
         )
         warn(msg, PSFWarning)
         return psf
-    if not 1 / _OTHER_WIDTH < ratio < _OTHER_WIDTH:
-        wanted = f"a PSF of {filter}, about {usual:.3g} arcsec wide (FWHM)"
-        got = f"one of {width:.3g} arcsec with pixels of {psf.cell:.4g} arcsec: is that its pixel?"
-        raise argument_error(argument, wanted, got)
+    wanted = f"a PSF of {filter}, about {usual:.3g} arcsec wide (FWHM)"
+    got = f"one of {width:.3g} arcsec with pixels of {psf.cell:.4g} arcsec: is that its pixel?"
+    check_that(1 / _OTHER_WIDTH < ratio < _OTHER_WIDTH, argument, wanted, got)
     if pa is not None and psf.frame == "sky" and filter not in WFC3_FILTERS:
         other = filter_psf(filter, pa=angle, **form)
         other = psf_image(other, **place)

@@ -11,7 +11,7 @@ from miricigale.psf import _core
 from miricigale.psf.effects import detector_response
 from miricigale.psf.model import instrument_psf
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_choice
+from miricigale.utils.options import check_choice, check_that
 from miricigale.utils.tables import described_table
 from miricigale.utils.units import ANGLE, to_array
 
@@ -97,9 +97,8 @@ def radius_of_encircled_energy(psf, fraction):
     psf = instrument_psf(psf)
     cells = np.arange(0.0, psf.half_width / psf.cell, 0.25)
     sums = _core.radial_sums(psf.data, *psf.origin, cells) / psf.n_cells**2
-    if not 0 < fraction <= min(1, sums[-1]):
-        wanted = f"positive and at most the {sums[-1]:.4f} that the PSF's grid holds"
-        raise argument_error("fraction", wanted, fraction)
+    wanted = f"positive and at most the {sums[-1]:.4f} that the PSF's grid holds"
+    check_that(0 < fraction <= min(1, sums[-1]), "fraction", wanted, fraction)
     k = int(np.argmax(sums >= fraction))
     if k == 0:
         return 0.0 * ANGLE

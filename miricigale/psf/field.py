@@ -7,6 +7,7 @@ from miricigale.psf.miri import miri_psf
 from miricigale.psf.model import SHARED, InstrumentPSF, PSFGrid
 from miricigale.psf.resample import alike
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 
 
 def psf_grid(psfs, positions):
@@ -99,8 +100,7 @@ def miri_psf_grid(filter, *, n_psfs=9, subarray="FULL", **options):
     (4, 55, 55)
     """
     side = round(n_psfs**0.5) if n_psfs >= 4 else 0
-    if side**2 != n_psfs:
-        raise argument_error("n_psfs", "a square number of at least 4", n_psfs)
+    check_that(side**2 == n_psfs, "n_psfs", "a square number of at least 4", n_psfs)
     part = aperture(subarray)
     ny, nx = part.shape
     first, last = (int(np.clip(c - part.origin[0], 0, nx)) for c in imager_columns())

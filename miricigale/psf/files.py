@@ -13,6 +13,7 @@ from miricigale.psf.kernels import MatchingKernel
 from miricigale.psf.model import InstrumentPSF, make_psf
 from miricigale.utils.exceptions import argument_error, data_error
 from miricigale.utils.files import open_fits, write_fits
+from miricigale.utils.options import check_that
 from miricigale.utils.store import native, open_parts, plain_value, replacing, write_parts
 from miricigale.utils.unified import register
 from miricigale.utils.units import ANGLE, to_array
@@ -69,9 +70,8 @@ def fits_image(path, ext, plane, pixel_scale, *, wanted, oversampling=1):
         pixel_scale = cell * oversampling * ANGLE
     elif cell is not None:
         mine = float(to_array(pixel_scale, ANGLE, "pixel_scale")) / oversampling
-        if abs(mine / cell - 1) > 0.02:
-            stated = f"{cell * oversampling:.4g} arcsec by the header and 'oversampling'"
-            raise argument_error("pixel_scale", stated, pixel_scale)
+        stated = f"{cell * oversampling:.4g} arcsec by the header and 'oversampling'"
+        check_that(abs(mine / cell - 1) <= 0.02, "pixel_scale", stated, pixel_scale)
     return data, header, pixel_scale, angle
 
 

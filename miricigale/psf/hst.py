@@ -13,7 +13,7 @@ from miricigale.psf.effects import detector_response
 from miricigale.psf.model import make_psf
 from miricigale.psf.optics import hst_pupil, polychromatic_psf
 from miricigale.psf.telescope import band_quantiles, checked_grid, odd_cells
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.units import ANGLE, to_array
 
 WFC3_FILTERS = ("wfc3.f105w", "wfc3.f125w", "wfc3.f140w", "wfc3.f160w")
@@ -51,9 +51,8 @@ def _hst_blur(scale):
         image = _hst_blurred(data, oversampling, scale, sigma)
         return _core.half_maximum_width(image, middle, middle) * cell - _WFC3_FWHM
 
-    if excess(0.0) > 0:
-        wanted = f"so fine that optics and pixels are narrower than {_WFC3_FWHM} arcsec (FWHM)"
-        raise argument_error("pixel_scale", wanted, f"{scale} arcsec")
+    wanted = f"so fine that optics and pixels are narrower than {_WFC3_FWHM} arcsec (FWHM)"
+    check_that(excess(0.0) <= 0, "pixel_scale", wanted, f"{scale} arcsec")
     return brentq(excess, 0.0, _WFC3_FWHM, xtol=1e-5)
 
 

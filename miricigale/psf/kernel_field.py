@@ -66,8 +66,7 @@ class KernelField:
     method: str = "linear"
 
     def __post_init__(self):
-        kernels = tuple(self.kernels)
-        object.__setattr__(self, "kernels", kernels)
+        kernels = self.__dict__["kernels"] = tuple(self.kernels)
         if not kernels or not all(isinstance(one, MatchingKernel) for one in kernels):
             raise argument_error("kernels", "MatchingKernels, at least one", self.kernels)
         if any(one.source is None or one.target is None for one in kernels):

@@ -23,7 +23,7 @@ from miricigale.psf.wiener import (
 )
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import Interactive, checked_calls
-from miricigale.utils.options import check_choice
+from miricigale.utils.options import check_choice, check_that
 from miricigale.utils.unified import read_write
 from miricigale.utils.units import ANGLE, frozen_array, positive, to_array
 
@@ -103,16 +103,14 @@ class MatchingKernel(Interactive):
     }
 
     def __post_init__(self):
-        if hasattr(self.array, "evaluate"):
-            wanted = "a square array ('MatchingKernel.from_psfs' makes the kernel of two PSFs)"
-            raise argument_error("array", wanted, type(self.array).__name__)
+        wanted = "a square array ('MatchingKernel.from_psfs' makes the kernel of two PSFs)"
+        check_that(not hasattr(self.array, "evaluate"), "array", wanted, type(self.array).__name__)
         for name in ("array", "source", "target"):
             value = getattr(self, name)
             if value is not None:
                 object.__setattr__(self, name, frozen_array(checked_square(value, name)))
         scale = positive(self.pixel_scale, ANGLE, "pixel_scale")
-        object.__setattr__(self, "pixel_scale", scale * ANGLE)
-        object.__setattr__(self, "meta", dict(self.meta))
+        self.__dict__.update(pixel_scale=scale * ANGLE, meta=dict(self.meta))
 
     def __repr__(self):
         n = self.array.shape[0]
@@ -339,8 +337,7 @@ class MatchingKernel(Interactive):
         if w.shape != (n,) or np.any(w < 0) or not w.sum() > 0:
             raise argument_error("weights", f"{n} non-negative numbers, not all 0", weights)
         forms = {(k.pixel_scale, *(np.shape(getattr(k, name)) for name in names)) for k in kernels}
-        if len(forms) > 1:
-            raise argument_error("kernels", "alike in pixel, shape and PSFs", forms)
+        check_that(len(forms) <= 1, "kernels", "alike in pixel, shape and PSFs", forms)
         w = w / w.sum()
         mean = {
             name: np.tensordot(w, [getattr(k, name) for k in kernels], axes=1)
@@ -395,11 +392,9 @@ class MatchingKernel(Interactive):
                 data, unit=image.unit, wcs=image.wcs, mask=image.mask, meta=dict(image.meta)
             )
         image = np.asarray(image, dtype=float)
-        if image.ndim != 2:
-            raise argument_error("image", "2D", f"shape {image.shape}")
+        check_that(image.ndim == 2, "image", "2D", f"shape {image.shape}")
         bad = int(np.count_nonzero(~np.isfinite(image)))
-        if bad:
-            raise argument_error("image", "finite", f"{bad} pixels that are NaN or infinite")
+        check_that(not bad, "image", "finite", f"{bad} pixels that are NaN or infinite")
         convolve = oaconvolve if min(image.shape) > 2 * self.array.shape[0] else fftconvolve
         full = convolve(image, self.array, mode="full")
         h = self.array.shape[0] // 2
@@ -487,9 +482,8 @@ class MatchingKernel(Interactive):
         """
         width = float(to_array(extent, ANGLE, "extent")) / self.pixel_scale.value
         half, old = int(width // 2), self.array.shape[0] // 2
-        if not 0 <= half <= old:
-            wanted = f"at most {self.array.shape[0] * self.pixel_scale.value:.4g} arcsec"
-            raise argument_error("extent", wanted, extent)
+        wanted = f"at most {self.array.shape[0] * self.pixel_scale.value:.4g} arcsec"
+        check_that(0 <= half <= old, "extent", wanted, extent)
         array = self.array[old - half : old + half + 1, old - half : old + half + 1]
         lost = self.meta.get("lost", 0.0) + float(self.array.sum() - array.sum())
         return dataclasses.replace(self, array=array, meta={**self.meta, "lost": lost})

@@ -21,6 +21,7 @@ from miricigale.psf.model import make_psf
 from miricigale.psf.optics import jwst_constants
 from miricigale.psf.telescope import Telescope, checked_grid, odd_cells
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.units import ANGLE
 
 #: Geometric mean of the imager's pixel, 0.110498 x 0.111336 arcsec (SIAF, MIRIM_FULL).
@@ -193,8 +194,7 @@ def miri_psf(
     name = known_filter(filter, MIRI_FILTERS, "PSF for the filter")
     oversampling, width = checked_grid(oversampling, fov, 21.0)
     unknown = set(includes) - set(EFFECTS)
-    if unknown:
-        raise argument_error("includes", f"out of {EFFECTS}", sorted(unknown))
+    check_that(not unknown, "includes", f"out of {EFFECTS}", sorted(unknown))
     telescope = Telescope.of(name, _V3_ANGLE, wavefront_error, seed)
     # written order, whatever the caller's
     effects = tuple(effect for effect in EFFECTS if effect in includes)

@@ -9,6 +9,7 @@ from photutils.psf import GriddedPSFModel, ImagePSF
 
 from miricigale.psf import _core
 from miricigale.utils.exceptions import PSFWarning, argument_error, warn
+from miricigale.utils.options import check_that
 from miricigale.utils.unified import read_write
 from miricigale.utils.units import ANGLE, check_count, positive, to_array
 
@@ -99,8 +100,7 @@ class InstrumentPSF(ImagePSF):
         pa_aper=None,
         meta=None,
     ):
-        if frame not in FRAMES:
-            raise argument_error("frame", f"one of {FRAMES}", repr(frame))
+        check_that(frame in FRAMES, "frame", f"one of {FRAMES}", repr(frame))
         cells = check_count(oversampling, "oversampling")
         scale = positive(pixel_scale, ANGLE, "pixel_scale")
         super().__init__(data, oversampling=cells, origin=origin, meta=dict(meta or {}))
@@ -257,9 +257,8 @@ def instrument_psf(psf, argument="psf"):
     ...
     ValueError: 'psf' must be a PSF on pixels of known size ..., got ImagePSF
     """
-    if not isinstance(psf, InstrumentPSF):
-        wanted = "a PSF on pixels of known size (see miricigale.psf.from_photutils and make_psf)"
-        raise argument_error(argument, wanted, type(psf).__name__)
+    wanted = "a PSF on pixels of known size (see miricigale.psf.from_photutils and make_psf)"
+    check_that(isinstance(psf, InstrumentPSF), argument, wanted, type(psf).__name__)
     return psf
 
 
@@ -314,8 +313,7 @@ def make_psf(data, *, pixel_scale, frame="sky", oversampling=1, enclosed=None, *
         raise argument_error("data", "a finite 2D array with a positive sum", f"{data.shape}")
     total, factor = float(data.sum()), 1.0
     if enclosed is not None:
-        if not 0 < enclosed <= 1:
-            raise argument_error("enclosed", "above 0 and at most 1", enclosed)
+        check_that(0 < enclosed <= 1, "enclosed", "above 0 and at most 1", enclosed)
         factor = enclosed * oversampling**2 / total
         facts["total_known"] = True
     elif not facts.get("total_known") and oversampling > 1 and 0.8 < total < 1.04:
@@ -337,10 +335,9 @@ def make_psf(data, *, pixel_scale, frame="sky", oversampling=1, enclosed=None, *
         sums = _core.radial_sums(data, *psf.origin, np.array([limit / 2, limit])) / psf.n_cells**2
         # in wings as r**-3 as much light lies beyond a radius as between it and its half
         outer = sums[1] - sums[0]
-        if 1 - psf.enclosed > max(0.15, 5 * outer):
-            wanted = "a PSF whose sum is the fraction of light it holds (or 'enclosed' given)"
-            got = f"a sum of {total:.4g}, though only {outer:.2g} lie in the outer half of the grid"
-            raise argument_error("data", wanted, got)
+        wanted = "a PSF whose sum is the fraction of light it holds (or 'enclosed' given)"
+        got = f"a sum of {total:.4g}, though only {outer:.2g} lie in the outer half of the grid"
+        check_that(1 - psf.enclosed <= max(0.15, 5 * outer), "data", wanted, got)
     return psf
 
 
@@ -387,9 +384,8 @@ def as_psf(psf, argument="psf"):
         data = model(*np.meshgrid(axis, axis))
     else:
         data = np.asarray(getattr(psf, "array", psf))
-    if data.ndim != 2 or data.dtype.kind not in "iuf":
-        wanted = "a PSF or model of photutils, an astropy kernel or a 2D array"
-        raise argument_error(argument, wanted, type(psf).__name__)
+    wanted = "a PSF or model of photutils, an astropy kernel or a 2D array"
+    check_that(data.ndim == 2 and data.dtype.kind in "iuf", argument, wanted, type(psf).__name__)
     data = data.astype(float)
     if not np.all(np.isfinite(data)) or not data.sum() > 0:
         raise argument_error(argument, "finite, with a positive sum", f"a sum of {data.sum()}")
@@ -439,8 +435,7 @@ def from_photutils(model, *, x=None, y=None, **options):
     if isinstance(model, ImagePSF):
         data, options["origin"] = model.data, tuple(model.origin)
     else:
-        if x is None or y is None:
-            raise argument_error("x, y", "given for a GriddedPSFModel", (x, y))
+        check_that(x is not None and y is not None, "x, y", "given for a GriddedPSFModel", (x, y))
         yy, xx = ((np.arange(n) - (n - 1) / 2) * (1.0 / cells) for n in model.data.shape[1:])
         data = model.evaluate(*np.meshgrid(xx + x, yy + y), 1.0, x, y)
     return make_psf(data, oversampling=cells, **options)

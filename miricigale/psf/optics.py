@@ -10,7 +10,7 @@ import numpy as np
 from miricigale.psf import _core
 from miricigale.refdata import locate
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_least
+from miricigale.utils.options import check_least, check_that
 from miricigale.utils.parallel import single_threaded
 from miricigale.utils.random import stream
 from miricigale.utils.units import frozen_array
@@ -62,8 +62,8 @@ class Pupil:
     angle: float = 0.0
 
     def __post_init__(self):
-        object.__setattr__(self, "amplitude", frozen_array(self.amplitude))
-        object.__setattr__(self, "segments", frozen_array(self.segments, dtype=np.int16))
+        segments = frozen_array(self.segments, dtype=np.int16)
+        self.__dict__.update(amplitude=frozen_array(self.amplitude), segments=segments)
 
     @property
     def n(self):
@@ -291,8 +291,7 @@ def polychromatic_psf(pupil, opd, wavelengths, *, step, n):
     ValueError
         If ``n`` is even or the grid is wider than the transform's period.
     """
-    if n % 2 == 0:
-        raise argument_error("n", "odd", n)
+    check_that(n % 2 != 0, "n", "odd", n)
     wavelengths, opd = np.asarray(wavelengths, float) * 1e-6, np.asarray(opd, float) * 1e-9
     period = wavelengths.min() / pupil.step / ARCSEC
     if n * step > period:

@@ -11,6 +11,7 @@ from miricigale.psf.model import from_photutils, make_psf
 from miricigale.psf.resample import average_psf, centered_psf, psf_image, psf_mosaic, rotate_psf
 from miricigale.psf.wiener import checked_square, gaussian_gain
 from miricigale.utils.exceptions import PSFWarning, argument_error, warn
+from miricigale.utils.options import check_that
 from miricigale.utils.units import ANGLE, to_array
 
 _log = logging.getLogger(__name__)
@@ -26,14 +27,12 @@ def psf_pair(hi, lo, scale, *, angles, grid_angle, resampling, extent, normalize
     """
     given, psfs, centering = {"hi": hi, "lo": lo}, {}, {}
     for name, psf in given.items():
-        if isinstance(psf, GriddedPSFModel):
-            wanted = "an ImagePSF or an array (psf_at gives the PSF of a grid at a position)"
-            raise argument_error(name, wanted, type(psf).__name__)
+        wanted = "an ImagePSF or an array (psf_at gives the PSF of a grid at a position)"
+        check_that(not isinstance(psf, GriddedPSFModel), name, wanted, type(psf).__name__)
         if hasattr(psf, "param_names") and not isinstance(psf, ImagePSF):
             given[name] = from_photutils(psf, pixel_scale=scale * ANGLE, angle=grid_angle)
     arrays = {k: np.shape(v) for k, v in given.items() if not isinstance(v, ImagePSF)}
-    if len(set(arrays.values())) > 1:
-        raise argument_error("hi, lo", "arrays of the same shape", arrays)
+    check_that(len(set(arrays.values())) <= 1, "hi, lo", "arrays of the same shape", arrays)
     for (name, psf), angle in zip(given.items(), angles, strict=True):
         if name in arrays:
             psf = _from_array(psf, name, scale, angle, grid_angle, normalize)
@@ -43,9 +42,8 @@ def psf_pair(hi, lo, scale, *, angles, grid_angle, resampling, extent, normalize
     n = 2 * int(half / scale + 1e-6) + 1
     if extent is not None:
         wanted = 2 * int(float(to_array(extent, ANGLE, "extent")) / scale / 2) + 1
-        if wanted > n or wanted < 5:
-            text = f"from 5 pixels to the {n * scale:.4g} arcsec of the PSFs"
-            raise argument_error("extent", text, extent)
+        text = f"from 5 pixels to the {n * scale:.4g} arcsec of the PSFs"
+        check_that(5 <= wanted <= n, "extent", text, extent)
         n = wanted
     images = [
         _on_grid(psf, name, angle, grid_angle, scale, n, resampling if name == "lo" else None)
@@ -85,9 +83,8 @@ def _from_array(array, name, scale, angle, grid_angle, normalize):
     """An array on the image's pixels as a PSF."""
     array = checked_square(array, name, odd=False)
     total = array.sum()
-    if not 0 < total < (np.inf if normalize else 1.02):
-        wanted = "a PSF whose sum is the fraction of light it holds (or 'normalize' True)"
-        raise argument_error(name, wanted, f"a sum of {total:.6g}")
+    wanted = "a PSF whose sum is the fraction of light it holds (or 'normalize' True)"
+    check_that(0 < total < (np.inf if normalize else 1.02), name, wanted, f"a sum of {total:.6g}")
     frame = "sky" if angle is None else "detector"
     try:
         return make_psf(
@@ -101,9 +98,8 @@ def _from_array(array, name, scale, angle, grid_angle, normalize):
 def _on_grid(psf, name, angle, grid_angle, scale, n, resampling):
     """One PSF on n x n pixels of the image, its sum the enclosed fraction."""
     if psf.frame == "detector" and angle is None:
-        if psf.pa_aper is None:
-            wanted = "the position angle of the detector's +y (the PSF is in the detector frame)"
-            raise argument_error(name + "_angle", wanted, "None")
+        wanted = "the position angle of the detector's +y (the PSF is in the detector frame)"
+        check_that(psf.pa_aper is not None, name + "_angle", wanted, "None")
         angle = psf.pa_aper
         _log.info("'%s' is turned by the %.4f deg of its header", name, angle.value)
     if resampling:
@@ -127,8 +123,7 @@ def ready_arrays(array, scale, **psfs):
     """
     array = checked_square(array, "array")
     total = float(array.sum())
-    if not 0.9 <= total <= 1.1:
-        raise argument_error("array", "a kernel whose sum is 1", f"a sum of {total:.6g}")
+    check_that(0.9 <= total <= 1.1, "array", "a kernel whose sum is 1", f"a sum of {total:.6g}")
     array = array / total
     texts = [f"summed to {total:.4f} and was brought to 1"] if abs(total - 1) > 1e-3 else []
     c = array.shape[0] // 2

@@ -10,7 +10,7 @@ from miricigale.psf import _core
 from miricigale.psf.effects import detector_response
 from miricigale.psf.model import instrument_psf
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_choice
+from miricigale.utils.options import check_choice, check_that
 from miricigale.utils.units import ANGLE, check_count, positive, to_array
 
 _log = logging.getLogger(__name__)
@@ -19,18 +19,16 @@ _ANGLES = ("pixel_scale", "angle")
 
 
 def _degrees(angle, argument):
-    if angle is None:
-        wanted = "the position angle of the detector's +y axis, east of north"
-        raise argument_error(argument, wanted, "None: it is unknown where the PSF points")
+    wanted = "the position angle of the detector's +y axis, east of north"
+    check_that(angle is not None, argument, wanted, "None: it is unknown where the PSF points")
     return float(to_array(angle, u.deg, argument, finite=True))
 
 
 def _turn_by(psf, angle, grid_angle, argument):
     """Counter-clockwise turn in deg that brings the PSF to the grid."""
     if psf.frame == "sky":
-        if angle is not None:
-            wanted = "left out for a PSF that stands on the sky already"
-            raise argument_error(argument, wanted, angle)
+        wanted = "left out for a PSF that stands on the sky already"
+        check_that(angle is None, argument, wanted, angle)
         start = psf.angle.value
     else:
         start = _degrees(angle, argument)
@@ -130,8 +128,7 @@ def average_psf(psfs):
     0.331 arcsec
     """
     psfs = list(psfs)
-    if not psfs:
-        raise argument_error("psfs", "at least one PSF", "none")
+    check_that(psfs, "psfs", "at least one PSF", "none")
     psfs = alike(psfs, ("pixel_scale", "oversampling", "frame", "angle", "includes", "origin"))
     weights = np.full(len(psfs), 1 / len(psfs))
     data = np.tensordot(weights, np.stack([psf.data for psf in psfs]), axes=1)
@@ -148,9 +145,8 @@ def alike(psfs, names):
             close = name in _ANGLES and np.isclose(mine.value, theirs.value, rtol=1e-6)
             if not (close or mine == theirs):
                 raise argument_error("psfs", f"alike in {name}", f"{theirs} and {mine} (psfs[{i}])")
-        if psf.data.shape != psfs[0].data.shape:
-            shapes = f"{psfs[0].data.shape} and {psf.data.shape} (psfs[{i}])"
-            raise argument_error("psfs", "alike in shape", shapes)
+        shapes = f"{psfs[0].data.shape} and {psf.data.shape} (psfs[{i}])"
+        check_that(psf.data.shape == psfs[0].data.shape, "psfs", "alike in shape", shapes)
     return psfs
 
 
@@ -194,8 +190,7 @@ def psf_image(psf, *, pixel_scale, shape, offset=(0.0, 0.0)):
     psf = instrument_psf(psf)
     scale = positive(pixel_scale, ANGLE, "pixel_scale")
     ny, nx = (shape, shape) if np.isscalar(shape) else shape
-    if min(ny, nx) < 1:
-        raise argument_error("shape", "at least one row and column", shape)
+    check_that(min(ny, nx) >= 1, "shape", "at least one row and column", shape)
     x = (np.arange(nx) - (nx - 1) / 2 - offset[0]) * scale
     y = ((np.arange(ny) - (ny - 1) / 2 - offset[1]) * scale)[:, None]
     return sampled(psf, x, y) * (scale / psf.pixel_scale.value) ** 2
@@ -262,8 +257,7 @@ def psf_mosaic(
     """
     psf = instrument_psf(psf)
     check_choice(resampling, "resampling", ("drizzle", None))
-    if not 0 < pixfrac <= 1:
-        raise argument_error("pixfrac", "above 0 and at most 1", pixfrac)
+    check_that(0 < pixfrac <= 1, "pixfrac", "above 0 and at most 1", pixfrac)
     scale = positive(pixel_scale, ANGLE, "pixel_scale")
     grid = _degrees(grid_angle, "grid_angle")
     angles = [None] if pa is None else list(np.atleast_1d(pa))

@@ -17,6 +17,7 @@ from miricigale.psf.effects import EFFECTS
 from miricigale.psf.model import make_psf
 from miricigale.psf.resample import psf_image
 from miricigale.utils.exceptions import argument_error, warn
+from miricigale.utils.options import check_that
 from miricigale.utils.units import ANGLE, check_count, positive, to_array
 
 
@@ -26,8 +27,7 @@ def _as_list(value, kinds):
 
 def _checked_images(images):
     images = _as_list(images, NDData)
-    if not images:
-        raise argument_error("images", "at least one image", "none")
+    check_that(images, "images", "at least one image", "none")
     for k, image in enumerate(images):
         if not isinstance(image, NDData) or np.ndim(image.data) != 2:
             got = f"{type(image).__name__} (images[{k}])"
@@ -40,8 +40,7 @@ def _pixel_scale(images, pixel_scale):
     if pixel_scale is not None:
         return positive(pixel_scale, ANGLE, "pixel_scale")
     wcs = images[0].wcs
-    if wcs is None:
-        raise argument_error("pixel_scale", "given for images without world coordinates", None)
+    check_that(wcs is not None, "pixel_scale", "given for images without world coordinates", None)
     sides = proj_plane_pixel_scales(getattr(wcs, "celestial", wcs))
     return float(np.sqrt(np.prod(sides))) * 3600
 
@@ -54,13 +53,11 @@ def _catalogs(images, stars):
         if not isinstance(sky, SkyCoord):
             raise argument_error("stars", "a table with SkyCoord in 'sky'", type(sky).__name__)
         missing = [k for k, image in enumerate(images) if image.wcs is None]
-        if missing:
-            raise argument_error("stars", "'x' and 'y' for images without a WCS", missing)
+        check_that(not missing, "stars", "'x' and 'y' for images without a WCS", missing)
         places = [image.wcs.world_to_pixel(sky) for image in images]
         return [Table({"x": np.atleast_1d(x), "y": np.atleast_1d(y)}) for x, y in places]
-    if len(tables) != len(images):
-        wanted = f"a table with 'sky', or one with 'x' and 'y' for each of {len(images)} images"
-        raise argument_error("stars", wanted, f"{len(tables)} tables")
+    wanted = f"a table with 'sky', or one with 'x' and 'y' for each of {len(images)} images"
+    check_that(len(tables) == len(images), "stars", wanted, f"{len(tables)} tables")
     for table in tables:
         if not {"x", "y"} <= set(table.colnames):
             raise argument_error("stars", "tables with 'x' and 'y', or 'sky'", table.colnames)
@@ -178,8 +175,7 @@ def psf_from_stars(
     check_count(oversampling, "oversampling")
     width = float(to_array(fov, ANGLE, "fov", ndim=0))
     size = 2 * round(0.5 * width / scale - 0.5) + 1
-    if not size >= 7:
-        raise argument_error("fov", f"at least 7 pixels of {scale:.4g} arcsec", fov)
+    check_that(size >= 7, "fov", f"at least 7 pixels of {scale:.4g} arcsec", fov)
     stamps, wanted = _stamps(images, _catalogs(images, stars), size)
     least = max(2, oversampling**2)
     if len(stamps) < least:
@@ -225,8 +221,7 @@ def psf_from_stars(
 def _enclosed(enclosed, shape, oversampling, scale):
     """Fraction of the light on the stamp's grid."""
     if isinstance(enclosed, numbers.Real):
-        if not 0 < enclosed <= 1:
-            raise argument_error("enclosed", "above 0 and at most 1, or a PSF", enclosed)
+        check_that(0 < enclosed <= 1, "enclosed", "above 0 and at most 1, or a PSF", enclosed)
         return float(enclosed)
     cell = scale / oversampling * ANGLE
     image = psf_image(enclosed, pixel_scale=cell, shape=shape)

@@ -8,7 +8,7 @@ from scipy.fft import fftshift, ifftshift, irfft2, next_fast_len, rfft2
 
 from miricigale.psf import _core
 from miricigale.utils.exceptions import PSFWarning, argument_error, warn
-from miricigale.utils.options import check_positive
+from miricigale.utils.options import check_positive, check_that
 
 _log = logging.getLogger(__name__)
 
@@ -35,8 +35,7 @@ def checked_square(value, name, *, odd=True):
     if value.ndim != 2 or value.shape[0] != value.shape[1] or (odd and value.shape[0] % 2 == 0):
         wanted = "square with an odd number of pixels" if odd else "square"
         raise argument_error(name, wanted, f"shape {value.shape}")
-    if not np.all(np.isfinite(value)):
-        raise argument_error(name, "finite", "NaN or infinite pixels")
+    check_that(np.all(np.isfinite(value)), name, "finite", "NaN or infinite pixels")
     return value
 
 

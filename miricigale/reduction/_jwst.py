@@ -53,7 +53,7 @@ def fit_steps(reducer, ramp, maps, *, reset, skipped):
     charge (``ipc``) are not known to them.
     """
     require("jwst", extra="jwst")
-    if not isinstance(ramp, Ramp) or ramp.steps or ramp.data.dtype != np.uint16:
+    if not isinstance(ramp, Ramp) or ramp.history.steps or ramp.data.dtype != np.uint16:
         raise argument_error("ramp", "a ramp of level 1b with backend='jwst'", repr(ramp))
     from jwst.dark_current import DarkCurrentStep
     from jwst.jump import JumpStep

@@ -5,39 +5,63 @@ from astropy.time import Time
 from scipy.ndimage import convolve
 
 from miricigale.detector import Charge, Ramp
-from miricigale.instrument import Exposure, ImageFacts, flat_field, photmjsr
+from miricigale.instrument import (
+    REFERENCES,
+    Exposure,
+    ExposureHistory,
+    ImageFacts,
+    flat_field,
+    photmjsr,
+)
 from miricigale.reduction.reference_maps import read_flat, read_photom
-from miricigale.reduction.references import BRIGHTNESS, SLOPES, STEP_OF, needed, own_maps
+from miricigale.reduction.references import BRIGHTNESS, SLOPES, needed, own_maps
 from miricigale.utils.exceptions import ReferenceWarning, argument_error, warn
 
 _OWN = "of the simulated detector"
+_OTHER = (
+    "it was made by another detector than miri_detector(), {}: give 'references' or 'properties' "
+    "(references='simulated' takes it for miri_detector())"
+)
 
 
-def is_own(reducer, ramp):
+def is_own(reducer, history):
     """
-    Whether the constants of the simulated detector are those of a ramp.
+    Whether the constants of the simulated detector are those of an exposure.
 
     Parameters
     ----------
     reducer : `~miricigale.reduction.Reducer`
-        Its ``references`` decide, or without them who made the ramp.
-    ramp : `~miricigale.detector.Ramp` or `~miricigale.detector.Charge`
-        What was exposed.
+        Its ``references`` decide, or without them who made the exposure.
+    history : `~miricigale.instrument.ExposureHistory`
+        Of the exposure.
 
     Returns
     -------
     own : bool
+
+    Raises
+    ------
+    ValueError
+        If the history says that another detector made it than that of the reducer.
     """
     if reducer.references is not None:
         return reducer.references == "simulated"
-    return isinstance(ramp, Charge) or ramp.simulated
+    other = history.gain is not None and history.gain != reducer.detector.gain
+    if history.simulated and reducer.properties is None and other:
+        raise ValueError(_OTHER.format(f"one with a gain of {history.gain:g} e-/DN"))
+    return history.simulated
 
 
 def maps_of(reducer, ramp):
     """
     What the detector of a ramp is taken for.
 
-    Parameters are those of `is_own`.
+    Parameters
+    ----------
+    reducer : `~miricigale.reduction.Reducer`
+        With references.
+    ramp : `~miricigale.detector.Ramp` or `~miricigale.detector.Charge`
+        What was exposed.
 
     Returns
     -------
@@ -50,53 +74,45 @@ def maps_of(reducer, ramp):
     """
     if not isinstance(ramp, (Ramp, Charge)):
         raise argument_error("ramp", "a Ramp or a Charge", type(ramp).__name__)
-    if is_own(reducer, ramp):
+    history = ramp.history
+    if is_own(reducer, history):
         stated = reducer.references is not None or reducer.properties is not None
         if not stated and ramp.properties not in (None, reducer.detector):
-            msg = (
-                f"the ramp was made by another detector than miri_detector(), {ramp.properties}: "
-                "give 'references' or 'properties' (references='simulated' takes it for miri_detector())"
-            )
-            raise ValueError(msg)
-        return own_maps(reducer.detector, _steps_of(ramp))
+            raise ValueError(_OTHER.format(ramp.properties))
+        return own_maps(reducer.detector, ramp)
     if isinstance(ramp, Charge):
         wanted = "None or 'simulated' for a Charge, which has no counts"
         raise argument_error("references", wanted, repr(reducer.references))
-    files = needed(reducer.references, ramp.header, ramp.steps, names=SLOPES, what="slopes")
+    files = needed(reducer.references, ramp.header, history, names=SLOPES, what="slopes")
     return files.maps(ramp)
 
 
 def history_of(reducer, ramp, maps):
     """
-    What the header of a rate says of its references and steps.
+    History of the slopes of a ramp.
 
     Parameters
     ----------
     reducer, ramp
-        As for `is_own`.
+        As for `maps_of`.
     maps : `~miricigale.reduction.DetectorMaps`
         What the detector was taken for.
 
     Returns
     -------
-    meta : dict
-        ``simulated``, ``reference_<name>`` for each reference and, of ramps whose references are files,
-        ``steps`` and ``day`` (MJD).
+    history : `~miricigale.instrument.ExposureHistory`
     """
-    meta = {f"reference_{name}": text for name, text in maps.used.items()}
-    if is_own(reducer, ramp):
-        done = {"steps": sorted({*_steps_of(ramp), "ramp_fit"})} if _steps_of(ramp) else {}
-        return {"simulated": True, **meta, **done}
-    used = {STEP_OF.get(name) for name, text in maps.used.items() if text != "none"}
-    meta["steps"] = sorted((used - {None}) | set(ramp.steps) | {"ramp_fit"})
-    if (day := middle_of(ramp.header)) is not None:
-        meta["day"] = day
-    return {"simulated": False, **meta}
-
-
-def _steps_of(ramp):
-    """What another pipeline has done to a ramp."""
-    return getattr(ramp, "steps", frozenset())
+    before = ramp.history
+    own = is_own(reducer, before)
+    used = {name for name, text in maps.used.items() if text != "none" and name in REFERENCES}
+    # the own bias is a part of the own linearity
+    steps = {REFERENCES[name] for name in used} - ({"superbias"} if own else set()) - {None}
+    return before.replace(
+        origin="simulated" if own else "other",
+        steps=before.steps | steps | {"ramp_fit"},
+        references=maps.used,
+        gain=float(np.median(maps.gain)),
+    )
 
 
 def brightness_of(reducer, rate):
@@ -122,22 +138,33 @@ def brightness_of(reducer, rate):
     ValueError
         If there are no references for it.
     """
-    facts = ImageFacts.of(rate)
-    if reducer.references == "simulated" or (reducer.references is None and facts.simulated):
-        detector, flattened = reducer.detector, "flat" in facts.steps
+    facts, history = ImageFacts.of(rate), ExposureHistory.of(rate)
+    flattened = history.done("flat")
+    if is_own(reducer, history):
+        detector = reducer.detector
         flat = flat_field(facts.filter, subarray=facts.subarray)
         if facts.ipc:
             # blurred as the image is: a uniform sky comes out uniform
             flat = convolve(flat, np.asarray(detector.ipc_kernel, np.float32), mode="nearest")
         values = {
-            "dark": 0.0 if "dark" in facts.steps else detector.dark_current / detector.gain,
             "flat": 1.0 if flattened else flat,
             "conversion": photmjsr(facts.filter, gain=detector.gain)
             / detector.relative_response(facts.filter, facts.subarray),
         }
         flat = "done before" if flattened else f"flat field {_OWN}"
         used = {"flat": flat, "photom": f"conversion {_OWN}"}
-        return values, {f"reference_{name}": text for name, text in used.items()}
+    else:
+        values, used = _from_files(reducer, rate, facts, history)
+    if not history.done("dark"):
+        msg = "nothing says that the dark current was taken out of the slopes: it becomes a part of the background"
+        warn(msg, ReferenceWarning)
+    steps = {"photom"} if used["flat"] == "none" else {"photom", "flat"}
+    references = {**history.references, **used}
+    return values, history.replace(steps=history.steps | steps, references=references).meta()
+
+
+def _from_files(reducer, rate, facts, history):
+    """Flat field, conversion and flags of reference files, and their names."""
     exposure = Exposure(
         facts.filter if facts.filter.startswith("miri.") else f"miri.{facts.band}",
         readout=rate.meta.get("readout", "FASTR1"),
@@ -146,48 +173,26 @@ def brightness_of(reducer, rate):
         pointing=None,
         roll=None,
     )
-    what, header = "surface brightness", _header(exposure, facts.day)
-    files = needed(reducer.references, header, facts.steps, names=BRIGHTNESS, what=what)
+    what, header = "surface brightness", _header(exposure, history.day)
+    files = needed(reducer.references, header, history, names=BRIGHTNESS, what=what)
     if files.photom is None:
         raise argument_error("references", f"given with 'photom' for {what}", "none")
     flat, flags, used = 1.0, None, {"flat": "none", "photom": files.photom.name}
-    if "flat" in facts.steps:
+    if history.done("flat"):
         used["flat"] = "done before"
     elif files.flat is not None:
         flat, flags = read_flat(files.flat, exposure)
         used["flat"] = files.flat.name
-    if "dark" not in facts.steps:
-        msg = "the dark current is in the slopes still: it becomes a part of the background"
-        warn(msg, ReferenceWarning)
-    conversion = read_photom(files.photom, exposure, facts.day)
-    values = {"dark": 0.0, "flat": flat, "conversion": conversion, "flags": flags}
-    meta = {f"reference_{name}": text for name, text in used.items()}
-    done = {"photom"} if used["flat"] == "none" else {"photom", "flat"}
-    meta["steps"] = sorted(done | set(facts.steps))
-    return values, meta
+    conversion = read_photom(files.photom, exposure, history.day)
+    return {"flat": flat, "conversion": conversion, "flags": flags}, used
 
 
 def _header(exposure, day):
     """Keywords by which references of a rate are found."""
     header = {
-        "DETECTOR": "MIRIMAGE",
-        "EXP_TYPE": "MIR_IMAGE",
-        "FILTER": exposure.filter.rpartition(".")[2].upper(),
-        "SUBARRAY": exposure.subarray,
-        "READPATT": exposure.readout,
-    }
+        "DETECTOR": "MIRIMAGE", "EXP_TYPE": "MIR_IMAGE", "FILTER": exposure.filter.rpartition(".")[2].upper(),
+        "SUBARRAY": exposure.subarray, "READPATT": exposure.readout,
+    }  # fmt: skip
     if day is not None:
         header["DATE-OBS"], header["TIME-OBS"] = Time(day, format="mjd").isot.split("T")
     return header
-
-
-def middle_of(header):
-    """Middle of an exposure (MJD), or its start where that is all that is known."""
-    for name in ("EXPMID", "EXPSTART"):
-        if np.isfinite(day := float(header.get(name) or np.nan)):
-            return day
-    try:
-        start = Time(f"{header['DATE-OBS']}T{header.get('TIME-OBS', '00:00:00')}", scale="utc")
-    except (KeyError, ValueError):
-        return None
-    return float(start.mjd)

@@ -1,4 +1,4 @@
-"""Slopes to surface brightness: dark, flat, conversion."""
+"""Slopes to surface brightness: flat field and conversion."""
 
 import numpy as np
 
@@ -13,7 +13,6 @@ def calibrate(
     *,
     filter,
     subarray,
-    dark,
     flat,
     conversion,
     flags=None,
@@ -24,11 +23,9 @@ def calibrate(
     Parameters
     ----------
     rate : `~astropy.nddata.CCDData`
-        DN/s, with uncertainty.
+        DN/s, without the dark current, with uncertainty.
     filter, subarray : str
         Of the exposure.
-    dark : float
-        Dark rate, DN/s.
     flat : `~numpy.ndarray`, shape (ny, nx), or float
         Relative response.
     conversion : float
@@ -61,7 +58,6 @@ def calibrate(
     ...     Reducer().fit_ramp(ramp),
     ...     filter="miri.f770w",
     ...     subarray="SUB64",
-    ...     dark=0.05,
     ...     flat=1.0,
     ...     conversion=photmjsr("miri.f770w"),
     ... )
@@ -75,10 +71,9 @@ def calibrate(
         raise argument_error("rate", f"of shape {inside.shape} for {subarray!r}", rate.shape)
     flat = np.broadcast_to(np.asarray(flat, np.float32), rate.shape)
     scale = np.float32(rate.unit.to(RATE) * conversion) / flat
-    dark = np.float32(dark / rate.unit.to(RATE))
     out = with_data(
         rate,
-        (np.asarray(rate.data, np.float32) - dark) * scale,
+        np.asarray(rate.data, np.float32) * scale,
         factor=scale,
         unit=SURFACE_BRIGHTNESS,
         photmjsr=float(conversion),

@@ -1,6 +1,7 @@
 """Images of the pipeline's later stages as files: rates, calibrated images, mosaics."""
 
 import dataclasses
+import functools
 import json
 import warnings
 from collections.abc import Mapping
@@ -12,35 +13,38 @@ from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.nddata import CCDData, StdDevUncertainty
 from astropy.wcs import WCS, FITSFixedWarning
+from astropy.wcs.utils import proj_plane_pixel_area
 
 from miricigale.detector import Ramp
 from miricigale.instrument import (
     DQ,
     STEPS,
+    ExposureHistory,
+    aperture,
+    check_imager,
     dq_planes,
     exposure_keywords,
     imager_wcs,
     joined_header,
+    kept_keywords,
+    pixel_area_map,
+    placed_keywords,
     read_dq,
-    steps_done,
     subarrays,
     with_own_bits,
 )
-from miricigale.instrument.image_files import asdf_wcs, json_meta
-from miricigale.reduction.assumed import middle_of
+from miricigale.instrument.asdf_extension import asdf_extension, asdf_wcs
+from miricigale.instrument.image_files import json_meta
 from miricigale.reduction.images import flagged_image, plain_flags, plain_mask, sigma
-from miricigale.reduction.reference_maps import TYPES
-from miricigale.reduction.references import ReferenceFiles
 from miricigale.utils.exceptions import argument_error, data_error
 from miricigale.utils.files import open_fits, write_fits
-from miricigale.utils.meta import undated
 from miricigale.utils.parallel import check_memory
 from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS
 
 _WANTED = "an image of JWST (FITS with SCI)"
 
 #: Planes beside the image, its errors and its flags.
-PLANES = ("VAR_POISSON", "VAR_RNOISE", "VAR_FLAT", "WHT", "CON", "BKG")
+PLANES = ("VAR_POISSON", "VAR_RNOISE", "VAR_FLAT", "AREA", "WHT", "CON", "BKG")
 
 _VARIANCES = PLANES[:3]
 
@@ -143,13 +147,13 @@ def read_images(path):
         if "SCI" not in hdus or hdus["SCI"].header.get("NAXIS") not in (2, 3):
             raise data_error(path, f"cannot be read as {_WANTED}: it has no image in SCI")
         header = joined_header(hdus)
-        instrument, detector = header.get("INSTRUME", "MIRI"), header.get("DETECTOR", "MIRIMAGE")
-        if instrument != "MIRI" or detector != "MIRIMAGE":
-            raise data_error(path, f"must be of the MIRI imager, got {instrument} {detector}")
+        own = json.loads(header["META"]) if "META" in header else None
+        check_imager(path, header, own=own)
         shape = hdus["SCI"].shape
         check_memory(24 * np.prod(shape, dtype=float), f"the image {path}", advice="cut it")
         unit = _unit(hdus["SCI"].header, path)
-        meta = _meta(header, path)
+        meta = _meta(header, path) if own is None else own
+        meta.setdefault("keywords", kept_keywords(header))
         wcs = _wcs(hdus, header, meta)
         data = _plane(hdus, "SCI", shape, path)
         error = _plane(hdus, "ERR", shape, path)
@@ -202,17 +206,24 @@ def open_exposure(path):
     >>> from miricigale.reduction import open_exposure
     >>> exposure = open_exposure("jw01180001001_02101_00001_mirimage_uncal.fits")  # doctest: +SKIP
     """
+    exposure = open_file(path)
+    return exposure if isinstance(exposure, Ramp) else exposure.image
+
+
+def open_file(path):
+    """As `open_exposure`; images with their planes, `ImageFile`."""
     with open_fits(path, wanted=_WANTED) as hdus:
         ramp = "SCI" in hdus and hdus["SCI"].header.get("NAXIS") == 4
     if ramp:
         return Ramp.read(path)
-    images = [file.image for file in read_images(path)]
-    return images[0] if len(images) == 1 else _mean(images)
+    files = read_images(path)
+    return files[0] if len(files) == 1 else _mean(files)
 
 
-def _mean(images):
+def _mean(files):
     """Mean of the integrations of an exposure; its flags are those of any, DO_NOT_USE those of all."""
-    first, error = images[0], None
+    images, error = [file.image for file in files], None
+    first = images[0]
     mask = np.array([im.mask for im in images])
     count = np.ma.masked_equal(np.count_nonzero(~mask, axis=0), 0)
 
@@ -225,10 +236,30 @@ def _mean(images):
         error = error.filled(np.nan)
     flags = np.bitwise_or.reduce([im.flags for im in images]) & ~int(DQ.DO_NOT_USE)
     flags |= np.where(mask.all(axis=0), int(DQ.DO_NOT_USE), 0)
-    meta, wcs = _shared_meta(first), first.wcs
-    return flagged_image(
-        mean.filled(np.nan), first.unit, error=error, flags=flags, wcs=wcs, meta=meta
+    image = flagged_image(
+        mean.filled(np.nan),
+        first.unit,
+        error=error,
+        flags=flags,
+        wcs=first.wcs,
+        meta=_shared_meta(first),
     )
+    planes = {
+        name: (total([file.planes[name] for file in files]) / count**2).filled(np.nan)
+        for name in _VARIANCES
+        if name in files[0].planes
+    }
+    return ImageFile(image, planes, files[0].header)
+
+
+def scaled_planes(planes, before, after):
+    """Variances and areas of an image, after it was multiplied as its errors say."""
+    kept = {"AREA": planes["AREA"]} if "AREA" in planes else {}
+    if before.uncertainty is None:
+        return kept
+    with np.errstate(divide="ignore", invalid="ignore"):
+        factor = np.square(sigma(after) / sigma(before))
+    return kept | {name: planes[name] * factor for name in _VARIANCES if name in planes}
 
 
 def _shared_meta(one):
@@ -256,7 +287,9 @@ def _plane(hdus, name, shape, path):
     if name not in hdus:
         return None
     data = hdus[name].data
-    if data is None or data.shape[-2:] != shape[-2:] or (name != "CON" and data.shape != shape):
+    # maps and counts are those of all integrations
+    same = slice(-2, None) if name in ("CON", "AREA") else slice(None)
+    if data is None or data.shape[same] != shape[same]:
         got = None if data is None else data.shape
         raise data_error(path, f"must have {shape} pixels in {name}, as in SCI, got {got}")
     kind = data.dtype.newbyteorder("=") if data.dtype.kind in "iu" else np.float32
@@ -275,23 +308,13 @@ def _flags(hdus, shape, path):
 
 
 def _meta(header, path):
-    """Facts of an image, from our own record or from the keywords of JWST."""
-    own = header.get("META")
-    if own is not None:
-        return json.loads(own)
+    """Facts of an image from the keywords of JWST."""
     meta = {name: header[key] for key, name in _META.items() if header.get(key) is not None}
     name, readout, part, meta["dither"] = exposure_keywords(header)
     part = part if part in subarrays() else None
     stated = {"filter": name, "subarray": part, "readout": readout}
     meta |= {key: value for key, value in stated.items() if value is not None}
-    meta["steps"] = sorted(steps_done(header))
-    if (day := middle_of(header)) is not None:
-        meta["day"] = day
-    for name in ReferenceFiles.names():
-        # the first six letters of the type in CRDS
-        keyword = f"R_{TYPES.get(name, name)[:6].upper()}"
-        if keyword in header:
-            meta[f"reference_{name}"] = str(header[keyword]).removeprefix("crds://")
+    meta |= ExposureHistory.from_header(header).meta()
     meta["source"] = path.name
     return meta
 
@@ -359,34 +382,46 @@ def write_image(image, path, *, planes=None, overwrite=False):
     """
     path = Path(path)
     image, planes, wcs = _joined(image, planes or {})
-    primary = fits.PrimaryHDU()
-    meta = undated(image.meta)
+    meta, cal = image.meta, image.unit.is_equivalent(SURFACE_BRIGHTNESS)
+    primary, science = placed_keywords(meta.get("keywords", {}), wcs=False)
     keywords = {
         "TELESCOP": "JWST", "INSTRUME": "MIRI", "DETECTOR": "MIRIMAGE", "EXP_TYPE": "MIR_IMAGE",
         "FILTER": str(meta.get("filter", "")).rpartition(".")[2].upper() or None,
         "SUBARRAY": meta.get("subarray"), "READPATT": meta.get("readout"),
         "DATAMODL": "ImageModel" if image.data.ndim == 2 else "CubeModel", "FILENAME": path.name,
     }  # fmt: skip
-    primary.header.update({key: value for key, value in keywords.items() if value is not None})
-    for step in STEPS if isinstance(meta.get("steps"), list) else ():
-        if STEPS[step] in meta["steps"]:
-            primary.header[step] = "COMPLETE"
-    science = fits.Header()
-    if wcs is not None:
-        science = wcs.to_header(relax=True)
-        # what is no WCS keyword of this image, and confuses
-        for name in ("DATE-OBS", "MJD-OBS", "TIMESYS"):
-            science.remove(name, ignore_missing=True)
-        primary.header["S_WCS"] = "COMPLETE"
+    steps = ExposureHistory.of(image).steps
+    keywords |= {word: "COMPLETE" for word, step in STEPS.items() if step in steps}
+    primary.update({key: value for key, value in keywords.items() if value is not None})
     # as the pipeline writes them; astropy takes DN/s for another unit than adu/s
     names = {RATE: "DN/s", SURFACE_BRIGHTNESS: "MJy/sr"}
     unit = next((n for own, n in names.items() if image.unit == own), image.unit.to_string("fits"))
     science["BUNIT"] = unit
-    science["META"] = json_meta(image.meta)
+    science["META"] = json_meta(meta)
     names = {"PHOTMJSR": "photmjsr", "PA_APER": "pa_aper", "XPOSURE": "exposure_time"}
     for key, name in names.items():
         if isinstance(meta.get(name), (int, float)):
             science[key] = meta[name]
+    extension = asdf_extension()
+    if wcs is not None:
+        # what is no WCS keyword of this image confuses
+        known = {*science, "DATE-OBS", "MJD-OBS", "TIMESYS"}
+        sky = wcs.to_header(relax=True).cards
+        science.extend(card for card in sky if card.keyword not in known)
+        primary["S_WCS"] = "COMPLETE"
+        corners = wcs.calc_footprint(axes=image.shape[:-3:-1], center=False).flat
+        science["S_REGION"] = " ".join(["POLYGON ICRS", *(f"{angle:.9f}" for angle in corners)])
+        if cal and "resample" in steps:
+            if "PIXAR_SR" not in science:
+                science["PIXAR_SR"] = proj_plane_pixel_area(wcs) * u.deg.to(u.rad) ** 2
+        elif cal:
+            extension = asdf_extension(wcs, image.shape[-2:], science)
+            if "AREA" not in planes or "PIXAR_SR" not in science:
+                science["PIXAR_SR"] = _nominal_area()
+                planes["AREA"] = pixel_area_map(wcs, image.shape[-2:]) / _nominal_area()
+        if cal:
+            science["PIXAR_A2"] = science["PIXAR_SR"] * u.rad.to(u.arcsec) ** 2
+    primary = fits.PrimaryHDU(header=primary)
     hdus = [primary, fits.ImageHDU(np.asarray(image.data, np.float32), science, name="SCI")]
     if image.uncertainty is not None:
         error = image.uncertainty.represent_as(StdDevUncertainty).array
@@ -407,8 +442,16 @@ def write_image(image, path, *, planes=None, overwrite=False):
         )
         if name == "BKG":
             hdus[-1].header["BUNIT"] = unit
-    write_fits(hdus, path, overwrite=overwrite)
+    write_fits([*hdus, extension], path, overwrite=overwrite)
     return path
+
+
+@functools.cache
+def _nominal_area():
+    """Solid angle of the pixel at the reference point of the full frame, sr."""
+    part = aperture("FULL")
+    x, y = (round(place) for place in part.reference)
+    return float(pixel_area_map(imager_wcs("0 0", 0 * u.deg), part.shape)[y, x])
 
 
 def _joined(image, planes):

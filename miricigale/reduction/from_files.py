@@ -11,19 +11,20 @@ from astropy.table import Table
 
 from miricigale.detector import Ramp
 from miricigale.instrument import ImageFacts
-from miricigale.pages import Page, SectionWriter, declared
+from miricigale.pages import Page, SectionWriter
 from miricigale.plotting.axes import WIDTH, new_figure
 from miricigale.plotting.images import plot_image
 from miricigale.reduction import (
     Reducer,
     ReferenceFiles,
-    open_exposure,
     read_images,
     write_image,
 )
 from miricigale.reduction.background import known_background
 from miricigale.reduction.dither_background import restored
+from miricigale.reduction.files import open_file, scaled_planes
 from miricigale.utils.content import content_sha256, file_sha256
+from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.progress import progress
 from miricigale.utils.units import ANGLE, RATE, SURFACE_BRIGHTNESS, to_array
@@ -31,7 +32,7 @@ from miricigale.utils.units import ANGLE, RATE, SURFACE_BRIGHTNESS, to_array
 log = logging.getLogger(__name__)
 
 #: Changes with what the products hold.
-_VERSION = 5
+_VERSION = 6
 
 #: Errors of a bad file; the other files are reduced all the same.
 _ERRORS = (ArithmeticError, ImportError, KeyError, MemoryError, OSError, ValueError)
@@ -186,13 +187,13 @@ def _exposure(reducer, path, stem, key, resume, integrations):
     slopes_only = "no photometry without references"
     if reducer.references == "none" and _kept(rate, key, resume):
         return None, "kept", slopes_only
-    exposure, planes = open_exposure(path), {}
+    exposure = open_file(path)
     if isinstance(exposure, Ramp):
         if integrations and exposure.shape[0] > 1:
             parts = reducer.fit_integrations(exposure, planes=True)
             write_image(parts, stem.with_name(f"{stem.name}_rateints.fits"), overwrite=True)
-        slopes = reducer.fit_ramp(exposure, planes=True)
-        exposure, planes = slopes.image, slopes.planes
+        exposure = reducer.fit_ramp(exposure, planes=True)
+    exposure, planes = exposure.image, exposure.planes
     if reducer.references == "none" and not exposure.unit.is_equivalent(SURFACE_BRIGHTNESS):
         _write(exposure, rate, key, **planes)
         return None, "rate", slopes_only
@@ -200,7 +201,8 @@ def _exposure(reducer, path, stem, key, resume, integrations):
         # there to stay where the brightness cannot be had
         _write(exposure, rate, key, **planes)
     _, image, background = reducer.reduce(exposure)
-    _write(image, cal, key, BKG=background.level)
+    planes = scaled_planes(planes, exposure, image)
+    _write(image, cal, key, **planes, BKG=background.level)
     return cal, "reduced", ""
 
 

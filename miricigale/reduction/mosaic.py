@@ -9,7 +9,7 @@ from astropy.wcs.utils import proj_plane_pixel_area
 from drizzle.resample import Drizzle
 from scipy.interpolate import RectBivariateSpline
 
-from miricigale.instrument import DQ, ImageFacts
+from miricigale.instrument import DQ, ExposureHistory, ImageFacts
 from miricigale.reduction.images import (
     check_images,
     check_overlap,
@@ -396,6 +396,12 @@ def _meta(images):
     for key in ("pa_aper", "dither", "background"):
         if all(key in m for m in metas):
             meta[key] = [m[key] for m in metas]
+    if any(words := [m.get("keywords", {}) for m in metas]):
+        shared = {k: card for k, card in words[0].items() if all(w.get(k) == card for w in words)}
+        # its pixels are others
+        meta["keywords"] = {k: card for k, card in shared.items() if not k.startswith("PIXAR")}
+    done = frozenset.intersection(*(ExposureHistory.of(im).steps for im in images))
+    meta["steps"] = sorted(done | {"resample"})
     for key in metas[0]:
         if key not in meta and all(m.get(key) == metas[0][key] for m in metas):
             meta[key] = metas[0][key]

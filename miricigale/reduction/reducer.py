@@ -8,7 +8,12 @@ from dataclasses import field
 from astropy.nddata import CCDData
 
 from miricigale.detector import Charge, Ramp, ResetAnomaly
-from miricigale.instrument import DetectorProperties, ImageFacts, miri_detector
+from miricigale.instrument import (
+    DetectorProperties,
+    ExposureHistory,
+    ImageFacts,
+    miri_detector,
+)
 from miricigale.instrument.data_models import is_data_model, read_data_model
 from miricigale.reduction.assumed import brightness_of, maps_of
 from miricigale.reduction.background import estimate_background, remove_background
@@ -254,7 +259,7 @@ class Reducer(Interactive):
         for key in ("filter", "subarray"):
             if getattr(facts, key) is None:
                 raise argument_error("rate", f"an image whose meta has {key!r}", "none")
-        if "photom" in facts.steps:
+        if ExposureHistory.of(rate).done("photom"):
             if not (before := rate.meta.get("photmjsr")):
                 raise argument_error("rate", "slopes, or an image with its PHOTMJSR", "neither")
             rate = with_data(rate, rate.data / before, factor=1 / before, unit=RATE)
@@ -374,9 +379,9 @@ class Reducer(Interactive):
         if not exposure.unit.is_equivalent(SURFACE_BRIGHTNESS):
             wanted = f"in {RATE} or {SURFACE_BRIGHTNESS}"
             raise argument_error("exposure", wanted, exposure.unit)
-        files, facts = self.references, ImageFacts.of(exposure)
+        files, history = self.references, ExposureHistory.of(exposure)
         given = isinstance(files, ReferenceFiles) and files.photom is not None
-        if given and "photom" in facts.steps and "resample" not in facts.steps:
+        if given and history.done("photom") and "resample" not in history.steps:
             exposure = self.calibrate(exposure)
         return None, *self.subtract_background(exposure)
 

@@ -5,12 +5,10 @@ import functools
 import numpy as np
 
 from miricigale.instrument import DQ, READOUT_NAMES, aperture, joined_header
+from miricigale.instrument.history import TYPES
 from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import open_fits
 from miricigale.utils.parallel import check_memory
-
-#: Reference types of CRDS whose names are not those of `ReferenceFiles`.
-TYPES = {"bias": "superbias", "read_noise": "readnoise"}
 
 #: Values of keywords that fit any exposure.
 _ANY = ("", "N/A", "ANY", "GENERIC", "*")

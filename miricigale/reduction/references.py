@@ -7,6 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+from miricigale.instrument import (
+    DQ,
+    REFERENCES,
+    ExposureHistory,
+    bad_pixel_mask,
+    reference_pixel_mask,
+)
 from miricigale.reduction.measured_noise import measure_noise
 from miricigale.reduction.reference_maps import READERS
 from miricigale.utils.exceptions import ReferenceWarning, argument_error, data_error, warn
@@ -14,10 +21,6 @@ from miricigale.utils.exceptions import ReferenceWarning, argument_error, data_e
 #: What slopes need, and what surface brightness needs beside them.
 SLOPES = ("mask", "saturation", "linearity", "dark", "gain", "read_noise")
 BRIGHTNESS = ("flat", "photom")
-
-#: Steps of the pipeline after which a reference is not needed any more.
-STEP_OF = {"mask": "dq_init", "bias": "superbias"}
-STEP_OF |= {name: name for name in ("saturation", "reset", "linearity", "dark", *BRIGHTNESS)}
 
 #: References that may be numbers instead of files, with their units.
 _NUMBERS = {"gain": "e-/DN", "read_noise": "DN", "bias": "DN", "saturation": "DN"}
@@ -48,6 +51,8 @@ class DetectorMaps:
         DN of each group, (integrations, groups, ny, nx).
     pixel_dq : `~numpy.ndarray` of int64, shape (ny, nx), or int
         Flags of pixels, bits as in `~miricigale.instrument.DQ`.
+    dark_rate : float
+        DN/s that are taken off the slopes.
     used : dict of str to str
         The file or the constant that each came from, by the names of `ReferenceFiles`.
 
@@ -68,6 +73,7 @@ class DetectorMaps:
     reset: np.ndarray | None = None
     dark: np.ndarray | None = None
     pixel_dq: object = 0
+    dark_rate: float = 0.0
     used: dict = dataclasses.field(default_factory=dict)
 
     def integration(self, number):
@@ -91,21 +97,23 @@ class DetectorMaps:
         return dataclasses.replace(self, **own)
 
 
-def own_maps(properties, steps=()):
+def own_maps(properties, ramp):
     """
-    The package's own detector, for ramps that it simulated.
+    The package's own detector, for ramps that it simulated or that are taken for such.
 
     Parameters
     ----------
     properties : `~miricigale.instrument.DetectorProperties`
         Of the detector.
-    steps : iterable of str, optional
-        What another pipeline has done to the ramp, which is not done again.
+    ramp : `~miricigale.detector.Ramp` or `~miricigale.detector.Charge`
+        What another pipeline has done to it is not done again; its flags have the bad pixels if its history
+        is known.
 
     Returns
     -------
     maps : `DetectorMaps`
     """
+    history, part = ramp.history, {"subarray": ramp.exposure.subarray}
     own = "of the simulated detector"
     limit = properties.bias + _SATURATION * properties.saturation_dn
     used = {
@@ -118,16 +126,18 @@ def own_maps(properties, steps=()):
         "read_noise": f"{properties.read_noise:.6g} DN {own}",
     }
     values = {"bias": properties.bias, "saturation": limit, "linearity": properties.nonlinearity}
-    done = {name for name in used if STEP_OF.get(name) in steps}
-    if "linearity" in done:
-        # linear DN have their bias behind them
-        done.add("bias")
+    done = {name for name in used if history.done(name)}
+    if "dark" not in done:
+        values["dark_rate"] = properties.dark_current / properties.gain
+    if not history.simulated and "mask" not in done:
+        masks = (bad_pixel_mask, DQ.DO_NOT_USE), (reference_pixel_mask, DQ.REFERENCE_PIXEL)
+        values["pixel_dq"] = sum(mask(**part) * np.int64(flag) for mask, flag in masks)
     used |= dict.fromkeys(done, "done before")
     values = {name: value for name, value in values.items() if name not in done}
     return DetectorMaps(gain=properties.gain, read_noise=properties.read_noise, **values, used=used)
 
 
-def needed(references, header, steps, *, names, what):
+def needed(references, header, history, *, names, what):
     """
     The reference files for one exposure, complete or with a warning.
 
@@ -137,8 +147,8 @@ def needed(references, header, steps, *, names, what):
         As a `~miricigale.reduction.Reducer` has them.
     header : mapping
         Keywords of the exposure.
-    steps : iterable of str
-        What was done to it.
+    history : `~miricigale.instrument.ExposureHistory`
+        Of the exposure.
     names : tuple of str
         References that are needed.
     what : str
@@ -159,17 +169,20 @@ def needed(references, header, steps, *, names, what):
         If some are missing and that is allowed.
     """
     if references is None:
+        lacks = ", ".join(ReferenceFiles().missing(history, names=names))
+        made = f"the package's Detector did not simulate (needed: {lacks})"
+        if history.origin == "unrecorded":
+            made = "the package simulated (ORIGIN), with a detector that its file does not state any more"
         msg = (
-            f"'references' must be given for {what} of an exposure that the package's Detector did "
-            f"not simulate (needed: {', '.join(ReferenceFiles().missing(steps, names=names))}): "
-            "ReferenceFiles, a ReferenceCache, or 'none' for slopes in DN/s without corrections"
+            f"'references' must be given for {what} of an exposure that {made}: ReferenceFiles, a "
+            "ReferenceCache, 'simulated' for miri_detector(), or 'none' for slopes in DN/s without corrections"
         )
         raise ValueError(msg)
     if isinstance(references, str):
         references = ReferenceFiles(gain="measured", read_noise="measured", incomplete=True)
     elif not isinstance(references, ReferenceFiles):
         references = references.find(header)
-    missing = references.missing(steps, names=names)
+    missing = references.missing(history, names=names)
     if missing and not references.incomplete:
         wanted = f"complete for {what} (or incomplete=True, to do without)"
         raise argument_error("references", wanted, f"none for {', '.join(missing)}")
@@ -266,18 +279,18 @@ class ReferenceFiles:
     @staticmethod
     def names():
         """Names of all references, in the order in which they are used."""
-        return (*READERS, *BRIGHTNESS)
+        return tuple(REFERENCES)
 
     replace = dataclasses.replace
 
-    def missing(self, steps=(), *, names=SLOPES + BRIGHTNESS):
+    def missing(self, history=None, *, names=SLOPES + BRIGHTNESS):
         """
         References that are needed and not given.
 
         Parameters
         ----------
-        steps : iterable of str, optional
-            What the pipeline has done already (`~miricigale.instrument.STEPS`).
+        history : `~miricigale.instrument.ExposureHistory`, optional
+            What the pipeline has done already.
         names : iterable of str, optional
             Of which references; of those for slopes and brightness by default.
 
@@ -285,10 +298,8 @@ class ReferenceFiles:
         -------
         names : tuple of str
         """
-        steps = set(steps)
-        return tuple(
-            name for name in names if getattr(self, name) is None and STEP_OF.get(name) not in steps
-        )
+        history = ExposureHistory() if history is None else history
+        return tuple(n for n in names if getattr(self, n) is None and not history.done(n))
 
     def maps(self, ramp):
         """
@@ -314,9 +325,10 @@ class ReferenceFiles:
             If a file cannot be read as what it should be.
         """
         values, used = {"pixel_dq": np.zeros(ramp.exposure.shape, np.int64)}, {}
+        history = ramp.history
         for name, reader in READERS.items():
             value = getattr(self, name)
-            if STEP_OF.get(name) in ramp.steps:
+            if history.done(name):
                 used[name] = "done before"
             elif isinstance(value, Path):
                 found, flags = reader(value, ramp.exposure)
@@ -329,13 +341,9 @@ class ReferenceFiles:
                 used[name] = f"{value:.6g} {_NUMBERS[name]} (given)"
             else:
                 used[name] = "none"
-        if "saturation" not in values and "saturation" not in ramp.steps:
+        if "saturation" not in values and not history.done("saturation"):
             values["saturation"] = 65535.0 if ramp.data.dtype.kind == "u" else np.inf
             used["saturation"] = "the highest number of the converter"
-        if "linearity" in ramp.steps and "bias" in values:
-            # linear DN have their bias behind them
-            del values["bias"]
-            used["bias"] = "done before"
         if "dark" in values and values["dark"].shape[1] < ramp.shape[1]:
             got = f"it has {values['dark'].shape[1]} groups, and the ramp {ramp.shape[1]}"
             raise data_error(self.dark, f"is no dark reference for this exposure: {got}")

@@ -7,7 +7,9 @@ import numpy as np
 from astropy.io.fits import Header
 from astropy.nddata import CCDData
 
-from miricigale.instrument import Image, ImageFacts
+from miricigale.detector import Ramp
+from miricigale.detector.level1b import keywords
+from miricigale.instrument import Image, ImageFacts, kept_keywords
 from miricigale.reduction.assumed import history_of
 from miricigale.reduction.background import Background
 from miricigale.reduction.files import ImageFile, write_image
@@ -162,9 +164,11 @@ def rate_image(reducer, ramp, maps, fit):
         n_jumps=len(fit.jumps),
         ipc=ipc,
         noise_correction=fit.noise_correction(reducer.detector.ipc_kernel) if own else 1.0,
-        gain=float(np.median(maps.gain)),
-        **history_of(reducer, ramp, maps),
+        **history_of(reducer, ramp, maps).meta(),
     )
+    if None not in (ramp.exposure.filter, ramp.exposure.pointing) or ramp.observed:
+        known = isinstance(ramp, Ramp)
+        meta["keywords"] = kept_keywords(ramp.header if known else keywords(ramp.exposure))
     rate = flagged_image(
         fit.rate, RATE, error=fit.error, flags=fit.flags, wcs=ramp.exposure.wcs, meta=meta
     )

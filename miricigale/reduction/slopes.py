@@ -48,7 +48,7 @@ def fit_slopes(reducer, ramp, maps, progress_bar=False, *, first=0):
     ValueError
         If fewer than two groups are left.
     """
-    exposure, detector = ramp.exposure, reducer.detector
+    exposure, detector, history = ramp.exposure, reducer.detector, ramp.history
     dq = ramp.pixel_dq.astype(np.int64) | maps.pixel_dq
     if not isinstance(ramp, Charge) and ramp.data.dtype.kind in "iu":
         # counts of 0 are of pixels that were not read: the bias is thousands
@@ -62,20 +62,18 @@ def fit_slopes(reducer, ramp, maps, progress_bar=False, *, first=0):
         msg = f"at most {n_group - 2} groups together for {n_group} groups"
         raise argument_error("skip_first, skip_last", msg, f"{skip_first}, {skip_last}")
     drift = _anomaly(reducer, ramp, maps, first)
-    if reducer.backend == "jwst":
-        offsets = np.broadcast_to(drift, (exposure.n_integrations, n_group))
-        fit = fit_steps(reducer, ramp, maps, reset=offsets, skipped=(skip_first, skip_last))
-        fit.flags[...] |= dq
-        return fit
     factor = float(np.sum(detector.ipc_kernel**2)) if shares_charge(reducer, ramp) else 1.0
     part = skip_first, n_group - skip_last
     thresholds = reducer.jump_threshold, reducer.ramps.neighbor_threshold
-    if isinstance(ramp, Charge):
+    if reducer.backend == "jwst":
+        offsets = np.broadcast_to(drift, (exposure.n_integrations, n_group))
+        fit = fit_steps(reducer, ramp, maps, reset=offsets, skipped=(skip_first, skip_last))
+    elif isinstance(ramp, Charge):
         fit = draw_groups(
             ramp, maps, drift, usable, part, thresholds=thresholds, poisson_factor=factor
         )
     else:
-        if "jump" in ramp.steps:
+        if "jump" in history.steps:
             # the pipeline found them, and flags of groups mark them
             thresholds = None, None
         fit = fit_groups(
@@ -85,7 +83,7 @@ def fit_slopes(reducer, ramp, maps, progress_bar=False, *, first=0):
             drift=_drift(reducer, ramp, reference, drift),
             usable=usable,
             # those of a simulated ramp are the truth, until a pipeline has found its own
-            group_dq=None if ramp.simulated and not ramp.steps else ramp.group_dq,
+            group_dq=None if history.simulated and not history.steps else ramp.group_dq,
             first_group=part[0],
             last_group=part[1],
             jump_threshold=thresholds[0],
@@ -96,6 +94,7 @@ def fit_slopes(reducer, ramp, maps, progress_bar=False, *, first=0):
             progress_bar=progress_bar,
         )
     fit.flags[...] |= dq
+    fit.rate[...] -= np.float32(maps.dark_rate)
     fit.flags[~usable] |= int(DQ.DO_NOT_USE)
     return fit
 
@@ -118,12 +117,12 @@ def shares_charge(reducer, ramp):
     if reducer.ramps.ipc is not None:
         return bool(reducer.ramps.ipc)
     acted = ramp.shows(InterpixelCapacitance)
-    return is_own(reducer, ramp) if acted is None else acted
+    return is_own(reducer, ramp.history) if acted is None else acted
 
 
 def _skipped(reducer, ramp):
     """Groups left out at the start and the end of the integrations of a ramp."""
-    n_group, steps = ramp.exposure.n_groups, getattr(ramp, "steps", frozenset())
+    n_group, steps = ramp.exposure.n_groups, ramp.history.steps
     first, last = reducer.skip_first, reducer.skip_last
     if first is None:
         done = {"firstframe", "rscd"} & steps
@@ -138,8 +137,8 @@ def _drift(reducer, ramp, reference, drift):
     """Add the drift of the reference pixels to an offset of each group."""
     how = reducer.ramps.reference_correction
     if how is None:
-        how = ramp.simulated or (ramp.exposure.subarray == "FULL" and "channels")
-    if not how or "refpix" in ramp.steps:
+        how = ramp.history.simulated or (ramp.exposure.subarray == "FULL" and "channels")
+    if not how or "refpix" in ramp.history.steps:
         return drift
     if how != "channels":
         return drift + reference_drift(ramp.data, reference)

@@ -14,11 +14,11 @@ from miricigale.utils.content import file_sha256
 from miricigale.utils.exceptions import (
     DataError,
     ReferenceWarning,
-    argument_error,
     data_error,
     warn,
 )
 from miricigale.utils.files import cached_by_file
+from miricigale.utils.options import check_that
 
 
 def _folder(configured, default):
@@ -110,8 +110,7 @@ def find_place(record):
 def file_record(name):
     """Record of a resource that is a file; others are refused."""
     record = resource(name)
-    if not record.file:
-        raise argument_error("name", "a resource that is a file", f"{name!r} ({record.source})")
+    check_that(record.file, "name", "a resource that is a file", f"{name!r} ({record.source})")
     return record
 
 

@@ -2,10 +2,9 @@
 
 import dataclasses
 import functools
-import tomllib
-from importlib import resources as importlib_resources
 
-from miricigale.utils.exceptions import unknown_name
+from miricigale.utils.declared import declared
+from miricigale.utils.options import check_names
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,8 +74,8 @@ def resources():
     >>> sorted(resources())[:3]
     ['catalog.goodss', 'dust.dale2014', 'dust.dl07']
     """
-    text = (importlib_resources.files("miricigale.refdata") / "resources.toml").read_text("utf-8")
-    return {name: Resource(name=name, **entry) for name, entry in tomllib.loads(text).items()}
+    entries = declared("miricigale.refdata", "resources.toml").items()
+    return {name: Resource(name=name, **entry) for name, entry in entries}
 
 
 def resource(name):
@@ -94,10 +93,8 @@ def resource(name):
     >>> resource("ssp.bc03").kind
     'bundled'
     """
-    try:
-        return resources()[name]
-    except KeyError:
-        raise unknown_name("resource", name, resources()) from None
+    check_names([name], "resource", resources())
+    return resources()[name]
 
 
 def citations(*names):
@@ -155,10 +152,8 @@ class Registry:
         return self._entry(name)[0](name)
 
     def _entry(self, name):
-        try:
-            return self._loaders[name]
-        except KeyError:
-            raise unknown_name(self.kind, name, self._loaders) from None
+        check_names([name], self.kind, self._loaders)
+        return self._loaders[name]
 
     def __contains__(self, name):
         return name in self._loaders

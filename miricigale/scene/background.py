@@ -56,9 +56,10 @@ class Background:
             raise argument_error("level", "finite and not negative", self.level)
         gradient = to_array(self.gradient, 1 / u.arcmin, "gradient", ndim=0, finite=True)
         angle = to_array(self.position_angle, u.deg, "position_angle", ndim=0, finite=True)
-        object.__setattr__(self, "level", level * SURFACE_BRIGHTNESS)
-        object.__setattr__(self, "gradient", float(gradient) / u.arcmin)
-        object.__setattr__(self, "position_angle", float(angle) * u.deg)
+        gradient, angle = float(gradient) / u.arcmin, float(angle) * u.deg
+        self.__dict__.update(
+            level=level * SURFACE_BRIGHTNESS, gradient=gradient, position_angle=angle
+        )
 
     @classmethod
     def low_zodi(cls, filter, *, center=None):

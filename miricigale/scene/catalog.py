@@ -9,6 +9,7 @@ from miricigale.filters.surveys import is_band
 from miricigale.profiles import SERSIC_INDEX_RANGE
 from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
 from miricigale.utils.missing import plain_floats, without_codes
+from miricigale.utils.options import check_that
 from miricigale.utils.positions import as_positions
 from miricigale.utils.tables import (
     Flags,
@@ -173,11 +174,9 @@ def check_catalog(table, *, filters=(), wcs=None, argument="catalog"):
       1        3.0   point    16
       2        5.0   point    16
     """
-    if not isinstance(table, Table):
-        raise argument_error(argument, "a table", type(table).__name__)
+    check_that(isinstance(table, Table), argument, "a table", type(table).__name__)
     catalog = QTable(table, copy=True)
-    if len(catalog) == 0:
-        raise argument_error(argument, "a table with rows", "none")
+    check_that(len(catalog), argument, "a table with rows", "none")
     catalog["sky"] = as_positions(catalog, argument, wcs)
     points = list(_fill_columns(catalog, argument))
     units = {name: unit for name, unit in CATALOG_COLUMNS.items() if unit is not None}
@@ -185,16 +184,14 @@ def check_catalog(table, *, filters=(), wcs=None, argument="catalog"):
     fluxes = [*filters, *(name for name in catalog.colnames if is_band(name))]
     require_columns(catalog, filters, argument, units=dict.fromkeys(fluxes, FNU))
     ids = read_ids(catalog, argument)
-    if ids.dtype.kind not in "iuU":
-        wanted = "a table with integers or text in 'id'"
-        raise argument_error(argument, wanted, catalog["id"].dtype)
+    wanted = "a table with integers or text in 'id'"
+    check_that(ids.dtype.kind in "iuU", argument, wanted, catalog["id"].dtype)
     catalog["id"] = unique_ids(ascii_ids(ids, argument), argument)
     profile = catalog["profile"]
     # missing ones are refused below
     profile = np.asarray(profile.filled("") if hasattr(profile, "mask") else profile).astype(str)
     unknown = sorted(set(profile.tolist()) - set(PROFILES))
-    if unknown:
-        raise argument_error(argument, f"a table with 'profile' among {PROFILES}", unknown)
+    check_that(not unknown, argument, f"a table with 'profile' among {PROFILES}", unknown)
     catalog["profile"] = profile
     numbers = {n: unit for n, unit in CATALOG_COLUMNS.items() if n not in ("id", "sky", "profile")}
     for name in catalog.colnames:

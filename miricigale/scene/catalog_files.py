@@ -17,7 +17,8 @@ from miricigale.utils.exceptions import (
     DataError,
     warn,
 )
-from miricigale.utils.files import read_table
+from miricigale.utils.files import reading
+from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import error_column
 
 #: Counts of galaxies in K: AB magnitude and log of the number per magnitude and square degree (Weaver et
@@ -91,11 +92,12 @@ def read_catalog(path, catalog_map=None, **options):
     with warnings.catch_warnings():
         warnings.simplefilter("error", UnitsWarning)
         table = read_table(path, wanted="a table")
-    _, lost = catalog_map.names(table.colnames, path.name)
-    table, coded = catalog_map.convert(table, path.name)
-    _flags_of_stars(table)
+    with reading(path, "a catalog"):
+        _, lost = catalog_map.names(table.colnames, path.name)
+        table, coded = catalog_map.convert(table, path.name)
+        _flags_of_stars(table)
+        catalog = check_catalog(table, argument=path.name)
     texts = list(catalog_messages(lost, coded))
-    catalog = check_catalog(table, argument=path.name)
     for codes in coded.values():
         catalog["flags"][~np.isnan(codes)] |= int(CatalogFlags.MISSING_CODE)
     texts += _missing_fluxes(catalog)

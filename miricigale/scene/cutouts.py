@@ -10,6 +10,7 @@ from astropy.nddata import NDData
 
 from miricigale.scene.sky import local_jacobian
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.units import ANGLE, Frozen, frozen_array, positive, to_array
 
 # two points of Gauss and Legendre in a cell: the light's variance in it is exact
@@ -75,10 +76,10 @@ class Cutout(Frozen):
         center = ((nx - 1) / 2, (ny - 1) / 2) if self.center is None else self.center
         if len(center) != 2 or not np.all(np.isfinite(center)):
             raise argument_error("center", "a pixel x, y", self.center)
-        object.__setattr__(self, "data", data)
-        object.__setattr__(self, "pixel_scale", scale * ANGLE)
-        object.__setattr__(self, "angle", angle * u.deg)
-        object.__setattr__(self, "center", (float(center[0]), float(center[1])))
+        center = (float(center[0]), float(center[1]))
+        self.__dict__.update(
+            data=data, pixel_scale=scale * ANGLE, angle=angle * u.deg, center=center
+        )
 
     @classmethod
     def from_image(cls, image, position=None):
@@ -107,14 +108,12 @@ class Cutout(Frozen):
         if not isinstance(image, NDData) or image.wcs is None:
             raise argument_error("image", "NDData with a WCS", type(image).__name__)
         data = np.array(image.data, dtype=float)
-        if data.ndim != 2:
-            raise argument_error("image", "a 2D image", f"shape {data.shape}")
+        check_that(data.ndim == 2, "image", "a 2D image", f"shape {data.shape}")
         bad = ~np.isfinite(data)
         if image.mask is not None:
             bad |= np.asarray(image.mask, dtype=bool)
-        if bad.any():
-            got = f"{bad.sum()} of {bad.size} pixels that are"
-            raise argument_error("image", "without masked or infinite pixels (fill them)", got)
+        got = f"{bad.sum()} of {bad.size} pixels that are"
+        check_that(not bad.any(), "image", "without masked or infinite pixels (fill them)", got)
         ny, nx = data.shape
         middle = np.array([(nx - 1) / 2]), np.array([(ny - 1) / 2])
         # columns: the steps along x and y in (east, north), arcsec

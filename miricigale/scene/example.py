@@ -13,7 +13,7 @@ from miricigale.psf import filter_psf
 from miricigale.scene.catalog_files import read_catalog
 from miricigale.scene.highres import highres_image
 from miricigale.sed import SEDModel
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.units import positive
 
 _CENTER = SkyCoord(53.129, -27.842, unit="deg")
@@ -86,8 +86,7 @@ def example_field(filters=("wfc3.f160w", "miri.f770w"), *, size=30 * u.arcsec, s
     Unit("uJy")
     """
     width = positive(size, u.arcsec, "size")
-    if not 1 <= width <= 120:
-        raise argument_error("size", "1 to 120 arcsec", size)
+    check_that(1 <= width <= 120, "size", "1 to 120 arcsec", size)
     names = [find_filter(name) for name in filters]
     catalog = read_catalog("catalog.goodss")
     east, north = _CENTER.spherical_offsets_to(catalog["sky"])

@@ -12,6 +12,7 @@ from miricigale.scene import _core
 from miricigale.scene.convolve import Places, add_nodes, convolve, phases
 from miricigale.scene.deposit import deposit_profiles, smooth_from
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.parallel import thread_count
 
 #: Sersic sources with a half-light radius below this many nodes are points.
@@ -90,25 +91,21 @@ class Painter:
         if np.any(np.abs(origin - np.round(origin)) > 1e-6):
             got = f"origin {origin.tolist()}"
             raise argument_error("psf", "centered on a node (odd shape)", got)
-        if not 0 < self.enclosed < 1:
-            raise argument_error("enclosed", "between 0 and 1", self.enclosed)
-        if not self.max_radius > 0:
-            raise argument_error("max_radius", "positive", self.max_radius)
+        check_that(0 < self.enclosed < 1, "enclosed", "between 0 and 1", self.enclosed)
+        check_that(self.max_radius > 0, "max_radius", "positive", self.max_radius)
         thread_count(self.n_threads)
         oversampling, origin = int(oversampling[0]), tuple(round(float(v)) for v in origin)
         (x, k_x), (y, k_y) = (np.unique(v, return_inverse=True) for v in np.transpose(where))
         order = np.zeros((y.size, x.size), dtype=np.int64)
         order[k_y, k_x] = np.arange(len(where))
-        own = {
-            "_oversampling": oversampling,
-            "_origin": origin,
-            "_data": data,
-            "_phases": np.stack([phases(one, origin, oversampling) for one in data]),
-            "_order": order,
-            "_places": (y, x),
-        }
-        for name, value in own.items():
-            object.__setattr__(self, name, value)
+        self.__dict__.update(
+            _oversampling=oversampling,
+            _origin=origin,
+            _data=data,
+            _phases=np.stack([phases(one, origin, oversampling) for one in data]),
+            _order=order,
+            _places=(y, x),
+        )
 
     @property
     def margin(self):

@@ -23,7 +23,7 @@ from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
 from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.meta import provenance
 from miricigale.utils.missing import plain_floats
-from miricigale.utils.options import check_kind
+from miricigale.utils.options import check_kind, check_that
 from miricigale.utils.tables import Flags, described_table
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, positive, to_array
 
@@ -147,12 +147,9 @@ class Scene(Interactive):
             filter = exposure.filter if filter is None else filter
             wcs = exposure.wcs if wcs is None else wcs
         for name, value in (("filter", filter), ("wcs", wcs)):
-            if value is None:
-                raise argument_error(name, "given, or an exposure", "None")
-        if not isinstance(wcs, WCS):
-            raise argument_error("wcs", "an astropy WCS", type(wcs).__name__)
-        if wcs.pixel_shape is None:
-            raise argument_error("wcs", "a WCS with its pixel_shape", "one without")
+            check_that(value is not None, name, "given, or an exposure", "None")
+        check_that(isinstance(wcs, WCS), "wcs", "an astropy WCS", type(wcs).__name__)
+        check_that(wcs.pixel_shape is not None, "wcs", "a WCS with its pixel_shape", "one without")
         name = str(getattr(filter, "name", filter))
         self._wcs, self._filter = wcs, find_filter(name) or name
         #: The exposure that the image is for, or None; `~miricigale.detector.Detector.expose` asks for it.
@@ -268,9 +265,8 @@ class Scene(Interactive):
             return background
         if isinstance(background, str):
             background = sky_background(self._filter, background)
-        if not isinstance(background, u.Quantity):
-            wanted = "a Background, a Quantity in MJy/sr or a level such as 'low'"
-            raise argument_error("background", wanted, repr(background))
+        wanted = "a Background, a Quantity in MJy/sr or a level such as 'low'"
+        check_that(isinstance(background, u.Quantity), "background", wanted, repr(background))
         return Background(background)
 
     def _center_jacobian(self):
@@ -282,22 +278,19 @@ class Scene(Interactive):
             # a plain photutils model is taken as it is
             return
         have = psf.pixel_scale.to_value(ANGLE)
-        if abs(have / scale - 1) > 0.03:
-            got = f"pixels of {have:.4f} arcsec where the WCS has {scale:.4f}"
-            raise argument_error("psf", "on the pixels of the WCS", got)
+        got = f"pixels of {have:.4f} arcsec where the WCS has {scale:.4f}"
+        check_that(abs(have / scale - 1) <= 0.03, "psf", "on the pixels of the WCS", got)
         if psf.frame == "sky":
             # the direction on the sky in which +y points
             east, north = np.linalg.inv(self._center_jacobian()) @ [0.0, 1.0]
             angle = np.degrees(np.arctan2(east, north))
             turn = (psf.angle.to_value(u.deg) - angle + 180) % 360 - 180
-            if abs(turn) > 1:
-                got = f"turned by {turn:.1f} deg (see miricigale.psf.rotate_psf)"
-                raise argument_error("psf", "in the orientation of the WCS", got)
+            got = f"turned by {turn:.1f} deg (see miricigale.psf.rotate_psf)"
+            check_that(abs(turn) <= 1, "psf", "in the orientation of the WCS", got)
         if isinstance(psf, PSFGrid) and psf.subarray is not None:
             own = aperture(psf.subarray).shape
-            if own != self._shape:
-                got = f"those of {psf.subarray}, {own[1]} x {own[0]} pixels"
-                raise argument_error("psf", "a grid of places on this image", got)
+            got = f"those of {psf.subarray}, {own[1]} x {own[0]} pixels"
+            check_that(own == self._shape, "psf", "a grid of places on this image", got)
         if psf.filter is not None:
             # other packages write F770W where we write miri.f770w
             wanted, have = self._filter.lower(), psf.filter.lower()

@@ -8,6 +8,7 @@ import numpy as np
 from miricigale.filters import FilterSet
 from miricigale.sed import _core
 from miricigale.sed.component import ROLES
+from miricigale.utils.declared import declared
 
 #: Version of the numbers that follow from the components: raised when the chain, the derived
 #: quantities or the grids change, so that grids kept on the disk are made anew.
@@ -16,29 +17,11 @@ VERSION = 1
 INFRARED = (3.0, 1000.0)  # um
 SIX = 6.0  # um
 VISUAL = 0.55  # um, where A_V and the light-weighted age are taken
+_DECLARED = declared("miricigale.sed", "derived.toml")
 #: The ten windows of Calzetti, Kinney & Storchi-Bergmann 1994, table 2 (um).
-UV_WINDOWS = (
-    (0.1268, 0.1284),
-    (0.1309, 0.1316),
-    (0.1342, 0.1371),
-    (0.1407, 0.1515),
-    (0.1562, 0.1583),
-    (0.1677, 0.1740),
-    (0.1760, 0.1833),
-    (0.1866, 0.1890),
-    (0.1930, 0.1950),
-    (0.2400, 0.2580),
-)
-#: Bands of the rest-frame colors.
-COLOR_BANDS = {
-    "nuv": "sedpy.galex_NUV",
-    "u": "sedpy.bessell_U",
-    "v": "sedpy.bessell_V",
-    "r": "sedpy.sdss_r0",
-    "j": "sedpy.twomass_J",
-}
-#: Rest-frame colors: name to the two bands.
-COLORS = {"nuv_r": ("nuv", "r"), "u_v": ("u", "v"), "v_j": ("v", "j")}
+UV_WINDOWS = tuple(map(tuple, _DECLARED["uv_windows"]))
+#: Bands of the rest-frame colors, and these: name to the two bands.
+COLOR_BANDS, COLORS = _DECLARED["color_bands"], _DECLARED["colors"]
 
 #: Roles whose parameters together shape stars with their gas, the parts of a galaxy, and what lies
 #: between the source and us.

@@ -9,6 +9,7 @@ from miricigale.refdata import Registry, locate
 from miricigale.refdata.lookup import fingerprint_of
 from miricigale.sed.parameter import Parameter
 from miricigale.utils.exceptions import ConfigError, argument_error, config_error
+from miricigale.utils.options import check_that
 
 #: What a component does, in the order in which light meets it.
 ROLES = ("sfh", "stellar", "nebular", "attenuation", "dust", "agn", "xray", "igm", "foreground")
@@ -45,12 +46,9 @@ def register(cls):
     >>> COMPONENTS.get("gray_example")(tau=1.0)
     Gray(tau=1)
     """
-    if not cls.name:
-        raise argument_error("name", "a name", f"{cls.name!r} of {cls.__name__}")
-    if cls.role not in ROLES:
-        raise argument_error(
-            "role", f"one of {', '.join(ROLES)}", f"{cls.role!r} of {cls.__name__}"
-        )
+    check_that(cls.name, "name", "a name", f"{cls.name!r} of {cls.__name__}")
+    got = f"{cls.role!r} of {cls.__name__}"
+    check_that(cls.role in ROLES, "role", f"one of {', '.join(ROLES)}", got)
     same = False
     if cls.name in COMPONENTS:
         old = COMPONENTS.get(cls.name)

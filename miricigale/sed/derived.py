@@ -6,7 +6,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.sed.chain import COLOR_BANDS, COLORS, UV_WINDOWS
-from miricigale.utils.units import LUMINOSITY, MASS
+from miricigale.utils.declared import declared
 
 
 @dataclass(frozen=True)
@@ -27,43 +27,10 @@ class Derived:
     of: str = "galaxy"
 
 
-_RATE = u.Msun / u.yr
-_NONE = u.dimensionless_unscaled
-
 #: All derived quantities, in the order of the output.
 DERIVED = {
-    "stellar_mass": Derived(MASS, "mass of surviving stars, without remnants"),
-    "stellar_mass_formed": Derived(MASS, "mass of all stars ever formed"),
-    "sfr": Derived(_RATE, "star-formation rate of the last 1 Myr"),
-    "sfr_10myr": Derived(
-        _RATE, "mean star-formation rate of the last 10 Myr, or since the first stars"
-    ),
-    "sfr_100myr": Derived(
-        _RATE, "mean star-formation rate of the last 100 Myr, or since the first stars"
-    ),
-    "dust_luminosity": Derived(LUMINOSITY, "power that dust takes from starlight and emits"),
-    "ir_luminosity": Derived(LUMINOSITY, "all light in 3-1000 um, AGN included", of="both"),
-    "age_mass": Derived(u.Gyr, "mean age of stars by mass formed", extensive=False),
-    "age_light": Derived(
-        u.Gyr, "mean age of stars by their light at 0.55 um before dust", extensive=False
-    ),
-    "a_v": Derived(u.mag, "attenuation of the galaxy's light at 0.55 um", extensive=False),
-    "beta": Derived(
-        _NONE,
-        "slope of L_lambda in the ten windows of Calzetti et al. 1994, 0.127-0.258 um, galaxy",
-        extensive=False,
-    ),
-    "nuv_r": Derived(u.mag, "rest-frame color NUV - r of the galaxy, AB", extensive=False),
-    "u_v": Derived(u.mag, "rest-frame color U - V of the galaxy, AB", extensive=False),
-    "v_j": Derived(u.mag, "rest-frame color V - J of the galaxy, AB", extensive=False),
-    "agn_power": Derived(LUMINOSITY, "emission of torus and polar dust as seen", of="agn"),
-    "agn_luminosity": Derived(LUMINOSITY, "all light of the AGN as seen", of="agn"),
-    "accretion_power": Derived(
-        LUMINOSITY, "luminosity of the accretion disk, over all directions", of="agn"
-    ),
-    "l_6um": Derived(LUMINOSITY, "nu L_nu of the AGN at 6 um, as seen", of="agn"),
-    "frac_agn_dust": Derived(_NONE, "AGN fraction, definition 'dust'", False, "agn"),
-    "frac_agn_ir": Derived(_NONE, "AGN share of 3-1000 um light", False, "agn"),
+    name: Derived(**entry | {"unit": u.Unit(entry["unit"])})
+    for name, entry in declared("miricigale.sed", "derived.toml")["quantities"].items()
 }
 
 _LOG_UV = np.log10(np.mean(UV_WINDOWS, axis=1))

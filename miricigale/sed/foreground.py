@@ -4,26 +4,20 @@ import functools
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable, Table
+from astropy.table import QTable
 
 from miricigale.filters import FilterSet
 from miricigale.filters.spectra import spectrum_arrays
 from miricigale.sed.component import Component, register
 from miricigale.sed.parameter import Parameter
+from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.tables import error_column, require_columns
 from miricigale.utils.units import FNU
 
 #: Laws of extinction with R_V, as `dust_extinction` names them, and whom to cite.
-LAWS = {
-    "G23": "Gordon et al. 2023, ApJ 950, 86",
-    "F99": "Fitzpatrick 1999, PASP 111, 63",
-    "F19": "Fitzpatrick et al. 2019, ApJ 886, 108",
-    "F04": "Fitzpatrick 2004, ASP Conf. 309, 33",
-    "M14": "Maiz Apellaniz et al. 2014, A&A 564, A63",
-    "O94": "O'Donnell 1994, ApJ 422, 158",
-    "CCM89": "Cardelli, Clayton & Mathis 1989, ApJ 345, 245",
-}
+LAWS = declared("miricigale.sed", "extinction.toml")["laws"]
 
 #: What is done with bands that reach beyond the long end of a law.
 BEYOND = ("refuse", "transparent")
@@ -38,8 +32,7 @@ _KEY = "galactic_extinction"
 
 def _law(law):
     """The class of a law."""
-    if law not in LAWS:
-        raise argument_error("law", f"one of {', '.join(LAWS)}", repr(law))
+    check_that(law in LAWS, "law", f"one of {', '.join(LAWS)}", repr(law))
     from dust_extinction import parameter_averages
 
     return getattr(parameter_averages, law)
@@ -99,8 +92,7 @@ def extinction_curve(wave, law="G23", r_v=3.1):
 
 def check_bands(filters, law, beyond="refuse"):
     """Refuse bands over which a law is not defined; see `GalacticExtinction.check_bands`."""
-    if beyond not in BEYOND:
-        raise argument_error("beyond", f"one of {', '.join(BEYOND)}", repr(beyond))
+    check_that(beyond in BEYOND, "beyond", f"one of {', '.join(BEYOND)}", repr(beyond))
     low, high = coverage(law)
     out = []
     for band in FilterSet(filters):
@@ -235,8 +227,7 @@ def _band_grid(band, low, high, sed):
     weights = band.weights(wave)
     if sed is not None:
         weights = weights * np.interp(wave, *sed)
-    if not weights.sum() > 0:
-        raise argument_error("sed", f"of positive flux in {band.name}", weights.sum())
+    check_that(weights.sum() > 0, "sed", f"of positive flux in {band.name}", weights.sum())
     used = (weights != 0) & (wave >= low) & (wave <= high)
     return wave[used], weights[used], weights.sum()
 
@@ -280,11 +271,9 @@ def color_excess(sky, dust_map, *, scale=1.0):
     if not hasattr(dust_map, "query"):
         raise argument_error("dust_map", "a map with a method query(sky)", type(dust_map).__name__)
     ebv = np.asarray(dust_map.query(sky), dtype=float) * scale
-    if ebv.shape != sky.shape:
-        raise argument_error("dust_map", f"numbers of shape {sky.shape}", f"{ebv.shape}")
+    check_that(ebv.shape == sky.shape, "dust_map", f"numbers of shape {sky.shape}", ebv.shape)
     bad = np.count_nonzero(~(np.isfinite(ebv) & (ebv >= 0)))
-    if bad:
-        raise argument_error("sky", "positions with a color excess", f"{bad} of {ebv.size} without")
+    check_that(not bad, "sky", "positions with a color excess", f"{bad} of {ebv.size} without")
     return ebv * u.mag
 
 
@@ -394,12 +383,10 @@ def deredden(photometry, ebv, filters, *, law="G23", r_v=3.1, sed=None, beyond="
     <Quantity [1.027, 2.612] uJy>
     """
     bands = FilterSet(filters)
-    if not isinstance(photometry, Table):
-        raise argument_error("photometry", "a table", type(photometry).__name__)
+    require_columns(photometry, bands.names, "photometry")
     if _KEY in photometry.meta:
         got = f"one whose meta say {_KEY}: {photometry.meta[_KEY]}"
         raise argument_error("photometry", "a table not corrected yet", got)
-    require_columns(photometry, bands.names, "photometry")
     values, scalar = _color_excess(ebv)
     if not scalar and values.size != len(photometry):
         got = f"{values.size} for {len(photometry)} rows"

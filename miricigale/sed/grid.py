@@ -9,6 +9,7 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.store import open_parts, write_parts
 from miricigale.utils.unified import read_write, register
 from miricigale.utils.units import Frozen, frozen_array
@@ -155,29 +156,25 @@ class ModelGrid(Frozen):
     io_module = __name__
 
     def __post_init__(self):
-        object.__setattr__(self, "filters", tuple(str(name) for name in self.filters))
-        for name in ("meta", "recipe"):
-            object.__setattr__(self, name, dict(getattr(self, name)))
-        axes = {name: frozen_array(values, float) for name, values in self.axes.items()}
-        object.__setattr__(self, "axes", axes)
-        bounds = {name: (float(low), float(high)) for name, (low, high) in self.bounds.items()}
-        object.__setattr__(self, "bounds", bounds)
+        new = {"filters": tuple(map(str, self.filters)), "meta": dict(self.meta)}
+        new["recipe"] = dict(self.recipe)
+        new["axes"] = {name: frozen_array(values, float) for name, values in self.axes.items()}
+        new["bounds"] = {name: (float(a), float(b)) for name, (a, b) in self.bounds.items()}
         if self.agn is None:
-            object.__setattr__(self, "agn", np.zeros((len(self.redshift), 0, len(self.filters))))
+            new["agn"] = np.zeros((len(self.redshift), 0, len(self.filters)))
+        self.__dict__.update(new)
         for name, (_, dtype, _) in _ARRAYS.items():
-            object.__setattr__(self, name, frozen_array(getattr(self, name), dtype))
+            self.__dict__[name] = frozen_array(getattr(self, name), dtype)
         n_z, n_b = self.redshift.size, len(self.filters)
         n_g, n_a = self.dust_luminosity.size, self.agn_multiplicity.size
-        inert = tuple(map(tuple, self.inert)) or ((),) * n_a
-        object.__setattr__(self, "inert", inert)
-        if len(inert) != n_a:
-            raise argument_error("inert", f"names for each of {n_a} AGN models", len(inert))
+        inert = self.__dict__["inert"] = tuple(map(tuple, self.inert)) or ((),) * n_a
+        check_that(len(inert) == n_a, "inert", f"names for each of {n_a} AGN models", len(inert))
         fraction_span(self.frac_agn_definition)
         sizes = {"z": n_z, "g": n_g, "a": n_a, "f": self.frac_agn.size, "b": n_b}
         for name, (_, _, letters) in _ARRAYS.items():
             shape = tuple(sizes[letter] for letter in letters)
-            if getattr(self, name).shape != shape:
-                raise argument_error(name, f"of shape {shape}", f"{getattr(self, name).shape}")
+            got = getattr(self, name).shape
+            check_that(got == shape, name, f"of shape {shape}", got)
         for name in _TABLES:
             rows = n_g if name.startswith("galaxy") else n_a
             table = getattr(self, name)
@@ -197,8 +194,8 @@ class ModelGrid(Frozen):
         if n_a and self.agn_multiplicity.min() < 1:
             raise argument_error("agn_multiplicity", ">= 1", f"{self.agn_multiplicity.min()}")
         for name in ("galaxy", "agn", "dust_luminosity"):
-            if not np.all(np.isfinite(getattr(self, name))):
-                raise argument_error(name, "finite", "NaN or infinite values")
+            good = np.all(np.isfinite(getattr(self, name)))
+            check_that(good, name, "finite", "NaN or infinite values")
 
     @property
     def n_galaxies(self):

@@ -107,7 +107,10 @@ def _factors(model, grid, index):
     models, agn = np.unique(index[:, 2], return_inverse=True)
     rows = [row_values(model, grid.galaxy_parameters, g) for g in galaxies.tolist()]
     keys = [[chain.key(row, *roles) for row in rows] for roles in GALAXY]
-    light, _ = chain.attenuated(*chain.stars(keys[0]), *keys[1:])
+    light, absorbed = chain.attenuated(*chain.stars(keys[0]), *keys[1:])
+    for i, row in enumerate(rows):
+        if (excess := row.get("dust_excess", 1.0)) != 1.0:
+            light[i] += (excess - 1.0) * absorbed[i] * chain.dust(keys[2][i])
     nuclei = np.zeros((1, chain.wave.size))
     if grid.n_agn and np.any(grid.frac_agn[index[:, 3]] > 0):
         parts = [chain.agn(row_values(model, grid.agn_parameters, k)) for k in models.tolist()]

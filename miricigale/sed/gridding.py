@@ -12,6 +12,7 @@ from miricigale.sed.grid import ModelGrid
 from miricigale.sed.spectrum import distance
 from miricigale.sed.tables import BLOCK, dilution, seen_agn
 from miricigale.utils.exceptions import ModelWarning, argument_error, unknown_name, warn
+from miricigale.utils.options import check_that
 from miricigale.utils.tables import described_table
 from miricigale.utils.units import WAVE
 
@@ -25,7 +26,7 @@ def check_axes(model, axes):
     if not isinstance(axes, Mapping):
         raise argument_error("axes", "a dict of parameter name to values", type(axes).__name__)
     out = {}
-    skipped = {"mass", "dust_excess", *_names(model, ("xray", "igm", "foreground"))}
+    skipped = {"mass", *_names(model, ("xray", "igm", "foreground"))}
     for name, values in axes.items():
         if name not in model.parameters or name in skipped:
             raise unknown_name("axis", name, [n for n in model.parameters if n not in skipped])
@@ -33,13 +34,11 @@ def check_axes(model, axes):
         if np.any(getattr(values, "mask", False)):
             raise argument_error(name, "values without a mask", values)
         array = parameter.array(values)
-        if array.size == 0 or not np.all(np.diff(array) > 0):
-            raise argument_error(name, "ascending values", array)
+        check_that(array.size != 0 and np.all(np.diff(array) > 0), name, "ascending values", array)
         for value in array:
             parameter.check(value)
         out[name] = array
-    if "redshift" not in out:
-        raise argument_error("axes", "with 'redshift'", sorted(axes))
+    check_that("redshift" in out, "axes", "with 'redshift'", sorted(axes))
     return out
 
 
@@ -90,6 +89,7 @@ class _Galaxies:
 
     def __init__(self, model, rows):
         chain = self.chain = model.chain
+        excess = [row.get("dust_excess", 1.0) for row in rows]
         stars, dims, dusts = ([chain.key(row, *roles) for row in rows] for roles in GALAXY)
         self._stars, self._rows = chain.stars(stars)
         # many galaxies: their spectra are in memory once
@@ -102,7 +102,7 @@ class _Galaxies:
             _, absorbed[part] = chain.attenuated(self._stars, np.array(rows), keys, out=out)
         dusts, self.dust_rows = distinct(dusts)
         self.dust = chain.dusts(dusts)
-        self.absorbed = absorbed[self.light_rows]
+        self.absorbed = absorbed[self.light_rows] * excess
 
     def sums(self, weights):
         """Sums over the light of every galaxy for weights of shape (n_wave, n)."""
@@ -164,7 +164,8 @@ def model_grid(model, axes, filters):
     if of_agn:
         frac_agn = axes.get("frac_agn", np.array([of_agn["frac_agn"].default]))
     with_agn = bool(np.any(frac_agn > 0.0))
-    of_galaxy = {n: model.parameters[n] for n in _names(model, GALAXY_ROLES)}
+    names = _names(model, GALAXY_ROLES) + ["dust_excess"] * ("dust_excess" in axes)
+    of_galaxy = {n: model.parameters[n] for n in names}
     rows = _products(of_galaxy, axes)
     defaults = model.defaults
     _refuse_invalid(model, [defaults | row for row in rows], GALAXY_ROLES)

@@ -17,6 +17,7 @@ from miricigale.sed.spectrum import COSMOLOGY
 from miricigale.utils.exceptions import argument_error, config_error, unknown_name
 from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.meta import provenance
+from miricigale.utils.options import check_that
 from miricigale.utils.units import WAVE
 
 _MODEL_PARAMETERS = {
@@ -77,23 +78,19 @@ class SEDModel(Interactive):
             wanted = "'3-1000um' where nothing attenuates: there is no dust luminosity to refer to"
             raise argument_error("frac_agn_definition", wanted, "'dust'")
         for role in ("sfh", "stellar"):
-            if role not in roles:
-                raise argument_error("components", f"with a component of role {role!r}", roles)
-        if len(set(roles)) < len(roles):
-            raise argument_error("components", "at most one of each role", roles)
+            check_that(role in roles, "components", f"with a component of role {role!r}", roles)
+        check_that(len(set(roles)) == len(roles), "components", "at most one of each role", roles)
         for role, other in (("dust", "attenuation"), ("xray", "agn")):
             if role in roles and other not in roles:
                 raise argument_error("components", f"with {other!r} if there is {role!r}", roles)
         for role, name in (("sfh", "age"), ("stellar", "metallicity")):
             component = self.component(role)
-            if name not in component.parameters:
-                wanted = f"with a parameter {name!r} in the {role!r} component"
-                raise argument_error("components", wanted, component)
+            wanted = f"with a parameter {name!r} in the {role!r} component"
+            check_that(name in component.parameters, "components", wanted, component)
         merged = {}
         for component in self.components:
             twice = set(component.parameters) & (set(merged) | set(_MODEL_PARAMETERS))
-            if twice:
-                raise argument_error("components", "without shared parameter names", sorted(twice))
+            check_that(not twice, "components", "without shared parameter names", sorted(twice))
             merged.update(component.parameters)
         own = {n: p for n, p in _MODEL_PARAMETERS.items() if n != "dust_excess" or "dust" in roles}
         self._parameters = merged | own
@@ -424,9 +421,9 @@ class SEDModel(Interactive):
         Parameters
         ----------
         axes : dict of str to array
-            Parameter name to its values; ``redshift`` is needed, ``mass`` and ``dust_excess``
-            have no place here, nor have parameters of X-rays and the foreground. Other parameters
-            have their defaults. With no ``frac_agn`` but 0 the grid has no AGN.
+            Parameter name to its values; ``redshift`` is needed, ``mass`` and parameters of X-rays and
+            the foreground have no place here. Other parameters have their defaults: with ``dust_excess``
+            the dust's luminosity is free of energy balance. With no ``frac_agn`` but 0 the grid has no AGN.
         filters : `~miricigale.filters.FilterSet` or list of str
             The bands.
         cache : bool, optional

@@ -1,15 +1,12 @@
 """Chains and axes after published studies, with what stands in where libraries are missing."""
 
-import functools
-import tomllib
-from importlib import resources as importlib_resources
-
 import numpy as np
 
 from miricigale.refdata import find_resource
 from miricigale.sed import components as c
 from miricigale.sed.component import COMPONENTS
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.declared import declared
+from miricigale.utils.options import check_that
 
 #: Where a preset takes its libraries from.
 LIBRARIES = ("best", "bundled")
@@ -67,8 +64,7 @@ def survey_components(*, agn=True, igm="meiksin2006", libraries="best"):
 
 def _chooser(libraries):
     """Function that takes the better of two libraries if it is at hand, and notes on what it took."""
-    if libraries not in LIBRARIES:
-        raise argument_error("libraries", f"one of {LIBRARIES}", repr(libraries))
+    check_that(libraries in LIBRARIES, "libraries", f"one of {LIBRARIES}", repr(libraries))
     notes = []
 
     def choose(what, better, plain, covers):
@@ -128,8 +124,7 @@ def yang2021_axes(kind="fit"):
     >>> axes["tau"], axes["frac_agn"]
     (array([0.1, 1. , 5. ]), array([0.  , 0.2 , 0.4 , 0.6 , 0.8 , 0.99]))
     """
-    if kind not in ("fit", "galaxy", "quick"):
-        raise argument_error("kind", "'fit', 'galaxy' or 'quick'", repr(kind))
+    check_that(kind in ("fit", "galaxy", "quick"), "kind", "'fit', 'galaxy' or 'quick'", repr(kind))
     return _values(f"yang2021_{kind}")
 
 
@@ -167,8 +162,7 @@ def survey_axes(kind="survey"):
     >>> survey_axes("far-infrared")["u_min"]
     array([ 0.5,  2. ,  8. , 25. ])
     """
-    if kind not in ("survey", "far-infrared"):
-        raise argument_error("kind", "'survey' or 'far-infrared'", repr(kind))
+    check_that(kind in ("survey", "far-infrared"), "kind", "'survey' or 'far-infrared'", repr(kind))
     return _values(f"{kind.replace('-', '_')}_axes")
 
 
@@ -195,15 +189,9 @@ def quasar_axes():
     return _values("quasar_axes")
 
 
-@functools.cache
-def _tables():
-    text = (importlib_resources.files("miricigale.sed") / "presets.toml").read_text("utf-8")
-    return tomllib.loads(text)
-
-
 def _values(name):
     """New arrays of a table of ``presets.toml``; redshifts are even in ln(1 + z)."""
-    table = dict(_tables()[name])
+    table = dict(declared("miricigale.sed", "presets.toml")[name])
     step = table.pop("redshift", None)
     out = {axis: np.array(values) for axis, values in table.items()}
     return out if step is None else out | {"redshift": _redshifts(**step)}

@@ -10,10 +10,11 @@ from astropy.table import QTable
 
 from miricigale.filters import FilterSet, as_filter
 from miricigale.utils.exceptions import argument_error, data_error
-from miricigale.utils.files import read_table, write_table
+from miricigale.utils.files import reading
 from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.meta import full_meta
 from miricigale.utils.optional import require
+from miricigale.utils.table_files import read_table, write_table
 from miricigale.utils.units import FNU, WAVE, Frozen, frozen_quantity, is_number, to_array
 
 _FLAM = u.erg / u.s / u.cm**2 / u.AA
@@ -115,11 +116,8 @@ class SED(Frozen, Interactive):
             raise argument_error("wave", "positive and strictly ascending", "something else")
         if not (np.isfinite(self.redshift) and self.redshift >= 0):
             raise argument_error("redshift", ">= 0", self.redshift)
-        object.__setattr__(self, "wave", wave)
-        object.__setattr__(self, "fnu", fnu)
-        object.__setattr__(self, "redshift", float(self.redshift))
-        object.__setattr__(self, "meta", dict(self.meta))
-        object.__setattr__(self, "components", dict(self.components))
+        self.__dict__.update(wave=wave, fnu=fnu, redshift=float(self.redshift))
+        self.__dict__.update(meta=dict(self.meta), components=dict(self.components))
 
     @property
     def parameters(self):
@@ -273,15 +271,13 @@ class SED(Frozen, Interactive):
         units = [getattr(column, "unit", None) for column in table.columns.values()]
         if len(units) < 2 or None in units:
             raise data_error(path, "has no two columns with units, wavelengths and flux densities")
-        meta = full_meta(table.meta)
-        redshift = float(meta.pop("redshift", 0.0))
         wave, fnu, *names = table.colnames
-        parts = {
-            name: cls(table[wave], table[name], redshift=redshift)
-            for name in names
-            if table[name].unit.is_equivalent(FNU)
-        }
-        return cls(table[wave], table[fnu], redshift=redshift, meta=meta, components=parts)
+        lights = [name for name in names if table[name].unit.is_equivalent(FNU)]
+        with reading(path, "a spectrum"):
+            meta = full_meta(table.meta)
+            redshift = float(meta.pop("redshift", 0.0))
+            parts = {n: cls(table[wave], table[n], redshift=redshift) for n in lights}
+            return cls(table[wave], table[fnu], redshift=redshift, meta=meta, components=parts)
 
     @classmethod
     def from_synphot(cls, spectrum, *, redshift=None):

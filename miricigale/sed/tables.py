@@ -18,6 +18,7 @@ from miricigale.sed.derived import (
 )
 from miricigale.sed.spectrum import SED, distance
 from miricigale.utils.exceptions import ModelWarning, argument_error, warn
+from miricigale.utils.options import check_that
 from miricigale.utils.tables import Flags, as_table, described_table
 from miricigale.utils.units import FNU, WAVE
 
@@ -260,8 +261,7 @@ def flux_table(model, table, filters):
     n = len(table)
     names = model.derived_columns()
     taken = set(filters.names) & {"id", "flags", *names}
-    if taken:
-        raise argument_error("filters", "without names of other columns", sorted(taken))
+    check_that(not taken, "filters", "without names of other columns", sorted(taken))
     values = _columns(model, table)
     flags = _row_flags(model, values, n)
     flux = np.full((n, len(filters)), np.nan)

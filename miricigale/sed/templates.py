@@ -14,9 +14,10 @@ from miricigale.sed.components.igm import Meiksin2006
 from miricigale.sed.grid import ModelGrid
 from miricigale.sed.spectrum import SED
 from miricigale.utils.exceptions import ModelWarning, argument_error, data_error, warn
-from miricigale.utils.files import read_table
 from miricigale.utils.meta import provenance
 from miricigale.utils.missing import plain_floats
+from miricigale.utils.options import check_that
+from miricigale.utils.table_files import read_table
 from miricigale.utils.units import FNU, WAVE
 
 _SUFFIXES = (".fits", ".fit", ".dat", ".txt", ".csv", ".ecsv", ".ascii")
@@ -265,6 +266,5 @@ def _fluxes(name, sed, filters):
     except ValueError as err:
         msg = f"template {name!r}: {err}"
         raise ValueError(msg) from err
-    if not flux.mean() > 0:
-        raise argument_error("spectra", f"with light in the bands, also {name!r}", f"{flux}")
+    check_that(flux.mean() > 0, "spectra", f"with light in the bands, also {name!r}", flux)
     return flux

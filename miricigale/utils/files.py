@@ -3,7 +3,6 @@
 import contextlib
 import functools
 import importlib
-import io
 import math
 import os
 import warnings
@@ -11,13 +10,11 @@ import zipfile
 from pathlib import Path
 
 from astropy.io import fits
-from astropy.table import QTable
-from astropy.utils.exceptions import AstropyDeprecationWarning, AstropyUserWarning
+from astropy.units import UnitsError
+from astropy.utils.exceptions import AstropyDeprecationWarning
 
 from miricigale.utils.configuration import conf
-from miricigale.utils.exceptions import DataError, argument_error, warn
-from miricigale.utils.meta import fits_meta
-from miricigale.utils.positions import sky_as_angles
+from miricigale.utils.exceptions import DataError, warn
 
 # how packed files begin, and the module of Python's that opens them
 _PACKED = {b"\x1f\x8b": "gzip", b"BZh": "bz2", b"\xfd7zXZ\x00": "lzma"}
@@ -63,9 +60,36 @@ def cached_by_file(maxsize):
     return decorate
 
 
+@contextlib.contextmanager
+def reading(path, wanted):
+    """
+    Name a file in what goes wrong while it is read.
+
+    Parameters
+    ----------
+    path, wanted
+        As for `open_fits`.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        In place of errors that are not of values or units, such as `AttributeError`; those get
+        a note with the file if they do not name it.
+    """
+    try:
+        yield
+    except (OSError, ValueError, KeyError, MemoryError, UnitsError) as err:
+        if Path(path).name not in str(err):
+            err.add_note(f"in {path}")
+        raise
+    except Exception as err:  # readers of different formats raise different exceptions
+        raise unreadable(path, wanted, err) from err
+
+
+@contextlib.contextmanager
 def open_fits(path, *, wanted, **options):
     """
-    Open a FITS file, or say which file could not be read as what.
+    Open a FITS file for a ``with`` statement, or say which file could not be read as what.
 
     Parameters
     ----------
@@ -76,10 +100,10 @@ def open_fits(path, *, wanted, **options):
     **options
         Passed to `astropy.io.fits.open`.
 
-    Returns
-    -------
+    Yields
+    ------
     hdus : `~astropy.io.fits.HDUList`
-        To be closed (or used in a ``with`` statement).
+        The open file; what goes wrong within names it (`reading`).
 
     Raises
     ------
@@ -102,10 +126,10 @@ def open_fits(path, *, wanted, **options):
             _judge(caught)
         except DataError:
             raise
-        except (OSError, TypeError, ValueError) as err:
-            raise _unreadable(path, wanted, err) from err
-        opened.pop_all()
-    return hdus
+        except (OSError, TypeError, ValueError, KeyError, AttributeError, fits.VerifyError) as err:
+            raise unreadable(path, wanted, err) from err
+        with reading(path, wanted):
+            yield hdus
 
 
 def split_extension(path):
@@ -156,12 +180,23 @@ def _check_declared(path, hdus, n_bytes):
     """Refuse headers that declare more data than there are, or than tiles may unpack to."""
     last = hdus[-1].fileinfo()
     wanted = 0 if last is None else last["datLoc"] + last["datSpan"]
+    if bad := [i for i, hdu in enumerate(hdus) if not _is_sound(hdu)]:
+        msg = f"damaged: the header of its extension {bad[0]}"
+        raise OSError(msg)
     if wanted > n_bytes:
         msg = f"truncated: {n_bytes} bytes, and its headers declare {wanted}"
         raise OSError(msg)
     tiled = [hdu for hdu in hdus if isinstance(hdu, fits.CompImageHDU)]
     declared = sum(math.prod(hdu.shape) * abs(hdu.header["BITPIX"]) // 8 for hdu in tiled)
     check_unpacked(path, declared)
+
+
+def _is_sound(hdu):
+    """Whether a header declares an array, a table or nothing, of sizes that there are."""
+    known = fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU, fits.BinTableHDU, fits.TableHDU
+    if not isinstance(hdu, (*known, fits.GroupsHDU)):
+        return False
+    return all(value >= 0 for value in hdu.header["NAXIS*"].values())
 
 
 def check_unpacked(path, n_bytes):
@@ -230,7 +265,7 @@ def unpacked_size(path):
         if getattr(err, "errno", None):
             # the reader that opens it says what is wrong
             return 0
-        raise _unreadable(path, "a packed file", err) from err
+        raise unreadable(path, "a packed file", err) from err
     check_unpacked(path, n_bytes)
     return n_bytes
 
@@ -287,133 +322,6 @@ def write_fits(hdus, path, *, overwrite=False):
         hdus.writeto(path, overwrite=overwrite, output_verify="exception")
 
 
-def read_table(path, *, wanted, cls=QTable, form=None, hdu=None):
-    """
-    Read a table in any of the usual formats, or say which file could not be read as what.
-
-    Parameters
-    ----------
-    path, wanted
-        As for `open_fits`.
-    cls : type, optional
-        Class of the table.
-    form : str, optional
-        Format by `astropy.table.Table.read`. By default by content and suffix: those of `write_table`, or
-        plain text, whose names of columns stand behind ``#`` if ``id`` is among them.
-    hdu : int or str, optional
-        Extension of a FITS file, the first table by default.
-
-    Returns
-    -------
-    table : `~astropy.table.QTable`
-
-    Raises
-    ------
-    `~miricigale.utils.exceptions.DataError`
-        If the file is missing or no such table.
-    """
-    # astropy would take text for the table itself
-    if not Path(path).is_file():
-        raise _unreadable(path, wanted, FileNotFoundError())
-    unpacked_size(path)
-    try:
-        form = _table_format(path) if form is None else form
-        if form == "fits":
-            with open_fits(path, wanted=wanted) as hdus:
-                table = cls.read(hdus, format=form, character_as_bytes=False, hdu=hdu)
-        elif hdu is not None:
-            raise _unreadable(path, wanted, f"'hdu' is {hdu!r}, and it is no FITS file")
-        else:
-            table = cls.read(path, format=form)
-        if not table.colnames:
-            raise _unreadable(path, wanted, "it has no columns")
-        return table
-    except DataError:
-        raise
-    except Exception as err:  # readers of different formats raise different exceptions
-        raise _unreadable(path, wanted, err) from err
-
-
-#: Formats of tables by suffix, as `astropy.table.Table` calls them.
-TABLE_FORMATS = {
-    ".fits": "fits",
-    ".fit": "fits",
-    ".ecsv": "ascii.ecsv",
-    ".csv": "ascii.csv",
-    ".xml": "votable",
-    ".vot": "votable",
-    ".votable": "votable",
-    ".h5": "hdf5",
-    ".hdf5": "hdf5",
-    ".parquet": "parquet",
-}
-#: What astropy must know further to write a format.
-_OPTIONS = {"hdf5": {"path": "table", "serialize_meta": True}}
-
-
-def write_table(table, path, *, overwrite=False):
-    """
-    Write a table in the format that the suffix of the file names.
-
-    Parameters
-    ----------
-    table : `~astropy.table.Table`
-        The table.
-    path : path-like
-        FITS, ECSV, CSV, VOTable (``.xml``), HDF5 (with h5py) or parquet (with pyarrow).
-    overwrite : bool, optional
-        Whether a file that is there is replaced.
-
-    Raises
-    ------
-    ValueError
-        If the suffix names no format.
-    OSError
-        If the file is there and ``overwrite`` is not set.
-    """
-    path = Path(path)
-    form = TABLE_FORMATS.get(path.suffix.lower())
-    if form is None:
-        wanted = f"a file ending in one of {', '.join(TABLE_FORMATS)}"
-        raise argument_error("path", wanted, str(path))
-    with writing(path):
-        if form == "fits":
-            hdus = fits.HDUList([fits.PrimaryHDU(), table_hdu(table)])
-            hdus.writeto(path, overwrite=overwrite)
-        else:
-            plain = sky_as_angles(table) if form == "votable" else table
-            plain.write(path, overwrite=overwrite, format=form, **_OPTIONS.get(form, {}))
-
-
-def table_hdu(table):
-    """Binary table of a table with any columns that astropy has; its meta as `fits_meta` has it."""
-    table = table.copy(copy_data=False)
-    table.meta = fits_meta(table.meta)
-    stream = io.BytesIO()
-    with warnings.catch_warnings():
-        # units such as dex are kept for astropy, and in the descriptions
-        warnings.filterwarnings("ignore", "The unit .* could not be saved", AstropyUserWarning)
-        table.write(stream, format="fits")
-    stream.seek(0)
-    with fits.open(stream) as hdus:
-        return hdus[1].copy()
-
-
-def _table_format(path):
-    with open(path, "rb") as stream:
-        start = stream.read(65536)
-    first = start.strip().partition(b"\n")[0].decode(errors="replace")
-    suffix = Path(Path(path).name.lower().removesuffix(".gz")).suffix
-    if start.startswith(b"SIMPLE"):
-        return "fits"
-    if start.startswith(b"# %ECSV"):
-        return "ascii.ecsv"
-    if suffix in TABLE_FORMATS:
-        return TABLE_FORMATS[suffix]
-    named = first.startswith("#") and "id" in first.strip("# \r").split()
-    return "ascii.commented_header" if named else "ascii"
-
-
 @contextlib.contextmanager
 def writing(path):
     """
@@ -437,12 +345,15 @@ def writing(path):
             raise
         if err.errno is not None:
             raise OSError(err.errno, err.strerror, str(path)) from err
-        # numpy says how much it wrote, but not why it was no more
-        msg = f"{path} could not be written (is the disk full?): {err}"
-        raise OSError(msg) from err
+        # numpy says how much it wrote, but not why it was no more; of temporary names within nothing is said
+        failed = OSError()
+        failed.reason = getattr(err, "reason", err)
+        failed.args = (f"{path} could not be written (is the disk full?): {failed.reason}",)
+        raise failed from err
 
 
-def _unreadable(path, wanted, err):
+def unreadable(path, wanted, err):
+    """A `DataError` that says which file could not be read as what, and why."""
     if isinstance(err, OSError) and not Path(path).is_file():
         err = "it is a folder, wanted is a file" if Path(path).is_dir() else "no such file"
     lines = str(err).strip().splitlines() or [type(err).__name__]

@@ -51,8 +51,8 @@ class FileFolder:
         parts = PurePosixPath(name).parts
         # also none that leads out of a folder of Windows
         if not parts or "/".join(parts) != name or ".." in parts or set(name) & set("\\:\0"):
-            msg = f"{name!r} is not the name of a product: products lie in {self.folder}"
-            raise DataError(msg)
+            what = f"is not the name of a product: products lie in {self.folder}"
+            raise data_error(repr(name), what)
         path = self.folder
         for part in parts:
             path = path / part

@@ -44,7 +44,7 @@ def provenance(*, citations=(), **values):
 
 def undated(meta):
     """
-    Copy of a meta dictionary without dates, at any depth.
+    Copy of a meta dictionary without dates, at any depth, and without the keywords of a file.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def undated(meta):
     return {
         key: undated(value) if isinstance(value, dict) else value
         for key, value in meta.items()
-        if key != "created"
+        if key not in ("created", "keywords")
     }
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.interactive import Interactive
+from miricigale.utils.options import check_that
 
 #: Types of fields: an array whose first axis is the objects, and a dict of such.
 PerObject = Annotated[np.ndarray, "per object"]
@@ -175,8 +176,7 @@ class ObjectRows(Interactive):
             If there is none, or their arrays differ in names or shapes.
         """
         parts = [part._several() for part in parts]
-        if not parts:
-            raise argument_error("parts", f"at least one {cls.__name__}", "none")
+        check_that(parts, "parts", f"at least one {cls.__name__}", "none")
         new = parts[0]._take(slice(0))
         for name, value in parts[0]._per_object():
             values = [getattr(part, name) for part in parts]

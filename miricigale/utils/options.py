@@ -5,10 +5,37 @@ import numbers
 from miricigale.utils.exceptions import argument_error, unknown_name
 
 
+def check_that(good, name, wanted, got):
+    """
+    Refuse an argument unless ``good`` holds.
+
+    Parameters
+    ----------
+    good : bool
+        What must hold.
+    name, wanted, got : str, str, object
+        As for `~miricigale.utils.exceptions.argument_error`: ``got`` is only put into words if it is needed.
+
+    Raises
+    ------
+    ValueError
+        If ``good`` does not hold.
+
+    Examples
+    --------
+    >>> from miricigale.utils.options import check_that
+    >>> check_that(0 <= 2 <= 1, "share", "from 0 to 1", 2)
+    Traceback (most recent call last):
+    ...
+    ValueError: 'share' must be from 0 to 1, got 2
+    """
+    if not good:
+        raise argument_error(name, wanted, got)
+
+
 def check_choice(value, name, known):
     """Refuse a value that is none of those known (a `ValueError`)."""
-    if value not in known:
-        raise argument_error(name, " or ".join(repr(one) for one in known), repr(value))
+    check_that(value in known, name, " or ".join(repr(one) for one in known), repr(value))
 
 
 def check_names(names, kind, known):

@@ -4,6 +4,7 @@ import contextlib
 import functools
 import logging
 import multiprocessing
+import operator
 import os
 import pickle
 import signal
@@ -187,7 +188,7 @@ def _sent_once(function, executor):
     if len(data) <= _HEAVY:
         yield (function,)
     elif scatter is not None:
-        yield (_call, scatter(function))
+        yield (operator.call, scatter(function))
     else:
         handle, name = tempfile.mkstemp(prefix="miricigale-", suffix=".pickle")
         try:
@@ -197,10 +198,6 @@ def _sent_once(function, executor):
             yield (_FromFile(name),)
         finally:
             Path(name).unlink(missing_ok=True)
-
-
-def _call(function, item):
-    return function(item)
 
 
 @dataclass(frozen=True)

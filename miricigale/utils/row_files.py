@@ -12,8 +12,9 @@ from astropy.table import QTable
 
 from miricigale.utils.content import file_sha256
 from miricigale.utils.exceptions import DataError, data_error
-from miricigale.utils.files import open_fits, read_table
+from miricigale.utils.files import open_fits
 from miricigale.utils.store import plain_value, replacing
+from miricigale.utils.table_files import read_table
 from miricigale.utils.units import check_count
 
 
@@ -25,7 +26,7 @@ def open_rows(path, chunk_rows, *, hdu=None):
     ----------
     path : path-like
         FITS with a binary table, of which one piece at a time is in memory; or any other file for
-        `~miricigale.utils.files.read_table`, also a packed one, which is in memory as a whole.
+        `~miricigale.utils.table_files.read_table`, also a packed one, which is in memory as a whole.
     chunk_rows : int
         Rows in a piece.
     hdu : int or str, optional
@@ -116,11 +117,8 @@ class _FitsRows(RowFile):
             self.colnames = tuple(table.columns.names)
             ragged = [column.name for column in table.columns if set(column.format) & {"P", "Q"}]
         if ragged:
-            msg = (
-                f"{path} has columns of variable length, {ragged}, "
-                "which cannot be read in pieces of rows"
-            )
-            raise DataError(msg)
+            what = f"has columns of variable length, {ragged}"
+            raise data_error(path, f"{what}, which cannot be read in pieces of rows")
         # what belongs to the whole table
         for key in ("CHECKSUM", "DATASUM", "THEAP"):
             self._header.remove(key, ignore_missing=True)

@@ -11,6 +11,7 @@ import numpy as np
 import sep
 
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.units import check_count
 
 
@@ -41,8 +42,7 @@ def native(array):
 def _image(data, mask):
     """Return native data with non-finite pixels zeroed and added to the mask."""
     data = native(data)
-    if data.ndim != 2:
-        raise argument_error("data", "a two-dimensional image", f"shape {data.shape}")
+    check_that(data.ndim == 2, "data", "a two-dimensional image", f"shape {data.shape}")
     if data.dtype.kind != "f":
         data = data.astype(np.float64)
     if mask is not None:
@@ -143,8 +143,7 @@ def extract(
     """
     data, mask = _image(data, mask)
     err = np.ascontiguousarray(err, data.dtype)
-    if err.shape != data.shape:
-        raise argument_error("err", f"of the image's shape {data.shape}", str(err.shape))
+    check_that(err.shape == data.shape, "err", f"of the image's shape {data.shape}", str(err.shape))
     bad = ~(np.isfinite(err) & (err > 0))
     if bad.any():
         mask = bad if mask is None else mask | bad

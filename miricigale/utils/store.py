@@ -7,10 +7,12 @@ import uuid
 from pathlib import Path
 
 import numpy as np
+from astropy.io.fits import VerifyError
 
 from miricigale.utils.exceptions import data_error
-from miricigale.utils.files import open_fits, table_hdu, write_fits, writing
+from miricigale.utils.files import open_fits, write_fits, writing
 from miricigale.utils.meta import undated
+from miricigale.utils.table_files import table_hdu
 
 #: How the names of unfinished files begin.
 PARTIAL = ".partial-"
@@ -148,7 +150,7 @@ def open_parts(path, layouts, *, wanted, memmap=False):
             raise data_error(path, f"holds no {wanted} (no FORMAT = {layouts[0]!r} in its header)")
         try:
             yield Parts(hdus)
-        except (KeyError, IndexError, TypeError, ValueError) as err:
+        except (KeyError, IndexError, TypeError, ValueError, VerifyError) as err:
             raise data_error(path, f"is not a complete file of {wanted}: {err}") from err
 
 

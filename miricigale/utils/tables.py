@@ -11,7 +11,7 @@ import numpy as np
 from astropy.table import Table
 
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_least
+from miricigale.utils.options import check_least, check_that
 from miricigale.utils.units import ANGLE, to_array
 
 
@@ -80,7 +80,7 @@ def as_table(data, argument):
     if isinstance(data, Row):
         return data.table[data.index : data.index + 1]
     if isinstance(data, (str, os.PathLike)):
-        from miricigale.utils.files import read_table
+        from miricigale.utils.table_files import read_table
 
         return read_table(data, wanted="a table")
     if hasattr(data, "to_numpy") and hasattr(data, "columns"):
@@ -177,13 +177,10 @@ def require_columns(table, names, argument, *, units=None):
     `~astropy.units.UnitsError`
         If a column has no unit or a wrong one (magnitudes are no fluxes).
     """
-    if not isinstance(table, Table):
-        raise argument_error(argument, "a table", type(table).__name__)
+    check_that(isinstance(table, Table), argument, "a table", type(table).__name__)
     missing = [name for name in names if name not in table.colnames]
-    if missing:
-        raise argument_error(
-            argument, f"a table with the columns {missing}", f"columns {table.colnames}"
-        )
+    wanted = f"a table with the columns {missing}"
+    check_that(not missing, argument, wanted, f"columns {table.colnames}")
     for name, unit in (units or {}).items():
         if name not in table.colnames:
             continue
@@ -218,8 +215,7 @@ def read_ids(table, argument="photometry"):
     require_columns(table, ["id"], argument)
     column = table["id"]
     ids = np.asarray(getattr(column, "unmasked", column))
-    if ids.ndim != 1:
-        raise argument_error(argument, "a table with one id in a row", f"{ids.shape}")
+    check_that(ids.ndim == 1, argument, "a table with one id in a row", ids.shape)
     missing = np.broadcast_to(np.asarray(getattr(column, "mask", False)), ids.shape)
     if ids.dtype.kind in "OUS":
         missing = missing | np.array([key in (None, "", b"") for key in ids.tolist()], dtype=bool)

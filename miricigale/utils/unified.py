@@ -7,7 +7,7 @@ from inspect import cleandoc
 from astropy.io import registry
 from astropy.io.registry import UnifiedReadWrite, UnifiedReadWriteMethod
 
-from miricigale.utils.files import write_table
+from miricigale.utils.table_files import write_table
 
 _SUFFIXES = {"fits": (".fits", ".fit", ".fits.gz"), "ascii.ecsv": (".ecsv",)}
 

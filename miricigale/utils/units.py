@@ -6,6 +6,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 
 #: Units declared once; every array inside the package is in one of these.
 WAVE = u.um
@@ -94,8 +95,7 @@ def _remake(cls, values):
 def positive(value, unit, name):
     """A quantity as a number in ``unit``, after checking that it is one, above 0 (errors as `to_array`)."""
     number = float(to_array(value, unit, name, ndim=0, finite=True))
-    if not number > 0:
-        raise argument_error(name, "positive", value)
+    check_that(number > 0, name, "positive", value)
     return number
 
 

@@ -112,7 +112,7 @@ def read_setting(text):
         raise ConfigError(msg)
     try:
         return section, key, tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (tomllib.TOMLDecodeError, RecursionError):
         return section, key, value.strip()
 
 
@@ -175,7 +175,7 @@ class Configuration:
         for label, text in texts:
             try:
                 config = cls.from_dict(tomllib.loads(text), base=config)
-            except (tomllib.TOMLDecodeError, ConfigError) as err:
+            except (tomllib.TOMLDecodeError, RecursionError, ConfigError) as err:
                 what = ":" if isinstance(err, ConfigError) else " is not valid TOML:"
                 msg = f"{label}{what} {err}"
                 raise ConfigError(msg) from None

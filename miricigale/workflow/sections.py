@@ -382,6 +382,9 @@ class FitBasics(Section):
         Relative model error.
     min_detected
         MIRI bands in which a source must be detected to count.
+    dust_excess
+        Dust luminosities of the grid over what attenuation takes. Without any there is energy balance, as in the
+        paper; real galaxies do not keep it (``[sed] infrared = "ceers"``).
     """
 
     bands: tuple[str, ...] = tuple(YANG2021_DEPTHS)
@@ -389,6 +392,7 @@ class FitBasics(Section):
     axes: str = option("fit", choices=("fit", "quick"))
     model_error: float = option(0.1, low=0.0, high=1.0)
     min_detected: int = option(2, low=0, high=9)
+    dust_excess: tuple[float, ...] = option((0.25, 1.0, 2.5), low=0.001, high=1000.0)
 
     def __post_init__(self):
         n = len(self.bands)
@@ -408,16 +412,32 @@ class FitSection(FitBasics):
     depths
         Their 5-sigma AB depths; without any each source has the errors of the catalog, and no flux where it has
         none.
+    min_redshift
+        Least redshift, by the catalog, of the sources that count. Those that this and the next three leave
+        out keep their light in the images, but are in no fit and no share.
+    min_mass
+        Least stellar mass (Msun) by the input fit, likewise.
+    max_chi2
+        Largest reduced chi2 of the input fit, likewise; 0 for any.
+    redshift_quality
+        What columns of the catalog must say of a redshift, likewise: "redshift_source=spec", "q_z<=3".
     sets
         Sets of the MIRI bands that are fitted with the existing ones.
     experiments
         Further fits of each sample with all MIRI bands.
+    skies
+        Skies of a truth 'field' whose AGN are drawn and fitted without images, for purity and completeness.
     """
 
     bands: tuple[str, ...] = ()
     depths: tuple[float, ...] = option((), low=10.0, high=40.0)
+    min_redshift: float = option(0.0, low=0.0, high=10.0)
+    min_mass: float = option(0.0, low=0.0, high=1e13)
+    max_chi2: float = option(0.0, low=0.0, high=1e4)
+    redshift_quality: tuple[str, ...] = option((), single=True)
     sets: tuple[str, ...] = option(("all", "none"), choices=SETS, unique=True)
     experiments: tuple[str, ...] = option((), choices=EXPERIMENTS, unique=True)
+    skies: int = option(200, low=0, high=10000)
 
 
 class PointSourceSection(Section):

@@ -16,6 +16,7 @@ from miricigale.workflow.sections import HighresSection
 from miricigale.workflow.stages import study_stages
 from miricigale.workflow.stages.exposures import grid_of, study_background, study_exposures
 from miricigale.workflow.stages.inputs import existing_bands, study_catalog
+from miricigale.workflow.stages.sample import good_redshifts
 from miricigale.workflow.truths import CATALOG
 from miricigale.workflow.warmup import compile_missing
 
@@ -68,6 +69,7 @@ def check_study(config):
             )
             raise ConfigError(msg)
     catalog = study_catalog(config.catalog)
+    good_redshifts(catalog, config.fit.redshift_quality)
     if CATALOG in config.sed.frac_agn:
         from miricigale.workflow.stages.truth import catalog_fractions
 

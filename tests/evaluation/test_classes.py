@@ -9,6 +9,7 @@ from miricigale.evaluation import (
     confusion,
     selection_quality,
 )
+from miricigale.evaluation.classes import sky_quality
 
 TRUE = ["galaxy"] * 4 + ["composite"] * 2 + ["agn"] * 4
 FOUND = ["galaxy"] * 3 + ["agn", "composite", "unknown"] + ["agn"] * 3 + ["composite"]
@@ -54,3 +55,14 @@ def test_other_lengths_are_refused():
     refuses("'found' must be a 1-D array as long as 'true'", confusion, ["agn"], [])
     text = "'selected' must be a 1-D array as long as 'wanted'"
     refuses(text, selection_quality, [True], [True, False])
+
+
+def test_more_skies_of_the_same_galaxies_know_no_more_than_the_galaxies():
+    """Half of 100 galaxies are found, alone or each in ten skies: the error is binomial, of 100."""
+    galaxies, found = np.arange(100), np.arange(100) < 50
+    one = sky_quality(galaxies, np.ones(100, bool), found, np.ones(100)).completeness
+    assert one.error == pytest.approx(np.sqrt(0.25 / 100), rel=0.02)
+    many = (np.repeat(array, 10) for array in (galaxies, np.ones(100, bool), found))
+    ten = sky_quality(*many, np.full(1000, 0.1)).completeness
+    assert (ten.value, ten.low, ten.high) == pytest.approx((one.value, one.low, one.high))
+    assert (one.n, ten.n) == (100, 1000)

@@ -113,16 +113,30 @@ def test_dust_emits_at_least_what_attenuation_took(galaxies):
     refuses(r"'table' must be .* columns \['u_v'\]", main_sequence_dust, galaxies, seed=1)
 
 
-def test_dust_of_ceers_rises_with_mass_and_is_rare_in_quiescent_galaxies(galaxies):
-    for mass, wanted in ((1e8, 0.07 - 0.43 * 1.8), (1e9, 0.07 - 0.43 * 1.3), (1e11, 0.07)):
+def test_dust_of_ceers_follows_mass_and_star_formation(galaxies):
+    galaxies["sfr_100myr"] = np.full(len(galaxies), 10.0) * u.Msun / u.yr
+    # log10 L = 0.79 + log M at 10^10.3 Msun and 10^-9.3 / yr, whatever the attenuation takes
+    for mass, wanted in (
+        (1e8, 8.79 - 0.56 * 1.8 + 0.69 * 1.3),
+        (1e9, 9.79 - 0.56 * 1.3 + 0.69 * 1.3),
+        (1e11, 11.79 - 0.69 * 0.7),
+    ):
         galaxies["stellar_mass"] = np.full(len(galaxies), mass) * u.Msun
         dust = ceers_dust(galaxies, "dl07_alpha", seed=5)
-        drawn = np.log10(dust["dust_excess"][~dust["quiescent"]][1:])
-        assert drawn.mean() == pytest.approx(wanted, abs=4 * 0.30 / np.sqrt(drawn.size))
-        assert drawn.std() == pytest.approx(0.30, rel=0.1)
+        drawn = np.log10(dust["dust_luminosity"].to_value(u.Lsun)[~dust["quiescent"]][1:])
+        assert drawn.mean() == pytest.approx(wanted, abs=4 * 0.21 / np.sqrt(drawn.size))
+        assert drawn.std() == pytest.approx(0.21, rel=0.1)
+    assert_allclose(dust["dust_excess"], dust["dust_luminosity"] / galaxies["dust_luminosity"])
     galaxies["u_v"] = np.full(len(galaxies), 1.9) * u.mag
     dust = ceers_dust(galaxies, "dale2014", seed=5)
     assert np.median(np.log10(dust["dust_excess"])) == pytest.approx(-0.49, abs=0.1)
+    refuses(
+        r"columns \['sfr_100myr'\]",
+        ceers_dust,
+        galaxies[list(galaxies.colnames[:6])],
+        "dale2014",
+        seed=1,
+    )
     refuses(
         "no dust component 'casey2012'", ceers_dust, galaxies, "casey2012", seed=1, error=KeyError
     )

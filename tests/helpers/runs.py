@@ -59,12 +59,12 @@ def save_exposure(made, name, unit):
     shape = (64, 72)
     rate = sky_image(SCALE, shape, 30 + rng.normal(size=shape))
     rate.unit = "adu / s"
-    rate.meta.update(filter=name, subarray="SUB64")
+    rate.meta.update(filter=name, subarray="SUB64", steps=["dark"])
     made.save_image(f"{unit}_rate.fits", rate)
     made.save_image(f"{unit}_cal.fits", sky_image(SCALE, shape, rng.normal(size=shape), rim=4))
 
 
-def small_config(filters, *, points=False, frac_agn=(0.0,), sets=("all", "none")):
+def small_config(filters, *, points=False, frac_agn=(0.0,), sets=("all", "none"), skies=0):
     n = len(filters)
     return StudyConfig.from_dict(
         {
@@ -83,6 +83,7 @@ def small_config(filters, *, points=False, frac_agn=(0.0,), sets=("all", "none")
                 "axes": "quick",
                 "min_detected": 1,
                 "sets": sets,
+                "skies": skies,
             },
             "point_sources": {"enabled": points},
             "report": {"dpi": 40},
@@ -121,6 +122,7 @@ def make_run(folder, filters, *, mass=3e10, points=False, report=True, text_ids=
     light = SEDModel.yang2021(agn=False).fluxes(parameters, ["wfc3.f160w"])
     catalog["wfc3.f160w"] = light["wfc3.f160w"]
     made.save_table("catalog.ecsv", catalog)
+    do_stage(config, folder, "seds")
     for name in filters:
         made.save_result(f"kernel_{name}.fits", made_up_kernel())
         bright = QTable({"flux_true": np.full(5, 100.0) * u.uJy})
@@ -138,6 +140,8 @@ def make_run(folder, filters, *, mass=3e10, points=False, report=True, text_ids=
         do_stage(config, folder, "matches", name)
         for unit in config.fit.sets:
             do_stage(config, folder, "fits", f"{name}/{unit}")
+    for unit in STAGES["skies"].unit_names(config):
+        do_stage(config, folder, "skies", unit)
     if report:
         do_stage(config, folder, "report")
     return folder / "report"

@@ -24,6 +24,7 @@ from miricigale.instrument import (
     tangent_offset,
     v2v3_to_sky,
 )
+from miricigale.instrument.asdf_extension import imager_gwcs
 
 FIELD = SkyCoord(53.1344, -27.83444, unit="deg")
 ROLL = 35 * u.deg
@@ -200,3 +201,17 @@ def test_areas_filled_into_an_array_are_the_same():
     for out, rtol in ((np.zeros((1024, 1032)), 1e-12), (np.zeros((1024, 1032), "f4"), 2e-7)):
         assert pixel_area_map(wcs, out.shape, out=out) is out
         assert_allclose(out, pixel_area_map(wcs, out.shape), rtol=rtol)
+
+
+@pytest.mark.parametrize("subarray", ["FULL", "SUB64"])
+def test_gwcs_of_an_image_is_its_wcs(subarray):
+    pytest.importorskip("gwcs", reason="needs gwcs: pip install miricigale[gwcs]")
+    exposure = Exposure("miri.f770w", n_groups=5, subarray=subarray, pointing="359.9999 -89.5")
+    exact = imager_gwcs(exposure.wcs, exposure.shape, exposure.pointing_keywords())
+    x, y = grid(subarray)
+    sky = SkyCoord(*exact(x, y), unit="deg")
+    assert sky.separation(exposure.wcs.pixel_to_world(x, y)).max() < 1e-4 * u.mas
+    assert_allclose(
+        exact.invert(sky.ra.deg, sky.dec.deg, with_bounding_box=False), [x, y], atol=1e-3
+    )
+    assert exact.available_frames == ["detector", "v2v3", "v2v3vacorr", "world"]

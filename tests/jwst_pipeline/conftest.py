@@ -57,11 +57,10 @@ def make_crds(folder, *options):
     return variables
 
 
-def run_stage(stage, folder, files, crds, *, keep_ramp=False):
-    """Run one stage of the pipeline, which may keep the ramp it fits, and return what it needed."""
-    stage_and_more = f"{stage}+ramp" if keep_ramp else stage
-    command(HERE / "run_stage.py", stage_and_more, folder, *files, environment=crds)
-    return json.loads((folder / f"{stage}.json").read_text())
+def run_stage(stage, folder, files, crds):
+    """Run one stage of the pipeline (see run_stage.py), and return what it needed."""
+    command(HERE / "run_stage.py", stage, folder, *files, environment=crds)
+    return json.loads((folder / f"{stage.partition('+')[0]}.json").read_text())
 
 
 def star_field(base, x, y, flux):

@@ -1,7 +1,8 @@
 """
 One stage of the official pipeline in a process of its own, which cannot open a connection.
 
-``python run_stage.py STAGE OUTPUT FILE [FILE ...]``; ``detector1+ramp`` keeps the ramp that is fitted.
+``python run_stage.py STAGE OUTPUT FILE [FILE ...]``; ``detector1+ramp`` keeps the ramp that is fitted,
+``image3+align`` aligns the images, and ``image3+level`` leaves their levels.
 """
 
 import json
@@ -35,7 +36,7 @@ def image2(files, output):
         Image2Pipeline.call(path, save_results=True, output_dir=output, steps=steps)
 
 
-def image3(files, output):
+def image3(files, output, *, align=False, level=True):
     from jwst.associations.asn_from_list import asn_from_list
     from jwst.associations.lib.rules_level3_base import DMS_Level3_Base
     from jwst.pipeline import Image3Pipeline
@@ -44,8 +45,9 @@ def image3(files, output):
     path = Path(output, "asn.json")
     path.write_text(association.dump()[1])
     steps = {
-        # the positions are to be those of the headers
-        "tweakreg": {"skip": True},
+        # the positions are to be those of the headers, where nothing else is asked for
+        "tweakreg": {"skip": not align},
+        "skymatch": {"skip": not level},
         # the default weighs pixels by their read noise, less where a cosmic ray has cut the ramp:
         # stars with hits in the core are then up to 2 % off, however exact the exposures are
         "resample": {"weight_type": "exptime"},
@@ -56,7 +58,12 @@ def image3(files, output):
 if __name__ == "__main__":
     stage, folder, *paths = sys.argv[1:]
     stage, _, kept = stage.partition("+")
-    options = {"save_calibrated_ramp": True} if kept else {}
+    more = {
+        "ramp": {"save_calibrated_ramp": True},
+        "align": {"align": True},
+        "level": {"level": False},
+    }
+    options = more.get(kept, {})
     socket.socket.connect = socket.socket.connect_ex = refuse
     {"detector1": detector1, "image2": image2, "image3": image3}[stage](paths, folder, **options)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

@@ -2,7 +2,9 @@ import astropy.units as u
 import numpy as np
 import pytest
 import sep
+from astropy.convolution import Gaussian2DKernel
 from numpy.testing import assert_allclose
+from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
 from helpers.errors import refuses
@@ -51,6 +53,25 @@ def test_source_extractor_like_fluxes(tools, stars):
     assert np.all(table["flux_auto"].value[index] > 0.9 * flux)
     inside = 1 - np.exp(-0.5 * (0.93 / tools.LO) ** 2)
     assert_allclose(table["flux_aper"].value[index] / flux, inside, rtol=0.05)
+
+
+def test_without_weights_the_noisier_part_has_more_detections(tools, stars):
+    """As another program has it: one threshold for all, and zeros for data where there are none."""
+    _, _, image = stars
+    noise = gaussian_filter(np.random.default_rng(1).normal(size=(400, 400)), 1.5)
+    noise[:, 300:] *= 2
+    empty = np.add.outer(np.arange(400), 2 * np.arange(400)) > 1000
+    image = tools.as_ccd(np.where(empty, np.nan, noise), image.wcs, noise.std())
+    data = np.where(empty, 0.0, noise)
+    mesh = sep.Background(data, bw=64, bh=64, fw=6, fh=6)
+    kernel = Gaussian2DKernel(5 / np.sqrt(8 * np.log(2)), x_size=9, y_size=9).array
+    kind = {"err": mesh.globalrms, "minarea": 5, "filter_kernel": kernel, "filter_type": "conv"}
+    found = sep.extract(data - mesh.back(), 1.5, **kind)
+    table = source_extractor_photometry(image, weighted=False, stated_on=None)
+    # those at the threshold may differ
+    assert len(table) == pytest.approx(len(found), rel=0.1)
+    x = table["x_centroid"].value
+    assert np.count_nonzero(x > 300) > 2 * np.count_nonzero(x < 200)
 
 
 def test_encircled_energy_and_scale_of_point_sources(tools, stars):

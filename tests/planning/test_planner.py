@@ -21,7 +21,9 @@ from miricigale.utils.parallel import threads
 
 BANDS = ["miri.f770w", "miri.f1500w"]
 EXPOSURES = {"bands": BANDS, "time": 1665.0, "dithers": 3, "sets": ["all", "f770w"]}
-SETTINGS = {"sample": {"n_sources": 60}, "exposures": EXPOSURES, "fit": {"axes": "quick"}}
+SETTINGS = {"sample": {"n_sources": 60}, "exposures": EXPOSURES}
+# dust as the fits have it
+SETTINGS |= {"sed": {"infrared": "fit"}, "fit": {"axes": "quick", "dust_excess": ()}}
 SETTINGS["survey"] = {"areas": [1, 4]}
 FIELD = dict(SETTINGS)
 SETTINGS["agn"] = {"frac_agn": [0.0, 0.2, 0.4, 0.6, 0.8, 0.99], "shares": [5, 1, 1, 1, 1, 1]}

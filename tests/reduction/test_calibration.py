@@ -10,13 +10,13 @@ from miricigale.reduction.images import flagged_image
 
 SHAPE = (1024, 1032)
 FILTER = "miri.f1000w"
-OPTIONS = {"filter": FILTER, "subarray": "FULL", "dark": 0.05, "flat": flat_field(FILTER)}
+OPTIONS = {"filter": FILTER, "subarray": "FULL", "flat": flat_field(FILTER)}
 OPTIONS["conversion"] = photmjsr(FILTER, gain=4.0)
 
 
 @pytest.fixture(scope="module")
 def rate():
-    data = 20.0 * flat_field(FILTER) + 0.05
+    data = 20.0 * flat_field(FILTER)
     flags = np.zeros(SHAPE, np.int64)
     flags[:, :4] = DQ.REFERENCE_PIXEL | DQ.DO_NOT_USE
     form = {"error": np.full(SHAPE, 0.1), "flags": flags, "wcs": None}

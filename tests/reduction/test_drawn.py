@@ -41,7 +41,7 @@ def both(exposure, light, *effects, seed=1, without=(), reducer=None, properties
         make(image, exposure, seed=seed) for make in (detector.expose, detector.collect)
     )
     fits = [reducer.fit_groups(exposed) for exposed in (ramp, charge)]
-    return fits, charge.mean / miri_detector().gain
+    return fits, (charge.mean - miri_detector().dark_current) / miri_detector().gain
 
 
 def inside(array):

@@ -10,12 +10,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses, warned
 from helpers.exposures import exposure_of, sky_of
-from helpers.references import imager_keywords, write_photom, write_reference
+from helpers.references import imager_keywords
 from miricigale.detector import CosmicRays, Detector, Ramp
-from miricigale.instrument import DQ, ImageFacts
+from miricigale.instrument import DQ, ExposureHistory, ImageFacts, joined_header
 from miricigale.reduction import (
     Reducer,
-    ReferenceFiles,
     open_exposure,
     read_images,
     write_image,
@@ -39,7 +38,13 @@ def rate_file(path, exposure, *, unit="DN/s", steps=("S_LINEAR", "S_DARK", "S_RA
     dq[10, 20], dq[11, 21] = DQ.DO_NOT_USE | DQ.OTHER_BAD_PIXEL, DQ.JUMP_DET
     primary = fits.PrimaryHDU()
     given = {"DETECTOR": "MIRIMAGE", "FILTER": "F1000W", "NGROUPS": 12, "TGROUP": 0.085}
-    given |= {"EFFEXPTM": 1.02, "EXPMID": 60000.5, "PATT_NUM": 2}
+    given |= {
+        "EFFEXPTM": 1.02,
+        "EXPMID": 60000.5,
+        "PATT_NUM": 2,
+        "PROGRAM": "01345",
+        "TITLE": "a" * 67,
+    }
     given |= {"R_FLAT": "crds://jwst_miri_flat_0786.fits", **dict.fromkeys(steps, "COMPLETE")}
     primary.header.update(imager_keywords(**given))
     pointed = {"RA_REF": 53.1344, "DEC_REF": -27.8344, "ROLL_REF": 30.0}
@@ -65,10 +70,10 @@ def test_a_rate_of_the_pipeline(tmp_path, exposure, unit):
     assert image.flags[10, 20] == DQ.DO_NOT_USE | DQ.OTHER_BAD_PIXEL
     assert image.flags[11, 21] == DQ.JUMP_DET
     assert_array_equal(np.argwhere(image.mask), [[10, 20]])
-    facts = ImageFacts.of(image)
-    assert (facts.filter, facts.subarray, facts.day) == ("miri.f1000w", "SUB64", 60000.5)
-    assert set(facts.steps) == {"linearity", "dark", "ramp_fit"}
-    assert not facts.simulated
+    facts, history = ImageFacts.of(image), ExposureHistory.of(image)
+    assert (facts.filter, facts.subarray, history.day) == ("miri.f1000w", "SUB64", 60000.5)
+    assert history.steps == {"linearity", "dark", "ramp_fit"}
+    assert history.origin == "other"
     assert image.meta["reference_flat"] == "jwst_miri_flat_0786.fits"
     assert image.meta["dither"] == 1
     # a rate has the linear part of the coordinates; the distortion is the imager's
@@ -93,27 +98,8 @@ def test_errors_come_from_variances_where_there_are_no_others(tmp_path, exposure
         refuses(match, read_images, path, error=DataError)
 
 
-def test_what_was_done_to_a_rate_is_not_done_again(tmp_path, exposure):
-    flat = np.full(exposure.shape, 2.0)
-    references = ReferenceFiles(
-        flat=write_reference(tmp_path / "flat.fits", "flat", exposure, flat, FILTER="F1000W"),
-        photom=write_photom(tmp_path / "photom.fits", [("F1000W", "SUB64", 0.5)]),
-    )
-    reducer = Reducer(references=references)
-    level = {}
-    for name, steps in {"dark": ("S_DARK",), "flat": ("S_DARK", "S_FLAT")}.items():
-        path = tmp_path / f"{name}_rate.fits"
-        data = rate_file(path, exposure, steps=steps)
-        cal = reducer.calibrate(open_exposure(path))
-        level[name] = np.median(cal.data / data)
-        assert {"flat", "photom"} <= set(cal.meta["steps"])
-    assert level["dark"] == pytest.approx(0.25)
-    assert level["flat"] == pytest.approx(0.5)
-    refuses("needed: flat, photom", Reducer().calibrate, open_exposure(tmp_path / "dark_rate.fits"))
-
-
 @pytest.mark.filterwarnings("ignore::astropy.wcs.FITSFixedWarning")
-def test_a_real_image_of_the_pipeline(data_file):
+def test_a_real_image_of_the_pipeline(data_file, tmp_path):
     path = data_file(I2D)
     (file,) = read_images(path)
     with fits.open(path) as hdus:
@@ -136,6 +122,18 @@ def test_a_real_image_of_the_pipeline(data_file):
     assert result.rates == ()
     wanted = "a single dither: outliers", "1 of 1 backgrounds", "the background of the mosaic"
     assert tuple(note.split(" cannot")[0] for note in result.notes) == wanted
+    # products keep the keywords of the observation
+    words = {word: value for word, value in file.header.items() if word not in ("COMMENT", "")}
+    assert len(words) > 230
+    result.write(tmp_path / "mosaic_i2d.fits")
+    write_image(file, tmp_path / "copy_i2d.fits")
+    for name in ("copy", "mosaic"):
+        with fits.open(tmp_path / f"{name}_i2d.fits") as hdus:
+            kept = joined_header(hdus)
+            assert hdus[0].header["S_RESAMP"] == "COMPLETE"
+        assert np.mean([word in kept for word in words]) > 0.98
+        # all but name, grid and world coordinates are the same
+        assert np.mean([kept.get(word) == value for word, value in words.items()]) > 0.94
 
 
 def test_real_rates_of_integrations_and_their_mean(data_file):
@@ -199,7 +197,7 @@ def test_what_is_no_image_is_refused(tmp_path):
     hdus = fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(np.ones((3, 3)), name="SCI")])
     hdus[0].header["INSTRUME"] = "NIRCAM"
     hdus.writeto(tmp_path / "nircam.fits")
-    wanted = "must be of the MIRI imager, got NIRCAM MIRIMAGE"
+    wanted = "must be an exposure of the MIRI imager .* got NIRCAM MIRIMAGE"
     refuses(wanted, read_images, tmp_path / "nircam.fits", error=DataError)
     refuses("'exposure' must be a Ramp, a Charge, CCDData or a path", Reducer().reduce, 3)
     image = CCDData(np.ones((4, 4)), unit="Jy", uncertainty=StdDevUncertainty(np.ones((4, 4))))

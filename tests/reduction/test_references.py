@@ -3,16 +3,14 @@
 import numpy as np
 import pytest
 from astropy.stats import mad_std
-from numpy.polynomial import Polynomial
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses, warned
 from helpers.exposures import exposure_of, sky_of
-from helpers.references import nameless, write_photom, write_reference
-from miricigale.detector import CosmicRays, Detector, InterpixelCapacitance, Ramp, ResetAnomaly
+from helpers.references import nameless, write_photom, write_reference, write_references
+from miricigale.detector import CosmicRays, Detector, InterpixelCapacitance, ResetAnomaly
 from miricigale.instrument import DQ, field_mask, flat_field, miri_detector, photmjsr
 from miricigale.reduction import RampSettings, Reducer, ReferenceFiles
-from miricigale.reduction.images import with_data
 from miricigale.reduction.reference_maps import read_photom
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
 
@@ -40,35 +38,15 @@ def ramp(exposure):
 @pytest.fixture(scope="module")
 def references(exposure, ramp, tmp_path_factory):
     """The other detector's reference files."""
-    folder, shape = tmp_path_factory.mktemp("references"), exposure.shape
-
-    def file(kind, *args, **options):
-        return write_reference(folder / f"{kind}.fits", kind, exposure, *args, **options)
-
-    def full(value):
-        return np.full(shape, value)
-
-    # as CRDS has it for MIRI, a polynomial of raw DN
-    raw = Polynomial(OTHER.nonlinearity)(Polynomial([-OTHER.bias, 1.0])) + OTHER.bias
-    step = exposure.group_time.value * OTHER.dark_current / OTHER.gain
-    dark = step * np.arange(1, 41)[:, None, None] * np.ones((2, 40, *shape))
+    folder = tmp_path_factory.mktemp("references")
     offsets = ResetAnomaly((-60.0, -40.0)).offsets(2, 30)
     sees = (ramp.pixel_dq & DQ.REFERENCE_PIXEL) == 0
-    # CRDS keeps the noise of a difference of two reads
-    noise = np.sqrt(2 * OTHER.read_noise**2)
-    bad = np.where(ramp.pixel_dq != 0, 1, 0)
-    rows = [("F1000W", "FULL", 9.0), ("F1000W", "SUB256", photmjsr("miri.f1000w", gain=OTHER.gain))]
-    return ReferenceFiles(
-        mask=file("mask", dq=bad, legend=["DO_NOT_USE"]),
-        saturation=file("saturation", full(OTHER.bias + 0.95 * OTHER.saturation_dn)),
-        reset=file("reset", offsets[:, :, None, None] * sees, READPATT="FAST"),
-        linearity=file("linearity", raw.coef[:, None, None] * np.ones(shape)),
-        dark=file("dark", dark * sees, READPATT="FASTR1"),
-        gain=file("gain", full(OTHER.gain)),
-        read_noise=file("readnoise", full(noise)),
-        flat=file("flat", flat_field(exposure.filter, subarray="SUB256"), FILTER="F1000W"),
-        photom=write_photom(folder / "photom.fits", rows),
+    path = folder / "reset.fits"
+    reset = write_reference(
+        path, "reset", exposure, offsets[:, :, None, None] * sees, READPATT="FAST"
     )
+    bad = np.where(ramp.pixel_dq != 0, 1, 0)
+    return ReferenceFiles(**write_references(folder, exposure, OTHER, bad), reset=reset)
 
 
 @pytest.fixture(scope="module")
@@ -145,7 +123,9 @@ def test_without_references_it_is_refused(ramp, real, references):
     partial = references.replace(dark=None, incomplete=True)
     rate = warned("slopes without references for dark", Reducer(references=partial).fit_ramp, real)
     assert rate.meta["reference_dark"] == "none"
-    with pytest.warns(MiricigaleWarning, match="the dark current is in the slopes still"):
+    with pytest.warns(
+        MiricigaleWarning, match="nothing says that the dark current was taken out of the slopes"
+    ):
         Reducer(references=partial).calibrate(rate)
     refuses("must be given for surface brightness", Reducer().calibrate, rate)
 
@@ -174,62 +154,6 @@ def test_slopes_without_any_reference_have_measured_noise(real):
         pytest.raises(ValueError, match="given with 'photom' for surface brightness"),
     ):
         reducer.calibrate(rate)
-
-
-def test_what_a_file_had_done_to_it_is_not_done_twice(exposure, real, references):
-    # linear, dark and anomaly off: as the pipeline leaves it before the ramp fit
-    offsets = ResetAnomaly((-60.0, -40.0)).offsets(2, 30)
-    linear = OTHER.linearize(real.data - offsets[:, :, None, None] - OTHER.bias) + OTHER.bias
-    step = exposure.group_time.value * OTHER.dark_current / OTHER.gain
-    linear -= step * np.arange(1, 31)[:, None, None]
-    steps = ["dq_init", "saturation", "reset", "linearity", "dark", "lastframe"]
-    group_dq = np.zeros(real.shape, np.uint8)
-    group_dq[:, -1] = DQ.DO_NOT_USE
-    bad = real.pixel_dq | np.where(references.maps(real).pixel_dq, 1, 0).astype(np.uint32)
-    told = {"pixel_dq": bad, "group_dq": group_dq, "steps": steps, "header": real.header}
-    done = Ramp(linear.astype(np.float32), exposure, **told)
-    whole = Reducer(references=references, skip_first=0, skip_last=1).fit_ramp(real)
-    few = ReferenceFiles(gain=references.gain, read_noise=references.read_noise)
-    rest = Reducer(references=few, skip_first=0).fit_ramp(done)
-    both = ~whole.mask & ~rest.mask & (whole.data > 0)
-    assert both.mean() > 0.95
-    assert np.abs(rest.data - whole.data)[both].max() < 0.02 * whole.data[both].max()
-    assert_allclose(rest.data[both], whole.data[both], rtol=0.01, atol=0.05)
-    assert rest.meta["reference_linearity"] == "done before"
-    assert set(steps) <= set(rest.meta["steps"])
-
-
-def test_what_was_done_to_a_simulated_ramp_is_not_done_twice(exposure):
-    """Linear, without dark, with a flagged jump, as a pipeline leaves a ramp of the package's detector."""
-    own = miri_detector()
-    detector = Detector.miri_imager().without(CosmicRays, InterpixelCapacitance)
-    ramp = detector.expose(sky_of(exposure, np.full(exposure.shape, 200.0)), exposure, seed=4)
-    linear = own.linearize(ramp.data - own.bias)
-    step = exposure.group_time.value * own.dark_current / own.gain
-    linear -= step * np.arange(1, 31)[:, None, None]
-    steps = ["dq_init", "saturation", "linearity", "dark", "refpix", "jump"]
-    group_dq, hit = np.zeros(ramp.shape, np.uint8), (slice(None), slice(12, None), 100, 110)
-    linear[hit] += 300.0
-    group_dq[:, 12, 100, 110] = DQ.JUMP_DET
-    told = {name: getattr(ramp, name) for name in ("pixel_dq", "effects", "properties")}
-    done = Ramp(linear.astype(np.float32), exposure, **told, group_dq=group_dq, steps=steps)
-    settings = {"ramps": RampSettings(reference_correction=False), "jump_threshold": None}
-    whole, rest = (Reducer(**settings).fit_ramp(one) for one in (ramp, done))
-    both = ~whole.mask & ~rest.mask
-    both[100, 110] = False
-    assert both.mean() > 0.9
-    dark = own.dark_current / own.gain
-    assert_allclose(rest.data[both] + dark, whole.data[both], rtol=2e-3, atol=0.02)
-    error = np.hypot(*(one.uncertainty.array[100, 110] for one in (whole, rest)))
-    assert abs(rest.data[100, 110] + dark - whole.data[100, 110]) < 4 * error
-    calibrated = [Reducer(**settings).calibrate(one).data[both] for one in (whole, rest)]
-    assert np.nanmedian(calibrated[1] / calibrated[0]) == pytest.approx(1, abs=2e-4)
-    # nor is a flat field divided by twice
-    flat = flat_field(exposure.filter, subarray=exposure.subarray)
-    flattened = with_data(rest, rest.data / flat, steps=[*rest.meta["steps"], "flat"])
-    again = Reducer(**settings).calibrate(flattened)
-    assert again.meta["reference_flat"] == "done before"
-    assert_allclose(again.data[both], calibrated[1], rtol=1e-5)
 
 
 def test_files_for_something_else_are_refused(exposure, real, references, data_file, tmp_path):

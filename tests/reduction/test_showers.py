@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter
 from helpers.errors import refuses
 from helpers.exposures import exposure_of, sky_of
 from miricigale.detector import CosmicRays, Detector
-from miricigale.instrument import DQ, flat_field, miri_detector, photmjsr
+from miricigale.instrument import DQ, flat_field, photmjsr
 from miricigale.reduction import RampSettings, Reducer
 
 BAND, SKY, WIDTH = "miri.f770w", 5.1, 4.0
@@ -22,9 +22,7 @@ def expose(*, fraction, seed=2):
     sky = sky_of(exposure, light, psf_includes=["ipc"])
     rays = CosmicRays(shower_fraction=fraction, shower_above=5e4, shower_charge=1e5)
     ramp = Detector.miri_imager(rays).expose(sky, exposure, seed=seed, n_threads=1)
-    detector = miri_detector()
-    truth = light * flat_field(BAND, subarray="BRIGHTSKY") / photmjsr(BAND)
-    return ramp, truth + detector.dark_current / detector.gain
+    return ramp, light * flat_field(BAND, subarray="BRIGHTSKY") / photmjsr(BAND)
 
 
 def smoothed_pull(fit, truth):

@@ -148,11 +148,6 @@ def test_small_and_large_values_of_an_axis_are_told_apart(scale):
     assert library.row(k=scale * 1.0005) is None
 
 
-def test_whether_the_grid_is_complete_is_known():
-    assert make().complete
-    assert not make(axes={"tau": [1.0, 1.0, 2.0, 3.0], "q": [0.0, 1.0, 0.0, 0.0]}).complete
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

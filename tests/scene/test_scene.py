@@ -215,13 +215,6 @@ def test_refuses(wcs, psf, options, message):
     refuses(message, Scene, catalog, **{"filter": FILTER, "wcs": wcs, "psf": psf} | options)
 
 
-def test_magnitudes_are_fluxes(wcs, psf):
-    catalog = scenes.make_catalog(wcs, 50, 45)
-    catalog[FILTER] = [20.0] * u.ABmag
-    truth = make_scene(catalog, wcs, psf).truth
-    assert truth["flux_total"][0].to_value(u.uJy) == pytest.approx(3631e6 * 1e-8, rel=1e-4)
-
-
 def test_psfs_that_fit(wcs):
     catalog = scenes.make_catalog(wcs, 50, 45)
     make_scene(catalog, scenes.tan_wcs(pa=40.0), TURNED)

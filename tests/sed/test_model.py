@@ -21,6 +21,7 @@ from miricigale.sed.components import (
     DraineLi2007,
     ParametricTorus,
 )
+from miricigale.sed.grid_spectra import model_fluxes, observed_spectra
 from miricigale.utils.exceptions import ConfigError, MiricigaleWarning
 
 AXES = {"tau": [0.1, 1.0], "age": [0.5, 5.0], "ebv": [0.1, 0.7], "alpha": [1.0, 2.0]}
@@ -56,6 +57,32 @@ def test_dust_excess_changes_the_dust_and_leaves_the_stars(model, filters):
     assert_quantity_allclose(table["ir_luminosity"][1], more.derived["ir_luminosity"])
     assert table["dust_luminosity"][2] == 0
     assert table["flags"].tolist() == [0, 0, ModelFlags.NO_AGN_POWER]
+
+
+def test_a_grid_has_dust_free_of_energy_balance(model, filters):
+    axes = AXES | {"tau": [1.0], "age": [0.5], "dust_excess": [0.2, 1.0, 4.0]}
+    free, balanced = model.grid(axes, filters), model.grid(axes | {"dust_excess": [1.0]}, filters)
+    rows = [i for i, x in enumerate(free.galaxy_parameters["dust_excess"]) if x == 1.0]
+    assert_allclose(free.galaxy[:, rows], balanced.galaxy, rtol=1e-12)
+    rng, n = np.random.default_rng(1), 20
+    index = np.array([rng.integers(k, size=n) for k in (4, free.galaxy.shape[1], free.n_agn, 3)]).T
+    # far from the nodes of other bands: one model at a time
+    other = FilterSet.from_names(["mips.24"])
+    got = model_fluxes(model, free, index, other)[:, 0]
+    wave, light = observed_spectra(model, free, index, np.ones(n))
+    for row, (z, g, k, f) in enumerate(index):
+        values = {"redshift": free.redshift[z], "frac_agn": free.frac_agn[f], "mass": 1.0}
+        values |= {
+            name: free.galaxy_parameters[name][g] for name in free.galaxy_parameters.colnames
+        }
+        values |= {name: free.agn_parameters[name][k] for name in free.agn_parameters.colnames}
+        one = model.evaluate(**values)
+        wanted = [flux.to_value(u.uJy) for flux in filters.synthetic_fluxes(one)]
+        assert_allclose(free.flux(z, g, k, f), wanted, rtol=1e-5)
+        assert got[row] == pytest.approx(other.synthetic_fluxes(one)[0].to_value(u.uJy), rel=1e-5)
+        at = np.interp(wave, one.wave.to_value(u.um), one.fnu.to_value(u.uJy))
+        some = slice(2000, 4000, 50)
+        assert_allclose(light[row][some], at[some], rtol=1e-3)
 
 
 def test_dust_excess_needs_dust():
@@ -268,7 +295,6 @@ def test_redshift_is_needed(model, filters):
     [
         ({"taus": [1.0], "redshift": [1.0]}, KeyError, "no axis 'taus'"),
         ({"mass": [1.0], "redshift": [1.0]}, KeyError, "no axis 'mass'"),
-        ({"dust_excess": [2.0], "redshift": [1.0]}, KeyError, "no axis 'dust_excess'"),
         ({"tau": [1.0, 0.5], "redshift": [1.0]}, ValueError, "'tau' must be ascending values"),
         ({"tau": [1e4], "redshift": [1.0]}, ValueError, "'tau' must be from"),
         ({"age": MASKED, "redshift": [1.0]}, ValueError, "'age' must be values without a mask"),

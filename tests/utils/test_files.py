@@ -16,12 +16,8 @@ from astropy.table import QTable
 from helpers.errors import refuses
 from miricigale import conf
 from miricigale.utils.exceptions import DataError
-from miricigale.utils.files import (
-    open_fits,
-    read_table,
-    unpacked_size,
-    writing,
-)
+from miricigale.utils.files import open_fits, unpacked_size, writing
+from miricigale.utils.table_files import read_table
 
 
 def read_ecsv(path, wanted):
@@ -43,11 +39,16 @@ def test_tables_are_recognized_by_content_and_name(tmp_path, name):
         assert np.asarray(back[column]).tolist() == np.asarray(table[column]).tolist()
 
 
-def not_read(match, path, reader=open_fits):
+def opened(path, wanted):
+    with open_fits(path, wanted=wanted) as hdus:
+        return [hdu.name for hdu in hdus]
+
+
+def not_read(match, path, reader=opened):
     refuses(match, reader, path, error=DataError, wanted="a kernel")
 
 
-@pytest.mark.parametrize("reader", [open_fits, read_ecsv])
+@pytest.mark.parametrize("reader", [opened, read_ecsv])
 def test_missing_and_foreign_files_are_named(tmp_path, reader):
     not_read("none.x cannot be read as a kernel: no such file", tmp_path / "none.x", reader)
     not_read("cannot be read as a kernel: it is a folder, wanted is a file", tmp_path, reader)
@@ -64,6 +65,50 @@ def test_truncated_files_are_named(tmp_path):
     not_read(r"part\.fits cannot be read as a kernel: .*truncated", path)
 
 
+def test_text_that_would_take_far_more_memory_than_its_bytes_is_refused(tmp_path):
+    path = tmp_path / "small.ecsv"
+    columns = (
+        "# - {name: id, datatype: int64}\n# - {name: v, datatype: string, subtype: 'float64[%s]'}\n"
+    )
+    for shape, wanted in (
+        ("1000000000", "arrays of 1000000000 numbers"),
+        ("9999,999,null", "9999,999"),
+    ):
+        path.write_text(f"# %ECSV 1.0\n# ---\n# datatype:\n{columns % shape}id v\n1 [1.0]\n")
+        not_read(rf"small\.ecsv cannot .* it declares .*{wanted}", path, read_table)
+    path.write_text(f"# %ECSV 1.0\n# ---\n# datatype:\n{columns % 2}id v\n1 [1.0,2.0]\n")
+    assert read_table(path, wanted="a table")["v"].tolist() == [[1.0, 2.0]]
+    path = tmp_path / "wide.csv"
+    path.write_text("id,flux\n1,2.0\n2," + "1" * 3_000_000 + "\n")
+    not_read(r"wide\.csv cannot .* a line is longer than", path, read_table)
+    path.write_text("id,flux\n" + "1,2.0\n" * 500_000)
+    assert len(read_table(path, wanted="a table")) == 500_000
+
+
+def test_damaged_headers_are_named(tmp_path):
+    path = tmp_path / "bad.fits"
+    fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(np.zeros((9, 9)), name="SCI")]).writeto(path)
+    whole = path.read_bytes()
+    for old, new in (
+        (b"NAXIS1  =                    9", b"NAXIS1  =                   -9"),
+        (b"XTENSION= 'IMAGE", b"XTENSION= 'EGAMI"),
+    ):
+        path.write_bytes(whole.replace(old, new))
+        not_read(r"bad\.fits cannot be read as a kernel: ", path)
+    path.write_bytes(whole)
+    # what goes wrong with what is in a file
+    with (
+        pytest.raises(
+            DataError, match=r"bad\.fits cannot be read as a kernel: .*no attribute 'none'"
+        ),
+        open_fits(path, wanted="a kernel") as hdus,
+    ):
+        hdus[1].none  # noqa: B018
+    with pytest.raises(ValueError, match="pixels") as info, open_fits(path, wanted="a kernel"):
+        raise ValueError("too many pixels")
+    assert info.value.__notes__ == [f"in {path}"]
+
+
 def test_a_file_that_could_not_be_written_is_named(tmp_path, full_disk):
     path, partial = tmp_path / "a.fits", tmp_path / "a.partial"
     with full_disk(5000):
@@ -74,6 +119,13 @@ def test_a_file_that_could_not_be_written_is_named(tmp_path, full_disk):
         match = r"a\.fits could not be written \(is the disk full\?\)"
         with pytest.raises(OSError, match=match), writing(path):
             fits.PrimaryHDU(np.zeros(9000)).writeto(path)
+    # a file under a temporary name within another is not named
+    with pytest.raises(OSError) as info, writing(path), writing(partial):
+        raise OSError("9000 requested and 100 written")
+    assert (
+        str(info.value)
+        == f"{path} could not be written (is the disk full?): 9000 requested and 100 written"
+    )
 
 
 def test_errors_that_say_what_they_are_about_are_left_alone(tmp_path):
@@ -99,7 +151,7 @@ def test_what_unpacks_beyond_the_bound_is_refused_by_name(tmp_path, module):
         assert unpacked_size(path) == 3_000_000
     wanted = r"bomb \(.* MB .*\) would unpack to more than 0\.002 GB, .* bound is 0\.002 GB"
     with conf.set_temp("unpacked_size", 2):
-        for reader in (open_fits, read_ecsv):
+        for reader in (opened, read_ecsv):
             not_read(wanted + ".*raise .*conf.unpacked_size", path, reader)
 
 
@@ -115,7 +167,8 @@ def test_a_bomb_takes_no_memory(tmp_path):
         from miricigale import conf
         conf.unpacked_size = 250
         try:
-            open_fits(sys.argv[1], wanted="an image")
+            with open_fits(sys.argv[1], wanted="an image"):
+                pass
         except OSError as err:
             assert "more than 0.25 GB" in str(err), err
         else:

@@ -11,7 +11,7 @@ from helpers.runs import STAGES, do_stage
 from miricigale.pages import Page
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import ConfigError
-from miricigale.workflow import Context
+from miricigale.workflow import Context, load_config
 from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.page.declared import texts_of
 from miricigale.workflow.page.numbers import StudyTables
@@ -27,7 +27,8 @@ N = 13
 
 def config_of(*names, frac_agn=(0.4,)):
     bands = ["megacam.r", "acs.f814w", "wfc3.f160w", "irac.ch1", "irac.ch2", "mips.24"]
-    fit = {"bands": bands, "depths": [27.2, 28.2, 27.6, 23.9, 24.2, 19.3], "axes": "quick"}
+    fit = {"bands": bands, "depths": [27.2, 28.2, 27.6, 23.9, 24.2, 19.3]}
+    fit |= {"axes": "quick", "dust_excess": ()}
     fit |= {"sets": ["all"], "experiments": list(names)}
     exposures, sed = {"filters": FILTERS}, {"frac_agn": list(frac_agn)}
     return StudyConfig.from_dict({"exposures": exposures, "sed": sed, "fit": fit})
@@ -86,7 +87,8 @@ def test_all_fit_the_sample_of_the_study(found):
 
 @pytest.mark.parametrize("kind", ["fit", "quick"])
 def test_freed_axes_hold_the_fixed_values(kind):
-    study, freed = (experiments.experiment_axes(n, kind) for n in ("no_model_error", "free_agn"))
+    config = load_config("goodss", overrides={"fit": {"axes": kind}})
+    study, freed = (experiments.experiment_axes(n, config) for n in ("no_model_error", "free_agn"))
     defaults = SEDModel.yang2021().defaults
     for name in set(freed) - set(study):
         assert defaults[name] in freed[name]

@@ -19,10 +19,16 @@ from miricigale.utils.exceptions import ConfigError, MiricigaleWarning
 from miricigale.workflow import StudyRunner
 from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.page.provenance import catalog_facts
+from miricigale.workflow.sections import FitSection
 from miricigale.workflow.stages import study_stages
 from miricigale.workflow.stages.fits import mock_photometry
 from miricigale.workflow.stages.inputs import existing_bands
-from miricigale.workflow.stages.sample import SampleFlags, add_selection
+from miricigale.workflow.stages.sample import (
+    SampleFlags,
+    add_selection,
+    cut_flags,
+    good_redshifts,
+)
 
 SHORT, LONG = ["nircam.f090w", "nircam.f150w", "nircam.f200w"], ["mips.24"]
 ALPHA = [1.5, 2.5]
@@ -217,3 +223,23 @@ def test_sources_without_redshift_and_outside_of_the_grid_are_told_apart(galaxie
     facts = catalog_facts(StudyConfig(), check_catalog(table))
     assert facts["galaxies without redshift"].startswith("1: without a model SED")
     assert facts["dust colors"].startswith("drawn from CEERS' distribution, measured on")
+
+
+def test_cuts_leave_out_galaxies_by_their_reasons():
+    truth = QTable({"redshift": [0.1, 1.0, 1.0, 1.0, 0.1], "star": [False] * 4 + [True]})
+    truth["stellar_mass"] = [1e9, 1e6, 1e9, np.nan, 1e6] * u.Msun
+    catalog = QTable({"redshift_source": ["spec", "spec", "phot", "spec", "star"]})
+    catalog["q_z"] = np.ma.masked_equal([1, 2, 3, -1, 9], -1)
+    chi2, none = np.array([1.0, 9.0, 1.0, np.nan, 9.0]), FitSection()
+    assert cut_flags(none, catalog, truth, chi2).tolist() == [0] * 5
+    rules = ("redshift_source = spec", "q_z<=3")
+    cuts = FitSection(min_redshift=0.2, min_mass=1e8, max_chi2=5.0, redshift_quality=rules)
+    flags = cut_flags(cuts, catalog, truth, chi2)
+    names = [SampleFlags.names(flag) for flag in flags]
+    # without a quality a redshift is no good one; nothing is said of stars
+    assert names == [
+        ["min_redshift"], ["min_mass", "max_chi2"], ["redshift_quality"], ["redshift_quality"], [],
+    ]  # fmt: skip
+    assert good_redshifts(catalog, ["q_z=2"]).tolist() == [False, True, False, False, False]
+    for rule in ("q_z", "nope=1", "redshift_source<3", "q_z<=low"):
+        refuses("redshift_quality", good_redshifts, catalog, [rule], error=ConfigError)

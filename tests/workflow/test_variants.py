@@ -10,6 +10,7 @@ from numpy.testing import assert_array_equal
 from helpers.errors import refuses
 from helpers.points import PRIOR, point_catalog, save_prior
 from helpers.runs import STAGES, do_stage, one_band
+from miricigale.evaluation import PUBLISHED
 from miricigale.pages import Page
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow import Context
@@ -195,9 +196,12 @@ def test_the_report_says_what_each_costs(tmp_path):
     assert "without the gradient</td>" in page
     written = QTable.read(tmp_path / "report" / "variants.ecsv")
     assert_array_equal(written["limit"], numbers["limit"])
-    reasons = {"limit.f2100w": "another field", "limit.f770w": "other"}
-    variants.add_reasons(reasons, numbers, config)
-    assert reasons["limit.f770w"] == "other"
+    reasons, known = (
+        variants.measured_reasons(numbers, config),
+        variants.measured_reasons(None, config),
+    )
+    assert known == {one.key: one.why for one in PUBLISHED}
+    assert {key for key, reason in reasons.items() if reason != known[key]} == {"limit.f2100w"}
     told = reasons["limit.f2100w"]
-    assert told.startswith("another field; with the calculator's residual noise -0.4")
+    assert "with the calculator's residual noise -0.4" in told
     assert told.endswith("without the gradient +0.00 mag")

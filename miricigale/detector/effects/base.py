@@ -6,6 +6,7 @@ import numpy as np
 
 from miricigale.instrument import DetectorProperties, Exposure, reference_pixel_mask
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.random import stream
 
 
@@ -99,14 +100,12 @@ def stream_key(seed, exposure, name):
 def check_finite(**values):
     """Check that settings are finite."""
     for name, value in values.items():
-        if not np.all(np.isfinite(value)):
-            raise argument_error(name, "finite", value)
+        check_that(np.all(np.isfinite(value)), name, "finite", value)
 
 
 def check_share(name, value, highest=1):
     """Check that a setting lies between 0 and ``highest``."""
-    if not 0 <= value <= highest:
-        raise argument_error(name, f"from 0 to {highest}", value)
+    check_that(0 <= value <= highest, name, f"from 0 to {highest}", value)
 
 
 def check_amounts(*, above_zero=False, **values):

@@ -16,6 +16,7 @@ from miricigale.detector.effects.light import Photons, Residual
 from miricigale.detector.effects.readout import ADConversion, Bias, Nonlinearity, ReadNoise
 from miricigale.detector.effects.reset import FirstFrame, LastFrame, ResetAnomaly, ResetDecay
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 
 #: The order in which the effects act. Others may stand anywhere after `Photons`.
 ORDER = (
@@ -65,8 +66,7 @@ def checked_effects(effects):
     """Effects as a tuple; anything that is not an effect is refused."""
     effects = tuple(effects)
     for effect in effects:
-        if not isinstance(effect, Effect):
-            raise argument_error("effects", "made of detector effects", repr(effect))
+        check_that(isinstance(effect, Effect), "effects", "made of detector effects", repr(effect))
     return effects
 
 
@@ -84,9 +84,8 @@ def check_order(effects):
         raise argument_error("effects", "a tuple that ends with ADConversion", names)
     known = [(place, effect) for effect in effects if (place := place_of(effect)) is not None]
     for (place, effect), (following, other) in itertools.pairwise(known):
-        if place > following:
-            wanted = f"in their order, {type(other).__name__} before {type(effect).__name__}"
-            raise argument_error("effects", wanted, names)
+        wanted = f"in their order, {type(other).__name__} before {type(effect).__name__}"
+        check_that(place <= following, "effects", wanted, names)
 
 
 def keyed(effects, seed, exposure):

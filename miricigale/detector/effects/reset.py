@@ -22,7 +22,7 @@ import numpy as np
 
 from miricigale.detector._core.readout import pull_last_group
 from miricigale.detector.effects.base import Effect, check_amounts, check_finite, check_share
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,8 +60,7 @@ class ResetAnomaly(Effect):
     def __post_init__(self):
         amplitudes = tuple(float(a) for a in np.atleast_1d(self.amplitudes))
         object.__setattr__(self, "amplitudes", amplitudes)
-        if not amplitudes:
-            raise argument_error("amplitudes", "at least one amplitude", "none")
+        check_that(amplitudes, "amplitudes", "at least one amplitude", "none")
         check_finite(amplitudes=amplitudes)
         check_amounts(above_zero=True, groups=self.groups)
 
@@ -121,8 +120,7 @@ class ResetDecay(Effect):
     groups: float = 2.0
 
     def __post_init__(self):
-        if not -1 < self.share < 1:
-            raise argument_error("share", "between -1 and 1", self.share)
+        check_that(-1 < self.share < 1, "share", "between -1 and 1", self.share)
         check_amounts(above_zero=True, groups=self.groups)
 
     def apply(self, ramp, block):

@@ -18,6 +18,7 @@ from miricigale.fitting.samplers.space import Space, redshift_axis
 from miricigale.fitting.settings import SamplerSettings
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.parallel import single_threaded
 from miricigale.utils.random import stream
 from miricigale.utils.units import MASS
@@ -54,8 +55,7 @@ class SamplerFit:
     @classmethod
     def of_model(cls, model, filters, priors, settings, *, sampler, scale_error):
         """Work out the priors of a model, and set the sampler up."""
-        if not isinstance(model, FluxModel):
-            raise argument_error("model", "an SEDModel", type(model).__name__)
+        check_that(isinstance(model, FluxModel), "model", "an SEDModel", type(model).__name__)
         if not isinstance(priors, dict):
             raise argument_error("priors", "a dict of parameters", type(priors).__name__)
         predict = settings.predict

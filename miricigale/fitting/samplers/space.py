@@ -9,7 +9,7 @@ from miricigale.fitting.likelihood import FitFlags
 from miricigale.fitting.posterior import cell_edges
 from miricigale.fitting.priors import integrals, integrals_to, known_redshifts, read_density
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_names
+from miricigale.utils.options import check_names, check_that
 
 #: Part of a prior without limits that may lie outside the cells of its axis.
 _TAIL = 1e-3
@@ -215,8 +215,7 @@ def _interval(argument, low, high, kind):
     if not (np.isfinite(low) and np.isfinite(high) and low < high):
         raise argument_error(argument, "(low, high), finite and ascending", f"({low}, {high})")
     if kind == "log":
-        if not low > 0:
-            raise argument_error(argument, "above 0 if it is flat in the logarithm", f"{low}")
+        check_that(low > 0, argument, "above 0 if it is flat in the logarithm", low)
         return Log(low, high)
     return Flat(low, high)
 
@@ -224,15 +223,13 @@ def _interval(argument, low, high, kind):
 def _choice(argument, values, weights, parameter):
     values = [parameter.check(value) for value in values]
     weights = np.asarray(weights, dtype=float)
-    if weights.shape != (len(values),):
-        text = f"a weight for each of {len(values)} values"
-        raise argument_error(argument, text, f"shape {weights.shape}")
+    text = f"a weight for each of {len(values)} values"
+    check_that(weights.shape == (len(values),), argument, text, f"shape {weights.shape}")
     if not (np.all(np.isfinite(weights) & (weights >= 0)) and weights.sum() > 0):
         raise argument_error(argument, "weights that are finite, >= 0 and not all 0", f"{weights}")
     order = np.argsort(values)
     values, weights = np.array(values)[order], weights[order]
-    if np.any(np.diff(values) == 0):
-        raise argument_error(argument, "different values", f"{values}")
+    check_that(np.all(np.diff(values) != 0), argument, "different values", values)
     if values.size == 1:
         return float(values[0])
     return Choice(values, weights / weights.sum())

@@ -14,7 +14,8 @@ from filelock import FileLock
 from miricigale.refdata.libraries.table import LibraryTable, verify_library, write_library
 from miricigale.refdata.lookup import data_folder, file_sha256, record_path, stored_record
 from miricigale.refdata.registry import resource
-from miricigale.utils.exceptions import DataError, data_error, unknown_name
+from miricigale.utils.exceptions import DataError, data_error
+from miricigale.utils.options import check_names
 from miricigale.utils.progress import progress
 from miricigale.utils.store import PARTIAL, replacing
 
@@ -189,10 +190,8 @@ def _installing(target):
 
 
 def _reader(name):
-    try:
-        reader = READERS[name]
-    except KeyError:
-        raise unknown_name("library", name, READERS) from None
+    check_names([name], "library", READERS)
+    reader = READERS[name]
     return pkgutil.resolve_name(reader) if isinstance(reader, str) else reader
 
 

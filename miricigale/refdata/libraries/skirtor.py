@@ -12,7 +12,7 @@ from miricigale.refdata.libraries.members import is_archive, members
 from miricigale.refdata.libraries.table import LibraryTable
 from miricigale.utils.content import file_sha256
 from miricigale.utils.exceptions import data_error
-from miricigale.utils.files import read_table
+from miricigale.utils.table_files import read_table
 from miricigale.utils.units import to_array
 
 #: Values of the whole library: 19,200 spectra.

@@ -11,6 +11,7 @@ from astropy.table import Table
 
 from miricigale.utils.exceptions import argument_error, data_error
 from miricigale.utils.files import cached_by_file, open_fits
+from miricigale.utils.options import check_that
 from miricigale.utils.store import open_parts, write_parts
 from miricigale.utils.units import WAVE, frozen_array, to_array
 
@@ -65,8 +66,7 @@ class LibraryTable:
 
     def __post_init__(self):
         wave = to_array(self.wave, WAVE, "wave") if hasattr(self.wave, "unit") else self.wave
-        wave = frozen_array(wave)
-        object.__setattr__(self, "wave", wave)
+        wave = self.__dict__["wave"] = frozen_array(wave)
         good = wave.ndim == 1 and wave.size > 1 and np.all(np.isfinite(wave)) and wave[0] > 0
         if not good or not np.all(np.diff(wave) > 0):
             got = f"{wave.size} of shape {wave.shape}"
@@ -78,15 +78,12 @@ class LibraryTable:
             for name, column in getattr(self, kind).items():
                 if kind != "spectra" and hasattr(column, "unit"):
                     raise argument_error(name, "plain numbers (units stand apart)", "a quantity")
-                if np.shape(column) != shape:
-                    raise argument_error(name, f"of shape {shape}", np.shape(column))
+                check_that(np.shape(column) == shape, name, f"of shape {shape}", np.shape(column))
                 if kind == "axes" and not np.all(np.isfinite(column)):
                     raise argument_error(name, "finite in every row", "NaN or infinity")
         for kind in ("axes", "values"):
-            columns = {k: frozen_array(v) for k, v in getattr(self, kind).items()}
-            object.__setattr__(self, kind, columns)
-        object.__setattr__(self, "summary", tuple(self.summary))
-        object.__setattr__(self, "_index", self._make_index())
+            self.__dict__[kind] = {k: frozen_array(v) for k, v in getattr(self, kind).items()}
+        self.__dict__.update(summary=tuple(self.summary), _index=self._make_index())
 
     def _check_names(self):
         if not self.axes or not self.spectra:
@@ -130,9 +127,8 @@ class LibraryTable:
     def _make_index(self):
         codes = {name: self._codes(name, column) for name, column in self.axes.items()}
         for name, numbers in codes.items():
-            if np.any(numbers < 0):
-                wanted = f"of values that differ by more than {_SAME:g}, relatively"
-                raise argument_error(name, wanted, "values closer together")
+            wanted = f"of values that differ by more than {_SAME:g}, relatively"
+            check_that(not np.any(numbers < 0), name, wanted, "values closer together")
         places = self._place(tuple(codes.values()))
         index = dict(zip(places.tolist(), range(self.n_rows), strict=True))
         if len(index) < self.n_rows:

@@ -7,36 +7,6 @@ from miricigale.sed._core.thermal import drude
 _BREAK = 0.0912  # nothing is attenuated at this wavelength and below
 _B, _V = 0.44, 0.55
 
-# Pei 1992, table 4: amplitude, wavelength in um, b, n. Background, far-ultraviolet rise, 2175 A,
-# silicates at 9.7 and 18 um, far infrared
-_PEI = {
-    "mw": (
-        (165.0, 0.047, 90.0, 2.0),
-        (14.0, 0.08, 4.0, 6.5),
-        (0.045, 0.22, -1.95, 2.0),
-        (0.002, 9.7, -1.95, 2.0),
-        (0.002, 18.0, -1.80, 2.0),
-        (0.012, 25.0, 0.0, 2.0),
-    ),
-    "lmc": (
-        (175.0, 0.046, 90.0, 2.0),
-        (19.0, 0.08, 5.5, 4.5),
-        (0.023, 0.22, -1.95, 2.0),
-        (0.005, 9.7, -1.95, 2.0),
-        (0.006, 18.0, -1.80, 2.0),
-        (0.020, 25.0, 0.0, 2.0),
-    ),
-    "smc": (
-        (185.0, 0.042, 90.0, 2.0),
-        (27.0, 0.08, 5.5, 4.0),
-        (0.005, 0.22, -1.95, 2.0),
-        (0.010, 9.7, -1.95, 2.0),
-        (0.012, 18.0, -1.80, 2.0),
-        (0.030, 25.0, 0.0, 2.0),
-    ),
-}
-_PEI_RV = {"mw": 3.08, "lmc": 3.16, "smc": 2.93}
-
 
 def leitherer_calzetti(wave):
     """k(lambda) of starbursts: Calzetti 2000, Leitherer 2002 in 0.0912-0.15 um, 0 below."""
@@ -83,10 +53,10 @@ def smc_power_law(wave):
     return 1.39 * np.asarray(wave, dtype=float) ** -1.2
 
 
-def pei_extinction(wave, galaxy):
-    """k(lambda) = (1 + R_V) xi(lambda), Pei 1992, of mw, lmc or smc."""
+def pei_extinction(wave, terms, r_v):
+    """k(lambda) = (1 + R_V) xi(lambda), Pei 1992, of amplitudes, wavelengths, b and n."""
     xi = 0.0
-    for amplitude, center, b, n in _PEI[galaxy]:
+    for amplitude, center, b, n in terms:
         ratio = (wave / center) ** n
         xi = xi + amplitude / (ratio + 1.0 / ratio + b)
-    return (1.0 + _PEI_RV[galaxy]) * xi
+    return (1.0 + r_v) * xi

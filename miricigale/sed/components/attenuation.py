@@ -7,6 +7,7 @@ import numpy as np
 from miricigale.sed import _core
 from miricigale.sed.component import Component, register
 from miricigale.sed.parameter import Parameter
+from miricigale.utils.declared import declared
 
 # Cardelli et al. 1989, equation 5, in 1 um / lambda - 8: the highest power first
 _FAR = ((-0.070, 0.137, -0.628, -1.073), (0.374, -0.420, 4.257, 13.670))
@@ -29,12 +30,18 @@ def milky_way(wave, r_v):
     return np.where(x > high, r_v * np.polyval(_FAR[0], x - 8) + np.polyval(_FAR[1], x - 8), k)
 
 
+def _pei1992(wave, galaxy):
+    """Extinction k of mw, lmc or smc by table 4 of Pei 1992."""
+    law = declared("miricigale.sed", "extinction.toml")["pei1992"][galaxy]
+    return _core.pei_extinction(wave, **law)
+
+
 _CURVES = {
     "calzetti": _core.attenuation_curve,
     "milky_way": milky_way,
     "power_law": _core.power_law_attenuation,
     "smc": _core.smc_power_law,
-    "pei1992": _core.pei_extinction,
+    "pei1992": _pei1992,
 }
 _MAG = -0.4 * np.log(10.0)
 

@@ -11,7 +11,8 @@ from miricigale.sed import _core
 from miricigale.sed.component import Component, register
 from miricigale.sed.parameter import Parameter
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.files import read_table
+from miricigale.utils.options import check_that
+from miricigale.utils.table_files import read_table
 from miricigale.utils.units import to_array
 
 _RATE = u.Msun / u.yr
@@ -254,20 +255,15 @@ def _read(table):
 def _bins(table):
     """Edges of the bins in Myr and rates in Msun/yr, shape (n_column, n_bin), checked."""
     names = [name for name in table.colnames if name != "time"]
-    if "time" not in table.colnames or not names:
-        wanted = "with a column 'time' and one or more columns of rates"
-        raise argument_error("table", wanted, table.colnames)
-    if len(table) < 2:
-        raise argument_error("table", "of two rows or more", len(table))
+    wanted = "with a column 'time' and one or more columns of rates"
+    check_that("time" in table.colnames and names, "table", wanted, table.colnames)
+    check_that(len(table) >= 2, "table", "of two rows or more", len(table))
     time = _column(table, "time", u.Myr)
-    if not np.all(np.diff(time) > 0):
-        raise argument_error("time", "ascending", "times that stand still or fall")
+    check_that(np.all(np.diff(time) > 0), "time", "ascending", "times that stand still or fall")
     rates = np.array([_column(table, name, _RATE) for name in names])
     for name, rate in zip(names, rates, strict=True):
-        if np.any(rate < 0):
-            raise argument_error(name, "rates of 0 or more", f"{rate.min():g}")
-        if not np.any(rate > 0):
-            raise argument_error(name, "a history that forms stars", "zeros")
+        check_that(not np.any(rate < 0), name, "rates of 0 or more", f"{rate.min():g}")
+        check_that(np.any(rate > 0), name, "a history that forms stars", "zeros")
     return np.append(time, 2 * time[-1] - time[-2]), rates
 
 

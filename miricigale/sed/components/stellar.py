@@ -9,7 +9,7 @@ from miricigale.refdata.tables import load_ssp
 from miricigale.sed import _core
 from miricigale.sed.component import Component, register
 from miricigale.sed.parameter import Parameter
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.units import frozen_array
 
 _OLDEST = 14000  # Myr, more steps than any history has
@@ -110,8 +110,7 @@ class StellarPopulations(Component):
         """`age_weights` of n histories one after the other, each until one of ``end``: shape (2, n, n_age)."""
         age = self.table(values["metallicity"])[0]
         longest = np.diff(end, prepend=0).max()
-        if longest > _OLDEST:
-            raise argument_error("history", f"of at most {_OLDEST} steps", longest)
+        check_that(longest <= _OLDEST, "history", f"of at most {_OLDEST} steps", longest)
         young = round(values["separation_age"])
         return _core.split_by_age(histories, end, young, age, *_steps(age.tobytes()))
 

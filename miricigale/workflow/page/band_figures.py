@@ -258,13 +258,10 @@ def input_figure(galaxies):
         shown += int(np.count_nonzero(rows))
         middle = 0.5 * (low + high)
         sequence = main_sequence_sfr(line, sed.COSMOLOGY.age(middle))
-        plot_relation(
-            mass[rows].to_value(u.Msun),
-            rate[rows].to_value(u.Msun / u.yr),
-            lines=[(line.value, sequence.value, f"main sequence, z = {middle:g}")],
-            ax=ax,
-            labels=(r"stellar mass / M$_\odot$", r"SFR (100 Myr) / (M$_\odot$/yr)"),
-        )
+        x, y = mass[rows].to_value(u.Msun), rate[rows].to_value(u.Msun / u.yr)
+        lines = [(line.value, sequence.value, f"main sequence, z = {middle:g}")]
+        labels = (r"stellar mass / M$_\odot$", r"SFR (100 Myr) / (M$_\odot$/yr)")
+        plot_relation(x, y, lines=lines, ax=ax, labels=labels)
         ax.set_title(f"{title} ({np.count_nonzero(rows)})", fontsize="medium")
     label_outer(axes)
     ax.set(xlim=(LEAST_MASS.value, None), ylim=(LEAST_RATE.value, None))

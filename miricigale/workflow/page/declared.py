@@ -1,6 +1,6 @@
 """What is declared of the study's page in `sections.toml`."""
 
-from miricigale.pages import declared
+from miricigale.utils.declared import declared
 
 
 def texts_of(section):

@@ -8,6 +8,7 @@ from miricigale.workflow.page import pictures, study_figures
 from miricigale.workflow.page.labels import band_label, browse, color_bands, three_bands
 from miricigale.workflow.stages.exposures import study_exposures, study_pointings
 from miricigale.workflow.stages.images import measured_mosaic, reducer_of
+from miricigale.workflow.stages.sample import CUTS
 
 
 def write_summary(page, truths, numbers, caveats):
@@ -69,12 +70,13 @@ def write_detections(page):
         other_exposures="" if m["as_paper"] else ", six bands, other exposures",
         paper_sigma=page.sentence("paper_sigma") if page.config.errors.statistic == "mad" else "",
     )
-    reasons = {name.replace("_", " "): n for name, n in m["n_left_out"].items()}
-    outside = reasons.pop("outside field")
-    rows = [
-        {"reason": name, "sources": browse(page.first.name, n, flag=name)}
-        for name, n in reasons.items()
-    ]
+    reasons = {name.replace("_", " "): n for name, n in m["n_left_out"].items() if n}
+    outside = reasons.pop("outside field", 0)
+    rows = ((name, browse(page.first.name, n, flag=name)) for name, n in reasons.items())
+    rows = [dict(zip(("reason", "sources"), row, strict=True)) for row in rows]
+    cuts = [f"{key} {m['n_left_out'][key]}" for key in CUTS if getattr(page.config.fit, key)]
+    if cuts:
+        page.text("cuts", counts=", ".join(cuts))
     page.table("left_out", rows, n_outside=outside)
     if page.first.field.any():
         page.figure("luminosity", study_figures.detection_figure(page.study))

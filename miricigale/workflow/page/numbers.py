@@ -29,7 +29,7 @@ from miricigale.workflow.stages.conditions import (
     has_flag,
 )
 from miricigale.workflow.stages.exposures import pointing_exposures, pointing_time
-from miricigale.workflow.stages.sample import SampleFlags
+from miricigale.workflow.stages.sample import NOT_COUNTED, SampleFlags
 
 #: Fewest sources of which a median with its error or scatter is shown.
 FEWEST = 5
@@ -68,6 +68,8 @@ class StudyTables:
     matched = _product("{}/matched.ecsv")
     #: The photometry of all detections.
     detections = _product("{}/photometry.ecsv")
+    #: The fits of the input SEDs, row by row.
+    inputs = _product("input_seds.fits", fitting.FitResults.read)
     #: The error functions (`~miricigale.photometry.ErrorModel`), of the reference truth.
     errors = _product("errors.ecsv", photometry.ErrorModel.read)
 
@@ -98,9 +100,8 @@ class StudyTables:
 
     @property
     def field(self):
-        """Which of these are galaxies with a model."""
-        no_galaxy = SampleFlags.STAR | SampleFlags.NO_MODEL
-        return self.inside & ~has_flag(self.matched, "selection", no_galaxy)
+        """Which of these are galaxies with a model that no cut leaves out."""
+        return self.inside & ~has_flag(self.matched, "selection", NOT_COUNTED)
 
     @functools.cached_property
     def fits(self):
@@ -207,16 +208,16 @@ def _depth_by_time(tables, name, time):
 def _light(galaxies, bands, area):
     """Light of all galaxies together, where it is published."""
     rows = []
-    for name, wave, least, value, down, up, reference in PUBLISHED_LIGHT:
+    names = ("band", "wavelength", "least", "n", "light", "light_err")
+    names += ("published", "down", "up", "reference")
+    for name, wave, least, *published in PUBLISHED_LIGHT:
         if name in bands:
             flux = galaxies[name][galaxies[name] >= least * u.uJy]
-            light, error = integrated_light(flux, area, wave * u.um)
+            light = [one.value for one in integrated_light(flux, area, wave * u.um)]
             # without sources the error is undefined too
-            values = (light.value, error.value) if len(flux) else (np.nan, np.nan)
-            row = {"band": name, "wavelength": wave, "least": least, "n": len(flux)}
-            row |= dict(zip(("light", "light_err"), values, strict=True))
-            row |= {"published": value, "down": down, "up": up, "reference": reference}
-            rows.append(row)
+            light = light if len(flux) else [np.nan, np.nan]
+            values = (name, wave, least, len(flux), *light, *published)
+            rows.append(dict(zip(names, values, strict=True)))
     return rows
 
 
@@ -271,11 +272,8 @@ def _band_numbers(config, tables, name):
         points = tables.points[name]
         good = points[np.asarray(points["in_field"], bool)]
         found = recovery_metrics(good["flux_true"].value, good["flux"].value, relative=True)
-        entry |= {
-            "points_n": found.n,
-            "points_median": found.median,
-            "points_scatter": found.sigma_mad,
-        }
+        entry |= {"points_n": found.n, "points_median": found.median}
+        entry["points_scatter"] = found.sigma_mad
         for key in ("f_scaling", "f_scaling_err", "f_aper"):
             entry[key] = float(points.meta.get(key, np.nan))
     return entry

@@ -1,17 +1,15 @@
-"""All truths of a run compared with Yang et al. 2021: tables, numbers of other products, reasons."""
+"""All truths of a run compared with Yang et al. 2021: tables, numbers of other products, differences."""
 
 import collections
 
 import numpy as np
 
 from miricigale.evaluation import (
-    PUBLISHED,
     Estimate,
     StudyResults,
     TruthResults,
     compare_with_paper,
 )
-from miricigale.evaluation.paper import ONE_FIELD
 from miricigale.pages import number, sentence
 from miricigale.workflow.page.declared import texts_of
 from miricigale.workflow.stages.conditions import ConditionFlags, has_flag
@@ -95,8 +93,8 @@ def extra_numbers(study, metrics, kernels):
 _PAPER_ALPHA = 1.0
 
 
-def _differences(config, metrics, model):
-    """What a run does otherwise than Yang et al. 2021: topics, in their order, with facts for their sentences."""
+def differences_of(config, metrics, model):
+    """What a run does otherwise than Yang et al. 2021: a list of sentences."""
     deeper = [m["limit"] - m["proposal"] for m in metrics["bands"].values()]
     shares = {row["limit"]: row["to_proposal"] for row in metrics["detected"]}
     stand_ins = [name for name in model.resources if name in texts_of("stand_ins")]
@@ -119,34 +117,8 @@ def _differences(config, metrics, model):
         "alpha": config.sed.alpha,
         "stand_ins": ", ".join(stand_ins),
     }
-    return [topic for topic, differ in differs.items() if differ], facts
-
-
-def reasons_of(config, metrics, model):
-    """
-    Why numbers of a run may differ from the paper's: reasons by key, and what they mean.
-
-    Returns
-    -------
-    reasons : dict of str to str
-        General reasons, and the run's own in a few words, by key of `~miricigale.evaluation.PUBLISHED`.
-    sentences : list of str
-        What each of the run's own means.
-    """
-    topics, facts = _differences(config, metrics, model)
-    words, reasons = {topic: texts_of("differences")[topic] for topic in topics}, {}
-    bearing = texts_of("bearing")
-    for one in PUBLISHED:
-        topic = one.quantity if one.quantity != "extra" else one.key.partition(".")[0]
-        if topic == "f_aper":
-            reasons[one.key] = "a PSF with other wings; the factor is not applied"
-        if topic in ("feature", "f_scaling", "f_aper", "source_extractor", "kernels", "errors"):
-            continue
-        # that the field is another one is among the run's own
-        general = [part for part in one.why.split("; ") if part and part != ONE_FIELD]
-        own = [words[name][0] for name in bearing.get(topic, bearing["other"]) if name in words]
-        reasons[one.key] = "; ".join([*general, *own])
-    return reasons, [sentence(f"{short}: {text}", facts) for short, text in words.values()]
+    texts = texts_of("differences")
+    return [sentence(texts[topic], facts) for topic, differ in differs.items() if differ]
 
 
 #: What verdicts are in the plural, by their first words; others are as they stand.

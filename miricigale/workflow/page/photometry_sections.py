@@ -11,10 +11,7 @@ from miricigale.workflow.stages.conditions import CONDITIONS, ConditionFlags
 from miricigale.workflow.stages.images import measured_mosaic, mosaic_psf
 
 #: How sources are marked in figures: bit, marker and label.
-_MARKS = (
-    (int(ConditionFlags.CROWDED), "o", "crowded"),
-    (int(ConditionFlags.EDGE), "s", "at the edge"),
-)
+_MARKS = ((ConditionFlags.CROWDED, "o", "crowded"), (ConditionFlags.EDGE, "s", "at the edge"))
 
 
 def write_photometry(page):

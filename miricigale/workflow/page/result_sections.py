@@ -9,6 +9,7 @@ from miricigale.evaluation import (
     selection_table,
     study_confusion,
 )
+from miricigale.evaluation.estimates import outlier_share
 from miricigale.filters import Filter
 from miricigale.pages import Missing, number
 from miricigale.workflow.page import source_figures, study_figures
@@ -24,6 +25,8 @@ from miricigale.workflow.page.numbers import FEWEST, true_ranks
 from miricigale.workflow.page.study_figures import CLASS_COLUMNS, FEATURES
 from miricigale.workflow.stages.conditions import CONDITIONS
 from miricigale.workflow.stages.sample import typical_source
+from miricigale.workflow.stages.skies import NEAR, PER_WHOLE, sky_numbers
+from miricigale.workflow.truths import FIELD
 
 #: fracAGN of the truths of which a source is shown in detail.
 EXAMPLES = (0.0, 0.4)
@@ -33,12 +36,12 @@ COVERED = ("redshift", "frac_agn", "stellar_mass", "sfr_100myr", "dust_luminosit
 RANKED = ("redshift", "frac_agn", "stellar_mass")
 
 
-def write_results(page, numbers, binned):
+def write_results(page, numbers):
     """
     All sections on the fits; without a sample one sentence.
 
     ``numbers`` are those of the fits of the whole samples with their errors
-    (`~miricigale.workflow.page.numbers.whole_sample`), ``binned`` the table that they are of.
+    (`~miricigale.workflow.page.numbers.whole_sample`).
     """
     if not any(one.sample.any() for one in page.study.truths):
         left = page.metrics["n_left_out"].items()
@@ -47,7 +50,7 @@ def write_results(page, numbers, binned):
         return
     _write_examples(page)
     rows = _fit_rows(page, numbers)
-    _write_redshifts(page, rows, binned)
+    _write_redshifts(page, rows)
     _write_fractions(page, rows)
     _write_figure(page, "disk", study_figures.disk_figure(page.study))
     several = ", of all truths together" if len(page.study.with_agn) > 1 else ""
@@ -122,26 +125,41 @@ def _fit_rows(page, numbers):
 _QUANTITIES = ("z_bias", "z_scatter", "z_outliers", "frac_offset", "frac_scatter", "width")
 
 
-def _binned_outliers(page, binned):
-    """Outliers without and with MIRI in each bin of true redshift, a row for each truth."""
-    rows = binned[np.asarray(binned["quantity"]) == "z_outliers"]
-    found = {(r["truth"], r["band_set"], r["z_low"], r["z_high"]): r for r in rows}
+def _outliers(one, rows, **where):
+    """A cell: outliers without and with MIRI among some rows of the sample, and their number."""
+    errors = [one.redshift_error(name) for name in ("none", "all")]
+    rows = rows & np.isfinite(errors[0])
+    if not rows.any():
+        return "none"
+    shares = " and ".join(f"{100 * outlier_share(error[rows]):.1f}" for error in errors)
+    text = f"{shares} % ({np.count_nonzero(rows)})"
+    return browse(one.name, text, show="outliers", **where) if where else text
+
+
+#: Mass (Msun) below which a source is doubtful, and reduced chi2 of its input fit above which it is.
+DOUBTFUL_MASS, DOUBTFUL_CHI2 = 1e8, 2.0
+
+
+def _outlier_rows(page):
+    """Outliers of each truth by true redshift (keys "0" to "4"), and without doubtful sources."""
+    chi2 = page.tables.inputs.reduced_chi2
     for one in page.study.truths:
-        if {"all", "none"} <= set(one.fits):
-            row = {"injected": truth_label(one)}
-            for k, span in enumerate(REDSHIFT_BINS):
-                both = [found[one.name, name, *span] for name in ("none", "all")]
-                shares = " and ".join(f"{100 * r['value']:.1f}" for r in both)
-                text = f"{shares} % ({both[0]['n']})" if both[0]["n"] else 0
-                where = {
-                    "show": "outliers",
-                    "redshift": "{:g}..{:g}".format(*span).removesuffix("inf"),
-                }
-                row[str(k)] = browse(one.name, text, **where) or "none"
-            yield row
+        if not {"all", "none"} <= set(one.fits):
+            continue
+        z, least = one.true("redshift"), REDSHIFT_BINS[0][1]
+        row = {"injected": truth_label(one), "every": _outliers(one, z > 0, redshift="0..")}
+        for k, (low, high) in enumerate(REDSHIFT_BINS):
+            span = f"{low:g}..{high:g}".removesuffix("inf")
+            row[str(k)] = _outliers(one, (z >= low) & (z < high), redshift=span)
+        row["redshift"] = _outliers(one, z >= least, redshift=f"{least:g}..")
+        row["mass"] = _outliers(one, one.true("stellar_mass") >= DOUBTFUL_MASS)
+        row["chi2"] = _outliers(one, ~(chi2 > DOUBTFUL_CHI2)[one.sample])
+        if "redshift_source" in one.truth.colnames:
+            row["spec"] = _outliers(one, one.truth["redshift_source"][one.sample] == "spec")
+        yield row
 
 
-def _write_redshifts(page, rows, binned):
+def _write_redshifts(page, rows):
     """Photometric redshifts."""
     page.section("redshifts")
     if len(page.tables.sample):
@@ -151,12 +169,18 @@ def _write_redshifts(page, rows, binned):
         page.figure("scatter", figure)
     page.figure("errors", study_figures.histogram_figure(page.study, "redshift"))
     page.table("table", rows)
-    page.table("bins", list(_binned_outliers(page, binned)))
-    groups = [
-        {"fit": SET_LABELS[unit], "group": group, **fit["conditions"][group]}
-        for unit, fit in page.metrics["fits"].items()
-        for group in CONDITIONS
-    ]
+    if outliers := list(_outlier_rows(page)):
+        page.table("bins", outliers)
+        page.table("doubtful", outliers)
+    groups = []
+    for unit, fit in page.metrics["fits"].items():
+        for group in CONDITIONS:
+            row = {"fit": SET_LABELS[unit], "group": group, **fit["conditions"][group]}
+            # isolated ones have no flag that the browser could list them by
+            if CONDITIONS[group] and unit in ("all", "none"):
+                for key, show in (("n", "sample"), ("photoz_n_outliers", f"outliers_{unit}")):
+                    row[key] = browse(page.first.name, row[key], show=show, flag=group)
+            groups.append(row)
     page.table("conditions", groups)
 
 
@@ -206,11 +230,27 @@ def _write_classes(page):
         page.table("table", rows)
     for one in study.truths:
         if one.frac_agn is None and one.fits:
-            rows = [
-                {"fit": SET_LABELS[row["band_set"]], **row, **_quality(row)}
-                for row in selection_table(one)
-            ]
-            page.table("selection", rows, truth=truth_label(one))
+            rows = [_selection(one, row) for row in selection_table(one)]
+            if one.name == FIELD and len(skies := sky_numbers(page.context)):
+                page.context.save_table("report/skies.ecsv", skies)
+                rows += [_selection(one, row) for row in skies]
+            facts = {"n_near": 2 * NEAR + 1, "per_whole": PER_WHOLE}
+            page.table("selection", rows, truth=truth_label(one), **facts)
+
+
+def _selection(one, row):
+    """A row on a selection of AGN by fracAGN: of the sky with images, or (``n_skies``) of many without."""
+    unit, limit = row["band_set"], row["limit"]
+    shown = {"fit": SET_LABELS[unit], "limit": limit, "agn": row["n_wanted"]} | _quality(row)
+    if "n_skies" in row.colnames:
+        shown |= {key: f"{row[key]:.1f}" for key in ("wanted", "selected")}
+        return shown | {"skies": f"{row['n_skies']}, forecast"}
+    span, n = f"{limit:g}..", row["n_selected"]
+    wanted = browse(one.name, row["n_wanted"], frac_agn=span)
+    # the browser has the columns of these
+    listed = {f"frac_agn_{unit}": span} if unit in ("all", "none") else {}
+    selected = browse(one.name, n, **listed) if listed else n
+    return shown | {"skies": "1, images", "wanted": wanted, "selected": selected}
 
 
 # ---------------------------------------------------------------------- features, coverage
@@ -231,14 +271,9 @@ def _write_features(page):
         options = {"pivot": own.pivot, "filter_width": own.width, "seed": page.context.seed}
         for rest in FEATURES:
             inside, outside = feature_residuals(values, redshift, feature=rest, **options)
-            rows.append(
-                {
-                    "band and feature": f"{band_label(band)}, {rest.value:g} µm",
-                    "sources with it": inside.n,
-                    "median residual": _residual(inside),
-                    "of the others": _residual(outside),
-                }
-            )
+            row = {"band and feature": f"{band_label(band)}, {rest.value:g} µm"}
+            row |= {"sources with it": inside.n, "median residual": _residual(inside)}
+            rows.append(row | {"of the others": _residual(outside)})
     page.table("table", rows)
 
 

@@ -137,17 +137,19 @@ def _draw_fit(ax, best, without, row, model):
 
 
 def _draw_posteriors(ax, distributions):
-    """One-dimensional posteriors over each other, each with its peak at 1; the axis holds 99.8 % of each."""
+    """One-dimensional posteriors over each other, as curves with a peak of 1; the axis holds 99.8 % of each."""
     ends = []
     for name, (edges, weights) in distributions.items():
         edges, weights = u.Quantity(edges).value, np.asarray(weights, float)
         color, line, _ = _SETS[name]
         width = np.diff(edges)
         density = np.divide(weights, width, out=np.zeros(width.size), where=width > 0)
-        density = density / max(density.max(), 1e-300)
+        # straight lines between the middles of the cells, level to the ends
+        density = np.pad(density / max(density.max(), 1e-300), 1, mode="edge")
+        place = np.r_[edges[0], 0.5 * (edges[1:] + edges[:-1]), edges[-1]]
         if not ends:
-            ax.stairs(density, edges, fill=True, alpha=0.2, color=color)
-        ax.stairs(density, edges, color=color, lw=1.6, ls=line, label=SET_LABELS[name])
+            ax.fill_between(place, density, alpha=0.2, color=color, lw=0)
+        ax.plot(place, density, color=color, lw=1.6, ls=line, label=SET_LABELS[name])
         total = np.cumsum(weights) / weights.sum()
         inside = np.flatnonzero((total > 1e-3) & (np.r_[0, total[:-1]] < 1 - 1e-3))
         ends += [edges[inside[0]], edges[inside[-1] + 1]]

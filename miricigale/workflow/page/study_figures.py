@@ -8,6 +8,7 @@ from miricigale.evaluation import (
     PAH_FEATURES,
     REDSHIFT_BINS,
     XRAY_LIMITS,
+    TruthResults,
     completeness,
     feature_redshifts,
     measure,
@@ -86,32 +87,16 @@ def answer_figure(study, numbers):
     return figure
 
 
-#: Histograms: values of a truth and a set of bands, edges of bins, label, and the true value of a truth.
+def _fitted(column):
+    return lambda one, name: one.fitted(name, column)
+
+
+#: Histograms: values of a truth and a set of bands, edges of bins, and label.
 _HISTOGRAMS = {
-    "redshift": (
-        lambda one, name: one.redshift_error(name),
-        np.linspace(-0.3, 0.3, 61),
-        r"(z$_{\rm fit}$ - z) / (1 + z)",
-        lambda one: 0.0,
-    ),
-    "fraction": (
-        lambda one, name: one.fitted(name, "frac_agn_mean"),
-        np.linspace(0, 1, 26),
-        "fracAGN (posterior mean)",
-        lambda one: one.frac_agn,
-    ),
-    "width": (
-        lambda one, name: one.fitted(name, "frac_agn_std"),
-        np.linspace(0, 0.4, 26),
-        "posterior width of fracAGN (std)",
-        lambda one: None,
-    ),
-    "difference": (
-        lambda one, name: one.fitted(name, "frac_agn_mean") - one.true("frac_agn"),
-        np.linspace(-0.2, 0.8, 26),
-        "fitted - true fracAGN",
-        lambda one: 0.0,
-    ),
+    "redshift": (TruthResults.redshift_error, (-0.3, 0.3, 61), r"(z$_{\rm fit}$ - z) / (1 + z)"),
+    "fraction": (_fitted("frac_agn_mean"), (0, 1, 26), "fracAGN (posterior mean)"),
+    "width": (_fitted("frac_agn_std"), (0, 0.4, 26), "posterior width of fracAGN (std)"),
+    "difference": (TruthResults.fraction_error, (-0.2, 0.8, 26), "fitted - true fracAGN"),
 }
 
 
@@ -123,7 +108,8 @@ def histogram_figure(study, quantity):
     with median, scatter and, of redshifts, the share of outliers; values beyond the bins are counted in the
     outermost ones.
     """
-    values, bins, xlabel, true = _HISTOGRAMS[quantity]
+    values, bins, xlabel = _HISTOGRAMS[quantity]
+    bins = np.linspace(*bins)
     shown = {truth_label(one): (one, (0, np.inf)) for one in study.truths if one.sample.any()}
     if quantity == "difference":
         one = study.truths[0]
@@ -133,6 +119,7 @@ def histogram_figure(study, quantity):
     ends = 0.5 * (bins[[0, -2]] + bins[[1, -1]])
     for title, ax in axes.items():
         one, (low, high) = shown[title]
+        true = {"fraction": one.frac_agn, "width": None}.get(quantity, 0.0)
         inside = (one.true("redshift") >= low) & (one.true("redshift") < high)
         for k, (name, label) in enumerate(_both(one).items()):
             some = values(one, name)[inside]
@@ -144,11 +131,11 @@ def histogram_figure(study, quantity):
                 if quantity == "redshift":
                     note += f"\n{100 * outlier_share(some):.1f} % outliers"
                 # away from the truth
-                x, side = (0.03, "left") if (true(one) or 0) > 0.5 else (0.97, "right")
+                x, side = (0.03, "left") if (true or 0) > 0.5 else (0.97, "right")
                 at = {"transform": ax.transAxes, "va": "top", "ha": side, "fontsize": 7.5}
                 ax.text(x, 0.97 - 0.2 * k, note, color=color, **at)
-        if true(one) is not None:
-            ax.axvline(true(one), color=TRUE, lw=1, ls="--", label="truth")
+        if true is not None:
+            ax.axvline(true, color=TRUE, lw=1, ls="--", label="truth")
         # space for the numbers
         ax.set(xlim=(bins[0], bins[-1]), ylim=(0, 1.3 * ax.get_ylim()[1]))
     label_outer(axes, xlabel, "sources")

@@ -2,9 +2,11 @@
 
 import functools
 
-from miricigale.pages import SectionWriter, declared
+from miricigale.pages import SectionWriter
+from miricigale.utils.declared import declared
 from miricigale.workflow.page.labels import band_label, three_bands, truth_label
 from miricigale.workflow.page.numbers import FEWEST, MIPS_LIMIT
+from miricigale.workflow.truths import FIELD
 
 
 class DeclaredPage(SectionWriter):
@@ -61,20 +63,25 @@ class StudyPage(DeclaredPage):
     @functools.cached_property
     def facts(self):
         """What the sentences say of the run: dict of str to values."""
-        options, chosen = self.config.catalog, [band_label(n) for n in three_bands(self.bands)]
-        return self.metrics | {
+        config, chosen = self.config, [band_label(n) for n in three_bands(self.bands)]
+        facts = self.metrics | {
             "truth": truth_label(self.first),
             "three_bands": ", ".join(chosen),
             "longest": chosen[-1],
             "detected_bands": "the one band" if len(self.bands) == 1 else "two or more bands",
-            "prior": band_label(self.config.highres.filter),
-            "mag_column": options.mag_column,
-            "mag_limit": options.mag_limit,
+            "prior": band_label(config.highres.filter),
+            "mag_column": config.catalog.mag_column,
+            "mag_limit": config.catalog.mag_limit,
             "mips_limit": MIPS_LIMIT,
             "fewest": FEWEST,
-            "model_error": 100 * self.config.fit.model_error,
+            "model_error": 100 * config.fit.model_error,
             **{name: self.model.meta[name] for name in ("cosmology", "frac_agn_definition")},
         }
+        wide, own = config.fit.model_error > 0, config.sed.infrared == "fit"
+        true = {"wide": wide, "same_templates": own, "own_models": wide and own}
+        true["field_agn"] = FIELD in config.sed.frac_agn
+        texts = self.texts["optional"]
+        return facts | {name: texts[name].format(**facts) if true[name] else "" for name in true}
 
     @property
     def band_rows(self):

@@ -24,6 +24,7 @@ def study_stages():
         points,
         report,
         rivals,
+        skies,
         sources,
         truth,
         variants,
@@ -46,6 +47,7 @@ def study_stages():
         variants.measure_variants,
         fits.fit_photometry,
         experiments.fit_experiment,
+        skies.fit_skies,
         sources.make_sources,
         report.make_report,
     )

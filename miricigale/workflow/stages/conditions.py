@@ -31,9 +31,7 @@ CONDITIONS = {
     "ambiguous": int(ConditionFlags.AMBIGUOUS),
 }
 _ANY = sum(CONDITIONS.values())
-_DOUBTFUL = int(
-    AssociationFlags.SEVERAL_FIRST | AssociationFlags.SEVERAL_SECOND | AssociationFlags.NOT_MUTUAL
-)
+_DOUBTFUL = sum(AssociationFlags[key] for key in ("SEVERAL_FIRST", "SEVERAL_SECOND", "NOT_MUTUAL"))
 
 
 def has_flag(table, column, flag):
@@ -128,9 +126,6 @@ def fit_conditions(sample, redshift, table, bands):
     groups = {}
     for name, rows in _groups(any_condition(sample, bands)).items():
         found = photoz_metrics(np.asarray(redshift)[rows], table["redshift_mean"][rows])
-        groups[name] = {
-            "n": found.n,
-            "photoz_sigma_mad": found.sigma_mad,
-            "photoz_n_outliers": found.n_outliers,
-        }
+        groups[name] = {"n": found.n, "photoz_sigma_mad": found.sigma_mad}
+        groups[name]["photoz_n_outliers"] = found.n_outliers
     return groups

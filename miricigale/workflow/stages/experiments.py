@@ -17,7 +17,7 @@ from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.page.declared import texts_of
 from miricigale.workflow.page.numbers import true_ranks
 from miricigale.workflow.stages.fits import FIT_SECTIONS, fit_mock, fit_sample
-from miricigale.workflow.stages.inputs import plain_axes, sed_resources
+from miricigale.workflow.stages.inputs import fit_plan, plain_axes, sed_resources
 from miricigale.workflow.truths import study_truths
 
 #: Most sources of each truth that are fitted with a freed torus.
@@ -42,19 +42,18 @@ def experiment_units(config):
     return tuple(f"{of}/{name}" for of in known for name in config.fit.experiments)
 
 
-def experiment_axes(name, kind):
-    """Axes of the grid of an experiment; ``kind`` is that of the fits of the study."""
-    axes = sed.SEDModel.yang2021_axes(kind)
+def experiment_axes(name, config):
+    """Axes of the grid of an experiment of a study."""
+    axes = fit_plan(config, name)
     if name != "free_agn":
         return axes
-    thinner = _THINNER if kind == "fit" else {}
-    return axes | {key: np.array(values) for key, values in {**thinner, **_FREED}.items()}
+    return axes | (_THINNER if config.fit.axes == "fit" else {}) | _FREED
 
 
 def _experiment_plan(config, unit):
     """What an experiment takes from the package, for hashing."""
     name = unit.partition("/")[2]
-    plan = {"axes": plain_axes(experiment_axes(name, config.fit.axes))}
+    plan = {"axes": plain_axes(experiment_axes(name, config))}
     if name == "free_agn":
         plan["n"] = N_FREE
     elif name == "between":
@@ -73,9 +72,7 @@ def far_infrared_photometry(sample, *, seed):
     model, bands = sed.SEDModel.yang2021(), list(HERSCHEL_DEPTHS)
     known = [name for name in sample.colnames if name in model.parameters]
     light = model.fluxes(sample["id", *known], bands)
-    errors = photometry.ErrorModel.from_depths(
-        dict(HERSCHEL_DEPTHS), fractional=dict.fromkeys(bands, 0.1)
-    )
+    errors = photometry.ErrorModel.from_depths(HERSCHEL_DEPTHS, fractional=0.1)
     light["id"] = sample["id"]
     return errors.perturb(light["id", *bands], seed=seed)
 

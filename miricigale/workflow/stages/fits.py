@@ -20,7 +20,9 @@ from miricigale.workflow.stages.exposures import (
 from miricigale.workflow.stages.inputs import existing_bands, fit_plan, sed_resources
 from miricigale.workflow.stages.measure import joined_photometry
 from miricigale.workflow.stages.sample import (
+    CUTS,
     add_selection,
+    cut_flags,
     in_field,
     matched_errors,
     mean_coverage,
@@ -91,12 +93,16 @@ def make_errors(context, _):
     context.save_result("errors.ecsv", errors)
 
 
+#: What the sample depends on.
+_SAMPLE = ("fit.min_detected", "fit.axes", *(f"fit.{key}" for key in CUTS))
+
+
 @stage(
     "matches",
     "match to the truth",
     version=2,
-    needs=("truth", "mosaics", "photometry", "errors"),
-    sections=(*GRID, "errors.coverage", "photometry.match_radius", "fit.min_detected", "fit.axes"),
+    needs=("catalog", "seds", "truth", "mosaics", "photometry", "errors"),
+    sections=(*GRID, "errors.coverage", "photometry.match_radius", *_SAMPLE),
     units=truth_names,
     plan=fit_plan,
 )
@@ -110,14 +116,11 @@ def match_sources(context, unit):
         matched[f"{name}_formal_err"] = matched[error_column(name)]
         matched[f"{name}_extrapolated"] = errors.extrapolated(matched[name], name)
     matched = errors.assign(matched, filters=bands, noise=field.noise(config))
-    add_selection(
-        matched,
-        field.truth,
-        bands,
-        inside=field.inside,
-        min_detected=config.fit.min_detected,
-        redshifts=sed.SEDModel.yang2021_axes(config.fit.axes)["redshift"],
-    )
+    chi2 = fitting.FitResults.read(context.path("input_seds.fits")).reduced_chi2
+    options = {"inside": field.inside, "min_detected": config.fit.min_detected}
+    options["redshifts"] = sed.SEDModel.yang2021_axes(config.fit.axes)["redshift"]
+    options["cuts"] = cut_flags(config.fit, context.table("catalog.ecsv"), field.truth, chi2)
+    add_selection(matched, field.truth, bands, **options)
     add_conditions(matched, bands, suffix="_true")
     detections["association"] = np.zeros(len(detections), int)
     here = association[np.asarray(association["second"]) >= 0]
@@ -159,17 +162,11 @@ def mock_photometry(config, truth, matched, *, seed, zero_point=0.0):
 
 
 #: What fits of mock photometry read of the configuration.
-FIT_SECTIONS = (
-    "catalog",
-    "fit.bands",
-    "fit.depths",
-    "fit.axes",
-    "fit.model_error",
-    "exposures.filters",
-)
+_EXISTING = ("catalog", "fit.bands", "fit.depths", "exposures.filters")
+FIT_SECTIONS = (*_EXISTING, "fit.axes", "fit.model_error")
 
 
-def _fit_plan(config, unit):
+def set_plan(config, unit):
     """Axes and MIRI bands of a fit, and the zero points of its existing bands where they are others."""
     truth, _, chosen = unit.partition("/")
     plan = {"axes": fit_plan(config, unit), "bands": band_sets(config)[chosen]}
@@ -184,7 +181,7 @@ def _fit_plan(config, unit):
     needs=("truth", "matches"),
     sections=FIT_SECTIONS,
     resources=sed_resources,
-    plan=_fit_plan,
+    plan=set_plan,
     units=lambda config: tuple(
         f"{of}/{name}" for of in truth_names(config) for name in config.fit.sets
     ),
@@ -194,9 +191,7 @@ def fit_photometry(context, unit):
     config, plan = context.config, context.plan
     name, chosen = unit.split("/")
     _, matched, mock = fit_sample(context, name, zero_point=plan.get("zero_point", 0.0))
-    results = fit_mock(
-        context, mock, plan["bands"], axes=sed.SEDModel.yang2021_axes(config.fit.axes)
-    )
+    results = fit_mock(context, mock, plan["bands"], axes=plan["axes"])
     context.save_result(f"{name}/fits_{chosen}.fits", results)
     table = results.to_table()
     conditions = any_condition(matched, config.exposures.filters)

@@ -56,12 +56,10 @@ def reducer_of(config, n_threads=None):
 
 def background_of(config, exposure):
     """The background of an exposure, which those of a pointing share: it moves with the telescope."""
-    return scene.Background(
-        study_background(config, exposure.filter),
-        gradient=config.scene.background_gradient / u.arcmin,
-        position_angle=config.scene.gradient_angle * u.deg,
-        center=pointing_of(config, exposure),
-    )
+    options, level = config.scene, study_background(config, exposure.filter)
+    slope = {"gradient": options.background_gradient / u.arcmin}
+    slope |= {"position_angle": options.gradient_angle * u.deg}
+    return scene.Background(level, center=pointing_of(config, exposure), **slope)
 
 
 def imager_of(config, properties=None):
@@ -105,15 +103,10 @@ def expose_and_reduce(
         In DN/s and in MJy/sr, background subtracted unless that of dithers will be (`mosaics_of`).
     """
     differ = perturbation or Perturbation({}, seed)
-    sky = scene.Scene(
-        differ.catalog(catalog, exposure.filter),
-        exposure=exposure,
-        psf=differ.psf(exposure.filter),
-        cutouts=differ.stamps,
-        background=background_of(config, exposure),
-        n_threads=n_threads,
-        agn=differ.point_column(exposure.filter),
-    )
+    catalog, band = differ.catalog(catalog, exposure.filter), exposure.filter
+    options = {"psf": differ.psf(band), "cutouts": differ.stamps, "agn": differ.point_column(band)}
+    options |= {"background": background_of(config, exposure), "n_threads": n_threads}
+    sky = scene.Scene(catalog, exposure=exposure, **options)
     imager = imager_of(config, differ.detector)
     image = differ.with_flat(sky.render(), exposure)
     if tell is not None:
@@ -172,16 +165,11 @@ def make_exposure(context, unit):
 
     effects = context.plan.get("perturbations", {})
     stamps = read_stamps(context.path(f"{truth}/stamps.fits")) if CUTOUTS in effects else {}
-    rate, cal = expose_and_reduce(
-        config,
-        exposure,
-        context.table(f"{truth}/truth.ecsv"),
-        seed=context.seed,
-        perturbation=Perturbation(effects, context.seed, stamps),
-        n_threads=context.n_threads,
-        tell=tell,
-        keep=keep if config.run.keep_level1b else None,
-    )
+    options = {"seed": context.seed, "n_threads": context.n_threads, "tell": tell}
+    options["perturbation"] = Perturbation(effects, context.seed, stamps)
+    options["keep"] = keep if config.run.keep_level1b else None
+    catalog = context.table(f"{truth}/truth.ecsv")
+    rate, cal = expose_and_reduce(config, exposure, catalog, **options)
     context.save_image(f"{truth}/exposures/{name}_cal.fits", cal, dq=cal.flags)
     # the report shows what the subtraction of the background did to one exposure of a band
     if config.run.keep_level1b or (context.plan["is_reference"] and exposure.dither == 0):
@@ -266,12 +254,9 @@ def prior_image(config, catalog, wcs, *, seed):
 
 def mosaic_psf(config, name, scale):
     """The PSF of the mosaic of one band on pixels of ``scale`` arcsec."""
-    return psf.psf_mosaic(
-        psf.miri_psf(name),
-        scale * u.arcsec,
-        u.Quantity([e.pa_aper for e in band_exposures(config, name)]),
-        pixfrac=config.reduction.pixfrac,
-    )
+    angles = u.Quantity([e.pa_aper for e in band_exposures(config, name)])
+    options = {"pixfrac": config.reduction.pixfrac}
+    return psf.psf_mosaic(psf.miri_psf(name), scale * u.arcsec, angles, **options)
 
 
 def measured_mosaic(config):
@@ -293,10 +278,8 @@ def measured_mosaic(config):
 def make_kernel(context, name):
     """Stage 10: the kernel from the high-resolution image to the mosaic of one band."""
     config = context.config
-    kernel = psf.MatchingKernel.from_psfs(
-        prior_psf(config),
-        mosaic_psf(config, name, config.reduction.pixel_scale),
-        pixel_scale=config.highres.pixel_scale * u.arcsec,
-        regularization=config.photometry.regularization,
-    )
+    pair = prior_psf(config), mosaic_psf(config, name, config.reduction.pixel_scale)
+    options = {"regularization": config.photometry.regularization}
+    scale = config.highres.pixel_scale * u.arcsec
+    kernel = psf.MatchingKernel.from_psfs(*pair, pixel_scale=scale, **options)
     context.save_result(f"kernel_{name}.fits", kernel)

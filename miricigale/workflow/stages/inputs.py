@@ -43,8 +43,9 @@ def plain_axes(axes):
 
 
 def fit_plan(config, _):
-    """The axes of the final fit, for hashing."""
-    return plain_axes(sed.SEDModel.yang2021_axes(config.fit.axes))
+    """The axes of the final fit."""
+    free = {"dust_excess": config.fit.dust_excess} if config.fit.dust_excess else {}
+    return plain_axes(sed.SEDModel.yang2021_axes(config.fit.axes) | free)
 
 
 def sed_resources():
@@ -189,12 +190,9 @@ def bright_sources(catalog, options, prior):
 )
 def fit_inputs(context, _):
     """Stage 2: fit a galaxy grid to the catalog's fluxes at the known redshifts."""
-    results = fit_seds(
-        context.table("catalog.ecsv"),
-        context.config.sed,
-        model_error=context.config.fit.model_error,
-        progress_bar=context.progress_bar,
-    )
+    config, catalog = context.config, context.table("catalog.ecsv")
+    options = {"model_error": config.fit.model_error, "progress_bar": context.progress_bar}
+    results = fit_seds(catalog, config.sed, **options)
     context.save_result("input_seds.fits", results)
 
 
@@ -215,13 +213,9 @@ def fit_seds(catalog, options, *, model_error, executor=None, progress_bar=False
         photometry[error_column(name)] = measured_error(catalog, name, options.catalog_error)
     nodes = np.unique(np.round(photometry["redshift"] / REDSHIFT_STEP) * REDSHIFT_STEP)
     axes = input_axes(options.axes, dust=longest > DUST_SHOWS)
-    fitter = fitting.BayesFitter(
-        sed.SEDModel.yang2021(agn=False),
-        list(bands),
-        axes=axes | {"redshift": nodes[nodes > 0]},
-        model_error=model_error,
-        settings=fitting.GridSettings(redshift_tolerance=REDSHIFT_STEP, interpolate=0),
-        # a single band is enough for a flux
-        n_bands_min=1,
-    )
+    settings = fitting.GridSettings(redshift_tolerance=REDSHIFT_STEP, interpolate=0)
+    # a single band is enough for a flux
+    options = {"model_error": model_error, "settings": settings, "n_bands_min": 1}
+    options["axes"] = axes | {"redshift": nodes[nodes > 0]}
+    fitter = fitting.BayesFitter(sed.SEDModel.yang2021(agn=False), list(bands), **options)
     return fitter.fit(photometry, redshift="redshift", executor=executor, progress_bar=progress_bar)

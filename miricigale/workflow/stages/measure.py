@@ -61,11 +61,9 @@ def photometer_of(context, name, method):
         blur = mosaic_psf(config, name, config.highres.pixel_scale)
         return photometry.Yang2021Photometer(prior_psf(config), blur, n_threads=context.n_threads)
     # the constant absorbs the light of faint sources and of wings in the background
-    return photometry.ForcedPhotometer(
-        psf.MatchingKernel.read(context.path(f"kernel_{name}.fits")),
-        background_order=0,
-        n_threads=context.n_threads,
-    )
+    options = {"background_order": 0, "n_threads": context.n_threads}
+    kernel = psf.MatchingKernel.read(context.path(f"kernel_{name}.fits"))
+    return photometry.ForcedPhotometer(kernel, **options)
 
 
 def measure_band(context, mosaic, name, method):

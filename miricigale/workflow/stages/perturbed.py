@@ -5,7 +5,8 @@ from astropy.table import Table
 
 from miricigale.evaluation import bootstrap
 from miricigale.evaluation.estimates import median, outlier_share, scatter
-from miricigale.pages import Missing, number
+from miricigale.pages import Missing, number, sentence
+from miricigale.workflow.page.declared import texts_of
 from miricigale.workflow.page.labels import band_label, by_wavelength
 from miricigale.workflow.page.numbers import bright_isolated
 from miricigale.workflow.truths import ALL, EFFECTS
@@ -98,7 +99,11 @@ def write_perturbed(page, truths, every):
     table = perturbation_costs(truths, every, config.exposures.filters, seed=page.context.seed)
     if len(table) == 0:
         return
-    page.numbers("perturbations", table, size=config.perturb)
+    found = set(table["perturbation"])
+    effects = [t for name, t in texts_of("perturbations")["effects"].items() if name in found]
+    effects = sentence("; ".join(effects), {"size": config.perturb})
+    together = " and together" if ALL in found else ""
+    page.numbers("perturbations", table, effects=effects, together=together)
     rows = {}
     for row in table:
         known = {"sky": row["truth"], "perturbation": _LABELS[row["perturbation"]]}

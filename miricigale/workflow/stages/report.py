@@ -38,9 +38,9 @@ from miricigale.workflow.truths import reference, study_truths
 log = logging.getLogger(__name__)
 
 
-#: Stages whose products are read: of the images, and of the measurements.
-_IMAGES = ("exposures", "mosaics", "highres", "kernels", "points", "variants")
-_TABLES = ("catalog", "truth", "photometry", "errors", "matches", "rivals", "fits", "experiments")
+#: Stages whose products are read: of the inputs and images, and of the measurements.
+_IMAGES = ("catalog", "seds", "exposures", "mosaics", "highres", "kernels", "points", "variants")
+_TABLES = ("truth", "photometry", "errors", "matches", "rivals", "fits", "experiments", "skies")
 #: Sections of the configuration on the measurements.
 _MEASURED = ("highres", "photometry", "errors", "fit", "point_sources", "perturb", "variants")
 
@@ -48,7 +48,7 @@ _MEASURED = ("highres", "photometry", "errors", "fit", "point_sources", "perturb
 @stage(
     "report",
     "report",
-    version=9,
+    version=10,
     needs=(*_IMAGES, *_TABLES),
     sections=("run.name", "catalog", "sed", *IMAGES, *_MEASURED, "report"),
     resources=lambda: (*sed_resources(), *EXPOSURE_RESOURCES),
@@ -73,7 +73,7 @@ def make_report(context, _):
     study = dataclasses.replace(study, extra=extra)
     numbers = study_numbers(study, seed=context.seed, n_draws=300)
     context.save_table("report/numbers.ecsv", numbers)
-    binned, numbers = numbers, whole_sample(numbers)
+    numbers = whole_sample(numbers)
     metrics["truths"] = {
         name: truth_metrics(truth, tables[name], numbers, bands) for name, truth in known.items()
     }
@@ -101,11 +101,10 @@ def make_report(context, _):
     calculator = {name: entry["etc_limit"] for name, entry in metrics["bands"].items()}
     matched = page.tables.matched
     switched = variants.write_variants(page, matched, calculator)
-    write_results(page, numbers, binned)
+    write_results(page, numbers)
     experiments.write_experiments(page, tables)
-    reasons, sentences = paper.reasons_of(config, metrics, model)
-    variants.add_reasons(reasons, switched, config)
-    paper.write_comparison(page, reasons, sentences)
+    reasons = variants.measured_reasons(switched, config)
+    paper.write_comparison(page, reasons, paper.differences_of(config, metrics, model))
     perturbed.write_perturbed(page, truths, every)
     write_inputs(page)
     write_origin(page, [page.tables.truth.meta, matched.meta])

@@ -42,7 +42,7 @@ SIZE_RANGES = ((0.0, 0.2), (0.2, 0.4), (0.4, 0.8), (0.8, np.inf))
 @stage(
     "rivals",
     "rival photometry",
-    version=2,
+    version=3,
     needs=("truth", "mosaics", "highres", "kernels", "templates", "matches"),
     within=reference,
     sections=(*KERNEL, "photometry.method", "photometry.match_radius"),
@@ -63,7 +63,8 @@ def measure_rivals(context, name):
     mosaic = context.image(f"{of_truth}/mosaic_{name}_fine.fits")
     measured = mosaic if other == "yang2021" else context.image(f"{of_truth}/mosaic_{name}.fits")
     forced = measure_band(context, measured, name, other).to_table()
-    blind = photometry.source_extractor_photometry(mosaic)
+    # as the paper's, without a map of weights
+    blind = photometry.source_extractor_photometry(mosaic, weighted=False)
     n_blind = np.count_nonzero(in_field(blind["sky"], [mosaic])) if len(blind) else 0
     table = rival_table(truth, matched, name, own=own, inside=in_field(truth["sky"], [mosaic]))
     found = {other: (forced, "flux"), "source_extractor": (blind, "flux_best")}

@@ -1,5 +1,8 @@
 """Which sources are compared and fitted, and why the others are not."""
 
+import re
+from operator import eq, ge, gt, le, lt
+
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
@@ -9,6 +12,7 @@ from scipy.ndimage import uniform_filter
 from miricigale.photometry import ErrorModel
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import Flags, error_column
+from miricigale.workflow.options import of_option, require
 
 
 class SampleFlags(Flags):
@@ -28,6 +32,21 @@ class SampleFlags(Flags):
     OUTSIDE_GRID = 32
     #: A galaxy without a positive redshift, and so without a model.
     NO_REDSHIFT = 64
+    #: Its redshift is below [fit] min_redshift.
+    MIN_REDSHIFT = 128
+    #: Its stellar mass is below [fit] min_mass.
+    MIN_MASS = 256
+    #: The reduced chi2 of its input fit is above [fit] max_chi2.
+    MAX_CHI2 = 512
+    #: Its redshift is not as [fit] redshift_quality says.
+    REDSHIFT_QUALITY = 1024
+
+
+#: Keys of the cuts of [fit]: the last flags.
+CUTS = tuple(flag.name.lower() for flag in SampleFlags)[-4:]
+#: What is no galaxy of a field that counts, wherever it is.
+NOT_COUNTED = sum(SampleFlags[key.upper()] for key in ("star", "no_model", *CUTS))
+_COMPARE = {"<=": le, ">=": ge, "<": lt, ">": gt, "=": eq}
 
 
 def values_at(sky, wcs, plane, *, off=0):
@@ -91,15 +110,52 @@ def detected_bands(table, bands):
     return sum((table[name] > 5 * table[error_column(name)]).astype(int) for name in bands)
 
 
-def add_selection(matched, truth, bands, *, inside, min_detected, redshifts):
+def good_redshifts(catalog, rules):
+    """
+    Which rows of a catalog fulfill all rules such as ``"redshift_source=spec"`` or ``"q_z<=3"``, shape (n,).
+
+    A value that is missing fulfills none; a `ConfigError` where there is no such column or number.
+    """
+    good = np.ones(len(catalog), bool)
+    for rule in rules:
+        parts = re.split(r"\s*(<=|>=|<|>|=)\s*", rule.strip(), maxsplit=1)
+        column, sign, wanted = parts if len(parts) == 3 else (*parts, "", "")
+        known = wanted and column in catalog.colnames
+        text = "must be as 'column=value', '<=', '<', '>=' or '>', of a column of the catalog"
+        require(known, "fit", "redshift_quality", text, f"{rule!r}; {catalog.colnames}")
+        values = np.ma.asarray(getattr(catalog[column], "value", catalog[column]))
+        kind = str if sign == "=" and values.dtype.kind not in "iuf" else float
+        with of_option(f"[fit] redshift_quality, {rule!r}:", ValueError):
+            values = np.ma.filled(values.astype(kind), kind("nan"))
+            good &= _COMPARE[sign](values, kind(wanted))
+    return good
+
+
+def cut_flags(options, catalog, truth, chi2):
+    """
+    `SampleFlags` of the galaxies that the cuts of the section ``fit`` (``options``) leave out, shape (n,).
+
+    ``catalog`` and ``truth`` have the same sources row by row, and ``chi2`` is that of their input fits.
+    """
+    out = (
+        truth["redshift"] < options.min_redshift,
+        truth["stellar_mass"] < options.min_mass * u.Msun,
+        (chi2 > options.max_chi2) & (options.max_chi2 > 0),
+        ~good_redshifts(catalog, options.redshift_quality),
+    )
+    flags = sum(SampleFlags[k.upper()] * np.asarray(o) for k, o in zip(CUTS, out, strict=True))
+    return np.where(np.asarray(truth["star"], bool), 0, flags)
+
+
+def add_selection(matched, truth, bands, *, inside, min_detected, redshifts, cuts=0):
     """
     Add ``n_detected`` and ``selection`` (`SampleFlags`, 0 in the sample) to a matched table.
 
     ``matched`` is of `~miricigale.evaluation.match_truth` with errors from the error function,
-    ``truth`` has the same sources row by row, with ``star``; ``inside`` is that of `in_field`, and
-    ``redshifts`` the nodes of the grid of the fit.
+    ``truth`` has the same sources row by row, with ``star``; ``inside`` is that of `in_field`,
+    ``redshifts`` the nodes of the grid of the fit, and ``cuts`` those of `cut_flags`.
     """
-    flags = np.zeros(len(matched), int)
+    flags = np.zeros(len(matched), int) + cuts
     matched["n_detected"] = detected_bands(matched, bands)
     known = np.all([np.isfinite(matched[f"{name}_true"].value) for name in bands], axis=0)
     redshift, star = np.asarray(truth["redshift"], float), np.asarray(truth["star"], bool)

@@ -19,6 +19,7 @@ from miricigale.workflow.page.labels import SET_COLORS, SET_LABELS, band_label
 from miricigale.workflow.page.numbers import StudyTables
 from miricigale.workflow.stages.conditions import ConditionFlags, any_condition
 from miricigale.workflow.stages.cutouts import Cutouts
+from miricigale.workflow.stages.exposures import KERNEL
 from miricigale.workflow.stages.inputs import existing_bands, sed_resources
 from miricigale.workflow.stages.sample import SampleFlags
 from miricigale.workflow.truths import truth_names
@@ -44,16 +45,7 @@ FLAGS = {
     "source browser",
     version=2,
     needs=("truth", "mosaics", "highres", "photometry", "matches", "fits"),
-    sections=(
-        "run.name",
-        "catalog",
-        "exposures",
-        "highres",
-        "photometry",
-        "reduction",
-        "fit",
-        "report",
-    ),
+    sections=("run.name", "catalog", *KERNEL, "photometry", "fit", "report"),
     resources=sed_resources,
     units=truth_names,
     plan=lambda config, _: list(truth_names(config)),
@@ -111,10 +103,8 @@ class _Sources(StudyTables):
         config, truth = context.config, self.truth
         self.model, self.prior = sed.SEDModel.yang2021(), config.highres.filter
         self.miri = tuple(config.exposures.filters)
-        self.bands = (
-            *(band for band in existing_bands(config) if band not in self.miri),
-            *self.miri,
-        )
+        existing = (band for band in existing_bands(config) if band not in self.miri)
+        self.bands = (*existing, *self.miri)
         self.pivots = np.array([Filter.from_name(band).pivot.value for band in self.bands])
         self.edges = np.geomspace(0.7 * self.pivots.min(), 1.4 * self.pivots.max(), N_WAVE + 1)
         self.sampled = np.asarray(self.matched["selection"]) == 0
@@ -126,13 +116,11 @@ class _Sources(StudyTables):
         known = [name for name in fitted.parameters if name in truth.colnames]
         self.units = {name: fitted.unit(name) for name in known}
         # columns without a unit are in that of the parameter
-        self.parameters = np.transpose(
-            [u.Quantity(truth[key], unit, dtype=float).value for key, unit in self.units.items()]
-        )
+        values = (u.Quantity(truth[k], unit, dtype=float) for k, unit in self.units.items())
+        self.parameters = np.transpose([one.value for one in values])
         self.true = np.transpose([truth[band].to_value(FNU) for band in self.bands])
-        self.flux, self.error = (
-            np.transpose(values) for values in zip(*map(self._measured, self.bands), strict=True)
-        )
+        pairs = zip(*map(self._measured, self.bands), strict=True)
+        self.flux, self.error = map(np.transpose, pairs)
 
     def _measured(self, band):
         """Fluxes of all sources in a band and their errors; mock fluxes are of the sample, and of all sets."""

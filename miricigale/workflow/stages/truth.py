@@ -91,7 +91,7 @@ def galaxy_parameters(config, catalog, best, *, seed):
         if config.sed.infrared == "ceers":
             excess = np.where(shown, 1.0, ceers_dust(light, kind, seed=seed)["dust_excess"])
             if "pah_33" in model.parameters:
-                table["pah_33"] = np.where(shown, 1.0, CEERS_DUST[kind][5])
+                table["pah_33"] = np.where(shown, 1.0, CEERS_DUST[kind][6])
         else:
             excess = main_sequence_dust(light, seed=seed)["dust_excess"]
         table["dust_excess"] = excess
@@ -150,6 +150,32 @@ def add_field_agn(table, model, band, seed):
         table[name] = drawn[name]
 
 
+def other_skies(galaxies, model, band, n_skies, *, least, seed, whole=0):
+    """
+    AGN from a fracAGN of ``least`` on that galaxies have in other skies, as by `add_field_agn`.
+
+    Of the first ``whole`` skies all galaxies are kept, with the AGN that they have or none. ``galaxies`` has the
+    parameters of ``model``. Returns the table, with ``sky`` from 1 on and ids of its own, and the row of the
+    galaxy of each.
+    """
+    n, ids = len(galaxies), galaxies["id"]
+    rows = np.arange(n * n_skies) % n
+    others = galaxies[rows]
+    others["sky"] = 1 + np.arange(n * n_skies) // n
+    keys = [f"{key}-{sky}" for key, sky in zip(others["id"], others["sky"], strict=True)]
+    numbers = np.asarray(ids).dtype.kind in "iu"
+    others["id"] = np.max(ids) + 1 + np.arange(n * n_skies) if numbers else keys
+    light = QTable(others["id", "redshift"])
+    light["stellar_mass"] = model.fluxes(galaxies, [band])["stellar_mass"][rows]
+    # each id has draws of its own, so that these are the AGN that are added
+    keep = AGNPopulation().draw(light, seed=seed)["has_agn"] | (others["sky"] <= whole)
+    others, rows = others[keep], rows[keep]
+    if len(others):
+        add_field_agn(others, model, band, seed)
+    keep = (others["frac_agn"] >= least) | (others["sky"] <= whole)
+    return others[keep], rows[keep]
+
+
 def library_fluxes(model, parameters, bands):
     """Fluxes of models; a `DataError` if the registered libraries lack parameters of some."""
     light = model.fluxes(parameters, bands)
@@ -182,13 +208,7 @@ def _truth_plan(config, unit):
     "model fluxes",
     version=3,
     needs=("catalog", "seds"),
-    sections=(
-        *MODELS,
-        "catalog",
-        "exposures.filters",
-        "fit",
-        "highres.filter",
-    ),
+    sections=(*MODELS, "catalog", "exposures.filters", "fit.bands", "fit.depths", "highres.filter"),
     resources=sed_resources,
     units=truth_names,
     plan=_truth_plan,

@@ -5,7 +5,7 @@ import numpy as np
 from astropy.stats import biweight_scale
 
 from miricigale import psf, scene
-from miricigale.evaluation import Estimate, match_truth
+from miricigale.evaluation import PUBLISHED, Estimate, match_truth
 from miricigale.photometry.error_curves import limiting_flux, measured_curve
 from miricigale.utils.random import stream
 from miricigale.utils.tables import described_rows, error_column
@@ -29,7 +29,7 @@ from miricigale.workflow.stages.images import (
     mosaics_of,
 )
 from miricigale.workflow.stages.measure import joined_photometry, measure_band
-from miricigale.workflow.stages.sample import SampleFlags
+from miricigale.workflow.stages.sample import NOT_COUNTED, SampleFlags
 from miricigale.workflow.truths import reference, variant_changes
 
 #: Draws of the sources for the errors of limits.
@@ -41,7 +41,7 @@ _LABELS = {
     "plane": ("plane taken off before the mesh", "background by the mesh alone"),
 }
 STUDY, RATES = "study", "rates"
-_OUT = SampleFlags.OUTSIDE_FIELD | SampleFlags.STAR | SampleFlags.NO_MODEL
+_OUT = SampleFlags.OUTSIDE_FIELD | NOT_COUNTED
 
 
 @stage(
@@ -206,18 +206,20 @@ def write_variants(page, matched, limits):
     tables = {name: context.tables(f"variants/{name}", bands) for name in changes}
     options = {"statistic": config.errors.statistic, "bin_size": config.errors.bin_size}
     table = variant_numbers(matched, tables, limits, seed=context.seed, **options)
-    page.numbers("variants", table)
+    gradient = texts_of("optional")["gradient"] if "gradient" in changes else ""
+    page.numbers("variants", table, gradient=gradient)
     labels = {name: variant_label(name, changes) for name in (STUDY, *changes)}
     page.figure("figure", variant_figure(table, labels))
     page.table("table", variant_entries(table, changes))
     return table
 
 
-def add_reasons(reasons, table, config):
-    """Add to the reasons of `~miricigale.workflow.page.paper.reasons_of` what the variants cost."""
-    changes = variant_changes(config)
+def measured_reasons(table, config):
+    """Reasons by key of `~miricigale.evaluation.PUBLISHED`: of limits with what the variants change of them."""
+    changes, reasons = variant_changes(config), {one.key: one.why for one in PUBLISHED}
     for row in () if table is None else table:
         key = f"limit.{row['band'].removeprefix('miri.')}"
         if key in reasons and row["images"] in _LABELS and np.isfinite(row["limit_change"]):
             cost = f"{variant_label(row['images'], changes)} {row['limit_change']:+.2f} mag"
             reasons[key] = "; ".join(part for part in (reasons[key], cost) if part)
+    return reasons

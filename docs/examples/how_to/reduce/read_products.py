@@ -42,7 +42,7 @@ files["file", "filter", "status"]
 # The planes of a mosaic:
 
 with fits.open("products/mosaic_f770w.fits") as hdus:
-    images = hdus[1:]
+    images = [hdu for hdu in hdus[1:] if hdu.is_image]
     planes = Table(
         {
             "extension": [hdu.name for hdu in images],

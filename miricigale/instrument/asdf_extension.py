@@ -1,0 +1,149 @@
+"""The extension ASDF of JWST's files, in which world coordinates are a gwcs."""
+
+import importlib.util
+import io
+
+import numpy as np
+from astropy.coordinates import ICRS
+from astropy.io import fits
+from astropy.modeling.models import (
+    Identity,
+    Mapping,
+    Polynomial2D,
+    RotationSequence3D,
+    Scale,
+    Shift,
+)
+
+from miricigale.instrument.siaf import attitude_matrix, unit_vector, vector_angles
+from miricigale.instrument.wcs import scaled_fit
+from miricigale.utils.exceptions import data_error
+from miricigale.utils.optional import require
+
+#: By which the official pipeline recognizes a file; it says nothing.
+_STUB = (
+    b"#ASDF 1.0.0\n#ASDF_STANDARD 1.6.0\n%YAML 1.1\n%TAG ! tag:stsci.edu:asdf/\n"
+    b"--- !core/asdf-1.1.0\nmeta: {}\n...\n"
+)
+
+#: Orders of the polynomials from pixels to the telescope frame and back.
+_FORWARD, _INVERSE = 5, 8
+
+#: Keywords of the reference point: on the sky, and in the telescope frame.
+_REFERENCE = ("RA_REF", "DEC_REF", "ROLL_REF", "V2_REF", "V3_REF")
+
+
+def asdf_wcs(header, hdus):
+    """The gwcs in the extension ASDF of JWST's pipeline, as FITS polynomials good to 0.01 pixels."""
+    from astropy.wcs import WCS
+
+    require("gwcs", extra="gwcs")
+    asdf = require("asdf", extra="gwcs")
+    content = np.asarray(hdus["ASDF"].data["ASDF_METADATA"][0]).tobytes()
+    try:
+        with asdf.open(io.BytesIO(content)) as tree:
+            exact = tree["meta"]["wcs"]
+    except (KeyError, ValueError) as err:
+        raise data_error(hdus.filename(), f"has no gwcs in its extension ASDF: {err}") from err
+    box = tuple((-0.5, header[f"NAXIS{k}"] - 0.5) for k in (1, 2))
+    return WCS(exact.to_fits_sip(bounding_box=box, max_pix_error=0.01))
+
+
+def bytes_table(text, column, name):
+    """Extension that holds bytes in one column."""
+    array = np.frombuffer(text, np.uint8)[None]
+    fields = [fits.Column(name=column, format=f"{array.size}B", array=array)]
+    return fits.BinTableHDU.from_columns(fields, name=name)
+
+
+def asdf_extension(wcs=None, shape=None, header=None):
+    """
+    The extension without which the official pipeline does not go on with a file.
+
+    Parameters
+    ----------
+    wcs : `~astropy.wcs.WCS`, optional
+        World coordinates of an array of the imager. With the package ``gwcs`` they are written as `imager_gwcs`
+        gives them.
+    shape : tuple of int, optional
+        ``(ny, nx)`` of the array.
+    header : mapping, optional
+        With the keywords of the reference point; without them, or without ``gwcs``, the extension is a stub,
+        from which the pipeline's calwebb_image2 goes on and calwebb_image3 does not.
+
+    Returns
+    -------
+    hdu : `~astropy.io.fits.BinTableHDU`
+    """
+    content = _STUB
+    known = wcs is not None and all(header.get(name) is not None for name in _REFERENCE)
+    if known and importlib.util.find_spec("gwcs") is not None:
+        buffer = io.BytesIO()
+        asdf = require("asdf", extra="gwcs")
+        asdf.AsdfFile({"meta": {"wcs": imager_gwcs(wcs, shape, header)}}).write_to(buffer)
+        content = buffer.getvalue()
+    return bytes_table(content, "ASDF_METADATA", "ASDF")
+
+
+def _polynomials(begin, end, order):
+    """Model of positions by others, about the first of each."""
+    offsets = end - end[:, :1]
+    models = []
+    for table in scaled_fit(*(begin - begin[:, :1]), offsets.T, order):
+        powers = [(i, j) for i in range(order + 1) for j in range(order + 1 - i)]
+        models.append(Polynomial2D(order, **{f"c{i}_{j}": table[i, j] for i, j in powers}))
+    before, after = (Shift(float(a)) & Shift(float(b)) for a, b in (-begin[:, 0], end[:, 0]))
+    return before | Mapping((0, 1, 0, 1)) | models[0] & models[1] | after
+
+
+def imager_gwcs(wcs, shape, header):
+    """
+    World coordinates of the imager with the frames of JWST: detector, telescope (V2, V3), sky.
+
+    Parameters
+    ----------
+    wcs : `~astropy.wcs.WCS`
+        Of the image.
+    shape : tuple of int
+        ``(ny, nx)``.
+    header : mapping
+        Keywords RA_REF, DEC_REF, ROLL_REF, V2_REF and V3_REF of the reference point.
+
+    Returns
+    -------
+    exact : `gwcs.WCS`
+        Equal to ``wcs`` to 1e-4 pixels for the polynomials of fifth order that JWST has.
+
+    References
+    ----------
+    JWST-STScI-001550, "Description and use of the JWST Science Instrument Aperture File".
+    """
+    gwcs = require("gwcs", extra="gwcs")
+    from gwcs.coordinate_frames import CelestialFrame, Frame2D
+    from gwcs.geometry import CartesianToSpherical, SphericalToCartesian
+
+    ra, dec, roll, v2, v3 = (float(header[name]) for name in _REFERENCE)
+    ny, nx = shape
+    nodes = np.cos(np.pi * (np.arange(40) + 0.5) / 40)
+    x, y = np.meshgrid((nx / 2) * (1 + nodes) - 0.5, (ny / 2) * (1 + nodes) - 0.5)
+    # the first is the middle, from which the polynomials count
+    pixel = np.stack([np.append(nodes.mean(), nodes) for nodes in (x, y)])
+    matrix = attitude_matrix(ra, dec, roll, v2=v2, v3=v3)
+    sky = np.radians(wcs.all_pix2world(*pixel, 0))
+    seen = np.degrees(vector_angles(matrix.T @ unit_vector(*sky))) * 3600
+    distortion = _polynomials(pixel, seen, _FORWARD)
+    distortion.inverse = _polynomials(seen, pixel, _INVERSE)
+    to_sky = (
+        Scale(1 / 3600) & Scale(1 / 3600)
+        | SphericalToCartesian(wrap_lon_at=180)
+        | RotationSequence3D([v2 / 3600, -v3 / 3600, roll, dec, -ra], axes_order="zyxyz")
+        | CartesianToSpherical(wrap_lon_at=360)
+    )
+    names = "detector", "v2v3", "v2v3vacorr"
+    units = ("pix", "pix"), ("arcsec", "arcsec"), ("arcsec", "arcsec")
+    frames = [Frame2D(name=name, unit=unit) for name, unit in zip(names, units, strict=True)]
+    frames.append(CelestialFrame(reference_frame=ICRS(), name="world"))
+    exact = gwcs.WCS(list(zip(frames, (distortion, Identity(2), to_sky, None), strict=True)))
+    exact.bounding_box = (-0.5, nx - 0.5), (-0.5, ny - 0.5)
+    exact.pixel_shape = nx, ny
+    return exact

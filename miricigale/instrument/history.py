@@ -1,0 +1,161 @@
+"""The history of an exposure: who made it, what was done to it, and with which references."""
+
+import dataclasses
+import numbers
+
+import numpy as np
+from astropy.time import Time
+
+from miricigale.instrument.keywords import steps_done
+from miricigale.utils.exceptions import argument_error
+
+#: References in the order in which they are used, with the step after which each is not needed any more.
+REFERENCES = {
+    "mask": "dq_init", "saturation": "saturation", "bias": "superbias", "reset": "reset", "linearity": "linearity",
+    "dark": "dark", "gain": None, "read_noise": None, "flat": "flat", "photom": "photom",
+}  # fmt: skip
+
+#: Reference types of CRDS whose names are not those of `REFERENCES`.
+TYPES = {"bias": "superbias", "read_noise": "readnoise"}
+
+#: ORIGIN of files of simulated ramps, which other pipelines keep in theirs.
+ORIGIN = "miricigale"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ExposureHistory:
+    """
+    Who made an exposure, what was done to it, and with which references.
+
+    What a reduction does to an exposure depends on this and on its settings alone.
+
+    Parameters
+    ----------
+    origin : {"simulated", "unrecorded", "other"}, optional
+        The package's `~miricigale.detector.Detector`, with the record of what acted; the same without the
+        record, as in the rates that another pipeline makes of its ramps; or anything else.
+    steps : iterable of str, optional
+        What was done (`~miricigale.instrument.STEPS`), kept as a frozenset; a text is taken apart.
+    references : dict of str to str, optional
+        File or constant that was used, by the names of `~miricigale.reduction.ReferenceFiles`.
+    day : float, optional
+        Middle of the exposure, MJD.
+    gain : float, optional
+        Electrons per DN that slopes were fitted with.
+
+    Raises
+    ------
+    ValueError
+        If a value is of another kind.
+
+    Examples
+    --------
+    >>> from astropy.io.fits import Header
+    >>> from miricigale.instrument import ExposureHistory
+    >>> header = Header({"ORIGIN": "miricigale", "S_LINEAR": "COMPLETE", "EXPMID": 60000.5})
+    >>> history = ExposureHistory.from_header(header)
+    >>> history.origin, history.done("bias"), history.done("dark")
+    ('unrecorded', True, False)
+    """
+
+    origin: str = "other"
+    steps: frozenset = frozenset()
+    references: dict = dataclasses.field(default_factory=dict)
+    day: float | None = None
+    gain: float | None = None
+
+    def __post_init__(self):
+        steps = self.steps
+        if isinstance(steps, str):
+            steps = steps.replace(",", " ").split()
+        object.__setattr__(self, "steps", frozenset(str(name).lower() for name in steps))
+        for name in ("day", "gain"):
+            value = getattr(self, name)
+            if value is not None and not isinstance(value, numbers.Real):
+                wanted = f"one whose meta[{name!r}] is a number"
+                raise argument_error("exposure", wanted, repr(value))
+
+    replace = dataclasses.replace
+
+    @classmethod
+    def from_header(cls, header, *, recorded=False):
+        """
+        History that the keywords of a file tell.
+
+        Parameters
+        ----------
+        header : mapping
+            As `~miricigale.instrument.joined_header` makes it.
+        recorded : bool, optional
+            Whether the file has the record of the simulated detector.
+
+        Returns
+        -------
+        history : `ExposureHistory`
+        """
+        origin = "unrecorded" if header.get("ORIGIN") == ORIGIN else "other"
+        # the first six letters of the type in CRDS
+        words = {name: f"R_{TYPES.get(name, name)[:6].upper()}" for name in REFERENCES}
+        known = {name: str(header[word]) for name, word in words.items() if word in header}
+        used = {name: text.removeprefix("crds://") for name, text in known.items()}
+        origin = "simulated" if recorded else origin
+        return cls(origin=origin, steps=steps_done(header), references=used, day=_middle_of(header))
+
+    @classmethod
+    def of(cls, exposure):
+        """
+        History of an exposure.
+
+        Parameters
+        ----------
+        exposure : `~miricigale.detector.Ramp`, `~miricigale.detector.Charge` or `~astropy.nddata.CCDData`
+            What has no ``history`` has it in its meta dictionary.
+
+        Returns
+        -------
+        history : `ExposureHistory`
+        """
+        if hasattr(exposure, "history"):
+            return exposure.history
+        meta = getattr(exposure, "meta", None) or {}
+        names = ("origin", "steps", "day", "gain")
+        values = {name: meta[name] for name in names if meta.get(name) is not None}
+        if meta.get("simulated"):
+            values["origin"] = "simulated"
+        used = {
+            name: meta[f"reference_{name}"] for name in REFERENCES if f"reference_{name}" in meta
+        }
+        return cls(**values, references=used)
+
+    def meta(self):
+        """Entries of the meta dictionary of an image, from which `of` makes it again."""
+        values = {
+            "simulated": self.simulated,
+            "origin": self.origin if self.origin == "unrecorded" else None,
+            "steps": sorted(self.steps) or None,
+            **{name: getattr(self, name) for name in ("day", "gain")},
+            **{f"reference_{name}": text for name, text in self.references.items()},
+        }
+        return {name: value for name, value in values.items() if value is not None}
+
+    @property
+    def simulated(self):
+        """Whether the package's Detector made the counts, and it is known what acted."""
+        return self.origin == "simulated"
+
+    def done(self, reference):
+        """Whether the step of a reference was done; linear DN have their bias behind them."""
+        step = REFERENCES[reference]
+        return step in self.steps or (reference == "bias" and "linearity" in self.steps)
+
+
+def _middle_of(header):
+    """Middle of an exposure (MJD), or its start where that is all that is known."""
+    for name in ("EXPMID", "EXPSTART"):
+        if np.isfinite(day := float(header.get(name) or np.nan)):
+            return day
+    try:
+        start = Time(f"{header['DATE-OBS']}T{header.get('TIME-OBS', '00:00:00')}", scale="utc")
+    except (KeyError, ValueError):
+        return None
+    return float(start.mjd)

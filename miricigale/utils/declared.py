@@ -1,0 +1,25 @@
+"""What the package declares in TOML files beside its modules: texts, names, presets."""
+
+import functools
+import tomllib
+from importlib import resources
+
+
+@functools.cache
+def declared(package, file="page.toml"):
+    """
+    Read a TOML file of the package, once.
+
+    Parameters
+    ----------
+    package : str
+        Package that has the file, such as ``"miricigale.fitting"``.
+    file : str, optional
+        Its name.
+
+    Returns
+    -------
+    tables : dict
+        As they stand in the file; not to be changed.
+    """
+    return tomllib.loads((resources.files(package) / file).read_text("utf-8"))
