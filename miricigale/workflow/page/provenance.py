@@ -128,6 +128,8 @@ def catalog_facts(config, catalog):
     )
     of = f"{len(existing)} existing bands, {of} ({', '.join(existing)})"
     facts["fitted in the end"] = f"{of}, and {len(config.exposures.filters)} of MIRI"
+    excess = " or ".join(f"{value:g}" for value in config.fit.dust_excess)
+    facts["dust of the fit"] = f"{excess or 1} times the power that attenuation takes"
     if "redshift_source" in catalog.colnames:
         kinds, counts = np.unique(np.asarray(catalog["redshift_source"], str), return_counts=True)
         pairs = zip(kinds, counts, strict=True)
