@@ -14,6 +14,8 @@ _CALZETTI_1994 = [
     (0.1268, 0.1284), (0.1309, 0.1316), (0.1342, 0.1371), (0.1407, 0.1515), (0.1562, 0.1583),
     (0.1677, 0.1740), (0.1760, 0.1833), (0.1866, 0.1890), (0.1930, 0.1950), (0.2400, 0.2580),
 ]  # fmt: skip
+#: Wavelength (um), limit (uJy), light (nW / m2 / sr) and its errors.
+_LIGHT = [(15, 50, 2.4, 0.5, 0.5), (24, 60, 1.9, 0.6, 0.6), (24, 0, 2.7, 0.7, 1.1)]
 PUBLISHED = [
     ("Calzetti et al. 1994, table 2 (um)", chain.UV_WINDOWS, _CALZETTI_1994),
     ("Madau 1995, Lyman alpha to delta", igm._MADAU, [0.0036, 0.0017, 0.0012, 0.00093]),
@@ -80,7 +82,7 @@ PUBLISHED = [
         classes.CLASS_LIMITS,
         (0.1, 0.4),
     ),
-    ("Elbaz et al. 2002, 15 um", counts.PUBLISHED_LIGHT[0][3:6], (2.4, 0.5, 0.5)),
+    ("Elbaz et al. 2002, Papovich et al. 2004", [r[1:6] for r in counts.PUBLISHED_LIGHT], _LIGHT),
 ]
 #: Of 1 um, and the limit of hydrogen's Lyman series.
 _PER_UM = 1 * u.um

@@ -21,31 +21,42 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-#: Modules of the science, and the tests that hold them.
+#: Modules of the science, and the files of tests or their folders that hold them.
 TARGETS = {
-    "reduction/_core/*.py": "tests/reduction/test_rampfit.py tests/reduction/test_mosaic.py",
-    "reduction/calibration.py": "tests/reduction/test_calibration.py",
-    "detector/_core/*.py": "tests/detector",
-    "psf/_core.py": "tests/psf",
-    "psf/wiener.py": "tests/psf",
-    "psf/optics.py": "tests/psf",
-    "profiles/_core.py": "tests/profiles",
-    "photometry/_core/*.py": "tests/photometry",
-    "photometry/error_model.py": "tests/photometry",
-    "photometry/error_curves.py": "tests/photometry",
-    "sed/_core/*.py": "tests/sed",
-    "sed/chain.py": "tests/sed",
-    "sed/components/*.py": "tests/sed",
-    "sed/xray.py": "tests/sed",
-    "fitting/_core/*.py": "tests/fitting",
-    "depth/noise.py": "tests/depth",
-    "depth/limits.py": "tests/depth",
-    "evaluation/counts.py": "tests/evaluation",
-    "evaluation/classes.py": "tests/evaluation",
-    "evaluation/xray.py": "tests/evaluation",
-    "evaluation/population.py": "tests/evaluation",
-    "scene/background.py": "tests/scene",
-    "instrument/photometric.py": "tests/instrument",
+    "reduction/_core/drawing.py": "reduction/test_drawn",
+    "reduction/_core/[lpr]*.py": "reduction/test_rampfit",
+    "reduction/calibration.py": "reduction/test_calibration",
+    "detector/_core/*.py": "detector/test_core detector/test_detector detector/test_effects",
+    "psf/_core.py": "psf/test_optics psf/test_model psf/test_resample",
+    "psf/wiener.py": "psf/test_kernels",
+    "psf/optics.py": "psf/test_optics",
+    "profiles/_core.py": "profiles",
+    "photometry/_core/*.py": "photometry/test_core photometry/test_forced photometry/test_shapes",
+    "photometry/error_model.py": "photometry/test_error_model photometry/test_errors",
+    "photometry/error_curves.py": "photometry/test_errors",
+    "sed/_core/igm.py": "test_constants sed/test_igm",
+    "sed/_core/attenuation.py": "sed/test_attenuation",
+    "sed/_core/disk.py": "test_constants sed/test_agn",
+    "sed/_core/polar.py": "sed/test_agn",
+    "sed/_core/nebular.py": "test_constants sed/test_nebular",
+    "sed/_core/histories.py": "sed/test_sfh sed/test_stellar",
+    "sed/_core/xray.py": "test_constants sed/test_xray",
+    "sed/_core/[brt]*.py": "sed/test_core sed/test_model",
+    "sed/chain.py": "sed/test_chain sed/test_model",
+    "sed/components/agn.py": "sed/test_agn",
+    "sed/components/dust.py": "sed/test_dust",
+    "sed/components/attenuation.py": "sed/test_attenuation",
+    "sed/xray*.py": "test_constants sed/test_xray sed/test_xray_bands",
+    "fitting/_core/*.py": "fitting/test_grid_engine fitting/test_between fitting/test_limits "
+    "fitting/test_outliers fitting/test_pairs fitting/test_engine_corners",
+    "depth/noise.py": "depth",
+    "depth/limits.py": "depth",
+    "evaluation/counts.py": "test_constants evaluation/test_counts",
+    "evaluation/classes.py": "evaluation/test_classes",
+    "evaluation/xray.py": "evaluation/test_xray",
+    "evaluation/population.py": "test_constants evaluation/test_population",
+    "scene/background.py": "scene/test_background",
+    "instrument/photometric.py": "instrument/test_photometric",
 }
 _OPERATORS = {
     ast.Add: ("+", "-"),
@@ -148,7 +159,11 @@ def noticed(copy, path, text, tests, minutes):
     before = place.read_bytes()
     place.write_text(text)
     environment = {**os.environ, "PYTHONPATH": str(copy), "MPLBACKEND": "agg"}
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *tests.split()]
+    files = [
+        f"tests/{name}" if (copy / "tests" / name).is_dir() else f"tests/{name}.py"
+        for name in tests.split()
+    ]
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *files]
     try:
         done = subprocess.run(
             command,
