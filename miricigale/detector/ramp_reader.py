@@ -188,10 +188,8 @@ def _counts(hdu):
 
 def _flags(path, hdus, exposure, shape):
     """Flags of pixels and groups, as far as the file has them; reference pixels are always known."""
-    pixel_dq, found = (
-        np.zeros(shape[2:], np.uint32),
-        {"SIM_PIXELDQ", "PIXELDQ"} & {h.name for h in hdus},
-    )
+    pixel_dq = np.zeros(shape[2:], np.uint32)
+    found = {"SIM_PIXELDQ", "PIXELDQ"} & {hdu.name for hdu in hdus}
     for name in sorted(found):
         # unsigned 32 bits as FITS keeps them: BZERO 2^31
         stored = np.asarray(hdus[name].data).astype(np.int32).view(np.uint32)

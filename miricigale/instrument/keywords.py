@@ -243,8 +243,8 @@ def placed_keywords(kept, *, wcs=True):
     parts = fits.Header(), fits.Header()
     for name, (value, comment) in kept.items():
         # a card has 80 characters
-        room = max(0, 65 - max(20, len(str(value)) + 2))
+        longest = max(0, 65 - max(20, len(str(value)) + 2))
         sky = _WCS.fullmatch(name) is not None
         if wcs or not sky:
-            parts[sky or _SCIENCE.fullmatch(name) is not None][name] = value, comment[:room]
+            parts[sky or _SCIENCE.fullmatch(name) is not None][name] = value, comment[:longest]
     return parts

@@ -4,9 +4,10 @@ import dataclasses
 from typing import ClassVar
 
 from miricigale.instrument import CEERS_FILTERS, imager_filters, readout_patterns
+from miricigale.workflow.analysis_sections import FitBasics
 from miricigale.workflow.background import check_levels
 from miricigale.workflow.options import Configuration, Section, option, read_text
-from miricigale.workflow.sections import CatalogSection, FitBasics, RunBasics, SedSection
+from miricigale.workflow.sections import CatalogSection, RunBasics, SedSection
 
 
 class PlanSection(RunBasics):

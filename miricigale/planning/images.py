@@ -17,14 +17,13 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.random import stream
 from miricigale.utils.store import replacing
 from miricigale.utils.tables import error_column
+from miricigale.workflow.analysis_sections import FitSection, PointSourceSection
 from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.derived import rows_of
 from miricigale.workflow.sections import (
     DetectorSection,
     ExposureSection,
-    FitSection,
     PointingSection,
-    PointSourceSection,
     RunSection,
     SceneSection,
 )

@@ -10,8 +10,8 @@ from .dither_background import dither_backgrounds as dither_backgrounds
 from .files import ImageFile as ImageFile
 from .files import open_exposure as open_exposure
 from .files import read_images as read_images
-from .files import write_image as write_image
 from .from_files import reduce_files as reduce_files
+from .image_writer import write_image as write_image
 from .measured_noise import MeasuredNoise as MeasuredNoise
 from .measured_noise import measure_noise as measure_noise
 from .mosaic import Mosaic as Mosaic

@@ -12,7 +12,8 @@ from miricigale.detector.level1b import keywords
 from miricigale.instrument import Image, ImageFacts, kept_keywords
 from miricigale.reduction.assumed import history_of
 from miricigale.reduction.background import Background
-from miricigale.reduction.files import ImageFile, write_image
+from miricigale.reduction.files import ImageFile
+from miricigale.reduction.image_writer import write_image
 from miricigale.reduction.images import exposure_values, flagged_image
 from miricigale.reduction.slopes import shares_charge
 from miricigale.utils.interactive import Interactive, checked_calls

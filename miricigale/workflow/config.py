@@ -7,25 +7,27 @@ from typing import ClassVar
 
 from miricigale.refdata import resources as known_resources
 from miricigale.utils.exceptions import ConfigError, unknown_name
+from miricigale.workflow.analysis_sections import (
+    ErrorSection,
+    FitSection,
+    PerturbSection,
+    PhotometrySection,
+    PointSourceSection,
+    ReportSection,
+    VariantSection,
+)
 from miricigale.workflow.background import check_levels
 from miricigale.workflow.options import Configuration, read_text
 from miricigale.workflow.sections import (
     CatalogSection,
     DetectorSection,
-    ErrorSection,
     ExposureSection,
-    FitSection,
     HighresSection,
-    PerturbSection,
-    PhotometrySection,
     PointingSection,
-    PointSourceSection,
     ReductionSection,
-    ReportSection,
     RunSection,
     SceneSection,
     SedSection,
-    VariantSection,
 )
 from miricigale.workflow.truths import ALL, CUTOUTS, NEEDS_AGN, perturbed_values
 

@@ -17,9 +17,9 @@ from miricigale.scene import CatalogFlags, check_catalog
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import ConfigError, MiricigaleWarning
 from miricigale.workflow import StudyRunner
+from miricigale.workflow.analysis_sections import FitSection
 from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.page.provenance import catalog_facts
-from miricigale.workflow.sections import FitSection
 from miricigale.workflow.stages import study_stages
 from miricigale.workflow.stages.fits import mock_photometry
 from miricigale.workflow.stages.inputs import existing_bands

@@ -84,7 +84,7 @@ def _likelihood(flux, agn, z, target, limits, mixture, agn_error, scratch):
 
     All that is known of the data is in here: ``z`` is the redshift that errors are of. With bands that may be
     wrong the scale follows from how likely each of them is, and that from the scale. ``agn`` are the fluxes of the
-    AGN in the model, ``scratch`` has room for weights.
+    AGN in the model, ``scratch`` is memory for weights.
     """
     more = _widen(flux, agn, z, target, agn_error, scratch)
     s, r, variance, chi2 = _best_scale(flux, scratch, target, limits)

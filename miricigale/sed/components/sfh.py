@@ -259,7 +259,7 @@ def _bins(table):
     check_that("time" in table.colnames and names, "table", wanted, table.colnames)
     check_that(len(table) >= 2, "table", "of two rows or more", len(table))
     time = _column(table, "time", u.Myr)
-    check_that(np.all(np.diff(time) > 0), "time", "ascending", "times that stand still or fall")
+    check_that(np.all(np.diff(time) > 0), "time", "ascending", "times that do not ascend")
     rates = np.array([_column(table, name, _RATE) for name in names])
     for name, rate in zip(names, rates, strict=True):
         check_that(not np.any(rate < 0), name, "rates of 0 or more", f"{rate.min():g}")
