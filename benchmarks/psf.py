@@ -1,15 +1,35 @@
 """Time the PSFs and kernels and print how they compare with the telescope in flight.
 
 python benchmarks/psf.py
+python benchmarks/psf.py stars [SEED ...]    a PSF that is wrong by a known amount, corrected by stars
+python benchmarks/psf.py field FOLDER        real images: the folder uds of the test data
 """
 
+import dataclasses
+import sys
 import time
+import warnings
 
 import astropy.units as u
+import numpy as np
+from astropy.coordinates import SkyCoord
+from astropy.nddata import CCDData, StdDevUncertainty
+from astropy.table import QTable
 
+from miricigale.instrument import north_up_wcs
+from miricigale.photometry import (
+    ForcedPhotometer,
+    MosaicFile,
+    SourceTemplates,
+    detect_sources,
+    read_prior,
+)
+from miricigale.photometry.from_files import _empty_positions
+from miricigale.photometry.kernel_files import matching_kernel
 from miricigale.psf import (
     MatchingKernel,
     encircled_energy,
+    filter_psf,
     fwhm,
     hst_psf,
     jwst_pupil,
@@ -19,6 +39,7 @@ from miricigale.psf import (
     radius_of_encircled_energy,
     rotate_psf,
 )
+from miricigale.psf._core import interpolate
 from miricigale.psf.miri import _miri_data
 from miricigale.psf.telescope import Telescope
 
@@ -96,5 +117,135 @@ def main():
         print(f"F{number}W".ljust(8), "   ".join(cells), f"  {seconds:.2f}")
 
 
+def wrong(psf, scale, *, core=0.05, wings=0.2, edge=1.0):
+    """A PSF on pixels whose core is wider within ``edge`` arcsec and whose wings are brighter beyond."""
+    half = len(psf) // 2
+    y, x = np.indices(psf.shape) - half
+    wide = interpolate(psf, x / (1 + core) + half, y / (1 + core) + half) / (1 + core) ** 2
+    # from one to the other over a fifth of the edge
+    part = np.clip((np.hypot(x, y) * scale / edge - 0.9) / 0.2, 0, 1)
+    changed = wide * (1 - part) + psf * part * (1 + wings)
+    return changed / (changed.sum() + (1 - psf.sum()) * (1 + wings))
+
+
+def simulated(seed, n_stars=12, n_galaxies=60, shape=(900, 900)):
+    """Image in F770W with another PSF than its kernel's, prior in F444W, catalog with true fluxes, kernels."""
+    rng, form = np.random.default_rng(seed), {"pixel_scale": SCALE, "pa": 35 * u.deg}
+    sharp, wide = (filter_psf(name, **form) for name in ("F444W", "F770W"))
+    kernel = MatchingKernel.from_psfs(sharp, wide, pixel_scale=SCALE)
+    true = kernel.with_psfs(kernel.source, wrong(kernel.target, SCALE.value))
+    center = SkyCoord(53.1, -27.8, unit="deg")
+    wcs = north_up_wcs(center, SCALE, shape)
+    n = n_stars + n_galaxies
+    grid = (
+        np.stack(np.meshgrid(np.arange(9), np.arange(9))).reshape(2, -1).T[rng.permutation(81)[:n]]
+    )
+    xy = (grid + 0.5) * np.array(shape) / 9 + rng.uniform(-15, 15, (n, 2))
+    star = np.arange(n) < n_stars
+    catalog = QTable({"id": np.arange(1, n + 1), "sky": wcs.pixel_to_world(*xy.T)})
+    catalog["profile"] = np.where(star, "point", "sersic")
+    catalog["half_light_radius"] = np.where(star, 0, rng.uniform(0.1, 0.5, n)) * u.arcsec
+    catalog["sersic_index"], catalog["axis_ratio"] = rng.uniform(0.8, 3, n), rng.uniform(0.4, 1, n)
+    catalog["position_angle"] = rng.uniform(0, 180, n) * u.deg
+    catalog["flux"] = 10 ** np.where(star, rng.uniform(0.8, 2, n), rng.uniform(0, 1.5, n)) * u.uJy
+    templates = SourceTemplates.from_catalog(catalog, template="sersic", wcs=wcs)
+    point = np.zeros(kernel.source.shape)
+    point[len(point) // 2, len(point) // 2] = 1.0
+    same = dataclasses.replace(kernel, array=point, target=kernel.source)
+    images = []
+    some = StdDevUncertainty(np.ones(shape))
+    none = CCDData(np.ones(shape), unit="MJy/sr", wcs=wcs, uncertainty=some)
+    for one, factor, sigma in (
+        (same, np.where(star, 3, 0.5), 0.01),
+        (true, np.ones(n), 0.05),
+    ):
+        light = ForcedPhotometer(one).render(none, templates, factor * catalog["flux"]).value
+        noise = StdDevUncertainty(np.full(shape, sigma))
+        images.append(
+            CCDData(light + rng.normal(0, sigma, shape), unit="MJy/sr", wcs=wcs, uncertainty=noise)
+        )
+    for image, name in zip(images, ("nircam.f444w", "miri.f770w"), strict=True):
+        image.meta["filter"] = name
+    return images[1], images[0], catalog, star, kernel, true
+
+
+def stars(seeds):
+    """Print fluxes with the wrong, the corrected and the true PSF."""
+    print("seed psf        stars: flux - 1   galaxies: flux - 1   stated   chi2 of stars")
+    for seed in seeds:
+        image, prior, catalog, star, kernel, true = simulated(seed)
+        segments, _ = detect_sources(prior)
+        for name, one, asked in (
+            ("model", kernel, False), ("corrected", kernel, True), ("true", true, False),
+        ):  # fmt: skip
+            result = ForcedPhotometer(one, psf_stars=asked).measure(
+                image, prior, segments, catalog["id", "sky"]
+            )
+            ratio = (result.flux / catalog["flux"]).value - 1
+            bright = result.snr > 20
+            parts = [ratio[star], ratio[~star & bright]]
+            spread = [(np.median(p), 1.2533 * np.std(p) / np.sqrt(len(p))) for p in parts]
+            texts = [f"{100 * a:+6.2f} +- {100 * b:.2f} %" for a, b in spread]
+            error = result.meta.get("image_psf_err", 0.0)
+            kind = result.meta.get("image_psf", name)
+            print(
+                f"{seed:4d} {kind:10s} {texts[0]:>18s} {texts[1]:>20s} {100 * error:7.2f} %",
+                f"  {np.median(result.chi2[star]):.2f}",
+            )
+
+
+def loose_chi2(result, row, radius=0.8, scatter=0.02):
+    """Chi-square below the light within a radius (arcsec) if pixels deviate by a part of the light too."""
+    residual, model = result.residual_image, result.model_image.data
+    if result.background is not None:
+        model = model - result.background.to_value(residual.unit)
+    reach = radius / result.meta["pixel_scale"]
+    y, x = np.indices(model.shape)
+    near = (np.hypot(x - result.x[row], y - result.y[row]) < reach) & ~residual.mask & (model > 0)
+    noise = np.hypot(residual.uncertainty.array, scatter * model)[near]
+    return np.average((residual.data[near] / noise) ** 2, weights=model[near])
+
+
+def field(folder):
+    """Print how bright sources of real images are fitted, without and with the stars."""
+    start, psfs = f"{folder}/uds-test-", f"{folder}/psf/uds-test-"
+    files = [
+        MosaicFile(f"{start}{name}_sci.fits.gz", weight=f"{start}{name}_wht.fits.gz", filter=name,
+                   psf=f"{psfs}{name}_psf.fits.gz[0,mean]")
+        for name in ("f770w", "f444w")
+    ]  # fmt: skip
+    kernel = matching_kernel(*files)
+    image, prior = (one.read() for one in files)
+    segments, catalog = read_prior(prior, segmentation=f"{start}LW_seg.fits.gz")
+    for options in ({}, {"psf_stars": True}, {"psf_stars": True, "components": 2}):
+        result = ForcedPhotometer(kernel, background_order=0, **options).measure(
+            image, prior, segments, catalog
+        )
+        # signal-to-noise by the noise alone
+        snr = (result.flux / result.flux_err_noise).value
+        bright = np.flatnonzero(np.nan_to_num(snr) > 20)
+        chi2 = result.chi2[bright]
+        used = kernel if result.psf_stars is None else result.psf_stars.kernel
+        empty = _empty_positions(result, 1)
+        blank = ForcedPhotometer(used, template="psf").measure(result.residual_image, catalog=empty)
+        pulls, depth = np.std(blank.snr), 5 * np.median(blank.flux_err.value) * 1e3
+        print(
+            f"{options}: {len(bright)} sources above 20 sigma, {np.sum(chi2 < 2)} with chi2 below 2,"
+        )
+        loose = np.array([loose_chi2(result, k) for k in bright])
+        print(
+            f"  {np.sum(loose < 2)} with 2 % of the light in each pixel as an error: {np.round(np.sort(loose), 2)}"
+        )
+        print(f"  chi2 {np.round(np.sort(chi2), 2)}; pulls {pulls:.3f}, 5 sigma {depth:.1f} nJy")
+        if result.psf_stars is not None:
+            print(f"  {result.psf_stars.meta}")
+
+
 if __name__ == "__main__":
-    main()
+    warnings.simplefilter("ignore")
+    if sys.argv[1:2] == ["stars"]:
+        stars([int(one) for one in sys.argv[2:]] or [1, 2, 3])
+    elif sys.argv[1:2] == ["field"]:
+        field(sys.argv[2])
+    else:
+        main()

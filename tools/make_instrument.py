@@ -11,7 +11,8 @@ siaf_miri.toml     distortion of the imager and its sub-arrays, digits as in the
 imager.toml        detector, readout and filter figures; band-averaged backgrounds
 thermal.ecsv       thermal background of the observatory, thinned
 
-The figures that are not computed here (literals below) carry their source beside them.
+The figures that are not computed here (literals below) carry their source beside them. effects.toml and
+dithers.toml are kept by hand: they hold literals alone, with their sources.
 """
 
 import hashlib

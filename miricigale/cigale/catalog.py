@@ -125,12 +125,8 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
         if n_lost:
             no_limit.append(f"{band} {n_lost}")
         out[name].info.description = band
-    out.meta["cigale"] = {
-        "file": path.name,
-        "bands": filters,
-        "default_error": no_error,
-        "left_out": left_out + other,
-    }
+    note = {"file": path.name, "bands": filters, "default_error": no_error}
+    out.meta["cigale"] = note | {"left_out": left_out + other}
     notes = {
         f"left out, no filter here ({GIVE_FILTER})": left_out,
         "left out, no bands": other,
@@ -149,12 +145,8 @@ def _choose(path, table, bands):
     """Bands to read."""
     have = table.colnames
     if bands is None:
-        bands = [
-            name
-            for name in have
-            if name not in _OWN
-            and (error_column(name) in have or filter_of_band(name) or is_line(name))
-        ]
+        own = [name for name in have if name not in _OWN]
+        bands = [x for x in own if error_column(x) in have or filter_of_band(x) or is_line(x)]
     lost = [name for name in ("id", "redshift", *bands) if name not in have]
     if lost:
         raise data_error(path, f"has no column {', '.join(lost)}; it has {', '.join(have)}")

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from miricigale.utils.exceptions import config_error, data_error
+from miricigale.utils.options import check_that
 
 #: Settings other than those of the modules; empty ones count as not given.
 _SPEC = """\
@@ -59,9 +60,8 @@ def parse_ini(path):
     except (OSError, UnicodeError, configobj.ConfigObjError) as err:
         raise data_error(path, f"cannot be read as a configuration of CIGALE: {err}") from None
     analysis = config.get("analysis_params", {})
-    if "sed_modules" not in config or not all(
-        isinstance(section, dict) for section in (config.get("sed_modules_params"), analysis)
-    ):
+    sections = config.get("sed_modules_params"), analysis
+    if "sed_modules" not in config or not all(isinstance(one, dict) for one in sections):
         what = "is no configuration of CIGALE: no sed_modules, or no [sed_modules_params]"
         raise data_error(path, what)
     for section in (config, analysis):
@@ -87,24 +87,22 @@ def parse_values(value, name):
     text = ", ".join(items)
     try:
         if text.startswith("eval "):
-            numbers = np.atleast_1d(_evaluate(text[5:].strip()))
+            with np.errstate(all="raise"):
+                numbers = _value(ast.parse(text[5:].strip(), mode="eval").body)
         elif text.startswith("range "):
             start, stop, step = (float(x) for x in text[6:].split())
             # both ends are included
             numbers = _arange(start, stop + step, step)
         else:
             numbers = np.array([float(item) for item in items])
-        numbers = np.asarray(numbers, dtype=float)
+        numbers = np.atleast_1d(numbers).astype(float)
     except (ValueError, TypeError, ArithmeticError, SyntaxError, RecursionError) as err:
         msg = f"{name} = {text} cannot be read as numbers: {err}"
         raise ValueError(msg) from None
-    if numbers.ndim != 1 or not numbers.size or not np.all(np.isfinite(numbers)):
-        msg = f"{name} must be a list of finite numbers, got {value}"
-        raise ValueError(msg)
+    good = numbers.ndim == 1 and numbers.size and np.all(np.isfinite(numbers))
+    check_that(good, name, "a list of finite numbers", value)
     unique = np.unique(numbers)
-    if unique.size < numbers.size:
-        msg = f"{name} has a value twice: {value}"
-        raise ValueError(msg)
+    check_that(unique.size == numbers.size, name, "of different values", value)
     return unique
 
 
@@ -116,17 +114,15 @@ def _arange(*args):
 
 
 def _count(number):
-    if number != int(number) or not 0 <= number <= _MAX_VALUES:
-        msg = f"{number:g} values are not from 0 to {_MAX_VALUES}"
-        raise ValueError(msg)
+    good = number == int(number) and 0 <= number <= _MAX_VALUES
+    check_that(good, "number of values", f"from 0 to {_MAX_VALUES}", f"{number:g}")
     return int(number)
 
 
 def _spaced(function):
     def made(start, stop, num=50, **options):
-        if not set(options) <= {"endpoint", "base"}:
-            msg = f"arguments {sorted(options)}"
-            raise ValueError(msg)
+        known = ["base", "endpoint"]
+        check_that({*options} <= {*known}, "arguments", f"of {known}", sorted(options))
         return function(float(start), float(stop), _count(num), **options)
 
     return made
@@ -149,14 +145,6 @@ _OPERATORS = {
     ast.Div: operator.truediv,
     ast.Pow: lambda a, b: np.float64(a) ** b if np.ndim(a) == 0 else a**b,
 }
-
-
-def _evaluate(text):
-    with np.errstate(all="raise"):
-        try:
-            return _value(ast.parse(text, mode="eval").body)
-        except FloatingPointError as err:
-            raise ValueError(str(err)) from None
 
 
 def _value(node):

@@ -184,11 +184,9 @@ def _sfhfromfile(m):
 def _bc03(m):
     imf = _IMF.get(int(m.one("imf", 0)), "another")
     metallicity = m.numbers("metallicity", 0.02)
-    age = np.array([m.one("separation_age", 10.0)])
-    values = {
-        "metallicity": ("metallicity", metallicity),
-        "separation_age": ("separation_age", age),
-    }
+    numbers = {"metallicity": metallicity}
+    numbers["separation_age"] = np.array([m.one("separation_age", 10.0)])
+    values = {name: (name, some) for name, some in numbers.items()}
 
     def covers(library):
         if imf.lower() not in library.imf.lower():
@@ -256,11 +254,8 @@ def _skirtor2016(m):
     if m.has("disk_type") and law in ("calzetti", "gaskell"):
         text = "continued below 0.1 um, where CIGALE has grains"
         m.chain.differs.append(f"skirtor2016.law {law}: {text}")
-    options = {
-        "polar_law": law,
-        # files of older versions have no choice
-        "disk": m.option("disk_type", 0, {0: "skirtor", 1: "schartmann2005"}),
-    }
+    # files of older versions have no choice
+    disk = m.option("disk_type", 0, {0: "skirtor", 1: "schartmann2005"})
     if m.numbers("Mcl", 0.97).tolist() != [0.97]:
         m.chain.replaced.append("skirtor2016.Mcl by 0.97")
     m.chain.frac_agn_definition = _definition(m)
@@ -271,7 +266,7 @@ def _skirtor2016(m):
         return lacks and f"the library has not all values of {', '.join(lacks)}"
 
     kind, why = m.choose(c.Skirtor2016, c.ParametricTorus, covers)
-    m.add(kind, values, why=why, **options)
+    m.add(kind, values, why=why, polar_law=law, disk=disk)
 
 
 def _definition(m):
@@ -344,8 +339,7 @@ def read_modules(names, parameters, *, folder, libraries):
     chain = Chain()
     for name in names:
         if name in _INSTEAD:
-            msg = f"{name} is not here, and what it is for would be lacking: take {_INSTEAD[name]}"
-            raise ConfigError(msg)
+            raise config_error(name, f"is not here, but is needed: take {_INSTEAD[name]}")
         if name not in _MODULES:
             chain.left_out.append(name)
             continue
@@ -354,15 +348,13 @@ def read_modules(names, parameters, *, folder, libraries):
         try:
             _MODULES[name](module)
         except (ValueError, TypeError) as err:
-            msg = f"[[{name}]]: {err}"
-            raise ConfigError(msg) from err
+            raise config_error("[sed_modules_params]", f"[[{name}]]: {err}") from err
         module.rest()
     have = {component.role for component in chain.components}
     lack = [role for role in ("sfh", "stellar") if role not in have]
     if "dust" in have and "attenuation" not in have:
         lack.append("attenuation")
     if lack:
-        text = ", ".join(chain.left_out) or "none"
-        msg = f"no module for {', '.join(lack)} is known here; left out: {text}"
-        raise ConfigError(msg)
+        text = f"is known here; left out: {', '.join(chain.left_out) or 'none'}"
+        raise config_error("no module", f"for {', '.join(lack)} {text}")
     return chain

@@ -128,8 +128,7 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
     )
     text = setup.describe()
     if strict and (setup.left_out or setup.replaced):
-        msg = f"{path}:\n{text}"
-        raise ConfigError(msg)
+        raise config_error(path, f"cannot be used as a whole:\n{text}")
     if text:
         warn(f"{path}:\n{text}", CatalogWarning)
     return setup

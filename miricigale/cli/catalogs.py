@@ -3,8 +3,13 @@
 import sys
 
 from miricigale.cli.options import chosen, read_input
+from miricigale.utils.exceptions import argument_error
 
-_NOISE = ("error", "variance", "inverse_variance", "weight")
+#: Options of an image, as `~miricigale.photometry.MosaicFile` has them.
+_KNOWN = (
+    "error", "variance", "inverse_variance", "weight", "filter", "unit", "zero_point", "background_box", "psf",
+    "psf_scale", "psf_angle", "pa_aper",
+)  # fmt: skip
 
 
 def fit(args):
@@ -49,30 +54,44 @@ def fit(args):
     return 0
 
 
-def photometry(args):
-    """Measure an image."""
+def _images(args, paths, prefix=""):
+    """Images with their options, each given as often as there are images, in their order; - for none."""
     from miricigale.photometry import MosaicFile
+
+    given = {name: getattr(args, prefix + name) or ["-"] * len(paths) for name in _KNOWN}
+    for name, values in given.items():
+        if len(values) != len(paths):
+            wanted = f"given for each of {len(paths)} images, in their order (- for none)"
+            raise argument_error(f"--{prefix}{name}".replace("_", "-"), wanted, len(values))
+    options = [dict(zip(given, one, strict=True)) for one in zip(*given.values(), strict=True)]
+    return [
+        MosaicFile(path, **{name: one for name, one in own.items() if one != "-"})
+        for path, own in zip(paths, options, strict=True)
+    ]
+
+
+def photometry(args):
+    """Measure images."""
     from miricigale.photometry.from_files import measure_files
 
-    paths = [path for path in (args.image, args.highres) if path is not None] + args.positional
-    if len(paths) != 2 or (args.positional and len(args.positional) != 2):
-        msg = "wanted are --image and --highres, or the two files without options"
+    *paths, prior = [*(args.image or ()), *args.positional, *(args.highres or ())] or [None]
+    ways = bool(args.image) == bool(args.highres) != bool(args.positional)
+    if not paths or not ways or len(args.highres or ()) > 1:
+        msg = "wanted are --image and --highres, or the images and last the prior without options"
         raise ValueError(msg)
-    known = [*_NOISE, "filter", "unit", "zero_point"]
-    known += ["background_box", "psf", "psf_scale", "psf_angle", "pa_aper"]
-    images = [
-        MosaicFile(path, **{n: getattr(args, prefix + n) for n in known})
-        for path, prefix in zip(paths, ("", "highres_"), strict=True)
-    ]
     if str(args.output) == "-":
         args.output, page = None, args.page
     else:
         page = args.page or args.output.with_suffix(".html")
+    kernels = args.kernel and [None if one == "-" else one for one in args.kernel]
     table = measure_files(
-        *images,
-        **chosen(args, "segmentation catalog kernel"),
+        _images(args, paths),
+        _images(args, [prior], "highres_")[0],
+        kernel=kernels,
+        detection=args.detection,
+        **chosen(args, "segmentation catalog confidence"),
         **chosen(args, "max_shift background_order offset_order second_pass"),
-        **chosen(args, "components output model residual overwrite seed"),
+        **chosen(args, "components psf_stars output model residual overwrite seed"),
         page=page,
         n_threads=args.threads,
         progress_bar=not args.no_progress,
@@ -81,4 +100,28 @@ def photometry(args):
         table.write(sys.stdout, format="ascii.ecsv")
     else:
         print(f"{len(table)} sources in {args.output}; page: {page}")
+    return 0
+
+
+def errors(args):
+    """Measure the errors of an image."""
+    import astropy.units as u
+
+    from miricigale.photometry import MosaicFile, image_errors
+    from miricigale.photometry.errors_page import write_errors_page
+    from miricigale.photometry.from_files import check_output
+    from miricigale.photometry.kernel_files import image_psf
+    from miricigale.utils.table_files import write_table
+
+    paths = [args.output.with_suffix(one) for one in (".fits", ".ecsv", ".html")]
+    for what, path in zip(("output", "output", "page"), paths, strict=True):
+        check_output(what, path, args.overwrite, [args.image])
+    file = MosaicFile(args.image, **{name: getattr(args, name) for name in _KNOWN})
+    psf, image = image_psf(file), file.read()
+    options = {"diameters": u.Quantity(args.apertures)} if args.apertures else {}
+    found = image_errors(image, psf=psf, n_sigma=args.sigma, seed=args.seed, **options)
+    found.write(paths[0])
+    write_table(found.table, paths[1], overwrite=True)
+    write_errors_page(paths[2], found)
+    print(f"limits in {paths[0]} and {paths[1]}; page: {paths[2]}")
     return 0

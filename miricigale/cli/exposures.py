@@ -7,7 +7,7 @@ _FILES = "mask saturation bias reset linearity dark gain read_noise flat photom"
 
 def reduce(args):
     """Reduce exposures."""
-    from miricigale.reduction import Reducer
+    from miricigale.reduction import BackgroundSettings, Reducer
     from miricigale.reduction.from_files import reduce_files
     from miricigale.utils.exceptions import DataError
 
@@ -15,14 +15,16 @@ def reduce(args):
         if not path.is_file():
             msg = f"no file {path}"
             raise DataError(msg)
-    settings = chosen(args, "backend background skip_first skip_last")
+    settings = chosen(args, "backend skip_first skip_last")
+    background = BackgroundSettings(args.background, **chosen(args, "stripes sky_flat"))
+    settings |= {"background": background}
     settings |= {"n_threads": args.threads, "jump_threshold": args.jump_threshold or None}
     table = reduce_files(
         args.files,
         args.output,
         reducer=Reducer(references=_references(args), **settings),
         integrations=args.rateints,
-        **chosen(args, "pixel_scale resume"),
+        **chosen(args, "pixel_scale align resume"),
         progress_bar=not args.no_progress,
     )
     failed = table[table["status"] == "failed"]

@@ -1,6 +1,5 @@
 """Commands of studies: run, plan, compile."""
 
-import dataclasses
 import sys
 import time
 from pathlib import Path
@@ -42,14 +41,8 @@ def run(args):
             with process_pool(thread_count(config.run.threads or None)) as executor:
                 report = run_study(config, folder, executor=executor, **options)
         else:
-            with cluster_executor(args.scheduler) as (executor, n_threads, memory):
-                limits = dataclasses.replace(
-                    config.run,
-                    threads=config.run.threads or n_threads,
-                    memory=config.run.memory or 0.5 * memory,
-                )
-                config = dataclasses.replace(config, run=limits)
-                report = run_study(config, folder, executor=executor, **options)
+            with cluster_executor(args.scheduler, memory=config.run.memory) as cluster:
+                report = run_study(config, folder, executor=cluster, **options)
     except OtherResultsError as err:
         # name the option of this command instead of the argument
         raise OtherResultsError(err.reason, "--redo to replace it") from err

@@ -7,7 +7,6 @@ from scipy.ndimage import gaussian_filter
 
 from miricigale.depth.noise import ExposureNoise, noise_power, pattern_amplitude
 from miricigale.psf import MIRI_PIXEL_SCALE, miri_psf, psf_image
-from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_positive, check_that
 from miricigale.utils.units import ANGLE, positive, to_array
 
@@ -32,10 +31,8 @@ def extraction_map(share, boxes):
     for box in boxes:
         width = box * _SAMPLES
         smear = smear * np.sinc(fy * width) * np.sinc(fx * width)
-    weight = scipy.fft.irfft2(
-        scipy.fft.rfft2(share, s=(period, period)) * smear**2, s=(period,) * 2
-    )
-    weight = weight[:n, :n]
+    smeared = scipy.fft.rfft2(share, s=(period, period)) * smear**2
+    weight = scipy.fft.irfft2(smeared, s=(period, period))[:n, :n]
     return weight * _SAMPLES**2 / np.sum(weight * share)
 
 
@@ -124,8 +121,7 @@ def fitted_noise(
         check_that(int(value) == value and value >= 1, name, "an integer of at least 1", value)
     step = float(to_array(frame_time, u.s, "frame_time"))
     n_frames = int(seconds / n_integrations / step * (1 + 1e-9))
-    if n_frames < 2:
-        raise argument_error("time", f"at least two frames of {step} s in each integration", time)
+    check_that(n_frames >= 2, "time", f"at least two frames of {step} s in each integration", time)
     check_positive(excess, "excess")
     share = _share(filter, psf, size)
     boxes = () if mosaic is None else (1.0, _pixels(mosaic, "mosaic"))
@@ -144,10 +140,8 @@ def fitted_noise(
     amplitude = pattern_amplitude(residual, filter)
     if amplitude:
         # the pattern is that of whole pixels, wherever the source falls
-        phases = [
-            weight[y::_SAMPLES, x::_SAMPLES] for y in range(_SAMPLES) for x in range(_SAMPLES)
-        ]
-        pattern = np.mean([noise_power(one, 1.0) for one in phases])
+        phases = np.ndindex(_SAMPLES, _SAMPLES)
+        pattern = np.mean([noise_power(weight[y::_SAMPLES, x::_SAMPLES], 1.0) for y, x in phases])
         sky += (amplitude * noise.sky / electrons) ** 2 * pattern / n_dithers
     photon = noise.growth * np.sum(weight**2 * share) / _SAMPLES**2 / electrons
     return float(excess * np.sqrt(sky)), float(photon)

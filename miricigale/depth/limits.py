@@ -58,8 +58,7 @@ def _extraction(radius, annulus, psf, correlation, filter):
     # other packages write F770W where we write miri.f770w
     if isinstance(have, str) and have.lower().rpartition(".")[2] != filter.rpartition(".")[2]:
         raise argument_error("psf", f"one of the filter {filter}", f"one of {have}")
-    if "pixel" not in psf.includes:
-        raise argument_error("psf", "a PSF that includes the pixel", f"one with {psf.includes}")
+    check_that("pixel" in psf.includes, "psf", "a PSF that includes the pixel", psf.includes)
     scale = MIRI_PIXEL_SCALE.value
     edges = None if annulus is None else tuple(edge / scale for edge in annulus)
     values = []
@@ -185,9 +184,8 @@ def aperture_noise(
         detector=detector,
         subarray=subarray,
     )
-    if noise.rate * groups * step >= noise.detector.full_well:
-        wanted = "so few that the sky does not fill the well"
-        raise argument_error("n_groups", wanted, groups)
+    wanted = "so few that the sky does not fill the well"
+    check_that(noise.rate * groups * step < noise.detector.full_well, "n_groups", wanted, groups)
     variance, growth, sky, electrons = noise.variance(), noise.growth, noise.sky, noise.electrons
 
     psf = miri_psf(filter) if psf is None else psf
@@ -298,9 +296,8 @@ def sensitivity_table(filters=None, time=1e4 * u.s, *, residual="etc", n_sigma=1
         row |= {"light": found["light"], "background": found["background"] * SURFACE_BRIGHTNESS}
         for column, key in _COLUMNS.items():
             row[column] = found[key] * u.uJy
-        for version in ("4.0", "2.0"):
-            limit = scaled_limit(name, time, n_sigma=n_sigma, version=version)
-            row[f"etc_{version.replace('.', '')}"] = limit
+        for column, version in (("etc_40", "4.0"), ("etc_20", "2.0")):
+            row[column] = scaled_limit(name, time, n_sigma=n_sigma, version=version)
         rows.append(row)
     meta = provenance(time=seconds, n_sigma=float(n_sigma), residual=str(residual))
     return QTable(rows, meta=meta)

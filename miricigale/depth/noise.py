@@ -16,7 +16,7 @@ from miricigale.instrument import (
 )
 from miricigale.psf import MIRI_PIXEL_SCALE
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_that
+from miricigale.utils.options import check_kind, check_that
 from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
 
 
@@ -66,9 +66,8 @@ class ExposureNoise:
     subarray: str = "FULL"
 
     def __post_init__(self):
+        check_kind(self.detector, "detector", DetectorProperties)
         detector = miri_detector() if self.detector is None else self.detector
-        if not isinstance(detector, DetectorProperties):
-            raise argument_error("detector", "a DetectorProperties", repr(detector))
         level = background_level(self.filter) if self.background is None else self.background
         value = float(to_array(level, SURFACE_BRIGHTNESS, "background", ndim=0, finite=True))
         check_that(value >= 0, "background", "at least 0", self.background)
@@ -109,13 +108,9 @@ class ExposureNoise:
         variance : float
             (Electrons per second) squared.
         """
-        variance = ramp_variance(
-            self.rate + more,
-            n_groups=self.n_groups,
-            group_time=self.group_time,
-            read_noise=self.detector.read_noise * self.detector.gain,
-        )
-        return variance / self.n_ramps
+        ramp = {"n_groups": self.n_groups, "group_time": self.group_time}
+        noise = self.detector.read_noise * self.detector.gain
+        return ramp_variance(self.rate + more, **ramp, read_noise=noise) / self.n_ramps
 
     @property
     def growth(self):

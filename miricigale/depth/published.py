@@ -8,7 +8,7 @@ import numpy as np
 from miricigale.instrument import frame_time, imager_filters
 from miricigale.instrument.figures import filter_row, imager_filter, table
 from miricigale.utils.exceptions import unknown_name
-from miricigale.utils.options import check_that
+from miricigale.utils.options import check_names, check_that
 from miricigale.utils.units import to_array
 
 
@@ -88,16 +88,9 @@ def etc_setup(filter):
     0.42 arcsec, 106 groups, 10001 s
     """
     name = _short(filter)
-    common, counts = table("etc")["setup"], dict(table("etc")["filters"][name])
-    radius = common["radius_per_um"] * counts.pop("wavelength") * u.arcsec
-    return EtcSetup(
-        filter=f"miri.{name}",
-        radius=radius,
-        annulus=radius * common["annulus"],
-        subtract_annulus=common["subtract_annulus"],
-        readout=common["readout"],
-        **counts,
-    )
+    common, own = dict(table("etc")["setup"]), dict(table("etc")["filters"][name])
+    radius = common.pop("radius_per_um") * own.pop("wavelength") * u.arcsec
+    return EtcSetup(f"miri.{name}", radius, radius * common.pop("annulus"), **common, **own)
 
 
 def etc_limit(filter, version="4.0"):
@@ -123,8 +116,7 @@ def etc_limit(filter, version="4.0"):
     0.246 uJy 0.241 uJy
     """
     versions = {"4.0": "etc_40", "2.0": "etc_20"}
-    if str(version) not in versions:
-        raise unknown_name("version of the exposure time calculator", version, versions)
+    check_names([str(version)], "version of the exposure time calculator", versions)
     return filter_row(filter)[versions[str(version)]] * u.uJy
 
 
@@ -239,6 +231,5 @@ def residual_amplitude(filter, preset="etc"):
     """
     name = _short(filter)
     presets = table("etc")["residual"]
-    if preset not in presets:
-        raise unknown_name("residual preset", preset, presets)
+    check_names([preset], "residual preset", presets)
     return presets[preset][name]

@@ -12,9 +12,8 @@ from miricigale.filters import Filter
 from miricigale.instrument import background_level
 from miricigale.instrument.figures import filter_row, imager_filter
 from miricigale.refdata import locate
-from miricigale.utils.exceptions import unknown_name
 from miricigale.utils.optional import require
-from miricigale.utils.options import check_that
+from miricigale.utils.options import check_names, check_that
 from miricigale.utils.positions import as_position
 from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
 
@@ -94,8 +93,7 @@ def zodiacal_factor(filter, level="medium", *, position=None, date=None):
     if date is not None:
         check_that(position is not None, "date", "given with a position", date)
         return _factor_on(name, position, Time(date))
-    if level not in zodiacal_levels():
-        raise unknown_name("level of the zodiacal light", level, zodiacal_levels())
+    check_names([level], "level of the zodiacal light", zodiacal_levels())
     rows = _table()[_table()["level"] == level]
     latitude = rows["latitude"].to_value(u.deg)
     if position is None:

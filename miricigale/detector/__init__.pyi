@@ -12,6 +12,7 @@ from .effects.charge import ReferencePixels as ReferencePixels
 from .effects.charge import Saturation as Saturation
 from .effects.light import Photons as Photons
 from .effects.light import Residual as Residual
+from .effects.migration import BrighterFatter as BrighterFatter
 from .effects.readout import ADConversion as ADConversion
 from .effects.readout import Bias as Bias
 from .effects.readout import Nonlinearity as Nonlinearity

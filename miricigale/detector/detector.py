@@ -1,6 +1,7 @@
 """The detector: a tuple of effects, applied block by block."""
 
 import dataclasses
+import itertools
 import logging
 import math
 from pathlib import Path
@@ -14,7 +15,15 @@ from miricigale.detector.collected import Charge
 from miricigale.detector.effects.base import Block, Effect
 from miricigale.detector.effects.charge import Persistence
 from miricigale.detector.effects.light import Residual
-from miricigale.detector.effects.order import ORDER, check_order, checked_effects, keyed, place_of
+from miricigale.detector.effects.migration import BrighterFatter
+from miricigale.detector.effects.order import (
+    ORDER,
+    check_order,
+    checked_effects,
+    effect_from_record,
+    keyed,
+    place_of,
+)
 from miricigale.detector.effects.readout import ReadNoise
 from miricigale.detector.effects.reset import FirstFrame, LastFrame, ResetAnomaly, ResetDecay
 from miricigale.detector.image import checked_light
@@ -22,10 +31,11 @@ from miricigale.detector.latent import checked_previous
 from miricigale.detector.ramp import Ramp
 from miricigale.detector.work import Work
 from miricigale.instrument import DetectorProperties, miri_detector
+from miricigale.instrument.figures import table
 from miricigale.utils.exceptions import DetectorWarning, argument_error, warn
 from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.meta import provenance
-from miricigale.utils.options import check_kind, check_that
+from miricigale.utils.options import check_kind, check_names, check_that
 from miricigale.utils.parallel import check_memory
 from miricigale.utils.random import check_seed
 from miricigale.utils.units import SURFACE_BRIGHTNESS
@@ -36,7 +46,8 @@ logger = logging.getLogger(__name__)
 _STANDARD = [
     kind
     for kind in ORDER
-    if kind not in (Residual, Persistence, ResetAnomaly, ResetDecay, FirstFrame, LastFrame)
+    if kind
+    not in (Residual, BrighterFatter, Persistence, ResetAnomaly, ResetDecay, FirstFrame, LastFrame)
 ]
 
 _EXPOSE_TO = "expose fewer groups, or write it by 'expose_to'"
@@ -93,8 +104,10 @@ class Detector(Interactive):
 
         Parameters
         ----------
-        *effects : `~miricigale.detector.Effect`
-            Effects with settings of their own, or beyond the standard ones; see `replaced`.
+        *effects : `~miricigale.detector.Effect` or str
+            Effects with settings of their own, or beyond the standard ones; see `replaced`. ``"flight"``
+            stands for all optional ones but `Residual` at the amplitudes of flight, as far as these are
+            published; what follows replaces them.
         properties : `~miricigale.instrument.DetectorProperties`, optional
             `~miricigale.instrument.miri_detector` if not given.
 
@@ -104,14 +117,24 @@ class Detector(Interactive):
             With photons, dark current, interpixel capacitance, cosmic rays, bad and reference
             pixels, saturation, non-linearity, bias, read noise and conversion.
 
+        Raises
+        ------
+        KeyError
+            If no set of effects has that name.
+
         Examples
         --------
         >>> from miricigale.detector import CosmicRays, Detector, ReadNoise, Residual
         >>> detector = Detector.miri_imager(Residual("etc"), ReadNoise(pink=2.0))
         >>> [type(effect).__name__ for effect in detector.without(CosmicRays).effects][:3]
         ['Residual', 'Photons', 'Dark']
+        >>> [type(effect).__name__ for effect in Detector.miri_imager("flight").effects][2:4]
+        ['BrighterFatter', 'InterpixelCapacitance']
         """
-        return cls(properties=properties).replaced(*effects)
+        sets = table("effects")
+        check_names([e for e in effects if isinstance(e, str)], "set of effects", sets)
+        parts = (map(effect_from_record, sets[e]) if isinstance(e, str) else [e] for e in effects)
+        return cls(properties=properties).replaced(*itertools.chain.from_iterable(parts))
 
     def replaced(self, *effects):
         """
@@ -321,8 +344,8 @@ class Detector(Interactive):
         `~astropy.units.UnitsError`
             As `expose`.
         ValueError
-            As `expose`; or if the detector has 1/f noise, a decay after resets, or effects of
-            other kinds than the package's.
+            As `expose`; or if the detector has 1/f noise, the brighter-fatter effect, a decay after resets,
+            or effects of other kinds than the package's.
 
         Warns
         -----
@@ -336,10 +359,10 @@ class Detector(Interactive):
         """
         for effect in self.effects:
             pink = isinstance(effect, ReadNoise) and effect.pink > 0
-            if pink or isinstance(effect, ResetDecay) or place_of(effect) is None:
+            if pink or isinstance(effect, (BrighterFatter, ResetDecay)) or place_of(effect) is None:
                 wanted = (
-                    "the package's own, without 1/f noise and decay after resets, to be collected "
-                    "without groups"
+                    "the package's own, without 1/f noise, brighter-fatter effect and decay after resets, "
+                    "to be collected without groups"
                 )
                 raise argument_error("effects", wanted, repr(effect))
         seed = check_seed(seed)

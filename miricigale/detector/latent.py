@@ -29,13 +29,15 @@ class Latent(Frozen):
         Time from the end of that exposure to the start of the next one.
     subarray : str, optional
         Sub-array of the exposure; pixels are remembered in its frame.
+    saturated : `~numpy.ndarray` of bool, shape (ny, nx), optional
+        Which pixels were full; none by default.
 
     Raises
     ------
     KeyError
         If the sub-array is not known.
     ValueError
-        If a rate or the gap is negative.
+        If a rate or the gap is negative, or ``saturated`` has another shape.
 
     Notes
     -----
@@ -63,6 +65,7 @@ class Latent(Frozen):
     rate: u.Quantity
     gap: u.Quantity
     subarray: str = "FULL"
+    saturated: np.ndarray | None = None
 
     def __post_init__(self):
         unit = u.electron / TIME
@@ -73,7 +76,10 @@ class Latent(Frozen):
         gap = float(to_array(self.gap, TIME, "gap", ndim=0, finite=True))
         check_that(gap >= 0, "gap", "at least 0 s", self.gap)
         rate = u.Quantity(frozen_array(rate), unit, copy=False)
-        self.__dict__.update(rate=rate, gap=gap * TIME)
+        full = np.zeros(rate.shape, bool) if self.saturated is None else self.saturated
+        if np.shape(full) != rate.shape:
+            raise argument_error("saturated", f"of shape {rate.shape}", np.shape(full))
+        self.__dict__.update(rate=rate, gap=gap * TIME, saturated=frozen_array(full, bool))
 
     @classmethod
     def from_ramp(cls, ramp, gap, *, threshold=0.1):
@@ -103,7 +109,10 @@ class Latent(Frozen):
         dark = (ramp.pixel_dq & np.uint32(_NO_LIGHT)) != 0
         charge[dark | (charge < threshold * properties.full_well)] = 0
         rate = charge * u.electron / ramp.exposure.integration_time
-        return cls(rate, gap, ramp.exposure.subarray)
+        # ramps of files may have no flags: counts within 1 % of the well are full too
+        full = ((ramp.group_dq & DQ.SATURATED) != 0).any(axis=(0, 1)) & ~dark
+        full |= charge > 0.99 * properties.full_well
+        return cls(rate, gap, ramp.exposure.subarray, full)
 
     def after(self, time):
         """

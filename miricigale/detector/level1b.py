@@ -48,11 +48,8 @@ def header(exposure, *, filename="", start=None):
         "EFFEXPTM": exposure.exposure_time, "DURATION": exposure.duration,
     }  # fmt: skip
     days = {"EXPSTART": start, "EXPMID": start + duration / 2, "EXPEND": start + duration}
-    n_int, number, name = (
-        exposure.n_integrations,
-        exposure.dither + 1,
-        exposure.filter.rpartition(".")[2],
-    )
+    n_int, number = exposure.n_integrations, exposure.dither + 1
+    name = exposure.filter.rpartition(".")[2]
     values = where | {
         # not the time of writing: the same exposure gives the same bytes
         "DATE": days["EXPEND"].utc.isot, "DATE-OBS": start.utc.isot[:10], "TIME-OBS": start.utc.isot[11:],

@@ -6,7 +6,7 @@ import numpy as np
 
 from miricigale.evaluation.estimates import Estimate, weighted_share
 from miricigale.evaluation.metrics import one_by_one
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.tables import described_table
 
 #: Names in order of rising fracAGN, and the limits between them.
@@ -40,10 +40,8 @@ def classify(frac_agn, *, limits=CLASS_LIMITS):
     ['galaxy', 'composite', 'agn']
     """
     frac_agn = np.asarray(frac_agn, float)
-    if np.any((frac_agn < 0) | (frac_agn > 1)):
-        raise argument_error(
-            "frac_agn", "between 0 and 1", f"{np.nanmin(frac_agn)} to {np.nanmax(frac_agn)}"
-        )
+    bad = (frac_agn < 0) | (frac_agn > 1)
+    check_that(not np.any(bad), "frac_agn", "between 0 and 1", frac_agn[bad])
     names = np.array([*CLASS_NAMES, "unknown"])
     index = np.searchsorted(limits, frac_agn, side="right")
     index[~np.isfinite(frac_agn)] = len(CLASS_NAMES)
@@ -144,10 +142,8 @@ def selection_quality(wanted, selected):
     """
     wanted, selected = one_by_one(bool, wanted=wanted, selected=selected)
     both = np.count_nonzero(wanted & selected)
-    return SelectionQuality(
-        Estimate.of_fraction(both, np.count_nonzero(wanted)),
-        Estimate.of_fraction(both, np.count_nonzero(selected)),
-    )
+    shares = (Estimate.of_fraction(both, np.count_nonzero(of)) for of in (wanted, selected))
+    return SelectionQuality(*shares)
 
 
 def sky_quality(galaxies, wanted, selected, weight):

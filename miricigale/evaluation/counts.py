@@ -4,11 +4,10 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.sed import COSMOLOGY
-from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_names
+from miricigale.utils.options import check_names, check_that
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import described_table, require_columns, unique_ids
-from miricigale.utils.units import FNU, LUMINOSITY, MASS, ab_magnitude, to_array
+from miricigale.utils.units import FNU, LUMINOSITY, MASS, ab_magnitude, positive, to_array
 
 #: Light of galaxies together in nW / m2 / sr: band, wavelength (um), least flux (uJy), value,
 #: errors down and up, reference.
@@ -199,8 +198,7 @@ def main_sequence_dust(table, *, seed, scatter=0.2):
       1     False         9.4
       2      True         1.0
     """
-    if not (np.isfinite(scatter) and scatter >= 0):
-        raise argument_error("scatter", "finite and >= 0", scatter)
+    check_that(np.isfinite(scatter) and scatter >= 0, "scatter", "finite and >= 0", scatter)
     ids, z, mass, dust, galaxy, quiescent = _dusty_galaxies(table)
     seed, rows = check_seed(seed), np.flatnonzero(galaxy & ~quiescent)
     hidden = mass[rows] * u.Msun
@@ -320,12 +318,11 @@ def number_counts(flux, area, edges):
     [1800. 5400.] 1 / deg2
     """
     edges = np.asarray(edges, float)
-    if edges.ndim != 1 or np.any(np.diff(edges) <= 0):
-        raise argument_error("edges", "ascending magnitudes", edges)
+    check_that(edges.ndim == 1 and np.all(np.diff(edges) > 0), "edges", "ascending", edges)
     flux = to_array(flux, FNU, "flux", ndim=1)
     mag = ab_magnitude(flux[flux > 0] * FNU)
     n, _ = np.histogram(mag, edges)
-    unit = 1 / (np.diff(edges) * _solid_angle(area)) / u.deg**2
+    unit = 1 / (np.diff(edges) * positive(area, u.deg**2, "area")) / u.deg**2
     return n * unit, np.sqrt(n) * unit
 
 
@@ -357,18 +354,10 @@ def integrated_light(flux, area, wavelength):
     0.67 nW / (sr m2) +- 0.50
     """
     flux = to_array(flux, FNU, "flux", ndim=1, finite=True) * FNU
-    area = _solid_angle(area) * u.deg**2
+    area = positive(area, u.deg**2, "area") * u.deg**2
     nu = to_array(wavelength, u.Hz, "wavelength", ndim=0, equivalencies=u.spectral()) * u.Hz
     unit = u.nW / u.m**2 / u.sr
     return (
         (nu * flux.sum() / area).to(unit),
         (nu * np.sqrt((flux**2).sum()) / area).to(unit),
     )
-
-
-def _solid_angle(area):
-    """Check an area: a positive number of square degrees."""
-    value = float(to_array(area, u.deg**2, "area", ndim=0))
-    if not (np.isfinite(value) and value > 0):
-        raise argument_error("area", "finite and positive", area)
-    return value

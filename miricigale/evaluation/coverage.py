@@ -4,7 +4,9 @@ import numpy as np
 from scipy.stats import kstest
 
 from miricigale.evaluation.metrics import fraction_interval
+from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import described_rows
 
@@ -116,28 +118,17 @@ def coverage_table(ranks, *, levels=(0.68, 0.95)):
     redshift 101  0.95  0.94       0.5
     """
     levels = np.atleast_1d(np.asarray(levels, float))
-    if not np.all((levels > 0) & (levels < 1)):
-        raise argument_error("levels", "between 0 and 1", levels)
+    check_that(np.all((levels > 0) & (levels < 1)), "levels", "between 0 and 1", levels)
     rows = []
     for name, values in ranks.items():
         values = np.asarray(values, float)
         values = values[np.isfinite(values)]
-        if np.any((values < 0) | (values > 1)):
-            raise argument_error("ranks", "between 0 and 1", f"{values.min()} to {values.max()}")
+        bad = (values < 0) | (values > 1)
+        check_that(not np.any(bad), "ranks", "between 0 and 1", values[bad])
         p_uniform = kstest(values, "uniform").pvalue if values.size else np.nan
         mean = values.mean() if values.size else np.nan
         for level in levels:
             inside = np.count_nonzero(np.abs(values - 0.5) <= 0.5 * level)
             share = fraction_interval(inside, values.size)
             rows.append((name, values.size, level, *share, mean, p_uniform))
-    texts = {
-        "name": "What the ranks are of",
-        "n": "Posteriors with a true value",
-        "level": "Part of the posterior in the central interval",
-        "share": "Share of the true values in it",
-        "share_low": "Lower end of its 68 % interval",
-        "share_high": "Upper end of its 68 % interval",
-        "mean_rank": "Mean rank; below 0.5 where the fits are too high",
-        "p_uniform": "Probability of ranks as far from uniform (Kolmogorov-Smirnov)",
-    }
-    return described_rows(rows, texts)
+    return described_rows(rows, declared("miricigale.evaluation", "columns.toml")["coverage"])

@@ -145,10 +145,7 @@ def bootstrap(statistic, *columns, seed, n_draws=1000, n_all=None):
     columns = [np.asarray(column, float) for column in columns]
     if not columns or len({len(column) for column in columns}) != 1:
         raise argument_error("columns", "of one length", [column.shape for column in columns])
-    known = [
-        np.isfinite(column) if column.ndim == 1 else np.isfinite(column).any(axis=1)
-        for column in columns
-    ]
+    known = [np.atleast_2d(np.isfinite(column).T).any(axis=0) for column in columns]
     columns = [column[np.all(known, axis=0)] for column in columns]
     n = len(columns[0])
     if n == 0:

@@ -6,6 +6,7 @@ from astropy.coordinates import SkyCoord
 from astropy.table import QTable, Table
 
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.tables import (
     Flags,
     described_table,
@@ -13,7 +14,7 @@ from miricigale.utils.tables import (
     match_sky,
     require_columns,
 )
-from miricigale.utils.units import ANGLE, FNU, to_array
+from miricigale.utils.units import ANGLE, FNU, positive, to_array
 
 
 class AssociationFlags(Flags):
@@ -94,9 +95,7 @@ def associate(first, second, *, radius):
         1     -1 unmatched
        -1      1 unmatched
     """
-    limit = float(to_array(radius, ANGLE, "radius", ndim=0))
-    if not limit > 0:
-        raise argument_error("radius", "positive", radius)
+    limit = positive(radius, ANGLE, "radius")
     sky = [_positions(one, name) for one, name in ((first, "first"), (second, "second"))]
     near = _Candidates(*sky, limit)
     pair = near.partner[0]
@@ -229,8 +228,7 @@ def match_truth(truth, measured, bands, *, radius=0.5 * u.arcsec):
       1           7             5.0        5.2
       2          -1             2.0        nan
     """
-    if isinstance(bands, str):
-        raise argument_error("bands", "a list of filter names", repr(bands))
+    check_that(not isinstance(bands, str), "bands", "a list of filter names", repr(bands))
     bands = list(bands)
     units = dict.fromkeys([c for band in bands for c in (band, error_column(band))], FNU)
     require_columns(truth, ["id", "sky", *bands], "truth", units=dict.fromkeys(bands, FNU))
@@ -238,14 +236,12 @@ def match_truth(truth, measured, bands, *, radius=0.5 * u.arcsec):
     index, separation = match_sky(measured["sky"], truth["sky"], radius=radius)
     found = index >= 0
     table = QTable({"id": truth["id"], "sky": truth["sky"]})
-    table["measured_id"] = (
-        np.where(found, np.asarray(measured["id"])[index], -1) if len(measured) else -1
-    )
+    ids = np.asarray(measured["id"])
+    table["measured_id"] = np.where(found, ids[index], -1) if len(measured) else -1
     table["separation"] = separation
     table["matched"] = found
-    near = _Candidates(
-        truth["sky"].icrs, measured["sky"].icrs, float(to_array(radius, ANGLE, "radius"))
-    )
+    limit = float(to_array(radius, ANGLE, "radius"))
+    near = _Candidates(truth["sky"].icrs, measured["sky"].icrs, limit)
     reasons = near.reasons(0)
     reasons[found] |= near.reasons(1)[index[found]]
     table["association"] = reasons

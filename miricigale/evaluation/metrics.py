@@ -6,7 +6,7 @@ import itertools
 import numpy as np
 from astropy.stats import binom_conf_interval
 
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 
 #: abs(dz) / (1 + z) above which a redshift is an outlier.
 OUTLIER = 0.15
@@ -16,9 +16,8 @@ def one_by_one(dtype=float, **arrays):
     """Two 1-D arrays of one length, of a type; an error by their names if they are not."""
     (name, first), (other, second) = arrays.items()
     first, second = np.asarray(first, dtype), np.asarray(second, dtype)
-    if first.shape != second.shape or first.ndim != 1:
-        got = f"shapes {first.shape} and {second.shape}"
-        raise argument_error(other, f"a 1-D array as long as '{name}'", got)
+    good, got = first.shape == second.shape, f"shapes {first.shape} and {second.shape}"
+    check_that(good and first.ndim == 1, other, f"a 1-D array as long as '{name}'", got)
     return first, second
 
 
@@ -247,8 +246,7 @@ def running_median(x, y, *, size=20):
     [19. 59.]
     """
     x, y = one_by_one(x=x, y=y)
-    if size < 1:
-        raise argument_error("size", "at least 1", size)
+    check_that(size >= 1, "size", "at least 1", size)
     good = np.isfinite(x) & np.isfinite(y)
     order = np.argsort(x[good], kind="stable")
     x, y = x[good][order], y[good][order]

@@ -10,6 +10,7 @@ from miricigale.evaluation.classes import (
     selection_quality,
 )
 from miricigale.evaluation.quantities import OF_FITS, REDSHIFT_BINS, measure
+from miricigale.utils.declared import declared
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import described_rows, described_table
 
@@ -65,26 +66,12 @@ def study_numbers(study, *, seed, n_draws=500):
                     continue
                 for option in (None,) if of_power else (None, *REDSHIFT_BINS):
                     key = stream(seed, "numbers", one.name, band_set, quantity, str(option))
-                    got = measure(
-                        study, quantity, truth=one, band_set=band_set, option=option, seed=key,
-                        n_draws=n_draws,
-                    )  # fmt: skip
+                    given = {"truth": one, "band_set": band_set, "option": option}
+                    got = measure(study, quantity, **given, seed=key, n_draws=n_draws)
                     span = option or (0.0, np.inf)
                     values = (got.value, got.low, got.high, got.n, got.completeness)
                     rows.append((one.name, band_set, quantity, *span, *values))
-    texts = {
-        "truth": "Name of the truth",
-        "band_set": "Bands of the fit",
-        "quantity": "Name of `QUANTITIES`",
-        "z_low": "Least true redshift",
-        "z_high": "True redshifts are below",
-        "value": "The number",
-        "low": "Lower end of its 68 % interval",
-        "high": "Upper end of its 68 % interval",
-        "n": "Sources",
-        "completeness": "Share of the sources of the field",
-    }
-    return described_rows(rows, texts)
+    return described_rows(rows, declared("miricigale.evaluation", "columns.toml")["numbers"])
 
 
 def found_classes(one, band_set):

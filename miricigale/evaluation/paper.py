@@ -8,7 +8,7 @@ import numpy as np
 
 from miricigale.evaluation.estimates import Estimate
 from miricigale.evaluation.quantities import QUANTITIES, SHARES, measure
-from miricigale.utils.exceptions import unknown_name
+from miricigale.utils.options import check_names
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import described_rows
 
@@ -129,20 +129,15 @@ def compare_with_paper(study, *, seed, n_draws=1000, reasons=None):
     KeyError
         If ``reasons`` has a key that no published number has.
     """
-    seed, reasons = check_seed(seed), dict(reasons or {})
-    keys = [one.key for one in PUBLISHED]
-    for key in reasons:
-        if key not in keys:
-            raise unknown_name("published number", key, keys)
-    rows = []
+    seed, reasons, rows = check_seed(seed), dict(reasons or {}), []
+    check_names(reasons, "published number", [one.key for one in PUBLISHED])
     for one in PUBLISHED:
         if one.quantity == "extra":
             ours = study.extra.get(one.key, Estimate(np.nan))
         else:
-            ours = measure(
-                study, one.quantity, truth=one.truth, band_set=one.band_set, option=one.option,
-                seed=stream(seed, "paper", one.key), n_draws=n_draws,
-            )  # fmt: skip
+            given = {"truth": one.truth, "band_set": one.band_set, "option": one.option}
+            given["seed"] = stream(seed, "paper", one.key)
+            ours = measure(study, one.quantity, **given, n_draws=n_draws)
         sigma = _difference(one, ours)
         text = QUANTITIES.get(one.quantity)
         right = one.quantity == "class_share"
@@ -159,13 +154,9 @@ def compare_with_paper(study, *, seed, n_draws=1000, reasons=None):
 
 def _difference(one, ours):
     """Difference in units of its error; that of the paper is ours, where it has none, for its sample."""
-    delta = ours.value - one.value
-    if (one.relation == "<" and abs(ours.value) <= one.value) or (
-        one.relation == ">" and delta >= 0
-    ):
+    delta = _excess(one, ours)
+    if (one.relation == "<" and delta <= 0) or (one.relation == ">" and delta >= 0):
         return 0.0
-    if one.relation == "<":
-        delta = abs(ours.value) - one.value
     error = np.nan_to_num(ours.error)
     size = one.n or ours.n or 1
     published = one.error or error * np.sqrt((ours.n or size) / size)
@@ -176,6 +167,11 @@ def _difference(one, ours):
     return float(delta / total) if total > 0 else np.nan
 
 
+def _excess(one, ours):
+    """How much our value, or of a bound its size, is above the published one."""
+    return (abs(ours.value) if one.relation == "<" else ours.value) - one.value
+
+
 def _verdict(one, ours, sigma, why):
     """Whether the two agree, in words."""
     if not np.isfinite(ours.value):
@@ -183,7 +179,7 @@ def _verdict(one, ours, sigma, why):
     if one.relation in "<>" and sigma == 0:
         return "within the bound"
     if not np.isfinite(sigma):
-        delta = (abs(ours.value) if one.relation == "<" else ours.value) - one.value
+        delta = _excess(one, ours)
         if abs(delta) <= one.tolerance:
             return f"agrees (to {one.tolerance:g})"
         return f"differs by {delta:+.3g}: {why or 'open'}"

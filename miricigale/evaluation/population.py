@@ -7,39 +7,22 @@ import numpy as np
 from scipy.special import ndtr
 
 from miricigale.sed import stern2015_6um
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.declared import declared
+from miricigale.utils.options import check_that
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import described_table, require_columns, unique_ids
 from miricigale.utils.units import LUMINOSITY, MASS, positive, to_array
 
 _DENSITY = u.Mpc**-3 / u.dex
 
-#: Ueda et al. 2014, table 4 (H0 = 70): A in Mpc^-3, luminosities as log of erg/s.
-_LDDE = {
-    "A": 2.91e-6, "break": 43.97, "gamma1": 0.96, "gamma2": 2.71, "p1": 4.78, "beta1": 0.84, "p2": -1.5,
-    "p3": -6.2, "pivot": 44.0, "z1": 1.86, "la1": 44.61, "alpha1": 0.29, "z2": 3.0, "la2": 44.0,
-    "alpha2": -0.1,
-}  # fmt: skip
+_TABLES = declared("miricigale.evaluation", "population.toml")
+#: Luminosity function of Ueda et al. 2014.
+_LDDE = _TABLES["ldde"]
 #: Obscured fraction of Ueda et al. 2014: at 10^43.75 erg/s and z = 0, evolution, slope, limits, z.
 _PSI = {"at": 0.43, "evolution": 0.48, "slope": 0.24, "low": 0.2, "high": 2.7 / 4.7, "until": 2.0}
 
-#: Davidzon et al. 2017, table 1 (all galaxies, H0 = 70, Chabrier IMF): edges of redshift, log of the
-#: mass, slopes, and densities in 1e-3 Mpc^-3 of the two Schechter functions.
-_SMF_EDGES = (0.2, 0.5, 0.8, 1.1, 1.5, 2.0, 2.5, 3.0, 3.5, 4.5, 5.5)
-_SMF = np.array(
-    [
-        (10.78, -1.38, 1.187, -0.43, 1.92),
-        (10.77, -1.36, 1.070, 0.03, 1.68),
-        (10.56, -1.31, 1.428, 0.51, 2.19),
-        (10.62, -1.28, 1.069, 0.29, 1.21),
-        (10.51, -1.28, 0.969, 0.82, 0.64),
-        (10.60, -1.57, 0.295, 0.07, 0.45),
-        (10.59, -1.67, 0.228, -0.08, 0.21),
-        (10.83, -1.76, 0.090, 0.0, 0.0),
-        (11.10, -1.98, 0.016, 0.0, 0.0),
-        (11.30, -2.11, 0.003, 0.0, 0.0),
-    ]
-)
+#: Edges of redshift, and pairs of Schechter functions between them, of Davidzon et al. 2017.
+_SMF_EDGES, _SMF = (np.array(_TABLES["schechter"][name]) for name in ("edges", "rows"))
 
 #: Aird et al. 2013: slopes of the probability in specific accretion rate below and above the Eddington
 #: limit, and scatter of the black hole's mass in dex.
@@ -233,10 +216,9 @@ class AGNPopulation:
 
     def __post_init__(self):
         least = positive(self.min_luminosity, u.erg / u.s, "min_luminosity")
-        if not 1e41 <= least <= 1e46:
-            raise argument_error("min_luminosity", "from 1e41 to 1e46 erg/s", self.min_luminosity)
-        if not self.compton_thick >= 0:
-            raise argument_error("compton_thick", ">= 0", self.compton_thick)
+        wanted = "from 1e41 to 1e46 erg/s"
+        check_that(1e41 <= least <= 1e46, "min_luminosity", wanted, self.min_luminosity)
+        check_that(self.compton_thick >= 0, "compton_thick", ">= 0", self.compton_thick)
 
     @property
     def _log_l(self):
@@ -327,14 +309,13 @@ class AGNPopulation:
         ValueError, `~astropy.units.UnitsError`
             If a column is missing or has a wrong unit, or an id is there twice.
         """
-        require_columns(
-            table, ("id", "redshift", "stellar_mass"), "table", units={"stellar_mass": MASS}
-        )
+        names = ("id", "redshift", "stellar_mass")
+        require_columns(table, names, "table", units={"stellar_mass": MASS})
         ids = unique_ids(table["id"], "table")
         log_mass, redshift = _galaxies(u.Quantity(table["stellar_mass"]), table["redshift"])
         seed = check_seed(seed)
-        drawn = np.array([stream(seed, "agn", str(key)).uniform(size=2) for key in ids])
-        drawn = drawn.reshape(len(ids), 2)
+        drawn = [stream(seed, "agn", str(key)).uniform(size=2) for key in ids]
+        drawn = np.reshape(drawn, (len(ids), 2))
         probability, log_l = np.zeros(len(ids)), np.full(len(ids), np.nan)
         grid = self._log_l
         for first in range(0, len(ids), _ROWS):
@@ -403,13 +384,12 @@ def _psi(log_l, z):
 
 def _smf(log_mass, z):
     """Mass function in Mpc^-3 dex^-1."""
-    middles = 0.5 * (np.array(_SMF_EDGES[1:]) + _SMF_EDGES[:-1])
+    middles = 0.5 * (_SMF_EDGES[1:] + _SMF_EDGES[:-1])
     place = np.interp(z, middles, np.arange(middles.size))
     low = np.minimum(place.astype(int), middles.size - 2)
     part = place - low
-    return np.exp(
-        (1.0 - part) * _log_schechter(log_mass, low) + part * _log_schechter(log_mass, low + 1)
-    )
+    below, above = (_log_schechter(log_mass, row) for row in (low, low + 1))
+    return np.exp((1.0 - part) * below + part * above)
 
 
 def _log_schechter(log_mass, row):

@@ -14,7 +14,7 @@ from miricigale.evaluation.metrics import OUTLIER
 from miricigale.evaluation.study import TruthResults
 from miricigale.evaluation.xray import half_complete, xray_luminosity_at, yang2021_xray_flux
 from miricigale.filters import Filter
-from miricigale.utils.exceptions import unknown_name
+from miricigale.utils.options import check_names
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import ab_magnitude
 
@@ -69,10 +69,6 @@ def _width(one, band_set):
 
 def _size(values):
     return np.abs(_median(values))
-
-
-def _size_median(values):
-    return _median(np.abs(values))
 
 
 def _high(values):
@@ -163,7 +159,7 @@ def _bright_error(study, one, _, band, draws):
     """Median size of measured minus true magnitude of the 30 brightest of the field in a band."""
     rows = np.flatnonzero(one.field & np.isfinite(one.magnitude_error(band)))
     order = np.argsort(-one.matched[f"{band}_true"][rows])
-    return draws(_size_median, one.magnitude_error(band)[rows[order[:_FEW]]])
+    return draws(_median, np.abs(one.magnitude_error(band)[rows[order[:_FEW]]]))
 
 
 def _signal_to_noise(study, one, _, band, draws):
@@ -350,8 +346,7 @@ def measure(study, quantity, *, truth=0.0, band_set="all", option=None, seed, n_
     >>> measure(study, "z_outliers", seed=1).value
     0.25
     """
-    if quantity not in _MEASURES:
-        raise unknown_name("quantity", quantity, _MEASURES)
+    check_names([quantity], "quantity", _MEASURES)
     one = study.at(truth) if isinstance(truth, (int, float)) else truth
     if one is None and not (truth is None and quantity in _OF_ALL + _TRENDS):
         return Estimate(np.nan)

@@ -60,11 +60,7 @@ def find_filter(text):
     """
     lower = text.lower()
     alone = _ALONE.fullmatch(lower)
-    found = [
-        name
-        for name in FILTERS.names()
-        if lower == name or (alone and lower == name.partition(".")[2])
-    ]
+    found = [n for n in FILTERS.names() if lower in (n, n.partition(".")[2] if alone else n)]
     if len(found) == 1:
         return found[0]
     name = filter_of_band(text)
@@ -135,10 +131,7 @@ def filter_of_band(band):
     if _is_here(band):
         return band
     names, _, free = _tables()
-    if band in names:
-        return names[band]
-    name = _by_rule(band)
-    if name is not None:
+    if name := names.get(band) or _by_rule(band):
         return name
     plain = _BETWEEN.sub(".", _ENDING.sub("", band.strip()))
     for rule, ours in free:

@@ -18,6 +18,7 @@ from miricigale.utils.exceptions import (
     CatalogWarning,
     argument_error,
     data_error,
+    units_error,
     unknown_name,
     warn,
 )
@@ -267,8 +268,7 @@ class CatalogMap:
         if unit is None or unit == u.mag or not (_is_ab(unit) or unit.is_equivalent(FNU)):
             say = "AB magnitudes are units={'flux': 'ABmag'}"
             say = "say it, such as units={'flux': 'uJy'}" if unit is None else say
-            msg = f"'{argument}' column {name!r} must be convertible to {FNU}, got {unit}: {say}"
-            raise u.UnitsError(msg)
+            raise units_error(argument, f"convertible to {FNU}", f"{unit}: {say}", column=name)
         values = plain_floats(table[name], name, argument)
         errors = None
         if error in table.colnames:
@@ -305,8 +305,7 @@ class CatalogMap:
         if ab and (unit in (None, u.mag, u.dimensionless_unscaled) or _is_ab(unit)):
             return _PER_MAGNITUDE * flux * errors
         if unit is None or not unit.is_equivalent(FNU):
-            msg = f"'{argument}' column {name!r} must be convertible to {FNU}, got {unit}"
-            raise u.UnitsError(msg)
+            raise units_error(argument, f"convertible to {FNU}", unit, column=name)
         return u.Quantity(errors, unit).to_value(FNU)
 
 
@@ -321,15 +320,12 @@ def _translated(text, path):
         elif kind in ("F", "E") and number.isdigit():
             name = eazy_filter(number)
             if name is None:
-                raise data_error(
-                    path, f"has no filter here for {theirs} {meaning} (of FILTER.RES.latest)"
-                )
+                what = f"has no filter here for {theirs} {meaning} (of FILTER.RES.latest)"
+                raise data_error(path, what)
             columns[name if kind == "F" else error_column(name)] = theirs
         elif meaning and not meaning.upper().startswith("TOT"):
-            what = (
-                f"must have F or E and a number, id, z_spec or TOT after {theirs}, got {meaning!r}"
-            )
-            raise data_error(path, what)
+            wanted = "F or E and a number, id, z_spec or TOT"
+            raise data_error(path, f"must have {wanted} after {theirs}, got {meaning!r}")
     return columns
 
 

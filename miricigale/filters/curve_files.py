@@ -78,5 +78,4 @@ def _of_text(path, unit):
 
 
 def _unit(word):
-    word = word.lower()
-    return {"u": u.um, "m": u.um, "n": u.nm, "a": u.AA}[word[0]]
+    return {"u": u.um, "m": u.um, "n": u.nm, "a": u.AA}[word[0].lower()]

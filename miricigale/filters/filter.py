@@ -337,8 +337,7 @@ class Filter(Frozen, Interactive):
             return 1.0
         wave, throughput, norm = self._fine
         if self.reference_temperature is None:
-            mean = _core.photon_integral(wave, throughput, 1) / norm
-            return float(self.reference_wavelength.value / mean)
+            return float(self.reference_wavelength.value / self.effective_wavelength.value)
         from astropy.modeling.physical_models import BlackBody
 
         body = BlackBody(temperature=self.reference_temperature)

@@ -23,10 +23,7 @@ def curve_folder():
     """The folder of astro-sedpy with the curves; the package itself is not imported."""
     spec = find_spec("sedpy")
     if spec is None or spec.origin is None:
-        msg = (
-            "astro-sedpy, which holds the filter curves, is not installed: pip install astro-sedpy"
-        )
-        raise DataError(msg)
+        raise DataError("astro-sedpy with its curves is not installed: pip install astro-sedpy")
     return Path(spec.origin).parent / "data" / "filters"
 
 

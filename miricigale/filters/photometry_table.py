@@ -10,7 +10,8 @@ from miricigale.filters.band_names import find_filter
 from miricigale.filters.catalog_files import catalog_messages
 from miricigale.filters.catalog_map import CatalogMap
 from miricigale.filters.library import FILTERS
-from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
+from miricigale.utils.exceptions import CatalogWarning, warn
+from miricigale.utils.options import check_that
 from miricigale.utils.tables import as_table, error_column
 
 # what stands before or after the band in names of fluxes, magnitudes and their errors
@@ -126,9 +127,8 @@ def _our_names(colnames, bands, argument):
         ours = "id" if theirs.lower() in _IDS else _band_of(theirs, bands)
         if ours is None or (ours in colnames):
             continue
-        if ours in found:
-            wanted = f"a table with one column for {ours!r}"
-            raise argument_error(argument, wanted, f"{found[ours]!r} and {theirs!r}")
+        wanted = f"a table with one column for {ours!r}"
+        check_that(ours not in found, argument, wanted, f"{found.get(ours)!r} and {theirs!r}")
         found[ours] = theirs
     for theirs in colnames:
         band = theirs.endswith(_LIMIT) and _band_of(theirs.removesuffix(_LIMIT), bands)

@@ -10,9 +10,7 @@ from miricigale.utils.units import FNU, WAVE, to_array
 
 def check_wave(wave):
     """Wavelengths of a spectrum as an array in um."""
-    wave = (
-        to_array(wave, WAVE, "wave", ndim=1) if hasattr(wave, "unit") else np.asarray(wave, float)
-    )
+    wave = to_array(wave, WAVE, "wave") if hasattr(wave, "unit") else np.asarray(wave, float)
     if wave.ndim != 1 or wave.size < 2 or not np.all(np.diff(wave) > 0):
         raise argument_error("wave", "two or more strictly ascending wavelengths", wave)
     return wave
@@ -58,18 +56,12 @@ def spectrum_arrays(sed, bands):
         wanted = "a spectrum: an SED, (wavelengths, flux densities), or one of specutils or synphot"
         raise argument_error("sed", wanted, type(sed).__name__)
     if not hasattr(wave, "unit"):
-        msg = "'sed' must have wavelengths with a unit, got bare numbers"
-        raise u.UnitsError(msg)
+        raise u.UnitsError("'sed' must have wavelengths with a unit, got bare numbers")
     order = slice(None, None, -1 if wave[-1] < wave[0] else 1)
     wave, flux = check_wave(wave[order]), flux[order]
     plain = getattr(flux, "unit", None) == FNU
-    fnu = to_array(
-        flux,
-        FNU,
-        "sed.fnu",
-        ndim=1,
-        equivalencies=[] if plain else u.spectral_density(wave * WAVE),
-    )
+    spectral = [] if plain else u.spectral_density(wave * WAVE)
+    fnu = to_array(flux, FNU, "sed.fnu", ndim=1, equivalencies=spectral)
     got = f"{fnu.size} for {wave.size} wavelengths"
     check_that(wave.shape == fnu.shape, "sed.fnu", "as many values as sed.wave", got)
     return wave, fnu

@@ -56,6 +56,11 @@ SURVEYS = types.MappingProxyType(
 )
 
 
+def flux_bands(colnames):
+    """Those of some columns that are the fluxes of filters of the library."""
+    return [name for name in colnames if is_band(name) and not name.endswith(error_column(""))]
+
+
 def is_band(name):
     """Whether a column is called by a filter of the library, or is the error of one."""
     band = name.removesuffix(error_column(""))

@@ -12,7 +12,7 @@ from scipy.special import expit, ndtr
 from miricigale.filters import FilterSet
 from miricigale.fitting.likelihood import per_band
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_names, check_that
+from miricigale.utils.options import check_kind, check_names, check_that
 from miricigale.utils.tables import described_table, error_column, require_columns
 from miricigale.utils.units import FNU, WAVE, frozen_array, to_array
 
@@ -100,8 +100,7 @@ def grid_errors(template_error, filters, redshift):
     """Template errors of bands at the redshifts of a grid: shape (nz, nb); None if there are none."""
     if template_error is None:
         return None
-    if not isinstance(template_error, TemplateError):
-        raise argument_error("template_error", "a TemplateError or None", repr(template_error))
+    check_kind(template_error, "template_error", TemplateError)
     return template_error(_pivots(filters) / (1.0 + np.asarray(redshift)[:, None]))
 
 
@@ -138,8 +137,7 @@ def _excess(flux, error, model, scatter):
         within = _MEDIAN * np.hypot(error, part * flux)
         return 0.5 - np.mean(ndtr((within - apart) / scatter) - ndtr((-within - apart) / scatter))
 
-    if excess(_MOST) > 0:
-        raise argument_error("results", "with models near most fluxes", "models that are far off")
+    check_that(not excess(_MOST) > 0, "results", "with models near most fluxes", "others")
     return brentq(excess, 0.0, _MOST, xtol=1e-4) if excess(0.0) > 0 else 0.0
 
 

@@ -11,6 +11,7 @@ from miricigale.fitting.fitter import BayesFitter
 from miricigale.fitting.likelihood import FitFlags, flux_column
 from miricigale.fitting.posterior import randomized_ranks
 from miricigale.fitting.pulls import without_warnings
+from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.random import check_seed, stream
@@ -24,6 +25,7 @@ from miricigale.utils.tables import (
 from miricigale.utils.units import FNU, frozen_array
 
 _LEVELS = (0.16, 0.84)
+_COLUMNS = declared("miricigale.fitting", "columns.toml")
 
 
 def mock_analysis(fitter, results, photometry, *, seed, model_error=False, **options):
@@ -193,16 +195,9 @@ class MockResult:
             parameters of the grid, whose truth lies on a node, the coverage counts randomized
             ranks.
         """
-        texts = {
-            "parameter": "parameter or derived quantity",
-            "unit": "unit of offset and scatter",
-            "n": "objects with a true value that were fitted",
-            "offset": "median of posterior mean less truth",
-            "scatter": "1.48 times the median absolute deviation of the same",
-            "coverage": "part of truths within the 16-84 % interval; 0.68 is right",
-        }
         names = self.parameters if parameters is None else parameters
-        table = described_rows([(name, *self._metric(name)) for name in names], texts)
+        rows = [(name, *self._metric(name)) for name in names]
+        table = described_rows(rows, _COLUMNS["mock"])
         table.meta["mock"] = dict(self.meta)
         return table
 
@@ -307,8 +302,7 @@ def leave_out(fitter, photometry, bands, *, separately=False, **options):
             wanted = f"such that n_bands_min = {fitter.n_bands_min} or more of {fitted} are left"
             raise argument_error("bands", wanted, f"{list(group)}")
     empty = [name for name, known in zip(bands, data.used.any(axis=0), strict=True) if not known]
-    if empty and len(photometry):
-        raise argument_error("bands", "measured for one object at least", f"{empty}")
+    check_that(not (empty and len(photometry)), "bands", "measured for one object at least", empty)
     results = {}
     for group in groups:
         blank = QTable(photometry, copy=True)
@@ -422,15 +416,8 @@ class LeaveOutResult:
             absolute deviation of the pulls; ``within``, the part of pulls within 1 (0.68 if
             errors and models are right).
         """
-        texts = {
-            "band": "band that was left out",
-            "n": "objects measured and predicted",
-            "offset": "median of measured over predicted, less 1",
-            "pull": "median of the pulls",
-            "pull_scatter": "1.48 times their median absolute deviation",
-            "within": "part of the pulls within 1",
-        }
-        return described_rows([(n, *self._metric(i)) for i, n in enumerate(self.bands)], texts)
+        rows = [(name, *self._metric(i)) for i, name in enumerate(self.bands)]
+        return described_rows(rows, _COLUMNS["left_out"])
 
     def _metric(self, i):
         good = np.isfinite(self.pull[:, i])

@@ -2,6 +2,7 @@
 
 import warnings
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -67,28 +68,21 @@ def fit_classes(path, output, *, quasars=False, red_dots=False, stars=None, **op
         from miricigale.sed import red_dots as shapes
 
         options.pop("pairs", None)
+
+        def fit(name, models):
+            found[name] = fit_catalog(path, Path(output) / name, models=models, **options)
+
         # what is of another class has large residuals
         with without_warnings():
             if quasars:
-                made = SEDModel.survey(), quasar_axes()
-                folder = Path(output) / "quasar"
-                found["quasar"] = fit_catalog(path, folder, models=lambda _: made, **options)
+                fit("quasar", lambda _: (SEDModel.survey(), quasar_axes()))
             if red_dots:
-
-                def dots(bands):
-                    return template_grid(shapes(), bands, redshift=RED_DOT_REDSHIFTS), None
-
-                found["red_dot"] = fit_catalog(
-                    path, Path(output) / "red_dot", models=dots, **options
-                )
+                dots = partial(template_grid, shapes(), redshift=RED_DOT_REDSHIFTS)
+                fit("red_dot", lambda bands: (dots(bands), None))
             options.pop("redshift", None)
             if spectra is not None:
-
-                def templates(bands):
-                    return template_grid(spectra, bands, beyond="rayleigh-jeans"), None
-
-                folder = Path(output) / "star"
-                found["star"] = fit_catalog(path, folder, models=templates, **options)
+                templates = partial(template_grid, spectra, beyond="rayleigh-jeans")
+                fit("star", lambda bands: (templates(bands), None))
     return found
 
 

@@ -196,13 +196,12 @@ class BayesFitter(Interactive):
         if scale_error not in (None, True, False) or (compat and scale_error):
             wanted = "False with compat='cigale'" if compat else "True, False or None"
             raise argument_error("scale_error", wanted, repr(scale_error))
-        self.calibration = calibration
         if calibration is not None:
             if template_error is None:
                 of_grid["template_error"] = calibration.template_error
             if settings.mass_function is None:
                 settings = replace(settings, mass_function=calibration.mass_function)
-        self.engine, self.filters = engine, names
+        self.engine, self.calibration = engine, calibration
         self.model = None if isinstance(model, ModelGrid) else model
         scale_error = compat is None if scale_error is None else bool(scale_error)
         kind, more = (GridFit, of_grid) if on_grid else (SamplerFit, {"sampler": engine})
@@ -212,24 +211,20 @@ class BayesFitter(Interactive):
         self.grid = self.backend.grid if on_grid else None
         if names is not None:
             names = tuple(known_filter(name, self.bands, "filter of the grid") for name in names)
-            self.filters = names
+        self.filters = names
         of_bands = self.bands if on_grid else names
         self.n_bands_min = check_count(n_bands_min, "n_bands_min")
-        self.zero_points, factors = {}, {}
+        given = {}
         if calibration is not None:
-            self.zero_points = calibration.of_bands("zero_point", of_bands, 1.0)
-            factors["error_factor"] = calibration.of_bands("error_factor", of_bands, 1.0)
+            for name in ("zero_point", "error_factor"):
+                given[name] = calibration.of_bands(name, of_bands, 1.0)
             if model_error is None:
                 model_error = calibration.of_bands("error_part", of_bands, 0.0)
-        self._reader = PhotometryReader(
-            self.bands,
-            names,
-            per_band(0.1 if model_error is None else model_error, of_bands, "model_error"),
-            per_band(error_floor, of_bands, "error_floor"),
-            self.n_bands_min,
-            self.zero_points,
-            **factors,
-        )
+        model_error = 0.1 if model_error is None else model_error
+        for name, value in (("model_error", model_error), ("error_floor", error_floor)):
+            given[name] = per_band(value, of_bands, name)
+        self._reader = PhotometryReader(self.bands, names, n_bands_min=self.n_bands_min, **given)
+        self.zero_points = self._reader.zero_point
 
     def changed(self, **options):
         """Fitter of the same models with other options, named as for `BayesFitter`."""
@@ -392,13 +387,6 @@ class BayesFitter(Interactive):
             meta=provenance(fit=settings, **self.backend.provenance()),
         )
 
-    def _calibrated(self):
-        """Settings that a calibration has beside those of the fitter."""
-        if self.calibration is None:
-            return {}
-        factors = {"zero_point": self.zero_points, "error_factor": self._reader.error_factor}
-        return {"calibration": self.calibration.name, **factors}
-
     def read_bands(self, photometry, bands):
         """Photometry (`~miricigale.fitting.likelihood.FitData`) of bands, with zero points and its own errors."""
         zero = dict.fromkeys(bands, 0.0)
@@ -409,15 +397,13 @@ class BayesFitter(Interactive):
         unused = unused_bands(photometry, self._reader.fitted(photometry))
         if unused and self.filters is None:
             text = "bands of the photometry that the grid lacks are not fitted"
-            text = f"{text}: {', '.join(unused)}"
-            warn(text, FitWarning)
+            warn(f"{text}: {', '.join(unused)}", FitWarning)
 
     def _prepare(self, photometry, redshift, redshift_prior, repeated=None):
         """Photometry with flags, what is known of the redshift of every object, and the settings."""
         filters = self._reader.fitted(photometry)
-        if redshift is not None and redshift_prior is not None:
-            msg = "'redshift' and 'redshift_prior' must not be given both"
-            raise ValueError(msg)
+        both = redshift is not None and redshift_prior is not None
+        check_that(not both, "redshift_prior", "left out where 'redshift' is given", "both")
         data = self._reader.read(photometry, repeated)
         self.backend.check_data(data)
         flags = np.array(data.flags)
@@ -477,12 +463,16 @@ class BayesFitter(Interactive):
 
     def settings(self, filters=None):
         """Return the settings of the fit, for the meta of results: a dict of plain values."""
+        calibration, known = self.calibration, {}
+        if calibration is not None:
+            known = {"calibration": calibration.name, "zero_point": self.zero_points}
+            known["error_factor"] = self._reader.error_factor
         return {
             "engine": self._engine_name,
             "filters": list(filters or self.filters or self.bands),
             "model_error": dict(self._reader.model_error),
             "error_floor": dict(self._reader.error_floor),
             "n_bands_min": self.n_bands_min,
-            **self._calibrated(),
+            **known,
             **self.backend.settings(),
         }

@@ -129,8 +129,7 @@ def fit_catalog(
     unused = unused_bands(rows.chunk(0), bands)
     if unused:
         why = "as their names ('miricigale filters') or errors are missing"
-        msg = f"bands of the photometry are not fitted, {why}: {', '.join(unused)}"
-        warn(msg, FitWarning)
+        warn(f"bands of the photometry are not fitted, {why}: {', '.join(unused)}", FitWarning)
     if axes in ("survey", "far-infrared"):
         model, nodes = SEDModel.survey(), SEDModel.survey_axes(axes)
     else:
@@ -149,10 +148,7 @@ def fit_catalog(
     given["settings"] = GridSettings(interpolate=interpolate, agn_error=agn_error)
     fitter = BayesFitter(model, bands, axes=nodes, **given)
     if calibrate is not None:
-        given = {name: options.get(name) for name in ("flux_unit", "executor")}
-        fitter = _calibrated(
-            fitter, rows, calibrate, Path(output), options.get("resume", True), **given
-        )
+        fitter = _calibrated(fitter, rows, calibrate, Path(output), options)
     if models is None and fitter.calibration is not None:
         error = 100 * fitter.calibration.template_error.error
         text = "calibration of %s: errors of the models %.0f to %.0f %% of the flux, priors of %s"
@@ -162,18 +158,20 @@ def fit_catalog(
     return fit_file(fitter, path, output, **options)
 
 
-def _calibrated(fitter, rows, column, output, resume, *, flux_unit, executor):
+def _calibrated(fitter, rows, column, output, options):
     """Fitter with the calibration by known redshifts of a catalog, measured unless it is there."""
     from miricigale.fitting.priors import known_redshifts
     from miricigale.fitting.pulls import without_warnings
     from miricigale.fitting.survey import SurveyCalibration, calibrate, with_calibration
 
+    resume, executor = options.get("resume", True), options.get("executor")
     path, name = output / "calibration.ecsv", f"{rows.path.name} by {column} ({rows.sha256[:8]})"
     found = SurveyCalibration.read(path) if resume and path.exists() else None
     if found is None or found.name != name:
         known = []
         for table in map(rows.chunk, range(rows.n_chunks)):
-            give_units(table, {c for b in fitter.bands for c in (b, error_column(b))}, flux_unit)
+            fluxes = {c for b in fitter.bands for c in (b, error_column(b))}
+            give_units(table, fluxes, options.get("flux_unit"))
             known.append(table[np.isfinite(known_redshifts(table, column))])
         table = vstack(known, metadata_conflicts="silent")
         with without_warnings():

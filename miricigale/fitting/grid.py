@@ -289,15 +289,12 @@ class GridEngine(Frozen):
         single = self._rtol >= _SINGLE
         broad = None if self.mixture is None else self.mixture.broad(data, sigma)
         for i in np.flatnonzero(log_prior.max(axis=1, initial=-1e300) > -1e200):
-            target = stated = _core.make_target(
-                data[i], sigma[i], log_prior[i], self.template_error
-            )
+            given = data[i], sigma[i], log_prior[i]
+            target = stated = _core.make_target(*given, self.template_error)
             limits = _core.make_limits(limit[i], inverse[i], getattr(self.mixture, "part", None))
             if broad is not None:
-                more = limit[i], limit_sigma[i] if limits is not None else None
-                target, wrong = self._tangents.touch(
-                    stated, log_prior[i], sigma[i], broad[i], *more
-                )
+                more = broad[i], limit[i], limit_sigma[i] if limits is not None else None
+                target, wrong = self._tangents.touch(stated, log_prior[i], sigma[i], *more)
             tables, target = self._of_masses(target, workspace[2])
             given = tables, self._scales, self._request, target, limits
             sums.draws.state[0] = seeds[i]

@@ -173,9 +173,8 @@ class GridFit:
             wave = error.wave.value.tolist()
             out["template_error"] = {"wave": wave, "error": error.error.tolist()}
         if self.engine.mixture is not None:
-            out["outliers"] = dict(
-                zip(self.filters, self.engine.mixture.part.tolist(), strict=True)
-            )
+            part = self.engine.mixture.part.tolist()
+            out["outliers"] = dict(zip(self.filters, part, strict=True))
         if self.engine.density is not None:
             out["mass_function"] = repr(self.engine.density.mass_function)
         if prior is not None:
@@ -289,7 +288,8 @@ class GridFit:
         if self.compat == "cigale":
             vanished = out.chi2 > VANISHING_CHI2
             flags[vanished] |= int(FitFlags.NO_LIKELIHOOD)
-            _forget(out, vanished)
+            for array in (*out[:-1], *out.joint.values()):
+                array[vanished] = -1 if array.dtype.kind == "i" else np.nan
         axes = self.priors.axes
         pdf = {"redshift": out.zf.sum(axis=2)}
         if self.between is None:
@@ -375,9 +375,3 @@ class GridFit:
 def _draw_piece(engine, n_draws, piece):
     data, log_prior, seeds = piece
     return engine.draw(n_draws=n_draws, seeds=seeds, **data.of_engine(log_prior))
-
-
-def _forget(out, rows):
-    """Leave nothing of these objects, in place."""
-    for array in (*out[:-1], *out.joint.values()):
-        array[rows] = -1 if array.dtype.kind == "i" else np.nan

@@ -133,9 +133,8 @@ class Nodes:
                 values = self.axes[name].values
                 if values.size > 2 and values[0] >= 0:
                     powers = [p for p in _POWERS if p > 0 or values[0] > 0]
-                    power[a] = powers[
-                        np.argmin([kind.bent(name, _scaled(values, p)) for p in powers])
-                    ]
+                    bent = [kind.bent(name, _scaled(values, p)) for p in powers]
+                    power[a] = powers[np.argmin(bent)]
                 scaled[a, : values.size] = _scaled(values, power[a])
             out[label] = _core.Kind(kind.flux, kind.model.ravel(), size, scaled, power)
         return out

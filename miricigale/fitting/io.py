@@ -162,9 +162,10 @@ class FitFolder(RecordFolder):
     remedy = "results of fit_file need a folder of their own"
 
     def parse(self, values):
-        """Facts and records, of which the facts are complete."""
+        """Facts and records, of which the facts are complete; none before the fit is known."""
         facts, parts = super().parse(values)
-        facts["job"]["catalogue"]["rows"], facts["job"]["chunk_rows"]
+        if facts or parts:
+            facts["job"]["catalogue"]["rows"], facts["job"]["chunk_rows"]
         return facts, parts
 
 

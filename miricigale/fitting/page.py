@@ -69,13 +69,9 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None):
     if columns is not None:
         # fits of stars and quasars with galaxies say nothing about the fit
         found = found[np.isin(columns["class"], ["galaxy", ""])]
-    page = SectionWriter(
-        Page(
-            f"Fits of {Path(path).name}",
-            subtitle=f"{len(results)} objects, {len(found.meta['filters'])} bands",
-        ),
-        declared("miricigale.fitting"),
-    )
+    subtitle = f"{len(results)} objects, {len(found.meta['filters'])} bands"
+    report = Page(f"Fits of {Path(path).name}", subtitle=subtitle)
+    page = SectionWriter(report, declared("miricigale.fitting"))
     _notices(page, found)
     others = " or ".join(list(classes)[1:])
     facts = {"n": len(found), "n_all": len(results), "others": others}

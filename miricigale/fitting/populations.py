@@ -51,9 +51,8 @@ def agn_fraction_prior(frac_agn):
     edges = cell_edges(frac, (0.0, 1.0))[1:-1]
     log = np.linspace(-2.0, 2.0, 4001)
     number = 10.0 ** (-0.5 * log) * np.exp(-(10.0**log))
-    above = 1.0 - np.concatenate([[0.0], np.cumsum(0.5 * (number[1:] + number[:-1]))]) / np.sum(
-        0.5 * (number[1:] + number[:-1])
-    )
+    steps = 0.5 * (number[1:] + number[:-1])
+    above = 1.0 - np.concatenate([[0.0], np.cumsum(steps)]) / np.sum(steps)
     # 33,000 solar luminosities for each solar mass of black hole
     rate = edges / (1.0 - edges) * _DUST / (0.5 * _EDDINGTON / _PER_HOLE)
     exceeding = _ACTIVE * np.interp(np.log10(rate), log, above)
@@ -137,9 +136,9 @@ def sfr_log_prior(sfr_prior, grid):
         return None
     pair = isinstance(sfr_prior, tuple) and len(sfr_prior) == 2
     relation, scatter = sfr_prior if pair else (None, None)
-    if not (callable(relation) and is_number(scatter) and scatter > 0):
-        wanted = "a function of stellar mass and redshift, and a scatter in dex above 0"
-        raise argument_error("sfr_prior", wanted, repr(sfr_prior))
+    wanted = "a function of stellar mass and redshift, and a scatter in dex above 0"
+    good = callable(relation) and is_number(scatter) and scatter > 0
+    check_that(good, "sfr_prior", wanted, repr(sfr_prior))
     rate = grid.galaxy_properties["sfr_100myr"].to_value(u.Msun / u.yr / MASS)
     stars = plain(grid.galaxy_properties["stellar_mass"])
     return partial(_log_normal_sfr, relation, float(scatter), grid.redshift[:, None], stars, rate)

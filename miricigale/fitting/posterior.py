@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from miricigale.utils.exceptions import argument_error, unknown_name
-from miricigale.utils.options import check_that
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_names, check_that
 
 #: Letters of the engine's joint sums: redshift and fraction before galaxy, galaxy before AGN model.
 _LETTERS = {"redshift": "z", "frac_agn": "f", "galaxy": "g", "agn": "k"}
@@ -135,8 +135,7 @@ def check_pairs(pairs, axes, constant, derived, wanted):
             if name in constant or (name in axes and axes[name].values.size == 1):
                 several = "of parameters with several values"
                 raise argument_error("pairs", several, f"{name!r}, which has one")
-            if name not in axes:
-                raise unknown_name("parameter for 'pairs'", name, axes)
+            check_names([name], "parameter for 'pairs'", axes)
         names = tuple(map(str, names))
         check_that(names[0] != names[1], "pairs", "of two different parameters", names)
         if set(names) != _ALWAYS and names[::-1] not in out:

@@ -74,8 +74,8 @@ def grid_priors(grid, priors=None, *, prior_f="grid"):
     ValueError
         If weights are no numbers, or are negative, not finite or all zero.
     """
-    if priors is not None and not isinstance(priors, dict):
-        raise argument_error("priors", "a dict of parameters", type(priors).__name__)
+    got = type(priors).__name__
+    check_that(isinstance(priors or {}, dict), "priors", "a dict of parameters", got)
     priors = dict(priors or {})
     check_choice(prior_f, "prior_f", ("grid", "uniform"))
     axes = {}
@@ -147,9 +147,8 @@ def _axis(name, values, unit, kind, priors, bounds=(-np.inf, np.inf)):
         weights = to_array(weights, u.dimensionless_unscaled, argument)
     else:
         weights = to_array(prior, u.dimensionless_unscaled, argument)
-    if weights.shape != values.shape:
-        wanted = f"{values.size} weights, for {name} = {values}"
-        raise argument_error(argument, wanted, f"shape {weights.shape}")
+    wanted = f"{values.size} weights, for {name} = {values}"
+    check_that(weights.shape == values.shape, argument, wanted, f"shape {weights.shape}")
     if not np.all(np.isfinite(weights) & (weights >= 0)) or not weights.sum() > 0:
         raise argument_error(argument, "finite, >= 0 and not all 0", f"{weights}")
     return GridAxis(name, values, unit, kind, weights / weights.sum(), None, bounds)

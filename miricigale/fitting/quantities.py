@@ -8,14 +8,13 @@ import numpy as np
 
 from miricigale.fitting.posterior import cell_percentiles
 from miricigale.utils.options import check_that
-from miricigale.utils.units import LUMINOSITY, MASS
+from miricigale.utils.units import LUMINOSITY, MASS, frozen_array
 
 #: Levels at which the distributions of derived quantities are kept.
-DERIVED_LEVELS = np.array(
+DERIVED_LEVELS = frozen_array(
     [0.001, 0.005, 0.01, 0.025, 0.05, 0.1, 0.16, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5]
     + [0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.84, 0.9, 0.95, 0.975, 0.99, 0.995, 0.999]
 )
-DERIVED_LEVELS.flags.writeable = False
 #: Values of a shape quantity closer than this part of their range are one.
 _SAME = 1e-9
 #: Shape quantities whose outermost cells end at 0.

@@ -18,6 +18,7 @@ from miricigale.fitting.posterior import (
 )
 from miricigale.fitting.quantities import DERIVED_LEVELS, kept_percentiles
 from miricigale.fitting.rows import FitRows
+from miricigale.utils.declared import declared
 from miricigale.utils.interactive import checked_calls
 from miricigale.utils.object_rows import PerObject, PerObjectDict
 from miricigale.utils.options import check_names
@@ -33,14 +34,7 @@ _OUTLIER = 0.15
 _ODDS = f"probability that redshift_p50 is within {_OUTLIER} (1 + z) of the redshift"
 #: Objects that a notebook shows.
 _SHOWN = 20
-_PARTS = {
-    "mean": "posterior mean",
-    "std": "posterior standard deviation",
-    "p16": "16th percentile",
-    "p50": "median",
-    "p84": "84th percentile",
-    "best": "value of the best model",
-}
+_PARTS = declared("miricigale.fitting", "columns.toml")["parameter"]
 
 
 @checked_calls

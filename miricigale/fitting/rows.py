@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from miricigale.fitting.likelihood import FitFlags
-from miricigale.utils.exceptions import argument_error
 from miricigale.utils.object_rows import ObjectRows
+from miricigale.utils.options import check_that
 
 
 class FitRows(ObjectRows):
@@ -33,8 +33,7 @@ class FitRows(ObjectRows):
 
     def _fitted_one(self):
         """Refuse a single object that was not fitted."""
-        if not self.fitted:
-            names = ", ".join(FitFlags.names(self.flags)) or "no draws"
-            got = f"{np.asarray(self.ids).item()!r} ({names})"
-            raise argument_error("key", "the id of an object that was fitted", got)
+        names = ", ".join(FitFlags.names(self.flags)) or "no draws"
+        got = f"{np.asarray(self.ids).item()!r} ({names})"
+        check_that(self.fitted, "key", "the id of an object that was fitted", got)
         return self

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 from miricigale.sed import SEDModel
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.units import check_count, is_number
 
 #: Most models that are moved between the nodes for an object.
@@ -76,25 +76,18 @@ class GridSettings:
     agn_error: float = 0.0
 
     def __post_init__(self):
-        if not (is_number(self.rtol) and 0 <= self.rtol < 0.1):
-            raise argument_error("rtol", "in [0, 0.1)", repr(self.rtol))
-        near = self.redshift_tolerance
-        if near is not None and not (is_number(near) and near >= 0):
-            raise argument_error("redshift_tolerance", ">= 0", repr(near))
-        if check_count(self.interpolate, "interpolate", least=0) > _MOST_MODELS:
-            wanted = f"at most {_MOST_MODELS}"
-            raise argument_error("interpolate", wanted, repr(self.interpolate))
-        if not (
-            is_number(self.agn_error)
-            and self.agn_error >= 0
-            and (self.interpolate or not self.agn_error)
-        ):
-            raise argument_error(
-                "agn_error", "0 or more, and 0 without 'interpolate'", repr(self.agn_error)
-            )
-        if self.finer is not None and not (self.interpolate and isinstance(self.finer, SEDModel)):
-            wanted = "an SEDModel" if self.interpolate else "None without 'interpolate'"
-            raise argument_error("finer", wanted, repr(self.finer))
+        def check(name, good, wanted):
+            check_that(good, name, wanted, repr(getattr(self, name)))
+
+        near, error, finer = self.redshift_tolerance, self.agn_error, self.finer
+        check("rtol", is_number(self.rtol) and 0 <= self.rtol < 0.1, "in [0, 0.1)")
+        check("redshift_tolerance", near is None or (is_number(near) and near >= 0), ">= 0")
+        most = check_count(self.interpolate, "interpolate", least=0)
+        check("interpolate", most <= _MOST_MODELS, f"at most {_MOST_MODELS}")
+        good = is_number(error) and error >= 0 and (most or not error)
+        check("agn_error", good, "0 or more, and 0 without 'interpolate'")
+        wanted = "an SEDModel" if most else "None without 'interpolate'"
+        check("finer", finer is None or (most and isinstance(finer, SEDModel)), wanted)
 
 
 @dataclass(frozen=True)

@@ -120,8 +120,7 @@ def fit_file(
     if not isinstance(path_in, (str, os.PathLike)):
         raise argument_error("path_in", "the path of a catalog", type(path_in).__name__)
     if fitter.engine != "grid":
-        if seed is None:
-            raise argument_error("seed", "given for a sampler, so that it can be resumed", "None")
+        check_that(seed is not None, "seed", "given for a sampler, to resume it", "None")
         seed = check_seed(seed)
     else:
         # the same fit, in whatever order they are given
@@ -140,7 +139,9 @@ def fit_file(
             warn(f"{rows.path.name}: {text}", CatalogWarning)
     fluxes = {c for name in fitter.bands for c in (name, error_column(name))}
     take = _pieces(rows, options, unit, fluxes)
-    _check_ids(rows)
+    for i in range(rows.n_chunks) if "id" in rows.colnames else ():
+        with _noted(rows, i):
+            ascii_ids(read_ids(rows.chunk(i)), "photometry")
     given = {"hdu": hdu, "flux_unit": None if unit is None else unit.to_string()}
     given |= {} if catalog_map is None else {"map": rows.map.settings()}
     job = _job(fitter, rows, options | {"seed": seed}, given)
@@ -159,13 +160,6 @@ def _noted(rows, i):
         start, stop = rows.span(i)
         err.add_note(f"in rows {start} to {stop - 1} of {rows.path}")
         raise
-
-
-def _check_ids(rows):
-    """Refuse ids that parts cannot hold before the first is fitted, not when it is written."""
-    for i in range(rows.n_chunks) if "id" in rows.colnames else ():
-        with _noted(rows, i):
-            ascii_ids(read_ids(rows.chunk(i)), "photometry")
 
 
 def _fit_parts(fitter, rows, take, folder, seed, executor, progress_bar):
@@ -191,6 +185,8 @@ def _fit_parts(fitter, rows, take, folder, seed, executor, progress_bar):
                     if not n_new:
                         warn_of_pulls(results)
                 n_new += 1
+                # the same bytes, whenever they are made
+                results.meta.pop("created", None)
                 folder.save(name, results.write)
                 n_fitted = int(np.count_nonzero(results.fitted))
                 product = {name: folder.describe(name)}

@@ -22,7 +22,8 @@ from miricigale.fitting.populations import MassFunction, agn_fraction_prior
 from miricigale.fitting.priors import known_redshifts
 from miricigale.fitting.pulls import without_warnings
 from miricigale.refdata import locate
-from miricigale.utils.exceptions import DataError, FitWarning, argument_error, warn
+from miricigale.utils.declared import declared
+from miricigale.utils.exceptions import DataError, FitWarning, warn
 from miricigale.utils.options import check_that
 from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import described_rows, described_table, require_columns
@@ -42,15 +43,7 @@ _STARLIGHT = 2.5 * u.um
 #: Least number of sources of a half, and of bands that predict those of an instrument.
 _LEAST, _OTHERS = 50, 4
 _NAME = "miricigale survey calibration"
-_COLUMNS = {
-    "band": "band",
-    "n": "sources of S/N above 5 at rest wavelengths below 2.5 um",
-    "zero_point": "what fluxes and errors are multiplied by",
-    "zero_point_err": "its error: half of the difference of two halves",
-    "error_factor": "what errors are multiplied by besides",
-    "error_part": "part of the flux that is added to the error in quadrature",
-    "outlier": "part of the fluxes that are wrong",
-}
+_COLUMNS, _SCORES = (declared("miricigale.fitting", "columns.toml")[k] for k in ("bands", "scores"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,9 +89,8 @@ class SurveyCalibration:
         require_columns(self.bands, [c for c in _COLUMNS if "_err" not in c and c != "n"], "bands")
 
     def __repr__(self):
-        return (
-            f"<SurveyCalibration {self.name}: {len(self.bands)} bands, {len(self.priors)} priors>"
-        )
+        numbers = f"{len(self.bands)} bands, {len(self.priors)} priors"
+        return f"<SurveyCalibration {self.name}: {numbers}>"
 
     def of_bands(self, column, filters, default):
         """Values of a column for bands: dict by name; ``default`` for those that are not in it."""
@@ -113,10 +105,8 @@ class SurveyCalibration:
             if axis is None or np.size(axis) < 2:
                 continue
             if np.shape(axis) != np.shape(values) or not np.allclose(axis, values, rtol=1e-6):
-                text = (
-                    f"the calibration {self.name!r} has no prior for the values of {name!r}: flat"
-                )
-                warn(text, FitWarning)
+                text = f"the calibration {self.name!r} has no prior for the values of {name!r}"
+                warn(f"{text}: flat", FitWarning)
                 continue
             out[name] = np.array(weights)
         return out
@@ -197,7 +187,6 @@ def calibrate(
     redshift="redshift",
     name="calibration",
     reference=None,
-    apart=None,
     priors=None,
     executor=None,
 ):
@@ -210,7 +199,9 @@ def calibrate(
     are wrong (``outlier``). Each of two halves of the sources, every other one, is measured by itself, and
     fitted with free redshifts with what was found on the other: the scores. What is returned is the mean of
     both, with half of their difference as error. These are six fits of the sources at their redshifts, on nodes,
-    five more for each instrument that is measured apart, and two with free redshifts.
+    five more for each instrument that is measured apart, and two with free redshifts. Apart are those without a
+    band below 5 um, such as MIRI: their errors are measured from what the others predict of starlight, and their
+    zero points are left as they are.
 
     Parameters
     ----------
@@ -225,10 +216,6 @@ def calibrate(
         What results call it.
     reference : str, optional
         Band whose zero point is 1: by default that of the most sources of S/N above 5.
-    apart : list of str, optional
-        Instruments, as the names of their filters begin, whose errors of bands are measured from what the others
-        predict of starlight, and whose zero points are left as they are: by default those without a band below
-        5 um, such as MIRI.
     priors : dict, optional
         Weights of the values of parameters that are not measured: by default those of `agn_fraction_prior`, for
         templates that do not fit make AGN where there are none. ``{}`` measures all.
@@ -259,13 +246,10 @@ def calibrate(
     check_that(fitter.grid is not None, "fitter", "one with a grid", fitter.engine)
     table = fitter.table_of(photometry)
     z = known_redshifts(table, redshift)
-    rows = np.flatnonzero(
-        np.isfinite(z) & (z >= fitter.grid.redshift[0]) & (z <= fitter.grid.redshift[-1])
-    )
-    if rows.size < 2 * _LEAST:
-        raise argument_error(
-            "photometry", f"with {2 * _LEAST} known redshifts or more", f"{rows.size}"
-        )
+    # none of NaN
+    rows = np.flatnonzero((z >= fitter.grid.redshift[0]) & (z <= fitter.grid.redshift[-1]))
+    wanted = f"with {2 * _LEAST} known redshifts or more"
+    check_that(rows.size >= 2 * _LEAST, "photometry", wanted, rows.size)
     if priors is None:
         axis = fitter.priors.axes.get("frac_agn")
         some = axis is not None and axis.values.size > 1 and axis.values[0] == 0
@@ -280,22 +264,13 @@ def calibrate(
     before, after = [], []
     # what there is to say of the catalog was said of all of it
     with without_warnings():
-        given = name, reference, apart, priors, options
-        found = [_measure(fitter, *half, *given) for half in halves]
+        found = [_measure(fitter, *half, name, reference, priors, options) for half in halves]
         for (some, _), other in zip(halves, found[::-1], strict=True):
             before.append(fitter.fit(some, **options))
             after.append(with_calibration(fitter, other).fit(some, **options))
     true = np.concatenate([half[1] for half in halves])
     lines = [(label, *_score(fits, true)) for label, fits in (("before", before), ("after", after))]
-    texts = {
-        "fit": "before or after the calibration, of the other half",
-        "n": "sources fitted",
-        "bias": "median of dz / (1 + z)",
-        "sigma_mad": "1.48 times its median absolute deviation",
-        "outliers": "part beyond 0.15",
-        "inside": "part within their 16-84 % interval",
-    }
-    return dataclasses.replace(_mean(found), scores=described_rows(lines, texts))
+    return dataclasses.replace(_mean(found), scores=described_rows(lines, _SCORES))
 
 
 def _fitted(fitter, table):
@@ -314,7 +289,7 @@ def _score(fits, true):
     return int(good.sum()), metrics.bias, metrics.sigma_mad, metrics.outlier_fraction, inside
 
 
-def _measure(fitter, table, z, name, reference, apart, priors, options):
+def _measure(fitter, table, z, name, reference, priors, options):
     """`SurveyCalibration` of some sources at their redshifts."""
     options = {"redshift": z, **options}
     # errors and priors are of what the nodes leave
@@ -323,13 +298,15 @@ def _measure(fitter, table, z, name, reference, apart, priors, options):
     bands = _fitted(fitter, table)
     used = fitter.read_bands(table, bands).used.any(axis=0)
     measured = {band for band, known in zip(bands, used, strict=True) if known}
-    zero, factor, part = dict.fromkeys(bands, (1.0, 0)), {}, {}
-    wrong = dict.fromkeys(bands, 0.0)
-    weights, error = {}, None
-    groups = _instruments(bands, apart)
+    zero, factor = dict.fromkeys(bands, (1.0, 0)), dict.fromkeys(bands, 1.0)
+    part, wrong = dict.fromkeys(bands, 0.0), dict.fromkeys(bands, 0.0)
+    weights, error, groups = {}, None, _instruments(bands)
 
     def current():
-        return _calibration(fitter, name, zero, factor, part, wrong, error, weights)
+        rows = [(b, n, point, 0.0, factor[b], part[b], wrong[b]) for b, (point, n) in zero.items()]
+        known = {n: (fitter.priors.axes[n].values, w) for n, w in weights.items()}
+        found = name, described_rows(rows, _COLUMNS), error, known, MassFunction()
+        return SurveyCalibration(*found)
 
     now = fitter.changed(model_error=_FIRST, template_error=None, calibration=None)
     for turn in range(_TURNS):
@@ -344,7 +321,7 @@ def _measure(fitter, table, z, name, reference, apart, priors, options):
         if turn:
             now = with_calibration(fitter, current())
         fit = now.fit(table, **options)
-        error = measure_template_error(fit, model_error={b: part.get(b, 0.0) for b in bands})
+        error = measure_template_error(fit, model_error=part)
         points = calibrate_zero_points(fit, reference=reference, longest=_STARLIGHT)
         # one pass finds a part of them, since models follow the fluxes; where errors are measured apart too few
         # fluxes are left for it
@@ -376,16 +353,14 @@ def with_calibration(fitter, calibration):
     return fitter.changed(calibration=calibration, **none)
 
 
-def _instruments(bands, apart):
-    """Bands of each of the instruments that are measured apart, by default those of long wavelengths."""
+def _instruments(bands):
+    """Bands of each of the instruments that are measured apart: those of long wavelengths."""
     groups = {}
     for band in bands:
         groups.setdefault(band.split(".")[0], []).append(band)
     pivots = {band: Filter.from_name(band).pivot for band in bands}
-    if apart is None:
-        apart = [name for name, some in groups.items() if min(map(pivots.get, some)) > _LONG]
-    found = (groups.get(name, ()) for name in apart)
-    return [group for group in found if group and len(bands) - len(group) >= _OTHERS]
+    long = [some for some in groups.values() if min(map(pivots.get, some)) > _LONG]
+    return [some for some in long if len(bands) - len(some) >= _OTHERS]
 
 
 def _longer(before, now, power):
@@ -396,16 +371,6 @@ def _longer(before, now, power):
         step = np.divide(weights, old, out=np.zeros(weights.size), where=old > 0) ** power * old
         out[name] = step / step.sum()
     return out
-
-
-def _calibration(fitter, name, zero, factor, part, wrong, error, weights):
-    values = {n: axis.values for n, axis in fitter.priors.axes.items()}
-    rows = [
-        (b, n, point, 0.0, factor.get(b, 1.0), part.get(b, 0.0), wrong[b])
-        for b, (point, n) in zero.items()
-    ]
-    priors = {n: (values[n], w) for n, w in weights.items()}
-    return SurveyCalibration(name, described_rows(rows, _COLUMNS), error, priors, MassFunction())
 
 
 def _mean(found):

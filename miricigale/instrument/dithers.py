@@ -9,6 +9,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import Table
 
+from miricigale.instrument.figures import table
 from miricigale.instrument.siaf import aperture, imager_columns
 from miricigale.utils.exceptions import DataError, argument_error, data_error
 from miricigale.utils.files import reading, unpacked_size
@@ -20,33 +21,7 @@ from miricigale.utils.units import ANGLE, check_count, to_array
 # sides of the pixel at the reference, arcsec (SIAF)
 _PIXEL = (0.110497, 0.111336)
 
-# In pixels, (x, y): steps of a few arcsec step over bad pixels and cosmic rays, and the
-# fractions (thirds, halves) sample the pixel grid evenly. They have the form of the
-# observatory's patterns, not the digits of its tables.
-_PATTERNS = {
-    # three points on a slanted line, thirds of a pixel apart in phase; three more fill the
-    # sixths
-    "ceers": [
-        (0.0, 0.0),
-        (-22.0 - 1 / 3, 14.0 + 1 / 3),
-        (23.0 + 1 / 3, -15.0 + 2 / 3),
-        (12.0 + 1 / 2, 30.0 + 1 / 2),
-        (-33.0 + 1 / 6, -9.0 - 1 / 6),
-        (34.0 - 1 / 6, -28.0 + 1 / 6),
-    ],
-    # a box whose corners differ by half a pixel in x, in y, in both
-    "4-point": [(10.0, 15.0), (-10.5, 15.5), (-10.0, -15.5), (10.5, -15.0)],
-    "none": [(0.0, 0.0)],
-}
-
-
-#: Cycling patterns: standard deviation and largest radius in pixels. Gaussian as IRAC's, from
-#: which the observatory's are taken, the small one without its middle.
-_CYCLING = {
-    "cycling-small": (8.0, 11.0),
-    "cycling-medium": (26.0, 64.0),
-    "cycling-large": (52.0, 128.0),
-}
+#: Points of the cycling patterns.
 _N_CYCLING = 311
 #: Half pixels in turn.
 _PHASES = ((0.0, 0.0), (0.5, 0.0), (0.5, 0.5), (0.0, 0.5))
@@ -56,7 +31,7 @@ _PHASES = ((0.0, 0.0), (0.5, 0.0), (0.5, 0.5), (0.0, 0.5))
 def _cycling(name):
     from scipy.stats.qmc import Halton
 
-    sigma, limit = _CYCLING[name]
+    sigma, limit = table("dithers")["cycling"][name]
     # evenly spread over 0 to 1 from any start; without the first, which is zero
     share, turn = Halton(2, scramble=False).random(_N_CYCLING + 1)[1:].T
     inner = (0.4 * limit if name == "cycling-small" else 0.0) ** 2 / (2 * sigma**2)
@@ -70,7 +45,8 @@ def _cycling(name):
 
 
 def _points(pattern):
-    return _cycling(pattern) if pattern in _CYCLING else np.array(_PATTERNS[pattern])
+    fixed = table("dithers")["points"]
+    return np.array(fixed[pattern]) if pattern in fixed else _cycling(pattern)
 
 
 def dither_patterns():
@@ -83,7 +59,7 @@ def dither_patterns():
     >>> dither_patterns()
     ('ceers', '4-point', 'none', 'cycling-small', 'cycling-medium', 'cycling-large')
     """
-    return (*_PATTERNS, *_CYCLING)
+    return tuple(name for kind in table("dithers").values() for name in kind)
 
 
 def dither_offsets(pattern, n=None, *, start=0):

@@ -7,7 +7,6 @@ from markupsafe import Markup
 
 from miricigale.pages.rendering import image_of, macros, render
 from miricigale.pages.values import Missing
-from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
 from miricigale.utils.store import replacing
 
@@ -84,13 +83,8 @@ class Page:
 
     def items(self, pairs):
         """Add headline numbers: (label, value) pairs of text; a value may be `Missing`."""
-        self._add(
-            "items",
-            [
-                (label + f" ({value.reason})" if isinstance(value, Missing) else label, value)
-                for label, value in pairs
-            ],
-        )
+        named = [(k + f" ({v.reason})" if isinstance(v, Missing) else k, v) for k, v in pairs]
+        self._add("items", named)
 
     def table(self, rows, *, header, caption="", empty="", text=1):
         """
@@ -117,9 +111,8 @@ class Page:
             ``empty``.
         """
         rows = [tuple(row) for row in rows]
-        if any(len(row) != len(header) for row in rows):
-            lengths = sorted({len(row) for row in rows})
-            raise argument_error("rows", f"{len(header)} cells in each row", lengths)
+        lengths = {len(row) for row in rows}
+        check_that(lengths <= {len(header)}, "rows", f"{len(header)} cells in each row", lengths)
         if not rows:
             check_that(empty, "rows", "at least one, or 'empty' for the sentence", "none")
             return self.text(empty)
@@ -129,10 +122,7 @@ class Page:
             reason: Markup("{}<sup>{}</sup>").format(cell, k) if len(reasons) > 1 else cell
             for k, (reason, cell) in enumerate(reasons.items(), start=1)
         }
-        shown = [
-            [marks[cell.reason] if isinstance(cell, Missing) else cell for cell in row]
-            for row in rows
-        ]
+        shown = [[marks[c.reason] if isinstance(c, Missing) else c for c in row] for row in rows]
         words = range(text) if isinstance(text, int) else text
         return self._add("table", shown, header, set(words), caption, marks)
 
@@ -153,13 +143,8 @@ class Page:
 
     def to_html(self):
         """The page as text."""
-        return render(
-            "page.html",
-            title=self.title,
-            subtitle=self.subtitle,
-            notices=self.notices,
-            sections=self._sections,
-        )
+        values = {name: getattr(self, name) for name in ("title", "subtitle", "notices")}
+        return render("page.html", sections=self._sections, **values)
 
     def write(self, path):
         """

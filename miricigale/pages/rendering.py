@@ -55,13 +55,10 @@ def image_of(figure, dpi):
 
     if figure.get_layout_engine() is None:
         figure.set_layout_engine("constrained")
-    vectors = _count_marks(figure) <= _MOST_MARKS
     # dates and the version of matplotlib are omitted, and ids do not depend on chance
-    kind, options = (
-        ("svg+xml", {"format": "svg", "metadata": {"Date": None, "Creator": None}})
-        if vectors
-        else ("png", {"format": "png", "metadata": {"Software": None}, "dpi": 2 * dpi})
-    )
+    kind, options = "png", {"format": "png", "metadata": {"Software": None}, "dpi": 2 * dpi}
+    if _count_marks(figure) <= _MOST_MARKS:
+        kind, options = "svg+xml", {"format": "svg", "metadata": {"Date": None, "Creator": None}}
     buffer = io.BytesIO()
     with rc_context({"svg.hashsalt": "miricigale"}):
         figure.savefig(buffer, **options)

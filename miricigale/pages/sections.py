@@ -101,11 +101,7 @@ class SectionWriter:
             for header, *column in table.get("columns", [(key, key) for key in keys])
             if column[0] in keys
         }
+        cells = [[cell_of(row, column) for column in columns.values()] for row in rows]
+        about = {key: sentence(table.get(key, ""), facts) for key in ("caption", "empty")}
         with self.folding(name, **facts):
-            self.report.table(
-                [[cell_of(row, column) for column in columns.values()] for row in rows],
-                header=tuple(columns),
-                caption=sentence(table.get("caption", ""), facts),
-                empty=sentence(table.get("empty", ""), facts),
-                text=table.get("text", 1),
-            )
+            self.report.table(cells, header=tuple(columns), text=table.get("text", 1), **about)

@@ -8,6 +8,7 @@ from .corrections import flux_scaling as flux_scaling
 from .detection import DETECTION_PRESETS as DETECTION_PRESETS
 from .detection import DetectionFlags as DetectionFlags
 from .detection import DetectionPreset as DetectionPreset
+from .detection import chi_image as chi_image
 from .detection import detect_sources as detect_sources
 from .detection import detection_purity as detection_purity
 from .error_calibration import ErrorCalibration as ErrorCalibration
@@ -16,6 +17,8 @@ from .fields import SmoothField as SmoothField
 from .flags import ForcedFlags as ForcedFlags
 from .forced import ForcedPhotometer as ForcedPhotometer
 from .from_files import measure_files as measure_files
+from .image_noise import ImageErrors as ImageErrors
+from .image_noise import image_errors as image_errors
 from .injection import calibrate_errors as calibrate_errors
 from .mosaics import MosaicFile as MosaicFile
 from .mosaics import as_mosaic as as_mosaic
@@ -31,6 +34,5 @@ from .settings import ErrorSettings as ErrorSettings
 from .settings import MemorySettings as MemorySettings
 from .sky_noise import weight_scale as weight_scale
 from .sources import SourceTemplates as SourceTemplates
-from .stars import psf_photometry as psf_photometry
 from .surveys import YANG2021_DEPTHS as YANG2021_DEPTHS
 from .yang2021 import Yang2021Photometer as Yang2021Photometer

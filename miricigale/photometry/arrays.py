@@ -187,6 +187,13 @@ def pixel_scale(wcs):
     return float(np.sqrt(np.prod(proj_plane_pixel_scales(wcs.celestial))) * 3600.0)
 
 
+def same_grid(one, other):
+    """Whether two WCSs put a square of pixels at the same places (to 1e-3 pixel)."""
+    x, y = np.array([0.0, 1000.0, 0.0, 1000.0]), np.array([0.0, 0.0, 1000.0, 1000.0])
+    found = other.world_to_pixel(one.pixel_to_world(x, y))
+    return bool(np.all(np.abs(np.array(found) - [x, y]) < 1e-3))
+
+
 def fine_wcs(image_wcs, shape, scale):
     """North-up grid of pixels of ``scale`` arcsec about the middle of an image."""
     middle = image_wcs.pixel_to_world((shape[1] - 1) / 2, (shape[0] - 1) / 2).icrs

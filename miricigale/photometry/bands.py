@@ -1,14 +1,22 @@
 """Several bands with the same sources: measured with the same templates, joined in one table."""
 
+import dataclasses
+
 import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable, Table
 
+from miricigale.photometry.arrays import sky_pixels
+from miricigale.photometry.catalogs import joined_sky
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.forced import ForcedPhotometer
+from miricigale.photometry.mosaics import as_mosaic, own_pixels
+from miricigale.photometry.packaging import new_ids
+from miricigale.photometry.results import band_column
+from miricigale.photometry.sources import SourceTemplates
+from miricigale.photometry.stars import with_stars
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
-from miricigale.utils.tables import error_column
 
 
 def measure_bands(images, kernels, templates, **options):
@@ -77,6 +85,80 @@ def measure_bands(images, kernels, templates, **options):
     return results
 
 
+def measure_prior(images, photometers, highres, segmentation, catalog):
+    """
+    Measure the sources of a prior on images of several bands, and with them what any of these shows beyond it.
+
+    Parameters
+    ----------
+    images, photometers : dict of str to `~astropy.nddata.CCDData` and to `ForcedPhotometer`
+        By name of the filter, with the same templates.
+    highres, segmentation, catalog
+        As for `ForcedPhotometer.measure`.
+
+    Returns
+    -------
+    results : dict of str to `ForcedPhotometryResult`
+        Of the same sources in all bands: those of the catalog, and after them new ones, flagged
+        ``NOT_IN_CATALOG``, where a photometer found some. Of those within half the width of the PSF of one that
+        another band has shown there is one.
+    """
+    images = {name: own_pixels(as_mosaic(image)) for name, image in images.items()}
+    starred = {
+        name: with_stars(one, images[name], catalog, highres)
+        for name, one in photometers.items()
+        if one.psf_stars and not one.bare
+    }
+    photometers = photometers | {name: one for name, (one, _) in starred.items()}
+    results = _measure_prior(images, photometers, highres, segmentation, catalog)
+    return results | {name: stars.noted(results[name]) for name, (_, stars) in starred.items()}
+
+
+def _measure_prior(images, photometers, highres, segmentation, catalog):
+    """As `measure_prior`, without stars."""
+    # without PSFs there are no wings
+    first = min(photometers.values(), key=lambda one: one.bare)
+    near = np.zeros(len(catalog), bool)
+    for name, image in images.items():
+        reach = len(photometers[name].mean_kernel.target)
+        xy = sky_pixels(catalog["sky"], image.wcs, image.shape, reach)
+        near |= np.isfinite(xy[:, 0])
+    templates = first._templates(highres, segmentation, catalog[near])
+    if not near.all():
+        parts = [templates, SourceTemplates.from_catalog(catalog[~near])]
+        order = np.argsort(np.concatenate([np.flatnonzero(near), np.flatnonzero(~near)]))
+        joined = SourceTemplates.concatenate(parts)[order]
+        templates = dataclasses.replace(joined, meta=templates.meta)
+    if first.bare:
+        # kernels are not alike
+        templates = dataclasses.replace(templates, psf=None)
+    results = measure_bands(images, photometers, templates)
+    sky = SkyCoord([], [], unit="deg")
+    for result in results.values():
+        new = [] if result.new_sources is None else result.new_sources["sky"].icrs
+        if len(new) and len(sky):
+            new = new[new.match_to_catalog_sky(sky)[1] > result.psf_fwhm / 2]
+        sky = joined_sky([sky, new]) if len(new) else sky
+    if not len(sky):
+        return results
+    points = SourceTemplates.from_catalog(
+        QTable({"id": new_ids(templates.id, len(sky)), "sky": sky})
+    )
+    known = {"flags": int(ForcedFlags.NOT_IN_CATALOG)}
+    known |= {
+        k: v for k, v in (("flux", 0.0), ("components", 1)) if getattr(templates, k) is not None
+    }
+    points = dataclasses.replace(points, **{k: np.full(len(sky), v) for k, v in known.items()})
+    every = dataclasses.replace(
+        SourceTemplates.concatenate([templates, points]), meta=templates.meta
+    )
+    again = {name: one.replace(second_pass=False) for name, one in photometers.items()}
+    found = measure_bands(images, again, every)
+    for name, result in found.items():
+        result.meta["second_pass"] = results[name].meta["second_pass"]
+    return found
+
+
 def join_bands(results):
     """
     Put the photometry of several bands in one table, by id.
@@ -126,7 +208,8 @@ def join_bands(results):
             rows.setdefault(key, (one, k))
     ids = list(rows)
     sky = [one["sky"][k].icrs for one, k in rows.values()] if len(tables) > 1 else []
-    joined = QTable(meta=provenance(stage="photometry"))
+    bands = {name: dict(one.meta) for name, one in tables.items() if one.meta}
+    joined = QTable(meta=provenance(stage="photometry") | ({"bands": bands} if bands else {}))
     first = next(iter(tables.values()))
     joined["id"] = np.array(ids, dtype=np.asarray(first["id"]).dtype if not ids else None)
     same = all(np.array_equal(one["id"], first["id"]) for one in tables.values())
@@ -135,11 +218,9 @@ def join_bands(results):
         at = {key: k for k, key in enumerate(np.asarray(one["id"]).tolist())}
         index = np.array([at.get(key, -1) for key in ids], int)
         for column in one.colnames:
-            if column in ("id", "sky"):
+            label = band_column(column, name)
+            if label == column:
                 continue
-            label = {"flux": name, error_column("flux"): error_column(name)}.get(
-                column, f"{name}_{column}"
-            )
             joined[label] = spread_rows(one[column], index, column)
             joined[label].info.description = one[column].info.description
     return joined

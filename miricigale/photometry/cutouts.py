@@ -3,12 +3,16 @@
 import dataclasses
 
 import numpy as np
+import scipy.ndimage
 
 from miricigale.photometry._core.sampling import convolve_batch
 from miricigale.photometry.flags import ForcedFlags
 
 #: Rim of zeros around fine stamps, for the splines and the pixel response to fade in.
 RIM = 8
+
+#: Least number of pixels of a flat top.
+_FLAT = 5
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -67,6 +71,53 @@ def own_segments(segmentation, labels, xy):
         label[losers] = 0
         flags[losers] |= int(ForcedFlags.SHARED_SEGMENT)
     return label, flags
+
+
+def saturated_cores(data, usable, segmentation, label, xy, width):
+    """
+    Find sources whose core a detector could not measure.
+
+    Parameters
+    ----------
+    data : `~numpy.ndarray`, shape (ny, nx)
+        The image.
+    usable : bool `~numpy.ndarray`, shape (ny, nx)
+        Pixels with data.
+    segmentation : int `~numpy.ndarray`, shape (ny, nx)
+        Label of each pixel.
+    label : int `~numpy.ndarray`, shape (n,)
+        Label of each source, 0 for none.
+    xy : `~numpy.ndarray`, shape (n, 2)
+        Positions.
+    width : float
+        Full width at half maximum of the PSF in pixels.
+
+    Returns
+    -------
+    saturated : bool `~numpy.ndarray`, shape (n,)
+        Whether pixels without data, but with data all around, are within half the width of the position, or
+        five pixels or more of the segment have the value of its brightest.
+    flat : bool `~numpy.ndarray`, shape (ny, nx)
+        Pixels of flat tops.
+    """
+    holes, flat = scipy.ndimage.binary_fill_holes(usable) & ~usable, np.zeros(data.shape, bool)
+    saturated, places = np.zeros(len(label), bool), scipy.ndimage.find_objects(segmentation)
+    reach = max(width / 2, 1.0)
+    for k, one in enumerate(label):
+        if not 0 < one <= len(places) or places[one - 1] is None:
+            continue
+        place = places[one - 1]
+        own = (segmentation[place] == one) & usable[place]
+        light = np.where(own, data[place], -np.inf)
+        # a solid angle may have been multiplied
+        top = own & (light > (1 - 1e-6) * light.max())
+        if np.count_nonzero(top) >= _FLAT:
+            flat[place] |= top
+            saturated[k] = True
+        low = np.maximum(np.ceil(xy[k, ::-1] - reach), 0).astype(int)
+        high = np.maximum(np.floor(xy[k, ::-1] + reach), -1).astype(int) + 1
+        saturated[k] |= holes[low[0] : high[0], low[1] : high[1]].any()
+    return saturated, flat
 
 
 def convolve_padded(array, response):

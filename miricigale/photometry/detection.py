@@ -6,19 +6,24 @@ import astropy.units as u
 import numpy as np
 import scipy.ndimage
 from astropy.coordinates import SkyCoord
+from astropy.nddata import StdDevUncertainty
 from astropy.stats import poisson_conf_interval
 from photutils.segmentation import SegmentationImage, make_2dgaussian_kernel
+from scipy.special import gammaln
 
-from miricigale.photometry.arrays import image_arrays, pixel_scale
+from miricigale.instrument.image import Image
+from miricigale.photometry.arrays import image_arrays, pixel_scale, same_grid
 from miricigale.photometry.mosaics import as_mosaic
 from miricigale.photometry.segments import dilate_segments, dilation_rule
+from miricigale.photometry.sky_noise import sky_noise
+from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_names, check_positive
 from miricigale.utils.sep_tools import background as sep_background
 from miricigale.utils.sep_tools import extract
-from miricigale.utils.tables import Flags, described_table
-from miricigale.utils.units import ANGLE, FNU, positive
+from miricigale.utils.tables import Flags, described_columns
+from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, positive
 
 
 class DetectionFlags(Flags):
@@ -196,6 +201,83 @@ def detect_sources(
     return SegmentationImage(labels), _catalog(objects, found, labels, arrays, meta)
 
 
+def chi_image(images):
+    """
+    Add images of several bands up to one in which sources of any color are detected.
+
+    Parameters
+    ----------
+    images : iterable of `~astropy.nddata.CCDData`, path-like or other (see `as_mosaic`)
+        On the same pixels, best of the same resolution. Of each the sky is subtracted and the noise measured, on
+        source-free pixels.
+
+    Returns
+    -------
+    image : `~astropy.nddata.CCDData`
+        Root of the sum of squares of the pixels over their noise, less its mean on empty sky, in MJy/sr: times
+        the noise of the first image. The uncertainty is the standard deviation on empty sky. A pixel has as many
+        bands as have data there; without any it is masked. Its segments are those of sources, its values are no
+        fluxes.
+
+    Raises
+    ------
+    ValueError
+        If there is no image, or they are not on the same pixels.
+
+    Notes
+    -----
+    On empty sky with Gaussian noise the root follows the chi distribution with as many degrees of freedom as there
+    are bands.
+
+    References
+    ----------
+    Szalay, Connolly & Szokoly 1999, AJ 117, 68.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.nddata import CCDData
+    >>> from miricigale.instrument import north_up_wcs
+    >>> from miricigale.photometry import chi_image
+    >>> sky = SkyCoord(53.1, -27.8, unit="deg")
+    >>> wcs = north_up_wcs(sky, 0.1 * u.arcsec, (200, 200))
+    >>> noise = np.random.default_rng(1).normal(0, 1, (3, 200, 200))
+    >>> chi = chi_image([CCDData(one, unit="MJy / sr", wcs=wcs) for one in noise])
+    >>> (chi.data / chi.uncertainty.array).std().round(2)
+    np.float64(1.0)
+    """
+    images = [as_mosaic(one, "images") for one in images]
+    arrays = [image_arrays(one, "images") for one in images]
+    if not arrays or any(
+        one.flux.shape != arrays[0].flux.shape or not same_grid(one.wcs, arrays[0].wcs)
+        for one in arrays
+    ):
+        raise argument_error(
+            "images", "at least one, all on the same pixels", f"{len(arrays)} images"
+        )
+    square, n = (np.zeros(arrays[0].flux.shape) for _ in range(2))
+    for one in arrays:
+        values = one.flux / one.sigma
+        level, rms, _ = sky_noise(values, one.usable)
+        square += np.where(one.usable, (values - level) / rms, 0.0) ** 2
+        n += one.usable
+    sigma = np.where(arrays[0].usable, arrays[0].sigma / arrays[0].area, np.nan)
+    sigma = np.where(np.isfinite(sigma), sigma, np.nanmedian(sigma))
+    # mean of the chi distribution
+    mean = np.sqrt(2.0) * np.exp(gammaln((n + 1) / 2) - gammaln(np.maximum(n, 1) / 2))
+    spread = np.where(n > 0, np.sqrt(np.maximum(n - mean**2, 0)), np.nan)
+    return Image(
+        (np.sqrt(square) - mean) * sigma,
+        unit=SURFACE_BRIGHTNESS,
+        wcs=arrays[0].wcs,
+        mask=n == 0,
+        uncertainty=StdDevUncertainty(spread * sigma),
+        meta={"bands": [one.meta.get("filter") for one in images]},
+    )
+
+
 def detection_purity(image, *, snr_edges=None, preset="yang2021", **settings):
     """
     Estimate which share of the detections is real, from the image's negative.
@@ -286,18 +368,10 @@ def detection_purity(image, *, snr_edges=None, preset="yang2021", **settings):
         )
         above = [np.cumsum(n[::-1])[::-1] for n in counts]
         purity_above = np.where(above[0] > 0, 1 - above[1] / above[0], np.nan)
-    columns = {
-        "snr_low": (edges[:-1], "Least signal-to-noise of a segment"),
-        "snr_high": (edges[1:], "Largest signal-to-noise, not included"),
-        "n_positive": (n_positive, "Detections on the image"),
-        "n_negative": (n_negative, "Detections on its negative"),
-        "purity": (purity, "1 - n_negative / n_positive"),
-        "purity_low": (low, "Lower end of the 68 % interval"),
-        "purity_high": (high, "Upper end of the 68 % interval"),
-        "purity_above": (purity_above, "Purity of all detections from snr_low on"),
-    }
+    texts = declared("miricigale.photometry", "columns.toml")["purity"]
     meta = provenance(n_positive=len(positive), n_negative=len(negative))
-    return described_table(columns, {**meta, **dataclasses.asdict(settings)})
+    values = edges[:-1], edges[1:], *counts, purity, low, high, purity_above
+    return described_columns(values, texts, {**meta, **dataclasses.asdict(settings)})
 
 
 def _prepared(
@@ -392,27 +466,18 @@ def _catalog(objects, found, labels, arrays, meta):
     sky = arrays.wcs.pixel_to_world(x, y) if n else SkyCoord([], [], unit="deg")
     with np.errstate(divide="ignore", invalid="ignore"):
         snr = total / noise
-    known = sum(int(flag) for flag in DetectionFlags)
-    columns = {
-        "id": (index, "Number of the detection"),
-        "label": (index, "Label in the segmentation image"),
-        "sky": (sky.icrs, "Position: centroid of the bright part"),
-        "x_centroid": (x, "Centroid of the bright part, 0-based"),
-        "y_centroid": (y, "Centroid of the bright part, 0-based"),
-        "flux": (total * FNU, "Flux in the segment"),
-        "flux_err": (noise * FNU, "1-sigma error, if the noise is not correlated"),
-        "semimajor_axis": (objects["a"] * scale * ANGLE, "Rms of the light along the major axis"),
-        "semiminor_axis": (objects["b"] * scale * ANGLE, "Rms of the light along the minor axis"),
-        "orientation": (
-            np.degrees(objects["theta"]) * u.deg,
-            "Direction of the major axis, +x to +y",
-        ),
-        "n_pixels": (_sizes(labels, n), "Pixels of the segment"),
-        "n_detected": (_sizes(found, n), "Pixels of the segment before dilation"),
-        "snr": (snr, "flux over flux_err"),
-        "flags": (objects["flag"].astype(int) & known, DetectionFlags.describe()),
-    }
-    return described_table(columns, meta)
+    flags = objects["flag"].astype(int) & sum(int(flag) for flag in DetectionFlags)
+    axes = [objects[one] * scale * ANGLE for one in "ab"]
+    values = [index, index, sky.icrs, x, y, total * FNU, noise * FNU, *axes]
+    values += [
+        np.degrees(objects["theta"]) * u.deg,
+        _sizes(labels, n),
+        _sizes(found, n),
+        snr,
+        flags,
+    ]
+    texts = declared("miricigale.photometry", "columns.toml")["detections"]
+    return described_columns(values, texts | {"flags": DetectionFlags.describe()}, meta)
 
 
 def _sizes(labels, n):

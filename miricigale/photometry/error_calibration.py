@@ -8,6 +8,7 @@ import scipy.sparse
 from astropy.stats import mad_std
 from astropy.table import QTable
 
+from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
 from miricigale.utils.tables import described_rows, require_columns
@@ -101,8 +102,9 @@ class ErrorCalibration:
         pull = (flux[good] - true[good]) / error[good]
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = flux[good] / true[good] - 1.0
+        texts = declared("miricigale.photometry", "columns.toml")["calibration"]
         rows = (_row(snr, pull, ratio, member) for member in _members(snr))
-        return cls(sources, described_rows(rows, _COLUMNS), provenance(source="injection", **meta))
+        return cls(sources, described_rows(rows, texts), provenance(source="injection", **meta))
 
     def to_table(self):
         """Return the sources, with the meta of the calibration, from which `from_table` makes it again."""
@@ -167,21 +169,6 @@ class ErrorCalibration:
         bins = {name: self.bins[name].tolist() for name in ("snr", "factor")}
         meta = {**result.meta, "error_calibration": bins}
         return dataclasses.replace(result, **changed, meta=meta)
-
-
-_COLUMNS = {
-    "low": "Least true flux over error by noise",
-    "high": "Largest true flux over error by noise",
-    "snr": "Median of it",
-    "n": "Number of sources",
-    "std": "Standard deviation of the pulls",
-    "mad": "1.4826 times the median absolute deviation of the pulls",
-    "mean": "Mean pull",
-    "median": "Median pull",
-    "bias": "Median of measured over true flux, less 1",
-    "factor": "Within which 68.27 % of the absolute pulls are",
-    "factor_err": "Its standard error, for Gaussian pulls",
-}
 
 
 def _members(snr):

@@ -8,9 +8,10 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.filters import as_photometry
+from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_names
-from miricigale.utils.tables import described_table, error_column, require_columns
+from miricigale.utils.tables import described_columns, error_column, require_columns
 from miricigale.utils.units import FNU
 
 #: What turns the median of absolute values into a standard deviation.
@@ -191,21 +192,13 @@ def curves_to_table(curves, meta):
     """Make the table of curves by filter name."""
     rows = [np.stack(curve.rows()) for curve in curves.values()]
     counts = [values.shape[1] for values in rows]
-    flux, sigma, low, high, fraction, photon = np.concatenate([np.empty((6, 0)), *rows], axis=1)
-    columns = {
-        "filter": (np.repeat(np.array(list(curves), str), counts), None),
-        "kind": (np.repeat(np.array([one.kind for one in curves.values()], str), counts), None),
-        "flux": (flux * FNU, "Median true flux of the bin"),
-        "sigma": (sigma * FNU, "1-sigma error there, or that of the sky"),
-        "low": (low * FNU, "Least true flux of all bins"),
-        "high": (high * FNU, "Greatest true flux of all bins"),
-        "fraction": (
-            fraction * u.dimensionless_unscaled,
-            "Part of the flux added in quadrature",
-        ),
-        "photon": (photon * FNU, "Variance per flux of the source's own photons"),
-    }
-    return described_table(columns, dict(meta))
+    values = np.concatenate([np.empty((6, 0)), *rows], axis=1)
+    units = [FNU] * 4 + [u.dimensionless_unscaled, FNU]
+    columns = [np.repeat(np.array(list(curves), str), counts)]
+    columns += [np.repeat(np.array([one.kind for one in curves.values()], str), counts)]
+    columns += [one * unit for one, unit in zip(values, units, strict=True)]
+    texts = declared("miricigale.photometry", "columns.toml")["curves"]
+    return described_columns(columns, texts, dict(meta))
 
 
 def curves_from_table(table):

@@ -49,3 +49,6 @@ class ForcedFlags(Flags):
     ONE_COMPONENT = 1024
     #: Not in the catalog: found on the residual of a first fit.
     NOT_IN_CATALOG = 2048
+    #: The core is saturated on the high-resolution image (a hole without data, or a flat top): it is masked there,
+    #: and the template follows from what is around it.
+    SATURATED = 4096

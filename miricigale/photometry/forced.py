@@ -6,7 +6,7 @@ import os
 import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
-from astropy.table import Table
+from astropy.table import QTable, Table
 from photutils.segmentation import SegmentationImage
 
 from miricigale.photometry._core.stamps import add_model
@@ -16,7 +16,7 @@ from miricigale.photometry.arrays import (
     pixel_scale,
 )
 from miricigale.photometry.flags import ForcedFlags
-from miricigale.photometry.mosaics import as_mosaic
+from miricigale.photometry.mosaics import as_mosaic, own_pixels
 from miricigale.photometry.packaging import CatalogRows, package
 from miricigale.photometry.passes import fit_image
 from miricigale.photometry.placement import Placement
@@ -24,6 +24,7 @@ from miricigale.photometry.priors import detected_prior, read_catalog, read_prio
 from miricigale.photometry.settings import ErrorSettings, MemorySettings
 from miricigale.photometry.sky_noise import warn_of_background
 from miricigale.photometry.sources import SourceTemplates
+from miricigale.photometry.stars import with_stars
 from miricigale.psf import KernelField, MatchingKernel
 from miricigale.utils.exceptions import PhotometryWarning, argument_error, warn
 from miricigale.utils.interactive import Interactive, checked_calls
@@ -87,9 +88,14 @@ class ForcedPhotometer(Interactive):
         a point on top of it, and stay so where chi-square is less than without the point. Column
         ``components`` of the catalog (1 or 2) says which those are instead. The point is at the catalog's
         position, or at the center of the fitted profile if that is more than 3 sigma away.
-    second_pass : bool, optional
-        Whether peaks of the residual that the catalog lacks are fitted together with it, as
-        points; they are listed in ``new_sources`` of the result.
+    second_pass : bool or None, optional
+        Whether peaks of the residual above 5 sigma that the catalog lacks are fitted together with it, as
+        points; they are listed in ``new_sources`` of the result. None leaves it to the evidence: they are
+        where at most a tenth of them are false, by the peaks of the residual's negative and of Gaussian noise.
+    psf_stars : bool, optional
+        Whether stars on the image and on the high-resolution image correct the two PSFs, as far as stars that
+        are left out confirm it (`~miricigale.photometry.stars.kernel_stars`); the error that remains is
+        ``psf_error``, unless that is given, and ``psf_stars`` of the result says what was found.
     errors : `ErrorSettings`, optional
         What the errors are made of.
     memory : `MemorySettings`, optional
@@ -155,7 +161,8 @@ class ForcedPhotometer(Interactive):
     offset_order: int | None = None
     integrate: bool = False
     components: int = 1
-    second_pass: bool = False
+    second_pass: bool | None = False
+    psf_stars: bool = False
     errors: ErrorSettings = dataclasses.field(default_factory=ErrorSettings)
     memory: MemorySettings = dataclasses.field(default_factory=MemorySettings)
     n_threads: int | None = None
@@ -203,6 +210,7 @@ class ForcedPhotometer(Interactive):
         if self.offset_order is not None and self.max_shift is None:
             raise argument_error("max_shift", "given with 'offset_order'", "None")
         check_choice(self.components, "components", (1, 2))
+        check_choice(self.second_pass, "second_pass", (False, True, None))
         for name, kind in (("errors", ErrorSettings), ("memory", MemorySettings)):
             if not isinstance(getattr(self, name), kind):
                 raise argument_error(name, kind.__name__, repr(getattr(self, name)))
@@ -259,7 +267,7 @@ class ForcedPhotometer(Interactive):
         """
         if isinstance(highres, (SkyCoord, Table)) and segmentation is None and catalog is None:
             highres, catalog = None, highres
-        image = as_mosaic(image, "image")
+        image = own_pixels(as_mosaic(image, "image"))
         arrays = fit_arrays(image, "image", self.memory.scratch)
         given = [one is not None for one in (highres, segmentation, catalog)]
         if templates is None:
@@ -273,6 +281,11 @@ class ForcedPhotometer(Interactive):
             raise TypeError(msg)
         else:
             sources = templates
+        if self.psf_stars and not self.bare:
+            known = QTable({"id": sources.id, "sky": sources.sky})
+            one, stars = with_stars(self, image, known, highres, sources.wcs)
+            prior = (highres, segmentation, catalog) if templates is None else ()
+            return stars.noted(one.measure(image, *prior, templates=templates))
         place = Placement.of(self, arrays, sources.sky)
         if len(sources.id) and not len(place.near):
             msg = (
@@ -288,6 +301,7 @@ class ForcedPhotometer(Interactive):
         meta = {"template": templates.meta.get("template", self.template)}
         name = image.meta.get("filter", image.meta.get("FILTER"))
         meta |= {} if name is None else {"filter": str(name)}
+        meta |= {k: v for k, v in image.meta.items() if k == "repeated_pixels"}
         with threads(self.n_threads) as executor, single_threaded():
             bank = place.bank(rows.near, templates, executor)
             found = fit_image(arrays, bank, self, rows, place.grid(templates))

@@ -3,30 +3,29 @@
 import logging
 import os
 import tempfile
-import warnings
 from pathlib import Path
 
 import numpy as np
-from astropy.io.fits.verify import VerifyWarning
+from astropy.io import fits
 
 from miricigale.filters import Filter
 from miricigale.instrument.image_files import write_image
 from miricigale.photometry.grids import grid_angle
 from miricigale.photometry.kernel_files import can_be_modeled, file_place, matching_kernel
 from miricigale.photometry.mosaics import MosaicFile
-from miricigale.utils.exceptions import DataError, PhotometryWarning, argument_error
+from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import split_extension
 from miricigale.utils.progress import progress
 from miricigale.utils.store import replacing
-from miricigale.utils.tables import error_column
+from miricigale.utils.table_files import write_table
 
 _log = logging.getLogger(__name__)
 
 #: Endings of tables that can be written.
 _TABLES = (".ecsv", ".fits", ".fits.gz")
 
-#: Largest number of empty positions at which errors are tested.
-_EMPTY = 400
+#: What the file of a `~miricigale.psf.KernelField` states as its format.
+FIELD = "kernel-field-1"
 
 
 def measure_files(
@@ -35,9 +34,10 @@ def measure_files(
     *,
     segmentation=None,
     catalog=None,
+    detection=(),
     kernel=None,
-    background_order=0,
-    max_shift=None,
+    confidence=0.95,
+    psf_stars=False,
     output=None,
     page=None,
     model=None,
@@ -49,27 +49,34 @@ def measure_files(
     **options,
 ):
     """
-    Measure the sources of a high-resolution image on another one, from files to files.
+    Measure the sources of a high-resolution image on others, from files to files.
 
     Parameters
     ----------
-    image, highres : path-like or `~miricigale.photometry.MosaicFile`
-        The image and the prior; as `~miricigale.photometry.MosaicFile` with what is not in their headers, such as
-        filters, maps of the noise and PSFs.
+    image : path-like or `~miricigale.photometry.MosaicFile`, or a list of them
+        The image, or those of several bands; as `~miricigale.photometry.MosaicFile` with what is not in their
+        headers, such as filters, maps of the noise and PSFs.
+    highres : path-like or `~miricigale.photometry.MosaicFile`
+        The prior. Its sources are looked at once for all bands.
     segmentation, catalog : path-like, optional
         See `~miricigale.photometry.read_prior`. Without a segmentation sources are detected
         on the prior.
-    kernel : path-like, optional
+    detection : list of path-like or `~miricigale.photometry.MosaicFile`, optional
+        Images on the prior's pixels in which sources are detected together with it
+        (`~miricigale.photometry.chi_image`).
+    kernel : path-like, or a list of one for each image (or None), optional
         From the prior's resolution to that of the image, on the prior's pixels; see
-        ``miricigale.photometry.kernel_files.read_kernel``. Without a PSF of the prior sources are
-        the segments as they are, and those without one are not measured.
-    background_order : int or None, optional
-        Order of the background that is fitted with the sources, 0 for a constant; none is fitted if None.
-    max_shift : `~astropy.units.Quantity`, optional
-        If given, a shift of the image up to this is fitted.
+        ``miricigale.photometry.kernel_files.read_kernel``; or a file of a `~miricigale.psf.KernelField`.
+        Without a PSF of the prior sources are the segments as they are, and those without one are not measured.
+    confidence : float, optional
+        Of the upper limits in the columns ``<filter>_upper`` and on the page.
+    psf_stars : bool, optional
+        Whether stars correct the PSFs (see `~miricigale.photometry.ForcedPhotometer`); never a kernel that
+        is given.
     output, page, model, residual : path-like, optional
         Where the table (ECSV or FITS), the HTML page and FITS images of the fitted model (with its
-        background) and of the residual are written; not if None.
+        background) and of the residual are written; not if None. Those of several bands have the
+        name of the filter before their ending. A page has one of its sources beside it, ``NAME-sources.html``.
     overwrite : bool, optional
         Whether files that are there are replaced.
     seed : int, optional
@@ -79,8 +86,9 @@ def measure_files(
     progress_bar : bool, optional
         Whether progress is shown.
     **options
-        Others of `~miricigale.photometry.ForcedPhotometer`, such as ``second_pass``: what the prior lacks is
-        then in the last rows of the table, flagged ``NOT_IN_CATALOG``.
+        Of `~miricigale.photometry.ForcedPhotometer`: a constant background is fitted unless ``background_order``
+        is given (None for no background). Sources that the prior lacks are fitted in all bands, and are the last
+        rows of the table, flagged ``NOT_IN_CATALOG``, if ``second_pass`` says so; by default the evidence does.
 
     Returns
     -------
@@ -99,95 +107,124 @@ def measure_files(
     --------
     >>> from miricigale.photometry import measure_files
     >>> table = measure_files(
-    ...     "f770w_i2d.fits", "f444w_i2d.fits", output="f770w.ecsv", page="f770w.html"
+    ...     ["f770w_i2d.fits", "f1000w_i2d.fits"], "f444w_i2d.fits", output="miri.ecsv", page="miri.html"
     ... )  # doctest: +SKIP
     """
-    image, highres = (
-        one if isinstance(one, MosaicFile) else MosaicFile(one) for one in (image, highres)
+    images, kernels = (list(v) if isinstance(v, (list, tuple)) else [v] for v in (image, kernel))
+    kernels = kernels * len(images) if kernels == [None] else kernels
+    if len(kernels) != len(images):
+        raise argument_error("kernel", f"one for each of {len(images)} images", len(kernels))
+    files = (
+        one if isinstance(one, MosaicFile) else MosaicFile(one)
+        for one in (*images, highres, *detection)
     )
-    extras = {"segmentation": segmentation, "catalog": catalog, "kernel": kernel}
-    extras.update(psf=image.psf, highres_psf=highres.psf)
-    inputs = [one for one in extras.values() if one is not None]
-    results = {"output": output, "page": page, "model": model, "residual": residual}
-    for what, path in results.items():
-        _check_output(what, path, overwrite, [image.path, highres.path, *inputs])
-    written = [Path(path).resolve() for path in results.values() if path is not None]
+    files = list(files)
+    images, highres, others = files[: len(images)], files[len(images)], files[len(images) + 1 :]
+    named = [("segmentation", segmentation), ("catalog", catalog), ("highres_psf", highres.psf)]
+    named += [("psf", one.psf) for one in images] + [("kernel", one) for one in kernels]
+    named = [(what, path) for what, path in named if path is not None]
+    results = {("output", 0): output, ("page", 0): page}
+    for k, one in enumerate(images):
+        own = one if len(images) > 1 else None
+        results |= {("model", k): _of_band(model, own), ("residual", k): _of_band(residual, own)}
+    results = {key: path for key, path in results.items() if path is not None}
+    read = [one.path for one in files] + [path for _, path in named]
+    for (what, _), path in results.items():
+        check_output(what, path, overwrite, read)
+    written = [Path(path).resolve() for path in results.values()]
     if len(set(written)) < len(written):
-        given = ", ".join(what for what, path in results.items() if path is not None)
+        given = ", ".join(dict.fromkeys(what for what, _ in results))
         raise argument_error(given, "different files", [str(path) for path in written])
-    _check_images(image, highres)
-    for what, path in extras.items():
-        if path is not None and not os.path.isfile(file_place(path)[0]):
+    for one in images:
+        _check_images(one, highres)
+    for what, path in named:
+        if not os.path.isfile(file_place(path)[0]):
             msg = f"no file {path} ('{what}')"
             raise DataError(msg)
-    if catalog is not None:
-        _check_catalog(catalog, image, highres)
-    _check_psfs(image, highres, kernel)
-    filter_ = image.header.filter
+    for one, own in zip(images, kernels, strict=True):
+        if catalog is not None:
+            _check_catalog(catalog, one, highres)
+        _check_psfs(one, highres, own)
+    bands = [one.header.filter for one in images]
+    if len(set(bands)) < len(bands):
+        raise argument_error("image", "of different filters", bands)
     # heavy imports only after the files were checked
-    from miricigale.photometry import ForcedPhotometer, read_prior
+    from miricigale.photometry import ForcedPhotometer, chi_image, read_prior
+    from miricigale.photometry.bands import join_bands, measure_prior
     from miricigale.photometry.priors import detected_prior
+    from miricigale.psf import KernelField
 
     with progress(show=progress_bar, total=4, desc="images", unit="steps") as bar:
-        mosaic, prior = image.read(), highres.read()
+        prior, mosaics = highres.read(), {k: v.read() for k, v in zip(bands, images, strict=True)}
         bar.update()
-        bar.set_description("kernel and sources")
-        matching = matching_kernel(image, highres, kernel)
+        bar.set_description("kernels and sources")
+        options = {"background_order": 0, "second_pass": None, "n_threads": n_threads} | options
+        photometers = {
+            band: ForcedPhotometer(
+                _kernel(one, highres, own), psf_stars=psf_stars and own is None, **options
+            )
+            for band, one, own in zip(bands, images, kernels, strict=True)
+        }
         if segmentation is None:
-            segments, sources = detected_prior(prior, catalog)
+            found = chi_image([prior, *(one.read() for one in others)]) if others else prior
+            segments, sources = detected_prior(found, catalog)
         else:
             segments, sources = read_prior(prior, segmentation=segmentation, catalog=catalog)
         bar.update()
         bar.set_description("fluxes")
-        photometer = ForcedPhotometer(
-            matching, background_order=background_order, max_shift=max_shift, n_threads=n_threads,
-            **options,
-        )  # fmt: skip
-        result = photometer.measure(mosaic, prior, segments, sources)
-        table = _with_new_sources(result.to_table(filter_), result.new_sources, filter_)
-        table.meta.update(image=str(image.path), highres=str(highres.path))
+        found = measure_prior(mosaics, photometers, prior, segments, sources)
+        if len(found) == 1:
+            table = found[bands[0]].to_table(bands[0], confidence=confidence)
+        else:
+            tables = {k: one.to_table(confidence=confidence) for k, one in found.items()}
+            table = join_bands(tables)
+        paths = [str(one.path) for one in images]
+        table.meta.update(image=paths[0] if len(paths) == 1 else paths, highres=str(highres.path))
         bar.update()
         bar.set_description("page")
         for path in written:
             path.parent.mkdir(parents=True, exist_ok=True)
         if output is not None:
-            with replacing(output, overwrite=overwrite) as partial, warnings.catch_warnings():
-                # keywords of more than eight letters
-                warnings.simplefilter("ignore", VerifyWarning)
-                table.write(partial)
-        for path, picture in ((model, result.model_image), (residual, result.residual_image)):
-            if path is not None:
-                with replacing(path) as partial:
-                    write_image(picture, partial)
+            with replacing(output, overwrite=overwrite) as partial:
+                write_table(table, partial)
+        for k, result in enumerate(found.values()):
+            for what in {"model", "residual"} & {one for one, _ in results}:
+                with replacing(results[what, k]) as partial:
+                    write_image(getattr(result, f"{what}_image"), partial)
         if page is not None:
-            from miricigale.photometry.page import photometry_page
+            from miricigale.photometry.page import Measured, write_page
 
-            pulls = _pulls(result, matching, seed, n_threads)
-            photometry_page(result, filter_, mosaic, prior, matching, pulls, segments).write(page)
+            measured = []
+            for name, result in found.items():
+                kernel = photometers[name].kernel
+                if result.psf_stars is not None:
+                    kernel = result.psf_stars.kernel
+                kernel = kernel.mean if isinstance(kernel, KernelField) else kernel
+                measured.append(Measured(name, result, mosaics[name], kernel, None))
+            write_page(page, measured, prior, segments, confidence, seed)
         bar.update()
     return table
 
 
-def _with_new_sources(table, new, filter_):
-    """A table and, in its last rows, the sources that the catalog lacks."""
-    if new is None or len(new) == 0:
-        return table
-    from astropy.table import QTable, vstack
-
-    from miricigale.photometry.bands import spread_rows
-
-    known = {"id": "id", "sky": "sky", filter_: "flux", error_column(filter_): "flux_err"}
-    known.update({f"{filter_}_{name}": name for name in ("flags", "snr", "coverage", "chi2")})
-    absent = np.full(len(new), -1)
-    rows = {
-        name: new[known[name]] if name in known else spread_rows(table[name], absent, name)
-        for name in table.colnames
-    }
-    rows[f"{filter_}_template"] = np.full(len(new), "point")
-    return vstack([table, QTable(rows)], metadata_conflicts="silent")
+def _of_band(path, file):
+    """The path of what belongs to one of several images, if one is given: with its filter before the ending."""
+    if path is None or file is None:
+        return path
+    name, dot, ending = Path(path).name.partition(".")
+    band = str(file.header.filter).rpartition(".")[2]
+    return Path(path).with_name(f"{name}_{band}{dot}{ending}")
 
 
-def _check_output(what, path, overwrite, inputs):
+def _kernel(image, highres, path):
+    """The kernel between two images; that of a file may be of several places."""
+    from miricigale.psf import KernelField
+
+    if path is not None and fits.getheader(file_place(path)[0]).get("FORMAT") == FIELD:
+        return KernelField.read(path)
+    return matching_kernel(image, highres, path)
+
+
+def check_output(what, path, overwrite, inputs):
     """Refuse a file that could not be written in the end, or that is not to be replaced."""
     if path is None:
         return
@@ -303,44 +340,3 @@ def _check_catalog(path, image, highres):
             where = _middle(file.header).to_string("decimal", precision=4)
             msg += f": the first is at {first}, the middle of the image at {where} deg"
         raise ValueError(msg)
-
-
-def _pulls(result, kernel, seed, n_threads):
-    """Flux over error of point sources where none is; None without a PSF or such places."""
-    from miricigale.photometry import ForcedPhotometer
-
-    empty = _empty_positions(result, seed)
-    if kernel.target is None or not len(empty):
-        return None
-    blank = ForcedPhotometer(kernel, template="psf", n_threads=n_threads)
-    with warnings.catch_warnings():
-        # the warning about a background was given already
-        warnings.simplefilter("ignore", PhotometryWarning)
-        return blank.measure(result.residual_image, catalog=empty).snr
-
-
-def _empty_positions(result, seed):
-    """
-    Random positions at which a measurement left no light: ``id`` and ``sky``.
-
-    They are at least 0.3 arcsec from pixels with light of a model (above a third of the
-    noise) or without data.
-    """
-    import scipy.ndimage
-    from astropy.table import QTable
-
-    from miricigale.photometry.arrays import pixel_scale
-
-    residual = result.residual_image
-    sigma = residual.uncertainty.array
-    level = 0.0 if result.background is None else result.background.to_value(residual.unit)
-    free = ~np.asarray(residual.mask, bool)
-    free &= np.abs(result.model_image.data - level) < 0.3 * np.where(free, sigma, 1.0)
-    steps = max(1, round(0.3 / pixel_scale(residual.wcs)))
-    # pixels beyond the image count as without data
-    free = scipy.ndimage.binary_erosion(free, iterations=steps)
-    y, x = np.nonzero(free)
-    rng = np.random.default_rng(seed)
-    chosen = rng.choice(len(x), min(_EMPTY, len(x)), replace=False) if len(x) else np.zeros(0, int)
-    sky = residual.wcs.pixel_to_world(x[chosen].astype(float), y[chosen].astype(float)).icrs
-    return QTable({"id": np.arange(1, len(chosen) + 1), "sky": sky})

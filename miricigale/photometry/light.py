@@ -100,14 +100,14 @@ def cutouts(
             found[k] = _bare(data, variance, segments, label[k])
         return found, flags, snr, fitted
     lights = _Lights(data, variance, ShapeFitter(psf, scale), segments, select, executor)
-    models = lights.fit([(label[k], xy[k]) for k in chosen])
+    models, population = lights.fit([(label[k], xy[k]) for k in chosen])
     for k, model in zip(chosen, models, strict=True):
         if model is None:
             flags[k] = int(ForcedFlags.NOISY_SEGMENT)
         else:
             found[k], fitted[k] = model.cutout, model.record
     for k in np.flatnonzero(flags & int(ForcedFlags.NOISY_SEGMENT)):
-        shape = lights.fitter.unfitted(xy[k])
+        shape = lights.fitter.unfitted(xy[k], population.at(segments.brightness(label[k])))
         fitted[k] = shape.parameters, shape.covariance, shape.point, 1.0
     return found, flags, snr, fitted
 
@@ -134,6 +134,10 @@ class _Segments:
         np.divide(totals, np.sqrt(noise), out=ratio, where=noise > 0)
         totals[0] = ratio[0] = 0.0
         return cls(labels, usable, places, totals, ratio)
+
+    def brightness(self, label):
+        """Ln of the light of a label."""
+        return np.log(max(self.totals[label], 1e-300))
 
 
 def _bare(data, variance, segments, label):
@@ -180,23 +184,38 @@ class _Lights:
     def fit(self, sources):
         """The model of each (label, position); None where no light fits."""
         models = parallel_map(lambda one: self._model(*one), sources, executor=self.executor)
-        for _ in range(_PASSES):
+        population = self.fitter.expected
+        for turn in range(_PASSES):
             sum_of_all = self._paint(models)
+            if turn == 0:
+                population = self._population(models, sources)
 
-            def again(one, sum_of_all=sum_of_all):
+            def again(one, sum_of_all=sum_of_all, turn=turn, population=population):
                 model, (label, xy) = one
                 if model is None:
                     return None
                 others = sum_of_all[model.around] - self._image(model)
                 weight, _, _ = self._weight(model.around, label)
-                if np.sum(((others - model.others) * weight) ** 2) < _CONTAMINATED:
+                if turn and np.sum(((others - model.others) * weight) ** 2) < _CONTAMINATED:
                     return model
-                new = self._model(label, xy, others, model.shape)
+                new = self._model(label, xy, others, model.shape, population)
                 return model if new is None else dataclasses.replace(new, others=others)
 
             pairs = zip(models, sources, strict=True)
             models = parallel_map(again, pairs, executor=self.executor)
-        return models
+        return models, population
+
+    def _population(self, models, sources):
+        """The distribution of the shapes of all sources."""
+        some = [(one.shape, label) for one, (label, _) in zip(models, sources, strict=True) if one]
+        if not some:
+            return self.fitter.expected
+        shapes, labels = zip(*some, strict=True)
+        nodes, points = (
+            np.array([getattr(one, name) for one in shapes]) for name in ("nodes", "as_point")
+        )
+        brightness = np.array([self.segments.brightness(label) for label in labels])
+        return self.fitter.expected.fitted(nodes, points, brightness)
 
     def _paint(self, models):
         """The light of all models."""
@@ -229,13 +248,14 @@ class _Lights:
         looser = weight / np.hypot(1.0, _MISFIT * np.maximum(self.light[around], 0.0) * weight)
         return weight, looser, free & (labels == label)
 
-    def _model(self, label, xy, others=0.0, start=None):
+    def _model(self, label, xy, others=0.0, start=None, population=None):
         """Fit one source, ``others`` being the light of others on its stamp, ``start`` its last shape."""
         around = _around(self.segments.places[label - 1], xy, self.data.shape)
         weight, looser, own = self._weight(around, label)
         data = self.data[around] - others
         corner = np.array([around[1].start, around[0].start])
-        shape = self.fitter.fit(data, looser, xy - corner, start)
+        prior = None if population is None else population.at(self.segments.brightness(label))
+        shape = self.fitter.fit(data, looser, xy - corner, prior, start)
         if shape is None:
             return None
         if self.select and shape.point > 0.5:

@@ -20,6 +20,10 @@ _BRIGHT, _ISOLATED, _SOURCES = 20.0, 0.2, 3
 #: which a source does not count, and change of the map (pixels) at which it is done.
 _FLOOR, _CLIP, _DONE = 0.01, 4.0, 5e-3
 
+#: How often sources are moved by their own offsets, and how far at most in rms widths of the PSF; offset of all,
+#: in full widths at half maximum, of which there is a warning.
+_SETTLED, _OWN, _NOTICED = 3, 0.3, 0.05
+
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class OffsetMap:
@@ -207,6 +211,57 @@ def fit_offsets(arrays, bank, settings, catalog):
     table["used"] = used
     in_arcsec = SmoothField(field.coefficients * fit.scale, field.shape, order)
     fit.offset_map = OffsetMap(table, in_arcsec, arrays.wcs)
+    return fit
+
+
+def settled(fit, bank, catalog):
+    """
+    A fit with bright isolated sources moved to where the image shows them.
+
+    Registration and colors move sources against each other by some milliarcseconds, which bright ones show. Each
+    goes by its own offset, as far as offsets scatter beyond their errors; nothing is done if they do not, or if
+    what all have in common is large enough for a warning: ``max_shift`` is for that.
+
+    Parameters
+    ----------
+    fit, bank
+        A `TemplateFit`, and the templates before they were moved.
+    catalog : `~miricigale.photometry.packaging.CatalogRows`
+        The catalog; ``near`` lists the bank's sources.
+
+    Returns
+    -------
+    fit : `TemplateFit`
+        Its ``own``, (k, 2), are what each source was moved by (pixels), None if nothing was done.
+    """
+    xy, shape = catalog.xy[catalog.near], fit.arrays.flux.shape
+    common = np.array(fit.displacement(xy))
+    own, first = np.zeros_like(common), fit
+    for _ in range(_SETTLED):
+        rows, offset, error = _bright_offsets(fit, catalog, common + own)
+        found = offset - common[fit.bank.order[rows]]
+        # what is farther off is another source
+        good = np.hypot(*found.T) < _OWN * fit.psf_width
+        member, found, error = fit.bank.order[rows][good], found[good], error[good]
+        if len(member) <= _SOURCES:
+            break
+        order = max(k for k in range(4) if k == 0 or len(member) > _SOURCES**2 * n_terms(k))
+        smooth, _ = _robust_field(xy[member], found, error, good[good], shape, order)
+        smooth = smooth(*xy[member].T)
+        if np.abs(smooth).max() > _NOTICED * np.sqrt(8 * np.log(2)) * fit.psf_width:
+            break
+        # of two normal errors the median distance is 1.18
+        scatter = (np.median(np.hypot(*found.T)) / 1.1774) ** 2 - np.median(error) ** 2
+        if scatter <= _FLOOR**2:
+            break
+        new = np.zeros_like(own)
+        new[member] = found * (scatter / (scatter + error**2))[:, None]
+        change, own = np.abs(new - own).max(), new
+        fit.bank.forget()
+        fit = TemplateFit(fit.arrays, bank, fit.settings, moved=common + own, search=False)
+        fit.shift, fit.offset_map, fit.own = first.shift, first.offset_map, own
+        if change < _DONE:
+            break
     return fit
 
 

@@ -24,8 +24,8 @@ from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS
 #: Names of the errors of a flux after ``flux_err``: their sum, and its terms.
 _TERMS = ("", "_noise", "_template", "_psf")
 
-#: Fewest sources above so many sigma with which there is a warning of an offset, and relative error of templates.
-_FEWEST, _BRIGHT, _TEMPLATE = 5, 10.0, 0.1
+#: Least offset (pixels) that is warned of, with so many sources above so many sigma; relative error of templates.
+_OFFSET, _FEWEST, _BRIGHT, _TEMPLATE = 0.1, 5, 10.0, 0.1
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -88,7 +88,7 @@ def package(fit, diagnostics, new_xy, catalog, meta):
     for name, error in zip(_TERMS, flux_err, strict=True):
         columns[f"flux_err{name}"] = error * FNU
     new = None
-    if fit.settings.second_pass:
+    if fit.settings.second_pass or len(new_xy):
         names = ("flux", "flux_err", "flags", "coverage", "chi2")
         rows = {name: columns[name][n:] for name in names}
         new = _new_sources(catalog, new_xy, fit.arrays.wcs, rows)
@@ -111,7 +111,8 @@ def package(fit, diagnostics, new_xy, catalog, meta):
             pixel_scale=round(fit.scale, 6),
             correlated_noise=diagnostics.correlation is not None,
             measured_noise=fit.arrays.measured_noise,
-            **_measured_offset(fit, diagnostics, np.count_nonzero(flux > _BRIGHT * flux_err[0])),
+            **_registration(fit, diagnostics, common, np.sum(flux > _BRIGHT * flux_err[0])),
+            **({} if fit.evidence is None else {"second_pass": fit.evidence}),
         ),
         **_components(fit, catalog, joint, place, n_all),
         **_common(fit, common),
@@ -119,14 +120,20 @@ def package(fit, diagnostics, new_xy, catalog, meta):
     )
 
 
-def _measured_offset(fit, diagnostics, n_bright):
+def _registration(fit, diagnostics, common, n_bright):
     """
-    How far the image lies from its templates by the residuals, and the error of that: for the meta dictionary.
+    How far the image lies from the prior, and the error of that, arcsec along x and y: for the meta dictionary.
 
-    In arcsec along x and y of the image, to first order; the error is the jackknife's over strips of rows, which
-    has errors of single templates in it. There is a warning of what a fitted shift would have mended, if sources
-    are bright.
+    The shift that was fitted, the mean of the sources of a map, or else what the residuals show, to first order:
+    then the error is the jackknife's over strips of rows, which has errors of single templates in it, and there
+    is a warning of what a fitted shift would have mended, if sources are bright.
     """
+    if fit.shift is not None:
+        return _offset_meta(fit.shift, np.sqrt(np.diag(common))[-2:] * fit.scale)
+    if fit.offset_map is not None:
+        table = fit.offset_map.sources[fit.offset_map.sources["used"]]
+        values = np.stack([table["dx"].value, table["dy"].value])
+        return _offset_meta(values.mean(axis=1), values.std(axis=1) / np.sqrt(len(table)))
     model, sums = diagnostics.model, []
     for part in chunks(len(model), int(np.clip(len(model) // 16, 4, 256))):
         # a row more on both sides for the gradient
@@ -141,21 +148,23 @@ def _measured_offset(fit, diagnostics, n_bright):
     # of all strips, and of all but each
     every = np.concatenate([[sums.sum(axis=0)], sums.sum(axis=0) - sums])
     normal = every[:, :2, :2]
-    if fit.shift is not None or fit.offset_map is not None or np.linalg.det(normal).min() <= 0:
+    if np.linalg.det(normal).min() <= 0:
         return {}
     found = np.linalg.solve(normal, every[:, :2, 2:])[..., 0]
     offset, without = found[0], found[1:]
     error = np.sqrt((len(sums) - 1) * np.var(without, axis=0))
-    # a twentieth of the PSF's width at half maximum
-    least = 0.05 * np.sqrt(8 * np.log(2)) * fit.psf_width
-    far = n_bright >= _FEWEST and np.any((np.abs(offset) > least) & (np.abs(offset) > 3 * error))
+    far = np.any((np.abs(offset) > _OFFSET) & (np.abs(offset) > 3 * error)) and n_bright >= _FEWEST
     # a shift that was asked for and is too large has a warning of its own
     if far and fit.settings.max_shift is None:
         x, y = offset * fit.scale
         msg = f"the image lies about {x:+.3f}, {y:+.3f} arcsec (x, y) from its templates: 'max_shift' fits that"
         warn(msg, PhotometryWarning)
-    values = (offset * fit.scale).round(5).tolist(), (error * fit.scale).round(5).tolist()
-    return dict(zip(("offset", "offset_err"), values, strict=True))
+    return _offset_meta(offset * fit.scale, error * fit.scale)
+
+
+def _offset_meta(offset, error):
+    """Offset and error in arcsec as plain values."""
+    return {"offset": offset.round(5).tolist(), "offset_err": error.round(5).tolist()}
 
 
 def _by_source(covariance, place, main, n):
@@ -187,16 +196,18 @@ def _components(fit, catalog, joint, place, n_all):
     }
 
 
-def _new_sources(catalog, xy, wcs, columns):
-    n = len(xy)
-    ids = np.asarray(catalog.id)
+def new_ids(ids, n):
+    """Ids of ``n`` sources, (n,), that are not among ``ids``, and of their kind."""
     if ids.dtype.kind in "iu":
-        new = int(ids.max(initial=0)) + 1 + np.arange(n)
-    else:
-        known = set(ids.tolist())
-        names = (f"new-{k}" for k in itertools.count(1))
-        new = list(itertools.islice((name for name in names if name not in known), n))
-    table = QTable({"id": np.array(new) if n else ids[:0]})
+        return int(ids.max(initial=0)) + 1 + np.arange(n)
+    known = set(ids.tolist())
+    names = (f"new-{k}" for k in itertools.count(1))
+    new = list(itertools.islice((name for name in names if name not in known), n))
+    return np.array(new) if n else ids[:0]
+
+
+def _new_sources(catalog, xy, wcs, columns):
+    table = QTable({"id": new_ids(np.asarray(catalog.id), len(xy))})
     table["sky"] = wcs.pixel_to_world(*xy.T).transform_to(catalog.sky.frame)
     table["x_centroid"], table["y_centroid"] = xy.T
     for name, values in columns.items():

@@ -1,67 +1,108 @@
-"""The page of forced photometry: images, magnitudes, flags, errors at empty positions."""
+"""The page of forced photometry: images, magnitudes, flags, errors at empty positions, sources one by one."""
 
+import collections
 from pathlib import Path
 
 import astropy.units as u
 import numpy as np
+from astropy.nddata import Cutout2D
 from astropy.stats import mad_std
 
-from miricigale.pages import Missing, Page, SectionWriter
+from miricigale.pages import Link, Missing, Page, SectionWriter
 from miricigale.photometry import ForcedFlags
 from miricigale.photometry.arrays import pixel_scale
+from miricigale.photometry.browser import write_browser
+from miricigale.photometry.empty import empty_pulls
 from miricigale.plotting.axes import new_figure
 from miricigale.plotting.images import plot_image, plot_model_residual, plot_segmentation
 from miricigale.plotting.posteriors import plot_pulls
+from miricigale.psf.star_fit import TERMS
 from miricigale.utils.declared import declared
-from miricigale.utils.units import ab_magnitude
+from miricigale.utils.units import ANGLE, ab_magnitude
 
-#: Largest number of pixels across a drawing of a whole image, and rows of the table.
-_ACROSS, _ROWS = 1500, 40
-#: Signal-to-noise above which a poor fit points to a wrong PSF.
-_BRIGHT = 20.0
+#: Largest number of pixels across a drawing of a whole image, rows of a table, arcsec across a source.
+_ACROSS, _ROWS, _SIZE = 1500, 40, 12.0
+#: Number of stars that are drawn.
+_STARS = 6
+#: Signal-to-noise above which a poor fit points to a wrong PSF, and above which there is a magnitude.
+_BRIGHT, _DETECTED = 20.0, 3.0
 
 
-def photometry_page(result, filter_, image, highres, kernel, pulls=None, segments=None):
+#: A band on the page: name, result, image, kernel, and pulls at empty positions (made by `write_page`).
+Measured = collections.namedtuple("Measured", "name result image kernel pulls")
+
+
+def write_page(path, bands, highres, segments, confidence, seed):
     """
-    Make the page (`~miricigale.pages.Page`) of one measurement in a filter.
+    Write the page of a measurement, and beside it the one of its sources.
 
-    ``image`` and ``highres`` are what was measured and the prior, of
-    `~miricigale.photometry.read_mosaic`, ``kernel`` is between them; ``pulls`` are flux over error at
-    empty positions, and ``segments`` (int array) those of the prior, whose outlines are drawn.
+    ``bands`` are what was measured (`Measured`), ``highres`` and ``segments`` (int array) the prior; upper limits
+    are of the ``confidence``, and ``seed`` that of the empty positions.
     """
-    sources = " on the prior ".join(Path(one.meta["source"]).name for one in (image, highres))
-    page = SectionWriter(
-        Page(f"Forced photometry: {filter_}", subtitle=sources), declared("miricigale.photometry")
-    )
-    _notices(page, result, image, highres, kernel, pulls)
-    _summary(page, result, pulls)
+    bands = [b._replace(pulls=empty_pulls(b.result, b.kernel, seed)) for b in bands]
+    names = ", ".join(one.name for one in bands)
+    files = ", ".join(Path(one.image.meta["source"]).name for one in bands)
+    title, prior = f"Forced photometry: {names}", Path(highres.meta["source"]).name
+    report = Page(title, subtitle=f"{files} on the prior {prior}")
+    page = SectionWriter(report, declared("miricigale.photometry"))
+    page.facts = {"confidence": f"{100 * confidence:g}", "detected": f"{_DETECTED:g}"}
+    browser = write_browser(Path(path), title, bands, highres, confidence, _DETECTED)
+    _notices(page, bands, highres)
+    page.section("summary", browser=Link("one by one", browser))
+    page.table("table", (_summary(one) for one in bands))
     page.section("images")
-    page.figure("whole", _whole(result))
-    for k, what in _examples(result):
-        facts = {"id": result.id[k], "snr": result.snr[k], "chi2": result.chi2[k]}
-        page.figure("source", _zoom(result, highres, segments, k), what=what, **facts)
+    for one in bands:
+        page.figure("whole", _whole(one.result), band=one.name)
+    for one in bands:
+        result = one.result
+        for k, what in _examples(result):
+            facts = {"id": result.id[k], "snr": result.snr[k], "chi2": result.chi2[k]}
+            figure = _zoom(result, highres, segments, k)
+            page.figure("source", figure, what=what, band=one.name, **facts)
     page.section("magnitudes")
-    page.figure("figure", _magnitudes(result, filter_))
-    if pulls is not None:
+    for one in bands:
+        page.figure("figure", _magnitudes(one, confidence))
+    tested = [one for one in bands if one.pulls is not None]
+    if tested:
         page.section("pulls")
+    for one in tested:
         figure, axes = new_figure(1, 1, size=(5.6, 3.4))
-        plot_pulls(pulls, ax=axes[0, 0], limit=6.0).set_xlabel("flux / error")
-        page.figure("figure", figure, n=len(pulls))
-    _flag_table(page, result)
-    _source_table(page, result)
-    _input_table(page, image, highres, kernel)
-    return page.report
+        plot_pulls(one.pulls, ax=axes[0, 0], limit=6.0).set_xlabel("flux / error")
+        page.figure("figure", figure, n=len(one.pulls), band=one.name)
+    shown = [one for one in bands if one.result.psf_stars is not None]
+    if shown:
+        page.section("stars")
+    for one in shown:
+        _stars(page, one.result.psf_stars, one.name)
+    _flag_table(page, bands)
+    page.section("sources", n=min(_ROWS, len(bands[0].result)), n_all=len(bands[0].result))
+    for one in bands:
+        page.table("table", _source_rows(one.result, confidence), band=one.name)
+    _input_table(page, bands, highres)
+    report.write(path)
 
 
-def _notices(page, result, image, highres, kernel, pulls):
-    if kernel.target is None:
-        page.notice("no_psfs")
-    bright = np.nan_to_num(result.snr) > _BRIGHT
-    poor = bright & (result.flags & int(ForcedFlags.POOR_FIT) != 0)
-    n, n_poor = np.count_nonzero(bright), np.count_nonzero(poor)
-    if n >= 5 and n_poor > 0.5 * n:
-        page.notice("poor", n_poor=n_poor, n=n, bright=_BRIGHT)
-    for what, one in (("image", image), ("prior", highres)):
+def _notices(page, bands, highres):
+    noted = [(f"image ({one.name})", one.image) for one in bands]
+    for one in bands:
+        result, rms = one.result, _pulls_rms(one.pulls)
+        if one.kernel.target is None:
+            page.notice("no_psfs")
+        bright = np.nan_to_num(result.snr) > _BRIGHT
+        poor = bright & (result.flags & int(ForcedFlags.POOR_FIT) != 0)
+        n, n_poor = np.count_nonzero(bright), np.count_nonzero(poor)
+        if n >= 5 and n_poor > 0.5 * n:
+            page.notice("poor", n_poor=n_poor, n=n, bright=_BRIGHT, band=one.name)
+        if one.pulls is not None and len(one.pulls) >= 100 and not 0.8 < rms < 1.25:
+            page.notice("pulls", rms=rms, band=one.name)
+        evidence = result.meta.get("second_pass", {})
+        if evidence.get("peaks") and not evidence["fitted"]:
+            page.notice("unfitted", **evidence, band=one.name)
+        offset, error = (np.array(result.meta.get(k, [0.0])) for k in ("offset", "offset_err"))
+        least = 0.1 * pixel_scale(result.residual_image.wcs)
+        if result.shift is None and np.any((abs(offset) > least) & (abs(offset) > 3 * error)):
+            page.notice("offset", offset=_pairs(result.meta), band=one.name)
+    for what, one in (*noted, ("prior", highres)):
         scale = one.meta.get("noise_scale")
         if one.meta.get("n_filled"):
             page.notice("filled", n=one.meta["n_filled"], what=what)
@@ -70,11 +111,15 @@ def _notices(page, result, image, highres, kernel, pulls):
         elif scale is not None and not 0.1 < scale < 10:
             done = "were scaled by it" if "weight_scale" in one.meta else "were kept"
             page.notice("noise", what=what, scale=scale, done=done)
-    level, rms = highres.meta.get("sky_over_noise", 0.0), _pulls_rms(pulls)
+    level = highres.meta.get("sky_over_noise", 0.0)
     if abs(level) > 1:
         page.notice("sky", level=level)
-    if pulls is not None and len(pulls) >= 100 and not 0.8 < rms < 1.25:
-        page.notice("pulls", rms=rms)
+
+
+def _pairs(meta):
+    """The offset of an image along x and y with its errors, as text."""
+    both = zip(meta["offset"], meta["offset_err"], strict=True)
+    return ", ".join(f"{x:+.3f} ± {error:.3f}" for x, error in both)
 
 
 def _pulls_rms(pulls):
@@ -82,26 +127,23 @@ def _pulls_rms(pulls):
     return float(mad_std(values)) if len(values) else np.nan
 
 
-def _summary(page, result, pulls):
-    good = np.isfinite(result.flux.value)
+def _summary(one):
+    result, good = one.result, np.isfinite(one.result.flux.value)
     errors = result.flux_err[good & (result.flags == 0)]
     values = {
+        "band": one.name,
         "n": len(result),
         "n_measured": np.count_nonzero(good),
         "n_detected": np.count_nonzero(good & (result.snr > 5)),
         "depth": (5 * np.median(errors)).to_value(u.ABmag) if len(errors) else np.nan,
-        "rms": _pulls_rms(pulls),
+        "rms": _pulls_rms(one.pulls),
+        "background": Missing("not fitted"),
+        "offset": _pairs(result.meta) if "offset" in result.meta else Missing("no light"),
     }
     if result.background is not None:
         background, error = result.background.value, result.background_err.value
         values["background"] = f"{background:.3g} ± {error:.1g}"
-    if "offset" in result.meta:
-        both = zip(result.meta["offset"], result.meta["offset_err"], strict=True)
-        values["offset"] = ", ".join(f"{x:+.3f} ± {error:.3f}" for x, error in both)
-    if result.shift is not None:
-        values["shift"] = ", ".join(f"{one:.3f}" for one in result.shift.value)
-    page.section("summary")
-    page.items(values)
+    return values
 
 
 def _whole(result):
@@ -132,52 +174,52 @@ def _examples(result):
     return [(int(k), what) for what, k in chosen.items()]
 
 
-def _zoom(result, highres, segments, k, size=12.0):
-    """Prior, image, model and residual about a source."""
-    model = result.model_image
-    data = result.residual_image.data + model.data
-    x, y = (float(one) for one in highres.wcs.world_to_pixel(result.sky[k]))
-    fine, coarse = (pixel_scale(one.wcs) for one in (highres, model))
-    cut, middle = _cutout(highres.data.shape, x, y, size / fine)
+def _zoom(result, highres, segments, k):
+    """Prior, image, model and residual about a source: squares, white beyond the images."""
+
+    def square(data, wcs, fill=np.nan):
+        scale = pixel_scale(wcs)
+        at, size = wcs.world_to_pixel(result.sky[k]), 2 * round(_SIZE / 2 / scale) + 1
+        cut = Cutout2D(data, at, size, mode="partial", fill_value=fill)
+        return cut.data, {"pixel_scale": scale, "center": cut.input_position_cutout}
+
+    model, wcs = result.model_image.data, result.model_image.wcs
     _, axes = new_figure(1, 4, size=(2.9, 3.0))
-    sharp = np.asarray(highres.data[cut], float)
+    sharp = np.array(highres.data, float)
     if highres.mask is not None:
-        sharp = np.where(highres.mask[cut], np.nan, sharp)
-    form = {"ax": axes[0, 0], "pixel_scale": fine, "title": "prior", "center": middle}
-    if sharp.size and segments is not None:
-        plot_segmentation(sharp, segments[cut], **form)
-    elif sharp.size:
+        sharp[highres.mask] = np.nan
+    sharp, form = square(sharp, highres.wcs)
+    form |= {"ax": axes[0, 0], "title": "prior"}
+    if segments is None:
         plot_image(sharp, **form)
-    cut, middle = _cutout(data.shape, float(result.x[k]), float(result.y[k]), size / coarse)
-    plot_model_residual(
-        data[cut], model.data[cut], ax=axes[0, 1:], pixel_scale=coarse, center=middle
-    )
-    axes[0, 1].set_ylabel("")
+    else:
+        plot_segmentation(sharp, square(segments, highres.wcs, 0)[0], **form)
+    light, form = square(model, wcs)
+    data, _ = square(result.residual_image.data + model, wcs)
+    plot_model_residual(data, light, ax=axes[0, 1:], **form)
+    for ax in axes[0, 1:]:
+        ax.set(ylabel="", yticklabels=[])
     return axes[0, 0].figure
 
 
-def _cutout(shape, x, y, size):
-    """Slices of a square of ``size`` pixels about a position, and the position in it."""
-    half = max(8, round(size / 2))
-    low = [min(max(0, round(p) - half), n) for p, n in zip((y, x), shape, strict=True)]
-    high = [min(max(0, round(p) + half + 1), n) for p, n in zip((y, x), shape, strict=True)]
-    return tuple(slice(*pair) for pair in zip(low, high, strict=True)), (x - low[1], y - low[0])
-
-
-def _magnitudes(result, filter_):
+def _magnitudes(one, confidence):
+    result, xlabel = one.result, f"{one.name} (AB)"
     figure, axes = new_figure(1, 2, size=(5.2, 3.6))
-    detected = result.snr > 3
-    mag = ab_magnitude(result.flux)
+    detected = result.snr > _DETECTED
+    mag, limit = ab_magnitude(result.flux), ab_magnitude(result.upper_limit(confidence))
     error = 1.0857 / np.where(detected, result.snr, np.nan)
-    clean = detected & (result.flags == 0)
+    clean, fainter = detected & (result.flags == 0), np.isfinite(limit) & ~detected
     ax = axes[0, 0]
-    if detected.any():
-        bins = np.arange(np.floor(np.nanmin(mag[detected])), np.nanmax(mag[detected]) + 0.5, 0.5)
-        bins = bins if len(bins) > 1 else np.array([bins[0], bins[0] + 0.5])
-        ax.hist(mag[detected], bins, color="0.75", label="above 3 sigma")
+    shown = np.where(detected, mag, limit)
+    if np.isfinite(shown).any():
+        low, high = np.floor(np.nanmin(shown)), np.nanmax(shown)
+        bins = np.arange(low, max(high, low) + 1.0, 0.5)
+        ax.hist(mag[detected], bins, color="0.75", label=f"above {_DETECTED:g} sigma")
         ax.hist(mag[clean], bins, histtype="step", color="#1d4ed8", label="of these, no flag")
+        others = {"color": "#c2410c", "ls": ":", "label": f"limits of others ({confidence:.0%})"}
+        ax.hist(limit[fainter], bins, histtype="step", **others)
         ax.legend(frameon=False)
-    ax.set(xlabel=f"{filter_} (AB)", ylabel="sources")
+    ax.set(xlabel=xlabel, ylabel="sources")
     ax = axes[0, 1]
     for rows, marker, color, label in (
         (detected & ~clean, "x", "#c2410c", "flagged"),
@@ -185,60 +227,96 @@ def _magnitudes(result, filter_):
     ):
         ax.plot(mag[rows], error[rows], marker, color=color, ms=5, label=label)
     ax.axhline(1.0857 / 5, color="0.5", lw=0.8, ls="--", label="5 sigma")
-    ax.set(xlabel=f"{filter_} (AB)", ylabel="error (mag)", yscale="log")
+    ax.set(xlabel=xlabel, ylabel="error (mag)", yscale="log")
     ax.legend(frameon=False)
     return figure
 
 
-def _flag_table(page, result):
+def _stars(page, stars, band):
+    """The stars that the PSFs were compared with, before and after."""
+    for name, fit in stars.fits.items():
+        terms = zip(TERMS, 100 * fit.terms, 100 * fit.terms_err, strict=True)
+        changes = ", ".join(
+            f"{key.replace('_', ' ')} {x:+.1f} ± {err:.1f} %" for key, x, err in terms
+        )
+        what = f"{band} image" if name == "image" else name
+        facts = {"what": what, "n": len(fit.after), "error": 100 * fit.error, "changes": changes}
+        page.text(fit.kind, **facts, before=fit.chi2["model"], after=fit.chi2[fit.kind])
+        pairs = list(zip(fit.before, fit.after, strict=True))[:_STARS]
+        figure, axes = new_figure(len(pairs), 3, size=(3.0, 2.8))
+        plain = {
+            "pixel_scale": stars.kernel.pixel_scale.to_value(ANGLE)
+            * np.sqrt(fit.after[0].star.area)
+        }
+        pulls = {"limits": (-5, 5), "stretch": "linear", "cmap": "RdBu_r", **plain}
+        for row, (before, after) in zip(axes, pairs, strict=True):
+            star, known = before.star, np.isfinite(before.star.sigma)
+            plot_image(np.where(known, star.data, np.nan), ax=row[0], title="star", **plain)
+            for ax, one, title in ((row[1], before, "model"), (row[2], after, "corrected")):
+                pull = np.where(one.weight > 0, one.residual * one.weight, np.nan)
+                title = f"{title}, chi2 {one.chi2:.2f}"
+                plot_image(pull.reshape(star.data.shape), ax=ax, title=title, **pulls)
+        page.figure("figure", figure, **facts)
+    page.table("table", (dict(zip(stars.table.colnames, row, strict=True)) for row in stars.table))
+
+
+def _flag_table(page, bands):
     page.section("flags")
-    counts = [("none", "", "usable", np.count_nonzero(result.flags == 0))]
+
+    def row(name, meaning, flux, of):
+        counts = {one.name: np.count_nonzero(of(one.result)) for one in bands}
+        return {"flag": name, "meaning": meaning, "flux": flux, **counts}
+
+    rows = [row("none", "", "usable", lambda result: result.flags == 0)]
     for value, (name, meaning) in ForcedFlags.meanings().items():
-        count = np.count_nonzero(result.flags & value)
         lost = value in (ForcedFlags.NO_DATA, ForcedFlags.DEGENERATE)
-        counts.append((f"{value} {name}", meaning, "not measured" if lost else "usable", count))
-    crowded = np.count_nonzero(result.crowded)
-    counts.append(("crowded", page.sentence("crowded"), "usable", crowded))
-    header = ("flag", "meaning", "flux", "sources")
-    page.table("table", (dict(zip(header, row, strict=True)) for row in counts))
+        flux = "not measured" if lost else "usable"
+        rows.append(row(f"{value} {name}", meaning, flux, lambda result, v=value: result.flags & v))
+    rows.append(row("crowded", page.sentence("crowded"), "usable", lambda result: result.crowded))
+    page.table("table", rows)
 
 
-def _source_table(page, result):
+def _source_rows(result, confidence):
     order = np.argsort(np.nan_to_num(-result.flux.value, nan=np.inf), kind="stable")[:_ROWS]
-    page.section("sources", n=len(order), n_all=len(result))
-    table = result.to_table()[order]
-    table["mag"] = ab_magnitude(result.flux)[order]
+    table = result.to_table(confidence=confidence)[order]
     rows = []
     for one in table:
         row = {name: getattr(one[name], "value", one[name]) for name in table.colnames}
         flags = ", ".join(ForcedFlags.names(row["flags"])).replace("_", " ") or "none"
         position = {"ra": f"{one['sky'].ra.deg:.5f}", "dec": f"{one['sky'].dec.deg:.5f}"}
-        rows.append(row | {"flags": flags, **position})
-    page.table("table", rows)
+        mag, limit = (float(ab_magnitude(one[name])) for name in ("flux", "upper"))
+        mag = f"{mag:.2f}" if row["snr"] > _DETECTED else f"> {limit:.2f}"
+        lost = Missing("not measured")
+        mag = mag if np.isfinite(limit) else lost
+        rows.append(row | {"flags": flags, "mag": mag, **position})
+    return rows
 
 
-def _input_table(page, image, highres, kernel):
+def _input_table(page, bands, highres):
     page.section("inputs")
-    psfs, facts = kernel.meta.get("psfs", {}), {}
-    for what, one, psf in (("image", image, "psf"), ("prior", highres, "highres_psf")):
-        facts[what] = {**one.meta, **{f"psf_{key}": v for key, v in psfs.get(psf, {}).items()}}
-        facts[what]["pixels"] = f"{one.data.shape[1]} x {one.data.shape[0]}"
-        facts[what]["pixel_scale"] = f"{pixel_scale(one.wcs):.4f}"
+    files, facts = [(one.name, one.image, one.kernel, "psf") for one in bands], {}
+    for what, image, kernel, psf in (*files, ("prior", highres, bands[0].kernel, "highres_psf")):
+        known = kernel.meta.get("psfs", {}).get(psf, {})
+        facts[what] = {**image.meta, **{f"psf_{key}": v for key, v in known.items()}}
+        facts[what]["pixels"] = f"{image.data.shape[1]} x {image.data.shape[0]}"
+        facts[what]["pixel_scale"] = f"{pixel_scale(image.wcs):.4f}"
     page.table(
         "table",
         [
-            {"fact": label, **{what: _text(known.get(key)) for what, known in facts.items()}}
+            {"": label, **{what: _text(known.get(key)) for what, known in facts.items()}}
             for key, label in page.texts["inputs"]["facts"].items()
         ],
     )
-    page.text(
-        "kernel",
-        size=kernel.array.shape[0],
-        scale=kernel.pixel_scale.value,
-        sum=kernel.array.sum(),
-        gain=kernel.noise_gain,
-        origin=kernel.meta.get("file", "made from two PSFs"),
-    )
+    for one in bands:
+        page.text(
+            "kernel",
+            band=one.name,
+            size=one.kernel.array.shape[0],
+            scale=one.kernel.pixel_scale.value,
+            sum=one.kernel.array.sum(),
+            gain=one.kernel.noise_gain,
+            origin=one.kernel.meta.get("file", "made from two PSFs"),
+        )
 
 
 def _text(value):

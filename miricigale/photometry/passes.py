@@ -2,17 +2,21 @@
 
 import numpy as np
 from astropy.wcs.utils import pixel_to_pixel
+from scipy.special import ndtr
 
 from miricigale.photometry.arrays import local_maps
 from miricigale.photometry.diagnostics import diagnose
-from miricigale.photometry.offsets import fit_offsets, source_offsets
-from miricigale.photometry.residual_sources import new_sources
+from miricigale.photometry.offsets import fit_offsets, settled, source_offsets
+from miricigale.photometry.residual_sources import LEFT_SNR, new_sources, residual_peaks
 from miricigale.photometry.template_fit import TemplateFit
 from miricigale.utils.units import ANGLE
 
 #: How often positions of new sources are refined, and the errors by which the center of a profile
 #: differs from the catalog's position where it is taken instead.
 _REFINED, _ELSEWHERE = 2, 3.0
+
+#: Largest share of false ones with which new sources are fitted where the evidence decides.
+_FALSE_RATE = 0.1
 
 
 def fit_image(arrays, bank, settings, catalog, grid_wcs):
@@ -39,6 +43,9 @@ def fit_image(arrays, bank, settings, catalog, grid_wcs):
         fit = TemplateFit(arrays, bank, settings)
     else:
         fit = fit_offsets(arrays, bank, settings, catalog)
+    if not settings.second_pass:
+        # what the catalog lacks would move its neighbors
+        fit = settled(fit, bank, catalog)
     more = _More(bank, fit, catalog, grid_wcs)
     by_catalog = catalog.double is not None
     double = np.flatnonzero(catalog.double[catalog.near]) if by_catalog else np.empty(0, int)
@@ -47,9 +54,10 @@ def fit_image(arrays, bank, settings, catalog, grid_wcs):
     if choose:
         # before templates may change, which hides some of the light of a point in their middle
         poor = _poor(fit, catalog, new_xy)
-    if settings.second_pass:
+    evidence = None
+    if settings.second_pass is not False:
         # templates that may change absorb some of the light of their neighbors
-        new_xy = _new_positions(fit, catalog)
+        new_xy, evidence = _new_positions(fit, catalog)
     if len(new_xy) or len(double):
         fit.bank.forget()
         new_xy = more.refined(double, new_xy)
@@ -62,6 +70,7 @@ def fit_image(arrays, bank, settings, catalog, grid_wcs):
     diagnostics = diagnose(fit, np.concatenate([catalog.xy, new_xy]))
     if len(poor):
         fit, diagnostics = _split(fit, diagnostics, more, poor, new_xy)
+    fit.evidence = evidence
     return fit, diagnostics, new_xy
 
 
@@ -73,12 +82,30 @@ def _poor(fit, catalog, new_xy):
 
 
 def _new_positions(fit, catalog):
-    """Where the residual shows sources that the catalog lacks, in the catalog's frame."""
-    peaks = diagnose(fit, catalog.xy).peaks
-    flux = np.full(len(catalog.xy), np.nan)
+    """
+    Where the residual shows sources that the catalog lacks, in the catalog's frame, and the evidence for them.
+
+    The false ones are taken to be as many as the negative of the residual shows, and those of Gaussian noise.
+    Where the evidence decides (``second_pass`` is None) there are none unless they are few.
+    """
+    found, xy = diagnose(fit, catalog.xy), catalog.xy + fit.displacement(catalog.xy)
+    flux = np.full(len(xy), np.nan)
     flux[catalog.near[fit.bank.order]] = fit.total
-    new = new_sources(peaks, catalog.xy + fit.displacement(catalog.xy), flux)
-    return peaks.refined[new] - fit.displacement(peaks.refined[new])
+    peaks, usable, decide = found.peaks, fit.arrays.usable, fit.settings.second_pass is None
+    # a background that is not fitted is no source
+    residual = found.residual - usable * np.median(found.residual[usable])
+    if decide:
+        peaks = residual_peaks(fit, residual, found.model, xy)
+    negative = residual_peaks(fit, -residual, found.model, xy)
+    form = {"usable": usable} if decide else {}
+    new, false = (new_sources(one, xy, flux, **form) for one in (peaks, negative))
+    n_beams = np.count_nonzero(usable) / (4 * np.pi * fit.psf_width**2)
+    n_false = np.count_nonzero(false) + n_beams * ndtr(-LEFT_SNR)
+    rate = float(n_false / max(np.count_nonzero(new), 1))
+    done = fit.settings.second_pass or rate <= _FALSE_RATE
+    at = peaks.refined[new & done]
+    evidence = {"peaks": int(new.sum()), "threshold": LEFT_SNR, "false_rate": float(f"{rate:.2g}")}
+    return at - fit.displacement(at), evidence | {"fitted": bool(done and len(at))}
 
 
 def _split(fit, diagnostics, more, poor, new_xy):
@@ -112,7 +139,7 @@ class _More:
         self._arrays, self._settings, self._scale = first.arrays, first.settings, first.scale
         self._displacement, self._map = first.displacement, first.offset_map
         # a shift that was rejected is not searched again
-        self._search = first.shift is not None
+        self._search, self._own = first.shift is not None and first.own is None, first.own
 
     def fit(self, double, new_xy, search=None):
         """Fit with second components of some of the sources, and new sources after those."""
@@ -125,9 +152,11 @@ class _More:
         half = half * settings.mean_kernel.pixel_scale.to_value(ANGLE) / self._scale / 2
         poly = local_maps(xy, np.full(len(xy), half), arrays.wcs, self._grid_wcs)
         bank = self._bank.with_points(xy, poly)
-        moved = self._displacement(all_xy)
+        moved = np.array(self._displacement(all_xy))
+        moved[:n] += 0.0 if self._own is None else self._own
+        one = self._map is None and self._own is None
         fit = TemplateFit(
-            arrays, bank, settings, host=host, moved=moved if self._map is not None else moved[0],
+            arrays, bank, settings, host=host, moved=moved[0] if one else moved,
             search=self._search if search is None else search,
         )  # fmt: skip
         fit.offset_map = self._map

@@ -42,6 +42,9 @@ class Placement:
         settings, wcs, xy = self.settings, self.arrays.wcs, self.xy[rows]
         shape, grid = self.arrays.flux.shape, self.grid(templates)
         fine_xy = np.stack(grid.world_to_pixel(templates.sky), axis=-1).reshape(-1, 2)
+        # points are where the high-resolution image shows them
+        point = np.isfinite(templates.fitted["parameters"][:, 0]) & (templates.kind == "point")
+        fine_xy[point] = templates.fitted["parameters"][point, :2]
         poly = local_maps(xy, np.full(len(xy), self.margin / 2), wcs, grid)
         sides = None
         if settings.integrate:

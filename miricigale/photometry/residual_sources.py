@@ -12,7 +12,10 @@ from miricigale.utils.parallel import chunks, parallel_map
 #: Least signal-to-noise of light that no template explains, its least share of the model below it and
 #: of a neighbor's flux, and its distance to sources in full widths at half maximum: the least to any,
 #: and the largest to one that is flagged.
-_LEFT_SNR, _LEFT_SHARE, _LEFT_DISTANCE, _LEFT_REACH = 5.0, 0.1, 0.7, 2.0
+LEFT_SNR, _LEFT_SHARE, _LEFT_DISTANCE, _LEFT_REACH = 5.0, 0.1, 0.7, 2.0
+
+#: Share of a source's flux, and distance to it in full widths, within which peaks are of its wings.
+_WINGS = 0.02, 10.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -59,7 +62,7 @@ def residual_peaks(fit, residual, model, xy):
     # few pixels are left for what follows, unless the image has a background
     near = np.arange(-int(np.ceil(width)), int(np.ceil(width)) + 1)
     found = []
-    y, x = np.nonzero(snr > _LEFT_SNR * noise)
+    y, x = np.nonzero(snr > LEFT_SNR * noise)
     for part in chunks(len(y), _CANDIDATES):
         i, j = y[part], x[part]
         top = snr[i, j] >= _windows(snr, i, j, near).max(axis=(1, 2))
@@ -173,13 +176,13 @@ def _parabola(image, xy):
     return np.stack(offsets, axis=1)
 
 
-def _near(peaks, xy):
-    """Pairs of a peak and a source within reach of it, as two arrays of numbers."""
+def _near(peaks, xy, reach=_LEFT_REACH):
+    """Pairs of a peak and a source within reach (full widths) of it, as two arrays of numbers."""
     placed = np.flatnonzero(np.isfinite(xy).all(axis=1))
     if not len(placed) or not len(peaks.xy):
         return np.empty(0, int), np.empty(0, int)
     tree = scipy.spatial.KDTree(xy[placed])
-    found = tree.query_ball_point(peaks.xy, _LEFT_REACH * peaks.full_width)
+    found = tree.query_ball_point(peaks.xy, reach * peaks.full_width)
     peak = np.repeat(np.arange(len(found)), [len(rows) for rows in found])
     return peak, placed[np.concatenate(found).astype(int)]
 
@@ -197,13 +200,19 @@ def unexplained_neighbors(peaks, xy, flux):
     return found
 
 
-def new_sources(peaks, xy, flux):
+def new_sources(peaks, xy, flux, *, usable=None):
     """
     Find peaks that are more than what an imperfect template leaves of a bright source.
 
-    False for peaks with less than a tenth of the flux of a source within two full widths.
+    False for peaks with less than a tenth of the flux of a source within two full widths. With pixels that are
+    ``usable``, (ny, nx), also for those with less than 2 % of that of one within ten, which a PSF that is not
+    exact leaves of wings and spikes, and for those less than two from others, beyond which a source may lie.
     """
-    new = np.ones(len(peaks.xy), bool)
-    peak, source = _near(peaks, xy)
-    new[peak[peaks.flux[peak] <= _LEFT_SHARE * flux[source]]] = False
+    new, strict = np.ones(len(peaks.xy), bool), usable is not None
+    for share, reach in ((_LEFT_SHARE, _LEFT_REACH), *[_WINGS] * strict):
+        peak, source = _near(peaks, xy, reach)
+        new[peak[peaks.flux[peak] <= share * flux[source]]] = False
+    if strict:
+        around = np.arange(-round(2 * peaks.full_width), round(2 * peaks.full_width) + 1)
+        new &= _windows(usable, peaks.xy[:, 1], peaks.xy[:, 0], around).all(axis=(1, 2))
     return new

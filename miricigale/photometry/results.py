@@ -11,6 +11,7 @@ import scipy.sparse
 from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData
 from astropy.table import QTable
+from scipy.special import ndtr, ndtri
 
 from miricigale.instrument.image import Image
 from miricigale.photometry.arrays import pixel_scale
@@ -18,11 +19,23 @@ from miricigale.photometry.draws import correlated_draws
 from miricigale.photometry.fields import SmoothField
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.offsets import OffsetMap
+from miricigale.utils.declared import declared
+from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import Tabular, checked_calls
 from miricigale.utils.random import check_seed
-from miricigale.utils.tables import described_table, error_column
+from miricigale.utils.tables import described_table
 from miricigale.utils.unified import read_write
-from miricigale.utils.units import ANGLE, FNU, check_count
+from miricigale.utils.units import ANGLE, FNU, check_count, is_number
+
+#: Columns of which a band's name takes the place of flux.
+_FLUXES = ("flux", "flux_err", "flux_err_noise", "flux_err_template", "flux_err_psf")
+
+
+def band_column(key, band):
+    """What a column is called in a table of the band, if one is given: ``<band>_flags`` for ``flags``."""
+    if band is None or key in ("id", "sky"):
+        return key
+    return f"{band}{key[4:]}" if key in _FLUXES else f"{band}_{key}"
 
 
 def crowded(sky, flux, *, radius=2 * u.arcsec):
@@ -129,6 +142,8 @@ class ForcedPhotometryResult(Tabular):
         What the catalog lacks, fitted with it: ``id`` (none of the catalog's), ``sky``,
         ``x_centroid``, ``y_centroid``, ``flux``, ``flux_err``, ``snr``, ``flags``, ``coverage`` and
         ``chi2``. None without a second pass.
+    psf_stars : `~miricigale.photometry.stars.KernelStars` or None
+        The stars that corrected the PSFs, and the corrected kernel; None where it was not asked for.
     psf_fwhm : `~astropy.units.Quantity` or None
         Full width at half maximum of a Gaussian as peaked as the image's PSF, in arcsec.
     meta : dict
@@ -191,6 +206,7 @@ class ForcedPhotometryResult(Tabular):
     flux_point_err: u.Quantity | None = None
     joint_covariance: scipy.sparse.csr_array | None = None
     new_sources: QTable | None = None
+    psf_stars: object = None
     psf_fwhm: u.Quantity | None = None
     meta: dict = dataclasses.field(default_factory=dict)
 
@@ -260,6 +276,34 @@ class ForcedPhotometryResult(Tabular):
         draws = correlated_draws(self.covariance, keys, size, check_seed(seed))
         return (self.flux.value + draws) * FNU
 
+    def upper_limit(self, confidence=0.95):
+        """
+        Fluxes that the true ones, which are not negative, are below with some confidence.
+
+        Parameters
+        ----------
+        confidence : float, optional
+            Between 0 and 1.
+
+        Returns
+        -------
+        limit : `~astropy.units.Quantity`, shape (n,)
+            In uJy: quantile of a normal distribution about the measured flux that is cut at 0, so that it is
+            positive for negative fluxes too; NaN where not measured.
+
+        Raises
+        ------
+        ValueError
+            If the confidence is not between 0 and 1.
+
+        References
+        ----------
+        Helene 1983, Nucl. Instr. Meth. 212, 319, eq. 4.
+        """
+        if not (is_number(confidence) and 0 < confidence < 1):
+            raise argument_error("confidence", "between 0 and 1", confidence)
+        return self.flux - ndtri((1 - confidence) * ndtr(self.snr)) * self.flux_err
+
     def correlation(self, first, second):
         """
         Correlation of the errors of two sources, given by id.
@@ -313,7 +357,7 @@ class ForcedPhotometryResult(Tabular):
                 facts[f"flag {name}"] = n
         return facts
 
-    def to_table(self, name=None):
+    def to_table(self, name=None, *, confidence=None):
         """
         Make a table of the fluxes.
 
@@ -323,44 +367,21 @@ class ForcedPhotometryResult(Tabular):
             Name of the filter: columns are then called ``<name>``, ``<name>_err``,
             ``<name>_flags`` and so on, so that tables of several bands can be joined by
             ``id``. Without it they are ``flux``, ``flux_err``, ``flags``...
+        confidence : float, optional
+            If given, that of a column ``upper`` of upper limits (see `upper_limit`).
 
         Returns
         -------
         table : `~astropy.table.QTable`
             With units, descriptions, and provenance in ``meta``.
         """
-        flux, prefix = ("flux", "") if name is None else (name, f"{name}_")
-        error, point = error_column(flux), f"{prefix}flux_point"
-        unknown = "Part of the error from the uncertainty of the template"
-        columns = {
-            "id": (self.id, "Id of the catalog"),
-            "sky": (self.sky, "Position of the catalog"),
-            flux: (self.flux, "Total flux"),
-            error: (self.flux_err, "1-sigma error of the flux"),
-            f"{error}_noise": (
-                self.flux_err_noise,
-                "Part of the error from the noise of the image",
-            ),
-            f"{error}_template": (self.flux_err_template, unknown),
-            f"{error}_psf": (
-                self.flux_err_psf,
-                "Part of the error from the uncertainty of the PSF",
-            ),
-        }
-        texts = {
-            "flags": ForcedFlags.describe(),
-            "snr": "Flux over error",
-            "crowded": "Neighbor within 2 arcsec brighter than the magnitude + 1",
-            "coverage": "Fraction of the light on usable pixels",
-            "chi2": "Template-weighted mean of (residual / sigma)^2",
-            "residual_fraction": "Residual over fitted light in the core",
-            "template": "Template: cutout, sersic, point or none",
-            "template_snr": "Signal-to-noise of the segment of the high-resolution image",
-        }
-        columns |= {f"{prefix}{key}": (getattr(self, key), text) for key, text in texts.items()}
-        if self.flux_point is not None:
-            columns[point] = self.flux_point, "Flux of the point on top of the template"
-            columns[error_column(point)] = self.flux_point_err, "1-sigma error of the point's flux"
+        texts, columns = declared("miricigale.photometry", "columns.toml")["forced"], {}
+        facts = {"flags": ForcedFlags.describe(), "confidence": confidence}
+        for key, text in texts.items():
+            wanted = key == "upper" and confidence is not None
+            values = self.upper_limit(confidence) if wanted else getattr(self, key, None)
+            if values is not None:
+                columns[band_column(key, name)] = values, text.format(**facts)
         return described_table(columns, dict(self.meta))
 
     def plot(self, ax=None, **kwargs):

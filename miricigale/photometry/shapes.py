@@ -1,20 +1,23 @@
 """Which shape the light of a source has: fits of a point and of a Sersic profile, and their evidence."""
 
 import dataclasses
+import functools
 
 import numpy as np
 import scipy.fft
 
 from miricigale.photometry._core.sampling import box_response
-from miricigale.photometry._core.shapes import INDEX_RANGE, shape_models
+from miricigale.photometry._core.shapes import INDEX_RANGE, shape_curves, shape_models
 from miricigale.photometry.cutouts import Cutout
+from miricigale.photometry.population import Population
 from miricigale.profiles import sersic_stamp
 
-#: What is known of shapes beforehand (mean and width): ln of the circularised half-light radius
-#: (arcsec), ln of the Sersic index, the two ellipticities, and the offset of the center (pixels).
-_RADIUS, _INDEX, _ELLIPTICITY, _OFFSET = (np.log(0.2), 0.8), (np.log(1.8), 0.8), 0.6, 0.7
+#: Width (pixels) of the offset of the center from the position.
+_OFFSET = 0.7
 
-_WIDTHS = (_OFFSET, _OFFSET, _RADIUS[1], _INDEX[1], _ELLIPTICITY, _ELLIPTICITY)
+#: Nodes that a shape's probability is summed over, and the width of their density over that of the
+#: normal distribution about the best shape.
+_NODES, _WIDER = 32, 1.15
 
 #: What is kept of the profile fitted to a source: its parameters with x and y on the whole image, the
 #: covariance of ln flux and parameters, the probability of a point, and the profile's part of the
@@ -36,6 +39,9 @@ _STARTS = (-0.9, 0.0, 0.9)
 #: over that of the stamp.
 _HALF, _MOST, _REACH, _PERIOD = 16, 48, 4.0, 1.8
 
+#: Part of a PSF's light below which frequencies are left out.
+_PASSED = 1e-5
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Shape:
@@ -45,6 +51,9 @@ class Shape:
     parameters: np.ndarray  # (6,): As for `~miricigale.photometry._core.shapes.shape_models`.
     point: float  # Probability that the source is a point.
     covariance: np.ndarray  # (7, 7): Of ln flux and the parameters.
+    #: Nodes, (k, 6), and ln of the likelihood of a point, as `Population.odds` takes them.
+    nodes: np.ndarray | None = None
+    as_point: float = -np.inf
 
     @property
     def axes(self):
@@ -62,6 +71,27 @@ class Shape:
             theta=angle, max_radius=farthest,
         )  # fmt: skip
         return Cutout(stamp, origin, convolved=False)
+
+    def among(self, odds, point):
+        """The mean of the nodes, with their probabilities and that of a point."""
+        odds = odds / odds.sum() if odds.sum() > 0 else np.full(len(odds), 1.0 / len(odds))
+        values = self.nodes[:, 1:]
+        mean = odds @ values
+        off = values - mean
+        found = (off * odds[:, None]).T @ off
+        # noise of the flux of each shape
+        found[0, 0] += 1.0 / np.linalg.inv(self.covariance)[0, 0]
+        covariance, keep = np.zeros((7, 7)), [0, 3, 4, 5, 6]
+        covariance[1:3, 1:3] = self.covariance[1:3, 1:3]
+        covariance[np.ix_(keep, keep)] = found
+        parameters = np.concatenate([self.parameters[:2], mean[1:]])
+        return dataclasses.replace(
+            self,
+            flux=float(np.exp(mean[0])),
+            parameters=parameters,
+            covariance=covariance,
+            point=float(point),
+        )
 
     def semi_major(self, size, origin):
         """Semi-major axis (pixels) of the ellipse through each pixel of an image at an origin (y, x)."""
@@ -81,6 +111,16 @@ def not_fitted(n):
     return found
 
 
+@functools.cache
+def normal_nodes():
+    """Points of a normal distribution in four dimensions: of zero mean and unit covariance."""
+    from scipy.stats import norm, qmc
+
+    z = norm.ppf(qmc.Sobol(4, scramble=True, rng=np.random.default_rng(1)).random(_NODES))
+    z -= z.mean(axis=0)
+    return z @ np.linalg.inv(np.linalg.cholesky(z.T @ z / len(z))).T
+
+
 class ShapeModels:
     """Draws light through a PSF, odd and centered."""
 
@@ -88,7 +128,7 @@ class ShapeModels:
         self._psf = np.asarray(psf, float)
         #: Half-width of the PSF (pixels).
         self.reach = self._psf.shape[0] / 2
-        self._transforms = {}
+        self._transforms, self._waves = {}, {}
 
     def _transform(self, size):
         if size not in self._transforms:
@@ -110,6 +150,24 @@ class ShapeModels:
         size = _period(shape)
         psf = self._transform(size)
         return shape_models(psf, size, shape, parameters, derivatives=derivatives)
+
+    def waves(self, size):
+        """The `Waves` of stamps of a size."""
+        if size not in self._waves:
+            period = _period((size, size))
+            self._waves[size] = Waves(self._transform(period), period, size)
+        return self._waves[size]
+
+    def nodes(self, shape, xy, shapes):
+        """Profiles of unit light at one place, (n, *shape); ``shapes``, (n, 4), without it."""
+        size = _period(shape)
+        psf = self._transform(size)
+        fy, fx = 2 * np.pi * np.fft.fftfreq(size), 2 * np.pi * np.fft.rfftfreq(size)
+        ky, kx = (one.ravel() for one in np.meshgrid(fy, fx, indexing="ij"))
+        moved = psf * np.exp(-1j * fy * xy[1])[:, None] * np.exp(-1j * fx * xy[0])
+        spectra = shape_curves(kx, ky, shapes).reshape(len(shapes), size, -1) * moved
+        images = scipy.fft.irfft2(spectra.astype(np.complex64), s=(size, size), overwrite_x=True)
+        return images[:, : shape[0], : shape[1]]
 
     def convolve(self, images, origin, shape):
         """
@@ -133,6 +191,36 @@ class ShapeModels:
         return found[:, rims[0] : rims[0] + shape[0], rims[1] : rims[1] + shape[1]]
 
 
+class Waves:
+    """The frequencies that a PSF lets pass, on a square stamp."""
+
+    def __init__(self, psf, period, size):
+        self._period, self._size = period, size
+        self._use = np.abs(psf) > _PASSED * np.abs(psf[0, 0])
+        ky, kx = np.nonzero(self._use)
+        self._psf = psf[self._use]
+        #: Frequencies, rad per pixel, shape (m,), and what their squares count in the sum over all pixels.
+        self.kx, self.ky = (
+            2 * np.pi * np.fft.rfftfreq(period)[kx],
+            2 * np.pi * np.fft.fftfreq(period)[ky],
+        )
+        twice = np.where((kx == 0) | (2 * kx == period), 1.0, 2.0)
+        self.weight = twice * np.abs(self._psf) ** 2 / period**2
+
+    def power(self, curve):
+        """Sum of squares of the pixels of a transform."""
+        return np.sum(self.weight * curve**2)
+
+    def images(self, curves, xy):
+        """Pixels of transforms, (n, m), about a place: (n, size, size)."""
+        spectra = np.zeros((len(curves), *self._use.shape), complex)
+        spectra[:, self._use] = curves * (
+            self._psf * np.exp(-1j * (self.kx * xy[0] + self.ky * xy[1]))
+        )
+        images = scipy.fft.irfft2(spectra, s=(self._period,) * 2, overwrite_x=True)
+        return images[:, : self._size, : self._size]
+
+
 class ShapeFitter(ShapeModels):
     """Fits light profiles through the PSF of an image of ``scale`` arcsec per pixel."""
 
@@ -140,7 +228,7 @@ class ShapeFitter(ShapeModels):
         super().__init__(psf)
         self._log_scale = np.log(scale)
 
-    def fit(self, data, weight, xy, start=None):
+    def fit(self, data, weight, xy, population=None, start=None):
         """
         Fit a point and a Sersic profile.
 
@@ -158,7 +246,10 @@ class ShapeFitter(ShapeModels):
         shape : `Shape` or None
             None where no profile of positive light fits.
         """
-        mean, width = self._expected(xy), np.array(_WIDTHS)
+        population = population or self.expected
+        mean = np.concatenate([xy, population.mean])
+        precision = np.diag([_OFFSET**-2] * 2 + [0.0] * 4)
+        precision[2:, 2:] = np.linalg.inv(population.spread)
         half = _HALF if start is None else _half_width(start.parameters)
         inner = self._stamp(data, weight, mean, half)
         if start is None:
@@ -166,30 +257,36 @@ class ShapeFitter(ShapeModels):
             parameters = min(starts, key=lambda one: _misfit(one, inner))
         else:
             parameters = start.parameters
-        extended = _minimum(inner, parameters, mean, width, 6)
+        extended = _minimum(inner, parameters, mean, precision)
         if extended is not None and start is None and _half_width(extended[1]) > half:
             inner = self._stamp(data, weight, mean, _half_width(extended[1]))
-            extended = _minimum(inner, extended[1], mean, width, 6)
+            extended = _minimum(inner, extended[1], mean, precision)
         if extended is None:
             return None
         flux, parameters, evidence, covariance = extended
+        nodes = inner.nodes(parameters, covariance[3:, 3:], mean)
         start = parameters.copy()
         start[2] = -30.0
-        share = 0.0
+        as_point = -np.inf
         # a point that is far worse in the same place need not be moved to the best one
         if _misfit(start, inner) < -2 * evidence + _FAR_BELOW:
-            point = _minimum(inner, start, mean, width, 2)
-            odds = np.inf if point is None else evidence - point[2]
-            share = 1.0 / (1.0 + np.exp(np.clip(odds, -50, 50)))
-        return Shape(flux, parameters, float(share), covariance)
+            point = _minimum(inner, start, mean, precision[:2, :2])
+            if point is not None:
+                as_point = point[2] - np.log(point[0])
+        shape = Shape(flux, parameters, 0.0, covariance, nodes, as_point)
+        return shape.among(*(one[0] for one in population.odds(nodes[None], np.array([as_point]))))
 
-    def _expected(self, xy):
-        return np.array([*xy, _RADIUS[0] - self._log_scale, _INDEX[0], 0.0, 0.0])
+    @functools.cached_property
+    def expected(self):
+        """What is known of sources beforehand."""
+        return Population.expected(np.exp(self._log_scale))
 
-    def unfitted(self, xy):
+    def unfitted(self, xy, population):
         """What is known beforehand of a source at a position: the typical shape, or a point."""
-        widths = np.square([0.0, *_WIDTHS])
-        return Shape(np.nan, self._expected(xy), 0.5, np.diag(widths))
+        covariance = np.zeros((7, 7))
+        covariance[3:, 3:] = population.spread
+        covariance[1, 1] = covariance[2, 2] = _OFFSET**2
+        return Shape(np.nan, np.array([*xy, *population.mean]), population.point, covariance)
 
     def _stamp(self, data, weight, mean, half):
         """The pixels within ``half`` of the middle."""
@@ -205,12 +302,17 @@ class ShapeFitter(ShapeModels):
             return self.profiles(shape, shifted, derivatives)
 
         inverse = weight[cut].ravel()[use]
-        return _Stamp(models, use, inverse, data[cut].ravel()[use] * inverse, max(shape))
+
+        def curves(xy, shapes):
+            return self.nodes(shape, np.asarray(xy) - [x0, y0], shapes)
+
+        return _Stamp(models, curves, use, inverse, data[cut].ravel()[use] * inverse, max(shape))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Stamp:
     models: object
+    curves: object
     use: np.ndarray
     inverse: np.ndarray
     white: np.ndarray
@@ -218,6 +320,43 @@ class _Stamp:
 
     def whitened(self, images):
         return images.reshape(len(images), -1)[:, self.use] * self.inverse
+
+    def nodes(self, parameters, covariance, mean):
+        """Shapes about the best as `Population.odds` takes them: likelihood over density, flux, shape."""
+        root = np.linalg.cholesky(covariance) * _WIDER
+        z = normal_nodes()
+        shapes = parameters[2:] + z @ root.T
+        shapes[:, 0] = np.clip(shapes[:, 0], np.log(0.05), np.log(self.size))
+        shapes[:, 1] = np.clip(shapes[:, 1], *np.log(INDEX_RANGE))
+        images = self.curves(parameters[:2], shapes)
+        columns = np.stack(
+            [images, -np.gradient(images, axis=2), -np.gradient(images, axis=1)], axis=1
+        )
+        columns = columns.reshape(len(images), 3, -1)[:, :, self.use] * self.inverse
+        power, below = (
+            np.einsum("kp,kp->k", columns[:, 0], columns[:, 0]),
+            columns[:, 0] @ self.white,
+        )
+        seen = below > 0
+        flux = np.where(seen, below, 1.0) / power
+        # flux and center that are best for each, and the volume of what is possible
+        columns[:, 1:] *= flux[:, None, None]
+        matrix = columns @ columns.transpose(0, 2, 1)
+        matrix[:, [1, 2], [1, 2]] += _OFFSET**-2
+        residual = self.white - flux[:, None] * columns[:, 0]
+        off = np.append(0.0, parameters[:2] - mean[:2])
+        slope = np.einsum("kcp,kp->kc", columns, residual) - off * _OFFSET**-2
+        step = np.linalg.solve(matrix, slope[..., None])[..., 0]
+        chi2 = np.einsum("kp,kp->k", residual, residual) + off @ off * _OFFSET**-2
+        chi2 -= np.einsum("kc,kc->k", slope, step)
+        volume = np.linalg.slogdet(matrix)[1] + 4 * np.log(_OFFSET)
+        density = (
+            -0.5 * np.sum(z * z, axis=1) - np.sum(np.log(np.diag(root))) - 2 * np.log(2 * np.pi)
+        )
+        # of a distribution that is flat in ln flux
+        log_flux = np.log(np.maximum(flux + step[:, 0], 0.1 * flux))
+        like = -0.5 * (chi2 + volume) - log_flux - density
+        return np.column_stack([np.where(seen, like, -1e9), np.where(seen, log_flux, 0.0), shapes])
 
 
 def _half_width(parameters):
@@ -239,15 +378,15 @@ def _misfit(parameters, stamp):
     return float(np.sum((stamp.white - flux * scaled) ** 2))
 
 
-def _minimum(stamp, start, mean, width, n_free):
+def _minimum(stamp, start, mean, precision):
     """
     Levenberg-Marquardt for the light and the first parameters, with Gaussian priors.
 
     Flux, parameters, evidence (Laplace's, without the light's prior) and covariance of ln flux and the free
     parameters; None if nothing is found.
     """
+    n_free = len(precision)
     free = slice(0, n_free)
-    precision = np.concatenate([[0.0], width[free] ** -2])
     low = np.array([-np.inf, -np.inf, np.log(0.05), np.log(INDEX_RANGE[0]), -2.0, -2.0])
     high = np.array([np.inf, np.inf, np.log(stamp.size), np.log(INDEX_RANGE[1]), 2.0, 2.0])
 
@@ -256,13 +395,14 @@ def _minimum(stamp, start, mean, width, n_free):
         power = columns[0] @ columns[0]
         flux = (columns[0] @ stamp.white) / power if power > 0 else 0.0
         z = stamp.white - flux * columns[0]
-        chi2 = z @ z + np.sum(((parameters - mean)[free] / width[free]) ** 2)
+        off = (parameters - mean)[free]
+        chi2 = z @ z + off @ precision @ off
         columns[1:] *= flux
         return parameters, columns, flux, z, chi2
 
     def curvature(columns):
         matrix = columns @ columns.T
-        matrix[np.diag_indices_from(matrix)] += precision
+        matrix[1:, 1:] += precision
         return matrix
 
     best = at(start.copy())
@@ -270,7 +410,8 @@ def _minimum(stamp, start, mean, width, n_free):
     for _ in range(_STEPS):
         parameters, columns, _, z, chi2 = best
         matrix = curvature(columns)
-        slope = columns @ z - precision * np.concatenate([[0.0], (parameters - mean)[free]])
+        slope = columns @ z
+        slope[1:] -= precision @ (parameters - mean)[free]
         gained = 0.0
         while damping < 1e6:
             damped = matrix + np.diag(damping * np.diag(matrix))
@@ -295,7 +436,7 @@ def _minimum(stamp, start, mean, width, n_free):
     sign, log_det = np.linalg.slogdet(matrix)
     if not (sign > 0 and np.isfinite(chi2) and flux > 0):
         return None
-    evidence = -0.5 * (chi2 + log_det - np.sum(np.log(precision[1:])))
+    evidence = -0.5 * (chi2 + log_det - np.linalg.slogdet(precision)[1])
     covariance = np.linalg.inv(matrix)
     covariance[0] /= flux
     covariance[:, 0] /= flux

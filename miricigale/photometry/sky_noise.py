@@ -9,8 +9,8 @@ from miricigale.utils.units import FNU
 #: Pixels of the smallest area that counts as filled.
 _FILLED = 25
 
-#: Of what is no sky: the Gaussian that smooths, the least significance after it, the rim (pixels).
-_WIDTH, _SIGNIFICANT, _RIM = 2.0, 3.5, 3
+#: Of what is no sky: the Gaussian that smooths, and the rim (pixels).
+_WIDTH, _RIM = 2.0, 3
 
 
 def weight_scale(data, weight, *, mask=None):
@@ -94,7 +94,7 @@ def mask_filled(values, usable, what):
     return n
 
 
-def sky_noise(values, usable):
+def sky_noise(values, usable, *, significance=3.5):
     """
     Median and robust rms of the source-free pixels, and which they are.
 
@@ -106,6 +106,9 @@ def sky_noise(values, usable):
         The image, best in units of its local noise.
     usable : bool `~numpy.ndarray`, shape (ny, nx)
         Pixels with data; at least one.
+    significance : float, optional
+        Of what is left out, after smoothing. Below 4 peaks of noise are left out too, and with them a part of the
+        noise on large scales.
 
     Returns
     -------
@@ -124,7 +127,7 @@ def sky_noise(values, usable):
     free = usable
     for _ in range(12):
         level, rms = _median_rms(smooth[free])
-        bright = usable & (np.abs(smooth - level) > _SIGNIFICANT * rms)
+        bright = usable & (np.abs(smooth - level) > significance * rms)
         bright = scipy.ndimage.binary_dilation(bright, structure, iterations=_RIM)
         found = usable & ~bright
         # an image that is full of light is measured as it is

@@ -9,9 +9,10 @@ from astropy.coordinates import SkyCoord
 from photutils.psf import ImagePSF
 from photutils.segmentation import SegmentationImage
 
-from miricigale.photometry.arrays import image_arrays, pixel_scale
+from miricigale.photometry.arrays import image_arrays, pixel_scale, same_grid
 from miricigale.photometry.catalogs import OPTIONAL, catalog_sources, joined_sky, sersic_rows
-from miricigale.photometry.cutouts import Cutout, own_segments
+from miricigale.photometry.cutouts import Cutout, own_segments, saturated_cores
+from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.light import cutouts
 from miricigale.photometry.priors import check_labels, labels_at
 from miricigale.photometry.shapes import not_fitted
@@ -187,9 +188,13 @@ class SourceTemplates:
             check_labels(np.asarray(catalog["label"]), label, "catalog['label']")
             label = catalog["label"]
         label, flags = own_segments(segments, label, xy)
+        width = 1 / np.sqrt(psf.max() / psf.sum())
+        full, flat = saturated_cores(fine.flux, fine.usable, segments, label, xy, width)
+        flags[full] |= int(ForcedFlags.SATURATED)
+        variance = np.where(flat, np.inf, fine.sigma**2)
         with threads(n_threads) as executor, single_threaded():
             light, more, snr, fitted = cutouts(
-                fine.flux, fine.sigma**2, psf, scale, segments, label, xy,
+                fine.flux, variance, psf, scale, segments, label, xy,
                 select=template == "auto", wings=wings,
                 min_snr=_MIN_SNR if template == "auto" else 0.0,
                 executor=executor,
@@ -306,7 +311,7 @@ class SourceTemplates:
         if not parts:
             raise argument_error("parts", "at least one SourceTemplates", "none")
         grids = [one.wcs for one in parts if one.wcs is not None]
-        if any(not _same_grid(one, grids[0]) for one in grids[1:]):
+        if any(not same_grid(one, grids[0]) for one in grids[1:]):
             raise argument_error("parts", "on one grid", "different ones")
         psfs = [one.psf for one in parts if one.psf is not None]
         names = {str(one.meta.get("template")): None for one in parts}
@@ -417,10 +422,3 @@ def _pixels_per_arcsec(sky, wcs):
     """Jacobian [dx, dy] = J @ [east, north] of a WCS at a position."""
     moved = sky.directional_offset_by([90, 0] * u.deg, 1 * u.arcsec)
     return np.array(wcs.world_to_pixel(moved)) - np.array(wcs.world_to_pixel(sky))[:, None]
-
-
-def _same_grid(one, other):
-    """Whether two WCSs put a square of pixels at the same places (to 1e-3 pixel)."""
-    x, y = np.array([0.0, 1000.0, 0.0, 1000.0]), np.array([0.0, 0.0, 1000.0, 1000.0])
-    found = other.world_to_pixel(one.pixel_to_world(x, y))
-    return bool(np.all(np.abs(np.array(found) - [x, y]) < 1e-3))

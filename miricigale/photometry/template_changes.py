@@ -5,17 +5,16 @@ import dataclasses
 import numpy as np
 import scipy.ndimage
 
-from miricigale.photometry._core.shapes import INDEX_RANGE
+from miricigale.photometry._core.shapes import INDEX_RANGE, shape_curves
 from miricigale.photometry.cutouts import Cutout
-from miricigale.photometry.shapes import ShapeModels
+from miricigale.photometry.shapes import ShapeModels, normal_nodes
 
 #: Half-width (fine pixels) of the stamps of changes, least and most, in half-light radii and in rms
 #: widths of the PSF.
 _HALF, _MOST, _REACH, _WIDTHS = 16, 160, 5.0, 4.0
 
-#: Radius (fine pixels) of a profile that is as good as a point; largest step of ln radius, ln index
-#: or ellipticity that is taken as linear.
-_POINT, _LINEAR = 0.05, 0.15
+#: Least power of a change (see `TemplateChanges.of`) below which stamps are larger than that.
+_SEEN = 0.01
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -54,7 +53,7 @@ class TemplateChanges:
         widths = [np.sum(psf) ** 2 / (4 * np.pi * np.sum(psf**2)) for psf in (target, source)]
         self._width = np.sqrt(widths[0])
         self._blur = np.sqrt(max(widths[0] - widths[1], 0.0))
-        self._size_variance = size_scatter**2
+        self._size_scatter = size_scatter
 
     def of(self, cutout, fitted, least):
         """
@@ -63,50 +62,44 @@ class TemplateChanges:
         ``cutout`` is the template, None for a point, ``fitted`` what is known of it. Changes with less than the
         part ``least`` of the root of the sum of squares of the template are left out.
         """
+        if cutout is not None and cutout.rest is not None:
+            return self._of_image(cutout, fitted, least)
         parameters = fitted["parameters"]
         middle = np.rint(parameters[:2])
-        half = min(_reach(parameters), _MOST) + _WIDTHS * self._width
+        # the wings of a brighter source's changes are seen farther out
+        widths = _WIDTHS * np.clip(_SEEN / least, 1.0, 4.0)
+        half = min(_reach(parameters), _MOST) + widths * self._width
         half = int(np.ceil(max(half, _HALF)))
+        waves = self._target.waves(2 * half + 1)
+        # nodes about the mean, and the profile that is scaled
+        covariance = fitted["covariance"][3:, 3:]
+        nodes = parameters[2:] + normal_nodes() @ _root(covariance).T
+        nodes[:, 1] = np.clip(nodes[:, 1], *np.log(INDEX_RANGE))
+        step = np.array([0.5 * self._size_scatter, 0.0, 0.0, 0.0])
+        some = [parameters[2:], parameters[2:] + step, parameters[2:] - step]
+        curves = shape_curves(waves.kx, waves.ky, np.concatenate([nodes, some]))
+        profile, *sides = curves[len(nodes) :]
+        curves = curves[: len(nodes)]
+        # a point has no size
+        odds = fitted["point"]
+        base = np.ones_like(profile) if cutout is None else profile
+        mean = (1.0 - odds) * curves.mean(axis=0) + odds
+        steps = np.sqrt((1.0 - odds) / len(nodes)) * (curves - mean)
+        scatter = (1.0 - odds) * (sides[0] - sides[1])
+        steps = np.concatenate([steps, [np.sqrt(odds) * (1.0 - mean), scatter]])
+        # light is blurred by what is not known of the center
+        kx, ky = waves.kx, waves.ky
+        cxx, cxy, _, cyy = fitted["covariance"][1:3, 1:3].ravel()
+        blur = np.exp(-0.5 * (cxx * kx * kx + 2 * cxy * kx * ky + cyy * ky * ky))
+        limit = least**2 * waves.power(base)
+        value, vector = np.linalg.eigh((steps * waves.weight) @ steps.T)
+        kept = value > limit
+        found = np.concatenate([vector.T[kept] @ steps, [mean * blur - base]])
+        fixed = waves.power(found[-1]) > limit
+        images = waves.images(found if fixed else found[:-1], parameters[:2] - middle + half)
         origin = int(middle[1]) - half, int(middle[0]) - half
-
-        def images(parameters, derivatives=0):
-            moved = parameters + np.array([half - middle[0], half - middle[1], 0, 0, 0, 0])
-            found = self._target.profiles((2 * half + 1,) * 2, moved, derivatives)
-            return found.astype(float)
-
-        profile, *derivatives = images(parameters, 6)
-        spread = np.zeros((6, 6))
-        spread[2, 2] = self._size_variance
-        found, noise = [], 0.0
-        if cutout is not None and cutout.rest is not None:
-            found, noise = self._of_image(cutout, fitted, least)
-            share, limit = fitted["light"] ** 2, least**2 * np.sum(profile**2)
-            point = None
-        else:
-            spread += fitted["covariance"][1:, 1:]
-            share = 1.0 if cutout is not None else 1.0 - fitted["point"]
-            point = _as_point(images, parameters) if 0 < fitted["point"] < 1 else None
-            template = point if cutout is None and point is not None else profile
-            limit = least**2 * np.sum(template**2)
-        mean = np.zeros_like(profile)
-        for step in _steps(_root(share * spread), derivatives, limit):
-            change = np.tensordot(step, derivatives, 1)
-            if np.max(np.abs(step[2:])) > _LINEAR:
-                sides = [images(_moved(parameters, sign * step))[0] for sign in (1, -1)]
-                change = 0.5 * (sides[0] - sides[1])
-                mean += 0.5 * (sides[0] + sides[1]) - profile
-            found.append(Change(Cutout(change, origin)))
-        if point is not None:
-            odds = fitted["point"]
-            change = np.sqrt(odds * (1.0 - odds)) * (point - profile)
-            mean += (1.0 - odds if cutout is None else odds) * (
-                profile - point if cutout is None else point - profile
-            )
-            if np.sum(change**2) > limit:
-                found.append(Change(Cutout(change, origin)))
-        if np.sum(mean**2) > limit:
-            found.append(Change(Cutout(mean, origin), fixed=True))
-        return found, noise
+        last = len(images) - 1 if fixed else len(images)
+        return [Change(Cutout(one, origin), fixed=k == last) for k, one in enumerate(images)], 0.0
 
     def _of_image(self, cutout, fitted, least):
         """The same where the core is the image: its own noise, and the profile elsewhere."""
@@ -140,12 +133,6 @@ def _reach(parameters):
     return _REACH * np.exp(parameters[2] + 0.5 * np.hypot(*parameters[4:]))
 
 
-def _as_point(images, parameters):
-    point = np.array(parameters)
-    point[2], point[4:] = np.log(_POINT), 0.0
-    return images(point)[0]
-
-
 def _root(covariance):
     """A root of a covariance that may be singular."""
     value, vector = np.linalg.eigh(covariance)
@@ -157,9 +144,3 @@ def _steps(root, derivatives, least):
     flat = np.reshape(derivatives, (len(derivatives), -1))
     value, vector = np.linalg.eigh(root.T @ (flat @ flat.T) @ root)
     return [root @ vector[:, k] for k in range(len(value)) if value[k] > least]
-
-
-def _moved(parameters, step):
-    moved = parameters + step
-    moved[3] = np.clip(moved[3], *np.log(INDEX_RANGE))
-    return moved

@@ -63,6 +63,10 @@ class TemplateFit:
         The common parameters' images: the background's first, then those of the shift.
     shift, offset_map
         In arcsec, shape (2,), and the `OffsetMap` by which templates are moved; None without.
+    evidence
+        For a second pass (dict), where that was asked for; None otherwise.
+    own : `~numpy.ndarray`, shape (n, 2)
+        Pixels by which each source of the bank is moved beyond that; None without.
     """
 
     def __init__(self, arrays, bank, settings, *, host=None, moved=None, search=None):
@@ -73,7 +77,7 @@ class TemplateFit:
         self._background = (
             self._background_columns() if settings.background_order is not None else []
         )
-        self.shift = self.offset_map = self.free = None
+        self.shift = self.offset_map = self.free = self.own = self.evidence = None
         self.bank = bank
         moved = np.zeros(2) if moved is None else moved
         self._solve(bank.shifted(moved) if np.any(moved) else bank, [])

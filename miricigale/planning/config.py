@@ -45,7 +45,7 @@ class SampleSection(Section):
     n_sources: int = option(1000, low=0, high=1000000)
     redshift: tuple[float, ...] = option((0.01, 6.0), low=0.0, high=20.0)
     luminosity: tuple[float, ...] = option((0.0, 16.0), low=0.0, high=20.0)
-    area: float = option(0.0, low=0.0)
+    area: float = option(0.0, low=0.0, high=1e5)
     luminosity_function: str = ""
 
 
@@ -67,7 +67,7 @@ class AgnSection(Section):
     """
 
     frac_agn: tuple[float, ...] = option((), low=0.0, high=0.99, single=True)
-    shares: tuple[float, ...] = option((), low=0.0, single=True)
+    shares: tuple[float, ...] = option((), low=0.0, high=1e6, single=True)
     limit: float = option(0.4, low=0.01, high=0.99)
     threshold: float = option(0.5, low=0.0, high=1.0)
 
@@ -111,12 +111,12 @@ class ExposureSection(Section):
     """
 
     bands: tuple[str, ...] = option(CEERS_FILTERS, choices=imager_filters(), unique=True)
-    time: tuple[float, ...] = option((), low=0.0, single=True)
+    time: tuple[float, ...] = option((), low=0.0, high=1e7, single=True)
     depth: tuple[float, ...] = option((), low=10.0, high=40.0, single=True)
     dithers: tuple[int, ...] = option((), low=1, high=500, single=True)
     readout: str = option("FASTR1", choices=readout_patterns())
     max_fill: float = option(0.6, low=0.05, high=0.95)
-    max_groups: int = option(100, low=2)
+    max_groups: int = option(100, low=2, high=10000)
     photom: str = ""
     date: str = ""
     sets: tuple[str, ...] = ("all",)
@@ -253,14 +253,14 @@ class OverheadSection(Section):
     """
 
     # JDox is the JWST user documentation; its "JWST Instrument Overheads" are of APT 2023.3.4
-    slew: float = option(1800.0, low=0.0)
-    next_slew: float = option(150.0, low=0.0)
-    guide_star: float = option(284.0, low=0.0)
-    visit: float = option(90.0, low=0.0)
-    filter: float = option(50.0, low=0.0)
-    script: float = option(22.0, low=0.0)
-    exposure: float = option(44.0, low=0.0)
-    dither: float = option(60.0, low=0.0)
+    slew: float = option(1800.0, low=0.0, high=1e5)
+    next_slew: float = option(150.0, low=0.0, high=1e5)
+    guide_star: float = option(284.0, low=0.0, high=1e5)
+    visit: float = option(90.0, low=0.0, high=1e5)
+    filter: float = option(50.0, low=0.0, high=1e5)
+    script: float = option(22.0, low=0.0, high=1e5)
+    exposure: float = option(44.0, low=0.0, high=1e5)
+    dither: float = option(60.0, low=0.0, high=1e5)
     observatory: float = option(0.16, low=0.0, high=1.0)
 
 

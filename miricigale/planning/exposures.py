@@ -19,7 +19,7 @@ from miricigale.instrument import Exposure, frame_time, miri_detector, psf_fwhm
 from miricigale.photometry import ErrorModel
 from miricigale.planning.config import NoiseSection
 from miricigale.reduction import imager_response
-from miricigale.utils.exceptions import ConfigError, data_error
+from miricigale.utils.exceptions import ConfigError, config_error, data_error
 from miricigale.workflow.background import band_background
 from miricigale.workflow.options import of_option
 
@@ -83,21 +83,17 @@ class BandPlan:
     def _light(self):
         return {"background": self.background, "detector": self.detector}
 
+    @property
+    def _noise(self):
+        known = {"n_dithers": self.n_dithers, "residual": self.noise.residual or None}
+        return self._light | known
+
     @functools.cached_property
     def limit(self):
         """5-sigma AB limit of point sources in the calculator's aperture, by `~miricigale.depth.sensitivity`."""
-        limit = sensitivity(
-            self.filter,
-            self.time,
-            n_sigma=5,
-            **self._light,
-            residual=self.noise.residual or None,
-            n_dithers=self.n_dithers,
-            n_groups=self.exposure.n_groups,
-            readout=self.exposure.readout,
-            subarray=self.exposure.subarray,
-        )
-        return limit.to(u.ABmag)
+        names = ("n_groups", "readout", "subarray")
+        options = {name: getattr(self.exposure, name) for name in names} | self._noise
+        return sensitivity(self.filter, self.time, n_sigma=5, **options).to(u.ABmag)
 
     def numbers(self):
         """
@@ -111,6 +107,7 @@ class BandPlan:
             "groups": self.exposure.n_groups,
             "integrations": self.exposure.n_integrations,
             "dithers": self.n_dithers,
+            "background": np.round(self.background, 2),
             "sky_in_well": round(float(self.sky_fraction), 3),
             "limit_etc": np.round(scaled_limit(self.filter, self.time).to(u.ABmag), 2),
             "limit": np.round(self.limit, 2),
@@ -166,13 +163,11 @@ class BandPlan:
         return ErrorModel.from_exposure(
             self.filter,
             self.time,
-            **self._light,
+            **self._noise,
             size=size,
             n_integrations=self.n_dithers * self.exposure.n_integrations,
             frame_time=self.exposure.frame_time,
             fractional=self.noise.fractional,
-            n_dithers=self.n_dithers,
-            residual=self.noise.residual or None,
             excess=self.noise.excess,
         )
 
@@ -209,8 +204,7 @@ class RunErrors:
         exposures = band_exposures(self.config, plan.filter)
         if not exposures:
             known = list(self.config.exposures.filters)
-            msg = f"the run of [noise] has no band {plan.filter}; it has {known}"
-            raise ConfigError(msg)
+            raise config_error("the run of [noise]", f"has no band {plan.filter}; it has {known}")
         background = study_background(self.config, plan.filter)
         noise = NoiseSection(residual=self.config.detector.residual)
         own = BandPlan(exposures[0], len(exposures), background, noise)
@@ -227,12 +221,8 @@ def background_options(config):
     options, position = config.background, None
     if options.ra >= 0:
         position = SkyCoord(options.ra * u.deg, options.dec * u.deg)
-    return {
-        "filters": config.exposures.bands,
-        "levels": options.level,
-        "position": position,
-        "date": options.date,
-    }
+    levels = {"filters": config.exposures.bands, "levels": options.level}
+    return levels | {"position": position, "date": options.date}
 
 
 def _band_plan(filter, time, n_dithers, config, run):

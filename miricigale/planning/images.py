@@ -13,7 +13,7 @@ from miricigale.evaluation.estimates import median, scatter
 from miricigale.photometry import ErrorModel
 from miricigale.planning.accuracy import accuracy, difference
 from miricigale.planning.sample import agn_mix
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.random import stream
 from miricigale.utils.store import replacing
 from miricigale.utils.tables import error_column
@@ -135,14 +135,7 @@ def images_study(planner, source):
             n_dithers=tuple(plan.n_dithers for plan in plans.values()),
         ),
         detector=DetectorSection(residual=config.noise.residual),
-        fit=FitSection(
-            bands=fit.bands,
-            depths=fit.depths,
-            axes=fit.axes,
-            model_error=fit.model_error,
-            dust_excess=fit.dust_excess,
-            min_detected=planner.min_detected,
-        ),
+        fit=FitSection(**dataclasses.asdict(fit) | {"min_detected": planner.min_detected}),
         point_sources=PointSourceSection(enabled=False),
     )
 
@@ -172,17 +165,15 @@ def image_sample(planner, folder, *, executor=None, progress_bar=False):
     ValueError
         If the plan has sources of the caller, which have no positions.
     """
-    if planner.given is not None:
-        raise argument_error("planner", "one with the sample of its catalog", "given sources")
+    check_that(planner.given is None, "planner", "one with the sample of its catalog", "sources")
     folder = Path(folder).resolve()
     source = folder.with_name(f"{folder.name}.ecsv")
     folder.parent.mkdir(parents=True, exist_ok=True)
     with replacing(source, overwrite=True) as partial:
         images_catalog(planner).write(partial, format="ascii.ecsv")
     study = images_study(planner, source)
-    run_study(
-        study, folder, executor=executor, redo=True, until="matches", progress_bar=progress_bar
-    )
+    parallel = {"executor": executor, "progress_bar": progress_bar}
+    run_study(study, folder, redo=True, until="matches", **parallel)
     truth = truth_names(study)[-1]
     matched = QTable.read(folder / truth / "matched.ecsv")
     matched = rows_of(matched, planner.sources["id"])
@@ -278,11 +269,8 @@ def paired_numbers(planner, plans, imaged_plans, imaged):
         noise, images = (accuracy(one, **options) for one in pair)
         for name, change in difference(*pair, **options).items():
             row = {"plan": plan.name, "number": name, "n": int(np.count_nonzero(chosen))}
-            for key, one in (
-                ("noise", noise[name]),
-                ("images", images[name]),
-                ("difference", change),
-            ):
+            numbers = {"noise": noise[name], "images": images[name], "difference": change}
+            for key, one in numbers.items():
                 row |= {key: one.value, f"{key}_err": one.error}
             row["sigma"] = change.value / change.error if change.error > 0 else np.nan
             rows.append(row)

@@ -94,9 +94,8 @@ def _entries(table):
         if "filter" in entry:
             entry["band"] = entry["filter"].removeprefix("miri.")
         if "groups" in entry:
-            entry["frames"] = " x ".join(
-                str(entry[name]) for name in ("dithers", "integrations", "groups")
-            )
+            numbers = (entry[name] for name in ("dithers", "integrations", "groups"))
+            entry["frames"] = " x ".join(map(str, numbers))
         yield entry
 
 

@@ -11,7 +11,7 @@ from miricigale.planning.accuracy import accuracy
 from miricigale.planning.config import PlanConfig
 from miricigale.planning.exposures import RunErrors, band_plans, wall_clock
 from miricigale.planning.sample import make_sample
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.tables import error_column, require_columns
 from miricigale.workflow.stages.fits import existing_errors, study_fitter
 from miricigale.workflow.stages.inputs import fit_plan
@@ -77,26 +77,15 @@ class Plan:
             ``saturates``, the magnitude at which a point does, ``n_saturated`` sources of the sample and
             ``n_missing`` of them without a flux.
         """
-        columns = (
-            "filter",
-            "time",
-            "groups",
-            "integrations",
-            "dithers",
-            "background",
-            "sky_in_well",
-        )
-        columns += ("limit_etc", "limit", "limit_used", "saturates", "n_saturated", "n_missing")
         rows = []
         for name, plan in self.bands.items():
             row = plan.numbers() | {
-                "background": np.round(plan.background, 2),
                 "limit_used": np.round(plan.errors().limiting_magnitude(name), 2),
                 "saturates": np.round(plan.saturation, 1),
             }
             for what in ("saturated", "missing"):
                 row[f"n_{what}"] = int(np.count_nonzero(self.sources[f"{name}_{what}"]))
-            rows.append({column: row[column] for column in columns})
+            rows.append(row)
         return QTable(rows)
 
 
@@ -260,9 +249,8 @@ class Planner:
         """
         config = self.config
         bands = config.exposures.bands if bands is None else tuple(bands)
-        for band in bands:
-            if band not in config.exposures.bands:
-                raise argument_error("bands", f"some of {list(config.exposures.bands)}", repr(band))
+        wanted = f"some of {list(config.exposures.bands)}"
+        check_that(set(bands) <= set(config.exposures.bands), "bands", wanted, list(bands))
         known = self.band_plans(share)
         plans = {band: known[band] for band in bands}
         photometry = self.photometry(plans.values(), measured)
@@ -331,10 +319,8 @@ class Planner:
         plans : list of `Plan`
             One for each number of ``[survey] areas``.
         """
-        return [
-            self.evaluate(bands, name=str(n), share=1.0 / n, pointings=n)
-            for n in self.config.survey.areas
-        ]
+        areas = self.config.survey.areas
+        return [self.evaluate(bands, name=str(n), share=1.0 / n, pointings=n) for n in areas]
 
     def common(self, plans):
         """Which sources one of the plans detects in `min_detected` bands: more bands never make them fewer."""

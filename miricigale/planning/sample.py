@@ -6,7 +6,8 @@ from astropy.table import QTable, vstack
 
 from miricigale.refdata import resources
 from miricigale.sed import SEDModel
-from miricigale.utils.exceptions import ConfigError, argument_error, config_error
+from miricigale.utils.exceptions import argument_error, config_error
+from miricigale.utils.options import check_that
 from miricigale.utils.random import stream
 from miricigale.utils.tables import require_columns
 from miricigale.workflow.config import StudyConfig
@@ -78,9 +79,8 @@ def make_sample(config, bands, *, executor=None):
     chosen = (redshift >= options.redshift[0]) & (redshift <= options.redshift[1])
     area = catalog_area(config, catalog)
     catalog = _cut(catalog, chosen & ~np.asarray(catalog["star"], bool), "[sample] redshift")
-    results = fit_seds(
-        catalog, config.sed, model_error=config.fit.model_error, executor=executor
-    ).to_table()
+    fit = {"model_error": config.fit.model_error, "executor": executor}
+    results = fit_seds(catalog, config.sed, **fit).to_table()
     sources = galaxy_parameters(study, catalog, results, seed=seed)
     sources["luminosity"] = results["dust_luminosity_best"].to(u.Lsun)
     if "dust_excess" in sources.colnames:
@@ -162,10 +162,8 @@ def _by_luminosity(sources, options, rng):
     try:
         table = QTable.read(options.luminosity_function)
     except OSError as err:
-        msg = (
-            f"[sample] luminosity_function = {options.luminosity_function!r} cannot be read: {err}"
-        )
-        raise ConfigError(msg) from err
+        where = f"[sample] luminosity_function = {options.luminosity_function!r}"
+        raise config_error(where, f"cannot be read: {err}") from err
     names = ("log_luminosity", "redshift", "phi")
     require_columns(table, names, "luminosity_function")
     log_luminosity, redshift, phi = (np.asarray(u.Quantity(table[n]).value, float) for n in names)
@@ -184,10 +182,8 @@ def _by_luminosity(sources, options, rng):
     fine = np.array([np.interp(z, steps, column) for column in at_levels.T]).T
     volume = model.cosmology.differential_comoving_volume(z).to_value(u.Mpc**3 / u.arcmin**2)
     cells = fine * volume[:, None] * (high[0] - low[0]) / 200 * (high[1] - low[1]) / 200
-    if not (np.all(cells >= 0) and cells.sum() > 0):
-        raise argument_error(
-            "luminosity_function", "phi of at least 0, and not 0 everywhere", "none"
-        )
+    wanted = "phi of at least 0, and not 0 everywhere"
+    check_that(np.all(cells >= 0) and cells.sum() > 0, "luminosity_function", wanted, "none")
     n = options.n_sources or 500
     drawn = rng.choice(cells.size, n, p=(cells / cells.sum()).ravel())
     z, logs = z[drawn // 200], logs[drawn % 200]

@@ -10,6 +10,14 @@ from miricigale.utils.options import check_choice, check_that
 _LINES = "#c2410c"
 
 
+def filled(image):
+    """Values of an image (`~astropy.nddata.NDData`) with NaN where it is masked."""
+    data = np.array(image.data, float)
+    if image.mask is not None:
+        data[np.asarray(image.mask, bool)] = np.nan
+    return data
+
+
 def _robust(image):
     """Median and robust standard deviation of the finite pixels, (0, 1) without any."""
     values = image[np.isfinite(image)]
@@ -260,10 +268,8 @@ def color_image(red, green, blue):
     if len({plane.shape for plane in planes}) != 1:
         msg = f"'red', 'green', 'blue' must be of one shape, got {[p.shape for p in planes]}"
         raise ValueError(msg)
-    scaled = []
-    for plane in planes:
-        middle, sigma = _robust(plane)
-        scaled.append(np.nan_to_num((plane - middle) * (1 / sigma), nan=0.0))
+    pairs = zip(planes, map(_robust, planes), strict=True)
+    scaled = [np.nan_to_num((p - middle) * (1 / s), nan=0.0) for p, (middle, s) in pairs]
     # stretch is in units of the noise
     image = make_lupton_rgb(*scaled, minimum=-1.0, stretch=4.0, Q=7.0)
     # a color of two bands would be a wrong one

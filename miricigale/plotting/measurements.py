@@ -27,9 +27,8 @@ def plot_energies(radius, curves, *, ax=None, **kwargs):
     ax = resolve_axes(ax)
     for k, (name, values) in enumerate(curves.items()):
         # every third one is dashed: it may lie on the one before
-        ax.plot(
-            radius, values, **{"label": name, "ls": ("-", "-", "--")[k % 3], "lw": 1.4} | kwargs
-        )
+        style = {"label": name, "ls": ("-", "-", "--")[k % 3], "lw": 1.4}
+        ax.plot(radius, values, **style | kwargs)
     ax.set(xlabel="radius [arcsec]", ylabel="encircled energy", ylim=(0, None))
     ax.legend(frameon=False)
     return ax

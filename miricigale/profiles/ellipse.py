@@ -36,14 +36,10 @@ def ellipse_to_pixels(jacobian, *, radius, axis_ratio, position_angle):
     """
     direction = np.pi / 2 - np.asarray(position_angle, dtype=float)
     jacobian = np.asarray(jacobian, dtype=float)
-    radius, axis_ratio, direction = np.broadcast_arrays(
-        np.asarray(radius, float), np.asarray(axis_ratio, float), direction
-    )
+    radius, axis_ratio, direction = np.broadcast_arrays(radius, axis_ratio, direction)
     cos, sin = np.cos(direction), np.sin(direction)
     # columns: the images of the two semi-axes; their outer products add up to the shape matrix
-    axes = np.stack(
-        [np.stack([cos, -axis_ratio * sin], -1), np.stack([sin, axis_ratio * cos], -1)], -2
-    )
+    axes = np.stack([cos, -axis_ratio * sin, sin, axis_ratio * cos], -1).reshape(*cos.shape, 2, 2)
     axes = jacobian @ (axes * radius[..., None, None])
     shape = axes @ np.swapaxes(axes, -1, -2)
     a, b, c = shape[..., 0, 0], shape[..., 0, 1], shape[..., 1, 1]

@@ -79,9 +79,8 @@ def sersic_radius(fraction, n):
     array([1.   , 5.549])
     """
     n = np.asarray(n, dtype=float)
-    return (
-        (scipy.special.gammaincinv(2 * n, np.asarray(fraction, dtype=float)) / sersic_bn(n)) ** n
-    )[()]
+    x = scipy.special.gammaincinv(2 * n, np.asarray(fraction, dtype=float))
+    return ((x / sersic_bn(n)) ** n)[()]
 
 
 def light_table(n):
@@ -108,9 +107,8 @@ def light_table(n):
     # dF / d ln R
     density = np.exp(2 * n * np.log(bn) - scipy.special.gammaln(2 * n) + 2 * log_r - z) / n
     fraction = scipy.special.gammainc(2 * n, z)
-    moment = np.exp(
-        scipy.special.gammaln(3 * n) - scipy.special.gammaln(2 * n) - n * np.log(bn)
-    ) * scipy.special.gammainc(3 * n, z)
+    scale = scipy.special.gammaln(3 * n) - scipy.special.gammaln(2 * n) - n * np.log(bn)
+    moment = np.exp(scale) * scipy.special.gammainc(3 * n, z)
     bend = density * (2 - z / n)
     return np.stack([fraction, density, moment, density * np.exp(log_r), bend], axis=1)
 
@@ -127,9 +125,8 @@ def parameter_rows(*, x, y, total_flux, r_eff, n, axis_ratio, theta):
         Columns as in ``_core.PARAMETERS``.
     """
     values = (x, y, total_flux, r_eff, n, axis_ratio, theta)
-    x, y, total_flux, r_eff, n, axis_ratio, theta = np.broadcast_arrays(
-        *(np.atleast_1d(np.asarray(value, dtype=float)) for value in values)
-    )
+    values = np.broadcast_arrays(*(np.atleast_1d(np.asarray(v, dtype=float)) for v in values))
+    x, y, total_flux, r_eff, n, axis_ratio, theta = values
     bn = sersic_bn(n)
     minor = axis_ratio * r_eff
     log_norm = 2 * n * np.log(bn) - scipy.special.gammaln(2 * n)
@@ -198,9 +195,8 @@ def sersic_image(shape, *, x, y, total_flux=1.0, r_eff, n, axis_ratio=1.0, theta
     1.0
     """
     _check(total_flux, r_eff, n, axis_ratio)
-    rows = parameter_rows(
-        x=x, y=y, total_flux=total_flux, r_eff=r_eff, n=n, axis_ratio=axis_ratio, theta=theta
-    )
+    shapes = {"r_eff": r_eff, "n": n, "axis_ratio": axis_ratio, "theta": theta}
+    rows = parameter_rows(x=x, y=y, total_flux=total_flux, **shapes)
     image = np.zeros(shape)
     from miricigale.profiles import _core
 
@@ -240,14 +236,6 @@ def sersic_stamp(*, x, y, total_flux=1.0, r_eff, n, axis_ratio=1.0, theta=0.0, m
     half_y = np.hypot(radius * np.sin(theta), radius * axis_ratio * np.cos(theta))
     x0, x1 = int(np.floor(x - half_x + 0.5)), int(np.ceil(x + half_x - 0.5))
     y0, y1 = int(np.floor(y - half_y + 0.5)), int(np.ceil(y + half_y - 0.5))
-    stamp = sersic_image(
-        (y1 - y0 + 1, x1 - x0 + 1),
-        x=x - x0,
-        y=y - y0,
-        total_flux=total_flux,
-        r_eff=r_eff,
-        n=n,
-        axis_ratio=axis_ratio,
-        theta=theta,
-    )
+    options = {"total_flux": total_flux, "r_eff": r_eff, "n": n, "axis_ratio": axis_ratio}
+    stamp = sersic_image((y1 - y0 + 1, x1 - x0 + 1), x=x - x0, y=y - y0, theta=theta, **options)
     return stamp, (y0, x0)

@@ -365,6 +365,28 @@ class MatchingKernel(Interactive):
         self._need_psfs()
         return fftconvolve(self.source, self.array, mode="same")
 
+    def with_psfs(self, source, target):
+        """
+        Make the kernel between two other PSFs, as large as this one.
+
+        Parameters
+        ----------
+        source, target : `~numpy.ndarray`, shape (n, n)
+            The PSFs, on the pixels and of the shape of those that the kernel has.
+
+        Returns
+        -------
+        kernel : `MatchingKernel`
+            With the automatic regularization; that of points on an image stays one of points.
+        """
+        if np.count_nonzero(self.array) == 1:
+            return dataclasses.replace(self, source=target, target=target)
+        mu, array, figures = choose("auto", wiener(source, target), source, target, 1e-3)
+        edge = (len(array) - len(self.array)) // 2
+        changed = {"source": source, "target": target, "regularization": mu}
+        changed["array"] = array[edge : len(array) - edge, edge : len(array) - edge]
+        return dataclasses.replace(self, **changed, meta={**self.meta, **figures})
+
     def apply(self, image):
         """
         Convolve an image, taking zero outside of it.

@@ -34,5 +34,8 @@ from .settings import BACKENDS as BACKENDS
 from .settings import BackgroundSettings as BackgroundSettings
 from .settings import MosaicSettings as MosaicSettings
 from .settings import RampSettings as RampSettings
+from .settling import settling_groups as settling_groups
+from .sky_flat import sky_flats as sky_flats
 from .sky_match import match_levels as match_levels
 from .sky_match import sky_offsets as sky_offsets
+from .stripes import remove_stripes as remove_stripes

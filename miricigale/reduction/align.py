@@ -14,6 +14,7 @@ from miricigale.reduction.background import estimate_background
 from miricigale.reduction.images import plain_mask, with_data
 from miricigale.utils import sep_tools
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.units import ANGLE, positive
 
 # pairs vote for the shift within this radius, and are matched within it after the shift, arcsec
@@ -113,11 +114,13 @@ def align_to_catalog(image, catalog, *, radius=1 * u.arcsec):
     >>> print(f"{solution.north.to(u.arcsec):.1f}, {solution.n_matched} stars")
     -0.2 arcsec, 4 stars
     """
-    x, y = _sources(image, "image")
-    return _aligned(image, x, y, _positions(catalog), positive(radius, ANGLE, "radius"), "image")
+    found = [(image, *_sources(image, "image"))]
+    reach = positive(radius, ANGLE, "radius")
+    (aligned,), alignment = _aligned(found, _positions(catalog), reach, "image")
+    return aligned, alignment
 
 
-def align_images(images, catalog=None, *, radius=1 * u.arcsec):
+def align_images(images, catalog=None, *, radius=1 * u.arcsec, groups=None):
     """
     Align images to each other, or to a catalog.
 
@@ -130,17 +133,27 @@ def align_images(images, catalog=None, *, radius=1 * u.arcsec):
         those before it.
     radius : optional
         As for `align_to_catalog`.
+    groups : iterable, optional
+        Of which group each image is, such as its visit: dithers on one guide star have the right places to each
+        other, but visits are off from each other, so that a group is moved as a whole, by all of its sources.
+        Each image by itself if not given.
 
     Returns
     -------
     images : list of `~astropy.nddata.CCDData`
     alignments : list of `Alignment`
-        Of the first image without a catalog that of none, with the number of its sources.
+        Of the first group without a catalog that of none, with the number of its sources.
 
     Raises
     ------
     ValueError
-        As of `align_to_catalog`, naming the image by its place in the list; or if there are no images.
+        As of `align_to_catalog`, naming the first image of a group by its place in the list; if there are no
+        images, or not one group for each.
+
+    References
+    ----------
+    STScI-MIRI, notebooks on imaging: dithers with one guide star agree, tiles with different ones are off by up
+    to 2 arcsec.
 
     Examples
     --------
@@ -167,26 +180,37 @@ def align_images(images, catalog=None, *, radius=1 * u.arcsec):
         raise argument_error("images", "at least one image", "none")
     reach = positive(radius, ANGLE, "radius")
     known = None if catalog is None else _positions(catalog)
-    out, alignments = [], []
-    for k, im in enumerate(images):
-        name = f"images[{k}]"
-        x, y = _sources(im, name)
+    groups = list(range(len(images)) if groups is None else groups)
+    if len(groups) != len(images):
+        raise argument_error("groups", f"one for each of {len(images)} images", len(groups))
+    out, alignments = [None] * len(images), [None] * len(images)
+    for group in dict.fromkeys(groups):
+        members = [k for k, one in enumerate(groups) if one == group]
+        found = [(images[k], *_sources(images[k], f"images[{k}]")) for k in members]
         if known is None:
             still = dict.fromkeys(("east", "north", "scatter"), 0 * ANGLE)
-            aligned, alignment = im, Alignment(**still, rotation=0 * u.deg, n_matched=x.size)
+            moved, sizes = zip(*((im, x.size) for im, x, _ in found), strict=True)
+            alignment = Alignment(**still, rotation=0 * u.deg, n_matched=sum(sizes))
         else:
-            aligned, alignment = _aligned(im, x, y, known, reach, name)
-        if catalog is None:
-            sky = aligned.wcs.pixel_to_world(x, y)
-            if known is not None:
-                # what is there already stays as it is
-                _, apart, _ = sky.match_to_catalog_sky(known)
-                sky = sky[apart.to_value(ANGLE) > 0.5]
-                sky = SkyCoord(np.append(known.ra, sky.ra), np.append(known.dec, sky.dec))
-            known = sky.icrs
-        out.append(aligned)
-        alignments.append(alignment)
+            moved, alignment = _aligned(found, known, reach, f"images[{members[0]}]")
+        for k, im, (_, x, y) in zip(members, moved, found, strict=True):
+            out[k], alignments[k] = im, alignment
+            if catalog is None:
+                sky = im.wcs.pixel_to_world(x, y).icrs
+                if known is not None:
+                    # what is there already stays as it is
+                    _, apart, _ = sky.match_to_catalog_sky(known)
+                    sky = sky[apart.to_value(ANGLE) > 0.5]
+                    sky = SkyCoord(np.append(known.ra, sky.ra), np.append(known.dec, sky.dec))
+                known = sky
     return out, alignments
+
+
+def visit_of(image):
+    """The visit of an image, of the keyword VISIT_ID of its observation."""
+    visit, *_ = image.meta.get("keywords", {}).get("VISIT_ID", [None])
+    check_that(visit is not None, "images", "ones with the keyword VISIT_ID", "one without")
+    return visit
 
 
 def _positions(catalog):
@@ -221,15 +245,17 @@ def _sources(image, argument):
     return x[good], y[good]
 
 
-def _aligned(image, x, y, catalog, radius, argument):
-    """Image with its WCS moved to a catalog, and by how much."""
-    # plane about the reference position, deg, east and north
-    plane = WCS(naxis=2)
+def _aligned(found, catalog, radius, argument):
+    """Images, with pixels of their sources, moved together to a catalog: the images, and by how much."""
+    # plane about the reference position of the first, deg, east and north
+    plane, first = WCS(naxis=2), found[0][0].wcs.wcs
     plane.wcs.ctype = "RA---TAN", "DEC--TAN"
-    plane.wcs.crval, plane.wcs.crpix = image.wcs.wcs.crval, (1.0, 1.0)
+    plane.wcs.crval, plane.wcs.crpix = first.crval, (1.0, 1.0)
     plane.wcs.cdelt = 1.0, 1.0
-    sky = image.wcs.pixel_to_world(x, y).icrs if len(x) else SkyCoord([], [], unit="deg")
-    i, j, *_ = search_around_sky(sky, catalog, radius * ANGLE) if len(x) else ([], [])
+    seen = [im.wcs.pixel_to_world(x, y).icrs for im, x, y in found if x.size]
+    places = [(one.ra.deg, one.dec.deg) for one in seen] or [([], [])]
+    sky = SkyCoord(*np.concatenate(places, axis=1), unit="deg")
+    i, j, *_ = search_around_sky(sky, catalog, radius * ANGLE) if len(sky) else ([], [])
     one, other = (
         np.stack(plane.world_to_pixel(s[k]), axis=1) * 3600 if len(k) else np.empty((0, 2))
         for s, k in ((sky, i), (catalog, j))
@@ -246,7 +272,8 @@ def _aligned(image, x, y, catalog, radius, argument):
     for _ in range(5):
         if np.count_nonzero(used) < _LEAST:
             wanted = f"one with at least {_LEAST} sources of the catalog within {radius:g} arcsec"
-            raise argument_error(argument, wanted, f"{np.count_nonzero(used)} of {len(x)} sources")
+            got = f"{np.count_nonzero(used)} of {len(sky)} sources"
+            raise argument_error(argument, wanted, got)
         turn, move = _solved(one[used], other[used])
         residual = other - one @ _rotation(turn).T - move
         spread = np.sqrt(np.mean(np.square(residual[used])))
@@ -254,16 +281,6 @@ def _aligned(image, x, y, catalog, radius, argument):
         if np.array_equal(new, used):
             break
         used = new
-    wcs = image.wcs.deepcopy()
-    matrix = _rotation(turn)
-    if wcs.wcs.has_cd():
-        wcs.wcs.cd = matrix @ wcs.wcs.cd
-    else:
-        scale = np.diag(wcs.wcs.cdelt)
-        wcs.wcs.pc = np.linalg.inv(scale) @ matrix @ scale @ wcs.wcs.get_pc()
-    center = plane.pixel_to_world(*(move / 3600)).icrs
-    wcs.wcs.crval = [center.ra.deg, center.dec.deg]
-    wcs.wcs.set()
     alignment = Alignment(
         east=move[0] * ANGLE,
         north=move[1] * ANGLE,
@@ -271,8 +288,19 @@ def _aligned(image, x, y, catalog, radius, argument):
         n_matched=int(np.count_nonzero(used)),
         scatter=float(np.sqrt(np.mean(np.square(residual[used])))) * ANGLE,
     )
-    out = with_data(image, image.data, n_aligned=alignment.n_matched)
-    out.wcs = wcs
+    matrix, out = _rotation(turn), []
+    for im, *_ in found:
+        new = with_data(im, im.data, n_aligned=alignment.n_matched)
+        new.wcs = wcs = im.wcs.deepcopy()
+        if wcs.wcs.has_cd():
+            wcs.wcs.cd = matrix @ wcs.wcs.cd
+        else:
+            scale = np.diag(wcs.wcs.cdelt)
+            wcs.wcs.pc = np.linalg.inv(scale) @ matrix @ scale @ wcs.wcs.get_pc()
+        place = np.array(plane.wcs_world2pix([wcs.wcs.crval], 0)[0])
+        wcs.wcs.crval = plane.wcs_pix2world([matrix @ place + move / 3600], 0)[0]
+        wcs.wcs.set()
+        out.append(new)
     return out, alignment
 
 

@@ -37,7 +37,8 @@ def calibrate(
     -------
     cal : `~astropy.nddata.CCDData`
         MJy/sr; ``meta["photmjsr"]`` is the conversion. Pixels behind the coronagraph masks are
-        masked; sub-arrays that lie wholly outside the imager's field are left alone.
+        masked, and those that the flags of the flat field call NON_SCIENCE; sub-arrays that lie wholly outside
+        the imager's field are left alone.
 
     Raises
     ------
@@ -78,9 +79,11 @@ def calibrate(
         unit=SURFACE_BRIGHTNESS,
         photmjsr=float(conversion),
     )
+    outside = ~inside if inside.any() else np.zeros_like(inside)
     if flags is not None:
         out.flags |= flags
         out.mask |= (flags & DQ.DO_NOT_USE) != 0
-    outside = ~inside if inside.any() else np.zeros_like(inside)
+        # the knife edge and other parts of the metering structure
+        outside |= (flags & DQ.NON_SCIENCE) != 0
     outside &= (plain_flags(rate) & DQ.REFERENCE_PIXEL) == 0
     return flag_pixels(out, outside, DQ.NON_SCIENCE | DQ.DO_NOT_USE)

@@ -14,7 +14,7 @@ from miricigale.reduction.sky_match import match_levels
 from miricigale.utils.exceptions import argument_error
 
 
-def drizzle(settings, images, wcs):
+def drizzle(settings, images, wcs, variances=()):
     """
     As `~miricigale.reduction.Reducer.drizzle`.
 
@@ -24,6 +24,8 @@ def drizzle(settings, images, wcs):
         How images are combined.
     images, wcs
         As of that method.
+    variances : list of dict, optional
+        As of `~miricigale.reduction.drizzle_images`.
 
     Returns
     -------
@@ -43,8 +45,8 @@ def drizzle(settings, images, wcs):
         images = reject_outliers(
             images, wcs, threshold=settings.outlier_threshold, weights=weights, pixel_maps=maps
         )
-    mosaic = drizzle_images(images, wcs, pixfrac=settings.pixfrac, weights=weights, pixel_maps=maps)
-    return mosaic, images
+    options = {"weights": weights, "pixel_maps": maps, "variances": variances}
+    return drizzle_images(images, wcs, pixfrac=settings.pixfrac, **options), images
 
 
 def subtract_dithers(reducer, images, alone=None, wcs=None):
@@ -56,7 +58,7 @@ def subtract_dithers(reducer, images, alone=None, wcs=None):
     return [remove_background(*pair, **reducer.background.negative) for pair in pairs], backgrounds
 
 
-def combine(reducer, images, backgrounds, rates, wcs, pixel_scale, align):
+def combine(reducer, images, backgrounds, rates, wcs, pixel_scale, align, planes=()):
     """
     As `~miricigale.reduction.Reducer.combine`.
 
@@ -64,7 +66,7 @@ def combine(reducer, images, backgrounds, rates, wcs, pixel_scale, align):
     ----------
     reducer : `~miricigale.reduction.Reducer`
         Settings.
-    images, backgrounds, rates, wcs, pixel_scale, align
+    images, backgrounds, rates, wcs, pixel_scale, align, planes
         As of that method.
 
     Returns
@@ -95,7 +97,7 @@ def combine(reducer, images, backgrounds, rates, wcs, pixel_scale, align):
         notes.append(f"{doubt} ({_reasons(doubts)})")
     known = len(backgrounds) == len(images)
     whole = [im.data + b.level for im, b in zip(images, backgrounds, strict=True)] if known else []
-    drizzled, images = drizzle(reducer.mosaics, images, wcs)
+    drizzled, images = drizzle(reducer.mosaics, images, wcs, planes)
     mosaic, mosaic_background = reducer.subtract_background(drizzled.image)
     subtracted = mosaic_background.level
     if known:
@@ -107,9 +109,10 @@ def combine(reducer, images, backgrounds, rates, wcs, pixel_scale, align):
         reasons = _reasons([mosaic_background])
         notes.append(f"the background of the mosaic cannot be trusted ({reasons})")
     # the mosaic's own level would hide those of the dithers
-    mosaic.meta["mosaic_background"] = mosaic.meta.pop("background")
-    if "background" in drizzled.image.meta:
-        mosaic.meta["background"] = drizzled.image.meta["background"]
+    for key in ("background", "background_error", "background_flags"):
+        mosaic.meta[f"mosaic_{key}"] = mosaic.meta.pop(key, None)
+        if key in drizzled.image.meta:
+            mosaic.meta[key] = drizzled.image.meta[key]
     return ReductionResult(
         tuple(rates),
         tuple(images),
@@ -120,6 +123,7 @@ def combine(reducer, images, backgrounds, rates, wcs, pixel_scale, align):
         mosaic_background,
         subtracted,
         tuple(notes),
+        drizzled.variances,
     )
 
 

@@ -103,7 +103,7 @@ def dither_backgrounds(images, backgrounds=None, *, wcs=None):
         wcs = own_grid(images, 0.11 * ANGLE)
     sources = _deep_masks(images, alone, wcs)
     levels = [float(np.median(b.level[~m])) for b, m in zip(alone, masks, strict=True)]
-    templates = _other_medians(images, masks, sources, levels)
+    templates = other_medians(images, masks, sources, levels)
     out = []
     for im, own, mask, source, level, template in zip(
         images, alone, masks, sources, levels, templates, strict=True
@@ -157,8 +157,14 @@ def _deep_masks(images, backgrounds, wcs):
     return out
 
 
-def _other_medians(images, masks, sources, levels):
-    """For each image the median of the others in each pixel, each less its level; NaN without any."""
+def other_medians(images, masks, sources, levels, others=None):
+    """
+    For each image the median of the others in each pixel, each less its level; NaN without any.
+
+    ``others`` has a row for each image: which ones count, all but itself by default.
+    """
+    if others is None:
+        others = ~np.eye(len(images), dtype=bool)
     shape = images[0].shape
     out = [np.full(shape, np.nan, np.float32) for _ in images]
     for rows in chunks(shape[0], _ROWS):
@@ -169,5 +175,5 @@ def _other_medians(images, masks, sources, levels):
             ]
         ).astype(np.float32)
         for k, template in enumerate(out):
-            template[rows], _ = nan_median(np.delete(stack, k, axis=0))
+            template[rows], _ = nan_median(stack[others[k]])
     return out

@@ -21,7 +21,6 @@ from miricigale.reduction import (
     write_image,
 )
 from miricigale.reduction.background import known_background
-from miricigale.reduction.dither_background import restored
 from miricigale.reduction.files import open_file, scaled_planes
 from miricigale.utils.content import content_sha256, file_sha256
 from miricigale.utils.declared import declared
@@ -32,7 +31,7 @@ from miricigale.utils.units import ANGLE, RATE, SURFACE_BRIGHTNESS, to_array
 log = logging.getLogger(__name__)
 
 #: Changes with what the products hold.
-_VERSION = 6
+_VERSION = 7
 
 #: Errors of a bad file; the other files are reduced all the same.
 _ERRORS = (ArithmeticError, ImportError, KeyError, MemoryError, OSError, ValueError)
@@ -45,6 +44,7 @@ def reduce_files(
     reducer=None,
     pixel_scale=0.11 * ANGLE,
     integrations=False,
+    align=None,
     resume=True,
     progress_bar=False,
 ):
@@ -67,6 +67,8 @@ def reduce_files(
     integrations : bool, optional
         Whether ramps of several integrations give a ``<name>_rateints.fits`` too, with the
         slopes of each.
+    align : optional
+        As of `~miricigale.reduction.Reducer.run`.
     resume : bool, optional
         Whether products of the same files and settings that are there are kept.
     progress_bar : bool, optional
@@ -126,9 +128,11 @@ def reduce_files(
         rows.append(row | {"status": "failed", "reason": ""})
         try:
             scale = pixel_scale.to_value(ANGLE)
-            status, notes = _mosaic(reducer, members, folder / row["file"], scale, settings, resume)
+            options = {"pixel_scale": scale * ANGLE, "align": align}
+            path = folder / row["file"]
+            status, notes = _mosaic(reducer, members, path, options, settings, resume)
             rows[-1] |= {"status": status, "reason": "; ".join(notes)}
-            _show(page, folder / row["file"], members, notes)
+            _show(page, path, members, notes)
         except _ERRORS as err:
             rows[-1]["reason"] = _reason(err)
             log.warning("no mosaic of %s: %s", name, rows[-1]["reason"])
@@ -211,22 +215,18 @@ def _write(image, path, key, **planes):
     write_image(image, path, planes=planes, overwrite=True)
 
 
-def _mosaic(reducer, members, path, scale, settings, resume):
+def _mosaic(reducer, members, path, options, settings, resume):
     """Make the mosaic of a filter: what was done, and what could not be."""
-    key = content_sha256([_VERSION, [key for _, key in members], scale, settings])
+    key = content_sha256([_VERSION, [key for _, key in members], repr(options), settings])
     if _kept(path, key, resume):
         return "kept", json.loads(read_images(path)[0].header["META"]).get("notes", [])
     files = [read_images(cal)[0] for cal, _ in members]
     images = [file.image for file in files]
-    backgrounds = [known_background(file.planes["BKG"]) for file in files]
-    if reducer.background.method == "dithers" and len(files) >= 3:
-        images, backgrounds = reducer.subtract_dithers(
-            [restored(file.image, file.planes["BKG"]) for file in files]
-        )
-        reducer = reducer.replace(
-            background=dataclasses.replace(reducer.background, method="masked")
-        )
-    result = reducer.combine(images, backgrounds, pixel_scale=scale * ANGLE)
+    mesh = {name: reducer.background.mesh[name] for name in ("box", "filter_size")}
+    levels = [known_background(file.planes["BKG"]) for file in files]
+    backgrounds = [dataclasses.replace(level, **mesh) for level in levels]
+    planes = [file.planes for file in files]
+    result = reducer.combine(images, backgrounds, planes=planes, **options)
     result.mosaic.meta["key"] = key
     result.write(path, overwrite=True)
     return "reduced", list(result.notes)
@@ -260,9 +260,14 @@ def _show(page, path, members, notes):
 
 
 def _levels(members):
-    levels = [read_images(cal)[0].image.meta.get("background") for cal, _ in members]
-    known = [f"{level:.4g}" for level in levels if level is not None]
-    return ", ".join(known) + " MJy/sr" if known else "not known"
+    metas = [read_images(cal)[0].image.meta for cal, _ in members]
+    known = [
+        f"{meta['background']:.4g} ± {meta.get('background_error', np.nan):.1g} "
+        + " ".join(meta.get("background_flags", []))
+        for meta in metas
+        if "background" in meta
+    ]
+    return ", ".join(map(str.strip, known)) + " MJy/sr" if known else "not known"
 
 
 def _references(meta):

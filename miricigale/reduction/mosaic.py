@@ -10,6 +10,7 @@ from drizzle.resample import Drizzle
 from scipy.interpolate import RectBivariateSpline
 
 from miricigale.instrument import DQ, ExposureHistory, ImageFacts
+from miricigale.reduction.files import PLANES
 from miricigale.reduction.images import (
     check_images,
     check_overlap,
@@ -40,6 +41,8 @@ class Mosaic:
         Sum of the inverse variances that went into each pixel (area-weighted).
     n_images : `~numpy.ndarray` of uint8, shape (ny, nx)
         Number of inputs that touch each pixel.
+    variances : dict of str to `~numpy.ndarray`
+        Parts of the variance of a pixel (``VAR_POISSON``, ``VAR_RNOISE``, ``VAR_FLAT``) that all inputs have.
 
     Examples
     --------
@@ -69,6 +72,7 @@ class Mosaic:
     image: CCDData
     weight: np.ndarray
     n_images: np.ndarray
+    variances: dict = dataclasses.field(default_factory=dict)
 
     def __repr__(self):
         ny, nx = self.weight.shape
@@ -240,7 +244,7 @@ def noise_correction(pixfrac, ratio):
     return r / (1 - 1 / (3 * r)) if r >= 1 else 1 / (1 - r / 3)
 
 
-def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None):
+def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None, variances=()):
     """
     Drizzle images onto one grid.
 
@@ -257,6 +261,9 @@ def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None):
         Weight of each pixel; by default `weight_map`.
     pixel_maps : list of (x, y), optional
         Results of `pixel_map`, if they are there already.
+    variances : list of dict of str to `~numpy.ndarray`, optional
+        Parts of the variance of each image by name, as the planes of an `ImageFile`; they go through as
+        the variance does.
 
     Returns
     -------
@@ -317,24 +324,26 @@ def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None):
     )
     n_images = np.zeros(shape, np.uint8)
     before = np.zeros(shape, np.float32)
-    for im, weight, (x, y) in zip(images, weights, pixel_maps, strict=True):
+    variances = list(variances) or [{}] * len(images)
+    names = [name for name in PLANES[:3] if all(name in own for own in variances)]
+    for im, own, weight, (x, y) in zip(images, variances, weights, pixel_maps, strict=True):
         # an image of many may reach a small part of the grid
         part = extent_of((x, y), shape)
         weight = np.where(plain_mask(im), 0.0, np.asarray(weight) / unit_weight)
         weight = weight.astype(np.float32)
         if part is None or not weight.any():
             continue
-        variance = np.square(np.asarray(sigma(im), float))
-        variance = np.where(weight > 0, variance, 0.0).astype(np.float32)
-        add_image(sink, im, weight, (x, y), wcs, pixfrac, data2=variance)
+        parts = [np.square(np.asarray(sigma(im), float)), *(own[name] for name in names)]
+        parts = [np.where(weight > 0, plane, 0.0).astype(np.float32) for plane in parts]
+        add_image(sink, im, weight, (x, y), wcs, pixfrac, data2=parts)
         n_images[part] += sink.out_wht[part] > before[part]
         before[part] = sink.out_wht[part]
 
     if n_images.any():
-        data, variance, weight = sink.out_img, sink.out_img2[0], sink.out_wht
+        data, parts, weight = sink.out_img, sink.out_img2, sink.out_wht
     else:
         data = np.full(shape, np.nan, np.float32)
-        variance, weight = data, np.zeros(shape, np.float32)
+        parts, weight = [data] * (1 + len(names)), np.zeros(shape, np.float32)
     covered = (weight > 0) & np.isfinite(data)
     flags = np.where(covered, 0, int(DQ.NON_SCIENCE | DQ.DO_NOT_USE))
     ratio = _scale(wcs) / float(np.mean([_scale(im.wcs) for im in images]))
@@ -347,12 +356,13 @@ def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None):
     out = flagged_image(
         np.where(covered, data, np.nan),
         images[0].unit,
-        error=np.sqrt(np.where(covered, variance, np.nan)),
+        error=np.sqrt(np.where(covered, parts[0], np.nan)),
         flags=flags,
         wcs=wcs,
         meta=meta,
     )
-    return Mosaic(out, (weight * np.float32(unit_weight)).astype(np.float32), n_images)
+    weight = (weight * np.float32(unit_weight)).astype(np.float32)
+    return Mosaic(out, weight, n_images, dict(zip(names, parts[1:], strict=True)))
 
 
 def add_image(sink, im, weight, pixel_map, wcs, pixfrac=1.0, **planes):
@@ -393,7 +403,7 @@ def _meta(images):
     for key in ("exposure_time", "n_negative", "n_outliers"):
         if all(key in m for m in metas):
             meta[key] = sum(m[key] for m in metas)
-    for key in ("pa_aper", "dither", "background"):
+    for key in ("pa_aper", "dither", "background", "background_error", "background_flags"):
         if all(key in m for m in metas):
             meta[key] = [m[key] for m in metas]
     if any(words := [m.get("keywords", {}) for m in metas]):

@@ -86,13 +86,10 @@ def reject_outliers(images, wcs, *, threshold=5.0, weights=None, pixel_maps=None
     # where too few images overlap there is nothing to compare with
     judged = count >= 3
     share = np.where(judged, 1.5 / np.maximum(count, 1), 0.0).astype(np.float32)
-    steep = np.zeros_like(median)
-    for axis in (0, 1):
-        step = np.abs(np.diff(median, axis=axis))
-        low, high = [slice(None)] * 2, [slice(None)] * 2
-        low[axis], high[axis] = slice(None, -1), slice(1, None)
-        steep[tuple(low)] = np.fmax(steep[tuple(low)], step)
-        steep[tuple(high)] = np.fmax(steep[tuple(high)], step)
+    inner, (before, after) = slice(1, -1), (slice(None, -2), slice(2, None))
+    around = np.pad(median, 1, constant_values=np.nan)
+    beside = [(before, inner), (after, inner), (inner, before), (inner, after)]
+    steep = np.fmax.reduce([np.abs(median - around[place]) for place in beside])
     median = np.where(judged, median, 0.0)
     ny, nx = median.shape
     # between four pixels of the grid that all can be compared with

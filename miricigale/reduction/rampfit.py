@@ -52,6 +52,8 @@ class RampFit:
     jumps : `~numpy.ndarray`, shape (n_jumps,)
         Every jump found: structured array with ``y``, ``x``, ``integration``, ``group`` (the
         first after the jump) and signed ``significance`` in sigma.
+    settling : int or None, optional
+        First groups that had not settled after the reset (`settling_groups`); None if they were not looked at.
 
     Examples
     --------
@@ -73,6 +75,7 @@ class RampFit:
     n_jump: np.ndarray
     flags: np.ndarray
     jumps: np.ndarray
+    settling: int | None = None
 
     @property
     def error(self):

@@ -15,6 +15,7 @@ from miricigale.instrument import (
     miri_detector,
 )
 from miricigale.instrument.data_models import is_data_model, read_data_model
+from miricigale.reduction.align import align_images, visit_of
 from miricigale.reduction.assumed import brightness_of, maps_of
 from miricigale.reduction.background import estimate_background, remove_background
 from miricigale.reduction.calibration import calibrate
@@ -30,7 +31,9 @@ from miricigale.reduction.settings import (
     MosaicSettings,
     RampSettings,
 )
+from miricigale.reduction.sky_flat import flattened
 from miricigale.reduction.slopes import fit_slopes
+from miricigale.reduction.stripes import remove_stripes
 from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.options import check_choice, check_kind, check_least, check_positive
@@ -38,6 +41,8 @@ from miricigale.utils.parallel import thread_count
 from miricigale.utils.progress import progress
 from miricigale.utils.units import ANGLE, RATE, SURFACE_BRIGHTNESS, to_array
 
+# pixels of mosaics
+_SCALE = 0.11 * ANGLE
 #: Classes of the options that are objects.
 _KINDS = {
     "reset_anomaly": ResetAnomaly, "ramps": RampSettings, "background": BackgroundSettings,
@@ -332,7 +337,7 @@ class Reducer(Interactive):
             or lies elsewhere on the sky.
         """
         images = [_opened(image) for image in _several(images)]
-        wcs = own_grid(images, 0.11 * ANGLE) if wcs is None else wcs
+        wcs = own_grid(images, _SCALE) if wcs is None else wcs
         return self.drizzle(images, wcs)[0].image
 
     def drizzle(self, images, wcs):
@@ -374,18 +379,20 @@ class Reducer(Interactive):
         if not isinstance(exposure, CCDData):
             wanted = "a Ramp, a Charge, CCDData or a path"
             raise argument_error("exposure", wanted, type(exposure).__name__)
-        if exposure.unit.is_equivalent(RATE):
-            return exposure, *self.subtract_background(self.calibrate(exposure))
-        if not exposure.unit.is_equivalent(SURFACE_BRIGHTNESS):
+        rate = exposure if exposure.unit.is_equivalent(RATE) else None
+        if rate is None and not exposure.unit.is_equivalent(SURFACE_BRIGHTNESS):
             wanted = f"in {RATE} or {SURFACE_BRIGHTNESS}"
             raise argument_error("exposure", wanted, exposure.unit)
         files, history = self.references, ExposureHistory.of(exposure)
         given = isinstance(files, ReferenceFiles) and files.photom is not None
-        if given and history.done("photom") and "resample" not in history.steps:
+        again = given and history.done("photom") and "resample" not in history.steps
+        if rate is not None or again:
             exposure = self.calibrate(exposure)
-        return None, *self.subtract_background(exposure)
+        if self.background.stripes and "resample" not in history.steps:
+            exposure = remove_stripes(exposure)
+        return rate, *self.subtract_background(exposure)
 
-    def run(self, ramps, *, wcs=None, pixel_scale=0.11 * ANGLE, align=None, progress_bar=False):
+    def run(self, ramps, *, wcs=None, pixel_scale=_SCALE, align=None, progress_bar=False):
         """
         Reduce the dithers of one filter.
 
@@ -400,9 +407,9 @@ class Reducer(Interactive):
             every unmasked pixel of the dithers.
         pixel_scale : `~astropy.units.Quantity`, optional
             Of that grid, if ``wcs`` is not given.
-        align : `~astropy.coordinates.SkyCoord` or "dithers", optional
-            Positions of a catalog to which the images are aligned (`align_images`), or to each other; not at
-            all by default.
+        align : `~astropy.coordinates.SkyCoord`, "dithers" or "visits", optional
+            Positions of a catalog to which the images are aligned (`align_images`), or to each other, the images
+            of a visit together with ``"visits"``; not at all by default.
         progress_bar : bool, optional
             Whether a progress bar is shown.
 
@@ -438,7 +445,7 @@ class Reducer(Interactive):
     __call__ = run
 
     def combine(
-        self, images, backgrounds, *, rates=(), wcs=None, pixel_scale=0.11 * ANGLE, align=None
+        self, images, backgrounds, *, rates=(), wcs=None, pixel_scale=_SCALE, align=None, planes=()
     ):
         """
         Put the images of one filter together.
@@ -453,6 +460,8 @@ class Reducer(Interactive):
             What they come from, for the result.
         wcs, pixel_scale, align : optional
             As for `run`.
+        planes : list of dict of str to `~numpy.ndarray`, optional
+            Those of the `ImageFile` of each image: the parts of its variance go to the mosaic.
 
         Returns
         -------
@@ -463,4 +472,8 @@ class Reducer(Interactive):
         ValueError
             If there are no images.
         """
-        return combine(self, images, backgrounds, rates, wcs, pixel_scale, align)
+        if self.background.sky_flat is not None and len(images) == len(backgrounds):
+            images, backgrounds = flattened(self, images, backgrounds)
+        if isinstance(align, str) and align == "visits":
+            (images, _), align = align_images(images, groups=map(visit_of, images)), None
+        return combine(self, images, backgrounds, rates, wcs, pixel_scale, align, planes)

@@ -7,18 +7,9 @@ from unittest import mock
 
 from miricigale.instrument.history import TYPES
 from miricigale.reduction.references import ReferenceFiles
+from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error, data_error
 from miricigale.utils.optional import require
-
-#: Keywords of files by the parameters of rules.
-_KEYWORDS = {
-    "META.INSTRUMENT.DETECTOR": "DETECTOR", "META.INSTRUMENT.FILTER": "FILTER",
-    "META.INSTRUMENT.BAND": "BAND", "META.INSTRUMENT.CHANNEL": "CHANNEL", "META.INSTRUMENT.LAMP_STATE": "LAMP",
-    "META.INSTRUMENT.CORONAGRAPH": "CORONMSK", "META.EXPOSURE.READPATT": "READPATT",
-    "META.EXPOSURE.TYPE": "EXP_TYPE", "META.EXPOSURE.NGROUPS": "NGROUPS", "META.EXPOSURE.NFRAMES": "NFRAMES",
-    "META.SUBARRAY.NAME": "SUBARRAY",
-    "META.VISIT.TSOVISIT": "TSOVISIT", "META.OBSERVATION.DATE": "DATE-OBS", "META.OBSERVATION.TIME": "TIME-OBS",
-}  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,7 +89,8 @@ class ReferenceCache:
         `~miricigale.utils.exceptions.DataError`
             If a rule cannot be read, or a file that it chooses is not in the cache.
         """
-        words = {key: str(header.get(word, "UNDEFINED")).strip() for key, word in _KEYWORDS.items()}
+        keywords = declared("miricigale.reduction", "crds.toml")["keywords"].items()
+        words = {key: str(header.get(word, "UNDEFINED")).strip() for key, word in keywords}
         words["META.INSTRUMENT.NAME"] = "MIRI"
         kinds = {name: TYPES.get(name, name) for name in ReferenceFiles.names()}
         rmap = require("crds.core.rmap", extra="jwst")

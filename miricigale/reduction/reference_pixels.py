@@ -1,6 +1,7 @@
 """Drift of the read-out, as the pixels without light show it."""
 
 import numpy as np
+from astropy.stats import sigma_clip
 
 from miricigale.utils.exceptions import argument_error
 
@@ -112,19 +113,6 @@ def reference_channels(data, reference, *, origin=(0, 0)):
                 good = known[np.ix_(rows, side)].ravel()
                 part = pixels[:, :, rows][..., side].reshape(n_int, n_group, -1)[..., good]
                 change = part.astype(float) - part[:, :1]
-                values[:, :, odd, channel] += _clipped_mean(change) / len(mine)
+                clipped = sigma_clip(change, _CLIP, maxiters=None, cenfunc="mean", axis=-1)
+                values[:, :, odd, channel] += clipped.mean(axis=-1) / len(mine)
     return values[:, :, parity]
-
-
-def _clipped_mean(values):
-    """Mean along the last axis, of what lies within three standard deviations of it."""
-    keep = np.ones(values.shape, bool)
-    while True:
-        count = np.maximum(keep.sum(axis=-1), 1)
-        mean = np.where(keep, values, 0).sum(axis=-1) / count
-        residual = values - mean[..., None]
-        spread = np.sqrt(np.where(keep, np.square(residual), 0).sum(axis=-1) / count)
-        new = keep & (np.abs(residual) <= _CLIP * spread[..., None] + 1e-12)
-        if np.array_equal(new, keep):
-            return mean
-        keep = new

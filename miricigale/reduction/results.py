@@ -47,6 +47,8 @@ class ReductionResult(Interactive):
         On the mosaic, all that was subtracted from it and from the exposures: the plane BKG.
     notes : tuple of str
         What could not be done.
+    variances : dict of str to `~numpy.ndarray`
+        Parts of the variance of the mosaic, as of `Mosaic`, where they are known of each exposure.
 
     Examples
     --------
@@ -76,6 +78,7 @@ class ReductionResult(Interactive):
     mosaic_background: Background
     subtracted: np.ndarray
     notes: tuple = ()
+    variances: dict = dataclasses.field(default_factory=dict)
 
     _other_names: ClassVar[dict] = {
         "image": "mosaic",
@@ -113,7 +116,7 @@ class ReductionResult(Interactive):
 
     def write(self, path, *, overwrite=False):
         """
-        Write the mosaic with its planes ERR, DQ, WHT, CON (number of exposures) and BKG.
+        Write the mosaic with its planes ERR, DQ, WHT, CON (number of exposures) and BKG, and its variances.
 
         Parameters
         ----------
@@ -134,6 +137,7 @@ class ReductionResult(Interactive):
         mosaic = Image(self.mosaic, copy=False)
         mosaic.meta = {**self.mosaic.meta, "notes": list(self.notes)}
         planes = {"WHT": self.weight, "CON": self.n_images, "BKG": self.subtracted}
+        planes |= self.variances
         return write_image(mosaic, path, planes=planes, overwrite=overwrite)
 
 
@@ -163,6 +167,7 @@ def rate_image(reducer, ramp, maps, fit):
     meta = provenance(
         **exposure_values(ramp.exposure),
         n_jumps=len(fit.jumps),
+        settling_groups=fit.settling,
         ipc=ipc,
         noise_correction=fit.noise_correction(reducer.detector.ipc_kernel) if own else 1.0,
         **history_of(reducer, ramp, maps).meta(),

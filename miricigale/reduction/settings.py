@@ -75,6 +75,11 @@ class BackgroundSettings:
         Pixels more than this many sigma below the background are masked; None for none.
     negative_noise : {"larger", "background"}, optional
         Which noise gives that sigma (`remove_background`).
+    stripes : bool, optional
+        Whether stripes of rows and columns are taken off each exposure first (`remove_stripes`).
+    sky_flat : float or None, optional
+        Days within which exposures make each other's sky flat, by which they are divided when they are combined
+        (`sky_flats`); None for none.
 
     Raises
     ------
@@ -96,6 +101,8 @@ class BackgroundSettings:
     plane: bool = True
     negative_threshold: float | None = 10.0
     negative_noise: str = "larger"
+    stripes: bool = False
+    sky_flat: float | None = None
 
     def __post_init__(self):
         check_choice(self.method, "method", ("masked", "sep", "dithers", "none"))
@@ -103,6 +110,7 @@ class BackgroundSettings:
         check_least(self.filter_size, "filter_size", 1, whole=True)
         check_positive(self.negative_threshold, "negative_threshold", optional=True)
         check_choice(self.negative_noise, "negative_noise", ("larger", "background"))
+        check_positive(self.sky_flat, "sky_flat", optional=True)
 
     @property
     def mesh(self):

@@ -1,7 +1,7 @@
 """Showers: faint, wide clouds of charge that come with large hits of cosmic rays."""
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, label
+from scipy.ndimage import gaussian_filter, label, maximum_position, sum_labels
 
 #: Tracks whose jumps add up to so many sigma are looked around.
 _LARGE = 300.0
@@ -50,7 +50,7 @@ def find_showers(data, jumps, usable, threshold, *, first_group, last_group):
         hit = np.zeros(usable.shape, np.float32)
         ys, xs = where[same, :2].T
         hit[ys, xs] = np.abs(jumps[same, 4])
-        for y, x in _tracks(hit, ys, xs):
+        for y, x in _tracks(hit):
             part = tuple(slice(max(c - _REACH, 0), c + _REACH + 1) for c in (y, x))
             differences = [
                 data[k, first_group + j + 1][part].astype(np.float32)
@@ -68,16 +68,12 @@ def find_showers(data, jumps, usable, threshold, *, first_group, last_group):
     return tuple(np.unique(np.concatenate(found), axis=0).T)
 
 
-def _tracks(hit, ys, xs):
+def _tracks(hit):
     """Brightest pixel of each track of jumps whose significances add up to a large one."""
     labels, number = label(hit > 0, structure=np.ones((3, 3)))
-    track, size = labels[ys, xs], hit[ys, xs]
-    large = np.bincount(track, size, number + 1) >= _LARGE
-    # the brightest of each comes last
-    order = np.lexsort((size, track))
-    brightest = order[np.append(np.diff(track[order]) != 0, True)]
-    brightest = brightest[large[track[brightest]]]
-    return zip(ys[brightest], xs[brightest], strict=True)
+    index = np.arange(1, number + 1)
+    large = index[sum_labels(hit, labels, index) >= _LARGE]
+    return maximum_position(hit, labels, large) if large.size else []
 
 
 def _significant(excess, good, threshold):

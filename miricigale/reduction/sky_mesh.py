@@ -272,6 +272,7 @@ class SkyMesh:
         return out
 
     def _measure(self, sources, mode=False):
+        self.sources = sources
         boxes = sky_boxes(self._data - self._smooth, self.mask | sources, self.box, mode=mode)
         values = boxes.level
         if self.plane:
@@ -279,8 +280,7 @@ class SkyMesh:
             self._smooth, values = self._smooth + more, values - there
         self._boxes = boxes
         mesh = self._over(values)
-        self.tilted = self._data - self._smooth
-        self.residual = self.tilted - mesh
+        self.residual = self._data - self._smooth - mesh
         self.level = (self._smooth + mesh).astype(np.float32)
         self.rms = np.maximum(self._over(boxes.spread), 0)
 

@@ -1,5 +1,7 @@
 """Slopes of the ramps of an exposure: which groups take part, and what is taken off them."""
 
+import dataclasses
+
 import numpy as np
 
 from miricigale.detector import (
@@ -16,6 +18,7 @@ from miricigale.reduction.assumed import is_own
 from miricigale.reduction.drawn import draw_groups
 from miricigale.reduction.rampfit import fit_groups
 from miricigale.reduction.reference_pixels import reference_channels, reference_drift
+from miricigale.reduction.settling import note_settling
 from miricigale.utils.exceptions import ReductionWarning, argument_error, warn
 
 # flags of a ramp's pixels that forbid a slope
@@ -96,7 +99,10 @@ def fit_slopes(reducer, ramp, maps, progress_bar=False, *, first=0):
     fit.flags[...] |= dq
     fit.rate[...] -= np.float32(maps.dark_rate)
     fit.flags[~usable] |= int(DQ.DO_NOT_USE)
-    return fit
+    if history.simulated:
+        # it is known what acted
+        return fit
+    return dataclasses.replace(fit, settling=note_settling(ramp, maps, skip_first, fit.flags))
 
 
 def shares_charge(reducer, ramp):

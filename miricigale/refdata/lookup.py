@@ -81,8 +81,7 @@ def _read_record(path):
     # thousands of checksums: read once
     record = json.loads(Path(path).read_text(encoding="utf-8"))
     if not isinstance(record, dict) or not isinstance(record.get("sha256"), str):
-        msg = "it has no 'sha256'"
-        raise ValueError(msg)
+        raise ValueError("it has no 'sha256'")
     return record
 
 
@@ -178,11 +177,8 @@ def locate(name):
         remedy = f"get it from {record.source} and run 'miricigale data add {name} PATH'"
         msg = f"resource {name!r} ({record.title}) is in none of {tried}; {remedy}"
         raise DataError(msg)
-    if (
-        label != "the package"
-        and record.kind == "bundled"
-        and fingerprint_of(path) != record.sha256
-    ):
+    own = record.kind == "bundled" and label != "the package"
+    if own and fingerprint_of(path) != record.sha256:
         msg = f"resource {record.name!r} is taken from {path}, which differs from the bundled file"
         warn(msg, ReferenceWarning)
     return path

@@ -8,8 +8,8 @@ from astropy.coordinates import SkyCoord
 from scipy.interpolate import RectBivariateSpline
 
 from miricigale.instrument import background_level
-from miricigale.utils.exceptions import argument_error
-from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
+from miricigale.utils.options import check_that
+from miricigale.utils.units import SURFACE_BRIGHTNESS, frozen_quantity
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,15 +51,12 @@ class Background:
     center: SkyCoord | None = None
 
     def __post_init__(self):
-        level = float(to_array(self.level, SURFACE_BRIGHTNESS, "level", ndim=0))
-        if not (np.isfinite(level) and level >= 0):
-            raise argument_error("level", "finite and not negative", self.level)
-        gradient = to_array(self.gradient, 1 / u.arcmin, "gradient", ndim=0, finite=True)
-        angle = to_array(self.position_angle, u.deg, "position_angle", ndim=0, finite=True)
-        gradient, angle = float(gradient) / u.arcmin, float(angle) * u.deg
-        self.__dict__.update(
-            level=level * SURFACE_BRIGHTNESS, gradient=gradient, position_angle=angle
-        )
+        level = frozen_quantity(self.level, SURFACE_BRIGHTNESS, "level", ndim=0)
+        check_that(0 <= level.value < np.inf, "level", "finite and not negative", self.level)
+        options = {"ndim": 0, "finite": True}
+        gradient = frozen_quantity(self.gradient, 1 / u.arcmin, "gradient", **options)
+        angle = frozen_quantity(self.position_angle, u.deg, "position_angle", **options)
+        self.__dict__.update(level=level, gradient=gradient, position_angle=angle)
 
     @classmethod
     def low_zodi(cls, filter, *, center=None):

@@ -5,7 +5,7 @@ import numpy as np
 from astropy.table import QTable, Table
 
 from miricigale.filters.photometry_table import as_photometry
-from miricigale.filters.surveys import is_band
+from miricigale.filters.surveys import flux_bands, is_band
 from miricigale.profiles import SERSIC_INDEX_RANGE
 from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
 from miricigale.utils.missing import plain_floats, without_codes
@@ -245,8 +245,7 @@ def _flags(catalog):
     flags[sersic & ~((ratio > 0) & (ratio <= 1))] |= CatalogFlags.BAD_AXIS_RATIO
     flags[sersic & ~np.isfinite(angle) & (ratio != 1)] |= CatalogFlags.BAD_ANGLE
     flags[~(catalog["redshift"] > 0)] |= CatalogFlags.NO_REDSHIFT
-    bands = [n for n in catalog.colnames if is_band(n) and not n.endswith(error_column(""))]
-    if bands:
+    if bands := flux_bands(catalog.colnames):
         usable = np.any([_usable(catalog, name) for name in bands], axis=0)
         flags[~usable] |= CatalogFlags.NO_FLUX
     return flags
@@ -254,8 +253,5 @@ def _flags(catalog):
 
 def _usable(catalog, name):
     """Which sources have a positive flux in a band, with a positive error if it has errors."""
-    good = np.isfinite(catalog[name].value) & (catalog[name].value > 0)
-    if error_column(name) in catalog.colnames:
-        error = catalog[error_column(name)].value
-        good &= np.isfinite(error) & (error > 0)
-    return good
+    names = [n for n in (name, error_column(name)) if n in catalog.colnames]
+    return np.all([(catalog[n].value > 0) & np.isfinite(catalog[n].value) for n in names], axis=0)

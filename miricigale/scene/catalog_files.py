@@ -9,7 +9,7 @@ from astropy.units import UnitsWarning
 
 from miricigale.filters import Filter
 from miricigale.filters.catalog_files import as_catalog_map, catalog_messages
-from miricigale.filters.surveys import is_band
+from miricigale.filters.surveys import flux_bands
 from miricigale.refdata import locate, resources
 from miricigale.scene.catalog import CatalogFlags, check_catalog
 from miricigale.utils.exceptions import (
@@ -19,7 +19,7 @@ from miricigale.utils.exceptions import (
 )
 from miricigale.utils.files import reading
 from miricigale.utils.table_files import read_table
-from miricigale.utils.tables import error_column
+from miricigale.utils.units import ab_magnitude
 
 #: Counts of galaxies in K: AB magnitude and log of the number per magnitude and square degree (Weaver et
 #: al. 2022, ApJS 258, 11, table 2).
@@ -146,27 +146,19 @@ def _hours(table, catalog):
 
 def _odd_units(catalog):
     """Warnings about units of fluxes, by their number on the sky and their colors."""
-    pivots = {
-        name: Filter.from_name(name).pivot.value
-        for name in catalog.colnames
-        if is_band(name) and not name.endswith(error_column(""))
-    }
+    pivots = {name: Filter.from_name(name).pivot.value for name in flux_bands(catalog.colnames)}
     galaxies = ~np.asarray(catalog["star"])
-    logs = {}
-    for name in pivots:
-        flux = catalog[name].value
-        good = galaxies & np.isfinite(flux) & (flux > 0)
-        logs[name] = np.where(good, np.log10(np.where(good, flux, 1.0)), np.nan)
-    known = [n for n, log in logs.items() if np.isfinite(log).sum() >= _FEW]
+    mags = {name: np.where(galaxies, ab_magnitude(catalog[name]), np.nan) for name in pivots}
+    known = [name for name, mag in mags.items() if np.isfinite(mag).sum() >= _FEW]
     if not known:
         return
     reference = min(known, key=lambda name: abs(np.log(pivots[name] / 2.0)))
-    yield from _odd_counts(catalog, logs[reference], reference)
+    yield from _odd_counts(catalog, mags[reference], reference)
     for name in known:
-        color = logs[name] - logs[reference]
+        color = mags[reference] - mags[name]
         if np.isfinite(color).sum() < _FEW:
             continue
-        factor = float(np.nanmedian(color))
+        factor = 0.4 * float(np.nanmedian(color))
         if abs(factor) > _COLOR[int(pivots[name] > 10.0)]:
             yield (
                 f"the median of {name} over {reference} is {10**factor:.2g}: are these fluxes in "
@@ -174,10 +166,10 @@ def _odd_units(catalog):
             )
 
 
-def _odd_counts(catalog, log_flux, name):
+def _odd_counts(catalog, magnitudes, name):
     """Warnings about the unit of a band, by the density of its sources."""
-    median = 23.9 - 2.5 * float(np.nanmedian(log_flux))
-    sky = catalog["sky"][np.isfinite(log_flux)]
+    median = float(np.nanmedian(magnitudes))
+    sky = catalog["sky"][np.isfinite(magnitudes)]
     ra = sky.ra.wrap_at(sky.ra[0] + 180 * u.deg).deg
     area = np.ptp(ra) * np.cos(sky.dec.rad.mean()) * np.ptp(sky.dec.deg)
     if not area > 0:

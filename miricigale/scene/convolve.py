@@ -124,9 +124,8 @@ def add_nodes(image, i, j, light, phases, *, margin):
         x0, x1 = max(x - half, 0), min(x + half + 1, image.shape[1])
         if y1 > y0 and x1 > x0:
             one = phases[row % os_, column % os_]
-            image[y0:y1, x0:x1] += (
-                value * one[y0 - y + half : y1 - y + half, x0 - x + half : x1 - x + half]
-            )
+            one = one[y0 - y + half : y1 - y + half, x0 - x + half : x1 - x + half]
+            image[y0:y1, x0:x1] += value * one
 
 
 def _kernels(data, origin, oversampling, order, y, x):

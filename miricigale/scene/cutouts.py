@@ -11,7 +11,7 @@ from astropy.nddata import NDData
 from miricigale.scene.sky import local_jacobian
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
-from miricigale.utils.units import ANGLE, Frozen, frozen_array, positive, to_array
+from miricigale.utils.units import ANGLE, Frozen, frozen_array, frozen_quantity, positive
 
 # two points of Gauss and Legendre in a cell: the light's variance in it is exact
 _GAUSS = 0.5 / math.sqrt(3.0)
@@ -70,16 +70,14 @@ class Cutout(Frozen):
         data = frozen_array(np.asarray(self.data, dtype=float))
         if data.ndim != 2 or not np.all(np.isfinite(data)) or not data.sum() > 0:
             raise argument_error("data", "a finite 2D array with a positive sum", data.shape)
-        scale = positive(self.pixel_scale, ANGLE, "pixel_scale")
-        angle = float(to_array(self.angle, u.deg, "angle", ndim=0, finite=True))
+        scale = positive(self.pixel_scale, ANGLE, "pixel_scale") * ANGLE
+        angle = frozen_quantity(self.angle, u.deg, "angle", ndim=0, finite=True)
         ny, nx = data.shape
         center = ((nx - 1) / 2, (ny - 1) / 2) if self.center is None else self.center
         if len(center) != 2 or not np.all(np.isfinite(center)):
             raise argument_error("center", "a pixel x, y", self.center)
         center = (float(center[0]), float(center[1]))
-        self.__dict__.update(
-            data=data, pixel_scale=scale * ANGLE, angle=angle * u.deg, center=center
-        )
+        self.__dict__.update(data=data, pixel_scale=scale, angle=angle, center=center)
 
     @classmethod
     def from_image(cls, image, position=None):
@@ -115,16 +113,15 @@ class Cutout(Frozen):
         got = f"{bad.sum()} of {bad.size} pixels that are"
         check_that(not bad.any(), "image", "without masked or infinite pixels (fill them)", got)
         ny, nx = data.shape
-        middle = np.array([(nx - 1) / 2]), np.array([(ny - 1) / 2])
+        x, y = (nx - 1) / 2, (ny - 1) / 2
         # columns: the steps along x and y in (east, north), arcsec
-        steps = np.linalg.inv(local_jacobian(image.wcs, *middle)[0])
+        steps = np.linalg.inv(local_jacobian(image.wcs, x, y))
         sides = np.hypot(*steps)
         cosine = float(steps[:, 0] @ steps[:, 1]) / float(np.prod(sides))
         if abs(sides[1] / sides[0] - 1) > 0.01 or abs(cosine) > 0.01:
             wanted = "with square pixels (resample it first)"
             got = f"sides of {sides[0]:.4g} and {sides[1]:.4g} arcsec, cosine {cosine:.3g}"
             raise argument_error("image", wanted, got)
-        x, y = float(middle[0][0]), float(middle[1][0])
         if position is not None:
             x, y = (float(v) for v in image.wcs.world_to_pixel(position))
         # east of north is counter-clockwise where +x is west of +y
@@ -151,13 +148,12 @@ class Cutout(Frozen):
         y, x = np.indices(self.data.shape)
         radius = np.hypot(x - self.center[0], y - self.center[1]).ravel()
         order = np.argsort(radius, kind="stable")
-        share = np.cumsum(self.data.ravel()[order]) / self.data.sum()
+        share = np.append(0.0, np.cumsum(self.data.ravel()[order]) / self.data.sum())
+        radius = np.append(0.0, radius[order])
         # noise may take the sum up and down: where it first has the half
         k = int(np.argmax(share >= 0.5))
-        inner = share[k - 1] if k else 0.0
-        low = radius[order[k - 1]] if k else 0.0
-        step = (0.5 - inner) / (share[k] - inner)
-        return (low + step * (radius[order[k]] - low)) * self.pixel_scale
+        step = (0.5 - share[k - 1]) / (share[k] - share[k - 1])
+        return (radius[k - 1] + step * (radius[k] - radius[k - 1])) * self.pixel_scale
 
     def pieces(self, jacobian):
         """

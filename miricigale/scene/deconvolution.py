@@ -4,6 +4,7 @@ import numpy as np
 import scipy.fft
 
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 
 
 def deconvolve(image, psf, *, max_gain=3.0):
@@ -53,13 +54,10 @@ def deconvolve(image, psf, *, max_gain=3.0):
     if any(side % 2 == 0 for side in psf.shape) or not psf.sum() > 0:
         got = f"shape {psf.shape} with the sum {psf.sum():.4g}"
         raise argument_error("psf", "an array with odd sides and a positive sum", got)
-    if not (np.isfinite(max_gain) and max_gain >= 1):
-        raise argument_error("max_gain", "a number of at least 1", max_gain)
+    check_that(1 <= max_gain < np.inf, "max_gain", "a number of at least 1", max_gain)
     # so wide that nothing comes in again from the other side
-    shape = [
-        scipy.fft.next_fast_len(n + m, real=True)
-        for n, m in zip(image.shape, psf.shape, strict=True)
-    ]
+    sides = np.add(image.shape, psf.shape).tolist()
+    shape = [scipy.fft.next_fast_len(side, real=True) for side in sides]
     centered = np.zeros(shape)
     centered[: psf.shape[0], : psf.shape[1]] = psf / psf.sum()
     centered = np.roll(centered, (-(psf.shape[0] // 2), -(psf.shape[1] // 2)), axis=(0, 1))

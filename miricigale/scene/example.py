@@ -110,12 +110,7 @@ def example_field(filters=("wfc3.f160w", "miri.f770w"), *, size=30 * u.arcsec, s
         pixel = _SCALES[camera]
         n_pixels = round(width / pixel.value)
         psfs[name] = filter_psf(name, pixel_scale=pixel, pa=0 * u.deg)
-        images[name] = highres_image(
-            truth,
-            filter=name,
-            wcs=north_up_wcs(_CENTER, pixel, (n_pixels, n_pixels)),
-            psf=psfs[name],
-            depth=_DEPTHS[camera] * u.ABmag,
-            seed=seed,
-        )
+        wcs, depth = north_up_wcs(_CENTER, pixel, (n_pixels, n_pixels)), _DEPTHS[camera] * u.ABmag
+        options = {"filter": name, "wcs": wcs, "psf": psfs[name], "depth": depth}
+        images[name] = highres_image(truth, seed=seed, **options)
     return ExampleField(images, psfs, truth)

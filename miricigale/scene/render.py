@@ -98,14 +98,9 @@ class Painter:
         (x, k_x), (y, k_y) = (np.unique(v, return_inverse=True) for v in np.transpose(where))
         order = np.zeros((y.size, x.size), dtype=np.int64)
         order[k_y, k_x] = np.arange(len(where))
-        self.__dict__.update(
-            _oversampling=oversampling,
-            _origin=origin,
-            _data=data,
-            _phases=np.stack([phases(one, origin, oversampling) for one in data]),
-            _order=order,
-            _places=(y, x),
-        )
+        tables = np.stack([phases(one, origin, oversampling) for one in data])
+        self.__dict__.update(_oversampling=oversampling, _origin=origin, _data=data)
+        self.__dict__.update(_phases=tables, _order=order, _places=(y, x))
 
     @property
     def margin(self):
@@ -119,20 +114,17 @@ class Painter:
 
     def _axes(self):
         """Places of the PSFs along y and along x."""
-        return tuple(
-            Places(at, n_pixels=n, margin=self.margin, oversampling=self._oversampling)
-            for at, n in zip(self._places, self.shape, strict=True)
-        )
+        options = {"margin": self.margin, "oversampling": self._oversampling}
+        pairs = zip(self._places, self.shape, strict=True)
+        return tuple(Places(at, n_pixels=n, **options) for at, n in pairs)
 
     def _landing(self):
         """Which part of the light on each node lands on the image."""
         shape = self._phases.shape
         sums = np.zeros((*shape[:3], shape[3] + 1, shape[4] + 1))
         sums[..., 1:, 1:] = self._phases.cumsum(axis=3).cumsum(axis=4)
-        y, x = (
-            (*self._ranges(n), *axis.weights())
-            for n, axis in zip(self.shape, self._axes(), strict=True)
-        )
+        axes = zip(self.shape, self._axes(), strict=True)
+        y, x = ((*self._ranges(n), *axis.weights()) for n, axis in axes)
         return _core.Landing(sums, self._oversampling, self._order, *y, *x)
 
     def _ranges(self, n):
@@ -189,15 +181,9 @@ class Painter:
         grid = np.zeros((land.low_y.size, land.low_x.size), dtype=np.float32)
         if np.any(extended):
             radius, index, ratio = r_eff[extended] * os_, n[extended], axis_ratio[extended]
-            rows = parameter_rows(
-                x=node_x[extended],
-                y=node_y[extended],
-                total_flux=flux[extended],
-                r_eff=radius,
-                n=index,
-                axis_ratio=ratio,
-                theta=theta[extended],
-            )
+            shapes = {"r_eff": radius, "n": index, "axis_ratio": ratio, "theta": theta[extended]}
+            places = {"x": node_x[extended], "y": node_y[extended]}
+            rows = parameter_rows(**places, total_flux=flux[extended], **shapes)
             tables = light_table(index)
             # the cusp, and profiles thinner than the nodes as a whole, in small cells
             zone = np.where(ratio * radius < 4, np.maximum(4 / ratio, 3 * radius), 4 / ratio)
@@ -210,21 +196,12 @@ class Painter:
             )
             kept[extended] = sersic_enclosed_fraction(cut / radius, index)
         for row, (dx, dy, share) in (images or {}).items():
-            in_image[row] = self._add_image(
-                grid, node_x[row] + dx * os_, node_y[row] + dy * os_, flux[row] * share, land
-            )
+            places = node_x[row] + dx * os_, node_y[row] + dy * os_
+            in_image[row] = self._add_image(grid, *places, flux[row] * share, land)
         _core.deposit_nodes(grid, i, j, light)
-        image = convolve(
-            grid,
-            self._data,
-            self._order,
-            *self._axes(),
-            origin=self._origin,
-            margin=margin,
-            oversampling=os_,
-            n_threads=self.n_threads,
-        )
-        return image, in_image, kept
+        options = {"margin": margin, "oversampling": os_, "n_threads": self.n_threads}
+        arrays = grid, self._data, self._order
+        return convolve(*arrays, *self._axes(), origin=self._origin, **options), in_image, kept
 
     @staticmethod
     def _add_image(grid, x, y, light, land):

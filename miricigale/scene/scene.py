@@ -1,6 +1,7 @@
 """A noiseless image of a catalog of sources, and the truth that belongs to it."""
 
 import functools
+from operator import attrgetter
 
 import astropy.units as u
 import numpy as np
@@ -166,10 +167,9 @@ class Scene(Interactive):
         self._background = self._check_background(background)
         scale = float(np.abs(np.linalg.det(self._center_jacobian())) ** -0.5)
         self._check_psf(psf, scale)
-        radius = positive(max_radius, ANGLE, "max_radius")
-        self._painter = Painter(
-            self._shape, psf, enclosed=enclosed, max_radius=radius / scale, n_threads=n_threads
-        )
+        radius = positive(max_radius, ANGLE, "max_radius") / scale
+        options = {"enclosed": enclosed, "max_radius": radius, "n_threads": n_threads}
+        self._painter = Painter(self._shape, psf, **options)
         self._cutouts = self._check_cutouts(cutouts)
         self._galaxy_flux, self._agn_flux = self._split_flux(agn)
         self._warn_of_fluxes()
@@ -181,30 +181,11 @@ class Scene(Interactive):
         ny, nx = self._shape
         return f"<Scene {self._filter}: {len(self._catalog)} sources on {nx} x {ny} pixels>"
 
-    @property
-    def catalog(self):
-        """The checked catalog."""
-        return self._catalog
-
-    @property
-    def filter(self):
-        """Name of the flux column."""
-        return self._filter
-
-    @property
-    def wcs(self):
-        """World coordinates of the image."""
-        return self._wcs
-
-    @property
-    def psf(self):
-        """The PSF."""
-        return self._painter.psf
-
-    @property
-    def background(self):
-        """The background, or None."""
-        return self._background
+    catalog = property(attrgetter("_catalog"), doc="The checked catalog.")
+    filter = property(attrgetter("_filter"), doc="Name of the flux column.")
+    wcs = property(attrgetter("_wcs"), doc="World coordinates of the image.")
+    psf = property(attrgetter("_painter.psf"), doc="The PSF.")
+    background = property(attrgetter("_background"), doc="The background, or None.")
 
     def _check_cutouts(self, cutouts):
         """Cutouts by row of the catalog."""
@@ -271,7 +252,7 @@ class Scene(Interactive):
 
     def _center_jacobian(self):
         ny, nx = self._shape
-        return local_jacobian(self._wcs, np.array([(nx - 1) / 2]), np.array([(ny - 1) / 2]))[0]
+        return local_jacobian(self._wcs, (nx - 1) / 2, (ny - 1) / 2)
 
     def _check_psf(self, psf, scale):
         if not isinstance(psf, _TYPED):
@@ -323,28 +304,20 @@ class Scene(Interactive):
         profile = np.arange(rows.size) < n_profiles
         jacobian = local_jacobian(self._wcs, x[rows], y[rows])
         is_sersic = sersic[rows] & profile
-        radius, ratio, theta = ellipse_to_pixels(
-            jacobian,
-            radius=np.where(is_sersic, catalog["half_light_radius"].to_value(ANGLE)[rows], 0),
-            axis_ratio=np.where(is_sersic, catalog["axis_ratio"][rows], 1.0),
-            position_angle=np.nan_to_num(catalog["position_angle"].to_value(u.rad))[rows],
-        )
+        radius = np.where(is_sersic, catalog["half_light_radius"].to_value(ANGLE)[rows], 0)
+        ratio = np.where(is_sersic, catalog["axis_ratio"][rows], 1.0)
+        ellipse = {"radius": radius, "axis_ratio": ratio}
+        ellipse["position_angle"] = np.nan_to_num(catalog["position_angle"].to_value(u.rad))[rows]
+        radius, ratio, theta = ellipse_to_pixels(jacobian, **ellipse)
         images = {
             k: self._cutouts[row].pieces(jacobian[k])
             for k, row in enumerate(rows[:n_profiles])
             if row in self._cutouts
         }
-        image, landed, whole = self._painter.paint(
-            x=x[rows],
-            y=y[rows],
-            flux=np.where(profile, galaxy[rows], agn[rows]),
-            is_sersic=is_sersic,
-            r_eff=radius,
-            n=catalog["sersic_index"][rows],
-            axis_ratio=ratio,
-            theta=theta,
-            images=images,
-        )
+        sources = {"is_sersic": is_sersic, "r_eff": radius, "axis_ratio": ratio, "theta": theta}
+        sources |= {"x": x[rows], "y": y[rows], "n": catalog["sersic_index"][rows]}
+        light = np.where(profile, galaxy[rows], agn[rows])
+        image, landed, whole = self._painter.paint(flux=light, images=images, **sources)
         in_image = np.bincount(rows, weights=landed, minlength=len(catalog))
         # of all light, the points' included
         lost = np.zeros(len(catalog))
@@ -352,28 +325,18 @@ class Scene(Interactive):
         total = np.where(flux[own] > 0, flux[own], 1.0)
         lost[own] = (1 - whole[:n_profiles]) * galaxy[own] / total
         flags[lost > 0.01] |= SceneFlags.CUT_PROFILE
-        enclosed = self._painter.enclosed_by_psf
-        flags[inside & valid & (in_image < 0.95 * flux * (1 - lost) * enclosed)] |= (
-            SceneFlags.NEAR_EDGE
-        )
+        dim = in_image < 0.95 * flux * (1 - lost) * self._painter.enclosed_by_psf
+        flags[inside & valid & dim] |= SceneFlags.NEAR_EDGE
         painted_as = np.where(sersic, "sersic", "point").astype("U6")
         painted_as[list(self._cutouts)] = "cutout"
+        plain = {"id": catalog["id"], "sky": catalog["sky"], "x": x, "y": y, "profile": painted_as}
+        columns = {name: (values, None) for name, values in plain.items()}
+        columns["flux_total"] = flux * FNU, "light to infinity, the AGN's included"
+        columns["flux_agn"] = agn * FNU, "light of the point at the center"
         held = "light that the image holds, through PSF and edges"
-        truth = described_table(
-            {
-                "id": (catalog["id"], None),
-                "sky": (catalog["sky"], None),
-                "x": (x, None),
-                "y": (y, None),
-                "profile": (painted_as, None),
-                "flux_total": (flux * FNU, "light to infinity, the AGN's included"),
-                "flux_agn": (agn * FNU, "light of the point at the center"),
-                "flux_in_image": (in_image * FNU, held),
-                "flags": (flags, SceneFlags.describe()),
-            },
-            provenance(filter=self._filter),
-        )
-        return image, truth
+        columns["flux_in_image"] = in_image * FNU, held
+        columns["flags"] = flags, SceneFlags.describe()
+        return image, described_table(columns, provenance(filter=self._filter))
 
     @property
     def truth(self):
@@ -416,11 +379,9 @@ class Scene(Interactive):
         """
         light = self._painted[0]
         brightness = light * _UJY_TO_MJY / pixel_area_map(self._wcs, self._shape)
-        meta = provenance(
-            filter=self._filter,
-            psf_includes=list(self.psf.includes) if isinstance(self.psf, _TYPED) else [],
-            n_sources=len(self._catalog),
-        )
+        includes = list(self.psf.includes) if isinstance(self.psf, _TYPED) else []
+        n = len(self._catalog)
+        meta = provenance(filter=self._filter, psf_includes=includes, n_sources=n)
         if self._background is not None:
             brightness += self._background.image(self._wcs, self._shape)
             meta["background"] = float(self._background.level.value)

@@ -8,7 +8,7 @@ import astropy.units as u
 from miricigale.refdata import Registry, locate
 from miricigale.refdata.lookup import fingerprint_of
 from miricigale.sed.parameter import Parameter
-from miricigale.utils.exceptions import ConfigError, argument_error, config_error
+from miricigale.utils.exceptions import ConfigError, config_error
 from miricigale.utils.options import check_that
 
 #: What a component does, in the order in which light meets it.
@@ -112,19 +112,18 @@ class Component:
 
     def __init__(self, **defaults):
         known, options = type(self).declared(), type(self).all_options()
-        for name, values in options.items():
-            self.__dict__[name] = values[0]
+        self.__dict__.update({name: values[0] for name, values in options.items()})
         for name, value in defaults.items():
             if name in options:
-                if value not in options[name]:
-                    raise argument_error(name, f"one of {', '.join(options[name])}", repr(value))
-                self.__dict__[name] = value
-                continue
-            if name not in known:
+                wanted = f"one of {', '.join(options[name])}"
+                check_that(value in options[name], name, wanted, repr(value))
+            elif name in known:
+                value = known[name].check(value)
+            else:
                 names = ", ".join([*known, *options])
                 msg = f"{type(self).__name__} has no parameter {name!r}; known: {names}"
                 raise TypeError(msg)
-            self.__dict__[name] = known[name].check(value)
+            self.__dict__[name] = value
 
     def __setattr__(self, name, value):
         if name in type(self).all_options():
@@ -210,10 +209,9 @@ def read_config(config):
     """Components and other options of a model from plain values; see `SEDModel.from_dict`."""
     if not isinstance(config, Mapping):
         raise config_error("[sed]", f"must be a table of keys, got {type(config).__name__}")
-    unknown = set(config) - {"components", "frac_agn_definition"}
-    if unknown:
-        msg = f"[sed] does not know {sorted(unknown)}; known: components, frac_agn_definition"
-        raise ConfigError(msg)
+    known = ["components", "frac_agn_definition"]
+    if unknown := sorted(set(config).difference(known)):
+        raise config_error("[sed]", f"does not know {unknown}; known: {', '.join(known)}")
     parts = []
     entries = config.get("components", ())
     if isinstance(entries, (str, Mapping)) or not all(isinstance(e, Mapping) for e in entries):

@@ -11,7 +11,7 @@ from miricigale.filters.spectra import spectrum_arrays
 from miricigale.sed.component import Component, register
 from miricigale.sed.parameter import Parameter
 from miricigale.utils.declared import declared
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.exceptions import argument_error, units_error
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import error_column, require_columns
 from miricigale.utils.units import FNU
@@ -384,13 +384,12 @@ def deredden(photometry, ebv, filters, *, law="G23", r_v=3.1, sed=None, beyond="
     """
     bands = FilterSet(filters)
     require_columns(photometry, bands.names, "photometry")
-    if _KEY in photometry.meta:
-        got = f"one whose meta say {_KEY}: {photometry.meta[_KEY]}"
-        raise argument_error("photometry", "a table not corrected yet", got)
+    got = f"one whose meta say {_KEY}: {photometry.meta.get(_KEY)}"
+    check_that(_KEY not in photometry.meta, "photometry", "a table not corrected yet", got)
     values, scalar = _color_excess(ebv)
-    if not scalar and values.size != len(photometry):
-        got = f"{values.size} for {len(photometry)} rows"
-        raise argument_error("ebv", "one number or one for each row", got)
+    got = f"{values.size} for {len(photometry)} rows"
+    good = scalar or values.size == len(photometry)
+    check_that(good, "ebv", "one number or one for each row", got)
     table = band_extinction(bands, values, law=law, r_v=r_v, sed=sed, beyond=beyond)
     out = photometry.copy()
     for name in bands.names:
@@ -404,8 +403,7 @@ def deredden(photometry, ebv, filters, *, law="G23", r_v=3.1, sed=None, beyond="
                 unit.is_equivalent(FNU, u.spectral_density(1 * u.um)) or unit.is_equivalent(u.mgy)
             )
             if not linear:
-                msg = f"'photometry' column {column!r} must be in a linear unit of flux, got {unit}"
-                raise u.UnitsError(msg)
+                raise units_error("photometry", "in a linear unit of flux", unit, column=column)
             if out[column].ndim != 1 or out[column].dtype.kind not in "fiu":
                 raise argument_error("photometry", "one number in each row", f"column {column!r}")
             info = out[column].info

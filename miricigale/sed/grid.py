@@ -14,8 +14,6 @@ from miricigale.utils.store import open_parts, write_parts
 from miricigale.utils.unified import read_write, register
 from miricigale.utils.units import Frozen, frozen_array
 
-#: What the AGN fraction is a fraction of.
-DEFINITIONS = ("dust", "3-1000um")
 _SPAN = re.compile(r"(\d+(?:\.\d+)?)-(\d+(?:\.\d+)?)um")
 
 #: Layouts of files; in the second the facts that decide stood in the meta.
@@ -182,17 +180,13 @@ class ModelGrid(Frozen):
                 raise argument_error(name, f"a table of {rows} rows", f"{len(table)} rows")
         if len(set(self.filters)) != n_b or n_b == 0:
             raise argument_error("filters", "one or more different names", f"{self.filters}")
-        if n_z == 0 or n_g == 0:
-            raise argument_error("galaxy", "of at least one redshift and model", f"({n_z}, {n_g})")
-        if np.any(np.diff(self.redshift) <= 0) or not np.all(self.redshift >= 0):
-            raise argument_error("redshift", "ascending and >= 0", f"{self.redshift}")
-        f = self.frac_agn
+        check_that(n_z and n_g, "galaxy", "of at least one redshift and model", f"({n_z}, {n_g})")
+        z, f, n_alike = self.redshift, self.frac_agn, self.agn_multiplicity
+        check_that(np.all(np.diff(z) > 0) and np.all(z >= 0), "redshift", "ascending and >= 0", z)
         if f.size == 0 or np.any(np.diff(f) <= 0) or not (f[0] >= 0 and f[-1] < 1):
             raise argument_error("frac_agn", "ascending values in [0, 1)", f"{f}")
-        if n_a == 0 and not (f.size == 1 and f[0] == 0):
-            raise argument_error("frac_agn", "[0] for a grid without AGN", f"{f}")
-        if n_a and self.agn_multiplicity.min() < 1:
-            raise argument_error("agn_multiplicity", ">= 1", f"{self.agn_multiplicity.min()}")
+        check_that(n_a or f.tolist() == [0.0], "frac_agn", "[0] for a grid without AGN", f)
+        check_that(np.all(n_alike >= 1), "agn_multiplicity", ">= 1", n_alike)
         for name in ("galaxy", "agn", "dust_luminosity"):
             good = np.all(np.isfinite(getattr(self, name)))
             check_that(good, name, "finite", "NaN or infinite values")
@@ -280,13 +274,8 @@ def _read(path):
             name: _described(parts.table(name, QTable), text["descriptions"][name])
             for name in _TABLES
         }
-        return ModelGrid(
-            tuple(text["filters"]),
-            **arrays,
-            **tables,
-            meta=text["meta"],
-            **{name: text[name] for name in _FACTS},
-        )
+        facts = {name: text[name] for name in ("meta", *_FACTS)}
+        return ModelGrid(tuple(text["filters"]), **arrays, **tables, **facts)
 
 
 def _described(table, descriptions):

@@ -73,11 +73,10 @@ def cached_grid(model, axes, filters, make):
         try:
             grid = ModelGrid.read(path)
             os.utime(path)
-        except (DataError, OSError) as err:
-            _log.warning("cached grid not used: %s", err)
-        else:
             # the numbers are those of the file, the provenance is that of this model
             return replace(grid, meta=model.meta, recipe=model.recipe)
+        except (DataError, OSError) as err:
+            _log.warning("cached grid not used: %s", err)
     grid = make(model, axes, filters)
     if grid.galaxy.nbytes + grid.agn.nbytes > limit or not _unchanged(model):
         return grid

@@ -8,16 +8,15 @@ from miricigale.sed.chain import GALAXY
 from miricigale.sed.spectrum import distance
 from miricigale.sed.tables import dilution
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 
 
 def check_model(model, grid):
     """Refuse a model that is not the one of the grid, as far as the grid says what it was."""
     recipe = model.recipe
     for name, value in grid.recipe.items():
-        if recipe.get(name) != value:
-            raise argument_error(
-                "model", f"the one of the grid ({name}: {value})", f"{recipe.get(name)}"
-            )
+        wanted = f"the one of the grid ({name}: {value})"
+        check_that(recipe.get(name) == value, "model", wanted, recipe.get(name))
 
 
 def plain_index(grid, index):
@@ -37,12 +36,10 @@ def band_names(grid, filters):
     """
     if filters is None:
         return list(grid.filters), {}
-    if isinstance(filters, str):
-        raise argument_error("filters", "a list of names or a FilterSet", repr(filters))
-    if not isinstance(filters, FilterSet):
-        names, given = list(filters), {}
-    else:
-        names, given = list(filters.names), dict(zip(filters.names, filters, strict=True))
+    wanted = "a list of names or a FilterSet"
+    check_that(not isinstance(filters, str), "filters", wanted, repr(filters))
+    given = {band.name: band for band in filters} if isinstance(filters, FilterSet) else {}
+    names = list(given or filters)
     return names, {name: given.get(name) for name in names if name not in grid.filters}
 
 
@@ -63,9 +60,7 @@ def draw_fluxes(grid, index, scale, names, extra, model):
         flux = grid.flux(z, g, k, f)[:, columns]
         out[row][:, own] = scale[row][:, None] * flux
     if extra and len(index):
-        missing = [name for name, band in extra.items() if band is None]
-        found = dict(zip(missing, FilterSet.from_names(missing), strict=True)) if missing else {}
-        bands = [found.get(name, band) for name, band in extra.items()]
+        bands = [name if band is None else band for name, band in extra.items()]
         other = [names.index(name) for name in extra]
         flux = model_fluxes(model, grid, index, bands)
         out[:, :, other] = flux * scale[:, :, None]

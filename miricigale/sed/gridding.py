@@ -58,9 +58,8 @@ def _names(model, roles):
 def _products(parameters, axes):
     """All combinations of parameters, the last one fastest: list of dicts."""
     values = [axes.get(name, [parameter.default]) for name, parameter in parameters.items()]
-    return [
-        dict(zip(parameters, map(float, row), strict=True)) for row in itertools.product(*values)
-    ]
+    rows = itertools.product(*values)
+    return [dict(zip(parameters, map(float, row), strict=True)) for row in rows]
 
 
 def _distinct_agn(component, rows):
@@ -79,9 +78,8 @@ def _distinct_agn(component, rows):
 
 def _parameter_table(parameters, rows):
     columns = {name: np.array([row[name] for row in rows], dtype=float) for name in parameters}
-    return described_table(
-        {n: (u.Quantity(columns[n], p.unit), p.doc) for n, p in parameters.items()}
-    )
+    pairs = {n: (u.Quantity(columns[n], p.unit), p.doc) for n, p in parameters.items()}
+    return described_table(pairs)
 
 
 class _Galaxies:
@@ -147,12 +145,9 @@ def _agn_table(model, parts):
     }
     texts = {name: DERIVED[name].text for name in values}
     texts["ir_luminosity"] = "3-1000 um light of the AGN"
-    return model.chain.lnu(spectra) * scale[:, None], described_table(
-        {
-            name: (column * scale * u.one, f"{texts[name]}, W for each W of AGN power")
-            for name, column in values.items()
-        }
-    )
+    per = "W for each W of AGN power"
+    columns = {n: (v * scale * u.one, f"{texts[n]}, {per}") for n, v in values.items()}
+    return model.chain.lnu(spectra) * scale[:, None], described_table(columns)
 
 
 def model_grid(model, axes, filters):

@@ -196,15 +196,8 @@ class SEDModel(Interactive):
         model._notes = tuple(notes)
         return model
 
-    @staticmethod
-    def survey_axes(kind="survey"):
-        """Axes for real galaxies; see `miricigale.sed.survey_axes`."""
-        return presets.survey_axes(kind)
-
-    @staticmethod
-    def yang2021_axes(kind="fit"):
-        """Axes of the grids of Yang et al. 2021; see `miricigale.sed.yang2021_axes`."""
-        return presets.yang2021_axes(kind)
+    survey_axes = staticmethod(presets.survey_axes)
+    yang2021_axes = staticmethod(presets.yang2021_axes)
 
     # -------------------------------------------------------------- description
 
@@ -330,10 +323,8 @@ class SEDModel(Interactive):
             if why:
                 raise ValueError(why)
         limit = float(self.cosmology.age(out["redshift"]).to_value(u.Gyr))
-        if out["age"] > limit:
-            raise argument_error(
-                "age", f"at most the age of the universe, {limit:.3f} Gyr", out["age"]
-            )
+        wanted = f"at most the age of the universe, {limit:.3f} Gyr"
+        check_that(out["age"] <= limit, "age", wanted, out["age"])
         return out
 
     def evaluate(self, **parameters):
@@ -463,8 +454,7 @@ class SEDModel(Interactive):
 
     def _bands(self, filters):
         filters = filters if isinstance(filters, FilterSet) else FilterSet(filters)
-        foreground = self.component("foreground")
-        if foreground is not None:
+        if foreground := self.component("foreground"):
             foreground.check_bands(filters)
         return filters
 

@@ -5,7 +5,8 @@ import math
 import astropy.units as u
 import numpy as np
 
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.exceptions import argument_error, units_error
+from miricigale.utils.options import check_that
 
 
 class Parameter:
@@ -118,10 +119,8 @@ class Parameter:
             values = self._quantity(values, "a mixture")
         mask = getattr(values, "mask", None)
         plain = self.convert(getattr(values, "unmasked", values))
-        plain = np.ma.getdata(plain)
-        array = np.atleast_1d(np.asarray(plain))
-        if array.ndim != 1:
-            raise argument_error(self.name, "of one dimension", f"shape {array.shape}")
+        array = np.atleast_1d(np.asarray(np.ma.getdata(plain)))
+        check_that(array.ndim == 1, self.name, "of one dimension", f"shape {array.shape}")
         if array.dtype.kind not in "iuf":
             raise argument_error(self.name, "numbers", f"values of type {array.dtype}")
         out = array.astype(float)
@@ -140,8 +139,7 @@ class Parameter:
             return u.Quantity(value).to(self.unit)
         except (u.UnitConversionError, TypeError, ValueError):
             wanted = self.unit if self.unit != u.dimensionless_unscaled else "a number"
-            msg = f"'{self.name}' must be convertible to {wanted}, got {unit}"
-            raise u.UnitsError(msg) from None
+            raise units_error(self.name, f"convertible to {wanted}", unit) from None
 
     def __repr__(self):
         unit = f" {self.unit}" if self.unit != u.dimensionless_unscaled else ""

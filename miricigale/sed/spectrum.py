@@ -14,6 +14,7 @@ from miricigale.utils.files import reading
 from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.meta import full_meta
 from miricigale.utils.optional import require
+from miricigale.utils.options import check_that
 from miricigale.utils.table_files import read_table, write_table
 from miricigale.utils.units import FNU, WAVE, Frozen, frozen_quantity, is_number, to_array
 
@@ -108,14 +109,11 @@ class SED(Frozen, Interactive):
         wave = frozen_quantity(self.wave, WAVE, "wave", ndim=1, finite=True)
         fnu = to_array(self.fnu, FNU, "fnu", ndim=1, finite=True, equivalencies=spectral)
         fnu = frozen_quantity(fnu * FNU, FNU, "fnu")
-        if wave.size < 2 or wave.shape != fnu.shape:
-            raise argument_error(
-                "fnu", f"of the shape of 'wave', two points or more ({wave.shape})", fnu.shape
-            )
+        wanted = f"of the shape of 'wave', two points or more ({wave.shape})"
+        check_that(wave.size >= 2 and wave.shape == fnu.shape, "fnu", wanted, fnu.shape)
         if np.any(np.diff(wave.value) <= 0) or wave.value[0] <= 0:
             raise argument_error("wave", "positive and strictly ascending", "something else")
-        if not (np.isfinite(self.redshift) and self.redshift >= 0):
-            raise argument_error("redshift", ">= 0", self.redshift)
+        check_that(0 <= self.redshift < np.inf, "redshift", ">= 0", self.redshift)
         self.__dict__.update(wave=wave, fnu=fnu, redshift=float(self.redshift))
         self.__dict__.update(meta=dict(self.meta), components=dict(self.components))
 
@@ -162,9 +160,8 @@ class SED(Frozen, Interactive):
     def __add__(self, other):
         if not isinstance(other, SED):
             return NotImplemented
-        if self.redshift != other.redshift or not np.array_equal(self.wave, other.wave):
-            wanted = "an SED at the same redshift and wavelengths"
-            raise argument_error("other", wanted, repr(other))
+        alike = self.redshift == other.redshift and np.array_equal(self.wave, other.wave)
+        check_that(alike, "other", "an SED at the same redshift and wavelengths", other)
         return SED(self.wave, self.fnu + other.fnu, redshift=self.redshift)
 
     def replace(self, **changes):
@@ -292,8 +289,7 @@ class SED(Frozen, Interactive):
             Redshift of the source; the spectrum's ``z`` if not given.
         """
         wave = spectrum.waveset
-        if wave is None:
-            raise argument_error("spectrum", "one with a waveset", repr(spectrum))
+        check_that(wave is not None, "spectrum", "one with a waveset", spectrum)
         fnu = spectrum(wave, flux_unit=u.Jy)
         order = np.argsort(wave)
         redshift = spectrum.z if redshift is None else redshift

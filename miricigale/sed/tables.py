@@ -17,7 +17,7 @@ from miricigale.sed.derived import (
     scaled_quantities,
 )
 from miricigale.sed.spectrum import SED, distance
-from miricigale.utils.exceptions import ModelWarning, argument_error, warn
+from miricigale.utils.exceptions import ModelWarning, warn
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import Flags, as_table, described_table
 from miricigale.utils.units import FNU, WAVE
@@ -67,16 +67,12 @@ def seen_agn(chain, parts):
 
 def _columns(model, table):
     """Values of every parameter for every row, in the declared units."""
-    n = len(table)
-    out = {}
-    for name, parameter in model.parameters.items():
-        if name in table.colnames:
-            out[name] = parameter.array(table[name])
-        elif name == "redshift":
-            raise argument_error("table", "a table with a column 'redshift'", table.colnames)
-        else:
-            out[name] = np.full(n, parameter.default)
-    return out
+    wanted = "a table with a column 'redshift'"
+    check_that("redshift" in table.colnames, "table", wanted, table.colnames)
+    return {
+        name: par.array(table[name]) if name in table.colnames else np.full(len(table), par.default)
+        for name, par in model.parameters.items()
+    }
 
 
 def _warn_of_slips(model, names):
@@ -132,10 +128,8 @@ def _stack(filters):
 def spectra(model, values):
     """The spectrum of one model with its parts and derived quantities; see `SEDModel.evaluate`."""
     chain, z = model.chain, values["redshift"]
-    (stars, rows), dim = (
-        chain.stars([chain.key(values, *STELLAR)]),
-        chain.key(values, "attenuation"),
-    )
+    stars, rows = chain.stars([chain.key(values, *STELLAR)])
+    dim = chain.key(values, "attenuation")
     (starlight,), absorbed = chain.attenuated(stars, rows, [dim])
     absorbed *= values.get("dust_excess", 1.0)
     dust = absorbed * chain.dust(chain.key(values, "dust"))
@@ -164,13 +158,9 @@ def spectra(model, values):
     scaled = scaled_quantities(model, got, np.array([values["mass"]]), z, far, values)
     factor = chain.sky(values) * (values["mass"] * float(dilution(z, far)))
     wave = chain.wave * (1.0 + z) * WAVE
-    quantities = {
-        name: u.Quantity(values[name], par.unit) for name, par in model.parameters.items()
-    }
-    derived = {
-        name: u.Quantity(scaled[name][0], entry.unit)
-        for name, entry in model.derived_columns().items()
-    }
+    quantities = {n: u.Quantity(values[n], par.unit) for n, par in model.parameters.items()}
+    columns = model.derived_columns().items()
+    derived = {n: u.Quantity(scaled[n][0], entry.unit) for n, entry in columns}
 
     def sed(spectrum, **options):
         return SED(wave, chain.lnu(spectrum) * factor * FNU, redshift=z, **options)

@@ -16,7 +16,7 @@ from miricigale.sed.spectrum import SED
 from miricigale.utils.exceptions import ModelWarning, argument_error, data_error, warn
 from miricigale.utils.meta import provenance
 from miricigale.utils.missing import plain_floats
-from miricigale.utils.options import check_that
+from miricigale.utils.options import check_choice, check_that
 from miricigale.utils.table_files import read_table
 from miricigale.utils.units import FNU, WAVE
 
@@ -95,9 +95,8 @@ def _read_file(file):
     try:
         # NaN where a value is lacking, which is none of a spectrum
         wave = plain_floats(table[first], first, "spectrum") * _unit(table[first], u.AA)
-        stem = re.sub(
-            rf"({'|'.join(map(re.escape, _SUFFIXES))})?(\.gz)?$", "", file.name, flags=re.I
-        )
+        endings = "|".join(map(re.escape, _SUFFIXES))
+        stem = re.sub(rf"({endings})?(\.gz)?$", "", file.name, flags=re.I)
         out = {}
         for column in gravities or others[:1]:
             values = plain_floats(table[column], column, "spectrum").reshape(wave.size, -1).T
@@ -164,15 +163,10 @@ def template_grid(spectra, filters, *, beyond="error", redshift=None):
            [1.   , 1.   ],
            [0.078, 1.922]]))
     """
-    if beyond not in ("error", "rayleigh-jeans"):
-        raise argument_error("beyond", "'error' or 'rayleigh-jeans'", repr(beyond))
-    if not spectra:
-        raise argument_error("spectra", "a dict of at least one spectrum", repr(spectra))
+    check_choice(beyond, "beyond", ("error", "rayleigh-jeans"))
+    check_that(spectra, "spectra", "a dict of at least one spectrum", spectra)
     filters = filters if isinstance(filters, FilterSet) else FilterSet(filters)
-    seds = {
-        name: one if isinstance(one, SED) else SED.from_synphot(one)
-        for name, one in spectra.items()
-    }
+    seds = {k: one if isinstance(one, SED) else SED.from_synphot(one) for k, one in spectra.items()}
     if beyond != "error":
         last = max(band.wave[-1] for band in filters)
         short = [name for name, sed in seds.items() if sed.wave[-1] < last]
@@ -226,9 +220,7 @@ def red_dots():
     <ModelGrid 2 redshifts x 162 galaxies x 0 AGN x 1 fractions, 2 bands, 324 models>
     """
     # finely where bands of a survey are, at redshifts of 2 to 9
-    wave = np.unique(
-        np.concatenate([np.geomspace(0.005, 300, 800), np.geomspace(0.0912, 1.5, 1200)])
-    )
+    wave = np.union1d(np.geomspace(0.005, 300, 800), np.geomspace(0.0912, 1.5, 1200))
     out = {}
     for blue, red, turn, far in product(*_RED_DOTS):
         fnu = (wave / _BALMER) ** (np.where(wave < _BALMER, blue, red) + 2.0)

@@ -133,9 +133,8 @@ def band_luminosity(l_x, *, from_band, to_band, photon_index=1.8):
     """
     index = to_array(photon_index, u.dimensionless_unscaled, "photon_index", finite=True)
     top = _core.power_law_energy(*check_band(to_band, "to_band"), index)
-    return u.Quantity(l_x) * (
-        top / _core.power_law_energy(*check_band(from_band, "from_band"), index)
-    )
+    bottom = _core.power_law_energy(*check_band(from_band, "from_band"), index)
+    return u.Quantity(l_x) * (top / bottom)
 
 
 def xray_flux(l_x_2_10, redshift, *, band=(0.5, 7.0) * u.keV, photon_index=1.8, transmission=1.0):

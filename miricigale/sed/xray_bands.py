@@ -168,10 +168,8 @@ def with_xray_bands(grid, model, bands, *, alpha_ox=ALPHA_OX, **options):
 
     def observed(*sources):
         """Fluxes in uJy, (nz, n, n_bands)."""
-        seen = [
-            [s.dimming(band, z, far)[:, None] * s.power for s in sources]
-            for band in energies.values()
-        ]
+        ends = energies.values()
+        seen = [[s.dimming(two, z, far)[:, None] * s.power for s in sources] for two in ends]
         return np.moveaxis(np.sum(seen, axis=1), 0, -1)
 
     galaxies = xrays.galaxy(

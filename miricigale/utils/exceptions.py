@@ -4,6 +4,7 @@ import difflib
 import sys
 import warnings
 
+from astropy.units import UnitsError
 from astropy.utils.exceptions import AstropyUserWarning
 
 
@@ -71,6 +72,12 @@ class FitWarning(MiricigaleWarning):
 def argument_error(name, wanted, got):
     """Make the `ValueError` that names an argument, what was wanted and what came."""
     return ValueError(f"'{name}' must be {wanted}, got {got}")
+
+
+def units_error(name, wanted, got, *, column=None):
+    """Make the `~astropy.units.UnitsError` of an argument, or a column of it: what was wanted and what came."""
+    label = f"'{name}'" if column is None else f"'{name}' column {column!r}"
+    return UnitsError(f"{label} must be {wanted}, got {got}")
 
 
 def config_error(where, what):

@@ -58,9 +58,8 @@ def _checked(method):
             signature = inspect.signature(method)
             plain = [one.replace(annotation=one.empty) for one in signature.parameters.values()][1:]
             wanted = signature.replace(parameters=plain, return_annotation=signature.empty)
-            given = ", ".join(
-                [*(type(one).__name__ for one in args[1:]), *map("{}=".format, kwargs)]
-            )
+            kinds = (type(one).__name__ for one in args[1:])
+            given = ", ".join([*kinds, *map("{}=".format, kwargs)])
             name = method.__qualname__.removesuffix(".__init__").removesuffix(".__call__")
             msg = f"{name} takes {wanted}, got ({given})"
             raise TypeError(msg) from None

@@ -37,8 +37,8 @@ class FolderLock:
     Raises
     ------
     `~miricigale.utils.exceptions.DataError`
-        On entering, if another process (or this one) holds the lock; the message names the
-        process and the file.
+        On entering, if another process (or this one) holds the lock, with the process and the file in the
+        message, or the file system has no locks.
     """
 
     def __init__(self, folder, *, name="run.lock", purpose="run"):
@@ -56,6 +56,9 @@ class FolderLock:
             raise self._refusal() from None
         except PermissionError as err:
             raise data_error(self._lock.lock_file, "is a lock that this user may not open") from err
+        except OSError as err:
+            what = f"cannot be locked ({err.strerror}): choose a folder on a file system with locks"
+            raise data_error(self._lock.lock_file, what) from err
         try:
             # where locks are not passed on to other hosts the file alone says who was first
             if _is_elsewhere(self._owner()):

@@ -82,9 +82,8 @@ def fits_meta(meta):
     for key, value in meta.items():
         key = str(key)
         value = value.item() if isinstance(value, np.generic) else value
-        plain = isinstance(value, (bool, int)) or (
-            isinstance(value, float) and math.isfinite(value)
-        )
+        finite = isinstance(value, float) and math.isfinite(value)
+        plain = finite or isinstance(value, (bool, int))
         if plain or (isinstance(value, str) and _TEXT.fullmatch(value)):
             own = _KEYWORD.fullmatch(key) is not None and key.upper() not in _RESERVED
             cards[key if own else f"HIERARCH {key}"] = value

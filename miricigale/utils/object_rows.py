@@ -215,6 +215,4 @@ def _rows(array, rows):
 def _joined(arrays, name):
     if len({array.shape[1:] for array in arrays}) > 1:
         raise argument_error("parts", f"with arrays {name!r} of one shape", "several")
-    array = np.concatenate(arrays)
-    array.flags.writeable = False
-    return array
+    return _frozen(np.concatenate(arrays), copy=False)

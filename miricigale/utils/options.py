@@ -59,7 +59,5 @@ def check_least(value, name, least, *, whole=False):
 
 def check_positive(value, name, *, optional=False):
     """Refuse what is no number above 0 (a `ValueError`); with ``optional``, None passes."""
-    if optional and value is None:
-        return
-    if not (isinstance(value, numbers.Real) and value > 0):
-        raise argument_error(name, "positive or None" if optional else "positive", value)
+    good = (optional and value is None) or (isinstance(value, numbers.Real) and value > 0)
+    check_that(good, name, "positive or None" if optional else "positive", value)

@@ -12,12 +12,12 @@ import sys
 import tempfile
 import threading
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 
 import threadpoolctl
 
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.progress import progress
 
 #: Functions whose pickle is longer (bytes) go to other processes once, not with every piece.
@@ -89,13 +89,10 @@ def process_pool(n_processes):
     """
     level = logging.getLogger().getEffectiveLevel()
     before = set(multiprocessing.active_children())
-    executor = ProcessPoolExecutor(
-        n_processes,
-        # forks of a process with threads can hang
-        mp_context=multiprocessing.get_context("spawn"),
-        initializer=_end_with_parent,
-        initargs=(level,),
-    )
+    # forks of a process with threads can hang
+    context = multiprocessing.get_context("spawn")
+    options = {"initializer": _end_with_parent, "initargs": (level,)}
+    executor = ProcessPoolExecutor(n_processes, mp_context=context, **options)
     try:
         yield executor
     except BaseException:
@@ -159,8 +156,7 @@ def parallel_map(function, items, *, executor=None, progress_bar=False, desc=Non
     items = list(items)
     if executor is None:
         return [function(item) for item in progress(items, show=progress_bar, desc=desc)]
-    if not hasattr(executor, "submit"):
-        raise argument_error("executor", "a concurrent.futures.Executor", f"{executor!r}")
+    check_that(hasattr(executor, "submit"), "executor", "a concurrent.futures.Executor", executor)
     with _sent_once(function, executor) as call:
         futures = [executor.submit(*call, item) for item in items]
         try:
@@ -195,19 +191,14 @@ def _sent_once(function, executor):
             with os.fdopen(handle, "wb") as stream:
                 stream.write(data)
             del data
-            yield (_FromFile(name),)
+            yield (_call_from_file, name)
         finally:
             Path(name).unlink(missing_ok=True)
 
 
-@dataclass(frozen=True)
-class _FromFile:
-    """A function that every process reads from a file when it needs it first."""
-
-    path: str
-
-    def __call__(self, item):
-        return _unpickled(self.path)(item)
+def _call_from_file(path, item):
+    """Call a function that every process reads from a file when it needs it first."""
+    return _unpickled(path)(item)
 
 
 @functools.lru_cache(maxsize=1)

@@ -6,8 +6,9 @@ import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
 
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.exceptions import argument_error, units_error
 from miricigale.utils.missing import plain_floats, without_codes
+from miricigale.utils.options import check_that
 
 _WANTED = "one SkyCoord, text such as '150.1 +2.2' or '10h00m24s +02d12m00s', or (ra, dec) in deg"
 #: Columns of right ascension and declination, in lower case and without ``_j2000``.
@@ -54,8 +55,7 @@ def as_position(value, argument):
         position = position.reshape(()).icrs
     except (TypeError, ValueError) as err:
         raise argument_error(argument, _WANTED, f"{value!r} ({err})") from None
-    if not np.isfinite([position.ra.deg, position.dec.deg]).all():
-        raise argument_error(argument, "finite", repr(value))
+    check_that(np.isfinite([position.ra.deg, position.dec.deg]).all(), argument, "finite", value)
     return SkyCoord(position.ra, position.dec)
 
 
@@ -114,8 +114,7 @@ def _degrees(table, name, argument):
     column = table[name]
     unit = getattr(column, "unit", None) or u.deg
     if not u.Unit(unit).is_equivalent(u.deg):
-        msg = f"{argument!r} column {name!r} must be an angle, got {unit}"
-        raise u.UnitsError(msg)
+        raise units_error(argument, "an angle", unit, column=name)
     values = plain_floats(column, name, argument)
     values[without_codes(values)[0] | np.isinf(values)] = np.nan
     return values * u.Unit(unit).to(u.deg)

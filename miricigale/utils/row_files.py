@@ -175,8 +175,7 @@ def write_rows(path, tables, n_rows, *, id_width=0, overwrite=False):
                 for part in (fits.PrimaryHDU().header, header):
                     stream.write(part.tostring().encode("ascii"))
             elif columns != layout:
-                msg = "the parts have different columns"
-                raise DataError(msg)
+                raise DataError("the parts have different columns")
             n_bytes += stream.write(rows)
         stream.write(bytes(-n_bytes % 2880))
 

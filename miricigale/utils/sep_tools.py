@@ -47,8 +47,8 @@ def _image(data, mask):
         data = data.astype(np.float64)
     if mask is not None:
         mask = native(np.asarray(mask) != 0)
-        if mask.shape != data.shape:
-            raise argument_error("mask", f"of the image's shape {data.shape}", str(mask.shape))
+        got = f"{mask.shape} of {data.shape}"
+        check_that(mask.shape == data.shape, "mask", "of the image's shape", got)
     bad = ~np.isfinite(data)
     if bad.any():
         mask = bad if mask is None else mask | bad

@@ -112,7 +112,7 @@ def write_table(table, path, *, overwrite=False):
     table : `~astropy.table.Table`
         The table.
     path : path-like
-        FITS, ECSV, CSV, VOTable (``.xml``), HDF5 (with h5py) or parquet (with pyarrow).
+        FITS (or ``.fits.gz``), ECSV, CSV, VOTable (``.xml``), HDF5 (with h5py) or parquet (with pyarrow).
     overwrite : bool, optional
         Whether a file that is there is replaced.
 
@@ -124,7 +124,7 @@ def write_table(table, path, *, overwrite=False):
         If the file is there and ``overwrite`` is not set.
     """
     path = Path(path)
-    form = TABLE_FORMATS.get(path.suffix.lower())
+    form = TABLE_FORMATS.get(Path(path.name.lower().removesuffix(".gz")).suffix)
     wanted = f"a file ending in one of {', '.join(TABLE_FORMATS)}"
     check_that(form is not None, "path", wanted, str(path))
     with writing(path):

@@ -10,7 +10,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import Table
 
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.exceptions import argument_error, units_error
 from miricigale.utils.options import check_least, check_that
 from miricigale.utils.units import ANGLE, to_array
 
@@ -129,6 +129,27 @@ def described_table(columns, meta=None):
     return table
 
 
+def described_columns(values, texts, meta=None):
+    """
+    Make a table of columns whose names and descriptions are declared.
+
+    Parameters
+    ----------
+    values : iterable
+        Values of the columns, in the order of ``texts``.
+    texts : dict of str to str
+        Description of each column by name; empty for none.
+    meta : dict, optional
+        Provenance.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+    """
+    pairs = zip(texts.items(), values, strict=True)
+    return described_table({name: (one, text or None) for (name, text), one in pairs}, meta)
+
+
 def described_rows(rows, texts):
     """
     Make a table from rows, whose columns say what they are.
@@ -146,8 +167,7 @@ def described_rows(rows, texts):
     """
     rows = list(rows)
     columns = zip(*rows, strict=True) if rows else [[]] * len(texts)
-    pairs = zip(texts.items(), columns, strict=True)
-    return described_table({name: (np.array(column), text) for (name, text), column in pairs})
+    return described_columns(map(np.array, columns), texts)
 
 
 def error_column(name):
@@ -188,19 +208,15 @@ def require_columns(table, names, argument, *, units=None):
         have = None if have is None else u.Unit(have)
         # magnitudes are no units of flux
         if not (isinstance(have, u.UnitBase) and have.is_equivalent(unit)):
-            msg = f"'{argument}' column {name!r} must be convertible to {unit}, got {have}"
-            raise u.UnitsError(msg)
+            raise units_error(argument, f"convertible to {unit}", have, column=name)
 
 
 def unique_ids(ids, argument):
     """Return ids as an array after checking that none is there twice."""
     ids = np.asarray(ids)
     values, counts = np.unique(ids, return_counts=True)
-    if np.any(counts > 1):
-        twice = values[counts > 1][:5].tolist()
-        raise argument_error(
-            argument, "a table whose ids are unique", f"duplicates such as {twice}"
-        )
+    twice = values[counts > 1][:5].tolist()
+    check_that(not twice, argument, "a table whose ids are unique", f"duplicates such as {twice}")
     return ids
 
 
@@ -231,10 +247,8 @@ def read_ids(table, argument="photometry"):
             wanted = "a table with ids that are text, or bytes of text in UTF-8"
             raise argument_error(argument, wanted, f"{err.object!r}") from None
     if ids.dtype.kind == "O":
-        kinds = {type(value) for value in ids.tolist()}
-        if len(kinds) > 1:
-            names = sorted(kind.__name__ for kind in kinds)
-            raise argument_error(argument, "a table with ids of one kind", f"{names}")
+        kinds = sorted({type(value).__name__ for value in ids.tolist()})
+        check_that(len(kinds) < 2, argument, "a table with ids of one kind", kinds)
         return np.array(ids.tolist()) if ids.size else ids.astype(str)
     # FITS takes numbers of one byte for true and false
     dtype = np.dtype(np.int16) if ids.dtype == np.int8 else ids.dtype

@@ -1,11 +1,12 @@
 """The units of arrays inside the package, and conversions to them at the public methods."""
 
 import dataclasses
+import functools
 
 import astropy.units as u
 import numpy as np
 
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.exceptions import argument_error, units_error
 from miricigale.utils.options import check_that
 
 #: Units declared once; every array inside the package is in one of these.
@@ -57,21 +58,18 @@ def to_array(value, unit, name, *, ndim=None, finite=False, equivalencies=None):
         quantity = u.Quantity(value)
     except u.UnitTypeError:
         # magnitudes and other logarithms
-        msg = f"'{name}' must be convertible to {unit}, got {value.unit}"
-        raise u.UnitsError(msg) from None
+        raise units_error(name, f"convertible to {unit}", value.unit) from None
     except (TypeError, ValueError):
         wanted = "numbers" if unit == u.dimensionless_unscaled else f"convertible to {unit}"
         got = repr(value) if isinstance(value, (str, list)) else type(value).__name__
         raise argument_error(name, wanted, got) from None
     bare = not hasattr(value, "unit") and quantity.unit == u.dimensionless_unscaled
     if bare and unit != u.dimensionless_unscaled:
-        msg = f"'{name}' must be a quantity convertible to {unit}, got a bare number"
-        raise u.UnitsError(msg)
+        raise units_error(name, f"a quantity convertible to {unit}", "a bare number")
     try:
         array = np.asarray(quantity.to_value(unit, equivalencies or []), dtype=float)
     except u.UnitConversionError:
-        msg = f"'{name}' must be convertible to {unit}, got {getattr(value, 'unit', None)}"
-        raise u.UnitsError(msg) from None
+        raise units_error(name, f"convertible to {unit}", getattr(value, "unit", None)) from None
     if ndim is not None and array.ndim != ndim:
         raise argument_error(name, f"an array of {ndim} dimension(s)", f"shape {array.shape}")
     if finite and not np.all(np.isfinite(array)):
@@ -85,11 +83,7 @@ class Frozen:
 
     def __reduce__(self):
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return _remake, (type(self), values)
-
-
-def _remake(cls, values):
-    return cls(**values)
+        return functools.partial(type(self), **values), ()
 
 
 def positive(value, unit, name):
@@ -107,8 +101,8 @@ def is_number(value, kind=np.number):
 
 def check_count(value, name, least=1):
     """Return an integer after checking that it is one, not below ``least`` (a `ValueError`)."""
-    if not (is_number(value, np.integer) and value >= least):
-        raise argument_error(name, f"an integer >= {least}", repr(value))
+    good = is_number(value, np.integer) and value >= least
+    check_that(good, name, f"an integer >= {least}", repr(value))
     return int(value)
 
 

@@ -1,7 +1,9 @@
 """Typed run configuration: frozen dataclasses from TOML, strict about every key."""
 
 import dataclasses
+from dataclasses import asdict
 from importlib import resources
+from operator import attrgetter
 from pathlib import Path
 from typing import ClassVar
 
@@ -126,12 +128,8 @@ class StudyConfig(Configuration):
 
     def values(self, *names):
         """Plain values of sections (``"scene"``) and keys (``"run.name"``), for hashing."""
-        found = {}
-        for name in names:
-            section, _, key = name.partition(".")
-            values = getattr(self, section)
-            found[name] = getattr(values, key) if key else dataclasses.asdict(values)
-        return found
+        values = {name: attrgetter(name)(self) for name in names}
+        return {name: value if "." in name else asdict(value) for name, value in values.items()}
 
 
 def preset_names():

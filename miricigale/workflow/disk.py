@@ -53,6 +53,7 @@ def disk_use(config):
     else:
         # slopes of one dither of each band of the reference
         rates = 3.6 * sum(pixels[name] for name, e in exposures.items() if e.dither == 0)
+    pointed = min(2, n_bands) / len(study_pointings(config)) * config.point_sources.enabled
     by_stage = {
         "catalog": 240 * n,
         "seds": (5_100 + 14.5 * n_redshifts) * n,
@@ -60,11 +61,7 @@ def disk_use(config):
         "exposures": truths * exposed + rates,
         "mosaics": truths * n_bands * 2.05 * (native + fine),
         "highres": 3.8 * fine,
-        "points": config.point_sources.enabled
-        * min(2, n_bands)
-        * 2.05
-        * measured
-        / len(study_pointings(config)),
+        "points": pointed * 2.05 * measured,
         "kernels": n_bands * 2_950_000,
         "templates": 2.7 * fine + 9_400 * n_imaged,
         "photometry": truths * n_bands * (6 * measured + 250 * n_imaged),

@@ -342,15 +342,10 @@ def read_stamps(path):
     """Stamps by id of a file of `write_stamps`."""
     with open_parts(path, (_LAYOUT,), wanted="stamps of galaxies") as parts:
         table, light = parts.table("stamps", QTable), parts.array("light")
-        ends = np.cumsum(table["ny"] * table["nx"])
-        return {
-            key: Cutout(
-                one.reshape(row["ny"], row["nx"]),
-                pixel_scale=row["pixel_scale"],
-                angle=row["angle"],
-                center=(float(row["x"]), float(row["y"])),
-            )
-            for key, row, one in zip(
-                table["id"].tolist(), table, np.split(light, ends[:-1]), strict=True
-            )
-        }
+        pieces = np.split(light, np.cumsum(table["ny"] * table["nx"])[:-1])
+    stamps = {}
+    for key, row, one in zip(table["id"].tolist(), table, pieces, strict=True):
+        options = {name: row[name] for name in ("pixel_scale", "angle")}
+        center = float(row["x"]), float(row["y"])
+        stamps[key] = Cutout(one.reshape(row["ny"], row["nx"]), center=center, **options)
+    return stamps

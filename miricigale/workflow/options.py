@@ -90,13 +90,12 @@ def read_text(path):
     """Text of a configuration file, or a `ConfigError` that names it."""
     path = Path(path).expanduser()
     if not path.is_file():
-        msg = f"no configuration file {path}"
-        raise ConfigError(msg)
+        raise config_error("no configuration file", path)
     try:
         return path.read_text(encoding="utf-8")
     except UnicodeDecodeError as err:
-        msg = f"{path} is not a text file in UTF-8: {err.reason} at byte {err.start}"
-        raise ConfigError(msg) from None
+        what = f"is not a text file in UTF-8: {err.reason} at byte {err.start}"
+        raise config_error(path, what) from None
 
 
 def read_setting(text):
@@ -108,8 +107,7 @@ def read_setting(text):
     name, found, value = text.partition("=")
     section, dot, key = name.strip().partition(".")
     if not (found and dot and section and key):
-        msg = f"a setting must be section.key=value, got {text!r}"
-        raise ConfigError(msg)
+        raise config_error("a setting", f"must be section.key=value, got {text!r}")
     try:
         return section, key, tomllib.loads(f"value = {value}")["value"]
     except (tomllib.TOMLDecodeError, RecursionError):
@@ -160,8 +158,7 @@ class Configuration:
         base = base or cls()
         known = [field.name for field in dataclasses.fields(base)]
         if unknown := sorted(set(values).difference(known)):
-            msg = f"unknown section {unknown}; known: {sorted(known)}"
-            raise ConfigError(msg)
+            raise config_error("unknown section", f"{unknown}; known: {sorted(known)}")
         sections = {
             name: _replace_section(name, getattr(base, name), entries)
             for name, entries in values.items()
@@ -176,9 +173,8 @@ class Configuration:
             try:
                 config = cls.from_dict(tomllib.loads(text), base=config)
             except (tomllib.TOMLDecodeError, RecursionError, ConfigError) as err:
-                what = ":" if isinstance(err, ConfigError) else " is not valid TOML:"
-                msg = f"{label}{what} {err}"
-                raise ConfigError(msg) from None
+                label += ":" if isinstance(err, ConfigError) else " is not valid TOML:"
+                raise config_error(label, err) from None
         return cls.from_dict(overrides, base=config) if overrides else config
 
     def to_toml(self):

@@ -236,10 +236,8 @@ def perturbed_parameters(effects, table, models, prior, *, seed):
             # each stream gives the first parameter, then the second
             for name, ends in ranges.items():
                 changed[name] = np.array([np.exp(rng.uniform(*np.log(ends))) for rng in streams])
-    known, own = (
-        galaxy_light(model, parameters, [prior])[prior].value
-        for model, parameters in zip(models, (table, changed), strict=True)
-    )
+    pairs = zip(models, (table, changed), strict=True)
+    known, own = (galaxy_light(*pair, [prior])[prior].value for pair in pairs)
     usable = np.isfinite(known) & np.isfinite(own) & (own > 0)
     changed["mass"] = changed["mass"] * np.where(usable, known / np.where(usable, own, 1.0), 1.0)
     return changed
@@ -273,8 +271,5 @@ def point_columns(model, parameters, bands):
     """
     alone, both = galaxy_light(model, parameters, bands), model.fluxes(parameters, bands)
     with np.errstate(invalid="ignore", divide="ignore"):
-        shares = {band: 1.0 - alone[band].value / both[band].value for band in bands}
-    return {
-        point_column(band): np.clip(np.nan_to_num(share), 0.0, 1.0)
-        for band, share in shares.items()
-    }
+        shares = {point_column(b): 1.0 - alone[b].value / both[b].value for b in bands}
+    return {name: np.clip(np.nan_to_num(share), 0.0, 1.0) for name, share in shares.items()}

@@ -4,6 +4,8 @@ Sections of a run's configuration: every key with its default, its limits and wh
 What a docstring says of a key is its comment in files of configurations and its entry in the reference.
 """
 
+from pathlib import Path
+
 from miricigale.filters import SURVEYS
 from miricigale.instrument import CEERS_FILTERS, imager_filters
 from miricigale.workflow.options import Section, option, require
@@ -26,7 +28,7 @@ class RunBasics(Section):
 
     name: str = "study"
     seed: int = option(20210211, low=0)
-    threads: int = option(0, low=0)
+    threads: int = option(0, low=0, high=10000)
 
 
 class RunSection(RunBasics):
@@ -36,12 +38,12 @@ class RunSection(RunBasics):
     Parameters
     ----------
     memory
-        Memory (GB) of steps side by side; 0 for half of all.
+        Memory (GB) of steps side by side on a machine; 0 for half of all.
     keep_level1b
         Whether the level-1b (uncal) files are kept.
     """
 
-    memory: float = option(0.0, low=0.0)
+    memory: float = option(0.0, low=0.0, high=1e5)
     keep_level1b: bool = False
 
 
@@ -103,7 +105,8 @@ class PointingSection(Section):
     overlap
         Share of its side that a tile has in common with the next.
     centers
-        Centers of several pointings in degrees, "RA Dec", instead of ra, dec and tiles.
+        Centers of several pointings in degrees, "RA Dec", instead of ra, dec and tiles; or a table of them with
+        the columns ra and dec and, where these differ, roll, bands and time (s, all dithers).
     """
 
     ra: float = option(53.13440, low=0, high=360)
@@ -111,16 +114,22 @@ class PointingSection(Section):
     roll: float = option(0.0, low=-360, high=360)
     tiles: tuple[int, ...] = option((1, 1), low=1, high=30)
     overlap: float = option(0.1, low=0.0, high=0.9)
-    centers: tuple[str, ...] = ()
+    centers: tuple[str, ...] = option((), single=True)
 
     def __post_init__(self):
         pair = len(self.tiles) == 2
         require(pair, "pointing", "tiles", "must be two numbers", list(self.tiles))
         alone = not self.centers or self.tiles == (1, 1)
         require(alone, "pointing", "tiles", "must be [1, 1] with centers", list(self.tiles))
-        for text in self.centers:
-            wanted = "must have the form 'RA Dec' in degrees"
+        for text in () if self.table else self.centers:
+            wanted = "must have the form 'RA Dec' in degrees, or be a file"
             require(_is_position(text), "pointing", "centers", wanted, repr(text))
+
+    @property
+    def table(self):
+        """Path of the table of pointings, None without one."""
+        paths = [Path(text).expanduser() for text in self.centers]
+        return paths[0] if len(paths) == 1 and paths[0].is_file() else None
 
 
 def _is_position(text):
@@ -203,9 +212,9 @@ class ExposureSection(Section):
     filters: tuple[str, ...] = option(CEERS_FILTERS, choices=imager_filters(), unique=True)
     plan: str = option("ceers", choices=("ceers", "quick"))
     kind: str = option("ramps", choices=("ramps", "rates"))
-    n_groups: tuple[int, ...] = option((), low=1)
-    n_integrations: tuple[int, ...] = option((), low=1)
-    n_dithers: tuple[int, ...] = option((), low=1)
+    n_groups: tuple[int, ...] = option((), low=1, high=10000)
+    n_integrations: tuple[int, ...] = option((), low=1, high=10000)
+    n_dithers: tuple[int, ...] = option((), low=1, high=1000)
     dithers: tuple[str, ...] = option((), single=True)
     dither_observation: int = option(0, low=0)
     dither_exposures: tuple[int, ...] = option((), low=1)

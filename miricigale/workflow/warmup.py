@@ -61,9 +61,8 @@ def _images():
     # options that are off by default call further kernels
     overrides = {"detector": {"residual": 0.01}}
     config = load_config("goodss", quick=True, overrides=overrides)
-    exposure = Exposure(
-        "miri.f770w", n_groups=12, subarray="SUB64", pointing=center, roll=0 * u.deg
-    )
+    where = {"subarray": "SUB64", "pointing": center, "roll": 0 * u.deg}
+    exposure = Exposure("miri.f770w", n_groups=12, **where)
     catalog = point_catalog(exposure, 3 * u.uJy, config.highres.filter, spacing=100, seed=1)[:2]
     # a galaxy and a star
     catalog["sky"] = center.directional_offset_by(45 * u.deg, [0, 1.4] * u.arcsec)

@@ -102,7 +102,7 @@ def test_the_decay_is_told_and_gone_with_the_first_groups(make_exposure, make_sk
     good = np.isfinite(clean.rate)
     assert np.nanmean(fit.rate) == pytest.approx(np.mean(clean.rate[good]), rel=1e-4)
     assert np.nanmean(left.rate) > 1.001 * np.mean(clean.rate[good])
-    with pytest.raises(ValueError, match="without 1/f noise and decay after resets"):
+    with pytest.raises(ValueError, match="brighter-fatter effect and decay after resets"):
         detector.replaced(ResetDecay()).collect(sky, exposure, seed=1)
 
 

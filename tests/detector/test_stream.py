@@ -9,6 +9,7 @@ from astropy.time import Time
 from numpy.testing import assert_array_equal
 
 from miricigale.detector import (
+    BrighterFatter,
     CosmicRays,
     Detector,
     FirstFrame,
@@ -22,7 +23,8 @@ from miricigale.detector import (
     Residual,
 )
 
-RESETS = Persistence((0.01,), (np.float32(20),)), ResetAnomaly(), ResetDecay()
+LATENT = Persistence((0.01,), (np.float32(20),), deficit=0.02)
+RESETS = LATENT, BrighterFatter(0.2), ResetAnomaly(), ResetDecay()
 FRAMES = FirstFrame(), LastFrame()
 EVERYTHING = CosmicRays(shower_fraction=0.2), Residual(0.01), ReadNoise(pink=2.0), *RESETS, *FRAMES
 

@@ -34,7 +34,7 @@ def test_counts_conserve_sources():
     counts, error = number_counts(flux, 2 * u.deg**2, [23, 24, 24.5, 26])
     assert counts.to_value(u.deg**-2) * [1, 0.5, 1.5] * 2 == pytest.approx([2, 0, 1])
     assert (error[0] / counts[0]).value == pytest.approx(1 / np.sqrt(2))
-    refuses("'edges' must be ascending magnitudes", number_counts, flux, 1 * u.deg**2, [24, 23])
+    refuses("'edges' must be ascending", number_counts, flux, 1 * u.deg**2, [24, 23])
 
 
 def test_integrated_light_in_closed_form():
@@ -50,7 +50,7 @@ def test_bare_numbers_are_refused_by_name():
     flux, area = [1.0, 2.0] * u.uJy, 1 * u.deg**2
     for function, arguments, message in (
         (number_counts, (flux, 1, [23, 24]), "'area' must be a quantity convertible to deg2"),
-        (number_counts, (flux, 0 * u.sr, [23, 24]), "'area' must be finite and positive, got 0"),
+        (number_counts, (flux, 0 * u.sr, [23, 24]), "'area' must be positive, got 0"),
         (integrated_light, (flux, None, 15 * u.um), "'area' must be convertible to deg2"),
         (number_counts, ([23.0] * u.ABmag, area, [23, 24]), r"'flux' .* uJy, got mag\(AB\)"),
         (integrated_light, (flux, area, 15), "'wavelength' must be a quantity convertible to Hz"),

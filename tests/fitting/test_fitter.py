@@ -177,7 +177,7 @@ def test_densities_that_cannot_be_used_are_flagged_or_refused():
     ):
         refuses(match, fitter.fit, table, redshift_prior=prior)
     both = {"redshift": 1.0, "redshift_prior": (nodes, density)}
-    refuses("must not be given both", fitter.fit, table, **both)
+    refuses("left out where .redshift. is given", fitter.fit, table, **both)
 
 
 def test_choices_of_cigale():

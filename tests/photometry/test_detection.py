@@ -3,11 +3,14 @@ import numpy as np
 import pytest
 from astropy.nddata import CCDData
 from numpy.testing import assert_allclose
+from scipy.stats import chi, kstest
 
 from helpers.errors import refuses
+from miricigale.instrument import north_up_wcs
 from miricigale.photometry import (
     DETECTION_PRESETS,
     DilationRule,
+    chi_image,
     detect_sources,
     detection_purity,
     dilate_segments,
@@ -184,3 +187,27 @@ def test_settings_stated_on_other_pixels_find_the_same(tools):
         assert len(found) == 16
         areas.append(np.median(found["n_pixels"][index]) * scale**2)
     assert_allclose(areas[1], areas[0], rtol=0.05)
+
+
+def test_chi_images_of_empty_sky_follow_the_chi_distribution(tools):
+    """Of three bands with skies and noise of their own, and two where one has no data; a source of one band."""
+    rng, shape = np.random.default_rng(5), (300, 300)
+    wcs, images = north_up_wcs(tools.CENTER, 0.1 * u.arcsec, shape), []
+    for sky, noise in ((0.0, 0.1), (3.0, 0.4), (-1.0, 2.0)):
+        images.append(tools.as_ccd(sky + noise * rng.normal(size=shape), wcs, 1.7 * noise))
+    images[2].mask = np.arange(300) * np.ones(shape) < 100
+    found = chi_image(images)
+    for columns, k in ((np.s_[100:], 3), (np.s_[:100], 2)):
+        # its own scale: the noise of the first band
+        level = found.data[:, columns] / 0.17
+        spread = found.uncertainty.array[:, columns] / 0.17
+        assert_allclose(spread, chi(k).std(), rtol=1e-6)
+        values = level + chi(k).mean()
+        assert kstest(values[::3, ::3].ravel(), chi(k).cdf).pvalue > 1e-3
+        assert np.mean(values) == pytest.approx(chi(k).mean(), abs=0.02)
+    blue = tools.render(tools.places([2.0]), [60.0], 0.15, wcs, shape)
+    images[0].data += blue
+    _, sources = detect_sources(chi_image(images), preset="default", threshold=3.0)
+    assert sources["sky"].separation(tools.places([2.0])[0]).min() < 0.1 * u.arcsec
+    moved = tools.as_ccd(blue, north_up_wcs(tools.places([1.0])[0], 0.1 * u.arcsec, shape), 1)
+    refuses("'images' must be at least one, all on the same pixels", chi_image, [images[0], moved])

@@ -272,6 +272,9 @@ def test_background_and_shift_are_found(tools, field):
         plain = tools.measured(image, field.catalog, background_order=0)
     assert_allclose(plain.meta["offset"], [-0.06, -0.03], atol=0.006)
     assert np.all(np.array(plain.meta["offset_err"]) < 0.01)
+    # that of a fitted shift stands there too
+    assert_allclose(result.meta["offset"], result.shift.value, atol=1e-5)
+    assert_allclose(result.meta["offset_err"], result.shift_err.value, atol=1e-5)
     settings["max_shift"] = 0.02 * u.arcsec
     with pytest.warns(MiricigaleWarning, match="beyond 'max_shift'"):
         assert tools.measured(image, field.catalog, **settings).shift is None
@@ -468,3 +471,23 @@ def test_a_kernel_alone_measures_segments(tools, field):
     for kind in ("psf", "sersic"):
         message = "'kernel' must be a MatchingKernel with its PSFs for"
         refuses(message, ForcedPhotometer, bare, template=kind)
+
+
+def test_upper_limits_hold_the_stated_part_of_fluxes_that_are_not_negative(tools, field):
+    """By counting draws of true fluxes, uniform above 0, that give the measured ones."""
+    image = tools.picture(
+        field.sky, np.zeros(60), (260, 260), sigma=0.05, rng=np.random.default_rng(2)
+    )
+    result = tools.measured(image, field.catalog)
+    rows = np.argsort(result.snr)[[0, 20, 40, 59]]
+    true = np.random.default_rng(3).uniform(0, 8, 2_000_000)
+    for confidence in (0.68, 0.95):
+        limit = (result.upper_limit(confidence) / result.flux_err).value
+        for row in rows:
+            weight = np.exp(-0.5 * (result.snr[row] - true) ** 2)
+            assert np.sum(weight[true < limit[row]]) / weight.sum() == pytest.approx(
+                confidence, abs=4e-3
+            )
+    table = result.to_table("miri.f770w", confidence=0.95)
+    assert_array_equal(table["miri.f770w_upper"], result.upper_limit(0.95))
+    refuses("'confidence' must be between 0 and 1, got 1", result.upper_limit, 1)

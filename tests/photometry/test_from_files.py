@@ -1,5 +1,6 @@
 """The command `miricigale photometry` on files of a small field whose fluxes are known."""
 
+import contextlib
 import html
 import types
 from pathlib import Path
@@ -84,7 +85,7 @@ def arguments(files, output, **changes):
 @pytest.mark.parametrize("form", ["ecsv", "fits"])
 def test_files_become_a_catalog_that_can_be_fitted_and_a_page(files, tmp_path, form, capsys):
     output = tmp_path / "new" / f"fluxes.{form}"
-    assert main(arguments(files, output)) == 0
+    assert main([*arguments(files, output), "--psf-stars"]) == 0
     assert f"25 sources in {output}" in capsys.readouterr().out
     table = QTable.read(output)
     assert list(table["id"]) == list(files.ids)
@@ -105,9 +106,9 @@ def test_files_become_a_catalog_that_can_be_fitted_and_a_page(files, tmp_path, f
     told = html.unescape(page)
     for value, (name, meaning) in ForcedFlags.meanings().items():
         assert f"<td>{value} {name}</td><td>{meaning}</td>" in told
-    # the whole, the brightest source without a flag and the poorest fit, magnitudes, pulls
-    assert page.count("<img") == 5
-    assert "the poorest fit: signal-to-noise" in page
+    # the whole, the brightest source without a flag, magnitudes, pulls, stars on both images
+    assert page.count("<img") == 6
+    assert "PSFs from the images themselves" in page
 
 
 def test_catalog_kernel_and_the_plain_form(files, tmp_path):
@@ -168,6 +169,88 @@ def test_sources_that_the_prior_lacks_are_the_last_rows(files, tmp_path):
     assert separation.max() < 0.05 * u.arcsec
     found = table["irac.ch4"][23:][index].to_value(u.uJy)
     assert_allclose(found, files.flux[lost], rtol=0.02)
+
+
+def test_several_bands_are_measured_in_one_call(files, tmp_path, capsys):
+    """The second with a kernel by place, the prior with a sky; what one shows beyond it is measured in both."""
+    from miricigale.psf import KernelField, MatchingKernel
+
+    shape, red = (260, 262), "irac.ch3"
+    wcs, rng = north_up_wcs(CENTER, COARSE * u.arcsec, shape), np.random.default_rng(5)
+    labels, header = fits.getdata(files.paths["segmentation"], header=True)
+    lost = np.argsort(-files.flux)[[2, 5]]
+    labels[np.isin(labels, files.ids[lost])] = 0
+    fits.writeto(tmp_path / "seg.fits", labels, header)
+    psfs = [gaussian_image(61, width / FINE) for width in (SHARP, WIDE)]
+    kernel = MatchingKernel.from_psfs(*psfs, pixel_scale=FINE * u.arcsec)
+    places = SkyCoord([34.298, 34.302], [-5.1, -5.1], unit="deg")
+    KernelField([kernel, kernel], places).write(tmp_path / "kernels.fits")
+    data = points(files.sky, 2 * files.flux, WIDE, wcs, shape) + rng.normal(0, 0.005, shape)
+    # one of the two is as blue as the sky
+    data -= points(files.sky[lost[1:]], 2 * files.flux[lost[1:]], WIDE, wcs, shape)
+    extra = {"image": files.save("red.fits", data * 100, wcs, BUNIT="10*nanoJansky"), "filter": red,
+             "weight": "-", "psf": "-", "kernel": tmp_path / "kernels.fits"}  # fmt: skip
+    more = [text for key, value in extra.items() for text in (f"--{key}", str(value))]
+    prior, own = fits.getdata(files.paths["highres"], header=True)
+    fits.writeto(tmp_path / "prior.fits", prior + 8.0, own)
+    folder, rest = tmp_path / "both", {"segmentation": tmp_path / "seg.fits", "kernel": "-"}
+    rest |= {"highres": tmp_path / "prior.fits", "highres-background-box": 50}
+    command = arguments(files, folder / "out.ecsv", **rest)
+    with pytest.warns(MiricigaleWarning, match="has no map of the noise"):
+        assert main([*command, *more, "--model", str(folder / "model.fits")]) == 0
+    both = QTable.read(folder / "out.ecsv")
+    assert len(both) == 25
+    assert (folder / "model_ch3.fits").is_file()
+    assert (folder / "model_ch4.fits").is_file()
+    flagged = np.asarray(both[f"{BAND}_flags"]) & int(ForcedFlags.NOT_IN_CATALOG) > 0
+    assert flagged.tolist() == [False] * 23 + [True] * 2
+    index, separation, _ = files.sky.match_to_catalog_sky(both["sky"])
+    assert separation.max() < 0.05 * u.arcsec
+    wanted = {BAND: files.flux, red: 2 * files.flux}
+    wanted[red][lost[1]] = 0.0
+    for name, flux in wanted.items():
+        found = both[name][index].to_value(u.uJy)
+        error = both[f"{name}_err"][index].to_value(u.uJy)
+        assert_allclose(found, flux, atol=4 * error.max(), rtol=0.03)
+        assert both.meta["bands"][name]["second_pass"]["fitted"]
+    assert_allclose(
+        both[f"{BAND}_upper"][index] - both[BAND][index],
+        1.645 * both[f"{BAND}_err"][index],
+        rtol=0.02,
+    )
+    page = (folder / "out.html").read_text()
+    for text in (
+        f"Forced photometry: {BAND}, {red}",
+        "out-sources.html",
+        f"The whole image, {red}.",
+    ):
+        assert text in page
+    facts = (folder / "out-sources.html").read_text()
+    assert f'"mag_{red}"' in facts
+    assert len(list((folder / "out-sources").iterdir())) == 2
+    # an option given once for two images, and one filter twice
+    assert main([*command, *more[:2]]) == 2
+    assert "'--weight' must be given for each of 2 images" in capsys.readouterr().err
+    assert main([*command, *more[:2], "--filter", BAND, *more[4:], "--overwrite"]) == 2
+    assert "'image' must be of different filters" in capsys.readouterr().err
+
+
+def test_sources_are_detected_on_several_images(files, tmp_path):
+    """A source that the prior does not show is found on another image of its pixels."""
+    data, header = fits.getdata(files.paths["highres"], header=True)
+    shape, faint = data.shape, int(np.argmax(files.flux))
+    data = data - 1e3 * points(files.sky[[faint]], [3 * files.flux[faint]], SHARP, files.wcs, shape)
+    fits.writeto(tmp_path / "prior.fits", data, header)
+    found = []
+    for more in ([], ["--detection", files.paths["highres"]]):
+        output = tmp_path / f"{len(more)}.ecsv"
+        command = arguments(files, output, highres=tmp_path / "prior.fits", segmentation=None)
+        with pytest.warns(MiricigaleWarning) if more else contextlib.nullcontext():
+            assert main([*command, "--no-second-pass", *more]) == 0
+        table = QTable.read(output)
+        found.append(table["sky"].separation(files.sky[faint]).min().arcsec)
+    assert found[0] > 0.3
+    assert found[1] < 0.1
 
 
 def test_our_own_files_are_read(files, tmp_path):
@@ -257,7 +340,15 @@ def test_a_real_field_agrees_with_another_program(data_file, tmp_path, capsys):
     start = f"{uds}/uds-test-"
     psfs = f"{uds}/psf/uds-test-f444w"
     output = tmp_path / "uds.ecsv"
-    command = ["photometry", "--no-progress", "--filter", "miri.f770w", "-o", str(output)]
+    command = [
+        "photometry",
+        "--no-progress",
+        "--no-second-pass",
+        "--filter",
+        "miri.f770w",
+        "-o",
+        str(output),
+    ]
     for key, path in {
         "image": f"{start}f770w_sci.fits.gz",
         "weight": f"{start}f770w_wht.fits.gz",
@@ -269,7 +360,7 @@ def test_a_real_field_agrees_with_another_program(data_file, tmp_path, capsys):
     }.items():
         command += [f"--{key}", path]
     # the weights were made for an image of another scale
-    with pytest.warns(UserWarning, match="noise on the sky is 2.. times what the weight map says"):
+    with pytest.warns(UserWarning, match="noise on the sky is 2.. times|each of its pixels 2 x 2"):
         assert main(command) == 0
     table = QTable.read(output)
     other = Table.read(uds / "photometry_ca3cf34.cat", format="ascii")

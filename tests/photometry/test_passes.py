@@ -79,6 +79,33 @@ def test_second_pass_with_nothing_to_find_changes_nothing(tools, field):
     assert twice.new_sources["flux"].unit == u.uJy
 
 
+def test_the_evidence_decides_on_a_second_pass(tools, crowd):
+    """Sources that are there are fitted; wings of a PSF too narrow, a sky and peaks of symmetric noise are not."""
+    found = tools.measured(crowd.image, crowd.sky, second_pass=None)
+    told = tools.measured(crowd.image, crowd.sky, second_pass=True)
+    assert found.meta["second_pass"]["fitted"]
+    assert found.meta["second_pass"]["false_rate"] < 0.1
+    # those next to a source fifty times as bright are left out
+    assert len(told.new_sources) - 3 <= len(found.new_sources) <= len(told.new_sources)
+    rng = np.random.default_rng(3)
+    sky, flux = tools.places(*tools.lattice(rng, 5, 4.0, 0.4)), np.full(25, 300.0)
+    wide = tools.picture(sky, flux, (260, 260), sigma=0.02, width=1.03 * tools.LO, rng=rng)
+    level = tools.picture(sky, flux, (260, 260), sigma=0.02, rng=rng)
+    level.data += 0.002
+    noisy = tools.picture(sky, 0.01 * flux, (260, 260), sigma=0.02, rng=rng)
+    # rare pixels of either sign far from Gaussian
+    y, x = rng.integers(0, 260, (2, 60))
+    noisy.data[y, x] += rng.choice([-1, 1], 60) * 1.5
+    for image in (wide, level, noisy):
+        result = tools.measured(image, sky, second_pass=None)
+        assert result.new_sources is None
+        assert not result.meta["second_pass"]["fitted"]
+    assert result.meta["second_pass"]["peaks"] > 3
+    refuses(
+        "'second_pass' must be False or True or None", tools.measured, noisy, sky, second_pass=2
+    )
+
+
 def test_ids_that_are_text_do_not_clash(tools, crowd):
     names = np.array([f"source {k}" for k in range(80)] + ["new-2"])
     catalog = QTable({"id": names, "sky": crowd.sky})

@@ -1,106 +1,142 @@
-"""PSF photometry by photutils: against closed-form images and forced photometry."""
+"""Stars of the images correct the PSFs: Gaussian light in closed form, with a kernel that is wrong."""
 
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.nddata import CCDData
 from astropy.table import QTable
 from numpy.testing import assert_allclose
 
-from helpers.errors import refuses
-from helpers.light import gaussian, gaussian_image
+from helpers.light import gaussian_image
 from helpers.scenes import tan_wcs
-from miricigale.photometry import psf_photometry
-from miricigale.psf import gaussian_psf, make_psf
+from miricigale.photometry import ForcedFlags, ForcedPhotometer, SourceTemplates
+from miricigale.psf import MatchingKernel
 
-SCALE = 0.11
+SIGMA = 0.004
 
 
-@pytest.fixture(scope="module")
-def psf(tools):
-    # integrated over no pixel, as the images are made
-    data = 16 * gaussian_image(161, 4 * tools.LO / SCALE)
-    return make_psf(data, pixel_scale=SCALE * u.arcsec, oversampling=4, frame="sky")
+def wrong_kernel(tools, factor):
+    """The kernel to a PSF that is ``factor`` times as wide as that of the images."""
+    psfs = (gaussian_image(67, width / tools.FINE) for width in (tools.HI, factor * tools.LO))
+    return MatchingKernel.from_psfs(*psfs, pixel_scale=tools.FINE * u.arcsec)
 
 
 @pytest.fixture(scope="module")
 def stars(tools):
-    """Isolated stars with white noise, one masked, one off the image."""
+    """Isolated stars on an image with white noise."""
     rng = np.random.default_rng(8)
-    dx, dy = tools.lattice(rng, 9, 3.25, 0.05)
-    dx[-1] = 60.0
-    sky, flux = tools.places(dx, dy), 10 ** rng.uniform(1, 2.5, 81)
-    sigma = 0.02 / (SCALE**2 * tools.SR * 1e12)
+    dx, dy = tools.lattice(rng, 5, 5.5, 0.05)
+    sky, flux = tools.places(dx, dy), 10 ** rng.uniform(0.8, 1.6, 25)
+    sigma = SIGMA / (0.11**2 * tools.SR * 1e12)
     image = tools.picture(sky, flux, (300, 300), sigma=sigma, rng=rng)
-    x, y = image.wcs.world_to_pixel(sky[0])
-    image.mask = np.zeros(image.shape, bool)
-    image.mask[int(y) - 12 : int(y) + 13, int(x) - 12 : int(x) + 13] = True
-    return image, QTable({"id": np.arange(81) + 500, "sky": sky}), flux
+    return image, QTable({"id": np.arange(25) + 500, "sky": sky}), flux
 
 
-def test_stars_come_back_with_true_errors_and_every_row_stays(stars, psf):
+@pytest.mark.parametrize("factor", [0.95, 1.06])
+def test_a_width_that_is_wrong_is_found_and_mended(tools, stars, factor):
     image, catalog, flux = stars
-    table = psf_photometry(image, psf, catalog)
-    assert table["id"].tolist() == catalog["id"].tolist()
-    assert table["flux"].unit == u.uJy
-    good = np.arange(1, 80)
-    assert np.isnan(table["flux"][[0, 80]]).all()
-    assert np.all(table["flags"][[0, 80]] > 0)
-    assert not table["flags"][good].any()
-    pull = ((table["flux"].value - flux) / table["flux_err"].value)[good]
-    assert 0.8 < pull.std() < 1.2
-    assert abs(pull.mean()) < 4 / np.sqrt(len(good))
-    # matched filter of a Gaussian in white noise: sigma sqrt(4 pi) width in pixels
-    expected = 0.02 * np.sqrt(4 * np.pi) * 0.25 / SCALE
-    assert_allclose(table["flux_err"].value[good], expected, rtol=0.03)
-    assert_allclose(table["chi2"][good], 1, atol=0.45)
-    # its position: sqrt(2) width over signal-to-noise along either axis
-    snr = flux[good] / table["flux_err"].value[good]
-    shift = table["shift"][good].to_value(u.arcsec) * snr / (np.sqrt(2) * 0.25)
-    assert np.median(shift) == pytest.approx(np.sqrt(2 * np.log(2)), rel=0.25)
-    assert shift.max() < 4.5
-    assert not table["neighbor"].any()
+    kernel = wrong_kernel(tools, factor)
+    before = ForcedPhotometer(kernel, template="psf").measure(image, catalog=catalog)
+    after = ForcedPhotometer(kernel, template="psf", psf_stars=True).measure(image, catalog=catalog)
+    # a Gaussian that is fitted with one a times as wide: 2 a^2 / (1 + a^2) of its flux
+    assert_allclose(np.median(before.flux.value / flux), 2 * factor**2 / (1 + factor**2), rtol=5e-3)
+    assert_allclose(np.median(after.flux.value / flux), 1, atol=0.01)
+    meta = after.meta
+    assert meta["image_psf"] != "model"
+    assert meta["image_stars"] == 20
+    assert meta["image_psf_chi2"][1] < meta["image_psf_chi2"][0] - 100
+    assert meta["image_psf_width"][0] == pytest.approx(1 / factor - 1, abs=0.02)
+    # what remains is stated, and goes into the errors of all alike
+    assert abs(np.median(after.flux.value / flux) - 1) < 3 * meta["image_psf_err"] < 0.1
+    expected = meta["image_psf_err"] * after.flux.value
+    assert_allclose(after.flux_err_psf.value, expected, rtol=0.05)
+    assert np.median(after.chi2) < 1.3 < np.median(before.chi2)
+    made = SourceTemplates.from_catalog(catalog)
+    same = ForcedPhotometer(kernel, psf_stars=True).measure(image, templates=made)
+    assert_allclose(same.flux.value, after.flux.value, rtol=1e-6)
 
 
-def test_it_agrees_with_forced_photometry(tools, stars, psf):
+def test_a_psf_that_is_right_stays_as_it_is(tools, stars):
     image, catalog, _ = stars
-    fixed = psf_photometry(image, psf, catalog, max_shift=None)
-    forced = tools.measured(image, catalog, errors=tools.WHITE)
-    good = np.isfinite(fixed["flux"].value)
-    assert good.sum() == 79
-    assert np.all(fixed["shift"][good] == 0)
-    difference = (fixed["flux"] - forced.flux).value[good] / forced.flux_err.value[good]
-    # the square that is fitted leaves out some of the light, not more
-    assert np.abs(difference).max() < 0.5
-    assert_allclose(fixed["flux_err"].value[good], forced.flux_err.value[good], rtol=0.03)
+    plain = tools.measured(image, catalog)
+    asked = tools.measured(image, catalog, psf_stars=True)
+    assert asked.meta["image_psf"] == "model"
+    assert asked.psf_stars.kernel is tools.kernel
+    assert_allclose(asked.flux.value, plain.flux.value, rtol=1e-12)
+    assert_allclose(asked.flux_err.value, plain.flux_err.value, rtol=1e-12)
 
 
-def test_the_psf_is_turned_to_the_image(tools):
-    # an elliptical star, drawn out along north, on an image whose +y points 30 degrees east of north
-    def star(east, north):
-        return gaussian(east / 0.2, north / 0.4, 1.0) / 0.08
-
-    wcs = tan_wcs((121, 121), SCALE, pa=30.0)
-    sky = wcs.pixel_to_world(60.3, 59.8)
-    light = star(*tools.offsets(sky, wcs, *np.indices((121, 121))))
-    image = tools.as_ccd(light * 50e-12 / tools.SR, wcs, 0.01)
-    g = (np.arange(201) - 100) * SCALE / 4
-    data = SCALE**2 * star(g, g[:, None])
-    catalog = QTable({"sky": sky.reshape(1)})
-    north_up = make_psf(data, pixel_scale=SCALE * u.arcsec, oversampling=4, frame="sky")
-    assert_allclose(psf_photometry(image, north_up, catalog)["flux"].value, 50, rtol=0.01)
-    detector = make_psf(data, pixel_scale=SCALE * u.arcsec, oversampling=4, frame="detector")
-    table = psf_photometry(image, detector, catalog, pa=0 * u.deg)
-    assert_allclose(table["flux"].value, 50, rtol=0.01)
-    wrong = psf_photometry(image, detector, catalog, pa=90 * u.deg)["flux"].value[0]
-    assert abs(wrong / 50 - 1) > 0.1
-    refuses("pa", psf_photometry, image, detector, catalog)
+def test_galaxies_and_crowded_stars_are_no_stars(tools):
+    rng = np.random.default_rng(3)
+    dx, dy = tools.lattice(rng, 5, 5.5, 0.05)
+    sky, flux = tools.places(dx, dy), np.full(25, 20.0)
+    # ten are wider, five have a neighbor
+    width = np.where(np.arange(25) < 10, 1.3 * tools.LO, tools.LO)
+    near = tools.places(dx[10:15] + 0.5, dy[10:15])
+    sigma = SIGMA / (0.11**2 * tools.SR * 1e12)
+    image = tools.picture(sky, flux, (300, 300), width=width, sigma=sigma, rng=rng)
+    more = tools.picture(near, flux[:5] / 2, (300, 300))
+    image = image.add(more.data * image.unit, handle_meta="first_found")
+    image.wcs = more.wcs
+    both = tools.places(np.append(dx, dx[10:15] + 0.5), np.append(dy, dy[10:15]))
+    catalog = QTable({"id": np.arange(30), "sky": both})
+    found = tools.measured(image, catalog, psf_stars=True).psf_stars.table
+    assert sorted(found["id"]) == list(range(15, 25))
 
 
-def test_neighbors_are_told_and_options_checked(tools, stars, psf):
+def test_a_psf_that_changes_over_the_field(tools):
+    """Stars from 0.94 to 1.06 of the width from one side to the other."""
+    rng = np.random.default_rng(5)
+    dx, dy = tools.lattice(rng, 6, 5.0, 0.05)
+    sky, flux = tools.places(dx, dy), np.full(36, 30.0)
+    width = tools.LO * (1 + 0.06 * dx / 15)
+    sigma = SIGMA / (0.11**2 * tools.SR * 1e12)
+    image = tools.picture(sky, flux, (320, 320), width=width, sigma=sigma, rng=rng)
+    catalog = QTable({"id": np.arange(36), "sky": sky})
+    options = {"template": "psf", "psf_stars": True}
+    result = ForcedPhotometer(tools.kernel, **options).measure(image, catalog=catalog)
+    assert len(result.psf_stars.kernel) == 4
+    one = ForcedPhotometer(tools.kernel, template="psf").measure(image, catalog=catalog)
+    slopes = [np.polyfit(dx / 15, r.flux.value / flux, 1)[0] for r in (one, result)]
+    # sources that are wider than the PSF are fitted too faint
+    assert slopes[0] == pytest.approx(-0.06, abs=0.01)
+    assert abs(slopes[1]) < 0.01
+
+
+def test_repeated_pixels_are_measured_once(tools, stars):
     image, catalog, _ = stars
-    two = QTable({"sky": tools.places([0, 0.6])})
-    assert psf_photometry(image, psf, two)["neighbor"].tolist() == [True, True]
-    narrow = gaussian_psf(0.3 * u.arcsec, pixel_scale=0.03 * u.arcsec, fov=3 * u.arcsec)
-    # a PSF on other pixels is brought to the image's
-    assert np.isfinite(psf_photometry(image, narrow, two)["flux"].value).all()
-    assert len(psf_photometry(image, psf, catalog[:0])) == 0
+    plain = tools.measured(image, catalog)
+    for unit, share in ((image.unit, 1.0), (u.Jy, 1e-9)):
+        data = np.kron(image.data, np.ones((2, 2))) * share
+        noise = type(image.uncertainty)(np.full(data.shape, image.uncertainty.array[0, 0] * share))
+        wcs = tan_wcs(data.shape, 0.055)
+        wcs = image.wcs.deepcopy()
+        wcs.wcs.crpix, wcs.wcs.cdelt = 2 * image.wcs.wcs.crpix - 0.5, image.wcs.wcs.cdelt / 2
+        # cut in the middle of a pixel
+        large = CCDData(data, unit=unit, wcs=wcs, uncertainty=noise)[1:, 3:]
+        with pytest.warns(UserWarning, match="has each of its pixels 2 x 2 times"):
+            result = tools.measured(large, catalog)
+        assert result.meta["repeated_pixels"] == 2
+        inner = np.isfinite(plain.flux.value) & (plain.coverage > 0.999) & (result.coverage > 0.999)
+        if unit == image.unit:
+            assert_allclose(result.flux[inner], plain.flux[inner], rtol=1e-4)
+            assert_allclose(result.flux_err[inner], plain.flux_err[inner], rtol=0.02)
+
+
+def test_saturated_cores_are_masked_and_said(tools):
+    sky, flux = tools.places([-4.0, 0.0, 4.0]), np.array([30.0, 30.0, 30.0])
+    prior = tools.picture(sky, flux, (260, 260), scale=tools.FINE, width=tools.HI, sigma=1e-3)
+    image = tools.picture(sky, flux, (200, 200), sigma=1e-3)
+    y, x = np.indices(prior.shape)
+    xy = np.stack(prior.wcs.world_to_pixel(sky), axis=1)
+    distance = [np.hypot(x - a, y - b) for a, b in xy]
+    segments = sum((k + 1) * (one < 8) for k, one in enumerate(distance))
+    whole = prior.data.copy()
+    # a hole, a flat top, and one that is as it should be
+    prior.mask = distance[0] < 1.6
+    prior.data[distance[1] < 2.5] = whole[distance[1] < 2.5].min()
+    catalog = QTable({"id": [1, 2, 3], "sky": sky})
+    result = ForcedPhotometer(tools.kernel).measure(image, prior, segments, catalog)
+    flagged = result.flags & int(ForcedFlags.SATURATED) > 0
+    assert flagged.tolist() == [True, True, False]
+    assert_allclose(result.flux.value, flux, rtol=0.01)

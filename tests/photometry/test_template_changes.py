@@ -54,21 +54,22 @@ def test_an_unknown_size_costs_what_the_closed_form_says(changes):
     # T of width w fits data of the width w0 with 2 w^2 / (w^2 + w0^2) of the flux, so that
     # d ln flux / d ln s = s^2 / (s^2 + psf^2) at w = w0
     for sigma in (2.0, 5.0):
-        found, noise = changes.of(PROFILE, record(sigma, [0, 0, 0.02, 0, 0, 0]), 1e-6)
-        assert len(found) == 1
+        found, noise = changes.of(PROFILE, record(sigma, [0, 0, 0.02, 0, 0, 0]), 1e-3)
+        # the second is what the mean of all sizes has more than the middle one
+        assert [one.fixed for one in found] == [False, True][: len(found)]
         assert noise == 0
         expected = 0.02 * sigma**2 / (sigma**2 + 16)
         assert abs(own(found[0], np.hypot(sigma, 4))) == pytest.approx(expected, rel=0.01)
-    # a shift costs nothing to first order, but it is a change
-    (shift,), _ = changes.of(PROFILE, record(3.0, [0.1, 0, 0, 0, 0, 0]), 1e-6)
-    assert abs(own(shift, 5.0)) < 1e-4
-    assert np.abs(shift.cutout.data).sum() > 0.01
+    # a shift costs nothing to first order
+    assert changes.of(PROFILE, record(3.0, [0.1, 0, 0, 0, 0, 0]), 3e-3)[0] == []
 
 
 def test_changes_that_do_not_matter_are_left_out(changes):
     one = record(3.0, [0.01, 0.02, 0.05, 0, 0.01, 0.02])
-    assert len(changes.of(PROFILE, one, 1e-6)[0]) == 5
-    assert len(changes.of(PROFILE, one, 0.01)[0]) == 1
+    # position, of which there are two, moves no flux
+    for least, n in ((1e-3, 3), (0.01, 1)):
+        found, _ = changes.of(PROFILE, one, least)
+        assert sum(not change.fixed for change in found) == n
     assert changes.of(PROFILE, one, 1.0)[0] == []
 
 
@@ -77,19 +78,21 @@ def test_between_point_and_profile_the_other_counts_by_its_probability(changes):
     (point, mean_of_point), _ = changes.of(None, record(4.0, np.zeros(6), point=0.9), 1e-6)
     # a choice of probability 0.1: mean 0.1 and variance 0.1 * 0.9 of the difference
     assert [one.fixed for one in (chosen, mean, mean_of_point)] == [False, True, True]
-    assert_allclose(chosen.cutout.data, point.cutout.data, atol=1e-9)
-    assert_allclose(mean.cutout.data, chosen.cutout.data * 0.1 / 0.3, atol=1e-9)
-    assert_allclose(mean_of_point.cutout.data, -mean.cutout.data, atol=1e-9)
     expected = 0.3 * (below(chosen.cutout, 4.0) - below(chosen.cutout, np.sqrt(32.0)))
-    assert_allclose(chosen.cutout.data, expected, atol=2e-3 * np.abs(expected).max())
+    for one in (chosen, point):
+        # of either sign
+        found = one.cutout.data * np.sign(np.sum(one.cutout.data * expected))
+        assert_allclose(found, expected, atol=2e-3 * np.abs(expected).max())
+    assert_allclose(mean.cutout.data, expected * 0.1 / 0.3, atol=1e-3 * np.abs(expected).max())
+    assert_allclose(mean_of_point.cutout.data, -mean.cutout.data, atol=1e-8)
 
 
 def test_the_mean_of_possible_sizes_is_another_template(changes):
     """ln sigma of normal distribution: the mean template is that of all draws."""
     width = 0.25
     found, _ = changes.of(PROFILE, record(4.0, [0, 0, width, 0, 0, 0]), 1e-3)
-    assert [one.fixed for one in found] == [False, True]
-    mean = found[1].cutout
+    assert [one.fixed for one in found] == [False] * (len(found) - 1) + [True]
+    mean = found[-1].cutout
     # by Gauss-Hermite quadrature
     nodes, weights = np.polynomial.hermite_e.hermegauss(9)
     drawn = [below(mean, np.hypot(4.0 * np.exp(width * one), 4.0)) for one in nodes]

@@ -229,6 +229,16 @@ def test_areas_filled_with_zero_have_no_data(field, tmp_path, name):
     assert np.all(np.abs(found - field.flux)[snr < 5] < 3 * error[snr < 5])
 
 
+def test_maps_of_the_noise_below_zero_are_refused(field, tmp_path):
+    for name in ("error", "variance", "inverse_variance"):
+        data = np.ones((241, 241))
+        data[3, 4:6] = -1.0
+        path = saved(tmp_path, data, f"{name}.fits")
+        wanted = rf"'{name}' must be a map of 0 \(no data\) or more, got 2 pixels below 0 in .*{name}.fits"
+        with pytest.raises(ValueError, match=wanted):
+            read_mosaic(field.paths["image"], **{name: path})
+
+
 def test_labels_of_another_detection_are_not_taken(field, tmp_path):
     labels, header = fits.getdata(field.folder / "seg.fits", header=True)
     # ids of the map say nothing of the catalog's: positions do

@@ -84,6 +84,36 @@ def test_dithers_are_aligned_to_the_first(stars):
     refuses(wanted, reducer.combine, images, [], align="gaia")
 
 
+def test_visits_are_moved_as_a_whole(stars):
+    """A dither of two stars alone has its place by the others of its visit."""
+    sky, peaks = stars
+    rng = np.random.default_rng(7)
+    images, truths = [], []
+    for k, (dx, dy) in enumerate(((0, 0), (6, 2), (-4, 7), (3, -6))):
+        pointing = CENTER.spherical_offsets_by(dx * u.arcsec, dy * u.arcsec)
+        error = 0.4 * u.arcsec if k > 1 else 0 * u.arcsec
+        told = cut(pointing.spherical_offsets_by(error, -error / 2), 30.03 if k > 1 else 30.0)
+        truths.append(cut(pointing))
+        x, y = truths[-1].world_to_pixel(sky)
+        inside = (x > 30) & (x < 390) & (y > 30) & (y < 370)
+        some = np.flatnonzero(inside)[:2] if k == 3 else np.arange(60)
+        images.append(observed(truths[-1], told, sky[some], peaks[some] + 50, rng))
+        images[-1].meta["keywords"] = {"VISIT_ID": [f"0134500100{k // 2}", ""]}
+    refuses(r"'images\[3\]' must be one with at least 3 sources", align_images, images)
+    aligned, alignments = align_images(images, groups=[0, 0, 1, 1])
+    assert alignments[2] is alignments[3]
+    for im, true, before in zip(aligned, truths, images, strict=True):
+        assert off(im.wcs, true) < 0.012
+        assert_array_equal(im.data, before.data)
+    reducer = Reducer(background=BackgroundSettings("sep"))
+    result = reducer.combine(images, [], align="visits")
+    assert max(off(im.wcs, true) for im, true in zip(result.images, truths, strict=True)) < 0.012
+    refuses("'groups' must be one for each of 4 images, got 1", align_images, images, groups=[0])
+    images[0].meta["keywords"] = {}
+    wanted = "'images' must be ones with the keyword VISIT_ID"
+    refuses(wanted, reducer.combine, images, [], align="visits")
+
+
 def test_of_two_shifts_that_are_as_frequent_one_is_taken(stars):
     """A catalog that holds each star twice, with and without an error of 0.5 arcsec."""
     sky, peaks = stars

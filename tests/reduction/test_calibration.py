@@ -40,6 +40,12 @@ def test_pixels_off_the_field_are_masked_with_the_reason(rate):
     reference = (cal.flags & DQ.REFERENCE_PIXEL) != 0
     assert_array_equal(outside, ~field_mask() & ~reference)
     assert_array_equal(cal.mask, ~field_mask() | reference)
+    # and what the flat field says of the knife edge
+    flags = np.zeros(SHAPE, np.int64)
+    flags[480:500, 360:420] = DQ.NON_SCIENCE
+    edge = calibrate(rate, **OPTIONS, flags=flags)
+    assert_array_equal(edge.mask, cal.mask | (flags != 0))
+    assert np.all(edge.flags[flags != 0] & int(DQ.DO_NOT_USE))
 
 
 def test_refuses_what_is_no_rate(rate):

@@ -20,6 +20,7 @@ from miricigale.reduction import (
     reduce_files,
     write_image,
 )
+from miricigale.reduction.images import sigma
 from miricigale.utils.exceptions import MiricigaleWarning
 
 
@@ -74,6 +75,14 @@ def test_all_stages_and_filters_in_one_go(files, tmp_path, capsys):
     assert_array_equal(file.planes["CON"][0], result.n_images)
     assert_allclose(file.planes["WHT"], result.weight, rtol=1e-6)
     assert_allclose(file.planes["BKG"], result.subtracted, rtol=1e-5)
+    # the parts of the variance, as the pipeline has them, make up the errors; a rate has none here
+    assert "VAR_POISSON" not in file.planes
+    (other,) = read_images(out / "mosaic_f1000w.fits")
+    parts, error = other.planes["VAR_POISSON"] + other.planes["VAR_RNOISE"], sigma(other.image)
+    assert_allclose(parts[~other.image.mask], error[~other.image.mask] ** 2, rtol=1e-3)
+    # levels stand on the page with their errors
+    level, error = (file.image.meta[key][0] for key in ("background", "background_error"))
+    assert f"{level:.4g} ± {error:.1g}" in page
     # with what was subtracted it is the mosaic of what was exposed, however much that is
     left = tmp_path / "left"
     assert main([*arguments[:-2], str(left), "--background", "none", "--no-progress"]) == 1

@@ -14,6 +14,7 @@ from scipy.ndimage import convolve
 
 from helpers.references import write_reference
 from miricigale.detector import Ramp
+from miricigale.instrument import DQ
 from miricigale.reduction import Reducer, ReferenceFiles
 from miricigale.utils.exceptions import MiricigaleWarning
 
@@ -56,6 +57,32 @@ def derivative(ramp, pipeline):
     return solution[0]
 
 
+def test_groups_that_settle_are_said(ramp, pipeline):
+    """They are a third to a half of the slopes: only 5 to 15 % are left without the first three groups."""
+    rates, good = pipeline
+    reducer = Reducer(references="none")
+    with pytest.warns(MiricigaleWarning) as found:
+        rate = reducer.fit_ramp(ramp)
+    said = [str(w.message) for w in found if "still settle" in str(w.message)]
+    # the first integration settles longest, by tens of DN
+    assert len(said) == 1
+    assert "the first 9 groups still settle after the reset, by -3" in said[0]
+    assert rate.meta["settling_groups"] == 9
+    assert np.all(rate.flags[~rate.mask] & int(DQ.FLUX_ESTIMATED))
+    with pytest.warns(MiricigaleWarning):
+        parts = reducer.fit_integrations(ramp)
+    assert [part.meta["settling_groups"] for part in parts] == [9, 4, 1, 1, 5]
+    ratio = [
+        np.median(p.data[g]) / np.median(r[g]) for p, r, g in zip(parts, rates, good, strict=True)
+    ]
+    assert 1.15 < min(ratio[1:]) < max(ratio[1:]) < 1.5
+    with pytest.warns(MiricigaleWarning) as found:
+        later = reducer.replace(skip_first=9).fit_ramp(ramp)
+    assert not any("still settle" in str(w.message) for w in found)
+    assert not np.any(later.flags & int(DQ.FLUX_ESTIMATED))
+
+
+@pytest.mark.filterwarnings("ignore:the first . groups still settle")
 def test_later_integrations_have_the_slopes_of_the_pipeline(ramp, pipeline, derivative, tmp_path):
     rates, good = pipeline
     coefficients = np.zeros((3, 64, 72))

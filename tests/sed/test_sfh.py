@@ -217,5 +217,5 @@ def test_model_from_a_configuration_reads_the_file(tmp_path, suffix):
 def test_files_that_are_no_tables_are_refused(tmp_path):
     (tmp_path / "noise.fits").write_bytes(b"SIMPLE but no more")
     for name in ("absent.ecsv", "noise.fits"):
-        match = f"{name} cannot be read as a star-formation history"
+        match = f"{name} cannot be read as a table"
         refuses(match, TableSFH, error=DataError, path=tmp_path / name)

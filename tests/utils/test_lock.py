@@ -1,5 +1,6 @@
 """Locks of folders, seen from several processes."""
 
+import errno
 import json
 import os
 import signal
@@ -196,3 +197,13 @@ def test_of_many_that_find_an_old_lock_one_wins(tmp_path):
     for process in processes:
         process.communicate()
     assert [process.returncode for process in processes] == [0] * 5
+
+
+def test_a_file_system_without_locks_is_named(tmp_path, monkeypatch):
+    fcntl = pytest.importorskip("fcntl")
+
+    def flock(file, operation):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    refused(r"\.run\.lock cannot be locked \(No locks available\): choose a folder", tmp_path)

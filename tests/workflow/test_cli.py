@@ -135,7 +135,7 @@ def test_help_names_presets_and_surveys(capsys):
         (["fit"], "miricigale fit: the following arguments are required: CATALOG"),
         (["fitt"], "miricigale: argument COMMAND: invalid choice: 'fitt'"),
         (["plan", "--depth", "x"], "miricigale plan: argument --depth: invalid float value"),
-        (["photometry", "a", "b", "--error", "c", "--weight", "d"], "not allowed with argument"),
+        (["photometry", "a", "b", "--error", "c", "--weight", "d"], "must be at most one of them"),
         (["reduce", "absent_uncal.fits", "-o", "out"], "miricigale: no file absent_uncal.fits"),
         (["show", "absent.fits"], "miricigale: no file absent.fits"),
         (["-v", "-q", "filters"], "not allowed with argument"),

@@ -26,14 +26,19 @@ def test_workers_that_die_are_replaced_or_named_and_the_run_resumes(tmp_path):
     _, whole = run(tmp_path / "processes")
     # one worker dies
     (tmp_path / "one.deaths").write_text("1")
-    _, products = run(tmp_path / "one", "cluster")
+    message, products = run(tmp_path / "one", "cluster")
+    assert "is lost; first c is done again by another worker" in message
     assert (tmp_path / "one.deaths").read_text() == "0"
     assert products == whole
     # every worker that does the unit dies
     (tmp_path / "all.deaths").write_text("4")
     message, products = run(tmp_path / "all", "cluster", fails=True)
     assert (tmp_path / "all.deaths").read_text() == "0"
-    for text in ("4 workers of tcp://", "died over one unit", "the same command resumes it"):
+    for text in (
+        "4 workers died over first c",
+        "the last at tcp://",
+        "the same command resumes it",
+    ):
         assert text in message
     assert products.items() < whole.items()
     assert "c/0.txt" not in products

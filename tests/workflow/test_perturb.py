@@ -22,6 +22,7 @@ from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow import Context, load_config
 from miricigale.workflow.config import StudyConfig
+from miricigale.workflow.engine.stage import Units
 from miricigale.workflow.page.study_page import DeclaredPage
 from miricigale.workflow.perturbation import (
     Perturbation,
@@ -98,7 +99,9 @@ def test_perturbations_that_cannot_be(perturb, message):
 def test_no_stage_of_the_analysis_knows_of_them():
     """Stages of truth and sky have them in their plans, those of a perturbed truth only."""
     plain, config = config_of([]), config_of(of=[0.0, 0.4])
-    parts = {one: {n: s.unit_names(one) for n, s in STAGES.items()} for one in (plain, config)}
+    parts = {
+        one: {n: Units(s.unit_names(one)) for n, s in STAGES.items()} for one in (plain, config)
+    }
     for name, stage in STAGES.items():
         assert ("perturb" in stage.sections) == (name == "report")
         assert not [key for key in stage.sections if key.startswith("perturb.")]

@@ -7,10 +7,12 @@ from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 from numpy.testing import assert_allclose
 
+from helpers.errors import refuses
 from helpers.runs import do_stage, make_run, sky_image, small_config, thicker_half
 from miricigale.detector.effects.base import stream_key
 from miricigale.instrument import imager_columns
 from miricigale.photometry import ErrorModel
+from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.stages.exposures import (
     exposure_plan,
@@ -119,3 +121,38 @@ def test_errors_of_a_run_follow_the_exposure_time(tmp_path, coverage):
     ratio = (matched[f"{BAND}_err"] / errors.sigma(matched[BAND], BAND)).to_value(u.one)
     assert_allclose(ratio[deep], 0.5 if coverage else 1.0)
     assert_allclose(ratio[shallow], 1.0)
+
+
+def test_pointings_of_a_table(tmp_path):
+    path = tmp_path / "plan.ecsv"
+    rows = QTable({"ra": [53.1, 53.2, 53.3] * u.deg, "dec": [-27.8, -27.8, -27.7] * u.deg})
+    rows["roll"] = [0.0, np.pi / 2, 0.3] * u.rad
+    rows["bands"] = ["F770W", "", "F770W, miri.f2100w"]
+    rows["time"] = [1000.0, 2000.0, 500.0] * u.s
+    rows.write(path)
+    config = field(centers=[str(path)], roll=45.0)
+    exposures = study_exposures(config)
+    centers = study_pointings(config)
+    assert [round(one.ra.deg, 6) for one in centers] == [53.1, 53.2, 53.3]
+    for name, seen in (("miri.f770w", (0, 1, 2)), ("miri.f2100w", (1, 2))):
+        own = [e for e in exposures.values() if e.filter == name]
+        n = len(own) // len(seen)
+        for k, row in enumerate(seen):
+            some = own[k * n : (k + 1) * n]
+            assert {pointing_of(config, e).ra.deg for e in some} == {centers[row].ra.deg}
+            assert_allclose([e.roll.to_value(u.rad) for e in some], rows["roll"][row].value)
+            time = sum(e.exposure_time for e in some)
+            assert_allclose(time.to_value(u.s), rows["time"][row].value, rtol=0.02)
+        assert len(exposure_plan(config, name)) == len(own)
+    time = pointing_time(config, "miri.f2100w")
+    assert_allclose(time.to_value(u.s), 2000, rtol=0.02)
+    # one that has changed is read again
+    rows[:2].write(path, overwrite=True)
+    assert len(study_pointings(config)) == 2
+    # without columns all is as elsewhere
+    rows["ra", "dec"].write(path, overwrite=True)
+    assert {e.roll.to_value(u.deg) for e in study_exposures(config).values()} == {45.0}
+    rows["bands"] = "F1000W"
+    rows.write(path, overwrite=True)
+    match = r"\[pointing\] centers: plan.ecsv: 'bands' must be of \[exposures\] filters .*'F1000W'"
+    refuses(match, study_exposures, config, error=ConfigError)

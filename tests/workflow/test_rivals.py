@@ -12,6 +12,7 @@ from miricigale.pages import Page
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow import Context
 from miricigale.workflow.config import load_config
+from miricigale.workflow.engine.stage import Units
 from miricigale.workflow.page.study_page import DeclaredPage
 from miricigale.workflow.stages import rivals
 
@@ -150,7 +151,7 @@ def test_rivals_are_asked_for():
     stage, config = STAGES["rivals"], config_of("package")
     assert stage.unit_names(config) == (BAND,)
     assert stage.unit_names(config_of("package", rivals=False)) == ()
-    units = {name: one.unit_names(config) for name, one in STAGES.items()}
+    units = {name: Units(one.unit_names(config)) for name, one in STAGES.items()}
     assert stage.needed(config, BAND, units)["mosaics"] == [f"mosaics:agn00/{BAND}"]
     with pytest.raises(ConfigError, match=r"0\.06 with \[photometry\] rivals, got 0\.05"):
         load_config("goodss", overrides={"photometry": {"rivals": True},

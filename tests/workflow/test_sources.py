@@ -15,12 +15,13 @@ from PIL import Image
 
 from helpers.runs import SCALE, SHAPE, do_stage, make_run, noise_image, sky_image, small_config
 from miricigale.fitting import FitResults
+from miricigale.pages.browser import CHUNK
+from miricigale.plotting import cutouts
+from miricigale.plotting.cutouts import N_GRAY, Cutouts
 from miricigale.sed import SEDModel
 from miricigale.workflow import Context
 from miricigale.workflow.config import StudyConfig
-from miricigale.workflow.stages import cutouts
-from miricigale.workflow.stages.cutouts import N_GRAY, Cutouts
-from miricigale.workflow.stages.sources import CHUNK, FLAGS
+from miricigale.workflow.stages.sources import FLAGS
 
 BANDS = ["miri.f770w", "miri.f2100w"]
 
@@ -174,7 +175,10 @@ def test_pictures_are_of_so_many_sources_the_fitted_and_the_brightest_first(run,
 
 
 def test_pictures_of_many_sources_are_looked_at_in_parts(run, monkeypatch):
-    cut = Cutouts.read(Context(small_config(BANDS), run[0]), "agn00")
+    context = Context(small_config(BANDS), run[0])
+    paths = "mosaic_{}", "photometry/{}_model", "photometry/{}_residual"
+    bands = {b: [context.image(f"agn00/{one.format(b)}.fits") for one in paths] for b in BANDS}
+    cut = Cutouts(context.image("f160w.fits"), bands)
     monkeypatch.setattr(cutouts, "_AT_ONCE", 5)
     found = cut.on_image(product(run[0], "truth")["sky"])
     assert sum(found) == sum(entry["imaged"] for entry in run[2])

@@ -60,11 +60,12 @@ def on_cluster(n_workers):
         LocalCluster(
             n_workers=n_workers, threads_per_worker=1, dashboard_address=None, memory_limit="1GB"
         ) as cluster,
-        cluster_executor(cluster.scheduler_address) as (executor, n_threads, memory),
+        cluster_executor(cluster.scheduler_address) as workers,
     ):
-        assert n_threads == n_workers
-        assert abs(memory - n_workers) < 1e-3
-        yield executor
+        places = workers.places().values()
+        assert [place.slots for place in places] == n_workers * [1]
+        assert all(abs(place.memory - 5e8) < 1 for place in places)
+        yield workers
 
 
 if __name__ == "__main__":

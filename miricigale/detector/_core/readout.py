@@ -51,27 +51,6 @@ def interpolate_response(ramp, gain, response, step):
 
 
 @njit(cache=True, nogil=True)
-def pull_last_group(ramp, sees, first_row, offset, coupling):
-    """
-    Offset the last group of each integration by what the reset of the row pair before does.
-
-    Pixels of ``sees`` (n_row, n_col) lose the share ``coupling`` of the pair's mean signal and get
-    ``offset`` DN; rows whose preceding pair is not in the array are left.
-    """
-    n_int, _, n_row, n_col = ramp.shape
-    for i in range(n_int):
-        # from the end: a pair is used before it is changed
-        for r in range(n_row - 1, -1, -1):
-            before = r - (first_row + r) % 2 - 2
-            if before < 0:
-                continue
-            for x in range(n_col):
-                if sees[r, x]:
-                    pair = ramp[i, -1, before, x] + ramp[i, -1, before + 1, x]
-                    ramp[i, -1, r, x] += offset - coupling * np.float32(0.5) * pair
-
-
-@njit(cache=True, nogil=True)
 def add_noise(ramp, sigma, key, first_row):
     """Add independent Gaussian noise of standard deviation ``sigma`` to every read."""
     n_int, n_group, n_row, n_col = ramp.shape

@@ -13,6 +13,7 @@ from miricigale.detector.effects.charge import (
     Saturation,
 )
 from miricigale.detector.effects.light import Photons, Residual
+from miricigale.detector.effects.migration import BrighterFatter
 from miricigale.detector.effects.readout import ADConversion, Bias, Nonlinearity, ReadNoise
 from miricigale.detector.effects.reset import FirstFrame, LastFrame, ResetAnomaly, ResetDecay
 from miricigale.utils.exceptions import argument_error
@@ -23,6 +24,7 @@ ORDER = (
     Residual,
     Photons,
     Dark,
+    BrighterFatter,
     InterpixelCapacitance,
     CosmicRays,
     Persistence,

@@ -20,7 +20,6 @@ import dataclasses
 
 import numpy as np
 
-from miricigale.detector._core.readout import pull_last_group
 from miricigale.detector.effects.base import Effect, check_amounts, check_finite, check_share
 from miricigale.utils.options import check_that
 
@@ -201,8 +200,12 @@ class LastFrame(Effect):
 
     def apply(self, ramp, block):
         """Pull the last groups."""
-        sees = ~block.reference
-        pull_last_group(
-            ramp, sees, block.rows.start, np.float32(self.offset), np.float32(self.coupling)
-        )
+        rows = np.arange(ramp.shape[2])
+        before = rows - (block.rows.start + rows) % 2 - 2
+        # rows whose preceding pair is not in the block are of its halo, or of the first pair
+        whole = before >= 0
+        last = ramp[:, -1]
+        pair = last[:, before[whole]] + last[:, before[whole] + 1]
+        pull = np.float32(self.offset) - np.float32(0.5 * self.coupling) * pair
+        last[:, whole] += np.where(block.reference[whole], 0, pull)
         return ramp

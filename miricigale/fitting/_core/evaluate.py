@@ -257,12 +257,10 @@ def sum_up(tables, scales, request, target, limits, sums, pairs, lanes, *, singl
     reference = _begin(tables, target, limits, pairs, sums.hist.origin)
     if reference is None:
         return False
-    best, total = sums.best, sums.total
+    best, total, given = sums.best, sums.total, (tables, target, limits, pairs)
     best[2] = reference
     if tables.zero_frac == 1 and tables.prior_zero > 0.0:
-        _evaluate_alone(
-            tables, target, limits, pairs, lanes, sums, request.delta, request.scale_error
-        )
+        _evaluate_alone(*given, lanes, sums, request.delta, request.scale_error)
     # a bound holds the largest prior of the fractions above 0, a weight those of all
     prior = tables.of_frac[at.PRIOR_FRAC]
     prior_sum, prior_top = prior.sum(), prior.max(initial=0.0)
@@ -273,28 +271,19 @@ def sum_up(tables, scales, request, target, limits, sums, pairs, lanes, *, singl
     if limits is not None:
         highest = np.square(limits.level).max()
     while position < end:
-        n, position, reference = list_runs(
-            tables, target, limits, pairs, request.delta, reference, position
-        )
+        n, position, reference = list_runs(*given, request.delta, reference, position)
         share *= 0.5
         if limits is not None:
             # a probability many sigma out is not one for single precision
             single = single and max(target.top + limits.dark - reference, highest) < _MODEST
         floor, few = first_floor(pairs, n, reference)
-        _evaluate_runs(
-            tables, target, limits, pairs, lanes, sums, request, n, reference, floor,
-            single and not few,
-        )  # fmt: skip
+        light = single and not few
+        _evaluate_runs(*given, lanes, sums, request, n, reference, floor, light)
         allowed = share * request.rtol * total[0]
         tail = (target.norm.max() + 1.0) / request.tail
-        unit = (
-            math.exp(min(0.5 * (reference - best[2]), 600.0)) * prior_sum / max(prior_top, 1e-300)
-        )
-        floor = second_floor(
-            tables, target, pairs, n, reference, allowed, unit, request.delta, tail,
-            widest(scales, sums) if allowed > 0.0 else None,
-        )  # fmt: skip
-        _evaluate_runs(
-            tables, target, limits, pairs, lanes, sums, request, n, reference, floor, single
-        )
+        rise = math.exp(min(0.5 * (reference - best[2]), 600.0))
+        asked = allowed, rise * prior_sum / max(prior_top, 1e-300), request.delta, tail
+        wide = widest(scales, sums) if allowed > 0.0 else None
+        floor = second_floor(tables, target, pairs, n, reference, *asked, wide)
+        _evaluate_runs(*given, lanes, sums, request, n, reference, floor, single)
     return total[0] > 0.0

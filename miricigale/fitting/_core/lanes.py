@@ -31,18 +31,19 @@ def galaxy_products(tables, target, z, block, pq):
 
 
 @njit(**PART)
-def best_mixture(p, q, t, a, b, low, high):
+def best_mixture(p, q, t, a, b, low, high, tiny):
     """
-    Best R of a galaxy with an AGN model, x = c L_dust anything from low to high.
+    Best x = c L_dust from low to high of a galaxy with an AGN model, and R there, in the precision given.
 
-    With p = <G, wF>, q = <G, wG>, t = <G, wA>, a = <A, wF>, b = <A, wA>.
+    With p = <G, wF>, q = <G, wG>, t = <G, wA>, a = <A, wF>, b = <A, wA>; ``tiny`` is the least norm.
     """
+    zero = type(p)(0.0)
     rise = a * q - p * t
     fall = p * b - a * t
-    x = rise / fall if fall > 0.0 else high
-    x = min(max(x, low), high) if rise > 0.0 else low
-    num = max(p + x * a, 0.0)
-    return num * num / max(q + x * (2.0 * t + x * b), 1e-300)
+    x = rise / fall if fall > tiny else high
+    x = min(max(x, low), high) if rise > zero else low
+    num = max(p + x * a, zero)
+    return x, num * num / max(q + x * (t + t + x * b), tiny)
 
 
 @njit(**PART)

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from miricigale.fitting._core.lanes import best_mixture
 from miricigale.fitting._core.structs import KERNEL, PART
 from miricigale.utils.compilation import njit
 
@@ -58,18 +59,6 @@ def _sum(few, n, data, share, n_used):
 
 
 @njit(**PART)
-def _mix(p, q, t, a, b, low, high):
-    """Best x of a galaxy with an AGN model (see `lanes.best_mixture`), and R."""
-    zero = np.float32(0)
-    rise = a * q - p * t
-    fall = p * b - a * t
-    x = rise / fall if fall > _TINY else high
-    x = min(max(x, low), high) if rise > zero else low
-    num = max(p + x * a, zero)
-    return x, num * num / max(q + x * (t + t + x * b), _TINY)
-
-
-@njit(**PART)
 def _reach(few, n, ratio, data, share, base, n_used, first, last, ends):
     """Fill the best R without the bands from ``first`` to before ``last``; the best R."""
     zero, n_agn = np.float32(0), few.agn.shape[0]
@@ -102,7 +91,7 @@ def _reach(few, n, ratio, data, share, base, n_used, first, last, ends):
                 t[i] -= row[i] * x
         low, high = np.float32(ends[0]), np.float32(ends[1])
         for i in range(n):
-            _, r = _mix(p[i], q[i], t[i], a, b, low * limit[i], high * limit[i])
+            _, r = best_mixture(p[i], q[i], t[i], a, b, low * limit[i], high * limit[i], _TINY)
             best[i] = max(best[i], r)
     top = zero
     for i in range(n):
@@ -188,13 +177,10 @@ def find_models(tables, target, few, odds, base, offset, ends, sizes, share, low
                             v = np.float32(start[j])
                             a += few.agn[m, j] * data[j] * v
                             b += few.agn[m, j] * few.agn[m, j] * v
-                        low, high = (
-                            ratio[m, g] * np.float32(ends[0]),
-                            ratio[m, g] * np.float32(ends[1]),
-                        )
-                        y, value = _mix(
-                            few.less[_P, g], few.less[_Q, g], few.sums[m, g], a, b, low, high
-                        )
+                        p, q, t = few.less[_P, g], few.less[_Q, g], few.sums[m, g]
+                        low = np.float32(ends[0]) * ratio[m, g]
+                        high = np.float32(ends[1]) * ratio[m, g]
+                        y, value = best_mixture(p, q, t, a, b, low, high, _TINY)
                         if value > r:
                             r, x, k = value, y, m
                     for j in range(n_used):

@@ -298,6 +298,7 @@ def list_runs(tables, target, limits, pairs, delta, reference, position):
             _project_tori(tables.agn32[z], target, z, pairs.unit_agn, pairs.agn32)
         start, norm = block * BLOCK, target.norm[z]
         lowest = reference - delta - target.log_prior[z] - tables.log_top_pair
+        top_prior = target.log_prior[z] + tables.log_top_pair
         log_usable = tables.log_usable[z, start : start + BLOCK]
         p32 = pairs.p32[z, start : start + BLOCK]
         inverse = pairs.inverse_norm[z, start : start + BLOCK]
@@ -312,9 +313,7 @@ def list_runs(tables, target, limits, pairs, delta, reference, position):
             usable = log_usable[i] > -1e200
             rows[_LEAST + i] = t if usable else _NEVER
             rows[_P + i] = p32[i] if usable else _NOWHERE
-            rows[_BASE + i] = max(
-                log_usable[i] + (target.log_prior[z] + tables.log_top_pair), -1e30
-            )
+            rows[_BASE + i] = max(log_usable[i] + top_prior, -1e30)
         for j in range(bands.size):
             row = tables.galaxy32[z, bands[j], start : start + BLOCK]
             s32 = target.root32[z, j]

@@ -78,14 +78,17 @@ def _widen(flux, agn, z, target, agn_error, weight):
 
 
 @njit(**PART)
-def _likelihood(flux, agn, z, target, limits, mixture, agn_error, scratch):
+def _likelihood(one, limits, mixture, z, work):
     """
     Best scale of a model, ln of the likelihood there but for a constant, and the variance of the scale.
 
     All that is known of the data is in here: ``z`` is the redshift that errors are of. With bands that may be
-    wrong the scale follows from how likely each of them is, and that from the scale. ``agn`` are the fluxes of the
-    AGN in the model, ``scratch`` is memory for weights.
+    wrong the scale follows from how likely each of them is, and that from the scale. ``work.flux`` are the fluxes
+    of the model and of its AGN, and memory for weights; ``limits`` and ``mixture``, those of the object, are
+    arguments so that kernels without them are compiled.
     """
+    flux, agn, scratch = work.flux[0], work.flux[1], work.flux[2]
+    target, agn_error = one.target, one.agn_error
     more = _widen(flux, agn, z, target, agn_error, scratch)
     s, r, variance, chi2 = _best_scale(flux, scratch, target, limits)
     log = 0.5 * (r + target.level[z] + more)
@@ -100,11 +103,8 @@ def _likelihood(flux, agn, z, target, limits, mixture, agn_error, scratch):
                 narrow, broad, odds = mixture.narrow[z, j], mixture.broad[j], mixture.odds[z, j]
                 part = _widened(narrow, b, flux, agn, target, agn_error)
                 if part < 1.0:
-                    narrow, odds, log = (
-                        narrow * part,
-                        odds / math.sqrt(part),
-                        log + 0.5 * math.log(part),
-                    )
+                    narrow, odds = narrow * part, odds / math.sqrt(part)
+                    log += 0.5 * math.log(part)
                 some = odds > 0.0
                 good = exponential(max(0.5 * (broad - narrow) * d * d, -600.0)) if some else 1.0
                 log -= 0.5 * (broad if some else narrow) * d * d
@@ -203,16 +203,7 @@ def _evaluate(space, one, x, work):
     log, z = _prior(one, z, g)
     if log < _NONE:
         return NEVER, 0.0, 0.0, 0.0
-    s, like, variance = _likelihood(
-        work.flux[0],
-        work.flux[1],
-        z,
-        one.target,
-        one.limits,
-        one.mixture,
-        one.agn_error,
-        work.flux[2],
-    )
+    s, like, variance = _likelihood(one, one.limits, one.mixture, z, work)
     return prior + log, like, s, variance
 
 

@@ -46,9 +46,9 @@ def find_best(tables, limits, lanes, sums, z, level):
     for i in range(BLOCK):
         if buffer[at.PRIOR + i] < -1e200:
             continue
-        r = best_mixture(
+        _, r = best_mixture(
             buffer[at.P + i], buffer[at.Q + i], 0.5 * buffer[at.X2 + i], buffer[at.A + i], buffer[at.B + i],
-            of_frac[at.RATIO, 0], of_frac[at.RATIO, -1],
+            of_frac[at.RATIO, 0], of_frac[at.RATIO, -1], 1e-300,
         )  # fmt: skip
         if r * (1.0 + 1e-12) + level < best[0]:
             continue

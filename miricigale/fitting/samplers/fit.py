@@ -56,8 +56,7 @@ class SamplerFit:
     def of_model(cls, model, filters, priors, settings, *, sampler, scale_error):
         """Work out the priors of a model, and set the sampler up."""
         check_that(isinstance(model, FluxModel), "model", "an SEDModel", type(model).__name__)
-        if not isinstance(priors, dict):
-            raise argument_error("priors", "a dict of parameters", type(priors).__name__)
+        check_that(isinstance(priors, dict), "priors", "a dict of parameters", repr(priors))
         predict = settings.predict
         names = tuple(n for some in (filters, predict) for n in getattr(some, "names", some))
         bands = FilterSet([*filters, *predict]) if isinstance(model, SEDModel) else names
@@ -84,11 +83,10 @@ class SamplerFit:
         rows = [{name: float(v[i]) for name, v in values.items()} for i in range(_FEW_TRIALS)]
         for component in self.model.components:
             why = [component.invalid(row) for row in rows] if component.refuses else [None]
-            if all(why):
-                names = [name for name in component.parameters if name in self.space.free]
-                wanted = f"values that {component.name!r} has, such as a list of them"
-                argument = " and ".join(f"priors[{name!r}]" for name in names)
-                raise argument_error(argument, wanted, f"none: {why[0]}")
+            names = [name for name in component.parameters if name in self.space.free]
+            argument = " and ".join(f"priors[{name!r}]" for name in names)
+            wanted = f"values that {component.name!r} has, such as a list of them"
+            check_that(not all(why), argument, wanted, f"none: {why[0]}")
 
     @property
     def priors(self):
@@ -148,8 +146,7 @@ class SamplerFit:
         else:
             msg = "'priors' must have 'redshift', or 'redshift' or 'redshift_prior' be given"
             raise ValueError(msg)
-        if any(one.n_dim == 0 for one in spaces):
-            raise argument_error("priors", "at least one free parameter", "none")
+        check_that(all(one.n_dim for one in spaces), "priors", "with a free parameter", "none")
         n_free = max((one.n_dim for one in spaces), default=0) + self.profile
         return spaces, n_free, kind
 

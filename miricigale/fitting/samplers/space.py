@@ -190,9 +190,8 @@ def make_prior(name, prior, parameter):
     if hasattr(prior, "ppf") and hasattr(prior, "cdf"):
         law = Continuous(*parameter.bounds, prior)
         first, last = law._ends
-        if not last - first > 0:
-            text = f"with weight from {law.low} to {law.high}"
-            raise argument_error(argument, text, str(law))
+        text = f"with weight from {law.low} to {law.high}"
+        check_that(last - first > 0, argument, text, str(law))
         return law
     if not isinstance(prior, tuple) and np.ndim(prior) == 1:
         return _choice(argument, prior, np.ones(len(prior)), parameter)

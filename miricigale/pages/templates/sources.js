@@ -3,7 +3,11 @@
 // sources each, which are loaded as scripts and images, since a page of the file system can read no other data.
 (function () {
   const facts = JSON.parse(document.getElementById("facts").textContent);
-  const table = facts.table, bands = facts.bands, sets = facts.sets;
+  const table = facts.table, bands = facts.bands;
+  // of a study with truths and fits, or of measured images alone
+  const study = "selection" in table;
+  if (!study) Object.assign(facts, { truths: [], sets: [], compared: [] });
+  const sets = facts.sets;
   const miri = bands.filter((band) => band.miri);
   const setOf = Object.fromEntries(sets.map((set) => [set.name, set]));
   const DASHES = { none: "5 3", blue: "1.5 2", red: "8 2 1.5 2" };
@@ -41,7 +45,7 @@
 
   function bits(kind, value) {
     const found = [];
-    for (const bit of Object.keys(facts.flags[kind])) {
+    for (const bit of Object.keys(facts.flags[kind] || {})) {
       if (value & Number(bit)) found.push(facts.flags[kind][bit]);
     }
     return found;
@@ -63,6 +67,7 @@
     }
     const noted = new Set([...words("selection", row.selection), ...words("condition", row.condition)]);
     for (const set of facts.compared) words("fit", row["fit_" + set]).forEach((word) => noted.add(word));
+    for (const band of bands) words("photometry", row["flags_" + band.name]).forEach((word) => noted.add(word));
     row.words = [...noted];
     row.flags = row.words.join(", ");
     return row;
@@ -70,38 +75,49 @@
   const byId = new Map(rows.map((row) => [String(row.id), row]));
 
   const columns = [{ key: "id", group: "", label: "id", title: "id of the catalog", plain: true }];
-  columns.push({ key: "mag", group: "", label: facts.prior, title: "true AB magnitude in the band of the prior", digits: 2 });
+  if (study) columns.push({ key: "mag", group: "", label: facts.prior, title: "true AB magnitude in the band of the prior", digits: 2 });
+  for (const band of bands) {
+    if (!("mag_" + band.name in table)) continue;
+    columns.push({ key: "mag_" + band.name, group: "AB", label: band.label, title: "magnitude, or its limit (" + facts.limits + ")", digits: 2, limit: "limit_" + band.name });
+    columns.push({ key: "chi2_" + band.name, group: "χ²", label: band.label, title: "template-weighted mean of (residual / sigma)²", digits: 2 });
+  }
+  columns.sort((a, b) => (a.group > b.group) - (a.group < b.group));
   for (const [key, group, digits] of [["redshift", "redshift", 3], ["frac_agn", "fracAGN", 2]]) {
-    columns.push({ key, group, label: "true", title: "injected", digits });
+    if (study) columns.push({ key, group, label: "true", title: "injected", digits });
     for (const set of facts.compared) {
       if (!(key + "_" + set in table)) continue;
       columns.push({ key: key + "_" + set, group, label: setOf[set].label, title: "posterior mean, " + setOf[set].label, digits, set });
     }
   }
   for (const band of miri) {
-    columns.push({ key: "sn_" + band.name, group: "S/N", label: band.label, title: "measured flux over the error of the error function", digits: 1 });
+    columns.push({ key: "sn_" + band.name, group: "S/N", label: band.label, title: "measured flux over " + (study ? "the error of the error function" : "its error"), digits: 1 });
   }
-  columns.push({ key: "n_detected", group: " ", label: "bands", title: "MIRI bands above 5 sigma" });
+  if (study) columns.push({ key: "n_detected", group: " ", label: "bands", title: "MIRI bands above 5 sigma" });
   for (const set of facts.compared) {
     columns.push({ key: "chi2_" + set, group: "reduced χ²", label: setOf[set].label, title: "of the best model", digits: 2 });
   }
-  columns.push({ key: "flags", group: "flags", label: "in words", title: "why it is not fitted, conditions, flags of the fits", text: true });
+  columns.push({ key: "flags", group: "flags", label: "in words", title: study ? "why it is not fitted, conditions, flags of the fits" : "flags of all bands", text: true });
   columns.forEach((column, k) => { column.first = k > 0 && columns[k - 1].group !== column.group; });
 
   // ------------------------------------------------------------------ state, kept in the address
 
-  const blank = () => ({ id: null, sort: "id", down: false, show: "field", flag: "", text: "", ranges: {} });
-  let state = blank();
-  let listed = [];
-
   const outside = 1; // bit of the selection: outside of the pixels that all bands share
-  const shows = { field: ["in the field", (row) => !(row.selection & outside)], all: ["all of the catalog", () => true] };
-  shows.sample = ["the sample (fitted)", (row) => row.selection === 0];
-  shows.left = ["in the field, not fitted", (row) => row.selection !== 0 && !(row.selection & outside)];
+  const shows = study ? { field: ["in the field", (row) => !(row.selection & outside)] } : {};
+  shows.all = ["all of the catalog", () => true];
+  if (study) {
+    shows.sample = ["the sample (fitted)", (row) => row.selection === 0];
+    shows.left = ["in the field, not fitted", (row) => row.selection !== 0 && !(row.selection & outside)];
+  } else {
+    shows.detected = ["with a magnitude in any band", (row) => bands.some((band) => row["limit_" + band.name] === false)];
+  }
   for (const set of facts.compared) {
     shows["outliers_" + set] = ["outliers in z " + setOf[set].label, (row) => row.outlier[set]];
   }
-  shows.outliers = ["outliers in z of either", (row) => facts.compared.some((set) => row.outlier[set])];
+  if (study) shows.outliers = ["outliers in z of either", (row) => facts.compared.some((set) => row.outlier[set])];
+  const first = Object.keys(shows)[0];
+  const blank = () => ({ id: null, sort: "id", down: false, show: first, flag: "", text: "", ranges: {} });
+  let state = blank();
+  let listed = [];
 
   function readAddress() {
     const [id, query] = location.hash.slice(1).split("?");
@@ -119,7 +135,7 @@
   function address() {
     const query = new URLSearchParams();
     if (state.sort !== "id" || state.down) query.set("sort", (state.down ? "-" : "") + state.sort);
-    if (state.show !== "field") query.set("show", state.show);
+    if (state.show !== first) query.set("show", state.show);
     for (const name of ["flag", "text"]) if (state[name]) query.set(name, state[name]);
     for (const [name, value] of Object.entries(state.ranges)) if (value) query.set(name, value);
     const text = query.toString();
@@ -222,7 +238,7 @@
   function cell(row, column) {
     const value = row[column.key];
     const off = column.key.startsWith("redshift_") && row.outlier[column.set];
-    const shown = column.plain ? String(value) : typeof value === "string" ? value : number(value, column.digits);
+    const shown = (row[column.limit] ? "> " : "") + (column.plain ? String(value) : typeof value === "string" ? value : number(value, column.digits));
     return make("td", { class: [cellClass(column), off ? "outlier" : ""].join(" ").trim() || null, title: column.text && value ? value : null }, shown);
   }
 
@@ -264,7 +280,7 @@
   // ------------------------------------------------------------------ details, loaded by file
 
   const files = new Map();
-  const stem = (k) => "sources/" + facts.truth + "/" + String(k).padStart(3, "0");
+  const stem = (k) => facts.folder + "/" + String(k).padStart(3, "0");
 
   window.loaded = (k, entries) => {
     const file = files.get(k);
@@ -296,20 +312,21 @@
     withFile(Math.floor(row.i / facts.chunk), (file) => {
       if (String(row.id) !== state.id) return;
       const entry = file.entries[row.i % facts.chunk];
+      if (!study) Object.assign(entry, { true: bands.map(() => null), conditions: bands.map(() => 0) });
       $("detail").replaceChildren(
         heading(row, entry),
         make("section", { class: "wide" }, make("h3", {}, "Images"), cutouts(row, entry, file.image)),
-        make("section", {}, make("h3", {}, "Photometry and best models"), spectrum(entry)),
-        make("section", {}, make("h3", {}, "Posteriors"), posteriors(row, entry), make("h3", {}, "Flags"), flags(row, entry)),
+        make("section", {}, make("h3", {}, "Photometry" + (study ? " and best models" : "")), spectrum(entry)),
+        make("section", {}, study ? [make("h3", {}, "Posteriors"), posteriors(row, entry)] : null, make("h3", {}, "Flags"), flags(row, entry)),
         make("section", {}, make("h3", {}, "Fluxes (µJy)"), fluxes(entry)),
-        make("section", {}, make("h3", {}, "Parameters"), parameters(entry)));
+        study ? make("section", {}, make("h3", {}, "Parameters"), parameters(entry)) : "");
     });
   }
 
   function heading(row, entry) {
     const item = (label, value) => make("span", {}, label + " ", make("b", {}, value));
-    const items = [item("RA", number(row.ra, 6)), item("Dec", number(row.dec, 6)), item(facts.prior, number(row.mag, 2)),
-      item("true z", number(row.redshift, 4)), item("true fracAGN", number(row.frac_agn, 3))];
+    const items = [item("RA", number(row.ra, 6)), item("Dec", number(row.dec, 6))];
+    if (study) items.push(item(facts.prior, number(row.mag, 2)), item("true z", number(row.redshift, 4)), item("true fracAGN", number(row.frac_agn, 3)));
     for (const set of sets) {
       const fit = entry.fits && entry.fits[set.name];
       if (!fit) continue;
@@ -326,7 +343,7 @@
     const c = facts.cutouts;
     if (!entry.top) {
       return make("p", {}, !entry.imaged ? "No band has data at this position."
-        : "Without pictures: " + facts.pictured + " sources have some, those that were fitted first, then the brightest ([report] pictures).");
+        : "Without pictures: " + facts.pictured + " sources have some, " + (study ? "those that were fitted first, then the brightest ([report] pictures)." : "those of the highest signal-to-noise."));
     }
     const y0 = (row.i % facts.chunk) * c.height;
     const ring = 100 * 2 / c.box;
@@ -353,19 +370,21 @@
         make("div", { style: "width:" + 2 * size + "px;font-size:11px;text-align:center;color:var(--soft)" },
           make("b", {}, facts.prior + " (prior)"), prior, limits(0)),
         grid),
-      make("p", { class: "note" }, c.box + " arcsec on a side, north up, east left; circle: 1 arcsec about the true position; "
+      make("p", { class: "note" }, c.box + " arcsec on a side, " + (study ? "north up, east left" : "along the pixels of each image") + "; circle: 1 arcsec about the " + (study ? "true " : "") + "position; "
         + "blue: other sources of the catalog; sand: no data. Mosaic, model and residual of a band have one stretch: asinh of the value over "
         + c.softening + " times the noise of a pixel (in residuals), between the limits beneath in " + c.unit + ", which are " + number(c.lowest)
         + " times the noise and the brightest pixel of the model, or 10 times the noise if that is more."));
   }
 
   function neighbors(row, box) {
-    const found = [], near = Math.cos(row.dec * Math.PI / 180);
+    // position angle of +y of the prior
+    const found = [], near = Math.cos(row.dec * Math.PI / 180), turn = (facts.turn || 0) * Math.PI / 180;
     for (const other of rows) {
       const north = (other.dec - row.dec) * 3600, east = (other.ra - row.ra) * 3600 * near;
-      if (other === row || Math.abs(north) > box / 2 || Math.abs(east) > box / 2) continue;
-      const style = "left:" + (50 - 100 * east / box) + "%;top:" + (50 - 100 * north / box) + "%";
-      found.push(make("a", { style, href: "#" + encodeURIComponent(other.id), title: "source " + other.id + ", " + facts.prior + " = " + number(other.mag, 1),
+      const up = north * Math.cos(turn) + east * Math.sin(turn), left = east * Math.cos(turn) - north * Math.sin(turn);
+      if (other === row || Math.abs(up) > box / 2 || Math.abs(left) > box / 2) continue;
+      const style = "left:" + (50 - 100 * left / box) + "%;top:" + (50 - 100 * up / box) + "%";
+      found.push(make("a", { style, href: "#" + encodeURIComponent(other.id), title: "source " + other.id + (study ? ", " + facts.prior + " = " + number(other.mag, 1) : ""),
         onclick: (event) => { event.preventDefault(); choose(other, true); } }));
     }
     return found;
@@ -394,6 +413,7 @@
       if (entry.flux[k] > entry.error[k]) lowest.push(entry.flux[k]);
     });
     if (!positive.length) return make("p", {}, "There is no flux to show.");
+    const least = (k) => entry.upper ? facts.detected * entry.error[k] : entry.error[k];
     const low = log(Math.min(...(lowest.length ? lowest : positive), ...entry.true.filter((v) => v > 0))) - 0.45, high = log(Math.max(...positive)) + 0.45;
     const x = scaled(log(wave[0]), log(wave[wave.length - 1]), left, width - right), y = scaled(low, high, height - bottom, top);
     const parts = [];
@@ -425,27 +445,27 @@
     const truth = { fill: "none", stroke: "#6b7280" };
     bands.forEach((band, k) => {
       const cx = x(log(band.wave)), flux = entry.flux[k], error = entry.error[k], color = band.miri ? "#9a3412" : "#1c2330";
-      const title = draw("title", {}, band.label + ": " + number(flux) + " ± " + number(error) + " µJy, true " + number(entry.true[k]));
+      const title = draw("title", {}, band.label + ": " + number(flux) + " ± " + number(error) + " µJy, " + (study ? "true " + number(entry.true[k]) : "limit " + number(entry.upper[k])));
       const group = draw("g", {}, title);
       if (entry.true[k] > 0) group.append(draw("rect", { x: cx - 5, y: y(log(entry.true[k])) - 5, width: 10, height: 10, ...truth }));
       if (flux !== null && error > 0) {
-        if (flux > error) {
+        if (flux > least(k)) {
           const cy = y(log(flux));
           group.append(draw("line", { x1: cx, x2: cx, y1: y(log(flux + error)), y2: y(log(flux - error)), stroke: color }), point(cx, cy, band.miri, color));
         } else {
-          const cy = y(log(3 * error));
+          const cy = y(log(entry.upper ? entry.upper[k] : 3 * error));
           group.append(draw("path", { d: "M" + (cx - 5) + " " + cy + "h10m-5 0v16m-4 -6l4 6l4 -6", stroke: color, fill: "none" }));
         }
       }
       clip.append(group);
     });
-    entries.push(["MIRI", point(10, 0, true, "#9a3412")], ["existing bands", point(10, 0, false, "#1c2330")],
-      ["true flux", draw("rect", { x: 5, y: -5, width: 10, height: 10, ...truth })]);
+    entries.push([study ? "MIRI" : "measured", point(10, 0, true, "#9a3412")]);
+    if (study) entries.push(["existing bands", point(10, 0, false, "#1c2330")], ["true flux", draw("rect", { x: 5, y: -5, width: 10, height: 10, ...truth })]);
     const clipping = draw("clipPath", { id: "inside" }, draw("rect", { x: left, y: top, width: width - left - right, height: height - top - bottom }));
     return make("div", {}, draw("svg", { viewBox: "0 0 " + width + " " + height, role: "img", "aria-label": "spectral energy distribution" },
       clipping, parts, clip, legend(left + 12, top + 14, entries)),
-      make("p", { class: "note" }, "Arrows: three times the error, where the flux is below its error. "
-        + (entry.fits ? "Models are means over cells of " + (100 * (wave[1] / wave[0] - 1)).toFixed(1) + " % in wavelength." : "Existing bands have mock fluxes for fitted sources only.")));
+      make("p", { class: "note" }, study ? "Arrows: three times the error, where the flux is below its error. "
+        + (entry.fits ? "Models are means over cells of " + (100 * (wave[1] / wave[0] - 1)).toFixed(1) + " % in wavelength." : "Existing bands have mock fluxes for fitted sources only.") : "Arrows: upper limits, " + facts.limits + "."));
   }
 
   function point(x, y, miriBand, color) {
@@ -514,11 +534,11 @@
         noted.push(...words("condition", entry.conditions[k]), ...words("photometry", entry.flags[k] < 0 ? 0 : entry.flags[k]));
       }
       const ratio = entry.error[i] > 0 && entry.flux[i] !== null ? entry.flux[i] / entry.error[i] : null;
-      return make("tr", {}, make("td", { class: "t" }, band.miri ? band.label : band.name), make("td", {}, number(band.wave)), make("td", {}, number(entry.true[i])),
+      return make("tr", {}, make("td", { class: "t" }, band.miri ? band.label : band.name), make("td", {}, number(band.wave)), make("td", {}, number((entry.upper || entry.true)[i])),
         make("td", {}, number(entry.flux[i])), make("td", {}, number(entry.error[i])), make("td", {}, number(ratio, 1)), make("td", { class: "t" }, [...new Set(noted)].join(", ")));
     });
     return make("div", { class: "scrolls" }, make("table", { class: "values" },
-      make("thead", {}, make("tr", {}, ["band", "µm", "true", "measured", "error", "S/N", "flags"].map((text, j) => make("th", { class: j === 0 || j === 6 ? "t" : null }, text)))),
+      make("thead", {}, make("tr", {}, ["band", "µm", study ? "true" : "upper limit", "measured", "error", "S/N", "flags"].map((text, j) => make("th", { class: j === 0 || j === 6 ? "t" : null }, text)))),
       make("tbody", {}, body)));
   }
 

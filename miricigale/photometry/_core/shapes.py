@@ -113,6 +113,47 @@ def _fill(psf, fy, fx, x, y, log_s, g1, g2, profile, by_index, out):
                 out[6, i, j] = 0.0
 
 
+@njit(cache=True, nogil=True)
+def _fill_curves(kx, ky, shapes, profiles, out):
+    n_nodes = profiles.shape[1]
+    for s in range(shapes.shape[0]):
+        g1, g2 = shapes[s, 2], shapes[s, 3]
+        eta = np.sqrt(g1 * g1 + g2 * g2)
+        ch = np.cosh(eta)
+        sh = np.sinh(eta) / eta if eta > 1e-4 else 1.0
+        size = np.exp(2.0 * shapes[s, 0])
+        profile = profiles[s]
+        for i in range(kx.size):
+            x2, y2 = kx[i] * kx[i], ky[i] * ky[i]
+            form = ch * (x2 + y2) + sh * (g1 * (x2 - y2) + 2.0 * g2 * kx[i] * ky[i])
+            form *= size
+            if form < 1e-5:
+                out[s, i] = 1.0
+                continue
+            t = (0.5 * np.log(form) - _START) / _STEP
+            t = min(max(t, 1.0), n_nodes - 3.0)
+            m = int(t)
+            t -= m
+            a, b, e, f = profile[m - 1], profile[m], profile[m + 1], profile[m + 2]
+            c1 = 0.5 * (e - a)
+            c2 = a - 2.5 * b + 2.0 * e - 0.5 * f
+            c3 = 0.5 * (f - a) + 1.5 * (b - e)
+            out[s, i] = b + t * (c1 + t * (c2 + t * c3))
+
+
+def shape_curves(kx, ky, shapes):
+    """
+    Transforms of centered Sersic profiles of unit light, without a PSF, shape (n, m).
+
+    ``kx`` and ``ky``, (m,), are frequencies in radians per pixel; ``shapes``, (n, 4), the last four parameters
+    of `shape_models`.
+    """
+    out = np.empty((len(shapes), len(kx)))
+    profiles = np.array([_profile(one)[0] for one in shapes[:, 1]])
+    _fill_curves(kx, ky, shapes, profiles, out)
+    return out
+
+
 def shape_models(psf, size, shape, parameters, *, derivatives=6):
     """
     Sersic profile of unit light through a PSF, and its derivatives.

@@ -35,16 +35,10 @@ _Y, _X, _JUMPS, _FLAGS = range(4)
 @njit(cache=True, nogil=True)
 def fitting_lanes(n_int, n_diff):
     """Arrays of the lanes: differences, which are kept, scratch (3), values, pixels (-1: none)."""
-    n = n_int * (n_diff + 1)
-    return (
-        np.zeros((n, LANES)),
-        np.zeros((n, LANES)),
-        np.zeros((n, LANES)),
-        np.zeros((n, LANES)),
-        np.zeros((n, LANES)),
-        np.ones((_N_VALUES, LANES)),
-        np.full((LANES, 4), -1),
-    )
+    size = n_int * (n_diff + 1), LANES
+    differences, kept, values = np.zeros(size), np.zeros(size), np.ones((_N_VALUES, LANES))
+    left, right, forward = np.zeros(size), np.zeros(size), np.zeros(size)
+    return differences, kept, left, right, forward, values, np.full((LANES, 4), -1)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

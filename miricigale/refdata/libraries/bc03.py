@@ -77,7 +77,10 @@ def read_bc03(path):
         remnants[rows] = part.quantities["remnants"]
         basis.add(how)
     metal, name, (low, high) = [p[2] for p in parts], _set_name(paths[0].name), first.mass_limits
-    extended = first.wave[-1] / 1e4 < LONGEST * (1 - 1e-6)
+    last = first.wave[-1] / 1e4
+    reach = f"the files reach {last:g} um"
+    if last < LONGEST * (1 - 1e-6):
+        reach = f"continued from {last:g} to {LONGEST:g} um"
     return LibraryTable(
         name="ssp.bc03_user",
         wave=wave,
@@ -98,9 +101,7 @@ def read_bc03(path):
             f"{n_age} ages to {first.age[-1] / 1e9:g} Gyr, {first.wave.size} wavelengths",
             f"{wave.size - first.wave.size} wavelengths inserted beyond {DENSE_FROM:g} um",
             f"surviving mass: {', '.join(sorted(basis))}",
-            f"continued from {first.wave[-1] / 1e4:g} to {LONGEST:g} um"
-            if extended
-            else f"the files reach {first.wave[-1] / 1e4:g} um",
+            reach,
         ),
     )
 

@@ -137,8 +137,8 @@ def _content(source):
     """The numbers of a file in their order, whatever its form."""
     source.begin("the head")
     age = source.vector().astype(float)
-    limits = source.floats(2)
-    slopes = [source.floats(6)[0] for _ in range(source.integer())]
+    limits = tuple(source.floats(2).tolist())
+    slopes = tuple(round(float(source.floats(6)[0]), 6) for _ in range(source.integer()))
     source.floats(3)  # mass, number of stars and mean mass of the IMF
     law, tau, texts = source.integer(), float(source.floats(1)[0]), source.texts()
     source.begin("wavelengths")
@@ -152,17 +152,8 @@ def _content(source):
     while len(vectors) < N_NEEDED or not source.ended():
         source.begin(f"vector {len(vectors) + 1} after the spectra")
         vectors.append(source.vector(age.size).astype(float))
-    return Ised(
-        age,
-        wave,
-        spectra,
-        dict(zip(QUANTITIES, vectors, strict=False)),
-        mass_limits=tuple(float(x) for x in limits),
-        slopes=tuple(round(float(x), 6) for x in slopes),
-        law=law,
-        tau=tau,
-        texts=tuple(texts),
-    )
+    quantities = dict(zip(QUANTITIES, vectors, strict=False))
+    return Ised(age, wave, spectra, quantities, limits, slopes, law, tau, tuple(texts))
 
 
 def _foreign(path, why):

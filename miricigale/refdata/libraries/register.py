@@ -137,21 +137,6 @@ def add_library(name, path, *, progress_bar=False):
 
 
 @contextlib.contextmanager
-def _locked(target):
-    """
-    Keep other processes from writing the same file; wait if one does.
-
-    What an interrupted process left half written is removed.
-    """
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with FileLock(target.with_name(f".{target.name}.lock")):
-        # no other process writes: these are left over from ones that ended
-        for path in target.parent.glob(f"{PARTIAL}*-{target.name}*"):
-            path.unlink(missing_ok=True)
-        yield
-
-
-@contextlib.contextmanager
 def _installing(target):
     """
     Write a file of the data folder and a record beside it; other processes wait.
@@ -173,17 +158,19 @@ def _installing(target):
         of the file are added.
     """
     beside, record = record_path(target), {}
-    with _locked(target), contextlib.ExitStack() as last, replacing(target) as partial:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(target.with_name(f".{target.name}.lock"))
+    with lock, contextlib.ExitStack() as last, replacing(target) as partial:
+        # no other process writes: these are left over from ones that were interrupted
+        for path in target.parent.glob(f"{PARTIAL}*-{target.name}*"):
+            path.unlink(missing_ok=True)
         yield partial, record
         # before anything of the old one goes
         with open(partial, "rb+") as handle:
             os.fsync(handle.fileno())
         status = partial.stat()
-        known = {
-            "sha256": file_sha256(partial),
-            "size": status.st_size,
-            "mtime_ns": status.st_mtime_ns,
-        }
+        known = {"sha256": file_sha256(partial), "size": status.st_size}
+        known["mtime_ns"] = status.st_mtime_ns
         new = last.enter_context(replacing(beside))
         new.write_text(json.dumps(known | record, indent=1) + "\n", encoding="utf-8")
         beside.unlink(missing_ok=True)

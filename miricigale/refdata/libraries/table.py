@@ -86,9 +86,9 @@ class LibraryTable:
         self.__dict__.update(summary=tuple(self.summary), _index=self._make_index())
 
     def _check_names(self):
-        if not self.axes or not self.spectra:
-            got = f"axes {list(self.axes)} and spectra {list(self.spectra)}"
-            raise argument_error("axes", "one axis and one kind of spectra at least", got)
+        got = f"axes {list(self.axes)} and spectra {list(self.spectra)}"
+        wanted = "one axis and one kind of spectra at least"
+        check_that(self.axes and self.spectra, "axes", wanted, got)
         names = [*self.axes, *self.values, *self.spectra]
         # columns of a FITS table have names without case
         if len({name.lower() for name in names}) < len(names):
@@ -179,9 +179,8 @@ class LibraryTable:
             If an axis has no value.
         """
         missing = [name for name in self.axes if name not in values]
-        if missing:
-            got = f"only {', '.join(values) or 'none'}"
-            raise argument_error(", ".join(missing), f"given to find a row of {self.name!r}", got)
+        got = f"only {', '.join(values) or 'none'}"
+        check_that(not missing, ", ".join(missing), f"given to find a row of {self.name!r}", got)
         codes = [int(self._codes(name, float(values[name]))) for name in self.axes]
         return self._index.get(int(self._place(codes))) if min(codes) >= 0 else None
 
@@ -286,16 +285,11 @@ def _open(path, name):
         if text["name"] != name:
             raise data_error(path, f"holds {text['name']!r}, not {name!r}")
         rows = parts.table("ROWS")
-        return LibraryTable(
-            name=name,
-            wave=parts.array("WAVE"),
-            axes={n: np.asarray(rows[n]) for n in text["axes"]},
-            values={n: np.asarray(rows[n]) for n in text["values"]},
-            spectra={n: parts.mapped(_extension(n)) for n in text["spectra"]},
-            units=text["units"],
-            meta=text["meta"],
-            summary=tuple(text["summary"]),
-        )
+        kinds = ("axes", "values")
+        columns = {kind: {n: np.asarray(rows[n]) for n in text[kind]} for kind in kinds}
+        spectra = {n: parts.mapped(_extension(n)) for n in text["spectra"]}
+        facts = {key: text[key] for key in ("name", "units", "meta", "summary")}
+        return LibraryTable(wave=parts.array("WAVE"), spectra=spectra, **columns, **facts)
 
 
 def verify_library(path, name):

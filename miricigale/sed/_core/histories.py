@@ -124,13 +124,10 @@ def age_steps(age, n_steps):
     k = np.arange(n_steps)
     cell, _ = cells(age, k + 0.1)
     inside = (k + 0.1 >= age[cell]) & (k + 1.0 <= age[cell + 1])
-    runs = []
-    for j in np.unique(cell[inside]):
-        steps = k[inside & (cell == j)]
-        runs.append((steps[0], steps[-1] + 1, j))
-    mixed = k[~inside]
+    steps, mixed = k[inside], k[~inside]
+    j, first, n = np.unique(cell[inside], return_index=True, return_counts=True)
+    runs = np.array([steps[first], steps[first + n - 1] + 1, j], dtype=np.int64)
     rows = time_weights(age, n_steps)[mixed]
-    runs = np.array(runs, dtype=np.int64).reshape(-1, 3).T.copy()
     return runs, mixed, rows.indptr, rows.indices, rows.data
 
 

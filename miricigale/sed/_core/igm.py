@@ -133,36 +133,23 @@ def _meiksin(wave, redshift, first, series, lines, depth):
 
 def madau_transmission(wave, redshift):
     """Madau 1995: four lines and the continuum (footnote 3)."""
-    wave = np.ascontiguousarray(wave, dtype=float)
-    return _madau(wave, 1.0 + float(redshift), lyman_lines(6), _MADAU)
-
-
-@njit(cache=True)
-def _madau(wave, z1, lines, amplitudes):
-    out = np.ones(wave.size)
-    scaled = amplitudes * lines**-3.46
-    highest = lines[0] * z1
-    for i in range(wave.size):
-        w = wave[i]
-        if w >= highest:
-            continue
-        total = 0.0
-        for j in range(lines.size):
-            if w < lines[j] * z1 and w > lines[j]:
-                total += scaled[j]
-        tau = total * w**3.46 if total > 0.0 else 0.0
-        x = w / LYMAN_LIMIT
-        if x < z1:
-            low = max(x, 1.0)
-            continuum = (
-                0.25 * x**3 * (z1**0.46 - low**0.46)
-                + 9.4 * x**1.5 * (z1**0.18 - low**0.18)
-                - 0.7 * x**3 * (low**-1.32 - z1**-1.32)
-                - 0.023 * (z1**1.68 - low**1.68)
-            )
-            # the last term is a fit that turns the sum negative far in the ultraviolet
-            tau += max(continuum, 0.0)
-        out[i] = math.exp(-tau)
+    wave, z1, lines = np.asarray(wave, dtype=float), 1.0 + float(redshift), lyman_lines(6)
+    out, dimmed = np.ones(wave.size), wave < lines[0] * z1
+    w = wave[dimmed]
+    between = (w[:, None] < lines * z1) & (w[:, None] > lines)
+    tau = between @ (_MADAU * lines**-3.46) * w**3.46
+    behind = w < LYMAN_LIMIT * z1
+    x = w[behind] / LYMAN_LIMIT
+    low = np.maximum(x, 1.0)
+    continuum = (
+        0.25 * x**3 * (z1**0.46 - low**0.46)
+        + 9.4 * x**1.5 * (z1**0.18 - low**0.18)
+        - 0.7 * x**3 * (low**-1.32 - z1**-1.32)
+        - 0.023 * (z1**1.68 - low**1.68)
+    )
+    # the last term is a fit that turns the sum negative far in the ultraviolet
+    tau[behind] += np.maximum(continuum, 0.0)
+    out[dimmed] = np.exp(-tau)
     return out
 
 

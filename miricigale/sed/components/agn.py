@@ -176,8 +176,7 @@ class AGN(Component):
         return AGNTemplates(parts[0], parts[1], parts[2], power)
 
     def inert(self, values):
-        polar = values["ebv_polar"] == 0.0
-        return ("temperature_polar", "emissivity_polar") if polar else ()
+        return ("temperature_polar", "emissivity_polar") if values["ebv_polar"] == 0.0 else ()
 
 
 @functools.lru_cache(maxsize=16)
@@ -265,10 +264,8 @@ def _fine(wave):
     if sparse.size < 2:
         return wave
     number = np.ceil(np.diff(np.log(sparse)) / _FINE_STEP).astype(int)
-    more = [
-        np.geomspace(a, b, n + 1)[1:-1] for a, b, n in zip(sparse, sparse[1:], number, strict=False)
-    ]
-    return _core.merge_nodes([wave, *more])
+    steps = zip(sparse, sparse[1:], number, strict=False)
+    return _core.merge_nodes([wave, *(np.geomspace(a, b, n + 1)[1:-1] for a, b, n in steps)])
 
 
 def _refined(wave, dust, fine):
@@ -300,18 +297,14 @@ def _torus(path, wave_bytes, disk, slope, axes):
     values = dict(zip(SKIRTOR_AXES, axes, strict=True))
     row, above = table.row(**values), table.row(**values | {"inclination": 0.0})
     wave = np.frombuffer(wave_bytes)
-    seen, top, dust = (
-        table.spectrum(name, k) for name, k in (("disk", row), ("disk", above), ("dust", row))
-    )
+    places = (("disk", row), ("disk", above), ("dust", row))
+    seen, top, dust = (table.spectrum(*place) for place in places)
     fine = _fine(table.wave)
     dust = _refined(table.wave, np.asarray(dust, dtype=float), fine)
     scale = 1.0 / np.trapezoid(dust, fine)
     through = np.divide(seen, top, out=np.zeros_like(top), where=top > 0.0)
     face_on = _core.disk_spectrum(wave, slope, disk)
     face_on *= scale * np.trapezoid(top, table.wave) / np.trapezoid(face_on, wave)
-    parts = (
-        face_on,
-        face_on * np.interp(wave, table.wave, through),
-        np.interp(wave, fine, dust * scale, left=0.0, right=0.0),
-    )
-    return TorusSpectra(*map(frozen_array, parts))
+    seen = face_on * np.interp(wave, table.wave, through)
+    dust = np.interp(wave, fine, dust * scale, left=0.0, right=0.0)
+    return TorusSpectra(*map(frozen_array, (face_on, seen, dust)))

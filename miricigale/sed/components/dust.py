@@ -88,11 +88,8 @@ class _Mixture(DustEmission):
 def _between(axis, values):
     """Weights, shape (n, n_axis), of the linear interpolation between ascending nodes."""
     cell, part = _core.cells(axis, values)
-    out, rows, part = (
-        np.zeros((values.size, axis.size)),
-        np.arange(values.size),
-        np.clip(part, 0, 1),
-    )
+    out, rows = np.zeros((values.size, axis.size)), np.arange(values.size)
+    part = np.clip(part, 0, 1)
     out[rows, cell], out[rows, cell + 1] = 1.0 - part, part
     return out
 
@@ -335,11 +332,9 @@ def _alpha_tables(path):
     table = load_dl07(path)
     intensity = np.geomspace(0.1, U_MAX, 141)
     matrix = _core.hat_matrix(np.log(table["u"]), np.clip(np.log(intensity), None, np.log(U_MAX)))
-    out = []
-    for q in (-1, 0):
-        mass = table["single"][q] * table["single_power"][q][:, None]
-        out.append(np.exp(matrix @ np.log(np.maximum(mass, 1e-300))))
-    spectra, log_wave = np.concatenate(out), np.log(table["wave"])
+    ends = table["single"][[-1, 0]] * table["single_power"][[-1, 0]][..., None]
+    logs = np.log(np.maximum(ends, 1e-300))
+    spectra, log_wave = np.concatenate([np.exp(matrix @ q) for q in logs]), np.log(table["wave"])
     plain = spectra.copy()
     feature = slice(*np.searchsorted(table["wave"], PAH_33))
     ends = [feature.start, feature.stop]

@@ -9,6 +9,7 @@ from miricigale.sed import _core
 from miricigale.sed.component import Component, register
 from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import cached_by_file
+from miricigale.utils.units import frozen_array
 
 # n = 2 ... 10: of the lines beyond, each is at most 1.6 % of Lyman alpha in optical depth
 _N_LINES = 9
@@ -156,7 +157,4 @@ def load_lines(path):
     if not positive or np.any(np.diff(table[:, 0]) >= 0):
         what = "must hold six columns of 39 positive numbers, from the longest wavelength on"
         raise data_error(path, what)
-    lines = _core.inoue_lines(table)
-    for array in lines:
-        array.flags.writeable = False
-    return lines
+    return tuple(map(frozen_array, _core.inoue_lines(table)))

@@ -1,18 +1,17 @@
 """Star-formation histories, in steps of 1 Myr."""
 
 import hashlib
-import os
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable, Table
+from astropy.table import QTable
 
 from miricigale.sed import _core
 from miricigale.sed.component import Component, register
 from miricigale.sed.parameter import Parameter
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
-from miricigale.utils.table_files import read_table
+from miricigale.utils.tables import as_table
 from miricigale.utils.units import to_array
 
 _RATE = u.Msun / u.yr
@@ -211,7 +210,7 @@ class TableSFH(StarFormationHistory):
     def __init__(self, table=None, *, path=None, **defaults):
         if (table is None) == (path is None):
             raise argument_error("table", "a table or a path, one of them", "both or none")
-        table = _read(path if table is None else table)
+        table = QTable(as_table(path if table is None else table, "table"), copy=False)
         edges, rates = _bins(table)
         self._columns = tuple(name for name in table.colnames if name != "time")
         self._sha256 = hashlib.sha256(edges.tobytes() + rates.tobytes()).hexdigest()
@@ -242,14 +241,6 @@ class TableSFH(StarFormationHistory):
         if not np.any(self._rates[int(index), :steps]):
             return f"'age' must be after the first stars of the table, got {values['age']:g} Gyr"
         return None
-
-
-def _read(table):
-    if isinstance(table, Table):
-        return QTable(table, copy=False)
-    if not isinstance(table, (str, os.PathLike)):
-        raise argument_error("table", "an astropy table or a path", type(table).__name__)
-    return read_table(table, wanted="a star-formation history")
 
 
 def _bins(table):

@@ -103,8 +103,7 @@ class StellarPopulations(Component):
             Solar masses formed less and more than ``separation_age`` ago, spread over the
             table: a step is the mean of ten interpolations in age.
         """
-        young, old = self.masses(history, np.array([history.size]), values)[:, 0]
-        return young, old
+        return tuple(self.masses(history, np.array([history.size]), values)[:, 0])
 
     def masses(self, histories, end, values):
         """`age_weights` of n histories one after the other, each until one of ``end``: shape (2, n, n_age)."""

@@ -14,10 +14,11 @@ log = logging.getLogger(__name__)
 class Display:
     """A bar on a terminal, otherwise a line for each stage, or nothing."""
 
-    def __init__(self, show, total):
+    def __init__(self, show, units, keys):
+        self._units = units
         self.is_bar = show and on_terminal()
         self._lines = show and not self.is_bar
-        self._bar = progress(total=total, show=self.is_bar, desc="study", unit="step")
+        self._bar = progress(total=len(keys), show=self.is_bar, desc="study", unit="step")
         self._spent = {}
         self._facts = collections.Counter()
 
@@ -39,11 +40,11 @@ class Display:
     def begin(self, titles):
         self._bar.set_description(", ".join(titles))
 
-    def finish(self, stage, config, seconds):
+    def finish(self, stage, seconds):
         """A unit of a stage is done."""
         self._bar.update()
         spent = self._spent.setdefault(stage.name, [])
         spent.append(seconds)
-        if self._lines and len(spent) == len(stage.unit_names(config)) and any(spent):
+        if self._lines and len(spent) == len(self._units[stage.name]) and any(spent):
             units = f" ({len(spent)})" if len(spent) > 1 else ""
             print_line(f"{stage.title}{units}: {sum(spent):.1f} s")

@@ -3,6 +3,7 @@
 import collections
 import dataclasses
 import fnmatch
+import functools
 import hashlib
 import itertools
 import json
@@ -19,8 +20,8 @@ from miricigale.utils.parallel import available_memory, thread_count
 from miricigale.utils.progress import print_line
 from miricigale.workflow.config import load_config
 from miricigale.workflow.engine.display import Display
-from miricigale.workflow.engine.schedule import Task, run_tasks
-from miricigale.workflow.engine.stage import run_unit
+from miricigale.workflow.engine.schedule import Task, local_place, run_tasks
+from miricigale.workflow.engine.stage import Units, run_unit
 from miricigale.workflow.engine.store import CONFIG, ProductStore, check_disk
 
 log = logging.getLogger(__name__)
@@ -46,7 +47,7 @@ class StudyRunner:
     stages : callable or tuple of `~miricigale.workflow.engine.stage.Stage`
         In an order in which every stage comes after what it needs, or a function that returns
         them, which executors of processes need.
-    executor : `concurrent.futures.Executor`, optional
+    executor : `concurrent.futures.Executor` or `~miricigale.workflow.engine.cluster.Cluster`, optional
         Does units that do not need each other side by side, as many at once as there are
         threads and as the memory allows. Without it they are done one by one, each on all
         threads. The products are the same bytes either way.
@@ -110,9 +111,14 @@ class StudyRunner:
                 msg = f"stage {stage.name!r} needs {sorted(missing)}, which do not come before it"
                 raise ConfigError(msg)
             seen.add(stage.name)
+        names = {name: Units(units) for name, units in self.units.items()}
+        # by unit and stage: keys of the units that it reads
+        self._inputs = {
+            key: stage.needed(config, unit, names) for key, (stage, unit) in self._parts.items()
+        }
         self._needed = {
-            key: frozenset(itertools.chain(*stage.needed(config, unit, self.units).values()))
-            for key, (stage, unit) in self._parts.items()
+            key: frozenset(itertools.chain.from_iterable(inputs.values()))
+            for key, inputs in self._inputs.items()
         }
         chosen = set(self._parts) if until is None else self._matching(until, "until")
         for key in reversed(self._parts):
@@ -153,10 +159,7 @@ class StudyRunner:
             "version": stage.version,
             "seed": self.config.run.seed,
             "config": self.config.values(*stage.sections),
-            "inputs": {
-                name: store.checksums(keys)
-                for name, keys in stage.needed(self.config, unit, self.units).items()
-            },
+            "inputs": {name: store.checksums(keys) for name, keys in self._inputs[key].items()},
             "data": {name: fingerprint(name) for name in stage.resource_names()},
         }
         if stage.plan is not None:
@@ -332,13 +335,19 @@ class StudyRunner:
 
     def _execute(self, store):
         """Do all units, each when what it needs is done."""
-        with Display(self.progress_bar, len(self.keys)) as display:
+        limits = self.config.run
+        places = getattr(self.executor, "places", None)
+        n_threads = self.n_threads
+        if places is None:
+            memory = limits.memory * 1e9 or 0.5 * available_memory()
+            places = functools.partial(dict, local_place(self.executor, n_threads, memory))
+        elif not limits.threads:
+            n_threads = sum(place.slots for place in places().values())
+        with Display(self.progress_bar, self.units, self.keys) as display:
+            tasks = [self._task(key, store, display) for key in self.keys]
+            wait_for = getattr(self.executor, "wait_for", None)
             run_tasks(
-                [self._task(key, store, display) for key in self.keys],
-                executor=self.executor,
-                n_threads=self.n_threads,
-                memory=self.config.run.memory * 1e9 or 0.5 * available_memory(),
-                report=display.begin,
+                tasks, places=places, n_threads=n_threads, wait_for=wait_for, report=display.begin
             )
 
     def _task(self, key, store, display):
@@ -350,7 +359,7 @@ class StudyRunner:
             nonlocal digest
             digest = self.digest(key, store)
             if store.is_current(key, digest):
-                display.finish(stage, self.config, 0.0)
+                display.finish(stage, 0.0)
                 return None
             if store.records.get(key, {}).get("hash") != digest:
                 store.drop(key)
@@ -374,7 +383,7 @@ class StudyRunner:
             for category, text in warned:
                 display.warn(category, text)
             log.debug("%s took %.1f s", key, seconds)
-            display.finish(stage, self.config, seconds)
+            display.finish(stage, seconds)
 
         return Task(
             key,

@@ -1,10 +1,20 @@
-"""Tasks that need each other, side by side within a number of threads and an amount of memory."""
+"""Tasks that need each other, side by side within the threads and the memory of each machine."""
 
+import collections
 import dataclasses
+import heapq
+import logging
+import time
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
+from typing import NamedTuple
 
 from miricigale.utils.exceptions import DataError
+
+log = logging.getLogger(__name__)
+
+#: Workers that may die over one task.
+_DEATHS = 4
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -49,7 +59,96 @@ class _Inline(Executor):
         return future
 
 
-def run_tasks(tasks, *, executor=None, n_threads=1, memory=float("inf"), report=None):
+class Place(NamedTuple):
+    """
+    Where tasks are done: the processes of this machine, or a worker of a cluster.
+
+    Parameters
+    ----------
+    submit : callable
+        As that of an executor.
+    slots : int
+        Tasks that may be done there side by side.
+    n_threads : int
+        Threads of the machine, for a task alone.
+    memory : float
+        Bytes that these may take together.
+    """
+
+    submit: Callable
+    slots: int
+    n_threads: int
+    memory: float
+
+
+def local_place(executor, n_threads, memory):
+    """
+    Tell where tasks are done on this machine.
+
+    Parameters
+    ----------
+    executor : `concurrent.futures.Executor` or None
+        Does up to ``n_threads`` tasks side by side; one by one in this thread without it.
+    n_threads : int
+        Threads of all tasks together.
+    memory : float
+        Bytes that tasks side by side may take.
+
+    Returns
+    -------
+    places : dict of str to `Place`
+        One.
+    """
+    slots = n_threads if executor is not None else 1
+    return {"here": Place((executor or _Inline()).submit, slots, n_threads, memory)}
+
+
+class _Queue:
+    """Tasks in their order; one is ready when all groups that it needs are complete."""
+
+    def __init__(self, tasks):
+        self._tasks = tasks
+        self._left = collections.Counter(task.group for task in tasks)
+        self._missing, self._waiting = [], collections.defaultdict(list)
+        # by memory: there are few amounts and many tasks
+        self._ready = collections.defaultdict(list)
+        self.n_ready = 0
+        for k, task in enumerate(tasks):
+            groups = [group for group in task.needs if group in self._left]
+            self._missing.append(len(groups))
+            for group in groups:
+                self._waiting[group].append(k)
+            if not groups:
+                self._add(k)
+
+    def _add(self, k):
+        heapq.heappush(self._ready[self._tasks[k].memory], k)
+        self.n_ready += 1
+
+    def put_back(self, task):
+        """Let a task that was taken begin once more."""
+        self._add(self._tasks.index(task))
+
+    def take(self, memory):
+        """Return the first task that needs no more memory, or None."""
+        fitting = [m for m, waiting in self._ready.items() if waiting and m <= memory]
+        if not fitting:
+            return None
+        self.n_ready -= 1
+        least = min(fitting, key=lambda m: self._ready[m][0])
+        return self._tasks[heapq.heappop(self._ready[least])]
+
+    def complete(self, task):
+        """Note that a task is done."""
+        self._left[task.group] -= 1
+        if not self._left[task.group]:
+            for k in self._waiting.pop(task.group, ()):
+                self._missing[k] -= 1
+                if not self._missing[k]:
+                    self._add(k)
+
+
+def run_tasks(tasks, *, places, n_threads, wait_for=None, report=None):
     """
     Do tasks, each when what it needs is complete.
 
@@ -57,12 +156,14 @@ def run_tasks(tasks, *, executor=None, n_threads=1, memory=float("inf"), report=
     ----------
     tasks : iterable of `Task`
         In the order in which they begin, as far as they can.
-    executor : `concurrent.futures.Executor`, optional
-        Does up to ``n_threads`` of them side by side; one by one without it.
-    n_threads : int, optional
+    places : callable
+        Gives the places as they are now, a dict of str to `Place`. A task begins where most memory is left; one
+        that is larger than the memory of all places, alone where there is most. What runs at a place that
+        is there no more is begun again.
+    n_threads : int
         Threads of all tasks together.
-    memory : float, optional
-        Bytes that tasks side by side may take; a larger one is done alone.
+    wait_for : float, optional
+        Seconds after which places are asked for again; not while tasks run if not given.
     report : callable, optional
         Called with the titles of what runs, whenever that changes.
 
@@ -71,53 +172,79 @@ def run_tasks(tasks, *, executor=None, n_threads=1, memory=float("inf"), report=
     Exception
         The first that a task raised, after what ran beside it has been finished.
     `~miricigale.utils.exceptions.DataError`
-        If a process of the executor died.
+        If a process of an executor died, or four places were lost over one task.
     """
-    slots = n_threads if executor is not None else 1
-    submit = (executor or _Inline()).submit
-    waiting, running, error = list(tasks), {}, None
+    queue, running, error = _Queue(list(tasks)), {}, None
+    deaths = collections.Counter()
     while True:
+        now = places()
+        for future, (task, place) in list(running.items()):
+            if place not in now and not future.done():
+                future.cancel()
+                del running[future]
+                deaths[task] += 1
+                if deaths[task] == _DEATHS:
+                    msg = (
+                        f"{_DEATHS} workers died over {task.title}, the last at {place}; was there too little "
+                        "memory? What is finished stands: the same command resumes it"
+                    )
+                    raise DataError(msg)
+                log.warning("%s is lost; %s is done again by another worker", place, task.title)
+                queue.put_back(task)
         task = None
-        if error is None and len(running) < slots:
-            ready = _ready(waiting, running.values())
-            task = _fitting(ready, running.values(), memory)
+        if error is None and len(running) < n_threads:
+            place, left = _roomiest(now, running.values())
+            task = queue.take(left)
         if task is not None:
-            waiting.remove(task)
-            together = min(slots, len(running) + len(ready))
+            slots = min(n_threads, sum(one.slots for one in now.values()))
+            together = min(slots, len(running) + queue.n_ready + 1)
+            threads = min(now[place].n_threads, max(1, n_threads // together))
             try:
-                future = task.begin(submit, n_threads // together)
+                future = task.begin(now[place].submit, threads)
             except BrokenExecutor as err:
                 raise _died(task) from err
-            if future is not None:
-                running[future] = task
+            if future is None:
+                queue.complete(task)
+            else:
+                running[future] = task, place
                 if report is not None:
-                    report([other.title for other in running.values()])
+                    report([other.title for other, _ in running.values()])
         elif running:
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
-                task = running.pop(future)
+            for future in wait(running, wait_for, return_when=FIRST_COMPLETED).done:
+                task, _ = running.pop(future)
                 failed = future.exception()
                 if isinstance(failed, BrokenExecutor):
                     raise _died(task) from failed
                 if failed is None:
                     task.finish(future.result())
+                    queue.complete(task)
                 error = error or failed
         elif error is not None:
             raise error
+        elif queue.n_ready:
+            log.warning("there are no workers any more: waiting for some")
+            while not places():
+                time.sleep(wait_for)
         else:
             return
 
 
+def _roomiest(places, running):
+    """Name of the place with most memory left, and how much; none (-1) where no slot is free."""
+    used, tasks = collections.Counter(), collections.Counter()
+    for task, name in running:
+        used[name] += task.memory
+        tasks[name] += 1
+    free = {
+        name: one.memory - used[name] for name, one in places.items() if tasks[name] < one.slots
+    }
+    if not free:
+        return None, -1
+    name = max(free, key=free.get)
+    largest = max(one.memory for one in places.values())
+    # what fits nowhere is done alone
+    return name, float("inf") if free[name] == largest and not tasks[name] else free[name]
+
+
 def _died(task):
     return DataError(f"a process ended during {task.title}; was there too little memory?")
-
-
-def _ready(waiting, running):
-    """Tasks whose needs are complete."""
-    incomplete = {task.group for task in (*waiting, *running)}
-    return [task for task in waiting if incomplete.isdisjoint(task.needs)]
-
-
-def _fitting(ready, running, memory):
-    """The first task that there is memory for."""
-    left = memory - sum(task.memory for task in running)
-    return next((task for task in ready if not running or task.memory <= left), None)

@@ -1,7 +1,9 @@
 """A stage of the study, and what it sees of the run."""
 
+import collections
 import dataclasses
 import functools
+import itertools
 import socket
 import time
 import types
@@ -35,7 +37,7 @@ class Stage:
         What it does, for the progress line.
     needs : tuple of str
         Stages whose products it reads; reading another product is an error. Of these a unit reads the
-        units that are parts of it, or it of them (see `related`): ``"sky/band"`` those named
+        units that are parts of it, or it of them (see `Units`): ``"sky/band"`` those named
         ``"sky"``, ``"band"``, ``"sky/band"`` and ``"sky/band-1"``, and a stage's only one.
     sections : tuple of str
         Sections (``"scene"``) or keys (``"run.keep_level1b"``) of the configuration that it
@@ -91,8 +93,8 @@ class Stage:
             The configuration.
         unit : str
             Which.
-        units : dict of str to tuple of str
-            Names of the units of each stage.
+        units : dict of str to `Units`
+            The units of each stage.
 
         Returns
         -------
@@ -101,9 +103,7 @@ class Stage:
         """
         own = f"{self.within(config)}/{unit}" if self.within else unit
         return {
-            name: [
-                f"{name}:{other}" if other else name for other in units[name] if related(own, other)
-            ]
+            name: [f"{name}:{other}" if other else name for other in units[name].related(own)]
             for name in self.needs
         }
 
@@ -116,14 +116,41 @@ class Stage:
         return f"{self.name}:{unit}" if unit else self.name
 
 
-def related(first, second):
+class Units:
     """
-    Return whether all parts of one of two units are parts of the other.
+    Names of the units of a stage, and which of them belong to another unit.
 
-    A part with a number (``"band-1"``) is a part of that without (``"band"``).
+    Two units are related if all parts of one are parts of the other. A part with a number (``"band-1"``) is
+    a part of that without (``"band"``).
+
+    Parameters
+    ----------
+    names : iterable of str
+        In their order.
     """
-    parts = _parts(first), _parts(second)
-    return parts[0] <= parts[1] or parts[1] <= parts[0]
+
+    def __init__(self, names):
+        self._names = tuple(names)
+        self._parts = [_parts(name) for name in self._names]
+        # so that looking for one does not go through all
+        self._same, self._with = collections.defaultdict(list), collections.defaultdict(list)
+        for k, parts in enumerate(self._parts):
+            self._same[parts].append(k)
+            for part in parts:
+                self._with[part].append(k)
+
+    def related(self, unit):
+        """Names of the units that are parts of a unit, or it of them, in their order."""
+        parts = _parts(unit)
+        subsets = itertools.chain(
+            *(itertools.combinations(parts, n) for n in range(len(parts) + 1))
+        )
+        found = {k for some in subsets for k in self._same.get(frozenset(some), ())}
+        few = min(
+            (self._with.get(part, ()) for part in parts), key=len, default=range(len(self._names))
+        )
+        found.update(k for k in few if parts <= self._parts[k])
+        return [self._names[k] for k in sorted(found)]
 
 
 @functools.cache

@@ -46,7 +46,7 @@ class ProductStore(RecordFolder):
         """Checksums of all products of units by their keys; those that are not done have none."""
         return {
             name: product["sha256"]
-            for key in sorted(set(keys).intersection(self.records))
+            for key in sorted(self.records.keys() & set(keys))
             for name, product in self.records[key]["products"].items()
         }
 

@@ -86,13 +86,10 @@ def error_figure(errors, bands, limits):
     flux = np.geomspace(0.02, max(300, 30 * max(finite, default=1)), 120) * u.uJy
     # darker at shorter wavelengths, distinct to color-blind readers
     shades = colormaps["viridis"](np.linspace(0, 0.82, len(order)))
-    plot_error_function(
-        {band_label(name): flux.value for name in order},
-        {band_label(name): errors.sigma(flux, name).to_value(u.uJy) for name in order},
-        limits={band_label(name): limits[name] for name in order},
-        ax=ax,
-        colors={band_label(name): shade for name, shade in zip(order, shades, strict=True)},
-    )
+    sigma = {band_label(name): errors.sigma(flux, name).to_value(u.uJy) for name in order}
+    ends = {band_label(name): limits[name] for name in order}
+    options = {"limits": ends, "colors": dict(zip(sigma, shades, strict=True))}
+    plot_error_function(dict.fromkeys(sigma, flux.value), sigma, ax=ax, **options)
     legend(ax, ncols=2)
     return figure
 
@@ -115,10 +112,8 @@ def limit_figure(entries):
     figure, axes = new_figure(size=(WIDTH, 3.4))
     ax, bands = axes[0, 0], by_wavelength(entries)
     wave = np.array([Filter.from_name(name).pivot.to_value(u.um) for name in bands])
-    values = {
-        key: np.array([entries[name][key] for name in bands], float)
-        for key in (*_LIMITS, "proposal")
-    }
+    keys = (*_LIMITS, "proposal")
+    values = {key: np.array([entries[name][key] for name in bands], float) for key in keys}
     own = np.array([entries[name]["ceers"] for name in bands], bool)
     for key, (fmt, color, fill, label) in _LIMITS.items():
         ax.plot(wave, values[key], fmt, color=color, mfc=fill, lw=1.2, label=label)
@@ -132,12 +127,8 @@ def limit_figure(entries):
     low, high = (shown.min(), shown.max()) if shown.size else (20, 26)
     for x, name in zip(wave, bands, strict=True):
         ax.text(x, high + 0.35, band_label(name), ha="center", va="bottom", fontsize=8, rotation=30)
-    ax.set(
-        xlim=(wave.min() - 1.5, wave.max() + 1.5),
-        ylim=(low - 0.6, high + 1.3),
-        xlabel="wavelength (µm)",
-        ylabel="5-sigma limit (AB)",
-    )
+    ax.set(xlim=(wave.min() - 1.5, wave.max() + 1.5), xlabel="wavelength (µm)")
+    ax.set(ylim=(low - 0.6, high + 1.3), ylabel="5-sigma limit (AB)")
     legend(ax, loc="lower left")
     return figure
 
@@ -177,11 +168,8 @@ def point_figure(points, bands):
     reach = np.clip(1.3 * far, 0.05, 0.5)
     for k, ratio in enumerate(ratios):
         x = k + np.linspace(-0.3, 0.3, len(ratio))
-        for keep, marker in (
-            (np.abs(ratio - 1) <= reach, "."),
-            (ratio > 1 + reach, "^"),
-            (ratio < 1 - reach, "v"),
-        ):
+        inside, above = np.abs(ratio - 1) <= reach, ratio > 1 + reach
+        for keep, marker in ((inside, "."), (above, "^"), (ratio < 1 - reach, "v")):
             y = np.clip(ratio[keep], 1 - 0.97 * reach, 1 + 0.97 * reach)
             ax.plot(x[keep], y, marker, ms=4, color=MEASURED, alpha=0.6)
         if np.isfinite(ratio).any():

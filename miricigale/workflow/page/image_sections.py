@@ -42,10 +42,8 @@ def write_images(page, mosaics):
     rate, cal = (image(f"{sky}/exposures/{unit}_{kind}.fits") for kind in ("rate", "cal"))
     page.figure("subtraction", pictures.subtraction_figure(rate, cal, reducer_of(config)))
     suffix, _ = measured_mosaic(config)
-    pairs = [
-        (image(f"{sky}/mosaic_{n}{suffix}.fits"), image(f"{sky}/photometry/{n}_model.fits"))
-        for n in chosen
-    ]
+    paths = f"{sky}/mosaic_{{}}{suffix}.fits", f"{sky}/photometry/{{}}_model.fits"
+    pairs = [tuple(image(path.format(name)) for path in paths) for name in chosen]
     page.figure("residual", pictures.residual_figure(pairs, chosen))
     middle = len(chosen) // 2
     whole = pictures.residual_figure(pairs[middle:][:1], chosen[middle:][:1], size=None)
@@ -64,16 +62,13 @@ def write_detections(page):
         known = {key: value for key, value in row.items() if key not in unknown}
         rows.append({"sample": f"{prior} < {row['limit']:g}", "interval": interval, **known})
     page.section("detections")
-    page.table(
-        "shares",
-        rows,
-        other_exposures="" if m["as_paper"] else ", six bands, other exposures",
-        paper_sigma=page.sentence("paper_sigma") if page.config.errors.statistic == "mad" else "",
-    )
+    others = "" if m["as_paper"] else ", six bands, other exposures"
+    sigma = page.sentence("paper_sigma") if page.config.errors.statistic == "mad" else ""
+    page.table("shares", rows, other_exposures=others, paper_sigma=sigma)
     reasons = {name.replace("_", " "): n for name, n in m["n_left_out"].items() if n}
     outside = reasons.pop("outside field", 0)
-    rows = ((name, browse(page.first.name, n, flag=name)) for name, n in reasons.items())
-    rows = [dict(zip(("reason", "sources"), row, strict=True)) for row in rows]
+    links = {name: browse(page.first.name, n, flag=name) for name, n in reasons.items()}
+    rows = [{"reason": name, "sources": link} for name, link in links.items()]
     cuts = [f"{key} {m['n_left_out'][key]}" for key in CUTS if getattr(page.config.fit, key)]
     if cuts:
         page.text("cuts", counts=", ".join(cuts))

@@ -5,18 +5,13 @@ from urllib.parse import quote, urlencode
 from miricigale.filters import Filter
 from miricigale.pages import Link
 from miricigale.plotting.axes import MEASURED, SECOND
+from miricigale.workflow.page.declared import texts_of
 from miricigale.workflow.truths import CATALOG
 
+_LABELS = texts_of("labels")
 #: Sets of bands: what they are called, and their colors.
-SET_LABELS = {
-    "all": "with MIRI",
-    "none": "without MIRI",
-    "blue": "with the shorter half of MIRI",
-    "red": "with the longer half of MIRI",
-}
+SET_LABELS = _LABELS["sets"]
 SET_COLORS = {"all": MEASURED, "none": SECOND, "blue": "#0d9488", "red": "#a21caf"}
-_CLASS_LABELS = {"agn": "AGN", "unknown": "not in the fit"}
-_PARAMETER_LABELS = {"frac_agn": "fracAGN", "sfr_100myr": "SFR (100 Myr)"}
 
 
 def band_label(name):
@@ -26,12 +21,12 @@ def band_label(name):
 
 def class_label(name):
     """Return what a class of `~miricigale.evaluation.classify` is called."""
-    return _CLASS_LABELS.get(name, str(name))
+    return _LABELS["classes"].get(name, str(name))
 
 
 def parameter_label(name):
     """Return what a parameter of the fits is called."""
-    return _PARAMETER_LABELS.get(name, name.replace("_", " "))
+    return _LABELS["parameters"].get(name, name.replace("_", " "))
 
 
 def truth_label(one):

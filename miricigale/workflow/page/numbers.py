@@ -164,11 +164,9 @@ def above_proposal(truth, bands):
 
 def as_paper(config):
     """Whether exposures, bands and selection are those of Yang et al. 2021."""
-    return (
-        set(config.exposures.filters) == set(CEERS_FILTERS)
-        and all(as_ceers(config, name) for name in config.exposures.filters)
-        and config.highres.filter == "wfc3.f160w"
-    )
+    bands = config.exposures.filters
+    alike = set(bands) == set(CEERS_FILTERS) and config.highres.filter == "wfc3.f160w"
+    return alike and all(as_ceers(config, name) for name in bands)
 
 
 def _usable(matched, name):
@@ -289,6 +287,8 @@ def study_metrics(config, tables, area):
     bands = config.exposures.filters
     field, selection = tables.field, np.asarray(tables.matched["selection"])
     off = np.where(tables.inside, ~0, SampleFlags.OUTSIDE_FIELD)
+    # what else a source outside of the field may be is no matter
+    left_out = {f.name.lower(): int(np.count_nonzero(selection & f & off)) for f in SampleFlags}
     # with a single band, detections in that band are counted
     least = min(2, len(bands))
     return {
@@ -296,11 +296,7 @@ def study_metrics(config, tables, area):
         "n_field": int(field.sum()),
         "n_matched": int((field & np.asarray(tables.matched["matched"])).sum()),
         "n_sample": int((selection == 0).sum()),
-        "n_left_out": {
-            # what else a source outside of the field may be is no matter
-            flag.name.lower(): int(np.count_nonzero(selection & flag & off))
-            for flag in SampleFlags
-        },
+        "n_left_out": left_out,
         "area": float(area.to_value(u.arcmin**2)),
         "as_paper": as_paper(config),
         "detections": detection_counts(tables.detections, bands),

@@ -31,27 +31,16 @@ def study_results(config, truths, every, metrics):
     # the paper's limits are where the median absolute difference is a fifth of the flux
     options = {"statistic": "median_abs", "bin_size": config.errors.bin_size}
     errors = matched_errors(reference.matched, reference.inside, bands, **options)
-    return StudyResults(
-        tuple(
-            TruthResults(
-                name,
-                None if isinstance(truths[name].frac_agn, str) else truths[name].frac_agn,
-                tables.truth,
-                tables.matched,
-                tables.fits,
-                tables.field,
-                {
-                    band: has_flag(tables.matched, f"{band}_condition", ConditionFlags.CROWDED)
-                    for band in bands
-                },
-            )
-            for name, tables in every.items()
-        ),
-        bands,
-        config.highres.filter,
-        {name: float(errors.limiting_magnitude(name).value) for name in bands},
-        {name: metrics["bands"][name]["etc_limit"] for name in bands},
-    )
+    results, crowded = [], ConditionFlags.CROWDED
+    for name, tables in every.items():
+        fraction, matched = truths[name].frac_agn, tables.matched
+        fraction = None if isinstance(fraction, str) else fraction
+        parts = fraction, tables.truth, matched, tables.fits, tables.field
+        near = {band: has_flag(matched, f"{band}_condition", crowded) for band in bands}
+        results.append(TruthResults(name, *parts, near))
+    limits = {name: float(errors.limiting_magnitude(name).value) for name in bands}
+    calculator = {name: metrics["bands"][name]["etc_limit"] for name in bands}
+    return StudyResults(tuple(results), bands, config.highres.filter, limits, calculator)
 
 
 def extra_numbers(study, metrics, kernels):

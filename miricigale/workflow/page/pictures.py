@@ -9,21 +9,13 @@ from scipy.ndimage import uniform_filter
 from miricigale.evaluation import sigma_mad
 from miricigale.photometry import encircled_flux
 from miricigale.plotting.axes import MEASURED, SECOND, TRUE, WIDTH, legend, new_figure
-from miricigale.plotting.images import mark_sky, plot_color, plot_image, plot_model_residual
+from miricigale.plotting.images import filled, mark_sky, plot_color, plot_image, plot_model_residual
 from miricigale.psf import encircled_energy, radius_of_encircled_energy
 from miricigale.psf.wiener import energy_error
 from miricigale.workflow.page.labels import band_label
 
 #: Error of the encircled energy (%) that counts as small.
 _SMALL_ERROR = 4
-
-
-def filled(image):
-    """Values of an image with NaN where it is masked."""
-    data = np.array(image.data, float)
-    if image.mask is not None:
-        data[np.asarray(image.mask, bool)] = np.nan
-    return data
 
 
 def _scale(image):

@@ -47,7 +47,9 @@ def exposure_kinds(config, forecasts, bands):
             "as_ceers": "yes" if bands[name]["ceers"] else "no",
             "readout": readout,
             "frames": f"{n_groups} x {n_integrations}",
-            "exposures": f"{n_pointings} x {len(group) // n_pointings}",
+            "exposures": f"{len(group)} at {n_pointings} pointings"
+            if len(group) % n_pointings
+            else f"{n_pointings} x {len(group) // n_pointings}",
             "time": sum(e.exposure_time for e, _ in group).to_value(u.s) / n_pointings,
             "background": study_background(config, name).value,
             "fill": max(float(table["sky_fraction"][0]) for _, table in group),
@@ -77,9 +79,8 @@ def library_rows(model):
         what = f"{record.title} ({part.resource})" if record else "closed form"
         if part.role == "stellar":
             what += f"; IMF {part.imf}"
-        rows.append(
-            (part.role, part.name, what, part.reference or (record.citation if record else ""))
-        )
+        cite = part.reference or (record.citation if record else "")
+        rows.append((part.role, part.name, what, cite))
     return rows
 
 
@@ -123,10 +124,8 @@ def catalog_facts(config, catalog):
     if none := np.count_nonzero(~known & ~np.asarray(catalog["star"], bool)):
         facts["galaxies without redshift"] = f"{none}: without a model SED, and so on no image"
     existing = existing_bands(config)
-    of = (
-        "with depths" if all(existing.values()) else "with the errors of each source in the catalog"
-    )
-    of = f"{len(existing)} existing bands, {of} ({', '.join(existing)})"
+    own = "depths" if all(existing.values()) else "the errors of each source in the catalog"
+    of = f"{len(existing)} existing bands, with {own} ({', '.join(existing)})"
     facts["fitted in the end"] = f"{of}, and {len(config.exposures.filters)} of MIRI"
     excess = " or ".join(f"{value:g}" for value in config.fit.dust_excess)
     facts["dust of the fit"] = f"{excess or 1} times the power that attenuation takes"

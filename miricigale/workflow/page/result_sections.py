@@ -165,8 +165,7 @@ def _write_redshifts(page, rows):
     if len(page.tables.sample):
         true = page.tables.sample["redshift"]
         fits = {SET_LABELS[unit]: (true, fit) for unit, fit in page.tables.fits.items()}
-        figure = study_figures.redshift_figure(fits)
-        page.figure("scatter", figure)
+        page.figure("scatter", study_figures.redshift_figure(fits))
     page.figure("errors", study_figures.histogram_figure(page.study, "redshift"))
     page.table("table", rows)
     if outliers := list(_outlier_rows(page)):

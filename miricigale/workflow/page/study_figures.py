@@ -67,13 +67,11 @@ def answer_figure(study, numbers):
     for k, (name, label) in enumerate(_both(truths[0]).items()):
         color, marker = STYLES[k]
         place = injected + 0.012 * (k - 0.5)
-        for ax, quantity, scale in zip(
-            axes.values(), ("z_outliers", "z_scatter", "frac_offset"), (100, 100, 1), strict=True
-        ):
+        quantities = (("z_outliers", 100), ("z_scatter", 100), ("frac_offset", 1))
+        for ax, (quantity, scale) in zip(axes.values(), quantities, strict=True):
             rows = [numbers[one.name, name, quantity] for one in truths]
-            value, low, high = (
-                scale * np.array([r[c] for r in rows]) for c in ("value", "low", "high")
-            )
+            found = [[row[column] for row in rows] for column in ("value", "low", "high")]
+            value, low, high = scale * np.array(found)
             if quantity == "frac_offset":
                 scatter = [numbers[one.name, name, "frac_scatter"]["value"] for one in truths]
                 value = value + injected

@@ -53,14 +53,9 @@ def experiment_axes(name, config):
 def _experiment_plan(config, unit):
     """What an experiment takes from the package, for hashing."""
     name = unit.partition("/")[2]
-    plan = {"axes": plain_axes(experiment_axes(name, config))}
-    if name == "free_agn":
-        plan["n"] = N_FREE
-    elif name == "between":
-        plan["agn_error"] = AGN_ERROR
-    elif name == "far_infrared":
-        plan["depths"] = dict(HERSCHEL_DEPTHS)
-    return plan
+    own = {"free_agn": {"n": N_FREE}, "between": {"agn_error": AGN_ERROR}}
+    own["far_infrared"] = {"depths": dict(HERSCHEL_DEPTHS)}
+    return {"axes": plain_axes(experiment_axes(name, config))} | own.get(name, {})
 
 
 def far_infrared_photometry(sample, *, seed):
@@ -196,10 +191,7 @@ def write_experiments(page, every):
     numbers = described_rows([(*row, *values.values()) for *row, values in rows], texts)
     declared = texts_of("experiments")
     sentences = " ".join(declared["sentences"][name] for name in names)
-    page.numbers(
-        "experiments",
-        numbers,
-        sentences=sentence(sentences, {"n_free": N_FREE, "agn_error": AGN_ERROR}),
-    )
+    sentences = sentence(sentences, {"n_free": N_FREE, "agn_error": AGN_ERROR})
+    page.numbers("experiments", numbers, sentences=sentences)
     labels = declared["labels"]
     page.table("table", [dict(row) | {"fit": labels[row["experiment"]]} for row in numbers])

@@ -4,8 +4,10 @@ import functools
 import math
 import operator
 from pathlib import Path
+from typing import NamedTuple
 
 import astropy.units as u
+import numpy as np
 from astropy.coordinates import SkyCoord
 
 from miricigale.instrument import (
@@ -17,6 +19,8 @@ from miricigale.instrument import (
     tangent_offset,
     tile_offsets,
 )
+from miricigale.utils.positions import as_positions
+from miricigale.utils.table_files import read_table
 from miricigale.workflow.background import band_background, of_filter, text_by_filter
 from miricigale.workflow.options import of_option, require
 from miricigale.workflow.truths import truth_names
@@ -46,7 +50,7 @@ def study_exposures(config):
     """
     options = config.exposures
     patterns = tuple(_dithers(options, k)[0] for k in range(len(options.filters)))
-    return dict(_exposures(config.pointing, options, patterns))
+    return dict(_exposures(config.pointing, options, patterns, _stamp(config.pointing)))
 
 
 def dithers_text(config):
@@ -83,9 +87,35 @@ def _file_pattern(path, *_, **part):
     return tuple(map(tuple, offsets.to_value(u.arcsec).tolist()))
 
 
+class Pointing(NamedTuple):
+    """
+    Where the telescope looks once.
+
+    Parameters
+    ----------
+    center : `~astropy.coordinates.SkyCoord`
+        Of the field.
+    roll : `~astropy.units.Quantity`
+        Position angle of V3.
+    bands : tuple of str
+        Filters that are exposed there.
+    time : `~astropy.units.Quantity`, optional
+        Exposure time of each, all dithers; as elsewhere if None.
+    """
+
+    center: SkyCoord
+    roll: u.Quantity
+    bands: tuple
+    time: u.Quantity | None = None
+
+
 def study_pointings(config):
     """Centers of the pointings."""
-    return _centers(config.pointing)
+    return tuple(one.center for one in _study_pointings(config))
+
+
+def _study_pointings(config):
+    return _pointings(config.pointing, config.exposures.filters, _stamp(config.pointing))
 
 
 def pointing_of(config, exposure):
@@ -93,22 +123,56 @@ def pointing_of(config, exposure):
     return min(study_pointings(config), key=exposure.pointing.separation)
 
 
+def _stamp(field):
+    """Time and size of the file of pointings, which is read again when it has changed; none without one."""
+    if field.table is None:
+        return None
+    with of_option("[pointing] centers:", OSError):
+        stat = field.table.stat()
+    return stat.st_mtime_ns, stat.st_size
+
+
 @functools.lru_cache(maxsize=8)
-def _centers(field):
-    """Centers of the pointings of a section of a configuration."""
+def _pointings(field, filters, _):
+    """Pointings of a section of a configuration."""
+    roll = field.roll * u.deg
+    if field.table is not None:
+        with of_option(f"[pointing] centers: {field.table.name}:", ValueError, u.UnitsError):
+            return _read_pointings(read_table(field.table, wanted="pointings"), roll, filters)
     if field.centers:
-        return tuple(SkyCoord(*map(float, text.split()), unit="deg") for text in field.centers)
+        centers = [SkyCoord(*map(float, text.split()), unit="deg") for text in field.centers]
+        return tuple(Pointing(center, roll, filters) for center in centers)
     center = SkyCoord(field.ra * u.deg, field.dec * u.deg)
     if field.tiles == (1, 1):
-        return (center,)
+        return (Pointing(center, roll, filters),)
     # as dithers are, along the axes of the imager
-    pa = Exposure("miri.f770w", n_groups=2, pointing=center, roll=field.roll * u.deg).pa_aper
+    pa = Exposure("miri.f770w", n_groups=2, pointing=center, roll=roll).pa_aper
     offsets = tile_offsets(*field.tiles, overlap=field.overlap)
-    return tuple(tangent_offset(center, dx, dy, pa) for dx, dy in offsets)
+    return tuple(Pointing(tangent_offset(center, dx, dy, pa), roll, filters) for dx, dy in offsets)
+
+
+def _read_pointings(table, roll, filters):
+    """Pointings of the rows of a table; a row without a roll, bands or time has those of the study."""
+    known = {name.rpartition(".")[2]: name for name in filters}
+    columns, found = {name.lower(): name for name in table.colnames}, []
+    for row, center in zip(table, as_positions(table, "centers"), strict=True):
+        given = {"roll": roll, "time": None}
+        for name, unit in (("roll", u.deg), ("time", u.s)):
+            value = row[columns[name]] if name in columns else np.ma.masked
+            if not np.ma.is_masked(value):
+                given[name] = u.Quantity(value, unit)
+        text = row[columns["bands"]] if "bands" in columns else ""
+        names = [] if np.ma.is_masked(text) else str(text).lower().replace(",", " ").split()
+        bands = [known.get(name.rpartition(".")[2]) for name in names] or filters
+        if None in bands:
+            msg = f"'bands' must be of [exposures] filters {list(filters)}, got {text!r}"
+            raise ValueError(msg)
+        found.append(Pointing(center, bands=tuple(bands), **given))
+    return tuple(found)
 
 
 @functools.lru_cache(maxsize=8)
-def _exposures(field, options, patterns):
+def _exposures(field, options, patterns, stamp):
     """Names and exposures of two sections of a configuration, and of the dithers of each filter."""
     units = {}
     for k, name in enumerate(options.filters):
@@ -123,8 +187,11 @@ def _exposures(field, options, patterns):
             require(good, "exposures", "n_dithers", wanted, n_dithers)
         offsets = pattern if named else pattern * u.arcsec
         number = 0
-        for center in _centers(field):
-            exposure, n = _planned(name, own, n_dithers, center, field.roll * u.deg, options)
+        for center, roll, bands, time in _pointings(field, options.filters, stamp):
+            if name not in bands:
+                continue
+            exposure, n = _planned(name, own, n_dithers, center, roll, options)
+            exposure = exposure if time is None else exposure.replace(time=time / n)
             for dither in exposure.dithered(offsets, n):
                 units[f"{name}-{number}"] = dither.replace(dither=number)
                 number += 1
@@ -193,9 +260,9 @@ def band_exposures(config, name):
 
 
 def pointing_exposures(config, name):
-    """The exposures of one band at the first pointing; those at the others are the same elsewhere."""
+    """The exposures of one band at its first pointing; there are as many dithers at the others."""
     own = band_exposures(config, name)
-    return own[: len(own) // len(study_pointings(config))]
+    return own[: len(own) // sum(name in one.bands for one in _study_pointings(config))]
 
 
 def pointing_time(config, name):

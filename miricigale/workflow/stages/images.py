@@ -140,7 +140,7 @@ def _sky_plan(config, unit):
 @stage(
     "exposures",
     "exposure",
-    version=11,
+    version=12,
     needs=("truth",),
     sections=(*IMAGES, "run.keep_level1b"),
     resources=EXPOSURE_RESOURCES,
@@ -179,7 +179,7 @@ def make_exposure(context, unit):
 @stage(
     "mosaics",
     "mosaic",
-    version=8,
+    version=9,
     needs=("exposures",),
     sections=(*GRID, "reduction", "highres.pixel_scale"),
     units=truth_bands,

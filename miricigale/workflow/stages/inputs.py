@@ -118,14 +118,10 @@ def study_catalog(options):
 @functools.lru_cache(maxsize=2)
 def _catalog(options, state):
     """The catalog, read and warned of once; ``state`` changes with a file."""
-    catalog = read_catalog(
-        options.source,
-        columns=dict(pair.split("=") for pair in options.columns),
-        units=dict(pair.split("=") for pair in options.units),
-        survey=options.survey or None,
-        missing=options.missing,
-        factor=options.factor or None,
-    )
+    pairs = {"columns": options.columns, "units": options.units}
+    known = {key: dict(pair.split("=") for pair in texts) for key, texts in pairs.items()}
+    known |= {"survey": options.survey or None, "factor": options.factor or None}
+    catalog = read_catalog(options.source, missing=options.missing, **known)
     known = np.count_nonzero(catalog["redshift"] > 0)
     require(known, "catalog", "source", "must have a column 'redshift'", catalog.colnames)
     return catalog

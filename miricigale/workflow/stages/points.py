@@ -61,7 +61,7 @@ def point_catalog(exposure, band_flux, prior, *, spacing, seed):
 @stage(
     "points",
     "point sources",
-    version=8,
+    version=9,
     needs=("kernels",),
     sections=(*IMAGES, "highres", *DETECTION, "photometry.method", "point_sources"),
     resources=EXPOSURE_RESOURCES,

@@ -82,14 +82,10 @@ def make_report(context, _):
         log.warning("no source is left to fit: %s", metrics["n_left_out"])
     text = json.dumps(_without_nan(metrics), indent=1, allow_nan=False)
     context.save("report/metrics.json", lambda path: path.write_text(text, encoding="utf-8"))
-    report = Page(
-        f"miricigale: {config.run.name}",
-        subtitle=(
-            f"{metrics['n_field']} galaxies in {field_text(config)}, injected fracAGN "
-            f"{', '.join(map(str, config.sed.frac_agn))}, seed {context.seed}"
-        ),
-        dpi=config.report.dpi,
-    )
+    subtitle = f"{metrics['n_field']} galaxies in {field_text(config)}, injected fracAGN "
+    subtitle += f"{', '.join(map(str, config.sed.frac_agn))}, seed {context.seed}"
+    title = f"miricigale: {config.run.name}"
+    report = Page(title, subtitle=subtitle, dpi=config.report.dpi)
     page = StudyPage(report, context, tables, study, metrics, kernels, model, area)
     write_summary(page, truths, numbers, stand_ins(config, model))
     write_exposures(page)

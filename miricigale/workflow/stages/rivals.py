@@ -26,11 +26,7 @@ from miricigale.workflow.stages.sample import SampleFlags, in_field
 from miricigale.workflow.truths import reference
 
 #: Methods that are compared: name of the columns, and what the page calls them.
-RIVALS = {
-    "package": "package",
-    "yang2021": "steps of Yang et al.",
-    "source_extractor": "Source Extractor",
-}
+RIVALS = texts_of("rivals")["methods"]
 #: The band in which Yang et al. 2021 compare with Source Extractor.
 SE_BAND = "miri.f1500w"
 #: Ranges of the true signal-to-noise ratio.
@@ -215,9 +211,8 @@ def source_extractor_numbers(tables, seed):
     bright = np.asarray(table["field"]) & (np.asarray(table["snr"], float) > 5)
     pulls = np.abs((flux - table["flux_true"].value) / error)[bright]
     white = bootstrap(lambda values: np.percentile(values, 99, axis=-1), pulls, seed=seed)
-    return {f"source_extractor.{name}": number for name, number in numbers.items()} | {
-        "errors.white": white
-    }
+    numbers = {f"source_extractor.{name}": number for name, number in numbers.items()}
+    return numbers | {"errors.white": white}
 
 
 def write_rivals(page, tables):
@@ -247,9 +242,7 @@ def write_rivals(page, tables):
     rows = []
     for name, table in tables.items():
         counts, offset = rival_counts(table), _se_offset(table, page.context.seed)
-        rows.append(
-            {"band": band_label(name), "offset": offset.value, "offset_err": offset.error}
-            | {key: one.n for key, one in counts.items()}
-            | {"share": counts["missed"].value}
-        )
+        row = {"band": band_label(name), "offset": offset.value, "offset_err": offset.error}
+        row |= {key: one.n for key, one in counts.items()}
+        rows.append(row | {"share": counts["missed"].value})
     page.table("source_extractor", rows)

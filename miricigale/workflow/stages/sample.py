@@ -62,10 +62,8 @@ def values_at(sky, wcs, plane, *, off=0):
 
 def in_field(sky, images):
     """Whether positions, shape (n,), fall on a usable pixel of every image (with WCS and mask)."""
-    inside = np.ones(len(sky), bool)
-    for image in images:
-        inside &= values_at(sky, image.wcs, ~np.asarray(image.mask, bool), off=False)
-    return inside
+    usable = ((image.wcs, ~np.asarray(image.mask, bool)) for image in images)
+    return np.all([values_at(sky, *pair, off=False) for pair in usable], axis=0)
 
 
 def mean_coverage(sky, image, n_images):
@@ -90,9 +88,8 @@ def matched_errors(matched, inside, bands, *, noise=None, **options):
     """
     truth = QTable({"id": matched["id"], **{name: matched[f"{name}_true"] for name in bands}})
     own = None if noise is None else {name: values[inside] for name, values in noise.items()}
-    return ErrorModel.from_tables(
-        truth[inside], matched[inside], filters=bands, noise=own, **options
-    )
+    pair = truth[inside], matched[inside]
+    return ErrorModel.from_tables(*pair, filters=bands, noise=own, **options)
 
 
 def footprint_area(images):

@@ -1,31 +1,26 @@
 """The source browser: pages that show the sources of a truth one by one, linked from the report."""
 
-import json
-from importlib import resources
-
 import astropy.units as u
 import numpy as np
-from markupsafe import Markup
 from matplotlib.colors import to_hex
 
 from miricigale import fitting, photometry, sed
 from miricigale.evaluation import OUTLIER, AssociationFlags
 from miricigale.filters import Filter
-from miricigale.pages import render
+from miricigale.pages.browser import rounded, source_pages
+from miricigale.plotting.cutouts import Cutouts
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU, WAVE, ab_magnitude
 from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.page.labels import SET_COLORS, SET_LABELS, band_label
 from miricigale.workflow.page.numbers import StudyTables
 from miricigale.workflow.stages.conditions import ConditionFlags, any_condition
-from miricigale.workflow.stages.cutouts import Cutouts
 from miricigale.workflow.stages.exposures import KERNEL
+from miricigale.workflow.stages.images import measured_mosaic
 from miricigale.workflow.stages.inputs import existing_bands, sed_resources
 from miricigale.workflow.stages.sample import SampleFlags
 from miricigale.workflow.truths import truth_names
 
-#: Sources whose details and pictures are in one file.
-CHUNK = 32
 #: Cells of the spectra, evenly spaced in the logarithm of wavelength.
 N_WAVE = 240
 #: Parameters whose posteriors are drawn.
@@ -51,48 +46,40 @@ FLAGS = {
     plan=lambda config, _: list(truth_names(config)),
 )
 def make_sources(context, name):
-    """Stage 14, in addition: the page of a truth, and what it shows of its sources, `CHUNK` in a file."""
-    tables, cutouts = _Sources(context, name), Cutouts.read(context, name)
-    sky = tables.truth["sky"]
+    """Stage 14, in addition: the page of a truth, and what it shows of its sources."""
+    config, tables = context.config, _Sources(context, name)
+    suffix, _ = measured_mosaic(config)
+    paths = f"mosaic_{{}}{suffix}", "photometry/{}_model", "photometry/{}_residual"
+    bands = {
+        band: [context.image(f"{name}/{path.format(band)}.fits") for path in paths]
+        for band in config.exposures.filters
+    }
+    cutouts, sky = Cutouts(context.image("f160w.fits"), bands), tables.truth["sky"]
     imaged = cutouts.on_image(sky)
-    shown = tables.first_of(imaged, context.config.report.pictures)
+    shown = tables.first_of(imaged, config.report.pictures)
     # those of a file are near to each other in the page, and those without pictures come last
     order = np.argsort(~shown, kind="stable")
-    for k, first in enumerate(range(0, len(order), CHUNK)):
-        rows, stem, tops = order[first : first + CHUNK], f"report/sources/{name}/{k:03d}", {}
-        pictured = rows[shown[rows]]
-        if pictured.size:
-            sheet, limits = cutouts.sheet(sky[pictured])
-            tops = dict(zip(pictured, _rounded(limits), strict=True))
-            context.save(f"{stem}.png", sheet.save)
-        entries = [
-            tables.entry(row) | {"top": tops.get(row), "imaged": bool(imaged[row])} for row in rows
-        ]
-        _save_text(context, f"{stem}.js", f"loaded({k}, {_json(entries)});\n")
     facts = {
         "truth": name,
         "truths": context.plan,
-        "chunk": CHUNK,
         "outlier": OUTLIER,
-        "pictured": int(shown.sum()),
         "prior": band_label(tables.prior),
         "cutouts": cutouts.describe(),
         "flags": {kind: flags.meanings() for kind, flags in FLAGS.items()},
         **tables.describe(),
         "table": tables.columns(order),
     }
-    script = resources.files("miricigale.pages") / "templates" / "sources.js"
-    page = render(
-        "sources.html",
-        title=f"{context.config.run.name}: sources of {name}",
-        facts=Markup(_json(facts)),
-        script=Markup(script.read_text("utf-8")),
+    source_pages(
+        context.save,
+        "report",
+        (f"sources-{name}", f"sources/{name}"),
+        f"{config.run.name}: sources of {name}",
+        facts,
+        order,
+        shown,
+        lambda row: tables.entry(row) | {"imaged": bool(imaged[row])},
+        lambda rows: cutouts.sheet(sky[rows]),
     )
-    _save_text(context, f"report/sources-{name}.html", page)
-
-
-def _save_text(context, name, text):
-    context.save(name, lambda path: path.write_text(text, "utf-8"))
 
 
 class _Sources(StudyTables):
@@ -171,7 +158,7 @@ class _Sources(StudyTables):
         for unit, results in self.results.items():
             columns[f"fit_{unit}"] = np.nan_to_num(self.of_sources(results.flags)).astype(int)
         return {
-            key: _rounded(np.asarray(values)[order], digits.get(key, 4))
+            key: rounded(np.asarray(values)[order], digits.get(key, 4))
             for key, values in columns.items()
         }
 
@@ -185,11 +172,11 @@ class _Sources(StudyTables):
             "compared": self.compared,
             "bands": [
                 {"name": name, "label": band_label(name), "wave": wave, "miri": name in self.miri}
-                for name, wave in zip(self.bands, _rounded(self.pivots), strict=True)
+                for name, wave in zip(self.bands, rounded(self.pivots), strict=True)
             ],
-            "wave": _rounded(np.sqrt(self.edges[1:] * self.edges[:-1])),
+            "wave": rounded(np.sqrt(self.edges[1:] * self.edges[:-1])),
             "pdf_edges": {
-                unit: {key: _rounded(found.distribution(key)[0].value) for key in DRAWN}
+                unit: {key: rounded(found.distribution(key)[0].value) for key in DRAWN}
                 for unit, found in self.results.items()
             },
             "parameters": [{"name": key, "unit": str(unit)} for key, unit in self.units.items()],
@@ -199,12 +186,12 @@ class _Sources(StudyTables):
         """What belongs to the source in a row of the truth."""
         entry = {
             "id": self.truth["id"][row].item(),
-            "true": _rounded(self.true[row]),
-            "flux": _rounded(self.flux[row]),
-            "error": _rounded(self.error[row], 3),
+            "true": rounded(self.true[row]),
+            "flux": rounded(self.flux[row]),
+            "error": rounded(self.error[row], 3),
             "flags": [int(self.matched[f"{band}_flags"][row]) for band in self.miri],
             "conditions": [int(self.matched[f"{band}_condition"][row]) for band in self.miri],
-            "parameters": _rounded(self.parameters[row]),
+            "parameters": rounded(self.parameters[row]),
         }
         if self.sampled[row]:
             entry["fits"] = {unit: self._fit(unit, entry["id"]) for unit in self.results}
@@ -216,10 +203,10 @@ class _Sources(StudyTables):
         if not one.fitted:
             return None
         fit = {
-            "chi2": _rounded(one.chi2),
+            "chi2": rounded(one.chi2),
             "n_bands": int(one.n_bands),
             "moments": [
-                [_rounded(moment(name).to_value(own)) for moment in (one.mean, one.std)]
+                [rounded(moment(name).to_value(own)) for moment in (one.mean, one.std)]
                 for name, own in self.units.items()
             ],
             "pdf": {name: _weights(one.pdf[name]) for name in DRAWN},
@@ -246,23 +233,3 @@ def _cell_means(x, y, edges):
     steps = 0.5 * (y[1:] + y[:-1]) * np.diff(x)
     total = np.concatenate([[0.0], np.cumsum(steps)])
     return np.diff(np.interp(edges, x, total)) / np.diff(edges)
-
-
-def _rounded(values, digits=4):
-    """Plain numbers of so many significant digits, None for NaN; text, integers and flags as they are."""
-    values = np.asarray(values)
-    if values.ndim:
-        return [_rounded(value, digits) for value in values]
-    if values.dtype.kind != "f":
-        return values.item()
-    if not np.isfinite(values):
-        return None
-    value = float(f"{float(values):.{digits}g}")
-    return int(value) if value.is_integer() and abs(value) < 1e9 else value
-
-
-def _json(values):
-    """JSON that may stand in a script of a page."""
-    text = json.dumps(values, separators=(",", ":"), allow_nan=False)
-    # no tag and no comment of HTML can begin in it
-    return text.replace("<", "\\u003c")

@@ -35,11 +35,7 @@ from miricigale.workflow.truths import reference, variant_changes
 #: Draws of the sources for the errors of limits.
 N_DRAWS = 100
 #: What images are called: where the key is on, and where it is off.
-_LABELS = {
-    "residual": ("with the calculator's residual noise", "without residual noise"),
-    "gradient": ("with a gradient", "without the gradient"),
-    "plane": ("plane taken off before the mesh", "background by the mesh alone"),
-}
+_LABELS = texts_of("variants")["labels"]
 STUDY, RATES = "study", "rates"
 _OUT = SampleFlags.OUTSIDE_FIELD | NOT_COUNTED
 
@@ -118,9 +114,8 @@ def variant_numbers(matched, tables, calculator, *, seed, statistic="mad", bin_s
     rows = []
     for band, limit in calculator.items():
         true = matched[f"{band}_true"].value
-        fluxes = {STUDY: matched[band].value} | {
-            name: one[band][band].value for name, one in tables.items()
-        }
+        fluxes = {STUDY: matched[band].value}
+        fluxes |= {name: one[band][band].value for name, one in tables.items()}
         good = inside & np.all([np.isfinite(v) for v in (true, *fluxes.values())], axis=0)
         bright = field & (true > 10 ** (-0.4 * (limit - 23.9)))
         faint = good & ~bright
@@ -180,15 +175,11 @@ def variant_entries(table, changes):
 
     ``table`` is of `variant_numbers`, ``changes`` of `~miricigale.workflow.truths.variant_changes`.
     """
-    return [
-        dict(row)
-        | {
-            "band": band_label(row["band"]),
-            "images": variant_label(row["images"], changes),
-            "offset": row["limit"] - row["calculator"],
-        }
-        for row in table
-    ]
+    rows = []
+    for row in table:
+        labels = {"band": band_label(row["band"]), "images": variant_label(row["images"], changes)}
+        rows.append(dict(row) | labels | {"offset": row["limit"] - row["calculator"]})
+    return rows
 
 
 def write_variants(page, matched, limits):

@@ -16,6 +16,7 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 
 from miricigale import ForcedPhotometer
+from miricigale.photometry import image_errors
 from miricigale.scene import example_field
 
 field = example_field(["F160W", "F1000W"], size=20 * u.arcsec)
@@ -27,20 +28,29 @@ photometer = ForcedPhotometer(
 result = photometer.measure(image, prior)
 
 # %%
-# The 3-sigma upper limit of a flux that may be negative is the positive part plus three errors. Keep flux and
-# error for fits: they say more than a limit.
+# Upper limits have a confidence: the true flux, which is not negative, is below them in 95 of 100 cases. Keep
+# flux and error for fits: they say more than a limit.
 
-table = result.to_table()["id", "flux", "flux_err", "snr"]
+table = result.to_table(confidence=0.95)["id", "flux", "flux_err", "snr", "upper"]
 faint = table[table["snr"] < 3]
-faint["limit"] = np.maximum(faint["flux"], 0 * u.uJy) + 3 * faint["flux_err"]
-faint["limit_mag"] = faint["limit"].to(u.ABmag)
-for name in ("flux", "flux_err", "snr", "limit", "limit_mag"):
+faint["limit_mag"] = faint["upper"].to(u.ABmag)
+for name in ("flux", "flux_err", "snr", "upper", "limit_mag"):
     faint[name].info.format = ".2f"
 faint[:5]
 
 # %%
-# Depth: fit points at empty positions, on the image without its sources. Here they are on a grid of 1.5 arcsec,
-# at least 1 arcsec from any source.
+# Depth of the image alone, without a catalog: for circles, and points that are fitted with the PSF. ``factor`` is
+# what the correlation of the noise adds, and ``scatter`` that of fluxes at empty positions over the errors.
+
+psf = field.psfs["miri.f1000w"]
+errors = image_errors(image, diameters=[0.5, 1.0] * u.arcsec, psf=psf, seed=1)
+for name in ("error", "factor", "limit_mag", "scatter"):
+    errors.table[name].info.format = ".3f"
+errors.table["aperture", "error", "factor", "limit_mag", "scatter"]
+
+# %%
+# As a check, fit points at empty positions, on the image without its sources. Here they are on a grid of 1.5
+# arcsec, at least 1 arcsec from any source.
 
 empty = image.copy()
 empty.data = result.residual.data
@@ -72,5 +82,6 @@ ax.legend()
 plt.show()
 
 # %%
-# The page that ``miricigale photometry`` writes has the same test. For limits before you observe see
+# ``miricigale errors image.fits`` writes the table, a page and maps of the limits; the page of ``miricigale
+# photometry`` has the test at empty positions. For limits before you observe see
 # :doc:`/method/depth`; for errors in your image by injected sources, :doc:`check_errors`.

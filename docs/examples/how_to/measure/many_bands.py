@@ -68,6 +68,7 @@ axes[3].set(xlabel="F770W - F1000W", ylabel="F770W - F1500W", title="colors (AB)
 plt.show()
 
 # %%
-# ``table.write("miri.ecsv")`` writes what ``BayesFitter`` and ``miricigale fit`` read. A source that one band
-# lacks has NaN and the flag NO_DATA there. For options that differ between bands put a ``ForcedPhotometer`` in
-# place of a kernel. See :doc:`/method/photometry`.
+# With files, ``miricigale photometry f770w.fits f1000w.fits f1500w.fits prior.fits -o miri.ecsv`` does all of
+# this. ``table.write("miri.ecsv")`` writes what ``BayesFitter`` and ``miricigale fit`` read. A source that one
+# band lacks has NaN and the flag NO_DATA there. For options that differ between bands put a ``ForcedPhotometer``
+# in place of a kernel. See :doc:`/method/photometry`.

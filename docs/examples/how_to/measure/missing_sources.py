@@ -68,6 +68,7 @@ print(f"source {result.id[row]}: {fluxes[0]:.2f} -> {fluxes[1]:.2f}")
 print(f"truth: {known['miri.f770w'][row]:.2f}")
 
 # %%
-# With the command add ``--second-pass``: the new sources are the last rows of the table, flagged
-# NOT_IN_CATALOG. Look at them before you use them: residuals of imperfect templates can pass for sources. See
-# :doc:`/method/photometry_options` and the completeness measured in :doc:`/accuracy/photometry`.
+# ``second_pass=None`` leaves it to the evidence of the residual, as the command does: there the new sources are
+# the last rows of the table, flagged NOT_IN_CATALOG. Look at them before you use them: residuals of imperfect
+# templates can pass for sources. See :doc:`/method/photometry_options` and the completeness measured in
+# :doc:`/accuracy/photometry`.

@@ -2,12 +2,13 @@
 Measure the PSF from stars
 ==========================
 
-You have dithered images with stars. You want an empirical PSF (effective PSF, ePSF) and to know how it
-compares with the model.
+You have dithered images with stars. You want to know whether the model PSF is theirs, and a corrected one
+if it is not.
 """
 
 # %%
-# Four simulated F770W exposures with nine stars each, at different sub-pixel positions and with noise.
+# Four simulated F770W exposures with nine stars each, at different sub-pixel positions and with noise. Their PSF
+# is 5 % wider than the model.
 
 import astropy.units as u
 import matplotlib.pyplot as plt
@@ -16,9 +17,11 @@ from astropy.nddata import NDData, StdDevUncertainty
 from astropy.table import Table
 
 from miricigale.plotting.images import plot_image
-from miricigale.psf import MIRI_PIXEL_SCALE, miri_psf, psf_from_stars, psf_table
+from miricigale.psf import miri_psf, psf_from_stars, psf_table
 
-truth = miri_psf("F770W")
+model = miri_psf("F770W", fov=12 * u.arcsec)
+scale = 1.05 * model.pixel_scale
+truth = model.replaced(pixel_scale=scale)
 rng = np.random.default_rng(3)
 images, stars = [], []
 yy, xx = np.mgrid[:165, :165]
@@ -26,40 +29,42 @@ for _ in range(4):
     place = np.array([(x, y) for x in (30, 82, 134) for y in (30, 82, 134)])
     x, y = (place + rng.uniform(-0.5, 0.5, place.shape)).T
     data = rng.normal(0, 1.0, xx.shape)
-    for one in zip(x, y, strict=True):
-        truth.x_0, truth.y_0, truth.flux = *one, 3000.0
-        data += truth(xx, yy)
+    for x0, y0 in zip(x, y, strict=True):
+        data += truth.evaluate(
+            (xx - x0) / 1.05, (yy - y0) / 1.05, 3000.0 / 1.05**2, 0, 0
+        )
     images.append(NDData(data, uncertainty=StdDevUncertainty(np.ones(data.shape))))
     stars.append(Table({"x": x.round(), "y": y.round()}))
 
 # %%
-# Positions need to be good to a pixel. Stars do not show how much light is outside of their stamps:
-# ``enclosed`` takes that from the model.
+# Positions need to be good to half a pixel. The light far out is the model's.
 
-psf = psf_from_stars(
-    images,
-    stars,
-    fov=4 * u.arcsec,
-    oversampling=2,
-    pixel_scale=MIRI_PIXEL_SCALE,
-    enclosed=truth,
-)
+psf = psf_from_stars(images, stars, model, fov=4 * u.arcsec)
 fig, axes = plt.subplots(1, 3, figsize=(11, 3.8), layout="constrained")
 plot_image(images[0].data, ax=axes[0], pixel_scale=0.111, title="one exposure")
 plot_image(psf.data, ax=axes[1], pixel_scale=psf.cell, title="PSF from 36 stamps")
-model = miri_psf("F770W", oversampling=2, fov=4 * u.arcsec)
-plot_image(model.data, ax=axes[2], pixel_scale=model.cell, title="true PSF")
+change = psf.data - model.data
+plot_image(change, ax=axes[2], pixel_scale=psf.cell, title="less the model")
+for ax in axes[1:]:
+    ax.set(xlim=(-2, 2), ylim=(-2, 2))
 plt.show()
 
 # %%
+# What was done, and how well the flux of a point source is known by that:
 
-table = psf_table([psf, truth], radii=[0.3, 0.5, 1.0, 1.5] * u.arcsec)
+for name in ("correction", "width", "wings_4", "flux_err"):
+    value = psf.meta[name]
+    print(name, value if isinstance(value, str) else round(value, 3))
+
+# %%
+
+table = psf_table([model, psf, truth], radii=[0.3, 0.5, 1.0, 1.5] * u.arcsec)
 names = ["fwhm", "enclosed", "eef_0.3", "eef_0.5", "eef_1", "eef_1.5"]
 for name in names:
     table[name].info.format = ".3f"
 table[names]
 
 # %%
-# ``psf.write("psf.fits")`` keeps it. On images with a WCS give one table with ``sky``; for a drizzled mosaic
-# add ``frame="sky"`` and ``includes=(*EFFECTS, "drizzle")``. See :doc:`/method/psf`, and :doc:`/accuracy/psf`
-# for a test with stars of lower signal-to-noise.
+# ``psf.write("psf.fits")`` keeps it. Forced photometry does all this by itself with
+# ``ForcedPhotometer(kernel, psf_stars=True)``: it finds the stars on the image and the prior. See
+# :doc:`/method/psf`, and :doc:`/accuracy/psf` for tests.

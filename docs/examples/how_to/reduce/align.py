@@ -73,7 +73,7 @@ for ax, (title, image) in zip(axes, panels.items(), strict=True):
 plt.show()
 
 # %%
-# In a reduction: ``Reducer().run(paths, align=reference)``, or ``align="dithers"``. The distortion is not
-# changed.
+# In a reduction: ``Reducer().run(paths, align=reference)``, or ``align="dithers"``; ``align="visits"`` moves the
+# exposures of a visit, which share a guide star, as a whole. The distortion is not changed.
 #
 # See :doc:`/method/reduction_mosaics`, and :doc:`/accuracy/reduction` for positions after offsets.

@@ -75,5 +75,8 @@ plt.show()
 #
 #    $ miricigale reduce jw*_mirimage_uncal.fits --crds ~/crds_cache -o reduced
 #
+# For deep fields of several visits add ``--stripes --sky-flat 30 --align visits``
+# (:doc:`/method/reduction_mosaics`). A warning that first groups still settle says which ``--skip-first`` to add.
+#
 # See :doc:`/method/reduction_files` for products and references, and :doc:`/accuracy/reduction_real` for the
 # comparison with the official pipeline.

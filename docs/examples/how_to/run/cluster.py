@@ -71,5 +71,34 @@ plt.show()
 #        with process_pool(4) as executor:
 #            run_study(load_config("goodss"), "study", executor=executor)
 #
-# Set ``[run] memory`` in the configuration, or fewer threads, if memory is short. See :doc:`/method/workflow` and
-# :doc:`/tutorials/large_catalogs`.
+# Set ``[run] memory`` in the configuration (GB on each machine), or fewer threads, if memory is short.
+#
+# Under SLURM, workers are jobs. Start them from Python (``pip install dask-jobqueue``), keep that session open,
+# and run the study with the address that it prints:
+#
+# .. code-block:: python
+#
+#    from dask_jobqueue import SLURMCluster
+#
+#    cluster = SLURMCluster(cores=1, memory="6GB", walltime="04:00:00")
+#    cluster.scale(jobs=40)
+#    print(cluster.scheduler_address)
+#
+# Workers may come and go, such as at the end of their time. What a run says of trouble:
+#
+# ================================  ============================================================================
+# message                           what to do
+# ================================  ============================================================================
+# ... is lost; ... is done again    nothing, another worker does the unit
+# there are no workers any more     start some; the run waits for them
+# 4 workers died over ...           it is short of memory: larger workers, or ``--nthreads 1``; then the same
+#                                   command resumes
+# the scheduler ... was lost        start it and its workers again; the same command resumes
+# scheduler and workers ... have    install one version everywhere, also where the scheduler runs
+# version ...
+# ... is not on HOST: all workers   use a folder of a shared disk, by the same path on each machine
+# must see the folder of the run
+# ================================  ============================================================================
+#
+# :doc:`/accuracy/running` has times and memory, :doc:`/method/workflow` how units are done, and
+# :doc:`/tutorials/large_catalogs` fits of catalogs that do not fit in memory.

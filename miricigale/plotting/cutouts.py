@@ -4,13 +4,12 @@ import dataclasses
 
 import numpy as np
 from astropy.nddata import block_reduce
+from astropy.stats import mad_std
 from astropy.wcs.utils import proj_plane_pixel_scales
 from PIL import Image
 
-from miricigale.evaluation import sigma_mad
+from miricigale.plotting.images import filled
 from miricigale.utils.parallel import chunks
-from miricigale.workflow.page.pictures import filled
-from miricigale.workflow.stages.images import measured_mosaic
 
 #: Side of the pictures, and the finest pixels of those of the bands, in arcsec.
 BOX, FINEST = 5.3, 0.1
@@ -53,7 +52,7 @@ class _Panels:
             first.wcs[::factor, ::factor],
             planes[0].shape,
             n,
-            float(sigma_mad(planes[-1][np.isfinite(planes[-1])])),
+            float(mad_std(planes[-1][np.isfinite(planes[-1])])),
         )
 
     def squares(self, sky):
@@ -90,7 +89,7 @@ class _Panels:
 
 class Cutouts:
     """
-    Pictures of the sources of a truth.
+    Pictures of sources.
 
     Parameters
     ----------
@@ -105,17 +104,6 @@ class Cutouts:
         self.bands = {
             name: _Panels.of_images(images, finest=FINEST) for name, images in bands.items()
         }
-
-    @classmethod
-    def read(cls, context, truth):
-        """Of the images of a truth, those that were measured."""
-        suffix, _ = measured_mosaic(context.config)
-        paths = f"mosaic_{{}}{suffix}", "photometry/{}_model", "photometry/{}_residual"
-        bands = {
-            name: [context.image(f"{truth}/{path.format(name)}.fits") for path in paths]
-            for name in context.config.exposures.filters
-        }
-        return cls(context.image("f160w.fits"), bands)
 
     def describe(self):
         """Where the pictures are in a sheet, in pixels, and their stretch: plain values."""

@@ -1,0 +1,301 @@
+"""A model PSF corrected by stars: a few terms by least squares, then what stars have in common beyond them."""
+
+import dataclasses
+
+import numpy as np
+from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
+
+from miricigale.psf import _core
+from miricigale.utils.options import check_that
+
+#: Terms of a correction and the standard deviation of each by its prior: relative width of the core, its
+#: elongation along the axes and the diagonals, and the light beyond some full widths at half maximum.
+_BEYOND = (1, 2, 4, 8)
+TERMS = dict.fromkeys(["width", "elongation", "diagonal", *(f"wings_{n}" for n in _BEYOND)], 0.1)
+
+#: How many of the terms may change over the field; standard deviations of all terms, and of their changes from the
+#: middle of the field to its edges; deviation of single cells, as a fraction of the light about them.
+_SLOPED, _CELLS = 3, 0.1
+_SPREAD = np.array([*TERMS.values(), *[0.05] * (2 * _SLOPED)])
+
+#: Least number of stars that are left out one by one (of fewer, halves are), with which changes over the field and
+#: single cells are tried; how much smaller chi-square must be of what was left out.
+_WHOLE, _FIELD, _EFFECTIVE, _EVIDENCE = 3, 6, 3, 9.0
+
+#: Deviation of a star from any PSF, as a fraction of its light in a pixel; steps of the fit.
+_SCATTER, _STEPS = 0.02, 5
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Star:
+    """
+    Pixels of a star, each array of shape (ny, nx): its light, the error (infinite for pixels that do not count),
+    and the distance from its catalog position in cells of the PSF.
+
+    ``place`` is where it is in the field, -1 to 1 along each axis, ``area`` that of a pixel in cells.
+    """
+
+    data: np.ndarray
+    sigma: np.ndarray
+    u: np.ndarray
+    v: np.ndarray
+    place: tuple = (0.0, 0.0)
+    area: float = 1.0
+
+    def halves(self):
+        """Two stars, each with every other octant about its position."""
+        odd = np.floor(np.arctan2(self.v, self.u) * (4 / np.pi)).astype(int) % 2 == 1
+        return [
+            dataclasses.replace(self, sigma=np.where(part, np.inf, self.sigma))
+            for part in (odd, ~odd)
+        ]
+
+
+def derivatives(psf, fwhm):
+    """How a PSF, (n, n), changes with each of `TERMS` at constant light, shape (k, n, n); ``fwhm`` in cells."""
+    xx, yy = (np.gradient(np.gradient(psf, axis=axis), axis=axis) for axis in (1, 0))
+    variance = (fwhm / 2.3548) ** 2
+    axis = np.arange(len(psf)) - len(psf) // 2
+    place = np.log(np.maximum(np.hypot(axis, axis[:, None]), 0.1) / fwhm)
+    cross = np.gradient(np.gradient(psf, axis=0), axis=1)
+    found = [variance * (xx + yy), 0.5 * variance * (xx - yy), variance * cross]
+    for one in np.log(_BEYOND):
+        found.append(psf * np.clip(1.0 + (place - one) / np.log(2.0), 0.0, 1.0))
+    found = np.stack(found)
+    light = found.sum(axis=(1, 2))
+    # what lies beyond the grid is wings too
+    light[-len(_BEYOND) :] += 1.0 - psf.sum()
+    return found - light[:, None, None] * psf
+
+
+class FittedStar:
+    """
+    A star with a PSF: flux, offset and background are fitted, what all stars have in common is not.
+
+    ``images``, (3 + k, n, n), are spline coefficients of the PSF, of its derivatives by x and y, and of its
+    changes by the terms. The first of these change by ``slope``, (3, 2), over the field. ``offset`` is that of the
+    center in cells.
+    """
+
+    def __init__(self, star, offset, images, slope):
+        half = images.shape[-1] // 2
+        x, y = star.u.ravel() - offset[0], star.v.ravel() - offset[1]
+        at = (y + half, x + half)
+        light, dx, dy, *terms = (map_coordinates(one, at, prefilter=False) for one in images)
+        light = light + (slope @ star.place) @ terms[:_SLOPED]
+        own = star.area * np.stack([light, -dx, -dy, np.ones_like(x)], axis=1)
+        data, sigma = star.data.ravel(), star.sigma.ravel()
+        weight = 1.0 / sigma
+        for _ in range(2):
+            found = np.linalg.lstsq(own * weight[:, None], data * weight)[0]
+            weight = 1.0 / np.hypot(sigma, _SCATTER * found[0] * own[:, 0])
+        self.star, self.at, self.flux, self.weight = star, at, found[0], weight
+        self.offset = offset + np.clip(found[1:3] / np.where(found[0] > 0, found[0], np.inf), -1, 1)
+        self.residual = data - own @ found
+        #: What a change of the PSF by 1 is in each weighted pixel.
+        self.scale = found[0] * star.area * weight
+        self._basis = np.linalg.qr(own * weight[:, None])[0]
+        self._left = self._apart(self.residual * weight)
+        sloped = np.multiply.outer(star.place, terms[:_SLOPED]).reshape(-1, x.size)
+        self.columns = self._apart((self.scale * np.concatenate([terms, sloped])).T)
+        self.normal, self.right = self.columns.T @ self.columns, self.columns.T @ self._left
+        light = np.maximum(light, 0.0) * (weight > 0)
+        self.chi2 = float(light @ (self.residual * weight) ** 2 / light.sum())
+        self.snr = found[0] * np.sqrt(np.sum((own[:, 0] / sigma) ** 2))
+
+    @property
+    def width(self):
+        """Width of the core relative to the PSF's, less 1, and its error."""
+        power = max(self.normal[0, 0], 1e-30)
+        return self.right[0] / power, power**-0.5
+
+    def _apart(self, values):
+        """What the star's own parameters leave of weighted pixels."""
+        return values - self._basis @ (self._basis.T @ values)
+
+    def misfit(self, change=0.0):
+        """Chi-square if the weighted pixels of the model change by this."""
+        return float(np.sum(self._apart(self._left - change) ** 2))
+
+
+def fitted_stars(psf, stars, *, slope=None, offsets=None):
+    """
+    Fit stars one by one.
+
+    Parameters
+    ----------
+    psf : `~numpy.ndarray`, shape (n, n)
+        The PSF in the middle of the field.
+    stars : sequence of `Star`
+        The stars.
+    slope : `~numpy.ndarray`, shape (3, 2), optional
+        How the first of `TERMS` change over the field.
+    offsets : sequence of `~numpy.ndarray`, optional
+        Where their centers stand, for one step from there; by default steps from the catalog positions.
+
+    Returns
+    -------
+    fits : list of `FittedStar`
+    """
+    fwhm = _core.half_maximum_width(psf, len(psf) // 2, len(psf) // 2)
+    images = [psf, *np.gradient(psf)[::-1], *derivatives(psf, fwhm)]
+    images = np.stack([spline_filter(one) for one in images])
+    slope = np.zeros((_SLOPED, 2)) if slope is None else slope
+    steps, offsets = (_STEPS, np.zeros((len(stars), 2))) if offsets is None else (1, offsets)
+    for _ in range(steps):
+        fits = [FittedStar(*one, images, slope) for one in zip(stars, offsets, strict=True)]
+        offsets = [one.offset for one in fits]
+    return fits
+
+
+class StarPSF:
+    """
+    A PSF corrected by stars, as far as what is left out of the fit confirms it.
+
+    Parameters
+    ----------
+    psf : `~numpy.ndarray`, shape (n, n), n odd
+        The model, centered; its sum is the fraction of all light.
+    stars : sequence of `Star`
+        At least one.
+
+    Attributes
+    ----------
+    kind : str
+        ``"model"`` (not corrected), ``"terms"``, ``"field"`` (terms that change over the field) or
+        ``"effective"`` (single cells too).
+    chi2 : dict of str to float
+        Chi-square of what was left out, by kind.
+    terms, terms_err : `~numpy.ndarray`, shape (k,)
+        Corrections of `TERMS` in the middle of the field, zero if it is not corrected, and their errors.
+    error : float
+        Relative error of a point source's flux by that of the PSF.
+    before, after : list of `FittedStar`
+        The stars with the model and with the corrected PSF.
+
+    Notes
+    -----
+    Flux, position and background of each star are projected out, so that stars are left out by taking away
+    their normal equations. Single cells are the mean of the residuals, weighted by noise and prior.
+
+    References
+    ----------
+    Anderson & King 2000, PASP 112, 1360 (effective PSFs from residuals).
+    """
+
+    def __init__(self, psf, stars):
+        stars = list(stars)
+        check_that(stars, "stars", "at least one star", "none")
+        self._model, half = psf, len(psf) // 2
+        self._fwhm = _core.half_maximum_width(psf, half, half)
+        # of few stars each one counts as two, of which one is left out
+        units = stars if len(stars) >= _WHOLE else [half for one in stars for half in one.halves()]
+        self.kind, self._cells, self._state = "model", 0.0, np.zeros(len(_SPREAD))
+        self.before = self._fitted(stars)
+        self.chi2 = {"model": sum(one.misfit() for one in self._fitted(units))}
+        fits, without, inverse = self._solved(units, 0)
+        for kind, least, k in (("terms", 1, len(TERMS)), ("field", _FIELD, len(_SPREAD))):
+            if len(stars) < least:
+                continue
+            kept, found = self._state, self._solved(units, k)
+            left = zip(*found[:2], strict=True)
+            if self._better(kind, sum(fit.misfit(fit.columns @ step) for fit, step in left)):
+                fits, without, inverse = found
+            else:
+                self._state = kept
+        image = self.at()
+        changes = np.tensordot(without[:, : len(TERMS)], derivatives(image, self._fwhm), 1)
+        if self.kind != "model" and len(stars) >= _EFFECTIVE:
+            whole, cells = self._common_cells(fits, image)
+            at = [f.scale * map_coordinates(one, f.at) for one, f in zip(cells, fits, strict=True)]
+            if self._better("effective", sum(map(FittedStar.misfit, fits, at))):
+                self._cells, changes = whole, changes + cells - whole
+        self.after = self._fitted(stars)
+        self.terms, self.terms_err = self._state[: len(TERMS)], np.sqrt(np.diag(inverse))
+        matched = self.at() / np.sum(self.at() ** 2)
+        slope = np.tensordot(derivatives(self.at(), self._fwhm), matched)
+        scatter = (len(units) - 1) * np.var(np.tensordot(changes, matched))
+        self.error = np.sqrt(slope @ inverse @ slope + scatter)
+
+    def at(self, place=(0.0, 0.0), model=None):
+        """
+        The corrected PSF at a place of the field, shape (n, n).
+
+        Parameters
+        ----------
+        place : tuple of float, optional
+            -1 to 1 along each axis; the middle by default.
+        model : `~numpy.ndarray`, shape (n, n), optional
+            Another PSF that is corrected alike.
+
+        Returns
+        -------
+        psf : `~numpy.ndarray`, shape (n, n)
+        """
+        terms = self._state[: len(TERMS)]
+        image = self._model if model is None else model
+        # in steps, since changes are linear for small ones
+        for _ in range(_STEPS):
+            image = image + np.tensordot(terms / _STEPS, derivatives(image, self._fwhm), 1)
+        more = self.slope @ place
+        if more.any():
+            image = image + np.tensordot(more, derivatives(image, self._fwhm)[:_SLOPED], 1)
+        return image + self._cells
+
+    @property
+    def slope(self):
+        """Changes of the first terms over the field, shape (3, 2)."""
+        return self._state[len(TERMS) :].reshape(2, _SLOPED).T
+
+    def _fitted(self, stars, offsets=None):
+        return fitted_stars(self.at(), stars, slope=self.slope, offsets=offsets)
+
+    def _solved(self, units, k):
+        """Fit the first k terms: the stars, steps of terms where each is left out, covariance of `TERMS`."""
+        self._state, offsets = np.zeros(len(_SPREAD)), np.zeros((len(units), 2))
+        prior, free = np.diag(_SPREAD**-2.0), np.ix_(*[np.arange(k)] * 2)
+        inverse = np.zeros_like(prior)
+
+        def step(normal, right):
+            inverse[free] = np.linalg.inv((normal + prior)[free])
+            return inverse @ (right - prior @ self._state)
+
+        for last in np.arange(_STEPS + 1) == _STEPS:
+            fits = self._fitted(units, offsets)
+            offsets = [one.offset for one in fits]
+            normal, right = sum(one.normal for one in fits), sum(one.right for one in fits)
+            if not last:
+                self._state = self._state + step(normal, right)
+        without = np.array([step(normal - one.normal, right - one.right) for one in fits])
+        step(normal, right)
+        return fits, without, inverse[: len(TERMS), : len(TERMS)].copy()
+
+    def _better(self, kind, chi2):
+        """Whether a kind of correction is confirmed, which is then the kind."""
+        self.chi2[kind] = chi2
+        better = chi2 < self.chi2[self.kind] - _EVIDENCE
+        self.kind = kind if better else self.kind
+        return better
+
+    def _common_cells(self, fits, image):
+        """What the residuals have in common by cell, and that without each of the stars."""
+        shape, sums = image.shape, []
+        for fit in fits:
+            corner = np.floor(fit.at).astype(int)
+            part = fit.at - corner
+            inside = np.all((corner >= 0) & (corner < shape[0] - 1), axis=0)
+            pair = np.zeros((2, image.size))
+            for dy, dx in np.ndindex(2, 2):
+                share = np.abs(1 - dy - part[0]) * np.abs(1 - dx - part[1])
+                cell = np.ravel_multi_index((corner + [[dy], [dx]])[:, inside], shape)
+                weight = (share * fit.scale**2)[inside]
+                values = fit.residual[inside] / (fit.flux * fit.star.area)
+                pair += [np.bincount(cell, one, image.size) for one in (weight * values, weight)]
+            sums.append(pair.reshape(2, *shape))
+        # a PSF that ends within its grid is 0 beyond
+        light = np.maximum(gaussian_filter(image, self._fwhm / 2.3548), 1e-9 * image.max())
+        prior = (_CELLS * light) ** -2.0
+        total = np.sum(sums, axis=0)
+        found = [(total[0] - a) / (total[1] - b + prior) for a, b in ((0, 0), *sums)]
+        found = [one - one.sum() * image for one in found]
+        return found[0], np.array(found[1:])
