@@ -24,7 +24,7 @@ from miricigale.photometry import (
     detect_sources,
     read_prior,
 )
-from miricigale.photometry.from_files import _empty_positions
+from miricigale.photometry.empty import _empty_positions
 from miricigale.photometry.kernel_files import matching_kernel
 from miricigale.psf import (
     MatchingKernel,
