@@ -4,12 +4,12 @@ from .effects.base import Block as Block
 from .effects.base import Effect as Effect
 from .effects.base import OtherEffect as OtherEffect
 from .effects.charge import BadPixels as BadPixels
-from .effects.charge import CosmicRays as CosmicRays
 from .effects.charge import Dark as Dark
 from .effects.charge import InterpixelCapacitance as InterpixelCapacitance
 from .effects.charge import Persistence as Persistence
 from .effects.charge import ReferencePixels as ReferencePixels
 from .effects.charge import Saturation as Saturation
+from .effects.cosmic_rays import CosmicRays as CosmicRays
 from .effects.light import Photons as Photons
 from .effects.light import Residual as Residual
 from .effects.migration import BrighterFatter as BrighterFatter

@@ -6,7 +6,8 @@ import numpy as np
 
 from miricigale.detector._core.charge import add_poisson
 from miricigale.detector.effects.base import Block, WholeBlock
-from miricigale.detector.effects.charge import CosmicRays, Dark, Saturation
+from miricigale.detector.effects.charge import Dark, Saturation
+from miricigale.detector.effects.cosmic_rays import CosmicRays
 from miricigale.detector.effects.light import Photons
 from miricigale.detector.effects.order import ORDER
 from miricigale.instrument import DetectorProperties, Exposure

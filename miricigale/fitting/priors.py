@@ -75,7 +75,7 @@ def grid_priors(grid, priors=None, *, prior_f="grid"):
         If weights are no numbers, or are negative, not finite or all zero.
     """
     got = type(priors).__name__
-    check_that(isinstance(priors or {}, dict), "priors", "a dict of parameters", got)
+    check_that(priors is None or isinstance(priors, dict), "priors", "a dict of parameters", got)
     priors = dict(priors or {})
     check_choice(prior_f, "prior_f", ("grid", "uniform"))
     axes = {}

@@ -8,9 +8,9 @@ from .corrections import flux_scaling as flux_scaling
 from .detection import DETECTION_PRESETS as DETECTION_PRESETS
 from .detection import DetectionFlags as DetectionFlags
 from .detection import DetectionPreset as DetectionPreset
-from .detection import chi_image as chi_image
 from .detection import detect_sources as detect_sources
 from .detection import detection_purity as detection_purity
+from .detection_image import chi_image as chi_image
 from .error_calibration import ErrorCalibration as ErrorCalibration
 from .error_model import ErrorModel as ErrorModel
 from .fields import SmoothField as SmoothField

@@ -10,8 +10,9 @@ from miricigale.photometry.arrays import sky_pixels
 from miricigale.photometry.catalogs import joined_sky
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.forced import ForcedPhotometer
-from miricigale.photometry.mosaics import as_mosaic, own_pixels
+from miricigale.photometry.mosaics import as_mosaic
 from miricigale.photometry.packaging import new_ids
+from miricigale.photometry.repeated_pixels import own_pixels
 from miricigale.photometry.results import band_column
 from miricigale.photometry.sources import SourceTemplates
 from miricigale.photometry.stars import with_stars

@@ -6,16 +6,12 @@ import astropy.units as u
 import numpy as np
 import scipy.ndimage
 from astropy.coordinates import SkyCoord
-from astropy.nddata import StdDevUncertainty
 from astropy.stats import poisson_conf_interval
 from photutils.segmentation import SegmentationImage, make_2dgaussian_kernel
-from scipy.special import gammaln
 
-from miricigale.instrument.image import Image
-from miricigale.photometry.arrays import image_arrays, pixel_scale, same_grid
+from miricigale.photometry.arrays import image_arrays, pixel_scale
 from miricigale.photometry.mosaics import as_mosaic
 from miricigale.photometry.segments import dilate_segments, dilation_rule
-from miricigale.photometry.sky_noise import sky_noise
 from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
@@ -23,7 +19,7 @@ from miricigale.utils.options import check_names, check_positive
 from miricigale.utils.sep_tools import background as sep_background
 from miricigale.utils.sep_tools import extract
 from miricigale.utils.tables import Flags, described_columns
-from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, positive
+from miricigale.utils.units import ANGLE, FNU, positive
 
 
 class DetectionFlags(Flags):
@@ -199,83 +195,6 @@ def detect_sources(
         labels = dilate_segments(found, rule, pixel_scale=scale, mask=~arrays.usable).data
         meta["dilation"] = dataclasses.asdict(rule)
     return SegmentationImage(labels), _catalog(objects, found, labels, arrays, meta)
-
-
-def chi_image(images):
-    """
-    Add images of several bands up to one in which sources of any color are detected.
-
-    Parameters
-    ----------
-    images : iterable of `~astropy.nddata.CCDData`, path-like or other (see `as_mosaic`)
-        On the same pixels, best of the same resolution. Of each the sky is subtracted and the noise measured, on
-        source-free pixels.
-
-    Returns
-    -------
-    image : `~astropy.nddata.CCDData`
-        Root of the sum of squares of the pixels over their noise, less its mean on empty sky, in MJy/sr: times
-        the noise of the first image. The uncertainty is the standard deviation on empty sky. A pixel has as many
-        bands as have data there; without any it is masked. Its segments are those of sources, its values are no
-        fluxes.
-
-    Raises
-    ------
-    ValueError
-        If there is no image, or they are not on the same pixels.
-
-    Notes
-    -----
-    On empty sky with Gaussian noise the root follows the chi distribution with as many degrees of freedom as there
-    are bands.
-
-    References
-    ----------
-    Szalay, Connolly & Szokoly 1999, AJ 117, 68.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> import numpy as np
-    >>> from astropy.coordinates import SkyCoord
-    >>> from astropy.nddata import CCDData
-    >>> from miricigale.instrument import north_up_wcs
-    >>> from miricigale.photometry import chi_image
-    >>> sky = SkyCoord(53.1, -27.8, unit="deg")
-    >>> wcs = north_up_wcs(sky, 0.1 * u.arcsec, (200, 200))
-    >>> noise = np.random.default_rng(1).normal(0, 1, (3, 200, 200))
-    >>> chi = chi_image([CCDData(one, unit="MJy / sr", wcs=wcs) for one in noise])
-    >>> (chi.data / chi.uncertainty.array).std().round(2)
-    np.float64(1.0)
-    """
-    images = [as_mosaic(one, "images") for one in images]
-    arrays = [image_arrays(one, "images") for one in images]
-    if not arrays or any(
-        one.flux.shape != arrays[0].flux.shape or not same_grid(one.wcs, arrays[0].wcs)
-        for one in arrays
-    ):
-        raise argument_error(
-            "images", "at least one, all on the same pixels", f"{len(arrays)} images"
-        )
-    square, n = (np.zeros(arrays[0].flux.shape) for _ in range(2))
-    for one in arrays:
-        values = one.flux / one.sigma
-        level, rms, _ = sky_noise(values, one.usable)
-        square += np.where(one.usable, (values - level) / rms, 0.0) ** 2
-        n += one.usable
-    sigma = np.where(arrays[0].usable, arrays[0].sigma / arrays[0].area, np.nan)
-    sigma = np.where(np.isfinite(sigma), sigma, np.nanmedian(sigma))
-    # mean of the chi distribution
-    mean = np.sqrt(2.0) * np.exp(gammaln((n + 1) / 2) - gammaln(np.maximum(n, 1) / 2))
-    spread = np.where(n > 0, np.sqrt(np.maximum(n - mean**2, 0)), np.nan)
-    return Image(
-        (np.sqrt(square) - mean) * sigma,
-        unit=SURFACE_BRIGHTNESS,
-        wcs=arrays[0].wcs,
-        mask=n == 0,
-        uncertainty=StdDevUncertainty(spread * sigma),
-        meta={"bands": [one.meta.get("filter") for one in images]},
-    )
 
 
 def detection_purity(image, *, snr_edges=None, preset="yang2021", **settings):

@@ -16,11 +16,12 @@ from miricigale.photometry.arrays import (
     pixel_scale,
 )
 from miricigale.photometry.flags import ForcedFlags
-from miricigale.photometry.mosaics import as_mosaic, own_pixels
+from miricigale.photometry.mosaics import as_mosaic
 from miricigale.photometry.packaging import CatalogRows, package
 from miricigale.photometry.passes import fit_image
 from miricigale.photometry.placement import Placement
 from miricigale.photometry.priors import detected_prior, read_catalog, read_prior
+from miricigale.photometry.repeated_pixels import own_pixels
 from miricigale.photometry.settings import ErrorSettings, MemorySettings
 from miricigale.photometry.sky_noise import warn_of_background
 from miricigale.photometry.sources import SourceTemplates

@@ -119,65 +119,6 @@ def as_mosaic(image, argument="image"):
     return CCDData(image)
 
 
-def own_pixels(image):
-    """
-    An image without copies of its pixels.
-
-    Images are enlarged by repeating each pixel n x n times. A template has another value in each of these, and
-    their noise is one.
-
-    Parameters
-    ----------
-    image : `~astropy.nddata.CCDData`
-        Two-dimensional, with WCS.
-
-    Returns
-    -------
-    image : `~astropy.nddata.CCDData`
-        Itself unless pixels are repeated; then on the pixels that it had before, those that are cut by the edge
-        left out, with n in ``meta["repeated_pixels"]``.
-
-    Warns
-    -----
-    `~miricigale.utils.exceptions.PhotometryWarning`
-        If pixels are repeated.
-    """
-    data = np.asarray(image.data)
-    if data.ndim != 2 or min(data.shape) < 8:
-        return image
-    ends = [_first_lines(lines) for lines in (data, data.T)]
-    n = np.diff(ends[0])[0]
-    if n == 1 or any(np.any(np.diff(one) != n) for one in ends):
-        return image
-    msg = f"the image has each of its pixels {n} x {n} times: it is measured on the pixels that it had before"
-    warn(msg, PhotometryWarning)
-    first = [one[0] % n for one in ends]
-    part = tuple(
-        slice(k, k + (size - k) // n * n, n) for k, size in zip(first, data.shape, strict=True)
-    )
-    # a flux in a pixel is that of all its copies
-    factor = n**2 if image.unit.is_equivalent(u.Jy) else 1
-    more = {"unit": image.unit, "wcs": image.wcs.slice(part)}
-    more["meta"] = {**image.meta, "repeated_pixels": int(n)}
-    if image.mask is not None:
-        more["mask"] = image.mask[part]
-    if image.uncertainty is not None:
-        noise = image.uncertainty.represent_as(StdDevUncertainty).array[part]
-        more["uncertainty"] = StdDevUncertainty(noise * factor)
-    return Image(data[part] * factor, **more)
-
-
-def _first_lines(lines):
-    """Numbers of the lines, from 1 on, with other values than the one before."""
-    some = np.asarray(lines[:, :: max(1, lines.shape[1] // 256)], float)
-    step, size = np.abs(np.diff(some, axis=0)), np.abs(some[1:])
-    # a solid angle that changes by 1e-6 may have been divided out
-    with np.errstate(invalid="ignore"):
-        alike = np.sum(step <= 1e-5 * size, axis=1, where=size > 0)
-        known = np.sum(np.isfinite(step) & (size > 0), axis=1)
-    return np.flatnonzero(alike < 0.9 * np.maximum(known, 1)) + 1
-
-
 @dataclasses.dataclass(frozen=True)
 class MosaicFile:
     """

@@ -44,7 +44,7 @@ def fit_image(arrays, bank, settings, catalog, grid_wcs):
     else:
         fit = fit_offsets(arrays, bank, settings, catalog)
     if not settings.second_pass:
-        # what the catalog lacks would move its neighbors
+        # where the catalog is known to lack sources, these would move their neighbors
         fit = settled(fit, bank, catalog)
     more = _More(bank, fit, catalog, grid_wcs)
     by_catalog = catalog.double is not None

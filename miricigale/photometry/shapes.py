@@ -151,23 +151,12 @@ class ShapeModels:
         psf = self._transform(size)
         return shape_models(psf, size, shape, parameters, derivatives=derivatives)
 
-    def waves(self, size):
-        """The `Waves` of stamps of a size."""
-        if size not in self._waves:
-            period = _period((size, size))
-            self._waves[size] = Waves(self._transform(period), period, size)
-        return self._waves[size]
-
-    def nodes(self, shape, xy, shapes):
-        """Profiles of unit light at one place, (n, *shape); ``shapes``, (n, 4), without it."""
-        size = _period(shape)
-        psf = self._transform(size)
-        fy, fx = 2 * np.pi * np.fft.fftfreq(size), 2 * np.pi * np.fft.rfftfreq(size)
-        ky, kx = (one.ravel() for one in np.meshgrid(fy, fx, indexing="ij"))
-        moved = psf * np.exp(-1j * fy * xy[1])[:, None] * np.exp(-1j * fx * xy[0])
-        spectra = shape_curves(kx, ky, shapes).reshape(len(shapes), size, -1) * moved
-        images = scipy.fft.irfft2(spectra.astype(np.complex64), s=(size, size), overwrite_x=True)
-        return images[:, : shape[0], : shape[1]]
+    def waves(self, shape):
+        """The `Waves` of a stamp."""
+        period = _period(shape)
+        if period not in self._waves:
+            self._waves[period] = Waves(self._transform(period), period)
+        return self._waves[period]
 
     def convolve(self, images, origin, shape):
         """
@@ -192,18 +181,16 @@ class ShapeModels:
 
 
 class Waves:
-    """The frequencies that a PSF lets pass, on a square stamp."""
+    """The frequencies that a PSF lets pass, on a square of ``period`` pixels."""
 
-    def __init__(self, psf, period, size):
-        self._period, self._size = period, size
+    def __init__(self, psf, period):
+        self._period = period
         self._use = np.abs(psf) > _PASSED * np.abs(psf[0, 0])
         ky, kx = np.nonzero(self._use)
         self._psf = psf[self._use]
         #: Frequencies, rad per pixel, shape (m,), and what their squares count in the sum over all pixels.
-        self.kx, self.ky = (
-            2 * np.pi * np.fft.rfftfreq(period)[kx],
-            2 * np.pi * np.fft.fftfreq(period)[ky],
-        )
+        self.kx = 2 * np.pi * np.fft.rfftfreq(period)[kx]
+        self.ky = 2 * np.pi * np.fft.fftfreq(period)[ky]
         twice = np.where((kx == 0) | (2 * kx == period), 1.0, 2.0)
         self.weight = twice * np.abs(self._psf) ** 2 / period**2
 
@@ -211,14 +198,14 @@ class Waves:
         """Sum of squares of the pixels of a transform."""
         return np.sum(self.weight * curve**2)
 
-    def images(self, curves, xy):
-        """Pixels of transforms, (n, m), about a place: (n, size, size)."""
-        spectra = np.zeros((len(curves), *self._use.shape), complex)
-        spectra[:, self._use] = curves * (
-            self._psf * np.exp(-1j * (self.kx * xy[0] + self.ky * xy[1]))
-        )
+    def images(self, curves, xy, shape):
+        """Pixels of transforms, (n, m), about a place of a stamp: (n, *shape), in their precision."""
+        moved = self._psf * np.exp(-1j * (self.kx * xy[0] + self.ky * xy[1]))
+        single = curves.dtype == np.float32
+        spectra = np.zeros((len(curves), *self._use.shape), np.complex64 if single else complex)
+        spectra[:, self._use] = curves * moved.astype(spectra.dtype)
         images = scipy.fft.irfft2(spectra, s=(self._period,) * 2, overwrite_x=True)
-        return images[:, : self._size, : self._size]
+        return images[:, : shape[0], : shape[1]]
 
 
 class ShapeFitter(ShapeModels):
@@ -238,6 +225,8 @@ class ShapeFitter(ShapeModels):
             Light of a stamp, and the inverse of its noise, zero for pixels that do not count.
         xy : (float, float)
             Where the source is on the stamp.
+        population : `Population`, optional
+            What is known of its shape, at its brightness; `expected` if not given.
         start : `Shape`, optional
             A profile to begin with; several sizes are tried without.
 
@@ -304,7 +293,9 @@ class ShapeFitter(ShapeModels):
         inverse = weight[cut].ravel()[use]
 
         def curves(xy, shapes):
-            return self.nodes(shape, np.asarray(xy) - [x0, y0], shapes)
+            waves = self.waves(shape)
+            found = shape_curves(waves.kx, waves.ky, shapes).astype(np.float32)
+            return waves.images(found, np.asarray(xy) - [x0, y0], shape)
 
         return _Stamp(models, curves, use, inverse, data[cut].ravel()[use] * inverse, max(shape))
 

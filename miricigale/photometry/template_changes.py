@@ -70,7 +70,8 @@ class TemplateChanges:
         widths = _WIDTHS * np.clip(_SEEN / least, 1.0, 4.0)
         half = min(_reach(parameters), _MOST) + widths * self._width
         half = int(np.ceil(max(half, _HALF)))
-        waves = self._target.waves(2 * half + 1)
+        size = (2 * half + 1,) * 2
+        waves = self._target.waves(size)
         # nodes about the mean, and the profile that is scaled
         covariance = fitted["covariance"][3:, 3:]
         nodes = parameters[2:] + normal_nodes() @ _root(covariance).T
@@ -96,7 +97,8 @@ class TemplateChanges:
         kept = value > limit
         found = np.concatenate([vector.T[kept] @ steps, [mean * blur - base]])
         fixed = waves.power(found[-1]) > limit
-        images = waves.images(found if fixed else found[:-1], parameters[:2] - middle + half)
+        place = parameters[:2] - middle + half
+        images = waves.images(found if fixed else found[:-1], place, size)
         origin = int(middle[1]) - half, int(middle[0]) - half
         last = len(images) - 1 if fixed else len(images)
         return [Change(Cutout(one, origin), fixed=k == last) for k, one in enumerate(images)], 0.0

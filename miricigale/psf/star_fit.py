@@ -19,8 +19,9 @@ _SLOPED, _CELLS = 3, 0.1
 _SPREAD = np.array([*TERMS.values(), *[0.05] * (2 * _SLOPED)])
 
 #: Least number of stars that are left out one by one (of fewer, halves are), with which changes over the field and
-#: single cells are tried; how much smaller chi-square must be of what was left out.
-_WHOLE, _FIELD, _EFFECTIVE, _EVIDENCE = 3, 6, 3, 9.0
+#: single cells are tried; how much smaller chi-square must be of what was left out, and as a part of it: less may
+#: come from the wings of neighbors.
+_WHOLE, _FIELD, _EFFECTIVE, _EVIDENCE, _PART = 3, 6, 3, 9.0, 1e-3
 
 #: Deviation of a star from any PSF, as a fraction of its light in a pixel; steps of the fit.
 _SCATTER, _STEPS = 0.02, 5
@@ -273,7 +274,8 @@ class StarPSF:
     def _better(self, kind, chi2):
         """Whether a kind of correction is confirmed, which is then the kind."""
         self.chi2[kind] = chi2
-        better = chi2 < self.chi2[self.kind] - _EVIDENCE
+        known = self.chi2[self.kind]
+        better = chi2 < known - max(_EVIDENCE, _PART * known)
         self.kind = kind if better else self.kind
         return better
 

@@ -129,6 +129,11 @@ def test_psfs_of_any_sum_hold_what_the_model_does(field, tmp_path, width, total)
     assert_allclose(np.median(found / field.flux), 1, atol=0.007)
 
 
+def test_stars_leave_an_exact_psf_alone(field):
+    """Also where sixteen stars stand in each other's wings."""
+    assert_allclose(fluxes(field, psf_stars=True), fluxes(field), rtol=1e-6)
+
+
 def test_psfs_on_cells_of_a_pixel_are_told_by_their_width(field, tmp_path):
     data = miri_psf("miri.f770w", fov=8 * ARCSEC).data
     path = saved(tmp_path, data / data.sum())

@@ -45,19 +45,19 @@ def ended(process, status=0):
     return message
 
 
-def killed(folder, name, text=""):
-    """Start a study, and kill it when a file stands (and has a text)."""
+def killed(folder, name, *texts):
+    """Start a study, and kill it when a file stands (and has some texts)."""
     process = start(folder)
-    wait_for(folder / name, process, text)
+    wait_for(folder / name, process, *texts)
     process.kill()
     process.communicate(timeout=60)
 
 
-def wait_for(path, process, text=""):
-    """Wait until a file stands (and has a text), or the process has ended."""
+def wait_for(path, process, *texts):
+    """Wait until a file stands (and has some texts), or the process has ended."""
     deadline = time.monotonic() + 60
     while process.poll() is None and time.monotonic() < deadline:
-        if path.exists() and text in path.read_text():
+        if path.exists() and all(text in path.read_text() for text in texts):
             return
         time.sleep(0.002)
 
@@ -113,7 +113,8 @@ def test_a_second_run_in_the_folder_is_refused_and_the_first_one_goes_on(tmp_pat
 
 def test_a_configuration_that_changes_before_a_killed_run_goes_on(tmp_path, undisturbed):
     folder = tmp_path / "run"
-    killed(folder, ".manifest.journal", '"first:c"')
+    # whichever ends first
+    killed(folder, ".manifest.journal", '"first:a"', '"first:b"', '"first:c"')
     before = contents(folder)
     # what units c and d depend on is refused, and nothing is touched
     message = ended(start(folder, "2.0"), 1)

@@ -5,13 +5,13 @@ import itertools
 from miricigale.detector.effects.base import Effect, OtherEffect, stream_key
 from miricigale.detector.effects.charge import (
     BadPixels,
-    CosmicRays,
     Dark,
     InterpixelCapacitance,
     Persistence,
     ReferencePixels,
     Saturation,
 )
+from miricigale.detector.effects.cosmic_rays import CosmicRays
 from miricigale.detector.effects.light import Photons, Residual
 from miricigale.detector.effects.migration import BrighterFatter
 from miricigale.detector.effects.readout import ADConversion, Bias, Nonlinearity, ReadNoise

@@ -55,6 +55,21 @@ def _profile(log_index):
 
 
 @njit(cache=True, nogil=True)
+def _interpolated(profile, form):
+    """Value of a profile at the square of k R_e, its derivative to ln(k R_e), and the place in the table."""
+    t = (0.5 * np.log(form) - _START) / _STEP
+    t = min(max(t, 1.0), profile.size - 3.0)
+    m = int(t)
+    t -= m
+    a, b, e, f = profile[m - 1], profile[m], profile[m + 1], profile[m + 2]
+    c1 = 0.5 * (e - a)
+    c2 = a - 2.5 * b + 2.0 * e - 0.5 * f
+    c3 = 0.5 * (f - a) + 1.5 * (b - e)
+    slope = (c1 + t * (2.0 * c2 + 3.0 * t * c3)) / _STEP
+    return b + t * (c1 + t * (c2 + t * c3)), slope, m, t
+
+
+@njit(cache=True, nogil=True)
 def _fill(psf, fy, fx, x, y, log_s, g1, g2, profile, by_index, out):
     """Write the transforms of the unit model and its derivatives into ``out``."""
     eta = np.sqrt(g1 * g1 + g2 * g2)
@@ -64,7 +79,6 @@ def _fill(psf, fy, fx, x, y, log_s, g1, g2, profile, by_index, out):
         ch, sh = np.cosh(eta), np.sinh(eta) / eta
         bend = (ch - sh) / (eta * eta)
     size = np.exp(2.0 * log_s)
-    n_nodes = profile.size
     n_out = out.shape[0]
     ex = np.exp(-1j * fx * x)
     for i in range(fy.size):
@@ -81,19 +95,7 @@ def _fill(psf, fy, fx, x, y, log_s, g1, g2, profile, by_index, out):
             if form * size < 1e-5:
                 s, ds, dn = 1.0, 0.0, 0.0
             else:
-                t = (0.5 * np.log(form * size) - _START) / _STEP
-                m = int(t)
-                if m < 1:
-                    m, t = 1, 1.0
-                if m > n_nodes - 3:
-                    m, t = n_nodes - 3, n_nodes - 3.0
-                t -= m
-                a, b, e, f = profile[m - 1], profile[m], profile[m + 1], profile[m + 2]
-                c1 = 0.5 * (e - a)
-                c2 = a - 2.5 * b + 2.0 * e - 0.5 * f
-                c3 = 0.5 * (f - a) + 1.5 * (b - e)
-                s = b + t * (c1 + t * (c2 + t * c3))
-                ds = (c1 + t * (2.0 * c2 + 3.0 * t * c3)) / _STEP
+                s, ds, m, t = _interpolated(profile, form * size)
                 dn = by_index[m] + t * (by_index[m + 1] - by_index[m])
             model = factor * s
             out[0, i, j] = model
@@ -115,7 +117,6 @@ def _fill(psf, fy, fx, x, y, log_s, g1, g2, profile, by_index, out):
 
 @njit(cache=True, nogil=True)
 def _fill_curves(kx, ky, shapes, profiles, out):
-    n_nodes = profiles.shape[1]
     for s in range(shapes.shape[0]):
         g1, g2 = shapes[s, 2], shapes[s, 3]
         eta = np.sqrt(g1 * g1 + g2 * g2)
@@ -130,15 +131,7 @@ def _fill_curves(kx, ky, shapes, profiles, out):
             if form < 1e-5:
                 out[s, i] = 1.0
                 continue
-            t = (0.5 * np.log(form) - _START) / _STEP
-            t = min(max(t, 1.0), n_nodes - 3.0)
-            m = int(t)
-            t -= m
-            a, b, e, f = profile[m - 1], profile[m], profile[m + 1], profile[m + 2]
-            c1 = 0.5 * (e - a)
-            c2 = a - 2.5 * b + 2.0 * e - 0.5 * f
-            c3 = 0.5 * (f - a) + 1.5 * (b - e)
-            out[s, i] = b + t * (c1 + t * (c2 + t * c3))
+            out[s, i], _, _, _ = _interpolated(profile, form)
 
 
 def shape_curves(kx, ky, shapes):

@@ -4,9 +4,10 @@ import collections
 import dataclasses
 import heapq
 import logging
+import queue
 import time
 from collections.abc import Callable
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
+from concurrent.futures import BrokenExecutor, Executor, Future
 from typing import NamedTuple
 
 from miricigale.utils.exceptions import DataError
@@ -174,8 +175,9 @@ def run_tasks(tasks, *, places, n_threads, wait_for=None, report=None):
     `~miricigale.utils.exceptions.DataError`
         If a process of an executor died, or four places were lost over one task.
     """
-    queue, running, error = _Queue(list(tasks)), {}, None
-    deaths = collections.Counter()
+    waiting, running, error = _Queue(list(tasks)), {}, None
+    # concurrent.futures.wait holds locks of all futures, and keeps them if it is interrupted
+    done, deaths = queue.SimpleQueue(), collections.Counter()
     while True:
         now = places()
         for future, (task, place) in list(running.items()):
@@ -190,38 +192,44 @@ def run_tasks(tasks, *, places, n_threads, wait_for=None, report=None):
                     )
                     raise DataError(msg)
                 log.warning("%s is lost; %s is done again by another worker", place, task.title)
-                queue.put_back(task)
+                waiting.put_back(task)
         task = None
         if error is None and len(running) < n_threads:
             place, left = _roomiest(now, running.values())
-            task = queue.take(left)
+            task = waiting.take(left)
         if task is not None:
             slots = min(n_threads, sum(one.slots for one in now.values()))
-            together = min(slots, len(running) + queue.n_ready + 1)
+            together = min(slots, len(running) + waiting.n_ready + 1)
             threads = min(now[place].n_threads, max(1, n_threads // together))
             try:
                 future = task.begin(now[place].submit, threads)
             except BrokenExecutor as err:
                 raise _died(task) from err
             if future is None:
-                queue.complete(task)
+                waiting.complete(task)
             else:
                 running[future] = task, place
+                future.add_done_callback(done.put)
                 if report is not None:
                     report([other.title for other, _ in running.values()])
         elif running:
-            for future in wait(running, wait_for, return_when=FIRST_COMPLETED).done:
-                task, _ = running.pop(future)
-                failed = future.exception()
-                if isinstance(failed, BrokenExecutor):
-                    raise _died(task) from failed
-                if failed is None:
-                    task.finish(future.result())
-                    queue.complete(task)
-                error = error or failed
+            try:
+                future = done.get(timeout=wait_for)
+            except queue.Empty:
+                continue
+            task, _ = running.pop(future, (None, None))
+            if task is None:
+                continue
+            failed = future.exception()
+            if isinstance(failed, BrokenExecutor):
+                raise _died(task) from failed
+            if failed is None:
+                task.finish(future.result())
+                waiting.complete(task)
+            error = error or failed
         elif error is not None:
             raise error
-        elif queue.n_ready:
+        elif waiting.n_ready:
             log.warning("there are no workers any more: waiting for some")
             while not places():
                 time.sleep(wait_for)
