@@ -1,17 +1,22 @@
 """
 Memory and time of a fit from file to file: a long catalog and a small grid, or the paper's at known redshifts.
 
-    python benchmarks/large.py [--n 200000] [--chunk-rows 10000] [--threads 1] [--known]
+    python benchmarks/large.py [--n 200000] [--chunk-rows 10000] [--threads 1] [--few] [--kind parquet] [--kill]
+    python benchmarks/large.py --known [--n 10000]
 
 With ``--known`` the grid is that of Yang et al. 2021 (24 million models, 21 bands), objects are fitted at their
 known redshifts in one process, and CPU seconds are printed beside those of the loop of ``benchmarks/fit.py``.
-Otherwise the catalog is written a piece at a time. Peak memory is that of a process of its own, for this
-catalog and for one a tenth as long: the difference is what a longer catalog costs.
+Otherwise the catalog is written a piece at a time, and fitted on the nodes of a small grid; with ``--few`` one of
+12 redshifts, 24 galaxies and 6 bands, for long catalogs. Peak memory is that of a process of its own, for this
+catalog and for one a tenth as long: the difference is what a longer catalog costs. The page of ``miricigale fit``
+is made too. With ``--kill`` a third fit is killed with -9 again and again, and its files are compared.
 """
 
 import argparse
+import hashlib
 import os
 import resource
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -24,7 +29,8 @@ import fit
 import numpy as np
 from astropy.table import QTable
 
-from miricigale.fitting import BayesFitter, fit_file, open_results
+from miricigale.fitting import BayesFitter, GridSettings, fit_file, open_results
+from miricigale.fitting.page import fit_page
 from miricigale.sed import SEDModel
 from miricigale.utils.row_files import write_rows
 
@@ -32,11 +38,11 @@ BANDS = ["megacam.u", "acs.f606w", "acs.f814w", "wfc3.f125w", "wfc3.f160w", "ira
 BANDS += ["miri.f770w", "miri.f1000w", "miri.f1500w", "miri.f2100w"]
 
 
-def make_grid():
+def make_grid(few):
     axes = SEDModel.yang2021_axes("quick")
-    axes = {name: axes[name] for name in ("tau", "age", "ebv", "alpha")}
-    axes["redshift"] = np.expm1(np.linspace(np.log(1.1), np.log(5.0), 30))
-    return SEDModel.yang2021(agn=False).grid(axes, BANDS)
+    axes = {name: axes[name] for name in ("tau", "age", "ebv", "alpha")[: 3 if few else 4]}
+    axes["redshift"] = np.expm1(np.linspace(np.log(1.1), np.log(5.0), 12 if few else 30))
+    return SEDModel.yang2021(agn=False).grid(axes, BANDS[:: 2 if few else 1])
 
 
 def catalog(grid, n, step=20000):
@@ -59,31 +65,69 @@ def write_catalog(path, grid, n):
     write_rows(path, catalog(grid, n), n)
 
 
-def one(folder, n, chunk_rows, threads):
+def one(folder, n, chunk_rows, threads, few, kind):
     """Fit a catalog and print seconds and peak memory."""
-    grid = make_grid()
-    fitter = BayesFitter(grid)
-    warm = QTable({"id": [0], **{c: [1.0] * u.uJy for b in BANDS for c in (b, f"{b}_err")}})
+    grid = make_grid(few)
+    fitter = BayesFitter(grid, settings=GridSettings(interpolate=0))
+    bands = grid.filters
+    warm = QTable({"id": [0], **{c: [1.0] * u.uJy for b in bands for c in (b, f"{b}_err")}})
     fitter.fit(warm)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    start = time.time()
+    before, path = peak(), folder / f"{n}.{kind}"
+    start, cpu = time.time(), time.process_time()
     with ThreadPoolExecutor(threads) as executor:
         results = fit_file(
             fitter,
-            folder / f"{n}.fits",
+            path,
             folder / f"out{n}",
             chunk_rows=chunk_rows,
             executor=executor if threads > 1 else None,
         )
+    cpu = time.process_time() - cpu
     fitted = time.time() - start
     start = time.time()
-    results.write_table(folder / f"table{n}.fits")
+    results.write_table(folder / f"table{n}.{kind}", overwrite=True)
     joined = time.time() - start
     start = time.time()
-    fit_file(fitter, folder / f"{n}.fits", folder / f"out{n}", chunk_rows=chunk_rows)
+    fit_file(fitter, path, folder / f"out{n}", chunk_rows=chunk_rows)
     again = time.time() - start
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(fitted, joined, again, before, peak)
+    of_fit = peak()
+    fit_page(results, path).write(folder / f"page{n}.html")
+    loop = fit.loop_time(grid, grid.n_allowed, len(bands))
+    print(fitted, joined, again, before, of_fit, peak(), cpu, loop)
+
+
+def peak():
+    """Peak memory so far, MB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def killed(run, folder, n, kind):
+    """Kill a fit after more and more seconds until it ends; the files that differ from those of a whole one."""
+    old, path = folder / f"out{n}", folder / f"whole{n}"
+    old.rename(path)
+    whole = {**checksums(path), "table": digest(folder / f"table{n}.{kind}")}
+    kills, wait = 0, 12.0
+    while True:
+        with subprocess.Popen(run, stdout=subprocess.DEVNULL) as process:
+            try:
+                process.wait(wait)
+                break
+            except subprocess.TimeoutExpired:
+                process.kill()
+                kills, wait = kills + 1, 1.3 * wait
+    again = {**checksums(old), "table": digest(folder / f"table{n}.{kind}")}
+    differ = [name for name in {*whole, *again} if whole.get(name) != again.get(name)]
+    print(f"killed {kills} times: {len(whole)} files, of which differ: {differ}")
+
+
+def checksums(folder):
+    """Checksums of the files of a fit by name."""
+    return {one.name: digest(one) for one in folder.iterdir() if one.name != ".fit.lock"}
+
+
+def digest(path):
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def known(n, chunk_rows):
@@ -115,37 +159,48 @@ def main():
     parser.add_argument("--chunk-rows", type=int, default=10_000)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--known", action="store_true", help="known redshifts, the paper's grid")
+    parser.add_argument("--few", action="store_true", help="a smaller grid in fewer bands")
+    parser.add_argument("--kind", choices=["fits", "parquet"], default="fits", help="of files")
+    parser.add_argument("--kill", action="store_true", help="kill a fit, and compare its files")
     parser.add_argument("--one", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.one:
-        one(options.one, options.n, options.chunk_rows, options.threads)
+        more = options.threads, options.few, options.kind
+        one(options.one, options.n, options.chunk_rows, *more)
         return
     if options.known:
         known(options.n, options.chunk_rows)
         return
-    grid = make_grid()
+    grid, kind = make_grid(options.few), options.kind
     print(f"{grid!r}; {options.chunk_rows} rows a part, {options.threads} threads")
     print(
         f"{'objects':>8s} {'input':>8s} {'results':>8s} {'fit':>8s} {'rate':>8s} {'join':>7s}",
         end="",
     )
-    print(f" {'resume':>7s} {'before':>8s} {'peak':>8s}")
+    print(f" {'resume':>7s} {'before':>8s} {'peak':>8s} {'page':>8s} {'CPU':>8s} {'loop':>8s}")
     with tempfile.TemporaryDirectory() as folder:
         folder = Path(folder)
         for n in (options.n // 10, options.n):
-            write_catalog(folder / f"{n}.fits", grid, n)
+            write_catalog(folder / f"{n}.{kind}", grid, n)
             run = [sys.executable, __file__, "--one", str(folder), "--n", str(n)]
             run += ["--chunk-rows", str(options.chunk_rows), "--threads", str(options.threads)]
+            run += ["--kind", kind, *(["--few"] if options.few else [])]
             env = {**os.environ, "OMP_NUM_THREADS": "1"}
             text = subprocess.check_output(run, text=True, env=env).split()
-            fitted, joined, again, before, peak = map(float, text[-5:])
-            size = (folder / f"{n}.fits").stat().st_size / 1e6
+            fitted, joined, again, before, of_fit, of_page, cpu, loop = map(float, text[-8:])
+            size = (folder / f"{n}.{kind}").stat().st_size / 1e6
             results = open_results(folder / f"out{n}")
             out = sum(path.stat().st_size for path in results.paths) / 1e6
             print(
                 f"{n:8d} {size:5.0f} MB {out:5.0f} MB {fitted:6.0f} s {n / fitted:4.0f} /s "
-                f"{joined:5.0f} s {again:5.1f} s {before:5.0f} MB {peak:5.0f} MB"
+                f"{joined:5.0f} s {again:5.1f} s {before:5.0f} MB {of_fit:5.0f} MB {of_page:5.0f} MB "
+                f"{1e3 * cpu / n:5.3f} ms {1e3 * loop:5.3f} ms",
+                flush=True,
             )
+            if options.kill:
+                killed(run, folder, n, kind)
+                shutil.rmtree(folder / f"whole{n}")
+            shutil.rmtree(folder / f"out{n}")
 
 
 if __name__ == "__main__":

@@ -8,12 +8,9 @@ from astropy.table import QTable, Table
 
 from miricigale.filters.band_names import band_filters, filter_of_band, is_line
 from miricigale.filters.given import given_filters
-from miricigale.utils.exceptions import (
-    CatalogWarning,
-    data_error,
-    warn,
-)
+from miricigale.utils.exceptions import CatalogWarning, data_error, warn
 from miricigale.utils.missing import negative_errors, plain_floats, without_codes
+from miricigale.utils.options import check_data
 from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU
@@ -103,8 +100,7 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
         filters, lost = band_filters([name for name in chosen if name not in lines], names)
     except ValueError as err:
         raise data_error(path, f"cannot be used: {err}") from None
-    if not filters:
-        raise data_error(path, f"has no band that is known here, of {', '.join(chosen) or 'none'}")
+    check_data(filters, path, f"has no band that is known here, of {', '.join(chosen) or 'none'}")
     left_out = [*lost, *(f"{name} (line)" for name in lines)]
     own = {*_OWN, *chosen, *map(error_column, chosen)}
     other = [] if bands is not None else [name for name in table.colnames if name not in own]
@@ -134,8 +130,7 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
         "taken as missing, upper limits that are not positive": no_limit,
     }
     text = "; ".join(f"{what}: {', '.join(which)}" for what, which in notes.items() if which)
-    if strict and left_out:
-        raise data_error(path, f"cannot be used as a whole: {text}")
+    check_data(not (strict and left_out), path, f"cannot be used as a whole: {text}")
     if text:
         warn(f"{path}: {text}", CatalogWarning)
     return out
@@ -148,8 +143,7 @@ def _choose(path, table, bands):
         own = [name for name in have if name not in _OWN]
         bands = [x for x in own if error_column(x) in have or filter_of_band(x) or is_line(x)]
     lost = [name for name in ("id", "redshift", *bands) if name not in have]
-    if lost:
-        raise data_error(path, f"has no column {', '.join(lost)}; it has {', '.join(have)}")
+    check_data(not lost, path, f"has no column {', '.join(lost)}; it has {', '.join(have)}")
     return [name for name in dict.fromkeys(bands) if not name.endswith("_err")]
 
 

@@ -45,19 +45,12 @@ def at_their_distances(results, redshift, distances, cosmology):
         here = np.where(np.isfinite(given), given * u.Mpc.to(u.m), here)
     factor = np.where(np.isfinite(node), (here / there) ** 2 * (1.0 + node) / (1.0 + z), 1.0)
     rows = [results.extensive(name) for name in results.quantities]
-    moments, quantiles = np.array(results.moments), np.array(results.quantiles)
-    moments[:, rows, :2] *= factor[:, None, None]
-    moments[:, rows, 2] += np.log10(factor)[:, None]
-    quantiles[:, rows] *= factor[:, None, None]
-    best = {
-        name: value * factor if results.extensive(name) else value
-        for name, value in results.best.items()
-    }
-    return dataclasses.replace(
-        results,
-        moments=moments,
-        quantiles=quantiles,
-        best=best | {"redshift": np.where(np.isfinite(node), z, np.nan)},
-        best_scale=results.best_scale * factor,
-        distance=given,
-    )
+    new = results._mapped(np.array)
+    new["moments"][:, rows, :2] *= factor[:, None, None]
+    new["moments"][:, rows, 2] += np.log10(factor)[:, None]
+    new["quantiles"][:, rows] *= factor[:, None, None]
+    for name in filter(results.extensive, new["best"]):
+        new["best"][name] *= factor
+    new["best"]["redshift"] = np.where(np.isfinite(node), z, np.nan)
+    new["best_scale"] *= factor
+    return dataclasses.replace(results, **new | {"distance": given})

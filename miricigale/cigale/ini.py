@@ -7,33 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import config_error, data_error
 from miricigale.utils.options import check_that
 
-#: Settings other than those of the modules; empty ones count as not given.
-_SPEC = """\
-data_file = string(default="")
-parameters_file = string(default="")
-sed_modules = force_list
-analysis_method = option(pdf_analysis, savefluxes, default=pdf_analysis)
-bands = force_list(default=list())
-properties = force_list(default=list())
-additionalerror = float(min=0, default=0.1)
-[analysis_params]
-variables = force_list(default=list())
-bands = force_list(default=list())
-lim_flag = option({limits}, default=none)
-mock_flag = boolean(default=False)
-redshift_decimals = integer(default=2)
-"""
+_DECLARED = declared("miricigale.cigale", "pcigale.toml")
 #: Values of ``lim_flag``, those of older versions too.
-LIMIT_FLAGS = {
-    "full": "full",
-    "noscaling": "noscaling",
-    "none": "none",
-    **dict.fromkeys(("True", "true", "yes", "on", "1"), "full"),
-    **dict.fromkeys(("False", "false", "no", "off", "0"), "none"),
-}
+LIMIT_FLAGS = _DECLARED["limit_flags"]
 #: No parameter has more values than this.
 _MAX_VALUES = 100_000
 
@@ -49,7 +29,7 @@ def parse_ini(path):
     # the library that CIGALE itself uses; astropy bundles a copy
     from astropy.extern.configobj import configobj, validate
 
-    spec = _SPEC.format(limits=", ".join(LIMIT_FLAGS)).splitlines()
+    spec = _DECLARED["specification"].format(limits=", ".join(LIMIT_FLAGS)).splitlines()
     try:
         if not Path(path).is_file():
             msg = "no such file"

@@ -49,13 +49,7 @@ def near_relation(fitter, photometry, results, most, *, redshift=None, seed=0):
         best of them that was drawn, where the best of all is none of them. Objects of which less than 1 % of the
         posterior keeps the bound are flagged ``OFF_RELATION``, and left as they are.
     """
-    new = {
-        name: np.array(getattr(results, name))
-        for name in ("flags", "chi2", "log_evidence", "moments", "quantiles", "pdf_2d")
-        + ("model_flux", "model_flux_std", "best_flux", "best_index", "best_scale")
-    }
-    new["pdf"] = {name: np.array(pdf) for name, pdf in results.pdf.items()}
-    new["best"] = {name: np.array(values.value) for name, values in results.best.items()}
+    new = results._mapped(np.array)
     for rows in chunks(len(results), _OBJECTS):
         z = None if redshift is None else np.asarray(redshift)[rows]
         with warnings.catch_warnings():
@@ -77,8 +71,7 @@ def near_relation(fitter, photometry, results, most, *, redshift=None, seed=0):
             new["model_flux"][i], new["model_flux_std"][i] = flux.mean(axis=0), flux.std(axis=0)
             if not _best_is_near(results, i, most):
                 _take_best(results, new, i, index, scale, flux, mine)
-    best = {name: u.Quantity(v, results.best[name].unit) for name, v in new.pop("best").items()}
-    return dataclasses.replace(results, **new, best=best)
+    return dataclasses.replace(results, **new)
 
 
 def _near(samples, most):
@@ -121,6 +114,5 @@ def _take_best(results, new, i, index, scale, flux, values):
     k = int(np.argmin(chi2))
     new["chi2"][i], new["best_flux"][i] = chi2[k], flux[k]
     new["best_index"][i], new["best_scale"][i] = index[k], scale[k]
-    for name, array in new["best"].items():
-        if name in values:
-            array[i] = values[name][k]
+    for name in new["best"].keys() & values.keys():
+        new["best"][name][i] = values[name][k]

@@ -1,8 +1,9 @@
 """Commands that make catalogs: fit, photometry."""
 
+import contextlib
 import sys
 
-from miricigale.cli.options import chosen, read_input
+from miricigale.cli.options import chosen, read_input, workers
 from miricigale.utils.exceptions import argument_error
 
 #: Options of an image, as `~miricigale.photometry.MosaicFile` has them.
@@ -17,26 +18,24 @@ def fit(args):
     from miricigale.fitting.classes import fit_classes, write_table
     from miricigale.fitting.page import fit_page
     from miricigale.utils.exceptions import OtherResultsError
-    from miricigale.utils.parallel import threads
 
     hdu = int(args.hdu) if (args.hdu or "").isdigit() else args.hdu
     if str(args.photometry) == "-":
         args.photometry = read_input(args.output)
     try:
-        with threads(args.threads or None) as executor:
+        with _workers(args) as executor:
             found = fit_classes(
                 args.photometry,
                 args.output,
-                **chosen(args, "quasars red_dots stars"),
-                **chosen(args, "axes redshift model_error outliers calibration calibrate"),
-                **chosen(
-                    args, "interpolate agn_error pairs flux_unit catalog_map ebv chunk_rows resume"
-                ),
+                **chosen(args, "quasars red_dots stars axes redshift model_error outliers"),
+                **chosen(args, "calibration calibrate interpolate agn_error pairs"),
+                **chosen(args, "flux_unit catalog_map ebv chunk_rows resume"),
                 hdu=hdu,
                 executor=executor,
                 progress_bar=not args.no_progress,
             )
-        table = args.output / "table.fits"
+        kind = ".parquet" if args.photometry.suffix.lower() == ".parquet" else ".fits"
+        table = args.output / f"table{kind}"
         write_table(found, table, overwrite=True)
         page = fit_page(found, args.photometry, **chosen(args, "catalog_map z_spec"), hdu=hdu)
         page = page.write(args.output / "page.html")
@@ -52,6 +51,21 @@ def fit(args):
         raise OtherResultsError(err.reason, "--no-resume to replace them") from err
     print(f"{found['galaxy']!r}; all in {table}; page: {page}")
     return 0
+
+
+@contextlib.contextmanager
+def _workers(args):
+    """Executor of the threads of this machine, or of the workers of a scheduler."""
+    from miricigale.utils.parallel import threads
+
+    if args.scheduler is None:
+        with threads(args.threads or None) as executor:
+            yield executor
+    else:
+        from miricigale.workflow.engine.cluster import cluster_executor
+
+        with cluster_executor(args.scheduler) as cluster:
+            yield cluster._client.get_executor(pure=False)
 
 
 def _images(args, paths, prefix=""):
@@ -79,28 +93,42 @@ def photometry(args):
     if not paths or not ways or len(args.highres or ()) > 1:
         msg = "wanted are --image and --highres, or the images and last the prior without options"
         raise ValueError(msg)
-    if str(args.output) == "-":
-        args.output, page = None, args.page
-    else:
-        page = args.page or args.output.with_suffix(".html")
-    kernels = args.kernel and [None if one == "-" else one for one in args.kernel]
-    table = measure_files(
-        _images(args, paths),
-        _images(args, [prior], "highres_")[0],
-        kernel=kernels,
-        detection=args.detection,
-        **chosen(args, "segmentation catalog confidence"),
+    images, prior = _images(args, paths), _images(args, [prior], "highres_")[0]
+    options = {
+        "kernel": args.kernel and [None if one == "-" else one for one in args.kernel],
+        **chosen(args, "detection segmentation catalog confidence"),
         **chosen(args, "max_shift background_order offset_order second_pass"),
-        **chosen(args, "components psf_stars output model residual overwrite seed"),
-        page=page,
-        n_threads=args.threads,
-        progress_bar=not args.no_progress,
-    )
-    if args.output is None:
+        **chosen(args, "components psf_stars overwrite seed"),
+        "output": None if str(args.output) == "-" else args.output,
+        "n_threads": args.threads,
+        "progress_bar": not args.no_progress,
+    }
+    page, whole = args.page, args.patches is None
+    for name in ("patch_size", "scheduler", "redo") if whole else ("page", "model", "residual"):
+        if getattr(args, name):
+            wanted = f"left out with{'out' * whole} --patches"
+            raise argument_error("--" + name.replace("_", "-"), wanted, getattr(args, name))
+    if not whole:
+        table, page = _in_patches(args, images, prior, options), args.patches / "index.html"
+    else:
+        if page is None and options["output"] is not None:
+            page = args.output.with_suffix(".html")
+        table = measure_files(images, prior, page=page, **chosen(args, "model residual"), **options)
+    if options["output"] is None:
         table.write(sys.stdout, format="ascii.ecsv")
     else:
         print(f"{len(table)} sources in {args.output}; page: {page}")
     return 0
+
+
+def _in_patches(args, images, prior, options):
+    """Measure images in patches, on the processors of this machine or of others."""
+    from miricigale.workflow import measure_patches
+
+    options |= chosen(args, "patch_size overlap redo")
+    args.stopped = f"stopped; the same command resumes what is in {args.patches}/"
+    with workers(args.scheduler, args.threads) as executor:
+        return measure_patches(images, prior, args.patches, executor=executor, **options)
 
 
 def errors(args):

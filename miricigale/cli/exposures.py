@@ -9,12 +9,10 @@ def reduce(args):
     """Reduce exposures."""
     from miricigale.reduction import BackgroundSettings, Reducer
     from miricigale.reduction.from_files import reduce_files
-    from miricigale.utils.exceptions import DataError
+    from miricigale.utils.options import check_data
 
     for path in args.files:
-        if not path.is_file():
-            msg = f"no file {path}"
-            raise DataError(msg)
+        check_data(path.is_file(), "no file", path)
     settings = chosen(args, "backend skip_first skip_last")
     background = BackgroundSettings(args.background, **chosen(args, "stripes sky_flat"))
     settings |= {"background": background}

@@ -1,6 +1,7 @@
 """The parser of the program, from the declarations of ``commands.toml``."""
 
 import argparse
+import contextlib
 import sys
 import tomllib
 from importlib import resources
@@ -54,6 +55,25 @@ def chosen(args, names):
 def declarations():
     """What ``commands.toml`` declares: of each command by name, and of ``shared`` options."""
     return tomllib.loads((resources.files("miricigale.cli") / "commands.toml").read_text("utf-8"))
+
+
+@contextlib.contextmanager
+def workers(scheduler, n_threads, memory=None):
+    """Processes of this machine, or the workers of a dask scheduler, as an executor of a run that is resumed."""
+    from miricigale.utils.exceptions import OtherResultsError
+    from miricigale.utils.parallel import process_pool, thread_count
+    from miricigale.workflow.engine.cluster import cluster_executor
+
+    if scheduler is None:
+        pool = process_pool(thread_count(n_threads or None))
+    else:
+        pool = cluster_executor(scheduler, memory=memory)
+    try:
+        with pool as executor:
+            yield executor
+    except OtherResultsError as err:
+        # name the option of the command instead of the argument
+        raise OtherResultsError(err.reason, "--redo to replace it") from err
 
 
 def make_parser(argv):

@@ -41,14 +41,13 @@ def open_product(path):
     """
     from astropy.io.registry import IORegistryError
 
-    from miricigale.utils.exceptions import DataError, data_error
+    from miricigale.utils.exceptions import data_error
+    from miricigale.utils.options import check_data
 
     # of a reader for a file of another kind
     other = (OSError, ValueError, KeyError, TypeError, IORegistryError)
     path = Path(path)
-    if not path.is_file():
-        msg = f"no file {path}"
-        raise DataError(msg)
+    check_data(path.is_file(), "no file", path)
     with warnings.catch_warnings():
         # they are about what was tried
         warnings.simplefilter("ignore")

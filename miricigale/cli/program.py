@@ -62,7 +62,7 @@ def main(argv=None):
         from astropy.units import UnitsError
 
         # one clear sentence for input that cannot be used; the traceback is for --verbose
-        expected = (ValueError, KeyError, OSError, ImportError, UnitsError)
+        expected = (ValueError, KeyError, OSError, ImportError, MemoryError, UnitsError)
         if verbose or not isinstance(err, expected):
             raise
         message = err.args[0] if isinstance(err, KeyError) and err.args else err

@@ -4,7 +4,7 @@ import sys
 import time
 from pathlib import Path
 
-from miricigale.cli.options import chosen, declarations
+from miricigale.cli.options import chosen, declarations, workers
 
 
 def _settings(args, values):
@@ -22,10 +22,7 @@ def _settings(args, values):
 
 def run(args):
     """Run a study."""
-    from miricigale.utils.exceptions import OtherResultsError
-    from miricigale.utils.parallel import process_pool, thread_count
     from miricigale.workflow import load_config, run_study
-    from miricigale.workflow.engine.cluster import cluster_executor
 
     options = chosen(args, "threads seed") | {"keep_level1b": args.keep_level1b or None}
     values = {f"run.{name}": value for name, value in options.items() if value is not None}
@@ -36,16 +33,8 @@ def run(args):
     folder = args.output or Path(config.run.name)
     begin = time.monotonic()
     options = chosen(args, "redo until again") | {"progress_bar": not args.no_progress}
-    try:
-        if args.scheduler is None:
-            with process_pool(thread_count(config.run.threads or None)) as executor:
-                report = run_study(config, folder, executor=executor, **options)
-        else:
-            with cluster_executor(args.scheduler, memory=config.run.memory) as cluster:
-                report = run_study(config, folder, executor=cluster, **options)
-    except OtherResultsError as err:
-        # name the option of this command instead of the argument
-        raise OtherResultsError(err.reason, "--redo to replace it") from err
+    with workers(args.scheduler, config.run.threads, config.run.memory) as executor:
+        report = run_study(config, folder, executor=executor, **options)
     made = f"report: {report}" if args.until is None else f"products: {folder}"
     print(f"done in {(time.monotonic() - begin) / 60:.1f} min; {made}")
     return 0
@@ -56,10 +45,8 @@ def plan(args):
     options = declarations()["plan"]["options"]
     keys = {flag.lstrip("-"): option["key"] for flag, option in options.items() if "key" in option}
     keys |= {"seed": "plan.seed", "threads": "plan.threads"}
-    values = {key: getattr(args, name) for name, key in keys.items()}
-    values = {
-        key: value for key, value in values.items() if value is not None and value is not False
-    }
+    given = {key: getattr(args, name) for name, key in keys.items()}
+    values = {key: one for key, one in given.items() if one is not None and one is not False}
     others = [args.config, args.bands, args.position, args.output, *args.settings]
     if not values and not args.print_config and all(one is None for one in others):
         from miricigale.planning import plan_table

@@ -5,7 +5,6 @@ import itertools
 import logging
 import math
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
@@ -43,12 +42,8 @@ from miricigale.utils.units import SURFACE_BRIGHTNESS
 logger = logging.getLogger(__name__)
 
 #: What acts unless it is asked for more.
-_STANDARD = [
-    kind
-    for kind in ORDER
-    if kind
-    not in (Residual, BrighterFatter, Persistence, ResetAnomaly, ResetDecay, FirstFrame, LastFrame)
-]
+_OPTIONAL = (Residual, BrighterFatter, Persistence, ResetAnomaly, ResetDecay, FirstFrame, LastFrame)
+_STANDARD = [kind for kind in ORDER if kind not in _OPTIONAL]
 
 _EXPOSE_TO = "expose fewer groups, or write it by 'expose_to'"
 
@@ -84,10 +79,6 @@ class Detector(Interactive):
     effects: tuple | None = None
     _: dataclasses.KW_ONLY
     properties: DetectorProperties | None = None
-
-    _other_names: ClassVar[dict] = {
-        name: f"properties.{name}" for name in ("gain", "read_noise", "dark_current", "full_well")
-    } | {"replace": "replaced"}
 
     def __post_init__(self):
         effects = [kind() for kind in _STANDARD] if self.effects is None else self.effects
@@ -252,15 +243,8 @@ class Detector(Interactive):
                 group_dq[i, g, rows.start + r] = group_flags[i, g, r]
 
         task.run(store, n_threads, progress_bar)
-        return Ramp(
-            data,
-            task.exposure,
-            pixel_dq=pixel_dq,
-            group_dq=group_dq,
-            effects=task.effects,
-            properties=self.properties,
-            meta=task.meta,
-        )
+        about = {"effects": task.effects, "properties": self.properties, "meta": task.meta}
+        return Ramp(data, task.exposure, pixel_dq=pixel_dq, group_dq=group_dq, **about)
 
     __call__ = expose
 

@@ -142,8 +142,7 @@ def checked_previous(previous, exposure):
         return ()
     previous = tuple(previous) if np.iterable(previous) else (previous,)
     for latent in previous:
-        if not isinstance(latent, Latent):
-            raise argument_error("previous", "a Latent or several", repr(latent))
+        check_that(isinstance(latent, Latent), "previous", "a Latent or several", repr(latent))
         if latent.subarray != exposure.subarray or latent.rate.shape != exposure.shape:
             wanted = f"of {exposure.subarray}, {exposure.shape} pixels"
             raise argument_error("previous", wanted, repr(latent))

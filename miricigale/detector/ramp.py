@@ -1,8 +1,9 @@
 """The ramp: counts of one exposure, group by group, and its file."""
 
+import functools
 import numbers
 import operator
-from typing import ClassVar
+from operator import attrgetter
 
 import numpy as np
 from astropy.nddata import NDData
@@ -29,10 +30,6 @@ def _flags(values, name, shape, dtype):
         got = f"shape {values.shape}, dtype {values.dtype}"
         raise argument_error(name, f"of shape {shape}, dtype {np.dtype(dtype)}", got)
     return _read_only(values)
-
-
-def _remade(data, exposure, values):
-    return Ramp(data, exposure, **values)
 
 
 @checked_calls
@@ -88,15 +85,6 @@ class Ramp(Interactive, NDData):
     (1, 10, 64, 72)
     """
 
-    _other_names: ClassVar[dict] = {
-        "filter": "exposure.filter",
-        "dq": "pixel_dq",
-        "pixeldq": "pixel_dq",
-        "groupdq": "group_dq",
-        "n_groups": "exposure.n_groups",
-        "n_integrations": "exposure.n_integrations",
-    }
-
     def __init__(
         self,
         data,
@@ -147,7 +135,7 @@ class Ramp(Interactive, NDData):
 
     def __reduce__(self):
         # made anew, for arrays to be read-only again
-        return _remade, (self.data, self.exposure, self._values())
+        return functools.partial(Ramp, self.data, self.exposure, **self._values()), ()
 
     @property
     def simulated(self):
@@ -272,10 +260,7 @@ class Ramp(Interactive, NDData):
             return None
         return any(isinstance(effect, kind) for effect in self.effects)
 
-    @property
-    def shape(self):
-        """(n_int, n_group, ny, nx)."""
-        return self.data.shape
+    shape = property(attrgetter("data.shape"), doc="(n_int, n_group, ny, nx).")
 
     def __repr__(self):
         n_int, n_group, ny, nx = self.shape

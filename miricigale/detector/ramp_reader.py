@@ -1,7 +1,6 @@
 """Ramps from files of the JWST pipeline, of level 1b or with some of its steps done."""
 
 import json
-import math
 from pathlib import Path
 
 import astropy.units as u
@@ -21,6 +20,7 @@ from miricigale.instrument import (
 )
 from miricigale.utils.exceptions import DataError, data_error
 from miricigale.utils.files import open_fits
+from miricigale.utils.options import check_data
 from miricigale.utils.parallel import check_memory
 
 _WANTED = "a ramp of the MIRI imager"
@@ -65,8 +65,7 @@ def read(path):
 
 
 def _read(path, hdus):
-    if "SCI" not in hdus:
-        raise data_error(path, "is no ramp: it has no SCI extension")
+    check_data("SCI" in hdus, path, "is no ramp: it has no SCI extension")
     header = joined_header(hdus)
     own = None
     if "SIM_META" in hdus:
@@ -76,7 +75,7 @@ def _read(path, hdus):
     exposure = _exposure(path, header, shape)
     _check_header(path, header, exposure)
     check_memory(
-        sum(_size(hdus[name]) for name in ("SCI", "GROUPDQ") if name in hdus),
+        sum(hdus[name].size for name in ("SCI", "GROUPDQ") if name in hdus),
         f"the ramp of {path}, shape {shape},",
         advice="split the file by integrations",
     )
@@ -113,8 +112,7 @@ def _exposure(path, header, shape):
     n_int, n_group, *size = shape
     name, readout, part, dither = exposure_keywords(header)
     for key, value in (("READPATT", readout), ("SUBARRAY", part)):
-        if value is None:
-            raise data_error(path, f"has no keyword {key}")
+        check_data(value is not None, path, f"has no keyword {key}")
     pointed = [header.get(key) for key in ("RA_REF", "DEC_REF", "ROLL_REF")]
     stated = [value is not None for value in pointed]
     if any(stated) and not all(stated):
@@ -132,9 +130,8 @@ def _exposure(path, header, shape):
         roll=roll,
         dither=dither,
     )
-    if tuple(size) != exposure.shape:
-        wanted = f"must have {exposure.shape} pixels for {exposure.subarray}"
-        raise data_error(path, f"{wanted}, got {tuple(size)}")
+    wanted = f"must have {exposure.shape} pixels for {exposure.subarray}"
+    check_data(tuple(size) == exposure.shape, path, f"{wanted}, got {tuple(size)}")
     return exposure
 
 
@@ -159,9 +156,8 @@ def _check_header(path, header, exposure):
         "SUBSTRT2": (header.get("SUBSTRT2"), part.origin[1] + 1, part_name),
     }
     for name, (stated, true, where) in wanted.items():
-        if stated is not None and stated != true:
-            what = f"{name} is {stated} in the header and {true} {where}"
-            raise data_error(path, f"contradicts itself: {what}")
+        what = f"{name} is {stated} in the header and {true} {where}"
+        check_data(not (stated is not None and stated != true), path, f"contradicts itself: {what}")
     for name in ("TGROUP", "TFRAME"):
         stated = header.get(name)
         # the table of the read-out patterns is rounded to a millisecond or three digits
@@ -169,11 +165,6 @@ def _check_header(path, header, exposure):
             truth = f"the frame of {exposure.readout} {exposure.subarray} takes {frame} s"
             what = f"{name} = {stated} s, but {truth}, and is one group"
             raise data_error(path, f"contradicts itself: {what}")
-
-
-def _size(hdu):
-    head = hdu.header
-    return math.prod(head[f"NAXIS{i + 1}"] for i in range(head["NAXIS"])) * abs(head["BITPIX"]) // 8
 
 
 def _counts(hdu):
@@ -193,9 +184,8 @@ def _flags(path, hdus, exposure, shape):
     for name in sorted(found):
         # unsigned 32 bits as FITS keeps them: BZERO 2^31
         stored = np.asarray(hdus[name].data).astype(np.int32).view(np.uint32)
-        if stored.shape != shape[2:]:
-            wanted = f"must have flags of {shape[2:]} pixels in {name}"
-            raise data_error(path, f"{wanted}, got {stored.shape}")
+        wanted = f"must have flags of {shape[2:]} pixels in {name}"
+        check_data(stored.shape == shape[2:], path, f"{wanted}, got {stored.shape}")
         pixel_dq = pixel_dq | (stored ^ np.uint32(2**31))
     if "SIM_PIXELDQ" not in found:
         mask = reference_pixel_mask(subarray=exposure.subarray)
@@ -203,8 +193,7 @@ def _flags(path, hdus, exposure, shape):
     values = {"pixel_dq": pixel_dq}
     if "GROUPDQ" in hdus:
         group_dq = np.asarray(hdus["GROUPDQ"].data).astype(np.uint8)
-        if group_dq.shape != shape:
-            wanted = f"must have flags of shape {shape} in GROUPDQ"
-            raise data_error(path, f"{wanted}, got {group_dq.shape}")
+        wanted = f"must have flags of shape {shape} in GROUPDQ"
+        check_data(group_dq.shape == shape, path, f"{wanted}, got {group_dq.shape}")
         values["group_dq"] = group_dq
     return values

@@ -148,13 +148,9 @@ class Work:
             block = WholeBlock(*where, key, self.previous)
             mean, ramp = effect.expected(mean, block), effect.apply(ramp, block)
         hits = (np.empty((3, 0), np.int32), np.empty(0))
+        flags = np.broadcast_to(np.uint8(0), (*self.shape[:2], rows.stop - rows.start, shape[1]))
         for effect, key in self.keyed:
             if isinstance(effect, CosmicRays):
                 # the shape alone is used of its flags
-                flags = np.broadcast_to(
-                    np.uint8(0), (*self.shape[:2], rows.stop - rows.start, shape[1])
-                )
-                hits = effect.hits(
-                    Block(self.exposure, self.properties, rows, pixel_dq, flags, key)
-                )
+                hits = effect.hits(Block(*where[:2], rows, pixel_dq, flags, key))
         return mean[inner], ramp[0, 0, inner], pixel_dq[inner], *hits

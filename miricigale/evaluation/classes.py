@@ -6,8 +6,9 @@ import numpy as np
 
 from miricigale.evaluation.estimates import Estimate, weighted_share
 from miricigale.evaluation.metrics import one_by_one
+from miricigale.utils.declared import declared
 from miricigale.utils.options import check_that
-from miricigale.utils.tables import described_table
+from miricigale.utils.tables import described_columns
 
 #: Names in order of rising fracAGN, and the limits between them.
 CLASS_NAMES = ("galaxy", "composite", "agn")
@@ -78,21 +79,12 @@ def confusion(true, found):
           agn   2      0   1       1          0.5
     """
     true, found = one_by_one(str, true=true, found=found)
-    counts = {
-        name: np.array([np.sum((true == own) & (found == name)) for own in CLASS_NAMES])
-        for name in (*CLASS_NAMES, "unknown")
-    }
-    columns = {
-        "class": (np.array(CLASS_NAMES), "True class"),
-        "n": (np.array([np.sum(true == own) for own in CLASS_NAMES]), "Sources of the class"),
-    }
-    columns |= {name: (values, f"Of them found as {name}") for name, values in counts.items()}
-    columns |= quality_columns(
-        [selection_quality(true == name, found == name) for name in CLASS_NAMES],
-        "Share of the class that was found in it",
-        "Share of those found in the class that are of it",
-    )
-    return described_table(columns)
+    own = np.array(CLASS_NAMES)[:, None] == true
+    as_named = (np.sum(own & (found == name), axis=1) for name in (*CLASS_NAMES, "unknown"))
+    shares = quality_columns(selection_quality(true == n, found == n) for n in CLASS_NAMES)
+    columns = CLASS_NAMES, own.sum(axis=1), *as_named, *shares.values()
+    texts = declared("miricigale.evaluation", "columns.toml")["confusion"]
+    return described_columns(map(np.array, columns), texts)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -182,12 +174,11 @@ def sky_quality(galaxies, wanted, selected, weight):
     return SelectionQuality(*shares)
 
 
-def quality_columns(qualities, completeness, purity):
-    """Columns for `described_table` of `SelectionQuality`, with the descriptions of the two numbers."""
-    columns = {}
-    for kind, text in (("completeness", completeness), ("purity", purity)):
+def quality_columns(qualities):
+    """Columns ``completeness`` and ``purity``, each with ``_low`` and ``_high``, of `SelectionQuality`."""
+    columns, qualities = {}, list(qualities)
+    for kind in ("completeness", "purity"):
         shares = [getattr(one, kind) for one in qualities]
-        columns[kind] = (np.array([one.value for one in shares]), text)
-        columns[f"{kind}_low"] = (np.array([one.low for one in shares]), "Lower end of 68 %")
-        columns[f"{kind}_high"] = (np.array([one.high for one in shares]), "Upper end of 68 %")
+        for end, key in (("", "value"), ("_low", "low"), ("_high", "high")):
+            columns[kind + end] = np.array([getattr(one, key) for one in shares])
     return columns

@@ -4,26 +4,21 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.sed import COSMOLOGY
+from miricigale.utils.declared import declared
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.random import check_seed, stream
-from miricigale.utils.tables import described_table, require_columns, unique_ids
+from miricigale.utils.tables import described_columns, require_columns, unique_ids
 from miricigale.utils.units import FNU, LUMINOSITY, MASS, ab_magnitude, positive, to_array
 
+_TABLES = declared("miricigale.evaluation", "population.toml")
 #: Light of galaxies together in nW / m2 / sr: band, wavelength (um), least flux (uJy), value,
 #: errors down and up, reference.
-PUBLISHED_LIGHT = (
-    ("miri.f1500w", 15.0, 50.0, 2.4, 0.5, 0.5, "Elbaz et al. 2002, A&A 384, 848"),
-    ("miri.f2100w", 24.0, 60.0, 1.9, 0.6, 0.6, "Papovich et al. 2004, ApJS 154, 70"),
-    ("miri.f2100w", 24.0, 0.0, 2.7, 0.7, 1.1, "Papovich et al. 2004, extrapolated"),
-)
+PUBLISHED_LIGHT = tuple(map(tuple, _TABLES["light"]["rows"]))
 #: Dust of galaxies of CEERS by dust component: log10 of its luminosity over the stellar mass (solar units) at
 #: 10^10.3 Msun and 10^-9.3 / yr, slope per dex of mass between 10^8.5 and 10^10.3 Msun, slope per dex of specific
 #: star-formation rate (100 Myr) between 10^-12 and 10^-8 / yr, scatter in dex; of quiescent galaxies mean and
 #: scatter of log10 of ``dust_excess``; strength of the 3.3 um feature; sources. By benchmarks/dust_colors.py.
-CEERS_DUST = {
-    "dl07_alpha": (0.79, 0.56, 0.69, 0.21, -1.18, 1.02, 0.1, 96),
-    "dale2014": (0.78, 0.64, 0.74, 0.24, -0.49, 0.85, 1.0, 105),
-}
+CEERS_DUST = {name: tuple(row) for name, row in _TABLES["ceers_dust"].items()}
 
 
 def main_sequence_sfr(stellar_mass, age_of_universe):
@@ -280,14 +275,8 @@ def _dusty_galaxies(table):
 
 
 def _dust_table(ids, quiescent, dust, excess):
-    return described_table(
-        {
-            "id": (ids, None),
-            "quiescent": (quiescent, "whether the colors U - V and V - J are quiescent"),
-            "dust_luminosity": (dust * excess * LUMINOSITY, "dust luminosity that was drawn"),
-            "dust_excess": (excess, "its ratio to the power that attenuation takes"),
-        }
-    )
+    columns = ids, quiescent, dust * excess * LUMINOSITY, excess
+    return described_columns(columns, declared("miricigale.evaluation", "columns.toml")["dust"])
 
 
 def number_counts(flux, area, edges):
@@ -357,7 +346,4 @@ def integrated_light(flux, area, wavelength):
     area = positive(area, u.deg**2, "area") * u.deg**2
     nu = to_array(wavelength, u.Hz, "wavelength", ndim=0, equivalencies=u.spectral()) * u.Hz
     unit = u.nW / u.m**2 / u.sr
-    return (
-        (nu * flux.sum() / area).to(unit),
-        (nu * np.sqrt((flux**2).sum()) / area).to(unit),
-    )
+    return ((nu * flux.sum() / area).to(unit), (nu * np.sqrt((flux**2).sum()) / area).to(unit))

@@ -7,13 +7,7 @@ from astropy.table import QTable, Table
 
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
-from miricigale.utils.tables import (
-    Flags,
-    described_table,
-    error_column,
-    match_sky,
-    require_columns,
-)
+from miricigale.utils.tables import Flags, described_table, error_column, match_sky, require_columns
 from miricigale.utils.units import ANGLE, FNU, positive, to_array
 
 
@@ -100,10 +94,7 @@ def associate(first, second, *, radius):
     near = _Candidates(*sky, limit)
     pair = near.partner[0]
     alone = np.flatnonzero(near.partner[1] < 0)
-    rows = (
-        np.append(np.arange(len(pair)), np.full(len(alone), -1)),
-        np.append(pair, alone),
-    )
+    rows = (np.append(np.arange(len(pair)), np.full(len(alone), -1)), np.append(pair, alone))
     reasons = np.zeros(len(rows[0]), int)
     columns, ids, counts = {}, {}, {}
     for k, (name, other) in enumerate((("first", "second"), ("second", "first"))):

@@ -12,7 +12,7 @@ from miricigale.evaluation.classes import (
 from miricigale.evaluation.quantities import OF_FITS, REDSHIFT_BINS, measure
 from miricigale.utils.declared import declared
 from miricigale.utils.random import check_seed, stream
-from miricigale.utils.tables import described_rows, described_table
+from miricigale.utils.tables import described_columns, described_rows
 
 
 def study_numbers(study, *, seed, n_draws=500):
@@ -171,15 +171,12 @@ def selection_table(one, *, limits=CLASS_LIMITS):
         # NaN is below every limit
         found.append(selection_quality(true >= limit, mean >= limit))
     wanted, selected = ([getattr(f, k).n for f in found] for k in ("completeness", "purity"))
-    columns = {
-        "band_set": ([name for name, _ in pairs], "Bands of the fit"),
-        "limit": ([limit for _, limit in pairs], "Least AGN fraction"),
-        "n_wanted": (wanted, "Sources of the field whose true fraction is as high"),
-        "n_selected": (selected, "Sources whose posterior mean is as high"),
-    }
-    columns |= quality_columns(
-        found,
-        "Share of the wanted sources that are selected",
-        "Share of the selected sources that are wanted",
+    columns = (
+        *map(list, zip(*pairs, strict=True)),
+        wanted,
+        selected,
+        *quality_columns(found).values(),
     )
-    return described_table(columns)
+    return described_columns(
+        columns, declared("miricigale.evaluation", "columns.toml")["selection"]
+    )

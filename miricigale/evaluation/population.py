@@ -10,7 +10,7 @@ from miricigale.sed import stern2015_6um
 from miricigale.utils.declared import declared
 from miricigale.utils.options import check_that
 from miricigale.utils.random import check_seed, stream
-from miricigale.utils.tables import described_table, require_columns, unique_ids
+from miricigale.utils.tables import described_columns, require_columns, unique_ids
 from miricigale.utils.units import LUMINOSITY, MASS, positive, to_array
 
 _DENSITY = u.Mpc**-3 / u.dex
@@ -329,18 +329,9 @@ class AGNPopulation:
         thick = self.compton_thick * psi / (1.0 + self.compton_thick * psi)
         hidden = thick + psi / (1.0 + self.compton_thick * psi)
         l_x = np.where(has, 10.0 ** np.where(has, log_l, 0.0), 0.0) * u.erg / u.s
-        text = "rest-frame 2-10 keV luminosity of the AGN, without absorption"
-        return described_table(
-            {
-                "id": (ids, None),
-                "probability": (probability, "probability of an AGN"),
-                "has_agn": (has, "whether the source has an AGN"),
-                "l_2_10kev": (l_x.to(LUMINOSITY), text),
-                "l_6um": (stern2015_6um(l_x), "nu L_nu of the AGN at 6 um, Stern 2015"),
-                "obscured": (has & (drawn[:, 1] < hidden), "whether log N_H > 22"),
-                "compton_thick": (has & (drawn[:, 1] < thick), "whether log N_H > 24"),
-            }
-        )
+        absorbed = (has & (drawn[:, 1] < share) for share in (hidden, thick))
+        columns = ids, probability, has, l_x.to(LUMINOSITY), stern2015_6um(l_x), *absorbed
+        return described_columns(columns, declared("miricigale.evaluation", "columns.toml")["agn"])
 
 
 def _log_luminosity(l_x):

@@ -9,8 +9,9 @@ from scipy.special import expit, ndtr, ndtri
 
 from miricigale.evaluation.metrics import fraction_interval, one_by_one
 from miricigale.sed.xray import stern2015, xray_flux
+from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.tables import described_table
+from miricigale.utils.tables import described_columns
 
 _CGS = u.erg / u.s / u.cm**2
 #: Share of the X-rays that absorption leaves in Yang et al. 2021.
@@ -57,12 +58,9 @@ class XRayLimit:
 #: Luo et al. 2017 (1.9e-17 in the central square arcmin) and of Nandra et al. 2015 have none: that of the
 #: paper calls MIRI (50 % at about 1e-16) "slightly more sensitive" than the deepest survey, and Nandra et
 #: al. call theirs a factor 2-3 shallower than the deep fields.
-XRAY_LIMITS = (
-    XRayLimit("CDF-S 7 Ms", 1.9e-17 * _CGS, "center", "Luo et al. 2017, ApJS 228, 2", True),
-    XRayLimit("CDF-S 7 Ms", 1.2e-16 * _CGS, "50 %", "after Yang et al. 2021, ApJ 908, 144", False),
-    XRayLimit(
-        "EGS 800 ks", 3.0e-16 * _CGS, "50 %", "after Nandra et al. 2015, ApJS 220, 10", False
-    ),
+XRAY_LIMITS = tuple(
+    XRayLimit(survey, flux * _CGS, *about)
+    for survey, flux, *about in declared("miricigale.evaluation", "population.toml")["xray"]["rows"]
 )
 
 
@@ -163,16 +161,9 @@ def completeness(values, found, edges):
     n, _ = np.histogram(values, edges)
     n_found, _ = np.histogram(values[found], edges)
     shares = np.array([fraction_interval(*pair) for pair in zip(n_found, n, strict=True)])
-    return described_table(
-        {
-            "low": (edges[:-1], "Lower edge of the bin"),
-            "high": (edges[1:], "Upper edge of the bin"),
-            "n": (n, "Sources"),
-            "n_found": (n_found, "Sources found"),
-            "share": (shares[:, 0], "Share of the sources found"),
-            "share_low": (shares[:, 1], "Lower end of its 68 % interval"),
-            "share_high": (shares[:, 2], "Upper end of its 68 % interval"),
-        }
+    columns = edges[:-1], edges[1:], n, n_found, *shares.T
+    return described_columns(
+        columns, declared("miricigale.evaluation", "columns.toml")["completeness"]
     )
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import warnings
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -66,7 +67,7 @@ def read_catalog_photometry(path, catalog_map=None, *, hdu=None, **options):
     with reading(path, "a catalog"):
         _, lost = catalog_map.names(table.colnames, path.name)
         table, coded = catalog_map.convert(table, path.name)
-    for text in catalog_messages(lost, coded):
+    for text in catalog_messages(lost, [coded]):
         warn(f"{path.name}: {text}", CatalogWarning)
     return table
 
@@ -85,16 +86,20 @@ def as_catalog_map(catalog_map, options=None):
     return dataclasses.replace(catalog_map, **options or {})
 
 
-def catalog_messages(lost, coded, what="taken as missing, by the number that stands there"):
-    """Yield warnings about bands without a filter, and numbers that stand for no value."""
+def catalog_messages(lost, pieces, what="taken as missing, by the number that stands there"):
+    """Yield warnings about bands without a filter, and numbers for no value in pieces (dicts as of `codes_of`)."""
     if lost:
         yield f"left out, no filter here: {', '.join(lost)}"
-    parts = []
-    for name, values in coded.items():
-        there = values[~np.isnan(values)]
-        if there.size:
-            codes = ", ".join(f"{value:g}" for value in np.unique(np.round(there, 4))[:3])
-            parts.append(f"{name} {there.size} of {values.size} ({codes})")
+    found, sizes, parts = {}, Counter(), []
+    for coded in pieces:
+        for name, values in coded.items():
+            sizes[name] += values.size
+            there = np.round(values[~np.isnan(values)], 4)
+            found.setdefault(name, Counter()).update(there.tolist())
+    for name, counts in found.items():
+        if counts:
+            codes = ", ".join(f"{value:g}" for value in sorted(counts)[:3])
+            parts.append(f"{name} {counts.total()} of {sizes[name]} ({codes})")
     if len(parts) > _FEW:
         parts = [*parts[:_FEW], f"and {len(parts) - _FEW} more bands"]
     if parts:
@@ -136,23 +141,13 @@ def codes_of(table, bands):
     return coded
 
 
-def warn_of_codes(coded, where):
-    """Warn of what `codes_of` found, by band and count, for fits that take the numbers as they are."""
-    found = {name: values for name, values in coded.items() if np.any(~np.isnan(values))}
+def warn_of_codes(pieces, where):
+    """Warn of what `codes_of` found in pieces of a table, for fits that take the numbers as they are."""
     for text in catalog_messages(
-        (), found, "look like numbers that stand for no value, and are fitted as they are"
+        (), pieces, "look like numbers that stand for no value, and are fitted as they are"
     ):
         how = "NaN is a missing band; read_catalog_photometry, or --map, makes them so"
         warn(f"{where}: {text} ({how})", CatalogWarning)
-
-
-def joined_codes(pieces):
-    """Join what `codes_of` or `CatalogMap.convert` found in each piece of a table."""
-    parts = {}
-    for coded in pieces:
-        for name, codes in coded.items():
-            parts.setdefault(name, []).append(codes)
-    return {name: np.concatenate(codes) for name, codes in parts.items()}
 
 
 class MappedRows:
@@ -187,4 +182,4 @@ class MappedRows:
     def messages(self):
         """Return the warnings about the whole file, all of which is read."""
         pieces = (self._convert(i, quiet=i > 0)[1] for i in range(self._rows.n_chunks))
-        return list(catalog_messages(self._lost, joined_codes(pieces)))
+        return list(catalog_messages(self._lost, pieces))

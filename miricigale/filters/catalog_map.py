@@ -23,7 +23,7 @@ from miricigale.utils.exceptions import (
     warn,
 )
 from miricigale.utils.missing import negative_errors, plain_floats, without_codes
-from miricigale.utils.options import check_choice, check_names, check_that
+from miricigale.utils.options import check_choice, check_data, check_names, check_that
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU
 
@@ -127,8 +127,7 @@ class CatalogMap:
             raise data_error(path, f"cannot be read as a map of columns: {err}") from err
         known = [field.name for field in dataclasses.fields(cls)]
         unknown = sorted(set(values) - set(known))
-        if unknown:
-            raise data_error(path, f"is no map of columns: it has {unknown}; known: {known}")
+        check_data(not unknown, path, f"is no map of columns: it has {unknown}; known: {known}")
         return cls(**values)
 
     def settings(self):
@@ -319,9 +318,8 @@ def _translated(text, path):
             columns["id" if meaning.lower() == "id" else "redshift"] = theirs
         elif kind in ("F", "E") and number.isdigit():
             name = eazy_filter(number)
-            if name is None:
-                what = f"has no filter here for {theirs} {meaning} (of FILTER.RES.latest)"
-                raise data_error(path, what)
+            what = f"has no filter here for {theirs} {meaning} (of FILTER.RES.latest)"
+            check_data(name is not None, path, what)
             columns[name if kind == "F" else error_column(name)] = theirs
         elif meaning and not meaning.upper().startswith("TOT"):
             wanted = "F or E and a number, id, z_spec or TOT"

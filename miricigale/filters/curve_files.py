@@ -69,13 +69,10 @@ def _of_text(path, unit):
         found = _UNITS.search(" ".join(comments))
         if not kinds and found is None:
             raise data_error(path, "does not state the unit of its wavelengths: give 'unit'")
-        unit = u.AA if kinds else _unit(found[1])
+        by_letter = {"u": u.um, "m": u.um, "n": u.nm, "a": u.AA}
+        unit = u.AA if kinds else by_letter[found[1][0].lower()]
     order = np.argsort(wave)
     wave, throughput = wave[order], throughput[order]
     if kinds[:1] == ["energy"]:
         throughput = throughput / (wave / wave.mean())
     return wave * u.Unit(unit), throughput, comments[0] if named else path.stem
-
-
-def _unit(word):
-    return {"u": u.um, "m": u.um, "n": u.nm, "a": u.AA}[word[0].lower()]

@@ -94,17 +94,6 @@ class Filter(Frozen, Interactive):
     reference_wavelength: u.Quantity | None = None
     reference_temperature: u.Quantity | None = None
 
-    _other_names = {
-        "wavelength": "wave",
-        "transmission": "throughput",
-        "response": "throughput",
-        "pivot_wavelength": "pivot",
-        "mean_wavelength": "effective_wavelength",
-        "bandwidth": "width",
-        "effective_width": "width",
-        "edges": "bounds",
-    }
-
     def __post_init__(self):
         wave, throughput, name = self.wave, self.throughput, self.name
         if isinstance(wave, str):

@@ -45,8 +45,6 @@ class FilterSet(Interactive):
 
     filters: tuple
 
-    _other_names = {"pivot": "pivots"}
-
     def __post_init__(self):
         items = self.filters
         items = [items] if isinstance(items, (str, Filter)) or hasattr(items, "waveset") else items

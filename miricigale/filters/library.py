@@ -9,8 +9,8 @@ import numpy as np
 
 from miricigale.refdata import Registry, citations, locate
 from miricigale.utils.declared import declared
-from miricigale.utils.exceptions import DataError, data_error
-from miricigale.utils.options import check_names
+from miricigale.utils.exceptions import DataError
+from miricigale.utils.options import check_data, check_names
 from miricigale.utils.units import WAVE
 
 _RESOURCE = "filters.sedpy"
@@ -48,8 +48,7 @@ def read_curve(curve):
             rows.append((float(words[-2]), float(words[-1])))
         except (IndexError, ValueError):
             continue
-    if len(rows) < 2:
-        raise data_error(path, "holds no filter curve")
+    check_data(len(rows) >= 2, path, "holds no filter curve")
     wave, throughput = np.array(rows).T
     wave, index = np.unique(wave, return_index=True)
     throughput = throughput[index]

@@ -84,7 +84,7 @@ def as_photometry(data, bands, argument="photometry"):
         out["id"] = np.arange(1, len(out) + 1)
     catalog_map = CatalogMap(units=dict.fromkeys(magnitudes, u.ABmag))
     coded = {name: catalog_map.set_band(out, name, 1.0, argument) for name in magnitudes}
-    for text in catalog_messages((), coded):
+    for text in catalog_messages((), [coded]):
         warn(f"{argument}: {text}", CatalogWarning)
     return out
 

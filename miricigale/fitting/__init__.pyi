@@ -1,4 +1,3 @@
-from .calibration import TemplateError as TemplateError
 from .calibration import apply_zero_points as apply_zero_points
 from .calibration import calibrate_zero_points as calibrate_zero_points
 from .calibration import measure_band_errors as measure_band_errors
@@ -24,3 +23,4 @@ from .settings import SamplerSettings as SamplerSettings
 from .streaming import fit_file as fit_file
 from .survey import SurveyCalibration as SurveyCalibration
 from .survey import calibrate as calibrate
+from .template_error import TemplateError as TemplateError

@@ -20,12 +20,9 @@ def between_nodes(found, results):
     results : `~miricigale.fitting.FitResults`
         What was found on the nodes.
     """
-    names, n = list(results.axes), len(results)
-    copied = ["pdf_2d", "moments", "quantiles", "flags"]
-    copied += [] if results.outlier is None else ["outlier"]
-    new = {name: np.array(getattr(results, name)) for name in copied}
-    new["pdf"] = {name: np.array(results.pdf[name]) for name in names}
-    new["pairs"] = {pair: np.array(table) for pair, table in results.pairs.items()}
+    names, n, new = list(results.axes), len(results), results._mapped(np.array)
+    # the best models stay those of the nodes
+    del new["best"]
     new["axis_moments"] = np.full((n, len(names), 2), np.nan)
     new["axis_quantiles"] = np.full((n, len(names), DERIVED_LEVELS.size), np.nan)
     for i, (drawn, taken) in found.items():

@@ -1,7 +1,6 @@
 """What fits of sources of known redshift say of models and catalogs: errors, zero points and priors."""
 
 import itertools
-from dataclasses import dataclass
 
 import astropy.units as u
 import numpy as np
@@ -9,13 +8,15 @@ from astropy.table import QTable
 from scipy.optimize import brentq, minimize
 from scipy.special import expit, ndtr
 
-from miricigale.filters import FilterSet
 from miricigale.fitting.likelihood import per_band
+from miricigale.fitting.template_error import TemplateError, pivots
+from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_kind, check_names, check_that
-from miricigale.utils.tables import described_table, error_column, require_columns
-from miricigale.utils.units import FNU, WAVE, frozen_array, to_array
+from miricigale.utils.options import check_names, check_that
+from miricigale.utils.tables import described_columns, error_column, require_columns
+from miricigale.utils.units import FNU, WAVE, to_array
 
+_COLUMNS = declared("miricigale.fitting", "columns.toml")["zero_points"]
 #: Fluxes of lower S/N say more of their noise than of the models.
 _LEAST_SIGNAL = 5.0
 #: Least number of such fluxes for what is measured by band, and in a bin of rest wavelength.
@@ -30,78 +31,6 @@ _SHORTEST = 0.4
 _MOST = 10.0
 #: Edges in um of the bins of rest wavelength; wider where few bands fall.
 _EDGES = (0.09, 0.17, 0.22, 0.28, 0.36, 0.45, 0.6, 0.8, 1.1, 1.5, 2.0, 2.6, 3.6, 5.5, 12.0)
-
-
-@dataclass(frozen=True, eq=False)
-class TemplateError:
-    """
-    How well models represent real galaxies, by rest wavelength (Brammer et al. 2008, ApJ 686, 1503).
-
-    At every redshift of a grid the flux of a band has this part of it added to its error in quadrature, at
-    the band's pivot wavelength over 1 + z. The likelihood keeps its normalization: a redshift is not
-    preferred for putting bands where errors are large.
-
-    Parameters
-    ----------
-    wave : `~astropy.units.Quantity`, shape (n,)
-        Ascending rest wavelengths.
-    error : array_like, shape (n,)
-        Error as a part of the flux; linear between logarithms of wavelength, constant outside.
-
-    Raises
-    ------
-    `~astropy.units.UnitsError`
-        If wavelengths have no unit of length.
-    ValueError
-        If wavelengths do not ascend from above 0, or errors are negative, not finite or not as many.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from miricigale.fitting import TemplateError
-    >>> error = TemplateError([0.1, 1.0, 10.0] * u.um, [0.15, 0.05, 0.30])
-    >>> error([0.1, 3.0] * u.um).round(3)
-    array([0.15 , 0.169])
-    >>> TemplateError.survey()([0.5, 8.0] * u.um).round(3)
-    array([0.059, 0.47 ])
-    """
-
-    wave: u.Quantity
-    error: np.ndarray
-
-    def __post_init__(self):
-        wave, error = to_array(self.wave, WAVE, "wave", ndim=1), np.asarray(self.error, dtype=float)
-        if wave.size == 0 or not (wave[0] > 0 and np.all(np.diff(wave) > 0)):
-            raise argument_error("wave", "ascending values above 0", f"{wave}")
-        if error.shape != wave.shape or not np.all(np.isfinite(error) & (error >= 0)):
-            raise argument_error("error", f"{wave.size} finite values, 0 or more", f"{error}")
-        self.__dict__.update(wave=frozen_array(wave) * WAVE, error=frozen_array(error))
-
-    def __call__(self, wave):
-        """Error at rest wavelengths (`~astropy.units.Quantity`): `~numpy.ndarray` of their shape."""
-        wave = to_array(wave, WAVE, "wave")
-        return np.interp(np.log(wave), np.log(self.wave.to_value(WAVE)), self.error)
-
-    @staticmethod
-    def survey():
-        """Template error of `~miricigale.sed.SEDModel.survey`: that of `SurveyCalibration.survey`."""
-        from miricigale.fitting.survey import SurveyCalibration
-
-        return SurveyCalibration.survey().template_error
-
-
-def _pivots(filters):
-    """Pivot wavelengths of a `FilterSet`, or of bands by name."""
-    filters = filters if isinstance(filters, FilterSet) else FilterSet.from_names(filters)
-    return u.Quantity([one.pivot for one in filters]).to(WAVE)
-
-
-def grid_errors(template_error, filters, redshift):
-    """Template errors of bands at the redshifts of a grid: shape (nz, nb); None if there are none."""
-    if template_error is None:
-        return None
-    check_kind(template_error, "template_error", TemplateError)
-    return template_error(_pivots(filters) / (1.0 + np.asarray(redshift)[:, None]))
 
 
 def _check_known(results):
@@ -121,7 +50,7 @@ def _residuals(results):
 
 def _rest(results):
     """Rest wavelengths in um of the bands of all objects, shape (n, nb)."""
-    return _pivots(results.filters).value / (1.0 + results.best["redshift"].value[:, None])
+    return pivots(results.filters).value / (1.0 + results.best["redshift"].value[:, None])
 
 
 def _excess(flux, error, model, scatter):
@@ -191,7 +120,7 @@ def error_of_bands(left, template_error, longest=2.5):
     for results in left.results.values():
         _check_known(results)
     z = np.array([left.results[name].best["redshift"].value for name in left.bands])
-    rest = _pivots(left.bands).value / (1.0 + z.T)
+    rest = pivots(left.bands).value / (1.0 + z.T)
     with np.errstate(invalid="ignore"):
         good = (left.predicted > 0) & (left.flux > _LEAST_SIGNAL * left.flux_err)
         good &= (rest > _SHORTEST) & (rest < longest)
@@ -405,13 +334,8 @@ def calibrate_zero_points(results, *, reference=None, longest=None):
         # standard error of a median
         scatter[i] = np.sqrt(np.pi / (2.0 * n[i])) * np.median(np.abs(ratio - middle)) / _MEDIAN
     factor[known] /= factor[bands.index(reference)]
-    texts = {
-        "band": (np.array(bands), "band"),
-        "n": (n, "sources of S/N above 5"),
-        "factor": (factor, "what fluxes are to be multiplied by; 1 where sources are too few"),
-        "factor_err": (factor * scatter, "its 1-sigma error"),
-    }
-    return described_table(texts, {"reference": reference})
+    values = np.array(bands), n, factor, factor * scatter
+    return described_columns(values, _COLUMNS, {"reference": reference})
 
 
 def apply_zero_points(photometry, zero_points):

@@ -9,10 +9,12 @@ import numpy as np
 
 from miricigale.fitting.classification import class_columns
 from miricigale.fitting.from_files import fit_catalog
+from miricigale.fitting.page_numbers import thinned
 from miricigale.fitting.pulls import without_warnings
 from miricigale.pages import number
 from miricigale.plotting.axes import WIDTH, new_figure
 from miricigale.utils.row_files import write_rows
+from miricigale.utils.tables import described_table
 
 #: Objects of each class but the first that a page lists, those of the highest ratio.
 _LISTED = 10
@@ -122,24 +124,23 @@ def write_table(found, path, *, overwrite=False):
     write_rows(path, _tables(found), len(first), id_width=width, overwrite=overwrite)
 
 
-def _parts(found):
-    """Iterate over the parts of the results: `FitResults` by class."""
-    for parts in zip(*(results.parts() for results in found.values()), strict=True):
+def _parts(found, step=1):
+    """Iterate over the parts of the results, or every ``step``-th of their objects: `FitResults` by class."""
+    thin = (thinned(results.parts(), step) for results in found.values())
+    for parts in zip(*thin, strict=True):
         yield dict(zip(found, parts, strict=True))
 
 
 def _tables(found):
     for some in _parts(found):
         table = some["galaxy"].to_table()
-        for name, (values, text) in class_columns(some).items():
-            table[name] = values
-            table[name].info.description = text
+        table.update(described_table(class_columns(some)))
         yield table
 
 
-def classes_of(found):
-    """Columns of `~miricigale.fitting.compare_classes` for all objects: dict of name to array."""
-    parts = [class_columns(some) for some in _parts(found)]
+def classes_of(found, step=1):
+    """Columns of `~miricigale.fitting.compare_classes` for every ``step``-th object: dict of name to array."""
+    parts = [class_columns(some) for some in _parts(found, step)]
     return {name: np.concatenate([part[name][0] for part in parts]) for name in parts[0]}
 
 

@@ -143,7 +143,8 @@ def plot_pdf2d(results, x="redshift", y="frac_agn", ax=None, **kwargs):
         raise argument_error("frac_agn", "an axis of the grid", "a grid without AGN")
     weights = results._one("plot_pdf2d").joint_pdf(x, y)
     kwargs.setdefault("labels", tuple(labeled(name, results.unit(name)) for name in (x, y)))
-    return plot_pdf_2d(results._edges(x), results._edges(y), weights, ax=ax, **kwargs)
+    edges = (results.distribution(name)[0].value for name in (x, y))
+    return plot_pdf_2d(*edges, weights, ax=ax, **kwargs)
 
 
 def labeled(name, unit):

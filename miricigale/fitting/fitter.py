@@ -5,9 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from miricigale.filters import as_photometry
 from miricigale.filters.band_names import known_filter
-from miricigale.filters.catalog_files import codes_of, warn_of_codes
+from miricigale.fitting import fitted_bands
 from miricigale.fitting.grid_fit import GridFit
 from miricigale.fitting.likelihood import (
     FitFlags,
@@ -24,14 +23,13 @@ from miricigale.fitting.samplers import get_sampler
 from miricigale.fitting.samplers.fit import SamplerFit
 from miricigale.fitting.settings import GridSettings, SamplerSettings
 from miricigale.sed import ModelGrid, yang2021_axes
-from miricigale.utils.exceptions import FitWarning, argument_error, warn
+from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_that
 from miricigale.utils.parallel import chunks, parallel_map, single_threaded
 from miricigale.utils.random import check_seed
-from miricigale.utils.tables import error_column
-from miricigale.utils.units import FNU, check_count
+from miricigale.utils.units import check_count
 
 logger = logging.getLogger(__name__)
 
@@ -339,24 +337,8 @@ class BayesFitter(Interactive):
         return results
 
     __call__ = fit
-
-    def table_of(self, photometry):
-        """
-        The catalog by our names, with what there is to warn of.
-
-        A band of ``filters`` that it lacks is a missing one of all objects.
-        """
-        table = as_photometry(photometry, self.filters or self.bands)
-        lost = [name for name in self.filters or () if name not in table.colnames]
-        if lost and len(lost) < len(self.filters):
-            text = f"the photometry has no {', '.join(lost)}: missing bands of all objects"
-            warn(text, FitWarning)
-            table = table.copy(copy_data=False)
-            for name in lost:
-                table[name] = table[error_column(name)] = np.full(len(table), np.nan) * FNU
-        warn_of_codes(codes_of(table, self._reader.fitted(table)), "photometry")
-        self.warn_of_bands(table)
-        return table
+    table_of, read_bands = fitted_bands.table_of, fitted_bands.read_bands
+    warn_of_bands = fitted_bands.warn_of_bands
 
     def fit_part(
         self, photometry, *, pairs, seed, parallel, chunk_size=None, repeated=None, **known
@@ -386,18 +368,6 @@ class BayesFitter(Interactive):
             model=self.model,
             meta=provenance(fit=settings, **self.backend.provenance()),
         )
-
-    def read_bands(self, photometry, bands):
-        """Photometry (`~miricigale.fitting.likelihood.FitData`) of bands, with zero points and its own errors."""
-        zero = dict.fromkeys(bands, 0.0)
-        return PhotometryReader(bands, bands, zero, zero, 1, self.zero_points).read(photometry)
-
-    def warn_of_bands(self, photometry):
-        """Warn of bands that are not fitted, if the fitter does not name those that are."""
-        unused = unused_bands(photometry, self._reader.fitted(photometry))
-        if unused and self.filters is None:
-            text = "bands of the photometry that the grid lacks are not fitted"
-            warn(f"{text}: {', '.join(unused)}", FitWarning)
 
     def _prepare(self, photometry, redshift, redshift_prior, repeated=None):
         """Photometry with flags, what is known of the redshift of every object, and the settings."""

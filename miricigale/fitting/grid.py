@@ -13,6 +13,7 @@ from miricigale.fitting.posterior import cell_edges
 from miricigale.fitting.priors import GridPriors
 from miricigale.fitting.quantities import DERIVED_LEVELS, Quantities
 from miricigale.sed import ModelGrid
+from miricigale.utils.declared import declared
 from miricigale.utils.units import Frozen
 
 #: Runs of up to 64 pairs listed at once by one worker (260 bytes each).
@@ -31,33 +32,8 @@ _SINGLE = 5e-7
 _TINY = 1e-290
 
 
-#: What a fit of n objects returns, by the axes of each array after that of the objects: z redshifts, g
-#: galaxies, k AGN models, f AGN fractions, b bands, q derived quantities, l levels of their quantiles, d draws.
-_AXES = {
-    # chi2 of the best model, ln of the sum of prior exp(-chi2 / 2)
-    "chi2": "",
-    "log_sum": "",
-    # of the best model: solar masses formed, fluxes; redshift, galaxy, AGN model and AGN fraction
-    "best_scale": "",
-    "best_flux": "b",
-    "index": "4",
-    # posteriors of redshift and AGN fraction, of galaxies, of AGN models
-    "zf": "zf",
-    "galaxy": "g",
-    "agn": "k",
-    # mean and standard deviation of model fluxes; mean, standard deviation, mean log10 of quantities
-    "band": "2b",
-    "moments": "q3",
-    "quantiles": "ql",
-    # mean and standard deviation of the other AGN fraction
-    "share": "2",
-    "share_quantiles": "l",
-    # models drawn from the posterior, their scales and the variances of these
-    "draw_index": "d4",
-    "draw_scale": "d2",
-    # how likely each band is wrong
-    "outlier": "b",
-}
+#: What a fit of n objects returns, by the axes of each array after that of the objects.
+_AXES = declared("miricigale.fitting", "columns.toml")["arrays"]
 #: These arrays, not a number or -1 in rows that were not fitted; ``joint`` are joint posteriors that were
 #: asked for, by two of the letters z, g, k and f.
 GridOutput = namedtuple("GridOutput", [*_AXES, "joint"])

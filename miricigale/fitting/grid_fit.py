@@ -7,7 +7,6 @@ import numpy as np
 
 from miricigale.filters import FilterSet
 from miricigale.fitting.between import between_nodes
-from miricigale.fitting.calibration import TemplateError, grid_errors
 from miricigale.fitting.continuation import Continuation
 from miricigale.fitting.grid import GridEngine
 from miricigale.fitting.interpolation import Nodes, finer_grid
@@ -25,6 +24,7 @@ from miricigale.fitting.quantities import Quantities, plain
 from miricigale.fitting.results import CIGALE_LEAST_STD, FitResults
 from miricigale.fitting.samples import Samples
 from miricigale.fitting.settings import GridSettings
+from miricigale.fitting.template_error import TemplateError, grid_errors
 from miricigale.sed import ModelGrid, SEDModel
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_choice, check_that

@@ -17,7 +17,7 @@ from miricigale.utils.exceptions import argument_error, data_error
 from miricigale.utils.files import open_fits
 from miricigale.utils.folder import RecordFolder
 from miricigale.utils.object_rows import ByID
-from miricigale.utils.options import check_names
+from miricigale.utils.options import check_data, check_names
 from miricigale.utils.row_files import write_rows
 from miricigale.utils.store import native, open_parts, write_parts
 from miricigale.utils.tables import ascii_ids
@@ -242,8 +242,7 @@ class FitResultsFiles:
         self.path = Path(path)
         self.model = model
         folder = FitFolder(path)
-        if not folder.facts:
-            raise data_error(path, "holds no results of fit_file (no manifest)")
+        check_data(folder.facts, path, "holds no results of fit_file (no manifest)")
         #: What was fitted, and how.
         self.job = folder.facts["job"]
         self.n_parts = max(1, -(-self.job["catalogue"]["rows"] // self.job["chunk_rows"]))
@@ -251,8 +250,7 @@ class FitResultsFiles:
         names = [part_name(i) for i in range(self.n_parts)]
         self.paths = tuple(self.path / name for name in names if name in parts)
         for item in self.paths:
-            if not item.is_file():
-                raise data_error(self.path, f"has lost {item.name}, which its manifest names")
+            check_data(item.is_file(), self.path, f"has lost {item.name}, which its manifest names")
         self._records = tuple(parts[item.name] for item in self.paths)
 
     def __repr__(self):
@@ -342,8 +340,7 @@ class FitResultsFiles:
         return out
 
     def _tables(self, columns):
-        if not self.paths:
-            raise data_error(self.path, "holds no part yet")
+        check_data(self.paths, self.path, "holds no part yet")
         for part in self.parts():
             table = part.to_table()
             check_names(columns or (), "column", table.colnames)
@@ -351,12 +348,12 @@ class FitResultsFiles:
 
     def write_table(self, path, *, columns=None, overwrite=False):
         """
-        Write the table of all results to one FITS file, a part at a time.
+        Write the table of all results to one FITS or parquet file, a part at a time.
 
         Parameters
         ----------
         path : path-like
-            The file.
+            The file: parquet if its name ends in ``.parquet``, else FITS.
         columns : list of str, optional
             Columns to write, all by default.
         overwrite : bool, optional

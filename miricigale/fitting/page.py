@@ -21,6 +21,8 @@ from miricigale.utils.declared import declared
 
 #: Examples on the page, and points in a drawing.
 _EXAMPLES, _POINTS = 6, 5000
+#: Objects of a longer catalog whose numbers are on the page, spread evenly over it: half of them at least.
+_MOST = 400_000
 _COLOR, _SECOND = "#1d4ed8", "#c2410c"
 #: Fluxes in a band for which a median is drawn.
 _FEW = 5
@@ -63,18 +65,21 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None):
     job = results.job
     names = {"catalog_map": catalog_map, "flux_unit": job["catalogue"]["flux_unit"]}
     rows = open_catalog(path, job["chunk_rows"], hdu=hdu, **names)
-    found = every = fit_numbers(results)
-    found.meta["known"], found["z_known"] = known_redshifts(rows, z_spec)
-    columns = classes_of(classes) if len(classes) > 1 else None
+    step = max(1, -(-len(results) // _MOST))
+    found = every = fit_numbers(results, step)
+    found.meta["known"], found["z_known"] = known_redshifts(rows, z_spec, step)
+    columns = classes_of(classes, step) if len(classes) > 1 else None
     if columns is not None:
         # fits of stars and quasars with galaxies say nothing about the fit
         found = found[np.isin(columns["class"], ["galaxy", ""])]
     subtitle = f"{len(results)} objects, {len(found.meta['filters'])} bands"
     report = Page(f"Fits of {Path(path).name}", subtitle=subtitle)
     page = SectionWriter(report, declared("miricigale.fitting"))
+    if step > 1:
+        page.notice("thinned", step=step, n=len(every))
     _notices(page, found)
     others = " or ".join(list(classes)[1:])
-    facts = {"n": len(found), "n_all": len(results), "others": others}
+    facts = {"n": len(found), "n_all": len(every), "others": others}
     page.section("summary", "classes" if others else "text", **facts)
     _summary(page, found)
     if columns is not None:
@@ -83,7 +88,7 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None):
     _calibration(page, results.path / "calibration.ecsv")
     _goodness(page, found)
     _physics(page, found)
-    _examples(page, results, every)
+    _examples(page, results, every, step)
     _left_out(page, rows, every)
     _settings(page, results)
     return page.report
@@ -239,14 +244,14 @@ def _physics(page, found):
         page.text("agn")
 
 
-def _examples(page, results, found):
+def _examples(page, results, found, step):
     chosen = _choose(found)
     if not chosen:
         return
     page.section("examples")
     filters = FilterSet(next(iter(results.parts())).filters)
     figure, axes = new_figure(-(-len(chosen) // 2), 2, size=(WIDTH / 2, 3.3))
-    picked = results[np.array([row for row, _ in chosen])]
+    picked = results[np.array([step * row for row, _ in chosen])]
     for ax, (_, what), one in zip(axes.ravel(), chosen, picked, strict=False):
         one.plot_sed(ax, filters=filters)
         z = "" if found.meta["fixed"] else f"z = {one.best['redshift'].value:.2f}, "

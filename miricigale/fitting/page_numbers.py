@@ -10,14 +10,24 @@ from miricigale.utils.options import check_that
 KNOWN_REDSHIFTS = ("z_spec", "zspec", "z_true", "redshift_spec", "redshift")
 
 
-def fit_numbers(results):
+def thinned(parts, step):
+    """Yield parts with every ``step``-th of their rows, counted through all parts."""
+    first = 0
+    for part in parts:
+        yield part[first::step]
+        first = (first - len(part)) % step
+
+
+def fit_numbers(results, step=1):
     """
-    Numbers of all objects, in the order of the catalog.
+    Numbers of all objects, or of every ``step``-th, in the order of the catalog.
 
     Parameters
     ----------
     results : `~miricigale.fitting.FitResultsFiles`
         The fit.
+    step : int, optional
+        For catalogs that are longer than memory.
 
     Returns
     -------
@@ -25,7 +35,7 @@ def fit_numbers(results):
         A row for each object: redshift, fraction and mass at 16, 50 and 84 %, fit, and ratios and pulls in the
         bands ``meta["filters"]``; ``meta["fixed"]`` is whether redshifts were given.
     """
-    table = vstack([Table(_numbers(part)) for part in results.parts()])
+    table = vstack([Table(_numbers(part)) for part in thinned(results.parts(), step)])
     first = next(iter(results.parts()))
     table.meta.update(filters=first.fitted_filters, fixed=first.redshift_fixed)
     return table
@@ -63,7 +73,7 @@ def _numbers(part):
     return out
 
 
-def known_redshifts(rows, name):
+def known_redshifts(rows, name, step=1):
     """
     Known redshifts of a catalog.
 
@@ -73,6 +83,8 @@ def known_redshifts(rows, name):
         The catalog.
     name : str or None
         The column; None for the first of `KNOWN_REDSHIFTS` that is there.
+    step : int, optional
+        As for `fit_numbers`.
 
     Returns
     -------
@@ -90,8 +102,8 @@ def known_redshifts(rows, name):
     if name is None:
         name = next((one for one in KNOWN_REDSHIFTS if one in names), None)
     if name is None:
-        return None, np.full(rows.n_rows, np.nan)
+        return None, np.full(len(range(0, rows.n_rows, step)), np.nan)
     check_that(name in names, "z_spec", f"one of the columns {list(names)}", repr(name))
-    chunks = (rows.chunk(i) for i in range(rows.n_chunks))
+    chunks = thinned((rows.chunk(i) for i in range(rows.n_chunks)), step)
     z = np.concatenate([plain_floats(chunk[name], name, "photometry") for chunk in chunks])
     return name, np.where(z > 0, z, np.nan)

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import astropy.units as u
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 from miricigale.fitting.likelihood import FitFlags
 from miricigale.fitting.posterior import cell_edges
@@ -258,14 +259,8 @@ def _unmasked(value, name):
     return np.where(mask, np.nan, array)
 
 
-def integrals(nodes, density):
-    """Integrals from the first node to each of densities (..., n) that straight lines join: (..., n)."""
-    steps = 0.5 * (density[..., 1:] + density[..., :-1]) * np.diff(nodes)
-    return np.concatenate([np.zeros((*density.shape[:-1], 1)), np.cumsum(steps, axis=-1)], axis=-1)
-
-
 def integrals_to(values, nodes, density, total):
-    """Integrals up to values (m,) between the nodes, shape (..., m), from those of `integrals`."""
+    """Integrals up to values (m,) between the nodes, shape (..., m), from their integrals up to each."""
     cell = np.clip(np.searchsorted(nodes, values, side="right") - 1, 0, nodes.size - 2)
     step = values - nodes[cell]
     slope = (density[..., cell + 1] - density[..., cell]) / (nodes[cell + 1] - nodes[cell])
@@ -284,7 +279,7 @@ def density_log_prior(redshift_prior, grid_redshift, allowed, flags):
     n = flags.size
     nodes, density = read_density(redshift_prior, n)
     density = np.broadcast_to(density, (n, nodes.size))
-    total = integrals(nodes, density)
+    total = cumulative_trapezoid(density, nodes, initial=0)
     if grid_redshift.size == 1:
         edges = np.array([nodes[0], nodes[-1]])
     else:

@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 import astropy.units as u
 import numpy as np
 
-from miricigale.fitting import drawing
-from miricigale.fitting.likelihood import FitFlags, filter_names
+from miricigale.fitting import drawing, result_tables
 from miricigale.fitting.posterior import (
     cell_edges,
     cell_percentiles,
@@ -17,24 +16,17 @@ from miricigale.fitting.posterior import (
     moments,
 )
 from miricigale.fitting.quantities import DERIVED_LEVELS, kept_percentiles
+from miricigale.fitting.result_tables import OUTLIER
 from miricigale.fitting.rows import FitRows
-from miricigale.utils.declared import declared
 from miricigale.utils.interactive import checked_calls
 from miricigale.utils.object_rows import PerObject, PerObjectDict
 from miricigale.utils.options import check_names
-from miricigale.utils.tables import described_table, error_column
 from miricigale.utils.unified import read_write
-from miricigale.utils.units import FNU
 
-_LEVELS = (0.16, 0.5, 0.84)
 #: Part of the mean below which CIGALE gives no standard deviation.
 CIGALE_LEAST_STD = 0.05
-#: Error of a redshift over 1 + z beyond which it is called an outlier.
-_OUTLIER = 0.15
-_ODDS = f"probability that redshift_p50 is within {_OUTLIER} (1 + z) of the redshift"
 #: Objects that a notebook shows.
 _SHOWN = 20
-_PARTS = declared("miricigale.fitting", "columns.toml")["parameter"]
 
 
 @checked_calls
@@ -350,11 +342,9 @@ class FitResults(FitRows):
             Weight of each cell; of the cells between quantiles the same for all.
         """
         if name in self.axes:
-            return self._edges(name) * self.unit(name), self.pdf[name]
+            edges = cell_edges(self.axes[name].values, self.axes[name].bounds)
+            return edges * self.unit(name), self.pdf[name]
         return self._kept(name, "quantiles") * self.unit(name), np.diff(DERIVED_LEVELS)
-
-    def _edges(self, name):
-        return cell_edges(self.axes[name].values, self.axes[name].bounds)
 
     def cdf(self, name):
         """
@@ -386,7 +376,7 @@ class FitResults(FitRows):
         out = np.full(len(some), np.nan)
         if "redshift" in self.axes and not self.redshift_fixed:
             z, axis = some.median("redshift").value, self.axes["redshift"]
-            low, high = (z - _OUTLIER) / (1.0 + _OUTLIER), (z + _OUTLIER) / (1.0 - _OUTLIER)
+            low, high = (z - OUTLIER) / (1.0 + OUTLIER), (z + OUTLIER) / (1.0 - OUTLIER)
             out = cell_shares(axis.values, some.pdf["redshift"], low, high, axis.bounds)
         return out[0] if self.isscalar else out
 
@@ -422,85 +412,9 @@ class FitResults(FitRows):
         msg = f"no joint posterior of {x} and {y}; known: {have} ('pairs' of BayesFitter.fit)"
         raise KeyError(msg)
 
-    # ---------------------------------------------------------------------- tables
+    # -------------------------------------------------------------- tables and drawings
 
-    def to_table(self):
-        """
-        Results as a table.
-
-        Returns
-        -------
-        table : `~astropy.table.QTable`
-            One row for each object: ``id``, ``flags``, ``n_bands``, ``n_limits``,
-            ``chi2_best``, ``reduced_chi2``, ``log_evidence`` (of a sampler also
-            ``log_evidence_err``, ``n_calls``, ``n_effective``, ``converged``), and for each
-            parameter and derived quantity ``<name>_mean``, ``_std``, ``_p16``, ``_p50``, ``_p84``
-            and ``_best``; derived quantities that scale with mass also have ``_logmean``, the mean
-            of log10 (dex, in their unit). Of a fit with ``outliers``, for each band
-            ``<band>_outlier``, how likely it is wrong. With free redshifts `redshift_odds`.
-        """
-        some = self._several()
-        columns = {
-            "id": (some.ids, "identifier"),
-            "flags": (some.flags, FitFlags.describe()),
-            "n_bands": (some.n_bands, "bands used, upper limits among them"),
-            "n_limits": (some.n_limits, "bands used that are upper limits"),
-            "chi2_best": (some.chi2, "chi2 of the best model"),
-            "reduced_chi2": (some.reduced_chi2, "chi2_best over the number of bands less one"),
-            "log_evidence": (some.log_evidence, "ln of the evidence, fluxes in uJy"),
-            "log_evidence_err": (some.log_evidence_err, "its 1-sigma error"),
-            "n_calls": (some.n_calls, "models evaluated"),
-            "n_effective": (some.n_effective, "effective size of the sample"),
-            "converged": (some.converged, "whether the sampler finished"),
-        }
-        columns = {n: value for n, value in columns.items() if value[0] is not None}
-        for name in some.parameters:
-            unit, meaning = some.unit(name), some._meaning(name)
-            percentiles = some.percentile(name, _LEVELS)
-            parts = [some.mean(name), some.std(name), *percentiles.T, some.best[name]]
-            for (suffix, text), value in zip(_PARTS.items(), parts, strict=True):
-                columns[f"{name}_{suffix}"] = (value, f"{text} of {meaning}")
-            if some.extensive(name):
-                log_mean = some.moments[:, some._quantity(name), 2] * u.dex
-                text = f"posterior mean of log10 of {meaning}, in {unit.to_string()}"
-                columns[f"{name}_logmean"] = (log_mean, text)
-            if name == "redshift" and not some.redshift_fixed:
-                columns["redshift_odds"] = (some.redshift_odds, _ODDS)
-        if some.outlier is not None:
-            for name in some.fitted_filters:
-                value = some.outlier[:, some.filters.index(name)]
-                columns[f"{name}_outlier"] = (value, f"how likely {name} is wrong")
-        return described_table(columns, dict(self.meta))
-
-    def predict(self, filters=None):
-        """
-        Fluxes of the models over the posterior; `Samples.predict` has those in other bands.
-
-        Parameters
-        ----------
-        filters : list of str or `~miricigale.filters.FilterSet`, optional
-            Bands of the models, fitted or not; all by default.
-
-        Returns
-        -------
-        table : `~astropy.table.QTable`
-            ``id`` and, for each filter, mean (by its name), standard deviation (``<name>_err``)
-            and flux of the best model (``<name>_best``) in uJy.
-        """
-        some = self._several()
-        columns = {"id": (some.ids, "identifier")}
-        names = filter_names("filters", self.filters if filters is None else filters)
-        check_names(names, "filter of the models", self.filters)
-        for name in names:
-            for column, array, text in (
-                (name, some.model_flux, "posterior mean of the model flux"),
-                (error_column(name), some.model_flux_std, "its posterior standard deviation"),
-                (f"{name}_best", some.best_flux, "flux of the best model"),
-            ):
-                columns[column] = (array[:, self.filters.index(name)] * FNU, text)
-        return described_table(columns, dict(self.meta))
-
-    # ---------------------------------------------------------------- single objects
+    to_table, predict = result_tables.to_table, result_tables.predict
 
     def _one(self, what):
         """Refuse several objects where one is needed."""

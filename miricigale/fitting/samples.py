@@ -6,22 +6,22 @@ from functools import cached_property
 import astropy.units as u
 import numpy as np
 
+from miricigale.fitting import drawn_spectra
 from miricigale.fitting.drawing import labeled
+from miricigale.fitting.drawn_spectra import LEVELS, suffix
 from miricigale.fitting.likelihood import FitFlags
 from miricigale.fitting.posterior import bin_edges, cell_edges, check_levels
 from miricigale.fitting.priors import grid_priors
 from miricigale.fitting.quantities import FRACTIONS, Quantities
 from miricigale.fitting.rows import FitRows
-from miricigale.sed import grid_spectra as spectra
+from miricigale.sed import grid_spectra
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.object_rows import PerObject
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.random import stream
 from miricigale.utils.tables import described_table, error_column
 from miricigale.utils.unified import read_write
-from miricigale.utils.units import FNU, WAVE
-
-_LEVELS = (0.16, 0.5, 0.84)
+from miricigale.utils.units import FNU
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -352,21 +352,21 @@ model : `~miricigale.sed.SEDModel`, optional
         ValueError
             If a band is not one of the grid and no model is known, or the model is another.
         """
-        names, extra = spectra.band_names(self.grid, filters)
+        names, extra = grid_spectra.band_names(self.grid, filters)
         model, some = self._model() if extra else None, self._several()
         out = np.full((*some.scale.shape, len(names)), np.nan)
         fitted = some.fitted
-        out[fitted] = spectra.draw_fluxes(
+        out[fitted] = grid_spectra.draw_fluxes(
             self.grid, some.index[fitted], some.scale[fitted], names, extra, model
         )
         return out.reshape(*self.scale.shape, len(names)) * FNU
 
     def _model(self):
         check_that(self.model is not None, "model", "an SEDModel (these samples know none)", "None")
-        spectra.check_model(self.model, self.grid)
+        grid_spectra.check_model(self.model, self.grid)
         return self.model
 
-    def predict(self, filters=None, *, levels=_LEVELS):
+    def predict(self, filters=None, *, levels=LEVELS):
         """
         Posterior of the fluxes in any bands.
 
@@ -384,7 +384,7 @@ model : `~miricigale.sed.SEDModel`, optional
             (``<name>_err``) and percentiles (``<name>_p16``, ...) in uJy.
         """
         levels = check_levels(levels)
-        names, _ = spectra.band_names(self.grid, filters)
+        names, _ = grid_spectra.band_names(self.grid, filters)
         some = self._several()
         columns = {
             "id": (np.array(some.ids), "identifier"),
@@ -395,68 +395,11 @@ model : `~miricigale.sed.SEDModel`, optional
             columns[error_column(name)] = (flux.std(axis=1), "its standard deviation")
             for level, values in zip(levels, np.quantile(flux, levels, axis=1), strict=True):
                 text = f"quantile {level:g} of the model flux"
-                columns[f"{name}_{_suffix(level)}"] = (values, text)
+                columns[f"{name}_{suffix(level)}"] = (values, text)
         return described_table(columns, dict(self.meta))
 
-    def spectra(self, key, *, rest=True):
-        """
-        Spectra of the draws of one object; different galaxies and AGN models are evaluated once.
-
-        Parameters
-        ----------
-        key : object
-            Id of the object.
-        rest : bool, optional
-            Whether in the rest frame (L_nu as it leaves the galaxy, without absorption between
-            the galaxies and in the Milky Way) or as observed (F_nu, with both).
-
-        Returns
-        -------
-        wave : `~astropy.units.Quantity`, shape (n_wave,)
-            Wavelengths in um; of the observed spectra those that all draws cover, in the steps
-            of the median redshift.
-        spectra : `~astropy.units.Quantity`, shape (n_draws, n_wave)
-            In W / Hz or uJy.
-        """
-        one = self.loc[key]._fitted_one()
-        function = spectra.rest_spectra if rest else spectra.observed_spectra
-        wave, values = function(self._model(), self.grid, one.index, one.scale)
-        return wave * WAVE, values * (u.W / u.Hz if rest else FNU)
-
-    def sed_band(self, key, levels=_LEVELS, *, rest=True):
-        """
-        Percentiles of the spectrum of one object.
-
-        Parameters
-        ----------
-        key, rest : optional
-            See `spectra`.
-        levels : tuple of float, optional
-            Levels of the percentiles, in (0, 1).
-
-        Returns
-        -------
-        table : `~astropy.table.QTable`
-            ``wave`` and a column for each level (``p16``, ``p50``, ``p84``), taken at every
-            wavelength by itself: L_nu in W / Hz, or F_nu in uJy as observed.
-        """
-        levels = check_levels(levels)
-        wave, values = self.spectra(key, rest=rest)
-        columns = {"wave": (wave, f"{'rest' if rest else 'observed'} wavelength")}
-        for level, row in zip(levels, np.quantile(values.value, levels, axis=0), strict=True):
-            text = f"quantile {level:g} of {'L_nu' if rest else 'F_nu'}"
-            columns[_suffix(level)] = (row * values.unit, text)
-        return described_table(columns, dict(self.meta) | {"id": str(key), "rest": bool(rest)})
-
-    # -------------------------------------------------------------------- drawing
-
-    def plot_sed_band(self, key, ax=None, *, levels=_LEVELS, rest=True, **kwargs):
-        """Draw `sed_band`; returns the axes."""
-        from miricigale.plotting.posteriors import plot_sed_band
-
-        table = self.sed_band(key, levels, rest=rest)
-        bands = [table[name] for name in table.colnames[1:]]
-        return plot_sed_band(table["wave"], bands, ax=ax, rest=rest, **kwargs)
+    spectra, sed_band = drawn_spectra.spectra, drawn_spectra.sed_band
+    plot_sed_band = drawn_spectra.plot_sed_band
 
     def plot_pdf2d(self, key, a="redshift", b="frac_agn", ax=None, **kwargs):
         """Draw the joint distribution of two parameters of an object; returns the axes."""
@@ -465,7 +408,3 @@ model : `~miricigale.sed.SEDModel`, optional
         a_edges, b_edges, weights = self.pdf_2d(a, b, key)
         kwargs.setdefault("labels", tuple(labeled(name, self.unit(name)) for name in (a, b)))
         return plot_pdf_2d(a_edges.value, b_edges.value, weights, ax=ax, **kwargs)
-
-
-def _suffix(level):
-    return f"p{100 * level:g}"

@@ -5,11 +5,15 @@ import importlib.metadata
 import json
 import logging
 import os
+import sqlite3
+import threading
+from collections import deque
+from functools import partial
 
 import astropy.units as u
 import numpy as np
 
-from miricigale.filters.catalog_files import codes_of, joined_codes, warn_of_codes
+from miricigale.filters.catalog_files import codes_of, warn_of_codes
 from miricigale.fitting.fitter import BayesFitter
 from miricigale.fitting.from_files import give_units, open_catalog
 from miricigale.fitting.io import FORMAT, FitFolder, open_results, part_ids, part_name
@@ -17,15 +21,19 @@ from miricigale.fitting.likelihood import HIGH_CHI2
 from miricigale.fitting.pulls import warn_of_pulls
 from miricigale.utils.content import content_sha256
 from miricigale.utils.exceptions import CatalogWarning, OtherResultsError, argument_error, warn
-from miricigale.utils.options import check_that
+from miricigale.utils.folder import FileFolder
+from miricigale.utils.meta import plain_value, undated
+from miricigale.utils.options import check_data, check_that
 from miricigale.utils.progress import progress
 from miricigale.utils.random import check_seed
-from miricigale.utils.store import plain_value
+from miricigale.utils.store import PARTIAL
 from miricigale.utils.tables import ascii_ids, error_column, read_ids, require_columns
 from miricigale.utils.units import FNU
 
 logger = logging.getLogger(__name__)
 
+#: Astropy's warnings are turned off for a process, not for a thread.
+_WRITING = threading.Lock()
 _PACKAGES = ("miricigale", "numpy", "numba", "astropy")
 
 
@@ -60,7 +68,7 @@ def fit_file(
         The fitter. (Of a sampler, the cells of a redshift axis that is not the same for all objects
         are those of each part.)
     path_in : path-like
-        The catalog: FITS with a binary table, by pieces; or ECSV, CSV, VOTable and plain text, which
+        The catalog: FITS with a binary table or parquet, by pieces; or ECSV, CSV, VOTable and plain text, which
         are in memory as a whole. Its columns are as `BayesFitter.fit` wants them, or become so by
         ``catalog_map``.
     path_out : path-like
@@ -81,7 +89,9 @@ def fit_file(
     hdu : int or str, optional
         Extension of a FITS file; the only table by default.
     executor : `concurrent.futures.Executor`, optional
-        Fits parts of each piece at the same time; the answer is the same.
+        Fits parts of each piece at the same time; the answer is the same. Workers of dask make whole pieces, and
+        write them, where there are as many pieces as workers or more: they must see the folder by the same path.
+        A piece whose worker is lost is made by another one.
     progress_bar : bool, optional
         Whether to show one.
     resume : bool, optional
@@ -133,7 +143,7 @@ def fit_file(
     options = {"redshift": redshift, "redshift_prior": redshift_prior, "pairs": pairs}
     if catalog_map is None:
         pieces = (codes_of(rows.chunk(i), fitter.bands) for i in range(rows.n_chunks))
-        warn_of_codes(joined_codes(pieces), rows.path.name)
+        warn_of_codes(pieces, rows.path.name)
     else:
         for text in rows.messages():
             warn(f"{rows.path.name}: {text}", CatalogWarning)
@@ -164,42 +174,114 @@ def _noted(rows, i):
 
 def _fit_parts(fitter, rows, take, folder, seed, executor, progress_bar):
     """Fit the pieces whose parts are not there, and write them."""
-    seen, n_new = set(), 0
-    with progress(show=progress_bar, total=rows.n_rows, desc="fit", unit="obj") as bar:
+    n_new, waiting = 0, deque()
+
+    def finish(i, made):
+        (products, n_rows, n_fitted), name = made, part_name(i)
+        what = "was written by a worker to a folder that cannot be seen from here"
+        check_data(folder.path(name).is_file(), folder.path(name), what)
+        folder.finish(name, "", products, rows=n_rows, fitted=n_fitted)
+        bar.update(n_rows)
+
+    def collect(most):
+        while len(waiting) > most:
+            i, future = waiting.popleft()
+            with _noted(rows, i):
+                finish(i, future.result())
+
+    with (
+        progress(show=progress_bar, total=rows.n_rows, desc="fit", unit="obj") as bar,
+        _seen_ids(folder) as seen,
+    ):
+        submit, most = _workers(fitter, folder, rows.n_chunks, executor)
         for i in range(rows.n_chunks):
             name = part_name(i)
             if name in folder.records and folder.is_whole(name):
-                keys = _keys(part_ids(folder.path(name)))
-            else:
-                if name in folder.records:
-                    logger.warning("%s is missing or damaged and is made again", folder.path(name))
-                with _noted(rows, i):
-                    table, options = take(i)
-                    keys = _keys(read_ids(table))
-                    repeated = np.array([key in seen for key in keys], dtype=bool)
+                bar.update(len(seen(part_ids(folder.path(name)))))
+                continue
+            if name in folder.records:
+                logger.warning("%s is missing or damaged and is made again", folder.path(name))
+            with _noted(rows, i):
+                table, options = take(i)
+                options |= {"seed": seed, "repeated": seen(read_ids(table))}
+                if n_new and submit:
+                    waiting.append((i, submit(name, table, options)))
+                else:
                     if not n_new:
                         # which holds for all pieces: to the caller of fit_file
                         fitter.warn_of_bands(table)
-                    options |= {"seed": seed, "parallel": {"executor": executor}}
-                    results = fitter.fit_part(table, **options, repeated=repeated)
+                    results = fitter.fit_part(table, **options, parallel={"executor": executor})
                     if not n_new:
                         warn_of_pulls(results)
-                n_new += 1
-                # the same bytes, whenever they are made
-                results.meta.pop("created", None)
-                folder.save(name, results.write)
-                n_fitted = int(np.count_nonzero(results.fitted))
-                product = {name: folder.describe(name)}
-                folder.finish(name, "", product, rows=len(results), fitted=n_fitted)
-            seen.update(keys)
-            start, stop = rows.span(i)
-            bar.update(stop - start)
+                    finish(i, _save_part(folder, name, results))
+            n_new += 1
+            # no more are in memory than are worked on
+            collect(most)
+        collect(0)
     logger.info("%s: %d parts, %d of them new", folder.folder, rows.n_chunks, n_new)
 
 
-def _keys(ids):
-    """Ids as a set knows them: numbers that are NaN are one."""
-    return [key if key == key else None for key in ids.tolist()]
+def _workers(fitter, folder, n_chunks, executor):
+    """Function that sends a piece to a worker of dask, and how many are to be sent; none if there are too few."""
+    # dask's executor has no public way to its client
+    client = getattr(executor, "_client", None)
+    n_workers = 0 if client is None else sum(client.nthreads().values())
+    if not 0 < n_workers <= n_chunks:
+        return None, 0
+    # one of them may be lost
+    known = client.scatter(fitter, broadcast=True)
+    place = FileFolder(folder.folder.absolute())
+
+    return partial(executor.submit, _make_part, known, place), 2 * n_workers
+
+
+def _make_part(fitter, folder, name, table, options):
+    """Fit a piece and write it, on a worker."""
+    return _save_part(folder, name, fitter.fit_part(table, **options, parallel={}))
+
+
+def _save_part(folder, name, results):
+    """Write a part: what the manifest says of it, its rows, and how many were fitted."""
+    # the same bytes, whenever they and the grid are made
+    results = results._changed(meta=undated(results.meta))
+    with _WRITING:
+        folder.save(name, results.write)
+    return {name: folder.describe(name)}, len(results), int(np.count_nonzero(results.fitted))
+
+
+@contextlib.contextmanager
+def _seen_ids(folder):
+    """Function of ids: which of them there were in earlier calls, for they are kept on disk."""
+    path = folder.folder.absolute() / f"{PARTIAL}ids"
+    # the folder is locked, and its file system may know no locks of parts of files
+    known = sqlite3.connect(f"{path.as_uri()}?nolock=1", uri=True, isolation_level=None)
+
+    def seen(ids):
+        keys = [(_key(value),) for value in ids.tolist()]
+        rows = [known.execute("SELECT 1 FROM seen WHERE id = ?", key).fetchone() for key in keys]
+        known.executemany("INSERT OR IGNORE INTO seen VALUES (?)", keys)
+        return np.array([row is not None for row in rows], dtype=bool)
+
+    try:
+        # nothing is read by a later process; 64 MB of them are in memory
+        for what in ("journal_mode = OFF", "synchronous = OFF", "cache_size = -64000"):
+            known.execute(f"PRAGMA {what}")
+        known.execute("BEGIN")
+        known.execute("CREATE TABLE seen (id PRIMARY KEY) WITHOUT ROWID")
+        yield seen
+    except sqlite3.Error as err:
+        msg = f"{path} could not be written: {err}"
+        raise OSError(msg) from err
+    finally:
+        known.close()
+        path.unlink(missing_ok=True)
+
+
+def _key(value):
+    """An id as the database knows it: numbers that are NaN are one, and those beyond 64 bits are text."""
+    if value != value:
+        return b""
+    return str(value) if isinstance(value, int) and value >= 1 << 63 else value
 
 
 def _pieces(rows, options, unit, fluxes):

@@ -11,7 +11,6 @@ from astropy.table import QTable
 from miricigale.evaluation import photoz_metrics
 from miricigale.filters import Filter
 from miricigale.fitting.calibration import (
-    TemplateError,
     calibrate_zero_points,
     error_of_bands,
     measure_priors,
@@ -21,6 +20,7 @@ from miricigale.fitting.checks import leave_out
 from miricigale.fitting.populations import MassFunction, agn_fraction_prior
 from miricigale.fitting.priors import known_redshifts
 from miricigale.fitting.pulls import without_warnings
+from miricigale.fitting.template_error import TemplateError
 from miricigale.refdata import locate
 from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import DataError, FitWarning, warn

@@ -1,3 +1,5 @@
+from .ceers import CEERS_FILTERS as CEERS_FILTERS
+from .ceers import ceers_exposures as ceers_exposures
 from .detector import DetectorProperties as DetectorProperties
 from .detector import bad_pixel_mask as bad_pixel_mask
 from .detector import field_mask as field_mask
@@ -6,6 +8,7 @@ from .detector import miri_detector as miri_detector
 from .detector import reference_pixel_mask as reference_pixel_mask
 from .dithers import dither_offsets as dither_offsets
 from .dithers import dither_patterns as dither_patterns
+from .dithers import read_centers as read_centers
 from .dithers import read_dithers as read_dithers
 from .dithers import tile_offsets as tile_offsets
 from .dq import DQ as DQ
@@ -13,9 +16,7 @@ from .dq import dq_legend as dq_legend
 from .dq import dq_planes as dq_planes
 from .dq import read_dq as read_dq
 from .dq import with_own_bits as with_own_bits
-from .exposure import CEERS_FILTERS as CEERS_FILTERS
 from .exposure import Exposure as Exposure
-from .exposure import ceers_exposures as ceers_exposures
 from .exposure import frame_time as frame_time
 from .exposure import readout_patterns as readout_patterns
 from .figures import imager_filters as imager_filters

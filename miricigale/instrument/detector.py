@@ -9,7 +9,7 @@ from numpy.polynomial import polynomial as poly
 from miricigale.instrument.figures import filter_row, imager_filter, table
 from miricigale.instrument.siaf import aperture, imager_columns
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_least, check_positive
+from miricigale.utils.options import check_least, check_positive, check_that
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.units import frozen_array
 
@@ -90,11 +90,9 @@ class DetectorProperties:
         object.__setattr__(self, "response", rows)
         for *_, value in rows:
             check_positive(value, "response")
-        if len(self.ipc) != 3:
-            raise argument_error("ipc", "three shares", self.ipc)
-        if coefficients[:2] != (0.0, 1.0):
-            wanted = "coefficients that begin with 0, 1"
-            raise argument_error("nonlinearity", wanted, self.nonlinearity)
+        check_that(len(self.ipc) == 3, "ipc", "three shares", self.ipc)
+        wanted = "coefficients that begin with 0, 1"
+        check_that(coefficients[:2] == (0.0, 1.0), "nonlinearity", wanted, self.nonlinearity)
         signal = np.linspace(0, self.full_well / self.gain, 200)
         if np.any(poly.polyval(signal, poly.polyder(coefficients)) < 0.2):
             raise argument_error("nonlinearity", "rising up to the full well", self.nonlinearity)
@@ -134,9 +132,8 @@ class DetectorProperties:
         """
         wanted = (imager_filter(filter), subarray)
         known = {row[:2]: row[2] for row in self.response} or {wanted: 1.0}
-        if wanted not in known:
-            what = f"with {' and '.join(wanted)}"
-            raise argument_error("response", what, f"{len(known)} others")
+        what = f"with {' and '.join(wanted)}"
+        check_that(wanted in known, "response", what, f"{len(known)} others")
         return known[wanted]
 
     def linearize(self, dn):

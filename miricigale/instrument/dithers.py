@@ -7,13 +7,15 @@ from pathlib import Path
 
 import astropy.units as u
 import numpy as np
+from astropy.coordinates import SkyCoord
 from astropy.table import Table
 
 from miricigale.instrument.figures import table
-from miricigale.instrument.siaf import aperture, imager_columns
+from miricigale.instrument.siaf import aperture, imager_columns, vector_angles
+from miricigale.instrument.wcs import tangent_offset
 from miricigale.utils.exceptions import DataError, argument_error, data_error
 from miricigale.utils.files import reading, unpacked_size
-from miricigale.utils.options import check_names
+from miricigale.utils.options import check_data, check_names, check_that
 from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import require_columns
 from miricigale.utils.units import ANGLE, check_count, to_array
@@ -21,6 +23,8 @@ from miricigale.utils.units import ANGLE, check_count, to_array
 # sides of the pixel at the reference, arcsec (SIAF)
 _PIXEL = (0.110497, 0.111336)
 
+#: Apertures of the imager's full array, and types of exposures, in APT's list of pointings.
+_FULL, _USED = ("MIRIM_FULL", "MIRIM_ILLUM"), ("SCIENCE", "PARALLEL")
 #: Points of the cycling patterns.
 _N_CYCLING = 311
 #: Half pixels in turn.
@@ -153,8 +157,7 @@ def tile_offsets(n_x, n_y, *, overlap=0.1):
                [ 33.2,   0. ]] arcsec>
     """
     n_x, n_y = check_count(n_x, "n_x"), check_count(n_y, "n_y")
-    if not 0 <= overlap < 1:
-        raise argument_error("overlap", "at least 0 and less than 1", overlap)
+    check_that(0 <= overlap < 1, "overlap", "at least 0 and less than 1", overlap)
     first, last = imager_columns()
     sides = np.array([last - first, aperture("FULL").shape[0]]) * _PIXEL
     row, column = np.divmod(np.arange(n_x * n_y), n_x)
@@ -215,31 +218,93 @@ def read_dithers(path, *, observation=None, exposure=None):
     if path.suffix.lower() == ".pointing":
         return _read_pointings(path, observation, exposure)
     for name, given in (("observation", observation), ("exposure", exposure)):
-        if given is not None:
-            raise argument_error(name, "left out, but for a .pointing file", given)
+        check_that(given is None, name, "left out, but for a .pointing file", given)
     with reading(path, "a table"):
         return _table_offsets(read_table(path, wanted="a table"), path.name)
 
 
-def _read_pointings(path, observation, exposure):
-    """Rows by observation and exposure; the columns are those of APT's header line."""
-    found, apertures, current = {}, set(), 0
+def _rows(path):
+    """Rows of APT's list of pointings: the number of the observation, and the columns of its header line."""
+    current = 0
     for line in path.read_text(errors="replace").splitlines():
         words = line.split()
         if line.startswith("* "):
             number = re.search(r"\(Obs (\d+)\)", line) or re.search(r"Observation (\d+)", line)
             current = int(number.group(1)) if number else current + 1
-        if len(words) < 19 or not all(word.isdigit() for word in words[:4]):
-            continue
+        if len(words) >= 19 and all(word.isdigit() for word in words[:4]):
+            yield current, words
+
+
+def read_centers(path, roll):
+    """
+    Read where the imager looks from APT's list of pointings.
+
+    In this list the target is at the place ``IdlX``, ``IdlY`` of the aperture's ideal frame, also where the imager
+    works in parallel.
+
+    Parameters
+    ----------
+    path : path-like
+        What APT exports as ``.pointing``. Exposures of science or in parallel with the full array
+        (``MIRIM_FULL``, ``MIRIM_ILLUM``) are used. The list does not have their filters, times or roll.
+    roll : `~astropy.units.Quantity`
+        Position angle of V3 at the imager.
+
+    Returns
+    -------
+    centers : list of `~astropy.coordinates.SkyCoord`
+        Of each tile of each observation, where the imager looks in the middle of its dithers.
+    others : list of str
+        Apertures of exposures that are not used, with their types.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If there is no such file, or no exposures of the imager's full array in it.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.instrument import read_centers
+    >>> centers, others = read_centers("program.pointing", 40 * u.deg)  # doctest: +SKIP
+    """
+    path, found, others = Path(path).expanduser(), {}, set()
+    unpacked_size(path)
+    with reading(path, "a list of pointings"):
+        for observation, words in _rows(path):
+            if words[4] not in _FULL or words[18] not in _USED:
+                others.add(f"{words[4]} ({words[18]})")
+                continue
+            place = [float(words[k]) for k in (7, 8, 15, 16)]
+            found.setdefault((observation, *words[:2]), []).append(place)
+    if not found:
+        raise data_error(path, f"has no exposures of the full imager; it has {sorted(others)}")
+    pa = roll + aperture().v3_ideal_y_angle * u.deg
+    return [_looks_at(*np.mean(places, axis=0), pa) for places in found.values()], sorted(others)
+
+
+def _looks_at(ra, dec, x, y, pa):
+    """Position of the reference pixel that has a target at a place of the ideal frame (deg, arcsec)."""
+    target = center = SkyCoord(ra, dec, unit="deg")
+    # north turns on the way: each step leaves some 1e-3 of what is missing
+    for _ in range(8):
+        missed = target.cartesian - tangent_offset(center, x * ANGLE, y * ANGLE, pa).cartesian
+        center = SkyCoord(*vector_angles((center.cartesian + missed).xyz.value), unit="rad")
+    return center
+
+
+def _read_pointings(path, observation, exposure):
+    """Offsets of the dithers of an exposure."""
+    found, apertures = {}, set()
+    for current, words in _rows(path):
         apertures.add(words[4])
-        if not words[4].startswith("MIRIM") or words[18] not in ("SCIENCE", "PARALLEL"):
+        if not words[4].startswith("MIRIM") or words[18] not in _USED:
             continue
         target, tile, number, dither = (int(word) for word in words[:4])
         places = found.setdefault(current, {}).setdefault(number, {})
         offset = float(words[11]), float(words[12])
         places.setdefault((target, tile), {}).setdefault(dither, offset)
-    if not found:
-        raise data_error(path, f"has no exposures of MIRIM apertures; it has {sorted(apertures)}")
+    check_data(found, path, f"has no exposures of MIRIM apertures; it has {sorted(apertures)}")
     exposures = found[_chosen("observation", observation, found)]
     patterns = {
         number: {tuple(offsets.values()) for offsets in places.values()}
@@ -259,6 +324,5 @@ def _chosen(name, value, known):
     """The key that is asked for, or the only one."""
     if value is None and len(known) == 1:
         return next(iter(known))
-    if value not in known:
-        raise argument_error(name, f"one of {sorted(known)}", value)
+    check_that(value in known, name, f"one of {sorted(known)}", value)
     return value

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import math
-from typing import ClassVar
+from operator import attrgetter
 
 import astropy.units as u
 from astropy.coordinates import SkyCoord
@@ -16,31 +16,9 @@ from miricigale.instrument.siaf import aperture, attitude_matrix, pixel_to_v2v3,
 from miricigale.instrument.wcs import imager_wcs, tangent_offset
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import Interactive, checked_calls
-from miricigale.utils.options import check_names
+from miricigale.utils.options import check_names, check_that
 from miricigale.utils.positions import as_position
 from miricigale.utils.units import check_count, to_array
-
-#: Bands of the CEERS/MIRI imaging.
-CEERS_FILTERS = (
-    "miri.f770w",
-    "miri.f1000w",
-    "miri.f1280w",
-    "miri.f1500w",
-    "miri.f1800w",
-    "miri.f2100w",
-)
-
-#: Groups, integrations and dithers of each band: 1665 s, and 4662 s at F2100W. Integrations are
-#: short enough for the low sky to fill less than 60 % of the well.
-_CEERS = dict.fromkeys(CEERS_FILTERS, (200, 1, 3))
-_CEERS["miri.f1500w"] = (100, 2, 3)
-_CEERS["miri.f1800w"] = (50, 4, 3)
-_CEERS["miri.f2100w"] = (10, 28, 6)
-
-#: The same for a trial: about a third of the frames, two dithers.
-_QUICK = dict.fromkeys(CEERS_FILTERS, (66, 1, 2))
-_QUICK["miri.f1800w"] = (33, 2, 2)
-_QUICK["miri.f2100w"] = (10, 7, 2)
 
 
 def readout_patterns():
@@ -88,8 +66,7 @@ def _counts_of(filter, time, frame, n_integrations, max_fill=0.6, max_groups=100
     """Groups and integrations whose time is nearest to the wanted one; the integrations may be given."""
     seconds = float(to_array(time, u.s, "time", ndim=0, finite=True))
     frames = round(seconds / frame.value)
-    if frames < 2:
-        raise argument_error("time", f"at least two frames of {frame}", time)
+    check_that(frames >= 2, "time", f"at least two frames of {frame}", time)
     choices = [n_integrations]
     if n_integrations is None:
         fills = miri_detector().full_well / electron_rate(filter) / frame.value
@@ -158,22 +135,6 @@ class Exposure(Interactive):
     pointing: SkyCoord | None
     roll: u.Quantity | None
     dither: int
-
-    _other_names: ClassVar[dict] = {
-        "groups": "n_groups",
-        "ngroups": "n_groups",
-        "integrations": "n_integrations",
-        "nints": "n_integrations",
-        "time": "exposure_time",
-        "total_time": "exposure_time",
-        "position": "pointing",
-        "center": "pointing",
-        "ra": "pointing.ra",
-        "dec": "pointing.dec",
-        "position_angle": "roll",
-        "pa": "roll",
-        "dithers": "dithered",
-    }
 
     def __init__(
         self,
@@ -272,20 +233,14 @@ class Exposure(Interactive):
         """The sub-array, an `~miricigale.instrument.Aperture`."""
         return aperture(self.subarray)
 
-    @property
-    def shape(self):
-        """Rows and columns, ``(ny, nx)``."""
-        return self.aperture.shape
+    shape = property(attrgetter("aperture.shape"), doc="Rows and columns, ``(ny, nx)``.")
 
     @property
     def frame_time(self):
         """Time of one frame, s."""
         return frame_time(self.readout, self.subarray)
 
-    @property
-    def group_time(self):
-        """Time between groups, s: one frame."""
-        return self.frame_time
+    group_time = property(attrgetter("frame_time"), doc="Time between groups, s: one frame.")
 
     @property
     def integration_time(self):
@@ -347,8 +302,7 @@ class Exposure(Interactive):
             If ``filter`` or ``pointing`` is None.
         """
         for name in ("filter", "pointing"):
-            if getattr(self, name) is None:
-                raise argument_error("exposure", f"one with a {name}", "None")
+            check_that(getattr(self, name) is not None, "exposure", f"one with a {name}", "None")
 
     @property
     def pa_aper(self):
@@ -434,50 +388,3 @@ class Exposure(Interactive):
             self.replace(pointing=tangent_offset(self.pointing, dx, dy, pa), dither=first + number)
             for number, (dx, dy) in enumerate(dither_offsets(pattern, n, start=start))
         ]
-
-
-def ceers_exposures(pointing, roll, *, filters=None, quick=False):
-    """
-    The exposures of one CEERS/MIRI pointing.
-
-    Parameters
-    ----------
-    pointing : `~astropy.coordinates.SkyCoord`
-        Center of the field: where the reference pixel looks before dithering.
-    roll : `~astropy.units.Quantity`
-        Position angle of +V3 there.
-    filters : iterable of str, optional
-        Which of the six bands; all if not given.
-    quick : bool, optional
-        Whether about a third of the frames and two dithers are enough.
-
-    Returns
-    -------
-    exposures : list of `Exposure`
-        Band by band; FASTR1, full frame, three dithers (six at F2100W) of 200 frames
-        (280): 1665 s (4662 s) in all. The split into groups and integrations is ours.
-
-    References
-    ----------
-    Yang et al. 2021, ApJ, 908, 144, section 2.
-
-    Examples
-    --------
-    >>> from astropy.coordinates import SkyCoord
-    >>> import astropy.units as u
-    >>> from miricigale.instrument import ceers_exposures
-    >>> field = SkyCoord(214.9, 52.9, unit="deg")
-    >>> exposures = ceers_exposures(field, 0 * u.deg, filters=["miri.f770w"])
-    >>> len(exposures), exposures[0].exposure_time
-    (3, <Quantity 555. s>)
-    """
-    filters = CEERS_FILTERS if filters is None else tuple(filters)
-    check_names(filters, "band of the survey", CEERS_FILTERS)
-    exposures = []
-    for name in filters:
-        n_groups, n_integrations, n_dithers = (_QUICK if quick else _CEERS)[name]
-        base = Exposure(
-            name, n_groups=n_groups, n_integrations=n_integrations, pointing=pointing, roll=roll
-        )
-        exposures += base.dithered("ceers", n_dithers)
-    return exposures

@@ -7,13 +7,12 @@ import numpy as np
 from astropy.time import Time
 
 from miricigale.instrument.keywords import steps_done
+from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error
 
+_STEPS = declared("miricigale.instrument", "keywords.toml")["references"].items()
 #: References in the order in which they are used, with the step after which each is not needed any more.
-REFERENCES = {
-    "mask": "dq_init", "saturation": "saturation", "bias": "superbias", "reset": "reset", "linearity": "linearity",
-    "dark": "dark", "gain": None, "read_noise": None, "flat": "flat", "photom": "photom",
-}  # fmt: skip
+REFERENCES = {name: step or None for name, step in _STEPS}
 
 #: Reference types of CRDS whose names are not those of `REFERENCES`.
 TYPES = {"bias": "superbias", "read_noise": "readnoise"}

@@ -10,12 +10,13 @@ from miricigale.instrument import dq_planes, read_dq, with_own_bits
 from miricigale.instrument.image import Image
 from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import open_fits, write_fits
-from miricigale.utils.meta import plain_text, undated
+from miricigale.utils.meta import plain_value, undated
+from miricigale.utils.options import check_data
 
 
 def json_meta(meta):
     """The meta dictionary of an image as JSON, without dates; a quantity keeps its unit as text."""
-    return json.dumps(undated(meta), default=plain_text)
+    return json.dumps(undated(meta), default=plain_value)
 
 
 #: Steps of rounded values in the median error of an image: with its dither that adds less than 1e-3
@@ -139,8 +140,7 @@ def read_image(path, *, planes=()):
     from astropy.wcs import WCS
 
     with open_fits(path, wanted="an image (FITS with SCI)") as hdus:
-        if "SCI" not in hdus:
-            raise data_error(path, f"has no SCI extension, only {[hdu.name for hdu in hdus]}")
+        check_data("SCI" in hdus, path, f"has no SCI extension, only {[hdu.name for hdu in hdus]}")
         header = hdus["SCI"].header
         wcs = WCS(header)
         error = np.array(hdus["ERR"].data, np.float32) if "ERR" in hdus else None

@@ -4,7 +4,9 @@ import re
 
 from astropy.io import fits
 
+from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import data_error
+from miricigale.utils.options import check_data
 
 #: Read-out patterns by the names that they had before the launch.
 READOUT_NAMES = {"FAST": "FASTR1", "SLOW": "SLOWR1"}
@@ -12,33 +14,12 @@ READOUT_NAMES = {"FAST": "FASTR1", "SLOW": "SLOWR1"}
 #: Where the light is blocked there is no filter.
 _NO_FILTER = ("", "OPAQUE", "N/A", "ANY")
 
-#: Keywords of FITS itself.
-_KEPT = re.compile(r"(?!COMMENT|HISTORY)[A-Z0-9_-]{1,8}")
-
-#: Keywords that a product does not take over.
-_DROPPED = re.compile(r"META|CHECKSUM|DATASUM|DQ(SCHEME|BIT\d+)|EXTVER|EXTEND|NEXTEND")
-
-#: World coordinates of FITS.
-_WCS = re.compile(
-    r"WCSAXES|RADESYS|EQUINOX|LONPOLE|LATPOLE|CROTA\d|C(TYPE|UNIT|RPIX|RVAL|DELT)\d|(CD|PC)\d_\d"
-    r"|[AB]P?_(ORDER|\d_\d)"
-)
-
-#: Keywords that JWST has in the extension SCI.
-_SCIENCE = re.compile(
-    r"(MJD|TDB)-(BEG|AVG|MID|END)|XPOSURE|TELAPSE|REFFRAME|EPH_T(IME|YPE)|JWST_D?[XYZ]|OBSGEO.*|MT_(AV)?(RA|DEC)"
-    r"|PA_(APER|V3)|(RA|DEC)_V1|V[23]_REF|VPARITY|V3I_YANG|(RA|DEC|ROLL)_REF|VA_SCALE|VELOSYS|S_REGION|BUNIT"
-    r"|PHOT(MJSR|UJA2)|PIXAR_(SR|A2)|SPECSYS|SPORDER|SRCTYPE|DISPAXIS"
-)
+_DECLARED = declared("miricigale.instrument", "keywords.toml")
+#: Keywords of FITS itself, those that a product does not take over, world coordinates, and those in SCI of JWST.
+_KEPT, _DROPPED, _WCS, _SCIENCE = (re.compile("|".join(p)) for p in _DECLARED["patterns"].values())
 
 #: Steps of the JWST pipeline by the keywords that record them.
-STEPS = {
-    "S_DQINIT": "dq_init", "S_SATURA": "saturation", "S_IPC": "ipc", "S_FRSTFR": "firstframe",
-    "S_LASTFR": "lastframe", "S_SUPERB": "superbias", "S_RESET": "reset", "S_LINEAR": "linearity",
-    "S_RSCD": "rscd", "S_DARK": "dark", "S_REFPIX": "refpix", "S_JUMP": "jump", "S_GANSCL": "gain_scale",
-    "S_RAMP": "ramp_fit", "S_FLAT": "flat", "S_BKDSUB": "background", "S_PHOTOM": "photom",
-    "S_SKYMAT": "skymatch", "S_OUTLIR": "outlier", "S_RESAMP": "resample",
-}  # fmt: skip
+STEPS = _DECLARED["steps"]
 
 
 def steps_done(header):
@@ -148,9 +129,8 @@ def check_imager(path, header, *, kinds=None, own=None):
         raise data_error(path, f"{wanted}, got {instrument} {detector} {kind}".rstrip())
     stated, recorded = str(header.get("FILTER", "")).strip(), (own or {}).get("filter")
     bands = {name.rpartition(".")[2].upper() for name in (stated, recorded) if name}
-    if len(bands) > 1:
-        what = f"FILTER is {stated} in the header and {recorded} in the package's record"
-        raise data_error(path, f"contradicts itself: {what}")
+    what = f"FILTER is {stated} in the header and {recorded} in the package's record"
+    check_data(len(bands) <= 1, path, f"contradicts itself: {what}")
 
 
 def exposure_keywords(header):

@@ -15,6 +15,7 @@ from miricigale.instrument.siaf import (
     vector_angles,
 )
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.positions import as_position
 from miricigale.utils.units import positive, to_array
 
@@ -309,8 +310,7 @@ def north_up_wcs(center, pixel_scale, shape):
     ra, dec = _radec(center, "center")
     scale = positive(pixel_scale, u.deg, "pixel_scale")
     ny, nx = (int(n) for n in shape)
-    if ny < 1 or nx < 1:
-        raise argument_error("shape", "two positive integers", shape)
+    check_that(ny >= 1 and nx >= 1, "shape", "two positive integers", shape)
     wcs = _gnomonic((ra, dec), [(nx + 1) / 2, (ny + 1) / 2], (ny, nx))
     wcs.wcs.cdelt = [-scale, scale]
     wcs.wcs.set()
@@ -352,8 +352,7 @@ def mosaic_wcs(exposures, pixel_scale):
     from astropy.wcs import WCS
 
     wcss = [getattr(item, "wcs", item) if not isinstance(item, WCS) else item for item in exposures]
-    if not wcss:
-        raise argument_error("exposures", "at least one exposure", "none")
+    check_that(wcss, "exposures", "at least one exposure", "none")
     ra, dec = [], []
     for wcs in wcss:
         if wcs.pixel_shape is None:

@@ -1,7 +1,6 @@
 """From images with units and coordinates to the plain arrays that photometry works on."""
 
 import dataclasses
-import tempfile
 
 import astropy.units as u
 import numpy as np
@@ -12,6 +11,7 @@ from astropy.wcs.utils import pixel_to_pixel, proj_plane_pixel_scales
 from miricigale.instrument import ImageFacts, north_up_wcs, pixel_area_map
 from miricigale.photometry.sky_noise import mask_filled
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.parallel import chunks
 from miricigale.utils.units import FNU, SURFACE_BRIGHTNESS, to_array
 
@@ -43,12 +43,11 @@ class FitArrays:
     area: np.ndarray
     wcs: object
     measured_noise: bool
-    scratch: object = None  # Folder of files that images are kept in; in memory if None.
     noise_correction: float = 1.0  # As the image states it (`ImageFacts`).
 
     def new(self, dtype=np.float32):
         """A new image of zeros."""
-        return _new_image(self.usable.shape, dtype, self.scratch)
+        return np.zeros(self.usable.shape, dtype)
 
     def whitened(self, image):
         """An image over the noise, zero where not usable."""
@@ -59,14 +58,6 @@ class FitArrays:
         """The noise, infinite where not usable."""
         with np.errstate(divide="ignore"):
             return np.divide(np.float32(1), self.inverse_sigma, out=self.new())
-
-
-def _new_image(shape, dtype, scratch):
-    if scratch is None:
-        return np.zeros(shape, dtype)
-    # the file has no name, and goes with the array
-    with tempfile.TemporaryFile(dir=scratch) as file:
-        return np.asarray(np.memmap(file, dtype, "w+", shape=shape))
 
 
 def image_arrays(image, name):
@@ -112,14 +103,10 @@ def image_arrays(image, name):
     )
 
 
-def fit_arrays(image, name, scratch=None):
-    """
-    Take a `~astropy.nddata.CCDData` apart for a fit of templates; see `image_arrays`.
-
-    ``scratch`` is a folder of files that images are kept in, if not in memory.
-    """
+def fit_arrays(image, name):
+    """Take a `~astropy.nddata.CCDData` apart for a fit of templates; see `image_arrays`."""
     data, noise, usable = _checked(image, name)
-    flux, inverse, area = (_new_image(usable.shape, np.float32, scratch) for _ in range(3))
+    flux, inverse, area = (np.zeros(usable.shape, np.float32) for _ in range(3))
     pixel_area_map(image.wcs, usable.shape, out=area)
     area *= np.float32(_MICRO)
     for part in chunks(len(usable), 256):
@@ -138,7 +125,6 @@ def fit_arrays(image, name, scratch=None):
         area=area,
         wcs=image.wcs,
         measured_noise=image.uncertainty is None,
-        scratch=scratch,
         noise_correction=ImageFacts.of(image).noise_correction,
     )
 
@@ -154,8 +140,7 @@ def _checked(image, name):
         msg = f"'{name}' must be a CCDData, got {type(image).__name__}"
         raise TypeError(msg)
     data = np.asarray(image.data)
-    if data.ndim != 2:
-        raise argument_error(name, "a two-dimensional image", f"shape {data.shape}")
+    check_that(data.ndim == 2, name, "a two-dimensional image", f"shape {data.shape}")
     if image.wcs is None or not image.wcs.has_celestial:
         raise argument_error(name, "an image with a celestial WCS", "one without")
     unit = FNU if _per_pixel(image) else SURFACE_BRIGHTNESS
@@ -169,16 +154,14 @@ def _checked(image, name):
     else:
         # which takes the size of what is below 0
         negative = np.count_nonzero(np.asarray(image.uncertainty.array)[usable] < 0)
-        if negative:
-            wanted = "an image with uncertainties of 0 (no data) or more"
-            raise argument_error(name, wanted, f"{negative} pixels below 0")
+        wanted = "an image with uncertainties of 0 (no data) or more"
+        check_that(not negative, name, wanted, f"{negative} pixels below 0")
         given = image.uncertainty.represent_as(StdDevUncertainty)
         scale = factor if given.unit is None else (1 * given.unit).to_value(unit)
         noise = np.asarray(given.array), float(scale)
     usable &= np.isfinite(noise[0]) & (noise[0] > 0)
     mask_filled(data, usable, f"'{name}'")
-    if not usable.any():
-        raise argument_error(name, "an image with usable pixels", "none (masked, NaN or no noise)")
+    check_that(usable.any(), name, "an image with usable pixels", "none (masked, NaN or no noise)")
     return (data, factor), noise, usable
 
 
@@ -219,6 +202,16 @@ def sky_pixels(sky, wcs, shape, margin):
     inside = (x > low) & (x < nx - 1 - low) & (y > low) & (y < ny - 1 - low)
     xy[~inside] = np.nan
     return xy
+
+
+def nearest_values(plane, xy):
+    """Values of a plane at the nearest pixels, (n, 2) (0 outside), and whether a position is on it."""
+    ny, nx = plane.shape
+    column, row = np.rint(np.where(np.isfinite(xy), xy, -1.0)).astype(int).T
+    inside = (column >= 0) & (column < nx) & (row >= 0) & (row < ny)
+    values = np.zeros(len(xy), plane.dtype)
+    values[inside] = plane[row[inside], column[inside]]
+    return values, inside
 
 
 def local_maps(xy, half, image_wcs, grid_wcs):

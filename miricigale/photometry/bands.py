@@ -16,8 +16,8 @@ from miricigale.photometry.repeated_pixels import own_pixels
 from miricigale.photometry.results import band_column
 from miricigale.photometry.sources import SourceTemplates
 from miricigale.photometry.stars import with_stars
-from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
+from miricigale.utils.options import check_that
 
 
 def measure_bands(images, kernels, templates, **options):
@@ -70,16 +70,14 @@ def measure_bands(images, kernels, templates, **options):
     miri.f1000w 4.05 uJy
     """
     missing = sorted(set(images) ^ set(kernels))
-    if missing:
-        raise argument_error("kernels", "one for each image", f"not in both: {missing}")
+    check_that(not missing, "kernels", "one for each image", f"not in both: {missing}")
     results = {}
     for name, image in images.items():
         one = kernels[name]
         try:
-            photometer = (
-                one if isinstance(one, ForcedPhotometer) else ForcedPhotometer(one, **options)
-            )
-            results[name] = photometer.measure(image, templates=templates)
+            if not isinstance(one, ForcedPhotometer):
+                one = ForcedPhotometer(one, **options)
+            results[name] = one.measure(image, templates=templates)
         except (ValueError, TypeError) as err:
             err.add_note(f"in the band {name!r}")
             raise
@@ -198,8 +196,7 @@ def join_bands(results):
       1        1.0         nan
       2        2.0         3.0
     """
-    if not results:
-        raise argument_error("results", "at least one band", "none")
+    check_that(results, "results", "at least one band", "none")
     tables = {
         name: one if isinstance(one, Table) else one.to_table() for name, one in results.items()
     }

@@ -7,7 +7,7 @@ import warnings
 import astropy.units as u
 import numpy as np
 
-from miricigale.utils.exceptions import argument_error, data_error
+from miricigale.utils.options import check_data, check_that
 from miricigale.utils.units import SURFACE_BRIGHTNESS, ab_quantity
 
 #: Names of count rates in headers that are no units of astropy.
@@ -68,35 +68,28 @@ def calibration(path, text, zero_point, keywords):
     if unit is not None and not unit.is_equivalent(u.dimensionless_unscaled):
         for target in (SURFACE_BRIGHTNESS, u.MJy):
             if unit.is_equivalent(target):
-                if zero_point is not None:
-                    raise argument_error(
-                        "zero_point", f"left out for {path}, whose unit is {unit}", zero_point
-                    )
+                wanted = f"left out for {path}, whose unit is {unit}"
+                check_that(zero_point is None, "zero_point", wanted, zero_point)
                 return unit.to(target) * target, f"unit {unit}"
     if zero_point is not None:
         zero = ab_quantity(zero_point).to(u.ABmag)
-        if not np.isfinite(zero):
-            raise argument_error("zero_point", "a finite AB magnitude", zero_point)
+        check_that(np.isfinite(zero), "zero_point", "a finite AB magnitude", zero_point)
         return zero.to(u.MJy), f"zero point {zero.value:g} AB"
-    if unit is None or unit.is_equivalent(u.dimensionless_unscaled):
-        what = f"must state the unit of its pixels ('unit' or 'zero_point'); what it states is {text!r}"
-        raise data_error(path, what)
+    what = f"must state the unit of its pixels ('unit' or 'zero_point'); what it states is {text!r}"
+    check_data(unit is not None and not unit.is_equivalent(u.dimensionless_unscaled), path, what)
     time, said = 1.0, ""
     if any(unit.is_equivalent(base) for base in _BASES):
         time = keywords["EXPTIME"]
-        if not time or not time > 0:
-            what = "no rate, and its header no EXPTIME: counts need 'zero_point'"
-            raise data_error(path, f"has pixels in {unit}, {what}")
+        what = "no rate, and its header no EXPTIME: counts need 'zero_point'"
+        check_data(time and time > 0, path, f"has pixels in {unit}, {what}")
         unit, said = unit / u.s, f", EXPTIME {time:g} s"
     rate = next((base / u.s for base in _BASES if unit.is_equivalent(base / u.s)), None)
-    if rate is None:
-        what = "and wanted is a surface brightness, a flux, counts or a rate of counts"
-        raise data_error(path, f"has pixels in {unit}, {what}")
+    what = "and wanted is a surface brightness, a flux, counts or a rate of counts"
+    check_data(rate is not None, path, f"has pixels in {unit}, {what}")
     scale = unit.to(rate) / time
     found = _header_calibrations(keywords)
-    if len(found) != 1:
-        what = "has both PHOTMJSR and PHOTFLAM" if found else "has neither PHOTMJSR nor PHOTFLAM"
-        raise data_error(path, f"has pixels in {unit}, its header {what}: give 'zero_point'")
+    what = "has both PHOTMJSR and PHOTFLAM" if found else "has neither PHOTMJSR nor PHOTFLAM"
+    check_data(len(found) == 1, path, f"has pixels in {unit}, its header {what}: give 'zero_point'")
     name, factor = found[0]
     return factor * scale, name + said
 

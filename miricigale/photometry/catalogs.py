@@ -48,14 +48,10 @@ def sersic_rows(catalog):
     units = {"half_light_radius": u.arcsec, "position_angle": u.deg}
     names = ["half_light_radius", "sersic_index", "axis_ratio", "position_angle"]
     require_columns(catalog, names, "catalog", units=units)
+    radius, index, ratio, angle = (catalog[name] for name in names)
+    sizes = u.Quantity(radius).to_value(u.arcsec), u.Quantity(angle).to_value(u.rad)
     rows = np.stack(
-        [
-            u.Quantity(catalog[names[0]]).to_value(u.arcsec),
-            np.asarray(catalog[names[1]], float),
-            np.asarray(catalog[names[2]], float),
-            u.Quantity(catalog[names[3]]).to_value(u.rad),
-        ],
-        axis=1,
+        [sizes[0], np.asarray(index, float), np.asarray(ratio, float), sizes[1]], axis=1
     )
     if "profile" in catalog.colnames:
         rows[np.asarray(catalog["profile"]) != "sersic"] = np.nan

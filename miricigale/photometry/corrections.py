@@ -10,6 +10,7 @@ from miricigale.photometry.arrays import image_arrays
 from miricigale.photometry.arrays import pixel_scale as image_scale
 from miricigale.psf import encircled_energy, radius_of_encircled_energy
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.units import ANGLE, FNU, to_array
 
 
@@ -167,7 +168,6 @@ def aperture_correction(psf, radius, *, pixel_scale=None):
     array([1.469, 1.223])
     """
     energy = np.asarray(encircled_energy(psf, radius, pixel_scale=pixel_scale), float)
-    if np.any(energy <= 0):
-        raise argument_error("radius", "positive", radius)
+    check_that(not np.any(energy <= 0), "radius", "positive", radius)
     factor = 1.0 / energy
     return float(factor) if factor.ndim == 0 else factor

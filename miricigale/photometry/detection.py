@@ -388,17 +388,7 @@ def _catalog(objects, found, labels, arrays, meta):
     flags = objects["flag"].astype(int) & sum(int(flag) for flag in DetectionFlags)
     axes = [objects[one] * scale * ANGLE for one in "ab"]
     values = [index, index, sky.icrs, x, y, total * FNU, noise * FNU, *axes]
-    values += [
-        np.degrees(objects["theta"]) * u.deg,
-        _sizes(labels, n),
-        _sizes(found, n),
-        snr,
-        flags,
-    ]
+    sizes = (np.bincount(one.ravel(), minlength=n + 1)[1:] for one in (labels, found))
+    values += [np.degrees(objects["theta"]) * u.deg, *sizes, snr, flags]
     texts = declared("miricigale.photometry", "columns.toml")["detections"]
     return described_columns(values, texts | {"flags": DetectionFlags.describe()}, meta)
-
-
-def _sizes(labels, n):
-    """Pixels of each of n segments."""
-    return np.bincount(labels.ravel(), minlength=n + 1)[1:]

@@ -8,7 +8,7 @@ from miricigale.instrument.image import Image
 from miricigale.photometry.arrays import image_arrays, same_grid
 from miricigale.photometry.mosaics import as_mosaic
 from miricigale.photometry.sky_noise import sky_noise
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.units import SURFACE_BRIGHTNESS
 
 
@@ -61,13 +61,12 @@ def chi_image(images):
     """
     images = [as_mosaic(one, "images") for one in images]
     arrays = [image_arrays(one, "images") for one in images]
-    if not arrays or any(
-        one.flux.shape != arrays[0].flux.shape or not same_grid(one.wcs, arrays[0].wcs)
+    alike = all(
+        one.flux.shape == arrays[0].flux.shape and same_grid(one.wcs, arrays[0].wcs)
         for one in arrays
-    ):
-        raise argument_error(
-            "images", "at least one, all on the same pixels", f"{len(arrays)} images"
-        )
+    )
+    wanted = "at least one, all on the same pixels"
+    check_that(arrays and alike, "images", wanted, f"{len(arrays)} images")
     square, n = (np.zeros(arrays[0].flux.shape) for _ in range(2))
     for one in arrays:
         values = one.flux / one.sigma

@@ -9,8 +9,8 @@ from astropy.stats import mad_std
 from astropy.table import QTable
 
 from miricigale.utils.declared import declared
-from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
+from miricigale.utils.options import check_that
 from miricigale.utils.tables import described_rows, require_columns
 from miricigale.utils.unified import read_write
 from miricigale.utils.units import FNU
@@ -95,9 +95,8 @@ class ErrorCalibration:
         require_columns(sources, names, "sources", units=dict.fromkeys(names, FNU))
         true, flux, error, noise = (sources[name].to_value(FNU) for name in names)
         good = np.flatnonzero(np.isfinite(flux) & (error > 0) & (noise > 0))
-        if len(good) < _LEAST:
-            wanted = f"at least {_LEAST} sources that are measured"
-            raise argument_error("sources", wanted, f"{len(good)}")
+        wanted = f"at least {_LEAST} sources that are measured"
+        check_that(len(good) >= _LEAST, "sources", wanted, f"{len(good)}")
         snr = true[good] / noise[good]
         pull = (flux[good] - true[good]) / error[good]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -154,9 +153,8 @@ class ErrorCalibration:
         ValueError
             If the errors were multiplied before.
         """
-        if "error_calibration" in result.meta:
-            wanted = "one with errors as they were measured"
-            raise argument_error("result", wanted, "a calibrated one")
+        wanted = "one with errors as they were measured"
+        check_that("error_calibration" not in result.meta, "result", wanted, "a calibrated one")
         factor = self.factor(result.flux, result.flux_err_noise)
         names = ["flux_err", "flux_err_noise", "flux_err_template", "flux_err_psf"]
         scale = scipy.sparse.diags_array(np.nan_to_num(factor, nan=1.0))

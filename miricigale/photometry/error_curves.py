@@ -9,8 +9,7 @@ from astropy.table import QTable
 
 from miricigale.filters import as_photometry
 from miricigale.utils.declared import declared
-from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_names
+from miricigale.utils.options import check_names, check_that
 from miricigale.utils.tables import described_columns, error_column, require_columns
 from miricigale.utils.units import FNU
 
@@ -67,10 +66,8 @@ class Analytic:
 
 def measured_curve(name, true, seen, size, statistic):
     """Errors of one band in bins of true flux, from arrays in uJy."""
-    if len(true) < 3:
-        raise argument_error(
-            "measured", f"at least three measured sources in {name!r}", f"{len(true)}"
-        )
+    wanted = f"at least three measured sources in {name!r}"
+    check_that(len(true) >= 3, "measured", wanted, f"{len(true)}")
     order = np.argsort(-true, kind="stable")
     edges = np.arange(0, max(len(true) // size, 1) * size + 1, size)
     edges[-1] = len(true)
@@ -148,9 +145,8 @@ def common_bands(truth, measured):
         if getattr(truth[name], "unit", None) is not None
         and u.Unit(truth[name].unit).is_equivalent(FNU)
     ]
-    if not bands:
-        wanted = "tables that share a column of fluxes with a unit (or 'filters' given)"
-        raise argument_error("truth, measured", wanted, f"the common columns {shared}")
+    wanted = "tables that share a column of fluxes with a unit (or 'filters' given)"
+    check_that(bands, "truth, measured", wanted, f"the common columns {shared}")
     return bands
 
 
@@ -161,10 +157,8 @@ def same_rows(truth, measured):
             np.asarray(truth["id"]), np.asarray(measured["id"]), return_indices=True
         )
         return rows, others
-    if len(truth) != len(measured):
-        raise argument_error(
-            "measured", f"a table of {len(truth)} rows as 'truth', or ids in both", len(measured)
-        )
+    wanted = f"a table of {len(truth)} rows as 'truth', or ids in both"
+    check_that(len(truth) == len(measured), "measured", wanted, len(measured))
     rows = np.arange(len(truth))
     return rows, rows
 
@@ -177,9 +171,8 @@ def flux_table(photometry, filters, known):
     if filters is None:
         filters = [name for name in known if name in photometry.colnames]
     filters = list(filters)
-    if not filters:
-        wanted = f"a table with at least one of the columns {list(known)}"
-        raise argument_error("photometry", wanted, f"columns {photometry.colnames}")
+    wanted = f"a table with at least one of the columns {list(known)}"
+    check_that(filters, "photometry", wanted, f"columns {photometry.colnames}")
     require_columns(photometry, filters, "photometry", units=dict.fromkeys(filters, FNU))
     check_names(filters, "band of this error model", known)
     table = QTable(photometry, copy=True)

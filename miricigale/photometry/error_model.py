@@ -25,7 +25,7 @@ from miricigale.photometry.surveys import YANG2021_DEPTHS, fractional_error
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.meta import provenance
-from miricigale.utils.options import check_choice, check_least, check_positive
+from miricigale.utils.options import check_choice, check_least, check_positive, check_that
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import error_column, require_columns
 from miricigale.utils.unified import read_write
@@ -183,8 +183,7 @@ class ErrorModel(Interactive):
             part = fractional.get(name, 0.0) if isinstance(fractional, dict) else fractional
             if not (np.isfinite(limit) and limit > 0):
                 raise argument_error("depths", "finite depths", f"{depth} for {name!r}")
-            if not part >= 0:
-                raise argument_error("fractional", "at least 0", f"{part} for {name!r}")
+            check_that(part >= 0, "fractional", "at least 0", f"{part} for {name!r}")
             curves[name] = Analytic(limit / 5, float(part))
         return cls(curves, provenance(source="depths"))
 
@@ -242,8 +241,7 @@ class ErrorModel(Interactive):
             options = known | options
             time = filter.exposure_time if time is None else time
             filter = filter.filter
-        if time is None:
-            raise argument_error("time", "given, or an Exposure", "None")
+        check_that(time is not None, "time", "given, or an Exposure", "None")
         filter = imager_filter(filter)
         sky, photon = fitted_noise(filter, time, **options)
         curve = Analytic(sky, float(fractional), photon)
@@ -427,6 +425,5 @@ def _relative_noise(noise, name, n):
     if noise is None:
         return np.ones(n)
     values = to_array(noise[name], u.one, "noise", ndim=1)
-    if len(values) != n:
-        raise argument_error("noise", f"a factor for each of {n} rows in {name!r}", len(values))
+    check_that(len(values) == n, "noise", f"a factor for each of {n} rows in {name!r}", len(values))
     return np.where(np.isfinite(values) & (values > 0), values, np.nan)

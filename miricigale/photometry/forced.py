@@ -10,11 +10,7 @@ from astropy.table import QTable, Table
 from photutils.segmentation import SegmentationImage
 
 from miricigale.photometry._core.stamps import add_model
-from miricigale.photometry.arrays import (
-    fit_arrays,
-    image_arrays,
-    pixel_scale,
-)
+from miricigale.photometry.arrays import fit_arrays, image_arrays, pixel_scale
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.mosaics import as_mosaic
 from miricigale.photometry.packaging import CatalogRows, package
@@ -29,16 +25,9 @@ from miricigale.photometry.stars import with_stars
 from miricigale.psf import KernelField, MatchingKernel
 from miricigale.utils.exceptions import PhotometryWarning, argument_error, warn
 from miricigale.utils.interactive import Interactive, checked_calls
-from miricigale.utils.options import check_choice
+from miricigale.utils.options import check_choice, check_that
 from miricigale.utils.parallel import single_threaded, thread_count, threads
-from miricigale.utils.units import (
-    ANGLE,
-    FNU,
-    SURFACE_BRIGHTNESS,
-    is_number,
-    positive,
-    to_array,
-)
+from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, is_number, positive, to_array
 
 
 @checked_calls
@@ -169,9 +158,8 @@ class ForcedPhotometer(Interactive):
     n_threads: int | None = None
 
     def __post_init__(self, psf, highres_psf):
-        if (self.kernel is None) == (psf is None):
-            got = "neither" if psf is None else "both"
-            raise argument_error("kernel, psf", "one of them given", got)
+        got = "neither" if psf is None else "both"
+        check_that((self.kernel is None) != (psf is None), "kernel, psf", "one of them given", got)
         if isinstance(self.kernel, (str, os.PathLike)):
             object.__setattr__(self, "kernel", MatchingKernel.read(self.kernel))
         if self.kernel is not None and highres_psf is not None:
@@ -193,9 +181,8 @@ class ForcedPhotometer(Interactive):
         changed = {"kernel": kernel, "template": template, "bare": bare, "mean_kernel": mean}
         changed["n_threads"] = thread_count(self.n_threads)
         if bare:
-            if template not in ("auto", "cutout"):
-                wanted = f"a MatchingKernel with its PSFs for template={template!r}"
-                raise argument_error("kernel", wanted, "one without")
+            wanted = f"a MatchingKernel with its PSFs for template={template!r}"
+            check_that(template in ("auto", "cutout"), "kernel", wanted, "one without")
             msg = (
                 "the kernel has no PSFs: sources are their segments as they are, without wings, and "
                 "those without a segment are not measured"
@@ -269,7 +256,7 @@ class ForcedPhotometer(Interactive):
         if isinstance(highres, (SkyCoord, Table)) and segmentation is None and catalog is None:
             highres, catalog = None, highres
         image = own_pixels(as_mosaic(image, "image"))
-        arrays = fit_arrays(image, "image", self.memory.scratch)
+        arrays = fit_arrays(image, "image")
         given = [one is not None for one in (highres, segmentation, catalog)]
         if templates is None:
             highres, segmentation, catalog = self._prior(image, highres, segmentation, catalog)
@@ -422,9 +409,8 @@ class ForcedPhotometer(Interactive):
     def _check_scale(self, name, wcs):
         scale = self.mean_kernel.pixel_scale.to_value(ANGLE)
         have = pixel_scale(wcs)
-        if abs(have / scale - 1) > 0.01:
-            wanted = f"on the kernel's pixels of {scale:.4g} arcsec"
-            raise argument_error(name, wanted, f"{have:.4g} arcsec")
+        wanted = f"on the kernel's pixels of {scale:.4g} arcsec"
+        check_that(not abs(have / scale - 1) > 0.01, name, wanted, f"{have:.4g} arcsec")
 
     def _check_grid(self, templates):
         """Refuse templates on other pixels than the kernel's, warn of those of another PSF."""

@@ -6,12 +6,7 @@ import numpy as np
 import scipy.sparse
 
 from miricigale.photometry._core.solve import factorize
-from miricigale.photometry.errors import (
-    LinearFit,
-    cross_matrix,
-    normal_matrix,
-    sandwich_matrix,
-)
+from miricigale.photometry.errors import LinearFit, cross_matrix, normal_matrix, sandwich_matrix
 from miricigale.photometry.template_changes import TemplateChanges
 from miricigale.utils.parallel import parallel_map
 

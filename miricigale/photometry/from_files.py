@@ -1,31 +1,25 @@
 """Forced photometry of files: what they are is checked first, then measured and put on a page."""
 
-import logging
-import os
 import tempfile
 from pathlib import Path
 
-import numpy as np
-from astropy.io import fits
-
-from miricigale.filters import Filter
 from miricigale.instrument.image_files import write_image
-from miricigale.photometry.grids import grid_angle
-from miricigale.photometry.kernel_files import can_be_modeled, file_place, matching_kernel
-from miricigale.photometry.mosaics import MosaicFile
-from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.photometry.file_inputs import Inputs
+from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import split_extension
+from miricigale.utils.options import check_that
+from miricigale.utils.parallel import check_memory
 from miricigale.utils.progress import progress
 from miricigale.utils.store import replacing
 from miricigale.utils.table_files import write_table
 
-_log = logging.getLogger(__name__)
-
 #: Endings of tables that can be written.
 _TABLES = (".ecsv", ".fits", ".fits.gz")
 
-#: What the file of a `~miricigale.psf.KernelField` states as its format.
-FIELD = "kernel-field-1"
+#: What is done with images that are too large.
+_IN_PATCHES = (
+    "measure it in patches (--patches FOLDER, miricigale.workflow.measure_patches in Python)"
+)
 
 
 def measure_files(
@@ -110,76 +104,33 @@ def measure_files(
     ...     ["f770w_i2d.fits", "f1000w_i2d.fits"], "f444w_i2d.fits", output="miri.ecsv", page="miri.html"
     ... )  # doctest: +SKIP
     """
-    images, kernels = (list(v) if isinstance(v, (list, tuple)) else [v] for v in (image, kernel))
-    kernels = kernels * len(images) if kernels == [None] else kernels
-    if len(kernels) != len(images):
-        raise argument_error("kernel", f"one for each of {len(images)} images", len(kernels))
-    files = (
-        one if isinstance(one, MosaicFile) else MosaicFile(one)
-        for one in (*images, highres, *detection)
-    )
-    files = list(files)
-    images, highres, others = files[: len(images)], files[len(images)], files[len(images) + 1 :]
-    named = [("segmentation", segmentation), ("catalog", catalog), ("highres_psf", highres.psf)]
-    named += [("psf", one.psf) for one in images] + [("kernel", one) for one in kernels]
-    named = [(what, path) for what, path in named if path is not None]
+    inputs = Inputs.of(
+        image, highres, detection=detection, segmentation=segmentation, catalog=catalog,
+        kernel=kernel, confidence=confidence, psf_stars=psf_stars, seed=seed, **options,
+    )  # fmt: skip
     results = {("output", 0): output, ("page", 0): page}
-    for k, one in enumerate(images):
-        own = one if len(images) > 1 else None
+    for k, one in enumerate(inputs.images):
+        own = one if len(inputs.images) > 1 else None
         results |= {("model", k): _of_band(model, own), ("residual", k): _of_band(residual, own)}
     results = {key: path for key, path in results.items() if path is not None}
-    read = [one.path for one in files] + [path for _, path in named]
     for (what, _), path in results.items():
-        check_output(what, path, overwrite, read)
+        check_output(what, path, overwrite, inputs.paths)
     written = [Path(path).resolve() for path in results.values()]
     if len(set(written)) < len(written):
         given = ", ".join(dict.fromkeys(what for what, _ in results))
         raise argument_error(given, "different files", [str(path) for path in written])
-    for one in images:
-        _check_images(one, highres)
-    for what, path in named:
-        if not os.path.isfile(file_place(path)[0]):
-            msg = f"no file {path} ('{what}')"
-            raise DataError(msg)
-    for one, own in zip(images, kernels, strict=True):
-        if catalog is not None:
-            _check_catalog(catalog, one, highres)
-        _check_psfs(one, highres, own)
-    bands = [one.header.filter for one in images]
-    if len(set(bands)) < len(bands):
-        raise argument_error("image", "of different filters", bands)
-    # heavy imports only after the files were checked
-    from miricigale.photometry import ForcedPhotometer, chi_image, read_prior
-    from miricigale.photometry.bands import join_bands, measure_prior
-    from miricigale.photometry.priors import detected_prior
-    from miricigale.psf import KernelField
-
+    inputs.check()
+    check_memory(inputs.n_bytes(), "photometry of whole images", advice=_IN_PATCHES)
     with progress(show=progress_bar, total=4, desc="images", unit="steps") as bar:
-        prior, mosaics = highres.read(), {k: v.read() for k, v in zip(bands, images, strict=True)}
+        pixels = inputs.read()
         bar.update()
         bar.set_description("kernels and sources")
-        options = {"background_order": 0, "second_pass": None, "n_threads": n_threads} | options
-        photometers = {
-            band: ForcedPhotometer(
-                _kernel(one, highres, own), psf_stars=psf_stars and own is None, **options
-            )
-            for band, one, own in zip(bands, images, kernels, strict=True)
-        }
-        if segmentation is None:
-            found = chi_image([prior, *(one.read() for one in others)]) if others else prior
-            segments, sources = detected_prior(found, catalog)
-        else:
-            segments, sources = read_prior(prior, segmentation=segmentation, catalog=catalog)
+        photometers = inputs.photometers(n_threads)
+        sources = inputs.find_sources(pixels, catalog)
         bar.update()
         bar.set_description("fluxes")
-        found = measure_prior(mosaics, photometers, prior, segments, sources)
-        if len(found) == 1:
-            table = found[bands[0]].to_table(bands[0], confidence=confidence)
-        else:
-            tables = {k: one.to_table(confidence=confidence) for k, one in found.items()}
-            table = join_bands(tables)
-        paths = [str(one.path) for one in images]
-        table.meta.update(image=paths[0] if len(paths) == 1 else paths, highres=str(highres.path))
+        measured = inputs.measure(pixels, photometers, *sources)
+        table = measured.table
         bar.update()
         bar.set_description("page")
         for path in written:
@@ -187,21 +138,12 @@ def measure_files(
         if output is not None:
             with replacing(output, overwrite=overwrite) as partial:
                 write_table(table, partial)
-        for k, result in enumerate(found.values()):
+        for k, result in enumerate(measured.results.values()):
             for what in {"model", "residual"} & {one for one, _ in results}:
                 with replacing(results[what, k]) as partial:
                     write_image(getattr(result, f"{what}_image"), partial)
         if page is not None:
-            from miricigale.photometry.page import Measured, write_page
-
-            measured = []
-            for name, result in found.items():
-                kernel = photometers[name].kernel
-                if result.psf_stars is not None:
-                    kernel = result.psf_stars.kernel
-                kernel = kernel.mean if isinstance(kernel, KernelField) else kernel
-                measured.append(Measured(name, result, mosaics[name], kernel, None))
-            write_page(page, measured, prior, segments, confidence, seed)
+            measured.write_page(page)
         bar.update()
     return table
 
@@ -215,15 +157,6 @@ def _of_band(path, file):
     return Path(path).with_name(f"{name}_{band}{dot}{ending}")
 
 
-def _kernel(image, highres, path):
-    """The kernel between two images; that of a file may be of several places."""
-    from miricigale.psf import KernelField
-
-    if path is not None and fits.getheader(file_place(path)[0]).get("FORMAT") == FIELD:
-        return KernelField.read(path)
-    return matching_kernel(image, highres, path)
-
-
 def check_output(what, path, overwrite, inputs):
     """Refuse a file that could not be written in the end, or that is not to be replaced."""
     if path is None:
@@ -233,8 +166,7 @@ def check_output(what, path, overwrite, inputs):
         raise argument_error("output", f"a table ({', '.join(_TABLES)})", path)
     if what in ("model", "residual") and not path.name.lower().endswith((".fits", ".fits.gz")):
         raise argument_error(what, "a FITS file (.fits, .fits.gz)", path)
-    if path.is_dir():
-        raise argument_error(what, "a file", f"the folder {path}")
+    check_that(not path.is_dir(), what, "a file", f"the folder {path}")
     if any(path.resolve() == Path(split_extension(one)[0]).resolve() for one in inputs):
         raise argument_error(what, "another file than those that are read", path)
     if path.exists() and not overwrite:
@@ -248,95 +180,3 @@ def check_output(what, path, overwrite, inputs):
             pass
     except OSError as err:
         raise argument_error(what, "in a folder that can be written to", path) from err
-
-
-def _check_images(image, highres):
-    """Refuse images that are not what they should be, or do not overlap."""
-    wanted, stated = image.filter, [MosaicFile(one.path).header.filter for one in (image, highres)]
-    if wanted is not None and stated[0] not in (None, wanted) and stated[1] == wanted:
-        msg = (
-            f"'image' and 'highres' seem to be swapped: {highres.path} is the image in {wanted}, "
-            f"{image.path} is in {stated[0]}"
-        )
-        raise ValueError(msg)
-    found, _ = (one.header.filter for one in (image, highres))
-    if found is None:
-        wanted = f"given, for the header of {image.path} does not name it"
-        raise argument_error("filter", wanted, None)
-    if found not in Filter.names() and not found.startswith("sedpy."):
-        wanted = f"a filter that 'miricigale filters' lists, for {image.path}"
-        raise argument_error("filter", wanted, repr(found))
-    for one in (image, highres):
-        try:
-            grid_angle(one.header.wcs, one.header.shape)
-        except ValueError as err:
-            msg = f"{one.path}: {err}"
-            raise ValueError(msg) from err
-    if not (_overlap(image.header, highres.header) or _overlap(highres.header, image.header)):
-        where = [_middle(one.header).to_string("decimal", precision=4) for one in (image, highres)]
-        msg = (
-            f"'image' and 'highres' show different fields: the middle of {image.path} is at "
-            f"{where[0]}, that of {highres.path} at {where[1]} deg"
-        )
-        raise ValueError(msg)
-
-
-def _middle(header):
-    ny, nx = header.shape
-    return header.wcs.pixel_to_world((nx - 1) / 2, (ny - 1) / 2).icrs
-
-
-def _inside(sky, header):
-    """Whether some positions are on an image."""
-    from miricigale.photometry.arrays import sky_pixels
-
-    return np.isfinite(sky_pixels(sky, header.wcs, header.shape, 0.0)).any()
-
-
-def _overlap(one, other):
-    """Whether some of a coarse grid of pixels of one image are on the other."""
-    axes = [np.linspace(0, n - 1, 15) for n in one.shape]
-    y, x = (grid.ravel() for grid in np.meshgrid(*axes, indexing="ij"))
-    return _inside(one.wcs.pixel_to_world(x, y), other)
-
-
-def _check_psfs(image, highres, kernel):
-    """Refuse images whose PSF is neither given nor known."""
-    from miricigale.psf import MODEL_FILTERS
-
-    if kernel is not None:
-        if image.psf is not None:
-            raise argument_error("psf", "left out where a kernel is given", image.psf)
-        return
-    for file, prefix in ((image, ""), (highres, "highres_")):
-        name = file.header.filter
-        if file.psf is not None or can_be_modeled(file.header):
-            continue
-        if name in MODEL_FILTERS:
-            wanted = f"given, for the header of {file.path} has no PA_APER (or '{prefix}psf')"
-            raise argument_error(prefix + "pa_aper", wanted, None)
-        name = name or "an image whose filter is unknown ('highres_filter')"
-        wanted = f"given (or 'kernel'), for there is no model PSF for {name}"
-        raise argument_error(prefix + "psf", wanted, None)
-
-
-def _check_catalog(path, image, highres):
-    """Refuse a catalog of another field."""
-    from astropy.coordinates import SkyCoord
-
-    from miricigale.photometry.priors import read_catalog
-
-    sky = read_catalog(path)["sky"]
-    for what, file in (("image", image), ("highres", highres)):
-        if _inside(sky, file.header):
-            continue
-        msg = f"none of the {len(sky)} sources of {path} is on {file.path} ('{what}')"
-        known = np.isfinite(sky.ra.deg)
-        hours = SkyCoord(15 * sky.ra[known], sky.dec[known])
-        if _inside(hours, file.header):
-            msg += ": is ra in hours? Wanted are degrees, or a column with a unit"
-        elif known.any():
-            first = sky[known][0].to_string("decimal", precision=4)
-            where = _middle(file.header).to_string("decimal", precision=4)
-            msg += f": the first is at {first}, the middle of the image at {where} deg"
-        raise ValueError(msg)

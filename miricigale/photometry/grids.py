@@ -9,13 +9,9 @@ import numpy as np
 from astropy.io import fits
 
 from miricigale.instrument.asdf_extension import asdf_wcs
-from miricigale.utils.exceptions import (
-    PhotometryWarning,
-    argument_error,
-    data_error,
-    warn,
-)
+from miricigale.utils.exceptions import PhotometryWarning, argument_error, data_error, warn
 from miricigale.utils.files import open_fits, split_extension
+from miricigale.utils.options import check_data
 
 
 class Opened(fits.HDUList):
@@ -67,17 +63,14 @@ def find_image(hdus, extension, path, names):
         except (KeyError, IndexError):
             known = [hdu.name for hdu in hdus]
             raise data_error(path, f"has no such extension, only {known}") from None
-        if found[0] not in images:
-            raise data_error(path, f"is no two-dimensional image: {hdus[found[0]].shape}")
+        check_data(found[0] in images, path, f"is no two-dimensional image: {hdus[found[0]].shape}")
         return found[0]
     named = [k for k in images if hdus[k].name in names]
     found = named or images[:1]
-    if not found:
-        shapes = [getattr(hdu, "shape", ()) for hdu in hdus]
-        raise data_error(path, f"has no two-dimensional image, only {shapes}")
-    if len(found) > 1:
-        what = f"has {len(found)} extensions {hdus[found[0]].name}"
-        raise data_error(path, f"{what}; say which as {path}[NUMBER]")
+    shapes = [getattr(hdu, "shape", ()) for hdu in hdus]
+    check_data(found, path, f"has no two-dimensional image, only {shapes}")
+    what = f"has {len(found)} extensions {hdus[found[0]].name}"
+    check_data(len(found) <= 1, path, f"{what}; say which as {path}[NUMBER]")
     return found[0]
 
 
@@ -97,11 +90,8 @@ def open_map(path, wanted, role, names, image):
     shape, wcs, image_path = image
     with open_image(path, wanted) as (hdus, extension):
         hdu = hdus[find_image(hdus, extension, path, names)]
-        if hdu.shape != shape:
-            what = (
-                f"({role}) has the shape {hdu.shape}, {image_path} {shape}: not on the same pixels"
-            )
-            raise data_error(path, what)
+        what = f"({role}) has the shape {hdu.shape}, {image_path} {shape}: not on the same pixels"
+        check_data(hdu.shape == shape, path, what)
         own = read_wcs(hdu.header, hdus)
         if own is not None:
             check_same_grid(own, wcs, shape, path, image_path)
@@ -162,6 +152,28 @@ def filter_name(get):
     if instrument == "nircam" and re.fullmatch(r"f\d{3}[a-z]\d?", pupil):
         names = [pupil]
     return f"{instrument}.{names[0]}" if instrument and len(names) == 1 else None
+
+
+def cut_wcs(wcs, section, path):
+    """
+    The coordinates of a part (slices of rows and columns) of an image, exact.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If they have distortions by tables, which cannot be cut.
+    """
+    cut = wcs.slice(section)
+    y, x = (np.array([0.0, one.stop - one.start - 1.0]) for one in section)
+    there = wcs.pixel_to_world(x + section[1].start, y + section[0].start)
+    what = "has coordinates with tables of distortion, and cannot be read in parts"
+    check_data(np.all(cut.pixel_to_world(x, y).separation(there) < 1e-4 * u.arcsec), path, what)
+    return cut
+
+
+def part_of(hdu, section):
+    """The data of an image extension, or a part of them, without reading the rest."""
+    return hdu.data if section is None else hdu.section[section]
 
 
 def grid_angle(wcs, shape):

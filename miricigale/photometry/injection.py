@@ -1,24 +1,25 @@
 """Calibration of errors by injection: sources of known flux, measured as all others are."""
 
-import dataclasses
+import collections
 
 import numpy as np
 import scipy.ndimage
-from astropy.nddata import CCDData
+from astropy.nddata import overlap_slices
 from astropy.table import QTable, vstack
 from photutils.segmentation import SegmentationImage
 
-from miricigale.photometry.arrays import image_arrays, pixel_scale
+from miricigale.photometry.arrays import image_arrays, nearest_values, pixel_scale
 from miricigale.photometry.catalogs import joined_sky
 from miricigale.photometry.detection import bright_centroids
 from miricigale.photometry.error_calibration import ErrorCalibration
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.forced import ForcedPhotometer
 from miricigale.photometry.mosaics import as_mosaic
-from miricigale.photometry.priors import labels_at
-from miricigale.photometry.shapes import Shape, ShapeModels
+from miricigale.photometry.shape_models import ShapeModels
+from miricigale.photometry.shapes import Shape
 from miricigale.photometry.sources import SourceTemplates
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.progress import progress
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.units import FNU, SURFACE_BRIGHTNESS, check_count
@@ -132,27 +133,10 @@ def calibrate_errors(
     return ErrorCalibration.from_sources(sources, seed=seed)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Donor:
-    """A source of the prior that is copied: fine profile, its light, and its segment about its middle."""
-
-    parameters: np.ndarray
-    light: float
-    mask: np.ndarray
-    corner: np.ndarray
-    point: bool
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Injected:
-    """Sources that were injected: catalog, light, fluxes and kinds; the prior with them."""
-
-    catalog: QTable
-    light: SourceTemplates
-    flux: np.ndarray
-    kind: np.ndarray
-    highres: CCDData | None
-    labels: np.ndarray | None
+#: A source of the prior that is copied: fine profile, its light, and its segment about its middle.
+_Donor = collections.namedtuple("_Donor", "parameters light mask corner point")
+#: Sources that were injected: catalog, light, fluxes and kinds; the prior with them.
+_Injected = collections.namedtuple("_Injected", "catalog light flux kind highres labels")
 
 
 class _Field:
@@ -183,7 +167,7 @@ class _Field:
             self.own = np.asarray(catalog["label"], int)
         else:
             xy = np.stack(highres.wcs.world_to_pixel(catalog["sky"]), axis=-1).reshape(-1, 2)
-            self.own, _ = labels_at(self.labels, xy)
+            self.own, _ = nearest_values(self.labels, xy)
         places = scipy.ndimage.find_objects(self.labels)
         usable = (self.base.flags & ~int(_HARMLESS) == 0) & (templates.flags == 0)
         found = zip(templates.fitted, templates.kind, self.own, strict=True)
@@ -191,9 +175,8 @@ class _Field:
             self._donor(*one, places) for one, good in zip(found, usable, strict=True) if good
         ]
         self.donors = [one for one in donors if one is not None]
-        if not self.donors:
-            wanted = "with sources that are points or profiles, to be copied"
-            raise argument_error("highres", wanted, "none")
+        wanted = "with sources that are points or profiles, to be copied"
+        check_that(self.donors, "highres", wanted, "none")
 
     def _donor(self, fitted, kind, label, places):
         """What is copied of a source; None if it is no profile, or has no light."""
@@ -236,8 +219,7 @@ class _Field:
     def trial(self, n, rng):
         """Inject sources and measure them: a table of true and measured fluxes."""
         at = self._places(2 * n, rng, [])
-        if len(at) < 2:
-            raise argument_error("image", "large enough for sources", "none")
+        check_that(len(at) >= 2, "image", "large enough for sources", "none")
         full, empty = np.array(at[::2]), np.array(at[1::2])
         flux = self.error * np.exp(rng.uniform(*np.log(_SNR_RANGE), len(full)))
         new = self._galaxies(full, flux, rng) if self.donors else self._points(full, flux)
@@ -289,8 +271,7 @@ class _Field:
             labels[cut][donor.mask] = first + len(rows)
             rows.append((total, donor.point, corner + (np.array([w, h]) - 1) / 2))
             light.append(shape.drawn(1.0, max(self.models.reach, 2 * shape.axes[0])))
-        if not rows:
-            raise argument_error("image", "large enough for sources", "none")
+        check_that(rows, "image", "large enough for sources", "none")
         flux, point, middle = (np.array(one) for one in zip(*rows, strict=True))
         # positions are those that detection would find
         own = np.maximum(labels - (first - 1), 0)
@@ -310,10 +291,8 @@ class _Field:
         x, y = np.rint(shape.parameters[:2]).astype(int)
         moved = shape.parameters - [x - half, y - half, 0, 0, 0, 0]
         stamp = shape.flux * self.models.profiles((2 * half + 1,) * 2, moved)[0]
-        y0, x0 = max(y - half, 0), max(x - half, 0)
-        target = image[y0 : y + half + 1, x0 : x + half + 1]
-        i, j = y0 - (y - half), x0 - (x - half)
-        target += stamp[i : i + target.shape[0], j : j + target.shape[1]]
+        here, own = overlap_slices(image.shape, stamp.shape, (y, x))
+        image[here] += stamp[own]
 
 
 def _with_light(image, light):

@@ -84,10 +84,8 @@ def _read_psf(file, argument):
             wanted = f"{turn:.4g} deg, as the header of {path} says"
             raise argument_error(argument + "_angle", wanted, file.psf_angle)
         turn = given
-    cell, turn = (
-        default if value is None else value
-        for value, default in zip((cell, turn), _grid(header), strict=True)
-    )
+    own = _grid(header)
+    cell, turn = own[0] if cell is None else cell, own[1] if turn is None else turn
     form = {"pixel_scale": cell * ANGLE, "frame": "sky", "angle": turn * u.deg}
     kept = []
     for data in planes:

@@ -1,13 +1,14 @@
 """Templates of sources on the high-resolution image: points, profiles, or the image itself."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import scipy.ndimage
 
 from miricigale.photometry.cutouts import Cutout
 from miricigale.photometry.flags import ForcedFlags
-from miricigale.photometry.shapes import Shape, ShapeFitter, not_fitted
+from miricigale.photometry.shapes import Beside, Shape, ShapeFitter, not_fitted
 from miricigale.photometry.wings import adjust_wings
 from miricigale.utils.parallel import parallel_map
 
@@ -27,6 +28,14 @@ _DRAWN, _FARTHEST = 6.0, 200.0
 #: Passes in which neighbors' light is taken off, chi^2 of that light from which a source is fitted
 #: again, and sources that are painted at a time.
 _PASSES, _CONTAMINATED, _AT_A_TIME = 4, 4.0, 512
+
+#: Largest number of sources whose profiles are fitted together, and chi^2 of the light of one on
+#: another's segment from which they are. Not those of a signal-to-noise of a hundred: what a
+#: profile misses of a bright galaxy would be taken for light of its neighbors.
+_TOGETHER, _LINKED, _BRIGHT = 5, 0.3, 100.0
+
+#: Least number of sources by which the population is known well enough.
+_LOOKED_AT = 500
 
 
 def cutouts(
@@ -81,7 +90,8 @@ def cutouts(
     nothing but noise on the core, which are the pixels whose smoothed signal-to-noise is
     above 4; otherwise the core is taken from the image, and everything beyond from the profile,
     scaled with radius to what is seen (see `~miricigale.photometry.wings.adjust_wings`). Sources
-    whose pixels hold light of others' models are fitted again without that light.
+    whose pixels hold light of others' models are fitted again without that light; the profiles of up to five that
+    overlap are fitted together, on the pixels of all of them.
     """
     segments = _Segments.of(data, variance, segmentation)
     flags, snr = np.zeros(len(label), int), np.full(len(label), np.nan)
@@ -154,21 +164,24 @@ class _Model:
     """
     A fitted source: its stamp, profile and template (None for a point) of some total light.
 
-    ``light`` is the profile's part of it, ``others`` that on the stamp that was taken off before.
+    ``light`` is the profile's part of it, ``others`` that on the stamp that was taken off before, ``labels`` those
+    of the sources that it was fitted together with, and ``beside`` what is known of these.
     """
 
     around: tuple
     shape: Shape
-    cutout: Cutout | None
+    cutout: Cutout | None = None
     total: float = 1.0
     light: float = 1.0
     others: np.ndarray | float = 0.0
+    labels: tuple = ()
+    beside: Beside | None = None
 
     @property
     def record(self):
         """What is kept of the fit."""
-        corner = [self.around[1].start, self.around[0].start, 0, 0, 0, 0]
-        return self.shape.parameters + corner, self.shape.covariance, self.shape.point, self.light
+        shape = self.shape.moved(_corner(self.around))
+        return shape.parameters, shape.covariance, shape.point, self.light
 
 
 class _Lights:
@@ -183,31 +196,90 @@ class _Lights:
 
     def fit(self, sources):
         """The model of each (label, position); None where no light fits."""
-        models = parallel_map(lambda one: self._model(*one), sources, executor=self.executor)
-        population = self.fitter.expected
+        # the population is that of some of the sources, of all parts of the list
+        every = max(1, len(sources) // _LOOKED_AT)
+        drafts = [(*one, k % every == 0) for k, one in enumerate(sources)]
+        models = parallel_map(lambda one: self._draft(*one), drafts, executor=self.executor)
+        population = self._population(models, sources)
+        models = self._joined(models, sources, population)
         for turn in range(_PASSES):
             sum_of_all = self._paint(models)
-            if turn == 0:
-                population = self._population(models, sources)
 
-            def again(one, sum_of_all=sum_of_all, turn=turn, population=population):
+            def again(one, sum_of_all=sum_of_all, turn=turn):
                 model, (label, xy) = one
                 if model is None:
                     return None
                 others = sum_of_all[model.around] - self._image(model)
-                weight, _, _ = self._weight(model.around, label)
+                weight, _, _ = self._weight(model.around, label, model.labels)
                 if turn and np.sum(((others - model.others) * weight) ** 2) < _CONTAMINATED:
                     return model
-                new = self._model(label, xy, others, model.shape, population)
-                return model if new is None else dataclasses.replace(new, others=others)
+                return self._model(label, xy, others, population, model)
 
-            pairs = zip(models, sources, strict=True)
-            models = parallel_map(again, pairs, executor=self.executor)
+            models = parallel_map(again, zip(models, sources, strict=True), executor=self.executor)
         return models, population
+
+    def _joined(self, models, sources, population):
+        """The models, profiles that hold light of each other fitted together."""
+        rows = np.full(len(self.segments.ratio), -1)
+        for k, (model, (label, _)) in enumerate(zip(models, sources, strict=True)):
+            use = model is not None and self.segments.ratio[label] < _BRIGHT
+            rows[label] = k if use else -1
+
+        def links(k):
+            model, (own, _) = models[k], sources[k]
+            if rows[own] < 0:
+                return []
+            labels, variance = self.segments.labels[model.around], self.variance[model.around]
+            power = np.bincount(labels.ravel(), (self._image(model) ** 2 / variance).ravel())
+            power[own] = 0.0
+            some = np.flatnonzero(power > _LINKED)
+            return [(-power[one], k, rows[one]) for one in some if rows[one] >= 0]
+
+        found = parallel_map(links, range(len(models)), executor=self.executor)
+        groups = {k: [k] for k in range(len(models))}
+        # the strongest first; from groups that would be too large light is taken off
+        for _, one, other in sorted(itertools.chain(*found)):
+            both, more = groups[one], groups[other]
+            if both is not more and len(both) + len(more) <= _TOGETHER:
+                both.extend(more)
+                groups.update(dict.fromkeys(more, both))
+        several = [group for k, group in groups.items() if len(group) > 1 and group[0] == k]
+        sum_of_all = self._paint(models)
+
+        def fit(group):
+            members, around = [models[k] for k in group], _hull([models[k].around for k in group])
+            data = self.data[around] - sum_of_all[around]
+            for one in members:
+                data[_within(one.around, around)] += self._image(one)
+            labels = [sources[k][0] for k in group]
+            _, weight, _ = self._weight(around, labels[0], labels)
+            corner = _corner(around)
+            shapes, beside = self.fitter.fit_together(
+                data, weight, [sources[k][1] - corner for k in group],
+                [population.at(self.segments.brightness(label)) for label in labels],
+                [one.shape.moved(_corner(one.around) - corner) for one in members],
+            )  # fmt: skip
+            found = []
+            for one, shape, others in zip(members, shapes, beside, strict=True):
+                back = corner - _corner(one.around)
+                others = others and others.moved(back)
+                found.append(
+                    dataclasses.replace(one, shape=shape.moved(back), labels=labels, beside=others)
+                )
+            return found
+
+        models = list(models)
+        fits = parallel_map(fit, several, executor=self.executor)
+        for k, model in zip(itertools.chain(*several), itertools.chain(*fits), strict=True):
+            models[k] = model
+        return models
 
     def _population(self, models, sources):
         """The distribution of the shapes of all sources."""
-        some = [(one.shape, label) for one, (label, _) in zip(models, sources, strict=True) if one]
+        pairs = zip(models, sources, strict=True)
+        some = [
+            (one.shape, label) for one, (label, _) in pairs if one and one.shape.nodes is not None
+        ]
         if not some:
             return self.fitter.expected
         shapes, labels = zip(*some, strict=True)
@@ -239,34 +311,48 @@ class _Lights:
         image = self.fitter.convolve(profile.data[None], origin, size)[0]
         return model.total * (image + rest.data)
 
-    def _weight(self, around, label):
+    def _weight(self, around, label, together=()):
         """Inverse noise of the pixels that are free of others, the same for a profile, and own pixels."""
         labels = self.segments.labels[around]
-        free = self.segments.usable[around] & ((labels == label) | ~self.others[labels])
+        own = labels == label
+        free = self.segments.usable[around] & (
+            own | np.isin(labels, together) | ~self.others[labels]
+        )
         variance = np.where(free, self.variance[around], 1.0)
         weight = np.where(free, 1.0 / np.sqrt(variance), 0.0)
         looser = weight / np.hypot(1.0, _MISFIT * np.maximum(self.light[around], 0.0) * weight)
-        return weight, looser, free & (labels == label)
+        return weight, looser, free & own
 
-    def _model(self, label, xy, others=0.0, start=None, population=None):
-        """Fit one source, ``others`` being the light of others on its stamp, ``start`` its last shape."""
+    def _draft(self, label, xy, nodes):
+        """The profile of one source, whatever others there are; of no template yet."""
         around = _around(self.segments.places[label - 1], xy, self.data.shape)
-        weight, looser, own = self._weight(around, label)
-        data = self.data[around] - others
-        corner = np.array([around[1].start, around[0].start])
-        prior = None if population is None else population.at(self.segments.brightness(label))
-        shape = self.fitter.fit(data, looser, xy - corner, prior, start)
+        _, weight, _ = self._weight(around, label)
+        shape = self.fitter.fit(self.data[around], weight, xy - _corner(around), nodes=nodes)
+        return None if shape is None else _Model(around, shape)
+
+    def _model(self, label, xy, others, population, last):
+        """Fit one source again, ``others`` being the light of others on its stamp, ``last`` its last model."""
+        around = last.around
+        weight, looser, own = self._weight(around, label, last.labels)
+        data, corner = self.data[around] - others, _corner(around)
+        prior = population.at(self.segments.brightness(label))
+        shape = self.fitter.fit(data, looser, xy - corner, prior, last.shape, last.beside)
         if shape is None:
-            return None
+            # as it was before, and if there was no template yet, as its profile
+            drawn = last.cutout is None and last.shape.point <= 0.5
+            return self._as_profile(last) if drawn else last
+        new = dataclasses.replace(
+            last, shape=shape, cutout=None, total=1.0, light=1.0, others=others
+        )
         if self.select and shape.point > 0.5:
-            return _Model(around, shape, None)
+            return new
         core = own & (self.snr[around] > _CORE_SNR)
         n = np.count_nonzero(core)
         if self.select:
             model = shape.flux * self.fitter.profiles(weight.shape, shape.parameters)[0]
             excess = np.sum(((data - model) * weight)[core] ** 2) - n
             if excess < _EXCESS * np.sqrt(2 * max(n, 1)):
-                return _Model(around, shape, self._profile(shape, corner))
+                return self._as_profile(new)
         profile = self._profile(shape, corner, light=shape.flux)
         origin = np.subtract(profile.origin, corner[::-1])
 
@@ -285,20 +371,42 @@ class _Lights:
         rest = np.where(core, data - convolve(light[None])[0], 0.0)
         total = light.sum() + rest.sum() + outer * (shape.flux - profile.data.sum())
         if not total > 0:
-            return None
+            return self._as_profile(new)
         template = dataclasses.replace(
             profile,
             data=light / total,
             noise=float(self.variance[around][core].sum()) / total**2,
             rest=Cutout(rest / total, (around[0].start, around[1].start)),
         )
-        return _Model(around, shape, template, float(total), shape.flux / total)
+        return dataclasses.replace(
+            new, cutout=template, total=float(total), light=shape.flux / total
+        )
+
+    def _as_profile(self, model):
+        """The same with its profile as the template."""
+        return dataclasses.replace(model, cutout=self._profile(model.shape, _corner(model.around)))
 
     def _profile(self, shape, corner, light=1.0):
         """A fitted profile on the fine grid, as far as the PSF reaches at least: steps at its edge show."""
-        placed = dataclasses.replace(shape, parameters=shape.parameters + [*corner, 0, 0, 0, 0])
         reach = min(_DRAWN * shape.axes[0], _FARTHEST)
-        return placed.drawn(light, max(self.fitter.reach, reach))
+        return shape.moved(corner).drawn(light, max(self.fitter.reach, reach))
+
+
+def _corner(around):
+    """X and y of the first pixel of a stamp."""
+    return np.array([around[1].start, around[0].start])
+
+
+def _hull(places):
+    """The rectangle that holds others."""
+    sides = zip(*places, strict=True)
+    return tuple(slice(min(s.start for s in one), max(s.stop for s in one)) for one in sides)
+
+
+def _within(place, around):
+    """Where a rectangle is in another."""
+    pairs = zip(place, around, strict=True)
+    return tuple(slice(s.start - a.start, s.stop - a.start) for s, a in pairs)
 
 
 def _around(place, xy, shape):
@@ -320,8 +428,7 @@ def _smooth(data, variance, executor):
         image, width = what
         return scipy.ndimage.gaussian_filter(np.where(usable, image, 0.0), width)
 
-    images = [(variance, 4 * _WIDTH), (data, _WIDTH)]
-    noise, light = parallel_map(smooth, images, executor=executor)
+    noise, light = parallel_map(smooth, [(variance, 4 * _WIDTH), (data, _WIDTH)], executor=executor)
     noise = np.sqrt(noise)
     gain = 1.0 / (2.0 * np.sqrt(np.pi) * _WIDTH)
     return light, light / np.where(noise > 0, noise * gain, np.inf)

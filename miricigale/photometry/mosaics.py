@@ -18,20 +18,18 @@ from miricigale.instrument.image import Image
 from miricigale.photometry.calibration import calibration, parsed_unit
 from miricigale.photometry.grids import (
     Opened,
+    cut_wcs,
     filter_name,
     find_image,
     is_exposure,
     open_image,
     open_map,
+    part_of,
     read_wcs,
 )
 from miricigale.photometry.sky_noise import mask_filled, sky_noise
-from miricigale.utils.exceptions import (
-    PhotometryWarning,
-    argument_error,
-    data_error,
-    warn,
-)
+from miricigale.utils.exceptions import PhotometryWarning, argument_error, data_error, warn
+from miricigale.utils.options import check_data, check_that
 from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
 
 _log = logging.getLogger(__name__)
@@ -109,10 +107,10 @@ def as_mosaic(image, argument="image"):
         return read_mosaic(image)
     if is_data_model(image):
         return read_data_model(image, read_mosaic)
+    if isinstance(image, (fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU)):
+        image = fits.HDUList([image])
     if isinstance(image, fits.HDUList):
         return read_mosaic(Opened(image))
-    if isinstance(image, (fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU)):
-        return read_mosaic(Opened([image]))
     wanted = "a CCDData, an NDData with unit and WCS, HDUs or the path of a FITS file"
     if not isinstance(image, NDData) or image.unit is None:
         raise argument_error(argument, wanted, type(image).__name__)
@@ -154,6 +152,9 @@ class MosaicFile:
         Pixel of the PSF and position angle of its +y; by default those of its header, or else of the image.
     pa_aper : `~astropy.units.Quantity`, optional
         Position angle of the detector's +y axis, if the header does not state it.
+    section : tuple of slice, optional
+        Rows and columns (with start and stop) that are read, of the maps of the noise too, as if the
+        file had no others.
 
     Examples
     --------
@@ -177,13 +178,15 @@ class MosaicFile:
     psf_scale: u.Quantity | None = None
     psf_angle: u.Quantity | None = None
     pa_aper: u.Quantity | None = None
+    section: tuple | None = None
+
+    replace = dataclasses.replace
 
     def __post_init__(self):
         if self.filter is not None:
             object.__setattr__(self, "filter", find_filter(str(self.filter)) or str(self.filter))
         given = [name for name in _NOISE if getattr(self, name) is not None]
-        if len(given) > 1:
-            raise argument_error(", ".join(_NOISE), "at most one of them", " and ".join(given))
+        check_that(len(given) <= 1, ", ".join(_NOISE), "at most one of them", " and ".join(given))
         if self.background_box is not None and not self.background_box >= 1:
             raise argument_error("background_box", "at least 1 pixel", self.background_box)
 
@@ -202,9 +205,11 @@ class MosaicFile:
         with open_image(self.path, "an image") as (hdus, extension):
             index = find_image(hdus, extension, self.path, ("SCI",))
             header, first = hdus[index].header, hdus[0].header
-            wcs = read_wcs(header, hdus)
-        if wcs is None:
-            raise data_error(self.path, "has no celestial coordinates (WCS) in its header")
+            wcs, shape = read_wcs(header, hdus), hdus[index].shape
+        check_data(wcs is not None, self.path, "has no celestial coordinates (WCS) in its header")
+        if self.section is not None:
+            wcs = cut_wcs(wcs, self.section, self.path)
+            shape = tuple(one.stop - one.start for one in self.section)
 
         def get(key):
             return header.get(key, first.get(key))
@@ -214,22 +219,18 @@ class MosaicFile:
         with contextlib.suppress(json.JSONDecodeError):
             meta = json.loads(header.get("META", "{}"))
         name = filter_name(get) or meta.get("filter")
-        if self.filter is not None and name not in (None, self.filter):
-            raise argument_error(
-                "filter", f"{name!r}, the filter in {self.path}", repr(self.filter)
-            )
+        good = self.filter is None or name in (None, self.filter)
+        check_that(good, "filter", f"{name!r}, the filter in {self.path}", repr(self.filter))
         # a mosaic of our own has a list of angles
         stated = {"filter": self.filter or name, "pa_aper": get("PA_APER")}
         stated = {key: meta.get(key) if value is None else value for key, value in stated.items()}
         return MosaicHeader(
             index=index,
-            shape=hdus[index].shape,
+            shape=shape,
             wcs=wcs,
             filter=stated["filter"],
             pa_aper=self._checked_angle(stated["pa_aper"]),
-            unit=str(header.get("BUNIT", "") or "").strip()
-            if self.unit is None
-            else str(self.unit),
+            unit=_unit_of(header) if self.unit is None else str(self.unit),
             exposure=is_exposure(get),
             keywords={key: get(key) for key in ("PHOTMJSR", "PHOTFLAM", "PHOTPLAM", "EXPTIME")},
             meta={**meta, **{key: value for key, value in stated.items() if value is not None}},
@@ -263,7 +264,7 @@ class MosaicFile:
             (rms of the source-free pixels in units of the map's errors), ``weight_scale``
             (by which errors of a weight map were multiplied), ``sky_over_noise`` (median over rms
             of those pixels), ``n_filled`` (pixels in areas that are exactly 0) and ``n_masked``, as
-            far as they are known.
+            far as they are known. None of a section without a usable pixel.
 
         Raises
         ------
@@ -285,19 +286,19 @@ class MosaicFile:
         header = self.header
         meta = {**header.meta, "source": str(self.path)}
         with open_image(self.path, "an image") as (hdus, _):
-            hdu = hdus[header.index]
-            data = _native(hdu.data)
-            factor, calibrated = calibration(
-                self.path, header.unit, self.zero_point, header.keywords
-            )
+            data = _native(part_of(hdus[header.index], self.section))
+            factor, how = calibration(self.path, header.unit, self.zero_point, header.keywords)
             if factor.unit.is_equivalent(u.MJy):
                 area = pixel_area_map(header.wcs, header.shape)
                 factor = (factor.to_value(u.MJy) / area).astype(data.dtype)
             else:
                 factor = data.dtype.type(factor.to_value(SURFACE_BRIGHTNESS))
-            usable = np.isfinite(data) & _unmarked(hdus, header.shape)
+            usable = np.isfinite(data)
+            for name, is_good in _MARKS.items():
+                if name in hdus and hdus[name].shape == hdus[header.index].shape:
+                    usable &= is_good(np.asarray(part_of(hdus[name], self.section)))
             kind, values, source = self._noise_map(hdus, header)
-        meta.update(source_unit=header.unit, calibration=calibrated)
+        meta.update(source_unit=header.unit, calibration=how)
         sigma = None
         if kind is None:
             zeros = float(np.mean(data[usable] == 0)) if usable.any() else 0.0
@@ -307,18 +308,18 @@ class MosaicFile:
             meta["noise"] = "none"
         else:
             negative = 0 if kind == "weight" else np.count_nonzero(values[usable] < 0)
-            if negative:
-                wanted = "a map of 0 (no data) or more"
-                raise argument_error(kind, wanted, f"{negative} pixels below 0 in {source}")
+            wanted = "a map of 0 (no data) or more"
+            check_that(not negative, kind, wanted, f"{negative} pixels below 0 in {source}")
             sigma = _sigma(kind, values)
             usable &= np.isfinite(sigma) & (sigma > 0)
             meta["noise"] = f"{kind} ({source})"
         filled = mask_filled(data, usable, self.path)
         if filled:
             meta["n_filled"] = filled
-        if not usable.any():
-            what = "has no usable pixel: all are masked, not finite or without weight"
-            raise data_error(self.path, what)
+        if self.section is not None and not usable.any():
+            return None
+        what = "has no usable pixel: all are masked, not finite or without weight"
+        check_data(usable.any(), self.path, what)
         data *= factor
         if self.background_box is not None:
             from miricigale.utils.sep_tools import background
@@ -331,11 +332,19 @@ class MosaicFile:
             relative = relative / np.where(usable, sigma, 1)
         level, scale, _ = sky_noise(relative, usable)
         if sigma is not None:
-            _note_scale(self, kind, scale)
+            done = "which are scaled by it" if kind == "weight" else "which are kept"
+            text = "%s: noise is %.4g times the errors of the %s map, %s"
+            _log.info(text, self.path, scale, kind, done)
+            if not 1 / _ODD_SCALE < scale < _ODD_SCALE:
+                msg = (
+                    f"{self.path}: noise on the sky is {scale:.4g} times what the {kind} map says, {done}; "
+                    "is it the map of this image, in its unit?"
+                )
+                warn(msg, PhotometryWarning)
             meta["noise_scale"] = float(f"{scale:.6g}")
         if kind == "weight":
-            if not scale > 0:
-                raise data_error(self.path, "has weights of unknown scale, for its sky is constant")
+            what = "has weights of unknown scale, for its sky is constant"
+            check_data(scale > 0, self.path, what)
             meta["weight_scale"] = meta["noise_scale"]
             sigma *= sigma.dtype.type(scale)
         meta["sky_over_noise"] = float(f"{level / (scale or 1):.4g}")
@@ -357,16 +366,35 @@ class MosaicFile:
             path = getattr(self, kind)
             if path is None:
                 continue
-            image = header.shape, header.wcs, self.path
+            whole = self.replace(section=None).header
+            image = whole.shape, whole.wcs, self.path
             what = f"a map of the {kind.replace('_', ' ')}", f"the {kind} of {self.path}"
             with open_map(path, *what, names, image) as hdu:
-                return kind, _in_unit(hdu, kind, stated, path), str(path)
+                return kind, self._in_unit(hdu, kind, stated, path), str(path)
         for kind, names in _NOISE.items():
             for name in names:
-                if name in hdus and hdus[name].shape == header.shape:
-                    values = _in_unit(hdus[name], kind, stated, f"{self.path}[{name}]")
+                if name in hdus and hdus[name].shape == hdus[header.index].shape:
+                    values = self._in_unit(hdus[name], kind, stated, f"{self.path}[{name}]")
                     return kind, values, f"extension {name}"
         return None, None, None
+
+    def _in_unit(self, hdu, kind, unit, path):
+        """A map of the noise in the unit that the image states, as far as both do."""
+        values = _native(part_of(hdu, self.section))
+        text = _unit_of(hdu.header)
+        power = _POWERS.get(kind)
+        have, wanted = parsed_unit(text), parsed_unit(unit)
+        # headers of many variance maps state the unit of the image itself
+        if None in (power, have, wanted) or have in (wanted, wanted**power):
+            return values
+        try:
+            factor = have.to(wanted**power)
+        except u.UnitConversionError:
+            role = kind.replace("_", " ")
+            what = f"(the {role}) is in {text!r}, the image in {unit!r}: give 'unit' if a header is wrong"
+            raise data_error(path, what) from None
+        _log.info("%s: from %s to %s", path, have, wanted**power)
+        return values * values.dtype.type(factor)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -385,6 +413,10 @@ class MosaicHeader:
     meta: dict  # What our own files carry, with ``filter`` and ``pa_aper`` (deg).
 
 
+def _unit_of(header):
+    return str(header.get("BUNIT", "") or "").strip()
+
+
 def _native(data):
     """A copy in native byte order; single precision stays single."""
     data = np.asarray(data)
@@ -394,39 +426,12 @@ def _native(data):
 
 #: Power of the image's unit that a map of the noise has; the scale of weights is measured.
 _POWERS = {"error": 1, "variance": 2, "inverse_variance": -2}
-
-
-def _in_unit(hdu, kind, unit, path):
-    """A map of the noise in the unit that the image states, as far as both do."""
-    values = _native(hdu.data)
-    text = str(hdu.header.get("BUNIT", "") or "").strip()
-    power = _POWERS.get(kind)
-    have, wanted = parsed_unit(text), parsed_unit(unit)
-    # headers of many variance maps state the unit of the image itself
-    if None in (power, have, wanted) or have in (wanted, wanted**power):
-        return values
-    try:
-        factor = have.to(wanted**power)
-    except u.UnitConversionError:
-        role = kind.replace("_", " ")
-        what = (
-            f"(the {role}) is in {text!r}, the image in {unit!r}: give 'unit' if a header is wrong"
-        )
-        raise data_error(path, what) from None
-    _log.info("%s: from %s to %s", path, have, wanted**power)
-    return values * values.dtype.type(factor)
-
-
-def _unmarked(hdus, shape):
-    """Pixels that neither MASK nor the first bit (DO_NOT_USE) of DQ marks."""
-    good = np.ones(shape, bool)
-    if "MASK" in hdus and hdus["MASK"].shape == shape:
-        good &= np.asarray(hdus["MASK"].data) == 0
-    if "DQ" in hdus and hdus["DQ"].shape == shape:
-        good &= np.asarray(hdus["DQ"].data).astype(np.int64) & 1 == 0
-    if "WHT" in hdus and hdus["WHT"].shape == shape:
-        good &= np.asarray(hdus["WHT"].data) > 0
-    return good
+#: Extensions that mark pixels, and which values are good: the first bit of DQ is DO_NOT_USE.
+_MARKS = {
+    "MASK": lambda marks: marks == 0,
+    "DQ": lambda marks: marks.astype(np.int64) & 1 == 0,
+    "WHT": lambda weights: weights > 0,
+}
 
 
 def _sigma(kind, values):
@@ -437,15 +442,3 @@ def _sigma(kind, values):
         if kind == "variance":
             return np.sqrt(np.where(values > 0, values, np.inf))
         return 1 / np.sqrt(np.where(values > 0, values, 0))
-
-
-def _note_scale(file, kind, scale):
-    """Log the measured scale of the noise, and warn of one that cannot be that of its map."""
-    done = "which are scaled by it" if kind == "weight" else "which are kept"
-    _log.info("%s: noise is %.4g times the errors of the %s map, %s", file.path, scale, kind, done)
-    if not 1 / _ODD_SCALE < scale < _ODD_SCALE:
-        msg = (
-            f"{file.path}: noise on the sky is {scale:.4g} times what the {kind} map says, {done}; "
-            "is it the map of this image, in its unit?"
-        )
-        warn(msg, PhotometryWarning)

@@ -204,31 +204,29 @@ def _zoom(result, highres, segments, k):
 
 def _magnitudes(one, confidence):
     result, xlabel = one.result, f"{one.name} (AB)"
-    figure, axes = new_figure(1, 2, size=(5.2, 3.6))
+    figure, [[left, right]] = new_figure(1, 2, size=(5.2, 3.6))
     detected = result.snr > _DETECTED
     mag, limit = ab_magnitude(result.flux), ab_magnitude(result.upper_limit(confidence))
     error = 1.0857 / np.where(detected, result.snr, np.nan)
     clean, fainter = detected & (result.flags == 0), np.isfinite(limit) & ~detected
-    ax = axes[0, 0]
     shown = np.where(detected, mag, limit)
     if np.isfinite(shown).any():
         low, high = np.floor(np.nanmin(shown)), np.nanmax(shown)
         bins = np.arange(low, max(high, low) + 1.0, 0.5)
-        ax.hist(mag[detected], bins, color="0.75", label=f"above {_DETECTED:g} sigma")
-        ax.hist(mag[clean], bins, histtype="step", color="#1d4ed8", label="of these, no flag")
+        left.hist(mag[detected], bins, color="0.75", label=f"above {_DETECTED:g} sigma")
+        left.hist(mag[clean], bins, histtype="step", color="#1d4ed8", label="of these, no flag")
         others = {"color": "#c2410c", "ls": ":", "label": f"limits of others ({confidence:.0%})"}
-        ax.hist(limit[fainter], bins, histtype="step", **others)
-        ax.legend(frameon=False)
-    ax.set(xlabel=xlabel, ylabel="sources")
-    ax = axes[0, 1]
+        left.hist(limit[fainter], bins, histtype="step", **others)
+        left.legend(frameon=False)
+    left.set(xlabel=xlabel, ylabel="sources")
     for rows, marker, color, label in (
         (detected & ~clean, "x", "#c2410c", "flagged"),
         (clean, ".", "#1d4ed8", "no flag"),
     ):
-        ax.plot(mag[rows], error[rows], marker, color=color, ms=5, label=label)
-    ax.axhline(1.0857 / 5, color="0.5", lw=0.8, ls="--", label="5 sigma")
-    ax.set(xlabel=xlabel, ylabel="error (mag)", yscale="log")
-    ax.legend(frameon=False)
+        right.plot(mag[rows], error[rows], marker, color=color, ms=5, label=label)
+    right.axhline(1.0857 / 5, color="0.5", lw=0.8, ls="--", label="5 sigma")
+    right.set(xlabel=xlabel, ylabel="error (mag)", yscale="log")
+    right.legend(frameon=False)
     return figure
 
 
@@ -244,10 +242,8 @@ def _stars(page, stars, band):
         page.text(fit.kind, **facts, before=fit.chi2["model"], after=fit.chi2[fit.kind])
         pairs = list(zip(fit.before, fit.after, strict=True))[:_STARS]
         figure, axes = new_figure(len(pairs), 3, size=(3.0, 2.8))
-        plain = {
-            "pixel_scale": stars.kernel.pixel_scale.to_value(ANGLE)
-            * np.sqrt(fit.after[0].star.area)
-        }
+        scale = stars.kernel.pixel_scale.to_value(ANGLE) * np.sqrt(fit.after[0].star.area)
+        plain = {"pixel_scale": scale}
         pulls = {"limits": (-5, 5), "stretch": "linear", "cmap": "RdBu_r", **plain}
         for row, (before, after) in zip(axes, pairs, strict=True):
             star, known = before.star, np.isfinite(before.star.sigma)
@@ -300,13 +296,11 @@ def _input_table(page, bands, highres):
         facts[what] = {**image.meta, **{f"psf_{key}": v for key, v in known.items()}}
         facts[what]["pixels"] = f"{image.data.shape[1]} x {image.data.shape[0]}"
         facts[what]["pixel_scale"] = f"{pixel_scale(image.wcs):.4f}"
-    page.table(
-        "table",
-        [
-            {"": label, **{what: _text(known.get(key)) for what, known in facts.items()}}
-            for key, label in page.texts["inputs"]["facts"].items()
-        ],
-    )
+    rows = [
+        {"": label, **{what: _text(known.get(key)) for what, known in facts.items()}}
+        for key, label in page.texts["inputs"]["facts"].items()
+    ]
+    page.table("table", rows)
     for one in bands:
         page.text(
             "kernel",

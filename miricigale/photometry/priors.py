@@ -5,20 +5,17 @@ import os
 
 import numpy as np
 
+from miricigale.photometry.arrays import nearest_values
 from miricigale.photometry.grids import open_map
-from miricigale.utils.exceptions import (
-    CatalogWarning,
-    argument_error,
-    data_error,
-    warn,
-)
+from miricigale.utils.exceptions import CatalogWarning, data_error, warn
+from miricigale.utils.options import check_data, check_that
 from miricigale.utils.positions import as_positions
 from miricigale.utils.tables import as_table, unique_ids
 
 _log = logging.getLogger(__name__)
 
 #: Extensions of segmentation maps, and names of columns.
-_SEGMENTS = ("SEGMENTATION", "SEGMAP", "SEG", "SCI")
+SEGMENTS = ("SEGMENTATION", "SEGMAP", "SEG", "SCI")
 _ID = ("id", "number", "id_obj", "objid", "label")
 
 
@@ -73,13 +70,12 @@ def read_prior(highres, *, segmentation=None, catalog=None):
     if segmentation is not None:
         if isinstance(segmentation, np.ndarray):
             data, segmentation = segmentation, "the segmentation"
-            if data.dtype == bool:
-                wanted = "whole numbers, one for each source (scipy.ndimage.label makes them)"
-                raise argument_error("segmentation", wanted, "a mask")
+            wanted = "whole numbers, one for each source (scipy.ndimage.label makes them)"
+            check_that(data.dtype != bool, "segmentation", wanted, "a mask")
         else:
             image = highres.data.shape, highres.wcs, highres.meta.get("source", "the image")
             what = "a segmentation map", "the segmentation"
-            with open_map(segmentation, *what, _SEGMENTS, image) as hdu:
+            with open_map(segmentation, *what, SEGMENTS, image) as hdu:
                 data = np.array(hdu.data)
         segments, ids = _numbered(data, segmentation)
     if catalog is None:
@@ -118,7 +114,19 @@ def detected_prior(highres, catalog=None):
     _log.info("%d sources detected on the high-resolution image", len(detected))
     if catalog is None:
         return segments.data, detected
-    return read_prior(highres, segmentation=segments.data, catalog=catalog)
+    return sources_of(highres, segments.data, catalog)
+
+
+def sources_of(highres, segmentation, catalog=None):
+    """As `read_prior`, of a map (an array) that may be without segments: then all of a catalog are points."""
+    if np.any(np.nan_to_num(segmentation)):
+        return read_prior(highres, segmentation=segmentation, catalog=catalog)
+    from astropy.coordinates import SkyCoord
+
+    nowhere = SkyCoord([], [], unit="deg")
+    sources = read_catalog({"id": np.empty(0, int), "sky": nowhere} if catalog is None else catalog)
+    sources["label"] = np.zeros(len(sources), int)
+    return np.zeros(segmentation.shape, np.int32), sources["id", "sky", "label"]
 
 
 def _numbered(data, path):
@@ -139,8 +147,7 @@ def _numbered(data, path):
     # the sky is 0 even where every pixel belongs to a segment
     if values[0] != 0:
         return labels + np.int32(1), values
-    if len(values) == 1:
-        raise data_error(path, "has no segment: all of its pixels are 0")
+    check_data(len(values) != 1, path, "has no segment: all of its pixels are 0")
     return labels, values[1:]
 
 
@@ -191,16 +198,6 @@ def read_catalog(catalog, wcs=None):
     return table
 
 
-def labels_at(segments, xy):
-    """The segments at pixels, (n, 2): labels (0 for none), and whether a position is on the map."""
-    ny, nx = segments.shape
-    column, row = np.rint(np.where(np.isfinite(xy), xy, -1.0)).T
-    inside = (column >= 0) & (column < nx) & (row >= 0) & (row < ny)
-    label = np.zeros(len(xy), np.int64)
-    label[inside] = segments[row[inside].astype(int), column[inside].astype(int)]
-    return label, inside
-
-
 def check_labels(labels, here, what):
     """
     Refuse labels that are those of another segmentation map, or warn of them.
@@ -212,9 +209,8 @@ def check_labels(labels, here, what):
     both = (labels > 0) & (here > 0)
     n, wrong = (int(np.count_nonzero(one)) for one in (both, both & (labels != here)))
     text = f"{wrong} of {n} sources that stand on another segment than theirs"
-    if wrong > 0.5 * n:
-        wanted = "labels of the segmentation map"
-        raise argument_error(what, wanted, f"{text}: is it the map of another detection?")
+    wanted = "labels of the segmentation map"
+    check_that(not wrong > 0.5 * n, what, wanted, f"{text}: is it the map of another detection?")
     if wrong >= max(3, 0.1 * n):
         msg = f"the labels of {what} are those of {text}"
         warn(msg, CatalogWarning)
@@ -227,14 +223,14 @@ def _labels(sources, segments, ids, wcs, catalog, segmentation):
     xy = np.full((len(sources), 2), np.nan)
     if known.any():
         xy[known] = np.stack(wcs.world_to_pixel(sky[known]), axis=-1)
-    here, inside = labels_at(segments, xy)
+    here, inside = nearest_values(segments, xy)
     own = np.zeros(len(sources), np.int64)
     if np.asarray(sources["id"]).dtype.kind in "iu":
         place = np.clip(np.searchsorted(ids, sources["id"]), 0, len(ids) - 1)
         own = np.where(ids[place] == sources["id"], place + 1, 0)
     both = here > 0
     by_id = both.any() and np.mean(own[both] == here[both]) > 0.5
-    label = own if by_id else here
+    label = own if by_id else here.astype(np.int64)
     check_labels(label, here, f"{catalog} by id")
     _log.info("%s: segments of %s by %s", catalog, segmentation, "id" if by_id else "position")
     n_without, n_inside = (int(np.count_nonzero(one)) for one in (inside & (label == 0), inside))
@@ -245,7 +241,9 @@ def _labels(sources, segments, ids, wcs, catalog, segmentation):
         warn(msg, CatalogWarning)
     elif n_without:
         _log.info(msg)
-    orphans = np.setdiff1d(np.arange(1, len(ids) + 1), label)
+    # what the edge cuts may be a source beyond it
+    edge = np.concatenate([segments[[0, -1]].ravel(), segments[:, [0, -1]].ravel()])
+    orphans = np.setdiff1d(np.arange(1, len(ids) + 1), np.append(label, edge))
     if orphans.size:
         some = ", ".join(map(str, ids[orphans[:5] - 1]))
         msg = (

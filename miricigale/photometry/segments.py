@@ -72,7 +72,7 @@ class DilationRule:
 #: ``"area"`` is the package's own choice for images like F160W: faint sources, whose segments hold only
 #: their cores, grow the most.
 DILATION_RULES = {
-    "area": DilationRule(areas=(0.3, 1.0, 5.0, 20.0), factors=(4.0, 3.0, 1.8, 1.2), min_area=0.8),
+    "area": DilationRule(areas=(0.3, 1.0, 5.0, 20.0), factors=(4.0, 3.0, 1.8, 1.2), min_area=0.8)
 }
 
 

@@ -1,9 +1,8 @@
 """Settings of forced photometry that belong together: errors of fluxes, and use of memory."""
 
 import dataclasses
-import os
 
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,8 +45,7 @@ class ErrorSettings:
     def __post_init__(self):
         for name in ("size_scatter", "psf_error"):
             value = getattr(self, name)
-            if value is not None and not 0 <= value < 1:
-                raise argument_error(name, "from 0 to 1", value)
+            check_that(value is None or 0 <= value < 1, name, "from 0 to 1", value)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,25 +57,12 @@ class MemorySettings:
     ----------
     max_bytes : float, optional
         Memory for templates; beyond it they are made anew for each pass.
-    scratch : path-like, optional
-        Folder, large enough for files of the size of the image, in which images are kept in place of
-        memory. Model and residual of the result are then such files too, which are deleted with them.
-
-    Raises
-    ------
-    ValueError
-        If the folder does not exist.
 
     Examples
     --------
     >>> from miricigale.photometry import MemorySettings
     >>> MemorySettings(max_bytes=4e9)
-    MemorySettings(max_bytes=4000000000.0, scratch=None)
+    MemorySettings(max_bytes=4000000000.0)
     """
 
     max_bytes: float = 1.5e9
-    scratch: object = None
-
-    def __post_init__(self):
-        if self.scratch is not None and not os.path.isdir(self.scratch):
-            raise argument_error("scratch", "a folder that is there", self.scratch)

@@ -4,6 +4,7 @@ import numpy as np
 from astropy.stats import mad_std
 
 from miricigale.utils.exceptions import PhotometryWarning, argument_error, warn
+from miricigale.utils.options import check_that
 from miricigale.utils.units import FNU
 
 #: Pixels of the smallest area that counts as filled.
@@ -50,8 +51,7 @@ def weight_scale(data, weight, *, mask=None):
     usable = np.isfinite(data) & np.isfinite(weight) & (weight > 0)
     if mask is not None:
         usable &= ~np.asarray(mask, bool)
-    if not usable.any():
-        raise argument_error("weight", "positive in some usable pixels", "none")
+    check_that(usable.any(), "weight", "positive in some usable pixels", "none")
     return sky_noise(np.where(usable, data * np.sqrt(np.where(usable, weight, 0)), 0.0), usable)[1]
 
 

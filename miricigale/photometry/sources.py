@@ -9,19 +9,19 @@ from astropy.coordinates import SkyCoord
 from photutils.psf import ImagePSF
 from photutils.segmentation import SegmentationImage
 
-from miricigale.photometry.arrays import image_arrays, pixel_scale, same_grid
+from miricigale.photometry.arrays import image_arrays, nearest_values, pixel_scale, same_grid
 from miricigale.photometry.catalogs import OPTIONAL, catalog_sources, joined_sky, sersic_rows
 from miricigale.photometry.cutouts import Cutout, own_segments, saturated_cores
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.light import cutouts
-from miricigale.photometry.priors import check_labels, labels_at
+from miricigale.photometry.priors import check_labels
 from miricigale.photometry.shapes import not_fitted
 from miricigale.photometry.sky_noise import warn_of_sky
 from miricigale.photometry.wcs_text import grid_text, text_grid
 from miricigale.profiles import ellipse_to_pixels, sersic_stamp
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
-from miricigale.utils.options import check_choice
+from miricigale.utils.options import check_choice, check_that
 from miricigale.utils.parallel import single_threaded, threads
 from miricigale.utils.tables import unique_ids
 from miricigale.utils.unified import read_write
@@ -128,15 +128,7 @@ class SourceTemplates:
 
     @classmethod
     def from_images(
-        cls,
-        highres,
-        segmentation,
-        catalog,
-        *,
-        psf,
-        template="auto",
-        wings=True,
-        n_threads=None,
+        cls, highres, segmentation, catalog, *, psf, template="auto", wings=True, n_threads=None
     ):
         """
         Look at the sources of a catalog on a high-resolution image.
@@ -183,7 +175,7 @@ class SourceTemplates:
         psf = _psf_array(psf, scale)
         xy = np.stack(highres.wcs.world_to_pixel(known["sky"]), axis=-1).reshape(-1, 2)
         warn_of_sky(fine, segments)
-        label, _ = labels_at(segments, xy)
+        label, _ = nearest_values(segments, xy)
         if "label" in catalog.colnames:
             check_labels(np.asarray(catalog["label"]), label, "catalog['label']")
             label = catalog["label"]
@@ -276,10 +268,9 @@ class SourceTemplates:
             data = None if one is None else np.asarray(one, float)
             if data is not None:
                 total = data.sum() if data.ndim == 2 else np.nan
-                if not (np.isfinite(total) and total > 0):
-                    wanted = "two-dimensional, finite and of positive total"
-                    got = f"shape {data.shape} and total {total} of source {known['id'][k]}"
-                    raise argument_error("arrays", wanted, got)
+                wanted = "two-dimensional, finite and of positive total"
+                got = f"shape {data.shape} and total {total} of source {known['id'][k]}"
+                check_that(np.isfinite(total) and total > 0, "arrays", wanted, got)
                 at = tuple(int(c) for c in corners[k])
                 data = Cutout(data / total, at, convolved=bool(convolved[k]))
             light.append(data)
@@ -308,8 +299,7 @@ class SourceTemplates:
             If there is no part, grids differ, or an id is there twice.
         """
         parts = list(parts)
-        if not parts:
-            raise argument_error("parts", "at least one SourceTemplates", "none")
+        check_that(parts, "parts", "at least one SourceTemplates", "none")
         grids = [one.wcs for one in parts if one.wcs is not None]
         if any(not same_grid(one, grids[0]) for one in grids[1:]):
             raise argument_error("parts", "on one grid", "different ones")

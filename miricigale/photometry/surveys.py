@@ -16,16 +16,11 @@ YANG2021_DEPTHS = types.MappingProxyType(
 #: 5-sigma AB depths of deep surveys of GOODS fields by Herschel, from 3-sigma depths in mJy: 0.6 and 1.3 with PACS
 #: (Magnelli et al. 2013, A&A 553, A132, abstract); 5.7, 7.2 and 9.0 with SPIRE (Elbaz et al. 2011,
 #: A&A 533, A119 [?], quoted from memory), at which confusion counts.
+_HERSCHEL = {"pacs_100": 0.6, "pacs_160": 1.3, "spire_250": 5.7, "spire_350": 7.2, "spire_500": 9.0}
 HERSCHEL_DEPTHS = types.MappingProxyType(
     {
-        name: round(16.4 - 2.5 * math.log10(depth * 5 / 3), 2)
-        for name, depth in (
-            ("sedpy.herschel_pacs_100", 0.6),
-            ("sedpy.herschel_pacs_160", 1.3),
-            ("sedpy.herschel_spire_250", 5.7),
-            ("sedpy.herschel_spire_350", 7.2),
-            ("sedpy.herschel_spire_500", 9.0),
-        )
+        f"sedpy.herschel_{name}": round(16.4 - 2.5 * math.log10(depth * 5 / 3), 2)
+        for name, depth in _HERSCHEL.items()
     }
 )
 

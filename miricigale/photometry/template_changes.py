@@ -7,7 +7,8 @@ import scipy.ndimage
 
 from miricigale.photometry._core.shapes import INDEX_RANGE, shape_curves
 from miricigale.photometry.cutouts import Cutout
-from miricigale.photometry.shapes import ShapeModels, normal_nodes
+from miricigale.photometry.shape_models import ShapeModels
+from miricigale.photometry.shapes import normal_nodes
 
 #: Half-width (fine pixels) of the stamps of changes, least and most, in half-light radii and in rms
 #: widths of the PSF.
@@ -68,7 +69,8 @@ class TemplateChanges:
         middle = np.rint(parameters[:2])
         # the wings of a brighter source's changes are seen farther out
         widths = _WIDTHS * np.clip(_SEEN / least, 1.0, 4.0)
-        half = min(_reach(parameters), _MOST) + widths * self._width
+        reach = _REACH * np.exp(parameters[2] + 0.5 * np.hypot(*parameters[4:]))
+        half = min(reach, _MOST) + widths * self._width
         half = int(np.ceil(max(half, _HALF)))
         size = (2 * half + 1,) * 2
         waves = self._target.waves(size)
@@ -128,11 +130,6 @@ class TemplateChanges:
 
     def _blurred(self, image):
         return scipy.ndimage.gaussian_filter(image, self._blur, mode="constant")
-
-
-def _reach(parameters):
-    """Some half-light radii (pixels)."""
-    return _REACH * np.exp(parameters[2] + 0.5 * np.hypot(*parameters[4:]))
 
 
 def _root(covariance):

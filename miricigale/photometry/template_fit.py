@@ -116,19 +116,13 @@ class TemplateFit:
         self._find_pairs(matrix, rows & ~self.degenerate)
         self.rows = np.flatnonzero(rows & ~self.degenerate & ~self.inseparable)
         matrix = matrix[self.rows][:, self.rows]
-        corner = np.array([[inner(a, b) for b in white] for a in white])
-        self.fit = None
+        g = len(white)
+        corner = np.array([[inner(a, b) for b in white] for a in white]).reshape(g, g)
+        corner_rhs = np.array([inner(a, data) for a in white])
+        self.fit, self.flux = None, np.zeros(len(bank.order))
         if len(self.rows):
-            g = len(white)
-            self.fit = LinearFit(
-                matrix,
-                projection[self.rows, 0],
-                projection[self.rows, 1:],
-                corner.reshape(g, g),
-                np.array([inner(a, data) for a in white]),
-            )
-        self.flux = np.zeros(len(bank.order))
-        if self.fit is not None:
+            rhs, border = projection[self.rows, 0], projection[self.rows, 1:]
+            self.fit = LinearFit(matrix, rhs, border, corner, corner_rhs)
             self.flux[self.rows] = self.fit.flux
 
     def free_templates(self, fitted):

@@ -65,16 +65,14 @@ class FineTemplates:
         """Sums of products of the kernels of two places, with the pixel's response, shape (k, k)."""
         kernels = self.kernel
         if self.sides is not None:
-            kernels = np.concatenate([convolve_padded(one, self._sides_only) for one in kernels])
+            response = functools.partial(box_response, sides=self.sides)
+            kernels = np.concatenate([convolve_padded(one, response) for one in kernels])
         flat = kernels.reshape(len(kernels), -1)
         return flat @ flat.T
 
     def kernel_power(self, weights):
         """Sum of squares of each source's kernel with the pixel's response, shape (n,)."""
         return np.einsum("nk,kl,nl->n", weights, self._kernel_power, weights)
-
-    def _sides_only(self, shape):
-        return box_response(shape, self.sides)
 
     @functools.lru_cache(maxsize=256)  # noqa: B019 - lives as long as one measurement
     def _transfer(self, shape, convolved, place):

@@ -12,6 +12,7 @@ from miricigale.photometry.settings import ErrorSettings
 from miricigale.photometry.sources import SourceTemplates
 from miricigale.psf import MatchingKernel
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 
 #: The grid of images and templates, and the width of the PSF stamps.
 _PIXEL, _STAMP = 0.06 * u.arcsec, 3.0 * u.arcsec
@@ -74,8 +75,7 @@ class Yang2021Photometer:
     """
 
     def __init__(self, source, target, *, scaling=1.0, n_threads=None):
-        if not (np.isfinite(scaling) and scaling > 0):
-            raise argument_error("scaling", "positive", scaling)
+        check_that(np.isfinite(scaling) and scaling > 0, "scaling", "positive", scaling)
         self.kernel = MatchingKernel.from_psfs(
             source,
             target,

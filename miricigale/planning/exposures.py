@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from operator import attrgetter
 
 import astropy.units as u
 import numpy as np
@@ -19,7 +20,8 @@ from miricigale.instrument import Exposure, frame_time, miri_detector, psf_fwhm
 from miricigale.photometry import ErrorModel
 from miricigale.planning.config import NoiseSection
 from miricigale.reduction import imager_response
-from miricigale.utils.exceptions import ConfigError, config_error, data_error
+from miricigale.utils.exceptions import ConfigError, config_error
+from miricigale.utils.options import check_data
 from miricigale.workflow.background import band_background
 from miricigale.workflow.options import of_option
 
@@ -64,10 +66,7 @@ class BandPlan:
     run: object = None
     detector: object = None
 
-    @property
-    def filter(self):
-        """Name of the band."""
-        return self.exposure.filter
+    filter = property(attrgetter("exposure.filter"), doc="Name of the band.")
 
     @property
     def time(self):
@@ -193,8 +192,7 @@ class RunErrors:
 
         folder = Path(folder).expanduser()
         for name in ("errors.ecsv", "config.toml"):
-            if not (folder / name).is_file():
-                raise data_error(folder, f"([noise] run) has no {name}")
+            check_data((folder / name).is_file(), folder, f"([noise] run) has no {name}")
         return cls(ErrorModel.read(folder / "errors.ecsv"), load_config(folder / "config.toml"))
 
     def scaled(self, plan):

@@ -29,13 +29,7 @@ def _instrument(filter_name):
     return instrument
 
 
-def stpsf_grid(
-    filter,
-    *,
-    n_psfs=1,
-    oversampling=4,
-    fov=10.0 * ANGLE,
-):
+def stpsf_grid(filter, *, n_psfs=1, oversampling=4, fov=10.0 * ANGLE):
     """
     PSFs of the MIRI imager over the field, from stpsf.
 

@@ -13,7 +13,7 @@ from miricigale.psf.miri import MIRI_FILTERS, miri_psf
 from miricigale.psf.model import instrument_psf
 from miricigale.psf.nircam import NIRCAM_FILTERS, nircam_psf
 from miricigale.psf.resample import psf_image, psf_mosaic, rotate_psf
-from miricigale.utils.exceptions import PSFWarning, argument_error, warn
+from miricigale.utils.exceptions import PSFWarning, warn
 from miricigale.utils.options import check_that
 from miricigale.utils.units import ANGLE
 
@@ -207,13 +207,12 @@ def _check_turn(psf, center, stamps, about, argument):
         argument, on_sky, on_detector, noise,
     )  # fmt: skip
     better = max(_BETTER, _SIGNIFICANT * math.sqrt(2) * noise)
-    if on_detector > max(_STRENGTH, on_sky + better):
-        wanted = f"turned to the image, as the model of {filter_} at PA_APER {pa:.4g} is"
-        got = (
-            f"one whose spikes stand as in the detector's axes ({on_detector:.2f} times those of the "
-            f"model, turned {on_sky:.2f}): state the angle of its +y"
-        )
-        raise argument_error(argument, wanted, got)
+    wanted = f"turned to the image, as the model of {filter_} at PA_APER {pa:.4g} is"
+    got = (
+        f"one whose spikes stand as in the detector's axes ({on_detector:.2f} times those of the "
+        f"model, turned {on_sky:.2f}): state the angle of its +y"
+    )
+    check_that(not on_detector > max(_STRENGTH, on_sky + better), argument, wanted, got)
 
 
 def _scaled(psf, expected, filter_, argument):

@@ -10,9 +10,10 @@ from miricigale.instrument import imager_filters, psf_fwhm
 from miricigale.psf import _core
 from miricigale.psf.effects import detector_response
 from miricigale.psf.model import instrument_psf
+from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_choice, check_that
-from miricigale.utils.tables import described_table
+from miricigale.utils.tables import described_columns
 from miricigale.utils.units import ANGLE, to_array
 
 
@@ -199,22 +200,14 @@ def psf_table(psfs, *, radii=(0.5, 1.0, 1.5, 2.5, 5.0) * u.arcsec):
     names = [psf.filter or "" for psf in psfs]
     flight = [psf_fwhm(n).value if n in imager_filters() else np.nan for n in names] * ANGLE
     angles = [psf.angle.value if psf.frame == "sky" else np.nan for psf in psfs] * u.deg
+    frames = [psf.frame for psf in psfs]
     includes = [" ".join(psf.includes) for psf in psfs]
     widths = u.Quantity([psf.fwhm for psf in psfs])
     gaussian = u.Quantity([fwhm(psf, method="gaussian") for psf in psfs])
-    columns = {
-        "filter": (names, None),
-        "frame": ([psf.frame for psf in psfs], "axes of the detector, or turned to the sky"),
-        "angle": (angles, "position angle of +y, east of north"),
-        "includes": (includes, "what the PSF holds besides the optics"),
-        "fwhm": (widths, "full width at half maximum of the azimuthal mean"),
-        "fwhm_gaussian": (gaussian, "that of a Gaussian fitted out to 0.75 FWHM"),
-        "fwhm_flight": (flight, "of stars in flight (JWST program 1028)"),
-        "r80": ([_r80(psf) for psf in psfs] * ANGLE, "radius that holds 80 % of all light"),
-        "enclosed": ([psf.enclosed for psf in psfs], "fraction of all light on the PSF's grid"),
-    }
+    r80, enclosed = [_r80(psf) for psf in psfs] * ANGLE, [psf.enclosed for psf in psfs]
+    columns = [names, frames, angles, includes, widths, gaussian, flight, r80, enclosed]
+    texts = dict(declared("miricigale.psf", "columns.toml"))
     for radius in radii:
-        within = [encircled_energy(psf, radius) for psf in psfs]
-        text = f"fraction of all light within {radius}"
-        columns[f"eef_{radius.to_value(ANGLE):g}"] = within, text
-    return described_table(columns)
+        columns.append([encircled_energy(psf, radius) for psf in psfs])
+        texts[f"eef_{radius.to_value(ANGLE):g}"] = f"fraction of all light within {radius}"
+    return described_columns(columns, texts)

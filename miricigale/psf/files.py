@@ -13,8 +13,9 @@ from miricigale.psf.kernels import MatchingKernel
 from miricigale.psf.model import InstrumentPSF, make_psf
 from miricigale.utils.exceptions import argument_error, data_error
 from miricigale.utils.files import open_fits, write_fits
+from miricigale.utils.meta import plain_value
 from miricigale.utils.options import check_that
-from miricigale.utils.store import native, open_parts, plain_value, replacing, write_parts
+from miricigale.utils.store import native, open_parts, replacing, write_parts
 from miricigale.utils.unified import register
 from miricigale.utils.units import ANGLE, to_array
 
@@ -49,7 +50,7 @@ def header_grid(header):
 
 def fits_image(path, ext, plane, pixel_scale, *, wanted, oversampling=1):
     """
-    An image of any FITS file, its header, its pixel (a quantity) and its position angle (deg or None).
+    An image of any FITS file, its header, pixel (a quantity), position angle (deg or None) and oversampling.
 
     Parameters and errors are those of `read_psf`; ``wanted`` describes the expected content for messages.
     """
@@ -72,7 +73,7 @@ def fits_image(path, ext, plane, pixel_scale, *, wanted, oversampling=1):
         mine = float(to_array(pixel_scale, ANGLE, "pixel_scale")) / oversampling
         stated = f"{cell * oversampling:.4g} arcsec by the header and 'oversampling'"
         check_that(abs(mine / cell - 1) <= 0.02, "pixel_scale", stated, pixel_scale)
-    return data, header, pixel_scale, angle
+    return data, header, pixel_scale, angle, oversampling
 
 
 def read_psf(
@@ -125,11 +126,9 @@ def read_psf(
     """
     if is_written(path):
         return _read_psf(path)
-    data, header, pixel_scale, turn = fits_image(
+    data, header, pixel_scale, turn, oversampling = fits_image(
         path, ext, plane, pixel_scale, wanted="a PSF", oversampling=oversampling
     )
-    if oversampling is None:
-        oversampling = int(header.get("OVERSAMP", 1))
     if frame is None:
         # as STPSF and WebbPSF write them
         frame = "detector" if {"OVERSAMP", "PIXELSCL"} <= set(header) else "sky"
@@ -189,7 +188,7 @@ def _write_kernel(kernel, path, *, overwrite=False):
 
 def _read_kernel(path, *, ext=None, plane=None, pixel_scale=None, source=None):
     if ext is not None:
-        data, _, pixel_scale, _ = fits_image(
+        data, _, pixel_scale, *_ = fits_image(
             path, ext, plane, pixel_scale, wanted="a matching kernel"
         )
         return MatchingKernel.from_array(data, pixel_scale=pixel_scale, source=source)

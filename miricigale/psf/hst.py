@@ -57,12 +57,7 @@ def _hst_blur(scale):
 
 
 def hst_psf(
-    filter="wfc3.f160w",
-    *,
-    pixel_scale=0.06 * u.arcsec,
-    oversampling=4,
-    fov=None,
-    angle=0.0 * u.deg,
+    filter="wfc3.f160w", *, pixel_scale=0.06 * u.arcsec, oversampling=4, fov=None, angle=0.0 * u.deg
 ):
     """
     PSF of a north-up WFC3/IR mosaic.

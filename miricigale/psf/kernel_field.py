@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from operator import attrgetter
 from typing import ClassVar
 
 import numpy as np
@@ -124,10 +125,7 @@ class KernelField:
     def __repr__(self):
         return f"<KernelField {len(self)} kernels, {self.method}, {self.mean!r}>"
 
-    @property
-    def mean(self):
-        """The mean `MatchingKernel`."""
-        return self._mean
+    mean = property(attrgetter("_mean"), doc="The mean `MatchingKernel`.")
 
     @property
     def pixel_scale(self):

@@ -2,43 +2,23 @@
 
 import dataclasses
 import functools
-import os
 from typing import ClassVar
 
 import astropy.units as u
 import numpy as np
 from astropy.nddata import CCDData
-from scipy.signal import fftconvolve, oaconvolve
+from scipy.signal import fftconvolve
 
-from miricigale.filters import Filter
 from miricigale.instrument.image import Image
+from miricigale.psf.kernel_arrays import blended, convolved
 from miricigale.psf.model import instrument_psf
-from miricigale.psf.pairs import psf_pair, ready_arrays
-from miricigale.psf.wiener import (
-    checked_square,
-    choose,
-    energy_error,
-    energy_radii,
-    wiener,
-)
+from miricigale.psf.pairs import named_psf, psf_pair, ready_arrays
+from miricigale.psf.wiener import checked_square, choose, energy_error, energy_radii, wiener
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.options import check_choice, check_that
 from miricigale.utils.unified import read_write
 from miricigale.utils.units import ANGLE, frozen_array, positive, to_array
-
-
-def _named(psf):
-    """A PSF of a file or of the name of a filter; anything else itself."""
-    if isinstance(psf, os.PathLike) or (isinstance(psf, str) and os.path.isfile(psf)):
-        from miricigale.psf.files import read_psf
-
-        return read_psf(psf)
-    if isinstance(psf, (str, Filter)):
-        from miricigale.psf.by_filter import exposure_psf
-
-        return exposure_psf(psf)
-    return psf
 
 
 @checked_calls
@@ -94,13 +74,6 @@ class MatchingKernel(Interactive):
     target: np.ndarray | None = None
     regularization: float = float("nan")
     meta: dict = dataclasses.field(default_factory=dict)
-
-    _other_names: ClassVar[dict] = {
-        "data": "array",
-        "kernel": "array",
-        "convolve": "apply",
-        "shape": "array.shape",
-    }
 
     def __post_init__(self):
         wanted = "a square array ('MatchingKernel.from_psfs' makes the kernel of two PSFs)"
@@ -212,7 +185,7 @@ class MatchingKernel(Interactive):
         >>> round(float(kernel.array.sum()), 4)
         1.0
         """
-        hi, lo = (_named(psf) for psf in (hi, lo))
+        hi, lo = (named_psf(psf) for psf in (hi, lo))
         pixel_scale = getattr(hi, "pixel_scale", None) if pixel_scale is None else pixel_scale
         if pixel_scale is None:
             raise argument_error("pixel_scale", "given where 'hi' does not state it", "None")
@@ -224,21 +197,10 @@ class MatchingKernel(Interactive):
         )  # fmt: skip
         make = wiener(source, target)
         mu, array, figures = choose(regularization, make, source, target, tolerance)
-        return cls(
-            array,
-            pixel_scale=scale * ANGLE,
-            source=source,
-            target=target,
-            regularization=mu,
-            meta={
-                "penalty": "laplacian",
-                "lost": 0.0,
-                "grid_angle": float(grid_angle.to_value(u.deg)),
-                "resampling": resampling or "none",
-                **mended,
-                **figures,
-            },
-        )
+        angle = float(grid_angle.to_value(u.deg))
+        meta = {"penalty": "laplacian", "lost": 0.0, "grid_angle": angle}
+        meta |= {"resampling": resampling or "none", **mended, **figures}
+        return cls(array, scale * ANGLE, source, target, regularization=mu, meta=meta)
 
     @classmethod
     def identity(cls, psf, *, angle=None):
@@ -262,14 +224,11 @@ class MatchingKernel(Interactive):
         ValueError
             If the pixel of the PSF is unknown, or its angle.
         """
-        psf = instrument_psf(_named(psf))
+        psf = instrument_psf(named_psf(psf))
         if psf.frame == "detector" and angle is None and psf.pa_aper is None:
             wanted = "given to 'MatchingKernel.identity' for a PSF in the detector's frame"
             raise argument_error("angle", wanted, "None")
-        source, target, mended = psf_pair(
-            psf, psf, psf.cell, angles=(angle, angle), grid_angle=0.0 * u.deg, resampling=None,
-            extent=None, normalize=None,
-        )  # fmt: skip
+        source, target, mended = psf_pair(psf, psf, psf.cell, angles=(angle, angle))
         array = np.zeros_like(source)
         array[tuple(n // 2 for n in array.shape)] = mended["energy"]
         return cls(array, pixel_scale=psf.cell * ANGLE, source=source, target=target, meta=mended)
@@ -332,20 +291,7 @@ class MatchingKernel(Interactive):
         ValueError
             If there is none, they differ, or the weights do not fit.
         """
-        n, names = len(kernels), ("array", "source", "target")
-        w = np.ones(n) if weights is None else np.asarray(weights, dtype=float)
-        if w.shape != (n,) or np.any(w < 0) or not w.sum() > 0:
-            raise argument_error("weights", f"{n} non-negative numbers, not all 0", weights)
-        forms = {(k.pixel_scale, *(np.shape(getattr(k, name)) for name in names)) for k in kernels}
-        check_that(len(forms) <= 1, "kernels", "alike in pixel, shape and PSFs", forms)
-        w = w / w.sum()
-        mean = {
-            name: np.tensordot(w, [getattr(k, name) for k in kernels], axes=1)
-            for name in names
-            if getattr(kernels[0], name) is not None
-        }
-        meta = {"weights": w.tolist(), "lost": float(w @ [k.meta.get("lost", 0) for k in kernels])}
-        return cls(**mean, pixel_scale=kernels[0].pixel_scale, meta=meta)
+        return cls(**blended(kernels, weights))
 
     @property
     def noise_gain(self):
@@ -362,7 +308,8 @@ class MatchingKernel(Interactive):
         ValueError
             If the kernel was made without PSFs.
         """
-        self._need_psfs()
+        if self.source is None or self.target is None:
+            raise argument_error("source, target", "the kernel's PSFs", "a kernel without them")
         return fftconvolve(self.source, self.array, mode="same")
 
     def with_psfs(self, source, target):
@@ -413,14 +360,7 @@ class MatchingKernel(Interactive):
             return Image(
                 data, unit=image.unit, wcs=image.wcs, mask=image.mask, meta=dict(image.meta)
             )
-        image = np.asarray(image, dtype=float)
-        check_that(image.ndim == 2, "image", "2D", f"shape {image.shape}")
-        bad = int(np.count_nonzero(~np.isfinite(image)))
-        check_that(not bad, "image", "finite", f"{bad} pixels that are NaN or infinite")
-        convolve = oaconvolve if min(image.shape) > 2 * self.array.shape[0] else fftconvolve
-        full = convolve(image, self.array, mode="full")
-        h = self.array.shape[0] // 2
-        return full[h : h + image.shape[0], h : h + image.shape[1]]
+        return convolved(image, self.array)
 
     __call__ = apply
 
@@ -446,11 +386,9 @@ class MatchingKernel(Interactive):
         """
         from miricigale.plotting.measurements import plot_energies
 
-        self._need_psfs()
-        pixels = energy_radii(self.target)
-        psfs = {"sharp PSF": self.source, "wide PSF": self.target, "convolved": self.matched}
-        zero = np.zeros_like(self.target)
-        curves = {name: energy_error(psf, zero, pixels) for name, psf in psfs.items()}
+        matched, pixels = self.matched, energy_radii(self.target)
+        psfs = {"sharp PSF": self.source, "wide PSF": self.target, "convolved": matched}
+        curves = {name: energy_error(psf, 0.0 * psf, pixels) for name, psf in psfs.items()}
         return plot_energies(pixels * self.pixel_scale.value, curves, ax=ax, **kwargs)
 
     def _facts(self):
@@ -481,11 +419,11 @@ class MatchingKernel(Interactive):
         ValueError
             If the kernel was made without PSFs.
         """
-        self._need_psfs()
+        matched = self.matched
         pixels = energy_radii(self.target)
         if radii is not None:
             pixels = np.atleast_1d(to_array(radii, ANGLE, "radii")) / self.pixel_scale.value
-        return energy_error(self.matched, self.target, np.ascontiguousarray(pixels))
+        return energy_error(matched, self.target, np.ascontiguousarray(pixels))
 
     def cropped(self, extent):
         """
@@ -509,7 +447,3 @@ class MatchingKernel(Interactive):
         array = self.array[old - half : old + half + 1, old - half : old + half + 1]
         lost = self.meta.get("lost", 0.0) + float(self.array.sum() - array.sum())
         return dataclasses.replace(self, array=array, meta={**self.meta, "lost": lost})
-
-    def _need_psfs(self):
-        if self.source is None or self.target is None:
-            raise argument_error("source, target", "the kernel's PSFs", "a kernel without them")

@@ -327,9 +327,8 @@ def make_psf(data, *, pixel_scale, frame="sky", oversampling=1, enclosed=None, *
         data, pixel_scale=pixel_scale, frame=frame, oversampling=oversampling, **facts
     )
     # stpsf's sums reach 1.03 at the corners of the array, where its distortion adds light
-    if psf.enclosed > 1.04:
-        wanted = f"normalized to {psf.n_cells**2} over the infinite plane (or 'enclosed' given)"
-        raise argument_error("data", wanted, f"a sum of {data.sum():.6g}")
+    wanted = f"normalized to {psf.n_cells**2} over the infinite plane (or 'enclosed' given)"
+    check_that(psf.enclosed <= 1.04, "data", wanted, f"a sum of {data.sum():.6g}")
     if not psf.total_known:
         limit = _half_width(data, psf.origin)
         sums = _core.radial_sums(data, *psf.origin, np.array([limit / 2, limit])) / psf.n_cells**2

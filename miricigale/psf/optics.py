@@ -9,7 +9,6 @@ import numpy as np
 
 from miricigale.psf import _core
 from miricigale.refdata import locate
-from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_least, check_that
 from miricigale.utils.parallel import single_threaded
 from miricigale.utils.random import stream
@@ -232,12 +231,8 @@ def hst_pupil(n=256, *, angle=45.0):
     for k in range(2):
         a = math.radians(angle + 90 * k)
         along, across = np.array([-math.sin(a), math.cos(a)]), np.array([math.cos(a), math.sin(a)])
-        corners = np.array(
-            [
-                s * radius * along + t * half * across
-                for s, t in ((-1, -1), (-1, 1), (1, 1), (1, -1))
-            ]
-        )
+        s, t = np.array([[-1, -1, 1, 1], [-1, 1, 1, -1]])[..., None]
+        corners = s * radius * along + t * half * across
         blocked = np.maximum(blocked, _core.polygon_coverage(corners, n, step, _ROWS))
     turn = math.radians(angle - 45.0)
     for px, py in ((0.8921, 0.0), (-0.4615, 0.7555), (-0.4564, -0.7606)):
@@ -294,9 +289,8 @@ def polychromatic_psf(pupil, opd, wavelengths, *, step, n):
     check_that(n % 2 != 0, "n", "odd", n)
     wavelengths, opd = np.asarray(wavelengths, float) * 1e-6, np.asarray(opd, float) * 1e-9
     period = wavelengths.min() / pupil.step / ARCSEC
-    if n * step > period:
-        wanted = f"an image below {period:.1f} arcsec (a finer pupil allows more)"
-        raise argument_error("n", wanted, f"{n} x {step:.4g} arcsec = {n * step:.1f} arcsec")
+    wanted = f"an image below {period:.1f} arcsec (a finer pupil allows more)"
+    check_that(n * step <= period, "n", wanted, f"{n} x {step:.4g} arcsec = {n * step:.1f} arcsec")
     weight = 1.0 / wavelengths.size
     mean = float(np.average(wavelengths, weights=np.full(wavelengths.size, weight)))
     axis = (np.arange(n) - (n - 1) // 2) * step * ARCSEC

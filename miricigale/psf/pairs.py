@@ -1,11 +1,14 @@
 """What a matching kernel is made of, on one grid: centered, turned, normalized, or refused."""
 
 import logging
+import os
 
+import astropy.units as u
 import numpy as np
 from photutils.psf import GriddedPSFModel, ImagePSF
 from scipy.signal import fftconvolve
 
+from miricigale.filters import Filter
 from miricigale.psf import _core
 from miricigale.psf.model import from_photutils, make_psf
 from miricigale.psf.resample import average_psf, centered_psf, psf_image, psf_mosaic, rotate_psf
@@ -17,7 +20,22 @@ from miricigale.utils.units import ANGLE, to_array
 _log = logging.getLogger(__name__)
 
 
-def psf_pair(hi, lo, scale, *, angles, grid_angle, resampling, extent, normalize):
+def named_psf(psf):
+    """A PSF of a file or of the name of a filter; anything else itself."""
+    if isinstance(psf, os.PathLike) or (isinstance(psf, str) and os.path.isfile(psf)):
+        from miricigale.psf.files import read_psf
+
+        return read_psf(psf)
+    if isinstance(psf, (str, Filter)):
+        from miricigale.psf.by_filter import exposure_psf
+
+        return exposure_psf(psf)
+    return psf
+
+
+def psf_pair(
+    hi, lo, scale, *, angles, grid_angle=0.0 * u.deg, resampling=None, extent=None, normalize=None
+):
     """
     The sharp PSF, of unit sum, and the wide one, of what it holds or of unit sum, on the pixels of an image.
 

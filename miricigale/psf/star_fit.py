@@ -59,10 +59,9 @@ def derivatives(psf, fwhm):
     axis = np.arange(len(psf)) - len(psf) // 2
     place = np.log(np.maximum(np.hypot(axis, axis[:, None]), 0.1) / fwhm)
     cross = np.gradient(np.gradient(psf, axis=0), axis=1)
-    found = [variance * (xx + yy), 0.5 * variance * (xx - yy), variance * cross]
-    for one in np.log(_BEYOND):
-        found.append(psf * np.clip(1.0 + (place - one) / np.log(2.0), 0.0, 1.0))
-    found = np.stack(found)
+    wings = (np.clip(1.0 + (place - one) / np.log(2.0), 0.0, 1.0) for one in np.log(_BEYOND))
+    core = variance * (xx + yy), 0.5 * variance * (xx - yy), variance * cross
+    found = np.stack([*core, *(psf * one for one in wings)])
     light = found.sum(axis=(1, 2))
     # what lies beyond the grid is wings too
     light[-len(_BEYOND) :] += 1.0 - psf.sum()

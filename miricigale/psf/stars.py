@@ -105,12 +105,10 @@ def psf_from_stars(images, stars, psf, *, fov=5 * ANGLE):
 
 def _places(image, stars):
     """Pixels x, y of stars on an image."""
-    sky = (
-        stars if isinstance(stars, SkyCoord) else stars["sky"] if "sky" in stars.colnames else None
-    )
-    if sky is None:
+    if not isinstance(stars, SkyCoord) and "sky" not in stars.colnames:
         if not {"x", "y"} <= set(stars.colnames):
             raise argument_error("stars", "tables with 'x' and 'y', or 'sky'", stars.colnames)
         return np.stack([np.asarray(stars[name], float) for name in "xy"], axis=1)
+    sky = stars if isinstance(stars, SkyCoord) else stars["sky"]
     check_that(image.wcs is not None, "stars", "'x' and 'y' for images without a WCS", "the sky")
     return np.stack(np.atleast_1d(*image.wcs.world_to_pixel(sky)), axis=1)

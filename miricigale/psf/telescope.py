@@ -37,9 +37,8 @@ def odd_cells(width, cell):
 
 def checked_grid(oversampling, fov, default):
     """Cells per pixel and width in arcsec of a PSF's grid."""
-    return check_count(oversampling, "oversampling"), default if fov is None else positive(
-        fov, ANGLE, "fov"
-    )
+    width = default if fov is None else positive(fov, ANGLE, "fov")
+    return check_count(oversampling, "oversampling"), width
 
 
 @dataclasses.dataclass(frozen=True)

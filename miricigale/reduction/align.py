@@ -176,8 +176,7 @@ def align_images(images, catalog=None, *, radius=1 * u.arcsec, groups=None):
     -0.2 arcsec, 4 stars
     """
     images = list(images)
-    if not images:
-        raise argument_error("images", "at least one image", "none")
+    check_that(images, "images", "at least one image", "none")
     reach = positive(radius, ANGLE, "radius")
     known = None if catalog is None else _positions(catalog)
     groups = list(range(len(images)) if groups is None else groups)
@@ -217,9 +216,8 @@ def _positions(catalog):
     if not isinstance(catalog, SkyCoord) or catalog.isscalar:
         raise argument_error("catalog", "a SkyCoord of several positions", repr(catalog)[:60])
     unknown = int(np.count_nonzero(~np.isfinite(catalog.cartesian.norm())))
-    if unknown:
-        got = f"{unknown} of {len(catalog)} that are not"
-        raise argument_error("catalog", "of finite positions", got)
+    got = f"{unknown} of {len(catalog)} that are not"
+    check_that(not unknown, "catalog", "of finite positions", got)
     return SkyCoord(catalog.icrs.ra, catalog.icrs.dec)
 
 
@@ -232,8 +230,7 @@ def _sources(image, argument):
         raise argument_error(argument, wanted, " and ".join(image.wcs.wcs.ctype))
     scale = float(np.mean(proj_plane_pixel_scales(image.wcs))) * 3600
     name = ImageFacts.of(image).filter
-    if name is None:
-        raise argument_error(argument, "one whose meta names its filter", "none")
+    check_that(name is not None, argument, "one whose meta names its filter", "none")
     width = psf_fwhm(name).to_value(ANGLE) / scale / 2.3548
     mask, background = plain_mask(image), estimate_background(image, warn=False)
     data = np.where(mask, 0, image.data - background.level)
@@ -270,10 +267,9 @@ def _aligned(found, catalog, radius, argument):
         used = np.hypot(*(shift - np.median(shift[near], axis=0)).T) < _VOTE
     turn, move, residual = 0.0, np.zeros(2), shift
     for _ in range(5):
-        if np.count_nonzero(used) < _LEAST:
-            wanted = f"one with at least {_LEAST} sources of the catalog within {radius:g} arcsec"
-            got = f"{np.count_nonzero(used)} of {len(sky)} sources"
-            raise argument_error(argument, wanted, got)
+        wanted = f"one with at least {_LEAST} sources of the catalog within {radius:g} arcsec"
+        got = f"{np.count_nonzero(used)} of {len(sky)} sources"
+        check_that(np.count_nonzero(used) >= _LEAST, argument, wanted, got)
         turn, move = _solved(one[used], other[used])
         residual = other - one @ _rotation(turn).T - move
         spread = np.sqrt(np.mean(np.square(residual[used])))

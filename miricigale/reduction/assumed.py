@@ -15,7 +15,8 @@ from miricigale.instrument import (
 )
 from miricigale.reduction.reference_maps import read_flat, read_photom
 from miricigale.reduction.references import BRIGHTNESS, SLOPES, needed, own_maps
-from miricigale.utils.exceptions import ReferenceWarning, argument_error, warn
+from miricigale.utils.exceptions import ReferenceWarning, warn
+from miricigale.utils.options import check_that
 
 _OWN = "of the simulated detector"
 _OTHER = (
@@ -72,17 +73,15 @@ def maps_of(reducer, ramp):
     ValueError
         If it is no ramp, there are no references for it, or another detector made it.
     """
-    if not isinstance(ramp, (Ramp, Charge)):
-        raise argument_error("ramp", "a Ramp or a Charge", type(ramp).__name__)
+    check_that(isinstance(ramp, (Ramp, Charge)), "ramp", "a Ramp or a Charge", type(ramp).__name__)
     history = ramp.history
     if is_own(reducer, history):
         stated = reducer.references is not None or reducer.properties is not None
         if not stated and ramp.properties not in (None, reducer.detector):
             raise ValueError(_OTHER.format(ramp.properties))
         return own_maps(reducer.detector, ramp)
-    if isinstance(ramp, Charge):
-        wanted = "None or 'simulated' for a Charge, which has no counts"
-        raise argument_error("references", wanted, repr(reducer.references))
+    wanted = "None or 'simulated' for a Charge, which has no counts"
+    check_that(not isinstance(ramp, Charge), "references", wanted, repr(reducer.references))
     files = needed(reducer.references, ramp.header, history, names=SLOPES, what="slopes")
     return files.maps(ramp)
 
@@ -175,8 +174,7 @@ def _from_files(reducer, rate, facts, history):
     )
     what, header = "surface brightness", _header(exposure, history.day)
     files = needed(reducer.references, header, history, names=BRIGHTNESS, what=what)
-    if files.photom is None:
-        raise argument_error("references", f"given with 'photom' for {what}", "none")
+    check_that(files.photom is not None, "references", f"given with 'photom' for {what}", "none")
     flat, flags, used = 1.0, None, {"flat": "none", "photom": files.photom.name}
     if history.done("flat"):
         used["flat"] = "done before"

@@ -9,8 +9,8 @@ from miricigale.reduction.images import flag_pixels, plain_mask, sigma, with_dat
 from miricigale.reduction.sky_mask import cells_of, detect, grown, light_left, pixels_of
 from miricigale.reduction.sky_mesh import SkyMesh, sky_boxes
 from miricigale.utils import sep_tools
-from miricigale.utils.exceptions import ReductionWarning, argument_error, warn
-from miricigale.utils.options import check_choice, check_least, check_positive
+from miricigale.utils.exceptions import ReductionWarning, warn
+from miricigale.utils.options import check_choice, check_least, check_positive, check_that
 from miricigale.utils.tables import Flags
 
 # rounds of detecting and masking sources at most; it ends when the mask stays
@@ -110,15 +110,7 @@ class Background:
         )
 
 
-def estimate_background(
-    image,
-    *,
-    method="masked",
-    box=64,
-    filter_size=3,
-    plane=True,
-    warn=True,
-):
+def estimate_background(image, *, method="masked", box=64, filter_size=3, plane=True, warn=True):
     """
     Estimate the background of an image, masking what stands above it.
 
@@ -222,8 +214,7 @@ def estimate_background(
     check_least(box, "box", 4, whole=True)
     check_least(filter_size, "filter_size", 1, whole=True)
     mask = plain_mask(image)
-    if mask.all():
-        raise argument_error("image", "one with pixels that are not masked", "every pixel masked")
+    check_that(not mask.all(), "image", "one with pixels that are not masked", "every pixel masked")
     data = sep_tools.native(image.data)
     data = np.where(mask, 0, data if data.dtype.kind == "f" else data.astype(float))
     correlation = ImageFacts.of(image).noise_correction
@@ -246,7 +237,8 @@ def known_background(level):
 def _masked(data, mask, stated, mesh, correlation):
     """Background with the sources masked; ``mesh`` has the size of the boxes, the filter and the plane."""
     box, filter_size, plane = mesh
-    step = _step(correlation, box)
+    # pixels along each axis that share their noise, as far as boxes have four such groups of them
+    step = max(1, min(int(correlation), box // 4))
     # without a plane what a gradient leaves at edges would be taken for sources, the more with each round
     if step == 1:
         mesh, found, flags = _search(SkyMesh(data, mask, box, filter_size, True), stated)
@@ -284,11 +276,6 @@ def _search(mesh, stated):
             break
         mesh = mesh.measured(found)
     return mesh, mesh.sources, BackgroundFlags.GOOD
-
-
-def _step(correlation, box):
-    """Pixels along each axis that share their noise, as far as boxes have four such groups of them."""
-    return max(1, min(int(correlation), box // 4))
 
 
 def _averaged(data, mask, stated, step, correlation):
@@ -342,9 +329,8 @@ def _plain(data, mask, box, filter_size, correlation):
     """The mesh of sep as it is."""
     level, rms = sep_tools.background(data, mask, box, filter_size)
     # sep takes boxes of which half is left, and gives 0 and 1 where there is none
-    flags = BackgroundFlags.GOOD if (sky_boxes(data, mask, box).share >= 0.5).any() else (
-        BackgroundFlags.FEW_SKY
-    )  # fmt: skip
+    enough = (sky_boxes(data, mask, box).share >= 0.5).any()
+    flags = BackgroundFlags.GOOD if enough else BackgroundFlags.FEW_SKY
     error = rms * (2.14 * correlation * min(1.0, 1.2533 / filter_size) / box)
     level, rms, error = (a.astype(np.float32, copy=False) for a in (level, rms, error))
     return Background(level, rms, error, np.zeros(mask.shape, bool), box, filter_size, flags)

@@ -8,15 +8,7 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS
 
 
-def calibrate(
-    rate,
-    *,
-    filter,
-    subarray,
-    flat,
-    conversion,
-    flags=None,
-):
+def calibrate(rate, *, filter, subarray, flat, conversion, flags=None):
     """
     Turn an image of slopes into surface brightness.
 

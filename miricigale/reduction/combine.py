@@ -6,12 +6,13 @@ from miricigale.instrument import ImageFacts
 from miricigale.reduction.align import align_images
 from miricigale.reduction.background import BackgroundFlags, estimate_background, remove_background
 from miricigale.reduction.dither_background import dither_backgrounds, restored
-from miricigale.reduction.images import check_images, check_overlap, own_grid, with_data
+from miricigale.reduction.images import check_images, own_grid, with_data
 from miricigale.reduction.mosaic import drizzle_images, pixel_map, weight_map
 from miricigale.reduction.outliers import reject_outliers
 from miricigale.reduction.results import ReductionResult
 from miricigale.reduction.sky_match import match_levels
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 
 
 def drizzle(settings, images, wcs, variances=()):
@@ -37,7 +38,6 @@ def drizzle(settings, images, wcs, variances=()):
     check_images(images, wcs)
     weights = [weight_map(im) for im in images]
     maps = [pixel_map(im.wcs, wcs, im.shape) for im in images]
-    check_overlap(maps, wcs.pixel_shape[::-1])
     if settings.match_sky and len(images) > 1:
         images = match_levels(images, wcs, pixel_maps=maps)
     judged = all(ImageFacts.of(im).n_outliers is not None for im in images)
@@ -73,8 +73,7 @@ def combine(reducer, images, backgrounds, rates, wcs, pixel_scale, align, planes
     -------
     result : `~miricigale.reduction.ReductionResult`
     """
-    if not images:
-        raise argument_error("images", "at least one image", "none")
+    check_that(images, "images", "at least one image", "none")
     if align is not None:
         if isinstance(align, str) and align != "dithers":
             raise argument_error("align", "a SkyCoord, 'dithers' or None", repr(align))

@@ -12,6 +12,7 @@ from miricigale.reduction.mosaic import drizzle_images, pixel_map
 from miricigale.reduction.outliers import nan_median
 from miricigale.reduction.sky_mesh import sky_boxes
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.parallel import chunks
 from miricigale.utils.units import ANGLE
 
@@ -87,12 +88,10 @@ def dither_backgrounds(images, backgrounds=None, *, wcs=None):
     4.9 MJy/sr
     """
     images = list(images)
-    if len(images) < 3:
-        raise argument_error("images", "at least three dithers", len(images))
+    check_that(len(images) >= 3, "images", "at least three dithers", len(images))
     shape = images[0].shape
     for im in images:
-        if im.shape != shape:
-            raise argument_error("images", f"of one shape {shape}", im.shape)
+        check_that(im.shape == shape, "images", f"of one shape {shape}", im.shape)
     if backgrounds is None:
         backgrounds = [estimate_background(im, warn=False) for im in images]
     alone = list(backgrounds)
@@ -109,9 +108,8 @@ def dither_backgrounds(images, backgrounds=None, *, wcs=None):
         images, alone, masks, sources, levels, templates, strict=True
     ):
         known = np.isfinite(template)
-        if not known.any():
-            wanted = "ones that leave some sky to each other"
-            raise argument_error("images", wanted, "none in common")
+        wanted = "ones that leave some sky to each other"
+        check_that(known.any(), "images", wanted, "none in common")
         boxes = sky_boxes(np.where(known, template, 0), ~known, _BOX)
         smooth, error = (boxes.smooth(v, shape, filter_size=1) for v in (boxes.level, boxes.error))
         sky = ~(mask | source)

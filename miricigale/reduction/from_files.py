@@ -14,17 +14,13 @@ from miricigale.instrument import ImageFacts
 from miricigale.pages import Page, SectionWriter
 from miricigale.plotting.axes import WIDTH, new_figure
 from miricigale.plotting.images import plot_image
-from miricigale.reduction import (
-    Reducer,
-    ReferenceFiles,
-    read_images,
-    write_image,
-)
+from miricigale.reduction import Reducer, ReferenceFiles, read_images, write_image
 from miricigale.reduction.background import known_background
 from miricigale.reduction.files import open_file, scaled_planes
 from miricigale.utils.content import content_sha256, file_sha256
 from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.progress import progress
 from miricigale.utils.units import ANGLE, RATE, SURFACE_BRIGHTNESS, to_array
 
@@ -97,12 +93,10 @@ def reduce_files(
     paths = [Path(path) for path in paths]
     reducer = Reducer() if reducer is None else reducer
     to_array(pixel_scale, ANGLE, "pixel_scale", ndim=0, finite=True)
-    if not paths:
-        raise argument_error("paths", "at least one file", "none")
+    check_that(paths, "paths", "at least one file", "none")
     stems = [_stem(path) for path in paths]
     twice = sorted({stem for stem in stems if stems.count(stem) > 1})
-    if twice:
-        raise argument_error("paths", "files of different names", f"two of {', '.join(twice)}")
+    check_that(not twice, "paths", "files of different names", f"two of {', '.join(twice)}")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     settings = _settings(reducer)

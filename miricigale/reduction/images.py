@@ -7,6 +7,7 @@ from astropy.wcs import WCS
 from miricigale.instrument import DQ, ImageFacts, mosaic_wcs
 from miricigale.instrument.image import Image
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.units import SURFACE_BRIGHTNESS
 
 
@@ -20,13 +21,7 @@ def flagged_image(data, unit, *, error, flags, wcs, meta, mask=False):
         uncertainty = StdDevUncertainty(np.asarray(error, np.float32))
         mask |= ~np.isfinite(uncertainty.array)
     return Image(
-        data,
-        unit=unit,
-        uncertainty=uncertainty,
-        mask=mask,
-        flags=flags,
-        wcs=wcs,
-        meta=dict(meta),
+        data, unit=unit, uncertainty=uncertainty, mask=mask, flags=flags, wcs=wcs, meta=dict(meta)
     )
 
 
@@ -45,8 +40,7 @@ def plain_flags(image):
 
 def sigma(image, name="image"):
     """Standard deviation of each pixel as an array; an image without uncertainty is refused."""
-    if image.uncertainty is None:
-        raise argument_error(name, "an image with an uncertainty", "one without")
+    check_that(image.uncertainty is not None, name, "an image with an uncertainty", "one without")
     uncertainty = image.uncertainty
     if uncertainty.uncertainty_type == "std":
         return np.asarray(uncertainty.array)
@@ -119,17 +113,14 @@ def own_grid(images, pixel_scale):
 
 def check_images(images, wcs):
     """Refuse images that cannot be put together, and what is no grid for them."""
-    if not isinstance(wcs, WCS):
-        raise argument_error("wcs", "an astropy WCS", type(wcs).__name__)
-    if wcs.pixel_shape is None:
-        raise argument_error("wcs", "a WCS with a pixel_shape", "one without")
+    check_that(isinstance(wcs, WCS), "wcs", "an astropy WCS", type(wcs).__name__)
+    check_that(wcs.pixel_shape is not None, "wcs", "a WCS with a pixel_shape", "one without")
     check_alike(images)
 
 
 def check_alike(images):
     """Refuse images that cannot be put together."""
-    if not images:
-        raise argument_error("images", "at least one image", "none")
+    check_that(images, "images", "at least one image", "none")
     for im in images:
         if not isinstance(im, CCDData) or im.wcs is None or im.uncertainty is None:
             raise argument_error("images", "CCDData with uncertainty and WCS", repr(type(im)))
@@ -140,8 +131,7 @@ def check_alike(images):
         raise argument_error("images", wanted, f"unit {images[0].unit}")
     facts = [ImageFacts.of(im) for im in images]
     filters = {fact.band: fact.filter for fact in facts if fact.band is not None}
-    if len(filters) > 1:
-        raise argument_error("images", "of one filter", ", ".join(sorted(filters.values())))
+    check_that(len(filters) <= 1, "images", "of one filter", ", ".join(sorted(filters.values())))
 
 
 def check_overlap(pixel_maps, shape):

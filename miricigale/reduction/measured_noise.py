@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from miricigale.instrument import DQ
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 
 # pixels that are looked at, at most
 _PIXELS = 60_000
@@ -139,13 +139,11 @@ def measure_noise(ramp):
     read noise 6.0 DN
     """
     n_int, n_group = ramp.shape[:2]
-    if n_group < 9:
-        raise argument_error("ramp", "one of nine groups at least, to measure its noise", n_group)
+    check_that(n_group >= 9, "ramp", "one of nine groups at least, to measure its noise", n_group)
     dq = ramp.pixel_dq.astype(np.int64)
     pixels = _few((dq & (_BAD | DQ.REFERENCE_PIXEL)) == 0)
-    if pixels[0].size < _FEWEST:
-        wanted = f"one with {_FEWEST} usable pixels, to measure its noise"
-        raise argument_error("ramp", wanted, pixels[0].size)
+    wanted = f"one with {_FEWEST} usable pixels, to measure its noise"
+    check_that(pixels[0].size >= _FEWEST, "ramp", wanted, pixels[0].size)
     blind = _few((dq & (_BAD_REFERENCE | DQ.REFERENCE_PIXEL)) == DQ.REFERENCE_PIXEL)
     rows, dark = [], []
     # the first integration settles, and is left out where there are others
@@ -154,8 +152,8 @@ def measure_noise(ramp):
         order = _slope(before)
         limit = _BRIGHT * np.median(order)
         kept = np.flatnonzero((order < limit) | (limit <= 0))
-        for part in np.array_split(kept[np.argsort(order[kept])], _CLASSES):
-            rows.append((signal[part].mean(), *_noise(data[:, part])))
+        parts = np.array_split(kept[np.argsort(order[kept])], _CLASSES)
+        rows += [(signal[part].mean(), *_noise(data[:, part])) for part in parts]
         if blind[0].size >= _FEWEST:
             dark.append(_noise(_parts(ramp, k, blind)[1])[:2])
     m, v, v_err, s, s_err = np.array(rows).T

@@ -21,6 +21,7 @@ from miricigale.reduction.images import (
 )
 from miricigale.utils import sep_tools
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 
 # pixels of the boxes by which the variance that gives weights is smoothed
 _WEIGHT_BOX = 32
@@ -307,17 +308,15 @@ def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None, v
     """
     images = list(images)
     check_images(images, wcs)
-    if not 0 < pixfrac <= 1:
-        raise argument_error("pixfrac", "above 0 and at most 1", pixfrac)
+    check_that(0 < pixfrac <= 1, "pixfrac", "above 0 and at most 1", pixfrac)
     shape = tuple(int(n) for n in wcs.pixel_shape[::-1])
     if pixel_maps is None:
         pixel_maps = [pixel_map(im.wcs, wcs, im.shape) for im in images]
     check_overlap(pixel_maps, shape)
     weights = [weight_map(im) for im in images] if weights is None else list(weights)
     # drizzle works in float32: weights near one
-    positive = [w[w > 0] for w in weights]
-    positive = [w for w in positive if w.size]
-    unit_weight = float(np.median([np.median(w) for w in positive])) if positive else 1.0
+    medians = [np.median(w[w > 0]) for w in weights if np.any(w > 0)]
+    unit_weight = float(np.median(medians)) if medians else 1.0
 
     sink = Drizzle(
         kernel="square", fillval="NAN", fillval2="NAN", out_shape=shape, disable_ctx=True

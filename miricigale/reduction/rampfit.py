@@ -22,7 +22,7 @@ from miricigale.reduction._core.pixel import DO_NOT_USE, JUMP, SATURATED, own_ch
 from miricigale.reduction._core.rows import fit_rows
 from miricigale.reduction.showers import find_showers
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_positive
+from miricigale.utils.options import check_positive, check_that
 from miricigale.utils.parallel import chunks, parallel_map, threads
 
 # rows that one call of the kernel fits; the events come out in this order
@@ -207,22 +207,19 @@ def fit_groups(
     5.00 DN/s, jump in group 12
     """
     data = np.asarray(data)
-    if data.ndim != 4:
-        raise argument_error("data", "of four dimensions", f"shape {data.shape}")
+    check_that(data.ndim == 4, "data", "of four dimensions", f"shape {data.shape}")
     _n_int, n_group, ny, nx = data.shape
     last_group = n_group if last_group is None else last_group
     if not 0 <= first_group <= last_group - 2 <= n_group - 2:
         wanted = f"a range of at least two of the {n_group} groups"
         raise argument_error("first_group, last_group", wanted, f"{first_group}, {last_group}")
     for name, value in (("group_time", group_time), ("poisson_factor", poisson_factor)):
-        if not (np.isfinite(value) and value > 0):
-            raise argument_error(name, "positive", value)
+        check_that(np.isfinite(value) and value > 0, name, "positive", value)
     jump = threshold(jump_threshold, "jump_threshold")
     neighbor = threshold(neighbor_threshold, "neighbor_threshold")
     shower = threshold(shower_threshold, "shower_threshold")
     usable = np.ones((ny, nx), bool) if usable is None else np.ascontiguousarray(usable, bool)
-    if usable.shape != (ny, nx):
-        raise argument_error("usable", f"of shape {(ny, nx)}", usable.shape)
+    check_that(usable.shape == (ny, nx), "usable", f"of shape {(ny, nx)}", usable.shape)
 
     gain = _map(maps.gain, "gain", usable, above=0.0, infinite=True)
     read_noise = _map(maps.read_noise, "read_noise", usable, least=0.0)
@@ -287,10 +284,9 @@ def _map(values, name, usable, *, above=-np.inf, least=-np.inf, infinite=False):
         raise argument_error(name, f"one number or of shape {usable.shape}", values.shape)
     good = (values > above) & (values >= least) & (np.isfinite(values) | infinite)
     bad = ~good if values.size == 1 else ~good & usable
-    if bad.any():
-        wanted = "positive" if above == 0 else "at least 0" if least == 0 else "finite"
-        got = values[0, 0] if values.size == 1 else f"{np.count_nonzero(bad)} pixels with others"
-        raise argument_error(name, wanted, got)
+    wanted = "positive" if above == 0 else "at least 0" if least == 0 else "finite"
+    got = values[0, 0] if values.size == 1 else f"{np.count_nonzero(bad)} pixels with others"
+    check_that(not bad.any(), name, wanted, got)
     # the value of pixels that are not used must not stop the others beside them
     return np.where(good, values, 1.0)
 

@@ -1,32 +1,26 @@
 """The `Reducer`: ramps in, calibrated images and mosaics out."""
 
 import dataclasses
-import glob
-import os
 from dataclasses import field
 
 from astropy.nddata import CCDData
 
 from miricigale.detector import Charge, Ramp, ResetAnomaly
-from miricigale.instrument import (
-    DetectorProperties,
-    ExposureHistory,
-    ImageFacts,
-    miri_detector,
-)
-from miricigale.instrument.data_models import is_data_model, read_data_model
+from miricigale.instrument import DetectorProperties, ExposureHistory, ImageFacts, miri_detector
 from miricigale.reduction.align import align_images, visit_of
 from miricigale.reduction.assumed import brightness_of, maps_of
 from miricigale.reduction.background import estimate_background, remove_background
 from miricigale.reduction.calibration import calibrate
 from miricigale.reduction.combine import combine, drizzle, subtract_dithers
-from miricigale.reduction.files import open_exposure
+from miricigale.reduction.given import opened, several
 from miricigale.reduction.images import own_grid, with_data
 from miricigale.reduction.reference_cache import ReferenceCache
 from miricigale.reduction.references import ReferenceFiles
 from miricigale.reduction.results import rate_image
 from miricigale.reduction.settings import (
     BACKENDS,
+    KINDS,
+    NEEDED,
     BackgroundSettings,
     MosaicSettings,
     RampSettings,
@@ -34,44 +28,21 @@ from miricigale.reduction.settings import (
 from miricigale.reduction.sky_flat import flattened
 from miricigale.reduction.slopes import fit_slopes
 from miricigale.reduction.stripes import remove_stripes
-from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import Interactive, checked_calls
-from miricigale.utils.options import check_choice, check_kind, check_least, check_positive
+from miricigale.utils.options import (
+    check_choice,
+    check_kind,
+    check_least,
+    check_positive,
+    check_that,
+)
 from miricigale.utils.parallel import thread_count
 from miricigale.utils.progress import progress
 from miricigale.utils.units import ANGLE, RATE, SURFACE_BRIGHTNESS, to_array
 
 # pixels of mosaics
 _SCALE = 0.11 * ANGLE
-#: Classes of the options that are objects.
-_KINDS = {
-    "reset_anomaly": ResetAnomaly, "ramps": RampSettings, "background": BackgroundSettings,
-    "mosaics": MosaicSettings, "properties": DetectorProperties,
-}  # fmt: skip
-#: Settings without which nothing can be done.
-_NEEDED = ("ramps", "background", "mosaics")
-
-
-def _opened(given):
-    """An exposure of its file or data model; anything else itself."""
-    if is_data_model(given):
-        return read_data_model(given, open_exposure)
-    return open_exposure(given) if isinstance(given, (str, os.PathLike)) else given
-
-
-def _several(given):
-    """Exposures of one, of a pattern of files, or of several."""
-    if isinstance(given, str) and glob.has_magic(given) and not os.path.exists(given):
-        paths = sorted(glob.glob(os.path.expanduser(given)))
-        if not paths:
-            msg = f"no file is called {given}"
-            raise DataError(msg)
-        return paths
-    if isinstance(given, (str, os.PathLike)) and os.path.isdir(given):
-        wanted = f"files, such as {os.path.join(given, '*_uncal.fits')!r}"
-        raise argument_error("ramps", wanted, "a folder")
-    one = isinstance(given, (str, os.PathLike, Ramp, Charge, CCDData)) or is_data_model(given)
-    return [given] if one else given
 
 
 @checked_calls
@@ -145,9 +116,9 @@ class Reducer(Interactive):
         for name in ("skip_first", "skip_last"):
             if getattr(self, name) is not None:
                 check_least(getattr(self, name), name, 0, whole=True)
-        for name, kind in _KINDS.items():
+        for name, kind in KINDS.items():
             value = getattr(self, name)
-            if value is None and name in _NEEDED:
+            if value is None and name in NEEDED:
                 raise argument_error(name, f"a {kind.__name__}", "None")
             check_kind(value, name, kind)
         thread_count(self.n_threads)
@@ -182,7 +153,7 @@ class Reducer(Interactive):
         ValueError
             If it is no ramp, or fewer than two groups are left.
         """
-        ramp = _opened(ramp)
+        ramp = opened(ramp)
         return fit_slopes(self, ramp, maps_of(self, ramp), progress_bar)
 
     def fit_ramp(self, ramp, *, planes=False, progress_bar=False):
@@ -208,7 +179,7 @@ class Reducer(Interactive):
             ``planes`` it is the ``image`` of an `ImageFile`, whose ``planes`` are ``VAR_POISSON``
             and ``VAR_RNOISE``, (DN/s)^2: what `write_image` writes as a ``_rate``.
         """
-        ramp = _opened(ramp)
+        ramp = opened(ramp)
         maps = maps_of(self, ramp)
         rate = rate_image(self, ramp, maps, fit_slopes(self, ramp, maps, progress_bar))
         return rate if planes else rate.image
@@ -230,9 +201,8 @@ class Reducer(Interactive):
             As `fit_ramp` returns them, one for each integration; the references are those of
             the exposure. `write_image` makes a ``_rateints`` of the list.
         """
-        ramp = _opened(ramp)
-        if not isinstance(ramp, Ramp):
-            raise argument_error("ramp", "a Ramp", type(ramp).__name__)
+        ramp = opened(ramp)
+        check_that(isinstance(ramp, Ramp), "ramp", "a Ramp", type(ramp).__name__)
         maps = maps_of(self, ramp)
         rates = []
         for number in progress(range(ramp.shape[0]), show=progress_bar, desc="integrations"):
@@ -259,7 +229,7 @@ class Reducer(Interactive):
         cal : `~astropy.nddata.CCDData`
             MJy/sr.
         """
-        rate = _opened(rate)
+        rate = opened(rate)
         facts = ImageFacts.of(rate)
         for key in ("filter", "subarray"):
             if getattr(facts, key) is None:
@@ -288,7 +258,7 @@ class Reducer(Interactive):
         image : `~astropy.nddata.CCDData`
         background : `Background`
         """
-        image = _opened(image)
+        image = opened(image)
         background = estimate_background(image, **self.background.mesh)
         return remove_background(image, background, **self.background.negative), background
 
@@ -336,7 +306,7 @@ class Reducer(Interactive):
             If the images are not surface brightness of one filter, or the grid has no shape
             or lies elsewhere on the sky.
         """
-        images = [_opened(image) for image in _several(images)]
+        images = [opened(image) for image in several(images)]
         wcs = own_grid(images, _SCALE) if wcs is None else wcs
         return self.drizzle(images, wcs)[0].image
 
@@ -373,12 +343,11 @@ class Reducer(Interactive):
             MJy/sr, background subtracted.
         background : `Background`
         """
-        exposure = _opened(exposure)
+        exposure = opened(exposure)
         if isinstance(exposure, (Ramp, Charge)):
             exposure = self.fit_ramp(exposure)
-        if not isinstance(exposure, CCDData):
-            wanted = "a Ramp, a Charge, CCDData or a path"
-            raise argument_error("exposure", wanted, type(exposure).__name__)
+        wanted = "a Ramp, a Charge, CCDData or a path"
+        check_that(isinstance(exposure, CCDData), "exposure", wanted, type(exposure).__name__)
         rate = exposure if exposure.unit.is_equivalent(RATE) else None
         if rate is None and not exposure.unit.is_equivalent(SURFACE_BRIGHTNESS):
             wanted = f"in {RATE} or {SURFACE_BRIGHTNESS}"
@@ -426,19 +395,17 @@ class Reducer(Interactive):
         """
         to_array(pixel_scale, ANGLE, "pixel_scale", ndim=0, finite=True)
         rates, images, backgrounds, name = [], [], [], None
-        for ramp in progress(_several(ramps), show=progress_bar, desc="reduce"):
+        for ramp in progress(several(ramps), show=progress_bar, desc="reduce"):
             rate, subtracted, background = self.reduce(ramp)
             del ramp
             band = ImageFacts.of(subtracted).filter
             name = band if name is None else name
-            if band != name:
-                raise argument_error("ramps", f"of one filter ({name})", band)
+            check_that(band == name, "ramps", f"of one filter ({name})", band)
             if rate is not None:
                 rates.append(rate)
             images.append(subtracted)
             backgrounds.append(background)
-        if not images:
-            raise argument_error("ramps", "at least one ramp", "none")
+        check_that(images, "ramps", "at least one ramp", "none")
         options = {"rates": rates, "wcs": wcs, "pixel_scale": pixel_scale, "align": align}
         return self.combine(images, backgrounds, **options)
 

@@ -8,8 +8,9 @@ from unittest import mock
 from miricigale.instrument.history import TYPES
 from miricigale.reduction.references import ReferenceFiles
 from miricigale.utils.declared import declared
-from miricigale.utils.exceptions import argument_error, data_error
+from miricigale.utils.exceptions import data_error
 from miricigale.utils.optional import require
+from miricigale.utils.options import check_that
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,8 +54,7 @@ class ReferenceCache:
 
     def __post_init__(self):
         folder = self.folder if self.folder is not None else os.environ.get("CRDS_PATH")
-        if not folder:
-            raise argument_error("folder", "given, or the variable CRDS_PATH set", "neither")
+        check_that(folder, "folder", "given, or the variable CRDS_PATH set", "neither")
         object.__setattr__(self, "folder", Path(folder).expanduser())
         found = [path.name for path in self._mappings.glob("jwst_*.pmap")]
         context = self.context or os.environ.get("CRDS_CONTEXT") or max(found, default="a context")

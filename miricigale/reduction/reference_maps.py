@@ -8,6 +8,7 @@ from miricigale.instrument import DQ, READOUT_NAMES, aperture, joined_header
 from miricigale.instrument.history import TYPES
 from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import open_fits
+from miricigale.utils.options import check_data
 from miricigale.utils.parallel import check_memory
 
 #: Values of keywords that fit any exposure.
@@ -36,15 +37,10 @@ def _other(path, name, what):
 
 def _header(hdus, path, name, extension, exposure=None):
     """Keywords of a reference; one of another kind, detector, filter or read-out is refused."""
-    if extension not in hdus:
-        found = f"it has {[hdu.name for hdu in hdus]}"
-        raise data_error(path, f"cannot be read as {_wanted(name, extension)}: {found}")
+    found = f"it has {[hdu.name for hdu in hdus]}"
+    check_data(extension in hdus, path, f"cannot be read as {_wanted(name, extension)}: {found}")
     header = joined_header(hdus, extension)
-    wanted = {
-        "REFTYPE": TYPES.get(name, name).upper(),
-        "INSTRUME": "MIRI",
-        "DETECTOR": "MIRIMAGE",
-    }
+    wanted = {"REFTYPE": TYPES.get(name, name).upper(), "INSTRUME": "MIRI", "DETECTOR": "MIRIMAGE"}
     if exposure is not None:
         wanted["READPATT"] = exposure.readout
     if name == "flat" and exposure.filter is not None:
@@ -108,18 +104,12 @@ def _read(path, exposure, name, extension="SCI"):
     with open_fits(path, wanted=wanted) as hdus:
         header = _header(hdus, path, name, extension, exposure)
         shape = hdus[extension].shape
-        if len(shape) < 2:
-            raise data_error(path, f"cannot be read as {wanted}: {extension} is no image")
+        check_data(len(shape) >= 2, path, f"cannot be read as {wanted}: {extension} is no image")
         n_bytes = 4 * np.prod(shape[:-2], dtype=float) * np.prod(exposure.shape)
         check_memory(n_bytes, f"the {name} reference {path}", advice="use one with fewer groups")
         array = _cut(path, name, hdus[extension].data, header, exposure)
         array = np.ascontiguousarray(array, np.float32)
         return array, _flags(path, name, hdus, header, exposure)
-
-
-def _read_mask(path, exposure):
-    """Flags of bad pixels; there is no other value."""
-    return None, _read(path, exposure, "mask", "DQ")[1]
 
 
 def _read_values(path, exposure, name):
@@ -150,9 +140,8 @@ def _read_bias(path, exposure):
 def _read_linearity(path, exposure):
     """Coefficients of the polynomial to linear DN; none where the file says so."""
     coef, flags = _read(path, exposure, "linearity", "COEFFS")
-    if coef.ndim != 3 or len(coef) < 2:
-        wanted = "must hold coefficients (n, ny, nx) in COEFFS"
-        raise data_error(path, f"{wanted}, got shape {coef.shape}")
+    wanted = "must hold coefficients (n, ny, nx) in COEFFS"
+    check_data(coef.ndim == 3 and len(coef) >= 2, path, f"{wanted}, got shape {coef.shape}")
     bad = ~np.isfinite(coef).all(axis=0) | ((flags & DQ.NO_LIN_CORR) != 0)
     flags[bad] |= int(DQ.NO_LIN_CORR)
     # as in the pipeline: no correction, and a flag
@@ -166,16 +155,16 @@ def _read_groups(path, exposure, name):
     array, flags = _read(path, exposure, name)
     if array.ndim == 3:
         array = array[None]
-    if array.ndim != 4:
-        wanted = "must hold groups (integrations, groups, ny, nx)"
-        raise data_error(path, f"{wanted}, got shape {array.shape}")
+    wanted = "must hold groups (integrations, groups, ny, nx)"
+    check_data(array.ndim == 4, path, f"{wanted}, got shape {array.shape}")
     # what is not known is not subtracted, as in the pipeline
     return np.nan_to_num(array, copy=False, posinf=0.0, neginf=0.0), flags
 
 
 #: Readers of the references of slopes, in the order of their use: each gives values (or None) and flags.
 READERS = {
-    "mask": _read_mask,
+    # flags of bad pixels; there is no other value
+    "mask": lambda path, exposure: (None, _read(path, exposure, "mask", "DQ")[1]),
     "saturation": functools.partial(_read_values, name="saturation"),
     "bias": _read_bias,
     "reset": functools.partial(_read_groups, name="reset"),
@@ -211,9 +200,8 @@ def read_photom(path, exposure, day):
         If there is no row for them, or the time is needed and not known.
     """
     conversion, times = photom_row(path, exposure.filter, exposure.subarray)
-    if times and day is None:
-        what = "has a conversion that depends on time, and the exposure does not state when"
-        raise data_error(path, what)
+    what = "has a conversion that depends on time, and the exposure does not state when"
+    check_data(not (times and day is None), path, what)
     return on_day(conversion, times, day)
 
 
@@ -227,8 +215,7 @@ def photom_row(path, filter, subarray):
         keys = list(zip(*columns, strict=True))
         wanted = [(short, part) for part in (subarray, "GENERIC")]
         known = [keys.index(key) for key in wanted if key in keys]
-        if not known:
-            raise data_error(path, f"has no row for {short} and {subarray}")
+        check_data(known, path, f"has no row for {short} and {subarray}")
         conversion = float(rows["photmjsr"][known[0]])
         times = {
             name: {key.lower(): float(hdus[name].data[key][known[0]]) for key in hdus[name].data.names

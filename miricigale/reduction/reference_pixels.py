@@ -3,7 +3,7 @@
 import numpy as np
 from astropy.stats import sigma_clip
 
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 
 #: Channels of the read-out, to which columns belong in turn.
 _CHANNELS = 4
@@ -104,9 +104,8 @@ def reference_channels(data, reference, *, origin=(0, 0)):
     for channel in range(_CHANNELS):
         mine = [side[columns[side] % _CHANNELS == channel] for side in sides]
         mine = [side for side in mine if side.size]
-        if not mine:
-            wanted = "reference pixels of every channel"
-            raise argument_error("reference", wanted, f"none in columns {channel} + 4 n")
+        wanted = "reference pixels of every channel"
+        check_that(mine, "reference", wanted, f"none in columns {channel} + 4 n")
         for odd in np.unique(parity):
             rows = np.flatnonzero(parity == odd)
             for side in mine:

@@ -1,7 +1,6 @@
 """What a reduction returns."""
 
 import dataclasses
-from typing import ClassVar
 
 import numpy as np
 from astropy.io.fits import Header
@@ -79,17 +78,6 @@ class ReductionResult(Interactive):
     subtracted: np.ndarray
     notes: tuple = ()
     variances: dict = dataclasses.field(default_factory=dict)
-
-    _other_names: ClassVar[dict] = {
-        "image": "mosaic",
-        "background": "backgrounds",
-        "calibrated": "images",
-        "cals": "images",
-        **{
-            name: f"mosaic.{name}"
-            for name in ("data", "uncertainty", "mask", "wcs", "unit", "meta")
-        },
-    }
 
     @property
     def filter(self):

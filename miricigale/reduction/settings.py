@@ -2,8 +2,9 @@
 
 import dataclasses
 
-from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_choice, check_least, check_positive
+from miricigale.detector.effects.reset import ResetAnomaly
+from miricigale.instrument import DetectorProperties
+from miricigale.utils.options import check_choice, check_least, check_positive, check_that
 
 #: Known backends.
 BACKENDS = ("native", "jwst")
@@ -122,10 +123,8 @@ class BackgroundSettings:
     @property
     def negative(self):
         """Options of `remove_background`."""
-        return {
-            "negative_threshold": self.negative_threshold,
-            "negative_noise": self.negative_noise,
-        }
+        names = ("negative_threshold", "negative_noise")
+        return {name: getattr(self, name) for name in names}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -163,5 +162,13 @@ class MosaicSettings:
 
     def __post_init__(self):
         check_positive(self.outlier_threshold, "outlier_threshold", optional=True)
-        if not 0 < self.pixfrac <= 1:
-            raise argument_error("pixfrac", "above 0 and at most 1", self.pixfrac)
+        check_that(0 < self.pixfrac <= 1, "pixfrac", "above 0 and at most 1", self.pixfrac)
+
+
+#: Classes of the options that are objects.
+KINDS = {
+    "reset_anomaly": ResetAnomaly, "ramps": RampSettings, "background": BackgroundSettings,
+    "mosaics": MosaicSettings, "properties": DetectorProperties,
+}  # fmt: skip
+#: Settings without which nothing can be done.
+NEEDED = ("ramps", "background", "mosaics")

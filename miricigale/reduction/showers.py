@@ -41,7 +41,7 @@ def find_showers(data, jumps, usable, threshold, *, first_group, last_group):
     """
     n_diff = last_group - first_group - 1
     where = jumps[:, :4].astype(np.int64)
-    found = []
+    found = [np.zeros((0, 4), np.int64)]
     for k, i in np.unique(where[:, 2:], axis=0):
         beside = [j for j in range(i - _BESIDE, i + _BESIDE + 1) if 0 <= j < n_diff and j != i]
         if len(beside) < 2:
@@ -63,8 +63,6 @@ def find_showers(data, jumps, usable, threshold, *, first_group, last_group):
             place = np.full((len(ys), 4), (part[0].start, part[1].start, k, i))
             place[:, :2] += np.stack([ys, xs], axis=1)
             found.append(place)
-    if not found:
-        return tuple(np.zeros((4, 0), np.int64))
     return tuple(np.unique(np.concatenate(found), axis=0).T)
 
 

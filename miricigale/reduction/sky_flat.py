@@ -11,6 +11,7 @@ from miricigale.reduction.dither_background import other_medians, restored
 from miricigale.reduction.images import plain_mask, with_data
 from miricigale.reduction.sky_mesh import sky_boxes
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 
 
 def sky_flats(images, *, window=None, box=16):
@@ -83,8 +84,7 @@ def sky_flats(images, *, window=None, box=16):
             sources = [estimate_background(im, warn=False).source_mask for im in even]
         hidden = zip(images, masks, sources, strict=True)
         levels = [float(np.median(im.data[~(mask | source)])) for im, mask, source in hidden]
-        if not min(levels) > 0:
-            raise argument_error("images", "of positive sky levels", f"{min(levels):.3g}")
+        check_that(min(levels) > 0, "images", "of positive sky levels", f"{min(levels):.3g}")
         relative = [with_data(im, im.data / v) for im, v in zip(images, levels, strict=True)]
         out = []
         for template in other_medians(relative, masks, sources, [1.0] * len(images), others):

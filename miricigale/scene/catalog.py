@@ -7,6 +7,7 @@ from astropy.table import QTable, Table
 from miricigale.filters.photometry_table import as_photometry
 from miricigale.filters.surveys import flux_bands, is_band
 from miricigale.profiles import SERSIC_INDEX_RANGE
+from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
 from miricigale.utils.missing import plain_floats, without_codes
 from miricigale.utils.options import check_that
@@ -21,29 +22,12 @@ from miricigale.utils.tables import (
 )
 from miricigale.utils.units import FNU
 
+_DECLARED = declared("miricigale.scene", "columns.toml")
 #: Columns that every catalog has, with their unit (None: dimensionless or not a number).
-CATALOG_COLUMNS = {
-    "id": None,
-    "sky": None,
-    "redshift": None,
-    "profile": None,
-    "half_light_radius": u.arcsec,
-    "sersic_index": None,
-    "axis_ratio": None,
-    "position_angle": u.deg,
-}
+CATALOG_COLUMNS = {n: u.Unit(unit) if unit else None for n, unit in _DECLARED["catalog"].items()}
 
 #: What makes a Sersic profile.
 _SHAPE = ("half_light_radius", "sersic_index", "axis_ratio", "position_angle")
-
-#: Names of columns that are usual elsewhere.
-_OTHER_NAMES = {
-    "redshift": {"z", "redshift"},
-    "half_light_radius": {"re", "r_e", "reff", "r_eff", "hlr", "r50"},
-    "sersic_index": {"n", "sersic", "n_sersic", "sersic_n"},
-    "axis_ratio": {"q", "ba", "b_a", "axis_ratio"},
-    "position_angle": {"pa", "theta", "position_angle"},
-}
 
 PROFILES = ("sersic", "point", "cutout")
 
@@ -113,7 +97,7 @@ def as_sources(data, filter, argument="catalog"):
     ['id', 'miri.f770w', 'half_light_radius']
     """
     table = QTable(as_photometry(data, [filter], argument), copy=True)
-    for ours, others in _OTHER_NAMES.items():
+    for ours, others in _DECLARED["other_names"].items():
         theirs = [name for name in table.colnames if name.lower() in others]
         if ours not in table.colnames and theirs:
             table.rename_column(theirs[0], ours)

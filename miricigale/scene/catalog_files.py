@@ -12,11 +12,7 @@ from miricigale.filters.catalog_files import as_catalog_map, catalog_messages
 from miricigale.filters.surveys import flux_bands
 from miricigale.refdata import locate, resources
 from miricigale.scene.catalog import CatalogFlags, check_catalog
-from miricigale.utils.exceptions import (
-    CatalogWarning,
-    DataError,
-    warn,
-)
+from miricigale.utils.exceptions import CatalogWarning, DataError, warn
 from miricigale.utils.files import reading
 from miricigale.utils.table_files import read_table
 from miricigale.utils.units import ab_magnitude
@@ -97,7 +93,7 @@ def read_catalog(path, catalog_map=None, **options):
         table, coded = catalog_map.convert(table, path.name)
         _flags_of_stars(table)
         catalog = check_catalog(table, argument=path.name)
-    texts = list(catalog_messages(lost, coded))
+    texts = list(catalog_messages(lost, [coded]))
     for codes in coded.values():
         catalog["flags"][~np.isnan(codes)] |= int(CatalogFlags.MISSING_CODE)
     texts += _missing_fluxes(catalog)

@@ -20,12 +20,13 @@ from miricigale.scene.catalog_files import read_catalog
 from miricigale.scene.cutouts import Cutout
 from miricigale.scene.render import Painter
 from miricigale.scene.sky import local_jacobian, pixel_positions
+from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
 from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.meta import provenance
 from miricigale.utils.missing import plain_floats
 from miricigale.utils.options import check_kind, check_that
-from miricigale.utils.tables import Flags, described_table
+from miricigale.utils.tables import Flags, described_columns
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, positive, to_array
 
 #: PSFs with known pixel, frame and filter.
@@ -329,14 +330,12 @@ class Scene(Interactive):
         flags[inside & valid & dim] |= SceneFlags.NEAR_EDGE
         painted_as = np.where(sersic, "sersic", "point").astype("U6")
         painted_as[list(self._cutouts)] = "cutout"
-        plain = {"id": catalog["id"], "sky": catalog["sky"], "x": x, "y": y, "profile": painted_as}
-        columns = {name: (values, None) for name, values in plain.items()}
-        columns["flux_total"] = flux * FNU, "light to infinity, the AGN's included"
-        columns["flux_agn"] = agn * FNU, "light of the point at the center"
-        held = "light that the image holds, through PSF and edges"
-        columns["flux_in_image"] = in_image * FNU, held
-        columns["flags"] = flags, SceneFlags.describe()
-        return image, described_table(columns, provenance(filter=self._filter))
+        columns = [catalog["id"], catalog["sky"], x, y, painted_as]
+        columns += [*(light * FNU for light in (flux, agn, in_image)), flags]
+        texts = declared("miricigale.scene", "columns.toml")["truth"] | {
+            "flags": SceneFlags.describe()
+        }
+        return image, described_columns(columns, texts, provenance(filter=self._filter))
 
     @property
     def truth(self):

@@ -78,8 +78,7 @@ def _distinct_agn(component, rows):
 
 def _parameter_table(parameters, rows):
     columns = {name: np.array([row[name] for row in rows], dtype=float) for name in parameters}
-    pairs = {n: (u.Quantity(columns[n], p.unit), p.doc) for n, p in parameters.items()}
-    return described_table(pairs)
+    return described_table({n: (columns[n] * p.unit, p.doc) for n, p in parameters.items()})
 
 
 class _Galaxies:
@@ -183,9 +182,7 @@ def model_grid(model, axes, filters):
             "agn_multiplicity": count,
             "inert": inert,
         }
-    reference = galaxies.absorbed
-    if model.frac_agn_definition != "dust":
-        reference = quantities["reference"]
+    dusty = model.frac_agn_definition == "dust"
 
     galaxy = np.empty((redshift.size, len(rows), len(filters)))
     agn = np.empty((redshift.size, len(agn_spectra), len(filters)))
@@ -202,7 +199,7 @@ def model_grid(model, axes, filters):
         redshift=redshift,
         galaxy=galaxy,
         agn=agn,
-        dust_luminosity=reference,
+        dust_luminosity=galaxies.absorbed if dusty else quantities["reference"],
         allowed=age[None, :] <= universe[:, None],
         galaxy_parameters=_parameter_table(of_galaxy, rows),
         galaxy_properties=properties,

@@ -8,7 +8,7 @@ from miricigale.filters import FilterSet
 from miricigale.refdata import citations
 from miricigale.sed import gridding, presets, tables
 from miricigale.sed.chain import Chain
-from miricigale.sed.component import ROLES, Component, read_config
+from miricigale.sed.component import in_order, read_config
 from miricigale.sed.derived import DERIVED, Derived
 from miricigale.sed.grid import fraction_span
 from miricigale.sed.grid_cache import cached_grid
@@ -69,30 +69,21 @@ class SEDModel(Interactive):
     """
 
     def __init__(self, components, *, cosmology=COSMOLOGY, frac_agn_definition="dust"):
-        self.components = tuple(sorted(components, key=_role_order))
+        self.components = in_order(components)
         fraction_span(frac_agn_definition)
         self.cosmology = cosmology
         self.frac_agn_definition = frac_agn_definition
-        roles = [c.role for c in self.components]
-        if "agn" in roles and "attenuation" not in roles and frac_agn_definition == "dust":
+        if self.has_agn and not self.component("attenuation") and frac_agn_definition == "dust":
             wanted = "'3-1000um' where nothing attenuates: there is no dust luminosity to refer to"
             raise argument_error("frac_agn_definition", wanted, "'dust'")
-        for role in ("sfh", "stellar"):
-            check_that(role in roles, "components", f"with a component of role {role!r}", roles)
-        check_that(len(set(roles)) == len(roles), "components", "at most one of each role", roles)
-        for role, other in (("dust", "attenuation"), ("xray", "agn")):
-            if role in roles and other not in roles:
-                raise argument_error("components", f"with {other!r} if there is {role!r}", roles)
-        for role, name in (("sfh", "age"), ("stellar", "metallicity")):
-            component = self.component(role)
-            wanted = f"with a parameter {name!r} in the {role!r} component"
-            check_that(name in component.parameters, "components", wanted, component)
         merged = {}
         for component in self.components:
             twice = set(component.parameters) & (set(merged) | set(_MODEL_PARAMETERS))
             check_that(not twice, "components", "without shared parameter names", sorted(twice))
             merged.update(component.parameters)
-        own = {n: p for n, p in _MODEL_PARAMETERS.items() if n != "dust_excess" or "dust" in roles}
+        own = dict(_MODEL_PARAMETERS)
+        if self.component("dust") is None:
+            del own["dust_excess"]
         self._parameters = merged | own
         self._notes = ()
 
@@ -161,9 +152,8 @@ class SEDModel(Interactive):
         >>> SEDModel.yang2021(libraries="bundled", igm="inoue2014")
         <SEDModel delayed -> bc03 -> calzetti -> dl07_alpha -> parametric_torus -> inoue2014>
         """
-        return cls._preset(
-            presets.yang2021_components(agn=agn, xray=xray, igm=igm, libraries=libraries), options
-        )
+        made = presets.yang2021_components(agn=agn, xray=xray, igm=igm, libraries=libraries)
+        return cls._preset(made, options)
 
     @classmethod
     def survey(cls, *, agn=True, igm="meiksin2006", libraries="best", **options):
@@ -185,9 +175,8 @@ class SEDModel(Interactive):
         >>> SEDModel.survey(libraries="bundled", agn=False)
         <SEDModel delayed -> bc03 -> nebular -> calzetti -> dl07 -> meiksin2006>
         """
-        return cls._preset(
-            presets.survey_components(agn=agn, igm=igm, libraries=libraries), options
-        )
+        made = presets.survey_components(agn=agn, igm=igm, libraries=libraries)
+        return cls._preset(made, options)
 
     @classmethod
     def _preset(cls, made, options):
@@ -457,9 +446,3 @@ class SEDModel(Interactive):
         if foreground := self.component("foreground"):
             foreground.check_bands(filters)
         return filters
-
-
-def _role_order(component):
-    if not isinstance(component, Component):
-        raise argument_error("components", "Component instances", repr(component))
-    return ROLES.index(component.role)

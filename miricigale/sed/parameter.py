@@ -121,8 +121,7 @@ class Parameter:
         plain = self.convert(getattr(values, "unmasked", values))
         array = np.atleast_1d(np.asarray(np.ma.getdata(plain)))
         check_that(array.ndim == 1, self.name, "of one dimension", f"shape {array.shape}")
-        if array.dtype.kind not in "iuf":
-            raise argument_error(self.name, "numbers", f"values of type {array.dtype}")
+        check_that(array.dtype.kind in "iuf", self.name, "numbers", f"values of type {array.dtype}")
         out = array.astype(float)
         if mask is not None and np.any(mask):
             out[np.broadcast_to(mask, out.shape)] = np.nan

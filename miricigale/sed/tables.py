@@ -10,12 +10,7 @@ from astropy.table import QTable
 from miricigale.filters.filter import UNCOVERED
 from miricigale.sed import _core
 from miricigale.sed.chain import GALAXY, SIX, SKY, STELLAR, distinct
-from miricigale.sed.derived import (
-    DERIVED,
-    agn_quantities,
-    galaxy_quantities,
-    scaled_quantities,
-)
+from miricigale.sed.derived import DERIVED, agn_quantities, galaxy_quantities, scaled_quantities
 from miricigale.sed.spectrum import SED, distance
 from miricigale.utils.exceptions import ModelWarning, warn
 from miricigale.utils.options import check_that

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable, Table
+from astropy.table import Table
 
 from miricigale.filters import FilterSet
 from miricigale.sed.components.igm import Meiksin2006
@@ -16,8 +16,9 @@ from miricigale.sed.spectrum import SED
 from miricigale.utils.exceptions import ModelWarning, argument_error, data_error, warn
 from miricigale.utils.meta import provenance
 from miricigale.utils.missing import plain_floats
-from miricigale.utils.options import check_choice, check_that
+from miricigale.utils.options import check_choice, check_data, check_that
 from miricigale.utils.table_files import read_table
+from miricigale.utils.tables import described_table
 from miricigale.utils.units import FNU, WAVE
 
 _SUFFIXES = (".fits", ".fit", ".dat", ".txt", ".csv", ".ecsv", ".ascii")
@@ -71,8 +72,7 @@ def read_spectra(path):
     if path.is_dir():
         names = sorted(p for p in path.iterdir() if p.is_file())
         files = [p for p in names if p.name.lower().removesuffix(".gz").endswith(_SUFFIXES)]
-        if not files:
-            raise data_error(path, f"has no files of spectra ({', '.join(_SUFFIXES)})")
+        check_data(files, path, f"has no files of spectra ({', '.join(_SUFFIXES)})")
     out = {}
     for file in files:
         found = _read_file(file)
@@ -184,8 +184,7 @@ def template_grid(spectra, filters, *, beyond="error", redshift=None):
     mean = flux.mean(axis=-1, keepdims=True)
     n = len(seds)
     number = np.arange(n, dtype=float)
-    templates = QTable({"template": number * u.one})
-    templates["template"].info.description = "number of the template"
+    templates = described_table({"template": (number * u.one, "number of the template")})
     return ModelGrid(
         filters=filters.names,
         redshift=z,

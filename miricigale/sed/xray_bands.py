@@ -13,6 +13,7 @@ from miricigale.sed.grid_spectra import row_values
 from miricigale.sed.spectrum import distance
 from miricigale.sed.xray import check_band
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.tables import described_table
 from miricigale.utils.units import positive, to_array
 
 #: Slopes between 2500 A and 2 keV, the values of X-CIGALE.
@@ -196,13 +197,10 @@ def _agn_rows(grid, slopes, disk, hard):
     parameters, properties = grid.agn_parameters[rows], grid.agn_properties[rows]
     of_disk = "L_nu of the disk at 2500 A, without dust at 30 deg, W/Hz for each W of AGN power"
     of_corona = "2-10 keV luminosity of the AGN, unabsorbed, W for each W of AGN power"
-    for table, name, values, text in (
-        (parameters, "alpha_ox", np.tile(slopes, grid.n_agn) * u.one, "slope from 2500 A to 2 keV"),
-        (properties, "l_2500", disk[rows] / u.Hz, of_disk),
-        (properties, "l_2_10kev", hard * u.one, of_corona),
-    ):
-        table[name] = values
-        table[name].info.description = text
+    slope = np.tile(slopes, grid.n_agn) * u.one, "slope from 2500 A to 2 keV"
+    parameters.update(described_table({"alpha_ox": slope}))
+    light = {"l_2500": (disk[rows] / u.Hz, of_disk), "l_2_10kev": (hard * u.one, of_corona)}
+    properties.update(described_table(light))
     return {
         "agn_parameters": parameters,
         "agn_properties": properties,

@@ -78,7 +78,7 @@ def reading(path, wanted):
     """
     try:
         yield
-    except (OSError, ValueError, KeyError, MemoryError, UnitsError) as err:
+    except (OSError, ValueError, KeyError, MemoryError, ImportError, UnitsError) as err:
         if Path(path).name not in str(err):
             err.add_note(f"in {path}")
         raise

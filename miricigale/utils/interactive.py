@@ -6,8 +6,8 @@ import functools
 import html
 import inspect
 import operator
-from typing import ClassVar
 
+from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import unknown_name
 from miricigale.utils.positions import sky_as_angles
 
@@ -40,13 +40,13 @@ def checked_calls(cls):
         if name.startswith("_") and name not in ("__init__", "__call__"):
             continue
         if isinstance(member, classmethod):
-            setattr(cls, name, classmethod(_checked(member.__func__)))
+            setattr(cls, name, classmethod(_checked(cls, member.__func__)))
         elif inspect.isfunction(member):
-            setattr(cls, name, _checked(member))
+            setattr(cls, name, _checked(cls, member))
     return cls
 
 
-def _checked(method):
+def _checked(cls, method):
     @functools.wraps(method)
     def call(*args, **kwargs):
         try:
@@ -60,7 +60,9 @@ def _checked(method):
             wanted = signature.replace(parameters=plain, return_annotation=signature.empty)
             kinds = (type(one).__name__ for one in args[1:])
             given = ", ".join([*kinds, *map("{}=".format, kwargs)])
-            name = method.__qualname__.removesuffix(".__init__").removesuffix(".__call__")
+            # functions of other modules are methods too
+            name = f"{cls.__qualname__}.{method.__name__}"
+            name = name.removesuffix(".__init__").removesuffix(".__call__")
             msg = f"{name} takes {wanted}, got ({given})"
             raise TypeError(msg) from None
 
@@ -75,8 +77,10 @@ class Interactive(metaclass=_Named):
     sentence that lists the nearest ones. In notebooks an object is shown as a table of what it holds.
     """
 
-    #: Names that are usual elsewhere, and the attribute of ours, or of one of its parts (``"part.name"``).
-    _other_names: ClassVar[dict] = {}
+    @property
+    def _other_names(self):
+        """Names that are usual elsewhere, and the attribute of ours, or of one of its parts ("part.name")."""
+        return declared("miricigale.utils", "other_names.toml").get(type(self).__name__, {})
 
     def __getattr__(self, name):
         # copies and notebooks ask for private names that need not be there

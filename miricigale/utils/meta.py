@@ -87,7 +87,7 @@ def fits_meta(meta):
         if plain or (isinstance(value, str) and _TEXT.fullmatch(value)):
             own = _KEYWORD.fullmatch(key) is not None and key.upper() not in _RESERVED
             cards[key if own else f"HIERARCH {key}"] = value
-    return cards | {"META": json.dumps(meta, default=plain_text)}
+    return cards | {"META": json.dumps(meta, default=plain_value)}
 
 
 def full_meta(meta):
@@ -95,7 +95,7 @@ def full_meta(meta):
     return json.loads(meta["META"]) if "META" in meta else dict(meta)
 
 
-def plain_text(value):
+def plain_value(value):
     """A value that JSON does not know as one that it does; a quantity keeps its unit as text."""
     if isinstance(value, (np.generic, np.ndarray)) and not hasattr(value, "unit"):
         return value.tolist()

@@ -2,7 +2,7 @@
 
 import numbers
 
-from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.exceptions import argument_error, data_error, unknown_name
 
 
 def check_that(good, name, wanted, got):
@@ -31,6 +31,34 @@ def check_that(good, name, wanted, got):
     """
     if not good:
         raise argument_error(name, wanted, got)
+
+
+def check_data(good, path, what):
+    """
+    Refuse a file unless ``good`` holds.
+
+    Parameters
+    ----------
+    good : bool
+        What must hold.
+    path, what : path, str
+        As for `~miricigale.utils.exceptions.data_error`.
+
+    Raises
+    ------
+    DataError
+        If ``good`` does not hold.
+
+    Examples
+    --------
+    >>> from miricigale.utils.options import check_data
+    >>> check_data(False, "image.fits", "has no SCI extension")
+    Traceback (most recent call last):
+    ...
+    miricigale.utils.exceptions.DataError: image.fits has no SCI extension
+    """
+    if not good:
+        raise data_error(path, what)
 
 
 def check_choice(value, name, known):

@@ -20,6 +20,9 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
 from miricigale.utils.progress import progress
 
+#: Lets this thread set numbers of threads: one that did so keeps others from it since threadpoolctl 3.8.
+_take_over = getattr(threadpoolctl.OpenBLASController, "clear_controlling_thread", lambda **_: None)
+
 #: Functions whose pickle is longer (bytes) go to other processes once, not with every piece.
 _HEAVY = 100_000
 
@@ -184,7 +187,8 @@ def _sent_once(function, executor):
     if len(data) <= _HEAVY:
         yield (function,)
     elif scatter is not None:
-        yield (operator.call, scatter(function))
+        # one of the workers may be lost
+        yield (operator.call, scatter(function, broadcast=True))
     else:
         handle, name = tempfile.mkstemp(prefix="miricigale-", suffix=".pickle")
         try:
@@ -281,12 +285,14 @@ class _SingleThreaded:
             if self._known != len(sys.modules):
                 self._pools, self._known = threadpoolctl.ThreadpoolController(), len(sys.modules)
             if any(pool["num_threads"] > 1 for pool in self._pools.info()):
+                _take_over(force=True)
                 self._limits.append(self._pools.limit(limits=1))
 
     def __exit__(self, *exc):
         with self._lock:
             self._users -= 1
             while self._limits and not self._users:
+                _take_over(force=True)
                 self._limits.pop().restore_original_limits()
 
 

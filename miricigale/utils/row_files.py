@@ -1,5 +1,6 @@
-"""Tables on disk by pieces of rows: FITS binary tables are read and written so, others are read as a whole."""
+"""Tables on disk by pieces of rows: FITS and parquet are read and written so, others are read as a whole."""
 
+import contextlib
 import io
 import json
 import warnings
@@ -12,9 +13,12 @@ from astropy.table import QTable
 
 from miricigale.utils.content import file_sha256
 from miricigale.utils.exceptions import DataError, data_error
-from miricigale.utils.files import open_fits
-from miricigale.utils.store import plain_value, replacing
-from miricigale.utils.table_files import read_table
+from miricigale.utils.files import open_fits, reading, unreadable
+from miricigale.utils.meta import plain_value
+from miricigale.utils.optional import require
+from miricigale.utils.options import check_data
+from miricigale.utils.store import replacing
+from miricigale.utils.table_files import arrow_table, read_table
 from miricigale.utils.units import check_count
 
 
@@ -25,7 +29,7 @@ def open_rows(path, chunk_rows, *, hdu=None):
     Parameters
     ----------
     path : path-like
-        FITS with a binary table, of which one piece at a time is in memory; or any other file for
+        FITS with a binary table, or parquet, of which one piece at a time is in memory; or any other file for
         `~miricigale.utils.table_files.read_table`, also a packed one, which is in memory as a whole.
     chunk_rows : int
         Rows in a piece.
@@ -42,12 +46,13 @@ def open_rows(path, chunk_rows, *, hdu=None):
         If the file is missing, of another kind, or cannot be read by rows.
     """
     chunk_rows = check_count(chunk_rows, "chunk_rows")
-    path = Path(path)
+    path, start = Path(path), b""
     if path.is_file():
         with open(path, "rb") as stream:
-            if stream.read(6) == b"SIMPLE":
-                return _FitsRows(path, chunk_rows, hdu)
-    return RowFile(path, chunk_rows, hdu)
+            start = stream.read(6)
+    kinds = {b"SIMPLE": _FitsRows, b"PAR1": _ParquetRows}
+    kind = next((kind for begin, kind in kinds.items() if start.startswith(begin)), RowFile)
+    return kind(path, chunk_rows, hdu)
 
 
 class RowFile:
@@ -116,9 +121,8 @@ class _FitsRows(RowFile):
             self._header, self.n_rows = table.header.copy(), table.header["NAXIS2"]
             self.colnames = tuple(table.columns.names)
             ragged = [column.name for column in table.columns if set(column.format) & {"P", "Q"}]
-        if ragged:
-            what = f"has columns of variable length, {ragged}"
-            raise data_error(path, f"{what}, which cannot be read in pieces of rows")
+        what = f"has columns of variable length, {ragged}"
+        check_data(not ragged, path, f"{what}, which cannot be read in pieces of rows")
         # what belongs to the whole table
         for key in ("CHECKSUM", "DATASUM", "THEAP"):
             self._header.remove(key, ignore_missing=True)
@@ -141,14 +145,53 @@ class _FitsRows(RowFile):
             return QTable.read(part, character_as_bytes=False)
 
 
+class _ParquetRows(RowFile):
+    """Rows of a parquet file, read in their order; going back begins anew."""
+
+    def __init__(self, path, chunk_rows, hdu):
+        super().__init__(path, chunk_rows, hdu)
+        if hdu is not None:
+            raise unreadable(path, "a catalog", f"'hdu' is {hdu!r}, and it is no FITS file")
+        parquet = require("pyarrow.parquet", extra="parquet")
+        try:
+            # without a buffer a group of rows is read as a whole
+            self._file = parquet.ParquetFile(path, buffer_size=1 << 20)
+            self.n_rows = self._file.metadata.num_rows
+            self._begin()
+            self.colnames = tuple(arrow_table(self._take(0)).colnames)
+        except (OSError, ValueError, NotImplementedError) as err:
+            raise unreadable(path, "a catalog", err) from err
+
+    def _begin(self):
+        self._batches, self._at = self._file.iter_batches(self.chunk_rows), 0
+        self._kept = self._file.schema_arrow.empty_table()
+
+    def _take(self, n):
+        """Return the next rows, a `pyarrow.Table`."""
+        kept = [self._kept]
+        while sum(map(len, kept)) < n:
+            kept.append(type(self._kept).from_batches([next(self._batches)]))
+        rows = require("pyarrow", extra="parquet").concat_tables(kept)
+        self._kept, self._at = rows.slice(n), self._at + n
+        return rows.slice(0, n)
+
+    def _read(self, rows):
+        with reading(self.path, "a catalog"):
+            if rows.start < self._at:
+                self._begin()
+            while self._at < rows.start:
+                self._take(min(self.chunk_rows, rows.start - self._at))
+            return arrow_table(self._take(rows.stop - rows.start))
+
+
 def write_rows(path, tables, n_rows, *, id_width=0, overwrite=False):
     """
-    Write tables of the same columns as one FITS table, one at a time.
+    Write tables of the same columns as one table, one at a time.
 
     Parameters
     ----------
     path : path-like
-        The file.
+        The file: parquet if its name ends so, else FITS.
     tables : iterable of `~astropy.table.Table`
         At least one.
     n_rows : int
@@ -165,27 +208,57 @@ def write_rows(path, tables, n_rows, *, id_width=0, overwrite=False):
     OSError
         If the file is there and ``overwrite`` is not set.
     """
-    layout, n_bytes = None, 0
-    with replacing(path, overwrite=overwrite) as partial, open(partial, "wb") as stream:
+    write = _write_parquet if Path(path).suffix.lower() == ".parquet" else _write_fits
+    with replacing(path, overwrite=overwrite) as partial:
+        write(partial, (_same_ids(table, id_width) for table in tables), n_rows)
+
+
+def _same_ids(table, width):
+    """A table whose ids, if they are text, have the given width."""
+    if "id" in table.colnames and table["id"].dtype.kind == "U":
+        about = table["id"].info.description
+        table["id"] = np.asarray(table["id"]).astype(f"U{max(1, width // 4)}")
+        table["id"].info.description = about
+    return table
+
+
+def _write_parquet(path, tables, _):
+    parquet = require("pyarrow.parquet", extra="parquet")
+    writer, piece = None, path.with_suffix(".piece")
+    with contextlib.ExitStack() as opened:
+        opened.callback(piece.unlink, missing_ok=True)
         for table in tables:
-            header, rows = _fits_rows(table, id_width)
+            # as astropy writes it, with units and descriptions
+            table.write(piece, format="parquet", overwrite=True)
+            rows = parquet.read_table(piece)
+            if writer is None:
+                writer = opened.enter_context(parquet.ParquetWriter(path, rows.schema))
+            _check_same(writer.schema.types, rows.schema.types)
+            writer.write_table(rows)
+
+
+def _write_fits(path, tables, n_rows):
+    layout, n_bytes = None, 0
+    with open(path, "wb") as stream:
+        for table in tables:
+            header, rows = _fits_rows(table)
             columns = [*header["TFORM*"].values()]
             if layout is None:
                 layout, header["NAXIS2"] = columns, n_rows
                 for part in (fits.PrimaryHDU().header, header):
                     stream.write(part.tostring().encode("ascii"))
-            elif columns != layout:
-                raise DataError("the parts have different columns")
+            _check_same(layout, columns)
             n_bytes += stream.write(rows)
         stream.write(bytes(-n_bytes % 2880))
 
 
-def _fits_rows(table, id_width):
-    """Header and rows of a table as astropy writes it, ids that are text of the given width."""
-    if "id" in table.colnames and table["id"].dtype.kind == "U":
-        about = table["id"].info.description
-        table["id"] = np.asarray(table["id"]).astype(f"U{max(1, id_width // 4)}")
-        table["id"].info.description = about
+def _check_same(layout, columns):
+    if columns != layout:
+        raise DataError("the parts have different columns")
+
+
+def _fits_rows(table):
+    """Header and rows of a table as astropy writes it."""
     meta, table.meta = dict(table.meta), {}
     for key, value in meta.items():
         if key == "citations":

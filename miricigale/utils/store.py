@@ -11,7 +11,7 @@ from astropy.io.fits import VerifyError
 
 from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import open_fits, write_fits, writing
-from miricigale.utils.meta import undated
+from miricigale.utils.meta import plain_value, undated
 from miricigale.utils.table_files import table_hdu
 
 #: How the names of unfinished files begin.
@@ -53,13 +53,6 @@ def replacing(path, *, overwrite=True):
             os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
-
-
-def plain_value(value):
-    """Turn a value that JSON does not know into one that it does; others become text."""
-    if isinstance(value, (np.generic, np.ndarray)):
-        return value.tolist()
-    return str(value)
 
 
 def write_parts(path, layout, *, shown=None, text=None, arrays=None, tables=None, overwrite=False):

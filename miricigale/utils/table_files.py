@@ -8,12 +8,13 @@ import warnings
 from pathlib import Path
 
 from astropy.io import fits
-from astropy.table import QTable
+from astropy.table import Column, MaskedColumn, QTable
 from astropy.utils.exceptions import AstropyUserWarning
 
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import open_fits, unpacked_size, unreadable, writing
 from miricigale.utils.meta import fits_meta
+from miricigale.utils.optional import require
 from miricigale.utils.options import check_that
 from miricigale.utils.positions import sky_as_angles
 
@@ -56,6 +57,8 @@ def read_table(path, *, wanted, cls=QTable, form=None, hdu=None):
                 table = cls.read(hdus, format=form, character_as_bytes=False, hdu=hdu)
         elif hdu is not None:
             raise unreadable(path, wanted, f"'hdu' is {hdu!r}, and it is no FITS file")
+        elif form == "parquet":
+            table = arrow_table(require("pyarrow.parquet", extra="parquet").read_table(path), cls)
         else:
             _check_text(path)
             table = cls.read(path, format=form)
@@ -66,6 +69,51 @@ def read_table(path, *, wanted, cls=QTable, form=None, hdu=None):
         raise
     except Exception as err:  # readers of different formats raise different exceptions
         raise unreadable(path, wanted, err) from err
+
+
+def arrow_table(rows, cls=QTable):
+    """
+    Make a table of rows of a parquet file, as astropy does, with its units.
+
+    Parameters
+    ----------
+    rows : `pyarrow.Table`
+        The rows, with the metadata of the file.
+    cls : type, optional
+        Class of the table.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        Missing numbers with a fraction or a unit are NaN, other missing values are masked.
+    """
+    pyarrow = require("pyarrow", extra="parquet")
+    known, missing = dict(rows.schema.metadata or {}), {}
+    for i, field in enumerate(rows.schema):
+        column, kind = rows.column(i), field.type
+        if pyarrow.types.is_dictionary(kind):
+            kind = kind.value_type
+            column = column.cast(kind)
+        text = pyarrow.types.is_string(kind) or pyarrow.types.is_large_string(kind)
+        if column.null_count and not pyarrow.types.is_floating(kind):
+            missing[field.name] = column.is_null().to_numpy()
+            column = column.fill_null("" if text else pyarrow.scalar(0).cast(kind))
+        if text:
+            # what the file says of lengths may be of other rows
+            longest = max(map(len, column.to_pylist()), default=0)
+            known[f"table::len::{field.name}".encode()] = str(max(1, longest)).encode()
+        rows = rows.set_column(i, field.name, column)
+    stream = io.BytesIO()
+    require("pyarrow.parquet", extra="parquet").write_table(
+        rows.replace_schema_metadata(known), stream
+    )
+    table = cls.read(stream, format="parquet")
+    for name, mask in missing.items():
+        if isinstance(table[name], Column):
+            table[name] = MaskedColumn(table[name], mask=mask)
+        else:
+            table[name][mask] = math.nan
+    return table
 
 
 def _check_text(path):

@@ -276,10 +276,9 @@ def ascii_ids(ids, argument):
     if ids.dtype.kind in "UO":
         texts = [key for key in ids.tolist() if isinstance(key, str)]
         foreign = [key for key in texts if not key.isascii() or key != key.rstrip(" ")]
-        if foreign:
-            more = f" and {len(foreign) - 3} more" if len(foreign) > 3 else ""
-            wanted = "ASCII, with no blank at the end, where they go to a FITS file"
-            raise argument_error(argument, wanted, ", ".join(map(repr, foreign[:3])) + more)
+        more = f" and {len(foreign) - 3} more" if len(foreign) > 3 else ""
+        wanted = "ASCII, with no blank at the end, where they go to a FITS file"
+        check_that(not foreign, argument, wanted, ", ".join(map(repr, foreign[:3])) + more)
     return ids
 
 

@@ -1,9 +1,7 @@
 """Typed run configuration: frozen dataclasses from TOML, strict about every key."""
 
 import dataclasses
-from dataclasses import asdict
 from importlib import resources
-from operator import attrgetter
 from pathlib import Path
 from typing import ClassVar
 
@@ -125,11 +123,6 @@ class StudyConfig(Configuration):
         self.check(good, "highres.pixel_scale", "must be 0.06 with method = 'yang2021'")
         good = not photometry.rivals or fine
         self.check(good, "highres.pixel_scale", "must be 0.06 with [photometry] rivals")
-
-    def values(self, *names):
-        """Plain values of sections (``"scene"``) and keys (``"run.name"``), for hashing."""
-        values = {name: attrgetter(name)(self) for name in names}
-        return {name: value if "." in name else asdict(value) for name, value in values.items()}
 
 
 def preset_names():

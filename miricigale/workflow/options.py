@@ -137,6 +137,14 @@ class Configuration:
         n = len(operator.attrgetter(name)(self))
         self.check(n in lengths, name, wanted, n)
 
+    def values(self, *names):
+        """Plain values of sections (``"scene"``) and keys (``"run.name"``), for hashing."""
+        values = {name: operator.attrgetter(name)(self) for name in names}
+        return {
+            name: value if "." in name else dataclasses.asdict(value)
+            for name, value in values.items()
+        }
+
     @classmethod
     def from_dict(cls, values, *, base=None):
         """
@@ -202,48 +210,43 @@ def _shown(value):
 def _replace_section(name, section, entries):
     label = f"[{name}]"
     if not isinstance(entries, dict):
-        raise _wrong(label, "a section", entries)
+        raise config_error(label, f"must be a section, got {entries!r}")
     fields = {field.name: field for field in dataclasses.fields(section)}
     if unknown := sorted(set(entries) - set(fields)):
         raise config_error(label, f"does not know {unknown}; known: {sorted(fields)}")
     hints = typing.get_type_hints(type(section))
     changes = {
-        key: _checked(f"{label} {key}", value, hints[key], _limits_of(fields[key]))
+        key: _checked((name, key), value, hints[key], _limits_of(fields[key]))
         for key, value in entries.items()
     }
     return dataclasses.replace(section, **changes)
 
 
-def _wrong(label, wanted, value):
-    return ConfigError(f"{label} must be {wanted}, got {value!r}")
-
-
-def _checked(label, value, hint, limits):
+def _checked(name, value, hint, limits):
     if typing.get_origin(hint) is tuple:
         if limits.single and isinstance(value, (int, float, str)):
             value = (value,)
-        if not isinstance(value, (list, tuple)):
-            raise _wrong(label, "a list", value)
+        require(isinstance(value, (list, tuple)), *name, "must be a list", repr(value))
         item = typing.get_args(hint)[0]
-        value = tuple(_checked(label, entry, item, limits) for entry in value)
-        if limits.unique and len(set(value)) != len(value):
-            raise config_error(label, f"must not repeat, got {list(value)}")
+        value = tuple(_checked(name, entry, item, limits) for entry in value)
+        repeats = limits.unique and len(set(value)) != len(value)
+        require(not repeats, *name, "must not repeat", list(value))
         return value
     if isinstance(hint, types.UnionType):
         # a number within the limits, or one of the names
         hint = str if isinstance(value, str) else float
     if hint is float and type(value) is int:
         value = float(value)
-    if type(value) is not hint:
-        raise _wrong(label, f"of type {hint.__name__}", value)
-    if hint is float and not math.isfinite(value):
-        raise _wrong(label, "a finite number", value)
+    require(type(value) is hint, *name, f"must be of type {hint.__name__}", repr(value))
     low, high, choices = limits.low, limits.high, limits.choices
-    if hint is str and choices and value not in choices:
-        raise _wrong(label, f"one of {list(choices)}", value)
-    if hint is not str and low is not None and not low <= value <= high:
-        wanted = f"between {low} and {high}" if high < math.inf else f"at least {low}"
-        raise _wrong(label, wanted, value)
+    if hint is str:
+        good = not choices or value in choices
+        require(good, *name, f"must be one of {list(choices)}", repr(value))
+        return value
+    good = hint is not float or math.isfinite(value)
+    require(good, *name, "must be a finite number", repr(value))
+    wanted = f"between {low} and {high}" if high < math.inf else f"at least {low}"
+    require(low is None or low <= value <= high, *name, f"must be {wanted}", repr(value))
     return value
 
 

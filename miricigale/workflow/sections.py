@@ -106,7 +106,8 @@ class PointingSection(Section):
         Share of its side that a tile has in common with the next.
     centers
         Centers of several pointings in degrees, "RA Dec", instead of ra, dec and tiles; or a table of them with
-        the columns ra and dec and, where these differ, roll, bands and time (s, all dithers).
+        the columns ra and dec and, where these differ, roll, bands and time (s, all dithers); or the .pointing
+        file of APT, of which the exposures of the full imager are used.
     """
 
     ra: float = option(53.13440, low=0, high=360)

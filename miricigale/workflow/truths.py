@@ -12,23 +12,11 @@ EXPERIMENTS = ("free_agn", "far_infrared", "no_model_error", "known_redshift", "
 FIELD = "field"
 #: In place of a fracAGN: that of each source, in the column ``frac_agn`` of the catalog.
 CATALOG = "catalog"
-#: Where the sky may differ from what the analysis assumes (section [perturb]), and what the page calls it.
-EFFECTS = {
-    "psf": "PSF, another wavefront",
-    "psf_width": "PSF, width",
-    "flat": "flat field",
-    "gain": "gain",
-    "linearity": "linearity",
-    "zero_point": "zero point, MIRI",
-    "zero_point_existing": "zero point, existing bands",
-    "astrometry": "astrometry",
-    "stars": "stars: bursts and gas",
-    "dust": "dust: Draine & Li",
-    "torus": "another torus",
-    "point_agn": "AGN as a point",
-    "clumps": "made-up clumps",
-    "cutouts": "light of real galaxies",
-}
+#: Where the sky may differ from what the analysis assumes (section [perturb]).
+EFFECTS = (
+    "psf", "psf_width", "flat", "gain", "linearity", "zero_point", "zero_point_existing", "astrometry",
+    "stars", "dust", "torus", "point_agn", "clumps", "cutouts",
+)  # fmt: skip
 #: Effects that need an AGN.
 NEEDS_AGN = ("torus", "point_agn")
 

@@ -225,13 +225,12 @@ def _numba_folder():
 
 def _key():
     """What the compiled code depends on: the sources as numba sees them, packages, processor."""
-    package = _PACKAGE
     processor = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
-    parts = [str(package), sys.version, *processor, os.environ.get("NUMBA_CPU_NAME", "")]
+    parts = [str(_PACKAGE), sys.version, *processor, os.environ.get("NUMBA_CPU_NAME", "")]
     parts += [importlib.metadata.version(name) for name in ("numba", "llvmlite", "numpy")]
-    for path in sorted([*package.glob("*/_core.py"), *package.glob("*/_core/*.py")]):
+    for path in sorted([*_PACKAGE.glob("*/_core.py"), *_PACKAGE.glob("*/_core/*.py")]):
         state = path.stat()
-        parts.append(f"{path.relative_to(package)} {state.st_size} {state.st_mtime_ns}")
+        parts.append(f"{path.relative_to(_PACKAGE)} {state.st_size} {state.st_mtime_ns}")
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
 

@@ -6,18 +6,13 @@ import pytest
 from astropy.table import QTable, Table
 from numpy.testing import assert_allclose, assert_array_equal
 
+from helpers.cases import cases_of
 from helpers.errors import refuses
 from miricigale.cigale import read_cigale_catalog
 from miricigale.filters import Filter, cigale_band, filter_of_band
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
 
-TEXT = """\
-# id redshift IRAC1 IRAC1_err jwst.miri.F770W jwst.miri.F770W_err MIPS1 MIPS1_err
-one 1.324 2.0e-3 1e-4 3e-3 2e-4 0.1 -0.02
-two -1 nan 1e-4 -99 2e-4 0.2 0.03
-three 0.5 -9999 -9999 3e-3 0 -0.01 0.02
-four 0.25 2e-3 nan 3e-3 -9999 0.3 0.04
-"""
+TEXT = cases_of(__file__, "text")
 
 
 @pytest.fixture
@@ -138,15 +133,7 @@ def test_only_the_bands_asked_for(text_file):
     refuses("no column IRAC3", read_cigale_catalog, text_file, error=DataError, bands=["IRAC3"])
 
 
-@pytest.mark.parametrize(
-    ("content", "wanted"),
-    [
-        ("id IRAC1 IRAC1_err\n1 1 1\n", "no column redshift"),
-        ("id redshift IRAC1 IRAC1_err spitzer.irac.ch1\n1 1 1 1 1\n", "IRAC1 and spitzer.irac.ch1"),
-        ("id redshift xray\n1 1 1\n", "no band that is known"),
-        ("id redshift IRAC1 IRAC1_err\n1 1 faint 1\n", "other than numbers in the column 'IRAC1'"),
-    ],
-)
+@pytest.mark.parametrize(("content", "wanted"), cases_of(__file__, "refused"))
 def test_refused(tmp_path, content, wanted):
     path = tmp_path / "c.txt"
     path.write_text(content)
@@ -154,53 +141,10 @@ def test_refused(tmp_path, content, wanted):
     refuses("no such file", read_cigale_catalog, tmp_path / "none.txt", error=DataError)
 
 
-@pytest.mark.parametrize(
-    ("band", "name", "pivot"),
-    [
-        # pivot wavelengths of the instruments' documentation, um
-        ("FUV", "sedpy.galex_FUV", 0.153),
-        ("galex.NUV", "sedpy.galex_NUV", 0.230),
-        ("u_prime", "sedpy.sdss_u0", 0.356),
-        ("sdss.up", "sedpy.sdss_u0", 0.356),
-        ("sdss.zp", "sedpy.sdss_z0", 0.893),
-        ("megacam_u", "megacam.u", 0.38),
-        ("ACS_F606W", "acs.f606w", 0.592),
-        ("hst.wfc3.F275W", "sedpy.wfc3_uvis_f275w", 0.271),
-        ("F336W_UVIS_CHIP2", "sedpy.wfc3_uvis_f336w", 0.335),
-        ("J_2mass", "sedpy.twomass_J", 1.24),
-        ("2mass.Ks", "sedpy.twomass_Ks", 2.16),
-        ("vista.vircam.Ks", "sedpy.vista_vircam_Ks", 2.15),
-        ("ukirt.wfcam.K", "wfcam.k", 2.2),
-        ("WISE3", "sedpy.wise_w3", 12.08),
-        ("IRAC4", "irac.ch4", 7.87),
-        ("MIPS1", "mips.24", 23.68),
-        ("spitzer.mips.70", "mips.70", 71.4),
-        ("F770W", "miri.f770w", 7.64),
-        ("F444W", "nircam.f444w", 4.42),
-        ("PACS_green", "sedpy.herschel_pacs_100", 100.0),
-        ("herschel.pacs.160", "sedpy.herschel_pacs_160", 160.0),
-        ("PLW", "sedpy.herschel_spire_500", 500.0),
-        ("subaru.suprime.IB427", "sedpy.subaru_suprimecam_ia427", 0.426),
-        ("subaru.hsc.y", "sedpy.hsc_y", 0.98),
-        ("V_B90", "sedpy.bessell_V", 0.55),
-        # as their users write them
-        ("cfht.wircam.Ks", "sedpy.cfht_wircam_Ks_8302", 2.15),
-        ("CFHT_wircam_J", "sedpy.cfht_wircam_J_8101", 1.25),
-        ("decam.g", "sedpy.decam_g", 0.48),
-        ("DECam_Y", "sedpy.decam_Y", 0.99),
-        ("panstarrs.i", "sedpy.panstarrs_i", 0.75),
-        ("PS1_y", "sedpy.panstarrs_y", 0.96),
-        ("newfirm.J1", "newfirm.j1", 1.05),
-        ("mayall.newfirm.K", "newfirm.k", 2.17),
-        ("VISTA_Ks", "sedpy.vista_vircam_Ks", 2.15),
-        ("VIRCAM_Y", "sedpy.vista_vircam_Y", 1.02),
-        ("PSW_ext", "sedpy.herschel_spire_250", 250.0),
-        ("SPIRE_350", "sedpy.herschel_spire_350", 350.0),
-        ("HSC-g", "sedpy.hsc_g", 0.48),
-        ("HST_ACS_F606W", "acs.f606w", 0.592),
-        ("MIRI_F770W", "miri.f770w", 7.64),
-    ],
-)
+BANDS = cases_of(__file__, "bands")
+
+
+@pytest.mark.parametrize(("band", "name", "pivot"), BANDS)
 def test_bands(band, name, pivot):
     assert filter_of_band(band) == name
     assert_allclose(Filter.from_name(name).pivot.value, pivot, rtol=0.03)

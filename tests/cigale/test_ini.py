@@ -1,5 +1,6 @@
 import dataclasses
 import warnings
+from pathlib import Path
 
 import astropy.units as u
 import numpy as np
@@ -9,6 +10,7 @@ from astropy.table import QTable, Table
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import quad
 
+from helpers.cases import cases_of
 from helpers.errors import refuses
 from miricigale.cigale import CigaleSetup, fit_cigale, read_cigale_results, write_best_models
 from miricigale.cigale import read_pcigale_ini as read
@@ -19,81 +21,7 @@ from miricigale.utils.exceptions import ConfigError, DataError, MiricigaleWarnin
 
 H_KEV = 4.135667696e-18  # h in keV s
 
-INI = """\
-# A comment, with an = sign
-data_file = galaxies.txt
-parameters_file =
-sed_modules = sfhdelayed, bc03, nebular, dustatt_modified_starburst, dl2007, skirtor2016, redshifting
-analysis_method = pdf_analysis
-cores = 2
-bands = hst.wfc3.F160W, hst.wfc3.F160W_err, IRAC1, IRAC1_err, F770W, F770W_err, MIPS1, MIPS1_err
-properties =
-additionalerror = 0.05
-
-[sed_modules_params]
-  [[sfhdelayed]]
-    tau_main = 500, 5e3   # Myr
-    age_main = 5000, 1000
-    tau_burst = 50.0
-    age_burst = 20
-    f_burst = 0.0
-    sfr_A = 1.0
-    normalise = True
-  [[bc03]]
-    imf = 1
-    metallicity = 0.02
-    separation_age = 10
-  [[nebular]]
-    logU = -3.0
-    zgas = 0.02
-    ne = 100
-    f_esc = 0.0
-    f_dust = 0.0
-    lines_width = 400.0
-    emission = True
-  [[dustatt_modified_starburst]]
-    E_BV_lines = "range 0.5 1.0 0.5"
-    E_BV_factor = 0.44
-    uv_bump_wavelength = 217.5
-    uv_bump_width = 35.0
-    uv_bump_amplitude = 0.0
-    powerlaw_slope = -0.2
-    Ext_law_emission_lines = 2
-    Rv = 3.1
-    filters = B_B90 & V_B90 & FUV
-  [[dl2007]]
-    qpah = 2.5
-    umin = 1.0
-    umax = 1000000.0
-    gamma = 0.1
-  [[skirtor2016]]
-    t = 3, 7
-    pl = 1.0
-    q = 0.5
-    oa = 40
-    R = 20
-    Mcl = 0.97
-    i = 30, 70
-    disk_type = 1
-    delta = -0.36
-    fracAGN = 0.0, 0.5, 0.9
-    lambda_fracAGN = 0/0
-    law = 2
-    EBV = 0.03
-    temperature = 100.0
-    emissivity = 1.6
-  [[redshifting]]
-    redshift =
-
-[analysis_params]
-  variables = agn.fracAGN, stellar.m_star, sfh.sfr10Myrs, sfh.age_main, dust.luminosity
-  bands = jwst.miri.F2100W
-  save_best_sed = False
-  lim_flag = noscaling
-  mock_flag = True
-  redshift_decimals = 1
-  blocks = 1
-"""
+INI = Path(__file__).with_name("pcigale.ini").read_text()
 
 
 def write(folder, *changes, name="pcigale.ini"):
@@ -118,22 +46,11 @@ def quiet(path, **options):
 
 
 def test_the_dialect_is_that_of_configobj(tmp_path):
-    lines = ["sed_modules = 'bc03',", "[sed_modules_params]", "[[a]]", "  one = 2,", "  none = "]
-    lines += ["  list = 1, 'b, c' , \"d # e\" # f", '  x = "eval np.linspace(0, 1, 3)"']
-    lines += ["  y = B_B90 & V_B90", "  z=3=4", "  [[[b]]]", "  open = %(home)s"]
+    dialect = cases_of(__file__, "dialect")
     path = tmp_path / "a.ini"
-    path.write_text("\n".join(lines))
+    path.write_text(dialect["text"])
     found = parse_ini(path)
-    assert found["sed_modules"] == ["bc03"]
-    assert found["sed_modules_params"]["a"] == {
-        "one": ["2"],
-        "none": "",
-        "list": ["1", "b, c", "d # e"],
-        "x": "eval np.linspace(0, 1, 3)",
-        "y": "B_B90 & V_B90",
-        "z": "3=4",
-        "b": {"open": "%(home)s"},
-    }
+    assert {name: found[name] for name in dialect["wanted"]} == dialect["wanted"]
 
 
 def test_settings_have_their_types(tmp_path):
@@ -151,72 +68,17 @@ def test_an_expression_needs_no_quotes():
     assert_allclose(parse_values(parted, "x"), [0, 0.4, 0.8, 0.99])
 
 
-@pytest.mark.parametrize(
-    ("text", "wanted"),
-    [
-        ("2.5", [2.5]),
-        (["3", "1e2", "-0.5"], [-0.5, 3.0, 100.0]),
-        ("range 0.1 1.0 0.1", np.arange(1, 11) / 10),
-        ("range 10 40 10", [10, 20, 30, 40]),
-        ("eval np.linspace(0.01, 6., 5)", np.linspace(0.01, 6, 5)),
-        ("eval np.logspace(-1, 1, num=3)", [0.1, 1, 10]),
-        ("eval list(np.arange(3) * 0.5) ", [0, 0.5, 1]),
-        ("eval np.append(np.linspace(0, 0.8, 3), 0.99)", [0, 0.4, 0.8, 0.99]),
-        ("eval 10**np.linspace(1, 3, 3)", [10, 100, 1000]),
-        ("eval np.round(np.geomspace(1, 10, 3), 2)", [1, 3.16, 10]),
-        ("eval [1, 2**3, -(1 + 1) / 4]", [-0.5, 1, 8]),
-        ("eval 7", [7]),
-    ],
-)
+@pytest.mark.parametrize(("text", "wanted"), cases_of(__file__, "values"))
 def test_values(text, wanted):
     assert_allclose(parse_values(text, "x"), wanted, rtol=1e-12)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "eval __import__('os').remove('x')",
-        "eval open('x')",
-        "eval np.load('x')",
-        "eval np.lib.format.open_memmap('x')",
-        "eval (1).__class__",
-        "eval [x for x in (1, 2)]",
-        "eval lambda: 1",
-        "eval np.linspace(0, 1, 10**9)",
-        "eval np.linspace(0, 1, 3, dtype=1)",
-        "eval np.arange(0, 1e12, 1)",
-        "eval 9**9**9**9",
-        "eval 1/0",
-        "eval 'text'",
-        "eval " + "(" * 5000,
-        "eval",
-        "range 1 2",
-        "range 0 1 0",
-        "three",
-        ["1", "1.0"],
-        [],
-        "nan",
-    ],
-)
+@pytest.mark.parametrize("text", [*cases_of(__file__, "no_values"), "eval " + "(" * 5000])
 def test_nothing_else_is_evaluated(text):
     refuses(r"^'?fracAGN'? ", parse_values, text, "fracAGN")
 
 
-@pytest.mark.parametrize(
-    ("content", "wanted"),
-    [
-        ("a = 1\nb\n", "neither section nor keyword.* line 2"),
-        ("a = 1\na = 2\n", "Duplicate keyword name at line 2"),
-        ("[[b]]\n", "nested at line 1"),
-        ("[b]\n[b]\n", "Duplicate section name at line 2"),
-        ("[b\n", "line 1"),
-        ('a = "b\n', "line 1"),
-        ('a = """b\n', "line 1"),
-        ("analysis_params = 1\nsed_modules = a\n[sed_modules_params]\n", "no configuration"),
-        (b"a = \xff\n".decode("latin1"), "no sed_modules"),
-        ("a = 1\n", "no sed_modules"),
-    ],
-)
+@pytest.mark.parametrize(("content", "wanted"), cases_of(__file__, "foreign"))
 def test_foreign_files_are_refused(tmp_path, content, wanted):
     path = tmp_path / "pcigale.ini"
     path.write_text(content)
@@ -274,33 +136,12 @@ def test_definition_of_the_fraction_and_flag_of_limits(tmp_path):
 
 
 def test_other_modules(tmp_path):
-    sections = """\
-  [[sfh2exp]]
-    tau_main = 6000
-    tau_burst = 50
-    f_burst = 0.01, 0.1
-    age = 3000
-    burst_age = 20, 40
-    sfr_0 = 1.0
-    normalise = True
-  [[dustatt_modified_CF00]]
-    Av_ISM = 0.5, 1
-    mu = 0.44
-    slope_ISM = -0.7
-    slope_BC = -1.3
-    filters = V_B90
-  [[casey2012]]
-    temperature = 35
-    beta = 1.6
-    alpha = 2.0, 2.5
-[analysis_params]
-"""
     modules = "sed_modules = sfh2exp, bc03, dustatt_modified_CF00, casey2012, redshifting"
     old = next(line for line in INI.splitlines() if line.startswith("sed_modules"))
     path = write(
         tmp_path,
         (old, modules),
-        ("[analysis_params]\n", sections),
+        ("[analysis_params]\n", cases_of(__file__, "other_modules")),
         ("redshift =\n", 'redshift = "eval np.linspace(0.5, 1, 3)"\n'),
         ("agn.fracAGN, ", ""),
         ("sfh.age_main", "sfh.age"),
@@ -323,17 +164,9 @@ def test_other_modules(tmp_path):
 def test_history_from_a_file(tmp_path):
     rows = "\n".join(f"{t} {2.0 if t < 50 else 0.0} 1.0" for t in range(100))
     (tmp_path / "history.txt").write_text(f"# time burst steady\n{rows}\n")
-    section = """\
-  [[sfhfromfile]]
-    filename = history.txt
-    sfr_column = 1, 2
-    age = 100
-    normalise = True
-[analysis_params]
-"""
     modules = "sed_modules = sfhdelayed", "sed_modules = sfhfromfile"
-    path = write(tmp_path, ("[analysis_params]\n", section), modules)
-    setup = quiet(path)
+    section = "[analysis_params]\n", cases_of(__file__, "history_from_a_file")
+    setup = quiet(write(tmp_path, section, modules))
     assert_array_equal(setup.parameters["sfh_index"], [0, 1])
     sfh = setup.components[0]
     rate = sfh.history({"age": 0.1, "sfh_index": 0})
@@ -404,26 +237,7 @@ def test_one_message_names_all_that_is_left_out(tmp_path):
     refuses(r"(?s)module radio.*parametric_torus", read, path, error=ConfigError, **strict)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "wanted"),
-    [
-        ("sfhdelayed, bc03", "sfhperiodic, sfhperiodic", "sfh, stellar .*sfhperiodic, sfhperiodic"),
-        ("sfhdelayed, bc03", "sfhdelayed, m2005", "m2005 is not here, .* take bc03"),
-        ("skirtor2016,", "fritz2006,", "fritz2006 is not here, .* take skirtor2016"),
-        ("tau_main = 500, 5e3", "tau_main = 500, fast", r"sfhdelayed.tau_main = 500, fast"),
-        # a parameter by another name does not become the default
-        ("tau_main = 500, 5e3", "tau = 500, 5e3", r"sfhdelayed.tau: .* tau_main"),
-        ("uv_bump_width = 35.0", "width = 35", r"starburst.width: .* uv_bump_width"),
-        ("t = 3, 7", "t = 3, 3", "'skirtor2016.t' must be of different values"),
-        ("parameters_file =", "parameters_file = models.txt", "parameters_file"),
-        ("IRAC1, IRAC1_err, F770W, F770W_err", "F770W, jwst.miri.F770W", "both the filter miri"),
-        ("IRAC1, IRAC1_err", "IRAC1_err", "not IRAC1"),
-        ("lambda_fracAGN = 0/0", "lambda_fracAGN = all", "two wavelengths"),
-        ("lim_flag = noscaling", "lim_flag = perhaps", "lim_flag"),
-        ("additionalerror = 0.05", "additionalerror = -1", "additionalerror"),
-        ("redshift_decimals = 1", "redshift_decimals = x", "redshift_decimals"),
-    ],
-)
+@pytest.mark.parametrize(("old", "new", "wanted"), cases_of(__file__, "refused"))
 def test_refused(tmp_path, old, new, wanted):
     path = write(tmp_path, (old, new))
     with pytest.raises(ConfigError, match=wanted) as error:
@@ -460,16 +274,7 @@ def write_catalog(path, redshift, fluxes, bands, error=0.01, **more):
     Table(columns).write(path, format="ascii.commented_header", overwrite=True)
 
 
-ROWS = {
-    "redshift": [0.5, 1.3, 0.5],
-    "mass": [1e10, 3e10, 1e11],
-    "tau": [0.5, 5.0, 0.5],
-    "age": [5.0, 1.0, 1.0],
-    "ebv_lines": [0.5, 1.0, 0.5],
-    "tau97": [7.0, 3.0, 7.0],
-    "inclination": [30.0, 70.0, 70.0],
-    "frac_agn": [0.5, 0.0, 0.9],
-}
+ROWS = cases_of(__file__, "rows")
 
 
 def nearer(redshift, node):
@@ -754,16 +559,7 @@ def apart_from_just(values):
     return values("alpha_ox").value - (-0.137 * disk + 2.638)
 
 
-XRAY = """
-  [[xray]]
-    gam = 1.7
-    E_cut = 200
-    alpha_ox = -1.7, -1.4
-    max_dev_alpha_ox = 0
-    angle_coef = 0.5 & 0
-    det_lmxb = 0.2
-    det_hmxb = 0.0
-  [[redshifting]]"""
+XRAY = cases_of(__file__, "xray")
 
 
 BAND = "xray_boxcar_0p5to2keV"

@@ -162,9 +162,6 @@ def test_refuses_wrong_images(make_exposure, make_sky, detector):
         refused(match, image)
     image.data[3, 4], image.mask = 5.0, image.data < 0
     refused(r"'image' must be without masked pixels.* got 1 of them", image)
-    for n_threads in (0, 1.5):
-        refused("'n_threads' must be at least 1 and an integer", plain, n_threads=n_threads)
-    refused("'seed' must be", plain, seed=-1)
 
 
 def test_refuses_images_of_another_place_or_filter(make_exposure, make_sky, detector):

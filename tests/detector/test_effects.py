@@ -5,25 +5,21 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 
+from helpers.cases import cases_of
 from helpers.errors import refuses
+from miricigale import detector
 from miricigale.depth import residual_amplitude
 from miricigale.detector import (
     BadPixels,
     Bias,
     Block,
-    BrighterFatter,
     CosmicRays,
     Dark,
     Detector,
-    FirstFrame,
     InterpixelCapacitance,
-    LastFrame,
     Nonlinearity,
-    Persistence,
     ReadNoise,
     ReferencePixels,
-    ResetAnomaly,
-    ResetDecay,
     Residual,
     Saturation,
 )
@@ -224,27 +220,12 @@ def test_residual_by_name_has_the_amplitude_of_the_filter(make_block, name):
 
 
 #: Values out of range, by effect and argument.
-WRONG = {
-    Residual: {"amplitude": [0.5], "correlation": [-1]},
-    CosmicRays: {"leakage": [0.3], "shower_fraction": [2], "track_max": [1000], "flux": [-1.0],
-                 "yield_dex": [np.nan], "shower_sigma": [0]},
-    Dark: {"current": [-0.2]},
-    BadPixels: {"hot_current": [np.inf]},
-    Saturation: {"full_well": [0]},
-    Bias: {"level": [np.nan], "reset_noise": [-1]},
-    ReadNoise: {"sigma": [-6], "pink": [np.nan], "octaves": [0]},
-    BrighterFatter: {"strength": [-0.1, 0.3]},
-    Persistence: {"amplitudes": [(-0.1, 0.2)], "times": [(0, 1)], "deficit": [-1], "deficit_time": [0]},
-    ResetAnomaly: {"amplitudes": [(), (np.nan,)], "groups": [0]},
-    ResetDecay: {"share": [1.0], "groups": [np.nan]},
-    FirstFrame: {"offset": [np.inf]},
-    LastFrame: {"coupling": [1.5], "offset": [np.nan]},
-}  # fmt: skip
+WRONG = cases_of(__file__)
 
 
 @pytest.mark.parametrize("effect", WRONG)
 def test_errors_name_the_argument(effect):
-    needed = {"amplitude": 0.01} if effect is Residual else {}
+    needed = {"amplitude": 0.01} if effect == "Residual" else {}
     for name, values in WRONG[effect].items():
         for value in values:
-            refuses(f"'{name}' must be", effect, **{**needed, name: value})
+            refuses(f"'{name}' must be", getattr(detector, effect), **{**needed, name: value})

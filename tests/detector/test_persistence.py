@@ -140,9 +140,7 @@ def test_refuses_what_cannot_be_remembered(make_exposure, make_sky):
     wanted = "no sub-array 'SUB65'; known: BRIGHTSKY"
     refuses(wanted, Latent, np.ones((2, 2)) * RATE, 1 * u.s, "SUB65", error=KeyError)
     refuses("'ramp' must be a Ramp", Latent.from_ramp, sky, 1 * u.s)
-    refuses("'time'", latent.after, 5, error=u.UnitsError)
     refuses("'rate' must be nowhere negative", Latent, np.array([[-1.0]]) * RATE, 1 * u.s)
     refuses("'gap' must be at least 0 s", Latent, np.ones((2, 2)) * RATE, -1 * u.s)
-    refuses("'gap'", Latent, np.ones((2, 2)) * RATE, 1 * u.m, error=u.UnitsError)
     for amplitudes in ((0.1, 0.2, 0.3), ()):
         refuses("'amplitudes, times' must be", Persistence, amplitudes, amplitudes[:2])

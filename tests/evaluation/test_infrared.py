@@ -2,11 +2,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 
-from miricigale.evaluation import (
-    feature_magnitude,
-    feature_redshifts,
-    feature_residuals,
-)
+from miricigale.evaluation import feature_magnitude, feature_redshifts, feature_residuals
 from miricigale.filters import Filter
 from miricigale.sed import SED
 

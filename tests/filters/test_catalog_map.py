@@ -8,6 +8,7 @@ import pytest
 from astropy.table import QTable, Table
 from numpy.testing import assert_allclose, assert_array_equal
 
+from helpers.cases import cases_of
 from helpers.errors import refuses
 from miricigale.filters import SURVEYS, CatalogMap, Filter, read_catalog_photometry
 from miricigale.filters.catalog_files import MappedRows, codes_of
@@ -135,34 +136,12 @@ def test_factors():
     refuses("no column of catalog 'totl'", convert, columns, error=KeyError, factor="totl")
 
 
-#: Columns of each survey: places, uJy in one of their units, how fluxes become errors, fluxes of bands.
-NAMES = {
-    "candels": ("ID RA DEC", 1.0, ("FLUX", "FLUXERR"), {
-        "megacam.u": "CFHT_u_FLUX", "acs.f606w": "ACS_F606W_FLUX", "wfc3.f160w": "WFC3_F160W_FLUX",
-        "sedpy.cfht_wircam_Ks_8302": "WIRCAM_K_FLUX", "newfirm.j1": "NEWFIRM_J1_FLUX",
-        "sedpy.vlt_isaac_Ks": "ISAAC_KS_FLUX", "irac.ch1": "IRAC_CH1_FLUX"}),
-    "3dhst": ("id ra dec", 0.363078, ("f_", "e_"), {
-        "acs.f606w": "f_F606W", "wfc3.f125w": "f_F125W", "wfc3.f160w": "f_F160W",
-        "irac.ch4": "f_IRAC4"}),
-    "jades": ("ID RA DEC", 1e-3, ("CONV", "CONV_e"), {
-        "nircam.f090w": "F090W_KRON_CONV", "nircam.f410m": "F410M_KRON_CONV",
-        "acs.f814w": "F814W_KRON_CONV"}),
-    "dja": ("id ra dec", 1.0, ("_tot_", "_etot_"), {
-        "acs.f606w": "f606w_tot_1", "nircam.f115w": "f115w_tot_1",
-        "nircam.f444w": "f444w-clear_tot_1", "miri.f770w": "f770w_tot_1"}),
-    "cosmos2020": ("ID ALPHA_J2000 DELTA_J2000", 1.0, ("FLUX", "FLUXERR"), {
-        "megacam.u": "CFHT_ustar_FLUX_APER2", "sedpy.hsc_g": "HSC_g_FLUX_APER2",
-        "sedpy.vista_vircam_Ks": "UVISTA_Ks_FLUX_APER2", "irac.ch1": "IRAC_CH1_FLUX",
-        "sedpy.subaru_suprimecam_ia427": "SC_IB427_FLUX_APER2"}),
-    "ceers": ("id redshift", 1e3, ("W", "W_err"), {
-        "acs.f606w": "hst.wfc.F606W", "nircam.f444w": "jwst.nircam.F444W",
-        "miri.f770w": "jwst.miri.F770W"}),
-}  # fmt: skip
+NAMES = cases_of(__file__, "surveys")
 
 
 @pytest.mark.parametrize("survey", sorted({*SURVEYS} - {"cigale"}))
 def test_columns_of_surveys(survey):
-    places, in_ujy, error, bands = NAMES[survey]
+    places, in_ujy, error, bands = NAMES[survey].values()
     table = Table({name: [1.0] for name in places.split()})
     for k, name in enumerate(bands.values()):
         table[name], table[name.replace(*error)] = [k + 2.0], [0.5]
@@ -280,13 +259,7 @@ def test_real_magnitudes_of_goodss(data_file):
     assert np.median(ratio) == pytest.approx(1, abs=0.02)
 
 
-#: Names of numbers of EAZY, and the central wavelengths in Angstrom of FILTER.RES.latest.info.
-EAZY = {
-    6: ("acs.f814w", 8059.9), 18: ("irac.ch1", 35569.0), 88: ("megacam.u", 3828.0),
-    131: ("newfirm.h1", 15601.0), 160: ("sedpy.sdss_z0", 8946.7), 205: ("wfc3.f160w", 15396.0),
-    208: ("sedpy.wfc3_uvis_f275w", 2708.6), 259: ("sedpy.vista_vircam_Ks", 21503.0),
-    325: ("mips.24", 237589.0), 377: ("nircam.f444w", 44037.0), 396: ("miri.f770w", 76364.0),
-}  # fmt: skip
+EAZY = cases_of(__file__, "eazy")
 
 
 @pytest.mark.parametrize("number", EAZY)

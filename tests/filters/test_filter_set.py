@@ -33,11 +33,6 @@ def test_is_an_ordered_collection(filters):
     assert "irac.ch1" not in filters
 
 
-def test_pivots_in_um(filters):
-    assert filters.pivots.unit == u.um
-    assert_allclose(filters.pivots.value, [0.3828, 1.5369, 7.884, 7.639, 20.795], rtol=1e-3)
-
-
 def test_weights_are_those_of_the_single_filters(filters):
     wave = np.geomspace(0.1, 100, 700)
     weights = filters.weights(wave)

@@ -10,14 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
 from helpers.grids import brute_force, draw_photometry, make_grid, node_fitter
-from miricigale.fitting import (
-    BayesFitter,
-    FitFlags,
-    FitResults,
-    GridSettings,
-    Samples,
-    fit_file,
-)
+from miricigale.fitting import BayesFitter, FitFlags, FitResults, GridSettings, Samples, fit_file
 from miricigale.utils.exceptions import MiricigaleWarning
 
 

@@ -1,8 +1,11 @@
 """Workers in other processes: the same numbers, and the grid travels once."""
 
 import operator
+import os
 import pickle
-from concurrent.futures import ProcessPoolExecutor
+import signal
+import time
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from functools import partial
 from multiprocessing import get_context
 
@@ -12,7 +15,7 @@ from numpy.testing import assert_array_equal
 
 from helpers.grids import draw_photometry, make_grid
 from helpers.results import assert_same
-from miricigale.fitting import BayesFitter, fit_file
+from miricigale.fitting import BayesFitter, FitFlags, fit_file
 from miricigale.utils.parallel import parallel_map
 
 
@@ -51,29 +54,43 @@ def elsewhere(fitter, photometry):
         return fitter.fit(photometry, executor=executor)
 
 
-@pytest.mark.parametrize("processes", [True, False])
-def test_two_dask_workers_give_the_numbers_of_one_process(grid, photometry, tmp_path, processes):
+def test_two_dask_workers_give_the_numbers_of_one_process(grid, photometry, tmp_path):
+    """And the bytes of its files, where one of them is killed."""
     distributed = pytest.importorskip("distributed")
     fitter = BayesFitter(grid)
-    whole = elsewhere(fitter, photometry) if processes else fitter.fit(photometry)
+    whole = elsewhere(fitter, photometry)
+    photometry["id"][70] = photometry["id"][3]
+    photometry.write(tmp_path / "catalog.fits")
+    one, two = (tmp_path / name for name in ("one", "two"))
+    arguments = {"path_in": tmp_path / "catalog.fits", "chunk_rows": 5}
     options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
     with (
-        distributed.LocalCluster(processes=processes, **options) as cluster,
+        distributed.LocalCluster(**options) as cluster,
         distributed.Client(cluster) as client,
+        ThreadPoolExecutor(1) as other,
     ):
-        assert len(client.scheduler_info()["workers"]) == 2
-        executor = client.get_executor()
-        assert_same(fitter.fit(photometry, executor=executor, chunk_size=8), whole)
-        # both workers had their part
-        n_done = client.run(lambda dask_worker: dask_worker.state.executed_count)
-        assert len(n_done) == 2
-        assert min(n_done.values()) > 0
-        photometry.write(tmp_path / "catalog.fits")
-        options = {"chunk_rows": 50, "executor": executor}
-        results = fit_file(fitter, tmp_path / "catalog.fits", tmp_path / "out", **options)
-        table = results.to_table()
+        pids = list(client.run(os.getpid).values())
+        assert len(pids) == 2
+
+        def kill():
+            while not (two / "part-00002.fits").exists():
+                time.sleep(0.01)
+            os.kill(pids[0], signal.SIGKILL)
+
+        executor, done = client.get_executor(), other.submit(kill)
+        fit_file(fitter, path_out=two, executor=executor, **arguments)
+        done.result()
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as executor:
+        results = fit_file(fitter, path_out=one, executor=executor, **arguments)
+    names = sorted(path.name for path in one.iterdir())
+    assert sorted(path.name for path in two.iterdir()) == names
+    for name in names[1:]:
+        assert (one / name).read_bytes() == (two / name).read_bytes(), name
+    table = results.to_table()
+    assert np.flatnonzero(table["flags"] & FitFlags.DUPLICATE_ID)[0] == 70
     for name, column in whole.to_table().items():
-        assert_array_equal(np.asarray(table[name]), np.asarray(column), err_msg=name)
+        mine, theirs = (np.delete(np.asarray(one), 70) for one in (table[name], column))
+        assert_array_equal(mine, theirs, err_msg=name)
 
 
 def test_processes_get_the_grid_once(grid, photometry):

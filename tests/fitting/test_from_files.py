@@ -188,7 +188,7 @@ def test_a_table_without_fluxes_is_refused_with_what_is_wanted(tmp_path, capsys,
     assert "Traceback" not in err
 
 
-def test_the_page_of_a_catalog_says_how_redshifts_compare_and_what_was_left_out(catalog, tmp_path):
+def test_the_page_says_how_redshifts_compare_and_what_is_left_out(catalog, tmp_path, monkeypatch):
     """Redshifts of the models themselves come back; a band of no error is counted, flags have their meanings."""
     table = catalog.copy()
     table["irac.ch2_err"][1] = -1.0 * u.uJy
@@ -207,6 +207,9 @@ def test_the_page_of_a_catalog_says_how_redshifts_compare_and_what_was_left_out(
     ):
         assert text in page, text
     assert "outliers, above 0.15" in page
+    monkeypatch.setattr("miricigale.fitting.page._MOST", 2)
+    few = fit_page(results, tmp_path / "cat.fits").to_html()
+    assert "numbers and figures are of one object in 3, 2 of them" in few
     refuses("z_phot", fit_page, results, tmp_path / "cat.fits", z_spec="z_phot")
 
 

@@ -22,13 +22,7 @@ from helpers.grids import (
     photometry_table,
 )
 from helpers.results import assert_joined
-from miricigale.fitting import (
-    FitFlags,
-    GridSettings,
-    fit_file,
-    leave_out,
-    mock_analysis,
-)
+from miricigale.fitting import FitFlags, GridSettings, fit_file, leave_out, mock_analysis
 
 ERROR = {"band0": 0.1, "band1": 0.05, "band3": 0.2}
 FLOOR = {"band2": 0.15, "band3": 0.02}

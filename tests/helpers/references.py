@@ -12,17 +12,10 @@ from miricigale.instrument import DQ, flat_field, photmjsr, reference_pixel_mask
 __all__ = ["KINDS", "POINTED", "imager_keywords", "nameless", "write_cache", "write_reference"]
 
 #: Reference types and the extension of their arrays.
-KINDS = {
-    "mask": None,
-    "saturation": "SCI",
-    "superbias": "SCI",
-    "reset": "SCI",
-    "linearity": "COEFFS",
-    "dark": "SCI",
-    "gain": "SCI",
-    "readnoise": "SCI",
-    "flat": "SCI",
-}
+KINDS = dict.fromkeys(
+    ["saturation", "superbias", "reset", "dark", "gain", "readnoise", "flat"], "SCI"
+)
+KINDS |= {"mask": None, "linearity": "COEFFS"}
 
 
 #: Where a file of the imager points.

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from helpers.cases import cases_of
 from helpers.errors import refuses
 from miricigale.instrument import (
     DetectorProperties,
@@ -99,16 +100,7 @@ def test_subarrays_are_cut_from_the_same_detector():
     refuses("no sub-array 'SUB3'", bad_pixel_mask, subarray="SUB3", error=KeyError)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"gain": 0}, "'gain' must be positive, got 0"),
-        ({"read_noise": -1}, "'read_noise' must be at least 0"),
-        ({"nonlinearity": (0, 2)}, "'nonlinearity' must be coefficients that begin with 0, 1"),
-        ({"nonlinearity": (0, 1, -1e-4)}, "'nonlinearity' must be rising"),
-        ({"ipc": (1, 2)}, "'ipc' must be three shares"),
-    ],
-)
+@pytest.mark.parametrize(("options", "message"), cases_of(__file__, "refused"))
 def test_rejects_impossible_detectors(options, message):
     refuses(message, DetectorProperties, **options)
     refuses(r"no imaging filter 'miri.f1w'", flat_field, "miri.f1w", error=KeyError)

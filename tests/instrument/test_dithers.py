@@ -12,6 +12,7 @@ from miricigale.instrument import (
     Exposure,
     dither_offsets,
     imager_columns,
+    read_centers,
     read_dithers,
     tile_offsets,
 )
@@ -175,6 +176,25 @@ def test_tiles_have_one_pattern_or_none(tmp_path):
     refuses(r"plan\.pointing: tiles of the observation have dithers", read_dithers, path)
 
 
+def test_centers_of_a_list_have_the_target_where_the_list_has_it(tmp_path):
+    """At its distance and angle from +y, which is V3IdlYAngle from V3 (SIAF: 4.835 deg for MIRIM_FULL)."""
+    prime = [row(1, 100.0, 50.0, aperture="MIRIM_ILLUM"), row(2, 104.0, 46.0, exp=2)]
+    beside = [row(1, 0.0, 0.0, aperture="NRCBS_FULL"), row(1, -380.417, -90.488, kind="PARALLEL")]
+    extra = [row(1, 9.0, 9.0, kind="T_ACQ"), row(1, 9.0, 9.0, aperture="MIRIM_SUB256")]
+    path = pointing_list(tmp_path / "plan.pointing", {3: prime + extra, 8: beside})
+    target, roll = SkyCoord(80.48750, -69.49750, unit="deg"), 200 * u.deg
+    centers, others = read_centers(path, roll)
+    assert others == ["MIRIM_FULL (T_ACQ)", "MIRIM_SUB256 (SCIENCE)", "NRCBS_FULL (SCIENCE)"]
+    for center, (x, y) in zip(centers, [(102.0, 48.0), (-380.417, -90.488)], strict=True):
+        assert_allclose(center.separation(target).arcsec, np.hypot(x, y), atol=2e-3)
+        angle = center.position_angle(target) - roll - 4.83545 * u.deg + np.arctan2(x, y) * u.rad
+        assert_allclose(np.sin(angle) * np.hypot(x, y), 0, atol=2e-3)
+        assert np.cos(angle) > 0.99
+    pointing_list(path, {1: beside[:1]})
+    match = r"no exposures of the full imager; it has \['NRCBS_FULL \(SCIENCE\)'\]"
+    refuses(match, read_centers, path, roll, error=DataError)
+
+
 OFFSETS = [[0, 0], [1, 2]] * u.arcsec
 BARE = QTable({"x_offset": [1.0], "y_offset": [1.0]})
 WANTED = r"offsets of shape \(3, 2"
@@ -183,12 +203,9 @@ WANTED = r"offsets of shape \(3, 2"
 @pytest.mark.parametrize(
     ("function", "args", "options", "error", "match"),
     [
-        (tile_offsets, [2, 0], {}, ValueError, "'n_y' must be an integer >= 1, got 0"),
         (tile_offsets, [2, 2], {"overlap": 1}, ValueError, "'overlap' must be at least 0 and less"),
         (read_dithers, ["nothing.ecsv"], {}, DataError, "no file of dithers"),
         (dither_offsets, [BARE[["x_offset"]]], {}, ValueError, "'pattern' must be .*'y_offset'"),
-        (dither_offsets, [BARE], {}, u.UnitsError, "'x_offset' must be convertible to arcsec"),
-        (dither_offsets, ["ceers"], {"start": -1}, ValueError, "'start' must be an integer >= 0"),
         (dither_offsets, ["spiral", 3], {}, KeyError, "no dither pattern 'spiral'; known: 4-point"),
         (dither_offsets, [OFFSETS, 3], {}, ValueError, rf"'pattern' must be {WANTED}"),
         (dither_offsets, [OFFSETS, 2], {"start": 1}, ValueError, f"must be {WANTED}"),

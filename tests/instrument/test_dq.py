@@ -1,17 +1,13 @@
 import numpy as np
 from astropy.io import fits
 
+from helpers.cases import cases_of
 from helpers.errors import refuses
 from miricigale.instrument import DQ, dq_legend, read_dq
 from miricigale.utils.exceptions import DataError
 
 #: Bits of JWST from the lowest, as its pipeline documents them.
-JWST = """
-DO_NOT_USE SATURATED JUMP_DET DROPOUT OUTLIER PERSISTENCE AD_FLOOR CHARGELOSS UNRELIABLE_ERROR
-NON_SCIENCE DEAD HOT WARM LOW_QE RC TELEGRAPH NONLINEAR BAD_REF_PIXEL NO_FLAT_FIELD NO_GAIN_VALUE
-NO_LIN_CORR NO_SAT_CHECK UNRELIABLE_BIAS UNRELIABLE_DARK UNRELIABLE_SLOPE UNRELIABLE_FLAT OPEN
-ADJ_OPEN FLUX_ESTIMATED MSA_FAILED_OPEN OTHER_BAD_PIXEL REFERENCE_PIXEL
-"""
+JWST = cases_of(__file__, "jwst")
 
 
 def test_bits_of_jwst_have_its_values_and_our_own_lie_above():

@@ -108,13 +108,11 @@ def test_dithers_sample_the_pixel_evenly():
     assert_allclose(four.mean(axis=0), 0, atol=1e-9)
 
 
-def test_patterns_go_on_and_tables_are_taken():
+def test_patterns_go_on():
     for name in dither_patterns():
         offsets = dither_offsets(name, 13)
         assert offsets.shape == (13, 2)
         assert len(np.unique(offsets.value.round(6), axis=0)) == 13
-    table = [[0, 0], [1, -2]] * u.arcsec
-    assert_quantity_allclose(dither_offsets(table, 2), table)
 
 
 def test_keywords_of_the_pointing():
@@ -146,8 +144,6 @@ def test_normalizes_and_freezes():
     ("options", "error", "message"),
     [
         ({"n_groups": 1}, ValueError, "'n_groups' must be an integer >= 2, got 1"),
-        ({"n_groups": 2.5}, ValueError, "'n_groups' must be an integer"),
-        ({"n_integrations": 0}, ValueError, "'n_integrations' must be an integer >= 1"),
         ({"readout": "FAST"}, KeyError, "no readout pattern 'FAST'; known: FASTR1, SLOWR1"),
         ({"subarray": "SUB1"}, KeyError, "no sub-array 'SUB1'"),
         (SLOW_SUBARRAY, KeyError, "no sub-array of SLOWR1 'SUB256'; known: FULL"),
@@ -155,7 +151,6 @@ def test_normalizes_and_freezes():
         ({"n_groups": None}, ValueError, "'n_groups, time' must be one of them given, got neither"),
         ({"time": 1 * u.h}, ValueError, "'n_groups, time' must be one of them given, got both"),
         ({"time": 3 * u.s, "n_groups": None}, ValueError, "'time' must be at least two frames"),
-        ({"roll": 3 * u.s}, u.UnitsError, "'roll' must be convertible to deg"),
         ({"pointing": 3}, ValueError, "'pointing' must be one SkyCoord"),
     ],
 )

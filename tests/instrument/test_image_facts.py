@@ -3,6 +3,7 @@ import pytest
 from astropy.io import fits
 from astropy.nddata import CCDData
 
+from helpers.cases import cases_of
 from helpers.errors import refuses
 from miricigale.instrument import ImageFacts
 
@@ -29,10 +30,7 @@ def test_headers_of_files_are_understood():
     assert facts.subarray == "FULL"
 
 
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [("filter", 770), ("ipc", "no"), ("noise_correction", "1.2"), ("n_outliers", 0.5)],
-)
+@pytest.mark.parametrize(("key", "value"), cases_of(__file__, "others"))
 def test_values_of_another_kind_are_named(key, value):
     image = CCDData(np.zeros((2, 2)), unit="MJy/sr", meta={key: value})
     refuses(rf"'image' must be one whose meta\['{key}'\] is", ImageFacts.of, image)

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import astropy.units as u
 import numpy as np
@@ -20,33 +21,7 @@ from miricigale.instrument.image_files import read_image
 from miricigale.workflow import disk_use, load_config, study_stages
 from miricigale.workflow.stages.exposures import study_exposures
 
-SMALL = """
-[run]
-name = "small"
-seed = 3
-
-[catalog]
-mag_limit = 22.5
-
-[exposures]
-filters = ["miri.f770w", "miri.f1500w"]
-n_groups = [12, 12]
-n_integrations = [1, 1]
-n_dithers = [2, 1]
-
-[sed]
-axes = "quick"
-
-[photometry]
-threshold = 1.0
-n_pixels = 20
-
-[errors]
-bin_size = 10
-
-[fit]
-axes = "quick"
-"""
+SMALL = Path(__file__).with_name("small.toml")
 
 
 def recorded(folder, name):
@@ -77,7 +52,7 @@ def stopped(command, folder, name, how):
 def study(tmp_path_factory):
     """Folder of a small study that was killed, then stopped, then finished."""
     folder = tmp_path_factory.mktemp("study")
-    (folder / "small.toml").write_text(SMALL)
+    shutil.copy(SMALL, folder)
     command = [sys.executable, "-m", "miricigale", "run", "small.toml", "--no-progress"]
     name = "agn00/exposures/miri.f770w-0_cal.fits"
     product = folder / "small" / name

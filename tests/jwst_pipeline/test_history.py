@@ -28,13 +28,7 @@ from miricigale.instrument import (
     miri_detector,
     photmjsr,
 )
-from miricigale.reduction import (
-    RampSettings,
-    Reducer,
-    ReferenceCache,
-    ReferenceFiles,
-    write_image,
-)
+from miricigale.reduction import RampSettings, Reducer, ReferenceCache, ReferenceFiles, write_image
 from miricigale.utils.exceptions import DataError
 
 OWN = miri_detector()

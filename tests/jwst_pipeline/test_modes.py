@@ -83,8 +83,7 @@ def subarray_exposure(tools, band, n_groups, n_integrations, flux):
 
 # in the reddest band the sky fills the well in about a hundred seconds: small sub-arrays are read in time
 @pytest.mark.parametrize(
-    ("mode", "split"),
-    [(("miri.f1500w", 12, 3, 2e3), 150.0), (("miri.f2100w", 20, 2, 5e3), 600.0)],
+    ("mode", "split"), [(("miri.f1500w", 12, 3, 2e3), 150.0), (("miri.f2100w", 20, 2, 5e3), 600.0)]
 )
 def test_sub_arrays_and_integrations(tmp_path, tools, mode, split):
     exposure, catalog = subarray_exposure(tools, *mode)

@@ -1,6 +1,5 @@
 import html
 import re
-import tomllib
 import xml.etree.ElementTree as ElementTree
 from base64 import b64decode
 from io import BytesIO
@@ -10,33 +9,10 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 from PIL import Image
 
+from helpers.cases import cases_of
 from helpers.errors import refuses
 from miricigale.pages import Link, Missing, Page, SectionWriter, number
 
-DECLARED = """
-notices = {few = "{n} sources"}
-
-[bands]
-title = "{n} bands"
-closed = "made for {survey}"
-folded.plain = "All of {survey}"
-text = '''
-In
-two lines.'''
-items = [["limit", "limit", ".1f", ""], ["saturation", "brightest"]]
-picture = "of {survey}"
-
-[bands.table]
-columns = [
-    ["name of {survey}", "name"],
-    ["sources", "n"],
-    ["offset", "z", "+.1f %", "-", "z_err"],
-    ["unknown", "none"],
-]
-
-[bands.plain]
-empty = "No band."
-"""
 HOSTILE = "</script><img src=x onerror='alert(1)'> & \"co\""
 
 
@@ -125,9 +101,8 @@ def test_columns_of_text_are_named_by_number_or_place():
 
 
 def test_sections_are_filled_as_they_are_declared():
-    texts = tomllib.loads(DECLARED)
     report = Page("made up")
-    writer = SectionWriter(report, texts)
+    writer = SectionWriter(report, cases_of(__file__))
     writer.facts = {"survey": "<CEERS>"}
     writer.notice("few", n=3)
     writer.section("bands", n=2)

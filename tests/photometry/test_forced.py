@@ -18,7 +18,6 @@ from miricigale.photometry import (
     ErrorSettings,
     ForcedFlags,
     ForcedPhotometer,
-    MemorySettings,
     detect_sources,
 )
 from miricigale.photometry.catalogs import joined_sky
@@ -331,25 +330,6 @@ def test_blends_are_flagged_and_twins_not_counted_twice(tools):
     assert result.covariance[0, 1] < 0
     # a source without light of its own is crowded by any neighbour
     assert result.crowded.tolist() == [True, True, False, True]
-
-
-def test_files_in_place_of_memory_change_nothing(tools, field, tmp_path):
-    rng = np.random.default_rng(3)
-    noise = scipy.ndimage.gaussian_filter(rng.normal(size=field.image.shape), 1.0)
-    image = tools.as_ccd(field.image.data + noise, field.wcs, 0.3, mask=noise > 0.7)
-    options = {"background_order": 0, "max_shift": 0.1 * u.arcsec, "second_pass": True}
-    one, other = (
-        tools.measured(image, field.catalog[:-5], memory=MemorySettings(scratch=folder), **options)
-        for folder in (None, tmp_path)
-    )
-    assert len(one.new_sources) > 0
-    assert_equal_values("result", one, other, skip=("wcs", "meta"))
-    for name in ("model_image", "residual_image"):
-        assert isinstance(getattr(other, name).data.base, np.memmap)
-        assert not isinstance(getattr(one, name).data.base, np.memmap)
-    # nothing is left behind
-    assert not list(tmp_path.iterdir())
-    refuses("'scratch' must be a folder that is there", MemorySettings, scratch=tmp_path / "none")
 
 
 @pytest.mark.parametrize("n_threads", [2, 3])

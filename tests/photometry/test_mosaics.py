@@ -9,6 +9,7 @@ from astropy.io import fits
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses, warned
+from helpers.scenes import distorted_wcs
 from miricigale.instrument import north_up_wcs, pixel_area_map
 from miricigale.photometry import MosaicFile, read_mosaic, weight_scale
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
@@ -261,6 +262,22 @@ def test_stored_forms_give_the_same_image(write, tmp_path, kind):
     assert one.data.dtype == np.dtype("=f4")
     assert other.data.dtype.isnative
     assert_allclose(other.data, one.data, atol=0.05 * one.uncertainty.array.max())
+    # of each form a part, in the same units
+    part = read_mosaic(tmp_path / "other.fits", section=np.s_[20:75, 11:90])
+    assert_allclose(part.data, other.data[20:75, 11:90], rtol=1e-5)
+    assert_allclose(part.uncertainty.array, other.uncertainty.array[20:75, 11:90], rtol=1e-5)
+
+
+def test_a_part_of_a_distorted_image_is_where_it_was(write):
+    wcs = distorted_wcs()
+    mask = np.random.default_rng(1).random(SHAPE) < 0.1
+    planes = {"DQ": mask.astype(np.int32), "ERR": np.full(SHAPE, 1.0)}
+    path = write(np.random.default_rng(2).normal(0, 1, SHAPE), wcs=wcs, BUNIT="uJy", planes=planes)
+    part = read_mosaic(path, section=np.s_[7:60, 33:90])
+    assert_array_equal(part.mask, mask[7:60, 33:90])
+    x, y = np.meshgrid(np.arange(0, 57, 8), np.arange(0, 53, 8))
+    there = wcs.pixel_to_world(x + 33, y + 7)
+    assert part.wcs.pixel_to_world(x, y).separation(there).max() < 1e-6 * u.arcsec
 
 
 @pytest.fixture

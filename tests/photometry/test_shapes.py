@@ -6,8 +6,8 @@ from astropy.nddata import overlap_slices
 from numpy.testing import assert_allclose
 
 from helpers.light import gaussian_image
-from miricigale.photometry._core.shapes import shape_models
 from miricigale.photometry.light import cutouts
+from miricigale.photometry.shape_models import Waves
 from miricigale.photometry.shapes import ShapeFitter
 from miricigale.profiles import sersic_image
 
@@ -45,22 +45,20 @@ def test_models_are_those_of_the_renderer(n, r_eff, q):
         20.3, 19.6, np.log(r_eff * np.sqrt(q)), np.log(n), eta * np.cos(1.0), eta * np.sin(1.0),
     ]  # fmt: skip
     # a large period, for the wings of its images not to matter
-    image = shape_models(transform(256), 256, (41, 41), parameters, derivatives=0)[0]
+    image = Waves(transform(256), 256).profiles((41, 41), parameters)[0]
     assert_allclose(image, truth, atol=1e-3 * truth.max())
 
 
 @pytest.mark.parametrize("ellipticity", [(0.4, -0.3), (1e-5, 0.0)])
 def test_derivatives(ellipticity):
-    psf = transform(64)
+    waves = Waves(transform(64), 64)
     parameters = np.array([15.3, 16.2, np.log(3.0), np.log(1.7), *ellipticity])
-    images = shape_models(psf, 64, (33, 33), parameters)
+    images = waves.profiles((33, 33), parameters, 6)
     assert images.shape == (7, 33, 33)
     for k in range(6):
         step = np.zeros(6)
         step[k] = 2e-2
-        high, low = (
-            shape_models(psf, 64, (33, 33), parameters + s, derivatives=0)[0] for s in (step, -step)
-        )
+        high, low = (waves.profiles((33, 33), parameters + s)[0] for s in (step, -step))
         assert_allclose(images[1 + k], (high - low) / 4e-2, atol=5e-3 * np.abs(images[1 + k]).max())
 
 
@@ -80,6 +78,49 @@ def test_noiseless_galaxies_are_recovered(n, r_eff, q):
     assert_allclose(angle % np.pi, 2.0, atol=0.01)
     assert_allclose(shape.parameters[:2], [48.2, 47.7], atol=0.01)
     assert shape.point < 1e-6
+
+
+def test_galaxies_that_overlap_are_recovered_together():
+    size = (97, 97)
+    wide, small = {"r_eff": 5.0, "n": 1.5, "q": 0.7}, {"r_eff": 2.0, "n": 1.0, "q": 0.8}
+    light = 7.0, 2.0
+    centers = np.array([(44.2, 47.7), (53.1, 49.2)])
+    images = [
+        galaxy(size, *xy, flux=flux, **one)
+        for xy, flux, one in zip(centers, light, (wide, small), strict=True)
+    ]
+    fitter = ShapeFitter(gaussian_psf(), SCALE)
+    weight = np.full(size, 1e4)
+    # each on its own side, with the light of both
+    sides = np.arange(size[1]) < 49, np.arange(size[1]) > 49
+    drafts = [
+        fitter.fit(sum(images), weight * side, xy) for xy, side in zip(centers, sides, strict=True)
+    ]
+    assert abs(drafts[1].flux / light[1] - 1) > 0.3
+    known = np.round(centers), [fitter.expected] * 2
+    found, _ = fitter.fit_together(sum(images), weight, *known, drafts)
+    for one, flux, xy, true in zip(found, light, centers, (wide, small), strict=True):
+        radius, ratio, _ = one.axes
+        assert_allclose([one.flux, radius, ratio], [flux, true["r_eff"], true["q"]], rtol=0.01)
+        assert_allclose(np.exp(one.parameters[3]), true["n"], rtol=0.01)
+        assert_allclose(one.parameters[:2], xy, atol=0.01)
+    # the light of one is less well known if the other may change: by draws of the noise, and as stated
+    weight, rng = np.full(size, 500.0), np.random.default_rng(1)
+    drawn, stated = [], []
+    for _ in range(40):
+        noise = rng.normal(size=size) / weight
+        both, beside = fitter.fit_together(sum(images) + noise, weight, *known, found)
+        other = both[0].flux * fitter.profiles(size, both[0].parameters)[0]
+        data = sum(images) + noise - other
+        again = (
+            fitter.fit(data, weight, centers[1], start=both[1], beside=free)
+            for free in (None, beside[1])
+        )
+        stated.append([np.sqrt(one.covariance[0, 0]) for one in again])
+        drawn.append(np.log(both[1].flux))
+    alone, free = np.mean(stated, axis=0)
+    assert free > 1.03 * alone
+    assert_allclose(free, np.std(drawn), rtol=0.25)
 
 
 @pytest.mark.parametrize(("snr", "share"), [(8, 0.7), (30, 0.95)])

@@ -6,6 +6,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 
+from helpers.cases import cases_of
 from helpers.errors import refuses
 from helpers.references import write_photom
 from miricigale.depth import etc_limit, saturation_forecast, sensitivity
@@ -56,20 +57,7 @@ def test_a_depth_gives_the_time_that_reaches_it():
     refuses(r"35\.0 is not reached in miri\.f1000w", band_plans, too_deep, error=ConfigError)
 
 
-@pytest.mark.parametrize(
-    ("band", "time", "dithers", "published"),
-    [
-        # COSMOS-Web: Harish et al. 2025 (arXiv 2506.03306), abstract
-        ("miri.f770w", 1054.5, 4, 25.51),
-        # SMILES: Alberts et al. 2024 (arXiv 2405.15972), abstract: 0.2 to 18 uJy
-        ("miri.f560w", 654.9, 4, 25.65),
-        ("miri.f2550w", 832.5, 4, 20.76),
-        # CEERS: median errors of sources of 3 to 10 sigma in the catalog of Lisiecki et al. 2025
-        ("miri.f1000w", 1665.0, 3, 24.99),
-        ("miri.f1280w", 1665.0, 3, 24.19),
-        ("miri.f1500w", 1665.0, 3, 23.83),
-    ],
-)
+@pytest.mark.parametrize(("band", "time", "dithers", "published"), cases_of(__file__, "in_flight"))
 def test_limits_are_those_of_surveys_in_flight(band, time, dithers, published):
     """One factor for all bands, within 0.15 mag; docs/accuracy/planning.rst has the residuals."""
     exposures = {"bands": [band], "time": time, "dithers": dithers}
@@ -126,14 +114,7 @@ def test_the_clock_counts_every_overhead_once():
     assert wall_clock([plan], OverheadSection()) > 1.16 * light
 
 
-@pytest.mark.parametrize(
-    ("own", "same"),
-    [
-        ({}, {}),
-        ({"scene": {"background": "high"}}, {"background": {"level": "high"}}),
-        ({"detector": {"residual": "etc"}}, {"noise": {"residual": "etc"}}),
-    ],
-)
+@pytest.mark.parametrize(("own", "same"), cases_of(__file__, "of_runs"))
 def test_errors_of_a_run_are_its_own_for_its_exposures(tmp_path, own, same):
     exposures = {"filters": [BAND], "n_groups": [100], "n_integrations": [1], "n_dithers": [4]}
     sections = {"exposures": exposures, "fit": {"min_detected": 1}, **own}

@@ -10,6 +10,7 @@ from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
+from helpers.cases import cases_of
 from helpers.errors import refuses
 from helpers.runs import do_stage
 from miricigale.photometry import ErrorModel
@@ -23,15 +24,7 @@ from miricigale.workflow.stages.exposures import band_exposures, study_backgroun
 from miricigale.workflow.study import check_study
 
 BANDS = ["miri.f770w", "miri.f1500w"]
-SETTINGS = {
-    "sample": {"n_sources": 60},
-    "agn": {"frac_agn": [0.0, 0.2, 0.4, 0.6, 0.8, 0.99], "shares": [5, 1, 1, 1, 1, 1]},
-    "catalog": {"mag_limit": 24.0},
-    "exposures": {"bands": BANDS, "time": [900.0, 1500.0], "dithers": [2, 3], "sets": ["all"]},
-    "sed": {"axes": "quick"},
-    "fit": {"axes": "quick"},
-    "images": {"enabled": True},
-}
+SETTINGS = cases_of(__file__)
 
 
 @pytest.fixture(scope="module")

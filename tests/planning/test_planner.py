@@ -8,6 +8,7 @@ import pytest
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
+from helpers.cases import cases_of
 from helpers.commands import command
 from helpers.errors import refuses
 from miricigale.depth import saturation_flux
@@ -255,16 +256,7 @@ def test_the_command_writes_a_page(tmp_path, capsys):
     assert load_plan(folder / "plan.toml").sample.n_sources == 30
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--bands", "f707w", "--time", "100"], "no imaging filter 'f707w'"),
-        (["--bands", "f770w", "--time", "100", "200"], "[exposures] time must have one number"),
-        (["--bands", "f770w", "--time", "9", "--depth", "25"], "wanted are --time or --depth"),
-        (["--quick", "--bands", "f770w"], "--quick is of the table"),
-        (["--config", "absent.toml"], "no configuration file absent.toml"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "message"), cases_of(__file__, "refused"))
 def test_what_cannot_be_planned_is_one_sentence(capsys, arguments, message):
     err = command(capsys, "plan", *arguments, status=2).err
     assert err.startswith(f"miricigale: {message}")

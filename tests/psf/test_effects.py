@@ -3,7 +3,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from helpers.errors import refuses
 from helpers.light import gaussian_image
 from miricigale.psf import cruciform_fraction, effects, miri_psf
 from miricigale.psf.miri import _miri_data
@@ -121,8 +120,3 @@ def test_in_flight_f560w_scatters_about_twice_as_much():
     stpsf = cruciform_fraction("miri.f560w", calibration="stpsf")
     assert flight / (1 - flight) == pytest.approx(2 * stpsf / (1 - stpsf))
     assert cruciform_fraction("miri.f2100w") == 0
-
-
-def test_unknown_calibration():
-    match = "'calibration' must be 'flight' or 'stpsf'"
-    refuses(match, cruciform_fraction, "miri.f560w", calibration="ground")

@@ -3,14 +3,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from helpers.errors import refuses
-from miricigale.psf import (
-    encircled_energy,
-    fwhm,
-    nircam_psf,
-    psf_mosaic,
-    read_psf,
-)
+from miricigale.psf import encircled_energy, fwhm, nircam_psf, psf_mosaic, read_psf
 
 
 # in flight (jwst-docs, NIRCam Point Spread Functions); the pixel's response is a part of ours
@@ -48,9 +41,3 @@ def test_is_centered_normalized_and_says_what_it_is():
     # wings fall as r**-3: the light outside of a radius as its inverse
     outside = 1 - encircled_energy(psf, [1.0, 2.0] * u.arcsec)
     assert outside[0] / outside[1] == pytest.approx(2, abs=0.35)
-
-
-def test_unknown_filters_and_options_are_named():
-    match = r"no PSF for the filter 'nircam.f182m'; known: nircam"
-    refuses(match, nircam_psf, "nircam.f182m", error=KeyError)
-    refuses("'oversampling' must be an integer >= 1", nircam_psf, "F444W", oversampling=0)

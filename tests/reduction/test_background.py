@@ -5,6 +5,7 @@ from astropy.coordinates import SkyCoord
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.ndimage import gaussian_filter
 
+from helpers.cases import cases_of
 from helpers.errors import refuses, warned
 from helpers.exposures import gaussians
 from helpers.exposures import image_of as make
@@ -138,16 +139,7 @@ def test_masked_pixels_do_not_count(noise):
     assert abs(background.level[:, 150:].mean()) < 0.02
 
 
-@pytest.mark.parametrize(
-    ("options", "match"),
-    [
-        ({"method": "median"}, "'method' must be 'masked' or 'sep' or 'none', got 'median'"),
-        ({"box": 2}, "'box' must be at least 4"),
-        ({"box": 7.5}, "'box' must be at least 4, an integer"),
-        ({"negative_noise": "mine"}, "'negative_noise' must be 'larger' or 'background'"),
-        ({"negative_threshold": 0}, "'negative_threshold' must be positive or None"),
-    ],
-)
+@pytest.mark.parametrize(("options", "match"), cases_of(__file__, "refused"))
 def test_bad_options_are_named(noise, options, match):
     refuses(match, subtracted, make(noise), **options)
 

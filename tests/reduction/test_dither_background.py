@@ -3,7 +3,6 @@ import warnings
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 
-from helpers.errors import refuses
 from helpers.exposures import FIELD, gaussians, image_of
 from miricigale.instrument import north_up_wcs
 from miricigale.reduction import (
@@ -93,12 +92,6 @@ def test_the_reducer_takes_backgrounds_of_dithers_in_its_second_pass():
         assert np.std((background.level - ripple)[~raw.mask]) < 0.1
     few = reducer.combine([im for im, _ in pairs[:2]], [b for _, b in pairs[:2]])
     assert any("it takes three" in note for note in few.notes)
-
-
-def test_bad_input_is_named():
-    images, _, _ = dithers(3)
-    refuses("'images' must be at least three dithers, got 2", dither_backgrounds, images[:2])
-    refuses("'backgrounds' must be one for each of 3 images", dither_backgrounds, images, [])
 
 
 def test_medians_leave_out_what_is_not_known():

@@ -6,19 +6,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.exposures import FIELD, exposure_of, sky_of
-from miricigale.detector import (
-    CosmicRays,
-    Detector,
-    FirstFrame,
-    LastFrame,
-    ResetAnomaly,
-    Residual,
-)
-from miricigale.instrument import (
-    DQ,
-    background_level,
-    miri_detector,
-)
+from miricigale.detector import CosmicRays, Detector, FirstFrame, LastFrame, ResetAnomaly, Residual
+from miricigale.instrument import DQ, background_level, miri_detector
 from miricigale.reduction import RampSettings, Reducer
 
 STORM = CosmicRays(flux=8e-7)  # ten times as many as there are

@@ -13,12 +13,7 @@ from helpers.exposures import exposure_of, sky_of
 from helpers.references import imager_keywords
 from miricigale.detector import CosmicRays, Detector, Ramp
 from miricigale.instrument import DQ, ExposureHistory, ImageFacts, joined_header
-from miricigale.reduction import (
-    Reducer,
-    open_exposure,
-    read_images,
-    write_image,
-)
+from miricigale.reduction import Reducer, open_exposure, read_images, write_image
 from miricigale.utils.exceptions import DataError
 
 I2D = "real/i2d/jw01288015001_04101_00001_mirimage_i2d.fits"

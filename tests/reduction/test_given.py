@@ -95,9 +95,6 @@ def test_a_detector_of_defaults():
     plain, imager = (map(type, one.effects) for one in (Detector(), Detector.miri_imager()))
     assert list(plain) == list(imager)
     assert Detector().gain == Detector().properties.gain
-    with pytest.raises(AttributeError, match="Detector has no 'expse'; it has expose"):
-        Detector().expse  # noqa: B018
-    refuses("'exposure' must be an Exposure", Detector().expose, np.zeros((3, 3)) * u.MJy / u.sr)
 
 
 def test_integrations_and_pixels_of_a_ramp(ramps):

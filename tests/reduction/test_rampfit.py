@@ -7,12 +7,7 @@ from scipy.stats import norm
 
 from helpers.errors import refuses
 from miricigale.instrument import DQ, miri_detector
-from miricigale.reduction import (
-    DetectorMaps,
-    fit_groups,
-    reference_channels,
-    reference_drift,
-)
+from miricigale.reduction import DetectorMaps, fit_groups, reference_channels, reference_drift
 
 DT, GAIN, READ, BIAS = 2.775, 4.0, 6.0, 11000.0
 OPTIONS = {"group_time": DT, "gain": GAIN, "read_noise": READ, "bias": BIAS}
@@ -292,7 +287,6 @@ def test_drift_of_channels_and_rows_is_taken_off_as_in_the_official_pipeline():
         ({"gain": 0.0}, "'gain' must be positive"),
         ({"read_noise": -1.0}, "'read_noise' must be at least 0"),
         ({"jump_threshold": -5.0}, "'jump_threshold' must be positive or None"),
-        ({"n_threads": 0}, "'n_threads' must be at least 1"),
         ({"usable": np.ones((2, 2), bool)}, "'usable' must be of shape"),
         ({"data": np.zeros((5, 3, 4), np.uint16)}, "'data' must be of four dimensions"),
     ],

@@ -8,14 +8,9 @@ from numpy.testing import assert_array_equal
 from scipy.ndimage import convolve
 
 from helpers.errors import refuses
-from helpers.exposures import exposure_of, image_of, sky_of
+from helpers.exposures import exposure_of, sky_of
 from helpers.mosaics import render
-from miricigale.detector import (
-    BadPixels,
-    CosmicRays,
-    Detector,
-    Ramp,
-)
+from miricigale.detector import BadPixels, CosmicRays, Detector, Ramp
 from miricigale.instrument import (
     DQ,
     DetectorProperties,
@@ -26,13 +21,7 @@ from miricigale.instrument import (
     photmjsr,
     pixel_area_map,
 )
-from miricigale.reduction import (
-    BackgroundSettings,
-    MosaicSettings,
-    RampSettings,
-    Reducer,
-    ReductionResult,
-)
+from miricigale.reduction import MosaicSettings, RampSettings, Reducer, ReductionResult
 
 FILTER = "miri.f1000w"
 SKY = background_level(FILTER).value
@@ -162,11 +151,6 @@ def test_the_whole_way_keeps_fluxes_and_errors(field):
     assert 0.97 < pull.std() < 1.1
 
 
-def test_settings_do_not_change():
-    with pytest.raises(AttributeError):
-        Reducer(n_threads=1).jump_threshold = 3.0
-
-
 def test_subarrays_beside_the_field_are_not_masked_away():
     exp = exposure(subarray="SUB64", n_groups=5)
     reducer = Reducer()
@@ -220,10 +204,8 @@ def test_groups_can_be_left_out():
     [
         (Reducer, {"backend": "magic"}, "'backend' must be 'native' or 'jwst', got 'magic'"),
         (Reducer, {"jump_threshold": 0}, "'jump_threshold' must be positive or None"),
-        (BackgroundSettings, {"box": 1}, "'box' must be at least 4"),
         (MosaicSettings, {"pixfrac": 1.5}, "'pixfrac' must be above 0 and at most 1"),
         (Reducer, {"skip_first": -1}, "'skip_first' must be at least 0, an integer, got -1"),
-        (Reducer, {"n_threads": 0}, "'n_threads' must be at least 1 and an integer"),
         (Reducer, {"properties": 3}, "'properties' must be a DetectorProperties"),
         (Reducer, {"background": 3}, "'background' must be a BackgroundSettings, got 3"),
     ],
@@ -236,19 +218,13 @@ def test_refuses_what_does_not_belong_together():
     reducer = Reducer(properties=DetectorProperties())
     refuses("'images' must be at least one image, got none", Reducer().combine, [], [])
     refuses("'ramps' must be at least one ramp", reducer.run, [])
+    wanted = "'ramp' must be a Ramp or a Charge, got ndarray"
+    refuses(wanted, reducer.fit_ramp, np.zeros((1, 5, 8, 8)))
     exposures = [exposure(n_groups=2, filt=filt) for filt in ("miri.f770w", FILTER)]
     ramps = [expose(5.0, one, without=[CosmicRays]) for one in exposures]
     refuses(r"'ramps' must be of one filter \(miri.f770w\)", reducer.run, ramps)
     bare = CCDData(np.ones((4, 4)), unit="adu / s", uncertainty=StdDevUncertainty(np.ones((4, 4))))
     refuses("'rate' must be an image whose meta has 'filter'", reducer.calibrate, bare)
-
-
-def test_what_is_no_ramp_or_grid_is_named():
-    image = image_of(np.zeros((8, 8)))
-    wanted = "'ramp' must be a Ramp or a Charge, got ndarray"
-    refuses(wanted, Reducer().fit_ramp, np.zeros((1, 5, 8, 8)))
-    refuses("'wcs' must be an astropy WCS, got tuple", Reducer().mosaic, [image], (8, 8))
-    refuses("'images' must be CCDData with uncertainty and WCS", Reducer().mosaic, [image])
 
 
 def test_the_official_pipeline_is_asked_for_by_name(monkeypatch):

@@ -2,6 +2,7 @@
 
 import pytest
 
+from helpers.cases import cases_of
 from helpers.errors import refuses
 from helpers.references import imager_keywords, write_cache
 from miricigale.reduction import ReferenceCache
@@ -12,46 +13,7 @@ pytest.importorskip("crds", reason="needs crds: pip install miricigale[jwst]")
 HEADER = imager_keywords(DETECTOR="MIRIMAGE", BAND="N/A")
 HEADER |= {"DATE-OBS": "2022-07-03", "TIME-OBS": "12:30:00.500"}
 
-DETECTOR = "('META.INSTRUMENT.DETECTOR',)"
-DATES = "('META.OBSERVATION.DATE', 'META.OBSERVATION.TIME')"
-
-RULES = {
-    # by dates
-    "gain": (
-        f"({DETECTOR}, {DATES})",
-        """Match({
-            'MIRIFULONG' : UseAfter({'2000-01-01 00:00:00' : 'long.fits',}),
-            'MIRIMAGE' : UseAfter({
-                '2000-01-01 00:00:00' : 'ground.fits',
-                '2022-07-03 12:00:00' : 'flight.fits',
-                '2022-07-03 13:00:00' : 'later.fits',
-            }),
-        })""",
-    ),
-    # the best match wins; GENERIC stands for N/A
-    "flat": (
-        ("(('META.INSTRUMENT.DETECTOR', 'META.INSTRUMENT.FILTER', 'META.INSTRUMENT.BAND', "
-        "'META.EXPOSURE.READPATT', 'META.SUBARRAY.NAME'),)"),
-        """Match({
-            ('MIRIMAGE', 'F1000W', 'N/A', '*', 'GENERIC') : 'other.fits',
-            ('MIRIMAGE', 'F770W', 'N/A', '*', 'GENERIC') : 'generic.fits',
-            ('MIRIMAGE', 'F770W', 'N/A', 'FAST|FASTR1', 'BRIGHTSKY') : 'brightsky.fits',
-            ('MIRIMAGE', 'F770W', 'N/A', 'FAST|FASTR1', 'SUB64|SUB128') : 'sub64.fits',
-            ('MIRIMAGE', 'F770W', 'N/A', 'SLOW', 'SUB64') : 'slow.fits',
-        })""",
-        {"substitutions": "{'META.SUBARRAY.NAME' : {'GENERIC' : 'N/A'}}"},
-    ),
-    "superbias": (f"({DETECTOR},)", "Match({'MIRIMAGE' : 'N/A'})"),
-    # equally good matches are put together by their dates
-    "dark": (
-        "(('META.INSTRUMENT.DETECTOR', 'META.EXPOSURE.READPATT', 'META.SUBARRAY.NAME'), " + DATES + ")",
-        """Match({
-            ('MIRIMAGE', 'FASTR1', 'N/A') : UseAfter({'2021-01-01 00:00:00' : 'one.fits',}),
-            ('MIRIMAGE', 'N/A', 'SUB64') : UseAfter({'2022-01-01 00:00:00' : 'two.fits',}),
-            ('NOT MIRIMAGE', 'N/A', 'SUB64') : UseAfter({'2022-02-01 00:00:00' : 'three.fits',}),
-        })""",
-    ),
-}  # fmt: skip
+RULES = {name: tuple(rule.values()) for name, rule in cases_of(__file__).items()}
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ import json
 import mmap
 import os
 import pkgutil
-import subprocess
 import sys
 import tracemalloc
 from concurrent.futures import ThreadPoolExecutor
@@ -15,17 +14,13 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.io import fits
+from filelock import FileLock
 from numpy.testing import assert_allclose, assert_array_equal
 
+from helpers.cases import cases_of
 from helpers.errors import refuses
 from miricigale import conf, refdata
-from miricigale.refdata import (
-    Resource,
-    check_resources,
-    find_resource,
-    locate,
-    registry,
-)
+from miricigale.refdata import Resource, check_resources, find_resource, locate, registry
 from miricigale.refdata.libraries import (
     READERS,
     LibraryTable,
@@ -320,17 +315,7 @@ def test_a_library_is_registered_and_found(folder):
     assert "2 x 2: 1 of 4 not there" in str(holes)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("3 0 1.5\n", "fake.dat is truncated"),
-        ("3 0 x\nend\n", "fake.dat cannot be read as 'test.library': could not convert"),
-        ("3 0 1\n3 0 2\nend\n", "fake.dat cannot be read .* different in every row"),
-        ("end\n", "fake.dat cannot be read as 'test.library'"),
-        ("3 0 nan\nend\n", "NaN or infinity"),
-        ("3 0 1\n3 90\nend\n", "fake.dat cannot be read as 'test.library'"),
-    ],
-)
+@pytest.mark.parametrize(("text", "message"), cases_of(__file__, "refused"))
 def test_a_refused_library_leaves_the_old_one(folder, text, message):
     before = add_library(NAME, source(folder))
     path = source(folder, text)
@@ -392,50 +377,16 @@ def test_a_process_that_dies_between_file_and_record_leaves_a_library_that_works
     assert fingerprint(NAME) == file_sha256(locate(NAME))
 
 
-ADD = """
-import sys
-import numpy as np
-from miricigale import conf
-from miricigale.refdata import Resource, registry
-from miricigale.refdata.libraries import READERS, LibraryTable, add_library
-
-value, folder = float(sys.argv[1]), sys.argv[2]
-record = Resource("t", "user", "T", "L", "C", "S", file="sed/t.fits")
-registry.resources = lambda: {"t": record}
-READERS["t"] = lambda path: LibraryTable(
-    "t", np.linspace(1, 2, 1000), {"k": np.arange(200.0)},
-    {"dust": np.full((200, 1000), value)}, meta={"files": {"f": sys.argv[1]}},
-)
-with conf.set_temp("data_folder", folder):
-    print("ready", flush=True)
-    sys.stdin.readline()
-    for _ in range(15):
-        add_library("t", folder)
-"""
-
-
-def test_two_processes_may_add_at_once(tmp_path):
-    pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
-    command = [sys.executable, "-c", ADD]
-    processes = [
-        subprocess.Popen([*command, value, str(tmp_path)], text=True, **pipes)
-        for value in ("1", "2")
-    ]
-    for process in processes:
-        assert process.stdout.readline() == "ready\n"
-    for process in processes:
-        process.stdin.write("\n")
-        process.stdin.flush()
-    for process in processes:
-        _, errors = process.communicate(timeout=120)
-        assert process.returncode == 0, errors
-    path = tmp_path / "sed" / "t.fits"
-    library = verify_library(path, "t")
-    record = stored_record(path)
-    # one of the two won, and the record is of that one
-    assert record["sha256"] == file_sha256(path)
-    assert float(record["files"]["f"]) == library.spectra["dust"][0, 0]
-    assert not list(path.parent.glob(f"{PARTIAL}*"))
+def test_who_comes_second_waits_for_the_first(folder):
+    before = add_library(NAME, source(folder))
+    path = source(folder, "3 0 9.5\nend\n")
+    with ThreadPoolExecutor(1) as pool:
+        with FileLock(before.path.with_name(f".{before.path.name}.lock")):
+            later = pool.submit(add_library, NAME, path)
+            with pytest.raises(TimeoutError):
+                later.result(timeout=1)
+            stands(folder, before)
+        stands(folder, later.result(timeout=60))
 
 
 def test_damage_is_told(folder):

@@ -72,7 +72,6 @@ def test_cache_folder_is_set_by_the_user(folders):
 def test_absent_resource_says_where_to_get_it(folders):
     match = r"'test.file' \(T\) is in none of the data folder .*a page"
     refuses(match, locate, "test.file", error=DataError)
-    refuses("no resource 'nope'", locate, "nope", error=KeyError)
     refuses("'name' must be a resource that is a file", locate, "test.package")
 
     refuses("no resource 'nope'", find_resource, "nope", error=KeyError)

@@ -17,10 +17,6 @@ def test_every_record_says_where_it_comes_from():
             assert record.file, name
 
 
-def test_unknown_resource_lists_the_known():
-    refuses(r"no resource 'nope'; known: .*instrument.siaf", resource, "nope", error=KeyError)
-
-
 def test_citations_are_sorted_without_repeats():
     names = ["instrument.thermal", "filters.sedpy", "instrument.thermal"]
     found = citations(*names)

@@ -41,8 +41,6 @@ def test_low_zodi_is_five_percent_per_arcmin():
 
 
 def test_refuses(wcs):
-    with pytest.raises(u.UnitsError, match="'level' must be a quantity convertible to MJy / sr"):
-        Background(3.0)
     refuses("'level' must be finite and not negative", Background, -1 * u.MJy / u.sr)
     with pytest.raises(ValueError, match="makes it negative within the image"):
         Background(LEVEL, gradient=20 / u.arcmin).image(wcs, (90, 100))

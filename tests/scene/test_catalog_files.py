@@ -9,7 +9,7 @@ from astropy.table import Table
 
 from helpers.errors import refuses
 from miricigale.scene import CatalogFlags, read_catalog
-from miricigale.utils.exceptions import DataError, MiricigaleWarning
+from miricigale.utils.exceptions import MiricigaleWarning
 
 COLUMNS = {"id": "NUMBER", "ra": "ALPHA", "dec": "DELTA", "redshift": "zbest"}
 COLUMNS |= {"wfc3.f160w": "FLUX_H", "wfc3.f160w_err": "FLUXERR_H", "irac.ch1": "f36"}
@@ -154,9 +154,6 @@ def test_empty_files(plain, tmp_path):
     path = write(plain[:0], tmp_path / "empty.fits")
     with pytest.raises(ValueError, match=r"'empty\.fits' must be a table with rows, got none"):
         read_catalog(path, columns=COLUMNS | SHAPE, units=UNITS)
-    path = tmp_path / "text.csv"
-    path.write_text("")
-    refuses(r"text\.csv cannot be read as a table", read_catalog, path, error=DataError)
 
 
 # ------------------------------------------------------------------------- warnings

@@ -143,21 +143,11 @@ def test_a_stamp_for_each_cutout(wcs, psf, cutouts, message):
     refuses(message, scenes.make_scene, one(wcs, 50, 45), wcs, psf, cutouts=cutouts)
 
 
-@pytest.mark.parametrize(
-    ("data", "scale", "message"),
-    [
-        (np.zeros((5, 5)), 0.1 * u.arcsec, "'data' must be a finite 2D array with a positive sum"),
-        (np.ones((5, 5)), 0 * u.arcsec, "'pixel_scale' must be positive"),
-        (np.ones((5, 5)), 0.1, "'pixel_scale' must be a quantity"),
-    ],
-)
-def test_refuses(data, scale, message):
-    refuses(message, Cutout, data, error=(ValueError, u.UnitsError), pixel_scale=scale)
-
-
-def test_images_without_a_usable_wcs_are_refused():
+def test_images_without_light_or_a_usable_wcs_are_refused():
     image = CCDData(np.ones((5, 5)), unit="adu")
     refuses("'image' must be NDData with a WCS", Cutout.from_image, image)
+    wanted = "'data' must be a finite 2D array with a positive sum"
+    refuses(wanted, Cutout, np.zeros((5, 5)), pixel_scale=0.1 * u.arcsec)
     image.wcs = scenes.tan_wcs((5, 5))
     image.wcs.wcs.cd = image.wcs.wcs.cd * np.array([1.0, 1.2])
     refuses("'image' must be with square pixels", Cutout.from_image, image)

@@ -59,12 +59,6 @@ def test_one_truth_of_any_catalog(catalog, exposure):
     np.testing.assert_allclose(truth["flux_total"].to_value(u.uJy), FLUX, rtol=1e-4)
 
 
-def test_files_are_read(exposure, tmp_path):
-    QTable({"sky": SKY, "F770W": FLUX * u.uJy, "profile": ["point"] * 2}).write(tmp_path / "a.ecsv")
-    truth = Scene(tmp_path / "a.ecsv", exposure).to_table()
-    np.testing.assert_allclose(truth["flux_total"].value, FLUX)
-
-
 def test_shapes_by_their_usual_names():
     shapes = {"Re": [0.3] * u.arcsec, "n": [1.0], "q": [0.5], "PA": [30.0] * u.deg, "z": [1.5]}
     table = as_sources({"ra": [150.1], "dec": [2.2], "flux": [1.0] * u.uJy, **shapes}, "miri.f770w")
@@ -80,21 +74,6 @@ def test_an_exposure_gives_filter_grid_and_psf(exposure):
     )
     np.testing.assert_array_equal(scene.render().data, by_hand.render().data)
     assert len(scene) == 2
-
-
-def test_levels_of_the_sky(exposure):
-    catalog = {"sky": SKY, "F770W": FLUX * u.uJy, "profile": "point"}
-    levels = [Scene(catalog, exposure, background=k).background.level for k in ("low", "high")]
-    # Rigby et al. 2023, figure 8: some 6 MJy/sr
-    assert 4 < levels[0].to_value(u.MJy / u.sr) < 8
-    assert levels[1] > levels[0]
-
-
-def test_a_detector_takes_a_scene(exposure):
-    catalog = {"sky": SKY, "F770W": FLUX * u.uJy, "profile": "point"}
-    scene, detector = Scene(catalog, exposure, background="low"), Detector.miri_imager()
-    ramps = [detector.expose(light, exposure, seed=1) for light in (scene, scene.render())]
-    np.testing.assert_array_equal(ramps[0].data, ramps[1].data)
 
 
 @pytest.mark.parametrize("band", ["F770W", "F2550W"])

@@ -3,7 +3,6 @@ import numpy as np
 import pytest
 
 from helpers import scenes
-from helpers.errors import refuses
 from miricigale.instrument import north_up_wcs
 from miricigale.psf import encircled_energy, hst_psf
 from miricigale.scene import Scene, highres_image
@@ -48,13 +47,6 @@ def test_noise_does_not_know_the_sources(fine, psf, catalog):
     np.testing.assert_array_equal(both.data, again.data)
     other = highres_image(catalog, filter=FILTER, wcs=fine, psf=psf, seed=10)
     assert not np.any(both.data == other.data)
-
-
-def test_refuses(fine, psf, catalog):
-    kwargs = {"filter": FILTER, "wcs": fine, "psf": psf, "seed": 1}
-    match = "'depth' must be a quantity convertible to uJy"
-    refuses(match, highres_image, catalog, error=u.UnitsError, depth=27.0, **kwargs)
-    refuses("'depth' must be positive", highres_image, catalog, depth=-1 * u.uJy, **kwargs)
 
 
 def test_f160w_mosaic_through_its_psf():

@@ -173,19 +173,6 @@ def test_the_same_on_any_number_of_threads(wcs, psf):
             np.testing.assert_array_equal(image, alone)
 
 
-def test_image_says_what_it_is(wcs):
-    psf = scenes.gaussian_psf(includes=("pixel", "ipc"), frame="detector")
-    catalog = scenes.make_catalog(wcs, 50, 45)
-    image = make_scene(catalog, wcs, psf, background=3 * u.MJy / u.sr).render()
-    assert image.unit == u.MJy / u.sr
-    assert image.shape == (90, 100)
-    assert image.meta["filter"] == FILTER
-    assert image.meta["psf_includes"] == ["pixel", "ipc"]
-    assert image.meta["background"] == 3.0
-    assert image.wcs is not None
-    np.testing.assert_allclose(image.data[0, 0], 3.0)
-
-
 def bare_wcs():
     wcs = scenes.tan_wcs()
     wcs.pixel_shape = None
@@ -205,8 +192,6 @@ def bare_wcs():
         ({"background": 3.0}, "'background' must be a Background, a Quantity in MJy/sr or a level"),
         ({"background": -3 * u.MJy / u.sr}, r"'level' must be .* not negative, got -3\.0 MJy"),
         ({"wcs": bare_wcs()}, "'wcs' must be a WCS with its pixel_shape"),
-        ({"n_threads": 0}, "'n_threads' must be at least 1 and an integer, got 0"),
-        ({"n_threads": 1.5}, r"'n_threads' must be at least 1 and an integer, got 1\.5"),
         ({"max_radius": -1 * u.arcsec}, r"'max_radius' must be positive, got -1\.0 arcsec"),
     ],
 )

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from astropy.table import QTable, Table
 
+from miricigale.utils.exceptions import DataError
 from miricigale.utils.row_files import open_rows
+from miricigale.utils.table_files import read_table
 
 
 @pytest.fixture
@@ -18,10 +20,14 @@ def table():
     return QTable({"id": [f'"n"\n{i}' for i in range(n)], **columns})
 
 
-@pytest.mark.parametrize("suffix", ["fits", "fits.gz", "ecsv", "csv"])
+@pytest.mark.parametrize("suffix", ["fits", "fits.gz", "ecsv", "csv", "parquet"])
 def test_pieces_are_the_rows_of_the_table(table, tmp_path, suffix):
     path = tmp_path / f"t.{suffix}"
+    parquet = pytest.importorskip("pyarrow.parquet") if suffix == "parquet" else None
     Table(table).write(path)
+    if parquet:
+        # in groups that are no multiple of a piece
+        parquet.write_table(parquet.read_table(path), path, row_group_size=700)
     rows = open_rows(path, 300)
     assert (rows.n_rows, rows.n_chunks, rows.colnames) == (4000, 14, tuple(table.colnames))
     for i in (13, 0, 6):
@@ -56,3 +62,26 @@ def test_a_column_of_csv_is_what_all_of_its_rows_can_be(tmp_path):
     kinds = [[piece[name].dtype.kind for name in piece.colnames] for piece in pieces]
     assert kinds == [list("Uiif"), list("Uiif")]
     assert all(np.ma.is_masked(piece["b"][0]) for piece in pieces)
+
+
+def test_missing_values_of_parquet_are_missing(tmp_path):
+    """Of a file of other programs: names by their length, categories, NaN for numbers, masks for the rest."""
+    pyarrow, parquet = (pytest.importorskip(name) for name in ("pyarrow", "pyarrow.parquet"))
+    columns = {
+        "id": ["a", None, "much longer", "b"],
+        "kind": pyarrow.array(["x", "y", "x", None]).dictionary_encode(),
+        "n": [1, 2, None, 4],
+        "flux": [1.5, None, 2.5, 3.5],
+    }
+    path = tmp_path / "t.parquet"
+    parquet.write_table(pyarrow.table(columns), path)
+    rows = open_rows(path, 3)
+    for table in (rows.chunk(0), read_table(path, wanted="a table")[:3]):
+        assert table["id"].tolist() == ["a", None, "much longer"]
+        assert table["kind"].tolist() == ["x", "y", "x"]
+        assert table["n"].tolist() == [1, 2, None]
+        np.testing.assert_array_equal(table["flux"], [1.5, np.nan, 2.5])
+    assert rows.chunk(1)["kind"].tolist() == [None]
+    path.write_bytes(path.read_bytes()[:-9])
+    with pytest.raises(DataError, match=r"t\.parquet cannot be read as a catalog"):
+        open_rows(path, 3)

@@ -3,6 +3,7 @@
 import datetime
 import math
 import os
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import threadpoolctl
@@ -97,11 +98,13 @@ def test_linear_algebra_stays_on_one_core_until_the_last_thread_is_done():
     def cores():
         return {pool["num_threads"] for pool in threadpoolctl.threadpool_info()}
 
-    with threadpoolctl.threadpool_limits(2):
+    # the thread that set the limits first is another one
+    with threadpoolctl.threadpool_limits(2), ThreadPoolExecutor(1) as thread:
         before = cores()
         first, second = single_threaded(), single_threaded()
-        first.__enter__()
+        thread.submit(first.__enter__).result()
+        assert cores() == {1}
         with second:
-            first.__exit__(None, None, None)
+            thread.submit(first.__exit__, None, None, None).result()
             assert cores() == {1}
         assert cores() == before

@@ -71,14 +71,6 @@ def test_match_is_one_to_one():
     assert_allclose(separation.value, [np.nan, 0.1, 0.2, np.nan], atol=1e-9)
 
 
-def test_match_recovers_a_permutation():
-    rng = np.random.default_rng(4)
-    x, y = rng.uniform(0, 3000, (2, 100))
-    order = rng.permutation(100)
-    index, _ = match_sky(sky(x, y), sky(x[order] + 0.05, y[order]), radius=0.2 * u.arcsec)
-    assert_array_equal(index, order)
-
-
 @pytest.mark.parametrize(("n", "m"), [(0, 3), (3, 0)])
 def test_match_with_nothing(n, m):
     coords, reference = (sky(np.zeros(size), np.zeros(size)) for size in (n, m))

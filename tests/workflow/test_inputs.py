@@ -23,12 +23,7 @@ from miricigale.workflow.page.provenance import catalog_facts
 from miricigale.workflow.stages import study_stages
 from miricigale.workflow.stages.fits import mock_photometry
 from miricigale.workflow.stages.inputs import existing_bands
-from miricigale.workflow.stages.sample import (
-    SampleFlags,
-    add_selection,
-    cut_flags,
-    good_redshifts,
-)
+from miricigale.workflow.stages.sample import SampleFlags, add_selection, cut_flags, good_redshifts
 
 SHORT, LONG = ["nircam.f090w", "nircam.f150w", "nircam.f200w"], ["mips.24"]
 ALPHA = [1.5, 2.5]

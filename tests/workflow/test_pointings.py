@@ -156,3 +156,18 @@ def test_pointings_of_a_table(tmp_path):
     rows.write(path, overwrite=True)
     match = r"\[pointing\] centers: plan.ecsv: 'bands' must be of \[exposures\] filters .*'F1000W'"
     refuses(match, study_exposures, config, error=ConfigError)
+
+
+def test_pointings_of_a_list_of_apt(tmp_path, caplog):
+    line = "1 1 1 1 {} 1 FIELD +53.1 -27.8 +0.0 +0.0 +0.0 +0.0 -453.6 -373.8 +0.0 +0.0 TARGET SCIENCE 0 0"
+    path = tmp_path / "plan.pointing"
+    path.write_text("\n".join(["* (Obs 1)", *map(line.format, ("MIRIM_FULL", "NRCALL_FULL"))]))
+    config = field(centers=[str(path)], roll=45.0)
+    assert [center.to_string(precision=3) for center in study_pointings(config)] == [
+        "53.100 -27.800"
+    ]
+    assert {e.roll.to_value(u.deg) for e in study_exposures(config).values()} == {45.0}
+    assert (
+        "plan.pointing: exposures that are not of the full imager are not used: NRCALL_FULL (SCIENCE)"
+        in caplog.text
+    )

@@ -10,15 +10,7 @@ import pytest
 from astropy.table import QTable
 
 from helpers.figures import legend_texts
-from helpers.runs import (
-    AREA,
-    SCALE,
-    SHAPE,
-    make_run,
-    noise_image,
-    sky_image,
-    small_config,
-)
+from helpers.runs import AREA, SCALE, SHAPE, make_run, noise_image, sky_image, small_config
 from miricigale.evaluation import PUBLISHED
 from miricigale.fitting import FitResults
 from miricigale.sed import SEDModel

@@ -15,8 +15,8 @@ looks at the results, breaks and repairs them, and checks the redshifts.
 # A catalog on disk
 # -----------------
 #
-# FITS (a binary table) is read by ranges of rows; ECSV, CSV and other tables are read as a whole. The columns are
-# those of ``fit``: ``id``, a flux for each filter, and its error.
+# FITS (a binary table) and parquet are read by ranges of rows; ECSV, CSV and other tables are read as a whole. The
+# columns are those of ``fit``: ``id``, a flux for each filter, and its error.
 #
 # The galaxies are drawn from a small grid of models without AGN, with errors of 5 %.
 
@@ -123,8 +123,8 @@ largest = np.max(np.abs(whole.to_table()["mass_p50"] - table["mass_p50"]))
 print(f"largest difference of masses: {largest:.1f}")
 
 # %%
-# ``results.write_table("table.fits")`` writes the table of all objects into one FITS file without ever having it
-# in memory.
+# ``results.write_table("table.fits")`` writes the table of all objects into one file, FITS or parquet, without
+# ever having it in memory.
 #
 # Stop and resume
 # ---------------
@@ -189,7 +189,9 @@ plt.show()
 
 # %%
 # With `dask.distributed <https://distributed.dask.org>`_ (``pip install 'miricigale[dask]'``) the executor is that
-# of a client, which connects to a cluster. Only the process that calls ``fit_file`` reads and writes files.
+# of a client, which connects to a cluster. Where there are as many parts as workers, each worker fits and writes
+# whole parts: the workers must see the folder by the same path, and the process that calls ``fit_file`` sends them
+# the rows. A part whose worker is lost is made by another one, with the same bytes.
 #
 # .. code-block:: python
 #
@@ -205,11 +207,12 @@ plt.show()
 # .. code-block:: console
 #
 #    $ miricigale fit catalog.fits -o fits --threads 8
+#    $ miricigale fit catalog.parquet -o fits --scheduler tcp://host:8786
 #
-# fits with the grid of Yang et al. 2021 in the filters of the catalog, and joins the results in
-# ``fits/table.fits``. Ctrl-C keeps the parts that are finished; the same command resumes. ``--redshift z_spec``
-# takes known redshifts from a column, ``--pairs age:tau redshift:ebv`` keeps joint posteriors, ``--chunk-rows``
-# sets the length of the parts, and ``--no-resume`` begins anew.
+# fit with the grid of Yang et al. 2021 in the filters of the catalog, and join the results in ``fits/table.fits``,
+# or ``fits/table.parquet`` of a catalog in parquet. Ctrl-C keeps the parts that are finished; the same command
+# resumes. ``--redshift z_spec`` takes known redshifts from a column, ``--pairs age:tau redshift:ebv`` keeps joint
+# posteriors, ``--chunk-rows`` sets the length of the parts, and ``--no-resume`` begins anew.
 #
 # Other inputs
 # ------------
@@ -222,5 +225,5 @@ plt.show()
 # - Compressed files are read as a whole. FITS columns of variable length, and ids that are text but not ASCII,
 #   which FITS tables cannot hold, are refused before anything is fitted; ``BayesFitter.fit`` takes such ids.
 #
-# Memory and times for 200 000 objects are in :doc:`/accuracy/fitting`. Next: :doc:`/how_to/fit/mock_analysis`
+# Memory and times for a million objects are in :doc:`/accuracy/fitting`. Next: :doc:`/how_to/fit/mock_analysis`
 # tests the errors of the results.

@@ -12,12 +12,11 @@ from miricigale.detector._core.random import (
     fill_table,
     poisson,
     poisson_inversion,
+    ptrs,
     ptrs_constants,
-    ptrs_rest,
     seed_stream,
     table_lookup,
     uniform,
-    unit,
 )
 from miricigale.utils.compilation import njit
 
@@ -66,28 +65,16 @@ def _add_tabulated(s0, s1, s2, s3, mean, slot, tables, out):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _add_single(s0, s1, s2, s3, mean, out):
+def _add_single(state, mean, out):
     """Add a draw of a mean to each of ``out``, without a table."""
     if mean < PTRS_FROM:
         p0 = math.exp(-mean)
         for g in range(out.size):
-            s0, s1, s2, s3, bits = advance(s0, s1, s2, s3)
-            out[g] += poisson_inversion(unit(bits), mean, p0)
-        return s0, s1, s2, s3
-    a, b, v_r, inverse_alpha, log_mean = ptrs_constants(mean)
+            out[g] += poisson_inversion(uniform(state), mean, p0)
+        return
+    constants = ptrs_constants(mean)
     for g in range(out.size):
-        k = -1.0
-        while k < 0.0:
-            s0, s1, s2, s3, bits = advance(s0, s1, s2, s3)
-            u = unit(bits) - 0.5
-            s0, s1, s2, s3, bits = advance(s0, s1, s2, s3)
-            v = unit(bits)
-            us = 0.5 - abs(u)
-            k = math.floor((2.0 * a / us + b) * u + mean + 0.43)
-            if us < 0.07 or v > v_r:
-                k = ptrs_rest(mean, a, b, inverse_alpha, log_mean, v, k, us)
-        out[g] += k
-    return s0, s1, s2, s3
+        out[g] += ptrs(state, mean, constants)
 
 
 @njit(cache=True, nogil=True)
@@ -98,13 +85,12 @@ def _draw_groups(state, mean, tables, out):
     The mean is the sum of those of one or two tables and of a rest, whose events are as many as
     all groups have together, each in a group of its own choice: a sum of Poisson numbers is one.
     """
-    s0, s1, s2, s3 = state[0], state[1], state[2], state[3]
     n_group = out.size
     out[:] = 0.0
     if tables[0].size == 0 or mean > _TABLE_MEAN:
-        s0, s1, s2, s3 = _add_single(s0, s1, s2, s3, mean, out)
-        state[0], state[1], state[2], state[3] = s0, s1, s2, s3
+        _add_single(state, mean, out)
         return
+    s0, s1, s2, s3 = state[0], state[1], state[2], state[3]
     node, slot, rest = _node(mean)
     if node > 0.0:
         s0, s1, s2, s3 = _add_tabulated(s0, s1, s2, s3, node, slot, tables, out)
@@ -182,18 +168,17 @@ def add_latent(ramp, rates, released, key, first_row):
     n_int, n_group, n_row, n_col = ramp.shape
     n_latent = rates.shape[0]
     state = np.empty(4, np.uint64)
-    for r in range(n_row):
-        for i in range(n_int):
-            seed_stream(state, key, i, first_row + r)
-            for x in range(n_col):
-                total = 0.0
-                for g in range(n_group):
-                    mean = 0.0
-                    for k in range(n_latent):
-                        mean += rates[k, r, x] * released[k, i, g]
-                    if mean > 0.0:
-                        total += poisson(state, min(mean, _MEAN_MAX))
-                    ramp[i, g, r, x] += np.float32(total)
+    for r, i in np.ndindex(n_row, n_int):
+        seed_stream(state, key, i, first_row + r)
+        for x in range(n_col):
+            total = 0.0
+            for g in range(n_group):
+                mean = 0.0
+                for k in range(n_latent):
+                    mean += rates[k, r, x] * released[k, i, g]
+                if mean > 0.0:
+                    total += poisson(state, min(mean, _MEAN_MAX))
+                ramp[i, g, r, x] += np.float32(total)
 
 
 @njit(cache=True, nogil=True)
@@ -201,11 +186,7 @@ def _push(deposits, n, slot, head, row, col, charge):
     """Append one deposit to the list of its group; returns the (grown) list and its length."""
     if n == deposits.shape[0]:
         # by hand: an assignment of slices takes seconds to compile
-        grown = np.empty((2 * n, 4))
-        for i in range(n):
-            for j in range(4):
-                grown[i, j] = deposits[i, j]
-        deposits = grown
+        deposits = np.concatenate((deposits, np.empty_like(deposits)))
     deposits[n, 0] = head[slot]
     deposits[n, 1] = row
     deposits[n, 2] = col
@@ -354,17 +335,16 @@ def couple_neighbors(ramp, kernel):
     """
     n_int, n_group, n_row, n_col = ramp.shape
     padded = np.empty((n_row + 2, n_col + 2), np.float32)
-    for i in range(n_int):
-        for g in range(n_group):
-            padded[1:-1, 1:-1] = ramp[i, g]
-            padded[0, 1:-1] = ramp[i, g, 0]
-            padded[-1, 1:-1] = ramp[i, g, -1]
-            padded[:, 0] = padded[:, 1]
-            padded[:, -1] = padded[:, -2]
-            for r in range(n_row):
-                for x in range(n_col):
-                    total = np.float32(0.0)
-                    for dy in range(3):
-                        for dx in range(3):
-                            total += kernel[dy, dx] * padded[r + dy, x + dx]
-                    ramp[i, g, r, x] = total
+    for i, g in np.ndindex(n_int, n_group):
+        padded[1:-1, 1:-1] = ramp[i, g]
+        padded[0, 1:-1] = ramp[i, g, 0]
+        padded[-1, 1:-1] = ramp[i, g, -1]
+        padded[:, 0] = padded[:, 1]
+        padded[:, -1] = padded[:, -2]
+        for r in range(n_row):
+            for x in range(n_col):
+                total = np.float32(0.0)
+                for dy in range(3):
+                    for dx in range(3):
+                        total += kernel[dy, dx] * padded[r + dy, x + dx]
+                ramp[i, g, r, x] = total

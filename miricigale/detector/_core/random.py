@@ -243,7 +243,13 @@ def poisson(s, mean):
         return 0.0
     if mean < PTRS_FROM:
         return poisson_inversion(uniform(s), mean, math.exp(-mean))
-    a, b, v_r, inverse_alpha, log_mean = ptrs_constants(mean)
+    return ptrs(s, mean, ptrs_constants(mean))
+
+
+@njit(cache=True, nogil=True)
+def ptrs(s, mean, constants):
+    """One Poisson number of a mean of at least ``PTRS_FROM``."""
+    a, b, v_r, inverse_alpha, log_mean = constants
     k = -1.0
     while k < 0.0:
         u = uniform(s) - 0.5

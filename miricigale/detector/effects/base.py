@@ -1,6 +1,7 @@
 """What all effects share: the block they act on, their streams, their base."""
 
 import dataclasses
+from operator import attrgetter
 
 import numpy as np
 
@@ -72,10 +73,7 @@ class Block(Timed):
         """True where a pixel is a reference pixel, (n_row, n_col)."""
         return reference_pixel_mask(subarray=self.exposure.subarray)[self.rows]
 
-    @property
-    def ramp_shape(self):
-        """Shape of a ramp of this block."""
-        return self.group_dq.shape
+    ramp_shape = property(attrgetter("group_dq.shape"), doc="Shape of a ramp of this block.")
 
 
 class WholeBlock(Block):

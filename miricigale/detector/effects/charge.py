@@ -5,11 +5,7 @@ import dataclasses
 import numpy as np
 from scipy import ndimage
 
-from miricigale.detector._core.charge import (
-    add_latent,
-    add_poisson,
-    couple_neighbors,
-)
+from miricigale.detector._core.charge import add_latent, add_poisson, couple_neighbors
 from miricigale.detector._core.readout import clip_well
 from miricigale.detector.effects.base import Effect, check_amounts, check_share
 from miricigale.instrument import DQ, bad_pixel_mask

@@ -4,10 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from miricigale.detector._core.charge import (
-    add_cosmic_rays,
-    cosmic_ray_deposits,
-)
+from miricigale.detector._core.charge import add_cosmic_rays, cosmic_ray_deposits
 from miricigale.detector.effects.base import Effect, check_amounts, check_share
 
 

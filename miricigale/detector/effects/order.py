@@ -58,10 +58,8 @@ def effect_from_record(record):
     """
     settings = dict(record)
     name = settings.pop("effect")
-    for kind in ORDER:
-        if kind.__name__ == name:
-            return kind(**settings)
-    return OtherEffect(name, tuple(settings.items()))
+    kind = next((kind for kind in ORDER if kind.__name__ == name), None)
+    return OtherEffect(name, tuple(settings.items())) if kind is None else kind(**settings)
 
 
 def checked_effects(effects):

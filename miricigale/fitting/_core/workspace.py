@@ -51,9 +51,7 @@ def make_sums(n_z, n_galaxy, n_agn, n_frac, n_bands, n_draws=0, joint=()):
         best=np.zeros(3),
         index=np.full(4, -1),
         hist=Histograms(
-            **hist,
-            used=np.tile(np.array([[N_BINS, -1]]), (rows, 1)),
-            origin=np.zeros(3),
+            **hist, used=np.tile(np.array([[N_BINS, -1]]), (rows, 1)), origin=np.zeros(3)
         ),
         draws=Draws(
             next=np.zeros(n_draws),

@@ -4,10 +4,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 from miricigale.fitting.likelihood import FitFlags
 from miricigale.fitting.posterior import cell_edges
-from miricigale.fitting.priors import integrals, integrals_to, known_redshifts, read_density
+from miricigale.fitting.priors import integrals_to, known_redshifts, read_density
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_names, check_that
 
@@ -129,7 +130,7 @@ class Table:
 
     @cached_property
     def _total(self):
-        return integrals(self.value, self.density)
+        return cumulative_trapezoid(self.density, self.value, initial=0)
 
     @property
     def bounds(self):
@@ -247,7 +248,7 @@ class Space:
         declared = model.parameters
         check_names(priors, "parameter", declared)
         made = {name: make_prior(name, priors[name], declared[name]) for name in priors}
-        free = {name: made[name] for name in declared if not _number(made.get(name, 0.0))}
+        free = {name: made[name] for name in declared if not isinstance(made.get(name, 0.0), float)}
         every = {name: made.get(name, parameter.default) for name, parameter in declared.items()}
         return cls(free, {name: every[name] for name in every if name not in free})
 
@@ -255,7 +256,7 @@ class Space:
         """Copy in which a parameter has another prior, or a value."""
         free = {key: value for key, value in self.free.items() if key != name}
         fixed = {key: value for key, value in self.fixed.items() if key != name}
-        (fixed if _number(prior) else free)[name] = prior
+        (fixed if isinstance(prior, float) else free)[name] = prior
         return replace(self, free=free, fixed=fixed)
 
     @property
@@ -320,7 +321,3 @@ def redshift_axis(spaces, limits, n):
     edges = cell_edges(nodes, bounds)
     cdf = np.mean([p.cdf(edges) for p in tables] or [edges], axis=0)
     return nodes, np.diff(cdf) / (cdf[-1] - cdf[0]), bounds
-
-
-def _number(prior):
-    return isinstance(prior, (int, float))

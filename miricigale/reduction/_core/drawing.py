@@ -86,22 +86,21 @@ def draw_slopes(mean, electrons, time, normals, table, offset, scale, quoted, qu
     rate, var_poisson, var_read = out
     n_row, n_col = mean.shape
     last, end = table.shape[1] - 2, quoted.shape[1] - 2
-    for y in range(n_row):
-        for x in range(n_col):
-            m = mean[y, x]
-            if m != m:
-                rate[y, x] = var_poisson[y, x] = var_read[y, x] = np.nan
-                continue
-            k, part = _place(m, scale, last)
-            response = table[0, k] + part * (table[0, k + 1] - table[0, k])
-            counted = table[1, k] + part * (table[1, k + 1] - table[1, k])
-            read = table[2, k] + part * (table[2, k + 1] - table[2, k])
-            noise = (electrons[y, x] / time - m) * math.sqrt(time / counted)
-            slope = offset + response * (m + noise) + read * normals[y, x]
-            k, part = _place(slope, quoted_scale, end)
-            rate[y, x] = slope
-            var_poisson[y, x] = quoted[0, k] + part * (quoted[0, k + 1] - quoted[0, k])
-            var_read[y, x] = quoted[1, k] + part * (quoted[1, k + 1] - quoted[1, k])
+    for y, x in np.ndindex(n_row, n_col):
+        m = mean[y, x]
+        if m != m:
+            rate[y, x] = var_poisson[y, x] = var_read[y, x] = np.nan
+            continue
+        k, part = _place(m, scale, last)
+        response = table[0, k] + part * (table[0, k + 1] - table[0, k])
+        counted = table[1, k] + part * (table[1, k + 1] - table[1, k])
+        read = table[2, k] + part * (table[2, k + 1] - table[2, k])
+        noise = (electrons[y, x] / time - m) * math.sqrt(time / counted)
+        slope = offset + response * (m + noise) + read * normals[y, x]
+        k, part = _place(slope, quoted_scale, end)
+        rate[y, x] = slope
+        var_poisson[y, x] = quoted[0, k] + part * (quoted[0, k + 1] - quoted[0, k])
+        var_read[y, x] = quoted[1, k] + part * (quoted[1, k + 1] - quoted[1, k])
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -166,32 +165,31 @@ def _find(rate, variance, mean, entries, n, groups, noise, truth, jump, rng):
     cut = np.zeros(link.size, np.uint8)
     jumps = np.empty((n, 5))
     n_jump = 0
-    for y in range(ny):
-        for x in range(nx):
-            i = head[y, x]
-            while i >= 0:
-                g = slot[i] % n_group
-                j = g - g0
-                full = mean[y, x] * step * (g + 1) + charge[i] >= limit
-                if 1 <= j <= n_diff and not full:
-                    slope, share = rate[y, x] * step, variance[y, x] * step * step
-                    q = charge[i] * dn
-                    v, t = slope * inv_gain, 0.0
-                    for _ in range(2):
-                        weight, leverage = difference_weight(j, n_diff, v, s)
-                        t = q * math.sqrt(max(leverage - weight * weight * share, 0.0))
-                        if not 0.5 * jump < t < 2.0 * jump:
-                            break
-                        # the fit takes its weights from a slope that the hit has raised
-                        v = (slope + weight * share * q) * inv_gain
-                    t += rng.standard_normal()
-                    if abs(t) > jump:
-                        cut[i] = _OWN
-                        jumps[n_jump, 0], jumps[n_jump, 1] = y, x
-                        jumps[n_jump, 2], jumps[n_jump, 3] = slot[i] // n_group, j - 1
-                        jumps[n_jump, 4] = t
-                        n_jump += 1
-                i = link[i]
+    for y, x in np.ndindex(ny, nx):
+        i = head[y, x]
+        while i >= 0:
+            g = slot[i] % n_group
+            j = g - g0
+            full = mean[y, x] * step * (g + 1) + charge[i] >= limit
+            if 1 <= j <= n_diff and not full:
+                slope, share = rate[y, x] * step, variance[y, x] * step * step
+                q = charge[i] * dn
+                v, t = slope * inv_gain, 0.0
+                for _ in range(2):
+                    weight, leverage = difference_weight(j, n_diff, v, s)
+                    t = q * math.sqrt(max(leverage - weight * weight * share, 0.0))
+                    if not 0.5 * jump < t < 2.0 * jump:
+                        break
+                    # the fit takes its weights from a slope that the hit has raised
+                    v = (slope + weight * share * q) * inv_gain
+                t += rng.standard_normal()
+                if abs(t) > jump:
+                    cut[i] = _OWN
+                    jumps[n_jump, 0], jumps[n_jump, 1] = y, x
+                    jumps[n_jump, 2], jumps[n_jump, 3] = slot[i] // n_group, j - 1
+                    jumps[n_jump, 4] = t
+                    n_jump += 1
+            i = link[i]
     return jumps[:n_jump].copy(), cut
 
 
@@ -273,61 +271,60 @@ def hit_slopes(mean, hits, electrons, groups, noise, truth, thresholds, rng, out
     # segments that are not whole integrations; hits that stay: segment, difference, charge
     lengths = np.empty(n_int * (n_diff + 1) + 1, np.int64)
     kept = np.empty((n_int * n_group, 3))
-    for y in range(ny):
-        for x in range(nx):
-            i = head[y, x]
-            each = mean[y, x] * step
-            whole = _usable(each, 0.0, 0, limit, g0, g1)
-            if rate[y, x] != rate[y, x] or (i < 0 and whole == n_diff):
-                continue
-            n_whole, n_seg, n_kept = n_int, 0, 0
-            own, beside, full = 0, False, whole < n_diff
-            while i >= 0:
-                k = slot[i] // n_group
-                n_whole -= 1
-                begin, last, extra = 1, whole, 0.0
-                while i >= 0 and slot[i] // n_group == k:
-                    g = slot[i] % n_group
-                    j = g - g0
-                    beside = beside or (cut[i] & _NEIGHBOR) > 0
-                    if j <= last:
-                        extra += charge[i]
-                        last = min(last, _usable(each, extra, g, limit, g0, g1))
-                        if 1 <= j <= last and cut[i]:
-                            own += cut[i] & _OWN
-                            if j > begin:
-                                lengths[n_seg] = j - begin
-                                n_seg += 1
-                            begin = j + 1
-                        elif 1 <= j <= last:
-                            kept[n_kept, 0], kept[n_kept, 1] = n_seg, j - begin + 1
-                            kept[n_kept, 2] = charge[i]
-                            n_kept += 1
-                    i = link[i]
-                full = full or last < n_diff
-                if last >= begin:
-                    lengths[n_seg] = last - begin + 1
-                    n_seg += 1
-            used = n_whole * whole
-            for m in range(n_seg):
-                used += lengths[m]
-            n_used[y, x] = used
-            n_jump[y, x] = own
-            dq[y, x] |= SATURATED * full + JUMP * (own > 0 or beside) + JUMP_NEIGHBOR * beside
-            if used == 0:
-                rate[y, x] = var_poisson[y, x] = var_read[y, x] = np.nan
-                continue
+    for y, x in np.ndindex(ny, nx):
+        i = head[y, x]
+        each = mean[y, x] * step
+        whole = _usable(each, 0.0, 0, limit, g0, g1)
+        if rate[y, x] != rate[y, x] or (i < 0 and whole == n_diff):
+            continue
+        n_whole, n_seg, n_kept = n_int, 0, 0
+        own, beside, full = 0, False, whole < n_diff
+        while i >= 0:
+            k = slot[i] // n_group
+            n_whole -= 1
+            begin, last, extra = 1, whole, 0.0
+            while i >= 0 and slot[i] // n_group == k:
+                g = slot[i] % n_group
+                j = g - g0
+                beside = beside or (cut[i] & _NEIGHBOR) > 0
+                if j <= last:
+                    extra += charge[i]
+                    last = min(last, _usable(each, extra, g, limit, g0, g1))
+                    if 1 <= j <= last and cut[i]:
+                        own += cut[i] & _OWN
+                        if j > begin:
+                            lengths[n_seg] = j - begin
+                            n_seg += 1
+                        begin = j + 1
+                    elif 1 <= j <= last:
+                        kept[n_kept, 0], kept[n_kept, 1] = n_seg, j - begin + 1
+                        kept[n_kept, 2] = charge[i]
+                        n_kept += 1
+                i = link[i]
+            full = full or last < n_diff
+            if last >= begin:
+                lengths[n_seg] = last - begin + 1
+                n_seg += 1
+        used = n_whole * whole
+        for m in range(n_seg):
+            used += lengths[m]
+        n_used[y, x] = used
+        n_jump[y, x] = own
+        dq[y, x] |= SATURATED * full + JUMP * (own > 0 or beside) + JUMP_NEIGHBOR * beside
+        if used == 0:
+            rate[y, x] = var_poisson[y, x] = var_read[y, x] = np.nan
+            continue
+        shift = 0.0
+        # the fit's weights know the slope with the hits that it keeps
+        for _ in range(1 if n_kept == 0 else 3):
+            v = (rate[y, x] * step + shift) * inv_gain
+            total, squares = _sums(lengths, n_seg, v, s, whole, n_whole)
             shift = 0.0
-            # the fit's weights know the slope with the hits that it keeps
-            for _ in range(1 if n_kept == 0 else 3):
-                v = (rate[y, x] * step + shift) * inv_gain
-                total, squares = _sums(lengths, n_seg, v, s, whole, n_whole)
-                shift = 0.0
-                for m in range(n_kept):
-                    weight, _ = difference_weight(kept[m, 1], lengths[int(kept[m, 0])], v, s)
-                    shift += weight * kept[m, 2] * dn / total
-            more = max(1.0 / total - (var_poisson[y, x] + var_read[y, x]) * step * step, 0.0)
-            rate[y, x] += (shift + math.sqrt(more) * rng.standard_normal()) / step
-            var_poisson[y, x] = max(v, 0.0) * squares / (total * step) ** 2
-            var_read[y, x] = max(1.0 / (total * step * step) - var_poisson[y, x], 0.0)
+            for m in range(n_kept):
+                weight, _ = difference_weight(kept[m, 1], lengths[int(kept[m, 0])], v, s)
+                shift += weight * kept[m, 2] * dn / total
+        more = max(1.0 / total - (var_poisson[y, x] + var_read[y, x]) * step * step, 0.0)
+        rate[y, x] += (shift + math.sqrt(more) * rng.standard_normal()) / step
+        var_poisson[y, x] = max(v, 0.0) * squares / (total * step) ** 2
+        var_read[y, x] = max(1.0 / (total * step * step) - var_poisson[y, x], 0.0)
     return jumps

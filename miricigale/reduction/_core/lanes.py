@@ -163,12 +163,7 @@ def settle(lanes, n_int, scale, threshold, events, n_event, free, out):
             values[_SUM, b] -= lanes[0][i, b]
             pixels[b, _JUMPS] += 1
             if n_event == events.shape[0]:
-                # by hand: an assignment of slices takes seconds to compile
-                grown = np.empty((2 * n_event, 5))
-                for k in range(n_event):
-                    for j in range(5):
-                        grown[k, j] = events[k, j]
-                events = grown
+                events = np.concatenate((events, np.empty_like(events)))
             events[n_event, 0] = y
             events[n_event, 1] = x
             events[n_event, 2] = i // each

@@ -9,6 +9,7 @@ from miricigale.refdata.libraries.ised import read_ised
 from miricigale.refdata.libraries.table import LibraryTable
 from miricigale.refdata.lookup import file_sha256
 from miricigale.utils.exceptions import data_error
+from miricigale.utils.options import check_data
 
 #: Of GALAXEV, in W: its files are in this unit (3.826e33 erg/s).
 SOLAR_LUMINOSITY = 3.826e26
@@ -59,9 +60,8 @@ def read_bc03(path):
     parts, files = [], {file.name: file_sha256(file) for file in paths}
     for file in paths:
         part = read_ised(file)
-        if part.law:
-            what = f"holds a composite population ({part.history}), wanted a single burst"
-            raise data_error(file, what)
+        what = f"holds a composite population ({part.history}), wanted a single burst"
+        check_data(not part.law, file, what)
         parts.append((file, part, _metallicity(part, file), _imf(part, file)))
     _check_set(parts)
     parts.sort(key=lambda item: item[2])
@@ -114,9 +114,8 @@ def _files(path):
         found = [path]
     else:
         found = sorted(p for p in path.parent.glob(path.name) if _is_ised(p.name))
-    if not found:
-        wanted = "wanted files *.ised or *.ised_ASCII (also .gz), got none"
-        raise data_error(path, f"cannot be read as populations of BC03: {wanted}")
+    wanted = "wanted files *.ised or *.ised_ASCII (also .gz), got none"
+    check_data(found, path, f"cannot be read as populations of BC03: {wanted}")
     return found
 
 
@@ -134,9 +133,8 @@ def _metallicity(part, file):
     match = re.search(r"_m(\d{2,3})(?=[_.])", file.name)
     named = (PADOVA_1994 | PADOVA_2000).get(int(match[1])) if match else None
     stated = part.metallicity
-    if named is None and stated is None:
-        wanted = "wanted 'Z=...' in its head or a name like _m62_"
-        raise data_error(file, f"states no metallicity: {wanted}")
+    wanted = "wanted 'Z=...' in its head or a name like _m62_"
+    check_data(not (named is None and stated is None), file, f"states no metallicity: {wanted}")
     if named is not None and stated is not None and not np.isclose(named, stated, rtol=0.01):
         what = f"states Z = {stated:g}, but its name (m{match[1]}) means Z = {named:g}"
         raise data_error(file, what)
@@ -169,8 +167,7 @@ def _check_set(parts):
             "ages": ages,
         }
         differ = ", ".join(name for name, is_same in same.items() if not is_same)
-        if differ:
-            raise data_error(other, f"and {file.name} are not one set: other {differ}")
+        check_data(not differ, other, f"and {file.name} are not one set: other {differ}")
         if metallicity in seen:
             twice = f"the same metallicity as {seen[metallicity].name}, {metallicity:g}"
             raise data_error(other, f"is not of one set: it has {twice}")
@@ -191,9 +188,8 @@ def _surviving(part, file):
     if gas is not None and np.any(gas[old] > 0):
         with_remnants = np.abs(mass + gas - 1.0)[old].max()
         without = np.abs(mass + remnants + gas - 1.0)[old].max()
-        if min(with_remnants, without) > 0.01:
-            what = "has masses of stars, remnants and gas that do not sum to 1 Msun"
-            raise data_error(file, what)
+        what = "has masses of stars, remnants and gas that do not sum to 1 Msun"
+        check_data(min(with_remnants, without) <= 0.01, file, what)
         take = with_remnants < without
     elif _version(part) is not None:
         take = _version(part) == 2003

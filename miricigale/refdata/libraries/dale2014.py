@@ -9,7 +9,9 @@ from miricigale.refdata.libraries.members import is_archive, members
 from miricigale.refdata.libraries.table import LibraryTable
 from miricigale.refdata.lookup import locate
 from miricigale.refdata.tables import load_ssp
+from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import data_error
+from miricigale.utils.options import check_data
 
 SPECTRA = "spectra.0.00AGN.dat"
 CALIBRATION = "dhcal.dat"
@@ -21,10 +23,7 @@ SCALED_AT = 7  # row of the spectra (1.028 um) at which CIGALE scales the starli
 LONGEST = 1e4  # um; beyond, rows are 7 to 25 % apart and the last says -99.9999
 
 #: Files that this reader was tested on.
-KNOWN = {
-    CALIBRATION: "bb0b15806b03f8f45d340c236222cad787607d00c0f1354393622629c9cb22db",
-    SPECTRA: "eb716792d6426ab839b2764d6a8ad6e1558d3b1d44a9bbe911af75a36514b4b3",
-}
+KNOWN = declared("miricigale.refdata.libraries", "formats.toml")["dale2014"]
 
 
 def read_dale2014(path):
@@ -111,13 +110,11 @@ def _find(path):
     folders = [place.parent for place, _, _ in found if place.name == SPECTRA]
     if len(folders) > 1:
         folders = [f for f in folders if f.parts[-2:] == ("database_builder", "dale2014")]
-    if len(folders) != 1:
-        raise data_error(path, f"must hold one {SPECTRA}, got {len(folders) or 'none'}")
+    check_data(len(folders) == 1, path, f"must hold one {SPECTRA}, got {len(folders) or 'none'}")
     here = [(place.name, *rest) for place, *rest in found if place.parent == folders[0]]
     contents = {name: data for name, data, _ in here}
-    if CALIBRATION not in contents:
-        what = f"has {SPECTRA} without {CALIBRATION}, which lists the alphas of its columns"
-        raise data_error(path, what)
+    what = f"has {SPECTRA} without {CALIBRATION}, which lists the alphas of its columns"
+    check_data(CALIBRATION in contents, path, what)
     return contents, {name: source for name, _, source in here}
 
 
@@ -127,9 +124,8 @@ def _numbers(data, place, n_columns, wanted):
         table = np.loadtxt(data.decode("ascii").splitlines(), ndmin=2)
     except ValueError as err:
         raise data_error(place, f"is not {wanted} in {n_columns} columns: {err}") from err
-    if table.shape[1] != n_columns:
-        got = f"row 1 of {len(table)} has {table.shape[1]} columns"
-        raise data_error(place, f"is not {wanted} in {n_columns} columns: {got}")
+    got = f"row 1 of {len(table)} has {table.shape[1]} columns"
+    check_data(table.shape[1] == n_columns, place, f"is not {wanted} in {n_columns} columns: {got}")
     if n_bad := np.count_nonzero(~np.isfinite(table)):
         raise data_error(place, f"must hold finite numbers, got {n_bad} others")
     return table
@@ -146,12 +142,10 @@ def _read_calibration(data, place):
 def _read_spectra(data, place):
     table = _numbers(data, place, 1 + ALPHA.size, "wavelength and log10 nuF_nu")
     wave = table[:, 0]
-    if wave.size != N_WAVE:
-        what = f"must have {N_WAVE} rows, got {wave.size}: truncated or another version"
-        raise data_error(place, what)
-    if not np.all(np.diff(wave) > 0) or wave[0] > 1.0 or wave[-1] < 1e3:
-        what = "must have ascending wavelengths in um, from 1 or less to 1000 or more"
-        raise data_error(place, what)
+    what = f"must have {N_WAVE} rows, got {wave.size}: truncated or another version"
+    check_data(wave.size == N_WAVE, place, what)
+    what = "must have ascending wavelengths in um, from 1 or less to 1000 or more"
+    check_data(np.all(np.diff(wave) > 0) and wave[0] <= 1.0 and wave[-1] >= 1e3, place, what)
     return wave, table[:, 1:]
 
 
@@ -170,9 +164,8 @@ def _check_order(wave, log_power, color, places):
     at = np.log([60.0, 100.0])
     seen = np.array([np.subtract(*np.interp(at, np.log(wave), row)) for row in log_fnu])
     worst = np.abs(seen - color).max()
-    if worst > 0.06:
-        what = f"does not fit {places[CALIBRATION]}: log f60/f100 differs by {worst:.2f}"
-        raise data_error(places[SPECTRA], f"{what}, wanted less than 0.06")
+    what = f"does not fit {places[CALIBRATION]}: log f60/f100 differs by {worst:.2f}"
+    check_data(worst <= 0.06, places[SPECTRA], f"{what}, wanted less than 0.06")
 
 
 def _bundled_starlight(wave):

@@ -16,26 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
+from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import unpacked_size
 
 #: Quantities after the spectra, in their order.
-QUANTITIES = [
-    "bolometric",
-    "mass",
-    "sfr",
-    "evolutionary",
-    "supernovae",
-    "planetary_nebulae",
-    "black_holes",
-    "neutron_stars",
-    "white_dwarfs",
-    "remnants",
-    "turn_off",
-    "main_sequence",
-    "gas",
-    "galaxy",
-]
+QUANTITIES = declared("miricigale.refdata.libraries", "formats.toml")["ised"]["quantities"]
 N_NEEDED = 10  # of them; later versions go on
 
 _LAWS = {0: "single burst (SSP)", 4: "exponential", 6: "delayed"}

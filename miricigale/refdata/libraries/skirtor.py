@@ -11,19 +11,14 @@ import numpy as np
 from miricigale.refdata.libraries.members import is_archive, members
 from miricigale.refdata.libraries.table import LibraryTable
 from miricigale.utils.content import file_sha256
+from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import data_error
+from miricigale.utils.options import check_data
 from miricigale.utils.table_files import read_table
 from miricigale.utils.units import to_array
 
 #: Values of the whole library: 19,200 spectra.
-SKIRTOR_AXES = {
-    "tau97": (3.0, 5.0, 7.0, 9.0, 11.0),
-    "p": (0.0, 0.5, 1.0, 1.5),
-    "q": (0.0, 0.5, 1.0, 1.5),
-    "opening_angle": (10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0),
-    "radius_ratio": (10.0, 20.0, 30.0),
-    "inclination": tuple(10.0 * k for k in range(10)),
-}
+SKIRTOR_AXES = declared("miricigale.refdata.libraries", "formats.toml")["skirtor"]
 _WHOLE = 19200
 _WANTED = (
     "the SKIRTOR library (t*_p*_q*_oa*_R*_Mcl0.97_i*_sed.dat, or lightningpy's SKIRTOR.fits.gz)"
@@ -70,8 +65,7 @@ def read_skirtor(path):
         or the product of values has holes.
     """
     path = Path(path)
-    if not path.exists():
-        raise data_error(path, f"does not exist; wanted {_WANTED}")
+    check_data(path.exists(), path, f"does not exist; wanted {_WANTED}")
     if path.is_file() and not is_archive(path):
         wave, axes, spectra, files = _read_fits(path)
     else:
@@ -142,9 +136,8 @@ def _read_texts(path):
         key = tuple(map(float, _NAME.fullmatch(name).groups()))
         digest = hashlib.sha256(data).hexdigest()
         if key in known:
-            if known[key][0] != digest:
-                what = f"and {known[key][1]} are the same model with different numbers"
-                raise data_error(source, what)
+            what = f"and {known[key][1]} are the same model with different numbers"
+            check_data(known[key][0] == digest, source, what)
             continue
         known[key] = (digest, source)
         table = _parse(data, source)
@@ -159,8 +152,7 @@ def _read_texts(path):
         disk.append((seen / (wave * _FLUX)).astype(np.float32))
         dust.append((table[4] / (wave * _FLUX)).astype(np.float32))
         files[source.removeprefix(f"{path}{'/' if path.is_dir() else ':'}")] = digest
-    if not keys:
-        raise data_error(path, f"holds no spectrum; wanted {_WANTED}")
+    check_data(keys, path, f"holds no spectrum; wanted {_WANTED}")
     axes = dict(zip(SKIRTOR_AXES, np.array(keys).T, strict=True))
     return wave, axes, {"disk": np.array(disk), "dust": np.array(dust)}, files
 
@@ -203,9 +195,8 @@ def _check_columns(wave, table, seen, inclination, unit, source):
     with 1e11 Lsun over all directions: a foreign unit or column breaks one of them.
     """
     total, dust, transparent = table[0], table[3], table[-1]
-    if np.abs(total - seen - dust).max() > 1e-3 * total.max():
-        what = "has a total that is not direct + scattered + dust: columns in another order?"
-        raise data_error(source, what)
+    what = "has a total that is not direct + scattered + dust: columns in another order?"
+    check_data(np.abs(total - seen - dust).max() <= 1e-3 * total.max(), source, what)
     mu = np.cos(np.radians(inclination))
     power = np.trapezoid(transparent / wave, wave) / unit
     law = mu * (1.0 + 2.0 * mu) / 3.0 * 18.0 / 7.0

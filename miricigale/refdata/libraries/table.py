@@ -11,7 +11,7 @@ from astropy.table import Table
 
 from miricigale.utils.exceptions import argument_error, data_error
 from miricigale.utils.files import cached_by_file, open_fits
-from miricigale.utils.options import check_that
+from miricigale.utils.options import check_data, check_that
 from miricigale.utils.store import open_parts, write_parts
 from miricigale.utils.units import WAVE, frozen_array, to_array
 
@@ -282,8 +282,7 @@ def _open(path, name):
     # the mapping lives as long as the arrays that use it
     with open_parts(path, (_LAYOUT,), wanted=wanted, memmap=True) as parts:
         text = parts.text
-        if text["name"] != name:
-            raise data_error(path, f"holds {text['name']!r}, not {name!r}")
+        check_data(text["name"] == name, path, f"holds {text['name']!r}, not {name!r}")
         rows = parts.table("ROWS")
         kinds = ("axes", "values")
         columns = {kind: {n: np.asarray(rows[n]) for n in text[kind]} for kind in kinds}
@@ -312,9 +311,8 @@ def verify_library(path, name):
     with open_fits(path, wanted=f"the library {name!r}") as hdus:
         for number, hdu in enumerate(hdus):
             # 1 is success, 2 no checksum
-            if (hdu.verify_datasum(), hdu.verify_checksum()) != (1, 1):
-                what = f"is damaged: wrong checksum in HDU {number} ({hdu.name})"
-                raise data_error(path, what)
+            what = f"is damaged: wrong checksum in HDU {number} ({hdu.name})"
+            check_data((hdu.verify_datasum(), hdu.verify_checksum()) == (1, 1), path, what)
     for kind, spectra in library.spectra.items():
         for first in range(0, library.n_rows, 1000):
             if not np.all(np.isfinite(spectra[first : first + 1000])):

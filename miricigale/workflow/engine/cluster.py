@@ -6,6 +6,7 @@ from concurrent.futures import CancelledError
 
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.optional import require
+from miricigale.utils.options import check_data
 from miricigale.workflow.engine.schedule import Place
 
 
@@ -44,9 +45,8 @@ def cluster_executor(address, *, memory=None):
         msg = f"there is no dask scheduler at {address!r}: {err}"
         raise DataError(msg) from err
     with client:
-        if not client.nthreads():
-            msg = f"the scheduler at {address} has no workers; start some with 'dask worker {address}'"
-            raise DataError(msg)
+        what = f"has no workers; start some with 'dask worker {address}'"
+        check_data(client.nthreads(), f"the scheduler at {address}", what)
 
         # functions made here go to others as they are, where this module may be missing
         def version():

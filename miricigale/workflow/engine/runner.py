@@ -12,17 +12,14 @@ import os
 from pathlib import Path
 
 from miricigale.refdata.lookup import fingerprint
-from miricigale.utils.exceptions import (
-    ConfigError,
-    OtherResultsError,
-)
+from miricigale.utils.exceptions import ConfigError, OtherResultsError
 from miricigale.utils.parallel import available_memory, thread_count
 from miricigale.utils.progress import print_line
-from miricigale.workflow.config import load_config
 from miricigale.workflow.engine.display import Display
 from miricigale.workflow.engine.schedule import Task, local_place, run_tasks
 from miricigale.workflow.engine.stage import Units, run_unit
 from miricigale.workflow.engine.store import CONFIG, ProductStore, check_disk
+from miricigale.workflow.options import read_text
 
 log = logging.getLogger(__name__)
 
@@ -257,13 +254,20 @@ class StudyRunner:
     def _config_stands(self, store):
         """Whether manifest and ``config.toml`` say what this run does."""
         values = _values(self.config)
-        return store.config == values == _values_of(store.path(CONFIG))
+        return store.config == values == self._values_of(store.path(CONFIG))
+
+    def _values_of(self, path):
+        """The same of a file; none where it is missing or cannot be read."""
+        try:
+            return _values(self.config.from_texts([(str(path), read_text(path))]))
+        except (ConfigError, OSError, ValueError):
+            return {}
 
     def _edited_config(self, store):
         """Path of a ``config.toml`` that says neither what this run does nor what the last one did, or None."""
         path = store.path(CONFIG)
         known = store.config, _values(self.config)
-        return path if path.is_file() and _values_of(path) not in known else None
+        return path if path.is_file() and self._values_of(path) not in known else None
 
     def _refuse_replacing(self, store, states):
         if self.redo:
@@ -325,7 +329,7 @@ class StudyRunner:
             os.replace(edited, kept)
             log.warning("the edited %s is kept as %s", edited, kept.name)
         store.facts["config"] = values = _values(self.config)
-        if _values_of(store.path(CONFIG)) != values:
+        if self._values_of(store.path(CONFIG)) != values:
             store.save(CONFIG, lambda path: path.write_text(self.config.to_toml(), "utf-8"))
         store.write_manifest()
 
@@ -401,14 +405,6 @@ def _values(config):
     # threads and memory do not change products
     del values["run"]["threads"], values["run"]["memory"]
     return values
-
-
-def _values_of(path):
-    """The same of a file; none where it is missing or cannot be read."""
-    try:
-        return _values(load_config(path))
-    except (ConfigError, OSError, ValueError):
-        return {}
 
 
 def _summary(keys):

@@ -13,10 +13,7 @@ from collections.abc import Callable
 from astropy.table import QTable
 
 from miricigale.instrument.image_files import read_image, write_image
-from miricigale.utils.exceptions import (
-    data_error,
-    warn,
-)
+from miricigale.utils.exceptions import data_error, warn
 from miricigale.utils.folder import FileFolder
 from miricigale.utils.meta import undated
 from miricigale.utils.parallel import single_threaded

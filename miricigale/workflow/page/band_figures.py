@@ -16,11 +16,7 @@ from miricigale.plotting.axes import (
     new_figure,
     panels,
 )
-from miricigale.plotting.comparison import (
-    plot_error_function,
-    plot_offsets,
-    plot_relation,
-)
+from miricigale.plotting.comparison import plot_error_function, plot_offsets, plot_relation
 from miricigale.utils.units import ab_magnitude
 from miricigale.workflow.page.labels import band_label, by_wavelength
 from miricigale.workflow.stages.conditions import has_flag
@@ -80,8 +76,8 @@ def error_figure(errors, bands, limits):
     """The error function of every band, with the 5-sigma limits in uJy."""
     from matplotlib import colormaps
 
-    figure, axes = new_figure(size=(WIDTH, 4.2))
-    ax, order = axes[0, 0], by_wavelength(bands)
+    figure, [[ax]] = new_figure(size=(WIDTH, 4.2))
+    order = by_wavelength(bands)
     finite = [value for value in limits.values() if np.isfinite(value)]
     flux = np.geomspace(0.02, max(300, 30 * max(finite, default=1)), 120) * u.uJy
     # darker at shorter wavelengths, distinct to color-blind readers
@@ -109,8 +105,8 @@ def limit_figure(entries):
     Entries have ``limit``, ``formal_limit``, ``etc_limit``, ``proposal`` (AB or NaN) and ``ceers``,
     whether the exposures are those of the proposal.
     """
-    figure, axes = new_figure(size=(WIDTH, 3.4))
-    ax, bands = axes[0, 0], by_wavelength(entries)
+    figure, [[ax]] = new_figure(size=(WIDTH, 3.4))
+    bands = by_wavelength(entries)
     wave = np.array([Filter.from_name(name).pivot.to_value(u.um) for name in bands])
     keys = (*_LIMITS, "proposal")
     values = {key: np.array([entries[name][key] for name in bands], float) for key in keys}
@@ -140,8 +136,8 @@ def variant_figure(numbers, labels):
     ``numbers`` are those of `~miricigale.workflow.stages.variants.variant_numbers`, ``labels`` the names of
     images to what they are called.
     """
-    figure, axes = new_figure(size=(WIDTH, 3.4))
-    ax, bands = axes[0, 0], by_wavelength(set(numbers["band"]))
+    figure, [[ax]] = new_figure(size=(WIDTH, 3.4))
+    bands = by_wavelength(set(numbers["band"]))
     for k, (name, label) in enumerate(labels.items()):
         rows = {row["band"]: row for row in numbers[numbers["images"] == name]}
         offsets = [rows[band]["limit"] - rows[band]["calculator"] for band in bands]
@@ -160,8 +156,7 @@ def variant_figure(numbers, labels):
 
 def point_figure(points, bands):
     """Measured over true flux of the bright point sources of each band; triangles lie beyond."""
-    figure, axes = new_figure(size=(WIDTH, 3.2))
-    ax = axes[0, 0]
+    figure, [[ax]] = new_figure(size=(WIDTH, 3.2))
     ratios = [(points[n]["flux"] / points[n]["flux_true"]).to_value(u.one) for n in bands]
     finite = np.concatenate([r[np.isfinite(r)] for r in ratios])
     far = np.percentile(np.abs(finite - 1), 98, method="higher") if finite.size else 0.0

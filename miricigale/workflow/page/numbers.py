@@ -16,10 +16,7 @@ from miricigale.evaluation import (
     recovery_metrics,
     sigma_mad,
 )
-from miricigale.instrument import (
-    CEERS_FILTERS,
-    ceers_exposures,
-)
+from miricigale.instrument import CEERS_FILTERS, ceers_exposures
 from miricigale.utils.units import ab_magnitude
 from miricigale.workflow.stages.conditions import (
     ConditionFlags,

@@ -4,12 +4,7 @@ import collections
 
 import numpy as np
 
-from miricigale.evaluation import (
-    Estimate,
-    StudyResults,
-    TruthResults,
-    compare_with_paper,
-)
+from miricigale.evaluation import Estimate, StudyResults, TruthResults, compare_with_paper
 from miricigale.pages import number, sentence
 from miricigale.workflow.page.declared import texts_of
 from miricigale.workflow.stages.conditions import ConditionFlags, has_flag

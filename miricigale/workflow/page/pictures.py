@@ -220,8 +220,7 @@ def convolution_figure(kernels):
 
     reach = min(k.target.shape[0] // 2 * k.pixel_scale.to_value(u.arcsec) for k in kernels.values())
     radius = np.linspace(0.03, min(2.5, reach), 60)
-    figure, axes = new_figure(1, 2, size=(5.25, 3.4), sharex=True)
-    left, right = axes[0]
+    figure, [[left, right]] = new_figure(1, 2, size=(5.25, 3.4), sharex=True)
     most, steps = _SMALL_ERROR, np.linspace(0.0, 0.82, max(len(kernels), 2))
     for k, (name, kernel) in enumerate(kernels.items()):
         pixels = radius / kernel.pixel_scale.to_value(u.arcsec)

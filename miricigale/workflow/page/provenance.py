@@ -22,12 +22,7 @@ from miricigale.workflow.stages.exposures import (
     study_exposures,
     study_pointings,
 )
-from miricigale.workflow.stages.inputs import (
-    DUST_SHOWS,
-    catalog_bands,
-    existing_bands,
-    input_bands,
-)
+from miricigale.workflow.stages.inputs import DUST_SHOWS, catalog_bands, existing_bands, input_bands
 
 
 def exposure_kinds(config, forecasts, bands):

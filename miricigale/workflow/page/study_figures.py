@@ -204,8 +204,8 @@ def xray_figure(study, seed):
     ends = np.percentile(values[good], [0.5, 99.5])
     bins = np.arange(np.floor(4 * ends[0]) / 4, np.ceil(4 * ends[1]) / 4 + 0.01, 0.25)
     table = completeness(values, found, bins)
-    figure, axes = new_figure(2, 1, size=(7.0, 2.2), sharex=True, height_ratios=(1.5, 1))
-    upper, lower = axes[:, 0]
+    form = {"size": (7.0, 2.2), "sharex": True, "height_ratios": (1.5, 1)}
+    figure, [[upper], [lower]] = new_figure(2, 1, **form)
     upper.stairs(table["n"], bins, color=TRUE, lw=1.6, label="all")
     upper.stairs(table["n_found"], bins, color=MEASURED, fill=True, alpha=0.35, label="found")
     upper.stairs(table["n_found"], bins, color=MEASURED, lw=1.6)
@@ -242,8 +242,7 @@ def detection_figure(study):
             groups["MIPS 24 µm above its limit"] = ab_magnitude(table["mips.24"]) < MIPS_LIMIT
     z, power = np.asarray(table["redshift"], float), table["ir_luminosity"].to_value(u.Lsun)
     good = one.field & (power > 0) & np.isfinite(z)
-    figure, axes = new_figure(size=(7.0, 3.8))
-    ax = axes[0, 0]
+    figure, [[ax]] = new_figure(size=(7.0, 3.8))
     rest = good & ~np.any(list(groups.values()), axis=0)
     ax.semilogy(z[rest], power[rest], ".", ms=4, color="0.75", label="not detected", zorder=1)
     for k, (name, rows) in enumerate(groups.items()):

@@ -3,11 +3,7 @@
 import numpy as np
 
 from miricigale import photometry, sed
-from miricigale.evaluation import (
-    fraction_interval,
-    photoz_metrics,
-    recovery_metrics,
-)
+from miricigale.evaluation import fraction_interval, photoz_metrics, recovery_metrics
 from miricigale.fitting import GridSettings
 from miricigale.pages import sentence
 from miricigale.photometry.surveys import HERSCHEL_DEPTHS

@@ -1,6 +1,7 @@
 """What is exposed, and the grids that cover it, from the configuration alone."""
 
 import functools
+import logging
 import math
 import operator
 from pathlib import Path
@@ -15,15 +16,19 @@ from miricigale.instrument import (
     ceers_exposures,
     dither_patterns,
     mosaic_wcs,
+    read_centers,
     read_dithers,
     tangent_offset,
     tile_offsets,
 )
+from miricigale.utils.options import check_that
 from miricigale.utils.positions import as_positions
 from miricigale.utils.table_files import read_table
 from miricigale.workflow.background import band_background, of_filter, text_by_filter
 from miricigale.workflow.options import of_option, require
 from miricigale.workflow.truths import truth_names
+
+log = logging.getLogger(__name__)
 
 #: Sections of the configuration on which the grids of images depend, what is exposed, and kernels.
 GRID = ("pointing", "exposures")
@@ -138,6 +143,12 @@ def _pointings(field, filters, _):
     roll = field.roll * u.deg
     if field.table is not None:
         with of_option(f"[pointing] centers: {field.table.name}:", ValueError, u.UnitsError):
+            if field.table.suffix.lower() == ".pointing":
+                centers, others = read_centers(field.table, roll)
+                if others:
+                    text = "%s: exposures that are not of the full imager are not used: %s"
+                    log.warning(text, field.table.name, ", ".join(others))
+                return tuple(Pointing(center, roll, filters) for center in centers)
             return _read_pointings(read_table(field.table, wanted="pointings"), roll, filters)
     if field.centers:
         centers = [SkyCoord(*map(float, text.split()), unit="deg") for text in field.centers]
@@ -164,9 +175,8 @@ def _read_pointings(table, roll, filters):
         text = row[columns["bands"]] if "bands" in columns else ""
         names = [] if np.ma.is_masked(text) else str(text).lower().replace(",", " ").split()
         bands = [known.get(name.rpartition(".")[2]) for name in names] or filters
-        if None in bands:
-            msg = f"'bands' must be of [exposures] filters {list(filters)}, got {text!r}"
-            raise ValueError(msg)
+        wanted = f"of [exposures] filters {list(filters)}"
+        check_that(None not in bands, "bands", wanted, repr(text))
         found.append(Pointing(center, bands=tuple(bands), **given))
     return tuple(found)
 

@@ -12,11 +12,7 @@ from miricigale.utils.tables import error_column
 from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.perturbation import Perturbation
 from miricigale.workflow.stages.conditions import ConditionFlags, add_conditions, any_condition
-from miricigale.workflow.stages.exposures import (
-    GRID,
-    pointing_exposures,
-    pointing_time,
-)
+from miricigale.workflow.stages.exposures import GRID, pointing_exposures, pointing_time
 from miricigale.workflow.stages.inputs import existing_bands, fit_plan, sed_resources
 from miricigale.workflow.stages.measure import joined_photometry
 from miricigale.workflow.stages.sample import (
@@ -27,12 +23,7 @@ from miricigale.workflow.stages.sample import (
     matched_errors,
     mean_coverage,
 )
-from miricigale.workflow.truths import (
-    band_sets,
-    reference,
-    study_truths,
-    truth_names,
-)
+from miricigale.workflow.truths import band_sets, reference, study_truths, truth_names
 
 
 class _Field:

@@ -48,8 +48,7 @@ def measure_photometry(context, unit):
     suffix, _ = measured_mosaic(context.config)
     mosaic = context.image(f"{truth}/mosaic_{name}{suffix}.fits")
     result = measure_band(context, mosaic, name, context.config.photometry.method)
-    table = result.to_table()
-    context.save_table(f"{truth}/photometry/{name}.ecsv", table)
+    context.save_table(f"{truth}/photometry/{name}.ecsv", result.to_table())
     context.save_image(f"{truth}/photometry/{name}_model.fits", result.model_image)
     context.save_image(f"{truth}/photometry/{name}_residual.fits", result.residual_image)
 

@@ -9,11 +9,11 @@ from miricigale.pages import Missing, number, sentence
 from miricigale.workflow.page.declared import texts_of
 from miricigale.workflow.page.labels import band_label, by_wavelength
 from miricigale.workflow.page.numbers import bright_isolated
-from miricigale.workflow.truths import ALL, EFFECTS
+from miricigale.workflow.truths import ALL
 
 #: Name of what no effect has changed.
 NONE = "none"
-_LABELS = {NONE: "none", **EFFECTS, ALL: "all together"}
+_LABELS = texts_of("perturbations")["labels"]
 
 
 def _quantities(bands):

@@ -15,12 +15,7 @@ from miricigale.workflow.page.band_figures import rival_figure
 from miricigale.workflow.page.declared import texts_of
 from miricigale.workflow.page.labels import band_label
 from miricigale.workflow.stages.conditions import ConditionFlags
-from miricigale.workflow.stages.exposures import (
-    IMAGE_RESOURCES,
-    KERNEL,
-    band_names,
-    exposure_plan,
-)
+from miricigale.workflow.stages.exposures import IMAGE_RESOURCES, KERNEL, band_names, exposure_plan
 from miricigale.workflow.stages.measure import measure_band
 from miricigale.workflow.stages.sample import SampleFlags, in_field
 from miricigale.workflow.truths import reference

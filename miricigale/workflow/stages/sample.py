@@ -5,11 +5,12 @@ from operator import eq, ge, gt, le, lt
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
+from astropy.table import Column, QTable
 from astropy.wcs.utils import proj_plane_pixel_area, proj_plane_pixel_scales
 from scipy.ndimage import uniform_filter
 
 from miricigale.photometry import ErrorModel
+from miricigale.photometry.arrays import nearest_values
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import Flags, error_column
 from miricigale.workflow.options import of_option, require
@@ -49,21 +50,15 @@ NOT_COUNTED = sum(SampleFlags[key.upper()] for key in ("star", "no_model", *CUTS
 _COMPARE = {"<=": le, ">=": ge, "<": lt, ">": gt, "=": eq}
 
 
-def values_at(sky, wcs, plane, *, off=0):
-    """Values of a plane with a WCS at the pixels of positions, shape (n,); ``off`` outside of it."""
-    x, y = (np.asarray(v) for v in wcs.world_to_pixel(sky))
-    near = np.isfinite(x) & np.isfinite(y)
-    x, y = (np.round(np.where(near, v, -1)).astype(int) for v in (x, y))
-    on = (x >= 0) & (x < plane.shape[1]) & (y >= 0) & (y < plane.shape[0])
-    found = np.full(len(sky), off, plane.dtype)
-    found[on] = plane[y[on], x[on]]
-    return found
+def values_at(sky, wcs, plane):
+    """Values of a plane with a WCS at the pixels of positions, shape (n,); 0 outside of it."""
+    return nearest_values(plane, np.stack(wcs.world_to_pixel(sky), axis=-1))[0]
 
 
 def in_field(sky, images):
     """Whether positions, shape (n,), fall on a usable pixel of every image (with WCS and mask)."""
     usable = ((image.wcs, ~np.asarray(image.mask, bool)) for image in images)
-    return np.all([values_at(sky, *pair, off=False) for pair in usable], axis=0)
+    return np.all([values_at(sky, *pair) for pair in usable], axis=0)
 
 
 def mean_coverage(sky, image, n_images):
@@ -164,8 +159,7 @@ def add_selection(matched, truth, bands, *, inside, min_detected, redshifts, cut
     outside = (redshift < redshifts[0]) | (redshift > redshifts[-1])
     flags[(redshift > 0) & outside] |= SampleFlags.OUTSIDE_GRID
     flags[~(redshift > 0) & ~star] |= SampleFlags.NO_REDSHIFT
-    matched["selection"] = flags
-    matched["selection"].info.description = SampleFlags.describe()
+    matched["selection"] = Column(flags, description=SampleFlags.describe())
 
 
 def typical_source(sample, fitted, band):

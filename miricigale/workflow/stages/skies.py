@@ -150,6 +150,6 @@ def sky_numbers(context):
             rows.append((unit.split("/")[1], limit, n, np.count_nonzero(wanted), *sums))
     names = ["band_set", "limit", "n_skies", "n_wanted", "wanted", "selected"]
     numbers = QTable(rows=rows, names=names) if rows else QTable(names=names)
-    for name, (values, _) in quality_columns(qualities, "", "").items():
+    for name, values in quality_columns(qualities).items():
         numbers[name] = values
     return numbers

@@ -7,7 +7,8 @@ it was stopped.
 """
 
 # %%
-# A catalog of 1000 simulated galaxies at known redshifts, as a FITS file.
+# A catalog of 1000 simulated galaxies at known redshifts, as a FITS file. Parquet is read by parts too, with
+# ``pip install miricigale[parquet]``.
 
 from pathlib import Path
 
@@ -60,7 +61,7 @@ sorted(path.name for path in Path("fits").glob("part-*.fits"))
 
 # %%
 # Open the folder later, and take some columns. ``results.write_table("table.fits")`` joins everything in one FITS
-# file.
+# file, ``table.parquet`` in one of parquet.
 
 results = open_results("fits")
 table = results.to_table(["id", "redshift_best", "mass_p50", "sfr_p50", "flags"])

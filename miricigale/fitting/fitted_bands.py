@@ -1,0 +1,43 @@
+"""Bands of a catalog and of a fitter: methods of `~miricigale.fitting.BayesFitter`."""
+
+import numpy as np
+
+from miricigale.filters import as_photometry
+from miricigale.filters.catalog_files import codes_of, warn_of_codes
+from miricigale.fitting.likelihood import PhotometryReader, unused_bands
+from miricigale.utils.exceptions import FitWarning, warn
+from miricigale.utils.tables import error_column
+from miricigale.utils.units import FNU
+
+
+def table_of(fitter, photometry):
+    """
+    The catalog by our names, with what there is to warn of.
+
+    A band of ``filters`` that it lacks is a missing one of all objects.
+    """
+    table = as_photometry(photometry, fitter.filters or fitter.bands)
+    lost = [name for name in fitter.filters or () if name not in table.colnames]
+    if lost and len(lost) < len(fitter.filters):
+        text = f"the photometry has no {', '.join(lost)}: missing bands of all objects"
+        warn(text, FitWarning)
+        table = table.copy(copy_data=False)
+        for name in lost:
+            table[name] = table[error_column(name)] = np.full(len(table), np.nan) * FNU
+    warn_of_codes([codes_of(table, fitter._reader.fitted(table))], "photometry")
+    fitter.warn_of_bands(table)
+    return table
+
+
+def read_bands(fitter, photometry, bands):
+    """Photometry (`~miricigale.fitting.likelihood.FitData`) of bands, with zero points and its own errors."""
+    zero = dict.fromkeys(bands, 0.0)
+    return PhotometryReader(bands, bands, zero, zero, 1, fitter.zero_points).read(photometry)
+
+
+def warn_of_bands(fitter, photometry):
+    """Warn of bands that are not fitted, if the fitter does not name those that are."""
+    unused = unused_bands(photometry, fitter._reader.fitted(photometry))
+    if unused and fitter.filters is None:
+        text = "bands of the photometry that the grid lacks are not fitted"
+        warn(f"{text}: {', '.join(unused)}", FitWarning)

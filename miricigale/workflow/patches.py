@@ -1,0 +1,345 @@
+"""Forced photometry of mosaics that are larger than the memory: in patches, each a unit that is resumed."""
+
+import dataclasses
+import functools
+import json
+import math
+import os
+import shutil
+import tempfile
+from pathlib import Path
+from typing import ClassVar
+
+import astropy.units as u
+import numpy as np
+
+from miricigale import photometry
+from miricigale.pages import Link, Page, SectionWriter
+from miricigale.photometry.arrays import pixel_scale
+from miricigale.photometry.file_inputs import Inputs
+from miricigale.photometry.from_files import check_output
+from miricigale.photometry.kernel_files import file_place
+from miricigale.photometry.patches import PatchGrid, join_patches, measure_patch, patch_parts
+from miricigale.photometry.priors import read_catalog
+from miricigale.utils.declared import declared
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.files import cached_by_file
+from miricigale.utils.meta import provenance
+from miricigale.utils.options import check_least
+from miricigale.utils.store import plain_value, replacing
+from miricigale.utils.table_files import read_table, write_table
+from miricigale.utils.units import ANGLE, ab_magnitude, positive
+from miricigale.workflow.engine.runner import StudyRunner
+from miricigale.workflow.engine.stage import stage
+from miricigale.workflow.options import Configuration, Section, option
+from miricigale.workflow.sections import RunBasics
+
+#: Most bytes that a patch may take, and of these for templates, where no others are given.
+_MEMORY, _TEMPLATES = 2_000_000_000, photometry.MemorySettings(max_bytes=3e8)
+#: Fields of an image that name files, whose states go into the record.
+_PATHS = ("path", "error", "variance", "inverse_variance", "weight", "psf")
+_KINDS = (photometry.ErrorSettings, photometry.MemorySettings, photometry.MosaicFile)
+
+
+class RunSection(RunBasics):
+    """
+    How the run goes.
+
+    Parameters
+    ----------
+    memory
+        Memory (GB) of patches side by side on a machine; 0 for half of all.
+    """
+
+    name: str = "patches"
+    memory: float = option(0.0, low=0.0, high=1e5)
+
+
+class FilesSection(Section):
+    """
+    What is measured.
+
+    Parameters
+    ----------
+    inputs
+        Files and options as JSON.
+    """
+
+    inputs: str = ""
+
+
+class PatchSection(Section):
+    """
+    The grid of patches.
+
+    Parameters
+    ----------
+    size
+        Side of the cores (pixels of the prior).
+    overlap
+        Pixels of the prior around them.
+    pages
+        Whether each patch has a page.
+    """
+
+    size: int = option(1000, low=1)
+    overlap: int = option(0, low=0)
+    pages: bool = True
+
+
+@dataclasses.dataclass(frozen=True)
+class PatchConfig(Configuration):
+    """What a run in patches depends on."""
+
+    heading: ClassVar = "# miricigale photometry in patches; a record of what was asked for"
+
+    run: RunSection = dataclasses.field(default_factory=RunSection)
+    files: FilesSection = dataclasses.field(default_factory=FilesSection)
+    patches: PatchSection = dataclasses.field(default_factory=PatchSection)
+
+
+def _as_plain(value):
+    """What JSON does not know, as it does; `_from_plain` takes it back."""
+    if isinstance(value, u.Quantity):
+        return {"value": float(value.value), "unit": value.unit.to_string()}
+    if isinstance(value, _KINDS):
+        known = {one.name: getattr(value, one.name) for one in dataclasses.fields(value)}
+        known |= {name: _absolute(known[name]) for name in known.keys() & set(_PATHS)}
+        return {"of": type(value).__name__, **known}
+    return os.fspath(value) if isinstance(value, os.PathLike) else plain_value(value)
+
+
+def _from_plain(values):
+    if values.keys() == {"value", "unit"}:
+        return values["value"] * u.Unit(values["unit"])
+    return getattr(photometry, values.pop("of"))(**values) if "of" in values else values
+
+
+def _absolute(path):
+    # workers have another working directory
+    return None if path is None else os.path.abspath(path)
+
+
+@functools.lru_cache(maxsize=4)
+def _made(files, patches):
+    values = json.loads(files.inputs, object_hook=_from_plain)
+    inputs = Inputs(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+    whole, images = inputs.highres.header, [one.header for one in inputs.images]
+    return inputs, PatchGrid.over(whole, images, patches.size, patches.overlap)
+
+
+def _task(config):
+    """Inputs and grid of a configuration."""
+    return _made(config.files, config.patches)
+
+
+def _states(config, unit):
+    """Size and time of each file that is read, for the digest."""
+    inputs, _ = _task(config)
+    files = [inputs.highres, *inputs.images, *inputs.detection]
+    paths = [getattr(one, name) for one in files for name in _PATHS]
+    paths = {file_place(one)[0] for one in (*paths, *inputs.paths) if one is not None}
+    states = {path: os.stat(path) for path in sorted(map(str, paths))}
+    return {path: [one.st_size, one.st_mtime_ns] for path, one in states.items()}
+
+
+def _bytes(inputs, grid, unit):
+    """About how many bytes a patch takes."""
+    parts = patch_parts(inputs, grid, grid.names.index(unit))
+    prior, *images = (tuple(one.stop - one.start for one in part or ()) or (0, 0) for part in parts)
+    return inputs.n_bytes(prior, images)
+
+
+_sources = cached_by_file(1)(read_catalog)
+
+
+def _catalog(inputs):
+    """Ids and positions of the sources, if they are given."""
+    return None if inputs.catalog is None else _sources(inputs.catalog)["id", "sky"]
+
+
+_READS = {"sections": ("files", "patches"), "plan": _states}
+_UNITS = {
+    "units": lambda config: _task(config)[1].names,
+    "memory": lambda config, unit: _bytes(*_task(config), unit),
+}
+
+
+@stage("patch", "patches", **_READS, **_UNITS)
+def patch_stage(context, unit):
+    """Measure a patch: its table, and its page."""
+    inputs, grid = _task(context.config)
+    k = grid.names.index(unit)
+    table, measured = measure_patch(inputs, grid, k, _catalog(inputs), context.n_threads)
+    if measured is not None:
+        table.meta["patch"] = _facts(measured, table)
+        shown = [k for k, one in measured.pixels.images.items() if "source" in one.meta]
+        # pictures are of both
+        sharp = "source" in measured.pixels.prior.meta
+        if context.config.patches.pages and shown and sharp and len(table):
+            with tempfile.TemporaryDirectory() as folder:
+                measured.write_page(Path(folder) / f"{unit}.html")
+                for path in sorted(Path(folder).rglob("*.*")):
+                    name = f"patches/{path.relative_to(folder).as_posix()}"
+                    context.save(name, functools.partial(shutil.copyfile, path))
+    context.save_table(f"patches/{unit}.ecsv", table)
+
+
+def _facts(measured, table):
+    """What a patch found of each band, as plain values."""
+    rows = []
+    for band, result in measured.results.items():
+        flux, background, meta = table[band], result.background, result.meta
+        clean = table[f"{band}_err"][np.isfinite(flux) & (table[f"{band}_flags"] == 0)]
+        rows.append({
+            "band": band, "n": len(table), "n_measured": int(np.isfinite(flux).sum()),
+            "depth": float(ab_magnitude(5 * np.median(clean))) if len(clean) else None,
+            "background": None if background is None else float(background.value),
+            "noise_scale": measured.pixels.images[band].meta.get("noise_scale"),
+            "offset": str(meta.get("offset", "not measured")),
+            "second_pass": str(meta.get("second_pass", {}).get("fitted", "not asked for")),
+        })  # fmt: skip
+    return rows
+
+
+@stage("table", "table", needs=("patch",), **_READS)
+def table_stage(context, _):
+    """Join the tables of the patches, and write the page of all."""
+    inputs, grid = _task(context.config)
+    tables, facts = {}, []
+    for k, name in enumerate(grid.names):
+        found = context.table(f"patches/{name}.ecsv")
+        facts += [{"patch": name, **one} for one in found.meta.pop("patch", ())]
+        if len(found):
+            tables[k] = found
+    if not tables:
+        raise argument_error("highres", "an image with sources", "none in any patch")
+    ids = inputs.segmentation is not None
+    table = join_patches(tables, grid, inputs.highres.header, _catalog(inputs), ids)
+    files = {"image": [str(one.path) for one in inputs.images], "highres": str(inputs.highres.path)}
+    about = dataclasses.asdict(context.config.patches)
+    table.meta = provenance(stage="photometry", **files, **about)
+    context.save_table("table.fits", table)
+    title = f"Forced photometry in patches: {', '.join(inputs.bands)}"
+    report = Page(title, subtitle=f"on the prior {Path(inputs.highres.path).name}")
+    page = SectionWriter(report, declared("miricigale.photometry"))
+    page.section("patches", n=len(table), n_patches=len(grid.names), **about)
+    for one in facts:
+        if context.products.path(f"patches/{one['patch']}.html").exists():
+            one["patch"] = Link(one["patch"], f"patches/{one['patch']}.html")
+    page.table("table", facts)
+    context.save("index.html", report.write)
+
+
+def patch_stages():
+    """The stages of photometry in patches."""
+    return patch_stage, table_stage
+
+
+def measure_patches(
+    image,
+    highres,
+    folder,
+    *,
+    patch_size=None,
+    overlap=10 * u.arcsec,
+    output=None,
+    overwrite=False,
+    pages=True,
+    executor=None,
+    redo=False,
+    n_threads=None,
+    progress_bar=False,
+    **options,
+):
+    """
+    Measure the sources of mosaics that are larger than the memory, in patches.
+
+    The prior is cut into squares, each measured with an overlap around it as by
+    `~miricigale.photometry.measure_files`. A source belongs to the patch whose core holds it. What is finished
+    stays in the folder: the same call resumes it.
+
+    Parameters
+    ----------
+    image, highres
+        As for `~miricigale.photometry.measure_files`; images are files.
+    folder : path-like
+        Of the products: ``table.fits``, the page ``index.html``, and in ``patches`` a table and a page of each.
+    patch_size : int, optional
+        Side of the cores in pixels of the prior; as many as take 2 GB by default.
+    overlap : `~astropy.units.Quantity`, optional
+        Width of the rim around them (angle).
+    output : path-like, optional
+        Where the table (ECSV or FITS) is written too.
+    overwrite : bool, optional
+        Whether ``output`` is replaced if it is there.
+    pages : bool, optional
+        Whether each patch has a page.
+    executor : optional
+        Processes, threads or a cluster that measure patches side by side, as for
+        `~miricigale.workflow.StudyRunner`; the products are the same bytes.
+    redo : bool, optional
+        Whether products of other files or options in the folder are replaced; otherwise they are refused.
+    n_threads : int, optional
+        Number of threads of all patches together; all by default.
+    progress_bar : bool, optional
+        Whether progress is shown.
+    **options
+        ``segmentation``, ``catalog`` and all others of `~miricigale.photometry.measure_files`.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        As of `~miricigale.photometry.measure_files`, with ``patch``. The rows of a catalog in their order;
+        without one sources are counted, patch by patch. Sources that the prior lacks are the last rows.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.OtherResultsError`
+        If the folder holds what other files or options made, and ``redo`` is False.
+    `~miricigale.utils.exceptions.DataError`, ValueError
+        As `~miricigale.photometry.measure_files`; if the folder is another's or in use.
+
+    Examples
+    --------
+    >>> from miricigale.workflow import measure_patches
+    >>> table = measure_patches("f770w_i2d.fits", "f444w_i2d.fits", "patches")  # doctest: +SKIP
+    """
+    inputs = Inputs.of(image, highres, **{"memory": _TEMPLATES, **options})
+    named = {name: _absolute(getattr(inputs, name)) for name in ("segmentation", "catalog")}
+    inputs = dataclasses.replace(inputs, kernels=tuple(map(_absolute, inputs.kernels)), **named)
+    check_output("output", output, overwrite, inputs.paths)
+    inputs.check()
+    # refused here rather than in each patch
+    inputs.photometers(n_threads)
+    header = inputs.highres.header
+    rim = math.ceil(positive(overlap, ANGLE, "overlap") / pixel_scale(header.wcs))
+    if patch_size is None:
+        patch_size = _largest(inputs, rim)
+    check_least(patch_size, "patch_size", max(rim, 1), whole=True)
+    values = {one.name: getattr(inputs, one.name) for one in dataclasses.fields(inputs)}
+    config = PatchConfig(
+        run=RunSection(threads=n_threads or 0, seed=inputs.seed),
+        files=FilesSection(inputs=json.dumps(values, default=_as_plain, sort_keys=True)),
+        patches=PatchSection(size=int(patch_size), overlap=rim, pages=pages),
+    )
+    runner = StudyRunner(
+        config, folder, patch_stages, executor=executor, redo=redo, progress_bar=progress_bar
+    )
+    table = read_table(runner.run().path("table.fits"), wanted="the table")
+    if output is not None:
+        Path(output).parent.mkdir(parents=True, exist_ok=True)
+        with replacing(output, overwrite=overwrite) as partial:
+            write_table(table, partial)
+    return table
+
+
+def _largest(inputs, rim):
+    """Side of cores of the same size whose patches take 2 GB at most."""
+    whole, images = inputs.highres.header, [one.header for one in inputs.images]
+    longest = max(whole.shape)
+    for n in range(1, longest):
+        grid = PatchGrid.over(whole, images, math.ceil(longest / n), rim)
+        if max(_bytes(inputs, grid, name) for name in grid.names) <= _MEMORY:
+            return grid.size
+    raise argument_error("overlap", "small enough for patches of 2 GB", f"{rim} pixels")
