@@ -231,8 +231,7 @@ class _Lights:
                 return []
             labels, variance = self.segments.labels[model.around], self.variance[model.around]
             power = np.bincount(labels.ravel(), (self._image(model) ** 2 / variance).ravel())
-            power[own] = 0.0
-            some = np.flatnonzero(power > _LINKED)
+            some = (one for one in np.flatnonzero(power > _LINKED) if one != own)
             return [(-power[one], k, rows[one]) for one in some if rows[one] >= 0]
 
         found = parallel_map(links, range(len(models)), executor=self.executor)

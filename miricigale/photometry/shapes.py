@@ -125,9 +125,8 @@ class Beside:
 
     flux: np.ndarray  # (m,)
     parameters: np.ndarray  # (m, 6)
-    root: (
-        np.ndarray
-    )  # (7 m, 7 m): Cholesky's factor of the inverse covariance of their light and parameters.
+    #: Cholesky's factor, (7 m, 7 m), of the inverse covariance of their light and parameters.
+    root: np.ndarray
 
     def moved(self, shift):
         """The same at another place (x, y)."""
