@@ -18,6 +18,7 @@ from astropy.table import QTable
 
 from miricigale.instrument import north_up_wcs
 from miricigale.photometry import (
+    ErrorSettings,
     ForcedPhotometer,
     MosaicFile,
     SourceTemplates,
@@ -206,6 +207,16 @@ def loose_chi2(result, row, radius=0.8, scatter=0.02):
     return np.average((residual.data[near] / noise) ** 2, weights=model[near])
 
 
+def light_ratio(result, row, radius=0.5):
+    """Light of the image over that of the model within a radius (arcsec)."""
+    residual, model = result.residual_image, result.model_image.data
+    y, x = np.indices(model.shape)
+    reach = radius / result.meta["pixel_scale"]
+    near = (np.hypot(x - result.x[row], y - result.y[row]) < reach) & ~residual.mask
+    background = 0.0 if result.background is None else result.background.to_value(residual.unit)
+    return float(1 + residual.data[near].sum() / (model - background)[near].sum())
+
+
 def field(folder):
     """Print how bright sources of real images are fitted, without and with the stars."""
     start, psfs = f"{folder}/uds-test-", f"{folder}/psf/uds-test-"
@@ -217,13 +228,16 @@ def field(folder):
     kernel = matching_kernel(*files)
     image, prior = (one.read() for one in files)
     segments, catalog = read_prior(prior, segmentation=f"{start}LW_seg.fits.gz")
-    for options in ({}, {"psf_stars": True}, {"psf_stars": True, "components": 2}):
+    # signal-to-noise by the noise alone, of templates that cannot change
+    exact = ForcedPhotometer(
+        kernel, background_order=0, errors=ErrorSettings(size_scatter=None)
+    ).measure(image, prior, segments, catalog)
+    snr = (exact.flux / exact.flux_err_noise).value
+    bright = np.flatnonzero(np.nan_to_num(snr) > 20)
+    for options in ({}, {"psf_stars": None}, {"psf_stars": True}, {"components": 2}):
         result = ForcedPhotometer(kernel, background_order=0, **options).measure(
             image, prior, segments, catalog
         )
-        # signal-to-noise by the noise alone
-        snr = (result.flux / result.flux_err_noise).value
-        bright = np.flatnonzero(np.nan_to_num(snr) > 20)
         chi2 = result.chi2[bright]
         used = kernel if result.psf_stars is None else result.psf_stars.kernel
         empty = _empty_positions(result, 1)
@@ -237,6 +251,8 @@ def field(folder):
             f"  {np.sum(loose < 2)} with 2 % of the light in each pixel as an error: {np.round(np.sort(loose), 2)}"
         )
         print(f"  chi2 {np.round(np.sort(chi2), 2)}; pulls {pulls:.3f}, 5 sigma {depth:.1f} nJy")
+        ratio = [round(light_ratio(result, k), 3) for k in bright[np.argsort(-snr[bright])]]
+        print(f"  light over the model's within 0.5 arcsec, brightest first: {ratio}")
         if result.psf_stars is not None:
             print(f"  {result.psf_stars.meta}")
 

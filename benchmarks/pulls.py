@@ -3,6 +3,7 @@ Pulls (measured less true flux, over the error) on scenes that GalSim draws: how
 
     python benchmarks/pulls.py                          10 scenes of 30 draws of the noise each
     python benchmarks/pulls.py --scenes 2 --draws 5     a look
+    python benchmarks/pulls.py --load A.npz B.npz       the table of runs that were saved
 
 Each scene has galaxies (Sersic index 0.5 to 4, half-light radius 0.1 to 0.5 arcsec) and points (one in
 four), alone or in pairs 0.5 to 1 arcsec apart, on a prior like F160W (0.06 arcsec) and an image like F770W, on
@@ -145,13 +146,13 @@ def line(name, pull, bias):
     )
 
 
-def table(fields, rows, grids):
+def table(catalogs, rows, grids):
     print(
         f"{'':48s} {'n':>6s} {'std':>6s} {'MAD':>6s} {'mean':>6s} {'median':>6s} {'bias':>7s} {'> 3':>6s}"
     )
-    truth = np.concatenate([f.catalog["flux"] for f in fields])
-    pair = np.concatenate([f.catalog["pair"] for f in fields])
-    point = np.concatenate([f.catalog["point"] for f in fields])
+    truth, pair, point = (
+        np.concatenate([one[name] for one in catalogs]) for name in ("flux", "pair", "point")
+    )
     for grid in grids:
         # columns, draws, sources
         flux, err, noise, _, prior_snr, flags = np.concatenate(
@@ -185,7 +186,11 @@ def main():
     parser.add_argument("--band", default="miri.f770w")
     parser.add_argument("--grids", nargs="+", default=["own", "resampled"])
     parser.add_argument("--save", help="file for the numbers (npz)")
+    parser.add_argument("--load", nargs="+", help="files of --save, of the same number of draws")
     args = parser.parse_args()
+    if args.load:
+        saved = [np.load(one) for one in args.load]
+        return table(saved, saved, args.grids)
     hst = hst_psf("wfc3.f160w", pixel_scale=FINE * u.arcsec)
     target = psf_mosaic(miri_psf(args.band), FINE * u.arcsec, 40 * u.deg)
     kernel = MatchingKernel.from_psfs(hst, target, pixel_scale=FINE * u.arcsec, extent=9 * u.arcsec)
@@ -197,15 +202,16 @@ def main():
         fields.append(field)
         rows.append({grid: [one[grid] for one in draws] for grid in args.grids})
     print(f"{args.band}: {time.process_time() - start:.0f} s of processor time")
-    table(fields, rows, args.grids)
+    catalogs = [field.catalog for field in fields]
+    table(catalogs, rows, args.grids)
     if args.save:
-        catalogs = {
-            key: np.concatenate([field.catalog[key] for field in fields])
+        known = {
+            key: np.concatenate([one[key] for one in catalogs])
             for key in ("flux", "high", "pair", "point", "n", "radius", "q")
         }
         # draws, columns, sources
         arrays = {grid: np.concatenate([one[grid] for one in rows], axis=2) for grid in args.grids}
-        np.savez(args.save, **catalogs, **arrays)
+        np.savez(args.save, **known, **arrays)
 
 
 if __name__ == "__main__":

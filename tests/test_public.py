@@ -45,7 +45,7 @@ def test_the_classes_of_the_package_import_from_it():
 @pytest.fixture(scope="module")
 def objects():
     """Public objects that other tests do not pickle, by name, and what shows that they are whole."""
-    from miricigale import BayesFitter, Detector, Exposure, Filter, Reducer, SEDModel
+    from miricigale import BayesFitter, Detector, Exposure, Filter, FilterSet, Reducer, SEDModel
 
     model = SEDModel.yang2021(libraries="bundled")
     axes = SEDModel.yang2021_axes("quick") | {"redshift": [0.5, 1.0, 1.5]}
@@ -72,6 +72,7 @@ def objects():
 
     return {
         "filter": (Filter.from_name("F770W"), lambda x: x.throughput),
+        "filters": (FilterSet(BANDS), lambda x: x.weights(np.geomspace(0.5, 20, 99))),
         "SED": (model.evaluate(redshift=1.0), lambda x: x.fnu.value),
         "model": (model, lambda x: x.evaluate(redshift=1.0).fnu.value),
         "grid": (fitter.grid, lambda x: x.galaxy),
@@ -88,7 +89,18 @@ def objects():
     }
 
 
-NAMES = ["filter", "SED", "model", "grid", "fitter", "results", "rows", "object", "samples"]
+NAMES = [
+    "filter",
+    "filters",
+    "SED",
+    "model",
+    "grid",
+    "fitter",
+    "results",
+    "rows",
+    "object",
+    "samples",
+]
 NAMES += ["drawn object", "exposure", "detector", "ramp", "reducer"]
 
 

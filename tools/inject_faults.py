@@ -1,7 +1,7 @@
 """
 Faults of the system at each write of a study and of a fit: is the result the same after going on?
 
-    python tools/inject_faults.py [--step 1] [--faults kill torn ENOSPC EIO EROFS]
+    python tools/inject_faults.py [--step 1] [--only study fit] [--faults kill torn ENOSPC EIO EROFS]
 
 A small study (tables, images, text) and a fit of a catalog in pieces are done once as they are. Then, at each call
 of the system that writes, renames, makes, removes or flushes a file of their folder, they are done with a fault
@@ -147,7 +147,7 @@ def build(folder):
     return library
 
 
-def make_work():
+def make_work(only):
     """Two functions that fill a folder: a study and a fit of a catalog in pieces."""
     import astropy.units as u
     import numpy as np
@@ -196,10 +196,11 @@ def make_work():
     catalog_path = Path(tempfile.mkdtemp()) / "catalog.fits"
     catalog.write(catalog_path)
     # everything that is read, compiled or kept on the way is so before
-    for one in (study, fit):
+    work = {name: one for name, one in {"study": study, "fit": fit}.items() if name in only}
+    for one in work.values():
         with tempfile.TemporaryDirectory() as folder:
             one(Path(folder) / "out")
-    return {"study": study, "fit": fit}
+    return work
 
 
 def contents(folder):
@@ -263,8 +264,8 @@ def wrong(function, whole, place, library, at, name):
     return ""
 
 
-def main(step, faults, library):
-    work = make_work()
+def main(step, only, faults, library):
+    work = make_work(only)
     n_wrong = 0
     for what, function in work.items():
         with tempfile.TemporaryDirectory() as place:
@@ -289,10 +290,11 @@ if __name__ == "__main__":
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--step", type=int, default=1, help="every which call")
+    parser.add_argument("--only", nargs="+", default=["study", "fit"], help="what is done")
     parser.add_argument("--faults", nargs="+", choices=FAULTS, default=list(FAULTS))
     args = parser.parse_args()
     if "MIRICIGALE_FAULTS" in os.environ:
-        sys.exit(main(args.step, args.faults, os.environ["MIRICIGALE_FAULTS"]))
+        sys.exit(main(args.step, args.only, args.faults, os.environ["MIRICIGALE_FAULTS"]))
     with tempfile.TemporaryDirectory() as folder:
         library = str(build(Path(folder)))
         # one thread: forks of a process with threads can hang

@@ -104,7 +104,9 @@ def photometry(args):
         "progress_bar": not args.no_progress,
     }
     page, whole = args.page, args.patches is None
-    for name in ("patch_size", "scheduler", "redo") if whole else ("page", "model", "residual"):
+    for name in (
+        ("patch_size", "overlap", "scheduler", "redo") if whole else ("page", "model", "residual")
+    ):
         if getattr(args, name):
             wanted = f"left out with{'out' * whole} --patches"
             raise argument_error("--" + name.replace("_", "-"), wanted, getattr(args, name))
@@ -125,7 +127,8 @@ def _in_patches(args, images, prior, options):
     """Measure images in patches, on the processors of this machine or of others."""
     from miricigale.workflow import measure_patches
 
-    options |= chosen(args, "patch_size overlap redo")
+    given = chosen(args, "patch_size overlap redo")
+    options |= {name: value for name, value in given.items() if value is not None}
     args.stopped = f"stopped; the same command resumes what is in {args.patches}/"
     with workers(args.scheduler, args.threads) as executor:
         return measure_patches(images, prior, args.patches, executor=executor, **options)

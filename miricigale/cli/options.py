@@ -155,8 +155,8 @@ def _filled(text, words):
 def read_input(folder):
     """Write what standard input holds, a table, beside the folder of its results: its path."""
     data = sys.stdin.buffer.read()
-    kinds = {b"SIMPLE": "fits", b"# %ECS": "ecsv"}
-    ending = kinds.get(data[:6], "csv")
+    kinds = {b"SIMPLE": "fits", b"# %ECSV": "ecsv", b"PAR1": "parquet", b"<?xml": "xml"}
+    ending = next((kind for begin, kind in kinds.items() if data.startswith(begin)), "csv")
     path = folder.with_name(f"{folder.name}-input.{ending}")
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(data)

@@ -30,6 +30,8 @@ def run(args):
     if args.print_config:
         print(config.to_toml(), end="")
         return 0
+    if args.plan:
+        return _show_cost(config)
     folder = args.output or Path(config.run.name)
     begin = time.monotonic()
     options = chosen(args, "redo until again") | {"progress_bar": not args.no_progress}
@@ -37,6 +39,18 @@ def run(args):
         report = run_study(config, folder, executor=executor, **options)
     made = f"report: {report}" if args.until is None else f"products: {folder}"
     print(f"done in {(time.monotonic() - begin) / 60:.1f} min; {made}")
+    return 0
+
+
+def _show_cost(config):
+    """Print what a run takes, and do nothing."""
+    from miricigale.workflow import check_study, study_cost
+
+    check_study(config)
+    cost = study_cost(config)
+    cost.pprint_all()
+    hours, disk = cost["cpu"].sum().to_value("h"), cost["disk"].sum().to_value("GB")
+    print(f"all: {cost['units'].sum()} units, {hours:.1f} hours of a core, {disk:.1f} GB")
     return 0
 
 
@@ -76,8 +90,7 @@ def plan(args):
     folder = args.output or Path(config.plan.name)
     begin = time.monotonic()
     with threads(config.plan.threads or None) as executor:
-        show = not args.no_progress
-        comparison = write_plan(config, folder, executor=executor, progress_bar=show)
+        comparison = write_plan(config, folder, executor=executor)
     wanted = ["plan", "time", "z_scatter", "z_outliers", "frac_scatter", "completeness", "purity"]
     table = comparison[[*wanted, "n_agn", "merit"]]
     for name in table.colnames[1:]:

@@ -176,13 +176,16 @@ def read_dithers(path, *, observation=None, exposure=None):
     """
     Read the offsets of one dither pattern from a table or from APT's list of pointings.
 
+    APT's list states where the target lies in the aperture's ideal frame (``IdlX`` = ``BaseX`` + ``DithX``): where
+    ``DithX`` and ``DithY`` are larger, the telescope looks that much further along -x and -y.
+
     Parameters
     ----------
     path : path-like
         A table with the columns ``x_offset`` and ``y_offset`` and their units (ECSV, FITS), or
         the list that APT exports as ``.pointing``: of this the rows of MIRI imager apertures
         (``MIRIM_...``) that are exposures of science or in parallel are taken, one for each
-        dither, and their ``DithX`` and ``DithY``.
+        dither. Tiles of a mosaic, whose places are in ``DithX`` and ``DithY`` too, are to have one pattern.
     observation : int, optional
         Number of the observation, for a list of several.
     exposure : int, optional
@@ -192,7 +195,8 @@ def read_dithers(path, *, observation=None, exposure=None):
     Returns
     -------
     offsets : `~astropy.units.Quantity`, shape (n, 2)
-        Along the ideal +x and +y axes, arcsec.
+        Of the pointing along the ideal +x and +y axes, arcsec. Those of a list are about the mean of all exposures
+        of the tile, where `read_centers` has the imager look.
 
     Raises
     ------
@@ -202,6 +206,11 @@ def read_dithers(path, *, observation=None, exposure=None):
         If a list has several observations with such rows, or exposures with other dithers, and none,
         or another, is asked for; if tiles of a mosaic have other dithers than one another; or if a table
         comes with an observation or an exposure, which it has not.
+
+    References
+    ----------
+    The sign is that of ``XOFFSET`` and ``YOFFSET`` in headers, from which the official pipeline has the target
+    (``jwst.assign_wcs.miri.store_dithered_position``).
 
     Examples
     --------
@@ -305,19 +314,27 @@ def _read_pointings(path, observation, exposure):
         offset = float(words[11]), float(words[12])
         places.setdefault((target, tile), {}).setdefault(dither, offset)
     check_data(found, path, f"has no exposures of MIRIM apertures; it has {sorted(apertures)}")
-    exposures = found[_chosen("observation", observation, found)]
+    exposures, every = found[_chosen("observation", observation, found)], {}
+    for places in exposures.values():
+        for tile, offsets in places.items():
+            every.setdefault(tile, []).extend(offsets.values())
     patterns = {
-        number: {tuple(offsets.values()) for offsets in places.values()}
+        number: [np.mean(every[k], axis=0) - list(one.values()) for k, one in places.items()]
         for number, places in exposures.items()
     }
-    differ = len(set().union(*patterns.values())) > 1
-    if exposure is not None or differ:
+    if exposure is not None or not _alike([one for some in patterns.values() for one in some]):
         patterns = {0: patterns[_chosen("exposure", exposure, patterns)]}
     offsets = next(iter(patterns.values()))
-    if len(offsets) > 1:
+    if not _alike(offsets):
         msg = f"{path.name}: tiles of the observation have dithers that differ from one another"
         raise ValueError(msg)
-    return np.array(next(iter(offsets))) * ANGLE
+    return offsets[0] * ANGLE
+
+
+def _alike(patterns):
+    """Whether patterns are the same, to the digits of the list."""
+    first = patterns[0]
+    return all(one.shape == first.shape and np.allclose(one, first, atol=2e-3) for one in patterns)
 
 
 def _chosen(name, value, known):

@@ -73,8 +73,6 @@ class DQ(Flags):
     JUMP_NEIGHBOR = 2**32
     #: No slope: saturated from the start, or not fitted.
     NO_SLOPE = 2**33
-    #: Cosmic ray found on the slope image.
-    COSMIC_RAY = 2**34
     #: Far below the background.
     NEGATIVE = 2**35
 

@@ -106,7 +106,7 @@ def measure_prior(images, photometers, highres, segmentation, catalog):
     starred = {
         name: with_stars(one, images[name], catalog, highres)
         for name, one in photometers.items()
-        if one.psf_stars and not one.bare
+        if one.psf_stars is not False and not one.bare
     }
     photometers = photometers | {name: one for name, (one, _) in starred.items()}
     results = _measure_prior(images, photometers, highres, segmentation, catalog)

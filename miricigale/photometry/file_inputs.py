@@ -41,7 +41,7 @@ class Inputs:
     catalog: object = None
     kernels: tuple = (None,)
     confidence: float = 0.95
-    psf_stars: bool = False
+    psf_stars: bool | None = False
     seed: int = 1
     options: dict = dataclasses.field(default_factory=dict)
 
@@ -151,7 +151,8 @@ class Inputs:
         }
         found = {}
         for band, one, own in zip(self.bands, self.images, self.kernels, strict=True):
-            kernel, stars = _kernel(one, self.highres, own), self.psf_stars and own is None
+            kernel = _kernel(one, self.highres, own)
+            stars = self.psf_stars if own is None else False
             found[band] = ForcedPhotometer(kernel, psf_stars=stars, **options)
         return found
 

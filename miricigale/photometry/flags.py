@@ -52,3 +52,5 @@ class ForcedFlags(Flags):
     #: The core is saturated on the high-resolution image (a hole without data, or a flat top): it is masked there,
     #: and the template follows from what is around it.
     SATURATED = 4096
+    #: The segment reaches beyond the patch of a large mosaic: what it has there is not in the template.
+    CUT = 8192

@@ -82,10 +82,11 @@ class ForcedPhotometer(Interactive):
         Whether peaks of the residual above 5 sigma that the catalog lacks are fitted together with it, as
         points; they are listed in ``new_sources`` of the result. None leaves it to the evidence: they are
         where at most a tenth of them are false, by the peaks of the residual's negative and of Gaussian noise.
-    psf_stars : bool, optional
+    psf_stars : bool or None, optional
         Whether stars on the image and on the high-resolution image correct the two PSFs, as far as stars that
         are left out confirm it (`~miricigale.photometry.stars.kernel_stars`); the error that remains is
-        ``psf_error``, unless that is given, and ``psf_stars`` of the result says what was found.
+        ``psf_error``, unless that is given, and ``psf_stars`` of the result says what was found. None corrects
+        the PSF of an image only if it shows three stars at least, each of which the others can confirm.
     errors : `ErrorSettings`, optional
         What the errors are made of.
     memory : `MemorySettings`, optional
@@ -152,7 +153,7 @@ class ForcedPhotometer(Interactive):
     integrate: bool = False
     components: int = 1
     second_pass: bool | None = False
-    psf_stars: bool = False
+    psf_stars: bool | None = False
     errors: ErrorSettings = dataclasses.field(default_factory=ErrorSettings)
     memory: MemorySettings = dataclasses.field(default_factory=MemorySettings)
     n_threads: int | None = None
@@ -198,7 +199,8 @@ class ForcedPhotometer(Interactive):
         if self.offset_order is not None and self.max_shift is None:
             raise argument_error("max_shift", "given with 'offset_order'", "None")
         check_choice(self.components, "components", (1, 2))
-        check_choice(self.second_pass, "second_pass", (False, True, None))
+        for name in ("second_pass", "psf_stars"):
+            check_choice(getattr(self, name), name, (False, True, None))
         for name, kind in (("errors", ErrorSettings), ("memory", MemorySettings)):
             if not isinstance(getattr(self, name), kind):
                 raise argument_error(name, kind.__name__, repr(getattr(self, name)))
@@ -269,7 +271,7 @@ class ForcedPhotometer(Interactive):
             raise TypeError(msg)
         else:
             sources = templates
-        if self.psf_stars and not self.bare:
+        if self.psf_stars is not False and not self.bare:
             known = QTable({"id": sources.id, "sky": sources.sky})
             one, stars = with_stars(self, image, known, highres, sources.wcs)
             prior = (highres, segmentation, catalog) if templates is None else ()

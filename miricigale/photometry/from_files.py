@@ -31,7 +31,7 @@ def measure_files(
     detection=(),
     kernel=None,
     confidence=0.95,
-    psf_stars=False,
+    psf_stars=None,
     output=None,
     page=None,
     model=None,
@@ -64,9 +64,9 @@ def measure_files(
         Without a PSF of the prior sources are the segments as they are, and those without one are not measured.
     confidence : float, optional
         Of the upper limits in the columns ``<filter>_upper`` and on the page.
-    psf_stars : bool, optional
-        Whether stars correct the PSFs (see `~miricigale.photometry.ForcedPhotometer`); never a kernel that
-        is given.
+    psf_stars : bool or None, optional
+        Whether stars correct the PSFs (see `~miricigale.photometry.ForcedPhotometer`), by default those of images
+        with three stars at least; never a kernel that is given.
     output, page, model, residual : path-like, optional
         Where the table (ECSV or FITS), the HTML page and FITS images of the fitted model (with its
         background) and of the residual are written; not if None. Those of several bands have the

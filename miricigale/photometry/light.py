@@ -25,9 +25,9 @@ _AROUND, _LEAST, _MOST = 6, 16, 160
 #: Semi-major axis to which profiles are drawn: in half-light radii, and at most (pixels).
 _DRAWN, _FARTHEST = 6.0, 200.0
 
-#: Passes in which neighbors' light is taken off, chi^2 of that light from which a source is fitted
-#: again, and sources that are painted at a time.
-_PASSES, _CONTAMINATED, _AT_A_TIME = 4, 4.0, 512
+#: Passes in which neighbors' light is taken off, and chi^2 of that light from which a source is fitted
+#: again.
+_PASSES, _CONTAMINATED = 4, 4.0
 
 #: Largest number of sources whose profiles are fitted together, and chi^2 of the light of one on
 #: another's segment from which they are. Not those of a signal-to-noise of a hundred: what a
@@ -164,14 +164,15 @@ class _Model:
     """
     A fitted source: its stamp, profile and template (None for a point) of some total light.
 
-    ``light`` is the profile's part of it, ``others`` that on the stamp that was taken off before, ``labels`` those
-    of the sources that it was fitted together with, and ``beside`` what is known of these.
+    ``image`` is its light on the stamp, ``light`` the profile's part of the template, ``others`` the light
+    that was taken off the stamp before, ``labels`` those of the sources that it was fitted together with, and
+    ``beside`` what is known of these.
     """
 
     around: tuple
     shape: Shape
+    image: np.ndarray
     cutout: Cutout | None = None
-    total: float = 1.0
     light: float = 1.0
     others: np.ndarray | float = 0.0
     labels: tuple = ()
@@ -209,10 +210,11 @@ class _Lights:
                 model, (label, xy) = one
                 if model is None:
                     return None
-                others = sum_of_all[model.around] - self._image(model)
-                weight, _, _ = self._weight(model.around, label, model.labels)
-                if turn and np.sum(((others - model.others) * weight) ** 2) < _CONTAMINATED:
-                    return model
+                others = sum_of_all[model.around] - model.image
+                if turn:
+                    weight, _, _ = self._weight(model.around, label, model.labels)
+                    if np.sum(((others - model.others) * weight) ** 2) < _CONTAMINATED:
+                        return model
                 return self._model(label, xy, others, population, model)
 
             models = parallel_map(again, zip(models, sources, strict=True), executor=self.executor)
@@ -230,7 +232,7 @@ class _Lights:
             if rows[own] < 0:
                 return []
             labels, variance = self.segments.labels[model.around], self.variance[model.around]
-            power = np.bincount(labels.ravel(), (self._image(model) ** 2 / variance).ravel())
+            power = np.bincount(labels.ravel(), (model.image**2 / variance).ravel())
             some = (one for one in np.flatnonzero(power > _LINKED) if one != own)
             return [(-power[one], k, rows[one]) for one in some if rows[one] >= 0]
 
@@ -249,7 +251,7 @@ class _Lights:
             members, around = [models[k] for k in group], _hull([models[k].around for k in group])
             data = self.data[around] - sum_of_all[around]
             for one in members:
-                data[_within(one.around, around)] += self._image(one)
+                data[_within(one.around, around)] += one.image
             labels = [sources[k][0] for k in group]
             _, weight, _ = self._weight(around, labels[0], labels)
             corner = _corner(around)
@@ -262,9 +264,8 @@ class _Lights:
             for one, shape, others in zip(members, shapes, beside, strict=True):
                 back = corner - _corner(one.around)
                 others = others and others.moved(back)
-                found.append(
-                    dataclasses.replace(one, shape=shape.moved(back), labels=labels, beside=others)
-                )
+                shape, image = shape.moved(back), self._image(one.around, shape.moved(back))
+                found.append(_Model(one.around, shape, image, labels=labels, beside=others))
             return found
 
         models = list(models)
@@ -291,43 +292,33 @@ class _Lights:
     def _paint(self, models):
         """The light of all models."""
         image = np.zeros(self.data.shape, np.float32)
-        some = [model for model in models if model is not None]
-        for first in range(0, len(some), _AT_A_TIME):
-            part = some[first : first + _AT_A_TIME]
-            stamps = parallel_map(self._image, part, executor=self.executor)
-            for model, stamp in zip(part, stamps, strict=True):
-                image[model.around] += stamp
+        for model in models:
+            if model is not None:
+                image[model.around] += model.image
         return image
 
-    def _image(self, model):
-        """The light of a model on its stamp."""
-        size = tuple(s.stop - s.start for s in model.around)
-        if model.cutout is None or model.cutout.rest is None:
-            return model.shape.flux * self.fitter.profiles(size, model.shape.parameters)[0]
-        corner = [s.start for s in model.around]
-        profile, rest = model.cutout.layers
-        origin = np.subtract(profile.origin, corner)
-        image = self.fitter.convolve(profile.data[None], origin, size)[0]
-        return model.total * (image + rest.data)
+    def _image(self, around, shape):
+        """The light of a profile on a stamp."""
+        size = tuple(s.stop - s.start for s in around)
+        return np.float32(shape.flux) * self.fitter.profiles(size, shape.parameters)[0]
 
     def _weight(self, around, label, together=()):
         """Inverse noise of the pixels that are free of others, the same for a profile, and own pixels."""
-        labels = self.segments.labels[around]
-        own = labels == label
-        free = self.segments.usable[around] & (
-            own | np.isin(labels, together) | ~self.others[labels]
-        )
-        variance = np.where(free, self.variance[around], 1.0)
-        weight = np.where(free, 1.0 / np.sqrt(variance), 0.0)
+        labels, usable = self.segments.labels[around], self.segments.usable[around]
+        own = usable & (labels == label)
+        free = own | usable & ~self.others[labels]
+        for one in together:
+            free |= usable & (labels == one)
+        weight = 1.0 / np.sqrt(np.where(free, self.variance[around], np.inf))
         looser = weight / np.hypot(1.0, _MISFIT * np.maximum(self.light[around], 0.0) * weight)
-        return weight, looser, free & own
+        return weight, looser, own
 
     def _draft(self, label, xy, nodes):
         """The profile of one source, whatever others there are; of no template yet."""
         around = _around(self.segments.places[label - 1], xy, self.data.shape)
         _, weight, _ = self._weight(around, label)
         shape = self.fitter.fit(self.data[around], weight, xy - _corner(around), nodes=nodes)
-        return None if shape is None else _Model(around, shape)
+        return None if shape is None else _Model(around, shape, self._image(around, shape))
 
     def _model(self, label, xy, others, population, last):
         """Fit one source again, ``others`` being the light of others on its stamp, ``last`` its last model."""
@@ -341,15 +332,19 @@ class _Lights:
             drawn = last.cutout is None and last.shape.point <= 0.5
             return self._as_profile(last) if drawn else last
         new = dataclasses.replace(
-            last, shape=shape, cutout=None, total=1.0, light=1.0, others=others
+            last,
+            shape=shape,
+            image=self._image(around, shape),
+            cutout=None,
+            light=1.0,
+            others=others,
         )
         if self.select and shape.point > 0.5:
             return new
         core = own & (self.snr[around] > _CORE_SNR)
         n = np.count_nonzero(core)
         if self.select:
-            model = shape.flux * self.fitter.profiles(weight.shape, shape.parameters)[0]
-            excess = np.sum(((data - model) * weight)[core] ** 2) - n
+            excess = np.sum(((data - new.image) * weight)[core] ** 2) - n
             if excess < _EXCESS * np.sqrt(2 * max(n, 1)):
                 return self._as_profile(new)
         profile = self._profile(shape, corner, light=shape.flux)
@@ -367,7 +362,8 @@ class _Lights:
             weight=np.where(core, 0.0, looser),
         )
         light = profile.data * scale
-        rest = np.where(core, data - convolve(light[None])[0], 0.0)
+        image = convolve(light[None])[0]
+        rest = np.where(core, data - image, 0.0)
         total = light.sum() + rest.sum() + outer * (shape.flux - profile.data.sum())
         if not total > 0:
             return self._as_profile(new)
@@ -378,7 +374,7 @@ class _Lights:
             rest=Cutout(rest / total, (around[0].start, around[1].start)),
         )
         return dataclasses.replace(
-            new, cutout=template, total=float(total), light=shape.flux / total
+            new, image=image + rest, cutout=template, light=shape.flux / total
         )
 
     def _as_profile(self, model):

@@ -16,7 +16,7 @@ from miricigale.photometry.bands import spread_rows
 from miricigale.photometry.catalogs import joined_sky
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.packaging import new_ids
-from miricigale.utils.exceptions import PhotometryWarning
+from miricigale.utils.exceptions import PhotometryWarning, warn
 
 #: Pixels of the prior beyond its core in which a patch lists detections too: one that two patches see on
 #: either side of the line between them would be in both tables or in none.
@@ -95,13 +95,17 @@ class PatchGrid:
 def patch_parts(inputs, grid, k):
     """The parts (slices, or None) of the prior and of each image that a patch has with its overlap."""
     box, whole = grid.box(k), inputs.highres.header
-    edge, parts = _raster([(one.start, one.stop) for one in box]), [_within(box, whole.shape)]
-    for one in inputs.images:
-        xy = np.array(pixel_to_pixel(whole.wcs, one.header.wcs, *edge))
-        ends = np.floor(np.nanmin(xy, axis=1)), np.ceil(np.nanmax(xy, axis=1)) + 1
-        found = [slice(int(a), int(b)) for a, b in zip(*ends, strict=True)]
-        parts.append(_within(found[::-1], one.header.shape))
-    return parts
+    headers = (one.header for one in inputs.images)
+    seen = [seen_part(box, whole.wcs, one.wcs, one.shape) for one in headers]
+    return [_within(box, whole.shape), *seen]
+
+
+def seen_part(box, wcs, other, shape):
+    """The part (slices, or None) of an image with a WCS that has what a box of pixels of another has."""
+    xy = np.array(pixel_to_pixel(wcs, other, *_raster([(one.start, one.stop) for one in box])))
+    ends = np.floor(np.nanmin(xy, axis=1)), np.ceil(np.nanmax(xy, axis=1)) + 1
+    found = [slice(int(a), int(b)) for a, b in zip(*ends, strict=True)]
+    return _within(found[::-1], shape)
 
 
 def _within(box, shape):
@@ -185,13 +189,17 @@ def join_patches(tables, grid, prior, catalog=None, ids=False):
     xy = _pixels(table["sky"], prior)
     known, new = ~np.asarray(table["new"]), np.asarray(table["new"])
     kept = np.zeros(len(table), bool)
-    for some in (known, new) if catalog is None else (new,):
+    for some in (known, new) if catalog is None and not ids else (new,):
         kept[some] = own_rows(patch[some], grid, xy[some])
     table["patch"] = np.array(grid.names)[patch]
     table["patch"].info.description = "Patch whose core holds the source"
+    flags = [table[name] for name in table.colnames if name.endswith("flags")]
+    cut = np.any([one & ForcedFlags.CUT for one in flags], axis=0)
     if catalog is None:
-        rows = np.flatnonzero(known & kept)
+        rows = np.flatnonzero(known if ids else known & kept)
         if ids:
+            core = grid.holder(xy[rows]) == patch[rows]
+            rows = rows[np.lexsort((~core, cut[rows]))]
             rows = rows[np.unique(np.asarray(table["id"])[rows], return_index=True)[1]]
         found, key, sky = rows, np.asarray(table["id"])[rows], table["sky"][rows]
         key = key if ids else np.arange(1, len(rows) + 1)
@@ -201,6 +209,9 @@ def join_patches(tables, grid, prior, catalog=None, ids=False):
         found = np.array([place.get(one, -1) for one in key.tolist()], int)
     extra = np.flatnonzero(new & kept)
     found = np.concatenate([found, extra])
+    if n_cut := np.count_nonzero(cut[found[found >= 0]]):
+        text = f"{n_cut} sources have segments that reach beyond their patches (flag CUT): a larger overlap"
+        warn(f"{text} than {grid.overlap} pixels has them whole", PhotometryWarning)
     joined = QTable()
     joined["id"] = np.concatenate([key, new_ids(key, len(extra))])
     joined["sky"] = joined_sky([sky, table["sky"][extra]])
@@ -254,10 +265,30 @@ def measure_patch(inputs, grid, k, catalog=None, n_threads=None):
     table = measured.table
     columns = [table[name] for name in table.colnames if name.endswith("flags")]
     table["new"] = np.any([one & ForcedFlags.NOT_IN_CATALOG for one in columns], axis=0)
-    kept = grid.near(k, _pixels(table["sky"], whole), RIM)
+    xy = _pixels(table["sky"], whole)
+    kept = grid.near(k, xy, RIM)
+    if part:
+        cut = _is_cut(segments, part, whole.shape, xy)
+        for one in columns:
+            one[cut] |= int(ForcedFlags.CUT)
+        if inputs.segmentation is not None:
+            # its position may be in another core than that of the whole, and in none
+            kept |= cut
     if own is not None:
         kept[: len(own)] = own
     return table[kept], measured
+
+
+def _is_cut(segments, part, shape, xy):
+    """Whether the segment at each pixel x, y of the prior reaches an edge of a part which is none of the prior."""
+    edges = [np.zeros(0, int)]
+    for labels, one, n in zip((segments, segments.T), part, shape, strict=True):
+        edges += [labels[0]] * (one.start > 0) + [labels[-1]] * (one.stop < n)
+    place = np.nan_to_num(xy[:, ::-1] - [one.start for one in part], nan=-1.0)
+    place = np.rint(place).astype(int)
+    inside = np.all((place >= 0) & (place < segments.shape), axis=1)
+    label = np.where(inside, segments[tuple(np.where(inside[:, None], place, 0).T)], 0)
+    return (label > 0) & np.isin(label, np.concatenate(edges))
 
 
 def _pixels(sky, header):

@@ -6,7 +6,8 @@ import functools
 import numpy as np
 import scipy.linalg
 
-from miricigale.photometry._core.shapes import INDEX_RANGE, shape_curves
+from miricigale.photometry._core.shape_fits import Plan, evidence_of, minimum
+from miricigale.photometry._core.shapes import INDEX_RANGE, profile_table
 from miricigale.photometry.cutouts import Cutout
 from miricigale.photometry.population import Population
 from miricigale.photometry.shape_models import ShapeModels
@@ -14,6 +15,9 @@ from miricigale.profiles import sersic_stamp
 
 #: Width (pixels) of the offset of the center from the position.
 _OFFSET = 0.7
+
+#: The same as the inverse of a covariance.
+_CENTER = np.diag([_OFFSET**-2] * 2)
 
 #: Nodes that a shape's probability is summed over, and the width of their density over that of the
 #: normal distribution about the best shape.
@@ -167,24 +171,24 @@ class ShapeFitter(ShapeModels):
         population = population or self.expected
         mean, precision = _known(xy, population)
         half = _HALF if start is None else _half_width(start.parameters)
-        inner = self._stamp(data, weight, mean[None], [half])
+        inner = self._stamp(data, weight, mean[None], half)
         if start is None:
             starts = [mean + [0, 0, step, 0, 0, 0] for step in _STARTS]
-            parameters = min(starts, key=lambda one: _misfit(one, inner))
+            parameters = min(starts, key=inner.misfit)
         else:
             parameters = start.parameters
 
         def best(parameters, precision):
-            found = _minimum(inner, parameters[None], mean[None], precision[None])
+            found = inner.minimum(parameters[None], mean[None], precision[None])
             return found and [one if np.ndim(one) == 0 else one[0] for one in found]
 
         extended = best(parameters, precision)
-        if extended is not None and start is None and _half_width(extended[1]) > half:
-            inner = self._stamp(data, weight, mean[None], [_half_width(extended[1])])
-            extended = best(extended[1], precision)
+        if extended is not None and start is None and _half_width(extended[2]) > half:
+            inner = self._stamp(data, weight, mean[None], _half_width(extended[2]))
+            extended = best(extended[2], precision)
         if extended is None:
             return None
-        flux, parameters, evidence, covariance, _ = extended
+        _, flux, parameters, evidence, covariance, _ = extended
         if not nodes:
             return Shape(flux, parameters, 0.0, covariance)
         changes = inner.changes(beside)
@@ -193,9 +197,9 @@ class ShapeFitter(ShapeModels):
         start[2] = -30.0
         as_point = -np.inf
         # a point that is far worse in the same place need not be moved to the best one
-        near = _misfit(start, inner) < -2 * evidence + _FAR_BELOW
-        if near and (point := best(start, precision[:2, :2])) is not None:
-            as_point = point[2] - np.log(point[0])
+        near = inner.misfit(start) < -2 * evidence + _FAR_BELOW
+        if near and (point := best(start, precision[:2, :2].copy())) is not None:
+            as_point = point[3] - np.log(point[1])
         shape = Shape(flux, parameters, 0.0, covariance, nodes, as_point)
         return shape.among(*(one[0] for one in population.odds(nodes[None], np.array([as_point]))))
 
@@ -223,11 +227,11 @@ class ShapeFitter(ShapeModels):
         """
         mean, precision = (np.array(one) for one in zip(*map(_known, xy, populations), strict=True))
         start = np.array([one.parameters for one in shapes])
-        inner = self._stamp(data, weight, mean, [_half_width(one) for one in start])
-        found = _minimum(inner, start, mean, precision)
+        inner = self._stamp(data, weight, mean, max(_half_width(one) for one in start))
+        found = inner.minimum(start, mean, precision)
         if found is None:
             return list(shapes), [None] * len(shapes)
-        flux, parameters, _, covariance, matrix = found
+        _, flux, parameters, _, covariance, matrix = found
         new = [
             dataclasses.replace(
                 shape, flux=flux[k], parameters=parameters[k], covariance=covariance[k]
@@ -254,61 +258,63 @@ class ShapeFitter(ShapeModels):
         covariance[1, 1] = covariance[2, 2] = _OFFSET**2
         return Shape(np.nan, np.array([*xy, *population.mean]), population.point, covariance)
 
-    def _stamp(self, data, weight, means, halves):
+    def _stamp(self, data, weight, means, half):
         """The pixels within some distance of the middles, (n, 6), on the rectangle that holds all."""
-        middles = np.round(means[:, 1::-1]).astype(int)
-        lows = np.maximum(middles - np.reshape(halves, (-1, 1)), 0)
-        highs = np.minimum(middles + np.reshape(halves, (-1, 1)) + 1, weight.shape)
-        corner = lows.min(axis=0)
-        shape = tuple(highs.max(axis=0) - corner)
-        boxes = [tuple(map(slice, *one)) for one in zip(lows - corner, highs - corner, strict=True)]
-        cut = tuple(map(slice, corner, corner + shape))
-        inside = np.zeros(shape, bool)
-        for box in boxes:
-            inside[box] = True
-        use = np.flatnonzero(inside & (weight[cut] > 0))
-        moved = [np.array([*low[::-1], 0, 0, 0, 0]) for low in lows]
-
-        def models(parameters, derivatives):
-            images = np.zeros((len(parameters), 1 + derivatives, *shape), np.float32)
-            for image, box, one, off in zip(images, boxes, parameters, moved, strict=True):
-                size = tuple(s.stop - s.start for s in box)
-                image[:, *box] = self.profiles(size, one - off, derivatives)
-            return images.reshape(-1, *shape)
-
-        def changes(beside):
-            if beside is None:
-                return np.zeros((0, len(use)))
-            at = beside.parameters - [*corner[::-1], 0, 0, 0, 0]
-            images = np.array([self.profiles(shape, one, 6) for one in at], float)
-            images[:, 1:] *= beside.flux[:, None, None, None]
-            columns = images.reshape(-1, images[0, 0].size)[:, use] * inverse
-            return scipy.linalg.solve_triangular(beside.root, columns, lower=True)
-
-        inverse = weight[cut].ravel()[use]
-
-        def curves(xy, shapes):
-            waves = self.waves(shape)
-            found = shape_curves(waves.kx, waves.ky, shapes).astype(np.float32)
-            return waves.images(found, np.asarray(xy) - corner[::-1], shape)
-
-        return _Stamp(
-            models, curves, changes, use, inverse, data[cut].ravel()[use] * inverse, max(shape)
-        )
+        corners = np.round(means[:, :2]).astype(int) - half
+        size, (left, top) = 2 * half + 1, corners.min(axis=0)
+        right, bottom = corners.max(axis=0) + size
+        found = np.zeros((2, bottom - top, right - left))
+        for x, y in corners:
+            seen = np.s_[max(y, 0) : max(y + size, 0), max(x, 0) : max(x + size, 0)]
+            inverse = weight[seen]
+            at = max(y, 0) - top, max(x, 0) - left
+            box = np.s_[:, at[0] : at[0] + inverse.shape[0], at[1] : at[1] + inverse.shape[1]]
+            found[box] = data[seen] * inverse, inverse
+        return _Stamp(self, self.plan(size), *found, corners)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Stamp:
-    models: object
-    curves: object
-    changes: object
-    use: np.ndarray
-    inverse: np.ndarray
+    models: ShapeModels
+    plan: Plan
     white: np.ndarray
-    size: int
+    inverse: np.ndarray
+    corners: np.ndarray
 
-    def whitened(self, images):
-        return images.reshape(len(images), -1)[:, self.use] * self.inverse
+    @property
+    def pixels(self):
+        """As the kernels take them."""
+        return self.plan, profile_table(), self.white, self.inverse, self.corners
+
+    @functools.cached_property
+    def limits(self):
+        """Least and largest parameters."""
+        size, index = np.log(max(self.white.shape)), np.log(INDEX_RANGE)
+        low = [-np.inf, -np.inf, np.log(0.05), index[0], -2.0, -2.0]
+        return np.array([low, [np.inf, np.inf, size, index[1], 2.0, 2.0]])
+
+    def minimum(self, start, mean, precision, steps=_STEPS):
+        """As `~miricigale.photometry._core.shape_fits.minimum`; None if nothing is found."""
+        try:
+            found = minimum(*self.pixels, start, mean, precision, self.limits, steps, _GAIN)
+        except np.linalg.LinAlgError:
+            return None
+        return found if np.isfinite(found[0]) else None
+
+    def misfit(self, parameters):
+        """Chi^2 of a profile with the light that fits best, infinite if that is negative."""
+        found = self.minimum(parameters[None], parameters[None], np.empty((1, 0, 0)), 0)
+        return np.inf if found is None else found[0]
+
+    def changes(self, beside):
+        """Whitened changes of the light of neighbors by independent unit normal deviates, (p, pixels)."""
+        if beside is None:
+            return np.zeros((0, self.white.size))
+        at = beside.parameters - [*self.corners[0], 0, 0, 0, 0]
+        images = np.array([self.models.profiles(self.white.shape, one, 6) for one in at], float)
+        images[:, 1:] *= beside.flux[:, None, None, None]
+        columns = (images * self.inverse).reshape(-1, self.white.size)
+        return scipy.linalg.solve_triangular(beside.root, columns, lower=True)
 
     def nodes(self, parameters, flux, covariance, mean, beside):
         """
@@ -320,42 +326,28 @@ class _Stamp:
         root = np.linalg.cholesky(covariance) * _WIDER
         z = normal_nodes()
         shapes = parameters[2:] + z @ root.T
-        shapes[:, 0] = np.clip(shapes[:, 0], np.log(0.05), np.log(self.size))
+        shapes[:, 0] = np.clip(shapes[:, 0], np.log(0.05), self.limits[1, 2])
         shapes[:, 1] = np.clip(shapes[:, 1], *np.log(INDEX_RANGE))
-        images = self.curves(parameters[:2], shapes)
-        columns = np.stack(
-            [images, -np.gradient(images, axis=2), -np.gradient(images, axis=1)], axis=1
+        found = evidence_of(
+            *self.pixels,
+            parameters[None],
+            np.array([flux]),
+            shapes,
+            mean[None],
+            _CENTER[None],
+            beside,
         )
-        columns = columns.reshape(len(images), 3, -1)[:, :, self.use] * self.inverse
-        shared = columns @ beside.T
-        best = flux * (beside @ self.whitened(self.models(parameters[None], 0))[0])
-        matrix = columns @ columns.transpose(0, 2, 1) - shared @ shared.transpose(0, 2, 1)
-        slope = columns @ self.white - shared @ best
-        seen = (slope[:, 0] > 0) & (matrix[:, 0, 0] > 0)
-        # of the center: changes of the pixels are in proportion to the light
-        scale = np.where(seen, slope[:, 0], 1.0) / np.where(seen, matrix[:, 0, 0], 1.0)
-        factor = np.stack([np.ones_like(scale), scale, scale], axis=1)
-        matrix *= factor[:, :, None] * factor[:, None]
-        matrix[:, [1, 2], [1, 2]] += _OFFSET**-2
-        off = np.append(0.0, parameters[:2] - mean[:2])
-        slope = slope * factor - off * _OFFSET**-2
-        step = np.linalg.solve(matrix, slope[..., None])[..., 0]
-        chi2 = self.white @ self.white - best @ best + off @ off * _OFFSET**-2
-        chi2 = chi2 - np.einsum("kc,kc->k", slope, step)
-        volume = np.linalg.slogdet(matrix)[1] + 4 * np.log(_OFFSET)
         density = (
             -0.5 * np.sum(z * z, axis=1) - np.sum(np.log(np.diag(root))) - 2 * np.log(2 * np.pi)
         )
-        # of a distribution that is flat in ln flux
-        log_flux = np.log(np.maximum(step[:, 0], 0.1 * scale))
-        like = -0.5 * (chi2 + volume) - log_flux - density
-        return np.column_stack([np.where(seen, like, -1e9), np.where(seen, log_flux, 0.0), shapes])
+        found[:, 0] -= density
+        return np.column_stack([found, shapes])
 
 
 def _known(xy, population):
     """What is known of the parameters of a source at a position: mean, and inverse of the covariance."""
-    precision = np.diag([_OFFSET**-2] * 2 + [0.0] * 4)
-    precision[2:, 2:] = np.linalg.inv(population.spread)
+    precision = np.zeros((6, 6))
+    precision[:2, :2], precision[2:, 2:] = _CENTER, np.linalg.inv(population.spread)
     return np.concatenate([xy, population.mean]), precision
 
 
@@ -363,81 +355,3 @@ def _half_width(parameters):
     """Half-width of the stamp that a profile is fitted on."""
     reach = np.exp(parameters[2] + 0.5 * np.hypot(*parameters[4:]))
     return int(np.clip(np.ceil(_REACH * reach), _HALF, _MOST))
-
-
-def _misfit(parameters, stamp):
-    """Chi^2 of a profile with the light that fits best."""
-    (scaled,) = stamp.whitened(stamp.models(parameters[None], 0))
-    power = scaled @ scaled
-    flux = (scaled @ stamp.white) / power if power > 0 else 0.0
-    return float(np.sum((stamp.white - flux * scaled) ** 2))
-
-
-def _minimum(stamp, start, mean, precision):
-    """
-    Levenberg-Marquardt for the light and the first parameters of sources, with Gaussian priors.
-
-    ``start`` and ``mean`` are of shape (n, 6), ``precision`` (n, m, m) for m free parameters. Fluxes, parameters,
-    evidence (Laplace's, without the light's prior) and covariance of ln flux and the free parameters of each, (n,
-    1 + m, 1 + m), and inverse of the covariance of flux and parameters of all; None if nothing is found.
-    """
-    n, n_free = precision.shape[:2]
-    free = np.s_[:, :n_free]
-    low = np.array([-np.inf, -np.inf, np.log(0.05), np.log(INDEX_RANGE[0]), -2.0, -2.0])
-    high = np.array([np.inf, np.inf, np.log(stamp.size), np.log(INDEX_RANGE[1]), 2.0, 2.0])
-
-    def at(parameters):
-        # sources, light and derivatives, pixels
-        columns = stamp.whitened(stamp.models(parameters, n_free)).reshape(n, 1 + n_free, -1)
-        light = columns[:, 0]
-        flux = np.linalg.lstsq(light @ light.T, light @ stamp.white, rcond=1e-12)[0]
-        z = stamp.white - flux @ light
-        off = (parameters - mean)[free]
-        chi2 = z @ z + np.einsum("ni,nij,nj", off, precision, off)
-        columns[:, 1:] *= flux[:, None, None]
-        return parameters, columns.reshape(-1, z.size), flux, z, chi2
-
-    def curvature(columns):
-        matrix = columns @ columns.T
-        blocks = matrix.reshape(n, 1 + n_free, n, 1 + n_free)
-        for k in range(n):
-            blocks[k, 1:, k, 1:] += precision[k]
-        return matrix
-
-    best = at(start.copy())
-    damping = 1e-2
-    for _ in range(_STEPS):
-        parameters, columns, _, z, chi2 = best
-        matrix = curvature(columns)
-        slope = (columns @ z).reshape(n, -1)
-        slope[:, 1:] -= np.einsum("nij,nj->ni", precision, (parameters - mean)[free])
-        gained = 0.0
-        while damping < 1e6:
-            damped = matrix + np.diag(damping * np.diag(matrix))
-            try:
-                step = np.linalg.solve(damped, slope.ravel()).reshape(n, -1)
-            except np.linalg.LinAlgError:
-                return None
-            trial = parameters.copy()
-            trial[free] += np.clip(step[:, 1:], -1.0, 1.0)
-            trial[free] = np.clip(trial[free], low[:n_free], high[:n_free])
-            new = at(trial)
-            if new[-1] <= chi2:
-                gained = chi2 - new[-1]
-                best = new
-                damping = max(damping * 0.1, 1e-6)
-                break
-            damping *= 10.0
-        if gained < _GAIN:
-            break
-    parameters, columns, flux, _, chi2 = best
-    matrix = curvature(columns)
-    sign, log_det = np.linalg.slogdet(matrix)
-    if not (sign > 0 and np.isfinite(chi2) and np.all(flux > 0)):
-        return None
-    evidence = -0.5 * (chi2 + log_det - np.linalg.slogdet(precision)[1].sum())
-    whole = np.linalg.inv(matrix).reshape(n, 1 + n_free, n, 1 + n_free)
-    covariance = np.array([whole[k, :, k] for k in range(n)])
-    covariance[:, 0] /= flux[:, None]
-    covariance[:, :, 0] /= flux[:, None]
-    return flux, parameters, evidence, covariance, matrix

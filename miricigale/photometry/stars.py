@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 from miricigale.filters import Filter
 from miricigale.photometry.arrays import fine_wcs, image_arrays, pixel_scale, sky_pixels
 from miricigale.psf import KernelField, _core
-from miricigale.psf.star_fit import TERMS, Star, StarPSF, fitted_stars
+from miricigale.psf.star_fit import TERMS, WHOLE, Star, StarPSF, fitted_stars
 from miricigale.utils.units import ANGLE
 
 #: Least signal-to-noise of a star, and largest number that are looked at and used, the brightest first.
@@ -59,7 +59,7 @@ class KernelStars:
     @property
     def meta(self):
         """What was done, for the meta of a table: kind of each correction, stars, chi-square, terms, error."""
-        known = {}
+        known = {"image_psf": "model", "image_stars": 0}
         for name, one in self.fits.items():
             known |= {f"{name}_psf": one.kind, f"{name}_stars": len(one.after)}
             known[f"{name}_psf_chi2"] = [round(one.chi2[kind], 1) for kind in ("model", one.kind)]
@@ -70,7 +70,7 @@ class KernelStars:
         return known
 
 
-def kernel_stars(kernel, image, highres, catalog, *, grid=None):
+def kernel_stars(kernel, image, highres, catalog, *, grid=None, least=1):
     """
     Correct a kernel by the stars of its two images.
 
@@ -84,6 +84,8 @@ def kernel_stars(kernel, image, highres, catalog, *, grid=None):
         Columns ``id`` and ``sky``: all sources, stars among them.
     grid : `~astropy.wcs.WCS`, optional
         The pixels of the kernel; those of ``highres``, or north up without it.
+    least : int, optional
+        Number of stars below which the PSF of an image is not corrected.
 
     Returns
     -------
@@ -118,7 +120,7 @@ def kernel_stars(kernel, image, highres, catalog, *, grid=None):
         rows, found = rows[:_USED], found[:_USED]
         flux = {k: star.flux for k, star in zip(rows, found, strict=True)}
         if len(rows):
-            fits[name] = fit = StarPSF(psf, [star.star for star in found])
+            fits[name] = fit = StarPSF(psf, [star.star for star in found], least)
             pairs = zip(rows, fit.before, fit.after, strict=True)
             table += [(name, ids[k], a.snr, a.width[0], a.chi2, b.chi2) for k, a, b in pairs]
     names = ("on", "id", "snr", "width", "chi2_model", "chi2")
@@ -135,7 +137,8 @@ def with_stars(photometer, image, sources, highres=None, grid=None):
     ``sources`` has the columns ``id`` and ``sky``; the other arguments are those of `kernel_stars`. Without the
     prior only the image's PSF is corrected.
     """
-    stars = kernel_stars(photometer.kernel, image, highres, sources, grid=grid)
+    least = WHOLE if photometer.psf_stars is None else 1
+    stars = kernel_stars(photometer.kernel, image, highres, sources, grid=grid, least=least)
     errors, fit = photometer.errors, stars.fits.get("image")
     if errors.psf_error is None and fit is not None and fit.kind != "model":
         errors = dataclasses.replace(errors, psf_error=min(float(fit.error), 0.99))

@@ -13,10 +13,16 @@ YANG2021_DEPTHS = types.MappingProxyType(
     }
 )  # fmt: skip
 
-#: 5-sigma AB depths of deep surveys of GOODS fields by Herschel, from 3-sigma depths in mJy: 0.6 and 1.3 with PACS
-#: (Magnelli et al. 2013, A&A 553, A132, abstract); 5.7, 7.2 and 9.0 with SPIRE (Elbaz et al. 2011,
-#: A&A 533, A119 [?], quoted from memory), at which confusion counts.
-_HERSCHEL = {"pacs_100": 0.6, "pacs_160": 1.3, "spire_250": 5.7, "spire_350": 7.2, "spire_500": 9.0}
+#: 5-sigma AB depths of deep surveys by Herschel, from 3-sigma depths in mJy: 0.6 and 1.3 with PACS in GOODS-South
+#: (Magnelli et al. 2013, A&A 553, A132, abstract), and with SPIRE three times the confusion noise of 5.8, 6.3 and
+#: 6.8 mJy / beam (Nguyen et al. 2010, A&A 518, L5, abstract), which no exposure goes below without priors.
+_HERSCHEL = {
+    "pacs_100": 0.6,
+    "pacs_160": 1.3,
+    "spire_250": 17.4,
+    "spire_350": 18.9,
+    "spire_500": 20.4,
+}
 HERSCHEL_DEPTHS = types.MappingProxyType(
     {
         f"sedpy.herschel_{name}": round(16.4 - 2.5 * math.log10(depth * 5 / 3), 2)

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import scipy.ndimage
 
+from miricigale.photometry._core.shape_fits import draw_curves
 from miricigale.photometry._core.shapes import INDEX_RANGE, shape_curves
 from miricigale.photometry.cutouts import Cutout
 from miricigale.photometry.shape_models import ShapeModels
@@ -72,15 +73,14 @@ class TemplateChanges:
         reach = _REACH * np.exp(parameters[2] + 0.5 * np.hypot(*parameters[4:]))
         half = min(reach, _MOST) + widths * self._width
         half = int(np.ceil(max(half, _HALF)))
-        size = (2 * half + 1,) * 2
-        waves = self._target.waves(size)
+        plan = self._target.plan(2 * half + 1)
         # nodes about the mean, and the profile that is scaled
         covariance = fitted["covariance"][3:, 3:]
         nodes = parameters[2:] + normal_nodes() @ _root(covariance).T
         nodes[:, 1] = np.clip(nodes[:, 1], *np.log(INDEX_RANGE))
         step = np.array([0.5 * self._size_scatter, 0.0, 0.0, 0.0])
         some = [parameters[2:], parameters[2:] + step, parameters[2:] - step]
-        curves = shape_curves(waves.kx, waves.ky, np.concatenate([nodes, some]))
+        curves = shape_curves(plan.kx, plan.ky, np.concatenate([nodes, some]))
         profile, *sides = curves[len(nodes) :]
         curves = curves[: len(nodes)]
         # a point has no size
@@ -91,16 +91,19 @@ class TemplateChanges:
         scatter = (1.0 - odds) * (sides[0] - sides[1])
         steps = np.concatenate([steps, [np.sqrt(odds) * (1.0 - mean), scatter]])
         # light is blurred by what is not known of the center
-        kx, ky = waves.kx, waves.ky
+        kx, ky = plan.kx, plan.ky
         cxx, cxy, _, cyy = fitted["covariance"][1:3, 1:3].ravel()
         blur = np.exp(-0.5 * (cxx * kx * kx + 2 * cxy * kx * ky + cyy * ky * ky))
-        limit = least**2 * waves.power(base)
-        value, vector = np.linalg.eigh((steps * waves.weight) @ steps.T)
+        limit = least**2 * np.sum(plan.weight * base**2)
+        value, vector = np.linalg.eigh((steps * plan.weight) @ steps.T)
         kept = value > limit
         found = np.concatenate([vector.T[kept] @ steps, [mean * blur - base]])
-        fixed = waves.power(found[-1]) > limit
+        fixed = np.sum(plan.weight * found[-1] ** 2) > limit
         place = parameters[:2] - middle + half
-        images = waves.images(found if fixed else found[:-1], place, size)
+        found = (found if fixed else found[:-1]).astype(np.float32)
+        if not len(found):
+            return [], 0.0
+        images = draw_curves(plan, found, *place, 0).swapaxes(0, 1).astype(float)
         origin = int(middle[1]) - half, int(middle[0]) - half
         last = len(images) - 1 if fixed else len(images)
         return [Change(Cutout(one, origin), fixed=k == last) for k, one in enumerate(images)], 0.0
@@ -123,6 +126,14 @@ class TemplateChanges:
             Change(Cutout(np.tensordot(step, derivatives, 1), rest.origin), float(step @ light))
             for step in _steps(_root(fitted["covariance"]), derivatives, least**2 * power)
         ]
+        # more or less of the light may be in the middle than in the other band, unless a point on top of it
+        # is that light: the center is open only then
+        middle = self._target.profiles(shape, [*parameters[:2], -30.0, 0.0, 0.0, 0.0])[0]
+        middle = middle - self._blurred(rest.data)
+        middle -= self._target.convolve(profile.data[None], profile.origin - corner, shape)[0]
+        seen = self._size_scatter**2 * np.sum(middle**2) > least**2 * power
+        if seen and not fitted["covariance"][1, 1]:
+            changes.append(Change(Cutout(self._size_scatter * middle, rest.origin)))
         # each pixel adds to the light, and to what is taken off by the fit
         weight = 1.0 - self._blurred(template) / power
         each = cutout.noise / max(np.count_nonzero(core), 1)

@@ -1,4 +1,4 @@
-"""What exposures would yield: noise or images, fits of mock photometry, times."""
+"""What exposures would yield: noise, fits of mock photometry, times."""
 
 import lazy_loader
 

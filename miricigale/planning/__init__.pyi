@@ -6,10 +6,6 @@ from .config import PlanConfig as PlanConfig
 from .config import load_plan as load_plan
 from .exposures import BandPlan as BandPlan
 from .exposures import wall_clock as wall_clock
-from .images import image_sample as image_sample
-from .images import images_study as images_study
-from .images import paired_bands as paired_bands
-from .images import paired_numbers as paired_numbers
 from .page import write_page as write_page
 from .planner import Plan as Plan
 from .planner import Planner as Planner

@@ -18,7 +18,7 @@ def sky_weights(sources, agn_limit):
 
 
 #: Statistic of each number, and the columns (`_columns`) that it is of.
-_NUMBERS = {
+NUMBERS = {
     "z_scatter": (scatter, "dz"),
     "z_outliers": (_share, "outlier", "known"),
     "z_width": (median, "z_std"),
@@ -30,7 +30,7 @@ _NUMBERS = {
 }
 
 
-def _columns(sources, agn_limit):
+def columns_of(sources, agn_limit):
     """What the numbers are made of, by source."""
     z, f = (np.asarray(sources[name], float) for name in ("redshift", "frac_agn"))
     dz = (np.asarray(sources["redshift_mean"], float) - z) / (1 + z)
@@ -73,40 +73,11 @@ def accuracy(sources, *, agn_limit=0.4, seed=0):
         ``z_width`` and ``frac_width``, median posterior standard deviations (of z over 1+z);
         ``completeness`` and ``purity`` of the selected AGN, the only ones for which AGN of other skies count.
     """
-    columns, numbers = _columns(sources, agn_limit), {}
-    for name, (statistic, *wanted) in _NUMBERS.items():
+    columns, numbers = columns_of(sources, agn_limit), {}
+    for name, (statistic, *wanted) in NUMBERS.items():
         values = [columns[key] for key in wanted]
         if statistic is _share:
             numbers[name] = weighted_share(*values)
         else:
             numbers[name] = bootstrap(statistic, *values, seed=seed)
-    return numbers
-
-
-def difference(first, second, *, agn_limit, seed):
-    """
-    Numbers of `accuracy` of the second plan less those of the first.
-
-    Parameters
-    ----------
-    first, second : `~astropy.table.QTable`
-        Tables of the same sources, row by row.
-    agn_limit, seed
-        As for `accuracy`.
-
-    Returns
-    -------
-    numbers : dict of str to `~miricigale.evaluation.Estimate`
-        With the errors of sources that are drawn together.
-    """
-    columns = [_columns(one, agn_limit) for one in (first, second)]
-    numbers = {}
-    for name, (statistic, *wanted) in _NUMBERS.items():
-        n = len(wanted)
-
-        def change(*values, statistic=statistic, n=n):
-            return statistic(*values[n:]) - statistic(*values[:n])
-
-        values = [one[key] for one in columns for key in wanted]
-        numbers[name] = bootstrap(change, *values, seed=seed)
     return numbers

@@ -51,7 +51,7 @@ def plan_table(*, quick=False):
     return QTable(rows)[[*order, "limit_etc", "limit", "limit_proposal", "fwhm"]]
 
 
-def write_plan(config, folder, *, executor=None, progress_bar=False):
+def write_plan(config, folder, *, executor=None):
     """
     Work out a plan and write it.
 
@@ -62,12 +62,9 @@ def write_plan(config, folder, *, executor=None, progress_bar=False):
     folder : path-like
         Gets ``plan.html``, ``plan.toml``, ``comparison.ecsv``, ``areas.ecsv`` (with ``[survey] areas``),
         and ``bands-<n>.ecsv`` and ``sources-<n>.ecsv`` of each set of bands, in the order of the
-        configuration (0: the existing ones); with ``[images] enabled`` the run in ``images``, its catalog
-        ``images.ecsv``, ``images-numbers.ecsv`` and ``images-bands.ecsv``. Files of these names are replaced.
+        configuration (0: the existing ones). Files of these names are replaced.
     executor : `concurrent.futures.Executor`, optional
         Threads to fit with; the answer is the same.
-    progress_bar : bool, optional
-        Whether the progress of the images is shown.
 
     Returns
     -------
@@ -99,23 +96,5 @@ def write_plan(config, folder, *, executor=None, progress_bar=False):
     tables |= {f"bands-{k}": plan.band_table() for k, plan in enumerate(plans) if plan.bands}
     for name, table in tables.items():
         table.write(folder / f"{name}.ecsv", overwrite=True)
-    pair = _write_images(planner, plans, folder, progress_bar) if config.images.enabled else None
-    write_page(folder / "plan.html", planner, plans, comparison, areas, pair)
+    write_page(folder / "plan.html", planner, plans, comparison, areas)
     return comparison
-
-
-def _write_images(planner, plans, folder, progress_bar):
-    """Image a plan, and write its numbers beside those of the noise: tables by band and of all."""
-    from miricigale.planning import image_sample, paired_bands, paired_numbers
-    from miricigale.utils.parallel import process_pool, thread_count
-
-    n_processes = thread_count(planner.config.plan.threads or None)
-    with process_pool(n_processes) as pool:
-        imaged = image_sample(planner, folder / "images", executor=pool, progress_bar=progress_bar)
-    pair = (
-        paired_bands(planner, imaged),
-        paired_numbers(planner, plans, planner.compare(measured=imaged.measured), imaged),
-    )
-    for name, table in zip(("bands", "numbers"), pair, strict=True):
-        table.write(folder / f"images-{name}.ecsv", overwrite=True)
-    return pair

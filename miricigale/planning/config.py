@@ -31,7 +31,7 @@ class SampleSection(Section):
     ----------
     n_sources
         Sources drawn from the catalog; 0 for all. More than it has are galaxies of several skies, with other AGN
-        and noise (not with images).
+        and noise.
     redshift
         Range of redshifts.
     luminosity
@@ -160,10 +160,6 @@ class NoiseSection(Section):
 
     Parameters
     ----------
-    kind
-        Fit on the mosaic, or the error function of a run.
-    run
-        Folder of the run whose errors.ecsv is scaled, with kind = 'run'.
     residual
         Fraction of the sky that stays as a fixed pattern, or the calculator's.
     fractional
@@ -174,37 +170,10 @@ class NoiseSection(Section):
         Whether errors grow with the half-light radii of the sources.
     """
 
-    kind: str = option("fitted", choices=("fitted", "run"))
-    run: str = ""
     residual: float | str = option(0.0, low=0.0, high=0.1, choices=("etc",))
     fractional: float = option(0.03, low=0.0, high=1.0)
     excess: float = option(1.4, low=0.1, high=10.0)
     sizes: bool = True
-
-
-class ImageSection(Section):
-    """
-    Images of the planned exposures, measured as in a run, beside the noise of the section above.
-
-    Parameters
-    ----------
-    enabled
-        Whether the exposures are imaged and measured too.
-    kind
-        As of the exposures of a run.
-    ra
-        Right ascension of the pointing in degrees; -1: the middle of the catalog.
-    dec
-        Declination in degrees.
-    roll
-        Position angle of V3 in degrees.
-    """
-
-    enabled: bool = False
-    kind: str = option("rates", choices=("rates", "ramps"))
-    ra: float = option(-1.0, low=-1, high=360)
-    dec: float = option(0.0, low=-90, high=90)
-    roll: float = option(0.0, low=-360, high=360)
 
 
 class SurveySection(Section):
@@ -297,7 +266,6 @@ class PlanConfig(Configuration):
     exposures: ExposureSection = dataclasses.field(default_factory=ExposureSection)
     background: BackgroundSection = dataclasses.field(default_factory=BackgroundSection)
     noise: NoiseSection = dataclasses.field(default_factory=NoiseSection)
-    images: ImageSection = dataclasses.field(default_factory=ImageSection)
     fit: FitBasics = dataclasses.field(default_factory=lambda: FitBasics(min_detected=1))
     survey: SurveySection = dataclasses.field(default_factory=SurveySection)
     overheads: OverheadSection = dataclasses.field(default_factory=OverheadSection)
@@ -324,13 +292,6 @@ class PlanConfig(Configuration):
         check_levels("background", "level", background.level, n, background.date)
         good = not background.date or background.ra >= 0
         self.check(good, "background.date", "must come with a position (ra, dec)")
-        good = self.noise.kind != "run" or self.noise.run
-        self.check(good, "noise.run", "must be a folder with kind = 'run'", "none")
-        if self.images.enabled:
-            wanted = "must be left out with [images], which need positions"
-            self.check(not self.sample.luminosity_function, "sample.luminosity_function", wanted)
-            wanted = "must be FASTR1 with [images], as of a run"
-            self.check(exposures.readout == "FASTR1", "exposures.readout", wanted)
         for name in exposures.sets:
             good = set(self.set_bands(name)) <= set(exposures.bands)
             wanted = f"must be 'all' or bands of {list(exposures.bands)}"

@@ -18,10 +18,8 @@ from miricigale.depth import (
 )
 from miricigale.instrument import Exposure, frame_time, miri_detector, psf_fwhm
 from miricigale.photometry import ErrorModel
-from miricigale.planning.config import NoiseSection
 from miricigale.reduction import imager_response
-from miricigale.utils.exceptions import ConfigError, config_error
-from miricigale.utils.options import check_data
+from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow.background import band_background
 from miricigale.workflow.options import of_option
 
@@ -44,8 +42,6 @@ class BandPlan:
         Of sky and telescope, MJy/sr.
     noise : `~miricigale.planning.config.NoiseSection`
         Kind of the errors.
-    run : `RunErrors`, optional
-        With ``noise.kind = "run"``.
     detector : `~miricigale.instrument.DetectorProperties`, optional
         With the response of a day; `~miricigale.instrument.miri_detector` if not given.
 
@@ -63,7 +59,6 @@ class BandPlan:
     n_dithers: int
     background: u.Quantity
     noise: object
-    run: object = None
     detector: object = None
 
     filter = property(attrgetter("exposure.filter"), doc="Name of the band.")
@@ -151,14 +146,12 @@ class BandPlan:
         Parameters
         ----------
         size : `~astropy.units.Quantity`, optional
-            Full width at half maximum of the sources before the PSF; only with ``"fitted"`` errors.
+            Full width at half maximum of the sources before the PSF.
 
         Returns
         -------
         errors : `~miricigale.photometry.ErrorModel`
         """
-        if self.noise.kind == "run":
-            return self.run.scaled(self)
         return ErrorModel.from_exposure(
             self.filter,
             self.time,
@@ -171,49 +164,6 @@ class BandPlan:
         )
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class RunErrors:
-    """
-    Error functions measured in a run, for other exposures.
-
-    The part of an error that the faintest sources have is scaled as the limit of
-    `~miricigale.depth.sensitivity`; what is beyond it (templates, blends) stays.
-    """
-
-    errors: ErrorModel
-    config: object
-
-    @classmethod
-    def read(cls, folder):
-        """Read ``errors.ecsv`` and ``config.toml`` of a run."""
-        from pathlib import Path
-
-        from miricigale.workflow.config import load_config
-
-        folder = Path(folder).expanduser()
-        for name in ("errors.ecsv", "config.toml"):
-            check_data((folder / name).is_file(), folder, f"([noise] run) has no {name}")
-        return cls(ErrorModel.read(folder / "errors.ecsv"), load_config(folder / "config.toml"))
-
-    def scaled(self, plan):
-        """`~miricigale.photometry.ErrorModel` of a `BandPlan`."""
-        from miricigale.workflow.stages.exposures import band_exposures, study_background
-
-        exposures = band_exposures(self.config, plan.filter)
-        if not exposures:
-            known = list(self.config.exposures.filters)
-            raise config_error("the run of [noise]", f"has no band {plan.filter}; it has {known}")
-        background = study_background(self.config, plan.filter)
-        noise = NoiseSection(residual=self.config.detector.residual)
-        own = BandPlan(exposures[0], len(exposures), background, noise)
-        ratio = float((plan.limit.to(u.uJy) / own.limit.to(u.uJy)).decompose())
-        table = self.errors.to_table()
-        table = table[table["filter"] == plan.filter]
-        sigma = table["sigma"]
-        table["sigma"] = np.sqrt(sigma**2 + (ratio**2 - 1) * np.min(sigma) ** 2)
-        return ErrorModel.from_table(table)
-
-
 def background_options(config):
     """Arguments of `band_background`, but for the filter, and of `background_text`."""
     options, position = config.background, None
@@ -223,7 +173,7 @@ def background_options(config):
     return levels | {"position": position, "date": options.date}
 
 
-def _band_plan(filter, time, n_dithers, config, run):
+def _band_plan(filter, time, n_dithers, config):
     """The exposures of one band that last a time."""
     options, background = config.exposures, band_background(filter, **background_options(config))
     # the time for which Exposure.from_time allows is of the low background
@@ -237,7 +187,7 @@ def _band_plan(filter, time, n_dithers, config, run):
         **_ANYWHERE,
     )
     detector = _detector(options.photom, options.date)
-    return BandPlan(exposure, n_dithers, background, config.noise, run, detector)
+    return BandPlan(exposure, n_dithers, background, config.noise, detector)
 
 
 @functools.lru_cache(maxsize=8)
@@ -248,11 +198,11 @@ def _detector(photom, date):
     return miri_detector().replace(response=response)
 
 
-def _time_to(depth, filter, n_dithers, config, run):
+def _time_to(depth, filter, n_dithers, config):
     """Time in which the errors of point sources reach a 5-sigma depth."""
 
     def excess(log_time):
-        plan = _band_plan(filter, 10**log_time * u.s, n_dithers, config, run)
+        plan = _band_plan(filter, 10**log_time * u.s, n_dithers, config)
         return plan.errors().limiting_magnitude(filter).value - depth
 
     # two frames in each dither at least
@@ -265,7 +215,7 @@ def _time_to(depth, filter, n_dithers, config, run):
     return 10 ** brentq(excess, low, 7.0, xtol=2e-3) * u.s
 
 
-def band_plans(config, *, share=1.0, run=None):
+def band_plans(config, *, share=1.0):
     """
     The exposures of all bands of a configuration.
 
@@ -275,8 +225,6 @@ def band_plans(config, *, share=1.0, run=None):
         The configuration.
     share : float, optional
         Factor on all times.
-    run : `RunErrors`, optional
-        Errors of a run.
 
     Returns
     -------
@@ -285,8 +233,8 @@ def band_plans(config, *, share=1.0, run=None):
     options, plans = config.exposures, {}
     values = options.by_band("depth" if options.depth else "time")
     for name, value, dithers in zip(options.bands, values, options.by_band("dithers"), strict=True):
-        time = _time_to(value, name, dithers, config, run) if options.depth else value * u.s
-        plans[name] = _band_plan(name, share * time, dithers, config, run)
+        time = _time_to(value, name, dithers, config) if options.depth else value * u.s
+        plans[name] = _band_plan(name, share * time, dithers, config)
     return plans
 
 

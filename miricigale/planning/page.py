@@ -13,7 +13,7 @@ from miricigale.workflow.background import background_text
 from miricigale.workflow.page.study_figures import redshift_figure
 
 
-def write_page(path, planner, plans, comparison, areas=None, images=None):
+def write_page(path, planner, plans, comparison, areas=None):
     """
     Write the page of a plan.
 
@@ -27,8 +27,6 @@ def write_page(path, planner, plans, comparison, areas=None, images=None):
         Of `Planner.compare`.
     comparison, areas : `~astropy.table.QTable`
         Of `comparison_table` and, if there is one, `area_table`.
-    images : tuple of `~astropy.table.QTable`, optional
-        Of `paired_bands` and `paired_numbers`.
 
     Returns
     -------
@@ -57,8 +55,6 @@ def write_page(path, planner, plans, comparison, areas=None, images=None):
     }
     page.figure("redshifts", redshift_figure(redshifts))
     page.figure("fractions", _fraction_figure(fits, config.agn.limit))
-    if images is not None:
-        _write_images(page, *images)
     if areas is not None and len(areas):
         page.section("areas")
         page.table("table", _entries(areas))
@@ -105,9 +101,9 @@ def _notices(page, planner):
     skies = planner.sources.meta.get("n_skies", 1)
     n = np.count_nonzero(np.asarray(planner.sources.columns.get("sky", 0)) == 0)
     page.notice("skies" if skies > 1 else "sample", n=n, skies=skies, seed=config.plan.seed)
-    page.notice("images" if config.images.enabled else "noise")
+    page.notice("noise")
     noise = dataclasses.asdict(config.noise)
-    page.notice(f"errors_{noise['kind']}", **noise | {"fractional": 100 * noise["fractional"]})
+    page.notice("errors", **noise | {"fractional": 100 * noise["fractional"]})
     models = "models_ceers" if config.sed.infrared == "ceers" else "models"
     page.notice(models, model_error=100 * config.fit.model_error)
     page.notice("hours")
@@ -131,22 +127,6 @@ def _write_exposures(page, config, plan):
         time=plan.time.to_value(u.h),
     )
     page.table("table", _entries(plan.band_table()))
-
-
-def _write_images(page, bands, numbers):
-    """The section on the images of the exposures."""
-    page.section("images", n=numbers["n"][0], n_field=bands["n"][0])
-    page.table("bands", _entries(bands))
-    columns = page.texts["sets"]["table"]["columns"]
-    formats = {key: (header, *form) for header, key, *form in columns}
-    for name in dict.fromkeys(numbers["plan"]):
-        rows = list(_entries(numbers[numbers["plan"] == name]))
-        for row in rows:
-            row["number"], spec, reason, _ = formats[row["number"]]
-            signed = "+" + spec.removeprefix("+")
-            for key, form in (("noise", spec), ("images", spec), ("difference", signed)):
-                row[key] = number(row[key], form, reason, error=row[f"{key}_err"])
-        page.table("numbers", rows, plan=name)
 
 
 def _comparison_figure(table):

@@ -9,7 +9,7 @@ from astropy.table import QTable, vstack
 
 from miricigale.planning.accuracy import accuracy
 from miricigale.planning.config import PlanConfig
-from miricigale.planning.exposures import RunErrors, band_plans, wall_clock
+from miricigale.planning.exposures import band_plans, wall_clock
 from miricigale.planning.sample import make_sample
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import error_column, require_columns
@@ -151,14 +151,9 @@ class Planner:
         smallest = min(len(config.set_bands(name)) for name in config.exposures.sets)
         return max(1, min(config.fit.min_detected, smallest))
 
-    @functools.cached_property
-    def _run(self):
-        noise = self.config.noise
-        return RunErrors.read(noise.run) if noise.kind == "run" else None
-
     def band_plans(self, share=1.0):
         """The exposures of all bands, each time multiplied by ``share``: dict of `BandPlan`."""
-        return band_plans(self.config, share=share, run=self._run)
+        return band_plans(self.config, share=share)
 
     @functools.cached_property
     def _existing(self):
@@ -199,7 +194,7 @@ class Planner:
         """
         columns, seed = self.sources[["id", plan.filter]], self.config.plan.seed
         good, node = self._good_groups(plan), np.zeros(len(columns), int)
-        if self.config.noise.kind == "fitted" and self.config.noise.sizes:
+        if self.config.noise.sizes:
             node = np.argmin(np.abs(self._size[:, None] - _SIZES), axis=1)
         # a power of two, so that few errors are computed
         kept = 2 ** np.log2(np.maximum(good, 2)).astype(int)

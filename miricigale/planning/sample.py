@@ -100,7 +100,7 @@ def make_sample(config, bands, *, executor=None):
     elif 0 < options.n_sources < len(sources):
         rows = rng.choice(len(sources), options.n_sources, replace=False)
         sources = sources[np.sort(rows)]
-    elif options.n_sources > len(sources) and not config.images.enabled:
+    elif options.n_sources > len(sources):
         # the same galaxies in other skies: with AGN and noise of their own
         sources = sources[np.arange(options.n_sources) % len(sources)]
         sources["template"], sources["id"] = sources["id"], np.arange(1, len(sources) + 1)
@@ -111,11 +111,10 @@ def make_sample(config, bands, *, executor=None):
     sources["sky"], n_skies = 0, 1
     if agn == "field":
         add_field_agn(sources, model, next(iter(bands)), seed)
-        if not config.images.enabled:
-            n_skies += _DRAWS // len(sources)
-            options = {"least": config.agn.limit, "seed": seed}
-            others, _ = other_skies(sources, model, next(iter(bands)), n_skies - 1, **options)
-            sources = vstack([sources, others], metadata_conflicts="silent")
+        n_skies += _DRAWS // len(sources)
+        options = {"least": config.agn.limit, "seed": seed}
+        others, _ = other_skies(sources, model, next(iter(bands)), n_skies - 1, **options)
+        sources = vstack([sources, others], metadata_conflicts="silent")
     else:
         add_agn(sources, 0.0, seed)
         mixed = given is None

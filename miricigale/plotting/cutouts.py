@@ -47,12 +47,16 @@ class _Panels:
             block_reduce(np.where(bad, np.nan, filled(image)), factor, np.mean) for image in images
         ]
         n = 2 * round(0.5 * BOX / (factor * scale)) + 1
+        sigma = float(mad_std(planes[-1][np.isfinite(planes[-1])]))
+        if not sigma > 0:
+            # without noise, or data, the brightest pixel makes the stretch
+            sigma = float(np.nan_to_num(np.abs(planes[len(planes) // 2])).max()) / 1000 or 1.0
         return cls(
             tuple(np.pad(p.astype(np.float32), n, constant_values=np.nan) for p in planes),
             first.wcs[::factor, ::factor],
             planes[0].shape,
             n,
-            float(mad_std(planes[-1][np.isfinite(planes[-1])])),
+            sigma,
         )
 
     def squares(self, sky):

@@ -21,7 +21,7 @@ _SPREAD = np.array([*TERMS.values(), *[0.05] * (2 * _SLOPED)])
 #: Least number of stars that are left out one by one (of fewer, halves are), with which changes over the field and
 #: single cells are tried; how much smaller chi-square must be of what was left out, and as a part of it: less may
 #: come from the wings of neighbors.
-_WHOLE, _FIELD, _EFFECTIVE, _EVIDENCE, _PART = 3, 6, 3, 9.0, 1e-3
+WHOLE, _FIELD, _EFFECTIVE, _EVIDENCE, _PART = 3, 6, 3, 9.0, 1e-3
 
 #: Deviation of a star from any PSF, as a fraction of its light in a pixel; steps of the fit.
 _SCATTER, _STEPS = 0.02, 5
@@ -158,6 +158,8 @@ class StarPSF:
         The model, centered; its sum is the fraction of all light.
     stars : sequence of `Star`
         At least one.
+    least : int, optional
+        Number of stars below which the model is not corrected.
 
     Attributes
     ----------
@@ -183,19 +185,19 @@ class StarPSF:
     Anderson & King 2000, PASP 112, 1360 (effective PSFs from residuals).
     """
 
-    def __init__(self, psf, stars):
+    def __init__(self, psf, stars, least=1):
         stars = list(stars)
         check_that(stars, "stars", "at least one star", "none")
         self._model, half = psf, len(psf) // 2
         self._fwhm = _core.half_maximum_width(psf, half, half)
         # of few stars each one counts as two, of which one is left out
-        units = stars if len(stars) >= _WHOLE else [half for one in stars for half in one.halves()]
+        units = stars if len(stars) >= WHOLE else [half for one in stars for half in one.halves()]
         self.kind, self._cells, self._state = "model", 0.0, np.zeros(len(_SPREAD))
         self.before = self._fitted(stars)
         self.chi2 = {"model": sum(one.misfit() for one in self._fitted(units))}
         fits, without, inverse = self._solved(units, 0)
-        for kind, least, k in (("terms", 1, len(TERMS)), ("field", _FIELD, len(_SPREAD))):
-            if len(stars) < least:
+        for kind, n, k in (("terms", 1, len(TERMS)), ("field", _FIELD, len(_SPREAD))):
+            if len(stars) < max(n, least):
                 continue
             kept, found = self._state, self._solved(units, k)
             left = zip(*found[:2], strict=True)

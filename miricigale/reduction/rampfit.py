@@ -17,9 +17,8 @@ import dataclasses
 import numpy as np
 
 from miricigale.instrument import DQ
-from miricigale.reduction._core.lanes import refit
-from miricigale.reduction._core.pixel import DO_NOT_USE, JUMP, SATURATED, own_charge
-from miricigale.reduction._core.rows import fit_rows
+from miricigale.reduction._core.lanes import fit_pixels
+from miricigale.reduction._core.pixel import own_charge
 from miricigale.reduction.showers import find_showers
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_positive, check_that
@@ -233,39 +232,43 @@ def fit_groups(
         drift, bias = bias[0, 0] + drift, np.zeros((1, 1))
     reset = _groups(maps.reset, "reset", data.shape)
     dark = _groups(maps.dark, "dark", data.shape, least=last_group)
-    flagged = _flagged(group_dq, data.shape, last_group) & usable
-    group_dq = _plain(group_dq if flagged.any() else np.zeros((1, 0, 1, 1), np.uint8))
+    if group_dq is None:
+        group_dq = np.zeros((1, 0, 1, 1), np.uint8)
+    elif np.shape(group_dq) != data.shape or np.asarray(group_dq).dtype != np.uint8:
+        got = f"{np.asarray(group_dq).dtype}, shape {np.shape(group_dq)}"
+        raise argument_error("group_dq", f"uint8, of shape {data.shape}", got)
+    group_dq = _plain(group_dq)
 
     data = _plain(data)
     variance = np.square(read_noise) + (1 / 12 if data.dtype.kind in "iu" else 0.0)
-    kinds = (np.float32,) * 3 + (np.int16,) * 2 + (np.int64,)
-    out = tuple(np.zeros((ny, nx), kind) for kind in kinds)
+    out = tuple(np.full((ny, nx), np.nan, np.float32) for _ in range(3))
+    out += tuple(np.zeros((ny, nx), kind) for kind in (np.int16, np.int16, np.int64))
     ramp = (data, (drift, bias, reset), (coef, saturation, dark))
     # a trace of read noise keeps the closed forms finite
     noise = (np.maximum(variance, 1e-6), poisson_factor / gain, np.square(slow_noise))
     fit = (first_group, last_group, noise, 1 / group_time, jump)
-    # pixels whose groups have flags are fitted one by one
-    plain = usable & ~flagged
 
-    def fit_block(rows):
-        events = fit_rows(ramp, plain, rows.start, rows.stop, fit, out)
+    def fit_part(part):
+        ys, xs, start, cuts = part
+        events = fit_pixels(ramp, group_dq, ys, xs, start, cuts, fit, out)
         return events[np.lexsort(events.T[3::-1])]
 
-    def refit_block(part):
-        ys, xs, start, cuts = part
-        refit(ramp, group_dq, ys, xs, start, cuts, fit, out)
+    def fit_rows(rows):
+        ys, xs = np.nonzero(usable[rows])
+        none = np.zeros(len(ys) + 1, np.int64)
+        return fit_part((ys + rows.start, xs, none, none[:0]))
 
     with threads(n_threads) as executor:
         options = {"executor": executor, "progress_bar": progress_bar, "desc": "slopes"}
-        events = np.concatenate(parallel_map(fit_block, chunks(ny, _ROWS), **options))
+        events = np.concatenate(parallel_map(fit_rows, chunks(ny, _ROWS), **options))
         n_diff = last_group - first_group - 1
         showers = np.zeros((4, 0), np.int64)
         if np.isfinite(shower):
             showers = find_showers(
                 data, events, usable, shower, first_group=first_group, last_group=last_group
             )
-        parts = list(_again(events, neighbor, usable, n_diff, showers, flagged))
-        parallel_map(refit_block, parts, executor=executor)
+        parts = list(_again(events, neighbor, usable, n_diff, showers))
+        parallel_map(fit_part, parts, executor=executor)
 
     return fit_result(*out, events, first_group)
 
@@ -316,21 +319,6 @@ def _groups(values, name, shape, *, least=0):
     return _plain(values)
 
 
-def _flagged(group_dq, shape, last_group):
-    """Pixels of which a group has a flag that forbids its use."""
-    seen = np.zeros(shape[2:], bool)
-    if group_dq is None:
-        return seen
-    group_dq = np.asarray(group_dq)
-    if group_dq.shape != shape or group_dq.dtype != np.uint8:
-        got = f"{group_dq.dtype}, shape {group_dq.shape}"
-        raise argument_error("group_dq", f"uint8, of shape {shape}", got)
-    wanted = np.uint8(DO_NOT_USE | SATURATED | JUMP)
-    for k, g in np.ndindex(shape[0], last_group):
-        seen |= (group_dq[k, g] & wanted) != 0
-    return seen
-
-
 def fit_result(rate, var_poisson, var_read, n_used, n_jump, flags, events, first_group):
     """Make a `RampFit` of what the kernels give; jumps are counted from ``first_group``."""
     flags[np.isnan(rate)] |= int(DQ.NO_SLOPE | DQ.DO_NOT_USE)
@@ -347,11 +335,11 @@ def threshold(value, name):
     return np.inf if value is None else float(value)
 
 
-def _again(events, threshold, usable, n_diff, showers, flagged):
+def _again(events, threshold, usable, n_diff, showers):
     """
     Yield the pixels that are fitted once more, and where they are to be cut.
 
-    They lie beside large jumps or in showers, or their groups have flags. Each part is the argument of
+    They lie beside large jumps or in showers. Each part is the argument of
     one call of the kernel: rows, columns, start of each pixel's cuts, and the cuts. Pixels keep the cuts
     that they found themselves.
     """
@@ -374,7 +362,7 @@ def _again(events, threshold, usable, n_diff, showers, flagged):
     cuts = np.concatenate([cuts, own[again, 2] * n_diff + own[again, 3]])
     order = np.lexsort((cuts, pixels))
     pixels, cuts = pixels[order], cuts[order]
-    unique = np.union1d(pixels, np.flatnonzero(flagged))
+    unique = np.unique(pixels)
     start = np.append(np.searchsorted(pixels, unique), len(pixels))
     for part in chunks(len(unique), _PIXELS):
         first, last = start[part.start], start[part.stop]

@@ -53,7 +53,9 @@ def depth_to_rms(depth, *, pixel_area):
     return (1e-12 * limit / _N_SIGMA / np.sqrt(n_pixels) / pixel_area)[()]
 
 
-def highres_image(catalog, *, filter="wfc3.f160w", wcs, psf, depth=_DEPTH, seed=None, **options):
+def highres_image(
+    catalog, *, filter="wfc3.f160w", wcs, psf, depth=_DEPTH, seed=None, noise=None, **options
+):
     """
     A high-resolution image with Gaussian noise.
 
@@ -66,6 +68,8 @@ def highres_image(catalog, *, filter="wfc3.f160w", wcs, psf, depth=_DEPTH, seed=
         CANDELS wide fields in F160W.
     seed : int, `~numpy.random.Generator` or None, optional
         Seed of the noise; its stream depends on the filter only, not on the sources.
+    noise : `~numpy.ndarray`, optional
+        Standard normal numbers of the pixels, in place of those of ``seed``: a part of a larger image.
     **options
         Passed to `~miricigale.scene.Scene` (such as ``enclosed`` or ``background``).
 
@@ -95,7 +99,8 @@ def highres_image(catalog, *, filter="wfc3.f160w", wcs, psf, depth=_DEPTH, seed=
     image = scene.render()
     sigma = depth_to_rms(depth, pixel_area=pixel_area_map(wcs, image.shape))
     seed = check_seed(seed)
-    noise = stream(seed, "highres", scene.filter).standard_normal(image.shape)
+    if noise is None:
+        noise = stream(seed, "highres", scene.filter).standard_normal(image.shape)
     image.data += noise * sigma
     image.uncertainty = StdDevUncertainty(sigma)
     image.meta |= {"seed": seed, "depth": str(depth), "aperture_radius": float(_APERTURE.value)}

@@ -40,6 +40,14 @@ def distance(redshift, cosmology):
     return np.where(z > 0, far, (10.0 * u.pc).to_value(u.m))
 
 
+class _Flux(u.Quantity):
+    """The spectrum by the name ``flux``, whose call says what gives the flux in a band."""
+
+    def __call__(self, *_):
+        msg = "SED.flux is the spectrum (fnu); synthetic_flux(band) gives the flux in a band"
+        raise TypeError(msg)
+
+
 @checked_calls
 @dataclass(frozen=True, eq=False, repr=False)
 class SED(Frozen, Interactive):
@@ -88,7 +96,6 @@ class SED(Frozen, Interactive):
 
     _other_names = {
         "wavelength": "wave",
-        "flux": "fnu",
         "properties": "derived",
         "quantities": "derived",
         "to_spectrum": "to_specutils",
@@ -98,7 +105,7 @@ class SED(Frozen, Interactive):
     def _value(self, name):
         # half-made copies have no meta yet
         known = self.derived | self.parameters if "meta" in self.__dict__ else {}
-        return known.get(name)
+        return self.fnu.view(_Flux) if name == "flux" else known.get(name)
 
     def __post_init__(self):
         if not hasattr(self.fnu, "unit"):

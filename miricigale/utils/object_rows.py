@@ -22,6 +22,12 @@ def _frozen(array, copy):
     return array
 
 
+class _ByName(dict):
+    """Arrays by name, which a call gives too: ``results.pdf("redshift")``."""
+
+    __call__ = dict.__getitem__
+
+
 class ObjectRows(Interactive):
     """
     Base of frozen dataclasses with a row for each object of a catalog, and its ``ids``.
@@ -58,7 +64,7 @@ class ObjectRows(Interactive):
         found = {}
         for name, value in self._per_object():
             if isinstance(value, dict):
-                found[name] = {key: function(array) for key, array in value.items()}
+                found[name] = _ByName({key: function(array) for key, array in value.items()})
             else:
                 found[name] = None if value is None else function(value)
         return found

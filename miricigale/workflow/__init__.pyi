@@ -1,7 +1,8 @@
 from .config import StudyConfig as StudyConfig
 from .config import load_config as load_config
 from .config import preset_names as preset_names
-from .disk import disk_use as disk_use
+from .cost import disk_use as disk_use
+from .cost import study_cost as study_cost
 from .engine.runner import StudyRunner as StudyRunner
 from .engine.stage import Context as Context
 from .engine.stage import Stage as Stage

@@ -23,6 +23,7 @@ from miricigale.workflow.sections import (
     DetectorSection,
     ExposureSection,
     HighresSection,
+    PatchesSection,
     PointingSection,
     ReductionSection,
     RunSection,
@@ -66,6 +67,7 @@ class StudyConfig(Configuration):
     highres: HighresSection = dataclasses.field(default_factory=HighresSection)
     detector: DetectorSection = dataclasses.field(default_factory=DetectorSection)
     reduction: ReductionSection = dataclasses.field(default_factory=ReductionSection)
+    patches: PatchesSection = dataclasses.field(default_factory=PatchesSection)
     photometry: PhotometrySection = dataclasses.field(default_factory=PhotometrySection)
     errors: ErrorSection = dataclasses.field(default_factory=ErrorSection)
     fit: FitSection = dataclasses.field(default_factory=FitSection)
@@ -123,6 +125,16 @@ class StudyConfig(Configuration):
         self.check(good, "highres.pixel_scale", "must be 0.06 with method = 'yang2021'")
         good = not photometry.rivals or fine
         self.check(good, "highres.pixel_scale", "must be 0.06 with [photometry] rivals")
+        patches = self.patches
+        if patches.size:
+            self.check(
+                patches.size >= patches.overlap, "patches.size", "must be 0 or above overlap"
+            )
+            own = photometry.method == "package"
+            self.check(own, "photometry.method", "must be 'package' in patches")
+            whole = "must be left out in patches: whole fields are compared"
+            self.check(not photometry.rivals, "photometry.rivals", whole)
+            self.check(not self.variants.images, "variants.images", whole)
 
 
 def preset_names():
@@ -133,7 +145,7 @@ def preset_names():
     --------
     >>> from miricigale.workflow import preset_names
     >>> preset_names()
-    ['goodss', 'yang2021']
+    ['cosmosweb', 'goodss', 'yang2021']
     """
     folder = resources.files("miricigale.workflow") / "presets"
     names = (Path(entry.name) for entry in folder.iterdir() if entry.name.endswith(".toml"))

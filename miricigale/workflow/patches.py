@@ -307,6 +307,8 @@ def measure_patches(
     """
     inputs = Inputs.of(image, highres, **{"memory": _TEMPLATES, **options})
     named = {name: _absolute(getattr(inputs, name)) for name in ("segmentation", "catalog")}
+    # all patches have one PSF unless their stars are asked for
+    named |= {"psf_stars": bool(inputs.psf_stars)}
     inputs = dataclasses.replace(inputs, kernels=tuple(map(_absolute, inputs.kernels)), **named)
     check_output("output", output, overwrite, inputs.paths)
     inputs.check()

@@ -326,3 +326,19 @@ class ReductionSection(Section):
     negative_noise: str = option("larger", choices=("larger", "background"))
     pixel_scale: float = option(0.11, low=0.02, high=0.5)
     pixfrac: float = option(1.0, low=0.1, high=1.0)
+
+
+class PatchesSection(Section):
+    """
+    Patches of the sky, for fields too large to be measured in one: mosaics, prior and photometry are of each.
+
+    Parameters
+    ----------
+    size
+        Side of their cores in arcsec; 0 for the whole field in one.
+    overlap
+        Arcsec that each sees around its core.
+    """
+
+    size: float = option(0.0, low=0.0, high=3600.0)
+    overlap: float = option(10.0, low=1.0, high=120.0)

@@ -9,12 +9,13 @@ from miricigale.depth import saturation_forecast
 from miricigale.filters import Filter
 from miricigale.photometry.kernel_files import file_place
 from miricigale.utils.exceptions import ConfigError
-from miricigale.workflow.disk import disk_use
+from miricigale.workflow.cost import disk_use
 from miricigale.workflow.engine.runner import StudyRunner
 from miricigale.workflow.options import of_option
 from miricigale.workflow.sections import HighresSection
 from miricigale.workflow.stages import study_stages
-from miricigale.workflow.stages.exposures import grid_of, study_background, study_exposures
+from miricigale.workflow.stages.exposures import study_background, study_exposures
+from miricigale.workflow.stages.grids import grid_of
 from miricigale.workflow.stages.inputs import existing_bands, study_catalog
 from miricigale.workflow.stages.sample import good_redshifts
 from miricigale.workflow.truths import CATALOG

@@ -3,7 +3,7 @@ import warnings
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.table import QTable, Table
+from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.cases import cases_of
@@ -55,22 +55,6 @@ def test_negative_errors_are_upper_limits(text_file):
     assert "mips.24_limit" not in without.colnames
     assert np.isnan(without["mips.24"][0].value)
     assert np.isnan(without["mips.24_err"][0].value)
-
-
-@pytest.mark.parametrize("name", ["cat.fits", "cat.xml", "cat.ecsv", "cat.csv", "cat.txt"])
-def test_all_formats_say_the_same(text_file, tmp_path, name):
-    truth = read_cigale_catalog(text_file)
-    plain = Table.read(text_file, format="ascii.commented_header")
-    path = tmp_path / name
-    kind = {"xml": "votable", "txt": "ascii", "csv": "csv"}.get(name[4:])
-    plain.write(path, **({"format": kind} if kind else {}))
-    table = read_cigale_catalog(path)
-    assert table.colnames == truth.colnames
-    for column in truth.colnames:
-        if column == "id":
-            assert table["id"].tolist() == truth["id"].tolist()
-        else:
-            assert_allclose(np.asarray(table[column]), np.asarray(truth[column]), rtol=1e-12)
 
 
 def test_units_of_the_file_are_kept(tmp_path):
@@ -194,16 +178,3 @@ def test_a_wrong_filter_is_refused_when_it_is_read(tmp_path):
         (12.0, ValueError, r"'IRAS1' must be a Filter, .* got float"),
     ):
         refuses(wanted, read_cigale_catalog, path, error=error, names={"IRAS1": given})
-
-
-def test_codes_and_limits_that_are_not_positive_are_missing(tmp_path):
-    """-99.99 with -99.99, as real catalogs have it, is no upper limit of -99.99 mJy."""
-    path = tmp_path / "galaxies.txt"
-    rows = ("a 0.5 -99.99 -99.99 2 0.1", "b 0.5 -1e-3 -1e-4 2 -0.1", "c 0.5 0 -1e-4 2 -99.9")
-    path.write_text("\n".join(["# id redshift IRAC1 IRAC1_err IRAC2 IRAC2_err", *rows, ""]))
-    with pytest.warns(MiricigaleWarning, match="limits that are not positive: IRAC1 2"):
-        table = read_cigale_catalog(path)
-    assert np.all(np.isnan(table["irac.ch1"]))
-    assert "irac.ch1_limit" not in table.colnames
-    assert table["irac.ch2_limit"].tolist() == [False, True, False]
-    assert_array_equal(np.isnan(table["irac.ch2_err"]), [False, False, True])

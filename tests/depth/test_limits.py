@@ -114,6 +114,11 @@ def test_limits_fall_with_the_root_of_time_and_residuals_do_not(psf):
     assert_quantity_allclose(double, 2 * floor, rtol=1e-4)
     spread = sensitivity(NAME, 1e12 * u.s, residual=0.01, n_dithers=4, **options)
     assert_quantity_allclose(spread, floor / 2, rtol=1e-4)
+    kind = {"residual": 0.01, **options}
+    columns = [
+        sensitivity_table([NAME], 1e4 * u.s, n_dithers=n, **kind)["residual"] for n in (1, 4)
+    ]
+    assert_quantity_allclose(columns[1], columns[0] / 2, rtol=1e-9)
 
 
 def test_faint_limits_are_linear_and_bright_ones_count_their_own_photons(psf):
@@ -160,6 +165,7 @@ def test_table_scales_the_calculators_limits(psf):
     assert_quantity_allclose(table["limit"], table["limit_white"])
     assert_quantity_allclose(table["background"], background_level(NAME))
     assert table["residual"][0] == 0 * u.uJy
+    assert table["background"].unit == u.MJy / u.sr
     # one name is a list of one, and the instrument's may be left out of it
     short = sensitivity_table("f1000w", 2500 * u.s, n_sigma=5, residual=None)
     assert short["filter"].tolist() == [NAME]

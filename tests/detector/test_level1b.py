@@ -73,14 +73,6 @@ def test_a_file_that_is_renamed_later_has_its_later_name(ramp, tmp_path):
         assert fits.getheader(path)["FILENAME"] == name
 
 
-def test_a_full_disk_is_told_with_the_file(ramp, tmp_path, full_disk):
-    path = tmp_path / "a_uncal.fits"
-    for n_bytes in (5000, 60000):
-        with pytest.raises(OSError, match=r"a_uncal\.fits"), full_disk(n_bytes):
-            ramp.write(path)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_only_counts_are_written(make_exposure, tmp_path):
     exposure = make_exposure(n_groups=2)
     floats = Ramp(np.zeros((1, 2, 64, 72), np.float32), exposure)

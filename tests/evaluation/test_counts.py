@@ -68,7 +68,7 @@ def galaxies():
     table["dust_luminosity"] = 1e36 * ones * u.W
     table["u_v"], table["v_j"] = ones * u.mag, ones * u.mag
     table["u_v"][0] = 1.8 * u.mag
-    table["redshift"][1], table["stellar_mass"][1] = 0.0, np.nan
+    table["redshift"][1] = 0.0
     return table
 
 

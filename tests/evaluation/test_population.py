@@ -81,11 +81,18 @@ def test_obscured_fraction_by_hand():
 
 
 def test_mass_function_by_hand():
-    # the bin 0.8 < z < 1.1 of Davidzon et al. 2017 at its characteristic mass
+    # the bin 0.8 < z < 1.1 of Davidzon et al. 2017 at its characteristic mass, and 0.7 dex below it
     wanted = np.log(10) * (1.428e-3 + 2.19e-3) / np.e
     got = galaxy_mass_function(10**10.56 * u.Msun, [0.95, 0.96])
     assert got[0].to_value(DENSITY) == pytest.approx(wanted)
     assert got[1] < got[0]
+    x = 10**-0.7
+    wanted = np.log(10) * x * (1.428e-3 * x**-1.31 + 2.19e-3 * x**0.51) * np.exp(-x)
+    low = galaxy_mass_function(10**9.86 * u.Msun, 0.95)
+    assert low.to_value(DENSITY) == pytest.approx(wanted)
+    # beyond the middle of the last bin, 4.5 < z < 5.5, that of the bin
+    last, far = galaxy_mass_function(10**10.5 * u.Msun, [5.0, 9.0])
+    assert far == last
 
 
 def test_mass_function_agrees_with_another():

@@ -1,14 +1,12 @@
 """Sets of filters."""
 
-import copy
-import pickle
 from types import SimpleNamespace
 
 import astropy.units as u
 import numpy as np
 import pytest
 from astropy.tests.helper import assert_quantity_allclose
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 from synphot import Box1D, SpectralElement
 
 from helpers.errors import refuses
@@ -81,20 +79,6 @@ def test_rejects_bad_sets(filters):
     refuses("strictly ascending", filters.weights, [3.0, 2.0])
 
 
-@pytest.mark.parametrize(
-    "make", [copy.copy, copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))]
-)
-def test_copies_and_pickles(filters, make):
-    again = make(filters)
-    assert again.names == filters.names
-    assert_quantity_allclose(again.pivots, filters.pivots)
-    one = make(filters[0])
-    assert (one.name, one.meta) == (filters[0].name, filters[0].meta)
-    assert_array_equal(one.throughput, filters[0].throughput)
-    assert not one.throughput.flags.writeable
-    assert not one.wave.flags.writeable
-
-
 def test_sets_are_made_of_anything_and_joined():
     box = SpectralElement(Box1D, amplitude=1, x_0=50000, width=1000)
     filters = FilterSet(["F770W"]) + FilterSet([box]) + "F1000W"
@@ -123,13 +107,3 @@ def test_names_are_forgiving():
         ("something else", r"^((?!did you mean).)*$"),
     ):
         refuses(match, Filter.from_name, name, error=KeyError)
-
-
-def test_plot_returns_the_axes(filters):
-    from matplotlib.figure import Figure
-
-    ax = Figure().add_subplot()
-    assert filters.plot(ax=ax) is ax
-    assert len(ax.lines) == 5
-    assert filters[0].plot(ax=ax) is ax
-    assert len(ax.lines) == 6

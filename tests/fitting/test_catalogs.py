@@ -257,6 +257,7 @@ def test_tables_of_any_kind_are_the_same_fit(grid, catalog, tmp_path):
     catalog.write(tmp_path / "cat.ecsv")
     tables = [plain, Table(plain, masked=True)]
     tables += [cls.read(tmp_path / f"cat.{x}") for cls in (Table, QTable) for x in ("fits", "ecsv")]
+    tables += [tmp_path / "cat.ecsv", {name: catalog[name] for name in catalog.colnames}]
     for table in tables:
         got = node_fitter(grid).fit(table)
         assert_allclose(got.chi2, want.chi2, rtol=1e-12)

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import norm
 
 from helpers.errors import refuses
-from helpers.grids import cell_integrals, draw_photometry, make_grid, node_fitter, photometry_table
+from helpers.grids import draw_photometry, make_grid, node_fitter, photometry_table
 from miricigale.fitting import BayesFitter, FitFlags, GridSettings, SamplerSettings, leave_out
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import FitWarning
@@ -116,20 +116,6 @@ def test_what_is_no_table_is_named(grid, photometry, filters):
     refuses(wanted, fitter.fit, table, error=u.UnitsError)
 
 
-def test_catalogs_come_in_any_kind_of_table(grid, photometry, tmp_path):
-    fitter = node_fitter(grid)
-    want = fitter.fit(photometry)
-    photometry.write(tmp_path / "a.ecsv")
-    plain = {name: photometry[name] for name in photometry.colnames}
-    other = photometry.copy()
-    for name in grid.filters:
-        other.rename_column(f"{name}_err", f"e_{name}")
-    for given in (tmp_path / "a.ecsv", plain, other):
-        assert_array_equal(fitter(given).chi2, want.chi2)
-    del plain["id"]
-    assert fitter.fit(plain).ids.tolist() == list(range(1, len(photometry) + 1))
-
-
 def test_a_band_that_is_not_there_is_a_missing_band(grid, photometry):
     fitter = node_fitter(grid, ["band0", "band1", "band2"], n_bands_min=2)
     without = photometry.copy()
@@ -142,21 +128,6 @@ def test_a_band_that_is_not_there_is_a_missing_band(grid, photometry):
 
 
 # ------------------------------------------------------------- densities of redshift, limits
-
-
-def test_a_density_weighs_the_redshifts_by_its_integral_over_their_cells():
-    """Posterior with p(z) = posterior with a flat prior times the integrals, by quadrature."""
-    grid = make_grid(3, n_z=6)
-    fitter = node_fitter(grid, settings=GridSettings(rtol=0))
-    table, _ = draw_photometry(grid, 5, seed=2)
-    nodes = np.array([0.0, 0.4, 0.9, 2.0, 9.0])
-    density = np.array([0.1, 2.0, 0.3, 0.5, 0.0])
-    want = fitter.fit(table).pdf["redshift"] * cell_integrals(grid.redshift, nodes, density)
-    got = fitter.fit(table, redshift_prior=(nodes, density)).pdf["redshift"]
-    assert_allclose(got, want / want.sum(axis=1, keepdims=True), rtol=1e-7, atol=1e-13)
-    # one for each object is the same, row by row
-    each = fitter.fit(table, redshift_prior=(nodes, np.tile(density, (5, 1)))).pdf["redshift"]
-    assert_array_equal(each, got)
 
 
 def test_densities_that_cannot_be_used_are_flagged_or_refused():

@@ -1,6 +1,8 @@
 """``miricigale fit``: the folder it fills, and how it is resumed."""
 
+import io
 import warnings
+from pathlib import Path
 
 import astropy.units as u
 import numpy as np
@@ -71,6 +73,46 @@ def test_a_catalog_becomes_a_folder_of_results(catalog, tmp_path, capsys):
     assert "resume=" not in err
     assert main([*argv, "--chunk-rows", "3", "--no-resume"]) == 0
     assert open_results(out).n_parts == 2
+
+
+@pytest.mark.parametrize("kind", ["parquet", "vot"])
+def test_catalogs_of_other_formats_and_from_standard_input(
+    catalog, tmp_path, capsys, monkeypatch, kind
+):
+    """The values of a catalog in FITS; of parquet the table is parquet."""
+    if kind == "parquet":
+        pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed")
+    end = "parquet" if kind == "parquet" else "fits"
+    catalog.write(tmp_path / "cat.fits")
+    catalog.write(tmp_path / f"cat.{kind}", format="votable" if kind == "vot" else None)
+    data = io.BytesIO((tmp_path / f"cat.{kind}").read_bytes())
+    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(data))
+    monkeypatch.chdir(tmp_path)
+    for path, out in (("cat.fits", "fits"), (f"cat.{kind}", "file"), ("-", "stdin")):
+        told = command(capsys, *fit(Path(path), out=out)).out
+        assert f"{out}/table.{'fits' if out == 'fits' else end};" in told
+    wanted = QTable.read("fits/table.fits")
+    for out in ("file", "stdin"):
+        found = QTable.read(f"{out}/table.{end}")
+        assert found.colnames == wanted.colnames
+        for name in ("id", "redshift_p50", "mass_best", "chi2_best"):
+            assert_allclose(
+                u.Quantity(found[name]).value, u.Quantity(wanted[name]).value, rtol=1e-12
+            )
+
+
+def test_the_workers_of_a_scheduler_give_the_table_of_this_process(catalog, tmp_path, capsys):
+    distributed = pytest.importorskip("distributed", reason="dask.distributed is not installed")
+    catalog.write(tmp_path / "cat.fits")
+    options = {"n_workers": 1, "threads_per_worker": 1, "dashboard_address": None}
+    with distributed.LocalCluster(**options) as cluster:
+        scheduler = ["--scheduler", cluster.scheduler_address, "--chunk-rows", "2"]
+        command(capsys, *fit(tmp_path / "cat.fits", *scheduler, out="there"))
+    command(capsys, *fit(tmp_path / "cat.fits", out="here"))
+    assert open_results(tmp_path / "there").n_parts == 3
+    there, here = (QTable.read(tmp_path / out / "table.fits") for out in ("there", "here"))
+    for name in ("id", "redshift_p50", "mass_best", "chi2_best"):
+        assert_allclose(u.Quantity(there[name]).value, u.Quantity(here[name]).value, rtol=1e-9)
 
 
 def test_real_galaxies_have_their_own_grid_whose_errors_are_logged(tmp_path, caplog):

@@ -21,8 +21,7 @@ from helpers.grids import (
     other_fraction,
     photometry_table,
 )
-from helpers.results import assert_joined
-from miricigale.fitting import FitFlags, GridSettings, fit_file, leave_out, mock_analysis
+from miricigale.fitting import FitFlags, GridSettings, leave_out, mock_analysis
 
 ERROR = {"band0": 0.1, "band1": 0.05, "band3": 0.2}
 FLOOR = {"band2": 0.15, "band3": 0.02}
@@ -330,20 +329,6 @@ def test_negative_models_have_no_limits():
 def catalog(grid):
     table = draw_photometry(grid, 60, seed=8, noise=0.15, missing=0.1)[0]
     return add_limits(table, grid, part=0.25)
-
-
-@pytest.mark.parametrize("kind", ["fits", "ecsv", "csv"])
-def test_catalogs_on_disk(grid, catalog, tmp_path, kind):
-    """In text as 1 and 0, or True and False."""
-    fitter, path, plain = node_fitter(grid), tmp_path / f"catalog.{kind}", catalog.copy()
-    for name in plain.colnames if kind == "csv" else ():
-        plain[name] = getattr(plain[name], "value", plain[name])
-        if name.endswith("_limit"):
-            plain[name] = plain[name].astype(int if name < "band2" else bool)
-    plain.write(path)
-    unit = u.uJy if kind == "csv" else None
-    results = fit_file(fitter, path, tmp_path / "out", chunk_rows=25, flux_unit=unit)
-    assert_joined(results.parts(), fitter.fit(catalog))
 
 
 def test_samples_follow_the_posterior(grid, catalog):

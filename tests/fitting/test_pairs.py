@@ -19,7 +19,7 @@ from helpers.grids import (
     node_fitter,
 )
 from helpers.results import assert_same
-from miricigale.fitting import FitResults, GridSettings, fit_file, open_results
+from miricigale.fitting import FitResults, GridSettings
 
 
 def free_pairs(fitter):
@@ -172,31 +172,6 @@ def test_files_keep_them(results, tmp_path):
     results.write(tmp_path / "new.fits")
     assert_same(FitResults.read(tmp_path / "new.fits"), results)
     assert_same(results.with_model(None), results)
-
-
-def test_from_file_to_file(fitter, photometry, tmp_path):
-    table = QTable(photometry, copy=True)
-    table["id"][9] = table["id"][1]
-    table.write(tmp_path / "catalog.fits")
-    pairs = [("age", "redshift"), ("tau", "temperature_polar")]
-    source, folder = tmp_path / "catalog.fits", tmp_path / "out"
-    files = fit_file(fitter, source, folder, chunk_rows=5, pairs=pairs)
-    whole = fitter.fit(table, pairs=pairs)
-    parts = list(files.parts())
-    for names in pairs:
-        joined = np.concatenate([part.pairs[names] for part in parts])
-        assert_array_equal(joined, whole.pairs[names])
-    key = table["id"][7]
-    got = open_results(folder).loc[key].joint_pdf("redshift", "age")
-    assert_array_equal(got, whole[key].joint_pdf("redshift", "age"))
-    # the same in other words goes on, others do not
-    arguments, text = (fitter, source, folder), "results of another fit: pairs differ"
-    fit_file(*arguments, chunk_rows=5, pairs=[*pairs, ("redshift", "frac_agn")])
-    for other in (None, pairs[:1]):
-        refuses(text, fit_file, *arguments, chunk_rows=5, pairs=other)
-    arguments, pairs = (fitter, source, tmp_path / "new"), [("mood", "age")]
-    refuses("'mood'", fit_file, *arguments, error=KeyError, pairs=pairs)
-    assert not (tmp_path / "new").exists()
 
 
 def test_cigale_forgets_them_where_its_weights_vanish(grid, photometry):

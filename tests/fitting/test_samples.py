@@ -184,18 +184,6 @@ def test_band_of_the_spectrum(real):
     assert_allclose(got, want, rtol=1e-3)
 
 
-def test_drawing(real):
-    from miricigale.plotting.axes import new_figure
-
-    for rest, label in ((True, "rest wavelength (µm)"), (False, "observed wavelength (µm)")):
-        ax = new_figure()[1][0, 0]
-        assert real.plot_sed_band("a", ax=ax, rest=rest) is ax
-        assert ax.get_xlabel() == label
-        assert ax.get_yscale() == "log"
-    ax = new_figure()[1][0, 0]
-    assert real.plot_pdf2d("a", "mass", "a_v", ax=ax).get_ylabel() == "a_v (mag)"
-
-
 def test_what_is_refused(real, model, samples):
     args = (real.grid, real.ids, real.flags)
     refuses("'index' must be of shape", Samples, *args, real.index[:, :5], real.scale)

@@ -113,14 +113,6 @@ def test_redshifts_go_with_their_rows(fitter, catalog, in_pieces, how):
     assert_joined(in_pieces(catalog, **options).parts(), whole)
 
 
-def test_text_tables_are_read_by_rows(fitter, catalog, in_pieces):
-    catalog["note"] = [f'a "note"\nof {i} lines' for i in range(len(catalog))]
-    whole = fitter.fit(catalog)
-    for delimiter in (" ", ","):
-        results = in_pieces(catalog, kind="ecsv", delimiter=delimiter)
-        assert_joined(results.parts(), whole)
-
-
 def test_parquet_gives_the_columns_and_values_of_fits(catalog, in_pieces, tmp_path):
     pytest.importorskip("pyarrow.parquet")
     found = []
@@ -220,6 +212,7 @@ def test_parts_of_another_fit_are_refused(fitter, grid, on_disk, catalog):
         assert part.read_bytes() == (out / part.name).read_bytes()
     refused("chunk_rows", chunk_rows=79)
     refused("redshift", redshift=None)
+    refused("pairs", pairs=[("age", "tau")])
     refused("redshift", redshift=np.array(catalog["redshift"]))
     refused("model_error", node_fitter(grid, error_floor=0.01, model_error=0.2))
     refused("error_floor", node_fitter(grid))

@@ -102,13 +102,3 @@ def test_agn_fraction_in_the_other_definition(definition, name):
     column = results.to_table()[f"{name}_mean"]
     assert_array_equal(column.value, mean)
     assert samples.description(name) in column.info.description
-
-
-def test_plot_sed(fitter):
-    import matplotlib.pyplot as plt
-
-    table, _ = draw_photometry(fitter.grid, 1, noise=0.05)
-    top, bottom = fitter.fit(table)[0].plot_sed()
-    assert len(top.lines) > 1
-    assert bottom.get_xlabel() == "observed wavelength (µm)"
-    plt.close("all")

@@ -4,7 +4,9 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
+from astropy.io import fits
 from astropy.table import QTable
+from astropy.wcs import WCS
 from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
@@ -104,25 +106,47 @@ def test_a_list_of_pointings(tmp_path):
         row(1, 0.0, 0.0, kind="T_ACQ"),
         row(1, 1.101, -0.25),
         row(1, 1.101, -0.25, exp=2),
-        row(2, -1.2, 3.5),
+        row(2, -1.601, 3.0),
         row(2, 9.0, 9.0, aperture="NRCALL_FULL"),
         row(3, 0.5, -2.75, kind="PARALLEL"),
         # another filter at the same places
-        row(2, -1.2, 3.5, exp=2),
+        row(2, -1.601, 3.0, exp=2),
         row(3, 0.5, -2.75, exp=2),
     ]
     path = pointing_list(tmp_path / "plan.pointing", {4: rows})
-    truth = [[1.101, -0.25], [-1.2, 3.5], [0.5, -2.75]]
+    truth = [[-1.101, 0.25], [1.601, -3.0], [-0.5, 2.75]]
     assert_allclose(read_dithers(path).value, truth)
     assert_allclose(dither_offsets(path).value, truth)
-    several = pointing_list(tmp_path / "two.pointing", {4: rows, 7: rows[:3]})
-    assert_allclose(read_dithers(several, observation=7).value, truth[:1])
+    several = pointing_list(tmp_path / "two.pointing", {4: rows, 7: rows[:4]})
+    found = read_dithers(several, observation=7, exposure=1)
+    assert_allclose(np.diff(found.value, axis=0), [[2.702, -3.25]])
     # all exposures have these
     assert_allclose(read_dithers(path, exposure=1).value, truth)
     refuses(r"'observation' must be one of \[4, 7\], got None", read_dithers, several)
     other = pointing_list(tmp_path / "nircam.pointing", {1: rows[4:5]})
     match = r"no exposures of MIRIM apertures; it has \['NRCALL_FULL'\]"
     refuses(match, read_dithers, other, error=DataError)
+
+
+@pytest.mark.filterwarnings("ignore:.*made the change:astropy.wcs.FITSFixedWarning")
+def test_pointings_of_a_list_are_where_an_exposure_in_flight_was(tmp_path, data_file):
+    """By XOFFSET and YOFFSET of its header, with which other dithers of the list have no part."""
+    path = data_file("real/i2d/jw01288015001_04101_00001_mirimage_i2d.fits")
+    first, second = (fits.getheader(path, name) for name in (0, "SCI"))
+    assert np.hypot(first["XOFFSET"], first["YOFFSET"]) > 15
+    place = f"{first['TARG_RA']:+.5f}  {first['TARG_DEC']:+.5f}"
+    lines = ["* Orion Bar (Obs 15)", HEADER]
+    for dith, x, y in ((1, first["XOFFSET"], first["YOFFSET"]), (2, 4.0, 9.0)):
+        lines.append(ROW.format(**row(dith, x, y)).replace("+80.48750  -69.49750", place))
+    plan = tmp_path / "plan.pointing"
+    plan.write_text("\n".join(lines))
+    roll = (second["PA_APER"] - 4.83545) * u.deg
+    (center,), _ = read_centers(plan, roll)
+    base = Exposure("F1130W", n_groups=5, pointing=center, roll=roll, subarray="SUB128")
+    exposure = base.dithered(read_dithers(plan))[0]
+    # the middle of the sub-array's part that sees the sky
+    seen = WCS(second).celestial.pixel_to_world(68.3, 64.5)
+    assert seen.separation(exposure.wcs.pixel_to_world(69.5, 64.5)) < 0.3 * u.arcsec
 
 
 @pytest.mark.parametrize("overlap", [0.0, 0.2])
@@ -157,22 +181,27 @@ def test_exposures_of_a_list_with_dithers_of_their_own(tmp_path):
         for dith, offset in enumerate(offsets, start=1)
     ]
     path = pointing_list(tmp_path / "plan.pointing", {1: rows})
-    for exp, offsets in patterns.items():
-        assert_allclose(read_dithers(path, exposure=exp).value, offsets)
+    middle = np.mean([place for places in patterns.values() for place in places], axis=0)
+    for exp, places in patterns.items():
+        assert_allclose(read_dithers(path, exposure=exp).value, middle - places)
     for exposure in (None, 3):
         match = rf"'exposure' must be one of \[1, 2\], got {exposure}"
         refuses(match, read_dithers, path, exposure=exposure)
 
 
 def test_tiles_have_one_pattern_or_none(tmp_path):
-    def tile(number, x):
-        text = ROW.format(**row(1, x, 1.0))
-        return f"  1    {number}" + text[8:]
-
-    path, lines = tmp_path / "plan.pointing", ["* Deep field (Obs 1)", HEADER, tile(1, 0.5)]
-    path.write_text("\n".join([*lines, tile(2, 0.5)]))
-    assert_allclose(read_dithers(path).value, [[0.5, 1.0]])
-    path.write_text("\n".join([*lines, tile(2, 0.7)]))
+    """Places of a mosaic of 2 x 1 as APT lists them (M51 of the examples of mirage)."""
+    tiles = [
+        [(-57.221, -82.6), (0.779, -59.1), (58.779, -35.6)],
+        [(-58.779, 35.6), (-0.779, 59.1), (57.221, 82.6)],
+    ]
+    path, lines = tmp_path / "plan.pointing", ["* Deep field (Obs 1)", HEADER]
+    for number, places in enumerate(tiles, start=1):
+        rows = [ROW.format(**row(k, *place)) for k, place in enumerate(places, start=1)]
+        lines += [f"  1    {number}" + text[8:] for text in rows]
+    path.write_text("\n".join(lines))
+    assert_allclose(read_dithers(path).value, [[58, 23.5], [0, 0], [-58, -23.5]], atol=1e-9)
+    path.write_text("\n".join(lines).replace("+57.221", "+57.321"))
     refuses(r"plan\.pointing: tiles of the observation have dithers", read_dithers, path)
 
 

@@ -1,13 +1,12 @@
 import numpy as np
 import pytest
-import scipy.fft
 import scipy.ndimage
 from astropy.nddata import overlap_slices
 from numpy.testing import assert_allclose
 
 from helpers.light import gaussian_image
 from miricigale.photometry.light import cutouts
-from miricigale.photometry.shape_models import Waves
+from miricigale.photometry.shape_models import ShapeModels
 from miricigale.photometry.shapes import ShapeFitter
 from miricigale.profiles import sersic_image
 
@@ -18,10 +17,6 @@ WIDTH = 1.4  # rms width of the PSF in pixels
 def gaussian_psf(n=61):
     psf = gaussian_image(n, WIDTH)
     return psf / psf.sum()
-
-
-def transform(size):
-    return scipy.fft.rfft2(scipy.fft.ifftshift(gaussian_image(size, WIDTH, 0.5, 0.5)))
 
 
 def galaxy(shape, x, y, *, r_eff, n, q=1.0, theta=0.0, flux=1.0, fine=5):
@@ -45,20 +40,36 @@ def test_models_are_those_of_the_renderer(n, r_eff, q):
         20.3, 19.6, np.log(r_eff * np.sqrt(q)), np.log(n), eta * np.cos(1.0), eta * np.sin(1.0),
     ]  # fmt: skip
     # a large period, for the wings of its images not to matter
-    image = Waves(transform(256), 256).profiles((41, 41), parameters)[0]
+    image = ShapeModels(gaussian_psf()).profiles((161, 161), parameters)[0, :41, :41]
     assert_allclose(image, truth, atol=1e-3 * truth.max())
+
+
+def test_gaussian_profile_is_as_wide_as_both():
+    """The profile of index 0.5 is a Gaussian, half of whose light is within sqrt(2 ln 2) widths."""
+    radius, ratio, angle = 4.0, 0.6, 0.7
+    eta = -np.log(ratio)
+    ellipticity = eta * np.cos(2 * angle), eta * np.sin(2 * angle)
+    parameters = [24.3, 23.8, np.log(radius), np.log(0.5), *ellipticity]
+    image = ShapeModels(gaussian_psf()).profiles((49, 49), parameters)[0]
+    axes = radius**2 / (2 * np.log(2)) * np.array([1 / ratio, ratio]) + WIDTH**2
+    y, x = np.indices((49, 49)) - np.array([23.8, 24.3])[:, None, None]
+    along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
+    truth = np.exp(-0.5 * (along**2 / axes[0] + across**2 / axes[1]))
+    truth /= 2 * np.pi * np.sqrt(axes.prod())
+    assert_allclose(image, truth, atol=1e-3 * truth.max())
+    assert_allclose(image.sum(), truth.sum(), rtol=1e-3)
 
 
 @pytest.mark.parametrize("ellipticity", [(0.4, -0.3), (1e-5, 0.0)])
 def test_derivatives(ellipticity):
-    waves = Waves(transform(64), 64)
+    models = ShapeModels(gaussian_psf())
     parameters = np.array([15.3, 16.2, np.log(3.0), np.log(1.7), *ellipticity])
-    images = waves.profiles((33, 33), parameters, 6)
+    images = models.profiles((33, 33), parameters, 6)
     assert images.shape == (7, 33, 33)
     for k in range(6):
         step = np.zeros(6)
         step[k] = 2e-2
-        high, low = (waves.profiles((33, 33), parameters + s)[0] for s in (step, -step))
+        high, low = (models.profiles((33, 33), parameters + s)[0] for s in (step, -step))
         assert_allclose(images[1 + k], (high - low) / 4e-2, atol=5e-3 * np.abs(images[1 + k]).max())
 
 

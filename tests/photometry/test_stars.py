@@ -32,6 +32,19 @@ def stars(tools):
     return image, QTable({"id": np.arange(25) + 500, "sky": sky}), flux
 
 
+def test_two_stars_do_not_decide_by_themselves(tools, stars):
+    image, catalog, _ = stars
+    kernel = wrong_kernel(tools, 1.06)
+    for n, kind in ((2, "model"), (5, "terms")):
+        photometer = ForcedPhotometer(kernel, template="psf", psf_stars=None)
+        result = photometer.measure(image, catalog=catalog[:n])
+        assert (result.meta["image_psf"], result.meta["image_stars"]) == (kind, n)
+    asked = photometer.replace(psf_stars=True).measure(image, catalog=catalog[:2])
+    assert asked.meta["image_psf"] == "terms"
+    none = photometer.measure(image, catalog=tools.places([9.0], [0.2]))
+    assert (none.meta["image_psf"], none.meta["image_stars"]) == ("model", 0)
+
+
 @pytest.mark.parametrize("factor", [0.95, 1.06])
 def test_a_width_that_is_wrong_is_found_and_mended(tools, stars, factor):
     image, catalog, flux = stars

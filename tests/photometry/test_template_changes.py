@@ -130,6 +130,26 @@ def test_sizes_differ_between_bands():
     assert free.of(None, record(3.0, np.zeros(6), point=1.0), 1e-6)[0] == []
 
 
+def test_a_nucleus_that_the_other_band_lacks_does_not_bias_an_image(tools):
+    """A galaxy with a fifth of its light in a point that the high-resolution image does not show."""
+    rng, sky, wide = np.random.default_rng(4), tools.places([0.02], [0.03]), 0.4
+    high, low = tools.pair(sky, np.array([80.0]), np.array([wide]), (150, 83), (0.02, 0.01), rng)
+    point = tools.picture(sky, np.array([20.0]), (83, 83))
+    low.data = low.data + point.data
+    prior = high, *detect_sources(high, threshold=3.0)
+    ratio = []
+    for scatter in (None, 0.1):
+        photometer = ForcedPhotometer(
+            tools.kernel, template="cutout", errors=settings(size_scatter=scatter)
+        )
+        result = photometer.measure(low, *prior)
+        ratio.append(result.flux[np.argmax(result.flux)].value / 100)
+    # a Gaussian of variance a fitted to one of variance b: 2 a / (a + b) of its flux
+    a, b = wide**2 + tools.LO**2, tools.LO**2
+    assert_allclose(ratio[0], 0.8 + 0.2 * 2 * a / (a + b), rtol=0.01)
+    assert_allclose(ratio[1], 1.0, rtol=0.01)
+
+
 @pytest.fixture(scope="module")
 def blend(tools):
     """Three galaxies, two of them blended, on a noisy prior and a noisy image."""

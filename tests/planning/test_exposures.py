@@ -11,12 +11,10 @@ from helpers.errors import refuses
 from helpers.references import write_photom
 from miricigale.depth import etc_limit, saturation_forecast, sensitivity
 from miricigale.instrument import background_level, imager_filters, subarrays
-from miricigale.photometry import ErrorModel
 from miricigale.planning import load_plan, wall_clock
 from miricigale.planning.config import OverheadSection
-from miricigale.planning.exposures import RunErrors, band_plans
-from miricigale.utils.exceptions import ConfigError, DataError
-from miricigale.workflow import StudyConfig
+from miricigale.planning.exposures import band_plans
+from miricigale.utils.exceptions import ConfigError
 
 BAND = "miri.f1000w"
 
@@ -112,31 +110,3 @@ def test_the_clock_counts_every_overhead_once():
         time = wall_clock([plan, plan], options, pointings=3).to_value(u.s)
         assert time - 6 * light.value == pytest.approx(10 * count), name
     assert wall_clock([plan], OverheadSection()) > 1.16 * light
-
-
-@pytest.mark.parametrize(("own", "same"), cases_of(__file__, "of_runs"))
-def test_errors_of_a_run_are_its_own_for_its_exposures(tmp_path, own, same):
-    exposures = {"filters": [BAND], "n_groups": [100], "n_integrations": [1], "n_dithers": [4]}
-    sections = {"exposures": exposures, "fit": {"min_detected": 1}, **own}
-    (tmp_path / "config.toml").write_text(StudyConfig.from_dict(sections).to_toml())
-    errors = ErrorModel.from_depths({BAND: 0.5 * u.uJy}, fractional=0.05)
-    errors.write(tmp_path / "errors.ecsv")
-    run = RunErrors.read(tmp_path)
-
-    def scaled(time, dithers):
-        exposures = {"bands": [BAND], "time": time, "dithers": dithers}
-        noise = {"kind": "run", "run": str(tmp_path)} | same.get("noise", {})
-        config = load_plan(overrides={**same, "exposures": exposures, "noise": noise})
-        return band_plans(config, run=run)[BAND].errors()
-
-    own, longer = scaled(4 * 277.5, 4), scaled(16 * 277.5, 16)
-    for value in (0.1, 1.0, 30.0):
-        one = errors.sigma(value * u.uJy, BAND).value
-        assert own.sigma(value * u.uJy, BAND).value == pytest.approx(one, rel=1e-6)
-    # four times the time and dithers: half the noise of the sky, the same part of the flux
-    assert longer.sigma(0 * u.uJy, BAND).value == pytest.approx(0.05, rel=0.02)
-    assert longer.sigma(40 * u.uJy, BAND).value == pytest.approx(2.0, rel=1e-3)
-
-
-def test_a_run_that_is_none_is_named(tmp_path):
-    refuses(r"has no errors\.ecsv", RunErrors.read, tmp_path, error=DataError)

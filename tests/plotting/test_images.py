@@ -52,8 +52,6 @@ def test_an_image_is_drawn_as_it_is(image, ax):
     # of unit noise: two sigma below the sky, and what is bright
     assert drawn.norm.vmin == pytest.approx(-2.0, abs=0.4)
     assert drawn.norm.vmax == pytest.approx(np.percentile(image, 99.7))
-    assert drawn.colorbar.ax.get_ylabel() == "MJy/sr"
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("x (arcsec)", "y (arcsec)")
     assert ax.get_title() == "F770W"
 
 
@@ -71,7 +69,6 @@ def test_ticks_of_a_color_bar_stand_apart_and_are_plain_numbers(image, ax, top):
     texts = [text.get_text() for text in bar.ax.get_yticklabels()]
     assert_allclose(np.array(texts, float), bar.get_ticks(), rtol=0.05)
     assert not any("e" in text for text in texts)
-    assert bar.ax.get_ylabel() == "flux"
 
 
 def test_constant_and_empty_images_draw(ax):
@@ -156,7 +153,6 @@ def test_offsets_are_arrows_over_those_of_the_map(ax):
     assert arrows.scale == smooth.scale
     assert_allclose(line_data(ax, "x"), [xy[2:]])
     assert (ax.get_xlim(), ax.get_ylim()) == ((-0.5, 119.5), (-0.5, 59.5))
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("x (pixels)", "y (pixels)")
     (key,) = ax.artists
     assert key.text.get_text() == f"{1e3 * key.U:.0f} mas"
     # its arrow is as long as the map's step

@@ -32,7 +32,6 @@ def test_density_integrates_to_one(ax):
     assert_array_equal(edges, [0.0, 1.0, 3.0])
     assert np.sum(values * np.diff(edges)) == pytest.approx(1.0)
     assert line_data(ax, "--")[0][:, 0].tolist() == [1.0, 1.0]
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("x", "probability density")
     assert ax.get_ylim()[0] == 0
 
 
@@ -41,8 +40,6 @@ def test_a_logarithmic_density_is_one_in_dex(ax):
     values, edges, _ = ax.patches[0].get_data()
     assert_allclose(values, [0.5, 0.25])
     assert_array_equal(edges, [1.0, 10.0, 1000.0])
-    assert ax.get_xscale() == "log"
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("age (Gyr)", "probability density per dex")
 
 
 def test_cells_without_width_have_no_density(ax):
@@ -65,7 +62,6 @@ def test_outline_holds_the_stated_part(ax):
     # cells of unit area
     assert_array_equal(ax.collections[0].get_array(), weights.T)
     assert_array_equal(line_data(ax, "x"), [[[2.5, 1.5]]])
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("a", "b")
 
 
 def test_axes_end_two_cells_beyond_what_has_weight(ax):
@@ -91,7 +87,6 @@ def test_photometry_with_and_without_residuals(ax, pair):
     model = np.array([1.1, 0.5, 3.0]) * u.nJy * 1e3
     top, bottom = plot_sed_fit(WAVE, flux, err, model, ax=pair, title="x")
     assert (top, bottom) == pair
-    assert (top.get_xscale(), top.get_yscale()) == ("log", "log")
     xy, low, high = error_bars(top)[0]
     assert_allclose(xy, [[1.0, 1.0]])
     assert_allclose((low, high), ([0.9], [1.1]))
@@ -101,11 +96,7 @@ def test_photometry_with_and_without_residuals(ax, pair):
     pulls = line_data(bottom, "o")[0]
     assert_allclose(pulls, [[1.0, -1.0], [4.0, -1.0], [15.0, np.nan]])
     assert top.get_title() == "x"
-    assert top.get_ylabel() == "flux density (µJy)"
-    assert bottom.get_ylabel() == "residual (sigma)"
-    assert bottom.get_xlabel() == "observed wavelength (µm)"
     assert plot_sed_fit(WAVE, flux, err, model, ax=ax) is ax
-    assert ax.get_xlabel() == "observed wavelength (µm)"
     assert ax.get_legend() is None
 
 
@@ -165,10 +156,6 @@ def test_percentiles_are_bands_about_a_line(ax, rest):
         for x, s, y in zip(WAVE.value, scale, (1.0, 2.0, 4.0), strict=True):
             at = corners[corners[:, 0] == x, 1]
             assert (at.min(), at.max()) == pytest.approx((low * s * y, high * s * y))
-    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
-    x_label = "rest wavelength (µm)" if rest else "observed wavelength (µm)"
-    y_label = r"$\nu L_\nu$ (W)" if rest else "flux density (µJy)"
-    assert (ax.get_xlabel(), ax.get_ylabel()) == (x_label, y_label)
     assert ax.lines[0].get_label() == "median"
 
 
@@ -191,8 +178,6 @@ def test_recovered_values_stand_over_the_true_ones(ax, log):
     assert_allclose((low, high), ([1.0, 3.5], [1.2, 4.1]))
     (equality,) = line_data(ax, "-")
     assert_array_equal(equality, [[1.0, 1.0], [4.0, 4.0]])
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("true age (Gyr)", "recovered age (Gyr)")
-    assert (ax.get_xscale(), ax.get_yscale()) == 2 * ("log" if log else "linear",)
 
 
 def test_pulls_are_a_density_beside_the_gaussian(ax):
@@ -208,8 +193,6 @@ def test_pulls_are_a_density_beside_the_gaussian(ax):
         assert round(n / 5 / 0.5, 9) in heights, place
     assert ax.get_xlim() == (-5.0, 5.0)
     assert ax.patches[0].get_label() == "F770W"
-    labels = "(measured - predicted) / error", "probability density"
-    assert (ax.get_xlabel(), ax.get_ylabel()) == labels
 
 
 def test_no_pulls_leave_the_gaussian(ax):

@@ -1,5 +1,7 @@
 """Drawn slopes against those that are fitted to the ramps of the same exposures."""
 
+import dataclasses
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -111,6 +113,21 @@ def test_hits_that_are_not_cut_stay_where_they_are():
     usual = np.abs(one) < 100
     assert np.nanstd((other - one)[usual]) == pytest.approx(np.sqrt(2), rel=0.03)
     assert np.nanmean((other - one)[usual]) == pytest.approx(0, abs=0.03)
+
+
+def test_one_hit_costs_one_difference_of_its_pixel():
+    """Two in one integration, neither of which fills the well, cost one and what follows the second."""
+    exposure = exposure_of("miri.f770w", n_groups=30, subarray="SUB64")
+    detector, image = Detector.miri_imager().without(CosmicRays), sky_of(exposure, 5.0)
+    charge = detector.collect(image, exposure, seed=1)
+    full = charge.limit(65535.0 - miri_detector().bias)
+    places = np.array([[10, 5, 20], [30, 20, 20], [40, 50, 50]])
+    electrons = np.array([2e4, 0.7 * full, 0.7 * full])
+    reducer = Reducer(ramps=RampSettings(neighbor_threshold=None))
+    for n, used in ((1, (28, 29)), (3, (28, 18))):
+        hits = {"hits": places[:, :n], "hit_electrons": electrons[:n]}
+        fit = reducer.fit_groups(dataclasses.replace(charge, **hits))
+        assert (fit.n_used[30, 40], fit.n_used[20, 50]) == used
 
 
 def test_hits_below_the_threshold_make_the_same_tails():

@@ -5,13 +5,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from astropy.io import fits
-from astropy.nddata import CCDData
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
 from miricigale.detector import Detector, Ramp
 from miricigale.instrument import DQ, Exposure
-from miricigale.reduction import Reducer, open_exposure, read_images
+from miricigale.reduction import Reducer, read_images
 from miricigale.scene import Scene
 from miricigale.utils.exceptions import DataError
 
@@ -51,23 +50,6 @@ def test_what_is_no_file_is_said(folder):
     refuses("'ramps' must be files, such as .* got a folder", Reducer().run, folder)
 
 
-def test_images_of_ccddata_come_back(ramps, folder, tmp_path):
-    path = tmp_path / "rate.fits"
-    rate = Reducer().fit_ramp(folder / "d0_uncal.fits")
-    rate.write(path)
-    back = open_exposure(path)
-    assert equal(back, rate)
-    assert np.array_equal(back.uncertainty.array, rate.uncertainty.array, equal_nan=True)
-    assert_array_equal(back.flags, rate.flags)
-    assert_array_equal(back.mask, rate.mask)
-    assert (back.unit, back.meta) == (rate.unit, rate.meta)
-    calibrated = Reducer().calibrate(path)
-    assert equal(calibrated, Reducer().calibrate(rate))
-    # and astropy reads it as it reads its own
-    assert_array_equal(CCDData.read(path).mask, rate.mask)
-    assert equal(Reducer().mosaic(calibrated), Reducer().mosaic([calibrated]))
-
-
 def test_a_result_is_written_and_drawn(ramps, tmp_path):
     result = Reducer().run(ramps)
     path = result.write(tmp_path / "mosaic.fits")
@@ -89,12 +71,6 @@ def test_a_result_is_written_and_drawn(ramps, tmp_path):
 def test_a_method_stands_for_its_settings():
     assert Reducer(background="dithers").background.method == "dithers"
     refuses("'method' must be 'masked' or 'sep' or 'dithers'", Reducer, background="mesh")
-
-
-def test_a_detector_of_defaults():
-    plain, imager = (map(type, one.effects) for one in (Detector(), Detector.miri_imager()))
-    assert list(plain) == list(imager)
-    assert Detector().gain == Detector().properties.gain
 
 
 def test_integrations_and_pixels_of_a_ramp(ramps):

@@ -108,14 +108,15 @@ def test_variances_are_those_of_many_draws():
 
 def test_parts_of_the_variance_go_through_as_those_of_the_pipeline():
     """As its resampling has it: of pixels that lie upon each other, sum(w^2 v) / sum(w)^2."""
-    wcs, variance, share = small_wcs(), np.array([0.25, 1.0, 4.0]), np.array([0.1, 0.5, 0.8])
+    wcs, variance, share = small_wcs(), np.array([0.5, 2.0, 8.0]), np.array([0.1, 0.5, 0.8])
     images = [make(np.full((150, 160), 3.0), wcs, error=np.sqrt(v)) for v in variance]
     parts = {"VAR_POISSON": share * variance, "VAR_RNOISE": (1 - share) * variance}
     planes = [{k: np.full((150, 160), v[i]) for k, v in parts.items()} for i in range(3)]
     # what one alone has is left out
     planes[0]["VAR_FLAT"] = np.ones((150, 160))
-    found = drizzle_images(images, wcs, variances=planes).variances
-    weight = 1 / variance
+    mosaic, weight = drizzle_images(images, wcs, variances=planes), 1 / variance
+    found = mosaic.variances
+    assert_allclose(mosaic.weight[5:-5, 5:-5], weight.sum(), rtol=1e-4)
     assert set(found) == set(parts)
     for name, part in parts.items():
         wanted = np.sum(weight**2 * part) / np.sum(weight) ** 2

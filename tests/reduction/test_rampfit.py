@@ -122,12 +122,14 @@ def test_what_saturates_at_once_is_masked_with_the_reason():
     data[:, :, 0, 1] = 65535
     data[0, :, 0, 2] = 65535
     data[:, 2:, 0, 3] = 65535
+    # the limit itself is saturated, as in the pipeline
+    data[0, 5:, 0, 4] = 63000
     fit = fitted(data, **OPTIONS, saturation=63000.0)
     gone = DQ.SATURATED | DQ.NO_SLOPE | DQ.DO_NOT_USE
     assert fit.flags[0, 0] == fit.flags[0, 1] == gone
     assert np.all(np.isnan(fit.rate[0, :2]))
     # one integration, or one difference in each, is enough
-    assert fit.flags[0, 2] == fit.flags[0, 3] == DQ.SATURATED
+    assert fit.flags[0, 2] == fit.flags[0, 3] == fit.flags[0, 4] == DQ.SATURATED
     assert fit.n_used[0, 2] == 5
     assert fit.n_used[0, 3] == 2
     assert np.all(np.abs(fit.rate[0, 2:4] - 10) < 5 * fit.error[0, 2:4])

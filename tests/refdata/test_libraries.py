@@ -91,12 +91,6 @@ def test_other_programs_read_it(tmp_path):
         assert hdus["ROWS"].columns.names == ["tau", "q", "mass"]
 
 
-def test_the_same_library_gives_the_same_bytes(tmp_path):
-    for name in ("a", "b"):
-        write_library(make(), tmp_path / name)
-    assert file_sha256(tmp_path / "a") == file_sha256(tmp_path / "b")
-
-
 def test_a_large_library_stays_on_disk(tmp_path):
     n, wave = 15000, np.geomspace(1e-3, 1e3, 500)
     spectra = np.ones((n, wave.size), dtype=np.float32)

@@ -42,5 +42,6 @@ def test_low_zodi_is_five_percent_per_arcmin():
 
 def test_refuses(wcs):
     refuses("'level' must be finite and not negative", Background, -1 * u.MJy / u.sr)
+    assert not np.any(Background(0 * u.MJy / u.sr).image(wcs, (90, 100)))
     with pytest.raises(ValueError, match="makes it negative within the image"):
         Background(LEVEL, gradient=20 / u.arcmin).image(wcs, (90, 100))

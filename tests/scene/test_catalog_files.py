@@ -59,29 +59,6 @@ def test_any_format_with_names_and_units_of_its_own(plain, tmp_path, suffix):
     assert catalog["flags"].tolist() == [0, CatalogFlags.MISSING_CODE]
 
 
-def test_a_catalog_of_cigale(tmp_path):
-    path = tmp_path / "cigale.txt"
-    path.write_text(
-        "# id redshift ra dec IRAC1 IRAC1_err MIPS1 star\n"
-        "1 0.5 53.1 -27.8 5e-3 1e-3 -9999. 0\n"
-        "2 1.5 53.2 -27.8 -9999. -9999. -9999. 1\n"
-    )
-    columns = {"irac.ch1": "IRAC1", "irac.ch1_err": "IRAC1_err", "mips.24": "MIPS1"}
-    with pytest.warns(MiricigaleWarning) as caught:
-        catalog = read_catalog(path, columns=columns, units={"flux": "mJy"})
-    texts = [str(one.message) for one in caught]
-    missing = "irac.ch1 1 of 2 (-9999); mips.24 2 of 2 (-9999)"
-    assert sorted(texts) == [
-        "cigale.txt: 1 of 2 sources have no usable flux in any band (flag no_flux): ids 2",
-        "cigale.txt: 2 of 2 sources are points (no column 'half_light_radius')",
-        f"cigale.txt: taken as missing, by the number that stands there: {missing}",
-    ]
-    assert catalog["irac.ch1"][0].to_value(u.uJy) == pytest.approx(5)
-    coded = CatalogFlags.MISSING_CODE
-    assert catalog["flags"].tolist() == [coded, coded | CatalogFlags.NO_FLUX]
-    assert catalog["star"].tolist() == [False, True]
-
-
 def test_wrong_names_are_refused_with_the_right_ones(plain, tmp_path):
     path = write(plain, tmp_path / "c.csv")
     match = r"no filter 'wfc3\.f161w'; the nearest of 73 are wfc3\.f160w"

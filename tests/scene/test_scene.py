@@ -205,14 +205,3 @@ def test_psfs_that_fit(wcs):
     make_scene(catalog, scenes.tan_wcs(pa=40.0), TURNED)
     for name in (FILTER, "F770W"):
         make_scene(catalog, wcs, scenes.gaussian_psf(filter=name))
-
-
-def test_plot_draws_on_the_axes_given(wcs, psf):
-    from matplotlib.figure import Figure
-
-    catalog = scenes.make_catalog(wcs, [50, 70], [45, 20])
-    scene = make_scene(catalog, wcs, psf, background=1 * u.MJy / u.sr)
-    ax = Figure().subplots()
-    assert scene.plot(ax, sources=True) is ax
-    assert len(ax.images) == 1
-    assert len(ax.lines[0].get_xdata()) == 2

@@ -381,21 +381,14 @@ def test_archives_and_folders_of_archives_are_the_same(folder, tmp_path, kind):
         assert_array_equal(library.axes["q"], wanted.axes["q"])
 
 
-@pytest.mark.parametrize("kind", ["zip", "tar", "gztar"])
-def test_archives_that_unpack_beyond_the_bound_are_refused(tmp_path, kind):
+def test_archives_that_unpack_beyond_the_bound_are_refused(tmp_path):
+    """A member that is all holes: nothing is stored of its 80 GB."""
     name = "t7_p0.5_q0_oa40_R20_Mcl0.97_i40_sed.dat"
-    (tmp_path / "zeros").mkdir()
-    (tmp_path / "zeros" / name).write_bytes(bytes(1_100_000))
-    if kind != "tar":
-        archive = shutil.make_archive(tmp_path / "skirtor", kind, tmp_path / "zeros")
-    else:
-        # a member that is all holes: nothing is stored of its 80 GB
-        archive, info = tmp_path / "skirtor.tar", tarfile.TarInfo(name)
-        sparse = {"GNU.sparse.major": "0", "GNU.sparse.minor": "1", "GNU.sparse.name": name}
-        sparse |= {"GNU.sparse.size": "80000000000", "GNU.sparse.map": "0,0"}
-        info.pax_headers = sparse
-        with tarfile.open(archive, "w", format=tarfile.PAX_FORMAT) as out:
-            out.addfile(info)
+    archive, info = tmp_path / "skirtor.tar", tarfile.TarInfo(name)
+    sparse = {"GNU.sparse.major": "0", "GNU.sparse.minor": "1", "GNU.sparse.name": name}
+    info.pax_headers = sparse | {"GNU.sparse.size": "80000000000", "GNU.sparse.map": "0,0"}
+    with tarfile.open(archive, "w", format=tarfile.PAX_FORMAT) as out:
+        out.addfile(info)
     with conf.set_temp("unpacked_size", 1):
         refuses("would unpack to", read_skirtor, archive, error=DataError)
 

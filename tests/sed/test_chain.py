@@ -91,16 +91,6 @@ def test_tables_and_single_models_agree_in_every_number(full):
             assert_quantity_allclose(got[name][i], value, rtol=1e-9, atol=1e-12 * value.unit)
 
 
-def test_order_and_company_of_rows_do_not_matter(full):
-    table = QTable({"redshift": [2.0, 0.3, 1.0, np.nan, 0.3], "age": [1.0, 3.0, 0.1, 1.0, 90.0]})
-    whole = full.fluxes(table, BANDS)
-    assert [ModelFlags.names(f) for f in whole["flags"][3:]] == [["not_finite"], ["out_of_bounds"]]
-    for i in range(3):
-        alone = full.fluxes(table[i : i + 1], BANDS)
-        for name in (*BANDS, "beta", "sfr"):
-            assert_quantity_allclose(alone[name][0], whole[name][i], rtol=1e-12)
-
-
 def test_every_derived_quantity_comes_with_unit_and_description(full):
     got = full.fluxes(QTable({"redshift": [1.0]}), BANDS)
     for name, entry in full.derived_columns().items():

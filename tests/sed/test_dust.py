@@ -169,18 +169,6 @@ def test_without_the_stellar_file_bundled_populations_are_subtracted(dale_folder
     assert np.ptp(ratio) / ratio.mean() < 1e-3
 
 
-def test_source_trees_and_archives_are_read_alike(dale_folder, tmp_path):
-    wanted = read_dale2014(dale_folder)
-    tree = tmp_path / "cigale/database_builder/dale2014"
-    shutil.copytree(dale_folder, tree)
-    for kind in ("zip", "gztar"):
-        shutil.make_archive(tmp_path / "cigale", kind, tmp_path, "cigale")
-    for source in ("cigale", "cigale.zip", "cigale.tar.gz"):
-        got = read_dale2014(tmp_path / source)
-        assert got.meta["files"] == wanted.meta["files"]
-        assert_array_equal(got.spectra["removed"], wanted.spectra["removed"])
-
-
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [

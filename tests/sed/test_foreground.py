@@ -77,15 +77,6 @@ def test_nothing_is_extrapolated(law):
 # ------------------------------------------------------------------------------- component
 
 
-def test_transmission_in_magnitudes():
-    part = GalacticExtinction(law="CCM89")
-    wave = np.array([1.0 / 1.43, 1.0 / 0.80])
-    got = part.transmission(wave, values_of(part, ebv_galactic=0.2))
-    want = 0.2 * 3.1 * np.array([0.751, 0.282])
-    assert_allclose(-2.5 * np.log10(got), want, rtol=5e-3)
-    assert np.all(part.transmission(wave, values_of(part)) == 1.0)
-
-
 def test_default_law_covers_the_bands_of_the_paper():
     GalacticExtinction().check_bands(FilterSet(PAPER))
 

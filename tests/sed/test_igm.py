@@ -295,6 +295,8 @@ def test_table_two_by_curve_of_growth(n):
         (0.11, 0.5, 1.690e-2 * (0.165 / 0.121567) ** 1.2 + 1.617e-4 * (0.165 / 0.121567) ** 2),
         (0.11, 2.0, 2.354e-3 * (0.33 / 0.121567) ** 3.7 + 1.617e-4 * (0.33 / 0.121567) ** 2),
         (0.11, 3.0, 2.354e-3 * (0.44 / 0.121567) ** 3.7 + 5.390e-5 * (0.44 / 0.121567) ** 3),
+        # a little beyond the step of damped systems at 3
+        (0.115, 2.2, 2.354e-3 * (0.368 / 0.121567) ** 3.7 + 5.390e-5 * (0.368 / 0.121567) ** 3),
         (0.11, 6.0, 1.026e-4 * (0.77 / 0.121567) ** 5.5 + 5.390e-5 * (0.77 / 0.121567) ** 3),
     ],
 )
@@ -361,6 +363,15 @@ def test_inoue_continuum_by_direct_integration(rest, z):
     assert got == pytest.approx(continuum_depth(wave, z, exact=False), rel=0.01, abs=2e-3)
     # and near those without the approximations they name
     assert got == pytest.approx(continuum_depth(wave, z, exact=True), rel=0.05, abs=5e-3)
+
+
+def test_inoue_continuum_by_hand_a_little_beyond_the_step_of_the_forest():
+    """Equations 27 and 29, at 5.75 times the limit, from redshift 7."""
+    x, y = 5.75, 8.0
+    want = 5.22e-4 * (y**3.4 * x**2.1 - x**5.5)
+    want += 0.04696 * y**3 - 0.01779 * y**3.3 * x**-0.3 - 0.02916 * x**3
+    got = depth(Inoue2014(), 0.09118 * x, 7.0)[0] - series_depth(0.09118 * x, 7.0)
+    assert got == pytest.approx(want, rel=1e-9)
 
 
 @pytest.mark.parametrize(("wave", "z"), [(0.085, 0.5), (0.06, 0.5), (0.085, 1.5), (0.07, 3.5)])

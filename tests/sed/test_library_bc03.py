@@ -150,14 +150,6 @@ def test_a_file_cut_anywhere_is_refused(write, form):
         refuses(match, read_ised, path, error=DataError)
 
 
-def test_a_compressed_file_cut_anywhere_is_refused(write):
-    path = write(zipped=True)
-    data = path.read_bytes()
-    for cut in (10, len(data) // 2, len(data) - 1):
-        path.write_bytes(data[:cut])
-        refuses(r"\.ised\.gz cannot be read", read_ised, path, error=DataError)
-
-
 @pytest.mark.parametrize("data", [b"nothing of the kind\n" * 100, bytes(5000), b"12 of them\n"])
 def test_foreign_files_are_refused(tmp_path, data):
     path = tmp_path / "foreign.ised"

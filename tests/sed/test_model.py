@@ -1,6 +1,3 @@
-import copy
-import pickle
-
 import astropy.units as u
 import numpy as np
 import pytest
@@ -98,17 +95,6 @@ def test_flux_scales_with_mass_and_inverse_square_of_distance(filters):
     away = far.evaluate(redshift=1.0, age=1.0, mass=1e10)
     assert_quantity_allclose(two.fnu, 2 * one.fnu)
     assert_quantity_allclose(away.fnu * 4, one.fnu)
-
-
-@pytest.mark.parametrize("fraction", [0.1, 0.6, 0.99])
-@pytest.mark.parametrize(
-    ("definition", "name"), [("dust", "frac_agn_dust"), ("3-1000um", "frac_agn_ir")]
-)
-def test_agn_fraction_means_what_its_definition_says(fraction, definition, name):
-    """The same from the spectra: `test_a_fraction_of_the_light_in_any_range`."""
-    model = SEDModel.yang2021(frac_agn_definition=definition)
-    got = model.derived(frac_agn=fraction, age=3.0, redshift=0.5)
-    assert got[name].value == pytest.approx(fraction, rel=1e-10)
 
 
 def test_six_micron_luminosity_from_the_spectrum(model):
@@ -209,19 +195,6 @@ def test_from_dict():
 )
 def test_from_dict_says_what_is_wrong(config, match):
     refuses(match, SEDModel.from_dict, config, error=ConfigError)
-
-
-@pytest.mark.parametrize(
-    "make", [copy.copy, copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))]
-)
-def test_models_and_spectra_survive_copying_and_pickling(model, make):
-    sed = model.evaluate(age=1.0)
-    assert_quantity_allclose(make(model).evaluate(age=1.0).fnu, sed.fnu)
-    again = make(sed)
-    assert again.redshift == sed.redshift
-    assert again.meta.keys() == sed.meta.keys()
-    assert_quantity_allclose(again.fnu, sed.fnu)
-    assert not again.fnu.flags.writeable
 
 
 # --------------------------------------------------------------------- many models

@@ -110,14 +110,6 @@ def test_an_exponential_without_time_is_refused():
 # -------------------------------------------------------------------------- tables
 
 
-def test_rows_of_1_myr_are_the_steps():
-    rate = np.random.default_rng(3).uniform(0, 5, 300)
-    part = TableSFH(table_of(np.arange(300), rate))
-    values = values_of(part)
-    assert values["age"] == pytest.approx(0.3)
-    assert_allclose(part.history(values), 1e-6 * rate / rate.sum(), rtol=1e-12)
-
-
 def test_uneven_bins_keep_their_mass_in_every_step(uneven):
     edges = np.array([0, 0.3, 7.5, 20, 21, 400, 779])
     rates = np.array([2, 0, 5, 1, 0.5, 3.0])

@@ -60,14 +60,6 @@ def test_sed_refuses(wave, fnu, error, match):
     refuses(match, SED, wave, fnu, error=error)
 
 
-def test_plot_returns_the_axes_it_was_given(flat):
-    from matplotlib.figure import Figure
-
-    ax = Figure().subplots()
-    assert flat.plot(ax=ax) is ax
-    assert ax.get_xscale() == "log"
-
-
 def test_a_spectrum_of_a_model_has_its_parts_and_can_be_kept(tmp_path):
     sed = SEDModel.yang2021(libraries="bundled").evaluate(redshift=1.5, mass=5e10, frac_agn=0.3)
     names = ["stellar", "dust", "agn_disk", "agn_torus", "agn_polar"]

@@ -46,13 +46,6 @@ def test_masses_are_parted_at_the_separation_age(stars):
         assert young.sum() + old.sum() == pytest.approx(1.0, rel=1e-12)
 
 
-def test_mean_age_of_the_mass_is_that_of_the_history(stars):
-    history = ConstantSFH().history({"age": 2.0})
-    weights = sum(stars.age_weights(history, values_of(stars)))
-    # steps count at k + 0.55 Myr on average: 0.05 Myr more than the middle
-    assert weights @ stars.table(0.02)[0] == pytest.approx(1000.05, rel=1e-9)
-
-
 def test_a_history_longer_than_the_universe_is_refused(stars):
     match = "'history' must be of at most 14000 steps, got 14001"
     refuses(match, stars.age_weights, np.ones(14001), values_of(stars))

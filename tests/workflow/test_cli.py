@@ -127,7 +127,7 @@ def test_help_names_presets_and_surveys(capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["run", "cosmos"], "miricigale: no preset 'cosmos'; known: goodss"),
+        (["run", "cosmos"], "miricigale: no preset 'cosmos'; known: cosmosweb, goodss"),
         (["run", "absent.toml"], "miricigale: no configuration file absent.toml"),
         (["fit", "absent.ecsv"], "miricigale: absent.ecsv cannot be read as a catalog: no such"),
         (["data", "add", "nothing", "x"], "miricigale: no library 'nothing'; known:"),

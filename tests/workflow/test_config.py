@@ -32,7 +32,7 @@ def test_a_printed_configuration_comes_back_the_same(tmp_path, config):
 
 
 def test_presets_are_listed_without_their_variants():
-    assert preset_names() == ["goodss", "yang2021"]
+    assert preset_names() == ["cosmosweb", "goodss", "yang2021"]
 
 
 @pytest.mark.parametrize(
@@ -92,7 +92,7 @@ def test_missing_files_and_presets_are_named(tmp_path):
     absent, binary = tmp_path / "absent.toml", tmp_path / "binary.toml"
     binary.write_bytes(b"\xff\xfe")
     refuses(r"no configuration file .*absent\.toml", load_config, absent, error=ConfigError)
-    refuses("no preset 'cosmos'; known: goodss", load_config, "cosmos", error=KeyError)
+    refuses("no preset 'cosmos'; known: cosmosweb, goodss", load_config, "cosmos", error=KeyError)
     text = "--quick belongs to presets"
     refuses(text, load_config, absent, error=ConfigError, quick=True)
     refuses(r"binary\.toml is not a text file in UTF-8", load_config, binary, error=ConfigError)

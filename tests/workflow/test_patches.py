@@ -136,6 +136,32 @@ def test_patches_have_the_sources_and_fluxes_of_the_whole(mosaics, tmp_path, giv
     assert len(set(found["patch"])) >= 9
 
 
+@pytest.mark.filterwarnings("ignore:.*noise on the sky is", "ignore:.*segments that reach beyond")
+def test_a_segment_larger_than_the_overlap_is_there_once_and_flagged(mosaics, tmp_path):
+    """Three points and what is between them, as one galaxy that no patch of a small overlap sees whole."""
+    image, prior = mosaics.files("noisy")
+    labels, header = fits.getdata(mosaics.folder / "segments.fits", header=True)
+    x, y = north_up_wcs(CENTER, FINE * u.arcsec, (700, 700)).world_to_pixel(mosaics.sky)
+    left, right = (np.argmin(np.hypot(x - at, y - 350)) for at in (210, 350))
+    rows = np.sort(np.rint([y[left], y[right]]).astype(int)) + [-9, 10]
+    part = labels[slice(*rows), int(x[left]) - 8 : int(x[right]) + 9]
+    lost = np.unique(part[part > 0])
+    part[:] = 999
+    labels[np.isin(labels, lost)] = 0
+    path = tmp_path / "segments.fits"
+    fits.PrimaryHDU(labels, header).writeto(path)
+    more = {"kernel": [mosaics.folder / "kernel.fits"], "second_pass": False, "segmentation": path}
+    more |= {"template": "cutout", "background_order": None, "pages": False, "patch_size": 250}
+    found = measure_patches(image, prior, tmp_path / "small", overlap=1 * u.arcsec, **more)
+    assert_array_equal(np.sort(found["id"]), np.unique(labels[labels > 0]))
+    cut = found[f"{BAND}_flags"] & int(ForcedFlags.CUT) > 0
+    assert_array_equal(found["id"][cut], [999])
+    whole = measure_patches(image, prior, tmp_path / "large", overlap=10 * u.arcsec, **more)
+    assert not np.any(whole[f"{BAND}_flags"] & int(ForcedFlags.CUT))
+    flux = whole[BAND][whole["id"] == 999]
+    assert found[BAND][cut] < 0.9 * flux
+
+
 SCRIPT = f"""
 import sys, pathlib
 import astropy.units as u
@@ -186,8 +212,9 @@ def test_the_command_refuses_what_is_beyond_the_memory_and_measures_it_in_patche
         small.setattr("miricigale.utils.parallel.available_memory", lambda: 100_000_000)
         assert main(given) == 2
     assert "--patches FOLDER" in capsys.readouterr().err
-    assert main([*given, "--redo"]) == 2
-    assert "left out without --patches" in capsys.readouterr().err
+    for one in (["--redo"], ["--overlap", "5"], ["--patch-size", "300"]):
+        assert main([*given, *one]) == 2
+        assert f"'{one[0]}' must be left out without --patches" in capsys.readouterr().err
     given += ["--patches", str(run), "--threads", "1"]
     assert main([*given, "--page", "a.html"]) == 2
     assert "left out with --patches" in capsys.readouterr().err

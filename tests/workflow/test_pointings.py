@@ -16,13 +16,12 @@ from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.stages.exposures import (
     exposure_plan,
-    grid_of,
-    mosaic_memory,
     pointing_of,
     pointing_time,
     study_exposures,
     study_pointings,
 )
+from miricigale.workflow.stages.grids import grid_of, mosaic_memory
 from miricigale.workflow.stages.sample import mean_coverage
 
 BAND = "miri.f770w"

@@ -235,6 +235,25 @@ def test_pictures_show_the_sky_about_the_source():
     assert len(np.unique(model)) == 2
 
 
+def test_pictures_of_images_without_noise_are_clean():
+    data = np.zeros(SHAPE)
+    data[65, 85] = 5.0
+    image, nothing = (sky_image(SCALE, SHAPE, values) for values in (data, np.zeros(SHAPE)))
+    with np.errstate(all="raise"):
+        pictures = Cutouts(image, {"miri.f770w": [image, image, nothing]})
+        sheet, tops = pictures.sheet(SkyCoord([image.wcs.pixel_to_world(85, 65)]))
+    assert tops == pytest.approx(np.array([[5.0, 5.0]]))
+    prior, (mosaic, _, rest) = (
+        np.asarray(sheet)[:49, :49],
+        np.asarray(sheet)[:, 49:].reshape(3, 49, 49),
+    )
+    for picture, n_dark in ((prior, 1), (mosaic, 1), (rest, 0)):
+        dark = picture == N_GRAY - 1
+        assert np.count_nonzero(dark) == n_dark
+        assert len(np.unique(picture[~dark])) == 1
+        assert picture[~dark].max() < N_GRAY / 2
+
+
 def test_pictures_of_fine_mosaics_are_no_larger():
     image, _ = noise_image(rim=0, scale=0.051, shape=(300, 300))
     pictures = Cutouts(image, {"miri.f770w": [image] * 3})

@@ -17,7 +17,8 @@ from miricigale.workflow import Context
 from miricigale.workflow.derived import changed_config
 from miricigale.workflow.page.study_page import DeclaredPage
 from miricigale.workflow.stages import variants
-from miricigale.workflow.stages.exposures import IMAGES, grid_of, study_exposures
+from miricigale.workflow.stages.exposures import IMAGES, study_exposures
+from miricigale.workflow.stages.grids import grid_of
 from miricigale.workflow.stages.images import (
     background_of,
     expose_and_reduce,

@@ -12,77 +12,115 @@ from miricigale.utils.compilation import njit
 #: Sersic indices that can be fitted.
 INDEX_RANGE = (0.4, 6.0)
 
-#: Table of the transform: even in ln(k R_e) and in ln n.
-_START, _STEP, _NODES = -7.0, 0.05, 320
-_INDEX_STEP = 0.1
+#: Table of the transform: even in the fourth root of k R_e, from 0, and in ln n, from below the range.
+_STEP, _NODES, _INDEX_STEP = 0.0125, 460, 0.1
+_FIRST = np.log(INDEX_RANGE[0]) - 2 * _INDEX_STEP
+
+#: What the compiler may do with sums: nothing here is infinite or no number.
+FAST = {"reassoc", "contract", "nsz"}
+
+#: Ln(k R_e) below which all light is seen as one point.
+_POINT = -9.0
 
 
 @functools.cache
-def _table():
-    """Spline in ln n of the Hankel transforms, by ln(k R_e), of Sersic profiles of unit light and radius."""
-    low, high = np.log(INDEX_RANGE)
-    log_n = np.arange(low - 2 * _INDEX_STEP, high + 2.5 * _INDEX_STEP, _INDEX_STEP)
-    step = _STEP / 2
+def profile_table():
+    """
+    Transforms of Sersic profiles of unit light and radius, for the kernels.
+
+    Returns
+    -------
+    table : `~numpy.ndarray`, shape (4, m, nodes)
+        Coefficients of a cubic spline in ln n of the Hankel transforms, at nodes that are even in the fourth
+        root of k R_e.
+    """
+    log_n = np.arange(_FIRST, np.log(INDEX_RANGE[1]) + 2.5 * _INDEX_STEP, _INDEX_STEP)
+    step = 0.025
     log_r = (np.arange(2048) - 1023.5) * step
     log_k = log_r  # reciprocal grids, centered on 1
-    rows = np.empty((len(log_n), _NODES))
-    at = _START + _STEP * np.arange(_NODES)
+    rows = np.ones((len(log_n), _NODES))
+    at = 4 * np.log(np.maximum(_STEP * np.arange(_NODES), np.exp(_POINT / 4)))
     for row, n in zip(rows, np.exp(log_n), strict=True):
         bn = scipy.special.gammaincinv(2 * n, 0.5)
         log_light = 2 * n * np.log(bn) - scipy.special.gammaln(2 * n) + 2 * log_r
         light = np.exp(log_light - bn * np.exp(log_r / n)) / n  # d light / d ln R
         transform = scipy.fft.fht(light * np.exp(-log_r), step, 0.0) * np.exp(-log_k)
-        row[:] = scipy.interpolate.CubicSpline(log_k, transform)(at)
-    return scipy.interpolate.CubicSpline(log_n, rows)
+        row[:] = np.where(at > _POINT, scipy.interpolate.CubicSpline(log_k, transform)(at), 1.0)
+    return scipy.interpolate.CubicSpline(log_n, rows).c
 
 
 @njit(cache=True, nogil=True)
-def _interpolated(profile, form):
-    """Value of a profile at the square of k R_e, its derivative to ln(k R_e), and the place in the table."""
-    t = (0.5 * np.log(form) - _START) / _STEP
-    t = min(max(t, 1.0), profile.size - 3.0)
-    m = int(t)
-    t -= m
-    a, b, e, f = profile[m - 1], profile[m], profile[m + 1], profile[m + 2]
-    c1 = 0.5 * (e - a)
-    c2 = a - 2.5 * b + 2.0 * e - 0.5 * f
-    c3 = 0.5 * (f - a) + 1.5 * (b - e)
-    slope = (c1 + t * (2.0 * c2 + 3.0 * t * c3)) / _STEP
-    return b + t * (c1 + t * (c2 + t * c3)), slope, m, t
+def profile_of(table, log_n, changes):
+    """The transform of one index at the nodes, and its changes with ln n if they are wanted."""
+    place = (log_n - _FIRST) / _INDEX_STEP
+    m = min(max(int(place), 0), table.shape[1] - 1)
+    t = _INDEX_STEP * (place - m)
+    found = np.empty((2, table.shape[2]), np.float32)
+    for i in range(table.shape[2]):
+        a, b, c, d = table[0, m, i], table[1, m, i], table[2, m, i], table[3, m, i]
+        found[0, i] = d + t * (c + t * (b + t * a))
+        if changes:
+            found[1, i] = c + t * (2.0 * b + 3.0 * t * a)
+    return found
 
 
-@njit(cache=True, nogil=True)
-def _fill(kx, ky, shapes, profiles, by_index, out):
-    """Write the transforms of unit models and, where ``out`` has room for them, their derivatives."""
-    for s in range(shapes.shape[0]):
-        g1, g2 = shapes[s, 2], shapes[s, 3]
-        eta = np.sqrt(g1 * g1 + g2 * g2)
-        ch, sh, bend = 1.0 + 0.5 * eta * eta, 1.0 + eta * eta / 6.0, 1.0 / 3.0
-        if eta > 1e-4:
-            ch, sh = np.cosh(eta), np.sinh(eta) / eta
-            bend = (ch - sh) / (eta * eta)
-        size = np.exp(2.0 * shapes[s, 0])
-        profile, of_index = profiles[s], by_index[s]
-        for i in range(kx.size):
-            x2, y2 = kx[i] * kx[i], ky[i] * ky[i]
-            k2, d, c = x2 + y2, x2 - y2, 2.0 * kx[i] * ky[i]
+@njit(cache=True, nogil=True, fastmath=FAST)
+def fill_curves(kx, ky, shape, table, out):
+    """
+    Write the transform of a centered Sersic profile of unit light, and its derivatives.
+
+    Parameters
+    ----------
+    kx, ky : float32 `~numpy.ndarray`, shape (m,)
+        Frequencies in radians per pixel.
+    shape : `~numpy.ndarray`, shape (4,)
+        As for `shape_curves`.
+    table : `~numpy.ndarray`
+        `profile_table`.
+    out : float32 `~numpy.ndarray`, shape (1, m) or (5, m)
+        For the profile, or also for its derivatives to the four.
+    """
+    changes = len(out) > 1
+    profile = profile_of(table, shape[1], changes)
+    g1, g2 = np.float32(shape[2]), np.float32(shape[3])
+    eta = np.sqrt(shape[2] ** 2 + shape[3] ** 2)
+    ch, sh, bend = 1.0 + 0.5 * eta * eta, 1.0 + eta * eta / 6.0, 1.0 / 3.0
+    if eta > 1e-4:
+        ch, sh = np.cosh(eta), np.sinh(eta) / eta
+        bend = (ch - sh) / (eta * eta)
+    ch, sh, bend = np.float32(ch), np.float32(sh), np.float32(bend)
+    size = np.float32(np.exp(2.0 * shape[0]))
+    light, last = out[0], np.float32(_NODES - 2.5)
+    # a loop without branches, which the compiler turns into vector instructions
+    for i in range(kx.size):
+        x, y = kx[i], ky[i]
+        form = ch * (x * x + y * y) + sh * (g1 * (x * x - y * y) + g2 * (x * y + x * y))
+        # rounded it may be below zero
+        place = np.sqrt(np.sqrt(np.sqrt(max(form, np.float32(0.0)) * size)))
+        light[i] = min(place * np.float32(1.0 / _STEP), last)
+    for i in range(kx.size):
+        place = light[i]
+        m = max(int(place), 1)
+        t = place - np.float32(m)
+        a, b, e, f = profile[0, m - 1], profile[0, m], profile[0, m + 1], profile[0, m + 2]
+        c1 = np.float32(0.5) * (e - a)
+        c2 = a - np.float32(2.5) * b + np.float32(2.0) * e - np.float32(0.5) * f
+        c3 = np.float32(0.5) * (f - a) + np.float32(1.5) * (b - e)
+        light[i] = b + t * (c1 + t * (c2 + t * c3))
+        if changes:
+            # the derivative to ln(k R_e)
+            slope = 0.25 * place * (c1 + t * (2.0 * c2 + 3.0 * t * c3))
+            x, y = kx[i], ky[i]
+            k2, d, c = x * x + y * y, x * x - y * y, 2.0 * x * y
             turn = g1 * d + g2 * c
-            form = ch * k2 + sh * turn
-            if form * size < 1e-5:
-                out[s, :, i] = 0.0
-                out[s, 0, i] = 1.0
-                continue
-            value, slope, m, t = _interpolated(profile, form * size)
-            out[s, 0, i] = value
-            if out.shape[1] > 1:
-                half, bent = 0.5 * slope / form, sh * k2 + bend * turn
-                out[s, 1, i] = slope
-                out[s, 2, i] = of_index[m] + t * (of_index[m + 1] - of_index[m])
-                out[s, 3, i] = half * (g1 * bent + sh * d)
-                out[s, 4, i] = half * (g2 * bent + sh * c)
+            half, bent = 0.5 * slope / max(ch * k2 + sh * turn, 1e-30), sh * k2 + bend * turn
+            out[1, i] = slope
+            out[2, i] = profile[1, m] + t * (profile[1, m + 1] - profile[1, m])
+            out[3, i] = half * (g1 * bent + sh * d)
+            out[4, i] = half * (g2 * bent + sh * c)
 
 
-def shape_curves(kx, ky, shapes, *, derivatives=False):
+def shape_curves(kx, ky, shapes):
     """
     Transforms of centered Sersic profiles of unit light, without a PSF.
 
@@ -93,14 +131,13 @@ def shape_curves(kx, ky, shapes, *, derivatives=False):
     shapes : `~numpy.ndarray`, shape (n, 4)
         Ln of the circularised half-light radius (pixels), ln of the index, and the ellipticity ln(major /
         minor) (cos 2 theta, sin 2 theta).
-    derivatives : bool, optional
-        Whether the derivatives to these four are wanted.
 
     Returns
     -------
-    curves : `~numpy.ndarray`, shape (n, m), or (n, 5, m) with derivatives
+    curves : `~numpy.ndarray`, shape (n, m)
     """
-    out = np.empty((len(shapes), 5 if derivatives else 1, len(kx)))
-    spline = _table()
-    _fill(kx, ky, shapes, spline(shapes[:, 1]), spline(shapes[:, 1], 1), out)
-    return out if derivatives else out[:, 0]
+    kx, ky, table = kx.astype(np.float32), ky.astype(np.float32), profile_table()
+    out = np.empty((len(shapes), 1, len(kx)), np.float32)
+    for shape, curve in zip(shapes, out, strict=True):
+        fill_curves(kx, ky, shape, table, curve)
+    return out[:, 0]

@@ -151,7 +151,7 @@ def _list(rate, hits, electrons):
 @njit(cache=True, nogil=True, error_model="numpy")
 def _find(rate, variance, mean, entries, n, groups, noise, truth, jump, rng):
     """
-    Jumps that the fit finds, (n_jump, 5) as from `fit_rows`, and which entries are cut by it.
+    Jumps that the fit finds, (n_jump, 5) as from `fit_pixels`, and which entries are cut by it.
 
     The statistic of a jump is its expected value plus a standard normal number, which is
     independent of the slope: the fit is the best linear one.
@@ -251,7 +251,7 @@ def hit_slopes(mean, hits, electrons, groups, noise, truth, thresholds, rng, out
     ``flags``.
 
     The fit to fewer groups is that to all of them plus independent noise of the difference of the
-    variances. Returns the jumps that are found, as `fit_rows`.
+    variances. Returns the jumps that are found, as `fit_pixels`.
     """
     n_int, n_group, g0, g1 = groups
     step, s, inv_gain = noise

@@ -1,5 +1,5 @@
 """
-Pixels with jumps, saturated groups or differences cut from outside, many at once.
+Pixels that are fitted many at once.
 
 Each of `LANES` lanes holds the differences of one pixel; ``keep`` is 0 where a difference is cut,
 also behind the last of each integration, so that sums which run through all of them begin
@@ -147,7 +147,7 @@ def settle(lanes, n_int, scale, threshold, events, n_event, free, out):
     Cut the most significant jump of each fitted lane, or store what has none and free its lane.
 
     ``free`` gets the lanes that hold no pixel; returns their number, the list of jumps (see
-    `fit_rows`; grown where it is full), and the number of those.
+    `fit_pixels`; grown where it is full), and the number of those.
     """
     keep, values, pixels = lanes[1], lanes[5], lanes[6]
     each = keep.shape[0] // n_int
@@ -189,14 +189,33 @@ def settle(lanes, n_int, scale, threshold, events, n_event, free, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def refit(ramp, group_dq, ys, xs, start, cuts, fit, out):
+def fit_pixels(ramp, group_dq, ys, xs, start, cuts, fit, out):
     """
-    Fit the pixels ``ys``, ``xs`` again with differences that are cut from outside.
+    Fit the ramps of the pixels ``ys``, ``xs``, and find their jumps.
 
-    Pixel i is cut at ``cuts[start[i]:start[i + 1]]``, each the index of a difference: integration
-    times number of differences plus difference; and where the flags of its groups say so. The other
-    parameters are those of `fit_rows`. Jumps that were found before belong to the cuts; new ones are
-    added to their number.
+    ``ramp`` is data, levels and response; ``fit`` the first group and the one behind the last, noise, scale and
+    threshold. The data are DN as read, (n_int, n_group, ny, nx). Maps of pixels are (ny, nx) or, where all
+    are alike, (1, 1), also within larger arrays:
+
+    ``levels``: drift (n_int, n_group, 1 or ny, 1 or 4: the channels that columns belong to in
+    turn), bias (map) and reset anomaly (integrations, groups, ny, nx), which are subtracted. The
+    last integration of the anomaly stands for all further ones, and groups beyond it have none.
+
+    ``response``: coefficients (ascending, each a map) of the polynomial that makes them linear;
+    saturation (map): a group from it (raw DN) and all after it are dropped; dark signal
+    (integrations, groups, ny, nx), subtracted last. Anomaly and dark of no groups are none.
+
+    ``noise``: variance of one read in DN^2, what times the slope is the Poisson variance of a
+    difference, and what slow noise of the read-out adds to it (maps).
+
+    ``scale`` is the inverse group time, and jumps are cut above ``threshold`` sigma. Pixel i is cut at
+    ``cuts[start[i]:start[i + 1]]`` too, each the index of a difference: integration times number of differences
+    plus difference; and where the flags of its groups say so. Its jumps of an earlier fit belong to the cuts; new
+    ones are added to their number. The images ``out``, those of `RampFit` from ``rate`` to ``flags``, are filled
+    in place.
+
+    Returns an array (n_event, 5) in no order: y, x, integration, difference (from the first group) and
+    signed significance of each jump.
     """
     data, levels, response = ramp
     g0, g1, noise, scale, threshold = fit
@@ -210,11 +229,13 @@ def refit(ramp, group_dq, ys, xs, start, cuts, fit, out):
     free = np.arange(LANES)
     n_free = LANES
     events = np.empty((256, 5))
-    i = 0
+    i = n_event = 0
     while i < ys.size or n_free < LANES:
         if i == ys.size or n_free == 0:
             fit_lanes(lanes)
-            n_free, events, _ = settle(lanes, n_int, scale, threshold, events, 0, free, out)
+            n_free, events, n_event = settle(
+                lanes, n_int, scale, threshold, events, n_event, free, out
+            )
             continue
         y = ys[i]
         x = xs[i]
@@ -228,9 +249,9 @@ def refit(ramp, group_dq, ys, xs, start, cuts, fit, out):
             cut[cuts[j]] = True
             flags |= JUMP | JUMP_NEIGHBOR
         n_free -= 1
-        # its own jumps are among the cuts
         fill_lane(
             lanes, free[n_free], d, cut, valid, at(variance, y, x), at(inv_gain, y, x), at(slow, y, x),
             y, x, out[4][y, x], flags,
         )  # fmt: skip
         i += 1
+    return events[:n_event].copy()

@@ -24,17 +24,6 @@ def at(values, y, x):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def polynomial(coef, level, value):
-    """Linearity polynomial of many pixels at once, coefficients ascending (n, n_pixel), into ``value``."""
-    n = value.size
-    for b in range(n):
-        value[b] = coef[coef.shape[0] - 1, b]
-    for j in range(coef.shape[0] - 2, -1, -1):
-        for b in range(n):
-            value[b] = value[b] * level[b] + coef[j, b]
-
-
-@njit(cache=True, error_model="numpy", inline="always")
 def weights(slope, s, inv_gain, slow):
     """Variance v of a difference, l and 1 - l of the weights, and 1 / (s (1/l - l))."""
     v = slope * inv_gain
@@ -67,7 +56,7 @@ def own_charge(jumps, nx, n_diff):
     """
     Significance of jumps without what leaked from the jumps of the four neighbors at the same difference.
 
-    ``jumps`` (n, 5) are those of `fit_rows`, in the order of rows, columns, integrations and differences.
+    ``jumps`` (n, 5) are those of `fit_pixels`, in the order of rows, columns, integrations and differences.
     """
     own = np.abs(jumps[:, 4])
     if own.size == 0:
@@ -107,25 +96,28 @@ def gather(data, levels, response, y, x, g0, g1, d, valid):
     for k in range(n_int):
         valid[k] = n_diff
         before = 0.0
+        reads, shift = data[k, :, y, x], drift[k, :, row, channel]
+        anomaly = reset[min(k, reset.shape[0] - 1), :, y, x]
+        signal = dark[min(k, dark.shape[0] - 1), :, y, x]
         for g in range(g0, g1):
-            raw = float(data[k, g, y, x])
+            raw = float(reads[g])
             if raw >= saturation and valid[k] == n_diff:
                 valid[k] = max(g - g0 - 1, 0)
                 saturated = True
-            level = raw - (drift[k, g, row, channel] + start)
-            if g < reset.shape[1]:
-                level -= reset[min(k, reset.shape[0] - 1), g, y, x]
+            level = raw - (shift[g] + start)
+            if g < anomaly.size:
+                level -= anomaly[g]
             value = coef[-1]
             for j in range(coef.size - 2, -1, -1):
                 value = value * level + coef[j]
-            if dark.shape[1] > 0:
-                value -= dark[min(k, dark.shape[0] - 1), g, y, x]
+            if signal.size > 0:
+                value -= signal[g]
             if g > g0:
                 d[k * n_diff + g - g0 - 1] = value - before
             before = value
         # groups dropped at the start may already be saturated
         for g in range(g0):
-            if float(data[k, g, y, x]) >= saturation:
+            if float(reads[g]) >= saturation:
                 valid[k] = 0
                 saturated = True
     return saturated

@@ -49,6 +49,8 @@ class Stage:
     within : callable, optional
         Called with the configuration; a part that counts as one of the name of each unit in
         what it reads.
+    reads : callable, optional
+        Called with the configuration and the unit; names that count in place of its own in what it reads.
     plan : callable, optional
         Called with the configuration and the unit; plain values that the stage takes from the
         package (the exposures of a named plan, the axes of a named grid) or from a part of the
@@ -73,6 +75,7 @@ class Stage:
     version: int = 1
     units: Callable | None = None
     within: Callable | None = None
+    reads: Callable | None = None
     plan: Callable | None = None
     memory: Callable | None = None
 
@@ -98,11 +101,13 @@ class Stage:
         keys : dict of str to list of str
             By stage: keys of its units in the manifest.
         """
-        own = f"{self.within(config)}/{unit}" if self.within else unit
-        return {
-            name: [f"{name}:{other}" if other else name for other in units[name].related(own)]
-            for name in self.needs
-        }
+        own = [f"{self.within(config)}/{unit}" if self.within else unit]
+        own = self.reads(config, unit) if self.reads else own
+        found = {}
+        for name in self.needs:
+            others = itertools.chain(*map(units[name].related, own))
+            found[name] = [f"{name}:{k}" if k else name for k in dict.fromkeys(others)]
+        return found
 
     def resource_names(self):
         """Names of the reference data that it depends on."""

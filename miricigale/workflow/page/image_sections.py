@@ -7,6 +7,7 @@ from miricigale.pages import number
 from miricigale.workflow.page import pictures, study_figures
 from miricigale.workflow.page.labels import band_label, browse, color_bands, three_bands
 from miricigale.workflow.stages.exposures import study_exposures, study_pointings
+from miricigale.workflow.stages.grids import of_patch
 from miricigale.workflow.stages.images import measured_mosaic, reducer_of
 from miricigale.workflow.stages.sample import CUTS
 
@@ -28,21 +29,22 @@ def write_summary(page, truths, numbers, caveats):
     page.report.bullets(caveats, box=True)
 
 
-def write_images(page, mosaics):
-    """The field in color or gray; an exposure before and after; mosaic, model and residual."""
+def write_images(page, mosaics, patch):
+    """The field, or a patch, in color or gray; an exposure before and after; mosaic, model and residual."""
     config, image, sky = page.config, page.context.image, page.first.name
-    chosen = three_bands(page.bands)
-    page.section("images")
-    colors = color_bands(page.bands)
-    field = [mosaics[name] for name in colors]
-    figure = pictures.field_figure(field, image("f160w.fits"), [*colors, config.highres.filter])
+    bands = tuple(mosaics)
+    chosen, colors = three_bands(bands), color_bands(bands)
+    page.section("images", "patch" if patch else "text", patch=patch)
+    field, sharp = [mosaics[name] for name in colors], image(f"{of_patch('f160w', patch)}.fits")
+    figure = pictures.field_figure(field, sharp, [*colors, config.highres.filter])
     kind = {3: "color", 6: "colors"}.get(len(colors), "gray")
     page.figure(kind, figure, bands=", ".join(map(band_label, colors)))
     unit = next(n for n, e in study_exposures(config).items() if e.filter == chosen[-1])
     rate, cal = (image(f"{sky}/exposures/{unit}_{kind}.fits") for kind in ("rate", "cal"))
     page.figure("subtraction", pictures.subtraction_figure(rate, cal, reducer_of(config)))
     suffix, _ = measured_mosaic(config)
-    paths = f"{sky}/mosaic_{{}}{suffix}.fits", f"{sky}/photometry/{{}}_model.fits"
+    paths = of_patch(f"{sky}/mosaic_{{}}{suffix}", patch), of_patch(f"{sky}/photometry/{{}}", patch)
+    paths = f"{paths[0]}.fits", f"{paths[1]}_model.fits"
     pairs = [tuple(image(path.format(name)) for path in paths) for name in chosen]
     page.figure("residual", pictures.residual_figure(pairs, chosen))
     middle = len(chosen) // 2

@@ -15,7 +15,6 @@ from miricigale.instrument import (
     Exposure,
     ceers_exposures,
     dither_patterns,
-    mosaic_wcs,
     read_centers,
     read_dithers,
     tangent_offset,
@@ -33,7 +32,7 @@ log = logging.getLogger(__name__)
 #: Sections of the configuration on which the grids of images depend, what is exposed, and kernels.
 GRID = ("pointing", "exposures")
 IMAGES = (*GRID, "scene", "detector", "reduction")
-KERNEL = (*GRID, "highres", "photometry.regularization", "reduction")
+KERNEL = (*GRID, "patches", "highres", "photometry.regularization", "reduction")
 
 #: Reference data of the simulated images.
 IMAGE_RESOURCES = (
@@ -53,9 +52,14 @@ def study_exposures(config):
 
     Dithers are counted through all pointings, so that each exposure has random numbers of its own.
     """
+    return all_exposures(*exposure_sections(config))
+
+
+def exposure_sections(config):
+    """What exposures follow from, as a key of caches: sections, dithers, state of the file of pointings."""
     options = config.exposures
     patterns = tuple(_dithers(options, k)[0] for k in range(len(options.filters)))
-    return dict(_exposures(config.pointing, options, patterns, _stamp(config.pointing)))
+    return config.pointing, options, patterns, _stamp(config.pointing)
 
 
 def dithers_text(config):
@@ -182,8 +186,8 @@ def _read_pointings(table, roll, filters):
 
 
 @functools.lru_cache(maxsize=8)
-def _exposures(field, options, patterns, stamp):
-    """Names and exposures of two sections of a configuration, and of the dithers of each filter."""
+def all_exposures(field, options, patterns, stamp):
+    """Exposures by name of what `exposure_sections` gives; not to be changed."""
     units = {}
     for k, name in enumerate(options.filters):
         keys = ("n_groups", "n_integrations")
@@ -205,7 +209,7 @@ def _exposures(field, options, patterns, stamp):
             for dither in exposure.dithered(offsets, n):
                 units[f"{name}-{number}"] = dither.replace(dither=number)
                 number += 1
-    return tuple(units.items())
+    return units
 
 
 def _planned(name, own, n_dithers, pointing, roll, options):
@@ -243,24 +247,26 @@ def exposure_units(config):
     return tuple(f"{t}/{name}" for t in truth_names(config) for name in study_exposures(config))
 
 
-def truth_bands(config):
-    """Names of the bands of all truths, ``<truth>/<filter>``."""
-    return tuple(f"{truth}/{name}" for truth in truth_names(config) for name in band_names(config))
-
-
 def exposures_of(config, unit=""):
     """Exposures by name of a unit that ends with the name of an exposure or of a band; all without one."""
     name = unit.rpartition("/")[2]
     every = study_exposures(config)
-    return {own: e for own, e in every.items() if not name or name in (own, e.filter)}
+    if name in every:
+        return {name: every[name]}
+    return {own: e for own, e in every.items() if name in ("", e.filter)}
 
 
 def exposure_plan(config, unit=""):
     """Plain values of the exposures of a unit, a filter, or the whole study, for hashing."""
+    return plain_exposures(exposures_of(config, unit))
+
+
+def plain_exposures(exposures):
+    """Plain values of exposures by name."""
     counts = operator.attrgetter("readout", "n_groups", "n_integrations", "subarray")
     return {
         name: [*counts(e), e.pointing.ra.deg, e.pointing.dec.deg, e.roll.value]
-        for name, e in exposures_of(config, unit).items()
+        for name, e in exposures.items()
     }
 
 
@@ -280,11 +286,6 @@ def pointing_time(config, name):
     return sum(exposure.exposure_time for exposure in pointing_exposures(config, name))
 
 
-def grid_of(config, pixel_scale):
-    """North-up WCS that covers every exposure of the study."""
-    return mosaic_wcs(list(study_exposures(config).values()), pixel_scale * u.arcsec)
-
-
 def exposure_memory(config, unit):
     """
     About how many bytes a process takes for an exposure, of a unit or the largest of a filter.
@@ -296,15 +297,3 @@ def exposure_memory(config, unit):
     chosen = exposures_of(config, unit).values()
     groups = max(math.prod(e.shape) * e.n_groups * e.n_integrations for e in chosen)
     return 500_000_000 + int(3.3 * groups)
-
-
-def mosaic_memory(config, unit):
-    """
-    About how many bytes a process takes for a mosaic of a band, the prior, or what is measured on them.
-
-    Measured, of one to four pointings: 0.5 GB, 60 MB for each exposure, and 120 bytes for each pixel of the
-    prior's grid.
-    """
-    pixels = math.prod(grid_of(config, config.highres.pixel_scale).pixel_shape)
-    n_images = len(exposures_of(config, unit)) if unit else 0
-    return 500_000_000 + 60_000_000 * n_images + 120 * pixels

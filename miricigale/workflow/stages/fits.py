@@ -6,13 +6,15 @@ import astropy.units as u
 import numpy as np
 
 from miricigale import evaluation, fitting, photometry, sed
+from miricigale.photometry.catalogs import joined_sky
 from miricigale.photometry.error_model import add_noise
 from miricigale.photometry.surveys import fractional_error
 from miricigale.utils.tables import error_column
 from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.perturbation import Perturbation
 from miricigale.workflow.stages.conditions import ConditionFlags, add_conditions, any_condition
-from miricigale.workflow.stages.exposures import GRID, pointing_exposures, pointing_time
+from miricigale.workflow.stages.exposures import pointing_exposures, pointing_time
+from miricigale.workflow.stages.grids import PATCHED, by_patch, of_patch, study_patches
 from miricigale.workflow.stages.inputs import existing_bands, fit_plan, sed_resources
 from miricigale.workflow.stages.measure import joined_photometry
 from miricigale.workflow.stages.sample import (
@@ -38,15 +40,21 @@ class _Field:
         self.detections = joined_photometry(tables)
         self.matched = evaluation.match_truth(self.truth, self.detections, bands, radius=radius)
         self.association = evaluation.associate(self.truth, self.detections, radius=radius)
-        mosaics = []
-        for band in bands:
-            mosaic, n_images = context.image(f"{name}/mosaic_{band}.fits", "n_images")
-            mosaics.append(mosaic)
-            seen = mean_coverage(self.truth["sky"], mosaic, n_images)
+        n, sky = len(self.truth), joined_sky([self.truth["sky"], self.detections["sky"]])
+        seen, inside = np.zeros((len(bands), len(sky))), np.zeros((len(bands), len(sky)), bool)
+        patches = study_patches(config)
+        for patch, rows in by_patch(config, sky):
+            for k, band in enumerate(bands):
+                if band in patches[patch].bands:
+                    path = of_patch(f"{name}/mosaic_{band}", patch)
+                    mosaic, n_images = context.image(f"{path}.fits", "n_images")
+                    seen[k, rows] = mean_coverage(sky[rows], mosaic, n_images)
+                    inside[k, rows] = in_field(sky[rows], [mosaic])
+        for k, band in enumerate(bands):
             time = pointing_exposures(config, band)[0].exposure_time
-            self.matched[f"{band}_time"] = seen * time
-        self.inside = in_field(self.truth["sky"], mosaics)
-        self.detections["in_field"] = in_field(self.detections["sky"], mosaics)
+            self.matched[f"{band}_time"] = seen[k, :n] * time
+        inside = inside.all(axis=0)
+        self.inside, self.detections["in_field"] = inside[:n], inside[n:]
 
     def noise(self, config):
         """
@@ -69,9 +77,9 @@ class _Field:
     "errors",
     "error function",
     version=4,
-    needs=("truth", "mosaics", "photometry"),
+    needs=("truth", "mosaics", "photometry", "joined"),
     within=reference,
-    sections=(*GRID, "errors", "photometry.match_radius"),
+    sections=(*PATCHED, "errors", "photometry.match_radius"),
     plan=lambda config, _: reference(config),
 )
 def make_errors(context, _):
@@ -92,8 +100,8 @@ _SAMPLE = ("fit.min_detected", "fit.axes", *(f"fit.{key}" for key in CUTS))
     "matches",
     "match to the truth",
     version=2,
-    needs=("catalog", "seds", "truth", "mosaics", "photometry", "errors"),
-    sections=(*GRID, "errors.coverage", "photometry.match_radius", *_SAMPLE),
+    needs=("catalog", "seds", "truth", "mosaics", "photometry", "joined", "errors"),
+    sections=(*PATCHED, "errors.coverage", "photometry.match_radius", *_SAMPLE),
     units=truth_names,
     plan=fit_plan,
 )

@@ -6,26 +6,32 @@ import astropy.units as u
 import numpy as np
 
 from miricigale import depth, detector, photometry, psf, reduction, scene
+from miricigale.utils.random import stream
 from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.morphology import read_stamps
 from miricigale.workflow.perturbation import Perturbation
 from miricigale.workflow.stages.exposures import (
     EXPOSURE_RESOURCES,
-    GRID,
     IMAGE_RESOURCES,
     IMAGES,
     KERNEL,
-    band_exposures,
-    band_names,
     exposure_memory,
     exposure_plan,
     exposure_units,
-    exposures_of,
-    grid_of,
-    mosaic_memory,
     pointing_of,
     study_background,
     study_exposures,
+)
+from miricigale.workflow.stages.grids import (
+    PATCHED,
+    grid_of,
+    mosaic_memory,
+    of_patch,
+    parts_of,
+    patch_bands,
+    patch_exposures,
+    patch_plan,
+    study_patches,
     truth_bands,
 )
 from miricigale.workflow.truths import CUTOUTS, reference, study_truths
@@ -181,29 +187,36 @@ def make_exposure(context, unit):
     "mosaic",
     version=9,
     needs=("exposures",),
-    sections=(*GRID, "reduction", "highres.pixel_scale"),
+    sections=(*PATCHED, "reduction"),
     units=truth_bands,
-    plan=exposure_plan,
+    reads=lambda config, unit: [f"{parts_of(unit)[0]}/{name}" for name in patch_plan(config, unit)],
+    plan=patch_plan,
     memory=mosaic_memory,
 )
 def make_mosaic(context, unit):
     """Stage 8: drizzle the dithers of one band, on its own grid and on the prior's."""
     config = context.config
-    truth, band = unit.split("/")
-    names = exposures_of(config, band)
+    truth, band, patch = parts_of(unit)
+    names = patch_exposures(config, band, patch)
     images = [context.image(f"{truth}/exposures/{name}_cal.fits") for name in names]
-    for label, mosaic, planes in mosaics_of(config, images):
-        context.save_image(f"{truth}/mosaic_{band}{label}.fits", mosaic, dq=mosaic.flags, **planes)
+    for label, mosaic, planes in mosaics_of(config, images, patch):
+        name = of_patch(f"{truth}/mosaic_{band}{label}", patch)
+        context.save_image(f"{name}.fits", mosaic, dq=mosaic.flags, **planes)
 
 
-def mosaics_of(config, images):
-    """Mosaics of a band, on its own grid (``""``) and on the prior's (``"_fine"``), with further planes."""
+def mosaics_of(config, images, patch=""):
+    """
+    Mosaics of a band, on its own grid (``""``) and on the prior's (``"_fine"``), with further planes.
+
+    Those of a patch are on the first alone: the second is for whole fields, as Yang et al. 2021 measure them.
+    """
     reducer = reducer_of(config)
     if reducer.background.method == "dithers":
         images, _ = reducer.subtract_dithers(images)
-    for label, scale in (("", config.reduction.pixel_scale), ("_fine", config.highres.pixel_scale)):
+    grids = {"": config.reduction.pixel_scale, "_fine": config.highres.pixel_scale}
+    for label, scale in list(grids.items())[: 1 if patch else 2]:
         # outliers are found in the first pass, which returns the images with them masked
-        drizzled, images = reducer.drizzle(images, grid_of(config, scale))
+        drizzled, images = reducer.drizzle(images, grid_of(config, scale, patch))
         # second pass: background that remained after subtraction from single dithers
         mosaic, _ = reducer.subtract_background(drizzled.image)
         # how many exposures each pixel has: what errors follow
@@ -221,20 +234,31 @@ DETECTION = ("photometry.threshold", "photometry.n_pixels")
     version=3,
     needs=("truth",),
     within=reference,
-    sections=(*GRID, "highres", *DETECTION),
+    sections=(*PATCHED, "highres", *DETECTION),
     resources=("filters.sedpy",),
+    units=study_patches,
     plan=lambda config, _: {"exposures": exposure_plan(config), "truth": reference(config)},
     memory=mosaic_memory,
 )
-def make_highres(context, _):
+def make_highres(context, patch):
     """Stage 9: the high-resolution image, its segmentation and the detected sources."""
     config = context.config
     truth = context.table(f"{context.plan['truth']}/truth.ecsv")
-    wcs = grid_of(config, config.highres.pixel_scale)
-    image, segmentation, detected = prior_image(config, truth, wcs, seed=context.seed)
-    context.save_image("f160w.fits", image)
-    context.save_image("segm.fits", image, segmentation=np.asarray(segmentation.data, np.int32))
-    context.save_table("detections.ecsv", detected)
+    wcs = grid_of(config, config.highres.pixel_scale, patch)
+    noise = _shared_noise(config, patch, context.seed) if patch else None
+    own = {"seed": context.seed, "noise": noise}
+    image, segmentation, detected = prior_image(config, truth, wcs, **own)
+    context.save_image(f"{of_patch('f160w', patch)}.fits", image)
+    segmentation = np.asarray(segmentation.data, np.int32)
+    context.save_image(f"{of_patch('segm', patch)}.fits", image, segmentation=segmentation)
+    context.save_table(f"{of_patch('detections', patch)}.ecsv", detected)
+
+
+def _shared_noise(config, patch, seed):
+    """Standard normal numbers of a patch: a part of each row of the field, the same where patches overlap."""
+    rows, columns = study_patches(config)[patch].box
+    streams = (stream(seed, "highres", str(y)) for y in range(rows.start, rows.stop))
+    return np.stack([one.standard_normal(columns.stop)[columns] for one in streams])
 
 
 def prior_psf(config):
@@ -243,18 +267,18 @@ def prior_psf(config):
     return psf.hst_psf(options.filter, pixel_scale=options.pixel_scale * u.arcsec)
 
 
-def prior_image(config, catalog, wcs, *, seed):
+def prior_image(config, catalog, wcs, *, seed, noise=None):
     """High-resolution image of a catalog, its segmentation and the detected sources."""
     filter, depth = config.highres.filter, config.highres.depth * u.ABmag
     sky = {"filter": filter, "wcs": wcs, "psf": prior_psf(config), "depth": depth}
-    image = scene.highres_image(catalog, **sky, seed=seed)
+    image = scene.highres_image(catalog, **sky, seed=seed, noise=noise)
     limits = {name: getattr(config.photometry, name) for name in ("threshold", "n_pixels")}
     return image, *photometry.detect_sources(image, **limits)
 
 
-def mosaic_psf(config, name, scale):
+def mosaic_psf(config, name, scale, patch=""):
     """The PSF of the mosaic of one band on pixels of ``scale`` arcsec."""
-    angles = u.Quantity([e.pa_aper for e in band_exposures(config, name)])
+    angles = u.Quantity([e.pa_aper for e in patch_exposures(config, name, patch).values()])
     options = {"pixfrac": config.reduction.pixfrac}
     return psf.psf_mosaic(psf.miri_psf(name), scale * u.arcsec, angles, **options)
 
@@ -272,14 +296,14 @@ def measured_mosaic(config):
     version=3,
     sections=KERNEL,
     resources=IMAGE_RESOURCES,
-    units=band_names,
-    plan=exposure_plan,
+    units=patch_bands,
+    plan=lambda config, unit: patch_plan(config, f"/{unit}"),
 )
-def make_kernel(context, name):
+def make_kernel(context, unit):
     """Stage 10: the kernel from the high-resolution image to the mosaic of one band."""
-    config = context.config
-    pair = prior_psf(config), mosaic_psf(config, name, config.reduction.pixel_scale)
+    config, (_, name, patch) = context.config, parts_of(f"/{unit}")
+    pair = prior_psf(config), mosaic_psf(config, name, config.reduction.pixel_scale, patch)
     options = {"regularization": config.photometry.regularization}
     scale = config.highres.pixel_scale * u.arcsec
     kernel = psf.MatchingKernel.from_psfs(*pair, pixel_scale=scale, **options)
-    context.save_result(f"kernel_{name}.fits", kernel)
+    context.save_result(f"{of_patch(f'kernel_{name}', patch)}.fits", kernel)

@@ -1,15 +1,24 @@
 """Stage 11: forced photometry."""
 
 import numpy as np
+from astropy.table import vstack
 
 from miricigale import photometry, psf
+from miricigale.photometry.bands import spread_rows
+from miricigale.photometry.patches import RIM, own_rows
 from miricigale.utils.tables import error_column
 from miricigale.workflow.engine.stage import stage
-from miricigale.workflow.stages.exposures import (
-    IMAGE_RESOURCES,
-    KERNEL,
-    exposure_plan,
+from miricigale.workflow.stages.exposures import IMAGE_RESOURCES, KERNEL
+from miricigale.workflow.stages.grids import (
+    PATCHED,
+    grid_of,
     mosaic_memory,
+    of_patch,
+    parts_of,
+    patch_grid,
+    patch_plan,
+    study_bands,
+    study_patches,
     truth_bands,
 )
 from miricigale.workflow.stages.images import measured_mosaic, mosaic_psf, prior_psf
@@ -21,14 +30,15 @@ from miricigale.workflow.stages.images import measured_mosaic, mosaic_psf, prior
     version=2,
     needs=("highres",),
     sections=("highres.filter", "highres.pixel_scale"),
+    units=study_patches,
     memory=mosaic_memory,
 )
-def make_templates(context, _):
+def make_templates(context, patch):
     """Stage 11, once for all bands: what the detected sources look like on the prior."""
     templates = photometry.SourceTemplates.from_images(
-        *_detections(context), psf=prior_psf(context.config), n_threads=context.n_threads
+        *_detections(context, patch), psf=prior_psf(context.config), n_threads=context.n_threads
     )
-    context.save_result("templates.fits", templates)
+    context.save_result(f"{of_patch('templates', patch)}.fits", templates)
 
 
 @stage(
@@ -39,46 +49,99 @@ def make_templates(context, _):
     sections=(*KERNEL, "photometry.method"),
     resources=IMAGE_RESOURCES,
     units=truth_bands,
-    plan=exposure_plan,
+    plan=patch_plan,
     memory=mosaic_memory,
 )
 def measure_photometry(context, unit):
     """Stage 11: forced photometry of one band, on its own grid or by the steps of Yang et al. 2021."""
-    truth, name = unit.split("/")
+    truth, name, patch = parts_of(unit)
     suffix, _ = measured_mosaic(context.config)
-    mosaic = context.image(f"{truth}/mosaic_{name}{suffix}.fits")
-    result = measure_band(context, mosaic, name, context.config.photometry.method)
-    context.save_table(f"{truth}/photometry/{name}.ecsv", result.to_table())
-    context.save_image(f"{truth}/photometry/{name}_model.fits", result.model_image)
-    context.save_image(f"{truth}/photometry/{name}_residual.fits", result.residual_image)
+    mosaic = context.image(f"{of_patch(f'{truth}/mosaic_{name}{suffix}', patch)}.fits")
+    result = measure_band(context, mosaic, name, context.config.photometry.method, patch)
+    place = of_patch(f"{truth}/photometry/{name}", patch)
+    context.save_table(f"{place}.ecsv", result.to_table())
+    context.save_image(f"{place}_model.fits", result.model_image)
+    context.save_image(f"{place}_residual.fits", result.residual_image)
 
 
-def photometer_of(context, name, method):
+@stage(
+    "detections",
+    "detections of all patches",
+    needs=("highres",),
+    sections=PATCHED,
+    units=lambda config: ("",) if config.patches.size else (),
+)
+def join_detections(context, _):
+    """Stage 9, of patches: each detection once, with its patch and its label there."""
+    config, tables = context.config, []
+    grid, wcs = patch_grid(config), grid_of(config, config.highres.pixel_scale)
+    for name in study_patches(config):
+        table = context.table(f"detections_{name}.ecsv")
+        xy = np.transpose(wcs.world_to_pixel(table["sky"]))
+        table["patch"], table["label"] = name, table["id"]
+        tables.append(table[grid.near(grid.names.index(name), xy, RIM)])
+    joined = vstack(tables, metadata_conflicts="silent")
+    numbers = np.array([grid.names.index(name) for name in joined["patch"]])
+    xy = np.transpose(wcs.world_to_pixel(joined["sky"]))
+    joined = joined[own_rows(numbers, grid, xy)]
+    joined["id"] = np.arange(1, len(joined) + 1)
+    context.save_table("detections.ecsv", joined)
+
+
+@stage(
+    "joined",
+    "photometry of all patches",
+    needs=("detections", "photometry"),
+    sections=PATCHED,
+    units=lambda config: study_bands(config) if config.patches.size else (),
+)
+def join_photometry(context, unit):
+    """Stage 11, of patches: the photometry of a band at all detections."""
+    truth, band = unit.split("/")
+    every = context.table("detections.ecsv")
+    tables, rows, n = [], np.full(len(every), -1), 0
+    for name, patch in study_patches(context.config).items():
+        if band in patch.bands:
+            table = context.table(f"{truth}/photometry/{band}_{name}.ecsv")
+            own, order = np.asarray(every["patch"]) == name, np.argsort(table["id"])
+            rows[own] = n + order[np.searchsorted(table["id"], every["label"][own], sorter=order)]
+            tables.append(table)
+            n += len(table)
+    stacked = vstack(tables, metadata_conflicts="silent")
+    joined = every["id", "sky"]
+    for name in stacked.colnames[2:]:
+        joined[name] = spread_rows(stacked[name], rows, name)
+    context.save_table(f"{truth}/photometry/{band}.ecsv", joined)
+
+
+def photometer_of(context, name, method, patch=""):
     """Photometer of one band: of the package, or by the steps of Yang et al. 2021 (images not scaled)."""
     config = context.config
     if method == "yang2021":
-        blur = mosaic_psf(config, name, config.highres.pixel_scale)
+        blur = mosaic_psf(config, name, config.highres.pixel_scale, patch)
         return photometry.Yang2021Photometer(prior_psf(config), blur, n_threads=context.n_threads)
     # the constant absorbs the light of faint sources and of wings in the background
     options = {"background_order": 0, "n_threads": context.n_threads}
-    kernel = psf.MatchingKernel.read(context.path(f"kernel_{name}.fits"))
+    kernel = psf.MatchingKernel.read(context.path(f"{of_patch(f'kernel_{name}', patch)}.fits"))
     return photometry.ForcedPhotometer(kernel, **options)
 
 
-def measure_band(context, mosaic, name, method):
+def measure_band(context, mosaic, name, method, patch=""):
     """Result of the forced photometry of a mosaic of one band, ``"package"`` or ``"yang2021"``."""
-    photometer = photometer_of(context, name, method)
+    photometer = photometer_of(context, name, method, patch)
     if method == "yang2021":
         # on the grid of the prior
-        return photometer.measure(mosaic, *_detections(context))
-    templates = photometry.SourceTemplates.read(context.path("templates.fits"))
+        return photometer.measure(mosaic, *_detections(context, patch))
+    path = context.path(f"{of_patch('templates', patch)}.fits")
+    templates = photometry.SourceTemplates.read(path)
     return photometer.measure(mosaic, templates=templates)
 
 
-def _detections(context):
+def _detections(context, patch):
     """The high-resolution image, the labels of its segments, and the detected sources."""
-    image, (_, labels) = context.image("f160w.fits"), context.image("segm.fits", "segmentation")
-    return image, labels.astype(np.int32), context.table("detections.ecsv")
+    image, segm, found = (of_patch(name, patch) for name in ("f160w", "segm", "detections"))
+    _, labels = context.image(f"{segm}.fits", "segmentation")
+    return context.image(f"{image}.fits"), labels.astype(np.int32), context.table(f"{found}.ecsv")
 
 
 def joined_photometry(tables):

@@ -19,6 +19,7 @@ from miricigale.workflow.stages.exposures import (
     exposure_memory,
     exposure_plan,
 )
+from miricigale.workflow.stages.grids import shown_patch
 from miricigale.workflow.stages.images import (
     DETECTION,
     expose_and_reduce,
@@ -63,7 +64,7 @@ def point_catalog(exposure, band_flux, prior, *, spacing, seed):
     "point sources",
     version=9,
     needs=("kernels",),
-    sections=(*IMAGES, "highres", *DETECTION, "photometry.method", "point_sources"),
+    sections=(*IMAGES, "patches", "highres", *DETECTION, "photometry.method", "point_sources"),
     resources=EXPOSURE_RESOURCES,
     units=lambda config: band_names(config) if config.point_sources.enabled else (),
     plan=exposure_plan,
@@ -88,7 +89,7 @@ def measure_point_sources(context, name):
     mosaic, _ = reducer.subtract_background(mosaic)
     wcs = mosaic_wcs([exposure], config.highres.pixel_scale * u.arcsec)
     highres, segmentation, detected = prior_image(config, catalog, wcs, seed=seed)
-    photometer = photometer_of(context, name, config.photometry.method)
+    photometer = photometer_of(context, name, config.photometry.method, shown_patch(config))
     result = photometer.measure(mosaic, highres, segmentation, detected)
     table = catalog["id", "sky"]
     table["flux_true"] = catalog[name]

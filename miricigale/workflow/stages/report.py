@@ -4,7 +4,9 @@ import dataclasses
 import json
 import logging
 
+import astropy.units as u
 import numpy as np
+from astropy.wcs.utils import pixel_to_pixel
 
 from miricigale import sed
 from miricigale.evaluation import study_numbers
@@ -26,6 +28,13 @@ from miricigale.workflow.page.result_sections import write_results
 from miricigale.workflow.page.study_page import StudyPage
 from miricigale.workflow.stages import experiments, perturbed, rivals, variants
 from miricigale.workflow.stages.exposures import EXPOSURE_RESOURCES, IMAGES, exposure_plan
+from miricigale.workflow.stages.grids import (
+    grid_of,
+    of_patch,
+    patch_grid,
+    shown_patch,
+    study_patches,
+)
 from miricigale.workflow.stages.inputs import sed_resources
 from miricigale.workflow.stages.sample import footprint_area
 from miricigale.workflow.truths import reference, study_truths
@@ -45,7 +54,7 @@ _MEASURED = ("highres", "photometry", "errors", "fit", "point_sources", "perturb
     "report",
     version=10,
     needs=(*_IMAGES, *_TABLES),
-    sections=("run.name", "catalog", "sed", *IMAGES, *_MEASURED, "report"),
+    sections=("run.name", "catalog", "sed", *IMAGES, "patches", *_MEASURED, "report"),
     resources=lambda: (*sed_resources(), *EXPOSURE_RESOURCES),
     plan=exposure_plan,
 )
@@ -54,15 +63,19 @@ def make_report(context, _):
     config, truths, model = context.config, study_truths(context.config), sed.SEDModel.yang2021()
     every = {name: StudyTables(context, name) for name in truths}
     shown, bands = reference(config), config.exposures.filters
-    mosaics = {name: context.image(f"{shown}/mosaic_{name}.fits") for name in bands}
-    area = footprint_area(mosaics.values())
+    area = _field_area(context, shown)
+    patch = shown_patch(config)
+    own = study_patches(config)[patch].bands
+    path = of_patch(f"{shown}/mosaic_{{}}", patch)
+    mosaics = {name: context.image(f"{path.format(name)}.fits") for name in own}
     metrics = study_metrics(config, every[shown], area)
     # those of whose sky the analysis knows all
     known = {name: truth for name, truth in truths.items() if not truth.perturbations}
     tables = {name: every[name] for name in known}
     others = rivals.read_rivals(context)
     study = paper.study_results(config, known, tables, metrics)
-    kernels = {n: MatchingKernel.read(context.path(f"kernel_{n}.fits")) for n in bands}
+    path = of_patch("kernel_{}", patch)
+    kernels = {n: MatchingKernel.read(context.path(f"{path.format(n)}.fits")) for n in own}
     extra = paper.extra_numbers(study, metrics, kernels)
     extra |= rivals.source_extractor_numbers(others, context.seed)
     study = dataclasses.replace(study, extra=extra)
@@ -84,7 +97,7 @@ def make_report(context, _):
     page = StudyPage(report, context, tables, study, metrics, kernels, model, area)
     write_summary(page, truths, numbers, stand_ins(config, model))
     write_exposures(page)
-    write_images(page, mosaics)
+    write_images(page, mosaics, patch)
     write_detections(page)
     write_photometry(page)
     rivals.write_rivals(page, others)
@@ -100,6 +113,27 @@ def make_report(context, _):
     write_inputs(page)
     write_origin(page, [page.tables.truth.meta, matched.meta])
     context.save("report/index.html", lambda path: report.write(path))
+
+
+def _field_area(context, truth):
+    """Solid angle of the field of all bands, that of each patch in its core."""
+    config, area = context.config, 0 * u.arcmin**2
+    for patch, one in study_patches(config).items():
+        if one.bands == tuple(config.exposures.filters):
+            path = of_patch(f"{truth}/mosaic_{{}}", patch)
+            mosaics = [context.image(f"{path.format(band)}.fits") for band in one.bands]
+            area += footprint_area(mosaics, _core_of(config, patch, mosaics[0].wcs))
+    return area
+
+
+def _core_of(config, patch, wcs):
+    """Which pixels of a mosaic are in the core of its patch."""
+    if not patch:
+        return True
+    grid, whole = patch_grid(config), grid_of(config, config.highres.pixel_scale)
+    y, x = np.indices(wcs.pixel_shape[::-1])
+    xy = np.transpose(pixel_to_pixel(wcs, whole, x.ravel(), y.ravel()))
+    return (grid.holder(xy) == grid.names.index(patch)).reshape(x.shape)
 
 
 def _without_nan(values):

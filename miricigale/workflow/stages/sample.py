@@ -87,12 +87,12 @@ def matched_errors(matched, inside, bands, *, noise=None, **options):
     return ErrorModel.from_tables(*pair, filters=bands, noise=own, **options)
 
 
-def footprint_area(images):
+def footprint_area(images, among=True):
     """Solid angle of the pixels that are usable in every image on one grid: the field of `in_field`."""
     images = list(images)
     if len({image.shape for image in images}) != 1:
         raise argument_error("images", "on one grid", [image.shape for image in images])
-    usable = ~np.any([image.mask for image in images], axis=0)
+    usable = ~np.any([image.mask for image in images], axis=0) & among
     pixel = proj_plane_pixel_area(images[0].wcs) * u.deg**2
     return (np.count_nonzero(usable) * pixel).to(u.arcmin**2)
 

@@ -16,6 +16,7 @@ from miricigale.workflow.page.labels import SET_COLORS, SET_LABELS, band_label
 from miricigale.workflow.page.numbers import StudyTables
 from miricigale.workflow.stages.conditions import ConditionFlags, any_condition
 from miricigale.workflow.stages.exposures import KERNEL
+from miricigale.workflow.stages.grids import of_patch, shown_patch, study_patches
 from miricigale.workflow.stages.images import measured_mosaic
 from miricigale.workflow.stages.inputs import existing_bands, sed_resources
 from miricigale.workflow.stages.sample import SampleFlags
@@ -43,18 +44,24 @@ FLAGS = {
     sections=("run.name", "catalog", *KERNEL, "photometry", "fit", "report"),
     resources=sed_resources,
     units=truth_names,
+    # the prior of the patch that is shown is of no truth
+    reads=lambda config, unit: [unit, f"{unit}/{shown_patch(config)}"],
     plan=lambda config, _: list(truth_names(config)),
 )
 def make_sources(context, name):
     """Stage 14, in addition: the page of a truth, and what it shows of its sources."""
     config, tables = context.config, _Sources(context, name)
     suffix, _ = measured_mosaic(config)
-    paths = f"mosaic_{{}}{suffix}", "photometry/{}_model", "photometry/{}_residual"
+    # pictures are of one patch where there are more
+    patch = shown_patch(config)
+    paths = [of_patch(f"mosaic_{{}}{suffix}", patch)]
+    paths += [f"{of_patch('photometry/{}', patch)}_{kind}" for kind in ("model", "residual")]
     bands = {
         band: [context.image(f"{name}/{path.format(band)}.fits") for path in paths]
-        for band in config.exposures.filters
+        for band in study_patches(config)[patch].bands
     }
-    cutouts, sky = Cutouts(context.image("f160w.fits"), bands), tables.truth["sky"]
+    cutouts = Cutouts(context.image(f"{of_patch('f160w', patch)}.fits"), bands)
+    sky = tables.truth["sky"]
     imaged = cutouts.on_image(sky)
     shown = tables.first_of(imaged, config.report.pictures)
     # those of a file are near to each other in the page, and those without pictures come last

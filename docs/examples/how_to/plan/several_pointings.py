@@ -69,6 +69,7 @@ print(f"{'both, twice':12} {np.sum(twice) * pixel:5.1f} arcmin2")
 # .. code-block:: console
 #
 #    $ miricigale run goodss --set 'pointing.tiles=[3, 2]'
+#    $ miricigale run goodss --set 'pointing.tiles=[3, 2]' --set patches.size=100 --plan
 #    $ miricigale plan --bands f770w f1500w --time 1500 --pointings 6
 #
 # See :doc:`/method/workflow_truth` for how errors follow the exposure time at each source.

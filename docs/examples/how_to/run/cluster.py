@@ -84,6 +84,16 @@ plt.show()
 #    cluster.scale(jobs=40)
 #    print(cluster.scheduler_address)
 #
+# A survey of many pointings is done in patches of the sky (``[patches] size``), so that no unit needs more than 2
+# GB. The preset ``cosmosweb`` is the MIRI imaging of COSMOS-Web, 152 visits in F770W; it needs your catalog. See
+# what it takes first:
+#
+# .. code-block:: console
+#
+#    $ miricigale run cosmosweb --set catalog.source=cosmos.fits --plan
+#    $ miricigale run cosmosweb --set catalog.source=cosmos.fits -o /shared/cosmos \
+#        --scheduler tcp://host:8786
+#
 # Workers may come and go, such as at the end of their time. What a run says of trouble:
 #
 # ================================  ============================================================================

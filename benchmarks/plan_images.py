@@ -1,5 +1,14 @@
-"""Images of the planned exposures: the plan as a run of the study, compared with the noise."""
+"""
+A plan beside images of the same exposures: python benchmarks/plan_images.py PLAN.toml FOLDER [--set KEY=VALUE]
 
+The plan becomes the configuration of a run in FOLDER, which resumes like any run: slopes with the noise of ramps,
+mosaics, forced photometry and error functions. Its catalog is the plan's, so that the sky has the very fluxes of
+the sample, and its neighbors. The measured fluxes are then fitted in place of the mock ones. The sample is of the
+plan's catalog, without a luminosity function ([sample] n_sources = 0 takes all), with a mix of AGN ([agn]).
+Prints, for the sources that the images can measure, noise and images side by side.
+"""
+
+import argparse
 import dataclasses
 from pathlib import Path
 
@@ -11,9 +20,10 @@ from astropy.table import QTable
 from miricigale.evaluation import bootstrap
 from miricigale.evaluation.estimates import median, scatter
 from miricigale.photometry import ErrorModel
-from miricigale.planning.accuracy import accuracy, difference
+from miricigale.planning import Planner, load_plan
+from miricigale.planning.accuracy import NUMBERS, accuracy, columns_of
 from miricigale.planning.sample import agn_mix
-from miricigale.utils.options import check_that
+from miricigale.utils.parallel import process_pool, thread_count
 from miricigale.utils.random import stream
 from miricigale.utils.store import replacing
 from miricigale.utils.tables import error_column
@@ -109,12 +119,10 @@ def images_study(planner, source):
         the sample.
     """
     config, plans = planner.config, planner.band_plans()
-    own, fit, options = study_catalog(config.catalog), config.fit, config.images
+    own, fit = study_catalog(config.catalog), config.fit
     center = SkyCoord(own["sky"].cartesian.mean(), representation_type="cartesian")
     center.representation_type = "spherical"
     ra, dec = float(center.ra.deg), float(center.dec.deg)
-    if options.ra >= 0:
-        ra, dec = options.ra, options.dec
     fractions = (0.0,)
     if "frac_agn" in own.colnames or np.any(np.asarray(planner.sources["frac_agn"], float) > 0):
         fractions = (0.0, CATALOG)
@@ -124,12 +132,12 @@ def images_study(planner, source):
     return StudyConfig(
         run=RunSection(name=f"{run.name} images", seed=run.seed, threads=run.threads),
         catalog=dataclasses.replace(config.catalog, source=str(source), **_PLAIN),
-        pointing=PointingSection(ra=ra, dec=dec, roll=options.roll),
+        pointing=PointingSection(ra=ra, dec=dec),
         sed=dataclasses.replace(config.sed, frac_agn=fractions),
         scene=SceneSection(background=_levels(config, plans)),
         exposures=ExposureSection(
             filters=tuple(plans),
-            kind=options.kind,
+            kind="rates",
             n_groups=tuple(one.n_groups for one in exposures),
             n_integrations=tuple(one.n_integrations for one in exposures),
             n_dithers=tuple(plan.n_dithers for plan in plans.values()),
@@ -160,12 +168,7 @@ def image_sample(planner, folder, *, executor=None, progress_bar=False):
     -------
     imaged : `ImagedSample`
 
-    Raises
-    ------
-    ValueError
-        If the plan has sources of the caller, which have no positions.
     """
-    check_that(planner.given is None, "planner", "one with the sample of its catalog", "sources")
     folder = Path(folder).resolve()
     source = folder.with_name(f"{folder.name}.ecsv")
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -238,6 +241,35 @@ def paired_bands(planner, imaged):
     return QTable(rows)
 
 
+def difference(first, second, *, agn_limit, seed):
+    """
+    Numbers of `accuracy` of the second plan less those of the first.
+
+    Parameters
+    ----------
+    first, second : `~astropy.table.QTable`
+        Tables of the same sources, row by row.
+    agn_limit, seed
+        As for `accuracy`.
+
+    Returns
+    -------
+    numbers : dict of str to `~miricigale.evaluation.Estimate`
+        With the errors of sources that are drawn together.
+    """
+    columns = [columns_of(one, agn_limit) for one in (first, second)]
+    numbers = {}
+    for name, (statistic, *wanted) in NUMBERS.items():
+        n = len(wanted)
+
+        def change(*values, statistic=statistic, n=n):
+            return statistic(*values[n:]) - statistic(*values[:n])
+
+        values = [one[key] for one in columns for key in wanted]
+        numbers[name] = bootstrap(change, *values, seed=seed)
+    return numbers
+
+
 def paired_numbers(planner, plans, imaged_plans, imaged):
     """
     Accuracies with the noise of the plan and with its images, of the same sources.
@@ -275,3 +307,28 @@ def paired_numbers(planner, plans, imaged_plans, imaged):
             row["sigma"] = change.value / change.error if change.error > 0 else np.nan
             rows.append(row)
     return QTable(rows)
+
+
+def main():
+    """Run."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("plan", help="configuration of the plan")
+    parser.add_argument("folder", type=Path, help="of the run")
+    parser.add_argument(
+        "--set", action="append", default=[], help="of the plan, as miricigale plan"
+    )
+    args = parser.parse_args()
+    planner = Planner(load_plan(args.plan, overrides=args.set))
+    plans = planner.compare()
+    with process_pool(thread_count(planner.config.plan.threads or None)) as pool:
+        imaged = image_sample(planner, args.folder, executor=pool, progress_bar=True)
+    numbers = paired_numbers(planner, plans, planner.compare(measured=imaged.measured), imaged)
+    for table in (paired_bands(planner, imaged), numbers):
+        for name in table.colnames:
+            if table[name].dtype.kind == "f":
+                table[name].info.format = ".4g"
+        table.pprint_all()
+
+
+if __name__ == "__main__":
+    main()

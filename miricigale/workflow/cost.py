@@ -1,0 +1,165 @@
+"""How much disk, memory and processor time a study takes, from its configuration."""
+
+import math
+
+import numpy as np
+from astropy.table import QTable
+
+from miricigale.instrument import imager_columns
+from miricigale.workflow.stages import study_stages
+from miricigale.workflow.stages.exposures import study_exposures, study_pointings
+from miricigale.workflow.stages.grids import grid_of, patch_bands, study_patches
+from miricigale.workflow.stages.inputs import REDSHIFT_STEP, bright_sources, study_catalog
+from miricigale.workflow.truths import study_truths
+
+
+def disk_use(config):
+    """
+    About how many bytes the products of a run take, as `study_cost` has them by stage.
+
+    Parameters
+    ----------
+    config : `~miricigale.workflow.StudyConfig`
+        The configuration.
+
+    Returns
+    -------
+    n_bytes : dict of str to int
+        By stage, all units together; stages of small tables only are left out.
+
+    Examples
+    --------
+    >>> from miricigale.workflow import disk_use, load_config
+    >>> use = disk_use(load_config("goodss", quick=True))
+    >>> print(f"{sum(use.values()) / 1e6:.0f} MB")
+    273 MB
+    """
+    return {name: int(n_bytes) for name, n_bytes in _Size(config).disk().items()}
+
+
+def study_cost(config):
+    """
+    What a run takes: units, processor time, disk and memory by stage.
+
+    Times are of a core on which the plain loop of ``benchmarks/fit.py`` takes 0.03 s an object with ``--kind
+    quick``, kernels compiled, after runs of one pointing (docs/accuracy/running.rst); those of many are not
+    measured.
+
+    Parameters
+    ----------
+    config : `~miricigale.workflow.StudyConfig`
+        The configuration.
+
+    Returns
+    -------
+    cost : `~astropy.table.QTable`
+        A row for each stage: ``stage``, ``units``, ``cpu`` (s, all units together), ``disk`` (MB) and ``memory``
+        (MB, the largest unit; 0 where it is small).
+
+    Examples
+    --------
+    >>> from miricigale.workflow import load_config, study_cost
+    >>> cost = study_cost(load_config("goodss", quick=True))
+    >>> print(cost["units"][cost["stage"] == "exposures"][0], "exposures")
+    12 exposures
+    """
+    size, rows = _Size(config), []
+    disk, seconds = size.disk(), size.seconds()
+    for one in study_stages():
+        units = one.unit_names(config)
+        memory = max((one.memory(config, unit) for unit in units), default=0) if one.memory else 0
+        taken = round(seconds.get(one.name, 0.0)), round(disk.get(one.name, 0) / 1e6)
+        rows.append((one.name, len(units), *taken, round(memory / 1e6)))
+    names, units = ("stage", "units", "cpu", "disk", "memory"), ("s", "Mbyte", "Mbyte")
+    return QTable(rows=rows, names=names, units=dict(zip(names[2:], units, strict=True)))
+
+
+class _Size:
+    """What the cost of a study follows from: numbers of exposures, pixels and sources."""
+
+    def __init__(self, config):
+        self.config = config
+        self.exposures, self.truths = study_exposures(config), len(study_truths(config))
+        self.pixels = {name: math.prod(e.shape) for name, e in self.exposures.items()}
+        patches = study_patches(config)
+        self.native, self.fine = (
+            sum(math.prod(grid_of(config, scale, name).pixel_shape) for name in patches)
+            for scale in (config.reduction.pixel_scale, config.highres.pixel_scale)
+        )
+        # patches have no mosaics on the prior's pixels
+        self.drizzled = 0 if config.patches.size else self.fine
+        self.n_bands, self.n_sets = len(config.exposures.filters), len(config.fit.sets)
+        self.n_kernels = len(patch_bands(config))
+        # exposures of the mosaics, of which an exposure is in several
+        self.n_drizzled = sum(len(one.exposures) for one in patches.values())
+        catalog = study_catalog(config.catalog)
+        catalog = bright_sources(catalog, config.catalog, config.highres.filter)
+        self.n = len(catalog)
+        redshifts = np.round(np.asarray(catalog["redshift"], float) / REDSHIFT_STEP)
+        self.n_redshifts = len(np.unique(redshifts))
+        wcs = grid_of(config, config.reduction.pixel_scale)
+        inside, whole = np.count_nonzero(wcs.footprint_contains(catalog["sky"])), wcs.pixel_shape
+        # sources of the prior; those where patches overlap are in each
+        self.n_drawn = inside * self.native / math.prod(whole)
+        # the box about the fields has corners that no field covers
+        first, last = imager_columns()
+        height = next(iter(self.exposures.values())).shape[0]
+        share = len(study_pointings(config)) * (last - first) * height / math.prod(whole)
+        self.n_imaged = int(inside * min(1.0, share))
+        self.pictured = min(self.n_imaged, config.report.pictures)
+
+    def disk(self):
+        """Bytes by stage, as they were measured; stages of small tables only are left out."""
+        config, pixels = self.config, self.pixels
+        exposed = 3.5 * sum(pixels.values())
+        if config.run.keep_level1b:
+            # counts, the planes that only a simulation knows, and slopes
+            for name, e in self.exposures.items():
+                exposed += (2 * e.n_groups * e.n_integrations + 11.6) * pixels[name]
+            rates = 0
+        else:
+            # slopes of one dither of each band of the reference
+            rates = 3.6 * sum(pixels[name] for name, e in self.exposures.items() if e.dither == 0)
+        measured = self.fine if config.photometry.method == "yang2021" else self.native
+        pointed = min(2, self.n_bands) / len(study_pointings(config)) * config.point_sources.enabled
+        n, truths, bands = self.n, self.truths, self.n_bands
+        return {
+            "catalog": 240 * n,
+            "seds": (5_100 + 14.5 * self.n_redshifts) * n,
+            "truth": truths * 800 * n,
+            "exposures": truths * exposed + rates,
+            "mosaics": truths * bands * 2.05 * (self.native + self.drizzled),
+            "highres": 3.8 * self.fine,
+            "points": pointed * 2.05 * measured,
+            "kernels": self.n_kernels * 2_950_000,
+            "templates": 2.7 * self.fine + 9_400 * self.n_imaged,
+            "photometry": truths * bands * (6 * measured + 250 * self.n_imaged),
+            "matches": truths * (240 + 70 * bands) * n,
+            "fits": truths * self.n_sets * 4_500 * self.n_imaged,
+            "experiments": truths * len(config.fit.experiments) * 4_500 * self.n_imaged,
+            "sources": truths * (600 * n + (6_000 + 4_100 * bands) * self.pictured),
+            "report": 13_000_000,
+        }
+
+    def seconds(self):
+        """Processor time by stage, of one pointing; small and optional stages have none."""
+        truths, bands, config = self.truths, self.n_bands, self.config
+        # of an exposure as rates, or of an exposure and all groups of its pixels
+        each = 5.0
+        if config.exposures.kind == "ramps":
+            exposures = self.exposures.items()
+            groups = sum(e.n_groups * e.n_integrations * self.pixels[name] for name, e in exposures)
+            each = 1.7 + 5.9e-8 * groups / len(self.exposures)
+        return {
+            "seds": (1.6e-3 + truths * 4e-4) * self.n,
+            "exposures": truths * each * len(self.exposures),
+            "mosaics": truths * (0.46 * self.n_drizzled + 9e-7 * self.drizzled * bands),
+            "highres": 5e-7 * self.fine + 3e-3 * self.n_drawn,
+            "kernels": 0.8 * self.n_kernels,
+            "templates": 5e-7 * self.fine + 7e-3 * self.n_drawn,
+            "photometry": truths * bands * (5e-7 * self.native + 9e-3 * self.n_drawn),
+            "points": config.point_sources.enabled * bands * (each + 3.0),
+            "fits": truths * self.n_sets * 1.9e-3 * self.n_imaged,
+            "sources": truths * 5.0,
+            "report": 12.0,
+        }
