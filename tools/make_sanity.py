@@ -27,7 +27,6 @@ from miricigale.workflow.page import (
     source_figures,
     study_figures,
 )
-from miricigale.workflow.page.declared import texts_of
 from miricigale.workflow.page.numbers import StudyTables
 from miricigale.workflow.page.paper import study_results
 from miricigale.workflow.stages.sample import SampleFlags, typical_source
@@ -166,7 +165,7 @@ def main():
     print(rst_table(header, rows), "\n")
     if config.variants.images:
         table = QTable.read(run / "report" / "variants.ecsv")
-        columns = texts_of("variants")["table"]["columns"]
+        columns = labels.texts_of("variants")["table"]["columns"]
         rows = [
             [cell_of(entry, tuple(column)) for _, *column in columns]
             for entry in variant_entries(table, variant_changes(config))

@@ -107,9 +107,10 @@ def photometry(args):
     for name in (
         ("patch_size", "overlap", "scheduler", "redo") if whole else ("page", "model", "residual")
     ):
-        if getattr(args, name):
+        value = getattr(args, name)
+        if value is not None and value is not False:
             wanted = f"left out with{'out' * whole} --patches"
-            raise argument_error("--" + name.replace("_", "-"), wanted, getattr(args, name))
+            raise argument_error("--" + name.replace("_", "-"), wanted, value)
     if not whole:
         table, page = _in_patches(args, images, prior, options), args.patches / "index.html"
     else:

@@ -18,6 +18,7 @@ from miricigale.utils.exceptions import (
     CatalogWarning,
     argument_error,
     data_error,
+    file_errors,
     units_error,
     unknown_name,
     warn,
@@ -118,13 +119,11 @@ class CatalogMap:
             If the file is missing, not TOML, or has another key; if it has a number of no filter here.
         """
         path = Path(path).expanduser()
-        try:
+        with file_errors(path, "cannot be read as a map of columns", OSError, RecursionError):
             text = path.read_text(encoding="utf-8")
             if path.suffix == ".translate":
                 return cls(columns=_translated(text, path))
             values = tomllib.loads(text)
-        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as err:
-            raise data_error(path, f"cannot be read as a map of columns: {err}") from err
         known = [field.name for field in dataclasses.fields(cls)]
         unknown = sorted(set(values) - set(known))
         check_data(not unknown, path, f"is no map of columns: it has {unknown}; known: {known}")

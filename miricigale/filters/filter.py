@@ -433,7 +433,7 @@ class Filter(Frozen, Interactive):
         -------
         ax : `~matplotlib.axes.Axes`
         """
-        from miricigale.plotting.filters import plot_filters
+        from miricigale.plotting.curves import plot_filters
 
         return plot_filters([(self.wave.value, self.throughput, self.name)], ax=ax, **kwargs)
 

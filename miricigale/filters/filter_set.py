@@ -170,7 +170,7 @@ class FilterSet(Interactive):
         -------
         ax : `~matplotlib.axes.Axes`
         """
-        from miricigale.plotting.filters import plot_filters
+        from miricigale.plotting.curves import plot_filters
 
         curves = [(f.wave.value, f.throughput / f.throughput.max(), f.name) for f in self.filters]
         ax = plot_filters(curves, ax=ax, **kwargs)

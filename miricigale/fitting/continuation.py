@@ -173,7 +173,7 @@ class Continuation(Frozen):
     def _mixture(self, stated, sigma, broad):
         """`_core.Mixture` of an object."""
         used, part = stated.bands, self.engine.mixture.part[stated.bands]
-        narrow, wide = stated.weight[:, used], broad[used]
+        narrow, wide = np.take(stated.weight, used, axis=1), broad[used]
         odds = part / (1.0 - part) / np.sqrt(narrow) / wide
         # of fluxes in units of the errors without that of templates
         level = 0.5 * np.log(narrow * np.square(sigma[used])).sum(axis=1)

@@ -175,7 +175,7 @@ class Tangents:
             How likely each band is wrong for the models at which they touch.
         """
         tables, bands, part = self.tables, target.bands, self.bands.part
-        own = 1.0 / np.sqrt(target.weight[:, bands])
+        own = 1.0 / np.sqrt(np.take(target.weight, bands, axis=1))
         narrow = own / broad[bands]
         odds = part[bands] / (1.0 - part[bands]) * narrow
         n_z, ratio = len(log_prior), tables.of_frac[0]

@@ -17,7 +17,7 @@ from astropy.modeling.models import (
 
 from miricigale.instrument.siaf import attitude_matrix, unit_vector, vector_angles
 from miricigale.instrument.wcs import scaled_fit
-from miricigale.utils.exceptions import data_error
+from miricigale.utils.exceptions import file_errors
 from miricigale.utils.optional import require
 
 #: By which the official pipeline recognizes a file; it says nothing.
@@ -40,11 +40,9 @@ def asdf_wcs(header, hdus):
     require("gwcs", extra="gwcs")
     asdf = require("asdf", extra="gwcs")
     content = np.asarray(hdus["ASDF"].data["ASDF_METADATA"][0]).tobytes()
-    try:
-        with asdf.open(io.BytesIO(content)) as tree:
-            exact = tree["meta"]["wcs"]
-    except (KeyError, ValueError) as err:
-        raise data_error(hdus.filename(), f"has no gwcs in its extension ASDF: {err}") from err
+    refused = file_errors(hdus.filename(), "has no gwcs in its extension ASDF")
+    with refused, asdf.open(io.BytesIO(content)) as tree:
+        exact = tree["meta"]["wcs"]
     box = tuple((-0.5, header[f"NAXIS{k}"] - 0.5) for k in (1, 2))
     return WCS(exact.to_fits_sip(bounding_box=box, max_pix_error=0.01))
 

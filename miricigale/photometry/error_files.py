@@ -2,7 +2,7 @@
 
 from miricigale.photometry.error_calibration import ErrorCalibration
 from miricigale.photometry.error_model import ErrorModel
-from miricigale.utils.exceptions import data_error
+from miricigale.utils.exceptions import file_errors
 from miricigale.utils.store import replacing
 from miricigale.utils.table_files import read_table
 from miricigale.utils.unified import register
@@ -17,10 +17,8 @@ def write_ecsv(thing, path, *, overwrite=False):
 def _reader(cls, kind):
     def read(path):
         table = read_table(path, wanted=kind, form="ascii.ecsv")
-        try:
+        with file_errors(path, f"is not {kind}"):
             return cls.from_table(table)
-        except (TypeError, ValueError) as err:
-            raise data_error(path, f"is not {kind}: {err}") from err
 
     return read
 

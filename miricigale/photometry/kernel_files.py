@@ -6,7 +6,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.photometry.grids import grid_angle
-from miricigale.utils.exceptions import argument_error, data_error
+from miricigale.utils.exceptions import argument_error, data_error, file_errors
 from miricigale.utils.files import open_fits, split_extension
 from miricigale.utils.units import ANGLE, to_array
 
@@ -96,10 +96,8 @@ def _read_psf(file, argument):
         scaled = known and not 0.8 < total < 0.995
         if scaled:
             _log.info("%s sums to %.4g and is scaled to 1", path, total)
-        try:
+        with file_errors(path, "cannot be read as a PSF"):
             psf = make_psf(data / total if scaled else data, origin=_centered(data), **form)
-        except ValueError as err:
-            raise data_error(path, f"cannot be read as a PSF: {err}") from err
         n = 2 * (min(data.shape) // 2) - 1
         middle = psf_image(psf, pixel_scale=cell * ANGLE, shape=n)
         middle = middle / middle.sum() if scaled else middle
@@ -176,12 +174,10 @@ def read_kernel(path, *, pixel_scale, highres_psf=None):
     else:
         planes, header = _planes(path, "a kernel")
         stated = header_grid(header)[0]
-        try:
+        with file_errors(path, "cannot be read as a kernel"):
             kernel = MatchingKernel.from_array(
                 planes.mean(axis=0), pixel_scale=pixel_scale, source=highres_psf
             )
-        except ValueError as err:
-            raise data_error(path, f"cannot be read as a kernel: {err}") from err
         kernel.meta["file"] = str(path)
     wanted = pixel_scale.to_value(ANGLE)
     if stated is not None and abs(stated / wanted - 1) > 0.02:

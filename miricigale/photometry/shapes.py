@@ -314,7 +314,8 @@ class _Stamp:
         images = np.array([self.models.profiles(self.white.shape, one, 6) for one in at], float)
         images[:, 1:] *= beside.flux[:, None, None, None]
         columns = (images * self.inverse).reshape(-1, self.white.size)
-        return scipy.linalg.solve_triangular(beside.root, columns, lower=True)
+        # of the layout of an empty one: kernels are compiled once
+        return np.ascontiguousarray(scipy.linalg.solve_triangular(beside.root, columns, lower=True))
 
     def nodes(self, parameters, flux, covariance, mean, beside):
         """

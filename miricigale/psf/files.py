@@ -11,7 +11,7 @@ from astropy.wcs import WCS
 from miricigale.psf.kernel_field import KernelField
 from miricigale.psf.kernels import MatchingKernel
 from miricigale.psf.model import InstrumentPSF, make_psf
-from miricigale.utils.exceptions import argument_error, data_error
+from miricigale.utils.exceptions import argument_error, data_error, file_errors
 from miricigale.utils.files import open_fits, write_fits
 from miricigale.utils.meta import plain_value
 from miricigale.utils.options import check_that
@@ -196,7 +196,7 @@ def _read_kernel(path, *, ext=None, plane=None, pixel_scale=None, source=None):
         if "KERNEL" not in hdus:
             raise data_error(path, f"has no KERNEL extension, only {[hdu.name for hdu in hdus]}")
         header = hdus["KERNEL"].header
-        try:
+        with file_errors(path, "is not a complete matching kernel"):
             return MatchingKernel(
                 native(hdus["KERNEL"].data),
                 header["PIXSCALE"] * ANGLE,
@@ -204,8 +204,6 @@ def _read_kernel(path, *, ext=None, plane=None, pixel_scale=None, source=None):
                 meta=json.loads(header.get("META", "{}")),
                 **{k: native(hdus[k].data) for k in ("source", "target") if k.upper() in hdus},
             )
-        except (KeyError, TypeError, ValueError) as err:
-            raise data_error(path, f"is not a complete matching kernel: {err}") from err
 
 
 def _write_field(field, path, *, overwrite=False):

@@ -8,7 +8,7 @@ from unittest import mock
 from miricigale.instrument.history import TYPES
 from miricigale.reduction.references import ReferenceFiles
 from miricigale.utils.declared import declared
-from miricigale.utils.exceptions import data_error
+from miricigale.utils.exceptions import data_error, file_errors
 from miricigale.utils.optional import require
 from miricigale.utils.options import check_that
 
@@ -96,12 +96,9 @@ class ReferenceCache:
         rmap = require("crds.core.rmap", extra="jwst")
         # by which crds finds the mappings of a context
         own = mock.patch.dict(os.environ, CRDS_PATH=str(self.folder), CRDS_OBSERVATORY="jwst")
-        try:
-            with own:
-                rules = rmap.load_mapping(str(self._mappings / self.context))
-                chosen = rules.get_best_references(words, include=list(kinds.values()))
-        except Exception as err:
-            raise data_error(self.folder, f"cannot be read as a CRDS cache: {err}") from err
+        with file_errors(self.folder, "cannot be read as a CRDS cache", Exception), own:
+            rules = rmap.load_mapping(str(self._mappings / self.context))
+            chosen = rules.get_best_references(words, include=list(kinds.values()))
         files = {
             name: self._file(chosen[kind])
             for name, kind in kinds.items()

@@ -1,6 +1,6 @@
 """Reading of the bundled tables: images of FITS files, as read-only arrays."""
 
-from miricigale.utils.exceptions import data_error
+from miricigale.utils.exceptions import file_errors
 from miricigale.utils.files import cached_by_file, open_fits
 from miricigale.utils.units import frozen_array
 
@@ -13,11 +13,8 @@ def read_images(path, names, *, wanted):
 
     What ``wanted`` says that the file should be stands in the `DataError` if it is something else.
     """
-    try:
-        with open_fits(path, wanted=wanted) as hdus:
-            return {name: frozen_array(hdus[name].data) for name in names}
-    except KeyError as err:
-        raise data_error(path, f"is not {wanted}: {err.args[0]}") from err
+    with file_errors(path, f"is not {wanted}"), open_fits(path, wanted=wanted) as hdus:
+        return {name: frozen_array(hdus[name].data) for name in names}
 
 
 @cached_by_file(maxsize=2)

@@ -326,8 +326,8 @@ class SED(Frozen, Interactive):
         return kind(spectral_axis=self.wave, flux=self.fnu, meta=dict(self.meta))
 
     def plot(self, ax=None, **kwargs):
-        """Draw the spectrum (`miricigale.plotting.spectra.plot_spectrum`) and return the axes."""
-        from miricigale.plotting.spectra import plot_spectrum
+        """Draw the spectrum (`miricigale.plotting.curves.plot_spectrum`) and return the axes."""
+        from miricigale.plotting.curves import plot_spectrum
 
         return plot_spectrum(self.wave.value, self.fnu.value, ax=ax, **kwargs)
 

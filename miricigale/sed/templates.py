@@ -13,7 +13,7 @@ from miricigale.filters import FilterSet
 from miricigale.sed.components.igm import Meiksin2006
 from miricigale.sed.grid import ModelGrid
 from miricigale.sed.spectrum import SED
-from miricigale.utils.exceptions import ModelWarning, argument_error, data_error, warn
+from miricigale.utils.exceptions import ModelWarning, argument_error, data_error, file_errors, warn
 from miricigale.utils.meta import provenance
 from miricigale.utils.missing import plain_floats
 from miricigale.utils.options import check_choice, check_data, check_that
@@ -92,7 +92,7 @@ def _read_file(file):
         raise data_error(file, f"cannot be read as a spectrum: {got}")
     first, *others = table.colnames
     gravities = [name for name in others if re.fullmatch(r"g\d\d", name)]
-    try:
+    with file_errors(file, "cannot be read as a spectrum"):
         # NaN where a value is lacking, which is none of a spectrum
         wave = plain_floats(table[first], first, "spectrum") * _unit(table[first], u.AA)
         endings = "|".join(map(re.escape, _SUFFIXES))
@@ -107,8 +107,6 @@ def _read_file(file):
                     name = stem if part is None else f"{stem}[{part}]"
                     out[name] = SED(wave, one * _unit(table[column], _FLAM))
         return out
-    except (TypeError, ValueError, u.UnitsError) as err:
-        raise data_error(file, f"cannot be read as a spectrum: {err}") from err
 
 
 def _unit(column, default):

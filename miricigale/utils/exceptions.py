@@ -1,5 +1,6 @@
 """Errors and warnings of the package, and the one way to word them."""
 
+import contextlib
 import difflib
 import sys
 import warnings
@@ -88,6 +89,16 @@ def config_error(where, what):
 def data_error(path, what):
     """Make the `DataError` that names a file and says what is wrong with it."""
     return DataError(f"{path} {what}")
+
+
+@contextlib.contextmanager
+def file_errors(path, what, *kinds):
+    """Raise what is wrong with the content of a file, or these kinds too, as a `DataError` that names it."""
+    try:
+        yield
+    except (KeyError, IndexError, TypeError, ValueError, *kinds) as err:
+        said = err.args[0] if isinstance(err, KeyError) and err.args else err
+        raise data_error(path, f"{what}: {said}") from err
 
 
 #: Of more names than this an error lists the nearest ones only.

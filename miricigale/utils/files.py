@@ -333,7 +333,9 @@ def writing(path):
     try:
         yield
     except OSError as err:
-        if isinstance(err, DataError) or err.filename is not None or str(path) in str(err):
+        # the name of a file that is not whole yet ends in its own
+        named = err.filename is not None and not str(err.filename).endswith(f"-{Path(path).name}")
+        if isinstance(err, DataError) or named or str(path) in str(err):
             raise
         if err.errno is not None:
             raise OSError(err.errno, err.strerror, str(path)) from err

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from astropy.io.fits import VerifyError
 
-from miricigale.utils.exceptions import data_error
+from miricigale.utils.exceptions import data_error, file_errors
 from miricigale.utils.files import open_fits, write_fits, writing
 from miricigale.utils.meta import plain_value, undated
 from miricigale.utils.table_files import table_hdu
@@ -141,10 +141,8 @@ def open_parts(path, layouts, *, wanted, memmap=False):
     with open_fits(path, wanted=wanted, memmap=memmap) as hdus:
         if hdus[0].header.get("FORMAT") not in layouts:
             raise data_error(path, f"holds no {wanted} (no FORMAT = {layouts[0]!r} in its header)")
-        try:
+        with file_errors(path, f"is not a complete file of {wanted}", VerifyError):
             yield Parts(hdus)
-        except (KeyError, IndexError, TypeError, ValueError, VerifyError) as err:
-            raise data_error(path, f"is not a complete file of {wanted}: {err}") from err
 
 
 class Parts:

@@ -42,8 +42,7 @@ def study_cost(config):
     What a run takes: units, processor time, disk and memory by stage.
 
     Times are of a core on which the plain loop of ``benchmarks/fit.py`` takes 0.03 s an object with ``--kind
-    quick``, kernels compiled, after runs of one pointing (docs/accuracy/running.rst); those of many are not
-    measured.
+    quick``, kernels compiled, after runs of 1, 9 and 25 pointings (docs/accuracy/running.rst).
 
     Parameters
     ----------
@@ -142,7 +141,7 @@ class _Size:
         }
 
     def seconds(self):
-        """Processor time by stage, of one pointing; small and optional stages have none."""
+        """Processor time by stage; small and optional stages have none."""
         truths, bands, config = self.truths, self.n_bands, self.config
         # of an exposure as rates, or of an exposure and all groups of its pixels
         each = 5.0
@@ -157,9 +156,9 @@ class _Size:
             "highres": 5e-7 * self.fine + 3e-3 * self.n_drawn,
             "kernels": 0.8 * self.n_kernels,
             "templates": 5e-7 * self.fine + 7e-3 * self.n_drawn,
-            "photometry": truths * bands * (5e-7 * self.native + 9e-3 * self.n_drawn),
+            "photometry": truths * bands * (5e-7 * self.native + 1.4e-2 * self.n_drawn),
             "points": config.point_sources.enabled * bands * (each + 3.0),
             "fits": truths * self.n_sets * 1.9e-3 * self.n_imaged,
-            "sources": truths * 5.0,
-            "report": 12.0,
+            "sources": truths * (5.0 + 2.5e-3 * self.n),
+            "report": 12.0 + 1.5e-3 * self.n,
         }

@@ -1,6 +1,7 @@
 """What a study simulates more than once, and what it fits of each: truths and sets of bands."""
 
 import dataclasses
+import itertools
 
 from miricigale.filters import Filter
 
@@ -143,6 +144,11 @@ def band_sets(config):
     half = (len(by_wave) + 1) // 2
     chosen = {"all": bands, "none": (), "blue": by_wave[:half], "red": by_wave[half:]}
     return {name: tuple(b for b in bands if b in chosen[name]) for name in config.fit.sets}
+
+
+def unit_names(*parts):
+    """Names of units, ``a/b/...``, of all combinations of some parts; one without a name is left out."""
+    return tuple("/".join(filter(None, one)) for one in itertools.product(*parts))
 
 
 def variant_changes(config):

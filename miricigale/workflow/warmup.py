@@ -119,9 +119,9 @@ def _photometry():
 
 #: What is compiled together: what it is, and about how many seconds it takes on a slow machine.
 JOBS = {
-    "fit": (_fit, "model spectra and their fit", 40),
+    "fit": (_fit, "model spectra and their fit", 60),
     "images": (_images, "scenes, detector and reduction", 50),
-    "photometry": (_photometry, "photometry", 20),
+    "photometry": (_photometry, "photometry", 60),
 }
 
 

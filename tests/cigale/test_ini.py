@@ -283,15 +283,19 @@ def nearer(redshift, node):
     return (d[0] / d[1]) ** 2 * (1 + np.array(node)) / (1 + np.array(redshift))
 
 
+@pytest.fixture(scope="module")
+def three(tmp_path_factory):
+    """Photometry of three models, and all that is known of them."""
+    return models(quiet(write(tmp_path_factory.mktemp("three"))), ROWS)
+
+
 @pytest.fixture
-def run(tmp_path):
+def run(three, tmp_path):
     """Three models, written as CIGALE's files."""
-    path = write(tmp_path)
-    setup = quiet(path)
-    fluxes, truth = models(setup, ROWS)
+    path, near = write(tmp_path), [0.52, 1.26, 0.5]
     # redshifts that round to the models'
-    write_catalog(tmp_path / "galaxies.txt", [0.52, 1.26, 0.5], fluxes, setup.bands.values())
-    return path, fluxes, truth
+    write_catalog(tmp_path / "galaxies.txt", near, three[0], quiet(path).bands.values())
+    return path, *three
 
 
 def test_a_run_gives_the_models_back(run, tmp_path):
@@ -656,14 +660,14 @@ def test_best_models_have_x_rays(tmp_path):
     assert np.all(rows["xray.galaxy"][energy < 0.1] == 0)
 
 
-def test_x_ray_bands_are_fitted_where_there_is_a_module(tmp_path):
+def test_x_ray_bands_are_fitted_where_there_is_a_module(three, tmp_path):
     setup = quiet(with_xrays(tmp_path))
     assert "xray" not in setup.describe()
     assert setup.xray["alpha_ox"].tolist() == [-1.7, -1.4]
     assert setup.xray["angle_coefficients"] == (0.5, 0.0)
     assert setup.bands[BAND] == BAND
     assert setup.filters().names[0] == BAND
-    fluxes, _ = models(quiet(write(tmp_path)), ROWS)
+    fluxes, _ = three
     # X-rays of the first model: the mean of the two slopes, -0.15 / 0.3838 dex from either
     catalog = QTable({"id": ["a"], "redshift": [0.5]})
     for name, theirs in setup.bands.items():

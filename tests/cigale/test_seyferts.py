@@ -23,15 +23,24 @@ def numbers(table, name):
     return np.ma.filled(np.ma.asarray(getattr(column, "value", column), float), np.nan)
 
 
+@pytest.fixture(scope="module")
+def libraries(data_file, tmp_path_factory):
+    """A data folder with Dale 2014 and SKIRTOR."""
+    folder = tmp_path_factory.mktemp("libraries")
+    with conf.set_temp("data_folder", str(folder)):
+        add_library("dust.dale2014", data_file("dale2014/dhcal.dat").parent)
+        add_library("torus.skirtor2016", data_file("skirtor2016/SKIRTOR.fits.gz"))
+    return folder
+
+
 @pytest.fixture(scope="module", params=["bundled", "best"])
-def tables(request, data_file, tmp_path_factory):
-    """Ours and CIGALE's: with bundled libraries, and with Dale 2014 and SKIRTOR (q 0 for the run's q 1)."""
+def tables(request, data_file, libraries, tmp_path_factory):
+    """Ours and CIGALE's: with bundled libraries, and with others (q 0 for the run's q 1)."""
     tmp_path = tmp_path_factory.mktemp(request.param)
     text = data_file(f"{RUN}/pcigale.ini").read_text()
-    with conf.set_temp("data_folder", str(tmp_path / "data")):
+    folder = libraries if request.param == "best" else tmp_path / "data"
+    with conf.set_temp("data_folder", str(folder)):
         if request.param == "best":
-            add_library("dust.dale2014", data_file("dale2014/dhcal.dat").parent)
-            add_library("torus.skirtor2016", data_file("skirtor2016/SKIRTOR.fits.gz"))
             text = text.replace("    q = 1.0\n", "    q = 0.0\n")
         ini = tmp_path / "pcigale.ini"
         ini.write_text(text)
@@ -77,12 +86,9 @@ NAMES = ("ESO_428-14", "Mrk_493", "Mrk_509", "NGC_3516", "NGC_4748")
 
 
 @pytest.fixture(scope="module")
-def model(data_file, tmp_path_factory):
+def model(libraries):
     """The run's chain with its libraries of dust and torus (q 0), and the bundled stars and gas."""
-    folder = tmp_path_factory.mktemp("libraries")
-    with conf.set_temp("data_folder", str(folder)):
-        add_library("dust.dale2014", data_file("dale2014"))
-        add_library("torus.skirtor2016", data_file("skirtor2016/SKIRTOR.fits.gz"))
+    with conf.set_temp("data_folder", str(libraries)):
         options = {"polar_law": "smc_wd01", "disk": "schartmann2005", "disk_slope": -0.36}
         torus = parts.Skirtor2016(q=0.0, **options)
         law = parts.ModifiedStarburst(gas_law="mw", ebv_scaling="cigale")

@@ -41,12 +41,6 @@ def test_box_has_the_closed_form_wavelengths():
     assert_quantity_allclose(band.width, 4 * u.um, rtol=1e-5)
 
 
-def test_flux_through_a_box_has_the_closed_form():
-    # F_nu = lam through a box: int dlam / int dlam / lam, from two points only
-    sed = spectrum(np.array([1.0, 100.0]), np.array([1.0, 100.0]))
-    assert_quantity_allclose(box().synthetic_flux(sed), 4 / np.log(1.5) * u.uJy, rtol=1e-6)
-
-
 def test_flat_spectrum_has_its_flux_in_every_band():
     sed = spectrum(np.geomspace(0.05, 400, 37), np.full(37, 3.0))
     for name in Filter.names():

@@ -86,27 +86,29 @@ def coverage(results, true, name):
     return np.mean((values >= low) & (values <= high))
 
 
-def test_intervals_hold_the_truth_between_nodes(grid, drawn):
+@pytest.fixture(scope="module")
+def at_nodes(grid, drawn):
+    return interpolated(grid, 0).fit(drawn[0])
+
+
+def test_intervals_hold_the_truth_between_nodes(grid, drawn, at_nodes):
     table, true = drawn
     results = interpolated(grid, 150).fit(table)
-    nodes = interpolated(grid, 0).fit(table)
     for name in ("redshift", "tau", "ebv", "mass", "sfr", "beta"):
         # three times the binomial error of 300 objects
         assert abs(coverage(results, true, name) - 0.68) < 0.08, name
-    assert coverage(nodes, true, "mass") < 0.4
-    assert coverage(nodes, true, "sfr") < 0.4
+    assert coverage(at_nodes, true, "mass") < 0.4
+    assert coverage(at_nodes, true, "sfr") < 0.4
     for name in results.axes:
         assert_allclose(results.pdf[name].sum(axis=1), 1)
 
 
-def test_what_rests_on_one_node_is_flagged(grid, drawn):
-    table, _ = drawn
-    nodes = interpolated(grid, 0).fit(table)
-    alone = (nodes.flags & int(FitFlags.ONE_NODE)) != 0
-    top = np.minimum(nodes.pdf["redshift"].max(1), nodes.pdf["tau"].max(1))
+def test_what_rests_on_one_node_is_flagged(grid, drawn, at_nodes):
+    alone = (at_nodes.flags & int(FitFlags.ONE_NODE)) != 0
+    top = np.minimum(at_nodes.pdf["redshift"].max(1), at_nodes.pdf["tau"].max(1))
     assert np.all(top[alone] > 0.95)
     assert alone.sum() > 50
-    wide = interpolated(grid, 0, model_error=1.0).fit(table)
+    wide = interpolated(grid, 0, model_error=1.0).fit(drawn[0])
     assert not np.any(wide.flags & int(FitFlags.ONE_NODE))
 
 
@@ -183,6 +185,12 @@ def chain():
 
 
 @pytest.fixture(scope="module")
+def finer(chain):
+    """A fit between the nodes of a finer grid of the chain."""
+    return interpolated(chain[1], 300, chain[0])
+
+
+@pytest.fixture(scope="module")
 def off_nodes(chain):
     """80 models of the chain, of any node, anywhere in its cell, with S/N 10."""
     model, rng, n, true = chain[0], np.random.default_rng(4), 80, QTable()
@@ -198,14 +206,14 @@ def off_nodes(chain):
     return table, true, fluxes
 
 
-def test_interpolated_models_are_those_of_the_chain(chain, off_nodes):
+def test_interpolated_models_are_those_of_the_chain(chain, off_nodes, finer):
     """Between the nodes of a finer grid; between those of the grid itself they are far off."""
-    (model, grid), (_, true, fluxes) = chain, off_nodes
+    _, true, fluxes = off_nodes
     values = {name: true[name].value for name in CHAIN}
     want = np.column_stack([fluxes[name].value for name in CHAIN_BANDS])
     off = []
-    for finer in (None, model):
-        models = interpolated(grid, 1, finer).backend.between.finer
+    for fitter in (interpolated(chain[1], 1), finer):
+        models = fitter.backend.between.finer
         flux, power = models.fluxes(values, values["redshift"], values["frac_agn"])
         ratio = np.log(flux * 1e10 / want)
         off.append(np.sqrt(np.mean(np.minimum(np.abs(ratio), 0.3) ** 2)))
@@ -217,11 +225,10 @@ def test_interpolated_models_are_those_of_the_chain(chain, off_nodes):
         assert_allclose(derived[name], true[name].value, rtol=within)
 
 
-def test_intervals_of_galaxies_and_agn(chain, off_nodes):
+def test_intervals_of_galaxies_and_agn(chain, off_nodes, finer):
     """Of models of the chain, two-sided; ``benchmarks/intervals.py`` measures more of them."""
-    (model, grid), (table, true, _) = chain, off_nodes
-    results = interpolated(grid, 300, model).fit(table)
-    nodes = interpolated(grid, 0).fit(table)
+    table, true, _ = off_nodes
+    results, nodes = finer.fit(table), interpolated(chain[1], 0).fit(table)
     names = ("redshift", "frac_agn", "stellar_mass", "sfr", "dust_luminosity")
     held = {}
     for name in names:
@@ -232,7 +239,7 @@ def test_intervals_of_galaxies_and_agn(chain, off_nodes):
     assert abs(np.mean(list(held.values())) - 0.68) < 0.1
 
 
-def test_known_redshifts_between_nodes_are_those_of_the_chain(chain):
+def test_known_redshifts_between_nodes_are_those_of_the_chain(chain, finer):
     """Galaxies of the nodes at redshifts between: chi2 is that of no noise, whatever the cells' width."""
     model, grid = chain
     true = QTable({"redshift": [0.51, 0.87, 1.63, 2.71], "age": [1.0, 0.5, 2.0, 1.0] * u.Gyr})
@@ -243,7 +250,7 @@ def test_known_redshifts_between_nodes_are_those_of_the_chain(chain):
     for name in CHAIN_BANDS:
         table[name], table[f"{name}_err"] = fluxes[name], 0.02 * fluxes[name]
     known = np.array(true["redshift"])
-    results = interpolated(grid, 20, model).fit(table, redshift=known)
+    results = finer.fit(table, redshift=known)
     # fluxes are good to half a percent, a quarter of their errors
     assert np.all(results.chi2 < len(CHAIN_BANDS) / 10)
     nodes = interpolated(grid, 0).fit(table, redshift=known)

@@ -143,12 +143,6 @@ def test_ids_of_any_number_survive_files(grid, catalog, tmp_path, dtype):
         assert item.row(ids[5]) == 5
 
 
-def test_bytes_that_are_no_text_are_refused(grid, catalog):
-    table = Table(catalog)
-    table["id"] = np.array([b"a", "ä".encode("latin1"), b"c", b"d", b"e", b"f"])
-    refuses(r"bytes of text in UTF-8, got b'\\xe4'", node_fitter(grid).fit, table)
-
-
 def test_masked_redshifts_are_missing(grid, catalog):
     fitter = node_fitter(grid)
     z = np.array(catalog["redshift"], dtype=float)

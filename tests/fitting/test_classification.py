@@ -138,8 +138,9 @@ def sources(n, seed):
 def test_sources_of_known_class_are_sorted(fitters):
     """At S/N 20 in six bands nine of ten of each class are found, stars always (Planck's law is narrow)."""
     n = 20
+    data = sources(n, 11)
     with without_warnings():
-        table = compare_classes({name: f.fit(sources(n, 11)) for name, f in fitters.items()})
+        table = compare_classes({name: f.fit(data) for name, f in fitters.items()})
     right = np.char.startswith(table["id"].astype(str), table["class"].astype(str))
     galaxy, quasar, star = right.reshape(3, n).sum(axis=1)
     assert galaxy >= 0.9 * n

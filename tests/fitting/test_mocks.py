@@ -66,12 +66,11 @@ def test_without_noise_the_truth_comes_back(grid):
 
 
 def test_a_cut_changes_nothing(fitter, results, catalog, mock):
-    some = [7, 300, 12]
-    part = mock_analysis(fitter, fitter.fit(catalog[some]), catalog[some], seed=5)
+    few = catalog[[7, 300, 12]]
+    part, other = (mock_analysis(fitter, fitter.fit(few), few, seed=seed) for seed in (5, 6))
     for name in results.filters:
-        assert_array_equal(part.photometry[name], mock.photometry[name][some])
-    other = mock_analysis(fitter, results, catalog, seed=6)
-    assert np.any(other.photometry["band0"] != mock.photometry["band0"])
+        assert_array_equal(part.photometry[name], mock.photometry[name][[7, 300, 12]])
+    assert np.any(other.photometry["band0"] != part.photometry["band0"])
 
 
 def test_objects_without_fit_and_upper_limits_stay(fitter, catalog):
@@ -120,7 +119,7 @@ def test_bands_left_out(fitter, catalog, results):
 
 
 def test_a_wrong_zero_point_is_found(fitter, catalog):
-    table = catalog.copy()
+    table = catalog[:100].copy()
     table["band3"] = table["band3"] * 3.0
     out = leave_out(fitter, table, ["band3"])
     assert out.metrics()["offset"][0] == pytest.approx(2.0, abs=0.5)

@@ -6,7 +6,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
 from helpers.grids import draw_photometry, make_grid, node_fitter, photometry_table
@@ -31,17 +31,6 @@ PIVOTS = np.array([one.pivot.to_value(u.um) for one in FilterSet.from_names(BAND
 @pytest.fixture(scope="module")
 def grid():
     return replace(make_grid(7, n_z=5, n_tau=3, n_age=3), filters=BANDS)
-
-
-def test_one_that_is_everywhere_the_same_is_a_model_error(grid):
-    table, _ = draw_photometry(grid, 8, noise=0.1)
-    plain = node_fitter(grid, model_error=0.2).fit(table)
-    same = TemplateError([0.1, 10.0] * u.um, [0.2, 0.2])
-    ours = node_fitter(grid, model_error=0.0, template_error=same).fit(table)
-    assert_allclose(ours.pdf_2d, plain.pdf_2d, atol=1e-9)
-    for name in ("chi2", "log_evidence", "sigma", "best_flux"):
-        assert_allclose(getattr(ours, name), getattr(plain, name), rtol=1e-9)
-    assert_array_equal(ours.best_index, plain.best_index)
 
 
 def test_posterior_is_the_sum_over_models_with_the_errors_of_their_redshifts(grid):

@@ -8,7 +8,7 @@ import numpy as np
 from astropy.table import QTable
 from numpy.testing import assert_allclose
 from scipy.integrate import quad
-from scipy.stats import norm
+from scipy.special import log_ndtr
 
 from miricigale.fitting import BayesFitter, GridSettings
 from miricigale.sed import ModelGrid
@@ -227,21 +227,24 @@ def limited_scales(p, q, unit, level):
 
     ``unit`` is the model flux over the limits' sigma, shape (..., n), ``level`` the limit over it.
     """
+    if not unit.shape[-1]:
+        return np.maximum(p, 0.0) / q, 1.0 / q, 0.0
+
+    def hazard(u):
+        return np.exp(-0.5 * u**2 - log_ndtr(-u)) / np.sqrt(2 * np.pi)
 
     def slope(s):
-        u = s[..., None] * unit - level
-        return q * s - p + (np.exp(norm.logpdf(u) - norm.logsf(u)) * unit).sum(-1)
+        return q * s - p + (hazard(s[..., None] * unit - level) * unit).sum(-1)
 
     low, high = np.zeros(p.shape), np.maximum(p, 0.0) / q
-    for _ in range(120):
+    for _ in range(80):
         middle = 0.5 * (low + high)
         above = slope(middle) > 0
         low, high = np.where(above, low, middle), np.where(above, middle, high)
     s = np.where(slope(np.zeros(p.shape)) >= 0, 0.0, high)
     u = s[..., None] * unit - level
-    hazard = np.exp(norm.logpdf(u) - norm.logsf(u))
-    variance = 1.0 / (q + (hazard * (hazard - u) * unit**2).sum(-1))
-    return s, variance, -2.0 * norm.logsf(u).sum(-1)
+    variance = 1.0 / (q + (hazard(u) * (hazard(u) - u) * unit**2).sum(-1))
+    return s, variance, -2.0 * log_ndtr(-u).sum(-1)
 
 
 def brute_force(

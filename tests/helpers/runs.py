@@ -1,5 +1,7 @@
 """A run of made-up products: what the stages after the photometry read."""
 
+import itertools
+
 import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
@@ -14,7 +16,7 @@ from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.page.labels import end_bands
 from miricigale.workflow.stages import study_stages
 from miricigale.workflow.stages.exposures import study_exposures
-from miricigale.workflow.stages.inputs import existing_bands
+from miricigale.workflow.stages.inputs import existing_bands, pieces
 from miricigale.workflow.stages.truth import add_agn, add_field_agn
 from miricigale.workflow.truths import CATALOG, FIELD, study_truths
 
@@ -122,7 +124,8 @@ def make_run(folder, filters, *, mass=3e10, points=False, report=True, text_ids=
     light = SEDModel.yang2021(agn=False).fluxes(parameters, ["wfc3.f160w"])
     catalog["wfc3.f160w"] = light["wfc3.f160w"]
     made.save_table("catalog.ecsv", catalog)
-    do_stage(config, folder, "seds")
+    for piece in pieces(count):
+        do_stage(config, folder, "seds", piece)
     for name in filters:
         made.save_result(f"kernel_{name}.fits", made_up_kernel())
         bright = QTable({"flux_true": np.full(5, 100.0) * u.uJy})
@@ -138,8 +141,8 @@ def make_run(folder, filters, *, mass=3e10, points=False, report=True, text_ids=
     do_stage(config, folder, "errors")
     for name in study_truths(config):
         do_stage(config, folder, "matches", name)
-        for unit in config.fit.sets:
-            do_stage(config, folder, "fits", f"{name}/{unit}")
+        for unit in itertools.product([name], config.fit.sets, pieces(count)):
+            do_stage(config, folder, "fits", "/".join(filter(None, unit)))
     for unit in STAGES["skies"].unit_names(config):
         do_stage(config, folder, "skies", unit)
     if report:

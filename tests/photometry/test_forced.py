@@ -332,8 +332,7 @@ def test_blends_are_flagged_and_twins_not_counted_twice(tools):
     assert result.crowded.tolist() == [True, True, False, True]
 
 
-@pytest.mark.parametrize("n_threads", [2, 3])
-def test_threads_do_not_change_a_bit(tools, monkeypatch, n_threads):
+def test_threads_do_not_change_a_bit(tools, monkeypatch):
     # pieces so small that there are many for each thread
     monkeypatch.setattr("miricigale.photometry.templates._PART", 5000)
     monkeypatch.setattr("miricigale.photometry.errors._PAIRS", 7)
@@ -343,10 +342,11 @@ def test_threads_do_not_change_a_bit(tools, monkeypatch, n_threads):
     segmentation, _ = detect_sources(high, threshold=1.0, n_pixels=10)
     photometer = ForcedPhotometer(tools.kernel, background_order=0)
     arguments = low, high, segmentation, QTable({"sky": sky})
-    alone, shared = (photometer.replace(n_threads=n).measure(*arguments) for n in (1, n_threads))
+    alone, *shared = (photometer.replace(n_threads=n).measure(*arguments) for n in (1, 2, 3))
     assert alone.noise_correlation.shape[0] > 1
     assert np.isfinite(alone.flux.value).all()
-    assert_equal_values("result", alone, shared, skip=("wcs", "meta"))
+    for one in shared:
+        assert_equal_values("result", alone, one, skip=("wcs", "meta"))
 
 
 def test_integration_over_pixels(tools):

@@ -11,7 +11,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 from helpers.errors import refuses
 from helpers.mosaics import flagged
 from miricigale.instrument import north_up_wcs
-from miricigale.photometry import ErrorSettings, ForcedFlags, ForcedPhotometer, detect_sources
+from miricigale.photometry import (
+    ErrorSettings,
+    ForcedFlags,
+    ForcedPhotometer,
+    SourceTemplates,
+    detect_sources,
+)
 from miricigale.photometry.catalogs import joined_sky
 
 
@@ -137,8 +143,10 @@ def nuclei(tools):
 def test_points_on_top_of_galaxies(tools, nuclei):
     catalog = QTable({"sky": nuclei.sky})
     fixed = {"errors": ErrorSettings(size_scatter=None)}
+    low, *prior = nuclei.images
+    templates = SourceTemplates.from_images(*prior, catalog, psf=tools.kernel.source)
     one, free, exact, two = (
-        ForcedPhotometer(tools.kernel, **options).measure(*nuclei.images, catalog)
+        ForcedPhotometer(tools.kernel, **options).measure(low, templates=templates)
         for options in (fixed, {}, {"components": 2, **fixed}, {"components": 2})
     )
     assert one.flux_point is free.flux_point is None

@@ -4,7 +4,7 @@ from numpy.testing import assert_array_equal
 
 from helpers.figures import legend_texts, line_data
 from miricigale.filters import FilterSet
-from miricigale.plotting.filters import plot_filters
+from miricigale.plotting.curves import plot_filters
 
 
 def test_curves_are_drawn_with_their_names(ax):

@@ -1,7 +1,7 @@
 import numpy as np
 from numpy.testing import assert_array_equal
 
-from miricigale.plotting.spectra import plot_spectrum
+from miricigale.plotting.curves import plot_spectrum
 
 
 def test_a_spectrum_on_logarithmic_axes_leaves_out_what_is_not_positive(ax):

@@ -48,12 +48,6 @@ def put(folders, content=TEXT):
     return path
 
 
-def test_bundled_files_are_there_and_whole():
-    states = {row.name: row.state for row in check_resources()}
-    kinds = {name: record.kind for name, record in registry.resources().items()}
-    assert {states[name] for name, kind in kinds.items() if kind == "bundled"} == {"ok"}
-
-
 def test_data_folder_is_set_by_the_user(folders):
     assert data_folder() == folders / "data"
     with conf.set_temp("data_folder", ""):

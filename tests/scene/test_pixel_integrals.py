@@ -29,7 +29,7 @@ def on_cells(value, fine):
     return (np.floor((value + 0.5) * fine) + 0.5) / fine - 0.5
 
 
-def by_small_cells(n, radius, ratio, x, y, theta, *, size, sigma, fine=16, pad=9):
+def by_small_cells(n, radius, ratio, x, y, theta, *, size, sigma, fine=16, pad=7):
     """
     Closed-form light of small cells (tested by quadrature on their own), times a Gaussian.
 
@@ -43,7 +43,7 @@ def by_small_cells(n, radius, ratio, x, y, theta, *, size, sigma, fine=16, pad=9
         (cells, cells), x=at[0], y=at[1], r_eff=radius * fine, n=n, axis_ratio=ratio, theta=theta
     )
     for axis in (0, 1):
-        image = gaussian_filter1d(image, sigma * fine, axis=axis, truncate=8.5)
+        image = gaussian_filter1d(image, sigma * fine, axis=axis, truncate=6.0)
     image = image.reshape(size + 2 * pad, fine, size + 2 * pad, fine).sum(axis=(1, 3))
     return image[pad:-pad, pad:-pad]
 

@@ -39,19 +39,6 @@ def test_placement_to_a_thousandth_of_the_peak(wcs, oversampling):
     np.testing.assert_allclose(image, truth, atol=limit * truth.max())
 
 
-@pytest.mark.parametrize("radius", [0.01, 0.05, 0.15, 0.5])
-@pytest.mark.parametrize("ratio", [0.1, 0.4, 1.0])
-def test_gaussian_galaxy_adds_its_variance(wcs, psf, radius, ratio):
-    # position angle 90 deg is along x on a north-up image
-    shape = {"radius": radius, "index": 0.5, "ratio": ratio, "angle": 90.0}
-    catalog = scenes.make_catalog(wcs, 50.3, 44.7, profile="sersic", **shape)
-    image = light(make_scene(catalog, wcs, psf, enclosed=0.99999))
-    own = radius / 0.11 / np.sqrt(2 * np.log(2))
-    rows = pixel_gaussian(90, 44.7, np.hypot(0.85, ratio * own))
-    truth = 10 * np.outer(rows, pixel_gaussian(100, 50.3, np.hypot(0.85, own)))
-    np.testing.assert_allclose(image, truth, atol=1e-3 * truth.max())
-
-
 @pytest.mark.parametrize("parity", [-1, 1])
 @pytest.mark.parametrize("pa", [0.0, 35.0, 200.0])
 def test_position_angles_land_right(psf, pa, parity):

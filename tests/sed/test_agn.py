@@ -275,23 +275,22 @@ def test_hidden_disk_is_weak_in_the_visible(torus, wave):
     assert 1e-5 < np.interp(0.5, wave, parts.disk) / np.interp(0.5, wave, parts.face_on) < 1e-3
 
 
-def test_torus_against_skirtor(data_file, torus, wave):
+def test_torus_against_skirtor(real, torus, wave):
     """Shape in 2-40 um and the scale of dust light over disk light; tau 5, i 80 left out."""
-    library = read_skirtor(data_file("skirtor2016/SKIRTOR.fits.gz"))
     grid = np.geomspace(2, 40, 61)
     shape, scale = [], []
-    for k in range(library.n_rows):
-        tau, angle = (float(library.axes[a][k]) for a in ("tau97", "inclination"))
+    for k in range(real.n_rows):
+        tau, angle = (float(real.axes[a][k]) for a in ("tau97", "inclination"))
         if tau == 5 and angle == 80:
             continue
-        theirs = library.spectra["dust"][k] * library.wave
+        theirs = real.spectra["dust"][k] * real.wave
         values = values_of(torus, q=0.0, tau97=tau, inclination=angle)
         ours = torus.torus_spectra(wave, values).dust
         ratio = np.log10(np.interp(grid, wave, ours * wave))
         log = np.log10(np.maximum(theirs, 1e-30))
-        ratio -= np.interp(np.log(grid), np.log(library.wave), log)
+        ratio -= np.interp(np.log(grid), np.log(real.wave), log)
         shape.append(ratio - ratio.mean())
-        power = np.trapezoid(theirs / library.wave, library.wave)
+        power = np.trapezoid(theirs / real.wave, real.wave)
         scale.append(np.log10(np.trapezoid(ours, wave) / power))
     assert np.sqrt(np.mean(np.square(shape))) < 0.058
     assert np.sqrt(np.mean(np.square(shape), axis=1)).max() < 0.15

@@ -215,13 +215,6 @@ def test_gas_laws_of_pei_agree_with_dust_extinction(law):
     assert_allclose(gas_curve(wave, law), pei(wave, law), rtol=1e-6, atol=1e-9)
 
 
-@pytest.mark.parametrize("x", [2.9, 3.5, 4.6, 5.5, 7.0, 8.0])
-def test_gas_law_of_the_lmc_is_that_of_howarth(x):
-    """Howarth 1983, MNRAS 203, 301: fit to the LMC for x = 1 um / lambda from 2.75 to 9."""
-    want = 3.1 - 0.236 + 0.462 * x + 0.105 * x**2 + 0.454 / ((x - 4.557) ** 2 + 0.293)
-    assert gas_curve(1.0 / x, "lmc")[0] == pytest.approx(want, rel=0.06)
-
-
 @pytest.mark.parametrize("changes", [{}, {"slope": -0.5, "uv_bump": 3.0}])
 @pytest.mark.parametrize("scaling", ["exact", "cigale"])
 def test_stars_have_the_starburst_curve_and_their_share(changes, scaling):

@@ -11,17 +11,6 @@ from miricigale.utils.exceptions import DataError
 # ----------------------------------------------------------------------------- stars
 
 
-def test_sun_like_luminosity_of_an_old_population():
-    """M/L_V of an old solar population with a Kroupa IMF is a few (BC03: about 2.5-3.5 at 10 Gyr)."""
-    stars = BC03()
-    age, spectra, living = stars.table(0.02)
-    row = np.argmin(np.abs(age - 1e4))
-    visual = np.interp(0.551, stars.nodes(), spectra[row])  # W/um per Msun formed
-    sun = 10 ** (-0.4 * (4.81 + 21.1)) * 1e-7 * 1e4 * 1e4  # W/m2/um at 10 pc
-    sun *= 4 * np.pi * (10 * 3.0857e16) ** 2
-    assert 1.5 < living[row] * sun / visual < 4.0
-
-
 @pytest.mark.parametrize("name", ["delayed0.5", "delayed1", "delayed3"])
 def test_delayed_composites_agree_with_those_of_bc03(data_file, name):
     """

@@ -50,7 +50,8 @@ def build(folder, text):
     source = folder / "source"
     (source / "method").mkdir(parents=True)
     (source / "conf.py").write_text(
-        f"import sys\nsys.path.insert(0, {str(DOCS / '_ext')!r})\nextensions = ['sed_component']\n"
+        f"import sys\nsys.path.insert(0, {str(DOCS / '_ext')!r})\n"
+        "extensions = ['sed_component']\nplot_formats = ['png']\n"
     )
     (source / "method" / "data.rst").write_text(":orphan:\n\nData\n====\n")
     (source / "index.rst").write_text(text)

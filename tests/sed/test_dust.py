@@ -277,29 +277,16 @@ def test_alpha_sequence_against_dale_2014(real_dale):
 # -------------------------------------------------------------------- Casey 2012
 
 
-def test_blackbody_is_planck_times_one_minus_exp_of_minus_tau():
+@pytest.mark.parametrize(("temperature", "beta"), [(50.0, 1.8), (100.0, 1.0), (80.0, 2.0)])
+def test_blackbody_is_planck_times_one_minus_exp_of_minus_tau(temperature, beta):
     part = Casey2012()
     wave = part.nodes()
-    got = part.parts(values_of(part, temperature_dust=50.0, emissivity_dust=1.8))[0]
-    planck = BlackBody(temperature=50 * u.K)(wave * u.um).value / wave**2
-    truth = planck * (1.0 - np.exp(-((200.0 / wave) ** 1.8)))
+    got = part.parts(values_of(part, temperature_dust=temperature, emissivity_dust=beta))[0]
+    planck = BlackBody(temperature=temperature * u.K)(wave * u.um).value / wave**2
+    truth = planck * (1.0 - np.exp(-((200.0 / wave) ** beta)))
     # hot enough to stay clear of underflow
     ratio = (got / truth)[wave > 5.0]
     assert_allclose(ratio, ratio[0], rtol=1e-6)
-
-
-@pytest.mark.parametrize("beta", [1.0, 1.6, 2.0])
-def test_rayleigh_jeans_tail(beta):
-    """dlnL/dlnl = -5 + x/(1-exp(-x)) - beta tau/(exp(tau)-1); -(4 + beta) in the limit."""
-    part = Casey2012()
-    wave = part.nodes()
-    spectrum = part.spectrum(values_of(part, temperature_dust=100.0, emissivity_dust=beta))
-    slope = np.gradient(np.log(spectrum), np.log(wave))
-    at = np.searchsorted(wave, [500.0, 1000.0, 2500.0])
-    x, tau = 14387.77 / wave[at] / 100.0, (200.0 / wave[at]) ** beta
-    closed = -5.0 + x / (1.0 - np.exp(-x)) - beta * tau / np.expm1(tau)
-    assert_allclose(slope[at], closed, atol=2e-3)
-    assert slope[at[-1]] == pytest.approx(-(4.0 + beta), abs=0.08)
 
 
 @pytest.mark.parametrize("alpha", [1.5, 2.0, 3.0])

@@ -14,7 +14,6 @@ from miricigale.utils.tables import (
     described_rows,
     match_sky,
     require_columns,
-    unique_ids,
 )
 
 
@@ -50,11 +49,6 @@ def test_require_columns():
         args = (require_columns, table, [], "photometry")
         match = f"'photometry' column '{name}' must be convertible to {unit}"
         refuses(match, *args, error=u.UnitsError, units={name: unit})
-
-
-def test_unique_ids():
-    assert_array_equal(unique_ids([3, 1, 2], "catalog"), [3, 1, 2])
-    refuses(r"'catalog' must be .* duplicates such as \[1\]", unique_ids, [1, 1, 2], "catalog")
 
 
 def sky(x, y):

@@ -98,12 +98,6 @@ def test_missing_files_and_presets_are_named(tmp_path):
     refuses(r"binary\.toml is not a text file in UTF-8", load_config, binary, error=ConfigError)
 
 
-def test_overrides_win():
-    config = load_config("goodss", overrides={"run": {"seed": 5}, "sed": {"frac_agn": 0}})
-    assert config.run.seed == 5
-    assert config.sed.frac_agn == (0.0,)
-
-
 @pytest.mark.parametrize("config", [StudyConfig(), PlanConfig()], ids=["study", "plan"])
 def test_every_key_is_explained_and_nothing_else(config):
     for section in vars(config).values():

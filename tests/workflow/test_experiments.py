@@ -13,7 +13,7 @@ from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow import Context, load_config
 from miricigale.workflow.config import StudyConfig
-from miricigale.workflow.page.declared import texts_of
+from miricigale.workflow.page.labels import texts_of
 from miricigale.workflow.page.numbers import StudyTables
 from miricigale.workflow.page.study_page import DeclaredPage
 from miricigale.workflow.stages import experiments

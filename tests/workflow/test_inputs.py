@@ -10,7 +10,7 @@ from astropy.table import QTable, Table
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
-from helpers.runs import do_stage
+from helpers.runs import STAGES, do_stage
 from helpers.scenes import catalog_at
 from miricigale.fitting import FitResults
 from miricigale.scene import CatalogFlags, check_catalog
@@ -67,6 +67,27 @@ def test_without_errors_short_bands_get_five_percent(galaxies, tmp_path):
     # drawn, each its own
     assert np.all((truth["alpha"] >= 1.5) & (truth["alpha"] <= 2.5))
     assert truth["alpha"][0] != truth["alpha"][1]
+
+
+def test_a_long_catalog_is_fitted_in_pieces_to_the_same_truth(galaxies, tmp_path, monkeypatch):
+    table = galaxies[[0, 1, 0]]
+    table["id"], table["redshift"] = [1, 2, 3], [0.8, 0.3, 1.7]
+    table.write(tmp_path / "mine.ecsv")
+    config = StudyConfig.from_dict({"catalog": {"source": str(tmp_path / "mine.ecsv")}})
+    seds, truths = STAGES["seds"], {}
+    for size, pieces in ((3, [""]), (2, ["0000", "0001"])):
+        folder = tmp_path / str(size)
+        monkeypatch.setattr("miricigale.workflow.stages.inputs.LONG", size)
+        monkeypatch.setattr("miricigale.workflow.engine.stage.LONG", size)
+        StudyRunner(config, folder, study_stages, until="truth").run()
+        assert list(seds.unit_names(config)) == pieces
+        truths[size] = QTable.read(next(folder.glob("agn00/truth.*")))
+    assert sorted(folder.glob("input_seds*")) == [
+        folder / "input_seds_0000.fits",
+        folder / "input_seds_0001.fits",
+    ]
+    for name in ("id", "redshift", "mass", "age", "tau", "ebv", "alpha", "miri.f770w"):
+        assert_array_equal(truths[2][name], truths[3][name])
 
 
 def test_the_catalogs_own_errors_are_used_beyond_three_micron_too(galaxies, tmp_path):

@@ -123,7 +123,8 @@ def test_only_the_disks_are_clumpy_and_points_keep_their_light():
     assert add_clumps(table[:3], BAND, share=0.2, seed=SEED)[BAND].sum() == table[BAND][:3].sum()
 
 
-def image_of_galaxies(*, psf_sigma=1.2, noise=0.002):
+@pytest.fixture(scope="module")
+def drawn():
     """Spirals that no Sersic profile describes, on 0.06 arcsec pixels, with a point and a faint galaxy."""
     wcs = scenes.tan_wcs(shape=(400, 400), scale=PIXEL)
     x, y = [100.0, 280.0, 120.0, 290.0, 200.0], [110.0, 100.0, 290.0, 280.0, 200.0]
@@ -133,18 +134,18 @@ def image_of_galaxies(*, psf_sigma=1.2, noise=0.002):
     )  # fmt: skip
     table["profile"][4] = "point"
     table[PRIOR] = table[BAND]
-    width = 2.3548 * psf_sigma * PIXEL * u.arcsec
+    width = 2.3548 * 1.2 * PIXEL * u.arcsec
     psf = gaussian_psf(width, pixel_scale=PIXEL * u.arcsec, fov=4 * u.arcsec)
     clumpy = add_clumps(table, PRIOR, share=0.4, seed=2)
     image = Scene(clumpy, filter=PRIOR, wcs=wcs, psf=psf).render()
-    data = image.data + noise * np.random.default_rng(1).normal(size=image.shape)
+    data = image.data + 0.002 * np.random.default_rng(1).normal(size=image.shape)
     mask = np.zeros(data.shape, bool)
     return CCDData(data, unit="MJy/sr", wcs=wcs, mask=mask), psf, table, clumpy
 
 
 @pytest.fixture(scope="module")
-def field():
-    image, psf, table, clumpy = image_of_galaxies()
+def field(drawn):
+    image, psf, table, clumpy = drawn
     return RealGalaxies(image, psf), table, clumpy
 
 
@@ -218,8 +219,8 @@ def test_drawn_galaxies_have_size_place_and_turn_of_the_source(field):
     refuses(NONE.format(1), stamps_of_sources, table, galaxies, **options)
 
 
-def test_masked_galaxies_and_those_at_the_edge_are_not_used():
-    image, psf, table, _ = image_of_galaxies()
+def test_masked_galaxies_and_those_at_the_edge_are_not_used(drawn):
+    image, psf, table = drawn[0].copy(), *drawn[1:3]
     image.mask[110, 100] = True
     # that of row 2 ends 1 arcsec from the edge
     image = CCDData(image.data[:300], mask=image.mask[:300], unit=image.unit, wcs=image.wcs[:300])
@@ -240,9 +241,9 @@ def test_stamps_come_back_from_their_file(field, tmp_path):
         assert back[key].center == stamp.center
 
 
-def test_a_study_paints_the_light_of_an_image(tmp_path, monkeypatch):
+def test_a_study_paints_the_light_of_an_image(drawn, tmp_path, monkeypatch):
     """From a file to the sky of an exposure: the truth keeps its profiles, the scene has the stamps."""
-    image, _, table, _ = image_of_galaxies()
+    image, table = drawn[0].copy(), drawn[2].copy()
     image.write(tmp_path / "galaxies.fits")
     bands = ["acs.f606w", "acs.f814w", "wfc3.f125w", PRIOR]
     parameters = QTable({"redshift": np.full(len(table), 1.0), "age": np.full(len(table), 1.0)})

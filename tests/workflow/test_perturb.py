@@ -285,7 +285,7 @@ def chain():
     known = {}
 
     def run(effects, flux=1.0):
-        key = str(effects), flux
+        key = str(effects), str(flux)
         if key not in known:
             catalog = table.copy()
             catalog[BAND] = flux * catalog[BAND]
@@ -380,12 +380,10 @@ def test_another_flat_takes_the_place_of_the_known_one(chain):
 
 
 def test_another_linearity_shows_where_wells_are_full(chain):
-    changes = []
-    for flux in (0.1, 2.0):
-        images = (chain(effects, flux) for effects in ({}, {"linearity": 0.05}))
-        first, second = (stars(cal, places)[0] for _, cal, places in images)
-        changes.append(np.median(second / first) - 1)
-    faint, bright = changes
+    flux = np.tile([0.1, 2.0], 3)
+    images = (chain(effects, flux) for effects in ({}, {"linearity": 0.05}))
+    first, second = (stars(cal, places)[0] for _, cal, places in images)
+    faint, bright = np.median((second / first - 1).reshape(3, 2), axis=0)
     # signals are larger than they are taken for where wells are full
     assert bright < -0.005
     assert abs(faint) < 0.15 * abs(bright)

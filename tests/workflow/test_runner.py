@@ -11,7 +11,7 @@ from helpers.errors import refuses
 from miricigale.refdata import locate
 from miricigale.utils.exceptions import ConfigError, DataError, MiricigaleWarning, OtherResultsError
 from miricigale.workflow.config import StudyConfig, load_config
-from miricigale.workflow.engine.runner import StudyRunner, check_disk
+from miricigale.workflow.engine.runner import StudyRunner
 from miricigale.workflow.engine.stage import Stage, Units
 from miricigale.workflow.engine.store import ProductStore
 from miricigale.workflow.stages import study_stages
@@ -414,11 +414,6 @@ def test_a_part_of_the_stages_and_units(folder):
     refuses(wanted, run, error=ConfigError, until="first", again="second")
     # stages must come after what they need
     refuses("stage 'second' needs", run_stages, folder, *stages[1:], error=ConfigError)
-
-
-def test_a_full_disk_is_text_before_the_run(tmp_path):
-    refuses("the run needs about", check_disk, tmp_path / "not" / "yet", 10**18, error=DataError)
-    check_disk(tmp_path / "not" / "yet", 1)
 
 
 @pytest.mark.parametrize(

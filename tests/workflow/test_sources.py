@@ -41,7 +41,7 @@ def read_page(folder, name="agn00"):
 def run(tmp_path_factory):
     """A run with a sample, and what its page holds."""
     folder = tmp_path_factory.mktemp("sources") / "run"
-    make_run(folder, BANDS)
+    make_run(folder, BANDS, report=False)
     do_stage(small_config(BANDS), folder, "sources", "agn00")
     return folder, *read_page(folder)
 
@@ -200,7 +200,6 @@ def test_the_page_needs_nothing_from_outside(run):
     assert set(re.findall(r"\w+://[^\"'\s)]*", text)) <= {"http://www.w3.org/2000/svg"}
     assert not re.search(r"\b(fetch|XMLHttpRequest|import)\b", text)
     assert not re.findall(r"<(?:script|link|img)[^>]*\b(?:src|href)=", text)
-    assert "href='sources-agn00.html'" in (report / "index.html").read_text("utf-8")
     assert len(list((report / "sources/agn00").glob("*.js"))) == -(-24 // CHUNK)
 
 

@@ -1,4 +1,4 @@
-"""A study of small stages, run as a script: what is killed and compared in the tests."""
+"""A study of small stages, run as a script or here: what is killed and compared in the tests."""
 
 import contextlib
 import os
@@ -43,12 +43,12 @@ def stages():
 
 
 def main(folder, n_processes, *options):
-    """Options are ``cluster``, ``redo``, and a number for units c and d."""
+    """Options are ``cluster``, ``redo``, and a number for units c and d; no process is this one."""
     numbers = [float(one) for one in options if one not in ("cluster", "redo")]
     scene = {"background_scale": numbers[0]} if numbers else {}
     config = StudyConfig.from_dict({"run": {"threads": n_processes}, "scene": scene})
     pool = on_cluster if "cluster" in options else process_pool
-    with pool(n_processes) as executor:
+    with pool(n_processes) if n_processes else contextlib.nullcontext() as executor:
         StudyRunner(config, folder, stages, executor=executor, redo="redo" in options).run()
 
 

@@ -113,7 +113,7 @@ def add_poisson(ramp, mean, key, first_row):
     drawn = np.empty((_PIXELS, n_group))
     total = np.empty(_PIXELS)
     n_table = _COARSE + _FINE if n_int * n_group >= _TABLE_DRAWS else 0
-    # room for the distribution of the greatest mean, out to a part in 10^20
+    # wide enough for the distribution of the greatest mean, out to a part in 10^20
     width = 32
     if n_table > 0:
         for r in range(n_row):

@@ -156,7 +156,8 @@ def weighed(flux, weight, level, log_prior, bands):
 
 
 def _bundle(flux, weight, norm, level, log_prior, bands):
-    used = weight[:, bands]
+    # C order, also of several redshifts: kernels are compiled once
+    used = np.take(weight, bands, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         root32 = np.sqrt(used / used.max(axis=1, keepdims=True, initial=0.0)).astype(np.float32)
         data32 = (flux[bands] * np.sqrt(used / norm[:, None])).astype(np.float32)

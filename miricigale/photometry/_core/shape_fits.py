@@ -51,7 +51,7 @@ def make_plan(size, transform, passed):
 
 
 @njit(cache=True, nogil=True)
-def _room(plan, n_curves, n):
+def _buffers(plan, n_curves, n):
     """
     Arrays to draw n images of as many curves in, or of two more: derivatives of the first to the place.
 
@@ -80,9 +80,9 @@ def _placed(plan, x, y):
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _images(plan, placed, room):
-    """Draw images of transforms; if there is room for two more, the first moved along x and y after it."""
-    curves, right, middle, images = room
+def _images(plan, placed, buffers):
+    """Draw images of transforms; if there is space for two more, the first moved along x and y after it."""
+    curves, right, middle, images = buffers
     (n_curves, _, ny, nx), n = curves.shape, images.shape[1]
     more = n - n_curves
     for c in range(n_curves):
@@ -129,23 +129,23 @@ def draw_curves(plan, curves, x, y, more):
     -------
     images : float32 `~numpy.ndarray`, shape (size, n + more, size)
     """
-    room = _room(plan, len(curves), len(curves) + more)
-    room[0].reshape(len(curves), -1)[:] = curves
-    _images(plan, _placed(plan, x, y), room)
-    return room[3]
+    buffers = _buffers(plan, len(curves), len(curves) + more)
+    buffers[0].reshape(len(curves), -1)[:] = curves
+    _images(plan, _placed(plan, x, y), buffers)
+    return buffers[3]
 
 
 @njit(cache=True, nogil=True)
-def _products(plan, table, inverse, corners, parameters, room, columns):
+def _products(plan, table, inverse, corners, parameters, buffers, columns):
     """Write whitened models and derivatives into all columns but the last; products of all columns."""
-    images = room[3]
+    images = buffers[3]
     size, k, width = len(images), images.shape[1], inverse.shape[1]
     left, top = corners[:, 0].min(), corners[:, 1].min()
     for s in range(len(parameters)):
         x, y = corners[s]
-        curves = room[0].reshape(len(room[0]), -1)
+        curves = buffers[0].reshape(len(buffers[0]), -1)
         fill_curves(plan.kx, plan.ky, parameters[s, 2:], table, curves)
-        _images(plan, _placed(plan, parameters[s, 0] - x, parameters[s, 1] - y), room)
+        _images(plan, _placed(plan, parameters[s, 0] - x, parameters[s, 1] - y), buffers)
         for row in range(size):
             first = (y - top + row) * width + x - left
             noise = inverse[y - top + row, x - left : x - left + size]
@@ -224,11 +224,11 @@ def minimum(plan, table, white, inverse, corners, start, mean, precision, limits
     k = 1 + m
     columns = np.zeros((n * k + 1, white.size))
     columns[-1] = white.reshape(-1)
-    room = _room(plan, 5 if m == 6 else 1, k)
+    buffers = _buffers(plan, 5 if m == 6 else 1, k)
     flux, matrix, slope = np.zeros(n), np.eye(n * k), np.zeros(n * k)
     trial, parameters, chi2, damping = start, start, np.inf, 0.1
     while True:
-        products = _products(plan, table, inverse, corners, trial, room, columns)
+        products = _products(plan, table, inverse, corners, trial, buffers, columns)
         state = _state(products, trial, mean, precision)
         if state[0] <= chi2:
             parameters, (chi2, flux, matrix, slope) = trial, state
@@ -286,14 +286,14 @@ def evidence_of(plan, table, white, inverse, corners, best, flux, shapes, mean, 
         Ln of the likelihood, integrated over a light that is flat in its logarithm, and ln flux; -1e9 and 0
         where no positive light fits.
     """
-    room, parameters, columns = _room(plan, 1, 3), best.copy(), np.empty((4, white.size))
+    buffers, parameters, columns = _buffers(plan, 1, 3), best.copy(), np.empty((4, white.size))
     columns[-1] = white.reshape(-1)
     found, known = np.zeros((len(shapes), 2)), np.empty(len(beside))
     # the best one first
     for s in range(-1 if len(beside) else 0, len(shapes)):
         if s >= 0:
             parameters[0, 2:] = shapes[s]
-        products = _products(plan, table, inverse, corners, parameters, room, columns)
+        products = _products(plan, table, inverse, corners, parameters, buffers, columns)
         if len(beside):
             shared = columns @ beside.T
             if s < 0:

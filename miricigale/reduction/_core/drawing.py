@@ -124,7 +124,7 @@ def _list(rate, hits, electrons):
     Lists of what comes into each pixel, one entry for a group.
 
     Returns the first entry of each pixel (-1: none), and of the entries (n,) the next one, the
-    group and the electrons; in arrays with room for 64 more.
+    group and the electrons; in arrays with space for 64 more.
     """
     ny, nx = rate.shape
     head, tail = np.full((ny, nx), -1, np.int32), np.empty((ny, nx), np.int32)

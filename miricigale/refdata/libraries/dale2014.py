@@ -10,7 +10,7 @@ from miricigale.refdata.libraries.table import LibraryTable
 from miricigale.refdata.lookup import locate
 from miricigale.refdata.tables import load_ssp
 from miricigale.utils.declared import declared
-from miricigale.utils.exceptions import data_error
+from miricigale.utils.exceptions import data_error, file_errors
 from miricigale.utils.options import check_data
 
 SPECTRA = "spectra.0.00AGN.dat"
@@ -120,10 +120,8 @@ def _find(path):
 
 def _numbers(data, place, n_columns, wanted):
     """Columns of numbers of a text file, comments left out: array (n_rows, n_columns)."""
-    try:
+    with file_errors(place, f"is not {wanted} in {n_columns} columns"):
         table = np.loadtxt(data.decode("ascii").splitlines(), ndmin=2)
-    except ValueError as err:
-        raise data_error(place, f"is not {wanted} in {n_columns} columns: {err}") from err
     got = f"row 1 of {len(table)} has {table.shape[1]} columns"
     check_data(table.shape[1] == n_columns, place, f"is not {wanted} in {n_columns} columns: {got}")
     if n_bad := np.count_nonzero(~np.isfinite(table)):

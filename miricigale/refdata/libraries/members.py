@@ -5,7 +5,7 @@ import zipfile
 import zlib
 from pathlib import PurePosixPath
 
-from miricigale.utils.exceptions import data_error
+from miricigale.utils.exceptions import file_errors
 from miricigale.utils.files import check_unpacked, unpacked_size
 
 
@@ -33,14 +33,13 @@ def members(path, accept):
                 yield PurePosixPath(file.as_posix()), file.read_bytes(), str(file)
         return
     n_bytes = 0
-    try:
+    damage = zipfile.BadZipFile, tarfile.TarError, EOFError, zlib.error
+    with file_errors(path, "is a truncated or damaged archive", *damage):
         for place, size, read in _zipped(path) if zipfile.is_zipfile(path) else _tarred(path):
             if accept(place.name):
                 n_bytes += size
                 check_unpacked(path, n_bytes)
                 yield place, read(), f"{path}:{place}"
-    except (zipfile.BadZipFile, tarfile.TarError, EOFError, zlib.error) as err:
-        raise data_error(path, f"is a truncated or damaged archive: {err}") from err
 
 
 def _zipped(path):

@@ -12,7 +12,7 @@ from miricigale.refdata.libraries.members import is_archive, members
 from miricigale.refdata.libraries.table import LibraryTable
 from miricigale.utils.content import file_sha256
 from miricigale.utils.declared import declared
-from miricigale.utils.exceptions import data_error
+from miricigale.utils.exceptions import data_error, file_errors
 from miricigale.utils.options import check_data
 from miricigale.utils.table_files import read_table
 from miricigale.utils.units import to_array
@@ -166,10 +166,8 @@ def _parse(data, source):
             f"must have {_ROWS} rows of {_COLUMNS} numbers below '#' lines, got {len(tokens)} words"
         )
         raise data_error(source, f"{what}: truncated, or not a spectrum of SKIRTOR")
-    try:
+    with file_errors(source, "has text in a spectrum of SKIRTOR"):
         table = np.array([float(x) for x in tokens]).reshape(_ROWS, _COLUMNS)
-    except ValueError as err:
-        raise data_error(source, f"has text in a spectrum of SKIRTOR: {err}") from err
     _check_numbers(table, source)
     return table.T
 
@@ -214,10 +212,8 @@ def _read_fits(path):
     lacking = [name for name in _FITS_UNITS if name not in table.colnames]
     if lacking:
         raise data_error(path, f"is not {_WANTED}: its table has no column {lacking[0]}")
-    try:
+    with file_errors(path, "has another unit"):
         table = {name: to_array(table[name], unit, name) for name, unit in _FITS_UNITS.items()}
-    except u.UnitsError as err:
-        raise data_error(path, f"has another unit: {err}") from err
     order = np.argsort(table["WAVE_REST"][0])
     wave = table["WAVE_REST"][0][order]
     if wave.shape != (_ROWS,) or not np.all(table["WAVE_REST"] == table["WAVE_REST"][0]):

@@ -7,7 +7,7 @@ import numpy as np
 
 from miricigale.sed import _core
 from miricigale.sed.component import Component, register
-from miricigale.utils.exceptions import data_error
+from miricigale.utils.exceptions import data_error, file_errors
 from miricigale.utils.files import cached_by_file
 from miricigale.utils.units import frozen_array
 
@@ -148,11 +148,9 @@ def load_lines(path):
 
     A TOML file with the arrays ``wavelength`` (um), ``laf1`` to ``laf3``, ``dla1``, ``dla2``; others are refused.
     """
-    try:
+    with file_errors(path, "is not table 2 of Inoue et al. 2014"):
         columns = tomllib.loads(Path(path).read_text())
         table = np.array([columns[name] for name in _COLUMNS], dtype=float).T
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, KeyError, TypeError, ValueError) as err:
-        raise data_error(path, f"is not table 2 of Inoue et al. 2014: {err}") from err
     positive = table.shape == (39, len(_COLUMNS)) and np.all(np.isfinite(table) & (table > 0))
     if not positive or np.any(np.diff(table[:, 0]) >= 0):
         what = "must hold six columns of 39 positive numbers, from the longest wavelength on"

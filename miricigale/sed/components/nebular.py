@@ -9,7 +9,7 @@ from miricigale.refdata.tables import read_images
 from miricigale.sed import _core
 from miricigale.sed.component import Component, register
 from miricigale.sed.parameter import Parameter
-from miricigale.utils.exceptions import data_error
+from miricigale.utils.exceptions import file_errors
 from miricigale.utils.files import cached_by_file, open_fits
 from miricigale.utils.units import frozen_array
 
@@ -79,13 +79,10 @@ def load_nebular(path):
     names = ("metallicity", "log_u", "age", "wave", "continuum", "lines")
     images = [name.replace("_", "") for name in names]
     arrays = dict(zip(names, read_images(path, images, wanted=wanted).values(), strict=True))
-    try:
-        with open_fits(path, wanted=wanted) as hdus:
-            rows = hdus["LINE_LIST"].data
-            names = tuple(str(name).strip() for name in rows["NAME"])
-            arrays["line_wave"] = frozen_array(rows["WAVE"])
-    except KeyError as err:
-        raise data_error(path, f"is not {wanted}: {err.args[0]}") from err
+    with file_errors(path, f"is not {wanted}"), open_fits(path, wanted=wanted) as hdus:
+        rows = hdus["LINE_LIST"].data
+        names = tuple(str(name).strip() for name in rows["NAME"])
+        arrays["line_wave"] = frozen_array(rows["WAVE"])
     return NebularTable(names=names, **arrays)
 
 

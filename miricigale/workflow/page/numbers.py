@@ -5,7 +5,6 @@ import itertools
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
 
 from miricigale import depth, fitting, photometry
 from miricigale.evaluation import (
@@ -26,6 +25,8 @@ from miricigale.workflow.stages.conditions import (
     has_flag,
 )
 from miricigale.workflow.stages.exposures import pointing_exposures, pointing_time
+from miricigale.workflow.stages.grids import of_patch
+from miricigale.workflow.stages.inputs import input_fits, pieces
 from miricigale.workflow.stages.sample import NOT_COUNTED, SampleFlags
 
 #: Fewest sources of which a median with its error or scatter is shown.
@@ -37,11 +38,9 @@ MIPS_LIMIT = 19.3
 PAPER_DETECTED = ((26.0, 0.53), (25.0, 0.75))
 
 
-def _product(path, reader=QTable.read):
-    """A product of a truth, by its path within the run, that is read when it is first asked for."""
-    return functools.cached_property(
-        lambda self: reader(self._context.path(path.format(self._name)))
-    )
+def _table(path):
+    """A table of a truth, by its path within the run, that is read when it is first asked for."""
+    return functools.cached_property(lambda self: self._context.table(path.format(self._name)))
 
 
 class StudyTables:
@@ -60,23 +59,34 @@ class StudyTables:
         self._context, self._name = context, name
 
     #: The sources of the catalog with their true fluxes (stage 3).
-    truth = _product("{}/truth.ecsv")
+    truth = _table("{}/truth.ecsv")
     #: The same sources row by row with measured fluxes (stage 12).
-    matched = _product("{}/matched.ecsv")
+    matched = _table("{}/matched.ecsv")
     #: The photometry of all detections.
-    detections = _product("{}/photometry.ecsv")
-    #: The fits of the input SEDs, row by row.
-    inputs = _product("input_seds.fits", fitting.FitResults.read)
-    #: The error functions (`~miricigale.photometry.ErrorModel`), of the reference truth.
-    errors = _product("errors.ecsv", photometry.ErrorModel.read)
+    detections = _table("{}/photometry.ecsv")
+
+    @functools.cached_property
+    def inputs(self):
+        """The table of the fits of the input SEDs, row by row."""
+        return input_fits(self._context, len(self.truth))
+
+    @functools.cached_property
+    def errors(self):
+        """The error functions (`~miricigale.photometry.ErrorModel`), of the reference truth."""
+        return photometry.ErrorModel.read(self._context.path("errors.ecsv"))
 
     @functools.cached_property
     def results(self):
         """`~miricigale.fitting.FitResults` of the sample by set of bands."""
         return {
-            unit: fitting.FitResults.read(self._context.path(f"{self._name}/fits_{unit}.fits"))
+            unit: fitting.FitResults.concatenate(
+                [self._fits(of_patch(f"fits_{unit}", one)) for one in pieces(len(self.truth))]
+            )
             for unit in self._context.config.fit.sets
         }
+
+    def _fits(self, name):
+        return fitting.FitResults.read(self._context.path(f"{self._name}/{name}.fits"))
 
     @functools.cached_property
     def points(self):

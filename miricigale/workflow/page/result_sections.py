@@ -142,7 +142,7 @@ DOUBTFUL_MASS, DOUBTFUL_CHI2 = 1e8, 2.0
 
 def _outlier_rows(page):
     """Outliers of each truth by true redshift (keys "0" to "4"), and without doubtful sources."""
-    chi2 = page.tables.inputs.reduced_chi2
+    chi2 = np.asarray(page.tables.inputs["reduced_chi2"])
     for one in page.study.truths:
         if not {"all", "none"} <= set(one.fits):
             continue

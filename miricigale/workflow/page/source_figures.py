@@ -6,9 +6,8 @@ import numpy as np
 from miricigale.evaluation import PAH_FEATURES
 from miricigale.filters import Filter
 from miricigale.plotting.axes import MEASURED, SECOND, TRUE, WIDTH, legend, new_figure
-from miricigale.plotting.filters import plot_filters
+from miricigale.plotting.curves import plot_filters, plot_spectrum
 from miricigale.plotting.posteriors import plot_pdf_2d
-from miricigale.plotting.spectra import plot_spectrum
 from miricigale.utils.units import FNU
 from miricigale.workflow.page.labels import SET_LABELS, band_label, by_wavelength
 

@@ -10,7 +10,7 @@ from miricigale.photometry.surveys import HERSCHEL_DEPTHS
 from miricigale.utils.tables import described_rows
 from miricigale.workflow.derived import rows_of
 from miricigale.workflow.engine.stage import stage
-from miricigale.workflow.page.declared import texts_of
+from miricigale.workflow.page.labels import texts_of
 from miricigale.workflow.page.numbers import true_ranks
 from miricigale.workflow.stages.fits import FIT_SECTIONS, fit_mock, fit_sample
 from miricigale.workflow.stages.inputs import fit_plan, plain_axes, sed_resources

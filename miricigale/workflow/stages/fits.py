@@ -14,8 +14,15 @@ from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.perturbation import Perturbation
 from miricigale.workflow.stages.conditions import ConditionFlags, add_conditions, any_condition
 from miricigale.workflow.stages.exposures import pointing_exposures, pointing_time
-from miricigale.workflow.stages.grids import PATCHED, by_patch, of_patch, study_patches
-from miricigale.workflow.stages.inputs import existing_bands, fit_plan, sed_resources
+from miricigale.workflow.stages.grids import PATCHED, by_patch, of_patch, parts_of, study_patches
+from miricigale.workflow.stages.inputs import (
+    catalog_pieces,
+    existing_bands,
+    fit_plan,
+    input_fits,
+    piece_rows,
+    sed_resources,
+)
 from miricigale.workflow.stages.measure import joined_photometry
 from miricigale.workflow.stages.sample import (
     CUTS,
@@ -25,7 +32,7 @@ from miricigale.workflow.stages.sample import (
     matched_errors,
     mean_coverage,
 )
-from miricigale.workflow.truths import band_sets, reference, study_truths, truth_names
+from miricigale.workflow.truths import band_sets, reference, study_truths, truth_names, unit_names
 
 
 class _Field:
@@ -103,6 +110,7 @@ _SAMPLE = ("fit.min_detected", "fit.axes", *(f"fit.{key}" for key in CUTS))
     needs=("catalog", "seds", "truth", "mosaics", "photometry", "joined", "errors"),
     sections=(*PATCHED, "errors.coverage", "photometry.match_radius", *_SAMPLE),
     units=truth_names,
+    reads=lambda config, unit: [unit, *filter(None, catalog_pieces(config))],
     plan=fit_plan,
 )
 def match_sources(context, unit):
@@ -115,7 +123,7 @@ def match_sources(context, unit):
         matched[f"{name}_formal_err"] = matched[error_column(name)]
         matched[f"{name}_extrapolated"] = errors.extrapolated(matched[name], name)
     matched = errors.assign(matched, filters=bands, noise=field.noise(config))
-    chi2 = fitting.FitResults.read(context.path("input_seds.fits")).reduced_chi2
+    chi2 = np.asarray(input_fits(context, len(field.truth))["reduced_chi2"])
     options = {"inside": field.inside, "min_detected": config.fit.min_detected}
     options["redshifts"] = sed.SEDModel.yang2021_axes(config.fit.axes)["redshift"]
     options["cuts"] = cut_flags(config.fit, context.table("catalog.ecsv"), field.truth, chi2)
@@ -126,8 +134,8 @@ def match_sources(context, unit):
     detections["association"][here["second"]] = here["reasons"]
     add_conditions(detections, bands, detections=True)
     context.save_table(f"{unit}/association.ecsv", association)
-    context.save_table(f"{unit}/photometry.ecsv", detections)
-    context.save_table(f"{unit}/matched.ecsv", matched)
+    context.save_rows(f"{unit}/photometry", detections)
+    context.save_rows(f"{unit}/matched", matched)
 
 
 def existing_errors(depths):
@@ -167,7 +175,7 @@ FIT_SECTIONS = (*_EXISTING, "fit.axes", "fit.model_error")
 
 def set_plan(config, unit):
     """Axes and MIRI bands of a fit, and the zero points of its existing bands where they are others."""
-    truth, _, chosen = unit.partition("/")
+    truth, chosen, *_ = unit.split("/")
     plan = {"axes": fit_plan(config, unit), "bands": band_sets(config)[chosen]}
     size = dict(study_truths(config)[truth].perturbations).get("zero_point_existing")
     return plan | ({"zero_point": size} if size else {})
@@ -181,27 +189,27 @@ def set_plan(config, unit):
     sections=FIT_SECTIONS,
     resources=sed_resources,
     plan=set_plan,
-    units=lambda config: tuple(
-        f"{of}/{name}" for of in truth_names(config) for name in config.fit.sets
-    ),
+    units=lambda config: unit_names(truth_names(config), config.fit.sets, catalog_pieces(config)),
 )
 def fit_photometry(context, unit):
     """Stage 13: fit the detected sources of a truth with a set of the MIRI bands."""
     config, plan = context.config, context.plan
-    name, chosen = unit.split("/")
-    _, matched, mock = fit_sample(context, name, zero_point=plan.get("zero_point", 0.0))
+    name, chosen, piece = parts_of(unit)
+    options = {"rows": piece_rows(piece), "zero_point": plan.get("zero_point", 0.0)}
+    _, matched, mock = fit_sample(context, name, **options)
     results = fit_mock(context, mock, plan["bands"], axes=plan["axes"])
-    context.save_result(f"{name}/fits_{chosen}.fits", results)
+    place = of_patch(f"{name}/fits_{chosen}", piece)
+    context.save_result(f"{place}.fits", results)
     table = results.to_table()
     conditions = any_condition(matched, config.exposures.filters)
     table["condition"] = conditions[np.asarray(matched["selection"]) == 0]
     table["condition"].info.description = ConditionFlags.describe()
-    context.save_table(f"{name}/fits_{chosen}.ecsv", table)
+    context.save_table(f"{place}.ecsv", table)
 
 
-def fit_sample(context, name, **options):
-    """Truth, matched sources and `mock_photometry` of a truth."""
-    truth, matched = context.tables(name, ("truth", "matched")).values()
+def fit_sample(context, name, rows=slice(None), **options):
+    """Truth, matched sources and `mock_photometry` of a truth, or of these rows of it."""
+    truth, matched = (table[rows] for table in context.tables(name, ("truth", "matched")).values())
     mock = mock_photometry(context.config, truth, matched, seed=context.seed, **options)
     return truth, matched, mock
 

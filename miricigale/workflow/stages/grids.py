@@ -6,11 +6,8 @@ from typing import NamedTuple
 
 import astropy.units as u
 import numpy as np
-from matplotlib.path import Path
-from matplotlib.transforms import Bbox
 
 from miricigale.instrument import mosaic_wcs
-from miricigale.photometry.patches import PatchGrid, seen_part
 from miricigale.workflow.stages.exposures import (
     GRID,
     all_exposures,
@@ -18,7 +15,7 @@ from miricigale.workflow.stages.exposures import (
     plain_exposures,
     study_exposures,
 )
-from miricigale.workflow.truths import truth_names
+from miricigale.workflow.truths import truth_names, unit_names
 
 #: Sections of the configuration on which the grids of patches depend.
 PATCHED = (*GRID, "patches", "highres.pixel_scale")
@@ -51,6 +48,12 @@ def _whole(key, pixel_scale):
 @functools.lru_cache(maxsize=4)
 def _patches(key, options, pixel_scale):
     """`~miricigale.photometry.patches.PatchGrid` and `SkyPatch` by name."""
+    # whole fields need none of these, and commands that only read settings import nothing heavy
+    from matplotlib.path import Path
+    from matplotlib.transforms import Bbox
+
+    from miricigale.photometry.patches import PatchGrid
+
     exposures, whole = all_exposures(*key), _whole(key, pixel_scale)
     side, rim = (math.ceil(x / pixel_scale) for x in (options.size, options.overlap))
     ny, nx = shape = whole.pixel_shape[::-1]
@@ -114,6 +117,8 @@ def grid_of(config, pixel_scale, patch=""):
         return whole
     box, fine = study_patches(config)[patch].box, _whole(key, config.highres.pixel_scale)
     if pixel_scale != config.highres.pixel_scale:
+        from miricigale.photometry.patches import seen_part
+
         box = seen_part(box, fine, whole, whole.pixel_shape[::-1])
     wcs = whole[box]
     wcs.pixel_shape = tuple(one.stop - one.start for one in box[::-1])
@@ -151,14 +156,12 @@ def patch_bands(config):
 
 def study_bands(config):
     """Names of the bands of all truths, ``<truth>/<filter>``."""
-    return tuple(
-        f"{truth}/{band}" for truth in truth_names(config) for band in config.exposures.filters
-    )
+    return unit_names(truth_names(config), config.exposures.filters)
 
 
 def truth_bands(config):
     """Names of the bands of all truths and patches, ``<truth>/<filter>/<patch>``."""
-    return tuple(f"{truth}/{unit}" for truth in truth_names(config) for unit in patch_bands(config))
+    return unit_names(truth_names(config), patch_bands(config))
 
 
 def patch_plan(config, unit):

@@ -1,10 +1,11 @@
 """Stages 1 and 2: catalog, input SEDs."""
 
 import functools
+import math
 from pathlib import Path
 
 import numpy as np
-from astropy.table import QTable
+from astropy.table import QTable, vstack
 
 from miricigale import fitting, sed
 from miricigale.filters import Filter
@@ -16,8 +17,9 @@ from miricigale.utils.content import file_sha256
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import ab_magnitude
-from miricigale.workflow.engine.stage import stage
+from miricigale.workflow.engine.stage import LONG, stage
 from miricigale.workflow.options import require
+from miricigale.workflow.stages.grids import of_patch
 
 #: Redshifts closer than this share a node of the grid of the input fit.
 REDSHIFT_STEP = 0.01
@@ -153,7 +155,7 @@ def make_catalog(context, _):
     catalog = study_catalog(options)
     chosen = bright_sources(catalog, options, prior)
     chosen.meta["n_sources"] = len(catalog)
-    context.save_table("catalog.ecsv", chosen)
+    context.save_rows("catalog", chosen)
 
 
 def bright_sources(catalog, options, prior):
@@ -175,6 +177,22 @@ def bright_sources(catalog, options, prior):
     return chosen
 
 
+def pieces(n):
+    """Names of the pieces that n sources are fitted in; a single empty one if these are few."""
+    return [f"{k:04d}" for k in range(math.ceil(n / LONG))] if n > LONG else [""]
+
+
+def catalog_pieces(config):
+    """Names of the pieces that the sources of the study's catalog are fitted in."""
+    catalog = study_catalog(config.catalog)
+    return pieces(len(bright_sources(catalog, config.catalog, config.highres.filter)))
+
+
+def piece_rows(piece):
+    """Rows of a piece, a slice."""
+    return slice(LONG * int(piece), LONG * (int(piece) + 1)) if piece else slice(None)
+
+
 @stage(
     "seds",
     "input SEDs",
@@ -182,14 +200,22 @@ def bright_sources(catalog, options, prior):
     needs=("catalog",),
     sections=("sed.axes", "sed.catalog_error", "sed.max_wavelength", "fit.model_error"),
     resources=sed_resources,
+    units=catalog_pieces,
     plan=_input_plan,
 )
-def fit_inputs(context, _):
+def fit_inputs(context, piece):
     """Stage 2: fit a galaxy grid to the catalog's fluxes at the known redshifts."""
-    config, catalog = context.config, context.table("catalog.ecsv")
+    config, catalog = context.config, context.table("catalog.ecsv")[piece_rows(piece)]
     options = {"model_error": config.fit.model_error, "progress_bar": context.progress_bar}
     results = fit_seds(catalog, config.sed, **options)
-    context.save_result("input_seds.fits", results)
+    context.save_result(f"{of_patch('input_seds', piece)}.fits", results)
+
+
+def input_fits(context, n):
+    """The table of the fits of the input SEDs of the catalog's n sources, row by row."""
+    names = [of_patch("input_seds", piece) for piece in pieces(n)]
+    fits = (fitting.FitResults.read(context.path(f"{name}.fits")) for name in names)
+    return vstack([one.to_table() for one in fits], metadata_conflicts="silent")
 
 
 def fit_seds(catalog, options, *, model_error, executor=None, progress_bar=False):

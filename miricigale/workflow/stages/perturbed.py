@@ -6,8 +6,7 @@ from astropy.table import Table
 from miricigale.evaluation import bootstrap
 from miricigale.evaluation.estimates import median, outlier_share, scatter
 from miricigale.pages import Missing, number, sentence
-from miricigale.workflow.page.declared import texts_of
-from miricigale.workflow.page.labels import band_label, by_wavelength
+from miricigale.workflow.page.labels import band_label, by_wavelength, texts_of
 from miricigale.workflow.page.numbers import bright_isolated
 from miricigale.workflow.truths import ALL
 

@@ -20,9 +20,12 @@ from miricigale.workflow.page.image_sections import (
     write_images,
     write_summary,
 )
-from miricigale.workflow.page.input_sections import write_inputs
 from miricigale.workflow.page.numbers import StudyTables, study_metrics, truth_metrics, whole_sample
-from miricigale.workflow.page.photometry_sections import write_errors, write_photometry
+from miricigale.workflow.page.photometry_sections import (
+    write_errors,
+    write_inputs,
+    write_photometry,
+)
 from miricigale.workflow.page.provenance import stand_ins, write_exposures, write_origin
 from miricigale.workflow.page.result_sections import write_results
 from miricigale.workflow.page.study_page import StudyPage

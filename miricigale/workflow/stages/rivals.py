@@ -12,8 +12,7 @@ from miricigale.utils.tables import described_rows, error_column
 from miricigale.workflow.derived import NO_SOURCE
 from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.page.band_figures import rival_figure
-from miricigale.workflow.page.declared import texts_of
-from miricigale.workflow.page.labels import band_label
+from miricigale.workflow.page.labels import band_label, texts_of
 from miricigale.workflow.stages.conditions import ConditionFlags
 from miricigale.workflow.stages.exposures import IMAGE_RESOURCES, KERNEL, band_names, exposure_plan
 from miricigale.workflow.stages.measure import measure_band

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from astropy.table import QTable, hstack
 
-from miricigale import fitting, sed
+from miricigale import sed
 from miricigale.evaluation import (
     CEERS_DUST,
     AGNPopulation,
@@ -26,7 +26,9 @@ from miricigale.workflow.options import require
 from miricigale.workflow.perturbation import perturbed_model, perturbed_parameters, point_columns
 from miricigale.workflow.stages.inputs import (
     catalog_bands,
+    catalog_pieces,
     existing_bands,
+    input_fits,
     measured_error,
     sed_resources,
     shows_dust,
@@ -211,6 +213,7 @@ def _truth_plan(config, unit):
     sections=(*MODELS, "catalog", "exposures.filters", "fit.bands", "fit.depths", "highres.filter"),
     resources=sed_resources,
     units=truth_names,
+    reads=lambda config, _: catalog_pieces(config),
     plan=_truth_plan,
 )
 def make_truth(context, name):
@@ -218,7 +221,7 @@ def make_truth(context, name):
     config, frac_agn = context.config, context.plan["frac_agn"]
     effects = context.plan.get("perturbations", {})
     catalog = context.table("catalog.ecsv")
-    best = fitting.FitResults.read(context.path("input_seds.fits")).to_table()
+    best = input_fits(context, len(catalog))
     parameters = galaxy_parameters(config, catalog, best, seed=context.seed)
     prior = config.highres.filter
     existing = existing_bands(config)
@@ -262,4 +265,4 @@ def make_truth(context, name):
     citations = [*catalog.meta.get("citations", ()), *model.meta["citations"]]
     truth.meta.clear()
     truth.meta.update(provenance(citations=citations, stage="truth"))
-    context.save_table(f"{name}/truth.ecsv", truth)
+    context.save_rows(f"{name}/truth", truth)

@@ -12,8 +12,7 @@ from miricigale.utils.tables import described_rows, error_column
 from miricigale.workflow.derived import changed_config
 from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.page.band_figures import variant_figure
-from miricigale.workflow.page.declared import texts_of
-from miricigale.workflow.page.labels import band_label
+from miricigale.workflow.page.labels import band_label, texts_of
 from miricigale.workflow.stages.exposures import (
     EXPOSURE_RESOURCES,
     IMAGES,

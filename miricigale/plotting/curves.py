@@ -1,0 +1,57 @@
+"""Curves against wavelength: filters and spectra."""
+
+import numpy as np
+
+from miricigale.plotting.axes import legend, resolve_axes
+
+
+def plot_filters(curves, ax=None, **kwargs):
+    """
+    Draw filter curves, with a legend if there are several.
+
+    Parameters
+    ----------
+    curves : iterable of tuple
+        Wavelength (um), throughput and name of each.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to; the current axes if not given.
+    **kwargs
+        Passed to `~matplotlib.axes.Axes.plot`.
+
+    Returns
+    -------
+    ax : `~matplotlib.axes.Axes`
+    """
+    ax, curves = resolve_axes(ax), list(curves)
+    for wave, throughput, name in curves:
+        ax.plot(wave, throughput, **{"label": name, **kwargs})
+    ax.set(xlabel="wavelength (µm)", ylabel="throughput")
+    if len(curves) > 1:
+        legend(ax)
+    return ax
+
+
+def plot_spectrum(wave, fnu, ax=None, **kwargs):
+    """
+    Draw a spectrum on logarithmic axes.
+
+    Parameters
+    ----------
+    wave : `~numpy.ndarray`, shape (n,)
+        Observed wavelengths in um.
+    fnu : `~numpy.ndarray`, shape (n,)
+        Flux densities in uJy; values that are not positive are left out.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to; the current axes if not given.
+    **kwargs
+        Passed to `~matplotlib.axes.Axes.plot`.
+
+    Returns
+    -------
+    ax : `~matplotlib.axes.Axes`
+    """
+    ax = resolve_axes(ax)
+    fnu = np.where(np.asarray(fnu) > 0.0, fnu, np.nan)
+    ax.loglog(wave, fnu, **kwargs)
+    ax.set(xlabel="observed wavelength (µm)", ylabel=r"$F_\nu$ (µJy)")
+    return ax
