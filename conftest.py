@@ -30,6 +30,11 @@ def pytest_unconfigure(config):
     shutil.rmtree(config.own_folder, ignore_errors=True)
 
 
+def pytest_collection_modifyitems(items):
+    """Begin with whole studies, which take longest: the last worker would be alone with them."""
+    items.sort(key=lambda item: "integration" not in item.path.parts)
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
     """Let one worker do all tests of a module, so that what they share is made once."""

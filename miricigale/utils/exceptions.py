@@ -97,7 +97,8 @@ def file_errors(path, what, *kinds):
     try:
         yield
     except (KeyError, IndexError, TypeError, ValueError, *kinds) as err:
-        said = err.args[0] if isinstance(err, KeyError) and err.args else err
+        # a name that is missing is quoted, a sentence is not
+        said = err.args[0] if isinstance(err, KeyError) and " " in f"{err}" else err
         raise data_error(path, f"{what}: {said}") from err
 
 
