@@ -331,14 +331,8 @@ class _Lights:
             # as it was before, and if there was no template yet, as its profile
             drawn = last.cutout is None and last.shape.point <= 0.5
             return self._as_profile(last) if drawn else last
-        new = dataclasses.replace(
-            last,
-            shape=shape,
-            image=self._image(around, shape),
-            cutout=None,
-            light=1.0,
-            others=others,
-        )
+        fitted = {"shape": shape, "image": self._image(around, shape), "others": others}
+        new = dataclasses.replace(last, **fitted, cutout=None, light=1.0)
         if self.select and shape.point > 0.5:
             return new
         core = own & (self.snr[around] > _CORE_SNR)

@@ -182,11 +182,7 @@ def fit_offsets(arrays, bank, settings, catalog):
         while order >= 0 and np.count_nonzero(good) < _SOURCES * n_terms(order):
             order -= 1
         if order < 0:
-            msg = (
-                f"an offset map needs at least {_SOURCES} bright isolated sources within 'max_shift', "
-                f"got {np.count_nonzero(good)}: one shift is fitted to all sources instead"
-            )
-            warn(msg, PhotometryWarning)
+            _too_few(0, good, "one shift is fitted to all sources instead")
             return TemplateFit(arrays, bank, settings, search=True)
         member = fit.bank.order[rows]
         field, used = _robust_field(xy[member], offset, error, good, arrays.flux.shape, order)
@@ -197,12 +193,7 @@ def fit_offsets(arrays, bank, settings, catalog):
         fit.bank.forget()
         fit = TemplateFit(arrays, bank, settings, moved=moved)
     if order < settings.offset_order:
-        msg = (
-            f"an offset map of order {settings.offset_order} needs "
-            f"{_SOURCES * n_terms(settings.offset_order)} bright isolated sources within 'max_shift', "
-            f"got {np.count_nonzero(good)}: order {order} is taken"
-        )
-        warn(msg, PhotometryWarning)
+        _too_few(settings.offset_order, good, f"order {order} is taken")
     near = catalog.near[member]
     table = QTable({"id": catalog.id[near], "sky": catalog.sky[near]})
     table["x_centroid"], table["y_centroid"] = xy[member].T
@@ -212,6 +203,13 @@ def fit_offsets(arrays, bank, settings, catalog):
     in_arcsec = SmoothField(field.coefficients * fit.scale, field.shape, order)
     fit.offset_map = OffsetMap(table, in_arcsec, arrays.wcs)
     return fit
+
+
+def _too_few(order, good, instead):
+    """Warn of an offset map with fewer sources than it needs."""
+    needed = f"needs {_SOURCES * n_terms(order)} bright isolated sources within 'max_shift'"
+    msg = f"an offset map of order {order} {needed}, got {np.count_nonzero(good)}: {instead}"
+    warn(msg, PhotometryWarning)
 
 
 def settled(fit, bank, catalog):
@@ -257,8 +255,9 @@ def settled(fit, bank, catalog):
         new = np.zeros_like(own)
         new[member] = found * (scatter / (scatter + error**2))[:, None]
         change, own = np.abs(new - own).max(), new
-        fit.bank.forget()
-        fit = TemplateFit(fit.arrays, bank, fit.settings, moved=common + own, search=False)
+        fit = TemplateFit(
+            fit.arrays, bank, fit.settings, moved=common + own, like=fit.bank, search=False
+        )
         fit.shift, fit.offset_map, fit.own = first.shift, first.offset_map, own
         if change < _DONE:
             break

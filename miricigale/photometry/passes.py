@@ -59,7 +59,6 @@ def fit_image(arrays, bank, settings, catalog, grid_wcs):
         # templates that may change absorb some of the light of their neighbors
         new_xy, evidence = _new_positions(fit, catalog)
     if len(new_xy) or len(double):
-        fit.bank.forget()
         new_xy = more.refined(double, new_xy)
         fit = more.fit(double, new_xy)
         if choose:
@@ -118,7 +117,6 @@ def _split(fit, diagnostics, more, poor, new_xy):
 
     split, chosen = (fit, diagnostics), poor
     before = chi2(*split)
-    fit.bank.forget()
     for _ in range(2):
         found = more.fit(chosen, new_xy)
         found.free_templates(more.catalog.fitted)
@@ -127,7 +125,6 @@ def _split(fit, diagnostics, more, poor, new_xy):
         if len(chosen) == len(better) or not len(better):
             break
         chosen = better
-        found.bank.forget()
     return split if len(better) else (fit, diagnostics)
 
 
@@ -136,30 +133,29 @@ class _More:
 
     def __init__(self, bank, first, catalog, grid_wcs):
         self._bank, self.catalog, self._grid_wcs = bank, catalog, grid_wcs
-        self._arrays, self._settings, self._scale = first.arrays, first.settings, first.scale
-        self._displacement, self._map = first.displacement, first.offset_map
-        # a shift that was rejected is not searched again
-        self._search, self._own = first.shift is not None and first.own is None, first.own
+        self._first, self._made = first, first.bank
 
     def fit(self, double, new_xy, search=None):
         """Fit with second components of some of the sources, and new sources after those."""
-        settings, arrays, near = self._settings, self._arrays, self.catalog.near
+        first, near = self._first, self.catalog.near
+        arrays, settings, own = first.arrays, first.settings, first.own
         n = len(near)
         host = np.concatenate([np.arange(n), double, n + len(double) + np.arange(len(new_xy))])
         all_xy = np.concatenate([self.catalog.xy[near], self._centers(double), new_xy])
         xy = all_xy[n:]
         half = settings.mean_kernel.target.shape[0] // 2 + 1
-        half = half * settings.mean_kernel.pixel_scale.to_value(ANGLE) / self._scale / 2
+        half = half * settings.mean_kernel.pixel_scale.to_value(ANGLE) / first.scale / 2
         poly = local_maps(xy, np.full(len(xy), half), arrays.wcs, self._grid_wcs)
         bank = self._bank.with_points(xy, poly)
-        moved = np.array(self._displacement(all_xy))
-        moved[:n] += 0.0 if self._own is None else self._own
-        one = self._map is None and self._own is None
-        fit = TemplateFit(
-            arrays, bank, settings, host=host, moved=moved[0] if one else moved,
-            search=self._search if search is None else search,
-        )  # fmt: skip
-        fit.offset_map = self._map
+        moved = np.array(first.displacement(all_xy))
+        moved[:n] += 0.0 if own is None else own
+        one = first.offset_map is None and own is None
+        if search is None:
+            # a shift that was rejected is not searched again
+            search = first.shift is not None and own is None
+        form = {"host": host, "moved": moved[0] if one else moved, "search": search}
+        fit = TemplateFit(arrays, bank, settings, like=self._made, **form)
+        fit.offset_map, self._made = first.offset_map, fit.bank
         return fit
 
     def _centers(self, double):
@@ -168,12 +164,12 @@ class _More:
         rows = np.flatnonzero(np.isfinite(fitted["parameters"][:, 0]))
         if len(rows):
             center = fitted["parameters"][rows, :2]
-            place = pixel_to_pixel(self._arrays.wcs, self._grid_wcs, *xy[rows].T)
+            place = pixel_to_pixel(self._first.arrays.wcs, self._grid_wcs, *xy[rows].T)
             offset = center - np.stack(place, axis=1)
             inverse = np.linalg.pinv(fitted["covariance"][rows, 1:3, 1:3])
             far = np.einsum("ki,kij,kj->k", offset, inverse, offset) > _ELSEWHERE**2
             if far.any():
-                found = pixel_to_pixel(self._grid_wcs, self._arrays.wcs, *center[far].T)
+                found = pixel_to_pixel(self._grid_wcs, self._first.arrays.wcs, *center[far].T)
                 xy[rows[far]] = np.stack(found, axis=1)
         return xy
 
@@ -189,5 +185,4 @@ class _More:
             good = error < 0.25 * fit.psf_width
             step = np.clip(step[good], -fit.psf_width, fit.psf_width)
             new_xy[fit.bank.order[rows[good]] - first_new] += step
-            fit.bank.forget()
         return new_xy

@@ -329,15 +329,8 @@ class _Stamp:
         shapes = parameters[2:] + z @ root.T
         shapes[:, 0] = np.clip(shapes[:, 0], np.log(0.05), self.limits[1, 2])
         shapes[:, 1] = np.clip(shapes[:, 1], *np.log(INDEX_RANGE))
-        found = evidence_of(
-            *self.pixels,
-            parameters[None],
-            np.array([flux]),
-            shapes,
-            mean[None],
-            _CENTER[None],
-            beside,
-        )
+        best, prior = (parameters[None], np.array([flux])), (mean[None], _CENTER[None])
+        found = evidence_of(*self.pixels, *best, shapes, *prior, beside)
         density = (
             -0.5 * np.sum(z * z, axis=1) - np.sum(np.log(np.diag(root))) - 2 * np.log(2 * np.pi)
         )

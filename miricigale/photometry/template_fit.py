@@ -38,6 +38,8 @@ class TemplateFit:
         number of that source, all others have their own.
     moved : `~numpy.ndarray`, shape (2,) or (n, 2), optional
         Pixels by which templates are moved; a shift that is fitted is searched from there.
+    like : `~miricigale.photometry.templates.TemplateBank`, optional
+        A bank whose templates are taken where they are the same; it forgets its own.
     search : bool, optional
         Whether one shift of the image is fitted; if the settings ask for one by default.
 
@@ -69,7 +71,7 @@ class TemplateFit:
         Pixels by which each source of the bank is moved beyond that; None without.
     """
 
-    def __init__(self, arrays, bank, settings, *, host=None, moved=None, search=None):
+    def __init__(self, arrays, bank, settings, *, host=None, moved=None, like=None, search=None):
         self.arrays, self.settings = arrays, settings
         self.host = np.arange(len(bank.order)) if host is None else host
         self.scale = pixel_scale(arrays.wcs)
@@ -78,9 +80,11 @@ class TemplateFit:
             self._background_columns() if settings.background_order is not None else []
         )
         self.shift = self.offset_map = self.free = self.own = self.evidence = None
-        self.bank = bank
         moved = np.zeros(2) if moved is None else moved
-        self._solve(bank.shifted(moved) if np.any(moved) else bank, [])
+        self.bank = bank.shifted(moved) if np.any(moved) else bank
+        if like is not None:
+            self.bank.reuse(like)
+        self._solve(self.bank, [])
         if search is None:
             search = settings.max_shift is not None and settings.offset_order is None
         if search and len(self.rows):

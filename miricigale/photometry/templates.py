@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Callable
 from concurrent.futures import Executor
 
@@ -230,7 +231,7 @@ class TemplateBank:
         self.order = np.argsort(box[:, 0], kind="stable")
         self.box = np.ascontiguousarray(box[self.order])
         self.start = np.concatenate([[0], np.cumsum(self.box[:, 2] * self.box[:, 3])])
-        self._kept = None
+        self._kept, self._same = None, {}
 
     def _boxes(self, shape):
         """Boxes on the image that hold the fine stamps, cut to the image."""
@@ -285,13 +286,32 @@ class TemplateBank:
         fine = dataclasses.replace(self.fine, kernel=one, target=one)
         return dataclasses.replace(self, sources=sources, fine=fine, weigh=None)
 
+    def reuse(self, other):
+        """
+        Take the templates of another bank, which has this one's first sources, that are the same here.
+
+        The other forgets its own. Nothing is taken where memory does not hold both.
+        """
+        kept, n = other._kept, len(other.order)
+        other.forget()
+        if kept is None or 8.0 * self.start[-1] > self.max_bytes:
+            return
+        stamps = [
+            one.values[slice(*ends)] for one in kept for ends in itertools.pairwise(one.start)
+        ]
+        mine, theirs = (
+            np.hstack([one.xy, one.poly.reshape(-1, 12)]) for one in (self.sources, other.sources)
+        )
+        same = (mine[:n] == theirs).all(axis=1)
+        self._same = {k: stamps[row] for row, k in enumerate(other.order) if same[k]}
+
     def parts(self, rows):
         """The cutouts of some rows, None for points."""
         return [self.sources.cutout[k] for k in self.order[rows]]
 
     def forget(self):
         """Free the templates that are kept; they are made anew if they are needed again."""
-        self._kept = None
+        self._kept, self._same = None, {}
 
     def map(self, function, parts):
         """Call a function with each of some independent pieces of work, on the bank's threads."""
@@ -324,7 +344,7 @@ class TemplateBank:
                 kept.append(block)
             yield block
         if keep:
-            self._kept = kept
+            self._kept, self._same = kept, {}
 
     def _make(self, first, last):
         fine = self.fine
@@ -332,7 +352,12 @@ class TemplateBank:
         block = Block(first, self.box[first:last], start, np.zeros(int(start[-1]), np.float32))
         sources = self.order[first:last]
         cutout = [self.sources.cutout[k] for k in sources]
-        points = np.flatnonzero([one is None for one in cutout])
+        needed = (block.box[:, 2] > 0) & (block.box[:, 3] > 0)
+        for row, source in enumerate(sources):
+            if source in self._same:
+                block.values[start[row] : start[row + 1]] = self._same[source]
+                needed[row] = False
+        points = np.flatnonzero([one is None for one in cutout] & needed)
         layers = [
             (row, one) for row, all_of in enumerate(cutout) if all_of for one in all_of.layers
         ]
@@ -368,12 +393,11 @@ class TemplateBank:
             add(found, np.arange(len(rows)), np.ones(len(rows)), rows, origin)
 
         self.map(add_points, block.parts())
-        seen = (block.box[:, 2] > 0) & (block.box[:, 3] > 0)
         # profiles first, what is added to them afterwards
         for rest in (False, True):
             shapes = (
                 (*fine.shape(one), one.convolved, rest)
-                if seen[row] and rest == (one is not cutout[row])
+                if needed[row] and rest == (one is not cutout[row])
                 else None
                 for row, one in layers
             )

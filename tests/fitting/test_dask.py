@@ -31,34 +31,41 @@ class Weighing(ProcessPoolExecutor):
         return super().submit(function, *args)
 
 
-@pytest.fixture
-def grid():
+@pytest.fixture(scope="module")
+def photometry(fitter):
+    return draw_photometry(fitter.grid, 90, missing=0.1)[0]
+
+
+@pytest.fixture(scope="module")
+def fitter():
     # half a megabyte, as pickled
-    return make_grid(n_z=20, n_tau=12, n_age=12, n_b=20)
+    return BayesFitter(make_grid(n_z=20, n_tau=12, n_age=12, n_b=20))
 
 
-@pytest.fixture
-def photometry(grid):
-    return draw_photometry(grid, 90, missing=0.1)[0]
+@pytest.fixture(scope="module")
+def process():
+    with Weighing(1, mp_context=get_context("spawn")) as executor:
+        yield executor
 
 
-def elsewhere(fitter, photometry):
+@pytest.fixture(scope="module")
+def whole(fitter, photometry, process):
     """
-    Fit in one other process, which loads the kernels that this one has compiled.
+    A fit in one other process, which loads the kernels that this one has compiled.
 
     Code that was compiled a moment ago, with all that it calls in sight, and the same from
     numba's cache may differ in the last digits: only the latter is what workers run.
     """
     fitter.fit(photometry[:1])
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as executor:
-        return fitter.fit(photometry, executor=executor)
+    return fitter.fit(photometry, executor=process)
 
 
-def test_two_dask_workers_give_the_numbers_of_one_process(grid, photometry, tmp_path):
+def test_two_dask_workers_give_the_numbers_of_one_process(
+    fitter, photometry, whole, process, tmp_path
+):
     """And the bytes of its files, where one of them is killed."""
     distributed = pytest.importorskip("distributed")
-    fitter = BayesFitter(grid)
-    whole = elsewhere(fitter, photometry)
+    photometry = photometry.copy()
     photometry["id"][70] = photometry["id"][3]
     photometry.write(tmp_path / "catalog.fits")
     one, two = (tmp_path / name for name in ("one", "two"))
@@ -80,8 +87,7 @@ def test_two_dask_workers_give_the_numbers_of_one_process(grid, photometry, tmp_
         executor, done = client.get_executor(), other.submit(kill)
         fit_file(fitter, path_out=two, executor=executor, **arguments)
         done.result()
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as executor:
-        results = fit_file(fitter, path_out=one, executor=executor, **arguments)
+    results = fit_file(fitter, path_out=one, executor=process, **arguments)
     names = sorted(path.name for path in one.iterdir())
     assert sorted(path.name for path in two.iterdir()) == names
     for name in names[1:]:
@@ -93,22 +99,19 @@ def test_two_dask_workers_give_the_numbers_of_one_process(grid, photometry, tmp_
         assert_array_equal(mine, theirs, err_msg=name)
 
 
-def test_processes_get_the_grid_once(grid, photometry):
-    fitter = BayesFitter(grid)
-    whole = elsewhere(fitter, photometry)
+def test_processes_get_the_grid_once(fitter, photometry, whole, process):
     assert len(pickle.dumps(fitter)) > 400_000
-    with Weighing(2, mp_context=get_context("spawn")) as executor:
-        assert_same(fitter.fit(photometry, executor=executor, chunk_size=8), whole)
-    assert len(executor.n_bytes) == 12
+    process.n_bytes.clear()
+    assert_same(fitter.fit(photometry, executor=process, chunk_size=8), whole)
+    assert len(process.n_bytes) == 12
     # 8 objects, 20 bands and redshifts
-    assert max(executor.n_bytes) < 5000
+    assert max(process.n_bytes) < 5000
 
 
-def test_a_fault_in_a_worker_is_reported_and_leaves_no_file(tmp_path, monkeypatch):
+def test_a_fault_in_a_worker_is_reported_and_leaves_no_file(process, tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     heavy = partial(operator.getitem, list(range(100_000)))
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as executor:
-        with pytest.raises(IndexError, match="out of range"):
-            parallel_map(heavy, [1, 2, 100_000, 4], executor=executor)
-        assert parallel_map(heavy, [4, 5], executor=executor) == [4, 5]
+    with pytest.raises(IndexError, match="out of range"):
+        parallel_map(heavy, [1, 2, 100_000, 4], executor=process)
+    assert parallel_map(heavy, [4, 5], executor=process) == [4, 5]
     assert list(tmp_path.iterdir()) == []

@@ -230,6 +230,52 @@ def test_noise_in_the_template_is_taken_off_the_diagonal(tools):
     assert_allclose(np.mean(power[1:] - terms[1:]), power[0], rtol=0.02)
 
 
+def test_templates_that_did_not_move_are_taken_as_they_are(tools, monkeypatch):
+    from miricigale.photometry.cutouts import Cutout
+    from miricigale.photometry.templates import BankSources, FineTemplates, TemplateBank
+
+    rng, n = np.random.default_rng(4), 60
+    fine = FineTemplates(tools.kernel.array, tools.kernel.target)
+    stamps = [rng.random(rng.integers(9, 25, 2)) for _ in range(n)]
+    parts = [Cutout(a, (20, 30)) if k % 5 else None for k, a in enumerate(stamps)]
+    poly = np.zeros((n, 2, 6))
+    poly[:, 0, 1] = poly[:, 1, 2] = 11 / 6
+    xy = rng.uniform(-10, 210, (n, 2))
+    poly[:, :, 0] = xy * 11 / 6
+    bank = TemplateBank(fine, BankSources(parts, poly[:, :, 0], xy, poly), (200, 200))
+    before = list(bank.blocks())
+    moved = np.where(rng.random((n, 1)) < 0.2, rng.uniform(-1, 1, (n, 2)), 0.0)
+    made, plain = [], FineTemplates.coefficients
+
+    def coefficients(self, group, *args):
+        made.extend(map(id, group))
+        return plain(self, group, *args)
+
+    monkeypatch.setattr(FineTemplates, "coefficients", coefficients)
+    shifted = bank.shifted(moved)
+    shifted.reuse(bank)
+    first = list(shifted.blocks())
+    changed = {id(one) for one, m in zip(parts, moved, strict=True) if one and m.any()}
+    assert 5 < len(changed) < 20
+    assert set(made) <= changed
+    more = bank.with_points(xy[:3] + 0.3, poly[:3]).shifted(np.append(moved, np.zeros((3, 2)), 0))
+    more.reuse(shifted)
+    second = list(more.blocks())
+    assert set(made) <= changed
+    for found, own in ((first, shifted), (second, more), (before, bank)):
+        own.forget()
+        for one, two in zip(found, own.blocks(), strict=True):
+            assert_array_equal(one.values, two.values)
+    # where memory does not hold both nothing is taken, and the first ones go
+    more.max_bytes = 6.0 * more.start[-1]
+    more.forget()
+    made.clear()
+    more.reuse(bank)
+    list(more.blocks())
+    assert bank._kept is None
+    assert len(made) > len(changed)
+
+
 def test_sersic_templates(tools):
     from miricigale.profiles import sersic_image
 

@@ -47,6 +47,11 @@ def config_of(size, *bands, **sections):
     return load_config("goodss", overrides=values | sections)
 
 
+def run_config(size=SIZE):
+    """The study that is run, whole by a size of 0; with pixels of the prior that are not the finest."""
+    return config_of(size, BAND, highres={"pixel_scale": 0.09})
+
+
 @pytest.fixture(scope="module")
 def tiled():
     return config_of(40.0, pointing={"tiles": [2, 1], "overlap": 0.1})
@@ -132,10 +137,10 @@ def test_what_needs_the_whole_field_is_refused(sections, named):
 def runs(tmp_path_factory):
     """The same study whole and in patches; catalog, SEDs, truth and exposures are the same."""
     folders = {size: tmp_path_factory.mktemp("study") / "run" for size in (0.0, SIZE)}
-    whole = run_study(config_of(0.0, BAND), folders[0.0], until="matches").parent.parent
+    whole = run_study(run_config(0.0), folders[0.0], until="matches").parent.parent
     shutil.copytree(whole, folders[SIZE])
     before = (folders[SIZE] / "agn00/exposures/miri.f770w-0_cal.fits").stat().st_mtime_ns
-    run_study(config_of(SIZE, BAND), folders[SIZE], redo=True)
+    run_study(run_config(), folders[SIZE], redo=True)
     after = (folders[SIZE] / "agn00/exposures/miri.f770w-0_cal.fits").stat().st_mtime_ns
     assert before == after
     return folders[0.0], folders[SIZE]
@@ -160,7 +165,7 @@ def test_patches_measure_what_the_whole_field_does(runs):
 
 
 def test_mosaics_of_patches_are_parts_of_the_whole(runs):
-    config = config_of(SIZE, BAND)
+    config = run_config()
     whole = grid_of(config, NATIVE)
     full = read_image(runs[0] / f"agn00/mosaic_{BAND}.fits")
     name = shown_patch(config)
@@ -177,11 +182,11 @@ def test_mosaics_of_patches_are_parts_of_the_whole(runs):
 
 def test_the_page_says_which_patch_it_shows(runs):
     page = (runs[1] / "report/index.html").read_text()
-    assert f"the images are of patch {shown_patch(config_of(SIZE, BAND))}" in page
+    assert f"the images are of patch {shown_patch(run_config())}" in page
     every = QTable.read(runs[1] / "detections.ecsv")
     assert len(set(every["id"].tolist())) == len(every)
     patches = set(np.asarray(every["patch"]).tolist())
-    assert patches == set(study_patches(config_of(SIZE, BAND)))
+    assert patches == set(study_patches(run_config()))
 
 
 def test_a_patch_reads_its_own_exposures_only():

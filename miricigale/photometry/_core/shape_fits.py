@@ -60,22 +60,22 @@ def _buffers(plan, n_curves, n):
     """
     (_, ny, nx), size = plan.response.shape, len(plan.inner)
     curves = np.empty((n_curves, 2, ny, nx), np.float32)
-    right, middle = (
-        np.empty((2 * ny, n, 2, nx), np.float32),
-        np.empty((size * n, 2 * nx), np.float32),
-    )
+    right = np.empty((2 * ny, n, 2, nx), np.float32)
+    middle = np.empty((size * n, 2 * nx), np.float32)
     return curves, right, middle, np.empty((size, n, size), np.float32)
 
 
 @njit(cache=True, nogil=True)
-def _placed(plan, x, y):
-    """The PSF's transform, moved to a place."""
-    found, (_, ny, nx) = plan.response.copy(), plan.response.shape
-    along = np.exp(-1j * x * plan.kx[:nx]).astype(np.complex64)
-    for i in range(ny):
-        turn = np.complex64(np.exp(-1j * y * plan.ky[i * nx]))
-        found[0, i] *= along * turn
-        found[1, i] *= along * np.conj(turn)
+def _placed(plan, xy):
+    """The PSF's transform, moved to places, (n, 2)."""
+    _, ny, nx = plan.response.shape
+    found = np.empty((len(xy), 2, ny, nx), np.complex64)
+    for s, (x, y) in enumerate(xy):
+        along = np.exp(-1j * x * plan.kx[:nx]).astype(np.complex64)
+        for i in range(ny):
+            turn = np.complex64(np.exp(-1j * y * plan.ky[i * nx]))
+            found[s, 0, i] = plan.response[0, i] * along * turn
+            found[s, 1, i] = plan.response[1, i] * along * np.conj(turn)
     return found
 
 
@@ -131,26 +131,28 @@ def draw_curves(plan, curves, x, y, more):
     """
     buffers = _buffers(plan, len(curves), len(curves) + more)
     buffers[0].reshape(len(curves), -1)[:] = curves
-    _images(plan, _placed(plan, x, y), buffers)
+    _images(plan, _placed(plan, np.array([[x, y]]))[0], buffers)
     return buffers[3]
 
 
 @njit(cache=True, nogil=True)
-def _products(plan, table, inverse, corners, parameters, buffers, columns):
+def _products(plan, table, inverse, corners, shapes, placed, buffers, columns):
     """Write whitened models and derivatives into all columns but the last; products of all columns."""
     images = buffers[3]
     size, k, width = len(images), images.shape[1], inverse.shape[1]
     left, top = corners[:, 0].min(), corners[:, 1].min()
-    for s in range(len(parameters)):
+    for s in range(len(shapes)):
         x, y = corners[s]
         curves = buffers[0].reshape(len(buffers[0]), -1)
-        fill_curves(plan.kx, plan.ky, parameters[s, 2:], table, curves)
-        _images(plan, _placed(plan, parameters[s, 0] - x, parameters[s, 1] - y), buffers)
+        fill_curves(plan.kx, plan.ky, shapes[s], table, curves)
+        _images(plan, placed[s], buffers)
         for row in range(size):
             first = (y - top + row) * width + x - left
-            noise = inverse[y - top + row, x - left : x - left + size]
             for j in range(k):
-                columns[s * k + j, first : first + size] = images[row, j] * noise
+                # by pixel: expressions of short pieces of arrays take longer than their pixels
+                for i in range(size):
+                    noise = inverse[y - top + row, x - left + i]
+                    columns[s * k + j, first + i] = images[row, j, i] * noise
     return np.dot(columns, columns.T)
 
 
@@ -228,7 +230,8 @@ def minimum(plan, table, white, inverse, corners, start, mean, precision, limits
     flux, matrix, slope = np.zeros(n), np.eye(n * k), np.zeros(n * k)
     trial, parameters, chi2, damping = start, start, np.inf, 0.1
     while True:
-        products = _products(plan, table, inverse, corners, trial, buffers, columns)
+        placed = _placed(plan, trial[:, :2] - corners)
+        products = _products(plan, table, inverse, corners, trial[:, 2:], placed, buffers, columns)
         state = _state(products, trial, mean, precision)
         if state[0] <= chi2:
             parameters, (chi2, flux, matrix, slope) = trial, state
@@ -289,11 +292,13 @@ def evidence_of(plan, table, white, inverse, corners, best, flux, shapes, mean, 
     buffers, parameters, columns = _buffers(plan, 1, 3), best.copy(), np.empty((4, white.size))
     columns[-1] = white.reshape(-1)
     found, known = np.zeros((len(shapes), 2)), np.empty(len(beside))
+    placed, log_prior = _placed(plan, best[:, :2] - corners), np.linalg.slogdet(precision[0])[1]
     # the best one first
     for s in range(-1 if len(beside) else 0, len(shapes)):
         if s >= 0:
             parameters[0, 2:] = shapes[s]
-        products = _products(plan, table, inverse, corners, parameters, buffers, columns)
+        form = parameters[:, 2:]
+        products = _products(plan, table, inverse, corners, form, placed, buffers, columns)
         if len(beside):
             shared = columns @ beside.T
             if s < 0:
@@ -307,8 +312,7 @@ def evidence_of(plan, table, white, inverse, corners, best, flux, shapes, mean, 
         if light[0] > 0:
             # the center: changes of the pixels are in proportion to the light
             step = np.linalg.solve(matrix, slope)
-            evidence = slope @ step - chi2 - np.linalg.slogdet(matrix)[1]
-            evidence += np.linalg.slogdet(precision[0])[1]
+            evidence = slope @ step - chi2 - np.linalg.slogdet(matrix)[1] + log_prior
             found[s, 1] = np.log(max(light[0] + step[0], 0.1 * light[0]))
             found[s, 0] = 0.5 * evidence - found[s, 1]
     return found
