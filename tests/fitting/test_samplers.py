@@ -266,7 +266,7 @@ def test_processes_give_the_same_numbers(engine):
     fitter = BayesFitter(model, REAL, priors=priors, engine=engine, settings=settings)
     serial = fitter.fit(table, seed=1)
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, mp_context=context) as pool:
+    with ProcessPoolExecutor(2, mp_context=context) as pool:
         again = fitter.fit(table, seed=1, executor=pool)
     assert_array_equal(serial.draws, again.draws)
     assert_array_equal(serial.model_flux, again.model_flux)

@@ -253,6 +253,8 @@ def test_killed_in_each_stage_on_one_thread_and_with_level1b_it_ends_with_the_sa
     again = json.loads((folder / "manifest.json").read_text())["stages"]
     assert set(again) == set(known)
     for key, record in known.items():
+        more = set(again[key]["products"]) - set(record["products"])
+        assert all("/level1b/" in name or name.endswith("_rate.fits") for name in more)
         assert record["products"].items() <= again[key]["products"].items()
         for name in record["products"]:
             assert (folder / name).read_bytes() == (study["folder"] / name).read_bytes(), name
