@@ -134,6 +134,35 @@ def test_galaxies_that_overlap_are_recovered_together():
     assert_allclose(free, np.std(drawn), rtol=0.25)
 
 
+def test_evidence_is_the_integral_over_light_and_center():
+    from miricigale.photometry._core.shape_fits import evidence_of
+
+    fitter, rng = ShapeFitter(gaussian_psf(), SCALE), np.random.default_rng(3)
+    truth = np.array([16.2, 15.9, np.log(2.5), 0.0, 0.2, -0.1])
+    light = 600 * fitter.profiles((33, 33), truth)[0] + rng.normal(0, 1.0, (33, 33))
+    stamp = fitter._stamp(light, np.ones_like(light), truth[None], 16)
+    mean, width = truth + [0.03, -0.02, 0, 0, 0, 0], 0.05
+    best = stamp.minimum(truth[None], mean[None], np.eye(2)[None] / width**2)
+    shapes = truth[2:] + [[0, 0, 0, 0], [0.03, -0.02, 0.02, 0.0]]
+    prior = mean[None], np.eye(2)[None] / width**2
+    none = np.zeros((0, light.size))
+    found = evidence_of(*stamp.pixels, best[2], best[1], shapes, *prior, none)[:, 0]
+    step = 0.008
+    grid = np.arange(-0.2, 0.201, step)
+    for shape, value in zip(shapes, found, strict=True):
+        total = 0.0
+        for dx in grid:
+            for dy in grid:
+                model = fitter.profiles((33, 33), [*(mean[:2] + [dx, dy]), *shape])[0].ravel()
+                power, seen = model @ model, model @ light.ravel()
+                # the light is flat in its logarithm, and well known
+                fit = seen / power
+                inside = np.exp(-0.5 * (light.ravel() @ light.ravel() - seen * fit - light.size))
+                total += inside * np.exp(-0.5 * (dx**2 + dy**2) / width**2) / (fit * np.sqrt(power))
+        expected = np.log(total * step**2 / (2 * np.pi * width**2)) - 0.5 * light.size
+        assert_allclose(value, expected, atol=0.02)
+
+
 @pytest.mark.parametrize(("snr", "share"), [(8, 0.7), (30, 0.95)])
 def test_points_are_told_from_galaxies(snr, share):
     rng = np.random.default_rng(snr)
