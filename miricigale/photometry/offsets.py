@@ -134,14 +134,14 @@ def source_offsets(fit, residual, model, rows):
     step = np.full((len(rows), 2), np.nan)
     error, others = np.full(len(rows), np.nan), np.full(len(rows), np.nan)
     half = max(3, int(np.ceil(2 * 2.3548 * fit.psf_width)))
+    at = np.rint(fit.bank.xy[rows]).astype(int)
     for block in fit.bank.blocks():
         for k in range(*np.searchsorted(rows, [block.first, block.last])):
             one = rows[k] - block.first
             y0, x0, ny, nx = block.box[one]
-            x, y = np.rint(fit.bank.xy[rows[k]]).astype(int)
             place = tuple(
                 slice(max(c - half, low), max(min(c + half + 1, low + size), low))
-                for c, low, size in ((y, y0, ny), (x, x0, nx))
+                for c, low, size in zip(at[k, ::-1], (y0, x0), (ny, nx), strict=True)
             )
             stamp = block.values[block.start[one] : block.start[one + 1]].reshape(ny, nx)
             stamp = stamp[place[0].start - y0 : place[0].stop - y0]
