@@ -19,6 +19,9 @@ collect_ignore = [f"tests/{name}" for name in POSIX] if os.name == "nt" else []
 def pytest_configure(config):
     # figures belong to no window
     os.environ.setdefault("MPLBACKEND", "agg")
+    if getattr(config.option, "numprocesses", None):
+        # workers fill the cores: threads of the linear algebra would wait for each other
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from miricigale import conf
 
     config.own_folder = Path(tempfile.mkdtemp(prefix="miricigale-tests-"))

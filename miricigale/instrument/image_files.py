@@ -43,6 +43,9 @@ def _packed(values, name, header=None, *, step=None):
         packs = values.dtype.kind in "iu" and values.dtype.itemsize <= 4
     if not packs:
         return fits.ImageHDU(values, header, name=name)
+    # of several rows, for each tile costs time
+    if values.ndim == 2:
+        options["tile_shape"] = (min(16, values.shape[0]), values.shape[1])
     return fits.CompImageHDU(
         values, header, name=name, compression_type="RICE_1", dither_seed=1, **options
     )

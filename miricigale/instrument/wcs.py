@@ -245,7 +245,7 @@ def pixel_area_map(wcs, shape, out=None):
     >>> area.mean().to("arcsec2").round(5)
     <Quantity 0.01213 arcsec2>
     """
-    from scipy.interpolate import RectBivariateSpline, make_interp_spline
+    from scipy.interpolate import make_interp_spline
 
     ny, nx = shape
     nodes = [np.linspace(0, n - 1, min(max(n, 6), 33)) for n in (ny, nx)]
@@ -259,9 +259,8 @@ def pixel_area_map(wcs, shape, out=None):
     along_x = (direction(step, 0) - direction(-step, 0)) / (2 * step)
     along_y = (direction(0, step) - direction(0, -step)) / (2 * step)
     area = np.linalg.norm(np.cross(along_x, along_y, axis=0), axis=0).reshape(x.shape)
-    if out is None:
-        return RectBivariateSpline(nodes[0], nodes[1], area)(np.arange(ny), np.arange(nx))
-    # the same splines as products: values at the nodes to those at all pixels, axis by axis
+    out = np.empty(shape) if out is None else out
+    # bicubic splines as products: values at the nodes to those at all pixels, axis by axis
     down, along = (
         make_interp_spline(one, np.eye(len(one)))(np.arange(n))
         for one, n in zip(nodes, shape, strict=True)

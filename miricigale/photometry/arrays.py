@@ -12,7 +12,6 @@ from miricigale.instrument import ImageFacts, north_up_wcs, pixel_area_map
 from miricigale.photometry.sky_noise import mask_filled
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
-from miricigale.utils.parallel import chunks
 from miricigale.utils.units import FNU, SURFACE_BRIGHTNESS, to_array
 
 #: uJy per MJy.
@@ -29,7 +28,6 @@ class ImageArrays:
     usable: np.ndarray  # (ny, nx): False where masked, not finite or without noise.
     area: np.ndarray  # (ny, nx): uJy per MJy/sr: the solid angle of each pixel.
     wcs: object  # The image's coordinates.
-    measured_noise: bool  # Whether sigma was measured on the image for want of an uncertainty.
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -42,7 +40,7 @@ class FitArrays:
     usable: np.ndarray
     area: np.ndarray
     wcs: object
-    measured_noise: bool
+    measured_noise: bool  # Whether the noise was measured on the image for want of an uncertainty.
     noise_correction: float = 1.0  # As the image states it (`ImageFacts`).
 
     def new(self, dtype=np.float32):
@@ -60,7 +58,7 @@ class FitArrays:
             return np.divide(np.float32(1), self.inverse_sigma, out=self.new())
 
 
-def image_arrays(image, name):
+def image_arrays(image, name, dtype=float):
     """
     Take a `~astropy.nddata.CCDData` apart.
 
@@ -71,6 +69,8 @@ def image_arrays(image, name):
         Without an uncertainty the noise is 1.4826 times the median absolute deviation of the image.
     name : str
         The argument's name, for messages.
+    dtype : type, optional
+        That of the arrays; single precision for large images.
 
     Returns
     -------
@@ -90,43 +90,24 @@ def image_arrays(image, name):
     `~miricigale.utils.exceptions.PhotometryWarning`
         If areas that are exactly 0 are taken as without data.
     """
-    data, noise, usable = _checked(image, name)
-    area = pixel_area_map(image.wcs, usable.shape) * _MICRO
-    each = 1.0 if _per_pixel(image) else area
-    return ImageArrays(
-        flux=np.where(usable, np.asarray(data[0], float) * data[1], 0.0) * each,
-        sigma=np.where(usable, np.asarray(noise[0], float) * noise[1] * each, np.inf),
-        usable=usable,
-        area=area,
-        wcs=image.wcs,
-        measured_noise=image.uncertainty is None,
-    )
+    *given, usable = _checked(image, name)
+    area = pixel_area_map(image.wcs, usable.shape, out=np.empty(usable.shape, dtype))
+    area *= _MICRO
+    # in place, for images can be large
+    flux, sigma = (np.multiply(*one, dtype=dtype, casting="same_kind") for one in given)
+    if not _per_pixel(image):
+        flux *= area
+        sigma *= area
+    flux[~usable], sigma[~usable] = 0.0, np.inf
+    return ImageArrays(flux, sigma, usable, area, image.wcs)
 
 
 def fit_arrays(image, name):
     """Take a `~astropy.nddata.CCDData` apart for a fit of templates; see `image_arrays`."""
-    data, noise, usable = _checked(image, name)
-    flux, inverse, area = (np.zeros(usable.shape, np.float32) for _ in range(3))
-    pixel_area_map(image.wcs, usable.shape, out=area)
-    area *= np.float32(_MICRO)
-    for part in chunks(len(usable), 256):
-        for out, (values, factor) in ((flux, data), (inverse, noise)):
-            out[part] = values[part]
-            out[part] *= np.float32(factor)
-            if not _per_pixel(image):
-                out[part] *= area[part]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            np.divide(np.float32(1), inverse[part], out=inverse[part])
-        flux[part][~usable[part]] = inverse[part][~usable[part]] = 0
-    return FitArrays(
-        flux=flux,
-        inverse_sigma=inverse,
-        usable=usable,
-        area=area,
-        wcs=image.wcs,
-        measured_noise=image.uncertainty is None,
-        noise_correction=ImageFacts.of(image).noise_correction,
-    )
+    one = image_arrays(image, name, np.float32)
+    inverse = np.divide(np.float32(1), one.sigma, out=one.sigma)
+    facts = image.uncertainty is None, ImageFacts.of(image).noise_correction
+    return FitArrays(one.flux, inverse, one.usable, one.area, one.wcs, *facts)
 
 
 def _per_pixel(image):

@@ -19,7 +19,7 @@ _FLAT = 5
 class Cutout:
     """The light of one source on the fine grid, before convolution, of unit total."""
 
-    data: np.ndarray  # (h, w): Light to be convolved.
+    data: np.ndarray  # (h, w): Light to be convolved, in single precision: there can be many.
     origin: tuple  # Fine pixel (y, x) of its corner.
     #: Sum of the noise variances of the light, for the errors-in-variables correction.
     noise: float = 0.0
@@ -28,6 +28,9 @@ class Cutout:
     #: What is added to a profile: the image less the profile, which has the sharp PSF; None
     #: without.
     rest: "Cutout | None" = None
+
+    def __post_init__(self):
+        object.__setattr__(self, "data", np.asarray(self.data, np.float32))
 
     @property
     def kind(self):

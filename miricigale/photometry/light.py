@@ -10,7 +10,7 @@ from miricigale.photometry.cutouts import Cutout
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.shapes import Beside, Shape, ShapeFitter, not_fitted
 from miricigale.photometry.wings import adjust_wings
-from miricigale.utils.parallel import parallel_map
+from miricigale.utils.parallel import chunks, parallel_map
 
 #: Width (pixels) of the Gaussian that defines the core, its least signal-to-noise, how many standard
 #: deviations of chi^2 a profile may miss it by, and the signal-to-noise that makes a neighbor.
@@ -136,9 +136,12 @@ class _Segments:
     def of(cls, data, variance, labels):
         places = scipy.ndimage.find_objects(labels)
         usable = np.isfinite(variance)
-        flat, n = labels.ravel(), len(places) + 1
-        totals = np.bincount(flat, np.where(usable, data, 0.0).ravel(), n)
-        noise = np.bincount(flat, np.where(usable, variance, 0.0).ravel(), n)
+        totals, noise = np.zeros((2, len(places) + 1))
+        for rows in chunks(len(labels), 256):
+            for sums, image in ((totals, data), (noise, variance)):
+                sums += np.bincount(
+                    labels[rows][usable[rows]], image[rows][usable[rows]], len(sums)
+                )
         # infinite for noiseless images, zero for segments without data
         ratio = np.where(totals > 0, np.inf, 0.0)
         np.divide(totals, np.sqrt(noise), out=ratio, where=noise > 0)
@@ -191,7 +194,7 @@ class _Lights:
     def __init__(self, data, variance, fitter, segments, select, executor):
         self.data, self.variance, self.fitter, self.segments = data, variance, fitter, segments
         self.select, self.executor = select, executor
-        self.light, self.snr = _smooth(data, variance, executor)
+        self.light, self.core = _smooth(data, variance, executor)
         # what is no more than a peak of the noise hides nothing
         self.others = segments.ratio >= _OTHER_SNR
 
@@ -249,7 +252,7 @@ class _Lights:
 
         def fit(group):
             members, around = [models[k] for k in group], _hull([models[k].around for k in group])
-            data = self.data[around] - sum_of_all[around]
+            data = self.data[around].astype(float) - sum_of_all[around]
             for one in members:
                 data[_within(one.around, around)] += one.image
             labels = [sources[k][0] for k in group]
@@ -309,7 +312,7 @@ class _Lights:
         free = own | usable & ~self.others[labels]
         for one in together:
             free |= usable & (labels == one)
-        weight = 1.0 / np.sqrt(np.where(free, self.variance[around], np.inf))
+        weight = 1.0 / np.sqrt(np.where(free, self.variance[around], np.inf), dtype=float)
         looser = weight / np.hypot(1.0, _MISFIT * np.maximum(self.light[around], 0.0) * weight)
         return weight, looser, own
 
@@ -317,14 +320,15 @@ class _Lights:
         """The profile of one source, whatever others there are; of no template yet."""
         around = _around(self.segments.places[label - 1], xy, self.data.shape)
         _, weight, _ = self._weight(around, label)
-        shape = self.fitter.fit(self.data[around], weight, xy - _corner(around), nodes=nodes)
+        data = self.data[around].astype(float)
+        shape = self.fitter.fit(data, weight, xy - _corner(around), nodes=nodes)
         return None if shape is None else _Model(around, shape, self._image(around, shape))
 
     def _model(self, label, xy, others, population, last):
         """Fit one source again, ``others`` being the light of others on its stamp, ``last`` its last model."""
         around = last.around
         weight, looser, own = self._weight(around, label, last.labels)
-        data, corner = self.data[around] - others, _corner(around)
+        data, corner = self.data[around].astype(float) - others, _corner(around)
         prior = population.at(self.segments.brightness(label))
         shape = self.fitter.fit(data, looser, xy - corner, prior, last.shape, last.beside)
         if shape is None:
@@ -335,7 +339,7 @@ class _Lights:
         new = dataclasses.replace(last, **fitted, cutout=None, light=1.0)
         if self.select and shape.point > 0.5:
             return new
-        core = own & (self.snr[around] > _CORE_SNR)
+        core = own & self.core[around]
         n = np.count_nonzero(core)
         if self.select:
             excess = np.sum(((data - new.image) * weight)[core] ** 2) - n
@@ -410,14 +414,22 @@ def _around(place, xy, shape):
 
 
 def _smooth(data, variance, executor):
-    """The image smoothed, and its signal-to-noise."""
-    usable = np.isfinite(variance)
+    """The image smoothed, and where its signal-to-noise is that of a core."""
+    light, core = np.empty(data.shape, np.float32), np.empty(data.shape, bool)
+    rim, gain = round(16 * _WIDTH) + 1, 1.0 / (2.0 * np.sqrt(np.pi) * _WIDTH)
 
-    def smooth(what):
-        image, width = what
-        return scipy.ndimage.gaussian_filter(np.where(usable, image, 0.0), width)
+    def smooth(rows):
+        first = max(rows.start - rim, 0)
+        part, own = slice(first, rows.stop + rim), slice(rows.start - first, rows.stop - first)
+        usable = np.isfinite(variance[part])
+        found, noise = (
+            scipy.ndimage.gaussian_filter(np.where(usable, image[part], 0.0), width, output=float)[
+                own
+            ]
+            for image, width in ((data, _WIDTH), (variance, 4 * _WIDTH))
+        )
+        light[rows] = found
+        core[rows] = (noise > 0) & (found > _CORE_SNR * gain * np.sqrt(noise))
 
-    noise, light = parallel_map(smooth, [(variance, 4 * _WIDTH), (data, _WIDTH)], executor=executor)
-    noise = np.sqrt(noise)
-    gain = 1.0 / (2.0 * np.sqrt(np.pi) * _WIDTH)
-    return light, light / np.where(noise > 0, noise * gain, np.inf)
+    parallel_map(smooth, chunks(len(data), 256), executor=executor)
+    return light, core

@@ -249,9 +249,9 @@ def _stars(page, stars, band):
             star, known = before.star, np.isfinite(before.star.sigma)
             plot_image(np.where(known, star.data, np.nan), ax=row[0], title="star", **plain)
             for ax, one, title in ((row[1], before, "model"), (row[2], after, "corrected")):
-                pull = np.where(one.weight > 0, one.residual * one.weight, np.nan)
-                title = f"{title}, chi2 {one.chi2:.2f}"
-                plot_image(pull.reshape(star.data.shape), ax=ax, title=title, **pulls)
+                pull = np.full(star.data.shape, np.nan)
+                pull[known] = one.residual * one.weight
+                plot_image(pull, ax=ax, title=f"{title}, chi2 {one.chi2:.2f}", **pulls)
         page.figure("figure", figure, **facts)
     page.table("table", (dict(zip(stars.table.colnames, row, strict=True)) for row in stars.table))
 

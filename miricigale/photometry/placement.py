@@ -62,11 +62,5 @@ class Placement:
             np.stack([one.target for one in kernels]),
             sides,
         )
-        return TemplateBank(
-            fine,
-            BankSources(templates.drawn(grid, fine_xy), fine_xy, xy, poly),
-            shape,
-            max_bytes=settings.memory.max_bytes,
-            weigh=weigh,
-            executor=executor,
-        )
+        sources = BankSources(templates.drawn(grid, fine_xy), fine_xy, xy, poly)
+        return TemplateBank(fine, sources, shape, settings.memory.max_bytes, weigh, executor)

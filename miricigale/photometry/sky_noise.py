@@ -192,7 +192,7 @@ def warn_of_sky(arrays, segments):
     member = arrays.usable & (segments > 0)
     label = segments[member]
     light, variance = (
-        np.bincount(label, values[member]) for values in (arrays.flux, arrays.sigma**2)
+        np.bincount(label, values) for values in (arrays.flux[member], arrays.sigma[member] ** 2)
     )
     good = light > 5 * np.sqrt(variance)
     if not good.any():

@@ -169,7 +169,7 @@ class SourceTemplates:
         """
         check_choice(template, "template", ("auto", "cutout"))
         known = catalog_sources(catalog)
-        fine = image_arrays(highres, "highres")
+        fine = image_arrays(highres, "highres", np.float32)
         segments = _segments(segmentation, fine.flux.shape)
         scale = pixel_scale(highres.wcs)
         psf = _psf_array(psf, scale)
@@ -183,10 +183,13 @@ class SourceTemplates:
         width = 1 / np.sqrt(psf.max() / psf.sum())
         full, flat = saturated_cores(fine.flux, fine.usable, segments, label, xy, width)
         flags[full] |= int(ForcedFlags.SATURATED)
-        variance = np.where(flat, np.inf, fine.sigma**2)
+        data, variance = fine.flux, fine.sigma
+        del fine
+        variance *= variance
+        variance[flat] = np.inf
         with threads(n_threads) as executor, single_threaded():
             light, more, snr, fitted = cutouts(
-                fine.flux, variance, psf, scale, segments, label, xy,
+                data, variance, psf, scale, segments, label, xy,
                 select=template == "auto", wings=wings,
                 min_snr=_MIN_SNR if template == "auto" else 0.0,
                 executor=executor,

@@ -11,6 +11,7 @@ from miricigale.filters import Filter
 from miricigale.photometry.arrays import fine_wcs, image_arrays, pixel_scale, sky_pixels
 from miricigale.psf import KernelField, _core
 from miricigale.psf.star_fit import TERMS, WHOLE, Star, StarPSF, fitted_stars
+from miricigale.utils.parallel import single_threaded
 from miricigale.utils.units import ANGLE
 
 #: Least signal-to-noise of a star, and largest number that are looked at and used, the brightest first.
@@ -138,7 +139,8 @@ def with_stars(photometer, image, sources, highres=None, grid=None):
     prior only the image's PSF is corrected.
     """
     least = WHOLE if photometer.psf_stars is None else 1
-    stars = kernel_stars(photometer.kernel, image, highres, sources, grid=grid, least=least)
+    with single_threaded():
+        stars = kernel_stars(photometer.kernel, image, highres, sources, grid=grid, least=least)
     errors, fit = photometer.errors, stars.fits.get("image")
     if errors.psf_error is None and fit is not None and fit.kind != "model":
         errors = dataclasses.replace(errors, psf_error=min(float(fit.error), 0.99))
@@ -209,9 +211,10 @@ def _star(arrays, grid, xy, others, place, reach, masked, half, step):
 
 def _without_others(fit):
     """A star without pixels that other sources brighten."""
-    star, left = fit.star, fit.residual.reshape(fit.star.data.shape)
-    most = _CLIP * np.hypot(star.sigma, _OTHERS * (star.data - left))
-    return dataclasses.replace(star, sigma=np.where(left > most, np.inf, star.sigma))
+    sigma, use = fit.star.sigma.copy(), np.isfinite(fit.star.sigma)
+    most = _CLIP * np.hypot(sigma[use], _OTHERS * (fit.star.data[use] - fit.residual))
+    sigma[use] = np.where(fit.residual > most, np.inf, sigma[use])
+    return dataclasses.replace(fit.star, sigma=sigma)
 
 
 def _corrected(kernel, fits, image):

@@ -103,7 +103,7 @@ class TemplateChanges:
         found = (found if fixed else found[:-1]).astype(np.float32)
         if not len(found):
             return [], 0.0
-        images = draw_curves(plan, found, *place, 0).swapaxes(0, 1).astype(float)
+        images = draw_curves(plan, found, *place, 0).swapaxes(0, 1)
         origin = int(middle[1]) - half, int(middle[0]) - half
         last = len(images) - 1 if fixed else len(images)
         return [Change(Cutout(one, origin), fixed=k == last) for k, one in enumerate(images)], 0.0

@@ -235,31 +235,20 @@ class TemplateBank:
 
     def _boxes(self, shape):
         """Boxes on the image that hold the fine stamps, cut to the image."""
-        fine, n = self.fine, len(self.sources.cutout)
-        low, high = np.empty((n, 2)), np.empty((n, 2))
-        half = fine.target.shape[1] // 2 + 1
+        half = self.fine.target.shape[1] // 2 + 1
+        low, high = self.sources.fine_xy - half, self.sources.fine_xy + half
         for k, cutout in enumerate(self.sources.cutout):
-            if cutout is None:
-                low[k] = self.sources.fine_xy[k] - half
-                high[k] = self.sources.fine_xy[k] + half
-                continue
-            sides = np.array([fine.sides_of(one) for one in cutout.layers])
-            low[k], high[k] = sides[:, 0].min(axis=0), sides[:, 1].max(axis=0)
-        # corners of the fine rectangle through the inverse of the linear map
+            if cutout is not None:
+                sides = np.array([self.fine.sides_of(one) for one in cutout.layers])
+                low[k], high[k] = sides[:, 0].min(axis=0), sides[:, 1].max(axis=0)
+        # the middle of the fine rectangle through the inverse of the linear map, and its half sides
         matrix = np.linalg.inv(self.sources.poly[:, :, 1:3])
-        corners = np.stack(
-            [
-                np.stack([a[:, 0], b[:, 1]], axis=-1) - self.sources.poly[:, :, 0]
-                for a in (low, high)
-                for b in (low, high)
-            ]
-        )
-        offset = np.einsum("kij,ckj->cki", matrix, corners)
-        first = offset.min(axis=0) + self.sources.xy
-        last = offset.max(axis=0) + self.sources.xy
+        middle = 0.5 * (low + high) - self.sources.poly[:, :, 0]
+        middle = np.einsum("kij,kj->ki", matrix, middle) + self.sources.xy
+        reach = np.einsum("kij,kj->ki", np.abs(matrix), 0.5 * (high - low))
         limit = np.array(shape)[::-1]
-        first = np.clip(np.floor(first), 0, limit).astype(int)
-        last = np.clip(np.ceil(last) + 1, 0, limit).astype(int)
+        first = np.clip(np.floor(middle - reach), 0, limit).astype(int)
+        last = np.clip(np.ceil(middle + reach) + 1, 0, limit).astype(int)
         size = np.maximum(last - first, 0)
         return np.stack([first[:, 1], first[:, 0], size[:, 1], size[:, 0]], axis=1)
 

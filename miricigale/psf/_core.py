@@ -278,6 +278,32 @@ def core_moments(data):
     return math.nan, math.nan, math.nan
 
 
+@njit(cache=True, nogil=True)
+def cubic_splines(coefficients, y, x):
+    """Cubic splines of shape (ny, nx, k) at positions in cells, shape (k, n), zero outside of the grid."""
+    ny, nx, k = coefficients.shape
+    values = np.zeros((y.size, k))
+    weights, nodes = np.empty((2, 4)), np.empty((2, 4), np.int64)
+    for n in range(y.size):
+        if not (0 <= y[n] <= ny - 1 and 0 <= x[n] <= nx - 1):
+            continue
+        for axis, (position, size) in enumerate(((y[n], ny), (x[n], nx))):
+            first = math.floor(position)
+            t = position - first
+            weights[axis, 0], weights[axis, 3] = (1 - t) ** 3 / 6, t**3 / 6
+            weights[axis, 1] = 2 / 3 - t * t * (2 - t) / 2
+            weights[axis, 2] = 1 - weights[axis, 0] - weights[axis, 1] - weights[axis, 3]
+            for m in range(4):
+                # the coefficients are mirrored at the edges
+                nodes[axis, m] = size - 1 - abs(size - 1 - abs(first + m - 1))
+        for a in range(4):
+            for b in range(4):
+                weight = weights[0, a] * weights[1, b]
+                for m in range(k):
+                    values[n, m] += weight * coefficients[nodes[0, a], nodes[1, b], m]
+    return values.T
+
+
 def half_maximum_width(data, x, y):
     """Full width at half maximum (cells) of the azimuthal mean around a point; NaN without a half."""
     limit = min(x, data.shape[1] - 1 - x, y, data.shape[0] - 1 - y)

@@ -72,19 +72,22 @@ class FittedStar:
     """
     A star with a PSF: flux, offset and background are fitted, what all stars have in common is not.
 
-    ``images``, (3 + k, n, n), are spline coefficients of the PSF, of its derivatives by x and y, and of its
+    Its arrays are of the pixels that count.
+
+    ``images``, (n, n, 3 + k), are spline coefficients of the PSF, of its derivatives by x and y, and of its
     changes by the terms. The first of these change by ``slope``, (3, 2), over the field. ``offset`` is that of the
     center in cells.
     """
 
     def __init__(self, star, offset, images, slope):
-        half = images.shape[-1] // 2
-        x, y = star.u.ravel() - offset[0], star.v.ravel() - offset[1]
+        half = len(images) // 2
+        use = np.isfinite(star.sigma)
+        data, sigma = star.data[use], star.sigma[use]
+        x, y = star.u[use] - offset[0], star.v[use] - offset[1]
         at = (y + half, x + half)
-        light, dx, dy, *terms = (map_coordinates(one, at, prefilter=False) for one in images)
+        light, dx, dy, *terms = _core.cubic_splines(images, *at)
         light = light + (slope @ star.place) @ terms[:_SLOPED]
         own = star.area * np.stack([light, -dx, -dy, np.ones_like(x)], axis=1)
-        data, sigma = star.data.ravel(), star.sigma.ravel()
         weight = 1.0 / sigma
         for _ in range(2):
             found = np.linalg.lstsq(own * weight[:, None], data * weight)[0]
@@ -99,7 +102,7 @@ class FittedStar:
         sloped = np.multiply.outer(star.place, terms[:_SLOPED]).reshape(-1, x.size)
         self.columns = self._apart((self.scale * np.concatenate([terms, sloped])).T)
         self.normal, self.right = self.columns.T @ self.columns, self.columns.T @ self._left
-        light = np.maximum(light, 0.0) * (weight > 0)
+        light = np.maximum(light, 0.0)
         self.chi2 = float(light @ (self.residual * weight) ** 2 / light.sum())
         self.snr = found[0] * np.sqrt(np.sum((own[:, 0] / sigma) ** 2))
 
@@ -139,7 +142,7 @@ def fitted_stars(psf, stars, *, slope=None, offsets=None):
     """
     fwhm = _core.half_maximum_width(psf, len(psf) // 2, len(psf) // 2)
     images = [psf, *np.gradient(psf)[::-1], *derivatives(psf, fwhm)]
-    images = np.stack([spline_filter(one) for one in images])
+    images = np.stack([spline_filter(one) for one in images], axis=-1)
     slope = np.zeros((_SLOPED, 2)) if slope is None else slope
     steps, offsets = (_STEPS, np.zeros((len(stars), 2))) if offsets is None else (1, offsets)
     for _ in range(steps):
@@ -194,8 +197,8 @@ class StarPSF:
         units = stars if len(stars) >= WHOLE else [half for one in stars for half in one.halves()]
         self.kind, self._cells, self._state = "model", 0.0, np.zeros(len(_SPREAD))
         self.before = self._fitted(stars)
-        self.chi2 = {"model": sum(one.misfit() for one in self._fitted(units))}
         fits, without, inverse = self._solved(units, 0)
+        self.chi2 = {"model": sum(one.misfit() for one in fits)}
         for kind, n, k in (("terms", 1, len(TERMS)), ("field", _FIELD, len(_SPREAD))):
             if len(stars) < max(n, least):
                 continue
@@ -237,7 +240,7 @@ class StarPSF:
         terms = self._state[: len(TERMS)]
         image = self._model if model is None else model
         # in steps, since changes are linear for small ones
-        for _ in range(_STEPS):
+        for _ in range(_STEPS if terms.any() else 0):
             image = image + np.tensordot(terms / _STEPS, derivatives(image, self._fwhm), 1)
         more = self.slope @ place
         if more.any():

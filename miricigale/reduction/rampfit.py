@@ -256,7 +256,8 @@ def fit_groups(
     def fit_rows(rows):
         ys, xs = np.nonzero(usable[rows])
         none = np.zeros(len(ys) + 1, np.int64)
-        return fit_part((ys + rows.start, xs, none, none[:0]))
+        # a copy, as all others are contiguous: for another layout the kernel would be compiled again
+        return fit_part((ys + rows.start, xs.copy(), none, none[:0]))
 
     with threads(n_threads) as executor:
         options = {"executor": executor, "progress_bar": progress_bar, "desc": "slopes"}

@@ -85,8 +85,7 @@ class Parameter:
             If it is not one finite number inside the bounds.
         """
         number = self.convert(value)
-        if np.ndim(number) != 0:
-            raise argument_error(self.name, "one number", f"shape {np.shape(number)}")
+        check_that(np.ndim(number) == 0, self.name, "one number", f"shape {np.shape(number)}")
         if number is np.ma.masked or np.asarray(number).dtype.kind not in "iuf":
             raise argument_error(self.name, "one number", repr(value))
         number = float(number)

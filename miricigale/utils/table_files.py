@@ -194,8 +194,7 @@ def table_hdu(table):
         warnings.filterwarnings("ignore", "The unit .* could not be saved", AstropyUserWarning)
         table.write(stream, format="fits")
     stream.seek(0)
-    with fits.open(stream) as hdus:
-        return hdus[1].copy()
+    return fits.open(stream)[1]
 
 
 def _table_format(path):

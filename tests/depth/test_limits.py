@@ -215,7 +215,6 @@ WIDE = gaussian_psf(0.3 * u.arcsec, pixel_scale=0.11 * u.arcsec, fov=6 * u.arcse
         ({"annulus": [0.1, 1] * u.arcsec}, "annulus"),
         ({"annulus": [1, 2, 3] * u.arcsec}, "annulus"),
         ({"n_groups": 3000, "time": 1e5 * u.s}, "n_groups"),
-        ({"time": 10 * u.s}, "time"),
         ({"residual": 0.5}, "residual"),
         ({"residual": True}, "residual"),
         ({"background": -1 * u.MJy / u.sr}, "background"),
@@ -233,3 +232,6 @@ def test_unknown_names_list_the_known():
     refuses(text, sensitivity, "miri.f770w", psf=miri_psf("miri.f560w"))
     refuses("no imaging filter", sensitivity, "miri.f600w", error=KeyError)
     refuses("'time' must be", sensitivity, NAME, 1e4, error=u.UnitsError)
+    # frames of 2.775 s
+    wanted = "'time' must be at least one integration of 10 groups, 27.75 s, got 10"
+    refuses(wanted, sensitivity, NAME, 10 * u.s, n_groups=10)

@@ -3,7 +3,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 
-from miricigale.detector._core.charge import add_poisson
+from miricigale.detector._core.charge import add_poisson, cosmic_ray_deposits
 from miricigale.detector._core.random import standard_normals
 from miricigale.detector._core.readout import digitize
 
@@ -102,6 +102,19 @@ def test_a_pixel_draws_the_same_beside_other_rows_and_dark_columns():
     add_poisson(part, np.ascontiguousarray(mean[3:5, bright]), KEY, 103)
     assert_array_equal(whole[:, :, 3:5, bright], part)
     assert not whole[..., ~bright].any()
+
+
+def test_tracks_lie_in_all_directions_alike():
+    # 160 hits per row, nearly each in a group of its own, along 12 pixels
+    settings = np.array([160, 1e6, 1, 0, 12, 0, 0, 0, 1, 0.0])
+    where, charge = cosmic_ray_deposits(KEY, 0, 500, (1, 2000000, 500, 500), settings)
+    group, y, x = where
+    # the angle of a complex second moment is twice that of the track
+    start = np.flatnonzero(np.diff(group, prepend=-1))
+    total, first, second = (np.add.reduceat(charge * (x + 1j * y) ** k, start) for k in range(3))
+    twice = np.exp(1j * np.angle(second / total - (first / total) ** 2))
+    # Rayleigh's test
+    assert np.exp(-twice.size * np.abs(twice.mean()) ** 2) > 1e-3
 
 
 def test_enormous_means_stay_finite():

@@ -56,6 +56,16 @@ def test_hidden_star_formation_and_colors_at_published_values():
     for u_v, v_j, z in ((1.25, 0.5, [1.0, 2.5]), (1.52, 1.0, [0.2, 0.6])):
         assert uvj_quiescent(u_v * u.mag, v_j * u.mag, z).tolist() == [False, True]
     assert not uvj_quiescent(np.nan * u.mag, 0.5 * u.mag, 1.0)
+    # equation 15: U - V least, V - J most, and constant of the line, on both sides of each
+    for z, least, most, line in (
+        (0.4, 1.3, 1.6, 0.69),
+        (1.4, 1.3, 1.6, 0.59),
+        (1.9, 1.3, 1.5, 0.59),
+        (2.1, 1.2, 1.4, 0.59),
+    ):
+        edge = np.array([-1e-9, 1e-9])
+        for u_v, v_j in ((least + edge, 0.3), (3.0, most - edge), (0.88 * 1.3 + line + edge, 1.3)):
+            assert uvj_quiescent(u_v * u.mag, v_j * u.mag, z).tolist() == [False, True], (z, v_j)
 
 
 @pytest.fixture

@@ -120,6 +120,16 @@ def test_over_all_galaxies_the_agn_are_those_of_the_luminosity_function(z, compt
     assert_allclose(number, wanted, rtol=5e-3)
 
 
+def test_rates_of_accretion_break_at_the_eddington_limit_and_black_holes_scatter():
+    """Aird et al. 2013: slopes -0.65 and -2.1, 0.38 dex, by numerical convolution."""
+    log_mass, y = np.array([9.5, 10.5, 11.5, 12.5]), np.linspace(-4.0, 4.0, 8001)
+    rate = y + (44.0 - log_mass - np.log10(1.3e38 * 0.002 / 25.0))[:, None]
+    law = 10 ** np.where(rate < 0, -0.65 * rate, -2.1 * rate)
+    wanted = np.trapezoid(law * np.exp(-0.5 * (y / 0.38) ** 2), y)
+    got = AGNPopulation().density(10**log_mass * u.Msun, 1.0, lx(44.0))[:, 0]
+    assert_allclose(got / got[0], wanted / wanted[0], rtol=1e-4)
+
+
 @pytest.fixture(scope="module")
 def galaxies():
     """A volume of galaxies at z = 1, of the mass function above 10^9."""

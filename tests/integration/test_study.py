@@ -207,6 +207,7 @@ from miricigale.workflow import StudyRunner, load_config, study_stages
 from miricigale.workflow.engine.stage import Context
 
 save = Context.save
+study_stages()  # what is imported here is not imported by each fork
 config = load_config(sys.argv[1], overrides={"run": {"threads": 1, "keep_level1b": True}})
 
 

@@ -90,7 +90,7 @@ def test_extended_sources_through_kernel_and_cutouts(tools):
 
 @pytest.mark.parametrize(("noise", "snr", "bias"), [(0.05, 40, 0.06), (0.16, 20, 0.1)])
 def test_noisy_templates(tools, noise, snr, bias):
-    ratios, as_they_are = [], []
+    ratios, as_they_are, less = [], [], []
     for seed in range(3):
         sky, flux, high, low = galaxies(tools, noise=noise, n=49, seed=seed)
         segmentation, _ = detect_sources(high, threshold=1.0, n_pixels=10)
@@ -105,8 +105,13 @@ def test_noisy_templates(tools, noise, snr, bias):
         plain = ForcedPhotometer(tools.kernel, wings=False)
         result = plain.measure(low, quiet, segmentation, catalog)
         as_they_are.append((result.flux.value / flux)[good])
+        less.append(
+            (plain.measure(low, high, segmentation, catalog).flux / result.flux).value[good]
+        )
     assert abs(np.median(np.concatenate(ratios)) - 1) < bias
     assert np.median(np.concatenate(as_they_are)) < 1 - bias / 2
+    # what noise adds to the power of a template is taken off
+    assert np.min(np.concatenate(less)) > 1.0005
 
 
 def test_templates_and_flags_say_what_was_used(tools):

@@ -146,11 +146,14 @@ def test_evidence_is_the_integral_over_light_and_center():
     shapes = truth[2:] + [[0, 0, 0, 0], [0.03, -0.02, 0.02, 0.0]]
     prior = mean[None], np.eye(2)[None] / width**2
     none = np.zeros((0, light.size))
-    found = evidence_of(*stamp.pixels, best[2], best[1], shapes, *prior, none)[:, 0]
+    # a prior that is twice as wide about the same values holds a quarter of its density there
+    flat = [stamp.minimum(best[2], best[2], np.eye(2)[None] / w**2)[3] for w in (5.0, 10.0)]
+    assert_allclose(flat[0] - flat[1], 2 * np.log(2), rtol=1e-4)
+    found = evidence_of(*stamp.pixels, best[2], best[1], shapes, *prior, none)
     step = 0.008
     grid = np.arange(-0.2, 0.201, step)
-    for shape, value in zip(shapes, found, strict=True):
-        total = 0.0
+    for shape, (value, flux) in zip(shapes, found, strict=True):
+        total = most = at_most = 0.0
         for dx in grid:
             for dy in grid:
                 model = fitter.profiles((33, 33), [*(mean[:2] + [dx, dy]), *shape])[0].ravel()
@@ -158,9 +161,12 @@ def test_evidence_is_the_integral_over_light_and_center():
                 # the light is flat in its logarithm, and well known
                 fit = seen / power
                 inside = np.exp(-0.5 * (light.ravel() @ light.ravel() - seen * fit - light.size))
-                total += inside * np.exp(-0.5 * (dx**2 + dy**2) / width**2) / (fit * np.sqrt(power))
+                inside *= np.exp(-0.5 * (dx**2 + dy**2) / width**2)
+                total += inside / (fit * np.sqrt(power))
+                most, at_most = max((most, at_most), (inside, fit))
         expected = np.log(total * step**2 / (2 * np.pi * width**2)) - 0.5 * light.size
         assert_allclose(value, expected, atol=0.02)
+        assert_allclose(flux, np.log(at_most), atol=2e-5)
 
 
 @pytest.mark.parametrize(("snr", "share"), [(8, 0.7), (30, 0.95)])

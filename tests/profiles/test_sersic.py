@@ -3,16 +3,18 @@ import itertools
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from scipy.special import gamma
+from scipy.special import erfc, gamma
 
 from helpers.errors import refuses
 from miricigale.profiles import (
+    _core,
     sersic_bn,
     sersic_enclosed_fraction,
     sersic_image,
     sersic_radius,
     sersic_stamp,
 )
+from miricigale.profiles.sersic import light_table, parameter_rows
 
 INDICES = (0.3, 0.5, 1.0, 2.5, 4.0, 8.0)
 
@@ -119,6 +121,46 @@ def test_every_pixel_is_the_integral_over_it(n, r_eff, ratio):
         assert image[i, j] == pytest.approx(truth, rel=1e-3), (i, j)
         checked += 1
     assert checked >= 1
+
+
+def cell_of(dx, dy, size, r_eff, **shape):
+    """Light of a cell of a source of unit light, and the offset of its centroid."""
+    rows = parameter_rows(x=0, y=0, total_flux=1, r_eff=r_eff, **shape)
+    out = np.empty(3)
+    _core.cell(dx, dy, size, rows[0], light_table(shape["n"])[0], out)
+    return out
+
+
+@pytest.mark.parametrize(
+    ("size", "dx", "dy"), [(0.8, 0.2, 0.3), (0.8, -0.7, 1.1), (0.8, 3.0, 4.0), (0.2, 3.0, 4.0)]
+)
+def test_light_and_centroid_of_a_cell_whatever_the_unit_of_length(size, dx, dy):
+    """Sums of 1000 x 1000 points of an exponential disk (Graham & Driver 2005, eq. 1 and 2)."""
+    r_eff, ratio, theta = 2.5, 0.6, 0.5
+    shape = {"n": 1.0, "axis_ratio": ratio, "theta": theta}
+    found = cell_of(dx, dy, size, r_eff, **shape)
+    u, v = np.meshgrid(*[size * ((np.arange(1000) + 0.5) / 1000 - 0.5)] * 2)
+    x, y, bn = dx + u, dy + v, sersic_bn(1.0)
+    along, across = x * np.cos(theta) + y * np.sin(theta), y * np.cos(theta) - x * np.sin(theta)
+    values = np.exp(-bn * np.hypot(along, across / ratio) / r_eff)
+    light = bn**2 / (2 * np.pi * r_eff**2 * ratio) * values.mean() * size**2
+    assert found[0] == pytest.approx(light, rel=1e-6)
+    centroid = np.average(u, weights=values), np.average(v, weights=values)
+    assert_allclose(found[1:], centroid, atol=2e-5 * size)
+    smaller = cell_of(dx / 16, dy / 16, size / 16, r_eff / 16, **shape)
+    assert_allclose(smaller * (1, 16, 16), found, rtol=1e-10)
+
+
+def test_cells_of_a_gaussian_are_products_of_error_functions():
+    """The index 0.5, from the middle to where the light is 1e-33 of the total."""
+    sigma, side = 1.5, 41
+    image = sersic_image((side, side), x=20, y=20, r_eff=sigma * np.sqrt(2 * np.log(2)), n=0.5)
+    near = np.abs(np.arange(side) - 20)
+    one = 0.5 * (erfc((near - 0.5) / sigma / 2**0.5) - erfc((near + 0.5) / sigma / 2**0.5))
+    assert_allclose(image, one * one[:, None], rtol=1e-5, atol=1e-35)
+    # and far below the half-light radius the light is the central brightness times the area
+    light = cell_of(0, 0, 1e-9, 1.0, n=0.5, axis_ratio=1, theta=0)[0]
+    assert light / 1e-18 == pytest.approx(np.log(2) / np.pi, rel=1e-6)
 
 
 def test_stamp_is_a_cut_of_the_image():

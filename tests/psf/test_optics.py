@@ -45,6 +45,12 @@ def test_airy_pattern_of_a_circular_aperture(disk):
     assert density == pytest.approx(np.pi / 4 / wavelength**2, rel=1e-3)
 
 
+def test_width_of_a_circular_aperture_in_arcsec(disk):
+    image = optics.polychromatic_psf(disk, 0.0, [2.0], step=0.02, n=101)
+    width = 0.02 * _core.half_maximum_width(image, 50.0, 50.0)
+    assert width == pytest.approx(1.029 * np.degrees(2.0e-6 / 1.0) * 3600, rel=2e-3)
+
+
 def test_transform_equals_the_fourier_sum_and_keeps_the_light():
     rng = np.random.default_rng(4)
     pupil = rng.normal(size=(16, 16)) + 1j * rng.normal(size=(16, 16))
@@ -96,6 +102,20 @@ def test_wavefront_has_its_rms_and_no_tilt(rms):
     x = np.broadcast_to(np.arange(256.0), w.shape)
     tilt = np.average((opd * (x - np.average(x, weights=w)))[inside], weights=w[inside])
     assert tilt == pytest.approx(0, abs=1e-7 * rms)
+
+
+def test_segment_terms_are_piston_tilt_and_focus_of_every_segment():
+    pupil = jwst_pupil(128)
+    y, x = np.mgrid[-1:1:128j, -1:1:128j]
+    rng = np.random.default_rng(7)
+    opd = _core.wavefront(pupil.amplitude, pupil.segments, x, y, 75.0, 1.0, rng)
+    for k in range(1, 19):
+        here = (pupil.segments == k) & (pupil.amplitude > 0)
+        design = np.stack([np.ones(here.sum()), x[here], y[here], (x**2 + y**2)[here]], axis=1)
+        terms = np.linalg.lstsq(design, opd[here], rcond=None)[0]
+        assert_allclose(design @ terms, opd[here], atol=1e-9 * 75)
+        # nanometers of focus across the pupil
+        assert abs(terms[3]) > 1
 
 
 def test_wavefront_does_not_depend_on_the_grid():

@@ -7,17 +7,26 @@ from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData, NDData, StdDevUncertainty
 from astropy.table import Table
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.ndimage import map_coordinates, spline_filter
 
 from helpers.errors import refuses
 from helpers.scenes import tan_wcs
 from miricigale.psf import encircled_energy, fwhm, miri_psf, psf_from_stars
-from miricigale.psf._core import interpolate
+from miricigale.psf._core import cubic_splines, interpolate
 
 SIZE, SCALE = 260, 0.1109
 # far enough apart for the wings of the neighbors to matter little
 SPACING = 78
 DITHERS = [(0, 0), (6.5, 3.25), (-5.75, 4.5), (5.25, -6.75), (-3, -6.5), (1.5, 7.25), (-7, 0.75)]
 RADII = [0.2, 0.3, 0.5, 1.0, 1.5] * u.arcsec
+
+
+def test_splines_are_those_of_scipy_also_at_the_edges():
+    rng = np.random.default_rng(2)
+    images, at = rng.normal(size=(3, 8, 11)), rng.uniform(-1.5, [[8.5], [11.5]], (2, 500))
+    coefficients = np.stack([spline_filter(one) for one in images], axis=-1)
+    expected = [map_coordinates(one, at, mode="constant") for one in images]
+    assert_allclose(cubic_splines(coefficients, *at), expected, atol=1e-12)
 
 
 @pytest.fixture(scope="module")

@@ -186,6 +186,17 @@ def test_wavelengths_without_dust_emission_are_refused(torus):
     refuses(r"'wave' must be a grid .* 50 points from 0\.05", torus.templates, wave, values)
 
 
+def test_without_light_there_is_no_polar_dust():
+    """Where the grid ends before its emission, too: nothing taken, nothing sent out."""
+    wave = np.geomspace(0.05, 0.2, 50)
+    grid, none = _core.polar_grid(wave, _core.polar_curve(wave, "smc")), np.zeros(50)
+    for dust, total in ((none, 0.0), (np.ones(50), 0.15)):
+        parts, *powers = _core.add_polar(grid, none, none, dust, 0.2, 100.0, 1.6, 0.1, True)
+        assert_allclose(powers, [0.0, total], rtol=1e-12)
+        assert_allclose(parts[1], dust / 0.15, rtol=1e-12)
+        assert not parts[[0, 2]].any()
+
+
 # ------------------------------------------------------------------------------ power
 
 

@@ -43,6 +43,9 @@ def curve(wave, component=None, **changes):
         # k(H alpha) and k(H beta) as quoted by Dominguez et al. 2013, ApJ 763, 145
         (0.6563, 3.33),
         (0.4861, 4.60),
+        # Calzetti et al. 2000, equation 4, on both sides of 0.63 um
+        (0.6299, 2.659 * (-2.156 + 1.509 / 0.6299 - 0.198 / 0.6299**2 + 0.011 / 0.6299**3) + 4.05),
+        (0.6301, 2.659 * (-1.857 + 1.040 / 0.6301) + 4.05),
     ],
 )
 def test_starburst_curve_has_its_published_values(wave, k):

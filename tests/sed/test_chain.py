@@ -123,6 +123,11 @@ def test_ages_of_a_constant_history_and_of_a_burst():
     burst = make("delayed", "bc03").derived(age=5.0, tau=0.001, redshift=0.1)
     for name in ("age_mass", "age_light"):
         assert burst[name].to_value(u.Gyr) == pytest.approx(5.0, rel=2e-3)
+    # of Kroupa's (2001) m^-1.3 from 0.1 and m^-2.3 from 0.5 to 100 Msun, those that live 10 m^-2.5 Gyr
+    low = (0.5**0.7 - 0.1**0.7) / 0.7
+    alive, every = (low + 0.5 / 0.3 * (0.5**-0.3 - m**-0.3) for m in (2**0.4, 100.0))
+    living = burst["stellar_mass"] / burst["stellar_mass_formed"]
+    assert living.value == pytest.approx(alive / every, abs=0.02)
 
 
 def test_beta_against_a_fit_of_the_spectrum(full):

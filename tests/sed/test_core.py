@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import quad
 
 from miricigale.sed import _core
@@ -29,6 +30,19 @@ def test_band_means_over_the_part_that_a_spectrum_covers(ends):
     assert mean(wave, 1.01 - bottom / whole) == pytest.approx(top / bottom, rel=1e-10)
     assert np.isnan(mean(wave, 0.99 - bottom / whole))
     assert np.isnan(mean(wave + 10.0, 1.0))
+
+
+def test_nodes_closer_than_1e_7_of_themselves_are_one_at_any_wavelength():
+    near = np.outer([0.01, 1.0, 1000.0], [1.0, 1.0 + 0.5e-7, 1.0 + 3e-7])
+    assert_array_equal(_core.merge_nodes(near), near[:, [0, 2]].ravel())
+
+
+def test_sums_of_spectra_are_a_matrix_product_whatever_their_number():
+    rng = np.random.default_rng(2)
+    for n in range(1, 10):
+        weights, spectra = rng.uniform(0.1, 1.0, (3, n)), rng.uniform(0.1, 1.0, (n, 600))
+        weights[1, ::2] = 0.0
+        assert_allclose(_core.weighted_sums(weights, spectra), weights @ spectra, rtol=1e-13)
 
 
 # ------------------------------------------------------------------------------ IGM

@@ -365,13 +365,17 @@ def test_dust_at_a_node_is_the_table(u_min, q_pah):
         assert_allclose(got, table[name][i, j], rtol=1e-4)
 
 
+def mean_intensity(gamma, least, most=1e6):
+    """Draine & Li 2007, equation 33, in units of the starlight near the Sun."""
+    return (1 - gamma) * least + gamma * least * np.log(most / least) / (1 - least / most)
+
+
 @pytest.mark.parametrize("gamma", [0.0, 0.02, 0.3, 1.0])
 def test_power_per_dust_mass_is_the_mean_intensity(gamma):
-    """Draine & Li 2007, equation 33: (1 - g) Umin + g Umin ln(Umax/Umin) / (1 - Umin/Umax)."""
     part = DraineLi2007()
     table = load_dl07(part.path)
     for j, umin in enumerate(table["umin"]):
-        mean = part.mean_intensity(values_of(part, u_min=umin, gamma=gamma))
+        mean = mean_intensity(gamma, umin)
         i = int(np.argmin(np.abs(table["u"] - umin)))
         power = (1 - gamma) * table["single_power"][:, i] + gamma * table["powerlaw_power"][:, j]
         assert_allclose(power / mean, 1.0, atol=0.01)
@@ -382,7 +386,7 @@ def test_gamma_changes_spectra_as_mass_fractions_do():
     part = DraineLi2007()
     nodes = part.nodes()
     none, all_, some = (part.template(nodes, gamma=g) for g in (0.0, 1.0, 0.2))
-    weights = [part.mean_intensity(values_of(part, gamma=g)) for g in (0.0, 1.0)]
+    weights = [mean_intensity(gamma, 1.0) for gamma in (0.0, 1.0)]
     mixed = 0.8 * weights[0] * none + 0.2 * weights[1] * all_
     assert_allclose(some, mixed / np.trapezoid(mixed, nodes), rtol=0.01)
 
@@ -403,8 +407,9 @@ def test_without_the_feature_at_3_um_the_continuum_is_a_power_law():
     inside = (wave >= 3.0) & (wave < 3.65)
     assert_allclose(none[~inside], full[~inside])
     assert_allclose(half, (full + none) / 2)
-    # sums of power laws are not one, but nearly so
-    slope = np.diff(np.log(none[inside])) / np.diff(np.log(wave[inside]))
+    # sums of power laws are not one, but nearly so, and there is no step where the feature ends
+    to_next = slice(np.argmax(inside), np.searchsorted(wave, 3.65) + 1)
+    slope = np.diff(np.log(none[to_next])) / np.diff(np.log(wave[to_next]))
     assert np.ptp(slope) < 0.2
     assert full[inside].max() > 10 * none[inside].max()
 

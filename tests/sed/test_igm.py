@@ -177,15 +177,27 @@ def test_madau_continuum_by_hand(x, z):
 
 @pytest.mark.parametrize(
     ("n", "z", "factor"),
-    [(3, 2.0, 0.348), (3, 3.5, 0.348), (4, 2.5, 0.179), (5, 2.5, 0.109), (6, 3.5, 0.0722)],
+    [
+        (3, 2.0, 0.348),
+        (3, 3.5, 0.348),
+        (4, 2.5, 0.179),
+        (5, 2.5, 0.109),
+        (6, 3.5, 0.0722),
+        (12, 2.5, 0.0283 * 720 / (12 * (12**2 - 1))),
+    ],
 )
 def test_meiksin_higher_lines(n, z, factor):
-    """Table 1: the step at a line is its share of Lyman alpha, (1 + z)/4 to 1/3 or, above 3, 1/6."""
+    """
+    Table 1: the step at a line is its share of Lyman alpha, (1 + z)/4 to 1/3 or, above 3, 1/6.
+
+    Lines above n = 9 go with the depth of n = 9 at the wavelength (equation 4), of another absorber.
+    """
     line = 0.0912 / (1 - 1 / n**2)
     inside, outside = line * (1 + z) * np.array([1 - 1e-9, 1 + 1e-9])
     step = depth(Meiksin2006(), inside, z)[0] - depth(Meiksin2006(), outside, z)[0]
     power = 1 / 6 if n <= 5 and z > 3 else 1 / 3
-    want = factor * 0.00211 * (1 + z) ** 3.7 * ((1 + z) / 4) ** power
+    absorber = inside / 0.0912 * (1 - min(n, 9) ** -2)
+    want = factor * 0.00211 * (1 + z) ** 3.7 * (absorber / 4) ** power
     assert step == pytest.approx(want, rel=1e-5)
 
 
@@ -300,7 +312,7 @@ def continuum_depth(wave, z):
 
 CASES = [(0.090, z) for z in (0.6, 1.1, 1.6, 2.5, 3.3, 4.5, 5.0, 6.5)]
 CASES += [(0.075, z) for z in (0.6, 1.6, 2.5, 3.3, 5.0)]
-CASES += [(0.050, z) for z in (1.1, 2.5, 3.3, 5.0)]
+CASES += [(0.050, z) for z in (1.1, 2.5, 3.3, 5.0)] + [(0.030, 5.0)]
 
 
 @pytest.mark.parametrize(("rest", "z"), CASES)
