@@ -246,11 +246,9 @@ class TemplateBank:
         middle = 0.5 * (low + high) - self.sources.poly[:, :, 0]
         middle = np.einsum("kij,kj->ki", matrix, middle) + self.sources.xy
         reach = np.einsum("kij,kj->ki", np.abs(matrix), 0.5 * (high - low))
-        limit = np.array(shape)[::-1]
-        first = np.clip(np.floor(middle - reach), 0, limit).astype(int)
-        last = np.clip(np.ceil(middle + reach) + 1, 0, limit).astype(int)
-        size = np.maximum(last - first, 0)
-        return np.stack([first[:, 1], first[:, 0], size[:, 1], size[:, 0]], axis=1)
+        first = np.clip(np.floor(middle - reach), 0, shape[::-1]).astype(int)
+        last = np.clip(np.ceil(middle + reach) + 1, 0, shape[::-1]).astype(int)
+        return np.hstack([first[:, ::-1], np.maximum(last - first, 0)[:, ::-1]])
 
     def shifted(self, shift):
         """Make the bank of the same sources moved by (dx, dy) image pixels."""

@@ -243,6 +243,17 @@ class DraineLi2007(_DraineLi):
     gamma = Parameter(0.02, (0.0, 1.0), "Mass fraction heated by more.")
     q_pah = Parameter(2.5, (0.47, 4.58), "Mass fraction in PAHs, per cent.")
 
+    @staticmethod
+    def mean_intensity(values):
+        """
+        Mean intensity <U> over the dust mass, Draine & Li 2007, equation 33.
+
+        In units of the starlight near the Sun. The power per dust mass is P0 <U>, P0 being that at
+        U = 1 (135 to 139 L_sun / M_sun in the table's source, by q_PAH).
+        """
+        least, gamma = values["u_min"], values["gamma"]
+        return float(least * (1.0 + gamma * (np.log(U_MAX / least) / (1.0 - least / U_MAX) - 1.0)))
+
     def mixture(self, columns):
         table, u_min = load_dl07(self.path), columns["u_min"]
         share = _between(table["qpah"], columns["q_pah"])
