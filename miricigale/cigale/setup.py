@@ -6,21 +6,39 @@ from pathlib import Path
 
 import astropy.units as u
 import numpy as np
+from astropy.table import QTable
 
 from miricigale.cigale.catalog import read_cigale_catalog
 from miricigale.cigale.distances import at_their_distances
-from miricigale.cigale.models import save_models, with_agn_parts
-from miricigale.cigale.names import AGN_PARTS
+from miricigale.cigale.names import AGN_PARTS, cigale_names
 from miricigale.cigale.relation import near_relation
 from miricigale.cigale.results import described, write_cigale_results
 from miricigale.filters.band_names import xray_energies
 from miricigale.filters.filter_set import FilterSet
-from miricigale.fitting import BayesFitter, FitResults, GridSettings
+from miricigale.fitting import BayesFitter, FitResults, GridSettings, Samples
 from miricigale.sed import SEDModel
+from miricigale.sed.grid_spectra import row_values
 from miricigale.sed.xray_bands import with_xray_bands, xray_filter
 from miricigale.utils.exceptions import config_error
 from miricigale.utils.options import check_that
+from miricigale.utils.store import replacing
 from miricigale.utils.tables import require_columns
+
+#: Most models that are written.
+_MOST = 2_000_000
+
+
+def with_agn_parts(grid, model):
+    """A grid whose AGN have the luminosities of their parts too (`AGN_PARTS`), for each W of AGN power."""
+    if not grid.n_agn:
+        return grid
+    chain, table = model.chain, grid.agn_properties.copy()
+    parts = [chain.agn(row_values(model, grid.agn_parameters, k)) for k in range(grid.n_agn)]
+    for name, (ours, theirs) in AGN_PARTS.items():
+        light = np.array([chain.weights @ getattr(part, name) for part in parts])
+        table[ours] = light * table["agn_power"]
+        table[ours].info.description = f"{theirs} of CIGALE"
+    return dataclasses.replace(grid, agn_properties=table)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -323,7 +341,30 @@ class CigaleSetup:
         `~miricigale.utils.exceptions.ConfigError`
             If there are more models than 2 million.
         """
-        return save_models(self, path, redshifts, overwrite=overwrite)
+        axes = self.axes(redshifts)
+        if self.xray_bands() and self.model().has_agn:
+            axes["alpha_ox"] = self.xray["alpha_ox"]
+        count = int(np.prod([len(values) for values in axes.values()], dtype=float))
+        if count > _MOST:
+            raise config_error(self.path, f"has {count:,} models; at most {_MOST:,} are written")
+        every = self.bands | self.predicted
+        grid = self.grid(list(every), redshifts)
+        shape = grid.redshift.size, grid.n_galaxies, max(grid.n_agn, 1), grid.frac_agn.size
+        index = np.indices(shape).reshape(4, -1).T
+        n, mass = len(index), np.where(grid.allowed[index[:, 0], index[:, 1]], 1.0, np.nan)
+        # each model as the only draw of an object, in the order of the file's parameters
+        models = Samples(grid, np.arange(n), np.zeros(n, int), index[:, None], mass[:, None])
+        models = models[np.lexsort([models.values(name)[:, 0].value for name in reversed(axes)])]
+        fluxes = models.fluxes(list(every))[:, 0]
+        out = QTable({"id": np.arange(n)})
+        for i, band in enumerate(every.values()):
+            out[band] = fluxes[:, i].to(u.mJy)
+        for ours, (theirs, unit, factor) in cigale_names(self.modules).items():
+            if ours in models.parameters:
+                out[theirs] = models.values(ours)[:, 0].value * factor * unit
+        with replacing(path, overwrite=overwrite) as partial:
+            out.write(partial, format="fits")
+        return out
 
     def write_results(self, results, path, *, overwrite=False):
         """Write results as `write_cigale_results` does, with the variables of this configuration."""

@@ -140,9 +140,9 @@ def errors(args):
     import astropy.units as u
 
     from miricigale.photometry import MosaicFile, image_errors
-    from miricigale.photometry.errors_page import write_errors_page
     from miricigale.photometry.from_files import check_output
     from miricigale.photometry.kernel_files import image_psf
+    from miricigale.photometry.page import write_errors_page
     from miricigale.utils.table_files import write_table
 
     paths = [args.output.with_suffix(one) for one in (".fits", ".ecsv", ".html")]

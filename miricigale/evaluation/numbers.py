@@ -74,12 +74,6 @@ def study_numbers(study, *, seed, n_draws=500):
     return described_rows(rows, declared("miricigale.evaluation", "columns.toml")["numbers"])
 
 
-def found_classes(one, band_set):
-    """Classes of all sources of the catalog by a fit; ``"unknown"`` for those not in the sample."""
-    mean = one.of_catalog(one.fitted(band_set, "frac_agn_mean"))
-    return classify(np.clip(mean, 0, 1))
-
-
 def study_confusion(study, band_set="all"):
     """
     Classes found of the sources of each true class, of all truths with one AGN fraction together.
@@ -120,7 +114,9 @@ def study_confusion(study, band_set="all"):
     """
     truths = [one for one in study.truths if one.frac_agn is not None and band_set in one.fits]
     true = [classify(np.asarray(one.truth["frac_agn"], float))[one.field] for one in truths]
-    found = [found_classes(one, band_set)[one.field] for one in truths]
+    # "unknown" of those not in the sample
+    means = [one.of_catalog(one.fitted(band_set, "frac_agn_mean"))[one.field] for one in truths]
+    found = [classify(np.clip(mean, 0, 1)) for mean in means]
     return confusion(np.concatenate([[], *true]), np.concatenate([[], *found]))
 
 

@@ -1,27 +1,33 @@
-"""The page of forced photometry: images, magnitudes, flags, errors at empty positions, sources one by one."""
+"""Pages of forced photometry (images, flags, empty positions, sources one by one) and of errors of images."""
 
 import collections
+import warnings
 from pathlib import Path
 
 import astropy.units as u
 import numpy as np
+import scipy.ndimage
 from astropy.nddata import Cutout2D
 from astropy.stats import mad_std
+from astropy.table import QTable, Table
 
 from miricigale.pages import Link, Missing, Page, SectionWriter
 from miricigale.photometry import ForcedFlags
 from miricigale.photometry.arrays import pixel_scale
 from miricigale.photometry.browser import write_browser
-from miricigale.photometry.empty import empty_pulls
+from miricigale.photometry.forced import ForcedPhotometer
 from miricigale.plotting.axes import new_figure
 from miricigale.plotting.images import plot_image, plot_model_residual, plot_segmentation
 from miricigale.plotting.posteriors import plot_pulls
 from miricigale.psf.star_fit import TERMS
 from miricigale.utils.declared import declared
+from miricigale.utils.exceptions import PhotometryWarning
 from miricigale.utils.units import ANGLE, ab_magnitude
 
 #: Largest number of pixels across a drawing of a whole image, rows of a table, arcsec across a source.
 _ACROSS, _ROWS, _SIZE = 1500, 40, 12.0
+#: Largest number of empty positions at which errors are tested.
+_EMPTY = 400
 #: Number of stars that are drawn.
 _STARS = 6
 #: Signal-to-noise above which a poor fit points to a wrong PSF, and above which there is a magnitude.
@@ -317,3 +323,61 @@ def _text(value):
     if value is None:
         return Missing("not stated or not done")
     return f"{value:.5g}" if isinstance(value, float) else value
+
+
+def empty_pulls(result, kernel, seed):
+    """Flux over error of points where a `ForcedPhotometryResult` has none; None without a PSF or such places."""
+    empty = _empty_positions(result, seed)
+    if kernel.target is None or not len(empty):
+        return None
+    blank = ForcedPhotometer(kernel, template="psf")
+    with warnings.catch_warnings():
+        # the warning about a background was given already
+        warnings.simplefilter("ignore", PhotometryWarning)
+        return blank.measure(result.residual_image, catalog=empty).snr
+
+
+def _empty_positions(result, seed):
+    """
+    Random positions at which a measurement left no light: ``id`` and ``sky``.
+
+    They are at least 0.3 arcsec from pixels with light of a model (above a third of the
+    noise) or without data.
+    """
+    residual = result.residual_image
+    sigma = residual.uncertainty.array
+    level = 0.0 if result.background is None else result.background.to_value(residual.unit)
+    free = ~np.asarray(residual.mask, bool)
+    free &= np.abs(result.model_image.data - level) < 0.3 * np.where(free, sigma, 1.0)
+    steps = max(1, round(0.3 / pixel_scale(residual.wcs)))
+    # pixels beyond the image count as without data
+    free = scipy.ndimage.binary_erosion(free, iterations=steps)
+    y, x = np.nonzero(free)
+    rng = np.random.default_rng(seed)
+    chosen = rng.choice(len(x), min(_EMPTY, len(x)), replace=False) if len(x) else np.zeros(0, int)
+    sky = residual.wcs.pixel_to_world(x[chosen].astype(float), y[chosen].astype(float)).icrs
+    return QTable({"id": np.arange(1, len(chosen) + 1), "sky": sky})
+
+
+def write_errors_page(path, errors):
+    """Write the page of the errors of an image (`~miricigale.photometry.ImageErrors`)."""
+    table, meta = errors.table, errors.table.meta
+    report = Page(f"Errors of {Path(meta['source']).name}", subtitle=meta.get("filter", ""))
+    page = SectionWriter(report, declared("miricigale.photometry"))
+    facts = {"over": meta["noise_over_stated"], "factor": errors.factor}
+    page.section("errors", n_free=errors.n_free, **facts)
+    page.table("table", [dict(zip(table.colnames, row, strict=True)) for row in Table(table)])
+    aperture, limit = next((k, v.value) for k, v in errors.limits.items())
+    step = max(1, -(-max(limit.shape) // 1500))
+    scale = step * pixel_scale(errors.noise.wcs)
+    figure, [[left, right]] = new_figure(1, 2, size=(5.2, 4.2))
+    form = {"limits": np.nanpercentile(limit, [1, 99]), "colorbar": "limit (uJy)"}
+    plot_image(limit[::step, ::step], ax=left, pixel_scale=scale, stretch="linear", **form)
+    form = {"limits": (0, 1), "colorbar": "correlation"}
+    shown = errors.correlation / errors.correlation.max()
+    plot_image(shown, ax=right, stretch="linear", **form).set(
+        xlabel="x (pixels)", ylabel="y (pixels)"
+    )
+    what = "a point fitted" if aperture == "psf" else f"a circle of {aperture} arcsec"
+    page.figure("map", figure, aperture=what, n_sigma=meta["n_sigma"])
+    report.write(path)

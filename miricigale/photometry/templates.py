@@ -62,7 +62,7 @@ class FineTemplates:
         return np.tensordot(alike, self._points, axes=1), which.reshape(-1)
 
     @functools.cached_property
-    def _kernel_power(self):
+    def kernel_power(self):
         """Sums of products of the kernels of two places, with the pixel's response, shape (k, k)."""
         kernels = self.kernel
         if self.sides is not None:
@@ -70,10 +70,6 @@ class FineTemplates:
             kernels = np.concatenate([convolve_padded(one, response) for one in kernels])
         flat = kernels.reshape(len(kernels), -1)
         return flat @ flat.T
-
-    def kernel_power(self, weights):
-        """Sum of squares of each source's kernel with the pixel's response, shape (n,)."""
-        return np.einsum("nk,kl,nl->n", weights, self._kernel_power, weights)
 
     @functools.lru_cache(maxsize=256)  # noqa: B019 - lives as long as one measurement
     def _transfer(self, shape, convolved, place):
@@ -313,7 +309,9 @@ class TemplateBank:
         """Sum over unit-weight pixels of the templates' variance, by row."""
         noise = np.array([0.0 if one is None else one.noise for one in self.sources.cutout])
         area = np.abs(np.linalg.det(self.sources.poly[:, :, 1:3]))
-        return (noise * area * self.fine.kernel_power(self._weights))[self.order]
+        # sums of squares of each source's kernel
+        power = np.einsum("nk,kl,nl->n", self._weights, self.fine.kernel_power, self._weights)
+        return (noise * area * power)[self.order]
 
     def full_light(self):
         """Light of a whole point source, by row."""

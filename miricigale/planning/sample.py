@@ -85,7 +85,9 @@ def make_sample(config, bands, *, executor=None):
     sources["luminosity"] = results["dust_luminosity_best"].to(u.Lsun)
     if "dust_excess" in sources.colnames:
         sources["luminosity"] *= sources["dust_excess"]
-    sources["size"] = _sizes(catalog)
+    # full width at half maximum of a Gaussian with the half-light radius; 0 of points
+    size = 2 * u.Quantity(catalog["half_light_radius"]).to_value(u.arcsec)
+    sources["size"] = np.where(np.isfinite(size) & (size > 0), size, 0.0) * u.arcsec
     if "frac_agn" in catalog.colnames:
         sources["frac_agn"] = np.asarray(catalog["frac_agn"], float)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -133,12 +135,6 @@ def _cut(table, chosen, what):
     if not np.any(chosen):
         raise config_error(what, f"leaves none of the {len(table)} sources")
     return table[chosen]
-
-
-def _sizes(catalog):
-    """Full width at half maximum of a Gaussian with the half-light radius; 0 for points."""
-    size = 2 * u.Quantity(catalog["half_light_radius"]).to_value(u.arcsec)
-    return np.where(np.isfinite(size) & (size > 0), size, 0.0) * u.arcsec
 
 
 def agn_mix(options, n, rng):

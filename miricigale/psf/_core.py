@@ -279,6 +279,16 @@ def core_moments(data):
 
 
 @njit(cache=True, nogil=True)
+def spline_weights(t, w):
+    """Weights (4) of the cubic B-splines at the nodes -1 to 2 for a position t from 0 to 1."""
+    s = 1.0 - t
+    w[0] = s * s * s / 6.0
+    w[1] = (4.0 - 6.0 * t * t + 3.0 * t * t * t) / 6.0
+    w[2] = (4.0 - 6.0 * s * s + 3.0 * s * s * s) / 6.0
+    w[3] = t * t * t / 6.0
+
+
+@njit(cache=True, nogil=True)
 def cubic_splines(coefficients, y, x):
     """Cubic splines of shape (ny, nx, k) at positions in cells, shape (k, n), zero outside of the grid."""
     ny, nx, k = coefficients.shape
@@ -289,10 +299,7 @@ def cubic_splines(coefficients, y, x):
             continue
         for axis, (position, size) in enumerate(((y[n], ny), (x[n], nx))):
             first = math.floor(position)
-            t = position - first
-            weights[axis, 0], weights[axis, 3] = (1 - t) ** 3 / 6, t**3 / 6
-            weights[axis, 1] = 2 / 3 - t * t * (2 - t) / 2
-            weights[axis, 2] = 1 - weights[axis, 0] - weights[axis, 1] - weights[axis, 3]
+            spline_weights(position - first, weights[axis])
             for m in range(4):
                 # the coefficients are mirrored at the edges
                 nodes[axis, m] = size - 1 - abs(size - 1 - abs(first + m - 1))

@@ -1,7 +1,9 @@
 """Images of the pipeline's later stages as files: rates, calibrated images, mosaics."""
 
 import dataclasses
+import glob
 import json
+import os
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,7 +15,7 @@ from astropy.io import fits
 from astropy.nddata import CCDData
 from astropy.wcs import WCS, FITSFixedWarning
 
-from miricigale.detector import Ramp
+from miricigale.detector import Charge, Ramp
 from miricigale.instrument import (
     DQ,
     ExposureHistory,
@@ -27,8 +29,9 @@ from miricigale.instrument import (
     with_own_bits,
 )
 from miricigale.instrument.asdf_extension import asdf_wcs
+from miricigale.instrument.data_models import is_data_model, read_data_model
 from miricigale.reduction.images import flagged_image, sigma
-from miricigale.utils.exceptions import data_error
+from miricigale.utils.exceptions import DataError, argument_error, data_error
 from miricigale.utils.files import open_fits
 from miricigale.utils.parallel import check_memory
 from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS
@@ -329,3 +332,25 @@ def _wcs(hdus, header, meta):
         wcs = asdf_wcs(science, hdus)
     wcs.pixel_shape = (science["NAXIS1"], science["NAXIS2"])
     return wcs
+
+
+def opened(given):
+    """An exposure of its file or data model; anything else itself."""
+    if is_data_model(given):
+        return read_data_model(given, open_exposure)
+    return open_exposure(given) if isinstance(given, (str, os.PathLike)) else given
+
+
+def several(given):
+    """Exposures of one, of a pattern of files, or of several."""
+    if isinstance(given, str) and glob.has_magic(given) and not os.path.exists(given):
+        paths = sorted(glob.glob(os.path.expanduser(given)))
+        if not paths:
+            msg = f"no file is called {given}"
+            raise DataError(msg)
+        return paths
+    if isinstance(given, (str, os.PathLike)) and os.path.isdir(given):
+        wanted = f"files, such as {os.path.join(given, '*_uncal.fits')!r}"
+        raise argument_error("ramps", wanted, "a folder")
+    one = isinstance(given, (str, os.PathLike, Ramp, Charge, CCDData)) or is_data_model(given)
+    return [given] if one else given

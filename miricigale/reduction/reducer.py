@@ -12,7 +12,7 @@ from miricigale.reduction.assumed import brightness_of, maps_of
 from miricigale.reduction.background import estimate_background, remove_background
 from miricigale.reduction.calibration import calibrate
 from miricigale.reduction.combine import combine, drizzle, subtract_dithers
-from miricigale.reduction.given import opened, several
+from miricigale.reduction.files import opened, several
 from miricigale.reduction.images import own_grid, with_data
 from miricigale.reduction.reference_cache import ReferenceCache
 from miricigale.reduction.references import ReferenceFiles

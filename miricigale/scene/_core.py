@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from miricigale.profiles._core import cell
+from miricigale.psf._core import spline_weights
 from miricigale.utils.compilation import njit
 
 #: Small cells per node and axis near the cusp.
@@ -31,15 +32,6 @@ LAGRANGE = np.array(
         for m in range(STEP)
     ]
 )
-
-
-@njit(cache=True, nogil=True)
-def _spline_weights(t, w):
-    s = 1.0 - t
-    w[0] = s * s * s / 6.0
-    w[1] = (4.0 - 6.0 * t * t + 3.0 * t * t * t) / 6.0
-    w[2] = (4.0 - 6.0 * s * s + 3.0 * s * s * s) / 6.0
-    w[3] = t * t * t / 6.0
 
 
 class Landing(NamedTuple):
@@ -127,8 +119,8 @@ def point_nodes(x, y, flux, land):
         j0, j1 = max(ix - 1, 0), min(ix + 3, nx)
         if j1 <= j0:
             continue
-        _spline_weights(y[k] - iy, wy)
-        _spline_weights(x[k] - ix, wx)
+        spline_weights(y[k] - iy, wy)
+        spline_weights(x[k] - ix, wx)
         for a in range(4):
             i = iy - 1 + a
             if i < 0 or i >= ny:
@@ -156,8 +148,8 @@ def _deposit(part, y, x, light, wy, wx):
     iy, ix = math.floor(y), math.floor(x)
     if iy < -2 or ix < -2 or iy > ny or ix > nx:
         return
-    _spline_weights(y - iy, wy)
-    _spline_weights(x - ix, wx)
+    spline_weights(y - iy, wy)
+    spline_weights(x - ix, wx)
     for a in range(max(0, 1 - iy), min(4, ny - iy + 1)):
         for b in range(max(0, 1 - ix), min(4, nx - ix + 1)):
             part[iy - 1 + a, ix - 1 + b] += light * wy[a] * wx[b]

@@ -270,20 +270,14 @@ def _read(path):
         text = parts.text
         # FITS cannot hold arrays without elements, those of AGN
         arrays = {n: parts.array(n) for n in _ARRAYS if n in parts}
-        tables = {
-            name: _described(parts.table(name, QTable), text["descriptions"][name])
-            for name in _TABLES
-        }
+        tables = {name: parts.table(name, QTable) for name in _TABLES}
+        for name, table in tables.items():
+            for column, description in text["descriptions"][name].items():
+                # pure numbers are quantities again, too
+                table[column] = u.Quantity(table[column], dtype=float)
+                table[column].info.description = description
         facts = {name: text[name] for name in ("meta", *_FACTS)}
         return ModelGrid(tuple(text["filters"]), **arrays, **tables, **facts)
-
-
-def _described(table, descriptions):
-    """Columns are quantities again, pure numbers too, and say what they are."""
-    for name, description in descriptions.items():
-        table[name] = u.Quantity(table[name], dtype=float)
-        table[name].info.description = description
-    return table
 
 
 register(ModelGrid, read=_read, write=_write)

@@ -225,10 +225,6 @@ class RealGalaxies:
             position = wcs.pixel_to_world(x, y)
         return Cutout.from_image(CCDData(light, unit=self.image.unit, wcs=wcs), position)
 
-    def labels_at(self, sky):
-        """Return the labels of the segments at positions; 0 outside of all."""
-        return values_at(sky, self.image.wcs, self._found[1])
-
     @functools.cached_property
     def resolved(self):
         """
@@ -290,7 +286,7 @@ def stamps_of_sources(catalog, galaxies, *, of, seed):
     checked = check_catalog(catalog)
     rows = np.flatnonzero(_sersic(checked))
     if of == "own":
-        labels = galaxies.labels_at(checked["sky"])
+        labels = values_at(checked["sky"], galaxies.image.wcs, galaxies._found[1])
         # of all sources, points too
         counts = np.bincount(labels)
         pairs = ((row, labels[row]) for row in rows if labels[row] and counts[labels[row]] == 1)

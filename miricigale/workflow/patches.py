@@ -5,6 +5,7 @@ import functools
 import json
 import math
 import os
+import re
 import shutil
 import tempfile
 from pathlib import Path
@@ -79,7 +80,7 @@ class PatchSection(Section):
     overlap
         Pixels of the prior around them.
     pages
-        Whether each patch has a page.
+        Whether each patch has a page, and images of model and residual.
     """
 
     size: int = option(1000, low=1)
@@ -165,9 +166,9 @@ _UNITS = {
 }
 
 
-@stage("patch", "patches", **_READS, **_UNITS)
+@stage("patch", "patches", version=2, **_READS, **_UNITS)
 def patch_stage(context, unit):
-    """Measure a patch: its table, and its page."""
+    """Measure a patch: its table, and its page with model and residual of each band."""
     inputs, grid = _task(context.config)
     k = grid.names.index(unit)
     table, measured = measure_patch(inputs, grid, k, _catalog(inputs), context.n_threads)
@@ -179,6 +180,10 @@ def patch_stage(context, unit):
         if context.config.patches.pages and shown and sharp and len(table):
             with tempfile.TemporaryDirectory() as folder:
                 measured.write_page(Path(folder) / f"{unit}.html")
+                for band, result in measured.results.items():
+                    stem = "patches/" + re.sub(r"[^\w.+-]", "-", f"{unit}_{band}")
+                    context.save_image(f"{stem}_model.fits", result.model_image)
+                    context.save_image(f"{stem}_residual.fits", result.residual_image)
                 for path in sorted(Path(folder).rglob("*.*")):
                     name = f"patches/{path.relative_to(folder).as_posix()}"
                     context.save(name, functools.partial(shutil.copyfile, path))
@@ -264,7 +269,8 @@ def measure_patches(
     image, highres
         As for `~miricigale.photometry.measure_files`; images are files.
     folder : path-like
-        Of the products: ``table.fits``, the page ``index.html``, and in ``patches`` a table and a page of each.
+        Of the products: ``table.fits``, the page ``index.html``, and in ``patches`` a table, a page and images
+        of each.
     patch_size : int, optional
         Side of the cores in pixels of the prior; as many as take 2 GB by default.
     overlap : `~astropy.units.Quantity`, optional
@@ -274,7 +280,8 @@ def measure_patches(
     overwrite : bool, optional
         Whether ``output`` is replaced if it is there.
     pages : bool, optional
-        Whether each patch has a page.
+        Whether each patch has a page, and of each band the images ``<patch>_<band>_model.fits`` and
+        ``_residual.fits``, with the overlap.
     executor : optional
         Processes, threads or a cluster that measure patches side by side, as for
         `~miricigale.workflow.StudyRunner`; the products are the same bytes.

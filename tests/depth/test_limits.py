@@ -84,6 +84,13 @@ def test_noise_power_is_the_scatter_of_empty_apertures(correlation):
         assert_allclose(np.std(some), np.sqrt(power), rtol=0.05)
 
 
+def test_extraction_lies_where_the_source_does():
+    weights = extraction_weights(2.7, offset=(0.3, -0.4))
+    y, x = np.indices(weights.shape) - len(weights) // 2
+    center = [np.sum(weights * at) / weights.sum() for at in (x, y)]
+    assert_allclose(center, [0.3, -0.4], atol=0.01)
+
+
 def test_limit_of_photons_alone_is_sky_over_light(psf):
     # Poisson sky in the aperture, no read noise, no dark; small source term left out by n_sigma
     quiet = DetectorProperties(gain=4.0, read_noise=0.0, dark_current=0.0, full_well=1e9)

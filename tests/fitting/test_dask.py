@@ -70,7 +70,7 @@ def test_two_dask_workers_give_the_numbers_of_one_process(
     photometry.write(tmp_path / "catalog.fits")
     one, two = (tmp_path / name for name in ("one", "two"))
     arguments = {"path_in": tmp_path / "catalog.fits", "chunk_rows": 5}
-    options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
+    options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": ":0"}
     with (
         distributed.LocalCluster(**options) as cluster,
         distributed.Client(cluster) as client,

@@ -104,7 +104,7 @@ def test_catalogs_of_other_formats_and_from_standard_input(
 def test_the_workers_of_a_scheduler_give_the_table_of_this_process(catalog, tmp_path, capsys):
     distributed = pytest.importorskip("distributed", reason="dask.distributed is not installed")
     catalog.write(tmp_path / "cat.fits")
-    options = {"n_workers": 1, "threads_per_worker": 1, "dashboard_address": None}
+    options = {"n_workers": 1, "threads_per_worker": 1, "dashboard_address": ":0"}
     with distributed.LocalCluster(**options) as cluster:
         scheduler = ["--scheduler", cluster.scheduler_address, "--chunk-rows", "2"]
         command(capsys, *fit(tmp_path / "cat.fits", *scheduler, out="there"))

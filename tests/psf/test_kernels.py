@@ -11,7 +11,15 @@ from scipy.signal import fftconvolve
 from helpers.cases import cases_of
 from helpers.errors import refuses
 from helpers.light import gaussian_image
-from miricigale.psf import MatchingKernel, gaussian_psf, hst_psf, miri_psf, psf_image, rotate_psf
+from miricigale.psf import (
+    MatchingKernel,
+    gaussian_psf,
+    hst_psf,
+    miri_psf,
+    psf_image,
+    rotate_psf,
+    wiener,
+)
 from miricigale.utils.exceptions import DataError
 
 SCALE = 0.06 * u.arcsec
@@ -185,3 +193,25 @@ def test_foreign_files_are_named(tmp_path):
     fits.HDUList(hdus).writeto(path, overwrite=True)
     match = r"kernel\.fits is not a complete .*PIXSCALE"
     refuses(match, MatchingKernel.read, path, error=DataError)
+
+
+def test_gain_of_gaussians_is_that_of_the_gaussian_between_them():
+    """The rms of white noise through a Gaussian of s pixels is 1 / (2 s sqrt(pi)) of what it was."""
+    sharp, wide = (gaussian_image(61, sigma) for sigma in (1.5, 3.0))
+    found = wiener.gaussian_gain(sharp, wide)
+    assert found == pytest.approx(0.5 / np.sqrt(np.pi * (3.0**2 - 1.5**2)), rel=0.02)
+    assert wiener.gaussian_gain(sharp, sharp) == 1.0
+
+
+def test_energies_are_compared_up_to_half_the_image():
+    assert_allclose(wiener.energy_radii(np.zeros((9, 9))), [1, 1.5, 2, 2.5, 3, 3.5, 4])
+
+
+def test_a_kernel_to_a_brighter_psf_is_brighter():
+    sharp, wide = (gaussian_image(41, sigma) for sigma in (1.2, 2.0))
+    one, three = (
+        wiener.choose("auto", wiener.wiener(sharp, k * wide), sharp, k * wide, 1e-3 * k)
+        for k in (1, 3)
+    )
+    assert three[0] == one[0]
+    assert_allclose(three[1], 3 * one[1], rtol=1e-9, atol=1e-12)

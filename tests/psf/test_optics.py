@@ -150,3 +150,24 @@ def test_bad_arguments_are_named():
     pupil = jwst_pupil(128)
     refuses("'n' must be odd, got 50", optics.polychromatic_psf, pupil, 0.0, [5.6], step=0.1, n=50)
     refuses("an image below", optics.polychromatic_psf, pupil, 0.0, [5.6], step=0.1, n=501)
+
+
+@pytest.mark.parametrize("angle", [45.0, 30.0, 0.0])
+def test_open_area_of_hst(angle):
+    """Krist, Hook & Stoehr 2011: four vanes of 0.022 of the radius, three pads of 0.065."""
+    pupil = hst_pupil(256, angle=angle)
+    inner = optics._HST_OBSCURATION
+    area = np.pi * (1 - inner**2) - 4 * (1 - inner) * 0.022 - 3 * np.pi * 0.065**2
+    got = pupil.amplitude.sum() * pupil.step**2 / 1.2**2
+    assert got == pytest.approx(area, rel=3e-4)
+
+
+def test_the_wavefront_turns_with_the_telescope():
+    upright, turned = (jwst_pupil(128, angle=angle) for angle in (0.0, 90.0))
+    errors = [
+        np.rot90(upright.wavefront_error(100.0, seed=3)),
+        turned.wavefront_error(100.0, seed=3),
+    ]
+    both = (np.rot90(upright.amplitude) > 0.99) & (turned.amplitude > 0.99)
+    assert both.mean() > 0.5
+    assert_allclose(*(one[both] for one in errors), atol=2.0)

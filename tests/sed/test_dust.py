@@ -414,3 +414,12 @@ def test_a_foreign_table_is_refused(tmp_path):
     path = tmp_path / "other.fits"
     fits.PrimaryHDU(np.zeros((2, 2))).writeto(path)
     refuses("not a Draine & Li table", load_dl07, str(path), error=DataError)
+
+
+@pytest.mark.parametrize(("u_min", "gamma"), [(1.0, 0.0), (0.7, 0.1), (25.0, 1.0)])
+def test_mean_intensity_over_the_dust_mass(u_min, gamma):
+    """Draine & Li 2007, equation 23: a share gamma of the mass with dM/dU as U^-2 up to 1e6, the rest at u_min."""
+    spread = np.geomspace(u_min, 1e6, 20_001)
+    mean = np.trapezoid(spread**-1.0, spread) / np.trapezoid(spread**-2.0, spread)
+    got = DraineLi2007.mean_intensity({"u_min": u_min, "gamma": gamma})
+    assert got == pytest.approx((1 - gamma) * u_min + gamma * mean, rel=1e-5)

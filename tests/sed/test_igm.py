@@ -17,6 +17,7 @@ from scipy.special import gamma
 
 from helpers.errors import refuses
 from miricigale.sed import _core
+from miricigale.sed._core import igm
 from miricigale.sed.components import Inoue2014, Madau1995, Meiksin2006
 from miricigale.sed.components.igm import load_lines
 from miricigale.utils.exceptions import DataError
@@ -351,3 +352,33 @@ def test_a_foreign_table_is_refused(tmp_path, text, match):
     path = tmp_path / "lines.toml"
     path.write_text(text)
     refuses(match, load_lines, str(path), error=DataError)
+
+
+@pytest.mark.parametrize("z", [2.5, 3.6])
+def test_lyman_limit_systems_of_meiksin_by_numerical_integration(z):
+    """Meiksin 2006, sections 2.2 and 2.3: 0.25 y^1.5 systems per dz, of depth t as t^-1.5 / 2 from 1 upwards."""
+    t = np.geomspace(1.0, 1e6, 20_001)
+    # from 0.07 (1 + z) um on
+    x = np.array([0.78, 0.85, 0.95]) * (1 + z)
+    wave = x * _core.LYMAN_LIMIT
+
+    def systems(y, x):
+        return 0.25 * y**1.5 * np.trapezoid(0.5 * t**-1.5 * -np.expm1(-t * (x / y) ** 3), t)
+
+    y = [np.linspace(one, 1 + z, 401) for one in x]
+    hidden = [np.trapezoid([systems(a, b) for a in ys], ys) for b, ys in zip(x, y, strict=True)]
+    lines, depths = igm._meiksin_lines()
+    got = igm._meiksin(wave, z, *igm._lls_terms(), lines, np.zeros(depths.size))
+    # between them, and in Lyman alpha of nearer gas
+    thin = 0.805 * x**3 * (1 / x - 1 / (1 + z))
+    forest = np.where(wave > lines[0], 0.00211 * (wave / lines[0]) ** 3.7, 0.0)
+    assert_allclose(-np.log(got), thin + forest + hidden, rtol=2e-3)
+    assert_allclose(-np.log(got) - thin - forest, hidden, rtol=3e-3)
+
+
+@pytest.mark.parametrize("z", [1.0, 2.5, 4.0, 7.0])
+def test_inoue_has_no_step_at_the_limit_as_seen(z):
+    """There the lower limit of the integrals becomes redshift 0: both forms agree, digits of the paper apart."""
+    sides = igm.INOUE_LIMIT * np.array([1 - 1e-7, 1 + 1e-7])
+    below, above = (depth(Inoue2014(), wave, z)[0] for wave in sides)
+    assert below == pytest.approx(above, abs=1e-4)

@@ -18,6 +18,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from helpers.mosaics import CENTER, FINE, HI, LO, disks, kernel, lattice, places, render
 from miricigale.cli import main
 from miricigale.instrument import north_up_wcs, pixel_area_map
+from miricigale.instrument.image_files import read_image
 from miricigale.photometry import ForcedFlags, MosaicFile, measure_files
 from miricigale.photometry.patches import PatchGrid, own_rows
 from miricigale.workflow import measure_patches
@@ -224,5 +225,11 @@ def test_the_command_refuses_what_is_beyond_the_memory_and_measures_it_in_patche
     assert set(QTable.read(output)["patch"]) == {"y00x00"}
     assert "patches/y00x00.html" in (run / "index.html").read_text()
     assert "Forced photometry" in (run / "patches" / "y00x00.html").read_text()
+    # rounded far below the noise
+    parts = [read_image(*(run / "patches").glob(f"*_{one}.fits")) for one in ("model", "residual")]
+    whole, good = image.read(), ~parts[1].mask
+    assert good.mean() > 0.5
+    noise = np.median(whole.uncertainty.array[good])
+    assert_allclose(sum(one.data for one in parts)[good], whole.data[good], atol=0.05 * noise)
     assert main([*given, "--overwrite", "--confidence", "0.9"]) == 2
     assert "--redo to replace it" in capsys.readouterr().err

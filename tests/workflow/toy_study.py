@@ -58,7 +58,7 @@ def on_cluster(n_workers):
 
     with (
         LocalCluster(
-            n_workers=n_workers, threads_per_worker=1, dashboard_address=None, memory_limit="1GB"
+            n_workers=n_workers, threads_per_worker=1, dashboard_address=":0", memory_limit="1GB"
         ) as cluster,
         cluster_executor(cluster.scheduler_address) as workers,
     ):

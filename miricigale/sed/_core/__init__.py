@@ -12,7 +12,6 @@ from miricigale.sed._core.disk import DISK_BREAKS, DISKS, disk_nodes, disk_spect
 from miricigale.sed._core.histories import (
     YOUNG,
     age_steps,
-    constant_history,
     delayed_history,
     double_exponential_history,
     split_by_age,

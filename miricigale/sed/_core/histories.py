@@ -74,11 +74,6 @@ def double_exponential_history(age, tau, f_burst=0.0, age_burst=20.0, tau_burst=
     return _finish(rate, float(f_burst), int(age_burst), float(tau_burst))
 
 
-def constant_history(age):
-    """Star-formation rate in ``age`` steps of 1 Myr, all the same; the sum is 1e-6."""
-    return np.full(int(age), 1e-6 / int(age))
-
-
 def table_history(time, rate):
     """
     Put rates in bins of any width (edges in Myr, one more than rates) on steps of 1 Myr.

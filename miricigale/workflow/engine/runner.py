@@ -150,6 +150,7 @@ class StudyRunner:
         checksums of the products it reads and of its reference data.
         """
         stage, unit = self._parts[key]
+        resources = stage.resources() if callable(stage.resources) else stage.resources
         values = {
             "stage": stage.name,
             "unit": unit,
@@ -157,7 +158,7 @@ class StudyRunner:
             "seed": self.config.run.seed,
             "config": self.config.values(*stage.sections),
             "inputs": {name: store.checksums(keys) for name, keys in self._inputs[key].items()},
-            "data": {name: fingerprint(name) for name in stage.resource_names()},
+            "data": {name: fingerprint(name) for name in resources},
         }
         if stage.plan is not None:
             values["plan"] = stage.plan(self.config, unit)

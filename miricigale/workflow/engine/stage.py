@@ -113,10 +113,6 @@ class Stage:
             found[name] = [f"{name}:{k}" if k else name for k in dict.fromkeys(others)]
         return found
 
-    def resource_names(self):
-        """Names of the reference data that it depends on."""
-        return tuple(self.resources() if callable(self.resources) else self.resources)
-
     def key(self, unit):
         """Name of a piece in the manifest."""
         return f"{self.name}:{unit}" if unit else self.name

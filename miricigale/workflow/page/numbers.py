@@ -6,7 +6,7 @@ import itertools
 import astropy.units as u
 import numpy as np
 
-from miricigale import depth, fitting, photometry
+from miricigale import depth, photometry
 from miricigale.evaluation import (
     PUBLISHED_LIGHT,
     fraction_interval,
@@ -25,8 +25,7 @@ from miricigale.workflow.stages.conditions import (
     has_flag,
 )
 from miricigale.workflow.stages.exposures import pointing_exposures, pointing_time
-from miricigale.workflow.stages.grids import of_patch
-from miricigale.workflow.stages.inputs import input_fits, pieces
+from miricigale.workflow.stages.inputs import FitPieces
 from miricigale.workflow.stages.sample import NOT_COUNTED, SampleFlags
 
 #: Fewest sources of which a median with its error or scatter is shown.
@@ -66,27 +65,15 @@ class StudyTables:
     detections = _table("{}/photometry.ecsv")
 
     @functools.cached_property
-    def inputs(self):
-        """The table of the fits of the input SEDs, row by row."""
-        return input_fits(self._context, len(self.truth))
-
-    @functools.cached_property
     def errors(self):
         """The error functions (`~miricigale.photometry.ErrorModel`), of the reference truth."""
         return photometry.ErrorModel.read(self._context.path("errors.ecsv"))
 
     @functools.cached_property
     def results(self):
-        """`~miricigale.fitting.FitResults` of the sample by set of bands."""
-        return {
-            unit: fitting.FitResults.concatenate(
-                [self._fits(of_patch(f"fits_{unit}", one)) for one in pieces(len(self.truth))]
-            )
-            for unit in self._context.config.fit.sets
-        }
-
-    def _fits(self, name):
-        return fitting.FitResults.read(self._context.path(f"{self._name}/{name}.fits"))
+        """Fits of the sample by set of bands (`~miricigale.workflow.stages.inputs.FitPieces`)."""
+        sets, n = self._context.config.fit.sets, len(self.truth)
+        return {unit: FitPieces(self._context, f"{self._name}/fits_{unit}", n) for unit in sets}
 
     @functools.cached_property
     def points(self):

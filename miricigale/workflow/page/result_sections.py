@@ -24,6 +24,7 @@ from miricigale.workflow.page.labels import (
 from miricigale.workflow.page.numbers import FEWEST, true_ranks
 from miricigale.workflow.page.study_figures import CLASS_COLUMNS, FEATURES
 from miricigale.workflow.stages.conditions import CONDITIONS
+from miricigale.workflow.stages.inputs import FitPieces
 from miricigale.workflow.stages.sample import typical_source
 from miricigale.workflow.stages.skies import NEAR, PER_WHOLE, sky_numbers
 from miricigale.workflow.truths import FIELD
@@ -77,9 +78,9 @@ def _write_examples(page):
     study, keys = page.study, {}
     for one in study.truths:
         tables = page.every[one.name]
-        fits = tables.results.get("all")
-        if fits is not None:
-            keys[one.name] = typical_source(tables.sample, fits.fitted, study.bands[-1])
+        if "all" in tables.fits:
+            fitted = np.isfinite(tables.fits["all"]["chi2_best"])
+            keys[one.name] = typical_source(tables.sample, fitted, study.bands[-1])
     page.section("examples")
     key = next((key for key in keys.values() if key is not None), None)
     if key is None:
@@ -142,7 +143,7 @@ DOUBTFUL_MASS, DOUBTFUL_CHI2 = 1e8, 2.0
 
 def _outlier_rows(page):
     """Outliers of each truth by true redshift (keys "0" to "4"), and without doubtful sources."""
-    chi2 = np.asarray(page.tables.inputs["reduced_chi2"])
+    chi2 = FitPieces(page.context, "input_seds", len(page.tables.truth)).of("reduced_chi2")
     for one in page.study.truths:
         if not {"all", "none"} <= set(one.fits):
             continue
@@ -291,7 +292,7 @@ def _write_coverage(page):
         (unit, name): true_ranks(results, tables.sample, name, page.context.seed)
         for unit, results in tables.results.items()
         for name in COVERED
-        if name in tables.truth.colnames and len(results)
+        if name in tables.truth.colnames and len(tables.fits[unit])
     }
     if not ranks:
         return

@@ -319,12 +319,13 @@ def band_residuals(results, bands):
     """
     Measured minus best-model magnitudes of the MIRI bands, of sources above 5 sigma in them.
 
-    ``results`` is a `~miricigale.fitting.FitResults`; dict of str to `~numpy.ndarray`, NaN where fainter.
+    ``results`` is a `~miricigale.workflow.stages.inputs.FitPieces`; dict of str to `~numpy.ndarray`, NaN where
+    fainter.
     """
     out = {}
     for band in bands:
-        k = results.filters.index(band)
-        flux, error, model = (v[:, k] for v in (results.flux, results.flux_err, results.best_flux))
+        k = results.first.filters.index(band)
+        flux, error, model = (results.of(n)[:, k] for n in ("flux", "flux_err", "best_flux"))
         with np.errstate(invalid="ignore", divide="ignore"):
             good = (flux > 5 * error) & (model > 0)
             out[band] = np.where(good, -2.5 * np.log10(np.where(good, flux / model, 1.0)), np.nan)

@@ -109,7 +109,8 @@ def _ranked(results, sample, seed):
     table = results.to_table()
     for name in RANKED:
         rank = np.full(len(table), np.nan)
-        if len(table) and not (name == "redshift" and results.redshift_fixed):
+        # at known redshifts they have no odds
+        if len(table) and (name != "redshift" or "redshift_odds" in table.colnames):
             rank = true_ranks(results, sample, name, seed)
         table[f"{name}_rank"] = rank
         table[f"{name}_rank"].info.description = "Rank of the true value in the posterior"

@@ -16,12 +16,13 @@ from miricigale.workflow.stages.conditions import ConditionFlags, add_conditions
 from miricigale.workflow.stages.exposures import pointing_exposures, pointing_time
 from miricigale.workflow.stages.grids import PATCHED, by_patch, of_patch, parts_of, study_patches
 from miricigale.workflow.stages.inputs import (
+    FitPieces,
     catalog_pieces,
     existing_bands,
     fit_plan,
-    input_fits,
     piece_rows,
     sed_resources,
+    sources_memory,
 )
 from miricigale.workflow.stages.measure import joined_photometry
 from miricigale.workflow.stages.sample import (
@@ -88,6 +89,7 @@ class _Field:
     within=reference,
     sections=(*PATCHED, "errors", "photometry.match_radius"),
     plan=lambda config, _: reference(config),
+    memory=sources_memory,
 )
 def make_errors(context, _):
     """Stage 12: error function of every band, of the matched sources of the reference truth."""
@@ -112,6 +114,7 @@ _SAMPLE = ("fit.min_detected", "fit.axes", *(f"fit.{key}" for key in CUTS))
     units=truth_names,
     reads=lambda config, unit: [unit, *filter(None, catalog_pieces(config))],
     plan=fit_plan,
+    memory=sources_memory,
 )
 def match_sources(context, unit):
     """Stage 12: each truth matched, with the errors of the error function; sample of the fit."""
@@ -123,7 +126,7 @@ def match_sources(context, unit):
         matched[f"{name}_formal_err"] = matched[error_column(name)]
         matched[f"{name}_extrapolated"] = errors.extrapolated(matched[name], name)
     matched = errors.assign(matched, filters=bands, noise=field.noise(config))
-    chi2 = np.asarray(input_fits(context, len(field.truth))["reduced_chi2"])
+    chi2 = FitPieces(context, "input_seds", len(field.truth)).of("reduced_chi2")
     options = {"inside": field.inside, "min_detected": config.fit.min_detected}
     options["redshifts"] = sed.SEDModel.yang2021_axes(config.fit.axes)["redshift"]
     options["cuts"] = cut_flags(config.fit, context.table("catalog.ecsv"), field.truth, chi2)

@@ -38,7 +38,7 @@ from miricigale.workflow.stages.grids import (
     shown_patch,
     study_patches,
 )
-from miricigale.workflow.stages.inputs import sed_resources
+from miricigale.workflow.stages.inputs import sed_resources, sources_memory
 from miricigale.workflow.stages.sample import footprint_area
 from miricigale.workflow.truths import reference, study_truths
 
@@ -60,6 +60,7 @@ _MEASURED = ("highres", "photometry", "errors", "fit", "point_sources", "perturb
     sections=("run.name", "catalog", "sed", *IMAGES, "patches", *_MEASURED, "report"),
     resources=lambda: (*sed_resources(), *EXPOSURE_RESOURCES),
     plan=exposure_plan,
+    memory=sources_memory,
 )
 def make_report(context, _):
     """Stage 14: the page with its figures, and the numbers as JSON."""
@@ -91,7 +92,8 @@ def make_report(context, _):
     metrics["fits"] = metrics["truths"][shown]["fits"]
     if metrics["n_sample"] == 0:
         log.warning("no source is left to fit: %s", metrics["n_left_out"])
-    text = json.dumps(_without_nan(metrics), indent=1, allow_nan=False)
+    # JSON does not know NaN
+    text = json.dumps(json.loads(json.dumps(metrics), parse_constant=lambda _: None), indent=1)
     context.save("report/metrics.json", lambda path: path.write_text(text, encoding="utf-8"))
     subtitle = f"{metrics['n_field']} galaxies in {field_text(config)}, injected fracAGN "
     subtitle += f"{', '.join(map(str, config.sed.frac_agn))}, seed {context.seed}"
@@ -134,15 +136,9 @@ def _core_of(config, patch, wcs):
     if not patch:
         return True
     grid, whole = patch_grid(config), grid_of(config, config.highres.pixel_scale)
-    y, x = np.indices(wcs.pixel_shape[::-1])
-    xy = np.transpose(pixel_to_pixel(wcs, whole, x.ravel(), y.ravel()))
-    return (grid.holder(xy) == grid.names.index(patch)).reshape(x.shape)
-
-
-def _without_nan(values):
-    """The same values with None for NaN, which JSON does not know."""
-    if isinstance(values, dict):
-        return {key: _without_nan(value) for key, value in values.items()}
-    if isinstance(values, list):
-        return [_without_nan(value) for value in values]
-    return None if isinstance(values, float) and not np.isfinite(values) else values
+    nx, ny = wcs.pixel_shape
+    # both grids have the same axes
+    x = pixel_to_pixel(wcs, whole, np.arange(nx), np.zeros(nx))[0]
+    y = pixel_to_pixel(wcs, whole, np.zeros(ny), np.arange(ny))[1]
+    holder = grid.holder(np.stack(np.meshgrid(x, y), axis=-1))
+    return (holder == grid.names.index(patch)).reshape(ny, nx)

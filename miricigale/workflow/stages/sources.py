@@ -18,7 +18,7 @@ from miricigale.workflow.stages.conditions import ConditionFlags, any_condition
 from miricigale.workflow.stages.exposures import KERNEL
 from miricigale.workflow.stages.grids import of_patch, shown_patch, study_patches
 from miricigale.workflow.stages.images import measured_mosaic
-from miricigale.workflow.stages.inputs import existing_bands, sed_resources
+from miricigale.workflow.stages.inputs import existing_bands, sed_resources, sources_memory
 from miricigale.workflow.stages.sample import SampleFlags
 from miricigale.workflow.truths import truth_names
 
@@ -47,6 +47,7 @@ FLAGS = {
     # the prior of the patch that is shown is of no truth
     reads=lambda config, unit: [unit, f"{unit}/{shown_patch(config)}"],
     plan=lambda config, _: list(truth_names(config)),
+    memory=sources_memory,
 )
 def make_sources(context, name):
     """Stage 14, in addition: the page of a truth, and what it shows of its sources."""
@@ -106,7 +107,7 @@ class _Sources(StudyTables):
         both = [unit for unit in ("all", "none") if unit in self.results]
         self.compared = both or list(self.results)[:2]
         # all sets are fitted with the same model
-        fitted = next(iter(self.results.values()))
+        fitted = next(iter(self.results.values())).first
         known = [name for name in fitted.parameters if name in truth.colnames]
         self.units = {name: fitted.unit(name) for name in known}
         # columns without a unit are in that of the parameter
@@ -121,8 +122,8 @@ class _Sources(StudyTables):
         if band in self.miri:
             return [self.matched[key].to_value(FNU) for key in (band, error_column(band))]
         results = next(iter(self.results.values()))
-        at = results.filters.index(band)
-        return [self.of_sources(values[:, at]) for values in (results.flux, results.flux_err)]
+        at = results.first.filters.index(band)
+        return [self.of_sources(results.of(name)[:, at]) for name in ("flux", "flux_err")]
 
     def of_sources(self, values):
         """Values of the rows of the fits as values of the sources, NaN without a fit."""
@@ -154,7 +155,7 @@ class _Sources(StudyTables):
             fits = self.fits[unit]
             for parameter in DRAWN:
                 columns[f"{parameter}_{unit}"] = self.of_sources(fits[f"{parameter}_mean"])
-            columns[f"chi2_{unit}"] = self.of_sources(self.results[unit].reduced_chi2)
+            columns[f"chi2_{unit}"] = self.of_sources(fits["reduced_chi2"])
         for band in self.miri:
             flux, error = self._measured(band)
             none = np.full(len(flux), np.nan)
@@ -162,8 +163,8 @@ class _Sources(StudyTables):
             digits[f"sn_{band}"] = 3
         columns |= {key: matched[key] for key in ("n_detected", "selection", "association")}
         columns["condition"] = any_condition(matched, self.miri)
-        for unit, results in self.results.items():
-            columns[f"fit_{unit}"] = np.nan_to_num(self.of_sources(results.flags)).astype(int)
+        for unit, fits in self.fits.items():
+            columns[f"fit_{unit}"] = np.nan_to_num(self.of_sources(fits["flags"])).astype(int)
         return {
             key: rounded(np.asarray(values)[order], digits.get(key, 4))
             for key, values in columns.items()
@@ -183,7 +184,7 @@ class _Sources(StudyTables):
             ],
             "wave": rounded(np.sqrt(self.edges[1:] * self.edges[:-1])),
             "pdf_edges": {
-                unit: {key: rounded(found.distribution(key)[0].value) for key in DRAWN}
+                unit: {key: rounded(found.first.distribution(key)[0].value) for key in DRAWN}
                 for unit, found in self.results.items()
             },
             "parameters": [{"name": key, "unit": str(unit)} for key, unit in self.units.items()],

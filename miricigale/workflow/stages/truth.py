@@ -25,13 +25,14 @@ from miricigale.workflow.morphology import RealGalaxies, stamps_of_sources, writ
 from miricigale.workflow.options import require
 from miricigale.workflow.perturbation import perturbed_model, perturbed_parameters, point_columns
 from miricigale.workflow.stages.inputs import (
+    FitPieces,
     catalog_bands,
     catalog_pieces,
     existing_bands,
-    input_fits,
     measured_error,
     sed_resources,
     shows_dust,
+    sources_memory,
 )
 from miricigale.workflow.stages.stars import star_fluxes
 from miricigale.workflow.truths import CATALOG, CUTOUTS, FIELD, study_truths, truth_names
@@ -215,13 +216,14 @@ def _truth_plan(config, unit):
     units=truth_names,
     reads=lambda config, _: catalog_pieces(config),
     plan=_truth_plan,
+    memory=sources_memory,
 )
 def make_truth(context, name):
     """Stage 3: the best-fit SED (and its AGN) of each source through every band."""
     config, frac_agn = context.config, context.plan["frac_agn"]
     effects = context.plan.get("perturbations", {})
     catalog = context.table("catalog.ecsv")
-    best = input_fits(context, len(catalog))
+    best = FitPieces(context, "input_seds", len(catalog)).to_table()
     parameters = galaxy_parameters(config, catalog, best, seed=context.seed)
     prior = config.highres.filter
     existing = existing_bands(config)

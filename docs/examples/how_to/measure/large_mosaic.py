@@ -52,9 +52,9 @@ print(f"{len(table)} sources in {len(set(table['patch']))} patches")
 table["id", "sky", "miri.f770w", "miri.f770w_err", "patch"][:5]
 
 # %%
-# The folder has the table (``table.fits``), a page of all patches (``index.html``), and a table and a page of
-# each. Fluxes are those of the images as a whole, but for what each patch finds by itself (background, offset,
-# correlation of the noise, sizes of galaxies):
+# The folder has the table (``table.fits``), a page of all patches (``index.html``), and of each a table, a page
+# and, for each band, images of the model and of the residual. Fluxes are those of the images as a whole, but for
+# what each patch finds by itself (background, offset, correlation of the noise, sizes of galaxies):
 
 whole = measure_files(image, prior, **options)
 index, apart, _ = whole["sky"].match_to_catalog_sky(table["sky"])
