@@ -82,7 +82,7 @@ TARGETS = {
     "sed/components/attenuation.py": "sed/test_attenuation",
     "sed/xray*.py": "test_constants sed/test_xray sed/test_xray_bands",
     "fitting/_core/*.py": "fitting/test_grid_engine fitting/test_between fitting/test_limits "
-    "fitting/test_outliers fitting/test_pairs fitting/test_engine_corners",
+    "fitting/test_between_likelihood fitting/test_outliers fitting/test_pairs fitting/test_engine_corners",
     "depth/noise.py": "depth",
     "depth/limits.py": "depth",
     "evaluation/counts.py": "test_constants evaluation/test_counts",
