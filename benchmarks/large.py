@@ -2,6 +2,7 @@
 Memory and time of a fit from file to file: a long catalog and a small grid, or the paper's at known redshifts.
 
     python benchmarks/large.py [--n 200000] [--chunk-rows 10000] [--threads 1] [--few] [--kind parquet] [--kill]
+    python benchmarks/large.py --workers 2 [--n 10000000] ...
     python benchmarks/large.py --known [--n 10000]
 
 With ``--known`` the grid is that of Yang et al. 2021 (24 million models, 21 bands), objects are fitted at their
@@ -9,7 +10,9 @@ known redshifts in one process, and CPU seconds are printed beside those of the 
 Otherwise the catalog is written a piece at a time, and fitted on the nodes of a small grid; with ``--few`` one of
 12 redshifts, 24 galaxies and 6 bands, for long catalogs. Peak memory is that of a process of its own, for this
 catalog and for one a tenth as long: the difference is what a longer catalog costs. The page of ``miricigale fit``
-is made too. With ``--kill`` a third fit is killed with -9 again and again, and its files are compared.
+is made too. With ``--kill`` a third fit is killed with -9 again and again, and its files are compared. With
+``--workers`` the pieces are fitted by processes of dask, of which one is killed with -9 when a tenth of the files
+are there; ten pieces are fitted in this process once more, and the files compared.
 """
 
 import argparse
@@ -17,6 +20,7 @@ import hashlib
 import os
 import resource
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -32,7 +36,7 @@ from astropy.table import QTable
 from miricigale.fitting import BayesFitter, GridSettings, fit_file, open_results
 from miricigale.fitting.page import fit_page
 from miricigale.sed import SEDModel
-from miricigale.utils.row_files import write_rows
+from miricigale.utils.row_files import open_rows, write_rows
 
 BANDS = ["megacam.u", "acs.f606w", "acs.f814w", "wfc3.f125w", "wfc3.f160w", "irac.ch1", "irac.ch2"]
 BANDS += ["miri.f770w", "miri.f1000w", "miri.f1500w", "miri.f2100w"]
@@ -65,13 +69,64 @@ def write_catalog(path, grid, n):
     write_rows(path, catalog(grid, n), n)
 
 
+def fitter_of(few):
+    """Fitter, and a warm-up that compiles what it needs."""
+    fitter = BayesFitter(make_grid(few), settings=GridSettings(interpolate=0))
+    bands = fitter.backend.filters
+    fitter.fit(QTable({"id": [0], **{c: [1.0] * u.uJy for b in bands for c in (b, f"{b}_err")}}))
+    return fitter
+
+
+def on_workers(folder, n, chunk_rows, few, kind, n_workers):
+    """Fit a catalog on workers of dask, of which one is killed; compare some parts with those of one process."""
+    import distributed
+
+    fitter = fitter_of(few)
+    path, out = folder / f"catalog.{kind}", folder / "out"
+    write_catalog(path, fitter.backend.grid, n)
+    print(f"{fitter.backend.grid!r}; {n} rows, {path.stat().st_size / 1e6:.0f} MB", flush=True)
+    options = {"n_workers": n_workers, "threads_per_worker": 1, "dashboard_address": ":0"}
+    n_parts = -(-n // chunk_rows)
+    with (
+        distributed.LocalCluster(**options) as cluster,
+        distributed.Client(cluster) as client,
+        ThreadPoolExecutor(1) as other,
+    ):
+
+        def kill():
+            while not (out / f"part-{n_parts // 10:05d}.fits").exists():
+                time.sleep(0.1)
+            pids = client.run(os.getpid).values()
+            os.kill(min(pids), signal.SIGKILL)
+
+        killed = other.submit(kill)
+        start, cpu = time.time(), os.times()
+        results = fit_file(fitter, path, out, chunk_rows=chunk_rows, executor=client.get_executor())
+        killed.result()
+        fitted = time.time() - start
+    spent = sum(os.times()[:4]) - sum(cpu[:4])
+    size = sum(one.stat().st_size for one in results.paths)
+    loop = fit.loop_time(fitter.backend.grid, fitter.backend.grid.n_allowed, len(fitter.bands))
+    print(
+        f"{len(results)} fitted in {fitted:.0f} s, {size / 1e9:.1f} GB, {peak():.0f} MB of the driver's memory"
+    )
+    print(
+        f"{1e3 * spent / n:.3f} ms of CPU an object, driver and workers; plain loop {1e3 * loop:.3f} ms"
+    )
+    rows, mine = open_rows(path, chunk_rows), folder / f"some.{kind}"
+    some = np.random.default_rng(1).choice(n_parts, size=min(10, n_parts), replace=False)
+    differ = 0
+    for i in some:
+        write_rows(mine, [rows.chunk(i)], rows.span(i)[1] - rows.span(i)[0], overwrite=True)
+        again = fit_file(fitter, mine, folder / "some", chunk_rows=chunk_rows, resume=False)
+        differ += digest(again.paths[0]) != digest(results.paths[i])
+    print(f"one worker killed; {len(some)} of {n_parts} parts made here, of which differ: {differ}")
+
+
 def one(folder, n, chunk_rows, threads, few, kind):
     """Fit a catalog and print seconds and peak memory."""
-    grid = make_grid(few)
-    fitter = BayesFitter(grid, settings=GridSettings(interpolate=0))
-    bands = grid.filters
-    warm = QTable({"id": [0], **{c: [1.0] * u.uJy for b in bands for c in (b, f"{b}_err")}})
-    fitter.fit(warm)
+    fitter = fitter_of(few)
+    grid = fitter.backend.grid
     before, path = peak(), folder / f"{n}.{kind}"
     start, cpu = time.time(), time.process_time()
     with ThreadPoolExecutor(threads) as executor:
@@ -92,7 +147,7 @@ def one(folder, n, chunk_rows, threads, few, kind):
     again = time.time() - start
     of_fit = peak()
     fit_page(results, path).write(folder / f"page{n}.html")
-    loop = fit.loop_time(grid, grid.n_allowed, len(bands))
+    loop = fit.loop_time(grid, grid.n_allowed, len(grid.filters))
     print(fitted, joined, again, before, of_fit, peak(), cpu, loop)
 
 
@@ -158,6 +213,7 @@ def main():
     parser.add_argument("--n", type=int, default=200_000, help="objects")
     parser.add_argument("--chunk-rows", type=int, default=10_000)
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--workers", type=int, default=0, help="of dask, one of which is killed")
     parser.add_argument("--known", action="store_true", help="known redshifts, the paper's grid")
     parser.add_argument("--few", action="store_true", help="a smaller grid in fewer bands")
     parser.add_argument("--kind", choices=["fits", "parquet"], default="fits", help="of files")
@@ -170,6 +226,11 @@ def main():
         return
     if options.known:
         known(options.n, options.chunk_rows)
+        return
+    if options.workers:
+        with tempfile.TemporaryDirectory() as folder:
+            given = options.n, options.chunk_rows, options.few, options.kind, options.workers
+            on_workers(Path(folder), *given)
         return
     grid, kind = make_grid(options.few), options.kind
     print(f"{grid!r}; {options.chunk_rows} rows a part, {options.threads} threads")

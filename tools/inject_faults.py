@@ -155,7 +155,7 @@ def make_work(only):
     from astropy.table import QTable
 
     from miricigale import BayesFitter, SEDModel
-    from miricigale.fitting import fit_file
+    from miricigale.fitting import GridSettings, fit_file
     from miricigale.workflow.config import StudyConfig
     from miricigale.workflow.engine.runner import StudyRunner
     from miricigale.workflow.engine.stage import Stage
@@ -179,7 +179,8 @@ def make_work(only):
     axes = SEDModel.yang2021_axes("quick") | {"redshift": [0.5, 1.0]}
     axes = {key: values[:2] for key, values in axes.items()}
     bands = ["wfc3.f160w", "miri.f770w", "miri.f1500w"]
-    fitter = BayesFitter(SEDModel.yang2021().grid(axes, bands))
+    settings = GridSettings(interpolate=0)
+    fitter = BayesFitter(SEDModel.yang2021().grid(axes, bands), settings=settings)
     catalog = QTable({"id": np.arange(6)})
     for band in bands:
         catalog[band], catalog[f"{band}_err"] = (
@@ -279,6 +280,7 @@ def main(step, only, faults, library):
                     if text := wrong(function, whole, place, library, at, name):
                         n_wrong += 1
                         print(f"{what}, call {at}, {name}: {text}", flush=True)
+                print(f"{what}, {name}: {calls} calls, {time.time() - begin:.0f} s", flush=True)
         seconds = time.time() - begin
         print(f"{what}: {calls} calls, {n} faults, {seconds:.0f} s", flush=True)
     print(f"{n_wrong} went wrong")

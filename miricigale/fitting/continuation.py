@@ -110,8 +110,8 @@ class Continuation(Frozen):
         for kind, values in self._values.items():
             z = np.full(getattr(engine, kind).shape[1], redshift)
             new[kind] = self.finer.one_kind(kind, values, z)[0][None] if z.size else engine.agn[:1]
-        error, density, prior = engine.template_error, engine.density, engine.mass_prior
-        new["template_error"] = None if error is None else error[node : node + 1]
+        density, prior = engine.density, engine.mass_prior
+        new["template_error"] = engine.template_error[node : node + 1]
         if density is not None:
             new["density"] = replace(density, table=density.table[node : node + 1])
         new["mass_prior"] = prior and (lambda formed, _: prior(formed, [node]))

@@ -300,7 +300,7 @@ class BayesFitter(Interactive):
         progress_bar : bool, optional
             Whether to show one.
         chunk_size : int, optional
-            Objects in a piece: by default 64 on a grid, 1 for a sampler.
+            Objects in a piece: by default 64 on a grid, more (up to 1024) on one of few models, 1 for a sampler.
 
         Returns
         -------

@@ -57,7 +57,7 @@ class GridEngine(Frozen):
         at another redshift than its own.
     usable : `~numpy.ndarray` of bool, shape (nz, nG)
         Galaxies that may be used.
-    template_error : `~numpy.ndarray`, shape (nz, nb), optional
+    template_error : `~numpy.ndarray`, shape (nz, nb)
         Part of a flux that is added to its error in quadrature at each redshift; what this does to the
         normalization of the likelihood is part of the weights.
     mass_prior : callable, optional
@@ -84,7 +84,7 @@ class GridEngine(Frozen):
     galaxy: np.ndarray
     agn: np.ndarray
     usable: np.ndarray
-    template_error: np.ndarray | None = None
+    template_error: np.ndarray
     mass_prior: object = None
     density: object = None
     rtol: float = 1e-6
@@ -249,7 +249,7 @@ class GridEngine(Frozen):
         log_prior = np.where(np.isfinite(log_prior), 2.0 * log_prior, -1e300)
         seeds = np.zeros(n, np.uint64) if seeds is None else np.array(seeds, np.uint64)
         # the galaxy's, the AGN model's and the sum of both
-        n_quantities = len(self.quantities.galaxy_scale) + len(self.quantities.agn_scale) + 1
+        n_quantities = len(self._scales.galaxy) + len(self._scales.agn) - 1
         size = self.size | {"b": n_bands, "q": n_quantities, "l": DERIVED_LEVELS.size, "d": n_draws}
         size |= {"2": 2, "3": 3, "4": 4}
 
@@ -346,8 +346,15 @@ class GridEngine(Frozen):
             out.agn[i] = agn / agn.sum()
         mean, square = sums.band / total
         out.band[i] = mean, np.sqrt(np.maximum(square - mean * mean, 0.0))
-        derived = out.moments[i], out.quantiles[i], out.share[i], out.share_quantiles[i]
-        _core.summarize(self._scales, sums, float(self.scale_error), DERIVED_LEVELS, *derived)
+        given = self._scales, sums, float(self.scale_error), DERIVED_LEVELS
+        _core.summarize(*given, out.moments[i], out.quantiles[i])
+        if self.quantities.fraction is not None:
+            mean, square = sums.total[4:6] / total
+            out.share[i] = mean, np.sqrt(max(square - mean * mean, 0.0))
+            # the density in each bin, from changes of slope
+            density = np.cumsum(sums.hist.share[: _core.N_SHARE])[None]
+            _core.percentile_places(density, DERIVED_LEVELS, out.share_quantiles[i : i + 1])
+            out.share_quantiles[i] /= _core.N_SHARE
         out.draw_index[i] = sums.draws.index
         out.draw_scale[i] = sums.draws.scale
         for name, table in out.joint.items():

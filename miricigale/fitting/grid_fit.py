@@ -54,8 +54,6 @@ class GridFit:
     template_error: TemplateError | None = None
     between: Continuation | None = None
 
-    #: Objects in a piece of the catalog.
-    chunk_size = 64
     #: Weight of the first or last redshift above which an object is flagged.
     edge_weight = 0.01
 
@@ -128,6 +126,11 @@ class GridFit:
             bands = filters if same else grid.filters
             finest = finer_grid(finer, grid, bands, out.constants, nodes)
         return replace(out, between=Continuation(engine, nodes, finest, float(settings.agn_error)))
+
+    @property
+    def chunk_size(self):
+        """Objects in a piece of the catalog."""
+        return int(min(max(1e6 // max(self.engine.n_models, 1), 64), 1024))
 
     @property
     def grid(self):

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from miricigale.fitting._core import percentile_places
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_names, check_that
 
@@ -57,16 +58,10 @@ def cell_percentiles(values, pdf, levels, bounds=(-np.inf, np.inf)):
     levels = np.asarray(levels, dtype=float)
     out = np.full((pdf.shape[0], levels.size), np.nan)
     good = np.flatnonzero(np.isfinite(pdf).all(axis=1) & (pdf.sum(axis=1) > 0))
-    part = pdf[good]
-    total = np.cumsum(part, axis=1)
-    target = levels * total[:, -1:]
-    # the first cell whose upper edge is not below the level
-    cell = [np.searchsorted(row, one) for row, one in zip(total, target, strict=True)]
-    cell = np.minimum(np.reshape(cell, target.shape).astype(int), total.shape[1] - 1)
-    own = np.take_along_axis(part, cell, axis=1)
-    below = np.take_along_axis(total, cell, axis=1) - own
-    inside = np.clip((target - below) / np.maximum(own, 1e-300), 0.0, 1.0)
-    out[good] = edges[cell] + inside * (edges[cell + 1] - edges[cell])
+    place = np.empty((good.size, levels.size))
+    percentile_places(pdf[good], levels, place)
+    cell = np.minimum(place.astype(int), pdf.shape[1] - 1)
+    out[good] = edges[cell] + (place - cell) * (edges[cell + 1] - edges[cell])
     return out
 
 

@@ -114,7 +114,7 @@ def _add_axis(axes, name, column, kind, priors, bounds, rows=None, nodes=None):
     column = plain(column)
     if nodes is None:
         # means of equal values may differ in the last digit
-        values, rows_of = np.unique(np.float64(np.char.mod("%.12g", column)), return_inverse=True)
+        values, rows_of = np.unique(np.char.mod("%.12g", column).astype(float), return_inverse=True)
         column = values[rows_of]
     else:
         values = np.unique(nodes)

@@ -77,8 +77,9 @@ def kept_percentiles(name, levels, kept):
     low, high = DERIVED_LEVELS[[0, -1]]
     wanted = f"from {low:g} to {high:g} for {name!r}, whose distribution is kept there"
     check_that(not np.any((levels < low) | (levels > high)), "levels", wanted, f"{levels.tolist()}")
-    out = np.array([np.interp(levels, DERIVED_LEVELS, row) for row in kept])
-    return out.reshape(len(kept), levels.size)
+    i = np.maximum(np.searchsorted(DERIVED_LEVELS, levels) - 1, 0)
+    part = (levels - DERIVED_LEVELS[i]) / (DERIVED_LEVELS[i + 1] - DERIVED_LEVELS[i])
+    return kept[:, i] * (1.0 - part) + kept[:, i + 1] * part
 
 
 @dataclass(frozen=True, eq=False)

@@ -76,8 +76,8 @@ def pivots(filters):
 
 
 def grid_errors(template_error, filters, redshift):
-    """Template errors of bands at the redshifts of a grid: shape (nz, nb); None if there are none."""
+    """Template errors of bands at the redshifts of a grid, 0 without: shape (nz, nb)."""
     if template_error is None:
-        return None
+        return np.zeros((len(redshift), len(filters)))
     check_kind(template_error, "template_error", TemplateError)
     return template_error(pivots(filters) / (1.0 + np.asarray(redshift)[:, None]))

@@ -171,9 +171,8 @@ def warn_of_background(result, kernel):
     # the errors of an image without noise are those of its model
     if abs(added) > error and abs(level.value) > 0.05 * _median(sigma[free]):
         msg = (
-            f"'image' has a background of {level:.3g} between the sources, which is not fitted and adds "
-            f"about {added:.3g} to fluxes whose median error is {error:.3g}: subtract it, or give "
-            "'background_order'"
+            f"'image' has a background of {level:.3g} between the sources, which is not fitted and adds about "
+            f"{added:.3g} to fluxes whose median error is {error:.3g}: subtract it, or give 'background_order'"
         )
         warn(msg, PhotometryWarning)
 

@@ -95,10 +95,8 @@ class Yang2021Photometer:
         self._n_threads = n_threads
 
     def __repr__(self):
-        return (
-            f"<Yang2021Photometer scaling={self.scaling:.4f}, aperture={self.aperture:.4f}, "
-            f"{self.kernel!r}>"
-        )
+        known = f"scaling={self.scaling:.4f}, aperture={self.aperture:.4f}"
+        return f"<Yang2021Photometer {known}, {self.kernel!r}>"
 
     def measure(self, image, highres, segmentation, catalog):
         """

@@ -179,9 +179,8 @@ def _write_kernel(kernel, path, *, overwrite=False):
     if np.isfinite(kernel.regularization):
         header["REGULAR"] = (kernel.regularization, "Wiener parameter")
     header["META"] = json.dumps(kernel.meta, default=plain_value)
-    for name in ("source", "target"):
-        if getattr(kernel, name) is not None:
-            hdus.append(fits.ImageHDU(getattr(kernel, name), name=name.upper()))
+    both = {"SOURCE": kernel.source, "TARGET": kernel.target}.items()
+    hdus += [fits.ImageHDU(psf, name=name) for name, psf in both if psf is not None]
     with replacing(path, overwrite=overwrite) as partial:
         write_fits(hdus, partial)
 

@@ -104,9 +104,8 @@ class Background:
     def __repr__(self):
         doubt = "" if self.trusted else f", {', '.join(BackgroundFlags.names(self.flags))}"
         return (
-            f"<Background median {np.median(self.level):.4g} +- {np.median(self.error):.2g}, "
-            f"rms {np.median(self.rms):.4g}, "
-            f"{100 * self.source_mask.mean():.1f} % masked as sources{doubt}>"
+            f"<Background median {np.median(self.level):.4g} +- {np.median(self.error):.2g}, rms "
+            f"{np.median(self.rms):.4g}, {100 * self.source_mask.mean():.1f} % masked as sources{doubt}>"
         )
 
 

@@ -156,10 +156,8 @@ def _odd_units(catalog):
             continue
         factor = 0.4 * float(np.nanmedian(color))
         if abs(factor) > _COLOR[int(pivots[name] > 10.0)]:
-            yield (
-                f"the median of {name} over {reference} is {10**factor:.2g}: are these fluxes in "
-                "one unit?"
-            )
+            of = f"{name} over {reference}"
+            yield f"the median of {of} is {10**factor:.2g}: are these fluxes in one unit?"
 
 
 def _odd_counts(catalog, magnitudes, name):

@@ -245,9 +245,8 @@ class ModelGrid(Frozen):
 
     def __repr__(self):
         return (
-            f"<ModelGrid {self.redshift.size} redshifts x {self.n_galaxies} galaxies x "
-            f"{self.n_agn} AGN x {self.frac_agn.size} fractions, {len(self.filters)} bands, "
-            f"{self.n_models:,} models>"
+            f"<ModelGrid {self.redshift.size} redshifts x {self.n_galaxies} galaxies x {self.n_agn} AGN x "
+            f"{self.frac_agn.size} fractions, {len(self.filters)} bands, {self.n_models:,} models>"
         )
 
 

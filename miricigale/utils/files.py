@@ -224,9 +224,8 @@ def check_unpacked(path, n_bytes):
     if n_bytes > bound:
         msg = (
             f"{path} ({os.stat(path).st_size / 1e6:.3g} MB on the disk) would unpack to "
-            f"{'more than ' if n_bytes == bound + 1 else ''}{n_bytes / 1e9:.3g} GB, and the bound "
-            f"is {bound / 1e9:.3g} GB; if it is to be trusted, raise "
-            "miricigale.conf.unpacked_size (in MB)"
+            f"{'more than ' if n_bytes == bound + 1 else ''}{n_bytes / 1e9:.3g} GB, and the bound is "
+            f"{bound / 1e9:.3g} GB; if it is to be trusted, raise miricigale.conf.unpacked_size (in MB)"
         )
         raise DataError(msg)
 

@@ -67,10 +67,8 @@ def check_memory(n_bytes, what, *, advice):
     """
     most = 0.9 * available_memory()
     if n_bytes > most:
-        msg = (
-            f"{what} would take {n_bytes / 1e9:.3g} GB of memory, and {most / 1e9:.3g} GB can be "
-            f"had: {advice}"
-        )
+        had = f"{most / 1e9:.3g} GB can be had"
+        msg = f"{what} would take {n_bytes / 1e9:.3g} GB of memory, and {had}: {advice}"
         raise MemoryError(msg)
 
 

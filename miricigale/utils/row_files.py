@@ -245,8 +245,8 @@ def _write_fits(path, tables, n_rows):
             columns = [*header["TFORM*"].values()]
             if layout is None:
                 layout, header["NAXIS2"] = columns, n_rows
-                for part in (fits.PrimaryHDU().header, header):
-                    stream.write(part.tostring().encode("ascii"))
+                both = fits.PrimaryHDU().header.tostring() + header.tostring()
+                stream.write(both.encode("ascii"))
             _check_same(layout, columns)
             n_bytes += stream.write(rows)
         stream.write(bytes(-n_bytes % 2880))

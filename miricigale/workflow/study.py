@@ -80,8 +80,7 @@ def check_study(config):
     if n_inside < MIN_SOURCES:
         msg = (
             f"[pointing] at RA {config.pointing.ra}, Dec {config.pointing.dec} has {n_inside} of the "
-            f"{len(catalog)} sources of {config.catalog.source!r} in its field; at least "
-            f"{MIN_SOURCES} are needed"
+            f"{len(catalog)} sources of {config.catalog.source!r} in its field; at least {MIN_SOURCES} are needed"
         )
         raise ConfigError(msg)
     # that of the default is known to have a PSF; to make one may take seconds

@@ -4,8 +4,10 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import MaskedColumn
+from numba import njit
 from numpy.testing import assert_allclose, assert_array_equal
-from scipy.special import log_ndtr
+from scipy.optimize import minimize_scalar
+from scipy.special import log_ndtr, ndtr
 from scipy.stats import norm
 
 from helpers.errors import refuses
@@ -22,6 +24,9 @@ from helpers.grids import (
     photometry_table,
 )
 from miricigale.fitting import FitFlags, GridSettings, leave_out, mock_analysis
+from miricigale.fitting._core.limits import limited_scale
+from miricigale.fitting._core.workspace import make_limits
+from miricigale.fitting.quantities import DERIVED_LEVELS
 
 ERROR = {"band0": 0.1, "band1": 0.05, "band3": 0.2}
 FLOOR = {"band2": 0.15, "band3": 0.02}
@@ -179,6 +184,54 @@ def test_one_model_has_the_posterior_of_the_text_book():
     assert results.log_evidence[0] == pytest.approx(norm_of_flux - 0.5 * best.fun, rel=1e-9)
     assert (results.n_bands[0], results.n_limits[0]) == (2, 1)
     assert results.reduced_chi2[0] == results.chi2[0]
+
+
+def test_quantities_of_one_galaxy_have_the_same_distribution():
+    """One galaxy measured to 10 %: all that scales with its mass is normal in the logarithm, with that error."""
+    grid = make_grid(n_z=1, n_tau=1, n_age=1, frac=[0.0], n_b=1)
+    flux = 1e10 * grid.galaxy[0]
+    results = node_fitter(grid, n_bands_min=1, model_error=0.0).fit(
+        photometry_table(grid.filters, flux, 0.1 * flux, ["only"])
+    )
+    names = [name for name in results.quantities if results.extensive(name)]
+    scale = {name: results.best[name][0].value for name in names}
+    names = [name for name in names if scale[name] > 0]
+    assert len(names) == 3
+    expected = 10.0 ** (0.1 / np.log(10) * norm.ppf(DERIVED_LEVELS))
+    found = np.array(
+        [results.percentile(name, DERIVED_LEVELS)[0].value / scale[name] for name in names]
+    )
+    assert_allclose(found[0], expected, rtol=3e-3)
+    assert_allclose(found, np.tile(found[0], (len(names), 1)), rtol=1e-9)
+
+
+@njit
+def _scale(p, q, limits):
+    return limited_scale(p, q, limits)
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.02, 0.3])
+def test_one_model_has_the_scale_of_the_least_chi2(wrong):
+    """Also where limits may be wrong, each with a prior probability: its likelihood is (1 - p) P + p."""
+    slope, level, p, q = np.array([3.0, 0.7, 1.5]), np.array([2.0, 1.0, 3.0]), 90.0, 60.0
+    limits = make_limits(level, np.ones(3), np.full(3, wrong) if wrong else None)
+    limits.slope[:] = slope
+
+    def terms(s):
+        return -np.log((1.0 - wrong) * ndtr(level - s * slope) + wrong)
+
+    def half(s):
+        return 0.5 * q * s * s - p * s + terms(s).sum()
+
+    best, step = minimize_scalar(half, bounds=(0.1, 3.0), options={"xatol": 1e-9}).x, 1e-3
+    bend = (terms(best + step) - 2.0 * terms(best) + terms(best - step)) / step**2
+    s, rise, variance = _scale(p, q, limits)
+    assert s == pytest.approx(best, rel=1e-6)
+    # limits pull: without them the scale is p / q
+    assert s < p / q
+    assert rise == pytest.approx(2.0 * (half(0.0) - half(best)), rel=1e-7)
+    # a limit that is not convex has no part in the curvature
+    assert variance == pytest.approx(1.0 / (q + np.maximum(bend, 0.0).sum()), rel=1e-4)
 
 
 def test_percentiles_of_the_other_fraction():

@@ -93,6 +93,9 @@ def test_the_place_in_a_catalog_makes_no_difference():
     for row in (0, 17, 255, 256, 298):
         alone = cell_percentiles(np.arange(30.0), weights[row : row + 1], levels)
         assert_array_equal(whole[row], alone[0])
+    # nor does the order of the levels
+    order = rng.permutation(levels.size)
+    assert_array_equal(cell_percentiles(np.arange(30.0), weights, levels[order]), whole[:, order])
 
 
 def test_objects_without_a_value():

@@ -225,5 +225,5 @@ plt.show()
 # - Compressed files are read as a whole. FITS columns of variable length, and ids that are text but not ASCII,
 #   which FITS tables cannot hold, are refused before anything is fitted; ``BayesFitter.fit`` takes such ids.
 #
-# Memory and times for a million objects are in :doc:`/accuracy/fitting`. Next: :doc:`/how_to/fit/mock_analysis`
+# Memory and times for millions of objects are in :doc:`/accuracy/fitting`. Next: :doc:`/how_to/fit/mock_analysis`
 # tests the errors of the results.

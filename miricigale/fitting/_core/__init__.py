@@ -12,7 +12,13 @@ limits) and summed up (`sums`, `histogram`); `summarize` turns the sums into mom
 
 from miricigale.fitting._core.between import Kind, interpolate, make_work
 from miricigale.fitting._core.evaluate import sum_up
-from miricigale.fitting._core.histogram import PER_DEX, make_scales, summarize
+from miricigale.fitting._core.histogram import (
+    N_SHARE,
+    PER_DEX,
+    make_scales,
+    percentile_places,
+    summarize,
+)
 from miricigale.fitting._core.masses import weigh_masses
 from miricigale.fitting._core.mixture import find_models
 from miricigale.fitting._core.population import (

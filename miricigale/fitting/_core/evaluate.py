@@ -194,35 +194,49 @@ def _evaluate_runs(
             finish_redshift(tables, lanes, sums, z)
 
 
-def _begin(tables, target, limits, pairs, origin):
+@njit(**KERNEL)
+def _begin(tables, target, limits, pairs, lanes, sums, delta, scale_error):
     """
-    Find a good model to begin with, and order the redshifts.
+    Find a good model to begin with, order the redshifts, and add the models without AGN to the sums.
 
-    ``origin`` is filled with the logarithms that the histograms begin with. Returned is the best
-    R + 2 ln(prior) met, None if there is no model that may be used.
+    Returned is the best R + 2 ln(prior) met, -1e300 if there is no model that may be used.
     """
     project(tables, target, pairs)
-    pairs.order[:] = np.argsort(-pairs.promise, kind="stable")
+    order, promise = pairs.order, pairs.promise
+    for z in range(order.size):
+        i = z
+        while i > 0 and promise[order[i - 1]] < promise[z]:
+            order[i] = order[i - 1]
+            i -= 1
+        order[i] = z
     reference = -1e300
     scale = 1.0
-    for i, z in enumerate(pairs.order):
-        if pairs.promise[z] < -1e29 or (i >= 3 and reference > -1e299):
+    for i in range(order.size):
+        z = order[i]
+        if promise[z] < -1e29 or (i >= 3 and reference > -1e299):
             break
-        weighted = tables.agn[z] * target.weight[z]
-        pairs.agn_pq[:, 0] = weighted @ target.flux
-        pairs.agn_pq[:, 1] = np.sum(weighted * tables.agn[z], axis=1)
+        agn_products(tables.agn[z], target, z, pairs.agn_pq, pairs.agn_weighted)
         g = pairs.galaxy_of[z]
         value, s = best_of_galaxy(tables, target, limits, pairs, z, g)
         if value > reference:
             reference = value
+            q = 0.0
+            for b in range(target.flux.size):
+                q += tables.galaxy[z, g, b] ** 2 * target.weight[z, b]
             # where the best has no light others have about what one sigma allows
-            q = np.sum(np.square(tables.galaxy[z, g]) * target.weight[z])
             scale = s if s > 0.0 else (1.0 / math.sqrt(q) if q > 1e-290 else 1.0)
     if reference < -1e299:
-        return None
+        return reference
+    origin = sums.hist.origin
     origin[:] = _LOG10_E * math.log(scale)
     for i, row in ((1, at.DUST), (2, at.MIXED_GALAXY)):
-        origin[i] += _LOG10_E * math.log(max(tables.of_galaxy[row].max(), 1e-300))
+        top = 1e-300
+        for g in range(tables.of_galaxy.shape[1]):
+            top = max(top, tables.of_galaxy[row, g])
+        origin[i] += _LOG10_E * math.log(top)
+    sums.best[2] = reference
+    if tables.zero_frac == 1 and tables.prior_zero > 0.0:
+        _evaluate_alone(tables, target, limits, pairs, lanes, sums, delta, scale_error)
     return reference
 
 
@@ -243,18 +257,15 @@ def sum_up(tables, scales, request, target, limits, sums, pairs, lanes, *, singl
     found : bool
         Whether there is any model with weight.
     """
-    reference = _begin(tables, target, limits, pairs, sums.hist.origin)
-    if reference is None:
-        return False
     best, total, given = sums.best, sums.total, (tables, target, limits, pairs)
-    best[2] = reference
-    if tables.zero_frac == 1 and tables.prior_zero > 0.0:
-        _evaluate_alone(*given, lanes, sums, request.delta, request.scale_error)
+    reference = _begin(*given, lanes, sums, request.delta, request.scale_error)
+    n_agn = tables.agn.shape[1]
+    if reference < -1e299 or n_agn == 0:
+        return total[0] > 0.0
     # a bound holds the largest prior of the fractions above 0, a weight those of all
     prior = tables.of_frac[at.PRIOR_FRAC]
     prior_sum, prior_top = prior.sum(), prior.max(initial=0.0)
-    n_agn = tables.agn.shape[1]
-    end = tables.tiles.shape[0] * tables.tiles.shape[1] if n_agn > 0 and prior_top > 0.0 else 0
+    end = tables.tiles.shape[0] * tables.tiles.shape[1] if prior_top > 0.0 else 0
     position = 0
     share = 1.0
     if limits is not None:

@@ -23,6 +23,9 @@ N_SHARE = 4096
 _HALF = N_BINS // 2
 # Variance in bins: 1/12 of a bin, and 1/6 of the sharing between neighbors.
 _BINNED = 0.25
+# Largest width of the kernel of scales in bins, and numbers that it has then.
+_WIDEST = 200.0
+KERNEL_SIZE = 1601
 _LOG10_E = 0.43429448190325183
 #: Logarithm of a scale of 0.
 NO_SCALE = -1e9
@@ -99,86 +102,99 @@ def clear_rows(table, used):
 
 
 @njit(**{**KERNEL, "fastmath": False})
-def _log_quantiles(
-    table, used, log, weight, least, zero, origin, kernel, work, levels, out, quantiles
-):
+def _log_quantiles(hists, row, log, weight, least, zero, width, levels, origin, quantiles):
     """
-    Mean logarithms and quantiles of quantities that scale with the same histograms.
+    Mean logarithm and quantiles of a quantity.
 
-    ``log``, of shape (n_quantities, n), is log10 of their scales in the n rows of the table, `NO_SCALE`
-    where one is 0; rows of less weight than ``least`` are left out. ``zero`` is the weight of models in
-    which all quantities are zero, ``origin`` log10 of the rows' middle bins, ``kernel`` that by which
-    histograms are broadened, ``work`` scratch of shape (2, n_bins + its length). ``out`` and
-    ``quantiles`` are filled; NaN where there is no weight.
+    ``log`` is log10 of its scale in the n rows of the table from ``row`` on, `NO_SCALE` where it is 0; rows of
+    less weight (shape (n, ...), the first column) than ``least`` are left out. ``zero`` is the weight of models in
+    which the quantity is zero, ``origin`` log10 of the rows' middle bins, ``width`` half of that of the kernel in
+    the third row of ``Histograms.work``, by which histograms are broadened; its first two rows are zeros, and are
+    again when this returns. ``quantiles`` are filled; NaN where there is no weight.
     """
-    reach = kernel.size // 2
-    for q in range(log.shape[0]):
-        hist, wide = work[0, :N_BINS], work[1]
-        hist[:] = 0.0
-        wide[:] = 0.0
-        top = 0.0
-        middle = 0.0
-        for i in range(weight.size):
-            if log[q, i] > NO_SCALE and weight[i] > top:
-                top = weight[i]
-                middle = log[q, i]
-        nothing = zero
-        for i in range(weight.size):
-            first, last = used[i, 0], used[i, 1]
-            if weight[i] <= least or last < 0:
-                continue
-            if log[q, i] <= NO_SCALE:
-                for j in range(first, last + 1):
-                    nothing += table[i, j]
-                continue
-            offset = (log[q, i] - middle) * PER_DEX
-            step = math.floor(offset)
-            part = offset - step
-            step = min(max(np.int64(step), -2 * N_BINS), 2 * N_BINS)
-            # what leaves the histogram is counted in its outermost bins
+    hist, wide, kernel = hists.work[0], hists.work[1], hists.work[2]
+    table, used = hists.table[row:], hists.used[row:]
+    low = np.int64(N_BINS)
+    high = np.int64(0)
+    top = 0.0
+    middle = 0.0
+    for i in range(len(weight)):
+        if log[i] > NO_SCALE and weight[i, 0] > top:
+            top = weight[i, 0]
+            middle = log[i]
+    nothing = zero
+    for i in range(len(weight)):
+        first, last = used[i, 0], used[i, 1]
+        if weight[i, 0] <= least or last < 0:
+            continue
+        if log[i] <= NO_SCALE:
             for j in range(first, last + 1):
-                column = min(max(j + step, 0), N_BINS - 1)
-                hist[column] += (1.0 - part) * table[i, j]
-                hist[min(max(j + step + 1, 0), N_BINS - 1)] += part * table[i, j]
+                nothing += table[i, j]
+            continue
+        offset = (log[i] - middle) * PER_DEX
+        step = math.floor(offset)
+        part = offset - step
+        step = min(max(np.int64(step), -2 * N_BINS), 2 * N_BINS)
+        low = min(low, max(first + step, 0))
+        high = max(high, min(last + step + 2, N_BINS))
+        # what leaves the histogram is counted in its outermost bins
+        for j in range(first, last + 1):
+            column = min(max(j + step, 0), N_BINS - 1)
+            hist[column] += (1.0 - part) * table[i, j]
+            hist[min(max(j + step + 1, 0), N_BINS - 1)] += part * table[i, j]
+    total = 0.0
+    moment = 0.0
+    for j in range(low, high):
+        total += hist[j]
+        moment += hist[j] * (j + 0.5)
+        if hist[j] > 0.0:
+            for i in range(2 * width + 1):
+                wide[j + i] += hist[j] * kernel[i]
+    for j in range(low, width):
+        wide[width] += wide[j]
+    for j in range(N_BINS + width, high + 2 * width):
+        wide[width + N_BINS - 1] += wide[j]
+    middle += origin
+    _places(
+        wide[width:], max(low - width, 0), N_BINS - 1, nothing, total + nothing, levels, quantiles
+    )
+    for i in range(levels.size):
+        quantiles[i] = 10.0 ** (middle + (quantiles[i] - _HALF) / PER_DEX)
+        if levels[i] * (total + nothing) <= nothing or total == 0.0:
+            quantiles[i] = 0.0 if total + nothing > 0.0 else np.nan
+    hist[low:high] = 0.0
+    wide[low : high + 2 * width] = 0.0
+    return middle + (moment / total - _HALF) / PER_DEX if total > 0.0 else np.nan
+
+
+@njit(**{**PART, "fastmath": False})
+def _places(bins, first, last, start, total, levels, out):
+    """
+    Fill the places, in bins, at which a distribution that is even within each bin reaches levels of the total.
+
+    Weights from the ``first`` to the ``last`` bin are looked at, and ``start`` lies below them.
+    """
+    j = first
+    below = start
+    for i in range(levels.size):
+        target = levels[i] * total
+        if target <= below:
+            j = first
+            below = start
+        while j < last and below + bins[j] < target:
+            below += bins[j]
+            j += 1
+        out[i] = j + (min(max((target - below) / bins[j], 0.0), 1.0) if bins[j] > 0.0 else 0.0)
+
+
+@njit(**{**KERNEL, "fastmath": False})
+def percentile_places(pdf, levels, out):
+    """Fill `_places` of the rows of a table (m, n), of levels (k,) in any order: (m, k)."""
+    for row in range(pdf.shape[0]):
         total = 0.0
-        moment = 0.0
-        for j in range(N_BINS):
-            total += hist[j]
-            moment += hist[j] * (j + 0.5)
-        for j in range(N_BINS):
-            if hist[j] > 0.0:
-                for i in range(kernel.size):
-                    wide[j + i] += hist[j] * kernel[i]
-        for j in range(reach):
-            wide[reach] += wide[j]
-            wide[reach + N_BINS - 1] += wide[reach + N_BINS + j]
-        middle += origin
-        out[q] = middle + (moment / total - _HALF) / PER_DEX if total > 0.0 else np.nan
-        below = nothing
-        j = 0
-        for i in range(levels.size):
-            target = levels[i] * (total + nothing)
-            if target <= nothing or total == 0.0:
-                quantiles[q, i] = 0.0 if total + nothing > 0.0 else np.nan
-                continue
-            while j < N_BINS - 1 and below + wide[reach + j] < target:
-                below += wide[reach + j]
-                j += 1
-            now = wide[reach + j]
-            part = min(max((target - below) / now, 0.0), 1.0) if now > 0.0 else 0.5
-            quantiles[q, i] = 10.0 ** (middle + (j - _HALF + part) / PER_DEX)
-
-
-def _share_quantiles(change, levels):
-    """Quantiles of a fraction, from changes of slope; NaN if there is no weight."""
-    slope = np.cumsum(change[:N_SHARE])
-    below = np.cumsum(np.append(0.0, slope))
-    target = levels * below[-1]
-    if not below[-1] > 0.0:
-        return np.full(levels.size, np.nan)
-    j = np.minimum(np.searchsorted(below[1:], target), N_SHARE - 1)
-    part = np.clip(target - below[j], 0.0, np.maximum(slope[j], 0.0))
-    return (j + np.divide(part, slope[j], where=slope[j] > 0, out=np.zeros(j.size))) / N_SHARE
+        for i in range(pdf.shape[1]):
+            total += pdf[row, i]
+        _places(pdf[row], 0, pdf.shape[1] - 1, 0.0, total, levels, out[row])
 
 
 def make_scales(galaxy, agn):
@@ -187,77 +203,87 @@ def make_scales(galaxy, agn):
         np.log10(scale, where=scale > 0, out=np.full(scale.shape, NO_SCALE))
         for scale in (galaxy, agn)
     ]
-    return Scales(galaxy, agn, np.square(galaxy), np.square(agn), *logs)
+    return Scales(galaxy, agn, *logs)
 
 
-def _moments(scales, sums):
-    """Means and variances of the derived quantities, scales' own variances included."""
-    moments = []
-    for power, galaxy, agn in (
-        (1, scales.galaxy, scales.agn),
-        (2, scales.galaxy_square, scales.agn_square),
-    ):
-        of_galaxy, of_agn = galaxy @ sums.galaxy[:, power], agn @ sums.agn[:, power]
-        of_galaxy[-1] += of_agn[-1]
-        moments.append(np.concatenate([of_galaxy[:-1], of_agn[:-1], of_galaxy[-1:]]))
-    first, second = moments
-    second[-1] += 2.0 * sums.total[3]
-    mean = first / sums.total[0]
-    return mean, second / sums.total[0] - mean * mean
+@njit(**KERNEL)
+def _moments(scales, sums, out):
+    """Fill means and standard deviations, scales' own variances included, of the derived quantities: (n, 2)."""
+    total, n, m = sums.total[0], len(scales.galaxy) - 1, len(scales.agn) - 1
+    for i in range(n + m + 1):
+        first = 0.0
+        second = 2.0 * sums.total[3] if i == n + m else 0.0
+        for g in range(scales.galaxy.shape[1] if i < n or i == n + m else 0):
+            x = scales.galaxy[min(i, n), g]
+            first += x * sums.galaxy[g, 1]
+            second += x * x * sums.galaxy[g, 2]
+        for k in range(scales.agn.shape[1] if i >= n else 0):
+            x = scales.agn[i - n, k]
+            first += x * sums.agn[k, 1]
+            second += x * x * sums.agn[k, 2]
+        out[i, 0] = first / total
+        out[i, 1] = math.sqrt(max(second / total - out[i, 0] ** 2, 0.0))
 
 
 def widest(scales, sums):
     """Squares of quantities over their variance so far, the largest of each galaxy and AGN model."""
-    mean, variance = _moments(scales, sums)
     n = len(scales.galaxy) - 1
+    out = np.empty((n + len(scales.agn), 2))
+    _moments(scales, sums, out)
+    mean, std = out.T
     part = 1e-6 * mean
     part[n:-1] = _FAINT * mean[-1]
-    value = np.maximum(variance, part * part)
+    value = np.square(np.maximum(std, part))
     # of what is the same for all models, in numbers too small to square, nothing is asked
     inverse = np.divide(1.0, value, where=value > 1e-290, out=np.zeros(value.size))
     of_galaxy = np.append(inverse[:n], inverse[-1])
-    galaxy = np.max(scales.galaxy_square * of_galaxy[:, None], axis=0)
-    return galaxy, np.max(scales.agn_square * inverse[n:, None], axis=0)
+    galaxy = np.max(np.square(scales.galaxy) * of_galaxy[:, None], axis=0)
+    return galaxy, np.max(np.square(scales.agn) * inverse[n:, None], axis=0)
 
 
-def summarize(scales, sums, scale_error, levels, out, quantiles, share, share_quantiles):
+@njit(**{**KERNEL, "fastmath": False})
+def summarize(scales, sums, scale_error, levels, out, quantiles):
     """
-    Fill moments and quantiles of all derived quantities of one object, and of the other fraction.
+    Fill moments and quantiles of all derived quantities of one object.
 
     The order is the galaxy's quantities, the AGN model's, then the one of both; ``out`` has means,
-    standard deviations and means of log10 in its rows, ``share`` mean and standard deviation.
+    standard deviations and means of log10 in its rows.
     """
-    total, hist = sums.total[0], sums.hist
-    sigma = scale_error / np.sqrt(max(sums.total[1] / total, 1.0))
-    mean, variance = _moments(scales, sums)
-    out[:, 0] = mean
-    out[:, 1] = np.sqrt(np.maximum(variance, 0.0))
-    width = min(sigma * _LOG10_E * PER_DEX, 200.0)
+    total, hist, kernel = sums.total[0], sums.hist, sums.hist.work[2]
+    n, m, ng, na = len(scales.galaxy) - 1, len(scales.agn) - 1, len(sums.galaxy), len(sums.agn)
+    _moments(scales, sums, out)
+    sigma = scale_error / math.sqrt(max(sums.total[1] / total, 1.0))
+    width = min(sigma * _LOG10_E * PER_DEX, _WIDEST)
     # what bins of equal density, and sharing between two of them, have added is left out
     width = math.sqrt(max(width * width - _BINNED, 0.0))
-    kernel = np.ones(1)
-    if width > 0.15:
-        reach = math.ceil(4.0 * width)
-        kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / width) ** 2)
-        kernel /= kernel.sum()
-    work = np.empty((2, N_BINS + kernel.size))
-    n_galaxy, n_agn = len(sums.galaxy), len(sums.agn)
-    mean_log = np.empty(len(out))
-    row = 0
-    for first, log, weight, least, origin in (
-        (0, scales.log_galaxy[:-1], sums.galaxy[:, 0].copy(), 1e-6 * total / n_galaxy, 0),
-        (n_galaxy, scales.log_agn[:-1], sums.agn[:, 0].copy(), 0.0, 1),
-        (n_galaxy + n_agn, np.zeros((1, 1)), np.array([total]), 0.0, 2),
-    ):
-        rows, these = slice(first, first + weight.size), slice(row, row + len(log))
-        # models without light, or any without AGN power, or without either
-        dark = sums.total[2] if first == 0 else max(total - hist.table[rows].sum(), 0.0)
-        _log_quantiles(
-            hist.table[rows], hist.used[rows], log, weight, least, dark, hist.origin[origin], kernel,
-            work, levels, mean_log[these], quantiles[these],
-        )  # fmt: skip
-        row += len(log)
-    out[:, 2] = mean_log
-    share[0] = sums.total[4] / total
-    share[1] = np.sqrt(max(sums.total[5] / total - share[0] ** 2, 0.0))
-    share_quantiles[:] = _share_quantiles(hist.share, levels)
+    reach = np.int64(math.ceil(4.0 * width) if width > 0.15 else 0.0)
+    norm = 0.0
+    for i in range(2 * reach + 1):
+        kernel[i] = math.exp(-0.5 * ((i - reach) / max(width, 0.15)) ** 2)
+        norm += kernel[i]
+    for i in range(2 * reach + 1):
+        kernel[i] /= norm
+    # models without light, or any without AGN power, or without either
+    dark, least = sums.total[2], 1e-6 * total / ng
+    no_power, neither = (
+        _without(hist, ng, ng + na, total),
+        _without(hist, ng + na, ng + na + 1, total),
+    )
+    for i in range(n):
+        given = hist, 0, scales.log_galaxy[i], sums.galaxy, least, dark, reach, levels
+        out[i, 2] = _log_quantiles(*given, hist.origin[0], quantiles[i])
+    for i in range(m):
+        given = hist, ng, scales.log_agn[i], sums.agn, 0.0, no_power, reach, levels
+        out[n + i, 2] = _log_quantiles(*given, hist.origin[1], quantiles[n + i])
+    hist.work[3, 0] = total
+    given = hist, ng + na, hist.work[4], hist.work[3:4], 0.0, neither, reach, levels
+    out[n + m, 2] = _log_quantiles(*given, hist.origin[2], quantiles[n + m])
+
+
+@njit(**PART)
+def _without(hist, first, end, total):
+    """Weight that is not in these rows of the histograms."""
+    for i in range(first, end):
+        for j in range(hist.used[i, 0], hist.used[i, 1] + 1):
+            total -= hist.table[i, j]
+    return max(total, 0.0)

@@ -88,8 +88,6 @@ class Scales(NamedTuple):
 
     galaxy: np.ndarray  # float64 (n_qg + 1, nG), for each Msun formed, and
     agn: np.ndarray  # float64 (n_qa + 1, nA), for each W
-    galaxy_square: np.ndarray  # their squares
-    agn_square: np.ndarray
     log_galaxy: np.ndarray  # their log10; NO_SCALE of 0
     log_agn: np.ndarray
 
@@ -109,9 +107,7 @@ class Target(NamedTuple):
 
     flux: np.ndarray  # float64 (nb,), uJy; 0 in bands not measured
     weight: np.ndarray  # float64 (nz, nb): 1 / sigma^2; 0 there
-    log_prior: (
-        np.ndarray
-    )  # float64 (nz,): 2 ln(prior) of the redshifts plus ``level``, -1e300 where it is 0
+    log_prior: np.ndarray  # float64 (nz,): 2 ln(prior) of redshifts + ``level``; -1e300 if it is 0
     bands: np.ndarray  # int64 (n_used,): the measured bands
     root32: np.ndarray  # float32 (nz, n_used): roots of their weights, the largest being 1
     data32: np.ndarray  # float32 (nz, n_used): flux over sigma, of norm 1
@@ -132,9 +128,7 @@ class Limits(NamedTuple):
     inverse: np.ndarray  # float64 (n_limits,): 1 / sigma
     slope: np.ndarray  # float64 (n_limits,), scratch: one model's fluxes over sigma
     dark: float  # sum of the limits' terms of chi2 for a model without light
-    wrong: (
-        np.ndarray | None
-    )  # float64 (n_limits,): prior fraction of wrong ones; None of no mixture
+    wrong: np.ndarray | None  # float64 (n_limits,): prior fraction of wrong ones, of a mixture
 
 
 class Histograms(NamedTuple):
@@ -145,6 +139,7 @@ class Histograms(NamedTuple):
     share: np.ndarray  # (N_SHARE + 2,): changes of slope of the other fraction's distribution
     used: np.ndarray  # int64 (nG + nA + 1, 2): first and last bin in use
     origin: np.ndarray  # (3,): log10 of s, power and mixed quantity in the middle bins
+    work: np.ndarray  # (5, N_BINS + KERNEL_SIZE), scratch, the last row zeros
 
 
 class Draws(NamedTuple):

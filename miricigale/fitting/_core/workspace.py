@@ -6,7 +6,7 @@ import numpy as np
 from scipy.special import log_ndtr
 
 from miricigale.fitting._core import structs as at
-from miricigale.fitting._core.histogram import N_BINS, N_SHARE, clear_rows
+from miricigale.fitting._core.histogram import KERNEL_SIZE, N_BINS, N_SHARE, clear_rows
 from miricigale.fitting._core.limits import LIMITED_SIZE
 from miricigale.fitting._core.mixture import Few
 from miricigale.fitting._core.pairs import GROUP, ROWS
@@ -43,7 +43,7 @@ def make_sums(n_z, n_galaxy, n_agn, n_frac, n_bands, n_draws=0, joint=()):
         total=(7,),
         **{name: (size[name[0]], size[name[1]]) if name in joint else (0, 0) for name in JOINT},
     )
-    _, hist = _cut(table=(rows, N_BINS), share=(N_SHARE + 2,))
+    _, hist = _cut(table=(rows, N_BINS), share=(N_SHARE + 2,), work=(5, N_BINS + KERNEL_SIZE))
     return Sums(
         flat=flat,
         joint=Joint(**{name: parts.pop(name) for name in JOINT}),
@@ -51,7 +51,9 @@ def make_sums(n_z, n_galaxy, n_agn, n_frac, n_bands, n_draws=0, joint=()):
         best=np.zeros(3),
         index=np.full(4, -1),
         hist=Histograms(
-            **hist, used=np.tile(np.array([[N_BINS, -1]]), (rows, 1)), origin=np.zeros(3)
+            **hist,
+            used=np.tile(np.array([[N_BINS, -1]]), (rows, 1)),
+            origin=np.zeros(3),
         ),
         draws=Draws(
             next=np.zeros(n_draws),
@@ -133,39 +135,27 @@ def clear(sums):
     clear_rows(hist.table, hist.used)
 
 
-def make_target(flux, sigma, log_prior, template_error=None):
+def make_target(flux, sigma, log_prior, template_error):
     """Bundle the data of one object; ``template_error`` is a part of the flux, shape (nz, nb)."""
-    n_z, bands = len(log_prior), np.flatnonzero(np.isfinite(sigma))
-    level = np.zeros(n_z)
-    if template_error is None:
-        weight = 1.0 / np.square(sigma)
-        norm = np.full(n_z, np.sum(weight * flux * flux))
-        weight = np.tile(weight, (n_z, 1))
-    else:
-        more = np.square(template_error * flux)
-        weight = 1.0 / (np.square(sigma) + more)
-        norm = np.sum(weight * flux * flux, axis=1)
-        level = -norm - np.log1p(more / np.square(sigma)).sum(axis=1)
-    return _bundle(flux, weight, norm, level, log_prior, bands)
+    square, more = np.square(sigma), np.square(template_error * flux)
+    level = -np.log1p(more / square).sum(axis=1)
+    bands = np.flatnonzero(np.isfinite(sigma))
+    return weighed(flux, 1.0 / (square + more), level, log_prior, bands)
 
 
 def weighed(flux, weight, level, log_prior, bands):
     """Bundle data with weights of their own, shape (nz, nb); ``level`` is added to -chi2 at each redshift."""
-    norm = np.sum(weight * flux * flux, axis=1)
-    return _bundle(flux, weight, norm, level - norm, log_prior, bands)
-
-
-def _bundle(flux, weight, norm, level, log_prior, bands):
     # C order, also of several redshifts: kernels are compiled once
-    used = np.take(weight, bands, axis=1)
+    used, norm = np.take(weight, bands, axis=1), np.sum(weight * flux * flux, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         root32 = np.sqrt(used / used.max(axis=1, keepdims=True, initial=0.0)).astype(np.float32)
         data32 = (flux[bands] * np.sqrt(used / norm[:, None])).astype(np.float32)
+    level = level - norm
+    top = level.max()
     # at most 0: errors that are the same at all redshifts change nothing
-    top = -level.max() if np.any(level) else float(norm[0])
-    level -= level.max()
+    level -= top
     log_prior = np.where(log_prior > -1e200, log_prior + level, -1e300)
-    return Target(flux, weight, log_prior, bands, root32, data32, norm, level, float(top))
+    return Target(flux, weight, log_prior, bands, root32, data32, norm, level, -float(top))
 
 
 def make_limits(limit, inverse, wrong=None):

@@ -94,8 +94,7 @@ def sample_stamps(coefficients, which, amplitude, center, poly, box, start, out)
     h, w = coefficients.shape[1], coefficients.shape[2]
     width = 0
     for k in range(box.shape[0]):
-        if box[k, 3] > width:
-            width = box[k, 3]
+        width = max(width, box[k, 3])
     fx, fy = np.empty(width), np.empty(width)
     ix, iy = np.empty(width, np.int64), np.empty(width, np.int64)
     wx, wy = np.empty((6, width)), np.empty((6, width))

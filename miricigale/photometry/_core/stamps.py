@@ -184,8 +184,7 @@ def residual_statistics(values, box, start, residual, inverse_sigma, out):
     for k in range(box.shape[0]):
         peak = 0.0
         for n in range(start[k], start[k + 1]):
-            if values[n] > peak:
-                peak = values[n]
+            peak = max(peak, values[n])
         n = start[k]
         square = 0.0
         weight = 0.0

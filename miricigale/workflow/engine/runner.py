@@ -283,9 +283,8 @@ class StudyRunner:
         again = [key for key, state in states.items() if state in ("changed", "surplus")]
         if again:
             reasons.append(
-                f"{self.folder} holds {len(again)} finished steps of another run "
-                f"({self._differences(store)}), which would be done again or removed: "
-                f"{_summary(again)}"
+                f"{self.folder} holds {len(again)} finished steps of another run ({self._differences(store)}), "
+                f"which would be done again or removed: {_summary(again)}"
             )
         if reasons:
             raise OtherResultsError("; ".join(reasons), _REMEDY)
@@ -317,8 +316,7 @@ class StudyRunner:
             if old and old.get(section, {}).get(key) != value
         ]
         return "; ".join(changes) or (
-            "by another version of the package, its data or the catalog, or before a redo that was "
-            "stopped"
+            "by another version of the package, its data or the catalog, or before a redo that was stopped"
         )
 
     def _write_config(self, store):

@@ -185,9 +185,8 @@ def library_fluxes(model, parameters, bands):
     lacking = np.count_nonzero(light["flags"] & int(sed.ModelFlags.NOT_IN_LIBRARY))
     if lacking:
         msg = (
-            f"{lacking} of {len(light)} sources have parameters that the "
-            f"registered libraries lack ({'; '.join(model.meta['libraries'])}): register whole "
-            "libraries with 'miricigale data add', or remove these"
+            f"{lacking} of {len(light)} sources have parameters that the registered libraries lack ("
+            f"{'; '.join(model.meta['libraries'])}): register whole ones (miricigale data add), or remove these"
         )
         raise DataError(msg)
     return light
