@@ -253,27 +253,28 @@ def _save_part(folder, name, results):
 def _seen_ids(folder):
     """Function of ids: which of them there were in earlier calls, for they are kept on disk."""
     path = folder.folder.absolute() / f"{PARTIAL}ids"
-    # the folder is locked, and its file system may know no locks of parts of files
-    known = sqlite3.connect(f"{path.as_uri()}?nolock=1", uri=True, isolation_level=None)
-
-    def seen(ids):
-        keys = [(_key(value),) for value in ids.tolist()]
-        rows = [known.execute("SELECT 1 FROM seen WHERE id = ?", key).fetchone() for key in keys]
-        known.executemany("INSERT OR IGNORE INTO seen VALUES (?)", keys)
-        return np.array([row is not None for row in rows], dtype=bool)
-
     try:
-        # nothing is read by a later process; 64 MB of them are in memory
-        for what in ("journal_mode = OFF", "synchronous = OFF", "cache_size = -64000"):
-            known.execute(f"PRAGMA {what}")
-        known.execute("BEGIN")
-        known.execute("CREATE TABLE seen (id PRIMARY KEY) WITHOUT ROWID")
-        yield seen
+        # the folder is locked, and its file system may know no locks of parts of files
+        place = f"{path.as_uri()}?nolock=1"
+        with contextlib.closing(sqlite3.connect(place, uri=True, isolation_level=None)) as known:
+
+            def seen(ids):
+                keys = [(_key(value),) for value in ids.tolist()]
+                select = "SELECT 1 FROM seen WHERE id = ?"
+                rows = [known.execute(select, key).fetchone() for key in keys]
+                known.executemany("INSERT OR IGNORE INTO seen VALUES (?)", keys)
+                return np.array([row is not None for row in rows], dtype=bool)
+
+            # nothing is read by a later process; 64 MB of them are in memory
+            for what in ("journal_mode = OFF", "synchronous = OFF", "cache_size = -64000"):
+                known.execute(f"PRAGMA {what}")
+            known.execute("BEGIN")
+            known.execute("CREATE TABLE seen (id PRIMARY KEY) WITHOUT ROWID")
+            yield seen
     except sqlite3.Error as err:
         msg = f"{path} could not be written: {err}"
         raise OSError(msg) from err
     finally:
-        known.close()
         path.unlink(missing_ok=True)
 
 
