@@ -82,9 +82,10 @@ def on_workers(folder, n, chunk_rows, few, kind, n_workers):
     import distributed
 
     fitter = fitter_of(few)
+    grid = fitter.backend.grid
     path, out = folder / f"catalog.{kind}", folder / "out"
-    write_catalog(path, fitter.backend.grid, n)
-    print(f"{fitter.backend.grid!r}; {n} rows, {path.stat().st_size / 1e6:.0f} MB", flush=True)
+    write_catalog(path, grid, n)
+    print(f"{grid!r}; {n} rows, {path.stat().st_size / 1e6:.0f} MB", flush=True)
     options = {"n_workers": n_workers, "threads_per_worker": 1, "dashboard_address": ":0"}
     n_parts = -(-n // chunk_rows)
     with (
@@ -106,7 +107,7 @@ def on_workers(folder, n, chunk_rows, few, kind, n_workers):
         fitted = time.time() - start
     spent = sum(os.times()[:4]) - sum(cpu[:4])
     size = sum(one.stat().st_size for one in results.paths)
-    loop = fit.loop_time(fitter.backend.grid, fitter.backend.grid.n_allowed, len(fitter.bands))
+    loop = fit.loop_time(grid, grid.n_allowed, len(grid.filters))
     print(
         f"{len(results)} fitted in {fitted:.0f} s, {size / 1e9:.1f} GB, {peak():.0f} MB of the driver's memory"
     )

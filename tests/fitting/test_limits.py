@@ -161,8 +161,6 @@ def test_pruning_loses_no_more_than_asked(noise):
 
 def test_one_model_has_the_posterior_of_the_text_book():
     """Detection 10 +- 1, limit 8 +- 0.5 on twice as bright a band: the minimum by scipy."""
-    from scipy.optimize import minimize_scalar
-
     grid = make_grid(n_z=1, n_tau=1, n_age=1, frac=[0.0], n_b=2)
     one, two = grid.galaxy[0, 0]
     mass = 1e10

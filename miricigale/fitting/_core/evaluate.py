@@ -203,6 +203,7 @@ def _begin(tables, target, limits, pairs, lanes, sums, delta, scale_error):
     """
     project(tables, target, pairs)
     order, promise = pairs.order, pairs.promise
+    # sorted by insertion: numba's argsort takes memory, which these kernels are compiled without
     for z in range(order.size):
         i = z
         while i > 0 and promise[order[i - 1]] < promise[z]:
