@@ -74,6 +74,8 @@ def pattern(node, names):
         given = [pattern(one, names) for one in node.args]
         if node.func.id == "argument_error" and len(given) == 3:
             return f"'{given[0]}' must be {given[1]}, got {given[2]}"
+        if node.func.id == "check_that" and len(given) == 4:
+            return f"'{given[1]}' must be {given[2]}, got {given[3]}"
         if node.func.id in ("data_error", "config_error") and len(given) == 2:
             return " ".join(given)
         if node.func.id == "unknown_name" and len(given) == 3:

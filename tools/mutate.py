@@ -62,8 +62,8 @@ TARGETS = {
     "psf/resample.py": "psf/test_resample",
     "psf/optics.py": "test_constants psf/test_optics",
     "profiles/_core.py": "profiles",
-    "photometry/_core/*.py": "photometry/test_stamps photometry/test_core photometry/test_forced "
-    "photometry/test_shapes",
+    "photometry/_core/*.py": "photometry/test_stamps photometry/test_core photometry/test_offsets "
+    "photometry/test_forced photometry/test_shapes",
     "photometry/template_fit.py": "photometry/test_core photometry/test_forced",
     "photometry/error_model.py": "photometry/test_error_model photometry/test_errors",
     "photometry/error_curves.py": "photometry/test_errors",

@@ -44,7 +44,7 @@ def write_cigale_results(results, path, *, variables=None, overwrite=False):
     Notes
     -----
     Bands have the names of ``results.meta["cigale"]``, or CIGALE's present ones, and ours where there is none;
-    ``left out``, ``replaced`` and ``differs`` of ``results.meta["cigale"]`` (`CigaleSetup.describe`) and the
+    ``left_out``, ``replaced`` and ``differs`` of ``results.meta["cigale"]`` (`CigaleSetup.describe`) and the
     meaning of the flags stand as comments in the header, or in lines with ``#`` above a text table.
 
     The columns are ``id``; ``flags`` (`~miricigale.fitting.FitFlags`); ``bayes.X`` and ``bayes.X_err``,

@@ -40,11 +40,11 @@ def _references(args):
 
     given = {k: _number(v) for k, v in chosen(args, _FILES).items() if v is not None}
     ways = [bool(given), args.crds is not None, args.references is not None]
-    if sum(ways) > 1:
-        msg = "wanted are files of references, --crds or --references, only one of these"
+    if sum(ways) > 1 or (args.context and args.crds is None):
+        msg = "wanted are files of references, --crds (with --context) or --references, only one of these"
         raise ValueError(msg)
     if args.crds is not None:
-        return ReferenceCache(args.crds, args.context)
+        return ReferenceCache(args.crds, args.context, incomplete=args.incomplete)
     return ReferenceFiles(**given, incomplete=args.incomplete) if given else args.references
 
 

@@ -348,8 +348,8 @@ class Filter(Frozen, Interactive):
         Returns
         -------
         weights : `~numpy.ndarray`, shape (n,)
-            Sum 1. ``weights @ fnu`` is the photon-counting mean, exact for F_nu
-            that is linear in wavelength between the points.
+            Sum 1, or all 0 for a band that lies wholly outside (with ``tolerance=1``). ``weights @ fnu`` is the
+            photon-counting mean, exact for F_nu that is linear in wavelength between the points.
 
         Raises
         ------

@@ -28,9 +28,9 @@ def compare_classes(results, *, prior=None):
     Returns
     -------
     table : `~astropy.table.QTable`
-        ``id``; ``class``, the one of the highest probability; ``probability_<class>``; ``log_ratio_<class>``,
-        ln of the evidence over that of the first class; ``reduced_chi2_<class>`` of the best models. An object
-        that was not fitted with all classes has the class ``""`` and NaN.
+        ``id``; ``class``, the one of the highest probability; ``probability_<class>``; and of each class but the
+        first ``log_ratio_<class>``, ln of its evidence over that of the first, and ``reduced_chi2_<class>`` of its
+        best models. An object that was not fitted with all classes has the class ``""`` and NaN.
 
     Raises
     ------

@@ -120,7 +120,7 @@ def fit_catalog(
     bands = [name for name in names if is_filter(name) and error_column(name) in names]
     if not bands:
         wanted = "columns <filter> and <filter>_err ('miricigale filters' lists the names)"
-        raise argument_error("photometry", f"a table with {wanted}", f"columns {list(names)}")
+        raise argument_error("path", f"a table with {wanted}", f"columns {list(names)}")
     # heavy imports only after the file was checked
     from miricigale.fitting import BayesFitter, GridSettings, SurveyCalibration, fit_file
     from miricigale.sed import SEDModel

@@ -48,7 +48,8 @@ class FitFlags(Flags):
     FEW_BANDS = 2
     #: A flux whose error is zero, negative, not finite or beyond 1e-60 to 1e60 uJy; the band is left out.
     BAD_ERROR = 4
-    #: A fixed redshift was asked for and is missing, not finite or not positive.
+    #: A fixed redshift was asked for and is missing, not finite or not positive; or the density of
+    #: ``redshift_prior`` is missing, not finite or 0 throughout.
     NO_REDSHIFT = 8
     #: The fixed redshift has no redshift of the grid within the tolerance.
     REDSHIFT_OUTSIDE = 16

@@ -46,7 +46,7 @@ class DetectorProperties:
     cosmic_ray_flux : float
         Hits per um2 per second.
     adc_bits : int
-        Bits of the converter.
+        Bits of the converter, for the record: `~miricigale.detector.ADConversion` has 16.
     response : tuple of (str, str, float)
         Count rate of light over that of `photmjsr`, by filter and sub-array, as
         `~miricigale.reduction.imager_response` gives it for a day; 1 if there are no rows.
@@ -54,8 +54,8 @@ class DetectorProperties:
     Raises
     ------
     ValueError
-        If a figure is not positive, or the non-linearity polynomial does not rise up to the
-        full well.
+        If gain, full well, pixel pitch or bits are not positive, another figure is negative, or the non-linearity
+        polynomial does not rise up to the full well.
 
     Examples
     --------

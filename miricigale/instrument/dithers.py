@@ -73,8 +73,8 @@ def dither_offsets(pattern, n=None, *, start=0):
     Parameters
     ----------
     pattern : str, path-like, `~astropy.units.Quantity` or `~astropy.table.Table`
-        ``"ceers"`` (3 points within 2.6" of the center, or 6 within 5"), ``"4-point"`` (a box
-        of 2" by 3" with half-pixel phases), ``"cycling-small"``, ``"cycling-medium"`` or
+        ``"ceers"`` (3 points within 3.1" of the center, or 6 within 5"), ``"4-point"`` (a box
+        of 2.2" by 3.4" with half-pixel phases), ``"cycling-small"``, ``"cycling-medium"`` or
         ``"cycling-large"`` (311 points within 1.2", 7" or 14", Gaussian, half-pixel phases in
         turn of four), ``"none"``; or offsets: of shape (m, 2), a table with ``x_offset`` and
         ``y_offset``, or the `~pathlib.Path` of a file for `read_dithers`.

@@ -38,7 +38,6 @@ class FitArrays:
     inverse_sigma: np.ndarray  # (ny, nx): Inverse of the noise, zero where not usable.
     #: As for `ImageArrays`.
     usable: np.ndarray
-    area: np.ndarray
     wcs: object
     measured_noise: bool  # Whether the noise was measured on the image for want of an uncertainty.
     noise_correction: float = 1.0  # As the image states it (`ImageFacts`).
@@ -47,15 +46,20 @@ class FitArrays:
         """A new image of zeros."""
         return np.zeros(self.usable.shape, dtype)
 
+    @property
+    def area(self):
+        """As for `ImageArrays`; made anew each time."""
+        return _areas(self.wcs, self.usable.shape, np.float32)
+
     def whitened(self, image):
         """An image over the noise, zero where not usable."""
         return np.multiply(image, self.inverse_sigma, out=self.new())
 
-    @property
-    def sigma(self):
-        """The noise, infinite where not usable."""
-        with np.errstate(divide="ignore"):
-            return np.divide(np.float32(1), self.inverse_sigma, out=self.new())
+
+def _areas(wcs, shape, dtype):
+    area = pixel_area_map(wcs, shape, out=np.empty(shape, dtype))
+    area *= _MICRO
+    return area
 
 
 def image_arrays(image, name, dtype=float):
@@ -91,11 +95,11 @@ def image_arrays(image, name, dtype=float):
         If areas that are exactly 0 are taken as without data.
     """
     *given, usable = _checked(image, name)
-    area = pixel_area_map(image.wcs, usable.shape, out=np.empty(usable.shape, dtype))
-    area *= _MICRO
+    area = _areas(image.wcs, usable.shape, dtype)
     # in place, for images can be large
     flux, sigma = (np.multiply(*one, dtype=dtype, casting="same_kind") for one in given)
-    if not _per_pixel(image):
+    # a surface brightness, and not the flux in each pixel
+    if not image.unit.is_equivalent(FNU):
         flux *= area
         sigma *= area
     flux[~usable], sigma[~usable] = 0.0, np.inf
@@ -107,12 +111,7 @@ def fit_arrays(image, name):
     one = image_arrays(image, name, np.float32)
     inverse = np.divide(np.float32(1), one.sigma, out=one.sigma)
     facts = image.uncertainty is None, ImageFacts.of(image).noise_correction
-    return FitArrays(one.flux, inverse, one.usable, one.area, one.wcs, *facts)
-
-
-def _per_pixel(image):
-    """Whether an image has a flux in each pixel, and no surface brightness."""
-    return image.unit.is_equivalent(FNU)
+    return FitArrays(one.flux, inverse, one.usable, one.wcs, *facts)
 
 
 def _checked(image, name):
@@ -124,7 +123,7 @@ def _checked(image, name):
     check_that(data.ndim == 2, name, "a two-dimensional image", f"shape {data.shape}")
     if image.wcs is None or not image.wcs.has_celestial:
         raise argument_error(name, "an image with a celestial WCS", "one without")
-    unit = FNU if _per_pixel(image) else SURFACE_BRIGHTNESS
+    unit = FNU if image.unit.is_equivalent(FNU) else SURFACE_BRIGHTNESS
     factor = float(to_array(1 * image.unit, unit, name))
     usable = np.isfinite(data)
     if image.mask is not None:

@@ -52,34 +52,23 @@ def noise_correlation(residual, usable, weight, *, executor=None):
     if np.count_nonzero(usable) < 100:
         raise argument_error("usable", "100 pixels or more", np.count_nonzero(usable))
 
-    def rows(part):
-        return residual[part] * weight[part]
-
-    # some millions of pixels are enough for the median and the spread
+    # some millions of pixels are enough for the mean and the spread
     every = np.s_[:: max(1, np.count_nonzero(usable) // _SOME)]
-    some, inverse, where = (
-        np.ascontiguousarray(one).reshape(-1)[every] for one in (residual, weight, usable)
-    )
+    some, inverse, where = (one.reshape(-1)[every] for one in (residual, weight, usable))
     some = (some * inverse)[where]
-    middle = np.median(some)
-    spread = mad_std(some)
-    kept = np.empty(usable.shape, bool)
+    middle, far = np.median(some), _CLIP * mad_std(some)
+    level = residual.dtype.type(some[np.abs(some - middle) <= far].mean(dtype=float))
 
-    def clipped(part):
-        z = rows(part)
-        kept[part] = usable[part] & (np.abs(z - middle) <= _CLIP * spread)
-        return z[kept[part]].sum(dtype=float)
+    def rows(part):
+        z = residual[part] * weight[part]
+        return z - level, usable[part] & (np.abs(z - middle) <= far)
 
-    parts = list(chunks(len(residual), 256))
-    level = sum(parallel_map(clipped, parts, executor=executor)) / np.count_nonzero(kept)
-    level = residual.dtype.type(level)
     lag = min(_MAX_LAG, (min(residual.shape) - 1) // 2)
-    covariance, error = autocorrelation(
-        lambda part: rows(part) - level,
-        kept,
-        lag,
-        functools.partial(parallel_map, executor=executor),
-    )
+    strips = [one for one in chunks(len(usable), 256) if usable[one].any()]
+    # those of tens of millions of pixels are enough
+    strips = strips[:: 1 + np.count_nonzero(usable) // 20_000_000]
+    in_threads = functools.partial(parallel_map, executor=executor)
+    covariance, error = autocorrelation(rows, strips, lag, in_threads)
     if not covariance[lag, lag] > 0:
         return np.zeros((1, 1))
     index = np.arange(-lag, lag + 1)

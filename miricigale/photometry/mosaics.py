@@ -139,8 +139,8 @@ class MosaicFile:
     error, variance, inverse_variance, weight : path-like, optional
         File with a map of the noise, on the pixels of the image; at most one. Errors and variances
         are in the unit of the image and its square, or in that of their own ``BUNIT``, and are taken
-        as they are, as inverse variances are. The scale of weights is measured on the sky. By
-        default the extensions ERR (an error) or WHT (a weight) of the image's own file.
+        as they are, as inverse variances are. The scale of weights is measured on the sky. By default the first
+        extension of the image's own file among ERR, RMS and UNCERT (errors), VAR, IVAR, WHT and WEIGHT.
     background_box : int, optional
         If given, a background is measured in boxes of so many pixels and subtracted.
     psf : path-like, optional

@@ -6,10 +6,12 @@ import numpy as np
 import scipy.optimize
 from astropy.table import QTable
 
+from miricigale.photometry._core.stamps import offset_sums
 from miricigale.photometry.fields import SmoothField, legendre_terms, n_terms
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.template_fit import TemplateFit
 from miricigale.utils.exceptions import PhotometryWarning, warn
+from miricigale.utils.parallel import chunks
 from miricigale.utils.units import ANGLE
 
 #: Least signal-to-noise of sources whose offsets are measured, largest light of others relative to
@@ -131,39 +133,30 @@ def source_offsets(fit, residual, model, rows):
     two full widths at half maximum of the PSF. Derivatives are differences of neighboring pixels:
     steps are right to some tens of percent, so that they must be repeated.
     """
-    step = np.full((len(rows), 2), np.nan)
-    error, others = np.full(len(rows), np.nan), np.full(len(rows), np.nan)
+    out = np.empty((len(rows), 18))
     half = max(3, int(np.ceil(2 * 2.3548 * fit.psf_width)))
     at = np.rint(fit.bank.xy[rows]).astype(int)
     for block in fit.bank.blocks():
-        for k in range(*np.searchsorted(rows, [block.first, block.last])):
-            one = rows[k] - block.first
-            y0, x0, ny, nx = block.box[one]
-            place = tuple(
-                slice(max(c - half, low), max(min(c + half + 1, low + size), low))
-                for c, low, size in zip(at[k, ::-1], (y0, x0), (ny, nx), strict=True)
-            )
-            stamp = block.values[block.start[one] : block.start[one + 1]].reshape(ny, nx)
-            stamp = stamp[place[0].start - y0 : place[0].stop - y0]
-            stamp = stamp[:, place[1].start - x0 : place[1].stop - x0]
-            light = fit.flux[rows[k]] * stamp.astype(float)
-            if min(light.shape) < 5:
-                continue
-            dy, dx = np.gradient(light)
-            weight = fit.inverse_sigma[place]
-            columns = np.stack([(c * weight).ravel() for c in (light, -dx, -dy)], axis=1)
-            data = (residual[place] * weight).ravel()
-            found, _, rank, _ = np.linalg.lstsq(columns, data)
-            if rank < 3:
-                continue
-            step[k] = found[1:]
-            left = data - columns @ found
-            variance = np.linalg.inv(columns.T @ columns).diagonal()[1:].mean()
-            error[k] = np.sqrt(variance * left @ left / max(np.count_nonzero(weight) - 3, 1))
-            own = columns[:, 0] @ columns[:, 0]
-            rest = ((model[place] - light) * weight).ravel()
-            others[k] = np.abs(rest) @ np.abs(columns[:, 0]) / own
-    return step, error, others
+        low, high = np.searchsorted(rows, [block.first, block.last])
+
+        def measure(part, block=block, low=low):
+            part = slice(low + part.start, low + part.stop)
+            own = rows[part] - block.first
+            light = block.values, block.box[own], block.start[own], fit.flux[rows[part]]
+            offset_sums(*light, at[part], half, model, residual, fit.inverse_sigma, out[part])
+
+        fit.bank.map(measure, chunks(high - low, 256))
+    products, (rest, seen) = out[:, :16].reshape(-1, 4, 4), out[:, 16:].T
+    scale = np.sqrt(products.diagonal(axis1=1, axis2=2))[:, :3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        normal = products[:, :3, :3] / (scale[:, :, None] * scale[:, None])
+        normal[~(np.linalg.det(normal) > 1e-12)] = np.nan
+        inverse, found = np.linalg.inv(normal), products[:, :3, 3] / scale
+        step = np.einsum("kij,kj->ki", inverse, found)
+        left = np.maximum(products[:, 3, 3] - np.sum(step * found, axis=1), 0)
+        variance = np.mean((inverse.diagonal(axis1=1, axis2=2) / scale**2)[:, 1:], axis=1)
+        error = np.sqrt(variance * left / np.maximum(seen - 3, 1))
+        return (step / scale)[:, 1:], error, rest / scale[:, 0] ** 2
 
 
 def fit_offsets(arrays, bank, settings, catalog):

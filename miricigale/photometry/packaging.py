@@ -236,12 +236,13 @@ def _common(fit, covariance):
 def _images(fit, diagnostics, meta):
     arrays = fit.arrays
     # images can be large: what the fit needs no longer becomes the result
-    model, residual, sigma = diagnostics.model, diagnostics.residual, arrays.sigma
+    model, residual, inverse = diagnostics.model, diagnostics.residual, arrays.inverse_sigma
     fit.add_background(model)
-    for image in (model, residual, sigma):
-        image /= arrays.area
-    for image in (residual, sigma):
+    for image in (residual, inverse):
         image[~arrays.usable] = np.nan
+    sigma, area = np.divide(1, inverse, out=inverse), arrays.area
+    for image in (model, residual, sigma):
+        image /= area
     options = {"unit": SURFACE_BRIGHTNESS, "wcs": arrays.wcs}
     return {
         "model_image": Image(model, meta=dict(meta), **options),

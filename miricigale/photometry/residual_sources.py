@@ -114,24 +114,21 @@ def _matched(fit, residual):
     """Signal-to-noise and power of point sources at all pixels, both zero where too little of them is seen."""
     snr, power, executor = fit.arrays.new(), fit.arrays.new(), fit.bank.executor
     inverse_sigma, width = fit.inverse_sigma, fit.psf_width
-    halo = _radius(width)
+    halo, even = _radius(width), np.broadcast_to(np.float32(1), residual.shape)
 
-    def strip(part):
+    def filtered(part, width, image):
         rows = slice(max(part.start - halo, 0), part.stop + halo)
-        return rows, slice(part.start - rows.start, part.stop - rows.start)
+        light = inverse_sigma[rows] ** 2 * image[rows]
+        light = scipy.ndimage.gaussian_filter(light, width, mode="constant")
+        return light[part.start - rows.start :][: part.stop - part.start]
 
     def fill_power(part):
-        rows, inner = strip(part)
-        square = inverse_sigma[rows] ** 2
-        square = scipy.ndimage.gaussian_filter(square, width / np.sqrt(2), mode="constant")[inner]
-        power[part] = square / (4 * np.pi * width**2)
+        power[part] = filtered(part, width / np.sqrt(2), even) / (4 * np.pi * width**2)
 
     def fill_snr(part):
-        rows, inner = strip(part)
         power[part][power[part] <= limit] = 0.0
-        light = residual[rows] * inverse_sigma[rows] ** 2
-        light = scipy.ndimage.gaussian_filter(light, width, mode="constant")[inner]
-        np.divide(light, np.sqrt(power[part]), out=snr[part], where=power[part] > 0)
+        light, root = filtered(part, width, residual), np.sqrt(power[part])
+        np.divide(light, root, out=snr[part], where=root > 0)
 
     parts = list(chunks(len(residual), _ROWS))
     parallel_map(fill_power, parts, executor=executor)

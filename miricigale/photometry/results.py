@@ -264,7 +264,8 @@ class ForcedPhotometryResult(Tabular):
         Returns
         -------
         flux : `~astropy.units.Quantity`, shape (size, n)
-            NaN where not measured. Draws hold what ``covariance`` holds, the noise of the image.
+            NaN where not measured. Draws hold all that ``covariance`` holds: the noise of the image, and the
+            errors of the templates and of the PSF.
 
         Raises
         ------

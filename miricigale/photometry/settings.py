@@ -29,7 +29,7 @@ class ErrorSettings:
     Raises
     ------
     ValueError
-        If a fraction is not from 0 to 1.
+        If a fraction is not at least 0 and below 1.
 
     Examples
     --------
@@ -45,7 +45,7 @@ class ErrorSettings:
     def __post_init__(self):
         for name in ("size_scatter", "psf_error"):
             value = getattr(self, name)
-            check_that(value is None or 0 <= value < 1, name, "from 0 to 1", value)
+            check_that(value is None or 0 <= value < 1, name, "at least 0 and below 1", value)
 
 
 @dataclasses.dataclass(frozen=True)

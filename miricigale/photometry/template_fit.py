@@ -10,7 +10,6 @@ from miricigale.photometry.fields import legendre_terms
 from miricigale.photometry.free_templates import free_templates
 from miricigale.photometry.shapes import not_fitted
 from miricigale.utils.exceptions import PhotometryWarning, warn
-from miricigale.utils.parallel import chunks
 from miricigale.utils.units import ANGLE
 
 #: Squared cosine between two components from which their sum alone is measured: errors of each are then
@@ -224,8 +223,7 @@ class TemplateFit:
         if self.fit is None:
             return
         for column, value in zip(self._background, self.common, strict=False):
-            for part in chunks(len(image), 256):
-                image[part] += np.float32(factor * value) * column[part]
+            image += np.float32(factor * value) * column
 
     def model(self):
         """The sources' model in uJy per pixel, without background."""

@@ -29,7 +29,7 @@ def _instrument(filter_name):
     return instrument
 
 
-def stpsf_grid(filter, *, n_psfs=1, oversampling=4, fov=10.0 * ANGLE):
+def stpsf_grid(filter, *, n_psfs=1, oversampling=4, fov=10.0 * ANGLE, position=None):
     """
     PSFs of the MIRI imager over the field, from stpsf.
 
@@ -38,11 +38,13 @@ def stpsf_grid(filter, *, n_psfs=1, oversampling=4, fov=10.0 * ANGLE):
     filter : str
         Such as ``"miri.f770w"``.
     n_psfs : int, optional
-        A square number of positions; 1 for the middle of the detector.
+        A square number of positions.
     oversampling : int, optional
         Cells per pixel.
     fov : `~astropy.units.Quantity`, optional
         Width of the grids.
+    position : (float, float), optional
+        Of a single PSF on the detector; the middle by default. Grids of more are even.
 
     Returns
     -------
@@ -68,6 +70,8 @@ def stpsf_grid(filter, *, n_psfs=1, oversampling=4, fov=10.0 * ANGLE):
     """
     check_that(round(n_psfs**0.5) ** 2 == n_psfs, "n_psfs", "a square number", n_psfs)
     instrument = _instrument(filter)
+    if position is not None:
+        instrument.detector_position = position
     pixels = to_array(fov, ANGLE, "fov") / MIRI_PIXEL_SCALE.value
     grid = instrument.psf_grid(
         num_psfs=int(n_psfs),
@@ -76,20 +80,17 @@ def stpsf_grid(filter, *, n_psfs=1, oversampling=4, fov=10.0 * ANGLE):
         fov_pixels=2 * int(np.ceil(pixels / 2)) + 1,
         nlambda=9,
         verbose=False,
+        single_psf_centered=position is None,
     )
-    psfs = [
-        InstrumentPSF(
-            np.asarray(data),
-            pixel_scale=MIRI_PIXEL_SCALE,
-            frame="detector",
-            oversampling=int(oversampling),
-            includes=EFFECTS,
-            filter=f"miri.{str(filter).removeprefix('miri.').lower()}",
-            total_known=True,
-            meta={"instrument": "MIRI", "source": "stpsf"},
-        )
-        for data in grid.data
-    ]
+    name = f"miri.{str(filter).removeprefix('miri.').lower()}"
+    facts = {
+        "pixel_scale": MIRI_PIXEL_SCALE,
+        "frame": "detector",
+        "oversampling": int(oversampling),
+    }
+    facts |= {"includes": EFFECTS, "filter": name, "total_known": True}
+    facts["meta"] = {"instrument": "MIRI", "source": "stpsf"}
+    psfs = [InstrumentPSF(np.asarray(data), **facts) for data in grid.data]
     return PSFGrid(psfs, grid.grid_xypos)
 
 
@@ -104,7 +105,7 @@ def stpsf_psf(filter, *, x=515.0, y=511.0, **options):
     x, y : float, optional
         Position on the detector.
     **options
-        Those of `stpsf_grid`.
+        Those of `stpsf_grid`. With ``n_psfs`` of 4 or more it is interpolated in the grid.
 
     Returns
     -------
@@ -117,5 +118,5 @@ def stpsf_psf(filter, *, x=515.0, y=511.0, **options):
     >>> from miricigale.psf import stpsf_psf
     >>> psf = stpsf_psf("miri.f770w", x=200, y=800)  # doctest: +SKIP
     """
-    grid = stpsf_grid(filter, **options)
+    grid = stpsf_grid(filter, position=(x, y), **options)
     return psf_at(grid, x, y)

@@ -111,8 +111,8 @@ def checked_psf(
     Returns
     -------
     psf : `~photutils.psf.ImagePSF`
-        The same, or with data of another sum: a PSF whose sum is not within 0.05 of what the model
-        has on this grid, or is 1, is taken to hold what the model does.
+        The same, or with data of another sum: unless it is ``total_known``, a PSF whose sum is not within 0.05 of
+        what the model has on this grid, or is 0.995 or more, is taken to hold what the model does.
 
     Raises
     ------

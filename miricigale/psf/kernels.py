@@ -407,7 +407,7 @@ class MatchingKernel(Interactive):
         Parameters
         ----------
         radii : `~astropy.units.Quantity`, optional
-            By default every pixel from 1 to the edge.
+            By default every half pixel from 1 to the edge.
 
         Returns
         -------

@@ -118,8 +118,8 @@ def estimate_background(image, *, method="masked", box=64, filter_size=3, plane=
     image : `~astropy.nddata.CCDData`
         Any unit.
     method : {"masked", "sep", "none"}, optional
-        ``"sep"`` is the plain mesh of sep, as in Yang et al. 2021 with boxes of 32 pixels and a filter of 3:
-        sources are only clipped, and the other options have no meaning; ``"none"`` is a level of 0.
+        ``"sep"`` is the plain mesh of sep, as in Yang et al. 2021 with ``box=32`` and ``filter_size=3``: sources
+        are only clipped, and ``plane`` has no meaning; ``"none"`` is a level of 0.
     box, filter_size : int, optional
         Size of the boxes in pixels, and of the median filter in boxes.
     plane : bool, optional

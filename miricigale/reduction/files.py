@@ -64,7 +64,7 @@ class ImageFile:
         Slopes are in adu / s, also of files that say DN/s.
     planes : dict of str to `~numpy.ndarray`
         Further planes of the file that are there: ``VAR_POISSON``, ``VAR_RNOISE``, ``VAR_FLAT``,
-        ``WHT``, ``CON`` and ``BKG``.
+        ``AREA``, ``WHT``, ``CON`` and ``BKG``.
     header : `~astropy.io.fits.Header`
         Keywords of the primary header and of SCI.
 

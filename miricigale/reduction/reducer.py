@@ -141,7 +141,7 @@ class Reducer(Interactive):
         """
         Fit the ramps of an exposure, with every plane of the result.
 
-        Parameters are those of `fit_ramp`.
+        ``ramp`` and ``progress_bar`` are as for `fit_ramp`.
 
         Returns
         -------

@@ -25,6 +25,8 @@ class ReferenceCache:
     context : str, optional
         Such as ``"jwst_1364.pmap"``; that of the variable CRDS_CONTEXT, or else the last one
         in the cache, if not given.
+    incomplete : bool, optional
+        As for `ReferenceFiles`, of what is found.
 
     Raises
     ------
@@ -51,6 +53,7 @@ class ReferenceCache:
 
     folder: object = None
     context: str | None = None
+    incomplete: bool = False
 
     def __post_init__(self):
         folder = self.folder if self.folder is not None else os.environ.get("CRDS_PATH")
@@ -66,7 +69,7 @@ class ReferenceCache:
     def _mappings(self):
         return self.folder / "mappings" / "jwst"
 
-    def find(self, header, *, incomplete=False):
+    def find(self, header):
         """
         Choose the reference files of an exposure.
 
@@ -74,8 +77,6 @@ class ReferenceCache:
         ----------
         header : mapping
             Keywords of the exposure, such as `~miricigale.detector.Ramp.header`.
-        incomplete : bool, optional
-            As for `ReferenceFiles`.
 
         Returns
         -------
@@ -104,7 +105,7 @@ class ReferenceCache:
             for name, kind in kinds.items()
             if not chosen.get(kind, "NOT FOUND").startswith("NOT FOUND")
         }
-        return ReferenceFiles(**files, incomplete=incomplete, origin=self.context)
+        return ReferenceFiles(**files, incomplete=self.incomplete, origin=self.context)
 
     def _file(self, name):
         """Path of a file of the cache."""

@@ -40,12 +40,12 @@ def read_catalog(path, catalog_map=None, **options):
         Name of a resource (``"catalog.goodss"``) or a FITS, ECSV, VOTable, CSV or text file
         (CIGALE's too).
     catalog_map : `~miricigale.filters.CatalogMap`, str or path-like, optional
-        Names and units of the file, the name of a survey or a TOML file, as for
+        Names and units of the file, the name of a survey or a file (TOML, or a translate file of EAZY), as for
         `~miricigale.filters.read_catalog_photometry`. Our names are those of `CATALOG_COLUMNS`, ``ra``,
         ``dec``, ``star``, names of filters, those with ``_err`` for errors, and any other without a dot.
     **options
         As for `~miricigale.filters.CatalogMap`, in place of what it has: ``columns``, ``units``, ``survey``,
-        ``missing``, ``factor``.
+        ``missing``, ``factor``, ``limits``.
 
     Returns
     -------

@@ -44,9 +44,9 @@ class SEDModel(Interactive):
     Parameters
     ----------
     components : iterable of `~miricigale.sed.Component`
-        One of each role at most; a history (``sfh``) and populations (``stellar``) are
-        needed, ``attenuation``, ``dust``, ``agn`` and ``igm`` may be left out. They act in the order
-        of their roles, whatever the order here.
+        One of each role at most; a history (``sfh``) and populations (``stellar``) are needed, all other roles may
+        be left out, but ``dust`` needs ``attenuation`` and ``xray`` needs ``agn``. They act in the order of their
+        roles, whatever the order here.
     cosmology : `~astropy.cosmology.Cosmology`, optional
         For distances and the age of the universe.
     frac_agn_definition : {"dust", "3-1000um"} or str, optional
@@ -57,7 +57,7 @@ class SEDModel(Interactive):
     Raises
     ------
     ValueError
-        If a role is missing or there twice, or two components share a parameter name.
+        If a role that is needed is missing, one is there twice, or two components share a parameter name.
 
     Examples
     --------

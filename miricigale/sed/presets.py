@@ -108,9 +108,10 @@ def yang2021_axes(kind="fit"):
     Parameters
     ----------
     kind : {"fit", "galaxy", "quick"}
-        ``"fit"``: the grid of the fits, 560 galaxies, 60 AGN, 11 fractions, 65 redshifts;
-        ``"galaxy"``: the same without AGN; ``"quick"``: a thinner one, not the paper's, 96
-        galaxies, 9 AGN (polar dust at 100 and 300 K), 6 fractions, 33 redshifts.
+        ``"fit"``: the grid of the fits, 560 galaxies, 60 AGN (50 different ones: temperatures make no difference
+        without polar dust), 11 fractions, 65 redshifts; ``"galaxy"``: the same without AGN; ``"quick"``: a thinner
+        one, not the paper's, 96 galaxies, 12 AGN (9 different ones; polar dust at 100 and 300 K), 6 fractions, 33
+        redshifts.
 
     Returns
     -------

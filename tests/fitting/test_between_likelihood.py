@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from astropy.cosmology import FlatLambdaCDM
 from astropy.table import QTable
+from numpy.testing import assert_allclose
 from scipy.special import log_ndtr
 
 from fitting.test_between import AXES, flux
@@ -106,7 +107,7 @@ def plain_means(observed, sigma, known):
 
 
 def by_hand(observed, sigma, known, *, limit=None, part=0.0, error=None, prior=None):
-    """Means and standard deviations of redshift, tau, E(B-V) and mass of one object."""
+    """Means and standard deviations of redshift, tau, E(B-V) and mass of one object, and ln(evidence)."""
     places, nodes = zip(*(fine(values) for values in AXES.values()), strict=True)
     if known is not None:
         near = np.abs(AXES["redshift"] - known).argmin()
@@ -127,14 +128,15 @@ def by_hand(observed, sigma, known, *, limit=None, part=0.0, error=None, prior=N
     p = np.exp(log - log.max()) / np.exp(log - log.max()).sum()
     mean = np.array([p @ x for x in (z, tau, ebv, scale)])
     square = np.array([p @ x**2 for x in (z, tau, ebv, np.hypot(scale, spread))])
-    return mean, np.sqrt(np.maximum(square - mean**2, 1e-20))
+    evidence = log.max() + np.log(np.mean(np.exp(log - log.max())))
+    return mean, np.sqrt(np.maximum(square - mean**2, 1e-20)), evidence
 
 
 def of_density(stars, _):
     z = AXES["redshift"]
     edges = np.concatenate([[2 * z[0] - z[1], *z, 2 * z[-1] - z[-2]]])
     cells = 0.5 * (edges[2:] - edges[:-2])
-    volume = FlatLambdaCDM(70, 0.3).differential_comoving_volume(z).value * cells
+    volume = FlatLambdaCDM(70.4, 0.272).differential_comoving_volume(z).value * cells
     return (4.0 - 2.0 * z[:, None]) * np.log(stars / 1e10) + np.log(volume)[:, None]
 
 
@@ -181,7 +183,7 @@ def test_posteriors_are_those_of_every_model(grid, objects, case):
     for i in range(N):
         known = z[i] if fixed else None
         mine = given | ({"error": error} if "error" in given else {})
-        mean, std = (x[fixed:] for x in by_hand(observed[i], sigma[i], known, **mine))
+        mean, std = (x[fixed:] for x in by_hand(observed[i], sigma[i], known, **mine)[:2])
         plain = plain_means(tuple(observed[i]), tuple(sigma[i]), known)[fixed:]
         found = [results.mean(name).value[i] for name in names]
         far.append((found - mean) / std)
@@ -192,6 +194,40 @@ def test_posteriors_are_those_of_every_model(grid, objects, case):
     assert np.sqrt(np.mean(np.square(far))) < 0.04
     assert np.abs(wide).max() < 0.15
     assert np.abs(without).max() > 0.15
+
+
+def test_galaxies_beyond_all_masses_have_the_last_density(grid, objects):
+    """Densities end at 1e16 Msun: what is brighter has the prior of that mass, by redshift only."""
+    _, observed, sigma = (1e9 * one[:2] for one in objects)
+    settings = GridSettings(interpolate=800, rtol=0.0, mass_function=density)
+    fitter = BayesFitter(grid, model_error=0.0, settings=settings)
+    results = fitter.fit(photometry_table(BANDS, observed, sigma))
+    for i in range(2):
+        mean, std, _ = by_hand(
+            observed[i], sigma[i], None, prior=lambda s, _: of_density(np.full_like(s, 1e16), _)
+        )
+        found = [results.mean(name).value[i] for name in AXES]
+        assert np.abs((found - mean[:3]) / std[:3]).max() < 0.1
+
+
+@pytest.mark.parametrize("part", [0.0, PART])
+def test_evidence_knows_how_low_limits_are(grid, objects, part):
+    """Of light far below the errors: what limits are unlikely to be counts in the evidence."""
+    _, observed, sigma = (one[:3] for one in objects)
+    sigma = np.where(LIMIT, 20 * sigma, sigma)
+    settings = GridSettings(interpolate=800, rtol=0.0)
+    options = {"outliers": part} if part else {}
+    fitter = BayesFitter(grid, model_error=0.0, settings=settings, **options)
+    found, expected = [], []
+    for height in (0.1, 3.0):
+        data = np.where(LIMIT, height * sigma, observed)
+        table = photometry_table(BANDS, data, sigma)
+        for name in np.array(BANDS)[LIMIT]:
+            table[f"{name}_limit"] = True
+        found.append(fitter.fit(table).log_evidence)
+        pairs = zip(data, sigma, strict=True)
+        expected.append([by_hand(*one, None, limit=LIMIT, part=part)[2] for one in pairs])
+    assert_allclose(np.diff(found, axis=0), np.diff(expected, axis=0), atol=0.05)
 
 
 @pytest.mark.parametrize("part", [0.0, PART])
@@ -257,3 +293,20 @@ def test_errors_of_agn_light_count_by_its_share(part):
             std = np.sqrt(p @ x**2 - mean**2)
             assert results.mean(name).value[i] == pytest.approx(mean, abs=0.1 * std)
             assert results.std(name).value[i] == pytest.approx(std, rel=0.1)
+
+
+def test_masses_on_nodes_have_the_density(grid, objects):
+    """Models of nodes only: their sum in closed form."""
+    _, observed, sigma = (one[:3] for one in objects)
+    settings = GridSettings(mass_function=density, interpolate=0)
+    fitter = BayesFitter(grid, model_error=0.0, settings=settings)
+    results = fitter.fit(photometry_table(BANDS, observed, sigma))
+    t, e = (x.ravel() for x in np.meshgrid(AXES["tau"], AXES["ebv"], indexing="ij"))
+    node, _ = flux(AXES["redshift"][:, None], t, e)
+    data, weight = observed[:, None, None], sigma[:, None, None] ** -2.0
+    formed = np.sum(weight * data * node, axis=3) / np.sum(weight * node**2, axis=3)
+    chi2 = np.sum(weight * (data - formed[..., None] * node) ** 2, axis=3)
+    p = np.exp(of_density(formed * (0.6 + 0.1 * t), None) - chi2 / 2)
+    p /= p.sum(axis=(1, 2), keepdims=True)
+    for name, values in {"redshift": AXES["redshift"][:, None], "tau": t, "mass": formed}.items():
+        assert_allclose(results.mean(name).value, np.sum(p * values, axis=(1, 2)), rtol=1e-6)

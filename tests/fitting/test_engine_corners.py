@@ -206,3 +206,13 @@ def test_signal_to_noise_of_a_millionth():
     # nothing is known but the sign: no model is preferred by more than the few sigma of noise
     prior = grid.allowed.sum(axis=1) / grid.allowed.sum()
     assert np.all(np.abs(np.log(results.pdf["redshift"] / prior)) < 5.0)
+
+
+def test_negative_fluxes_where_many_models_fit():
+    """Light of the AGN that is not wanted: in single precision too a fraction may have no positive scale."""
+    grid = make_grid(9, n_tau=45, n_age=45, frac=np.linspace(0, 0.95, 8))
+    table, _ = draw_photometry(grid, 2, seed=3, noise=1.0)
+    for name in grid.filters[-2:]:
+        table[name] = -3 * table[f"{name}_err"]
+    results = node_fitter(grid, model_error=0.0, settings=GridSettings(rtol=1e-6)).fit(table)
+    assert_plain(results, grid, rtol=1e-5, atol=1e-6)

@@ -429,7 +429,7 @@ def test_integration_over_pixels(tools):
 )
 def test_bad_settings_are_refused(tools, change, error, text):
     refuses(text, ForcedPhotometer, tools.kernel, error=error, **change)
-    refuses("'psf_error' must be from 0 to 1, got 2", ErrorSettings, psf_error=2)
+    refuses("'psf_error' must be at least 0 and below 1, got 2", ErrorSettings, psf_error=2)
 
 
 def test_bad_inputs_are_refused(tools, field):

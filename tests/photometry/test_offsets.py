@@ -1,5 +1,7 @@
 """Maps of offsets and backgrounds that vary, on scenes that were distorted by a known amount."""
 
+from types import SimpleNamespace
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -7,6 +9,8 @@ from astropy.table import QTable
 from numpy.testing import assert_allclose
 
 from miricigale.photometry import ForcedPhotometer, read_mosaic, read_prior
+from miricigale.photometry.offsets import source_offsets
+from miricigale.photometry.templates import Block
 from miricigale.utils.exceptions import MiricigaleWarning
 
 SHAPE, SIGMA = (400, 400), 0.02
@@ -121,3 +125,38 @@ def test_real_images_are_aligned(data_file):
     assert np.hypot(*found) < 0.011
     # as one shift of all sources is
     assert_allclose(found, one.shift.to_value(u.arcsec), atol=0.005)
+
+
+def test_steps_and_errors_of_a_gaussian():
+    """A Gaussian of width w: steps to first order, errors of sqrt(2) w over its signal-to-noise, others' light."""
+    width, flux, sky, sigma, moved = 3.0, 5000.0, 0.4, 0.5, np.array([0.05, -0.08])
+    y, x = np.mgrid[:61, :61]
+
+    def light(dx=0.0, dy=0.0):
+        square = (x - 30 - dx) ** 2 + (y - 30 - dy) ** 2
+        return np.exp(-0.5 * square / width**2) / (2 * np.pi * width**2)
+
+    noise = np.random.default_rng(1).normal(0, sigma, x.shape)
+    box, start = np.array([[0, 0, 61, 61]]), np.array([0, 61 * 61])
+    block = Block(0, box, start, light().astype(np.float32).ravel())
+    bank = SimpleNamespace(
+        blocks=lambda: [block],
+        xy=np.array([[30.0, 30.0]]),
+        map=lambda do, parts: list(map(do, parts)),
+    )
+    fit = SimpleNamespace(
+        bank=bank,
+        psf_width=width,
+        flux=np.array([flux]),
+        inverse_sigma=np.full(x.shape, np.float32(1 / sigma)),
+    )
+    change, model = flux * (light(*moved) - light()), flux * light() + sky
+    step, _, others = source_offsets(fit, change, model, np.array([0]))
+    # differences of neighbors are smaller than derivatives
+    smaller = 1 - 1 / (4 * width**2)
+    assert_allclose(smaller * step[0], moved, rtol=0.01)
+    assert_allclose(others, sky * 4 * np.pi * width**2 / flux, rtol=0.01)
+    step, error, _ = source_offsets(fit, noise, model, np.array([0]))
+    snr = flux / (2 * np.sqrt(np.pi) * width) / sigma
+    assert_allclose(smaller * error, np.sqrt(2) * width / snr, rtol=0.05)
+    assert (np.abs(step) < 4 * error).all()

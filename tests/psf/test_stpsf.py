@@ -65,6 +65,27 @@ def test_says_what_is_missing(monkeypatch):
     refuses(match, stpsf_psf, "miri.f770w", error=DataError)
 
 
+def test_one_psf_is_that_of_its_place(monkeypatch):
+    """stpsf takes the place from the instrument, if it is not to take the middle of the detector."""
+
+    class MIRI:
+        detector_position = (515, 511)
+
+        def psf_grid(self, *, num_psfs, single_psf_centered, oversample, fov_pixels, **_):
+            assert num_psfs == 1
+            place = (515, 511) if single_psf_centered else self.detector_position
+            data = np.zeros((1, oversample * fov_pixels, oversample * fov_pixels))
+            data[:, data.shape[1] // 2, data.shape[2] // 2] = place[0]
+            return types.SimpleNamespace(data=data, grid_xypos=[place])
+
+    monkeypatch.setenv("STPSF_PATH", "/somewhere")
+    monkeypatch.setitem(sys.modules, "stpsf", types.SimpleNamespace(MIRI=MIRI))
+    one = stpsf_psf("miri.f770w", x=200, y=800, fov=2 * u.arcsec)
+    assert one.data.max() == 200
+    assert one.position == (200, 800)
+    assert stpsf_grid("miri.f770w", fov=2 * u.arcsec).data.max() == 515
+
+
 @pytest.mark.skipif("STPSF_PATH" not in os.environ, reason="needs STPSF_PATH and stpsf")
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.usefixtures("data")

@@ -125,8 +125,9 @@ def test_wrong_arguments_are_named(files, tmp_path, capsys):
     with pytest.raises(ValueError, match="files of different names, got two of f770w_0"):
         reduce_files([files[0], tmp_path / "f770w_0_cal.fits"], tmp_path)
     arguments = ["reduce", str(files[0]), "-o", str(tmp_path)]
-    assert main([*arguments, "--gain", "4", "--references", "none"]) != 0
-    assert "only one of these" in capsys.readouterr().err
+    for more in (["--gain", "4", "--references", "none"], ["--context", "jwst_1364.pmap"]):
+        assert main([*arguments, *more]) != 0
+        assert "only one of these" in capsys.readouterr().err
 
 
 def test_products_never_replace_what_they_are_made_of(files, tmp_path):

@@ -25,7 +25,7 @@ def folder(tmp_path):
 
 
 def chosen(folder, **header):
-    files = ReferenceCache(folder).find({**HEADER, **header}, incomplete=True)
+    files = ReferenceCache(folder, incomplete=True).find({**HEADER, **header})
     return {name: path.name for name in files.names() if (path := getattr(files, name)) is not None}
 
 

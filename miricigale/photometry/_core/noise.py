@@ -4,16 +4,15 @@ import numpy as np
 import scipy.fft
 
 
-def autocorrelation(rows, usable, lag, map_parts=map):
+def autocorrelation(rows, strips, lag, map_parts=map):
     """
     Mean product of pixel pairs by separation, over usable pixels, and its statistical error.
 
     Both of shape (2 lag + 1, 2 lag + 1), lag (0, 0) in the middle; symmetric through the center.
-    ``rows(slice)`` are rows of the whitened residual (data minus model, over sigma), ``map_parts`` is called
-    as `map` to work in threads.
+    ``rows(slice)`` are rows of the whitened residual (data minus model, over sigma), and which pixels are usable;
+    of the image the ``strips``, slices of rows, are taken. ``map_parts`` is called as `map` to
+    work in threads.
     """
-    good = np.asarray(usable, bool)
-    size = 512
     wanted = np.ix_(np.arange(lag + 1), np.arange(-lag, lag + 1))
 
     def products(image):
@@ -26,11 +25,11 @@ def autocorrelation(rows, usable, lag, map_parts=map):
         power += spectrum.imag**2
         return scipy.fft.irfft2(power, s=shape, overwrite_x=True)[wanted].astype(float)
 
-    def strip(y0):
+    def of_strip(strip):
         # products of the rows of a strip with those up to lag below: those of all these rows,
         # without those among the rows below
-        member = good[y0 : y0 + size + lag]
-        z = rows(slice(y0, y0 + size + lag))
+        z, member = rows(slice(strip.start, strip.stop + lag))
+        size = strip.stop - strip.start
         kind = np.result_type(z, np.float32)
         z = np.where(member, z, kind.type(0))
         found = np.array([products(z), products(member.astype(kind))])
@@ -39,7 +38,7 @@ def autocorrelation(rows, usable, lag, map_parts=map):
         return found
 
     sums = np.zeros((2, lag + 1, 2 * lag + 1))
-    for found in map_parts(strip, range(0, len(good), size)):
+    for found in map_parts(of_strip, strips):
         sums += found
     # the half plane of negative separations is the mirror of the other
     full = np.concatenate([sums[:, :0:-1, ::-1], sums], axis=1)

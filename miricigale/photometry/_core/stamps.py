@@ -207,6 +207,46 @@ def residual_statistics(values, box, start, residual, inverse_sigma, out):
         out[k, 2] = core
 
 
+@njit(cache=True, nogil=True)
+def offset_sums(values, box, start, flux, at, half, model, residual, inverse_sigma, out):
+    """
+    Sum up what the steps of sources against their stamps follow from.
+
+    ``at``, (n, 2), are the sources' pixels (x, y), ``half`` is the window's half-width. ``out``, (n, 18), gets the
+    products (4 x 4) of the weighted light, its derivatives by the steps along x and y, and the residual; light of
+    others below the stamp, and the number of pixels: all zero for windows of less than 5 pixels.
+    """
+    term = np.empty(4)
+    for k in range(box.shape[0]):
+        y0, x0, ny, nx = box[k]
+        first, last = max(at[k, 1] - half, y0), min(at[k, 1] + half + 1, y0 + ny)
+        left, right = max(at[k, 0] - half, x0), min(at[k, 0] + half + 1, x0 + nx)
+        sums = out[k]
+        sums[:] = 0.0
+        if min(last - first, right - left) < 5:
+            continue
+        stamp = values[start[k] : start[k] + ny * nx].reshape(ny, nx)
+        stamp = stamp[first - y0 : last - y0, left - x0 : right - x0]
+        for j in range(stamp.shape[0]):
+            # at the window's edges one-sided differences
+            j0, j1 = max(j - 1, 0), min(j + 1, stamp.shape[0] - 1)
+            for i in range(stamp.shape[1]):
+                weight = np.float64(inverse_sigma[first + j, left + i])
+                if weight == 0.0:
+                    continue
+                i0, i1 = max(i - 1, 0), min(i + 1, stamp.shape[1] - 1)
+                white = flux[k] * weight
+                term[0] = white * stamp[j, i]
+                term[1] = white * (np.float64(stamp[j, i0]) - stamp[j, i1]) / (i1 - i0)
+                term[2] = white * (np.float64(stamp[j0, i]) - stamp[j1, i]) / (j1 - j0)
+                term[3] = weight * residual[first + j, left + i]
+                for a in range(4):
+                    for b in range(4):
+                        sums[4 * a + b] += term[a] * term[b]
+                sums[16] += abs(term[0] * (weight * model[first + j, left + i] - term[0]))
+                sums[17] += 1.0
+
+
 def convolve_stamps(values, box, start, rows, transfer, shape, out_box, out_start, out):
     """
     Convolve some of the flat stamps with a kernel given by its transform; the results are larger.

@@ -270,7 +270,7 @@ class DraineLi2007Alpha(_DraineLi):
 
     A mapping with eight constants, fitted to the sequence of Dale et al. 2014 and scored on
     it: 0.10 dex rms in 5-25 um and 0.06 dex beyond for alpha from 1 to 3.5. MIRI bands differ
-    by up to 0.4 mag, the 3.3 um feature by 1 mag. It is **no substitute for Dale et al. 2014**
+    by up to 0.45 mag, by 0.56 mag at the 3.3 um feature. It is **no substitute for Dale et al. 2014**
     in a paper. Galaxies of CEERS have a tenth of its 3.3 um feature: ``pah_33`` scales that.
 
     Examples

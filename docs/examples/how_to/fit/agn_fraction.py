@@ -39,7 +39,7 @@ for band in bands:
 
 # %%
 # Fit with and without AGN, on the same axes otherwise. The gain in ln(evidence) counts the freedom of the AGN
-# models: 3 is positive, 5 is strong, below 1 there is nothing.
+# models: 1 to 3 is positive, 3 to 5 strong, more very strong.
 
 axes = SEDModel.yang2021_axes()
 plain = SEDModel.yang2021(agn=False)

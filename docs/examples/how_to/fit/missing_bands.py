@@ -40,8 +40,8 @@ for band in nircam:
 
 # %%
 # ``n_bands_min`` sets how many bands an object needs; with fewer it is flagged and not fitted. ``n_bands`` is the
-# number that was used. The flag ``few_for_parameters`` marks objects with fewer bands than free parameters: their
-# posteriors are wide, and rest on the priors.
+# number that was used. The flag ``few_for_parameters`` marks objects with fewer than three fluxes of 2 sigma or
+# more: their posteriors are wide, and rest on the priors.
 
 fitter = BayesFitter(model, bands, axes=SEDModel.yang2021_axes(), n_bands_min=4)
 results = fitter.fit(photometry)

@@ -55,5 +55,5 @@ print(f"time to {wanted}: {(ratio**2 * u.h).round(1)}")
 #
 #    $ miricigale plan --bands f770w f1500w --depth 25.5 24.0
 #
-# Surveys reach the limits of apertures within 0.15 mag: see :doc:`/accuracy/planning`, and :doc:`/method/planning`
-# for the errors of forced photometry.
+# With the noise of plans (``[noise] excess``) the limits of surveys are met within 0.15 mag in six of seven bands:
+# see :doc:`/accuracy/planning`, and :doc:`/method/planning` for the errors of forced photometry.

@@ -80,5 +80,4 @@ for name in ("completeness", "purity"):
     print(f"{name}: {one.value:.2f} ({one.low:.2f} to {one.high:.2f})")
 
 # %%
-# See :doc:`/method/evaluation` for the classes, also by colors, and :doc:`/method/agn` for what an AGN fraction
-# is.
+# See :doc:`/method/evaluation` for the classes, and :doc:`/method/agn` for what an AGN fraction is.
