@@ -236,11 +236,11 @@ def _common(fit, covariance):
 def _images(fit, diagnostics, meta):
     arrays = fit.arrays
     # images can be large: what the fit needs no longer becomes the result
-    model, residual, inverse = diagnostics.model, diagnostics.residual, arrays.inverse_sigma
+    model, residual = diagnostics.model, diagnostics.residual
     fit.add_background(model)
-    for image in (residual, inverse):
-        image[~arrays.usable] = np.nan
-    sigma, area = np.divide(1, inverse, out=inverse), arrays.area
+    inverse, area = arrays.inverse_sigma, arrays.area
+    sigma = np.divide(1, inverse, out=np.full_like(area, np.nan), where=inverse > 0)
+    residual[~arrays.usable] = np.nan
     for image in (model, residual, sigma):
         image /= area
     options = {"unit": SURFACE_BRIGHTNESS, "wcs": arrays.wcs}
