@@ -4,7 +4,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 
 from miricigale.detector._core.charge import add_poisson, cosmic_ray_deposits
-from miricigale.detector._core.random import standard_normals
+from miricigale.detector._core.random import poisson, seed_stream, standard_normals
 from miricigale.detector._core.readout import digitize
 
 KEY = np.array([11, 22, 33, 44], np.uint64)
@@ -41,6 +41,16 @@ def test_streams_of_rows_and_keys_are_apart():
     correlation = np.corrcoef(np.vstack([rows, other]))
     np.fill_diagonal(correlation, 0)
     assert np.abs(correlation).max() < 5 / np.sqrt(4000)
+
+
+@pytest.mark.parametrize("mean", [3.0, 31.0, 5000.0])
+def test_single_numbers_are_poisson(mean):
+    state = np.empty(4, np.uint64)
+    seed_stream(state, KEY, 0, 0)
+    counts = np.array([poisson(state, mean) for _ in range(500_000)])
+    assert abs(counts.mean() - mean) < 4 * np.sqrt(mean / counts.size)
+    spread = np.sqrt((2 + 1 / mean) / counts.size)
+    assert abs(counts.var() / mean - 1) < 4 * spread
 
 
 @pytest.mark.parametrize("mean", [0.05, 0.555, 3.0, 9.99, 10.0, 31.0, 161.0, 5000.0])
