@@ -1,6 +1,7 @@
 """From images with units and coordinates to the plain arrays that photometry works on."""
 
 import dataclasses
+import functools
 
 import astropy.units as u
 import numpy as np
@@ -46,9 +47,9 @@ class FitArrays:
         """A new image of zeros."""
         return np.zeros(self.usable.shape, dtype)
 
-    @property
+    @functools.cached_property
     def area(self):
-        """As for `ImageArrays`; made anew each time."""
+        """As for `ImageArrays`; made when it is needed first, which without a background is at the end."""
         return _areas(self.wcs, self.usable.shape, np.float32)
 
     def whitened(self, image):

@@ -44,7 +44,7 @@ def stpsf_grid(filter, *, n_psfs=1, oversampling=4, fov=10.0 * ANGLE, position=N
     fov : `~astropy.units.Quantity`, optional
         Width of the grids.
     position : (float, float), optional
-        Of a single PSF on the detector; the middle by default. Grids of more are even.
+        Of a single PSF on the detector (x, y in pixels); the middle by default. Grids of more are even.
 
     Returns
     -------
@@ -103,7 +103,7 @@ def stpsf_psf(filter, *, x=515.0, y=511.0, **options):
     filter : str
         Such as ``"miri.f770w"``.
     x, y : float, optional
-        Position on the detector.
+        Position on the detector in pixels.
     **options
         Those of `stpsf_grid`. With ``n_psfs`` of 4 or more it is interpolated in the grid.
 

@@ -10,8 +10,7 @@ def autocorrelation(rows, strips, lag, map_parts=map):
 
     Both of shape (2 lag + 1, 2 lag + 1), lag (0, 0) in the middle; symmetric through the center.
     ``rows(slice)`` are rows of the whitened residual (data minus model, over sigma), and which pixels are usable;
-    of the image the ``strips``, slices of rows, are taken. ``map_parts`` is called as `map` to
-    work in threads.
+    of the image the ``strips``, slices of rows, are taken. ``map_parts`` is called as `map` to work in threads.
     """
     wanted = np.ix_(np.arange(lag + 1), np.arange(-lag, lag + 1))
 
