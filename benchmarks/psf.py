@@ -16,6 +16,7 @@ from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData, StdDevUncertainty
 from astropy.table import QTable
 
+from miricigale.depth import sky_background
 from miricigale.instrument import north_up_wcs
 from miricigale.photometry import (
     ErrorSettings,
@@ -195,15 +196,20 @@ def stars(seeds):
             )
 
 
-def loose_chi2(result, row, radius=0.8, scatter=0.02):
-    """Chi-square below the light within a radius (arcsec) if pixels deviate by a part of the light too."""
+def loose_chi2(result, row, radius=0.8, scatter=0.02, sky=np.inf):
+    """
+    Chi-square below the light within a radius (arcsec) if pixels deviate by a part of the light too.
+
+    With a ``sky`` (MJy/sr), that the image's weights state the noise of alone, the source's photons count besides.
+    """
     residual, model = result.residual_image, result.model_image.data
     if result.background is not None:
         model = model - result.background.to_value(residual.unit)
     reach = radius / result.meta["pixel_scale"]
     y, x = np.indices(model.shape)
     near = (np.hypot(x - result.x[row], y - result.y[row]) < reach) & ~residual.mask & (model > 0)
-    noise = np.hypot(residual.uncertainty.array, scatter * model)[near]
+    noise = residual.uncertainty.array * np.sqrt(1 + np.maximum(model, 0) / sky)
+    noise = np.hypot(noise, scatter * model)[near]
     return np.average((residual.data[near] / noise) ** 2, weights=model[near])
 
 
@@ -246,10 +252,15 @@ def field(folder):
         print(
             f"{options}: {len(bright)} sources above 20 sigma, {np.sum(chi2 < 2)} with chi2 below 2,"
         )
-        loose = np.array([loose_chi2(result, k) for k in bright])
-        print(
-            f"  {np.sum(loose < 2)} with 2 % of the light in each pixel as an error: {np.round(np.sort(loose), 2)}"
-        )
+        sky = sky_background("F770W", "medium").value
+        for what, form in (
+            ("within 0.8 arcsec", {"scatter": 0}),
+            (f"with the sources' photons on a sky of {sky:.1f} MJy/sr", {"scatter": 0, "sky": sky}),
+            ("with 2 % of the light in each pixel as an error", {}),
+            ("with both", {"sky": sky}),
+        ):
+            loose = np.array([loose_chi2(result, k, **form) for k in bright])
+            print(f"  {np.sum(loose < 2)} {what}: {np.round(np.sort(loose), 2)}")
         print(f"  chi2 {np.round(np.sort(chi2), 2)}; pulls {pulls:.3f}, 5 sigma {depth:.1f} nJy")
         ratio = [round(light_ratio(result, k), 3) for k in bright[np.argsort(-snr[bright])]]
         print(f"  light over the model's within 0.5 arcsec, brightest first: {ratio}")

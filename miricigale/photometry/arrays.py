@@ -1,7 +1,6 @@
 """From images with units and coordinates to the plain arrays that photometry works on."""
 
 import dataclasses
-import functools
 
 import astropy.units as u
 import numpy as np
@@ -47,18 +46,17 @@ class FitArrays:
         """A new image of zeros."""
         return np.zeros(self.usable.shape, dtype)
 
-    @functools.cached_property
-    def area(self):
-        """As for `ImageArrays`; made when it is needed first, which without a background is at the end."""
-        return _areas(self.wcs, self.usable.shape, np.float32)
+    def areas(self, out=None):
+        """The ``area`` of `ImageArrays`, made anew."""
+        return _areas(self.wcs, self.new() if out is None else out)
 
     def whitened(self, image):
         """An image over the noise, zero where not usable."""
         return np.multiply(image, self.inverse_sigma, out=self.new())
 
 
-def _areas(wcs, shape, dtype):
-    area = pixel_area_map(wcs, shape, out=np.empty(shape, dtype))
+def _areas(wcs, out):
+    area = pixel_area_map(wcs, out.shape, out=out)
     area *= _MICRO
     return area
 
@@ -96,7 +94,7 @@ def image_arrays(image, name, dtype=float):
         If areas that are exactly 0 are taken as without data.
     """
     *given, usable = _checked(image, name)
-    area = _areas(image.wcs, usable.shape, dtype)
+    area = _areas(image.wcs, np.empty(usable.shape, dtype))
     # in place, for images can be large
     flux, sigma = (np.multiply(*one, dtype=dtype, casting="same_kind") for one in given)
     # a surface brightness, and not the flux in each pixel

@@ -8,6 +8,7 @@ from miricigale.photometry._core.stamps import residual_statistics
 from miricigale.photometry.errors import noise_correlation, stated_correlation
 from miricigale.photometry.flags import POOR_CHI2, POOR_STRAIN, ForcedFlags
 from miricigale.photometry.residual_sources import ResidualPeaks, residual_peaks
+from miricigale.utils.parallel import chunks
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -53,7 +54,9 @@ def diagnose(fit, xy):
 def _correlation(fit, residual, model):
     """Measured correlation of the noise, or as the image states it where there is too little sky; or None."""
     usable = fit.arrays.usable
-    free = usable & (np.abs(model) * fit.inverse_sigma < 0.3)
+    free = usable.copy()
+    for part in chunks(len(model), 256):
+        free[part] &= np.abs(model[part]) * fit.inverse_sigma[part] < 0.3
     if np.count_nonzero(free) < max(400, 0.02 * np.count_nonzero(usable)):
         free = usable
     if np.count_nonzero(free) < 400:

@@ -238,9 +238,10 @@ def _images(fit, diagnostics, meta):
     # images can be large: what the fit needs no longer becomes the result
     model, residual = diagnostics.model, diagnostics.residual
     fit.add_background(model)
-    inverse, area = arrays.inverse_sigma, arrays.area
-    sigma = np.divide(1, inverse, out=np.full_like(area, np.nan), where=inverse > 0)
-    residual[~arrays.usable] = np.nan
+    sigma, area = arrays.inverse_sigma, arrays.areas(out=arrays.flux)
+    for image in (residual, sigma):
+        image[~arrays.usable] = np.nan
+    np.divide(1, sigma, out=sigma)
     for image in (model, residual, sigma):
         image /= area
     options = {"unit": SURFACE_BRIGHTNESS, "wcs": arrays.wcs}

@@ -308,15 +308,10 @@ def _input_table(page, bands, highres):
     ]
     page.table("table", rows)
     for one in bands:
-        page.text(
-            "kernel",
-            band=one.name,
-            size=one.kernel.array.shape[0],
-            scale=one.kernel.pixel_scale.value,
-            sum=one.kernel.array.sum(),
-            gain=one.kernel.noise_gain,
-            origin=one.kernel.meta.get("file", "made from two PSFs"),
-        )
+        values, scale = one.kernel.array, one.kernel.pixel_scale.value
+        facts = {"size": values.shape[0], "scale": scale, "sum": values.sum()}
+        facts["origin"] = one.kernel.meta.get("file", "made from two PSFs")
+        page.text("kernel", band=one.name, gain=one.kernel.noise_gain, **facts)
 
 
 def _text(value):

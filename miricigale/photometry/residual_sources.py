@@ -1,6 +1,7 @@
 """Light on the residual image that no template explains."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import scipy.ndimage
@@ -54,41 +55,51 @@ def residual_peaks(fit, residual, model, xy):
     placed = xy[np.isfinite(xy).all(axis=1)]
     if not inverse_sigma.any():
         return ResidualPeaks(np.empty((0, 2), int), np.empty((0, 2)), np.empty(0), full_width)
-    # fluxes of point sources by least squares, as if each stood alone: signal over power
-    snr, power = _matched(fit, residual)
-    usable = power > 0
+    matched, executor = _Matched(inverse_sigma, width, residual), fit.bank.executor
+    # of very many pixels only those of some rows
+    some = [part for part in chunks(len(residual), _ROWS // 8) if inverse_sigma[part].any()]
+    some = some[:: max(1, residual.size // _SOME)]
+    found = parallel_map(matched.rows, some, executor=executor)
+    snr, power = map(np.concatenate, zip(*found, strict=True))
+    seen = np.concatenate([inverse_sigma[part] for part in some]) > 0
+    matched.least = 0.25 * np.median(power[seen])
     # what is a thousandth of the stated noise is that of the arithmetic
-    noise = max(mad_std(_some(snr, usable)), 1e-3)
-    # few pixels are left for what follows, unless the image has a background
-    near = np.arange(-int(np.ceil(width)), int(np.ceil(width)) + 1)
-    found = []
-    y, x = np.nonzero(snr > LEFT_SNR * noise)
-    for part in chunks(len(y), _CANDIDATES):
-        i, j = y[part], x[part]
-        top = snr[i, j] >= _windows(snr, i, j, near).max(axis=(1, 2))
-        i, j = i[top], j[top]
-        taken = _filtered(model, inverse_sigma, i, j, width)
-        top = snr[i, j] * np.sqrt(power[i, j]) > _LEFT_SHARE * taken
-        found.append((i[top], j[top]))
-    y, x = (np.concatenate([one[k] for one in found] or [y]) for k in (0, 1))
+    limit = LEFT_SNR * max(mad_std(snr[power > matched.least]), 1e-3)
+    reach = int(np.ceil(width))
 
-    def light_at(y, x):
-        return snr[y, x] / np.sqrt(np.where(usable[y, x], power[y, x], 1.0))
+    def find(part):
+        """Places, lights and tops of the parabolas of peaks on some rows."""
+        first = max(part.start - reach, 0)
+        snr, power = matched.rows(slice(first, part.stop + reach))
+        own, found = slice(part.start - first, part.stop - first), []
+        y, x = np.nonzero(snr[own] > limit)
+        # few pixels are left for what follows, unless the image has a background
+        for some in chunks(len(y), _CANDIDATES):
+            i, j = y[some] + own.start, x[some]
+            top = snr[i, j] >= _windows(snr, i, j, np.arange(-reach, reach + 1)).max(axis=(1, 2))
+            i, j = i[top], j[top]
+            root = np.sqrt(power[i, j])
+            top = snr[i, j] * root > _LEFT_SHARE * matched.at(i + first, j, width, model)
+            place, light = np.stack([j, i], axis=1)[top], (snr[i, j] / root)[top]
+            found.append([place + [0, first], light, place + [0, first] + _parabola(snr, place)])
+        return found
 
-    light = light_at(y, x)
+    found = parallel_map(find, chunks(len(residual), _ROWS), executor=executor)
+    none = np.empty((0, 2), int), np.empty(0), np.empty((0, 2))
+    found = zip(none, *itertools.chain(*found), strict=True)
+    pixel, light, refined = map(np.concatenate, found)
     order = np.argsort(-light, kind="stable")
-    pixel, light = np.stack([x, y], axis=1)[order], light[order]
+    pixel, light, refined = pixel[order], light[order], refined[order]
     distance = np.full(len(pixel), np.inf)
     if len(placed) and len(pixel):
         distance, nearest = scipy.spatial.KDTree(placed).query(pixel)
         # a template that is too narrow leaves as much on the other side of the source
-        mirror = np.rint(2 * placed[nearest] - pixel).astype(int)
-        inside = np.all((mirror >= 0) & (mirror < snr.shape[::-1]), axis=1)
-        j, i = np.where(inside[:, None], mirror, 0).T
-        even = inside & (light_at(i, j) > 0.5 * light)
-        distance[even & (distance < _LEFT_REACH * full_width)] = 0.0
+        near = np.flatnonzero(distance < _LEFT_REACH * full_width)
+        for rows in (near[part] for part in chunks(len(near), _CANDIDATES // 10)):
+            mirror = np.rint(2 * placed[nearest[rows]] - pixel[rows]).astype(int)
+            distance[rows[matched.light_at(*mirror.T[::-1]) > 0.5 * light[rows]]] = 0.0
     apart = distance >= _LEFT_DISTANCE * full_width
-    pixel, light = pixel[apart], light[apart]
+    pixel, light, refined = pixel[apart], light[apart], refined[apart]
     lone = np.ones(len(pixel), bool)
     if len(pixel):
         # brightest first: each that is kept removes the fainter ones near it
@@ -96,8 +107,7 @@ def residual_peaks(fit, residual, model, xy):
             scipy.spatial.KDTree(pixel).query_pairs(_LEFT_DISTANCE * full_width)
         ):
             lone[other] &= ~lone[one]
-    kept = pixel[lone]
-    return ResidualPeaks(kept, kept + _parabola(snr, kept), light[lone], full_width)
+    return ResidualPeaks(pixel[lone], refined[lone], light[lone], full_width)
 
 
 #: Rows that are filtered at a time, pixels of which medians are taken, where there are more, and pixels
@@ -110,45 +120,43 @@ def _radius(width):
     return int(4.0 * width + 0.5)
 
 
-def _matched(fit, residual):
-    """Signal-to-noise and power of point sources at all pixels, both zero where too little of them is seen."""
-    snr, power, executor = fit.arrays.new(), fit.arrays.new(), fit.bank.executor
-    inverse_sigma, width = fit.inverse_sigma, fit.psf_width
-    halo, even = _radius(width), np.broadcast_to(np.float32(1), residual.shape)
+@dataclasses.dataclass
+class _Matched:
+    """Fluxes of point sources at all pixels by least squares, as if each stood alone: signal over power."""
 
-    def filtered(part, width, image):
+    inverse_sigma: np.ndarray
+    width: float
+    residual: np.ndarray
+    least: float = 0.0  # Power below which too little of a source is seen.
+
+    def rows(self, part):
+        """Signal-to-noise and power on some rows, both zero where too little of a source is seen."""
+        light = self._filtered(part, self.width, self.residual)
+        power = self._filtered(part, self.width / np.sqrt(2)) / (4 * np.pi * self.width**2)
+        power[power <= self.least] = 0.0
+        return np.divide(light, np.sqrt(power), out=np.zeros_like(light), where=power > 0), power
+
+    def _filtered(self, part, width, image=None):
+        halo = _radius(width)
         rows = slice(max(part.start - halo, 0), part.stop + halo)
-        light = inverse_sigma[rows] ** 2 * image[rows]
+        light = self.inverse_sigma[rows] ** 2
+        light *= 1 if image is None else image[rows]
         light = scipy.ndimage.gaussian_filter(light, width, mode="constant")
         return light[part.start - rows.start :][: part.stop - part.start]
 
-    def fill_power(part):
-        power[part] = filtered(part, width / np.sqrt(2), even) / (4 * np.pi * width**2)
+    def at(self, y, x, width, image=None):
+        """The inverse variance, times an image if there is one, filtered with a Gaussian at some pixels."""
+        around = np.arange(-_radius(width), _radius(width) + 1)
+        hat = np.exp(-0.5 * (around / width) ** 2)
+        values = _windows(self.inverse_sigma, y, x, around) ** 2
+        values *= 1 if image is None else _windows(image, y, x, around)
+        return np.einsum("kij,i,j->k", values, hat, hat) / hat.sum() ** 2
 
-    def fill_snr(part):
-        power[part][power[part] <= limit] = 0.0
-        light, root = filtered(part, width, residual), np.sqrt(power[part])
-        np.divide(light, root, out=snr[part], where=root > 0)
-
-    parts = list(chunks(len(residual), _ROWS))
-    parallel_map(fill_power, parts, executor=executor)
-    limit = 0.25 * np.median(_some(power, inverse_sigma > 0))
-    parallel_map(fill_snr, parts, executor=executor)
-    return snr, power
-
-
-def _filtered(image, inverse_sigma, y, x, width):
-    """An image times inverse variance, filtered with a Gaussian at some pixels."""
-    around = np.arange(-_radius(width), _radius(width) + 1)
-    hat = np.exp(-0.5 * (around / width) ** 2)
-    values = _windows(inverse_sigma, y, x, around) ** 2 * _windows(image, y, x, around)
-    return np.einsum("kij,i,j->k", values, hat, hat) / hat.sum() ** 2
-
-
-def _some(image, which):
-    """Values of an image at some pixels; of very many, only a part."""
-    step = max(1, image.size // _SOME)
-    return image.reshape(-1)[::step][which.reshape(-1)[::step]]
+    def light_at(self, y, x):
+        """Fluxes at some pixels, zero where too little of a source is seen."""
+        power = self.at(y, x, self.width / np.sqrt(2)) / (4 * np.pi * self.width**2)
+        light = self.at(y, x, self.width, self.residual)
+        return np.divide(light, power, out=np.zeros_like(light), where=power > self.least)
 
 
 def _windows(image, y, x, around):

@@ -1,10 +1,12 @@
 """Which shape the light of a source has: fits of a point and of a Sersic profile, and their evidence."""
 
+import contextlib
 import dataclasses
 import functools
 
 import numpy as np
 import scipy.linalg
+from astropy.nddata import NoOverlapError, overlap_slices
 
 from miricigale.photometry._core.shape_fits import Plan, evidence_of, minimum
 from miricigale.photometry._core.shapes import INDEX_RANGE, profile_table
@@ -310,9 +312,17 @@ class _Stamp:
         """Whitened changes of the light of neighbors by independent unit normal deviates, (p, pixels)."""
         if beside is None:
             return np.zeros((0, self.white.size))
-        at = beside.parameters - [*self.corners[0], 0, 0, 0, 0]
-        images = np.array([self.models.profiles(self.white.shape, one, 6) for one in at], float)
-        images[:, 1:] *= beside.flux[:, None, None, None]
+        size = self.white.shape
+        images = np.zeros((len(beside.flux), 7, *size))
+        for image, flux, one in zip(images, beside.flux, beside.parameters, strict=True):
+            # each on a square of its own: its transform is periodic, and it may be far from the stamp
+            corner = np.round(one[:2]).astype(int) - size[0] // 2
+            drawn = self.models.profiles(size, one - [*corner, 0, 0, 0, 0], 6)
+            middle = (corner - self.corners[0])[::-1] + size[0] // 2
+            with contextlib.suppress(NoOverlapError):
+                here, there = overlap_slices(size, size, tuple(middle))
+                image[:, *here] = drawn[:, *there]
+            image[1:] *= flux
         columns = (images * self.inverse).reshape(-1, self.white.size)
         # of the layout of an empty one: kernels are compiled once
         return np.ascontiguousarray(scipy.linalg.solve_triangular(beside.root, columns, lower=True))

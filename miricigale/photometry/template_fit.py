@@ -90,7 +90,7 @@ class TemplateFit:
             self._find_shift(bank, moved)
 
     def _background_columns(self):
-        area, order = self.arrays.area, self.settings.background_order
+        area, order = self.arrays.areas(), self.settings.background_order
         if order == 0:
             return [area]
         y, x = np.ogrid[: area.shape[0], : area.shape[1]]

@@ -48,7 +48,8 @@ class FineTemplates:
     @functools.cached_property
     def _points(self):
         """Coefficients of the point source at each place, shape (k, h, w), its center in the middle."""
-        return np.concatenate([convolve_padded(one, self._response) for one in self.target])
+        found = [convolve_padded(one, self._response) for one in self.target]
+        return np.concatenate(found, dtype=np.float32)
 
     def points(self, weights):
         """
@@ -59,7 +60,7 @@ class FineTemplates:
         if len(self.target) == 1:
             return self._points, np.zeros(len(weights), int)
         alike, which = np.unique(weights, axis=0, return_inverse=True)
-        return np.tensordot(alike, self._points, axes=1), which.reshape(-1)
+        return np.tensordot(np.float32(alike), self._points, axes=1), which.reshape(-1)
 
     @functools.cached_property
     def kernel_power(self):
@@ -74,10 +75,12 @@ class FineTemplates:
     @functools.lru_cache(maxsize=256)  # noqa: B019 - lives as long as one measurement
     def _transfer(self, shape, convolved, place):
         if convolved:
-            return scipy.fft.rfft2(self.kernel[place], s=shape) * self._response(shape)
-        # a profile is integrated over fine pixels already, which the PSF's samples are not
-        transfer = scipy.fft.rfft2(self.target[place], s=shape) * self._response(shape)
-        return transfer / box_response(shape, np.eye(2))
+            transfer = scipy.fft.rfft2(self.kernel[place], s=shape)
+        else:
+            # a profile is integrated over fine pixels already, which the PSF's samples are not
+            transfer = scipy.fft.rfft2(self.target[place], s=shape)
+            transfer /= box_response(shape, np.eye(2))
+        return np.complex64(transfer * self._response(shape))
 
     def _transfers(self, shape, convolved, weights):
         """The transform for each of some sources, or for all if they are alike."""
@@ -85,7 +88,8 @@ class FineTemplates:
         found = [self._transfer(shape, convolved, int(k)) for k in used]
         if len(used) == 1:
             return found[0]
-        return sum(w[:, None, None] * one for w, one in zip(weights.T[used], found, strict=True))
+        parts = zip(np.float32(weights.T[used]), found, strict=True)
+        return sum(w[:, None, None] * one for w, one in parts)
 
     def _size(self, cutout):
         """Size (y, x) of what a cutout is convolved with."""
@@ -110,7 +114,7 @@ class FineTemplates:
     def coefficients(self, group, shape, weights):
         """Convolve cutouts of one shape, returning an array of shape (n, *shape)."""
         size = np.max([cutout.data.shape for cutout in group], axis=0) + RIM
-        stamps = np.zeros((len(group), *size))
+        stamps = np.zeros((len(group), *size), np.float32)
         for stamp, cutout in zip(stamps, group, strict=True):
             h, w = cutout.data.shape
             stamp[RIM : RIM + h, RIM : RIM + w] = cutout.data
@@ -271,11 +275,11 @@ class TemplateBank:
 
     def reuse(self, other):
         """
-        Take the templates of another bank, which has this one's first sources, that are the same here.
+        Take the templates of another bank that are the same here: of the same numbers and places.
 
         The other forgets its own. Nothing is taken where memory does not hold both.
         """
-        kept, n = other._kept, len(other.order)
+        kept, n = other._kept, min(len(self.order), len(other.order))
         other.forget()
         if kept is None or 8.0 * self.start[-1] > self.max_bytes:
             return
@@ -285,8 +289,8 @@ class TemplateBank:
         mine, theirs = (
             np.hstack([one.xy, one.poly.reshape(-1, 12)]) for one in (self.sources, other.sources)
         )
-        same = (mine[:n] == theirs).all(axis=1)
-        self._same = {k: stamps[row] for row, k in enumerate(other.order) if same[k]}
+        same = (mine[:n] == theirs[:n]).all(axis=1)
+        self._same = {k: stamps[row] for row, k in enumerate(other.order) if k < n and same[k]}
 
     def parts(self, rows):
         """The cutouts of some rows, None for points."""
@@ -323,7 +327,7 @@ class TemplateBank:
             yield from self._kept
             return
         keep, kept = 4.0 * self.start[-1] <= self.max_bytes, []
-        for rows in _pieces(self.start, 16 * _PART):
+        for rows in _pieces(self.start, 40 * _PART):
             block = self._make(rows.start, rows.stop)
             if keep:
                 kept.append(block)

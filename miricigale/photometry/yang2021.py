@@ -121,15 +121,9 @@ class Yang2021Photometer:
             If the image is not on the pixels of ``highres`` (of the same or another extent).
         """
         _require_same_pixels(image, highres)
-        templates = SourceTemplates.from_images(
-            highres,
-            segmentation,
-            catalog,
-            psf=self.kernel.source,
-            template="cutout",
-            wings=False,
-            n_threads=self._n_threads,
-        )
+        given = highres, segmentation, catalog
+        options = {"template": "cutout", "wings": False, "n_threads": self._n_threads}
+        templates = SourceTemplates.from_images(*given, psf=self.kernel.source, **options)
         # T-PHOT takes templates as they are: nothing is taken off for their noise
         light = [one and dataclasses.replace(one, noise=0.0) for one in templates.light]
         templates = dataclasses.replace(templates, light=light)

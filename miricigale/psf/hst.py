@@ -114,13 +114,12 @@ def hst_psf(
     turn = float(to_array(angle, u.deg, "angle"))
     data = _hst_optics(name, cell, odd_cells(width, cell), (45.0 + turn) % 360.0)
     data = _hst_blurred(data, oversampling, scale, sigma) * oversampling**2
-    return make_psf(
-        data,
-        pixel_scale=pixel_scale,
-        oversampling=oversampling,
-        frame="sky",
-        includes=("pixel", "ipc", "jitter", "drizzle"),
-        filter=name,
-        total_known=True,
-        meta={"instrument": "WFC3/IR", "blur": sigma, "telescope_angle": turn},
-    )
+    form = {
+        "pixel_scale": pixel_scale,
+        "oversampling": oversampling,
+        "frame": "sky",
+        "filter": name,
+    }
+    meta = {"instrument": "WFC3/IR", "blur": sigma, "telescope_angle": turn}
+    effects = "pixel", "ipc", "jitter", "drizzle"
+    return make_psf(data, includes=effects, total_known=True, meta=meta, **form)

@@ -207,15 +207,7 @@ def miri_psf(
         "cruciform_fraction": scattered,
         "halo_fraction": scattered * halo_share(name, calibration=calibration),
     }
-    return make_psf(
-        data,
-        pixel_scale=scale * ANGLE,
-        oversampling=oversampling,
-        frame="detector",
-        includes=effects,
-        filter=name,
-        total_known=True,
-        position=position,
-        subarray=None if position is None else subarray,
-        meta={**telescope.meta, **meta},
-    )
+    form = {"pixel_scale": scale * ANGLE, "oversampling": oversampling, "frame": "detector"}
+    form |= {"filter": name, "total_known": True, "meta": {**telescope.meta, **meta}}
+    form |= {"position": position, "subarray": None if position is None else subarray}
+    return make_psf(data, includes=effects, **form)

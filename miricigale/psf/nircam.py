@@ -63,13 +63,10 @@ def nircam_psf(filter, *, oversampling=4, fov=None, wavefront_error=75 * u.nm, s
     data = telescope.image(cell, odd_cells(width, cell))
     jitter = jwst_constants()["jitter"] / scale
     data = detector_response(data, oversampling=oversampling, jitter=jitter)
-    return make_psf(
-        data * oversampling**2,
-        pixel_scale=scale * ANGLE,
-        oversampling=oversampling,
-        frame="detector",
-        includes=("jitter", "pixel"),
-        filter=name,
-        total_known=True,
-        meta={"instrument": "NIRCam", **telescope.meta},
-    )
+    form = {"pixel_scale": scale * ANGLE, "oversampling": oversampling, "frame": "detector"}
+    form |= {
+        "filter": name,
+        "total_known": True,
+        "meta": {"instrument": "NIRCam", **telescope.meta},
+    }
+    return make_psf(data * oversampling**2, includes=("jitter", "pixel"), **form)

@@ -112,18 +112,15 @@ def combine(reducer, images, backgrounds, rates, wcs, pixel_scale, align, planes
         mosaic.meta[f"mosaic_{key}"] = mosaic.meta.pop(key, None)
         if key in drizzled.image.meta:
             mosaic.meta[key] = drizzled.image.meta[key]
-    return ReductionResult(
+    made = (
         tuple(rates),
         tuple(images),
         tuple(backgrounds),
         mosaic,
         drizzled.weight,
         drizzled.n_images,
-        mosaic_background,
-        subtracted,
-        tuple(notes),
-        drizzled.variances,
     )
+    return ReductionResult(*made, mosaic_background, subtracted, tuple(notes), drizzled.variances)
 
 
 def _reasons(backgrounds):

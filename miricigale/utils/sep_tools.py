@@ -150,18 +150,10 @@ def extract(
         err = np.where(bad, err.dtype.type(1), err)
     # sep's buffer of detected pixels never overflows
     sep.set_extract_pixstack(max(data.size, sep.get_extract_pixstack()))
-    return sep.extract(
-        data,
-        float(threshold),
-        err=err,
-        mask=mask,
-        minarea=check_count(min_area, "min_area"),
-        filter_kernel=None if filter_kernel is None else native(filter_kernel),
-        filter_type="conv",
-        deblend_nthresh=int(deblend_n_thresholds),
-        deblend_cont=float(deblend_contrast),
-        segmentation_map=True,
-    )
+    form = {"err": err, "mask": mask, "minarea": check_count(min_area, "min_area")}
+    form |= {"deblend_nthresh": int(deblend_n_thresholds), "deblend_cont": float(deblend_contrast)}
+    form["filter_kernel"] = None if filter_kernel is None else native(filter_kernel)
+    return sep.extract(data, float(threshold), filter_type="conv", segmentation_map=True, **form)
 
 
 def window_positions(data, x, y, width, *, mask=None):

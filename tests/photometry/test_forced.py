@@ -267,7 +267,14 @@ def test_templates_that_did_not_move_are_taken_as_they_are(tools, monkeypatch):
     more.reuse(shifted)
     second = list(more.blocks())
     assert set(made) <= changed
-    for found, own in ((first, shifted), (second, more), (before, bank)):
+    # a bank without one of the points, and with another
+    fewer = bank.with_points(xy[[0, 3]] + 0.3, poly[[0, 3]]).shifted(
+        np.append(moved, np.zeros((2, 2)), 0)
+    )
+    fewer.reuse(more)
+    third = list(fewer.blocks())
+    assert set(made) <= changed
+    for found, own in ((first, shifted), (second, more), (third, fewer), (before, bank)):
         own.forget()
         for one, two in zip(found, own.blocks(), strict=True):
             assert_array_equal(one.values, two.values)

@@ -17,6 +17,7 @@ from miricigale.photometry import (
     ForcedPhotometer,
     SourceTemplates,
     detect_sources,
+    residual_sources,
 )
 from miricigale.photometry.catalogs import joined_sky
 
@@ -42,7 +43,11 @@ def crowd(tools):
 
 
 @pytest.mark.parametrize("moved", [False, True])
-def test_second_pass_finds_what_the_catalogue_lacks(tools, crowd, moved):
+def test_second_pass_finds_what_the_catalogue_lacks(tools, crowd, moved, monkeypatch):
+    if moved:
+        # as of very many pixels: strips, and the noise of some of their rows
+        monkeypatch.setattr(residual_sources, "_ROWS", 48)
+        monkeypatch.setattr(residual_sources, "_SOME", 20_000)
     ids = np.arange(300, 381)[::-1]
     # a catalogue that is wrong by (0.05, -0.03) arcsec lists new sources in its own frame
     offset = ([0.05, -0.03] if moved else [0.0, 0.0]) * u.arcsec
@@ -75,6 +80,19 @@ def test_second_pass_finds_what_the_catalogue_lacks(tools, crowd, moved):
     # the errors are those of a catalogue that has them all
     full = tools.measured(crowd.image, joined_sky([crowd.sky, crowd.hidden]))
     assert_allclose(result.flux_err.value, full.flux_err.value[:81], rtol=0.05)
+
+
+def test_what_is_left_has_its_flux_and_place(tools, crowd, monkeypatch):
+    """Two points that stand alone, and are not in the catalog, on the residual."""
+    found, plain = [], residual_sources.residual_peaks
+    keep = lambda *args: found.append(plain(*args)) or found[-1]  # noqa: E731
+    monkeypatch.setattr("miricigale.photometry.diagnostics.residual_peaks", keep)
+    result = tools.measured(crowd.image, crowd.sky)
+    xy = np.transpose(result.residual_image.wcs.world_to_pixel(crowd.hidden[-2:]))
+    distance = np.linalg.norm(found[-1].refined - xy[:, None], axis=2)
+    near = distance.argmin(axis=1)
+    assert np.all(distance.min(axis=1) < 0.3)
+    assert_allclose(found[-1].flux[near], crowd.hidden_flux[-2:], rtol=0.15)
 
 
 def test_second_pass_with_nothing_to_find_changes_nothing(tools, field):

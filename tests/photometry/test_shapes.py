@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose
 from helpers.light import gaussian_image
 from miricigale.photometry.light import cutouts
 from miricigale.photometry.shape_models import ShapeModels
-from miricigale.photometry.shapes import ShapeFitter
+from miricigale.photometry.shapes import Beside, ShapeFitter
 from miricigale.profiles import sersic_image
 
 SCALE = 0.06  # arcsec per pixel
@@ -134,20 +134,38 @@ def test_galaxies_that_overlap_are_recovered_together():
     assert_allclose(free, np.std(drawn), rtol=0.25)
 
 
+def test_light_of_a_neighbor_beyond_the_stamp_is_where_it_is():
+    """As the renderer has it within 16 pixels of its center; transforms are periodic."""
+    fitter, x, y = ShapeFitter(gaussian_psf(), SCALE), 44.3, 14.8
+    stamp = fitter._stamp(*np.ones((2, 33, 33)), np.array([[16.0, 16.0]]), 16)
+    parameters = np.array([[x, y, np.log(3.0), 0.0, 0.0, 0.0], [x + 60, y, np.log(3.0), 0, 0, 0]])
+    found = stamp.changes(Beside(np.array([5.0, 5.0]), parameters, np.eye(14)))
+    near, far = found.reshape(2, 7, 33, 33)
+    truth = galaxy((33, 60), x, y, r_eff=3.0, n=1.0)
+    truth[:, : round(x) - 16] = 0.0
+    truth[round(y) + 17 :] = 0.0
+    assert_allclose(near[0], truth[:, :33], atol=1e-4 * truth.max())
+    assert near[0].max() > 2e-3 * truth.max()
+    assert not far.any()
+
+
 def test_evidence_is_the_integral_over_light_and_center():
     from miricigale.photometry._core.shape_fits import evidence_of
 
     fitter, rng = ShapeFitter(gaussian_psf(), SCALE), np.random.default_rng(3)
     truth = np.array([16.2, 15.9, np.log(2.5), 0.0, 0.2, -0.1])
     light = 600 * fitter.profiles((33, 33), truth)[0] + rng.normal(0, 1.0, (33, 33))
-    stamp = fitter._stamp(light, np.ones_like(light), truth[None], 16)
+    # of a part of the source: the light goes with the center
+    weight = np.where(np.arange(33) < 18, 1.0, 0.0) * np.ones((33, 1))
+    light *= weight
+    stamp = fitter._stamp(light, weight, truth[None], 16)
     mean, width = truth + [0.03, -0.02, 0, 0, 0, 0], 0.05
     best = stamp.minimum(truth[None], mean[None], np.eye(2)[None] / width**2)
     shapes = truth[2:] + [[0, 0, 0, 0], [0.03, -0.02, 0.02, 0.0]]
     prior = mean[None], np.eye(2)[None] / width**2
     none = np.zeros((0, light.size))
     # a prior that is twice as wide about the same values holds a quarter of its density there
-    flat = [stamp.minimum(best[2], best[2], np.eye(2)[None] / w**2)[3] for w in (5.0, 10.0)]
+    flat = [stamp.minimum(best[2], best[2], np.eye(2)[None] / w**2)[3] for w in (50.0, 100.0)]
     assert_allclose(flat[0] - flat[1], 2 * np.log(2), rtol=1e-4)
     found = evidence_of(*stamp.pixels, best[2], best[1], shapes, *prior, none)
     step = 0.008
@@ -156,7 +174,8 @@ def test_evidence_is_the_integral_over_light_and_center():
         total = most = at_most = 0.0
         for dx in grid:
             for dy in grid:
-                model = fitter.profiles((33, 33), [*(mean[:2] + [dx, dy]), *shape])[0].ravel()
+                model = fitter.profiles((33, 33), [*(mean[:2] + [dx, dy]), *shape])[0]
+                model = (model * weight).ravel()
                 power, seen = model @ model, model @ light.ravel()
                 # the light is flat in its logarithm, and well known
                 fit = seen / power
@@ -166,7 +185,31 @@ def test_evidence_is_the_integral_over_light_and_center():
                 most, at_most = max((most, at_most), (inside, fit))
         expected = np.log(total * step**2 / (2 * np.pi * width**2)) - 0.5 * light.size
         assert_allclose(value, expected, atol=0.02)
-        assert_allclose(flux, np.log(at_most), atol=2e-5)
+        # the light goes with the center, which the grid has to half a step
+        assert_allclose(flux, np.log(at_most), atol=4e-4)
+
+
+def test_neighbors_that_may_change_take_power_from_the_evidence():
+    """At the best light and a fixed center only the error of the light is larger, by what they share of it."""
+    from miricigale.photometry._core.shape_fits import evidence_of
+
+    fitter, rng = ShapeFitter(gaussian_psf(), SCALE), np.random.default_rng(4)
+    truth = np.array([16.2, 15.9, np.log(2.5), 0.0, 0.2, -0.1])
+    model = fitter.profiles((33, 33), truth)[0]
+    stamp = fitter._stamp(
+        90 * model + rng.normal(size=(33, 33)), np.ones((33, 33)), truth[None], 16
+    )
+    prior = truth[None], 1e12 * np.eye(2)[None]
+    _, flux, best, *_ = stamp.minimum(truth[None], *prior)
+    beside = 0.02 * rng.normal(size=(3, model.size)) + 0.4 * model.ravel() / np.linalg.norm(model)
+    alone, free = (
+        evidence_of(*stamp.pixels, best, flux, best[:, 2:], *prior, one)[0]
+        for one in (beside[:0], beside)
+    )
+    power, shared = np.sum(model**2, dtype=float), beside @ model.ravel()
+    more = -0.5 * np.log(1 - shared @ shared / power)
+    assert more > 0.2
+    assert_allclose(free - alone, [more, 0.0], atol=1e-4)
 
 
 @pytest.mark.parametrize(("snr", "share"), [(8, 0.7), (30, 0.95)])

@@ -198,13 +198,14 @@ def test_a_blend_is_solved_as_by_dense_algebra(tools, blend, monkeypatch):
     original = forced.package
 
     def keep(fit, *args, **kwargs):
-        kept.append(fit)
+        # its images become the result's
+        kept.extend([fit, fit.arrays.flux * fit.inverse_sigma, fit.inverse_sigma.copy()])
         return original(fit, *args, **kwargs)
 
     monkeypatch.setattr(forced, "package", keep)
     result = ForcedPhotometer(tools.kernel, errors=settings(size_scatter=0.1)).measure(*blend)
     exact = ForcedPhotometer(tools.kernel, errors=settings(size_scatter=None)).measure(*blend)
-    fit = kept[0]
+    fit, white_data, inverse = kept[:3]
     templates, changes = (
         stamps_of(one, blend[0].shape).reshape(len(one.order), -1)
         for one in (fit.bank, fit.free.bank)
@@ -213,13 +214,13 @@ def test_a_blend_is_solved_as_by_dense_algebra(tools, blend, monkeypatch):
     member = fit.bank.order[fit.rows]
     assert len(fit.free.owner) >= 4
     columns = fit.free.basis.T @ np.concatenate([templates, changes])
-    inverse = fit.inverse_sigma.ravel()
+    inverse = inverse.ravel()
     prior = np.sqrt(fit.free.prior)
     # the prior of each change is the flux of the fit with exact templates
     known = np.unique(1 / prior[len(member) :])
     assert np.all(np.min(np.abs(known[:, None] / exact.flux.value - 1), axis=1) < 1e-6)
     white = np.concatenate([(columns * inverse).T, np.diag(prior)])
-    data = np.concatenate([(fit.arrays.flux * fit.inverse_sigma).ravel(), np.zeros(len(columns))])
+    data = np.concatenate([white_data.ravel(), np.zeros(len(columns))])
     solution = np.linalg.lstsq(white, data)[0]
     # of a template that is an image the power of its noise is taken off besides
     assert_allclose(result.flux.value[member], solution[: len(member)], rtol=5e-4)

@@ -9,7 +9,8 @@ from miricigale.utils.compilation import njit
 
 #: How square images are made from transforms, by products of small matrices: frequencies kx and ky (rad per pixel)
 #: at ky >= 0, then at ky <= 0, (2 ny nx,), what their squares count in the sum over all pixels; the PSF's
-#: transform, (2, ny, nx); cosines and sines along y, (size, 2 ny), and along x, (2 nx, size).
+#: transform, (2, ny, nx); cosines and sines along y, (2, size, 2 ny), and along x, (2, 2 nx, size), and their
+#: derivatives to the place.
 Plan = collections.namedtuple("Plan", "kx ky weight response inner outer")
 
 
@@ -44,25 +45,12 @@ def make_plan(size, transform, passed):
     ky, kx = np.meshgrid(*(2 * np.pi / period * np.arange(k) for k in (ny, nx)), indexing="ij")
     along, across = np.arange(size)[:, None] * ky[:, 0], kx[0, :, None] * np.arange(size)
     inner, outer = np.exp(1j * along), np.exp(1j * across)
-    real = np.tile(kx.ravel(), 2), np.append(ky, -ky), weight
-    products = np.hstack([inner.real, inner.imag]), np.vstack([outer.real, -outer.imag])
-    kx, ky, weight, inner, outer = (one.astype(np.float32) for one in (*real, *products))
+    # images move against the pixels
+    inner = [np.hstack([one.real, one.imag]) for one in (inner, -1j * ky[:, 0] * inner)]
+    outer = [np.vstack([one.real, -one.imag]) for one in (outer, -1j * kx[0, :, None] * outer)]
+    real = np.tile(kx.ravel(), 2), np.append(ky, -ky), weight, np.array(inner), np.array(outer)
+    kx, ky, weight, inner, outer = (one.astype(np.float32) for one in real)
     return Plan(kx, ky, weight, response.astype(np.complex64), inner, outer)
-
-
-@njit(cache=True, nogil=True)
-def _buffers(plan, n_curves, n):
-    """
-    Arrays to draw n images of as many curves in, or of two more: derivatives of the first to the place.
-
-    Transforms of profiles at +-ky; sums and differences of the two, real and imaginary parts, that cosines and
-    sines along y are multiplied with; their products; and the images, (size, n, size).
-    """
-    (_, ny, nx), size = plan.response.shape, len(plan.inner)
-    curves = np.empty((n_curves, 2, ny, nx), np.float32)
-    right = np.empty((2 * ny, n, 2, nx), np.float32)
-    middle = np.empty((size * n, 2 * nx), np.float32)
-    return curves, right, middle, np.empty((size, n, size), np.float32)
 
 
 @njit(cache=True, nogil=True)
@@ -80,33 +68,33 @@ def _placed(plan, xy):
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _images(plan, placed, buffers):
-    """Draw images of transforms; if there is space for two more, the first moved along x and y after it."""
-    curves, right, middle, images = buffers
-    (n_curves, _, ny, nx), n = curves.shape, images.shape[1]
-    more = n - n_curves
-    for c in range(n_curves):
-        to = c + more if c else 0
+def _images(plan, curves, placed, n_moved):
+    """
+    Draw images, (size, n + 2 n_moved, size), of transforms, (n, 2, ny, nx).
+
+    The first ``n_moved`` are followed by their derivatives to x, those to y, and the others.
+    """
+    (n, _, ny, nx), size = curves.shape, plan.inner.shape[1]
+    # sums and differences of the two at +-ky, real and imaginary parts
+    right = np.empty((2 * ny, n, 2 * nx), np.float32)
+    for c in range(n):
         for i in range(ny):
             for j in range(nx):
                 above = curves[c, 0, i, j] * placed[0, i, j]
                 below = curves[c, 1, i, j] * placed[1, i, j]
-                right[i, to, 0, j] = above.real + below.real
-                right[i, to, 1, j] = above.imag + below.imag
-                right[ny + i, to, 0, j] = below.imag - above.imag
-                right[ny + i, to, 1, j] = above.real - below.real
-    # times - i kx and - i ky
-    for i in range(ny if more else 0):
-        for j in range(nx):
-            kx, ky = plan.kx[j], plan.ky[i * nx]
-            for part in range(2):
-                for row in (i, ny + i):
-                    right[row, 1, part, j] = (kx - 2 * part * kx) * right[row, 0, 1 - part, j]
-                right[i, 2, part, j] = -ky * right[ny + i, 0, part, j]
-                right[ny + i, 2, part, j] = ky * right[i, 0, part, j]
-    size = len(images)
-    np.dot(plan.inner, right.reshape(2 * ny, -1), middle.reshape(size, -1))
-    np.dot(middle, plan.outer, images.reshape(size * n, -1))
+                right[i, c, j] = above.real + below.real
+                right[i, c, nx + j] = above.imag + below.imag
+                right[ny + i, c, j] = below.imag - above.imag
+                right[ny + i, c, nx + j] = above.real - below.real
+    middle = np.dot(plan.inner[0], right.reshape(2 * ny, -1)).reshape(size, n, 2 * nx)
+    images = np.dot(middle.reshape(-1, 2 * nx), plan.outer[0])
+    middle = np.ascontiguousarray(middle[:, :n_moved])
+    along_x = np.dot(middle.reshape(-1, 2 * nx), plan.outer[1])
+    middle = np.dot(plan.inner[1], np.ascontiguousarray(right[:, :n_moved]).reshape(2 * ny, -1))
+    along_y = np.dot(middle.reshape(-1, 2 * nx), plan.outer[0])
+    images, form = images.reshape(size, n, size), (size, n_moved, size)
+    moved = along_x.reshape(form), along_y.reshape(form)
+    return np.concatenate((images[:, :n_moved], *moved, images[:, n_moved:]), axis=1)
 
 
 @njit(cache=True, nogil=True)
@@ -129,28 +117,26 @@ def draw_curves(plan, curves, x, y, more):
     -------
     images : float32 `~numpy.ndarray`, shape (size, n + more, size)
     """
-    buffers = _buffers(plan, len(curves), len(curves) + more)
-    buffers[0].reshape(len(curves), -1)[:] = curves
-    _images(plan, _placed(plan, np.array([[x, y]]))[0], buffers)
-    return buffers[3]
+    _, ny, nx = plan.response.shape
+    placed = _placed(plan, np.array([[x, y]]))[0]
+    return _images(plan, curves.reshape(-1, 2, ny, nx), placed, more // 2)
 
 
 @njit(cache=True, nogil=True)
-def _products(plan, table, inverse, corners, shapes, placed, buffers, columns):
+def _products(plan, table, inverse, corners, shapes, placed, columns):
     """Write whitened models and derivatives into all columns but the last; products of all columns."""
-    images = buffers[3]
-    size, k, width = len(images), images.shape[1], inverse.shape[1]
+    k, (_, ny, nx), width = (len(columns) - 1) // len(shapes), plan.response.shape, inverse.shape[1]
     left, top = corners[:, 0].min(), corners[:, 1].min()
+    curves = np.empty((5 if k == 7 else 1, 2, ny, nx), np.float32)
     for s in range(len(shapes)):
         x, y = corners[s]
-        curves = buffers[0].reshape(len(buffers[0]), -1)
-        fill_curves(plan.kx, plan.ky, shapes[s], table, curves)
-        _images(plan, placed[s], buffers)
-        for row in range(size):
+        fill_curves(plan.kx, plan.ky, shapes[s], table, curves.reshape(len(curves), -1))
+        images = _images(plan, curves, placed[s], min(k - 1, 1))
+        for row in range(len(images)):
             first = (y - top + row) * width + x - left
             for j in range(k):
                 # by pixel: expressions of short pieces of arrays take longer than their pixels
-                for i in range(size):
+                for i in range(len(images)):
                     noise = inverse[y - top + row, x - left + i]
                     columns[s * k + j, first + i] = images[row, j, i] * noise
     return np.dot(columns, columns.T)
@@ -226,12 +212,11 @@ def minimum(plan, table, white, inverse, corners, start, mean, precision, limits
     k = 1 + m
     columns = np.zeros((n * k + 1, white.size))
     columns[-1] = white.reshape(-1)
-    buffers = _buffers(plan, 5 if m == 6 else 1, k)
     flux, matrix, slope = np.zeros(n), np.eye(n * k), np.zeros(n * k)
     trial, parameters, chi2, damping = start, start, np.inf, 0.1
     while True:
         placed = _placed(plan, trial[:, :2] - corners)
-        products = _products(plan, table, inverse, corners, trial[:, 2:], placed, buffers, columns)
+        products = _products(plan, table, inverse, corners, trial[:, 2:], placed, columns)
         state = _state(products, trial, mean, precision)
         if state[0] <= chi2:
             parameters, (chi2, flux, matrix, slope) = trial, state
@@ -265,6 +250,21 @@ def minimum(plan, table, white, inverse, corners, start, mean, precision, limits
     return chi2, flux, parameters, evidence, covariance, matrix
 
 
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _center_products(images, s, inverse, white, products):
+    """Products, (3, 4), of a whitened model and its derivatives to the center, with these and the data."""
+    aa = ab = ac = ad = bb = bc = bd = cc = cd = 0.0
+    n = images.shape[1] // 3
+    for row in range(len(images)):
+        for i in range(len(images)):
+            noise, d = inverse[row, i], white[row, i]
+            a, b, c = images[row, s, i], images[row, n + s, i], images[row, 2 * n + s, i]
+            a, b, c = a * noise, b * noise, c * noise
+            aa, ab, ac, ad = aa + a * a, ab + a * b, ac + a * c, ad + a * d
+            bb, bc, bd, cc, cd = bb + b * b, bc + b * c, bd + b * d, cc + c * c, cd + c * d
+    products[0], products[1], products[2] = (aa, ab, ac, ad), (ab, bb, bc, bd), (ac, bc, cc, cd)
+
+
 @njit(cache=True, nogil=True)
 def evidence_of(plan, table, white, inverse, corners, best, flux, shapes, mean, precision, beside):
     """
@@ -289,30 +289,40 @@ def evidence_of(plan, table, white, inverse, corners, best, flux, shapes, mean, 
         Ln of the likelihood, integrated over a light that is flat in its logarithm, and ln flux; -1e9 and 0
         where no positive light fits.
     """
-    buffers, parameters, columns = _buffers(plan, 1, 3), best.copy(), np.empty((4, white.size))
-    columns[-1] = white.reshape(-1)
-    found, known = np.zeros((len(shapes), 2)), np.empty(len(beside))
-    placed, log_prior = _placed(plan, best[:, :2] - corners), np.linalg.slogdet(precision[0])[1]
+    _, ny, nx = plan.response.shape
     # the best one first
-    for s in range(-1 if len(beside) else 0, len(shapes)):
-        if s >= 0:
-            parameters[0, 2:] = shapes[s]
-        form = parameters[:, 2:]
-        products = _products(plan, table, inverse, corners, form, placed, buffers, columns)
+    shapes = np.concatenate((best[:, 2:], shapes))
+    curves = np.empty((len(shapes), 2, ny, nx), np.float32)
+    for s in range(len(shapes)):
+        fill_curves(plan.kx, plan.ky, shapes[s], table, curves[s].reshape(1, -1))
+    images = _images(plan, curves, _placed(plan, best[:, :2] - corners)[0], len(shapes))
+    found, known = np.zeros((len(shapes), 2)), np.zeros(len(beside))
+    products, columns, data = np.empty((3, 4)), np.empty((3, white.size)), np.sum(white**2)
+    log_prior, off = np.linalg.slogdet(precision[0])[1], (best - mean)[0, :2]
+    pull = precision[0] @ off
+    for s in range(len(shapes)):
+        _center_products(images, s, inverse, white, products)
         if len(beside):
+            # neighbors' light that was taken off is the best together with this one's
+            for j in range(3):
+                columns[j] = (images[:, j * len(shapes) + s] * inverse).reshape(-1)
             shared = columns @ beside.T
-            if s < 0:
+            if s == 0:
                 known = flux * shared[0]
-                continue
-            # the neighbors' light that was taken off is the best together with this one's
-            shared[-1] = known
-            products -= shared @ shared.T
-        chi2, light, matrix, slope = _state(products, parameters, mean, precision)
+                data -= known @ known
+            products[:, :3] -= shared @ shared.T
+            products[:, 3] -= shared @ known
         found[s, 0] = -1e9
-        if light[0] > 0:
+        power, seen = products[0, 0], products[0, 3]
+        if power > 0 and seen > 0:
             # the center: changes of the pixels are in proportion to the light
+            light, own = seen / power, products[1:, 0]
+            slope = light * (products[1:, 3] - light * own) - pull
+            matrix = precision[0] + light**2 * (products[1:, 1:3] - np.outer(own, own) / power)
             step = np.linalg.solve(matrix, slope)
-            evidence = slope @ step - chi2 - np.linalg.slogdet(matrix)[1] + log_prior
-            found[s, 1] = np.log(max(light[0] + step[0], 0.1 * light[0]))
+            chi2 = data - light * seen + off @ pull
+            log_det = np.linalg.slogdet(matrix)[1] + np.log(power)
+            evidence = slope @ step - chi2 - log_det + log_prior
+            found[s, 1] = np.log(light * max(1 - np.sum(own * step) / power, 0.1))
             found[s, 0] = 0.5 * evidence - found[s, 1]
-    return found
+    return found[1:]
