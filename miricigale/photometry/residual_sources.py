@@ -97,7 +97,9 @@ def residual_peaks(fit, residual, model, xy):
         near = np.flatnonzero(distance < _LEFT_REACH * full_width)
         for rows in (near[part] for part in chunks(len(near), _CANDIDATES // 10)):
             mirror = np.rint(2 * placed[nearest[rows]] - pixel[rows]).astype(int)
-            distance[rows[matched.light_at(*mirror.T[::-1]) > 0.5 * light[rows]]] = 0.0
+            even = matched.light_at(*mirror.T[::-1]) > 0.5 * light[rows]
+            even &= np.all((mirror >= 0) & (mirror < residual.shape[::-1]), axis=1)
+            distance[rows[even]] = 0.0
     apart = distance >= _LEFT_DISTANCE * full_width
     pixel, light, refined = pixel[apart], light[apart], refined[apart]
     lone = np.ones(len(pixel), bool)
