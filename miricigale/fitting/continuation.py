@@ -15,7 +15,7 @@ from scipy.stats import qmc
 
 from miricigale.fitting import _core
 from miricigale.fitting.grid import GridEngine
-from miricigale.fitting.interpolation import Nodes
+from miricigale.fitting.interpolation import InterpolatedModels, grid_models
 from miricigale.fitting.posterior import cell_edges
 from miricigale.fitting.samplers.run import systematic_draws
 from miricigale.utils.random import stream
@@ -40,23 +40,21 @@ class Continuation(Frozen):
     ----------
     engine : `~miricigale.fitting.grid.GridEngine`
         Its models and priors.
-    nodes, finer : `~miricigale.fitting.interpolation.Nodes`
-        Its models, and those of a grid with more nodes between which models are interpolated: of the same, if
-        there is none.
+    models : `~miricigale.fitting.interpolation.InterpolatedModels`
+        Models between its nodes.
     agn_error : float
         Error of the AGN's light as a part of it.
     """
 
     engine: GridEngine
-    nodes: Nodes
-    finer: Nodes
+    models: InterpolatedModels
     agn_error: float = 0.0
 
     @cached_property
     def cells(self):
         """Edges of the cells around nodes of redshift, AGN fraction, axes of galaxies and of AGN: dict by name."""
-        kinds, out = self.nodes.kinds, {}
-        for name in ("redshift", "frac_agn", *kinds["galaxy"].names, *kinds["agn"].names):
+        out = {}
+        for name in self.models.parameters:
             axis = self.engine.priors.axes.get(name)
             values = self.engine.grid.frac_agn if axis is None else axis.values
             out[name] = cell_edges(values)
@@ -67,7 +65,7 @@ class Continuation(Frozen):
     @cached_property
     def space(self):
         """`_core.Space` of the cells."""
-        finer, size = self.finer, np.array([len(e) - 1 for e in self.cells.values()], np.int64)
+        size = np.array([len(e) - 1 for e in self.cells.values()], np.int64)
         edge, log_prior = np.zeros((len(size), max(size) + 1)), np.zeros((len(size), max(size)))
         for i, (name, edges) in enumerate(self.cells.items()):
             edge[i, : len(edges)] = edges
@@ -75,9 +73,9 @@ class Continuation(Frozen):
             if axis is not None and axis.kind in ("frac_agn", "agn"):
                 none = np.full(size[i], _core.NEVER)
                 log_prior[i, : size[i]] = np.log(axis.weights, where=axis.weights > 0, out=none)
-        lit, galaxy = finer.kinds["galaxy"].lit[-1], self.nodes.kinds["galaxy"].model.ravel()
-        of_finer = finer.log_z, np.array(finer.allowed), *finer.kernels.values(), int(lit)
-        return _core.Space(size, edge, log_prior, galaxy, *of_finer)
+        axes = self.engine.priors.axes
+        galaxy = grid_models(axes, "galaxy", self.engine.grid.n_galaxies)
+        return _core.Space(size, edge, log_prior, galaxy.ravel(), galaxy.ndim, self.models.light)
 
     @cached_property
     def library(self):
@@ -91,17 +89,18 @@ class Continuation(Frozen):
         return x, *made
 
     def _work(self):
-        return _core.make_work(len(self.cells), self.finer.kinds["galaxy"].flux.shape[2])
+        return self.models.make_work()
 
     @cached_property
     def _values(self):
         """Values of the models of the grid by kind: dicts by name; of those with several values the first."""
         out = {}
-        for kind, own in self.nodes.kinds.items():
-            models, first = np.unique(own.model, return_index=True)
-            place = np.unravel_index(first[models >= 0], own.model.shape) if own.names else ()
-            known = zip(own.names, place, strict=True)
-            out[kind] = {name: self.nodes.axes[name].values[i] for name, i in known}
+        axes = self.engine.priors.axes
+        for kind in ("galaxy", "agn"):
+            names = [name for name, axis in axes.items() if axis.kind == kind]
+            # of models that stand for several values the first
+            first = [axes[name].share.argmax(axis=0) for name in names]
+            out[kind] = {name: axes[name].values[i] for name, i in zip(names, first, strict=True)}
         return out
 
     def at_redshift(self, redshift, node):
@@ -109,7 +108,12 @@ class Continuation(Frozen):
         engine, new = self.engine, {"usable": self.engine.usable[node : node + 1]}
         for kind, values in self._values.items():
             z = np.full(getattr(engine, kind).shape[1], redshift)
-            new[kind] = self.finer.one_kind(kind, values, z)[0][None] if z.size else engine.agn[:1]
+            if not z.size:
+                new[kind] = engine.agn[:1]
+            elif kind == "galaxy":
+                new[kind] = self.models.galaxy_fluxes(values, z)[None]
+            else:
+                new[kind] = self.models.agn_fluxes(values, z)[None]
         density, prior = engine.density, engine.mass_prior
         new["template_error"] = engine.template_error[node : node + 1]
         if density is not None:
@@ -191,10 +195,10 @@ class Continuation(Frozen):
         scale = self.engine.drawn_scale(scale, variance, rng)
         if wrong:
             some = {name: value[rare] for name, value in values.items()}
-            flux = self.finer.fluxes(some, some["redshift"], some["frac_agn"])[0]
+            flux = self.models.fluxes(some, some["redshift"], some["frac_agn"])[0]
             z, flux = 0 if one.redshift else node["redshift"][rare], flux * scale[rare, None]
             share = self.engine.mixture.shares(flux, wrong[0], wrong[2], one.limits, z)
-        derived = self.finer.describe(values, values["redshift"], power, scale)
+        derived = self.models.describe(values, values["redshift"], power, scale)
         return values, node, derived, share
 
 

@@ -9,7 +9,7 @@ from miricigale.filters import FilterSet
 from miricigale.fitting.between import between_nodes
 from miricigale.fitting.continuation import Continuation
 from miricigale.fitting.grid import GridEngine
-from miricigale.fitting.interpolation import Nodes, finer_grid
+from miricigale.fitting.interpolation import InterpolatedModels
 from miricigale.fitting.likelihood import FitFlags, filter_names
 from miricigale.fitting.mixture import BandMixture
 from miricigale.fitting.populations import MassPrior, expected_sfr, sfr_log_prior
@@ -120,12 +120,13 @@ class GridFit:
         several = {name for name, axis in priors.axes.items() if axis.values.size > 1}
         if not interpolate or not several or "template" in several:
             return out
-        nodes = finest = Nodes.of_grid(grid, priors.axes)
-        if finer is not None:
+        if finer is None:
+            models = InterpolatedModels.of_grid(grid, priors.axes)
+        else:
             same = isinstance(filters, FilterSet) and tuple(filters.names) == grid.filters
             bands = filters if same else grid.filters
-            finest = finer_grid(finer, grid, bands, out.constants, nodes)
-        return replace(out, between=Continuation(engine, nodes, finest, float(settings.agn_error)))
+            models = InterpolatedModels.of_model(finer, grid, bands, out.constants, priors.axes)
+        return replace(out, between=Continuation(engine, models, float(settings.agn_error)))
 
     @property
     def chunk_size(self):
@@ -186,9 +187,8 @@ class GridFit:
             mass = [1e8, 1e10, 1e12] * MASS
             rates = [expected_sfr(relation, mass, one).tolist() for one in z[[0, -1]]]
             out["sfr_prior"] = {"scatter": scatter, "sfr": rates}
-        if between is not None and between.finer is not between.nodes:
-            axes = between.finer.axes.items()
-            out["finer"] = {name: int(axis.values.size) for name, axis in axes}
+        if between is not None:
+            out["tables"] = between.models.sizes
         return out
 
     def provenance(self):

@@ -1,307 +1,370 @@
 """
-Models between the nodes of a grid, interpolated from the nodes around them.
+Models between the nodes of a grid, interpolated in the parts in which their light is smooth.
 
-Logarithms of fluxes and of what is derived from models are parabolas through three nodes of each parameter, with
-products of the steps along two, on a scale of the parameter on which they are nearly straight. That of flux
-times z^2, without the distance at low redshift, is linear in ln(1 + z) between two redshifts. AGN fraction and
-mass enter in closed form. Nothing is said of what lies beyond the outermost nodes.
+Starlight, the dust's template and the AGN are tables of their own (`~miricigale.sed.light_parts`), each refined
+along its axes and in redshift until the interpolation is good; the burst enters linearly, and so does the power
+that dust takes. Of a grid whose model is unknown the whole galaxies are interpolated between its own nodes.
 """
 
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from dataclasses import dataclass
 
+import astropy.units as u
 import numpy as np
-from astropy.table import QTable
 
+from miricigale.filters import FilterSet
 from miricigale.fitting import _core
+from miricigale.fitting.model_tables import ModelTables
+from miricigale.fitting.part_tables import (
+    LEAST,
+    empty_part,
+    log_part_columns,
+    logarithms,
+    make_part,
+    part_columns,
+    straightest_power,
+    with_columns,
+)
 from miricigale.fitting.priors import grid_priors
-from miricigale.fitting.quantities import Quantities
-from miricigale.sed import ModelFlags
-from miricigale.utils.options import check_that
-from miricigale.utils.units import MASS
-
-#: Powers of a parameter, 1 or parts by 2, that may be its scale; those below 0 with the sign changed.
-_POWERS = (1.0, 0.5, 0.125, -0.5, -1.0)
-#: Fluxes below this part of a model's brightest band are interpolated as if they were it.
-_DARK = 1e-12
-#: Fluxes below this part of it are not compared with the chain.
-_FAINT = 1e-6
-#: Least of what is interpolated in the logarithm.
-_TINY = 1e-290
-#: Largest ln of a number.
-_LARGE = 690.0
-#: Most times that a finer grid is made.
-_ROUNDS = 3
-#: Errors count up to this: fluxes that change by more between nodes are faint.
-_MOST = 0.1
-#: Rms error of interpolated ln flux along an axis of a finer grid, and most galaxies or AGN at all redshifts.
-_TOLERANCE, _LARGEST = 0.005, 1 << 20
+from miricigale.fitting.quantities import Quantities, plain
 
 
 @dataclass(frozen=True, eq=False)
-class Kind:
-    """Galaxies or AGN: their axes, the model of each combination of values, and what is interpolated."""
+class _GalaxiesOfGrid:
+    """Derived quantities of galaxies interpolated between those of a grid."""
 
-    names: tuple
-    model: np.ndarray  # (n_1, n_2, ...), -1 where there is none
-    flux: np.ndarray  # (nz, n_models, nb + 1): ln(flux z^2), and the last row
-    rows: np.ndarray  # (1, n_models, n_rows): ln where lit
-    lit: np.ndarray  # (n_rows,): which have a logarithm
+    scaling: tuple
+    scaling_names: tuple
+    shape: tuple
+    shape_names: tuple
 
-    @classmethod
-    def of_axes(cls, axes, redshift, flux, rows):
-        """Of n models with fluxes (nz, n, nb) and other numbers (n_rows, n)."""
-        n = flux.shape[1]
-        model = np.full([a.values.size for a in axes], -1 if axes else 0)
-        if axes:
-            model[tuple(a.share.argmax(axis=0) for a in axes)] = np.arange(n)
-            # a model without effect of a parameter stands for all its values
-            many = sum(np.count_nonzero(a.share, axis=0) for a in axes) > len(axes)
-            for i in np.flatnonzero(many):
-                model[np.ix_(*(np.flatnonzero(a.share[:, i] > 0) for a in axes))] = i
-        top = flux.max(axis=-1, keepdims=True, initial=0.0)
-        flux = np.log(np.maximum(flux, np.maximum(_DARK * top, _TINY)))
-        flux += _two_ln(redshift)[:, None, None]
-        rows = np.array(rows, float).reshape(len(rows), n)
-        lit = np.all(rows > 0, axis=1)
-        with np.errstate(divide="ignore"):
-            rows = np.where(lit[:, None], np.log(rows), rows)
-        rows = rows.T[None].copy()
-        flux = np.concatenate([flux, np.repeat(rows[:, :, -1:], len(flux), axis=0)], axis=2)
-        return cls(tuple(a.name for a in axes), model, flux, rows, lit)
-
-    def bent(self, name, x):
-        """How far, on average, middle nodes of an axis are off lines between their neighbors on a scale ``x``."""
-        table, out = np.moveaxis(self.model, self.names.index(name), 0).reshape(x.size, -1), 0.0
-        # ln flux but for a factor, and what else is interpolated
-        two = self.flux[len(self.flux) // 2, :, :-1], self.rows[0][:, self.lit]
-        for k, numbers in enumerate(two):
-            for i, t in enumerate((x[1:-1] - x[:-2]) / (x[2:] - x[:-2])):
-                low, here, high = table[i : i + 3, (table[i : i + 3] >= 0).all(axis=0)]
-                off = numbers[here] - (1.0 - t) * numbers[low] - t * numbers[high]
-                out += np.abs(off if k else less_factor(off)).mean() if off.size else 0.0
-        return out
+    def quantities(self, light, values):
+        """As `ModelGalaxies.quantities`."""
+        scaling = part_columns(self.scaling, values).T
+        quantities = dict(zip(self.scaling_names, scaling, strict=True))
+        shape = log_part_columns(self.shape, values).T
+        return quantities | dict(zip(self.shape_names, shape, strict=True))
 
 
 @dataclass(frozen=True, eq=False)
-class Nodes:
-    """
-    The models of a grid, for models between them; picklable.
+class _Names:
+    """Names of the quantities of a grid, and what turns luminosities into W."""
 
-    ``axes`` are `~miricigale.fitting.priors.GridAxis` by name, ``kinds`` has a `Kind` of galaxies, whose last row
-    is what AGN fractions refer to, and one of AGN; ``allowed``, shape (nz, nG), are galaxies younger than the
-    universe.
-    """
-
-    axes: dict
-    quantities: Quantities
-    kinds: dict
-    allowed: np.ndarray
+    galaxy: tuple
+    galaxy_factors: tuple
+    agn: tuple
+    shape: tuple
 
     @classmethod
-    def of_grid(cls, grid, axes=None):
-        """Of a `~miricigale.sed.ModelGrid`, whose axes may be known."""
-        axes = grid_priors(grid).axes if axes is None else axes
-        known = Quantities.of_grid(grid)
-        of = known.fraction
-        galaxy = [*known.galaxy_scale, known.mixed_galaxy, np.asarray(grid.dust_luminosity)]
-        agn = [*known.agn_scale, known.mixed_agn]
-        if of is not None:
-            galaxy.insert(-1, of.galaxy)
-            agn.append(of.agn)
-        kinds = {}
-        for kind, flux, rows in (("galaxy", grid.galaxy, galaxy), ("agn", grid.agn, agn)):
-            own = [axis for axis in axes.values() if axis.kind == kind]
-            kinds[kind] = Kind.of_axes(own, grid.redshift, np.asarray(flux), rows)
-        axes = {name: replace(axis, share=None) for name, axis in axes.items()}
-        return cls(axes, known, kinds, np.asarray(grid.allowed))
-
-    def with_kind(self, kind, other):
-        """With the models of a kind, their axes and the redshifts of others."""
-        axes = {n: a for n, a in other.axes.items() if a.kind in ("redshift", kind)}
-        first, kinds = other if kind == "galaxy" else self, self.kinds | {kind: other.kinds[kind]}
-        return Nodes(self.axes | axes, first.quantities, kinds, first.allowed)
-
-    @cached_property
-    def kernels(self):
-        """`_core.Kind` of galaxies and of AGN, by kind."""
-        out = {}
-        for label, kind in self.kinds.items():
-            size = np.array([len(self.axes[name].values) for name in kind.names], np.int64)
-            scaled, power = np.zeros((len(size), max(size, default=1))), np.ones(len(size))
-            for a, name in enumerate(kind.names):
-                values = self.axes[name].values
-                if values.size > 2 and values[0] >= 0:
-                    powers = [p for p in _POWERS if p > 0 or values[0] > 0]
-                    bent = [kind.bent(name, _scaled(values, p)) for p in powers]
-                    power[a] = powers[np.argmin(bent)]
-                scaled[a, : values.size] = _scaled(values, power[a])
-            out[label] = _core.Kind(kind.flux, kind.model.ravel(), size, scaled, power)
-        return out
-
-    @cached_property
-    def log_z(self):
-        """ln(1 + z) of the nodes."""
-        return np.log1p(self.axes["redshift"].values)
-
-    def numbers(self, kind, values, redshift, table=None):
-        """Interpolate ln flux, or a table of the models, (1, n_models, n_rows), at values by name: (n, n_rows)."""
-        own, n, n_fluxes = self.kinds[kind], len(redshift), 0
-        if table is None:
-            table, n_fluxes = own.flux, own.flux.shape[2] - 1
-        places = np.empty((n, len(own.names)))
-        for i, name in enumerate(own.names):
-            places[:, i] = values.get(name, self.axes[name].values[0])
-        out, work = np.empty((n, table.shape[2])), _core.make_work(len(own.names), table.shape[2])
-        given = self.kernels[kind], table, self.log_z, places, np.array(redshift, float)
-        _core.interpolate(*given, n_fluxes, work, out)
-        return out
-
-    def one_kind(self, kind, values, redshift):
-        """Fluxes of models of a kind, shape (n, nb), and what they are interpolated with, (n,)."""
-        ln, lit = self.numbers(kind, values, redshift), self.kinds[kind].lit[-1]
-        more = np.exp(ln[:, -1]) if lit else np.maximum(ln[:, -1], 0.0)
-        return np.exp(ln[:, :-1] - _two_ln(redshift)[:, None]), more
-
-    def fluxes(self, values, redshift, frac):
-        """Fluxes of one solar mass formed, shape (n, nb), with AGN of given fractions, and their power."""
-        flux, dust = self.one_kind("galaxy", values, redshift)
-        power = frac / np.maximum(1.0 - frac, 1e-12) * dust
-        if np.any(frac > 0):
-            flux = flux + power[:, None] * self.one_kind("agn", values, redshift)[0]
-        return flux, power
-
-    def rows(self, kind, values, redshift):
-        """Rows of a kind at values by name: (n_rows, n)."""
-        own = self.kinds[kind]
-        out = self.numbers(kind, values, redshift, own.rows)
-        return np.where(own.lit, np.exp(np.clip(out, -_LARGE, _LARGE)), np.maximum(out, 0.0)).T
-
-    def describe(self, values, redshift, power, scale):
-        """Derived quantities of models of given AGN power and scale: dict by name."""
-        known, of = self.quantities, self.quantities.fraction
-        n, out, galaxy = len(known.galaxy_scale), {}, self.rows("galaxy", values, redshift)
-        out.update(zip(known.names, scale * galaxy[:n], strict=False))
-        total = scale * galaxy[n]
-        if self.kinds["agn"].flux.shape[1]:
-            agn, more = self.rows("agn", values, redshift), len(known.agn_scale)
-            out.update(zip(known.names[n:], scale * power * agn[:more], strict=False))
-            total, n = total + scale * power * agn[more], n + more
-            if of is not None:
-                odds = np.divide(power, galaxy[-1], out=np.zeros(power.size), where=galaxy[-1] > 0)
-                y = odds * galaxy[-2] * agn[-1]
-                out[of.name] = y / (1.0 + y)
-        out[known.names[n]] = total
-        shape = self.numbers("galaxy", values, redshift, known.shape.values.T[None].copy())
-        out.update(zip(known.shape.names, shape.T, strict=True))
-        return out
+    def of_grid(cls, grid):
+        factors = []
+        for column in grid.galaxy_properties.itercols():
+            unit = (getattr(column, "unit", None) or u.one) * u.Msun
+            factors.append(unit.to(u.W) if unit.is_equivalent(u.W) else 1.0)
+        return cls(
+            tuple(grid.galaxy_properties.colnames),
+            tuple(factors),
+            tuple(grid.agn_properties.colnames) if grid.n_agn else (),
+            tuple(grid.galaxy_shape.colnames),
+        )
 
 
-def finer_grid(model, grid, filters, constants, nodes):
+@dataclass(frozen=True, eq=False)
+class InterpolatedModels:
     """
-    Nodes of a grid of the same model, with cells halved until interpolation is good to 0.5 % along each axis.
+    Models between the nodes of a grid; picklable.
 
     Parameters
     ----------
-    model : `~miricigale.sed.SEDModel`
-        The model that made the grid.
-    grid : `~miricigale.sed.ModelGrid`
-    filters : list of str or `~miricigale.filters.FilterSet`
-        Bands of the grid.
-    constants : dict
-        Parameters of the grid with one value.
-    nodes : `Nodes`
+    parameters : tuple of str
+        Redshift, AGN fraction, the axes of galaxies, those of AGN: the order of values.
+    constants : `~numpy.ndarray`, shape (n_parameters,)
+        Value of each where none is given.
+    quantities : `~miricigale.fitting.quantities.Quantities`
         Of the grid.
+    light : `_core.Light`
+        Tables of the parts.
+    galaxies : `ModelGalaxies` or `_GalaxiesOfGrid`
+        Derived quantities.
+    agn_columns : `_core.Part`
+        Properties of the AGN.
+    names : `_Names`
+    bands : int
+        Number of bands.
+    """
+
+    parameters: tuple
+    constants: np.ndarray
+    quantities: Quantities
+    light: tuple
+    galaxies: object
+    agn_columns: tuple
+    names: _Names
+    n_bands: int
+
+    # ------------------------------------------------------------------------- making
+
+    @classmethod
+    def of_grid(cls, grid, axes=None):
+        """Between the nodes of a `~miricigale.sed.ModelGrid`, whose `GridAxis` by name may be known."""
+        axes = grid_priors(grid).axes if axes is None else axes
+        quantities = Quantities.of_grid(grid)
+        parameters = parameter_names(axes)
+        place = {name: i for i, name in enumerate(parameters)}
+        n_bands = len(grid.filters)
+        reference = np.asarray(grid.dust_luminosity, float)
+        model, values = _models_and_values(axes, "galaxy", grid.n_galaxies)
+        amount, reference = _saturating_reference(reference, model, values)
+        columns = np.column_stack([reference, reference])
+        flux = np.moveaxis(np.asarray(grid.galaxy), 0, 1)
+        table = logarithms(flux, columns, grid.redshift)
+        stars = _part_of_grid(table, model, values, grid.redshift, place)
+        names = _Names.of_grid(grid)
+        scaling_names = [*names.galaxy, "reference"]
+        scaling = [plain(column) for column in grid.galaxy_properties.itercols()]
+        scaling.append(np.asarray(grid.dust_luminosity, float))
+        scaling = np.log(np.maximum(np.array(scaling).T, LEAST))
+        shape = np.array([plain(column) for column in grid.galaxy_shape.itercols()], float)
+        shape = shape.reshape(len(names.shape), grid.n_galaxies).T
+        agn = empty_part(n_bands)
+        agn_columns = empty_part(len(names.agn))
+        if grid.n_agn:
+            model_agn, values_agn = _models_and_values(axes, "agn", grid.n_agn)
+            flux = np.moveaxis(np.asarray(grid.agn), 0, 1)
+            table = logarithms(flux, np.zeros((grid.n_agn, 0)), grid.redshift)
+            agn = _part_of_grid(table, model_agn, values_agn, grid.redshift, place)
+            columns = np.array([plain(column) for column in grid.agn_properties.itercols()])
+            agn_columns = with_columns(agn, np.log(np.maximum(columns.T, LEAST)))
+        light = _core.Light(
+            stars=stars,
+            burst=empty_part(n_bands + 2),
+            dust=empty_part(n_bands + 1),
+            agn=agn,
+            mixing=-1,
+            amount=-1 if amount is None else place[amount],
+            excess=-1,
+            age=-1,
+            youth=np.zeros(len(grid.redshift)),
+            by_dust=True,
+        )
+        galaxies = _GalaxiesOfGrid(
+            with_columns(stars, scaling),
+            tuple(scaling_names),
+            with_columns(stars, shape),
+            names.shape,
+        )
+        constants = np.array([_first_value(axes, grid, name) for name in parameters])
+        return cls(parameters, constants, quantities, light, galaxies, agn_columns, names, n_bands)
+
+    @classmethod
+    def of_model(cls, model, grid, filters, constants, axes=None):
+        """
+        Between the nodes of finer tables of the model that made a grid.
+
+        Parameters
+        ----------
+        model : `~miricigale.sed.SEDModel`
+        grid : `~miricigale.sed.ModelGrid`
+        filters : list of str or `~miricigale.filters.FilterSet`
+            Bands of the grid.
+        constants : dict of str to float
+            Parameters of the grid with one value.
+        axes : dict of str to `~miricigale.fitting.priors.GridAxis`, optional
+
+        Raises
+        ------
+        ValueError
+            If the model has other fluxes at the nodes of the grid.
+        """
+        axes = grid_priors(grid).axes if axes is None else axes
+        if not isinstance(filters, FilterSet):
+            filters = FilterSet.from_names(filters)
+        parameters = parameter_names(axes)
+        place = {name: i for i, name in enumerate(parameters)}
+        made = ModelTables(model, filters, constants, axes, place, grid.redshift)
+        made.check(grid)
+        light, galaxies, agn_columns = made.tables()
+        first = [_first_value(axes, grid, name) for name in parameters]
+        return cls(
+            parameters,
+            np.array(first),
+            Quantities.of_grid(grid),
+            light,
+            galaxies,
+            agn_columns,
+            _Names.of_grid(grid),
+            len(grid.filters),
+        )
+
+    # ------------------------------------------------------------------------- models
+
+    @property
+    def n_columns(self):
+        """Most columns of a table that fluxes are interpolated from."""
+        return self.light.stars.table.shape[2]
+
+    @property
+    def sizes(self):
+        """Number of models of each table: dict of str to int."""
+        names = ("stars", "burst", "dust", "agn")
+        return {name: len(getattr(self.light, name).table) for name in names}
+
+    def make_work(self):
+        """Scratch arrays of the kernels."""
+        return _core.make_work(len(self.parameters), self.n_columns)
+
+    def vector(self, values, redshift):
+        """Values by name, of shape (n,), in the order of ``parameters``: (n, n_parameters)."""
+        vector = np.tile(self.constants, (len(redshift), 1))
+        for i, name in enumerate(self.parameters):
+            if name in values:
+                vector[:, i] = values[name]
+        vector[:, 0] = redshift
+        return vector
+
+    def fluxes(self, values, redshift, frac):
+        """Fluxes of one solar mass formed, (n, nb), with AGN of fractions (n,), and the AGN's power, (n,)."""
+        redshift = np.asarray(redshift, float)
+        flux = np.empty((len(redshift), self.n_bands))
+        power = np.empty((2, len(redshift)))
+        vector = self.vector(values, redshift)
+        frac = np.broadcast_to(np.asarray(frac, float), redshift.shape)
+        work = self.make_work()
+        _core.interpolate_light(self.light, vector, redshift, frac.copy(), work, flux, power)
+        return flux, power[1]
+
+    def galaxy_fluxes(self, values, redshift):
+        """Fluxes of galaxies of one solar mass formed, shape (n, nb)."""
+        return self.fluxes(values, redshift, 0.0)[0]
+
+    def agn_fluxes(self, values, redshift):
+        """Fluxes of AGN of one watt, shape (n, nb)."""
+        redshift = np.asarray(redshift, float)
+        vector = self.vector(values, redshift)
+        flux = np.empty((len(redshift), self.n_bands))
+        _core.interpolate_columns(self.light.agn, vector, redshift, self.make_work(), flux)
+        return np.exp(flux) * np.maximum(redshift, 1e-6)[:, None] ** -2.0
+
+    def describe(self, values, redshift, power, scale):
+        """Derived quantities of models of AGN power (n,), for one solar mass, and scale (n,): dict by name."""
+        vector = self.vector(values, np.asarray(redshift, float))
+        galaxy = self.galaxies.quantities(self.light, vector)
+        names = self.names
+        described = {"mass": scale}
+        for name, factor in zip(names.galaxy, names.galaxy_factors, strict=True):
+            label = f"{name}_galaxy" if name in names.agn else name
+            described[label] = scale * galaxy[name] * factor
+        agn = {}
+        if names.agn:
+            columns = part_columns(self.agn_columns, vector).T
+            agn = dict(zip(names.agn, columns, strict=True))
+        for name in names.agn:
+            label = f"{name}_agn" if name in names.galaxy else name
+            described[label] = scale * power * agn[name]
+        both = [name for name in names.galaxy if name in names.agn]
+        if both:
+            described[both[0]] = described[f"{both[0]}_galaxy"] + described[f"{both[0]}_agn"]
+        else:
+            reference = galaxy["dust_luminosity" if "reference" not in galaxy else "reference"]
+            described["total_luminosity"] = scale * (reference + power)
+        for name in names.shape:
+            described[name] = galaxy[name]
+        if self.quantities.fraction is not None:
+            described[self.quantities.fraction.name] = self._other_fraction(galaxy, agn, power)
+        return described
+
+    def _other_fraction(self, galaxy, agn, power):
+        """AGN fraction in the definition that the grid does not use."""
+        if self.quantities.fraction.name == "frac_agn_ir":
+            of_galaxy = galaxy["ir_luminosity"]
+            of_agn = power * agn["ir_luminosity"]
+        else:
+            of_galaxy = galaxy["dust_luminosity"]
+            of_agn = power * agn["agn_power"]
+        total = of_galaxy + of_agn
+        return np.divide(of_agn, total, out=np.zeros(len(total)), where=total > 0)
+
+
+def parameter_names(axes):
+    """Order of the parameters of models: redshift, AGN fraction, axes of galaxies, axes of AGN."""
+    galaxy = [name for name, axis in axes.items() if axis.kind == "galaxy"]
+    agn = [name for name, axis in axes.items() if axis.kind == "agn"]
+    return ("redshift", "frac_agn", *galaxy, *agn)
+
+
+def _first_value(axes, grid, name):
+    if name in axes:
+        return float(axes[name].values[0])
+    return float(grid.frac_agn[0])
+
+
+def grid_models(axes, kind, n_models):
+    """
+    Models of all combinations of the values of a grid's axes.
+
+    Parameters
+    ----------
+    axes : dict of str to `~miricigale.fitting.priors.GridAxis`
+    kind : {"galaxy", "agn"}
+    n_models : int
 
     Returns
     -------
-    finer : `Nodes`
-
-    Raises
-    ------
-    ValueError
-        If the model has other fluxes at the nodes of the grid.
+    model : `~numpy.ndarray` of int, one axis for each parameter
+        -1 where there is none.
     """
-    axes = {name: [value] for name, value in constants.items()}
-    axes |= {name: np.asarray(grid.axes.get(name, a.values)) for name, a in nodes.axes.items()}
-    error = partial(_chain_rms, model, filters, constants, grid.frac_agn)
-    wanted = "the model that made the grid"
-    check_that(error(nodes) < 1e-3, "finer", wanted, "one with other fluxes at its nodes")
-    finer, kinds = nodes, {name: a.kind for name, a in nodes.axes.items()}
-    own = {
-        kind: [name for name in kinds if kinds[name] in ("redshift", kind)] for kind in nodes.kinds
-    }
-
-    def size(axes, kind):
-        return np.prod([len(axes[name]) for name in own[kind]])
-
-    # large tables are left as they are: those of finer grids would take tens of seconds
-    large = [own[kind] for kind in own if size(axes, kind) > _LARGEST / 4]
-    halved = sorted(set().union(*own.values()).difference(*large))
-    for _ in range(_ROUNDS):
-        # the error along an axis is that of its own cells
-        rms, halved, changed = {name: error(finer, name) for name in halved}, set(), set()
-        while any(value > _TOLERANCE for value in rms.values()):
-            name = max(rms, key=rms.get)
-            more = axes | {name: np.sort([*axes[name], *_middles(axes[name], name)])}
-            made = {kind for kind in own if name in own[kind]}
-            if max(size(more, kind) for kind in made) > _LARGEST:
-                del rms[name]
-                continue
-            # with the square of the cells; more slowly with features that cross bands, and dust that may be absent
-            axes, halved, changed = more, halved | {name}, changed | made
-            rms[name] *= 0.25 if made == {"galaxy"} else 0.5
-        for kind in changed:
-            # one kind at a time: all models of the other would be made for nothing
-            others = {*own} - {kind}
-            some = {n: v[:1] if kinds.get(n, kind) in others else v for n, v in axes.items()}
-            finer = finer.with_kind(kind, Nodes.of_grid(model.grid(some, filters)))
-    return finer
+    own = [axis for axis in axes.values() if axis.kind == kind]
+    model = np.full([axis.values.size for axis in own], -1 if own else 0)
+    if not own:
+        return model
+    for i in range(n_models):
+        # a model without effect of a parameter stands for all its values
+        places = [np.flatnonzero(axis.share[:, i] > 0) for axis in own]
+        model[np.ix_(*places)] = i
+    return model
 
 
-def _chain_rms(model, filters, constants, frac_agn, nodes, name=None, n=100):
+def _models_and_values(axes, kind, n_models):
+    values = {name: axis.values for name, axis in axes.items() if axis.kind == kind}
+    return grid_models(axes, kind, n_models), values
+
+
+def _part_of_grid(table, model, values, redshift, place):
+    """`_core.Part` of the models of a grid."""
+    full = table[model.ravel()].reshape(*model.shape, *table.shape[1:])
+    full = np.where((model >= 0)[..., None, None], full, np.nan)
+    # shapes matter, not brightness; one redshift is enough
+    at_middle = full[..., table.shape[1] // 2, :]
+    powers = {}
+    for i, name in enumerate(values):
+        along = np.moveaxis(at_middle, i, 0).reshape(len(values[name]), -1, table.shape[2])
+        along = along - np.median(along, axis=-1, keepdims=True)
+        powers[name] = straightest_power(values[name], along)
+    return make_part(tuple(values), values, powers, table, redshift, place, model)
+
+
+def _saturating_reference(reference, model, values):
     """
-    Rms of interpolated ln flux, but for a factor, at random nodes, or anywhere between those of an axis.
+    Axis of the amount of dust, whose 0 is none, and the dust's power over how far the amount saturates.
 
-    It is compared with the chain, and 0 where the chain has nothing between them.
+    The ratio at no dust is that of the next node. Without such an axis None and the power itself.
     """
-    rng, known = np.random.default_rng(1), model.parameters
-    values = {other: rng.choice(axis.values, n) for other, axis in nodes.axes.items()}
-    if name is not None:
-        axis = nodes.axes[name].values
-        first = rng.integers(max(axis.size - 1, 1), size=n)
-        values[name] = axis[first] + rng.random(n) * (np.roll(axis, -1) - axis)[first]
-    values |= {other: np.full(n, value) for other, value in constants.items()}
-    table = QTable({other: value * known[other].unit for other, value in values.items()})
-    table["mass"] = 1.0 * MASS
-    true = model.fluxes(table, filters)
-    flags = true["flags"]
-    if np.any(flags & int(ModelFlags.NOT_IN_LIBRARY)) and name is not None:
-        return 0.0
-    frac = values.get("frac_agn", np.full(n, frac_agn[0]))
-    flux = nodes.fluxes(values, values["redshift"], frac)[0]
-    true = np.column_stack([true[band].value for band in true.colnames[: flux.shape[1]]])
-    good = np.isfinite(true).all(axis=1)
-    top = _FAINT * true[good].max(axis=1, keepdims=True)
-    ratio = np.maximum(flux[good], top) / np.maximum(true[good], top)
-    return np.sqrt(np.mean(np.minimum(np.abs(less_factor(np.log(ratio))), _MOST) ** 2))
-
-
-def _middles(values, name):
-    """Half way between the nodes of an axis."""
-    if name == "redshift":
-        return np.expm1(0.5 * (np.log1p(values[1:]) + np.log1p(values[:-1])))
-    return 0.5 * (values[1:] + values[:-1])
-
-
-def less_factor(change):
-    """Changes of ln flux, shape (..., nb), but for a factor."""
-    return change - np.median(change, axis=-1, keepdims=True)
-
-
-def _two_ln(redshift):
-    return 2.0 * np.log(np.maximum(redshift, 1e-6))
-
-
-def _scaled(value, power):
-    return np.sign(power) * np.power(value, power) if power != 1.0 else np.asarray(value, float)
+    if np.all(reference > 0):
+        return None, reference
+    power = np.where(model >= 0, reference[model], np.nan)
+    for i, (name, nodes) in enumerate(values.items()):
+        along = np.moveaxis(power, i, 0)
+        with_dust = along[1:][np.isfinite(along[1:])]
+        without = along[0][np.isfinite(along[0])]
+        if nodes[0] != 0 or len(nodes) < 2 or np.any(without > 0) or np.any(with_dust <= 0):
+            continue
+        ratio = reference.copy()
+        models = np.moveaxis(model, i, 0)
+        for j in range(len(nodes) - 1, -1, -1):
+            rows = models[j][models[j] >= 0]
+            if j:
+                ratio[rows] = reference[rows] / -np.expm1(-_core.SATURATION * nodes[j])
+            else:
+                both = (models[0] >= 0) & (models[1] >= 0)
+                ratio[models[0][both]] = ratio[models[1][both]]
+        return name, ratio
+    return None, reference

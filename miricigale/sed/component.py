@@ -107,6 +107,9 @@ class Component:
     #: Parameters of other components that this one looks at.
     others = ()
 
+    #: Parameter in which the light for one solar mass formed is a straight line, "" if there is none.
+    linear = ""
+
     #: Options of this class: name to the values allowed, the first being the default.
     options = {}
 

@@ -81,22 +81,22 @@ def _parameter_table(parameters, rows):
     return described_table({n: (columns[n] * p.unit, p.doc) for n, p in parameters.items()})
 
 
-class _Galaxies:
+class Galaxies:
     """Galaxies of a grid: their different attenuated starlight and dust."""
 
     def __init__(self, model, rows):
         chain = self.chain = model.chain
         excess = [row.get("dust_excess", 1.0) for row in rows]
         stars, dims, dusts = ([chain.key(row, *roles) for row in rows] for roles in GALAXY)
-        self._stars, self._rows = chain.stars(stars)
+        self.stars, self.star_rows = chain.stars(stars)
         # many galaxies: their spectra are in memory once
-        pairs, self.light_rows = distinct(zip(self._rows.tolist(), dims, strict=True))
+        pairs, self.light_rows = distinct(zip(self.star_rows.tolist(), dims, strict=True))
         self.starlight, absorbed = np.empty((len(pairs), chain.wave.size)), np.empty(len(pairs))
         for first in range(0, len(pairs), BLOCK):
             part = slice(first, first + BLOCK)
             rows, keys = zip(*pairs[part], strict=True)
             out = self.starlight[part]
-            _, absorbed[part] = chain.attenuated(self._stars, np.array(rows), keys, out=out)
+            _, absorbed[part] = chain.attenuated(self.stars, np.array(rows), keys, out=out)
         dusts, self.dust_rows = distinct(dusts)
         self.dust = chain.dusts(dusts)
         self.absorbed = absorbed[self.light_rows] * excess
@@ -111,7 +111,7 @@ class _Galaxies:
         """Derived quantities: dict of arrays, one value for each galaxy."""
         sums = self.sums(self.chain.functionals.T)
         row = self.chain.reference_row
-        return galaxy_quantities(self._stars, self._rows, self.absorbed, sums, row)
+        return galaxy_quantities(self.stars, self.star_rows, self.absorbed, sums, row)
 
 
 def _galaxy_tables(quantities):
@@ -130,7 +130,7 @@ def _galaxy_tables(quantities):
     return described_table(scaling), described_table(shape)
 
 
-def _agn_table(model, parts):
+def agn_table(model, parts):
     """L_nu and properties of AGN for one watt of what the fraction refers to."""
     spectra, seen = seen_agn(model.chain, parts)
     dusty = model.frac_agn_definition == "dust"
@@ -163,7 +163,7 @@ def model_grid(model, axes, filters):
     rows = _products(of_galaxy, axes)
     defaults = model.defaults
     _refuse_invalid(model, [defaults | row for row in rows], GALAXY_ROLES)
-    galaxies = _Galaxies(model, rows)
+    galaxies = Galaxies(model, rows)
     quantities = galaxies.quantities()
     properties, shape = _galaxy_tables(quantities)
 
@@ -174,7 +174,7 @@ def model_grid(model, axes, filters):
         _refuse_invalid(model, [defaults | row for row in every], ("agn",))
         agn_rows, count, inert = _distinct_agn(agn_component, every)
         parts = [chain.agn(row) for row in agn_rows]
-        agn_spectra, properties_of_agn = _agn_table(model, parts)
+        agn_spectra, properties_of_agn = agn_table(model, parts)
         nuclei = {
             "frac_agn": frac_agn,
             "agn_parameters": _parameter_table(agn_parameters, agn_rows),

@@ -135,7 +135,8 @@ def test_chi2_and_evidence_are_those_at_the_known_redshift(grid):
     unit, data = models / error[:, None], (observed / error)[:, None]
     scale = np.sum(unit * data, axis=2) / np.sum(unit**2, axis=2)
     chi2 = np.sum((data - scale[..., None] * unit) ** 2, axis=2)
-    assert_allclose(results.chi2, chi2.min(axis=1), rtol=1e-6)
+    # tables are in single precision
+    assert_allclose(results.chi2, chi2.min(axis=1), rtol=5e-6)
     assert_allclose(results.best_scale, scale[np.arange(n), chi2.argmin(axis=1)])
     assert_allclose(results.best["redshift"], z)
     evidence = np.log(np.mean(np.exp(-0.5 * chi2), axis=1))
@@ -213,7 +214,7 @@ def test_interpolated_models_are_those_of_the_chain(chain, off_nodes, finer):
     want = np.column_stack([fluxes[name].value for name in CHAIN_BANDS])
     off = []
     for fitter in (interpolated(chain[1], 1), finer):
-        models = fitter.backend.between.finer
+        models = fitter.backend.between.models
         flux, power = models.fluxes(values, values["redshift"], values["frac_agn"])
         ratio = np.log(flux * 1e10 / want)
         off.append(np.sqrt(np.mean(np.minimum(np.abs(ratio), 0.3) ** 2)))

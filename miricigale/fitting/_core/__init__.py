@@ -6,11 +6,18 @@ pairs of galaxy and AGN model that can matter are listed by their bounds (`pairs
 `floors`), evaluated side by side (`lanes`, `single` in single precision, `limits` with upper
 limits) and summed up (`sums`, `histogram`); `summarize` turns the sums into moments and quantiles.
  `weigh_masses` (`masses`) puts a prior of mass in, `find_models` (`mixture`) finds wrong bands.
-`interpolate` (`between`) and `move` (`population`) are of models between the nodes.
+`interpolate_light` (`between`) and `move` (`population`) are of models between the nodes.
 `structs` says what the kernels take, `rows` where it stands there, `workspace` makes it.
 """
 
-from miricigale.fitting._core.between import Kind, interpolate, make_work
+from miricigale.fitting._core.between import (
+    SATURATION,
+    Light,
+    Part,
+    interpolate_columns,
+    interpolate_light,
+    make_work,
+)
 from miricigale.fitting._core.evaluate import sum_up
 from miricigale.fitting._core.histogram import (
     N_SHARE,

@@ -1,9 +1,10 @@
 """
-Models between the nodes of a grid.
+Models between the nodes of tables.
 
-The logarithm of a model's fluxes is that of the nearest node, a parabola along each axis, and products of the
-steps along two (at the corner next to it): of second order in all axes, from 1 + 2 n + n (n - 1) / 2 nodes of n
-axes where products of parabolas would need 3^n.
+A galaxy is the sum of its parts: starlight, in which a burst mixes linearly, and the power that dust takes from
+it times the dust's template. Logarithms of the parts are interpolated: that of the nearest node, a parabola along
+each axis, and products of the steps along two (at the corner next to it): of second order in all axes, from
+1 + 2 n + n (n - 1) / 2 nodes of n axes where products of parabolas would need 3^n.
 """
 
 import math
@@ -11,121 +12,308 @@ from collections import namedtuple
 
 import numpy as np
 
+from miricigale.fitting._core.functions import exponential
 from miricigale.fitting._core.structs import KERNEL, PART
 from miricigale.utils.compilation import njit
 
-#: Least weight of a corner that counts.
-_LEAST = 1e-10
+#: Least weight of a node that counts.
+_LEAST_WEIGHT = 1e-10
 #: Largest change of ln flux from the nearest node that is followed.
-_STEEP = 5.0
+_STEEPEST = 5.0
+#: How quickly the power that dust takes saturates with the amount of dust: it is interpolated over
+#: 1 - exp(-this * amount), which takes most of its change away.
+SATURATION = 4.0
 
-#: Galaxies or AGN on the nodes between which they are interpolated: table, float64 (nz, n_models, n_columns),
-#: ln(flux z^2); model, int64, flat, the models of all values of the axes (-1 where there is none); of each axis
-#: its size, int64 (n_axes,), nodes on its scale, (n_axes, n_largest), and the power that is the scale, (n_axes,).
-Kind = namedtuple("Kind", "table model size scaled power")
-#: Scratch arrays: values, (n_axes,); of each axis weights of two more nodes and the part of the way to the next,
-#: (n_axes, 3), and where these are in the list of models, int64; nodes of a model and their weights, (n_nodes,);
-#: fluxes of the model and of its AGN, and weights, (3, n_columns); a place, (n_axes,).
-Work = namedtuple("Work", "value part step row weight flux new")
+#: A table of one part of the light: ``table``, float32 (n_models, nz, n_columns), logarithms, of fluxes that of
+#: flux * z^2, less an ``offset`` of each column, (n_columns,), so that single precision is enough; ``log_z``,
+#: (nz,), ln(1 + z) of its nodes, one where there is no redshift; ``model``, int64, flat, the models of all
+#: values of the axes (-1 where there is none); of each axis its place among the parameters ``axis``, int64
+#: (n_axes,), its ``size``, int64, its nodes on the axis's scale, ``scaled`` (n_axes, n_largest), and the ``power``
+#: that is the scale.
+Part = namedtuple("Part", "table offset log_z model axis size scaled power")
+#: The parts of galaxies and the AGN; ``burst`` and ``dust`` have no models where there is none. Places among the
+#: parameters, -1 where there is none: ``mixing`` of the burst's mass fraction, ``amount`` of that whose 0 is no
+#: dust, ``excess`` of the dust's light over energy balance, ``age``; ``youth`` is the age of the universe at the
+#: redshifts ``log_z`` of the starlight. ``by_dust``: whether AGN fractions refer to the dust's power.
+Light = namedtuple("Light", "stars burst dust agn mixing amount excess age youth by_dust")
+#: Scratch arrays: values of all parameters, (n_axes,); of each axis weights of two more nodes and the part of the
+#: way to the next, (n_axes, 3), and where these are in the list of models, int64, and among the nodes,
+#: (n_axes, 2); nodes of a model and their weights, (n_nodes,); columns of the model, its AGN, and of another part,
+#: (3, n_columns); a place, (n_axes,).
+Work = namedtuple("Work", "value part step slot row weight flux new")
 
 
 def make_work(n_axes, n_columns):
-    """Make the scratch arrays."""
-    n = 1 + n_axes * (n_axes + 3) // 2
-    part, step, row = np.zeros((n_axes, 3)), np.zeros((n_axes, 3), np.int64), np.zeros(n, np.int64)
-    value, new = np.zeros((2, n_axes))
-    return Work(value, part, step, row, np.zeros(n), np.zeros((3, n_columns)), new)
+    """Make the scratch arrays for models of so many parameters, and tables of so many columns."""
+    n_nodes = 1 + n_axes * (n_axes + 3) // 2
+    return Work(
+        value=np.zeros(n_axes),
+        part=np.zeros((n_axes, 3)),
+        step=np.zeros((n_axes, 3), np.int64),
+        slot=np.zeros((n_axes, 2), np.int64),
+        row=np.zeros(n_nodes, np.int64),
+        weight=np.zeros(n_nodes),
+        flux=np.zeros((3, n_columns)),
+        new=np.zeros(n_axes),
+    )
 
 
 @njit(**PART)
 def place_between(nodes, n, x):
     """Node below a place, and the part of the way to the next."""
-    low, high = 0, max(n - 1, 1)
+    if n <= 1:
+        return 0, 0.0
+    low = 0
+    high = n - 1
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (middle, high) if nodes[middle] <= x else (low, middle)
-    return low, (x - nodes[low]) / (nodes[low + 1] - nodes[low]) if n > 1 else 0.0
+        if nodes[middle] <= x:
+            low = middle
+        else:
+            high = middle
+    return low, (x - nodes[low]) / (nodes[low + 1] - nodes[low])
 
 
 @njit(**PART)
-def find_nodes(kind, value, work):
-    """Fill nodes and weights of a model; returned are their number (0: there is none) and the nearest model."""
-    part, step = work.part, work.step
-    first, stride = 0, 1
-    for a in range(len(kind.size) - 1, -1, -1):
-        n, scaled, power = kind.size[a], kind.scaled[a], kind.power[a]
-        part[a], step[a] = 0.0, 0
+def _on_scale(value, power):
+    """A value on the scale of its axis: a power of 1 or parts by 2, the sign changed below 0."""
+    x = value
+    # powers of 1/2 are roots of roots
+    root = abs(power)
+    while root < 1.0:
+        x = math.sqrt(x)
+        root *= 2.0
+    return x if power > 0.0 else -1.0 / x
+
+
+@njit(**PART)
+def _axis_weights(a, n, stride, scaled, x, work):
+    """Weights and steps along one axis; returned is the nearest node."""
+    part = work.part
+    step = work.step
+    low, t = place_between(scaled, n, x)
+    center = low
+    if t > 0.5:
+        center += 1
+    # the nodes on both sides, at an end the next two
+    first = 1 if center == 0 else -1
+    if n == 2:
+        second = 0
+    elif center == n - 1:
+        second = -2
+    elif center == 0:
+        second = 2
+    else:
+        second = 1
+    d = x - scaled[center]
+    to_first = scaled[center + first] - scaled[center]
+    to_second = scaled[center + second] - scaled[center]
+    part[a, 0] = d / to_first
+    part[a, 1] = 0.0
+    if n > 2:
+        part[a, 0] *= (d - to_second) / (to_first - to_second)
+        part[a, 1] = d * (d - to_first) / (to_second * (to_second - to_first))
+    step[a, 0] = first * stride
+    step[a, 1] = second * stride
+    # the corner is on the side of the place
+    part[a, 2] = d / to_first
+    step[a, 2] = 0
+    if second == 1 and d > 0.0:
+        part[a, 2] = d / to_second
+        step[a, 2] = 1
+    return center
+
+
+@njit(**PART)
+def find_nodes(part_table, value, work):
+    """Fill nodes and weights of a model of a `Part`; returned is their number, 0 if there is none."""
+    part = work.part
+    step = work.step
+    size = part_table.size
+    model = part_table.model
+    n_axes = len(size)
+    nearest_place = 0
+    stride = 1
+    for a in range(n_axes - 1, -1, -1):
+        n = size[a]
+        for k in range(3):
+            part[a, k] = 0.0
+            step[a, k] = 0
         if n > 1:
-            x = value[a]
-            # powers of 1/2 are roots of roots
-            part[a, 0] = abs(power)
-            while part[a, 0] < 1.0:
-                x, part[a, 0] = math.sqrt(x), 2.0 * part[a, 0]
-            x = x if power > 0.0 else -1.0 / x
+            scaled = part_table.scaled[a]
+            x = _on_scale(value[part_table.axis[a]], part_table.power[a])
             x = min(max(x, scaled[0]), scaled[n - 1])
-            low, t = place_between(scaled, n, x)
-            c = low + (1 if t > 0.5 else 0)
-            # the nodes on both sides, at an end the next two
-            i = 1 if c == 0 else -1
-            j = 0 if n == 2 else -2 if c == n - 1 else 2 if c == 0 else 1
-            d, one, two = x - scaled[c], scaled[c + i] - scaled[c], scaled[c + j] - scaled[c]
-            part[a, 0] = d / one
-            if n > 2:
-                part[a, 0] *= (d - two) / (one - two)
-                part[a, 1] = d * (d - one) / (two * (two - one))
-            step[a, 0], step[a, 1] = i * stride, j * stride
-            up = j == 1 and d > 0.0
-            # the corner is on the side of the place
-            part[a, 2], step[a, 2] = d / two if up else d / one, 1 if up else 0
-            first += c * stride
+            nearest_place += stride * _axis_weights(a, n, stride, scaled, x, work)
         stride *= n
-    nearest = kind.model[first]
+    nearest = model[nearest_place]
     if nearest < 0:
-        return 0, -1
-    work.row[0], work.weight[0], count = nearest, 1.0, 1
-    for a in range(len(kind.size)):
+        return 0
+    work.row[0] = nearest
+    work.weight[0] = 1.0
+    count = 1
+    for a in range(n_axes):
         for k in range(2):
-            m = kind.model[first + step[a, k]]
-            work.row[count], work.weight[count] = m if m >= 0 else nearest, part[a, k]
-            work.weight[0] -= part[a, k]
-            count += 1
-    for a in range(len(kind.size)):
-        for b in range(a):
-            i, j, w = step[a, 2], step[b, 2], part[a, 2] * part[b, 2]
-            m = kind.model[first + step[a, i] + step[b, j]]
-            if m >= 0 and w > _LEAST:
-                work.row[count], work.weight[count] = m, w
-                work.weight[0] += w
-                work.weight[1 + 2 * a + i] -= w
-                work.weight[1 + 2 * b + j] -= w
+            if abs(part[a, k]) > _LEAST_WEIGHT:
+                m = model[nearest_place + step[a, k]]
+                # where there is no model the nearest stands for it
+                work.row[count] = m if m >= 0 else nearest
+                work.weight[count] = part[a, k]
+                work.weight[0] -= part[a, k]
+                work.slot[a, k] = count
                 count += 1
-    return count, nearest
+    # products of the steps along two axes
+    for a in range(n_axes):
+        for b in range(a):
+            w = part[a, 2] * part[b, 2]
+            if w > _LEAST_WEIGHT:
+                side_a = step[a, 2]
+                side_b = step[b, 2]
+                m = model[nearest_place + step[a, side_a] + step[b, side_b]]
+                if m >= 0:
+                    work.row[count] = m
+                    work.weight[count] = w
+                    work.weight[0] += w
+                    work.weight[work.slot[a, side_a]] -= w
+                    work.weight[work.slot[b, side_b]] -= w
+                    count += 1
+    return count
 
 
 @njit(**PART)
-def add_up(table, z, part, count, work, out, n_fluxes):
-    """Interpolate the columns of a table, the first of them ln flux, at a place whose nodes are in ``work``."""
-    other = min(z + 1, table.shape[0] - 1)
-    out[:] = 0.0
+def add_up(part_table, log_z, count, work, out):
+    """Interpolate the columns of a `Part` at ln(1 + z) between the nodes in ``work``: logarithms, into ``out``."""
+    table = part_table.table
+    n_z = table.shape[1]
+    n_columns = table.shape[2]
+    z, t = place_between(part_table.log_z, n_z, log_z)
+    other = min(z + 1, n_z - 1)
+    for j in range(n_columns):
+        out[j] = 0.0
     for r in range(count):
-        far = work.weight[r] * part
+        far = work.weight[r] * t
         near = work.weight[r] - far
-        low, high = table[z, work.row[r]], table[other, work.row[r]]
-        for j in range(table.shape[2]):
+        low = table[work.row[r], z]
+        high = table[work.row[r], other]
+        for j in range(n_columns):
             out[j] += near * low[j] + far * high[j]
-    nearest = table[other if part > 0.5 else z, work.row[0]]
-    for j in range(n_fluxes):
-        out[j] = min(max(out[j], nearest[j] - _STEEP), nearest[j] + _STEEP)
+    nearest = table[work.row[0], other if t > 0.5 else z]
+    for j in range(n_columns):
+        out[j] = min(max(out[j], nearest[j] - _STEEPEST), nearest[j] + _STEEPEST)
+        out[j] += part_table.offset[j]
+
+
+@njit(**PART)
+def mixed(part_table, burst, share, log_z, value, work, out):
+    """Columns of starlight, with a burst of a mass fraction, into ``out``; False where there is no model."""
+    n = part_table.table.shape[2]
+    count = find_nodes(part_table, value, work)
+    if count == 0:
+        return False
+    add_up(part_table, log_z, count, work, out)
+    for j in range(n):
+        out[j] = exponential(out[j])
+    if share > 0.0:
+        other = work.flux[2]
+        count = find_nodes(burst, value, work)
+        add_up(burst, log_z, count, work, other)
+        for j in range(n):
+            out[j] = (1.0 - share) * out[j] + share * exponential(other[j])
+    return True
+
+
+@njit(**PART)
+def dust_power(light, value, ratio):
+    """Power of the dust's light, from its ratio to how far the amount of dust saturates."""
+    power = ratio
+    if light.amount >= 0:
+        power *= 1.0 - math.exp(-SATURATION * value[light.amount])
+    if light.excess >= 0:
+        power *= value[light.excess]
+    return power
+
+
+@njit(**PART)
+def galaxy_light(light, value, log_z, work):
+    """
+    Fluxes times z^2 of a galaxy, and last what AGN fractions refer to, into ``work.flux[0]``.
+
+    Returned is whether there is such a galaxy.
+    """
+    flux = work.flux[0]
+    last = light.stars.table.shape[2] - 1
+    if light.age >= 0:
+        z, t = place_between(light.stars.log_z, len(light.youth), log_z)
+        oldest = light.youth[z]
+        if len(light.youth) > 1:
+            oldest += t * (light.youth[z + 1] - light.youth[z])
+        if value[light.age] > oldest:
+            return False
+    share = 0.0
+    if light.mixing >= 0:
+        share = value[light.mixing]
+    if not mixed(light.stars, light.burst, share, log_z, value, work, flux):
+        return False
+    power = dust_power(light, value, flux[last])
+    if len(light.dust.table) > 0 and power > 0.0:
+        template = work.flux[2]
+        count = find_nodes(light.dust, value, work)
+        add_up(light.dust, log_z, count, work, template)
+        for j in range(last):
+            flux[j] += power * exponential(template[j])
+    flux[last] = power if light.by_dust else flux[last - 1]
+    return True
+
+
+@njit(**PART)
+def with_agn(light, value, frac, log_z, work):
+    """
+    Add an AGN of a fraction to the galaxy in ``work.flux[0]``, whose last value becomes the AGN's power.
+
+    Its own fluxes stay in ``work.flux[1]``. Returned is whether there is such an AGN.
+    """
+    flux = work.flux[0]
+    last = light.stars.table.shape[2] - 1
+    power = flux[last] * frac / max(1.0 - frac, 1e-12)
+    flux[last] = power
+    if not power > 0.0:
+        return True
+    agn = work.flux[1]
+    count = find_nodes(light.agn, value, work)
+    if count == 0:
+        return False
+    add_up(light.agn, log_z, count, work, agn)
+    for j in range(last - 1):
+        agn[j] = power * exponential(agn[j])
+        flux[j] += agn[j]
+    return True
 
 
 @njit(**KERNEL)
-def interpolate(kind, table, log_z, values, redshift, n_fluxes, work, out):
+def interpolate_light(light, values, redshift, frac, work, flux, power):
     """
-    Interpolate a table of models, as it is, at n places: ``out``, shape (n, n_columns).
+    Fluxes of n models, (n, nb), with AGN of fractions (n,); NaN where there is no model.
 
-    ``values`` are those of the axes, shape (n, n_axes); a table of one redshift is that of all. The first
-    ``n_fluxes`` columns are ln flux.
+    ``power``, (2, n), gets what the fractions refer to, and the power of the AGN.
     """
+    last = light.stars.table.shape[2] - 1
+    for i in range(len(values)):
+        log_z = math.log1p(redshift[i])
+        exists = galaxy_light(light, values[i], log_z, work)
+        power[0, i] = work.flux[0, last]
+        if exists:
+            exists = with_agn(light, values[i], frac[i], log_z, work)
+        power[1, i] = work.flux[0, last]
+        nearer = max(redshift[i], 1e-6) ** -2.0
+        for j in range(flux.shape[1]):
+            flux[i, j] = work.flux[0, j] * nearer if exists else np.nan
+
+
+@njit(**KERNEL)
+def interpolate_columns(part_table, values, redshift, work, out):
+    """Interpolate the logarithms in a table at n places: ``out``, (n, n_columns); NaN where there is none."""
     for i in range(len(out)):
-        z, part = place_between(log_z, len(table), math.log1p(redshift[i]))
-        add_up(table, z, part, find_nodes(kind, values[i], work)[0], work, out[i], n_fluxes)
+        count = find_nodes(part_table, values[i], work)
+        if count == 0:
+            out[i, :] = np.nan
+        else:
+            add_up(part_table, math.log1p(redshift[i]), count, work, out[i])

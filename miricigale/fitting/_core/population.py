@@ -3,7 +3,7 @@
 import math
 from collections import namedtuple
 
-from miricigale.fitting._core.between import add_up, find_nodes, place_between
+from miricigale.fitting._core.between import galaxy_light, with_agn
 from miricigale.fitting._core.functions import exponential
 from miricigale.fitting._core.limits import limited_scale
 from miricigale.fitting._core.structs import KERNEL, NO_LIGHT, PART
@@ -16,9 +16,8 @@ NEVER, _NONE = -1e300, -1e200
 #: What populations move in: a unit interval for each axis (redshift, AGN fraction, those of galaxies, those of
 #: AGN), in which all cells are equally wide: their number, int64 (n_axes,), edges, (n_axes, n_largest + 1), and
 #: ln(prior) of those of AGN and their fractions, (n_axes, n_largest); the galaxies of all cells, int64, flat (-1:
-#: none); of the nodes between which models are interpolated ln(1 + z), (nz,), which galaxies may be used, (nz,
-#: n_models), the `Kind` of galaxies, whose last column is the dust luminosity or, if ``lit``, its ln, and of AGN.
-Space = namedtuple("Space", "size edge log_prior cells log_z allowed galaxy agn lit")
+#: none), of which there are ``n_galaxy`` axes; and the `Light` between whose nodes models are interpolated.
+Space = namedtuple("Space", "size edge log_prior cells n_galaxy light")
 #: An object: `Target`, `Limits` or None, `Mixture` or None, 2 ln(prior) of galaxies, (nz, nG), its redshift, 0 if
 #: that is free, and error of AGN light as a part of it.
 Object = namedtuple("Object", "target limits mixture log_usable redshift agn_error")
@@ -135,7 +134,9 @@ def _model(space, x, redshift, work):
     Returned are the node of redshift and the galaxy in whose cells it is (-1: there is none), and ln(prior) but
     for theirs.
     """
-    log_prior, g, node, galaxy = 0.0, 0, 0, space.galaxy
+    log_prior = 0.0
+    g = 0
+    node = 0
     for c in range(len(space.size)):
         n = space.size[c]
         y = x[c] * n
@@ -144,31 +145,20 @@ def _model(space, x, redshift, work):
         log_prior += space.log_prior[c, k]
         if c == 0:
             node = k
-        elif 2 <= c < 2 + len(galaxy.size):
+        elif 2 <= c < 2 + space.n_galaxy:
             g = g * n + k
     z_true = redshift if redshift > 0.0 else work.value[0]
-    z, part = place_between(space.log_z, len(space.log_z), math.log1p(z_true))
-    count, near = find_nodes(galaxy, work.value[2:], work)
-    if count == 0 or not space.allowed[min(z + int(part > 0.5), len(space.log_z) - 1), near]:
+    log_z = math.log1p(z_true)
+    if not galaxy_light(space.light, work.value, log_z, work):
         return node, -1, log_prior
+    if not with_agn(space.light, work.value, work.value[1], log_z, work):
+        return node, -1, log_prior
+    nearer = max(z_true, 1e-6) ** -2.0
     flux = work.flux[0]
-    last = len(flux) - 1
-    add_up(galaxy.table, z, part, count, work, flux, last)
-    power = exponential(flux[last]) if space.lit else max(flux[last], 0.0)
-    power *= work.value[1] / max(1.0 - work.value[1], 1e-12)
-    nearer = -2.0 * math.log(max(z_true, 1e-6))
-    for b in range(last):
-        flux[b] = exponential(flux[b] + nearer)
-    if power > 0.0:
-        more = work.flux[1]
-        count, _ = find_nodes(space.agn, work.value[2 + len(galaxy.size) :], work)
-        add_up(space.agn.table, z, part, count, work, more, last)
-        for b in range(last):
-            more[b] = power * exponential(more[b] + nearer)
-            flux[b] += more[b]
-        if count == 0:
-            return node, -1, log_prior
-    flux[last] = power
+    n_bands = len(flux) - 2
+    for b in range(n_bands):
+        flux[b] *= nearer
+        work.flux[1, b] *= nearer
     return node, space.cells[g], log_prior
 
 

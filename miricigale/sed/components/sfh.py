@@ -53,6 +53,7 @@ class StarFormationHistory(Component):
 class BurstHistory(StarFormationHistory):
     """Base: histories that may end in an exponential burst."""
 
+    linear = "f_burst"
     tau = Parameter(1.0, (0.001, 100.0), "E-folding time.", unit="Gyr")
     f_burst = Parameter(0.0, (0.0, 0.99), "Mass fraction made in the burst.")
     age_burst = Parameter(0.02, (0.001, 5.0), "Time since the burst began.", unit="Gyr")
