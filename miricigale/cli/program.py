@@ -42,8 +42,9 @@ def main(argv=None):
     level = logging.INFO if verbose else logging.ERROR if quiet else logging.WARNING
     logging.basicConfig(level=level, format="%(message)s", handlers=[handler])
     if not quiet:
-        # messages about compilation are shown at any verbosity
-        logging.getLogger("miricigale.utils.compilation").setLevel(logging.INFO)
+        # what is compiled, and what is fitted, is said at any verbosity
+        for name in ("miricigale.utils.compilation", "miricigale.fitting.from_files"):
+            logging.getLogger(name).setLevel(logging.INFO)
     if args.version:
         from miricigale import __version__
 

@@ -117,6 +117,13 @@ def band_columns(colnames, argument="photometry"):
     return {theirs: ours for ours, theirs in found.items() if ours in kept and ours != theirs}
 
 
+def our_names(colnames, argument="photometry"):
+    """Our names of columns that are fluxes, magnitudes and errors of bands, and ids: dict by their names."""
+    return {
+        theirs: ours for ours, theirs in _our_names(colnames, FILTERS.names(), argument).items()
+    }
+
+
 def _our_names(colnames, bands, argument):
     """Our names of the columns that are fluxes and errors of bands, and of ids, to theirs."""
     errors = {error_column(name): name for name in bands}

@@ -4,10 +4,44 @@ import numpy as np
 
 from miricigale.filters import as_photometry
 from miricigale.filters.catalog_files import codes_of, warn_of_codes
-from miricigale.fitting.likelihood import PhotometryReader, unused_bands
+from miricigale.filters.photometry_table import our_names
+from miricigale.fitting.likelihood import PhotometryReader, is_filter, unused_bands
 from miricigale.utils.exceptions import FitWarning, warn
-from miricigale.utils.tables import error_column
+from miricigale.utils.options import check_that
+from miricigale.utils.tables import as_table, error_column
 from miricigale.utils.units import FNU
+
+
+def bands_of(photometry):
+    """
+    Bands of a catalog that can be fitted: those of known filters that have an error.
+
+    Parameters
+    ----------
+    photometry : `~astropy.table.Table` or anything for `~miricigale.utils.tables.as_table`
+        As for `~miricigale.fitting.BayesFitter.fit`.
+
+    Returns
+    -------
+    bands : list of str
+        Our names, in the order of the columns.
+
+    Raises
+    ------
+    ValueError
+        If there is none.
+    """
+    names = as_table(photometry, "photometry").colnames
+    ours = our_names(names, "photometry")
+    return bands_with_errors([ours.get(name, name) for name in names], "photometry")
+
+
+def bands_with_errors(names, argument):
+    """Of our names of columns those of bands that have an error: list of str, one at least."""
+    bands = [name for name in names if is_filter(name) and error_column(name) in names]
+    wanted = "a table with columns <filter> and <filter>_err ('miricigale filters' lists the names)"
+    check_that(bands, argument, wanted, f"columns {list(names)}")
+    return bands
 
 
 def table_of(fitter, photometry):

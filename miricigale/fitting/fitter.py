@@ -7,6 +7,7 @@ import numpy as np
 
 from miricigale.filters.band_names import known_filter
 from miricigale.fitting import fitted_bands
+from miricigale.fitting.defaults import DEFAULT, axes_of, chosen_calibration, models_and_bands
 from miricigale.fitting.grid_fit import GridFit
 from miricigale.fitting.likelihood import (
     FitFlags,
@@ -22,7 +23,7 @@ from miricigale.fitting.results import FitResults
 from miricigale.fitting.samplers import get_sampler
 from miricigale.fitting.samplers.fit import SamplerFit
 from miricigale.fitting.settings import GridSettings, SamplerSettings
-from miricigale.sed import ModelGrid, yang2021_axes
+from miricigale.sed import ModelGrid, SEDModel
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.meta import provenance
@@ -32,6 +33,27 @@ from miricigale.utils.random import check_seed
 from miricigale.utils.units import check_count
 
 logger = logging.getLogger(__name__)
+
+#: Arguments of `BayesFitter`.
+_OPTIONS = (
+    "model", "filters", "priors", "engine", "axes", "model_error", "error_floor", "template_error", "outliers",
+    "calibration", "scale_error", "n_bands_min", "compat", "settings",
+)  # fmt: skip
+#: Arguments of its method fit.
+_OF_FIT = (
+    "photometry",
+    "redshift",
+    "redshift_prior",
+    "pairs",
+    "seed",
+    "executor",
+    "progress_bar",
+    "chunk_size",
+)
+#: Arguments of its method sample, besides the number of draws.
+_OF_SAMPLE = ("photometry", "seed", "redshift", "redshift_prior", "executor", "progress_bar")
+#: Attributes of a fitter that depend on its bands.
+_OF_BANDS = ("backend", "bands", "grid", "model_errors", "priors", "zero_points")
 
 
 @checked_calls
@@ -157,7 +179,7 @@ class BayesFitter(Interactive):
 
     def __init__(
         self,
-        model,
+        model=None,
         filters=None,
         *,
         priors=None,
@@ -167,19 +189,25 @@ class BayesFitter(Interactive):
         error_floor=0.0,
         template_error=None,
         outliers=None,
-        calibration=None,
+        calibration=DEFAULT,
         scale_error=None,
         n_bands_min=2,
         compat=None,
         settings=None,
     ):
-        self._given = {name: value for name, value in locals().items() if name != "self"}
         on_grid = engine == "grid"
+        model, filters = models_and_bands(model, filters, axes)
+        self._given = {name: value for name, value in locals().items() if name in _OPTIONS}
         kind = GridSettings if on_grid else SamplerSettings
         settings = settings or kind()
         wanted = f"{kind.__name__} with engine={engine!r}"
         check_that(isinstance(settings, kind), "settings", wanted, type(settings).__name__)
-        axes = yang2021_axes(axes) if isinstance(axes, str) else axes
+        axes, self.grid_name = axes_of(model, axes) if on_grid else (axes, None)
+        if on_grid and compat is None:
+            of_model = self.grid_name, model_error, template_error
+            calibration = chosen_calibration(calibration, *of_model)
+        elif isinstance(calibration, str):
+            calibration = None
         of_grid = {"axes": axes, "compat": compat, "calibration": calibration}
         of_grid |= {"template_error": template_error, "outliers": outliers}
         if not on_grid:
@@ -200,7 +228,13 @@ class BayesFitter(Interactive):
             if settings.mass_function is None:
                 settings = replace(settings, mass_function=calibration.mass_function)
         self.engine, self.calibration = engine, calibration
+        self.template_error = of_grid["template_error"]
         self.model = None if isinstance(model, ModelGrid) else model
+        self.filters, self.n_bands_min = names, check_count(n_bands_min, "n_bands_min")
+        self._made = {}
+        if on_grid and names is None and isinstance(model, SEDModel):
+            # the grid is made for the bands of the photometry
+            return
         scale_error = compat is None if scale_error is None else bool(scale_error)
         kind, more = (GridFit, of_grid) if on_grid else (SamplerFit, {"sampler": engine})
         more["scale_error"] = scale_error
@@ -211,7 +245,6 @@ class BayesFitter(Interactive):
             names = tuple(known_filter(name, self.bands, "filter of the grid") for name in names)
         self.filters = names
         of_bands = self.bands if on_grid else names
-        self.n_bands_min = check_count(n_bands_min, "n_bands_min")
         given = {}
         if calibration is not None:
             for name in ("zero_point", "error_factor"):
@@ -223,13 +256,78 @@ class BayesFitter(Interactive):
             given[name] = per_band(value, of_bands, name)
         self._reader = PhotometryReader(self.bands, names, n_bands_min=self.n_bands_min, **given)
         self.zero_points = self._reader.zero_point
+        self.model_errors = self._reader.model_error
+
+    def __getattr__(self, name):
+        if name in _OF_BANDS and "_made" in self.__dict__:
+            wanted = "the bands are those of the photometry: name them, BayesFitter(model, bands), or take"
+            msg = f"BayesFitter has no {name!r} yet; {wanted} fitter.for_bands(bands)"
+            raise AttributeError(msg, name=name, obj=self)
+        return super().__getattr__(name)
+
+    @property
+    def waits(self):
+        """Whether the bands of the models are those of a catalog that is yet to come."""
+        return "backend" not in self.__dict__
+
+    def for_bands(self, bands):
+        """
+        Fitter of the same models and options for these bands.
+
+        Parameters
+        ----------
+        bands : list of str or `~miricigale.filters.FilterSet`
+            Bands to fit.
+
+        Returns
+        -------
+        fitter : `BayesFitter`
+            With a grid of these bands, which a later call for the same bands returns again.
+
+        Raises
+        ------
+        ValueError
+            If the fitter has bands already.
+        """
+        check_that(self.waits, "bands", "left to the fitter, which has some", bands)
+        names = filter_names("bands", bands)
+        if names not in self._made:
+            self._made[names] = type(self)(**self._given | {"filters": bands})
+        return self._made[names]
+
+    def for_photometry(self, photometry):
+        """
+        Fitter for a catalog: this one, or `for_bands` of those in the catalog if it was given no bands.
+
+        Parameters
+        ----------
+        photometry : `~astropy.table.QTable`, dict, `pandas.DataFrame` or path-like
+            As for `fit`.
+
+        Raises
+        ------
+        ValueError
+            If the fitter has no bands, and the catalog has no flux in a known filter that has an error.
+        """
+        if not self.waits:
+            return self
+        return self.for_bands(fitted_bands.bands_of(photometry))
 
     def changed(self, **options):
         """Fitter of the same models with other options, named as for `BayesFitter`."""
         given = self._given | options
+        if self.waits:
+            return type(self)(**given)
         if self.grid is not None:
             given |= {"model": self.grid, "axes": None}
+            errors = given["model_error"], given["template_error"]
+            if given["compat"] is None:
+                chosen = chosen_calibration(given["calibration"], self.grid_name, *errors)
+                given["calibration"] = chosen
         new = type(self)(**given)
+        new.grid_name = self.grid_name
+        # errors that are given later take the place of a calibration by default
+        new._given["calibration"] = (self._given | options)["calibration"]
         known = getattr(self.backend, "between", None)
         if known and new.backend.between:
             # the finer grid is that of the same models
@@ -237,6 +335,12 @@ class BayesFitter(Interactive):
         return new
 
     def _facts(self):
+        if self.waits:
+            return {
+                "BayesFitter": self._engine_name,
+                "models": repr(self.model),
+                "bands": "of the photometry",
+            }
         return {
             "BayesFitter": self._engine_name,
             "models": repr(self.grid or self.model),
@@ -246,6 +350,8 @@ class BayesFitter(Interactive):
 
     def __repr__(self):
         bands = "bands of the photometry" if self.filters is None else f"{len(self.filters)} bands"
+        if self.waits:
+            return f"<BayesFitter of {self.model!r}, {bands}>"
         if self.engine == "grid":
             return f"<BayesFitter of {self.grid!r}, {bands}>"
         free = ", ".join(self.priors)
@@ -329,6 +435,9 @@ class BayesFitter(Interactive):
         `~astropy.units.UnitsError`
             If a flux column has no unit of flux density.
         """
+        if self.waits:
+            given = {name: value for name, value in locals().items() if name in _OF_FIT}
+            return self.for_photometry(photometry).fit(**given)
         known = {"redshift": redshift, "redshift_prior": redshift_prior}
         parallel = {"executor": executor, "progress_bar": progress_bar}
         options = {"pairs": pairs, "seed": seed, "chunk_size": chunk_size, "parallel": parallel}
@@ -420,6 +529,9 @@ class BayesFitter(Interactive):
         ValueError
             See `fit`; or if the fitter has no grid: the results of a sampler hold draws.
         """
+        if self.waits:
+            given = {name: value for name, value in locals().items() if name in _OF_SAMPLE}
+            return self.for_photometry(photometry).sample(n_draws=n_draws, **given)
         if self.engine != "grid":
             msg = "draws of a sampler are in its results: fitter.fit(photometry).samples(id)"
             raise ValueError(msg)

@@ -1,7 +1,8 @@
-"""Fits of a catalog of photometry in a file, with the models of Yang et al. 2021 or of surveys."""
+"""Fits of a catalog of photometry in a file, by default with models of real galaxies and their calibration."""
 
 import dataclasses
 import logging
+import os
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,9 @@ from astropy.table import vstack
 
 from miricigale.filters.catalog_files import MappedRows, as_catalog_map
 from miricigale.filters.photometry_table import band_columns
-from miricigale.fitting.likelihood import is_filter, unused_bands
-from miricigale.utils.exceptions import FitWarning, argument_error, warn
+from miricigale.fitting.fitted_bands import bands_with_errors
+from miricigale.fitting.likelihood import unused_bands
+from miricigale.utils.exceptions import FitWarning, warn
 from miricigale.utils.row_files import open_rows
 from miricigale.utils.tables import error_column
 
@@ -40,11 +42,11 @@ def fit_catalog(
     path,
     output,
     *,
-    axes="fit",
+    axes="survey",
     models=None,
     model_error=None,
     outliers=None,
-    calibration=None,
+    calibration="default",
     calibrate=None,
     catalog_map=None,
     ebv=0.0,
@@ -55,7 +57,10 @@ def fit_catalog(
     **options,
 ):
     """
-    Fit a catalog of photometry of any length with the chain of Yang et al. 2021, or that of surveys.
+    Fit a catalog of photometry of any length, by default with models of real galaxies and their calibration.
+
+    The fits are those of ``BayesFitter(bands, axes=axes)`` for the same catalog, number for number. What is fitted
+    is logged: models, bands, and errors with priors.
 
     Parameters
     ----------
@@ -64,18 +69,21 @@ def fit_catalog(
         ``<filter>_err`` by any usual name of the filter, or with columns that ``catalog_map`` gives these names.
     output : path-like
         Folder of the results.
-    axes : {"fit", "quick", "survey", "far-infrared"}, optional
-        Model grid; see `miricigale.sed.yang2021_axes` and `miricigale.sed.survey_axes`.
+    axes : {"survey", "far-infrared", "yang2021", "yang2021-quick"}, optional
+        Model grid: of real galaxies, without or with far-infrared bands (`miricigale.sed.survey_axes`), or that of
+        the simulations of Yang et al. 2021, or a thinner one (`miricigale.sed.yang2021_axes`), which have no lines
+        and no galaxies without dust.
     models : callable, optional
         Function of the bands (a list of str) that returns the `~miricigale.sed.SEDModel` and its axes in place of
         those of ``axes``, or a `~miricigale.sed.ModelGrid` and None; ``axes`` says whose errors are taken then.
     model_error : float, optional
-        Relative model error: 0.1 by default; with ``axes="survey"`` it takes the place of
-        `miricigale.fitting.SurveyCalibration.survey`, which is then the default.
+        Relative model error, in place of the calibration by default; 0.1 where there is no calibration.
     outliers : float or dict of str to float, optional
         Prior fraction of wrong fluxes; see `miricigale.fitting.BayesFitter`.
-    calibration : `~miricigale.fitting.SurveyCalibration` or path-like, optional
-        Zero points, errors and priors, or the file of them. With ``models`` its priors are left out.
+    calibration : `~miricigale.fitting.SurveyCalibration`, path-like or None, optional
+        Zero points, errors and priors, or the file of them; None: none. By default
+        `miricigale.fitting.SurveyCalibration.survey` with ``axes="survey"`` and none with others. With ``models``
+        its priors are left out.
     calibrate : str, optional
         Column of known redshifts, with which all of that is measured first: see `miricigale.fitting.calibrate`.
         It is written to ``calibration.ecsv`` in ``output``, from where a resumed fit takes it.
@@ -111,54 +119,101 @@ def fit_catalog(
     Examples
     --------
     >>> from miricigale.fitting import fit_catalog
-    >>> results = fit_catalog("catalog.fits", "fits", axes="survey")  # doctest: +SKIP
+    >>> results = fit_catalog("catalog.fits", "fits")  # doctest: +SKIP
     >>> results.to_table(["id", "redshift_p50", "mass_p50"])  # doctest: +SKIP
     """
     unit = options.get("flux_unit")
     rows = open_catalog(path, chunk_rows, hdu=hdu, catalog_map=catalog_map, flux_unit=unit)
-    names = rows.colnames
-    bands = [name for name in names if is_filter(name) and error_column(name) in names]
-    if not bands:
-        wanted = "columns <filter> and <filter>_err ('miricigale filters' lists the names)"
-        raise argument_error("path", f"a table with {wanted}", f"columns {list(names)}")
+    bands = bands_with_errors(rows.colnames, "path")
     # heavy imports only after the file was checked
-    from miricigale.fitting import BayesFitter, GridSettings, SurveyCalibration, fit_file
+    from miricigale.fitting import BayesFitter, GridSettings, fit_file
+    from miricigale.fitting.defaults import statement
     from miricigale.sed import SEDModel
     from miricigale.sed.components import GalacticExtinction
+    from miricigale.sed.presets import grid_name
 
     unused = unused_bands(rows.chunk(0), bands)
     if unused:
         why = "as their names ('miricigale filters') or errors are missing"
         warn(f"bands of the photometry are not fitted, {why}: {', '.join(unused)}", FitWarning)
-    if axes in ("survey", "far-infrared"):
-        model, nodes = SEDModel.survey(), SEDModel.survey_axes(axes)
+    axes = grid_name(axes)
+    if models is None:
+        model, nodes = SEDModel.for_axes(axes), axes
     else:
-        model, nodes = SEDModel.yang2021(), SEDModel.yang2021_axes(axes)
-    if calibration is None and axes == "survey" and model_error is None:
-        calibration = SurveyCalibration.survey()
-    elif calibration is not None and not isinstance(calibration, SurveyCalibration):
-        calibration = SurveyCalibration.read(calibration)
-    if models is not None:
         model, nodes = models(bands)
-        calibration = calibration and calibration.without_priors()
     if ebv and isinstance(model, SEDModel):
-        dust = GalacticExtinction(ebv_galactic=ebv, beyond="transparent")
-        model = SEDModel([*model.components, dust])
-    given = {"model_error": model_error, "outliers": outliers, "calibration": calibration}
-    given["settings"] = GridSettings(interpolate=interpolate, agn_error=agn_error)
-    fitter = BayesFitter(model, bands, axes=nodes, **given)
-    if calibrate is not None:
-        fitter = _calibrated(fitter, rows, calibrate, Path(output), options)
-    if models is None and fitter.calibration is not None:
-        error = 100 * fitter.calibration.template_error.error
-        text = "calibration of %s: errors of the models %.0f to %.0f %% of the flux, priors of %s"
-        named = ", ".join(fitter.calibration.priors) or "nothing"
-        log.warning(text, fitter.calibration.name, error.min(), error.max(), named)
+        model = model.with_components(GalacticExtinction(ebv_galactic=ebv, beyond="transparent"))
+    known = first_calibration(calibration, axes, model_error)
+    if models is not None and known is not None:
+        known = known.without_priors()
+    fitter = BayesFitter(
+        model,
+        bands,
+        axes=nodes,
+        model_error=model_error,
+        outliers=outliers,
+        calibration=known,
+        settings=GridSettings(interpolate=interpolate, agn_error=agn_error),
+    )
+    fitter = calibrated(fitter, rows, calibrate, Path(output), options)
+    if models is None:
+        for line in statement(fitter, unused):
+            log.info(line)
     options |= {"catalog_map": catalog_map, "hdu": hdu, "chunk_rows": chunk_rows}
     return fit_file(fitter, path, output, **options)
 
 
-def _calibrated(fitter, rows, column, output, options):
+def first_calibration(calibration, axes, model_error):
+    """
+    Calibration before a catalog says anything: given, read from a file, or that of the models.
+
+    Parameters
+    ----------
+    calibration : `~miricigale.fitting.SurveyCalibration`, path-like, "default" or None
+        As for `fit_catalog`.
+    axes : str
+        Name of the grid.
+    model_error : float or None
+        Errors that take the place of a calibration by default.
+
+    Returns
+    -------
+    calibration : `~miricigale.fitting.SurveyCalibration` or None
+    """
+    from miricigale.fitting.defaults import DEFAULT, chosen_calibration
+    from miricigale.fitting.survey import SurveyCalibration
+
+    of_file = isinstance(calibration, (str, os.PathLike)) and calibration != DEFAULT
+    if of_file:
+        return SurveyCalibration.read(calibration)
+    return chosen_calibration(calibration, axes, model_error)
+
+
+def calibrated(fitter, rows, column, output, options):
+    """
+    Fitter with what its catalog says of models and bands; that of `first_calibration` where it is not asked.
+
+    Parameters
+    ----------
+    fitter : `~miricigale.fitting.BayesFitter`
+        With the calibration of `first_calibration`.
+    rows : `~miricigale.utils.row_files.RowFile`
+        The catalog.
+    column : str or None
+        Column of known redshifts.
+    output : `~pathlib.Path`
+        Folder of the results, where what was measured is kept.
+    options : dict
+        Of `fit_catalog`: ``resume``, ``executor``, ``flux_unit``.
+
+    Returns
+    -------
+    fitter : `~miricigale.fitting.BayesFitter`
+    """
+    return fitter if column is None else _by_redshifts(fitter, rows, column, output, options)
+
+
+def _by_redshifts(fitter, rows, column, output, options):
     """Fitter with the calibration by known redshifts of a catalog, measured unless it is there."""
     from miricigale.fitting.priors import known_redshifts
     from miricigale.fitting.pulls import without_warnings

@@ -78,12 +78,6 @@ class GridFit:
         interpolate = 0 if compat == "cigale" else settings.interpolate
         grid = model
         if isinstance(model, SEDModel):
-            if axes is None or filters is None:
-                msg = (
-                    "'filters' and 'axes' must be given when 'model' is an SEDModel: values of its "
-                    "parameters by name, or 'fit', 'quick' or 'survey' for a grid of ours"
-                )
-                raise ValueError(msg)
             if finer not in (None, model):
                 raise argument_error("finer", "left out when 'model' is an SEDModel", "another one")
             grid, finer = model.grid(axes, filters), model if interpolate else None

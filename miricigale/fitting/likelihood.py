@@ -6,6 +6,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.filters import Filter
+from miricigale.filters.library import SEDPY
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.object_rows import ObjectRows, PerObject
 from miricigale.utils.options import check_that
@@ -265,8 +266,10 @@ def unused_bands(table, filters):
 
 
 def is_filter(name):
-    """Whether a column is called by a filter of the library."""
-    return name in Filter.names() or name.startswith("sedpy.")
+    """Whether a column is called by a filter of the library; errors of any filter of astro-sedpy are not."""
+    if name in Filter.names():
+        return True
+    return name.startswith(SEDPY) and not name.endswith((error_column(""), "_limit"))
 
 
 def _is_flux(column):

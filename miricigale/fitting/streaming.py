@@ -14,6 +14,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.filters.catalog_files import codes_of, warn_of_codes
+from miricigale.fitting.fitted_bands import bands_with_errors
 from miricigale.fitting.fitter import BayesFitter
 from miricigale.fitting.from_files import give_units, open_catalog
 from miricigale.fitting.io import FORMAT, FitFolder, open_results, part_ids, part_name
@@ -129,17 +130,19 @@ def fit_file(
     check_that(isinstance(fitter, BayesFitter), "fitter", "a BayesFitter", type(fitter).__name__)
     if not isinstance(path_in, (str, os.PathLike)):
         raise argument_error("path_in", "the path of a catalog", type(path_in).__name__)
+    unit = None if flux_unit is None else u.Unit(flux_unit)
+    if unit is not None and not unit.is_equivalent(FNU):
+        msg = f"'flux_unit' must be convertible to {FNU}, got {unit}"
+        raise u.UnitsError(msg)
+    rows = open_catalog(path_in, chunk_rows, hdu=hdu, catalog_map=catalog_map, flux_unit=unit)
+    if fitter.waits:
+        fitter = fitter.for_bands(bands_with_errors(rows.colnames, "path_in"))
     if fitter.engine != "grid":
         check_that(seed is not None, "seed", "given for a sampler, to resume it", "None")
         seed = check_seed(seed)
     else:
         # the same fit, in whatever order they are given
         pairs = fitter.backend.check_pairs(pairs)
-    unit = None if flux_unit is None else u.Unit(flux_unit)
-    if unit is not None and not unit.is_equivalent(FNU):
-        msg = f"'flux_unit' must be convertible to {FNU}, got {unit}"
-        raise u.UnitsError(msg)
-    rows = open_catalog(path_in, chunk_rows, hdu=hdu, catalog_map=catalog_map, flux_unit=unit)
     options = {"redshift": redshift, "redshift_prior": redshift_prior, "pairs": pairs}
     if catalog_map is None:
         pieces = (codes_of(rows.chunk(i), fitter.bands) for i in range(rows.n_chunks))

@@ -54,6 +54,12 @@ class SEDModel(Interactive):
         luminosity (CIGALE's default), or the AGN's share of all 3-1000 um light, or of another range
         of rest wavelengths such as ``"5-20um"``, within 0.1-1000 um.
 
+    Attributes
+    ----------
+    preset : str or None
+        ``"survey"`` or ``"yang2021"`` for a model that `survey` or `yang2021` made, which has axes of its own
+        (`named_axes`); None for another one.
+
     Raises
     ------
     ValueError
@@ -86,6 +92,7 @@ class SEDModel(Interactive):
             del own["dust_excess"]
         self._parameters = merged | own
         self._notes = ()
+        self.preset = None
 
     # ------------------------------------------------------------------ making
 
@@ -153,7 +160,7 @@ class SEDModel(Interactive):
         <SEDModel delayed -> bc03 -> calzetti -> dl07_alpha -> parametric_torus -> inoue2014>
         """
         made = presets.yang2021_components(agn=agn, xray=xray, igm=igm, libraries=libraries)
-        return cls._preset(made, options)
+        return cls._of_preset("yang2021", made, options)
 
     @classmethod
     def survey(cls, *, agn=True, igm="meiksin2006", libraries="best", **options):
@@ -176,14 +183,100 @@ class SEDModel(Interactive):
         <SEDModel delayed -> bc03 -> nebular -> calzetti -> dl07 -> meiksin2006>
         """
         made = presets.survey_components(agn=agn, igm=igm, libraries=libraries)
-        return cls._preset(made, options)
+        return cls._of_preset("survey", made, options)
 
     @classmethod
-    def _preset(cls, made, options):
+    def _of_preset(cls, name, made, options):
         parts, notes = made
         model = cls(parts, **options)
         model._notes = tuple(notes)
+        model.preset = name
         return model
+
+    @classmethod
+    def for_axes(cls, name="survey"):
+        """
+        The model that a grid of ours is made of.
+
+        Parameters
+        ----------
+        name : {"survey", "far-infrared", "yang2021", "yang2021-quick"}, optional
+            Name of the grid.
+
+        Examples
+        --------
+        >>> from miricigale import SEDModel
+        >>> SEDModel.for_axes("far-infrared").preset
+        'survey'
+        """
+        preset = presets.GRIDS[presets.grid_name(name, "name")][0]
+        return cls.survey() if preset == "survey" else cls.yang2021()
+
+    def with_components(self, *components):
+        """
+        Model of the same chain with more components, such as dust of the Milky Way.
+
+        Parameters
+        ----------
+        *components : `~miricigale.sed.Component`
+            Of roles that the chain does not have.
+
+        Examples
+        --------
+        >>> from miricigale import SEDModel
+        >>> from miricigale.sed import GalacticExtinction
+        >>> model = SEDModel.survey().with_components(GalacticExtinction(ebv_galactic=0.02))
+        >>> model.preset
+        'survey'
+        """
+        model = type(self)(
+            [*self.components, *components],
+            cosmology=self.cosmology,
+            frac_agn_definition=self.frac_agn_definition,
+        )
+        model._notes = self._notes
+        model.preset = self.preset
+        return model
+
+    def named_axes(self, name=None):
+        """
+        Axes of a grid of this model by name.
+
+        Parameters
+        ----------
+        name : {"survey", "far-infrared", "yang2021", "yang2021-quick"}, optional
+            The grid; by default that of its own name of a model that `survey` or `yang2021` made. Axes of AGN
+            are left out for a model without.
+
+        Returns
+        -------
+        axes : dict of str to `~numpy.ndarray`
+            In the units of the parameters; to be changed at will.
+
+        Raises
+        ------
+        ValueError
+            If there is no grid of that name, it is one of another chain, or no name was given for a model that
+            has no grid of its own.
+
+        Examples
+        --------
+        >>> from miricigale import SEDModel
+        >>> SEDModel.survey(agn=False).named_axes()["metallicity"]
+        array([0.004, 0.02 ])
+        """
+        own = [n for n, (preset, _) in presets.GRIDS.items() if preset == self.preset]
+        if name is None:
+            if not own:
+                wanted = "given for a model that has no grid of its own: a dict of its parameters to values"
+                raise argument_error("axes", wanted, "None")
+            name = self.preset
+        name = presets.grid_name(name)
+        if own and name not in own:
+            named = ", ".join(map(repr, own))
+            wanted = f"{named} or a dict of parameters to values for the model {self.preset!r}"
+            raise argument_error("axes", wanted, repr(name))
+        return presets.grid_axes(name, agn=self.has_agn)
 
     survey_axes = staticmethod(presets.survey_axes)
     yang2021_axes = staticmethod(presets.yang2021_axes)
@@ -400,10 +493,11 @@ class SEDModel(Interactive):
 
         Parameters
         ----------
-        axes : dict of str to array
-            Parameter name to its values; ``redshift`` is needed, ``mass`` and parameters of X-rays and
-            the foreground have no place here. Other parameters have their defaults: with ``dust_excess``
-            the dust's luminosity is free of energy balance. With no ``frac_agn`` but 0 the grid has no AGN.
+        axes : dict of str to array, str or None
+            Parameter name to its values, or a name for `named_axes` (None: its own grid); ``redshift`` is needed,
+            ``mass`` and parameters of X-rays and the foreground have no place here. Other parameters have their
+            defaults: with ``dust_excess`` the dust's luminosity is free of energy balance. With no ``frac_agn``
+            but 0 the grid has no AGN.
         filters : `~miricigale.filters.FilterSet` or list of str
             The bands.
         cache : bool, optional
@@ -434,6 +528,8 @@ class SEDModel(Interactive):
         >>> model.grid(axes, ["miri.f770w"], cache=False)
         <ModelGrid 2 redshifts x 3 galaxies x 0 AGN x 1 fractions, 1 bands, 6 models>
         """
+        if axes is None or isinstance(axes, str):
+            axes = self.named_axes(axes)
         axes = gridding.check_axes(self, axes)
         filters = self._bands(filters)
         gridding.warn_of_one_field(self, axes, filters)

@@ -1,15 +1,29 @@
-"""Chains and axes after published studies, with what stands in where libraries are missing."""
+"""Chains and axes for surveys and after published studies, with what stands in where libraries are missing."""
 
 import numpy as np
+from astropy.utils.exceptions import AstropyDeprecationWarning
 
 from miricigale.refdata import find_resource
 from miricigale.sed import components as c
 from miricigale.sed.component import COMPONENTS
 from miricigale.utils.declared import declared
+from miricigale.utils.exceptions import argument_error, warn
 from miricigale.utils.options import check_that
 
 #: Where a preset takes its libraries from.
 LIBRARIES = ("best", "bundled")
+
+#: Chains by the names of the grids that are made of them, and the tables of their axes.
+GRIDS = {
+    "survey": ("survey", "survey_axes"),
+    "far-infrared": ("survey", "far_infrared_axes"),
+    "yang2021": ("yang2021", "yang2021_fit"),
+    "yang2021-quick": ("yang2021", "yang2021_quick"),
+}
+#: Names that grids once had.
+_FORMER = {"fit": "yang2021", "quick": "yang2021-quick"}
+#: Parameters of grids that only a chain with an AGN has.
+_OF_AGN = frozenset({"tau97", "ebv_polar", "temperature_polar", "frac_agn"})
 
 #: AGN templates of the fits of Yang et al. 2021 (table 1; q is inferred).
 TORUS = {"p": 1.0, "q": 1.0, "opening_angle": 40.0, "radius_ratio": 20.0}
@@ -188,6 +202,36 @@ def quasar_axes():
     (array([0.  , 0.05, 0.1 , 0.2 , 0.4 ]), array([0.7  , 0.85 , 0.93 , 0.97 , 0.99 , 0.997]))
     """
     return _values("quasar_axes")
+
+
+def grid_name(name, argument="axes"):
+    """
+    Name of a grid in `GRIDS`, of which that or a former one is given.
+
+    Raises
+    ------
+    ValueError
+        If no grid has that name.
+
+    Warns
+    -----
+    `~astropy.utils.exceptions.AstropyDeprecationWarning`
+        Of a former name.
+    """
+    if name in _FORMER:
+        now = _FORMER[name]
+        warn(f"{argument} {name!r} is now called {now!r}", AstropyDeprecationWarning)
+        return now
+    if name not in GRIDS:
+        wanted = f"a dict of parameter name to values, or one of {', '.join(map(repr, GRIDS))}"
+        raise argument_error(argument, wanted, repr(name))
+    return name
+
+
+def grid_axes(name, *, agn=True):
+    """Axes of a grid in `GRIDS`: new arrays by parameter; without those of AGN if ``agn`` is false."""
+    axes = _values(GRIDS[name][1])
+    return axes if agn else {n: values for n, values in axes.items() if n not in _OF_AGN}
 
 
 def _values(name):

@@ -100,7 +100,7 @@ def test_bad_photometry_is_named(grid, photometry):
     refuses("'photometry' column 'band0' must be convertible", fitter.fit, bare, error=u.UnitsError)
     refuses("'redshift' must be a column among", fitter.fit, photometry, redshift="z_best")
     refuses("'redshift' must be 12 values", fitter.fit, photometry, redshift=[1.0, 2.0])
-    refuses("'filters' and 'axes' must be given", BayesFitter, SEDModel.yang2021())
+    refuses("'axes' must be given for a model that has no grid of its own", BayesFitter, OWN, ["F770W"])
 
 
 @pytest.mark.parametrize("filters", [None, ["band0", "band1"]])

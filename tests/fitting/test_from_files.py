@@ -24,7 +24,7 @@ from miricigale.utils.exceptions import MiricigaleWarning
 BANDS = ("wfc3.f125w", "wfc3.f160w", "irac.ch1", "irac.ch2", "miri.f770w", "miri.f1500w")
 
 
-def fit(path, *options, out="out", axes="quick"):
+def fit(path, *options, out="out", axes="yang2021-quick"):
     """``miricigale fit`` of a file, into a folder beside it."""
     folder = str(path.parent / out)
     return ["fit", str(path), "-o", folder, "--axes", axes, "--no-progress", *options]
@@ -128,7 +128,12 @@ def test_real_galaxies_have_their_own_grid_whose_errors_are_logged(tmp_path, cap
         table[name], table[f"{name}_err"] = fluxes[name], 0.03 * fluxes[name]
     table.write(tmp_path / "cat.fits")
     assert main(fit(tmp_path / "cat.fits", axes="survey")) == 0
-    assert "calibration of CEERS: errors of the models 3 to 48 % of the flux" in caplog.text
+    for text in (
+        "the grid 'survey' of 17,611,776 models, redshifts 0.01 to 6.92",
+        "8 fitted, wfc3.f125w",
+        "calibration 'CEERS'; errors of the models 3 to 48 % of the flux; priors of age",
+    ):
+        assert text in caplog.text
     found = QTable.read(tmp_path / "out" / "table.fits")
     for name in ("redshift", "frac_agn", "ebv"):
         assert_allclose(found[f"{name}_best"].value, nodes[name], rtol=1e-6)
@@ -137,6 +142,7 @@ def test_real_galaxies_have_their_own_grid_whose_errors_are_logged(tmp_path, cap
     options = ["--model-error", "0.1"]
     assert main(fit(tmp_path / "cat.fits", *options, out="other", axes="survey")) == 0
     assert "calibration" not in caplog.text
+    assert "10 % of the flux added to errors" in caplog.text
 
 
 def test_a_votable_in_magnitudes_by_a_map(catalog, tmp_path, capsys):
@@ -237,7 +243,7 @@ def test_the_page_says_how_redshifts_compare_and_what_is_left_out(catalog, tmp_p
     table["miri.f999w"], table["miri.f999w_err"] = table["irac.ch1"], table["irac.ch1_err"]
     table.write(tmp_path / "cat.fits")
     with pytest.warns(MiricigaleWarning, match=r"not fitted.*miri\.f999w"):
-        results = fit_catalog(tmp_path / "cat.fits", tmp_path / "out", axes="quick")
+        results = fit_catalog(tmp_path / "cat.fits", tmp_path / "out", axes="yang2021-quick")
     page = fit_page(results, tmp_path / "cat.fits").to_html()
     for text in (
         "objects with z_spec",
@@ -263,7 +269,7 @@ def test_fluxes_behind_the_milky_way_give_the_galaxies_in_front_of_it(catalog, t
         for column in (name, f"{name}_err"):
             table[column] = table[column] * 10 ** (-0.4 * lost[name][0].value)
     table.write(tmp_path / "cat.fits")
-    options = {"axes": "quick", "redshift": "z_spec", "ebv": 0.3}
+    options = {"axes": "yang2021-quick", "redshift": "z_spec", "ebv": 0.3}
     results = fit_catalog(tmp_path / "cat.fits", tmp_path / "out", **options)
     found = results.to_table(["mass_best", "chi2_best"])
     assert_allclose(found["mass_best"].to_value(u.Msun), 1e10, rtol=0.03)

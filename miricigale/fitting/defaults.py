@@ -1,0 +1,189 @@
+"""What is fitted where nothing else is said: models of real galaxies, their grid and their calibration."""
+
+import numpy as np
+
+from miricigale.filters import FilterSet
+from miricigale.sed import SEDModel
+from miricigale.sed.presets import GRIDS, grid_axes, grid_name
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
+
+#: For a calibration: that of the models.
+DEFAULT = "default"
+
+
+def models_and_bands(model, filters, axes):
+    """
+    The models and bands that arguments of `~miricigale.fitting.BayesFitter` stand for.
+
+    Parameters
+    ----------
+    model : `~miricigale.sed.ModelGrid`, `~miricigale.sed.SEDModel`, list of str, `FilterSet` or None
+        Bands alone are taken as ``filters``.
+    filters : list of str, `FilterSet` or None
+        Bands.
+    axes : dict, str or None
+        Parameters to values, or the name of a grid.
+
+    Returns
+    -------
+    model : object
+        As given, or `SEDModel.for_axes` where only bands or nothing was given.
+    filters : list of str, `FilterSet` or None
+        Bands.
+    """
+    if isinstance(model, (list, tuple, FilterSet)):
+        wanted = "left out where 'model' is a list of bands"
+        check_that(filters is None, "filters", wanted, filters)
+        filters, model = model, None
+    if model is None:
+        model = SEDModel.for_axes(axes if isinstance(axes, str) else "survey")
+    return model, filters
+
+
+def axes_of(model, axes):
+    """
+    Axes of a grid of a model, and the name of the grid.
+
+    Parameters
+    ----------
+    model : object
+        `~miricigale.sed.SEDModel`, or anything else, whose ``axes`` are left alone.
+    axes : dict, str or None
+        Parameters to values, or the name of a grid; None for the model's own.
+
+    Returns
+    -------
+    axes : dict or None
+        Parameters to values.
+    name : str or None
+        Name of the grid; None if they are of no grid of ours.
+
+    Raises
+    ------
+    ValueError
+        If no axes were given for a model that has none of its own, or the name is that of another chain.
+    """
+    if not isinstance(model, SEDModel):
+        return axes, None
+    if axes is None or isinstance(axes, str):
+        name = model.preset if axes is None else grid_name(axes)
+        return model.named_axes(axes if axes is None else name), name
+    for name, (preset, _) in GRIDS.items():
+        if preset == model.preset and _are_same(axes, grid_axes(name, agn=model.has_agn)):
+            return axes, name
+    return axes, None
+
+
+def _are_same(axes, others):
+    """Whether two grids have the same axes."""
+    if not isinstance(axes, dict) or axes.keys() != others.keys():
+        return False
+    return all(np.array_equal(np.asarray(axes[name]), values) for name, values in others.items())
+
+
+def default_calibration(grid, model_error=None, template_error=None):
+    """
+    Calibration of a grid of ours where none was given.
+
+    Parameters
+    ----------
+    grid : str or None
+        Name of the grid.
+    model_error : float, dict or None
+        Errors of the models that were given, which take its place.
+    template_error : `TemplateError` or None
+        The same, by rest wavelength.
+
+    Returns
+    -------
+    calibration : `~miricigale.fitting.SurveyCalibration` or None
+        That of `SurveyCalibration.survey` for the grid ``"survey"``; it was measured to 8 um at rest, and would
+        give far-infrared bands no weight.
+    """
+    if grid != "survey" or model_error is not None or template_error is not None:
+        return None
+    # it is measured by fits, whose modules are made of this one
+    from miricigale.fitting.survey import SurveyCalibration
+
+    return SurveyCalibration.survey()
+
+
+def chosen_calibration(calibration, grid, model_error=None, template_error=None):
+    """
+    The calibration that was given, or `default_calibration` where that is asked for.
+
+    Raises
+    ------
+    ValueError
+        If it is no `~miricigale.fitting.SurveyCalibration`, nor ``"default"``, nor None.
+    """
+    if calibration is None or hasattr(calibration, "template_error"):
+        return calibration
+    if not isinstance(calibration, str) or calibration != DEFAULT:
+        wanted = f"a SurveyCalibration, {DEFAULT!r} or None"
+        raise argument_error("calibration", wanted, repr(calibration))
+    return default_calibration(grid, model_error, template_error)
+
+
+def statement(fitter, unused=()):
+    """
+    What a fitter fits, in three lines: models, bands, and errors with priors.
+
+    Parameters
+    ----------
+    fitter : `~miricigale.fitting.BayesFitter`
+        The fitter.
+    unused : iterable of str, optional
+        Bands of the catalog that are not fitted.
+
+    Returns
+    -------
+    lines : list of str
+    """
+    bands = fitter.filters or fitter.bands
+    lost = f"; not fitted: {', '.join(unused)}" if unused else ""
+    return [
+        f"models: {_models(fitter)}",
+        f"bands: {len(bands)} fitted, {', '.join(bands)}{lost}",
+        f"errors and priors: {_errors(fitter, bands)}",
+    ]
+
+
+def _models(fitter):
+    """The models in words: the grid by its name, its size and redshifts."""
+    if fitter.grid is None:
+        return f"{fitter.model!r}, by {fitter.engine}"
+    z = fitter.grid.redshift
+    name = "a grid" if fitter.grid_name is None else f"the grid {fitter.grid_name!r}"
+    text = f"{name} of {fitter.grid.n_models:,} models, redshifts {z[0]:.2f} to {z[-1]:.2f}"
+    return text if fitter.model is None else f"{text}, of {fitter.model!r}"
+
+
+def _errors(fitter, bands):
+    """Errors and priors in words, as a part of the flux."""
+    calibration = fitter.calibration
+    parts = []
+    if calibration is not None:
+        parts.append(f"calibration {calibration.name!r}")
+    if fitter.template_error is not None:
+        error = 100.0 * fitter.template_error.error
+        parts.append(f"errors of the models {error.min():.0f} to {error.max():.0f} % of the flux")
+    given = 100.0 * np.array([fitter.model_errors[band] for band in bands])
+    if given.max() > 0.0:
+        span = (
+            f"{given.min():.0f}"
+            if given.min() == given.max()
+            else f"{given.min():.0f} to {given.max():.0f}"
+        )
+        parts.append(f"{span} % of the flux added to errors")
+    parts.append(f"priors of {', '.join(_priors(fitter)) or 'nothing: flat in the nodes'}")
+    return "; ".join(parts)
+
+
+def _priors(fitter):
+    """Names of the parameters that have a prior."""
+    names = [] if fitter.calibration is None else list(fitter.calibration.priors)
+    if fitter.calibration is not None and fitter.calibration.mass_function is not None:
+        names.append("mass and redshift")
+    return names
