@@ -23,7 +23,7 @@ from miricigale.utils.exceptions import (
     unknown_name,
     warn,
 )
-from miricigale.utils.missing import negative_errors, plain_floats, without_codes
+from miricigale.utils.missing import negative_codes, negative_errors, plain_floats, without_codes
 from miricigale.utils.options import check_choice, check_data, check_names, check_that
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU
@@ -273,6 +273,8 @@ class CatalogMap:
             errors = plain_floats(table[error], error, argument)
         ab = _is_ab(unit)
         missing, no_error = without_codes(values, errors, magnitudes=ab, further=self.missing)
+        if errors is not None and not self.limits and not ab:
+            no_error |= ~missing & negative_codes(values, errors)
         code = np.where(missing, values, np.nan)
         if ab:
             flux = 10 ** (-0.4 * (np.where(missing, np.nan, values) - 23.9))

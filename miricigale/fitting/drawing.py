@@ -38,6 +38,9 @@ def best_parameters(results, model):
     best = results._fitted_one().best
     names = dict.fromkeys((*results.axes, "redshift", "mass"))
     known = {name: best[name].value for name in names if name in best}
+    if "agn_power" in best and best["agn_power"].value == 0.0:
+        # of a galaxy without dust that its fraction refers to
+        known.pop("frac_agn", None)
     return {
         name: u.Quantity(value, model.parameters[name].unit)
         for name, value in (results.constants | known).items()

@@ -22,7 +22,10 @@ from miricigale.utils.units import WAVE
 
 _MODEL_PARAMETERS = {
     "redshift": Parameter(1.0, (0.0, 20.0), "Redshift."),
-    "mass": Parameter(1e10, (0.0, 1e16), "Mass of all stars ever formed.", unit="Msun"),
+    # a mass formed of 3 to 20 suns is the logarithm of one
+    "mass": Parameter(
+        1e10, (0.0, 1e16), "Mass of all stars ever formed.", unit="Msun", logarithms=(3.0, 20.0)
+    ),
     "dust_excess": Parameter(
         1.0,
         (0.0, 1e6),

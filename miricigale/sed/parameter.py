@@ -27,6 +27,9 @@ class Parameter:
         One sentence that says what it is.
     unit : `~astropy.units.Unit` or str, optional
         Unit; dimensionless if not given.
+    logarithms : tuple of float, optional
+        Bare numbers between these are refused: they are logarithms rather than values. A quantity is what it
+        says.
 
     Raises
     ------
@@ -42,8 +45,9 @@ class Parameter:
     0.3
     """
 
-    def __init__(self, default, bounds, doc, *, unit=""):
+    def __init__(self, default, bounds, doc, *, unit="", logarithms=None):
         self.unit = u.Unit(unit)
+        self.logarithms = logarithms
         self.default = float(default)
         self.bounds = (float(bounds[0]), float(bounds[1]))
         self.doc = str(doc)
@@ -64,7 +68,9 @@ class Parameter:
 
     def replace(self, default, name=None):
         """Copy with another default, and another name if one is given."""
-        new = Parameter(default, self.bounds, self.doc, unit=self.unit)
+        new = Parameter(
+            default, self.bounds, self.doc, unit=self.unit, logarithms=self.logarithms
+        )
         new.name = name or self.name
         return new
 
@@ -82,7 +88,7 @@ class Parameter:
         `~astropy.units.UnitsError`
             If the unit cannot be converted.
         ValueError
-            If it is not one finite number inside the bounds.
+            If it is not one finite number inside the bounds, or a logarithm.
         """
         number = self.convert(value)
         check_that(np.ndim(number) == 0, self.name, "one number", f"shape {np.shape(number)}")
@@ -129,8 +135,22 @@ class Parameter:
     def convert(self, value):
         """Convert a number, array or quantity to plain numbers in the unit."""
         if not hasattr(value, "unit") or value.unit is None:
+            self._refuse_logarithms(value)
             return value
         return self._quantity(value, value.unit).to_value(self.unit)
+
+    def _refuse_logarithms(self, value):
+        """Refuse bare numbers that are logarithms rather than values."""
+        plain = np.ma.getdata(value)
+        if self.logarithms is None or np.asarray(plain).dtype.kind not in "iuf":
+            return
+        low, high = self.logarithms
+        some = np.atleast_1d(plain)
+        some = some[(some > low) & (some < high)]
+        if some.size:
+            unit = self.unit.to_string()
+            wanted = f"in {unit}, not its logarithm: 10**{some[0]:g} or, if it is so small, a quantity"
+            raise argument_error(self.name, wanted, f"{some[0]:g}")
 
     def _quantity(self, value, unit):
         try:

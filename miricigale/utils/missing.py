@@ -47,6 +47,27 @@ def without_codes(values, errors=None, *, magnitudes=False, further=()):
     return missing, no_error
 
 
+def negative_codes(values, errors):
+    """
+    Errors of fluxes that stand for no value because they are negative, whatever the number.
+
+    Numbers such as -99 become -0.099 with the unit of a catalog, and -1 marks what was not measured. Left out are
+    those that may be 1 sigma of an upper limit, of a positive flux one to ten times as large.
+
+    Parameters
+    ----------
+    values, errors : `~numpy.ndarray`, shape (n,)
+        Fluxes and errors, NaN where they are missing.
+
+    Returns
+    -------
+    code : `~numpy.ndarray` of bool, shape (n,)
+    """
+    sigma = np.abs(errors)
+    limit = (values >= sigma) & (values <= 10.0 * sigma)
+    return (errors < 0) & ~limit
+
+
 def negative_errors(values, errors):
     """
     Upper limits by CIGALE's convention: the value is the limit, and minus the error its 1 sigma.

@@ -64,7 +64,6 @@ def test_every_combination_of_values_counts_as_one_model():
     assert np.any((found[0] > 0.01) & (found[0] < 0.3))
 
 
-@pytest.mark.filterwarnings("ignore:frac_agn has no effect")
 @pytest.mark.parametrize(
     ("definition", "name"), [("dust", "frac_agn_ir"), ("3-1000um", "frac_agn_dust")]
 )
