@@ -20,6 +20,7 @@ from miricigale.fitting.likelihood import (
 from miricigale.fitting.priors import known_redshifts
 from miricigale.fitting.pulls import warn_of_pulls
 from miricigale.fitting.results import FitResults
+from miricigale.fitting.sample_flags import chi2_limit, chi2_step, with_high_chi2
 from miricigale.fitting.samplers import get_sampler
 from miricigale.fitting.samplers.fit import SamplerFit
 from miricigale.fitting.settings import GridSettings, SamplerSettings
@@ -443,7 +444,8 @@ class BayesFitter(Interactive):
         options = {"pairs": pairs, "seed": seed, "chunk_size": chunk_size, "parallel": parallel}
         results = self.fit_part(self.table_of(photometry), **known, **options)
         warn_of_pulls(results)
-        return results
+        sample = results.reduced_chi2[:: chi2_step(len(results))]
+        return with_high_chi2(results, chi2_limit(sample))
 
     __call__ = fit
     table_of, read_bands = fitted_bands.table_of, fitted_bands.read_bands

@@ -10,6 +10,7 @@ from astropy.table import Table, vstack
 
 from miricigale.fitting.priors import GridAxis
 from miricigale.fitting.results import FitResults
+from miricigale.fitting.sample_flags import with_high_chi2
 from miricigale.fitting.samples import Samples
 from miricigale.sed import ModelGrid
 from miricigale.utils.content import content_sha256
@@ -180,6 +181,14 @@ def part_ids(path):
         return native(np.array(hdus["RESULTS"].data["ids"]))
 
 
+def part_chi2(path):
+    """Reduced chi2 of the objects of a part, read without the rest; NaN of a single band."""
+    with open_fits(path, wanted="fit results", memmap=True) as hdus:
+        data = hdus["RESULTS"].data
+        chi2, free = native(np.array(data["chi2"])), native(np.array(data["n_bands"])) - 1
+    return np.divide(chi2, free, out=np.full(chi2.shape, np.nan), where=free > 0)
+
+
 def open_results(path, *, partial=False, model=None):
     """
     Open the results that `fit_file` wrote.
@@ -245,6 +254,8 @@ class FitResultsFiles:
         check_data(folder.facts, path, "holds no results of fit_file (no manifest)")
         #: What was fitted, and how.
         self.job = folder.facts["job"]
+        # of all parts, once they are there
+        self._chi2_limit = folder.facts.get("chi2_limit")
         self.n_parts = max(1, -(-self.job["catalogue"]["rows"] // self.job["chunk_rows"]))
         parts = folder.records
         names = [part_name(i) for i in range(self.n_parts)]
@@ -270,7 +281,8 @@ class FitResultsFiles:
         return len(self.paths) == self.n_parts
 
     def _read(self, path, rows=None):
-        return read_results(path, rows=rows)._changed(model=self.model)
+        results = read_results(path, rows=rows)._changed(model=self.model)
+        return results if self._chi2_limit is None else with_high_chi2(results, self._chi2_limit)
 
     def parts(self):
         """Iterate over the parts: one `FitResults` at a time."""

@@ -56,7 +56,8 @@ class FitFlags(Flags):
     REDSHIFT_OUTSIDE = 16
     #: The id occurred before; only its first row is fitted.
     DUPLICATE_ID = 32
-    #: No model fits: the reduced chi2 of the best is above 100.
+    #: No model fits: the reduced chi2 of the best is above that of nearly all of the sample (by three standard
+    #: deviations of its logarithm; above 10 without 50 others), and larger than errors make it.
     HIGH_CHI2 = 64
     #: No model has a positive scale, the fluxes being zero or negative: the posterior is the prior.
     NO_SIGNAL = 128
@@ -84,6 +85,9 @@ class FitFlags(Flags):
     #: The median stellar mass is below 3e6 solar masses at a redshift that was fitted, as of few sources that a
     #: survey detects: rather another redshift, a star, or a little red dot.
     LOW_MASS = 131072
+    #: One band is off, that of the column ``band_off``: its residual to the best model is above 4 errors and makes
+    #: 40 % of chi2 or more. Look at that flux before you trust the fit, or fit without it.
+    BAND_OFF = 524288
     #: Bits with which a row has no result.
     UNFITTED = 1 | 2 | 8 | 16 | 32 | 512 | 4096 | 8192
 
@@ -353,7 +357,7 @@ def flags_of_fits(results, measured, edge_weight):
     flags, fitted, pdf = np.array(results.flags), results.fitted, results.pdf["redshift"]
     signal = np.where(measured, results.best_flux / results.sigma, 0.0)
     with np.errstate(invalid="ignore"):
-        flags[fitted & (results.reduced_chi2 > HIGH_CHI2)] |= FitFlags.HIGH_CHI2
+        flags[fitted & (results.band_off != "")] |= FitFlags.BAND_OFF
         flags[fitted & ~(results.best_scale > 0)] |= FitFlags.NO_SIGNAL
         faint = np.sqrt(np.sum(signal * signal, axis=1)) < LOW_SIGNAL
         flags[fitted & faint] |= FitFlags.LOW_SIGNAL

@@ -26,7 +26,7 @@ def to_table(results):
     -------
     table : `~astropy.table.QTable`
         One row for each object: ``id``, ``flags``, ``n_bands``, ``n_limits``,
-        ``chi2_best``, ``reduced_chi2``, ``log_evidence`` (of a sampler also
+        ``chi2_best``, ``reduced_chi2``, ``band_off``, ``log_evidence`` (of a sampler also
         ``log_evidence_err``, ``n_calls``, ``n_effective``, ``converged``), and for each
         parameter and derived quantity ``<name>_mean``, ``_std``, ``_p16``, ``_p50``, ``_p84``
         and ``_best``; derived quantities that scale with mass also have ``_logmean``, the mean

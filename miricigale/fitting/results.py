@@ -18,6 +18,7 @@ from miricigale.fitting.posterior import (
 from miricigale.fitting.quantities import DERIVED_LEVELS, kept_percentiles
 from miricigale.fitting.result_tables import OUTLIER
 from miricigale.fitting.rows import FitRows
+from miricigale.fitting.sample_flags import worst_bands
 from miricigale.utils.interactive import checked_calls
 from miricigale.utils.object_rows import PerObject, PerObjectDict
 from miricigale.utils.options import check_names
@@ -212,6 +213,13 @@ class FitResults(FitRows):
         """Chi2 over the number of bands (limits among them) less one; NaN with a single band."""
         free = np.asarray(np.maximum(self.n_bands - 1, 0))
         return np.divide(self.chi2, free, out=np.full(free.shape, np.nan), where=free > 0)[()]
+
+    @property
+    def band_off(self):
+        """The band that is off (`FitFlags` ``BAND_OFF``), empty without: array of str, shape (n,)."""
+        names = np.array([*self.filters, ""])
+        found = names[worst_bands(self._several())]
+        return found[0] if self.isscalar else found
 
     @property
     def parameters(self):

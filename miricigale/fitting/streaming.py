@@ -17,9 +17,10 @@ from miricigale.filters.catalog_files import codes_of, warn_of_codes
 from miricigale.fitting.fitted_bands import bands_with_errors
 from miricigale.fitting.fitter import BayesFitter
 from miricigale.fitting.from_files import give_units, open_catalog
-from miricigale.fitting.io import FORMAT, FitFolder, open_results, part_ids, part_name
+from miricigale.fitting.io import FORMAT, FitFolder, open_results, part_chi2, part_ids, part_name
 from miricigale.fitting.likelihood import HIGH_CHI2
 from miricigale.fitting.pulls import warn_of_pulls
+from miricigale.fitting.sample_flags import chi2_limit, chi2_step
 from miricigale.utils.content import content_sha256
 from miricigale.utils.exceptions import CatalogWarning, OtherResultsError, argument_error, warn
 from miricigale.utils.folder import FileFolder
@@ -161,7 +162,17 @@ def fit_file(
     with FitFolder(path_out) as folder:
         _begin(folder, job, resume)
         _fit_parts(fitter, rows, take, folder, seed, executor, progress_bar)
+        # which depends on all of the sample
+        folder.facts["chi2_limit"] = _chi2_limit(folder, rows.n_chunks)
+        folder.write_manifest()
     return open_results(path_out, model=fitter.model)
+
+
+def _chi2_limit(folder, n_parts):
+    """Reduced chi2 above which a fit is poor, of all parts."""
+    parts = [part_chi2(folder.path(part_name(i))) for i in range(n_parts)]
+    step = chi2_step(sum(len(chi2) for chi2 in parts))
+    return chi2_limit(np.concatenate(parts)[::step])
 
 
 @contextlib.contextmanager

@@ -68,9 +68,7 @@ class Parameter:
 
     def replace(self, default, name=None):
         """Copy with another default, and another name if one is given."""
-        new = Parameter(
-            default, self.bounds, self.doc, unit=self.unit, logarithms=self.logarithms
-        )
+        new = Parameter(default, self.bounds, self.doc, unit=self.unit, logarithms=self.logarithms)
         new.name = name or self.name
         return new
 
@@ -149,7 +147,9 @@ class Parameter:
         some = some[(some > low) & (some < high)]
         if some.size:
             unit = self.unit.to_string()
-            wanted = f"in {unit}, not its logarithm: 10**{some[0]:g} or, if it is so small, a quantity"
+            wanted = (
+                f"in {unit}, not its logarithm: 10**{some[0]:g} or, if it is so small, a quantity"
+            )
             raise argument_error(self.name, wanted, f"{some[0]:g}")
 
     def _quantity(self, value, unit):

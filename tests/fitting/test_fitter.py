@@ -11,6 +11,7 @@ from helpers.errors import refuses
 from helpers.grids import draw_photometry, make_grid, node_fitter, photometry_table
 from miricigale.fitting import BayesFitter, FitFlags, GridSettings, SamplerSettings, leave_out
 from miricigale.sed import SEDModel
+from miricigale.sed.components import BC03, DelayedSFH
 from miricigale.utils.exceptions import FitWarning
 
 
@@ -100,7 +101,13 @@ def test_bad_photometry_is_named(grid, photometry):
     refuses("'photometry' column 'band0' must be convertible", fitter.fit, bare, error=u.UnitsError)
     refuses("'redshift' must be a column among", fitter.fit, photometry, redshift="z_best")
     refuses("'redshift' must be 12 values", fitter.fit, photometry, redshift=[1.0, 2.0])
-    refuses("'axes' must be given for a model that has no grid of its own", BayesFitter, OWN, ["F770W"])
+    own = SEDModel([DelayedSFH(), BC03()])
+    refuses("'axes' must be given for a model that has no grid of its own", BayesFitter, own)
+    refuses(
+        "'yang2021', 'yang2021-quick' or a dict", BayesFitter, SEDModel.yang2021(), axes="survey"
+    )
+    refuses("or one of 'survey', 'far-infrared'", BayesFitter, axes="yang")
+    refuses("'calibration' must be a SurveyCalibration", BayesFitter, grid, calibration="CEERS")
 
 
 @pytest.mark.parametrize("filters", [None, ["band0", "band1"]])
