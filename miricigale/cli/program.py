@@ -43,8 +43,8 @@ def main(argv=None):
     logging.basicConfig(level=level, format="%(message)s", handlers=[handler])
     if not quiet:
         # what is compiled, and what is fitted, is said at any verbosity
-        for name in ("miricigale.utils.compilation", "miricigale.fitting.from_files"):
-            logging.getLogger(name).setLevel(logging.INFO)
+        for name in ("utils.compilation", "fitting.from_files", "fitting.class_names"):
+            logging.getLogger(f"miricigale.{name}").setLevel(logging.INFO)
     if args.version:
         from miricigale import __version__
 

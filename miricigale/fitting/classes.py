@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from miricigale.fitting.class_names import chosen_classes
 from miricigale.fitting.classification import class_columns
 from miricigale.fitting.from_files import fit_catalog
 from miricigale.fitting.page_numbers import thinned
@@ -26,7 +27,7 @@ RED_DOT_REDSHIFTS = np.expm1(np.arange(np.log(3.0), np.log(10.0), 0.03))
 _SPAN = 60.0
 
 
-def fit_classes(path, output, *, quasars=False, red_dots=False, stars=None, **options):
+def fit_classes(path, output, *, classes=(), quasars=False, red_dots=False, stars=None, **options):
     """
     Fit a catalog with galaxies and, where asked for, with quasars, little red dots and stars.
 
@@ -36,6 +37,9 @@ def fit_classes(path, output, *, quasars=False, red_dots=False, stars=None, **op
         As for `~miricigale.fitting.fit_catalog`, which fits the galaxies. All classes have the same
         bands, errors of models, limits and known redshifts, but stars are at redshift 0, and in front of the Milky
         Way's dust.
+    classes : iterable of str or str, optional
+        Classes besides galaxies: ``"quasars"``, ``"red_dots"``, ``"stars"`` (with ``stars``), or ``"all"``; as
+        text with commas between them. The arguments below ask for one each.
     quasars : bool, optional
         Whether type-1 AGN are fitted: `~miricigale.sed.SEDModel.survey` with `~miricigale.sed.quasar_axes`, into
         the folder ``quasar`` of ``output``.
@@ -55,8 +59,9 @@ def fit_classes(path, output, *, quasars=False, red_dots=False, stars=None, **op
     `~miricigale.utils.exceptions.FitWarning`
         What `~miricigale.fitting.fit_catalog` warns of, once for all classes.
     """
+    names = chosen_classes(classes, quasars=quasars, red_dots=red_dots, stars=stars)
     spectra = None
-    if stars is not None:
+    if "stars" in names:
         from miricigale.sed import read_spectra
 
         # a file that cannot be read is refused before hours of fitting
@@ -76,9 +81,9 @@ def fit_classes(path, output, *, quasars=False, red_dots=False, stars=None, **op
 
         # what is of another class has large residuals
         with without_warnings():
-            if quasars:
+            if "quasars" in names:
                 fit("quasar", lambda _: (SEDModel.survey(), quasar_axes()))
-            if red_dots:
+            if "red_dots" in names:
                 dots = partial(template_grid, shapes(), redshift=RED_DOT_REDSHIFTS)
                 fit("red_dot", lambda bands: (dots(bands), None))
             options.pop("redshift", None)

@@ -4,7 +4,7 @@ import numpy as np
 
 from miricigale.filters import FilterSet
 from miricigale.sed import SEDModel
-from miricigale.sed.presets import GRIDS, grid_axes, grid_name
+from miricigale.sed.presets import GRIDS, grid_axes
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
 
@@ -50,7 +50,7 @@ def axes_of(model, axes):
     model : object
         `~miricigale.sed.SEDModel`, or anything else, whose ``axes`` are left alone.
     axes : dict, str or None
-        Parameters to values, or the name of a grid; None for the model's own.
+        Parameters to values, or the name of a grid of `~miricigale.sed.presets.GRIDS`; None for the model's own.
 
     Returns
     -------
@@ -67,8 +67,7 @@ def axes_of(model, axes):
     if not isinstance(model, SEDModel):
         return axes, None
     if axes is None or isinstance(axes, str):
-        name = model.preset if axes is None else grid_name(axes)
-        return model.named_axes(axes if axes is None else name), name
+        return model.named_axes(axes), model.preset if axes is None else axes
     for name, (preset, _) in GRIDS.items():
         if preset == model.preset and _are_same(axes, grid_axes(name, agn=model.has_agn)):
             return axes, name

@@ -23,17 +23,26 @@ def bands_of(photometry):
 
     Returns
     -------
-    bands : list of str
-        Our names, in the order of the columns.
+    bands, unused : list of str
+        Those bands by our names, in the order of the columns, and others that the catalog has.
 
     Raises
     ------
     ValueError
         If there is none.
     """
-    names = as_table(photometry, "photometry").colnames
-    ours = our_names(names, "photometry")
-    return bands_with_errors([ours.get(name, name) for name in names], "photometry")
+    table = as_table(photometry, "photometry")
+    ours = our_names(table.colnames, "photometry")
+    bands = bands_with_errors([ours.get(name, name) for name in table.colnames], "photometry")
+    taken = {name for name, our in ours.items() if our in bands}
+    return bands, unused_bands(table, {*bands, *taken})
+
+
+def warn_of_unfitted(unused):
+    """Warn of bands of a catalog that cannot be fitted."""
+    if unused:
+        why = "as their names ('miricigale filters') or errors are missing"
+        warn(f"bands of the photometry are not fitted, {why}: {', '.join(unused)}", FitWarning)
 
 
 def bands_with_errors(names, argument):

@@ -25,6 +25,7 @@ from miricigale.fitting.samplers import get_sampler
 from miricigale.fitting.samplers.fit import SamplerFit
 from miricigale.fitting.settings import GridSettings, SamplerSettings
 from miricigale.sed import ModelGrid, SEDModel
+from miricigale.sed.presets import grid_name
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.meta import provenance
@@ -78,11 +79,13 @@ class BayesFitter(Interactive):
 
     Parameters
     ----------
-    model : `~miricigale.sed.ModelGrid` or `~miricigale.sed.SEDModel`
-        A grid; a model of which a grid is made with ``axes``; or, for a sampler, a model.
+    model : `~miricigale.sed.ModelGrid`, `~miricigale.sed.SEDModel` or list of str, optional
+        A grid; a model of which a grid is made with ``axes``; or, for a sampler, a model. By default
+        `SEDModel.survey <miricigale.sed.SEDModel.survey>`, for real galaxies, also where the bands stand here:
+        ``BayesFitter(bands)``.
     filters : list of str or `~miricigale.filters.FilterSet`, optional
-        Bands to fit. By default those of the grid that the photometry has; of a model, these
-        are the bands of the grid and must be given.
+        Bands to fit. By default those of the grid that the photometry has; of a model, all in a known filter that
+        the photometry has with an error, for which the grid is then made.
     priors : dict, optional
         Parameter name to prior. On a grid: a function of the value, a frozen distribution of
         `scipy.stats` (both are taken at the nodes), an array of weights of the nodes or ``"log"``;
@@ -101,11 +104,12 @@ class BayesFitter(Interactive):
         How the posterior is found: on a grid, or by a sampler. A callable is a sampler of the
         user's; see `miricigale.fitting.samplers.get_sampler`.
     axes : dict or str, optional
-        Parameter name to values, for a grid of a model (see `~miricigale.sed.SEDModel.grid`); or a name for
-        `~miricigale.sed.yang2021_axes`, such as ``"quick"``.
+        Parameter name to values, for a grid of a model (see `~miricigale.sed.SEDModel.grid`); or the name of one:
+        ``"survey"``, ``"far-infrared"``, ``"yang2021"`` (of simulations) or ``"yang2021-quick"``. By default the
+        model's own (`~miricigale.sed.SEDModel.named_axes`).
     model_error, error_floor : float or dict of str to float, optional
-        Part of the flux that is added to its error in quadrature, 0.1 by default, and least relative error of a
-        flux, for all or by filter.
+        Part of the flux that is added to its error in quadrature, 0.1 where there is no calibration, and least
+        relative error of a flux, for all or by filter.
     template_error : `~miricigale.fitting.TemplateError`, optional
         Of a grid: error of the models by rest wavelength, added in quadrature too; what it does to the
         normalization of the likelihood counts. ``sigma`` of the results has that of the best model.
@@ -114,10 +118,12 @@ class BayesFitter(Interactive):
         Each is then a mixture of the stated error and a broad one (`miricigale.fitting.mixture`);
         ``outlier`` of the results, ``<band>_outlier`` in tables, is how likely a band is wrong. Not with
         ``compat``. ``rtol`` is then at least 1e-3, unless it is 0.
-    calibration : `~miricigale.fitting.SurveyCalibration`, optional
+    calibration : `~miricigale.fitting.SurveyCalibration` or None, optional
         Of a grid: zero points and errors of the bands, by which fluxes and errors are multiplied (so are those in
         the results), and in place of what is not given here, priors, ``template_error``, ``model_error``,
-        ``outliers`` and ``mass_function`` of the settings.
+        ``outliers`` and ``mass_function`` of the settings. None: no calibration. By default that of
+        `SurveyCalibration.survey` for the axes ``"survey"``, unless ``model_error``, ``template_error`` or
+        ``compat`` is given, and none for others.
     scale_error : bool, optional
         Whether the uncertainty of each model's own scale is part of the posterior of masses,
         luminosities and fluxes: so by default, but CIGALE leaves it out.
@@ -134,7 +140,12 @@ class BayesFitter(Interactive):
     Attributes
     ----------
     bands : tuple of str
-        Bands of the models, in the order of the results.
+        Bands of the models, in the order of the results. This and what depends on it is not there yet where the
+        bands are those of the photometry (`for_bands`).
+    grid_name : str or None
+        Name of the grid, if it is one of ours.
+    calibration : `~miricigale.fitting.SurveyCalibration` or None
+        The calibration.
     grid : `~miricigale.sed.ModelGrid`
         The grid; None for a sampler.
     priors : `~miricigale.fitting.priors.GridPriors` or dict
@@ -160,7 +171,14 @@ class BayesFitter(Interactive):
 
     Examples
     --------
-    >>> from miricigale import BayesFitter, ErrorModel, SEDModel
+    Real galaxies, in the bands of the catalog:
+
+    >>> from miricigale import BayesFitter
+    >>> BayesFitter().fit("catalog.fits")  # doctest: +SKIP
+
+    A model and axes of one's own:
+
+    >>> from miricigale import ErrorModel, SEDModel
     >>> bands = ["acs.f814w", "wfc3.f160w", "irac.ch1", "miri.f770w"]
     >>> model = SEDModel.yang2021(agn=False)
     >>> truth = {"id": ["a", "b"], "redshift": [0.5, 1.0], "age": [1.0, 3.0], "mass": [1e10, 1e10]}
@@ -197,6 +215,7 @@ class BayesFitter(Interactive):
         settings=None,
     ):
         on_grid = engine == "grid"
+        axes = grid_name(axes) if isinstance(axes, str) else axes
         model, filters = models_and_bands(model, filters, axes)
         self._given = {name: value for name, value in locals().items() if name in _OPTIONS}
         kind = GridSettings if on_grid else SamplerSettings
@@ -312,7 +331,9 @@ class BayesFitter(Interactive):
         """
         if not self.waits:
             return self
-        return self.for_bands(fitted_bands.bands_of(photometry))
+        bands, unused = fitted_bands.bands_of(photometry)
+        fitted_bands.warn_of_unfitted(unused)
+        return self.for_bands(bands)
 
     def changed(self, **options):
         """Fitter of the same models with other options, named as for `BayesFitter`."""
@@ -418,11 +439,11 @@ class BayesFitter(Interactive):
         -----
         `~miricigale.utils.exceptions.FitWarning`
             If ``filters`` was not given and the photometry has bands (names of filters, or columns
-            in a unit of flux density that have an error) that the grid lacks. Bands that
-            are not fitted are also in ``meta["fit"]["unused_bands"]`` of the results. And of numbers that
-            look like codes for a missing value, such as -99 or 99 with an error of 99, by band and count. And of
-            bands whose fluxes of S/N above 5, 30 at least, scatter about what the other bands predict by more than
-            1.5 times their errors (`miricigale.fitting.pulls`).
+            in a unit of flux density that have an error) that the grid lacks, or that no filter here belongs to.
+            Bands that are not fitted are also in ``meta["fit"]["unused_bands"]`` of the results. And of numbers
+            that look like codes for a missing value, such as -99 or 99 with an error of 99, by band and count. And
+            of bands whose fluxes of S/N above 5, 30 at least, scatter about what the other bands predict by more
+            than 1.5 times their errors (`miricigale.fitting.pulls`).
 
         Raises
         ------

@@ -10,9 +10,8 @@ from astropy.table import vstack
 
 from miricigale.filters.catalog_files import MappedRows, as_catalog_map
 from miricigale.filters.photometry_table import band_columns
-from miricigale.fitting.fitted_bands import bands_with_errors
+from miricigale.fitting.fitted_bands import bands_with_errors, warn_of_unfitted
 from miricigale.fitting.likelihood import unused_bands
-from miricigale.utils.exceptions import FitWarning, warn
 from miricigale.utils.row_files import open_rows
 from miricigale.utils.tables import error_column
 
@@ -133,9 +132,7 @@ def fit_catalog(
     from miricigale.sed.presets import grid_name
 
     unused = unused_bands(rows.chunk(0), bands)
-    if unused:
-        why = "as their names ('miricigale filters') or errors are missing"
-        warn(f"bands of the photometry are not fitted, {why}: {', '.join(unused)}", FitWarning)
+    warn_of_unfitted(unused)
     axes = grid_name(axes)
     if models is None:
         model, nodes = SEDModel.for_axes(axes), axes

@@ -84,7 +84,8 @@ class GridFit:
         elif axes is not None:
             raise argument_error("axes", "None when 'model' is a ModelGrid", "a value")
         elif not isinstance(model, ModelGrid):
-            raise argument_error("model", "a ModelGrid or an SEDModel", type(model).__name__)
+            wanted = "a ModelGrid, an SEDModel or a list of bands"
+            raise argument_error("model", wanted, type(model).__name__)
         if settings.agn_error and compat:
             raise argument_error("agn_error", "0 with 'compat'", f"{settings.agn_error}")
         check_that(outliers is None or not compat, "outliers", "None with 'compat'", outliers)

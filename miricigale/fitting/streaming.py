@@ -14,11 +14,11 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.filters.catalog_files import codes_of, warn_of_codes
-from miricigale.fitting.fitted_bands import bands_with_errors
+from miricigale.fitting.fitted_bands import bands_with_errors, warn_of_unfitted
 from miricigale.fitting.fitter import BayesFitter
 from miricigale.fitting.from_files import give_units, open_catalog
 from miricigale.fitting.io import FORMAT, FitFolder, open_results, part_chi2, part_ids, part_name
-from miricigale.fitting.likelihood import HIGH_CHI2
+from miricigale.fitting.likelihood import HIGH_CHI2, unused_bands
 from miricigale.fitting.pulls import warn_of_pulls
 from miricigale.fitting.sample_flags import chi2_limit, chi2_step
 from miricigale.utils.content import content_sha256
@@ -137,7 +137,9 @@ def fit_file(
         raise u.UnitsError(msg)
     rows = open_catalog(path_in, chunk_rows, hdu=hdu, catalog_map=catalog_map, flux_unit=unit)
     if fitter.waits:
-        fitter = fitter.for_bands(bands_with_errors(rows.colnames, "path_in"))
+        bands = bands_with_errors(rows.colnames, "path_in")
+        warn_of_unfitted(unused_bands(rows.chunk(0), bands))
+        fitter = fitter.for_bands(bands)
     if fitter.engine != "grid":
         check_that(seed is not None, "seed", "given for a sampler, to resume it", "None")
         seed = check_seed(seed)

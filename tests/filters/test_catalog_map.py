@@ -103,6 +103,25 @@ def test_numbers_that_stand_for_nothing_in_fluxes():
     assert without_codes(np.float32([-99.9, -999.9]).astype(float))[0].all()
 
 
+def test_negative_errors_stand_for_nothing_unless_they_may_be_limits():
+    """Those of CEERS: -0.099 (-99 in other units), -1 beside a flux; a flux of 3 sigma may be a limit."""
+    values, errors = (
+        np.array([0.0, 1.2e-4, -0.0999, 3.0, 3.0]),
+        np.array([-0.099, -1, -0.0999, -1, 1]),
+    )
+    columns = {"id": np.arange(5), BAND: values, f"{BAND}_err": errors}
+    table, coded = convert(columns, units={"flux": "mJy"})
+    assert np.isnan(table[f"{BAND}_err"].value).tolist() == [True, True, True, False, False]
+    assert table[f"{BAND}_err"][3].value == -1000
+    assert coded[BAND][:3].tolist() == [-0.099, -1, -0.0999]
+    assert np.isnan(coded[BAND][3:]).all()
+    limits, _ = convert(columns, units={"flux": "mJy"}, limits=True)
+    assert limits[f"{BAND}_limit"].tolist() == [False, True, False, True, False]
+    # in magnitudes an error of -1 marks a limit, which the fit flags
+    table, _ = convert(columns, units={"flux": "ABmag"})
+    assert table[f"{BAND}_err"][3] < 0
+
+
 def test_what_is_missing_is_counted(tmp_path):
     table = Table({"id": [1, 2, 3], BAND: [1.0, -99.0, -99.9], f"{BAND}_err": [0.1, -99.0, 0.1]})
     path = write(table, tmp_path / "c.csv")

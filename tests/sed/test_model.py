@@ -329,6 +329,15 @@ def test_a_band_beyond_the_spectrum_is_flagged_and_alone_not_a_number():
         model.grid({"redshift": [0.1], "age": [0.1]}, FilterSet([far]))
 
 
+def test_logarithms_of_masses_are_refused(model, filters):
+    """In one model, a table and a prior; a quantity is what it says, and a mass of 1 a unit."""
+    text = r"'mass' must be in solMass, not its logarithm: 10\*\*10\.7"
+    refuses(text, model.evaluate, redshift=1.0, mass=10.7)
+    refuses(text, model.fluxes, {"redshift": [1.0, 1.0], "mass": [1e10, 10.7]}, filters)
+    one = model.evaluate(redshift=1.0, mass=1.0).fnu.value
+    assert_allclose(model.evaluate(redshift=1.0, mass=10 * u.Msun).fnu.value, 10 * one)
+
+
 def test_an_agn_without_dust_to_refer_to_is_said(model, filters):
     table = QTable({"redshift": [1.0, 1.0], "ebv": [0.0, 0.1], "frac_agn": [0.5, 0.5]})
     got = model.fluxes(table, filters)

@@ -1,0 +1,190 @@
+"""What is fitted where nothing else is said, and that Python and the command are one door."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable
+from astropy.utils.exceptions import AstropyDeprecationWarning
+from numpy.testing import assert_allclose, assert_array_equal
+
+from helpers.commands import command
+from helpers.errors import refuses
+from miricigale.fitting import BayesFitter, SurveyCalibration, TemplateError, fit_catalog, fit_file
+from miricigale.fitting.class_names import chosen_classes
+from miricigale.sed import SEDModel, presets
+from miricigale.utils.exceptions import FitWarning
+
+BANDS = ["acs.f606w", "acs.f814w", "wfc3.f125w", "wfc3.f160w", "nircam.f277w", "nircam.f444w"]
+BANDS += ["miri.f770w"]
+#: Axes of the survey grid that keep all of their values.
+KEPT = ("tau", "age", "metallicity")
+
+
+@pytest.fixture(autouse=True)
+def thin_survey(monkeypatch):
+    """The survey grid with one value of most parameters and 12 redshifts, of which priors know nothing."""
+    axes = presets.survey_axes()
+    thin = {name: values if name in KEPT else values[-1:] for name, values in axes.items()}
+    thin |= {"frac_agn": axes["frac_agn"][:1], "redshift": axes["redshift"][5:65:5]}
+    own = presets._values
+
+    def values(name):
+        return {n: v.copy() for n, v in thin.items()} if name == "survey_axes" else own(name)
+
+    monkeypatch.setattr(presets, "_values", values)
+    return thin
+
+
+@pytest.fixture
+def catalog(thin_survey):
+    """Galaxies between the nodes of that grid, in AB magnitudes with errors of 5 %, one band without filter."""
+    rng, n = np.random.default_rng(3), 6
+    truth = QTable({"id": np.arange(n) + 1, "mass": np.full(n, 3e10) * u.Msun})
+    fixed = {name: values[0] for name, values in thin_survey.items() if name not in KEPT}
+    truth["redshift"] = rng.uniform(0.3, 1.5, n)
+    truth["age"], truth["tau"] = rng.uniform(0.5, 3.0, n), rng.uniform(0.2, 2.0, n)
+    for name, value in fixed.items():
+        if name != "redshift":
+            truth[name] = np.full(n, value)
+    fluxes = SEDModel.survey().fluxes(truth, BANDS)
+    table = QTable({"id": truth["id"]})
+    for name in BANDS:
+        flux = fluxes[name] * (1 + 0.05 * rng.normal(size=n))
+        table[name] = flux.to_value(u.ABmag)
+        table[f"{name}_err"] = np.full(n, 0.05 * 2.5 / np.log(10))
+    return table
+
+
+def in_flux(table):
+    out = QTable({"id": table["id"]})
+    for name in BANDS:
+        out[name] = (table[name] * u.ABmag).to(u.uJy)
+        out[f"{name}_err"] = 0.4 * np.log(10) * out[name] * table[f"{name}_err"]
+    return out
+
+
+def test_models_bands_and_calibration_by_default():
+    model, named = SEDModel.survey(), {"axes": "survey"}
+    fitters = [
+        BayesFitter(BANDS),
+        BayesFitter(filters=BANDS),
+        BayesFitter(model, BANDS),
+        BayesFitter(model, BANDS, **named),
+        BayesFitter(model, BANDS, axes=SEDModel.survey_axes()),
+        BayesFitter().for_bands(BANDS),
+        BayesFitter(model).for_bands(BANDS),
+    ]
+    for fitter in fitters:
+        assert fitter.grid_name == "survey"
+        assert fitter.calibration is SurveyCalibration.survey()
+        assert fitter.grid.redshift.size == 12
+        assert_array_equal(fitter.grid.galaxy, fitters[0].grid.galaxy)
+        assert set(fitter.model_errors.values()) == {0.0}
+    # errors that are given take its place, and None turns it off; other grids have none
+    error = TemplateError([1.0] * u.um, [0.2])
+    for options in (
+        {"model_error": 0.1},
+        {"template_error": error},
+        {"calibration": None},
+        {"compat": "cigale"},
+        {"axes": SEDModel.survey_axes() | {"age": [1.0]}},
+    ):
+        fitter = BayesFitter(model, BANDS, **named | options)
+        assert fitter.calibration is None
+    assert set(BayesFitter(BANDS, calibration=None).model_errors.values()) == {0.1}
+    changed = fitters[0].changed(model_error=0.2)
+    assert changed.calibration is None
+    assert changed.changed(model_error=None).calibration is SurveyCalibration.survey()
+
+
+def test_the_grid_of_the_study_is_asked_for_by_name():
+    fitter = BayesFitter(BANDS, axes="yang2021-quick")
+    assert fitter.model.preset == fitter.grid_name.partition("-")[0] == "yang2021"
+    assert fitter.calibration is None
+    assert set(fitter.model_errors.values()) == {0.1}
+    galaxies = SEDModel.yang2021(agn=False)
+    assert BayesFitter(galaxies).grid_name == "yang2021"
+    wanted = SEDModel.yang2021_axes("galaxy")
+    found = galaxies.named_axes()
+    assert found.keys() == wanted.keys()
+    for name, values in wanted.items():
+        assert_array_equal(found[name], values)
+    for former, name in (("quick", "yang2021-quick"), ("fit", "yang2021")):
+        with pytest.warns(AstropyDeprecationWarning, match=f"{former!r} is now called {name!r}"):
+            assert BayesFitter(axes=former).grid_name == name
+
+
+def test_without_bands_those_of_the_photometry_are_fitted(catalog, tmp_path):
+    """As for the same bands by name, whatever columns are called, from a file too."""
+    wanted = BayesFitter(BANDS).fit(in_flux(catalog))
+    other = QTable({"id": catalog["id"]})
+    for name in BANDS:
+        short = name.partition(".")[2].upper()
+        other[f"mag_{short}"] = catalog[name] * u.ABmag
+        other[f"e_mag_{short}"] = catalog[f"{name}_err"] * u.mag
+    fitter = BayesFitter()
+    found = fitter.fit(other)
+    assert found.filters == tuple(BANDS)
+    assert_allclose(found.pdf["redshift"], wanted.pdf["redshift"], rtol=1e-9, atol=1e-15)
+    assert fitter.for_bands(BANDS) is fitter.for_photometry(other)
+    drawn = fitter.sample(other, 5, seed=1)
+    assert_array_equal(drawn.ids, catalog["id"])
+    table = in_flux(catalog)
+    table["miri.f999w"] = table["miri.f999w_err"] = 1.0 * u.uJy
+    table.write(tmp_path / "cat.fits")
+    for call in (
+        lambda: fitter.fit(table),
+        lambda: fit_file(fitter, tmp_path / "cat.fits", tmp_path / "out"),
+    ):
+        with pytest.warns(FitWarning, match=r"are not fitted, .*: miri\.f999w"):
+            found = call()
+    assert len(found) == len(catalog)
+    refuses("with columns <filter> and <filter>_err", fitter.fit, QTable({"id": [1]}))
+    refuses("has some", BayesFitter(BANDS).for_bands, BANDS)
+    refuses("left out where 'model' is a list of bands", BayesFitter, BANDS, BANDS)
+
+
+def test_python_and_the_command_give_the_same_numbers(catalog, tmp_path, capsys):
+    """Of AB magnitudes through a map, of fluxes, and of a table in memory: without an option anywhere."""
+    catalog.write(tmp_path / "mag.csv")
+    (tmp_path / "ab.toml").write_text('[units]\nflux = "ABmag"\n')
+    in_flux(catalog).write(tmp_path / "flux.fits")
+    argv = ["fit", str(tmp_path / "mag.csv"), "--map", str(tmp_path / "ab.toml"), "--no-progress"]
+    told = command(capsys, *argv, "-o", str(tmp_path / "one"))
+    # --classes with no class is the same fit
+    fluxes = ["fit", str(tmp_path / "flux.fits"), "--no-progress", "--classes", ""]
+    command(capsys, *fluxes, "-o", str(tmp_path / "two"))
+    assert "6 objects, 6 fitted" in told.out
+    of_call = fit_catalog(tmp_path / "flux.fits", tmp_path / "three").to_table()
+    in_memory = BayesFitter(BANDS).fit(in_flux(catalog)).to_table()
+    again = BayesFitter().fit(in_flux(catalog)).to_table()
+    for table in (
+        QTable.read(tmp_path / "one" / "table.fits"),
+        QTable.read(tmp_path / "two" / "table.fits"),
+        of_call,
+        again,
+    ):
+        assert table.colnames == in_memory.colnames
+        for name in ("redshift_p50", "mass_p50", "frac_agn_best", "chi2_best", "log_evidence"):
+            if name in table.colnames:
+                # what went through magnitudes has other last digits
+                assert_allclose(
+                    u.Quantity(table[name]).value, u.Quantity(in_memory[name]).value, rtol=1e-6
+                )
+        assert table["flags"].tolist() == in_memory["flags"].tolist()
+
+
+def test_classes_by_one_option():
+    assert chosen_classes("") == set()
+    assert chosen_classes("quasars, red-dots") == {"quasars", "red_dots"}
+    assert chosen_classes(["stars"], stars="pickles") == {"stars"}
+    assert chosen_classes("all") == {"quasars", "red_dots"}
+    assert chosen_classes("all", stars="pickles") == {"quasars", "red_dots", "stars"}
+    assert chosen_classes((), quasars=True, stars="pickles") == {"quasars", "stars"}
+    refuses(
+        "no class 'quasar'; known: quasars, red_dots, stars",
+        chosen_classes,
+        "quasar",
+        error=KeyError,
+    )
+    refuses("'stars' must be spectra", chosen_classes, "stars")
