@@ -4,7 +4,7 @@ Galaxy, quasar or star by their evidence: simulated sources, real quasars of SDS
     MIRICIGALE_DATA=../shared/data python benchmarks/classes.py [--n 40] [--seed 1]
 
 Simulated sources lie between the nodes of the grids, S/N 20 in ten bands; their stars are Planck's law, as there
-is no library of stars in the package. The real ones are fitted as ``miricigale fit --axes survey --quasars`` does.
+is no library of stars in the package. The real ones are fitted as ``miricigale fit --quasars`` does.
 """
 
 import argparse
@@ -92,12 +92,12 @@ def sort(model, bands, table, stars=None, **error):
 
 
 def real(what, table):
-    """Print the classes of real sources by ``miricigale fit --axes survey --quasars``."""
+    """Print the classes of real sources by ``miricigale fit --quasars``."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "catalog.ecsv"
         table.write(path)
         start = time.process_time()
-        fits = fit_classes(path, Path(folder) / "fit", quasars=True, axes="survey")
+        fits = fit_classes(path, Path(folder) / "fit", quasars=True)
         cost = 1e3 * (time.process_time() - start) / len(table)
         write_table(fits, Path(folder) / "classes.fits")
         found = QTable.read(Path(folder) / "classes.fits")

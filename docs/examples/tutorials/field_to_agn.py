@@ -36,9 +36,8 @@ truth = catalog[near & ~catalog["star"] & (catalog["mag_f160w"] < 25.5 * u.ABmag
 parameters = truth["id", "redshift"]
 parameters["frac_agn"] = np.where(np.arange(len(truth)) % 4 == 0, 0.6, 0.0)
 parameters["tau"] = parameters["age"] = 1 * u.Gyr
-parameters["alpha"] = 2.0
 parameters["ebv"] = np.random.default_rng(1).uniform(0.1, 0.4, len(truth))
-light = SEDModel.yang2021().fluxes(parameters, [*existing.filters, *miri])
+light = SEDModel.survey().fluxes(parameters, [*existing.filters, *miri])
 scale = truth["wfc3.f160w"] / light["wfc3.f160w"]
 for name in (*existing.filters, *miri):
     truth[name] = light[name] * scale
@@ -100,14 +99,10 @@ shown
 # %%
 # 4. Fit
 # ------
-# The fitter compares each source with a grid of models of galaxies with AGN. The coarse grid ("quick") is enough
-# here; "fit" is the grid of Yang et al. 2021.
+# The fitter compares each source with a grid of models of real galaxies with AGN. It counts errors of these
+# models, and how rare AGN are.
 
-fitter = BayesFitter(
-    SEDModel.yang2021(),
-    [*existing.filters, *miri],
-    axes=SEDModel.yang2021_axes("quick"),
-)
+fitter = BayesFitter([*existing.filters, *miri])
 fits = fitter.fit(sample)
 table = fits.to_table()
 columns = ["redshift_mean", "redshift_std", "frac_agn_mean", "frac_agn_std"]
@@ -159,6 +154,7 @@ fits[best].plot_sed()
 plt.show()
 
 # %%
-# With your own files the steps are the commands ``miricigale photometry`` and ``miricigale fit``. See
+# With your own files the steps are the commands ``miricigale photometry`` and ``miricigale fit``, which without
+# options gives the numbers of ``BayesFitter(bands)``. See
 # :doc:`/method/photometry` and :doc:`/method/fitting` for what is computed, and :doc:`/method/agn` for the AGN
 # fraction.

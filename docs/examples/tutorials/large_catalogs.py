@@ -209,10 +209,12 @@ plt.show()
 #    $ miricigale fit catalog.fits -o fits --threads 8
 #    $ miricigale fit catalog.parquet -o fits --scheduler tcp://host:8786
 #
-# fit with the grid of Yang et al. 2021 in the filters of the catalog, and join the results in ``fits/table.fits``,
-# or ``fits/table.parquet`` of a catalog in parquet. Ctrl-C keeps the parts that are finished; the same command
-# resumes. ``--redshift z_spec`` takes known redshifts from a column, ``--pairs age:tau redshift:ebv`` keeps joint
-# posteriors, ``--chunk-rows`` sets the length of the parts, and ``--no-resume`` begins anew.
+# fit as ``fit_file(BayesFitter(), ...)`` does, with the models for real galaxies and their calibration, in the
+# filters of the catalog (the grid of this tutorial is a small one of its own). The results are joined in
+# ``fits/table.fits``, or ``fits/table.parquet`` of a catalog in parquet. Ctrl-C keeps the parts that are finished;
+# the same command resumes. ``--redshift z_spec`` takes known redshifts from a column, ``--pairs age:tau
+# redshift:ebv`` keeps joint posteriors, ``--chunk-rows`` sets the length of the parts, and ``--no-resume`` begins
+# anew.
 #
 # Other inputs
 # ------------

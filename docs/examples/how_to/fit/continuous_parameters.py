@@ -19,12 +19,12 @@ from miricigale.fitting import GridSettings
 bands = ["acs.f435w", "acs.f606w", "acs.f814w", "wfc3.f125w", "wfc3.f160w"]
 bands += ["nircam.f277w", "nircam.f356w", "nircam.f444w"]
 bands += ["miri.f770w", "miri.f1000w", "miri.f1500w"]
-model = SEDModel.yang2021(agn=False)
+model = SEDModel.survey(agn=False)
 rng = np.random.default_rng(8)
 n = 10
 truth = QTable({"id": np.arange(n), "redshift": rng.uniform(0.8, 1.2, n)})
 truth["age"], truth["ebv"] = rng.uniform(0.6, 4, n), rng.uniform(0.12, 0.6, n)
-truth["alpha"], truth["mass"] = rng.uniform(1.1, 2.4, n), np.full(n, 3e10)
+truth["tau"], truth["mass"] = np.full(n, 0.5), np.full(n, 3e10)
 fluxes = model.fluxes(truth, bands)
 photometry = QTable({"id": truth["id"]})
 for band in bands:
@@ -37,7 +37,7 @@ for band in bands:
 # not. ``finer`` is the model that made the grid: it refines the grid until fluxes between its nodes are good to
 # 0.5 %. If a model is fitted instead of a grid, this happens by itself.
 
-axes = SEDModel.yang2021_axes("galaxy") | {"tau": [1.0]}
+axes = {"tau": [0.5], "age": [0.5, 1, 3, 5], "ebv": [0.1, 0.2, 0.3, 0.5, 0.7]}
 axes["redshift"] = np.expm1(np.arange(np.log(1.6), np.log(2.5), 0.03))
 grid = model.grid(axes, bands)
 fitters = {

@@ -101,7 +101,7 @@ plt.show()
 #
 # .. code-block:: console
 #
-#    $ miricigale fit catalog.fits --axes survey --quasars --stars pickles/
+#    $ miricigale fit catalog.fits --classes quasars,stars --stars pickles/
 #
 # Look at the reduced chi2 of the best class too: an artifact belongs to none. See :doc:`/method/classes`, and
 # :doc:`/accuracy/fitting` for real sources.

@@ -16,7 +16,7 @@ from miricigale import BayesFitter, SEDModel
 
 bands = ["acs.f606w", "acs.f814w", "wfc3.f125w", "wfc3.f160w"]
 bands += ["irac.ch1", "miri.f770w", "miri.f1500w"]
-model = SEDModel.yang2021()
+model = SEDModel.survey()
 truth = {
     "redshift": 1.2,
     "mass": 3e10,
@@ -32,12 +32,12 @@ for band in bands:
     photometry[f"{band}_err"] = 0.1 * fluxes[band]
 
 # %%
-# ``pairs`` asks for joint posteriors, which are summed over all 24 million models. That of redshift and AGN
+# ``pairs`` asks for joint posteriors, which are summed over all 18 million models. That of redshift and AGN
 # fraction is always there. Any two parameters of the grid can be a pair.
 
 names = ["redshift", "frac_agn", "ebv", "age"]
 pairs = [(a, b) for i, a in enumerate(names) for b in names[i + 1 :]]
-fitter = BayesFitter(model, bands, axes=SEDModel.yang2021_axes())
+fitter = BayesFitter(model, bands, model_error=0.05)
 galaxy = fitter.fit(photometry, pairs=pairs)["galaxy"]
 
 # %%

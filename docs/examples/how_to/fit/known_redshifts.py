@@ -22,7 +22,7 @@ n = 40
 truth = QTable({"id": np.arange(n), "redshift": rng.uniform(0.3, 2.5, n)})
 truth["mass"] = 10 ** rng.uniform(9.5, 11, n)
 truth["age"], truth["ebv"] = rng.uniform(0.8, 3, n), rng.uniform(0.1, 0.5, n)
-model = SEDModel.yang2021()
+model = SEDModel.survey()
 fluxes = model.fluxes(truth, bands)
 photometry = QTable({"id": truth["id"]})
 for band in bands:
@@ -35,7 +35,7 @@ photometry["z_spec"] = np.where(truth["id"] % 4 == 0, np.nan, truth["redshift"])
 # ``redshift="z_spec"`` takes the column. A row without a redshift is flagged and not fitted, so fit the others
 # with free redshifts and join the two.
 
-fitter = BayesFitter(model, bands, axes=SEDModel.yang2021_axes())
+fitter = BayesFitter(bands)
 has = np.isfinite(photometry["z_spec"])
 known = fitter.fit(photometry[has], redshift="z_spec")
 free = fitter.fit(photometry)
@@ -48,7 +48,7 @@ table[:5]
 # %%
 # An error of the redshift changes the mass, by the distance and by the color. Here the redshifts are good, so that
 # most of the scatter comes from the ages. At known redshifts the fit is also faster: it uses only the models at
-# the nearest redshift of the grid (here in steps of 3 % in 1 + z).
+# one redshift.
 
 off = {
     "free": np.log10(free[has]["mass"].value / truth["mass"][has]),

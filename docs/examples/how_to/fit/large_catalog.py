@@ -7,7 +7,7 @@ it was stopped.
 """
 
 # %%
-# A catalog of 1000 simulated galaxies at known redshifts, as a FITS file. Parquet is read by parts too, with
+# A catalog of 400 simulated galaxies at known redshifts, as a FITS file. Parquet is read by parts too, with
 # ``pip install miricigale[parquet]``.
 
 from pathlib import Path
@@ -29,25 +29,24 @@ bands = [
     "miri.f770w",
 ]
 rng = np.random.default_rng(12)
-n = 1000
-model = SEDModel.yang2021(agn=False)
-axes = SEDModel.yang2021_axes("galaxy")
-grid = model.grid(axes, bands)
-iz = rng.integers(5, 40, n)
-galaxy = [rng.choice(np.flatnonzero(grid.allowed[i])) for i in iz]
-flux = 10 ** rng.uniform(9, 11, (n, 1)) * grid.flux(iz, galaxy)
-catalog = QTable({"id": np.arange(n), "z_spec": grid.redshift[iz]})
-for i, band in enumerate(bands):
-    catalog[band] = flux[:, i] * (1 + 0.1 * rng.normal(size=n)) * u.uJy
-    catalog[f"{band}_err"] = 0.1 * flux[:, i] * u.uJy
+n = 400
+truth = QTable({"id": np.arange(n), "redshift": rng.uniform(0.3, 3, n)})
+truth["mass"] = 10 ** rng.uniform(9, 11, n) * u.Msun
+truth["age"], truth["tau"] = rng.uniform(0.1, 2, n), rng.uniform(0.2, 3, n)
+truth["ebv"] = rng.uniform(0, 0.6, n)
+fluxes = SEDModel.survey().fluxes(truth, bands)
+catalog = QTable({"id": truth["id"], "z_spec": truth["redshift"]})
+for band in bands:
+    catalog[band] = fluxes[band] * (1 + 0.1 * rng.normal(size=n))
+    catalog[f"{band}_err"] = 0.1 * fluxes[band]
 catalog.write("catalog.fits", overwrite=True)
 
 # %%
-# ``chunk_rows`` objects are in memory at a time and become one file of results. ``resume=False`` replaces what an
-# earlier fit left in the folder.
+# ``BayesFitter()`` fits real galaxies in the bands of the catalog. ``chunk_rows`` objects are in memory at a time
+# and become one file of results. ``resume=False`` replaces what an earlier fit left in the folder.
 
-fitter = BayesFitter(grid)
-options = {"chunk_rows": 250, "redshift": "z_spec"}
+fitter = BayesFitter()
+options = {"chunk_rows": 100, "redshift": "z_spec"}
 results = fit_file(fitter, "catalog.fits", "fits", resume=False, **options)
 results
 
@@ -89,6 +88,6 @@ plt.show()
 #
 # .. code-block:: console
 #
-#    $ miricigale fit catalog.fits -o fits --redshift z_spec --threads 8 --chunk-rows 250
+#    $ miricigale fit catalog.fits -o fits --redshift z_spec --threads 8 --chunk-rows 100
 #
 # The tutorial :doc:`/tutorials/large_catalogs` has threads, processes and clusters.

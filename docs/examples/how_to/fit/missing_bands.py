@@ -22,7 +22,7 @@ nircam = ["nircam.f277w", "nircam.f444w"]
 miri = ["miri.f770w", "miri.f1000w", "miri.f1500w"]
 bands = hst + nircam + miri
 
-model = SEDModel.yang2021()
+model = SEDModel.survey()
 truth = QTable({"id": ["A", "B", "C", "D", "E", "F"], "redshift": [0.6, 1.7] * 3})
 for name, value in [("mass", 3e10), ("age", 3.0), ("ebv", 0.3), ("frac_agn", 0.2)]:
     truth[name] = np.full(6, value)
@@ -43,7 +43,7 @@ for band in nircam:
 # number that was used. The flag ``few_for_parameters`` marks objects with fewer than three fluxes of 2 sigma or
 # more: their posteriors are wide, and rest on the priors.
 
-fitter = BayesFitter(model, bands, axes=SEDModel.yang2021_axes(), n_bands_min=4)
+fitter = BayesFitter(bands, n_bands_min=4)
 results = fitter.fit(photometry)
 table = results.summary()["id", "flags"]
 table["n_bands"] = results.n_bands
@@ -75,5 +75,6 @@ panels[0].legend(labels.values())
 plt.show()
 
 # %%
-# A band that is a column of the table but not of the grid is not fitted, with a warning. Codes such as -99 must be
+# ``BayesFitter()`` fits all bands that a catalog has. A band without a filter or an error is not fitted, with a
+# warning. Codes such as -99 must be
 # NaN: :doc:`own_catalog`. See :doc:`/method/fitting`.

@@ -33,7 +33,7 @@ n = len(catalog)
 truth = QTable({"id": catalog["id"], "redshift": catalog["redshift"]})
 truth["age"], truth["ebv"] = rng.uniform(0.6, 3, n), rng.uniform(0.1, 0.6, n)
 truth["frac_agn"] = rng.choice([0, 0.3, 0.6], n)
-model = SEDModel.yang2021()
+model = SEDModel.survey()
 fluxes = model.fluxes(truth, bands)
 scale = (catalog["wfc3.f160w"] / fluxes["wfc3.f160w"]).to("")
 true = QTable({"id": truth["id"]} | {band: fluxes[band] * scale for band in bands})
@@ -45,7 +45,7 @@ photometry["z_spec"] = truth["redshift"]
 # The mock analysis perturbs the best model of every object by its errors and fits it again: there the truth is
 # known. ``model_error=True`` includes the model error in the noise, as the fit allows for it.
 
-fitter = BayesFitter(model, bands, axes=SEDModel.yang2021_axes())
+fitter = BayesFitter(bands)
 results = fitter.fit(photometry, redshift="z_spec")
 options = {"model_error": True, "redshift": "z_spec"}
 mock = mock_analysis(fitter, results, photometry, seed=3, **options)
@@ -69,8 +69,8 @@ plt.show()
 
 # %%
 # Errors of the photometry itself show in bands that are left out. The pull is (measured - predicted) over both
-# errors; its scatter is 1 if errors are right. Here it is smaller: the fit allows for a model error of 10 %, and
-# the models that made this catalog have none.
+# errors; its scatter is 1 if errors are right. Here it is smaller: the fit allows for errors of models,
+# and those that made this catalog have none.
 
 check = leave_out(fitter, photometry, ["wfc3.f125w", "irac.ch2"], redshift="z_spec")
 table = check.metrics()

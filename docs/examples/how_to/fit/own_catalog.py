@@ -11,7 +11,7 @@ to fit it without renaming anything.
 
 import matplotlib.pyplot as plt
 
-from miricigale import BayesFitter, SEDModel
+from miricigale import BayesFitter
 from miricigale.filters import read_catalog_photometry
 
 catalog = """\
@@ -46,10 +46,10 @@ table.round(3)
 table
 
 # %%
-# The table goes to the fitter as it is. The grid ``survey_axes`` is the one for real galaxies.
+# The table goes to the fitter as it is. Unless you say something else, it has the models for real galaxies, their
+# grid, and their calibration: errors of the models by rest wavelength, and priors.
 
-model = SEDModel.survey()
-fitter = BayesFitter(model, bands, axes=SEDModel.survey_axes())
+fitter = BayesFitter(bands)
 results = fitter.fit(photometry)
 columns = ["id", "redshift_p50", "mass_p50", "frac_agn_p50", "chi2_best"]
 table = results.to_table()[columns]
@@ -68,11 +68,11 @@ axes[0].set(xlim=(0.4, 30), ylim=(0.05, 100))
 plt.show()
 
 # %%
-# The command line reads the same map from a file:
+# The command line reads the same map from a file, and gives the same numbers:
 #
 # .. code-block:: console
 #
-#    $ miricigale fit mine.csv --map mine.toml --axes survey -o fits
+#    $ miricigale fit mine.csv --map mine.toml -o fits
 #
 # with ``mine.toml``:
 #
@@ -80,11 +80,26 @@ plt.show()
 #
 #    [columns]
 #    id = "name"
+#    "acs.f606w" = "V"
+#    "acs.f606w_err" = "dV"
+#    "acs.f814w" = "I"
+#    "acs.f814w_err" = "dI"
+#    "wfc3.f125w" = "J"
+#    "wfc3.f125w_err" = "dJ"
 #    "wfc3.f160w" = "H"
 #    "wfc3.f160w_err" = "dH"
+#    "irac.ch1" = "ch1"
+#    "irac.ch1_err" = "dch1"
+#    "miri.f770w" = "F770"
+#    "miri.f770w_err" = "dF770"
+#    "miri.f1500w" = "F1500"
+#    "miri.f1500w_err" = "dF1500"
 #
 #    [units]
 #    flux = "ABmag"
+#
+# It prints what is fitted in three lines: models, bands, and errors with priors. ``--classes all`` fits quasars
+# and little red dots too (:doc:`/method/classes`).
 #
 # Catalogs of CANDELS, 3D-HST, JADES, DJA, COSMOS2020 and CEERS have ready maps: ``read_catalog_photometry(path,
 # "candels")``. See :doc:`/method/filters`.

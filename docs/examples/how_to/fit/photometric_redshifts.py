@@ -105,6 +105,7 @@ panels[0].set_ylabel("photometric redshift")
 plt.show()
 
 # %%
-# For real galaxies use the full ``survey_axes``. On the command line ``miricigale fit catalog.fits --axes survey
-# --calibrate z_spec`` does all of this, and draws this figure on the page of the fit. How well redshifts of CEERS
-# are found is in :doc:`/accuracy/fitting_real`, what is measured in :doc:`/method/fitting_errors`.
+# The axes here are thin. ``BayesFitter(bands)`` has those for real galaxies, and without known redshifts errors
+# and priors that were measured on CEERS. On the command line ``miricigale fit catalog.fits --calibrate z_spec``
+# does all of this, and draws this figure on the page of the fit. How well redshifts of CEERS are found is in
+# :doc:`/accuracy/fitting_real`, what is measured in :doc:`/method/fitting_errors`.

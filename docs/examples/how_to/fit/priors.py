@@ -18,7 +18,7 @@ from miricigale import BayesFitter, SEDModel
 from miricigale.fitting import magnitude_prior
 
 bands = ["acs.f814w", "wfc3.f160w", "irac.ch1", "miri.f770w"]
-model = SEDModel.yang2021()
+model = SEDModel.survey()
 truth = {
     "redshift": [0.7],
     "mass": [1e9],
@@ -33,22 +33,22 @@ for band in bands:
     photometry[f"{band}_err"] = 0.15 * fluxes[band]
 
 # %%
-# By default priors are flat in the nodes of the grid. ``priors`` takes for each parameter a function of the value,
+# The priors of a fit of real galaxies are those of its calibration; ``calibration=None`` makes them flat in the
+# nodes of the grid. ``priors`` takes for each parameter a function of the value,
 # a distribution of scipy, weights of the nodes, or ``"log"``. ``redshift_prior`` is a density of redshift for each
 # object; `~miricigale.fitting.magnitude_prior` makes one of its magnitude.
 
-axes = SEDModel.yang2021_axes()
-grid = model.grid(axes, bands)
 rare_agn = {
     "frac_agn": stats.expon(scale=0.1),
     "ebv": lambda ebv: np.exp(-ebv / 0.3),
 }
 by_magnitude = magnitude_prior(photometry["wfc3.f160w"])
-flat = BayesFitter(grid)
+flat = BayesFitter(bands, calibration=None)
 fits = {
     "flat": flat.fit(photometry),
     "redshift given magnitude": flat.fit(photometry, redshift_prior=by_magnitude),
-    "weak AGN and little dust": BayesFitter(grid, priors=rare_agn).fit(photometry),
+    "weak AGN and little dust": flat.changed(priors=rare_agn).fit(photometry),
+    "of real galaxies": BayesFitter(bands).fit(photometry),
 }
 table = QTable({"prior": list(fits)})
 for name in ("redshift", "frac_agn", "ebv"):
@@ -60,7 +60,7 @@ table
 # What changes with the prior is not determined by the data.
 
 fig, panels = plt.subplots(1, 2, figsize=(10, 3.8), layout="constrained")
-colors = ["0.7", "tab:blue", "tab:green"]
+colors = ["0.7", "tab:blue", "tab:green", "tab:red"]
 for ax, name in zip(panels, ["redshift", "frac_agn"], strict=True):
     for color, fit in zip(colors, fits.values(), strict=True):
         fit[0].plot_pdf(name, ax, fill=False, alpha=1, lw=2, color=color)
@@ -75,7 +75,7 @@ plt.show()
 #
 # .. code-block:: python
 #
-#    known = BayesFitter(grid).fit(photometry, redshift="z_spec")
+#    known = BayesFitter(bands).fit(photometry, redshift="z_spec")
 #    priors = measure_priors(known)
 #
 # See :doc:`/method/fitting` for priors of star-formation rates, and :doc:`/method/fitting_errors` for measured

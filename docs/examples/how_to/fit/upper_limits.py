@@ -18,7 +18,7 @@ from miricigale import BayesFitter, SEDModel
 
 bands = ["acs.f606w", "acs.f814w", "wfc3.f125w", "wfc3.f160w", "irac.ch1"]
 bands += ["miri.f1000w", "miri.f1500w"]
-model = SEDModel.yang2021()
+model = SEDModel.survey()
 truth = {
     "redshift": [1.0],
     "mass": [2e9],
@@ -45,20 +45,21 @@ ignored = photometry.copy()
 for band in ("miri.f1000w", "miri.f1500w"):
     ignored[band] = np.nan * u.uJy
 
-fitter = BayesFitter(model, bands, axes=SEDModel.yang2021_axes())
+# without the priors for real galaxies, of which few have an AGN
+fitter = BayesFitter(model, bands, model_error=0.05)
 fits = {
     "limits left out": fitter.fit(ignored)["galaxy"],
     "upper limits": fitter.fit(limits)["galaxy"],
 }
 summary = QTable({"fit": list(fits)})
 summary["limits"] = [fit.n_limits for fit in fits.values()]
-for name in ("frac_agn", "sfr"):
+for name in ("ebv", "sfr"):
     q = [fit.percentile(name, [0.5, 0.84]).value.round(2) for fit in fits.values()]
     summary[f"{name}_p50"], summary[f"{name}_p84"] = np.transpose(q)
 summary
 
 # %%
-# The limits exclude strong AGN. They are drawn as arrows.
+# The limits exclude dusty galaxies, whose dust would shine at 10 and 15 um. They are drawn as arrows.
 
 fig, (left, right) = plt.subplots(
     1, 2, figsize=(10, 4), width_ratios=[1.5, 1], layout="constrained"
@@ -66,8 +67,8 @@ fig, (left, right) = plt.subplots(
 fits["upper limits"].plot_sed(left)
 left.set(xlim=(0.4, 40), ylim=(0.03, 30))
 for fit in fits.values():
-    fit.plot_pdf("frac_agn", right)
-right.set(xlabel="AGN fraction")
+    fit.plot_pdf("ebv", right)
+right.set(xlabel="E(B-V)")
 right.legend(list(fits))
 plt.show()
 

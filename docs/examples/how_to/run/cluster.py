@@ -36,7 +36,7 @@ parameters["mass"] = 3e10
 light = model.fluxes(parameters, list(errors.filters))
 photometry = errors.perturb(light["id", *errors.filters], seed=1)
 
-fitter = BayesFitter(model, list(errors.filters), axes="quick")
+fitter = BayesFitter(model, list(errors.filters), axes="yang2021-quick")
 results = {}
 for n_workers in (1, 2, 4):
     with ThreadPoolExecutor(n_workers) as executor:
