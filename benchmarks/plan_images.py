@@ -23,9 +23,9 @@ from miricigale.photometry import ErrorModel
 from miricigale.planning import Planner, load_plan
 from miricigale.planning.accuracy import NUMBERS, accuracy, columns_of
 from miricigale.planning.sample import agn_mix
+from miricigale.utils.files import replacing
 from miricigale.utils.parallel import process_pool, thread_count
 from miricigale.utils.random import stream
-from miricigale.utils.store import replacing
 from miricigale.utils.tables import error_column
 from miricigale.workflow.analysis_sections import FitSection, PointSourceSection
 from miricigale.workflow.config import StudyConfig

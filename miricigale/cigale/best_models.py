@@ -14,7 +14,9 @@ from miricigale.filters.band_names import filter_of_band
 from miricigale.fitting.drawing import best_parameters
 from miricigale.sed.spectrum import distance
 from miricigale.sed.xray_bands import SPAN, XRays, disk_2500
-from miricigale.utils.store import replacing
+from miricigale.utils.files import replacing
+from miricigale.utils.options import check_that
+from miricigale.utils.outputs import FILE_NAME, is_file_name
 
 _LYMAN = 0.0912  # um
 _LIGHT = 299792458.0  # m/s
@@ -214,6 +216,8 @@ def write_best_models(results, folder, *, xray=None, overwrite=False):
     ------
     OSError
         If a file is there and ``overwrite`` is not given.
+    ValueError
+        If an id cannot be a part of a file's name, such as one with a slash.
 
     Examples
     --------
@@ -233,9 +237,17 @@ def write_best_models(results, folder, *, xray=None, overwrite=False):
     ['a_best_model.fits', 'b_best_model.fits']
     """
     folder = Path(folder)
+    fitted = results[results.fitted]
+    names = [str(one) for one in np.atleast_1d(fitted.ids)]
+    for name in names:
+        # an id such as ../a would be a file elsewhere
+        check_that(
+            is_file_name(name), "results", f"of ids that name files ({FILE_NAME})", repr(name)
+        )
+    paths = [folder / f"{name}_best_model.fits" for name in names]
     folder.mkdir(parents=True, exist_ok=True)
-    options, paths = {"modules": results.meta.get("cigale", {}).get("modules")}, []
-    for one in results[results.fitted]:
+    options = {"modules": results.meta.get("cigale", {}).get("modules")}
+    for one, path in zip(fitted, paths, strict=True):
         if one.distance is not None:
             known = np.isfinite(one.distance)
             options["far"] = float(one.distance) * u.Mpc if known else None
@@ -243,11 +255,9 @@ def write_best_models(results, folder, *, xray=None, overwrite=False):
             options["xray"] = xray | {"alpha_ox": float(one.best.get("alpha_ox", np.nan))}
         table = best_model_table(one.model, best_parameters(one, one.model), **options)
         meta, table.meta = table.meta | {"best.chi_square": float(one.chi2)}, {}
-        path = folder / f"{np.asarray(one.ids).item()}_best_model.fits"
         hdu = fits.table_to_hdu(table)
         for name, value in meta.items():
             hdu.header[f"HIERARCH {name}"] = value
         with replacing(path, overwrite=overwrite) as partial:
             hdu.writeto(partial)
-        paths.append(path)
     return paths

@@ -10,8 +10,8 @@ from miricigale.cigale.names import cigale_names, unit_of
 from miricigale.filters.band_names import cigale_band, filter_of_band
 from miricigale.fitting import FitFlags
 from miricigale.utils.exceptions import data_error
+from miricigale.utils.files import replacing
 from miricigale.utils.options import check_names
-from miricigale.utils.store import replacing
 from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import error_column
 

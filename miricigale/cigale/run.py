@@ -12,6 +12,7 @@ from miricigale.filters.band_names import band_filters, xray_energies
 from miricigale.filters.given import given_filters
 from miricigale.utils.exceptions import CatalogWarning, ConfigError, config_error, warn
 from miricigale.utils.options import check_choice
+from miricigale.utils.outputs import check_output
 from miricigale.utils.tables import error_column
 
 
@@ -130,7 +131,15 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
 
 
 def fit_cigale(
-    ini, *, output=None, best_models=None, libraries="best", names=None, strict=False, **options
+    ini,
+    *,
+    output=None,
+    best_models=None,
+    overwrite=False,
+    libraries="best",
+    names=None,
+    strict=False,
+    **options,
 ):
     """
     Do what a run of CIGALE does: read configuration and catalog, fit, write.
@@ -140,10 +149,11 @@ def fit_cigale(
     ini : path-like or `CigaleSetup`
         ``pcigale.ini``, or what `read_pcigale_ini` made of it.
     output : path-like, optional
-        File of results in CIGALE's columns (``results.fits`` or ``.txt``), replaced if it is
-        there.
+        File of results in CIGALE's columns (``results.fits`` or ``.txt``).
     best_models : path-like, optional
-        Folder of files of the best models (`write_best_models`), replaced if they are there.
+        Folder of files of the best models (`write_best_models`).
+    overwrite : bool, optional
+        Whether files that are there are replaced.
     libraries, names, strict : optional
         As for `read_pcigale_ini`; no use for a `CigaleSetup`.
     **options
@@ -158,12 +168,17 @@ def fit_cigale(
     `~miricigale.utils.exceptions.ConfigError`
         If the configuration is one of ``savefluxes``, which `CigaleSetup.save_models` does; as
         `read_pcigale_ini`.
+    ValueError
+        If ``output`` is there and ``overwrite`` is False.
+    OSError
+        If a file of ``best_models`` is there and ``overwrite`` is False.
 
     Examples
     --------
     >>> from miricigale.cigale import fit_cigale
     >>> results = fit_cigale("pcigale.ini", output="results.fits")  # doctest: +SKIP
     """
+    check_output(output, "output", overwrite=overwrite)
     setup = ini
     if not isinstance(ini, CigaleSetup):
         setup = read_pcigale_ini(ini, libraries=libraries, names=names, strict=strict)
@@ -172,8 +187,8 @@ def fit_cigale(
     photometry = setup.catalog(strict=strict)
     results = setup.fit(photometry, **options)
     if output is not None:
-        setup.write_results(results, output, overwrite=True)
+        setup.write_results(results, output, overwrite=overwrite)
     if best_models is not None:
         xray = setup.xray if setup.xray_bands() else None
-        write_best_models(results, best_models, xray=xray, overwrite=True)
+        write_best_models(results, best_models, xray=xray, overwrite=overwrite)
     return results

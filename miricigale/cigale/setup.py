@@ -20,8 +20,8 @@ from miricigale.sed import SEDModel
 from miricigale.sed.grid_spectra import row_values
 from miricigale.sed.xray_bands import with_xray_bands, xray_filter
 from miricigale.utils.exceptions import config_error
+from miricigale.utils.files import replacing
 from miricigale.utils.options import check_that
-from miricigale.utils.store import replacing
 from miricigale.utils.tables import require_columns
 
 #: Most models that are written.

@@ -39,7 +39,7 @@ def fit(args):
         table = args.output / f"table{kind}"
         write_table(found, table, overwrite=True)
         page = fit_page(found, args.photometry, **chosen(args, "catalog_map z_spec"), hdu=hdu)
-        page = page.write(args.output / "page.html")
+        page = page.write(args.output / "page.html", overwrite=True)
     except KeyboardInterrupt:
         n_parts = len(list(args.output.glob("part-*.fits")))
         how = "the same command" + ("" if args.resume else ", without --no-resume,")
@@ -141,20 +141,20 @@ def errors(args):
     import astropy.units as u
 
     from miricigale.photometry import MosaicFile, image_errors
-    from miricigale.photometry.from_files import check_output
     from miricigale.photometry.kernel_files import image_psf
     from miricigale.photometry.page import write_errors_page
+    from miricigale.utils.outputs import check_output
     from miricigale.utils.table_files import write_table
 
     paths = [args.output.with_suffix(one) for one in (".fits", ".ecsv", ".html")]
-    for what, path in zip(("output", "output", "page"), paths, strict=True):
-        check_output(what, path, args.overwrite, [args.image])
+    for path in paths:
+        check_output(path, "output", overwrite=args.overwrite, inputs=[args.image])
     file = MosaicFile(args.image, **{name: getattr(args, name) for name in _KNOWN})
     psf, image = image_psf(file), file.read()
     options = {"diameters": u.Quantity(args.apertures)} if args.apertures else {}
     found = image_errors(image, psf=psf, n_sigma=args.sigma, seed=args.seed, **options)
-    found.write(paths[0])
-    write_table(found.table, paths[1], overwrite=True)
-    write_errors_page(paths[2], found)
+    found.write(paths[0], overwrite=args.overwrite)
+    write_table(found.table, paths[1], overwrite=args.overwrite)
+    write_errors_page(paths[2], found, overwrite=args.overwrite)
     print(f"limits in {paths[0]} and {paths[1]}; page: {paths[2]}")
     return 0

@@ -22,7 +22,7 @@ def reduce(args):
         args.output,
         reducer=Reducer(references=_references(args), **settings),
         integrations=args.rateints,
-        **chosen(args, "pixel_scale align resume"),
+        **chosen(args, "pixel_scale align resume overwrite"),
         progress_bar=not args.no_progress,
     )
     failed = table[table["status"] == "failed"]

@@ -154,10 +154,19 @@ def _filled(text, words):
 
 def read_input(folder):
     """Write what standard input holds, a table, beside the folder of its results: its path."""
+    from miricigale.utils.files import replacing
+    from miricigale.utils.options import check_that
+
     data = sys.stdin.buffer.read()
     kinds = {b"SIMPLE": "fits", b"# %ECSV": "ecsv", b"PAR1": "parquet", b"<?xml": "xml"}
     ending = next((kind for begin, kind in kinds.items() if data.startswith(begin)), "csv")
     path = folder.with_name(f"{folder.name}-input.{ending}")
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(data)
+    if path.exists():
+        # the same input again resumes; another is not put in its place
+        same = path.is_file() and path.read_bytes() == data
+        check_that(same, "output", "another folder", f"{folder}: {path} holds another input")
+    else:
+        with replacing(path) as partial:
+            partial.write_bytes(data)
     return path

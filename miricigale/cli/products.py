@@ -4,6 +4,7 @@ import warnings
 from pathlib import Path
 
 from miricigale.utils.options import check_that
+from miricigale.utils.outputs import check_output
 
 
 def _readers():
@@ -74,9 +75,10 @@ def show(args):
     if not hasattr(product, "plot"):
         return 0
     picture = args.picture or Path(f"{args.file.name}.png")
-    if args.picture is None and picture.exists():
+    if args.picture is None and picture.exists() and not args.overwrite:
         print(f"picture: {picture} is there already; --picture gives another name")
         return 0
+    check_output(picture, "picture", overwrite=args.overwrite, inputs=[args.file])
     from matplotlib import pyplot as plt
 
     plt.switch_backend("agg")
@@ -98,6 +100,7 @@ def psf(args):
     made = image_psf(MosaicFile(args.image, filter=args.filter, pa_aper=args.pa_aper))
     wanted = f"an image of a filter with a model ({', '.join(MODEL_FILTERS)}) and its PA_APER"
     check_that(made is not None, "IMAGE", wanted, args.image)
+    check_output(args.output, "output", overwrite=args.overwrite, inputs=[args.image])
     made.write(args.output, overwrite=args.overwrite)
     print(f"{args.output}: FWHM {made.fwhm:.4f}, pixel {made.pixel_scale:.4f}")
     return 0

@@ -74,6 +74,7 @@ def plan(args):
         msg = "wanted are --time or --depth, not both"
         raise ValueError(msg)
     from miricigale.planning import load_plan, write_plan
+    from miricigale.utils.outputs import check_output
     from miricigale.utils.parallel import threads
 
     if args.time is not None:
@@ -88,9 +89,13 @@ def plan(args):
         print(config.to_toml(), end="")
         return 0
     folder = args.output or Path(config.plan.name)
+    if args.config is not None:
+        # never replaced, not even with --overwrite
+        path = folder / "plan.toml"
+        check_output(path, "output", overwrite=True, inputs=[args.config])
     begin = time.monotonic()
     with threads(config.plan.threads or None) as executor:
-        comparison = write_plan(config, folder, executor=executor)
+        comparison = write_plan(config, folder, executor=executor, overwrite=args.overwrite)
     wanted = ["plan", "time", "z_scatter", "z_outliers", "frac_scatter", "completeness", "purity"]
     table = comparison[[*wanted, "n_agn", "merit"]]
     for name in table.colnames[1:]:

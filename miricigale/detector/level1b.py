@@ -23,8 +23,8 @@ from miricigale.instrument import kept_keywords, placed_keywords
 from miricigale.instrument.asdf_extension import asdf_extension, bytes_table
 from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.files import replacing
 from miricigale.utils.meta import plain_value
-from miricigale.utils.store import replacing
 
 _START = "2022-06-21T00:00:00"
 

@@ -12,6 +12,7 @@ from miricigale.filters.catalog_files import MappedRows, as_catalog_map
 from miricigale.filters.photometry_table import band_columns
 from miricigale.fitting.fitted_bands import bands_with_errors, warn_of_unfitted
 from miricigale.fitting.likelihood import unused_bands
+from miricigale.utils.exceptions import OtherResultsError
 from miricigale.utils.row_files import open_rows
 from miricigale.utils.tables import error_column
 
@@ -219,7 +220,10 @@ def _by_redshifts(fitter, rows, column, output, options):
     resume, executor = options.get("resume", True), options.get("executor")
     path, name = output / "calibration.ecsv", f"{rows.path.name} by {column} ({rows.sha256[:8]})"
     found = SurveyCalibration.read(path) if resume and path.exists() else None
-    if found is None or found.name != name:
+    if found is not None and found.name != name:
+        msg = f"{path} is of {found.name}, not of {name}"
+        raise OtherResultsError(msg, "resume=False to replace it")
+    if found is None:
         known = []
         for table in map(rows.chunk, range(rows.n_chunks)):
             fluxes = {c for b in fitter.bands for c in (b, error_column(b))}

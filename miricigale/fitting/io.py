@@ -15,7 +15,7 @@ from miricigale.fitting.samples import Samples
 from miricigale.sed import ModelGrid
 from miricigale.utils.content import content_sha256
 from miricigale.utils.exceptions import argument_error, data_error
-from miricigale.utils.files import open_fits
+from miricigale.utils.files import open_fits, replacing
 from miricigale.utils.folder import RecordFolder
 from miricigale.utils.object_rows import ByID
 from miricigale.utils.options import check_data, check_names
@@ -141,7 +141,8 @@ def _axes_from_plain(text, shares):
 
 def _write_table(results, path, *, overwrite=False):
     """Write the table of `FitResults.to_table` or `Samples.to_table`."""
-    results.to_table().write(path, format="ascii.ecsv", overwrite=overwrite)
+    with replacing(path, overwrite=overwrite) as partial:
+        results.to_table().write(partial, format="ascii.ecsv")
 
 
 register(FitResults, read=read_results, write=write_results)

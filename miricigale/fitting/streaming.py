@@ -23,12 +23,12 @@ from miricigale.fitting.pulls import warn_of_pulls
 from miricigale.fitting.sample_flags import chi2_limit, chi2_step
 from miricigale.utils.content import content_sha256
 from miricigale.utils.exceptions import CatalogWarning, OtherResultsError, argument_error, warn
+from miricigale.utils.files import PARTIAL
 from miricigale.utils.folder import FileFolder
 from miricigale.utils.meta import plain_value, undated
 from miricigale.utils.options import check_data, check_that
 from miricigale.utils.progress import progress
 from miricigale.utils.random import check_seed
-from miricigale.utils.store import PARTIAL
 from miricigale.utils.tables import ascii_ids, error_column, read_ids, require_columns
 from miricigale.utils.units import FNU
 

@@ -24,6 +24,7 @@ from miricigale.fitting.template_error import TemplateError
 from miricigale.refdata import locate
 from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import DataError, FitWarning, warn
+from miricigale.utils.files import replacing
 from miricigale.utils.options import check_that
 from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import described_rows, described_table, require_columns
@@ -142,7 +143,8 @@ class SurveyCalibration:
         if self.scores is not None:
             meta["scores"] = {n: self.scores[n].tolist() for n in self.scores.colnames}
         table = described_table({n: (self.bands[n], t) for n, t in _COLUMNS.items()}, meta)
-        table.write(path, format="ascii.ecsv", overwrite=overwrite)
+        with replacing(path, overwrite=overwrite) as partial:
+            table.write(partial, format="ascii.ecsv")
 
     @classmethod
     def read(cls, path):

@@ -9,7 +9,7 @@ from astropy.io import fits
 from miricigale.instrument import dq_planes, read_dq, with_own_bits
 from miricigale.instrument.image import Image
 from miricigale.utils.exceptions import data_error
-from miricigale.utils.files import open_fits, write_fits
+from miricigale.utils.files import open_fits, replacing, write_fits
 from miricigale.utils.meta import plain_value, undated
 from miricigale.utils.options import check_data
 
@@ -51,7 +51,7 @@ def _packed(values, name, header=None, *, step=None):
     )
 
 
-def write_image(image, path, *, planes=None, rounded=False):
+def write_image(image, path, *, planes=None, rounded=False, overwrite=False):
     """
     Write an image as FITS: SCI, ERR, MASK and further planes.
 
@@ -61,12 +61,19 @@ def write_image(image, path, *, planes=None, rounded=False):
         Its WCS (with distortion) goes to the SCI header, its meta as JSON to the keyword
         META, so that names and types survive.
     path : path-like
-        Where to; an existing file is replaced.
+        The file.
     planes : dict of str to `~numpy.ndarray`, optional
         Further image extensions by name; ``dq`` holds flags (`~miricigale.instrument.DQ`).
     rounded : bool, optional
         Whether SCI and ERR are rounded to 1/2048 of the median of ERR, for a third of the size;
         otherwise every bit is kept.
+    overwrite : bool, optional
+        Whether an existing file is replaced.
+
+    Raises
+    ------
+    OSError
+        If the file exists and ``overwrite`` is False.
 
     Examples
     --------
@@ -96,7 +103,8 @@ def write_image(image, path, *, planes=None, rounded=False):
             hdus += [_packed(part, label, legend) for label, part, legend in dq_planes(plane)]
         else:
             hdus.append(_packed(np.asarray(plane), name.upper()))
-    write_fits(hdus, path, overwrite=True)
+    with replacing(path, overwrite=overwrite) as partial:
+        write_fits(hdus, partial)
 
 
 def _unit(header, path):

@@ -7,8 +7,8 @@ from markupsafe import Markup
 
 from miricigale.pages.rendering import image_of, macros, render
 from miricigale.pages.values import Missing
+from miricigale.utils.files import replacing
 from miricigale.utils.options import check_that
-from miricigale.utils.store import replacing
 
 
 class Page:
@@ -146,16 +146,28 @@ class Page:
         values = {name: getattr(self, name) for name in ("title", "subtitle", "notices")}
         return render("page.html", sections=self._sections, **values)
 
-    def write(self, path):
+    def write(self, path, *, overwrite=False):
         """
         Write the page, whole or not at all.
+
+        Parameters
+        ----------
+        path : path-like
+            The file; its folder is made.
+        overwrite : bool, optional
+            Whether an existing file is replaced.
 
         Returns
         -------
         path : `pathlib.Path`
+
+        Raises
+        ------
+        OSError
+            If the file exists and ``overwrite`` is False.
         """
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as partial:
+        with replacing(path, overwrite=overwrite) as partial:
             partial.write_text(self.to_html(), encoding="utf-8")
         return path

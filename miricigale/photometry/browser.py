@@ -1,5 +1,7 @@
 """The sources of a measurement one by one: pictures, fluxes, limits and flags."""
 
+from pathlib import Path
+
 import numpy as np
 
 from miricigale.filters import Filter
@@ -7,11 +9,22 @@ from miricigale.pages.browser import rounded, source_pages
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.grids import grid_angle
 from miricigale.plotting.cutouts import Cutouts
-from miricigale.utils.store import replacing
+from miricigale.utils.files import replacing
 from miricigale.utils.units import ab_magnitude
 
 #: Largest number of sources with pictures: those of the highest signal-to-noise.
 _PICTURES = 5000
+
+
+def browser_files(path):
+    """Page of the sources beside the page of a measurement, and the folder of its data."""
+    path = Path(path)
+    name = _browser_name(path)
+    return path.with_name(f"{name}.html"), path.with_name(name)
+
+
+def _browser_name(path):
+    return f"{path.name.partition('.')[0]}-sources"
 
 
 def write_browser(path, title, bands, highres, confidence, detected):
@@ -21,7 +34,7 @@ def write_browser(path, title, bands, highres, confidence, detected):
     ``bands`` are as for `~miricigale.photometry.page.write_page`, which has the other arguments too; fluxes below
     ``detected`` sigma are shown as limits.
     """
-    name = f"{path.name.partition('.')[0]}-sources"
+    name = _browser_name(path)
     results = {one.name: one.result for one in bands}
     first = bands[0].result
     images = {}

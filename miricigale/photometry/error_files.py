@@ -3,7 +3,7 @@
 from miricigale.photometry.error_calibration import ErrorCalibration
 from miricigale.photometry.error_model import ErrorModel
 from miricigale.utils.exceptions import file_errors
-from miricigale.utils.store import replacing
+from miricigale.utils.files import replacing
 from miricigale.utils.table_files import read_table
 from miricigale.utils.unified import register
 

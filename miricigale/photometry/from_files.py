@@ -1,20 +1,20 @@
 """Forced photometry of files: what they are is checked first, then measured and put on a page."""
 
-import tempfile
 from pathlib import Path
 
 from miricigale.instrument.image_files import write_image
 from miricigale.photometry.file_inputs import Inputs
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.files import split_extension
-from miricigale.utils.options import check_that
+from miricigale.utils.files import replacing
+from miricigale.utils.outputs import check_output, check_outputs
 from miricigale.utils.parallel import check_memory
 from miricigale.utils.progress import progress
-from miricigale.utils.store import replacing
 from miricigale.utils.table_files import write_table
 
-#: Endings of tables that can be written.
-_TABLES = (".ecsv", ".fits", ".fits.gz")
+#: What tables can be written as, and images.
+TABLE_KIND = {"kind": "a table", "endings": (".ecsv", ".fits", ".fits.gz")}
+IMAGE_KIND = {"kind": "a FITS file", "endings": (".fits", ".fits.gz")}
+_KINDS = {"output": TABLE_KIND, "page": {}, "model": IMAGE_KIND, "residual": IMAGE_KIND}
 
 #: What is done with images that are too large.
 _IN_PATCHES = (
@@ -114,7 +114,12 @@ def measure_files(
         results |= {("model", k): _of_band(model, own), ("residual", k): _of_band(residual, own)}
     results = {key: path for key, path in results.items() if path is not None}
     for (what, _), path in results.items():
-        check_output(what, path, overwrite, inputs.paths)
+        check_output(path, what, overwrite=overwrite, inputs=inputs.paths, **_KINDS[what])
+    if page is not None:
+        # the modules of pages are not needed where none is written
+        from miricigale.photometry.browser import browser_files
+
+        check_outputs(browser_files(page), "page", overwrite=overwrite, inputs=inputs.paths)
     written = [Path(path).resolve() for path in results.values()]
     if len(set(written)) < len(written):
         given = ", ".join(dict.fromkeys(what for what, _ in results))
@@ -155,28 +160,3 @@ def _of_band(path, file):
     name, dot, ending = Path(path).name.partition(".")
     band = str(file.header.filter).rpartition(".")[2]
     return Path(path).with_name(f"{name}_{band}{dot}{ending}")
-
-
-def check_output(what, path, overwrite, inputs):
-    """Refuse a file that could not be written in the end, or that is not to be replaced."""
-    if path is None:
-        return
-    path = Path(path)
-    if what == "output" and not path.name.lower().endswith(_TABLES):
-        raise argument_error("output", f"a table ({', '.join(_TABLES)})", path)
-    if what in ("model", "residual") and not path.name.lower().endswith((".fits", ".fits.gz")):
-        raise argument_error(what, "a FITS file (.fits, .fits.gz)", path)
-    check_that(not path.is_dir(), what, "a file", f"the folder {path}")
-    if any(path.resolve() == Path(split_extension(one)[0]).resolve() for one in inputs):
-        raise argument_error(what, "another file than those that are read", path)
-    if path.exists() and not overwrite:
-        raise argument_error(what, "a new file (or 'overwrite' given)", f"{path}, which is there")
-    folder = path.parent
-    while not folder.exists():
-        folder = folder.parent
-    try:
-        # permission bits are not enough for a superuser or on a read-only disk
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as err:
-        raise argument_error(what, "in a folder that can be written to", path) from err

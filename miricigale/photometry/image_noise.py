@@ -22,7 +22,6 @@ from miricigale.utils.declared import declared
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_positive
 from miricigale.utils.random import check_seed
-from miricigale.utils.store import replacing
 from miricigale.utils.tables import described_columns
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, to_array
 
@@ -81,14 +80,28 @@ class ImageErrors:
         m = len(self.correlation) // 2
         return float(np.sqrt(max(self.correlation.sum(), 0.0) / self.correlation[m, m]))
 
-    def write(self, path):
-        """Write the maps to a FITS file: SCI (the noise), ``LIMIT_<aperture>`` (uJy) and CORRELATION."""
+    def write(self, path, *, overwrite=False):
+        """
+        Write the maps to a FITS file: SCI (the noise), ``LIMIT_<aperture>`` (uJy) and CORRELATION.
+
+        Parameters
+        ----------
+        path : path-like
+            The file.
+        overwrite : bool, optional
+            Whether an existing file is replaced.
+
+        Raises
+        ------
+        OSError
+            If the file exists and ``overwrite`` is False.
+        """
         planes = {
             f"limit_{name}": one.to_value(FNU).astype(np.float32)
             for name, one in self.limits.items()
         }
-        with replacing(path) as partial:
-            write_image(self.noise, partial, planes={**planes, "correlation": self.correlation})
+        planes["correlation"] = self.correlation
+        write_image(self.noise, path, planes=planes, overwrite=overwrite)
 
 
 def image_errors(image, *, diameters=(0.5, 1.0) * u.arcsec, psf=None, n_sigma=5.0, seed=None):

@@ -85,7 +85,7 @@ def write_page(path, bands, highres, segments, confidence, seed):
     for one in bands:
         page.table("table", _source_rows(one.result, confidence), band=one.name)
     _input_table(page, bands, highres)
-    report.write(path)
+    report.write(path, overwrite=True)
 
 
 def _notices(page, bands, highres):
@@ -354,7 +354,7 @@ def _empty_positions(result, seed):
     return QTable({"id": np.arange(1, len(chosen) + 1), "sky": sky})
 
 
-def write_errors_page(path, errors):
+def write_errors_page(path, errors, *, overwrite=False):
     """Write the page of the errors of an image (`~miricigale.photometry.ImageErrors`)."""
     table, meta = errors.table, errors.table.meta
     report = Page(f"Errors of {Path(meta['source']).name}", subtitle=meta.get("filter", ""))
@@ -375,4 +375,4 @@ def write_errors_page(path, errors):
     )
     what = "a point fitted" if aperture == "psf" else f"a circle of {aperture} arcsec"
     page.figure("map", figure, aperture=what, n_sigma=meta["n_sigma"])
-    report.write(path)
+    report.write(path, overwrite=overwrite)

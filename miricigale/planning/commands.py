@@ -8,6 +8,9 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.files import replacing
+from miricigale.utils.outputs import check_outputs
+from miricigale.utils.table_files import write_table
 
 
 def plan_table(*, quick=False):
@@ -51,7 +54,7 @@ def plan_table(*, quick=False):
     return QTable(rows)[[*order, "limit_etc", "limit", "limit_proposal", "fwhm"]]
 
 
-def write_plan(config, folder, *, executor=None):
+def write_plan(config, folder, *, executor=None, overwrite=False):
     """
     Work out a plan and write it.
 
@@ -62,14 +65,21 @@ def write_plan(config, folder, *, executor=None):
     folder : path-like
         Gets ``plan.html``, ``plan.toml``, ``comparison.ecsv``, ``areas.ecsv`` (with ``[survey] areas``),
         and ``bands-<n>.ecsv`` and ``sources-<n>.ecsv`` of each set of bands, in the order of the
-        configuration (0: the existing ones). Files of these names are replaced.
+        configuration (0: the existing ones).
     executor : `concurrent.futures.Executor`, optional
         Threads to fit with; the answer is the same.
+    overwrite : bool, optional
+        Whether files of these names are replaced.
 
     Returns
     -------
     comparison : `~astropy.table.QTable`
         See `~miricigale.planning.comparison_table`.
+
+    Raises
+    ------
+    ValueError
+        If ``folder`` has files of these names and ``overwrite`` is False, or cannot be written to.
 
     Examples
     --------
@@ -82,6 +92,12 @@ def write_plan(config, folder, *, executor=None):
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
         raise argument_error("folder", "a folder, or nothing yet", f"the file {folder}")
+    names = ["plan.html", "plan.toml", "comparison.ecsv", "areas.ecsv"]
+    paths = [folder / name for name in names]
+    for pattern in ("bands-[0-9]*.ecsv", "sources-[0-9]*.ecsv"):
+        paths += sorted(folder.glob(pattern))
+    # refused before the fits, which take minutes
+    check_outputs(paths, "folder", overwrite=overwrite)
     planner = Planner(config, executor=executor)
     plans = planner.compare()
     comparison = comparison_table(planner, plans)
@@ -89,12 +105,13 @@ def write_plan(config, folder, *, executor=None):
     comparison.meta |= {"noise": dataclasses.asdict(config.noise)}
     areas = area_table(planner, planner.divide()) if config.survey.areas else None
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "plan.toml").write_text(config.to_toml(), encoding="utf-8")
+    with replacing(folder / "plan.toml", overwrite=overwrite) as partial:
+        partial.write_text(config.to_toml(), encoding="utf-8")
     tables = {"comparison": comparison}
     tables |= {} if areas is None else {"areas": areas}
     tables |= {f"sources-{k}": plan.sources for k, plan in enumerate(plans)}
     tables |= {f"bands-{k}": plan.band_table() for k, plan in enumerate(plans) if plan.bands}
     for name, table in tables.items():
-        table.write(folder / f"{name}.ecsv", overwrite=True)
-    write_page(folder / "plan.html", planner, plans, comparison, areas)
+        write_table(table, folder / f"{name}.ecsv", overwrite=overwrite)
+    write_page(folder / "plan.html", planner, plans, comparison, areas, overwrite=overwrite)
     return comparison

@@ -20,7 +20,7 @@ class PlanSection(RunBasics):
         Name of the plan; its folder unless --output is given.
     """
 
-    name: str = "plan"
+    name: str = option("plan", folder=True)
 
 
 class SampleSection(Section):

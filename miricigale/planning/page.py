@@ -13,7 +13,7 @@ from miricigale.workflow.background import background_text
 from miricigale.workflow.page.study_figures import redshift_figure
 
 
-def write_page(path, planner, plans, comparison, areas=None):
+def write_page(path, planner, plans, comparison, areas=None, *, overwrite=False):
     """
     Write the page of a plan.
 
@@ -27,6 +27,8 @@ def write_page(path, planner, plans, comparison, areas=None):
         Of `Planner.compare`.
     comparison, areas : `~astropy.table.QTable`
         Of `comparison_table` and, if there is one, `area_table`.
+    overwrite : bool, optional
+        Whether an existing file is replaced.
 
     Returns
     -------
@@ -59,7 +61,7 @@ def write_page(path, planner, plans, comparison, areas=None):
         page.section("areas")
         page.table("table", _entries(areas))
         page.figure("figure", _area_figure(areas))
-    return report.write(path)
+    return report.write(path, overwrite=overwrite)
 
 
 def answer(planner, plans, comparison):

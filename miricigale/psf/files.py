@@ -12,10 +12,10 @@ from miricigale.psf.kernel_field import KernelField
 from miricigale.psf.kernels import MatchingKernel
 from miricigale.psf.model import InstrumentPSF, make_psf
 from miricigale.utils.exceptions import argument_error, data_error, file_errors
-from miricigale.utils.files import open_fits, write_fits
+from miricigale.utils.files import open_fits, replacing, write_fits
 from miricigale.utils.meta import plain_value
 from miricigale.utils.options import check_that
-from miricigale.utils.store import native, open_parts, replacing, write_parts
+from miricigale.utils.store import native, open_parts, write_parts
 from miricigale.utils.unified import register
 from miricigale.utils.units import ANGLE, to_array
 

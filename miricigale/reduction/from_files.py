@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import logging
-import os
 from pathlib import Path
 
 import numpy as np
@@ -17,17 +16,20 @@ from miricigale.plotting.images import plot_image
 from miricigale.reduction import Reducer, ReferenceFiles, read_images, write_image
 from miricigale.reduction.background import known_background
 from miricigale.reduction.files import open_file, scaled_planes
+from miricigale.reduction.product_folder import ProductFolder
 from miricigale.utils.content import content_sha256, file_sha256
 from miricigale.utils.declared import declared
-from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.files import open_fits
 from miricigale.utils.options import check_that
 from miricigale.utils.progress import progress
+from miricigale.utils.table_files import write_table
 from miricigale.utils.units import ANGLE, RATE, SURFACE_BRIGHTNESS, to_array
 
 log = logging.getLogger(__name__)
 
 #: Changes with what the products hold.
-_VERSION = 7
+_VERSION = 8
 
 #: Errors of a bad file; the other files are reduced all the same.
 _ERRORS = (ArithmeticError, ImportError, KeyError, MemoryError, OSError, ValueError)
@@ -42,6 +44,7 @@ def reduce_files(
     integrations=False,
     align=None,
     resume=True,
+    overwrite=False,
     progress_bar=False,
 ):
     """
@@ -55,7 +58,8 @@ def reduce_files(
     folder : path-like
         Gets ``<name>_rate.fits`` (with VAR_POISSON and VAR_RNOISE) and ``<name>_cal.fits`` of each
         exposure (background subtracted, it is in the extension BKG), ``mosaic_<filter>.fits`` (SCI,
-        ERR, DQ, WHT, CON, BKG), ``files.ecsv`` and ``index.html``.
+        ERR, DQ, WHT, CON, BKG), ``files.ecsv``, ``index.html`` and ``reduce.json``, the checksums of these. One
+        reduction at a time uses a folder.
     reducer : `~miricigale.reduction.Reducer`, optional
         Settings, references among them.
     pixel_scale : `~astropy.units.Quantity`, optional
@@ -66,7 +70,10 @@ def reduce_files(
     align : optional
         As of `~miricigale.reduction.Reducer.run`.
     resume : bool, optional
-        Whether products of the same files and settings that are there are kept.
+        Whether products of the same files and settings that are there are kept, if their content is that which
+        was written. Others that a reduction wrote here are made again.
+    overwrite : bool, optional
+        Whether files are replaced that no reduction wrote here, or that were edited since.
     progress_bar : bool, optional
         Whether a progress bar is shown.
 
@@ -80,7 +87,10 @@ def reduce_files(
     Raises
     ------
     ValueError
-        If there are no paths, or two files have one name.
+        If there are no paths, two files have one name, or ``folder`` has files of others, or edited ones, that
+        would be replaced and ``overwrite`` is False.
+    `~miricigale.utils.exceptions.DataError`
+        If another reduction uses the folder.
 
     Examples
     --------
@@ -97,52 +107,73 @@ def reduce_files(
     stems = [_stem(path) for path in paths]
     twice = sorted({stem for stem in stems if stems.count(stem) > 1})
     check_that(not twice, "paths", "files of different names", f"two of {', '.join(twice)}")
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    settings = _settings(reducer)
-    rows, done = [], {}
-    for path, stem in zip(progress(paths, show=progress_bar, desc="reduce"), stems, strict=True):
-        row = {"file": str(path), "filter": "", "status": "failed", "reason": ""}
-        rows.append(row)
-        try:
-            key = content_sha256([_VERSION, file_sha256(path), settings, integrations])
-            cal, status, reason = _exposure(reducer, path, folder / stem, key, resume, integrations)
-            row |= {"status": status, "reason": reason}
+    with ProductFolder(folder, overwrite=overwrite) as products:
+        names = [name for path in paths for name in _product_names(path, integrations)]
+        inputs = {path.resolve() for path in paths}
+        if any((products.folder / name).resolve() in inputs for name in names):
+            raise argument_error("folder", "another one than that of the files", folder)
+        products.check_replaceable([*names, _TABLE, _PAGE])
+        reduction = _Reduction(reducer, products, _settings(reducer), resume, integrations)
+        rows = []
+        members = {}
+        for path in progress(paths, show=progress_bar, desc="reduce"):
+            row, cal, key = reduction.reduce(path)
+            rows.append(row)
             if cal is not None:
-                row["filter"] = ImageFacts.of(read_images(cal)[0].image).filter or ""
-                done.setdefault(row["filter"], []).append((cal, key))
-        except _ERRORS as err:
-            row["reason"] = _reason(err)
-            log.warning("%s is left out: %s", path, row["reason"])
-    page = SectionWriter(
-        Page("Reduction", subtitle=f"{len(paths)} files"), declared("miricigale.reduction")
-    )
-    for name, members in sorted(done.items()):
-        row = {"file": f"mosaic_{name.rpartition('.')[2]}.fits", "filter": name}
-        rows.append(row | {"status": "failed", "reason": ""})
-        try:
-            scale = pixel_scale.to_value(ANGLE)
-            options = {"pixel_scale": scale * ANGLE, "align": align}
-            path = folder / row["file"]
-            status, notes = _mosaic(reducer, members, path, options, settings, resume)
-            rows[-1] |= {"status": status, "reason": "; ".join(notes)}
-            _show(page, path, members, notes)
-        except _ERRORS as err:
-            rows[-1]["reason"] = _reason(err)
-            log.warning("no mosaic of %s: %s", name, rows[-1]["reason"])
-    table = Table(rows=[list(row.values()) for row in rows], names=list(rows[0]))
-    table.write(folder / "files.ecsv", overwrite=True)
-    _list(page, table)
-    page.report.write(folder / "index.html")
+                members.setdefault(row["filter"], []).append((cal, key))
+        page = SectionWriter(
+            Page("Reduction", subtitle=f"{len(paths)} files"), declared("miricigale.reduction")
+        )
+        options = {"pixel_scale": pixel_scale.to_value(ANGLE) * ANGLE, "align": align}
+        for name in sorted(members):
+            rows.append(reduction.combine(name, members[name], options, page))
+        table = Table(rows=[list(row.values()) for row in rows], names=list(rows[0]))
+        products.write(_TABLE, "", lambda path: write_table(table, path, overwrite=True))
+        _list(page, table)
+        products.write(_PAGE, "", lambda path: page.report.write(path, overwrite=True))
     return table
+
+
+#: Names of the table of the files, and of the page.
+_TABLE = "files.ecsv"
+_PAGE = "index.html"
+#: Stages of files that are calibrated.
+_CALIBRATED = ("cal", "calints", "i2d", "crf")
+_STAGES = ("uncal", "ramp", "rate", "rateints", *_CALIBRATED)
+
+
+def _name_parts(path):
+    """Name of a file without its suffix of the stage, and the stage; an empty one if the name has none."""
+    stem = path.name.removesuffix(".gz").removesuffix(".fits")
+    head, _, stage = stem.rpartition("_")
+    return (head, stage) if head and stage in _STAGES else (stem, "")
 
 
 def _stem(path):
     """Name of a file without its suffix of the stage."""
-    stem = path.name.removesuffix(".gz").removesuffix(".fits")
-    head, _, stage = stem.rpartition("_")
-    known = ("uncal", "ramp", "rate", "rateints", "cal", "calints", "i2d", "crf")
-    return head if head and stage in known else stem
+    return _name_parts(path)[0]
+
+
+def _product_names(path, integrations):
+    """Names of the products of a file, as far as its name and its header tell."""
+    stem, stage = _name_parts(path)
+    kinds = ["cal"]
+    if stage not in _CALIBRATED:
+        # also of a rate, whose copy has our keywords
+        kinds.append("rate")
+        kinds += ["rateints"] * integrations
+    names = [f"{stem}_{kind}.fits" for kind in kinds]
+    try:
+        with open_fits(path, wanted="an exposure") as hdus:
+            band = hdus[0].header.get("FILTER")
+    except OSError:
+        # what is wrong is said when the file is reduced
+        return names
+    return names if band is None else [*names, _mosaic_name(str(band))]
+
+
+def _mosaic_name(band):
+    return f"mosaic_{band.strip().lower().rpartition('.')[2]}.fits"
 
 
 def _reason(err):
@@ -151,7 +182,7 @@ def _reason(err):
 
 
 def _settings(reducer):
-    """What the products depend on: settings, and which state the reference files have."""
+    """What the products depend on: settings, and the content of reference files."""
     values = {
         field.name: repr(getattr(reducer, field.name))
         for field in dataclasses.fields(reducer)
@@ -160,70 +191,102 @@ def _settings(reducer):
     if isinstance(reducer.references, ReferenceFiles):
         for name in reducer.references.names():
             if isinstance(path := getattr(reducer.references, name), Path):
-                state = os.stat(path)
-                values[f"reference {name}"] = [state.st_size, state.st_mtime_ns]
+                values[f"reference {name}"] = file_sha256(path)
     return values
 
 
-def _kept(path, key, resume):
-    """Whether a product of this key is there."""
-    if not (resume and path.is_file()):
-        return False
-    try:
-        return read_images(path)[0].image.meta.get("key") == key
-    except DataError:
-        return False
+class _Reduction:
+    """Reduction of files into a folder of products, of which those that stand are kept."""
 
+    def __init__(self, reducer, products, settings, resume, integrations):
+        self.reducer = reducer
+        self.products = products
+        self.settings = settings
+        self.resume = resume
+        self.integrations = integrations
 
-def _exposure(reducer, path, stem, key, resume, integrations):
-    """Reduce one file: its calibrated product (None without), what was done, and why not more."""
-    cal, rate = (stem.with_name(f"{stem.name}_{kind}.fits") for kind in ("cal", "rate"))
-    if cal.resolve() == path.resolve() or rate.resolve() == path.resolve():
-        raise argument_error("folder", "another one than that of the files", stem.parent)
-    if _kept(cal, key, resume):
-        return cal, "kept", ""
-    slopes_only = "no photometry without references"
-    if reducer.references == "none" and _kept(rate, key, resume):
-        return None, "kept", slopes_only
-    exposure = open_file(path)
-    if isinstance(exposure, Ramp):
-        if integrations and exposure.shape[0] > 1:
-            parts = reducer.fit_integrations(exposure, planes=True)
-            write_image(parts, stem.with_name(f"{stem.name}_rateints.fits"), overwrite=True)
-        exposure = reducer.fit_ramp(exposure, planes=True)
-    exposure, planes = exposure.image, exposure.planes
-    if reducer.references == "none" and not exposure.unit.is_equivalent(SURFACE_BRIGHTNESS):
-        _write(exposure, rate, key, **planes)
-        return None, "rate", slopes_only
-    if exposure.unit.is_equivalent(RATE):
-        # there to stay where the brightness cannot be had
-        _write(exposure, rate, key, **planes)
-    _, image, background = reducer.reduce(exposure)
-    planes = scaled_planes(planes, exposure, image)
-    _write(image, cal, key, **planes, BKG=background.level)
-    return cal, "reduced", ""
+    def reduce(self, path):
+        """Reduce one file: its row, its calibrated product (None without one), and the key of that."""
+        row = {"file": str(path), "filter": "", "status": "failed", "reason": ""}
+        cal = key = None
+        try:
+            key = content_sha256([_VERSION, file_sha256(path), self.settings, self.integrations])
+            cal, row["status"], row["reason"] = self._exposure(path, key)
+            if cal is not None:
+                row["filter"] = ImageFacts.of(read_images(cal)[0].image).filter or ""
+        except _ERRORS as err:
+            cal = None
+            row |= {"status": "failed", "reason": _reason(err)}
+            log.warning("%s is left out: %s", path, row["reason"])
+        return row, cal, key
 
+    def _is_kept(self, name, key):
+        return self.products.is_kept(name, key, resume=self.resume)
 
-def _write(image, path, key, **planes):
-    image.meta["key"] = key
-    write_image(image, path, planes=planes, overwrite=True)
+    def _exposure(self, path, key):
+        """Reduce one file: its calibrated product (None without), what was done, and why not more."""
+        stem = _stem(path)
+        cal, rate = (f"{stem}_{kind}.fits" for kind in ("cal", "rate"))
+        if self._is_kept(cal, key):
+            return self.products.path(cal), "kept", ""
+        slopes_only = "no photometry without references"
+        if self.reducer.references == "none" and self._is_kept(rate, key):
+            return None, "kept", slopes_only
+        exposure = open_file(path)
+        if isinstance(exposure, Ramp):
+            if self.integrations and exposure.shape[0] > 1:
+                parts = self.reducer.fit_integrations(exposure, planes=True)
+                self._write(f"{stem}_rateints.fits", key, parts)
+            exposure = self.reducer.fit_ramp(exposure, planes=True)
+        image = exposure.image
+        planes = exposure.planes
+        if self.reducer.references == "none" and not image.unit.is_equivalent(SURFACE_BRIGHTNESS):
+            self._write(rate, key, image, **planes)
+            return None, "rate", slopes_only
+        if image.unit.is_equivalent(RATE):
+            # there to stay where the brightness cannot be had
+            self._write(rate, key, image, **planes)
+        _, reduced, background = self.reducer.reduce(image)
+        planes = scaled_planes(planes, image, reduced)
+        path = self._write(cal, key, reduced, **planes, BKG=background.level)
+        return path, "reduced", ""
 
+    def _write(self, name, key, image, **planes):
+        def writer(path):
+            write_image(image, path, planes=planes, overwrite=True)
 
-def _mosaic(reducer, members, path, options, settings, resume):
-    """Make the mosaic of a filter: what was done, and what could not be."""
-    key = content_sha256([_VERSION, [key for _, key in members], repr(options), settings])
-    if _kept(path, key, resume):
-        return "kept", json.loads(read_images(path)[0].header["META"]).get("notes", [])
-    files = [read_images(cal)[0] for cal, _ in members]
-    images = [file.image for file in files]
-    mesh = {name: reducer.background.mesh[name] for name in ("box", "filter_size")}
-    levels = [known_background(file.planes["BKG"]) for file in files]
-    backgrounds = [dataclasses.replace(level, **mesh) for level in levels]
-    planes = [file.planes for file in files]
-    result = reducer.combine(images, backgrounds, planes=planes, **options)
-    result.mosaic.meta["key"] = key
-    result.write(path, overwrite=True)
-    return "reduced", list(result.notes)
+        return self.products.write(name, key, writer)
+
+    def combine(self, band, members, options, page):
+        """Combine the exposures of a filter, and put the mosaic on the page: its row."""
+        name = _mosaic_name(band)
+        row = {"file": name, "filter": band, "status": "failed", "reason": ""}
+        try:
+            path, row["status"], notes = self._mosaic(name, members, options)
+            row["reason"] = "; ".join(notes)
+            _show(page, path, members, notes)
+        except _ERRORS as err:
+            row |= {"status": "failed", "reason": _reason(err)}
+            log.warning("no mosaic of %s: %s", band, row["reason"])
+        return row
+
+    def _mosaic(self, name, members, options):
+        """Make the mosaic of a filter: its path, what was done, and what could not be."""
+        keys = [key for _, key in members]
+        key = content_sha256([_VERSION, keys, repr(options), self.settings])
+        if self._is_kept(name, key):
+            path = self.products.path(name)
+            meta = json.loads(read_images(path)[0].header["META"])
+            return path, "kept", meta.get("notes", [])
+        files = [read_images(cal)[0] for cal, _ in members]
+        images = [file.image for file in files]
+        mesh = {name: self.reducer.background.mesh[name] for name in ("box", "filter_size")}
+        levels = [known_background(file.planes["BKG"]) for file in files]
+        backgrounds = [dataclasses.replace(level, **mesh) for level in levels]
+        planes = [file.planes for file in files]
+        result = self.reducer.combine(images, backgrounds, planes=planes, **options)
+        path = self.products.write(name, key, lambda path: result.write(path, overwrite=True))
+        return path, "reduced", list(result.notes)
 
 
 def _show(page, path, members, notes):

@@ -24,7 +24,7 @@ from miricigale.instrument.image_files import json_meta
 from miricigale.reduction.files import PLANES, ImageFile, shared_meta
 from miricigale.reduction.images import flagged_image, plain_flags, plain_mask, sigma
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.files import write_fits
+from miricigale.utils.files import replacing, write_fits
 from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS
 
 
@@ -131,7 +131,9 @@ def write_image(image, path, *, planes=None, overwrite=False):
         )
         if name == "BKG":
             hdus[-1].header["BUNIT"] = unit
-    write_fits([*hdus, extension], path, overwrite=overwrite)
+    # a process that is killed leaves no half of a file
+    with replacing(path, overwrite=overwrite) as partial:
+        write_fits([*hdus, extension], partial)
     return path
 
 

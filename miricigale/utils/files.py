@@ -5,6 +5,7 @@ import functools
 import importlib
 import math
 import os
+import uuid
 import warnings
 import zipfile
 from pathlib import Path
@@ -23,6 +24,8 @@ _COMPRESS = b"\x1f\x9d"
 _CHUNK = 1 << 20
 # a file may unpack to so many times its size, however large it is
 _EXPANSION = 8
+#: How the names of unfinished files begin.
+PARTIAL = ".partial-"
 
 
 def cached_by_file(maxsize):
@@ -351,3 +354,39 @@ def unreadable(path, wanted, err):
         err = "it is a folder, wanted is a file" if Path(path).is_dir() else "no such file"
     lines = str(err).strip().splitlines() or [type(err).__name__]
     return DataError(f"{path} cannot be read as {wanted}: {lines[0]}")
+
+
+@contextlib.contextmanager
+def replacing(path, *, overwrite=True):
+    """
+    Write a file under a temporary name, and give it its own when it is whole.
+
+    Parameters
+    ----------
+    path : path-like
+        The file. Its folder exists.
+    overwrite : bool, optional
+        Whether a file that is there is replaced.
+
+    Yields
+    ------
+    partial : `pathlib.Path`
+        What to write, in the same folder and with the same suffix.
+
+    Raises
+    ------
+    OSError
+        If the file is there and ``overwrite`` is not set, or it cannot be written: then what stood
+        there before stays.
+    """
+    path = Path(path)
+    if not overwrite and path.exists():
+        msg = f"{path} already exists; overwrite=True replaces it"
+        raise OSError(msg)
+    partial = path.with_name(f"{PARTIAL}{os.getpid()}-{uuid.uuid4().hex[:8]}-{path.name}")
+    try:
+        with writing(path):
+            yield partial
+            os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)

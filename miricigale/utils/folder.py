@@ -8,17 +8,12 @@ from pathlib import Path, PurePosixPath
 
 from miricigale.utils.content import file_sha256
 from miricigale.utils.exceptions import DataError, data_error
-from miricigale.utils.files import writing
+from miricigale.utils.files import PARTIAL, replacing, writing
 from miricigale.utils.lock import FolderLock
-from miricigale.utils.store import PARTIAL, replacing
 
 log = logging.getLogger(__name__)
 
 MANIFEST = "manifest.json"
-#: The same text once more: the records outlive the loss of either file.
-SECOND_MANIFEST = ".manifest.copy.json"
-#: Records since the manifests were written, a line each: checksum, key and record as JSON.
-JOURNAL = ".manifest.journal"
 
 
 class FileFolder:
@@ -127,6 +122,8 @@ class RecordFolder(FileFolder):
     #: Whose folder it is, for messages; the name of its lock; and the name of the records in it.
     purpose = "run"
     inputs = ()
+    #: Name of the manifest without its ending.
+    manifest_name = MANIFEST.removesuffix(".json")
     lock_name = "run.lock"
     records_name = "records"
     #: What to do about a folder that cannot be used.
@@ -138,11 +135,21 @@ class RecordFolder(FileFolder):
         self._lock = FolderLock(self.folder, name=self.lock_name, purpose=self.purpose)
         self._load()
 
+    @property
+    def _manifests(self):
+        """Names of the two manifests, of the same text: the records outlive the loss of either file."""
+        return f"{self.manifest_name}.json", f".{self.manifest_name}.copy.json"
+
+    @property
+    def _journal(self):
+        """File of records since the manifests were written, a line each: checksum, key and record as JSON."""
+        return self.path(f".{self.manifest_name}.journal")
+
     def _load(self):
         self.facts, self.records = {}, {}
-        paths = [self.path(name) for name in (MANIFEST, SECOND_MANIFEST)]
+        paths = [self.path(name) for name in self._manifests]
         texts = [path.read_bytes() if path.is_file() else None for path in paths]
-        journal = self.path(JOURNAL)
+        journal = self._journal
         self.is_sound = texts[0] is not None and texts[0] == texts[1] and not journal.is_file()
         for path, text in zip(paths, texts, strict=True):
             if text is not None and self._read_manifest(path, text):
@@ -210,7 +217,7 @@ class RecordFolder(FileFolder):
         """Refuse a folder that is another's, or whose files cannot be identified any more."""
         if damaged:
             msg = (
-                f"neither {MANIFEST} nor {SECOND_MANIFEST} in {self.folder} can be read, so that "
+                f"neither {' nor '.join(self._manifests)} in {self.folder} can be read, so that "
                 f"none of its products can be used; remove the folder, or {self.remedy}"
             )
             raise DataError(msg)
@@ -220,7 +227,7 @@ class RecordFolder(FileFolder):
             not self.folder.is_dir()
             or any(not entry.name.startswith(ours) for entry in self.folder.iterdir())
         ):
-            if self.path(MANIFEST).is_file():
+            if self.path(self._manifests[0]).is_file():
                 # another process began between the two looks
                 self._load()
                 return
@@ -234,8 +241,7 @@ class RecordFolder(FileFolder):
         try:
             # another process may have changed it since it was looked at
             self._load()
-            for path in self.folder.rglob(f"{PARTIAL}*"):
-                # left over by a process that was killed
+            for path in self._unfinished():
                 path.unlink()
             if not self.is_sound:
                 # also in a new folder: from the first moment on it is taken
@@ -247,10 +253,14 @@ class RecordFolder(FileFolder):
 
     def __exit__(self, *exc):
         try:
-            if self.path(JOURNAL).is_file():
+            if self._journal.is_file():
                 self.write_manifest()
         finally:
             self._lock.__exit__(*exc)
+
+    def _unfinished(self):
+        """Paths of unfinished files that processes left over that were killed."""
+        return list(self.folder.rglob(f"{PARTIAL}*"))
 
     def is_whole(self, key):
         """Whether all files of a record stand with the right checksums."""
@@ -318,7 +328,7 @@ class RecordFolder(FileFolder):
 
     def _append(self, key, record):
         """Append a record to the journal, None for one that is removed."""
-        path = self.path(JOURNAL)
+        path = self._journal
         with writing(path), path.open("ab") as file:
             # the first line end closes a line that could not be written wholly
             file.write(f"\n{json.dumps([_checksum({key: record}), key, record])}\n".encode())
@@ -332,9 +342,9 @@ class RecordFolder(FileFolder):
         """Write both manifests, with what stands in the journal."""
         values = {**self.facts, self.records_name: dict(sorted(self.records.items()))}
         text = json.dumps({"sha256": _checksum(values), **values}, indent=1)
-        for name in (MANIFEST, SECOND_MANIFEST):
+        for name in self._manifests:
             self.save(name, lambda path: path.write_text(text, encoding="utf-8"))
-        self.path(JOURNAL).unlink(missing_ok=True)
+        self._journal.unlink(missing_ok=True)
 
 
 def _checksum(values):

@@ -9,7 +9,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from miricigale.utils.exceptions import DataError, data_error
-from miricigale.utils.store import replacing
+from miricigale.utils.files import replacing
 
 # a child that a killed process has just forked holds the lock until it runs; in seconds
 _PATIENCE = 0.3

@@ -13,11 +13,10 @@ from astropy.table import QTable
 
 from miricigale.utils.content import file_sha256
 from miricigale.utils.exceptions import DataError, data_error
-from miricigale.utils.files import open_fits, reading, unreadable
+from miricigale.utils.files import open_fits, reading, replacing, unreadable
 from miricigale.utils.meta import plain_value
 from miricigale.utils.optional import require
 from miricigale.utils.options import check_data
-from miricigale.utils.store import replacing
 from miricigale.utils.table_files import arrow_table, read_table
 from miricigale.utils.units import check_count
 

@@ -2,57 +2,16 @@
 
 import contextlib
 import json
-import os
-import uuid
-from pathlib import Path
 
 import numpy as np
 from astropy.io.fits import VerifyError
 
 from miricigale.utils.exceptions import data_error, file_errors
-from miricigale.utils.files import open_fits, write_fits, writing
+from miricigale.utils.files import open_fits, replacing, write_fits
 from miricigale.utils.meta import plain_value, undated
 from miricigale.utils.table_files import table_hdu
 
-#: How the names of unfinished files begin.
-PARTIAL = ".partial-"
 _TEXT = "TEXT"
-
-
-@contextlib.contextmanager
-def replacing(path, *, overwrite=True):
-    """
-    Write a file under a temporary name, and give it its own when it is whole.
-
-    Parameters
-    ----------
-    path : path-like
-        The file. Its folder exists.
-    overwrite : bool, optional
-        Whether a file that is there is replaced.
-
-    Yields
-    ------
-    partial : `pathlib.Path`
-        What to write, in the same folder and with the same suffix.
-
-    Raises
-    ------
-    OSError
-        If the file is there and ``overwrite`` is not set, or it cannot be written: then what stood
-        there before stays.
-    """
-    path = Path(path)
-    if not overwrite and path.exists():
-        msg = f"{path} already exists; overwrite=True replaces it"
-        raise OSError(msg)
-    partial = path.with_name(f"{PARTIAL}{os.getpid()}-{uuid.uuid4().hex[:8]}-{path.name}")
-    try:
-        with writing(path):
-            yield partial
-            os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def write_parts(path, layout, *, shown=None, text=None, arrays=None, tables=None, overwrite=False):

@@ -12,7 +12,7 @@ from astropy.table import Column, MaskedColumn, QTable
 from astropy.utils.exceptions import AstropyUserWarning
 
 from miricigale.utils.exceptions import DataError
-from miricigale.utils.files import open_fits, unpacked_size, unreadable, writing
+from miricigale.utils.files import open_fits, replacing, unpacked_size, unreadable
 from miricigale.utils.meta import fits_meta
 from miricigale.utils.optional import require
 from miricigale.utils.options import check_that
@@ -175,13 +175,13 @@ def write_table(table, path, *, overwrite=False):
     form = TABLE_FORMATS.get(Path(path.name.lower().removesuffix(".gz")).suffix)
     wanted = f"a file ending in one of {', '.join(TABLE_FORMATS)}"
     check_that(form is not None, "path", wanted, str(path))
-    with writing(path):
+    with replacing(path, overwrite=overwrite) as partial:
         if form == "fits":
             hdus = fits.HDUList([fits.PrimaryHDU(), table_hdu(table)])
-            hdus.writeto(path, overwrite=overwrite)
+            hdus.writeto(partial)
         else:
             plain = sky_as_angles(table) if form == "votable" else table
-            plain.write(path, overwrite=overwrite, format=form, **_OPTIONS.get(form, {}))
+            plain.write(partial, format=form, **_OPTIONS.get(form, {}))
 
 
 def table_hdu(table):

@@ -13,6 +13,10 @@ import typing
 from pathlib import Path
 
 from miricigale.utils.exceptions import ConfigError, config_error
+from miricigale.utils.outputs import FILE_NAME, is_file_name
+
+#: What the name of a folder must be, for messages.
+_FOLDER_NAME = f"must be the name of a folder in the current one: {FILE_NAME}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,6 +34,8 @@ class Limits:
         Whether one value may stand for a list of one.
     unique : bool, optional
         Whether a list may not have a value twice.
+    folder : bool, optional
+        Whether text is the name of a folder, which is made in the current one.
     """
 
     low: float | None = None
@@ -37,6 +43,7 @@ class Limits:
     choices: tuple = ()
     single: bool = False
     unique: bool = False
+    folder: bool = False
 
     def __str__(self):
         names = ", ".join(self.choices)
@@ -242,6 +249,7 @@ def _checked(name, value, hint, limits):
     if hint is str:
         good = not choices or value in choices
         require(good, *name, f"must be one of {list(choices)}", repr(value))
+        require(not limits.folder or is_file_name(value), *name, _FOLDER_NAME, repr(value))
         return value
     good = hint is not float or math.isfinite(value)
     require(good, *name, "must be a finite number", repr(value))

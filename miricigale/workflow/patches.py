@@ -18,16 +18,17 @@ from miricigale import photometry
 from miricigale.pages import Link, Page, SectionWriter
 from miricigale.photometry.arrays import pixel_scale
 from miricigale.photometry.file_inputs import Inputs
-from miricigale.photometry.from_files import check_output
+from miricigale.photometry.from_files import TABLE_KIND
 from miricigale.photometry.kernel_files import file_place
 from miricigale.photometry.patches import PatchGrid, join_patches, measure_patch, patch_parts
 from miricigale.photometry.priors import read_catalog
 from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.files import cached_by_file
+from miricigale.utils.files import cached_by_file, replacing
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_least
-from miricigale.utils.store import plain_value, replacing
+from miricigale.utils.outputs import check_output
+from miricigale.utils.store import plain_value
 from miricigale.utils.table_files import read_table, write_table
 from miricigale.utils.units import ANGLE, ab_magnitude, positive
 from miricigale.workflow.engine.runner import StudyRunner
@@ -52,7 +53,7 @@ class RunSection(RunBasics):
         Memory (GB) of patches side by side on a machine; 0 for half of all.
     """
 
-    name: str = "patches"
+    name: str = option("patches", folder=True)
     memory: float = option(0.0, low=0.0, high=1e5)
 
 
@@ -317,7 +318,7 @@ def measure_patches(
     # all patches have one PSF unless their stars are asked for
     named |= {"psf_stars": bool(inputs.psf_stars)}
     inputs = dataclasses.replace(inputs, kernels=tuple(map(_absolute, inputs.kernels)), **named)
-    check_output("output", output, overwrite, inputs.paths)
+    check_output(output, "output", overwrite=overwrite, inputs=inputs.paths, **TABLE_KIND)
     inputs.check()
     # refused here rather than in each patch
     inputs.photometers(n_threads)

@@ -26,7 +26,7 @@ class RunBasics(Section):
         Threads; 0 for as many as there are cores.
     """
 
-    name: str = "study"
+    name: str = option("study", folder=True)
     seed: int = option(20210211, low=0)
     threads: int = option(0, low=0, high=10000)
 

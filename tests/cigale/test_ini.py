@@ -369,6 +369,12 @@ def test_one_redshift_and_a_distance_of_its_own(run, tmp_path):
     near = type(results).read(tmp_path / "fit.fits")[0]
     assert_allclose(near.best_sed(results.model).fnu, results[1].best_sed().fnu, rtol=1e-6)
     paths = write_best_models(results, tmp_path / "best")
+    # files that stand are replaced only if asked, and no id is a file elsewhere
+    refuses("already exists", write_best_models, results, tmp_path / "best", error=OSError)
+    text = "'output' must be a new file"
+    refuses(text, fit_cigale, "absent.ini", output=tmp_path / "results.fits", error=ValueError)
+    evil = dataclasses.replace(results, ids=np.array(["../evil", "b"]))
+    refuses("of ids that name files .* got '../evil'", write_best_models, evil, tmp_path / "best")
     assert_allclose(*(Table.read(path)["Fnu"] for path in paths), rtol=1e-6)
     # at another redshift the object is at the distance of that
     there = near.best_sed(results.model, redshift=0.4)

@@ -254,6 +254,20 @@ def test_the_command_writes_a_page(tmp_path, capsys):
     assert set(table["plan"]) == {EXISTING, "all", "f770w"}
     assert len(QTable.read(folder / "sources-1.ecsv")) == 30
     assert load_plan(folder / "plan.toml").sample.n_sources == 30
+    # a second plan does not replace the first one, and never the file that it was made from
+    page = (folder / "plan.html").read_bytes()
+    arguments = ("plan", "--sources", "20", "-o", folder)
+    told = command(capsys, *arguments, status=2).err
+    assert (
+        "'folder' must be a folder without files of the same names (or 'overwrite' given)" in told
+    )
+    assert "plan.html, plan.toml, comparison.ecsv, areas.ecsv, bands-1.ecsv" in told
+    assert (folder / "plan.html").read_bytes() == page
+    text = path.read_bytes()
+    arguments = ("plan", "--config", path, "-o", tmp_path, "--overwrite")
+    told = command(capsys, *arguments, status=2).err
+    assert "'output' must be another file than those that are read" in told
+    assert path.read_bytes() == text
 
 
 @pytest.mark.parametrize(("arguments", "message"), cases_of(__file__, "refused"))

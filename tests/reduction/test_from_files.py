@@ -133,9 +133,9 @@ def test_wrong_arguments_are_named(files, tmp_path, capsys):
 def test_products_never_replace_what_they_are_made_of(files, tmp_path):
     path = tmp_path / "a_rate.fits"
     path.write_bytes(files[1].read_bytes())
-    table = reduce_files([path], tmp_path)
-    assert table["status"][0] == "failed"
-    assert "'folder' must be another one than that of the files" in table["reason"][0]
+    for overwrite in (False, True):
+        with pytest.raises(ValueError, match="'folder' must be another one than that of the files"):
+            reduce_files([path], tmp_path, overwrite=overwrite)
     assert path.read_bytes() == files[1].read_bytes()
 
 

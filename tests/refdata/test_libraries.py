@@ -32,7 +32,7 @@ from miricigale.refdata.libraries import (
 )
 from miricigale.refdata.lookup import file_sha256, fingerprint, record_path, stored_record
 from miricigale.utils.exceptions import DataError
-from miricigale.utils.store import PARTIAL
+from miricigale.utils.files import PARTIAL
 
 NAME = "test.library"
 AXES = {"tau": [3.0, 3.0, 7.0, 7.0], "q": [0.0, 0.97, 0.0, 0.97]}

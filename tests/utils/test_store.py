@@ -8,7 +8,8 @@ from astropy.table import QTable
 
 from helpers.errors import refuses
 from miricigale.utils.exceptions import DataError
-from miricigale.utils.store import open_parts, replacing, write_parts
+from miricigale.utils.files import replacing
+from miricigale.utils.store import open_parts, write_parts
 from miricigale.utils.unified import read_write, register
 
 

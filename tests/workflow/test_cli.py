@@ -186,6 +186,13 @@ def test_products_are_shown_cited_and_have_psfs(capsys, tmp_path, monkeypatch):
         assert f"{name}: " in text
         assert words in text
         assert Path(f"{name}.png").exists() == (name != "t.ecsv")
+    # a picture that is there stays
+    Path("mine.png").write_text("mine")
+    told = command(capsys, "show", "mosaic.fits", "--picture", "mine.png", status=2).err
+    assert "'picture' must be a new file (or 'overwrite' given)" in told
+    assert Path("mine.png").read_text() == "mine"
+    command(capsys, "show", "mosaic.fits", "--picture", "mine.png", "--overwrite")
+    assert Path("mine.png").read_bytes().startswith(b"\x89PNG")
     assert command(capsys, "cite", "t.ecsv").out == "Nobody 2030\n"
     assert "ApJ 908, 144" in command(capsys, "cite").out
     command(capsys, "psf", "mosaic.fits", "-o", "psf.fits")

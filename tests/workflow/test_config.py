@@ -98,6 +98,25 @@ def test_missing_files_and_presets_are_named(tmp_path):
     refuses(r"binary\.toml is not a text file in UTF-8", load_config, binary, error=ConfigError)
 
 
+@pytest.mark.parametrize(
+    "name",
+    [
+        "", ".", "..", "../evil", "/tmp/evil", "a/b", "a\\b", "c:evil", ".hidden", " a", "a ", "a\nb", "a\x00b",
+        "\x1b[0m", "a" * 300,
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("kind", [(StudyConfig, "run"), (PlanConfig, "plan")])
+def test_names_are_folders_in_the_current_one(kind, name):
+    config, section = kind
+    text = rf"\[{section}\] name must be the name of a folder in the current one"
+    refuses(text, config.from_dict, {section: {"name": name}}, error=ConfigError)
+
+
+@pytest.mark.parametrize("name", ["my study", "été-2", "v1.2", "$x_1$"])
+def test_other_names_are_taken_as_they_are(name):
+    assert PlanConfig.from_dict({"plan": {"name": name}}).plan.name == name
+
+
 @pytest.mark.parametrize("config", [StudyConfig(), PlanConfig()], ids=["study", "plan"])
 def test_every_key_is_explained_and_nothing_else(config):
     for section in vars(config).values():

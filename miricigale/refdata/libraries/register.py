@@ -15,9 +15,9 @@ from miricigale.refdata.libraries.table import LibraryTable, verify_library, wri
 from miricigale.refdata.lookup import data_folder, file_sha256, record_path, stored_record
 from miricigale.refdata.registry import resource
 from miricigale.utils.exceptions import DataError, data_error
+from miricigale.utils.files import PARTIAL, replacing
 from miricigale.utils.options import check_names
 from miricigale.utils.progress import progress
-from miricigale.utils.store import PARTIAL, replacing
 
 #: What reads the distributed files of a library: a function, or ``"module:function"``,
 #: imported on first use; called with a `~pathlib.Path`, it gives a `LibraryTable`.
