@@ -428,8 +428,10 @@ class LeaveOutResult:
 
     def plot(self, band=None, ax=None, **kwargs):
         """Draw the distribution of the pulls of one band, or of all; returns the axes."""
+        from miricigale.plotting.axes import plain_text
         from miricigale.plotting.posteriors import plot_pulls
 
         check_names(() if band is None else [band], "band that was left out", self.bands)
         pull = self.pull if band is None else self.pull[:, self.bands.index(band)]
-        return plot_pulls(pull.ravel(), ax=ax, **{"label": band, **kwargs})
+        label = None if band is None else plain_text(band)
+        return plot_pulls(pull.ravel(), ax=ax, **{"label": label, **kwargs})

@@ -101,6 +101,7 @@ def plot_sed(results, ax=None, *, model=None, filters=None, **kwargs):
     axes : `~matplotlib.axes.Axes` or pair of them
     """
     from miricigale.filters import FilterSet
+    from miricigale.plotting.axes import plain_text
     from miricigale.plotting.posteriors import plot_sed_fit
 
     results._one("plot_sed")
@@ -112,7 +113,7 @@ def plot_sed(results, ax=None, *, model=None, filters=None, **kwargs):
     used = np.isfinite(results.sigma)
     if results.outlier is not None and np.any(results.outlier > 0.5):
         kwargs.setdefault("groups", np.where(results.outlier > 0.5, "looks wrong", "fluxes"))
-    text = f"{results.ids}: z = {results.best['redshift'].value:.3f}"
+    text = f"{plain_text(results.ids)}: z = {results.best['redshift'].value:.3f}"
     kwargs.setdefault("title", f"{text}, chi2 = {results.chi2:.1f} in {results.n_bands} bands")
     return plot_sed_fit(
         u.Quantity(filters.pivots)[order],
@@ -129,10 +130,11 @@ def plot_sed(results, ax=None, *, model=None, filters=None, **kwargs):
 
 def plot_pdf(results, name, ax=None, **kwargs):
     """Draw the posterior of a parameter or derived quantity of a single object."""
+    from miricigale.plotting.axes import plain_text
     from miricigale.plotting.posteriors import plot_pdf
 
     edges, weights = results._one("plot_pdf").distribution(name)
-    kwargs.setdefault("label", name)
+    kwargs.setdefault("label", plain_text(name))
     if results.extensive(name):
         kwargs.setdefault("log", bool(edges.value[0] > 0))
     return plot_pdf(edges, weights, ax=ax, **kwargs)
@@ -152,5 +154,7 @@ def plot_pdf2d(results, x="redshift", y="frac_agn", ax=None, **kwargs):
 
 def labeled(name, unit):
     """Label of an axis of a plot: a name and its unit."""
+    from miricigale.plotting.axes import plain_text
+
     text = unit.to_string()
-    return f"{name} ({text})" if text else name
+    return plain_text(f"{name} ({text})" if text else name)

@@ -15,7 +15,7 @@ from miricigale.fitting.from_files import open_catalog
 from miricigale.fitting.likelihood import unused_bands
 from miricigale.fitting.page_numbers import fit_numbers, known_redshifts
 from miricigale.pages import Page, SectionWriter
-from miricigale.plotting.axes import WIDTH, new_figure
+from miricigale.plotting.axes import WIDTH, new_figure, plain_text
 from miricigale.plotting.comparison import plot_redshifts
 from miricigale.utils.declared import declared
 
@@ -140,7 +140,7 @@ def _draw_counts(ax, xlabel, bins, samples):
     """Draw histograms of samples by label, the first filled, the others as outlines."""
     for k, (label, values) in enumerate(samples.items()):
         style = {"histtype": "step", "color": _COLOR} if k else {"color": "0.75"}
-        ax.hist(values, bins, label=label, **style)
+        ax.hist(values, bins, label=plain_text(label), **style)
     if len(samples) > 1:
         ax.legend(frameon=False, fontsize=8)
     ax.set(xlabel=xlabel, ylabel="objects")
@@ -159,7 +159,7 @@ def _redshifts(page, found):
         page.items(metrics | {"n": len(z), "inside": np.mean((low <= z) & (z <= high))}, name=name)
         step = _step(len(z))
         plot_redshifts(z[::step], middle[::step], ax=axes[0, 0])
-        axes[0, 0].set(xlabel=name, ylabel="fitted redshift (median)")
+        axes[0, 0].set(xlabel=plain_text(name), ylabel="fitted redshift (median)")
         samples[name] = z
     bins = np.histogram_bin_edges(np.concatenate(list(samples.values())), 40)
     _draw_counts(axes[0, -1], "redshift", bins, samples)
@@ -207,7 +207,7 @@ def _goodness(page, found):
         row |= {"low": low, "middle": middle, "high": high}
         rows.append(row | {"pull": _median(pull), "beyond": _mean(np.abs(pull) > 3)})
     of_bands.axhline(1.0, color="0.6", lw=0.8)
-    names = [row["band"] for row in rows]
+    names = [plain_text(row["band"]) for row in rows]
     of_bands.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
     of_bands.set(ylabel="flux over that of the best model", ylim=(0.4, 1.8))
     page.figure("figure", figure, few=_FEW)
@@ -255,7 +255,7 @@ def _examples(page, results, found, step):
     for ax, (_, what), one in zip(axes.ravel(), chosen, picked, strict=False):
         one.plot_sed(ax, filters=filters)
         z = "" if found.meta["fixed"] else f"z = {one.best['redshift'].value:.2f}, "
-        title = f"{np.asarray(one.ids).item()}: {z}reduced chi2 {one.reduced_chi2:.2f} ({what})"
+        title = f"{plain_text(one.ids)}: {z}reduced chi2 {one.reduced_chi2:.2f} ({what})"
         ax.set_title(title, fontsize="small")
     for ax in axes.ravel()[len(chosen) :]:
         ax.remove()

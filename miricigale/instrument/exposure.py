@@ -286,9 +286,10 @@ class Exposure(Interactive):
         ValueError
             If the exposure has no filter or no pointing.
         """
+        from miricigale.plotting.axes import plain_text
         from miricigale.plotting.images import plot_footprint
 
-        corners, label = self.footprint, f"{self.filter}, dither {self.dither}"
+        corners, label = self.footprint, f"{plain_text(self.filter)}, dither {self.dither}"
         options = {"label": label} | kwargs
         return plot_footprint(corners.ra.deg, corners.dec.deg, ax=ax, **options)
 

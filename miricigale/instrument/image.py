@@ -53,9 +53,10 @@ class Image(Interactive, CCDData):
         -------
         ax : `~matplotlib.axes.Axes`
         """
+        from miricigale.plotting.axes import plain_text
         from miricigale.plotting.scene import plot_scene
 
-        label = f"{self.meta.get('filter') or ''} ({self.unit})".strip()
+        label = f"{plain_text(self.meta.get('filter') or '')} ({self.unit})".strip()
         return plot_scene(self.data, ax=ax, label=label, **kwargs)
 
     def to_hdu(self, *args, **kwargs):

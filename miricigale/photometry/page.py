@@ -16,7 +16,7 @@ from miricigale.photometry import ForcedFlags
 from miricigale.photometry.arrays import pixel_scale
 from miricigale.photometry.browser import write_browser
 from miricigale.photometry.forced import ForcedPhotometer
-from miricigale.plotting.axes import new_figure
+from miricigale.plotting.axes import new_figure, plain_text
 from miricigale.plotting.images import plot_image, plot_model_residual, plot_segmentation
 from miricigale.plotting.posteriors import plot_pulls
 from miricigale.psf.star_fit import TERMS
@@ -209,7 +209,7 @@ def _zoom(result, highres, segments, k):
 
 
 def _magnitudes(one, confidence):
-    result, xlabel = one.result, f"{one.name} (AB)"
+    result, xlabel = one.result, f"{plain_text(one.name)} (AB)"
     figure, [[left, right]] = new_figure(1, 2, size=(5.2, 3.6))
     detected = result.snr > _DETECTED
     mag, limit = ab_magnitude(result.flux), ab_magnitude(result.upper_limit(confidence))

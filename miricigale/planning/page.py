@@ -7,7 +7,7 @@ import numpy as np
 
 from miricigale.pages import Page, SectionWriter, number, sentence
 from miricigale.planning.exposures import background_options
-from miricigale.plotting.axes import MEASURED, SECOND, TRUE, legend, new_figure
+from miricigale.plotting.axes import MEASURED, SECOND, TRUE, legend, new_figure, plain_text
 from miricigale.utils.declared import declared
 from miricigale.workflow.background import background_text
 from miricigale.workflow.page.study_figures import redshift_figure
@@ -162,7 +162,7 @@ def _fraction_figure(fits, limit):
         low, middle, high = np.transpose(levels)
         place = place + 0.015 * (k - (len(fits) - 1) / 2)
         spread = (middle - low, high - middle)
-        ax.errorbar(place, middle, spread, fmt="o", color=color, capsize=2, label=name)
+        ax.errorbar(place, middle, spread, fmt="o", color=color, capsize=2, label=plain_text(name))
     ax.plot([0, 1], [0, 1], color=TRUE, lw=1)
     ax.axvline(limit, color=TRUE, lw=0.8, ls="--")
     ax.set(xlabel="true fracAGN", ylabel="posterior mean", xlim=(-0.05, 1.05), ylim=(-0.03, 1.03))

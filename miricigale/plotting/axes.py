@@ -48,7 +48,7 @@ def panels(labels, *, height=2.7, **share):
     Parameters
     ----------
     labels : iterable of str
-        Titles of the panels.
+        Titles of the panels, shown as they are (`plain_text`).
     height : float, optional
         Inches of a row.
     **share
@@ -68,8 +68,33 @@ def panels(labels, *, height=2.7, **share):
         ax.remove()
     out = dict(zip(labels, axes.ravel(), strict=False))
     for label, ax in out.items():
-        ax.set_title(label, fontsize="medium")
+        ax.set_title(plain_text(label), fontsize="medium")
     return figure, out
+
+
+def plain_text(text):
+    r"""
+    Escape text that users bring, such as ids and names, for titles, labels and legends.
+
+    Matplotlib reads what stands between two ``$`` as a formula, and raises an error where it is none.
+
+    Parameters
+    ----------
+    text : object
+        Shown as ``str`` has it.
+
+    Returns
+    -------
+    text : str
+        The same with ``\$`` for each ``$``, which matplotlib draws as ``$``.
+
+    Examples
+    --------
+    >>> from miricigale.plotting.axes import plain_text
+    >>> print(plain_text("$a$ 5"))
+    \$a\$ 5
+    """
+    return str(text).replace("$", r"\$")
 
 
 def label_outer(axes, xlabel=None, ylabel=None):

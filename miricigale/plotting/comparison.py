@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from miricigale.plotting.axes import MEASURED, SECOND, TRUE, legend, resolve_axes
+from miricigale.plotting.axes import MEASURED, SECOND, TRUE, legend, plain_text, resolve_axes
 
 #: dz / (1 + z) beyond which a redshift is an outlier.
 _OUTLIER = 0.15
@@ -71,7 +71,7 @@ def plot_error_function(flux, sigma, *, limits=None, ax=None, colors=None):
     for k, name in enumerate(flux):
         # neighbors differ in more than a shade
         style = {"color": (colors or {}).get(name), "ls": ("-", "--")[k % 2]}
-        (line,) = ax.loglog(flux[name], sigma[name], lw=1.6, label=name, **style)
+        (line,) = ax.loglog(flux[name], sigma[name], lw=1.6, label=plain_text(name), **style)
         limit = (limits or {}).get(name, np.nan)
         if np.isfinite(limit):
             ax.plot(limit, limit / 5, "o", color=line.get_color(), ms=5)

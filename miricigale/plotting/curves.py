@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from miricigale.plotting.axes import legend, resolve_axes
+from miricigale.plotting.axes import legend, plain_text, resolve_axes
 
 
 def plot_filters(curves, ax=None, **kwargs):
@@ -24,7 +24,7 @@ def plot_filters(curves, ax=None, **kwargs):
     """
     ax, curves = resolve_axes(ax), list(curves)
     for wave, throughput, name in curves:
-        ax.plot(wave, throughput, **{"label": name, **kwargs})
+        ax.plot(wave, throughput, **{"label": plain_text(name), **kwargs})
     ax.set(xlabel="wavelength (µm)", ylabel="throughput")
     if len(curves) > 1:
         legend(ax)

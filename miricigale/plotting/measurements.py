@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from miricigale.plotting.axes import MEASURED, resolve_axes
+from miricigale.plotting.axes import MEASURED, plain_text, resolve_axes
 
 
 def plot_energies(radius, curves, *, ax=None, **kwargs):
@@ -27,7 +27,7 @@ def plot_energies(radius, curves, *, ax=None, **kwargs):
     ax = resolve_axes(ax)
     for k, (name, values) in enumerate(curves.items()):
         # every third one is dashed: it may lie on the one before
-        style = {"label": name, "ls": ("-", "-", "--")[k % 3], "lw": 1.4}
+        style = {"label": plain_text(name), "ls": ("-", "-", "--")[k % 3], "lw": 1.4}
         ax.plot(radius, values, **style | kwargs)
     ax.set(xlabel="radius [arcsec]", ylabel="encircled energy", ylim=(0, None))
     ax.legend(frameon=False)

@@ -146,9 +146,10 @@ class InstrumentPSF(ImagePSF):
         -------
         ax : `~matplotlib.axes.Axes`
         """
+        from miricigale.plotting.axes import plain_text
         from miricigale.plotting.scene import plot_scene
 
-        return plot_scene(self.data, ax=ax, label=self.filter or "PSF", **kwargs)
+        return plot_scene(self.data, ax=ax, label=plain_text(self.filter or "PSF"), **kwargs)
 
     @property
     def facts(self):

@@ -11,7 +11,7 @@ from astropy.table import Table
 from miricigale.detector import Ramp
 from miricigale.instrument import ImageFacts
 from miricigale.pages import Page, SectionWriter
-from miricigale.plotting.axes import WIDTH, new_figure
+from miricigale.plotting.axes import WIDTH, new_figure, plain_text
 from miricigale.plotting.images import plot_image
 from miricigale.reduction import Reducer, ReferenceFiles, read_images, write_image
 from miricigale.reduction.background import known_background
@@ -308,7 +308,9 @@ def _show(page, path, members, notes):
     _, axes = new_figure(1, 2, size=(WIDTH / 2, max(2.5, min(6.0, WIDTH / 2 * ny / nx))))
     scale = meta["pixel_scale"]
     data = np.where(image.mask, np.nan, image.data)
-    plot_image(data, ax=axes[0, 0], pixel_scale=scale, colorbar="MJy/sr", title=path.name)
+    plot_image(
+        data, ax=axes[0, 0], pixel_scale=scale, colorbar="MJy/sr", title=plain_text(path.name)
+    )
     options = {"stretch": "linear", "limits": (0, len(members)), "colorbar": "exposures"}
     count = np.squeeze(file.planes["CON"]).astype(float)
     title = "exposures of each pixel"

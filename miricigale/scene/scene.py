@@ -405,6 +405,7 @@ class Scene(Interactive):
         -------
         ax : `~matplotlib.axes.Axes`
         """
+        from miricigale.plotting.axes import plain_text
         from miricigale.plotting.scene import plot_scene
 
         truth = self._painted[1]
@@ -412,7 +413,7 @@ class Scene(Interactive):
         if sources:
             shown = (truth["flags"] & int(SceneFlags.OUTSIDE_IMAGE)) == 0
             marks = truth["x"][shown], truth["y"][shown]
-        label = f"{self._filter} (MJy / sr)"
+        label = f"{plain_text(self._filter)} (MJy / sr)"
         image = self.render().data
         if self._background is not None and not background:
             image = image - self._background.image(self._wcs, self._shape)

@@ -18,7 +18,7 @@ from miricigale.plotting.axes import (
 )
 from miricigale.plotting.comparison import plot_error_function, plot_offsets, plot_relation
 from miricigale.utils.units import ab_magnitude
-from miricigale.workflow.page.labels import band_label, by_wavelength
+from miricigale.workflow.page.labels import band_label, band_title, by_wavelength
 from miricigale.workflow.stages.conditions import has_flag
 
 #: Panels of one range.
@@ -38,7 +38,7 @@ def magnitude_figure(table, bands):
         lost = true[name][np.isfinite(true[name]) & ~(measured[name] < high)]
         at_bottom = {"transform": ax.get_xaxis_transform()}
         ax.plot(lost, np.full(len(lost), 0.02), "|", color=TRUE, ms=6, **at_bottom)
-        ax.set_title(band_label(name))
+        ax.set_title(band_title(name))
     low = known.min(initial=high)
     bright = np.nanmin(np.concatenate([*measured.values(), [low]]))
     ax.set(xlim=(low - 0.4, high - 1.1), ylim=(high, min(low, bright) - 0.4))
@@ -59,7 +59,7 @@ def offset_figure(table, bands, limits, marks=()):
         offset = measured - true
         good = np.isfinite(offset)
         running = running_median(true[good], offset[good], size=20)
-        plot_offsets(true[good], offset[good], running=running, ax=ax, title=band_label(name))
+        plot_offsets(true[good], offset[good], running=running, ax=ax, title=band_title(name))
         style = {"ms": 5, "mfc": "none", "mec": "0.35", "mew": 0.7}
         for bit, marker, label in marks:
             rows = good & has_flag(table, f"{name}_condition", bit) & (np.abs(offset) <= 1)
@@ -122,7 +122,7 @@ def limit_figure(entries):
     shown = np.concatenate([v[np.isfinite(v)] for v in values.values()])
     low, high = (shown.min(), shown.max()) if shown.size else (20, 26)
     for x, name in zip(wave, bands, strict=True):
-        ax.text(x, high + 0.35, band_label(name), ha="center", va="bottom", fontsize=8, rotation=30)
+        ax.text(x, high + 0.35, band_title(name), ha="center", va="bottom", fontsize=8, rotation=30)
     ax.set(xlim=(wave.min() - 1.5, wave.max() + 1.5), xlabel="wavelength (µm)")
     ax.set(ylim=(low - 0.6, high + 1.3), ylabel="5-sigma limit (AB)")
     legend(ax, loc="lower left")
@@ -146,7 +146,7 @@ def variant_figure(numbers, labels):
         ax.errorbar(place, offsets, errors, fmt="o", ms=5, capsize=2, label=label)
     ax.axhline(0, color="0.6", lw=1, zorder=0)
     ax.set(xlim=(-0.6, len(bands) - 0.4), ylabel="limit minus calculator (mag)")
-    ax.set_xticks(range(len(bands)), [band_label(name) for name in bands])
+    ax.set_xticks(range(len(bands)), [band_title(name) for name in bands])
     # space for the legend
     low, high = ax.get_ylim()
     ax.set_ylim(low - 0.35 * (high - low), high)
@@ -171,7 +171,7 @@ def point_figure(points, bands):
             ax.plot([k - 0.35, k + 0.35], [np.nanmedian(ratio)] * 2, color=SECOND, lw=2)
     ax.axhline(1, color="0.4", lw=1)
     ax.axhspan(0.97, 1.03, color="0.9", zorder=0)
-    ax.set_xticks(range(len(bands)), [band_label(name) for name in bands])
+    ax.set_xticks(range(len(bands)), [band_title(name) for name in bands])
     ax.set(xlim=(-0.6, len(bands) - 0.4), ylim=(1 - reach, 1 + reach))
     ax.set_ylabel("measured / true flux")
     return figure
@@ -260,6 +260,6 @@ def counts_figure(galaxies, bands, area):
         good = counts > 0
         middle = 0.5 * (edges[1:] + edges[:-1])[good]
         ax.errorbar(middle, counts[good], error[good], fmt="o", ms=4, color=MEASURED, lw=1)
-        ax.set(yscale="log", title=band_label(name))
+        ax.set(yscale="log", title=band_title(name))
     label_outer(axes, "magnitude (AB)", r"N (deg$^{-2}$ mag$^{-1}$)")
     return figure

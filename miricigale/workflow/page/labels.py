@@ -4,7 +4,7 @@ from urllib.parse import quote, urlencode
 
 from miricigale.filters import Filter
 from miricigale.pages import Link
-from miricigale.plotting.axes import MEASURED, SECOND
+from miricigale.plotting.axes import MEASURED, SECOND, plain_text
 from miricigale.utils.declared import declared
 from miricigale.workflow.truths import CATALOG
 
@@ -23,6 +23,11 @@ SET_COLORS = {"all": MEASURED, "none": SECOND, "blue": "#0d9488", "red": "#a21ca
 def band_label(name):
     """Return what a band is called on the page: ``F770W`` for ``miri.f770w``."""
     return name.rpartition(".")[2].upper()
+
+
+def band_title(name):
+    """Return what a band is called in figures: `band_label`, shown as it is by matplotlib."""
+    return plain_text(band_label(name))
 
 
 def class_label(name):

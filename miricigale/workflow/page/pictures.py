@@ -12,7 +12,7 @@ from miricigale.plotting.axes import MEASURED, SECOND, TRUE, WIDTH, legend, new_
 from miricigale.plotting.images import filled, mark_sky, plot_color, plot_image, plot_model_residual
 from miricigale.psf import encircled_energy, radius_of_encircled_energy
 from miricigale.psf.wiener import energy_error
-from miricigale.workflow.page.labels import band_label
+from miricigale.workflow.page.labels import band_title
 
 #: Error of the encircled energy (%) that counts as small.
 _SMALL_ERROR = 4
@@ -75,7 +75,7 @@ def field_figure(images, prior, names):
     from matplotlib.figure import Figure
     from matplotlib.patches import Rectangle
 
-    planes, labels = [filled(image) for image in images], [band_label(name) for name in names]
+    planes, labels = [filled(image) for image in images], [band_title(name) for name in names]
     rows, columns = _used(planes)
     planes = [plane[rows, columns] for plane in planes]
     (height, width), scale = planes[0].shape, _scale(images[0])
@@ -154,7 +154,7 @@ def residual_figure(images, names, *, size=220):
         plot_model_residual(image, model, ax=axes[row], **options)
         for ax in axes[row]:
             mark_sky(ax, 5 if size else 20, **_directions(pair[0]))
-        axes[row, 0].set_ylabel(band_label(name))
+        axes[row, 0].set_ylabel(band_title(name))
     return figure
 
 
@@ -227,7 +227,7 @@ def convolution_figure(kernels):
         before = 100 * energy_error(kernel.source, kernel.target, pixels)
         after = 100 * kernel.encircled_energy_error(radius * u.arcsec)
         style = {"color": colormaps["viridis"](steps[k]), "ls": ("-", "--")[k % 2], "lw": 1.6}
-        left.plot(radius, before, label=band_label(name), **style)
+        left.plot(radius, before, label=band_title(name), **style)
         right.plot(radius, after, **style)
         most = max(most, np.nanmax(np.abs(after)))
     for ax, when in ((left, "before"), (right, "after")):
@@ -256,7 +256,7 @@ def energy_figure(mosaics, points, psfs):
         own = encircled_energy(psfs[name], radius, pixel_scale=scale * u.arcsec)
         data = filled(image)
         data, size = _binned(data[_used([data])], scale)
-        plot_image(data, ax=row[0], pixel_scale=size, title=band_label(name))
+        plot_image(data, ax=row[0], pixel_scale=size, title=band_title(name))
         mark_sky(row[0], 20, **_directions(image))
         factor, x = table.meta["f_scaling"], radius.value
         for label, values, color in (

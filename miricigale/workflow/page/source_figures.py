@@ -5,7 +5,7 @@ import numpy as np
 
 from miricigale.evaluation import PAH_FEATURES
 from miricigale.filters import Filter
-from miricigale.plotting.axes import MEASURED, SECOND, TRUE, WIDTH, legend, new_figure
+from miricigale.plotting.axes import MEASURED, SECOND, TRUE, WIDTH, legend, new_figure, plain_text
 from miricigale.plotting.curves import plot_filters, plot_spectrum
 from miricigale.plotting.posteriors import plot_pdf_2d
 from miricigale.utils.units import FNU
@@ -129,7 +129,8 @@ def _draw_fit(ax, best, without, row, model):
         model=model,
         parts=parts,
         groups=["MIRI" if n.startswith("miri.") else "existing bands" for n in best.filters],
-        title=f"source {row['id']}: injected z = {row['redshift']:.3f}, fracAGN = {row['frac_agn']:.2g}; "
+        title=f"source {plain_text(row['id'])}: injected z = {row['redshift']:.3f}, "
+        f"fracAGN = {row['frac_agn']:.2g}; "
         f"best model with MIRI: z = {redshift:.3f}, fracAGN = {fraction:g}, "
         f"chi2 = {best.chi2:.1f} in {best.n_bands} bands",
     )

@@ -28,12 +28,13 @@ from miricigale.plotting.axes import (
     legend,
     new_figure,
     panels,
+    plain_text,
 )
 from miricigale.plotting.comparison import plot_offsets, plot_redshifts
 from miricigale.utils.units import ab_magnitude
 from miricigale.workflow.page.labels import (
     SET_LABELS,
-    band_label,
+    band_title,
     class_label,
     parameter_label,
     truth_label,
@@ -148,7 +149,7 @@ def redshift_figure(fits):
     for title, ax in axes.items():
         true, table = fits[title]
         plot_redshifts(true, table["redshift_mean"], z_err=table["redshift_std"], ax=ax)
-        ax.set_title(title)
+        ax.set_title(plain_text(title))
     label_outer(axes)
     return figure
 
@@ -272,7 +273,7 @@ def shape_figure(study):
         bright = one.field & one.is_bright(band) & np.isfinite(mag) & np.isfinite(error)
         for shape, rows in one.shapes.items():
             rows = bright & rows
-            title = f"{band_label(band)}, {labels[shape]} ({np.count_nonzero(rows)})"
+            title = f"{band_title(band)}, {labels[shape]} ({np.count_nonzero(rows)})"
             groups[title] = (mag[rows], error[rows], one.crowded[band][rows])
     figure, axes = panels(groups, height=3.1, sharex=True, sharey=True)
     for title, ax in axes.items():
@@ -343,7 +344,7 @@ def residual_figure(redshift, residuals):
         own, good = Filter.from_name(band), np.isfinite(redshift) & np.isfinite(residuals[band])
         z, residual = redshift[good], residuals[band][good]
         plot_offsets(z, residual, ax=ax, limit=0.6)
-        ax.set_title(band_label(band), fontsize="medium")
+        ax.set_title(band_title(band), fontsize="medium")
         for rest, color in zip(FEATURES, (SECOND, "#15803d"), strict=True):
             low, high = feature_redshifts(rest, own.pivot, own.width)
             if high > low:
