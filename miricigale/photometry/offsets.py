@@ -254,6 +254,8 @@ def settled(fit, bank, catalog):
         fit.shift, fit.offset_map, fit.own = first.shift, first.offset_map, own
         if change < _DONE:
             break
+    if fit is not first and first.shift is not None:
+        fit.include_shift(first.shift)
     return fit
 
 

@@ -11,7 +11,7 @@ from astropy.table import QTable
 
 from miricigale.instrument.image import Image
 from miricigale.photometry.diagnostics import source_flags
-from miricigale.photometry.fields import SmoothField, n_terms
+from miricigale.photometry.fields import SmoothField
 from miricigale.photometry.fit_errors import fit_covariances
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.residual_sources import unexplained_neighbors
@@ -129,7 +129,7 @@ def _registration(fit, diagnostics, common, n_bright):
     is a warning of what a fitted shift would have mended, if sources are bright.
     """
     if fit.shift is not None:
-        return _offset_meta(fit.shift, np.sqrt(np.diag(common))[-2:] * fit.scale)
+        return _offset_meta(fit.shift, _common_errors(fit, common, "shift") * fit.scale)
     if fit.offset_map is not None:
         table = fit.offset_map.sources[fit.offset_map.sources["used"]]
         values = np.stack([table["dx"].value, table["dy"].value])
@@ -218,19 +218,25 @@ def _new_sources(catalog, xy, wcs, columns):
 
 def _common(fit, covariance):
     """Parameters of the whole image with their errors."""
-    found, errors = {}, np.sqrt(np.diag(covariance)) if len(covariance) else np.empty(0)
+    found = {}
     order, shape = fit.settings.background_order, fit.arrays.flux.shape
     if order is not None and fit.fit is not None:
-        terms = fit.common[: n_terms(order)]
+        terms = fit.common[fit.places["background"]]
+        errors = _common_errors(fit, covariance, "background")
         found["background"] = terms[0] * SURFACE_BRIGHTNESS
         found["background_err"] = errors[0] * SURFACE_BRIGHTNESS
         found["background_field"] = SmoothField(terms, shape, order)
     if fit.shift is not None:
         found["shift"] = fit.shift * ANGLE
-        found["shift_err"] = errors[-2:] * fit.scale * ANGLE
+        found["shift_err"] = _common_errors(fit, covariance, "shift") * fit.scale * ANGLE
     if fit.offset_map is not None:
         found["offset_map"] = fit.offset_map
     return found
+
+
+def _common_errors(fit, covariance, name):
+    """Errors of the common parameters of a name."""
+    return np.sqrt(np.diag(covariance)[fit.places[name]])
 
 
 def _images(fit, diagnostics, meta):

@@ -37,6 +37,10 @@ _BRIGHT, _DETECTED = 20.0, 3.0
 #: A band on the page: name, result, image, kernel, and pulls at empty positions (made by `write_page`).
 Measured = collections.namedtuple("Measured", "name result image kernel pulls")
 
+#: Chi-square over degrees of freedom above which stars are said to be unlike the PSF: 2 sigma in a usual pixel,
+#: where 2 percent of the light are allowed for.
+_UNLIKE = 4.0
+
 
 def write_page(path, bands, highres, segments, confidence, seed):
     """
@@ -245,7 +249,8 @@ def _stars(page, stars, band):
         )
         what = f"{band} image" if name == "image" else name
         facts = {"what": what, "n": len(fit.after), "error": 100 * fit.error, "changes": changes}
-        page.text(fit.kind, **facts, before=fit.chi2["model"], after=fit.chi2[fit.kind])
+        for text in star_texts(fit):
+            page.text(text, **facts, **_star_numbers(fit))
         pairs = list(zip(fit.before, fit.after, strict=True))[:_STARS]
         figure, axes = new_figure(len(pairs), 3, size=(3.0, 2.8))
         scale = stars.kernel.pixel_scale.to_value(ANGLE) * np.sqrt(fit.after[0].star.area)
@@ -259,7 +264,26 @@ def _stars(page, stars, band):
                 pull[known] = one.residual * one.weight
                 plot_image(pull, ax=ax, title=f"{title}, chi2 {one.chi2:.2f}", **pulls)
         page.figure("figure", figure, **facts)
-    page.table("table", (dict(zip(stars.table.colnames, row, strict=True)) for row in stars.table))
+    rows = [dict(zip(stars.table.colnames, row, strict=True)) for row in stars.table]
+    for row in rows:
+        row["note"] = "not like the PSF" if row["chi2"] > _UNLIKE else ""
+    page.table("table", rows)
+
+
+def star_texts(fit):
+    """Names of texts of a `~miricigale.psf.star_fit.StarPSF`: what was done, and whether that fits the stars."""
+    tried = len(fit.chi2) > 1
+    texts = [fit.kind if tried else "untried"]
+    if fit.chi2[fit.kind] > _UNLIKE * fit.dof:
+        texts.append("unlike")
+    return texts
+
+
+def _star_numbers(fit):
+    """Chi-square of stars with the model and with what was chosen."""
+    after = fit.chi2[fit.kind]
+    ratio = after / max(fit.dof, 1)
+    return {"before": fit.chi2["model"], "after": after, "dof": fit.dof, "ratio": ratio}
 
 
 def _flag_table(page, bands):

@@ -150,11 +150,15 @@ class _More:
         moved = np.array(first.displacement(all_xy))
         moved[:n] += 0.0 if own is None else own
         one = first.offset_map is None and own is None
+        # positions are refined without a shift
+        shifted = first.shift is not None and search is None
         if search is None:
             # a shift that was rejected is not searched again
             search = first.shift is not None and own is None
         form = {"host": host, "moved": moved[0] if one else moved, "search": search}
         fit = TemplateFit(arrays, bank, settings, like=self._made, **form)
+        if shifted and not search:
+            fit.include_shift(first.shift)
         fit.offset_map, self._made = first.offset_map, fit.bank
         return fit
 

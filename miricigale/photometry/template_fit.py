@@ -61,7 +61,10 @@ class TemplateFit:
     power, light : `~numpy.ndarray`, shape (n,) and (n, 2)
         Sums of squares of the templates; their fractions on the image, and on its usable pixels.
     columns : list of `~numpy.ndarray`
-        The common parameters' images: the background's first, then those of the shift.
+        The common parameters' images.
+    places : dict of str to slice
+        Where common parameters stand among ``columns`` and ``common``, by name: ``"background"`` and, where it is
+        fitted, ``"shift"`` (x and y).
     shift, offset_map
         In arcsec, shape (2,), and the `OffsetMap` by which templates are moved; None without.
     evidence
@@ -103,7 +106,12 @@ class TemplateFit:
         """Fit fluxes and common parameters with the templates of a bank."""
         if bank is not self.bank:
             self.bank.forget()
-        self.bank, self.columns = bank, [*self._background, *gradients]
+        self.bank = bank
+        self.columns = list(self._background)
+        self.places = {"background": slice(0, len(self.columns))}
+        if gradients:
+            self.places["shift"] = slice(len(self.columns), len(self.columns) + len(gradients))
+            self.columns += gradients
         white = [self.arrays.whitened(column) for column in self.columns]
         data = self.arrays.whitened(self.arrays.flux)
         matrix, projection, power, light = normal_matrix(bank, self.inverse_sigma, [data, *white])
@@ -168,10 +176,7 @@ class TemplateFit:
     def _find_shift(self, plain, shift):
         limit = self.settings.max_shift.value / self.scale
         for _ in range(8):
-            dy, dx = np.gradient(self.model())
-            self._solve(plain.shifted(shift), [-dx, -dy])
-            # the columns are steps from the present positions of the templates
-            step = self.fit.common[-2:]
+            step = self._fit_step(plain.shifted(shift))
             found = shift + step
             if np.hypot(*found) > limit:
                 msg = (
@@ -185,6 +190,24 @@ class TemplateFit:
                 break
             shift = shift + np.clip(step, -1.0, 1.0)
         self.shift = found * self.scale
+
+    def _fit_step(self, bank):
+        """Fit with the templates of a bank and a small step of all of them: the step (x, y) in pixels."""
+        dy, dx = np.gradient(self.model())
+        self._solve(bank, [-dx, -dy])
+        return self.fit.common[self.places["shift"]]
+
+    def include_shift(self, shift):
+        """
+        Fit once more with a shift about the one that the templates have, so that it has an error.
+
+        Parameters
+        ----------
+        shift : `~numpy.ndarray`, shape (2,)
+            Arcsec (x, y) by which the templates were moved.
+        """
+        if self.fit is not None:
+            self.shift = shift + self._fit_step(self.bank) * self.scale
 
     def displacement(self, xy):
         """Positions of templates less those of the catalog, (x, y) in pixels."""
@@ -222,7 +245,8 @@ class TemplateFit:
         """Add the fitted background, in uJy per pixel, times a factor to an image in place."""
         if self.fit is None:
             return
-        for column, value in zip(self._background, self.common, strict=False):
+        values = self.common[self.places["background"]]
+        for column, value in zip(self._background, values, strict=True):
             image += np.float32(factor * value) * column
 
     def model(self):

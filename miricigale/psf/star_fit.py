@@ -107,6 +107,11 @@ class FittedStar:
         self.snr = found[0] * np.sqrt(np.sum((own[:, 0] / sigma) ** 2))
 
     @property
+    def dof(self):
+        """Degrees of freedom of its chi-square: pixels less its own parameters."""
+        return self.weight.size - self._basis.shape[1]
+
+    @property
     def width(self):
         """Width of the core relative to the PSF's, less 1, and its error."""
         power = max(self.normal[0, 0], 1e-30)
@@ -170,7 +175,9 @@ class StarPSF:
         ``"model"`` (not corrected), ``"terms"``, ``"field"`` (terms that change over the field) or
         ``"effective"`` (single cells too).
     chi2 : dict of str to float
-        Chi-square of what was left out, by kind.
+        Chi-square of what was left out, by kind; of ``"model"`` alone if no correction was tried.
+    dof : int
+        Degrees of freedom of these: pixels less flux, position and background of each star.
     terms, terms_err : `~numpy.ndarray`, shape (k,)
         Corrections of `TERMS` in the middle of the field, zero if it is not corrected, and their errors.
     error : float
@@ -199,6 +206,7 @@ class StarPSF:
         self.before = self._fitted(stars)
         fits, without, inverse = self._solved(units, 0)
         self.chi2 = {"model": sum(one.misfit() for one in fits)}
+        self.dof = sum(one.dof for one in fits)
         for kind, n, k in (("terms", 1, len(TERMS)), ("field", _FIELD, len(_SPREAD))):
             if len(stars) < max(n, least):
                 continue

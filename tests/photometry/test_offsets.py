@@ -75,6 +75,46 @@ def test_without_bright_sources_there_is_one_shift(tools):
     assert_allclose(result.shift.value, offset.mean(axis=0), atol=0.01)
 
 
+@pytest.mark.parametrize("order", [None, 0, 1, 2])
+@pytest.mark.parametrize("scatter", [0.0, 0.008])
+@pytest.mark.filterwarnings("ignore:.*lies about:miricigale.utils.exceptions.MiricigaleWarning")
+def test_one_shift_has_the_error_of_its_light(tools, order, scatter):
+    """
+    The error is that of the gradients of all light (Cramer-Rao), whatever else is fitted.
+
+    For Gaussians of rms s (pixels) it is sqrt(8 pi) s^2 sigma / sqrt(sum of flux^2). With scatter, bright sources
+    are moved one by one before the last fit.
+    """
+    rng = np.random.default_rng(5)
+    east, north = tools.lattice(rng, 10, 4.0, 1.0)
+    flux = 10 ** rng.uniform(0, 1.7, 100)
+    away = rng.normal(0, scatter, (2, 100))
+    there = tools.places(east + 0.04 + away[0], north - 0.03 + away[1])
+    image = tools.picture(there, flux, SHAPE, sigma=SIGMA, rng=rng)
+    options = {"background_order": order, "errors": tools.WHITE, **OPTIONS}
+    result = tools.measured(image, tools.places(east, north), **options)
+    sigma = SIGMA * 1e12 * tools.SR * 0.11**2
+    error = np.sqrt(8 * np.pi) * (tools.LO / 0.11) ** 2 * sigma / np.sqrt(np.sum(flux**2)) * 0.11
+    assert_allclose(result.shift_err.to_value(u.arcsec), error, rtol=0.1)
+    weights = flux**2 / np.sum(flux**2)
+    mean = np.array([-0.04, -0.03]) + [-weights @ away[0], weights @ away[1]]
+    # sources that were moved one by one no longer tell of the shift
+    bound = 5 * error if scatter == 0 else 3 * scatter * np.sqrt(np.sum(weights**2)) + 5 * error
+    assert_allclose(result.shift.to_value(u.arcsec), mean, atol=bound)
+    assert_allclose(result.meta["offset_err"], error, rtol=0.1, atol=1e-5)
+    assert_allclose(result.meta["offset"], result.shift.to_value(u.arcsec), atol=1e-5)
+    pulls = (result.flux.value - flux) / result.flux_err.value
+    assert 0.8 < pulls.std() < 1.2
+    if order is not None:
+        assert_allclose(result.background.value, 0, atol=5 * result.background_err.value)
+        assert len(result.background_field.coefficients) == [1, 3, 6][order]
+    # the shift is still there where sources are added
+    more = tools.measured(image, tools.places(east, north)[5:], second_pass=True, **options)
+    assert len(more.new_sources) >= 5
+    assert_allclose(more.shift.value, result.shift.value, atol=0.01)
+    assert_allclose(more.shift_err.to_value(u.arcsec), error, rtol=0.2)
+
+
 def test_new_sources_of_a_distorted_image_are_in_the_catalogue_s_frame(tools):
     sky, flux, _, image = distorted(tools)
     result = tools.measured(image, sky[5:], offset_order=1, second_pass=True, **OPTIONS)

@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose
 from helpers.light import gaussian_image
 from helpers.scenes import tan_wcs
 from miricigale.photometry import ForcedFlags, ForcedPhotometer, SourceTemplates
+from miricigale.photometry.page import star_texts
 from miricigale.psf import MatchingKernel
 
 SIGMA = 0.004
@@ -39,10 +40,21 @@ def test_two_stars_do_not_decide_by_themselves(tools, stars):
         photometer = ForcedPhotometer(kernel, template="psf", psf_stars=None)
         result = photometer.measure(image, catalog=catalog[:n])
         assert (result.meta["image_psf"], result.meta["image_stars"]) == (kind, n)
+        # the page does not say that no correction fits where none was tried
+        assert star_texts(result.psf_stars.fits["image"])[0] == {2: "untried", 5: "terms"}[n]
     asked = photometer.replace(psf_stars=True).measure(image, catalog=catalog[:2])
     assert asked.meta["image_psf"] == "terms"
     none = photometer.measure(image, catalog=tools.places([9.0], [0.2]))
     assert (none.meta["image_psf"], none.meta["image_stars"]) == ("model", 0)
+
+
+def test_stars_that_no_psf_describes_are_said_to_be_so(tools, stars):
+    """Two stars on an image whose errors are stated thirty times too small."""
+    image, catalog, _ = stars
+    small = CCDData(image, uncertainty=type(image.uncertainty)(image.uncertainty.array / 30))
+    photometer = ForcedPhotometer(wrong_kernel(tools, 1.06), template="psf", psf_stars=None)
+    fit = photometer.measure(small, catalog=catalog[:2]).psf_stars.fits["image"]
+    assert star_texts(fit) == ["untried", "unlike"]
 
 
 @pytest.mark.parametrize("factor", [0.95, 1.06])
@@ -74,6 +86,10 @@ def test_a_psf_that_is_right_stays_as_it_is(tools, stars):
     plain = tools.measured(image, catalog)
     asked = tools.measured(image, catalog, psf_stars=True)
     assert asked.meta["image_psf"] == "model"
+    fit = asked.psf_stars.fits["image"]
+    assert star_texts(fit) == ["model"]
+    # 2 percent of the light are allowed for on top of the noise
+    assert 0.7 < fit.chi2["model"] / fit.dof < 1.1
     assert asked.psf_stars.kernel is tools.kernel
     assert_allclose(asked.flux.value, plain.flux.value, rtol=1e-12)
     assert_allclose(asked.flux_err.value, plain.flux_err.value, rtol=1e-12)
