@@ -24,7 +24,7 @@ from astropy.stats import mad_std
 from astropy.table import QTable, Table
 
 from miricigale import BayesFitter, SEDModel
-from miricigale.fitting import TemplateError
+from miricigale.fitting import SurveyCalibration
 from miricigale.utils.exceptions import MiricigaleWarning
 
 OPTICAL = {
@@ -94,7 +94,9 @@ def main():
     for kind in args.axes:
         model = SEDModel.survey()
         axes = SEDModel.survey_axes(kind)
-        error, part = (TemplateError.survey(), 0.0) if kind == "survey" else (None, 0.1)
+        error, part = (
+            (SurveyCalibration.survey().template_error, 0.0) if kind == "survey" else (None, 0.1)
+        )
         if args.model_error is not None:
             error, part = None, args.model_error
         fitter = BayesFitter(model, bands, axes=axes, template_error=error, model_error=part)

@@ -20,7 +20,7 @@ from ceers import sample
 from fit import loop_time
 
 from miricigale import BayesFitter, SEDModel
-from miricigale.fitting import GridSettings, TemplateError
+from miricigale.fitting import GridSettings, SurveyCalibration
 from miricigale.fitting.posterior import cell_percentiles
 from miricigale.sed import ModelGrid
 
@@ -93,7 +93,11 @@ def real(path, grid_path):
     ):  # fmt: skip
         errors = {name: error if name.startswith("miri") else 0.0 for name in names}
         for part in (None, 0.03, 0.05, 0.1):
-            given = {"model_error": errors, "template_error": TemplateError.survey(), **NODES}
+            given = {
+                "model_error": errors,
+                "template_error": SurveyCalibration.survey().template_error,
+                **NODES,
+            }
             fitter = BayesFitter(grid, names, outliers=part, **given)
             fitter.fit(table[:2])
             start = time.process_time()
@@ -123,7 +127,11 @@ def main():
         return
     n, rng = options.n, np.random.default_rng(7)
     grid = SEDModel.survey().grid(AXES, BANDS)
-    given = {"model_error": 0.0, "template_error": TemplateError.survey(), **NODES}
+    given = {
+        "model_error": 0.0,
+        "template_error": SurveyCalibration.survey().template_error,
+        **NODES,
+    }
     fitter = BayesFitter(grid, BANDS, outliers=options.part, **given)
     plain = BayesFitter(grid, BANDS, **given)
     error = fitter.backend.engine.template_error

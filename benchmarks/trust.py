@@ -5,7 +5,7 @@ What says how far a fit of real sources can be trusted: odds, pulls of bands lef
 
 FOLDER has the folders ceers, stardust, cigale_seyferts and lrd with the files that are read below; GRID is the
 grid of `SEDModel.survey` in the bands of CEERS, made if it is not there. Errors are those of
-`TemplateError.survey`, 10 % of the flux with far-infrared bands.
+`SurveyCalibration.survey`, 10 % of the flux with far-infrared bands.
 
 odds: sources with S/N above 5 in seven bands, by `redshift_odds`: outliers, and expected ones.
 pulls: up to 100 sources of S/N above 5 a band: scatter of pulls of `leave_out`, and of `left_out_pulls`.
@@ -33,7 +33,7 @@ from miricigale.fitting import (
     FitFlags,
     GridSettings,
     MassFunction,
-    TemplateError,
+    SurveyCalibration,
     agn_fraction_prior,
     compare_classes,
     leave_out,
@@ -42,7 +42,7 @@ from miricigale.fitting.classes import RED_DOT_REDSHIFTS
 from miricigale.fitting.pulls import left_out_pulls
 from miricigale.sed import ModelGrid, red_dots, template_grid
 
-ERRORS = {"model_error": 0.0, "template_error": TemplateError.survey()}
+ERRORS = {"model_error": 0.0, "template_error": SurveyCalibration.survey().template_error}
 DOT_BANDS = {
     "814": "acs.f814w", "115": "nircam.f115w", "150": "nircam.f150w", "277": "nircam.f277w",
     "444": "nircam.f444w", "770": "miri.f770w",

@@ -1,7 +1,6 @@
 """Calibration of a survey: priors, errors of models and bands, and zero points, from sources of known redshift."""
 
 import dataclasses
-import functools
 from dataclasses import dataclass
 
 import astropy.units as u
@@ -22,13 +21,13 @@ from miricigale.fitting.priors import known_redshifts
 from miricigale.fitting.pulls import without_warnings
 from miricigale.fitting.template_error import TemplateError
 from miricigale.refdata import locate
+from miricigale.utils.caching import cached
 from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import DataError, FitWarning, warn
 from miricigale.utils.files import replacing
 from miricigale.utils.options import check_that
 from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import described_rows, described_table, require_columns
-from miricigale.utils.units import WAVE
 
 #: Turns of the calibration, each a step of expectation maximization, and the power by which steps of priors are
 #: lengthened (Salakhutdinov & Roweis 2003).
@@ -117,7 +116,7 @@ class SurveyCalibration:
         return dataclasses.replace(self, priors={}, mass_function=None, errors={})
 
     @classmethod
-    @functools.cache
+    @cached(copies=True)
     def survey(cls):
         """
         Calibration of `~miricigale.sed.SEDModel.survey`, measured on CEERS by ``tools/make_calibration.py``.
@@ -168,7 +167,7 @@ class SurveyCalibration:
             return cls(
                 name=meta["name"],
                 bands=described_table({n: (table[n], t) for n, t in _COLUMNS.items()}),
-                template_error=TemplateError(error["um"] * WAVE, error["error"]),
+                template_error=TemplateError.from_meta(error),
                 priors={
                     n: (np.array(p["values"]), np.array(p["weights"]))
                     for n, p in meta["priors"].items()

@@ -4,10 +4,13 @@ from dataclasses import dataclass
 
 import astropy.units as u
 import numpy as np
+from astropy.utils.decorators import deprecated
 
 from miricigale.filters import FilterSet
+from miricigale.refdata import locate
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_kind
+from miricigale.utils.table_files import read_table
 from miricigale.utils.units import WAVE, frozen_array, to_array
 
 
@@ -37,11 +40,11 @@ class TemplateError:
     Examples
     --------
     >>> import astropy.units as u
-    >>> from miricigale.fitting import TemplateError
+    >>> from miricigale.fitting import SurveyCalibration, TemplateError
     >>> error = TemplateError([0.1, 1.0, 10.0] * u.um, [0.15, 0.05, 0.30])
     >>> error([0.1, 3.0] * u.um).round(3)
     array([0.15 , 0.169])
-    >>> TemplateError.survey()([0.5, 8.0] * u.um).round(3)
+    >>> SurveyCalibration.survey().template_error([0.5, 8.0] * u.um).round(3)
     array([0.059, 0.47 ])
     """
 
@@ -61,12 +64,18 @@ class TemplateError:
         wave = to_array(wave, WAVE, "wave")
         return np.interp(np.log(wave), np.log(self.wave.to_value(WAVE)), self.error)
 
-    @staticmethod
-    def survey():
-        """Template error of `~miricigale.sed.SEDModel.survey`: that of `SurveyCalibration.survey`."""
-        from miricigale.fitting.survey import SurveyCalibration
+    @classmethod
+    def from_meta(cls, values):
+        """Template error of the plain values (``um`` and ``error``) in the file of a `SurveyCalibration`."""
+        return cls(values["um"] * WAVE, values["error"])
 
-        return SurveyCalibration.survey().template_error
+    @classmethod
+    @deprecated("1.0", alternative="SurveyCalibration.survey().template_error")
+    def survey(cls):
+        """Template error of `~miricigale.sed.SEDModel.survey`: that of `SurveyCalibration.survey`."""
+        # the file is read here too: the calibration knows template errors, not the other way round
+        table = read_table(locate("survey.ceers"), wanted="a calibration", form="ascii.ecsv")
+        return cls.from_meta(table.meta["template_error"])
 
 
 def pivots(filters):

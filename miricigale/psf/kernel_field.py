@@ -59,7 +59,7 @@ class KernelField:
            [0.  , 1.  ]])
     """
 
-    io_module: ClassVar[str] = "miricigale.psf.files"
+    io_module: ClassVar[str] = "miricigale.psf.kernel_io"
     read, write = read_write("kernels and their places")
 
     kernels: tuple

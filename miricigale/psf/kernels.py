@@ -65,7 +65,7 @@ class MatchingKernel(Interactive):
     noise gain 0.087, error 0.0007
     """
 
-    io_module: ClassVar[str] = "miricigale.psf.files"
+    io_module: ClassVar[str] = "miricigale.psf.kernel_io"
     read, write = read_write("a kernel and its PSFs")
 
     array: np.ndarray

@@ -11,7 +11,7 @@ from astropy.table import QTable, Table, vstack
 from scipy.ndimage import find_objects
 
 from miricigale import photometry
-from miricigale.photometry.arrays import pixel_scale
+from miricigale.photometry.arrays import nearest_values, pixel_scale
 from miricigale.photometry.grids import grid_angle
 from miricigale.photometry.kernel_files import image_psf
 from miricigale.profiles import sersic_radius
@@ -21,7 +21,6 @@ from miricigale.utils.exceptions import DataError
 from miricigale.utils.random import stream
 from miricigale.utils.store import open_parts, write_parts
 from miricigale.utils.units import ANGLE
-from miricigale.workflow.stages.sample import values_at
 
 log = logging.getLogger(__name__)
 
@@ -286,7 +285,8 @@ def stamps_of_sources(catalog, galaxies, *, of, seed):
     checked = check_catalog(catalog)
     rows = np.flatnonzero(_sersic(checked))
     if of == "own":
-        labels = values_at(checked["sky"], galaxies.image.wcs, galaxies._found[1])
+        xy = np.stack(galaxies.image.wcs.world_to_pixel(checked["sky"]), axis=-1)
+        labels = nearest_values(galaxies._found[1], xy)[0]
         # of all sources, points too
         counts = np.bincount(labels)
         pairs = ((row, labels[row]) for row in rows if labels[row] and counts[labels[row]] == 1)
