@@ -1,7 +1,5 @@
 """How bright zodiacal light and background are: by level, by ecliptic latitude, by position and date."""
 
-import functools
-
 import astropy.units as u
 import numpy as np
 from astropy.coordinates import BarycentricMeanEcliptic, SkyCoord, get_sun
@@ -12,6 +10,7 @@ from miricigale.filters import Filter
 from miricigale.instrument import background_level
 from miricigale.instrument.figures import filter_row, imager_filter
 from miricigale.refdata import locate
+from miricigale.utils.caching import cached
 from miricigale.utils.optional import require
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.positions import as_position
@@ -21,7 +20,7 @@ from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
 _FIELD_OF_REGARD = (85.0, 135.0)
 
 
-@functools.cache
+@cached(copies=True)
 def _table():
     return QTable.read(locate("instrument.zodiacal"), format="ascii.ecsv")
 

@@ -1,9 +1,9 @@
 """Names of bands: of CIGALE, old and new, and of surveys, for ours."""
 
 import re
-from functools import cache
 
 from miricigale.filters.library import FILTERS, SEDPY, curve_folder
+from miricigale.utils.caching import cached
 from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import unknown_name
 
@@ -15,7 +15,7 @@ _ALONE = re.compile(r"f\d+\w*|ch[1-4]|j[123]|h[12]|f850lp")
 _XRAY = re.compile(r"xray_boxcar_(\d+(?:p\d+)?)to(\d+(?:p\d+)?)keV")
 
 
-@cache
+@cached
 def _tables():
     """Names without a rule, rules of CIGALE's names, and rules of names written in any way."""
     tables = declared("miricigale.filters", "band_names.toml")
@@ -24,7 +24,7 @@ def _tables():
     return tables["names"], rules, free
 
 
-@cache
+@cached
 def _curves():
     return frozenset(path.stem for path in curve_folder().glob("*.par"))
 
@@ -35,7 +35,7 @@ def _is_here(name):
     return name in FILTERS.names()
 
 
-@cache
+@cached
 def find_filter(text):
     """
     Filter that a name in any of the usual forms is.
@@ -106,7 +106,7 @@ def eazy_filter(number):
     return next((start + group[number] for start, group in groups if number in group), None)
 
 
-@cache
+@cached
 def filter_of_band(band):
     """
     Filter that a band of CIGALE is.
@@ -154,7 +154,7 @@ def _by_rule(band):
     return None
 
 
-@cache
+@cached
 def cigale_band(name):
     """
     Band of CIGALE that a filter is.

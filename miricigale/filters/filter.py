@@ -1,7 +1,6 @@
 """Passbands."""
 
 import dataclasses
-import functools
 from pathlib import Path
 
 import astropy.units as u
@@ -13,6 +12,7 @@ from miricigale.filters.band_names import find_filter
 from miricigale.filters.curve_files import read_curve
 from miricigale.filters.library import FILTERS, load_curve
 from miricigale.filters.spectra import check_wave, spectrum_arrays
+from miricigale.utils.caching import cached, cached_property
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.files import reading
 from miricigale.utils.interactive import Interactive, checked_calls
@@ -272,31 +272,31 @@ class Filter(Frozen, Interactive):
             meta={"expr": self.name},
         )
 
-    @functools.cached_property
+    @cached_property
     def _fine(self):
         """Refined wavelengths (um) and throughput, and their photon integral."""
         wave, throughput = _core.refine(self.wave.value, self.throughput)
         return wave, throughput, _core.photon_integral(wave, throughput)
 
-    @functools.cached_property
+    @cached_property
     def pivot(self):
         """Pivot wavelength, sqrt(int T lam dlam / int T dlam / lam), um."""
         wave, throughput, norm = self._fine
         return np.sqrt(_core.photon_integral(wave, throughput, 2) / norm) * WAVE
 
-    @functools.cached_property
+    @cached_property
     def effective_wavelength(self):
         """Mean wavelength of the photons of a source with constant F_nu, um."""
         wave, throughput, norm = self._fine
         return _core.photon_integral(wave, throughput, 1) / norm * WAVE
 
-    @functools.cached_property
+    @cached_property
     def width(self):
         """Rectangular width, int T dlam / max T, um."""
         wave, throughput, _ = self._fine
         return _core.photon_integral(wave, throughput, 1) / throughput.max() * WAVE
 
-    @functools.cached_property
+    @cached_property
     def fwhm(self):
         """Full width at half of the highest throughput, um."""
         wave, throughput, _ = self._fine
@@ -308,7 +308,7 @@ class Filter(Frozen, Interactive):
         """Wavelengths beyond which the throughput is 0, um, shape (2,)."""
         return self.wave[[0, -1]]
 
-    @functools.cached_property
+    @cached_property
     def catalog_factor(self):
         """
         What turns the AB flux of a band into the one that catalogs quote.
@@ -438,7 +438,7 @@ class Filter(Frozen, Interactive):
         return plot_filters([(self.wave.value, self.throughput, self.name)], ax=ax, **kwargs)
 
 
-@functools.lru_cache(maxsize=512)
+@cached(maxsize=512)
 def _from_name(name):
     wave, throughput, options = load_curve(name)
     return Filter(wave, throughput, name=name, **options)

@@ -1,13 +1,13 @@
 """What the detector is: figures, non-linearity, flat field, bad and reference pixels."""
 
 import dataclasses
-import functools
 
 import numpy as np
 from numpy.polynomial import polynomial as poly
 
 from miricigale.instrument.figures import filter_row, imager_filter, table
 from miricigale.instrument.siaf import aperture, imager_columns
+from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_least, check_positive, check_that
 from miricigale.utils.random import check_seed, stream
@@ -185,7 +185,7 @@ class DetectorProperties:
         return np.where(linear > 0, beyond, linear)
 
 
-@functools.cache
+@cached
 def miri_detector():
     """
     The imager's detector.
@@ -206,12 +206,12 @@ def miri_detector():
     return DetectorProperties(**table()["detector"])
 
 
-@functools.lru_cache(maxsize=2)
+@cached(maxsize=2)
 def _flat_pixels(seed):
     return stream(seed, "flat", "pixels").standard_normal(aperture("FULL").shape, np.float32)
 
 
-@functools.lru_cache(maxsize=18)
+@cached(maxsize=18)
 def _full_flat(filter, seed):
     from scipy.interpolate import RectBivariateSpline
 
@@ -261,7 +261,7 @@ def flat_field(filter, *, subarray="FULL", seed=_SEED):
     return _full_flat(str(filter), check_seed(seed))[aperture(subarray).slices]
 
 
-@functools.cache
+@cached
 def _full_bad_pixels():
     shape = aperture("FULL").shape
     rng = stream(_SEED, "bad pixels")

@@ -1,6 +1,5 @@
 """Dither patterns: offsets of the pointing along the axes of the imager."""
 
-import functools
 import os
 import re
 from pathlib import Path
@@ -13,6 +12,7 @@ from astropy.table import Table
 from miricigale.instrument.figures import table
 from miricigale.instrument.siaf import aperture, imager_columns, vector_angles
 from miricigale.instrument.wcs import tangent_offset
+from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import DataError, argument_error, data_error
 from miricigale.utils.files import reading, unpacked_size
 from miricigale.utils.options import check_data, check_names, check_that
@@ -31,7 +31,7 @@ _N_CYCLING = 311
 _PHASES = ((0.0, 0.0), (0.5, 0.0), (0.5, 0.5), (0.0, 0.5))
 
 
-@functools.cache
+@cached
 def _cycling(name):
     from scipy.stats.qmc import Halton
 

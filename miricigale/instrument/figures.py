@@ -1,13 +1,13 @@
 """Tables of published figures."""
 
-import functools
 import tomllib
 
 from miricigale.filters.band_names import known_filter
 from miricigale.refdata import locate
+from miricigale.utils.caching import cached
 
 
-@functools.cache
+@cached
 def table(name="imager"):
     """A table of the instrument (``imager``, ``siaf``, ``etc``) as a dict."""
     return tomllib.loads(locate(f"instrument.{name}").read_text(encoding="utf-8"))

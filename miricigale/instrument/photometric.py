@@ -1,7 +1,5 @@
 """Photometric conversion, backgrounds and image quality of the imaging filters."""
 
-import functools
-
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
@@ -9,6 +7,7 @@ from astropy.table import QTable
 from miricigale.instrument.detector import miri_detector
 from miricigale.instrument.figures import filter_row, table
 from miricigale.refdata import locate
+from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_least, check_names, check_positive
 from miricigale.utils.units import SURFACE_BRIGHTNESS, WAVE, to_array
@@ -92,7 +91,7 @@ def background_level(filter, *, zodi="low"):
     return (row["thermal"] + _zodi_factor(zodi) * row["zodi"]) * SURFACE_BRIGHTNESS
 
 
-@functools.cache
+@cached
 def _thermal():
     curve = QTable.read(locate("instrument.thermal"), format="ascii.ecsv")
     return np.log(curve["wave"].to_value(WAVE)), np.log(curve["level"].to_value(SURFACE_BRIGHTNESS))

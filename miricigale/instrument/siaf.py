@@ -7,13 +7,13 @@ are 0-based here, with integers at their centers.
 """
 
 import dataclasses
-import functools
 
 import astropy.units as u
 import numpy as np
 from astropy.coordinates.matrix_utilities import rotation_matrix
 
 from miricigale.instrument.figures import table
+from miricigale.utils.caching import cached
 from miricigale.utils.options import check_names
 
 _ARCSEC = np.pi / 180 / 3600
@@ -91,7 +91,7 @@ def imager_columns():
     return tuple(table("siaf")["imager_columns"])
 
 
-@functools.cache
+@cached
 def aperture(name="FULL"):
     """
     Look up a sub-array.

@@ -1,7 +1,5 @@
 """World coordinates of the imager and of mosaics, as `astropy.wcs.WCS`."""
 
-import functools
-
 import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
@@ -14,6 +12,7 @@ from miricigale.instrument.siaf import (
     v2v3_to_sky,
     vector_angles,
 )
+from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
 from miricigale.utils.positions import as_position
@@ -78,7 +77,7 @@ def scaled_fit(x, y, values, order):
     return tables
 
 
-@functools.cache
+@cached
 def _sip(subarray):
     """
     CD matrix at roll 0 (deg / pixel) and SIP tables of a sub-array.

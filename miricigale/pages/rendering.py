@@ -1,16 +1,17 @@
 """Templates of the pages, and figures as images within them."""
 
 import base64
-import functools
 import io
 
 import jinja2
+
+from miricigale.utils.caching import cached
 
 #: Points, line nodes and glyphs above which a figure is smaller as pixels than as vectors.
 _MOST_MARKS = 1500
 
 
-@functools.cache
+@cached
 def _environment():
     return jinja2.Environment(
         loader=jinja2.PackageLoader("miricigale.pages"),
@@ -21,7 +22,7 @@ def _environment():
     )
 
 
-@functools.cache
+@cached
 def macros():
     """Return the blocks that make up a page: functions that return markup."""
     return _environment().get_template("macros.html").module

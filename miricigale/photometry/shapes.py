@@ -14,6 +14,7 @@ from miricigale.photometry.cutouts import Cutout
 from miricigale.photometry.population import Population
 from miricigale.photometry.shape_models import ShapeModels
 from miricigale.profiles import sersic_stamp
+from miricigale.utils.caching import cached
 
 #: Width (pixels) of the offset of the center from the position.
 _OFFSET = 0.7
@@ -115,7 +116,7 @@ def not_fitted(n):
     return found
 
 
-@functools.cache
+@cached
 def normal_nodes():
     """Points of a normal distribution in four dimensions: of zero mean and unit covariance."""
     from scipy.stats import norm, qmc

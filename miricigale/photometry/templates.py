@@ -16,6 +16,7 @@ from miricigale.photometry._core.sampling import (
     spline_response,
 )
 from miricigale.photometry.cutouts import RIM, convolve_padded
+from miricigale.utils.caching import cached
 from miricigale.utils.parallel import parallel_map
 
 #: Pixels of the stamps that a thread works on at a time.
@@ -72,7 +73,7 @@ class FineTemplates:
         flat = kernels.reshape(len(kernels), -1)
         return flat @ flat.T
 
-    @functools.lru_cache(maxsize=256)  # noqa: B019 - lives as long as one measurement
+    @cached(maxsize=256)
     def _transfer(self, shape, convolved, place):
         if convolved:
             transfer = scipy.fft.rfft2(self.kernel[place], s=shape)

@@ -1,6 +1,5 @@
 """PSFs of WFC3/IR mosaics."""
 
-import functools
 import math
 
 import astropy.units as u
@@ -13,6 +12,7 @@ from miricigale.psf.effects import detector_response
 from miricigale.psf.model import make_psf
 from miricigale.psf.optics import hst_pupil, polychromatic_psf
 from miricigale.psf.telescope import band_quantiles, checked_grid, odd_cells
+from miricigale.utils.caching import cached
 from miricigale.utils.options import check_that
 from miricigale.utils.units import ANGLE, to_array
 
@@ -25,7 +25,7 @@ _WFC3_PIXEL, _WFC3_PIXFRAC = 0.128, 0.8
 _WFC3_FWHM = 0.20
 
 
-@functools.lru_cache(maxsize=8)
+@cached(maxsize=8)
 def _hst_optics(name, cell, n, angle):
     pupil = hst_pupil(angle=angle)
     flat = np.zeros((pupil.n, pupil.n))
@@ -39,7 +39,7 @@ def _hst_blurred(data, oversampling, scale, sigma):
     return detector_response(data, oversampling=oversampling, boxes=boxes, jitter=sigma / scale)
 
 
-@functools.lru_cache(maxsize=16)
+@cached(maxsize=16)
 def _hst_blur(scale):
     """Gaussian sigma in arcsec with which the mosaic's PSF has its width at F160W."""
     oversampling = max(1, math.ceil(scale / 0.015))

@@ -1,6 +1,5 @@
 """PSFs of the nine MIRI imaging filters."""
 
-import functools
 import math
 
 import astropy.units as u
@@ -20,6 +19,7 @@ from miricigale.psf.effects import (
 from miricigale.psf.model import make_psf
 from miricigale.psf.optics import jwst_constants
 from miricigale.psf.telescope import Telescope, checked_grid, odd_cells
+from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
 from miricigale.utils.units import ANGLE
@@ -75,7 +75,7 @@ def _distorted_optics(telescope, map_, oversampling, n, cell):
     return _core.interpolate(fine, x, y) * abs(np.linalg.det(map_)) * finer**2
 
 
-@functools.lru_cache(maxsize=24)
+@cached(maxsize=24)
 def _miri_data(telescope, oversampling, fov, includes, calibration, position=None):
     """Data and pixel (arcsec) of a PSF; ``position`` is (x, y, sub-array)."""
     name, scale = telescope.filter, MIRI_PIXEL_SCALE.value

@@ -1,7 +1,6 @@
 """Pupils, wavefronts and the light of a point source in the focal plane."""
 
 import dataclasses
-import functools
 import math
 import tomllib
 
@@ -9,6 +8,7 @@ import numpy as np
 
 from miricigale.psf import _core
 from miricigale.refdata import locate
+from miricigale.utils.caching import cached
 from miricigale.utils.options import check_least, check_that
 from miricigale.utils.parallel import single_threaded
 from miricigale.utils.random import stream
@@ -112,7 +112,7 @@ class Pupil:
         return _core.wavefront(self.amplitude, self.segments, x, y, rms, _SEGMENT_FRACTION, rng)
 
 
-@functools.cache
+@cached
 def jwst_constants():
     """The telescope's outlines and MIRI's couplings, from ``psf.jwst_pupil``; see its comments for units."""
     return tomllib.loads(locate("psf.jwst_pupil").read_text())
@@ -132,7 +132,7 @@ def _to_image(vertices, angle):
     )
 
 
-@functools.lru_cache(maxsize=8)
+@cached(maxsize=8)
 def jwst_pupil(n=384, *, angle=4.83544897):
     """
     The entrance pupil of JWST as an image-plane axis sees it.
@@ -189,7 +189,7 @@ def _circle(radius, x=0.0, y=0.0, corners=720):
     return np.stack([x + r * np.cos(t), y + r * np.sin(t)], axis=1)
 
 
-@functools.lru_cache(maxsize=8)
+@cached(maxsize=8)
 def hst_pupil(n=256, *, angle=45.0):
     """
     The pupil of HST with its central obscuration, four vanes and three pads.

@@ -1,7 +1,6 @@
 """What the PSFs of all instruments share: names, grids, wavelengths, the optics of JWST."""
 
 import dataclasses
-import functools
 
 import astropy.units as u
 import numpy as np
@@ -9,10 +8,11 @@ import numpy as np
 from miricigale.filters import Filter
 from miricigale.psf.optics import jwst_pupil, polychromatic_psf
 from miricigale.refdata import citations
+from miricigale.utils.caching import cached
 from miricigale.utils.units import ANGLE, WAVE, check_count, positive, to_array
 
 
-@functools.lru_cache(maxsize=64)
+@cached(maxsize=64)
 def band_quantiles(name, n=9):
     """
     Wavelengths (um, ascending) of equal weight that stand for a band.
@@ -84,7 +84,7 @@ class Telescope:
             "citations": citations("psf.jwst_pupil"),
         }
 
-    @functools.lru_cache(maxsize=8)  # noqa: B019 - by value, a telescope is a few numbers
+    @cached(maxsize=8)
     def image(self, cell, n):
         """Fraction of the light in each of n x n cells of ``cell`` arcsec, read-only."""
         pupil = jwst_pupil(self.n_pupil, angle=self.angle)

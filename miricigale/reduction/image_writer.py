@@ -1,6 +1,5 @@
 """Images of the reduction as files from which the official pipeline goes on."""
 
-import functools
 from pathlib import Path
 
 import astropy.units as u
@@ -23,6 +22,7 @@ from miricigale.instrument.asdf_extension import asdf_extension
 from miricigale.instrument.image_files import json_meta
 from miricigale.reduction.files import PLANES, ImageFile, shared_meta
 from miricigale.reduction.images import flagged_image, plain_flags, plain_mask, sigma
+from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import replacing, write_fits
 from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS
@@ -137,7 +137,7 @@ def write_image(image, path, *, planes=None, overwrite=False):
     return path
 
 
-@functools.cache
+@cached
 def _nominal_area():
     """Solid angle of the pixel at the reference point of the full frame, sr."""
     part = aperture("FULL")

@@ -1,8 +1,8 @@
 """Records of the reference data, and registries of named things that cite."""
 
 import dataclasses
-import functools
 
+from miricigale.utils.caching import cached
 from miricigale.utils.declared import declared
 from miricigale.utils.options import check_names
 
@@ -59,7 +59,7 @@ class Resource:
     notes: str = ""
 
 
-@functools.cache
+@cached
 def resources():
     """
     All records of ``resources.toml``.

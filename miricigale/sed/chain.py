@@ -1,6 +1,5 @@
 """The chain of components worked out on one grid of rest wavelengths: arrays only."""
 
-import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,6 +7,7 @@ import numpy as np
 from miricigale.filters import FilterSet
 from miricigale.sed import _core
 from miricigale.sed.component import ROLES
+from miricigale.utils.caching import cached
 from miricigale.utils.declared import declared
 
 #: Version of the numbers that follow from the components: raised when the chain, the derived
@@ -119,7 +119,7 @@ class Chain:
         self._kept = ({}, None)
         # what was made last is kept, by its arguments, as long as the chain lives
         for name in _KEEPING.split():
-            setattr(self, name, functools.lru_cache(MAX_KEPT)(getattr(self, name)))
+            setattr(self, name, cached(getattr(self, name), maxsize=MAX_KEPT))
 
     def _functionals(self):
         wave, n = self.wave, self.wave.size

@@ -8,6 +8,7 @@ import astropy.units as u
 from miricigale.refdata import Registry, locate
 from miricigale.refdata.lookup import fingerprint_of
 from miricigale.sed.parameter import Parameter
+from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import ConfigError, config_error
 from miricigale.utils.options import check_that
 
@@ -135,7 +136,7 @@ class Component:
         super().__setattr__(name, value)
 
     @classmethod
-    @functools.cache
+    @cached
     def declared(cls):
         """Parameters as declared in the class bodies, base classes first."""
         bodies = [vars(base).items() for base in reversed(cls.__mro__)]

@@ -1,7 +1,5 @@
 """Extinction by dust of the Milky Way: a component, how much it is in bands, tables freed from it."""
 
-import functools
-
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
@@ -10,6 +8,7 @@ from miricigale.filters import FilterSet
 from miricigale.filters.spectra import spectrum_arrays
 from miricigale.sed.component import Component, register
 from miricigale.sed.parameter import Parameter
+from miricigale.utils.caching import cached
 from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error, units_error
 from miricigale.utils.options import check_that
@@ -52,7 +51,7 @@ def _outside(law, r_v):
     return f"'r_v' must be from {low} to {high} for the law {law}, got {r_v}"
 
 
-@functools.lru_cache(maxsize=64)
+@cached(maxsize=64)
 def _table(law, r_v):
     """ln(first wavelength), steps per unit of ln, and A(lambda) / E(B-V) at the steps."""
     import astropy.units as u

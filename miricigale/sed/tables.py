@@ -1,7 +1,6 @@
 """Models evaluated: one as spectra, rows of parameters as band fluxes, both with derived quantities."""
 
 import difflib
-import functools
 
 import astropy.units as u
 import numpy as np
@@ -12,6 +11,7 @@ from miricigale.sed import _core
 from miricigale.sed.chain import GALAXY, SIX, SKY, STELLAR, distinct
 from miricigale.sed.derived import DERIVED, agn_quantities, galaxy_quantities, scaled_quantities
 from miricigale.sed.spectrum import SED, distance
+from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import ModelWarning, warn
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import Flags, as_table, described_table
@@ -110,7 +110,7 @@ def _row_flags(model, values, n):
     return flags
 
 
-@functools.lru_cache(maxsize=16)
+@cached(maxsize=16)
 def _stack(filters):
     """All passbands one after the other, as `_core.band_means` takes them."""
     waves = [band.wave.to_value(WAVE) for band in filters]

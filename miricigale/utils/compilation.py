@@ -7,7 +7,6 @@ kernel holds that of the kernels it calls, and numba looks at the file of the fi
 forgotten when any file of kernels changes.
 """
 
-import functools
 import gc
 import hashlib
 import logging
@@ -16,6 +15,8 @@ from pathlib import Path
 
 import numba
 from numba.core import event
+
+from miricigale.utils.caching import cached
 
 log = logging.getLogger(__name__)
 
@@ -30,10 +31,10 @@ class _Listener(event.Listener):
 
     # numba calls both with its compiler lock held
     def on_start(self, event):
-        name = event.data["dispatcher"].py_func.__module__.split(".")[1:2]
-        if name and name[0] not in self.reported:
-            self.reported.add(name[0])
-            log.info("compiling kernels of %s, once for each installation, up to 20 s", name[0])
+        name = subpackage_of(event.data["dispatcher"].py_func.__module__)
+        if name and name not in self.reported:
+            self.reported.add(name)
+            log.info("compiling kernels of %s, once for each installation, up to 20 s", name)
         if self.depth == 0:
             self.collect = gc.isenabled()
             gc.disable()
@@ -43,6 +44,12 @@ class _Listener(event.Listener):
         self.depth -= 1
         if self.depth == 0 and self.collect:
             gc.enable()
+
+
+def subpackage_of(module):
+    """Subpackage of this package that a module is in, by their names; empty for numba's own and for others'."""
+    package, _, rest = module.partition(".")
+    return rest.partition(".")[0] if package == __name__.partition(".")[0] else ""
 
 
 event.register("numba:compile", _Listener())
@@ -77,7 +84,7 @@ def njit(**options):
     return decorate
 
 
-@functools.cache
+@cached
 def _warn_of_no_cache():
     log.warning(
         "compiled kernels cannot be kept, as neither the package's folder nor the user's cache can be "
@@ -85,7 +92,7 @@ def _warn_of_no_cache():
     )
 
 
-@functools.cache
+@cached
 def _forget_stale(folder, package):
     """Remove the index of what is kept in a folder, if it was compiled from other sources than today's."""
     current, marker = _digest(package), Path(folder) / "kernels.sha256"
@@ -96,7 +103,7 @@ def _forget_stale(folder, package):
     marker.write_text(current)
 
 
-@functools.cache
+@cached
 def _digest(package):
     """Checksum of all files of kernels of a package, ``_core.py`` and ``_core/*.py``."""
     root, found = Path(sys.modules[package].__file__).parent, hashlib.sha256()

@@ -1,11 +1,12 @@
 """What the package declares in TOML files beside its modules: texts, names, presets."""
 
-import functools
 import tomllib
 from importlib import resources
 
+from miricigale.utils.caching import cached
 
-@functools.cache
+
+@cached
 def declared(package, file="page.toml"):
     """
     Read a TOML file of the package, once.

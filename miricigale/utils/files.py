@@ -14,6 +14,7 @@ from astropy.io import fits
 from astropy.units import UnitsError
 from astropy.utils.exceptions import AstropyDeprecationWarning
 
+from miricigale.utils.caching import cached
 from miricigale.utils.configuration import conf
 from miricigale.utils.exceptions import DataError, warn
 
@@ -28,14 +29,18 @@ _EXPANSION = 8
 PARTIAL = ".partial-"
 
 
-def cached_by_file(maxsize):
+def cached_by_file(maxsize, *, copies=False):
     """
     Decorator: keep what a function of a file makes, as long as the file stays the same one.
+
+    Nobody who gets it can change it for others (`~miricigale.utils.caching.cached`).
 
     Parameters
     ----------
     maxsize : int
         How many results are kept; the least recently used go.
+    copies : bool, optional
+        Whether each caller gets a copy, as of `~miricigale.utils.caching.cached`.
 
     Returns
     -------
@@ -44,7 +49,7 @@ def cached_by_file(maxsize):
     """
 
     def decorate(function):
-        @functools.lru_cache(maxsize=maxsize)
+        @cached(maxsize=maxsize, copies=copies)
         def kept(path, state, *args):
             del state
             return function(path, *args)

@@ -1,7 +1,6 @@
 """What a result says of where it came from."""
 
 import datetime
-import functools
 import importlib.metadata
 import json
 import math
@@ -9,8 +8,10 @@ import re
 
 import numpy as np
 
+from miricigale.utils.caching import cached
 
-@functools.cache
+
+@cached
 def _version():
     try:
         return importlib.metadata.version("miricigale")

@@ -203,7 +203,7 @@ def _call_from_file(path, item):
     return _unpickled(path)(item)
 
 
-@functools.lru_cache(maxsize=1)
+@functools.lru_cache(maxsize=1)  # what the caller made is not ours to freeze
 def _unpickled(path):
     # a pickle can run any code; this one is of the process that asks for the work, which wrote it to a
     # temporary file that its user alone can read and write (mkstemp), and nothing else is read here

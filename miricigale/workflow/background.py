@@ -1,12 +1,11 @@
 """The background of sky and telescope as options have it: by level, position or day."""
 
-import functools
-
 import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
 
 from miricigale.depth import sky_background
+from miricigale.utils.caching import cached
 from miricigale.utils.units import SURFACE_BRIGHTNESS
 from miricigale.workflow.options import require
 
@@ -85,7 +84,7 @@ def band_background(filter, filters, levels, *, position=None, date=""):
     return _named(filter, level, place, date)
 
 
-@functools.lru_cache(maxsize=64)
+@cached(maxsize=64)
 def _named(filter, level, place, date):
     """Background of a named level: asked for by every exposure, and some time to evaluate for a day."""
     if place is None:

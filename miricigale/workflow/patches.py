@@ -22,6 +22,7 @@ from miricigale.photometry.from_files import TABLE_KIND
 from miricigale.photometry.kernel_files import file_place
 from miricigale.photometry.patches import PatchGrid, join_patches, measure_patch, patch_parts
 from miricigale.photometry.priors import read_catalog
+from miricigale.utils.caching import cached
 from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import cached_by_file, replacing
@@ -122,7 +123,7 @@ def _absolute(path):
     return None if path is None else os.path.abspath(path)
 
 
-@functools.lru_cache(maxsize=4)
+@cached(maxsize=4)
 def _made(files, patches):
     values = json.loads(files.inputs, object_hook=_from_plain)
     inputs = Inputs(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
@@ -152,7 +153,7 @@ def _bytes(inputs, grid, unit):
     return inputs.n_bytes(prior, images)
 
 
-_sources = cached_by_file(1)(read_catalog)
+_sources = cached_by_file(1, copies=True)(read_catalog)
 
 
 def _catalog(inputs):

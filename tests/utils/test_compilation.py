@@ -1,6 +1,10 @@
 import subprocess
 import sys
 
+import pytest
+
+from miricigale.utils.compilation import subpackage_of
+
 CALLEE = """
 from miricigale.utils.compilation import njit
 
@@ -42,3 +46,18 @@ def test_a_kernel_is_compiled_again_when_one_that_it_calls_has_changed(tmp_path)
     (toy / "first/_core.py").write_text(CALLEE.format(2))
     assert ask() == ["30", "0"]
     assert ask() == ["30", "1"]
+
+
+@pytest.mark.parametrize(
+    ("module", "name"),
+    [
+        ("miricigale.photometry._core.stamps", "photometry"),
+        ("miricigale.psf._core", "psf"),
+        ("numba.np.arraymath", ""),
+        ("numba.cpython.listobj", ""),
+        ("toy.first._core", ""),
+        ("miricigale", ""),
+    ],
+)
+def test_messages_name_subpackages_of_this_package_only(module, name):
+    assert subpackage_of(module) == name

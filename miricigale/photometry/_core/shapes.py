@@ -1,12 +1,11 @@
 """Sersic profiles seen through a PSF, with their derivatives, by their transforms."""
 
-import functools
-
 import numpy as np
 import scipy.fft
 import scipy.interpolate
 import scipy.special
 
+from miricigale.utils.caching import cached
 from miricigale.utils.compilation import njit
 
 #: Sersic indices that can be fitted.
@@ -23,7 +22,7 @@ FAST = {"reassoc", "contract", "nsz"}
 _POINT = -9.0
 
 
-@functools.cache
+@cached
 def profile_table():
     """
     Transforms of Sersic profiles of unit light and radius, for the kernels.

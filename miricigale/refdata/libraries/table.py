@@ -1,6 +1,5 @@
 """The one format in which libraries are kept: FITS, an image for each kind of spectrum."""
 
-import functools
 import threading
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,6 +8,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import Table
 
+from miricigale.utils.caching import cached_property
 from miricigale.utils.exceptions import argument_error, data_error
 from miricigale.utils.files import cached_by_file, open_fits
 from miricigale.utils.options import check_data, check_that
@@ -102,7 +102,7 @@ class LibraryTable:
         """Number of spectra of each kind."""
         return len(next(iter(self.spectra.values())))
 
-    @functools.cached_property
+    @cached_property
     def levels(self):
         """Different values of each axis, ascending: dict of name to `~numpy.ndarray`, read-only."""
         levels = {}

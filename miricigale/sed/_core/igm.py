@@ -7,11 +7,11 @@ is integrated from redshift 0. Where the published formulae are silent (observed
 0.0912 um) this is what their own integrands give.
 """
 
-import functools
 import math
 
 import numpy as np
 
+from miricigale.utils.caching import cached
 from miricigale.utils.compilation import njit
 
 LYMAN_LIMIT = 0.0912  # um, the rounded value that Madau, Meiksin and CIGALE use
@@ -38,7 +38,7 @@ def lyman_lines(n_max=_N_MAX):
 # ------------------------------------------------------------------------- Meiksin
 
 
-@functools.cache
+@cached
 def _lls_terms():
     factorial = [math.factorial(n) for n in range(10)]
     first = 0.2788 - math.exp(-1.0)
@@ -47,7 +47,7 @@ def _lls_terms():
     return first, np.array(series)
 
 
-@functools.cache
+@cached
 def _meiksin_lines():
     """Wavelengths of the lines n = 2 ... 30, and depths over Lyman alpha at 1 + z = 4."""
     n = np.arange(2, _N_MAX, dtype=float)

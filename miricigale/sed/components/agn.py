@@ -1,6 +1,5 @@
 """Active nuclei: accretion disk, dusty torus and polar dust."""
 
-import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +9,7 @@ from miricigale.refdata.libraries.table import open_library
 from miricigale.sed import _core
 from miricigale.sed.component import Component, register
 from miricigale.sed.parameter import Parameter
+from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import cached_by_file
 from miricigale.utils.units import frozen_array
@@ -179,7 +179,7 @@ class AGN(Component):
         return ("temperature_polar", "emissivity_polar") if values["ebv_polar"] == 0.0 else ()
 
 
-@functools.lru_cache(maxsize=16)
+@cached(maxsize=16)
 def _polar_grid(wave_bytes, law):
     wave = np.frombuffer(wave_bytes)
     if law != _GRAINS:

@@ -1,12 +1,11 @@
 """Attenuation of starlight by dust."""
 
-import functools
-
 import numpy as np
 
 from miricigale.sed import _core
 from miricigale.sed.component import Component, register
 from miricigale.sed.parameter import Parameter
+from miricigale.utils.caching import cached
 from miricigale.utils.declared import declared
 
 # Cardelli et al. 1989, equation 5, in 1 um / lambda - 8: the highest power first
@@ -46,7 +45,7 @@ _CURVES = {
 _MAG = -0.4 * np.log(10.0)
 
 
-@functools.lru_cache(maxsize=64)
+@cached(maxsize=64)
 def _exponents(wave, law, *shape):
     """
     First and last wavelength that a law dims, and ln of what one magnitude leaves there.

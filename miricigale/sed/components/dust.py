@@ -1,7 +1,5 @@
 """Emission of dust in galaxies; the energy is what attenuation took."""
 
-import functools
-
 import numpy as np
 
 from miricigale.refdata.libraries.table import open_library
@@ -9,6 +7,7 @@ from miricigale.refdata.tables import read_images
 from miricigale.sed import _core
 from miricigale.sed.component import Component, register
 from miricigale.sed.parameter import Parameter
+from miricigale.utils.caching import cached
 from miricigale.utils.files import cached_by_file
 from miricigale.utils.units import frozen_array
 
@@ -94,7 +93,7 @@ def _between(axis, values):
     return out
 
 
-@functools.lru_cache(maxsize=4)
+@cached(maxsize=4)
 def _sequence(library, column):
     """Alphas and spectra of an open library, in memory."""
     order = np.argsort(library.axes["alpha"])

@@ -9,6 +9,7 @@ from miricigale.refdata.tables import read_images
 from miricigale.sed import _core
 from miricigale.sed.component import Component, register
 from miricigale.sed.parameter import Parameter
+from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import file_errors
 from miricigale.utils.files import cached_by_file, open_fits
 from miricigale.utils.units import frozen_array
@@ -54,7 +55,7 @@ class NebularTable:
         """Numbers of the models of a metallicity, ascending in log U; empty if it is not there."""
         return np.flatnonzero(np.abs(self.metallicity / metallicity - 1.0) <= 1e-3)
 
-    @functools.lru_cache(maxsize=64)  # noqa: B019 -- tables live as long as the process
+    @cached(maxsize=64)
     def emission(self, metallicity, log_u):
         """
         Continuum and lines one after the other, shape (n_age, n_wave + n_line), linear in log U

@@ -1,6 +1,5 @@
 """Our own torus, a sum of blackbodies behind a screen."""
 
-import functools
 import tomllib
 from pathlib import Path
 from typing import NamedTuple
@@ -11,6 +10,7 @@ from miricigale.sed import _core
 from miricigale.sed.component import register
 from miricigale.sed.components.agn import AGN, TorusSpectra
 from miricigale.sed.parameter import Parameter
+from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import file_errors
 from miricigale.utils.files import cached_by_file
 from miricigale.utils.units import frozen_array
@@ -184,14 +184,14 @@ def _dust_shape(e, wave_bytes, shape):
     return emission * -np.expm1(-layer * opacity) * np.exp(-sight * opacity)
 
 
-@functools.lru_cache(maxsize=16)
+@cached(maxsize=16)
 def _planck_by_radius(wave_bytes, temperature, b, ratio):
     wave = np.frombuffer(wave_bytes)
     rho = np.geomspace(1.0, ratio, 60)
     return rho, _core.planck_lambda(wave[:, None], temperature * rho**-b)
 
 
-@functools.cache
+@cached
 def _gauss(n):
     x, w = np.polynomial.legendre.leggauss(n)
     return 0.5 * (x + 1.0), 0.5 * w

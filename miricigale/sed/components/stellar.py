@@ -1,7 +1,5 @@
 """Light of stars from simple stellar populations."""
 
-import functools
-
 import numpy as np
 
 from miricigale.refdata.libraries.table import open_library
@@ -9,6 +7,7 @@ from miricigale.refdata.tables import load_ssp
 from miricigale.sed import _core
 from miricigale.sed.component import Component, register
 from miricigale.sed.parameter import Parameter
+from miricigale.utils.caching import cached
 from miricigale.utils.options import check_that
 from miricigale.utils.units import frozen_array
 
@@ -125,12 +124,12 @@ class StellarPopulations(Component):
         return None
 
 
-@functools.lru_cache(maxsize=256)
+@cached(maxsize=256)
 def _nearest(known, metallicity):
     return min(known, key=lambda z: abs(np.log(z / metallicity)))
 
 
-@functools.lru_cache(maxsize=16)
+@cached(maxsize=16)
 def _steps(age_bytes):
     """Steps of 1 Myr among these ages, as many as a history may have."""
     return _core.age_steps(np.frombuffer(age_bytes, dtype=float), _OLDEST)
@@ -235,7 +234,7 @@ class BC03Library(StellarPopulations):
         return f"{type(self).__name__}({', '.join(values)})"
 
 
-@functools.lru_cache(maxsize=8)
+@cached(maxsize=8)
 def _library_table(library, metallicity):
     """Ages, spectra in memory and surviving masses of one metallicity of an open library."""
     rows = np.flatnonzero(library.axes["metallicity"] == metallicity)

@@ -2,7 +2,6 @@
 
 import collections
 import dataclasses
-import functools
 import itertools
 import socket
 import time
@@ -13,6 +12,7 @@ from collections.abc import Callable
 from astropy.table import QTable
 
 from miricigale.instrument.image_files import read_image, write_image
+from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import data_error, warn
 from miricigale.utils.folder import FileFolder
 from miricigale.utils.meta import undated
@@ -155,7 +155,7 @@ class Units:
         return [self._names[k] for k in sorted(found)]
 
 
-@functools.cache
+@cached
 def _parts(unit):
     names = [name for name in unit.split("/") if name]
     return frozenset([*names, *(name.rpartition("-")[0] or name for name in names)])

@@ -1,6 +1,5 @@
 """What is exposed, and the grids that cover it, from the configuration alone."""
 
-import functools
 import logging
 import math
 import operator
@@ -20,6 +19,7 @@ from miricigale.instrument import (
     tangent_offset,
     tile_offsets,
 )
+from miricigale.utils.caching import cached
 from miricigale.utils.options import check_that
 from miricigale.utils.positions import as_positions
 from miricigale.utils.table_files import read_table
@@ -88,7 +88,7 @@ def _dithers(options, k):
     return offsets, f"offsets in the file {path.name}{text}"
 
 
-@functools.lru_cache(maxsize=64)
+@cached(maxsize=64)
 def _file_pattern(path, *_, **part):
     """Offsets in a file, which is read again when it has changed."""
     with of_option(f"[exposures] dithers: {path.name}:", ValueError, u.UnitsError):
@@ -141,7 +141,7 @@ def _stamp(field):
     return stat.st_mtime_ns, stat.st_size
 
 
-@functools.lru_cache(maxsize=8)
+@cached(maxsize=8)
 def _pointings(field, filters, _):
     """Pointings of a section of a configuration."""
     roll = field.roll * u.deg
@@ -185,7 +185,7 @@ def _read_pointings(table, roll, filters):
     return tuple(found)
 
 
-@functools.lru_cache(maxsize=8)
+@cached(maxsize=8)
 def all_exposures(field, options, patterns, stamp):
     """Exposures by name of what `exposure_sections` gives; not to be changed."""
     units = {}

@@ -1,6 +1,5 @@
 """The pixels of mosaics and prior, of the whole field or of patches of it, and the exposures that see them."""
 
-import functools
 import math
 from typing import NamedTuple
 
@@ -8,6 +7,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.instrument import mosaic_wcs
+from miricigale.utils.caching import cached
 from miricigale.workflow.stages.exposures import (
     GRID,
     all_exposures,
@@ -40,12 +40,12 @@ class SkyPatch(NamedTuple):
     bands: tuple
 
 
-@functools.lru_cache(maxsize=8)
+@cached(maxsize=8, copies=True)
 def _whole(key, pixel_scale):
     return mosaic_wcs(list(all_exposures(*key).values()), pixel_scale * u.arcsec)
 
 
-@functools.lru_cache(maxsize=4)
+@cached(maxsize=4)
 def _patches(key, options, pixel_scale):
     """`~miricigale.photometry.patches.PatchGrid` and `SkyPatch` by name."""
     # whole fields need none of these, and commands that only read settings import nothing heavy

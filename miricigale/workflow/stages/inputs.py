@@ -13,6 +13,7 @@ from miricigale.photometry import YANG2021_DEPTHS
 from miricigale.refdata import resources
 from miricigale.refdata.lookup import fingerprint
 from miricigale.scene import read_catalog
+from miricigale.utils.caching import cached
 from miricigale.utils.content import file_sha256
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import error_column
@@ -114,10 +115,10 @@ def study_catalog(options):
     """The catalog of the section ``catalog`` of a configuration."""
     path = Path(options.source).expanduser()
     state = path.stat() if path.is_file() else None
-    return _catalog(options, state and (state.st_mtime_ns, state.st_size)).copy()
+    return _catalog(options, state and (state.st_mtime_ns, state.st_size))
 
 
-@functools.lru_cache(maxsize=2)
+@cached(maxsize=2, copies=True)
 def _catalog(options, state):
     """The catalog, read and warned of once; ``state`` changes with a file."""
     pairs = {"columns": options.columns, "units": options.units}
@@ -238,7 +239,7 @@ class FitPieces:
         self._paths = [context.path(f"{of_patch(name, piece)}.fits") for piece in pieces(n)]
         self._read = functools.lru_cache(maxsize=1)(fitting.FitResults.read)
         #: Called with the name of an array, such as ``"chi2"``: that of all sources.
-        self.of = functools.cache(self._joined)
+        self.of = cached(self._joined)
 
     @property
     def first(self):

@@ -1,0 +1,173 @@
+"""Results that are kept and shared: whoever gets one cannot change it for all others."""
+
+import copy
+import dataclasses
+import functools
+
+import numpy as np
+
+
+class FrozenDict(dict):
+    """
+    A dict that cannot be changed, shared by all who read it.
+
+    ``copy()``, ``dict(...)`` and ``|`` give a plain dict. A copy by `copy.deepcopy` is plain throughout.
+    """
+
+    def _refuse(self, *args, **kwargs):
+        msg = "this dict is shared and cannot be changed; change a copy, dict(...) or copy.deepcopy"
+        raise TypeError(msg)
+
+    __setitem__ = __delitem__ = __ior__ = _refuse
+    clear = pop = popitem = setdefault = update = _refuse
+
+    def copy(self):
+        """A plain dict of the same values."""
+        return dict(self)
+
+    def __copy__(self):
+        return dict(self)
+
+    def __deepcopy__(self, memo):
+        return copy.deepcopy(dict(self), memo)
+
+    def __reduce__(self):
+        return type(self), (dict(self),)
+
+
+class FrozenList(list):
+    """A list that cannot be changed, shared by all who read it; a slice and a copy are plain lists."""
+
+    def _refuse(self, *args, **kwargs):
+        msg = "this list is shared and cannot be changed; change a copy, list(...) or copy.deepcopy"
+        raise TypeError(msg)
+
+    __setitem__ = __delitem__ = __iadd__ = __imul__ = _refuse
+    append = clear = extend = insert = pop = remove = reverse = sort = _refuse
+
+    def copy(self):
+        """A plain list of the same values."""
+        return list(self)
+
+    def __copy__(self):
+        return list(self)
+
+    def __deepcopy__(self, memo):
+        return copy.deepcopy(list(self), memo)
+
+    def __reduce__(self):
+        return type(self), (list(self),)
+
+
+def frozen(value):
+    """
+    Make a value one that cannot be changed.
+
+    Parameters
+    ----------
+    value : object
+        Arrays and quantities are marked read-only as they are; so are those of frozen dataclasses. Dicts, lists
+        and sets are replaced by ones that refuse changes (`FrozenDict`, `FrozenList`, `frozenset`), with frozen
+        values. Anything else is returned as it is.
+
+    Returns
+    -------
+    value : object
+    """
+    if isinstance(value, np.ndarray):
+        _freeze_array(value)
+        return value
+    if isinstance(value, dict):
+        return FrozenDict({key: frozen(entry) for key, entry in value.items()})
+    if isinstance(value, list):
+        return FrozenList(frozen(entry) for entry in value)
+    if isinstance(value, tuple):
+        entries = [frozen(entry) for entry in value]
+        return type(value)(*entries) if hasattr(value, "_fields") else tuple(entries)
+    if isinstance(value, set):
+        return frozenset(value)
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        _freeze_fields(value)
+    return value
+
+
+def _freeze_array(array):
+    """Mark an array read-only, and the data and mask of a masked one."""
+    if isinstance(array, np.ma.MaskedArray):
+        array.harden_mask()
+        if array.mask is not np.ma.nomask:
+            array.mask.flags.writeable = False
+        array.data.flags.writeable = False
+    array.flags.writeable = False
+
+
+def _freeze_fields(value):
+    """Freeze the fields of a frozen dataclass; those of others are theirs to change."""
+    if not value.__dataclass_params__.frozen:
+        return
+    for field in dataclasses.fields(value):
+        entry = getattr(value, field.name, None)
+        changed = frozen(entry)
+        if changed is not entry:
+            object.__setattr__(value, field.name, changed)
+
+
+def cached(function=None, *, maxsize=None, copies=False):
+    """
+    Decorator: keep what a function returns, so that nobody who gets it can change it for others.
+
+    Parameters
+    ----------
+    function : callable, optional
+        Its arguments are hashable.
+    maxsize : int, optional
+        How many results are kept; the least recently used go. All by default.
+    copies : bool, optional
+        Whether each caller gets a copy: for tables and coordinate systems, which have no form that cannot be
+        changed. Otherwise results are `frozen`.
+
+    Returns
+    -------
+    function : callable
+        With ``cache_info`` and ``cache_clear`` of `functools.lru_cache`.
+
+    Examples
+    --------
+    >>> from miricigale.utils.caching import cached
+    >>> @cached
+    ... def squares(n):
+    ...     return {"squares": [k**2 for k in range(n)]}
+    >>> squares(3)["squares"].append(9)
+    Traceback (most recent call last):
+        ...
+    TypeError: this list is shared and cannot be changed; change a copy, list(...) or copy.deepcopy
+    """
+    if function is None:
+        return functools.partial(cached, maxsize=maxsize, copies=copies)
+    if not copies:
+
+        @functools.wraps(function)
+        def make(*args, **kwargs):
+            return frozen(function(*args, **kwargs))
+
+        return functools.lru_cache(maxsize=maxsize)(make)
+    kept = functools.lru_cache(maxsize=maxsize)(function)
+
+    @functools.wraps(function)
+    def call(*args, **kwargs):
+        return copy.deepcopy(kept(*args, **kwargs))
+
+    call.cache_info = kept.cache_info
+    call.cache_clear = kept.cache_clear
+    return call
+
+
+class cached_property(functools.cached_property):
+    """`functools.cached_property` of an object that is shared: the value is `frozen`."""
+
+    def __init__(self, function):
+        @functools.wraps(function)
+        def make(instance):
+            return frozen(function(instance))
+
+        super().__init__(make)
