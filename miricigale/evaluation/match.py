@@ -6,8 +6,16 @@ from astropy.coordinates import SkyCoord
 from astropy.table import QTable, Table
 
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.ids import ids_and_missing
 from miricigale.utils.options import check_that
-from miricigale.utils.tables import Flags, described_table, error_column, match_sky, require_columns
+from miricigale.utils.tables import (
+    Flags,
+    described_table,
+    error_column,
+    match_sky,
+    read_ids,
+    require_columns,
+)
 from miricigale.utils.units import ANGLE, FNU, positive, to_array
 
 
@@ -101,9 +109,10 @@ def associate(first, second, *, radius):
         catalog, here = (first, second)[k], rows[k] >= 0
         columns[name] = (rows[k], f"Row of the {name} catalog, -1 for none")
         if isinstance(catalog, Table) and "id" in catalog.colnames:
-            values = np.asarray(catalog["id"])
+            values, missing = ids_and_missing(catalog["id"], name)
             values = np.append(values, np.zeros(1, values.dtype))[rows[k]]
-            ids[f"{name}_id"] = (np.ma.MaskedArray(values, mask=~here), None)
+            missing = np.append(missing, True)[rows[k]]
+            ids[f"{name}_id"] = (np.ma.MaskedArray(values, mask=missing | ~here), None)
         near_by = np.full(len(here), -1)
         near_by[here] = near.count[k][rows[k][here]]
         text = f"Rows of the {other} catalog within the radius of the row of the {name}"
@@ -227,7 +236,7 @@ def match_truth(truth, measured, bands, *, radius=0.5 * u.arcsec):
     index, separation = match_sky(measured["sky"], truth["sky"], radius=radius)
     found = index >= 0
     table = QTable({"id": truth["id"], "sky": truth["sky"]})
-    ids = np.asarray(measured["id"])
+    ids = read_ids(measured, "measured")
     table["measured_id"] = np.where(found, ids[index], -1) if len(measured) else -1
     table["separation"] = separation
     table["matched"] = found

@@ -11,6 +11,7 @@ import numpy as np
 from miricigale.filters.catalog_map import CatalogMap
 from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
 from miricigale.utils.files import reading
+from miricigale.utils.ids import counted_ids, warn_of_duplicates
 from miricigale.utils.missing import plain_floats, without_codes
 from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import error_column
@@ -26,7 +27,7 @@ def read_catalog_photometry(path, catalog_map=None, *, hdu=None, **options):
     Parameters
     ----------
     path : path-like
-        FITS, ECSV, VOTable, CSV or text.
+        FITS (``file.fits[2]`` names an extension), ECSV, VOTable, CSV or text.
     catalog_map : `CatalogMap`, str or path-like, optional
         Names and units; the name of a survey (`SURVEYS`), or a file (`CatalogMap.read`): TOML, or a translate file
         of EAZY.
@@ -39,8 +40,8 @@ def read_catalog_photometry(path, catalog_map=None, *, hdu=None, **options):
     Returns
     -------
     photometry : `~astropy.table.QTable`
-        Of our names: ``id``, fluxes by filter and ``<filter>_err`` in uJy, NaN where missing, and the other
-        columns of the file. `~miricigale.fitting.BayesFitter.fit` and
+        Of our names: ``id`` (integers or text, as in the file), fluxes by filter and ``<filter>_err`` in uJy, NaN
+        where missing, and the other columns of the file. `~miricigale.fitting.BayesFitter.fit` and
         `~miricigale.photometry.ErrorModel.from_tables` take it as it is.
 
     Raises
@@ -53,7 +54,7 @@ def read_catalog_photometry(path, catalog_map=None, *, hdu=None, **options):
     Warns
     -----
     `~miricigale.utils.exceptions.CatalogWarning`
-        Of numbers that stand for no value, and of bands without a filter.
+        Of numbers that stand for no value, of bands without a filter, and of ids that occur more than once.
 
     Examples
     --------
@@ -63,10 +64,12 @@ def read_catalog_photometry(path, catalog_map=None, *, hdu=None, **options):
     """
     catalog_map = as_catalog_map(catalog_map, options)
     path = Path(path)
-    table = read_table(path, wanted="a table", hdu=hdu)
+    table = read_table(path, wanted="a table", hdu=hdu, id_names=catalog_map.id_names)
     with reading(path, "a catalog"):
         _, lost = catalog_map.names(table.colnames, path.name)
         table, coded = catalog_map.convert(table, path.name)
+    if "id" in table.colnames:
+        warn_of_duplicates(table["id"], path.name, what="fits take the first row of each only")
     for text in catalog_messages(lost, [coded]):
         warn(f"{path.name}: {text}", CatalogWarning)
     return table
@@ -148,6 +151,30 @@ def warn_of_codes(pieces, where):
     ):
         how = "NaN is a missing band; read_catalog_photometry, or --map, makes them so"
         warn(f"{where}: {text} ({how})", CatalogWarning)
+
+
+class CountedRows:
+    """
+    A table on disk by pieces, without ids: ``id`` counts the rows from 1.
+
+    Parameters
+    ----------
+    rows : `~miricigale.utils.row_files.RowFile` or `MappedRows`
+        The file.
+    """
+
+    def __init__(self, rows):
+        self._rows, self.colnames = rows, ("id", *rows.colnames)
+
+    def __getattr__(self, name):
+        return getattr(self._rows, name)
+
+    def chunk(self, i):
+        """A piece of the table."""
+        table = self._rows.chunk(i)
+        start, _ = self._rows.span(i)
+        table.add_column(counted_ids(table, self._rows.path.name, start), index=0, name="id")
+        return table
 
 
 class MappedRows:

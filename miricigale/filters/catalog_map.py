@@ -9,7 +9,7 @@ from pathlib import Path
 import astropy.units as u
 import numpy as np
 from astropy.coordinates import Angle
-from astropy.table import QTable
+from astropy.table import MaskedColumn, QTable
 
 from miricigale.filters.band_names import eazy_filter
 from miricigale.filters.filter import Filter
@@ -23,6 +23,7 @@ from miricigale.utils.exceptions import (
     unknown_name,
     warn,
 )
+from miricigale.utils.ids import id_column, ids_and_missing
 from miricigale.utils.missing import negative_codes, negative_errors, plain_floats, without_codes
 from miricigale.utils.options import check_choice, check_data, check_names, check_that
 from miricigale.utils.tables import error_column
@@ -46,7 +47,7 @@ class CatalogMap:
     columns : dict of str to str, optional
         Our name of a column to the file's, such as ``{"wfc3.f160w": "FLUX_H"}``. Ours are ``id``, ``ra``,
         ``dec``, ``redshift``, names of filters, those with ``_err`` for errors, and any other without a dot.
-        Columns that are not named keep their names.
+        Columns that are not named keep their names, but for the ids (`miricigale.utils.ids.id_column`).
     units : dict of str to str or `~astropy.units.Unit`, optional
         Units by our name, for columns whose file gives none or a wrong one; ``"flux"`` stands for all
         fluxes and errors: ``{"flux": "mJy", "ra": "hourangle"}``, ``{"flux": "0.3631 uJy"}`` for a
@@ -129,6 +130,11 @@ class CatalogMap:
         check_data(not unknown, path, f"is no map of columns: it has {unknown}; known: {known}")
         return cls(**values)
 
+    @property
+    def id_names(self):
+        """Column of the file that the map calls ``id``: a tuple, empty if it names none."""
+        return (self.columns["id"],) if "id" in self.columns else ()
+
     def settings(self):
         """What the map says, in plain values."""
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
@@ -157,6 +163,11 @@ class CatalogMap:
             is left out.
         lost : list of str
             Fluxes by the survey's names that no filter here belongs to.
+
+        Raises
+        ------
+        KeyError, ValueError
+            If a column is not there; if there is none of the survey, or several could be the ids.
         """
         colnames = list(colnames)
         columns, lost = {}, []
@@ -166,6 +177,9 @@ class CatalogMap:
                 wanted = f"a table with columns of {self.survey!r}"
                 raise argument_error(argument, wanted, f"columns {colnames}")
         taken = set(self.columns.values())
+        if "id" not in {**columns, **self.columns}:
+            theirs = id_column([name for name in colnames if name not in taken], argument)
+            columns |= {} if theirs in (None, "id") else {"id": theirs}
         columns = {ours: theirs for ours, theirs in columns.items() if theirs not in taken}
         columns |= self.columns
         for ours, theirs in columns.items():
@@ -211,7 +225,7 @@ class CatalogMap:
         for theirs, ours in names.items():
             out[ours] = table[theirs]
         check_names(self.units, f"column of {argument}", [*out.colnames, "flux"])
-        _plain_ids(out)
+        _plain_ids(out, argument)
         factor = self._factor(table, argument)
         coded = {}
         for name in out.colnames:
@@ -328,16 +342,12 @@ def _translated(text, path):
     return columns
 
 
-def _plain_ids(table):
-    """Ids as integers where they are whole, and as text where they are other numbers or objects."""
-    if "id" not in table.colnames or np.any(getattr(table["id"], "mask", False)):
+def _plain_ids(table, argument):
+    """Ids as integers or text (`miricigale.utils.ids`), masked where they are missing."""
+    if "id" not in table.colnames:
         return
-    ids = np.asarray(getattr(table["id"], "unmasked", table["id"]))
-    if ids.dtype.kind == "f" and np.all(np.isfinite(ids)):
-        whole = np.all(ids == np.round(ids)) and np.all(np.abs(ids) < 2**53)
-        table["id"] = ids.astype(np.int64) if whole else np.array([repr(v) for v in ids.tolist()])
-    elif ids.dtype.kind == "O" and ids.size and all(isinstance(v, str) for v in ids.tolist()):
-        table["id"] = ids.astype(str)
+    ids, missing = ids_and_missing(table["id"], argument)
+    table["id"] = MaskedColumn(ids, mask=missing) if missing.any() else ids
 
 
 def _angles(column, unit, name, argument):

@@ -3,7 +3,6 @@
 import re
 
 import astropy.units as u
-import numpy as np
 from astropy.table import QTable
 
 from miricigale.filters.band_names import find_filter
@@ -11,6 +10,7 @@ from miricigale.filters.catalog_files import catalog_messages
 from miricigale.filters.catalog_map import CatalogMap
 from miricigale.filters.library import FILTERS
 from miricigale.utils.exceptions import CatalogWarning, warn
+from miricigale.utils.ids import counted_ids, id_column
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import as_table, error_column
 
@@ -25,7 +25,6 @@ _MAGNITUDE = re.compile(
 )
 # columns that are the only band asked for
 _ALONE = ("flux", "flux_density", "fnu", "f_nu", "mag", "magnitude", "abmag")
-_IDS = ("id", "number", "source_id", "objid")
 # after the name of a band: whether its flux is an upper limit
 _LIMIT = "_limit"
 
@@ -49,19 +48,20 @@ def as_photometry(data, bands, argument="photometry"):
     -------
     table : `~astropy.table.Table`
         Itself, if its columns have our names already; else a copy with fluxes by band, errors ``<band>_err``
-        and ``id``, which counts the rows from 1 where there is none.
+        and ``id`` (`miricigale.utils.ids.id_column`), which counts the rows from 1 where there is none.
 
     Raises
     ------
     ValueError
-        If it is no table, or two columns are the same band.
+        If it is no table, two columns are the same band, or several columns could be the ids.
     `~astropy.units.UnitsError`
         If errors of magnitudes are in another unit than mag or a flux density's.
 
     Warns
     -----
     `~miricigale.utils.exceptions.CatalogWarning`
-        Of magnitudes such as 99 or -99, which stand for no value and become NaN.
+        Of magnitudes such as 99 or -99, which stand for no value and become NaN; and if rows are counted though a
+        column looks like ids.
 
     Examples
     --------
@@ -81,7 +81,7 @@ def as_photometry(data, bands, argument="photometry"):
         out = QTable({back.get(name, name): out[name] for name in table.colnames}, copy=False)
     out.meta = table.meta
     if "id" not in out.colnames:
-        out["id"] = np.arange(1, len(out) + 1)
+        out["id"] = counted_ids(table, argument)
     catalog_map = CatalogMap(units=dict.fromkeys(magnitudes, u.ABmag))
     coded = {name: catalog_map.set_band(out, name, 1.0, argument) for name in magnitudes}
     for text in catalog_messages((), [coded]):
@@ -103,17 +103,17 @@ def band_columns(colnames, argument="photometry"):
     Returns
     -------
     names : dict of str to str
-        Our names by theirs, of bands with an error; magnitudes are left out.
+        Our names by theirs, of bands with an error and of the ids; magnitudes are left out.
 
     Raises
     ------
     ValueError
-        If two columns are the same band.
+        If two columns are the same band, or several could be the ids.
     """
     fluxes = [name for name in colnames if not _MAGNITUDE.match(name)]
     found = _our_names(fluxes, FILTERS.names(), argument)
     both = [name for name in found if error_column(name) in found]
-    kept = {*both, *map(error_column, both), *(f"{name}{_LIMIT}" for name in both)}
+    kept = {"id", *both, *map(error_column, both), *(f"{name}{_LIMIT}" for name in both)}
     return {theirs: ours for ours, theirs in found.items() if ours in kept and ours != theirs}
 
 
@@ -127,11 +127,14 @@ def our_names(colnames, argument="photometry"):
 def _our_names(colnames, bands, argument):
     """Our names of the columns that are fluxes and errors of bands, and of ids, to theirs."""
     errors = {error_column(name): name for name in bands}
-    found = {name: name for name in (*bands, *errors, "id") if name in colnames}
+    found = {name: name for name in (*bands, *errors) if name in colnames}
+    ids = id_column(colnames, argument)
+    if ids is not None:
+        found["id"] = ids
     for theirs in colnames:
-        if theirs in found:
+        if theirs in found or theirs == ids:
             continue
-        ours = "id" if theirs.lower() in _IDS else _band_of(theirs, bands)
+        ours = _band_of(theirs, bands)
         if ours is None or (ours in colnames):
             continue
         wanted = f"a table with one column for {ours!r}"

@@ -7,8 +7,9 @@ from miricigale.filters.catalog_files import codes_of, warn_of_codes
 from miricigale.filters.photometry_table import our_names
 from miricigale.fitting.likelihood import PhotometryReader, is_filter, unused_bands
 from miricigale.utils.exceptions import FitWarning, warn
+from miricigale.utils.ids import warn_of_duplicates
 from miricigale.utils.options import check_that
-from miricigale.utils.tables import as_table, error_column
+from miricigale.utils.tables import as_table, error_column, read_ids
 from miricigale.utils.units import FNU
 
 
@@ -67,6 +68,7 @@ def table_of(fitter, photometry):
         table = table.copy(copy_data=False)
         for name in lost:
             table[name] = table[error_column(name)] = np.full(len(table), np.nan) * FNU
+    warn_of_duplicates(read_ids(table), "photometry")
     warn_of_codes([codes_of(table, fitter._reader.fitted(table))], "photometry")
     fitter.warn_of_bands(table)
     return table

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from astropy.table import vstack
 
-from miricigale.filters.catalog_files import MappedRows, as_catalog_map
+from miricigale.filters.catalog_files import CountedRows, MappedRows, as_catalog_map
 from miricigale.filters.photometry_table import band_columns
 from miricigale.fitting.fitted_bands import bands_with_errors, warn_of_unfitted
 from miricigale.fitting.likelihood import unused_bands
@@ -21,14 +21,16 @@ log = logging.getLogger(__name__)
 
 def open_catalog(path, chunk_rows, *, hdu=None, catalog_map=None, flux_unit=None):
     """Open a catalog by rows (`~miricigale.utils.row_files.RowFile`), under our names or those of a map."""
-    rows = open_rows(path, chunk_rows, hdu=hdu)
-    if catalog_map is not None:
-        known = as_catalog_map(catalog_map)
+    known = None if catalog_map is None else as_catalog_map(catalog_map)
+    id_names = () if known is None else known.id_names
+    rows = open_rows(path, chunk_rows, hdu=hdu, id_names=id_names)
+    if known is not None:
         if flux_unit is not None:
             known = dataclasses.replace(known, units={"flux": flux_unit, **known.units})
-        return MappedRows(rows, known)
-    rows.rename(band_columns(rows.colnames, Path(path).name))
-    return rows
+        rows = MappedRows(rows, known)
+    else:
+        rows.rename(band_columns(rows.colnames, rows.path.name))
+    return rows if "id" in rows.colnames else CountedRows(rows)
 
 
 def give_units(table, fluxes, unit):

@@ -25,6 +25,7 @@ from miricigale.utils.content import content_sha256
 from miricigale.utils.exceptions import CatalogWarning, OtherResultsError, argument_error, warn
 from miricigale.utils.files import PARTIAL
 from miricigale.utils.folder import FileFolder
+from miricigale.utils.ids import Duplicates
 from miricigale.utils.meta import plain_value, undated
 from miricigale.utils.options import check_data, check_that
 from miricigale.utils.progress import progress
@@ -155,9 +156,13 @@ def fit_file(
             warn(f"{rows.path.name}: {text}", CatalogWarning)
     fluxes = {c for name in fitter.bands for c in (name, error_column(name))}
     take = _pieces(rows, options, unit, fluxes)
-    for i in range(rows.n_chunks) if "id" in rows.colnames else ():
+    kinds = set()
+    for i in range(rows.n_chunks):
         with _noted(rows, i):
-            ascii_ids(read_ids(rows.chunk(i)), "photometry")
+            ids = ascii_ids(read_ids(rows.chunk(i)), "photometry")
+            kinds |= {ids.dtype.kind} if ids.size else set()
+            got = "whole numbers in earlier rows, and others here"
+            check_that(len(kinds) < 2, "photometry", "a table with ids of one kind", got)
     given = {"hdu": hdu, "flux_unit": None if unit is None else unit.to_string()}
     given |= {} if catalog_map is None else {"map": rows.map.settings()}
     job = _job(fitter, rows, options | {"seed": seed}, given)
@@ -190,7 +195,7 @@ def _noted(rows, i):
 
 def _fit_parts(fitter, rows, take, folder, seed, executor, progress_bar):
     """Fit the pieces whose parts are not there, and write them."""
-    n_new, waiting = 0, deque()
+    n_new, waiting, duplicates = 0, deque(), Duplicates()
 
     def finish(i, made):
         (products, n_rows, n_fitted), name = made, part_name(i)
@@ -213,13 +218,18 @@ def _fit_parts(fitter, rows, take, folder, seed, executor, progress_bar):
         for i in range(rows.n_chunks):
             name = part_name(i)
             if name in folder.records and folder.is_whole(name):
-                bar.update(len(seen(part_ids(folder.path(name)))))
+                ids = part_ids(folder.path(name))
+                duplicates.add(ids, seen(ids))
+                bar.update(len(ids))
                 continue
             if name in folder.records:
                 logger.warning("%s is missing or damaged and is made again", folder.path(name))
             with _noted(rows, i):
                 table, options = take(i)
-                options |= {"seed": seed, "repeated": seen(read_ids(table))}
+                ids = read_ids(table)
+                repeated = seen(ids)
+                duplicates.add(ids, repeated)
+                options |= {"seed": seed, "repeated": repeated}
                 if n_new and submit:
                     waiting.append((i, submit(name, table, options)))
                 else:
@@ -234,6 +244,7 @@ def _fit_parts(fitter, rows, take, folder, seed, executor, progress_bar):
             # no more are in memory than are worked on
             collect(most)
         collect(0)
+    duplicates.warn(rows.path.name)
     logger.info("%s: %d parts, %d of them new", folder.folder, rows.n_chunks, n_new)
 
 

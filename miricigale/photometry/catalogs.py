@@ -6,6 +6,7 @@ from astropy.coordinates import SkyCoord
 from astropy.table import Table
 
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.ids import counted_ids, id_column
 from miricigale.utils.tables import require_columns, unique_ids
 
 #: Columns of a catalog that need not be there, and that templates keep.
@@ -27,9 +28,8 @@ def catalog_sources(catalog):
     sky = catalog["sky"]
     if not isinstance(sky, SkyCoord):
         raise argument_error("catalog", "a table whose 'sky' is a SkyCoord", type(sky).__name__)
-    ids = np.arange(1, len(sky) + 1)
-    if "id" in catalog.colnames:
-        ids = unique_ids(catalog["id"], "catalog")
+    name = id_column(catalog.colnames, "catalog", labels=False)
+    ids = counted_ids(catalog, "catalog") if name is None else unique_ids(catalog[name], "catalog")
     flux = components = None
     if "flux" in catalog.colnames:
         flux = np.asarray(getattr(catalog["flux"], "value", catalog["flux"]), float)

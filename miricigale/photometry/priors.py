@@ -8,15 +8,15 @@ import numpy as np
 from miricigale.photometry.arrays import nearest_values
 from miricigale.photometry.grids import open_map
 from miricigale.utils.exceptions import CatalogWarning, data_error, warn
+from miricigale.utils.ids import counted_ids, id_column
 from miricigale.utils.options import check_data, check_that
 from miricigale.utils.positions import as_positions
 from miricigale.utils.tables import as_table, unique_ids
 
 _log = logging.getLogger(__name__)
 
-#: Extensions of segmentation maps, and names of columns.
+#: Extensions of segmentation maps.
 SEGMENTS = ("SEGMENTATION", "SEGMAP", "SEG", "SCI")
-_ID = ("id", "number", "id_obj", "objid", "label")
 
 
 def read_prior(highres, *, segmentation=None, catalog=None):
@@ -189,12 +189,11 @@ def read_catalog(catalog, wcs=None):
     table["sky"] = as_positions(table, name, wcs, missing=True)
     if "id" not in table.colnames:
         # labels are the ids of files, and in tables those of segments
-        known = _ID if isinstance(catalog, (str, os.PathLike)) else _ID[:-1]
-        theirs = [one for one in table.colnames if one.lower() in known]
-        if not theirs:
+        theirs = id_column(table.colnames, name, labels=isinstance(catalog, (str, os.PathLike)))
+        if theirs is None:
             _log.info("%s has no ids; its rows are counted from 1", name)
-        table["id"] = table[theirs[0]] if theirs else np.arange(1, len(table) + 1)
-    table["id"] = unique_ids(np.asarray(table["id"]), name)
+        table["id"] = counted_ids(table, name) if theirs is None else table[theirs]
+    table["id"] = unique_ids(table["id"], name)
     return table
 
 

@@ -9,6 +9,7 @@ from miricigale.filters.surveys import flux_bands, is_band
 from miricigale.profiles import SERSIC_INDEX_RANGE
 from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
+from miricigale.utils.ids import id_column, likely_ids
 from miricigale.utils.missing import plain_floats, without_codes
 from miricigale.utils.options import check_that
 from miricigale.utils.positions import as_positions
@@ -113,8 +114,8 @@ def check_catalog(table, *, filters=(), wcs=None, argument="catalog"):
     table : `~astropy.table.Table`
         With positions (see `~miricigale.utils.positions.as_positions`) and fluxes, whose columns are called
         by their filter (``"miri.f770w"``), those of errors end on ``_err``. The other columns of
-        `CATALOG_COLUMNS` may be there, ``id`` must: without ``profile`` sources with a complete shape are
-        Sersic profiles and the others points. ``star`` (bool) says which sources are stars.
+        `CATALOG_COLUMNS` may be there, ids must (`miricigale.utils.ids.id_column`). Without ``profile`` sources
+        with a complete shape are Sersic profiles and the others points. ``star`` (bool) says which are stars.
     filters : iterable of str, optional
         Flux columns that must be there.
     wcs : `~astropy.wcs.WCS`, optional
@@ -161,6 +162,15 @@ def check_catalog(table, *, filters=(), wcs=None, argument="catalog"):
     check_that(isinstance(table, Table), argument, "a table", type(table).__name__)
     catalog = QTable(table, copy=True)
     check_that(len(catalog), argument, "a table with rows", "none")
+    ids = id_column(catalog.colnames, argument)
+    if ids is None:
+        looks = likely_ids(catalog)
+        hint = f" ({looks[0]!r} looks like ids: name it 'id')" if looks else ""
+        raise argument_error(
+            argument, "a table with the columns ['id']", f"columns {catalog.colnames}{hint}"
+        )
+    if ids != "id":
+        catalog.rename_column(ids, "id")
     catalog["sky"] = as_positions(catalog, argument, wcs)
     points = list(_fill_columns(catalog, argument))
     units = {name: unit for name, unit in CATALOG_COLUMNS.items() if unit is not None}
@@ -169,7 +179,9 @@ def check_catalog(table, *, filters=(), wcs=None, argument="catalog"):
     require_columns(catalog, filters, argument, units=dict.fromkeys(fluxes, FNU))
     ids = read_ids(catalog, argument)
     wanted = "a table with integers or text in 'id'"
-    check_that(ids.dtype.kind in "iuU", argument, wanted, catalog["id"].dtype)
+    # a number with a fraction is rather a measurement
+    plain = ids.dtype.kind in "iu" or (ids.dtype.kind == "U" and catalog["id"].dtype.kind != "f")
+    check_that(plain, argument, wanted, catalog["id"].dtype)
     catalog["id"] = unique_ids(ascii_ids(ids, argument), argument)
     profile = catalog["profile"]
     # missing ones are refused below

@@ -1,11 +1,9 @@
 """Catalogs of users, read from common formats with their own names and units."""
 
-import warnings
 from pathlib import Path
 
 import astropy.units as u
 import numpy as np
-from astropy.units import UnitsWarning
 
 from miricigale.filters import Filter
 from miricigale.filters.catalog_files import as_catalog_map, catalog_messages
@@ -13,7 +11,7 @@ from miricigale.filters.surveys import flux_bands
 from miricigale.refdata import locate, resources
 from miricigale.scene.catalog import CatalogFlags, check_catalog
 from miricigale.utils.exceptions import CatalogWarning, DataError, warn
-from miricigale.utils.files import reading
+from miricigale.utils.files import reading, split_extension
 from miricigale.utils.table_files import read_table
 from miricigale.utils.units import ab_magnitude
 
@@ -80,14 +78,12 @@ def read_catalog(path, catalog_map=None, **options):
     if not isinstance(path, Path) and name in resources():
         path = locate(name)
     path = Path(path).expanduser()
-    if not path.is_file():
+    if not Path(split_extension(path)[0]).is_file():
         known = ", ".join(key for key in sorted(resources()) if key.startswith("catalog."))
         msg = f"no catalog {name!r}: neither a file nor one of {known}"
         raise DataError(msg)
     catalog_map = as_catalog_map(catalog_map, options)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", UnitsWarning)
-        table = read_table(path, wanted="a table")
+    table = read_table(path, wanted="a table", id_names=catalog_map.id_names)
     with reading(path, "a catalog"):
         _, lost = catalog_map.names(table.colnames, path.name)
         table, coded = catalog_map.convert(table, path.name)

@@ -279,6 +279,16 @@ def unpacked_size(path):
     return n_bytes
 
 
+def packed_open(path):
+    """Open a file for reading bytes, unpacked if it is packed by gzip, bzip2 or xz."""
+    with open(path, "rb") as stream:
+        start = stream.read(6)
+    for begin, module in _PACKED.items():
+        if start.startswith(begin):
+            return importlib.import_module(module).open(path)
+    return open(path, "rb")
+
+
 @cached_by_file(256)
 def _count(path, most):
     """Bytes after unpacking; one more than the most if there are more."""

@@ -93,16 +93,91 @@ def _is_code(values):
     return (np.abs(size - _CODES) <= 1e-6 * _CODES).any(axis=-1)
 
 
+#: Words that stand for no value in tables of text, in lower case.
+_WORDS = (
+    "",
+    "nan",
+    "null",
+    "na",
+    "n/a",
+    "#n/a",
+    "none",
+    "<na>",
+    "nil",
+    "-",
+    "--",
+    "---",
+    "...",
+    "masked",
+)
+
+
+def is_missing_word(texts):
+    """Which texts stand for no value, such as ``null``, ``NA`` or ``--``: array of bool."""
+    return np.isin(np.char.lower(np.char.strip(np.asarray(texts, dtype=str))), _WORDS)
+
+
+def mask_of(values):
+    """
+    Return where values are masked.
+
+    Parameters
+    ----------
+    values : array_like
+        `~numpy.ma.MaskedArray`, a column, `~astropy.utils.masked.Masked`, a quantity or anything else; of objects
+        None and pandas' ``NA`` count as masked.
+
+    Returns
+    -------
+    mask : `~numpy.ndarray` of bool
+        Of the shape of the values.
+    """
+    if not hasattr(values, "dtype") and not hasattr(values, "mask"):
+        values = np.asanyarray(values)
+    shape = np.shape(values)
+    mask = np.broadcast_to(np.asarray(getattr(values, "mask", False), dtype=bool), shape)
+    kind = getattr(getattr(values, "dtype", None), "kind", "O")
+    if kind == "O" and not hasattr(values, "unit"):
+        objects = np.asarray(values, dtype=object)
+        if objects.shape == shape:
+            gone = [
+                v is None or v is np.ma.masked or type(v).__name__ == "NAType"
+                for v in objects.ravel()
+            ]
+            mask = mask | np.array(gone, dtype=bool).reshape(shape)
+    return mask
+
+
 def plain_floats(column, name, argument):
-    """A column as plain floats, NaN where masked or blank."""
-    mask = np.broadcast_to(np.asarray(getattr(column, "mask", False)), np.shape(column))
+    """
+    A column as plain floats, NaN where masked, blank or a word for no value (`is_missing_word`).
+
+    A `ValueError` names the row and the text that is no number.
+    """
+    mask = mask_of(column)
     column = getattr(column, "value", column)
     values = np.ma.getdata(getattr(column, "unmasked", column))
-    if values.dtype.kind in "OUS":
+    if values.dtype.kind == "S":
+        values = np.char.decode(values, "utf-8", "replace")
+    if values.dtype.kind in "OU":
         # a column without a single number is text to the reader
         values = np.where(mask, "nan", values.astype(str))
+        values = np.where(is_missing_word(values), "nan", values)
     try:
         return np.where(mask, np.nan, values.astype(float))
     except (TypeError, ValueError):
+        row = _first_word(values)
         wanted = f"a table with numbers in {name!r}"
-        raise argument_error(argument, wanted, repr(values[0])) from None
+        raise argument_error(
+            argument, wanted, f"{values[row]!s:.40} in row {row} (from 0)"
+        ) from None
+
+
+def _first_word(values):
+    """Row of the first value that is no number."""
+    for row, value in enumerate(values.tolist()):
+        try:
+            float(value)
+        except (TypeError, ValueError):
+            return row
+    return 0

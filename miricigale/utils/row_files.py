@@ -9,19 +9,25 @@ from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
-from astropy.table import QTable
+from astropy.table import QTable, Table
 
 from miricigale.utils.content import file_sha256
 from miricigale.utils.exceptions import DataError, data_error
-from miricigale.utils.files import open_fits, reading, replacing, unreadable
+from miricigale.utils.files import open_fits, reading, replacing, split_extension, unreadable
 from miricigale.utils.meta import plain_value
 from miricigale.utils.optional import require
 from miricigale.utils.options import check_data
-from miricigale.utils.table_files import arrow_table, read_table
+from miricigale.utils.table_files import (
+    LDAC_HEADER,
+    arrow_table,
+    in_units,
+    read_table,
+    silent_units,
+)
 from miricigale.utils.units import check_count
 
 
-def open_rows(path, chunk_rows, *, hdu=None):
+def open_rows(path, chunk_rows, *, hdu=None, id_names=()):
     """
     Open a table that is to be read in pieces.
 
@@ -30,10 +36,13 @@ def open_rows(path, chunk_rows, *, hdu=None):
     path : path-like
         FITS with a binary table, or parquet, of which one piece at a time is in memory; or any other file for
         `~miricigale.utils.table_files.read_table`, also a packed one, which is in memory as a whole.
+        ``file.fits[2]`` names an extension.
     chunk_rows : int
         Rows in a piece.
     hdu : int or str, optional
-        Extension of a FITS file; the only table by default.
+        Extension of a FITS file; the only table by default, without that of keywords in FITS_LDAC.
+    id_names : iterable of str, optional
+        Columns of ids, besides those known by their names.
 
     Returns
     -------
@@ -45,24 +54,40 @@ def open_rows(path, chunk_rows, *, hdu=None):
         If the file is missing, of another kind, or cannot be read by rows.
     """
     chunk_rows = check_count(chunk_rows, "chunk_rows")
+    path, extension = split_extension(path)
+    hdu = extension if hdu is None else hdu
     path, start = Path(path), b""
     if path.is_file():
         with open(path, "rb") as stream:
             start = stream.read(6)
     kinds = {b"SIMPLE": _FitsRows, b"PAR1": _ParquetRows}
     kind = next((kind for begin, kind in kinds.items() if start.startswith(begin)), RowFile)
-    return kind(path, chunk_rows, hdu)
+    if kind is _FitsRows and _is_text_table(path, hdu):
+        # of ASCII tables astropy reads no pieces
+        kind = RowFile
+    return kind(path, chunk_rows, hdu, tuple(id_names))
+
+
+def _is_text_table(path, hdu):
+    """Whether the table of a FITS file is written in ASCII."""
+    with open_fits(path, wanted="a catalog") as hdus:
+        tables = [item for i, item in enumerate(hdus) if hdu in (None, i, item.name)]
+        kinds = [
+            type(item) for item in tables if isinstance(item, (fits.TableHDU, fits.BinTableHDU))
+        ]
+        return kinds == [fits.TableHDU]
 
 
 class RowFile:
     """A table on disk in pieces of rows; this class reads it as a whole when it is first used."""
 
-    def __init__(self, path, chunk_rows, hdu):
-        self.path, self.chunk_rows, self._hdu = path, chunk_rows, hdu
+    def __init__(self, path, chunk_rows, hdu, id_names=()):
+        self.path, self.chunk_rows = path, chunk_rows
+        self._hdu, self._id_names = hdu, id_names
 
     @cached_property
     def _table(self):
-        return read_table(self.path, wanted="a catalog", hdu=self._hdu)
+        return read_table(self.path, wanted="a catalog", hdu=self._hdu, id_names=self._id_names)
 
     @cached_property
     def colnames(self):
@@ -113,12 +138,11 @@ class RowFile:
 class _FitsRows(RowFile):
     """Rows of a FITS table."""
 
-    def __init__(self, path, chunk_rows, hdu):
-        super().__init__(path, chunk_rows, hdu)
+    def __init__(self, path, chunk_rows, hdu, id_names=()):
+        super().__init__(path, chunk_rows, hdu, id_names)
         with open_fits(path, wanted="a catalog") as hdus:
             table = self._choose(hdus)
             self._header, self.n_rows = table.header.copy(), table.header["NAXIS2"]
-            self.colnames = tuple(table.columns.names)
             ragged = [column.name for column in table.columns if set(column.format) & {"P", "Q"}]
         what = f"has columns of variable length, {ragged}"
         check_data(not ragged, path, f"{what}, which cannot be read in pieces of rows")
@@ -126,11 +150,15 @@ class _FitsRows(RowFile):
         for key in ("CHECKSUM", "DATASUM", "THEAP"):
             self._header.remove(key, ignore_missing=True)
         self._header["PCOUNT"] = 0
+        # two columns of the file may be one of the table, as those of a SkyCoord are
+        self.colnames = tuple(self._read(slice(0, 0)).colnames)
 
     def _choose(self, hdus):
         tables = [i for i, item in enumerate(hdus) if isinstance(item, fits.BinTableHDU)]
         wanted = self._hdu.upper() if isinstance(self._hdu, str) else self._hdu
         chosen = [i for i in tables if wanted in (None, i, hdus[i].name)]
+        if wanted is None and len(chosen) > 1:
+            chosen = [i for i in chosen if hdus[i].name != LDAC_HEADER]
         if len(chosen) != 1:
             what = f"no binary table in extension {wanted!r}"
             if wanted is None:
@@ -141,14 +169,16 @@ class _FitsRows(RowFile):
     def _read(self, rows):
         with open_fits(self.path, wanted="a catalog", memmap=True) as hdus:
             part = fits.BinTableHDU(self._choose(hdus).data[rows], header=self._header)
-            return QTable.read(part, character_as_bytes=False)
+            with silent_units():
+                table = Table.read(part, character_as_bytes=False)
+            return in_units(table, QTable, self._id_names)
 
 
 class _ParquetRows(RowFile):
     """Rows of a parquet file, read in their order; going back begins anew."""
 
-    def __init__(self, path, chunk_rows, hdu):
-        super().__init__(path, chunk_rows, hdu)
+    def __init__(self, path, chunk_rows, hdu, id_names=()):
+        super().__init__(path, chunk_rows, hdu, id_names)
         if hdu is not None:
             raise unreadable(path, "a catalog", f"'hdu' is {hdu!r}, and it is no FITS file")
         parquet = require("pyarrow.parquet", extra="parquet")
@@ -157,7 +187,7 @@ class _ParquetRows(RowFile):
             self._file = parquet.ParquetFile(path, buffer_size=1 << 20)
             self.n_rows = self._file.metadata.num_rows
             self._begin()
-            self.colnames = tuple(arrow_table(self._take(0)).colnames)
+            self.colnames = tuple(arrow_table(self._take(0), where=path.name).colnames)
         except (OSError, ValueError, NotImplementedError) as err:
             raise unreadable(path, "a catalog", err) from err
 
@@ -180,7 +210,9 @@ class _ParquetRows(RowFile):
                 self._begin()
             while self._at < rows.start:
                 self._take(min(self.chunk_rows, rows.start - self._at))
-            return arrow_table(self._take(rows.stop - rows.start))
+            return in_units(
+                arrow_table(self._take(rows.stop - rows.start), Table), QTable, self._id_names
+            )
 
 
 def write_rows(path, tables, n_rows, *, id_width=0, overwrite=False):

@@ -1,5 +1,6 @@
 """Tables of users: read in any of the usual formats, or refused in one sentence, and written by suffix."""
 
+import contextlib
 import io
 import math
 import os
@@ -7,45 +8,81 @@ import re
 import warnings
 from pathlib import Path
 
+import numpy as np
 from astropy.io import fits
-from astropy.table import Column, MaskedColumn, QTable
-from astropy.utils.exceptions import AstropyUserWarning
+from astropy.io.ascii import convert_numpy
+from astropy.table import Column, MaskedColumn, QTable, Table
+from astropy.units import UnitsWarning, UnrecognizedUnit
+from astropy.utils.exceptions import AstropyUserWarning, AstropyWarning
 
-from miricigale.utils.exceptions import DataError
-from miricigale.utils.files import open_fits, replacing, unpacked_size, unreadable
+from miricigale.utils.exceptions import CatalogWarning, DataError, warn
+from miricigale.utils.files import (
+    open_fits,
+    packed_open,
+    replacing,
+    split_extension,
+    unpacked_size,
+    unreadable,
+)
+from miricigale.utils.ids import ids_of_text, is_id_name
 from miricigale.utils.meta import fits_meta
+from miricigale.utils.missing import is_missing_word
 from miricigale.utils.optional import require
 from miricigale.utils.options import check_that
 from miricigale.utils.positions import sky_as_angles
+from miricigale.utils.units import flux_unit
 
 _PIECE = 1 << 20
+_BOM = b"\xef\xbb\xbf"
+#: Numbers that a reader of integers would not give back as they are written: 0007, +7.
+_ODD_NUMBER = re.compile(rb"(?:^|[\s,;|&\"'])(?:[+-]?0[0-9]|\+[0-9])")
+#: Above it a whole number may change when it becomes a float.
+_EXACT = 2**53
+#: The table of keywords in files of SExtractor, before that of its objects.
+LDAC_HEADER = "LDAC_IMHEAD"
+_DS9 = re.compile(rb"# *Region file format: *DS9|^(?:global |fk5|icrs|image)\b", re.IGNORECASE)
 
 
-def read_table(path, *, wanted, cls=QTable, form=None, hdu=None):
+def read_table(path, *, wanted, cls=QTable, form=None, hdu=None, id_names=()):
     """
     Read a table in any of the usual formats, or say which file could not be read as what.
 
+    Ids are kept as they stand in the file (`miricigale.utils.ids`): a unit does not make floats of them, and
+    ``0007`` is text. In text, ``null``, ``NA``, ``--`` and the like among numbers are missing.
+
     Parameters
     ----------
-    path, wanted
+    path : path-like
+        The file; ``file.fits[2]`` or ``file.fits[NAME]`` names an extension.
+    wanted
         As for `open_fits`.
     cls : type, optional
         Class of the table.
     form : str, optional
         Format by `astropy.table.Table.read`. By default by content and suffix: those of `write_table`, or
-        plain text, whose names of columns stand behind ``#`` if ``id`` is among them.
+        plain text, whose names of columns stand behind ``#`` if one of ids is among them.
     hdu : int or str, optional
-        Extension of a FITS file, the first table by default.
+        Extension of a FITS file; the first table by default, without that of keywords in FITS_LDAC.
+    id_names : iterable of str, optional
+        Columns of ids, besides those known by their names.
 
     Returns
     -------
     table : `~astropy.table.QTable`
+        A column whose unit is unknown has no unit that converts to any other.
 
     Raises
     ------
     `~miricigale.utils.exceptions.DataError`
         If the file is missing or no such table.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.CatalogWarning`
+        Of columns of a parquet file that no table can hold.
     """
+    path, extension = split_extension(path)
+    hdu = extension if hdu is None else hdu
     # astropy would take text for the table itself
     if not Path(path).is_file():
         raise unreadable(path, wanted, FileNotFoundError())
@@ -53,25 +90,86 @@ def read_table(path, *, wanted, cls=QTable, form=None, hdu=None):
     try:
         form = _table_format(path) if form is None else form
         if form == "fits":
-            with open_fits(path, wanted=wanted) as hdus:
-                table = cls.read(hdus, format=form, character_as_bytes=False, hdu=hdu)
+            with open_fits(path, wanted=wanted) as hdus, silent_units():
+                chosen = _first_table(hdus) if hdu is None else hdu
+                table = Table.read(hdus, format=form, character_as_bytes=False, hdu=chosen)
         elif hdu is not None:
             raise unreadable(path, wanted, f"'hdu' is {hdu!r}, and it is no FITS file")
         elif form == "parquet":
-            table = arrow_table(require("pyarrow.parquet", extra="parquet").read_table(path), cls)
+            rows = require("pyarrow.parquet", extra="parquet").read_table(path)
+            table = arrow_table(rows, Table, where=Path(path).name)
         else:
             _check_text(path)
-            table = cls.read(path, format=form)
+            with silent_units():
+                table = _read_text(path, form, id_names)
         if not table.colnames:
             raise unreadable(path, wanted, "it has no columns")
-        return table
+        return in_units(table, cls, id_names)
     except DataError:
         raise
     except Exception as err:  # readers of different formats raise different exceptions
         raise unreadable(path, wanted, err) from err
 
 
-def arrow_table(rows, cls=QTable):
+@contextlib.contextmanager
+def silent_units():
+    """Silence warnings about unknown units: a column that is used says so itself."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UnitsWarning)
+        warnings.filterwarnings("ignore", ".*(?:did not parse as|Invalid unit)", AstropyWarning)
+        yield
+
+
+def in_units(table, cls=QTable, id_names=()):
+    """
+    Make a table of another class of one that was read, with whole ids and the usual names of units.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        With columns that are no quantities yet.
+    cls : type, optional
+        Class of the table that is wanted.
+    id_names : iterable of str, optional
+        Columns of ids, besides those known by their names.
+
+    Returns
+    -------
+    table : `~astropy.table.Table`
+        Of ``cls``. Integers have no unit in columns of ids, and where a float could not hold them.
+    """
+    for name in table.colnames:
+        column = table[name]
+        if not isinstance(column, Column) or column.unit is None:
+            continue
+        if column.dtype.kind in "iu":
+            is_id = is_id_name(name) or name in id_names
+            large = column.dtype.itemsize == 8 and len(column) and _largest(column) >= _EXACT
+            if is_id or large:
+                column.unit = None
+                continue
+        if isinstance(column.unit, UnrecognizedUnit):
+            column.unit = flux_unit(column.unit) or column.unit
+    with silent_units():
+        return cls(table, copy=False)
+
+
+def _largest(column):
+    """Largest absolute value of integers."""
+    values = np.ma.getdata(column)
+    return max(int(values.max()), -int(values.min()))
+
+
+def _first_table(hdus):
+    """Number of the first table of a FITS file, without that of keywords; None if there is none."""
+    tables = [i for i, hdu in enumerate(hdus) if isinstance(hdu, (fits.BinTableHDU, fits.TableHDU))]
+    if len(tables) == 2 and hdus[tables[0]].name == LDAC_HEADER:
+        return tables[1]
+    # astropy takes the first, and warns if there are more
+    return None
+
+
+def arrow_table(rows, cls=QTable, *, where=None):
     """
     Make a table of rows of a parquet file, as astropy does, with its units.
 
@@ -81,39 +179,176 @@ def arrow_table(rows, cls=QTable):
         The rows, with the metadata of the file.
     cls : type, optional
         Class of the table.
+    where : str, optional
+        Name of the file, for a warning about columns that are left out; none without it.
 
     Returns
     -------
     table : `~astropy.table.QTable`
-        Missing numbers with a fraction or a unit are NaN, other missing values are masked.
+        Missing numbers with a fraction are NaN, also those of columns without any value; other missing values are
+        masked. Columns of bytes, lists and structures are left out.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.CatalogWarning`
+        Of the columns that are left out.
     """
     pyarrow = require("pyarrow", extra="parquet")
-    known, missing = dict(rows.schema.metadata or {}), {}
+    rows = _plain_columns(rows, where)
+    metadata, missing = dict(rows.schema.metadata or {}), {}
     for i, field in enumerate(rows.schema):
-        column, kind = rows.column(i), field.type
-        if pyarrow.types.is_dictionary(kind):
-            kind = kind.value_type
-            column = column.cast(kind)
-        text = pyarrow.types.is_string(kind) or pyarrow.types.is_large_string(kind)
-        if column.null_count and not pyarrow.types.is_floating(kind):
+        column = rows.column(i)
+        text = pyarrow.types.is_string(field.type)
+        if column.null_count and not pyarrow.types.is_floating(field.type):
             missing[field.name] = column.is_null().to_numpy()
-            column = column.fill_null("" if text else pyarrow.scalar(0).cast(kind))
+            column = column.fill_null("" if text else pyarrow.scalar(0).cast(field.type))
         if text:
             # what the file says of lengths may be of other rows
             longest = max(map(len, column.to_pylist()), default=0)
-            known[f"table::len::{field.name}".encode()] = str(max(1, longest)).encode()
+            metadata[f"table::len::{field.name}".encode()] = str(max(1, longest)).encode()
         rows = rows.set_column(i, field.name, column)
     stream = io.BytesIO()
     require("pyarrow.parquet", extra="parquet").write_table(
-        rows.replace_schema_metadata(known), stream
+        rows.replace_schema_metadata(metadata), stream
     )
-    table = cls.read(stream, format="parquet")
+    with silent_units():
+        table = Table.read(stream, format="parquet")
     for name, mask in missing.items():
-        if isinstance(table[name], Column):
+        if name in table.colnames and isinstance(table[name], Column):
             table[name] = MaskedColumn(table[name], mask=mask)
+    return in_units(table, cls)
+
+
+def _plain_columns(rows, where):
+    """Rows of Arrow with columns of types that a table can hold, and a warning about the others."""
+    types = require("pyarrow", extra="parquet").types
+    pyarrow = require("pyarrow", extra="parquet")
+    lost = []
+    for field in list(rows.schema):
+        i, kind = rows.schema.get_field_index(field.name), field.type
+        column = rows.column(i)
+        if types.is_dictionary(kind):
+            kind = kind.value_type
+            column = column.cast(kind)
+        if types.is_null(kind):
+            # no value in any row: missing numbers
+            column = column.cast(pyarrow.float64())
+        elif types.is_decimal(kind):
+            column = column.cast(pyarrow.float64())
+        elif types.is_large_string(kind) or getattr(types, "is_string_view", types.is_string)(kind):
+            column = column.cast(pyarrow.string())
+        elif not (_is_plain(types, kind) or _is_vector(types, column)):
+            lost.append(field.name)
+            rows = rows.remove_column(i)
+            continue
+        if column is not rows.column(i):
+            rows = rows.set_column(i, field.name, column)
+    if lost and where is not None:
+        names = ", ".join(map(repr, lost))
+        text = "columns of bytes, lists or structures, which a table cannot hold, are left out"
+        warn(f"{where}: {text}: {names}", CatalogWarning)
+    return rows
+
+
+def _is_plain(types, kind):
+    """Whether a type of Arrow is one that a column of a table has."""
+    number = types.is_integer(kind) or types.is_floating(kind) or types.is_boolean(kind)
+    return number or types.is_string(kind) or types.is_timestamp(kind)
+
+
+def _is_vector(types, column):
+    """Whether a column of Arrow holds as many numbers in each row."""
+    kind = column.type
+    return (
+        types.is_fixed_size_list(kind)
+        and _is_plain(types, kind.value_type)
+        and not column.null_count
+    )
+
+
+def _read_text(path, form, id_names):
+    """Table of a text file or another one that astropy reads by itself."""
+    if form.startswith("ascii"):
+        start = _start(path)
+        if _DS9.search(start[:_PIECE]):
+            raise ValueError(
+                "it is a region file of DS9: save the regions as a table of ra and dec"
+            )
+        source = str(path)
+        if start.startswith(_BOM):
+            # a mark at the start is no part of the first name
+            with packed_open(path) as stream:
+                source = stream.read().decode("utf-8-sig").splitlines()
+        with warnings.catch_warnings():
+            # what 64 bits do not hold is read as text
+            warnings.filterwarnings("ignore", "OverflowError converting to IntType", AstropyWarning)
+            table = Table.read(source, format=form)
+        if form != "ascii.ecsv":
+            names = [name for name in table.colnames if name in id_names or is_id_name(name)]
+            _numbers_among_words(table, names)
+            _ids_as_written(table, path, source, form, names)
+        return table
+    return Table.read(path, format=form)
+
+
+def _numbers_among_words(table, id_names):
+    """Turn text into numbers where all but words for a missing value are numbers."""
+    for name in table.colnames:
+        if table[name].dtype.kind != "U" or name in id_names:
+            continue
+        column = MaskedColumn(table[name])
+        texts = np.char.strip(np.asarray(column))
+        missing = column.mask | is_missing_word(texts)
+        if not missing.any() or missing.all():
+            continue
+        try:
+            numbers = texts[~missing].astype(float)
+        except ValueError:
+            continue
+        values = np.zeros(len(texts))
+        values[~missing] = numbers
+        table[name] = MaskedColumn(values, mask=missing, unit=column.unit)
+
+
+def _ids_as_written(table, path, source, form, names):
+    """Put the ids of a text file in place that stand there, 0007 or 18446744073709551615."""
+    for name in names:
+        column = MaskedColumn(table[name])
+        if column.dtype.kind in "iu" and not _has_odd_numbers(path):
+            continue
+        if column.dtype.kind == "U":
+            texts = np.asarray(column)
         else:
-            table[name][mask] = math.nan
-    return table
+            options = {"converters": {name: [convert_numpy(str)]}, "include_names": [name]}
+            texts = Table.read(source, format=form, fast_reader=False, **options)[name]
+            texts = np.asarray(texts).astype(str)
+        texts = np.char.strip(texts)
+        missing = column.mask | is_missing_word(texts)
+        ids = ids_of_text(texts[~missing].tolist())
+        if ids.dtype.kind == "U":
+            # a word may be an id among text
+            missing = column.mask | (texts == "")
+            ids = texts[~missing]
+        every = np.zeros(len(texts), dtype=ids.dtype)
+        every[~missing] = ids
+        table[name] = MaskedColumn(every, mask=missing) if missing.any() else Column(every)
+
+
+def _has_odd_numbers(path):
+    """Whether a file has a number with a leading zero or plus sign, anywhere."""
+    before = b""
+    with packed_open(path) as stream:
+        while piece := stream.read(_PIECE):
+            if _ODD_NUMBER.search(before + piece):
+                return True
+            before = piece[-4:]
+    return False
+
+
+def _start(path):
+    """First bytes of a file, unpacked."""
+    with packed_open(path) as stream:
+        return stream.read(1 << 16)
 
 
 def _check_text(path):
@@ -198,8 +433,7 @@ def table_hdu(table):
 
 
 def _table_format(path):
-    with open(path, "rb") as stream:
-        start = stream.read(65536)
+    start = _start(path).removeprefix(_BOM)
     first = start.strip().partition(b"\n")[0].decode(errors="replace")
     suffix = Path(Path(path).name.lower().removesuffix(".gz")).suffix
     if start.startswith(b"SIMPLE"):
@@ -208,5 +442,5 @@ def _table_format(path):
         return "ascii.ecsv"
     if suffix in TABLE_FORMATS:
         return TABLE_FORMATS[suffix]
-    named = first.startswith("#") and "id" in first.strip("# \r").split()
+    named = first.startswith("#") and any(map(is_id_name, first.strip("# \r").split()))
     return "ascii.commented_header" if named else "ascii"

@@ -11,6 +11,8 @@ import numpy as np
 from astropy.table import Table
 
 from miricigale.utils.exceptions import argument_error, units_error
+from miricigale.utils.frames import frame_columns, is_frame
+from miricigale.utils.ids import ids_and_missing
 from miricigale.utils.options import check_least, check_that
 from miricigale.utils.units import ANGLE, to_array
 
@@ -57,7 +59,8 @@ def as_table(data, argument):
     Parameters
     ----------
     data : `~astropy.table.Table`, row of one, dict, structured array, `pandas.DataFrame` or path-like
-        Columns by name; numbers in a dict are those of every row.
+        Columns by name; numbers in a dict are those of every row. Of a DataFrame missing values are masked (NaN in
+        floats), and an index that is not the count of the rows is a column (`miricigale.utils.frames`).
     argument : str
         The argument's name, for the message.
 
@@ -83,8 +86,8 @@ def as_table(data, argument):
         from miricigale.utils.table_files import read_table
 
         return read_table(data, wanted="a table")
-    if hasattr(data, "to_numpy") and hasattr(data, "columns"):
-        data = {str(name): data[name].to_numpy() for name in data.columns}
+    if is_frame(data):
+        data = frame_columns(data, argument)
     try:
         if isinstance(data, Mapping):
             shape = np.broadcast_shapes((1,), *(np.shape(column) for column in data.values()))
@@ -212,8 +215,8 @@ def require_columns(table, names, argument, *, units=None):
 
 
 def unique_ids(ids, argument):
-    """Return ids as an array after checking that none is there twice."""
-    ids = np.asarray(ids)
+    """Return ids as `read_ids` has them, after checking that none is there twice."""
+    ids = _whole_ids(ids, argument)
     values, counts = np.unique(ids, return_counts=True)
     twice = values[counts > 1][:5].tolist()
     check_that(not twice, argument, "a table whose ids are unique", f"duplicates such as {twice}")
@@ -222,37 +225,24 @@ def unique_ids(ids, argument):
 
 def read_ids(table, argument="photometry"):
     """
-    Ids of a catalog: numbers, or text whether it came as such or as bytes.
+    Ids of a catalog: integers, or text whether it came as such or as bytes (`miricigale.utils.ids`).
 
     ``argument`` is what the table is called in messages. A `ValueError` names ids that are masked or
-    empty, for their objects could not be distinguished, numbers among text, several in a row, and
-    bytes that are not UTF-8.
+    empty, for their objects could not be distinguished, numbers among text, several in a row, bytes that are
+    not UTF-8, and floats that are not exact.
     """
     require_columns(table, ["id"], argument)
-    column = table["id"]
-    ids = np.asarray(getattr(column, "unmasked", column))
-    check_that(ids.ndim == 1, argument, "a table with one id in a row", ids.shape)
-    missing = np.broadcast_to(np.asarray(getattr(column, "mask", False)), ids.shape)
-    if ids.dtype.kind in "OUS":
-        missing = missing | np.array([key in (None, "", b"") for key in ids.tolist()], dtype=bool)
+    return _whole_ids(table["id"], argument)
+
+
+def _whole_ids(column, argument):
+    """Ids of a column, after checking that there is one in every row."""
+    ids, missing = ids_and_missing(column, argument)
     if missing.any():
         rows = np.flatnonzero(missing)
         got = f"{rows.size} masked or empty, the first in row {rows[0]} (from 0)"
         raise argument_error(argument, "a table with an id in every row", got)
-    if ids.dtype.kind == "S":
-        # as astropy reads text of FITS files
-        try:
-            return np.char.decode(ids, "utf-8")
-        except UnicodeDecodeError as err:
-            wanted = "a table with ids that are text, or bytes of text in UTF-8"
-            raise argument_error(argument, wanted, f"{err.object!r}") from None
-    if ids.dtype.kind == "O":
-        kinds = sorted({type(value).__name__ for value in ids.tolist()})
-        check_that(len(kinds) < 2, argument, "a table with ids of one kind", kinds)
-        return np.array(ids.tolist()) if ids.size else ids.astype(str)
-    # FITS takes numbers of one byte for true and false
-    dtype = np.dtype(np.int16) if ids.dtype == np.int8 else ids.dtype
-    return ids.astype(dtype.newbyteorder("="))
+    return ids
 
 
 def ascii_ids(ids, argument):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import re
 
 import astropy.units as u
 import numpy as np
@@ -19,6 +20,50 @@ DN = u.adu
 TIME = u.s
 RATE = u.adu / u.s
 ANGLE = u.arcsec
+
+
+#: Flux density of AB magnitude 0, and with it the unit of the SDSS and the Legacy Surveys.
+_MAGGY = 3630.780547701013 * u.Jy
+_MAGGY_NAMES = {
+    "maggy": 1.0, "maggies": 1.0, "mgy": 1.0, "mggy": 1.0,
+    "nanomaggy": 1e-9, "nanomaggies": 1e-9, "nmgy": 1e-9, "nanomgy": 1e-9, "nmggy": 1e-9, "nanomaggie": 1e-9,
+    "micromaggy": 1e-6, "micromaggies": 1e-6,
+}  # fmt: skip
+#: Names of AB magnitudes as a unit, in lower case without blanks.
+_AB_NAMES = ("abmag", "mag(ab)", "ab", "mag_ab", "magab", "ab_mag", "abmags")
+
+
+def flux_unit(unit):
+    """
+    Return the unit that a name of a flux density means beyond those of astropy.
+
+    Parameters
+    ----------
+    unit : `~astropy.units.Unit` or str
+        ``"nanomaggies"``, ``"nmgy"``, ``"maggies"`` (AB, 3631 Jy for 1) and ``u.mgy`` are units of flux density,
+        ``"ABmag"``, ``"mag(AB)"``, ``"AB mag"`` AB magnitudes.
+
+    Returns
+    -------
+    unit : `~astropy.units.UnitBase` or `~astropy.units.FunctionUnitBase` or None
+        None for anything else.
+
+    Examples
+    --------
+    >>> from miricigale.utils.units import flux_unit
+    >>> flux_unit("nanomaggies")
+    Unit("3.63078 uJy")
+    >>> flux_unit("AB mag")
+    Unit("mag(AB)")
+    """
+    text = re.sub(r"\s+", "", str(unit)).lower()
+    if text in _AB_NAMES:
+        return u.ABmag
+    if text in _MAGGY_NAMES:
+        return u.Unit(_MAGGY_NAMES[text] * _MAGGY.to(u.uJy))
+    if isinstance(unit, u.UnitBase) and u.mgy in unit.bases and unit.is_equivalent(u.mgy):
+        return u.Unit(unit.to(u.mgy) * _MAGGY.to(u.uJy))
+    return None
 
 
 def to_array(value, unit, name, *, ndim=None, finite=False, equivalencies=None):

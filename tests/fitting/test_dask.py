@@ -60,6 +60,7 @@ def whole(fitter, photometry, process):
     return fitter.fit(photometry, executor=process)
 
 
+@pytest.mark.filterwarnings("ignore:.*an id that occurred before")
 def test_two_dask_workers_give_the_numbers_of_one_process(
     fitter, photometry, whole, process, tmp_path
 ):

@@ -26,6 +26,7 @@ from miricigale.fitting import (
 from miricigale.fitting.samplers import Lockstep, space
 from miricigale.fitting.samplers.run import best_scale, chi2_at
 from miricigale.sed import Parameter, SEDModel
+from miricigale.utils.exceptions import CatalogWarning
 
 BANDS = ("b0", "b1", "b2", "b3")
 SLOPES = np.array([[1.0, 0.5, 0.0, -0.5], [0.0, 0.4, 0.8, 1.2]])
@@ -279,7 +280,8 @@ def test_what_cannot_be_fitted_stays_in_place_and_files_keep_everything(engine, 
     for name in BANDS:
         table[f"{name}_limit"] = [False] * 5 + [True]
     fitter = linear_fitter({"a": (-5.0, 5.0)}, engine, n_live=60, n_effective=99, n_draws=40)
-    results = fitter.fit(table, redshift=[1.0, 1.0, 1.0, np.nan, 25.0, 1.0], seed=1)
+    with pytest.warns(CatalogWarning, match="an id that occurred before"):
+        results = fitter.fit(table, redshift=[1.0, 1.0, 1.0, np.nan, 25.0, 1.0], seed=1)
     assert list(results.fitted) == [True] + [False] * 5
     assert [FitFlags.NO_BAND & f for f in results.flags] == [0, 1, 0, 0, 0, 0]
     names = ("DUPLICATE_ID", "NO_REDSHIFT", "REDSHIFT_OUTSIDE", "ALL_LIMITS")

@@ -19,6 +19,9 @@ from miricigale.utils.exceptions import DataError
 from miricigale.utils.row_files import write_rows
 from miricigale.utils.table_files import read_table
 
+# some ids of the catalog occur twice, of which fits warn
+pytestmark = pytest.mark.filterwarnings("ignore:.*an id that occurred before")
+
 MANIFESTS = [".fit.lock", ".manifest.copy.json", "manifest.json"]
 
 

@@ -36,7 +36,9 @@ def grid():
 
 
 def test_the_former_name_of_the_survey_s_errors_is_deprecated():
-    with pytest.warns(AstropyDeprecationWarning, match=r"SurveyCalibration.survey\(\).template_error"):
+    with pytest.warns(
+        AstropyDeprecationWarning, match=r"SurveyCalibration.survey\(\).template_error"
+    ):
         former = TemplateError.survey()
     error = SurveyCalibration.survey().template_error
     assert_array_equal(former.wave, error.wave)

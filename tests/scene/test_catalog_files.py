@@ -68,11 +68,23 @@ def test_wrong_names_are_refused_with_the_right_ones(plain, tmp_path):
         (COLUMNS, {"irac.ch2": "uJy"}, r"no column of c\.csv 'irac\.ch2'"),
         ({"ra": "ALPHA", "dec": "ALPHA"}, {}, "'columns' must be a dict whose values differ"),
         (["ra"], {}, "'columns' must be a dict by our names of columns, got"),
-        ({}, {}, r"columns \['id'\], got columns"),
         (COLUMNS, {"flux": "micro"}, "'units' must be a dict of units, also for 'wfc3"),
     ):
         options = {"columns": columns, "units": units}
         refuses(message, read_catalog, path, error=(KeyError, ValueError), **options)
+
+
+def test_ids_are_found_by_their_usual_names_or_the_likely_column_is_named(plain, tmp_path):
+    plain.rename_column("NUMBER", "objid")
+    path = write(plain, tmp_path / "c.csv")
+    options = {"columns": {k: v for k, v in (COLUMNS | SHAPE).items() if k != "id"}, "units": UNITS}
+    with pytest.warns(MiricigaleWarning):
+        assert read_catalog(path, **options)["id"].tolist() == plain["objid"].tolist()
+    plain.rename_column("objid", "CATAID")
+    path = write(plain, tmp_path / "d.csv")
+    refuses(
+        r"columns \['id'\], got columns .*'CATAID' looks like ids", read_catalog, path, **options
+    )
 
 
 def test_units_must_be_said_where_the_file_has_none(plain, tmp_path):

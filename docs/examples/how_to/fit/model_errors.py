@@ -93,5 +93,6 @@ plt.show()
 
 # %%
 # ``SurveyCalibration.survey().template_error`` is the error of ``SEDModel.survey()``, measured on CEERS;
-# ``BayesFitter(bands)`` and ``miricigale fit`` use it. :func:`~miricigale.fitting.calibrate` measures such an error
-# with zero points, errors of bands and priors: :doc:`photometric_redshifts`. See also :doc:`/method/fitting_errors`.
+# ``BayesFitter(bands)`` and ``miricigale fit`` use it. :func:`~miricigale.fitting.calibrate` measures such an
+# error with zero points, errors of bands and priors: :doc:`photometric_redshifts`. See also
+# :doc:`/method/fitting_errors`.

@@ -1,0 +1,76 @@
+"""Columns of data frames (pandas, polars, Arrow), with their missing values and ids."""
+
+import numpy as np
+
+from miricigale.utils.ids import id_column
+
+
+def is_frame(data):
+    """Whether something is a frame: columns by name that turn into arrays."""
+    return hasattr(data, "columns") and (hasattr(data, "to_numpy") or hasattr(data, "to_pylist"))
+
+
+def frame_columns(data, argument):
+    """
+    Return the columns of a frame as arrays.
+
+    Parameters
+    ----------
+    data : `pandas.DataFrame`, `polars.DataFrame` or `pyarrow.Table`
+        The frame. Columns of polars and Arrow are read as those of parquet files are.
+    argument : str
+        What it is called in messages.
+
+    Returns
+    -------
+    columns : dict of str to array or column
+        Missing values are NaN in floats and masked in others (pandas' ``NA``, ``None``, null). An index of pandas
+        that has a name, or is not the count of the rows, is a column: by its name, or ``id``.
+
+    Raises
+    ------
+    ValueError
+        If an index and a column have one name and differ.
+    """
+    if not hasattr(data, "index"):
+        from miricigale.utils.table_files import arrow_table
+
+        rows = data if hasattr(data, "to_pylist") else data.to_arrow()
+        table = arrow_table(rows, where=argument)
+        return {name: table[name] for name in table.colnames}
+    columns = {str(name): _of_series(data[name]) for name in data.columns}
+    return _of_index(data, columns) | columns
+
+
+def _of_index(data, columns):
+    """Columns of an index, whose names are not among those of the frame."""
+    index = data.index
+    if index.nlevels > 1:
+        levels = [(name, index.get_level_values(i)) for i, name in enumerate(index.names)]
+        return {
+            str(n): _of_series(level) for n, level in levels if n is not None and n not in columns
+        }
+    counts = hasattr(index, "step") and index.start == 0 and index.step == 1
+    if index.name is None:
+        # rows of a frame that has no other ids are known by it
+        named = counts or id_column(columns, "photometry") is not None
+        return {} if named else {"id": _of_series(index)}
+    return {} if str(index.name) in columns else {str(index.name): _of_series(index)}
+
+
+def _of_series(series):
+    """A column as an array, masked where whole numbers or text are missing."""
+    missing = np.asarray(series.isna(), dtype=bool)
+    if not missing.any():
+        return series.to_numpy()
+    # only what is there, for pandas makes floats of whole numbers beside a missing one
+    here = series[~missing].to_numpy()
+    if here.dtype.kind == "O":
+        here = np.array(here.tolist())
+    if here.dtype.kind == "f":
+        out = np.full(len(series), np.nan, dtype=here.dtype)
+        out[~missing] = here
+        return out
+    out = np.zeros(len(series), dtype=here.dtype)
+    out[~missing] = here
+    return np.ma.MaskedArray(out, mask=missing)

@@ -1,0 +1,286 @@
+"""Ids of objects: the column that holds them, and their values."""
+
+import re
+
+import numpy as np
+
+from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
+from miricigale.utils.options import check_that
+
+#: Names of columns of ids, in lower case and without what stands between words; the first is preferred.
+_NAMES = (
+    "id", "number", "objectid", "objid", "idobj", "sourceid", "srcid", "targetid", "galaxyid", "galid", "catid",
+)  # fmt: skip
+#: The number of a segment, which is an id where nothing else is.
+_LABEL = "label"
+#: Names that ids often have, but other things too.
+_LIKELY = ("name", "designation", "iauname", "object", "source", "target", "seq", "recno", "index")
+_ID_PART = re.compile(r"(?:^|[_\-. ])id(?:$|[_\-. ])", re.IGNORECASE)
+_ID_END = re.compile(r"[a-z](?:Id|ID)$|[A-Z]ID$")
+#: Whole numbers up to which every one is exact in double and single precision.
+_EXACT = {8: 2**53, 4: 2**24, 2: 2**11}
+#: Ids listed in a message.
+_LISTED = 3
+
+
+def _plain(name):
+    """A name in lower case, without a byte-order mark and what stands between words."""
+    return re.sub(r"[\ufeff\s_\-.]+", "", str(name)).lower()
+
+
+def is_id_name(name):
+    """Whether a column of this name holds ids by its name alone."""
+    return _plain(name) in (*_NAMES, _LABEL)
+
+
+def id_column(colnames, argument, *, labels=True):
+    """
+    Return the name of the column of ids.
+
+    That is ``id``; else the one with this name in another case (``ID``); else the only one with another
+    usual name of ids (``NUMBER``, ``object_id``, ``objid``, ``source_id``, ``TARGETID``, ...), whatever its case
+    and underscores; else ``label``.
+
+    Parameters
+    ----------
+    colnames : iterable of str
+        Names of the columns.
+    argument : str
+        What the table is called in messages.
+    labels : bool, optional
+        Whether ``label`` is a name of ids.
+
+    Returns
+    -------
+    name : str or None
+        None if no column has such a name.
+
+    Raises
+    ------
+    ValueError
+        If several columns could be it.
+    """
+    colnames = list(colnames)
+    if "id" in colnames:
+        return "id"
+    for group in (_NAMES[:1], _NAMES[1:], (_LABEL,) if labels else ()):
+        names = [name for name in colnames if _plain(name) in group]
+        if len(names) == 1:
+            return names[0]
+        if names:
+            wanted = "a table with one column of ids, or with one of the name 'id'"
+            how = f"name the right one 'id', or give columns={{'id': {names[0]!r}}} with a map of columns"
+            raise argument_error(argument, wanted, f"{' and '.join(map(repr, names))} ({how})")
+    return None
+
+
+def likely_ids(table):
+    """Names of columns of whole numbers or text that look like ids, though not by a usual name."""
+    names = []
+    for name in table.colnames:
+        kind = getattr(getattr(table[name], "dtype", None), "kind", "")
+        looks = _ID_PART.search(name) or _ID_END.search(name) or _plain(name) in _LIKELY
+        if looks and kind in "iuUSO" and table[name].ndim == 1:
+            names.append(name)
+    return names
+
+
+def counted_ids(table, argument, start=0):
+    """
+    Return ids that count rows from 1, for a table without ids.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        The table.
+    argument : str
+        What it is called in messages.
+    start : int, optional
+        Rows before it, in earlier pieces of a file.
+
+    Returns
+    -------
+    ids : `~numpy.ndarray` of int, shape (n,)
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.CatalogWarning`
+        If a column looks like ids; of the first piece only.
+    """
+    names = likely_ids(table)
+    if names and start == 0:
+        text = f"{argument}: no column 'id'; rows are counted from 1, though {names[0]!r} looks like ids"
+        warn(f"{text} (name it 'id', or give columns={{'id': {names[0]!r}}})", CatalogWarning)
+    return np.arange(start + 1, start + len(table) + 1)
+
+
+def ids_and_missing(column, argument):
+    """
+    Return ids as an array of integers or text, and where there is none.
+
+    Whole numbers stay what they are, in 64 bits or unsigned, and a unit counts for nothing. Floats that are whole
+    become integers, as tables with a missing id store them; other floats become text.
+
+    Parameters
+    ----------
+    column : array_like, shape (n,)
+        A column of a table, masked or not.
+    argument : str
+        What the table is called in messages.
+
+    Returns
+    -------
+    ids : `~numpy.ndarray`, shape (n,)
+        Arbitrary where they are missing.
+    missing : `~numpy.ndarray` of bool, shape (n,)
+        Masked, NaN, None or empty.
+
+    Raises
+    ------
+    ValueError
+        If there are several ids in a row, ids of different kinds, bytes that are not UTF-8 or whole numbers in
+        floats of too few digits, which are not exact.
+    """
+    mask = np.asarray(getattr(column, "mask", False))
+    column = getattr(column, "unmasked", column)
+    ids = np.ma.getdata(getattr(column, "value", column))
+    check_that(ids.ndim == 1, argument, "a table with one id in a row", ids.shape)
+    missing = np.broadcast_to(mask, ids.shape).copy()
+    if ids.dtype.kind in "US":
+        missing |= np.char.str_len(ids) == 0
+    if ids.dtype.kind == "O":
+        missing |= np.array([_is_empty(key) for key in ids.tolist()], dtype=bool)
+        ids = _of_objects(ids, missing, argument)
+    if ids.dtype.kind == "S":
+        ids = _decoded(ids, argument)
+    if ids.dtype.kind == "f":
+        missing |= np.isnan(ids)
+        ids = _of_floats(ids, missing, argument)
+    # FITS takes numbers of one byte for true and false
+    dtype = np.dtype(np.int16) if ids.dtype == np.int8 else ids.dtype
+    return ids.astype(dtype.newbyteorder("=")), missing
+
+
+def _is_empty(key):
+    """Whether an id is None, NaN, pandas' NA or no text."""
+    if key is None or (isinstance(key, (str, bytes)) and not key):
+        return True
+    # NaN and NaT differ from themselves; NA is neither true nor false
+    return type(key).__name__ == "NAType" or (not isinstance(key, (str, bytes)) and key != key)
+
+
+def _of_objects(ids, missing, argument):
+    """Ids of Python objects as an array of one kind."""
+    here = [key for key, gone in zip(ids.tolist(), missing.tolist(), strict=True) if not gone]
+    kinds = sorted({type(key).__name__ for key in here})
+    check_that(len(kinds) < 2, argument, "a table with ids of one kind", kinds)
+    if not here:
+        return ids.astype(str)
+    values = np.array(here)
+    if values.dtype.kind == "O" and kinds == ["int"]:
+        # beyond 64 bits
+        values = values.astype(str)
+    out = np.zeros(ids.size, dtype=values.dtype)
+    out[~missing] = values
+    return out
+
+
+def _decoded(ids, argument):
+    """Bytes as text, as astropy reads them in FITS files."""
+    try:
+        return np.char.decode(ids, "utf-8")
+    except UnicodeDecodeError as err:
+        wanted = "a table with ids that are text, or bytes of text in UTF-8"
+        raise argument_error(argument, wanted, f"{err.object!r}") from None
+
+
+def _of_floats(ids, missing, argument):
+    """Whole numbers as integers, and other numbers as text."""
+    safe = np.where(missing, 0, ids)
+    if not np.all(safe == np.round(safe)):
+        return np.array([repr(value) for value in safe.tolist()])
+    limit = _EXACT.get(ids.dtype.itemsize, 2**53)
+    rows = np.flatnonzero(~(np.abs(safe) <= limit))
+    if rows.size:
+        wanted = f"a table with ids as integers or text, for floats of {8 * ids.dtype.itemsize} bits are not exact"
+        got = f"{safe[rows[0]]!r} in row {rows[0]} (from 0), of {rows.size} so large"
+        raise argument_error(argument, wanted, got)
+    return safe.astype(np.int64)
+
+
+def ids_of_text(texts):
+    """
+    Return ids that stand as text in a file: integers if all are written as such, or the text.
+
+    Parameters
+    ----------
+    texts : sequence of str
+        As they stand in the file, '' for none.
+
+    Returns
+    -------
+    ids : `~numpy.ndarray`
+        Integers if all are whole numbers without leading zeros, sign + or exponent, and 64 bits hold them.
+        ``7.0`` is such a number, ``0007`` and ``1E2`` are text.
+
+    Examples
+    --------
+    >>> from miricigale.utils.ids import ids_of_text
+    >>> ids_of_text(["7", "12"]), ids_of_text(["0007", "12"])
+    (array([ 7, 12]), array(['0007', '12'], dtype='<U4'))
+    """
+    whole = re.compile(r"(-?(?:0|[1-9]\d*))(?:\.0*)?")
+    matches = [whole.fullmatch(text) for text in texts]
+    if all(matches) and matches:
+        numbers = [int(match[1]) for match in matches]
+        for dtype in (np.int64, np.uint64):
+            limits = np.iinfo(dtype)
+            if limits.min <= min(numbers) and max(numbers) <= limits.max:
+                return np.array(numbers, dtype=dtype)
+    return np.array(texts, dtype=str)
+
+
+class Duplicates:
+    """
+    Rows of a catalog, seen in pieces, whose id occurred before.
+
+    Attributes
+    ----------
+    n_rows : int
+        Rows that repeat an id.
+    first : list
+        The first few of these ids, each once.
+    """
+
+    def __init__(self):
+        self.n_rows, self.first = 0, []
+
+    def add(self, ids, earlier=None):
+        """Take the ids of a piece; ``earlier`` (bool, shape (n,)) are those of earlier pieces."""
+        again = np.ones(ids.size, dtype=bool)
+        again[np.unique(ids, return_index=True)[1]] = False
+        if earlier is not None:
+            again |= earlier
+        self.n_rows += int(np.count_nonzero(again))
+        for key in ids[again].tolist():
+            if len(self.first) == _LISTED:
+                break
+            if key not in self.first:
+                self.first.append(key)
+
+    def warn(self, argument, what="only the first row of each is fitted"):
+        """Warn if there are any; ``what`` says what becomes of them."""
+        if self.n_rows:
+            some = ", ".join(map(repr, self.first))
+            rows = "1 row has" if self.n_rows == 1 else f"{self.n_rows} rows have"
+            text = f"{argument}: {rows} an id that occurred before ({some}"
+            warn(
+                f"{text}{', ...' if self.n_rows > len(self.first) else ''}); {what}", CatalogWarning
+            )
+
+
+def warn_of_duplicates(ids, argument, **options):
+    """Warn of ids that occur more than once, with the first three; see `Duplicates.warn`."""
+    duplicates = Duplicates()
+    duplicates.add(np.asarray(ids))
+    duplicates.warn(argument, **options)

@@ -1,0 +1,218 @@
+"""Ids: the column that holds them, and their values as they stand in a file."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import MaskedColumn, QTable, Table
+from astropy.utils.masked import Masked
+from numpy.testing import assert_array_equal
+
+from helpers.errors import refuses
+from miricigale.utils.exceptions import CatalogWarning
+from miricigale.utils.ids import counted_ids, id_column, ids_of_text, warn_of_duplicates
+from miricigale.utils.row_files import open_rows
+from miricigale.utils.table_files import read_table
+from miricigale.utils.tables import as_table, read_ids, unique_ids
+
+#: A double has 53 bits: the odd ones are no doubles.
+LARGE = [2**53 + 1, 2**62 + 1, 2**62 + 3]
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (["ra", "id", "ID"], "id"),
+        (["NUMBER", "ID"], "ID"),
+        (["ra", "object_id"], "object_id"),
+        (["TARGETID", "z"], "TARGETID"),
+        (["objID", "specz"], "objID"),
+        (["Source_Id"], "Source_Id"),
+        (["\ufeffid", "ra"], "\ufeffid"),
+        (["label", "NUMBER"], "NUMBER"),
+        (["label", "ra"], "label"),
+        (["valid", "grid", "ra"], None),
+    ],
+)
+def test_the_column_of_ids_is_found_by_one_rule(names, expected):
+    assert id_column(names, "catalog") == expected
+
+
+def test_several_columns_that_could_be_ids_are_refused_by_name():
+    refuses("'catalog' must be a table with one column of ids.*'NUMBER' and 'objid'", id_column,
+            ["NUMBER", "objid"], "catalog")  # fmt: skip
+
+
+def test_rows_are_counted_with_a_word_where_a_column_looks_like_ids():
+    table = Table({"CATAID": [7, 9], "valid": [True, True], "flux": [1.0, 2.0]})
+    with pytest.warns(CatalogWarning, match="counted from 1, though 'CATAID' looks like ids"):
+        assert counted_ids(table, "mine.csv").tolist() == [1, 2]
+    assert counted_ids(Table({"flux": [1.0, 2.0]}), "mine.csv", 10).tolist() == [11, 12]
+
+
+@pytest.mark.parametrize(
+    ("column", "expected"),
+    [
+        (u.Quantity([3.0, 5.0], u.ct), [3, 5]),
+        (np.array([2**63 + 5, 1], dtype=np.uint64), [2**63 + 5, 1]),
+        (np.array([2**63 + 5, 2**63 + 7], dtype=object), [2**63 + 5, 2**63 + 7]),
+        (np.array(["0007", "7"], dtype=object), ["0007", "7"]),
+        (np.array([b"a", b"bc"]), ["a", "bc"]),
+        ([1001.0, 1002.0], [1001, 1002]),
+        ([1.5, 2.0], ["1.5", "2.0"]),
+        (np.array([1, 2], dtype=">i4"), [1, 2]),
+    ],
+)
+def test_ids_are_whole_numbers_or_text(column, expected):
+    ids = read_ids(QTable({"id": column}))
+    assert ids.tolist() == expected
+    assert ids.dtype.kind in "iuU"
+
+
+@pytest.mark.parametrize(
+    "column",
+    [
+        MaskedColumn([5, 7], mask=[False, True]),
+        Masked(u.Quantity([5.0, 7.0], u.ct), mask=[False, True]),
+        np.array([5, None], dtype=object),
+        ["a", ""],
+        [5.0, np.nan],
+    ],
+)
+def test_a_missing_id_is_refused_by_its_row(column):
+    for function in (read_ids, lambda table: unique_ids(table["id"], "photometry")):
+        refuses(
+            r"1 masked or empty, the first in row 1 \(from 0\)", function, QTable({"id": column})
+        )
+
+
+def test_floats_that_cannot_tell_ids_apart_are_refused():
+    refuses(
+        "floats of 64 bits are not exact, got .* in row 1", read_ids, Table({"id": [1.0, 2.0**62]})
+    )
+    single = np.array([1, 2**24 + 2], dtype=np.float32)
+    refuses("floats of 32 bits are not exact", read_ids, Table({"id": single}))
+
+
+@pytest.mark.parametrize(
+    ("texts", "expected"),
+    [
+        (["0007", "007", "7"], ["0007", "007", "7"]),
+        (["1E2", "100"], ["1E2", "100"]),
+        (["+7", "7"], ["+7", "7"]),
+        (["7.0", "12."], [7, 12]),
+        (["-3", "0"], [-3, 0]),
+        (["9223372036854775809", "1"], [2**63 + 1, 1]),
+        (["18446744073709551616", "1"], ["18446744073709551616", "1"]),
+    ],
+)
+def test_text_of_digits_is_a_number_if_it_is_written_as_one(texts, expected):
+    assert ids_of_text(texts).tolist() == expected
+
+
+@pytest.mark.parametrize("unit", [None, "NA", "count", "whatever"])
+@pytest.mark.parametrize("name", ["id", "K"])
+def test_ids_of_fits_are_integers_whatever_their_unit(tmp_path, unit, name):
+    path = tmp_path / "k.fits"
+    columns = [
+        fits.Column(name, "K", array=LARGE, unit=unit),
+        fits.Column("f", "J", array=[1, 2, 3], unit="uJy"),
+    ]
+    fits.BinTableHDU.from_columns(columns).writeto(path)
+    for table in (read_table(path, wanted="a table"), open_rows(path, 2).chunk(0)):
+        assert table[name].tolist() == LARGE[: len(table)]
+        assert table["f"].unit == u.uJy
+
+
+def test_ids_of_votables_are_integers_whatever_their_unit(tmp_path):
+    table = Table({"id": LARGE, "x": [1.0, 2.0, 3.0]})
+    table["id"].unit = "count"
+    table.write(tmp_path / "k.xml", format="votable")
+    assert read_table(tmp_path / "k.xml", wanted="a table")["id"].tolist() == LARGE
+
+
+def test_unsigned_ids_and_null_values_of_fits_are_exact(tmp_path):
+    ids = np.array([2**63 + 5, 2**63 + 7, 1], dtype=np.uint64)
+    Table({"id": ids, "x": [1.0, 2.0, 3.0]}).write(tmp_path / "u.fits")
+    assert read_ids(read_table(tmp_path / "u.fits", wanted="a table")).tolist() == ids.tolist()
+    column = fits.Column("id", "K", array=LARGE, null=LARGE[1], unit="count")
+    fits.BinTableHDU.from_columns([column]).writeto(tmp_path / "n.fits")
+    table = read_table(tmp_path / "n.fits", wanted="a table")
+    assert table["id"][[0, 2]].tolist() == [LARGE[0], LARGE[2]]
+    refuses("1 masked or empty, the first in row 1", read_ids, table)
+
+
+@pytest.mark.parametrize("mark", ["", "\ufeff"])
+@pytest.mark.parametrize("form", ["z.csv", "z.txt", "z.dat"])
+def test_ids_of_text_files_stay_as_they_are_written(tmp_path, mark, form):
+    path = tmp_path / form
+    text = {
+        "z.csv": "id,f\n0007,1.5\n007,null\n1E2,3\n",
+        "z.txt": "# id f\n0007 1.5\n007 null\n1E2 3\n",
+        "z.dat": "id f\n0007 1.5\n007 null\n1E2 3\n",
+    }[form]
+    path.write_text(mark + text, encoding="utf-8")
+    table = read_table(path, wanted="a table")
+    assert table["id"].tolist() == ["0007", "007", "1E2"]
+    assert_array_equal(np.ma.filled(table["f"], -1.0), [1.5, -1.0, 3.0])
+
+
+@pytest.mark.parametrize(
+    ("rows", "expected"),
+    [
+        (["9223372036854775809", "9223372036854775811"], [2**63 + 1, 2**63 + 3]),
+        (["1001.0", "1002.0"], [1001, 1002]),
+        (["12", "7"], [12, 7]),
+        (["12", "00.7"], ["12", "00.7"]),
+        (["a1", "NA"], ["a1", "NA"]),
+    ],
+)
+def test_numbers_of_text_files_are_exact(tmp_path, rows, expected):
+    path = tmp_path / "n.csv"
+    path.write_text("ID,f\n" + "".join(f"{row},1.0\n" for row in rows))
+    assert read_table(path, wanted="a table")["ID"].tolist() == expected
+    path.write_text("mine,f\n" + "".join(f"{row},1.0\n" for row in rows))
+    assert read_table(path, wanted="a table", id_names=["mine"])["mine"].tolist() == expected
+
+
+def test_a_blank_id_of_a_text_file_is_refused_and_the_others_stay_exact(tmp_path):
+    path = tmp_path / "b.csv"
+    path.write_text(f"id,f\n{LARGE[0]},1\n,2\n{LARGE[2]},3\n")
+    table = read_table(path, wanted="a table")
+    assert table["id"][[0, 2]].tolist() == [LARGE[0], LARGE[2]]
+    refuses("first in row 1", read_ids, table)
+
+
+def test_nullable_columns_and_the_index_of_pandas_are_kept():
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.DataFrame({"id": pandas.array([LARGE[1], None], dtype="Int64"), "f": [1.0, 2.0]})
+    table = as_table(frame, "photometry")
+    assert table["id"][0] == LARGE[1]
+    refuses("1 masked or empty, the first in row 1", read_ids, table)
+    unsigned = pandas.DataFrame({"id": pandas.array([2**63 + 5], dtype="UInt64")})
+    assert read_ids(as_table(unsigned, "photometry")).tolist() == [2**63 + 5]
+    frame = pandas.DataFrame({"f": [1.0, 2.0]}, index=pandas.Index([1001, 7], name="object_id"))
+    assert as_table(frame, "photometry")["object_id"].tolist() == [1001, 7]
+    frame.index.name = None
+    assert as_table(frame, "photometry")["id"].tolist() == [1001, 7]
+    rows = pandas.DataFrame({"id": ["a", "b", "c"], "f": [1.0, 2.0, 3.0]})[lambda one: one.f > 1]
+    assert as_table(rows, "photometry").colnames == ["id", "f"]
+    assert as_table(pandas.DataFrame({"f": [1.0]}), "photometry").colnames == ["f"]
+
+
+def test_frames_of_arrow_are_exact_and_name_what_they_lose():
+    arrow = pytest.importorskip("pyarrow")
+    rows = arrow.table(
+        {"id": [LARGE[1], None], "f": [1.0, None], "lc": [[1.0], []], "none": arrow.nulls(2)}
+    )
+    with pytest.warns(CatalogWarning, match="left out: 'lc'"):
+        table = as_table(rows, "photometry")
+    assert table["id"][0] == LARGE[1]
+    refuses("1 masked or empty, the first in row 1", read_ids, table)
+    assert np.isnan(table["f"][1])
+    assert np.isnan(table["none"]).all()
+
+
+def test_ids_that_occur_twice_are_warned_of_with_the_first_three():
+    with pytest.warns(CatalogWarning, match=r"5 rows have an id .* \(4, 1, 9, \.\.\.\)"):
+        warn_of_duplicates([4, 4, 1, 9, 1, 9, 8, 8, 4], "photometry")
