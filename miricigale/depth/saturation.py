@@ -9,6 +9,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from miricigale.instrument import Exposure, electron_rate, miri_detector
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.missing import floats
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import require_columns
 
@@ -204,7 +205,7 @@ def saturation_group(rate, limit, step):
     group in s; `NEVER` where nothing fills it. Non-linearity plays no part: the well is one of
     charge.
     """
-    rate = np.asarray(rate, float)
+    rate = floats(rate)
     with np.errstate(divide="ignore", invalid="ignore"):
         # a rate that fills it exactly does so in that group, whatever the rounding
         group = np.ceil(limit / (rate * step) * (1 - 1e-12))
@@ -218,7 +219,7 @@ def _sources(sources, rate, group, limit, exposure):
         sources = QTable({"id": np.zeros(0, int), "x": np.zeros(0), "y": np.zeros(0)})
     require_columns(sources, ("id", "x", "y"), "sources")
     ny, nx = rate.shape
-    x, y = (np.asarray(sources[name], float) for name in ("x", "y"))
+    x, y = (floats(sources[name]) for name in ("x", "y"))
     with np.errstate(invalid="ignore"):
         on = (x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)
     table = QTable({name: sources[name][on] for name in ("id", "x", "y")})

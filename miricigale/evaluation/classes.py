@@ -7,6 +7,7 @@ import numpy as np
 from miricigale.evaluation.estimates import Estimate, weighted_share
 from miricigale.evaluation.metrics import one_by_one
 from miricigale.utils.declared import declared
+from miricigale.utils.missing import floats
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import described_columns
 
@@ -40,7 +41,7 @@ def classify(frac_agn, *, limits=CLASS_LIMITS):
     >>> classify([0.02, 0.3, 0.8]).tolist()
     ['galaxy', 'composite', 'agn']
     """
-    frac_agn = np.asarray(frac_agn, float)
+    frac_agn = floats(frac_agn)
     bad = (frac_agn < 0) | (frac_agn > 1)
     check_that(not np.any(bad), "frac_agn", "between 0 and 1", frac_agn[bad])
     names = np.array([*CLASS_NAMES, "unknown"])

@@ -5,6 +5,7 @@ import numpy as np
 
 from miricigale.sed import COSMOLOGY
 from miricigale.utils.declared import declared
+from miricigale.utils.missing import floats
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import described_columns, require_columns, unique_ids
@@ -254,7 +255,7 @@ def ceers_dust(table, component, *, seed):
     seed, rows, excess = check_seed(seed), np.flatnonzero(galaxy), np.ones(len(ids))
     offset = [stream(seed, "dust", str(ids[row])).normal() for row in rows]
     passive, mass, balance = quiescent[rows], np.log10(mass[rows]), dust[rows] * LUMINOSITY
-    sfr = to_array(u.Quantity(table["sfr_100myr"]), u.Msun / u.yr, "sfr_100myr")[rows]
+    sfr = to_array(table["sfr_100myr"], u.Msun / u.yr, "sfr_100myr")[rows]
     rate = np.clip(np.log10(np.maximum(sfr, 1e-9)) - mass, -12.0, -8.0)
     forming = at + mass + by_mass * (np.clip(mass, 8.5, 10.3) - 10.3) + by_rate * (rate + 9.3)
     mean = np.where(passive, low, forming - np.log10(balance.to_value(u.Lsun)))
@@ -266,11 +267,11 @@ def _dusty_galaxies(table):
     """Ids, redshifts, masses in Msun and dust luminosities in W of a table; which are galaxies, and quiescent."""
     units = {"stellar_mass": MASS, "dust_luminosity": LUMINOSITY, "u_v": u.mag, "v_j": u.mag}
     require_columns(table, ("id", "redshift", *units), "table", units=units)
-    mass = to_array(u.Quantity(table["stellar_mass"]), MASS, "stellar_mass")
-    dust = to_array(u.Quantity(table["dust_luminosity"]), LUMINOSITY, "dust_luminosity")
-    z = np.asarray(table["redshift"], float)
+    mass = to_array(table["stellar_mass"], MASS, "stellar_mass")
+    dust = to_array(table["dust_luminosity"], LUMINOSITY, "dust_luminosity")
+    z = floats(table["redshift"])
     galaxy = (mass > 0) & (z > 0) & (dust > 0) & np.isfinite(mass * z * dust)
-    quiescent = galaxy & uvj_quiescent(u.Quantity(table["u_v"]), u.Quantity(table["v_j"]), z)
+    quiescent = galaxy & uvj_quiescent(table["u_v"], table["v_j"], z)
     return unique_ids(table["id"], "table"), z, mass, dust, galaxy, quiescent
 
 
@@ -306,7 +307,7 @@ def number_counts(flux, area, edges):
     >>> print(counts.round(0))
     [1800. 5400.] 1 / deg2
     """
-    edges = np.asarray(edges, float)
+    edges = floats(edges)
     check_that(edges.ndim == 1 and np.all(np.diff(edges) > 0), "edges", "ascending", edges)
     flux = to_array(flux, FNU, "flux", ndim=1)
     mag = ab_magnitude(flux[flux > 0] * FNU)

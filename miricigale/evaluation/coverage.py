@@ -6,6 +6,7 @@ from scipy.stats import kstest
 from miricigale.evaluation.metrics import fraction_interval
 from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.missing import floats
 from miricigale.utils.options import check_that
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import described_rows
@@ -48,10 +49,10 @@ def posterior_ranks(true, values, levels, *, seed=None):
     >>> posterior_ranks([0.25, 0.75], [0.0, 0.5, 1.0], [0.0, 0.8, 1.0]).tolist()
     [0.4, 0.9]
     """
-    true = np.asarray(true, float)
+    true = floats(true)
     try:
         shape = np.broadcast_shapes(np.shape(values), np.shape(levels), (true.size, 1))
-        values, levels = (np.broadcast_to(np.asarray(a, float), shape) for a in (values, levels))
+        values, levels = (np.broadcast_to(floats(a), shape) for a in (values, levels))
     except ValueError:
         got = f"{np.shape(values)}, {np.shape(levels)} and {true.shape}"
         raise argument_error(
@@ -117,11 +118,11 @@ def coverage_table(ranks, *, levels=(0.68, 0.95)):
     redshift 101  0.68  0.68       0.5
     redshift 101  0.95  0.94       0.5
     """
-    levels = np.atleast_1d(np.asarray(levels, float))
+    levels = np.atleast_1d(floats(levels))
     check_that(np.all((levels > 0) & (levels < 1)), "levels", "between 0 and 1", levels)
     rows = []
     for name, values in ranks.items():
-        values = np.asarray(values, float)
+        values = floats(values)
         values = values[np.isfinite(values)]
         bad = (values < 0) | (values > 1)
         check_that(not np.any(bad), "ranks", "between 0 and 1", values[bad])

@@ -6,6 +6,7 @@ import numpy as np
 
 from miricigale.evaluation.metrics import OUTLIER, fraction_interval, sigma_mad
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.missing import floats
 from miricigale.utils.random import check_seed, stream
 
 #: Values that are held at once: draws are made in pieces of this size.
@@ -142,7 +143,7 @@ def bootstrap(statistic, *columns, seed, n_draws=1000, n_all=None):
     >>> print(f"{mean.error:.2f}")
     0.01
     """
-    columns = [np.asarray(column, float) for column in columns]
+    columns = [floats(column) for column in columns]
     if not columns or len({len(column) for column in columns}) != 1:
         raise argument_error("columns", "of one length", [column.shape for column in columns])
     known = [np.atleast_2d(np.isfinite(column).T).any(axis=0) for column in columns]

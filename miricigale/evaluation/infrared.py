@@ -4,6 +4,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.evaluation.estimates import bootstrap, median
+from miricigale.utils.missing import floats
 from miricigale.utils.units import WAVE, positive, to_array
 
 #: Rest wavelengths of the strong features of polycyclic aromatic hydrocarbons.
@@ -39,7 +40,7 @@ def feature_magnitude(width, redshift, filter_width):
     """
     width = to_array(width, WAVE, "width")
     band = positive(filter_width, WAVE, "filter_width")
-    return 2.5 * np.log10(1.0 + width * (1.0 + np.asarray(redshift)) / band)
+    return 2.5 * np.log10(1.0 + width * (1.0 + floats(redshift)) / band)
 
 
 def feature_redshifts(feature, pivot, filter_width):
@@ -107,7 +108,7 @@ def feature_residuals(residual, redshift, *, feature, pivot, filter_width, seed)
     >>> inside.value, outside.value
     (-0.2, 0.0)
     """
-    residual, redshift = np.asarray(residual, float), np.asarray(redshift, float)
+    residual, redshift = floats(residual), floats(redshift)
     low, high = feature_redshifts(feature, pivot, filter_width)
     rows = (redshift >= low) & (redshift < high)
     return tuple(bootstrap(median, residual[keep], seed=seed) for keep in (rows, ~rows))

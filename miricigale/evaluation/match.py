@@ -247,11 +247,11 @@ def match_truth(truth, measured, bands, *, radius=0.5 * u.arcsec):
     table["association"] = reasons
     table["association"].info.description = AssociationFlags.describe()
     for band in bands:
-        table[f"{band}_true"] = u.Quantity(truth[band]).to(u.uJy)
+        table[f"{band}_true"] = to_array(truth[band], FNU, band) * FNU
         for name in (band, error_column(band)):
             values = np.full(len(truth), np.nan)
             if name in measured.colnames:
-                values[found] = u.Quantity(measured[name]).to_value(u.uJy)[index[found]]
+                values[found] = to_array(measured[name], FNU, name)[index[found]]
             table[name] = values * u.uJy
     for name in [c for c in measured.colnames if c == "flags" or c.endswith("_flags")]:
         values = np.zeros(len(truth), int)

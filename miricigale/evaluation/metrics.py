@@ -6,6 +6,7 @@ import itertools
 import numpy as np
 from astropy.stats import binom_conf_interval
 
+from miricigale.utils.missing import floats, without_mask
 from miricigale.utils.options import check_that
 
 #: abs(dz) / (1 + z) above which a redshift is an outlier.
@@ -15,10 +16,20 @@ OUTLIER = 0.15
 def one_by_one(dtype=float, **arrays):
     """Two 1-D arrays of one length, of a type; an error by their names if they are not."""
     (name, first), (other, second) = arrays.items()
-    first, second = np.asarray(first, dtype), np.asarray(second, dtype)
+    first, second = _plain(first, name, dtype), _plain(second, other, dtype)
     good, got = first.shape == second.shape, f"shapes {first.shape} and {second.shape}"
     check_that(good and first.ndim == 1, other, f"a 1-D array as long as '{name}'", got)
     return first, second
+
+
+def _plain(values, name, dtype):
+    """Values of a type: of numbers NaN where they are masked; others may not be masked."""
+    if dtype is float:
+        return floats(values)
+    values, mask = without_mask(values)
+    n_masked = 0 if mask is None else int(np.count_nonzero(mask))
+    check_that(mask is None, name, "without masked values", f"{n_masked} of them")
+    return np.asarray(values, dtype)
 
 
 def sigma_mad(values, *, axis=None, ignore_nan=False):
@@ -49,7 +60,7 @@ def sigma_mad(values, *, axis=None, ignore_nan=False):
     >>> sigma_mad([1.0, 2.0, 3.0, 4.0, 100.0])
     1.48
     """
-    values = np.asarray(values, float)
+    values = floats(values)
     if values.size == 0:
         return np.nan
     median = np.nanmedian if ignore_nan else np.median

@@ -11,6 +11,7 @@ from miricigale.evaluation.classes import (
 )
 from miricigale.evaluation.quantities import OF_FITS, REDSHIFT_BINS, measure
 from miricigale.utils.declared import declared
+from miricigale.utils.missing import floats
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import described_columns, described_rows
 
@@ -113,7 +114,7 @@ def study_confusion(study, band_set="all"):
           agn   0      0         0   0
     """
     truths = [one for one in study.truths if one.frac_agn is not None and band_set in one.fits]
-    true = [classify(np.asarray(one.truth["frac_agn"], float))[one.field] for one in truths]
+    true = [classify(floats(one.truth["frac_agn"]))[one.field] for one in truths]
     # "unknown" of those not in the sample
     means = [one.of_catalog(one.fitted(band_set, "frac_agn_mean"))[one.field] for one in truths]
     found = [classify(np.clip(mean, 0, 1)) for mean in means]
@@ -159,7 +160,7 @@ def selection_table(one, *, limits=CLASS_LIMITS):
     -------- ----- -------- ---------- ------
          all   0.1        0          1    0.0
     """
-    true = np.asarray(one.truth["frac_agn"], float)[one.field]
+    true = floats(one.truth["frac_agn"])[one.field]
     pairs = [(band_set, limit) for band_set in one.fits for limit in limits]
     found = []
     for band_set, limit in pairs:

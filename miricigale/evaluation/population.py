@@ -132,7 +132,9 @@ def galaxy_mass_function(stellar_mass, redshift):
     4.10e-03 1 / (dex Mpc3)
     """
     log_mass = np.log10(to_array(stellar_mass, MASS, "stellar_mass"))
-    return _smf(log_mass, _redshift(redshift)) * _DENSITY
+    z = _redshift(redshift)
+    density = _smf(log_mass, np.where(np.isnan(z), 1.0, z))
+    return np.where(np.isnan(z), np.nan, density)[()] * _DENSITY
 
 
 def agn_fraction(l_6um, reference):
@@ -312,7 +314,7 @@ class AGNPopulation:
         names = ("id", "redshift", "stellar_mass")
         require_columns(table, names, "table", units={"stellar_mass": MASS})
         ids = unique_ids(table["id"], "table")
-        log_mass, redshift = _galaxies(u.Quantity(table["stellar_mass"]), table["redshift"])
+        log_mass, redshift = _galaxies(table["stellar_mass"], table["redshift"])
         seed = check_seed(seed)
         drawn = [stream(seed, "agn", str(key)).uniform(size=2) for key in ids]
         drawn = np.reshape(drawn, (len(ids), 2))

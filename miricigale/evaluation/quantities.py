@@ -14,6 +14,7 @@ from miricigale.evaluation.metrics import OUTLIER
 from miricigale.evaluation.study import TruthResults
 from miricigale.evaluation.xray import half_complete, xray_luminosity_at, yang2021_xray_flux
 from miricigale.filters import Filter
+from miricigale.utils.missing import floats
 from miricigale.utils.options import check_names
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import ab_magnitude
@@ -37,7 +38,7 @@ def _share(found, n_all=None):
 def _in_bin(one, option):
     """Rows of the sample in a bin of true redshift (all without), and sources of the field in it."""
     low, high = option or (0.0, np.inf)
-    z = np.asarray(one.truth["redshift"], float)
+    z = floats(one.truth["redshift"])
     rows = (z >= low) & (z < high)
     return rows[one.sample], int(np.count_nonzero(rows & one.field))
 
@@ -207,7 +208,7 @@ def _power(statistic):
 
 def xray_fluxes(one):
     """Log of the X-ray flux (erg/s/cm2) of all sources of a truth; NaN without an AGN, and of stars."""
-    redshift, power = np.asarray(one.truth["redshift"], float), one.truth["l_6um"]
+    redshift, power = floats(one.truth["redshift"]), one.truth["l_6um"]
     flux = np.full(redshift.size, np.nan)
     good = np.isfinite(redshift) & (power > 0)
     flux[good] = yang2021_xray_flux(power[good], redshift[good]).value

@@ -8,6 +8,7 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.missing import floats
 from miricigale.utils.tables import error_column, require_columns
 from miricigale.utils.units import FNU, ab_magnitude
 
@@ -92,14 +93,14 @@ class TruthResults:
 
     def true(self, name):
         """True values of the sample."""
-        return np.asarray(getattr(self.truth[name], "value", self.truth[name]), float)[self.sample]
+        return floats(self.truth[name])[self.sample]
 
     def fitted(self, band_set, name):
         """A column of a fit as plain numbers; NaN throughout if the truth has no such fit."""
         if band_set not in self.fits:
             return np.full(np.count_nonzero(self.sample), np.nan)
         column = self.fits[band_set][name]
-        return np.asarray(getattr(column, "value", column), float)
+        return floats(column)
 
     def redshift_error(self, band_set):
         """(z_fit - z) / (1 + z) of the sample."""
@@ -135,7 +136,7 @@ class TruthResults:
     @functools.cached_property
     def shapes(self):
         """Which sources are points and which of low and of high Sersic index: dict of arrays of bool."""
-        index = np.asarray(self.truth["sersic_index"], float)
+        index = floats(self.truth["sersic_index"])
         point = np.asarray(self.truth["profile"]) == "point"
         return {"point": point, "n < 2": ~point & (index < 2), "n >= 2": ~point & (index >= 2)}
 

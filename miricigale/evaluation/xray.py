@@ -11,6 +11,7 @@ from miricigale.evaluation.metrics import fraction_interval, one_by_one
 from miricigale.sed.xray import stern2015, xray_flux
 from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.missing import floats
 from miricigale.utils.tables import described_columns
 
 _CGS = u.erg / u.s / u.cm**2
@@ -155,7 +156,7 @@ def completeness(values, found, edges):
     """
     values, found = one_by_one(values=values, found=found)
     found = found > 0
-    edges = np.asarray(edges, float)
+    edges = floats(edges)
     if edges.ndim != 1 or edges.size < 2 or np.any(np.diff(edges) <= 0):
         raise argument_error("edges", "ascending", edges)
     n, _ = np.histogram(values, edges)

@@ -8,6 +8,7 @@ import numpy as np
 
 from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import unpacked_size
+from miricigale.utils.missing import floats
 from miricigale.utils.table_files import TABLE_FORMATS, read_table
 
 # units that a header may name
@@ -45,9 +46,9 @@ def _of_table(path, unit):
     if len(columns) < 2 or (unit is None and has is None):
         what = "has not two columns, the first with a unit of wavelength"
         raise data_error(path, f"{what}: give 'unit' if it has none")
-    wave = np.asarray(getattr(columns[0], "value", columns[0]), float)
+    wave = floats(columns[0])
     name = str(table.meta.get("name") or table.meta.get("NAME") or path.stem)
-    return wave * u.Unit(unit or has), np.asarray(columns[1], float), name
+    return wave * u.Unit(unit or has), floats(columns[1]), name
 
 
 def _of_text(path, unit):

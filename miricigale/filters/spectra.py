@@ -3,14 +3,15 @@
 import astropy.units as u
 import numpy as np
 
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.exceptions import ModelWarning, argument_error, warn
+from miricigale.utils.missing import floats
 from miricigale.utils.options import check_that
 from miricigale.utils.units import FNU, WAVE, to_array
 
 
 def check_wave(wave):
     """Wavelengths of a spectrum as an array in um."""
-    wave = to_array(wave, WAVE, "wave") if hasattr(wave, "unit") else np.asarray(wave, float)
+    wave = to_array(wave, WAVE, "wave") if hasattr(wave, "unit") else floats(wave)
     if wave.ndim != 1 or wave.size < 2 or not np.all(np.diff(wave) > 0):
         raise argument_error("wave", "two or more strictly ascending wavelengths", wave)
     return wave
@@ -32,11 +33,17 @@ def spectrum_arrays(sed, bands):
     Returns
     -------
     wave, fnu : `~numpy.ndarray`, shape (n,)
+        Without samples that are masked (by the flux or the mask of a spectrum of specutils) or NaN.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.ModelWarning`
+        If samples are left out, with the longest gap.
 
     Raises
     ------
     ValueError
-        If it is no spectrum.
+        If it is no spectrum, or fewer than two samples are left.
     `~astropy.units.UnitsError`
         If it has other units than a flux density's.
     """
@@ -64,7 +71,25 @@ def spectrum_arrays(sed, bands):
     fnu = to_array(flux, FNU, "sed.fnu", ndim=1, equivalencies=spectral)
     got = f"{fnu.size} for {wave.size} wavelengths"
     check_that(wave.shape == fnu.shape, "sed.fnu", "as many values as sed.wave", got)
-    return wave, fnu
+    missing = np.isnan(fnu)
+    if getattr(sed, "mask", None) is not None:
+        missing = missing | np.broadcast_to(np.asarray(sed.mask, dtype=bool), fnu.shape)[order]
+    return _without_missing(wave, fnu, missing)
+
+
+def _without_missing(wave, fnu, missing):
+    """Samples of a spectrum that are not masked or NaN, with a warning about the others."""
+    if not missing.any():
+        return wave, fnu
+    n_good = int(np.count_nonzero(~missing))
+    check_that(n_good >= 2, "sed.fnu", "two or more values that are not masked or NaN", n_good)
+    good = np.flatnonzero(~missing)
+    gap = good[np.argmax(np.diff(wave[good]) * missing[good[:-1] + 1]) :][:2]
+    text = f"{missing.size - n_good} of {missing.size} samples of the spectrum are masked or NaN and left out"
+    if missing[gap[0] + 1]:
+        text += f"; straight lines bridge them, the longest from {wave[gap[0]]:.5g} to {wave[gap[1]]:.5g} um"
+    warn(text, ModelWarning)
+    return wave[good], fnu[good]
 
 
 def _inside(bands):

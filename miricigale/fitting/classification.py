@@ -3,6 +3,7 @@
 import numpy as np
 
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.missing import floats
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import described_table
 
@@ -112,7 +113,7 @@ def _prior(prior, names, n):
     if prior is None:
         return np.ones((len(names), n))
     check_that(set(prior) == set(names), "prior", f"of the classes {names}", sorted(prior))
-    weight = np.array([np.broadcast_to(np.asarray(prior[name], float), (n,)) for name in names])
+    weight = np.array([np.broadcast_to(floats(prior[name]), (n,)) for name in names])
     if not np.all(np.isfinite(weight) & (weight >= 0)) or not np.all(weight.sum(axis=0) > 0):
         raise argument_error("prior", "finite, >= 0 and not all 0", f"{prior}")
     return weight

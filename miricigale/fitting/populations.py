@@ -10,6 +10,7 @@ from miricigale.fitting.posterior import cell_edges
 from miricigale.fitting.quantities import plain
 from miricigale.sed.spectrum import COSMOLOGY
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.missing import floats
 from miricigale.utils.options import check_that
 from miricigale.utils.units import MASS, is_number, to_array
 
@@ -45,7 +46,7 @@ def agn_fraction_prior(frac_agn):
     >>> agn_fraction_prior([0.0, 0.1, 0.3, 0.6, 0.9]).round(4)
     array([0.9247, 0.0497, 0.017 , 0.0073, 0.0013])
     """
-    frac = np.asarray(frac_agn, dtype=float)
+    frac = floats(frac_agn)
     if frac.ndim != 1 or frac.size < 2 or frac[0] != 0 or not np.all(np.diff(frac) > 0):
         raise argument_error("frac_agn", "ascending values from 0", f"{frac_agn}")
     edges = cell_edges(frac, (0.0, 1.0))[1:-1]

@@ -10,6 +10,7 @@ from miricigale.fitting.likelihood import FitFlags
 from miricigale.fitting.posterior import cell_edges
 from miricigale.fitting.quantities import plain
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.missing import floats, without_mask
 from miricigale.utils.options import check_choice, check_names, check_that
 from miricigale.utils.units import to_array
 
@@ -220,10 +221,12 @@ def magnitude_prior(magnitude, redshift=None):
     >>> z[density.argmax(axis=1)].round(1)
     array([0.4, 0.8])
     """
+    plain, mask = without_mask(magnitude)
     with np.errstate(divide="ignore", invalid="ignore"):
-        values = u.Quantity(magnitude, subok=True).to(u.ABmag).value
-    apart = np.atleast_1d(values).astype(float) - 24.0
-    z = np.linspace(0.0, 15.0, 751) if redshift is None else np.asarray(redshift, dtype=float)
+        values = u.Quantity(plain, subok=True).to(u.ABmag).value
+    values = np.asarray(values, dtype=float) if mask is None else np.where(mask, np.nan, values)
+    apart = np.atleast_1d(values) - 24.0
+    z = np.linspace(0.0, 15.0, 751) if redshift is None else floats(redshift)
     # bright galaxies are not all at 0
     top = np.maximum(_PEAK + _SLOPE * np.where(np.isfinite(apart), apart, 0.0), 0.1 * _PEAK)
     density = z**_POWER * np.exp(-((z / top[:, None]) ** _POWER))

@@ -9,6 +9,7 @@ from astropy.utils.decorators import deprecated
 from miricigale.filters import FilterSet
 from miricigale.refdata import locate
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.missing import floats
 from miricigale.utils.options import check_kind
 from miricigale.utils.table_files import read_table
 from miricigale.utils.units import WAVE, frozen_array, to_array
@@ -52,7 +53,7 @@ class TemplateError:
     error: np.ndarray
 
     def __post_init__(self):
-        wave, error = to_array(self.wave, WAVE, "wave", ndim=1), np.asarray(self.error, dtype=float)
+        wave, error = to_array(self.wave, WAVE, "wave", ndim=1), floats(self.error)
         if wave.size == 0 or not (wave[0] > 0 and np.all(np.diff(wave) > 0)):
             raise argument_error("wave", "ascending values above 0", f"{wave}")
         if error.shape != wave.shape or not np.all(np.isfinite(error) & (error >= 0)):

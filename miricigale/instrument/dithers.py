@@ -168,7 +168,7 @@ def tile_offsets(n_x, n_y, *, overlap=0.1):
 def _table_offsets(table, argument):
     names = ("x_offset", "y_offset")
     require_columns(table, names, argument, units=dict.fromkeys(names, ANGLE))
-    columns = [to_array(u.Quantity(table[name]), ANGLE, name, finite=True) for name in names]
+    columns = [to_array(table[name], ANGLE, name, finite=True) for name in names]
     return np.stack(columns, axis=1) * ANGLE
 
 

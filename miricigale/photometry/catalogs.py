@@ -7,7 +7,9 @@ from astropy.table import Table
 
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.ids import counted_ids, id_column
+from miricigale.utils.missing import floats
 from miricigale.utils.tables import require_columns, unique_ids
+from miricigale.utils.units import to_array
 
 #: Columns of a catalog that need not be there, and that templates keep.
 OPTIONAL = ("flux", "components")
@@ -32,7 +34,7 @@ def catalog_sources(catalog):
     ids = counted_ids(catalog, "catalog") if name is None else unique_ids(catalog[name], "catalog")
     flux = components = None
     if "flux" in catalog.colnames:
-        flux = np.asarray(getattr(catalog["flux"], "value", catalog["flux"]), float)
+        flux = floats(catalog["flux"])
     if "components" in catalog.colnames:
         components = np.asarray(catalog["components"])
         if components.dtype.kind not in "iu" or not np.isin(components, (1, 2)).all():
@@ -49,10 +51,11 @@ def sersic_rows(catalog):
     names = ["half_light_radius", "sersic_index", "axis_ratio", "position_angle"]
     require_columns(catalog, names, "catalog", units=units)
     radius, index, ratio, angle = (catalog[name] for name in names)
-    sizes = u.Quantity(radius).to_value(u.arcsec), u.Quantity(angle).to_value(u.rad)
-    rows = np.stack(
-        [sizes[0], np.asarray(index, float), np.asarray(ratio, float), sizes[1]], axis=1
+    sizes = (
+        to_array(radius, u.arcsec, "half_light_radius"),
+        to_array(angle, u.rad, "position_angle"),
     )
+    rows = np.stack([sizes[0], floats(index), floats(ratio), sizes[1]], axis=1)
     if "profile" in catalog.colnames:
         rows[np.asarray(catalog["profile"]) != "sersic"] = np.nan
     return rows

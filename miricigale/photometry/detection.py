@@ -15,6 +15,7 @@ from miricigale.photometry.segments import dilate_segments, dilation_rule
 from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
+from miricigale.utils.missing import floats
 from miricigale.utils.options import check_names, check_positive
 from miricigale.utils.sep_tools import background as sep_background
 from miricigale.utils.sep_tools import extract
@@ -275,7 +276,7 @@ def detection_purity(image, *, snr_edges=None, preset="yang2021", **settings):
             top = np.nextafter(negative.max(), np.inf)
             low = min(negative.min(), positive.min(initial=np.inf))
             snr_edges = np.append(np.linspace(low, max(top, low + 1e-6), 11), np.inf)
-    edges = np.asarray(snr_edges, float)
+    edges = floats(snr_edges)
     if edges.ndim != 1 or len(edges) < 2 or not np.all(np.diff(edges) > 0):
         raise argument_error("snr_edges", "two numbers or more that ascend", snr_edges)
     counts = [np.histogram(snr, edges)[0] for snr in (positive, negative)]

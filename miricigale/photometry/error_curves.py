@@ -11,7 +11,7 @@ from miricigale.filters import as_photometry
 from miricigale.utils.declared import declared
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.tables import described_columns, error_column, require_columns
-from miricigale.utils.units import FNU
+from miricigale.utils.units import FNU, to_array
 
 #: What turns the median of absolute values into a standard deviation.
 STATISTICS = {"mad": 1.482602218505602, "median_abs": 1.0}
@@ -177,7 +177,7 @@ def flux_table(photometry, filters, known):
     check_names(filters, "band of this error model", known)
     table = QTable(photometry, copy=True)
     for name in filters:
-        table[name] = u.Quantity(table[name]).to(FNU)
+        table[name] = to_array(table[name], FNU, name) * FNU
     return table, filters
 
 

@@ -22,6 +22,7 @@ from miricigale.photometry.offsets import OffsetMap
 from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import Tabular, checked_calls
+from miricigale.utils.missing import floats
 from miricigale.utils.random import check_seed
 from miricigale.utils.tables import described_table
 from miricigale.utils.unified import read_write
@@ -74,7 +75,7 @@ def crowded(sky, flux, *, radius=2 * u.arcsec):
     found = np.zeros(len(sky), bool)
     known = np.flatnonzero(np.isfinite(sky.spherical.lon) & np.isfinite(sky.spherical.lat))
     if len(known) > 1:
-        flux = np.asarray(getattr(flux, "value", flux), float)
+        flux = floats(flux)
         i, j, _, _ = sky[known].search_around_sky(sky[known], radius)
         i, j = known[i], known[j]
         limit = np.maximum(flux[i], 0.0) * 10**-0.4

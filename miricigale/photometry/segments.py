@@ -7,6 +7,7 @@ import scipy.ndimage
 from photutils.segmentation import SegmentationImage
 
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.missing import floats
 from miricigale.utils.options import check_names
 
 
@@ -50,7 +51,7 @@ class DilationRule:
     max_area: float = np.inf
 
     def __post_init__(self):
-        areas, factors = (np.atleast_1d(np.asarray(v, float)) for v in (self.areas, self.factors))
+        areas, factors = (np.atleast_1d(floats(v)) for v in (self.areas, self.factors))
         if areas.ndim != 1 or np.any(areas <= 0) or np.any(np.diff(areas) <= 0):
             raise argument_error("areas", "positive and ascending", self.areas)
         if factors.shape != areas.shape or not np.all(factors >= 1):
@@ -63,7 +64,7 @@ class DilationRule:
 
     def area(self, before):
         """Areas (arcsec2) that segments of some areas are to have, never below these."""
-        before = np.asarray(before, float)
+        before = floats(before)
         with np.errstate(divide="ignore"):
             factor = np.exp(np.interp(np.log(before), np.log(self.areas), np.log(self.factors)))
         return np.maximum(np.clip(before * factor, self.min_area, self.max_area), before)

@@ -6,6 +6,7 @@ import scipy.fft
 from miricigale.photometry._core.sampling import box_response
 from miricigale.photometry._core.shape_fits import draw_curves, make_plan
 from miricigale.photometry._core.shapes import fill_curves, profile_table
+from miricigale.utils.missing import floats
 
 #: Size of the transform over that of the stamp.
 _PERIOD = 1.6
@@ -18,7 +19,7 @@ class ShapeModels:
     """Draws light through a PSF, odd and centered."""
 
     def __init__(self, psf):
-        self._psf = np.asarray(psf, float)
+        self._psf = floats(psf)
         #: Half-width of the PSF (pixels).
         self.reach = self._psf.shape[0] / 2
         self._transforms, self._plans = {}, {}

@@ -3,6 +3,7 @@
 import numpy as np
 import scipy
 
+from miricigale.utils.missing import floats
 from miricigale.utils.options import check_that
 
 _IN_STAMP = 0.995  # of the light lies within the isophote that a stamp holds
@@ -34,7 +35,7 @@ def sersic_bn(n):
     >>> float(sersic_bn(4.0))
     7.6692494425008
     """
-    return scipy.special.gammaincinv(2.0 * np.asarray(n, dtype=float), 0.5)[()]
+    return scipy.special.gammaincinv(2.0 * floats(n), 0.5)[()]
 
 
 def sersic_enclosed_fraction(radius, n):
@@ -63,8 +64,8 @@ def sersic_enclosed_fraction(radius, n):
     >>> sersic_enclosed_fraction([1.0, 10.0], 4.0)
     array([0.5      , 0.9614859])
     """
-    n = np.asarray(n, dtype=float)
-    x = np.asarray(radius, dtype=float)
+    n = floats(n)
+    x = floats(radius)
     return scipy.special.gammainc(2 * n, sersic_bn(n) * x ** (1 / n))[()]
 
 
@@ -78,8 +79,8 @@ def sersic_radius(fraction, n):
     >>> sersic_radius([0.5, 0.9], 4.0).round(3)
     array([1.   , 5.549])
     """
-    n = np.asarray(n, dtype=float)
-    x = scipy.special.gammaincinv(2 * n, np.asarray(fraction, dtype=float))
+    n = floats(n)
+    x = scipy.special.gammaincinv(2 * n, floats(fraction))
     return ((x / sersic_bn(n)) ** n)[()]
 
 
@@ -100,7 +101,7 @@ def light_table(n):
     """
     from miricigale.profiles import _core
 
-    n = np.atleast_1d(np.asarray(n, dtype=float))[:, None]
+    n = np.atleast_1d(floats(n))[:, None]
     bn = sersic_bn(n)
     log_r = _core.TABLE_START + _core.TABLE_STEP * np.arange(_core.TABLE_SIZE)[None]
     z = bn * np.exp(log_r / n)
@@ -125,7 +126,7 @@ def parameter_rows(*, x, y, total_flux, r_eff, n, axis_ratio, theta):
         Columns as in ``_core.PARAMETERS``.
     """
     values = (x, y, total_flux, r_eff, n, axis_ratio, theta)
-    values = np.broadcast_arrays(*(np.atleast_1d(np.asarray(v, dtype=float)) for v in values))
+    values = np.broadcast_arrays(*(np.atleast_1d(floats(v)) for v in values))
     x, y, total_flux, r_eff, n, axis_ratio, theta = values
     bn = sersic_bn(n)
     minor = axis_ratio * r_eff

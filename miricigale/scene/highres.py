@@ -8,6 +8,7 @@ from astropy.nddata import StdDevUncertainty
 
 from miricigale.instrument import pixel_area_map
 from miricigale.scene.scene import Scene
+from miricigale.utils.missing import floats
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.units import positive
 
@@ -48,7 +49,7 @@ def depth_to_rms(depth, *, pixel_area):
     # magnitudes become fluxes
     flux = depth.to(u.uJy) if isinstance(depth, u.Magnitude) else depth
     limit = positive(flux, u.uJy, "depth")
-    pixel_area = np.asarray(pixel_area, dtype=float)
+    pixel_area = floats(pixel_area)
     n_pixels = math.pi * _APERTURE.to_value(u.rad) ** 2 / pixel_area
     return (1e-12 * limit / _N_SIGMA / np.sqrt(n_pixels) / pixel_area)[()]
 

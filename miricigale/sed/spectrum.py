@@ -13,6 +13,7 @@ from miricigale.utils.exceptions import argument_error, data_error
 from miricigale.utils.files import reading
 from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.meta import full_meta
+from miricigale.utils.missing import floats
 from miricigale.utils.optional import require
 from miricigale.utils.options import check_that
 from miricigale.utils.table_files import read_table, write_table
@@ -35,7 +36,7 @@ def distance(redshift, cosmology):
     cosmology : `~astropy.cosmology.Cosmology`
         The cosmology.
     """
-    z = np.asarray(redshift, dtype=float)
+    z = floats(redshift)
     far = cosmology.luminosity_distance(np.where(z > 0, z, 1.0)).to_value(u.m)
     return np.where(z > 0, far, (10.0 * u.pc).to_value(u.m))
 

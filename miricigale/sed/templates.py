@@ -15,7 +15,7 @@ from miricigale.sed.grid import ModelGrid
 from miricigale.sed.spectrum import SED
 from miricigale.utils.exceptions import ModelWarning, argument_error, data_error, file_errors, warn
 from miricigale.utils.meta import provenance
-from miricigale.utils.missing import plain_floats
+from miricigale.utils.missing import floats, plain_floats
 from miricigale.utils.options import check_choice, check_data, check_that
 from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import described_table
@@ -172,7 +172,7 @@ def template_grid(spectra, filters, *, beyond="error", redshift=None):
         if short:
             msg = f"{len(short)} of {len(seds)} spectra continued to {last:.3g} with F_nu ~ wave^-2"
             warn(msg, ModelWarning)
-    z = np.zeros(1) if redshift is None else np.array(redshift, dtype=float, ndmin=1)
+    z = np.zeros(1) if redshift is None else np.atleast_1d(floats(redshift))
     if z.ndim != 1 or not (np.all(np.diff(z) > 0) and z[0] >= 0 and np.isfinite(z[-1])):
         raise argument_error("redshift", "finite, ascending and >= 0", f"{redshift}")
     if redshift is None:

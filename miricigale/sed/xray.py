@@ -8,6 +8,7 @@ from miricigale.sed.component import Component, register
 from miricigale.sed.parameter import Parameter
 from miricigale.sed.spectrum import COSMOLOGY, distance
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.missing import without_mask
 from miricigale.utils.units import LUMINOSITY, to_array
 
 #: nu L_nu at 6 um that the samples of Stern 2015 span, roughly: Seyferts to luminous quasars.
@@ -134,7 +135,9 @@ def band_luminosity(l_x, *, from_band, to_band, photon_index=1.8):
     index = to_array(photon_index, u.dimensionless_unscaled, "photon_index", finite=True)
     top = _core.power_law_energy(*check_band(to_band, "to_band"), index)
     bottom = _core.power_law_energy(*check_band(from_band, "from_band"), index)
-    return u.Quantity(l_x) * (top / bottom)
+    values, mask = without_mask(l_x)
+    values = u.Quantity(values) * (top / bottom)
+    return values if mask is None else np.where(mask, np.nan, values)
 
 
 def xray_flux(l_x_2_10, redshift, *, band=(0.5, 7.0) * u.keV, photon_index=1.8, transmission=1.0):

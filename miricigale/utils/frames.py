@@ -42,6 +42,19 @@ def frame_columns(data, argument):
     return _of_index(data, columns) | columns
 
 
+def as_column(values):
+    """Values of a column of a dict; a masked array of what pandas holds, and of a list with None."""
+    if hasattr(values, "isna") and hasattr(values, "to_numpy"):
+        return _of_series(values)
+    if isinstance(values, list) and any(value is None for value in values):
+        missing = np.array([value is None for value in values])
+        here = np.array([value for value in values if value is not None])
+        out = np.zeros(len(values), dtype=here.dtype)
+        out[~missing] = here
+        return np.ma.MaskedArray(out, mask=missing)
+    return values
+
+
 def _of_index(data, columns):
     """Columns of an index, whose names are not among those of the frame."""
     index = data.index

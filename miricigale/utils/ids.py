@@ -75,12 +75,12 @@ def id_column(colnames, argument, *, labels=True):
 
 
 def likely_ids(table):
-    """Names of columns of whole numbers or text that look like ids, though not by a usual name."""
+    """Names of columns of numbers or text that look like ids, though not by a usual name."""
     names = []
     for name in table.colnames:
         kind = getattr(getattr(table[name], "dtype", None), "kind", "")
         looks = _ID_PART.search(name) or _ID_END.search(name) or _plain(name) in _LIKELY
-        if looks and kind in "iuUSO" and table[name].ndim == 1:
+        if looks and kind in "iufUSO" and table[name].ndim == 1:
             names.append(name)
     return names
 

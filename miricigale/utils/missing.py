@@ -148,6 +148,70 @@ def mask_of(values):
     return mask
 
 
+def without_mask(values):
+    """
+    Take values and their mask apart.
+
+    Parameters
+    ----------
+    values : array_like
+        As for `mask_of`, also a `pandas.Series`.
+
+    Returns
+    -------
+    values : array_like
+        Without a mask; where they are masked, anything.
+    mask : `~numpy.ndarray` of bool or None
+        None if nothing is masked.
+    """
+    if hasattr(values, "isna") and hasattr(values, "to_numpy"):
+        missing = np.asarray(values.isna(), dtype=bool)
+        here = values[~missing].to_numpy()
+        plain = np.zeros(len(values), dtype=here.dtype)
+        plain[~missing] = here
+        return plain, (missing if missing.any() else None)
+    if isinstance(values, (list, tuple)) and any(
+        value is None or value is np.ma.masked for value in values
+    ):
+        values = np.array(
+            [None if value is np.ma.masked else value for value in values], dtype=object
+        )
+    mask = (
+        mask_of(values)
+        if hasattr(values, "dtype") or hasattr(values, "mask")
+        else np.zeros((), bool)
+    )
+    if not np.any(mask):
+        return getattr(values, "unmasked", values), None
+    plain = getattr(values, "unmasked", values)
+    if isinstance(plain, np.ma.MaskedArray):
+        # columns keep their unit
+        unit = getattr(plain, "unit", None)
+        plain = np.ma.getdata(plain)
+        plain = plain if unit is None else plain << unit
+    if plain.dtype.kind == "O":
+        plain = np.where(mask, 0.0, plain).astype(float)
+    return plain, mask
+
+
+def floats(values):
+    """
+    Values as an array of floats, NaN where they are masked.
+
+    Parameters
+    ----------
+    values : array_like
+        Numbers without a unit, or whose unit counts for nothing; masked as for `mask_of`.
+
+    Returns
+    -------
+    array : `~numpy.ndarray` of float
+    """
+    values, mask = without_mask(values)
+    array = np.asarray(getattr(values, "value", values), dtype=float)
+    return array if mask is None else np.where(mask, np.nan, array)
+
+
 def plain_floats(column, name, argument):
     """
     A column as plain floats, NaN where masked, blank or a word for no value (`is_missing_word`).

@@ -7,7 +7,7 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 
 from miricigale.utils.exceptions import argument_error, units_error
-from miricigale.utils.missing import plain_floats, without_codes
+from miricigale.utils.missing import floats, plain_floats, without_codes
 from miricigale.utils.options import check_that
 
 _WANTED = "one SkyCoord, text such as '150.1 +2.2' or '10h00m24s +02d12m00s', or (ra, dec) in deg"
@@ -102,11 +102,13 @@ def as_positions(table, argument, wcs=None, *, missing=False):
         wanted = "a table with positions: 'sky' (SkyCoord), or 'ra' and 'dec'"
         wanted += "" if wcs is None else ", or pixels 'x' and 'y'"
         raise argument_error(argument, wanted, f"the columns {table.colnames}")
-    bad = np.flatnonzero(~(np.isfinite(sky.ra.deg) & np.isfinite(sky.dec.deg)))
+    # masked positions are missing ones
+    angles = [floats(sky.ra.deg), floats(sky.dec.deg)]
+    bad = np.flatnonzero(~(np.isfinite(angles[0]) & np.isfinite(angles[1])))
     if bad.size and not missing:
         wanted = "a table of finite positions"
         raise argument_error(argument, wanted, f"{bad.size} that are not, first in row {bad[0]}")
-    return SkyCoord(sky.ra, sky.dec)
+    return SkyCoord(*angles, unit="deg")
 
 
 def _degrees(table, name, argument):

@@ -11,7 +11,7 @@ import numpy as np
 from astropy.table import Table
 
 from miricigale.utils.exceptions import argument_error, units_error
-from miricigale.utils.frames import frame_columns, is_frame
+from miricigale.utils.frames import as_column, frame_columns, is_frame
 from miricigale.utils.ids import ids_and_missing
 from miricigale.utils.options import check_least, check_that
 from miricigale.utils.units import ANGLE, to_array
@@ -103,6 +103,7 @@ def as_table(data, argument):
 
 def _filled(column, n):
     """A column of ``n`` rows, of one value for all."""
+    column = as_column(column)
     if np.ndim(column):
         return column
     return np.full(n, column) if not hasattr(column, "unit") else u.Quantity([column] * n)

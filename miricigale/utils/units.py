@@ -8,6 +8,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.utils.exceptions import argument_error, units_error
+from miricigale.utils.missing import without_mask
 from miricigale.utils.options import check_that
 
 #: Units declared once; every array inside the package is in one of these.
@@ -73,8 +74,8 @@ def to_array(value, unit, name, *, ndim=None, finite=False, equivalencies=None):
     Parameters
     ----------
     value : `~astropy.units.Quantity`
-        Anything `~astropy.units.Quantity` accepts; a bare number is refused unless
-        ``unit`` is dimensionless.
+        Anything `~astropy.units.Quantity` accepts, masked or not (`miricigale.utils.missing.mask_of`); a bare
+        number is refused unless ``unit`` is dimensionless.
     unit : `~astropy.units.Unit`
         The unit wanted.
     name : str
@@ -89,16 +90,22 @@ def to_array(value, unit, name, *, ndim=None, finite=False, equivalencies=None):
     Returns
     -------
     array : `~numpy.ndarray`
-        Float64 values in ``unit``; a new array or a view of the input.
+        Float64 values in ``unit``, NaN where they are masked; a new array or a view of the input.
 
     Raises
     ------
     `~astropy.units.UnitsError`
         If the unit cannot be converted or is missing.
     ValueError
-        If it is no number, the number of dimensions is wrong or a value is not finite.
+        If it is no number, the number of dimensions is wrong or a value is not finite; with ``finite`` masked
+        values are not.
     """
     unit = u.Unit(unit)
+    value, mask = without_mask(value)
+    if isinstance(getattr(value, "unit", None), u.UnitBase) and unit.is_equivalent(u.Jy):
+        # maggies, which astropy ties to no flux
+        known = flux_unit(value.unit)
+        value = value if known is None else u.Quantity(getattr(value, "value", value), known)
     try:
         quantity = u.Quantity(value)
     except u.UnitTypeError:
@@ -115,11 +122,14 @@ def to_array(value, unit, name, *, ndim=None, finite=False, equivalencies=None):
         array = np.asarray(quantity.to_value(unit, equivalencies or []), dtype=float)
     except u.UnitConversionError:
         raise units_error(name, f"convertible to {unit}", getattr(value, "unit", None)) from None
+    if mask is not None:
+        array = np.where(mask, np.nan, array)
     if ndim is not None and array.ndim != ndim:
         raise argument_error(name, f"an array of {ndim} dimension(s)", f"shape {array.shape}")
     if finite and not np.all(np.isfinite(array)):
         n_bad = int(np.count_nonzero(~np.isfinite(array)))
-        raise argument_error(name, "finite values", f"{n_bad} that are NaN or infinite")
+        masked = "" if mask is None else "masked, "
+        raise argument_error(name, "finite values", f"{n_bad} that are {masked}NaN or infinite")
     return array
 
 
@@ -153,7 +163,7 @@ def check_count(value, name, least=1):
 
 def ab_magnitude(flux):
     """AB magnitudes of flux densities, as plain numbers; NaN where they are not positive."""
-    value = u.Quantity(flux).to_value(FNU)
+    value = to_array(flux, FNU, "flux")
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(value > 0, 23.9 - 2.5 * np.log10(value), np.nan)
 

@@ -10,6 +10,7 @@ from miricigale.fitting.likelihood import FitFlags
 from miricigale.fitting.posterior import cell_edges
 from miricigale.fitting.priors import integrals_to, known_redshifts, read_density
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.missing import floats
 from miricigale.utils.options import check_names, check_that
 
 #: Part of a prior without limits that may lie outside the cells of its axis.
@@ -222,7 +223,7 @@ def _interval(argument, low, high, kind):
 
 def _choice(argument, values, weights, parameter):
     values = [parameter.check(value) for value in values]
-    weights = np.asarray(weights, dtype=float)
+    weights = floats(weights)
     text = f"a weight for each of {len(values)} values"
     check_that(weights.shape == (len(values),), argument, text, f"shape {weights.shape}")
     if not (np.all(np.isfinite(weights) & (weights >= 0)) and weights.sum() > 0):
