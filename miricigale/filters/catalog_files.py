@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from miricigale.filters.catalog_map import CatalogMap
+from miricigale.filters.catalog_map import TRANSLATE_SUFFIXES, CatalogMap
 from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
 from miricigale.utils.files import reading
 from miricigale.utils.ids import counted_ids, warn_of_duplicates
@@ -77,7 +77,12 @@ def read_catalog_photometry(path, catalog_map=None, *, hdu=None, **options):
 
 def as_catalog_map(catalog_map, options=None):
     """A `CatalogMap` of what a caller gave: one, the name of a survey or a file, with keyword arguments."""
-    if isinstance(catalog_map, str) and not catalog_map.endswith((".toml", ".translate")):
+    if hasattr(catalog_map, "trans") and hasattr(catalog_map, "error"):
+        catalog_map = CatalogMap.from_translate(catalog_map)
+    elif isinstance(catalog_map, str) and "\n" in catalog_map:
+        # as TranslateFile.to_csv() of EAZY gives it
+        catalog_map = CatalogMap.from_translate(catalog_map)
+    elif isinstance(catalog_map, str) and not _is_file_name(catalog_map):
         catalog_map = CatalogMap(survey=catalog_map)
     elif isinstance(catalog_map, (str, os.PathLike)):
         catalog_map = CatalogMap.read(catalog_map)
@@ -87,6 +92,11 @@ def as_catalog_map(catalog_map, options=None):
         wanted = "a CatalogMap, the name of a survey or a file"
         raise argument_error("catalog_map", wanted, type(catalog_map).__name__)
     return dataclasses.replace(catalog_map, **options or {})
+
+
+def _is_file_name(text):
+    """Whether a text is the name of a file rather than of a survey."""
+    return text.lower().endswith((".toml", *TRANSLATE_SUFFIXES)) or os.sep in text
 
 
 def catalog_messages(lost, pieces, what="taken as missing, by the number that stands there"):

@@ -24,15 +24,21 @@ from miricigale.utils.exceptions import (
     warn,
 )
 from miricigale.utils.ids import id_column, ids_and_missing
-from miricigale.utils.missing import negative_codes, negative_errors, plain_floats, without_codes
+from miricigale.utils.missing import (
+    is_code,
+    negative_codes,
+    negative_errors,
+    plain_floats,
+    without_codes,
+)
 from miricigale.utils.options import check_choice, check_data, check_names, check_that
 from miricigale.utils.tables import error_column
-from miricigale.utils.units import FNU
+from miricigale.utils.units import FNU, flux_unit
 
 #: Unit that a column without any has.
 _DEFAULT_UNITS = {"ra": u.deg, "dec": u.deg, "position_angle": u.deg}
-#: Names of AB magnitudes as a unit.
-_AB = ("abmag", "mag(ab)", "ab", "mag_ab")
+#: Endings of translate files of EAZY.
+TRANSLATE_SUFFIXES = (".translate", ".csv")
 #: Error in magnitudes times flux is an error of the flux.
 _PER_MAGNITUDE = 0.4 * np.log(10)
 
@@ -64,6 +70,10 @@ class CatalogMap:
     limits : bool, optional
         Whether a negative error marks an upper limit, as in CIGALE: the flux is the limit and minus the error its
         1 sigma, marked in a column ``<filter>_limit``. Limits that are not positive are missing.
+    error_factors : dict of str to float, optional
+        By filter, what its errors are multiplied by, as the third column of a translate file of EAZY says.
+    left_out : iterable of str, optional
+        Columns of fluxes that have no filter here, which a warning names.
 
     Raises
     ------
@@ -88,9 +98,11 @@ class CatalogMap:
     missing: tuple = ()
     factor: str | None = None
     limits: bool = False
+    error_factors: Mapping = dataclasses.field(default_factory=dict)
+    left_out: tuple = ()
 
     def __post_init__(self):
-        for argument in ("columns", "units"):
+        for argument in ("columns", "units", "error_factors"):
             names = getattr(self, argument) or {}
             wanted = "a dict by our names of columns"
             check_that(isinstance(names, Mapping), argument, wanted, type(names).__name__)
@@ -104,6 +116,10 @@ class CatalogMap:
         if self.survey is not None:
             check_names([self.survey], "survey", SURVEYS)
         check_choice(self.limits, "limits", (True, False))
+        for name, factor in self.error_factors.items():
+            good = np.isfinite(factor) and factor > 0
+            check_that(good, "error_factors", f"positive for {name!r}", factor)
+        object.__setattr__(self, "left_out", tuple(map(str, self.left_out)))
         object.__setattr__(self, "missing", tuple(float(value) for value in self.missing))
 
     @classmethod
@@ -111,24 +127,56 @@ class CatalogMap:
         """
         Read a map in TOML: tables ``columns`` and ``units``, keys ``survey``, ``missing``, ``factor``, ``limits``.
 
-        A file that ends in ``.translate`` is one of EAZY's: lines of a column and ``F<number>`` or ``E<number>``
-        of a filter in ``FILTER.RES.latest``, ``id`` or ``z_spec``. It has no units.
+        A file that ends in ``.translate`` or ``.csv`` is one of EAZY's (`from_translate`), without units.
 
         Raises
         ------
         `~miricigale.utils.exceptions.DataError`
-            If the file is missing, not TOML, or has another key; if it has a number of no filter here.
+            If the file is missing, not TOML, or has another key; if two columns of a translate file are one
+            filter.
         """
         path = Path(path).expanduser()
         with file_errors(path, "cannot be read as a map of columns", OSError, RecursionError):
             text = path.read_text(encoding="utf-8")
-            if path.suffix == ".translate":
-                return cls(columns=_translated(text, path))
+            if path.suffix.lower() in TRANSLATE_SUFFIXES:
+                return cls(**_translated(_translate_rows(text), path))
             values = tomllib.loads(text)
         known = [field.name for field in dataclasses.fields(cls)]
         unknown = sorted(set(values) - set(known))
         check_data(not unknown, path, f"is no map of columns: it has {unknown}; known: {known}")
         return cls(**values)
+
+    @classmethod
+    def from_translate(cls, translate):
+        """
+        Make a map of a translate file of EAZY.
+
+        Parameters
+        ----------
+        translate : str or `eazy.param.TranslateFile`
+            Lines of a column of the catalog, ``F<number>`` (flux) or ``E<number>`` (error) of a filter in
+            ``FILTER.RES.latest``, ``id``, ``z_spec``, ``ra`` or ``dec``, and for errors a factor; or the text with
+            commas that its ``to_csv`` gives.
+
+        Returns
+        -------
+        catalog_map : `CatalogMap`
+            Fluxes in filters without a curve here are in ``left_out``; errors are multiplied by their factors.
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.DataError`
+            If two columns are one filter, or a line means something else.
+        """
+        if isinstance(translate, str):
+            rows = _translate_rows(translate)
+        else:
+            factors = translate.error
+            rows = [
+                (key, str(kind), float(factors.get(key, 1.0)))
+                for key, kind in translate.trans.items()
+            ]
+        return cls(**_translated(rows, "the translate file"))
 
     @property
     def id_names(self):
@@ -141,6 +189,11 @@ class CatalogMap:
         if not self.limits:
             # as before limits were known, so that results of such maps can be resumed
             del values["limits"]
+        del values["left_out"]
+        if self.error_factors:
+            values["error_factors"] = dict(self.error_factors)
+        else:
+            del values["error_factors"]
         values["columns"] = dict(self.columns)
         values["units"] = {name: str(unit) for name, unit in self.units.items()}
         return values
@@ -186,6 +239,7 @@ class CatalogMap:
             check_names([theirs], f"column of {argument} (for {ours!r})", colnames)
         ours = {theirs: name for name, theirs in columns.items()}
         kept = (name for name in colnames if name in ours or name not in columns)
+        lost = [*lost, *(name for name in self.left_out if name in colnames)]
         return {name: ours.get(name, name) for name in kept}, [n for n in lost if n not in ours]
 
     def convert(self, table, argument="catalog"):
@@ -226,8 +280,8 @@ class CatalogMap:
             out[ours] = table[theirs]
         check_names(self.units, f"column of {argument}", [*out.colnames, "flux"])
         _plain_ids(out, argument)
-        factor = self._factor(table, argument)
         coded = {}
+        factor = self._factor(table, argument, coded)
         for name in out.colnames:
             if is_band(name):
                 if not name.endswith(error_column("")):
@@ -238,19 +292,26 @@ class CatalogMap:
                 self._set_unit(out, name, argument)
         return out, coded
 
-    def _factor(self, table, argument):
+    def _factor(self, table, argument, coded):
+        """Factor on the fluxes of each source, NaN where it is missing; such numbers go to ``coded``."""
         if self.factor is None:
             return 1.0
         check_names([self.factor], f"column of {argument}", table.colnames)
         column = table[self.factor]
         values = plain_floats(column, self.factor, argument)
-        return 10 ** (-0.4 * values) if column.unit == u.mag else values
+        in_magnitudes = column.unit == u.mag
+        missing = is_code(values) | np.isinf(values)
+        if not in_magnitudes:
+            missing |= values <= 0
+        coded[self.factor] = np.where(missing, values, np.nan)
+        values = np.where(missing, np.nan, values)
+        return 10 ** (-0.4 * values) if in_magnitudes else values
 
     def _asked(self, name, column, of_flux, argument):
         """Unit that the caller says a column has, or the file's; a warning where these differ."""
         asked = self.units.get(name, self.units.get("flux") if of_flux else None)
         has = getattr(column, "unit", None)
-        has = None if has is None else u.Unit(has)
+        has = None if has is None else flux_unit(has) or u.Unit(has)
         if asked is None:
             if has is None and of_flux and self.survey is not None:
                 return u.Unit(SURVEYS[self.survey].unit)
@@ -316,30 +377,52 @@ class CatalogMap:
         """Errors of fluxes in uJy, from those in the file's unit."""
         stated = not ab or name in self.units or "flux" not in self.units
         unit = self._asked(name, column, not ab, argument) if stated else u.mag
+        factor = self.error_factors.get(name.removesuffix(error_column("")), 1.0)
         if ab and (unit in (None, u.mag, u.dimensionless_unscaled) or _is_ab(unit)):
-            return _PER_MAGNITUDE * flux * errors
+            return _PER_MAGNITUDE * flux * errors * factor
         if unit is None or not unit.is_equivalent(FNU):
             raise units_error(argument, f"convertible to {FNU}", unit, column=name)
-        return u.Quantity(errors, unit).to_value(FNU)
+        return u.Quantity(errors, unit).to_value(FNU) * factor
 
 
-def _translated(text, path):
-    """Columns of a translate file of EAZY by our names."""
-    columns = {}
-    for line in text.splitlines():
-        theirs, meaning, *_ = [*line.partition("#")[0].split(), "", ""]
-        kind, number = meaning[:1].upper(), meaning[1:]
-        if meaning.lower() in ("id", "z_spec"):
-            columns["id" if meaning.lower() == "id" else "redshift"] = theirs
+def _translate_rows(text):
+    """Rows of a translate file of EAZY, in either of its forms: column, meaning and factor."""
+    lines = [line.partition("#")[0].strip().lstrip("\ufeff") for line in text.splitlines()]
+    lines = [line for line in lines if line]
+    with_commas = bool(lines) and lines[0].replace(" ", "").startswith("column,trans")
+    rows = []
+    for line in lines[1:] if with_commas else lines:
+        parts = [part.strip() for part in line.split(",")] if with_commas else line.split()
+        parts = [part for part in parts if part]
+        if len(parts) > 1:
+            rows.append((parts[0], parts[1], parts[2] if len(parts) > 2 else 1.0))
+    return rows
+
+
+def _translated(rows, path):
+    """Arguments of a `CatalogMap` from the rows of a translate file of EAZY."""
+    columns, factors, left_out = {}, {}, []
+    names = {"id": "id", "z_spec": "redshift", "ra": "ra", "dec": "dec"}
+    for theirs, meaning, factor in rows:
+        kind = meaning[:1].upper()
+        number = meaning[1:]
+        if meaning.lower() in names:
+            columns[names[meaning.lower()]] = theirs
         elif kind in ("F", "E") and number.isdigit():
-            name = eazy_filter(number)
-            what = f"has no filter here for {theirs} {meaning} (of FILTER.RES.latest)"
-            check_data(name is not None, path, what)
-            columns[name if kind == "F" else error_column(name)] = theirs
-        elif meaning and not meaning.upper().startswith("TOT"):
-            wanted = "F or E and a number, id, z_spec or TOT"
+            band = eazy_filter(number)
+            if band is None:
+                left_out += [theirs] if kind == "F" else []
+                continue
+            ours = band if kind == "F" else error_column(band)
+            what = f"has two columns for {ours} ({meaning}): {columns.get(ours)} and {theirs}; remove one"
+            check_data(ours not in columns, path, what)
+            columns[ours] = theirs
+            if kind == "E" and float(factor) != 1.0:
+                factors[band] = float(factor)
+        elif not meaning.upper().startswith("TOT"):
+            wanted = "F or E and a number, id, z_spec, ra, dec or TOT"
             raise data_error(path, f"must have {wanted} after {theirs}, got {meaning!r}")
-    return columns
+    return {"columns": columns, "error_factors": factors, "left_out": left_out}
 
 
 def _plain_ids(table, argument):
@@ -361,8 +444,9 @@ def _angles(column, unit, name, argument):
 
 def _unit(asked, name):
     """A unit that the caller gave; AB magnitudes by any of their names."""
-    if isinstance(asked, str) and asked.strip().lower() in _AB:
-        return u.ABmag
+    known = flux_unit(asked) if isinstance(asked, (str, u.UnitBase)) else None
+    if known is not None:
+        return known
     try:
         return u.Unit(asked)
     except (TypeError, ValueError) as err:

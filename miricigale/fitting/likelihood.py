@@ -11,7 +11,7 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.object_rows import ObjectRows, PerObject
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import Flags, error_column, read_ids, require_columns
-from miricigale.utils.units import FNU, to_array
+from miricigale.utils.units import FNU, flux_unit, to_array
 
 #: S/N of the best model in all bands together below which an object is flagged, and reduced chi2 above which.
 LOW_SIGNAL, HIGH_CHI2 = 3.0, 100.0
@@ -280,7 +280,7 @@ def _is_flux(column):
     """Whether a column has a unit of flux density."""
     unit = getattr(column, "unit", None)
     try:
-        return unit is not None and u.Unit(unit).is_equivalent(FNU)
+        return unit is not None and (flux_unit(unit) or u.Unit(unit)).is_equivalent(FNU)
     except (TypeError, ValueError):
         return False
 

@@ -32,14 +32,14 @@ def without_codes(values, errors=None, *, magnitudes=False, further=()):
         are missing though the value may be there: a negative code, unless the value is one to ten times as large
         and positive, as limits are.
     """
-    code, further = _is_code(values), np.asarray(list(further), float)
+    code, further = is_code(values), np.asarray(list(further), float)
     named = np.isin(values, further)
     none = np.zeros(np.shape(values), bool)
     if errors is None:
         zero = (values == 0) if magnitudes else none
         return (code & (magnitudes | (values < 0))) | zero | named, none
     same, size, sigma = errors == values, np.abs(values), np.abs(errors)
-    coded, noise = _is_code(errors), (errors >= 0.2 * size) & (errors <= 100.0 * size)
+    coded, noise = is_code(errors), (errors >= 0.2 * size) & (errors <= 100.0 * size)
     limit = (values >= sigma) & (values <= 10.0 * sigma)
     no_error = (coded & (((errors < 0) & ~limit) | magnitudes | same)) | np.isin(errors, further)
     zero = (values == 0) & (~(errors > 0) if magnitudes else errors == 0)
@@ -87,7 +87,8 @@ def negative_errors(values, errors):
     return known & ~nothing, nothing
 
 
-def _is_code(values):
+def is_code(values):
+    """Which numbers are of the size of one that stands for no value, such as 99 or -999."""
     # single precision has seven digits
     size = np.abs(values)[..., None]
     return (np.abs(size - _CODES) <= 1e-6 * _CODES).any(axis=-1)

@@ -14,7 +14,7 @@ from miricigale.utils.exceptions import argument_error, units_error
 from miricigale.utils.frames import as_column, frame_columns, is_frame
 from miricigale.utils.ids import ids_and_missing
 from miricigale.utils.options import check_least, check_that
-from miricigale.utils.units import ANGLE, to_array
+from miricigale.utils.units import ANGLE, flux_unit, to_array
 
 
 class Flags(enum.IntFlag):
@@ -209,7 +209,7 @@ def require_columns(table, names, argument, *, units=None):
         if name not in table.colnames:
             continue
         have = getattr(table[name], "unit", None)
-        have = None if have is None else u.Unit(have)
+        have = None if have is None else flux_unit(have) or u.Unit(have)
         # magnitudes are no units of flux
         if not (isinstance(have, u.UnitBase) and have.is_equivalent(unit)):
             raise units_error(argument, f"convertible to {unit}", have, column=name)

@@ -298,9 +298,86 @@ def test_translate_files_of_eazy(tmp_path, number):
 
 def test_translate_files_that_cannot_be_used(tmp_path):
     path = tmp_path / "z.translate"
-    for line, said in (("flux F22", "no filter here for flux F22"), ("flux G205", "got 'G205'")):
+    for line, said in (
+        ("flux G205", "got 'G205'"),
+        ("f_wide F236\nf_narrow F236", r"two columns for acs\.f606w \(F236\): f_wide and f_narrow"),
+    ):
         path.write_text(f"{line}\n")
         refuses(said, CatalogMap.read, path, error=DataError)
+
+
+def test_translate_files_name_the_bands_that_have_no_filter_here(tmp_path):
+    """WFPC2's F300W (F22) as in EAZY's own catalog of the HDF-N."""
+    (tmp_path / "z.translate").write_text("id id\nf_300 F22\ne_300 E22\nf_160 F205\ne_160 E205\n")
+    (tmp_path / "c.cat").write_text("# id f_300 e_300 f_160 e_160\n1 1.0 0.1 2.0 0.1\n")
+    with pytest.warns(MiricigaleWarning, match="no filter here: f_300"):
+        out = read_catalog_photometry(
+            tmp_path / "c.cat", tmp_path / "z.translate", units={"flux": "uJy"}
+        )
+    assert out["wfc3.f160w"].value.tolist() == [2.0]
+
+
+@pytest.mark.parametrize("form", ["translate", "csv", "text", "object"])
+def test_the_third_column_of_a_translate_file_multiplies_errors(tmp_path, form):
+    text = "id id\nf_814 F239\ne_814 E239 1.e8\nf_160 F205\ne_160 E205 2.0\n"
+    commas = "column,trans,error\nid,id,1.0\nf_814,F239,1.0\ne_814,E239,1e8\nf_160,F205,1.0\ne_160,E205,2.0\n"
+
+    class TranslateFile:
+        trans = {"id": "id", "f_814": "F239", "e_814": "E239", "f_160": "F205", "e_160": "E205"}
+        error = {"id": 1.0, "f_814": 1.0, "e_814": 1e8, "f_160": 1.0, "e_160": 2.0}
+
+    (tmp_path / "z.translate").write_text(text)
+    (tmp_path / "z.csv").write_text(commas)
+    (tmp_path / "c.cat").write_text("# id f_814 e_814 f_160 e_160\n0007 3.0 0.3 2.0 0.1\n")
+    forms = {"translate": tmp_path / "z.translate", "csv": str(tmp_path / "z.csv")}
+    forms |= {"text": commas, "object": TranslateFile()}
+    out = read_catalog_photometry(tmp_path / "c.cat", forms[form], units={"flux": "uJy"})
+    assert_allclose(out["wfc3.f160w_err"].value, 0.2)
+    assert_allclose(out["acs.f814w_err"].value, 0.3e8)
+    assert out["id"].tolist() == ["0007"]
+
+
+@pytest.mark.parametrize("survey", ["dja", "jades"])
+def test_bands_beyond_the_usual_ones_of_a_survey_are_read_or_named(tmp_path, survey):
+    names = {
+        "dja": {"f850lp_tot_1": "acs.f850lp", "f814wu_tot_1": "sedpy.wfc3_uvis_f814w",
+                "f115wn-clear_tot_1": "sedpy.jwst_niriss_f115w", "f115w-clear_tot_1": "nircam.f115w",
+                "f600lpu_tot_1": None},
+        "jades": {"F850LP_KRON_CONV": "acs.f850lp", "F090W_KRON_CONV": "nircam.f090w", "F600LP_KRON_CONV": None},
+    }[survey]  # fmt: skip
+    table = Table({"id": [1]})
+    for name in names:
+        error = name.replace("_tot_1", "_etot_1") if survey == "dja" else f"{name}_e"
+        table[name] = [1.0]
+        table[error] = [0.1]
+    table.write(tmp_path / "c.fits")
+    lost = [name for name, band in names.items() if band is None]
+    with pytest.warns(MiricigaleWarning, match=f"no filter here: {lost[0]}"):
+        out = read_catalog_photometry(tmp_path / "c.fits", survey)
+    assert {band for band in names.values() if band} <= set(out.colnames)
+
+
+def test_a_factor_that_stands_for_no_value_makes_fluxes_missing():
+    table = Table({"wfc3.f160w": [1.0, 2.0, 3.0], "wfc3.f160w_err": [0.1, 0.2, 0.3]})
+    table["apcor"] = [0.0, 99.0, -2.5] * u.mag
+    out, coded = CatalogMap(units={"flux": "uJy"}, factor="apcor").convert(table)
+    assert_allclose(out["wfc3.f160w"].value, [1.0, np.nan, 30.0])
+    assert_allclose(out["wfc3.f160w_err"].value, [0.1, np.nan, 3.0])
+    assert_allclose(coded["apcor"], [np.nan, 99.0, np.nan])
+    table["apcor"] = [1.5, -99.0, 0.0]
+    out, _ = CatalogMap(units={"flux": "uJy"}, factor="apcor").convert(table)
+    assert_allclose(out["wfc3.f160w"].value, [1.5, np.nan, np.nan])
+
+
+@pytest.mark.parametrize("unit", ["nanomaggies", "nmgy", u.nmgy])
+def test_nanomaggies_are_a_unit_of_flux(unit):
+    """One nanomaggy is AB 22.5 (SDSS): 3.631 uJy."""
+    table = Table({"wfc3.f160w": [2.0], "wfc3.f160w_err": [0.1]})
+    out, _ = CatalogMap(units={"flux": unit}).convert(table)
+    assert_allclose(out["wfc3.f160w"].to_value(u.ABmag), 22.5 - 2.5 * np.log10(2.0), atol=1e-9)
+    for name in table.colnames:
+        table[name].unit = unit
+    assert_allclose(CatalogMap().convert(table)[0]["wfc3.f160w_err"].to_value(u.uJy), 0.36307805477)
 
 
 def test_codes_are_told_from_noise_and_from_limits():
