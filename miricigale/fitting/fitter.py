@@ -87,9 +87,10 @@ class BayesFitter(Interactive):
         Bands to fit. By default those of the grid that the photometry has; of a model, all in a known filter that
         the photometry has with an error, for which the grid is then made.
     priors : dict, optional
-        Parameter name to prior. On a grid: a function of the value, a frozen distribution of
-        `scipy.stats` (both are taken at the nodes), an array of weights of the nodes or ``"log"``;
-        others are flat in the nodes. For a sampler, of every free parameter (others are at the
+        Parameter name to prior. On a grid: a density, as a function of the value or a frozen distribution of
+        `scipy.stats`, which is integrated over the cells of the nodes; an array of weights of the nodes; or
+        ``"log"``, flat in the logarithm. Others are flat in the nodes: each has the same weight, so nodes of
+        equal ratios are flat in the logarithm. For a sampler, of every free parameter (others are at the
         defaults of the model):
 
         - ``(low, high)``: flat; ``(low, high, "log")``: flat in the logarithm; ``"flat"`` and

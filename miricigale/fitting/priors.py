@@ -18,6 +18,10 @@ from miricigale.utils.units import to_array
 _POWER, _PEAK, _SLOPE = 0.90, 0.62, 0.066
 
 
+#: Points of the Gauss-Legendre rule by which a density is integrated over a cell.
+_CELL_POINTS = 16
+
+
 @dataclass(frozen=True, eq=False)
 class GridAxis:
     """
@@ -142,11 +146,11 @@ def _axis(name, values, unit, kind, priors, bounds=(-np.inf, np.inf)):
     elif isinstance(prior, str):
         wanted = "a function, an array or 'log' (with values above 0)"
         check_that(prior == "log" and np.all(values > 0), argument, wanted, repr(prior))
-        weights = 1.0 / values
+        # flat in the logarithm from the first value to the last
+        edges = cell_edges(values, (values[0], values[-1]))
+        weights = np.diff(np.log(edges)) if values.size > 1 else np.ones(1)
     elif callable(prior) or hasattr(prior, "pdf"):
-        density = getattr(prior, "pdf", prior)
-        weights = [density(value) for value in values.tolist()]
-        weights = to_array(weights, u.dimensionless_unscaled, argument)
+        weights = cell_integrals(prior, values, argument)
     else:
         weights = to_array(prior, u.dimensionless_unscaled, argument)
     wanted = f"{values.size} weights, for {name} = {values}"
@@ -154,6 +158,47 @@ def _axis(name, values, unit, kind, priors, bounds=(-np.inf, np.inf)):
     if not np.all(np.isfinite(weights) & (weights >= 0)) or not weights.sum() > 0:
         raise argument_error(argument, "finite, >= 0 and not all 0", f"{weights}")
     return GridAxis(name, values, unit, kind, weights / weights.sum(), None, bounds)
+
+
+def cell_integrals(prior, values, argument):
+    """
+    Integrals of a density over the cells of ascending nodes.
+
+    Parameters
+    ----------
+    prior : callable or object with ``pdf``
+        Density of one value, not normalized; of a distribution of `scipy.stats` its ``cdf`` is taken.
+    values : `~numpy.ndarray`, shape (n,)
+        The nodes. Cells reach half way to the neighbors; the first begins and the last ends at its node, so that
+        the prior is that of a sampler between these bounds.
+    argument : str
+        What the prior is called in messages.
+
+    Returns
+    -------
+    weights : `~numpy.ndarray`, shape (n,)
+        The density at a single node, which has no cell.
+
+    Raises
+    ------
+    ValueError
+        If the density gives no numbers.
+    """
+    density = getattr(prior, "pdf", prior)
+    if values.size == 1:
+        return to_array([density(float(values[0]))], u.dimensionless_unscaled, argument)
+    edges = cell_edges(values, (values[0], values[-1]))
+    if hasattr(prior, "pdf") and hasattr(prior, "cdf"):
+        return np.diff(to_array(prior.cdf(edges), u.dimensionless_unscaled, argument))
+    # inside of each cell: a density may end, or be infinite, at an edge
+    nodes, weights = np.polynomial.legendre.leggauss(_CELL_POINTS)
+    half = 0.5 * np.diff(edges)
+    points = edges[:-1, None] + half[:, None] * (1.0 + nodes)
+    heights = [density(value) for value in points.ravel().tolist()]
+    heights = to_array(heights, u.dimensionless_unscaled, argument)
+    wanted = f"one number for each value of {argument}"
+    check_that(heights.shape == (points.size,), argument, wanted, f"shape {heights.shape}")
+    return half * (heights.reshape(points.shape) @ weights)
 
 
 def _inert(grid):

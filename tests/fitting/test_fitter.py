@@ -10,6 +10,7 @@ from scipy.stats import norm
 from helpers.errors import refuses
 from helpers.grids import draw_photometry, make_grid, node_fitter, photometry_table
 from miricigale.fitting import BayesFitter, FitFlags, GridSettings, SamplerSettings, leave_out
+from miricigale.fitting.posterior import cell_edges
 from miricigale.sed import SEDModel
 from miricigale.sed.components import BC03, DelayedSFH
 from miricigale.utils.exceptions import CatalogWarning, FitWarning
@@ -200,7 +201,7 @@ def test_signal_to_noise_below_three_is_flagged(signal):
 
 
 def test_priors_may_be_distributions_and_functions_of_one_value(grid, photometry):
-    """scipy's normal density at the nodes, given in four ways."""
+    """scipy's normal density over the cells of the nodes, given in four ways, and their weights."""
     normal = norm(1.5, 0.7)
     nodes = node_fitter(grid).priors.axes["tau"].values
 
@@ -210,12 +211,14 @@ def test_priors_may_be_distributions_and_functions_of_one_value(grid, photometry
     def of_one(tau):
         return math.exp(-0.5 * ((tau - 1.5) / 0.7) ** 2)
 
-    priors = (normal, normal.pdf, density, of_one, density(nodes))
+    edges = cell_edges(nodes, (nodes[0], nodes[-1]))
+    weights = normal.cdf(edges[1:]) - normal.cdf(edges[:-1])
+    priors = (normal, normal.pdf, density, of_one, weights)
     fits = [node_fitter(grid, priors={"tau": prior}).fit(photometry) for prior in priors]
     for other in fits[1:]:
         assert_allclose(other.pdf["tau"], fits[0].pdf["tau"], rtol=1e-6)
     # the prior of tau is that of the mean posterior's ratio to one with a flat prior
-    flat = node_fitter(grid).fit(photometry).pdf["tau"] * normal.pdf(nodes)
+    flat = node_fitter(grid).fit(photometry).pdf["tau"] * weights
     expected = flat / flat.sum(axis=1, keepdims=True)
     assert_allclose(fits[0].pdf["tau"], expected, rtol=1e-4, atol=1e-9)
 
