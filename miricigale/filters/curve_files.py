@@ -1,18 +1,64 @@
 """Files of filter curves."""
 
 import re
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import astropy.units as u
 import numpy as np
 
 from miricigale.utils.exceptions import data_error
-from miricigale.utils.files import unpacked_size
+from miricigale.utils.files import packed_open, unpacked_size
+from miricigale.utils.meta import full_meta
 from miricigale.utils.missing import floats
+from miricigale.utils.options import check_data
 from miricigale.utils.table_files import TABLE_FORMATS, read_table
+from miricigale.utils.units import WAVE
 
-# units that a header may name
-_UNITS = re.compile(r"\b(um|microns?|nm|AA|Angstroms?)\b", re.IGNORECASE)
+#: Units of wavelengths as headers name them.
+_UNITS = {
+    u.um: r"um|µm|μm|microns?|micromet(?:er|re)s?",
+    u.nm: r"nm|nanomet(?:er|re)s?",
+    u.AA: r"AA|Å|Ang(?:str[oö]ms?)?|(?<=[(\[])A(?=[)\]])",
+}
+_UNIT = {
+    unit: re.compile(rf"(?<![A-Za-z])(?:{names})(?![A-Za-z])", re.IGNORECASE)
+    for unit, names in _UNITS.items()
+}
+#: A wavelength in a description, such as "pivot 7.7 um", says nothing of the columns.
+_MEASURED = re.compile(r"\d[ \t]*$")
+#: What the first column is called.
+_WAVE_WORD = re.compile(r"wave|lambda|λ|\bwl\b", re.IGNORECASE)
+#: What counts the light, in comments and in the parameters of a VOTable.
+_DETECTOR = re.compile(r"detector[\s_]*(?:type)?\s*[:=\t ]\s*(energy|photon|[01])\b", re.IGNORECASE)
+_ENERGY = ("0", "energy")
+#: Part of the peak down to which a negative throughput is noise.
+_NOISE = 0.05
+#: Relative width of a vertical edge, a wavelength that is there twice.
+_EDGE = 1e-7
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """
+    A filter curve of a file.
+
+    Parameters
+    ----------
+    wave : `~astropy.units.Quantity`, shape (n,)
+        Ascending wavelengths.
+    throughput : `~numpy.ndarray`, shape (n,)
+        Response to photons, not negative.
+    name : str
+        The one in the file, else that of the file.
+    options : dict
+        Further arguments of `~miricigale.filters.Filter` (``meta``, ``reference_wavelength``, ...).
+    """
+
+    wave: u.Quantity
+    throughput: np.ndarray
+    name: str
+    options: dict = field(default_factory=dict)
 
 
 def read_curve(path, unit=None):
@@ -28,15 +74,58 @@ def read_curve(path, unit=None):
 
     Returns
     -------
-    wave : `~astropy.units.Quantity`, shape (n,)
-        Ascending wavelengths.
-    throughput : `~numpy.ndarray`, shape (n,)
-        Response to photons.
-    name : str
-        The one in the file, else that of the file.
+    curve : `Curve`
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If the file is no curve, its unit is not known or not the only one that is named, a wavelength is there
+        more than twice, or a throughput is below -5 % of the peak.
     """
     path = Path(path).expanduser()
-    return _of_table(path, unit) if path.suffix.lower() in TABLE_FORMATS else _of_text(path, unit)
+    read = _of_table if path.suffix.lower() in TABLE_FORMATS else _of_text
+    wave, throughput, energy, name, options = read(path, unit)
+    wave, throughput = _ascending(wave, throughput, path)
+    if energy:
+        # the energy of a photon goes as 1 / wavelength
+        throughput = throughput / (wave / wave.mean()).value
+    throughput, n_negative = _not_negative(throughput, path)
+    meta = options.pop("meta", {})
+    if n_negative:
+        meta["n_negative"] = n_negative
+    return Curve(wave, throughput, name, options | {"meta": meta})
+
+
+def _ascending(wave, throughput, path):
+    """A curve in the order of its wavelengths, with vertical edges of a finite width."""
+    if wave.size and wave[0] > wave[-1]:
+        # the sides of a vertical edge in their order
+        wave = wave[::-1]
+        throughput = throughput[::-1]
+    order = np.argsort(wave, kind="stable")
+    value = wave.value[order]
+    throughput = throughput[order]
+    same = np.append(np.diff(value) == 0, False)
+    thrice = np.flatnonzero(same[:-1] & same[1:]) if same.size > 1 else np.zeros(0, int)
+    what = f"has the wavelength {value[thrice[0]] if thrice.size else 0:.8g} more than twice"
+    check_data(not thrice.size, path, what)
+    twins = np.flatnonzero(same)
+    # one of two equal points is enough
+    equal = twins[throughput[twins] == throughput[twins + 1]]
+    value[same] *= 1.0 - _EDGE
+    keep = np.ones(value.size, dtype=bool)
+    keep[equal] = False
+    return value[keep] * wave.unit, throughput[keep]
+
+
+def _not_negative(throughput, path):
+    """Throughput with negative points at zero, and their number."""
+    peak = np.nanmax(throughput, initial=0.0)
+    lowest = np.nanmin(throughput, initial=0.0)
+    what = f"has a throughput of {lowest:.3g}, beside a peak of {peak:.3g}"
+    check_data(lowest >= -_NOISE * peak, path, what)
+    negative = throughput < 0
+    return np.where(negative, 0.0, throughput), int(np.count_nonzero(negative))
 
 
 def _of_table(path, unit):
@@ -46,34 +135,101 @@ def _of_table(path, unit):
     if len(columns) < 2 or (unit is None and has is None):
         what = "has not two columns, the first with a unit of wavelength"
         raise data_error(path, f"{what}: give 'unit' if it has none")
-    wave = floats(columns[0])
-    name = str(table.meta.get("name") or table.meta.get("NAME") or path.stem)
-    return wave * u.Unit(unit or has), floats(columns[1]), name
+    wave = floats(columns[0]) * u.Unit(unit or has)
+    meta = full_meta(table.meta)
+    if path.suffix.lower() in (".xml", ".vot", ".votable"):
+        meta = _parameters(path) | meta
+    plain = {str(key).lower().replace("_", ""): value for key, value in meta.items()}
+    energy = str(plain.get("detectortype", "")).strip().lower() in _ENERGY
+    name = plain.get("name") or plain.get("filterid") or path.stem
+    options = {}
+    for key, reference in (("reference_wavelength", WAVE), ("reference_temperature", u.K)):
+        value = plain.get(key.replace("_", ""))
+        if value is not None:
+            options[key] = float(value) * reference
+    kept = ("citations", "flux_convention", "n_negative")
+    options["meta"] = {key: meta[key] for key in kept if key in meta}
+    return wave, floats(columns[1]), energy, str(name), options
+
+
+def _parameters(path):
+    """Parameters of the first table of a VOTable by name, as the SVO gives the type of the detector."""
+    from astropy.io import votable
+
+    with packed_open(path) as stream:
+        first = votable.parse(stream, verify="ignore").get_first_table()
+    return {param.name: param.value for param in first.params if param.name is not None}
 
 
 def _of_text(path, unit):
     unpacked_size(path)
     try:
-        lines = path.read_text().splitlines()
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as err:
         raise data_error(path, f"cannot be read as a filter: {err}") from None
+    lines = [line.strip() for line in lines]
+    lines = [line for line in lines if line]
     comments = [line.lstrip("# ").strip() for line in lines if line.startswith("#")]
+    rows = [
+        line.partition("#")[0].replace(",", " ").split()
+        for line in lines
+        if not line.startswith("#")
+    ]
+    if rows and not _is_number(rows[0][0]):
+        # names of columns without a mark
+        comments.append(" ".join(rows.pop(0)))
     try:
-        data = np.array([line.split()[:2] for line in lines if line[:1] not in ("#", "")], float)
-        wave, throughput = data.T
+        data = _two_columns(rows)
     except ValueError:
         raise data_error(path, "is no filter: it has not two columns of numbers") from None
     # as in CIGALE's files, which are in Angstrom
     kinds = [text.lower() for text in comments[:3] if text.lower() in ("photon", "energy")]
     named = kinds and comments[0].lower() not in kinds
     if unit is None:
-        found = _UNITS.search(" ".join(comments))
-        if not kinds and found is None:
-            raise data_error(path, "does not state the unit of its wavelengths: give 'unit'")
-        by_letter = {"u": u.um, "m": u.um, "n": u.nm, "a": u.AA}
-        unit = u.AA if kinds else by_letter[found[1][0].lower()]
-    order = np.argsort(wave)
-    wave, throughput = wave[order], throughput[order]
-    if kinds[:1] == ["energy"]:
-        throughput = throughput / (wave / wave.mean())
-    return wave * u.Unit(unit), throughput, comments[0] if named else path.stem
+        unit = u.AA if kinds else _unit_of(comments, path)
+    said = _DETECTOR.search("\n".join(comments))
+    energy = kinds[:1] == ["energy"] or (said is not None and said[1].lower() in _ENERGY)
+    wave, throughput = data.T
+    return wave * u.Unit(unit), throughput, energy, comments[0] if named else path.stem, {}
+
+
+def _is_number(text):
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _two_columns(rows):
+    """Wavelengths and throughput; of three columns the first of which counts the rows, the others."""
+    if len(rows) < 2:
+        raise ValueError
+    numbered = all(len(row) == 3 for row in rows) and len(rows) > 2
+    if numbered:
+        counts = [float(row[0]) for row in rows]
+        if counts in (list(range(1, len(rows) + 1)), list(range(len(rows)))):
+            rows = [row[1:] for row in rows]
+    return np.array([row[:2] for row in rows], dtype=float).reshape(len(rows), 2)
+
+
+def _unit_of(comments, path):
+    """
+    Unit of the wavelengths that comments name.
+
+    That of the line of the columns, which speaks of wavelengths, counts before that of other lines, and a unit
+    after a number, which measures something, counts for nothing.
+    """
+    about_wave = [text for text in comments if _WAVE_WORD.search(text)]
+    for lines in (about_wave, comments):
+        named = []
+        for unit, pattern in _UNIT.items():
+            matches = [(text, match) for text in lines for match in pattern.finditer(text)]
+            if any(not _MEASURED.search(text[: match.start()]) for text, match in matches):
+                named.append(unit)
+        if len(named) == 1:
+            return named[0]
+        if named:
+            some = " and ".join(map(str, named))
+            raise data_error(path, f"names {some} as units of its wavelengths: give 'unit'")
+    raise data_error(path, "does not state the unit of its wavelengths: give 'unit'")

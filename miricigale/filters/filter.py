@@ -198,10 +198,11 @@ class Filter(Frozen, Interactive):
         Parameters
         ----------
         path : path-like
-            Two columns, wavelength and throughput: a table with units (ECSV, FITS, VOTable as of the SVO), or
-            text. Its comments start with ``#``; those at the top may hold, as in CIGALE's files, the name,
-            the word ``photon`` or ``energy`` (what the throughput counts, else photons) and a
-            description, or name the unit of the wavelengths.
+            Wavelength and throughput in the first two columns: a table with units (ECSV, FITS, VOTable as of the
+            SVO, whose ``DetectorType`` counts), or text. Its comments start with ``#``; those at the top may hold,
+            as in CIGALE's files, the name, the word ``photon`` or ``energy`` (what the throughput counts, else
+            photons) and a description, or name the unit of the wavelengths, best in the line of the columns.
+            A first column that counts the rows is left out, as in files of EAZY.
         name : str, optional
             Name of the filter; else the one in the file, else that of the file.
         unit : `~astropy.units.Unit`, optional
@@ -214,7 +215,11 @@ class Filter(Frozen, Interactive):
         Raises
         ------
         `~miricigale.utils.exceptions.DataError`
-            If the file is missing, has not two columns of numbers, or no unit of the wavelengths is known.
+            If the file is missing, has not two columns of numbers, names no unit of the wavelengths or several,
+            has a wavelength more than twice, or a throughput below -5 % of the peak. Smaller negative ones are
+            set to zero and counted in ``meta["n_negative"]``.
+        ValueError
+            If a value is missing.
 
         Examples
         --------
@@ -227,12 +232,21 @@ class Filter(Frozen, Interactive):
         <Filter mine: pivot 9.9896 um, width 1.500 um>
         """
         with reading(path, "a filter"):
-            wave, throughput, found = read_curve(path, unit)
-            return cls(wave, throughput, name or found, meta={"source": Path(path).name})
+            curve = read_curve(path, unit)
+            options = curve.options | {"meta": {"source": Path(path).name, **curve.options["meta"]}}
+            return cls(curve.wave, curve.throughput, name or curve.name, **options)
 
     def to_table(self):
-        """The curve as a `~astropy.table.QTable` of ``wave`` (um) and ``throughput``."""
+        """
+        Return the curve as a `~astropy.table.QTable` of ``wave`` (um) and ``throughput``.
+
+        Its meta has what else makes the filter: ``reference_wavelength`` (um), ``reference_temperature`` (K).
+        """
         meta = {"name": self.name, **self.meta}
+        if self.reference_wavelength is not None:
+            meta["reference_wavelength"] = float(self.reference_wavelength.value)
+        if self.reference_temperature is not None:
+            meta["reference_temperature"] = float(self.reference_temperature.value)
         return QTable({"wave": self.wave, "throughput": self.throughput}, meta=meta)
 
     def write(self, path, *, overwrite=False):

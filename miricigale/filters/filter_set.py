@@ -2,6 +2,7 @@
 
 import dataclasses
 import fnmatch
+import os
 
 import astropy.units as u
 import numpy as np
@@ -25,7 +26,10 @@ class FilterSet(Interactive):
     Parameters
     ----------
     filters : iterable of `Filter` or str
-        Filters, or anything else for `as_filter`; ``"miri.*"`` stands for all names of the library of this form.
+        Filters, or anything else for `as_filter`, also a set of sedpy's; ``"miri.*"`` stands for all names of the
+        library of this form.
+    unit : `~astropy.units.Unit`, optional
+        Unit of the wavelengths of files that name none.
 
     Raises
     ------
@@ -44,11 +48,16 @@ class FilterSet(Interactive):
     """
 
     filters: tuple
+    _: dataclasses.KW_ONLY
+    unit: dataclasses.InitVar[object] = None
 
-    def __post_init__(self):
+    def __post_init__(self, unit):
         items = self.filters
-        items = [items] if isinstance(items, (str, Filter)) or hasattr(items, "waveset") else items
-        filters = tuple(one for item in items for one in _each(item))
+        single = isinstance(items, (str, os.PathLike, Filter)) or hasattr(items, "waveset")
+        items = [items] if single or hasattr(items, "transmission") else items
+        # a set of sedpy's holds its filters
+        items = getattr(items, "filters", items)
+        filters = tuple(one for item in items for one in _each(item, unit))
         names = [f.name for f in filters]
         if not names or len(set(names)) < len(names):
             raise argument_error("filters", "one or more filters of different names", names)
@@ -216,11 +225,11 @@ def _table(filters):
     return table
 
 
-def _each(item):
+def _each(item, unit):
     """The filters that an item of a set stands for."""
     if isinstance(item, str) and "*" in item:
         found = fnmatch.filter(Filter.names(), item.lower())
         if not found:
             raise unknown_name("filters like", item, Filter.names())
         return [Filter.from_name(name) for name in found]
-    return [as_filter(item)]
+    return [as_filter(item, unit=unit)]

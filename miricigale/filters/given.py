@@ -20,8 +20,9 @@ def as_filter(given, name=None, *, unit=None):
 
     Parameters
     ----------
-    given : `Filter`, str, path-like or `synphot.SpectralElement`
-        A filter, a name for `Filter.from_name`, the path of a file for `Filter.read`, or a bandpass.
+    given : `Filter`, str, path-like, `synphot.SpectralElement` or `sedpy.observate.Filter`
+        A filter, a name for `Filter.from_name`, the path of a file for `Filter.read`, or a bandpass of another
+        package.
     name : str, optional
         Name of what comes from a file or a bandpass.
     unit : `~astropy.units.Unit`, optional
@@ -58,8 +59,20 @@ def as_filter(given, name=None, *, unit=None):
         return Filter.from_name(given)
     if hasattr(given, "waveset"):
         return Filter.from_synphot(given, name=name)
-    wanted = "a Filter, the name of one, the path of its file or a synphot SpectralElement"
+    if hasattr(given, "wavelength") and hasattr(given, "transmission"):
+        return _of_sedpy(given, name)
+    wanted = "a Filter, the name of one, the path of its file, or one of synphot or sedpy"
     raise argument_error(name or "filter", wanted, type(given).__name__)
+
+
+def _of_sedpy(given, name):
+    """Filter of sedpy's: wavelengths in Angstrom and the response to photons, whose noise may be negative."""
+    name = name or find_filter(given.name) or given.name
+    throughput = np.asarray(given.transmission, dtype=float)
+    meta = {"source": "sedpy"}
+    if np.any(throughput < 0):
+        meta["n_negative"] = int(np.count_nonzero(throughput < 0))
+    return Filter(given.wavelength * u.AA, np.maximum(throughput, 0.0), str(name), meta=meta)
 
 
 def _is_path(text):

@@ -21,6 +21,9 @@ from miricigale.utils.units import FNU, WAVE, Frozen, frozen_quantity, is_number
 
 _FLAM = u.erg / u.s / u.cm**2 / u.AA
 
+#: Unit of the parts of a spectrum in files, another one than that of the whole.
+_PART = u.nJy
+
 #: WMAP7, as in Yang et al. 2021.
 COSMOLOGY = FlatLambdaCDM(H0=70.4, Om0=0.272, name="yang2021")
 
@@ -250,8 +253,16 @@ class SED(Frozen, Interactive):
         return table
 
     def write(self, path, *, overwrite=False):
-        """Write the spectrum as a table, in the format of the suffix (``.ecsv``, ``.fits``, ...)."""
-        write_table(self.to_table(), path, overwrite=overwrite)
+        """
+        Write the spectrum as a table, in the format of the suffix (``.ecsv``, ``.fits``, ...).
+
+        The parts are in nJy: readers such as that of specutils take a further column in the unit of the flux for
+        its uncertainty.
+        """
+        table = self.to_table()
+        for name in self.components:
+            table[name] = table[name].to(_PART)
+        write_table(table, path, overwrite=overwrite)
 
     @classmethod
     def read(cls, path):

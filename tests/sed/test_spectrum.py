@@ -3,6 +3,7 @@ import operator
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.table import QTable
 from astropy.tests.helper import assert_quantity_allclose
 
 from helpers.errors import refuses
@@ -79,6 +80,12 @@ def test_a_spectrum_of_a_model_has_its_parts_and_can_be_kept(tmp_path):
         assert back.redshift == 1.5
         assert_quantity_allclose(back.fnu, sed.fnu)
         assert set(back.components) == set(sed.components)
+        assert_quantity_allclose(
+            back.components["dust"].fnu, sed.components["dust"].fnu, rtol=1e-14
+        )
+        # readers take a second column in the unit of the flux for its uncertainty
+        units = [column.unit for column in QTable.read(tmp_path / name).columns.values()]
+        assert units.count(u.uJy) == 1
     assert sed.synthetic_flux("F770W") == Filter("F770W").synthetic_flux(sed)
     assert_quantity_allclose(sed.fluxes(["F770W"])[0].to(u.ABmag), sed.synthetic_magnitude("F770W"))
     assert "stellar_mass" in sed._repr_html_()

@@ -1,0 +1,152 @@
+"""Curves in files: units, detectors, blanks, edges, and what is written is read."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import MaskedColumn, QTable
+from numpy.testing import assert_allclose
+
+from helpers.errors import refuses
+from miricigale.filters import Filter, FilterSet, as_filter
+from miricigale.utils.exceptions import DataError
+
+ANGSTROM = "70000 0\n71000 0.5\n76000 0.9\n82000 0.8\n88000 0\n"
+MICRON = "7.0 0\n7.1 0.5\n7.6 0.9\n8.2 0.8\n8.8 0\n"
+NANO = "7000 0\n7100 0.5\n7600 0.9\n8200 0.8\n8800 0\n"
+PIVOT = 7.810728
+
+
+def write(path, text):
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("head", "body"),
+    [
+        ("# MIRI F770W, pivot 7.7 um\n# wavelength (Angstrom)  throughput\n", ANGSTROM),
+        ("# resampled to 1 nm\n# wave(um) T\n", MICRON),
+        ("# wavelength [A], transmission\n", ANGSTROM),
+        ("# lambda(nm) T\n# measured at 7 K, width 1.2 microns\n", NANO),
+        ("# Å\n", ANGSTROM),
+        ("# um\n", MICRON),
+        ("# micrometers\n", MICRON),
+        ("wavelength_um throughput\n".replace("_", " "), MICRON),
+        ("\ufeff# wave (µm)\n\n   \n", MICRON.replace("\n", "\n\n")),
+        ("# um\n", MICRON.replace(" ", ", ")),
+        ("# um\n", "\n".join(reversed(MICRON.splitlines()))),
+        ("# wave(um)\n", "".join(f"{i + 1} {row} \n" for i, row in enumerate(MICRON.splitlines()))),
+        ("# um, third column: error\n", MICRON.replace("\n", " 0.01\n")),
+    ],
+)
+def test_the_unit_of_wavelengths_is_that_of_their_column(tmp_path, head, body):
+    band = Filter.read(write(tmp_path / "f.dat", head + body))
+    assert_allclose(band.pivot.value, PIVOT, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("head", "message"),
+    [
+        ("# converted from nm to um\n", "names um and nm as units"),
+        ("# pivot 7.7 um\n", "does not state the unit of its wavelengths"),
+        ("# a filter\n", "does not state the unit of its wavelengths"),
+    ],
+)
+def test_a_unit_that_is_not_sure_is_asked_for(tmp_path, head, message):
+    path = write(tmp_path / "f.dat", head + MICRON)
+    refuses(message, Filter.read, path, error=DataError)
+    assert_allclose(Filter.read(path, unit="um").pivot.value, PIVOT, rtol=1e-6)
+
+
+def _svo(kind):
+    rows = "".join(f"<TR><TD>{a}</TD><TD>1</TD></TR>" for a in np.linspace(80000, 165000, 401))
+    return f"""<?xml version="1.0"?><VOTABLE version="1.1" xmlns="http://www.ivoa.net/xml/VOTable/v1.1">
+<RESOURCE type="results"><TABLE><PARAM name="filterID" value="Mine/W3" datatype="char" arraysize="*"/>
+<PARAM name="DetectorType" value="{kind}" datatype="char" arraysize="*"/>
+<FIELD name="Wavelength" unit="Angstrom" datatype="float"/><FIELD name="Transmission" unit="" datatype="float"/>
+<DATA><TABLEDATA>{rows}</TABLEDATA></DATA></TABLE></RESOURCE></VOTABLE>"""
+
+
+def test_energy_counters_of_the_svo_and_of_comments_weigh_by_wavelength(tmp_path):
+    """For a box of an energy counter the pivot is the geometric mean of the edges (int dlam / int dlam/lam^2)."""
+    low, high = 8.0, 16.5
+    energy = Filter.read(write(tmp_path / "0.xml", _svo(0)))
+    assert_allclose(energy.pivot.value, np.sqrt(low * high), rtol=2e-5)
+    photon = Filter.read(write(tmp_path / "1.xml", _svo(1)))
+    assert_allclose(
+        photon.pivot.value, np.sqrt((high**2 - low**2) / 2 / np.log(high / low)), rtol=2e-5
+    )
+    rows = "".join(f"{a} 1\n" for a in np.linspace(8, 16.5, 401))
+    for line in ("# DETECTOR energy\n", "# DetectorType: 0\n"):
+        band = Filter.read(write(tmp_path / "c.dat", f"# um\n{line}{rows}"))
+        assert_allclose(band.pivot.value, energy.pivot.value, rtol=1e-5)
+    table = QTable(
+        {"w": np.linspace(8, 16.5, 401) * u.um, "t": np.ones(401)}, meta={"DetectorType": 0}
+    )
+    table.write(tmp_path / "c.ecsv")
+    assert_allclose(Filter.read(tmp_path / "c.ecsv").pivot.value, energy.pivot.value, rtol=1e-5)
+
+
+def test_small_negative_points_are_zero_and_counted(tmp_path):
+    band = Filter.read(write(tmp_path / "n.dat", "# um\n7.0 -1e-5\n7.1 0.5\n7.6 0.9\n8.8 -2e-6\n"))
+    assert band.meta["n_negative"] == 2
+    assert band == Filter([7.0, 7.1, 7.6, 8.8] * u.um, [0, 0.5, 0.9, 0], name="n")
+    path = write(tmp_path / "m.dat", "# um\n7.0 0\n7.1 0.5\n7.6 -0.9\n8.8 0\n")
+    refuses("has a throughput of -0.9, beside a peak of 0.5", Filter.read, path, error=DataError)
+
+
+def test_vertical_edges_are_steps_in_either_direction(tmp_path):
+    rows = ["7.0 0", "7.0 1", "8.0 1", "8.0 0"]
+    for order in (rows, rows[::-1]):
+        band = Filter.read(write(tmp_path / "b.dat", "# um\n" + "\n".join(order) + "\n"))
+        # the closed form of a box
+        assert_allclose(band.pivot.value, np.sqrt((64 - 49) / 2 / np.log(8 / 7)), rtol=1e-6)
+    path = write(tmp_path / "c.dat", "# um\n7 0\n7.5 1\n7.5 2\n7.5 1\n8 0\n")
+    refuses("has the wavelength 7.5 more than twice", Filter.read, path, error=DataError)
+    same = Filter.read(write(tmp_path / "d.dat", "# um\n7 0\n7.5 1\n7.5 1\n8 0\n"))
+    assert same.wave.size == 3
+
+
+def test_descending_tables_are_read_and_missing_values_refused(tmp_path):
+    QTable({"w": [8.8, 7.6, 7.1, 7.0] * u.um, "T": [0, 0.9, 0.5, 0]}).write(tmp_path / "d.ecsv")
+    assert Filter.read(tmp_path / "d.ecsv").throughput.tolist() == [0, 0.5, 0.9, 0]
+    (tmp_path / "b.csv").write_text("wavelength,throughput\n70000,0\n71000,0.5\n76000,\n88000,0\n")
+    refuses("'throughput' must be finite", Filter.read, tmp_path / "b.csv", unit="AA")
+    masked = MaskedColumn([0.0, 0.5, 0.9, 0.0], mask=[0, 0, 1, 0])
+    QTable({"w": [7.0, 7.1, 7.6, 8.8] * u.um, "T": masked}).write(tmp_path / "m.ecsv")
+    refuses("'throughput' must be finite", Filter.read, tmp_path / "m.ecsv")
+
+
+@pytest.mark.parametrize("name", ["mips.24", "irac.ch1", "miri.f770w"])
+@pytest.mark.parametrize("suffix", ["ecsv", "fits"])
+def test_a_filter_that_is_written_is_read_with_its_convention(tmp_path, name, suffix):
+    band = Filter(name)
+    band.write(tmp_path / f"m.{suffix}")
+    again = Filter.read(tmp_path / f"m.{suffix}")
+    assert_allclose(again.catalog_factor, band.catalog_factor, rtol=1e-12)
+    assert again.reference_wavelength == band.reference_wavelength
+    assert again.reference_temperature == band.reference_temperature
+    assert again.name == name
+
+
+def test_filters_of_sedpy_are_filters():
+    class SedpyFilter:
+        name = "mine"
+        wavelength = np.array([7.0e4, 7.1e4, 7.6e4, 8.2e4, 8.8e4])
+        transmission = np.array([-1e-6, 0.5, 0.9, 0.8, 0.0])
+
+    class SedpySet:
+        filters = [SedpyFilter(), as_filter("F770W")]
+
+    assert_allclose(as_filter(SedpyFilter()).pivot.value, PIVOT, rtol=1e-6)
+    assert FilterSet([SedpyFilter(), "F770W"]).names == ("mine", "miri.f770w")
+    assert FilterSet(SedpySet()).names == ("mine", "miri.f770w")
+    assert FilterSet(SedpyFilter()).names == ("mine",)
+
+
+def test_a_set_of_files_may_be_given_their_unit(tmp_path):
+    paths = [write(tmp_path / f"{name}.dat", MICRON) for name in "ab"]
+    refuses("does not state the unit", FilterSet, paths, error=DataError)
+    filters = FilterSet(paths, unit="um")
+    assert filters.names == ("a", "b")
+    assert_allclose(filters.pivots.value, PIVOT, rtol=1e-6)
