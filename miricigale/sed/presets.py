@@ -28,6 +28,13 @@ _OF_AGN = frozenset({"tau97", "ebv_polar", "temperature_polar", "frac_agn"})
 #: AGN templates of the fits of Yang et al. 2021 (table 1; q is inferred).
 TORUS = {"p": 1.0, "q": 1.0, "opening_angle": 40.0, "radius_ratio": 20.0}
 
+#: Strength of the 3.3 um feature of the dust of a survey's galaxies, over that of Draine & Li 2007. With it the
+#: feature has 0.12 % of the light at 8-1000 um for q_PAH 3.4 %, that of galaxies of half solar metallicity and
+#: more (Shivaei et al. 2024, A&A 690, A89); spectra of star-forming galaxies have about 0.1 % (Lai et al. 2020,
+#: ApJ 905, 55). The templates of Dale et al. 2014 have 0.23 to 0.30 of the feature of Draine & Li at the same
+#: 5-25 um light.
+PAH_33 = 0.2
+
 
 def yang2021_components(*, agn=True, xray=False, igm="meiksin2006", libraries="best"):
     """
@@ -59,7 +66,7 @@ def survey_components(*, agn=True, igm="meiksin2006", libraries="best"):
     Parameters are those of `SEDModel.survey`. Against `yang2021_components` there are the gas's lines and
     continuum, a burst, two metallicities, old stars with 0.44 of the color excess of young ones, and dust
     whose mass fraction in PAHs varies: real galaxies have less light at 3-12 um than dust rich in PAHs that
-    absorbs as much.
+    absorbs as much. Its 3.3 um feature is `PAH_33` of that of the templates, as in spectra of galaxies.
     """
     choose, notes = _chooser(libraries)
 
@@ -68,7 +75,7 @@ def survey_components(*, agn=True, igm="meiksin2006", libraries="best"):
         _stars(choose, survey_axes()["metallicity"]),
         c.Nebular(log_u=-2.5),
         c.CalzettiLeitherer(ebv_factor=0.44),
-        c.DraineLi2007(),
+        c.DraineLi2007(pah_33=PAH_33),
         COMPONENTS.get(igm)(),
     ]
     if agn:

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from astropy import units as u
 
 from helpers.errors import refuses
 from miricigale import conf
@@ -94,6 +95,17 @@ def test_survey_axes_are_those_of_the_chain(folder):
     # seven ages, three bursts, two metallicities and slopes, eight color excesses; two tori of three depths
     assert (grid.n_galaxies, grid.n_agn) == (672, 6)
     assert np.all(grid.galaxy > 0)
+
+
+@pytest.mark.parametrize("strength", [0.0, 0.2, 1.0])
+def test_dust_of_a_survey_emits_what_was_absorbed(strength):
+    """Whatever the feature at 3.3 um has: the difference of the starlight is the light of the dust."""
+    model = SEDModel.survey(libraries="bundled", agn=False)
+    sed = model.evaluate(age=1.0, ebv=0.4, q_pah=4.58, pah_33=strength, redshift=0.0)
+    rest = sed.wave.to_value(u.um)
+    power = {n: np.trapezoid(x.fnu.value / rest**2, rest) for n, x in sed.components.items()}
+    absorbed = power["stellar_intrinsic"] - power["stellar"] - power["nebular"]
+    assert power["dust"] == pytest.approx(absorbed, rel=1e-6)
 
 
 def test_far_infrared_axes_follow_the_cold_dust(folder):

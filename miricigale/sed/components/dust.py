@@ -210,11 +210,30 @@ def load_dl07(path):
 
 
 class _DraineLi(_Mixture):
+    """Base: mixtures of the bundled spectra, whose feature at 3.3 um is scaled by the parameter ``pah_33``."""
+
     reference = "Draine & Li 2007, ApJ 657, 810"
     resource = "dust.dl07"
 
     def nodes(self):
         return load_dl07(self.path)["wave"]
+
+    def _weights(self, columns):
+        """Weights of the spectra of `_tables`, by rows of columns."""
+        raise NotImplementedError
+
+    def _tables(self):
+        """Spectra per dust mass, and the same without the 3.3 um feature."""
+        raise NotImplementedError
+
+    def mixture(self, columns):
+        weight = self._weights(columns)
+        spectra, plain = self._tables()
+        strength = columns["pah_33"][:, None]
+        if np.all(strength == 1.0):
+            return weight, spectra
+        both = np.hstack([strength * weight, (1.0 - strength) * weight])
+        return both, np.concatenate([spectra, plain])
 
 
 @register
@@ -225,6 +244,9 @@ class DraineLi2007(_DraineLi):
     The mass fraction 1 - gamma is heated by U_min, gamma by dM/dU ~ U^-2 from U_min to 1e6.
     Between tabulated q_PAH and U_min the spectra per dust mass are interpolated (linear in
     q_PAH, linear in log U with the power scaled by U).
+
+    The feature at 3.3 um has 0.59 % of the power at 8-1000 um for q_PAH 3.4 %. Star-forming galaxies have about
+    0.1 % (Lai et al. 2020, ApJ 905, 55), as ``pah_33=0.2`` gives; the rest of the spectrum takes up the power.
 
     Examples
     --------
@@ -241,6 +263,7 @@ class DraineLi2007(_DraineLi):
     u_min = Parameter(1.0, (0.1, 25.0), "Least intensity of starlight.")
     gamma = Parameter(0.02, (0.0, 1.0), "Mass fraction heated by more.")
     q_pah = Parameter(2.5, (0.47, 4.58), "Mass fraction in PAHs, per cent.")
+    pah_33 = Parameter(1.0, (0.0, 2.0), "Strength of the 3.3 um feature.")
 
     @staticmethod
     def mean_intensity(values):
@@ -253,13 +276,16 @@ class DraineLi2007(_DraineLi):
         least, gamma = values["u_min"], values["gamma"]
         return float(least * (1.0 + gamma * (np.log(U_MAX / least) / (1.0 - least / U_MAX) - 1.0)))
 
-    def mixture(self, columns):
+    def _tables(self):
+        return _by_mass(self.path)
+
+    def _weights(self, columns):
         table, u_min = load_dl07(self.path), columns["u_min"]
         share = _between(table["qpah"], columns["q_pah"])
         scale = _between(np.log(table["umin"]), np.log(u_min)) * u_min[:, None] / table["umin"]
         weight = (share[:, :, None] * scale[:, None]).reshape(u_min.size, -1)
         gamma = columns["gamma"][:, None]
-        return np.hstack([(1.0 - gamma) * weight, gamma * weight]), _by_mass(self.path)
+        return np.hstack([(1.0 - gamma) * weight, gamma * weight])
 
 
 @register
@@ -270,7 +296,8 @@ class DraineLi2007Alpha(_DraineLi):
     A mapping with eight constants, fitted to the sequence of Dale et al. 2014 and scored on
     it: 0.10 dex rms in 5-25 um and 0.06 dex beyond for alpha from 1 to 3.5. MIRI bands differ
     by up to 0.45 mag, by 0.56 mag at the 3.3 um feature. It is **no substitute for Dale et al. 2014**
-    in a paper. Galaxies of CEERS have a tenth of its 3.3 um feature: ``pah_33`` scales that.
+    in a paper. Dale's templates have 0.23 to 0.30 of its 3.3 um feature, galaxies of CEERS a tenth:
+    ``pah_33`` scales that.
 
     Examples
     --------
@@ -287,19 +314,18 @@ class DraineLi2007Alpha(_DraineLi):
     alpha = Parameter(2.0, (1.0, 3.5), "Slope of dust mass in intensity, as Dale's alpha.")
     pah_33 = Parameter(1.0, (0.0, 2.0), "Strength of the 3.3 um feature.")
 
-    def mixture(self, columns):
-        intensity, spectra, plain = _alpha_tables(self.path)
+    def _tables(self):
+        return _alpha_tables(self.path)[1:]
+
+    def _weights(self, columns):
+        intensity = _alpha_tables(self.path)[0]
         step = columns["alpha"][:, None] - 2.0
         slope = ALPHA_SLOPE[0] + ALPHA_SLOPE[1] * step + ALPHA_SLOPE[2] * step**2
         log_u = np.log10(intensity)
         edges = _logistic((log_u - ALPHA_U[0]) / 0.05) * _logistic((ALPHA_U[1] - log_u) / 0.05)
         weight = intensity ** (1.0 - slope) * edges
         rich = _logistic((ALPHA_U_PAH - log_u) / 0.1)
-        weight = np.hstack([weight * rich, weight * (1.0 - rich)])
-        part = columns["pah_33"][:, None]
-        if np.all(part == 1.0):
-            return weight, spectra
-        return np.hstack([part * weight, (1.0 - part) * weight]), np.concatenate([spectra, plain])
+        return np.hstack([weight * rich, weight * (1.0 - rich)])
 
 
 #: Ends of log U, where PAHs are destroyed (log U), and the slope's polynomial in alpha - 2.
@@ -314,14 +340,27 @@ def _logistic(x):
     return 1.0 / (1.0 + np.exp(-np.clip(x, -500, 500)))
 
 
+def _without_feature(wave, spectra):
+    """Spectra whose 3.3 um feature is replaced by the power law through its ends."""
+    feature = slice(*np.searchsorted(wave, PAH_33))
+    ends = [feature.start, feature.stop]
+    log_wave = np.log(wave)
+    share = (log_wave[feature] - log_wave[ends[0]]) / np.ptp(log_wave[ends])
+    low, high = np.log(np.maximum(spectra[:, ends], 1e-300)).T[:, :, None]
+    plain = spectra.copy()
+    plain[:, feature] = np.exp(low + share * (high - low))
+    return plain
+
+
 @cached_by_file(maxsize=2)
 def _by_mass(path):
-    """Spectra per dust mass of single intensities at each q_PAH and U_min, then those of power laws."""
+    """Spectra per dust mass: of single U at each q_PAH and U_min, then power laws; and all without the feature."""
     table, parts = load_dl07(path), []
     for kind in ("single", "powerlaw"):
         spectra = (table[kind] * table[f"{kind}_power"][..., None])[:, : table["umin"].size]
         parts.append(spectra.reshape(-1, spectra.shape[-1]))
-    return np.concatenate(parts)
+    spectra = np.concatenate(parts)
+    return spectra, _without_feature(table["wave"], spectra)
 
 
 @cached_by_file(maxsize=2)
@@ -332,11 +371,5 @@ def _alpha_tables(path):
     matrix = _core.hat_matrix(np.log(table["u"]), np.clip(np.log(intensity), None, np.log(U_MAX)))
     ends = table["single"][[-1, 0]] * table["single_power"][[-1, 0]][..., None]
     logs = np.log(np.maximum(ends, 1e-300))
-    spectra, log_wave = np.concatenate([np.exp(matrix @ q) for q in logs]), np.log(table["wave"])
-    plain = spectra.copy()
-    feature = slice(*np.searchsorted(table["wave"], PAH_33))
-    ends = [feature.start, feature.stop]
-    share = (log_wave[feature] - log_wave[ends[0]]) / np.ptp(log_wave[ends])
-    low, high = np.log(np.maximum(spectra[:, ends], 1e-300)).T[:, :, None]
-    plain[:, feature] = np.exp(low + share * (high - low))
-    return intensity, spectra, plain
+    spectra = np.concatenate([np.exp(matrix @ q) for q in logs])
+    return intensity, spectra, _without_feature(table["wave"], spectra)
