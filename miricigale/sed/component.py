@@ -88,7 +88,7 @@ class Component:
     >>> from miricigale.sed.components import DraineLi2007
     >>> dust = DraineLi2007(q_pah=1.12)
     >>> dust
-    DraineLi2007(u_min=1, gamma=0.02, q_pah=1.12)
+    DraineLi2007(u_min=1, gamma=0.02, q_pah=1.12, pah_33=1)
     >>> dust.parameters["q_pah"].bounds
     (0.47, 4.58)
     """
