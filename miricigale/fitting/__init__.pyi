@@ -3,6 +3,7 @@ from .calibration import calibrate_zero_points as calibrate_zero_points
 from .calibration import measure_band_errors as measure_band_errors
 from .calibration import measure_priors as measure_priors
 from .calibration import measure_template_error as measure_template_error
+from .catalog_calibration import calibrate_bands as calibrate_bands
 from .checks import LeaveOutResult as LeaveOutResult
 from .checks import MockResult as MockResult
 from .checks import leave_out as leave_out

@@ -5,9 +5,16 @@ import itertools
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
-from scipy.optimize import brentq, minimize
-from scipy.special import expit, ndtr
+from scipy.optimize import brentq
+from scipy.special import ndtr
 
+from miricigale.fitting.band_errors import (
+    LONGEST_REST,
+    PredictedFluxes,
+    estimate_band_errors,
+    prior_of_band,
+    select_fluxes,
+)
 from miricigale.fitting.likelihood import per_band
 from miricigale.fitting.template_error import TemplateError, pivots
 from miricigale.utils.declared import declared
@@ -23,10 +30,6 @@ _LEAST_SIGNAL = 5.0
 _N_BAND, _N_BIN = 30, 10
 #: Median of the absolute value of a normal deviate.
 _MEDIAN = 0.6744897501960817
-#: How many times their errors fluxes scatter by that are something else's.
-_WIDE = 5.0
-#: Shortest rest wavelength in um at which others predict a band: young stars and dust vary most below.
-_SHORTEST = 0.4
 #: Largest template error that is looked for.
 _MOST = 10.0
 #: Edges in um of the bins of rest wavelength; wider where few bands fall.
@@ -70,26 +73,28 @@ def _excess(flux, error, model, scatter):
     return brentq(excess, 0.0, _MOST, xtol=1e-4) if excess(0.0) > 0 else 0.0
 
 
-def measure_band_errors(left, template_error, *, longest=2.5 * u.um):
+def measure_band_errors(left, template_error, *, longest=LONGEST_REST * u.um, prior=None):
     """
     Measure errors of bands that are not those of models: noise, and other apertures, PSFs and blends.
 
-    By the greatest likelihood of what was measured in bands that were left out of a fit, given what the other
-    bands predict, where starlight makes the flux: errors are those of the catalog times a factor, and a part of
-    the flux, added to the template error and that of the prediction. (Residuals of a fit that has the bands would
-    be too small, as models follow them.) One in twenty fluxes may be an outlier, with errors five times as large.
-    Errors of drizzled images may be too small by such a factor, for their noise is correlated; but where sources
-    were selected in these bands, the factor is also that of the fluxes that noise or neighbors brought into the
-    sample, and holds for sources that are selected like that.
+    By the greatest posterior of what was measured in bands that were left out of a fit, given what the other bands
+    predict, where starlight makes the flux: errors are those of the catalog times a factor, and a part of the
+    flux, added to the template error and that of the prediction. (Residuals of a fit that has the bands would be
+    too small, as models follow them.) Some fluxes may be wrong, with errors five times as large. Fluxes count
+    whose prediction is above five times their error. Errors of drizzled images may be too small by such a factor,
+    for their noise is correlated. `calibrate_bands` does this for all bands of a catalog with fewer fits.
 
     Parameters
     ----------
     left : `LeaveOutResult`
-        Of `leave_out` at known redshifts, of bands that are alike, such as those of MIRI.
+        Of `leave_out`, at known or free redshifts, of bands that are alike, such as those of MIRI.
     template_error : `TemplateError`
         That of the fit.
     longest : `~astropy.units.Quantity`, optional
         Longest rest wavelength that is looked at.
+    prior : `~miricigale.fitting.band_errors.BandErrorPrior`, optional
+        What is likely before anything was measured, and holds where no flux says more: for bands of MIRI by
+        default 3.3 times the errors and 15 % of the flux, for others 1 and 2 %.
 
     Returns
     -------
@@ -101,7 +106,11 @@ def measure_band_errors(left, template_error, *, longest=2.5 * u.um):
     Raises
     ------
     ValueError
-        If redshifts were free, or there are fewer than 30 fluxes of S/N above 5.
+        If no prior is given, and bands of MIRI and others were left out.
+
+    References
+    ----------
+    Hogg, Bovy & Lang 2010, arXiv:1008.4686, section 3.
 
     Examples
     --------
@@ -110,39 +119,26 @@ def measure_band_errors(left, template_error, *, longest=2.5 * u.um):
     >>> left = leave_out(fitter, photometry, miri, redshift="z_spec")  # doctest: +SKIP
     >>> factor, part = measure_band_errors(left, template_error)  # doctest: +SKIP
     """
-    found = error_of_bands(left, template_error, to_array(longest, WAVE, "longest", ndim=0))
-    check_that(found is not None, "left", f"with {_N_BAND} fluxes of S/N above 5", "fewer")
-    return found
-
-
-def error_of_bands(left, template_error, longest=2.5):
-    """Do what `measure_band_errors` does, with a wavelength in um; None where fluxes are too few."""
-    for results in left.results.values():
-        _check_known(results)
-    z = np.array([left.results[name].best["redshift"].value for name in left.bands])
-    rest = pivots(left.bands).value / (1.0 + z.T)
-    with np.errstate(invalid="ignore"):
-        good = (left.predicted > 0) & (left.flux > _LEAST_SIGNAL * left.flux_err)
-        good &= (rest > _SHORTEST) & (rest < longest)
-    if np.count_nonzero(good) < _N_BAND:
-        return None
-    model, err = left.predicted[good], left.flux_err[good]
-    fixed = np.square(left.predicted_std[good])
-    fixed += np.square(template_error(rest[good] * WAVE) * model)
-    square = np.square(left.flux[good] - model)
-
-    def unlikely(logs):
-        variance = fixed + np.square(np.exp(logs[0]) * err) + np.square(np.exp(logs[1]) * model)
-        share = max(0.5 * expit(logs[2]), 1e-300)
-        terms = [
-            np.log(part / wide) - 0.5 * (np.log(variance) + square / (wide * wide * variance))
-            for part, wide in ((1.0 - share, 1.0), (share, _WIDE))
-        ]
-        return -np.logaddexp(*terms).sum()
-
-    starts = [[*np.log(start), -3.0] for start in ([1.0, 0.2], [4.0, 0.1], [3.0, 0.02])]
-    found = [minimize(unlikely, start, method="Nelder-Mead") for start in starts]
-    return tuple(np.exp(min(found, key=lambda one: one.fun).x[:2]).tolist())
+    longest = to_array(longest, WAVE, "longest", ndim=0)
+    if prior is None:
+        priors = {prior_of_band(band) for band in left.bands}
+        check_that(len(priors) == 1, "left", "of bands of MIRI, or of others", list(left.bands))
+        prior = priors.pop()
+    samples = []
+    for i, band in enumerate(left.bands):
+        redshift = left.results[band].mean("redshift").value
+        fluxes = select_fluxes(
+            left.flux[:, i],
+            left.flux_err[:, i],
+            left.predicted[:, i],
+            left.predicted_std[:, i],
+            pivots([band]).to_value(WAVE) / (1.0 + redshift),
+            template_error,
+            longest,
+        )
+        samples.append(fluxes)
+    errors = estimate_band_errors(PredictedFluxes.concatenate(samples), prior)
+    return errors.factor, errors.part
 
 
 def measure_template_error(results, *, model_error=0.0, edges=None):

@@ -3,19 +3,17 @@
 import dataclasses
 from dataclasses import dataclass
 
-import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
 from miricigale.evaluation import photoz_metrics
-from miricigale.filters import Filter
-from miricigale.fitting.calibration import (
-    calibrate_zero_points,
-    error_of_bands,
-    measure_priors,
-    measure_template_error,
+from miricigale.fitting.band_errors import (
+    long_instruments,
+    measure_bands,
+    prior_errors,
+    relative_zero_points,
 )
-from miricigale.fitting.checks import leave_out
+from miricigale.fitting.calibration import measure_priors, measure_template_error
 from miricigale.fitting.populations import MassFunction, agn_fraction_prior
 from miricigale.fitting.priors import known_redshifts
 from miricigale.fitting.pulls import without_warnings
@@ -25,7 +23,7 @@ from miricigale.utils.caching import cached
 from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import DataError, FitWarning, warn
 from miricigale.utils.files import replacing
-from miricigale.utils.options import check_that
+from miricigale.utils.options import check_names, check_that
 from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import described_rows, described_table, require_columns
 
@@ -34,14 +32,8 @@ from miricigale.utils.tables import described_rows, described_table, require_col
 _TURNS, _LONGER = 6, 2.0
 #: Errors of models before any were measured.
 _FIRST = 0.1
-#: Part of fluxes that are wrong, before it was measured.
-_FIRST_WRONG = 0.03
-#: Wavelength beyond which all bands of an instrument are for it to be measured apart.
-_LONG = 5.0 * u.um
-#: Longest rest wavelength that zero points are measured at: beyond, dust makes the flux.
-_STARLIGHT = 2.5 * u.um
-#: Least number of sources of a half, and of bands that predict those of an instrument.
-_LEAST, _OTHERS = 50, 4
+#: Least number of sources of a half.
+_LEAST = 50
 _NAME = "miricigale survey calibration"
 _COLUMNS, _SCORES = (declared("miricigale.fitting", "columns.toml")[k] for k in ("bands", "scores"))
 
@@ -56,7 +48,8 @@ class SurveyCalibration:
     name : str
         What results call it.
     bands : `~astropy.table.QTable`
-        A row for each band: ``band``, ``zero_point``, ``error_factor``, ``error_part``, ``outlier``. Other
+        A row for each band: ``band``, ``zero_point``, ``error_factor``, ``error_part``, ``outlier``, the share of
+        wrong fluxes that fits allow for, and, where it was measured, ``wrong``, the share that was found. Other
         bands are taken as they are.
     template_error : `TemplateError`
         Errors of the models by rest wavelength.
@@ -86,7 +79,8 @@ class SurveyCalibration:
     errors: dict = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
-        require_columns(self.bands, [c for c in _COLUMNS if "_err" not in c and c != "n"], "bands")
+        wanted = ("band", "zero_point", "error_factor", "error_part", "outlier")
+        require_columns(self.bands, wanted, "bands")
 
     def __repr__(self):
         numbers = f"{len(self.bands)} bands, {len(self.priors)} priors"
@@ -114,6 +108,68 @@ class SurveyCalibration:
     def without_priors(self):
         """Calibration of the same bands and errors for other models: without priors."""
         return dataclasses.replace(self, priors={}, mass_function=None, errors={})
+
+    @classmethod
+    def without_bands(cls, name, template_error):
+        """Calibration that has errors of models only."""
+        return cls(name, described_rows([], _COLUMNS), template_error, {})
+
+    def with_band_errors(self, errors):
+        """
+        Calibration with other errors of bands; no band may be an outlier.
+
+        Parameters
+        ----------
+        errors : dict of str to `~miricigale.fitting.band_errors.BandErrors`
+            By band.
+
+        Returns
+        -------
+        calibration : `SurveyCalibration`
+            With these bands alone.
+        """
+        rows = [_band_row(band, found, outlier=0.0) for band, found in errors.items()]
+        return dataclasses.replace(self, bands=described_rows(rows, _COLUMNS))
+
+    def with_prior_errors(self, bands):
+        """
+        Calibration of a catalog of which nothing was measured.
+
+        Parameters
+        ----------
+        bands : list of str
+            Bands of the catalog.
+
+        Returns
+        -------
+        calibration : `SurveyCalibration`
+            Its bands have the errors of `~miricigale.fitting.band_errors.prior_errors`: in MIRI's 3.3 times those
+            of the catalog and 15 % of the flux.
+        """
+        return self.with_band_errors({band: prior_errors(band) for band in bands})
+
+    def summary(self):
+        """
+        Table of what is done to the fluxes and errors of each band, as text.
+
+        Returns
+        -------
+        text : str
+            A line for each band: fluxes that were compared with what others predict, zero point, factor of the
+            errors, part of the flux that is added, and share of wrong fluxes that was found. ``prior`` stands
+            where no flux said anything.
+        """
+        lines = [f"{'band':20s} {'fluxes':>6s}  zero point      errors x  + flux, %  wrong, %"]
+        for row in self.bands:
+            n_fluxes = str(int(row["n"])) if row["n"] > 0 else "prior"
+            zero_point = f"{row['zero_point']:.3f}"
+            if row["zero_point_err"] > 0:
+                zero_point += f" +- {row['zero_point_err']:.3f}"
+            numbers = f"{row['error_factor']:8.2f}  {100 * row['error_part']:9.1f}"
+            wrong = f"{100 * row['wrong']:8.1f}" if np.isfinite(row["wrong"]) else ""
+            line = f"{row['band']:20s} {n_fluxes:>6s}  {zero_point:14s} {numbers}  {wrong}"
+            lines.append(line.rstrip())
+        return "\n".join(lines)
 
     @classmethod
     @cached(copies=True)
@@ -166,7 +222,7 @@ class SurveyCalibration:
             )
             return cls(
                 name=meta["name"],
-                bands=described_table({n: (table[n], t) for n, t in _COLUMNS.items()}),
+                bands=_read_bands(table),
                 template_error=TemplateError.from_meta(error),
                 priors={
                     n: (np.array(p["values"]), np.array(p["weights"]))
@@ -179,6 +235,30 @@ class SurveyCalibration:
         except (KeyError, TypeError, ValueError) as error:
             msg = f"{msg}, or a damaged one: {error!r}"
             raise DataError(msg) from error
+
+
+def _read_bands(table):
+    """Bands of a file; those of earlier versions do not have the share of wrong fluxes that was found."""
+    columns = {}
+    for name, text in _COLUMNS.items():
+        values = table[name] if name in table.colnames else np.full(len(table), np.nan)
+        columns[name] = (values, text)
+    return described_table(columns)
+
+
+def _band_row(band, errors, outlier):
+    """Row of the table of bands, in the order of its columns: `BandErrors`, and what fits allow to be wrong."""
+    row = {
+        "band": band,
+        "n": errors.n,
+        "zero_point": errors.zero_point,
+        "zero_point_err": errors.zero_point_err,
+        "error_factor": errors.factor,
+        "error_part": errors.part,
+        "outlier": outlier,
+        "wrong": errors.wrong,
+    }
+    return [row[name] for name in _COLUMNS]
 
 
 def calibrate(
@@ -194,15 +274,15 @@ def calibrate(
     """
     Measure what sources of known redshift say of a survey and of the models.
 
-    In turns, each a step of expectation maximization: priors of all parameters (`measure_priors`), zero points
-    from starlight (`calibrate_zero_points`), errors of models by rest wavelength (`measure_template_error`),
-    errors of an instrument about what the others predict (`measure_band_errors`), and how many fluxes of a band
-    are wrong (``outlier``). Each of two halves of the sources, every other one, is measured by itself, and
-    fitted with free redshifts with what was found on the other: the scores. What is returned is the mean of
-    both, with half of their difference as error. These are six fits of the sources at their redshifts, on nodes,
-    five more for each instrument that is measured apart, and two with free redshifts. Apart are those without a
-    band below 5 um, such as MIRI: their errors are measured from what the others predict of starlight, and their
-    zero points are left as they are.
+    In turns, each a step of expectation maximization: priors of all parameters (`measure_priors`), errors of
+    models by rest wavelength (`measure_template_error`), and zero points, errors and shares of wrong fluxes of
+    bands as `calibrate_bands` measures them, from what the other bands predict. Each of two halves of the sources,
+    every other one, is measured by itself, and fitted with free redshifts with what was found on the other: the
+    scores. What is returned is the mean of both, with half of their difference as error. These are six fits of the
+    sources at their redshifts, on nodes, five more if instruments without a band below 5 um, such as MIRI, are
+    left out to be predicted by the others, and two with free redshifts.
+
+    Where nothing is measured of a band, the prior of `calibrate_bands` counts, and ``n`` of the band is 0.
 
     Parameters
     ----------
@@ -216,7 +296,7 @@ def calibrate(
     name : str, optional
         What results call it.
     reference : str, optional
-        Band whose zero point is 1: by default that of the most sources of S/N above 5.
+        Band whose zero point is 1: by default their median is 1.
     priors : dict, optional
         Weights of the values of parameters that are not measured: by default those of `agn_fraction_prior`, for
         templates that do not fit make AGN where there are none. ``{}`` measures all.
@@ -255,11 +335,8 @@ def calibrate(
         axis = fitter.priors.axes.get("frac_agn")
         some = axis is not None and axis.values.size > 1 and axis.values[0] == 0
         priors = {"frac_agn": agn_fraction_prior(axis.values)} if some else {}
-    if reference is None:
-        # the same for both halves
-        bands = _fitted(fitter, table)
-        data = fitter.read_bands(table[rows], bands)
-        reference = bands[np.argmax((data.flux > 5.0 * data.flux_err).sum(axis=0))]
+    if reference is not None:
+        check_names([reference], "band that is fitted", _fitted(fitter, table))
     options = {"executor": executor}
     halves = [(table[rows[h::2]], z[rows[h::2]]) for h in (0, 1)]
     before, after = [], []
@@ -290,78 +367,49 @@ def _score(fits, true):
     return int(good.sum()), metrics.bias, metrics.sigma_mad, metrics.outlier_fraction, inside
 
 
+def on_nodes(fitter):
+    """Return a fitter of the nodes of the grid alone: errors and priors are of what these leave."""
+    settings = dataclasses.replace(fitter.backend.given, interpolate=0, finer=None, agn_error=0.0)
+    return fitter.changed(settings=settings)
+
+
 def _measure(fitter, table, z, name, reference, priors, options):
     """`SurveyCalibration` of some sources at their redshifts."""
     options = {"redshift": z, **options}
-    # errors and priors are of what the nodes leave
-    settings = fitter.backend.given
-    fitter = fitter.changed(settings=dataclasses.replace(settings, interpolate=0))
+    fitter = on_nodes(fitter)
     bands = _fitted(fitter, table)
-    used = fitter.read_bands(table, bands).used.any(axis=0)
-    measured = {band for band, known in zip(bands, used, strict=True) if known}
-    zero, factor = dict.fromkeys(bands, (1.0, 0)), dict.fromkeys(bands, 1.0)
-    part, wrong = dict.fromkeys(bands, 0.0), dict.fromkeys(bands, 0.0)
-    weights, error, groups = {}, None, _instruments(bands)
+    long = [band for group in long_instruments(bands) for band in group]
+    predicting = [band for band in bands if band not in long]
+    data = fitter.changed(calibration=None).read_bands(table, bands)
+    errors = {band: prior_errors(band) for band in bands}
+    weights = {}
 
-    def current():
-        rows = [(b, n, point, 0.0, factor[b], part[b], wrong[b]) for b, (point, n) in zero.items()]
+    def current(template_error):
         known = {n: (fitter.priors.axes[n].values, w) for n, w in weights.items()}
-        found = name, described_rows(rows, _COLUMNS), error, known, MassFunction()
-        return SurveyCalibration(*found)
+        rows = [_band_row(band, found, outlier=found.wrong) for band, found in errors.items()]
+        table = described_rows(rows, _COLUMNS)
+        return SurveyCalibration(name, table, template_error, known, MassFunction())
 
     now = fitter.changed(model_error=_FIRST, template_error=None, calibration=None)
     for turn in range(_TURNS):
-        for group in groups if turn else ():
-            if not measured.intersection(group):
-                continue
-            left = leave_out(now, table, [b for b in group if b in measured], **options)
-            found = error_of_bands(left, error)
-            if found is not None:
-                factor |= dict.fromkeys(group, found[0])
-                part |= dict.fromkeys(group, found[1])
-        if turn:
-            now = with_calibration(fitter, current())
         fit = now.fit(table, **options)
+        part = {band: 0.0 if turn == 0 else errors[band].part for band in bands}
         error = measure_template_error(fit, model_error=part)
-        points = calibrate_zero_points(fit, reference=reference, longest=_STARLIGHT)
-        # one pass finds a part of them, since models follow the fluxes; where errors are measured apart too few
-        # fluxes are left for it
-        aside = [band for group in groups for band in group]
-        for row in points:
-            factor_of = 1.0 if row["band"] in aside else row["factor"]
-            zero[row["band"]] = (zero[row["band"]][0] * factor_of, int(row["n"]))
         weights = _longer(weights, measure_priors(fit), 1.0 if turn == 0 else _LONGER) | priors
-        # errors come first, wrong bands are what they leave
-        if turn >= 2:
-            wrong |= _wrong(fit, bands)
-        elif turn == 1:
-            wrong = dict.fromkeys(bands, _FIRST_WRONG)
-        now = with_calibration(fitter, current())
-    return current()
-
-
-def _wrong(fit, bands):
-    """Part of the fluxes of bands that are wrong: dict by name, drawn to the first guess as by 30 more."""
-    found = fit.outlier[:, [fit.filters.index(b) for b in bands]]
-    known = np.isfinite(found)
-    share = (np.nansum(found, axis=0) + 30 * _FIRST_WRONG) / (known.sum(axis=0) + 30)
-    return dict(zip(bands, share.tolist(), strict=True))
+        if turn > 0:
+            if long:
+                fit = now.changed(filters=predicting).fit(table, **options)
+            errors = measure_bands(fit, data, bands, error)
+            if reference is not None:
+                errors = relative_zero_points(errors, reference)
+        now = with_calibration(fitter, current(error))
+    return now.calibration
 
 
 def with_calibration(fitter, calibration):
     """Return a fitter with a calibration in place of its own priors and errors."""
     none = dict.fromkeys(("priors", "template_error", "model_error"))
     return fitter.changed(calibration=calibration, **none)
-
-
-def _instruments(bands):
-    """Bands of each of the instruments that are measured apart: those of long wavelengths."""
-    groups = {}
-    for band in bands:
-        groups.setdefault(band.split(".")[0], []).append(band)
-    pivots = {band: Filter.from_name(band).pivot for band in bands}
-    long = [some for some in groups.values() if min(map(pivots.get, some)) > _LONG]
-    return [some for some in long if len(bands) - len(some) >= _OTHERS]
 
 
 def _longer(before, now, power):
@@ -378,7 +426,7 @@ def _mean(found):
     """Mean of two calibrations, of errors that of their squares, with half of the difference as error."""
     a, b = found
     bands, wave = a.bands.copy(), a.template_error.wave
-    for name in ("zero_point", "outlier"):
+    for name in ("zero_point", "outlier", "wrong"):
         bands[name] = 0.5 * (a.bands[name] + b.bands[name])
     # what is scatter in parts of the flux in one half may be in parts of its error in the other
     for name in ("error_factor", "error_part"):
