@@ -3,8 +3,9 @@
 import dataclasses
 
 import numpy as np
-from astropy.table import QTable
+from astropy.table import QTable, vstack
 
+from miricigale.filters.catalog_files import MappedRows
 from miricigale.fitting.band_errors import (
     MIN_PREDICTING_BANDS,
     MIN_SIGNAL,
@@ -14,8 +15,12 @@ from miricigale.fitting.band_errors import (
 from miricigale.fitting.likelihood import PhotometryReader
 from miricigale.fitting.priors import known_redshifts
 from miricigale.fitting.pulls import without_warnings
-from miricigale.fitting.survey import SurveyCalibration, on_nodes
+from miricigale.fitting.streaming import row_pieces
+from miricigale.fitting.survey import SurveyCalibration, calibrate, on_nodes, with_calibration
 from miricigale.fitting.template_error import TemplateError, pivots
+from miricigale.utils.content import content_sha256
+from miricigale.utils.exceptions import OtherResultsError
+from miricigale.utils.files import replacing
 from miricigale.utils.options import check_that
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import error_column
@@ -28,6 +33,8 @@ _MAX_LONG_SOURCES = 250
 MIN_SOURCES = 100
 #: Bands of S/N above 5 that a source is to have.
 _MIN_BANDS = 5
+#: File of what was measured, in the folder of the results.
+FILE_NAME = "calibration.ecsv"
 #: Turns: zero points change what the other bands predict, by 1 to 2.5 % in the second turn and little after.
 _TURNS = 2
 
@@ -287,3 +294,133 @@ def _calibration_of(fitter):
         check_that(len(parts) == 1, "fitter", wanted, f"model errors of {sorted(parts)}")
         error = TemplateError([1.0] * WAVE, [*parts])
     return SurveyCalibration.without_bands("", error)
+
+
+def calibrate_file(fitter, rows, output, *, column=None, options):
+    """
+    Fitter with the errors of the bands of a catalog on disk, measured on it unless a file says them already.
+
+    They are kept in ``calibration.ecsv``, whose name has a checksum of the catalog, of its units and redshifts,
+    and of the models.
+
+    Parameters
+    ----------
+    fitter : `BayesFitter`
+        On a grid.
+    rows : `~miricigale.utils.row_files.RowFile`
+        The catalog.
+    output : `~pathlib.Path`
+        Folder of the results.
+    column : str, optional
+        Column of known redshifts for `calibrate`; without it `calibrate_bands` is done.
+    options : dict
+        Of `miricigale.fitting.fit_file`: ``redshift``, ``redshift_prior``, ``flux_unit``, ``hdu``, ``resume`` and
+        ``executor`` are used.
+
+    Returns
+    -------
+    fitter : `BayesFitter`
+        The same with the calibration in place of its errors, and of its priors with ``column``.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.OtherResultsError`
+        If the folder has a calibration of another fit and ``resume`` is not False.
+    """
+    path = output / FILE_NAME
+    name = _name_of(fitter, rows, column, options)
+    if path.exists() and options.get("resume", True):
+        found = SurveyCalibration.read(path)
+        if found.name != name:
+            msg = (
+                f"{output} holds a calibration of another fit: {found.name!r} in place of {name!r}"
+            )
+            raise OtherResultsError(msg, "resume=False to replace it")
+    else:
+        if column is None:
+            found = _bands_of_file(fitter, rows, name, options)
+        else:
+            found = _redshifts_of_file(fitter, rows, column, name, options)
+        output.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as partial:
+            found.write(partial, overwrite=True)
+    return with_errors_of(fitter, found) if column is None else with_calibration(fitter, found)
+
+
+def _name_of(fitter, rows, column, options):
+    """Name of a calibration: the file, how it was measured, and a checksum of all that it follows from."""
+    content = {
+        "catalog": rows.sha256,
+        "map": rows.map.settings() if isinstance(rows, MappedRows) else None,
+        "hdu": options.get("hdu"),
+        "unit": str(options.get("flux_unit")),
+        "redshift": options.get("redshift"),
+        "redshift_prior": options.get("redshift_prior"),
+        "models": fitter.backend.content,
+        "settings": fitter.settings(),
+    }
+    checksum = content_sha256(content)[:8]
+    if column is not None:
+        return f"{rows.path.name} by {column} ({checksum})"
+    models = "" if fitter.calibration is None else f"{fitter.calibration.name}, "
+    return f"{models}bands of {rows.path.name} ({checksum})"
+
+
+def _take_rows(fitter, rows, options):
+    """Function of the number of a piece: its table, with units, and what is known of redshifts."""
+    known = {"redshift": None, "redshift_prior": None} | options
+    known = {name: known[name] for name in ("redshift", "redshift_prior")}
+    fluxes = {column for band in fitter.bands for column in (band, error_column(band))}
+    return row_pieces(rows, known, options.get("flux_unit"), fluxes)
+
+
+def _bands_of_file(fitter, rows, name, options):
+    """Calibration of the bands of a catalog on disk, of which one piece is in memory at a time."""
+    take = _take_rows(fitter, rows, options)
+    sample = sample_of(fitter, rows.colnames, seed=0)
+    nodes = None
+    for i in range(rows.n_chunks):
+        table, known = take(i)
+        density = None
+        if known["redshift_prior"] is not None:
+            nodes, density = known["redshift_prior"]
+            density = np.broadcast_to(density, (len(table), np.shape(density)[-1]))
+        sample.add(table, redshift=known["redshift"], density=density)
+    executor = options.get("executor")
+    return calibrate_sample(fitter, sample, name=name, density_nodes=nodes, executor=executor)
+
+
+def _redshifts_of_file(fitter, rows, column, name, options):
+    """Calibration by the sources of known redshift of a catalog on disk."""
+    take = _take_rows(fitter, rows, options | {"redshift": None, "redshift_prior": None})
+    known = []
+    for i in range(rows.n_chunks):
+        table, _ = take(i)
+        known.append(table[np.isfinite(known_redshifts(table, column))])
+    table = vstack(known, metadata_conflicts="silent")
+    executor = options.get("executor")
+    with without_warnings():
+        # the fit of the catalog warns of it
+        return calibrate(fitter, table, redshift=column, name=name, executor=executor)
+
+
+def measured_calibration(results):
+    """
+    The calibration that was measured on a catalog and that its results have.
+
+    Parameters
+    ----------
+    results : `~miricigale.fitting.FitResultsFiles`
+        Results in a folder.
+
+    Returns
+    -------
+    calibration : `SurveyCalibration` or None
+        None if they have another one, or none.
+    """
+    path = results.path / FILE_NAME
+    name = results.job["settings"].get("calibration")
+    if name is None or not path.exists():
+        return None
+    found = SurveyCalibration.read(path)
+    return found if found.name == name else None

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from miricigale.fitting.catalog_calibration import measured_calibration
 from miricigale.fitting.class_names import chosen_classes
 from miricigale.fitting.classification import class_columns
 from miricigale.fitting.from_files import fit_catalog
@@ -68,8 +69,10 @@ def fit_classes(path, output, *, classes=(), quasars=False, red_dots=False, star
         spectra = read_spectra(stars)
     with _each_once():
         found = {"galaxy": fit_catalog(path, output, **options)}
-        if options.pop("calibrate", None) is not None:
-            options["calibration"] = Path(output) / "calibration.ecsv"
+        options.pop("calibrate", None)
+        measured = measured_calibration(found["galaxy"])
+        if measured is not None:
+            options["calibration"] = measured
         # after the fit, which refuses what it cannot read before it loads the models
         from miricigale.sed import SEDModel, quasar_axes, template_grid
         from miricigale.sed import red_dots as shapes

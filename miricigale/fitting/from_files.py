@@ -5,16 +5,12 @@ import logging
 import os
 from pathlib import Path
 
-import numpy as np
-from astropy.table import vstack
-
 from miricigale.filters.catalog_files import CountedRows, MappedRows, as_catalog_map
 from miricigale.filters.photometry_table import band_columns
 from miricigale.fitting.fitted_bands import bands_with_errors, warn_of_unfitted
 from miricigale.fitting.likelihood import unused_bands
-from miricigale.utils.exceptions import OtherResultsError
+from miricigale.utils.options import check_that
 from miricigale.utils.row_files import open_rows
-from miricigale.utils.tables import error_column
 
 log = logging.getLogger(__name__)
 
@@ -49,7 +45,7 @@ def fit_catalog(
     model_error=None,
     outliers=None,
     calibration="default",
-    calibrate=None,
+    calibrate=True,
     catalog_map=None,
     ebv=0.0,
     interpolate=200,
@@ -61,8 +57,9 @@ def fit_catalog(
     """
     Fit a catalog of photometry of any length, by default with models of real galaxies and their calibration.
 
-    The fits are those of ``BayesFitter(bands, axes=axes)`` for the same catalog, number for number. What is fitted
-    is logged: models, bands, and errors with priors.
+    The fits are those of ``BayesFitter(bands, axes=axes, calibration=...)`` for the same catalog, with what
+    `miricigale.fitting.calibrate_bands` measures on it, number for number. What is fitted is logged: errors of
+    bands, models, bands, and errors with priors.
 
     Parameters
     ----------
@@ -86,9 +83,13 @@ def fit_catalog(
         Zero points, errors and priors, or the file of them; None: none. By default
         `miricigale.fitting.SurveyCalibration.survey` with ``axes="survey"`` and none with others. With ``models``
         its priors are left out.
-    calibrate : str, optional
-        Column of known redshifts, with which all of that is measured first: see `miricigale.fitting.calibrate`.
-        It is written to ``calibration.ecsv`` in ``output``, from where a resumed fit takes it.
+    calibrate : bool or str, optional
+        Whether errors, zero points and shares of wrong fluxes of the bands are measured on the catalog first,
+        without known redshifts: see `miricigale.fitting.calibrate_bands`. Not where ``calibration``,
+        ``model_error`` or ``models`` is given, and not with the grids of simulations. A column of known redshifts:
+        with these all of the calibration is measured, see `miricigale.fitting.calibrate`. False or None: errors of
+        bands are those of the catalog. What was measured is logged and written to ``calibration.ecsv`` in
+        ``output``, from where a resumed fit takes it.
     catalog_map : `~miricigale.filters.CatalogMap`, str or path-like, optional
         Names and units of the catalog; the name of a survey, or a file: TOML, or a translate file of EAZY.
     ebv : float, optional
@@ -155,7 +156,8 @@ def fit_catalog(
         calibration=known,
         settings=GridSettings(interpolate=interpolate, agn_error=agn_error),
     )
-    fitter = calibrated(fitter, rows, calibrate, Path(output), options)
+    calibrate = calibrates_itself(calibrate, calibration, axes, models, model_error)
+    fitter = calibrated(fitter, rows, calibrate, Path(output), options | {"hdu": hdu})
     if models is None:
         for line in statement(fitter, unused):
             log.info(line)
@@ -189,7 +191,7 @@ def first_calibration(calibration, axes, model_error):
     return chosen_calibration(calibration, axes, model_error)
 
 
-def calibrated(fitter, rows, column, output, options):
+def calibrated(fitter, rows, calibrate, output, options):
     """
     Fitter with what its catalog says of models and bands; that of `first_calibration` where it is not asked.
 
@@ -199,42 +201,63 @@ def calibrated(fitter, rows, column, output, options):
         With the calibration of `first_calibration`.
     rows : `~miricigale.utils.row_files.RowFile`
         The catalog.
-    column : str or None
-        Column of known redshifts.
+    calibrate : str or bool
+        Column of known redshifts, or whether the errors of the bands are measured without.
     output : `~pathlib.Path`
         Folder of the results, where what was measured is kept.
     options : dict
-        Of `fit_catalog`: ``resume``, ``executor``, ``flux_unit``.
+        Of `fit_catalog`: ``redshift``, ``redshift_prior``, ``resume``, ``executor``, ``flux_unit``, ``hdu``.
 
     Returns
     -------
     fitter : `~miricigale.fitting.BayesFitter`
     """
-    return fitter if column is None else _by_redshifts(fitter, rows, column, output, options)
+    if calibrate is False:
+        return fitter
+    from miricigale.fitting.catalog_calibration import FILE_NAME, calibrate_file
+
+    # which a long calibration should not come before
+    fitter.backend.check_pairs(options.get("pairs"))
+    column = calibrate if isinstance(calibrate, str) else None
+    path = output / FILE_NAME
+    if not path.exists() or not options.get("resume", True):
+        log.info("measuring the errors of the bands on the catalog")
+    fitter = calibrate_file(fitter, rows, output, column=column, options=options)
+    log.info("errors of the bands (%s):", path)
+    for line in fitter.calibration.summary().splitlines():
+        log.info(line)
+    return fitter
 
 
-def _by_redshifts(fitter, rows, column, output, options):
-    """Fitter with the calibration by known redshifts of a catalog, measured unless it is there."""
-    from miricigale.fitting.priors import known_redshifts
-    from miricigale.fitting.pulls import without_warnings
-    from miricigale.fitting.survey import SurveyCalibration, calibrate, with_calibration
+def calibrates_itself(calibrate, calibration, axes, models, model_error):
+    """
+    Column of known redshifts, or whether the errors of bands are measured on the catalog.
 
-    resume, executor = options.get("resume", True), options.get("executor")
-    path, name = output / "calibration.ecsv", f"{rows.path.name} by {column} ({rows.sha256[:8]})"
-    found = SurveyCalibration.read(path) if resume and path.exists() else None
-    if found is not None and found.name != name:
-        msg = f"{path} is of {found.name}, not of {name}"
-        raise OtherResultsError(msg, "resume=False to replace it")
-    if found is None:
-        known = []
-        for table in map(rows.chunk, range(rows.n_chunks)):
-            fluxes = {c for b in fitter.bands for c in (b, error_column(b))}
-            give_units(table, fluxes, options.get("flux_unit"))
-            known.append(table[np.isfinite(known_redshifts(table, column))])
-        table = vstack(known, metadata_conflicts="silent")
-        with without_warnings():
-            # the fit of the catalog warns of it
-            found = calibrate(fitter, table, redshift=column, name=name, executor=executor)
-        output.mkdir(parents=True, exist_ok=True)
-        found.write(path, overwrite=True)
-    return with_calibration(fitter, found)
+    Parameters
+    ----------
+    calibrate : str, bool or None
+        As for `fit_catalog`.
+    calibration, axes, models, model_error : optional
+        As for `fit_catalog`: errors that are given are taken as they are, and simulations have those of their
+        makers.
+
+    Returns
+    -------
+    calibrate : str or bool
+
+    Raises
+    ------
+    ValueError
+        If ``calibrate`` is something else.
+    """
+    from miricigale.fitting.defaults import DEFAULT
+
+    if isinstance(calibrate, str):
+        return calibrate
+    wanted = "True, False, None or a column of known redshifts"
+    check_that(
+        calibrate is None or isinstance(calibrate, bool), "calibrate", wanted, repr(calibrate)
+    )
+    is_default = isinstance(calibration, str) and calibration == DEFAULT
+    is_default &= models is None and model_error is None
+    return bool(calibrate) and is_default and axes in ("survey", "far-infrared")

@@ -10,6 +10,7 @@ from miricigale.evaluation import photoz_metrics
 from miricigale.filters import Filter, FilterSet
 from miricigale.filters.catalog_files import MappedRows
 from miricigale.fitting import FitFlags
+from miricigale.fitting.catalog_calibration import measured_calibration
 from miricigale.fitting.classes import classes_of, classes_section
 from miricigale.fitting.from_files import open_catalog
 from miricigale.fitting.likelihood import unused_bands
@@ -85,7 +86,7 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None):
     if columns is not None:
         classes_section(page, columns, list(classes), every["ids"], every["chi2"])
     _redshifts(page, found)
-    _calibration(page, results.path / "calibration.ecsv")
+    _calibration(page, measured_calibration(results))
     _goodness(page, found)
     _physics(page, found)
     _examples(page, results, every, step)
@@ -166,16 +167,19 @@ def _redshifts(page, found):
     page.figure("compared" if some.any() else "alone", figure, name=name)
 
 
-def _calibration(page, path):
-    """What ``--calibrate`` measured: redshifts of halves, and the bands."""
-    if not path.exists():
+def _calibration(page, calibration):
+    """What was measured on the catalog: redshifts of halves, where they were known, and the bands."""
+    if calibration is None:
         return
-    from miricigale.fitting.survey import SurveyCalibration
-
-    found = SurveyCalibration.read(path)
-    page.section("calibration", name=found.name)
-    page.table("scores", _rows(found.scores))
-    page.table("bands", _rows(found.bands))
+    by_redshifts = calibration.scores is not None
+    page.section("calibration", "text" if by_redshifts else "bands_only", name=calibration.name)
+    if by_redshifts:
+        page.table("scores", _rows(calibration.scores))
+    rows = _rows(calibration.bands)
+    for row in rows:
+        if row["n"] == 0:
+            row["n"] = "prior"
+    page.table("bands", rows)
 
 
 def _rows(table):

@@ -155,7 +155,7 @@ def fit_file(
         for text in rows.messages():
             warn(f"{rows.path.name}: {text}", CatalogWarning)
     fluxes = {c for name in fitter.bands for c in (name, error_column(name))}
-    take = _pieces(rows, options, unit, fluxes)
+    take = row_pieces(rows, options, unit, fluxes)
     kinds = set()
     for i in range(rows.n_chunks):
         with _noted(rows, i):
@@ -312,7 +312,7 @@ def _key(value):
     return str(value) if isinstance(value, int) and value >= 1 << 63 else value
 
 
-def _pieces(rows, options, unit, fluxes):
+def row_pieces(rows, options, unit, fluxes):
     """Function of the number of a piece: its table, and the arguments of `fit` that go with it."""
     redshift, prior = options["redshift"], options["redshift_prior"]
     if prior is not None and (isinstance(prior, str) or len(prior) != 2):

@@ -161,12 +161,14 @@ class SurveyCalibration:
         """
         lines = [f"{'band':20s} {'fluxes':>6s}  zero point      errors x  + flux, %  wrong, %"]
         for row in self.bands:
-            n_fluxes = str(int(row["n"])) if row["n"] > 0 else "prior"
+            measured = row["n"] > 0
+            n_fluxes = str(int(row["n"])) if measured else "prior"
             zero_point = f"{row['zero_point']:.3f}"
-            if row["zero_point_err"] > 0:
+            if measured and row["zero_point_err"] > 0:
                 zero_point += f" +- {row['zero_point_err']:.3f}"
             numbers = f"{row['error_factor']:8.2f}  {100 * row['error_part']:9.1f}"
-            wrong = f"{100 * row['wrong']:8.1f}" if np.isfinite(row["wrong"]) else ""
+            has_wrong = measured and np.isfinite(row["wrong"])
+            wrong = f"{100 * row['wrong']:8.1f}" if has_wrong else ""
             line = f"{row['band']:20s} {n_fluxes:>6s}  {zero_point:14s} {numbers}  {wrong}"
             lines.append(line.rstrip())
         return "\n".join(lines)

@@ -9,7 +9,7 @@ from astropy.table import QTable
 from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
-from miricigale.fitting import BayesFitter, TemplateError, calibrate_bands
+from miricigale.fitting import BayesFitter, SurveyCalibration, TemplateError, calibrate_bands
 from miricigale.fitting.band_errors import (
     DEFAULT_PRIOR,
     MIRI_PRIOR,
@@ -19,8 +19,11 @@ from miricigale.fitting.band_errors import (
     long_instruments,
     prior_of_band,
 )
-from miricigale.fitting.catalog_calibration import MAX_SOURCES, SourceSample
+from miricigale.fitting.catalog_calibration import MAX_SOURCES, SourceSample, calibrate_file
+from miricigale.fitting.from_files import calibrates_itself
 from miricigale.sed import SEDModel
+from miricigale.utils.exceptions import OtherResultsError
+from miricigale.utils.row_files import open_rows
 
 BANDS = ["acs.f606w", "acs.f814w", "wfc3.f125w", "wfc3.f160w", "nircam.f277w", "nircam.f444w"]
 BANDS += ["miri.f560w", "miri.f770w"]
@@ -249,3 +252,80 @@ def test_fitters_that_cannot_be_calibrated(model_fluxes, fitter):
         "with a calibration, a template error or one model error", calibrate_bands, mixed, table
     )
     refuses("'seed' must be a non-negative integer", calibrate_bands, fitter, table, seed=-1)
+
+
+def test_a_catalog_on_disk_is_measured_once_and_by_pieces(
+    model_fluxes, fitter, tmp_path, monkeypatch
+):
+    """The numbers of the table in memory, for pieces of any size; a second call reads them."""
+    table = catalog(model_fluxes, factor=2.5, part=0.1, zero_point=1.12)
+    path = tmp_path / "cat.fits"
+    table.write(path)
+    wanted = calibrate_bands(fitter, table).bands
+    names = ("n", "zero_point", "error_factor", "error_part", "wrong")
+    for size in (1000, 70):
+        output = tmp_path / f"out{size}"
+        options = {"resume": True, "executor": None}
+        calibrated = calibrate_file(fitter, open_rows(path, size), output, options=options)
+        found = SurveyCalibration.read(output / "calibration.ecsv")
+        assert found.name.startswith("bands of cat.fits (")
+        for name in names:
+            assert_allclose(found.bands[name], wanted[name], rtol=1e-9)
+        assert calibrated.zero_points["nircam.f277w"] == found.bands["zero_point"][4]
+    monkeypatch.setattr("miricigale.fitting.catalog_calibration.calibrate_sample", None)
+    again = calibrate_file(fitter, open_rows(path, 70), output, options=options)
+    assert again.calibration.name == found.name
+    # known redshifts, another catalog or other models are another fit
+    known = options | {"redshift": "z_spec"}
+    text = "holds a calibration of another fit: 'bands of cat.fits.*resume=False to replace it"
+    other = {"fitter": fitter, "rows": open_rows(path, 70), "output": output}
+    refuses(text, calibrate_file, **other, options=known, error=OtherResultsError)
+    table[:300].write(path, overwrite=True)
+    other["rows"] = open_rows(path, 70)
+    refuses(text, calibrate_file, **other, options=options, error=OtherResultsError)
+    monkeypatch.undo()
+    calibrate_file(**other, options=options | {"resume": False})
+    assert SurveyCalibration.read(output / "calibration.ecsv").name != found.name
+
+
+def test_what_is_known_of_redshifts_is_used(model_fluxes, fitter):
+    """A density that is narrow about the known redshift gives what the redshift gives."""
+    table = catalog(model_fluxes, factor=2.5, part=0.1)
+    table = table[[name for name in table.colnames if not name.startswith("acs.")]]
+    some = fitter.changed(filters=BANDS[2:])
+    nodes = np.linspace(0.4, 3.1, 271)
+    density = np.exp(-0.5 * ((nodes - table["z_spec"][:, None]) / 0.02) ** 2)
+    by_density = calibrate_bands(some, table, redshift_prior=(nodes, density)).bands
+    known = calibrate_bands(some, table, redshift="z_spec").bands
+    for name in ("error_factor", "error_part", "zero_point"):
+        assert_allclose(by_density[name], known[name], rtol=0.05)
+    # sources without a redshift are left out, and few are left
+    table["z_spec"][20:] = np.nan
+    assert np.all(calibrate_bands(some, table, redshift="z_spec").bands["n"] == 0)
+
+
+@pytest.mark.parametrize(
+    ("given", "wanted"),
+    [
+        ({}, True),
+        ({"axes": "far-infrared"}, True),
+        ({"axes": "yang2021"}, False),
+        ({"calibrate": False}, False),
+        ({"calibrate": None}, False),
+        ({"calibration": None}, False),
+        ({"calibration": "calibration.ecsv"}, False),
+        ({"model_error": 0.1}, False),
+        ({"models": len}, False),
+        ({"calibrate": "z_spec", "calibration": "calibration.ecsv"}, "z_spec"),
+    ],
+)
+def test_catalogs_that_calibrate_themselves(given, wanted):
+    """Those of real galaxies, unless errors were given."""
+    default = {"calibrate": True, "calibration": "default", "axes": "survey"}
+    default |= {"models": None, "model_error": None}
+    assert calibrates_itself(**default | given) == wanted
+
+
+def test_calibrate_is_a_column_or_a_truth_value():
+    text = "'calibrate' must be True, False, None or a column of known redshifts, got 3"
+    refuses(text, calibrates_itself, 3, "default", "survey", None, None)
