@@ -1,5 +1,7 @@
 """What is fitted where nothing else is said: models of real galaxies, their grid and their calibration."""
 
+import functools
+
 import numpy as np
 
 from miricigale.filters import FilterSet
@@ -81,7 +83,17 @@ def _are_same(axes, others):
     return all(np.array_equal(np.asarray(axes[name]), values) for name, values in others.items())
 
 
-def default_calibration(grid, model_error=None, template_error=None):
+@functools.cache
+def _survey_calibration(bands):
+    """`SurveyCalibration.survey` for bands (tuple of str) of a catalog that was not measured."""
+    # it is measured by fits, whose modules are made of this one
+    from miricigale.fitting.survey import SurveyCalibration
+
+    calibration = SurveyCalibration.survey()
+    return calibration.with_prior_errors(bands) if bands else calibration
+
+
+def default_calibration(grid, model_error=None, template_error=None, *, bands=None):
     """
     Calibration of a grid of ours where none was given.
 
@@ -93,6 +105,10 @@ def default_calibration(grid, model_error=None, template_error=None):
         Errors of the models that were given, which take its place.
     template_error : `TemplateError` or None
         The same, by rest wavelength.
+    bands : list of str or `FilterSet`, optional
+        Bands of the catalog, which get the errors of the prior, for MIRI 3.3 times those of the catalog and 15 %
+        of the flux (`~miricigale.fitting.calibrate_bands` measures them). Without them errors are those of the
+        catalog.
 
     Returns
     -------
@@ -102,13 +118,14 @@ def default_calibration(grid, model_error=None, template_error=None):
     """
     if grid != "survey" or model_error is not None or template_error is not None:
         return None
-    # it is measured by fits, whose modules are made of this one
-    from miricigale.fitting.survey import SurveyCalibration
+    if bands is None:
+        return _survey_calibration(())
+    if not isinstance(bands, FilterSet):
+        bands = FilterSet.from_names(bands)
+    return _survey_calibration(tuple(bands.names))
 
-    return SurveyCalibration.survey()
 
-
-def chosen_calibration(calibration, grid, model_error=None, template_error=None):
+def chosen_calibration(calibration, grid, model_error=None, template_error=None, *, bands=None):
     """
     The calibration that was given, or `default_calibration` where that is asked for.
 
@@ -122,7 +139,7 @@ def chosen_calibration(calibration, grid, model_error=None, template_error=None)
     if not isinstance(calibration, str) or calibration != DEFAULT:
         wanted = f"a SurveyCalibration, {DEFAULT!r} or None"
         raise argument_error("calibration", wanted, repr(calibration))
-    return default_calibration(grid, model_error, template_error)
+    return default_calibration(grid, model_error, template_error, bands=bands)
 
 
 def statement(fitter, unused=()):

@@ -9,7 +9,13 @@ from astropy.table import QTable
 from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
-from miricigale.fitting import BayesFitter, SurveyCalibration, TemplateError, calibrate_bands
+from miricigale.fitting import (
+    BayesFitter,
+    GridSettings,
+    SurveyCalibration,
+    TemplateError,
+    calibrate_bands,
+)
 from miricigale.fitting.band_errors import (
     DEFAULT_PRIOR,
     MIRI_PRIOR,
@@ -329,3 +335,19 @@ def test_catalogs_that_calibrate_themselves(given, wanted):
 def test_calibrate_is_a_column_or_a_truth_value():
     text = "'calibrate' must be True, False, None or a column of known redshifts, got 3"
     refuses(text, calibrates_itself, 3, "default", "survey", None, None)
+
+
+def test_fitters_of_real_galaxies_have_the_prior_of_bands_that_were_not_measured():
+    """Unless other errors are given; the calibration itself says nothing of bands."""
+    bands = ["acs.f814w", "F160W", "miri.f770w"]
+    fitter = BayesFitter(
+        SEDModel.survey(), bands, axes="survey", settings=GridSettings(interpolate=0)
+    )
+    assert fitter.calibration.name == "CEERS"
+    assert fitter.model_errors == {"acs.f814w": 0.02, "wfc3.f160w": 0.02, "miri.f770w": 0.15}
+    assert fitter.settings()["error_factor"]["miri.f770w"] == 3.3
+    changed = fitter.changed(n_bands_min=3)
+    assert changed.model_errors == fitter.model_errors
+    as_published = fitter.changed(calibration=SurveyCalibration.survey())
+    assert set(as_published.model_errors.values()) == {0.0}
+    assert set(fitter.changed(model_error=0.1).model_errors.values()) == {0.1}
