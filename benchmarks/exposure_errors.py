@@ -144,6 +144,7 @@ def main():
                 frame_time=0.3 * u.s,
                 n_dithers=n_dithers,
                 residual=residual,
+                excess="ideal",
             )
             limit = model.limiting_flux(name).value
             off, formal, expected = [], [], []

@@ -11,12 +11,14 @@ error of the sources with 3 to 10 sigma of a published catalog, if the data fold
 import os
 from pathlib import Path
 
+import astropy.units as u
 import numpy as np
 from astropy.io import fits
 from astropy.table import Table
 from scipy.ndimage import binary_dilation
 from scipy.signal import fftconvolve
 
+from miricigale.depth import sensitivity
 from miricigale.planning import load_plan
 from miricigale.planning.exposures import band_plans
 
@@ -78,11 +80,13 @@ def main():
         for excess in ({}, {"excess": 1.0}):
             config = load_plan(overrides={"exposures": exposures, "noise": excess})
             plans += band_plans(config).values()
+        options = {"n_groups": plans[0].exposure.n_groups, "n_dithers": dithers}
+        aperture = sensitivity(plans[0].filter, plans[0].time, method="aperture", **options)
         limits = [plan.errors().limiting_magnitude(plan.filter).value for plan in plans]
         print(
             f"{survey:10s} {band:6s} {time:6.0f} s  published {published:.2f}  plan {limits[0]:.2f}"
             f"  difference {limits[0] - published:+.2f}  excess 1: {limits[1]:.2f}"
-            f"  aperture {plans[0].limit.value:.2f}"
+            f"  aperture {aperture.to_value(u.ABmag):.2f}"
         )
 
 

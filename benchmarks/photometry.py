@@ -273,7 +273,7 @@ def bands():
         ("miri.f1800w", 1665, 6),
         ("miri.f2100w", 4662, 60),
     ):
-        model = ErrorModel.from_exposure(band, seconds * u.s, n_integrations=n)
+        model = ErrorModel.from_exposure(band, seconds * u.s, n_integrations=n, excess="ideal")
         print(f"{band:12s} {model.limiting_magnitude(band).value:.2f}")
 
 

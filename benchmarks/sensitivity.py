@@ -189,7 +189,9 @@ def ceers(name):
     exposures = ceers_exposures(FIELD, 0 * u.deg, filters=[name])
     time = sum(e.exposure_time for e in exposures)
     options = {"n_sigma": 5, "n_groups": exposures[0].n_groups, "n_dithers": len(exposures)}
-    ours = [sensitivity(name, time, residual=r, **options).to_value(u.ABmag) for r in (None, "etc")]
+    options["method"] = "aperture"
+    limits = [sensitivity(name, time, residual=r, **options) for r in (None, "etc")]
+    ours = [limit.to_value(u.ABmag) for limit in limits]
     return proposal_limit(name).value, *ours
 
 
@@ -212,7 +214,7 @@ def main():
     for name in args.filters:
         setup, row = etc_setup(name), limits(name, args.seed, args.full)
         new, old = etc_limit(name).value, etc_limit(name, "2.0").value
-        closed = sensitivity(name, setup.time, residual="etc").value
+        closed = sensitivity(name, setup.time, n_sigma=10, method="aperture", residual="etc").value
         depths = ceers(name) if name in CEERS_FILTERS else ("", "", "")
         cells = [f"{d:5.2f}" if d else f"{'':5s}" for d in depths]
         print(

@@ -119,7 +119,7 @@ def of_exposures(config, band):
     exposures = band_exposures(config, band)
     time = sum((one.exposure_time for one in exposures), 0 * u.s)
     options = {"n_groups": exposures[0].n_groups, "n_dithers": len(exposures)}
-    found = sensitivity(band, time, n_sigma=5, residual="etc", **options)
+    found = sensitivity(band, time, method="aperture", residual="etc", **options)
     return float(found.to_value(u.ABmag))
 
 

@@ -69,7 +69,7 @@ def write(amplitudes):
 
 def amplitude(name):
     """The amplitude with which the closed form gives the published limit."""
-    row = aperture_noise(f"miri.{name}", etc_setup(name).time)
+    row = aperture_noise(f"miri.{name}", etc_setup(name).time, n_sigma=10)
     limit = etc_limit(f"miri.{name}").value
     rest = (limit * row["light"] / 10) ** 2 - row["white"] ** 2 - row["shot"] * limit
     print(

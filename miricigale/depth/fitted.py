@@ -6,9 +6,13 @@ import scipy.fft
 from scipy.ndimage import gaussian_filter
 
 from miricigale.depth.noise import ExposureNoise, noise_power, pattern_amplitude
-from miricigale.psf import MIRI_PIXEL_SCALE, miri_psf, psf_image
-from miricigale.utils.options import check_positive, check_that
+from miricigale.psf import MIRI_PIXEL_SCALE, instrument_psf, miri_psf, psf_image
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_choice, check_positive, check_that
 from miricigale.utils.units import ANGLE, positive, to_array
+
+#: Factors on the noise of the sky by name: what surveys in flight lose against an ideal fit, and nothing.
+EXCESS = {"flight": 1.4, "ideal": 1.0}
 
 #: Samples of a pixel's side, and pixels of the detector on which sources are weighed.
 _SAMPLES, _SIZE = 4, 91
@@ -49,7 +53,8 @@ def fitted_noise(
     residual=None,
     mosaic=0.11 * u.arcsec,
     detector=None,
-    excess=1.0,
+    subarray="FULL",
+    excess="flight",
 ):
     """
     Noise of sources fitted on the mosaic of an exposure.
@@ -80,9 +85,11 @@ def fitted_noise(
         extraction from the exposures themselves.
     detector : `~miricigale.instrument.DetectorProperties`, optional
         `~miricigale.instrument.miri_detector` if not given.
-    excess : float, optional
-        Factor on the noise of the sky: what surveys lose against an ideal fit. 1.4 gives their published limits
-        (see the notes).
+    subarray : str, optional
+        As in `~miricigale.instrument.Exposure`.
+    excess : {"flight", "ideal"} or float, optional
+        Factor on the noise of the sky. ``"flight"`` (1.4) gives the limits that surveys publish (see the notes),
+        ``"ideal"`` (1) is the fit of a source of known shape on a clean sky.
 
     Returns
     -------
@@ -104,17 +111,19 @@ def fitted_noise(
     sum(W^2 P), the pattern with sum(W_i W_j rho_ij). Ramps are fitted optimally, as in
     `sensitivity`.
 
-    With ``excess=1.4``, the default of a plan, limits are within 0.15 mag of those that CEERS, COSMOS-Web and
-    SMILES reach (F1800W of CEERS, 0.5 mag deeper, excepted): the page on the accuracy of plans has the table
-    and the sources. Much of it is that surveys measure in apertures.
+    With ``excess="flight"`` limits are within 0.15 mag of those that CEERS, COSMOS-Web and SMILES reach (F1800W
+    of CEERS, 0.5 mag deeper, excepted): the page on the accuracy of plans has the table and the sources. Much of
+    it is that surveys measure in apertures.
 
     Examples
     --------
     >>> import astropy.units as u
     >>> from miricigale.depth import fitted_noise
-    >>> sky, photon = fitted_noise("miri.f770w", 3000 * u.s)
-    >>> print(f"error of a faint source: {sky:.4f} uJy")
-    error of a faint source: 0.0184 uJy
+    >>> for excess in ("flight", "ideal"):
+    ...     sky, photon = fitted_noise("miri.f770w", 3000 * u.s, excess=excess)
+    ...     print(f"error of a faint source, {excess}: {sky:.4f} uJy")
+    error of a faint source, flight: 0.0258 uJy
+    error of a faint source, ideal: 0.0184 uJy
     """
     seconds = positive(time, u.s, "time")
     for name, value in (("n_integrations", n_integrations), ("n_dithers", n_dithers)):
@@ -122,7 +131,7 @@ def fitted_noise(
     step = float(to_array(frame_time, u.s, "frame_time"))
     n_frames = int(seconds / n_integrations / step * (1 + 1e-9))
     check_that(n_frames >= 2, "time", f"at least two frames of {step} s in each integration", time)
-    check_positive(excess, "excess")
+    factor = excess_factor(excess)
     share = _share(filter, psf, size)
     boxes = () if mosaic is None else (1.0, _pixels(mosaic, "mosaic"))
     weight = extraction_map(share, boxes)
@@ -133,6 +142,7 @@ def fitted_noise(
         group_time=step,
         n_ramps=seconds / (n_frames * step),
         detector=detector,
+        subarray=subarray,
     )
     electrons = noise.electrons
     power = np.sum(weight**2) / _SAMPLES**2
@@ -144,7 +154,28 @@ def fitted_noise(
         pattern = np.mean([noise_power(weight[y::_SAMPLES, x::_SAMPLES], 1.0) for y, x in phases])
         sky += (amplitude * noise.sky / electrons) ** 2 * pattern / n_dithers
     photon = noise.growth * np.sum(weight**2 * share) / _SAMPLES**2 / electrons
-    return float(excess * np.sqrt(sky)), float(photon)
+    return float(factor * np.sqrt(sky)), float(photon)
+
+
+def excess_factor(excess):
+    """The factor on the noise of the sky: a number, or that of a name in ``EXCESS``."""
+    if isinstance(excess, str):
+        check_choice(excess, "excess", EXCESS)
+        return EXCESS[excess]
+    check_positive(excess, "excess")
+    return float(excess)
+
+
+def psf_of(psf, filter, *, with_pixel=True):
+    """A PSF as `~miricigale.psf.InstrumentPSF`, after checking that it is of a filter and includes the pixel."""
+    psf = instrument_psf(psf)
+    have = psf.filter
+    # other packages write F770W where we write miri.f770w
+    if isinstance(have, str) and have.lower().rpartition(".")[2] != filter.rpartition(".")[2]:
+        raise argument_error("psf", f"one of the filter {filter}", f"one of {have}")
+    good = "pixel" in psf.includes or not with_pixel
+    check_that(good, "psf", "a PSF that includes the pixel", psf.includes)
+    return psf
 
 
 def _pixels(angle, name):
@@ -157,7 +188,7 @@ def _share(filter, psf, size):
     """Light of a source in a pixel, by the place of the pixel's middle."""
     pixel = u.Quantity(MIRI_PIXEL_SCALE, ANGLE) / _SAMPLES
     n = _SIZE * _SAMPLES
-    psf = miri_psf(filter) if psf is None else psf
+    psf = miri_psf(filter) if psf is None else psf_of(psf, filter, with_pixel=False)
     share = psf_image(psf, pixel_scale=pixel, shape=n + 1 - n % 2) * _SAMPLES**2
     width = float(to_array(size, ANGLE, "size"))
     check_that(width >= 0, "size", "at least 0", size)

@@ -7,13 +7,13 @@ import numpy as np
 from astropy.table import QTable
 from photutils.aperture import CircularAnnulus, CircularAperture
 
+from miricigale.depth.fitted import fitted_noise, psf_of
 from miricigale.depth.noise import ExposureNoise, noise_power, pattern_amplitude
 from miricigale.depth.published import etc_setup, scaled_limit
-from miricigale.instrument import frame_time, imager_filters
-from miricigale.psf import MIRI_PIXEL_SCALE, instrument_psf, miri_psf, psf_image
-from miricigale.utils.exceptions import argument_error
+from miricigale.instrument import Exposure, frame_time, imager_filters
+from miricigale.psf import MIRI_PIXEL_SCALE, miri_psf, psf_image
 from miricigale.utils.meta import provenance
-from miricigale.utils.options import check_least, check_positive, check_that
+from miricigale.utils.options import check_choice, check_least, check_positive, check_that
 from miricigale.utils.units import ANGLE, SURFACE_BRIGHTNESS, TIME, to_array
 
 # positions of the source's center within the pixel, per axis, over which is averaged
@@ -53,12 +53,7 @@ def _radii(aperture, annulus, setup):
 
 def _extraction(radius, annulus, psf, correlation, filter):
     """Light in the extraction and noise powers, means over positions within the pixel."""
-    psf = instrument_psf(psf)
-    have = psf.filter
-    # other packages write F770W where we write miri.f770w
-    if isinstance(have, str) and have.lower().rpartition(".")[2] != filter.rpartition(".")[2]:
-        raise argument_error("psf", f"one of the filter {filter}", f"one of {have}")
-    check_that("pixel" in psf.includes, "psf", "a PSF that includes the pixel", psf.includes)
+    psf = psf_of(psf, filter)
     scale = MIRI_PIXEL_SCALE.value
     edges = None if annulus is None else tuple(edge / scale for edge in annulus)
     values = []
@@ -74,7 +69,7 @@ def aperture_noise(
     filter,
     time=1e4 * u.s,
     *,
-    n_sigma=10.0,
+    n_sigma=5.0,
     aperture=None,
     annulus=None,
     background=None,
@@ -173,8 +168,7 @@ def aperture_noise(
     check_least(n_dithers, "n_dithers", 1)
     check_least(groups, "n_groups", 2, whole=True)
     check_that(0 <= correlation <= 30, "correlation", "from 0 to 30 pixels", correlation)
-    wanted = f"at least one integration of {groups} groups, {groups * step:.4g} s"
-    check_that(seconds >= groups * step * (1 - 1e-9), "time", wanted, time)
+    _check_time(time, groups, step)
     noise = ExposureNoise(
         filter=filter,
         background=background,
@@ -184,8 +178,7 @@ def aperture_noise(
         detector=detector,
         subarray=subarray,
     )
-    wanted = "so few that the sky does not fill the well"
-    check_that(noise.rate * groups * step < noise.detector.full_well, "n_groups", wanted, groups)
+    _check_well(noise)
     variance, growth, sky, electrons = noise.variance(), noise.growth, noise.sky, noise.electrons
 
     psf = miri_psf(filter) if psf is None else psf
@@ -213,14 +206,56 @@ def aperture_noise(
     }
 
 
-def sensitivity(filter, time=1e4 * u.s, *, n_sigma=10.0, residual=None, **options):
+def _check_time(time, n_groups, step):
+    """Refuse a time shorter than an integration; ``step`` is the time of a group in s."""
+    wanted = f"at least one integration of {n_groups} groups, {n_groups * step:.4g} s"
+    check_that(time.to_value(TIME) >= n_groups * step * (1 - 1e-9), "time", wanted, time)
+
+
+def _check_well(noise):
+    """Refuse integrations in which the sky fills the well."""
+    filled = noise.rate * noise.n_groups * noise.group_time
+    wanted = "so few that the sky does not fill the well"
+    check_that(filled < noise.detector.full_well, "n_groups", wanted, noise.n_groups)
+
+
+def sensitivity(
+    filter,
+    time=1e4 * u.s,
+    *,
+    n_sigma=5.0,
+    method="fit",
+    excess=None,
+    residual=None,
+    n_dithers=1,
+    **options,
+):
     """
     Flux of the point source that an exposure measures with a given significance.
 
+    It is the limit of `~miricigale.photometry.ErrorModel.from_exposure` and of plans, and by default that of
+    surveys in flight.
+
     Parameters
     ----------
-    filter, time, n_sigma, residual, **options
-        As for `aperture_noise`, which says what is counted.
+    filter : str
+        One of `~miricigale.instrument.imager_filters`.
+    time : `~astropy.units.Quantity`, optional
+        Total exposure time, all dithers.
+    n_sigma : float, optional
+        Flux over its error.
+    method : {"fit", "aperture"}, optional
+        How the source is measured: fitted with the PSF on a mosaic (`fitted_noise`), or in an aperture, by default
+        that of the exposure time calculator (`aperture_noise`).
+    excess : {"flight", "ideal"} or float, optional
+        Factor on the noise of the sky of a fit, as for `fitted_noise`: ``"flight"`` by default. There is none for
+        an aperture.
+    residual, n_dithers, n_groups, readout, subarray, background, psf, detector : optional
+        As for `aperture_noise`; ramps of a fit are by default those of an `~miricigale.instrument.Exposure` of the
+        time.
+    **options
+        ``aperture``, ``annulus`` and ``correlation`` of `aperture_noise`, or ``size`` and ``mosaic`` of
+        `fitted_noise`.
 
     Returns
     -------
@@ -232,30 +267,81 @@ def sensitivity(filter, time=1e4 * u.s, *, n_sigma=10.0, residual=None, **option
     KeyError
         If a name is not known.
     ValueError
-        If a number is out of its range, the time is shorter than one integration or the sky
-        fills the well within it.
+        If a number is out of its range, an option is one of the other method, the time is shorter than one
+        integration or the sky fills the well within it.
 
     Examples
     --------
     >>> import astropy.units as u
     >>> from miricigale.depth import sensitivity
-    >>> print(f"{sensitivity('miri.f1000w'):.2f}, {sensitivity('miri.f1000w', residual='etc'):.2f}")
-    0.32 uJy, 0.47 uJy
-    >>> short = {"n_sigma": 5, "residual": "etc", "n_dithers": 3}
-    >>> print(f"{sensitivity('miri.f1000w', 1665 * u.s, **short):.2f}")
-    0.41 uJy
+    >>> for options in ({}, {"excess": "ideal"}, {"method": "aperture"}):
+    ...     print(f"{sensitivity('miri.f1000w', 1665 * u.s, **options).to(u.ABmag):.2f}", options)
+    24.96 mag(AB) {}
+    25.32 mag(AB) {'excess': 'ideal'}
+    24.91 mag(AB) {'method': 'aperture'}
     """
-    found = aperture_noise(filter, time, n_sigma=n_sigma, residual=residual, **options)
-    return found["flux"] * u.uJy
+    check_choice(method, "method", ("fit", "aperture"))
+    others = {"fit": ("aperture", "annulus", "correlation"), "aperture": ("size", "mosaic")}
+    for name in others[method]:
+        check_that(name not in options, name, f"left out with method={method!r}", options.get(name))
+    if method == "aperture":
+        check_that(excess is None, "excess", "left out with method='aperture'", excess)
+        options |= {"n_sigma": n_sigma, "residual": residual, "n_dithers": n_dithers}
+        found = aperture_noise(filter, time, **options)
+        return found["flux"] * u.uJy
+    check_positive(n_sigma, "n_sigma")
+    filter = etc_setup(filter).filter
+    check_least(n_dithers, "n_dithers", 1, whole=True)
+    if options.get("psf") is not None:
+        options["psf"] = psf_of(options["psf"], filter)
+    names = ("n_groups", "readout", "subarray")
+    form = {name: options.pop(name) for name in names if name in options}
+    options |= _ramps(filter, time, n_dithers, **form) | {"n_dithers": n_dithers}
+    step = options["frame_time"].to_value(TIME)
+    seconds = float(to_array(time, TIME, "time", ndim=0, finite=True))
+    noise = ExposureNoise(
+        filter=filter,
+        background=options.get("background"),
+        n_groups=int(seconds / options["n_integrations"] / step * (1 + 1e-9)),
+        group_time=step,
+        n_ramps=options["n_integrations"],
+        detector=options.get("detector"),
+        subarray=options["subarray"],
+    )
+    _check_well(noise)
+    excess = "flight" if excess is None else excess
+    sky, photon = fitted_noise(filter, time, residual=residual, excess=excess, **options)
+    # F^2 = n^2 (sky^2 + photon F), solved for F
+    linear = n_sigma**2 * photon
+    return float((linear + np.sqrt(linear**2 + 4 * (n_sigma * sky) ** 2)) / 2) * u.uJy
+
+
+def _ramps(filter, time, n_dithers, *, n_groups=None, readout="FASTR1", subarray="FULL"):
+    """Integrations, frame time and sub-array for `fitted_noise`; by default those of an `Exposure` of the time."""
+    if n_groups is None:
+        form = {"readout": readout, "subarray": subarray}
+        exposure = Exposure(filter, time=time / n_dithers, **form)
+        n_integrations = n_dithers * exposure.n_integrations
+        return {
+            "n_integrations": n_integrations,
+            "frame_time": exposure.frame_time,
+            "subarray": subarray,
+        }
+    check_least(n_groups, "n_groups", 2, whole=True)
+    step = frame_time(readout, subarray)
+    seconds = float(to_array(time, TIME, "time", ndim=0, finite=True))
+    _check_time(time, n_groups, step.to_value(TIME))
+    n_integrations = round(seconds / (n_groups * step.to_value(TIME)))
+    return {"n_integrations": n_integrations, "frame_time": step, "subarray": subarray}
 
 
 #: Columns of `sensitivity_table` by what `aperture_noise` calls them.
 _COLUMNS = {"noise": "white", "residual": "residual", "limit_white": "flux_white", "limit": "flux"}
 
 
-def sensitivity_table(filters=None, time=1e4 * u.s, *, residual="etc", n_sigma=10.0, **options):
+def sensitivity_table(filters=None, time=1e4 * u.s, *, residual="etc", n_sigma=5.0, **options):
     """
-    Limits of several filters, compared with those of the exposure time calculator.
+    Limits of several filters in apertures, compared with those of the exposure time calculator.
 
     Parameters
     ----------
@@ -269,8 +355,9 @@ def sensitivity_table(filters=None, time=1e4 * u.s, *, residual="etc", n_sigma=1
     table : `~astropy.table.QTable`
         A row per filter: ``radius``, ``light`` (share in the aperture, less the annulus),
         ``background``, ``noise`` and ``residual`` (standard deviations within the
-        extraction), ``limit_white`` and ``limit`` without and with the residual, ``etc_40``
-        and ``etc_20`` scaled to the time and significance.
+        extraction), ``limit_white`` and ``limit`` in the aperture without and with the residual,
+        ``etc_40`` and ``etc_20`` scaled to the time and significance. For limits of surveys in flight see
+        `sensitivity`.
 
     Examples
     --------
@@ -282,8 +369,8 @@ def sensitivity_table(filters=None, time=1e4 * u.s, *, residual="etc", n_sigma=1
        filter   limit_white limit etc_40
                     uJy      uJy   uJy
     ----------- ----------- ----- ------
-     miri.f770w        0.14  0.25   0.25
-    miri.f2100w        3.47  4.70   4.70
+     miri.f770w        0.07  0.12   0.12
+    miri.f2100w        1.73  2.35   2.35
     """
     if isinstance(filters, str):
         filters = [filters]

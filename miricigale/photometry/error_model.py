@@ -201,7 +201,7 @@ class ErrorModel(Interactive):
         return cls.from_depths(YANG2021_DEPTHS, fractional=fractional)
 
     @classmethod
-    def from_exposure(cls, filter, time=None, *, fractional=0.0, **options):
+    def from_exposure(cls, filter, time=None, *, fractional=0.0, excess="flight", **options):
         """
         Compute the noise of sources fitted on the mosaic of an exposure.
 
@@ -213,9 +213,12 @@ class ErrorModel(Interactive):
             Total exposure time.
         fractional : float, optional
             Part of the flux that is added in quadrature.
+        excess : {"flight", "ideal"} or float, optional
+            Factor on the noise of the sky: by default that of surveys in flight, 1.4; ``"ideal"`` is a fit of a
+            source of known shape on a clean sky.
         **options
-            ``background``, ``size``, ``psf``, ``n_integrations``, ``frame_time``, ``n_dithers``,
-            ``residual``, ``mosaic``, ``excess`` and ``detector``, as for `~miricigale.depth.fitted_noise`.
+            ``background``, ``size``, ``psf``, ``n_integrations``, ``frame_time``, ``n_dithers``, ``residual``,
+            ``mosaic``, ``subarray`` and ``detector``, as for `~miricigale.depth.fitted_noise`.
 
         Returns
         -------
@@ -228,8 +231,8 @@ class ErrorModel(Interactive):
 
         Notes
         -----
-        Scatter of simulated, reduced and fitted point sources over these errors, nine filters at three
-        depths: see ``benchmarks/exposure_errors.py`` and the guide. Galaxies have larger errors, by
+        Scatter of simulated, reduced and fitted point sources over ideal errors, nine filters at three
+        depths: see ``benchmarks/exposure_errors.py``. Galaxies have larger errors, by
         ``size`` and by what is not known of their templates (``flux_err_template`` of
         `ForcedPhotometryResult`).
         """
@@ -237,13 +240,15 @@ class ErrorModel(Interactive):
         from miricigale.depth import fitted_noise
 
         if isinstance(filter, Exposure):
-            known = {"n_integrations": filter.n_integrations, "frame_time": filter.frame_time}
+            known = {
+                name: getattr(filter, name) for name in ("n_integrations", "frame_time", "subarray")
+            }
             options = known | options
             time = filter.exposure_time if time is None else time
             filter = filter.filter
         check_that(time is not None, "time", "given, or an Exposure", "None")
         filter = imager_filter(filter)
-        sky, photon = fitted_noise(filter, time, **options)
+        sky, photon = fitted_noise(filter, time, excess=excess, **options)
         curve = Analytic(sky, float(fractional), photon)
         return cls({str(filter): curve}, provenance(source="exposure"))
 

@@ -25,10 +25,9 @@ def plan_table(*, quick=False):
     Returns
     -------
     table : `~astropy.table.QTable`
-        A row for each band. Three limits of point sources: ``limit_etc``, the exposure time
-        calculator's scaled by the root of the time; ``limit``, of these exposures by
-        `~miricigale.depth.sensitivity` with the residual pattern
-        (``residual="etc"``); ``limit_proposal``, of the survey's proposal.
+        A row for each band. Three limits of point sources: ``limit_etc``, the exposure time calculator's
+        scaled by the root of the time; ``limit``, of these exposures by `~miricigale.depth.sensitivity`, as
+        surveys in flight reach; ``limit_proposal``, of the survey's proposal.
 
     Examples
     --------
@@ -44,7 +43,7 @@ def plan_table(*, quick=False):
     from miricigale.planning.config import NoiseSection
 
     exposures = ceers_exposures(SkyCoord(0 * u.deg, 0 * u.deg), 0 * u.deg, quick=quick)
-    noise, rows = NoiseSection(residual="etc"), []
+    noise, rows = NoiseSection(), []
     for name in dict.fromkeys(e.filter for e in exposures):
         mine = [e for e in exposures if e.filter == name]
         row = BandPlan(mine[0], len(mine), background_level(name), noise).numbers()

@@ -3,6 +3,7 @@
 import dataclasses
 from typing import ClassVar
 
+from miricigale.depth.fitted import EXCESS
 from miricigale.instrument import CEERS_FILTERS, imager_filters, readout_patterns
 from miricigale.workflow.analysis_sections import FitBasics
 from miricigale.workflow.background import check_levels
@@ -165,14 +166,14 @@ class NoiseSection(Section):
     fractional
         Part of the flux added in quadrature (templates, blends).
     excess
-        Factor on the noise of the sky of fitted sources, 1.4 by the limits of surveys in flight.
+        Factor on the noise of the sky of fitted sources: 1.4 (flight) by the limits of surveys, 1 (ideal).
     sizes
         Whether errors grow with the half-light radii of the sources.
     """
 
     residual: float | str = option(0.0, low=0.0, high=0.1, choices=("etc",))
     fractional: float = option(0.03, low=0.0, high=1.0)
-    excess: float = option(1.4, low=0.1, high=10.0)
+    excess: float | str = option(EXCESS["flight"], low=0.1, high=10.0, choices=tuple(EXCESS))
     sizes: bool = True
 
 

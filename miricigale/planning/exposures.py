@@ -19,6 +19,7 @@ from miricigale.depth import (
 from miricigale.instrument import Exposure, frame_time, miri_detector, psf_fwhm
 from miricigale.photometry import ErrorModel
 from miricigale.reduction import imager_response
+from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow.background import band_background
 from miricigale.workflow.options import of_option
@@ -52,7 +53,7 @@ class BandPlan:
     >>> planner = Planner(load_plan(overrides={"exposures": exposures}))
     >>> plan = planner.band_plans()["miri.f770w"]
     >>> print(f"{plan.time:.0f}, 5 sigma at {plan.limit:.2f}")
-    899 s, 5 sigma at 25.45 mag(AB)
+    899 s, 5 sigma at 25.44 mag(AB)
     """
 
     exposure: Exposure
@@ -84,10 +85,11 @@ class BandPlan:
 
     @functools.cached_property
     def limit(self):
-        """5-sigma AB limit of point sources in the calculator's aperture, by `~miricigale.depth.sensitivity`."""
+        """5-sigma AB limit of point sources, by `~miricigale.depth.sensitivity`."""
         names = ("n_groups", "readout", "subarray")
         options = {name: getattr(self.exposure, name) for name in names} | self._noise
-        return sensitivity(self.filter, self.time, n_sigma=5, **options).to(u.ABmag)
+        limit = sensitivity(self.filter, self.time, n_sigma=5, excess=self.noise.excess, **options)
+        return limit.to(u.ABmag)
 
     def numbers(self):
         """
@@ -159,6 +161,7 @@ class BandPlan:
             size=size,
             n_integrations=self.n_dithers * self.exposure.n_integrations,
             frame_time=self.exposure.frame_time,
+            subarray=self.exposure.subarray,
             fractional=self.noise.fractional,
             excess=self.noise.excess,
         )
@@ -190,7 +193,7 @@ def _band_plan(filter, time, n_dithers, config):
     return BandPlan(exposure, n_dithers, background, config.noise, detector)
 
 
-@functools.lru_cache(maxsize=8)
+@cached(maxsize=8)
 def _detector(photom, date):
     """The imager's detector, with the response of a day where one is given."""
     with of_option("[exposures] photom, date:", ValueError):

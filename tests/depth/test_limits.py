@@ -11,7 +11,14 @@ from scipy.ndimage import gaussian_filter
 
 from helpers.errors import refuses
 from helpers.exposures import exposure_of
-from miricigale.depth import etc_limit, etc_setup, sensitivity, sensitivity_table
+from miricigale.depth import (
+    aperture_noise,
+    etc_limit,
+    etc_setup,
+    fitted_noise,
+    sensitivity,
+    sensitivity_table,
+)
 from miricigale.depth.limits import extraction_weights
 from miricigale.depth.noise import ExposureNoise, noise_power, ramp_variance
 from miricigale.detector import BadPixels, CosmicRays, Detector, Residual
@@ -91,12 +98,56 @@ def test_extraction_lies_where_the_source_does():
     assert_allclose(center, [0.3, -0.4], atol=0.01)
 
 
+def aperture_limit(name, time=1e4 * u.s, **options):
+    """The limit in an aperture."""
+    return sensitivity(name, time, method="aperture", **options)
+
+
+def test_the_limit_of_a_fit_solves_its_equation():
+    """Signal over noise is n where noise is that of the fit: sky and the source's own photons."""
+    time = 4 * etc_setup(NAME).n_groups * 2.77504 * u.s
+    sky, photon = fitted_noise(NAME, time, n_integrations=4, frame_time=2.77504 * u.s)
+    for n in (1.0, 5.0, 50.0):
+        flux = sensitivity(NAME, time, n_sigma=n, n_groups=etc_setup(NAME).n_groups).value
+        assert_allclose(flux / np.sqrt(sky**2 + photon * flux), n, rtol=1e-4)
+    assert sensitivity(NAME, time) == sensitivity(NAME, time, n_sigma=5, excess="flight")
+    # the ideal fit is asked for by name; read noise and sky alone are 1.4 times as large in flight
+    faint = {"n_sigma": 1e-3}
+    ratio = sensitivity(NAME, time, **faint) / sensitivity(NAME, time, excess="ideal", **faint)
+    assert_allclose(ratio, 1.4, rtol=1e-3)
+    assert_quantity_allclose(
+        aperture_limit(NAME, time), aperture_noise(NAME, time, n_sigma=5)["flux"] * u.uJy
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"method": "psf"}, "'method' must be 'fit' or 'aperture', got 'psf'"),
+        ({"aperture": 0.3 * u.arcsec}, "'aperture' must be left out with method='fit'"),
+        (
+            {"method": "aperture", "excess": "ideal"},
+            "'excess' must be left out with method='aperture'",
+        ),
+        (
+            {"method": "aperture", "mosaic": None},
+            "'mosaic' must be left out with method='aperture'",
+        ),
+        ({"excess": "survey"}, "'excess' must be 'flight' or 'ideal', got 'survey'"),
+        ({"excess": 0.0}, "'excess' must be"),
+        ({"n_sigma": 0.0}, "'n_sigma' must be"),
+    ],
+)
+def test_options_of_the_other_method_are_refused(options, message):
+    refuses(message, sensitivity, NAME, **options)
+
+
 def test_limit_of_photons_alone_is_sky_over_light(psf):
     # Poisson sky in the aperture, no read noise, no dark; small source term left out by n_sigma
     quiet = DetectorProperties(gain=4.0, read_noise=0.0, dark_current=0.0, full_well=1e9)
     radius, seconds, level = 1.2 * u.arcsec, 1e4, 20.0
     kind = {"background": level * u.MJy / u.sr, "n_groups": 1000, "detector": quiet, "psf": psf}
-    flux = sensitivity(NAME, seconds * u.s, n_sigma=1e-3, aperture=radius, **kind)
+    flux = aperture_limit(NAME, seconds * u.s, n_sigma=1e-3, aperture=radius, **kind)
     rate = level * 4.0 / photmjsr(NAME, gain=4.0)
     pixels = np.pi * (radius / MIRI_PIXEL_SCALE).to_value("") ** 2
     electrons = np.sqrt(rate / seconds * 1000 / 999 * pixels)
@@ -109,16 +160,16 @@ def test_limit_of_photons_alone_is_sky_over_light(psf):
 
 def test_limits_fall_with_the_root_of_time_and_residuals_do_not(psf):
     options = {"psf": psf, "n_sigma": 1e-3}
-    short, long = (sensitivity(NAME, t * u.s, **options) for t in (1e4, 1e6))
+    short, long = (aperture_limit(NAME, t * u.s, **options) for t in (1e4, 1e6))
     assert_quantity_allclose(long, short / 10, rtol=1e-3)
-    short, long = (sensitivity(NAME, t * u.s, residual=0.01, **options) for t in (1e6, 1e10))
-    floor = sensitivity(NAME, 1e12 * u.s, residual=0.01, **options)
+    short, long = (aperture_limit(NAME, t * u.s, residual=0.01, **options) for t in (1e6, 1e10))
+    floor = aperture_limit(NAME, 1e12 * u.s, residual=0.01, **options)
     assert_quantity_allclose(long, floor, rtol=1e-3)
     assert short > 0.95 * floor
     # twice the pattern is twice the floor, and four positions halve it
-    double = sensitivity(NAME, 1e12 * u.s, residual=0.02, **options)
+    double = aperture_limit(NAME, 1e12 * u.s, residual=0.02, **options)
     assert_quantity_allclose(double, 2 * floor, rtol=1e-4)
-    spread = sensitivity(NAME, 1e12 * u.s, residual=0.01, n_dithers=4, **options)
+    spread = aperture_limit(NAME, 1e12 * u.s, residual=0.01, n_dithers=4, **options)
     assert_quantity_allclose(spread, floor / 2, rtol=1e-4)
     kind = {"residual": 0.01, **options}
     columns = [
@@ -128,12 +179,12 @@ def test_limits_fall_with_the_root_of_time_and_residuals_do_not(psf):
 
 
 def test_faint_limits_are_linear_and_bright_ones_count_their_own_photons(psf):
-    one, three = (sensitivity(NAME, n_sigma=n, psf=psf) for n in (1, 3))
+    one, three = (aperture_limit(NAME, n_sigma=n, psf=psf) for n in (1, 3))
     assert_quantity_allclose(three, 3 * one, rtol=0.005)
     # no sky: 10^4 electrons for 100 sigma, in the light of the aperture
     quiet = DetectorProperties(gain=4.0, read_noise=0.0, dark_current=0.0, full_well=1e12)
     kind = {"background": 0 * u.MJy / u.sr, "n_groups": 1000, "detector": quiet, "psf": psf}
-    dark = sensitivity(NAME, n_sigma=100, **kind)
+    dark = aperture_limit(NAME, n_sigma=100, **kind)
     radius = etc_setup(NAME).radius
     area = MIRI_PIXEL_SCALE.to_value(u.rad) ** 2 * 1e12
     collected = dark.value * 4 / photmjsr(NAME, gain=4.0) / area * 1e4
@@ -143,8 +194,8 @@ def test_faint_limits_are_linear_and_bright_ones_count_their_own_photons(psf):
 def test_annulus_adds_its_noise_and_takes_off_wings(psf):
     radius, inner, outer = 1.0, 4.0, np.sqrt(4.0**2 + 1.0**2 / 0.5)
     kind = {"n_sigma": 1e-3, "psf": psf, "aperture": radius * u.arcsec}
-    known = sensitivity(NAME, **kind)
-    measured = sensitivity(NAME, **kind, annulus=[inner, outer] * u.arcsec)
+    known = aperture_limit(NAME, **kind)
+    measured = aperture_limit(NAME, **kind, annulus=[inner, outer] * u.arcsec)
     light = encircled_energy(psf, radius * u.arcsec)
     wings = np.diff(encircled_energy(psf, [inner, outer] * u.arcsec))[0] / 2
     # half as noisy as the aperture: its area is twice as large
@@ -157,10 +208,11 @@ def test_residual_gives_the_published_limits(name):
     digits = [0.13, 0.24, 0.46, 1.02, 0.83, 1.18, 2.42, 4.70, 15.3]
     published = dict(zip(imager_filters(), digits, strict=True))
     psf = miri_psf(name, oversampling=2, fov=9 * u.arcsec)
-    limit = sensitivity(name, etc_setup(name).time, residual="etc", psf=psf).value
+    form = {"n_sigma": 10, "psf": psf}
+    limit = aperture_limit(name, etc_setup(name).time, residual="etc", **form).value
     assert_allclose(limit, published[name], rtol=0.10)
     # photons and read noise alone reach deeper: the calculator has excess noise
-    bare = sensitivity(name, etc_setup(name).time, psf=psf).value
+    bare = aperture_limit(name, etc_setup(name).time, **form).value
     assert 0.5 < bare / published[name] < 0.9
 
 

@@ -7,6 +7,7 @@ from astropy.table import QTable
 from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
+from miricigale.depth import sensitivity
 from miricigale.instrument import background_level
 from miricigale.photometry import YANG2021_DEPTHS, ErrorModel
 from miricigale.psf import gaussian_psf
@@ -143,7 +144,8 @@ def test_a_residual_pattern_falls_with_dithers_and_not_with_time():
     zero, name = 0 * u.uJy, "miri.f1500w"
 
     def variance(time, **options):
-        model = ErrorModel.from_exposure(name, time * u.s, n_integrations=10, **options)
+        options = {"n_integrations": 10, "excess": "ideal", **options}
+        model = ErrorModel.from_exposure(name, time * u.s, **options)
         return model.sigma(zero, name).value ** 2
 
     added = variance(1000, residual=0.01) - variance(1000)
@@ -162,6 +164,19 @@ def test_a_residual_pattern_falls_with_dithers_and_not_with_time():
     expected = level**2 * 4 * np.pi * width**2 * 4 * np.pi * 0.1109**2
     assert wide == pytest.approx(expected, rel=0.08)
     assert variance(1000, residual="etc") > variance(1000)
+
+
+def test_errors_of_an_exposure_are_those_of_surveys_in_flight():
+    """COSMOS-Web: 25.51 in F770W (Harish et al. 2025), four dithers of 264 s; the ideal fit by its name."""
+    form = {"n_integrations": 4, "n_dithers": 4}
+    default, ideal = (
+        ErrorModel.from_exposure(BAND, 1054 * u.s, **form, **more).limiting_magnitude(BAND).value
+        for more in ({}, {"excess": "ideal"})
+    )
+    assert default == pytest.approx(25.51, abs=0.05)
+    assert ideal - default == pytest.approx(2.5 * np.log10(1.4), abs=0.02)
+    limit = sensitivity(BAND, 1054 * u.s, n_groups=95, n_dithers=4).to_value(u.ABmag)
+    assert limit == pytest.approx(default, abs=0.005)
 
 
 def test_what_an_exposure_cannot_be_is_named():

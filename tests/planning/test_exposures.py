@@ -27,8 +27,17 @@ def plan_of(time=2000.0, **sections):
 def test_the_depth_quoted_is_that_of_the_sensitivity():
     plan = plan_of()
     assert plan.background == background_level(BAND)
-    own = sensitivity(BAND, plan.time, n_sigma=5, n_groups=plan.exposure.n_groups, n_dithers=4)
+    form = {"n_groups": plan.exposure.n_groups, "n_dithers": 4}
+    own = sensitivity(BAND, plan.time, **form)
     assert plan.limit.value == pytest.approx(own.to_value(u.ABmag), abs=1e-9)
+    # which is the limit of the errors that the plan draws, but for the fraction of the flux
+    errors = plan_of(noise={"fractional": 0.0}).errors()
+    assert plan.limit.value == pytest.approx(errors.limiting_magnitude(BAND).value, abs=1e-6)
+    # noise is by the name or by the number
+    for excess, name in ((1.0, "ideal"), (1.4, "flight"), ("ideal", "ideal")):
+        named = plan_of(noise={"excess": excess}).limit
+        other = sensitivity(BAND, plan.time, excess=name, **form)
+        assert named.value == pytest.approx(other.to_value(u.ABmag), abs=1e-9)
     # and the calculator's is the published 10 sigma in 10 ks, as the root of the time
     scaled = etc_limit(BAND) / 2 * np.sqrt(1e4 * u.s / plan.time)
     calculator = plan.numbers()["limit_etc"].value

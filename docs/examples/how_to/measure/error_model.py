@@ -8,7 +8,7 @@ exposure, from survey depths, or from fluxes of which you know the truth.
 
 # %%
 # From an exposure: photons of sky and source, dark current and read noise, for a point source on a drizzled
-# mosaic.
+# mosaic, as noisy as surveys in flight; ``excess="ideal"`` is an ideal fit.
 
 import astropy.units as u
 import matplotlib.pyplot as plt

@@ -23,7 +23,7 @@ for name in ("F770W", "F1000W", "F1500W", "F2100W"):
     row = {"filter": name}
     for level in ("low", "medium", "high"):
         background = sky_background(name, level)
-        limit = sensitivity(name, 1 * u.h, n_sigma=5, background=background)
+        limit = sensitivity(name, 1 * u.h, background=background)
         row[f"{level} sky"] = background.round(1)
         row[f"{level} limit"] = limit.to(u.ABmag).round(2)
     rows.append(row)

@@ -39,7 +39,7 @@ agn = AGNPopulation().draw(galaxies, seed=1)
 fraction = agn_fraction(agn["l_6um"], half["l_6um"] * scale)
 galaxies["frac_agn"] = np.nan_to_num(fraction)
 fluxes = model.fluxes(galaxies, bands)
-limits = {name: sensitivity(name, 1 * u.h, n_sigma=5) for name in bands[1:]}
+limits = {name: sensitivity(name, 1 * u.h) for name in bands[1:]}
 detected = np.all([fluxes[name] * scale > limits[name] for name in limits], axis=0)
 
 # %%
