@@ -12,7 +12,8 @@ pulls: up to 100 sources of S/N above 5 a band: scatter of pulls of `leave_out`,
 agn: at known redshift, with flat fractions and `agn_fraction_prior`: median fraction, sources with more than 0.4,
 those of them with a ratio of evidences of AGN above 5 and 150 (posterior odds of a fraction above 0 over the
 prior's), and all with a ratio above 5.
-dots: little red dots of COSMOS-Web, and sources of CEERS, as galaxies and as little red dots.
+dots: little red dots of COSMOS-Web, and sources of CEERS, as galaxies and as little red dots: classes, and redshifts
+of the classes against published ones.
 """
 
 import argparse
@@ -28,6 +29,7 @@ from far_infrared import read as read_stardust
 
 from miricigale import BayesFitter, SEDModel
 from miricigale.cigale import read_cigale_results, read_pcigale_ini
+from miricigale.evaluation import photoz_metrics
 from miricigale.filters import read_catalog_photometry
 from miricigale.fitting import (
     FitFlags,
@@ -37,10 +39,10 @@ from miricigale.fitting import (
     agn_fraction_prior,
     compare_classes,
     leave_out,
+    red_dot_prior,
 )
-from miricigale.fitting.classes import RED_DOT_REDSHIFTS
 from miricigale.fitting.pulls import left_out_pulls
-from miricigale.sed import ModelGrid, red_dots, template_grid
+from miricigale.sed import ModelGrid, red_dot_axes, red_dots, template_grid
 
 ERRORS = {"model_error": 0.0, "template_error": SurveyCalibration.survey().template_error}
 DOT_BANDS = {
@@ -180,8 +182,10 @@ def dots(grid, data, folder):
     settings = GridSettings(mass_function=MassFunction())
     known = {"priors": {"frac_agn": agn_fraction_prior(grid.frac_agn)}, "settings": settings}
     for label, some, bands in (("red dots", table, names), ("CEERS", data[0], data[1])):
-        shapes = template_grid(red_dots(), bands, redshift=RED_DOT_REDSHIFTS)
-        dot = BayesFitter(shapes, bands, **ERRORS).fit(some)
+        z = red_dot_axes()["redshift"]
+        shapes, alone = template_grid(red_dots(), bands, redshift=z), GridSettings(interpolate=0)
+        prior = {"redshift": red_dot_prior(z)}
+        dot = BayesFitter(shapes, bands, priors=prior, settings=alone, **ERRORS).fit(some)
         for kind, options in (("flat", {}), ("priors", known)):
             found = BayesFitter(grid, bands, **ERRORS, **options).fit(some)
             classes = compare_classes({"galaxy": found, "red_dot": dot})
@@ -203,8 +207,16 @@ def dots(grid, data, folder):
                     print(f"  log M < {edge}: {rows.sum()}, outliers {off[rows].mean():.2f}")
             else:
                 theirs = np.array(raw["z_qso_med"], float)
-                off = np.abs(dot.median("redshift").value - theirs) / (1 + theirs)
-                print(f"  of red dots |dz| / (1 + z) of the published: median {np.median(off):.2f}")
+                mine = classes["redshift_p50"]
+                low, high = classes["redshift_p16"], classes["redshift_p84"]
+                scores = photoz_metrics(theirs, mine)
+                inside = np.mean((low <= theirs) & (theirs <= high))
+                edge = np.sum((classes["flags"] & FitFlags.REDSHIFT_EDGE) > 0)
+                print(
+                    f"  redshift of the class against the published: bias {scores.bias:+.3f}, sigma_MAD "
+                    f"{scores.sigma_mad:.3f}, beyond 0.15 {scores.outlier_fraction:.2f}, inside 16-84 % "
+                    f"{inside:.2f}, at the edge of the axis {edge}"
+                )
                 print("  log M <6, <6.5, <7:", *[np.sum(mass < edge) for edge in (6, 6.5, 7)])
 
 

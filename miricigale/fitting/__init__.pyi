@@ -16,6 +16,7 @@ from .io import open_results as open_results
 from .likelihood import FitFlags as FitFlags
 from .populations import MassFunction as MassFunction
 from .populations import agn_fraction_prior as agn_fraction_prior
+from .populations import red_dot_prior as red_dot_prior
 from .priors import magnitude_prior as magnitude_prior
 from .results import FitResults as FitResults
 from .samples import Samples as Samples

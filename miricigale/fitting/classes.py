@@ -2,7 +2,6 @@
 
 import warnings
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ from miricigale.fitting.class_names import chosen_classes
 from miricigale.fitting.classification import class_columns
 from miricigale.fitting.from_files import fit_catalog
 from miricigale.fitting.page_numbers import thinned
+from miricigale.fitting.populations import red_dot_prior
 from miricigale.fitting.pulls import without_warnings
 from miricigale.pages import number
 from miricigale.plotting.axes import WIDTH, new_figure
@@ -22,8 +22,8 @@ from miricigale.utils.tables import described_table
 _LISTED = 10
 #: ln ratio beyond which a class is called sure (odds of 150 to 1).
 _SURE = 5.0
-#: Redshifts of little red dots.
-RED_DOT_REDSHIFTS = np.expm1(np.arange(np.log(3.0), np.log(10.0), 0.03))
+#: Columns of a table that are the same of all classes.
+_OF_ALL = ("id", "n_bands", "n_limits")
 #: ln ratios that a drawing spans.
 _SPAN = 60.0
 
@@ -45,7 +45,8 @@ def fit_classes(path, output, *, classes=(), quasars=False, red_dots=False, star
         Whether type-1 AGN are fitted: `~miricigale.sed.SEDModel.survey` with `~miricigale.sed.quasar_axes`, into
         the folder ``quasar`` of ``output``.
     red_dots : bool, optional
-        Whether `~miricigale.sed.red_dots` at redshifts of 2 to 9 are fitted, into the folder ``red_dot``.
+        Whether `~miricigale.sed.red_dots` are fitted, at the redshifts of `~miricigale.sed.red_dot_axes`, 2 to 10,
+        with the prior `~miricigale.fitting.red_dot_prior` and on the nodes alone, into the folder ``red_dot``.
     stars : path-like, optional
         Spectra of stars (`~miricigale.sed.read_spectra`), into the folder ``star``; those that end before the
         bands do are continued as `~miricigale.sed.template_grid` does with a warning.
@@ -74,26 +75,37 @@ def fit_classes(path, output, *, classes=(), quasars=False, red_dots=False, star
         if measured is not None:
             options["calibration"] = measured
         # after the fit, which refuses what it cannot read before it loads the models
-        from miricigale.sed import SEDModel, quasar_axes, template_grid
-        from miricigale.sed import red_dots as shapes
+        from miricigale.sed import SEDModel, quasar_axes, red_dot_axes, template_grid
 
         options.pop("pairs", None)
 
-        def fit(name, models):
-            found[name] = fit_catalog(path, Path(output) / name, models=models, **options)
+        def fit(name, models, **more):
+            own = options | more
+            found[name] = fit_catalog(path, Path(output) / name, models=models, **own)
 
         # what is of another class has large residuals
         with without_warnings():
             if "quasars" in names:
                 fit("quasar", lambda _: (SEDModel.survey(), quasar_axes()))
             if "red_dots" in names:
-                dots = partial(template_grid, shapes(), redshift=RED_DOT_REDSHIFTS)
-                fit("red_dot", lambda bands: (dots(bands), None))
+                # lines that cross the bands are exact at the nodes, and these lie close
+                own = {"priors": {"redshift": red_dot_prior(red_dot_axes()["redshift"])}}
+                fit("red_dot", _red_dots, interpolate=0, agn_error=0.0, **own)
             options.pop("redshift", None)
             if spectra is not None:
-                templates = partial(template_grid, spectra, beyond="rayleigh-jeans")
-                fit("star", lambda bands: (templates(bands), None))
+
+                def stars_in(bands):
+                    return template_grid(spectra, bands, beyond="rayleigh-jeans"), None
+
+                fit("star", stars_in)
     return found
+
+
+def _red_dots(bands):
+    """Grid of little red dots in some bands, and no axes."""
+    from miricigale.sed import red_dot_axes, red_dots, template_grid
+
+    return template_grid(red_dots(), bands, redshift=red_dot_axes()["redshift"]), None
 
 
 @contextmanager
@@ -124,6 +136,7 @@ def write_table(found, path, *, overwrite=False):
     path, overwrite
         As for `~miricigale.fitting.FitResultsFiles.write_table`.
     """
+    # redshifts and how well a model fits are those of the class; all else of the table is of the fit as a galaxy
     first = found["galaxy"]
     if len(found) == 1:
         first.write_table(path, overwrite=overwrite)
@@ -142,8 +155,14 @@ def _parts(found, step=1):
 def _tables(found):
     for some in _parts(found):
         table = some["galaxy"].to_table()
-        table.update(described_table(class_columns(some)))
-        yield table
+        columns = class_columns(some)
+        for name in table.colnames:
+            if name not in columns and name not in _OF_ALL:
+                table[name].info.description += ", of the fit as a galaxy"
+        table.update(described_table(columns))
+        # the class stands with the id, and so with the redshift, which is its
+        first = ["id", "class", "class_probability"]
+        yield table[first + [name for name in table.colnames if name not in first]]
 
 
 def classes_of(found, step=1):
@@ -152,7 +171,7 @@ def classes_of(found, step=1):
     return {name: np.concatenate([part[name][0] for part in parts]) for name in parts[0]}
 
 
-def classes_section(page, columns, names, ids, chi2):
+def classes_section(page, columns, names, ids):
     """
     The part of a page on classes.
 
@@ -164,19 +183,22 @@ def classes_section(page, columns, names, ids, chi2):
         As `classes_of` returned them.
     names : list of str
         The classes, galaxies first.
-    ids, chi2 : `~numpy.ndarray`, shape (n,)
-        Ids and reduced chi2 of the galaxies.
+    ids : `~numpy.ndarray`, shape (n,)
+        Ids of the objects.
     """
     label, others = columns["class"], names[1:]
+    chi2, free = columns["reduced_chi2_galaxy"], "redshift_p50" in columns
     page.section("classes", others=" or ".join(others))
     rows = []
     for name in names:
-        mine, own = label == name, chi2 if name == "galaxy" else columns[f"reduced_chi2_{name}"]
+        mine, own = label == name, columns[f"reduced_chi2_{name}"]
         sure = columns[f"probability_{name}"][mine] > 1.0 / (1.0 + np.exp(-_SURE))
         middle = number(np.median(own[mine]) if mine.any() else np.nan, ".2f", "no object")
-        rows.append({"class": name, "n": mine.sum(), "sure": sure.sum(), "chi2": middle})
+        z = np.median(columns["redshift_p50"][mine]) if free and mine.any() else np.nan
+        z = number(z, ".2f", "no object" if free else "given")
+        rows.append({"class": name, "n": mine.sum(), "sure": sure.sum(), "chi2": middle, "z": z})
     lost = {"class": "not fitted with all classes", "n": np.sum(label == "")}
-    page.table("counts", [*rows, lost | {"sure": "", "chi2": ""}])
+    page.table("counts", [*rows, lost | {"sure": "", "chi2": "", "z": ""}])
     figure, axes = new_figure(1, len(others), size=(WIDTH / 2, 3.2))
     for ax, name in zip(axes[0], others, strict=True):
         ratio = columns[f"log_ratio_{name}"]
@@ -191,6 +213,8 @@ def classes_section(page, columns, names, ids, chi2):
         mine = np.flatnonzero(label == name)
         for i in mine[np.argsort(-ratio[mine], kind="stable")][:_LISTED]:
             row = {"id": str(ids[i]), "class": name, "ratio": ratio[i]}
+            row["z"] = columns["redshift_p50"][i] if free else np.nan
+            row["z_galaxy"] = columns["redshift_p50_galaxy"][i] if free else np.nan
             surest.append(row | {"own": own[i], "galaxy": chi2[i]})
     if surest:
         page.table("surest", surest, n=_LISTED)

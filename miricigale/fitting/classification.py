@@ -2,10 +2,24 @@
 
 import numpy as np
 
+from miricigale.fitting.likelihood import FitFlags
+from miricigale.fitting.result_tables import LEVELS, ODDS
+from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing import floats
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import described_table
+
+#: Names of the percentiles of a class, and what the columns of a redshift are.
+_PERCENTILES = ("p16", "p50", "p84")
+_MEANINGS = declared("miricigale.fitting", "columns.toml")["parameter"]
+#: Columns of a fit that go with its redshift, with their descriptions.
+_OF_FIT = {
+    "flags": f"of the fit of the class; {FitFlags.describe()}",
+    "chi2_best": "chi2 of the best model of the class",
+    "reduced_chi2": "chi2_best over the number of bands less one",
+    "log_evidence": "ln of the evidence of the class, fluxes in uJy",
+}
 
 
 def compare_classes(results, *, prior=None):
@@ -18,6 +32,8 @@ def compare_classes(results, *, prior=None):
 
     .. math:: P_c = \frac{\pi_c Z_c}{\sum_k \pi_k Z_k}
 
+    An object has one redshift, that of the fit of its class; those of the other classes stand beside it.
+
     Parameters
     ----------
     results : dict of str to `FitResults`
@@ -29,9 +45,14 @@ def compare_classes(results, *, prior=None):
     Returns
     -------
     table : `~astropy.table.QTable`
-        ``id``; ``class``, the one of the highest probability; ``probability_<class>``; and of each class but the
-        first ``log_ratio_<class>``, ln of its evidence over that of the first, and ``reduced_chi2_<class>`` of its
-        best models. An object that was not fitted with all classes has the class ``""`` and NaN.
+        ``id``; ``class``, the one of the highest probability, and ``class_probability``; where redshifts are free
+        those of the class: ``redshift_mean``, ``_std``, ``_p16``, ``_p50``, ``_p84``, ``_best`` and ``_odds`` (see
+        `FitResults.to_table`; of stars, at redshift 0, there are no odds); ``flags``, ``chi2_best``,
+        ``reduced_chi2`` and ``log_evidence`` of its fit, with the flag ``OTHER_CLASS`` where it is not the first
+        class. Then of each class ``probability_<class>``, ``reduced_chi2_<class>``, ``flags_<class>`` and, where
+        its redshifts are free, ``redshift_p16_<class>``, ``_p50_<class>`` and ``_p84_<class>``. And of each but
+        the first ``log_ratio_<class>``, ln of its evidence over that of the first. An object that was not fitted
+        with all classes has the class ``""``, NaN as probabilities, and the redshift of the first class.
 
     Raises
     ------
@@ -42,6 +63,7 @@ def compare_classes(results, *, prior=None):
     Examples
     --------
     >>> import astropy.units as u
+    >>> import numpy as np
     >>> from astropy.modeling.models import BlackBody
     >>> from miricigale.fitting import compare_classes
     >>> from miricigale.sed import SED, template_grid
@@ -59,6 +81,8 @@ def compare_classes(results, *, prior=None):
     >>> table = compare_classes({"galaxy": fitter.fit(photometry), "star": star})
     >>> table["class"].tolist()
     ['galaxy', 'galaxy']
+    >>> bool(np.all(table["redshift_p50"] == table["redshift_p50_galaxy"]))
+    True
     """
     columns = class_columns(results, prior=prior)
     first = next(iter(results.values()))
@@ -79,17 +103,85 @@ def class_columns(results, *, prior=None):
         log_posterior = np.where(known, evidence, np.nan) + np.log(weight)
         shifted = np.exp(log_posterior - log_posterior.max(axis=0))
         probability = shifted / shifted.sum(axis=0)
-    label = np.where(known, np.array(names)[np.argmax(shifted, axis=0)], "")
-    out = {"class": (label, "class of the highest probability; none where a fit is missing")}
+    place = np.where(known, np.argmax(shifted, axis=0), -1)
+    label = np.where(known, np.array(names)[place], "")
+    chosen = np.where(known, probability.max(axis=0), np.nan)
+    out = {
+        "class": (label, "class of the highest probability; none where a fit is missing"),
+        "class_probability": (chosen, "probability of the class"),
+    }
+    fits = list(results.values())
+    # the first class stands for what has none
+    place = np.maximum(place, 0)
+    out |= _redshifts_of_class(fits, place)
+    for name, text in _OF_FIT.items():
+        attribute = {"chi2_best": "chi2"}.get(name, name)
+        values = np.array([np.asarray(getattr(fit, attribute)) for fit in fits])
+        out[name] = (_of_class(values, place), text)
+    other = np.where(place > 0, int(FitFlags.OTHER_CLASS), 0)
+    out["flags"] = (out["flags"][0] | other, out["flags"][1])
     for name, values in zip(names, probability, strict=True):
         out[f"probability_{name}"] = (values, f"probability of the class {name}")
     for name, values in zip(names[1:], evidence[1:], strict=True):
         text = f"ln of the evidence of {name} over that of {names[0]}"
         out[f"log_ratio_{name}"] = (values - evidence[0], text)
-    for name in names[1:]:
+    for name, fit in results.items():
         text = f"reduced chi2 of the best model of {name}"
-        out[f"reduced_chi2_{name}"] = (np.asarray(results[name].reduced_chi2), text)
+        out[f"reduced_chi2_{name}"] = (np.asarray(fit.reduced_chi2), text)
+        out[f"flags_{name}"] = (
+            np.asarray(fit.flags),
+            f"of the fit of {name}: {FitFlags.describe()}",
+        )
+        if _has_free_redshift(fit):
+            percentiles = fit.percentile("redshift", LEVELS).value.T
+            for suffix, values in zip(_PERCENTILES, percentiles, strict=True):
+                text = f"{_MEANINGS[suffix]} of the redshift of {name}"
+                out[f"redshift_{suffix}_{name}"] = (values, text)
     return out
+
+
+def _has_free_redshift(fit):
+    """Whether a fit has found redshifts."""
+    return "redshift" in fit.axes and not fit.redshift_fixed
+
+
+def _of_class(values, place):
+    """Values of the class of each object: of shape (n,), from (n_classes, n)."""
+    return np.take_along_axis(values, place[None], axis=0)[0]
+
+
+def _redshifts_of_class(fits, place):
+    """
+    Redshift columns of the class of each object, by name: values and descriptions.
+
+    There are none where the redshifts of the first class were given. Those of a class with a single redshift, such
+    as stars, are that one, without odds.
+    """
+    if not _has_free_redshift(fits[0]):
+        return {}
+    of_fits = [_redshift_columns(fit) for fit in fits]
+    out = {}
+    for name, meaning in (*_MEANINGS.items(), ("odds", ODDS)):
+        values = np.array([columns[name] for columns in of_fits])
+        text = (
+            f"{meaning}, of the class"
+            if name == "odds"
+            else f"{meaning} of the redshift of the class"
+        )
+        out[f"redshift_{name}"] = (_of_class(values, place), text)
+    return out
+
+
+def _redshift_columns(fit):
+    """Redshift columns of one fit by what stands behind ``redshift_``."""
+    best = np.asarray(fit.best["redshift"].value, dtype=float)
+    if not _has_free_redshift(fit):
+        spread = np.where(np.isfinite(best), 0.0, np.nan)
+        columns = dict.fromkeys(_MEANINGS, best)
+        return columns | {"std": spread, "odds": np.full(best.shape, np.nan)}
+    columns = {"mean": fit.mean("redshift").value, "std": fit.std("redshift").value, "best": best}
+    columns |= zip(_PERCENTILES, fit.percentile("redshift", LEVELS).value.T, strict=True)
+    return columns | {"odds": fit.redshift_odds}
 
 
 def _check_same(whose, first, name, other):

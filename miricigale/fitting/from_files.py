@@ -42,6 +42,7 @@ def fit_catalog(
     *,
     axes="survey",
     models=None,
+    priors=None,
     model_error=None,
     outliers=None,
     calibration="default",
@@ -75,6 +76,9 @@ def fit_catalog(
     models : callable, optional
         Function of the bands (a list of str) that returns the `~miricigale.sed.SEDModel` and its axes in place of
         those of ``axes``, or a `~miricigale.sed.ModelGrid` and None; ``axes`` says whose errors are taken then.
+    priors : dict, optional
+        Priors of parameters and redshift, as for `miricigale.fitting.BayesFitter`, in place of those of the
+        calibration.
     model_error : float, optional
         Relative model error, in place of the calibration by default; 0.1 where there is no calibration.
     outliers : float or dict of str to float, optional
@@ -150,6 +154,7 @@ def fit_catalog(
     fitter = BayesFitter(
         model,
         bands,
+        priors=priors,
         axes=nodes,
         model_error=model_error,
         outliers=outliers,

@@ -88,6 +88,9 @@ class FitFlags(Flags):
     #: One band is off, that of the column ``band_off``: its residual to the best model is above 4 errors and makes
     #: 40 % of chi2 or more. Look at that flux before you trust the fit, or fit without it.
     BAND_OFF = 524288
+    #: In a table of classes: the class is not the first one, that of galaxies. The redshift is that of the class;
+    #: masses and all else that is of galaxies are of the fit as one, at its redshift, ``redshift_p50_galaxy``.
+    OTHER_CLASS = 1048576
     #: Bits with which a row has no result.
     UNFITTED = 1 | 2 | 8 | 16 | 32 | 512 | 4096 | 8192
 

@@ -70,7 +70,11 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None):
     found = every = fit_numbers(results, step)
     found.meta["known"], found["z_known"] = known_redshifts(rows, z_spec, step)
     columns = classes_of(classes, step) if len(classes) > 1 else None
+    with_redshift = found
     if columns is not None:
+        # of the fits of the classes, as in the table
+        found["flags"] = columns["flags"]
+        with_redshift = _of_classes(found, columns)
         # fits of stars and quasars with galaxies say nothing about the fit
         found = found[np.isin(columns["class"], ["galaxy", ""])]
     subtitle = f"{len(results)} objects, {len(found.meta['filters'])} bands"
@@ -84,8 +88,8 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None):
     page.section("summary", "classes" if others else "text", **facts)
     _summary(page, found)
     if columns is not None:
-        classes_section(page, columns, list(classes), every["ids"], every["chi2"])
-    _redshifts(page, found)
+        classes_section(page, columns, list(classes), every["ids"])
+    _redshifts(page, with_redshift, "classes" if others else "text")
     _calibration(page, measured_calibration(results))
     _goodness(page, found)
     _physics(page, found)
@@ -93,6 +97,15 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None):
     _left_out(page, rows, every)
     _settings(page, results)
     return page.report
+
+
+def _of_classes(found, columns):
+    """Numbers of all objects but stars with the redshifts of their classes."""
+    out = found.copy()
+    if not found.meta["fixed"]:
+        names = [f"redshift_{level}" for level in ("p16", "p50", "p84")]
+        out["z"] = np.column_stack([columns[name] for name in names])
+    return out[columns["class"] != "star"]
 
 
 def _bands(found):
@@ -147,8 +160,8 @@ def _draw_counts(ax, xlabel, bins, samples):
     ax.set(xlabel=xlabel, ylabel="objects")
 
 
-def _redshifts(page, found):
-    page.section("redshifts", "given" if found.meta["fixed"] else "text")
+def _redshifts(page, found, text):
+    page.section("redshifts", "given" if found.meta["fixed"] else text)
     if found.meta["fixed"]:
         return
     samples = {"fitted": found["z"][found["good"], 1]}

@@ -12,7 +12,8 @@ from miricigale.utils.units import FNU
 LEVELS = (0.16, 0.5, 0.84)
 #: Error of a redshift over 1 + z beyond which it is called an outlier.
 OUTLIER = 0.15
-_ODDS = f"probability that redshift_p50 is within {OUTLIER} (1 + z) of the redshift"
+#: What the column of the odds of redshifts is.
+ODDS = f"probability that redshift_p50 is within {OUTLIER} (1 + z) of the redshift"
 _TEXTS = declared("miricigale.fitting", "columns.toml")
 #: Fields of results whose columns have another name.
 _FIELDS = {"id": "ids", "chi2_best": "chi2"}
@@ -48,7 +49,7 @@ def to_table(results):
             text = f"posterior mean of log10 of {meaning}, in {unit.to_string()}"
             columns[f"{name}_logmean"] = (log_mean, text)
         if name == "redshift" and not some.redshift_fixed:
-            columns["redshift_odds"] = (some.redshift_odds, _ODDS)
+            columns["redshift_odds"] = (some.redshift_odds, ODDS)
     if some.outlier is not None:
         for name in some.fitted_filters:
             value = some.outlier[:, some.filters.index(name)]

@@ -13,13 +13,15 @@ from .model import SEDModel as SEDModel
 from .parameter import Parameter as Parameter
 from .presets import COMPONENTS as COMPONENTS
 from .presets import quasar_axes as quasar_axes
+from .presets import red_dot_axes as red_dot_axes
 from .presets import survey_axes as survey_axes
 from .presets import yang2021_axes as yang2021_axes
+from .red_dots import red_dot as red_dot
+from .red_dots import red_dots as red_dots
 from .spectrum import COSMOLOGY as COSMOLOGY
 from .spectrum import SED as SED
 from .tables import ModelFlags as ModelFlags
 from .templates import read_spectra as read_spectra
-from .templates import red_dots as red_dots
 from .templates import template_grid as template_grid
 from .xray import XRay as XRay
 from .xray import band_luminosity as band_luminosity

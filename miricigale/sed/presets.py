@@ -156,7 +156,7 @@ def survey_axes(kind="survey"):
 
     Histories of three time scales and seven ages from 50 Myr, without a burst or with one of 30 Myr ago that
     made 3 or 30 % of the stars; 0.2 solar and solar metallicity of stars and gas; two slopes of attenuation;
-    color excesses from 0; dust poor and rich in PAHs. Redshifts to 7 in steps of 0.02 in ln(1 + z), half of the
+    color excesses from 0; dust poor and rich in PAHs. Redshifts to 10 in steps of 0.02 in ln(1 + z), half of the
     scatter of photometric redshifts. 4032 galaxies, six AGN, seven fractions.
 
     All have one least intensity of starlight, U_min = 1, and so one temperature of the cold dust: for data with
@@ -180,7 +180,7 @@ def survey_axes(kind="survey"):
     >>> from miricigale.sed import survey_axes
     >>> axes = survey_axes()
     >>> axes["tau"], axes["f_burst"], axes["redshift"].size
-    (array([0.1, 0.5, 3. ]), array([0.  , 0.03, 0.3 ]), 104)
+    (array([0.1, 0.5, 3. ]), array([0.  , 0.03, 0.3 ]), 121)
     >>> survey_axes("far-infrared")["u_min"]
     array([ 0.5,  2. ,  8. , 25. ])
     """
@@ -239,6 +239,29 @@ def grid_axes(name, *, agn=True):
     """Axes of a grid in `GRIDS`: new arrays by parameter; without those of AGN if ``agn`` is false."""
     axes = _values(GRIDS[name][1])
     return axes if agn else {n: values for n, values in axes.items() if n not in _OF_AGN}
+
+
+def red_dot_axes():
+    """
+    Axes of little red dots: parameters of `red_dot` over the range of published spectra, and redshifts of 2 to 10.
+
+    Temperatures and widths of H alpha have the values of 5 to 95 and 16 to 84 % of the spectra of de Graaff et al.
+    2025 (arXiv:2511.21820); the galaxy has 2.5 to 80 % of the light of the envelope, in steps of a factor of two.
+
+    Returns
+    -------
+    axes : dict of str to `~numpy.ndarray`
+        In the units of the parameters (K, Angstrom); to be changed at will. Redshifts have the steps of
+        `survey_axes`.
+
+    Examples
+    --------
+    >>> from miricigale.sed import red_dot_axes
+    >>> axes = red_dot_axes()
+    >>> axes["temperature"], axes["redshift"][[0, -1]].round(2)
+    (array([3500., 4300., 5200., 6300.]), array([ 2.  , 10.01]))
+    """
+    return _values("red_dot_axes")
 
 
 def _values(name):

@@ -2,7 +2,6 @@
 
 import re
 import warnings
-from itertools import product
 from pathlib import Path
 
 import astropy.units as u
@@ -30,9 +29,6 @@ _UNITS |= {"flam": _FLAM, "fnu": _FLAM * u.AA / u.Hz}
 _FAR = 100.0  # um
 #: Part of the wavelengths at the end of a spectrum whose mean its continuation starts from.
 _END = 0.95
-#: Balmer's limit in um; slopes of little red dots below and above it, where these end, and those of F_nu beyond.
-_BALMER = 0.3645
-_RED_DOTS = (-2.5, -2.0, -1.5), (0, 0.5, 1, 1.5, 2, 2.5), (0.7, 1.0, 1.4), (-1, 0, 1)
 
 
 def read_spectra(path):
@@ -134,9 +130,10 @@ def template_grid(spectra, filters, *, beyond="error", redshift=None):
     Returns
     -------
     grid : `ModelGrid`
-        One redshift, 0, or those given; as galaxies the templates, numbered by the parameter ``template``, each
-        with a mean flux of 1 uJy in the bands; no AGN. The scale of a fit (``mass`` of its results) is the mean
-        flux in uJy. ``meta["templates"]`` has the names.
+        One redshift, 0, or those given; as galaxies the templates, each with a mean flux of 1 uJy in the bands; no
+        AGN. They have the parameters that the spectra have (``SED.parameters``), where these are a full grid, such
+        as those of `red_dots`; others are numbered by the parameter ``template``. The scale of a fit (``mass`` of
+        its results) is the mean flux in uJy. ``meta["templates"]`` has the names.
 
     Raises
     ------
@@ -178,66 +175,55 @@ def template_grid(spectra, filters, *, beyond="error", redshift=None):
     if redshift is None:
         flux = np.array([[_fluxes(name, sed, filters) for name, sed in seds.items()]])
     else:
-        flux = np.array([_seen(seds.values(), one, filters) for one in z])
+        flux = _seen(list(seds.values()), z, filters)
     mean = flux.mean(axis=-1, keepdims=True)
     n = len(seds)
-    number = np.arange(n, dtype=float)
-    templates = described_table({"template": (number * u.one, "number of the template")})
+    columns = _columns(list(seds.values()))
     return ModelGrid(
         filters=filters.names,
         redshift=z,
         galaxy=np.divide(flux, mean, out=np.ones_like(flux), where=mean > 0),
         dust_luminosity=np.zeros(n),
         allowed=mean[..., 0] > 0,
-        galaxy_parameters=templates,
+        galaxy_parameters=described_table(columns),
         meta=provenance(templates=list(seds)),
-        axes={"redshift": z, "template": number},
+        axes={"redshift": z}
+        | {name: np.unique(column.value) for name, (column, _) in columns.items()},
     )
 
 
-def red_dots():
+def _columns(seds):
     """
-    Spectra of little red dots, for `template_grid` at redshifts: broken power laws of the shape of a V.
+    Parameters of templates, with meanings: their own, where these make a full grid, or their numbers.
 
-    F_lambda falls in the ultraviolet, with slopes of -2.5 to -1.5, and from Balmer's limit, 0.3645 um, is flat or
-    rises, with slopes of 0 to 2.5: within the bounds by which Kocevski et al. 2025 (ApJ 986, 126) select them, and
-    with the bend where Setton et al. 2024 (arXiv:2411.03424) find it. From 0.7, 1 or 1.4 um on F_nu has a slope of
-    -1, 0 or 1: little hot dust, or none. No lines; no light below 0.0912 um.
-
-    Returns
-    -------
-    spectra : dict of str to `SED`
-        162 of them, by wavelength at rest, 0.005 to 300 um.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from miricigale.sed import red_dots, template_grid
-    >>> template_grid(red_dots(), ["nircam.f150w", "nircam.f444w"], redshift=[5.0, 6.0])
-    <ModelGrid 2 redshifts x 162 galaxies x 0 AGN x 1 fractions, 2 bands, 324 models>
+    Of values that are all of the same names and differ from each other, each combination is there once.
     """
-    # finely where bands of a survey are, at redshifts of 2 to 9
-    wave = np.union1d(np.geomspace(0.005, 300, 800), np.geomspace(0.0912, 1.5, 1200))
-    out = {}
-    for blue, red, turn, far in product(*_RED_DOTS):
-        fnu = (wave / _BALMER) ** (np.where(wave < _BALMER, blue, red) + 2.0)
-        end = (turn / _BALMER) ** (red + 2.0) * (wave / turn) ** far
-        fnu = np.where(wave < 0.0912, 0.0, np.where(wave < turn, fnu, end))
-        out[f"{blue:g} {red:g} {turn:g} {far:g}"] = SED(wave * WAVE, fnu * FNU)
+    names = list(seds[0].parameters)
+    columns = {}
+    if names and all(list(sed.parameters) == names for sed in seds):
+        columns = {name: u.Quantity([sed.parameters[name] for sed in seds]) for name in names}
+    points = set(zip(*(column.value.tolist() for column in columns.values()), strict=True))
+    n_grid = np.prod([np.unique(column.value).size for column in columns.values()])
+    if len(seds) > 1 and len(points) == len(seds) == n_grid:
+        return {name: (column, name) for name, column in columns.items()}
+    return {"template": (np.arange(len(seds), dtype=float) * u.one, "number of the template")}
+
+
+def _seen(seds, redshifts, filters):
+    """Fluxes of spectra at redshifts, of any scale: shape (n_z, n, n_filters)."""
+    igm, alike = Meiksin2006(), {}
+    # spectra often have the same wavelengths
+    for i, sed in enumerate(seds):
+        wave = sed.rest_wavelength.to_value(WAVE)
+        alike.setdefault(wave.tobytes(), (wave, []))[1].append(i)
+    out = np.empty((len(redshifts), len(seds), len(filters)))
+    for rest, rows in alike.values():
+        fnu = np.array([seds[i].fnu.to_value(FNU) for i in rows])
+        for k, redshift in enumerate(redshifts):
+            wave = rest * (1.0 + redshift)
+            weights = filters.weights(wave) * igm.transmission(wave, redshift)
+            out[k, rows] = fnu @ weights.T
     return out
-
-
-def _seen(seds, redshift, filters):
-    """Fluxes of spectra at a redshift, of any scale: shape (n, n_filters)."""
-    out, known, igm = [], {}, Meiksin2006()
-    for sed in seds:
-        wave = sed.rest_wavelength.to_value(WAVE) * (1.0 + redshift)
-        # spectra often have the same wavelengths
-        key = wave.tobytes()
-        if key not in known:
-            known[key] = filters.weights(wave) * igm.transmission(wave, redshift)
-        out.append(known[key] @ sed.fnu.to_value(FNU))
-    return np.array(out)
 
 
 def _continued(sed):
