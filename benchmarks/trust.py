@@ -12,8 +12,8 @@ pulls: up to 100 sources of S/N above 5 a band: scatter of pulls of `leave_out`,
 agn: at known redshift, with flat fractions and `agn_fraction_prior`: median fraction, sources with more than 0.4,
 those of them with a ratio of evidences of AGN above 5 and 150 (posterior odds of a fraction above 0 over the
 prior's), and all with a ratio above 5.
-dots: little red dots of COSMOS-Web, and sources of CEERS, as galaxies and as little red dots: classes, and redshifts
-of the classes against published ones.
+dots: little red dots of COSMOS-Web, and sources of CEERS, as galaxies and as little red dots: classes, and
+redshifts of the classes against published ones.
 """
 
 import argparse

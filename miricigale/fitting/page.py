@@ -11,8 +11,8 @@ from miricigale.filters import Filter, FilterSet
 from miricigale.filters.catalog_files import MappedRows
 from miricigale.fitting import FitFlags
 from miricigale.fitting.catalog_calibration import measured_calibration
+from miricigale.fitting.catalog_rows import open_catalog
 from miricigale.fitting.classes import classes_of, classes_section
-from miricigale.fitting.from_files import open_catalog
 from miricigale.fitting.likelihood import unused_bands
 from miricigale.fitting.page_numbers import fit_numbers, known_redshifts
 from miricigale.pages import Page, SectionWriter

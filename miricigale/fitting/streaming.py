@@ -14,9 +14,9 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.filters.catalog_files import codes_of, warn_of_codes
+from miricigale.fitting.catalog_rows import give_units, open_catalog
 from miricigale.fitting.fitted_bands import bands_with_errors, warn_of_unfitted
 from miricigale.fitting.fitter import BayesFitter
-from miricigale.fitting.from_files import give_units, open_catalog
 from miricigale.fitting.io import FORMAT, FitFolder, open_results, part_chi2, part_ids, part_name
 from miricigale.fitting.likelihood import HIGH_CHI2, unused_bands
 from miricigale.fitting.pulls import warn_of_pulls

@@ -47,7 +47,8 @@ table
 
 # %%
 # The table goes to the fitter as it is. Unless you say something else, it has the models for real galaxies, their
-# grid, and their calibration: errors of the models by rest wavelength, and priors of parameters and of the errors of
+# grid, and their calibration: errors of the models by rest wavelength, and priors of parameters and of the errors
+# of
 # bands.
 
 fitter = BayesFitter(bands)
@@ -100,9 +101,12 @@ plt.show()
 #    flux = "ABmag"
 #
 # It prints what is fitted: a table of the errors of the bands, and models, bands, and errors with priors in three
-# lines. Three sources say nothing about the errors of the bands, so both have their prior: MIRI's are 3.3 times those
-# of the catalog, and 15 % of the flux. A catalog of a hundred sources or more is measured by the command, in Python
-# by :func:`~miricigale.fitting.calibrate_bands` (:doc:`/method/fitting_errors`). ``--classes all`` fits quasars and
+# lines. Three sources say nothing about the errors of the bands, so both have their prior: MIRI's are 3.3 times
+# those
+# of the catalog, and 15 % of the flux. A catalog of a hundred sources or more is measured by the command, in
+# Python
+# by :func:`~miricigale.fitting.calibrate_bands` (:doc:`/method/fitting_errors`). ``--classes all`` fits quasars
+# and
 # little red dots too (:doc:`/method/classes`).
 #
 # Catalogs of CANDELS, 3D-HST, JADES, DJA, COSMOS2020 and CEERS have ready maps: ``read_catalog_photometry(path,
