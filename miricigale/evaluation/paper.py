@@ -14,6 +14,10 @@ from miricigale.utils.tables import described_rows
 
 #: Differences below this many errors are none.
 _AGREES = 2.0
+#: Difference in sigma from which only that it is larger is said: errors are not known to a part of that.
+_FAR = 10.0
+#: Verdict of numbers of a study of other exposures.
+OTHER_EXPOSURES = "other exposures"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,7 +104,7 @@ PUBLISHED = tuple(
 )
 
 
-def compare_with_paper(study, *, seed, n_draws=1000, reasons=None):
+def compare_with_paper(study, *, seed, n_draws=1000, reasons=None, same_exposures=True):
     """
     Compare every published number with that of a study.
 
@@ -114,6 +118,9 @@ def compare_with_paper(study, *, seed, n_draws=1000, reasons=None):
         Draws of the bootstrap.
     reasons : dict of str to str, optional
         Why numbers differ, by key, instead of the general reasons.
+    same_exposures : bool, optional
+        Whether bands and exposures are those of the paper. Otherwise numbers that depend on the depth (all but
+        those of detection, kernels and bright points) stand next to the paper's without a verdict.
 
     Returns
     -------
@@ -138,16 +145,18 @@ def compare_with_paper(study, *, seed, n_draws=1000, reasons=None):
             given = {"truth": one.truth, "band_set": one.band_set, "option": one.option}
             given["seed"] = stream(seed, "paper", one.key)
             ours = measure(study, one.quantity, **given, n_draws=n_draws)
-        sigma = _difference(one, ours)
+        judged = same_exposures or one.quantity == "extra"
+        sigma = _difference(one, ours) if judged else np.nan
+        why = reasons.get(one.key, one.why)
+        verdict = _verdict(one, ours, sigma, why) if judged else OTHER_EXPOSURES
         text = QUANTITIES.get(one.quantity)
         right = one.quantity == "class_share"
-        why = reasons.get(one.key, one.why)
         rows.append(
             (one.key, one.section, f"{text}: {one.text}" if text else one.text)
             + (one.relation, one.value, one.error)
             + (ours.value, ours.low, ours.high, ours.n, ours.completeness)
             + (ours.value * ours.completeness if right else np.nan, sigma)
-            + (_verdict(one, ours, sigma, why), one.definition, one.source)
+            + (verdict, one.definition, one.source)
         )
     return described_rows(rows, _TABLE["columns"])
 
@@ -183,6 +192,10 @@ def _verdict(one, ours, sigma, why):
         if abs(delta) <= one.tolerance:
             return f"agrees (to {one.tolerance:g})"
         return f"differs by {delta:+.3g}: {why or 'open'}"
-    if abs(sigma) < _AGREES:
-        return f"agrees ({sigma:+.1f} sigma)"
-    return f"differs by {sigma:+.1f} sigma: {why or 'open'}"
+    if abs(sigma) >= _AGREES:
+        size = f"{sigma:+.1f}" if abs(sigma) < _FAR else f"more than {_FAR:g}"
+        return f"differs by {size} sigma: {why or 'open'}"
+    if one.relation in "<>":
+        delta = _excess(one, ours)
+        return f"agrees within its error: beyond the bound by {abs(delta):.2g} ({sigma:+.1f} sigma)"
+    return f"agrees ({sigma:+.1f} sigma)"

@@ -13,6 +13,7 @@ from miricigale.evaluation import (
     PUBLISHED,
     QUANTITIES,
     Estimate,
+    PublishedNumber,
     StudyResults,
     TruthResults,
     compare_with_paper,
@@ -261,6 +262,39 @@ def test_a_study_beside_the_paper(study):
     assert right["completeness"] == pytest.approx(one.sample.sum() / one.field.sum())
     unknown = {"seed": 1, "reasons": {"outliers": "?"}}
     refuses("no published number 'outliers'", compare_with_paper, study, error=KeyError, **unknown)
+
+
+def test_numbers_of_other_exposures_are_not_judged(study):
+    """Two of 366 s next to 1665 s: only what does not depend on the depth has a verdict."""
+    extra = {"points.scatter": Estimate(0.01), "f_scaling.f770w": Estimate(1.0, 0.99, 1.01, 40)}
+    study = dataclasses.replace(study, extra=extra)
+    options = {"seed": 1, "n_draws": 10}
+    same = compare_with_paper(study, **options)
+    other = compare_with_paper(study, **options, same_exposures=False)
+    assert_allclose(other["ours"], same["ours"])
+    judged = np.array([one.quantity == "extra" for one in PUBLISHED])
+    assert set(other["verdict"][~judged]) == {"other exposures"}
+    assert np.all(np.isnan(other["sigma"][~judged]))
+    assert list(other["verdict"][judged]) == list(same["verdict"][judged])
+
+
+@pytest.mark.parametrize(
+    ("relation", "ours", "error", "verdict"),
+    [
+        ("<", 0.9, 0.05, "within the bound"),
+        ("<", 1.06, 0.06, "agrees within its error: beyond the bound by 0.06 (+0.7 sigma)"),
+        (">", 0.94, 0.06, "agrees within its error: beyond the bound by 0.06 (-0.7 sigma)"),
+        ("<", 1.5, 0.1, "differs by +3.5 sigma: open"),
+        ("=", 1.01, 0.1, "agrees (+0.1 sigma)"),
+        ("=", 0.0, 0.0035, "differs by more than 10 sigma: open"),
+    ],
+)
+def test_verdicts_say_what_is_beyond_a_bound(study, monkeypatch, relation, ours, error, verdict):
+    one = PublishedNumber("a", "extra", 1.0, "text", "section", relation=relation)
+    monkeypatch.setattr("miricigale.evaluation.paper.PUBLISHED", (one,))
+    extra = {"a": Estimate(ours, ours - error, ours + error, 10)}
+    table = compare_with_paper(dataclasses.replace(study, extra=extra), seed=1)
+    assert table["verdict"].tolist() == [verdict]
 
 
 def test_tables_of_other_sources_are_refused():

@@ -18,6 +18,7 @@ from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.page.numbers import above_proposal, as_ceers, as_paper
 from miricigale.workflow.page.pictures import field_figure, residual_figure
 from miricigale.workflow.page.provenance import sources_to_cite, stand_ins
+from miricigale.workflow.page.result_sections import widths
 from miricigale.workflow.page.source_figures import example_figure
 from miricigale.workflow.stages.sample import footprint_area, in_field
 from miricigale.workflow.truths import FIELD
@@ -141,6 +142,32 @@ def test_numbers_of_the_fits_are_those_of_the_tables(reports):
     assert set(metrics["fits"]) == {"all", "none"}
 
 
+def test_one_number_says_how_many_redshifts_are_in_their_intervals(reports):
+    """In the table of redshifts, of the coverage, and in the metrics."""
+    page = page_of(reports["four"])
+    rows = re.findall(r"<tr>(.*?)</tr>", page[page.index("Coverage of the posteriors") :])
+    cells = [re.findall(r"<t[dh][^>]*>(.*?)</t[dh]>", row) for row in rows]
+    shares = {row[0]: row[3] for row in cells if len(row) == 6 and row[1] == "redshift"}
+    fits = read_metrics(reports["four"])["fits"]
+    assert len(shares) == len(fits) == 2
+    for unit, label in (("all", "with MIRI"), ("none", "without MIRI")):
+        share = 100 * fits[unit]["redshift_coverage"]
+        assert shares[label].startswith(f"{share:.0f} % (")
+
+
+def test_posteriors_are_judged_by_their_coverage():
+    """Of the rows of the central 68 %: too narrow, too wide, right."""
+    rows = [(0.5, 0.4, 0.6), (0.55, 0.45, 0.65), (0.9, 0.85, 0.95), (0.7, 0.6, 0.8)]
+    share, low, high = np.transpose(rows)
+    table = QTable({"share": share, "share_low": low, "share_high": high, "level": [0.68] * 4})
+    assert widths(table) == {
+        "n_sets": 4, "n_narrow": 2, "n_broad": 1, "n_right": 1, "verdict": "they differ",
+    }  # fmt: skip
+    assert widths(table[:2])["verdict"] == "most are too narrow"
+    assert widths(table[2:3])["verdict"] == "most are too wide"
+    assert widths(table[3:])["verdict"] == "most are right"
+
+
 def test_sections_stand_in_the_order_of_the_paper(reports):
     pages = {kind: page_of(report) for kind, report in reports.items()}
     titles = {kind: re.findall(r"<h2>(.*?)</h2>", page) for kind, page in pages.items()}
@@ -174,9 +201,16 @@ SAID = {
     "Redshift errors by injected fracAGN | by redshift, with median and scatter | of each true class | "
     "luminosity of the accretion disk | X-ray fluxes of the AGN of the field | matching kernel | "
     "background was subtracted | 3.4 of Gaussian errors | "
-    "the field is another one: 24 galaxies; theirs has 463. | the one thing that brings the number nearest",
+    "the field is another one: 24 galaxies; theirs has 463. | "
+    "Bands or exposures of this run are not those of the paper (1665 s, F2100W 4662 s). | "
+    "deeper than calculator by | "
+    "its rank is drawn uniformly from the part of the posterior in the cell",
 }
-NOT_SAID = {"one": ["point sources</th>"], "four": ["No source is left", "<li>Somebody 2001</li>"]}
+NOT_SAID = {
+    "one": ["point sources</th>"],
+    "four": ["No source is left", "<li>Somebody 2001</li>"],
+    "truths": ["wider than they would have to be", "fall short", "fainter than calculator"],
+}
 
 
 @pytest.mark.parametrize("kind", SAID)

@@ -322,12 +322,12 @@ def whole_sample(numbers):
     return {(row["truth"], row["band_set"], row["quantity"]): row for row in rows}
 
 
-def truth_metrics(truth, tables, numbers, bands):
+def truth_metrics(truth, tables, numbers, bands, seed):
     """
     Numbers of one truth as plain values: how well redshift and fracAGN are recovered, by set of bands.
 
-    ``truth`` is a `~miricigale.workflow.truths.Truth`, ``tables`` are its `StudyTables`, and ``numbers``
-    those of `whole_sample`.
+    ``truth`` is a `~miricigale.workflow.truths.Truth`, ``tables`` are its `StudyTables`, ``numbers`` those of
+    `whole_sample`, and ``seed`` is that of the ranks (`true_ranks`).
     """
     sample, fits = tables.sample, {}
     matched = tables.matched[np.asarray(tables.matched["selection"]) == 0]
@@ -336,16 +336,18 @@ def truth_metrics(truth, tables, numbers, bands):
         values = {key: float(row["value"]) for key, row in rows.items()}
         outliers = rows["photoz_outliers"]
         n = int(outliers["n"])
-        low, high = table["redshift_p16"], table["redshift_p84"]
-        known = np.isfinite(low) & np.isfinite(high)
-        inside = known & (sample["redshift"] >= low) & (sample["redshift"] <= high)
+        rank = np.empty(0)
+        if len(table):
+            rank = true_ranks(tables.results[unit], sample, "redshift", seed)
+        known = np.isfinite(rank)
+        inside = np.abs(rank[known] - 0.5) <= 0.34
         fits[unit] = {
             "n": n,
             **values,
             "photoz_n_outliers": round(n * values["photoz_outliers"]) if n else 0,
             "photoz_outliers_low": float(outliers["low"]),
             "photoz_outliers_high": float(outliers["high"]),
-            # share of the true values between the 16th and 84th percentiles
+            # as in the table of the coverage of all parameters
             "redshift_coverage": fraction_interval(int(inside.sum()), int(known.sum()))[0],
             "conditions": fit_conditions(matched, sample["redshift"], table, bands),
         }

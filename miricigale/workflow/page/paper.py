@@ -111,10 +111,13 @@ _VERDICTS = {"agrees": "agree", "differs": "differ"}
 
 def write_comparison(page, reasons, sentences):
     """The section with all numbers of Yang et al. 2021 and those of the run."""
-    table = compare_with_paper(page.study, seed=page.context.seed, reasons=reasons)
+    same = page.metrics["as_paper"]
+    options = {"seed": page.context.seed, "reasons": reasons, "same_exposures": same}
+    table = compare_with_paper(page.study, **options)
     counts = collections.Counter(_VERDICTS.get(v.split()[0], v) for v in table["verdict"])
     verdicts = ", ".join(f"{n} {verdict}" for verdict, n in counts.most_common())
     page.numbers("paper", table, verdicts=verdicts)
+    page.text("judged" if same else "other_exposures")
     with page.folding("differences", n_differences=len(sentences)):
         page.report.bullets(sentences)
     rows = []

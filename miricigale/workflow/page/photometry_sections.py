@@ -115,7 +115,7 @@ def write_errors(page):
     if len(bands) > 1:
         page.figure("limits", band_figures.limit_figure(bands))
     rows = [
-        row | {"fainter": row["limit"] - row["etc_limit"], "proposal": _proposal(row)}
+        row | {"deeper": row["limit"] - row["etc_limit"], "proposal": _proposal(row)}
         for row in page.band_rows
     ]
     own = all(row["ceers"] for row in rows)

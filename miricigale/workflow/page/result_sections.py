@@ -285,6 +285,19 @@ def _residual(estimate):
     return number(value, "+.3f", reason, error=estimate.error)
 
 
+def widths(table):
+    """How many posteriors are narrower and broader than their errors say, of the rows of their central 68 %."""
+    known = table[np.isfinite(table["share"])]
+    narrow = np.count_nonzero(known["share_high"] < known["level"])
+    broad = np.count_nonzero(known["share_low"] > known["level"])
+    right = len(known) - narrow - broad
+    verdicts = {"most are too narrow": narrow, "most are too wide": broad, "most are right": right}
+    most = max(verdicts, key=verdicts.get)
+    verdict = most if 2 * verdicts[most] > len(known) else "they differ"
+    counts = {"n_narrow": narrow, "n_broad": broad, "n_right": right}
+    return {"n_sets": len(known), **counts, "verdict": verdict}
+
+
 def _write_coverage(page):
     """Ranks of the truth in the posteriors, and how many are within central intervals."""
     tables = page.tables
@@ -297,7 +310,7 @@ def _write_coverage(page):
     if not ranks:
         return
     table = coverage_table({" ".join(key): values for key, values in ranks.items()})
-    page.section("coverage")
+    page.section("coverage", **widths(table[::2]))
     drawn = {key: values for key, values in ranks.items() if key[1] in RANKED}
     page.figure("figure", study_figures.rank_figure(drawn))
     # the table has a row for each of the two intervals

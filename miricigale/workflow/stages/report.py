@@ -55,7 +55,7 @@ _MEASURED = ("highres", "photometry", "errors", "fit", "point_sources", "perturb
 @stage(
     "report",
     "report",
-    version=10,
+    version=11,
     needs=(*_IMAGES, *_TABLES),
     sections=("run.name", "catalog", "sed", *IMAGES, "patches", *_MEASURED, "report"),
     resources=lambda: (*sed_resources(), *EXPOSURE_RESOURCES),
@@ -87,7 +87,8 @@ def make_report(context, _):
     context.save_table("report/numbers.ecsv", numbers)
     numbers = whole_sample(numbers)
     metrics["truths"] = {
-        name: truth_metrics(truth, tables[name], numbers, bands) for name, truth in known.items()
+        name: truth_metrics(truth, tables[name], numbers, bands, context.seed)
+        for name, truth in known.items()
     }
     metrics["fits"] = metrics["truths"][shown]["fits"]
     if metrics["n_sample"] == 0:
