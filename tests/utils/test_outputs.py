@@ -1,13 +1,16 @@
 """Files that stand are replaced only if the caller asks for it."""
 
 import inspect
+import io
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from astropy.nddata import CCDData
 from astropy.table import Table
 
+from miricigale.cli.options import read_input
 from miricigale.instrument import write_image
 from miricigale.pages import Page
 from miricigale.utils.outputs import check_output, check_outputs, is_file_name
@@ -70,6 +73,21 @@ def test_writers_of_single_files_have_one_rule(tmp_path):
         write(path, overwrite=True)
         assert path.stat().st_size > 4
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(writers)
+
+
+def test_a_second_input_from_a_pipe_does_not_replace_the_first(tmp_path, monkeypatch):
+    def read(text):
+        monkeypatch.setattr("sys.stdin", SimpleNamespace(buffer=io.BytesIO(text)))
+        return read_input(tmp_path / "fits")
+
+    path = read(b"id,flux\n1,2\n")
+    # the same again resumes
+    assert read(b"id,flux\n1,2\n") == path == tmp_path / "fits-input.csv"
+    with pytest.raises(
+        ValueError, match=r"'output' must be another folder, got .* holds another input"
+    ):
+        read(b"id,flux\n1,3\n")
+    assert path.read_bytes() == b"id,flux\n1,2\n"
 
 
 def test_every_public_writer_can_be_asked_to_overwrite():
