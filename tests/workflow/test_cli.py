@@ -212,7 +212,7 @@ def test_a_catalog_comes_from_standard_input(tmp_path, monkeypatch):
     text = f"id,{theirs}\n{body}".encode()
     monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(text)))
     (tmp_path / "ours.csv").write_text(f"id,{ours}\n{body}")
-    options = ["--axes", "quick", "--flux-unit", "uJy", "--no-progress", "--threads", "1"]
+    options = ["--axes", "yang2021-quick", "--flux-unit", "uJy", "--no-progress", "--threads", "1"]
     for path, name in (("-", "fits"), (str(tmp_path / "ours.csv"), "same")):
         assert main(["fit", path, "-o", str(tmp_path / name), *options]) == 0
     assert (tmp_path / "fits-input.csv").read_bytes() == text

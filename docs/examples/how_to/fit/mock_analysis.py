@@ -7,7 +7,7 @@ right.
 """
 
 # %%
-# 117 simulated galaxies stand for your catalog. They have redshifts and F160W magnitudes of GOODS-S, six bands
+# 60 simulated galaxies stand for your catalog. They have redshifts and F160W magnitudes of GOODS-S, six bands
 # with the depths of existing surveys, and two MIRI bands.
 
 import matplotlib.pyplot as plt
@@ -28,7 +28,7 @@ bands = list(depths)
 rng = np.random.default_rng(10)
 catalog = read_catalog("catalog.goodss")
 bright = (catalog["mag_f160w"].value < 24) & (catalog["redshift"] > 0.2)
-catalog = catalog[bright][:120]
+catalog = catalog[bright][:60]
 n = len(catalog)
 truth = QTable({"id": catalog["id"], "redshift": catalog["redshift"]})
 truth["age"], truth["ebv"] = rng.uniform(0.6, 3, n), rng.uniform(0.1, 0.6, n)
