@@ -78,6 +78,7 @@ def mock_analysis(fitter, results, photometry, *, seed, model_error=False, **opt
          mass   2
     """
     seed = check_seed(seed)
+    fitter = fitter.for_photometry(photometry)
     filters = results.fitted_filters
     columns = [c for name in filters for c in (name, error_column(name))]
     require_columns(photometry, ["id", *columns], "photometry", units=dict.fromkeys(columns, FNU))
@@ -292,6 +293,7 @@ def leave_out(fitter, photometry, bands, *, separately=False, **options):
     if isinstance(bands, str) or not len(bands):
         raise argument_error("bands", "a list of one or more names", repr(bands))
     bands = tuple(bands)
+    fitter = fitter.for_photometry(photometry)
     check_that(len(set(bands)) == len(bands), "bands", "different names", list(bands))
     check_names(bands, "filter of the models", fitter.bands)
     data = fitter.read_bands(photometry, bands)

@@ -162,7 +162,7 @@ def statement(fitter, unused=()):
     return [
         f"models: {_models(fitter)}",
         f"bands: {len(bands)} fitted, {', '.join(bands)}{lost}",
-        f"errors and priors: {_errors(fitter, bands)}",
+        f"errors and priors: {errors_and_priors(fitter)}",
     ]
 
 
@@ -176,30 +176,43 @@ def _models(fitter):
     return text if fitter.model is None else f"{text}, of {fitter.model!r}"
 
 
-def _errors(fitter, bands):
-    """Errors and priors in words, as a part of the flux."""
-    calibration = fitter.calibration
-    parts = []
-    if calibration is not None:
-        parts.append(f"calibration {calibration.name!r}")
+def errors_and_priors(fitter):
+    """Calibration, errors as parts of the flux, and priors of a fitter, in words."""
+    settings, parts = fitter.settings(), []
+    if "calibration" in settings:
+        parts.append(f"calibration {settings['calibration']!r}")
     if fitter.template_error is not None:
-        error = 100.0 * fitter.template_error.error
-        parts.append(f"errors of the models {error.min():.0f} to {error.max():.0f} % of the flux")
-    given = 100.0 * np.array([fitter.model_errors[band] for band in bands])
-    if given.max() > 0.0:
-        span = (
-            f"{given.min():.0f}"
-            if given.min() == given.max()
-            else f"{given.min():.0f} to {given.max():.0f}"
-        )
-        parts.append(f"{span} % of the flux added to errors")
-    parts.append(f"priors of {', '.join(_priors(fitter)) or 'nothing: flat in the nodes'}")
+        parts.append(f"errors of the models {_span(fitter.template_error.error)} % of the flux")
+    model_errors = list(settings["model_error"].values())
+    if max(model_errors) > 0.0:
+        parts.append(f"{_span(model_errors)} % of the flux added to errors")
+    factors = list(settings.get("error_factor", {}).values())
+    if factors and max(factors) > 1.0:
+        parts.append(f"errors times {min(factors):.2g} to {max(factors):.2g}")
+    if "outliers" in settings:
+        parts.append(f"{_span(settings['outliers'].values())} % of fluxes wrong")
+    parts.append(f"priors of {', '.join(_priors(fitter)) or 'nothing'}")
     return "; ".join(parts)
 
 
+def _span(values):
+    """Least and largest of some numbers in per cent; one number if they are the same."""
+    ends = [f"{100.0 * end:.0f}" for end in (min(values), max(values))]
+    return " to ".join(dict.fromkeys(ends))
+
+
 def _priors(fitter):
-    """Names of the parameters that have a prior."""
-    names = [] if fitter.calibration is None else list(fitter.calibration.priors)
-    if fitter.calibration is not None and fitter.calibration.mass_function is not None:
+    """Names of the parameters whose prior is not flat in the nodes; all of a sampler."""
+    if fitter.grid is None:
+        return list(fitter.priors)
+    settings = fitter.backend.given
+    names = [name for name, axis in fitter.priors.axes.items() if not _is_flat(axis.weights)]
+    if settings.mass_function is not None:
         names.append("mass and redshift")
+    if settings.sfr_prior is not None:
+        names.append("star-formation rate")
     return names
+
+
+def _is_flat(weights):
+    return np.ptp(weights) <= 1e-9 * np.max(weights)

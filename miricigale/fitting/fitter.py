@@ -7,7 +7,13 @@ import numpy as np
 
 from miricigale.filters.band_names import known_filter
 from miricigale.fitting import fitted_bands
-from miricigale.fitting.defaults import DEFAULT, axes_of, chosen_calibration, models_and_bands
+from miricigale.fitting.defaults import (
+    DEFAULT,
+    axes_of,
+    chosen_calibration,
+    errors_and_priors,
+    models_and_bands,
+)
 from miricigale.fitting.grid_fit import GridFit
 from miricigale.fitting.likelihood import (
     FitFlags,
@@ -353,6 +359,7 @@ class BayesFitter(Interactive):
                 given["calibration"] = chosen_calibration(*chosen, bands=bands)
         new = type(self)(**given)
         new.grid_name = self.grid_name
+        new.model = self.model
         # errors that are given later take the place of a calibration by default
         new._given["calibration"] = (self._given | options)["calibration"]
         known = getattr(self.backend, "between", None)
@@ -372,7 +379,7 @@ class BayesFitter(Interactive):
             "BayesFitter": self._engine_name,
             "models": repr(self.grid or self.model),
             "bands": ", ".join(self.filters or self.bands),
-            "priors": ", ".join(self.priors) if isinstance(self.priors, dict) else "of the grid",
+            "errors and priors": errors_and_priors(self),
         }
 
     def __repr__(self):

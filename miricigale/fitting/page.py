@@ -31,8 +31,9 @@ _FEW = 5
 _LONG = 200
 #: AGN fraction above which an object counts as one with an AGN.
 _SOME_AGN = 0.2
-#: Flags that are notices where more than a tenth of the objects have them.
-_WIDESPREAD = {"high_chi2": FitFlags.HIGH_CHI2, "redshift_edge": FitFlags.REDSHIFT_EDGE}
+#: Reduced chi2 of a poor fit, and part of the objects with it, or at an end of the redshifts, from which that is a
+#: notice.
+_POOR, _WIDESPREAD = 10.0, 0.1
 
 
 def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None):
@@ -120,10 +121,12 @@ def _notices(page, found):
     if len(found) and not good.any():
         page.notice("nothing")
         return
-    for name, flag in _WIDESPREAD.items():
-        share = _mean(found["flags"][good] & int(flag) != 0)
-        if share > 0.1:
-            page.notice(name, share=100 * share)
+    poor = found["chi2"][good] > _POOR
+    edge = found["flags"][good] & int(FitFlags.REDSHIFT_EDGE) != 0
+    for name, some in (("high_chi2", poor), ("redshift_edge", edge)):
+        share = _mean(some)
+        if share > _WIDESPREAD:
+            page.notice(name, share=100 * share, limit=_POOR)
     for name, ratio, _ in _bands(found):
         if ratio.size >= 30 and not 0.8 < np.median(ratio) < 1.25:
             page.notice("band", band=name, ratio=np.median(ratio), n=ratio.size)

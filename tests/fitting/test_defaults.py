@@ -11,6 +11,7 @@ from helpers.commands import command
 from helpers.errors import refuses
 from miricigale.fitting import BayesFitter, SurveyCalibration, TemplateError, fit_catalog, fit_file
 from miricigale.fitting.class_names import chosen_classes
+from miricigale.fitting.defaults import statement
 from miricigale.sed import SEDModel, presets
 from miricigale.utils.exceptions import FitWarning
 
@@ -95,6 +96,23 @@ def test_models_bands_and_calibration_by_default():
     changed = fitters[0].changed(model_error=0.2)
     assert changed.calibration is None
     assert changed.changed(model_error=None).calibration is SurveyCalibration.survey()
+    assert changed.model is fitters[0].model
+
+
+def test_a_fitter_says_what_it_fits():
+    """Models, bands, and errors with priors: those that are not flat in the nodes."""
+    fitter = BayesFitter(BANDS)
+    models, bands, errors = statement(fitter, ["miri.f999w"])
+    assert f"the grid 'survey' of {fitter.grid.n_models:,} models, redshifts 0.12 to" in models
+    assert bands == f"bands: 7 fitted, {', '.join(BANDS)}; not fitted: miri.f999w"
+    assert "calibration 'CEERS'; errors of the models 3 to 48 % of the flux; priors of " in errors
+    assert errors.endswith("mass and redshift")
+    assert errors.removeprefix("errors and priors: ") in fitter.summary()
+    weights = np.arange(1.0, 1.0 + fitter.priors.axes["age"].values.size)
+    own = fitter.changed(model_error={BANDS[0]: 0.2}, outliers=0.05, priors={"age": weights})
+    text = "0 to 20 % of the flux added to errors; 5 % of fluxes wrong; priors of age"
+    assert statement(own)[2] == f"errors and priors: {text}"
+    assert "bands: of the photometry" in BayesFitter().summary()
 
 
 def test_the_grid_of_the_study_is_asked_for_by_name():
