@@ -1,6 +1,12 @@
 """What is fitted where nothing else is said, and that Python and the command are one door."""
 
+import re
+import runpy
+import textwrap
+from pathlib import Path
+
 import astropy.units as u
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from astropy.table import QTable
@@ -17,8 +23,9 @@ from miricigale.utils.exceptions import FitWarning
 
 BANDS = ["acs.f606w", "acs.f814w", "wfc3.f125w", "wfc3.f160w", "nircam.f277w", "nircam.f444w"]
 BANDS += ["miri.f770w"]
+DOCS = Path(__file__).parents[2] / "docs"
 #: Axes of the survey grid that keep all of their values.
-KEPT = ("tau", "age", "metallicity")
+KEPT = ("tau", "age", "metallicity", "frac_agn")
 
 
 @pytest.fixture(autouse=True)
@@ -26,7 +33,7 @@ def thin_survey(monkeypatch):
     """The survey grid with one value of most parameters and 12 redshifts, of which priors know nothing."""
     axes = presets.survey_axes()
     thin = {name: values if name in KEPT else values[-1:] for name, values in axes.items()}
-    thin |= {"frac_agn": axes["frac_agn"][:1], "redshift": axes["redshift"][5:65:5]}
+    thin["redshift"] = axes["redshift"][5:65:5]
     own = presets._values
 
     def values(name):
@@ -206,3 +213,21 @@ def test_classes_by_one_option():
         error=KeyError,
     )
     refuses("'stars' must be spectra", chosen_classes, "stars")
+
+
+def test_the_command_of_the_how_to_gives_the_table_of_its_python(tmp_path, monkeypatch, capsys):
+    """The script is run, then its command with the map that it prints."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(plt, "show", lambda: None)
+    path = DOCS / "examples" / "how_to" / "fit" / "own_catalog.py"
+    wanted = runpy.run_path(str(path))["results"].to_table()
+    plt.close("all")
+    text = re.sub("^# ?", "", path.read_text(), flags=re.MULTILINE)
+    (tmp_path / "mine.toml").write_text(
+        textwrap.dedent(re.search(r"code-block:: toml\n\n((?: {3}.*\n|\n)+)", text)[1])
+    )
+    words = re.search(r"\$ miricigale (fit .*)", text)[1].split()
+    assert "3 objects, 3 fitted" in command(capsys, *words, "--no-progress").out
+    found = QTable.read(tmp_path / "fits" / "table.fits")
+    for name in ("redshift_p50", "mass_p50", "frac_agn_p50", "chi2_best"):
+        assert_allclose(u.Quantity(found[name]).value, u.Quantity(wanted[name]).value, rtol=1e-6)
