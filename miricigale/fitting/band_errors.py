@@ -45,6 +45,9 @@ class BandErrorPrior:
         That of the natural logarithm of the zero point; 0 leaves zero points at 1.
     n_wrong, n_right : float
         Numbers of wrong and right fluxes that the prior of the wrong share counts as.
+    allows_wrong : bool, optional
+        Whether fits allow for the share of wrong fluxes: where every band may be wrong they lose breaks, and
+        redshifts.
 
     Examples
     --------
@@ -60,6 +63,7 @@ class BandErrorPrior:
     zero_point_scatter: float
     n_wrong: float
     n_right: float
+    allows_wrong: bool = False
 
     @property
     def wrong(self):
@@ -70,7 +74,7 @@ class BandErrorPrior:
 #: Forced photometry in MIRI images scatters by more than its errors, about what HST and NIRCam predict of
 #: starlight: numbers of CEERS, whose catalog of Lisiecki et al. 2025 has no correction for correlated noise. Zero
 #: points stay at 1, for at rest 2.5 to 4 um errors of the models look like them.
-MIRI_PRIOR = BandErrorPrior(3.3, 0.4, 0.15, 0.5, 0.0, 2.0, 40.0)
+MIRI_PRIOR = BandErrorPrior(3.3, 0.4, 0.15, 0.5, 0.0, 2.0, 40.0, allows_wrong=True)
 #: Other bands: errors are right within a third, zero points within 4 %.
 DEFAULT_PRIOR = BandErrorPrior(1.0, 0.3, 0.02, 0.7, 0.04, 2.0, 60.0)
 

@@ -11,6 +11,7 @@ from miricigale.fitting.band_errors import (
     long_instruments,
     measure_bands,
     prior_errors,
+    prior_of_band,
     relative_zero_points,
 )
 from miricigale.fitting.calibration import measure_priors, measure_template_error
@@ -116,7 +117,7 @@ class SurveyCalibration:
 
     def with_band_errors(self, errors):
         """
-        Calibration with other errors of bands; no band may be an outlier.
+        Calibration with other errors of bands; fluxes of MIRI may be wrong.
 
         Parameters
         ----------
@@ -128,7 +129,7 @@ class SurveyCalibration:
         calibration : `SurveyCalibration`
             With these bands alone.
         """
-        rows = [_band_row(band, found, outlier=0.0) for band, found in errors.items()]
+        rows = [_band_row(band, found) for band, found in errors.items()]
         return dataclasses.replace(self, bands=described_rows(rows, _COLUMNS))
 
     def with_prior_errors(self, bands):
@@ -143,8 +144,8 @@ class SurveyCalibration:
         Returns
         -------
         calibration : `SurveyCalibration`
-            Its bands have the errors of `~miricigale.fitting.band_errors.prior_errors`: in MIRI's 3.3 times those
-            of the catalog and 15 % of the flux.
+            Its bands have the errors of `~miricigale.fitting.band_errors.prior_errors`: in MIRI 3.3 times those
+            of the catalog, 15 % of the flux, and 5 % of wrong fluxes.
         """
         return self.with_band_errors({band: prior_errors(band) for band in bands})
 
@@ -248,8 +249,8 @@ def _read_bands(table):
     return described_table(columns)
 
 
-def _band_row(band, errors, outlier):
-    """Row of the table of bands, in the order of its columns: `BandErrors`, and what fits allow to be wrong."""
+def _band_row(band, errors):
+    """Row of the table of bands, in the order of its columns, from `BandErrors`."""
     row = {
         "band": band,
         "n": errors.n,
@@ -257,7 +258,7 @@ def _band_row(band, errors, outlier):
         "zero_point_err": errors.zero_point_err,
         "error_factor": errors.factor,
         "error_part": errors.part,
-        "outlier": outlier,
+        "outlier": errors.wrong if prior_of_band(band).allows_wrong else 0.0,
         "wrong": errors.wrong,
     }
     return [row[name] for name in _COLUMNS]
@@ -388,7 +389,7 @@ def _measure(fitter, table, z, name, reference, priors, options):
 
     def current(template_error):
         known = {n: (fitter.priors.axes[n].values, w) for n, w in weights.items()}
-        rows = [_band_row(band, found, outlier=found.wrong) for band, found in errors.items()]
+        rows = [_band_row(band, found) for band, found in errors.items()]
         table = described_rows(rows, _COLUMNS)
         return SurveyCalibration(name, table, template_error, known, MassFunction())
 
