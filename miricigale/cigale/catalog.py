@@ -12,7 +12,7 @@ from miricigale.utils.exceptions import CatalogWarning, data_error, warn
 from miricigale.utils.missing import negative_errors, plain_floats, without_codes
 from miricigale.utils.options import check_data
 from miricigale.utils.table_files import read_table
-from miricigale.utils.tables import error_column
+from miricigale.utils.tables import error_column, read_ids
 from miricigale.utils.units import FNU
 
 #: All below stands for nothing, besides NaN and the codes of `without_codes`.
@@ -52,9 +52,10 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
     Returns
     -------
     photometry : `~astropy.table.QTable`
-        ``id``; ``redshift``, NaN where it is missing or negative; ``distance`` if it is there;
-        for each band, by our name, flux and error in uJy, and ``<filter>_limit`` if an object
-        has an upper limit there: then the flux is the limit and the error its 1 sigma.
+        ``id``; ``redshift``, NaN where it is missing or negative, and 0 where a galaxy with a distance is a little
+        below 0; ``distance`` if it is there; for each band, by our name, flux and error in uJy, and
+        ``<filter>_limit`` if an object has an upper limit there: then the flux is the limit and the error its 1
+        sigma.
         ``meta["cigale"]`` has ``bands`` (our names to CIGALE's), ``default_error`` (bands
         with an error of 10 %) and ``left_out``.
 
@@ -105,12 +106,15 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
     own = {*_OWN, *chosen, *map(error_column, chosen)}
     other = [] if bands is not None else [name for name in table.colnames if name not in own]
     out = QTable()
-    out["id"] = np.array(table["id"])
+    out["id"] = read_ids(table, path.name)
     redshift = _numbers(path, table, "redshift")
     out["redshift"] = np.where(redshift >= 0, redshift, np.nan)
     if "distance" in table.colnames:
         distance = _numbers(path, table, "distance")
         out["distance"] = _in_unit(path, table, "distance", distance, u.Mpc)
+        # CIGALE's advice for near galaxies, whose velocities say little of their distances
+        near = (redshift < 0) & (redshift > -_NEAR) & (out["distance"] > 0)
+        out["redshift"] = np.where(near, 0.0, out["redshift"])
     no_error, no_limit = [], []
     for name, band in filters.items():
         column = error_column(band) if error_column(band) in with_error else None
@@ -134,6 +138,10 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
     if text:
         warn(f"{path}: {text}", CatalogWarning)
     return out
+
+
+#: Redshift to which motions of near galaxies may reach: 0.01 is 3000 km/s.
+_NEAR = 0.01
 
 
 def _choose(path, table, bands):

@@ -6,6 +6,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.sed.spectrum import distance
+from miricigale.utils.units import to_array
 
 
 def at_their_distances(results, redshift, distances, cosmology):
@@ -40,7 +41,7 @@ def at_their_distances(results, redshift, distances, cosmology):
     here, there = (distance(np.where(np.isfinite(x), x, 0.0), cosmology) for x in (z, node))
     given = None
     if distances is not None:
-        given = np.ma.filled(np.ma.asarray(distances.to_value(u.Mpc)), np.nan)
+        given = to_array(distances, u.Mpc, "distance")
         given = np.where(np.isfinite(given) & (given > 0), given, np.nan)
         here = np.where(np.isfinite(given), given * u.Mpc.to(u.m), here)
     factor = np.where(np.isfinite(node), (here / there) ** 2 * (1.0 + node) / (1.0 + z), 1.0)

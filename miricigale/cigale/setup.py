@@ -21,6 +21,7 @@ from miricigale.sed.grid_spectra import row_values
 from miricigale.sed.xray_bands import with_xray_bands, xray_filter
 from miricigale.utils.exceptions import config_error
 from miricigale.utils.files import replacing
+from miricigale.utils.missing import floats
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import require_columns
 
@@ -168,8 +169,8 @@ class CigaleSetup:
         Those that would become 0, which stands for 10 pc, stay as they are; negative ones are
         missing (NaN).
         """
-        z = np.ma.filled(np.ma.masked_invalid(np.ma.asarray(redshifts, dtype=float)), np.nan)
-        z = np.where(z >= 0, z, np.nan)
+        z = floats(redshifts)
+        z = np.where((z >= 0) & np.isfinite(z), z, np.nan)
         if self.redshift_decimals < 0:
             return z
         near = np.round(z, self.redshift_decimals)
@@ -311,7 +312,7 @@ class CigaleSetup:
         model = self.model()
         results = dataclasses.replace(results, meta=meta, model=model)
         # objects over all redshifts of the file are where the model is
-        known = np.ma.filled(np.ma.asarray(known, dtype=float), np.nan)
+        known = floats(known)
         known = np.where(np.isfinite(z), known, np.nan)
         far = _column(photometry, "distance")
         return at_their_distances(results, known, far, model.cosmology)

@@ -28,7 +28,7 @@ def open_product(path):
     Parameters
     ----------
     path : path-like
-        A product of the package, a file of JWST, or any FITS image or table.
+        A product of the package, a file of JWST, any FITS image or table, or ``pcigale.ini``.
 
     Returns
     -------
@@ -49,6 +49,10 @@ def open_product(path):
     other = (OSError, ValueError, KeyError, TypeError, IORegistryError)
     path = Path(path)
     check_data(path.is_file(), "no file", path)
+    if path.suffix.lower() == ".ini":
+        from miricigale.cigale import read_pcigale_ini
+
+        return read_pcigale_ini(path)
     with warnings.catch_warnings():
         # they are about what was tried
         warnings.simplefilter("ignore")

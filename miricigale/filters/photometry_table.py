@@ -1,8 +1,10 @@
 """Catalogs of measured fluxes, however their columns are called."""
 
 import re
+from collections.abc import Mapping
 
 import astropy.units as u
+import numpy as np
 from astropy.table import QTable
 
 from miricigale.filters.band_names import find_filter
@@ -11,8 +13,10 @@ from miricigale.filters.catalog_map import CatalogMap
 from miricigale.filters.library import FILTERS
 from miricigale.utils.exceptions import CatalogWarning, warn
 from miricigale.utils.ids import counted_ids, id_column
+from miricigale.utils.missing import floats
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import as_table, error_column
+from miricigale.utils.units import flux_unit
 
 # what stands before or after the band in names of fluxes, magnitudes and their errors
 _ERROR = re.compile(
@@ -38,7 +42,8 @@ def as_photometry(data, bands, argument="photometry"):
     data : `~astropy.table.Table` or anything for `~miricigale.utils.tables.as_table`
         Fluxes by any usual name of a band (``F770W``, ``f_F770W``, ``mag_F770W``, ``jwst.miri.F770W``) and
         their errors (``F770W_err``, ``e_F770W``, ``err_F770W``), as flux densities or AB magnitudes. Where one
-        band is meant and none is named, ``flux`` or ``mag`` is it.
+        band is meant and none is named, ``flux`` or ``mag`` is it. Also the ``obs`` of Prospector, a single object
+        in maggies: a dict, or its ``Photometry``.
     bands : iterable of str
         Our names of the bands that are meant; other columns stay as they are.
     argument : str, optional
@@ -70,6 +75,8 @@ def as_photometry(data, bands, argument="photometry"):
     >>> table["miri.f770w"], table["miri.f770w_err"].round(3)
     (<Quantity [1.] uJy>, <Quantity [0.092] uJy>)
     """
+    if _is_of_prospector(data):
+        data = _of_prospector(data)
     table, bands = as_table(data, argument), tuple(bands)
     names = _our_names(table.colnames, bands, argument)
     magnitudes = [name for name in bands if _is_ab(table, names.get(name))]
@@ -87,6 +94,38 @@ def as_photometry(data, bands, argument="photometry"):
     for text in catalog_messages((), [coded]):
         warn(f"{argument}: {text}", CatalogWarning)
     return out
+
+
+def _is_of_prospector(data):
+    """Whether something is the photometry of an object as Prospector has it."""
+    if isinstance(data, Mapping):
+        return {"filters", "maggies", "maggies_unc"} <= set(data)
+    return all(hasattr(data, name) for name in ("filters", "flux", "uncertainty"))
+
+
+def _of_prospector(data):
+    """Columns of one row of the photometry of Prospector, in maggies; masked bands are missing."""
+    if isinstance(data, Mapping):
+        flux = floats(data["maggies"])
+        error = floats(data["maggies_unc"])
+        good = data.get("phot_mask")
+        filters = data["filters"]
+    else:
+        flux = floats(data.flux)
+        error = floats(data.uncertainty)
+        good = getattr(data, "mask", None)
+        filters = data.filters
+    good = np.ones(flux.shape, dtype=bool) if good is None else np.broadcast_to(good, flux.shape)
+    names = [getattr(item, "name", str(item)) for item in getattr(filters, "filters", filters)]
+    names = [find_filter(name) or name for name in names]
+    same = len(names) == flux.size == error.size
+    check_that(same, "photometry", "a flux and an error for each filter", f"{len(names)} filters")
+    unit = flux_unit("maggies")
+    columns = {}
+    for name, value, sigma, is_good in zip(names, flux, error, good, strict=True):
+        columns[name] = [value if is_good else np.nan] * unit
+        columns[error_column(name)] = [sigma if is_good else np.nan] * unit
+    return columns
 
 
 def band_columns(colnames, argument="photometry"):

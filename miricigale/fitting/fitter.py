@@ -528,7 +528,9 @@ class BayesFitter(Interactive):
         settings = self.settings(filters) | {"redshift": kind}
         settings["unused_bands"] = unused_bands(photometry, filters)
         if kind == "fixed":
-            data = data._changed(redshift=known_redshifts(photometry, redshift))
+            # 0 was checked above, where a grid has it
+            known_z = known_redshifts(photometry, redshift, zero=True)
+            data = data._changed(redshift=np.where(known_z > 0, known_z, np.nan))
         return data._changed(flags=flags), known, settings
 
     def sample(

@@ -209,7 +209,9 @@ class GridFit:
         if redshift_prior is not None:
             log_prior = density_log_prior(redshift_prior, z, allowed, flags)
         elif redshift is not None:
-            values = known_redshifts(photometry, redshift)
+            # on nodes alone a redshift of 0 is a node like others
+            zero = bool(z[0] == 0) and self.between is None
+            values = known_redshifts(photometry, redshift, zero=zero)
             log_prior = fixed_log_prior(values, z, allowed, self.given.redshift_tolerance, flags)
         else:
             if not allowed.any():

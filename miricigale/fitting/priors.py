@@ -212,12 +212,13 @@ def _inert(grid):
     return found
 
 
-def known_redshifts(photometry, redshift):
+def known_redshifts(photometry, redshift, *, zero=False):
     """
     Redshifts of a catalog: a column by its name, one value, or one for each object.
 
-    NaN where one is missing, masked, not finite or not positive. A `ValueError` is raised for a column that
-    is not there, or another shape.
+    NaN where one is missing, masked, not finite or not positive. With ``zero``, of a grid that has this node (at
+    10 pc, for objects with distances of their own), 0 is a redshift. A `ValueError` is raised for a column that
+    is not there, another shape, and one value for all that is no redshift.
     """
     n = len(photometry)
     if isinstance(redshift, str):
@@ -226,8 +227,11 @@ def known_redshifts(photometry, redshift):
         redshift = photometry[redshift]
     values = _unmasked(redshift, "redshift")
     check_that(values.shape in ((), (n,)), "redshift", f"{n} values", f"shape {values.shape}")
-    values = np.broadcast_to(values, (n,))
-    return np.where(np.isfinite(values) & (values > 0), values, np.nan)
+    good = np.isfinite(values) & ((values > 0) | (zero & (values == 0)))
+    if values.ndim == 0 and not good:
+        wanted = "above 0 (for a near galaxy the redshift of its distance: 0.001 for 4.3 Mpc)"
+        raise argument_error("redshift", wanted, values)
+    return np.broadcast_to(np.where(good, values, np.nan), (n,)).copy()
 
 
 def magnitude_prior(magnitude, redshift=None):

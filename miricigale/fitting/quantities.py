@@ -26,6 +26,12 @@ FRACTIONS = {"frac_agn_dust": _DUST, "frac_agn_ir": _IR}
 _ALL = 1e30
 
 
+#: Other codes quote the mass of living stars, which is 0.2 to 0.3 dex less.
+FORMED_TEXT = (
+    "mass of all stars formed; that of living stars, which other codes quote, is stellar_mass"
+)
+
+
 def plain(column):
     """Values of a column as an array of float, without its unit."""
     return np.asarray(getattr(column, "value", column), dtype=float)
@@ -200,7 +206,7 @@ class Quantities:
         of_galaxy, of_agn = grid.galaxy_properties, grid.agn_properties
         both = [n for n in of_galaxy.colnames if n_agn and n in of_agn.colnames]
         # name, unit and meaning of each
-        found = [("mass", MASS, "mass of stars formed")]
+        found = [("mass", MASS, FORMED_TEXT)]
         galaxy_scale, agn_scale = [np.ones(grid.n_galaxies)], []
         mixed_galaxy, mixed_agn = grid.dust_luminosity, np.ones(n_agn)
         mixed = ("total_luminosity", LUMINOSITY, "dust luminosity and AGN power")

@@ -4,6 +4,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import MaskedColumn, Table
+from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
 from helpers.grids import photometry_table
@@ -98,3 +99,42 @@ def test_two_columns_for_one_band_are_refused(catalog):
     table["jwst_f770w"] = table["F770W"]
     refuses(r"one column for 'miri.f770w', got 'F770W' and 'jwst_f77", as_photometry, table, BANDS)
     refuses(r"'catalog' must be a table, .*, got int", as_photometry, 3, BANDS, "catalog")
+
+
+@pytest.mark.parametrize("form", ["dict", "object"])
+def test_the_photometry_of_prospector_is_a_catalog_of_one(form):
+    """1e-9 maggies are AB 22.5 (3.631 uJy); a band that is masked there is missing."""
+
+    class Curve:
+        def __init__(self, name):
+            self.name = name
+
+    class Photometry:
+        filters = [Curve("wfc3_ir_f160w"), Curve("jwst_f770w")]
+        flux = np.array([1e-9, 2e-9])
+        uncertainty = np.array([1e-10, 1e-10])
+        mask = np.array([True, False])
+
+    data = Photometry()
+    if form == "dict":
+        data = {"filters": data.filters, "maggies": data.flux, "maggies_unc": data.uncertainty}
+        data |= {"phot_mask": Photometry.mask, "wavelength": None}
+    table = as_photometry(data, ["wfc3.f160w", "miri.f770w"])
+    assert len(table) == 1
+    assert_allclose(table["wfc3.f160w"].to_value(u.ABmag), 22.5, atol=1e-6)
+    assert_allclose(table["wfc3.f160w_err"].to_value(u.uJy), 0.363078054770)
+    assert np.isnan(table["miri.f770w"][0])
+    assert table["id"].tolist() == [1]
+
+
+def test_text_and_nullable_ids_of_a_table_are_kept_by_the_rule_of_all_readers():
+    table = Table(
+        {"TARGETID": ["0007", "07"], "F770W": [1.0, 2.0] * u.uJy, "F770W_err": [0.1, 0.1] * u.uJy}
+    )
+    assert as_photometry(table, ["miri.f770w"])["id"].tolist() == ["0007", "07"]
+    table["NUMBER"] = [1, 2]
+    refuses("one column of ids.*'TARGETID' and 'NUMBER'", as_photometry, table, ["miri.f770w"])
+    del table["NUMBER"]
+    table.rename_column("TARGETID", "CATAID")
+    with pytest.warns(CatalogWarning, match="'CATAID' looks like ids"):
+        assert as_photometry(table, ["miri.f770w"])["id"].tolist() == [1, 2]

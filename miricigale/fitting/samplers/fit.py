@@ -10,7 +10,7 @@ from miricigale.filters import FilterSet
 from miricigale.fitting.likelihood import FitFlags
 from miricigale.fitting.posterior import cell_edges, check_pairs
 from miricigale.fitting.priors import GridAxis
-from miricigale.fitting.quantities import DERIVED_LEVELS, plain
+from miricigale.fitting.quantities import DERIVED_LEVELS, FORMED_TEXT, plain
 from miricigale.fitting.results import FitResults
 from miricigale.fitting.samplers import CITATIONS, get_sampler
 from miricigale.fitting.samplers.run import Calls, FluxModel, positive_normal, systematic_draws
@@ -228,7 +228,7 @@ class SamplerFit:
             best_scale=out["best"]["mass"],
             quantities=quantities,
             units=(MASS, *(column.unit for column in columns.values())),
-            descriptions=("mass of stars formed", *(c.text for c in columns.values())),
+            descriptions=(FORMED_TEXT, *(c.text for c in columns.values())),
             intensive=tuple(name for name, column in columns.items() if not column.extensive),
             constants=self.settings()["constants"],
             **out,
