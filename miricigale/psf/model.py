@@ -4,11 +4,13 @@ import functools
 
 import astropy.units as u
 import numpy as np
+from astropy.io import fits
 from astropy.nddata import NDData
 from photutils.psf import GriddedPSFModel, ImagePSF
 
 from miricigale.psf import _core
 from miricigale.utils.exceptions import PSFWarning, argument_error, warn
+from miricigale.utils.files import write_fits
 from miricigale.utils.options import check_that
 from miricigale.utils.unified import read_write
 from miricigale.utils.units import ANGLE, check_count, positive, to_array
@@ -225,6 +227,52 @@ class PSFGrid(GriddedPSFModel):
             setattr(self, name, getattr(first, name))
         self.pixel_scales = u.Quantity([psfs[k].pixel_scale for k in order])
         self.pixel_scale = self.pixel_scales.mean()
+
+    def write_stdpsf(self, path, *, overwrite=False):
+        """
+        Write the grid as STDPSF, which ``photutils.psf.GriddedPSFModel.read(path, format="stdpsf")`` reads.
+
+        Pixel, frame and what the PSFs include are in the header (PIXELSCL, FRAME), where that reader does not
+        look.
+
+        Parameters
+        ----------
+        path : path-like
+            The FITS file.
+        overwrite : bool, optional
+            Whether a file that is there is replaced.
+
+        Raises
+        ------
+        ValueError
+            If there are not 4 cells in a pixel, which the format takes for granted, or the positions are no full
+            grid, are no whole pixels, or as many as those of an instrument with several chips (36, 56, 90, 200).
+        OSError
+            If the file is there and ``overwrite`` is not set.
+        """
+        cells = np.unique(self.oversampling).tolist()
+        check_that(cells == [4], "oversampling", "4 for STDPSF", cells)
+        x, y = np.transpose(self.grid_xypos)
+        columns = np.unique(x)
+        rows = np.unique(y)
+        whole = np.all(columns == np.round(columns)) and np.all(rows == np.round(rows))
+        full = columns.size * rows.size == x.size and max(columns.size, rows.size) < 100
+        got = f"{x.size} positions at {columns.size} x and {rows.size} y"
+        check_that(full and whole, "positions", "a full grid of whole pixels for STDPSF", got)
+        # photutils takes these numbers for several chips
+        check_that(
+            x.size not in (36, 56, 90, 200), "positions", "of another number for STDPSF", got
+        )
+        header = fits.Header({"NXPSFS": columns.size, "NYPSFS": rows.size})
+        # 1-based pixels
+        for key, values in (("IPSFX", columns), ("JPSFY", rows)):
+            for i, value in enumerate(values.tolist()):
+                header[f"{key}{i + 1:02d}"] = int(value) + 1
+        header["PIXELSCL"] = (self.pixel_scale.to_value(ANGLE) / 4, "arcsec per cell")
+        header["FRAME"] = (str(self.frame), "frame of the axes")
+        if self.filter is not None:
+            header["FILTER"] = str(self.filter)
+        write_fits([fits.PrimaryHDU(np.asarray(self.data), header)], path, overwrite=overwrite)
 
 
 def instrument_psf(psf, argument="psf"):
