@@ -11,6 +11,7 @@ from miricigale.refdata import find_resource
 from miricigale.sed import components as c
 from miricigale.sed.xray_bands import ALPHA_OX
 from miricigale.utils.exceptions import ConfigError, config_error
+from miricigale.utils.missing import floats
 from miricigale.utils.table_files import read_table
 
 
@@ -174,7 +175,7 @@ def _sfhfromfile(m):
     rates = QTable()
     for i, name in enumerate(table.colnames):
         unit = table[name].unit or (u.Myr if i == 0 else u.Msun / u.yr)
-        rates["time" if i == 0 else name] = np.asarray(table[name], dtype=float) * u.Unit(unit)
+        rates["time" if i == 0 else name] = floats(table[name]) * u.Unit(unit)
     columns = m.numbers("sfr_column", 1)
     m.chain.differs.append("sfhfromfile: one step of 1 Myr less at the same age")
     values = m.values(c.TableSFH) | {"sfh_index": ("sfr_column", columns - 1.0)}

@@ -7,7 +7,8 @@ from astropy.table import Table
 
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.ids import counted_ids, id_column
-from miricigale.utils.missing import floats
+from miricigale.utils.missing import floats, mask_of
+from miricigale.utils.options import check_that
 from miricigale.utils.tables import require_columns, unique_ids
 from miricigale.utils.units import to_array
 
@@ -36,7 +37,10 @@ def catalog_sources(catalog):
     if "flux" in catalog.colnames:
         flux = floats(catalog["flux"])
     if "components" in catalog.colnames:
-        components = np.asarray(catalog["components"])
+        components = catalog["components"]
+        wanted = "a column 'components' without masked values"
+        check_that(not np.any(mask_of(components)), "catalog", wanted, "some")
+        components = np.asarray(components)
         if components.dtype.kind not in "iu" or not np.isin(components, (1, 2)).all():
             found = np.unique(components)[:5].tolist()
             raise argument_error("catalog", "a column 'components' of 1 and 2", f"{found}")

@@ -75,14 +75,20 @@ def id_column(colnames, argument, *, labels=True):
 
 
 def likely_ids(table):
-    """Names of columns of numbers or text that look like ids, though not by a usual name."""
+    """Names of columns of distinct numbers or texts that look like ids, though not by a usual name."""
     names = []
     for name in table.colnames:
         kind = getattr(getattr(table[name], "dtype", None), "kind", "")
         looks = _ID_PART.search(name) or _ID_END.search(name) or _plain(name) in _LIKELY
-        if looks and kind in "iufUSO" and table[name].ndim == 1:
+        if looks and kind in "iufUSO" and table[name].ndim == 1 and _is_distinct(table[name]):
             names.append(name)
     return names
+
+
+def _is_distinct(column):
+    """Whether no value of a column occurs twice, and none is missing."""
+    values = np.ma.getdata(getattr(column, "unmasked", column)).tolist()
+    return not np.any(getattr(column, "mask", False)) and len(set(values)) == len(values)
 
 
 def counted_ids(table, argument, start=0):

@@ -13,7 +13,9 @@ from miricigale.psf import gaussian_psf, psf_grid
 def grid(oversampling, positions):
     widths = np.linspace(0.2, 0.3, len(positions)) * u.arcsec
     psfs = [
-        gaussian_psf(width, pixel_scale=0.11 * u.arcsec, fov=2 * u.arcsec, oversampling=oversampling)
+        gaussian_psf(
+            width, pixel_scale=0.11 * u.arcsec, fov=2 * u.arcsec, oversampling=oversampling
+        )
         for width in widths
     ]
     return psf_grid(psfs, positions)
@@ -38,4 +40,6 @@ def test_photutils_reads_the_grid_with_its_values(tmp_path):
 def test_what_the_format_cannot_hold_is_refused(tmp_path):
     path = tmp_path / "g.fits"
     refuses("'oversampling' must be 4 for STDPSF", grid(3, POSITIONS).write_stdpsf, path)
-    refuses("whole pixels for STDPSF", grid(4, [(1.5, 2), (9, 2), (1.5, 9), (9, 9)]).write_stdpsf, path)
+    refuses(
+        "whole pixels for STDPSF", grid(4, [(1.5, 2), (9, 2), (1.5, 9), (9, 9)]).write_stdpsf, path
+    )
