@@ -175,8 +175,8 @@ def _of_text(path, unit):
         for line in lines
         if not line.startswith("#")
     ]
-    if rows and not _is_number(rows[0][0]):
-        # names of columns without a mark
+    if len(rows) > 2 and not (len(rows[0]) > 1 and all(map(_is_number, rows[0][:2]))):
+        # names of columns without a mark, or what LePhare has there: a number of rows and a name
         comments.append(" ".join(rows.pop(0)))
     try:
         data = _two_columns(rows)

@@ -32,6 +32,8 @@ def write(path, text):
         ("# um\n", MICRON),
         ("# micrometers\n", MICRON),
         ("wavelength_um throughput\n".replace("_", " "), MICRON),
+        ("# um\n 299  Z  7  (Z #846 WFI/2p2)\n", MICRON),
+        ("# um\n5\n", MICRON),
         ("\ufeff# wave (µm)\n\n   \n", MICRON.replace("\n", "\n\n")),
         ("# um\n", MICRON.replace(" ", ", ")),
         ("# um\n", "\n".join(reversed(MICRON.splitlines()))),
