@@ -163,8 +163,14 @@ def _largest(column):
 def _first_table(hdus):
     """Number of the first table of a FITS file, without that of keywords; None if there is none."""
     tables = [i for i, hdu in enumerate(hdus) if isinstance(hdu, (fits.BinTableHDU, fits.TableHDU))]
-    if len(tables) == 2 and hdus[tables[0]].name == LDAC_HEADER:
-        return tables[1]
+    objects = [i for i in tables if hdus[i].name != LDAC_HEADER]
+    if len(objects) < len(tables):
+        if len(objects) != 1:
+            msg = (
+                f"it is FITS_LDAC with {len(objects)} tables of objects: name one, such as FILE[2]"
+            )
+            raise ValueError(msg)
+        return objects[0]
     # astropy takes the first, and warns if there are more
     return None
 

@@ -3,6 +3,7 @@
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.table import MaskedColumn, QTable, Table
 from astropy.utils.masked import Masked
@@ -216,3 +217,38 @@ def test_frames_of_arrow_are_exact_and_name_what_they_lose():
 def test_ids_that_occur_twice_are_warned_of_with_the_first_three():
     with pytest.warns(CatalogWarning, match=r"5 rows have an id .* \(4, 1, 9, \.\.\.\)"):
         warn_of_duplicates([4, 4, 1, 9, 1, 9, 8, 8, 4], "photometry")
+
+
+def test_the_table_of_objects_of_fits_ldac_is_the_catalog(tmp_path):
+    """SExtractor writes a table of keywords before each table of objects."""
+    header = fits.BinTableHDU(Table({"Field Header Card": ["SIMPLE"]}), name="LDAC_IMHEAD")
+    objects = fits.BinTableHDU(Table({"NUMBER": [3, 7], "f": [1.0, 2.0]}), name="LDAC_OBJECTS")
+    path = tmp_path / "c.ldac"
+    fits.HDUList([fits.PrimaryHDU(), header, objects]).writeto(path)
+    for name in (path, f"{path}[2]", f"{path}[LDAC_OBJECTS]"):
+        assert read_table(name, wanted="a table")["NUMBER"].tolist() == [3, 7]
+        assert open_rows(name, 1).chunk(1)["NUMBER"].tolist() == [7]
+    two = tmp_path / "two.ldac"
+    fits.HDUList([fits.PrimaryHDU(), header, objects, header, objects]).writeto(two)
+    refuses("2 tables of objects: name one", read_table, two, wanted="a table", error=OSError)
+
+
+def test_regions_are_refused_in_a_sentence(tmp_path):
+    path = tmp_path / "a.reg"
+    path.write_text('# Region file format: DS9 version 4.1\nfk5\ncircle(53.1,-27.8,0.5")\n')
+    refuses(
+        "a region file of DS9: save the regions as a table",
+        read_table,
+        path,
+        wanted="a table",
+        error=OSError,
+    )
+
+
+def test_a_table_with_positions_is_read_in_pieces(tmp_path):
+    table = QTable({"id": [1, 2, 3], "f": [1.0, 2.0, 3.0] * u.uJy})
+    table["sky"] = SkyCoord([53.1, 53.2, 53.3] * u.deg, [-27.8] * 3 * u.deg)
+    table.write(tmp_path / "s.fits")
+    rows = open_rows(tmp_path / "s.fits", 2)
+    assert rows.colnames == ("id", "f", "sky")
+    assert rows.chunk(1)["sky"].ra.deg.tolist() == [53.3]
