@@ -401,7 +401,9 @@ def _translate_rows(text):
 
 def _translated(rows, path):
     """Arguments of a `CatalogMap` from the rows of a translate file of EAZY."""
-    columns, factors, left_out = {}, {}, []
+    columns = {}
+    factors = {}
+    left_out = []
     names = {"id": "id", "z_spec": "redshift", "ra": "ra", "dec": "dec"}
     for theirs, meaning, factor in rows:
         kind = meaning[:1].upper()

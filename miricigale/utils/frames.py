@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from miricigale.utils.ids import id_column
+from miricigale.utils.ids import is_id_name
+from miricigale.utils.options import check_that
 
 
 def is_frame(data):
@@ -39,7 +40,7 @@ def frame_columns(data, argument):
         table = arrow_table(rows, where=argument)
         return {name: table[name] for name in table.colnames}
     columns = {str(name): _of_series(data[name]) for name in data.columns}
-    return _of_index(data, columns) | columns
+    return _of_index(data, columns, argument) | columns
 
 
 def as_column(values):
@@ -55,20 +56,26 @@ def as_column(values):
     return values
 
 
-def _of_index(data, columns):
-    """Columns of an index, whose names are not among those of the frame."""
+def _of_index(data, columns, argument):
+    """Columns of an index that the frame does not have."""
     index = data.index
-    if index.nlevels > 1:
-        levels = [(name, index.get_level_values(i)) for i, name in enumerate(index.names)]
-        return {
-            str(n): _of_series(level) for n, level in levels if n is not None and n not in columns
-        }
-    counts = hasattr(index, "step") and index.start == 0 and index.step == 1
-    if index.name is None:
+    if index.nlevels == 1 and index.name is None:
+        counts = hasattr(index, "step") and index.start == 0 and index.step == 1
         # rows of a frame that has no other ids are known by it
-        named = counts or id_column(columns, "photometry") is not None
+        named = counts or any(map(is_id_name, columns))
         return {} if named else {"id": _of_series(index)}
-    return {} if str(index.name) in columns else {str(index.name): _of_series(index)}
+    levels = {}
+    for i, name in enumerate(index.names):
+        if name is None:
+            continue
+        values = _of_series(index.get_level_values(i))
+        if str(name) in columns:
+            same = np.array_equal(np.ma.filled(values), np.ma.filled(columns[str(name)]))
+            wanted = "a frame whose index and columns have different names"
+            check_that(same, argument, wanted, f"two of {str(name)!r} that differ")
+        else:
+            levels[str(name)] = values
+    return levels
 
 
 def _of_series(series):

@@ -259,7 +259,8 @@ class Duplicates:
     """
 
     def __init__(self):
-        self.n_rows, self.first = 0, []
+        self.n_rows = 0
+        self.first = []
 
     def add(self, ids, earlier=None):
         """Take the ids of a piece; ``earlier`` (bool, shape (n,)) are those of earlier pieces."""

@@ -201,7 +201,8 @@ def arrow_table(rows, cls=QTable, *, where=None):
     """
     pyarrow = require("pyarrow", extra="parquet")
     rows = _plain_columns(rows, where)
-    metadata, missing = dict(rows.schema.metadata or {}), {}
+    metadata = dict(rows.schema.metadata or {})
+    missing = {}
     for i, field in enumerate(rows.schema):
         column = rows.column(i)
         text = pyarrow.types.is_string(field.type)

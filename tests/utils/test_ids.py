@@ -196,6 +196,8 @@ def test_nullable_columns_and_the_index_of_pandas_are_kept():
     assert as_table(frame, "photometry")["object_id"].tolist() == [1001, 7]
     frame.index.name = None
     assert as_table(frame, "photometry")["id"].tolist() == [1001, 7]
+    frame = pandas.DataFrame({"id": [1, 2]}, index=pandas.Index([7, 8], name="id"))
+    refuses("two of 'id' that differ", as_table, frame, "photometry")
     rows = pandas.DataFrame({"id": ["a", "b", "c"], "f": [1.0, 2.0, 3.0]})[lambda one: one.f > 1]
     assert as_table(rows, "photometry").colnames == ["id", "f"]
     assert as_table(pandas.DataFrame({"f": [1.0]}), "photometry").colnames == ["f"]
