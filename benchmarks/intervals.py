@@ -8,7 +8,7 @@ Objects are models drawn from the prior: of any node, anywhere in its cell betwe
 the chain itself, with S/N 10 in 21 bands, u* to MIPS 24, or for the axes of surveys in 14 of HST, NIRCam and MIRI.
 They are not scattered by the model error of the fit, which stands for what the models of a grid are off by, unless
 ``--scattered``. ``--draws`` is ``interpolate`` of the fitter, ``--finer`` makes a finer grid. Grids have 0.8, 69
-and 17.6 million models. Printed are the parts of the truths in 68 and 95 % intervals, their binomial errors,
+and 20.5 million models. Printed are the parts of the truths in 68 and 95 % intervals, their binomial errors,
 milliseconds of CPU an object, in one call and one object a call, seconds to make the fitter, and the plain loop of
 ``benchmarks/fit.py``.
 """

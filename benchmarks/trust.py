@@ -179,14 +179,16 @@ def read_dots(path):
 def dots(grid, data, folder):
     raw, table = read_dots(folder / "lrd/cosmosweb_lrds_every7th.ecsv")
     names = list(DOT_BANDS.values())
-    settings = GridSettings(mass_function=MassFunction())
+    # evidences are those of the nodes in any case
+    alone = GridSettings(interpolate=0)
+    settings = GridSettings(interpolate=0, mass_function=MassFunction())
     known = {"priors": {"frac_agn": agn_fraction_prior(grid.frac_agn)}, "settings": settings}
     for label, some, bands in (("red dots", table, names), ("CEERS", data[0], data[1])):
         z = red_dot_axes()["redshift"]
-        shapes, alone = template_grid(red_dots(), bands, redshift=z), GridSettings(interpolate=0)
+        shapes = template_grid(red_dots(), bands, redshift=z)
         prior = {"redshift": red_dot_prior(z)}
         dot = BayesFitter(shapes, bands, priors=prior, settings=alone, **ERRORS).fit(some)
-        for kind, options in (("flat", {}), ("priors", known)):
+        for kind, options in (("flat", {"settings": alone}), ("priors", known)):
             found = BayesFitter(grid, bands, **ERRORS, **options).fit(some)
             classes = compare_classes({"galaxy": found, "red_dot": dot})
             ratio, z = classes["log_ratio_red_dot"], found.median("redshift").value

@@ -142,7 +142,8 @@ def class_columns(results, *, prior=None):
 
 def _has_free_redshift(fit):
     """Whether a fit has found redshifts."""
-    return "redshift" in fit.axes and not fit.redshift_fixed
+    axis = fit.axes.get("redshift")
+    return axis is not None and axis.values.size > 1 and not fit.redshift_fixed
 
 
 def _of_class(values, place):

@@ -12,7 +12,16 @@ from scipy.special import logsumexp
 from helpers.errors import refuses
 from helpers.grids import photometry_table
 from miricigale.filters import FilterSet
-from miricigale.fitting import BayesFitter, FitFlags, TemplateError, compare_classes
+from miricigale.fitting import (
+    BayesFitter,
+    FitFlags,
+    GridSettings,
+    TemplateError,
+    compare_classes,
+    fit_file,
+    red_dot_prior,
+)
+from miricigale.fitting.classes import write_table
 from miricigale.fitting.pulls import without_warnings
 from miricigale.sed import (
     SED,
@@ -20,6 +29,7 @@ from miricigale.sed import (
     SEDModel,
     quasar_axes,
     read_spectra,
+    red_dot_axes,
     red_dots,
     template_grid,
 )
@@ -168,7 +178,7 @@ def test_spectra_at_redshifts_are_seen_behind_the_medium():
 
 
 def test_little_red_dots_are_no_dwarfs(fitters):
-    """Broken power laws between the nodes, with a line, are red dots, at 0.15 of 1 + z; galaxies stay such."""
+    """Broken power laws with H alpha of 700 A are red dots, at 0.15 of 1 + z; galaxies stay such."""
     bands = [
         "acs.f814w",
         "nircam.f115w",
@@ -179,16 +189,20 @@ def test_little_red_dots_are_no_dwarfs(fitters):
     ]
     z, wave = np.linspace(4.6, 7.4, 12), np.geomspace(0.03, 5, 4000)
     fnu = np.where(wave < 0.3645, (wave / 0.3645) ** -0.2, (np.minimum(wave, 0.9) / 0.3645) ** 3.2)
-    fnu += 0.2 * fnu.max() * (np.abs(wave / 0.6563 - 1) < 0.003)
+    # a box of 40 A over 17 times the continuum at 0.66 um
+    line = np.abs(wave / 0.6563 - 1) < 0.003
+    fnu[line] *= 1.0 + 700.0 / (0.006 * 6563.0)
     grid = template_grid({"dot": SED(wave * u.um, fnu * u.uJy)}, bands, redshift=z)
     dots = noisy(grid.galaxy[:, 0], 12, 3, z.astype(str), bands)
     error = {"model_error": 0.1}
     shapes = template_grid(red_dots(), bands, redshift=np.expm1(np.arange(1.1, 2.3, 0.04)))
-    classes = {"red_dot": BayesFitter(shapes, **error)}
+    nodes = GridSettings(interpolate=0)
+    classes = {"red_dot": BayesFitter(shapes, settings=nodes, **error)}
     axes = {name: axis.values for name, axis in fitters["galaxy"].priors.axes.items()}
     axes |= {"redshift": np.expm1(np.arange(0.02, 2.1, 0.05))}
     model = SEDModel.survey()
-    classes = {"galaxy": BayesFitter(model, bands, axes=axes, **error)} | classes
+    galaxies = BayesFitter(model, bands, axes=axes, settings=nodes, **error)
+    classes = {"galaxy": galaxies} | classes
     with without_warnings():
         found = {name: fitter.fit(dots) for name, fitter in classes.items()}
     assert np.sum(compare_classes(found)["class"] == "red_dot") >= 11
@@ -201,6 +215,124 @@ def test_little_red_dots_are_no_dwarfs(fitters):
     with without_warnings():
         found = {name: fitter.fit(table) for name, fitter in classes.items()}
     assert np.sum(compare_classes(found)["class"] == "galaxy") >= 38
+
+
+def test_tables_of_classes_are_the_same_in_parquet(fitters, tmp_path):
+    pytest.importorskip("pyarrow")
+    data = sources(2, 5)
+    data.write(tmp_path / "data.fits")
+    with without_warnings():
+        names = ("galaxy", "star")
+        found = {n: fit_file(fitters[n], tmp_path / "data.fits", tmp_path / n) for n in names}
+    for kind in ("fits", "parquet"):
+        write_table(found, tmp_path / f"table.{kind}")
+    table, packed = (QTable.read(tmp_path / f"table.{kind}") for kind in ("fits", "parquet"))
+    assert packed.colnames == table.colnames
+    assert table.colnames[:3] == ["id", "class", "class_probability"]
+    for name in ("class", "flags", "redshift_p50", "redshift_p16_galaxy", "log_ratio_star"):
+        np.testing.assert_array_equal(packed[name].tolist(), table[name].tolist())
+
+
+#: Little red dots with spectra: redshifts of de Graaff et al. 2025 (arXiv:2511.21820), and fluxes and errors in
+#: nJy of Kokorev et al. 2024 (arXiv:2401.09981) in F606W, F814W, F115W, F150W, F200W, F277W, F356W, F410M and
+#: F444W. Every third, by redshift, of those outside of COSMOS that are in both.
+WITH_SPECTRA = """
+3.702  20.7  67.4 68.1 90.2 171.9 616.8 586.8 692.5 725.4   8.1  6.1 3.6 3.1 2.7 2.7 2.6 3.9 3.4
+4.054  42.4  84.1 83.2 89.2 150.1 340.9 587.5 547.3 640.5   5.1  4.9 4.0 3.3 2.8 2.5 2.7 4.0 3.5
+4.543   8.5  24.4 31.4 32.6  31.1  85.5 218.5 128.4 138.8   3.6  4.0 2.0 2.8 2.3 2.2 1.8 3.4 2.6
+4.957  -3.4   4.2 17.8 26.3  32.9 148.9 372.6 576.2 439.9   4.5  5.0 2.9 3.4 2.9 2.1 2.3 4.8 3.4
+5.154   4.3  44.3 48.9 64.2  83.8 338.7 455.1 896.7 761.0   8.9 10.3 5.4 4.5 3.8 3.2 3.3 5.5 4.7
+5.442  -8.8  30.9 34.2 23.4  26.7  43.7  82.0 251.9 149.4   7.5  7.3 5.4 4.4 3.6 3.3 3.2 6.5 5.0
+5.630  -3.6   8.6 11.7 15.4  13.4  23.3  64.0  93.4 134.1   5.2  7.3 2.9 3.7 2.9 2.3 2.3 4.4 4.1
+5.685  -2.3  -1.8 15.0 18.0  20.5  66.2 141.1 189.7 260.0   3.2  3.6 1.9 2.8 2.2 1.9 1.7 3.5 2.8
+6.732  -5.8  -4.8 43.3 54.6  60.2  71.2 201.3 187.1 194.7   4.0  4.5 3.1 3.6 4.0 2.1 2.2 4.0 3.5
+7.098  -3.1   2.7 26.7 34.4  30.7  39.0  77.2 202.3 144.4   6.2  6.2 4.8 4.0 3.3 2.5 2.4 4.6 3.7
+7.769  -3.8   6.0  2.3 17.9  14.9  20.9  39.4  70.0  85.7   4.4  6.0 2.7 3.2 2.7 2.2 2.0 4.1 3.3
+"""
+
+
+def test_redshifts_of_little_red_dots_are_those_of_their_spectra():
+    """Published photometry and redshifts, none of which the models were made with."""
+    rows = np.array([line.split() for line in WITH_SPECTRA.split("\n") if line], dtype=float)
+    z, (flux, error) = rows[:, 0], 1e-3 * np.array([rows[:, 1:10], rows[:, 10:]])
+    names = ("f115w", "f150w", "f200w", "f277w", "f356w", "f410m", "f444w")
+    bands = ["acs.f606w", "acs.f814w", *(f"nircam.{name}" for name in names)]
+    axis = red_dot_axes()["redshift"][::2]
+    fitter = BayesFitter(
+        template_grid(red_dots(), bands, redshift=axis),
+        model_error=0.1,
+        priors={"redshift": red_dot_prior(axis)},
+        settings=GridSettings(interpolate=0),
+    )
+    with without_warnings():
+        results = fitter.fit(photometry_table(bands, flux, error, z.astype(str)))
+    apart = (results.median("redshift").value - z) / (1.0 + z)
+    assert abs(np.median(apart)) < 0.05
+    assert np.sum(np.abs(apart) < 0.15) >= 9
+    # models fit, and are of the envelopes that the spectra have
+    assert np.median(results.reduced_chi2) < 1.5
+    assert 3500 < np.median(results.median("temperature").value) < 6300
+
+
+def test_the_prior_of_red_dots_is_log_normal():
+    """Median at 5.5 and 68 % within a factor exp(0.25) of 6.5 in 1 + z, of nodes however they lie."""
+    even = np.expm1(np.linspace(np.log(2.0), np.log(20.0), 2001))
+    odd = np.sort(np.random.default_rng(2).uniform(1.0, 19.0, 3000))
+    for z in (even, odd):
+        below = np.cumsum(red_dot_prior(z))
+        wanted = 6.5 * np.exp([-0.25, 0.0, 0.25]) - 1.0
+        assert_allclose(np.interp(wanted, z, below), [0.1587, 0.5, 0.8413], atol=0.005)
+    refuses("'redshift' must be two or more, ascending", red_dot_prior, [3.0, 2.0])
+
+
+def test_an_object_has_the_redshift_of_its_class(fitters):
+    """Redshifts, fit and flags are the winner's own; those of the others stand beside it."""
+    n = 4
+    data = sources(n, 11)
+    data["wfc3.f160w"][0] = np.nan
+    for band in BANDS:
+        data[band][1] = np.nan
+    with without_warnings():
+        fits = {name: fitter.fit(data) for name, fitter in fitters.items()}
+    table = compare_classes(fits)
+    label = table["class"].astype(str)
+    assert set(label[2:]) == {"galaxy", "quasar", "star"}
+    tables = {name: fit.to_table() for name, fit in fits.items()}
+    levels = ("p16", "p50", "p84")
+    for row, name in enumerate(label):
+        # what was not fitted is as in the first class
+        own = tables[name or "galaxy"][row]
+        for column in ("redshift_mean", "redshift_std", "redshift_best", "redshift_odds"):
+            wanted = own[column] if name != "star" else 0.0 if column != "redshift_odds" else np.nan
+            assert_allclose(table[column][row], wanted, rtol=1e-12)
+        for level in levels:
+            wanted = 0.0 if name == "star" else own[f"redshift_{level}"]
+            assert_allclose(table[f"redshift_{level}"][row], wanted, rtol=1e-12)
+        for column in ("chi2_best", "reduced_chi2", "log_evidence"):
+            assert_allclose(table[column][row], own[column], rtol=1e-12)
+        other = int(FitFlags.OTHER_CLASS) if name in ("quasar", "star") else 0
+        assert table["flags"][row] == own["flags"] + other
+        if name:
+            chosen = table[f"probability_{name}"][row]
+            assert table["class_probability"][row] == chosen
+            assert chosen == max(table[f"probability_{one}"][row] for one in fits)
+    assert label[1] == ""
+    assert np.isnan(table["class_probability"][1])
+    for name in ("galaxy", "quasar"):
+        for level in levels:
+            wanted = tables[name][f"redshift_{level}"]
+            assert_allclose(table[f"redshift_{level}_{name}"], wanted, rtol=1e-12)
+        assert_allclose(table[f"reduced_chi2_{name}"], tables[name]["reduced_chi2"], rtol=1e-12)
+    # stars have no redshift that was fitted
+    assert "redshift_p50_star" not in table.colnames
+    # where redshifts are given nothing is said of them
+    given = np.full(len(data), 1.0)
+    fits = {
+        name: fitters[name].fit(data[2:4], redshift=given[2:4]) for name in ("galaxy", "quasar")
+    }
+    known = compare_classes(fits)
+    assert not [name for name in known.colnames if "redshift" in name]
+    assert known["class"].tolist() == label[2:4].tolist()
 
 
 def test_priors_of_classes_and_what_is_refused(fitters):

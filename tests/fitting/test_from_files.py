@@ -14,7 +14,13 @@ from numpy.testing import assert_allclose
 from helpers.commands import command
 from helpers.errors import refuses
 from miricigale.cli import main
-from miricigale.fitting import SurveyCalibration, fit_catalog, open_results
+from miricigale.fitting import (
+    FitFlags,
+    SurveyCalibration,
+    compare_classes,
+    fit_catalog,
+    open_results,
+)
 from miricigale.fitting.grid import GridEngine
 from miricigale.fitting.page import fit_page
 from miricigale.sed import SEDModel, read_spectra, template_grid
@@ -322,9 +328,26 @@ def test_a_catalog_is_sorted_into_galaxies_quasars_and_stars(
     total = table["probability_galaxy"] + table["probability_quasar"] + table["probability_star"]
     assert_allclose(total, 1.0, rtol=1e-12)
     assert np.all(table["log_ratio_star"][:5] < -5)
+    # one redshift, that of the class: stars have 0, and that as a galaxy stands beside it
+    found = {"galaxy": open_results(out)}
+    found |= {name: open_results(out / name) for name in ("quasar", "star")}
+    galaxy = found["galaxy"].to_table()
+    assert np.all(table["redshift_p50"][5:] == 0)
+    assert_allclose(table["redshift_p50"][:5], galaxy["redshift_p50"][:5], rtol=1e-12)
+    assert_allclose(table["redshift_p50_galaxy"], galaxy["redshift_p50"], rtol=1e-12)
+    assert_allclose(table["stellar_mass_p50"].value, galaxy["stellar_mass_p50"].value, rtol=1e-12)
+    assert table["stellar_mass_p50"].info.description.endswith("of the fit as a galaxy")
+    other = (table["flags"] & FitFlags.OTHER_CLASS) > 0
+    assert other.tolist() == [False] * 5 + [True] * 2
+    # the same in Python
+    same = compare_classes({name: results[:] for name, results in found.items()})
+    for name in same.colnames:
+        got = table[name].astype(str) if name == "class" else table[name]
+        np.testing.assert_array_equal(np.asarray(got), np.asarray(same[name]))
     page = (out / "page.html").read_text()
     assert "Galaxy, quasar or star" in page
     assert "that of the galaxy" in page
+    assert "those of the class of each object" in page
     monkeypatch.undo()
     # the fits of the classes are whole: the same command resumes from them, and finds nothing to do
     with pytest.warns(MiricigaleWarning, match="not fitted"):
