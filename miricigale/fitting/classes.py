@@ -2,6 +2,8 @@
 
 import warnings
 from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +39,7 @@ def fit_classes(path, output, *, classes=(), quasars=False, red_dots=False, star
     path, output, **options
         As for `~miricigale.fitting.fit_catalog`, which fits the galaxies. All classes have the same
         bands, errors of models, limits and known redshifts, but stars are at redshift 0, and in front of the Milky
-        Way's dust.
+        Way's dust. ``priors`` and ``pairs`` are of galaxies alone.
     classes : iterable of str or str, optional
         Classes besides galaxies: ``"quasars"``, ``"red_dots"``, ``"stars"`` (with ``stars``), or ``"all"``; as
         text with commas between them. The arguments below ask for one each.
@@ -77,7 +79,9 @@ def fit_classes(path, output, *, classes=(), quasars=False, red_dots=False, star
         # after the fit, which refuses what it cannot read before it loads the models
         from miricigale.sed import SEDModel, quasar_axes, red_dot_axes, template_grid
 
+        # of parameters of galaxies
         options.pop("pairs", None)
+        options.pop("priors", None)
 
         def fit(name, models, **more):
             own = options | more
@@ -90,7 +94,8 @@ def fit_classes(path, output, *, classes=(), quasars=False, red_dots=False, star
             if "red_dots" in names:
                 # lines that cross the bands are exact at the nodes, and these lie close
                 own = {"priors": {"redshift": red_dot_prior(red_dot_axes()["redshift"])}}
-                fit("red_dot", _red_dots, interpolate=0, agn_error=0.0, **own)
+                models = partial(red_dot_grid, ebv=options.get("ebv", 0.0))
+                fit("red_dot", models, interpolate=0, agn_error=0.0, **own)
             options.pop("redshift", None)
             if spectra is not None:
 
@@ -101,11 +106,31 @@ def fit_classes(path, output, *, classes=(), quasars=False, red_dots=False, star
     return found
 
 
-def _red_dots(bands):
-    """Grid of little red dots in some bands, and no axes."""
-    from miricigale.sed import red_dot_axes, red_dots, template_grid
+def red_dot_grid(bands, *, ebv=0.0):
+    """
+    Grid of little red dots, for ``models`` of `~miricigale.fitting.fit_catalog`.
 
-    return template_grid(red_dots(), bands, redshift=red_dot_axes()["redshift"]), None
+    Parameters
+    ----------
+    bands : list of str
+        The bands.
+    ebv : float, optional
+        Color excess of the Milky Way in mag, whose dust dims each band as a constant F_nu.
+
+    Returns
+    -------
+    grid : `~miricigale.sed.ModelGrid`
+        `~miricigale.sed.red_dots` at the redshifts of `~miricigale.sed.red_dot_axes`.
+    axes : None
+    """
+    from miricigale.sed import band_extinction, red_dot_axes, red_dots, template_grid
+
+    grid = template_grid(red_dots(), bands, redshift=red_dot_axes()["redshift"])
+    if ebv:
+        extinction = band_extinction(bands, ebv, beyond="transparent")
+        dimmed = [10.0 ** (-0.4 * extinction[band][0].value) for band in bands]
+        grid = replace(grid, galaxy=grid.galaxy * np.array(dimmed))
+    return grid, None
 
 
 @contextmanager

@@ -25,6 +25,8 @@ _FLAM = u.erg / u.s / u.cm**2 / u.AA
 #: How libraries write units that astropy does not know, in small letters.
 _UNITS = {"angstrom": u.AA, "angstroms": u.AA, "microns": u.um}
 _UNITS |= {"flam": _FLAM, "fnu": _FLAM * u.AA / u.Hz}
+#: Parameters that a grid has itself.
+_OF_GRIDS = frozenset({"redshift", "mass", "frac_agn"})
 #: Where spectra that end before are continued to.
 _FAR = 100.0  # um
 #: Part of the wavelengths at the end of a spectrum whose mean its continuation starts from.
@@ -194,19 +196,23 @@ def template_grid(spectra, filters, *, beyond="error", redshift=None):
 
 def _columns(seds):
     """
-    Parameters of templates, with meanings: their own, where these make a full grid, or their numbers.
+    Parameters of templates, with meanings: their own, where these are a full grid, or their numbers.
 
-    Of values that are all of the same names and differ from each other, each combination is there once.
+    Templates have their own parameters if all have the same, none is what a grid has itself, and each combination
+    of the values is there once.
     """
+    numbers = {"template": (np.arange(len(seds), dtype=float) * u.one, "number of the template")}
     names = list(seds[0].parameters)
-    columns = {}
-    if names and all(list(sed.parameters) == names for sed in seds):
-        columns = {name: u.Quantity([sed.parameters[name] for sed in seds]) for name in names}
-    points = set(zip(*(column.value.tolist() for column in columns.values()), strict=True))
-    n_grid = np.prod([np.unique(column.value).size for column in columns.values()])
-    if len(seds) > 1 and len(points) == len(seds) == n_grid:
-        return {name: (column, name) for name, column in columns.items()}
-    return {"template": (np.arange(len(seds), dtype=float) * u.one, "number of the template")}
+    alike = all(list(sed.parameters) == names for sed in seds)
+    if len(seds) < 2 or not names or not alike or _OF_GRIDS.intersection(names):
+        return numbers
+    columns = {name: u.Quantity([sed.parameters[name] for sed in seds]) for name in names}
+    values = [column.value.tolist() for column in columns.values()]
+    n_points = len(set(zip(*values, strict=True)))
+    n_grid = np.prod([len(set(own)) for own in values])
+    if not n_points == n_grid == len(seds):
+        return numbers
+    return {name: (column, name) for name, column in columns.items()}
 
 
 def _seen(seds, redshifts, filters):

@@ -21,12 +21,13 @@ from miricigale.fitting import (
     fit_file,
     red_dot_prior,
 )
-from miricigale.fitting.classes import write_table
+from miricigale.fitting.classes import red_dot_grid, write_table
 from miricigale.fitting.pulls import without_warnings
 from miricigale.sed import (
     SED,
     ModelGrid,
     SEDModel,
+    band_extinction,
     quasar_axes,
     read_spectra,
     red_dot_axes,
@@ -272,6 +273,19 @@ def test_redshifts_of_little_red_dots_are_those_of_their_spectra():
     # models fit, and are of the envelopes that the spectra have
     assert np.median(results.reduced_chi2) < 1.5
     assert 3500 < np.median(results.median("temperature").value) < 6300
+
+
+def test_red_dots_are_seen_behind_the_milky_way():
+    """Dust dims the bands of each spectrum as it does the spectrum itself."""
+    bands = ["acs.f814w", "nircam.f150w", "nircam.f444w", "miri.f770w"]
+    (clear, _), (dimmed, _) = (red_dot_grid(bands, ebv=ebv) for ebv in (0.0, 0.2))
+    spectra, z = list(red_dots().values()), clear.redshift
+    for row, k in ((0, 10), (700, 30), (1295, 50)):
+        seen = SED(spectra[row].wave * (1.0 + z[k]), spectra[row].fnu)
+        wanted = band_extinction(bands, 0.2, sed=seen, beyond="transparent")
+        found = -2.5 * np.log10(dimmed.galaxy[k, row] / clear.galaxy[k, row])
+        # of F814W light is in a part only, below Lyman alpha
+        assert_allclose(found, [wanted[band][0].value for band in bands], atol=0.03)
 
 
 def test_the_prior_of_red_dots_is_log_normal():

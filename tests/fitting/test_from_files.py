@@ -140,7 +140,9 @@ def test_real_galaxies_have_their_own_grid_whose_errors_are_logged(tmp_path, cap
         "8 fitted, wfc3.f125w",
         "miri.f770w            prior  1.000              3.30       15.0",
         "calibration 'CEERS, bands of cat.fits (",
-        "errors of the models 3 to 48 % of the flux; 2 to 15 % of the flux added to errors; priors of frac_agn, age",
+        "errors of the models 3 to 48 % of the flux",
+        "2 to 15 % of the flux added to errors",
+        "priors of frac_agn, age",
     ):
         assert text in caplog.text
     found = QTable.read(tmp_path / "out" / "table.fits")

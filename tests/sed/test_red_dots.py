@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
 from miricigale.fitting.interpolation import Nodes
-from miricigale.sed import SED, ModelGrid, red_dot, red_dot_axes, red_dots, template_grid
+from miricigale.sed import SED, ModelGrid, SEDModel, red_dot, red_dot_axes, red_dots, template_grid
 
 #: A red dot of one part and no lines.
 ENVELOPE = {"uv_to_optical": 0.0, "halpha_width": 0.0 * u.AA, "balmer_depth": 0.0}
@@ -118,6 +118,10 @@ def test_spectra_are_a_grid_of_their_parameters(tmp_path):
     rest = {key: sed for key, sed in spectra.items() if key != name}
     grid = template_grid(rest, BANDS, redshift=[4.0, 5.0])
     assert grid.galaxy_parameters.colnames == ["template"]
+    # spectra of a chain, whose redshift is none of a grid of templates, stay numbered too
+    model = SEDModel.yang2021(libraries="bundled", agn=False)
+    chain = {str(age): model.evaluate(age=age, redshift=0.5) for age in (1.0, 3.0)}
+    assert template_grid(chain, BANDS).galaxy_parameters.colnames == ["template"]
     plain = SED(spectra[name].wave, spectra[name].fnu)
     grid = template_grid(rest | {name: plain}, BANDS)
     assert grid.galaxy_parameters.colnames == ["template"]
