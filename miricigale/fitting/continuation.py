@@ -1,34 +1,23 @@
-"""
-Grids with what lies between their nodes, and the posteriors of objects there.
-
-A population of models begins as draws from models that fill the prior, by a power of the likelihood. From there it
-is led to the likelihood in steps, at each of which it is weighed, resampled and moved (sequential Monte Carlo: Del
-Moral et al. 2006, JRSS B 68, 411), along differences of members (ter Braak 2006, Stat. Comput. 16, 239; in some
-parameters at a time: Vrugt et al. 2009, Int. J. Nonlin. Sci. Num. Sim. 10, 273).
-"""
+"""Grids with what lies between their nodes, and the posteriors of objects there."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.special import ndtri
 from scipy.stats import qmc
 
 from miricigale.fitting import _core
+from miricigale.fitting.adaptive import AdaptiveSampler, places_to_values, redshift_peaks
 from miricigale.fitting.grid import GridEngine
 from miricigale.fitting.interpolation import InterpolatedModels, grid_models
-from miricigale.fitting.posterior import cell_edges
-from miricigale.fitting.samplers.run import systematic_draws
-from miricigale.utils.random import stream
+from miricigale.fitting.priors import GridAxis
 from miricigale.utils.units import Frozen
 
-#: Models that fill the prior, as a power of 2: of all redshifts, and of that of an object.
-_LIBRARY, _AT_REDSHIFT = 17, 13
-#: Moves of each member at every step; how often they are kept under the likelihood itself, and moves before that.
-_MOVES, _KEPT, _NEXT = 10, 6, 14
-#: Part of a population that the weights of a step may leave effective.
-_EFFECTIVE = 0.9
-#: Every so many of the kept say how likely a band is wrong.
-_SOME = 4
+#: Draws of the posterior on nodes that sampling begins with.
+N_START = 256
+#: Fluxes of galaxies that differ by less than this part, along an axis, are the same.
+_SAME_FLUX = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,49 +33,92 @@ class Continuation(Frozen):
         Models between its nodes.
     agn_error : float
         Error of the AGN's light as a part of it.
+    scramble : int, optional
+        Seed of the quasi-random points, which are those of all objects.
     """
 
     engine: GridEngine
     models: InterpolatedModels
     agn_error: float = 0.0
+    scramble: int = 1
 
     @cached_property
-    def cells(self):
-        """Edges of the cells around nodes of redshift, AGN fraction, axes of galaxies and of AGN: dict by name."""
+    def axes(self):
+        """`GridAxis` of redshift, AGN fraction, galaxies and AGN, in this order: dict by name."""
+        known, grid = self.engine.priors.axes, self.engine.grid
         out = {}
-        for name in self.models.parameters:
-            axis = self.engine.priors.axes.get(name)
-            values = self.engine.grid.frac_agn if axis is None else axis.values
-            out[name] = cell_edges(values)
-            # none beyond the outermost
-            out[name][[0, -1]] = values[[0, -1]]
+        for name, values in (("redshift", grid.redshift), ("frac_agn", grid.frac_agn)):
+            equal = np.full(values.size, 1.0 / values.size)
+            out[name] = known.get(name) or GridAxis(name, values, 1, name, equal)
+        for kind in ("galaxy", "agn"):
+            out |= {name: axis for name, axis in known.items() if axis.kind == kind}
         return out
+
+    def _models(self, kind):
+        """Model of each combination of values of the axes of a kind, -1 where there is none: (n_1, n_2, ...)."""
+        grid = self.engine.grid
+        n_models = grid.n_galaxies if kind == "galaxy" else grid.n_agn
+        return grid_models(self.engine.priors.axes, kind, n_models)
 
     @cached_property
     def space(self):
         """`_core.Space` of the cells."""
-        size = np.array([len(e) - 1 for e in self.cells.values()], np.int64)
-        edge, log_prior = np.zeros((len(size), max(size) + 1)), np.zeros((len(size), max(size)))
-        for i, (name, edges) in enumerate(self.cells.items()):
-            edge[i, : len(edges)] = edges
-            axis = self.engine.priors.axes.get(name)
-            if axis is not None and axis.kind in ("frac_agn", "agn"):
-                none = np.full(size[i], _core.NEVER)
-                log_prior[i, : size[i]] = np.log(axis.weights, where=axis.weights > 0, out=none)
-        axes = self.engine.priors.axes
-        galaxy = grid_models(axes, "galaxy", self.engine.grid.n_galaxies)
-        return _core.Space(size, edge, log_prior, galaxy.ravel(), galaxy.ndim, self.models.light)
+        axes = list(self.axes.values())
+        size = np.array([axis.values.size for axis in axes], np.int64)
+        low, high, log_prior = np.zeros((3, len(size), max(size)))
+        for i, axis in enumerate(axes):
+            n, values = size[i], axis.values
+            # none beyond the outermost
+            low[i, :n], high[i, :n] = np.clip(axis.cells(), values[0], values[-1])
+            if axis.kind in ("frac_agn", "agn"):
+                log_prior[i, :n] = _log(axis.weights)
+        galaxy = self._models("galaxy")
+        light = self.models.light
+        return _core.Space(size, low, high, log_prior, galaxy.ravel(), galaxy.ndim, light)
 
     @cached_property
-    def library(self):
-        """Models that fill the prior: places, (n, n_axes), their fluxes, cells and ln(prior)."""
-        return self._filled(qmc.Sobol(len(self.cells), seed=1).random_base2(_LIBRARY), 0.0)
+    def labels(self):
+        """`LabelTable` of objects whose redshift is free."""
+        return LabelTable.of_axes(list(self.axes.values()), self._without_effect)
 
-    def _filled(self, x, redshift):
-        n, n_bands = len(x), self.engine.galaxy.shape[2]
-        made = np.empty((n, n_bands), np.float32), np.empty((n, 2), np.int64), np.empty(n)
-        _core.fill_library(self.space, x, redshift, self._work(), *made)
-        return x, *made
+    @cached_property
+    def labels_at_redshift(self):
+        """The same where it is known: redshift is then no axis."""
+        return self.labels.without_first_axis()
+
+    @cached_property
+    def _without_effect(self):
+        """Which axes (columns) have no effect where what others (rows) measure is absent: (n_axes, n_axes)."""
+        axes = list(self.axes.values())
+        out = np.zeros((len(axes), len(axes)), bool)
+        for kind in ("galaxy", "agn"):
+            own = [i for i, axis in enumerate(axes) if axis.kind == kind]
+            model = self._models(kind)
+            for k, i in enumerate(own):
+                if not axes[i].absent_at_zero:
+                    continue
+                absent = model.take([0], axis=k)
+                for m, j in enumerate(own):
+                    first = absent.take([0], axis=m)
+                    out[i, j] = j != i and self._same(kind, absent, first)
+        out[1, [axis.kind == "agn" for axis in axes]] = True
+        return out
+
+    def _same(self, kind, models, first):
+        """Whether models have the fluxes of others, which broadcast; where both are there."""
+        both = (models >= 0) & (first >= 0)
+        a, b = np.broadcast_arrays(models, first)
+        a, b = a[both], b[both]
+        if kind == "galaxy":
+            dust = self.engine.grid.dust_luminosity
+            if not np.allclose(dust[a], dust[b], rtol=_SAME_FLUX, atol=0):
+                return False
+        table = getattr(self.engine, kind)
+        for z in {0, len(table) // 2, len(table) - 1}:
+            top = np.abs(table[z, b]).max(axis=-1, keepdims=True, initial=0.0)
+            if np.any(np.abs(table[z, a] - table[z, b]) > _SAME_FLUX * top):
+                return False
+        return True
 
     def _work(self):
         return self.models.make_work()
@@ -121,58 +153,47 @@ class Continuation(Frozen):
         new["mass_prior"] = prior and (lambda formed, _: prior(formed, [node]))
         return replace(engine, **new)
 
-    def draw(self, n_draws, ids, redshifts, found, i, target, limits, log_usable, wrong):
+    def place(self, n_effective, redshifts, found, i, target, limits, log_usable, wrong, drawn, zf):
         """
-        Draw models between the nodes from the posterior of an object.
+        Put models between the nodes, with the weights of the posterior of an object.
 
         Parameters
         ----------
-        n_draws : int
-            Members of the population.
-        ids, redshifts : `~numpy.ndarray`, shape (n,)
-            Ids of objects, on which alone draws depend, and their redshifts; 0 if these are free.
+        n_effective : int
+            Effective number of models.
+        redshifts : `~numpy.ndarray`, shape (n,)
+            Redshifts of objects; 0 if these are free.
         found : dict
-            Gets, at ``i``, values of parameters, nodes in whose cells these are, and derived quantities (dicts of
-            str to arrays), and how likely each band is wrong (None for all if no model is possible), and the part
-            of moves of members that were taken.
-        i, target, limits, log_usable, wrong
+            Gets, at ``i``, a `BetweenPosterior`, or None if no model is possible.
+        i, target, limits, log_usable, wrong, drawn, zf
             What `GridEngine.fit` says of the object.
         """
-        redshift, rng = float(redshifts[i]), stream(0, "between", str(ids[i]))
+        redshift = float(redshifts[i])
         mixture = wrong and self._mixture(*wrong)
         one = _core.Object(target, limits, mixture, log_usable, redshift, self.agn_error)
-        free = np.flatnonzero(self.space.size > 1)
-        free = free[free > 0] if redshift else free
-        state = rng.integers(2**63, size=1, dtype=np.uint64)
-        places, *models = self.library
         if redshift:
-            places, *models = self._filled(places[: 2**_AT_REDSHIFT], redshift)
-        known, work = np.empty((2, len(places))), self._work()
-        _core.rate(one._replace(limits=None, mixture=None), *models, known)
-        some, power = _next_step(known[1], known[0], 0.0, n_draws, n_draws, rng)
-        x, now, kept = places[some], np.empty((n_draws, 5)), []
-        by = power * known[1, some]
+            labels, borders, weights = self.labels_at_redshift, np.zeros(0), np.ones(1)
+        else:
+            labels = self.labels
+            borders, weights = redshift_peaks(self.engine.grid.redshift, zf.sum(axis=1))
+        given = self.space, labels.kernel, self._work(), one, borders, weights
+        sampler = AdaptiveSampler(*given, wanted=n_effective, scramble=self.scramble)
+        label, score = labels.of_nodes(self._cells_of(drawn))
+        peak = np.searchsorted(borders, self.engine.grid.redshift[drawn[:, 0]])
+        models = sampler.run(label, score, peak)
+        found[i] = models and self._describe(models, one, wrong)
 
-        def move(power, rounds):
-            return _core.move(self.space, one, free, state, power, rounds, x, now, work)
-
-        move(1.0, 0)
-        while True:
-            by = np.where(now[:, 0] > 0.5 * _core.NEVER, -by, _core.NEVER)
-            if np.all(by == _core.NEVER):
-                found[i] = None, 0.0
-                return
-            some, power = _next_step(now[:, 1], by, power, _EFFECTIVE * n_draws, n_draws, rng)
-            x, now = x[some], now[some]
-            if power == 1.0:
-                break
-            move(power, _MOVES)
-            by = power * now[:, 1]
-        taken = 0.0
-        for _ in range(_KEPT):
-            taken += move(1.0, _NEXT) / (_KEPT * _NEXT * n_draws)
-            kept.append(np.hstack([x, now[:, 2:]]))
-        found[i] = self._describe(np.concatenate(kept).T, one, wrong, rng), taken
+    def _cells_of(self, drawn):
+        """Nodes of the axes of draws from the posterior on nodes: (n, n_axes)."""
+        z, g, k, f = drawn.T
+        columns = []
+        for axis in self.axes.values():
+            if axis.share is None:
+                columns.append(z if axis.kind == "redshift" else f)
+            else:
+                node = axis.share.argmax(axis=0)
+                columns.append(node[g if axis.kind == "galaxy" else np.maximum(k, 0)])
+        return np.stack(columns, axis=1)
 
     def _mixture(self, stated, sigma, broad):
         """`_core.Mixture` of an object."""
@@ -183,47 +204,161 @@ class Continuation(Frozen):
         level = 0.5 * np.log(narrow * np.square(sigma[used])).sum(axis=1)
         return _core.Mixture(narrow, wide**-2.0, odds, level, np.zeros(len(broad)))
 
-    def _describe(self, kept, one, wrong, rng):
-        *places, scale, variance, power = kept
-        values, node, share, rare = {}, {}, None, slice(None, None, _SOME)
-        for (name, edges), x in zip(self.cells.items(), places, strict=True):
-            y = x * (len(edges) - 1)
-            node[name] = np.minimum(y.astype(np.int64), len(edges) - 2)
-            values[name] = edges[node[name]] + (y - node[name]) * np.diff(edges)[node[name]]
+    def _describe(self, models, one, wrong):
+        """`BetweenPosterior` of models."""
+        values, node, share, weight = {}, {}, None, models.weight
+        for j, name in enumerate(self.axes):
+            node[name], values[name] = places_to_values(self.space, j, models.place[:, j])
+        n = len(weight)
         if one.redshift:
-            values["redshift"] = np.full(len(scale), one.redshift)
-        scale = self.engine.drawn_scale(scale, variance, rng)
+            values["redshift"] = np.full(n, one.redshift)
+        scale = self.engine.drawn_scale(models.scale, models.variance, models.uniform)
         if wrong:
-            some = {name: value[rare] for name, value in values.items()}
-            flux = self.models.fluxes(some, some["redshift"], some["frac_agn"])[0]
-            z, flux = 0 if one.redshift else node["redshift"][rare], flux * scale[rare, None]
-            share = self.engine.mixture.shares(flux, wrong[0], wrong[2], one.limits, z)
-        derived = self.models.describe(values, values["redshift"], power, scale)
-        return values, node, derived, share
+            flux = self.models.fluxes(values, values["redshift"], values["frac_agn"])[0]
+            z = 0 if one.redshift else node["redshift"]
+            given = flux * scale[:, None], wrong[0], wrong[2], one.limits, z, weight
+            share = self.engine.mixture.shares(*given)
+        derived = self.models.describe(values, values["redshift"], models.power, scale)
+        return BetweenPosterior(values, node, derived, weight, share, models)
 
 
-def _next_step(like, log, power, wanted, n, rng):
+@dataclass(frozen=True, eq=False)
+class BetweenPosterior:
     """
-    Draw n of some models by a weight of exp(log + power * like), the power being the largest that leaves enough.
+    Posterior of an object between nodes.
 
-    That is an effective number ``wanted``; the power grows in any case, to 1 at most. Returned are the models,
-    shape (n,), and the power.
+    Parameters
+    ----------
+    values, node, derived : dict of str to `~numpy.ndarray`, shape (n,)
+        Values of parameters, nodes in whose cells these are, and derived quantities, of n models.
+    weight : `~numpy.ndarray`, shape (n,)
+        Weights of the models; they sum to 1.
+    wrong : `~numpy.ndarray` or None, shape (nb,)
+        How likely each band is wrong.
+    models : `~miricigale.fitting.adaptive.PlacedModels`
+        The models as they were sampled.
     """
-    # some of many say how wide the likelihood is
-    few = slice(None, None, max(len(like) // 8192, 1))
-    part = wanted * len(like[few]) / len(like)
 
-    def weight(to, some=slice(None)):
-        value = log[some] + to * like[some]
-        return np.exp(np.maximum(value - value.max(), -700.0))
+    values: dict
+    node: dict
+    derived: dict
+    weight: np.ndarray
+    wrong: np.ndarray | None
+    models: object
 
-    def enough(to):
-        w = weight(to, few)
-        return np.sum(w) ** 2 >= part * np.sum(w * w)
 
-    low, high = max(power, 1e-4), 1.0
-    for _ in range(0 if enough(1.0) else 10):
-        middle = np.sqrt(low * high)
-        low, high = (middle, high) if enough(middle) else (low, middle)
-    power = 1.0 if enough(1.0) else min(1.02 * low, 1.0)
-    return systematic_draws(weight(power), n, rng), power
+@dataclass(frozen=True, eq=False)
+class LabelTable:
+    """
+    What posteriors between nodes tell apart: components that are absent or present, and values that are labels.
+
+    Parameters
+    ----------
+    kernel : `_core.Labels`
+        Ranges of cells and active axes of each.
+    of_range : `~numpy.ndarray` of int, shape (n_ranges_1, n_ranges_2, ...)
+        Label of each combination of the ranges of the axes; -1 where there is no prior weight.
+    range_of : list of `~numpy.ndarray` of int
+        Range of each cell, by axis.
+    """
+
+    kernel: tuple
+    of_range: np.ndarray
+    range_of: list
+
+    @classmethod
+    def of_axes(cls, axes, without_effect):
+        """Of `GridAxis`, and which have no effect where others are absent; see `Continuation`."""
+        n_axes = len(axes)
+        largest = max(axis.values.size for axis in axes)
+        ranges = [axis.ranges for axis in axes]
+        below, log_share = np.zeros((n_axes, largest + 1)), np.zeros((n_axes, largest))
+        for i, axis in enumerate(axes):
+            n = axis.values.size
+            # what is known of redshift comes with each object
+            weight = np.full(n, 1.0 / n) if axis.kind == "redshift" else axis.weights
+            below[i, 1 : n + 1] = np.cumsum(weight)
+            below[i, n + 1 :] = below[i, n]
+            log_share[i, :n] = _log(weight)
+        of_range = np.full([len(r) for r in ranges], -1)
+        known, rows = {}, []
+        for index in np.ndindex(of_range.shape):
+            absent = [axes[i].absent_at_zero and index[i] == 0 for i in range(n_axes)]
+            inert = without_effect[np.array(absent, bool)].any(axis=0)
+            cells = []
+            for i in range(n_axes):
+                cells.append((0, axes[i].values.size) if inert[i] else ranges[i][index[i]])
+            key = tuple(cells)
+            if key not in known:
+                first, count = np.array(cells).T
+                share = below[np.arange(n_axes), first + count] - below[np.arange(n_axes), first]
+                known[key] = len(rows) if np.all(share > 0) else -1
+                if known[key] >= 0:
+                    rows.append((first, count, inert | (count == 1)))
+            of_range[index] = known[key]
+        first, count, still = (np.array(column) for column in zip(*rows, strict=True))
+        kernel = _labels(first, count, still, below, log_share)
+        range_of = [np.repeat(np.arange(len(r)), [n for _, n in r]) for r in ranges]
+        return cls(kernel, of_range, range_of)
+
+    def without_first_axis(self):
+        """The same, but for the first axis, which has one cell."""
+        own = self.kernel
+        first, count = own.first.copy(), own.count.copy()
+        below, log_share = own.below.copy(), own.log_share.copy()
+        first[:, 0], count[:, 0] = 0, 1
+        below[0], log_share[0] = 1.0, 0.0
+        below[0, 0] = 0.0
+        still = np.ones(first.shape, bool)
+        for i, n in enumerate(own.n_active):
+            still[i, own.axes[i, :n]] = False
+        still[:, 0] = True
+        kernel = _labels(first, count, still, below, log_share)
+        return LabelTable(kernel, self.of_range, self.range_of)
+
+    def of_nodes(self, node):
+        """
+        Labels and scores of places anywhere in the cells of nodes.
+
+        Parameters
+        ----------
+        node : `~numpy.ndarray` of int, shape (n, n_axes)
+            Nodes of the axes.
+
+        Returns
+        -------
+        label : `~numpy.ndarray` of int, shape (n,)
+            Their labels.
+        score : `~numpy.ndarray`, shape (n, n_axes)
+            Quasi-random scores, the same for the same nodes; standard normal in axes without effect.
+        """
+        n, n_axes = node.shape
+        index = tuple(self.range_of[i][node[:, i]] for i in range(n_axes))
+        label, every = self.of_range[index], np.arange(n_axes)
+        uniform = qmc.Sobol(n_axes, seed=2).random(n)
+        own, below = self.kernel, self.kernel.below
+        first, count = own.first[label], own.count[label]
+        inside = (node >= first) & (node < first + count)
+        cell = np.where(inside, node, first)
+        start = below[every, first]
+        whole = below[every, first + count] - start
+        place = below[every, cell] + uniform * (below[every, cell + 1] - below[every, cell])
+        score = ndtri(np.clip((place - start) / whole, 1e-6, 1.0 - 1e-6))
+        active = np.zeros(own.first.shape, bool)
+        for i, k in enumerate(own.n_active):
+            active[i, own.axes[i, :k]] = True
+        return label, np.where(active[label], score, ndtri(np.clip(uniform, 1e-6, 1.0 - 1e-6)))
+
+
+def _labels(first, count, still, below, log_share):
+    """`_core.Labels` of ranges, of which some axes have no effect."""
+    axes, n_active = np.zeros(first.shape, np.int64), (~still).sum(axis=1)
+    for i, row in enumerate(~still):
+        axes[i, : n_active[i]] = np.flatnonzero(row)
+    first, count = first.astype(np.int64), count.astype(np.int64)
+    return _core.Labels(first, count, axes, n_active.astype(np.int64), below, log_share)
+
+
+def _log(weights):
+    """Logarithms of weights; of 0 a number that is none."""
+    return np.log(weights, where=weights > 0, out=np.full(np.shape(weights), _core.NEVER))

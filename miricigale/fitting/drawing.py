@@ -3,6 +3,7 @@
 import astropy.units as u
 import numpy as np
 
+from miricigale.fitting.posterior import cell_edges
 from miricigale.sed.spectrum import distance
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
@@ -148,7 +149,9 @@ def plot_pdf2d(results, x="redshift", y="frac_agn", ax=None, **kwargs):
         raise argument_error("frac_agn", "an axis of the grid", "a grid without AGN")
     weights = results._one("plot_pdf2d").joint_pdf(x, y)
     kwargs.setdefault("labels", tuple(labeled(name, results.unit(name)) for name in (x, y)))
-    edges = (results.distribution(name)[0].value for name in (x, y))
+    axes = (results.axes[name] for name in (x, y))
+    # those of the nodes, among which what is absent has a cell that can be seen
+    edges = (cell_edges(axis.values, axis.bounds) for axis in axes)
     return plot_pdf_2d(*edges, weights, ax=ax, **kwargs)
 
 

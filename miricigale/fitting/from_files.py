@@ -25,7 +25,7 @@ def fit_catalog(
     calibrate=True,
     catalog_map=None,
     ebv=0.0,
-    interpolate=200,
+    interpolate=600,
     agn_error=0.0,
     hdu=None,
     chunk_rows=10000,

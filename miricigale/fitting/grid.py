@@ -235,8 +235,9 @@ class GridEngine(Frozen):
             a time; made if not given.
         each : callable, optional
             Called with the row of each object that was fitted, its data, its limits (or None), 2 ln(prior) of the
-            galaxies, shape (nz, nG), and, if bands may be wrong (else None), its data with stated errors, these
-            errors and the broad ones, shape (nb,).
+            galaxies, shape (nz, nG), if bands may be wrong (else None), its data with stated errors, these
+            errors and the broad ones, shape (nb,), its draws, shape (n_draws, 4), and its posterior of redshift
+            and AGN fraction, shape (nz, nf).
 
         Returns
         -------
@@ -282,7 +283,8 @@ class GridEngine(Frozen):
                     out.outlier[i] = np.where(used, out.zf[i].sum(axis=1) @ wrong, np.nan)
                 if each is not None:
                     wrong = None if broad is None else (stated, sigma[i], broad[i])
-                    each(i, target, limits, tables.log_usable, wrong)
+                    drawn = out.draw_index[i], out.zf[i]
+                    each(i, target, limits, tables.log_usable, wrong, *drawn)
         return out
 
     def _of_masses(self, target, space):
@@ -387,16 +389,21 @@ class GridEngine(Frozen):
             rng = np.random.default_rng(int(seeds[i]))
             drawn = rng.choice(prior.size, size=n_draws, p=prior)
             index[i, :, 2] = np.where(index[i, :, 2] < 0, drawn, index[i, :, 2])
-            scale[i] = self.drawn_scale(scale[i], out.draw_scale[i, :, 1], rng)
+            uniform = 1.0 - rng.random(n_draws)
+            scale[i] = self.drawn_scale(scale[i], out.draw_scale[i, :, 1], uniform)
         return index, scale
 
-    def drawn_scale(self, scale, variance, rng):
-        """Scales drawn from the Gaussians about best ones, as far as they are positive; or these themselves."""
+    def drawn_scale(self, scale, variance, uniform):
+        """
+        Scales drawn from the Gaussians about best ones, as far as they are positive; or these themselves.
+
+        ``uniform``, shape (n,), are numbers above 0 and below, or equal to, 1.
+        """
         if not self.scale_error:
             return scale
         error = np.sqrt(np.maximum(variance, _TINY))
         low = ndtr(-scale / error)
-        return scale + error * ndtri(low + (1.0 - low) * (1.0 - rng.random(len(scale))))
+        return scale + error * ndtri(low + (1.0 - low) * uniform)
 
     @cached_property
     def _request(self):

@@ -7,7 +7,7 @@ import numpy as np
 
 from miricigale.filters import FilterSet
 from miricigale.fitting.between import between_nodes
-from miricigale.fitting.continuation import Continuation
+from miricigale.fitting.continuation import N_START, Continuation
 from miricigale.fitting.grid import GridEngine
 from miricigale.fitting.interpolation import InterpolatedModels
 from miricigale.fitting.likelihood import FitFlags, filter_names
@@ -242,8 +242,11 @@ class GridFit:
         # between nodes each object has an engine of its own
         own = self.between is not None and data.redshift is not None and self.grid.redshift.size > 1
         options, size = {}, self.engine.size
-        if joint and not own:
-            options = {"joint": joint, "workspace": self.engine.workspace(joint=joint)}
+        n_draws = 0 if self.between is None else N_START
+        if n_draws or joint:
+            options = {"joint": joint, "n_draws": n_draws}
+        if options and not own:
+            options["workspace"] = self.engine.workspace(n_draws, joint)
         # joint sums are large: those of a few objects are reduced before the next are made
         each = sum(size[x] * size[y] for x, y in joint)
         step = 1 if own else max(1, min(_JOINT_SIZE // max(each, 1), len(data)))
@@ -252,23 +255,25 @@ class GridFit:
             some, prior, found = data[rows], log_prior[rows], {}
             if self.between is not None:
                 known = some.redshift if own else np.zeros(len(some))
-                given = self.given.interpolate, some.ids, known, found
-                options["each"] = partial(self.between.draw, *given)
+                given = self.given.interpolate, known, found
+                options["each"] = partial(self.between.place, *given)
             if own and len(some):
-                results = self._at_redshift(some, prior, joint, pairs, options)
+                results = self._at_redshift(some, prior, pairs, options)
             else:
                 out = self.engine.fit(**some.of_engine(prior), **options)
                 results = self._results(some, out, pairs)
             parts.append(results if self.between is None else between_nodes(found, results))
         return FitResults.concatenate(parts)
 
-    def _at_redshift(self, data, log_prior, joint, pairs, options):
-        """Results at an object's own redshift, which stand at the nearest node."""
+    def _at_redshift(self, data, log_prior, pairs, options):
+        """Results at an object's own redshift, which stand at the nearest node; ``options`` get a workspace."""
         z, n_z = float(data.redshift[0]), log_prior.shape[1]
         fitted = np.isfinite(log_prior).any()
         node = int(np.argmax(log_prior[0]))
         engine = self.between.at_redshift(z if fitted else self.grid.redshift[0], node)
-        out = engine.fit(**data.of_engine(log_prior[:, node : node + 1]), joint=joint, **options)
+        if "workspace" not in options:
+            options["workspace"] = engine.workspace(options["n_draws"], options["joint"])
+        out = engine.fit(**data.of_engine(log_prior[:, node : node + 1]), **options)
         if fitted:
             out.index[:, 0] = node
         here = (np.arange(n_z) == node)[:, None]

@@ -76,8 +76,8 @@ class FitFlags(Flags):
     NO_LIKELIHOOD = 8192
     #: The best model has S/N below 3 over all bands: take masses and luminosities from samples.
     LOW_SIGNAL = 16384
-    #: Few models carry the posterior. On nodes alone: more than 95 % of it lies on one galaxy model at one
-    #: redshift. Between the nodes: less than 1 % of the moves of the models were taken.
+    #: Of nodes alone (``interpolate=0``): more than 95 % of the posterior lies on one galaxy model at one
+    #: redshift.
     ONE_NODE = 32768
     #: Less than 1 % of the posterior keeps ``max_dev_alpha_ox`` of CIGALE's module xray: the result is
     #: without it.
@@ -85,6 +85,9 @@ class FitFlags(Flags):
     #: The median stellar mass is below 3e6 solar masses at a redshift that was fitted, as of few sources that a
     #: survey detects: rather another redshift, a star, or a little red dot.
     LOW_MASS = 131072
+    #: The posterior between nodes is not converged: the effective number of models that ``interpolate`` asks for
+    #: was not reached, in all or in a redshift peak or kind of model with more than 2 % of the weight.
+    NOT_CONVERGED = 262144
     #: One band is off, that of the column ``band_off``: its residual to the best model is above 4 errors and makes
     #: 40 % of chi2 or more. Look at that flux before you trust the fit, or fit without it.
     BAND_OFF = 524288

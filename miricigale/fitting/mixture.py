@@ -106,14 +106,19 @@ class BandMixture:
                 wrong = np.where(some, expit(bad - good), wrong)
         return log.sum(axis=-1), wrong
 
-    def shares(self, model, target, broad, limits, z):
-        """How likely each band is wrong, shape (nb,), over models, (n, nb), at nodes ``z`` of redshift."""
+    def shares(self, model, target, broad, limits, z, weight):
+        """
+        How likely each band is wrong, shape (nb,), over models, (n, nb), at nodes ``z`` of redshift.
+
+        ``weight``, shape (n,), are the weights of the models, which sum to 1.
+        """
         with np.errstate(divide="ignore"):
             own = 1.0 / np.sqrt(target.weight[z])
         more = np.array([np.zeros(len(broad)), np.full(len(broad), np.inf)])
         if limits is not None:
             more[:, limits.bands] = limits.level / limits.inverse, 1.0 / limits.inverse
-        return self.log_likelihood(model, target.flux, own, broad, *more)[1].mean(axis=0)
+        wrong = self.log_likelihood(model, target.flux, own, broad, *more)[1]
+        return np.sum(weight[:, None] * wrong, axis=0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,5 +1,6 @@
 """Priors of the parameters of a grid, in weights of the nodes, and what is known of redshifts."""
 
+import functools
 from dataclasses import dataclass, replace
 
 import astropy.units as u
@@ -9,6 +10,7 @@ from scipy.integrate import cumulative_trapezoid
 from miricigale.fitting.likelihood import FitFlags
 from miricigale.fitting.posterior import cell_edges
 from miricigale.fitting.quantities import plain
+from miricigale.sed import COMPONENTS
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing import floats, without_mask
 from miricigale.utils.options import check_choice, check_names, check_that
@@ -53,6 +55,51 @@ class GridAxis:
     weights: np.ndarray
     share: np.ndarray | None = None
     bounds: tuple = (-np.inf, np.inf)
+
+    @property
+    def absent_at_zero(self):
+        """Whether the first of several values is 0 and means that what the parameter measures is not there."""
+        return bool(self.values.size > 1 and self.values[0] == 0) and self._declared_as(
+            "absent_at_zero"
+        )
+
+    @property
+    def label(self):
+        """Whether values are labels of what a library has, with nothing between them."""
+        return self.values.size > 1 and self._declared_as("label")
+
+    def _declared_as(self, what):
+        return _declared(tuple(COMPONENTS.names()), self.name, what)
+
+    @property
+    def ranges(self):
+        """First and number of the cells of each thing that posteriors between nodes tell apart: list of pairs."""
+        n = self.values.size
+        if self.label:
+            return [(i, 1) for i in range(n)]
+        return [(0, 1), (1, n - 1)] if self.absent_at_zero else [(0, n)]
+
+    def cells(self, bounds=(-np.inf, np.inf)):
+        """
+        Lowest and highest values of the cells between which the posterior has weight: two arrays, shape (n,).
+
+        Those of a label, and of a component that is absent, are the value itself; the first cell of what is
+        present begins at 0. The outermost are those of `~miricigale.fitting.posterior.cell_edges` with these bounds.
+        """
+        edges = cell_edges(self.values, bounds)
+        low, high = edges[:-1].copy(), edges[1:].copy()
+        if self.label:
+            return self.values.copy(), self.values.copy()
+        if self.absent_at_zero:
+            low[:2], high[0] = 0.0, 0.0
+        return low, high
+
+
+@functools.lru_cache(maxsize=1024)
+def _declared(components, name, what):
+    """Whether a component declares the parameter of this name so."""
+    declared = [COMPONENTS.get(one).declared().get(name) for one in components]
+    return any(getattr(parameter, what, False) for parameter in declared)
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,13 +42,17 @@ def unit_of(column):
     return getattr(column, "unit", None) or u.dimensionless_unscaled
 
 
-def draws_summary(value, *, with_log=True):
+def draws_summary(value, *, with_log=True, weight=None):
     """
     Mean, standard deviation and mean log10, and quantiles at `DERIVED_LEVELS`, of finite draws.
 
     The mean log10, of draws above 0, is NaN without ``with_log``: for quantities that do not scale with mass.
+    Draws have the same weight, or the weights ``weight``.
     """
-    value = value[np.isfinite(value)]
+    finite = np.isfinite(value)
+    if weight is not None:
+        return _weighted_summary(value[finite], weight[finite], with_log)
+    value = value[finite]
     if not value.size:
         return np.full(3, np.nan), np.full(DERIVED_LEVELS.size, np.nan)
     lit = value[value > 0]
@@ -58,19 +62,46 @@ def draws_summary(value, *, with_log=True):
     return np.array([value.mean(), value.std(), log]), quantiles
 
 
-def put_draws(results, new, i, values):
-    """Put moments and quantiles of derived quantities of draws, by name, into arrays of results, row ``i``."""
+def _weighted_summary(value, weight, with_log):
+    """Do what `draws_summary` does, of finite draws with weights."""
+    total = weight.sum()
+    if not total > 0:
+        return np.full(3, np.nan), np.full(DERIVED_LEVELS.size, np.nan)
+    weight = weight / total
+    mean = np.sum(weight * value)
+    std = np.sqrt(np.sum(weight * np.square(value - mean)))
+    lit, log = value > 0, np.nan
+    if with_log and np.any(lit):
+        log = np.sum(weight[lit] * np.log10(value[lit])) / weight[lit].sum()
+    order = np.argsort(value, kind="stable")
+    weight = weight[order]
+    # a value stands for half of its weight on either side
+    place = np.cumsum(weight) - 0.5 * weight
+    return np.array([mean, std, log]), np.interp(DERIVED_LEVELS, place, value[order])
+
+
+def put_draws(results, new, i, values, weight=None):
+    """
+    Put moments and quantiles of derived quantities of draws, by name, into arrays of results, row ``i``.
+
+    Draws have the same weight, or the weights ``weight``.
+    """
     for j, name in enumerate(results.quantities):
         if name in values:
             with_log = np.isfinite(results.moments[i, j, 2])
-            found = draws_summary(values[name], with_log=with_log)
+            found = draws_summary(values[name], with_log=with_log, weight=weight)
             new["moments"][i, j], new["quantiles"][i, j] = found
 
 
-def node_shares(nodes, shape):
-    """Part of the draws at each combination of nodes: arrays of indices, one for each axis of ``shape``."""
+def node_shares(nodes, shape, weight=None):
+    """
+    Part of the draws at each combination of nodes: arrays of indices, one for each axis of ``shape``.
+
+    Draws have the same weight, or the weights ``weight``.
+    """
     place = np.ravel_multi_index(nodes, shape)
-    return np.bincount(place, minlength=np.prod(shape)).reshape(shape) / len(place)
+    total = len(place) if weight is None else weight.sum()
+    return np.bincount(place, weight, minlength=np.prod(shape)).reshape(shape) / total
 
 
 def kept_percentiles(name, levels, kept):

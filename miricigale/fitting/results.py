@@ -345,12 +345,17 @@ class FitResults(FitRows):
         -------
         edges : `~astropy.units.Quantity`, shape (n_cells + 1,) or (n, n_cells + 1)
             Edges of the cells: those around the values of a parameter, or, for each object, the
-            quantiles of a derived quantity.
+            quantiles of a derived quantity. Between nodes a component that may be absent has a first cell of
+            no width at 0, whose weight is the probability that it is.
         weights : `~numpy.ndarray`, shape (n, n_cells) or (n_cells,)
             Weight of each cell; of the cells between quantiles the same for all.
         """
         if name in self.axes:
-            edges = cell_edges(self.axes[name].values, self.axes[name].bounds)
+            axis = self.axes[name]
+            edges = cell_edges(axis.values, axis.bounds)
+            if self.axis_quantiles is not None and axis.absent_at_zero:
+                # what is absent has a cell of no width, and what is present begins at 0
+                edges[:2] = 0.0
             return edges * self.unit(name), self.pdf[name]
         return self._kept(name, "quantiles") * self.unit(name), np.diff(DERIVED_LEVELS)
 

@@ -23,7 +23,7 @@ def _value(quantity, unit=None):
 
 def plot_pdf(edges, weights, *, ax=None, label=None, truth=None, log=False, **kwargs):
     """
-    Draw a one-dimensional posterior as density over its cells.
+    Draw a one-dimensional posterior as density over its cells; a cell of no width is a line with its weight.
 
     Parameters
     ----------
@@ -52,6 +52,18 @@ def plot_pdf(edges, weights, *, ax=None, label=None, truth=None, log=False, **kw
     width = np.diff(np.log10(np.maximum(edges, 1e-300)) if log else edges)
     density = np.divide(weights, width, out=np.zeros(weights.size), where=width > 0)
     ax.stairs(density, edges, **{"fill": True, "alpha": 0.5, **kwargs})
+    # the probability of a single value, such as that a component is absent
+    for i in np.flatnonzero((np.diff(edges) == 0) & (weights > 0)):
+        ax.axvline(edges[i], linewidth=3, alpha=0.5)
+        text = f"P({edges[i]:g}) = {weights[i]:.2f}"
+        ax.annotate(
+            text,
+            (edges[i], 0.95),
+            (4, 0),
+            va="top",
+            xycoords=("data", "axes fraction"),
+            textcoords="offset points",
+        )
     if log:
         ax.set_xscale("log")
     if truth is not None:

@@ -30,6 +30,11 @@ class Parameter:
     logarithms : tuple of float, optional
         Bare numbers between these are refused: they are logarithms rather than values. A quantity is what it
         says.
+    absent_at_zero : bool, optional
+        Whether 0 means that what the parameter measures is not there (no burst, no dust, no AGN), so that
+        other parameters of it have no effect. The prior of a fit then has a finite weight at 0 itself.
+    label : bool, optional
+        Whether values are labels of what a library has, with no models between them.
 
     Raises
     ------
@@ -45,12 +50,24 @@ class Parameter:
     0.3
     """
 
-    def __init__(self, default, bounds, doc, *, unit="", logarithms=None):
+    def __init__(
+        self,
+        default,
+        bounds,
+        doc,
+        *,
+        unit="",
+        logarithms=None,
+        absent_at_zero=False,
+        label=False,
+    ):
         self.unit = u.Unit(unit)
         self.logarithms = logarithms
         self.default = float(default)
         self.bounds = (float(bounds[0]), float(bounds[1]))
         self.doc = str(doc)
+        self.absent_at_zero = bool(absent_at_zero)
+        self.label = bool(label)
         self.name = ""
         self.check(self.default)
 
@@ -68,7 +85,10 @@ class Parameter:
 
     def replace(self, default, name=None):
         """Copy with another default, and another name if one is given."""
-        new = Parameter(default, self.bounds, self.doc, unit=self.unit, logarithms=self.logarithms)
+        kind = {"absent_at_zero": self.absent_at_zero, "label": self.label}
+        new = Parameter(
+            default, self.bounds, self.doc, unit=self.unit, logarithms=self.logarithms, **kind
+        )
         new.name = name or self.name
         return new
 

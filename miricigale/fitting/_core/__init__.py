@@ -6,7 +6,7 @@ pairs of galaxy and AGN model that can matter are listed by their bounds (`pairs
 `floors`), evaluated side by side (`lanes`, `single` in single precision, `limits` with upper
 limits) and summed up (`sums`, `histogram`); `summarize` turns the sums into moments and quantiles.
  `weigh_masses` (`masses`) puts a prior of mass in, `find_models` (`mixture`) finds wrong bands.
-`interpolate_light` (`between`) and `move` (`population`) are of models between the nodes.
+`interpolate_light` (`between`) and `evaluate_places` (`population`, `importance`) are of models between nodes.
 `structs` says what the kernels take, `rows` where it stands there, `workspace` makes it.
 """
 
@@ -26,17 +26,20 @@ from miricigale.fitting._core.histogram import (
     percentile_places,
     summarize,
 )
+from miricigale.fitting._core.importance import (
+    FREEDOM,
+    Labels,
+    Parts,
+    add_density,
+    add_widest,
+    evaluate_places,
+    fit_parts,
+    flatten,
+    propose,
+)
 from miricigale.fitting._core.masses import weigh_masses
 from miricigale.fitting._core.mixture import find_models
-from miricigale.fitting._core.population import (
-    NEVER,
-    Mixture,
-    Object,
-    Space,
-    fill_library,
-    move,
-    rate,
-)
+from miricigale.fitting._core.population import NEVER, Mixture, Object, Space
 from miricigale.fitting._core.structs import BLOCK, Request, Tables
 from miricigale.fitting._core.workspace import (
     JOINT,

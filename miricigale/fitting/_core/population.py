@@ -1,4 +1,4 @@
-"""Populations of models between the nodes of a grid that follow the posterior of an object."""
+"""Posterior of an object at places between the nodes of a grid."""
 
 import math
 from collections import namedtuple
@@ -6,18 +6,18 @@ from collections import namedtuple
 from miricigale.fitting._core.between import galaxy_light, with_agn
 from miricigale.fitting._core.functions import exponential
 from miricigale.fitting._core.limits import limited_scale
-from miricigale.fitting._core.structs import KERNEL, NO_LIGHT, PART
-from miricigale.fitting._core.sums import _uniform
+from miricigale.fitting._core.structs import NO_LIGHT, PART
 from miricigale.utils.compilation import njit
 
 #: ln of what has no probability, and below which there is none.
 NEVER, _NONE = -1e300, -1e200
 
-#: What populations move in: a unit interval for each axis (redshift, AGN fraction, those of galaxies, those of
-#: AGN), in which all cells are equally wide: their number, int64 (n_axes,), edges, (n_axes, n_largest + 1), and
-#: ln(prior) of those of AGN and their fractions, (n_axes, n_largest); the galaxies of all cells, int64, flat (-1:
-#: none), of which there are ``n_galaxy`` axes; and the `Light` between whose nodes models are interpolated.
-Space = namedtuple("Space", "size edge log_prior cells n_galaxy light")
+#: Where places are: a unit interval for each axis (redshift, AGN fraction, those of galaxies, those of AGN), in
+#: which all cells are equally wide: their number, int64 (n_axes,), lowest and highest values, (n_axes, n_largest),
+#: equal where a cell is a value (the atom of a component that is absent, a label), and ln(prior) of those of AGN
+#: and their fractions, (n_axes, n_largest); the galaxies of all cells, int64, flat (-1: none), of which there are
+#: ``n_galaxy`` axes; and the `Light` between whose nodes models are interpolated.
+Space = namedtuple("Space", "size low high log_prior cells n_galaxy light")
 #: An object: `Target`, `Limits` or None, `Mixture` or None, 2 ln(prior) of galaxies, (nz, nG), its redshift, 0 if
 #: that is free, and error of AGN light as a part of it.
 Object = namedtuple("Object", "target limits mixture log_usable redshift agn_error")
@@ -141,7 +141,7 @@ def _model(space, x, redshift, work):
         n = space.size[c]
         y = x[c] * n
         k = min(int(y), n - 1)
-        work.value[c] = space.edge[c, k] + (y - k) * (space.edge[c, k + 1] - space.edge[c, k])
+        work.value[c] = space.low[c, k] + (y - k) * (space.high[c, k] - space.low[c, k])
         log_prior += space.log_prior[c, k]
         if c == 0:
             node = k
@@ -162,30 +162,6 @@ def _model(space, x, redshift, work):
     return node, space.cells[g], log_prior
 
 
-@njit(**KERNEL)
-def fill_library(space, x, redshift, work, flux, index, prior):
-    """Fluxes of places, (n, n_bands); nodes of redshift and galaxies (-1: none), (n, 2)."""
-    for i in range(len(x)):
-        index[i, 0], index[i, 1], prior[i] = _model(space, x[i], redshift, work)
-        for b in range(flux.shape[1]):
-            flux[i, b] = work.flux[0, b]
-
-
-@njit(**KERNEL)
-def rate(one, flux, index, prior, known):
-    """Ln of prior and, but for limits and wrong bands, of the likelihood of a library: ``known``, shape (2, n)."""
-    target = one.target
-    for i in range(len(index)):
-        log, z = _prior(one, index[i, 0], index[i, 1])
-        p, q = 0.0, NO_LIGHT
-        for b in target.bands:
-            wm = target.weight[z, b] * flux[i, b]
-            p += wm * target.flux[b]
-            q += wm * flux[i, b]
-        like = 0.5 * (max(p, 0.0) ** 2 / q + target.level[z])
-        known[0, i], known[1, i] = log + prior[i], like
-
-
 @njit(**PART)
 def _evaluate(space, one, x, work):
     """Ln of the prior and of the likelihood of a place, its scale and the variance of that."""
@@ -195,48 +171,3 @@ def _evaluate(space, one, x, work):
         return NEVER, 0.0, 0.0, 0.0
     s, like, variance = _likelihood(one, one.limits, one.mixture, z, work)
     return prior + log, like, s, variance
-
-
-@njit(**PART)
-def _propose(x, i, free, state, new):
-    """
-    Move a member along the difference of two others, in some of the axes, from the end of one to its begin.
-
-    So the way back is as likely; reflected at the ends it would not be, where axes are correlated.
-    """
-    n = len(x)
-    a, b = int(_uniform(state) * n) % n, int(_uniform(state) * n) % n
-    # a third of the axes, two or all
-    part = (1 + int(_uniform(state) * 3.0) % 3) / 3.0
-    far = 2.38 * math.sqrt(_uniform(state) / (2.0 * max(part * len(free), 1.0)))
-    # from one peak to another
-    far = 1.0 if _uniform(state) < 0.1 else far
-    for c in range(x.shape[1]):
-        new[c] = x[i, c]
-    for c in free:
-        if _uniform(state) <= part:
-            y = new[c] + far * (x[a, c] - x[b, c]) + 1e-3 * (_uniform(state) - 0.5)
-            new[c] = y - math.floor(y)
-
-
-@njit(**KERNEL)
-def move(space, one, free, state, power, rounds, x, known, work):
-    """
-    Move all members of a population, ``x`` of shape (n, n_axes), so many times under a power of the likelihood.
-
-    ``known``, shape (n, 5), has ln of prior and likelihood, scale, its variance and AGN power; it is filled first
-    if there are no rounds. Returned is the number of moves that were taken.
-    """
-    taken = 0
-    for turn in range(max(rounds, 1) * len(x)):
-        i = turn % len(x)
-        _propose(x, i, free[: len(free) * min(rounds, 1)], state, work.new)
-        prior, like, s, v = _evaluate(space, one, work.new, work)
-        rise = prior - known[i, 0] + power * (like - known[i, 1])
-        if rounds == 0 or (prior > _NONE and math.log(_uniform(state)) < rise):
-            taken += 1
-            for c in range(x.shape[1]):
-                x[i, c] = work.new[c]
-            known[i, 0], known[i, 1], known[i, 2], known[i, 3] = prior, like, s, v
-            known[i, 4] = work.flux[0, len(work.flux[0]) - 1]
-    return taken

@@ -111,7 +111,9 @@ class AGN(Component):
     role = "agn"
     options = {"polar_law": (*_core.POLAR_LAWS, _GRAINS), "disk": tuple(_core.DISKS)}
     packages = ("dust_extinction",)
-    frac_agn = Parameter(0.0, (0.0, 0.999999), "AGN fraction, in the model's definition.")
+    frac_agn = Parameter(
+        0.0, (0.0, 0.999999), "AGN fraction, in the model's definition.", absent_at_zero=True
+    )
     inclination = Parameter(70.0, (0.0, 90.0), "Angle between axis and line of sight.", unit="deg")
     opening_angle = Parameter(
         40.0, (10.0, 80.0), "Angle between the equator and the edge of the torus.", unit="deg"
@@ -121,7 +123,9 @@ class AGN(Component):
         (-1.0, 1.0),
         "Added to the disk's optical slope, L_lambda ~ lambda^(-1.5 + disk_slope).",
     )
-    ebv_polar = Parameter(0.1, (0.0, 3.0), "Color excess of the polar dust.", unit="mag")
+    ebv_polar = Parameter(
+        0.1, (0.0, 3.0), "Color excess of the polar dust.", unit="mag", absent_at_zero=True
+    )
     temperature_polar = Parameter(100.0, (20.0, 1500.0), "Temperature of the polar dust.", unit="K")
     emissivity_polar = Parameter(1.6, (0.5, 3.0), "Emissivity index of the polar dust.")
 

@@ -129,7 +129,9 @@ class Attenuation(Component):
 class _Screen(Attenuation):
     """A curve k(lambda) times a color excess, which old stars have a share of."""
 
-    ebv = Parameter(0.3, (0.0, 3.0), "Color excess of stars below 10 Myr.", unit="mag")
+    ebv = Parameter(
+        0.3, (0.0, 3.0), "Color excess of stars below 10 Myr.", unit="mag", absent_at_zero=True
+    )
     ebv_factor = Parameter(1.0, (0.0, 1.0), "Color excess of older stars over that of young ones.")
 
     def _law(self, values):
@@ -241,7 +243,9 @@ class ModifiedStarburst(_Starburst):
     )
     packages = ("dust_extinction",)
     options = {"gas_law": ("mw", "lmc", "smc", "mw_pei1992")}
-    ebv_lines = Parameter(0.3, (0.0, 5.0), "Color excess of the gas.", unit="mag")
+    ebv_lines = Parameter(
+        0.3, (0.0, 5.0), "Color excess of the gas.", unit="mag", absent_at_zero=True
+    )
     ebv_factor_stars = Parameter(
         0.44, (0.0, 1.0), "Color excess of the stars over that of the gas."
     )
@@ -320,7 +324,9 @@ class CharlotFall(Attenuation):
 
     name = "charlot_fall"
     reference = "Charlot & Fall 2000, ApJ 539, 718; Boquien et al. 2019, A&A 622, A103"
-    av_ism = Parameter(1.0, (0.0, 10.0), "A_V of the interstellar medium.", unit="mag")
+    av_ism = Parameter(
+        1.0, (0.0, 10.0), "A_V of the interstellar medium.", unit="mag", absent_at_zero=True
+    )
     mu = Parameter(
         0.44, (1e-4, 1.0), "A_V of the interstellar medium over that of it and the birth clouds."
     )

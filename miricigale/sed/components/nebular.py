@@ -140,6 +140,7 @@ class Nebular(Component):
         0.02,
         (0.0001, 0.05),
         "Metallicity of the gas if gas='free': 0.0001, 0.0004, 0.004, 0.008, 0.02 or 0.05.",
+        label=True,
     )
     f_esc = Parameter(0.0, (0.0, 1.0), "Share of ionizing photons that leave the galaxy.")
     f_dust = Parameter(0.0, (0.0, 1.0), "Share of ionizing photons that dust absorbs.")

@@ -55,7 +55,7 @@ class BurstHistory(StarFormationHistory):
 
     linear = "f_burst"
     tau = Parameter(1.0, (0.001, 100.0), "E-folding time.", unit="Gyr")
-    f_burst = Parameter(0.0, (0.0, 0.99), "Mass fraction made in the burst.")
+    f_burst = Parameter(0.0, (0.0, 0.99), "Mass fraction made in the burst.", absent_at_zero=True)
     age_burst = Parameter(0.02, (0.001, 5.0), "Time since the burst began.", unit="Gyr")
     tau_burst = Parameter(0.05, (0.001, 100.0), "E-folding time of the burst.", unit="Gyr")
 
@@ -127,7 +127,7 @@ class DoubleExponentialSFH(BurstHistory):
         "E-folding time of the main history; negative: the rate rises; not within 1 Myr of 0.",
         unit="Gyr",
     )
-    f_burst = Parameter(0.01, (0.0, 0.99), "Mass fraction made in the burst.")
+    f_burst = Parameter(0.01, (0.0, 0.99), "Mass fraction made in the burst.", absent_at_zero=True)
 
     def history(self, values):
         return _core.double_exponential_history(*self._numbers(values))
@@ -201,7 +201,7 @@ class TableSFH(StarFormationHistory):
 
     name = "sfh_table"
     reference = "Boquien et al. 2019, A&A 622, A103, sect. 3.1.1"
-    sfh_index = Parameter(0, (0, 9999), "Which column of rates, counted from 0.")
+    sfh_index = Parameter(0, (0, 9999), "Which column of rates, counted from 0.", label=True)
     age = Parameter(
         1.0,
         (0.001, 13.7),

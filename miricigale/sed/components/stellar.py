@@ -164,6 +164,7 @@ class BC03(StellarPopulations):
         0.02,
         (0.0001, 0.05),
         "Mass fraction of metals: 0.0001, 0.0004, 0.004, 0.008, 0.02 (solar) or 0.05.",
+        label=True,
     )
 
     def nodes(self):
@@ -199,7 +200,10 @@ class BC03Library(StellarPopulations):
     reference = "Bruzual & Charlot 2003, MNRAS 344, 1000"
     resource = "ssp.bc03_user"
     metallicity = Parameter(
-        0.02, (0.0001, 0.1), "Mass fraction of metals, one of those that the files have."
+        0.02,
+        (0.0001, 0.1),
+        "Mass fraction of metals, one of those that the files have.",
+        label=True,
     )
 
     def _library(self):

@@ -1,0 +1,367 @@
+"""
+Kernels of adaptive importance sampling: places of labels, mixtures of t distributions, and their fits.
+
+A *label* is a range of cells on each axis: the one cell of a component that is absent or of a metallicity, or all
+cells of what is present. Within a label a place has one coordinate for each axis, the normal score of its place
+among the prior weights of these cells, so that where data say nothing the posterior is a standard normal
+distribution. Axes without effect for a label stay at it; the others are *active*.
+"""
+
+import math
+from collections import namedtuple
+
+from miricigale.fitting._core.functions import exponential
+from miricigale.fitting._core.population import NEVER, _evaluate
+from miricigale.fitting._core.structs import KERNEL, PART
+from miricigale.utils.compilation import njit
+
+#: Labels of a `Space`: first cell and number of cells of each axis, int64 (n_labels, n_axes); the active axes,
+#: int64 (n_labels, n_axes), and their number, (n_labels,); share of the proposal below each cell, (n_axes,
+#: n_largest + 1), and ln of the share of each, (n_axes, n_largest).
+Labels = namedtuple("Labels", "first count axes n_active below log_share")
+#: A mixture of n parts, sorted by label: index of the first part of each label, int64 (n_labels + 1,); label of
+#: each, int64 (n,); shares, (n,); largest densities, (n,); means in the active axes, (n, n_axes); lower triangular
+#: roots of the covariances, (n, n_axes, n_axes), and their inverses.
+Parts = namedtuple("Parts", "start label share top mean root inverse")
+
+#: Degrees of freedom of the t distributions.
+FREEDOM = 8
+_LOG_FREEDOM_PI = math.log(FREEDOM * math.pi)
+#: Part of a cell that places keep from its ends, so that rounding does not move them to another.
+_INSIDE = 1e-9
+#: Least square of a diagonal element of a root.
+_NARROW = 1e-10
+_ROOT_HALF = math.sqrt(0.5)
+_LOG_ROOT_TWO_PI = 0.5 * math.log(2.0 * math.pi)
+#: A normal distribution has a third of its weight above this number of standard deviations.
+_THIRD = 0.43
+
+
+@njit(**PART)
+def _to_unit(space, labels, label, y, x):
+    """Put the place of scores ``y`` in the unit intervals of a `Space`; returns -ln of the proposal's density."""
+    log = 0.0
+    for c in range(len(x)):
+        first, below = labels.first[label, c], labels.below[c]
+        last = first + labels.count[label, c] - 1
+        start = below[first]
+        whole = below[last + 1] - start
+        t = start + whole * 0.5 * math.erfc(-y[c] * _ROOT_HALF)
+        low, high = first, last
+        while low < high:
+            middle = (low + high + 1) // 2
+            if below[middle] <= t:
+                low = middle
+            else:
+                high = middle - 1
+        own = below[low + 1] - below[low]
+        part = (t - below[low]) / own if own > 0.0 else 0.5
+        part = min(max(part, _INSIDE), 1.0 - _INSIDE)
+        x[c] = (low + part) / space.size[c]
+        log += math.log(whole) - labels.log_share[c, low]
+    return log
+
+
+@njit(**KERNEL)
+def evaluate_places(space, labels, one, label, y, x, known, work):
+    """
+    Evaluate the posterior of an object at places.
+
+    Parameters
+    ----------
+    space, labels, one : `Space`, `Labels`, `Object`
+        What places are in, and the object.
+    label : `~numpy.ndarray` of int, shape (n,)
+        Labels of the places.
+    y : `~numpy.ndarray`, shape (n, n_axes)
+        Their scores.
+    x : `~numpy.ndarray`, shape (n, n_axes)
+        Gets the places in unit intervals.
+    known : `~numpy.ndarray`, shape (n, 4)
+        Gets ln of the posterior in scores over the standard normal distribution of the axes that are not active,
+        best scale, its variance and AGN power.
+    work : `Work`
+        Scratch.
+    """
+    for i in range(len(y)):
+        log = _to_unit(space, labels, label[i], y[i], x[i])
+        prior, like, scale, variance = _evaluate(space, one, x[i], work)
+        for a in range(labels.n_active[label[i]]):
+            score = y[i, labels.axes[label[i], a]]
+            log -= 0.5 * score * score + _LOG_ROOT_TWO_PI
+        known[i, 0] = log + prior + like if prior > 0.5 * NEVER else NEVER
+        known[i, 1], known[i, 2] = scale, variance
+        known[i, 3] = work.flux[0, len(work.flux[0]) - 1]
+
+
+@njit(**KERNEL)
+def propose(labels, parts, choice, normal, spread, label, y):
+    """
+    Draw places from a mixture.
+
+    Parameters
+    ----------
+    labels, parts : `Labels`, `Parts`
+        The mixture.
+    choice, normal, spread : `~numpy.ndarray`, shapes (n,), (n, n_axes) and (n,)
+        Uniform numbers, which choose parts; standard normal numbers; roots of ``FREEDOM`` over numbers of a chi2
+        distribution.
+    label, y : `~numpy.ndarray`, shapes (n,) and (n, n_axes)
+        Get labels and scores.
+    """
+    n_axes = y.shape[1]
+    for i in range(len(y)):
+        p, upto = 0, parts.share[0]
+        while upto < choice[i] and p + 1 < len(parts.share):
+            p += 1
+            upto += parts.share[p]
+        own = parts.label[p]
+        label[i] = own
+        for c in range(n_axes):
+            y[i, c] = normal[i, c]
+        axes, n = labels.axes[own], labels.n_active[own]
+        for a in range(n):
+            total = 0.0
+            for b in range(a + 1):
+                total += parts.root[p, a, b] * normal[i, axes[b]]
+            y[i, axes[a]] = parts.mean[p, a] + spread[i] * total
+
+
+@njit(**PART)
+def _copy_active(y, first, n, axes, n_active, coordinate):
+    """Copy active axes of n points, from point ``first`` on, to rows of ``coordinate``."""
+    for a in range(n_active):
+        row, axis = coordinate[a], axes[a]
+        for i in range(n):
+            row[i] = y[first + i, axis]
+
+
+@njit(**PART)
+def _squares(coordinate, n, n_active, mean, inverse, row, square):
+    """Squared distances of n points from a mean, in units of a covariance whose inverse root is known."""
+    square[:n] = 0.0
+    for a in range(n_active):
+        row[:n] = 0.0
+        for b in range(a + 1):
+            factor, middle, values = inverse[a, b], mean[b], coordinate[b]
+            for i in range(n):
+                row[i] += factor * (values[i] - middle)
+        for i in range(n):
+            square[i] += row[i] * row[i]
+
+
+@njit(**KERNEL)
+def add_density(labels, parts, times, ends, y, coordinate, density):
+    """
+    Add the density of a mixture at places to that of others.
+
+    Parameters
+    ----------
+    labels, parts : `Labels`, `Parts`
+        The mixture.
+    times : float
+        What its density is multiplied by.
+    ends : `~numpy.ndarray` of int, shape (n_blocks, n_labels + 1)
+        Blocks of places are sorted by label: index of the first of each label, and the end of the last.
+    y : `~numpy.ndarray`, shape (n, n_axes)
+        Scores.
+    coordinate : `~numpy.ndarray`, shape (n_axes + 2, n_block)
+        Scratch.
+    density : `~numpy.ndarray`, shape (n,)
+        Is added to.
+    """
+    n_axes = y.shape[1]
+    row, square = coordinate[n_axes], coordinate[n_axes + 1]
+    for block in range(len(ends)):
+        for own in range(len(labels.n_active)):
+            first = ends[block, own]
+            n = ends[block, own + 1] - first
+            if n == 0:
+                continue
+            n_active = labels.n_active[own]
+            _copy_active(y, first, n, labels.axes[own], n_active, coordinate)
+            for p in range(parts.start[own], parts.start[own + 1]):
+                _squares(coordinate, n, n_active, parts.mean[p], parts.inverse[p], row, square)
+                top = times * parts.share[p] * parts.top[p]
+                # (1 + square / FREEDOM)^(-(FREEDOM + n_active) / 2)
+                for i in range(n):
+                    row[i] = 1.0 / math.sqrt(1.0 + square[i] / FREEDOM)
+                    square[i] = top
+                for _ in range(FREEDOM + n_active):
+                    for i in range(n):
+                        square[i] *= row[i]
+                for i in range(n):
+                    density[first + i] += square[i]
+
+
+@njit(**PART)
+def _invert(cov, n, root, inverse):
+    """Lower triangular root of a covariance and its inverse; returned is ln of the root's determinant."""
+    log = 0.0
+    for a in range(n):
+        for b in range(a + 1):
+            total = cov[a, b]
+            for c in range(b):
+                total -= root[a, c] * root[b, c]
+            if a == b:
+                root[a, a] = math.sqrt(max(total, _NARROW))
+                log += math.log(root[a, a])
+            else:
+                root[a, b] = total / root[b, b]
+    for b in range(n):
+        inverse[b, b] = 1.0 / root[b, b]
+        for a in range(b + 1, n):
+            total = 0.0
+            for c in range(b, a):
+                total -= root[a, c] * inverse[c, b]
+            inverse[a, b] = total / root[a, a]
+    return log
+
+
+@njit(**PART)
+def _set_part(labels, parts, p, label, cov):
+    """Finish part p, whose mean is there, with a covariance in all active axes of its label."""
+    n = labels.n_active[label]
+    log = _invert(cov, n, parts.root[p], parts.inverse[p])
+    half = 0.5 * (FREEDOM + n)
+    log = math.lgamma(half) - math.lgamma(0.5 * FREEDOM) - log - 0.5 * n * _LOG_FREEDOM_PI
+    parts.label[p], parts.top[p] = label, math.exp(log)
+
+
+@njit(**KERNEL)
+def add_widest(labels, parts, places, mean, cov, own):
+    """Set a part for each label, at ``places`` of the mixture, of a mean and covariance of all axes."""
+    for label in range(len(places)):
+        axes, p = labels.axes[label], places[label]
+        for a in range(labels.n_active[label]):
+            parts.mean[p, a] = mean[axes[a]]
+            for b in range(a + 1):
+                own[a, b] = cov[axes[a], axes[b]]
+        _set_part(labels, parts, p, label, own)
+
+
+@njit(**PART)
+def _moments(coordinate, n, n_active, weight, mean, cov, row):
+    """Mean and covariance of n points with weights; returned are the sum of weights and of their squares."""
+    total, square = 0.0, 0.0
+    for i in range(n):
+        total += weight[i]
+        square += weight[i] * weight[i]
+    inverse = 1.0 / max(total, 1e-300)
+    for a in range(n_active):
+        values, first = coordinate[a], 0.0
+        for i in range(n):
+            first += weight[i] * values[i]
+        mean[a] = first * inverse
+    for a in range(n_active):
+        values, middle = coordinate[a], mean[a]
+        for i in range(n):
+            row[i] = inverse * weight[i] * (values[i] - middle)
+        for b in range(a + 1):
+            others, other, second = coordinate[b], mean[b], 0.0
+            for i in range(n):
+                second += row[i] * (others[i] - other)
+            cov[a, b] = second
+    return total, square
+
+
+@njit(**KERNEL)
+def fit_parts(labels, parts, p, label, n_parts, rounds, wide, y, weight, middle, around, scratch):
+    """
+    Fit parts of a mixture to points of one label, by expectation and maximization of normal distributions.
+
+    Parameters
+    ----------
+    labels, parts : `Labels`, `Parts`
+        Parts from p on are filled; their shares sum to 1.
+    label, n_parts, rounds : int
+        Label of the points; parts to fit, 3 at most, and rounds.
+    wide : float
+        What widths are multiplied by in the end.
+    y : `~numpy.ndarray`, shape (n, n_axes)
+        Scores of the points.
+    weight : `~numpy.ndarray`, shape (n,)
+        Their weights.
+    middle, around : `~numpy.ndarray`, shapes (n_axes,) and (n_axes, n_axes)
+        Mean and covariance of all axes that those of few points are drawn to.
+    scratch : tuple of `~numpy.ndarray`, shapes (n_axes + 2, n), (n_parts + 1, n), (n_axes, n_axes) and (n_parts,)
+    """
+    coordinate, each, cov, of_part = scratch
+    n, n_axes, n_active = len(weight), y.shape[1], labels.n_active[label]
+    axes, row, square = labels.axes[label], coordinate[n_axes], coordinate[n_axes + 1]
+    _copy_active(y, 0, n, axes, n_active, coordinate)
+    # begin with slices along the axis in which the points scatter most
+    total, _ = _moments(coordinate, n, n_active, weight, parts.mean[p], cov, row)
+    longest = 0
+    for a in range(n_active):
+        if cov[a, a] > cov[longest, longest]:
+            longest = a
+    center, width = parts.mean[p, longest], math.sqrt(max(cov[longest, longest], 1e-300))
+    for i in range(n):
+        d = (coordinate[longest, i] - center) / width if n_active > 0 else 0.0
+        k = 0
+        if n_parts == 2:
+            k = int(d > 0.0)
+        elif n_parts > 2:
+            k = int(d > -_THIRD) + int(d > _THIRD)
+        for j in range(n_parts):
+            each[j, i] = weight[i] if j == k else 0.0
+    n_rounds = rounds if n_parts > 1 else 1
+    for turn in range(n_rounds):
+        last = turn == n_rounds - 1
+        factor = wide * wide if last else 1.0
+        for j in range(n_parts):
+            own, squares = _moments(coordinate, n, n_active, each[j], parts.mean[p + j], cov, row)
+            of_part[j] = own / total
+            # few points say little of a covariance
+            few = n_active / (n_active + own * own / max(squares, 1e-300))
+            for a in range(n_active):
+                for b in range(a + 1):
+                    from_all = around[axes[a], axes[b]]
+                    cov[a, b] = factor * ((1.0 - few) * cov[a, b] + few * from_all)
+            if n_parts == 1:
+                for a in range(n_active):
+                    parts.mean[p, a] += few * (middle[axes[a]] - parts.mean[p, a])
+            _set_part(labels, parts, p + j, label, cov)
+            parts.share[p + j] = of_part[j]
+        if last:
+            return
+        # points belong to parts by the normal densities of these
+        sums = each[n_parts]
+        sums[:n] = 1e-280
+        for j in range(n_parts):
+            inverse, density = parts.inverse[p + j], of_part[j]
+            for a in range(n_active):
+                density *= inverse[a, a]
+            _squares(coordinate, n, n_active, parts.mean[p + j], inverse, row, square)
+            for i in range(n):
+                each[j, i] = density * exponential(max(-0.5 * square[i], -600.0))
+            for i in range(n):
+                sums[i] += each[j, i]
+        for j in range(n_parts):
+            for i in range(n):
+                each[j, i] *= weight[i] / sums[i]
+
+
+@njit(**KERNEL)
+def flatten(log, wanted, weight):
+    """
+    Weights exp(power * log), at most 1, of which an effective number is wanted; the power is 1 or less.
+
+    Returned are that power and the effective number.
+    """
+    top = NEVER
+    for i in range(len(log)):
+        top = max(top, log[i])
+    power = 1.0
+    while True:
+        total, square = 0.0, 0.0
+        for i in range(len(log)):
+            w = exponential(max(power * (log[i] - top), -600.0))
+            weight[i] = w
+            total += w
+            square += w * w
+        effective = total * total / square
+        if effective >= wanted or power < 0.02:
+            return power, effective
+        power *= 0.75

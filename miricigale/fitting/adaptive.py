@@ -1,0 +1,497 @@
+"""
+Posteriors of single objects between the nodes of a grid, by adaptive importance sampling.
+
+Places are drawn from a mixture of t distributions, weighed by the posterior over the mean of all mixtures so
+far, and the next mixture is fitted to them (adaptive multiple importance sampling: Cornuet et al. 2012, Scand.
+J. Stat. 39, 798). The first one is fitted to draws from the posterior on the nodes. Results rest on places
+drawn afterwards, from parts that do not depend on them: recycled weights are biased (Marin, Pudlo & Sedki 2019,
+Bernoulli 25, 2714), which takes from what has little weight. Points are quasi-random, and the same for all
+objects: nothing depends on the id or place of an object in its catalog.
+"""
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import chdtri, ndtri
+from scipy.stats import qmc
+
+from miricigale.fitting import _core
+
+#: Places in a round, and most places for each of the effective number that is wanted, and at least.
+ROUND_SIZE = 512
+_LARGEST_ROUND = 1024
+_MOST_EACH = 16
+_LEAST_MOST = 1 << 14
+#: Places fitted to: rounds, or effective number of them over that wanted in all, which doubles from time to time;
+#: and places after which it is seen whether their mixture will do.
+_ADAPTING_ROUNDS = 6
+_FIRST_GOAL = 0.3
+_TRIED = 2048
+_TRY_AGAIN = 4
+#: Weight of peaks of redshift and of labels that are to have this part of the effective number themselves.
+_COUNTS = 0.02
+_PART_EACH = 0.05
+_PART_LEAST = 30
+#: Least number of places with weights that results rest on, and part of them in each label that has weight.
+_LEAST_KEPT = 2048
+_LEAST_PLACES = 0.03
+#: Share of a mixture that all labels have, whatever their weight, and each peak and what has weight in it.
+_GUARD = 0.05
+#: Least efficiency, effective over number of places, of what has few of them.
+_LEAST_RATE = 0.05
+_LEAST_SHARE = 0.05
+#: Weight of a node's redshift, over the largest, below which there is none between peaks; and of a peak that
+#: counts.
+_GAP = 2e-3
+_PEAK = 0.005
+#: Weight, over that of its peak, below which no part is fitted.
+_LEAST_WEIGHT = 1e-3
+#: Effective numbers of points from which two and three parts are fitted, and rounds of the fit.
+_TWO_PARTS = 40
+_THREE_PARTS = 60
+_FIT_ROUNDS = 4
+#: Share of wide parts, of the mean and this times the covariance of all places of a peak, in all labels.
+_WIDE_SHARE = 0.2
+_WIDE_SQUARE = 1.4
+#: What widths are multiplied by.
+_WIDER = 1.1
+#: Effective number of points that the weights of a peak are flattened to for a fit, in each round, and at most.
+_FLAT_EACH = 50
+_FLAT_MOST = 150
+#: Weight of the models that are left out of results.
+_LEFT_OUT = 1e-4
+#: Uniform numbers keep this from 0 and 1.
+_END = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedModels:
+    """
+    Models between nodes with the weights of a posterior.
+
+    Parameters
+    ----------
+    place : `~numpy.ndarray`, shape (n, n_axes)
+        Places in the unit intervals of `~miricigale.fitting._core.Space`.
+    weight : `~numpy.ndarray`, shape (n,)
+        Weights; they sum to 1.
+    scale, variance, power : `~numpy.ndarray`, shape (n,)
+        Best scales and their variances, and AGN power for each solar mass formed.
+    uniform : `~numpy.ndarray`, shape (n,)
+        Quasi-random numbers for the scales' own errors.
+    n_effective : float
+        Effective number of models, and of models evaluated.
+    n_evaluated : int
+        Number of models evaluated.
+    log_evidence : float
+        ln of the mean likelihood over the prior, in the constant of the likelihood.
+    converged : bool
+        Whether the effective number is what was asked for.
+    """
+
+    place: np.ndarray
+    weight: np.ndarray
+    scale: np.ndarray
+    variance: np.ndarray
+    power: np.ndarray
+    uniform: np.ndarray
+    n_effective: float
+    n_evaluated: int
+    log_evidence: float
+    converged: bool
+
+
+@functools.lru_cache(maxsize=8)
+def quasi_random(n_axes, log2_n, scramble):
+    """
+    Sobol points for all objects.
+
+    Parameters
+    ----------
+    n_axes, log2_n : int
+        Axes of the space, and base-2 logarithm of the number n of points.
+    scramble : int
+        Seed of the scrambling.
+
+    Returns
+    -------
+    choice, uniform : `~numpy.ndarray`, shape (n,)
+        Uniform numbers, which choose a part of a mixture and the error of a scale.
+    normal : `~numpy.ndarray`, shape (n, n_axes)
+        Standard normal numbers.
+    spread : `~numpy.ndarray`, shape (n,)
+        What makes normal numbers those of a t distribution.
+    """
+    points = qmc.Sobol(n_axes + 3, seed=scramble).random_base2(log2_n)
+    points = np.clip(points, _END, 1.0 - _END)
+    normal = np.ascontiguousarray(ndtri(points[:, 3:]))
+    spread = np.sqrt(_core.FREEDOM / chdtri(_core.FREEDOM, points[:, 1]))
+    return points[:, 0].copy(), points[:, 2].copy(), normal, spread
+
+
+def redshift_peaks(redshift, posterior):
+    """
+    Peaks of a posterior on nodes of redshift that others separate which have next to no weight.
+
+    Parameters
+    ----------
+    redshift, posterior : `~numpy.ndarray`, shape (nz,)
+        Nodes and their weights, which sum to 1.
+
+    Returns
+    -------
+    borders : `~numpy.ndarray`, shape (n_peaks - 1,)
+        Redshifts between them.
+    weights : `~numpy.ndarray`, shape (n_peaks,)
+        Their weights.
+    """
+    high = posterior > _GAP * posterior.max()
+    # a peak reaches to the next nodes
+    high = np.convolve(high, [1, 1, 1], "same") > 0
+    change = np.diff(high.astype(int), prepend=0, append=0)
+    first = np.flatnonzero(change == 1)
+    last = np.flatnonzero(change == -1) - 1
+    borders = 0.5 * (redshift[last[:-1]] + redshift[first[1:]])
+    weights = np.bincount(np.searchsorted(borders, redshift), posterior, minlength=first.size)
+    return borders, weights
+
+
+class AdaptiveSampler:
+    """
+    Sampling of the posterior of one object.
+
+    Parameters
+    ----------
+    space, labels : `~miricigale.fitting._core.Space`, `~miricigale.fitting._core.Labels`
+        What places are in.
+    work : `~miricigale.fitting._core.Work`
+        Scratch of the models.
+    one : `~miricigale.fitting._core.Object`
+        The object.
+    borders, peaks : `~numpy.ndarray`
+        Redshifts between peaks, and weights of the peaks on the nodes; see `redshift_peaks`.
+    wanted : int
+        Effective number that is wanted.
+    scramble : int
+        Seed of the quasi-random points.
+    """
+
+    def __init__(self, space, labels, work, one, borders, peaks, *, wanted, scramble=1):
+        self.space, self.labels, self.work, self.one = space, labels, work, one
+        self.borders, self.peaks, self.wanted = borders, peaks, wanted
+        self.members = _of_ranges(labels)
+        n_axes, most = len(space.size), max(_MOST_EACH * wanted, _LEAST_MOST)
+        self.most = most
+        self.points = quasi_random(n_axes, int(np.ceil(np.log2(most))), scramble)
+        self.label = np.empty(most, np.int64)
+        self.score = np.empty((most, n_axes))
+        self.place = np.empty((most, n_axes))
+        self.known = np.empty((most, 4))
+        self.peak = np.zeros(most, np.int64)
+        self.density = np.zeros(most)
+        self.scratch = np.empty((n_axes + 2, _LARGEST_ROUND))
+        self.mixtures, self.ends = [], []
+        self.n = 0
+
+    def run(self, label, score, peak):
+        """
+        Sample until the effective number is reached.
+
+        Parameters
+        ----------
+        label, peak : `~numpy.ndarray` of int, shape (n,)
+            Labels and peaks of draws to begin with.
+        score : `~numpy.ndarray`, shape (n, n_axes)
+            Their scores.
+
+        Returns
+        -------
+        models : `PlacedModels` or None
+            None if no place has a probability above 0.
+        """
+        share = np.bincount(self._groups(label, peak), minlength=self.n_groups)
+        parts = self._fit(label, score, peak, np.ones(len(label)))
+        goal, enough = _FIRST_GOAL * self.wanted, False
+        while not enough and self.n < self.most:
+            # places that say where the posterior is
+            for _ in range(_ADAPTING_ROUNDS):
+                size = min(ROUND_SIZE, self.most - self.n)
+                self._add_round(parts.shared(self._guarded(share)), size)
+                rows = slice(0, self.n)
+                weight, top = self._weights(rows, self.density[rows] / self.n)
+                if weight is None:
+                    return None
+                effective, _, share = self._wanted(weight, rows)
+                parts = self._fit(*self._of_places())
+                if effective >= goal or self.n >= self.most:
+                    break
+            # and others, on which the parts do not depend: recycled places have too little weight where few are
+            first, total = self.n, np.zeros(len(parts.kernel.share))
+            missing = share
+            while self.n < self.most:
+                size = int(np.clip(missing.sum(), ROUND_SIZE, _LARGEST_ROUND)) & ~127
+                size = min(size, self.most - self.n)
+                mixture = parts.shared(self._guarded(missing))
+                self._add_round(mixture, size)
+                total += size * mixture.share
+                rows = slice(first, self.n)
+                density = self._density(mixture._replace(share=total), first) / total.sum()
+                weight, top = self._weights(rows, density)
+                if weight is None:
+                    return None
+                effective, enough, wanted = self._wanted(weight, rows)
+                n = self.n - first
+                # they would not be enough of them
+                hopeless = first + n * self.wanted / effective > self.most
+                enough = enough and n >= _LEAST_KEPT
+                if enough or (hopeless and n >= _TRIED and self.most - self.n > _TRY_AGAIN * n):
+                    break
+                has = np.bincount(
+                    self._groups(self.label[rows], self.peak[rows]), minlength=wanted.size
+                )
+                missing = np.maximum(wanted - has, 0.02 * wanted)
+            goal = 2.0 * goal
+            if not enough and self.n < self.most:
+                share, parts = wanted, self._fit(*self._of_places())
+        evidence = top + np.log(weight.mean())
+        return self._models(rows, weight, effective, enough, evidence)
+
+    @property
+    def n_groups(self):
+        """Number of labels in all peaks."""
+        return len(self.labels.n_active) * len(self.peaks)
+
+    def _groups(self, label, peak):
+        """Index of labels and peaks."""
+        return label * len(self.peaks) + peak
+
+    def _of_places(self):
+        """Labels, scores, peaks of all places, and weights for a fit of parts."""
+        rows = slice(0, self.n)
+        log = self.known[rows, 0] - np.log(self.density[rows])
+        return self.label[rows], self.score[rows], self.peak[rows], self._flatten(log)
+
+    def _density(self, mixture, first):
+        """Density of a mixture at the places from ``first`` on."""
+        out = np.zeros(self.n)
+        ends = np.concatenate([block for block in self.ends if block[0, 0] >= first])
+        given = 1.0, ends, self.score, self.scratch, out
+        _core.add_density(self.labels, mixture, *given)
+        return out[first:]
+
+    def _weights(self, rows, density):
+        """Weights, at most 1, of places drawn from a density, and ln of their unit; None if none is possible."""
+        log = self.known[rows, 0] - np.log(density)
+        top = log.max()
+        if not top > 0.5 * _core.NEVER:
+            return None, top
+        return np.exp(np.maximum(log - top, -700.0)), top
+
+    def _add_round(self, mixture, size):
+        """Draw places of a mixture, evaluate them, and add its density to that of all mixtures."""
+        new = slice(self.n, self.n + size)
+        choice, _, normal, spread = self.points
+        label, score = np.empty(size, np.int64), np.empty((size, self.score.shape[1]))
+        _core.propose(self.labels, mixture, choice[new], normal[new], spread[new], label, score)
+        order = np.argsort(label, kind="stable")
+        label, score = label[order], score[order]
+        self.label[new], self.score[new] = label, score
+        of_new = label, score, self.place[new], self.known[new], self.work
+        _core.evaluate_places(self.space, self.labels, self.one, *of_new)
+        if self.borders.size:
+            self.peak[new] = np.searchsorted(self.borders, self._redshift(self.place[new, 0]))
+        ends = self.n + np.searchsorted(label, np.arange(len(self.labels.n_active) + 1))[None]
+        self.mixtures.append((mixture, size))
+        for parts, times in self.mixtures:
+            self._add_density(parts, times, ends)
+        if self.n:
+            self._add_density(mixture, size, np.concatenate(self.ends))
+        self.ends.append(ends)
+        self.n += size
+
+    def _add_density(self, parts, times, ends):
+        """Add a mixture's density to that of all at blocks of places."""
+        given = float(times), ends, self.score, self.scratch, self.density
+        _core.add_density(self.labels, parts, *given)
+
+    def _redshift(self, place):
+        """Redshifts of places in the unit interval."""
+        return places_to_values(self.space, 0, place)[1]
+
+    def _wanted(self, weight, rows):
+        """
+        Effective number of weights, whether it is enough, and places wanted in each label and peak.
+
+        Most is had of a number of places if that of each label and peak is as its weight over the root of its
+        efficiency (Neyman allocation). Labels, peaks, and components that count have enough of their own.
+        """
+        group, whole = self._groups(self.label[rows], self.peak[rows]), weight.sum()
+
+        def of_groups(values=None):
+            return np.bincount(group, values, minlength=self.n_groups)
+
+        own, square, n = of_groups(weight), of_groups(weight * weight), of_groups()
+        effective = whole**2 / square.sum()
+        enough = bool(effective >= self.wanted)
+        each = np.square(own) / np.maximum(square, 1e-300)
+        rate = np.clip(each / np.maximum(n, 1), _LEAST_RATE, 1.0)
+        part = own / whole
+        wanted = self.wanted * part / np.sqrt(rate) * np.sum(part / np.sqrt(rate))
+        table = np.arange(n.size).reshape(-1, len(self.peaks))
+        parts = [table[members].ravel() for members in self.members]
+        least_each = max(_PART_EACH * self.wanted, _PART_LEAST)
+        for members in (*table, *table.T, *parts):
+            total = part[members].sum()
+            if total <= _COUNTS:
+                continue
+            has = (total * whole) ** 2 / square[members].sum()
+            enough = enough and bool(has >= least_each)
+            least = least_each * part[members] / total / rate[members]
+            wanted[members] = np.maximum(wanted[members], least)
+        # what has little weight so far may have more
+        some = part > _LEAST_WEIGHT
+        wanted[some] = np.maximum(wanted[some], _LEAST_PLACES * wanted.sum())
+        return effective, enough, wanted
+
+    def _guarded(self, share):
+        """Shares of labels and peaks: each label has some, and each peak of the nodes, whatever its weight."""
+        n_peaks = len(self.peaks)
+        share = share.reshape(-1, n_peaks) / share.sum()
+        of_peak = share.sum(axis=0)
+        least = np.where(self.peaks > _PEAK, _LEAST_SHARE, 0.0)
+        few = (of_peak > 0) & (of_peak < least)
+        share = share * np.where(few, least / np.maximum(of_peak, 1e-300), 1.0)
+        share = share / share.sum()
+        even = share.sum(axis=0) / len(share)
+        return ((1.0 - _GUARD) * share + _GUARD * even).ravel()
+
+    def _flatten(self, log):
+        """Weights for a fit, flat enough in each peak to say what its shape is."""
+        flat = np.zeros(self.n)
+        for j in range(len(self.peaks)):
+            rows = np.flatnonzero(self.peak[: self.n] == j)
+            if rows.size < 20:
+                continue
+            few = min(_FLAT_MOST, _FLAT_EACH * len(self.mixtures), 0.5 * rows.size)
+            own = np.empty(rows.size)
+            _core.flatten(log[rows], float(few), own)
+            flat[rows] = own / own.sum()
+        return flat
+
+    def _fit(self, label, score, peak, flat):
+        """`FittedParts` of labels and peaks with places of weights ``flat``, and a wide one of each label."""
+        n_labels, n_axes, n_peaks = len(self.labels.n_active), score.shape[1], len(self.peaks)
+        group = self._groups(label, peak)
+        own = np.bincount(group, flat, minlength=self.n_groups).reshape(n_labels, n_peaks)
+        whole = own.sum(axis=0)
+        order = np.argsort(group, kind="stable")
+        ends = np.searchsorted(group[order], np.arange(self.n_groups + 1))
+        peaks = np.flatnonzero(whole > 0)
+        fitted, of_group, start = [], [], np.zeros(n_labels + 1, np.int64)
+        guards = np.zeros((n_labels, n_peaks), np.int64)
+        for i in range(n_labels):
+            start[i] = len(of_group)
+            for j in peaks:
+                k = i * n_peaks + j
+                if own[i, j] > _LEAST_WEIGHT * whole[j]:
+                    rows = order[ends[k] : ends[k + 1]]
+                    each = flat[rows]
+                    rows, each = rows[each > 0], each[each > 0]
+                    effective = each.sum() ** 2 / np.sum(each * each)
+                    n_parts = 1 + int(effective > _TWO_PARTS) + int(effective > _THREE_PARTS)
+                    fitted.append((len(of_group), i, j, n_parts, rows, each))
+                    of_group += [k] * n_parts
+                guards[i, j] = len(of_group)
+                of_group.append(k)
+        start[-1] = n = len(of_group)
+        square = n, n_axes, n_axes
+        parts = _core.Parts(
+            start, np.empty(n, np.int64), np.ones(n), np.empty(n), np.empty(square[:2]),
+            np.empty(square), np.empty(square),
+        )  # fmt: skip
+        # of axes without effect too, in which places are as the prior has them
+        moments, scratch = {}, np.empty((n_axes, n_axes))
+        _, every, _ = _mean_and_cov(score, flat)
+        for j in peaks:
+            rows = np.flatnonzero((peak == j) & (flat > 0))
+            mean, cov, effective = _mean_and_cov(score[rows], flat[rows])
+            few = n_axes / (n_axes + effective)
+            moments[j] = mean, (1.0 - few) * cov + few * every
+            given = mean, _WIDE_SQUARE * moments[j][1], scratch
+            _core.add_widest(self.labels, parts, guards[:, j].copy(), *given)
+        for p, i, j, n_parts, rows, each in fitted:
+            spaces = (
+                np.empty((n_axes + 2, rows.size)),
+                np.empty((4, rows.size)),
+                scratch,
+                np.empty(3),
+            )
+            given = p, i, n_parts, _FIT_ROUNDS, _WIDER, score[rows], each, *moments[j]
+            _core.fit_parts(self.labels, parts, *given, spaces)
+            parts.share[p : p + n_parts] *= 1.0 - _WIDE_SHARE
+            parts.share[p + n_parts] = _WIDE_SHARE
+        return FittedParts(parts, np.array(of_group))
+
+    def _models(self, rows, weight, effective, enough, evidence):
+        """`PlacedModels` of places but those of least weight."""
+        order = np.argsort(weight, kind="stable")
+        upto = np.cumsum(weight[order])
+        kept = np.sort(order[upto > _LEFT_OUT * upto[-1]])
+        weight = weight[kept] / weight[kept].sum()
+        rows = rows.start + kept
+        _, scale, variance, power = self.known[rows].T
+        return PlacedModels(
+            self.place[rows], weight, scale, variance, power, self.points[1][rows],
+            effective, self.n, evidence, enough,
+        )  # fmt: skip
+
+
+def _of_ranges(labels):
+    """Labels in which each component is absent, present, or a parameter has a value: list of arrays of int."""
+    out = []
+    for first, count in zip(labels.first.T, labels.count.T, strict=True):
+        kinds = np.unique(np.stack([first, count], axis=1), axis=0)
+        if len(kinds) > 1:
+            out += [np.flatnonzero((first == a) & (count == b)) for a, b in kinds]
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class FittedParts:
+    """
+    Parts of a mixture, whose shares are those within their label and peak.
+
+    Parameters
+    ----------
+    kernel : `~miricigale.fitting._core.Parts`
+        The parts.
+    group : `~numpy.ndarray` of int, shape (n,)
+        Index of label and peak of each.
+    """
+
+    kernel: tuple
+    group: np.ndarray
+
+    def shared(self, share):
+        """Mixture in which labels and peaks have shares, of any sum: `~miricigale.fitting._core.Parts`."""
+        own = self.kernel.share * share[self.group]
+        return self.kernel._replace(share=own / own.sum())
+
+
+def _mean_and_cov(score, weight):
+    """Mean and covariance of places with weights, and their effective number."""
+    weight = weight / weight.sum()
+    mean = weight @ score
+    apart = score - mean
+    cov = (apart * weight[:, None]).T @ apart + 1e-6 * np.eye(score.shape[1])
+    return mean, cov, 1.0 / np.sum(weight * weight)
+
+
+def places_to_values(space, axis, place):
+    """Cells, and values of an axis, of places in its unit interval: two arrays, shape (n,)."""
+    n = space.size[axis]
+    y = place * n
+    cell = np.minimum(y.astype(np.int64), n - 1)
+    low, high = space.low[axis, cell], space.high[axis, cell]
+    return cell, low + (y - cell) * (high - low)
