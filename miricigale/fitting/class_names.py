@@ -49,6 +49,6 @@ def chosen_classes(classes, *, quasars=False, red_dots=False, stars=None):
     if stars is not None:
         names.add("stars")
     if "stars" in names:
-        wanted = "spectra (a file or folder) where stars are among the classes"
+        wanted = "spectra (a file or folder; --stars) where stars are among the classes"
         check_that(stars is not None, "stars", wanted, "None")
     return names
