@@ -26,6 +26,7 @@ _LEAST_MOST = 1 << 14
 #: Places fitted to: rounds, or effective number of them over that wanted in all, which doubles from time to time;
 #: and places after which it is seen whether their mixture will do.
 _ADAPTING_ROUNDS = 6
+_PURSUING_ROUNDS = 16
 _FIRST_GOAL = 0.3
 _TRIED = 2048
 _TRY_AGAIN = 4
@@ -36,6 +37,13 @@ _PART_LEAST = 30
 #: Least number of places with weights that results rest on, and part of them in each label that has weight.
 _LEAST_KEPT = 2048
 _LEAST_PLACES = 0.03
+#: Part of the draws to begin with from which a label in a peak is pursued, its share of the places until its shape
+#: is found, and how many times as many places there may be.
+_PURSUED = 0.01
+_PURSUED_SHARE = 0.06
+_MORE_PURSUED = 4
+#: Least number of places that parts are fitted to.
+_FEWEST_PLACES = 20
 #: Share of a mixture that all labels have, whatever their weight, and each peak and what has weight in it.
 _GUARD = 0.05
 #: Least efficiency, effective over number of places, of what has few of them.
@@ -175,13 +183,22 @@ class AdaptiveSampler:
         Effective number that is wanted.
     scramble : int
         Seed of the quasi-random points.
+    pursue : bool
+        Whether each label of the draws to begin with is followed until its shape is found, whatever weight it
+        seems to have before that: where errors are small, the label in which a good model is found first would
+        take all places from the others.
     """
 
-    def __init__(self, space, labels, work, one, borders, peaks, *, wanted, scramble=1):
+    def __init__(
+        self, space, labels, work, one, borders, peaks, *, wanted, scramble=1, pursue=False
+    ):
         self.space, self.labels, self.work, self.one = space, labels, work, one
         self.borders, self.peaks, self.wanted = borders, peaks, wanted
         self.members = _of_ranges(labels)
+        self.pursue = pursue
         n_axes, most = len(space.size), max(_MOST_EACH * wanted, _LEAST_MOST)
+        if pursue:
+            most *= _MORE_PURSUED
         self.most = most
         self.points = quasi_random(n_axes, int(np.ceil(np.log2(most))), scramble)
         self.label = np.empty(most, np.int64)
@@ -211,11 +228,12 @@ class AdaptiveSampler:
             None if no place has a probability above 0.
         """
         share = np.bincount(self._groups(label, peak), minlength=self.n_groups)
+        self.pursued = (share > _PURSUED * share.sum()) & self.pursue
         parts = self._fit(label, score, peak, np.ones(len(label)))
         goal, enough = _FIRST_GOAL * self.wanted, False
         while not enough and self.n < self.most:
             # places that say where the posterior is
-            for _ in range(_ADAPTING_ROUNDS):
+            for turn in range(_PURSUING_ROUNDS if self.pursue else _ADAPTING_ROUNDS):
                 size = min(ROUND_SIZE, self.most - self.n)
                 self._add_round(parts.shared(self._guarded(share)), size)
                 rows = slice(0, self.n)
@@ -223,8 +241,10 @@ class AdaptiveSampler:
                 if weight is None:
                     return None
                 effective, _, share = self._wanted(weight, rows)
-                parts = self._fit(*self._of_places())
-                if effective >= goal or self.n >= self.most:
+                parts = self._fit(*self._of_places(weight))
+                share = self._pursuing(share)
+                good = effective >= goal or turn + 1 >= _ADAPTING_ROUNDS
+                if self.n >= self.most or (good and not self.pursued.any()):
                     break
             # and others, on which the parts do not depend: recycled places have too little weight where few are
             first, total = self.n, np.zeros(len(parts.kernel.share))
@@ -266,11 +286,33 @@ class AdaptiveSampler:
         """Index of labels and peaks."""
         return label * len(self.peaks) + peak
 
-    def _of_places(self):
-        """Labels, scores, peaks of all places, and weights for a fit of parts."""
+    def _of_places(self, weight=None):
+        """
+        Labels, scores, peaks of all places, and weights for a fit of parts.
+
+        Those of each peak are made flat enough to say what its shape is, or those of each label that has weight.
+        """
         rows = slice(0, self.n)
         log = self.known[rows, 0] - np.log(self.density[rows])
-        return self.label[rows], self.score[rows], self.peak[rows], self._flatten(log)
+        group = self.peak[rows]
+        chosen = range(len(self.peaks))
+        if self.pursue:
+            group = self._groups(self.label[rows], self.peak[rows])
+            if weight is None:
+                weight = np.exp(np.maximum(log - log.max(), -700.0))
+            share = np.bincount(group, weight, minlength=self.n_groups)
+            chosen = np.flatnonzero(self.pursued | (share > _LEAST_WEIGHT * share.sum()))
+        return (
+            self.label[rows],
+            self.score[rows],
+            self.peak[rows],
+            self._flatten(log, group, chosen),
+        )
+
+    def _pursuing(self, share):
+        """Shares of places, of which labels whose shape is still to be found have a part whatever their weight."""
+        least = _PURSUED_SHARE * share.sum()
+        return np.where(self.pursued, np.maximum(share, least), share)
 
     def _density(self, mixture, first):
         """Density of a mixture at the places from ``first`` on."""
@@ -366,17 +408,23 @@ class AdaptiveSampler:
         even = share.sum(axis=0) / len(share)
         return ((1.0 - _GUARD) * share + _GUARD * even).ravel()
 
-    def _flatten(self, log):
-        """Weights for a fit, flat enough in each peak to say what its shape is."""
+    def _flatten(self, log, group, chosen):
+        """
+        Weights for a fit, flat enough in each of some groups to say what its shape is.
+
+        A label whose own weights need not be made flat is no longer pursued: its weight can be believed.
+        """
         flat = np.zeros(self.n)
-        for j in range(len(self.peaks)):
-            rows = np.flatnonzero(self.peak[: self.n] == j)
-            if rows.size < 20:
+        for j in chosen:
+            rows = np.flatnonzero(group == j)
+            if rows.size < _FEWEST_PLACES:
                 continue
             few = min(_FLAT_MOST, _FLAT_EACH * len(self.mixtures), 0.5 * rows.size)
             own = np.empty(rows.size)
-            _core.flatten(log[rows], float(few), own)
+            power, _ = _core.flatten(log[rows], float(few), own)
             flat[rows] = own / own.sum()
+            if self.pursue and power == 1.0 and few == _FLAT_MOST:
+                self.pursued[j] = False
         return flat
 
     def _fit(self, label, score, peak, flat):

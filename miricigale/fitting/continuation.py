@@ -153,7 +153,20 @@ class Continuation(Frozen):
         new["mass_prior"] = prior and (lambda formed, _: prior(formed, [node]))
         return replace(engine, **new)
 
-    def place(self, n_effective, redshifts, found, i, target, limits, log_usable, wrong, drawn, zf):
+    def place(
+        self,
+        n_effective,
+        redshifts,
+        found,
+        i,
+        target,
+        limits,
+        log_usable,
+        wrong,
+        drawn,
+        zf,
+        spread,
+    ):
         """
         Put models between the nodes, with the weights of the posterior of an object.
 
@@ -165,7 +178,7 @@ class Continuation(Frozen):
             Redshifts of objects; 0 if these are free.
         found : dict
             Gets, at ``i``, a `BetweenPosterior`, or None if no model is possible.
-        i, target, limits, log_usable, wrong, drawn, zf
+        i, target, limits, log_usable, wrong, drawn, zf, spread
             What `GridEngine.fit` says of the object.
         """
         redshift = float(redshifts[i])
@@ -177,7 +190,7 @@ class Continuation(Frozen):
             labels = self.labels
             borders, weights = redshift_peaks(self.engine.grid.redshift, zf.sum(axis=1))
         given = self.space, labels.kernel, self._work(), one, borders, weights
-        sampler = AdaptiveSampler(*given, wanted=n_effective, scramble=self.scramble)
+        sampler = AdaptiveSampler(*given, wanted=n_effective, scramble=self.scramble, pursue=spread)
         label, score = labels.of_nodes(self._cells_of(drawn))
         peak = np.searchsorted(borders, self.engine.grid.redshift[drawn[:, 0]])
         models = sampler.run(label, score, peak)

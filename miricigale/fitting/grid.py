@@ -26,6 +26,8 @@ _TAIL = 10.0
 _THIN = 1e-4
 #: Least ``rtol``, unless it is 0, of fits with wrong bands.
 _LOOSE = 1e-3
+#: Best chi2 over the number of bands above which nodes are too coarse for the errors of the data.
+_EXCESS = 2.0
 #: Least ``rtol`` with which pairs of little weight are evaluated in single precision.
 _SINGLE = 5e-7
 #: Least variance of a scale.
@@ -283,9 +285,32 @@ class GridEngine(Frozen):
                     out.outlier[i] = np.where(used, out.zf[i].sum(axis=1) @ wrong, np.nan)
                 if each is not None:
                     wrong = None if broad is None else (stated, sigma[i], broad[i])
-                    drawn = out.draw_index[i], out.zf[i]
-                    each(i, target, limits, tables.log_usable, wrong, *drawn)
+                    start = out.draw_index[i], out.zf[i], False
+                    excess = out.chi2[i] / np.isfinite(sigma[i]).sum()
+                    if excess > _EXCESS:
+                        larger = np.sqrt(excess)
+                        loose = _core.make_target(
+                            data[i], larger * sigma[i], log_prior[i], larger * self.template_error
+                        )
+                        start = self._spread(loose, limits, workspace, single, seeds[i]) or start
+                    each(i, target, limits, tables.log_usable, wrong, *start)
         return out
+
+    def _spread(self, target, limits, workspace, single, seed):
+        """
+        Draws from the posterior of data with larger errors, that of redshift and AGN fraction, and True; or None.
+
+        Where errors are small against the differences of nodes, the posterior on nodes is that of a node that
+        happens to be near, and what lies in the cells of others is to be found.
+        """
+        sums = workspace[0]
+        tables, target = self._of_masses(target, workspace[2])
+        sums.draws.state[0] = seed
+        _core.clear(sums)
+        given = tables, self._scales, self._request, target, limits
+        if not (target.norm[0] > 0.0 and _core.sum_up(*given, *workspace, single=single)):
+            return None
+        return np.array(sums.draws.index), sums.zf / sums.zf.sum(), True
 
     def _of_masses(self, target, space):
         """Tables and data with the priors of galaxies, and of redshifts, at the masses that an object has."""

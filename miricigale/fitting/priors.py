@@ -84,7 +84,8 @@ class GridAxis:
         Lowest and highest values of the cells between which the posterior has weight: two arrays, shape (n,).
 
         Those of a label, and of a component that is absent, are the value itself; the first cell of what is
-        present begins at 0. The outermost are those of `~miricigale.fitting.posterior.cell_edges` with these bounds.
+        present begins at 0. The outermost are those of `~miricigale.fitting.posterior.cell_edges` with these
+        bounds.
         """
         edges = cell_edges(self.values, bounds)
         low, high = edges[:-1].copy(), edges[1:].copy()
