@@ -261,7 +261,8 @@ def sample_of(fitter, columns, seed):
 
 def calibrate_sample(fitter, sample, *, name, density_nodes=None, executor=None):
     """Do what `calibrate_bands` does, with sources that were chosen; ``density_nodes`` are those of densities."""
-    first = dataclasses.replace(_calibration_of(fitter), name=name)
+    # scores are of the sources that its errors of models and priors were measured on
+    first = dataclasses.replace(_calibration_of(fitter), name=name, scores=None)
     calibration = first.with_prior_errors(sample.bands)
     if len(sample) < MIN_SOURCES or len(sample.predicting) < MIN_PREDICTING_BANDS:
         return calibration

@@ -193,8 +193,10 @@ def _calibration(page, calibration):
         page.table("scores", _rows(calibration.scores))
     rows = _rows(calibration.bands)
     for row in rows:
+        if row["zero_point_err"] == 0:
+            row["zero_point_err"] = np.nan
         if row["n"] == 0:
-            row["n"] = "prior"
+            row |= {"n": "prior", "zero_point_err": np.nan, "wrong": np.nan}
     page.table("bands", rows)
 
 

@@ -200,6 +200,15 @@ def test_errors_that_are_right_stay(model_fluxes, fitter):
         assert rows[band]["error_part"] < 0.04
 
 
+def test_scores_of_other_sources_are_not_those_of_a_catalog(model_fluxes, fitter):
+    base = SurveyCalibration.survey().without_priors()
+    assert base.scores is not None
+    some = fitter.changed(calibration=base, model_error=None, template_error=None)
+    found = calibrate_bands(some, catalog(model_fluxes)[:5])
+    assert found.scores is None
+    assert found.template_error is base.template_error
+
+
 @pytest.mark.parametrize("n", [1, 10, 50])
 def test_few_sources_have_the_prior(model_fluxes, fitter, n):
     found = calibrate_bands(fitter, catalog(model_fluxes, factor=2.5)[:n])
