@@ -201,7 +201,7 @@ def main():
         for h, half in enumerate(halves)
     ]
     print(f"calibrations of {len(table)} sources: {time.process_time() - start:.0f} s of CPU")
-    print("band           zero points   errors times  of the flux    wrong")
+    print("band           zero points   errors times  of the flux   allowed wrong  wrong")
     for a, b in zip(found[0].bands, found[1].bands, strict=True):
         each = [
             [one[name] for name in list(a.colnames)[2:] if name[-3:] != "err"] for one in (a, b)
