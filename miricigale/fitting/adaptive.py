@@ -29,7 +29,7 @@ _ADAPTING_ROUNDS = 6
 _PURSUING_ROUNDS = 16
 _FIRST_GOAL = 0.3
 _TRIED = 2048
-_TRY_AGAIN = 4
+_TRY_AGAIN = 2
 #: Weight of peaks of redshift and of labels that are to have this part of the effective number themselves.
 _COUNTS = 0.02
 _PART_EACH = 0.05
@@ -230,7 +230,7 @@ class AdaptiveSampler:
         share = np.bincount(self._groups(label, peak), minlength=self.n_groups)
         self.pursued = (share > _PURSUED * share.sum()) & self.pursue
         parts = self._fit(label, score, peak, np.ones(len(label)))
-        goal, enough = _FIRST_GOAL * self.wanted, False
+        goal, enough, best = _FIRST_GOAL * self.wanted, False, None
         while not enough and self.n < self.most:
             # places that say where the posterior is
             for turn in range(_PURSUING_ROUNDS if self.pursue else _ADAPTING_ROUNDS):
@@ -271,9 +271,13 @@ class AdaptiveSampler:
                     self._groups(self.label[rows], self.peak[rows]), minlength=wanted.size
                 )
                 missing = np.maximum(wanted - has, 0.02 * wanted)
+            kept = self.n > first
+            if best is None or enough or (kept and effective > best[2]):
+                best = rows, weight, effective, top
             goal = 2.0 * goal
             if not enough and self.n < self.most:
                 share, parts = wanted, self._fit(*self._of_places())
+        rows, weight, effective, top = best
         evidence = top + np.log(weight.mean())
         return self._models(rows, weight, effective, enough, evidence)
 

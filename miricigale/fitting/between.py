@@ -26,6 +26,11 @@ def between_nodes(found, results):
         if posterior is None or not posterior.models.converged:
             new["flags"][i] |= int(FitFlags.NOT_CONVERGED)
         if posterior is None:
+            # what is known is that of the nodes
+            one = results[i]
+            for j, name in enumerate(names):
+                new["axis_moments"][i, j] = one.mean(name).value, one.std(name).value
+                new["axis_quantiles"][i, j] = one.percentile(name, DERIVED_LEVELS).value
             continue
         node, weight = posterior.node, posterior.weight
         if posterior.wrong is not None:

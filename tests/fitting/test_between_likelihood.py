@@ -268,8 +268,9 @@ def test_errors_of_agn_light_count_by_its_share(part):
     results = fitter.fit(photometry_table(BANDS, observed, sigma), redshift=z)
     # a fourth of the prior has no AGN; the others begin at 0
     edges = np.array([0.0, 0.45, 0.75, 0.9])
-    present = edges[:-1, None] + np.diff(edges)[:, None] * (np.arange(FINE) + 0.5) / FINE
-    f = np.concatenate([np.zeros(FINE), present.ravel()])
+    many = 8 * FINE
+    present = edges[:-1, None] + np.diff(edges)[:, None] * (np.arange(many) + 0.5) / many
+    f = np.concatenate([np.zeros(many), present.ravel()])
     t, f = (x.ravel() for x in np.meshgrid(fine(tau)[0], f, indexing="ij"))
     for i in range(3):
         one = flux(np.full(t.size, z[i]), t, np.full(t.size, 0.4))[0]
@@ -281,7 +282,7 @@ def test_errors_of_agn_light_count_by_its_share(part):
         wide = np.hypot(10 * sigma[i], wide)
         scale = np.sum(model * observed[i] / error**2, 1) / np.sum(model**2 / error**2, 1)
         every = []
-        steps = np.exp(np.arange(-1.0, 1.0, 0.01))
+        steps = np.exp(np.arange(-1.0, 1.0, 0.02))
         for step in steps:
             apart = observed[i] - (step * scale)[:, None] * model
             log = (1 - part) * np.exp(-0.5 * (apart / error) ** 2) / error
