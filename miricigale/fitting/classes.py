@@ -8,12 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from miricigale.fitting.catalog_calibration import measured_calibration
 from miricigale.fitting.class_names import chosen_classes
 from miricigale.fitting.classification import class_columns
 from miricigale.fitting.from_files import fit_catalog
 from miricigale.fitting.page_numbers import thinned
-from miricigale.fitting.populations import red_dot_prior
 from miricigale.fitting.pulls import without_warnings
 from miricigale.pages import number
 from miricigale.plotting.axes import WIDTH, new_figure
@@ -73,12 +71,14 @@ def fit_classes(path, output, *, classes=(), quasars=False, red_dots=False, star
     with _each_once():
         found = {"galaxy": fit_catalog(path, output, **options)}
         options.pop("calibrate", None)
+        # after the fit, which refuses what it cannot read before it loads the models
+        from miricigale.fitting.catalog_calibration import measured_calibration
+        from miricigale.fitting.populations import red_dot_prior
+        from miricigale.sed import SEDModel, quasar_axes, red_dot_axes, template_grid
+
         measured = measured_calibration(found["galaxy"])
         if measured is not None:
             options["calibration"] = measured
-        # after the fit, which refuses what it cannot read before it loads the models
-        from miricigale.sed import SEDModel, quasar_axes, red_dot_axes, template_grid
-
         # of parameters of galaxies
         options.pop("pairs", None)
         options.pop("priors", None)

@@ -10,7 +10,6 @@ from miricigale.evaluation import photoz_metrics
 from miricigale.filters import Filter, FilterSet
 from miricigale.filters.catalog_files import MappedRows
 from miricigale.fitting import FitFlags
-from miricigale.fitting.catalog_calibration import measured_calibration
 from miricigale.fitting.catalog_rows import open_catalog
 from miricigale.fitting.classes import classes_of, classes_section
 from miricigale.fitting.likelihood import unused_bands
@@ -62,6 +61,9 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None):
     ValueError
         If the catalog has no column ``z_spec``.
     """
+    # what measures it loads the models
+    from miricigale.fitting.catalog_calibration import measured_calibration
+
     classes = results if isinstance(results, dict) else {"galaxy": results}
     results = classes["galaxy"]
     job = results.job
