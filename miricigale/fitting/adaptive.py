@@ -9,7 +9,6 @@ Bernoulli 25, 2714), which takes from what has little weight. Points are quasi-r
 objects: nothing depends on the id or place of an object in its catalog.
 """
 
-import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +16,7 @@ from scipy.special import chdtri, ndtri
 from scipy.stats import qmc
 
 from miricigale.fitting import _core
+from miricigale.utils.caching import cached
 
 #: Places in a round, and most places for each of the effective number that is wanted, and at least.
 ROUND_SIZE = 512
@@ -110,7 +110,7 @@ class PlacedModels:
     converged: bool
 
 
-@functools.lru_cache(maxsize=8)
+@cached(maxsize=8)
 def quasi_random(n_axes, log2_n, scramble):
     """
     Sobol points for all objects.

@@ -1,12 +1,11 @@
 """What is fitted where nothing else is said: models of real galaxies, their grid and their calibration."""
 
-import functools
-
 import numpy as np
 
 from miricigale.filters import FilterSet
 from miricigale.sed import SEDModel
 from miricigale.sed.presets import GRIDS, grid_axes
+from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
 
@@ -83,7 +82,7 @@ def _are_same(axes, others):
     return all(np.array_equal(np.asarray(axes[name]), values) for name, values in others.items())
 
 
-@functools.cache
+@cached(copies=True)
 def _survey_calibration(bands):
     """`SurveyCalibration.survey` for bands (tuple of str) of a catalog that was not measured."""
     # it is measured by fits, whose modules are made of this one

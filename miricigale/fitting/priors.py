@@ -1,6 +1,5 @@
 """Priors of the parameters of a grid, in weights of the nodes, and what is known of redshifts."""
 
-import functools
 from dataclasses import dataclass, replace
 
 import astropy.units as u
@@ -11,6 +10,7 @@ from miricigale.fitting.likelihood import FitFlags
 from miricigale.fitting.posterior import cell_edges
 from miricigale.fitting.quantities import plain
 from miricigale.sed import COMPONENTS
+from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing import floats, without_mask
 from miricigale.utils.options import check_choice, check_names, check_that
@@ -96,7 +96,7 @@ class GridAxis:
         return low, high
 
 
-@functools.lru_cache(maxsize=1024)
+@cached(maxsize=1024)
 def _declared(components, name, what):
     """Whether a component declares the parameter of this name so."""
     declared = [COMPONENTS.get(one).declared().get(name) for one in components]

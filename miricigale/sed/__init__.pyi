@@ -16,8 +16,8 @@ from .presets import quasar_axes as quasar_axes
 from .presets import red_dot_axes as red_dot_axes
 from .presets import survey_axes as survey_axes
 from .presets import yang2021_axes as yang2021_axes
-from .red_dots import red_dot as red_dot
-from .red_dots import red_dots as red_dots
+from .red_dot_spectra import red_dot as red_dot
+from .red_dot_spectra import red_dots as red_dots
 from .spectrum import COSMOLOGY as COSMOLOGY
 from .spectrum import SED as SED
 from .tables import ModelFlags as ModelFlags

@@ -137,7 +137,7 @@ def test_real_galaxies_have_their_own_grid_whose_errors_are_logged(tmp_path, cap
     assert main(fit(tmp_path / "cat.fits", axes="survey")) == 0
     for text in (
         "the grid 'survey' of 20,490,624 models, redshifts 0.01 to 10.13",
-        "8 fitted, wfc3.f125w",
+        "10 fitted, wfc3.f125w",
         "miri.f770w            prior  1.000              3.30       15.0",
         "calibration 'CEERS, bands of cat.fits (",
         "errors of the models 3 to 48 % of the flux",

@@ -127,10 +127,14 @@ def node_weights(values, prior):
     """Prior of the values of one parameter, which sums to 1; None is flat in them."""
     if prior is None:
         weights = np.ones(values.size)
-    elif isinstance(prior, str):
-        weights = {"log": 1.0 / values}[prior]
+    elif callable(prior) or isinstance(prior, str):
+        # a density, in the cells from the first value to the last
+        density = {"log": np.reciprocal}[prior] if isinstance(prior, str) else prior
+        edges = cells(values, (values[0], values[-1]))
+        weights = [quad(density, a, b)[0] for a, b in itertools.pairwise(edges)]
+        weights = np.array(weights)
     else:
-        weights = np.asarray(prior(values) if callable(prior) else prior, float)
+        weights = np.asarray(prior, float)
     return weights / weights.sum()
 
 

@@ -7,7 +7,7 @@ from astropy.modeling.models import BlackBody
 from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
-from miricigale.fitting.interpolation import Nodes
+from miricigale.fitting.interpolation import InterpolatedModels
 from miricigale.sed import SED, ModelGrid, SEDModel, red_dot, red_dot_axes, red_dots, template_grid
 
 #: A red dot of one part and no lines.
@@ -145,17 +145,17 @@ def test_models_between_the_nodes_are_right():
     """Of axes with the values of the presets, interpolated fluxes are within 2 % at any values between them."""
     z = np.expm1(np.arange(np.log(6.0), np.log(6.6), 0.02))
     axes = red_dot_axes() | {"redshift": z, "uv_to_optical": np.array([0.1, 0.2, 0.4])}
-    nodes = Nodes.of_grid(template_grid(red_dots(axes), BANDS, redshift=z))
+    models = InterpolatedModels.of_grid(template_grid(red_dots(axes), BANDS, redshift=z))
     rng, n = np.random.default_rng(4), 40
     values = {name: rng.uniform(axis[0], axis[-1], n) for name, axis in axes.items()}
     values["redshift"] = rng.choice(z, n)
     units = {"temperature": u.K, "halpha_width": u.AA}
-    found = nodes.fluxes(values, values["redshift"], np.zeros(n))[0]
+    fluxes = models.fluxes(values, values["redshift"], np.zeros(n))[0]
     apart = []
     for i in range(n):
         own = {name: x[i] * units.get(name, u.one) for name, x in values.items()}
         redshift = [float(own.pop("redshift"))]
         true = template_grid({"one": red_dot(**own)}, BANDS, redshift=redshift).galaxy[0, 0]
-        apart.append(found[i] / found[i].mean() / true - 1.0)
+        apart.append(fluxes[i] / fluxes[i].mean() / true - 1.0)
     assert np.percentile(np.abs(apart), 95) < 0.03
     assert np.median(np.abs(apart)) < 0.01
