@@ -143,7 +143,11 @@ class Continuation(Frozen):
             if not z.size:
                 new[kind] = engine.agn[:1]
             elif kind == "galaxy":
-                new[kind] = self.models.galaxy_fluxes(values, z)[None]
+                flux = self.models.galaxy_fluxes(values, z)
+                # galaxies older than the universe there, if not at the node
+                exists = np.isfinite(flux).all(axis=1)
+                new["usable"] = new["usable"] & exists
+                new[kind] = np.where(exists[:, None], flux, 0.0)[None]
             else:
                 new[kind] = self.models.agn_fluxes(values, z)[None]
         density, prior = engine.density, engine.mass_prior

@@ -6,6 +6,7 @@ import pytest
 from astropy.table import QTable
 from numpy.testing import assert_allclose
 
+from miricigale.fitting import BayesFitter
 from miricigale.fitting.interpolation import InterpolatedModels
 from miricigale.fitting.priors import grid_priors
 from miricigale.sed import SEDModel, quasar_axes, survey_axes, yang2021_axes
@@ -155,3 +156,22 @@ def test_axes_are_refined_where_models_bend(survey):
     assert sizes["metallicity"] == 2
     assert sizes["age"] > known["age"].values.size
     assert np.diff(models.light.stars.log_z).max() < 0.0101
+
+
+def test_known_redshifts_between_nodes_leave_older_galaxies_out():
+    """At a redshift above its node a galaxy may be older than the universe: it is no model there, and no NaN."""
+    model = SEDModel.yang2021(libraries="bundled", agn=False)
+    universe = model.cosmology.age([1.0, 1.05]).to_value("Gyr")
+    axes = {"redshift": [1.0, 1.2], "age": [2.0, universe.mean()], "ebv": [0.1, 0.5]}
+    fitter = BayesFitter(model, BANDS, axes=axes, model_error=0.05)
+    truth = QTable({"redshift": [1.05], "age": [2.0] * u.Gyr, "ebv": [0.3] * u.mag})
+    truth["mass"] = 1e10 * u.Msun
+    fluxes = model.fluxes(truth, BANDS)
+    table = QTable({"id": [1], "z": [1.05]})
+    for name in BANDS:
+        table[name] = fluxes[name]
+        table[f"{name}_err"] = 0.05 * fluxes[name]
+    results = fitter.fit(table, redshift="z")
+    assert np.isfinite(results.chi2).all()
+    assert results.percentile("age", 0.999).value.max() <= universe[1]
+    assert results.best["age"].value[0] == 2.0
