@@ -88,7 +88,7 @@ class InterpolatedModels:
     agn_columns : `_core.Part`
         Properties of the AGN.
     names : `_Names`
-    bands : int
+    n_bands : int
         Number of bands.
     """
 
@@ -264,8 +264,7 @@ class InterpolatedModels:
         if both:
             described[both[0]] = described[f"{both[0]}_galaxy"] + described[f"{both[0]}_agn"]
         else:
-            reference = galaxy["dust_luminosity" if "reference" not in galaxy else "reference"]
-            described["total_luminosity"] = scale * (reference + power)
+            described["total_luminosity"] = scale * (galaxy["reference"] + power)
         for name in names.shape:
             described[name] = galaxy[name]
         if self.quantities.fraction is not None:

@@ -66,7 +66,10 @@ class ModelGalaxies:
         dust = np.zeros((n, self.n_sums))
         if len(self.dust.table):
             dust = part_columns(self.dust, values)
-        return quantities_of_parts(starlight, absorbed, dust, age, self.reference_row)
+        quantities = quantities_of_parts(starlight, absorbed, dust, age, self.reference_row)
+        if light.by_dust:
+            quantities["reference"] = absorbed
+        return quantities
 
 
 class ModelTables:
@@ -166,7 +169,8 @@ class ModelTables:
         if self.mixing:
             rows = [row | {self.mixing: share} for row in rows]
         table = light.starlight(rows)
-        power = table.columns[:, -1].copy()
+        excess = self.constants.get("dust_excess", 1.0)
+        power = excess * table.columns[:, -1]
         if not self.amount:
             return table.flux, table.columns, power
         amounts = np.array([row[self.amount] for row in rows])
@@ -176,7 +180,7 @@ class ModelTables:
             little = _HARDLY_ANY_DUST * float(self.names["starlight"][self.amount][1])
             amounts[without] = little
             some = [rows[i] | {self.amount: little} for i in without]
-            power[without] = light.absorbed(some)
+            power[without] = excess * light.absorbed(some)
         return table.flux, table.columns, power / -np.expm1(-_core.SATURATION * amounts)
 
     def _dust_logs(self, light, rows):
@@ -185,8 +189,8 @@ class ModelTables:
         return logarithms(table.flux, reference, light.redshift)
 
     def _agn_logs(self, light, rows):
-        table = light.agn(rows)
-        return logarithms(table.flux, np.zeros((len(rows), 0)), light.redshift)
+        flux = light.agn(rows).flux
+        return logarithms(flux, np.zeros((len(rows), 0)), light.redshift)
 
     def _part(self, name):
         evaluate = {
@@ -311,20 +315,20 @@ class ModelTables:
     def _dust(self, light, lines):
         part = self._part("dust")
         axes, powers = part.refined(lines)
-        table = light.dust(part.rows(axes))
-        reference = table.columns[:, [self.model.chain.reference_row]]
-        logs = logarithms(table.flux, reference, light.redshift)
+        rows = part.rows(axes)
+        logs = self._dust_logs(light, rows)
         dust = make_part(tuple(axes), axes, powers, logs, light.redshift, self.place)
-        return dust, with_columns(dust, np.log(np.maximum(table.columns, LEAST)))
+        columns = lines.dust(rows).columns
+        return dust, with_columns(dust, np.log(np.maximum(columns, LEAST)))
 
     def _agn(self, light, lines):
         part = self._part("agn")
         axes, powers = part.refined(lines)
         rows = part.rows(axes)
-        table = light.agn(rows)
-        logs = logarithms(table.flux, np.zeros((len(rows), 0)), light.redshift)
+        logs = self._agn_logs(light, rows)
         agn = make_part(tuple(axes), axes, powers, logs, light.redshift, self.place)
-        return agn, with_columns(agn, np.log(np.maximum(table.columns, LEAST)))
+        columns = lines.agn(rows).columns
+        return agn, with_columns(agn, np.log(np.maximum(columns, LEAST)))
 
 
 def _nearly_equal(values, expected):

@@ -125,14 +125,11 @@ def with_columns(part, table):
 
 def part_columns(part, values):
     """Columns of a part that do not depend on redshift, (n, n_columns)."""
-    n = len(values)
-    work = _core.make_work(values.shape[1], part.table.shape[2])
-    out = np.empty((n, part.table.shape[2]))
-    _core.interpolate_columns(part, values, np.zeros(n), work, out)
-    return np.exp(out)
+    return np.exp(log_part_columns(part, values))
 
 
 def log_part_columns(part, values):
+    """Columns of a part, as they are in its table, (n, n_columns)."""
     n = len(values)
     out = np.empty((n, part.table.shape[2]))
     work = _core.make_work(values.shape[1], part.table.shape[2])

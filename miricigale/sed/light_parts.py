@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csr_array, vstack
 
-from miricigale.sed.chain import STELLAR, VISUAL
+from miricigale.sed.chain import STELLAR, VISUAL, Stars
 from miricigale.sed.derived import galaxy_quantities
 from miricigale.sed.gridding import Galaxies, agn_table
 from miricigale.sed.spectrum import distance
@@ -35,7 +35,7 @@ _STELLAR_COLUMNS = (
     "visual_age",
 )
 #: Columns of masses formed in a time span, in Gyr, by their number.
-FORMED_COLUMNS = {2: 0.01, 3: 0.1}
+FORMED_COLUMNS = {_STELLAR_COLUMNS.index(name): span for name, span in RATE_SPANS.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,19 +181,6 @@ class LightParts:
         return PartTable(self.sums(spectra / chain.to_lnu), np.array(columns).T)
 
 
-@dataclass(frozen=True, eq=False)
-class _StarColumns:
-    """What `~miricigale.sed.derived.galaxy_quantities` takes of stars, arrays of shape (n,)."""
-
-    visual: np.ndarray
-    stellar_mass: np.ndarray
-    sfr: np.ndarray
-    sfr_10myr: np.ndarray
-    sfr_100myr: np.ndarray
-    age_mass: np.ndarray
-    age_light: np.ndarray
-
-
 def quantities_of_parts(starlight, absorbed, dust, age, reference_row):
     """
     Derived quantities of galaxies for one solar mass formed, from columns of their parts.
@@ -225,7 +212,9 @@ def quantities_of_parts(starlight, absorbed, dust, age, reference_row):
     columns["age_light"] = np.divide(
         visual_age, visual, out=np.full(len(visual), np.nan), where=visual > 0
     )
-    stars = _StarColumns(**columns)
+    # sums over the light take the place of the spectra
+    no_spectra = dict.fromkeys(("young", "old", "nebular_young", "nebular_old", "dust_power"))
+    stars = Stars(**no_spectra, **columns)
     sums = starlight[:, n_stellar:-1] + absorbed[:, None] * dust
     rows = np.arange(len(starlight))
     return galaxy_quantities(stars, rows, absorbed, sums, reference_row)

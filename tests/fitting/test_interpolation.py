@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose
 from miricigale.fitting import BayesFitter
 from miricigale.fitting.interpolation import InterpolatedModels
 from miricigale.fitting.priors import grid_priors
+from miricigale.fitting.quantities import Quantities
 from miricigale.sed import SEDModel, quasar_axes, survey_axes, yang2021_axes
 
 BANDS = ["acs.f814w", "wfc3.f160w", "nircam.f444w", "miri.f770w", "miri.f1500w", "miri.f2100w"]
@@ -175,3 +176,36 @@ def test_known_redshifts_between_nodes_leave_older_galaxies_out():
     assert np.isfinite(results.chi2).all()
     assert results.percentile("age", 0.999).value.max() <= universe[1]
     assert results.best["age"].value[0] == 2.0
+
+
+@pytest.mark.parametrize("excess", [[2.0], [1.0, 3.0]])
+def test_excess_of_dust_multiplies_its_light(excess):
+    """Dust may shine by another power than it takes, the same for all models or an axis of its own."""
+    model = SEDModel.yang2021(libraries="bundled")
+    axes = {"age": [1.0, 3.0], "ebv": [0.1, 0.5], "frac_agn": [0.0, 0.5], "dust_excess": excess}
+    models, known, constants = interpolated(model, axes)
+    values = {name: np.full(2, axis.values.mean()) for name, axis in known.items()}
+    values |= {"redshift": np.full(2, 1.1), "frac_agn": np.array([0.0, 0.4])}
+    values["age"] = np.full(2, 2.0)
+    expected, table = exact(model, values, constants)
+    flux, power = models.fluxes(values, values["redshift"], values["frac_agn"])
+    assert_allclose(flux, expected, rtol=0.02)
+    derived = models.describe(values, values["redshift"], power, np.ones(2))
+    assert_allclose(derived["dust_luminosity"], table["dust_luminosity"].value, rtol=0.01)
+    assert_allclose(derived["agn_power"], table["agn_power"].value, rtol=0.01)
+
+
+@pytest.mark.parametrize("definition", ["dust", "3-1000um"])
+def test_quantities_without_agn_are_those_of_the_grid(definition):
+    """At a node every derived quantity is that which the grid has for it."""
+    model = SEDModel.yang2021(libraries="bundled", agn=False, frac_agn_definition=definition)
+    axes = {"age": [1.0, 3.0], "ebv": [0.1, 0.5]}
+    models, known, _ = interpolated(model, axes)
+    grid = model.grid(axes | {"redshift": REDSHIFT}, BANDS)
+    quantities = Quantities.of_grid(grid)
+    values = {name: axis.values[[0]] for name, axis in known.items()}
+    galaxy = int(np.flatnonzero(grid.galaxy_parameters["ebv"].value == 0.1)[0])
+    derived = models.describe(values, REDSHIFT[[0]], np.zeros(1), np.ones(1))
+    for name in quantities.names:
+        wanted = quantities.evaluate(name, grid, galaxy, 0, 0.0, 1.0)
+        assert_allclose(derived[name][0], wanted, rtol=1e-4, atol=1e-4, err_msg=name)
