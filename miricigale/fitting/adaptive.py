@@ -9,7 +9,7 @@ Bernoulli 25, 2714), which takes from what has little weight. Points are quasi-r
 objects: nothing depends on the id or place of an object in its catalog.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import chdtri, ndtri
@@ -88,12 +88,6 @@ class PlacedModels:
         Best scales and their variances, and AGN power for each solar mass formed.
     uniform : `~numpy.ndarray`, shape (n,)
         Quasi-random numbers for the scales' own errors.
-    n_effective : float
-        Effective number of models, and of models evaluated.
-    n_evaluated : int
-        Number of models evaluated.
-    log_evidence : float
-        ln of the mean likelihood over the prior, in the constant of the likelihood.
     converged : bool
         Whether the effective number is what was asked for.
     """
@@ -104,9 +98,6 @@ class PlacedModels:
     variance: np.ndarray
     power: np.ndarray
     uniform: np.ndarray
-    n_effective: float
-    n_evaluated: int
-    log_evidence: float
     converged: bool
 
 
@@ -165,6 +156,32 @@ def redshift_peaks(redshift, posterior):
     return borders, weights
 
 
+@dataclass(frozen=True, eq=False)
+class WeightedPlaces:
+    """
+    Some of the places of a sampler with their weights, and what is wanted of them.
+
+    Parameters
+    ----------
+    rows : slice
+        Which places.
+    weight : `~numpy.ndarray`, shape (n,)
+        Weights, the largest of which is 1.
+    effective : float
+        Effective number of the weights.
+    enough : bool
+        Whether it is, in all and in each label, peak and component that counts.
+    wanted : `~numpy.ndarray`, shape (n_labels * n_peaks,)
+        Numbers of places wanted in labels and peaks.
+    """
+
+    rows: slice
+    weight: np.ndarray
+    effective: float
+    enough: bool
+    wanted: np.ndarray
+
+
 class AdaptiveSampler:
     """
     Sampling of the posterior of one object.
@@ -192,11 +209,17 @@ class AdaptiveSampler:
     def __init__(
         self, space, labels, work, one, borders, peaks, *, wanted, scramble=1, pursue=False
     ):
-        self.space, self.labels, self.work, self.one = space, labels, work, one
-        self.borders, self.peaks, self.wanted = borders, peaks, wanted
+        self.space = space
+        self.labels = labels
+        self.work = work
+        self.one = one
+        self.borders = borders
+        self.peaks = peaks
+        self.wanted = wanted
         self.members = _of_ranges(labels)
         self.pursue = pursue
-        n_axes, most = len(space.size), max(_MOST_EACH * wanted, _LEAST_MOST)
+        n_axes = len(space.size)
+        most = max(_MOST_EACH * wanted, _LEAST_MOST)
         if pursue:
             most *= _MORE_PURSUED
         self.most = most
@@ -208,7 +231,8 @@ class AdaptiveSampler:
         self.peak = np.zeros(most, np.int64)
         self.density = np.zeros(most)
         self.scratch = np.empty((n_axes + 2, _LARGEST_ROUND))
-        self.mixtures, self.ends = [], []
+        self.mixtures = []
+        self.ends = []
         self.n = 0
 
     def run(self, label, score, peak):
@@ -230,56 +254,82 @@ class AdaptiveSampler:
         share = np.bincount(self._groups(label, peak), minlength=self.n_groups)
         self.pursued = (share > _PURSUED * share.sum()) & self.pursue
         parts = self._fit(label, score, peak, np.ones(len(label)))
-        goal, enough, best = _FIRST_GOAL * self.wanted, False, None
-        while not enough and self.n < self.most:
-            # places that say where the posterior is
-            for turn in range(_PURSUING_ROUNDS if self.pursue else _ADAPTING_ROUNDS):
-                size = min(ROUND_SIZE, self.most - self.n)
-                self._add_round(parts.shared(self._guarded(share)), size)
-                rows = slice(0, self.n)
-                weight, top = self._weights(rows, self.density[rows] / self.n)
-                if weight is None:
-                    return None
-                effective, _, share = self._wanted(weight, rows)
-                parts = self._fit(*self._of_places(weight))
-                share = self._pursuing(share)
-                good = effective >= goal or turn + 1 >= _ADAPTING_ROUNDS
-                if self.n >= self.most or (good and not self.pursued.any()):
-                    break
-            # and others, on which the parts do not depend: recycled places have too little weight where few are
-            first, total = self.n, np.zeros(len(parts.kernel.share))
-            missing = share
-            while self.n < self.most:
-                size = int(np.clip(missing.sum(), ROUND_SIZE, _LARGEST_ROUND)) & ~127
-                size = min(size, self.most - self.n)
-                mixture = parts.shared(self._guarded(missing))
-                self._add_round(mixture, size)
-                total += size * mixture.share
-                rows = slice(first, self.n)
-                density = self._density(mixture._replace(share=total), first) / total.sum()
-                weight, top = self._weights(rows, density)
-                if weight is None:
-                    return None
-                effective, enough, wanted = self._wanted(weight, rows)
-                n = self.n - first
-                # they would not be enough of them
-                hopeless = first + n * self.wanted / effective > self.most
-                enough = enough and n >= _LEAST_KEPT
-                if enough or (hopeless and n >= _TRIED and self.most - self.n > _TRY_AGAIN * n):
-                    break
-                has = np.bincount(
-                    self._groups(self.label[rows], self.peak[rows]), minlength=wanted.size
-                )
-                missing = np.maximum(wanted - has, 0.02 * wanted)
-            kept = self.n > first
-            if best is None or enough or (kept and effective > best[2]):
-                best = rows, weight, effective, top
+        goal = _FIRST_GOAL * self.wanted
+        best = None
+        while self.n < self.most:
+            adapted = self._adapt(parts, share, goal)
+            if adapted is None:
+                return None
+            parts, share, sample = adapted
+            if self.n < self.most:
+                sample = self._collect(parts, share)
+            elif best is not None:
+                # there is no place for more, and weights of those that parts were fitted to are biased
+                break
+            if sample is None:
+                return None
+            if best is None or sample.enough or sample.effective > best.effective:
+                best = sample
+            if sample.enough:
+                break
             goal = 2.0 * goal
-            if not enough and self.n < self.most:
-                share, parts = wanted, self._fit(*self._of_places())
-        rows, weight, effective, top = best
-        evidence = top + np.log(weight.mean())
-        return self._models(rows, weight, effective, enough, evidence)
+            if self.n < self.most:
+                share = sample.wanted
+                parts = self._fit(*self._of_places())
+        return self._models(best)
+
+    def _adapt(self, parts, share, goal):
+        """
+        Add places that say where the posterior is, until they have an effective number.
+
+        Returned are parts that are fitted to them, shares of labels and peaks, and the `WeightedPlaces`; or None
+        if no place is possible.
+        """
+        n_rounds = _PURSUING_ROUNDS if self.pursue else _ADAPTING_ROUNDS
+        for turn in range(n_rounds):
+            size = min(ROUND_SIZE, self.most - self.n)
+            self._add_round(parts.shared(self._guarded(share)), size)
+            rows = slice(0, self.n)
+            sample = self._weigh(rows, self.density[rows] / self.n)
+            if sample is None:
+                return None
+            parts = self._fit(*self._of_places(sample.weight))
+            share = self._pursuing(sample.wanted)
+            good = sample.effective >= goal or turn + 1 >= _ADAPTING_ROUNDS
+            if self.n >= self.most or (good and not self.pursued.any()):
+                break
+        return parts, share, replace(sample, enough=False)
+
+    def _collect(self, parts, share):
+        """
+        Add places that the parts do not depend on: `WeightedPlaces`, or None if none is possible.
+
+        Until there are enough, or it shows that these parts will not do.
+        """
+        first = self.n
+        total = np.zeros(len(parts.kernel.share))
+        missing = share
+        while self.n < self.most:
+            size = int(np.clip(missing.sum(), ROUND_SIZE, _LARGEST_ROUND)) & ~127
+            size = min(size, self.most - self.n)
+            mixture = parts.shared(self._guarded(missing))
+            self._add_round(mixture, size)
+            total += size * mixture.share
+            rows = slice(first, self.n)
+            density = self._density(mixture._replace(share=total), first) / total.sum()
+            sample = self._weigh(rows, density)
+            if sample is None:
+                return None
+            n = self.n - first
+            sample = replace(sample, enough=sample.enough and n >= _LEAST_KEPT)
+            too_many = first + n * self.wanted / sample.effective > self.most
+            room = self.most - self.n > _TRY_AGAIN * n
+            if sample.enough or (too_many and n >= _TRIED and room):
+                break
+            group = self._groups(self.label[rows], self.peak[rows])
+            n_each = np.bincount(group, minlength=self.n_groups)
+            missing = np.maximum(sample.wanted - n_each, 0.02 * sample.wanted)
+        return sample
 
     @property
     def n_groups(self):
@@ -322,28 +372,31 @@ class AdaptiveSampler:
         """Density of a mixture at the places from ``first`` on."""
         out = np.zeros(self.n)
         ends = np.concatenate([block for block in self.ends if block[0, 0] >= first])
-        given = 1.0, ends, self.score, self.scratch, out
-        _core.add_density(self.labels, mixture, *given)
+        _core.add_density(self.labels, mixture, 1.0, ends, self.score, self.scratch, out)
         return out[first:]
 
-    def _weights(self, rows, density):
-        """Weights, at most 1, of places drawn from a density, and ln of their unit; None if none is possible."""
+    def _weigh(self, rows, density):
+        """`WeightedPlaces` of places drawn from a density; None if none is possible."""
         log = self.known[rows, 0] - np.log(density)
         top = log.max()
         if not top > 0.5 * _core.NEVER:
-            return None, top
-        return np.exp(np.maximum(log - top, -700.0)), top
+            return None
+        weight = np.exp(np.maximum(log - top, -700.0))
+        return WeightedPlaces(rows, weight, *self._wanted(weight, rows))
 
     def _add_round(self, mixture, size):
         """Draw places of a mixture, evaluate them, and add its density to that of all mixtures."""
         new = slice(self.n, self.n + size)
         choice, _, normal, spread = self.points
-        label, score = np.empty(size, np.int64), np.empty((size, self.score.shape[1]))
+        label = np.empty(size, np.int64)
+        score = np.empty((size, self.score.shape[1]))
         _core.propose(self.labels, mixture, choice[new], normal[new], spread[new], label, score)
         order = np.argsort(label, kind="stable")
-        label, score = label[order], score[order]
-        self.label[new], self.score[new] = label, score
-        of_new = label, score, self.place[new], self.known[new], self.work
+        label = label[order]
+        score = score[order]
+        self.label[new] = label
+        self.score[new] = score
+        of_new = (label, score, self.place[new], self.known[new], self.work)
         _core.evaluate_places(self.space, self.labels, self.one, *of_new)
         if self.borders.size:
             self.peak[new] = np.searchsorted(self.borders, self._redshift(self.place[new, 0]))
@@ -358,8 +411,8 @@ class AdaptiveSampler:
 
     def _add_density(self, parts, times, ends):
         """Add a mixture's density to that of all at blocks of places."""
-        given = float(times), ends, self.score, self.scratch, self.density
-        _core.add_density(self.labels, parts, *given)
+        scratch = self.scratch
+        _core.add_density(self.labels, parts, float(times), ends, self.score, scratch, self.density)
 
     def _redshift(self, place):
         """Redshifts of places in the unit interval."""
@@ -372,12 +425,15 @@ class AdaptiveSampler:
         Most is had of a number of places if that of each label and peak is as its weight over the root of its
         efficiency (Neyman allocation). Labels, peaks, and components that count have enough of their own.
         """
-        group, whole = self._groups(self.label[rows], self.peak[rows]), weight.sum()
+        group = self._groups(self.label[rows], self.peak[rows])
+        whole = weight.sum()
 
         def of_groups(values=None):
             return np.bincount(group, values, minlength=self.n_groups)
 
-        own, square, n = of_groups(weight), of_groups(weight * weight), of_groups()
+        own = of_groups(weight)
+        square = of_groups(weight * weight)
+        n = of_groups()
         effective = whole**2 / square.sum()
         enough = bool(effective >= self.wanted)
         each = np.square(own) / np.maximum(square, 1e-300)
@@ -433,14 +489,18 @@ class AdaptiveSampler:
 
     def _fit(self, label, score, peak, flat):
         """`FittedParts` of labels and peaks with places of weights ``flat``, and a wide one of each label."""
-        n_labels, n_axes, n_peaks = len(self.labels.n_active), score.shape[1], len(self.peaks)
+        n_labels = len(self.labels.n_active)
+        n_axes = score.shape[1]
+        n_peaks = len(self.peaks)
         group = self._groups(label, peak)
         own = np.bincount(group, flat, minlength=self.n_groups).reshape(n_labels, n_peaks)
         whole = own.sum(axis=0)
         order = np.argsort(group, kind="stable")
         ends = np.searchsorted(group[order], np.arange(self.n_groups + 1))
         peaks = np.flatnonzero(whole > 0)
-        fitted, of_group, start = [], [], np.zeros(n_labels + 1, np.int64)
+        fitted = []
+        of_group = []
+        start = np.zeros(n_labels + 1, np.int64)
         guards = np.zeros((n_labels, n_peaks), np.int64)
         for i in range(n_labels):
             start[i] = len(of_group)
@@ -449,29 +509,37 @@ class AdaptiveSampler:
                 if own[i, j] > _LEAST_WEIGHT * whole[j]:
                     rows = order[ends[k] : ends[k + 1]]
                     each = flat[rows]
-                    rows, each = rows[each > 0], each[each > 0]
+                    rows = rows[each > 0]
+                    each = each[each > 0]
                     effective = each.sum() ** 2 / np.sum(each * each)
                     n_parts = 1 + int(effective > _TWO_PARTS) + int(effective > _THREE_PARTS)
                     fitted.append((len(of_group), i, j, n_parts, rows, each))
                     of_group += [k] * n_parts
                 guards[i, j] = len(of_group)
                 of_group.append(k)
-        start[-1] = n = len(of_group)
-        square = n, n_axes, n_axes
+        n = len(of_group)
+        start[-1] = n
         parts = _core.Parts(
-            start, np.empty(n, np.int64), np.ones(n), np.empty(n), np.empty(square[:2]),
-            np.empty(square), np.empty(square),
-        )  # fmt: skip
+            start=start,
+            label=np.empty(n, np.int64),
+            share=np.ones(n),
+            top=np.empty(n),
+            mean=np.empty((n, n_axes)),
+            root=np.empty((n, n_axes, n_axes)),
+            inverse=np.empty((n, n_axes, n_axes)),
+        )
         # of axes without effect too, in which places are as the prior has them
-        moments, scratch = {}, np.empty((n_axes, n_axes))
+        moments = {}
+        scratch = np.empty((n_axes, n_axes))
         _, every, _ = _mean_and_cov(score, flat)
         for j in peaks:
             rows = np.flatnonzero((peak == j) & (flat > 0))
             mean, cov, effective = _mean_and_cov(score[rows], flat[rows])
             few = n_axes / (n_axes + effective)
-            moments[j] = mean, (1.0 - few) * cov + few * every
-            given = mean, _WIDE_SQUARE * moments[j][1], scratch
-            _core.add_widest(self.labels, parts, guards[:, j].copy(), *given)
+            cov = (1.0 - few) * cov + few * every
+            moments[j] = (mean, cov)
+            places = guards[:, j].copy()
+            _core.add_widest(self.labels, parts, places, mean, _WIDE_SQUARE * cov, scratch)
         for p, i, j, n_parts, rows, each in fitted:
             spaces = (
                 np.empty((n_axes + 2, rows.size)),
@@ -479,24 +547,29 @@ class AdaptiveSampler:
                 scratch,
                 np.empty(3),
             )
-            given = p, i, n_parts, _FIT_ROUNDS, _WIDER, score[rows], each, *moments[j]
-            _core.fit_parts(self.labels, parts, *given, spaces)
+            points = (score[rows], each, *moments[j])
+            _core.fit_parts(self.labels, parts, p, i, n_parts, _FIT_ROUNDS, _WIDER, *points, spaces)
             parts.share[p : p + n_parts] *= 1.0 - _WIDE_SHARE
             parts.share[p + n_parts] = _WIDE_SHARE
         return FittedParts(parts, np.array(of_group))
 
-    def _models(self, rows, weight, effective, enough, evidence):
-        """`PlacedModels` of places but those of least weight."""
+    def _models(self, sample):
+        """`PlacedModels` of weighted places but those of least weight."""
+        weight = sample.weight
         order = np.argsort(weight, kind="stable")
         upto = np.cumsum(weight[order])
         kept = np.sort(order[upto > _LEFT_OUT * upto[-1]])
-        weight = weight[kept] / weight[kept].sum()
-        rows = rows.start + kept
+        rows = sample.rows.start + kept
         _, scale, variance, power = self.known[rows].T
         return PlacedModels(
-            self.place[rows], weight, scale, variance, power, self.points[1][rows],
-            effective, self.n, evidence, enough,
-        )  # fmt: skip
+            place=self.place[rows],
+            weight=weight[kept] / weight[kept].sum(),
+            scale=scale,
+            variance=variance,
+            power=power,
+            uniform=self.points[1][rows],
+            converged=sample.enough,
+        )
 
 
 def _of_ranges(labels):

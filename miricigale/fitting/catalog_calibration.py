@@ -229,8 +229,11 @@ def calibrate_bands(
     ValueError
         If the fitter has no grid, or errors of the models that differ between bands and no calibration.
 
-    References ---------- Hogg, Bovy & Lang 2010, arXiv:1008.4686. Cook & Weisberg 1982, Residuals and Influence in
-    Regression, chapter 2.
+    References
+    ----------
+    Hogg, Bovy & Lang 2010, arXiv:1008.4686.
+
+    Cook & Weisberg 1982, Residuals and Influence in Regression, chapter 2.
 
     Examples
     --------

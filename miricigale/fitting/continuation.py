@@ -157,20 +157,7 @@ class Continuation(Frozen):
         new["mass_prior"] = prior and (lambda formed, _: prior(formed, [node]))
         return replace(engine, **new)
 
-    def place(
-        self,
-        n_effective,
-        redshifts,
-        found,
-        i,
-        target,
-        limits,
-        log_usable,
-        wrong,
-        drawn,
-        zf,
-        spread,
-    ):
+    def place(self, n_effective, redshifts, found, i, target, limits, log_usable, wrong, start):
         """
         Put models between the nodes, with the weights of the posterior of an object.
 
@@ -182,7 +169,7 @@ class Continuation(Frozen):
             Redshifts of objects; 0 if these are free.
         found : dict
             Gets, at ``i``, a `BetweenPosterior`, or None if no model is possible.
-        i, target, limits, log_usable, wrong, drawn, zf, spread
+        i, target, limits, log_usable, wrong, start
             What `GridEngine.fit` says of the object.
         """
         redshift = float(redshifts[i])
@@ -192,11 +179,13 @@ class Continuation(Frozen):
             labels, borders, weights = self.labels_at_redshift, np.zeros(0), np.ones(1)
         else:
             labels = self.labels
-            borders, weights = redshift_peaks(self.engine.grid.redshift, zf.sum(axis=1))
+            borders, weights = redshift_peaks(self.engine.grid.redshift, start.zf.sum(axis=1))
         given = self.space, labels.kernel, self._work(), one, borders, weights
-        sampler = AdaptiveSampler(*given, wanted=n_effective, scramble=self.scramble, pursue=spread)
-        label, score = labels.of_nodes(self._cells_of(drawn))
-        peak = np.searchsorted(borders, self.engine.grid.redshift[drawn[:, 0]])
+        sampler = AdaptiveSampler(
+            *given, wanted=n_effective, scramble=self.scramble, pursue=start.larger_errors
+        )
+        label, score = labels.of_nodes(self._cells_of(start.index))
+        peak = np.searchsorted(borders, self.engine.grid.redshift[start.index[:, 0]])
         models = sampler.run(label, score, peak)
         found[i] = models and self._describe(models, one, wrong)
 

@@ -39,6 +39,9 @@ _AXES = declared("miricigale.fitting", "columns.toml")["arrays"]
 #: These arrays, not a number or -1 in rows that were not fitted; ``joint`` are joint posteriors that were
 #: asked for, by two of the letters z, g, k and f.
 GridOutput = namedtuple("GridOutput", [*_AXES, "joint"])
+#: What the posterior between nodes begins with: draws on the nodes, redshift, galaxy, AGN model and fraction,
+#: shape (n_draws, 4); the posterior of redshift and AGN fraction, (nz, nf); whether both are of larger errors.
+Start = namedtuple("Start", "index zf larger_errors")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -238,8 +241,7 @@ class GridEngine(Frozen):
         each : callable, optional
             Called with the row of each object that was fitted, its data, its limits (or None), 2 ln(prior) of the
             galaxies, shape (nz, nG), if bands may be wrong (else None), its data with stated errors, these
-            errors and the broad ones, shape (nb,), its draws, shape (n_draws, 4), and its posterior of redshift
-            and AGN fraction, shape (nz, nf).
+            errors and the broad ones, shape (nb,), and a `Start`.
 
         Returns
         -------
@@ -285,7 +287,7 @@ class GridEngine(Frozen):
                     out.outlier[i] = np.where(used, out.zf[i].sum(axis=1) @ wrong, np.nan)
                 if each is not None:
                     wrong = None if broad is None else (stated, sigma[i], broad[i])
-                    start = out.draw_index[i], out.zf[i], False
+                    start = Start(out.draw_index[i], out.zf[i], False)
                     excess = out.chi2[i] / np.isfinite(sigma[i]).sum()
                     if excess > _EXCESS:
                         larger = np.sqrt(excess)
@@ -293,12 +295,12 @@ class GridEngine(Frozen):
                             data[i], larger * sigma[i], log_prior[i], larger * self.template_error
                         )
                         start = self._spread(loose, limits, workspace, single, seeds[i]) or start
-                    each(i, target, limits, tables.log_usable, wrong, *start)
+                    each(i, target, limits, tables.log_usable, wrong, start)
         return out
 
     def _spread(self, target, limits, workspace, single, seed):
         """
-        Draws from the posterior of data with larger errors, that of redshift and AGN fraction, and True; or None.
+        `Start` by the posterior of data with larger errors; None if no model is possible.
 
         Where errors are small against the differences of nodes, the posterior on nodes is that of a node that
         happens to be near, and what lies in the cells of others is to be found.
@@ -310,7 +312,7 @@ class GridEngine(Frozen):
         given = tables, self._scales, self._request, target, limits
         if not (target.norm[0] > 0.0 and _core.sum_up(*given, *workspace, single=single)):
             return None
-        return np.array(sums.draws.index), sums.zf / sums.zf.sum(), True
+        return Start(np.array(sums.draws.index), sums.zf / sums.zf.sum(), True)
 
     def _of_masses(self, target, space):
         """Tables and data with the priors of galaxies, and of redshifts, at the masses that an object has."""
