@@ -16,19 +16,21 @@ from scipy.special import chdtri, ndtri
 from scipy.stats import qmc
 
 from miricigale.fitting import _core
+from miricigale.fitting.proposals import LEAST_WEIGHT, Places, fit_mixture
 from miricigale.utils.caching import cached
 
 #: Places in a round, and most places for each of the effective number that is wanted, and at least.
 ROUND_SIZE = 512
 _LARGEST_ROUND = 1024
-_MOST_EACH = 16
+_MOST_EACH = 80
 _LEAST_MOST = 1 << 14
-#: Places fitted to: rounds, or effective number of them over that wanted in all, which doubles from time to time;
-#: and places after which it is seen whether their mixture will do.
+#: Places fitted to at first: rounds, or effective number of them over that wanted in all; places after which it is
+#: seen whether a mixture will do, which double each time; and how near it must be by then.
 _ADAPTING_ROUNDS = 6
 _PURSUING_ROUNDS = 16
 _FIRST_GOAL = 0.3
 _TRIED = 2048
+_ALMOST = 1.5
 _TRY_AGAIN = 2
 #: Weight of peaks of redshift and of labels that are to have this part of the effective number themselves.
 _COUNTS = 0.02
@@ -41,7 +43,7 @@ _LEAST_PLACES = 0.03
 #: is found, and how many times as many places there may be.
 _PURSUED = 0.01
 _PURSUED_SHARE = 0.06
-_MORE_PURSUED = 4
+_MORE_PURSUED = 2
 #: Least number of places that parts are fitted to.
 _FEWEST_PLACES = 20
 #: Share of a mixture that all labels have, whatever their weight, and each peak and what has weight in it.
@@ -53,20 +55,12 @@ _LEAST_SHARE = 0.05
 #: counts.
 _GAP = 2e-3
 _PEAK = 0.005
-#: Weight, over that of its peak, below which no part is fitted.
-_LEAST_WEIGHT = 1e-3
-#: Effective numbers of points from which two and three parts are fitted, and rounds of the fit.
-_TWO_PARTS = 40
-_THREE_PARTS = 60
-_FIT_ROUNDS = 4
-#: Share of wide parts, of the mean and this times the covariance of all places of a peak, in all labels.
-_WIDE_SHARE = 0.2
-_WIDE_SQUARE = 1.4
-#: What widths are multiplied by.
-_WIDER = 1.1
-#: Effective number of points that the weights of a peak are flattened to for a fit, in each round, and at most.
+#: Effective number of points that the weights of a peak are flattened to for a fit: in each round, and at most at
+#: first, which doubles each time.
 _FLAT_EACH = 50
 _FLAT_MOST = 150
+#: Narrow parts that are added to each label and peak where weights are large.
+_N_LOCAL = 16
 #: Weight of the models that are left out of results.
 _LEFT_OUT = 1e-4
 #: Uniform numbers keep this from 0 and 1.
@@ -220,8 +214,12 @@ class AdaptiveSampler:
         self.pursue = pursue
         n_axes = len(space.size)
         most = max(_MOST_EACH * wanted, _LEAST_MOST)
+        self.n_rounds = _ADAPTING_ROUNDS
         if pursue:
             most *= _MORE_PURSUED
+            self.n_rounds = _PURSUING_ROUNDS
+        # room for places that parts are fitted to, and for a first try
+        most = max(most, self.n_rounds * ROUND_SIZE + _TRIED)
         self.most = most
         self.points = quasi_random(n_axes, int(np.ceil(np.log2(most))), scramble)
         self.label = np.empty(most, np.int64)
@@ -231,8 +229,7 @@ class AdaptiveSampler:
         self.peak = np.zeros(most, np.int64)
         self.density = np.zeros(most)
         self.scratch = np.empty((n_axes + 2, _LARGEST_ROUND))
-        self.mixtures = []
-        self.ends = []
+        self.n_fitted = _FLAT_MOST
         self.n = 0
 
     def run(self, label, score, peak):
@@ -253,78 +250,89 @@ class AdaptiveSampler:
         """
         share = np.bincount(self._groups(label, peak), minlength=self.n_groups)
         self.pursued = (share > _PURSUED * share.sum()) & self.pursue
-        parts = self._fit(label, score, peak, np.ones(len(label)))
-        goal = _FIRST_GOAL * self.wanted
+        parts = self._fit(Places(label, score, peak, np.ones(len(label))))
+        adapted = self._adapt(parts, share)
+        if adapted is None:
+            return None
+        parts, share = adapted
         best = None
-        while self.n < self.most:
-            adapted = self._adapt(parts, share, goal)
-            if adapted is None:
-                return None
-            parts, share, sample = adapted
-            if self.n < self.most:
-                sample = self._collect(parts, share)
-            elif best is not None:
-                # there is no place for more, and weights of those that parts were fitted to are biased
-                break
+        size = _TRIED
+        while self.most - self.n >= ROUND_SIZE:
+            sample = self._collect(parts, share, size)
             if sample is None:
                 return None
             if best is None or sample.enough or sample.effective > best.effective:
                 best = sample
             if sample.enough:
                 break
-            goal = 2.0 * goal
-            if self.n < self.most:
-                share = sample.wanted
-                parts = self._fit(*self._of_places())
+            # what is seen of the posterior by now is fitted by more parts
+            size = 2 * size
+            self.n_fitted = 2 * self.n_fitted
+            parts = self._fit(self._places(self.n_fitted), n_local=_N_LOCAL)
+            share = sample.wanted
         return self._models(best)
 
-    def _adapt(self, parts, share, goal):
+    def _adapt(self, parts, share):
         """
         Add places that say where the posterior is, until they have an effective number.
 
-        Returned are parts that are fitted to them, shares of labels and peaks, and the `WeightedPlaces`; or None
-        if no place is possible.
+        Returned are parts that are fitted to them, and shares of labels and peaks; None if no place is possible.
         """
-        n_rounds = _PURSUING_ROUNDS if self.pursue else _ADAPTING_ROUNDS
-        for turn in range(n_rounds):
-            size = min(ROUND_SIZE, self.most - self.n)
-            self._add_round(parts.shared(self._guarded(share)), size)
+        mixtures = []
+        ends = []
+        total = np.zeros((1, self.n_rounds * ROUND_SIZE))
+        for turn in range(self.n_rounds):
+            mixture = parts.shared(self._guarded(share))
+            mixtures.append(mixture)
+            new = self._add_round(mixture, ROUND_SIZE)
+            for each in mixtures:
+                self._add_density(each, new, total)
+            if ends:
+                self._add_density(mixture, np.concatenate(ends), total)
+            ends.append(new)
             rows = slice(0, self.n)
-            sample = self._weigh(rows, self.density[rows] / self.n)
+            self.density[rows] = total[0, rows] / len(mixtures)
+            sample = self._weigh(rows)
             if sample is None:
                 return None
-            parts = self._fit(*self._of_places(sample.weight))
+            few = min(_FLAT_MOST, _FLAT_EACH * len(mixtures))
+            places = self._places(few)
             share = self._pursuing(sample.wanted)
-            good = sample.effective >= goal or turn + 1 >= _ADAPTING_ROUNDS
-            if self.n >= self.most or (good and not self.pursued.any()):
+            good = sample.effective >= _FIRST_GOAL * self.wanted or turn + 1 >= _ADAPTING_ROUNDS
+            if good and not self.pursued.any():
                 break
-        return parts, share, replace(sample, enough=False)
+            parts = self._fit(places)
+        return self._fit(places, n_local=_N_LOCAL), share
 
-    def _collect(self, parts, share):
+    def _collect(self, parts, share, tried):
         """
         Add places that the parts do not depend on: `WeightedPlaces`, or None if none is possible.
 
-        Until there are enough, or it shows that these parts will not do.
+        Until there are enough, or a number that is tried shows that it would take many more of them, where there
+        is room to begin again.
         """
         first = self.n
-        total = np.zeros(len(parts.kernel.share))
+        total = np.zeros(self.n_groups)
+        density = np.zeros((len(self.peaks), self.most))
         missing = share
-        while self.n < self.most:
+        while self.most - self.n >= ROUND_SIZE:
             size = int(np.clip(missing.sum(), ROUND_SIZE, _LARGEST_ROUND)) & ~127
             size = min(size, self.most - self.n)
-            mixture = parts.shared(self._guarded(missing))
-            self._add_round(mixture, size)
-            total += size * mixture.share
+            guarded = parts.possible(self._guarded(missing))
+            ends = self._add_round(parts.shared(guarded), size)
+            self._add_density(parts.kernel, ends, density, parts.group % len(self.peaks))
+            total += size * guarded
             rows = slice(first, self.n)
-            density = self._density(mixture._replace(share=total), first) / total.sum()
-            sample = self._weigh(rows, density)
+            each = total.reshape(-1, len(self.peaks))[self.label[rows]]
+            self.density[rows] = np.sum(each.T * density[:, rows], axis=0) / total.sum()
+            sample = self._weigh(rows)
             if sample is None:
                 return None
             n = self.n - first
             sample = replace(sample, enough=sample.enough and n >= _LEAST_KEPT)
-            too_many = first + n * self.wanted / sample.effective > self.most
+            many_more = self.wanted > _ALMOST * sample.effective
             room = self.most - self.n > _TRY_AGAIN * n
-            if sample.enough or (too_many and n >= _TRIED and room):
+            if sample.enough or (many_more and n >= tried and room):
                 break
             group = self._groups(self.label[rows], self.peak[rows])
             n_each = np.bincount(group, minlength=self.n_groups)
@@ -340,44 +348,43 @@ class AdaptiveSampler:
         """Index of labels and peaks."""
         return label * len(self.peaks) + peak
 
-    def _of_places(self, weight=None):
+    def _places(self, few):
         """
-        Labels, scores, peaks of all places, and weights for a fit of parts.
+        `Places` for a fit of parts.
 
-        Those of each peak are made flat enough to say what its shape is, or those of each label that has weight.
+        Weights of each peak are made flat enough to say what its shape is, or those of each label that has weight:
+        to an effective number of ``few``.
         """
         rows = slice(0, self.n)
         log = self.known[rows, 0] - np.log(self.density[rows])
+        weight = np.exp(np.maximum(log - log.max(), -700.0))
         group = self.peak[rows]
         chosen = range(len(self.peaks))
         if self.pursue:
             group = self._groups(self.label[rows], self.peak[rows])
-            if weight is None:
-                weight = np.exp(np.maximum(log - log.max(), -700.0))
             share = np.bincount(group, weight, minlength=self.n_groups)
-            chosen = np.flatnonzero(self.pursued | (share > _LEAST_WEIGHT * share.sum()))
-        return (
-            self.label[rows],
-            self.score[rows],
-            self.peak[rows],
-            self._flatten(log, group, chosen),
+            chosen = np.flatnonzero(self.pursued | (share > LEAST_WEIGHT * share.sum()))
+        return Places(
+            label=self.label[rows],
+            score=self.score[rows],
+            peak=self.peak[rows],
+            flat=self._flatten(log, group, chosen, few),
+            weight=weight,
+            log_target=self.known[rows, 0],
         )
+
+    def _fit(self, places, n_local=0):
+        """`FittedParts` of places."""
+        return fit_mixture(self.labels, len(self.peaks), places, n_local)
 
     def _pursuing(self, share):
         """Shares of places, of which labels whose shape is still to be found have a part whatever their weight."""
         least = _PURSUED_SHARE * share.sum()
         return np.where(self.pursued, np.maximum(share, least), share)
 
-    def _density(self, mixture, first):
-        """Density of a mixture at the places from ``first`` on."""
-        out = np.zeros(self.n)
-        ends = np.concatenate([block for block in self.ends if block[0, 0] >= first])
-        _core.add_density(self.labels, mixture, 1.0, ends, self.score, self.scratch, out)
-        return out[first:]
-
-    def _weigh(self, rows, density):
-        """`WeightedPlaces` of places drawn from a density; None if none is possible."""
-        log = self.known[rows, 0] - np.log(density)
+    def _weigh(self, rows):
+        """`WeightedPlaces` of some places; None if none is possible."""
+        log = self.known[rows, 0] - np.log(self.density[rows])
         top = log.max()
         if not top > 0.5 * _core.NEVER:
             return None
@@ -385,7 +392,7 @@ class AdaptiveSampler:
         return WeightedPlaces(rows, weight, *self._wanted(weight, rows))
 
     def _add_round(self, mixture, size):
-        """Draw places of a mixture, evaluate them, and add its density to that of all mixtures."""
+        """Draw places of a mixture and evaluate them; returned are their ends for `_core.add_density`."""
         new = slice(self.n, self.n + size)
         choice, _, normal, spread = self.points
         label = np.empty(size, np.int64)
@@ -401,18 +408,15 @@ class AdaptiveSampler:
         if self.borders.size:
             self.peak[new] = np.searchsorted(self.borders, self._redshift(self.place[new, 0]))
         ends = self.n + np.searchsorted(label, np.arange(len(self.labels.n_active) + 1))[None]
-        self.mixtures.append((mixture, size))
-        for parts, times in self.mixtures:
-            self._add_density(parts, times, ends)
-        if self.n:
-            self._add_density(mixture, size, np.concatenate(self.ends))
-        self.ends.append(ends)
         self.n += size
+        return ends
 
-    def _add_density(self, parts, times, ends):
-        """Add a mixture's density to that of all at blocks of places."""
-        scratch = self.scratch
-        _core.add_density(self.labels, parts, float(times), ends, self.score, scratch, self.density)
+    def _add_density(self, parts, ends, density, column=None):
+        """Add densities of parts of a mixture at blocks of places to columns of others, or to one."""
+        if column is None:
+            column = np.zeros(len(parts.share), np.int64)
+        places = (ends, self.score, self.scratch, density)
+        _core.add_density(self.labels, parts, column, 1.0, *places)
 
     def _redshift(self, place):
         """Redshifts of places in the unit interval."""
@@ -452,7 +456,7 @@ class AdaptiveSampler:
             least = least_each * part[members] / total / rate[members]
             wanted[members] = np.maximum(wanted[members], least)
         # what has little weight so far may have more
-        some = part > _LEAST_WEIGHT
+        some = part > LEAST_WEIGHT
         wanted[some] = np.maximum(wanted[some], _LEAST_PLACES * wanted.sum())
         return effective, enough, wanted
 
@@ -468,7 +472,7 @@ class AdaptiveSampler:
         even = share.sum(axis=0) / len(share)
         return ((1.0 - _GUARD) * share + _GUARD * even).ravel()
 
-    def _flatten(self, log, group, chosen):
+    def _flatten(self, log, group, chosen, few):
         """
         Weights for a fit, flat enough in each of some groups to say what its shape is.
 
@@ -479,79 +483,12 @@ class AdaptiveSampler:
             rows = np.flatnonzero(group == j)
             if rows.size < _FEWEST_PLACES:
                 continue
-            few = min(_FLAT_MOST, _FLAT_EACH * len(self.mixtures), 0.5 * rows.size)
             own = np.empty(rows.size)
-            power, _ = _core.flatten(log[rows], float(few), own)
+            power, _ = _core.flatten(log[rows], min(float(few), 0.5 * rows.size), own)
             flat[rows] = own / own.sum()
-            if self.pursue and power == 1.0 and few == _FLAT_MOST:
+            if self.pursue and power == 1.0 and min(few, 0.5 * rows.size) >= _FLAT_MOST:
                 self.pursued[j] = False
         return flat
-
-    def _fit(self, label, score, peak, flat):
-        """`FittedParts` of labels and peaks with places of weights ``flat``, and a wide one of each label."""
-        n_labels = len(self.labels.n_active)
-        n_axes = score.shape[1]
-        n_peaks = len(self.peaks)
-        group = self._groups(label, peak)
-        own = np.bincount(group, flat, minlength=self.n_groups).reshape(n_labels, n_peaks)
-        whole = own.sum(axis=0)
-        order = np.argsort(group, kind="stable")
-        ends = np.searchsorted(group[order], np.arange(self.n_groups + 1))
-        peaks = np.flatnonzero(whole > 0)
-        fitted = []
-        of_group = []
-        start = np.zeros(n_labels + 1, np.int64)
-        guards = np.zeros((n_labels, n_peaks), np.int64)
-        for i in range(n_labels):
-            start[i] = len(of_group)
-            for j in peaks:
-                k = i * n_peaks + j
-                if own[i, j] > _LEAST_WEIGHT * whole[j]:
-                    rows = order[ends[k] : ends[k + 1]]
-                    each = flat[rows]
-                    rows = rows[each > 0]
-                    each = each[each > 0]
-                    effective = each.sum() ** 2 / np.sum(each * each)
-                    n_parts = 1 + int(effective > _TWO_PARTS) + int(effective > _THREE_PARTS)
-                    fitted.append((len(of_group), i, j, n_parts, rows, each))
-                    of_group += [k] * n_parts
-                guards[i, j] = len(of_group)
-                of_group.append(k)
-        n = len(of_group)
-        start[-1] = n
-        parts = _core.Parts(
-            start=start,
-            label=np.empty(n, np.int64),
-            share=np.ones(n),
-            top=np.empty(n),
-            mean=np.empty((n, n_axes)),
-            root=np.empty((n, n_axes, n_axes)),
-            inverse=np.empty((n, n_axes, n_axes)),
-        )
-        # of axes without effect too, in which places are as the prior has them
-        moments = {}
-        scratch = np.empty((n_axes, n_axes))
-        _, every, _ = _mean_and_cov(score, flat)
-        for j in peaks:
-            rows = np.flatnonzero((peak == j) & (flat > 0))
-            mean, cov, effective = _mean_and_cov(score[rows], flat[rows])
-            few = n_axes / (n_axes + effective)
-            cov = (1.0 - few) * cov + few * every
-            moments[j] = (mean, cov)
-            places = guards[:, j].copy()
-            _core.add_widest(self.labels, parts, places, mean, _WIDE_SQUARE * cov, scratch)
-        for p, i, j, n_parts, rows, each in fitted:
-            spaces = (
-                np.empty((n_axes + 2, rows.size)),
-                np.empty((4, rows.size)),
-                scratch,
-                np.empty(3),
-            )
-            points = (score[rows], each, *moments[j])
-            _core.fit_parts(self.labels, parts, p, i, n_parts, _FIT_ROUNDS, _WIDER, *points, spaces)
-            parts.share[p : p + n_parts] *= 1.0 - _WIDE_SHARE
-            parts.share[p + n_parts] = _WIDE_SHARE
-        return FittedParts(parts, np.array(of_group))
 
     def _models(self, sample):
         """`PlacedModels` of weighted places but those of least weight."""
@@ -580,37 +517,6 @@ def _of_ranges(labels):
         if len(kinds) > 1:
             out += [np.flatnonzero((first == a) & (count == b)) for a, b in kinds]
     return out
-
-
-@dataclass(frozen=True, eq=False)
-class FittedParts:
-    """
-    Parts of a mixture, whose shares are those within their label and peak.
-
-    Parameters
-    ----------
-    kernel : `~miricigale.fitting._core.Parts`
-        The parts.
-    group : `~numpy.ndarray` of int, shape (n,)
-        Index of label and peak of each.
-    """
-
-    kernel: tuple
-    group: np.ndarray
-
-    def shared(self, share):
-        """Mixture in which labels and peaks have shares, of any sum: `~miricigale.fitting._core.Parts`."""
-        own = self.kernel.share * share[self.group]
-        return self.kernel._replace(share=own / own.sum())
-
-
-def _mean_and_cov(score, weight):
-    """Mean and covariance of places with weights, and their effective number."""
-    weight = weight / weight.sum()
-    mean = weight @ score
-    apart = score - mean
-    cov = (apart * weight[:, None]).T @ apart + 1e-6 * np.eye(score.shape[1])
-    return mean, cov, 1.0 / np.sum(weight * weight)
 
 
 def places_to_values(space, axis, place):

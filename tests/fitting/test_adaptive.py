@@ -234,8 +234,11 @@ def test_densities_are_those_of_t_distributions(mixture):
     choice, _, normal, spread = (x[:n] for x in quasi_random(n_axes, 11, 1))
     label, y = np.empty(n, np.int64), np.empty((n, n_axes))
     _core.propose(labels, parts, choice, normal, spread, label, y)
-    density = np.zeros(n)
-    _core.add_density(labels, parts, 1.0, np.array([[0, n]]), y, np.empty((n_axes + 2, n)), density)
+    density = np.zeros((2, n))
+    column = np.array([0, 1])
+    places = (np.array([[0, n]]), y, np.empty((n_axes + 2, n)), density)
+    _core.add_density(labels, parts, column, 1.0, *places)
+    density = density.sum(axis=0)
     want = 0.0
     for share, mean, root in zip(parts.share, parts.mean, np.tril(parts.root), strict=True):
         want = want + share * multivariate_t(mean, root @ root.T, df=_core.FREEDOM).pdf(y)
@@ -248,6 +251,60 @@ def test_densities_are_those_of_t_distributions(mixture):
     assert_allclose(mean, [-4.2, 0.2, 1.0], atol=0.05)
     apart = y - mean
     assert_allclose((apart * weight[:, None]).T @ apart / weight.sum(), cov, atol=0.08)
+
+
+def test_local_parts_go_where_weights_are_large():
+    """A curved ridge (Rosenbrock's): its evidence is 1, and weights of draws become much more equal."""
+    rng = np.random.default_rng(8)
+    n_axes, n, n_local = 2, 4000, 16
+    width = 0.15
+
+    def log_ridge(y):
+        across = (y[:, 1] - y[:, 0] ** 2 + 1.0) / width
+        return -0.5 * (y[:, 0] ** 2 + across**2) - np.log(2.0 * np.pi * width)
+
+    points = rng.standard_normal((n, n_axes))
+    points[:, 1] = points[:, 0] ** 2 - 1.0 + width * points[:, 1]
+    n_parts = 1 + n_local
+    square = (n_parts, n_axes, n_axes)
+    parts = _core.Parts(
+        start=np.array([0, n_parts]),
+        label=np.zeros(n_parts, np.int64),
+        share=np.zeros(n_parts),
+        top=np.zeros(n_parts),
+        mean=np.zeros((n_parts, n_axes)),
+        root=np.zeros(square),
+        inverse=np.zeros(square),
+    )
+    scratch = (np.empty((n_axes + 2, n)), np.empty((2, n)), np.empty((2, 2)), np.empty(1))
+    settings = (0, 0, 1, 1, 1.1)
+    cloud = (points, np.ones(n), np.zeros(n_axes), np.eye(n_axes))
+    _core.fit_parts(_labels(n_axes), parts, *settings, *cloud, scratch)
+
+    def effective(parts):
+        size = 1 << 15
+        choice, _, normal, spread = quasi_random(n_axes, 15, 1)
+        label = np.empty(size, np.int64)
+        y = np.empty((size, n_axes))
+        _core.propose(_labels(n_axes), parts, choice, normal, spread, label, y)
+        density = np.zeros((1, size))
+        places = (np.array([[0, size]]), y, np.empty((n_axes + 2, size)), density)
+        _core.add_density(_labels(n_axes), parts, np.zeros(n_parts, np.int64), 1.0, *places)
+        weight = np.exp(log_ridge(y)) / density[0] / size
+        return weight.sum(), weight.sum() ** 2 / np.sum(weight**2)
+
+    evidence, before = effective(parts)
+    assert evidence == pytest.approx(1.0, abs=0.05)
+    scratch = (np.empty((n_axes + 2, n)), np.empty((4, n)), np.empty((2, 2)), np.empty((2, 2)))
+    known = (points, np.full(n, 1.0 / n), np.exp(log_ridge(points)))
+    _core.add_local_parts(_labels(n_axes), parts, 0, 1, n_local, 0.6, 160, 1.1, known, scratch)
+    assert parts.share.sum() == pytest.approx(1.0)
+    # along the ridge, each of them
+    across = parts.mean[1:, 1] - parts.mean[1:, 0] ** 2 + 1.0
+    assert np.all(np.abs(across) < 4 * width)
+    evidence, after = effective(parts)
+    assert evidence == pytest.approx(1.0, abs=0.03)
+    assert after > 3.0 * before
 
 
 def test_points_are_normal_and_chi2_numbers():

@@ -31,6 +31,7 @@ from miricigale.fitting._core.importance import (
     Labels,
     Parts,
     add_density,
+    add_local_parts,
     add_widest,
     evaluate_places,
     fit_parts,

@@ -31,10 +31,11 @@ _LOG_FREEDOM_PI = math.log(FREEDOM * math.pi)
 _INSIDE = 1e-9
 #: Least square of a diagonal element of a root.
 _NARROW = 1e-10
+#: Steps in which places next to another are found, and how many times as many as wanted there may be.
+_BISECTIONS = 30
+_ENOUGH = 1.1
 _ROOT_HALF = math.sqrt(0.5)
 _LOG_ROOT_TWO_PI = 0.5 * math.log(2.0 * math.pi)
-#: A normal distribution has a third of its weight above this number of standard deviations.
-_THIRD = 0.43
 
 
 @njit(**PART)
@@ -150,24 +151,40 @@ def _squares(coordinate, n, n_active, mean, inverse, row, square):
             square[i] += row[i] * row[i]
 
 
+@njit(**PART)
+def _add_t_density(n, n_active, share, top, square, row, density):
+    """Add the density of a part at n points, whose squared distances are known, times its share."""
+    # (1 + square / FREEDOM)^(-(FREEDOM + n_active) / 2)
+    for i in range(n):
+        row[i] = 1.0 / math.sqrt(1.0 + square[i] / FREEDOM)
+        square[i] = share * top
+    for _ in range(FREEDOM + n_active):
+        for i in range(n):
+            square[i] *= row[i]
+    for i in range(n):
+        density[i] += square[i]
+
+
 @njit(**KERNEL)
-def add_density(labels, parts, times, ends, y, coordinate, density):
+def add_density(labels, parts, column, times, ends, y, coordinate, density):
     """
-    Add the density of a mixture at places to that of others.
+    Add the densities of parts of a mixture at places to others.
 
     Parameters
     ----------
     labels, parts : `Labels`, `Parts`
         The mixture.
+    column : `~numpy.ndarray` of int, shape (n_parts,)
+        Column of ``density`` that each part is added to.
     times : float
-        What its density is multiplied by.
+        What densities are multiplied by.
     ends : `~numpy.ndarray` of int, shape (n_blocks, n_labels + 1)
         Blocks of places are sorted by label: index of the first of each label, and the end of the last.
     y : `~numpy.ndarray`, shape (n, n_axes)
         Scores.
     coordinate : `~numpy.ndarray`, shape (n_axes + 2, n_block)
         Scratch.
-    density : `~numpy.ndarray`, shape (n,)
+    density : `~numpy.ndarray`, shape (n_columns, n)
         Is added to.
     """
     n_axes = y.shape[1]
@@ -182,16 +199,9 @@ def add_density(labels, parts, times, ends, y, coordinate, density):
             _copy_active(y, first, n, labels.axes[own], n_active, coordinate)
             for p in range(parts.start[own], parts.start[own + 1]):
                 _squares(coordinate, n, n_active, parts.mean[p], parts.inverse[p], row, square)
-                top = times * parts.share[p] * parts.top[p]
-                # (1 + square / FREEDOM)^(-(FREEDOM + n_active) / 2)
-                for i in range(n):
-                    row[i] = 1.0 / math.sqrt(1.0 + square[i] / FREEDOM)
-                    square[i] = top
-                for _ in range(FREEDOM + n_active):
-                    for i in range(n):
-                        square[i] *= row[i]
-                for i in range(n):
-                    density[first + i] += square[i]
+                share = times * parts.share[p]
+                out = density[column[p], first : first + n]
+                _add_t_density(n, n_active, share, parts.top[p], square, row, out)
 
 
 @njit(**PART)
@@ -275,7 +285,7 @@ def fit_parts(labels, parts, p, label, n_parts, rounds, wide, y, weight, middle,
     labels, parts : `Labels`, `Parts`
         Parts from p on are filled; their shares sum to 1.
     label, n_parts, rounds : int
-        Label of the points; parts to fit, 3 at most, and rounds.
+        Label of the points; parts to fit, and rounds.
     wide : float
         What widths are multiplied by in the end.
     y : `~numpy.ndarray`, shape (n, n_axes)
@@ -299,11 +309,8 @@ def fit_parts(labels, parts, p, label, n_parts, rounds, wide, y, weight, middle,
     center, width = parts.mean[p, longest], math.sqrt(max(cov[longest, longest], 1e-300))
     for i in range(n):
         d = (coordinate[longest, i] - center) / width if n_active > 0 else 0.0
-        k = 0
-        if n_parts == 2:
-            k = int(d > 0.0)
-        elif n_parts > 2:
-            k = int(d > -_THIRD) + int(d > _THIRD)
+        # of equal weight if these are normal
+        k = min(int(n_parts * 0.5 * math.erfc(-d * _ROOT_HALF)), n_parts - 1)
         for j in range(n_parts):
             each[j, i] = weight[i] if j == k else 0.0
     n_rounds = rounds if n_parts > 1 else 1
@@ -341,6 +348,119 @@ def fit_parts(labels, parts, p, label, n_parts, rounds, wide, y, weight, middle,
         for j in range(n_parts):
             for i in range(n):
                 each[j, i] *= weight[i] / sums[i]
+
+
+@njit(**PART)
+def _farthest_of(distance, n, near):
+    """Return a distance within which ``near`` of n points are, or a few more, and their number."""
+    low = 0.0
+    high = 0.0
+    for i in range(n):
+        high = max(high, distance[i])
+    count = n
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        inside = 0
+        for i in range(n):
+            if distance[i] <= middle:
+                inside += 1
+        if inside < near:
+            low = middle
+        else:
+            high = middle
+            count = inside
+            if count < _ENOUGH * near:
+                break
+    return high, count
+
+
+@njit(**KERNEL)
+def add_local_parts(labels, parts, first, n_base, n_local, share, near, wide, points, scratch):
+    """
+    Add narrow parts where the others would leave places of a group with large weights.
+
+    Each is put where places add most to the square of the weights, with the covariance of the places next to
+    it around this one (incremental mixture importance sampling: Raftery & Bao 2010, Biometrics 66, 1162).
+
+    Parameters
+    ----------
+    labels, parts : `Labels`, `Parts`
+        The mixture.
+    first, n_base, n_local : int
+        First part of the group, number of those that are there, whose shares are lowered, and number of those that
+        follow.
+    share : float
+        Share of the new parts.
+    near : int
+        Number of places next to the center of a part.
+    wide : float
+        What widths are multiplied by.
+    points : tuple
+        Scores of places of the group, shape (n, n_axes), their weights, which sum to 1, and the posterior in
+        any unit, both of shape (n,).
+    scratch : tuple of `~numpy.ndarray`, shapes (n_axes + 2, n), (4, n), and two of (n_axes, n_axes)
+    """
+    y, weight, target = points
+    coordinate, each, cov, own = scratch
+    n = len(weight)
+    n_axes = y.shape[1]
+    label = parts.label[first]
+    n_active = labels.n_active[label]
+    row = coordinate[n_axes]
+    square = coordinate[n_axes + 1]
+    base, local, near_weight, distance = each
+    _copy_active(y, 0, n, labels.axes[label], n_active, coordinate)
+    base[:] = 1e-290
+    for p in range(first, first + n_base):
+        _squares(coordinate, n, n_active, parts.mean[p], parts.inverse[p], row, square)
+        _add_t_density(n, n_active, parts.share[p], parts.top[p], square, row, base)
+        parts.share[p] *= 1.0 - share
+    local[:] = 0.0
+    p = first + n_base
+    _moments(coordinate, n, n_active, weight, parts.mean[p], cov, row)
+    for a in range(n_active):
+        cov[a, a] += 1e-6
+    # what distances are measured in
+    inverse = own
+    _invert(cov, n_active, parts.root[p], inverse)
+    for t in range(n_local):
+        p = first + n_base + t
+        lowered = 1.0 - share * t / n_local
+        best = -1.0
+        center = 0
+        for i in range(n):
+            worth = weight[i] * target[i] / (lowered * base[i] + local[i])
+            if worth > best:
+                best = worth
+                center = i
+        mean = parts.mean[p]
+        for a in range(n_active):
+            mean[a] = coordinate[a, center]
+        _squares(coordinate, n, n_active, mean, inverse, row, distance)
+        farthest, count = _farthest_of(distance, n, near)
+        total = 0.0
+        for i in range(n):
+            near_weight[i] = weight[i] if distance[i] <= farthest else 0.0
+            total += near_weight[i]
+        total = max(total, 1e-300)
+        for i in range(n):
+            # between the posterior and the places as they were drawn
+            near_weight[i] = 0.5 * near_weight[i] / total
+            if distance[i] <= farthest:
+                near_weight[i] += 0.5 / count
+        for a in range(n_active):
+            for i in range(n):
+                row[i] = near_weight[i] * (coordinate[a, i] - mean[a])
+            for b in range(a + 1):
+                second = 0.0
+                for i in range(n):
+                    second += row[i] * (coordinate[b, i] - mean[b])
+                cov[a, b] = wide * wide * second
+            cov[a, a] += 1e-6
+        _set_part(labels, parts, p, label, cov)
+        parts.share[p] = share / n_local
+        _squares(coordinate, n, n_active, mean, parts.inverse[p], row, square)
+        _add_t_density(n, n_active, parts.share[p], parts.top[p], square, row, local)
 
 
 @njit(**KERNEL)

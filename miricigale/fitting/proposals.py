@@ -1,0 +1,247 @@
+"""Mixtures of t distributions that places between the nodes of a grid are drawn from, fitted to places before."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from miricigale.fitting import _core
+
+#: Weight, over that of its peak, below which no part is fitted.
+LEAST_WEIGHT = 1e-3
+#: Effective number of points for each part that is fitted, most parts, and rounds of the fit.
+_POINTS_EACH = 50
+_MOST_PARTS = 3
+_FIT_ROUNDS = 4
+#: Share of wide parts, of the mean and this times the covariance of all places of a peak, in all labels.
+_WIDE_SHARE = 0.2
+_WIDE_SQUARE = 1.4
+#: What widths are multiplied by.
+_WIDER = 1.1
+#: Share of narrow parts where weights are large, in groups of at least this weight; places that one is fitted to.
+_LOCAL_SHARE = 0.5
+_LOCAL_LEAST = 0.03
+_NEAR = 120
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """
+    Places of a posterior that a mixture is fitted to.
+
+    Parameters
+    ----------
+    label, peak : `~numpy.ndarray` of int, shape (n,)
+        Labels, and peaks of redshift.
+    score : `~numpy.ndarray`, shape (n, n_axes)
+        Scores.
+    flat : `~numpy.ndarray`, shape (n,)
+        Weights for the fit, flatter than the posterior.
+    weight, log_target : `~numpy.ndarray` or None, shape (n,)
+        Weights of the posterior, and its ln; None if these are not known.
+    """
+
+    label: np.ndarray
+    score: np.ndarray
+    peak: np.ndarray
+    flat: np.ndarray
+    weight: np.ndarray | None = None
+    log_target: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class FittedParts:
+    """
+    Parts of a mixture, whose shares are those within their label and peak.
+
+    Parameters
+    ----------
+    kernel : `~miricigale.fitting._core.Parts`
+        The parts.
+    group : `~numpy.ndarray` of int, shape (n,)
+        Index of label and peak of each.
+    """
+
+    kernel: tuple
+    group: np.ndarray
+
+    def possible(self, share):
+        """Shares, which sum to 1, of the labels and peaks that have parts."""
+        some = np.bincount(self.group, minlength=len(share)) > 0
+        share = np.where(some, share, 0.0)
+        return share / share.sum()
+
+    def shared(self, share):
+        """Mixture in which labels and peaks have shares, of any sum: `~miricigale.fitting._core.Parts`."""
+        own = self.kernel.share * share[self.group]
+        return self.kernel._replace(share=own / own.sum())
+
+
+@dataclass(frozen=True, eq=False)
+class _Group:
+    """Places of one label in one peak: their rows, and its parts, which are fitted, wide and narrow."""
+
+    label: int
+    peak: int
+    rows: np.ndarray
+    first: int
+    n_fitted: int
+    n_local: int
+
+    @property
+    def wide(self):
+        """Index of the wide part."""
+        return self.first + self.n_fitted
+
+    @property
+    def last(self):
+        """Index of the part after its own."""
+        return self.wide + 1 + self.n_local
+
+
+def fit_mixture(labels, n_peaks, places, n_local=0):
+    """
+    Fit a mixture to places.
+
+    Each label with weight in a peak has parts of its own, and each label has a wide one in each peak.
+
+    Parameters
+    ----------
+    labels : `~miricigale.fitting._core.Labels`
+        Labels.
+    n_peaks : int
+        Number of peaks of redshift.
+    places : `Places`
+        The places.
+    n_local : int, optional
+        Number of narrow parts for each label and peak that counts, which needs weights.
+
+    Returns
+    -------
+    parts : `FittedParts`
+    """
+    groups = _groups(labels, n_peaks, places, n_local)
+    n_labels = len(labels.n_active)
+    n_axes = places.score.shape[1]
+    start = np.zeros(n_labels + 1, np.int64)
+    index = []
+    for group in groups:
+        index += [group.label * n_peaks + group.peak] * (group.last - group.first)
+        start[group.label + 1 :] = group.last
+    n = len(index)
+    parts = _core.Parts(
+        start=start,
+        label=np.empty(n, np.int64),
+        share=np.ones(n),
+        top=np.empty(n),
+        mean=np.empty((n, n_axes)),
+        root=np.empty((n, n_axes, n_axes)),
+        inverse=np.empty((n, n_axes, n_axes)),
+    )
+    moments = _moments_of_peaks(places)
+    scratch = np.empty((n_axes, n_axes))
+    for peak, (mean, cov) in moments.items():
+        wide = np.array([group.wide for group in groups if group.peak == peak])
+        _core.add_widest(labels, parts, wide, mean, _WIDE_SQUARE * cov, scratch)
+    for group in groups:
+        if group.n_fitted:
+            _fit_group(labels, parts, group, places, moments[group.peak])
+        if group.n_local:
+            _add_local_parts(labels, parts, group, places)
+    return FittedParts(parts, np.array(index))
+
+
+def _groups(labels, n_peaks, places, n_local):
+    """Labels in peaks that places have weight in: list of `_Group`, by label."""
+    n_labels = len(labels.n_active)
+    index = places.label * n_peaks + places.peak
+    n_groups = n_labels * n_peaks
+    flat = np.bincount(index, places.flat, minlength=n_groups).reshape(n_labels, n_peaks)
+    share = np.zeros(flat.shape)
+    if n_local:
+        share = np.bincount(index, places.weight, minlength=n_groups).reshape(flat.shape)
+        share = share / share.sum()
+    of_peak = flat.sum(axis=0)
+    peaks = np.flatnonzero(of_peak > 0)
+    order = np.argsort(index, kind="stable")
+    ends = np.searchsorted(index[order], np.arange(n_groups + 1))
+    groups = []
+    first = 0
+    for label in range(n_labels):
+        for peak in peaks:
+            k = label * n_peaks + peak
+            rows = order[ends[k] : ends[k + 1]]
+            n_fitted = 0
+            if flat[label, peak] > LEAST_WEIGHT * of_peak[peak]:
+                effective = _effective_number(places.flat[rows])
+                n_fitted = int(np.clip(effective / _POINTS_EACH, 1, _MOST_PARTS))
+            n_narrow = n_local
+            if share[label, peak] < _LOCAL_LEAST or rows.size < _NEAR:
+                n_narrow = 0
+            group = _Group(label, peak, rows, first, n_fitted, n_narrow)
+            groups.append(group)
+            first = group.last
+    return groups
+
+
+def _moments_of_peaks(places):
+    """Mean and covariance of the places of each peak: dict; of axes without effect too, for labels with them."""
+    n_axes = places.score.shape[1]
+    _, every = _mean_and_cov(places.score, places.flat)
+    moments = {}
+    for peak in np.unique(places.peak[places.flat > 0]):
+        rows = np.flatnonzero((places.peak == peak) & (places.flat > 0))
+        flat = places.flat[rows]
+        mean, cov = _mean_and_cov(places.score[rows], flat)
+        few = n_axes / (n_axes + _effective_number(flat))
+        moments[peak] = (mean, (1.0 - few) * cov + few * every)
+    return moments
+
+
+def _fit_group(labels, parts, group, places, moments):
+    """Fit parts to the places of a group, and let its wide one have a share."""
+    n_axes = places.score.shape[1]
+    rows = group.rows[places.flat[group.rows] > 0]
+    n = group.n_fitted
+    scratch = (
+        np.empty((n_axes + 2, rows.size)),
+        np.empty((n + 1, rows.size)),
+        np.empty((n_axes, n_axes)),
+        np.empty(n),
+    )
+    points = (places.score[rows], places.flat[rows], *moments)
+    settings = (group.first, group.label, n, _FIT_ROUNDS, _WIDER)
+    _core.fit_parts(labels, parts, *settings, *points, scratch)
+    parts.share[group.first : group.wide] *= 1.0 - _WIDE_SHARE
+    parts.share[group.wide] = _WIDE_SHARE
+
+
+def _add_local_parts(labels, parts, group, places):
+    """Add narrow parts where the others of a group would leave large weights."""
+    n_axes = places.score.shape[1]
+    rows = group.rows
+    weight = places.weight[rows]
+    log = places.log_target[rows]
+    target = np.exp(np.maximum(log - log.max(), -700.0))
+    scratch = (
+        np.empty((n_axes + 2, rows.size)),
+        np.empty((4, rows.size)),
+        np.empty((n_axes, n_axes)),
+        np.empty((n_axes, n_axes)),
+    )
+    points = (places.score[rows], weight / weight.sum(), target)
+    counts = (group.first, group.n_fitted + 1, group.n_local)
+    _core.add_local_parts(labels, parts, *counts, _LOCAL_SHARE, _NEAR, _WIDER, points, scratch)
+
+
+def _mean_and_cov(score, weight):
+    """Mean and covariance of places with weights."""
+    weight = weight / weight.sum()
+    mean = weight @ score
+    apart = score - mean
+    cov = (apart * weight[:, None]).T @ apart + 1e-6 * np.eye(score.shape[1])
+    return mean, cov
+
+
+def _effective_number(weight):
+    """Effective number of weights."""
+    return weight.sum() ** 2 / np.sum(weight * weight)
