@@ -16,6 +16,7 @@ from scipy.special import chdtri, ndtri
 from scipy.stats import qmc
 
 from miricigale.fitting import _core
+from miricigale.fitting.moves import move_places, systematic
 from miricigale.fitting.proposals import LEAST_WEIGHT, Places, fit_mixture
 from miricigale.utils.caching import cached
 
@@ -43,7 +44,7 @@ _LEAST_PLACES = 0.03
 #: is found, and how many times as many places there may be.
 _PURSUED = 0.01
 _PURSUED_SHARE = 0.06
-_MORE_PURSUED = 2
+_MORE_PURSUED = 1
 #: Least number of places that parts are fitted to.
 _FEWEST_PLACES = 20
 #: Share of a mixture that all labels have, whatever their weight, and each peak and what has weight in it.
@@ -61,6 +62,11 @@ _FLAT_EACH = 50
 _FLAT_MOST = 150
 #: Narrow parts that are added to each label and peak where weights are large.
 _N_LOCAL = 16
+#: Number of places that are moved where weights stay too unequal, least number in each label and peak, and the
+#: least weight of these.
+_N_MOVED = 768
+_FEWEST_MOVED = 48
+_LEAST_MOVED = 1e-3
 #: Weight of the models that are left out of results.
 _LEFT_OUT = 1e-4
 #: Uniform numbers keep this from 0 and 1.
@@ -212,6 +218,7 @@ class AdaptiveSampler:
         self.wanted = wanted
         self.members = _of_ranges(labels)
         self.pursue = pursue
+        self.scramble = scramble
         n_axes = len(space.size)
         most = max(_MOST_EACH * wanted, _LEAST_MOST)
         self.n_rounds = _ADAPTING_ROUNDS
@@ -270,7 +277,7 @@ class AdaptiveSampler:
             self.n_fitted = 2 * self.n_fitted
             parts = self._fit(self._places(self.n_fitted), n_local=_N_LOCAL)
             share = sample.wanted
-        return self._models(best)
+        return self._models(best) if best.enough else self._moved(best)
 
     def _adapt(self, parts, share):
         """
@@ -506,6 +513,62 @@ class AdaptiveSampler:
             power=power,
             uniform=self.points[1][rows],
             converged=sample.enough,
+        )
+
+    def _moved(self, sample):
+        """
+        `PlacedModels` of places that are moved to the posterior, where weights are too unequal for results.
+
+        Labels and peaks keep the weights that the sample gives them; places begin from all that there are.
+        """
+        rows = sample.rows
+        index = self._groups(self.label[rows], self.peak[rows])
+        share = np.bincount(index, sample.weight, minlength=self.n_groups)
+        share = share / share.sum()
+        share[share < _LEAST_MOVED] = 0.0
+        share = share / share.sum()
+        every = self._groups(self.label[: self.n], self.peak[: self.n])
+        log = self.known[: self.n, 0] - np.log(self.density[: self.n])
+        picked = []
+        weight = []
+        for j in np.flatnonzero(share):
+            own = np.flatnonzero(every == j)
+            n = max(int(np.rint(share[j] * _N_MOVED)), _FEWEST_MOVED)
+            flat = np.empty(own.size)
+            _core.flatten(log[own], float(min(_FLAT_MOST, 0.5 * own.size)), flat)
+            picked.append(own[systematic(flat, n)])
+            weight.append(np.full(n, share[j] / n))
+        picked = np.concatenate(picked)
+        label = self.label[picked]
+        score = self.score[picked]
+        known = self.known[picked]
+        place = self.place[picked]
+        active = np.zeros(self.labels.first.shape, bool)
+        for i, n in enumerate(self.labels.n_active):
+            active[i, self.labels.axes[i, :n]] = True
+        peaks = self.peak[picked]
+
+        def evaluate(rows, new):
+            place_new = np.empty(new.shape)
+            known_new = np.empty((len(new), 4))
+            of_new = (label[rows], new, place_new, known_new, self.work)
+            _core.evaluate_places(self.space, self.labels, self.one, *of_new)
+            if self.borders.size:
+                # the weights are those of the peaks
+                left = np.searchsorted(self.borders, self._redshift(place_new[:, 0]))
+                known_new[left != peaks[rows], 0] = _core.NEVER
+            return known_new, place_new
+
+        move_places(evaluate, every[picked], active[label], score, known, place, self.scramble)
+        _, scale, variance, power = known.T
+        return PlacedModels(
+            place=place,
+            weight=np.concatenate(weight),
+            scale=scale,
+            variance=variance,
+            power=power,
+            uniform=self.points[1][: len(picked)],
+            converged=False,
         )
 
 

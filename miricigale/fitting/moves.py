@@ -1,0 +1,75 @@
+"""Moves of many places to a posterior, for objects whose weights stay too unequal."""
+
+import numpy as np
+
+#: Sweeps over all places, in each of which half of them are moved, then the other half.
+N_SWEEPS = 100
+#: Most parts of the difference of two places that a third is moved by, over the best for normal distributions; how
+#: often it is moved by the whole difference, from one peak to another; and by how much more.
+_SHORTEST = 0.4
+_WHOLE = 0.1
+_JITTER = 1e-4
+#: Number of places, over that of their axes, below which a group is not moved.
+_LEAST_OF_AXES = 4
+
+
+def move_places(evaluate, group, active, score, known, place, seed):
+    """
+    Move places to the posterior in their labels by differential evolution.
+
+    A place is tried at itself plus a difference of two others of its group, and moved there by the rule of
+    Metropolis (ter Braak 2006, Statistics and Computing 16, 239); half of the places are moved at once by
+    differences of the other half (Goodman & Weare 2010, CAMCoS 5, 65).
+
+    Parameters
+    ----------
+    evaluate : callable
+        Of rows, shape (m,), and scores, shape (m, n_axes): what `_core.evaluate_places` says of them, shape
+        (m, 4), and places in unit intervals, shape (m, n_axes).
+    group : `~numpy.ndarray` of int, shape (n,)
+        Groups of the places, of one label each.
+    active : `~numpy.ndarray` of bool, shape (n, n_axes)
+        Axes that have an effect.
+    score, known, place : `~numpy.ndarray`, shapes (n, n_axes), (n, 4) and (n, n_axes)
+        Scores, what is known of them, and places in unit intervals; they change.
+    seed : int
+        Seed of the moves.
+    """
+    rng = np.random.default_rng(seed)
+    n = len(group)
+    n_active = active.sum(axis=1)
+    best = 2.38 / np.sqrt(2.0 * np.maximum(n_active, 1))
+    size = np.bincount(group)
+    movable = size[group] >= _LEAST_OF_AXES * (n_active + 1)
+    for _ in range(N_SWEEPS):
+        order = np.lexsort([rng.random(n), group])
+        order = order[movable[order]]
+        for parity in (0, 1):
+            rows = order[parity::2]
+            others = order[1 - parity :: 2]
+            first = _others_of_group(group, rows, others, rng)
+            second = _others_of_group(group, rows, others, rng)
+            factor = best[rows] * (_SHORTEST + (1.0 - _SHORTEST) * rng.random(rows.size))
+            factor[rng.random(rows.size) < _WHOLE] = 1.0
+            change = factor[:, None] * (score[first] - score[second])
+            change += _JITTER * rng.standard_normal(change.shape)
+            new = score[rows] + np.where(active[rows], change, 0.0)
+            known_new, place_new = evaluate(rows, new)
+            accepted = np.log(rng.random(rows.size)) < known_new[:, 0] - known[rows, 0]
+            rows = rows[accepted]
+            score[rows] = new[accepted]
+            known[rows] = known_new[accepted]
+            place[rows] = place_new[accepted]
+
+
+def _others_of_group(group, rows, others, rng):
+    """One of ``others``, which are sorted by group, of the same group for each of the rows."""
+    start = np.searchsorted(group[others], group[rows], "left")
+    end = np.searchsorted(group[others], group[rows], "right")
+    return others[start + (rng.random(rows.size) * (end - start)).astype(int)]
+
+
+def systematic(weight, n):
+    """Indices of n places in proportion to weights, as equally as can be."""
+    upto = np.cumsum(weight)
+    return np.searchsorted(upto, (np.arange(n) + 0.5) * upto[-1] / n)
