@@ -37,8 +37,7 @@ def main(argv=None):
     verbose, quiet = (getattr(args, name, False) for name in ("verbose", "quiet"))
     args.no_progress = quiet or getattr(args, "no_progress", False)
     handler = logging.StreamHandler()
-    # astropy has a handler of its own
-    handler.addFilter(lambda record: not record.name.startswith("astropy"))
+    handler.addFilter(lambda record: _is_logged(record, verbose))
     level = logging.INFO if verbose else logging.ERROR if quiet else logging.WARNING
     logging.basicConfig(level=level, format="%(message)s", handlers=[handler])
     if not quiet:
@@ -54,6 +53,7 @@ def main(argv=None):
         parser.print_help()
         return 2
     try:
+        _keep_output_clean()
         module, _, function = args.call.partition(":")
         return getattr(importlib.import_module(f"miricigale.cli.{module}"), function)(args)
     except KeyboardInterrupt as stop:
@@ -87,6 +87,30 @@ def command():
         # threads in compiled code ignore interrupts, and the interpreter would wait for them
         os._exit(status)
     sys.exit(status)
+
+
+def _is_logged(record, verbose):
+    """Whether a log record goes to our handler; astropy's warnings have a handler of their own."""
+    if not record.name.startswith("astropy"):
+        return True
+    return verbose and _is_note(record)
+
+
+def _is_note(record):
+    return record.levelno <= logging.INFO
+
+
+def _is_no_note(record):
+    return not _is_note(record)
+
+
+def _keep_output_clean():
+    """Keep astropy's notes (INFO) off standard output, where tables are."""
+    from astropy import log
+
+    for handler in log.handlers:
+        if _is_no_note not in handler.filters:
+            handler.addFilter(_is_no_note)
 
 
 def _terminate(signum, frame):

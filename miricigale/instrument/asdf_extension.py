@@ -16,6 +16,7 @@ from astropy.modeling.models import (
 )
 
 from miricigale.instrument.siaf import attitude_matrix, unit_vector, vector_angles
+from miricigale.instrument.sky_axes import pixel_to_radec
 from miricigale.instrument.wcs import scaled_fit
 from miricigale.utils.exceptions import file_errors
 from miricigale.utils.optional import require
@@ -33,16 +34,44 @@ _FORWARD, _INVERSE = 5, 8
 _REFERENCE = ("RA_REF", "DEC_REF", "ROLL_REF", "V2_REF", "V3_REF")
 
 
-def asdf_wcs(header, hdus):
-    """The gwcs in the extension ASDF of JWST's pipeline, as FITS polynomials good to 0.01 pixels."""
-    from astropy.wcs import WCS
+def read_gwcs(hdus, *, optional=False):
+    """
+    Read the gwcs in the extension ASDF of JWST's pipeline.
 
+    Parameters
+    ----------
+    hdus : `~astropy.io.fits.HDUList`
+        The file, with an extension ASDF.
+    optional : bool, optional
+        Whether None is returned if the extension has none.
+
+    Returns
+    -------
+    exact : `gwcs.WCS` or None
+
+    Raises
+    ------
+    ImportError
+        If gwcs is not installed.
+    `~miricigale.utils.exceptions.DataError`
+        If the extension has no gwcs and ``optional`` is False.
+    """
     require("gwcs", extra="gwcs")
     asdf = require("asdf", extra="gwcs")
     content = np.asarray(hdus["ASDF"].data["ASDF_METADATA"][0]).tobytes()
     refused = file_errors(hdus.filename(), "has no gwcs in its extension ASDF")
     with refused, asdf.open(io.BytesIO(content)) as tree:
-        exact = tree["meta"]["wcs"]
+        meta = tree.tree.get("meta", {})
+        if optional and meta.get("wcs") is None:
+            return None
+        return meta["wcs"]
+
+
+def asdf_wcs(header, hdus):
+    """The gwcs in the extension ASDF of JWST's pipeline, as FITS polynomials good to 0.01 pixels."""
+    from astropy.wcs import WCS
+
+    exact = read_gwcs(hdus)
     box = tuple((-0.5, header[f"NAXIS{k}"] - 0.5) for k in (1, 2))
     return WCS(exact.to_fits_sip(bounding_box=box, max_pix_error=0.01))
 
@@ -127,7 +156,7 @@ def imager_gwcs(wcs, shape, header):
     # the first is the middle, from which the polynomials count
     pixel = np.stack([np.append(nodes.mean(), nodes) for nodes in (x, y)])
     matrix = attitude_matrix(ra, dec, roll, v2=v2, v3=v3)
-    sky = np.radians(wcs.all_pix2world(*pixel, 0))
+    sky = np.radians(pixel_to_radec(wcs, *pixel))
     seen = np.degrees(vector_angles(matrix.T @ unit_vector(*sky))) * 3600
     distortion = _polynomials(pixel, seen, _FORWARD)
     distortion.inverse = _polynomials(seen, pixel, _INVERSE)

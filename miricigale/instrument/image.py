@@ -2,11 +2,37 @@
 
 import numpy as np
 from astropy.io import fits
-from astropy.nddata import CCDData
+from astropy.nddata import CCDData, StdDevUncertainty
 
 from miricigale.instrument.dq import dq_planes
+from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import fits_meta
+
+
+def standard_deviation(image):
+    """
+    Uncertainty of an image as a standard deviation.
+
+    Parameters
+    ----------
+    image : `~astropy.nddata.CCDData`
+        With an uncertainty: a variance, an inverse variance or a standard deviation.
+
+    Returns
+    -------
+    uncertainty : `~astropy.nddata.StdDevUncertainty`
+
+    Raises
+    ------
+    ValueError
+        If it is of unknown kind.
+    """
+    try:
+        return image.uncertainty.represent_as(StdDevUncertainty)
+    except TypeError:
+        wanted = "one with a standard deviation, a variance or an inverse variance"
+        raise argument_error("image", wanted, type(image.uncertainty).__name__) from None
 
 
 class Image(Interactive, CCDData):
@@ -14,8 +40,8 @@ class Image(Interactive, CCDData):
     An `~astropy.nddata.CCDData` whose meta may hold more than a FITS header does.
 
     ``write`` and ``to_hdu`` put numbers and short text on cards, and all of it as JSON on the card ``META``; the
-    data are the primary HDU, with uncertainty and mask as extensions, as astropy has them, and flags as
-    JWST has them (``DQ``).
+    data are the primary HDU, with uncertainty (as standard deviation) and mask as extensions, as astropy has
+    them, and flags as JWST has them (``DQ``).
 
     Examples
     --------
@@ -63,6 +89,8 @@ class Image(Interactive, CCDData):
         """The HDUs that ``write`` writes; see `astropy.nddata.CCDData.to_hdu`."""
         plain = CCDData(self, copy=False)
         plain.flags = None
+        if self.uncertainty is not None:
+            plain.uncertainty = standard_deviation(self)
         plain.meta = fits.Header(fits_meta(self.meta))
         hdus = plain.to_hdu(*args, **kwargs)
         if self.flags is not None:

@@ -7,7 +7,8 @@ import numpy as np
 from astropy.io import fits
 
 from miricigale.instrument import dq_planes, read_dq, with_own_bits
-from miricigale.instrument.image import Image
+from miricigale.instrument.header_wcs import header_wcs
+from miricigale.instrument.image import Image, standard_deviation
 from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import open_fits, replacing, write_fits
 from miricigale.utils.meta import plain_value, undated
@@ -53,7 +54,7 @@ def _packed(values, name, header=None, *, step=None):
 
 def write_image(image, path, *, planes=None, rounded=False, overwrite=False):
     """
-    Write an image as FITS: SCI, ERR, MASK and further planes.
+    Write an image as FITS: SCI, ERR (standard deviation), MASK and further planes.
 
     Parameters
     ----------
@@ -74,6 +75,8 @@ def write_image(image, path, *, planes=None, rounded=False, overwrite=False):
     ------
     OSError
         If the file exists and ``overwrite`` is False.
+    ValueError
+        If the uncertainty is of unknown kind.
 
     Examples
     --------
@@ -87,9 +90,10 @@ def write_image(image, path, *, planes=None, rounded=False, overwrite=False):
     header = image.wcs.to_header(relax=True) if image.wcs is not None else fits.Header()
     header["BUNIT"] = image.unit.to_string("fits")
     header["META"] = json_meta(image.meta)
-    data, error = np.asarray(image.data, np.float32), None
+    data = np.asarray(image.data, np.float32)
+    error = None
     if image.uncertainty is not None:
-        error = np.asarray(image.uncertainty.array, np.float32)
+        error = np.asarray(standard_deviation(image).array, np.float32)
     step = None
     if rounded and error is not None and np.any(good := np.isfinite(error) & (error > 0)):
         step = float(np.median(error[good])) / _STEPS
@@ -148,17 +152,16 @@ def read_image(path, *, planes=()):
     >>> image, dq = read_image("exposures/miri.f770w-0.fits", planes=["dq"])  # doctest: +SKIP
     """
     from astropy.nddata import StdDevUncertainty
-    from astropy.wcs import WCS
 
     with open_fits(path, wanted="an image (FITS with SCI)") as hdus:
         check_data("SCI" in hdus, path, f"has no SCI extension, only {[hdu.name for hdu in hdus]}")
         header = hdus["SCI"].header
-        wcs = WCS(header)
+        wcs = header_wcs(header, where=str(path))
         error = np.array(hdus["ERR"].data, np.float32) if "ERR" in hdus else None
         image = Image(
             np.array(hdus["SCI"].data, np.float32),
             unit=_unit(header, path),
-            wcs=wcs if wcs.has_celestial else None,
+            wcs=wcs,
             uncertainty=None if error is None else StdDevUncertainty(error),
             mask=np.array(hdus["MASK"].data, bool) if "MASK" in hdus else None,
             meta=json.loads(header.get("META", "{}")),

@@ -12,6 +12,7 @@ from miricigale.instrument.siaf import (
     v2v3_to_sky,
     vector_angles,
 )
+from miricigale.instrument.sky_axes import lon_lat, pixel_to_radec
 from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
@@ -223,7 +224,7 @@ def pixel_area_map(wcs, shape, out=None):
     Parameters
     ----------
     wcs : `~astropy.wcs.WCS`
-        Two celestial axes, distorted or not.
+        Two celestial axes, distorted or not, of any frame and in any order.
     shape : tuple of int
         ``(ny, nx)``.
     out : `~numpy.ndarray`, shape (ny, nx), optional
@@ -251,8 +252,8 @@ def pixel_area_map(wcs, shape, out=None):
     x, y = np.meshgrid(nodes[1], nodes[0])
 
     def direction(dx, dy):
-        ra, dec = wcs.all_pix2world((x + dx).ravel(), (y + dy).ravel(), 0)
-        return unit_vector(np.radians(ra), np.radians(dec))
+        lon, lat = lon_lat(wcs, (x + dx).ravel(), (y + dy).ravel())
+        return unit_vector(np.radians(lon), np.radians(lat))
 
     step = 0.5
     along_x = (direction(step, 0) - direction(-step, 0)) / (2 * step)
@@ -360,9 +361,9 @@ def mosaic_wcs(exposures, pixel_scale):
         tx, ty = np.linspace(-0.5, nx - 0.5, 17), np.linspace(-0.5, ny - 0.5, 17)
         x = np.concatenate([tx, tx, np.full(17, -0.5), np.full(17, nx - 0.5)])
         y = np.concatenate([np.full(17, -0.5), np.full(17, ny - 0.5), ty, ty])
-        world = wcs.all_pix2world(x, y, 0)
-        ra.append(world[0])
-        dec.append(world[1])
+        edge = pixel_to_radec(wcs, x, y)
+        ra.append(edge[0])
+        dec.append(edge[1])
     ra, dec = np.concatenate(ra), np.concatenate(dec)
     mean = unit_vector(np.radians(ra), np.radians(dec)).mean(axis=1)
     start = SkyCoord(*vector_angles(mean), unit="rad")

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 
 from miricigale.filters import Filter
+from miricigale.instrument.sky_axes import grid_angle
 from miricigale.pages.browser import rounded, source_pages
 from miricigale.photometry.flags import ForcedFlags
-from miricigale.photometry.grids import grid_angle
 from miricigale.plotting.cutouts import Cutouts
 from miricigale.utils.files import replacing
 from miricigale.utils.units import ab_magnitude

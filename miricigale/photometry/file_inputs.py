@@ -13,7 +13,9 @@ from astropy.nddata import StdDevUncertainty
 from miricigale.filters import Filter
 from miricigale.instrument import north_up_wcs
 from miricigale.instrument.image import Image
-from miricigale.photometry.grids import grid_angle, open_map, part_of
+from miricigale.instrument.image_planes import plane_data
+from miricigale.instrument.sky_axes import grid_angle
+from miricigale.photometry.grids import open_map
 from miricigale.photometry.kernel_files import can_be_modeled, file_place, matching_kernel
 from miricigale.photometry.mosaics import MosaicFile
 from miricigale.utils.exceptions import DataError, argument_error
@@ -169,7 +171,7 @@ class Inputs:
         whole, what = self.highres.header, ("a segmentation map", "the segmentation", SEGMENTS)
         grid = whole.shape, whole.wcs, self.highres.path
         with open_map(self.segmentation, *what, grid) as hdu:
-            return sources_of(prior, np.array(part_of(hdu, part)), catalog)
+            return sources_of(prior, np.array(plane_data(hdu, part)), catalog)
 
     def measure(self, pixels, photometers, segments, sources):
         """Measure the sources: a `Measurement`."""

@@ -2,14 +2,15 @@
 
 import contextlib
 import re
-import warnings
 
 import astropy.units as u
 import numpy as np
 from astropy.io import fits
 
-from miricigale.instrument.asdf_extension import asdf_wcs
-from miricigale.utils.exceptions import PhotometryWarning, argument_error, data_error, warn
+from miricigale.instrument.header_wcs import image_wcs
+from miricigale.instrument.image_planes import plane_shape
+from miricigale.instrument.sky_axes import grid_angle as grid_angle
+from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import open_fits, split_extension
 from miricigale.utils.options import check_data
 
@@ -36,6 +37,27 @@ def open_image(path, wanted):
         yield hdus, extension
 
 
+def extension_index(hdus, extension, path):
+    """
+    Index of an extension that is named by its number, its name, or name and EXTVER (``"SCI,2"``).
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If there is none.
+    """
+    wanted = extension
+    if isinstance(extension, str):
+        name, _, version = extension.rpartition(",")
+        if name and version.strip().isdigit():
+            wanted = name.strip(), int(version)
+    try:
+        return hdus.index_of(wanted)
+    except (KeyError, IndexError):
+        known = [hdu.name if hdu.ver == 1 else f"{hdu.name},{hdu.ver}" for hdu in hdus]
+        raise data_error(path, f"has no such extension, only {known}") from None
+
+
 def find_image(hdus, extension, path, names):
     """
     Index of the extension with the image.
@@ -56,21 +78,23 @@ def find_image(hdus, extension, path, names):
     `~miricigale.utils.exceptions.DataError`
         If there is no image, or more than one of these names.
     """
-    images = [k for k, hdu in enumerate(hdus) if hdu.is_image and len(hdu.shape) == 2]
+    images = [k for k, hdu in enumerate(hdus) if plane_shape(hdu) is not None]
     if extension is not None:
-        try:
-            found = [hdus.index_of(extension)]
-        except (KeyError, IndexError):
-            known = [hdu.name for hdu in hdus]
-            raise data_error(path, f"has no such extension, only {known}") from None
-        check_data(found[0] in images, path, f"is no two-dimensional image: {hdus[found[0]].shape}")
-        return found[0]
+        index = extension_index(hdus, extension, path)
+        got = getattr(hdus[index], "shape", None)
+        check_data(index in images, path, f"is no two-dimensional image: {got or 'without data'}")
+        return index
+    for hdu in hdus:
+        # a table or a cube beside it is not what was meant
+        if hdu.name in names and hdu.is_image and not hdu.shape and plane_shape(hdu) is None:
+            raise data_error(path, f"has no data in its extension {hdu.name} (NAXIS = 0)")
     named = [k for k in images if hdus[k].name in names]
     found = named or images[:1]
     shapes = [getattr(hdu, "shape", ()) for hdu in hdus]
     check_data(found, path, f"has no two-dimensional image, only {shapes}")
     what = f"has {len(found)} extensions {hdus[found[0]].name}"
-    check_data(len(found) <= 1, path, f"{what}; say which as {path}[NUMBER]")
+    name = hdus[found[0]].name
+    check_data(len(found) <= 1, path, f"{what}; say which as {path}[{name},2] or {path}[NUMBER]")
     return found[0]
 
 
@@ -90,56 +114,13 @@ def open_map(path, wanted, role, names, image):
     shape, wcs, image_path = image
     with open_image(path, wanted) as (hdus, extension):
         hdu = hdus[find_image(hdus, extension, path, names)]
-        what = f"({role}) has the shape {hdu.shape}, {image_path} {shape}: not on the same pixels"
-        check_data(hdu.shape == shape, path, what)
-        own = read_wcs(hdu.header, hdus)
+        own_shape = plane_shape(hdu)
+        what = f"({role}) has the shape {own_shape}, {image_path} {shape}: not on the same pixels"
+        check_data(own_shape == shape, path, what)
+        own = image_wcs(hdu.header, hdus)
         if own is not None:
             check_same_grid(own, wcs, shape, path, image_path)
         yield hdu
-
-
-def read_wcs(header, hdus):
-    """
-    The celestial coordinates of an image, None without any.
-
-    Those of its header; those of the extension ASDF of JWST's pipeline (a gwcs), as polynomials good to 0.01
-    pixels, if the header has none, or those of a single exposure without its distortion.
-
-    Raises
-    ------
-    ImportError
-        If the coordinates are in the ASDF extension alone and gwcs is not installed.
-
-    Warns
-    -----
-    `~miricigale.utils.exceptions.PhotometryWarning`
-        If distortion is in the ASDF extension alone and gwcs is not installed.
-    """
-    from astropy.wcs import WCS, FITSFixedWarning
-
-    with warnings.catch_warnings():
-        # dates and the like that are written in another way
-        warnings.simplefilter("ignore", FITSFixedWarning)
-        wcs = WCS(header, hdus)
-    if "ASDF" not in hdus:
-        return wcs if wcs.has_celestial else None
-    if not wcs.has_celestial:
-        return asdf_wcs(header, hdus)
-    if is_exposure(lambda key: header.get(key, hdus[0].header.get(key))) and wcs.sip is None:
-        try:
-            return asdf_wcs(header, hdus)
-        except ImportError as err:
-            msg = (
-                f"{hdus.filename()}: the coordinates in the header lack the distortion, which is in "
-                f"the extension ASDF: positions are pixels off. {err}"
-            )
-            warn(msg, PhotometryWarning)
-    return wcs
-
-
-def is_exposure(get):
-    """Whether a header (``get(keyword)``) is that of a single exposure of JWST, not resampled."""
-    return get("S_WCS") == "COMPLETE" and get("S_RESAMP") != "COMPLETE"
 
 
 def filter_name(get):
@@ -169,30 +150,6 @@ def cut_wcs(wcs, section, path):
     what = "has coordinates with tables of distortion, and cannot be read in parts"
     check_data(np.all(cut.pixel_to_world(x, y).separation(there) < 1e-4 * u.arcsec), path, what)
     return cut
-
-
-def part_of(hdu, section):
-    """The data of an image extension, or a part of them, without reading the rest."""
-    return hdu.data if section is None else hdu.section[section]
-
-
-def grid_angle(wcs, shape):
-    """
-    Position angle (a quantity in deg, east of north) of an image's +y axis at its middle.
-
-    Raises
-    ------
-    ValueError
-        If the image is mirrored (east to the right where north is up).
-    """
-    x, y = (shape[1] - 1) / 2, (shape[0] - 1) / 2
-    middle = wcs.pixel_to_world(x, y)
-    up, right = wcs.pixel_to_world(x, y + 1), wcs.pixel_to_world(x + 1, y)
-    angle = middle.position_angle(up).to(u.deg)
-    turn = (angle - middle.position_angle(right)).to_value(u.deg) % 360
-    if turn > 180:
-        raise argument_error("wcs", "of an image of the sky (east left of north)", "a mirrored one")
-    return angle
 
 
 def check_same_grid(wcs, reference, shape, path, reference_path):

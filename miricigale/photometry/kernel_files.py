@@ -5,7 +5,7 @@ import logging
 import astropy.units as u
 import numpy as np
 
-from miricigale.photometry.grids import grid_angle
+from miricigale.instrument.sky_axes import grid_angle
 from miricigale.utils.exceptions import argument_error, data_error, file_errors
 from miricigale.utils.files import open_fits, split_extension
 from miricigale.utils.units import ANGLE, to_array

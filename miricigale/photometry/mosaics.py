@@ -14,18 +14,27 @@ from astropy.nddata import CCDData, NDData, StdDevUncertainty
 
 from miricigale.filters.band_names import find_filter
 from miricigale.instrument.data_models import is_data_model, read_data_model
+from miricigale.instrument.dq_schemes import bad_pixels
+from miricigale.instrument.header_wcs import image_wcs, is_exposure
 from miricigale.instrument.image import Image
+from miricigale.instrument.image_planes import (
+    NOISE_MAPS,
+    VARIANCE_PARTS,
+    check_plane,
+    companion,
+    noise_kind,
+    noise_planes,
+    plane_data,
+    plane_shape,
+)
 from miricigale.photometry.calibration import calibration, parsed_unit
 from miricigale.photometry.grids import (
     Opened,
     cut_wcs,
     filter_name,
     find_image,
-    is_exposure,
     open_image,
     open_map,
-    part_of,
-    read_wcs,
 )
 from miricigale.photometry.sky_noise import mask_filled, sky_noise
 from miricigale.utils.exceptions import PhotometryWarning, argument_error, data_error, warn
@@ -34,13 +43,6 @@ from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
 
 _log = logging.getLogger(__name__)
 
-#: Maps of the noise, and the extensions that hold them in the image's own file.
-_NOISE = {
-    "error": ("ERR", "RMS", "UNCERT"),
-    "variance": ("VAR",),
-    "inverse_variance": ("IVAR",),
-    "weight": ("WHT", "WEIGHT"),
-}
 #: A scale of the noise further from 1 than this factor is warned of.
 _ODD_SCALE = 10.0
 
@@ -140,7 +142,9 @@ class MosaicFile:
         File with a map of the noise, on the pixels of the image; at most one. Errors and variances
         are in the unit of the image and its square, or in that of their own ``BUNIT``, and are taken
         as they are, as inverse variances are. The scale of weights is measured on the sky. By default the first
-        extension of the image's own file among ERR, RMS and UNCERT (errors), VAR, IVAR, WHT and WEIGHT.
+        extension of the image's own file among ERR, ERROR, RMS, UNCERT, SIGMA and STDDEV (errors), VAR and
+        VARIANCE, IVAR and INVVAR, WHT and WEIGHT, of the image's EXTVER, that is not all 0 or NaN; then the sum of
+        JWST's VAR_POISSON, VAR_RNOISE and VAR_FLAT. UTYPE says of what kind those of astropy are.
     background_box : int, optional
         If given, a background is measured in boxes of so many pixels and subtracted.
     psf : path-like, optional
@@ -185,8 +189,10 @@ class MosaicFile:
     def __post_init__(self):
         if self.filter is not None:
             object.__setattr__(self, "filter", find_filter(str(self.filter)) or str(self.filter))
-        given = [name for name in _NOISE if getattr(self, name) is not None]
-        check_that(len(given) <= 1, ", ".join(_NOISE), "at most one of them", " and ".join(given))
+        given = [name for name in NOISE_MAPS if getattr(self, name) is not None]
+        check_that(
+            len(given) <= 1, ", ".join(NOISE_MAPS), "at most one of them", " and ".join(given)
+        )
         if self.background_box is not None and not self.background_box >= 1:
             raise argument_error("background_box", "at least 1 pixel", self.background_box)
 
@@ -205,7 +211,8 @@ class MosaicFile:
         with open_image(self.path, "an image") as (hdus, extension):
             index = find_image(hdus, extension, self.path, ("SCI",))
             header, first = hdus[index].header, hdus[0].header
-            wcs, shape = read_wcs(header, hdus), hdus[index].shape
+            wcs = image_wcs(header, hdus)
+            shape = plane_shape(hdus[index])
         check_data(wcs is not None, self.path, "has no celestial coordinates (WCS) in its header")
         if self.section is not None:
             wcs = cut_wcs(wcs, self.section, self.path)
@@ -286,7 +293,7 @@ class MosaicFile:
         header = self.header
         meta = {**header.meta, "source": str(self.path)}
         with open_image(self.path, "an image") as (hdus, _):
-            data = _native(part_of(hdus[header.index], self.section))
+            data = _native(plane_data(hdus[header.index], self.section))
             factor, how = calibration(self.path, header.unit, self.zero_point, header.keywords)
             if factor.unit.is_equivalent(u.MJy):
                 area = pixel_area_map(header.wcs, header.shape)
@@ -294,10 +301,8 @@ class MosaicFile:
             else:
                 factor = data.dtype.type(factor.to_value(SURFACE_BRIGHTNESS))
             usable = np.isfinite(data)
-            for name, is_good in _MARKS.items():
-                if name in hdus and hdus[name].shape == hdus[header.index].shape:
-                    usable &= is_good(np.asarray(part_of(hdus[name], self.section)))
-            kind, values, source = self._noise_map(hdus, header)
+            usable &= self._marked_good(hdus, header.index, meta)
+            kind, values, source = self._noise_map(hdus, header, usable)
         meta.update(source_unit=header.unit, calibration=how)
         sigma = None
         if kind is None:
@@ -358,11 +363,11 @@ class MosaicFile:
             meta=meta,
         )
 
-    def _noise_map(self, hdus, header):
+    def _noise_map(self, hdus, header, usable):
         """Kind, values and place of the map of the noise; the kind is None if there is none."""
         # a unit given by the caller holds for the map too
         stated = "" if self.unit is not None else header.unit
-        for kind, names in _NOISE.items():
+        for kind, names in NOISE_MAPS.items():
             path = getattr(self, kind)
             if path is None:
                 continue
@@ -370,17 +375,93 @@ class MosaicFile:
             image = whole.shape, whole.wcs, self.path
             what = f"a map of the {kind.replace('_', ' ')}", f"the {kind} of {self.path}"
             with open_map(path, *what, names, image) as hdu:
+                own_kind = noise_kind(hdu)
+                # inverse variances are weights too
+                is_other = own_kind not in (None, kind) and {own_kind, kind} != {
+                    "inverse_variance",
+                    "weight",
+                }
+                if is_other:
+                    said = hdu.header.get("UTYPE", hdu.name)
+                    wanted = f"a map of the {kind.replace('_', ' ')}"
+                    got = f"{path}, whose extension is {said}: give it as '{own_kind}'"
+                    raise argument_error(kind, wanted, got)
                 return kind, self._in_unit(hdu, kind, stated, path), str(path)
-        for kind, names in _NOISE.items():
-            for name in names:
-                if name in hdus and hdus[name].shape == hdus[header.index].shape:
-                    values = self._in_unit(hdus[name], kind, stated, f"{self.path}[{name}]")
-                    return kind, values, f"extension {name}"
+        return self._own_noise_map(hdus, header, usable, stated)
+
+    def _own_noise_map(self, hdus, header, usable, stated):
+        """As `_noise_map`, of the image's own file."""
+        shape = plane_shape(hdus[header.index])
+        empty = []
+        for kind, hdu in noise_planes(hdus, header.index):
+            if plane_shape(hdu) is None and not hdu.shape:
+                empty.append(f"{hdu.name} (no data)")
+                continue
+            check_plane(hdu, shape, self.path, f"a map of the {kind.replace('_', ' ')}")
+            values = self._in_unit(hdu, kind, stated, f"{self.path}[{hdu.name}]")
+            if not self._has_noise(values, usable, hdu):
+                empty.append(f"{hdu.name} (nowhere finite and above 0)")
+                continue
+            if empty:
+                msg = f"{self.path}: {', '.join(empty)} holds no noise; {hdu.name} ({kind}) is used"
+                warn(msg, PhotometryWarning)
+            return kind, values, f"extension {hdu.name}"
+        parts = [companion(hdus, header.index, name) for name in VARIANCE_PARTS]
+        parts = [hdu for hdu in parts if hdu is not None and plane_shape(hdu) == shape]
+        if parts:
+            planes = [self._in_unit(hdu, "variance", stated, self.path) for hdu in parts]
+            total = np.sum([np.where(np.isfinite(plane), plane, 0) for plane in planes], axis=0)
+            if self._has_noise(total, usable, None):
+                names = " + ".join(hdu.name for hdu in parts)
+                return "variance", total.astype(planes[0].dtype), f"extensions {names}"
+        if any("nowhere" in text for text in empty):
+            what = f"holds no noise in {', '.join(empty)}, and no other map of it"
+            raise data_error(
+                self.path, f"{what}: give 'error', 'variance' or 'weight', or remove it"
+            )
         return None, None, None
+
+    def _has_noise(self, values, usable, hdu):
+        """Whether a map of the noise has a value above 0 (or one below, which is refused later)."""
+        where = np.isfinite(values) & (values != 0)
+        if np.any(where):
+            return True
+        if self.section is None or hdu is None or not np.any(usable):
+            # a part without data says nothing of the map
+            return self.section is not None
+        whole = plane_data(hdu)
+        return bool(np.any(np.isfinite(whole) & (whole != 0)))
+
+    def _marked_good(self, hdus, index, meta):
+        """Pixels that no extension of marks or weights excludes; notes the scheme of the bits in ``meta``."""
+        header = hdus[index].header
+
+        def get(key):
+            return header.get(key, hdus[0].header.get(key))
+
+        good = True
+        for name in _MARKS:
+            hdu = companion(hdus, index, name)
+            if hdu is None or not hdu.is_image or (not hdu.shape and plane_shape(hdu) is None):
+                continue
+            check_plane(hdu, plane_shape(hdus[index]), self.path, "marks of pixels")
+            values = np.asarray(plane_data(hdu, self.section))
+            if name == "WHT":
+                good = good & (values > 0)
+                continue
+            has_planes = any(str(key).startswith("MP_") for key in hdu.header)
+            if name == "MASK" and not has_planes:
+                # a mask of astropy's has no bits
+                good = good & (values == 0)
+                continue
+            bad, scheme = bad_pixels(values, hdu.header, get, f"{self.path}[{name}]")
+            good = good & ~bad
+            meta["dq_scheme"] = scheme
+        return good
 
     def _in_unit(self, hdu, kind, unit, path):
         """A map of the noise in the unit that the image states, as far as both do."""
-        values = _native(part_of(hdu, self.section))
+        values = _native(plane_data(hdu, self.section))
         text = _unit_of(hdu.header)
         power = _POWERS.get(kind)
         have, wanted = parsed_unit(text), parsed_unit(unit)
@@ -426,12 +507,8 @@ def _native(data):
 
 #: Power of the image's unit that a map of the noise has; the scale of weights is measured.
 _POWERS = {"error": 1, "variance": 2, "inverse_variance": -2}
-#: Extensions that mark pixels, and which values are good: the first bit of DQ is DO_NOT_USE.
-_MARKS = {
-    "MASK": lambda marks: marks == 0,
-    "DQ": lambda marks: marks.astype(np.int64) & 1 == 0,
-    "WHT": lambda weights: weights > 0,
-}
+#: Extensions that mark pixels: 0 is good in MASK, bits of DQ are those of the telescope, weights are above 0.
+_MARKS = ("MASK", "DQ", "WHT")
 
 
 def _sigma(kind, values):

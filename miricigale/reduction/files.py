@@ -4,7 +4,6 @@ import dataclasses
 import glob
 import json
 import os
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -13,7 +12,6 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.nddata import CCDData
-from astropy.wcs import WCS, FITSFixedWarning
 
 from miricigale.detector import Charge, Ramp
 from miricigale.instrument import (
@@ -28,8 +26,9 @@ from miricigale.instrument import (
     subarrays,
     with_own_bits,
 )
-from miricigale.instrument.asdf_extension import asdf_wcs
 from miricigale.instrument.data_models import is_data_model, read_data_model
+from miricigale.instrument.header_wcs import header_wcs, image_wcs
+from miricigale.instrument.image_planes import noise_kind, plane_data, plane_shape
 from miricigale.reduction.images import flagged_image, sigma
 from miricigale.utils.exceptions import DataError, argument_error, data_error
 from miricigale.utils.files import open_fits
@@ -151,11 +150,19 @@ def read_images(path):
         meta.setdefault("keywords", kept_keywords(header))
         wcs = _wcs(hdus, header, meta)
         data = _plane(hdus, "SCI", shape, path)
-        error = _plane(hdus, "ERR", shape, path)
+        error = _error(hdus, shape, path)
         planes = {name: _plane(hdus, name, shape, path) for name in PLANES if name in hdus}
         flags = _flags(hdus, shape, path)
         if "MASK" in hdus:
             flags |= np.where(_plane(hdus, "MASK", shape, path) != 0, int(DQ.DO_NOT_USE), 0)
+    if error is not None and not np.any(np.isfinite(error) & (error > 0)):
+        refused = "has no error in ERR, which is nowhere finite and above 0"
+        if not any(name in planes for name in _VARIANCES):
+            hint = (
+                "photometry.read_mosaic takes the errors of WHT" if "WHT" in planes else "mend it"
+            )
+            raise data_error(path, f"{refused}, and no variances: {hint}")
+        error = None
     if error is None and (parts := [planes[name] for name in _VARIANCES if name in planes]):
         error = np.sqrt(np.sum([np.nan_to_num(part) for part in parts], axis=0))
     out = []
@@ -291,6 +298,24 @@ def _plane(hdus, name, shape, path):
     return np.array(data, kind)
 
 
+def _error(hdus, shape, path):
+    """Standard deviation in ERR; a variance or its inverse if UTYPE says so; None without data."""
+    if "ERR" in hdus and hdus["ERR"].shape == ():
+        if plane_shape(hdus["ERR"]) != shape:
+            return None
+        return plane_data(hdus["ERR"])
+    values = _plane(hdus, "ERR", shape, path)
+    if values is None:
+        return None
+    with np.errstate(divide="ignore", invalid="ignore"):
+        kind = noise_kind(hdus["ERR"])
+        if kind == "variance":
+            return np.sqrt(values)
+        if kind == "inverse_variance":
+            return 1 / np.sqrt(values)
+    return values
+
+
 def _flags(hdus, shape, path):
     if "DQ" not in hdus:
         return np.zeros(shape, np.int64)
@@ -323,13 +348,12 @@ def _wcs(hdus, header, meta):
         pointing = SkyCoord(meta["ra"] * u.deg, meta["dec"] * u.deg)
         return imager_wcs(pointing, meta["roll"] * u.deg, subarray=meta["subarray"])
     science = hdus["SCI"].header
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FITSFixedWarning)
-        wcs = WCS(science, naxis=2)
-    if not wcs.has_celestial:
-        if "ASDF" not in hdus or not done:
-            return None
-        wcs = asdf_wcs(science, hdus)
+    if done:
+        wcs = image_wcs(science, hdus)
+    else:
+        wcs = header_wcs(science, where=hdus.filename())
+    if wcs is None:
+        return None
     wcs.pixel_shape = (science["NAXIS1"], science["NAXIS2"])
     return wcs
 

@@ -20,6 +20,7 @@ from miricigale.instrument import (
 )
 from miricigale.instrument.asdf_extension import asdf_extension
 from miricigale.instrument.image_files import json_meta
+from miricigale.instrument.sky_axes import pixel_to_radec
 from miricigale.reduction.files import PLANES, ImageFile, shared_meta
 from miricigale.reduction.images import flagged_image, plain_flags, plain_mask, sigma
 from miricigale.utils.caching import cached
@@ -98,7 +99,10 @@ def write_image(image, path, *, planes=None, overwrite=False):
         sky = wcs.to_header(relax=True).cards
         science.extend(card for card in sky if card.keyword not in known)
         primary["S_WCS"] = "COMPLETE"
-        corners = wcs.calc_footprint(axes=image.shape[:-3:-1], center=False).flat
+        ny, nx = image.shape[-2:]
+        x = np.array([-0.5, -0.5, nx - 0.5, nx - 0.5])
+        y = np.array([-0.5, ny - 0.5, ny - 0.5, -0.5])
+        corners = np.transpose(pixel_to_radec(wcs, x, y)).flat
         science["S_REGION"] = " ".join(["POLYGON ICRS", *(f"{angle:.9f}" for angle in corners)])
         if cal and "resample" in steps:
             if "PIXAR_SR" not in science:

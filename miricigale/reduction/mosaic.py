@@ -10,6 +10,7 @@ from drizzle.resample import Drizzle
 from scipy.interpolate import RectBivariateSpline
 
 from miricigale.instrument import DQ, ExposureHistory, ImageFacts
+from miricigale.instrument.sky_axes import pixel_to_radec, radec_axes
 from miricigale.reduction.files import PLANES
 from miricigale.reduction.images import (
     check_images,
@@ -140,7 +141,8 @@ def pixel_map(wcs_in, wcs_out, shape):
     else:
         nodes_y, nodes_x = np.arange(ny, dtype=float), np.arange(nx, dtype=float)
     grid_x, grid_y = np.meshgrid(nodes_x, nodes_y)
-    world = wcs_in.all_pix2world(grid_x.ravel(), grid_y.ravel(), 0)
+    sky = pixel_to_radec(wcs_in, grid_x.ravel(), grid_y.ravel())
+    world = radec_axes(wcs_out, *sky)
     try:
         found = wcs_out.all_world2pix(*world, 0)
     except NoConvergence:

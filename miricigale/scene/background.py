@@ -8,6 +8,7 @@ from astropy.coordinates import SkyCoord
 from scipy.interpolate import RectBivariateSpline
 
 from miricigale.instrument import background_level
+from miricigale.instrument.sky_axes import pixel_to_radec
 from miricigale.utils.options import check_that
 from miricigale.utils.units import SURFACE_BRIGHTNESS, frozen_quantity
 
@@ -105,11 +106,11 @@ class Background:
             return np.full(shape, level)
         center = self.center
         if center is None:
-            center = SkyCoord(*wcs.all_pix2world((nx - 1) / 2, (ny - 1) / 2, 0), unit="deg")
+            center = SkyCoord(*pixel_to_radec(wcs, (nx - 1) / 2, (ny - 1) / 2), unit="deg")
         # smooth, so a coarse grid is enough
         nodes = [np.linspace(-0.5, n - 0.5, 12) for n in (ny, nx)]
         x, y = np.meshgrid(nodes[1], nodes[0])
-        ra, dec = np.radians(wcs.all_pix2world(x.ravel(), y.ravel(), 0)).reshape(2, *x.shape)
+        ra, dec = np.radians(pixel_to_radec(wcs, x.ravel(), y.ravel())).reshape(2, *x.shape)
         ra0, dec0 = center.icrs.ra.rad, center.icrs.dec.rad
         cos = np.sin(dec0) * np.sin(dec) + np.cos(dec0) * np.cos(dec) * np.cos(ra - ra0)
         east = np.cos(dec) * np.sin(ra - ra0) / cos

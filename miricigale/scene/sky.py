@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from miricigale.instrument.sky_axes import pixel_to_radec, radec_axes
+
 
 def local_jacobian(wcs, x, y):
     """
@@ -11,7 +13,7 @@ def local_jacobian(wcs, x, y):
     """
 
     def world(dx, dy):
-        return np.asarray(wcs.all_pix2world(x + dx, y + dy, 0))
+        return np.asarray(pixel_to_radec(wcs, x + dx, y + dy))
 
     _, dec = world(0, 0)
     columns = []
@@ -31,8 +33,9 @@ def pixel_positions(wcs, sky, shape):
     """
     ny, nx = shape
     ra, dec = sky.icrs.ra.deg, sky.icrs.dec.deg
-    x, y = np.asarray(wcs.wcs_world2pix(ra, dec, 0), dtype=float)
+    world = np.array(radec_axes(wcs, ra, dec))
+    x, y = np.asarray(wcs.wcs_world2pix(*world, 0), dtype=float)
     near = (x > -0.5 * nx) & (x < 1.5 * nx) & (y > -0.5 * ny) & (y < 1.5 * ny)
     if np.any(near):
-        x[near], y[near] = wcs.all_world2pix(ra[near], dec[near], 0, quiet=True)
+        x[near], y[near] = wcs.all_world2pix(*world[:, near], 0, quiet=True)
     return x, y, near

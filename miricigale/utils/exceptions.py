@@ -122,7 +122,7 @@ def unknown_name(kind, name, known):
 
 
 #: Modules that are not the caller of a public function.
-_INNER = ("miricigale.", "contextlib")
+_INNER = ("miricigale.", "contextlib", "functools")
 
 
 def warn(message, category):

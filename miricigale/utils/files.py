@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import importlib
+import io
 import math
 import os
 import uuid
@@ -279,10 +280,23 @@ def unpacked_size(path):
     return n_bytes
 
 
+def is_zip(path):
+    """Whether a file is a zip archive."""
+    with open(path, "rb") as stream:
+        return stream.read(len(_ZIP)) == _ZIP
+
+
 def packed_open(path):
-    """Open a file for reading bytes, unpacked if it is packed by gzip, bzip2 or xz."""
+    """Open a file for reading bytes, unpacked if it is packed by gzip, bzip2 or xz, or alone in a zip archive."""
     with open(path, "rb") as stream:
         start = stream.read(6)
+    if start.startswith(_ZIP):
+        with zipfile.ZipFile(path) as archive:
+            names = [name for name in archive.namelist() if not name.endswith("/")]
+            if len(names) != 1:
+                msg = f"it is a zip archive of {len(names)} files, wanted is one"
+                raise OSError(msg)
+            return io.BytesIO(archive.read(names[0]))
     for begin, module in _PACKED.items():
         if start.startswith(begin):
             return importlib.import_module(module).open(path)

@@ -16,13 +16,15 @@ from miricigale.utils.exceptions import DataError, data_error
 from miricigale.utils.files import open_fits, reading, replacing, split_extension, unreadable
 from miricigale.utils.meta import plain_value
 from miricigale.utils.optional import require
-from miricigale.utils.options import check_data
 from miricigale.utils.table_files import (
     LDAC_HEADER,
     arrow_table,
     in_units,
+    mask_scaled_nulls,
+    ragged_columns,
     read_table,
     silent_units,
+    warn_of_ragged,
 )
 from miricigale.utils.units import check_count
 
@@ -143,9 +145,8 @@ class _FitsRows(RowFile):
         with open_fits(path, wanted="a catalog") as hdus:
             table = self._choose(hdus)
             self._header, self.n_rows = table.header.copy(), table.header["NAXIS2"]
-            ragged = [column.name for column in table.columns if set(column.format) & {"P", "Q"}]
-        what = f"has columns of variable length, {ragged}"
-        check_data(not ragged, path, f"{what}, which cannot be read in pieces of rows")
+            self._ragged = ragged_columns(table)
+        warn_of_ragged(self._ragged, Path(path).name)
         # what belongs to the whole table
         for key in ("CHECKSUM", "DATASUM", "THEAP"):
             self._header.remove(key, ignore_missing=True)
@@ -169,8 +170,12 @@ class _FitsRows(RowFile):
     def _read(self, rows):
         with open_fits(self.path, wanted="a catalog", memmap=True) as hdus:
             part = fits.BinTableHDU(self._choose(hdus).data[rows], header=self._header)
+            if self._ragged:
+                kept = [c for c in part.columns if c.name not in self._ragged]
+                part = fits.BinTableHDU.from_columns(kept, nrows=len(part.data))
             with silent_units():
                 table = Table.read(part, character_as_bytes=False)
+            mask_scaled_nulls(table, part)
             return in_units(table, QTable, self._id_names)
 
 

@@ -17,6 +17,7 @@ from astropy.utils.exceptions import AstropyUserWarning, AstropyWarning
 
 from miricigale.utils.exceptions import CatalogWarning, DataError, warn
 from miricigale.utils.files import (
+    is_zip,
     open_fits,
     packed_open,
     replacing,
@@ -79,7 +80,7 @@ def read_table(path, *, wanted, cls=QTable, form=None, hdu=None, id_names=()):
     Warns
     -----
     `~miricigale.utils.exceptions.CatalogWarning`
-        Of columns of a parquet file that no table can hold.
+        Of columns of variable length in FITS, and of those of a parquet file that no table can hold.
     """
     path, extension = split_extension(path)
     hdu = extension if hdu is None else hdu
@@ -93,6 +94,9 @@ def read_table(path, *, wanted, cls=QTable, form=None, hdu=None, id_names=()):
             with open_fits(path, wanted=wanted) as hdus, silent_units():
                 chosen = _first_table(hdus) if hdu is None else hdu
                 table = Table.read(hdus, format=form, character_as_bytes=False, hdu=chosen)
+                read = _table_read(hdus, chosen)
+                mask_scaled_nulls(table, read)
+                leave_ragged_out(table, read, Path(path).name)
         elif hdu is not None:
             raise unreadable(path, wanted, f"'hdu' is {hdu!r}, and it is no FITS file")
         elif form == "parquet":
@@ -158,6 +162,72 @@ def _largest(column):
     """Largest absolute value of integers."""
     values = np.ma.getdata(column)
     return max(int(values.max()), -int(values.min()))
+
+
+def _table_read(hdus, chosen):
+    """The table of a FITS file that astropy reads by an extension, or None for the first one."""
+    if chosen is not None:
+        return hdus[chosen]
+    return next(hdu for hdu in hdus if isinstance(hdu, (fits.BinTableHDU, fits.TableHDU)))
+
+
+def mask_scaled_nulls(table, hdu):
+    """
+    Mask the missing values of scaled integers, which astropy scales like any other.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        As astropy read it; changed in place.
+    hdu : `~astropy.io.fits.BinTableHDU`
+        What it was read from, with TNULL, TSCAL and TZERO of its columns.
+    """
+    for column in getattr(hdu, "columns", ()):
+        scaled = column.bscale not in ("", None, 1) or column.bzero not in ("", None, 0)
+        if not scaled or column.null in ("", None) or column.name not in table.colnames:
+            continue
+        raw = np.asarray(hdu.data.view(np.ndarray)[column.name])
+        missing = raw == int(column.null)
+        if missing.any():
+            values = table[column.name]
+            missing = missing | np.ma.getmaskarray(np.ma.asarray(values))
+            table[column.name] = MaskedColumn(values, mask=missing)
+
+
+def ragged_columns(hdu):
+    """Names of the columns of variable length of a binary table."""
+    columns = getattr(hdu, "columns", ())
+    return [column.name for column in columns if set(str(column.format)) & {"P", "Q"}]
+
+
+def leave_ragged_out(table, hdu, where):
+    """
+    Leave columns of variable length out of a table, with a warning that names them.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        Changed in place.
+    hdu : `~astropy.io.fits.BinTableHDU`
+        What it was read from.
+    where : str
+        Name of the file.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.CatalogWarning`
+        Of the columns.
+    """
+    names = [name for name in ragged_columns(hdu) if name in table.colnames]
+    table.remove_columns(names)
+    warn_of_ragged(names, where)
+
+
+def warn_of_ragged(names, where):
+    """Warn of columns of variable length that are left out, if there are any."""
+    if names:
+        listed = ", ".join(map(repr, names))
+        warn(f"{where}: columns of variable length are left out: {listed}", CatalogWarning)
 
 
 def _first_table(hdus):
@@ -282,8 +352,8 @@ def _read_text(path, form, id_names):
                 "it is a region file of DS9: save the regions as a table of ra and dec"
             )
         source = str(path)
-        if start.startswith(_BOM):
-            # a mark at the start is no part of the first name
+        if start.startswith(_BOM) or is_zip(path):
+            # a mark at the start is no part of the first name, and of archives astropy reads no text
             with packed_open(path) as stream:
                 source = stream.read().decode("utf-8-sig").splitlines()
         with warnings.catch_warnings():
@@ -295,7 +365,12 @@ def _read_text(path, form, id_names):
             _numbers_among_words(table, names)
             _ids_as_written(table, path, source, form, names)
         return table
-    return Table.read(path, format=form)
+    if is_zip(path):
+        msg = f"of {form} in a zip archive: unpack it first"
+        raise ValueError(msg)
+    # names are what users see; astropy takes the IDs of fields
+    options = {"use_names_over_ids": True} if form == "votable" else {}
+    return Table.read(path, format=form, **options)
 
 
 def _numbers_among_words(table, id_names):
@@ -442,7 +517,10 @@ def table_hdu(table):
 def _table_format(path):
     start = _start(path).removeprefix(_BOM)
     first = start.strip().partition(b"\n")[0].decode(errors="replace")
-    suffix = Path(Path(path).name.lower().removesuffix(".gz")).suffix
+    name = Path(path).name.lower()
+    for packing in (".gz", ".bz2", ".xz", ".zip"):
+        name = name.removesuffix(packing)
+    suffix = Path(name).suffix
     if start.startswith(b"SIMPLE"):
         return "fits"
     if start.startswith(b"# %ECSV"):

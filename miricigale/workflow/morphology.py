@@ -11,8 +11,8 @@ from astropy.table import QTable, Table, vstack
 from scipy.ndimage import find_objects
 
 from miricigale import photometry
+from miricigale.instrument.sky_axes import grid_angle
 from miricigale.photometry.arrays import nearest_values, pixel_scale
-from miricigale.photometry.grids import grid_angle
 from miricigale.photometry.kernel_files import image_psf
 from miricigale.profiles import sersic_radius
 from miricigale.psf import psf_image, rotate_psf

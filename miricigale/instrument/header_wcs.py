@@ -1,0 +1,162 @@
+"""World coordinates of images in FITS files: those of the header, and the gwcs of JWST's files."""
+
+import importlib.util
+import re
+import warnings
+
+import numpy as np
+
+from miricigale.instrument.asdf_extension import asdf_wcs, read_gwcs
+from miricigale.utils.exceptions import PhotometryWarning, warn
+
+#: Keywords of distortions in the convention SIP.
+_SIP = re.compile(r"(?:A|B|AP|BP)_(?:ORDER|DMAX|\d+_\d+)")
+#: Pixels by which the header and the gwcs of one image may be apart.
+_APART = 0.1
+#: The same at the reference pixel of a header that lacks the distortion.
+_APART_AT_REFERENCE = 0.5
+
+
+def header_wcs(header, hdus=None, *, where):
+    """
+    Celestial coordinates of a FITS header.
+
+    SIP coefficients count only if CTYPE ends in ``-SIP``, as the convention says: headers of mosaics often keep
+    those of an exposure. astropy applies them nevertheless.
+
+    Parameters
+    ----------
+    header : `~astropy.io.fits.Header`
+        Of an image; axes beyond two are left out.
+    hdus : `~astropy.io.fits.HDUList`, optional
+        The file, for lookup tables of distortion.
+    where : str
+        Name of the file, for messages.
+
+    Returns
+    -------
+    wcs : `~astropy.wcs.WCS` or None
+        None without celestial axes.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.PhotometryWarning`
+        If SIP coefficients are left out.
+
+    References
+    ----------
+    Shupe et al. 2005, ASP Conf. 347, 491 (SIP).
+    """
+    from astropy.wcs import WCS, FITSFixedWarning
+
+    kinds = [str(header.get(f"CTYPE{axis}", "")).strip() for axis in (1, 2)]
+    stray = [key for key in header if _SIP.fullmatch(key)]
+    if stray and not any(kind.endswith("-SIP") for kind in kinds):
+        header = header.copy()
+        for key in stray:
+            header.remove(key, ignore_missing=True, remove_all=True)
+        if all(kinds):
+            msg = (
+                f"{where}: its header has SIP coefficients, but CTYPE1 = {kinds[0]!r} without -SIP states no "
+                "distortion: they are not applied (write CTYPE with -SIP if they belong to this image)"
+            )
+            warn(msg, PhotometryWarning)
+    with warnings.catch_warnings():
+        # dates and the like that are written in another way
+        warnings.simplefilter("ignore", FITSFixedWarning)
+        wcs = WCS(header, hdus, naxis=2)
+    return wcs if wcs.has_celestial else None
+
+
+def image_wcs(header, hdus):
+    """
+    Celestial coordinates of an image in a file.
+
+    Those of its header; those of the extension ASDF of JWST's pipeline (a gwcs), as polynomials good to 0.01
+    pixels, if the header has none, or those of a single exposure without its distortion.
+
+    Parameters
+    ----------
+    header : `~astropy.io.fits.Header`
+        Of the extension with the image.
+    hdus : `~astropy.io.fits.HDUList`
+        The file.
+
+    Returns
+    -------
+    wcs : `~astropy.wcs.WCS` or None
+        None without any.
+
+    Raises
+    ------
+    ImportError
+        If the coordinates are in the ASDF extension alone and gwcs is not installed.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.PhotometryWarning`
+        If SIP coefficients are left out, distortion is in the ASDF extension alone and gwcs is not installed, or
+        the coordinates of header and gwcs (where it is installed) are not the same.
+    """
+    where = hdus.filename() or "the list of HDUs"
+    wcs = header_wcs(header, hdus, where=where)
+    if "ASDF" not in hdus:
+        return wcs
+    if wcs is None:
+        return asdf_wcs(header, hdus)
+    shape = header["NAXIS2"], header["NAXIS1"]
+    if is_exposure(lambda key: header.get(key, hdus[0].header.get(key))) and wcs.sip is None:
+        try:
+            distorted = asdf_wcs(header, hdus)
+        except ImportError as err:
+            msg = (
+                f"{where}: the coordinates in the header lack the distortion, which is in "
+                f"the extension ASDF: positions are pixels off. {err}"
+            )
+            warn(msg, PhotometryWarning)
+            return wcs
+        x, y = (np.atleast_1d(value - 1) for value in wcs.wcs.crpix)
+        inside = -0.5 <= x[0] <= shape[1] - 0.5 and -0.5 <= y[0] <= shape[0] - 0.5
+        if inside and (apart := _pixels_apart(wcs, distorted, x, y)) > _APART_AT_REFERENCE:
+            msg = (
+                f"{where}: the coordinates in its header and those in its extension ASDF (gwcs) are {apart:.3g} "
+                "pixels apart at the reference pixel: those of ASDF are used, which have the distortion. Was the "
+                "header aligned, but not the gwcs?"
+            )
+            warn(msg, PhotometryWarning)
+        return distorted
+    _compare_with_gwcs(wcs, hdus, shape, where)
+    return wcs
+
+
+def is_exposure(get):
+    """Whether a header (``get(keyword)``) is that of a single exposure of JWST, not resampled."""
+    return get("S_WCS") == "COMPLETE" and get("S_RESAMP") != "COMPLETE"
+
+
+def _compare_with_gwcs(wcs, hdus, shape, where):
+    """Warn if the gwcs of a file, where it can be read, says something else than its header."""
+    if any(importlib.util.find_spec(name) is None for name in ("gwcs", "asdf")):
+        return
+    exact = read_gwcs(hdus, optional=True)
+    if exact is None:
+        return
+    ny, nx = shape
+    x = np.array([0, nx - 1, 0, nx - 1, (nx - 1) / 2])
+    y = np.array([0, 0, ny - 1, ny - 1, (ny - 1) / 2])
+    apart = _pixels_apart(wcs, exact, x, y)
+    if apart > _APART:
+        msg = (
+            f"{where}: the coordinates in its header and those in its extension ASDF (gwcs) are up to {apart:.3g} "
+            "pixels apart: those of the header are used. If those of ASDF are right, remove the WCS keywords of "
+            "the header; if not, the extension ASDF"
+        )
+        warn(msg, PhotometryWarning)
+
+
+def _pixels_apart(wcs, other, x, y):
+    """Largest distance of positions by two coordinates, in pixels of the first; 0 where one of them has none."""
+    there = wcs.world_to_pixel(other.pixel_to_world(x, y))
+    distance = np.hypot(there[0] - x, there[1] - y)
+    finite = np.isfinite(distance)
+    return float(distance[finite].max()) if finite.any() else 0.0

@@ -1,0 +1,192 @@
+"""Planes of images in FITS files of any origin: their pixels, and those that belong to an image."""
+
+import numpy as np
+
+from miricigale.utils.exceptions import data_error
+from miricigale.utils.options import check_data
+
+#: What maps of the noise hold, and the extensions of an image's own file that hold them.
+NOISE_MAPS = {
+    "error": ("ERR", "ERROR", "RMS", "UNCERT", "SIGMA", "STDDEV"),
+    "variance": ("VAR", "VARIANCE"),
+    "inverse_variance": ("IVAR", "INVVAR"),
+    "weight": ("WHT", "WEIGHT"),
+}
+#: Parts of the variance in files of JWST.
+VARIANCE_PARTS = ("VAR_POISSON", "VAR_RNOISE", "VAR_FLAT")
+#: What astropy states in UTYPE.
+_UTYPES = {
+    "STDDEVUNCERTAINTY": "error",
+    "VARIANCEUNCERTAINTY": "variance",
+    "INVERSEVARIANCE": "inverse_variance",
+}
+
+
+def plane_shape(hdu):
+    """
+    Rows and columns of an image extension.
+
+    Parameters
+    ----------
+    hdu : HDU
+        Axes of length 1 before the two are left out; an extension without data but with NPIX1, NPIX2 and PIXVALUE
+        is a constant plane, as HST has them.
+
+    Returns
+    -------
+    shape : tuple of int or None
+        None if it is no image of two axes.
+    """
+    if not hdu.is_image:
+        return None
+    shape = tuple(hdu.shape or ())
+    if not shape and _is_constant(hdu):
+        return int(hdu.header["NPIX2"]), int(hdu.header["NPIX1"])
+    while len(shape) > 2 and shape[0] == 1:
+        shape = shape[1:]
+    return shape if len(shape) == 2 else None
+
+
+def plane_data(hdu, section=None):
+    """
+    Pixels of an image extension, or a part of them without reading the rest.
+
+    Parameters
+    ----------
+    hdu : HDU
+        As for `plane_shape`.
+    section : tuple of slice, optional
+        Rows and columns.
+
+    Returns
+    -------
+    data : `~numpy.ndarray`, shape (ny, nx)
+    """
+    if not hdu.shape and _is_constant(hdu):
+        data = np.full(plane_shape(hdu), float(hdu.header["PIXVALUE"]), np.float32)
+        return data if section is None else data[section]
+    extra = len(hdu.shape) - 2
+    if section is None:
+        data = hdu.data
+        return data if extra == 0 else data[(0,) * extra]
+    if extra == 0:
+        return hdu.section[section]
+    # a slice for each axis: astropy counts dimensions of numbers in another way
+    return hdu.section[(slice(0, 1),) * extra + tuple(section)][(0,) * extra]
+
+
+def _is_constant(hdu):
+    return all(key in hdu.header for key in ("NPIX1", "NPIX2", "PIXVALUE"))
+
+
+def companion(hdus, index, name):
+    """
+    Extension of a file that belongs to an image, by its name and EXTVER.
+
+    Parameters
+    ----------
+    hdus : `~astropy.io.fits.HDUList`
+        The file.
+    index : int
+        The image.
+    name : str
+        Name of the extension, such as ``"ERR"``.
+
+    Returns
+    -------
+    hdu : HDU or None
+        That of the same EXTVER; if the file has one image and one extension of the name, that one. Those of
+        several images without an EXTVER in common belong to none.
+    """
+    image = hdus[index]
+    named = [hdu for hdu in hdus if hdu is not image and hdu.name == name]
+    same = [hdu for hdu in named if hdu.ver == image.ver]
+    if len(same) == 1:
+        # of a file with two images and one map the map is that of the first by chance
+        return same[0]
+    alike = [hdu for hdu in hdus if hdu.name == image.name and plane_shape(hdu) is not None]
+    if len(named) == 1 and len(alike) <= 1:
+        return named[0]
+    return None
+
+
+def check_plane(hdu, shape, path, what):
+    """
+    Refuse a plane that is not on the pixels of its image.
+
+    Parameters
+    ----------
+    hdu : HDU
+        The plane.
+    shape : tuple of int
+        Rows and columns of the image.
+    path, what : path-like, str
+        File and what the plane is, for messages.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If the shape is another one.
+    """
+    own = plane_shape(hdu) or tuple(hdu.shape)
+    problem = (
+        f"has an extension {hdu.name} ({what}) of the shape {own}, and its image {tuple(shape)}"
+    )
+    check_data(own == tuple(shape), path, f"{problem}: not on the same pixels; remove or mend it")
+
+
+def noise_kind(hdu):
+    """
+    Kind of a map of the noise by what its extension says of itself.
+
+    Parameters
+    ----------
+    hdu : HDU
+        By UTYPE, as astropy writes it, or by its name.
+
+    Returns
+    -------
+    kind : str or None
+        One of `NOISE_MAPS`; None if it says nothing.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If UTYPE is one of an unknown uncertainty.
+    """
+    stated = str(hdu.header.get("UTYPE", "")).strip().upper()
+    if stated in _UTYPES:
+        return _UTYPES[stated]
+    if stated.endswith("UNCERTAINTY"):
+        what = (
+            f"holds an uncertainty of unknown kind (UTYPE {hdu.header['UTYPE']!r}): say which it is"
+        )
+        extension = f"extension {hdu.name}"
+        raise data_error(extension, what)
+    for kind, names in NOISE_MAPS.items():
+        if hdu.name in names:
+            return kind
+    return None
+
+
+def noise_planes(hdus, index):
+    """
+    Extensions of a file that can be maps of the noise of an image, the best first.
+
+    Parameters
+    ----------
+    hdus, index
+        As for `companion`.
+
+    Returns
+    -------
+    planes : list of (str, HDU)
+        Kind and extension.
+    """
+    planes = []
+    for names in NOISE_MAPS.values():
+        for name in names:
+            hdu = companion(hdus, index, name)
+            if hdu is not None and hdu.is_image:
+                planes.append((noise_kind(hdu), hdu))
+    return planes
