@@ -103,7 +103,8 @@ def letters(text):
 
 
 def test_messages_of_troubleshooting_are_those_of_the_code():
-    pages = ("troubleshooting.rst", "troubleshooting_catalogs.rst")
+    names = ("troubleshooting", "troubleshooting_catalogs", "troubleshooting_images")
+    pages = [f"{name}.rst" for name in names]
     every = [one for page in pages for one in blocks(page, "code-block")]
     messages = [" ".join(one.split()) for one in every]
     assert len(messages) >= 25

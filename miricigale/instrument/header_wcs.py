@@ -65,7 +65,12 @@ def header_wcs(header, hdus=None, *, where):
         # dates and the like that are written in another way
         warnings.simplefilter("ignore", FITSFixedWarning)
         wcs = WCS(header, hdus, naxis=2)
-    return wcs if wcs.has_celestial else None
+    if not wcs.has_celestial:
+        return None
+    if header.get("NAXIS", 2) > 2:
+        # parts are cut by it, and of two axes it must have two
+        wcs.pixel_shape = header["NAXIS1"], header["NAXIS2"]
+    return wcs
 
 
 def image_wcs(header, hdus):

@@ -1,5 +1,8 @@
 """Images that astropy can write."""
 
+import os
+import re
+
 import numpy as np
 from astropy.io import fits
 from astropy.nddata import CCDData, StdDevUncertainty
@@ -8,6 +11,11 @@ from miricigale.instrument.dq import dq_planes
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import fits_meta
+
+#: How files of products of JWST are called.
+_PRODUCT = re.compile(
+    r"_(?:uncal|ramp|rate|rateints|cal|calints|crf|crfints|i2d|blot|median)\.fits(?:\.gz)?$"
+)
 
 
 def standard_deviation(image):
@@ -84,6 +92,32 @@ class Image(Interactive, CCDData):
 
         label = f"{plain_text(self.meta.get('filter') or '')} ({self.unit})".strip()
         return plot_scene(self.data, ax=ax, label=label, **kwargs)
+
+    def write(self, path, *args, **kwargs):
+        """
+        Write the image; see `astropy.nddata.CCDData.write`.
+
+        Parameters
+        ----------
+        path : path-like
+            The file. Names of JWST's products (``_rate.fits``, ``_cal.fits``) are refused, for JWST's tools would
+            not find the image there: `miricigale.reduction.write_image` writes their layout.
+        *args, **kwargs
+            Those of `astropy.nddata.CCDData.write`, such as ``overwrite``.
+
+        Raises
+        ------
+        ValueError
+            If the name is one of a product of JWST.
+        """
+        is_path = isinstance(path, (str, os.PathLike))
+        if is_path and _PRODUCT.search(os.fspath(path).lower()):
+            wanted = (
+                "a name that is not one of JWST's products, whose layout "
+                "miricigale.reduction.write_image(image, path) writes"
+            )
+            raise argument_error("path", wanted, repr(os.fspath(path)))
+        super().write(path, *args, **kwargs)
 
     def to_hdu(self, *args, **kwargs):
         """The HDUs that ``write`` writes; see `astropy.nddata.CCDData.to_hdu`."""

@@ -6,6 +6,14 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.instrument.sky_axes import grid_angle
+from miricigale.psf.files import (
+    core_position,
+    file_place,
+    header_grid,
+    is_stpsf,
+    is_written,
+    read_planes,
+)
 from miricigale.utils.exceptions import argument_error, data_error, file_errors
 from miricigale.utils.files import open_fits, split_extension
 from miricigale.utils.units import ANGLE, to_array
@@ -13,64 +21,15 @@ from miricigale.utils.units import ANGLE, to_array
 _log = logging.getLogger(__name__)
 
 
-def file_place(path):
-    """
-    Take ``file.fits[EXTENSION,PLANE]`` apart: path, extension, plane.
-
-    The extension is the first without brackets; the plane of a cube is a number or ``"mean"``, None of an
-    image. Anything else is a ValueError.
-    """
-    name, extension = split_extension(path)
-    if not isinstance(extension, str) or "," not in extension:
-        return name, 0 if extension is None else extension, None
-    extension, _, plane = (part.strip() for part in extension.rpartition(","))
-    if plane != "mean" and not plane.isdigit():
-        raise argument_error("path", "FILE[EXTENSION,PLANE], the plane a number or mean", path)
-    extension = int(extension) if extension.isdigit() else extension
-    return name, extension, plane if plane == "mean" else int(plane)
-
-
-def _planes(path, wanted):
-    """The planes that a path means, shape (n, ny, nx), and the header."""
-    name, extension, plane = file_place(path)
-    with open_fits(name, wanted=wanted) as hdus:
-        try:
-            hdu = hdus[extension]
-        except (KeyError, IndexError):
-            known = [hdu.name for hdu in hdus]
-            raise data_error(path, f"has no such extension, only {known}") from None
-        data = hdu.data
-        shape = getattr(data, "shape", None)
-        if shape is None or len(shape) != (2 if plane is None else 3):
-            kind = "an image" if plane is None else "a cube"
-            hint = "; say FILE[EXTENSION,PLANE] or FILE[EXTENSION,mean] of a cube"
-            raise data_error(path, f"must be {kind} with {wanted}, got the shape {shape}{hint}")
-        if isinstance(plane, int) and plane >= shape[0]:
-            raise data_error(path, f"is a cube with the planes 0 to {shape[0] - 1}")
-        chosen = data[None] if plane is None else data if plane == "mean" else data[plane][None]
-        return np.array(chosen, dtype=float), hdu.header.copy()
-
-
-def _centered(data):
-    """The position x, y of the bright core of a PSF."""
-    y, x = np.indices(data.shape)
-    core = np.where(data > 0.3 * data.max(), data, 0.0)
-    # only the brightest peak
-    peak = np.unravel_index(np.argmax(data), data.shape)
-    core[np.hypot(y - peak[0], x - peak[1]) > 0.25 * min(data.shape)] = 0
-    return float((core * x).sum() / core.sum()), float((core * y).sum() / core.sum())
-
-
 def _read_psf(file, argument):
     """A PSF of a file, or the mean of several, with its center in the middle."""
     from miricigale.psf import MODEL_FILTERS, average_psf, make_psf, psf_image, read_psf
-    from miricigale.psf.files import header_grid, is_written
 
     path, header = file.psf, file.header
     known = header.filter in MODEL_FILTERS
     if split_extension(path)[1] is None and is_written(path):
         return _compared(read_psf(path), header, argument) if known else read_psf(path)
-    planes, stated = _planes(path, "a PSF")
+    planes, stated = read_planes(path, "a PSF")
     cell, turn = header_grid(stated)
     if file.psf_scale is not None:
         given = float(to_array(file.psf_scale, ANGLE, f"{argument}_scale"))
@@ -84,6 +43,10 @@ def _read_psf(file, argument):
             wanted = f"{turn:.4g} deg, as the header of {path} says"
             raise argument_error(argument + "_angle", wanted, file.psf_angle)
         turn = given
+    on_detector = turn is None and is_stpsf(stated) and np.size(header.pa_aper) == 1
+    if on_detector and header.pa_aper is not None:
+        # its axes are those of the detector
+        turn = float(np.ravel(header.pa_aper.to_value(u.deg))[0])
     own = _grid(header)
     cell, turn = own[0] if cell is None else cell, own[1] if turn is None else turn
     form = {"pixel_scale": cell * ANGLE, "frame": "sky", "angle": turn * u.deg}
@@ -97,7 +60,7 @@ def _read_psf(file, argument):
         if scaled:
             _log.info("%s sums to %.4g and is scaled to 1", path, total)
         with file_errors(path, "cannot be read as a PSF"):
-            psf = make_psf(data / total if scaled else data, origin=_centered(data), **form)
+            psf = make_psf(data / total if scaled else data, origin=core_position(data), **form)
         n = 2 * (min(data.shape) // 2) - 1
         middle = psf_image(psf, pixel_scale=cell * ANGLE, shape=n)
         middle = middle / middle.sum() if scaled else middle
@@ -163,7 +126,6 @@ def read_kernel(path, *, pixel_scale, highres_psf=None):
         As `~miricigale.psf.MatchingKernel.from_array`.
     """
     from miricigale.psf import MatchingKernel
-    from miricigale.psf.files import header_grid
 
     name = file_place(path)[0]
     with open_fits(name, wanted="a matching kernel") as hdus:
@@ -172,7 +134,7 @@ def read_kernel(path, *, pixel_scale, highres_psf=None):
         kernel = MatchingKernel.read(name, format="fits")
         stated = kernel.pixel_scale.value
     else:
-        planes, header = _planes(path, "a kernel")
+        planes, header = read_planes(path, "a kernel")
         stated = header_grid(header)[0]
         with file_errors(path, "cannot be read as a kernel"):
             kernel = MatchingKernel.from_array(

@@ -2,11 +2,13 @@
 
 import astropy.units as u
 import numpy as np
-from astropy.wcs import WCS
 
+from miricigale.instrument.header_wcs import header_wcs
+from miricigale.instrument.sky_axes import grid_angle
+from miricigale.psf import _core
 from miricigale.psf.model import InstrumentPSF, make_psf
-from miricigale.utils.exceptions import argument_error
-from miricigale.utils.files import open_fits
+from miricigale.utils.exceptions import PSFWarning, argument_error, data_error, warn
+from miricigale.utils.files import open_fits, split_extension
 from miricigale.utils.options import check_that
 from miricigale.utils.store import open_parts, write_parts
 from miricigale.utils.unified import register
@@ -15,6 +17,161 @@ from miricigale.utils.units import ANGLE, to_array
 #: Units of an `InstrumentPSF`'s quantities in files.
 _UNITS = {"pixel_scale": ANGLE, "angle": u.deg, "pa_aper": u.deg}
 _LAYOUT = "psf-1"
+#: Extensions of STPSF's files, the best first: with the distortion and the detector's effects, finely sampled.
+_STPSF_ORDER = ("OVERDIST", "DET_DIST", "OVERSAMP", "DET_SAMP")
+
+
+def file_place(path):
+    """
+    Take ``file.fits[EXTENSION,PLANE]`` apart.
+
+    Parameters
+    ----------
+    path : path-like
+        A file, with the extension in brackets or without.
+
+    Returns
+    -------
+    name : str
+        The file.
+    extension : int, str or None
+        None without brackets.
+    plane : int, ``"mean"`` or None
+        Of a cube; None of an image.
+
+    Raises
+    ------
+    ValueError
+        If the plane is something else.
+    """
+    name, extension = split_extension(path)
+    if not isinstance(extension, str) or "," not in extension:
+        return name, extension, None
+    extension, _, plane = (part.strip() for part in extension.rpartition(","))
+    if plane != "mean" and not plane.isdigit():
+        raise argument_error("path", "FILE[EXTENSION,PLANE], the plane a number or mean", path)
+    extension = int(extension) if extension.isdigit() else extension
+    return name, extension, plane if plane == "mean" else int(plane)
+
+
+def read_planes(path, wanted, *, ext=None, plane=None):
+    """
+    Read the image of a PSF or kernel, or several planes of a cube.
+
+    Parameters
+    ----------
+    path : path-like
+        The file, or ``file.fits[EXTENSION]`` or ``file.fits[EXTENSION,PLANE]``.
+    wanted : str
+        What the file should be, for messages.
+    ext : int or str, optional
+        The extension, if the path names none. By default the first with an image; of STPSF's files that with
+        distortion and the detector's effects.
+    plane : int or "mean", optional
+        Of a cube: one plane, or all.
+
+    Returns
+    -------
+    planes : `~numpy.ndarray`, shape (n, ny, nx)
+    header : `~astropy.io.fits.Header`
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If there is no such extension, or it is no image (of a cube with ``plane``).
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.PSFWarning`
+        If several extensions hold images and none was named: which is taken.
+    """
+    name, own_ext, own_plane = file_place(path)
+    ext = own_ext if own_ext is not None else ext
+    plane = own_plane if own_plane is not None else plane
+    with open_fits(name, wanted=wanted, output_verify="silentfix") as hdus:
+        if ext is None:
+            ext = _best_extension(hdus, name)
+        try:
+            hdu = hdus[ext]
+        except (KeyError, IndexError):
+            known = [hdu.name for hdu in hdus]
+            raise data_error(path, f"has no such extension, only {known}") from None
+        data = hdu.data if hdu.is_image else None
+        shape = getattr(data, "shape", None)
+        if shape is not None and len(shape) == 3 and shape[0] == 1 and plane is None:
+            data = data[0]
+            shape = data.shape
+        if shape is None or len(shape) != (2 if plane is None else 3):
+            kind = "an image" if plane is None else "a cube"
+            hint = "; say FILE[EXTENSION,PLANE] or FILE[EXTENSION,mean] of a cube"
+            raise data_error(path, f"must be {kind} with {wanted}, got the shape {shape}{hint}")
+        if isinstance(plane, int) and not 0 <= plane < shape[0]:
+            raise data_error(path, f"is a cube with the planes 0 to {shape[0] - 1}")
+        if plane is None:
+            chosen = data[None]
+        elif plane == "mean":
+            chosen = data
+        else:
+            chosen = data[plane][None]
+        header = hdu.header.copy()
+        for key in ("PA_APER", "PIXELSCL", "PIXSCALE"):
+            if key not in header and key in hdus[0].header:
+                header[key] = hdus[0].header[key]
+        return np.array(chosen, dtype=float), header
+
+
+def _best_extension(hdus, name):
+    """Number of the extension with the PSF or kernel of a file, said if there are several."""
+    images = [k for k, hdu in enumerate(hdus) if hdu.is_image and hdu.shape]
+    if not images:
+        return 0
+    names = [str(hdus[k].name).upper() for k in images]
+    for wanted in _STPSF_ORDER:
+        if wanted in names:
+            chosen = images[names.index(wanted)]
+            why = " (the best of STPSF's: distortion and detector effects, finely sampled)"
+            break
+    else:
+        chosen = images[0]
+        why = " (the first)"
+    if len(images) > 1:
+        label = hdus[chosen].name or chosen
+        others = ", ".join(str(hdus[k].name or k) for k in images if k != chosen)
+        msg = f"{name} has several images: extension {label} is taken{why}, not {others}; {name}[NUMBER] names one"
+        warn(msg, PSFWarning)
+    return chosen
+
+
+def core_position(data):
+    """
+    Find the bright core of a PSF.
+
+    Parameters
+    ----------
+    data : `~numpy.ndarray`, shape (ny, nx)
+        The PSF.
+
+    Returns
+    -------
+    x, y : float
+        Center under a round window as wide as the core, 0-based; where that does not settle, the centroid of
+        the cells above 0.3 of the peak around it.
+    """
+    x, y, _ = _core.core_moments(data)
+    ny, nx = data.shape
+    if 0 <= x <= nx - 1 and 0 <= y <= ny - 1:
+        return x, y
+    y, x = np.indices(data.shape)
+    core = np.where(data > 0.3 * data.max(), data, 0.0)
+    # only the brightest peak
+    peak = np.unravel_index(np.argmax(data), data.shape)
+    core[np.hypot(y - peak[0], x - peak[1]) > 0.25 * min(data.shape)] = 0
+    return float((core * x).sum() / core.sum()), float((core * y).sum() / core.sum())
+
+
+def is_stpsf(header):
+    """Whether a header is one of STPSF or WebbPSF: the axes are those of the detector."""
+    return {"OVERSAMP", "PIXELSCL"} <= set(header)
 
 
 def header_grid(header):
@@ -28,12 +185,19 @@ def header_grid(header):
     ValueError
         If the image is mirrored.
     """
-    wcs = WCS(header, naxis=2, fix=False).celestial if "CTYPE1" in header else None
-    if wcs is not None and wcs.has_celestial:
-        (a, b), (c, d) = wcs.pixel_scale_matrix
+    wcs = header_wcs(header, where="the PSF or kernel") if "CTYPE1" in header else None
+    if wcs is not None:
+        wcs.wcs.set()
+        matrix = wcs.pixel_scale_matrix
+        # rows of longitude and latitude, either of which may be the first
+        a, b = matrix[wcs.wcs.lng]
+        c, d = matrix[wcs.wcs.lat]
         if a * d - b * c > 0:
             raise argument_error("path", "a file with east to the left where north is up", wcs)
-        return float(np.sqrt(b * c - a * d)) * 3600, float(np.degrees(np.arctan2(b, d)))
+        angle = float(np.degrees(np.arctan2(b, d)))
+        if not str(wcs.wcs.lngtyp).startswith("RA"):
+            angle = float(grid_angle(wcs, (header["NAXIS2"], header["NAXIS1"])).value)
+        return float(np.sqrt(b * c - a * d)) * 3600, angle
     for key in ("PIXELSCL", "PIXSCALE"):
         if isinstance(header.get(key), (int, float)) and header[key] > 0:
             return float(header[key]), None
@@ -46,14 +210,8 @@ def fits_image(path, ext, plane, pixel_scale, *, wanted, oversampling=1):
 
     Parameters and errors are those of `read_psf`; ``wanted`` describes the expected content for messages.
     """
-    with open_fits(path, wanted=wanted, output_verify="silentfix") as hdus:
-        data = hdus[ext].data
-        if data is not None and plane is not None:
-            data = data[plane]
-        if data is None or data.ndim != 2:
-            got = None if data is None else f"shape {data.shape}"
-            raise argument_error("path", f"a file with a 2D image in extension {ext!r}", got)
-        data, header = np.array(data, dtype=float), hdus[ext].header
+    planes, header = read_planes(path, wanted, ext=ext, plane=plane)
+    data = planes.mean(axis=0)
     if oversampling is None:
         oversampling = int(header.get("OVERSAMP", 1))
     cell, angle = header_grid(header)
@@ -72,7 +230,7 @@ def read_psf(
     path,
     *,
     frame=None,
-    ext=0,
+    ext=None,
     plane=None,
     pixel_scale=None,
     oversampling=None,
@@ -85,18 +243,20 @@ def read_psf(
     Parameters
     ----------
     path : path-like
-        The file.
+        The file; ``file.fits[EXTENSION]`` and ``file.fits[EXTENSION,PLANE]`` name an extension and a plane.
     frame, oversampling : optional
         As for `make_psf`; by default those of STPSF's files (the detector's frame, OVERSAMP), else the sky and 1.
     ext : int or str, optional
-        The extension.
-    plane : int, optional
-        Which plane of a cube.
+        The extension. By default the first with an image, or of STPSF's files OVERDIST, DET_DIST, OVERSAMP or
+        DET_SAMP, the first of these that is there.
+    plane : int or "mean", optional
+        Which plane of a cube, or the mean of all.
     pixel_scale, angle : `~astropy.units.Quantity`, optional
         As for `make_psf`. Where the header states them (world coordinates; PIXELSCL or
         PIXSCALE, arcsec per cell) they can be left out, and must agree with it if given.
     **options
-        Further options of `make_psf`, such as ``includes`` and ``enclosed``.
+        Further options of `make_psf`, such as ``includes`` and ``enclosed``. The center is found in the core
+        unless ``origin`` says where it is.
 
     Returns
     -------
@@ -107,23 +267,28 @@ def read_psf(
     Raises
     ------
     `~miricigale.utils.exceptions.DataError`
-        If the file is missing or no FITS.
+        If the file is missing or no FITS, or there is no 2D image there.
     ValueError
-        If there is no 2D image there, or scale or angle are unknown or not the header's.
+        If scale or angle are unknown or not the header's.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.PSFWarning`
+        If several extensions hold images and none was named: which is taken.
 
     Examples
     --------
     >>> from miricigale.psf import read_psf
     >>> psf = read_psf("f770w_psf.fits", ext=1, enclosed=0.95)  # doctest: +SKIP
     """
-    if is_written(path):
+    if split_extension(path)[1] is None and is_written(path):
         return _read_psf(path)
     data, header, pixel_scale, turn, oversampling = fits_image(
         path, ext, plane, pixel_scale, wanted="a PSF", oversampling=oversampling
     )
     if frame is None:
         # as STPSF and WebbPSF write them
-        frame = "detector" if {"OVERSAMP", "PIXELSCL"} <= set(header) else "sky"
+        frame = "detector" if is_stpsf(header) else "sky"
     if frame == "detector" and isinstance(header.get("PA_APER"), (int, float)):
         options.setdefault("pa_aper", float(header["PA_APER"]) * u.deg)
     if frame == "sky" and turn is not None:
@@ -131,6 +296,8 @@ def read_psf(
         if abs((given - turn + 180) % 360 - 180) > 0.5:
             raise argument_error("angle", f"the header's, {turn:.4g} deg", angle)
         angle = given * u.deg
+    if np.all(np.isfinite(data)) and data.max() > 0:
+        options.setdefault("origin", core_position(data))
     return make_psf(
         data,
         pixel_scale=pixel_scale,

@@ -14,6 +14,7 @@ from miricigale.psf.model import from_photutils, make_psf
 from miricigale.psf.resample import average_psf, centered_psf, psf_image, psf_mosaic, rotate_psf
 from miricigale.psf.wiener import checked_square, gaussian_gain
 from miricigale.utils.exceptions import PSFWarning, argument_error, warn
+from miricigale.utils.files import split_extension
 from miricigale.utils.options import check_that
 from miricigale.utils.units import ANGLE, to_array
 
@@ -22,7 +23,8 @@ _log = logging.getLogger(__name__)
 
 def named_psf(psf):
     """A PSF of a file or of the name of a filter; anything else itself."""
-    if isinstance(psf, os.PathLike) or (isinstance(psf, str) and os.path.isfile(psf)):
+    is_path = isinstance(psf, os.PathLike)
+    if is_path or (isinstance(psf, str) and os.path.isfile(split_extension(psf)[0])):
         from miricigale.psf.files import read_psf
 
         return read_psf(psf)

@@ -24,7 +24,6 @@ from miricigale.utils.table_files import (
     ragged_columns,
     read_table,
     silent_units,
-    warn_of_ragged,
 )
 from miricigale.utils.units import check_count
 
@@ -64,20 +63,19 @@ def open_rows(path, chunk_rows, *, hdu=None, id_names=()):
             start = stream.read(6)
     kinds = {b"SIMPLE": _FitsRows, b"PAR1": _ParquetRows}
     kind = next((kind for begin, kind in kinds.items() if start.startswith(begin)), RowFile)
-    if kind is _FitsRows and _is_text_table(path, hdu):
-        # of ASCII tables astropy reads no pieces
+    if kind is _FitsRows and _is_read_whole(path, hdu):
         kind = RowFile
     return kind(path, chunk_rows, hdu, tuple(id_names))
 
 
-def _is_text_table(path, hdu):
-    """Whether the table of a FITS file is written in ASCII."""
+def _is_read_whole(path, hdu):
+    """Whether astropy reads no pieces of a FITS table: one in ASCII, or with columns of variable length."""
     with open_fits(path, wanted="a catalog") as hdus:
         tables = [item for i, item in enumerate(hdus) if hdu in (None, i, item.name)]
         kinds = [
             type(item) for item in tables if isinstance(item, (fits.TableHDU, fits.BinTableHDU))
         ]
-        return kinds == [fits.TableHDU]
+        return kinds == [fits.TableHDU] or any(map(ragged_columns, tables))
 
 
 class RowFile:
@@ -145,8 +143,6 @@ class _FitsRows(RowFile):
         with open_fits(path, wanted="a catalog") as hdus:
             table = self._choose(hdus)
             self._header, self.n_rows = table.header.copy(), table.header["NAXIS2"]
-            self._ragged = ragged_columns(table)
-        warn_of_ragged(self._ragged, Path(path).name)
         # what belongs to the whole table
         for key in ("CHECKSUM", "DATASUM", "THEAP"):
             self._header.remove(key, ignore_missing=True)
@@ -170,9 +166,6 @@ class _FitsRows(RowFile):
     def _read(self, rows):
         with open_fits(self.path, wanted="a catalog", memmap=True) as hdus:
             part = fits.BinTableHDU(self._choose(hdus).data[rows], header=self._header)
-            if self._ragged:
-                kept = [c for c in part.columns if c.name not in self._ragged]
-                part = fits.BinTableHDU.from_columns(kept, nrows=len(part.data))
             with silent_units():
                 table = Table.read(part, character_as_bytes=False)
             mask_scaled_nulls(table, part)

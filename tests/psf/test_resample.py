@@ -19,6 +19,7 @@ from miricigale.psf import (
     read_psf,
     rotate_psf,
 )
+from miricigale.utils.exceptions import DataError
 
 
 def psf_of(light, *, n, scale=0.11):
@@ -183,7 +184,13 @@ def test_reads_any_fits_image(tmp_path):
     one = read_psf(path, ext=1, plane=1, enclosed=0.9, **kind)
     assert_allclose(one.data, 0.9 * psf.data, rtol=1e-5, atol=1e-7)
     assert one.enclosed == pytest.approx(0.9)
-    refuses("a file with a 2D image in extension 0", read_psf, path, **kind)
+    refuses(
+        r"an image with a PSF, .* say FILE\[EXTENSION,PLANE\]",
+        read_psf,
+        path,
+        error=DataError,
+        **kind,
+    )
     refuses("'data' must be normalized to 16", read_psf, path, ext=1, plane=1, **kind)
 
 

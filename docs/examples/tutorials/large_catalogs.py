@@ -224,8 +224,9 @@ plt.show()
 # - Other names, magnitudes, and codes for missing values: ``catalog_map=`` (``--map``;
 #   :doc:`/how_to/fit/own_catalog`).
 # - CSV has no units: ``flux_unit="uJy"`` gives them. The type of a column is what all of its rows can be read as.
-# - Compressed files are read as a whole. FITS columns of variable length, and ids that are text but not ASCII,
-#   which FITS tables cannot hold, are refused before anything is fitted; ``BayesFitter.fit`` takes such ids.
+# - Compressed files (gzip, bzip2, xz, zip) and FITS tables with columns of variable length, which are left out and
+#   named, are read as a whole. Ids that are text but not ASCII, which FITS tables cannot hold, are refused before
+#   anything is fitted; ``BayesFitter.fit`` takes them.
 #
 # Memory and times for millions of objects are in :doc:`/accuracy/fitting`. Next: :doc:`/how_to/fit/mock_analysis`
 # tests the errors of the results.

@@ -1,0 +1,296 @@
+"""Images as other programs write them: coordinates, planes, units of the noise, bits of masks."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.io import fits
+from astropy.nddata import CCDData, InverseVariance, StdDevUncertainty, VarianceUncertainty
+from astropy.wcs import WCS
+
+from helpers.errors import refuses
+from miricigale.instrument import Image, pixel_area_map, read_image, write_image
+from miricigale.instrument.sky_axes import grid_angle, pixel_to_radec, radec_axes
+from miricigale.photometry import MosaicFile, read_mosaic
+from miricigale.reduction import pixel_map, read_images
+from miricigale.scene.sky import local_jacobian, pixel_positions
+from miricigale.utils.exceptions import DataError, PhotometryWarning
+
+SHAPE = (60, 80)
+SCALE = 0.1 / 3600
+#: Solid angle of a square pixel, sr.
+AREA = np.radians(SCALE) ** 2
+CENTER = SkyCoord(53.1, -27.8, unit="deg")
+
+
+def tan(angle=0.0, names=("RA---TAN", "DEC--TAN"), center=CENTER, swap=False):
+    """Gnomonic coordinates whose +y stands at an angle (deg), with either axis first."""
+    wcs = WCS(naxis=2)
+    turn = np.radians(angle)
+    lon = center.spherical.lon.deg
+    lat = center.spherical.lat.deg
+    cd = SCALE * np.array([[-np.cos(turn), np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    order = [1, 0] if swap else [0, 1]
+    wcs.wcs.ctype = [names[k] for k in order]
+    wcs.wcs.crval = [(lon, lat)[k] for k in order]
+    wcs.wcs.crpix = (SHAPE[1] + 1) / 2, (SHAPE[0] + 1) / 2
+    wcs.wcs.cd = cd[order]
+    wcs.pixel_shape = SHAPE[::-1]
+    wcs.wcs.set()
+    return wcs
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Write an image with planes, (name, version, values), and keywords; returns the path."""
+
+    def writer(data, planes=(), *, wcs=None, primary=None, name="image.fits", **keywords):
+        header = (tan() if wcs is None else wcs).to_header(relax=True)
+        header["BUNIT"] = "MJy/sr"
+        header.update(keywords)
+        hdus = [fits.PrimaryHDU(header=fits.Header(primary or {}))]
+        hdus.append(fits.ImageHDU(data, header, name="SCI"))
+        for label, version, values, *cards in planes:
+            own = fits.Header(cards[0] if cards else {})
+            hdus.append(fits.ImageHDU(values, own, name=label, ver=version))
+        fits.HDUList(hdus).writeto(tmp_path / name, overwrite=True)
+        return tmp_path / name
+
+    return writer
+
+
+def noise(sigma=0.1, seed=1):
+    return np.random.default_rng(seed).normal(0, sigma, SHAPE).astype(np.float32)
+
+
+def plane(value):
+    return np.full(SHAPE, value, np.float32)
+
+
+@pytest.mark.parametrize("angle", [0.0, 37.0, 180.0])
+def test_declination_may_be_the_first_axis(angle, write):
+    usual = tan(angle)
+    swapped = tan(angle, swap=True)
+    np.testing.assert_allclose(
+        pixel_area_map(swapped, SHAPE), pixel_area_map(usual, SHAPE), rtol=1e-12
+    )
+    assert pixel_area_map(swapped, SHAPE).mean() == pytest.approx(AREA, rel=1e-6)
+    x, y = np.array([[3.0, 70.0], [50.0, 10.0]])
+    np.testing.assert_allclose(pixel_to_radec(swapped, x, y), pixel_to_radec(usual, x, y))
+    np.testing.assert_allclose(local_jacobian(swapped, x, y), local_jacobian(usual, x, y))
+    sky = swapped.pixel_to_world(x, y)
+    np.testing.assert_allclose(pixel_positions(swapped, sky, SHAPE)[:2], (x, y), atol=1e-6)
+    np.testing.assert_allclose(
+        pixel_map(swapped, usual, SHAPE)[0][0], np.arange(SHAPE[1]), atol=1e-6
+    )
+    assert abs(grid_angle(swapped, SHAPE).value % 360 - angle) < 1e-3
+    # a flux in a pixel is divided by its solid angle
+    data = noise()
+    image = read_mosaic(write(data, [("ERR", 1, plane(0.1))], wcs=swapped, BUNIT="uJy"))
+    np.testing.assert_allclose(image.data, data * (1e-12 / AREA), rtol=1e-5)
+    assert np.all(
+        swapped.pixel_to_world(x, y).separation(usual.pixel_to_world(x, y)) < 1e-8 * u.arcsec
+    )
+
+
+def test_mirrored_images_are_refused_with_the_way_out():
+    wcs = tan()
+    wcs.wcs.cd = SCALE * np.eye(2)
+    wcs.wcs.set()
+    refuses("a mirrored one: flip the pixels and the coordinates", grid_angle, wcs, SHAPE)
+
+
+def test_north_is_that_of_right_ascension_on_galactic_axes(write):
+    place = SkyCoord(266.4, -28.9, unit="deg")
+    wcs = tan(names=("GLON-TAN", "GLAT-TAN"), center=place.galactic)
+    # the angle between the two norths by spherical trigonometry at this place
+    pole = SkyCoord(0, 90, unit="deg", frame="galactic").icrs
+    angle = place.position_angle(pole).to_value(u.deg)
+    assert abs((grid_angle(wcs, SHAPE).value - angle + 180) % 360 - 180) < 0.01
+    middle = (SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2
+    np.testing.assert_allclose(pixel_to_radec(wcs, *middle), (266.4, -28.9), atol=1e-8)
+    lon, lat = radec_axes(wcs, 266.4, -28.9)
+    np.testing.assert_allclose((lon, lat), (place.galactic.l.deg, place.galactic.b.deg), atol=1e-8)
+    # light to the equatorial east goes where the sky says
+    east = place.directional_offset_by(90 * u.deg, 1 * u.arcsec)
+    step = np.subtract(wcs.world_to_pixel(east), middle)
+    np.testing.assert_allclose(local_jacobian(wcs, *middle) @ [1, 0], step, atol=1e-4)
+    x, _ = pixel_map(wcs, tan(angle, center=place), SHAPE)
+    np.testing.assert_allclose(x[30], np.arange(SHAPE[1]), atol=0.02)
+
+
+def test_sip_without_its_ctype_is_no_distortion(write):
+    left = {"A_ORDER": 2, "B_ORDER": 2, "A_2_0": 1e-3, "B_1_1": -2e-3}
+    path = write(noise(), [("ERR", 1, plane(0.1))], **left)
+    with pytest.warns(
+        PhotometryWarning, match="CTYPE1 = 'RA---TAN' without -SIP states no distortion"
+    ):
+        image = read_mosaic(path)
+    assert image.wcs.sip is None
+    assert image.wcs.pixel_to_world(70, 5).separation(tan().pixel_to_world(70, 5)) < 1e-8 * u.arcsec
+    stated = write(
+        noise(), [("ERR", 1, plane(0.1))], **left, CTYPE1="RA---TAN-SIP", CTYPE2="DEC--TAN-SIP"
+    )
+    assert read_mosaic(stated).wcs.sip is not None
+
+
+@pytest.mark.parametrize(
+    ("kind", "value"),
+    [(StdDevUncertainty, 0.01), (VarianceUncertainty, 1e-4), (InverseVariance, 1e4)],
+)
+def test_uncertainties_are_written_as_standard_deviations(kind, value, tmp_path):
+    image = CCDData(noise(0.01), unit="MJy/sr", uncertainty=kind(plane(value)), wcs=tan())
+    write_image(image, tmp_path / "a.fits")
+    np.testing.assert_allclose(read_image(tmp_path / "a.fits").uncertainty.array, 0.01, rtol=1e-6)
+    Image(image).write(tmp_path / "b.fits")
+    # as astropy writes it, with UTYPE
+    image.write(tmp_path / "c.fits")
+    for name in ("a", "b", "c"):
+        error = read_mosaic(tmp_path / f"{name}.fits").uncertainty.array
+        np.testing.assert_allclose(error, 0.01, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("VARIANCE", 0.01), ("VAR", 0.01), ("IVAR", 100), ("INVVAR", 100), ("RMS", 0.1)],
+)
+def test_maps_are_what_their_names_say(name, value, write):
+    path = write(noise(), [(name, 1, plane(value))])
+    np.testing.assert_allclose(read_mosaic(path).uncertainty.array, 0.1, rtol=1e-5)
+    if name != "RMS":
+        with pytest.raises(ValueError, match=f"whose extension is {name}: give it as"):
+            read_mosaic(path, error=f"{path}[{name}]")
+
+
+def test_variances_of_jwst_are_added(write):
+    parts = [("VAR_POISSON", 1, plane(0.006)), ("VAR_RNOISE", 1, plane(0.004))]
+    image = read_mosaic(write(noise(), parts))
+    np.testing.assert_allclose(image.uncertainty.array, 0.1, rtol=1e-5)
+
+
+def test_planes_have_the_version_of_their_image(write):
+    marks = [np.zeros(SHAPE, np.int16) for _ in range(2)]
+    marks[0][10:20] = 1
+    marks[1][30:40] = 1
+    planes = [("ERR", 1, plane(0.3)), ("DQ", 1, marks[0])]
+    planes += [("SCI", 2, noise(), tan().to_header() + fits.Header({"BUNIT": "MJy/sr"}))]
+    planes += [("ERR", 2, plane(0.1)), ("DQ", 2, marks[1])]
+    path = write(noise(0.3), planes, primary={"TELESCOP": "JWST"})
+    for place in (f"{path}[SCI,2]", f"{path}[4]"):
+        image = read_mosaic(place)
+        np.testing.assert_array_equal(image.mask, marks[1] == 1)
+        np.testing.assert_allclose(image.uncertainty.array, 0.1)
+    refuses(r"say which as .*\[SCI,2\]", read_mosaic, path, error=DataError)
+    refuses("no such extension", read_mosaic, f"{path}[SCI,3]", error=DataError)
+
+
+def bits(*values):
+    """A plane in which row k has the k-th value."""
+    plane = np.zeros(SHAPE, np.int32)
+    for row, value in enumerate(values):
+        plane[row] = value
+    return plane
+
+
+BITS = [
+    ({"TELESCOP": "JWST"}, {}, (1, 4, 5), (True, False, True)),
+    (
+        {"TELESCOP": "HST", "INSTRUME": "WFC3", "DETECTOR": "IR"},
+        {},
+        (4, 64, 512, 8192, 32),
+        (1, 0, 0, 1, 1),
+    ),
+    (
+        {"TELESCOP": "HST", "INSTRUME": "ACS", "DETECTOR": "WFC"},
+        {},
+        (4, 32, 64, 4096),
+        (1, 0, 0, 1),
+    ),
+    (
+        {},
+        {"MP_BAD": 0, "MP_SAT": 1, "HIERARCH MP_DETECTED": 5, "HIERARCH MP_NO_DATA": 8},
+        (1, 32, 2, 256, 34),
+        (1, 0, 1, 1, 1),
+    ),
+]
+
+
+@pytest.mark.parametrize(("primary", "cards", "values", "bad"), BITS)
+def test_bits_are_those_of_the_telescope(primary, cards, values, bad, write):
+    name = "MASK" if cards else "DQ"
+    path = write(
+        noise(), [("ERR", 1, plane(0.1)), (name, 1, bits(*values), cards)], primary=primary
+    )
+    mask = read_mosaic(path).mask
+    np.testing.assert_array_equal(mask[: len(values), 0], np.array(bad, bool))
+    assert not mask[len(values) :].any()
+
+
+def test_bits_of_unknown_tables_are_bad_and_said(write):
+    path = write(noise(), [("ERR", 1, plane(0.1)), ("DQ", 1, bits(4, 8, 0))])
+    with pytest.warns(
+        PhotometryWarning, match=r"nothing says what they mean .* taken as bad, 3.33% of them"
+    ):
+        mask = read_mosaic(path).mask
+    assert mask[:2].all()
+    assert not mask[2:].any()
+
+
+def test_axes_of_one_plane_are_no_cube(write):
+    path = write(noise()[None], [("ERR", 1, plane(0.1)[None])])
+    image = read_mosaic(path)
+    np.testing.assert_array_equal(image.data, noise())
+    part = MosaicFile(path, section=(slice(5, 45), slice(10, 60))).read()
+    np.testing.assert_array_equal(part.data, noise()[5:45, 10:60])
+    np.testing.assert_allclose(part.uncertainty.array, 0.1)
+
+
+def test_an_image_without_data_is_refused(write):
+    refuses("has no data in its extension SCI", read_mosaic, write(None), error=DataError)
+
+
+@pytest.mark.parametrize("empty", [plane(0.0), plane(np.nan), None])
+def test_weights_stand_in_for_errors_that_hold_none(empty, write):
+    path = write(noise(), [("ERR", 1, empty), ("WHT", 1, plane(4.0))])
+    with pytest.warns(
+        PhotometryWarning, match=r"ERR \(.*\) holds no noise; WHT \(weight\) is used"
+    ):
+        image = read_mosaic(path)
+    assert np.median(image.uncertainty.array) == pytest.approx(0.1, rel=0.05)
+
+
+def test_maps_without_noise_or_of_another_shape_are_refused(write):
+    path = write(noise(), [("ERR", 1, plane(0.0))])
+    refuses("holds no noise in ERR .* and no other map", read_mosaic, path, error=DataError)
+    path = write(noise(), [("ERR", 1, plane(0.1)[:50])])
+    refuses(
+        r"ERR .* of the shape \(50, 80\), and its image \(60, 80\)",
+        read_mosaic,
+        path,
+        error=DataError,
+    )
+    path = write(noise(), [("ERR", 1, plane(0.1)), ("DQ", 1, bits(0)[:50])])
+    refuses(r"an extension DQ .* of the shape \(50, 80\)", read_mosaic, path, error=DataError)
+
+
+def test_constant_planes_of_hst_are_filled(write):
+    constant = {"NPIX1": SHAPE[1], "NPIX2": SHAPE[0], "PIXVALUE": 0.1}
+    image = read_mosaic(write(noise(), [("ERR", 1, None, constant)]))
+    np.testing.assert_allclose(image.uncertainty.array, 0.1, rtol=1e-6)
+
+
+def test_errors_of_0_are_refused_by_the_reduction(write):
+    keywords = {"TELESCOP": "JWST", "INSTRUME": "MIRI", "DETECTOR": "MIRIMAGE", "FILTER": "F770W"}
+    path = write(noise(), [("ERR", 1, plane(0.0)), ("WHT", 1, plane(1.0))], primary=keywords)
+    refuses(
+        "no error in ERR, which is nowhere finite and above 0", read_images, path, error=DataError
+    )
+
+
+@pytest.mark.parametrize("name", ["x_rate.fits", "x_cal.fits", "x_i2d.fits.gz", "X_CALINTS.fits"])
+def test_names_of_products_of_jwst_are_left_to_their_layout(name, tmp_path):
+    image = Image(noise(), unit="MJy/sr")
+    refuses("whose layout miricigale.reduction.write_image", image.write, tmp_path / name)
+    assert not list(tmp_path.iterdir())
+    image.write(tmp_path / "calibrated.fits")
+    np.testing.assert_array_equal(CCDData.read(tmp_path / "calibrated.fits").data, noise())
