@@ -92,9 +92,10 @@ def find_image(hdus, extension, path, names):
     found = named or images[:1]
     shapes = [getattr(hdu, "shape", ()) for hdu in hdus]
     check_data(found, path, f"has no two-dimensional image, only {shapes}")
-    what = f"has {len(found)} extensions {hdus[found[0]].name}"
     name = hdus[found[0]].name
-    check_data(len(found) <= 1, path, f"{what}; say which as {path}[{name},2] or {path}[NUMBER]")
+    count = len(found)
+    what = f"has {count} extensions {name}; say which as {path}[{name},2] or {path}[NUMBER]"
+    check_data(count <= 1, path, what)
     return found[0]
 
 
