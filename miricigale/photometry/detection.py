@@ -13,10 +13,10 @@ from miricigale.photometry.arrays import image_arrays, pixel_scale
 from miricigale.photometry.mosaics import as_mosaic
 from miricigale.photometry.segments import dilate_segments, dilation_rule
 from miricigale.utils.declared import declared
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.exceptions import PhotometryWarning, argument_error, warn
 from miricigale.utils.meta import provenance
 from miricigale.utils.missing import floats
-from miricigale.utils.options import check_names, check_positive
+from miricigale.utils.options import check_names, check_positive, check_that
 from miricigale.utils.sep_tools import background as sep_background
 from miricigale.utils.sep_tools import extract
 from miricigale.utils.tables import Flags, described_columns
@@ -96,6 +96,14 @@ class DetectionPreset:
         )
 
 
+# sigma of a pixel that the dark half of an image may spread to be taken for sky
+_SKY_SPREAD = 3.0
+
+_SKY_LEFT = (
+    "its sky may not be subtracted (subtract_background=True; on the command line "
+    "--highres-background-box 64)"
+)
+
 #: ``"default"``, the threshold and area of the paper on F160W at 0.06 arcsec, and its settings for MIRI
 #: images. The paper states no filter for F160W: there too it is the one of 5 pixels for MIRI.
 DETECTION_PRESETS = {
@@ -156,9 +164,14 @@ def detect_sources(
     Raises
     ------
     ValueError
-        If a setting is out of range.
+        If a setting is out of range, or the sky of the image is above the threshold.
     KeyError
         If there is no such preset or rule.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.PhotometryWarning`
+        If one segment has more than half of the image.
 
     References
     ----------
@@ -189,6 +202,10 @@ def detect_sources(
     )  # fmt: skip
     rule = None if dilation is None else dilation_rule(dilation)
     objects, found = _extract(arrays.flux, arrays, settings)
+    largest = np.bincount(found.ravel(), minlength=2)[1:].max() / np.count_nonzero(arrays.usable)
+    if largest > 0.5:
+        msg = f"one segment has {largest:.0%} of the image: {_SKY_LEFT}"
+        warn(msg, PhotometryWarning)
     name = preset if isinstance(preset, str) else "own"
     labels, meta = found, provenance(preset=name, **dataclasses.asdict(settings))
     if rule is not None:
@@ -318,20 +335,41 @@ def _prepared(
 
 def _extract(flux, arrays, settings):
     """Objects and labels of an image of flux per pixel."""
+    _check_sky(flux, arrays, settings)
     kernel = None
     if settings.fwhm:
         size = 2 * int(np.ceil(0.9 * settings.fwhm)) - 1
         kernel = make_2dgaussian_kernel(settings.fwhm, max(size, 3)).array
-    return extract(
-        flux,
-        settings.threshold,
-        err=arrays.sigma,
-        mask=~arrays.usable,
-        min_area=settings.n_pixels,
-        filter_kernel=kernel,
-        deblend_n_thresholds=settings.n_levels,
-        deblend_contrast=settings.contrast,
-    )
+    try:
+        return extract(
+            flux,
+            settings.threshold,
+            err=arrays.sigma,
+            mask=~arrays.usable,
+            min_area=settings.n_pixels,
+            filter_kernel=kernel,
+            deblend_n_thresholds=settings.n_levels,
+            deblend_contrast=settings.contrast,
+        )
+    except ValueError as err:
+        msg = f"sources cannot be told apart: {err}; {_SKY_LEFT}"
+        raise ValueError(msg) from None
+
+
+def _check_sky(flux, arrays, settings):
+    """Refuse an image whose sky is above the threshold: all of it would be one source."""
+    usable = arrays.usable
+    with np.errstate(divide="ignore", invalid="ignore"):
+        snr = np.where(usable, flux / arrays.sigma, 0.0)
+    low, middle = np.percentile(snr[usable], [10, 50])
+    # in noise they are 1.3 apart, in a crowded field much more
+    if middle <= settings.threshold or middle - low > _SKY_SPREAD:
+        return
+    smooth = scipy.ndimage.gaussian_filter(snr, (settings.fwhm or 0.0) / 2.3548)
+    dark = np.percentile(smooth[usable], 10)
+    wanted = "one whose sky is below the threshold"
+    got = f"one in which 90 % of the pixels are above {dark:.3g} sigma: {_SKY_LEFT}"
+    check_that(dark <= settings.threshold, "image", wanted, got)
 
 
 def _segment_snr(flux, arrays, settings):

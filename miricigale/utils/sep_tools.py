@@ -7,6 +7,8 @@ a filtered signal-to-noise and is not what Source Extractor's ``DETECT_THRESH`` 
 functions here take any array, put NaN into the mask, and use ``filter_type='conv'``.
 """
 
+import math
+
 import numpy as np
 import sep
 
@@ -94,6 +96,10 @@ def background(data, mask=None, box=64, filter_size=3):
     return result.back(dtype=data.dtype), result.rms(dtype=data.dtype)
 
 
+#: Sub-objects of one level of the deblending; 1024 in sep, which crowded fields exceed. sep keeps their
+#: numbers in 16 bits and the size of its table (levels x limit x limit at most) in 32.
+_SUB_OBJECTS = 8000
+
 #: Detection filter of sep and Source Extractor.
 _PYRAMID = np.array([[1.0, 2.0, 1.0], [2.0, 4.0, 2.0], [1.0, 2.0, 1.0]])
 
@@ -139,7 +145,8 @@ def extract(
     Raises
     ------
     ValueError
-        If arguments disagree in shape or are out of range.
+        If arguments disagree in shape or are out of range, or the area above the threshold has more peaks than
+        sep can tell apart.
     """
     data, mask = _image(data, mask)
     err = np.ascontiguousarray(err, data.dtype)
@@ -148,12 +155,26 @@ def extract(
     if bad.any():
         mask = bad if mask is None else mask | bad
         err = np.where(bad, err.dtype.type(1), err)
-    # sep's buffer of detected pixels never overflows
-    sep.set_extract_pixstack(max(data.size, sep.get_extract_pixstack()))
+    # sep's buffer of detected pixels never overflows, also where all of them are above the threshold
+    stack = data.size + data.shape[1] + 16
+    sep.set_extract_pixstack(max(stack, sep.get_extract_pixstack()))
+    levels = check_count(deblend_n_thresholds, "deblend_n_thresholds")
+    sep.set_sub_object_limit(min(_SUB_OBJECTS, math.isqrt((2**31 - 1) // levels)))
     form = {"err": err, "mask": mask, "minarea": check_count(min_area, "min_area")}
-    form |= {"deblend_nthresh": int(deblend_n_thresholds), "deblend_cont": float(deblend_contrast)}
+    form |= {"deblend_nthresh": levels, "deblend_cont": float(deblend_contrast)}
     form["filter_kernel"] = None if filter_kernel is None else native(filter_kernel)
-    return sep.extract(data, float(threshold), filter_type="conv", segmentation_map=True, **form)
+    try:
+        return sep.extract(
+            data, float(threshold), filter_type="conv", segmentation_map=True, **form
+        )
+    except Exception as err:
+        # sep raises this class itself, and names its limit
+        if type(err) is not Exception or "limit" not in str(err):
+            raise
+        wanted = f"one with less than {_SUB_OBJECTS} peaks in one area above the threshold"
+        raise argument_error(
+            "data", wanted, "more: its sky is not subtracted, or the threshold is too low"
+        ) from None
 
 
 def window_positions(data, x, y, width, *, mask=None):

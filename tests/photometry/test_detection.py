@@ -9,12 +9,14 @@ from helpers.errors import refuses
 from miricigale.instrument import north_up_wcs
 from miricigale.photometry import (
     DETECTION_PRESETS,
+    DetectionPreset,
     DilationRule,
     chi_image,
     detect_sources,
     detection_purity,
     dilate_segments,
 )
+from miricigale.utils.exceptions import PhotometryWarning
 
 
 @pytest.fixture(scope="module")
@@ -62,6 +64,38 @@ def test_mask_background_and_missing_uncertainty(deep):
     assert 10 <= len(catalog) <= 16
     assert segmentation.data[:, :245].max() == 0
     assert np.all(np.isfinite(catalog["flux_err"].value))
+
+
+def test_sky_left_in_the_image_is_one_sentence(deep):
+    *_, image = deep
+    raised = image.data + 8 * image.uncertainty.array
+    lit = CCDData(raised, unit=image.unit, wcs=image.wcs, uncertainty=image.uncertainty)
+    refuses("its sky may not be subtracted .*--highres-background-box", detect_sources, lit)
+    _, catalog = detect_sources(lit, preset="default", subtract_background=True)
+    _, plain = detect_sources(image, preset="default")
+    assert len(catalog) == len(plain)
+
+
+@pytest.mark.filterwarnings("ignore:one segment has")
+def test_a_crowded_field_is_no_sky_and_has_no_limit_of_sources(deep):
+    # 1600 stars that touch, of 10 to 1000 sigma
+    _, _, image = deep
+    line = np.sum([np.exp(-0.5 * ((np.arange(336) - 8 * k) / 2) ** 2) for k in range(1, 41)], 0)
+    data = 1000 * image.uncertainty.array[0, 0] * np.outer(line, line)
+    field = CCDData(data, unit=image.unit, wcs=image.wcs, uncertainty=image.uncertainty[:336, :336])
+    preset = DetectionPreset(threshold=0.25, n_pixels=5, contrast=1e-5)
+    _, catalog = detect_sources(field, preset=preset)
+    assert len(catalog) == 1600
+
+
+def test_a_source_that_fills_most_of_an_image_is_warned_of(deep):
+    _, _, image = deep
+    y, x = np.indices((81, 81)) - 40
+    data = 30 * image.uncertainty.array[0, 0] * np.exp(-(x**2 + y**2) / 2 / 14**2)
+    filled = CCDData(data, unit=image.unit, wcs=image.wcs, uncertainty=image.uncertainty[:81, :81])
+    with pytest.warns(PhotometryWarning, match=r"one segment has \d\d% of the image"):
+        _, catalog = detect_sources(filled, preset="default")
+    assert len(catalog) == 1
 
 
 def test_empty_image(tools):

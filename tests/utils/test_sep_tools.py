@@ -66,3 +66,37 @@ def test_bad_errors_are_masked(image):
 )
 def test_bad_arguments_are_named(image, call, match):
     refuses(match, call, image)
+
+
+def crowd(side, n):
+    """A square of equal stars that touch, the first at pixel (8, 8), 8 pixels apart."""
+    pixel = np.arange(side)
+    line = np.sum(
+        [np.exp(-0.5 * ((pixel - x) / 2.2) ** 2) for x in 8 * np.arange(1, n + 1)], axis=0
+    )
+    return 1e4 * np.outer(line, line)
+
+
+def test_more_sources_in_one_area_than_sep_has_by_default():
+    # sep ends at 1024
+    data = crowd(336, 40)
+    objects, labels = sep_tools.extract(data, 1.0, err=np.ones_like(data), deblend_contrast=1e-5)
+    assert len(objects) == labels.max() == 1600
+    places = {(8 * round(x / 8), 8 * round(y / 8)) for x, y in objects[["x", "y"]]}
+    assert len(places) == 1600
+    for axis in "xy":
+        assert np.all(np.abs(objects[axis] - 8 * np.round(objects[axis] / 8)) < 1)
+
+
+def test_all_pixels_above_the_threshold_fill_no_buffer():
+    data = np.full((70, 50), 9.0)
+    objects, labels = sep_tools.extract(data, 1.0, err=np.ones_like(data))
+    assert objects["npix"].tolist() == [3500]
+    assert np.all(labels == 1)
+
+
+def test_more_peaks_than_sep_can_number_are_one_sentence(monkeypatch):
+    monkeypatch.setattr(sep_tools, "_SUB_OBJECTS", 3)
+    data = crowd(56, 5)
+    match = "less than 3 peaks in one area"
+    refuses(match, lambda: sep_tools.extract(data, 1.0, err=np.ones_like(data)))
