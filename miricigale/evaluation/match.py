@@ -8,6 +8,7 @@ from astropy.table import QTable, Table
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.ids import ids_and_missing
 from miricigale.utils.options import check_that
+from miricigale.utils.positions import at_epoch
 from miricigale.utils.tables import (
     Flags,
     described_table,
@@ -98,7 +99,7 @@ def associate(first, second, *, radius):
        -1      1 unmatched
     """
     limit = positive(radius, ANGLE, "radius")
-    sky = [_positions(one, name) for one, name in ((first, "first"), (second, "second"))]
+    sky = _at_one_time(_positions(first, "first"), _positions(second, "second"))
     near = _Candidates(*sky, limit)
     pair = near.partner[0]
     alone = np.flatnonzero(near.partner[1] < 0)
@@ -176,7 +177,13 @@ def _positions(catalog, argument):
         sky = catalog["sky"]
         if not isinstance(sky, SkyCoord):
             raise argument_error(argument, "a table whose 'sky' is a SkyCoord", type(sky).__name__)
-    return sky.icrs.reshape(-1)
+    return sky.reshape(-1)
+
+
+def _at_one_time(first, second):
+    """Two catalogs at the time of the second, if they have proper motions; of the first, if only it has one."""
+    epoch = second.obstime if first.obstime is None or second.obstime is not None else first.obstime
+    return at_epoch(first, epoch, "first"), at_epoch(second, epoch, "second")
 
 
 def match_truth(truth, measured, bands, *, radius=0.5 * u.arcsec):

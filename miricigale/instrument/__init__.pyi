@@ -22,6 +22,7 @@ from .exposure import readout_patterns as readout_patterns
 from .figures import imager_filters as imager_filters
 from .history import REFERENCES as REFERENCES
 from .history import ExposureHistory as ExposureHistory
+from .history import epoch_of as epoch_of
 from .image import Image as Image
 from .image_facts import ImageFacts as ImageFacts
 from .image_files import read_image as read_image

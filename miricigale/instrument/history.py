@@ -158,3 +158,48 @@ def _middle_of(header):
     except (KeyError, ValueError):
         return None
     return float(start.mjd)
+
+
+#: Keywords of the middle of an exposure, and of its start, MJD.
+_MIDDLES = ("MJD-AVG", "MJD-MID", "EXPMID", "EXPSTART", "MJD-OBS", "MJD-BEG")
+
+
+def epoch_of(image):
+    """
+    When an image was taken.
+
+    Parameters
+    ----------
+    image : `~astropy.nddata.CCDData` or other
+        Its history, the keywords in its meta dictionary or those of its WCS say it.
+
+    Returns
+    -------
+    epoch : `~astropy.time.Time` or None
+        The middle of the exposure, or its start if that is all that is there; None where nothing is.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.nddata import CCDData
+    >>> from miricigale.instrument import epoch_of
+    >>> image = CCDData(np.ones((4, 4)), unit="MJy/sr", meta={"day": 60310.0})
+    >>> print(epoch_of(image).iso)
+    2024-01-01 00:00:00.000
+    """
+    meta = getattr(image, "meta", None) or {}
+    kept = meta.get("keywords", {})
+    header = {name: card[0] if isinstance(card, list) else card for name, card in kept.items()}
+    days = [header.get(name) for name in _MIDDLES[:3]]
+    days += [meta.get("day"), *(header.get(name) for name in _MIDDLES[3:])]
+    wcs = getattr(getattr(image, "wcs", None), "wcs", None)
+    days += [getattr(wcs, name, None) for name in ("mjdavg", "mjdobs", "mjdbeg")]
+    for day in days:
+        # keywords of what is not known are 0
+        if isinstance(day, numbers.Real) and np.isfinite(day) and day > 0:
+            return Time(float(day), format="mjd", scale="utc")
+    for text in (getattr(wcs, "dateavg", ""), getattr(wcs, "dateobs", "")):
+        if text:
+            return Time(text, scale="utc")
+    day = _middle_of(header)
+    return None if day is None else Time(day, format="mjd", scale="utc")

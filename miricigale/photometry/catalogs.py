@@ -9,6 +9,7 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.ids import counted_ids, id_column
 from miricigale.utils.missing import floats, mask_of
 from miricigale.utils.options import check_that
+from miricigale.utils.positions import at_epoch
 from miricigale.utils.tables import require_columns, unique_ids
 from miricigale.utils.units import to_array
 
@@ -16,9 +17,11 @@ from miricigale.utils.units import to_array
 OPTIONAL = ("flux", "components")
 
 
-def catalog_sources(catalog):
+def catalog_sources(catalog, epoch=None):
     """
     Return ``id``, ``sky`` (ICRS), ``flux`` and ``components`` of a catalog, by name; None without such a column.
+
+    Proper motions bring positions to an epoch (`~miricigale.utils.positions.at_epoch`).
 
     Raises
     ------
@@ -44,8 +47,8 @@ def catalog_sources(catalog):
         if components.dtype.kind not in "iu" or not np.isin(components, (1, 2)).all():
             found = np.unique(components)[:5].tolist()
             raise argument_error("catalog", "a column 'components' of 1 and 2", f"{found}")
-    icrs = sky.icrs
-    sky = SkyCoord(icrs.ra.deg, icrs.dec.deg, unit="deg")
+    sky = at_epoch(sky, epoch, "catalog")
+    sky = SkyCoord(sky.ra.deg, sky.dec.deg, unit="deg")
     return {"id": ids, "sky": sky, "flux": flux, "components": components}
 
 

@@ -11,7 +11,7 @@ from astropy.io import fits
 from astropy.nddata import StdDevUncertainty
 
 from miricigale.filters import Filter
-from miricigale.instrument import north_up_wcs
+from miricigale.instrument import epoch_of, north_up_wcs
 from miricigale.instrument.image import Image
 from miricigale.instrument.image_planes import plane_data
 from miricigale.instrument.sky_axes import grid_angle
@@ -319,7 +319,7 @@ def _check_catalog(path, image, highres):
 
     from miricigale.photometry.priors import read_catalog
 
-    sky = read_catalog(path)["sky"]
+    sky = read_catalog(path, epoch=epoch_of(highres.header))["sky"]
     for what, file in (("image", image), ("highres", highres)):
         if _inside(sky, file.header):
             continue

@@ -9,6 +9,7 @@ from astropy.coordinates import SkyCoord
 from astropy.table import QTable, Table
 from photutils.segmentation import SegmentationImage
 
+from miricigale.instrument import epoch_of
 from miricigale.photometry._core.stamps import add_model
 from miricigale.photometry.arrays import fit_arrays, image_arrays, pixel_scale
 from miricigale.photometry.flags import ForcedFlags
@@ -376,7 +377,8 @@ class ForcedPhotometer(Interactive):
             self._check_scale("highres", highres.wcs)
         if catalog is not None:
             # pixels of a catalog are those of the image it was made of
-            catalog = read_catalog(catalog, (image if highres is None else highres).wcs)
+            place = image if highres is None else highres
+            catalog = read_catalog(catalog, place.wcs, epoch_of(place))
         if self.template in ("psf", "sersic") or highres is None:
             return highres, segmentation, catalog
         if segmentation is None:

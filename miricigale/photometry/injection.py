@@ -8,6 +8,7 @@ from astropy.nddata import overlap_slices
 from astropy.table import QTable, vstack
 from photutils.segmentation import SegmentationImage
 
+from miricigale.instrument import epoch_of
 from miricigale.photometry.arrays import image_arrays, nearest_values, pixel_scale
 from miricigale.photometry.catalogs import joined_sky
 from miricigale.photometry.detection import bright_centroids
@@ -20,6 +21,7 @@ from miricigale.photometry.shapes import Shape
 from miricigale.photometry.sources import SourceTemplates
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
+from miricigale.utils.positions import at_epoch
 from miricigale.utils.progress import progress
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.units import FNU, SURFACE_BRIGHTNESS, check_count
@@ -150,7 +152,8 @@ class _Field:
             raise argument_error("catalog", "sources of which some are measured", "none that is")
         self.error = np.nanmedian(error)
         self.arrays = image_arrays(image, "image")
-        self.sky = catalog["sky"]
+        place = image if highres is None else highres
+        self.sky = at_epoch(catalog["sky"], epoch_of(place), "catalog")
         self.fwhm = self.base.psf_fwhm.value
         self.labels = self.own = None
         self.donors = []

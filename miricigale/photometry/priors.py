@@ -5,6 +5,7 @@ import os
 
 import numpy as np
 
+from miricigale.instrument import epoch_of
 from miricigale.photometry.arrays import nearest_values
 from miricigale.photometry.grids import open_map
 from miricigale.utils.exceptions import CatalogWarning, data_error, warn
@@ -80,7 +81,7 @@ def read_prior(highres, *, segmentation=None, catalog=None):
         segments, ids = _numbered(data, segmentation)
     if catalog is None:
         return segments, _from_segments(highres, segments, ids)
-    sources = read_catalog(catalog)
+    sources = read_catalog(catalog, epoch=epoch_of(highres))
     if isinstance(catalog, (str, os.PathLike)):
         sources = sources["id", "sky"]
     else:
@@ -124,7 +125,8 @@ def sources_of(highres, segmentation, catalog=None):
     from astropy.coordinates import SkyCoord
 
     nowhere = SkyCoord([], [], unit="deg")
-    sources = read_catalog({"id": np.empty(0, int), "sky": nowhere} if catalog is None else catalog)
+    catalog = {"id": np.empty(0, int), "sky": nowhere} if catalog is None else catalog
+    sources = read_catalog(catalog, epoch=epoch_of(highres))
     sources["label"] = np.zeros(len(sources), int)
     return np.zeros(segmentation.shape, np.int32), sources["id", "sky", "label"]
 
@@ -168,10 +170,11 @@ def _from_segments(highres, segments, ids):
     return QTable({"id": ids, "sky": sky, "label": index})
 
 
-def read_catalog(catalog, wcs=None):
+def read_catalog(catalog, wcs=None, epoch=None):
     """
     Ids and positions of a catalog in any of the usual forms; see ``catalog`` of `read_prior`.
 
+    Proper motions bring positions to an epoch (`~miricigale.utils.positions.at_epoch`).
     With a WCS positions may be pixels ``x`` and ``y``. A position that is missing is NaN; other columns are kept.
 
     Raises
@@ -186,7 +189,7 @@ def read_catalog(catalog, wcs=None):
     if isinstance(catalog, SkyCoord):
         catalog = QTable({"sky": catalog.reshape(-1)})
     table = QTable(as_table(catalog, "catalog"), copy=False)
-    table["sky"] = as_positions(table, name, wcs, missing=True)
+    table["sky"] = as_positions(table, name, wcs, missing=True, epoch=epoch)
     if "id" not in table.colnames:
         # labels are the ids of files, and in tables those of segments
         theirs = id_column(table.colnames, name, labels=isinstance(catalog, (str, os.PathLike)))

@@ -9,6 +9,7 @@ from astropy.coordinates import SkyCoord
 from photutils.psf import ImagePSF
 from photutils.segmentation import SegmentationImage
 
+from miricigale.instrument import epoch_of
 from miricigale.photometry.arrays import image_arrays, nearest_values, pixel_scale, same_grid
 from miricigale.photometry.catalogs import OPTIONAL, catalog_sources, joined_sky, sersic_rows
 from miricigale.photometry.cutouts import Cutout, own_segments, saturated_cores
@@ -168,7 +169,7 @@ class SourceTemplates:
             If an input does not fit; the message says which.
         """
         check_choice(template, "template", ("auto", "cutout"))
-        known = catalog_sources(catalog)
+        known = catalog_sources(catalog, epoch_of(highres))
         fine = image_arrays(highres, "highres", np.float32)
         segments = _segments(segmentation, fine.flux.shape)
         scale = pixel_scale(highres.wcs)

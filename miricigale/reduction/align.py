@@ -5,16 +5,18 @@ import dataclasses
 import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord, search_around_sky
+from astropy.time import Time
 from astropy.wcs import WCS
 from astropy.wcs.utils import proj_plane_pixel_scales
 from scipy.spatial import KDTree
 
-from miricigale.instrument import ImageFacts, psf_fwhm
+from miricigale.instrument import ImageFacts, epoch_of, psf_fwhm
 from miricigale.reduction.background import estimate_background
 from miricigale.reduction.images import plain_mask, with_data
 from miricigale.utils import sep_tools
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
+from miricigale.utils.positions import at_epoch
 from miricigale.utils.units import ANGLE, positive
 
 # pairs vote for the shift within this radius, and are matched within it after the shift, arcsec
@@ -72,7 +74,8 @@ def align_to_catalog(image, catalog, *, radius=1 * u.arcsec):
     image : `~astropy.nddata.CCDData`
         With uncertainty and WCS, background subtracted or not.
     catalog : `~astropy.coordinates.SkyCoord`
-        Positions, at the epoch of the image.
+        Positions at the epoch of the image; those with proper motions and ``obstime``, as of Gaia, are
+        brought to it.
     radius : `~astropy.units.Quantity`, optional
         Largest shift.
 
@@ -85,7 +88,8 @@ def align_to_catalog(image, catalog, *, radius=1 * u.arcsec):
     Raises
     ------
     ValueError
-        If fewer than three sources of the catalog are found in the image, or an option is out of range.
+        If fewer than three sources of the catalog are found in the image, an option is out of range, or the
+        catalog has proper motions and its time or that of the image is not known.
 
     Notes
     -----
@@ -116,7 +120,7 @@ def align_to_catalog(image, catalog, *, radius=1 * u.arcsec):
     """
     found = [(image, *_sources(image, "image"))]
     reach = positive(radius, ANGLE, "radius")
-    (aligned,), alignment = _aligned(found, _positions(catalog), reach, "image")
+    (aligned,), alignment = _aligned(found, _positions(catalog, [image]), reach, "image")
     return aligned, alignment
 
 
@@ -178,14 +182,16 @@ def align_images(images, catalog=None, *, radius=1 * u.arcsec, groups=None):
     images = list(images)
     check_that(images, "images", "at least one image", "none")
     reach = positive(radius, ANGLE, "radius")
-    known = None if catalog is None else _positions(catalog)
     groups = list(range(len(images)) if groups is None else groups)
     if len(groups) != len(images):
         raise argument_error("groups", f"one for each of {len(images)} images", len(groups))
+    known = None
     out, alignments = [None] * len(images), [None] * len(images)
     for group in dict.fromkeys(groups):
         members = [k for k, one in enumerate(groups) if one == group]
         found = [(images[k], *_sources(images[k], f"images[{k}]")) for k in members]
+        if catalog is not None:
+            known = _positions(catalog, [images[k] for k in members])
         if known is None:
             still = dict.fromkeys(("east", "north", "scatter"), 0 * ANGLE)
             moved, sizes = zip(*((im, x.size) for im, x, _ in found), strict=True)
@@ -212,13 +218,19 @@ def visit_of(image):
     return visit
 
 
-def _positions(catalog):
+def _positions(catalog, images):
+    """Places of a catalog at the mean time of images that are moved together."""
     if not isinstance(catalog, SkyCoord) or catalog.isscalar:
         raise argument_error("catalog", "a SkyCoord of several positions", repr(catalog)[:60])
     unknown = int(np.count_nonzero(~np.isfinite(catalog.cartesian.norm())))
     got = f"{unknown} of {len(catalog)} that are not"
     check_that(not unknown, "catalog", "of finite positions", got)
-    return SkyCoord(catalog.icrs.ra, catalog.icrs.dec)
+    epochs = [epoch_of(im) for im in images]
+    days = [np.nan if epoch is None else epoch.utc.mjd for epoch in epochs]
+    # of any without a time the mean is unknown
+    day = np.mean(days)
+    epoch = Time(day, format="mjd", scale="utc") if np.isfinite(day) else None
+    return at_epoch(catalog, epoch, "catalog")
 
 
 def _sources(image, argument):
@@ -234,7 +246,11 @@ def _sources(image, argument):
     width = psf_fwhm(name).to_value(ANGLE) / scale / 2.3548
     mask, background = plain_mask(image), estimate_background(image, warn=False)
     data = np.where(mask, 0, image.data - background.level)
-    found, _ = sep_tools.extract(data, _DETECTED, err=background.rms, mask=mask)
+    try:
+        found, _ = sep_tools.extract(data, _DETECTED, err=background.rms, mask=mask)
+    except ValueError as err:
+        # more peaks in one area than sep can tell apart
+        raise argument_error(argument, "one whose sources can be told apart", str(err)) from None
     # the edge, and what is masked, cuts sources
     x, y, fine = sep_tools.window_positions(data, found["x"], found["y"], width, mask=mask)
     moved = np.hypot(x - found["x"], y - found["y"])

@@ -2,6 +2,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
+from astropy.time import Time
 from numpy.testing import assert_array_equal
 
 from helpers.errors import refuses
@@ -144,3 +145,22 @@ def test_what_cannot_be_aligned_is_named(stars):
     refuses(wanted, align_to_catalog, galactic, sky)
     image.meta = {}
     refuses("'image' must be one whose meta names its filter", align_to_catalog, image, sky)
+
+
+def test_proper_motions_bring_a_catalog_to_the_time_of_the_image(stars):
+    sky, peaks = stars
+    rng = np.random.default_rng(5)
+    motions = rng.normal([[12.0], [-9.0]], 2.0, (2, 60)) * u.mas / u.yr
+    then, now = Time(2016.0, format="jyear"), Time(2024.5, format="jyear")
+    start = sky.spherical_offsets_by(*(-motions * 8.5 * u.yr))
+    gaia = SkyCoord(start.ra, start.dec, pm_ra_cosdec=motions[0], pm_dec=motions[1], obstime=then)
+    image = observed(cut(CENTER), cut(CENTER), sky, peaks, rng)
+    refuses("time of the image is not known", align_to_catalog, image, gaia)
+    image.meta["keywords"] = {"MJD-AVG": [now.mjd, "middle"]}
+    for solution in (align_to_catalog(image, gaia)[1], align_images([image], gaia)[1][0]):
+        # 128 mas without them; the scatter of the motions alone would be 17
+        assert abs(solution.east.to_value(u.mas)) < 3
+        assert abs(solution.north.to_value(u.mas)) < 3
+        assert solution.scatter.to_value(u.mas) < 12
+    undated = SkyCoord(gaia.ra, gaia.dec, pm_ra_cosdec=motions[0], pm_dec=motions[1])
+    refuses("no obstime", align_to_catalog, image, undated)

@@ -1,0 +1,75 @@
+"""Positions with proper motions, brought to the time of an image."""
+
+import warnings
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.table import QTable
+from astropy.time import Time
+from erfa import ErfaWarning
+from numpy.testing import assert_allclose, assert_array_equal
+
+from helpers.errors import refuses
+from miricigale.utils.exceptions import CatalogWarning
+from miricigale.utils.positions import as_position, as_positions, at_epoch
+
+THEN = Time(2016.0, format="jyear")
+NOW = Time(2024.5, format="jyear")
+
+
+def moving(**changes):
+    """Four stars with the motions of Gaia, one at the pole and one at 0 hours."""
+    values = {
+        "ra": [53.1, 0.0, 200.0, 359.9999999] * u.deg,
+        "dec": [-27.8, 89.99, 12.0, -60.0] * u.deg,
+        "pm_ra_cosdec": [120.0, -900.0, 0.0, 3000.0] * u.mas / u.yr,
+        "pm_dec": [-90.0, 400.0, 0.0, -2000.0] * u.mas / u.yr,
+        "obstime": THEN,
+    }
+    return SkyCoord(**(values | changes))
+
+
+@pytest.mark.parametrize("frame", ["icrs", "galactic", "fk5"])
+def test_motions_are_those_of_astropy(frame):
+    stars = moving()
+    with warnings.catch_warnings():
+        # erfa replaces the distances that are not there
+        warnings.simplefilter("ignore", ErfaWarning)
+        moved = stars.apply_space_motion(new_obstime=NOW)
+    right = SkyCoord(moved.ra, moved.dec)
+    ours = at_epoch(stars.transform_to(frame), NOW, "catalog")
+    assert np.all(right.separation(ours).to_value(u.mas) < 0.01)
+    # the first moves by 8.5 years of 150 mas
+    assert_allclose(ours.separation(stars).arcsec[0], 8.5 * 0.15, rtol=1e-4)
+    # the two ways give back what was put in
+    back = at_epoch(stars, THEN, "catalog")
+    assert np.all(back.separation(SkyCoord(stars.ra, stars.dec)).to_value(u.mas) < 1e-3)
+
+
+def test_motions_without_a_time_are_refused():
+    without = moving(obstime=None)
+    refuses(
+        "'stars' must be positions of a known time .*no obstime", at_epoch, without, NOW, "stars"
+    )
+    refuses("time of the image is not known, got 3 with", at_epoch, moving(), None, "stars")
+    refuses("'pointing' .* without proper motions", as_position, moving()[0], "pointing")
+    still = moving(pm_ra_cosdec=np.zeros(4) * u.mas / u.yr, pm_dec=np.zeros(4) * u.mas / u.yr)
+    assert_array_equal(at_epoch(still, None, "stars").ra, moving().ra)
+
+
+def test_stars_without_a_motion_stay_and_are_counted():
+    motions = [120.0, np.nan, 0.0, 3000.0] * u.mas / u.yr
+    with pytest.warns(CatalogWarning, match="stars: 1 of 4 positions have no proper motion"):
+        moved = at_epoch(moving(pm_ra_cosdec=motions), NOW, "stars")
+    assert moved.dec[1] == moving().dec[1]
+    assert np.all(np.isfinite(moved.ra))
+    assert_allclose(moved.separation(moving()).arcsec[0], 8.5 * 0.15, rtol=1e-4)
+
+
+def test_a_column_of_a_table_is_moved_too():
+    table = QTable({"id": [1, 2, 3, 4], "sky": moving()})
+    refuses("time of the image is not known", as_positions, table, "catalog")
+    moved = as_positions(table, "catalog", epoch=NOW)
+    assert_allclose(moved.separation(moving()).arcsec[0], 8.5 * 0.15, rtol=1e-4)
