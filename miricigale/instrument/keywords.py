@@ -11,12 +11,20 @@ from miricigale.utils.options import check_data
 #: Read-out patterns by the names that they had before the launch.
 READOUT_NAMES = {"FAST": "FASTR1", "SLOW": "SLOWR1"}
 
+#: Values of EXP_TYPE of images of the sky and of calibration lamps; ground tests state none.
+IMAGE_KINDS = (
+    "MIR_IMAGE", "MIR_DARKIMG", "MIR_DARKALL", "MIR_FLATIMAGE", "MIR_FLATIMAGE-EXT", "ANY", "N/A", "",
+)  # fmt: skip
+
 #: Where the light is blocked there is no filter.
 _NO_FILTER = ("", "OPAQUE", "N/A", "ANY")
 
 _DECLARED = declared("miricigale.instrument", "keywords.toml")
 #: Keywords of FITS itself, those that a product does not take over, world coordinates, and those in SCI of JWST.
 _KEPT, _DROPPED, _WCS, _SCIENCE = (re.compile("|".join(p)) for p in _DECLARED["patterns"].values())
+
+#: Values of FILTER that disperse the light.
+_DISPERSERS = ("P750L", "FLENS")
 
 #: Steps of the JWST pipeline by the keywords that record them.
 STEPS = _DECLARED["steps"]
@@ -106,7 +114,7 @@ def check_imager(path, header, *, kinds=None, own=None):
     header : mapping
         As `joined_header` makes it.
     kinds : tuple of str, optional
-        Values of EXP_TYPE; any if not given.
+        Values of EXP_TYPE; those of images if not given: no target acquisitions, coronagraphs or spectra.
     own : dict, optional
         The package's record of the exposure, if the file has one.
 
@@ -121,12 +129,18 @@ def check_imager(path, header, *, kinds=None, own=None):
     >>> from miricigale.instrument import check_imager
     >>> check_imager("a_rate.fits", Header({"DETECTOR": "MIRIMAGE"}))
     """
+    kinds = IMAGE_KINDS if kinds is None else kinds
     kind, detector = str(header.get("EXP_TYPE", "")).strip(), header.get("DETECTOR", "MIRIMAGE")
     instrument = header.get("INSTRUME", "MIRI" if own is not None or "DETECTOR" in header else None)
-    if (instrument, detector) != ("MIRI", "MIRIMAGE") or (kinds and kind not in kinds):
-        types = f", EXP_TYPE {' or '.join(kinds[:3])}" if kinds else ""
-        wanted = f"must be an exposure of the MIRI imager (INSTRUME MIRI, DETECTOR MIRIMAGE{types})"
+    if (instrument, detector) != ("MIRI", "MIRIMAGE") or kind not in kinds:
+        types = f"EXP_TYPE {' or '.join(kinds[:3])}"
+        wanted = (
+            f"must be an exposure of the MIRI imager (INSTRUME MIRI, DETECTOR MIRIMAGE, {types})"
+        )
         raise data_error(path, f"{wanted}, got {instrument} {detector} {kind}".rstrip())
+    if str(header.get("FILTER", "")).strip() in _DISPERSERS:
+        wanted = "must be an exposure of the MIRI imager through a filter"
+        raise data_error(path, f"{wanted}, got the prism {header['FILTER']}")
     stated, recorded = str(header.get("FILTER", "")).strip(), (own or {}).get("filter")
     bands = {name.rpartition(".")[2].upper() for name in (stated, recorded) if name}
     what = f"FILTER is {stated} in the header and {recorded} in the package's record"

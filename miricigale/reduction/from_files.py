@@ -17,6 +17,7 @@ from miricigale.reduction import Reducer, ReferenceFiles, read_images, write_ima
 from miricigale.reduction.background import known_background
 from miricigale.reduction.files import open_file, scaled_planes
 from miricigale.reduction.product_folder import ProductFolder
+from miricigale.reduction.repeats import ExposureRecord
 from miricigale.utils.content import content_sha256, file_sha256
 from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error
@@ -82,7 +83,8 @@ def reduce_files(
     files : `~astropy.table.Table`
         A row for each file: ``file``, ``filter``, ``status`` (reduced, rate, kept or failed) and
         ``reason``, why a file failed or has no brightness. A file that fails never loses the
-        others, and a filter whose mosaic fails is a row too.
+        others, and a filter whose mosaic fails is a row too. An exposure that is there twice (a copy, or a ramp
+        and its slopes) is left out the second time.
 
     Raises
     ------
@@ -116,7 +118,14 @@ def reduce_files(
         reduction = _Reduction(reducer, products, _settings(reducer), resume, integrations)
         rows = []
         members = {}
+        seen = ExposureRecord()
         for path in progress(paths, show=progress_bar, desc="reduce"):
+            same = seen.add_file(path)
+            if same is not None:
+                reason = f"the same exposure as {same}"
+                log.warning("%s is left out: %s", path, reason)
+                rows.append({"file": str(path), "filter": "", "status": "failed", "reason": reason})
+                continue
             row, cal, key = reduction.reduce(path)
             rows.append(row)
             if cal is not None:

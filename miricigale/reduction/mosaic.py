@@ -8,6 +8,7 @@ from astropy.wcs import NoConvergence
 from astropy.wcs.utils import proj_plane_pixel_area
 from drizzle.resample import Drizzle
 from scipy.interpolate import RectBivariateSpline
+from scipy.ndimage import distance_transform_edt
 
 from miricigale.instrument import DQ, ExposureHistory, ImageFacts
 from miricigale.instrument.sky_axes import pixel_to_radec, radec_axes
@@ -263,7 +264,7 @@ def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None, v
     weights : list of `~numpy.ndarray`, optional
         Weight of each pixel; by default `weight_map`.
     pixel_maps : list of (x, y), optional
-        Results of `pixel_map`, if they are there already.
+        Results of `pixel_map`, if they are there already. Pixels whose place is not finite have no weight.
     variances : list of dict of str to `~numpy.ndarray`, optional
         Parts of the variance of each image by name, as the planes of an `ImageFile`; they go through as
         the variance does.
@@ -328,9 +329,14 @@ def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None, v
     variances = list(variances) or [{}] * len(images)
     names = [name for name in PLANES[:3] if all(name in own for own in variances)]
     for im, own, weight, (x, y) in zip(images, variances, weights, pixel_maps, strict=True):
+        nowhere = ~(np.isfinite(x) & np.isfinite(y))
+        if nowhere.all():
+            continue
+        if nowhere.any():
+            x, y = (_filled(values, nowhere) for values in (x, y))
         # an image of many may reach a small part of the grid
         part = extent_of((x, y), shape)
-        weight = np.where(plain_mask(im), 0.0, np.asarray(weight) / unit_weight)
+        weight = np.where(plain_mask(im) | nowhere, 0.0, np.asarray(weight) / unit_weight)
         weight = weight.astype(np.float32)
         if part is None or not weight.any():
             continue
@@ -349,7 +355,10 @@ def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None, v
     flags = np.where(covered, 0, int(DQ.NON_SCIENCE | DQ.DO_NOT_USE))
     ratio = _scale(wcs) / float(np.mean([_scale(im.wcs) for im in images]))
     before_drizzle = float(np.mean([ImageFacts.of(im).noise_correction for im in images]))
-    meta = _meta(images) | {
+    # an exposure without any usable pixel was not long
+    pairs = zip(images, weights, strict=True)
+    alive = [im for im, weight in pairs if np.any((np.asarray(weight) > 0) & ~plain_mask(im))]
+    meta = _meta(alive or images) | {
         "pixfrac": float(pixfrac),
         "pixel_scale": _scale(wcs) * 3600,
         "noise_correction": noise_correction(pixfrac, ratio) * before_drizzle,
@@ -364,6 +373,22 @@ def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None, v
     )
     weight = (weight * np.float32(unit_weight)).astype(np.float32)
     return Mosaic(out, weight, n_images, dict(zip(names, parts[1:], strict=True)))
+
+
+def _filled(values, nowhere):
+    """
+    Coordinates with finite ones where there are none.
+
+    drizzle leaves out far more than the pixels of a map that are NaN, and takes corners of pixels from their
+    neighbors: they are filled by a plane through the others and what the nearest of these is off it.
+    """
+    y, x = np.nonzero(~nowhere)
+    terms = np.stack([np.ones(x.size), x, y], axis=1)
+    plane, *_ = np.linalg.lstsq(terms, values[~nowhere], rcond=None)
+    rows, columns = np.indices(values.shape)
+    smooth = plane[0] + plane[1] * columns + plane[2] * rows
+    nearest = distance_transform_edt(nowhere, return_distances=False, return_indices=True)
+    return np.where(nowhere, smooth + (values - smooth)[tuple(nearest)], values)
 
 
 def add_image(sink, im, weight, pixel_map, wcs, pixfrac=1.0, **planes):

@@ -16,6 +16,7 @@ from miricigale.reduction.files import opened, several
 from miricigale.reduction.images import own_grid, with_data
 from miricigale.reduction.reference_cache import ReferenceCache
 from miricigale.reduction.references import ReferenceFiles
+from miricigale.reduction.repeats import ExposureRecord
 from miricigale.reduction.results import rate_image
 from miricigale.reduction.settings import (
     BACKENDS,
@@ -391,11 +392,14 @@ class Reducer(Interactive):
         Raises
         ------
         ValueError
-            If there are no ramps, or of more than one filter.
+            If there are no ramps, of more than one filter, or one of them twice.
         """
         to_array(pixel_scale, ANGLE, "pixel_scale", ndim=0, finite=True)
         rates, images, backgrounds, name = [], [], [], None
-        for ramp in progress(several(ramps), show=progress_bar, desc="reduce"):
+        seen = ExposureRecord()
+        for number, ramp in enumerate(progress(several(ramps), show=progress_bar, desc="reduce")):
+            ramp = opened(ramp)
+            seen.check(f"exposure {number + 1}", ramp)
             rate, subtracted, background = self.reduce(ramp)
             del ramp
             band = ImageFacts.of(subtracted).filter

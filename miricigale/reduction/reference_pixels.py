@@ -12,7 +12,7 @@ _CHANNELS = 4
 _CLIP = 3.0
 
 
-def reference_drift(data, reference):
+def reference_drift(data, reference, offsets=()):
     """
     Mean level of the reference pixels in each group.
 
@@ -22,6 +22,9 @@ def reference_drift(data, reference):
         Groups in DN.
     reference : `~numpy.ndarray` of bool, shape (ny, nx)
         Which pixels see no light.
+    offsets : sequence of `~numpy.ndarray`, shape (n, n_group or more, ny, nx), optional
+        Maps of groups that are subtracted first, such as a dark; the last integration of each stands for all
+        further ones.
 
     Returns
     -------
@@ -43,11 +46,25 @@ def reference_drift(data, reference):
     columns = np.flatnonzero(reference.any(axis=0))
     if columns.size == 0:
         return np.zeros(data.shape[:2])
-    drift = data[..., columns][:, :, reference[:, columns]].mean(axis=-1, dtype=float)
+    pixels = _without(data, columns, offsets)
+    drift = pixels[:, :, reference[:, columns]].mean(axis=-1, dtype=float)
     return drift - drift.mean()
 
 
-def reference_channels(data, reference, *, origin=(0, 0)):
+def _without(data, columns, offsets):
+    """Columns of the data, a small part of it, without maps of groups."""
+    pixels = data[..., columns]
+    n_int, n_group = pixels.shape[:2]
+    for offset in offsets:
+        shared = min(n_group, offset.shape[1])
+        which = np.minimum(np.arange(n_int), len(offset) - 1)
+        own = np.nan_to_num(offset[:, :shared, :, columns], posinf=0.0, neginf=0.0)
+        pixels = pixels.astype(float)
+        pixels[:, :shared] -= own[which]
+    return pixels
+
+
+def reference_channels(data, reference, *, origin=(0, 0), offsets=()):
     """
     Drift of each channel of the read-out, of odd and even rows apart.
 
@@ -59,6 +76,8 @@ def reference_channels(data, reference, *, origin=(0, 0)):
         Which pixels see no light.
     origin : tuple of int, optional
         Column and row of the first pixel in the full frame, which determine its channel and parity.
+    offsets : sequence of `~numpy.ndarray`, optional
+        As of `reference_drift`.
 
     Returns
     -------
@@ -95,8 +114,7 @@ def reference_channels(data, reference, *, origin=(0, 0)):
     """
     n_int, n_group, ny, nx = data.shape
     columns = np.flatnonzero(reference.any(axis=0))
-    # a small part of the data
-    pixels, known = data[..., columns], reference[:, columns]
+    pixels, known = _without(data, columns, offsets), reference[:, columns]
     # left and right of the middle
     sides = [np.flatnonzero(columns < nx / 2), np.flatnonzero(columns >= nx / 2)]
     parity = (np.arange(ny) + origin[1]) % 2

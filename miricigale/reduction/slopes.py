@@ -19,7 +19,7 @@ from miricigale.reduction.drawn import draw_groups
 from miricigale.reduction.rampfit import fit_groups
 from miricigale.reduction.reference_pixels import reference_channels, reference_drift
 from miricigale.reduction.settling import note_settling
-from miricigale.utils.exceptions import ReductionWarning, argument_error, warn
+from miricigale.utils.exceptions import ReductionWarning, argument_error, data_error, warn
 
 # flags of a ramp's pixels that forbid a slope
 _UNUSABLE = DQ.DO_NOT_USE | DQ.NON_SCIENCE | DQ.REFERENCE_PIXEL | DQ.DEAD
@@ -83,7 +83,7 @@ def fit_slopes(reducer, ramp, maps, progress_bar=False, *, first=0):
             ramp.data,
             maps,
             group_time=ramp.group_time,
-            drift=_drift(reducer, ramp, reference, drift),
+            drift=_drift(reducer, ramp, maps, reference, drift),
             usable=usable,
             # those of a simulated ramp are the truth, until a pipeline has found its own
             group_dq=None if history.simulated and not history.steps else ramp.group_dq,
@@ -139,17 +139,34 @@ def _skipped(reducer, ramp):
     return first, last
 
 
-def _drift(reducer, ramp, reference, drift):
-    """Add the drift of the reference pixels to an offset of each group."""
+def _drift(reducer, ramp, maps, reference, drift):
+    """
+    Add the drift of the reference pixels to an offset of each group.
+
+    It is measured after reset anomaly and dark, in the order of the official pipeline for MIRI: a dark with
+    signal in the reference columns would be subtracted from the others twice.
+    """
     how = reducer.ramps.reference_correction
     if how is None:
         how = ramp.history.simulated or (ramp.exposure.subarray == "FULL" and "channels")
     if not how or "refpix" in ramp.history.steps:
         return drift
+    offsets = [one for one in (maps.reset, maps.dark) if one is not None]
     if how != "channels":
-        return drift + reference_drift(ramp.data, reference)
-    found = reference_channels(ramp.data, reference, origin=ramp.exposure.aperture.origin)
+        return drift + _finite(reference_drift(ramp.data, reference, offsets), ramp)
+    origin = ramp.exposure.aperture.origin
+    found = reference_channels(ramp.data, reference, origin=origin, offsets=offsets)
+    _finite(found, ramp)
     return np.broadcast_to(drift, ramp.shape[:2])[:, :, None, None] + found
+
+
+def _finite(drift, ramp):
+    """Refuse a drift of reference pixels that are not finite."""
+    if not np.isfinite(drift).all():
+        path = ramp.meta.get("filename", "the ramp")
+        what = "has values that are not finite in the reference columns of SCI"
+        raise data_error(path, f"{what}: reference_correction=False leaves them out of account")
+    return drift
 
 
 def _anomaly(reducer, ramp, maps, first):

@@ -233,3 +233,22 @@ def test_slopes_have_their_two_variances_and_those_of_each_integration(exposure,
     assert_allclose(mean.data[good], rate.image.data[good], rtol=0.02, atol=0.2)
     wanted, mixed = "'image' must be integrations of one shape", [parts[0], parts[1].image]
     refuses(wanted, write_image, mixed, tmp_path / "b.fits")
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [
+        ("MIR_TACQ", "F770W"), ("MIR_TACONFIRM", "F560W"), ("MIR_4QPM", "F1550C"),
+        ("MIR_LYOT", "F2300C"), ("MIR_LRS-SLITLESS", "P750L"), ("MIR_IMAGE", "P750L"),
+    ],
+)  # fmt: skip
+def test_acquisitions_coronagraphs_and_prisms_are_no_images(tmp_path, kind, name):
+    primary = fits.PrimaryHDU()
+    known = {"INSTRUME": "MIRI", "DETECTOR": "MIRIMAGE", "EXP_TYPE": kind, "FILTER": name}
+    primary.header.update(known)
+    science = fits.ImageHDU(np.ones((8, 8), np.float32), name="SCI")
+    science.header["BUNIT"] = "MJy/sr"
+    path = tmp_path / "x_cal.fits"
+    fits.HDUList([primary, science]).writeto(path)
+    with pytest.raises(DataError, match=r"x_cal\.fits must be an exposure of the MIRI imager"):
+        read_images(path)

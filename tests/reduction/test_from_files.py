@@ -1,5 +1,7 @@
 """Files at several stages and of two filters to mosaics, from the command line."""
 
+import shutil
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -174,3 +176,18 @@ def test_slopes_of_each_integration_on_demand(tmp_path):
     assert np.median(ratio) == pytest.approx(np.sqrt(2), rel=0.02)
     assert main(arguments) == 0
     assert Table.read(out / "files.ecsv")["status"][0] == "reduced"
+
+
+def test_copies_and_ramps_with_their_slopes_are_left_out(tmp_path):
+    exposure = exposure_of(n_groups=6, subarray="SUB64")
+    ramp = Detector.miri_imager().expose(sky_of(exposure, 5.0), exposure, seed=1)
+    ramp.write(tmp_path / "a_uncal.fits")
+    write_image(Reducer().fit_ramp(ramp, planes=True), tmp_path / "b_rate.fits")
+    shutil.copy(tmp_path / "a_uncal.fits", tmp_path / "c_uncal.fits")
+    paths = [tmp_path / name for name in ("a_uncal.fits", "b_rate.fits", "c_uncal.fits")]
+    table = reduce_files(paths, tmp_path / "out")
+    assert list(table["status"]) == ["reduced", "failed", "failed", "reduced"]
+    for row in table[1:3]:
+        assert row["reason"] == f"the same exposure as {paths[0]}"
+    mosaic = read_images(tmp_path / "out" / "mosaic_f1000w.fits")[0]
+    assert mosaic.image.meta["n_exposures"] == 1

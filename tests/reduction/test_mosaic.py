@@ -264,3 +264,32 @@ def test_a_grid_elsewhere_on_the_sky_is_refused(ra, dec):
     mosaic = drizzle_images([good, beside], grid)
     assert mosaic.n_images.max() == 1
     assert np.nanmax(mosaic.image.data) == 0
+
+
+def test_a_place_that_is_not_finite_loses_its_own_pixel_alone():
+    wcs = north_up_wcs(SkyCoord(53, -27, unit="deg"), 0.11 * u.arcsec, (60, 60))
+    rng = np.random.default_rng(3)
+    image = make(rng.normal(5, 1, (60, 60)), wcs, filter="miri.f770w")
+    x, y = pixel_map(wcs, wcs, (60, 60))
+    x, y = x.copy(), y.copy()
+    x[20, 31] = np.nan
+    y[40, 7] = np.inf
+    mosaic = drizzle_images([image], wcs, pixel_maps=[(x, y)])
+    whole = drizzle_images([image], wcs)
+    # neighbors touch a pixel by what rounding leaves
+    good = mosaic.weight > 1e-6 * np.median(mosaic.weight)
+    assert {tuple(place) for place in np.argwhere(~good)} == {(20, 31), (40, 7)}
+    assert_allclose(mosaic.image.data[good], whole.image.data[good], atol=1e-4)
+
+
+def test_a_dead_exposure_has_no_exposure_time():
+    wcs = north_up_wcs(SkyCoord(53, -27, unit="deg"), 0.11 * u.arcsec, (60, 60))
+    rng = np.random.default_rng(3)
+    images = [
+        make(rng.normal(5, 1, (60, 60)), wcs, filter="miri.f770w", exposure_time=100.0)
+        for _ in range(3)
+    ]
+    images[1].data[...] = np.nan
+    meta = drizzle_images(images, wcs).image.meta
+    assert meta["exposure_time"] == 200.0
+    assert meta["n_exposures"] == 2

@@ -21,7 +21,15 @@ from miricigale.instrument import (
     photmjsr,
     pixel_area_map,
 )
-from miricigale.reduction import MosaicSettings, RampSettings, Reducer, ReductionResult
+from miricigale.reduction import (
+    MosaicSettings,
+    RampSettings,
+    Reducer,
+    ReductionResult,
+    reference_channels,
+    reference_drift,
+)
+from miricigale.utils.exceptions import DataError
 
 FILTER = "miri.f1000w"
 SKY = background_level(FILTER).value
@@ -230,3 +238,41 @@ def test_the_official_pipeline_is_asked_for_by_name(monkeypatch):
     ramp = expose(SKY, exposure(n_groups=4, subarray="SUB64"))
     wanted = r"pip install 'miricigale\[jwst\]'"
     refuses(wanted, Reducer(backend="jwst").fit_ramp, ramp, error=ImportError)
+
+
+def test_drift_is_measured_after_the_dark():
+    # a dark that rises by 3 DN a group, in the reference columns as elsewhere, and a drift of the read-out
+    rng = np.random.default_rng(1)
+    reference = np.zeros((8, 24), bool)
+    reference[:, :4] = reference[:, -4:] = True
+    dark = np.broadcast_to(3.0 * np.arange(6)[:, None, None], (1, 6, 8, 24))
+    wander = rng.normal(0, 5, (2, 6))
+    data = (1000 + dark + wander[:, :, None, None]).astype(np.float32)
+    expected = wander - wander.mean()
+    np.testing.assert_allclose(reference_drift(data, reference, [dark]), expected, atol=1e-3)
+    channels = reference_channels(data, reference, offsets=[dark])
+    change = np.broadcast_to((wander - wander[:, :1])[:, :, None, None], channels.shape)
+    np.testing.assert_allclose(channels, change, atol=1e-3)
+
+
+def test_reference_columns_that_are_not_finite_are_named_with_their_file():
+    exposure = exposure_of(n_groups=6, subarray="SUB64")
+    ramp = Detector.miri_imager().expose(sky_of(exposure, 5.0), exposure, seed=1)
+    data = ramp.data.astype(np.float32)
+    data[0, 2, 5, :4] = np.nan
+    meta = {**ramp.meta, "filename": "a_ramp.fits"}
+    bad = Ramp(data, exposure, pixel_dq=ramp.pixel_dq, effects=ramp.effects, meta=meta)
+    with pytest.raises(DataError, match=r"a_ramp\.fits has values .* reference columns of SCI"):
+        Reducer().fit_ramp(bad)
+
+
+def test_an_exposure_twice_is_refused():
+    exposure = exposure_of(n_groups=6, subarray="SUB64")
+    ramps = [
+        Detector.miri_imager().expose(sky_of(exposure, 5.0), exposure, seed=seed) for seed in (1, 2)
+    ]
+    refuses("exposure 3, the same as exposure 1", Reducer().run, [*ramps, ramps[0]])
+    rates = [Reducer().fit_ramp(ramp) for ramp in ramps]
+    refuses("exposure 2, the same as exposure 1", Reducer().run, [rates[1]] * 2)
+    # of one pointing, with other noise
+    assert len(Reducer().run(rates).images) == 2

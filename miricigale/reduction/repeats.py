@@ -1,0 +1,90 @@
+"""Exposures that are given twice: by their data, or by their keywords at two stages."""
+
+import hashlib
+
+import numpy as np
+
+from miricigale.instrument import joined_header
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.files import open_fits
+
+#: Keywords that together name an exposure of JWST.
+_NAMES = (
+    "PROGRAM", "OBSERVTN", "VISIT", "VISITGRP", "SEQ_ID", "ACT_ID", "EXPOSURE", "EXSEGNUM", "EXPSTART", "DETECTOR",
+    "FILTER", "PATT_NUM",
+)  # fmt: skip
+
+
+class ExposureRecord:
+    """
+    Exposures that were seen so far.
+
+    Two are the same if their data are, bit for bit, or if their keywords are and their stages (ramp, slopes,
+    brightness) differ: one is made of the other. At one stage keywords alone do not tell, for simulations with
+    other seeds share them. Data of one single value, which have no noise, are never the same.
+    """
+
+    def __init__(self):
+        self._data = {}
+        self._keywords = {}
+
+    def add(self, name, data, header, stage):
+        """
+        Remember an exposure.
+
+        Parameters
+        ----------
+        name : str
+            What it is called in messages.
+        data : `~numpy.ndarray`
+            Its counts or brightness.
+        header : mapping
+            Its keywords.
+        stage : str
+            What tells stages from each other.
+
+        Returns
+        -------
+        same : str or None
+            The name of the first one that it repeats.
+        """
+        data = np.ascontiguousarray(data)
+        same = None
+        first = data.flat[0] if data.size else 0
+        if not np.all(data == first):
+            same = self._data.setdefault(hashlib.sha256(data).hexdigest(), name)
+        words = tuple(str(header.get(key)) for key in _NAMES)
+        if header.get("EXPSTART") is not None and header.get("PROGRAM") is not None:
+            other, before = self._keywords.setdefault(words, (name, stage))
+            if before != stage and same in (None, name):
+                same = other
+        return None if same == name else same
+
+    def add_file(self, path):
+        """As `add`, of a FITS file with an image or ramp in SCI; None for what is no such file."""
+        try:
+            with open_fits(path, wanted="an exposure") as hdus:
+                science = hdus["SCI"] if "SCI" in hdus else hdus[0]
+                if science.data is None:
+                    return None
+                header = joined_header(hdus)
+                stage = f"{science.data.ndim} {header.get('BUNIT')}"
+                return self.add(str(path), science.data, header, stage)
+        except (OSError, KeyError, ValueError):
+            # what is wrong is said when the file is reduced
+            return None
+
+    def check(self, name, exposure):
+        """Refuse an exposure that repeats another one."""
+        data = getattr(exposure, "data", None)
+        if data is None or np.ndim(data) < 2:
+            return
+        meta = getattr(exposure, "meta", None) or {}
+        kept = meta.get("keywords", {})
+        header = {key: card[0] if isinstance(card, list) else card for key, card in kept.items()}
+        if getattr(exposure, "observed", False):
+            header = exposure.header
+        stage = f"{np.ndim(data)} {getattr(exposure, 'unit', None)}"
+        same = self.add(name, np.asarray(data), header, stage)
+        if same is not None:
+            raise argument_error("ramps", "exposures that differ", f"{name}, the same as {same}")
