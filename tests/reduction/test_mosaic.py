@@ -293,3 +293,16 @@ def test_a_dead_exposure_has_no_exposure_time():
     meta = drizzle_images(images, wcs).image.meta
     assert meta["exposure_time"] == 200.0
     assert meta["n_exposures"] == 2
+
+
+def test_pixels_with_an_error_of_zero_have_no_weight():
+    # a rate of jwst has them where one good group was left
+    wcs = north_up_wcs(SkyCoord(53, -27, unit="deg"), 0.11 * u.arcsec, (60, 60))
+    rng = np.random.default_rng(3)
+    error = np.ones((60, 60))
+    error[10, 12] = 0.0
+    data = rng.normal(5, 1, (60, 60))
+    data[10, 12] = 1e4
+    mosaic = drizzle_images([make(data, wcs, error=error, filter="miri.f770w")], wcs)
+    assert mosaic.weight[10, 12] < 1e-6 * np.median(mosaic.weight)
+    assert np.count_nonzero(mosaic.weight > 1e-6 * np.median(mosaic.weight)) == 60 * 60 - 1
