@@ -120,6 +120,6 @@ def hst_psf(
         "frame": "sky",
         "filter": name,
     }
-    meta = {"instrument": "WFC3/IR", "blur": sigma, "telescope_angle": turn}
+    meta = {"instrument": "WFC3/IR", "blur": sigma}
     effects = "pixel", "ipc", "jitter", "drizzle"
     return make_psf(data, includes=effects, total_known=True, meta=meta, **form)

@@ -82,8 +82,8 @@ def rotate_psf(psf, angle=None, *, grid_angle=0.0 * u.deg):
     >>> import astropy.units as u
     >>> from miricigale.psf import miri_psf, rotate_psf
     >>> psf = rotate_psf(miri_psf("F1500W", fov=6 * u.arcsec), 35 * u.deg)
-    >>> psf.frame, psf.meta["telescope_angle"]
-    ('sky', 35.0)
+    >>> psf.frame, psf.angle
+    ('sky', <Quantity 0. deg>)
     """
     psf = instrument_psf(psf)
     grid = _degrees(grid_angle, "grid_angle")
@@ -96,8 +96,7 @@ def rotate_psf(psf, angle=None, *, grid_angle=0.0 * u.deg):
         x = (np.arange(nx) - psf.origin[0]) * psf.cell
         y = ((np.arange(ny) - psf.origin[1]) * psf.cell)[:, None]
         data = sampled(psf, x, y, turn)
-    meta = {"telescope_angle": turn + grid}
-    return psf.replaced(data, frame="sky", angle=grid * u.deg, meta=meta)
+    return psf.replaced(data, frame="sky", angle=grid * u.deg)
 
 
 def average_psf(psfs):
@@ -292,7 +291,6 @@ def psf_mosaic(
         frame="sky",
         angle=grid * u.deg,
         includes=includes,
-        meta={"telescope_angle": turns[0] + grid},
     )
 
 

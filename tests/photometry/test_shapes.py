@@ -307,6 +307,20 @@ def test_wings_of_a_bulge_and_a_disk_are_what_is_seen():
     assert_allclose(growth, 1.0, rtol=0.03)
 
 
+@pytest.mark.parametrize("r_eff", [4.0, 6.0])
+def test_light_beyond_a_template_is_part_of_the_total(r_eff):
+    """A tenth of a de Vaucouleurs profile is beyond six half-light radii, where templates end."""
+    shape, total = (161, 161), 1.0
+    truth = galaxy(shape, 80, 80, r_eff=r_eff, n=4.0, q=0.8, flux=total)
+    labels = (truth > 5e-4).astype(int)
+    (cutout,) = cutouts_of(truth, 2e-5, labels, [(80, 80)], select=False)
+    assert cutout.kind == "cutout"
+    assert sum(layer.data.sum() for layer in cutout.layers) < 0.97
+    # what the template has to be multiplied with to be the galaxy's bright part
+    template, bright = seen(cutout, shape), labels > 0
+    assert truth[bright].sum() / template[bright].sum() == pytest.approx(total, rel=0.02)
+
+
 def test_neighbors_do_not_add_to_each_others_wings():
     shape, sigma = (121, 161), 1e-4
     places, light = np.array([[62.0, 60.0], [98.0, 60.0]]), np.array([1.0, 3.0])

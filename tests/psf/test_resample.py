@@ -52,7 +52,6 @@ def test_feature_lands_at_its_place_on_the_sky(pa, x, y):
     assert abs(i - 20) * 0.05 < 0.15
     assert abs(j - 20) * 0.05 < 0.15
     assert psf.frame == "sky"
-    assert psf.meta["telescope_angle"] == pa
 
 
 @pytest.mark.parametrize("quarter", [1, 2, 3])

@@ -2,7 +2,9 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
+from astropy.stats import SigmaClip
 from numpy.testing import assert_allclose, assert_array_equal
+from photutils.background import SExtractorBackground
 from scipy.ndimage import gaussian_filter
 
 from helpers.cases import cases_of
@@ -17,6 +19,7 @@ from miricigale.reduction import (
     remove_background,
 )
 from miricigale.reduction.images import plain_mask
+from miricigale.reduction.sky_mesh import sky_boxes
 from miricigale.utils import sep_tools
 from miricigale.utils.exceptions import MiricigaleWarning
 
@@ -52,6 +55,39 @@ def test_recovers_a_gradient(noise, gradient):
     assert np.abs(residual).max() < 0.2
     assert np.median(background.rms) == pytest.approx(1, rel=0.02)
     assert background.source_mask.mean() < 0.01
+
+
+@pytest.mark.parametrize(("share", "n_skewed"), [(0.0, 0), (0.1, 0), (0.3, 2), (0.35, 3)])
+def test_mode_of_a_box_is_that_of_photutils(share, n_skewed):
+    """Boxes of noise, a share of whose pixels holds light of sources."""
+    rng = np.random.default_rng(6)
+    values = rng.normal(size=(64, 96)) + 7.0
+    values += rng.uniform(2.0, 6.0, values.shape) * (rng.random(values.shape) < share)
+    boxes = sky_boxes(values, np.zeros(values.shape, bool), 32, mode=True)
+    median = sky_boxes(values, np.zeros(values.shape, bool), 32)
+    clip = SigmaClip(3.0, maxiters=None, cenfunc="median", stdfunc="std")
+    skewed = 0
+    for i, j in np.ndindex(2, 3):
+        box = values[32 * i : 32 * i + 32, 32 * j : 32 * j + 32]
+        kept = clip(box, masked=False)
+        mean, middle = kept.mean(), np.median(kept)
+        is_skewed = abs(mean - middle) > 0.3 * kept.std()
+        wanted = middle if is_skewed else 2.5 * middle - 1.5 * mean
+        assert boxes.level[i, j] == pytest.approx(wanted, abs=1e-12)
+        assert boxes.level[i, j] == pytest.approx(
+            SExtractorBackground(sigma_clip=clip)(box), abs=1e-12
+        )
+        assert median.level[i, j] == pytest.approx(middle, abs=1e-12)
+        assert boxes.count[i, j] == kept.size
+        skewed += is_skewed
+    assert skewed == n_skewed
+
+
+def test_clipping_leaves_the_width_of_a_gaussian():
+    values = np.random.default_rng(9).normal(4.0, 2.0, (640, 640))
+    boxes = sky_boxes(values, np.zeros(values.shape, bool), 640)
+    assert boxes.spread.item() == pytest.approx(2.0, rel=5e-3)
+    assert boxes.error.item() == pytest.approx(2.0 * np.sqrt(np.pi / 2) / 640, rel=0.01)
 
 
 def test_the_mesh_alone_is_off_where_a_box_is_seen_in_part():

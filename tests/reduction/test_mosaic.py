@@ -143,6 +143,26 @@ def test_noise_correction_is_that_of_large_boxes():
     assert noise_correction(1.0, 0.5) == pytest.approx(2.4)
 
 
+def test_noise_correction_is_that_of_the_overlap_of_drops():
+    """Noise of the sum of all output pixels over theirs in quadrature, for drops at all places of a grid."""
+    step = 0.01
+    for pixfrac, ratio in ((0.5, 1.0), (0.25, 1.0), (0.8, 1.0), (1.0, 0.6), (0.9, 0.5)):
+        # overlap of a drop at each place with a pixel, along one axis
+        places = np.arange(-3, 3, step) + step / 2
+        overlap = np.minimum(places + pixfrac / 2, ratio / 2)
+        overlap -= np.maximum(places - pixfrac / 2, -ratio / 2)
+        overlap = np.clip(overlap, 0.0, None) / pixfrac
+        # the overlaps of a drop with all output pixels add up to one: the noise of the sum is the input's
+        mean = overlap.mean() * 6 / ratio
+        variance = np.mean(overlap**2) * 6 / ratio
+        assert mean == pytest.approx(1.0, abs=1e-3)
+        # one factor of the root of the variance for each axis
+        assert noise_correction(pixfrac, ratio) == pytest.approx(1 / variance, rel=2e-3)
+    # drops of half the size, and no step where the two forms meet
+    assert noise_correction(0.5, 1.0) == pytest.approx(1.2)
+    assert_allclose([noise_correction(r, 1.0) for r in (1 - 1e-9, 1.0, 1 + 1e-9)], 1.5, rtol=1e-8)
+
+
 def test_masked_pixels_and_nan_have_no_weight():
     wcs = small_wcs()
     data = np.full((150, 160), 5.0)
