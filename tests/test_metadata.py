@@ -64,8 +64,40 @@ def test_extras_are_documented():
     page = (ROOT / "docs/install.rst").read_text(encoding="utf-8")
     documented = dict(re.findall(r"^``(\w+)`` {2,}(.*)$", page, re.MULTILINE))
     assert sorted(documented) == sorted(EXTRAS)
+
+
+def test_the_extra_all_is_all_that_a_user_may_need():
+    """What it does not hold is another package's pipeline, or for those who work on the package."""
+    page = (ROOT / "docs/install.rst").read_text(encoding="utf-8")
+    documented = dict(re.findall(r"^``(\w+)`` {2,}(.*)$", page, re.MULTILINE))
+    names = list(documented)
     (everything,) = requirements(EXTRAS["all"])
-    assert set(re.findall(r"``(\w+)``", documented["all"])) == everything.extras
+    above = names[: names.index("all")]
+    assert everything.extras == set(above)
+    numbers = {8: "eight", 9: "nine", 10: "ten"}
+    assert documented["all"] == f"the {numbers[len(above)]} above"
+    others = set(EXTRAS) - everything.extras - {"all"}
+    assert others == {"jwst", "test", "galsim", "docs", "tools"}
+    assert documented["jwst"].endswith("not in ``all``")
+
+
+def test_each_extra_that_a_message_names_brings_the_package():
+    """`require` tells users which extra to install: it has to hold the package that was missing."""
+    # asdf-astropy brings asdf, jwst brings crds
+    distributions = {"nautilus": "nautilus-sampler", "asdf": "asdf-astropy", "crds": "jwst"}
+    call = re.compile(r"""require\(\s*"([\w.]+)",\s*extra="(\w+)\"""")
+    asked = set()
+    for path in (ROOT / "miricigale").rglob("*.py"):
+        asked |= set(call.findall(path.read_text(encoding="utf-8")))
+    assert {extra for _, extra in asked} >= {"dask", "gwcs", "parquet", "specutils"}
+    missing = []
+    for module, extra in sorted(asked):
+        package = module.partition(".")[0]
+        wanted = distributions.get(package, package)
+        held = {item.name for item in requirements(EXTRAS[extra])}
+        if wanted not in held:
+            missing.append((module, extra))
+    assert missing == []
 
 
 def test_citation_has_the_version_of_the_last_release():

@@ -105,11 +105,31 @@ def asdf_extension(wcs=None, shape=None, header=None):
     content = _STUB
     known = wcs is not None and all(header.get(name) is not None for name in _REFERENCE)
     if known and importlib.util.find_spec("gwcs") is not None:
-        buffer = io.BytesIO()
-        asdf = require("asdf", extra="gwcs")
-        asdf.AsdfFile({"meta": {"wcs": imager_gwcs(wcs, shape, header)}}).write_to(buffer)
-        content = buffer.getvalue()
+        content = _asdf_bytes({"meta": {"wcs": imager_gwcs(wcs, shape, header)}})
     return bytes_table(content, "ASDF_METADATA", "ASDF")
+
+
+def _extension_name(entry):
+    """By what the entries of a history are put in order."""
+    return entry.get("extension_uri") or "", entry["extension_class"]
+
+
+def _asdf_bytes(tree):
+    """
+    A tree as the bytes of an ASDF file, the same in every process.
+
+    asdf 6.0 lists the extensions that it used in the order of a set. Those that a tree names already keep their
+    place, so that it is written once more with them in order.
+    """
+    asdf = require("asdf", extra="gwcs")
+    draft, final = io.BytesIO(), io.BytesIO()
+    asdf.AsdfFile(tree).write_to(draft)
+    draft.seek(0)
+    with asdf.open(draft) as written:
+        used = written.tree["history"]["extensions"]
+        ordered = sorted(used, key=_extension_name)
+        asdf.AsdfFile({**tree, "history": {"extensions": ordered}}).write_to(final)
+    return final.getvalue()
 
 
 def _polynomials(begin, end, order):

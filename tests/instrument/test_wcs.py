@@ -1,5 +1,10 @@
 """World coordinates against closed forms, the full transformation and pysiaf."""
 
+import io
+import os
+import subprocess
+import sys
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -215,3 +220,34 @@ def test_gwcs_of_an_image_is_its_wcs(subarray):
         exact.invert(sky.ra.deg, sky.dec.deg, with_bounding_box=False), [x, y], atol=1e-3
     )
     assert exact.available_frames == ["detector", "v2v3", "v2v3vacorr", "world"]
+
+
+WRITTEN = """
+import sys
+from miricigale.instrument import Exposure
+from miricigale.instrument.asdf_extension import asdf_extension
+exposure = Exposure("miri.f770w", n_groups=5, subarray="SUB64", pointing="53 -27.8")
+hdu = asdf_extension(exposure.wcs, exposure.shape, exposure.pointing_keywords())
+sys.stdout.buffer.write(hdu.data["ASDF_METADATA"][0].tobytes())
+"""
+
+
+def test_gwcs_has_the_same_bytes_in_every_process():
+    pytest.importorskip("gwcs", reason="needs gwcs: pip install miricigale[gwcs]")
+    import asdf
+
+    # the order of sets of strings differs between these
+    texts = [
+        subprocess.run(
+            [sys.executable, "-c", WRITTEN],
+            env={**os.environ, "PYTHONHASHSEED": str(seed)},
+            stdout=subprocess.PIPE,
+            check=True,
+        ).stdout
+        for seed in (1, 2, 3)
+    ]
+    assert texts[0] == texts[1] == texts[2]
+    with asdf.open(io.BytesIO(texts[0])) as file:
+        used = [entry["extension_uri"] for entry in file["history"]["extensions"]]
+        assert len(used) == len(set(used)) >= 4
+        assert file["meta"]["wcs"].available_frames[-1] == "world"

@@ -18,6 +18,9 @@ from miricigale.workflow.engine.runner import StudyRunner
 from miricigale.workflow.engine.stage import Context, Stage
 from workflow import toy_study
 
+#: Seconds after which a test gives up, far more than any machine needs: no statement on how fast anything is.
+HANGS = 600
+
 
 def contents(folder):
     """Bytes of all products by name."""
@@ -39,7 +42,7 @@ def start(folder, *words, **options):
 
 def ended(process, status=0):
     """What a process says that ends with a status."""
-    _, message = process.communicate(timeout=120)
+    _, message = process.communicate(timeout=HANGS)
     assert process.returncode == status, message
     return message
 
@@ -49,12 +52,12 @@ def killed(folder, name, *texts):
     process = start(folder)
     wait_for(folder / name, process, *texts)
     process.kill()
-    process.communicate(timeout=60)
+    process.communicate(timeout=HANGS)
 
 
 def wait_for(path, process, *texts):
     """Wait until a file stands (and has some texts), or the process has ended."""
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + HANGS
     while process.poll() is None and time.monotonic() < deadline:
         if path.exists() and all(text in path.read_text() for text in texts):
             return
@@ -157,17 +160,16 @@ def test_no_process_outlives_the_run(tmp_path, how):
     process = start(tmp_path / "run", start_new_session=True)
     wait_for(tmp_path / "run" / "a" / "0.txt", process)
     process.send_signal(how)
-    begin = time.monotonic()
-    # ends when every process that holds its pipes has ended
-    _, message = process.communicate(timeout=60)
-    assert time.monotonic() - begin < 30
+    # ends when every process that holds its pipes has ended; the limit is for a machine that hangs
+    _, message = process.communicate(timeout=HANGS)
     assert process.returncode in (-how, 1, 130)
     # what Python says of a parent that had no time to tidy up is not ours
     assert how == signal.SIGKILL or "leaked" not in message
-    deadline = time.monotonic() + 10
-    while group_lives(process.pid) and time.monotonic() < deadline:
+    # the system takes them off its list a moment later
+    deadline = time.monotonic() + HANGS
+    while group_lives(process.pid):
+        assert time.monotonic() < deadline, "a process of the run goes on"
         time.sleep(0.05)
-    assert not group_lives(process.pid)
 
 
 def toy(folder):

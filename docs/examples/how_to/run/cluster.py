@@ -13,9 +13,12 @@ use them. The results do not depend on the number of workers.
 # .. code-block:: console
 #
 #    $ miricigale run goodss --threads 4
-#    $ dask scheduler
-#    $ dask worker tcp://host:8786 --nthreads 1
-#    $ miricigale run goodss -o /shared/study --scheduler tcp://host:8786
+#    $ dask scheduler --host 192.168.1.10 --dashboard-address 127.0.0.1:8787
+#    $ dask worker tcp://192.168.1.10:8786 --nthreads 1
+#    $ miricigale run goodss -o /shared/study --scheduler tcp://192.168.1.10:8786
+#
+# A plain ``dask scheduler`` listens on all network interfaces and runs what anyone sends who reaches it:
+# ``--host`` binds it to the address of one network (``127.0.0.1`` for workers on the same machine).
 #
 # In Python you bring an executor. Fits run well in threads:
 
