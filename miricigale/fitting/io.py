@@ -166,6 +166,13 @@ class FitFolder(RecordFolder):
     def parse(self, values):
         """Facts and records, of which the facts are complete; none before the fit is known."""
         facts, parts = super().parse(values)
+        if facts.get("format", FORMAT) != FORMAT:
+            what = (
+                f"holds results of fit_file in the layout {facts['format']!r} of another version of the package, "
+                f"and this one reads {FORMAT!r}: fit again in another folder, or read it with the version that "
+                "wrote it"
+            )
+            raise data_error(self.folder, what)
         if facts or parts:
             facts["job"]["catalogue"]["rows"], facts["job"]["chunk_rows"]
         return facts, parts

@@ -7,6 +7,7 @@ from miricigale.depth.fitted import EXCESS
 from miricigale.instrument import CEERS_FILTERS, imager_filters, readout_patterns
 from miricigale.workflow.analysis_sections import FitBasics
 from miricigale.workflow.background import check_levels
+from miricigale.workflow.earlier import EarlierKey
 from miricigale.workflow.options import Configuration, Section, option, read_text
 from miricigale.workflow.sections import CatalogSection, RunBasics, SedSection
 
@@ -257,6 +258,38 @@ class PlanConfig(Configuration):
     heading: ClassVar = (
         "# miricigale plan configuration; 'miricigale plan --config FILE' takes it back"
     )
+    earlier: ClassVar = {
+        "sample.source": EarlierKey("catalog.source"),
+        "sample.mag_limit": EarlierKey("catalog.mag_limit"),
+        "sample.mag_column": EarlierKey("catalog.mag_column"),
+        "agn.field": EarlierKey(
+            without_effect=(False,),
+            instead="AGN are those of a real field without a mix: remove field, frac_agn and shares",
+        ),
+        "agn.select": EarlierKey(
+            without_effect=("probability",),
+            instead="sources are selected by the probability of a fracAGN above limit; remove the line",
+        ),
+        "noise.kind": EarlierKey(
+            without_effect=("fitted",),
+            instead="errors are those of a fit on the mosaic; remove the line",
+        ),
+        "noise.run": EarlierKey(
+            without_effect=("",),
+            instead="errors are those of a fit on the mosaic; remove the line",
+        ),
+        "images.enabled": EarlierKey(
+            without_effect=(False,),
+            instead="exposures are imaged by 'miricigale run'; remove the section [images]",
+        ),
+        "images.kind": EarlierKey(),
+        "images.ra": EarlierKey(),
+        "images.dec": EarlierKey(),
+        "images.roll": EarlierKey(),
+        # a plan's sets of bands are those of [exposures], and it never made other fits
+        "fit.sets": EarlierKey(),
+        "fit.experiments": EarlierKey(),
+    }
 
     plan: PlanSection = dataclasses.field(default_factory=PlanSection)
     catalog: CatalogSection = dataclasses.field(default_factory=CatalogSection)

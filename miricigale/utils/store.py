@@ -98,10 +98,22 @@ def open_parts(path, layouts, *, wanted, memmap=False):
         (a `KeyError`, `IndexError`, `TypeError` or `ValueError`).
     """
     with open_fits(path, wanted=wanted, memmap=memmap) as hdus:
-        if hdus[0].header.get("FORMAT") not in layouts:
-            raise data_error(path, f"holds no {wanted} (no FORMAT = {layouts[0]!r} in its header)")
+        layout = hdus[0].header.get("FORMAT")
+        if layout not in layouts:
+            raise data_error(path, _foreign(str(layout), layouts[0], wanted))
         with file_errors(path, f"is not a complete file of {wanted}", VerifyError):
             yield Parts(hdus)
+
+
+def _foreign(layout, own, wanted):
+    """What is said of a file of another layout: of another version of the package, or something else."""
+    stem, _, number = layout.rpartition("-")
+    if number.isdecimal() and stem == own.rpartition("-")[0]:
+        return (
+            f"holds {wanted} in the layout {layout!r} of another version of the package, and this one reads "
+            f"{own!r}: make the file again with this version, or read it with the one that wrote it"
+        )
+    return f"holds no {wanted} (no FORMAT = {own!r} in its header)"
 
 
 class Parts:

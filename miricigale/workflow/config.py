@@ -17,6 +17,7 @@ from miricigale.workflow.analysis_sections import (
     VariantSection,
 )
 from miricigale.workflow.background import check_levels
+from miricigale.workflow.earlier import EarlierKey
 from miricigale.workflow.options import Configuration, read_text
 from miricigale.workflow.sections import (
     CatalogSection,
@@ -57,6 +58,13 @@ class StudyConfig(Configuration):
     """
 
     heading: ClassVar = "# miricigale run configuration; 'miricigale run FILE' takes it back"
+    earlier: ClassVar = {
+        "photometry.min_area": EarlierKey("photometry.n_pixels"),
+        "reduction.residual_cosmic_rays": EarlierKey(
+            without_effect=(False,),
+            instead="hits that ramps kept are rejected between the dithers; remove the line",
+        ),
+    }
 
     run: RunSection = dataclasses.field(default_factory=RunSection)
     catalog: CatalogSection = dataclasses.field(default_factory=CatalogSection)

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from miricigale.utils.exceptions import ConfigError, config_error
 from miricigale.utils.outputs import FILE_NAME, is_file_name
+from miricigale.workflow.earlier import keys_of_today
 
 #: What the name of a folder must be, for messages.
 _FOLDER_NAME = f"must be the name of a folder in the current one: {FILE_NAME}"
@@ -129,9 +130,12 @@ class Configuration:
     ----------
     heading : str
         First line of its file, a comment.
+    earlier : dict of str to `~miricigale.workflow.earlier.EarlierKey`
+        Keys ``section.key`` of earlier versions, and what became of them.
     """
 
     heading: typing.ClassVar[str]
+    earlier: typing.ClassVar[dict] = {}
 
     def check(self, good, name, wanted, got=None):
         """Refuse a key ``section.key`` that does not agree with others; its value came, if not ``got``."""
@@ -169,8 +173,14 @@ class Configuration:
         `~miricigale.utils.exceptions.ConfigError`
             For an unknown section or key (the message lists the known ones), a wrong
             type, or a value outside its limits.
+
+        Warns
+        -----
+        `~miricigale.utils.exceptions.MiricigaleWarning`
+            Of keys that earlier versions called otherwise, which are read, and of those that are gone.
         """
         base = base or cls()
+        values = keys_of_today(values, cls.earlier)
         known = [field.name for field in dataclasses.fields(base)]
         if unknown := sorted(set(values).difference(known)):
             raise config_error("unknown section", f"{unknown}; known: {sorted(known)}")

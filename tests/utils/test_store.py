@@ -68,7 +68,9 @@ def test_incomplete_and_foreign_files_are_named(tmp_path):
 
     match = r"a\.fits is not a complete file of fit results"
     refuses(match, read, "test-1", "b", error=DataError)
-    refuses(r"a\.fits holds no fit results", read, "test-2", "a", error=DataError)
+    refuses(r"a\.fits holds no fit results", read, "other-1", "a", error=DataError)
+    match = r"layout 'test-1' of another version of the package, and this one reads 'test-2'"
+    refuses(match, read, "test-2", "a", error=DataError)
 
 
 class Number:

@@ -9,10 +9,11 @@ import itertools
 import json
 import logging
 import os
+import warnings
 from pathlib import Path
 
 from miricigale.refdata.lookup import fingerprint
-from miricigale.utils.exceptions import ConfigError, OtherResultsError
+from miricigale.utils.exceptions import ConfigError, MiricigaleWarning, OtherResultsError
 from miricigale.utils.parallel import available_memory, thread_count
 from miricigale.utils.progress import print_line
 from miricigale.workflow.engine.display import Display
@@ -228,6 +229,7 @@ class StudyRunner:
             states = self.forecast(store)
             self._refuse_replacing(store, states)
             self._warn_of_faults(store, states)
+            self._warn_of_new_keys(store)
             n_left = sum(states[key] != "current" for key in self.keys)
             if n_left:
                 needed = max(0, self._products_bytes() - store.standing_bytes())
@@ -260,9 +262,23 @@ class StudyRunner:
     def _values_of(self, path):
         """The same of a file; none where it is missing or cannot be read."""
         try:
-            return _values(self.config.from_texts([(str(path), read_text(path))]))
+            return self._read_values(path)
         except (ConfigError, OSError, ValueError):
             return {}
+
+    def _read_values(self, path):
+        """Plain values of a configuration; keys of earlier versions are warned of where users read it."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", MiricigaleWarning)
+            return _values(self.config.from_texts([(str(path), read_text(path))]))
+
+    def _unreadable(self, path):
+        """Why this version does not take a configuration, in words; empty if it does."""
+        try:
+            self._read_values(path)
+        except (ConfigError, OSError, ValueError) as err:
+            return str(err)
+        return ""
 
     def _edited_config(self, store):
         """Path of a ``config.toml`` that says neither what this run does nor what the last one did, or None."""
@@ -275,10 +291,12 @@ class StudyRunner:
             return
         reasons = []
         if edited := self._edited_config(store):
+            fault = self._unreadable(edited)
+            advice = f"change it where it says {fault}, and run" if fault else "run"
             reasons.append(
                 f"{edited} was edited since the run that made this folder (or that run was of an "
                 f"earlier version), and this run has another configuration, which would replace it: "
-                f"run {edited} itself to use it"
+                f"{advice} {edited} itself to use it"
             )
         again = [key for key, state in states.items() if state in ("changed", "surplus")]
         if again:
@@ -304,6 +322,24 @@ class StudyRunner:
                 self.folder,
                 ", ".join(some),
                 more,
+            )
+
+    def _warn_of_new_keys(self, store):
+        """Name keys that the version which made the folder did not have, and their values in this run."""
+        old = store.config
+        if not old:
+            return
+        added = [
+            f"[{section}] {key} = {_short(value)}"
+            for section, values in _values(self.config).items()
+            for key, value in values.items()
+            if key not in old.get(section, {})
+        ]
+        if added:
+            log.warning(
+                "%s was made by a version without %s: what is made now has these values",
+                self.folder,
+                ", ".join(added),
             )
 
     def _differences(self, store):
