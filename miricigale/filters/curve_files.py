@@ -7,7 +7,7 @@ from pathlib import Path
 import astropy.units as u
 import numpy as np
 
-from miricigale.utils.exceptions import data_error
+from miricigale.utils.exceptions import data_error, file_errors
 from miricigale.utils.files import packed_open, unpacked_size
 from miricigale.utils.meta import full_meta
 from miricigale.utils.missing import floats
@@ -135,7 +135,9 @@ def _of_table(path, unit):
     if len(columns) < 2 or (unit is None and has is None):
         what = "has not two columns, the first with a unit of wavelength"
         raise data_error(path, f"{what}: give 'unit' if it has none")
-    wave = floats(columns[0]) * u.Unit(unit or has)
+    with file_errors(path, "is no filter: its first two columns are not numbers"):
+        first, throughput = map(floats, columns)
+    wave = first * u.Unit(unit or has)
     meta = full_meta(table.meta)
     if path.suffix.lower() in (".xml", ".vot", ".votable"):
         meta = _parameters(path) | meta
@@ -149,7 +151,7 @@ def _of_table(path, unit):
             options[key] = float(value) * reference
     kept = ("citations", "flux_convention", "n_negative")
     options["meta"] = {key: meta[key] for key in kept if key in meta}
-    return wave, floats(columns[1]), energy, str(name), options
+    return wave, throughput, energy, str(name), options
 
 
 def _parameters(path):

@@ -152,3 +152,30 @@ def test_a_set_of_files_may_be_given_their_unit(tmp_path):
     filters = FilterSet(paths, unit="um")
     assert filters.names == ("a", "b")
     assert_allclose(filters.pivots.value, PIVOT, rtol=1e-6)
+
+
+def test_words_in_a_table_of_numbers_are_refused_with_the_file(tmp_path):
+    """A title above the names of the columns, as in the tables of optics of NIRCam."""
+    path = tmp_path / "optics.csv"
+    path.write_text('"Transmission",\nWavelength,Collimator\n0.6,0.9\n0.7,0.91\n')
+    text = r"optics\.csv is no filter: its first two columns are not numbers: .*Wavelength"
+    refuses(text, Filter.read, path, unit="um", error=DataError)
+
+
+@pytest.mark.parametrize("mark", ["# ", "#"])
+@pytest.mark.parametrize(("kind", "power"), [("photon", 0), ("energy", -1)])
+def test_files_of_cigale_say_what_they_count(tmp_path, mark, kind, power):
+    """Name, kind and description in comments, Angstrom, and noise of -1e-5 at the edges."""
+    wave = np.linspace(20000.0, 24000.0, 41)
+    value = np.exp(-0.5 * ((wave - 22000.0) / 600.0) ** 2)
+    value[:3] = -1e-5
+    rows = [f"{a:.1f} {b:.6e}" for a, b in zip(wave, value, strict=True)]
+    path = tmp_path / "k.dat"
+    path.write_text("\n".join([f"{mark}KS", f"{mark}{kind} ", f"{mark}Ks band", *rows]))
+    band = Filter.read(path)
+    assert band.name == "KS"
+    assert band.meta["n_negative"] == 3
+    # response to photons, from which the pivot follows
+    response = np.clip(value, 0.0, None) * wave**power
+    weighed = np.trapezoid(response * wave, wave) / np.trapezoid(response / wave, wave)
+    assert band.pivot.to_value(u.AA) == pytest.approx(np.sqrt(weighed), rel=1e-5)
