@@ -4,10 +4,10 @@ Signs, factors and comparisons of the science code changed one at a time: does a
     python tools/mutate.py [--n 300] [--seed 1] [--only psf ...] [--log mutants.jsonl] [--again] [--list]
 
 A seeded sample of changes (a sign, product and quotient exchanged, a number times 1.02, an edge in or out) of
-the modules of ``TARGETS``, or those of it in some modules, is made in a copy of the package, and the tests of
-the module are run until one fails: those first that noticed other changes of the file. A run that takes too
-long is ended and counts as noticed. Printed are the changes that no test noticed. Those that change nothing (an
-equivalent formula, a tolerance of a solver, the size of a block) have to be judged by a reader.
+all modules that make a number (`targets`), or those of it in some modules, is made in a copy of the package, and
+the tests of the module are run until one fails: those first that noticed other changes of the file. A run that
+takes too long is ended and counts as noticed. Printed are the changes that no test noticed. Those that change
+nothing (an equivalent formula, a tolerance of a solver, the size of a block) have to be judged by a reader.
 
 Results are added to a file, one line each, and a run goes on where the last one ended; with ``--again``
 those changes are tried again that no test had noticed, with the tests of today. At last all tests that
@@ -18,6 +18,7 @@ import argparse
 import ast
 import collections
 import contextlib
+import functools
 import hashlib
 import importlib
 import json
@@ -48,7 +49,15 @@ def pytest_collection_modifyitems(items):
 """
 #: Tests that take minutes, with the kernels that they compile: their changes come last.
 SLOW = ("reduction/test_drawn", "detector/test_detector", "fitting/test_grid_engine")
-#: Modules of the science, and the files of tests or their folders that hold them.
+#: Modules whose numbers are places on a page or a screen, or limits of time: whatever else is there makes numbers
+#: that users see, and is changed.
+NO_SCIENCE = (
+    "__main__.py _version.py cli/*.py pages/*.py plotting/*.py workflow/page/*.py */page.py */browser.py "
+    "utils/compilation.py utils/exceptions.py utils/interactive.py utils/lock.py utils/outputs.py "
+    "utils/progress.py workflow/engine/display.py workflow/warmup.py"
+)
+#: Modules whose tests are chosen by hand, and the files of tests or their folders that hold them. Those of all
+#: others are derived (`tests_of`).
 TARGETS = {
     "reduction/_core/drawing.py": "reduction/test_drawn",
     "reduction/_core/[lpr]*.py": "reduction/test_rampfit",
@@ -167,14 +176,57 @@ class Sites(ast.NodeVisitor):
             self.visit(child)
 
 
+@functools.cache
+def _test_files():
+    """Files of tests, and their text."""
+    return {
+        file: file.read_text(encoding="utf-8")
+        for file in sorted((ROOT / "tests").rglob("test_*.py"))
+    }
+
+
+def tests_of(path):
+    """
+    Files of tests of a module that has none by hand, those that are most about it first.
+
+    They are those of its subpackage that have its name or import it; if there are none, the files of the
+    whole tree that import it, and at last the folder of the subpackage.
+    """
+    inside = path.relative_to(ROOT / "miricigale").with_suffix("")
+    folder = ROOT / "tests" / inside.parts[0]
+    module = ".".join(["miricigale", *inside.parts])
+    imported = re.compile(rf"(from|import) {re.escape(module)}\b")
+    own, others = [], []
+    for file, text in _test_files().items():
+        if file.stem == f"test_{inside.name}" and folder in file.parents:
+            own.insert(0, file)
+        elif imported.search(text):
+            (own if folder in file.parents else others).append(file)
+    files = own or others
+    names = [str(file.relative_to(ROOT / "tests").with_suffix("")) for file in files]
+    return " ".join(names) or inside.parts[0]
+
+
+def targets():
+    """Every module that makes a number, and its tests: dict of path to text."""
+    package, out = ROOT / "miricigale", {}
+    skipped = {path for pattern in NO_SCIENCE.split() for path in package.glob(pattern)}
+    for pattern, tests in TARGETS.items():
+        for path in sorted(package.glob(pattern)):
+            out.setdefault(path, tests)
+    for path in sorted({*package.rglob("*.py")} - skipped - out.keys()):
+        if Sites(path.read_text(encoding="utf-8")).found:
+            out[path] = tests_of(path)
+    return out
+
+
 def all_sites():
     """Every change: module, its tests, and the place."""
-    out, seen = [], set()
-    for pattern, tests in TARGETS.items():
-        for path in sorted({*(ROOT / "miricigale").glob(pattern)} - seen):
-            seen.add(path)
-            out += [(path, tests, site) for site in Sites(path.read_text()).found]
-    return out
+    return [
+        (path, tests, site)
+        for path, tests in targets().items()
+        for site in Sites(path.read_text(encoding="utf-8")).found
+    ]
 
 
 def drawn(change, seed):
