@@ -2,6 +2,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from scipy.stats import norm
 from helpers.errors import refuses
 from helpers.grids import draw_photometry, make_grid, node_fitter
 from miricigale.fitting import BayesFitter, FitResults, GridSettings
+from miricigale.fitting._core.workspace import make_limits
 from miricigale.fitting.mixture import BandMixture
 
 BANDS = ("acs.f606w", "acs.f814w", "wfc3.f125w", "wfc3.f160w", "miri.f770w", "miri.f1500w")
@@ -119,6 +121,25 @@ def test_likelihood_is_a_sum_of_two_normal_distributions():
     good = np.array([0.9, 0.7]) * norm.cdf((flux - model) / sigma)
     assert_allclose(log, np.log(good + [0.1, 0.3]).sum(axis=1), atol=1e-12)
     assert_allclose(wrong, [0.1, 0.3] / (good + [0.1, 0.3]))
+
+
+def test_shares_of_wrong_limits_are_those_of_the_mixture():
+    """A flux and a limit whose errors are far from 1 uJy, over three models of given weights."""
+    part = {"acs.f606w": 0.3, "miri.f770w": 0.1}
+    bands = BandMixture.of_bands(part, tuple(part))
+    sigma = np.array([0.2, 0.05])
+    flux, limit = 5.0, 0.4
+    model = np.array([[4.5, 0.3], [5.5, 0.45], [6.0, 0.5]])
+    weight = np.array([0.5, 0.3, 0.2])
+    wide = bands.broad(np.array([[flux, 0.0]]), np.array([[sigma[0], np.inf]]))[0]
+    limits = make_limits(np.array([0.0, limit]), np.array([0.0, 1 / sigma[1]]), bands.part)
+    target = SimpleNamespace(flux=np.array([flux, 0.0]), weight=np.array([[sigma[0] ** -2, 0.0]]))
+    found = bands.shares(model, target, wide, limits, 0, weight)
+    good = 0.7 * norm.pdf(flux, model[:, 0], sigma[0])
+    bad = 0.3 * norm.pdf(flux, model[:, 0], wide[0])
+    below = 0.9 * norm.cdf((limit - model[:, 1]) / sigma[1])
+    wanted = weight @ (bad / (good + bad)), weight @ (0.1 / (below + 0.1))
+    assert_allclose(found, wanted, rtol=1e-9)
 
 
 def test_a_band_that_cannot_be_is_found_and_does_no_harm(grid):

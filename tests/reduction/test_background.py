@@ -83,6 +83,19 @@ def test_mode_of_a_box_is_that_of_photutils(share, n_skewed):
     assert skewed == n_skewed
 
 
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 200.0])
+def test_surface_through_boxes_leaves_sources_out_in_any_unit(scale):
+    """A plane, 3 % of whose boxes hold the light of a source: the same plane in every unit."""
+    y, x = np.mgrid[:320, :320]
+    plane = 5.0 + 0.01 * x - 0.02 * y
+    values = plane + np.random.default_rng(3).normal(size=plane.shape)
+    for i, j in ((64, 32), (160, 256), (288, 96)):
+        values[i : i + 32, j : j + 32] += 8.0
+    boxes = sky_boxes(scale * values, np.zeros(values.shape, bool), 32)
+    surface, _ = boxes.surface(boxes.level, values.shape)
+    assert_allclose(surface / scale, plane, atol=0.1)
+
+
 def test_clipping_leaves_the_width_of_a_gaussian():
     values = np.random.default_rng(9).normal(4.0, 2.0, (640, 640))
     boxes = sky_boxes(values, np.zeros(values.shape, bool), 640)
