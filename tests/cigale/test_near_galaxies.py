@@ -39,6 +39,26 @@ def test_masses_at_redshift_zero_are_those_of_the_distance(model):
     refuses(r"'redshift' must be above 0 \(for a near galaxy", between.fit, table, redshift=0.0)
 
 
+@pytest.mark.parametrize("distance", [None, 150.0])
+def test_mass_at_another_distance_keeps_the_flux(model, distance):
+    """A flux is mass (1 + z) / d^2: models at 0.05, the galaxy at 0.03, or at a distance of its own."""
+    table = model.fluxes({"redshift": [0.05], "age": [1.0], "ebv": [0.1], "mass": [1e9]}, BANDS)
+    table["id"] = [7]
+    for name in BANDS:
+        table[f"{name}_err"] = 0.02 * table[name]
+    axes = {"redshift": [0.05, 0.5], "age": [1.0, 3.0], "ebv": [0.1, 0.3]}
+    settings = GridSettings(interpolate=0)
+    fitter = BayesFitter(model, BANDS, axes=axes, model_error=0.0, settings=settings)
+    results = fitter.fit(table, redshift=0.05)
+    given = None if distance is None else [distance] * u.Mpc
+    scaled = at_their_distances(results, np.array([0.03]), given, model.cosmology)
+    there, here = model.cosmology.luminosity_distance([0.05, 0.03]).to_value(u.Mpc)
+    here = here if distance is None else distance
+    wanted = 1e9 * (here / there) ** 2 * 1.05 / 1.03
+    assert_allclose(scaled.best["mass"].value, wanted, rtol=1e-5)
+    assert_allclose(scaled.best["redshift"], 0.03)
+
+
 def test_a_galaxy_with_a_distance_may_approach(tmp_path):
     """M31 has -0.001, and 0.78 Mpc."""
     rows = Table(
