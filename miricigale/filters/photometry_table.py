@@ -11,21 +11,23 @@ from miricigale.filters.band_names import find_filter
 from miricigale.filters.catalog_files import catalog_messages
 from miricigale.filters.catalog_map import CatalogMap
 from miricigale.filters.library import FILTERS
-from miricigale.utils.exceptions import CatalogWarning, warn
+from miricigale.utils.exceptions import CatalogWarning, units_error, warn
 from miricigale.utils.ids import counted_ids, id_column
 from miricigale.utils.missing import floats
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import as_table, error_column
-from miricigale.utils.units import flux_unit
+from miricigale.utils.units import FNU, flux_unit
 
 # what stands before or after the band in names of fluxes, magnitudes and their errors
 _ERROR = re.compile(
-    r"(?:e|err|error|sigma|d)_(?:mag_|flux_)?(?P<a>.+)|(?P<b>.+?)(?:_flux|_mag)?_?(?:err|error|unc|_e)",
+    r"(?:e|err|error|sigma|d|(?:mag|flux|f|m)_?(?:err|error))_(?:mag_|flux_)?(?P<a>.+)"
+    r"|(?P<b>.+?)(?:_flux|_mag)?_?(?:err|error|unc|_e)",
     re.IGNORECASE,
 )
 _FLUX = re.compile(r"(?:f|flux|mag|m)_(?P<a>.+)|(?P<b>.+?)_(?:flux|mag)", re.IGNORECASE)
 _MAGNITUDE = re.compile(
-    r"(?:(?:e|err|error)_)?(?:mag|m)_|.*_mag(?:_?err)?$|(?:ab)?mag(?:nitude)?$", re.IGNORECASE
+    r"(?:(?:e|err|error|sigma|d)_)?(?:mag|m)_?(?:err|error)?_|.*_mag(?:_?err(?:or)?)?$|(?:ab)?mag(?:nitude)?$",
+    re.IGNORECASE,
 )
 # columns that are the only band asked for
 _ALONE = ("flux", "flux_density", "fnu", "f_nu", "mag", "magnitude", "abmag")
@@ -33,7 +35,7 @@ _ALONE = ("flux", "flux_density", "fnu", "f_nu", "mag", "magnitude", "abmag")
 _LIMIT = "_limit"
 
 
-def as_photometry(data, bands, argument="photometry"):
+def as_photometry(data, bands, argument="photometry", *, units=None):
     """
     Catalog with columns by the names of bands, of any table.
 
@@ -48,6 +50,9 @@ def as_photometry(data, bands, argument="photometry"):
         Our names of the bands that are meant; other columns stay as they are.
     argument : str, optional
         The argument's name, for messages.
+    units : unit-like or dict of str to unit-like, optional
+        Unit of fluxes and errors that have none, such as ``"uJy"`` or ``"ABmag"`` (errors are in magnitudes then),
+        for all or by band. Columns with a unit keep it.
 
     Returns
     -------
@@ -58,9 +63,11 @@ def as_photometry(data, bands, argument="photometry"):
     Raises
     ------
     ValueError
-        If it is no table, two columns are the same band, or several columns could be the ids.
+        If it is no table, two columns are the same band (of a flux and a magnitude the flux is taken), or several
+        columns could be the ids.
     `~astropy.units.UnitsError`
-        If errors of magnitudes are in another unit than mag or a flux density's.
+        If errors of magnitudes are in another unit than mag or a flux density's, or ``units`` has one that is
+        none of flux densities and AB magnitudes.
 
     Warns
     -----
@@ -79,8 +86,14 @@ def as_photometry(data, bands, argument="photometry"):
         data = _of_prospector(data)
     table, bands = as_table(data, argument), tuple(bands)
     names = _our_names(table.colnames, bands, argument)
-    magnitudes = [name for name in bands if _is_ab(table, names.get(name))]
-    if not magnitudes and "id" in names and all(ours == name for ours, name in names.items()):
+    stated = _stated_units(table, names, bands, units)
+    magnitudes = [name for name in bands if _is_ab(table, names.get(name)) and name not in stated]
+    if (
+        not magnitudes
+        and not stated
+        and "id" in names
+        and all(ours == name for ours, name in names.items())
+    ):
         return table
     back = {theirs: ours for ours, theirs in names.items()}
     out = QTable(table, copy=False)
@@ -89,11 +102,72 @@ def as_photometry(data, bands, argument="photometry"):
     out.meta = table.meta
     if "id" not in out.colnames:
         out["id"] = counted_ids(table, argument)
-    catalog_map = CatalogMap(units=dict.fromkeys(magnitudes, u.ABmag))
-    coded = {name: catalog_map.set_band(out, name, 1.0, argument) for name in magnitudes}
+    catalog_map = CatalogMap(units=dict.fromkeys(magnitudes, u.ABmag) | stated)
+    converted = [name for name in bands if name in magnitudes or name in stated]
+    coded = {name: catalog_map.set_band(out, name, 1.0, argument) for name in converted}
     for text in catalog_messages((), [coded]):
         warn(f"{argument}: {text}", CatalogWarning)
     return out
+
+
+def _stated_units(table, names, bands, units):
+    """Units that a caller says of fluxes and errors without one: by our names of the columns."""
+    if units is None:
+        return {}
+    by_band = units
+    if isinstance(units, Mapping):
+        by_band = {find_filter(str(name)) or str(name): unit for name, unit in units.items()}
+        known = [*bands, "flux"]
+        check_that(set(by_band) <= set(known), "units", f"a dict with keys among {known}", units)
+    else:
+        by_band = {"flux": units}
+    stated = {}
+    for band in bands:
+        asked = by_band.get(band, by_band.get("flux"))
+        if asked is None or band not in names:
+            continue
+        unit = unit_of_fluxes(asked)
+        if _is_ab(table, names[band]):
+            # magnitudes by their name or unit
+            continue
+        if getattr(table[names[band]], "unit", None) is None:
+            stated[band] = unit
+        error = error_column(band)
+        bare = error in names and getattr(table[names[error]], "unit", None) is None
+        if bare and unit != u.ABmag:
+            stated[error] = unit
+    return stated
+
+
+def unit_of_fluxes(unit, argument="units"):
+    """
+    Return the unit of flux densities, or AB magnitudes, that a caller names.
+
+    Parameters
+    ----------
+    unit : unit-like
+        Such as ``"uJy"``, ``"nanomaggies"``, ``"ABmag"``.
+    argument : str, optional
+        The argument's name, for messages.
+
+    Returns
+    -------
+    unit : `~astropy.units.UnitBase` or `~astropy.units.FunctionUnitBase`
+
+    Raises
+    ------
+    `~astropy.units.UnitsError`
+        If it is something else.
+    """
+    wanted = f"a unit of flux density, such as {FNU}, or 'ABmag'"
+    try:
+        found = flux_unit(unit) or u.Unit(unit)
+    except (TypeError, ValueError):
+        raise units_error(argument, wanted, repr(unit)) from None
+    is_flux = isinstance(found, u.UnitBase) and found.is_equivalent(FNU)
+    if not is_flux and found != u.ABmag:
+        raise units_error(argument, wanted, repr(str(unit)))
+    return found
 
 
 def _is_of_prospector(data):
@@ -128,32 +202,34 @@ def _of_prospector(data):
     return columns
 
 
-def band_columns(colnames, argument="photometry"):
+def band_columns(table, argument="photometry"):
     """
-    Columns that are fluxes and errors of bands under names other than ours.
+    Columns that are fluxes or magnitudes, and errors, of bands under names other than ours.
 
     Parameters
     ----------
-    colnames : iterable of str
-        Of a catalog.
+    table : `~astropy.table.Table`
+        A catalog, or its first rows.
     argument : str, optional
         The argument's name, for messages.
 
     Returns
     -------
     names : dict of str to str
-        Our names by theirs, of bands with an error and of the ids; magnitudes are left out.
+        Our names by theirs, of bands with an error and of the ids.
+    magnitudes : list of str
+        Those of the bands whose column holds AB magnitudes, by its unit or, without one, its name.
 
     Raises
     ------
     ValueError
         If two columns are the same band, or several could be the ids.
     """
-    fluxes = [name for name in colnames if not _MAGNITUDE.match(name)]
-    found = _our_names(fluxes, FILTERS.names(), argument)
+    found = _our_names(table.colnames, FILTERS.names(), argument)
     both = [name for name in found if error_column(name) in found]
     kept = {"id", *both, *map(error_column, both), *(f"{name}{_LIMIT}" for name in both)}
-    return {theirs: ours for ours, theirs in found.items() if ours in kept and ours != theirs}
+    names = {theirs: ours for ours, theirs in found.items() if ours in kept and ours != theirs}
+    return names, [name for name in both if _is_ab(table, found[name])]
 
 
 def our_names(colnames, argument="photometry"):
@@ -170,15 +246,19 @@ def _our_names(colnames, bands, argument):
     ids = id_column(colnames, argument)
     if ids is not None:
         found["id"] = ids
-    for theirs in colnames:
-        if theirs in found or theirs == ids:
+    others = [name for name in colnames if name not in found and name != ids]
+    logarithmic = [name for name in others if _MAGNITUDE.match(name)]
+    linear = [name for name in others if name not in logarithmic]
+    found |= _matched(linear, colnames, bands, argument)
+    magnitudes = _matched(logarithmic, colnames, bands, argument)
+    for band in bands:
+        error = error_column(band)
+        complete = band in found and error in found
+        if band not in magnitudes or complete or (band in found and error not in magnitudes):
             continue
-        ours = _band_of(theirs, bands)
-        if ours is None or (ours in colnames):
-            continue
-        wanted = f"a table with one column for {ours!r}"
-        check_that(ours not in found, argument, wanted, f"{found.get(ours)!r} and {theirs!r}")
-        found[ours] = theirs
+        found[band] = magnitudes[band]
+        if error in magnitudes:
+            found[error] = magnitudes[error]
     for theirs in colnames:
         band = theirs.endswith(_LIMIT) and _band_of(theirs.removesuffix(_LIMIT), bands)
         if band in bands and f"{band}{_LIMIT}" not in colnames:
@@ -186,6 +266,19 @@ def _our_names(colnames, bands, argument):
     alone = [name for name in colnames if name.lower() in _ALONE]
     if len(bands) == len(alone) == 1 and bands[0] not in found:
         found[bands[0]] = alone[0]
+    return found
+
+
+def _matched(names, colnames, bands, argument):
+    """Our names of columns under other names, to theirs."""
+    found = {}
+    for theirs in names:
+        ours = _band_of(theirs, bands)
+        if ours is None or (ours in colnames):
+            continue
+        wanted = f"a table with one column for {ours!r}"
+        check_that(ours not in found, argument, wanted, f"{found.get(ours)!r} and {theirs!r}")
+        found[ours] = theirs
     return found
 
 

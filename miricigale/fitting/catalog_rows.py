@@ -2,8 +2,11 @@
 
 import dataclasses
 
+import astropy.units as u
+
+from miricigale.filters import CatalogMap
 from miricigale.filters.catalog_files import CountedRows, MappedRows, as_catalog_map
-from miricigale.filters.photometry_table import band_columns
+from miricigale.filters.photometry_table import band_columns, unit_of_fluxes
 from miricigale.utils.row_files import open_rows
 
 
@@ -17,13 +20,31 @@ def open_catalog(path, chunk_rows, *, hdu=None, catalog_map=None, flux_unit=None
             known = dataclasses.replace(known, units={"flux": flux_unit, **known.units})
         rows = MappedRows(rows, known)
     else:
-        rows.rename(band_columns(rows.colnames, rows.path.name))
+        rows = _named_rows(rows, flux_unit)
     return rows if "id" in rows.colnames else CountedRows(rows)
+
+
+def _named_rows(rows, flux_unit):
+    """Rows under our names; with magnitudes by a map that makes fluxes of them."""
+    first = rows.chunk(0)
+    names, magnitudes = band_columns(first, rows.path.name)
+    unit = None if flux_unit is None else unit_of_fluxes(flux_unit, "flux_unit")
+    is_ab = unit == u.ABmag
+    if not magnitudes and not is_ab:
+        rows.rename(names)
+        return rows
+    columns = {ours: theirs for theirs, ours in names.items()}
+    units = {} if unit is None else {"flux": unit}
+    return MappedRows(rows, CatalogMap(columns, units | dict.fromkeys(magnitudes, u.ABmag)))
 
 
 def give_units(table, fluxes, unit):
     """Give flux columns that have no unit one; None gives none."""
     if unit is None:
+        return
+    unit = unit_of_fluxes(unit, "flux_unit")
+    if unit == u.ABmag:
+        # magnitudes are fluxes by now
         return
     for name in fluxes.intersection(table.colnames):
         if table[name].unit is None:

@@ -54,13 +54,13 @@ def bands_with_errors(names, argument):
     return bands
 
 
-def table_of(fitter, photometry):
+def table_of(fitter, photometry, unit=None):
     """
-    The catalog by our names, with what there is to warn of.
+    The catalog by our names, fluxes without a unit in ``unit``, with what there is to warn of.
 
     A band of ``filters`` that it lacks is a missing one of all objects.
     """
-    table = as_photometry(photometry, fitter.filters or fitter.bands)
+    table = as_photometry(photometry, fitter.filters or fitter.bands, units=unit)
     lost = [name for name in fitter.filters or () if name not in table.colnames]
     if lost and len(lost) < len(fitter.filters):
         text = f"the photometry has no {', '.join(lost)}: missing bands of all objects"

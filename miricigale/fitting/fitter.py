@@ -50,6 +50,7 @@ _OPTIONS = (
 #: Arguments of its method fit.
 _OF_FIT = (
     "photometry",
+    "unit",
     "redshift",
     "redshift_prior",
     "pairs",
@@ -59,7 +60,15 @@ _OF_FIT = (
     "chunk_size",
 )
 #: Arguments of its method sample, besides the number of draws.
-_OF_SAMPLE = ("photometry", "seed", "redshift", "redshift_prior", "executor", "progress_bar")
+_OF_SAMPLE = (
+    "photometry",
+    "unit",
+    "seed",
+    "redshift",
+    "redshift_prior",
+    "executor",
+    "progress_bar",
+)
 #: Attributes of a fitter that depend on its bands.
 _OF_BANDS = ("backend", "bands", "grid", "model_errors", "priors", "zero_points")
 
@@ -399,6 +408,7 @@ class BayesFitter(Interactive):
         self,
         photometry,
         *,
+        unit=None,
         redshift=None,
         redshift_prior=None,
         pairs=None,
@@ -420,6 +430,9 @@ class BayesFitter(Interactive):
             (without model error and floor); its term of chi2 is -2 ln of the probability that a
             measurement of the model lies below the limit (Sawicki 2012, PASP 124, 1208, appendix).
             Objects with limits only are flagged, not fitted.
+        unit : unit-like or dict of str to unit-like, optional
+            Unit of fluxes and errors whose columns have none, as of a DataFrame: ``"uJy"``, ``"ABmag"``; for all
+            or by band.
         redshift : str or array_like, optional
             Column of ``photometry``, or values, of known redshifts; on a grid each is taken to the
             nearest redshift, unless the fitter is to ``interpolate``. Without it the redshift is free.
@@ -467,7 +480,7 @@ class BayesFitter(Interactive):
             has the wrong shape, or both are given, nothing is free, or ``pairs`` has a parameter
             twice, one with a single value or a derived quantity.
         `~astropy.units.UnitsError`
-            If a flux column has no unit of flux density.
+            If a flux column has no unit of flux density, and ``unit`` does not say it.
         """
         if self.waits:
             given = {name: value for name, value in locals().items() if name in _OF_FIT}
@@ -475,7 +488,7 @@ class BayesFitter(Interactive):
         known = {"redshift": redshift, "redshift_prior": redshift_prior}
         parallel = {"executor": executor, "progress_bar": progress_bar}
         options = {"pairs": pairs, "seed": seed, "chunk_size": chunk_size, "parallel": parallel}
-        results = self.fit_part(self.table_of(photometry), **known, **options)
+        results = self.fit_part(self.table_of(photometry, unit), **known, **options)
         warn_of_pulls(results)
         sample = results.reduced_chi2[:: chi2_step(len(results))]
         return with_high_chi2(results, chi2_limit(sample))
@@ -539,6 +552,7 @@ class BayesFitter(Interactive):
         n_draws,
         *,
         seed,
+        unit=None,
         redshift=None,
         redshift_prior=None,
         executor=None,
@@ -549,7 +563,7 @@ class BayesFitter(Interactive):
 
         Parameters
         ----------
-        photometry, redshift, redshift_prior, executor, progress_bar : optional
+        photometry, unit, redshift, redshift_prior, executor, progress_bar : optional
             As for `fit`.
         n_draws : int
             Draws for each object, independent and of equal weight.
@@ -573,7 +587,9 @@ class BayesFitter(Interactive):
             msg = "draws of a sampler are in its results: fitter.fit(photometry).samples(id)"
             raise ValueError(msg)
         n_draws, seed = check_count(n_draws, "n_draws"), check_seed(seed)
-        data, known, settings = self._prepare(self.table_of(photometry), redshift, redshift_prior)
+        data, known, settings = self._prepare(
+            self.table_of(photometry, unit), redshift, redshift_prior
+        )
         parallel = {"executor": executor, "progress_bar": progress_bar}
         samples = self.backend.sample(data, known, n_draws, seed, **parallel)
         cited = self.backend.provenance()["citations"]

@@ -7,7 +7,7 @@ import numpy as np
 
 from miricigale.filters import Filter
 from miricigale.filters.library import SEDPY
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.exceptions import argument_error, units_error
 from miricigale.utils.object_rows import ObjectRows, PerObject
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import Flags, error_column, read_ids, require_columns
@@ -223,7 +223,12 @@ class PhotometryReader:
         """
         filters = self.fitted(table)
         columns = [c for name in filters for c in (name, error_column(name))]
-        require_columns(table, ["id", *columns], "photometry", units=dict.fromkeys(columns, FNU))
+        require_columns(table, ["id", *columns], "photometry")
+        for name in columns:
+            if getattr(table[name], "unit", None) is None:
+                how = "no unit: say it, as unit='uJy' of the fit or --flux-unit uJy of the command"
+                raise units_error("photometry", f"convertible to {FNU}", how, column=name)
+        require_columns(table, [], "photometry", units=dict.fromkeys(columns, FNU))
         n = len(table)
         shape = (n, len(self.bands))
         flux, err, sigma = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.inf)

@@ -10,10 +10,10 @@ import threading
 from collections import deque
 from functools import partial
 
-import astropy.units as u
 import numpy as np
 
 from miricigale.filters.catalog_files import codes_of, warn_of_codes
+from miricigale.filters.photometry_table import unit_of_fluxes
 from miricigale.fitting.catalog_rows import give_units, open_catalog
 from miricigale.fitting.fitted_bands import bands_with_errors, warn_of_unfitted
 from miricigale.fitting.fitter import BayesFitter
@@ -31,7 +31,6 @@ from miricigale.utils.options import check_data, check_that
 from miricigale.utils.progress import progress
 from miricigale.utils.random import check_seed
 from miricigale.utils.tables import ascii_ids, error_column, read_ids, require_columns
-from miricigale.utils.units import FNU
 
 logger = logging.getLogger(__name__)
 
@@ -132,10 +131,7 @@ def fit_file(
     check_that(isinstance(fitter, BayesFitter), "fitter", "a BayesFitter", type(fitter).__name__)
     if not isinstance(path_in, (str, os.PathLike)):
         raise argument_error("path_in", "the path of a catalog", type(path_in).__name__)
-    unit = None if flux_unit is None else u.Unit(flux_unit)
-    if unit is not None and not unit.is_equivalent(FNU):
-        msg = f"'flux_unit' must be convertible to {FNU}, got {unit}"
-        raise u.UnitsError(msg)
+    unit = None if flux_unit is None else unit_of_fluxes(flux_unit, "flux_unit")
     rows = open_catalog(path_in, chunk_rows, hdu=hdu, catalog_map=catalog_map, flux_unit=unit)
     if fitter.waits:
         bands = bands_with_errors(rows.colnames, "path_in")
@@ -148,7 +144,8 @@ def fit_file(
         # the same fit, in whatever order they are given
         pairs = fitter.backend.check_pairs(pairs)
     options = {"redshift": redshift, "redshift_prior": redshift_prior, "pairs": pairs}
-    if catalog_map is None:
+    mapped = hasattr(rows, "map")
+    if not mapped:
         pieces = (codes_of(rows.chunk(i), fitter.bands) for i in range(rows.n_chunks))
         warn_of_codes(pieces, rows.path.name)
     else:
@@ -164,7 +161,7 @@ def fit_file(
             got = "whole numbers in earlier rows, and others here"
             check_that(len(kinds) < 2, "photometry", "a table with ids of one kind", got)
     given = {"hdu": hdu, "flux_unit": None if unit is None else unit.to_string()}
-    given |= {} if catalog_map is None else {"map": rows.map.settings()}
+    given |= {} if not mapped else {"map": rows.map.settings()}
     job = _job(fitter, rows, options | {"seed": seed}, given)
     with FitFolder(path_out) as folder:
         _begin(folder, job, resume)

@@ -46,6 +46,7 @@ def test_a_table_by_our_names_is_itself(catalog):
         *(("{}", error) for error in ("{}_err", "{}_error", "e_{}")),
         *(("f_{}", "e_{}"), ("flux_{}", "err_{}")),
         *(("{}_flux", "{}_flux_err"), ("FLUX_{}", "FLUX_{}_ERR")),
+        *(("flux_{}", "fluxerr_{}"), ("f_{}", "flux_err_{}")),
     ],
 )
 def test_columns_are_called_in_many_ways(catalog, flux, error):
@@ -78,11 +79,54 @@ def test_magnitudes_become_fluxes(catalog):
     assert np.isnan(as_photometry(masked, BANDS)["miri.f770w"].value).tolist() == [False, True]
 
 
+def test_a_unit_is_said_once_for_columns_without_any():
+    plain = {"ID": [7, 8], "F770W": [1.0, 2.0], "F770W_err": [0.1, 0.2], "mag_F160W": [23.9, 21.4]}
+    got = as_photometry(plain, BANDS, units="nJy")
+    assert_allclose(got["miri.f770w"].to_value(u.uJy), [0.001, 0.002])
+    assert_allclose(got["miri.f770w_err"].to_value(u.uJy), [0.0001, 0.0002])
+    # magnitudes by their name are no fluxes in nJy
+    assert_allclose(got["wfc3.f160w"].to_value(u.uJy), [1.0, 10.0])
+    assert got["id"].tolist() == [7, 8]
+    by_band = as_photometry(plain, BANDS, units={"F770W": "mJy"})
+    assert_allclose(by_band["miri.f770w"].to_value(u.uJy), [1000.0, 2000.0])
+    magnitudes = as_photometry({"F770W": [23.9], "F770W_err": [0.1]}, BANDS, units="ABmag")
+    assert_allclose(magnitudes["miri.f770w"].to_value(u.uJy), [1.0])
+    assert_allclose(magnitudes["miri.f770w_err"].to_value(u.uJy), [0.0921034], rtol=1e-6)
+
+
+def test_a_column_keeps_its_own_unit(catalog):
+    same(as_photometry(catalog, BANDS, units="Jy"), catalog)
+
+
+@pytest.mark.parametrize(
+    ("units", "error", "match"),
+    [
+        ("um", u.UnitsError, "'units' must be a unit of flux density, such as uJy, or 'ABmag'"),
+        ("foo", u.UnitsError, "'units' must be a unit of flux density.*got 'foo'"),
+        ({"F1000W": "uJy"}, ValueError, "'units' must be a dict with keys among"),
+    ],
+)
+def test_units_of_something_else_are_refused(units, error, match):
+    bare = {"F770W": [1.0], "F770W_err": [0.1]}
+    refuses(match, as_photometry, bare, BANDS, units=units, error=error)
+
+
+def test_a_flux_goes_before_a_magnitude_of_the_same_band():
+    table = Table({"F770W": [3.0], "F770W_err": [0.3], "mag_F770W": [23.9], "magerr_F770W": [0.1]})
+    got = as_photometry(table, BANDS, units="uJy")
+    assert_allclose(got["miri.f770w"].value, [3.0])
+    # a flux without error does not keep a magnitude with one away
+    table.remove_column("F770W_err")
+    got = as_photometry(table, BANDS, units="uJy")
+    assert_allclose(got["miri.f770w"].value, [1.0])
+    assert_allclose(got["miri.f770w_err"].value, [0.0921034], rtol=1e-6)
+
+
 def test_limits_are_found_by_any_name_of_their_band(catalog):
     table = renamed(catalog, "{}", "{}_err")
     table["F770W_limit"] = [True, False]
     assert as_photometry(table, BANDS)["miri.f770w_limit"].tolist() == [True, False]
-    named = band_columns(table.colnames)
+    named, _ = band_columns(table)
     assert named["F770W_limit"] == "miri.f770w_limit"
 
 

@@ -21,6 +21,7 @@ from miricigale.fitting import (
     fit_catalog,
     open_results,
 )
+from miricigale.fitting.catalog_rows import open_catalog
 from miricigale.fitting.grid import GridEngine
 from miricigale.fitting.page import fit_page
 from miricigale.sed import SEDModel, read_spectra, template_grid
@@ -209,13 +210,35 @@ def test_ctrl_c_keeps_what_is_finished(catalog, tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize(
+    ("table", "unit"),
+    [
+        ({"ID": [7, 8], "mag_F770W": [23.9, -99.0], "magerr_F770W": [0.1, -99.0]}, None),
+        ({"NUMBER": [7, 8], "F770W": [23.9, 99.0], "e_F770W": [0.1, 99.0]}, "ABmag"),
+        ({"id": [7, 8], "F770W": [23.9, np.nan] * u.ABmag, "F770W_err": [0.1, 0.1] * u.mag}, None),
+    ],
+)
+def test_magnitudes_in_files_are_the_fluxes_that_they_are_in_tables(tmp_path, table, unit):
+    path = tmp_path / "cat.ecsv"
+    QTable(table).write(path)
+    got = open_catalog(path, 10, flux_unit=unit).chunk(0)
+    assert got["id"].tolist() == [7, 8]
+    np.testing.assert_allclose(got["miri.f770w"].to_value(u.uJy), [1.0, np.nan])
+    np.testing.assert_allclose(
+        got["miri.f770w_err"].to_value(u.uJy), [0.0921034, np.nan], rtol=1e-6
+    )
+
+
+@pytest.mark.parametrize(
     ("options", "message"),
     [
         (["--redshift", "z_phot"], "'redshift' must be a column among"),
         (["--hdu", "SECOND"], "no binary table in extension 'SECOND'"),
         (["--chunk-rows", "0"], "'chunk_rows' must be an integer >= 1, got 0"),
         (["--pairs", "age:mood"], "no parameter for 'pairs' 'mood'; known: age"),
-        (["--flux-unit", "mag"], "'flux_unit' must be convertible to uJy, got mag"),
+        (
+            ["--flux-unit", "mag"],
+            "must be a unit of flux density, such as uJy, or 'ABmag', got 'mag'",
+        ),
         (["--threads", "-1"], "at least 1 and an integer, got -1"),
     ],
 )
@@ -235,8 +258,8 @@ def test_pairs_are_two_names(capsys):
     [
         ({"flux": [1.0] * u.uJy}, "a table with columns <filter> and <filter>_err"),
         (
-            {"irac.ch1": [20.0] * u.ABmag, "irac.ch1_err": [0.1] * u.mag},
-            "column 'irac.ch1' must be convertible to uJy, got mag(AB)",
+            {"irac.ch1": [20.0] * u.mag, "irac.ch1_err": [0.1] * u.mag},
+            "column 'irac.ch1' must be convertible to uJy, got mag",
         ),
     ],
 )

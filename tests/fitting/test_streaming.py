@@ -142,7 +142,7 @@ def test_csv_has_the_unit_that_is_given(fitter, catalog, in_pieces, tmp_path):
         assert_allclose(table[name].value, wanted[name].value, rtol=1e-9)
     arguments = (fit_file, fitter, tmp_path / "catalog.csv", tmp_path / "no unit")
     refuses("must be convertible to uJy", *arguments, error=u.UnitsError, chunk_rows=40)
-    text = "'flux_unit' must be convertible to uJy, got mag"
+    text = "'flux_unit' must be a unit of flux density, such as uJy, or 'ABmag', got 'mag'"
     refuses(text, *arguments, error=u.UnitsError, flux_unit="mag")
 
 
