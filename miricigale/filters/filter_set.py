@@ -99,6 +99,10 @@ class FilterSet(Interactive):
             return self.filters[self.names.index(name)]
         return self.filters[key]
 
+    def _ipython_key_completions_(self):
+        """What a session offers in brackets: the names."""
+        return list(self.names)
+
     def __repr__(self):
         return f"<FilterSet {', '.join(self.names)}>"
 

@@ -4,11 +4,15 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.fitting.posterior import cell_edges
+from miricigale.fitting.result_tables import OUTLIER
 from miricigale.sed.spectrum import distance
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_that
+from miricigale.utils.options import check_names, check_that
 from miricigale.utils.tables import described_table
-from miricigale.utils.units import FNU
+from miricigale.utils.units import FNU, to_array
+
+#: Parameters of a corner plot by default, in their order.
+CORNER = ("redshift", "stellar_mass", "sfr", "a_v", "frac_agn")
 
 
 def samples(results, key):
@@ -153,6 +157,116 @@ def plot_pdf2d(results, x="redshift", y="frac_agn", ax=None, **kwargs):
     # those of the nodes, among which what is absent has a cell that can be seen
     edges = (cell_edges(axis.values, axis.bounds) for axis in axes)
     return plot_pdf_2d(*edges, weights, ax=ax, **kwargs)
+
+
+def plot_corner(results, key=None, names=None, *, truths=None, figure=None):
+    """
+    Draw the posteriors of several parameters of an object, each and in pairs.
+
+    Parameters
+    ----------
+    key : object, optional
+        Id of the object; not of results of a single one.
+    names : list of str, optional
+        Parameters whose joint posteriors there are (``pairs`` of the fit, or redshift and AGN fraction); all of
+        them by default. `Samples.plot_corner` draws any, from draws.
+    truths : dict of str to float, optional
+        Values to mark, by name.
+    figure : `~matplotlib.figure.Figure`, optional
+        Where to draw; a new one by default.
+
+    Returns
+    -------
+    axes : `~numpy.ndarray` of `~matplotlib.axes.Axes`, shape (n, n)
+
+    Raises
+    ------
+    KeyError
+        If a joint posterior is not there.
+    """
+    from miricigale.plotting.corner import plot_corner
+
+    one = results if key is None else results.loc[key]
+    one = one._one("plot_corner")._fitted_one()
+    if names is None:
+        names = _with_joint_posteriors(one)
+    names = [one._named(name) for name in names]
+    edges = []
+    for name in names:
+        check_names([name], "parameter with joint posteriors", one.axes)
+        axis = one.axes[name]
+        edges.append(cell_edges(axis.values, axis.bounds))
+    marginals = [(cells, one.pdf[name]) for name, cells in zip(names, edges, strict=True)]
+    joints = {}
+    for row, later in enumerate(names):
+        for column, earlier in enumerate(names[:row]):
+            joints[row, column] = edges[column], edges[row], one.joint_pdf(earlier, later)
+    labels = [labeled(name, one.unit(name)) for name in names]
+    marked = {one._named(name): value for name, value in (truths or {}).items()}
+    check_names(marked, "parameter for 'truths'", names)
+    values = [marked.get(name) for name in names]
+    return plot_corner(labels, marginals, joints, truths=values, figure=figure)
+
+
+def _with_joint_posteriors(one):
+    """Parameters all of whose pairs have a joint posterior, beginning with redshift and AGN fraction."""
+    pairs = {frozenset(pair) for pair in one.pairs}
+    if "frac_agn" in one.axes:
+        pairs.add(frozenset(("redshift", "frac_agn")))
+    names = []
+    for name in dict.fromkeys(("redshift", "frac_agn", *one.axes)):
+        if name in one.axes and all(frozenset((name, other)) in pairs for other in names):
+            names.append(name)
+    return names
+
+
+def plot_redshift(results, z_spec, ax=None, **kwargs):
+    """
+    Draw the fitted redshifts, with their 68 % intervals, against known ones.
+
+    Parameters
+    ----------
+    z_spec : array_like, shape (n,)
+        Known redshifts in the order of the results; NaN and what is not positive is none.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; the current axes by default.
+    **kwargs
+        Passed to `miricigale.plotting.comparison.plot_redshifts`.
+
+    Returns
+    -------
+    ax : `~matplotlib.axes.Axes`
+        The title has bias, scatter (sigma_MAD) and the share of outliers, above 0.15, in
+        (z - z_spec) / (1 + z_spec).
+
+    Raises
+    ------
+    ValueError
+        If there are not as many, or redshifts were known to the fit.
+    """
+    from miricigale.plotting.comparison import plot_redshifts
+
+    some = results._several()
+    check_that(not some.redshift_fixed, "redshift", "free in the fit", "fixed")
+    known = to_array(z_spec, u.one, "z_spec")
+    known = np.atleast_1d(known)
+    wanted = f"{len(some)} redshifts, one for each object"
+    check_that(known.shape == (len(some),), "z_spec", wanted, f"shape {known.shape}")
+    with np.errstate(invalid="ignore"):
+        good = some.fitted & (known > 0)
+    check_that(np.any(good), "z_spec", "positive for one fitted object at least", "none")
+    low, middle, high = some[good].percentile("redshift", [0.16, 0.5, 0.84]).value.T
+    true = known[good]
+    offset = (middle - true) / (1.0 + true)
+    bias = np.median(offset)
+    scatter = 1.4826 * np.median(np.abs(offset - bias))
+    outliers = np.mean(np.abs(offset) > OUTLIER)
+    text = f"{true.size} objects: bias {bias:+.4f}, $\\sigma_{{MAD}}$ {scatter:.4f}, "
+    kwargs.setdefault("title", f"{text}{100 * outliers:.1f} % outliers")
+    errors = np.stack([middle - low, high - middle])
+    ax = plot_redshifts(true, middle, z_err=errors, ax=ax, **kwargs)
+    ax.set_xlabel("known redshift")
+    return ax
 
 
 def labeled(name, unit):

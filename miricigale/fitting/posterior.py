@@ -40,10 +40,18 @@ def moments(values, pdf):
 
 
 def check_levels(levels):
-    """Levels of percentiles as an array; a `ValueError` if one is not between 0 and 1."""
+    """
+    Levels of percentiles as an array of numbers between 0 and 1; those above 1, such as 16, are percent.
+
+    A `ValueError` if one is neither, or both kinds are there.
+    """
     levels = np.atleast_1d(np.asarray(levels, dtype=float))
     check_that(levels.ndim == 1, "levels", "a number or a list of numbers", f"shape {levels.shape}")
-    check_that(np.all((levels > 0) & (levels < 1)), "levels", "between 0 and 1", levels)
+    if levels.size and np.all((levels > 1) & (levels < 100)):
+        # 1 is left out: it may be 1 or 100 percent
+        levels = levels / 100.0
+    wanted = "all between 0 and 1, or percentages above 1 and below 100"
+    check_that(np.all((levels > 0) & (levels < 1)), "levels", wanted, levels)
     return levels
 
 

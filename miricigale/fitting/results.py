@@ -228,6 +228,7 @@ class FitResults(FitRows):
 
     def unit(self, name):
         """Unit of a parameter or derived quantity."""
+        name = self._named(name)
         if name in self.axes:
             return u.Unit(self.axes[name].unit)
         if name == "redshift":
@@ -257,6 +258,7 @@ class FitResults(FitRows):
         return self._moments(name)[1] * self.unit(name)
 
     def _moments(self, name):
+        name = self._named(name)
         kept = self._kept(name, "moments")
         if kept is None:
             mean, std = moments(self.axes[name].values, self.pdf[name])
@@ -285,7 +287,9 @@ class FitResults(FitRows):
 
     def _column(self, name):
         """Posterior medians of a parameter, or a column of the table."""
-        return self.median(name) if name in self.parameters else super()._column(name)
+        if self._named(name) in self.parameters:
+            return self.median(name)
+        return super()._column(name)
 
     def _value(self, name):
         # half-made copies have no axes yet
@@ -310,9 +314,10 @@ class FitResults(FitRows):
         Parameters
         ----------
         name : str
-            A parameter or derived quantity.
+            A parameter or derived quantity, by our name or CIGALE's (``"stellar.m_star"``).
         levels : array_like
-            Levels in (0, 1); of derived quantities, and of all of a sampler, from 0.001 to 0.999.
+            Levels in (0, 1), or all in percent (16, 50, 84); of derived quantities, and of all of a sampler, from
+            0.001 to 0.999.
 
         Returns
         -------
@@ -327,6 +332,7 @@ class FitResults(FitRows):
             If a level is outside.
         """
         single, levels = np.ndim(levels) == 0, check_levels(levels)
+        name = self._named(name)
         some = self._several()
         kept = some._kept(name, "quantiles")
         if kept is None:
@@ -350,6 +356,7 @@ class FitResults(FitRows):
         weights : `~numpy.ndarray`, shape (n, n_cells) or (n_cells,)
             Weight of each cell; of the cells between quantiles the same for all.
         """
+        name = self._named(name)
         if name in self.axes:
             axis = self.axes[name]
             edges = cell_edges(axis.values, axis.bounds)
@@ -370,6 +377,7 @@ class FitResults(FitRows):
         levels : `~numpy.ndarray`
             Part of the posterior below each; from 0.001 to 0.999 for a derived quantity.
         """
+        name = self._named(name)
         edges, weights = self.distribution(name)
         first = np.full((*weights.shape[:-1], 1), 0.0 if name in self.axes else DERIVED_LEVELS[0])
         # rounding may lift a sum above 1
@@ -413,6 +421,8 @@ class FitResults(FitRows):
         KeyError
             If the results do not have it.
         """
+        x = self._named(x)
+        y = self._named(y)
         known = dict(self.pairs)
         if "frac_agn" in self.axes:
             known["redshift", "frac_agn"] = self.pdf_2d
@@ -438,3 +448,4 @@ class FitResults(FitRows):
 
     samples, best_sed, plot_sed = drawing.samples, drawing.best_sed, drawing.plot_sed
     plot_pdf, plot_pdf2d = drawing.plot_pdf, drawing.plot_pdf2d
+    plot_corner, plot_redshift = drawing.plot_corner, drawing.plot_redshift

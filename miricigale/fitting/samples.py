@@ -7,7 +7,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.fitting import drawn_spectra
-from miricigale.fitting.drawing import labeled
+from miricigale.fitting.drawing import CORNER, labeled
 from miricigale.fitting.drawn_spectra import LEVELS, suffix
 from miricigale.fitting.likelihood import FitFlags
 from miricigale.fitting.posterior import bin_edges, cell_edges, check_levels
@@ -22,6 +22,10 @@ from miricigale.utils.random import stream
 from miricigale.utils.tables import described_table, error_column
 from miricigale.utils.unified import read_write
 from miricigale.utils.units import FNU
+
+#: Cells of a derived quantity in a corner plot, and the part of the draws that are beyond them.
+N_BINS = 20
+CUT = 0.01
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -163,6 +167,7 @@ model : `~miricigale.sed.SEDModel`, optional
 
     def unit(self, name):
         """Unit of a parameter or derived quantity."""
+        name = self._named(name)
         if name in self.axes:
             return u.Unit(self.axes[name].unit)
         check_names([name], "parameter", self.parameters)
@@ -190,6 +195,7 @@ model : `~miricigale.sed.SEDModel`, optional
             NaN for objects that could not be fitted, and for parameters of the AGN where a
             draw has none.
         """
+        name = self._named(name)
         some, unit = self._several(), self.unit(name)
         out = np.where(some.fitted[:, None], some._values(name), np.nan)
         return out.reshape(self.scale.shape) * unit
@@ -268,7 +274,7 @@ model : `~miricigale.sed.SEDModel`, optional
         name : str
             A parameter or derived quantity.
         levels : array_like, shape (n_levels,)
-            Levels in (0, 1), of percentiles of shape (n, n_levels); (n,) for a single level.
+            Levels in (0, 1), or all in percent, of percentiles of shape (n, n_levels); (n,) for a single level.
         """
         values = self.values(name)
         single, levels = np.ndim(levels) == 0, check_levels(levels)
@@ -323,6 +329,7 @@ model : `~miricigale.sed.SEDModel`, optional
 
     def _binned(self, name, key):
         """Values in the draws of an object, and edges of the cells."""
+        name = self._named(name)
         values, known = self.loc[key]._fitted_one().values(name).value, self._quantities
         if name in self.axes:
             return values, cell_edges(self.axes[name].values, self.axes[name].bounds)
@@ -408,3 +415,68 @@ model : `~miricigale.sed.SEDModel`, optional
         a_edges, b_edges, weights = self.pdf_2d(a, b, key)
         kwargs.setdefault("labels", tuple(labeled(name, self.unit(name)) for name in (a, b)))
         return plot_pdf_2d(a_edges.value, b_edges.value, weights, ax=ax, **kwargs)
+
+    def plot_corner(self, key, names=None, *, truths=None, figure=None):
+        """
+        Draw the posteriors of several parameters of an object, each and in pairs.
+
+        Parameters
+        ----------
+        key : object
+            Id of the object.
+        names : list of str, optional
+            Parameters and derived quantities; by default those of redshift, stellar mass, star-formation rate,
+            attenuation and AGN fraction that there are. Quantities that scale with mass are drawn as log10.
+        truths : dict of str to float, optional
+            Values to mark, by name.
+        figure : `~matplotlib.figure.Figure`, optional
+            Where to draw; a new one by default.
+
+        Returns
+        -------
+        axes : `~numpy.ndarray` of `~matplotlib.axes.Axes`, shape (n, n)
+            Of derived quantities the outermost 1 % of the draws are beyond the panels.
+        """
+        from miricigale.plotting.corner import plot_corner
+
+        if names is None:
+            names = [name for name in CORNER if name in self.parameters]
+        names = [self._named(name) for name in names]
+        check_names(names, "parameter", self.parameters)
+        some = self.loc[key]._fitted_one()
+        panels = [some._panel(name) for name in names]
+        marginals = [(edges, np.histogram(x, edges)[0] / self.n_draws) for x, edges, _ in panels]
+        joints = {}
+        for row, (y, y_edges, _) in enumerate(panels):
+            for column, (x, x_edges, _) in enumerate(panels[:row]):
+                weights = np.histogram2d(x, y, (x_edges, y_edges))[0] / self.n_draws
+                joints[row, column] = x_edges, y_edges, weights
+        labels = []
+        for name, (_, _, log) in zip(names, panels, strict=True):
+            label = labeled(name, self.unit(name))
+            labels.append(f"log {label}" if log else label)
+        marked = {self._named(name): value for name, value in (truths or {}).items()}
+        check_names(marked, "parameter for 'truths'", names)
+        values = [marked.get(name) for name in names]
+        for i, (_, _, log) in enumerate(panels):
+            if log and values[i] is not None:
+                values[i] = np.log10(values[i])
+        return plot_corner(labels, marginals, joints, truths=values, figure=figure)
+
+    def _panel(self, name):
+        """Values of a single object, edges of their cells, and whether both are logarithms, for a corner plot."""
+        values = self.values(name).value
+        if name in self.axes:
+            axis = self.axes[name]
+            return values, cell_edges(axis.values, axis.bounds), False
+        good = values[np.isfinite(values)]
+        check_that(good.size, "names", "of parameters with values in the draws", repr(name))
+        extensive = name in self._quantities.names and name not in self._quantities.intensive
+        log = bool(extensive and np.all(good > 0))
+        if log:
+            values = np.log10(values)
+            good = np.log10(good)
+        low, high = np.quantile(good, [0.5 * CUT, 1.0 - 0.5 * CUT])
+        # equal values get a narrow bin
+        high = max(high, low + 1e-6 * max(abs(low), 1e-30))
+        return values, np.linspace(low, high, N_BINS + 1), log

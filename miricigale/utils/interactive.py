@@ -126,6 +126,10 @@ class Tabular(Interactive):
             raise unknown_name("column", key, table.colnames)
         return table[key]
 
+    def _ipython_key_completions_(self):
+        """What a session offers in brackets: names of the columns."""
+        return self.to_table().colnames
+
     @property
     def columns(self):
         """Columns of the table by name."""

@@ -103,6 +103,11 @@ class ObjectRows(Interactive):
             return self._column(key)
         return self._take(self.row(key))
 
+    def _ipython_key_completions_(self):
+        """What a session offers in brackets: names of parameters, and ids that are text."""
+        ids = [] if self.isscalar else [key for key in self.ids.tolist() if isinstance(key, str)]
+        return [*getattr(self, "parameters", ()), *ids]
+
     @property
     def loc(self):
         """Objects by id: ``results.loc[id]`` and, for several, ``results.loc[[id, ...]]``."""

@@ -93,7 +93,7 @@ def test_views_agree_with_the_catalog(results):
     with pytest.raises(KeyError, match="no object with the id 99 among 12; the first are 0, 1"):
         results.loc[99]
     refuses("no parameter 'mood'; known: accretion_power", results.mean, "mood", error=KeyError)
-    refuses("'levels' must be between 0 and 1", results.percentile, "mass", [16])
+    refuses("'levels' must be all between 0 and 1", results.percentile, "mass", [0.5, 16])
 
 
 def test_prediction_of_the_best_model(results, grid):

@@ -197,7 +197,7 @@ def test_what_is_refused(real, model, samples):
     refuses(r"'model' must be the one of the grid \(components", other.sed_band, "a")
     refuses(r"'key' must be .* got 'c' \(no_band\)", real.sed_band, "c")
     refuses("'filters' must be a list", real.predict, "miri.f770w")
-    refuses("'levels' must be between 0 and 1", real.sed_band, "a", (16, 84))
+    refuses("'levels' must be all between 0 and 1", real.sed_band, "a", (0.16, 84))
     with pytest.raises(ValueError, match="read-only"):
         samples.scale[0, 0] = 1
     assert isinstance(samples.to_table(["mass"]), QTable)

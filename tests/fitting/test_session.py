@@ -1,0 +1,120 @@
+"""What people type in a session: percent, names of other programs, units of plain tables, corner plots."""
+
+import dataclasses
+
+import astropy.units as u
+import numpy as np
+import pytest
+from matplotlib import pyplot as plt
+from numpy.testing import assert_allclose, assert_array_equal
+
+from helpers.errors import refuses
+from helpers.grids import node_fitter
+
+
+@pytest.fixture(scope="module")
+def fitter(grid):
+    return node_fitter(grid)
+
+
+@pytest.fixture(scope="module")
+def results(fitter, photometry):
+    return fitter.fit(photometry)
+
+
+@pytest.fixture
+def figure():
+    yield plt.figure()
+    plt.close("all")
+
+
+def test_levels_are_parts_or_percent(results):
+    parts = results.percentile("redshift", [0.16, 0.5, 0.84])
+    assert_array_equal(results.percentile("redshift", [16, 50, 84]), parts)
+    assert_array_equal(results.percentile("redshift", 16), parts[:, 0])
+    assert_allclose(results.interval("redshift"), parts[:, [0, 2]], rtol=1e-12)
+    assert_allclose(results.interval("redshift", 68), parts[:, [0, 2]], rtol=1e-12)
+    # 1 may be one percent or all of it
+    for levels in (1, [0.16, 84], [50, 100], [-1], [0]):
+        refuses("'levels' must be all between 0 and 1, or perc", results.percentile, "mass", levels)
+
+
+def test_quantities_are_found_by_the_names_of_cigale(results):
+    mass = results.mean("mass")
+    for name in ("sfh.integrated", "bayes.sfh.integrated"):
+        assert_array_equal(results.mean(name), mass)
+    assert_array_equal(results["z"], results.median("redshift"))
+    assert_array_equal(results.std("agn.fracAGN"), results.std("frac_agn"))
+    assert results.unit("sfh.integrated") == u.Msun
+    assert_array_equal(results.cdf("z")[1], results.cdf("redshift")[1])
+    refuses("no parameter 'stellar.mstar'", results.mean, "stellar.mstar", error=KeyError)
+
+
+def test_a_table_without_units_is_fitted_in_the_unit_that_is_said(fitter, photometry, results):
+    plain = {
+        name: getattr(photometry[name], "value", photometry[name]) for name in photometry.colnames
+    }
+    refuses("got no unit: say it, as unit='uJy'", fitter.fit, plain, error=u.UnitsError)
+    fitted = fitter.fit(plain, unit="uJy")
+    assert_array_equal(fitted.pdf["redshift"], results.pdf["redshift"])
+    smaller = fitter.fit(plain, unit="nJy")
+    good = results.fitted
+    ratio = smaller.best_scale[good] / results.best_scale[good]
+    assert_allclose(ratio, 1e-3, rtol=1e-9)
+
+
+def test_redshifts_are_compared_with_known_ones(results, figure):
+    z = results.median("redshift").value
+    good = results.fitted
+    ax = results.plot_redshift(z / 1.0, figure.subplots())
+    assert "bias +0.0000" in ax.get_title()
+    assert ax.get_title().startswith(f"{np.count_nonzero(good)} objects")
+    # all are off by 0.2 (1 + z): the bias is that, the scatter none, and all are outliers
+    ax = results.plot_redshift((1 + z) / 1.2 - 1, figure.subplots())
+    assert "bias +0.2000, $\\sigma_{MAD}$ 0.0000, 100.0 % outliers" in ax.get_title()
+    refuses("'z_spec' must be 12 redshifts", results.plot_redshift, [1.0])
+    nothing = np.full(len(results), np.nan)
+    refuses("'z_spec' must be positive for one fitted", results.plot_redshift, nothing)
+    fixed = dataclasses.replace(results, redshift_fixed=True)
+    refuses("'redshift' must be free", fixed.plot_redshift, z)
+
+
+def shown(axes):
+    return [[ax.get_visible() for ax in row] for row in axes]
+
+
+def test_a_corner_plot_has_each_parameter_and_each_pair(results, figure):
+    key = results.ids[results.fitted][0]
+    axes = results.plot_corner(key, truths={"z": 1.0}, figure=figure)
+    assert shown(axes) == [[True, False], [True, True]]
+    assert axes[1, 0].get_xlabel() == "redshift"
+    assert axes[1, 0].get_ylabel() == "frac_agn"
+    assert axes[1, 0].lines[-1].get_xdata()[0] == 1.0
+    # the panel has the joint posterior over the areas of its cells, redshift along x
+    density = np.asarray(axes[1, 0].collections[0].get_array())
+    one = results.loc[key]
+    z_width, f_width = (
+        np.diff(one.distribution(name)[0].value) for name in ("redshift", "frac_agn")
+    )
+    joint = one.joint_pdf("redshift", "frac_agn")
+    assert_allclose(density * z_width * f_width[:, None], joint.T, atol=1e-12)
+    refuses("no parameter with joint", results.plot_corner, key, ["z", "mass"], error=KeyError)
+    refuses("no joint posterior of", results.plot_corner, key, ["z", "age"], error=KeyError)
+    refuses("plot_corner is of a single object", results.plot_corner, error=TypeError)
+
+
+def test_a_corner_plot_of_draws_has_any_quantity(fitter, photometry, results, figure):
+    samples = fitter.sample(photometry, 400, seed=1)
+    key = results.ids[results.fitted][0]
+    axes = samples.plot_corner(key, ["z", "mass"], truths={"mass": 1e10}, figure=figure)
+    assert axes[1, 0].get_ylabel() == "log mass (solMass)"
+    assert axes[1, 1].lines[-1].get_xdata()[0] == 10.0
+    low, high = axes[1, 1].get_xlim()
+    draws = np.log10(samples.loc[key].values("mass").value)
+    inside = np.mean((draws >= low) & (draws <= high))
+    assert inside >= 0.989
+    refuses("no parameter 'mood'", samples.plot_corner, key, ["mood"], error=KeyError)
+
+
+def test_brackets_are_completed(results):
+    assert set(results.parameters) <= set(results._ipython_key_completions_())
