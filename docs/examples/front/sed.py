@@ -20,8 +20,11 @@ galaxy = {"redshift": 1.6, "tau": 1 * u.Gyr, "age": 1 * u.Gyr, "ebv": 0.3}
 agn = {"mass": 4e10 * u.Msun, "alpha": 2.0, "frac_agn": 0.4, "tau97": 7.0}
 light = model.fluxes(QTable([{"id": 1, **galaxy, **agn}]), existing + miri)
 photometry = survey.perturb(light["id", *existing], seed=2)
-for name in miri:
-    photometry[name], photometry[f"{name}_err"] = light[name], 0.05 * light[name]
+# noise of 5 % in the MIRI bands
+noise = np.random.default_rng(3).normal(0.0, 0.05, len(miri))
+for name, offset in zip(miri, noise, strict=True):
+    photometry[name] = light[name] * (1.0 + offset)
+    photometry[f"{name}_err"] = 0.05 * light[name]
 
 axes = SEDModel.yang2021_axes("quick") | {"redshift": np.linspace(1, 2.4, 29)}
 choices = {
@@ -47,6 +50,9 @@ for filters, marker, color in ((existing, "o", "0.25"), (miri, "D", "#dc3c1e")):
         for end in ("", "_err")
     )
     ax.errorbar(wave, flux, error, fmt=marker, color=color, ms=5, mfc="white")
+truth = f"truth: $z$ = {galaxy['redshift']:.2f}, fracAGN = {agn['frac_agn']:.2f}"
+sed = model.evaluate(**galaxy, **agn)
+ax.plot(sed.wave.to_value(u.um), sed.fnu.to_value(u.uJy), "k:", lw=1, label=truth)
 ax.set(xscale="log", yscale="log", xlim=(0.3, 30), ylim=(0.1, 300))
 ax.set_xticks([0.3, 1, 3, 10, 30], ["0.3", "1", "3", "10", "30"])
 ax.set(xlabel="observed wavelength (µm)", ylabel="flux density (µJy)")
