@@ -50,11 +50,30 @@ def fit(args):
     except OtherResultsError as err:
         # name the option of this command instead of the argument
         raise OtherResultsError(err.reason, "--no-resume to replace them") from err
-    print(f"{found['galaxy']!r}; all in {table}; page: {page}")
+    print(f"{_outcome(found['galaxy'])}; table: {table}; page: {page}")
     print(
         "mass: all stars formed; stellar_mass: living stars, as other codes quote it (0.2 to 0.3 dex less)"
     )
     return 0
+
+
+def _outcome(results):
+    """Say how many objects were fitted, and why others were not."""
+    from collections import Counter
+
+    from miricigale.fitting import FitFlags
+
+    flags = results.to_table(["flags"])["flags"]
+    unfitted = [value for value in flags.tolist() if value & int(FitFlags.UNFITTED)]
+    n = len(flags)
+    text = f"{n} object{'s' * (n != 1)}, {n - len(unfitted)} fitted"
+    if not unfitted:
+        return text
+    reasons = Counter(
+        name for value in unfitted for name in FitFlags.names(value & int(FitFlags.UNFITTED))
+    )
+    said = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in reasons.most_common())
+    return f"{text} (not: {said})"
 
 
 @contextlib.contextmanager

@@ -2,6 +2,8 @@
 
 import argparse
 import contextlib
+import difflib
+import re
 import sys
 import tomllib
 from importlib import resources
@@ -12,8 +14,24 @@ class Parser(argparse.ArgumentParser):
     """A parser whose errors are one sentence."""
 
     def error(self, message):
-        """Say what is wrong with the arguments, and end with status 2."""
-        self.exit(2, f"{self.prog}: {message} (see {self.prog} --help)\n")
+        """Say what is wrong with the arguments, the nearest name that there is, and end with status 2."""
+        choice = re.search(r"invalid choice: '?(.+?)'? \(choose from (.+)\)", message)
+        unknown = re.match(r"unrecognized arguments: (\S+)", message)
+        hint = ""
+        if choice:
+            hint = _nearest(choice[1], [name.strip(" '") for name in choice[2].split(",")])
+        elif unknown:
+            hint = _nearest(unknown[1].partition("=")[0], self.every_flag)
+        self.exit(2, f"{self.prog}: {message}{hint} (see {self.prog} --help)\n")
+
+    #: Flags of all commands, for the nearest one to a wrong one.
+    every_flag = ()
+
+
+def _nearest(name, known):
+    """Say which name may be meant; empty if none is near."""
+    close = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
+    return f"; did you mean {close[0]!r}?" if close else ""
 
 
 def quantity_in(unit):
@@ -115,7 +133,49 @@ def make_parser(argv):
         groups = {}
         for flags, option in _of_both(options):
             _add(made, groups, flags, option, known)
+        names = _option_names(made)
+        made.set_defaults(option_names=names)
+        parser.every_flag = (*parser.every_flag, *names.values())
     return parser
+
+
+def _option_names(parser):
+    """What a user types for each argument of a command: its longest flag, or what a positional one is called."""
+    names = {}
+    for action in parser._actions:
+        if action.option_strings:
+            names.setdefault(action.dest, max(action.option_strings, key=len))
+        else:
+            names[action.dest] = action.metavar or action.dest
+    return names
+
+
+def in_options(message, names):
+    """
+    Put options in place of the names of Python's arguments in a message.
+
+    Parameters
+    ----------
+    message : str
+        Such as ``"'chunk_rows' must be an integer >= 1, got 0"``.
+    names : dict of str to str
+        What a user types for each argument, such as ``"--chunk-rows"``.
+
+    Returns
+    -------
+    message : str
+
+    Examples
+    --------
+    >>> from miricigale.cli.options import in_options
+    >>> in_options("'chunk_rows' must be >= 1", {"chunk_rows": "--chunk-rows"})
+    '--chunk-rows must be >= 1'
+    """
+    return re.sub(
+        r"'(\w+)'(?= must | is | column '| given\))",
+        lambda match: names.get(match[1], match[0]),
+        message,
+    )
 
 
 def _of_both(options):

@@ -1,10 +1,14 @@
 """Commands of single products: show, psf, cite."""
 
+import re
 import warnings
 from pathlib import Path
 
 from miricigale.utils.options import check_that
 from miricigale.utils.outputs import check_output
+
+#: Endings of files that may name what to cite.
+_PRODUCTS = (".fits", ".fit", ".gz", ".ecsv", ".parquet", ".asdf")
 
 
 def _readers():
@@ -76,12 +80,13 @@ def show(args):
         print(product.summary())
     else:
         print(product)
-    if not hasattr(product, "plot"):
+    if args.picture is None:
+        if hasattr(product, "plot"):
+            print("--picture draws it")
         return 0
-    picture = args.picture or Path(f"{args.file.name}.png")
-    if args.picture is None and picture.exists() and not args.overwrite:
-        print(f"picture: {picture} is there already; --picture gives another name")
-        return 0
+    wanted = "left out for what has no picture"
+    check_that(hasattr(product, "plot"), "picture", wanted, type(product).__name__)
+    picture = args.picture if args.picture.name else Path(f"{args.file.name}.png")
     check_output(picture, "picture", overwrite=args.overwrite, inputs=[args.file])
     from matplotlib import pyplot as plt
 
@@ -115,11 +120,94 @@ def cite(args):
     if args.file is None:
         from miricigale import __version__
 
-        print(f"miricigale {__version__} (CITATION.cff)")
-        print("Yang et al. 2021, ApJ 908, 144 (the study that it repeats)")
+        sources = [
+            f"miricigale {__version__} (CITATION.cff)",
+            "Yang et al. 2021, ApJ 908, 144 (the study that it repeats)",
+        ]
+        if args.bibtex:
+            print(bibtex(sources))
+            return 0
+        print("\n".join(sources))
         print("and what 'miricigale cite FILE' names for the products that you use")
         return 0
-    product = open_product(args.file)
-    found = getattr(product, "meta", {}).get("citations", ())
-    print("\n".join(found) if found else f"{args.file} names nothing to be cited")
+    sources = citations_of(args.file)
+    if not sources:
+        print(f"{args.file} names nothing to be cited")
+    else:
+        print(bibtex(sources) if args.bibtex else "\n".join(sources))
     return 0
+
+
+def citations_of(path):
+    """
+    What products name to be cited, each once, in the order of the files.
+
+    Parameters
+    ----------
+    path : `~pathlib.Path`
+        A product, or a folder of products, such as that of a study.
+
+    Returns
+    -------
+    citations : list of str
+    """
+    if not path.is_dir():
+        return list(getattr(open_product(path), "meta", {}).get("citations", ()))
+    citations = {}
+    for file in sorted(path.rglob("*")):
+        if file.suffix.lower() not in _PRODUCTS:
+            continue
+        try:
+            product = open_product(file)
+        except OSError:
+            # of another program
+            continue
+        citations |= dict.fromkeys(getattr(product, "meta", {}).get("citations", ()))
+    return list(citations)
+
+
+def bibtex(citations):
+    """
+    Entries for BibTeX.
+
+    Parameters
+    ----------
+    citations : iterable of str
+        Such as ``"Yang et al. 2021, ApJ 908, 144"``.
+
+    Returns
+    -------
+    text : str
+        An entry ``@misc`` of each, whose note is the citation: authors and year as far as it states them. ADS has
+        the full ones.
+
+    Examples
+    --------
+    >>> from miricigale.cli.products import bibtex
+    >>> print(bibtex(["Yang et al. 2021, ApJ 908, 144"]))
+    @misc{yang2021,
+      author = {Yang and others},
+      year = {2021},
+      note = {Yang et al. 2021, ApJ 908, 144}
+    }
+    """
+    entries = []
+    taken = set()
+    for text in citations:
+        match = re.match(r"(?P<author>[^,;(]+?),? \(?(?P<year>(?:19|20)\d\d)\b", text)
+        word = re.match(r"\W*(\w+)", text)[1].lower()
+        lines = []
+        if match:
+            authors = match["author"].replace("et al.", "and others").replace(" & ", " and ")
+            lines = [f"  author = {{{authors}}}", f"  year = {{{match['year']}}}"]
+        stem = word + (match["year"] if match else "")
+        key = stem
+        number = 1
+        while key in taken:
+            number += 1
+            key = f"{stem}_{number}"
+        taken.add(key)
+        note = re.sub(r"([&%#_$])", r"\\\1", text)
+        lines.append(f"  note = {{{note}}}")
+        entries.append(f"@misc{{{key},\n" + ",\n".join(lines) + "\n}")
+    return "\n".join(entries)

@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 
-from miricigale.cli.options import make_parser
+from miricigale.cli.options import in_options, make_parser
 
 # shells add the number of the signal to this
 _STOPPED = 128
@@ -71,7 +71,8 @@ def main(argv=None):
         bare = isinstance(err, KeyError) and " " not in str(message)
         kind = f"{type(err).__name__} " if bare else ""
         where = "".join(f" ({note})" for note in getattr(err, "__notes__", ()))
-        print(f"miricigale: {kind}{' '.join(str(message).split())}{where}", file=sys.stderr)
+        text = in_options(" ".join(str(message).split()), args.option_names)
+        print(f"miricigale: {kind}{text}{where}", file=sys.stderr)
         return 2
 
 

@@ -30,9 +30,9 @@ def run(args):
     if args.print_config:
         print(config.to_toml(), end="")
         return 0
-    if args.plan:
-        return _show_cost(config)
     folder = args.output or Path(config.run.name)
+    if args.plan:
+        return _show_cost(config, folder, **chosen(args, "until again"))
     begin = time.monotonic()
     options = chosen(args, "redo until again") | {"progress_bar": not args.no_progress}
     with workers(args.scheduler, config.run.threads, config.run.memory) as executor:
@@ -42,12 +42,19 @@ def run(args):
     return 0
 
 
-def _show_cost(config):
+def _show_cost(config, folder, until, again):
     """Print what a run takes, and do nothing."""
-    from miricigale.workflow import check_study, study_cost
+    from miricigale.workflow import StudyRunner, check_study, study_cost
+    from miricigale.workflow.stages import study_stages
 
     check_study(config)
+    # names of stages and units are checked as in a run
+    runner = StudyRunner(config, folder, study_stages, until=until, again=again)
     cost = study_cost(config)
+    if until is not None:
+        stages = {key.partition(":")[0] for key in runner.keys}
+        cost = cost[[name in stages for name in cost["stage"]]]
+        print(f"stages that {until!r} needs, with all of their units:")
     cost.pprint_all()
     hours, disk = cost["cpu"].sum().to_value("h"), cost["disk"].sum().to_value("GB")
     print(f"all: {cost['units'].sum()} units, {hours:.1f} hours of a core, {disk:.1f} GB")

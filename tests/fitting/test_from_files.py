@@ -60,7 +60,7 @@ def test_a_catalog_becomes_a_folder_of_results(catalog, tmp_path, capsys):
     options = ["--chunk-rows", "2", "--redshift", "z_spec", "--threads", "2"]
     options += ["--pairs", "age:tau", "--pairs", "ebv:age", "frac_agn:redshift"]
     argv = fit(tmp_path / "cat.fits", *options)
-    assert "5 objects, 5 fitted, 3 parts" in command(capsys, *argv).out
+    assert "5 objects, 5 fitted; table: " in command(capsys, *argv).out
     assert len(open_results(out)) == 5
     for galaxy in open_results(out):
         joint = galaxy.joint_pdf("tau", "age")
@@ -177,7 +177,7 @@ def test_a_votable_in_magnitudes_by_a_map(catalog, tmp_path, capsys):
     argv = fit(tmp_path / "cat.xml", *options, "zspec", out="one")
     with pytest.warns(MiricigaleWarning, match=r"cat\.xml: .*miri\.f770w 1 of 5 \(99\)"):
         told = command(capsys, *argv, "--map", tmp_path / "map.toml")
-    assert "5 objects, 5 fitted, 2 parts" in told.out
+    assert "5 objects, 5 fitted; table: " in told.out
     assert main(fit(tmp_path / "cat.fits", *options, "z_spec", out="two")) == 0
     mine, theirs = (QTable.read(tmp_path / one / "table.fits") for one in ("one", "two"))
     assert mine["id"].tolist() == [f"obj-{k}" for k in range(1, 6)]
@@ -231,9 +231,9 @@ def test_magnitudes_in_files_are_the_fluxes_that_they_are_in_tables(tmp_path, ta
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--redshift", "z_phot"], "'redshift' must be a column among"),
+        (["--redshift", "z_phot"], "--redshift must be a column among"),
         (["--hdu", "SECOND"], "no binary table in extension 'SECOND'"),
-        (["--chunk-rows", "0"], "'chunk_rows' must be an integer >= 1, got 0"),
+        (["--chunk-rows", "0"], "--chunk-rows must be an integer >= 1, got 0"),
         (["--pairs", "age:mood"], "no parameter for 'pairs' 'mood'; known: age"),
         (
             ["--flux-unit", "mag"],

@@ -231,7 +231,7 @@ def test_several_bands_are_measured_in_one_call(files, tmp_path, capsys):
     assert main([*command, *more[:2]]) == 2
     assert "'--weight' must be given for each of 2 images" in capsys.readouterr().err
     assert main([*command, *more[:2], "--filter", BAND, *more[4:], "--overwrite"]) == 2
-    assert "'image' must be of different filters" in capsys.readouterr().err
+    assert "--image must be of different filters" in capsys.readouterr().err
 
 
 def test_sources_are_detected_on_several_images(files, tmp_path):
@@ -265,10 +265,10 @@ def test_our_own_files_are_read(files, tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"filter": None}, "'filter' must be given, for the header of"),
-        ({"filter": "miri.f771w"}, "'filter' must be a filter that 'miricigale filters' lists"),
+        ({"filter": None}, "--filter must be given, for the header of"),
+        ({"filter": "miri.f771w"}, "--filter must be a filter that 'miricigale filters' lists"),
         ({"image": "highres", "highres": "image", "filter": "nircam.f356w", "weight": None},
-         "'filter' must be 'nircam.f430m', the filter in"),
+         "--filter must be 'nircam.f430m', the filter in"),
         ({"image": "highres", "highres": "f770w", "weight": None, "filter": "miri.f770w"},
          "seem to be swapped"),
         ({"highres": "f770w", "image": "image", "psf": "highres-psf", "highres-psf": "psf",
@@ -278,19 +278,19 @@ def test_our_own_files_are_read(files, tmp_path):
         ({"highres": "mirrored", "highres-error": None}, "mirrored.fits: 'wcs' must be of an image of"),
         ({"segmentation": "moved"}, "is not on the pixels of"),
         ({"segmentation": "absent.fits"}, "no file absent.fits ('segmentation')"),
-        ({"psf": None, "filter": "miri.f770w"}, "'pa_aper' must be given, for the header of"),
+        ({"psf": None, "filter": "miri.f770w"}, "--pa-aper must be given, for the header of"),
         ({"highres-psf": None}, "there is no model PSF for nircam.f430m"),
-        ({"highres-psf": None, "highres": "f444w"}, "'highres_pa_aper' must be given, for the"),
+        ({"highres-psf": None, "highres": "f444w"}, "--highres-pa-aper must be given, for the"),
         ({"psf": None, "filter": "nircam.f480m"}, "there is no model PSF for nircam.f480m"),
-        ({"kernel": "psf"}, "'psf' must be left out where a kernel is given"),
+        ({"kernel": "psf"}, "--psf must be left out where a kernel is given"),
         ({"kernel": "segmentation", "psf": None, "highres-psf": None}, "cannot be read as a kernel"),
         ({"kernel": "segmentation", "psf": None, "highres-psf": None}, "square with an odd number of pixels"),
         ({"psf": "segmentation"}, "seg.fits cannot be read as a PSF"),
         ({"psf": "cube"}, "must be an image with a PSF, got the shape"),
-        ({"output": "out.txt"}, "'output' must be a table (.ecsv, .fits, .fits.gz)"),
-        ({"output": "/proc/none/out.ecsv"}, "'output' must be in a folder that can be written to"),
+        ({"output": "out.txt"}, "--output must be a table (.ecsv, .fits, .fits.gz)"),
+        ({"output": "/proc/none/out.ecsv"}, "--output must be in a folder that can be written to"),
         ({"output": "image"}, "another file than those that are read"),
-        ({"output": "there.ecsv"}, "'output' must be a new file (or 'overwrite' given)"),
+        ({"output": "there.ecsv"}, "--output must be a new file (or --overwrite given)"),
     ],
 )  # fmt: skip
 def test_what_does_not_fit_is_refused_before_the_work(
@@ -330,7 +330,7 @@ def test_an_angle_other_than_the_headers_is_refused(files, tmp_path, capsys):
     output = tmp_path / "out.ecsv"
     command = arguments(files, output, image=path, psf=None)
     assert main([*command, "--pa-aper", "40"]) == 2
-    assert "'pa_aper' must be PA_APER of" in capsys.readouterr().err
+    assert "--pa-aper must be PA_APER of" in capsys.readouterr().err
 
 
 def test_a_real_field_agrees_with_another_program(data_file, tmp_path, capsys):

@@ -89,5 +89,5 @@ def test_the_command_states_what_empty_apertures_of_a_real_image_scatter_by(
             pulls = 5 * (sums - np.median(sums)) / limit
             assert 1.4826 * np.median(np.abs(pulls)) == pytest.approx(1, abs=0.08)
     assert main([*command]) == 2
-    assert "'output' must be a new file" in capsys.readouterr().err
+    assert "--output must be a new file" in capsys.readouterr().err
     assert_allclose(table["stated"] * table["factor"], table["error"])

@@ -135,6 +135,12 @@ def test_help_names_presets_and_surveys(capsys):
         (["photometry", "a", "b", *SETTINGS], "miricigale: a cannot be read as an image"),
         (["fit"], "miricigale fit: the following arguments are required: CATALOG"),
         (["fitt"], "miricigale: argument COMMAND: invalid choice: 'fitt'"),
+        (["fitt"], "; did you mean 'fit'? (see miricigale --help)"),
+        (["fit", "a.fits", "--flux-unti", "Jy"], "did you mean '--flux-unit'?"),
+        (
+            ["run", "goodss", "--quick", "--plan", "--until", "mosaic"],
+            "--until is 'mosaic', which is no",
+        ),
         (["plan", "--depth", "x"], "miricigale plan: argument --depth: invalid float value"),
         (["photometry", "a", "b", "--error", "c", "--weight", "d"], "must be at most one of them"),
         (["reduce", "absent_uncal.fits", "-o", "out"], "miricigale: no file absent_uncal.fits"),
@@ -186,16 +192,28 @@ def test_products_are_shown_cited_and_have_psfs(capsys, tmp_path, monkeypatch):
         text = command(capsys, "show", name).out
         assert f"{name}: " in text
         assert words in text
-        assert Path(f"{name}.png").exists() == (name != "t.ecsv")
+        # nothing is written unasked
+        assert not Path(f"{name}.png").exists()
+    command(capsys, "show", "mosaic.fits", "--picture")
+    assert Path("mosaic.fits.png").read_bytes().startswith(b"\x89PNG")
+    told = command(capsys, "show", "t.ecsv", "--picture", status=2).err
+    assert "--picture must be left out for what has no picture" in told
     # a picture that is there stays
     Path("mine.png").write_text("mine")
     told = command(capsys, "show", "mosaic.fits", "--picture", "mine.png", status=2).err
-    assert "'picture' must be a new file (or 'overwrite' given)" in told
+    assert "--picture must be a new file (or --overwrite given)" in told
     assert Path("mine.png").read_text() == "mine"
     command(capsys, "show", "mosaic.fits", "--picture", "mine.png", "--overwrite")
     assert Path("mine.png").read_bytes().startswith(b"\x89PNG")
     assert command(capsys, "cite", "t.ecsv").out == "Nobody 2030\n"
     assert "ApJ 908, 144" in command(capsys, "cite").out
+    # a folder names all of its products, BibTeX each once
+    assert "Nobody 2030" in command(capsys, "cite", ".").out.splitlines()
+    entry = command(capsys, "cite", "t.ecsv", "--bibtex").out
+    assert (
+        entry
+        == "@misc{nobody2030,\n  author = {Nobody},\n  year = {2030},\n  note = {Nobody 2030}\n}\n"
+    )
     command(capsys, "psf", "mosaic.fits", "-o", "psf.fits")
     # Perrin et al.: 0.269 arcsec, and what drizzling adds
     assert 0.26 < InstrumentPSF.read("psf.fits").fwhm.to_value(u.arcsec) < 0.31

@@ -7,8 +7,9 @@ of it.
 """
 
 # %%
-# ``miricigale show FILE`` prints what it is and draws it. It knows the package's images, ramps, PSFs, kernels,
-# fits and tables, JWST files, and any other FITS image or table. Here are some files to look at:
+# ``miricigale show FILE`` prints what it is, and draws it with ``--picture``. It knows images, ramps, PSFs,
+# kernels, fits and tables of the package, JWST files, and any other FITS image or table. Here are some files to
+# look at:
 
 import astropy.units as u
 import matplotlib.pyplot as plt
@@ -31,7 +32,7 @@ path = ramp.write("f770w_uncal.fits", overwrite=True)
 # %%
 # .. code-block:: console
 #
-#    $ miricigale show kernel.fits
+#    $ miricigale show kernel.fits --picture
 
 status = main(["show", "kernel.fits", "--picture", "kernel.png"])
 
