@@ -96,7 +96,24 @@ else:
     intersphinx_mapping = {}
 
 default_role = "py:obj"
-rst_epilog = ""
+# addresses stand in ``project_urls`` of setup.cfg alone, from the first release on
+_ADDRESSES = dict(
+    entry.split(", ", 1)
+    for entry in importlib.metadata.metadata("miricigale").get_all("Project-URL") or ()
+)
+
+
+def _address(label, text):
+    """A link of the metadata, or that there is none yet."""
+    if label in _ADDRESSES:
+        return f"`{text} <{_ADDRESSES[label]}>`__"
+    return f"{text} (not yet published)"
+
+
+rst_epilog = f"""
+.. |repository| replace:: {_address("Repository", "repository")}
+.. |issues| replace:: {_address("Issues", "issues of the repository")}
+"""
 automodapi_toctreedirnm = "reference/api"
 autodoc_typehints = "none"
 # signatures show defaults as they are written

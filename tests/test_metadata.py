@@ -110,3 +110,28 @@ def test_citation_has_the_version_of_the_last_release():
     citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
     stated = dict(re.findall(r"^(version|date-released): (\S+)$", citation, re.MULTILINE))
     assert (stated["version"], stated.get("date-released")) == (version, date)
+
+
+def test_addresses_stand_in_the_metadata_alone():
+    """Files that cannot read the metadata say the same, or that nothing is published yet."""
+    stated = SETUP["metadata"].get("project_urls", "")
+    addresses = dict(re.findall(r"^(\w+) = (\S+)$", stated, re.MULTILINE))
+    readme = (ROOT / "README.rst").read_text(encoding="utf-8")
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    code = re.findall(r"^repository-code: (\S+)$", citation, re.MULTILINE)
+    assert code == [addresses["Repository"]] if addresses else code == []
+    assert ("not yet published" in readme) == (not addresses)
+    assert all(address in readme for address in addresses.values())
+
+
+def test_supported_versions_of_python_are_tested():
+    pattern = r"Programming Language :: Python :: (3\.\d+)$"
+    classified = re.findall(pattern, SETUP["metadata"]["classifiers"], re.MULTILINE)
+    workflow = ROOT / ".github/workflows/ci.yml"
+    if not workflow.is_file():
+        pytest.skip("the source archive has no workflow")
+    tested = set(re.findall(r'python: "(3\.\d+)", env: py', workflow.read_text(encoding="utf-8")))
+    assert tested == set(classified)
+    first, last = classified[0], classified[-1]
+    for name in ("README.rst", "docs/install.rst", "docs/developers/contributing.rst"):
+        assert f"Python {first} to {last}" in (ROOT / name).read_text(encoding="utf-8"), name
