@@ -1,6 +1,7 @@
 """Passbands."""
 
 import dataclasses
+import re
 from pathlib import Path
 
 import astropy.units as u
@@ -13,7 +14,7 @@ from miricigale.filters.curve_files import read_curve
 from miricigale.filters.library import FILTERS, load_curve
 from miricigale.filters.spectra import check_wave, spectrum_arrays
 from miricigale.utils.caching import cached, cached_property
-from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.exceptions import argument_error, data_error, unknown_name
 from miricigale.utils.files import reading
 from miricigale.utils.interactive import Interactive, checked_calls
 from miricigale.utils.options import check_that
@@ -179,6 +180,78 @@ class Filter(Frozen, Interactive):
     def names():
         """Names of the library, sorted, as a tuple."""
         return tuple(FILTERS.names())
+
+    @staticmethod
+    def search(text):
+        """
+        Names of the library by a part of them, or by a wavelength.
+
+        Parameters
+        ----------
+        text : str or `~astropy.units.Quantity`
+            Part of a name, such as ``"miri"``, or a wavelength, such as ``"1.6 um"``.
+
+        Returns
+        -------
+        names : tuple of str
+            Sorted; at a wavelength the filters with at least half of their highest throughput there, the nearest
+            pivot first. Empty if there are none.
+
+        Raises
+        ------
+        `~astropy.units.UnitsError`
+            If a quantity is no wavelength.
+
+        Examples
+        --------
+        >>> from miricigale.filters import Filter
+        >>> Filter.search("miri.f1")
+        ('miri.f1000w', 'miri.f1130w', 'miri.f1280w', 'miri.f1500w', 'miri.f1800w')
+        >>> Filter.search("25.5 um")
+        ('miri.f2550w', 'mips.24')
+        """
+        try:
+            # text alone may be a unit too
+            is_wave = not isinstance(text, str) or re.match(r"\s*[\d.]+\s*[A-Za-zµ]", text)
+            wave = u.Quantity(text) if is_wave else None
+        except (TypeError, ValueError):
+            wave = None
+        if wave is None:
+            return tuple(name for name in FILTERS.names() if str(text).lower() in name)
+        wave = to_array(wave, WAVE, "text", ndim=0, finite=True)
+        near = []
+        for name in FILTERS.names():
+            band = Filter.from_name(name)
+            if band(wave * WAVE) >= 0.5 * band.throughput.max():
+                near.append((abs(band.pivot.value - wave), name))
+        return tuple(name for _, name in sorted(near))
+
+    @classmethod
+    def from_svo(cls, path, *, name=None):
+        """
+        Make a filter of a file of the SVO Filter Profile Service (a VOTable); nothing is downloaded.
+
+        Parameters
+        ----------
+        path : path-like
+            The file, as the service gives it.
+        name : str, optional
+            As for `read`, which does the same.
+
+        Returns
+        -------
+        filter : `Filter`
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.DataError`
+            If there is no such file, or it is none of a filter; the message says where the service has it.
+        """
+        if not Path(path).is_file():
+            # the service has most curves of the library under its own names
+            what = "is no file; nothing is downloaded: save the VOTable of http://svo2.cab.inta-csic.es/theory/fps"
+            raise data_error(path, f"{what}, or take Filter({str(path)!r}) of the library")
+        return cls.read(path, name=name)
 
     @property
     def min_wavelength(self):

@@ -213,3 +213,28 @@ def test_bundled_curves_are_where_they_are_published():
     published = {"z": 0.8817, "y": 1.0305, "j": 1.2483, "h": 1.6313, "k": 2.2010}
     for band, wave in published.items():
         assert_allclose(Filter.from_name(f"wfcam.{band}").pivot.value, wave, rtol=6e-3)
+
+
+def test_filters_are_searched_by_wavelength_and_name():
+    names = Filter.search("1.6 um")
+    assert "wfc3.f160w" in names
+    for name in names:
+        band = Filter(name)
+        assert band(1.6 * u.um) >= 0.5 * band.throughput.max()
+    pivots = [abs(Filter(name).pivot.to_value(u.um) - 1.6) for name in names]
+    assert pivots == sorted(pivots)
+    assert Filter.search(16000 * u.AA) == names
+    assert Filter.search("f770w") == ("miri.f770w",)
+    assert Filter.search("nothing") == ()
+    with pytest.raises(u.UnitsError, match="'text' must be convertible to um"):
+        Filter.search("3 s")
+
+
+def test_a_file_of_the_svo_is_a_filter(tmp_path):
+    band = Filter("F770W")
+    band.to_table().write(tmp_path / "a.vot", format="votable")
+    assert Filter.from_svo(tmp_path / "a.vot", name="mine").pivot.to_value(u.um) == pytest.approx(
+        band.pivot.value
+    )
+    with pytest.raises(DataError, match=r"is no file; nothing is downloaded"):
+        Filter.from_svo("JWST/MIRI.F770W")
