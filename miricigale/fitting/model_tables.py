@@ -1,5 +1,7 @@
 """Tables of the parts of a model's light, finer than its grid, and derived quantities that follow from them."""
 
+import threading
+from collections import OrderedDict
 from dataclasses import dataclass
 
 import astropy.units as u
@@ -17,12 +19,14 @@ from miricigale.fitting.part_tables import (
     part_columns,
     with_columns,
 )
+from miricigale.sed.grid_cache import grid_key, is_own
 from miricigale.sed.light_parts import (
     FORMED_COLUMNS,
     LightParts,
     part_parameters,
     quantities_of_parts,
 )
+from miricigale.utils.content import content_sha256
 from miricigale.utils.options import check_that
 
 #: Part of a parameter's first step at which dust that may be absent is evaluated in place of 0.
@@ -36,6 +40,10 @@ _N_LINE_REDSHIFTS = 5
 _REDSHIFT_STEP = 0.01
 #: Bursts differ by less than this along an axis that has no effect on them.
 _NO_EFFECT = 1e-6
+#: Tables that are kept for further fitters of a process (some 50 MB each), the last used at the end.
+_MOST_KEPT = 2
+_kept = OrderedDict()
+_lock = threading.Lock()
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,7 +210,35 @@ class ModelTables:
         return PartAxes(axes, evaluate[name], self._refuses)
 
     def tables(self):
-        """`_core.Light`, derived quantities of galaxies, and properties of AGN."""
+        """
+        `_core.Light`, derived quantities of galaxies, and properties of AGN.
+
+        A process keeps those it used last: fits of the same models and bands, such as a calibration and the fit
+        that it is for, share them. Nobody writes to them; they are not marked read-only, for which numba would
+        compile the kernels anew.
+        """
+        if not is_own(self.model):
+            return self._evaluated()
+        key = self._key()
+        with _lock:
+            tables = _kept.pop(key, None)
+        if tables is None:
+            tables = self._evaluated()
+        with _lock:
+            _kept[key] = tables
+            while len(_kept) > _MOST_KEPT:
+                _kept.popitem(last=False)
+        return tables
+
+    def _key(self):
+        """Checksum of all that tables depend on."""
+        axes = {
+            name: [axis.kind, np.asarray(axis.values, float)] for name, axis in self.axes.items()
+        }
+        content = [self.constants, axes, list(self.place), self.redshift]
+        return grid_key(self.model, {}, self.filters), content_sha256(content)
+
+    def _evaluated(self):
         n_lines = min(_N_LINE_REDSHIFTS, len(self.redshift))
         picked = np.linspace(0, len(self.redshift) - 1, n_lines + 2)[1:-1]
         lines = self.light_at(self.redshift[np.unique(np.rint(picked).astype(int))])

@@ -48,6 +48,11 @@ def grid_key(model, axes, filters):
     return content_sha256(content)
 
 
+def is_own(model):
+    """Whether all components are of this package: the code of others may change under the same name."""
+    return all(type(c).__module__.startswith("miricigale.") for c in model.components)
+
+
 def _unchanged(model):
     """Whether the files that were read are those that are there now."""
     return all(
@@ -65,8 +70,7 @@ def cached_grid(model, axes, filters, make):
     outside this package are not cached, since their code may change under the same name.
     """
     limit = conf.grid_cache_size * 1e6
-    own = all(type(c).__module__.startswith("miricigale.") for c in model.components)
-    if limit <= 0 or not own:
+    if limit <= 0 or not is_own(model):
         return make(model, axes, filters)
     path = cache_folder() / "grids" / f"{grid_key(model, axes, filters)}.fits"
     if path.exists():
