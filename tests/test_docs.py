@@ -42,6 +42,7 @@ def code_of(text):
             indent, options = len(line) - len(bare), True
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", SCRIPTS, ids=name_of)
 def test_example_runs_and_draws(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

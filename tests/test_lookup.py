@@ -8,6 +8,8 @@ import re
 import textwrap
 from pathlib import Path
 
+import pytest
+
 import miricigale
 from miricigale.utils.tables import Flags
 
@@ -102,6 +104,7 @@ def letters(text):
     return len(re.sub(r"\W|_", "", text))
 
 
+@pytest.mark.slow
 def test_messages_of_troubleshooting_are_those_of_the_code():
     names = ("troubleshooting", "troubleshooting_catalogs", "troubleshooting_images")
     pages = [f"{name}.rst" for name in names]

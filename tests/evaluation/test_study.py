@@ -149,6 +149,7 @@ def test_magnitudes_by_shape_and_crowding():
     assert error.value == pytest.approx(0.6745 * 0.1, rel=0.5)
 
 
+@pytest.mark.slow
 def test_xray_fluxes_are_those_of_the_relation(study):
     one = study.at(0.6)
     flux = yang2021_xray_flux(one.truth["l_6um"][:3], one.truth["redshift"][:3])
@@ -237,6 +238,7 @@ def test_published_numbers_are_named_once_and_can_be_measured():
     assert all(one.source for one in PUBLISHED)
 
 
+@pytest.mark.slow
 def test_a_study_beside_the_paper(study):
     extra = {"points.scatter": Estimate(0.01), "f_scaling.f770w": Estimate(1.0, 0.99, 1.01, 40)}
     study, reasons = dataclasses.replace(study, extra=extra), {"f_scaling.f770w": "no mismatch"}
@@ -264,6 +266,7 @@ def test_a_study_beside_the_paper(study):
     refuses("no published number 'outliers'", compare_with_paper, study, error=KeyError, **unknown)
 
 
+@pytest.mark.slow
 def test_numbers_of_other_exposures_are_not_judged(study):
     """Two of 366 s next to 1665 s: only what does not depend on the depth has a verdict."""
     extra = {"points.scatter": Estimate(0.01), "f_scaling.f770w": Estimate(1.0, 0.99, 1.01, 40)}

@@ -264,6 +264,7 @@ def test_the_real_part_of_ceers(data_file):
     assert np.count_nonzero(snr > 5) <= 1053
 
 
+@pytest.mark.slow
 def test_real_magnitudes_of_goodss(data_file):
     path = data_file("catalogs/goodss_3dhst.v4.1.jwst_galfit.cat.gz")
     columns = {"wfc3.f160w": "mag_wfc3_f160w", "nircam.f444w": "mag_nircam-f444w"}

@@ -87,6 +87,7 @@ def test_a_filter_cites_its_source():
     assert any("sedpy" in text for text in meta["citations"])
 
 
+@pytest.mark.slow
 def test_catalog_convention_gives_the_true_flux_of_its_reference_spectrum():
     def blackbody(lam):
         return BlackBody(1e4 * u.K)(lam * u.um).value * 1e6

@@ -128,6 +128,7 @@ def results(fitter, table):
     return fitter.fit(table)
 
 
+@pytest.mark.slow
 def test_posteriors_are_sums_over_the_prior(results, by_hand):
     """Of a grid whose logarithms are nearly parabolas, so that models between its nodes are known."""
     values, weights = by_hand

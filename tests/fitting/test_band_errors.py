@@ -160,6 +160,7 @@ def rows_of(calibration):
     return dict(zip(calibration.bands["band"], calibration.bands, strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known", [None, "z_spec"])
 def test_a_catalog_says_what_was_done_to_it(model_fluxes, fitter, known):
     """At free redshifts and at known ones: factor, part, zero point, share of wrong fluxes."""
@@ -272,6 +273,7 @@ def test_fitters_that_cannot_be_calibrated(model_fluxes, fitter):
     refuses("'seed' must be a non-negative integer", calibrate_bands, fitter, table, seed=-1)
 
 
+@pytest.mark.slow
 def test_a_catalog_on_disk_is_measured_once_and_by_pieces(
     model_fluxes, fitter, tmp_path, monkeypatch
 ):
@@ -349,6 +351,7 @@ def test_calibrate_is_a_column_or_a_truth_value():
     refuses(text, calibrates_itself, 3, "default", "survey", None, None)
 
 
+@pytest.mark.slow
 def test_fitters_of_real_galaxies_have_the_prior_of_bands_that_were_not_measured():
     """Unless other errors are given; the calibration itself says nothing of bands."""
     bands = ["acs.f814w", "F160W", "miri.f770w"]

@@ -91,6 +91,7 @@ def at_nodes(grid, drawn):
     return interpolated(grid, 0).fit(drawn[0])
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_truth_between_nodes(grid, drawn, at_nodes):
     table, true = drawn
     results = interpolated(grid, 150).fit(table)
@@ -112,6 +113,7 @@ def test_what_rests_on_one_node_is_flagged(grid, drawn, at_nodes):
     assert not np.any(wide.flags & int(FitFlags.ONE_NODE))
 
 
+@pytest.mark.slow
 def test_known_redshifts_are_those_of_the_catalog(grid, drawn):
     """Also where they lie between nodes; the rest is then that of these redshifts."""
     table, true = drawn
@@ -226,6 +228,7 @@ def test_interpolated_models_are_those_of_the_chain(chain, off_nodes, finer):
         assert_allclose(derived[name], true[name].value, rtol=within)
 
 
+@pytest.mark.slow
 def test_intervals_of_galaxies_and_agn(chain, off_nodes, finer):
     """Of models of the chain, two-sided; ``benchmarks/intervals.py`` measures more of them."""
     table, true, _ = off_nodes

@@ -164,6 +164,7 @@ CASES = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_posteriors_are_those_of_every_model(grid, objects, case):
     options, settings, given, fixed = CASES[case]

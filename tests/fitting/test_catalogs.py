@@ -182,6 +182,7 @@ def test_errors_may_be_per_cent(grid, catalog):
         refuses(f"'model_error' must {text}", BayesFitter, grid, error=error, model_error=bad)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("limited", [False, True])
 @pytest.mark.parametrize("flux", [0.0, -0.3, 1e-158, 1e-250])
 def test_without_signal_the_posterior_is_the_prior(flux, limited):

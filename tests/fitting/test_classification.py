@@ -146,6 +146,7 @@ def sources(n, seed):
     return noisy(10 * flux / flux[:, [2]], 20, seed, names)
 
 
+@pytest.mark.slow
 def test_sources_of_known_class_are_sorted(fitters):
     """At S/N 20 in six bands nine of ten of each class are found, stars always (Planck's law is narrow)."""
     n = 20
@@ -178,6 +179,7 @@ def test_spectra_at_redshifts_are_seen_behind_the_medium():
     refuses("'redshift' must be finite, asc", template_grid, spectra, bands, redshift=[2, 1])
 
 
+@pytest.mark.slow
 def test_little_red_dots_are_no_dwarfs(fitters):
     """Broken power laws with H alpha of 700 A are red dots, at 0.15 of 1 + z; galaxies stay such."""
     bands = [
@@ -252,6 +254,7 @@ WITH_SPECTRA = """
 """
 
 
+@pytest.mark.slow
 def test_redshifts_of_little_red_dots_are_those_of_their_spectra():
     """Published photometry and redshifts, none of which the models were made with."""
     rows = np.array([line.split() for line in WITH_SPECTRA.split("\n") if line], dtype=float)
@@ -275,6 +278,7 @@ def test_redshifts_of_little_red_dots_are_those_of_their_spectra():
     assert 3500 < np.median(results.median("temperature").value) < 6300
 
 
+@pytest.mark.slow
 def test_red_dots_are_seen_behind_the_milky_way():
     """Dust dims the bands of each spectrum as it does the spectrum itself."""
     bands = ["acs.f814w", "nircam.f150w", "nircam.f444w", "miri.f770w"]

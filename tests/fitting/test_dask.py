@@ -60,6 +60,7 @@ def whole(fitter, photometry, process):
     return fitter.fit(photometry, executor=process)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*an id that occurred before")
 def test_two_dask_workers_give_the_numbers_of_one_process(
     fitter, photometry, whole, process, tmp_path
@@ -70,7 +71,7 @@ def test_two_dask_workers_give_the_numbers_of_one_process(
     photometry["id"][70] = photometry["id"][3]
     photometry.write(tmp_path / "catalog.fits")
     one, two = (tmp_path / name for name in ("one", "two"))
-    arguments = {"path_in": tmp_path / "catalog.fits", "chunk_rows": 5}
+    arguments = {"path_in": tmp_path / "catalog.fits", "chunk_rows": 15}
     options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": ":0"}
     with (
         distributed.LocalCluster(**options) as cluster,

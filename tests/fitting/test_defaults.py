@@ -71,6 +71,7 @@ def in_flux(table):
     return out
 
 
+@pytest.mark.slow
 def test_models_bands_and_calibration_by_default():
     model, named = SEDModel.survey(), {"axes": "survey"}
     fitters = [
@@ -129,6 +130,7 @@ def test_a_fitter_says_what_it_fits():
     assert "bands: of the photometry" in BayesFitter().summary()
 
 
+@pytest.mark.slow
 def test_the_grid_of_the_study_is_asked_for_by_name():
     fitter = BayesFitter(BANDS, axes="yang2021-quick")
     assert fitter.model.preset == fitter.grid_name.partition("-")[0] == "yang2021"
@@ -146,6 +148,7 @@ def test_the_grid_of_the_study_is_asked_for_by_name():
             assert BayesFitter(axes=former).grid_name == name
 
 
+@pytest.mark.slow
 def test_without_bands_those_of_the_photometry_are_fitted(catalog, tmp_path):
     """As for the same bands by name, whatever columns are called, from a file too."""
     wanted = BayesFitter(BANDS).fit(in_flux(catalog))
@@ -176,6 +179,7 @@ def test_without_bands_those_of_the_photometry_are_fitted(catalog, tmp_path):
     refuses("left out where 'model' is a list of bands", BayesFitter, BANDS, BANDS)
 
 
+@pytest.mark.slow
 def test_python_and_the_command_give_the_same_numbers(catalog, tmp_path, capsys):
     """Of AB magnitudes through a map, of fluxes, and of a table in memory: without an option anywhere."""
     catalog.write(tmp_path / "mag.csv")
@@ -222,6 +226,7 @@ def test_classes_by_one_option():
     refuses("'stars' must be spectra", chosen_classes, "stars")
 
 
+@pytest.mark.slow
 def test_the_command_of_the_how_to_gives_the_table_of_its_python(tmp_path, monkeypatch, capsys):
     """The script is run, then its command with the map that it prints."""
     monkeypatch.chdir(tmp_path)

@@ -54,6 +54,7 @@ def catalog():
     return out
 
 
+@pytest.mark.slow
 def test_a_catalog_becomes_a_folder_of_results(catalog, tmp_path, capsys):
     catalog.write(tmp_path / "cat.fits")
     out = tmp_path / "out"
@@ -82,6 +83,7 @@ def test_a_catalog_becomes_a_folder_of_results(catalog, tmp_path, capsys):
     assert open_results(out).n_parts == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["parquet", "vot"])
 def test_catalogs_of_other_formats_and_from_standard_input(
     catalog, tmp_path, capsys, monkeypatch, kind
@@ -108,6 +110,7 @@ def test_catalogs_of_other_formats_and_from_standard_input(
             )
 
 
+@pytest.mark.slow
 def test_the_workers_of_a_scheduler_give_the_table_of_this_process(catalog, tmp_path, capsys):
     distributed = pytest.importorskip("distributed", reason="dask.distributed is not installed")
     catalog.write(tmp_path / "cat.fits")
@@ -122,6 +125,7 @@ def test_the_workers_of_a_scheduler_give_the_table_of_this_process(catalog, tmp_
         assert_allclose(u.Quantity(there[name]).value, u.Quantity(here[name]).value, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_real_galaxies_have_their_own_grid_whose_errors_are_logged(tmp_path, caplog):
     """Of models of the survey grid without noise the best fit has all that went in."""
     model, axes = SEDModel.survey(), SEDModel.survey_axes()
@@ -157,6 +161,7 @@ def test_real_galaxies_have_their_own_grid_whose_errors_are_logged(tmp_path, cap
     assert "10 % of the flux added to errors" in caplog.text
 
 
+@pytest.mark.slow
 def test_a_votable_in_magnitudes_by_a_map(catalog, tmp_path, capsys):
     """Names of a survey, AB magnitudes and text ids give the fits of the same fluxes."""
     table = Table({"ID": [f"obj-{k}" for k in catalog["id"]], "zspec": catalog["z_spec"]})
@@ -189,6 +194,7 @@ def test_a_votable_in_magnitudes_by_a_map(catalog, tmp_path, capsys):
     assert "a table with columns of 'candels'" in told.err
 
 
+@pytest.mark.slow
 def test_ctrl_c_keeps_what_is_finished(catalog, tmp_path, capsys, monkeypatch):
     catalog.write(tmp_path / "cat.ecsv")
     out = tmp_path / "out"
@@ -209,6 +215,7 @@ def test_ctrl_c_keeps_what_is_finished(catalog, tmp_path, capsys, monkeypatch):
     assert len(QTable.read(out / "table.fits")) == 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("table", "unit"),
     [
@@ -270,6 +277,7 @@ def test_a_table_without_fluxes_is_refused_with_what_is_wanted(tmp_path, capsys,
     assert "Traceback" not in err
 
 
+@pytest.mark.slow
 def test_the_page_says_how_redshifts_compare_and_what_is_left_out(catalog, tmp_path, monkeypatch):
     """Redshifts of the models themselves come back; a band of no error is counted, flags have their meanings."""
     table = catalog.copy()
@@ -297,6 +305,7 @@ def test_the_page_says_how_redshifts_compare_and_what_is_left_out(catalog, tmp_p
     refuses("z_phot", fit_page, results, tmp_path / "cat.fits", z_spec="z_phot")
 
 
+@pytest.mark.slow
 def test_fluxes_behind_the_milky_way_give_the_galaxies_in_front_of_it(catalog, tmp_path):
     """E(B-V) of 0.3, 0.2 mag in F125W, put on the fluxes and given to the fit; without it masses are low."""
     table = catalog.copy()
@@ -312,6 +321,7 @@ def test_fluxes_behind_the_milky_way_give_the_galaxies_in_front_of_it(catalog, t
     assert np.all(found["chi2_best"] < 0.1)
 
 
+@pytest.mark.slow
 def test_a_catalog_is_sorted_into_galaxies_quasars_and_stars(
     catalog, tmp_path, capsys, monkeypatch
 ):
@@ -380,6 +390,7 @@ def test_a_catalog_is_sorted_into_galaxies_quasars_and_stars(
     assert "no such file" in command(capsys, *argv[:-1], tmp_path / "none", status=2).err
 
 
+@pytest.mark.slow
 def test_a_catalog_is_calibrated_by_its_known_redshifts(tmp_path, capsys, monkeypatch):
     """A zero point that is 15 % off is found, used, kept for the next call, and shown on the page."""
     axes, rng, n = SEDModel.yang2021_axes("quick"), np.random.default_rng(6), 104

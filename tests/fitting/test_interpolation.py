@@ -70,6 +70,7 @@ def anywhere(axes, n, rng):
     return values
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", PRESETS)
 def test_models_between_nodes_are_those_of_the_chain(preset):
     """Fluxes and quantities within 2 % of the chain's, at places that no table has."""

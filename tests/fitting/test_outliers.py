@@ -71,6 +71,7 @@ def by_hand(grid, results, i):
     return best.reshape(shape), wrong.reshape(*shape, 6)
 
 
+@pytest.mark.slow
 def test_posterior_is_that_of_the_mixture(grid, table):
     """Evidence to 0.1, redshifts and fractions to 0.04 in weight, probabilities to 0.02 (rms)."""
     options = {"model_error": 0.02, "settings": GridSettings(rtol=0.0)}

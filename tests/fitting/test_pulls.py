@@ -46,6 +46,7 @@ def test_pulls_are_those_of_least_squares_without_the_band():
     assert np.isnan(pull[[1, 5], [0, 3]]).all()
 
 
+@pytest.mark.slow
 def test_bands_whose_errors_are_too_small_are_named(tmp_path):
     grid, x = make_grid(n_z=3, n_b=8, frac=[0.0]), np.linspace(-1, 1, 8)
     # power laws that are no farther from each other than errors leave them

@@ -91,6 +91,7 @@ def in_pieces(fitter, tmp_path):
     return fit
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chunk_rows", [1, 7, 64, 100, 1000])
 def test_the_pieces_are_one_fit_bit_for_bit(fitter, catalog, in_pieces, chunk_rows):
     catalog = catalog[: 25 * chunk_rows]
@@ -146,6 +147,7 @@ def test_csv_has_the_unit_that_is_given(fitter, catalog, in_pieces, tmp_path):
     refuses(text, *arguments, error=u.UnitsError, flux_unit="mag")
 
 
+@pytest.mark.slow
 def test_a_stopped_fit_is_resumed(fitter, on_disk, catalog, tmp_path):
     arguments = (fitter, *on_disk)
     whole = fitter.fit(catalog)
@@ -165,6 +167,7 @@ def test_a_stopped_fit_is_resumed(fitter, on_disk, catalog, tmp_path):
     assert executor.n_tasks == 2
 
 
+@pytest.mark.slow
 def test_a_damaged_part_is_made_again(fitter, on_disk, catalog, tmp_path):
     arguments = (fitter, *on_disk)
     fit_file(*arguments, chunk_rows=40)
@@ -199,6 +202,7 @@ def test_a_full_disk_is_reported_with_the_file_and_left_behind(
     assert sorted(item.name for item in tmp_path.iterdir()) == ["catalog.fits", "out"]
 
 
+@pytest.mark.slow
 def test_parts_of_another_fit_are_refused(fitter, grid, on_disk, catalog):
     path, out = on_disk
     fit_file(fitter, path, out, chunk_rows=80, redshift="redshift")
@@ -251,6 +255,7 @@ def test_a_call_that_failed_at_once_binds_no_other(fitter, catalog, tmp_path):
     assert len(results) == len(catalog)
 
 
+@pytest.mark.slow
 def test_results_are_read_as_if_they_were_one(fitter, catalog, in_pieces, tmp_path):
     whole = fitter.fit(catalog)
     in_pieces(catalog)
@@ -350,6 +355,7 @@ def test_links_are_not_followed(fitter, on_disk, tmp_path):
     assert (tmp_path / "victim").read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_numbers_as_ids(fitter, catalog, in_pieces):
     for kind in (np.uint64, np.int32, float):
         ids = np.arange(150).astype(kind)

@@ -90,6 +90,7 @@ def survey():
     return BayesFitter(model, BANDS, axes=axes), table
 
 
+@pytest.mark.slow
 def test_calibration_finds_what_was_done_to_a_catalog(survey, tmp_path):
     """Zero points, the instrument that scatters, how frequent ages are; files keep all of it."""
     fitter, table = survey

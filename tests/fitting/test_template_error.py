@@ -185,6 +185,7 @@ def test_errors_of_bands_are_distinguished_from_those_of_models(residuals):
     refuses("of bands of MIRI, or of others", measure_band_errors, left, error)
 
 
+@pytest.mark.slow
 def test_how_often_values_occur_is_measured():
     """Three in four galaxies are of the first kind: steps of the measured priors come to their share."""
     grid = make_grid(6, n_z=2, n_tau=2, n_age=1, frac=[0.0])

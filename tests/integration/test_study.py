@@ -21,6 +21,8 @@ from miricigale.instrument.image_files import read_image
 from miricigale.workflow import disk_use, load_config, study_stages
 from miricigale.workflow.stages.exposures import study_exposures
 
+pytestmark = pytest.mark.slow
+
 SMALL = Path(__file__).with_name("small.toml")
 
 

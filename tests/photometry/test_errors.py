@@ -19,6 +19,7 @@ from miricigale.photometry.errors import (
 from miricigale.reduction import drizzle_images
 
 
+@pytest.mark.slow
 def test_pulls_are_unity(tools):
     rng = np.random.default_rng(11)
     sky, flux = tools.positions(rng, 60, 9.5), 10 ** rng.uniform(-0.5, 1, 60)
@@ -52,6 +53,7 @@ def drizzled(tools, rng, scale, side):
     return drizzle_images(images, north_up_wcs(tools.CENTER, scale * u.arcsec, (n, n))).image
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scale", "white"), [(0.11, 1.4), (0.06, 2.1)])
 def test_errors_on_mosaics_are_the_scatter_of_fits_of_nothing(tools, scale, white):
     """Drizzled dithers, whose neighboring pixels share what they see (Fruchter & Hook 2002, sec. 7)."""
@@ -71,6 +73,7 @@ def test_errors_on_mosaics_are_the_scatter_of_fits_of_nothing(tools, scale, whit
     assert 0.85 < np.median(chi2) < 1.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [0.11, 0.06])
 def test_a_mosaic_without_room_for_sky_states_its_correlation(tools, scale):
     rng = np.random.default_rng(9)

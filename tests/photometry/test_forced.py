@@ -88,6 +88,7 @@ def test_extended_sources_through_kernel_and_cutouts(tools):
     assert np.median(tools.measured(low, sky).flux.value / flux) < 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("noise", "snr", "bias"), [(0.05, 40, 0.06), (0.16, 20, 0.1)])
 def test_noisy_templates(tools, noise, snr, bias):
     ratios, as_they_are, less = [], [], []

@@ -82,6 +82,7 @@ def arguments(files, output, **changes):
     return ["photometry", "--no-progress", *(part for pair in given for part in pair)]
 
 
+@pytest.mark.slow
 def test_files_become_a_catalog_that_can_be_fitted_and_a_page(files, tmp_path, capsys):
     output = tmp_path / "new" / "fluxes.ecsv"
     assert main([*arguments(files, output), "--psf-stars"]) == 0
@@ -110,6 +111,7 @@ def test_files_become_a_catalog_that_can_be_fitted_and_a_page(files, tmp_path, c
     assert "PSFs from the images themselves" in page
 
 
+@pytest.mark.slow
 def test_catalog_kernel_and_the_plain_form(files, tmp_path):
     """A kernel of others alone, a catalog, and the two files without options, packed."""
     from miricigale.psf import MatchingKernel
@@ -136,6 +138,7 @@ def test_catalog_kernel_and_the_plain_form(files, tmp_path):
     assert_allclose(*found, rtol=0.01, atol=0.02)
 
 
+@pytest.mark.slow
 def test_without_a_segmentation_sources_are_detected(files, tmp_path):
     catalog = tmp_path / "catalog.fits"
     Table({"id": files.ids, "ra": files.sky.ra.deg, "dec": files.sky.dec.deg}).write(catalog)
@@ -150,6 +153,7 @@ def test_without_a_segmentation_sources_are_detected(files, tmp_path):
     assert_allclose(ours, files.flux, rtol=0.05, atol=0.2)
 
 
+@pytest.mark.slow
 def test_sources_that_the_prior_lacks_are_the_last_rows(files, tmp_path):
     labels, header = fits.getdata(files.paths["segmentation"], header=True)
     lost = np.argsort(-files.flux)[[2, 5]]
@@ -170,6 +174,7 @@ def test_sources_that_the_prior_lacks_are_the_last_rows(files, tmp_path):
     assert_allclose(found, files.flux[lost], rtol=0.02)
 
 
+@pytest.mark.slow
 def test_several_bands_are_measured_in_one_call(files, tmp_path, capsys):
     """The second with a kernel by place, the prior with a sky; what one shows beyond it is measured in both."""
     from miricigale.psf import KernelField, MatchingKernel
@@ -234,6 +239,7 @@ def test_several_bands_are_measured_in_one_call(files, tmp_path, capsys):
     assert "--image must be of different filters" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_sources_are_detected_on_several_images(files, tmp_path):
     """A source that the prior does not show is found on another image of its pixels."""
     data, header = fits.getdata(files.paths["highres"], header=True)
@@ -333,6 +339,7 @@ def test_an_angle_other_than_the_headers_is_refused(files, tmp_path, capsys):
     assert "--pa-aper must be PA_APER of" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_real_field_agrees_with_another_program(data_file, tmp_path, capsys):
     """PRIMER-UDS, F444W to F770W; the other program's fluxes are no truth."""
     uds = data_file("uds")

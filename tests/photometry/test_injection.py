@@ -93,6 +93,7 @@ def test_injected_points_tell_understated_errors(tools, points, photometer, stat
     refuses("'result' must be one with errors as they were measured", calibration.apply, scaled)
 
 
+@pytest.mark.slow
 def test_galaxies_are_injected_into_the_prior_too(tools):
     rng = np.random.default_rng(7)
     sky, size = tools.positions(rng, 25, 13.0), rng.uniform(0.05, 0.3, 25)

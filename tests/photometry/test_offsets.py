@@ -139,6 +139,7 @@ def test_background_that_varies(tools, field):
     assert np.abs(varying.residual_image.data).max() < 1e-5 * field.image.data.max()
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # the scale of the weights, the kernel's centre
 def test_real_images_are_aligned(data_file):
     """F770W of PRIMER-UDS against F444W: within a tenth of a native pixel (0.11 arcsec)."""

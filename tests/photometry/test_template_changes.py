@@ -255,6 +255,7 @@ def test_psf_error_is_what_a_wide_psf_does(tools, width):
     assert result.flux.value[0] - 100 == pytest.approx(result.flux_err_psf.value[0], rel=0.05)
 
 
+@pytest.mark.slow
 def test_pulls_of_galaxies_on_a_noisy_prior(tools):
     """Gaussian galaxies and points of template signal-to-noise 8 to 40, bright on the image."""
     rng = np.random.default_rng(12)

@@ -95,6 +95,10 @@ def fluxes(field, **options):
     return measured(field, **options)["miri.f770w"].to_value(u.uJy)
 
 
+#: For faults that have nothing to do with the PSF, which the stars would confirm each time.
+WITHOUT_STARS = {"psf_stars": False}
+
+
 def edited(field, tmp_path, name, change=None, *, add=0.0, **header):
     path = tmp_path / f"{name}.fits"
     with fits.open(field.folder / f"{name}.fits") as hdus:
@@ -113,6 +117,7 @@ def saved(tmp_path, data, name="psf.fits", **header):
     return tmp_path / name
 
 
+@pytest.mark.slow
 def test_psfs_that_the_package_wrote_are_taken_as_they_are(field, tmp_path):
     """And stars leave an exact PSF alone, also where sixteen stand in each other's wings."""
     field.models["image"].write(tmp_path / "own.fits")
@@ -121,6 +126,7 @@ def test_psfs_that_the_package_wrote_are_taken_as_they_are(field, tmp_path):
         assert_allclose(fluxes(field, **options), known, rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("width", "total"), [(17, 1.0), (17, 0.5), (91, 1.0), (91, 40.0)])
 def test_psfs_of_any_sum_hold_what_the_model_does(field, tmp_path, width, total):
     """The light of a PSF within 1.9 arcsec is 0.85 of all."""
@@ -131,6 +137,7 @@ def test_psfs_of_any_sum_hold_what_the_model_does(field, tmp_path, width, total)
     assert_allclose(np.median(found / field.flux), 1, atol=0.007)
 
 
+@pytest.mark.slow
 def test_psfs_on_cells_of_a_pixel_are_told_by_their_width(field, tmp_path):
     data = miri_psf("miri.f770w", fov=8 * ARCSEC).data
     path = saved(tmp_path, data / data.sum())
@@ -146,15 +153,18 @@ def test_psfs_on_cells_of_a_pixel_are_told_by_their_width(field, tmp_path):
     assert "'psf' is 6% narrower" in str(said[0].message)
 
 
+@pytest.mark.slow
 def test_model_psfs_are_turned_to_the_angle_of_the_aperture(field, tmp_path):
     path = edited(field, tmp_path, "image", PA_APER=PA - 30)
-    right, wrong = (measured(field, image=one) for one in (field.paths["image"], path))
+    images = field.paths["image"], path
+    right, wrong = (measured(field, image=one, **WITHOUT_STARS) for one in images)
     assert_allclose(np.median(right["miri.f770w"].value / field.flux), 1, atol=0.007)
     # the six spikes stand elsewhere at another angle
     bright = field.flux > 30
     assert np.all(wrong["miri.f770w_chi2"][bright] > 2 * right["miri.f770w_chi2"][bright])
 
 
+@pytest.mark.slow
 def test_a_turned_psf_with_its_angle_is_right(field, tmp_path):
     form = {"grid_angle": 0 * u.deg, "oversampling": 4}
     drizzled = psf_mosaic(miri_psf("miri.f770w"), COARSE * ARCSEC, 0 * u.deg, **form)
@@ -164,6 +174,7 @@ def test_a_turned_psf_with_its_angle_is_right(field, tmp_path):
     assert_allclose(np.median(found / field.flux), 1, atol=0.01)
 
 
+@pytest.mark.slow
 def test_kernels_of_other_pixels_filters_or_sums(field, tmp_path):
     given = {"pixel_scale": FINE * ARCSEC}
     made = MatchingKernel.from_psfs(field.models["prior"], field.models["image"], **given)
@@ -197,15 +208,21 @@ def test_kernels_of_other_pixels_filters_or_sums(field, tmp_path):
     assert "the catalog position has no segment" in page
 
 
+@pytest.mark.slow
 def test_a_background_is_fitted_or_said(field, tmp_path):
     path = edited(field, tmp_path, "image", add=0.05)
-    assert_allclose(np.median(fluxes(field, image=path) / field.flux), 1, atol=0.007)
+    assert_allclose(
+        np.median(fluxes(field, image=path, **WITHOUT_STARS) / field.flux), 1, atol=0.007
+    )
     with pytest.warns(MiricigaleWarning, match=r"a background of 0\.05\d* MJy / sr between"):
-        fluxes(field, image=path, background_order=None)
+        fluxes(field, image=path, background_order=None, **WITHOUT_STARS)
     prior = edited(field, tmp_path, "prior", add=0.06)
-    warned("'highres' has a sky of 2.* times its noise", fluxes, field, highres=prior)
+    warned(
+        "'highres' has a sky of 2.* times its noise", fluxes, field, highres=prior, **WITHOUT_STARS
+    )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["image", "prior"])
 def test_areas_filled_with_zero_have_no_data(field, tmp_path, name):
     def corner(hdus):
@@ -220,8 +237,9 @@ def test_areas_filled_with_zero_have_no_data(field, tmp_path, name):
     zero = np.count_nonzero(np.add(*np.indices((n, n))) < 0.5 * n)
     image = warned(f"has {zero} pixels in areas that are exactly 0", read_mosaic, path)
     assert np.count_nonzero(image.mask) == zero
+    key = "image" if name == "image" else "highres"
     with pytest.warns(MiricigaleWarning, match="exactly 0"):
-        table = measured(field, **{"image" if name == "image" else "highres": path})
+        table = measured(field, **{key: path}, **WITHOUT_STARS)
     found, error, snr = (np.asarray(table[f"miri.f770w{c}"]) for c in ("", "_err", "_template_snr"))
     good = np.isfinite(found)
     assert np.count_nonzero(good) >= 13
@@ -241,26 +259,28 @@ def test_maps_of_the_noise_below_zero_are_refused(field, tmp_path):
             read_mosaic(field.paths["image"], **{name: path})
 
 
+@pytest.mark.slow
 def test_labels_of_another_detection_are_not_taken(field, tmp_path):
     labels, header = fits.getdata(field.folder / "seg.fits", header=True)
     # ids of the map say nothing of the catalog's: positions do
     order = np.append(0, np.random.default_rng(1).permutation(16) + 1)
     fits.writeto(tmp_path / "stale.fits", order[labels].astype(np.int32), header)
-    found = fluxes(field, segmentation=tmp_path / "stale.fits")
+    found = fluxes(field, segmentation=tmp_path / "stale.fits", **WITHOUT_STARS)
     assert_allclose(np.median(found / field.flux), 1, atol=0.007)
     # three of sixteen
     some = np.arange(17)
     some[[1, 2, 3]] = [2, 3, 1]
     fits.writeto(tmp_path / "some.fits", some[labels].astype(np.int32), header)
     with pytest.warns(MiricigaleWarning, match="those of 3 of 16 sources that stand on another"):
-        fluxes(field, segmentation=tmp_path / "some.fits")
+        fluxes(field, segmentation=tmp_path / "some.fits", **WITHOUT_STARS)
     # segments where no source is
     fits.writeto(tmp_path / "moved.fits", np.roll(labels, 30, axis=1), header)
     with pytest.warns(MiricigaleWarning) as said:
-        fluxes(field, segmentation=tmp_path / "moved.fits")
+        fluxes(field, segmentation=tmp_path / "moved.fits", **WITHOUT_STARS)
     assert any("on the map have no segment" in str(one.message) for one in said)
 
 
+@pytest.mark.slow
 def test_catalogs_of_other_fields_and_missing_positions(field, tmp_path, monkeypatch):
     def unread(self):
         raise AssertionError
@@ -268,7 +288,7 @@ def test_catalogs_of_other_fields_and_missing_positions(field, tmp_path, monkeyp
     catalog = field.catalog.copy()
     catalog["ra"][3] = np.nan
     catalog.write(tmp_path / "gap.fits")
-    found = fluxes(field, catalog=tmp_path / "gap.fits")
+    found = fluxes(field, catalog=tmp_path / "gap.fits", **WITHOUT_STARS)
     assert np.flatnonzero(np.isnan(found)).tolist() == [3]
     monkeypatch.setattr("miricigale.photometry.mosaics.MosaicFile.read", unread)
     ra = field.catalog["ra"]
@@ -280,6 +300,7 @@ def test_catalogs_of_other_fields_and_missing_positions(field, tmp_path, monkeyp
         refuses(message, fluxes, field, catalog=tmp_path / "far.fits")
 
 
+@pytest.mark.slow
 def test_model_psfs_of_a_nircam_prior(field, tmp_path):
     """An image of points with NIRCam's model PSF, at the roll of its header."""
     model = filter_psf("nircam.f444w", pixel_scale=FINE * ARCSEC, pa=40 * u.deg)
@@ -298,9 +319,10 @@ def test_model_psfs_of_a_nircam_prior(field, tmp_path):
     assert_allclose(np.median(found / field.flux), 1, atol=0.007)
 
 
+@pytest.mark.slow
 def test_model_and_residual_are_written_with_their_coordinates(field, tmp_path):
     paths = {name: tmp_path / "new" / f"{name}.fits" for name in ("model", "residual")}
-    fluxes(field, **paths)
+    fluxes(field, **paths, **WITHOUT_STARS)
     image = read_mosaic(field.paths["image"])
     model = warned("no map of the noise", read_mosaic, paths["model"])
     residual = read_mosaic(paths["residual"])
@@ -315,6 +337,7 @@ def test_model_and_residual_are_written_with_their_coordinates(field, tmp_path):
         fluxes(field, model=tmp_path / "a.png")
 
 
+@pytest.mark.slow
 def test_poor_fits_of_the_bright_stand_on_the_page_and_warnings_are_shown_once(field, tmp_path):
     """The PSF of another band, said to be that of a smoothed image."""
     form = {"pixel_scale": COARSE * ARCSEC}

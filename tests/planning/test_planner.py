@@ -40,6 +40,7 @@ def plans(planner):
     return planner.compare()
 
 
+@pytest.mark.slow
 def test_the_sample_has_the_mix_of_the_configuration(planner):
     sources = planner.sources
     assert len(sources) == 60
@@ -204,6 +205,7 @@ def test_a_luminosity_function_gives_the_sample(tmp_path):
     assert planner.density == pytest.approx(1e-3 * 0.2 * volume.to_value(u.Mpc**3) / sky, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_field_has_few_agn_and_cuts_that_leave_nothing_are_named():
     fields = Planner(load_plan(overrides=FIELD | {"sample": {"n_sources": 6000}}))
     first = fields.sources[fields.sources["sky"] == 0]
@@ -238,6 +240,7 @@ def test_agn_of_other_skies_count_by_their_share():
         _ = Planner(none).sources
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_page(tmp_path, capsys):
     path = tmp_path / "plan.toml"
     path.write_text(load_plan(overrides=SETTINGS).to_toml())

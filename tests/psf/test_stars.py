@@ -103,6 +103,7 @@ def test_stars_that_confirm_the_model_leave_it(truth, field):
     assert_array_equal(psf.data, truth.data)
 
 
+@pytest.mark.slow
 def test_sky_positions_serve_all_images_and_bad_pixels_are_left_out(model, field, measured):
     images, _, sky = field
     spoilt = []

@@ -85,6 +85,7 @@ def test_dithers_are_aligned_to_the_first(stars):
     refuses(wanted, reducer.combine, images, [], align="gaia")
 
 
+@pytest.mark.slow
 def test_visits_are_moved_as_a_whole(stars):
     """A dither of two stars alone has its place by the others of its visit."""
     sky, peaks = stars

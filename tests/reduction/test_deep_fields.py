@@ -96,6 +96,7 @@ def exposures(days, change=0.02):
     return images, catalogs
 
 
+@pytest.mark.slow
 def test_sky_flats_are_those_of_their_days():
     images, catalogs = exposures([0, 1, 2, 300, 301, 302])
     flats = sky_flats(images, window=30)
@@ -112,6 +113,7 @@ def test_sky_flats_are_those_of_their_days():
 
 
 # before they are divided the response looks like sources
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the background of .* cannot be trusted")
 def test_the_reducer_divides_by_the_flat_of_the_sky():
     images, catalogs = exposures(range(5))

@@ -124,6 +124,7 @@ def test_hits_that_are_not_cut_stay_where_they_are():
     assert np.nanmean((other - one)[usual]) == pytest.approx(0, abs=0.03)
 
 
+@pytest.mark.slow
 def test_one_hit_costs_one_difference_of_its_pixel():
     """Two in one integration, neither of which fills the well, cost one and what follows the second."""
     exposure = exposure_of("miri.f770w", n_groups=30, subarray="SUB64")
@@ -139,6 +140,7 @@ def test_one_hit_costs_one_difference_of_its_pixel():
         assert (fit.n_used[30, 40], fit.n_used[20, 50]) == used
 
 
+@pytest.mark.slow
 def test_hits_below_the_threshold_make_the_same_tails():
     reducer = Reducer(jump_threshold=20, ramps=RampSettings(neighbor_threshold=None))
     level = background_level("miri.f770w").value

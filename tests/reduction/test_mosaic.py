@@ -56,6 +56,7 @@ def test_agrees_with_reproject_exact(scale):
     assert np.all(mosaic.image.flags[mosaic.image.mask] == DQ.NON_SCIENCE | DQ.DO_NOT_USE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [0.06, 0.11])
 def test_flux_of_point_sources_is_conserved_through_the_distortion(scale):
     rng = np.random.default_rng(5)

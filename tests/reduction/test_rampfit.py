@@ -50,6 +50,7 @@ def gls(segments, v, s):
     return num / info, 1 / info
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [2, 3, 10, 100])
 def test_pure_read_noise_has_the_variance_of_least_squares(n):
     data = simulate(np.full((4, 70), 3.0), 1, n, dtype=np.float32, seed=n)

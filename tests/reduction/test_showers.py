@@ -34,6 +34,7 @@ def smoothed_pull(fit, truth):
     return pull[good], (mean * 2 * np.sqrt(np.pi) * WIDTH)[good]
 
 
+@pytest.mark.slow
 def test_showers_of_large_hits_are_cut():
     ramp, truth = expose(fraction=1.0)
     left = smoothed_pull(Reducer().fit_groups(ramp), truth)
@@ -46,6 +47,7 @@ def test_showers_of_large_hits_are_cut():
     assert abs(np.mean(cut[0])) < 0.02
 
 
+@pytest.mark.slow
 def test_without_showers_nothing_else_is_cut():
     ramp, truth = expose(fraction=0.0)
     plain = Reducer().fit_groups(ramp)

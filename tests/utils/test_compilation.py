@@ -26,6 +26,7 @@ print(outer(1), sum(outer.stats.cache_hits.values()))
 """
 
 
+@pytest.mark.slow
 def test_a_kernel_is_compiled_again_when_one_that_it_calls_has_changed(tmp_path):
     """numba alone looks at the file of the caller only, and would go on with the former callee."""
     toy = tmp_path / "toy"

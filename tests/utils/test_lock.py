@@ -166,6 +166,7 @@ def test_a_full_disk_leaves_no_lock(tmp_path, full_disk):
     assert names(tmp_path) == [".run.lock"]
 
 
+@pytest.mark.slow
 def test_of_many_that_find_an_old_lock_one_wins(tmp_path):
     # each takes over what another left, ten times: never are two inside at once
     code = """

@@ -138,6 +138,7 @@ def test_the_report_says_which_and_from_where():
     assert day == f"telescope and zodiacal light of 2027-05-01 at {place} {source}"
 
 
+@pytest.mark.slow
 def test_images_have_the_background_that_was_asked_for():
     scene = {"background": "20 MJy/sr", "background_gradient": 0.0}
     config = one_band(BANDS[0], kind="rates", n_groups=40, scene=scene)

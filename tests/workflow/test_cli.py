@@ -77,6 +77,7 @@ def test_data_names_licenses_and_checks_sums(capsys, monkeypatch, tmp_path):
     assert "wrong checksum" not in command(capsys, "data", "check").out
 
 
+@pytest.mark.slow
 def test_filters_and_exposures_are_listed(capsys):
     # a published pivot, and times of the survey
     assert "15.06" in command(capsys, "filters", "miri.f1500w").out
@@ -220,6 +221,7 @@ def test_products_are_shown_cited_and_have_psfs(capsys, tmp_path, monkeypatch):
     command(capsys, "psf", "t.ecsv", status=2)
 
 
+@pytest.mark.slow
 def test_a_catalog_comes_from_standard_input(tmp_path, monkeypatch):
     bands = ("miri.f770w", "miri.f1000w", "miri.f1500w")
     table = SEDModel.yang2021().fluxes({"redshift": [1.0, 2.0]}, bands)

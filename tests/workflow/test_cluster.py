@@ -22,6 +22,7 @@ def run(folder, fails=False):
     return done.stderr, products_of(folder)
 
 
+@pytest.mark.slow
 def test_workers_that_die_are_replaced_or_named_and_the_run_resumes(tmp_path):
     pytest.importorskip("distributed", reason="dask.distributed is not installed")
     toy_study.main(tmp_path / "whole", 0)

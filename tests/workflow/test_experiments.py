@@ -19,6 +19,8 @@ from miricigale.workflow.page.study_page import DeclaredPage
 from miricigale.workflow.stages import experiments
 from miricigale.workflow.truths import EXPERIMENTS
 
+pytestmark = pytest.mark.slow
+
 FILTERS = ["miri.f770w", "miri.f1500w", "miri.f2100w"]
 FAST = ("far_infrared", "no_model_error", "known_redshift", "free_agn", "between")
 #: Sources, one of which is not in the sample.

@@ -146,6 +146,7 @@ def runs(tmp_path_factory):
     return folders[0.0], folders[SIZE]
 
 
+@pytest.mark.slow
 def test_patches_measure_what_the_whole_field_does(runs):
     tables = [QTable.read(folder / "agn00/matched.ecsv") for folder in runs]
     flux, error, seen = (

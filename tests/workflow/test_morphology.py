@@ -296,6 +296,7 @@ def test_a_study_paints_the_light_of_an_image(drawn, tmp_path, monkeypatch):
     refuses(text, check_study, config, error=ConfigError)
 
 
+@pytest.mark.slow
 def test_real_galaxies_of_an_image_with_its_psf(data_file):
     """F444W of PRIMER-UDS: sharper than on the image, but for noise, and of light that is the image's."""
     uds = data_file("uds")

@@ -94,6 +94,7 @@ def test_a_source_on_a_line_is_there_once_however_patches_see_it():
     assert_array_equal(np.flatnonzero(kept), [0, 2, 4, 8, 11])
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*noise on the sky is")
 @pytest.mark.parametrize("given", ["detection", "segments", "catalog"])
 def test_patches_have_the_sources_and_fluxes_of_the_whole(mosaics, tmp_path, given):
@@ -137,6 +138,7 @@ def test_patches_have_the_sources_and_fluxes_of_the_whole(mosaics, tmp_path, giv
     assert len(set(found["patch"])) >= 9
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*noise on the sky is", "ignore:.*segments that reach beyond")
 def test_a_segment_larger_than_the_overlap_is_there_once_and_flagged(mosaics, tmp_path):
     """Three points and what is between them, as one galaxy that no patch of a small overlap sees whole."""
@@ -177,6 +179,7 @@ with process_pool(n) as executor:
 """
 
 
+@pytest.mark.slow
 def test_killed_and_resumed_on_any_workers_to_the_same_bytes(mosaics, tmp_path):
     def begin(n):
         command = [sys.executable, "-c", SCRIPT, str(n), str(tmp_path / "killed"), mosaics.folder]
@@ -202,6 +205,7 @@ def test_killed_and_resumed_on_any_workers_to_the_same_bytes(mosaics, tmp_path):
     assert made[0] == made[1]
 
 
+@pytest.mark.slow
 def test_the_command_refuses_what_is_beyond_the_memory_and_measures_it_in_patches(
     mosaics, tmp_path, monkeypatch, capsys
 ):

@@ -90,6 +90,7 @@ def test_coverage_is_the_mean_about_a_source():
     assert 1.98 < found[2] < 2.0
 
 
+@pytest.mark.slow
 def test_errors_of_a_run_follow_the_exposure_time(tmp_path):
     """Half of the field exposed four times: the same fluxes have half of the errors there."""
     make_run(tmp_path, [BAND], report=False)

@@ -23,6 +23,8 @@ from miricigale.workflow.page.source_figures import example_figure
 from miricigale.workflow.stages.sample import footprint_area, in_field
 from miricigale.workflow.truths import FIELD
 
+pytestmark = pytest.mark.slow
+
 FILTERS = {
     "one": ["miri.f1000w"],
     "four": ["miri.f2100w", "miri.f560w", "miri.f1000w", "miri.f2550w"],

@@ -11,6 +11,8 @@ from miricigale.photometry import ErrorModel
 from miricigale.workflow.stages.skies import sky_photometry
 from miricigale.workflow.truths import FIELD
 
+pytestmark = pytest.mark.slow
+
 BANDS = ["miri.f770w", "miri.f1500w"]
 
 

@@ -85,6 +85,7 @@ def test_the_table_holds_what_the_tables_hold(run):
             assert close([table[column][k] for column in columns], [row[name] for name in names])
 
 
+@pytest.mark.slow
 def test_ids_that_are_text_and_fractions_of_the_catalog(tmp_path):
     page = make_run(tmp_path, BANDS, text_ids=True, frac_agn=(0.0, "catalog"))
     text = (page / "index.html").read_text("utf-8")
@@ -139,6 +140,7 @@ def test_details_are_those_of_the_fits(run):
             assert np.sum(flux * wave * (half - 1 / half)) == pytest.approx(light, rel=2e-3)
 
 
+@pytest.mark.slow
 def test_a_source_without_a_fit_says_why(tmp_path):
     make_run(tmp_path, BANDS[:1], mass=1e4, report=False)
     do_stage(small_config(BANDS[:1]), tmp_path, "sources", "agn00")

@@ -55,6 +55,7 @@ def test_light_commands_and_errors_import_nothing_heavy(tmp_path):
     assert list(ends) == LIGHT + WRONG
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("package", ["fitting", "photometry", "psf", "scene", "sed", "workflow"])
 def test_subpackages_import_what_is_asked_for(tmp_path, package):
     """No kernel until it is used; that all names are there is tested with the public names."""

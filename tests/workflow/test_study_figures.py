@@ -69,6 +69,7 @@ def test_recovered_luminosities_lie_about_the_line_of_equality(study):
     assert study_figures.disk_figure(mock_study((0.0,))) is None
 
 
+@pytest.mark.slow
 def test_xray_counts_stand_above_the_shares_found(study):
     figure = study_figures.xray_figure(study, 1)
     upper, lower = figure.axes

@@ -28,6 +28,8 @@ from miricigale.workflow.stages.images import (
 from miricigale.workflow.stages.measure import measure_band
 from miricigale.workflow.truths import variant_changes
 
+pytestmark = pytest.mark.slow
+
 BAND = "miri.f2100w"
 
 
