@@ -19,6 +19,9 @@ _ROUNDS = 5
 _LEAST_SKY = 0.05
 # doubt of the level, in the noise of a pixel, from which it is told
 _DOUBT = 0.5
+# of the level itself, and in the noise of a pixel, above which a level is not known
+_UNKNOWN = 1 / 3
+_UNKNOWN_NOISE = 3.0
 # pixels from which the median of a smooth image is taken
 _SOME = 100_000
 
@@ -40,6 +43,9 @@ class BackgroundFlags(Flags):
     CONFUSED = 2
     """Light of sources that is not masked leaves the level open by more than half of the noise of a pixel:
     what is faint, blends, or is wide. The error says by how much."""
+    UNKNOWN = 4
+    """The level is open by more than a third of itself, and by more than three times the noise of a pixel:
+    `~miricigale.reduction.Reducer` leaves the sky in the image."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -223,7 +229,7 @@ def estimate_background(image, *, method="masked", box=64, filter_size=3, plane=
         stated, mesh = _stated(image, mask), (int(box), int(filter_size), plane)
         background = _masked(data, mask, stated, mesh, correlation)
     if warn:
-        warn_of(background, mask)
+        warn_of(background, mask, image.unit)
     return background
 
 
@@ -259,7 +265,12 @@ def _masked(data, mask, stated, mesh, correlation):
     if shift + np.median(_some(light)) > _DOUBT * np.median(_some(noise)):
         flags |= BackgroundFlags.CONFUSED
     error = np.sqrt((mesh.error * np.float32(correlation)) ** 2 + dark**2 + light**2)
-    return Background(mesh.level - shift, mesh.rms, error, found, mesh.box, mesh.filter_size, flags)
+    level = mesh.level - shift
+    doubt = np.median(_some(error))
+    least = _UNKNOWN * abs(np.median(_some(level)))
+    if doubt > max(least, _UNKNOWN_NOISE * np.median(_some(noise))):
+        flags |= BackgroundFlags.UNKNOWN
+    return Background(level, mesh.rms, error, found, mesh.box, mesh.filter_size, flags)
 
 
 def _search(mesh, stated):
@@ -310,16 +321,18 @@ def _noise(stated, rms, mask):
     return np.fmax(rms, stated[0] * np.float32(scale))
 
 
-def warn_of(background, mask):
-    """Warn of a background that cannot be trusted."""
+def warn_of(background, mask, unit):
+    """Warn of a background, in a unit, that cannot be trusted."""
     if background.trusted:
         return
     good = ~mask
     reasons = " ".join(BackgroundFlags.meanings()[flag.value][1] for flag in background.flags)
+    level = np.median(background.level[good])
+    error = np.median(background.error[good])
+    share = 100 * background.source_mask[good].mean()
     text = (
-        f"the background of {np.median(background.level[good]):.4g} cannot be trusted to better than "
-        f"{np.median(background.error[good]):.2g} ({100 * background.source_mask[good].mean():.0f} % of the "
-        f"pixels are sources): {reasons}"
+        f"the background of {level:.4g} cannot be trusted to better than {error:.2g} {unit} "
+        f"({share:.0f} % of the pixels are sources): {reasons}"
     )
     warn(text, ReductionWarning)
 

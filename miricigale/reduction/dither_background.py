@@ -123,7 +123,7 @@ def dither_backgrounds(images, backgrounds=None, *, wcs=None):
             error=np.hypot(error, left.error).astype(np.float32),
             source_mask=source,
         )
-        warn_of(new, mask)
+        warn_of(new, mask, im.unit)
         out.append(new)
     return out
 

@@ -14,6 +14,7 @@ from helpers.exposures import image_of as make
 from miricigale.instrument import DQ, north_up_wcs
 from miricigale.reduction import (
     BackgroundFlags,
+    Reducer,
     drizzle_images,
     estimate_background,
     remove_background,
@@ -295,3 +296,22 @@ def test_the_plain_mask_of_negative_pixels_is_by_key_and_counted(noise):
     plain, background = subtracted(make(noise + 7, error=error), negative_noise="background")
     assert plain.meta["n_negative"] == 2
     assert_array_equal(plain.mask, plain.data < -10 * background.rms)
+
+
+def test_a_level_that_is_not_known_is_not_taken_off():
+    """Light that fills the image, of 409 +- 460 where the sky is 5, stays in it with a warning."""
+    rng = np.random.default_rng(3)
+    shape = (256, 256)
+    nebula = gaussians(shape, [128], [120], [1000.0], [100.0])
+    sky = (5.0 + rng.normal(0, 0.1, shape)).astype(np.float32)
+    image, background = warned(
+        r"MJy / sr .*leaves the sky in the image",
+        Reducer().subtract_background,
+        make((sky + nebula).astype(np.float32)),
+    )
+    assert BackgroundFlags.UNKNOWN in background.flags
+    assert_array_equal(background.level, 0)
+    assert_allclose(image.data, sky + nebula, rtol=1e-6)
+    image, background = Reducer().subtract_background(make(sky))
+    assert background.trusted
+    assert np.median(image.data) == pytest.approx(0.0, abs=0.01)
