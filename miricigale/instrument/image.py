@@ -93,7 +93,7 @@ class Image(Interactive, CCDData):
         label = f"{plain_text(self.meta.get('filter') or '')} ({self.unit})".strip()
         return plot_scene(self.data, ax=ax, label=label, **kwargs)
 
-    def write(self, path, *args, **kwargs):
+    def write(self, path, *args, overwrite=False, **kwargs):
         """
         Write the image; see `astropy.nddata.CCDData.write`.
 
@@ -102,8 +102,10 @@ class Image(Interactive, CCDData):
         path : path-like
             The file. Names of JWST's products (``_rate.fits``, ``_cal.fits``) are refused, for JWST's tools would
             not find the image there: `miricigale.reduction.write_image` writes their layout.
+        overwrite : bool, optional
+            Whether a file of this name may be replaced.
         *args, **kwargs
-            Those of `astropy.nddata.CCDData.write`, such as ``overwrite``.
+            Others of `astropy.nddata.CCDData.write`, such as ``format``.
 
         Raises
         ------
@@ -117,6 +119,8 @@ class Image(Interactive, CCDData):
                 "miricigale.reduction.write_image(image, path) writes"
             )
             raise argument_error("path", wanted, repr(os.fspath(path)))
+        if overwrite:
+            kwargs["overwrite"] = True
         super().write(path, *args, **kwargs)
 
     def to_hdu(self, *args, **kwargs):

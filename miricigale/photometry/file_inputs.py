@@ -16,9 +16,10 @@ from miricigale.instrument.image import Image
 from miricigale.instrument.image_planes import plane_data
 from miricigale.instrument.sky_axes import grid_angle
 from miricigale.photometry.grids import open_map
-from miricigale.photometry.kernel_files import can_be_modeled, file_place, matching_kernel
+from miricigale.photometry.kernel_files import can_be_modeled, matching_kernel
 from miricigale.photometry.mosaics import MosaicFile
 from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.files import file_place
 from miricigale.utils.units import SURFACE_BRIGHTNESS
 
 #: What the file of a `~miricigale.psf.KernelField` states as its format.

@@ -6,16 +6,8 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.instrument.sky_axes import grid_angle
-from miricigale.psf.files import (
-    core_position,
-    file_place,
-    header_grid,
-    is_stpsf,
-    is_written,
-    read_planes,
-)
 from miricigale.utils.exceptions import argument_error, data_error, file_errors
-from miricigale.utils.files import open_fits, split_extension
+from miricigale.utils.files import file_place, open_fits, split_extension
 from miricigale.utils.units import ANGLE, to_array
 
 _log = logging.getLogger(__name__)
@@ -23,7 +15,9 @@ _log = logging.getLogger(__name__)
 
 def _read_psf(file, argument):
     """A PSF of a file, or the mean of several, with its center in the middle."""
+    # the kernels of PSFs are compiled when they are needed
     from miricigale.psf import MODEL_FILTERS, average_psf, make_psf, psf_image, read_psf
+    from miricigale.psf.files import core_position, header_grid, is_stpsf, is_written, read_planes
 
     path, header = file.psf, file.header
     known = header.filter in MODEL_FILTERS
@@ -126,6 +120,7 @@ def read_kernel(path, *, pixel_scale, highres_psf=None):
         As `~miricigale.psf.MatchingKernel.from_array`.
     """
     from miricigale.psf import MatchingKernel
+    from miricigale.psf.files import header_grid, read_planes
 
     name = file_place(path)[0]
     with open_fits(name, wanted="a matching kernel") as hdus:

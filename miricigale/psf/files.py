@@ -8,7 +8,7 @@ from miricigale.instrument.sky_axes import grid_angle
 from miricigale.psf import _core
 from miricigale.psf.model import InstrumentPSF, make_psf
 from miricigale.utils.exceptions import PSFWarning, argument_error, data_error, warn
-from miricigale.utils.files import open_fits, split_extension
+from miricigale.utils.files import file_place, open_fits, split_extension
 from miricigale.utils.options import check_that
 from miricigale.utils.store import open_parts, write_parts
 from miricigale.utils.unified import register
@@ -19,39 +19,6 @@ _UNITS = {"pixel_scale": ANGLE, "angle": u.deg, "pa_aper": u.deg}
 _LAYOUT = "psf-1"
 #: Extensions of STPSF's files, the best first: with the distortion and the detector's effects, finely sampled.
 _STPSF_ORDER = ("OVERDIST", "DET_DIST", "OVERSAMP", "DET_SAMP")
-
-
-def file_place(path):
-    """
-    Take ``file.fits[EXTENSION,PLANE]`` apart.
-
-    Parameters
-    ----------
-    path : path-like
-        A file, with the extension in brackets or without.
-
-    Returns
-    -------
-    name : str
-        The file.
-    extension : int, str or None
-        None without brackets.
-    plane : int, ``"mean"`` or None
-        Of a cube; None of an image.
-
-    Raises
-    ------
-    ValueError
-        If the plane is something else.
-    """
-    name, extension = split_extension(path)
-    if not isinstance(extension, str) or "," not in extension:
-        return name, extension, None
-    extension, _, plane = (part.strip() for part in extension.rpartition(","))
-    if plane != "mean" and not plane.isdigit():
-        raise argument_error("path", "FILE[EXTENSION,PLANE], the plane a number or mean", path)
-    extension = int(extension) if extension.isdigit() else extension
-    return name, extension, plane if plane == "mean" else int(plane)
 
 
 def read_planes(path, wanted, *, ext=None, plane=None):

@@ -17,7 +17,7 @@ from astropy.utils.exceptions import AstropyDeprecationWarning
 
 from miricigale.utils.caching import cached
 from miricigale.utils.configuration import conf
-from miricigale.utils.exceptions import DataError, warn
+from miricigale.utils.exceptions import DataError, argument_error, warn
 
 # how packed files begin, and the module of Python's that opens them
 _PACKED = {b"\x1f\x8b": "gzip", b"BZh": "bz2", b"\xfd7zXZ\x00": "lzma"}
@@ -171,6 +171,39 @@ def split_extension(path):
         return path, None
     extension = rest[:-1].strip()
     return name, int(extension) if extension.isdigit() else extension
+
+
+def file_place(path):
+    """
+    Take ``file.fits[EXTENSION,PLANE]`` apart.
+
+    Parameters
+    ----------
+    path : path-like
+        A file, with the extension in brackets or without.
+
+    Returns
+    -------
+    name : str
+        The file.
+    extension : int, str or None
+        None without brackets.
+    plane : int, ``"mean"`` or None
+        Of a cube; None of an image.
+
+    Raises
+    ------
+    ValueError
+        If the plane is something else.
+    """
+    name, extension = split_extension(path)
+    if not isinstance(extension, str) or "," not in extension:
+        return name, extension, None
+    extension, _, plane = (part.strip() for part in extension.rpartition(","))
+    if plane != "mean" and not plane.isdigit():
+        raise argument_error("path", "FILE[EXTENSION,PLANE], the plane a number or mean", path)
+    extension = int(extension) if extension.isdigit() else extension
+    return name, extension, plane if plane == "mean" else int(plane)
 
 
 def _judge(caught):

@@ -19,13 +19,12 @@ from miricigale.pages import Link, Page, SectionWriter
 from miricigale.photometry.arrays import pixel_scale
 from miricigale.photometry.file_inputs import Inputs
 from miricigale.photometry.from_files import TABLE_KIND
-from miricigale.photometry.kernel_files import file_place
 from miricigale.photometry.patches import PatchGrid, join_patches, measure_patch, patch_parts
 from miricigale.photometry.priors import read_catalog
 from miricigale.utils.caching import cached
 from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.files import cached_by_file, replacing
+from miricigale.utils.files import cached_by_file, file_place, replacing
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_least
 from miricigale.utils.outputs import check_output

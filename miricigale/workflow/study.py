@@ -7,8 +7,8 @@ import numpy as np
 
 from miricigale.depth import saturation_forecast
 from miricigale.filters import Filter
-from miricigale.photometry.kernel_files import file_place
 from miricigale.utils.exceptions import ConfigError
+from miricigale.utils.files import file_place
 from miricigale.workflow.cost import disk_use
 from miricigale.workflow.engine.runner import StudyRunner
 from miricigale.workflow.options import of_option

@@ -13,10 +13,10 @@ from miricigale.evaluation import (
     ceers_dust,
     main_sequence_dust,
 )
-from miricigale.photometry.kernel_files import file_place
 from miricigale.refdata.lookup import fingerprint
 from miricigale.utils.content import file_sha256
 from miricigale.utils.exceptions import DataError
+from miricigale.utils.files import file_place
 from miricigale.utils.meta import provenance
 from miricigale.utils.random import stream
 from miricigale.utils.tables import error_column
