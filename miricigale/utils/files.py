@@ -324,6 +324,8 @@ def packed_open(path):
     with open(path, "rb") as stream:
         start = stream.read(6)
     if start.startswith(_ZIP):
+        # refuses what unpacks to too much, before it is in memory
+        unpacked_size(path)
         with zipfile.ZipFile(path) as archive:
             names = [name for name in archive.namelist() if not name.endswith("/")]
             if len(names) != 1:

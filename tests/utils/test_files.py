@@ -16,7 +16,7 @@ from astropy.table import QTable
 from helpers.errors import refuses
 from miricigale import conf
 from miricigale.utils.exceptions import DataError
-from miricigale.utils.files import open_fits, unpacked_size, writing
+from miricigale.utils.files import open_fits, packed_open, unpacked_size, writing
 from miricigale.utils.table_files import read_table
 
 
@@ -192,6 +192,16 @@ def test_a_large_file_may_unpack_to_eight_times_its_size(tmp_path):
         with gzip.open(path, "wb") as stream:
             stream.write(noise + bytes(4_000_000))
         refuses("would unpack", unpacked_size, path, error=DataError)
+
+
+def test_a_zip_archive_is_not_unpacked_beyond_the_bound(tmp_path):
+    path = tmp_path / "table.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("table.csv", bytes(3_000_000))
+    with conf.set_temp("unpacked_size", 3), packed_open(path) as stream:
+        assert len(stream.read()) == 3_000_000
+    with conf.set_temp("unpacked_size", 2):
+        refuses("would unpack", packed_open, path, error=DataError)
 
 
 def test_members_of_zip_files_are_counted_together(tmp_path):
