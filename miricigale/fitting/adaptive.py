@@ -41,10 +41,9 @@ _PART_LEAST = 30
 _LEAST_KEPT = 2048
 _LEAST_PLACES = 0.03
 #: Part of the draws to begin with from which a label in a peak is pursued, its share of the places until its shape
-#: is found, and how many times as many places there may be.
+#: is found.
 _PURSUED = 0.01
 _PURSUED_SHARE = 0.06
-_MORE_PURSUED = 1
 #: Least number of places that parts are fitted to.
 _FEWEST_PLACES = 20
 #: Share of a mixture that all labels have, whatever their weight, and each peak and what has weight in it.
@@ -223,9 +222,8 @@ class AdaptiveSampler:
         most = max(_MOST_EACH * wanted, _LEAST_MOST)
         self.n_rounds = _ADAPTING_ROUNDS
         if pursue:
-            most *= _MORE_PURSUED
             self.n_rounds = _PURSUING_ROUNDS
-        # room for places that parts are fitted to, and for a first try
+        # at least those that parts are fitted to, and a first try
         most = max(most, self.n_rounds * ROUND_SIZE + _TRIED)
         self.most = most
         self.points = quasi_random(n_axes, int(np.ceil(np.log2(most))), scramble)
@@ -315,8 +313,8 @@ class AdaptiveSampler:
         """
         Add places that the parts do not depend on: `WeightedPlaces`, or None if none is possible.
 
-        Until there are enough, or a number that is tried shows that it would take many more of them, where there
-        is room to begin again.
+        They are added until there are enough. If ``tried`` of them show that it would take many more, this ends as
+        long as twice their number may follow.
         """
         first = self.n
         total = np.zeros(self.n_groups)
@@ -338,8 +336,8 @@ class AdaptiveSampler:
             n = self.n - first
             sample = replace(sample, enough=sample.enough and n >= _LEAST_KEPT)
             many_more = self.wanted > _ALMOST * sample.effective
-            room = self.most - self.n > _TRY_AGAIN * n
-            if sample.enough or (many_more and n >= tried and room):
+            may_follow = self.most - self.n > _TRY_AGAIN * n
+            if sample.enough or (many_more and n >= tried and may_follow):
                 break
             group = self._groups(self.label[rows], self.peak[rows])
             n_each = np.bincount(group, minlength=self.n_groups)
@@ -423,7 +421,7 @@ class AdaptiveSampler:
         if column is None:
             column = np.zeros(len(parts.share), np.int64)
         places = (ends, self.score, self.scratch, density)
-        _core.add_density(self.labels, parts, column, 1.0, *places)
+        _core.add_density(self.labels, parts, column, *places)
 
     def _redshift(self, place):
         """Redshifts of places in the unit interval."""

@@ -213,9 +213,9 @@ class ModelTables:
         """
         `_core.Light`, derived quantities of galaxies, and properties of AGN.
 
-        A process keeps those it used last: fits of the same models and bands, such as a calibration and the fit
-        that it is for, share them. Nobody writes to them; they are not marked read-only, for which numba would
-        compile the kernels anew.
+        A process keeps the last two: fits of the same models and bands, such as a calibration and the fit after
+        it, share them. No caller may change the arrays. They are not marked read-only, because numba would compile
+        the kernels once more for read-only arrays.
         """
         if not is_own(self.model):
             return self._evaluated()

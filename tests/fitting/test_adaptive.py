@@ -238,7 +238,7 @@ def test_densities_are_those_of_t_distributions(mixture):
     density = np.zeros((2, n))
     column = np.array([0, 1])
     places = (np.array([[0, n]]), y, np.empty((n_axes + 2, n)), density)
-    _core.add_density(labels, parts, column, 1.0, *places)
+    _core.add_density(labels, parts, column, *places)
     density = density.sum(axis=0)
     want = 0.0
     for share, mean, root in zip(parts.share, parts.mean, np.tril(parts.root), strict=True):
@@ -290,7 +290,7 @@ def test_local_parts_go_where_weights_are_large():
         _core.propose(_labels(n_axes), parts, choice, normal, spread, label, y)
         density = np.zeros((1, size))
         places = (np.array([[0, size]]), y, np.empty((n_axes + 2, size)), density)
-        _core.add_density(_labels(n_axes), parts, np.zeros(n_parts, np.int64), 1.0, *places)
+        _core.add_density(_labels(n_axes), parts, np.zeros(n_parts, np.int64), *places)
         weight = np.exp(log_ridge(y)) / density[0] / size
         return weight.sum(), weight.sum() ** 2 / np.sum(weight**2)
 

@@ -166,7 +166,7 @@ def _add_t_density(n, n_active, share, top, square, row, density):
 
 
 @njit(**KERNEL)
-def add_density(labels, parts, column, times, ends, y, coordinate, density):
+def add_density(labels, parts, column, ends, y, coordinate, density):
     """
     Add the densities of parts of a mixture at places to others.
 
@@ -176,8 +176,6 @@ def add_density(labels, parts, column, times, ends, y, coordinate, density):
         The mixture.
     column : `~numpy.ndarray` of int, shape (n_parts,)
         Column of ``density`` that each part is added to.
-    times : float
-        What densities are multiplied by.
     ends : `~numpy.ndarray` of int, shape (n_blocks, n_labels + 1)
         Blocks of places are sorted by label: index of the first of each label, and the end of the last.
     y : `~numpy.ndarray`, shape (n, n_axes)
@@ -199,9 +197,8 @@ def add_density(labels, parts, column, times, ends, y, coordinate, density):
             _copy_active(y, first, n, labels.axes[own], n_active, coordinate)
             for p in range(parts.start[own], parts.start[own + 1]):
                 _squares(coordinate, n, n_active, parts.mean[p], parts.inverse[p], row, square)
-                share = times * parts.share[p]
                 out = density[column[p], first : first + n]
-                _add_t_density(n, n_active, share, parts.top[p], square, row, out)
+                _add_t_density(n, n_active, parts.share[p], parts.top[p], square, row, out)
 
 
 @njit(**PART)
