@@ -266,11 +266,20 @@ def _masked(data, mask, stated, mesh, correlation):
         flags |= BackgroundFlags.CONFUSED
     error = np.sqrt((mesh.error * np.float32(correlation)) ** 2 + dark**2 + light**2)
     level = mesh.level - shift
-    doubt = np.median(_some(error))
-    least = _UNKNOWN * abs(np.median(_some(level)))
-    if doubt > max(least, _UNKNOWN_NOISE * np.median(_some(noise))):
+    if _is_unknown(level, error, noise):
         flags |= BackgroundFlags.UNKNOWN
     return Background(level, mesh.rms, error, found, mesh.box, mesh.filter_size, flags)
+
+
+def _is_unknown(level, error, noise):
+    """Whether the level of the sky is too uncertain to be taken off."""
+    brightness = abs(np.median(_some(level)))
+    pixel_noise = np.median(_some(noise))
+    # the sky is off already: its share of the error says nothing, and what is taken off changes nothing
+    if brightness < pixel_noise:
+        return False
+    limit = max(_UNKNOWN * brightness, _UNKNOWN_NOISE * pixel_noise)
+    return np.median(_some(error)) > limit
 
 
 def _search(mesh, stated):

@@ -315,3 +315,14 @@ def test_a_level_that_is_not_known_is_not_taken_off():
     image, background = Reducer().subtract_background(make(sky))
     assert background.trusted
     assert np.median(image.data) == pytest.approx(0.0, abs=0.01)
+
+
+def test_a_sky_that_is_off_already_is_never_called_unknown():
+    """Glow of 0.2 about a mean of 0 is wider than a box: its error exceeds the level, which is nothing."""
+    shape = (256, 256)
+    y, x = np.indices(shape)
+    glow = 0.4 * np.sin(2 * np.pi * x / 60) * np.sin(2 * np.pi * y / 60)
+    noise = np.random.default_rng(4).normal(0, 0.05, shape)
+    image = make((glow + noise).astype(np.float32), error=0.05)
+    background = estimate_background(image, warn=False)
+    assert BackgroundFlags.UNKNOWN not in background.flags
