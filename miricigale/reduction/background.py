@@ -239,6 +239,13 @@ def known_background(level):
     return Background(level, unknown, unknown, np.broadcast_to(False, level.shape), 1, 1)
 
 
+def subtractable(background):
+    """`Background` to take off: a level of 0 where the level of the sky is not known."""
+    if BackgroundFlags.UNKNOWN not in background.flags:
+        return background
+    return dataclasses.replace(background, level=np.zeros_like(background.level))
+
+
 def _masked(data, mask, stated, mesh, correlation):
     """Background with the sources masked; ``mesh`` has the size of the boxes, the filter and the plane."""
     box, filter_size, plane = mesh

@@ -4,7 +4,12 @@ import numpy as np
 
 from miricigale.instrument import ImageFacts
 from miricigale.reduction.align import align_images
-from miricigale.reduction.background import BackgroundFlags, estimate_background, remove_background
+from miricigale.reduction.background import (
+    BackgroundFlags,
+    estimate_background,
+    remove_background,
+    subtractable,
+)
 from miricigale.reduction.dither_background import dither_backgrounds, restored
 from miricigale.reduction.images import check_images, own_grid, with_data
 from miricigale.reduction.mosaic import drizzle_images, pixel_map, weight_map
@@ -53,7 +58,9 @@ def subtract_dithers(reducer, images, alone=None, wcs=None):
     """As `~miricigale.reduction.Reducer.subtract_dithers`; ``alone`` is the background of each image by itself."""
     if alone is None:
         alone = [estimate_background(im, warn=False, **reducer.background.mesh) for im in images]
-    backgrounds = dither_backgrounds(images, alone, wcs=wcs)
+    backgrounds = [
+        subtractable(background) for background in dither_backgrounds(images, alone, wcs=wcs)
+    ]
     pairs = zip(images, backgrounds, strict=True)
     return [remove_background(*pair, **reducer.background.negative) for pair in pairs], backgrounds
 

@@ -3,14 +3,13 @@
 import dataclasses
 from dataclasses import field
 
-import numpy as np
 from astropy.nddata import CCDData
 
 from miricigale.detector import Charge, Ramp, ResetAnomaly
 from miricigale.instrument import DetectorProperties, ExposureHistory, ImageFacts, miri_detector
 from miricigale.reduction.align import align_images, visit_of
 from miricigale.reduction.assumed import brightness_of, maps_of
-from miricigale.reduction.background import BackgroundFlags, estimate_background, remove_background
+from miricigale.reduction.background import estimate_background, remove_background, subtractable
 from miricigale.reduction.calibration import calibrate
 from miricigale.reduction.combine import combine, drizzle, subtract_dithers
 from miricigale.reduction.files import opened, several
@@ -250,7 +249,8 @@ class Reducer(Interactive):
         """
         Subtract the background and mask pixels far below it.
 
-        A level that is not known (`BackgroundFlags.UNKNOWN`) is not taken off: the sky stays in the image.
+        A level that is not known is not taken off: the sky stays in the image
+        (`~miricigale.reduction.BackgroundFlags`).
 
         Parameters
         ----------
@@ -264,9 +264,7 @@ class Reducer(Interactive):
             What was taken off, a level of 0 if it is not known.
         """
         image = opened(image)
-        background = estimate_background(image, **self.background.mesh)
-        if BackgroundFlags.UNKNOWN in background.flags:
-            background = dataclasses.replace(background, level=np.zeros_like(background.level))
+        background = subtractable(estimate_background(image, **self.background.mesh))
         return remove_background(image, background, **self.background.negative), background
 
     def subtract_dithers(self, images, *, wcs=None):
