@@ -403,7 +403,8 @@ class AdaptiveSampler:
         label = np.empty(size, np.int64)
         score = np.empty((size, self.score.shape[1]))
         _core.propose(self.labels, mixture, choice[new], normal[new], spread[new], label, score)
-        order = np.argsort(label, kind="stable")
+        # by redshift, so that models that lie near each other in memory are met together
+        order = np.lexsort((score[:, 0], label))
         label = label[order]
         score = score[order]
         self.label[new] = label

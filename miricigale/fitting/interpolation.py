@@ -206,7 +206,7 @@ class InterpolatedModels:
     def sizes(self):
         """Number of models of each table: dict of str to int."""
         names = ("stars", "burst", "dust", "agn")
-        return {name: len(getattr(self.light, name).table) for name in names}
+        return {name: getattr(self.light, name).table.shape[1] for name in names}
 
     def make_work(self):
         """Scratch arrays of the kernels."""

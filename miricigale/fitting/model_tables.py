@@ -64,7 +64,7 @@ class ModelGalaxies:
         age = np.full(n, self.constant_age) if light.age < 0 else values[:, light.age]
         starlight = part_columns(self.stars, values)
         starlight *= (1.0 - share)[:, None]
-        if len(self.burst.table):
+        if self.burst.table.shape[1]:
             starlight += share[:, None] * part_columns(self.burst, values)
         absorbed = starlight[:, -1].copy()
         if light.amount >= 0:
@@ -72,7 +72,7 @@ class ModelGalaxies:
         if light.excess >= 0:
             absorbed *= values[:, light.excess]
         dust = np.zeros((n, self.n_sums))
-        if len(self.dust.table):
+        if self.dust.table.shape[1]:
             dust = part_columns(self.dust, values)
         quantities = quantities_of_parts(starlight, absorbed, dust, age, self.reference_row)
         if light.by_dust:

@@ -104,11 +104,16 @@ def make_part(names, axes, powers, table, redshift, place, model=None):
 
 
 def _single(table):
-    """A table in single precision, and the offset of each column that is taken from it first."""
+    """
+    A table in single precision, (nz, n_models, n_columns), and the offset of each column that is taken from it.
+
+    Places of an object lie at few redshifts: models of one redshift next to each other fit in a cache.
+    """
     offset = np.zeros(table.shape[-1])
     if table.size:
         offset = 0.5 * (table.min(axis=(0, 1)) + table.max(axis=(0, 1)))
-    return np.ascontiguousarray(table - offset, np.float32), offset
+    by_redshift = np.moveaxis(table - offset, 0, 1)
+    return np.ascontiguousarray(by_redshift, np.float32), offset
 
 
 def empty_part(n_columns, n_z=1):

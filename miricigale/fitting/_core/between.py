@@ -24,7 +24,7 @@ _STEEPEST = 5.0
 #: 1 - exp(-this * amount), which takes most of its change away.
 SATURATION = 4.0
 
-#: A table of one part of the light: ``table``, float32 (n_models, nz, n_columns), logarithms, of fluxes that of
+#: A table of one part of the light: ``table``, float32 (nz, n_models, n_columns), logarithms, of fluxes that of
 #: flux * z^2, less an ``offset`` of each column, (n_columns,), so that single precision is enough; ``log_z``,
 #: (nz,), ln(1 + z) of its nodes, one where there is no redshift; ``model``, int64, flat, the models of all
 #: values of the axes (-1 where there is none); of each axis its place among the parameters ``axis``, int64
@@ -183,7 +183,7 @@ def find_nodes(part_table, value, work):
 def add_up(part_table, log_z, count, work, out):
     """Interpolate the columns of a `Part` at ln(1 + z) between the nodes in ``work``: logarithms, into ``out``."""
     table = part_table.table
-    n_z = table.shape[1]
+    n_z = table.shape[0]
     n_columns = table.shape[2]
     z, t = place_between(part_table.log_z, n_z, log_z)
     other = min(z + 1, n_z - 1)
@@ -192,11 +192,11 @@ def add_up(part_table, log_z, count, work, out):
     for r in range(count):
         far = work.weight[r] * t
         near = work.weight[r] - far
-        low = table[work.row[r], z]
-        high = table[work.row[r], other]
+        low = table[z, work.row[r]]
+        high = table[other, work.row[r]]
         for j in range(n_columns):
             out[j] += near * low[j] + far * high[j]
-    nearest = table[work.row[0], other if t > 0.5 else z]
+    nearest = table[other if t > 0.5 else z, work.row[0]]
     for j in range(n_columns):
         out[j] = min(max(out[j], nearest[j] - _STEEPEST), nearest[j] + _STEEPEST)
         out[j] += part_table.offset[j]
@@ -254,7 +254,7 @@ def galaxy_light(light, value, log_z, work):
     if not mixed(light.stars, light.burst, share, log_z, value, work, flux):
         return False
     power = dust_power(light, value, flux[last])
-    if len(light.dust.table) > 0 and power > 0.0:
+    if light.dust.table.shape[1] > 0 and power > 0.0:
         template = work.flux[2]
         count = find_nodes(light.dust, value, work)
         add_up(light.dust, log_z, count, work, template)
