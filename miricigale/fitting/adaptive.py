@@ -85,8 +85,12 @@ class PlacedModels:
         Weights; they sum to 1.
     scale, variance, power : `~numpy.ndarray`, shape (n,)
         Best scales and their variances, and AGN power for each solar mass formed.
+    log_likelihood : `~numpy.ndarray`, shape (n,)
+        Ln of the likelihoods, but for a constant.
     uniform : `~numpy.ndarray`, shape (n,)
         Quasi-random numbers for the scales' own errors.
+    log_evidence : float
+        Ln of the mean likelihood over the priors, but for the constant of the likelihoods.
     converged : bool
         Whether the effective number is what was asked for.
     """
@@ -96,7 +100,9 @@ class PlacedModels:
     scale: np.ndarray
     variance: np.ndarray
     power: np.ndarray
+    log_likelihood: np.ndarray
     uniform: np.ndarray
+    log_evidence: float
     converged: bool
 
 
@@ -166,6 +172,8 @@ class WeightedPlaces:
         Which places.
     weight : `~numpy.ndarray`, shape (n,)
         Weights, the largest of which is 1.
+    log_mean : float
+        Ln of the mean of the posterior over the density of the proposal.
     effective : float
         Effective number of the weights.
     enough : bool
@@ -176,6 +184,7 @@ class WeightedPlaces:
 
     rows: slice
     weight: np.ndarray
+    log_mean: float
     effective: float
     enough: bool
     wanted: np.ndarray
@@ -230,7 +239,7 @@ class AdaptiveSampler:
         self.label = np.empty(most, np.int64)
         self.score = np.empty((most, n_axes))
         self.place = np.empty((most, n_axes))
-        self.known = np.empty((most, 4))
+        self.known = np.empty((most, 5))
         self.peak = np.zeros(most, np.int64)
         self.density = np.zeros(most)
         self.scratch = np.empty((n_axes + 2, _LARGEST_ROUND))
@@ -394,7 +403,8 @@ class AdaptiveSampler:
         if not top > 0.5 * _core.NEVER:
             return None
         weight = np.exp(np.maximum(log - top, -700.0))
-        return WeightedPlaces(rows, weight, *self._wanted(weight, rows))
+        log_mean = top + np.log(weight.mean())
+        return WeightedPlaces(rows, weight, log_mean, *self._wanted(weight, rows))
 
     def _add_round(self, mixture, size):
         """Draw places of a mixture and evaluate them; returned are their ends for `_core.add_density`."""
@@ -503,15 +513,28 @@ class AdaptiveSampler:
         upto = np.cumsum(weight[order])
         kept = np.sort(order[upto > _LEFT_OUT * upto[-1]])
         rows = sample.rows.start + kept
-        _, scale, variance, power = self.known[rows].T
+        return self._placed(
+            self.place[rows],
+            self.known[rows],
+            weight[kept] / weight[kept].sum(),
+            self.points[1][rows],
+            sample,
+            converged=sample.enough,
+        )
+
+    def _placed(self, place, known, weight, uniform, sample, *, converged):
+        """`PlacedModels` of places, what is known of them and their weights; ``sample`` has the evidence."""
+        _, scale, variance, power, log_likelihood = known.T
         return PlacedModels(
-            place=self.place[rows],
-            weight=weight[kept] / weight[kept].sum(),
+            place=place,
+            weight=weight,
             scale=scale,
             variance=variance,
             power=power,
-            uniform=self.points[1][rows],
-            converged=sample.enough,
+            log_likelihood=log_likelihood,
+            uniform=uniform,
+            log_evidence=sample.log_mean,
+            converged=converged,
         )
 
     def _moved(self, sample):
@@ -549,7 +572,7 @@ class AdaptiveSampler:
 
         def evaluate(rows, new):
             place_new = np.empty(new.shape)
-            known_new = np.empty((len(new), 4))
+            known_new = np.empty((len(new), 5))
             of_new = (label[rows], new, place_new, known_new, self.work)
             _core.evaluate_places(self.space, self.labels, self.one, *of_new)
             if self.borders.size:
@@ -559,16 +582,8 @@ class AdaptiveSampler:
             return known_new, place_new
 
         move_places(evaluate, every[picked], active[label], score, known, place, self.scramble)
-        _, scale, variance, power = known.T
-        return PlacedModels(
-            place=place,
-            weight=np.concatenate(weight),
-            scale=scale,
-            variance=variance,
-            power=power,
-            uniform=self.points[1][: len(picked)],
-            converged=False,
-        )
+        uniform = self.points[1][: len(picked)]
+        return self._placed(place, known, np.concatenate(weight), uniform, sample, converged=False)
 
 
 def _of_ranges(labels):

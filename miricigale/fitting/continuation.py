@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.special import ndtri
+from scipy.special import log_ndtr, ndtri
 from scipy.stats import qmc
 
 from miricigale.fitting import _core
@@ -54,11 +54,15 @@ class Continuation(Frozen):
             out |= {name: axis for name, axis in known.items() if axis.kind == kind}
         return out
 
-    def _models(self, kind):
-        """Model of each combination of values of the axes of a kind, -1 where there is none: (n_1, n_2, ...)."""
+    @cached_property
+    def _models(self):
+        """Model of each combination of values of the axes, (n_1, n_2, ...), -1 where there is none: by kind."""
         grid = self.engine.grid
-        n_models = grid.n_galaxies if kind == "galaxy" else grid.n_agn
-        return grid_models(self.engine.priors.axes, kind, n_models)
+        axes = self.engine.priors.axes
+        return {
+            "galaxy": grid_models(axes, "galaxy", grid.n_galaxies),
+            "agn": grid_models(axes, "agn", grid.n_agn),
+        }
 
     @cached_property
     def space(self):
@@ -72,7 +76,7 @@ class Continuation(Frozen):
             low[i, :n], high[i, :n] = np.clip(axis.cells(), values[0], values[-1])
             if axis.kind in ("frac_agn", "agn"):
                 log_prior[i, :n] = _log(axis.weights)
-        galaxy = self._models("galaxy")
+        galaxy = self._models["galaxy"]
         light = self.models.light
         return _core.Space(size, low, high, log_prior, galaxy.ravel(), galaxy.ndim, light)
 
@@ -93,7 +97,7 @@ class Continuation(Frozen):
         out = np.zeros((len(axes), len(axes)), bool)
         for kind in ("galaxy", "agn"):
             own = [i for i, axis in enumerate(axes) if axis.kind == kind]
-            model = self._models(kind)
+            model = self._models[kind]
             for k, i in enumerate(own):
                 if not axes[i].absent_at_zero:
                     continue
@@ -137,7 +141,8 @@ class Continuation(Frozen):
 
     def at_redshift(self, redshift, node):
         """`GridEngine` of all models of the grid at one redshift; what else depends on it is that of a node."""
-        engine, new = self.engine, {"usable": self.engine.usable[node : node + 1]}
+        engine = self.engine
+        new = {"usable": engine.usable[node : node + 1]}
         for kind, values in self._values.items():
             z = np.full(getattr(engine, kind).shape[1], redshift)
             if not z.size:
@@ -157,7 +162,22 @@ class Continuation(Frozen):
         new["mass_prior"] = prior and (lambda formed, _: prior(formed, [node]))
         return replace(engine, **new)
 
-    def place(self, n_effective, redshifts, found, i, target, limits, log_usable, wrong, start):
+    @cached_property
+    def _log_usable(self):
+        """2 ln(prior) of the galaxies, shape (nz, nG)."""
+        prior = self.engine.priors.galaxy
+        return np.where(self.engine.usable, 2.0 * _log(prior / prior.sum()), _core.NEVER)
+
+    @cached_property
+    def _masses(self):
+        """`_core.Masses` of the grid."""
+        density = self.engine.density
+        if density is None:
+            n_z, n_galaxies = self.engine.usable.shape
+            return _core.Masses(np.zeros((n_z, 2)), np.zeros(n_galaxies), 0.0)
+        return _core.Masses(density.table, density.log_stars, density.per_dex)
+
+    def place(self, n_effective, posteriors, node, redshift, known):
         """
         Put models between the nodes, with the weights of the posterior of an object.
 
@@ -165,16 +185,31 @@ class Continuation(Frozen):
         ----------
         n_effective : int
             Effective number of models.
-        redshifts : `~numpy.ndarray`, shape (n,)
-            Redshifts of objects; 0 if these are free.
-        found : dict
-            Gets, at ``i``, a `BetweenPosterior`, or None if no model is possible.
-        i, target, limits, log_usable, wrong, start
-            What `GridEngine.fit` says of the object.
+        posteriors : dict
+            Gets, at the row of the object, a `BetweenPosterior`, or None if no model is possible.
+        node : int or None
+            Node that stands for the redshift; None if that is free.
+        redshift : float
+            Redshift of the object; 0 if it is free.
+        known : `~miricigale.fitting.grid.ObjectOnNodes`
+            What is known of the object.
         """
-        redshift = float(redshifts[i])
-        mixture = wrong and self._mixture(*wrong)
-        one = _core.Object(target, limits, mixture, log_usable, redshift, self.agn_error)
+        start = known.start
+        mixture = known.wrong and self._mixture(*known.wrong)
+        log_usable = known.log_usable
+        masses = self._masses
+        if log_usable is None:
+            log_usable = self._log_usable
+        else:
+            # these have the prior of mass
+            masses = masses._replace(table=np.zeros((len(masses.table), 2)), per_dex=0.0)
+        if node is not None:
+            masses = masses._replace(table=masses.table[node : node + 1])
+            if known.log_usable is None:
+                log_usable = log_usable[node : node + 1]
+        one = _core.Object(
+            known.target, known.limits, mixture, log_usable, masses, redshift, self.agn_error
+        )
         if redshift:
             labels, borders, weights = self.labels_at_redshift, np.zeros(0), np.ones(1)
         else:
@@ -187,7 +222,7 @@ class Continuation(Frozen):
         label, score = labels.of_nodes(self._cells_of(start.index))
         peak = np.searchsorted(borders, self.engine.grid.redshift[start.index[:, 0]])
         models = sampler.run(label, score, peak)
-        found[i] = models and self._describe(models, one, wrong)
+        posteriors[known.row] = models and self._describe(models, one, known)
 
     def _cells_of(self, drawn):
         """Nodes of the axes of draws from the posterior on nodes: (n, n_axes)."""
@@ -210,22 +245,80 @@ class Continuation(Frozen):
         level = 0.5 * np.log(narrow * np.square(sigma[used])).sum(axis=1)
         return _core.Mixture(narrow, wide**-2.0, odds, level, np.zeros(len(broad)))
 
-    def _describe(self, models, one, wrong):
+    def index_of_nodes(self, node):
+        """Redshift, galaxy, AGN model and fraction of nodes of the axes, (n, n_axes): (n, 4), -1 for none."""
+        index = np.full((len(node), 4), -1)
+        index[:, 0] = node[:, 0]
+        index[:, 3] = node[:, 1]
+        kinds = np.array([axis.kind for axis in self.axes.values()])
+        for column, kind in ((1, "galaxy"), (2, "agn")):
+            models = self._models[kind]
+            own = node[:, kinds == kind]
+            if own.shape[1]:
+                index[:, column] = models[tuple(own.T)]
+            else:
+                index[:, column] = models.ravel()[0]
+        without_agn = self.engine.grid.frac_agn[node[:, 1]] == 0.0
+        index[without_agn, 2] = -1
+        return index
+
+    def _describe(self, models, one, known):
         """`BetweenPosterior` of models."""
-        values, node, share, weight = {}, {}, None, models.weight
+        values = {}
+        node = {}
         for j, name in enumerate(self.axes):
             node[name], values[name] = places_to_values(self.space, j, models.place[:, j])
-        n = len(weight)
+        weight = models.weight
+        z = node["redshift"]
         if one.redshift:
-            values["redshift"] = np.full(n, one.redshift)
+            values["redshift"] = np.full(len(weight), one.redshift)
+            z = np.zeros(len(weight), int)
+        flux, _ = self.models.fluxes(values, values["redshift"], values["frac_agn"])
         scale = self.engine.drawn_scale(models.scale, models.variance, models.uniform)
-        if wrong:
-            flux = self.models.fluxes(values, values["redshift"], values["frac_agn"])[0]
-            z = 0 if one.redshift else node["redshift"]
-            given = flux * scale[:, None], wrong[0], wrong[2], one.limits, z, weight
+        drawn_flux = flux * scale[:, None]
+        share = None
+        if known.wrong:
+            stated, _, broad = known.wrong
+            given = drawn_flux, stated, broad, one.limits, z, weight
             share = self.engine.mixture.shares(*given)
-        derived = self.models.describe(values, values["redshift"], models.power, scale)
-        return BetweenPosterior(values, node, derived, weight, share, models)
+        mean = weight @ drawn_flux
+        variance = weight @ np.square(drawn_flux - mean)
+        # the best model is that of the highest likelihood, at its own scale
+        best = int(np.argmax(models.log_likelihood))
+        best_flux = flux[best] * models.scale[best]
+        stated = known.wrong[0] if known.wrong else one.target
+        return BetweenPosterior(
+            values=values,
+            node=node,
+            derived=self._derived(values, models, scale),
+            weight=weight,
+            wrong=share,
+            flux=np.array([mean, np.sqrt(variance)]),
+            best=self._best(values, models, best),
+            best_node=np.array([node[name][best] for name in self.axes]),
+            best_scale=models.scale[best],
+            best_flux=best_flux,
+            chi2=_chi2(stated, one.limits, z[best], best_flux),
+            log_sum=models.log_evidence + known.zero + known.log_norm,
+            converged=models.converged,
+        )
+
+    def _derived(self, values, models, scale):
+        """Derived quantities by name, shape (n,), of models with scales (n,)."""
+        return self.models.describe(values, values["redshift"], models.power, scale)
+
+    def _best(self, values, models, best):
+        """Parameters and derived quantities of the best model: dict of str to float."""
+        row = slice(best, best + 1)
+        own = {name: value[row] for name, value in values.items()}
+        derived = self.models.describe(own, own["redshift"], models.power[row], models.scale[row])
+        out = {name: float(value[0]) for name, value in (own | derived).items()}
+        if not out["frac_agn"] > 0:
+            # without AGN light there is no template
+            for name, axis in self.axes.items():
+                if axis.kind == "agn":
+                    out[name] = np.nan
+        return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,8 +334,22 @@ class BetweenPosterior:
         Weights of the models; they sum to 1.
     wrong : `~numpy.ndarray` or None, shape (nb,)
         How likely each band is wrong.
-    models : `~miricigale.fitting.adaptive.PlacedModels`
-        The models as they were sampled.
+    flux : `~numpy.ndarray`, shape (2, nb)
+        Mean and standard deviation of the fluxes of the models.
+    best : dict of str to float
+        Parameters and derived quantities of the model of the highest likelihood.
+    best_node : `~numpy.ndarray` of int, shape (n_axes,)
+        Nodes in whose cells that is.
+    best_scale : float
+        Its scale.
+    best_flux : `~numpy.ndarray`, shape (nb,)
+        Its fluxes.
+    chi2 : float
+        Its chi2.
+    log_sum : float
+        Ln of the sum of prior exp(-chi2 / 2).
+    converged : bool
+        Whether the effective number of models is what was asked for.
     """
 
     values: dict
@@ -250,7 +357,23 @@ class BetweenPosterior:
     derived: dict
     weight: np.ndarray
     wrong: np.ndarray | None
-    models: object
+    flux: np.ndarray
+    best: dict
+    best_node: np.ndarray
+    best_scale: float
+    best_flux: np.ndarray
+    chi2: float
+    log_sum: float
+    converged: bool
+
+
+def _chi2(target, limits, z, flux):
+    """Chi2 of the fluxes of a model, with errors at a node of redshift."""
+    chi2 = np.sum(target.weight[z] * np.square(target.flux - flux))
+    if limits is not None:
+        faint = limits.level - flux[limits.bands] * limits.inverse
+        chi2 -= 2.0 * log_ndtr(faint).sum()
+    return chi2
 
 
 @dataclass(frozen=True, eq=False)

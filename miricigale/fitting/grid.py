@@ -42,6 +42,13 @@ GridOutput = namedtuple("GridOutput", [*_AXES, "joint"])
 #: What the posterior between nodes begins with: draws on the nodes, redshift, galaxy, AGN model and fraction,
 #: shape (n_draws, 4); the posterior of redshift and AGN fraction, (nz, nf); whether both are of larger errors.
 Start = namedtuple("Start", "index zf larger_errors")
+#: What a fit says of an object: its row; `Target` and `Limits` (or None); 2 ln(prior) of galaxies, (nz, nG), or
+#: None where it is that of all objects; if bands may be wrong its data with stated errors, these errors and the
+#: broad ones, (nb,), else None; its `Start`; ln of the factor that keeps the sum of the priors with those of mass;
+#: and the constant of the sum of prior exp(-chi2 / 2).
+ObjectOnNodes = namedtuple(
+    "ObjectOnNodes", "row target limits log_usable wrong start log_norm zero"
+)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -239,9 +246,7 @@ class GridEngine(Frozen):
             What `workspace` returned for this ``n_draws`` and ``joint``, for use by one thread at
             a time; made if not given.
         each : callable, optional
-            Called with the row of each object that was fitted, its data, its limits (or None), 2 ln(prior) of the
-            galaxies, shape (nz, nG), if bands may be wrong (else None), its data with stated errors, these
-            errors and the broad ones, shape (nb,), and a `Start`.
+            Called with an `ObjectOnNodes` of each object that was fitted.
 
         Returns
         -------
@@ -253,18 +258,7 @@ class GridEngine(Frozen):
         limit = np.where(inverse > 0, 0.0 if limit is None else limit, 0.0)
         log_prior = np.where(np.isfinite(log_prior), 2.0 * log_prior, -1e300)
         seeds = np.zeros(n, np.uint64) if seeds is None else np.array(seeds, np.uint64)
-        # the galaxy's, the AGN model's and the sum of both
-        n_quantities = len(self._scales.galaxy) + len(self._scales.agn) - 1
-        size = self.size | {"b": n_bands, "q": n_quantities, "l": DERIVED_LEVELS.size, "d": n_draws}
-        size |= {"2": 2, "3": 3, "4": 4}
-
-        def empty(axes, value):
-            return np.full((n, *map(size.get, axes)), value)
-
-        out = GridOutput(
-            *(empty(axes, -1 if "index" in name else np.nan) for name, axes in _AXES.items()),
-            joint={name: empty(name, np.nan) for name in joint},
-        )
+        out = self.empty_output(n, n_draws, joint)
         workspace = self.workspace(n_draws, joint) if workspace is None else workspace
         sums = workspace[0]
         single = self._rtol >= _SINGLE
@@ -276,7 +270,8 @@ class GridEngine(Frozen):
             if broad is not None:
                 more = broad[i], limit[i], limit_sigma[i] if limits is not None else None
                 target, wrong = self._tangents.touch(stated, log_prior[i], sigma[i], *more)
-            tables, target = self._of_masses(target, workspace[2])
+            of_all = target
+            tables, target, log_norm = self._of_masses(target, workspace[2])
             given = tables, self._scales, self._request, target, limits
             sums.draws.state[0] = seeds[i]
             _core.clear(sums)
@@ -295,8 +290,31 @@ class GridEngine(Frozen):
                             data[i], larger * sigma[i], log_prior[i], larger * self.template_error
                         )
                         start = self._spread(loose, limits, workspace, single, seeds[i]) or start
-                    each(i, target, limits, tables.log_usable, wrong, start)
+                    # likelihoods of mixtures have no constant
+                    zero = 0.0 if broad is not None else -0.5 * target.top
+                    if limits is not None and broad is None:
+                        zero -= 0.5 * limits.dark
+                    known = ObjectOnNodes(i, of_all, limits, None, wrong, start, log_norm, zero)
+                    if self.mass_prior is not None:
+                        known = known._replace(target=target, log_usable=tables.log_usable)
+                    each(known)
         return out
+
+    def empty_output(self, n, n_draws=0, joint=()):
+        """`GridOutput` of n objects that were not fitted; arguments as of `fit`."""
+        # the galaxy's, the AGN model's and the sum of both
+        n_quantities = len(self._scales.galaxy) + len(self._scales.agn) - 1
+        n_bands = self.galaxy.shape[2]
+        size = self.size | {"b": n_bands, "q": n_quantities, "l": DERIVED_LEVELS.size, "d": n_draws}
+        size |= {"2": 2, "3": 3, "4": 4}
+
+        def empty(axes, value):
+            return np.full((n, *map(size.get, axes)), value)
+
+        return GridOutput(
+            *(empty(axes, -1 if "index" in name else np.nan) for name, axes in _AXES.items()),
+            joint={name: empty(name, np.nan) for name in joint},
+        )
 
     def _spread(self, target, limits, workspace, single, seed):
         """
@@ -306,7 +324,7 @@ class GridEngine(Frozen):
         happens to be near, and what lies in the cells of others is to be found.
         """
         sums = workspace[0]
-        tables, target = self._of_masses(target, workspace[2])
+        tables, target, _ = self._of_masses(target, workspace[2])
         sums.draws.state[0] = seed
         _core.clear(sums)
         given = tables, self._scales, self._request, target, limits
@@ -315,8 +333,13 @@ class GridEngine(Frozen):
         return Start(np.array(sums.draws.index), sums.zf / sums.zf.sum(), True)
 
     def _of_masses(self, target, space):
-        """Tables and data with the priors of galaxies, and of redshifts, at the masses that an object has."""
+        """
+        Tables and data with the priors of galaxies, and of redshifts, at the masses that an object has.
+
+        The third is ln of the factor that keeps the sum of a mass function's priors.
+        """
         tables = self._tables
+        log_norm = 0.0
         if self.density is not None:
             change, out = np.empty(target.log_prior.size), np.empty(tables.log_usable.shape)
             table, stars = self.density.table, np.zeros(out.shape[1])
@@ -326,11 +349,12 @@ class GridEngine(Frozen):
             tables = tables._replace(log_usable=out)
             # the evidence is that of a prior of redshift with the sum that it had
             prior = 0.5 * (target.log_prior - target.level)
-            change += logsumexp(prior) - logsumexp(prior + change)
+            log_norm = float(logsumexp(prior) - logsumexp(prior + change))
+            change += log_norm
             log_prior = np.where(target.log_prior > -1e200, target.log_prior + 2 * change, -1e300)
             target = target._replace(log_prior=log_prior)
         if self.mass_prior is None:
-            return tables, target
+            return tables, target, log_norm
         log, n_galaxy = tables.log_usable.copy(), self.size["g"]
         rows = np.flatnonzero(target.log_prior > -1e200)
         galaxy, weight = self.galaxy[rows], target.weight[rows]
@@ -343,7 +367,7 @@ class GridEngine(Frozen):
             # how much of the prior a redshift has is not for this factor to say
             found += (logsumexp(plain, axis=1) - logsumexp(found, axis=1))[:, None]
         log[rows, :n_galaxy] = np.where(found > -1e200, 2.0 * found, -1e300)
-        return tables._replace(log_usable=log), target
+        return tables._replace(log_usable=log), target, log_norm
 
     def _summarize(self, stated, target, limits, sums, out, i):
         """Fill row i of the output."""

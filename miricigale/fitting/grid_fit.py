@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 
 from miricigale.filters import FilterSet
-from miricigale.fitting.between import between_nodes
+from miricigale.fitting.between import between_results, with_axis_summaries
 from miricigale.fitting.continuation import N_START, Continuation
 from miricigale.fitting.grid import GridEngine
 from miricigale.fitting.interpolation import InterpolatedModels
@@ -238,42 +238,95 @@ class GridFit:
     def _fit_piece(self, pairs, piece):
         """`FitResults` of a piece: its photometry and priors of redshift."""
         data, log_prior = piece
+        if self.between is not None:
+            return self._between_nodes(data, log_prior, pairs)
+        return self._on_nodes(data, log_prior, pairs)
+
+    def _on_nodes(self, data, log_prior, pairs):
+        """Results on nodes alone."""
         joint = joint_names(pairs, self.priors.axes)
-        # between nodes each object has an engine of its own
-        own = self.between is not None and data.redshift is not None and self.grid.redshift.size > 1
-        options, size = {}, self.engine.size
-        n_draws = 0 if self.between is None else N_START
-        if n_draws or joint:
-            options = {"joint": joint, "n_draws": n_draws}
-        if options and not own:
-            options["workspace"] = self.engine.workspace(n_draws, joint)
+        options = {}
+        if joint:
+            workspace = self.engine.workspace(joint=joint)
+            options = {"joint": joint, "workspace": workspace}
         # joint sums are large: those of a few objects are reduced before the next are made
+        size = self.engine.size
         each = sum(size[x] * size[y] for x, y in joint)
-        step = 1 if own else max(1, min(_JOINT_SIZE // max(each, 1), len(data)))
+        step = max(1, min(_JOINT_SIZE // max(each, 1), len(data)))
         parts = []
         for rows in list(chunks(len(data), step)) or [slice(0, 0)]:
-            some, prior, found = data[rows], log_prior[rows], {}
-            if self.between is not None:
-                known = some.redshift if own else np.zeros(len(some))
-                given = self.given.interpolate, known, found
-                options["each"] = partial(self.between.place, *given)
-            if own and len(some):
-                results = self._at_redshift(some, prior, pairs, options)
-            else:
-                out = self.engine.fit(**some.of_engine(prior), **options)
-                results = self._results(some, out, pairs)
-            parts.append(results if self.between is None else between_nodes(found, results))
+            some = data[rows]
+            out = self.engine.fit(**some.of_engine(log_prior[rows]), **options)
+            parts.append(self._results(some, out, pairs))
         return FitResults.concatenate(parts)
 
-    def _at_redshift(self, data, log_prior, pairs, options):
-        """Results at an object's own redshift, which stand at the nearest node; ``options`` get a workspace."""
+    def _between_nodes(self, data, log_prior, pairs):
+        """Results between nodes, and on nodes of objects that no model between them is possible for."""
+        posteriors = {}
+        sampled = partial(self.between.place, self.given.interpolate)
+        at_redshift = data.redshift is not None and self.grid.redshift.size > 1
+        if at_redshift:
+            for i in np.flatnonzero(np.isfinite(log_prior).any(axis=1)):
+                row = slice(i, i + 1)
+                posterior = self._posterior_at_redshift(sampled, data[row], log_prior[row])
+                if posterior is not None:
+                    posteriors[i] = posterior
+        else:
+            self.engine.fit(
+                **data.of_engine(log_prior),
+                n_draws=N_START,
+                each=partial(sampled, posteriors, None, 0.0),
+                workspace=self.engine.workspace(N_START),
+            )
+        posteriors = {i: posterior for i, posterior in posteriors.items() if posterior is not None}
+        parts = []
+        rows = np.array(sorted(posteriors), int)
+        if rows.size:
+            found = [posteriors[i] for i in rows]
+            parts.append(between_results(self, data[rows], found, pairs))
+        others = np.setdiff1d(np.arange(len(data)), rows)
+        if others.size or not parts:
+            on_nodes = self._on_nodes
+            if at_redshift:
+                on_nodes = self._at_redshifts
+            results = on_nodes(data[others], log_prior[others], pairs)
+            parts.append(with_axis_summaries(results))
+        order = np.argsort(np.concatenate([rows, others]), kind="stable")
+        return FitResults.concatenate(parts)[order]
+
+    def _posterior_at_redshift(self, sampled, data, log_prior):
+        """`BetweenPosterior` of an object at its own redshift; None if no model is possible."""
+        z = float(data.redshift[0])
+        node = int(np.argmax(log_prior[0]))
+        engine = self.between.at_redshift(z, node)
+        posteriors = {}
+        engine.fit(
+            **data.of_engine(log_prior[:, node : node + 1]),
+            n_draws=N_START,
+            each=partial(sampled, posteriors, node, z),
+        )
+        return posteriors.get(0)
+
+    def _at_redshifts(self, data, log_prior, pairs):
+        """Results on nodes of objects at their own redshifts."""
+        parts = []
+        for rows in list(chunks(len(data), 1)) or [slice(0, 0)]:
+            if len(data[rows]):
+                parts.append(self._at_redshift(data[rows], log_prior[rows], pairs))
+            else:
+                parts.append(self._on_nodes(data[rows], log_prior[rows], pairs))
+        return FitResults.concatenate(parts)
+
+    def _at_redshift(self, data, log_prior, pairs):
+        """Results on nodes of an object at its own redshift, which stand at the nearest node."""
         z, n_z = float(data.redshift[0]), log_prior.shape[1]
         fitted = np.isfinite(log_prior).any()
         node = int(np.argmax(log_prior[0]))
         engine = self.between.at_redshift(z if fitted else self.grid.redshift[0], node)
-        if "workspace" not in options:
-            options["workspace"] = engine.workspace(options["n_draws"], options["joint"])
-        out = engine.fit(**data.of_engine(log_prior[:, node : node + 1]), **options)
+        joint = joint_names(pairs, self.priors.axes)
+        workspace = engine.workspace(joint=joint)
+        photometry = data.of_engine(log_prior[:, node : node + 1])
+        out = engine.fit(**photometry, joint=joint, workspace=workspace)
         if fitted:
             out.index[:, 0] = node
         here = (np.arange(n_z) == node)[:, None]
@@ -309,40 +362,56 @@ class GridFit:
                 pdf[name] = np.einsum("ng,vg->nv", models, axis.share)
         known = self.engine.quantities
         moments, quantiles = known.summarize(out)
-        # limits are probabilities, which have no unit
-        log_sigma = np.log(np.where(data.measured, data.sigma, 1.0)).sum(axis=1)
-        log_sigma += 0.5 * data.measured.sum(axis=1) * np.log(2.0 * np.pi)
-        if self.template_error is not None:
-            # that of the best model
-            more = self.engine.template_error[np.maximum(out.index[:, 0], 0)] * data.flux
-            more[~data.measured | np.isnan(out.chi2)[:, None]] = 0.0
-            data = data._changed(sigma=np.hypot(data.sigma, more))
+        log_sigma = self.log_errors(data)
+        data = self.with_template_error(data, np.where(np.isnan(out.chi2), -1, out.index[:, 0]))
         return FitResults(
             **data.columns,
+            **self.result_settings(),
             flags=flags,
             chi2=out.chi2,
             log_evidence=out.log_sum - log_sigma,
-            filters=self.filters,
-            axes={name: replace(axis, share=None) for name, axis in axes.items()},
             pdf=pdf,
             pdf_2d=out.zf,
             pairs=joint_tables(out, pairs, axes),
             best_index=out.index,
             best_scale=out.best_scale,
             best=self._best(out),
-            quantities=known.names,
-            units=known.units,
-            descriptions=known.descriptions,
-            intensive=known.intensive,
             moments=moments,
             quantiles=quantiles,
             model_flux=out.band[:, 0],
             model_flux_std=out.band[:, 1],
             best_flux=out.best_flux,
-            constants=self.constants,
             outlier=None if self.engine.mixture is None else out.outlier,
-            least_std=CIGALE_LEAST_STD if self.compat == "cigale" else 0.0,
         )
+
+    def log_errors(self, data):
+        """Ln of the product of the errors that likelihoods are divided by, shape (n,)."""
+        # limits are probabilities, which have no unit
+        log_sigma = np.log(np.where(data.measured, data.sigma, 1.0)).sum(axis=1)
+        return log_sigma + 0.5 * data.measured.sum(axis=1) * np.log(2.0 * np.pi)
+
+    def with_template_error(self, data, node):
+        """Photometry whose errors have that of the templates at nodes of redshift, (n,); -1 is none."""
+        if self.template_error is None:
+            return data
+        more = self.engine.template_error[np.maximum(node, 0)] * data.flux
+        more[~data.measured | (node < 0)[:, None]] = 0.0
+        return data._changed(sigma=np.hypot(data.sigma, more))
+
+    def result_settings(self):
+        """Keywords of `FitResults` that are the same for all objects."""
+        quantities = self.engine.quantities
+        axes = {name: replace(axis, share=None) for name, axis in self.priors.axes.items()}
+        return {
+            "filters": self.filters,
+            "axes": axes,
+            "quantities": quantities.names,
+            "units": quantities.units,
+            "descriptions": quantities.descriptions,
+            "intensive": quantities.intensive,
+            "constants": self.constants,
+            "least_std": CIGALE_LEAST_STD if self.compat == "cigale" else 0.0,
+        }
 
     def _best(self, out):
         """Parameters and derived quantities of the best models: name to array."""

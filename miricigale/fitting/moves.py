@@ -25,12 +25,12 @@ def move_places(evaluate, group, active, score, known, place, seed):
     ----------
     evaluate : callable
         Of rows, shape (m,), and scores, shape (m, n_axes): what `_core.evaluate_places` says of them, shape
-        (m, 4), and places in unit intervals, shape (m, n_axes).
+        (m, 5), and places in unit intervals, shape (m, n_axes).
     group : `~numpy.ndarray` of int, shape (n,)
         Groups of the places, of one label each.
     active : `~numpy.ndarray` of bool, shape (n, n_axes)
         Axes that have an effect.
-    score, known, place : `~numpy.ndarray`, shapes (n, n_axes), (n, 4) and (n, n_axes)
+    score, known, place : `~numpy.ndarray`, shapes (n, n_axes), (n, 5) and (n, n_axes)
         Scores, what is known of them, and places in unit intervals; they change.
     seed : int
         Seed of the moves.

@@ -40,7 +40,7 @@ from miricigale.fitting._core.importance import (
 )
 from miricigale.fitting._core.masses import weigh_masses
 from miricigale.fitting._core.mixture import find_models
-from miricigale.fitting._core.population import NEVER, Mixture, Object, Space
+from miricigale.fitting._core.population import NEVER, Masses, Mixture, Object, Space
 from miricigale.fitting._core.structs import BLOCK, Request, Tables
 from miricigale.fitting._core.workspace import (
     JOINT,

@@ -78,9 +78,9 @@ def evaluate_places(space, labels, one, label, y, x, known, work):
         Their scores.
     x : `~numpy.ndarray`, shape (n, n_axes)
         Gets the places in unit intervals.
-    known : `~numpy.ndarray`, shape (n, 4)
+    known : `~numpy.ndarray`, shape (n, 5)
         Gets ln of the posterior in scores over the standard normal distribution of the axes that are not active,
-        best scale, its variance and AGN power.
+        best scale, its variance, AGN power, and ln of the likelihood.
     work : `Work`
         Scratch.
     """
@@ -93,6 +93,7 @@ def evaluate_places(space, labels, one, label, y, x, known, work):
         known[i, 0] = log + prior + like if prior > 0.5 * NEVER else NEVER
         known[i, 1], known[i, 2] = scale, variance
         known[i, 3] = work.flux[0, len(work.flux[0]) - 1]
+        known[i, 4] = like
 
 
 @njit(**KERNEL)

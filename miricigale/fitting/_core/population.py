@@ -18,9 +18,12 @@ NEVER, _NONE = -1e300, -1e200
 #: and their fractions, (n_axes, n_largest); the galaxies of all cells, int64, flat (-1: none), of which there are
 #: ``n_galaxy`` axes; and the `Light` between whose nodes models are interpolated.
 Space = namedtuple("Space", "size low high log_prior cells n_galaxy light")
-#: An object: `Target`, `Limits` or None, `Mixture` or None, 2 ln(prior) of galaxies, (nz, nG), its redshift, 0 if
-#: that is free, and error of AGN light as a part of it.
-Object = namedtuple("Object", "target limits mixture log_usable redshift agn_error")
+#: An object: `Target`, `Limits` or None, `Mixture` or None, 2 ln(prior) of galaxies, (nz, nG), `Masses`, its
+#: redshift, 0 if that is free, and error of AGN light as a part of it.
+Object = namedtuple("Object", "target limits mixture log_usable masses redshift agn_error")
+#: Prior of stellar mass: ln of it, (nz, n), at log10 of masses 0, 1 / per_dex, 2 / per_dex, ...; log10 of the
+#: stellar mass of each galaxy for each solar mass formed, (nG,). Without one there are two values of 0.
+Masses = namedtuple("Masses", "table log_stars per_dex")
 #: Bands that may be wrong, of the used ones: 1 / sigma^2 of the stated error, (nz, n_used), and of the broad
 #: one, (n_used,); odds of the latter without a residual, (nz, n_used); ln of the likelihood where none is wrong
 #: and there are no residuals, (nz,); scratch, (nb,).
@@ -127,6 +130,18 @@ def _prior(one, z, g):
 
 
 @njit(**PART)
+def _mass_prior(masses, z, g, scale):
+    """Ln of the prior of the mass that a galaxy has with so many solar masses formed."""
+    values = masses.table[z]
+    n_last = len(values) - 2
+    log_mass = math.log10(max(scale, 1.0)) + masses.log_stars[g]
+    place = min(max(log_mass * masses.per_dex, 0.0), n_last + 1.0)
+    k = min(int(place), n_last)
+    part = place - k
+    return (1.0 - part) * values[k] + part * values[k + 1]
+
+
+@njit(**PART)
 def _model(space, x, redshift, work):
     """
     Put fluxes of a place, and then its AGN power, into ``work.flux[0]``.
@@ -170,4 +185,5 @@ def _evaluate(space, one, x, work):
     if log < _NONE:
         return NEVER, 0.0, 0.0, 0.0
     s, like, variance = _likelihood(one, one.limits, one.mixture, z, work)
+    log += _mass_prior(one.masses, z, g, s)
     return prior + log, like, s, variance
