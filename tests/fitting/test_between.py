@@ -281,8 +281,10 @@ def test_known_redshifts_between_nodes_are_those_of_the_chain(chain, finer):
     nodes = interpolated(grid, 0).fit(table, redshift=known)
     assert np.all(nodes.chi2 > 10 * results.chi2)
     for name in ("age", "tau", "ebv"):
-        # the best of the places, which lie within their errors of the truth
-        assert_allclose(u.Quantity(results.best[name]).value, true[name].value, rtol=0.1)
+        # of data without noise the best of the places is nearer than their scatter
+        low, high = results.percentile(name, [0.16, 0.84]).value.T
+        best = u.Quantity(results.best[name]).value
+        assert np.all(np.abs(best - true[name].value) < high - low)
 
 
 def test_a_finer_grid_is_of_the_model_that_made_the_grid(chain):

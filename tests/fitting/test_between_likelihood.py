@@ -106,7 +106,7 @@ def plain_means(observed, sigma, known):
     return by_hand(np.array(observed), np.array(sigma), known)[0]
 
 
-def by_hand(observed, sigma, known, *, limit=None, part=0.0, error=None, prior=None):
+def by_hand(observed, sigma, known, *, limit=None, part=0.0, error=None, prior=None, masses=None):
     """Means and standard deviations of redshift, tau, E(B-V) and mass of one object, and ln(evidence)."""
     places, nodes = zip(*(fine(values) for values in AXES.values()), strict=True)
     if known is not None:
@@ -125,6 +125,9 @@ def by_hand(observed, sigma, known, *, limit=None, part=0.0, error=None, prior=N
         node, sfr = flux(z_of[:, None], t, e)
         formed = np.sum(node * observed / sigma**2, 2) / np.sum(node**2 / sigma**2, 2)
         log = log + prior(formed * (0.6 + 0.1 * t), formed * sfr)[z_node, 3 * i + j]
+    if masses is not None:
+        # stars for each solar mass formed, and volumes, are those of nodes
+        log = log + masses(scale * (0.6 + 0.1 * AXES["tau"][i]), z_node)
     p = np.exp(log - log.max()) / np.exp(log - log.max()).sum()
     mean = np.array([p @ x for x in (z, tau, ebv, scale)])
     square = np.array([p @ x**2 for x in (z, tau, ebv, np.hypot(scale, spread))])
@@ -132,12 +135,12 @@ def by_hand(observed, sigma, known, *, limit=None, part=0.0, error=None, prior=N
     return mean, np.sqrt(np.maximum(square - mean**2, 1e-20)), evidence
 
 
-def of_density(stars, _):
+def of_density(stars, node):
     z = AXES["redshift"]
     edges = np.concatenate([[2 * z[0] - z[1], *z, 2 * z[-1] - z[-2]]])
     cells = 0.5 * (edges[2:] - edges[:-2])
     volume = FlatLambdaCDM(70.4, 0.272).differential_comoving_volume(z).value * cells
-    return (4.0 - 2.0 * z[:, None]) * np.log(stars / 1e10) + np.log(volume)[:, None]
+    return (4.0 - 2.0 * z[node]) * np.log(stars / 1e10) + np.log(volume)[node]
 
 
 def of_relation(stars, sfr):
@@ -157,8 +160,8 @@ CASES = {
         {"outliers": PART, "template_error": ERROR}, {},
         {"part": PART, "limit": LIMIT, "error": True}, False,
     ),
-    "masses": ({}, {"mass_function": density}, {"prior": of_density}, False),
-    "masses, known": ({}, {"mass_function": density}, {"prior": of_density}, True),
+    "masses": ({}, {"mass_function": density}, {"masses": of_density}, False),
+    "masses, known": ({}, {"mass_function": density}, {"masses": of_density}, True),
     "rates": ({}, {"sfr_prior": (relation, SCATTER)}, {"prior": of_relation}, False),
     "rates, known": ({}, {"sfr_prior": (relation, SCATTER)}, {"prior": of_relation}, True),
 }  # fmt: skip
@@ -205,7 +208,10 @@ def test_galaxies_beyond_all_masses_have_the_last_density(grid, objects):
     results = fitter.fit(photometry_table(BANDS, observed, sigma))
     for i in range(2):
         mean, std, _ = by_hand(
-            observed[i], sigma[i], None, prior=lambda s, _: of_density(np.full_like(s, 1e16), _)
+            observed[i],
+            sigma[i],
+            None,
+            masses=lambda s, node: of_density(np.full_like(s, 1e16), node),
         )
         found = [results.mean(name).value[i] for name in AXES]
         assert np.abs((found - mean[:3]) / std[:3]).max() < 0.1
@@ -309,7 +315,8 @@ def test_masses_on_nodes_have_the_density(grid, objects):
     data, weight = observed[:, None, None], sigma[:, None, None] ** -2.0
     formed = np.sum(weight * data * node, axis=3) / np.sum(weight * node**2, axis=3)
     chi2 = np.sum(weight * (data - formed[..., None] * node) ** 2, axis=3)
-    p = np.exp(of_density(formed * (0.6 + 0.1 * t), None) - chi2 / 2)
+    of_mass = of_density(formed * (0.6 + 0.1 * t), np.arange(4)[:, None])
+    p = np.exp(of_mass - chi2 / 2)
     p /= p.sum(axis=(1, 2), keepdims=True)
     for name, values in {"redshift": AXES["redshift"][:, None], "tau": t, "mass": formed}.items():
         assert_allclose(results.mean(name).value, np.sum(p * values, axis=(1, 2)), rtol=1e-6)
