@@ -101,7 +101,8 @@ class Background:
             If the gradient makes the background negative somewhere.
         """
         ny, nx = shape
-        level, gradient = self.level.value, self.gradient.value
+        level = self.level.value
+        gradient = self.gradient.value
         if gradient == 0:
             return np.full(shape, level)
         center = self.center
@@ -111,7 +112,8 @@ class Background:
         nodes = [np.linspace(-0.5, n - 0.5, 12) for n in (ny, nx)]
         x, y = np.meshgrid(nodes[1], nodes[0])
         ra, dec = np.radians(pixel_to_radec(wcs, x.ravel(), y.ravel())).reshape(2, *x.shape)
-        ra0, dec0 = center.icrs.ra.rad, center.icrs.dec.rad
+        ra0 = center.icrs.ra.rad
+        dec0 = center.icrs.dec.rad
         cos = np.sin(dec0) * np.sin(dec) + np.cos(dec0) * np.cos(dec) * np.cos(ra - ra0)
         east = np.cos(dec) * np.sin(ra - ra0) / cos
         north = (np.cos(dec0) * np.sin(dec) - np.sin(dec0) * np.cos(dec) * np.cos(ra - ra0)) / cos

@@ -67,7 +67,9 @@ def _plain(table, name, unit, argument):
     if name != "position_angle":  # an angle on the sky may be -99
         values[without_codes(values)[0]] = np.nan
     values = u.Quantity(values, getattr(table[name], "unit", None)).to(unit or u.one)
-    return values if unit else values.value
+    if unit:
+        return values
+    return values.value
 
 
 def as_sources(data, filter, argument="catalog"):
@@ -165,7 +167,10 @@ def check_catalog(table, *, filters=(), wcs=None, argument="catalog"):
     ids = id_column(catalog.colnames, argument)
     if ids is None:
         looks = likely_ids(catalog)
-        hint = f" ({looks[0]!r} looks like ids: name it 'id')" if looks else ""
+        if looks:
+            hint = f" ({looks[0]!r} looks like ids: name it 'id')"
+        else:
+            hint = ""
         raise argument_error(
             argument, "a table with the columns ['id']", f"columns {catalog.colnames}{hint}"
         )
@@ -201,7 +206,10 @@ def check_catalog(table, *, filters=(), wcs=None, argument="catalog"):
         catalog["star"] = np.zeros(len(catalog), dtype=bool)
     star = catalog["star"]
     if star.dtype != bool or np.any(getattr(star, "mask", False)):
-        got = "missing values" if star.dtype == bool else star.dtype
+        if star.dtype == bool:
+            got = "missing values"
+        else:
+            got = star.dtype
         raise argument_error(argument, "a table with True or False in 'star'", got)
     catalog["flags"] = _flags(catalog)
     catalog["flags"].info.description = CatalogFlags.describe()
@@ -225,7 +233,10 @@ def _fill_columns(table, argument):
     table["profile"] = np.where(usable, "sersic", "point")
     n = int(np.count_nonzero(~usable))
     if n:
-        why = f"no column {missing[0]!r}" if missing else "incomplete or not positive shapes"
+        if missing:
+            why = f"no column {missing[0]!r}"
+        else:
+            why = "incomplete or not positive shapes"
         yield f"{n} of {len(table)} sources are points ({why})"
 
 
@@ -233,7 +244,8 @@ def _flags(catalog):
     flags = np.zeros(len(catalog), dtype=int)
     sersic = catalog["profile"] == "sersic"
     radius = catalog["half_light_radius"].value
-    ratio, angle = catalog["axis_ratio"], catalog["position_angle"].value
+    ratio = catalog["axis_ratio"]
+    angle = catalog["position_angle"].value
     low, high = SERSIC_INDEX_RANGE
     index = catalog["sersic_index"]
     flags[sersic & ~(np.isfinite(radius) & (radius > 0))] |= CatalogFlags.BAD_RADIUS

@@ -116,7 +116,10 @@ def _missing_fluxes(catalog):
     lost = (catalog["flags"] & int(CatalogFlags.NO_FLUX)) > 0
     if np.any(lost):
         first = ", ".join(map(str, catalog["id"][lost][:5].tolist()))
-        more = ", ..." if lost.sum() > 5 else ""
+        if lost.sum() > 5:
+            more = ", ..."
+        else:
+            more = ""
         yield (
             f"{lost.sum()} of {len(catalog)} sources have no usable flux in any band "
             f"(flag no_flux): ids {first}{more}"
@@ -127,7 +130,8 @@ def _hours(table, catalog):
     """Warnings about right ascensions in degrees that look like hours."""
     if "ra" not in table.colnames or table["ra"].unit != u.deg or len(catalog) < 3:
         return
-    ra, dec = catalog["sky"].ra.deg, catalog["sky"].dec.deg
+    ra = catalog["sky"].ra.deg
+    dec = catalog["sky"].dec.deg
     width = np.ptp(ra) * np.cos(np.radians(dec.mean()))
     if ra.max() <= 24.0 and np.ptp(dec) > 0 and width < 0.2 * np.ptp(dec):
         yield (

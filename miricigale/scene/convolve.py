@@ -27,7 +27,8 @@ class Places:
 
     def __init__(self, at, *, n_pixels, margin, oversampling):
         self._at = np.asarray(at, dtype=float)
-        self._margin, self._oversampling = margin, oversampling
+        self._margin = margin
+        self._oversampling = oversampling
         self.n_pixels = n_pixels
         self._n_nodes = (n_pixels + 2 * margin) * oversampling
 
@@ -62,8 +63,10 @@ class Places:
 
 def _window(first, stop, n_pixels, margin, oversampling):
     """Pixels of a tile and of the image that it reaches, and the length of the transform."""
-    start, end = first // oversampling, -(-stop // oversampling)
-    low, high = max(start - margin, margin), min(end + margin, margin + n_pixels)
+    start = first // oversampling
+    end = -(-stop // oversampling)
+    low = max(start - margin, margin)
+    high = min(end + margin, margin + n_pixels)
     # what wraps round stays off the wanted pixels
     size = max(high - start + margin, end - low + margin, end - start)
     return start, end, low, high, next_fast_len(size, real=True)
@@ -94,7 +97,8 @@ def phases(data, origin, oversampling):
     result: (oversampling, oversampling, 2 L + 1, 2 L + 1), coefficients at the offsets of whole
     pixels less ``a`` and ``b`` nodes in y and x.
     """
-    os_, (cx, cy) = oversampling, origin
+    os_ = oversampling
+    cx, cy = origin
     # space in which the splines decay
     reach = max(cx, cy, data.shape[1] - 1 - cx, data.shape[0] - 1 - cy) + 8
     half = math.ceil((reach + os_) / os_)
@@ -117,11 +121,15 @@ def add_nodes(image, i, j, light, phases, *, margin):
     It is what `convolve` does with one PSF of these `phases`, which takes as long for one node as
     for all.
     """
-    os_, half = phases.shape[0], phases.shape[-1] // 2
+    os_ = phases.shape[0]
+    half = phases.shape[-1] // 2
     for row, column, value in zip(i, j, light, strict=True):
-        y, x = row // os_ - margin, column // os_ - margin
-        y0, y1 = max(y - half, 0), min(y + half + 1, image.shape[0])
-        x0, x1 = max(x - half, 0), min(x + half + 1, image.shape[1])
+        y = row // os_ - margin
+        x = column // os_ - margin
+        y0 = max(y - half, 0)
+        y1 = min(y + half + 1, image.shape[0])
+        x0 = max(x - half, 0)
+        x1 = min(x + half + 1, image.shape[1])
         if y1 > y0 and x1 > x0:
             one = phases[row % os_, column % os_]
             one = one[y0 - y + half : y1 - y + half, x0 - x + half : x1 - x + half]
@@ -130,7 +138,8 @@ def add_nodes(image, i, j, light, phases, *, margin):
 
 def _kernels(data, origin, oversampling, order, y, x):
     """Phases of the kernels of 1, x, y and xy of the pixel, as far as they are not zero."""
-    (k_y, length_y), (k_x, length_x) = y, x
+    k_y, length_y = y
+    k_x, length_x = x
     one = data[order[k_y, k_x]]
     # the splines' coefficients are those of the PSF times the offset: not the offset times them
     u = (np.arange(one.shape[1]) - origin[0]) / oversampling / length_x
@@ -189,7 +198,8 @@ def convolve(grid, data, order, rows, columns, *, origin, margin, oversampling, 
             if own.shape != full:
                 # the tile begins or ends within a pixel
                 light = np.zeros(full, dtype=grid.dtype)
-                i, j = y_first - y0 * os_, x_first - x0 * os_
+                i = y_first - y0 * os_
+                j = x_first - x0 * os_
                 light[i : i + own.shape[0], j : j + own.shape[1]] = own
             kernels = _kernels(data, origin, os_, order, (k_y, length_y), (k_x, length_x))
             size = (size_y, size_x)

@@ -73,7 +73,10 @@ class Cutout(Frozen):
         scale = positive(self.pixel_scale, ANGLE, "pixel_scale") * ANGLE
         angle = frozen_quantity(self.angle, u.deg, "angle", ndim=0, finite=True)
         ny, nx = data.shape
-        center = ((nx - 1) / 2, (ny - 1) / 2) if self.center is None else self.center
+        if self.center is None:
+            center = ((nx - 1) / 2, (ny - 1) / 2)
+        else:
+            center = self.center
         if len(center) != 2 or not np.all(np.isfinite(center)):
             raise argument_error("center", "a pixel x, y", self.center)
         center = (float(center[0]), float(center[1]))
@@ -113,7 +116,8 @@ class Cutout(Frozen):
         got = f"{bad.sum()} of {bad.size} pixels that are"
         check_that(not bad.any(), "image", "without masked or infinite pixels (fill them)", got)
         ny, nx = data.shape
-        x, y = (nx - 1) / 2, (ny - 1) / 2
+        x = (nx - 1) / 2
+        y = (ny - 1) / 2
         # columns: the steps along x and y in (east, north), arcsec
         steps = np.linalg.inv(local_jacobian(image.wcs, x, y))
         sides = np.hypot(*steps)
@@ -126,7 +130,8 @@ class Cutout(Frozen):
             x, y = (float(v) for v in image.wcs.world_to_pixel(position))
         # east of north is counter-clockwise where +x is west of +y
         if np.linalg.det(steps) > 0:
-            data, x = data[:, ::-1], nx - 1 - x
+            data = data[:, ::-1]
+            x = nx - 1 - x
         angle = math.degrees(math.atan2(steps[0, 1], steps[1, 1]))
         scale = float(np.sqrt(np.prod(sides)))
         return cls(data, pixel_scale=scale * ANGLE, angle=angle * u.deg, center=(x, y))
@@ -139,7 +144,8 @@ class Cutout(Frozen):
     @functools.cached_property
     def _steps(self):
         """East and north of a step along x and along y, arcsec, as columns."""
-        a, s = self.angle.to_value(u.rad), self.pixel_scale.value
+        a = self.angle.to_value(u.rad)
+        s = self.pixel_scale.value
         return s * np.array([[-math.cos(a), math.sin(a)], [math.sin(a), math.cos(a)]])
 
     @functools.cached_property

@@ -16,8 +16,10 @@ _BATCH = 2_000_000
 #: The smooth part begins so many nodes from the center along a row and across the major axis,
 #: and where the brightness changes by less than these fractions from node to node: the error is
 #: below 3e-5 of the brightness there.
-SMOOTH_ALONG, SMOOTH_ACROSS = 40.0, 16.0
-SLOPE_ALONG, SLOPE_ACROSS = 0.075, 0.12
+SMOOTH_ALONG = 40.0
+SMOOTH_ACROSS = 16.0
+SLOPE_ALONG = 0.075
+SLOPE_ACROSS = 0.12
 
 
 def smooth_from(rows, w_zone, w_cut):
@@ -70,7 +72,9 @@ def _outskirts(grid, rows, tables, w_zone, w_smooth, w_cut, land, executor):
 
 
 def _cusps(grid, rows, tables, w_zone, land, executor):
-    a, b, c = rows[:, 8], rows[:, 9], rows[:, 10]
+    a = rows[:, 8]
+    b = rows[:, 9]
+    c = rows[:, 10]
     half = np.sqrt(w_zone / (a * c - b * b))
     box = np.empty((rows.shape[0], 4), dtype=np.int64)
     for m, (center, reach) in enumerate(((rows[:, 1], half * a**0.5), (rows[:, 0], half * c**0.5))):

@@ -103,14 +103,16 @@ def example_field(filters=("wfc3.f160w", "miri.f770w"), *, size=30 * u.arcsec, s
     scale = galaxies["wfc3.f160w"] / light["wfc3.f160w"]
     shapes = ["profile", "half_light_radius", "sersic_index", "axis_ratio", "position_angle"]
     truth = galaxies["id", "sky", "redshift", *shapes]
-    images, psfs = {}, {}
+    images = {}
+    psfs = {}
     for name in names:
         truth[name] = light[name] * scale
         camera = name.split(".")[0]
         pixel = _SCALES[camera]
         n_pixels = round(width / pixel.value)
         psfs[name] = filter_psf(name, pixel_scale=pixel, pa=0 * u.deg)
-        wcs, depth = north_up_wcs(_CENTER, pixel, (n_pixels, n_pixels)), _DEPTHS[camera] * u.ABmag
+        wcs = north_up_wcs(_CENTER, pixel, (n_pixels, n_pixels))
+        depth = _DEPTHS[camera] * u.ABmag
         options = {"filter": name, "wcs": wcs, "psf": psfs[name], "depth": depth}
         images[name] = highres_image(truth, seed=seed, **options)
     return ExampleField(images, psfs, truth)

@@ -13,7 +13,9 @@ from miricigale.utils.random import check_seed, stream
 from miricigale.utils.units import positive
 
 #: Depth of the CANDELS wide fields in F160W, and the aperture and significance that it is for.
-_DEPTH, _APERTURE, _N_SIGMA = 27.6 * u.ABmag, 0.2 * u.arcsec, 5
+_DEPTH = 27.6 * u.ABmag
+_APERTURE = 0.2 * u.arcsec
+_N_SIGMA = 5
 
 
 def depth_to_rms(depth, *, pixel_area):
@@ -47,7 +49,10 @@ def depth_to_rms(depth, *, pixel_area):
     0.01325
     """
     # magnitudes become fluxes
-    flux = depth.to(u.uJy) if isinstance(depth, u.Magnitude) else depth
+    if isinstance(depth, u.Magnitude):
+        flux = depth.to(u.uJy)
+    else:
+        flux = depth
     limit = positive(flux, u.uJy, "depth")
     pixel_area = floats(pixel_area)
     n_pixels = math.pi * _APERTURE.to_value(u.rad) ** 2 / pixel_area

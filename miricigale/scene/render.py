@@ -75,12 +75,14 @@ class Painter:
     n_threads: int | None = None
 
     def __post_init__(self):
-        data, where = np.asarray(self.psf.data, dtype=float), [(0.0, 0.0)]
+        data = np.asarray(self.psf.data, dtype=float)
+        where = [(0.0, 0.0)]
         if isinstance(self.psf, GriddedPSFModel):
             origin = np.subtract(data.shape[:0:-1], 1) / 2
             where = np.asarray(self.psf.grid_xypos, dtype=float)
         elif isinstance(self.psf, ImagePSF):
-            data, origin = data[np.newaxis], self.psf.origin
+            data = data[np.newaxis]
+            origin = self.psf.origin
         else:
             wanted = "a photutils ImagePSF or GriddedPSFModel"
             raise argument_error("psf", wanted, type(self.psf).__name__)
@@ -94,7 +96,8 @@ class Painter:
         check_that(0 < self.enclosed < 1, "enclosed", "between 0 and 1", self.enclosed)
         check_that(self.max_radius > 0, "max_radius", "positive", self.max_radius)
         thread_count(self.n_threads)
-        oversampling, origin = int(oversampling[0]), tuple(round(float(v)) for v in origin)
+        oversampling = int(oversampling[0])
+        origin = tuple(round(float(v)) for v in origin)
         (x, k_x), (y, k_y) = (np.unique(v, return_inverse=True) for v in np.transpose(where))
         order = np.zeros((y.size, x.size), dtype=np.int64)
         order[k_y, k_x] = np.arange(len(where))
@@ -162,17 +165,21 @@ class Painter:
         kept : `~numpy.ndarray`, shape (N,)
             Fraction of the profile within the isophote at which it was cut.
         """
-        os_, margin = self._oversampling, self.margin
+        os_ = self._oversampling
+        margin = self.margin
         land = self._landing()
-        node_x, node_y = (np.asarray(x) + margin) * os_, (np.asarray(y) + margin) * os_
-        in_image, kept = np.zeros(len(node_x)), np.ones(len(node_x))
+        node_x = (np.asarray(x) + margin) * os_
+        node_y = (np.asarray(y) + margin) * os_
+        in_image = np.zeros(len(node_x))
+        kept = np.ones(len(node_x))
         extended = np.asarray(is_sersic) & (np.asarray(r_eff) * os_ >= _UNRESOLVED)
         points = ~extended
         points[list(images or {})] = False
         i, j, light, in_image[points] = _core.point_nodes(
             node_x[points], node_y[points], np.asarray(flux, float)[points], land
         )
-        n_nodes, n_taps = land.low_y.size * land.low_x.size, self._phases[0, 0, 0].size
+        n_nodes = land.low_y.size * land.low_x.size
+        n_taps = self._phases[0, 0, 0].size
         if points.all() and len(self._data) == 1 and i.size * n_taps < _DIRECT * n_nodes:
             image = np.zeros(self.shape)
             # in the grid's precision: the same sum
@@ -180,7 +187,9 @@ class Painter:
             return image, in_image, kept
         grid = np.zeros((land.low_y.size, land.low_x.size), dtype=np.float32)
         if np.any(extended):
-            radius, index, ratio = r_eff[extended] * os_, n[extended], axis_ratio[extended]
+            radius = r_eff[extended] * os_
+            index = n[extended]
+            ratio = axis_ratio[extended]
             shapes = {"r_eff": radius, "n": index, "axis_ratio": ratio, "theta": theta[extended]}
             places = {"x": node_x[extended], "y": node_y[extended]}
             rows = parameter_rows(**places, total_flux=flux[extended], **shapes)
@@ -189,7 +198,8 @@ class Painter:
             zone = np.where(ratio * radius < 4, np.maximum(4 / ratio, 3 * radius), 4 / ratio)
             cut = np.minimum(radius * sersic_radius(self.enclosed, index), self.max_radius * os_)
             cut = np.maximum(cut, zone)
-            w_zone, w_cut = (zone / radius) ** 2, (cut / radius) ** 2
+            w_zone = (zone / radius) ** 2
+            w_cut = (cut / radius) ** 2
             w_smooth = smooth_from(rows, w_zone, w_cut)
             in_image[extended] = deposit_profiles(
                 grid, rows, tables, w_zone, w_smooth, w_cut, land, n_threads=self.n_threads

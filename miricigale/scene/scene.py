@@ -146,14 +146,17 @@ class Scene(Interactive):
         if exposure is not None:
             check_kind(exposure, "exposure", Exposure)
             exposure.check_sky()
-            filter = exposure.filter if filter is None else filter
-            wcs = exposure.wcs if wcs is None else wcs
+            if filter is None:
+                filter = exposure.filter
+            if wcs is None:
+                wcs = exposure.wcs
         for name, value in (("filter", filter), ("wcs", wcs)):
             check_that(value is not None, name, "given, or an exposure", "None")
         check_that(isinstance(wcs, WCS), "wcs", "an astropy WCS", type(wcs).__name__)
         check_that(wcs.pixel_shape is not None, "wcs", "a WCS with its pixel_shape", "one without")
         name = str(getattr(filter, "name", filter))
-        self._wcs, self._filter = wcs, find_filter(name) or name
+        self._wcs = wcs
+        self._filter = find_filter(name) or name
         #: The exposure that the image is for, or None; `~miricigale.detector.Detector.expose` asks for it.
         self.exposure = exposure
         if isinstance(catalog, str) and catalog in resources():
@@ -163,7 +166,10 @@ class Scene(Interactive):
         if psf is None and (exposure is None or wcs is not exposure.wcs):
             # the model is in the axes of the detector
             raise argument_error("psf", "given for a grid that is not that of an exposure", "None")
-        psf = miri_psf(self._filter) if psf is None else as_psf(psf)
+        if psf is None:
+            psf = miri_psf(self._filter)
+        else:
+            psf = as_psf(psf)
         self._shape = tuple(int(n) for n in wcs.pixel_shape[::-1])
         self._background = self._check_background(background)
         scale = float(np.abs(np.linalg.det(self._center_jacobian())) ** -0.5)
@@ -213,17 +219,21 @@ class Scene(Interactive):
         column = self._catalog[agn]
         unit = getattr(column, "unit", None)
         is_share = unit is None or unit == u.one
-        values, high = plain_floats(column, agn, "catalog"), 1.0
+        values = plain_floats(column, agn, "catalog")
+        high = 1.0
         wanted = "shares between 0 and 1"
         if not is_share:
-            values, high = to_array(values * unit, FNU, "agn"), np.finfo(float).max
+            values = to_array(values * unit, FNU, "agn")
+            high = np.finfo(float).max
             wanted = "fluxes that are finite and not negative"
         bad = (values < 0) | (values > high)
         if np.any(bad):
             row = int(np.argmax(bad))
             raise argument_error("agn", wanted, f"{column[row]} in row {row}")
         values = np.nan_to_num(values, nan=0.0)
-        return (flux * (1 - values), flux * values) if is_share else (flux, values)
+        if is_share:
+            return (flux * (1 - values), flux * values)
+        return (flux, values)
 
     def _warn_of_fluxes(self):
         """Warn of sources that are not painted: without a finite, positive flux."""
@@ -275,7 +285,8 @@ class Scene(Interactive):
             check_that(own == self._shape, "psf", "a grid of places on this image", got)
         if psf.filter is not None:
             # other packages write F770W where we write miri.f770w
-            wanted, have = self._filter.lower(), psf.filter.lower()
+            wanted = self._filter.lower()
+            have = psf.filter.lower()
             if have not in (wanted, wanted.rpartition(".")[2]):
                 got = f"one of {psf.filter}"
                 raise argument_error("psf", f"one of the filter {self._filter}", got)
@@ -283,9 +294,11 @@ class Scene(Interactive):
     @functools.cached_property
     def _painted(self):
         """The light in each pixel (uJy), and the table of truth."""
-        catalog, shape = self._catalog, self._shape
+        catalog = self._catalog
+        shape = self._shape
         ny, nx = shape
-        galaxy, agn = self._galaxy_flux, self._agn_flux
+        galaxy = self._galaxy_flux
+        agn = self._agn_flux
         flux = galaxy + agn
         x, y, near = pixel_positions(self._wcs, catalog["sky"], shape)
         flags = np.zeros(len(catalog), dtype=int)
@@ -378,7 +391,10 @@ class Scene(Interactive):
         """
         light = self._painted[0]
         brightness = light * _UJY_TO_MJY / pixel_area_map(self._wcs, self._shape)
-        includes = list(self.psf.includes) if isinstance(self.psf, _TYPED) else []
+        if isinstance(self.psf, _TYPED):
+            includes = list(self.psf.includes)
+        else:
+            includes = []
         n = len(self._catalog)
         meta = provenance(filter=self._filter, psf_includes=includes, n_sources=n)
         if self._background is not None:

@@ -32,7 +32,8 @@ def pixel_positions(wcs, sky, shape):
     the image, whose ``shape`` is (ny, nx).
     """
     ny, nx = shape
-    ra, dec = sky.icrs.ra.deg, sky.icrs.dec.deg
+    ra = sky.icrs.ra.deg
+    dec = sky.icrs.dec.deg
     world = np.array(radec_axes(wcs, ra, dec))
     x, y = np.asarray(wcs.wcs_world2pix(*world, 0), dtype=float)
     near = (x > -0.5 * nx) & (x < 1.5 * nx) & (y > -0.5 * ny) & (y < 1.5 * ny)

@@ -21,7 +21,8 @@ _DECLARED = declared("miricigale.sed", "derived.toml")
 #: The ten windows of Calzetti, Kinney & Storchi-Bergmann 1994, table 2 (um).
 UV_WINDOWS = tuple(map(tuple, _DECLARED["uv_windows"]))
 #: Bands of the rest-frame colors, and these: name to the two bands.
-COLOR_BANDS, COLORS = _DECLARED["color_bands"], _DECLARED["colors"]
+COLOR_BANDS = _DECLARED["color_bands"]
+COLORS = _DECLARED["colors"]
 
 #: Roles whose parameters together shape stars with their gas, the parts of a galaxy, and what lies
 #: between the source and us.
@@ -109,7 +110,8 @@ class Chain:
         self.at = {
             x: int(np.searchsorted(wave, x * (1 - 1e-9))) for x in (SIX, VISUAL, *INFRARED, *span)
         }
-        self.functionals, self.reference_row = self._functionals(), 0
+        self.functionals = self._functionals()
+        self.reference_row = 0
         if tuple(span) != INFRARED:
             self.functionals = np.concatenate([self.functionals, [self._light_in(span)]])
             self.reference_row = -1
@@ -122,8 +124,10 @@ class Chain:
             setattr(self, name, cached(getattr(self, name), maxsize=MAX_KEPT))
 
     def _functionals(self):
-        wave, n = self.wave, self.wave.size
-        infrared, visual = self._light_in(INFRARED), np.zeros(n)
+        wave = self.wave
+        n = self.wave.size
+        infrared = self._light_in(INFRARED)
+        visual = np.zeros(n)
         visual[self.at[VISUAL]] = 1.0
         windows = np.zeros((len(UV_WINDOWS), n))
         for row, (low, high) in zip(windows, UV_WINDOWS, strict=True):
@@ -134,7 +138,8 @@ class Chain:
 
     def _light_in(self, span):
         """Weights of the integral of L_lambda over a range of wavelengths."""
-        weights, part = np.zeros(self.wave.size), slice(self.at[span[0]], self.at[span[1]] + 1)
+        weights = np.zeros(self.wave.size)
+        part = slice(self.at[span[0]], self.at[span[1]] + 1)
         weights[part] = _core.trapezoid_weights(self.wave[part])
         return weights
 
@@ -157,12 +162,16 @@ class Chain:
 
     def _populations(self, metallicity):
         """Ages, spectra on our grid, surviving mass of one metallicity, and photons by age of the gas's table."""
-        stellar, nebular = self.by_role["stellar"], self.by_role["nebular"]
+        stellar = self.by_role["stellar"]
+        nebular = self.by_role["nebular"]
         age, spectra, surviving = stellar.table(metallicity)
         spectra = np.ascontiguousarray(
             (self._hat("stellar") @ np.asarray(spectra, dtype=float).T).T
         )
-        photons = np.diag(stellar.ionizing(metallicity)) if nebular else ()
+        if nebular:
+            photons = np.diag(stellar.ionizing(metallicity))
+        else:
+            photons = ()
         photons = [_core.photons_by_age(age, row, nebular.table.age) for row in photons]
         return age, spectra, surviving, np.array(photons)
 
@@ -190,15 +199,20 @@ class Chain:
         sfh, stellar, nebular = (self.by_role[r] for r in STELLAR)
         n = len(values)
         light = np.zeros((2, n, self.wave.size))
-        gas = None if nebular is None else np.zeros_like(light)
+        if nebular is None:
+            gas = None
+        else:
+            gas = np.zeros_like(light)
         out = {name: np.zeros(n) for name in _OF_STARS.split()}
         histories = [sfh.history(v) for v in values]
         keys, kind = distinct([self.key(v, *STELLAR[1:]) for v in values])
         for i, key in enumerate(keys):
-            rows, v = np.flatnonzero(kind == i), self._dict(key, *STELLAR[1:])
+            rows = np.flatnonzero(kind == i)
+            v = self._dict(key, *STELLAR[1:])
             age, spectra, surviving, ionizing = self._populations(v["metallicity"])
             some = [histories[row] for row in rows]
-            every, end = np.concatenate([*some, [0.0]]), np.cumsum([h.size for h in some])
+            every = np.concatenate([*some, [0.0]])
+            end = np.cumsum([h.size for h in some])
             weights = stellar.masses(every, end, v)
             out["sfr"][rows] = every[end - 1]
             for last in (10, 100):
@@ -227,11 +241,15 @@ class Chain:
 
     def factors(self, key):
         """Transmissions for young stars, old stars and gas; None for gas that is as the stars."""
-        attenuation, values = self.by_role["attenuation"], self._dict(key, "attenuation")
+        attenuation = self.by_role["attenuation"]
+        values = self._dict(key, "attenuation")
         if attenuation is None:
             ones = np.ones(self.wave.size)
             return ones, ones, None
-        gas = attenuation.gas_factor(self.wave, values) if self.by_role["nebular"] else None
+        if self.by_role["nebular"]:
+            gas = attenuation.gas_factor(self.wave, values)
+        else:
+            gas = None
         return *attenuation.factors(self.wave, values), gas
 
     def attenuated(self, stars, rows, keys, dust_keys=None, out=None):
@@ -253,10 +271,12 @@ class Chain:
         light, absorbed : `~numpy.ndarray`, shape (n, n_wave) and (n,)
             L_lambda in W/um, and W.
         """
-        n, none = len(rows), np.zeros((0, self.wave.size))
+        n = len(rows)
+        none = np.zeros((0, self.wave.size))
         some = slice(int(rows.min()), int(rows.max()) + 1)
         different, dim = distinct(keys)
-        dust, dusty = np.zeros((1, self.wave.size)), np.zeros(n, dtype=np.int64)
+        dust = np.zeros((1, self.wave.size))
+        dusty = np.zeros(n, dtype=np.int64)
         if dust_keys is not None:
             dust_keys, dusty = distinct(dust_keys)
             dust = self.dusts(dust_keys)
@@ -264,10 +284,12 @@ class Chain:
         *dims, gas = zip(*map(self.factors, different), strict=True)
         dims = [*map(np.array, dims), none]
         if gas[0] is not None:
-            young, old = stars.nebular_young[some], stars.nebular_old[some]
+            young = stars.nebular_young[some]
+            old = stars.nebular_old[some]
             parts = [parts[0] - young, parts[1] - old, young + old]
             dims[2] = np.array(gas)
-        out = np.empty((n, self.wave.size)) if out is None else out
+        if out is None:
+            out = np.empty((n, self.wave.size))
         absorbed = np.empty(n)
         _core.mix_light(
             self.weights, *parts, rows - some.start, *dims, dim, stars.dust_power[some], dust, dusty, out, absorbed
@@ -313,7 +335,8 @@ class Chain:
 
         Given at the rest wavelengths from number ``first`` to ``last``, that one not included.
         """
-        observed, values = self.wave[first:last] * (1.0 + redshift), self._dict(key, *SKY)
+        observed = self.wave[first:last] * (1.0 + redshift)
+        values = self._dict(key, *SKY)
         igm, foreground = (self.by_role[role] for role in SKY)
         out = np.ones(observed.size)
         if igm is not None:

@@ -115,7 +115,8 @@ class Component:
     options = {}
 
     def __init__(self, **defaults):
-        known, options = type(self).declared(), type(self).all_options()
+        known = type(self).declared()
+        options = type(self).all_options()
         self.__dict__.update({name: values[0] for name, values in options.items()})
         for name, value in defaults.items():
             if name in options:

@@ -46,7 +46,9 @@ def galaxy_quantities(stars, rows, absorbed, sums, reference_row=0):
     times ``Chain.functionals``; ``reference`` is the light that AGN fractions refer to, and not in `DERIVED`.
     """
     n = len(_LOG_UV)
-    visual, windows, bands = sums[:, 1], sums[:, 2 : 2 + n], sums[:, 2 + n :]
+    visual = sums[:, 1]
+    windows = sums[:, 2 : 2 + n]
+    bands = sums[:, 2 + n :]
     with np.errstate(divide="ignore", invalid="ignore"):
         logs = np.log10(windows)
         magnitude = -2.5 * np.log10(bands)
@@ -77,7 +79,8 @@ def agn_quantities(definition, ratio, galaxy, seen):
     `galaxy_quantities`; ``seen`` holds, for one watt of torus and polar emission, ``infrared``,
     ``reference``, ``luminosity``, ``six`` and ``accretion``.
     """
-    dust, infrared = galaxy["dust_luminosity"], galaxy["ir_luminosity"]
+    dust = galaxy["dust_luminosity"]
+    infrared = galaxy["ir_luminosity"]
     power = ratio * (dust if definition == "dust" else galaxy["reference"] / seen["reference"])
     agn_infrared = power * seen["infrared"]
     total = infrared + agn_infrared

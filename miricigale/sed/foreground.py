@@ -59,7 +59,8 @@ def _table(law, r_v):
     low, high = coverage(law)
     wave = np.geomspace(low, high, _STEPS)
     # the last digit of 1 / (1 / x) must not lie outside
-    wave[0], wave[-1] = low, high
+    wave[0] = low
+    wave[-1] = high
     k = r_v * np.asarray(_law(law)(Rv=r_v)(1.0 / wave / u.um), dtype=float)
     k.flags.writeable = False
     return np.log(low), (_STEPS - 1) / np.log(high / low), k
@@ -96,7 +97,10 @@ def check_bands(filters, law, beyond="refuse"):
     out = []
     for band in FilterSet(filters):
         first, last = band.wave.value[[0, -1]]
-        top = max(high, 1.01 * last) if beyond == "transparent" else high
+        if beyond == "transparent":
+            top = max(high, 1.01 * last)
+        else:
+            top = high
         try:
             band.weights(np.array([low, top]))
         except ValueError:
@@ -220,7 +224,8 @@ def _band_grid(band, low, high, sed):
     """Wavelengths in um where the law is defined, weights of the light there, their whole sum."""
     first, last = band.wave.value[[0, -1]]
     wave = np.geomspace(first, last, max(int(_RESOLUTION * np.log(last / first)), 2) + 1)
-    wave[0], wave[-1] = first, last
+    wave[0] = first
+    wave[-1] = last
     if sed is not None:
         wave = np.union1d(wave, sed[0][(sed[0] > first) & (sed[0] < last)])
     weights = band.weights(wave)
@@ -323,7 +328,10 @@ def band_extinction(filters, ebv, *, law="G23", r_v=3.1, sed=None, beyond="refus
     values, _ = _color_excess(ebv)
     check_bands(bands, law, beyond)
     low, high = coverage(law)
-    points = None if sed is None else spectrum_arrays(sed, bands)
+    if sed is None:
+        points = None
+    else:
+        points = spectrum_arrays(sed, bands)
     if points is not None:
         bands.weights(points[0])  # refuses what the spectrum does not cover
     # many sources lie in one cell of a map
@@ -393,7 +401,8 @@ def deredden(photometry, ebv, filters, *, law="G23", r_v=3.1, sed=None, beyond="
     out = photometry.copy()
     for name in bands.names:
         factor = 10.0 ** (0.4 * table[name].value)
-        factor = factor[0] if scalar else factor
+        if scalar:
+            factor = factor[0]
         for column in (name, error_column(name)):
             if column not in out.colnames:
                 continue

@@ -47,12 +47,21 @@ def fraction_span(definition):
     ``definition`` is ``"dust"`` or a range such as ``"3-1000um"`` or ``"5-20um"`` in 0.1-1000 um; anything else
     is a ValueError.
     """
-    match = _SPAN.fullmatch(definition) if isinstance(definition, str) else None
-    low, high = map(float, match.groups()) if match else (0.0, 0.0)
+    if isinstance(definition, str):
+        match = _SPAN.fullmatch(definition)
+    else:
+        match = None
+    if match:
+        low, high = map(float, match.groups())
+    else:
+        low = 0.0
+        high = 0.0
     if definition != "dust" and not 0.1 <= low < high <= 1000.0:
         wanted = "one of 'dust' and ranges in 0.1-1000 um such as '3-1000um'"
         raise argument_error("frac_agn_definition", wanted, repr(definition))
-    return None if definition == "dust" else (low, high)
+    if definition == "dust":
+        return None
+    return (low, high)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -163,8 +172,10 @@ class ModelGrid(Frozen):
         self.__dict__.update(new)
         for name, (_, dtype, _) in _ARRAYS.items():
             self.__dict__[name] = frozen_array(getattr(self, name), dtype)
-        n_z, n_b = self.redshift.size, len(self.filters)
-        n_g, n_a = self.dust_luminosity.size, self.agn_multiplicity.size
+        n_z = self.redshift.size
+        n_b = len(self.filters)
+        n_g = self.dust_luminosity.size
+        n_a = self.agn_multiplicity.size
         inert = self.__dict__["inert"] = tuple(map(tuple, self.inert)) or ((),) * n_a
         check_that(len(inert) == n_a, "inert", f"names for each of {n_a} AGN models", len(inert))
         fraction_span(self.frac_agn_definition)
@@ -174,14 +185,19 @@ class ModelGrid(Frozen):
             got = getattr(self, name).shape
             check_that(got == shape, name, f"of shape {shape}", got)
         for name in _TABLES:
-            rows = n_g if name.startswith("galaxy") else n_a
+            if name.startswith("galaxy"):
+                rows = n_g
+            else:
+                rows = n_a
             table = getattr(self, name)
             if len(table) != rows and (table.colnames or name not in _MAY_LACK):
                 raise argument_error(name, f"a table of {rows} rows", f"{len(table)} rows")
         if len(set(self.filters)) != n_b or n_b == 0:
             raise argument_error("filters", "one or more different names", f"{self.filters}")
         check_that(n_z and n_g, "galaxy", "of at least one redshift and model", f"({n_z}, {n_g})")
-        z, f, n_alike = self.redshift, self.frac_agn, self.agn_multiplicity
+        z = self.redshift
+        f = self.frac_agn
+        n_alike = self.agn_multiplicity
         check_that(np.all(np.diff(z) > 0) and np.all(z >= 0), "redshift", "ascending and >= 0", z)
         if f.size == 0 or np.any(np.diff(f) <= 0) or not (f[0] >= 0 and f[-1] < 1):
             raise argument_error("frac_agn", "ascending values in [0, 1)", f"{f}")
@@ -218,7 +234,9 @@ class ModelGrid(Frozen):
 
     @property
     def _agn_count(self):
-        return self.frac_agn.size * int(self.agn_multiplicity.sum()) if self.n_agn else 1
+        if self.n_agn:
+            return self.frac_agn.size * int(self.agn_multiplicity.sum())
+        return 1
 
     def flux(self, z, galaxy, agn=0, frac=0):
         """
@@ -260,7 +278,10 @@ def _write(grid, path, *, overwrite=False):
     arrays = {}
     for name, (unit, *_) in _ARRAYS.items():
         array = getattr(grid, name)
-        arrays[name] = array if unit == u.one else u.Quantity(array, unit, copy=False)
+        if unit == u.one:
+            arrays[name] = array
+        else:
+            arrays[name] = u.Quantity(array, unit, copy=False)
     write_parts(path, _LAYOUT, text=text, arrays=arrays, tables=tables, overwrite=overwrite)
 
 

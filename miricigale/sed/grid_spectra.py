@@ -38,7 +38,10 @@ def band_names(grid, filters):
         return list(grid.filters), {}
     wanted = "a list of names or a FilterSet"
     check_that(not isinstance(filters, str), "filters", wanted, repr(filters))
-    given = {band.name: band for band in filters} if isinstance(filters, FilterSet) else {}
+    if isinstance(filters, FilterSet):
+        given = {band.name: band for band in filters}
+    else:
+        given = {}
     names = list(given or filters)
     return names, {name: given.get(name) for name in names if name not in grid.filters}
 
@@ -151,7 +154,8 @@ def observed_spectra(model, grid, index, scale):
     rest, lnu = rest_spectra(model, grid, index, scale)
     redshift = grid.redshift[index[:, 0]]
     wave = rest * (1.0 + np.median(redshift))
-    low, high = rest[0] * (1.0 + redshift.max()), rest[-1] * (1.0 + redshift.min())
+    low = rest[0] * (1.0 + redshift.max())
+    high = rest[-1] * (1.0 + redshift.min())
     wave = wave[(wave >= low) & (wave <= high)]
     out = np.empty((redshift.size, wave.size))
     for z in np.unique(redshift):

@@ -69,7 +69,8 @@ def _distinct_agn(component, rows):
         inert = component.inert(row)
         key = tuple((name, value) for name, value in row.items() if name not in inert)
         groups.setdefault((key, tuple(sorted(inert))), []).append(row)
-    out, names = [], [inert for _, inert in groups]
+    out = []
+    names = [inert for _, inert in groups]
     for group, inert in zip(groups.values(), names, strict=True):
         mean = {name: float(np.mean([row[name] for row in group])) for name in inert}
         out.append(group[0] | mean)
@@ -91,7 +92,8 @@ class Galaxies:
         self.stars, self.star_rows = chain.stars(stars)
         # many galaxies: their spectra are in memory once
         pairs, self.light_rows = distinct(zip(self.star_rows.tolist(), dims, strict=True))
-        self.starlight, absorbed = np.empty((len(pairs), chain.wave.size)), np.empty(len(pairs))
+        self.starlight = np.empty((len(pairs), chain.wave.size))
+        absorbed = np.empty(len(pairs))
         for first in range(0, len(pairs), BLOCK):
             part = slice(first, first + BLOCK)
             rows, keys = zip(*pairs[part], strict=True)
@@ -117,7 +119,8 @@ class Galaxies:
 def _galaxy_tables(quantities):
     """What scales with mass, and what does not."""
     texts = {"ir_luminosity": "3-1000 um light of stars and dust, without AGN"}
-    scaling, shape = {}, {}
+    scaling = {}
+    shape = {}
     for name, values in quantities.items():
         if name in ("stellar_mass_formed", "reference"):
             continue
@@ -134,7 +137,10 @@ def agn_table(model, parts):
     """L_nu and properties of AGN for one watt of what the fraction refers to."""
     spectra, seen = seen_agn(model.chain, parts)
     dusty = model.frac_agn_definition == "dust"
-    scale = np.ones(len(parts)) if dusty else 1.0 / seen["reference"]
+    if dusty:
+        scale = np.ones(len(parts))
+    else:
+        scale = 1.0 / seen["reference"]
     values = {
         "agn_power": np.ones(len(parts)),
         "agn_luminosity": seen["luminosity"],
@@ -151,9 +157,13 @@ def agn_table(model, parts):
 
 def model_grid(model, axes, filters):
     """The factorised grid of `SEDModel.grid`, for axes that `check_axes` gave."""
-    chain, redshift = model.chain, axes["redshift"]
+    chain = model.chain
+    redshift = axes["redshift"]
     agn_component = model.component("agn")
-    of_agn = agn_component.parameters if agn_component else {}
+    if agn_component:
+        of_agn = agn_component.parameters
+    else:
+        of_agn = {}
     frac_agn = np.zeros(1)
     if of_agn:
         frac_agn = axes.get("frac_agn", np.array([of_agn["frac_agn"].default]))
@@ -167,7 +177,8 @@ def model_grid(model, axes, filters):
     quantities = galaxies.quantities()
     properties, shape = _galaxy_tables(quantities)
 
-    nuclei, agn_spectra = {}, np.zeros((0, chain.wave.size))
+    nuclei = {}
+    agn_spectra = np.zeros((0, chain.wave.size))
     agn_parameters = {n: p for n, p in of_agn.items() if n != "frac_agn"}
     if with_agn:
         every = [r | {"frac_agn": 0.0} for r in _products(agn_parameters, axes)]

@@ -214,7 +214,9 @@ class SEDModel(Interactive):
         'survey'
         """
         preset = presets.GRIDS[presets.grid_name(name, "name")][0]
-        return cls.survey() if preset == "survey" else cls.yang2021()
+        if preset == "survey":
+            return cls.survey()
+        return cls.yang2021()
 
     def with_components(self, *components):
         """
@@ -360,7 +362,10 @@ class SEDModel(Interactive):
         out = {n: d for n, d in DERIVED.items() if self.has_agn or d.of != "agn"}
         xray = self.component("xray")
         # the relation is not linear: it is worked out after scaling
-        more = xray.columns if xray else {}
+        if xray:
+            more = xray.columns
+        else:
+            more = {}
         return out | {n: Derived(unit, text, False, "xray") for n, (unit, text) in more.items()}
 
     def __getstate__(self):
@@ -542,7 +547,8 @@ class SEDModel(Interactive):
         return cached_grid(self, axes, filters, gridding.model_grid)
 
     def _bands(self, filters):
-        filters = filters if isinstance(filters, FilterSet) else FilterSet(filters)
+        if not isinstance(filters, FilterSet):
+            filters = FilterSet(filters)
         if foreground := self.component("foreground"):
             foreground.check_bands(filters)
         return filters

@@ -176,9 +176,15 @@ class Parameter:
         try:
             return u.Quantity(value).to(self.unit)
         except (u.UnitConversionError, TypeError, ValueError):
-            wanted = self.unit if self.unit != u.dimensionless_unscaled else "a number"
+            if self.unit != u.dimensionless_unscaled:
+                wanted = self.unit
+            else:
+                wanted = "a number"
             raise units_error(self.name, f"convertible to {wanted}", unit) from None
 
     def __repr__(self):
-        unit = f" {self.unit}" if self.unit != u.dimensionless_unscaled else ""
+        if self.unit != u.dimensionless_unscaled:
+            unit = f" {self.unit}"
+        else:
+            unit = ""
         return f"<Parameter {self.name!r} {self.default}{unit}, {self.bounds}: {self.doc}>"

@@ -95,8 +95,14 @@ def _chooser(libraries):
             why = f"; {better.resource} is not registered"
         else:
             lacks = covers(better)
-            why = f"; {better.resource} {lacks}" if lacks else ""
-        taken = plain if why else better
+            if lacks:
+                why = f"; {better.resource} {lacks}"
+            else:
+                why = ""
+        if why:
+            taken = plain
+        else:
+            taken = better
         notes.append(f"{what}: {taken.resource}{why}")
         return taken
 
@@ -238,7 +244,9 @@ def grid_name(name, argument="axes"):
 def grid_axes(name, *, agn=True):
     """Axes of a grid in `GRIDS`: new arrays by parameter; without those of AGN if ``agn`` is false."""
     axes = _values(GRIDS[name][1])
-    return axes if agn else {n: values for n, values in axes.items() if n not in _OF_AGN}
+    if agn:
+        return axes
+    return {n: values for n, values in axes.items() if n not in _OF_AGN}
 
 
 def red_dot_axes():
@@ -269,7 +277,9 @@ def _values(name):
     table = dict(declared("miricigale.sed", "presets.toml")[name])
     step = table.pop("redshift", None)
     out = {axis: np.array(values) for axis, values in table.items()}
-    return out if step is None else out | {"redshift": _redshifts(**step)}
+    if step is None:
+        return out
+    return out | {"redshift": _redshifts(**step)}
 
 
 def _redshifts(step, first, last):

@@ -13,11 +13,18 @@ from miricigale.utils.units import FNU, WAVE, to_array
 #: Planck's h c / k in um K.
 _SECOND_RADIATION = 14387.77
 #: Limits of the Lyman and Balmer series in um.
-_LYMAN, _BALMER = 0.0912, 0.3646
+_LYMAN = 0.0912
+_BALMER = 0.3646
 #: Where the galaxy's share and the dust's are measured, and beyond what its F_nu does not rise any more, in um.
-_UV, _OPTICAL, _NEAR, _MIDDLE, _FLAT = 0.25, 0.51, 1.0, 3.0, 0.5
+_UV = 0.25
+_OPTICAL = 0.51
+_NEAR = 1.0
+_MIDDLE = 3.0
+_FLAT = 0.5
 #: Vacuum wavelengths of the lines in um.
-_H_ALPHA, _H_BETA, _OIII = 0.65646, 0.48627, (0.50082, 0.49603)
+_H_ALPHA = 0.65646
+_H_BETA = 0.48627
+_OIII = (0.50082, 0.49603)
 #: Flux of H alpha over that of H beta (de Graaff et al. 2025: 5.7, 8.8 and 12.0 at 16, 50 and 84 %).
 _DECREMENT = 9.0
 #: Equivalent width of both [O III] lines over the galaxy alone (Endsley et al. 2023: 780 A of [O III] and H beta
@@ -109,13 +116,15 @@ def red_dot(**parameters):
     <Quantity [0.12, 0.21, 1.12, 2.35] uJy>
     """
     check_names(parameters, "parameter of a red dot", _PARAMETERS)
-    numbers, known = {}, {}
+    numbers = {}
+    known = {}
     for name, (unit, default, least) in _PARAMETERS.items():
         value = parameters.get(name, default * unit)
         number = to_array(value, unit, name, ndim=0, finite=True).item()
         wanted = f"at least {least:g} {unit}".strip()
         check_that(number >= least, name, wanted, f"{number:g}")
-        numbers[name], known[name] = number, number * unit
+        numbers[name] = number
+        known[name] = number * unit
     fnu = _envelope(numbers) + _galaxy(numbers)
     fnu[_WAVE_UM <= _LYMAN] = 0.0
     return SED(_WAVE_UM * WAVE, fnu * FNU, meta={"parameters": known})
@@ -148,7 +157,10 @@ def red_dots(axes=None):
     >>> template_grid(red_dots(), ["nircam.f150w", "nircam.f444w"], redshift=z)
     <ModelGrid 66 redshifts x 1296 galaxies x 0 AGN x 1 fractions, 2 bands, 85,536 models>
     """
-    axes = red_dot_axes() if axes is None else dict(axes)
+    if axes is None:
+        axes = red_dot_axes()
+    else:
+        axes = dict(axes)
     axes.pop("redshift", None)
     check_names(axes, "parameter of a red dot", _PARAMETERS)
     values = [np.atleast_1d(np.asarray(axis, dtype=float)).tolist() for axis in axes.values()]

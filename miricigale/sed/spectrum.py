@@ -108,15 +108,23 @@ class SED(Frozen, Interactive):
 
     def _value(self, name):
         # half-made copies have no meta yet
-        known = self.derived | self.parameters if "meta" in self.__dict__ else {}
-        return self.fnu.view(_Flux) if name == "flux" else known.get(name)
+        if "meta" in self.__dict__:
+            known = self.derived | self.parameters
+        else:
+            known = {}
+        if name == "flux":
+            return self.fnu.view(_Flux)
+        return known.get(name)
 
     def __post_init__(self):
         if not hasattr(self.fnu, "unit"):
             to_array(self.fnu, FNU, "fnu")
         # slow to make, and needed by other units than F_nu's own only
         plain = self.fnu.unit == FNU
-        spectral = [] if plain else u.spectral_density(u.Quantity(self.wave, copy=False))
+        if plain:
+            spectral = []
+        else:
+            spectral = u.spectral_density(u.Quantity(self.wave, copy=False))
         wave = frozen_quantity(self.wave, WAVE, "wave", ndim=1, finite=True)
         fnu = to_array(self.fnu, FNU, "fnu", ndim=1, finite=True, equivalencies=spectral)
         fnu = frozen_quantity(fnu * FNU, FNU, "fnu")
@@ -166,7 +174,9 @@ class SED(Frozen, Interactive):
     __rmul__ = __mul__
 
     def __truediv__(self, number):
-        return self * (1.0 / number) if is_number(number) else NotImplemented
+        if is_number(number):
+            return self * (1.0 / number)
+        return NotImplemented
 
     def __add__(self, other):
         if not isinstance(other, SED):
@@ -311,7 +321,8 @@ class SED(Frozen, Interactive):
         check_that(wave is not None, "spectrum", "one with a waveset", spectrum)
         fnu = spectrum(wave, flux_unit=u.Jy)
         order = np.argsort(wave)
-        redshift = spectrum.z if redshift is None else redshift
+        if redshift is None:
+            redshift = spectrum.z
         return cls(wave[order], fnu[order], redshift=redshift)
 
     def to_synphot(self):

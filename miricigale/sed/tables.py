@@ -103,7 +103,8 @@ def _row_flags(model, values, n):
         if not component.refuses or not np.any(good):
             continue
         # each different set of values is asked for once
-        names, rows = [*component.parameters, *component.others], np.flatnonzero(good)
+        names = [*component.parameters, *component.others]
+        rows = np.flatnonzero(good)
         different, index = distinct(_keys(values, names, rows))
         bad = [bool(component.invalid(dict(zip(names, row, strict=True)))) for row in different]
         flags[rows[np.array(bad)[index]]] |= int(ModelFlags.NOT_IN_LIBRARY)
@@ -122,7 +123,8 @@ def _stack(filters):
 
 def spectra(model, values):
     """The spectrum of one model with its parts and derived quantities; see `SEDModel.evaluate`."""
-    chain, z = model.chain, values["redshift"]
+    chain = model.chain
+    z = values["redshift"]
     stars, rows = chain.stars([chain.key(values, *STELLAR)])
     dim = chain.key(values, "attenuation")
     (starlight,), absorbed = chain.attenuated(stars, rows, [dim])
@@ -139,7 +141,8 @@ def spectra(model, values):
     sums = spectrum[None] @ chain.functionals.T
     got = galaxy_quantities(stars, rows, absorbed, sums, chain.reference_row)
     if model.has_agn:
-        agn, fraction = chain.agn(values), values["frac_agn"]
+        agn = chain.agn(values)
+        fraction = values["frac_agn"]
         ratio = np.array([fraction / (1.0 - fraction)])
         _, seen = seen_agn(chain, [agn])
         got |= agn_quantities(model.frac_agn_definition, ratio, got, seen)
@@ -169,7 +172,9 @@ class _Blocks:
     """Works out blocks of rows of one model; a model's spectra are never all in memory."""
 
     def __init__(self, model, values, bands, far):
-        self.model, self.values, self.far = model, values, far
+        self.model = model
+        self.values = values
+        self.far = far
         self.chain = model.chain
         self.bands = bands
         self.span = np.array([bands[1].min(), bands[1].max()])
@@ -194,11 +199,14 @@ class _Blocks:
 
     def agn(self, rows):
         """Spectra of AGN for one watt, which of them each row has, and their sums."""
-        chain, n = self.chain, len(rows)
+        chain = self.chain
+        n = len(rows)
         which = np.zeros(n, dtype=np.int64)
-        names, active = chain.names("agn"), np.flatnonzero(self.values["frac_agn"][rows] > 0)
+        names = chain.names("agn")
+        active = np.flatnonzero(self.values["frac_agn"][rows] > 0)
         # without any the first row stands for all, at no power
-        active = active if active.size else np.array([0])
+        if not active.size:
+            active = np.array([0])
         different, index = distinct(self._keys(rows[active], "agn"))
         keys = [chain.agn_key(dict(zip(names, row, strict=True))) for row in different]
         keys, place = distinct(keys)
@@ -210,10 +218,14 @@ class _Blocks:
 
     def run(self, rows):
         """Fluxes in uJy and derived quantities of rows, masses included."""
-        chain, values, n = self.chain, self.values, len(rows)
-        z, mass = values["redshift"][rows], values["mass"][rows]
+        chain = self.chain
+        values = self.values
+        n = len(rows)
+        z = values["redshift"][rows]
+        mass = values["mass"][rows]
         light, derived = self.galaxies(rows)
-        power, which = np.zeros(n), np.zeros(n, dtype=np.int64)
+        power = np.zeros(n)
+        which = np.zeros(n, dtype=np.int64)
         spectra = np.zeros((1, chain.wave.size))
         if self.model.has_agn:
             spectra, which, seen = self.agn(rows)
@@ -266,7 +278,10 @@ def flux_table(model, table, filters):
         if model.has_agn:
             without = (values["frac_agn"][rows] > 0) & (got["agn_power"] == 0)
             flags[rows[without]] |= int(ModelFlags.NO_AGN_POWER)
-    out = {"id": (table["id"], table["id"].info.description)} if "id" in table.colnames else {}
+    if "id" in table.colnames:
+        out = {"id": (table["id"], table["id"].info.description)}
+    else:
+        out = {}
     for name, column in zip(filters.names, flux.T, strict=True):
         out[name] = column * FNU, f"model flux density in {name}"
     out |= {n: (derived[n] * entry.unit, entry.text) for n, entry in names.items()}

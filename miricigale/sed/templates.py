@@ -98,17 +98,27 @@ def _read_file(file):
         out = {}
         for column in gravities or others[:1]:
             values = plain_floats(table[column], column, "spectrum").reshape(wave.size, -1).T
-            parts = [column] if gravities else range(len(values)) if len(values) > 1 else [None]
+            if gravities:
+                parts = [column]
+            elif len(values) > 1:
+                parts = range(len(values))
+            else:
+                parts = [None]
             for part, one in zip(parts, values, strict=True):
                 # atmospheres that were not computed are 0 in such files
                 if not gravities or one.any():
-                    name = stem if part is None else f"{stem}[{part}]"
+                    if part is None:
+                        name = stem
+                    else:
+                        name = f"{stem}[{part}]"
                     out[name] = SED(wave, one * _unit(table[column], _FLAM))
         return out
 
 
 def _unit(column, default):
-    return default if column.unit is None else _UNITS.get(str(column.unit).lower(), column.unit)
+    if column.unit is None:
+        return default
+    return _UNITS.get(str(column.unit).lower(), column.unit)
 
 
 def template_grid(spectra, filters, *, beyond="error", redshift=None):
@@ -162,7 +172,8 @@ def template_grid(spectra, filters, *, beyond="error", redshift=None):
     """
     check_choice(beyond, "beyond", ("error", "rayleigh-jeans"))
     check_that(spectra, "spectra", "a dict of at least one spectrum", spectra)
-    filters = filters if isinstance(filters, FilterSet) else FilterSet(filters)
+    if not isinstance(filters, FilterSet):
+        filters = FilterSet(filters)
     seds = {k: one if isinstance(one, SED) else SED.from_synphot(one) for k, one in spectra.items()}
     if beyond != "error":
         last = max(band.wave[-1] for band in filters)
@@ -171,7 +182,10 @@ def template_grid(spectra, filters, *, beyond="error", redshift=None):
         if short:
             msg = f"{len(short)} of {len(seds)} spectra continued to {last:.3g} with F_nu ~ wave^-2"
             warn(msg, ModelWarning)
-    z = np.zeros(1) if redshift is None else np.atleast_1d(floats(redshift))
+    if redshift is None:
+        z = np.zeros(1)
+    else:
+        z = np.atleast_1d(floats(redshift))
     if z.ndim != 1 or not (np.all(np.diff(z) > 0) and z[0] >= 0 and np.isfinite(z[-1])):
         raise argument_error("redshift", "finite, ascending and >= 0", f"{redshift}")
     if redshift is None:
@@ -217,7 +231,8 @@ def _columns(seds):
 
 def _seen(seds, redshifts, filters):
     """Fluxes of spectra at redshifts, of any scale: shape (n_z, n, n_filters)."""
-    igm, alike = Meiksin2006(), {}
+    igm = Meiksin2006()
+    alike = {}
     # spectra often have the same wavelengths
     for i, sed in enumerate(seds):
         wave = sed.rest_wavelength.to_value(WAVE)
@@ -234,7 +249,8 @@ def _seen(seds, redshifts, filters):
 
 def _continued(sed):
     """A spectrum with F_nu ~ wave^-2 from its end on."""
-    wave, fnu = sed.wave.to_value(WAVE), sed.fnu.to_value(FNU)
+    wave = sed.wave.to_value(WAVE)
+    fnu = sed.fnu.to_value(FNU)
     end = wave > _END * wave[-1]
     level = np.mean((fnu * wave**2)[end])
     more = np.geomspace(wave[-1], max(_FAR, 2.0 * wave[-1]), 400)[1:]

@@ -137,7 +137,9 @@ def band_luminosity(l_x, *, from_band, to_band, photon_index=1.8):
     bottom = _core.power_law_energy(*check_band(from_band, "from_band"), index)
     values, mask = without_mask(l_x)
     values = u.Quantity(values) * (top / bottom)
-    return values if mask is None else np.where(mask, np.nan, values)
+    if mask is None:
+        return values
+    return np.where(mask, np.nan, values)
 
 
 def xray_flux(l_x_2_10, redshift, *, band=(0.5, 7.0) * u.keV, photon_index=1.8, transmission=1.0):
@@ -248,7 +250,8 @@ class XRay(Component):
         """Say so if the band is empty."""
         if values["xray_low"] < values["xray_high"]:
             return None
-        low, high = values["xray_low"], values["xray_high"]
+        low = values["xray_low"]
+        high = values["xray_high"]
         return f"'xray_high' must be above 'xray_low', got {low:g} to {high:g} keV"
 
     def derived(self, l_6um, redshift, far, values):
@@ -269,7 +272,10 @@ class XRay(Component):
         derived : dict of str to `~numpy.ndarray`
             ``l_2_10kev`` in W and ``xray_flux`` in W/m2, see `columns`.
         """
-        power, (low, high) = _LAWS[self.law](l_6um), (values["xray_low"], values["xray_high"])
-        index, share = values["photon_index"], values["xray_transmission"]
+        power = _LAWS[self.law](l_6um)
+        low = values["xray_low"]
+        high = values["xray_high"]
+        index = values["photon_index"]
+        share = values["xray_transmission"]
         flux = _core.xray_flux(power, redshift, far, (low, high), index, share)
         return {"l_2_10kev": power, "xray_flux": flux}

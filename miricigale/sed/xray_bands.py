@@ -26,8 +26,11 @@ _LIGHT = const.c.to_value(u.m / u.s)
 _PER_KEV = (u.keV / const.h).to_value(u.Hz)
 _MICROJANSKY = 1e-32  # W / m2 / Hz
 #: Exponential cutoff of binaries and, as low as its temperature, of hot gas, and the gas's photon index; keV.
-_CUT_BINARIES, _CUT_GAS, _INDEX_GAS = 100.0, 1.0, 1.0
-_HARD, _SOFT = (2.0, 10.0), (0.5, 2.0)
+_CUT_BINARIES = 100.0
+_CUT_GAS = 1.0
+_INDEX_GAS = 1.0
+_HARD = (2.0, 10.0)
+_SOFT = (0.5, 2.0)
 #: Mineo et al. 2012: hot gas in 0.5-2 keV for each Msun/yr, W.
 _GAS = 8.3e31
 #: Fragos et al. 2013, as fitted by Mezcua et al. 2018: log L(2-10 keV) in W, of low-mass binaries for 1e10 Msun in
@@ -165,7 +168,9 @@ def with_xray_bands(grid, model, bands, *, alpha_ox=ALPHA_OX, **options):
     slopes = to_array(alpha_ox, u.dimensionless_unscaled, "alpha_ox", ndim=1, finite=True)
     if slopes.size == 0 or np.any(np.diff(slopes) <= 0):
         raise argument_error("alpha_ox", "ascending values", f"{slopes}")
-    xrays, z, far = XRays(**options), grid.redshift, distance(grid.redshift, model.cosmology)
+    xrays = XRays(**options)
+    z = grid.redshift
+    far = distance(grid.redshift, model.cosmology)
 
     def observed(*sources):
         """Fluxes in uJy, (nz, n, n_bands)."""
@@ -194,7 +199,8 @@ def with_xray_bands(grid, model, bands, *, alpha_ox=ALPHA_OX, **options):
 def _agn_rows(grid, slopes, disk, hard):
     """What a grid says of its AGN, each of them repeated for every slope."""
     rows = np.repeat(np.arange(grid.n_agn), slopes.size)
-    parameters, properties = grid.agn_parameters[rows], grid.agn_properties[rows]
+    parameters = grid.agn_parameters[rows]
+    properties = grid.agn_properties[rows]
     of_disk = "L_nu of the disk at 2500 A, without dust at 30 deg, W/Hz for each W of AGN power"
     of_corona = "2-10 keV luminosity of the AGN, unabsorbed, W for each W of AGN power"
     slope = np.tile(slopes, grid.n_agn) * u.one, "slope from 2500 A to 2 keV"
@@ -241,6 +247,7 @@ def _shape(energy, index, cut):
 
 def _energy(low, high, index, cut):
     """Integral of E^(1 - Gamma) exp(-E / cut) over energies."""
-    middle, half = 0.5 * np.log(high * low), 0.5 * np.log(high / low)
+    middle = 0.5 * np.log(high * low)
+    half = 0.5 * np.log(high / low)
     energy = np.exp(middle + half * _NODES)
     return half * np.sum(_WEIGHTS * energy * _shape(energy, index, cut))

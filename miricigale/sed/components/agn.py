@@ -180,7 +180,9 @@ class AGN(Component):
         return AGNTemplates(parts[0], parts[1], parts[2], power)
 
     def inert(self, values):
-        return ("temperature_polar", "emissivity_polar") if values["ebv_polar"] == 0.0 else ()
+        if values["ebv_polar"] == 0.0:
+            return ("temperature_polar", "emissivity_polar")
+        return ()
 
 
 @cached(maxsize=16)
@@ -289,7 +291,9 @@ def _refusal(path, axes):
         f"'{name}' must be one of {', '.join(f'{v:g}' for v in there)}, got {values[name]:g}"
         for name, there in open_library(path, Skirtor2016.resource).missing(**values).items()
     ]
-    return f"{'; '.join(parts)} (the library at {path} has no more)" if parts else None
+    if parts:
+        return f"{'; '.join(parts)} (the library at {path} has no more)"
+    return None
 
 
 @cached_by_file(maxsize=512)
@@ -299,7 +303,8 @@ def _torus(path, wave_bytes, disk, slope, axes):
         raise ValueError(refusal)
     table = open_library(path, Skirtor2016.resource)
     values = dict(zip(SKIRTOR_AXES, axes, strict=True))
-    row, above = table.row(**values), table.row(**values | {"inclination": 0.0})
+    row = table.row(**values)
+    above = table.row(**values | {"inclination": 0.0})
     wave = np.frombuffer(wave_bytes)
     places = (("disk", row), ("disk", above), ("dust", row))
     seen, top, dust = (table.spectrum(*place) for place in places)

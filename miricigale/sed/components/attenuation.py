@@ -58,7 +58,12 @@ def _exponents(wave, law, *shape):
     if law != "calzetti":  # of whose curve the wing of a bump is left there
         exponent[wave <= _core.LYMAN_LIMIT] = 0.0
     inside = np.flatnonzero(exponent)
-    first, last = (int(inside[0]), int(inside[-1]) + 1) if inside.size else (0, 0)
+    if inside.size:
+        first = int(inside[0])
+        last = int(inside[-1]) + 1
+    else:
+        first = 0
+        last = 0
     part = exponent[first:last].copy()
     part.flags.writeable = False
     return first, last, part
@@ -139,7 +144,9 @@ class _Screen(Attenuation):
 
     def factors(self, wave, values):
         """See `Attenuation.factors`."""
-        law, ebv, factor = self._law(values), values["ebv"], values["ebv_factor"]
+        law = self._law(values)
+        ebv = values["ebv"]
+        factor = values["ebv_factor"]
         young = _dimmed(wave, ebv, *law)
         return young, young if factor == 1.0 else _dimmed(wave, ebv * factor, *law)
 
@@ -159,7 +166,8 @@ class _Starburst(Attenuation):
         bump = values["uv_bump"]
         if bump == 0.0:
             return "calzetti", values["slope"]
-        center, width = values["uv_bump_wavelength"], values["uv_bump_width"]
+        center = values["uv_bump_wavelength"]
+        width = values["uv_bump_width"]
         return "calzetti", values["slope"], bump, center, width, self.ebv_scaling
 
 
@@ -299,7 +307,9 @@ class SMC(_Screen):
     options = {"law": ("smc", "pei1992")}
 
     def _law(self, values):
-        return ("pei1992", "smc") if self.law == "pei1992" else ("smc",)
+        if self.law == "pei1992":
+            return ("pei1992", "smc")
+        return ("smc",)
 
 
 @register
@@ -335,7 +345,8 @@ class CharlotFall(Attenuation):
 
     def factors(self, wave, values):
         """See `Attenuation.factors`."""
-        av, mu = values["av_ism"], values["mu"]
+        av = values["av_ism"]
+        mu = values["mu"]
         old = _dimmed(wave, av, "power_law", values["slope_ism"])
         if mu == 1.0:
             return old, old

@@ -65,7 +65,8 @@ class DustEmission(Component):
             L_lambda in W/um; the integral over `nodes`, by trapezoids, is 1 W.
         """
         full = {name: par.default for name, par in self.parameters.items()} | values
-        nodes, spectrum = self.nodes(), self.spectrum(full)
+        nodes = self.nodes()
+        spectrum = self.spectrum(full)
         return np.interp(wave, nodes, spectrum / np.trapezoid(spectrum, nodes), left=0, right=0)
 
 
@@ -87,9 +88,11 @@ class _Mixture(DustEmission):
 def _between(axis, values):
     """Weights, shape (n, n_axis), of the linear interpolation between ascending nodes."""
     cell, part = _core.cells(axis, values)
-    out, rows = np.zeros((values.size, axis.size)), np.arange(values.size)
+    out = np.zeros((values.size, axis.size))
+    rows = np.arange(values.size)
     part = np.clip(part, 0, 1)
-    out[rows, cell], out[rows, cell + 1] = 1.0 - part, part
+    out[rows, cell] = 1.0 - part
+    out[rows, cell + 1] = part
     return out
 
 
@@ -180,7 +183,8 @@ class Casey2012(DustEmission):
 
     def parts(self, values):
         """Blackbody and power law on one, arbitrary scale: L_lambda at `nodes`."""
-        temperature, beta = values["temperature_dust"], values["emissivity_dust"]
+        temperature = values["temperature_dust"]
+        beta = values["emissivity_dust"]
         alpha = values["alpha_mir"]
         turn = self.turnover(alpha, temperature)
         # L_lambda goes as S_nu / lambda^2
@@ -273,14 +277,16 @@ class DraineLi2007(_DraineLi):
         In units of the starlight near the Sun. The power per dust mass is P0 <U>, P0 being that at
         U = 1 (135 to 139 L_sun / M_sun in the table's source, by q_PAH).
         """
-        least, gamma = values["u_min"], values["gamma"]
+        least = values["u_min"]
+        gamma = values["gamma"]
         return float(least * (1.0 + gamma * (np.log(U_MAX / least) / (1.0 - least / U_MAX) - 1.0)))
 
     def _tables(self):
         return _by_mass(self.path)
 
     def _weights(self, columns):
-        table, u_min = load_dl07(self.path), columns["u_min"]
+        table = load_dl07(self.path)
+        u_min = columns["u_min"]
         share = _between(table["qpah"], columns["q_pah"])
         scale = _between(np.log(table["umin"]), np.log(u_min)) * u_min[:, None] / table["umin"]
         weight = (share[:, :, None] * scale[:, None]).reshape(u_min.size, -1)
@@ -355,7 +361,8 @@ def _without_feature(wave, spectra):
 @cached_by_file(maxsize=2)
 def _by_mass(path):
     """Spectra per dust mass: of single U at each q_PAH and U_min, then power laws; and all without the feature."""
-    table, parts = load_dl07(path), []
+    table = load_dl07(path)
+    parts = []
     for kind in ("single", "powerlaw"):
         spectra = (table[kind] * table[f"{kind}_power"][..., None])[:, : table["umin"].size]
         parts.append(spectra.reshape(-1, spectra.shape[-1]))

@@ -172,10 +172,12 @@ class Nebular(Component):
         return values["metallicity" if self.gas == "stellar" else "metallicity_gas"]
 
     def invalid(self, values):
-        f_esc, f_dust = values["f_esc"], values["f_dust"]
+        f_esc = values["f_esc"]
+        f_dust = values["f_dust"]
         if f_esc + f_dust > 1.0 + 1e-12:
             return f"'f_esc' and 'f_dust' must not exceed 1 together, got {f_esc:g} and {f_dust:g}"
-        table, wanted = self.table, self._metallicity(values)
+        table = self.table
+        wanted = self._metallicity(values)
         models = table.models(wanted)
         if not models.size:
             known = ", ".join(f"{z:g}" for z in np.unique(table.metallicity))
@@ -246,7 +248,8 @@ class Nebular(Component):
 
         Parameters are those of `spectra`.
         """
-        emission, n = self._emission(age, weights, ionizing, values), self.table.wave.size
+        emission = self._emission(age, weights, ionizing, values)
+        n = self.table.wave.size
         continuum, lines = np.zeros((2, emission.size))
         continuum[:n], lines[n:] = emission[:n], emission[n:]
         return self._drawn[1] @ continuum, self._drawn[1] @ lines

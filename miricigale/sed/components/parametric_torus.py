@@ -66,7 +66,8 @@ class ParametricTorus(AGN):
 
     def torus_spectra(self, wave, values):
         shape = _shape(values)
-        slope, key = float(values["disk_slope"]), _core.wave_key(wave)
+        slope = float(values["disk_slope"])
+        key = _core.wave_key(wave)
         return _torus(self.path, key, self.disk, slope, shape)
 
     def absorbed_share(self, values):
@@ -98,7 +99,8 @@ def _constants(path):
 
 @cached_by_file(maxsize=512)
 def _torus(path, wave_bytes, disk, slope, shape):
-    const, wave = _constants(path), np.frombuffer(wave_bytes)
+    const = _constants(path)
+    wave = np.frombuffer(wave_bytes)
     tau, inclination, opening, _, q, _ = shape
     face_on = _core.disk_spectrum(wave, slope, disk)
     face_on /= _core.DISK_MEAN * np.trapezoid(face_on, wave)
@@ -118,8 +120,10 @@ def _seen_fraction(const, wave, tau, inclination, opening, q):
     angle = np.asarray(inclination, dtype=float)
     mu = np.cos(np.radians(angle))
     direct = mu * (1.0 + 2.0 * mu) / 3.0
-    x, depth = np.log10(wave), np.log(tau / 7.0)
-    ext, scatter = const["extinction"], const["scattering"]
+    x = np.log10(wave)
+    depth = np.log(tau / 7.0)
+    ext = const["extinction"]
+    scatter = const["scattering"]
     if np.all(angle < 90.0 - opening - ext["edge"]):
         a, b, cut, power = scatter["clear"]
         return direct + 10.0 ** (a + b * x) / (1.0 + (wave / cut) ** power)
@@ -173,8 +177,12 @@ def _dust_shape(e, wave_bytes, shape):
     weight = rho ** (e["c"] - (shape.p - 1.0))
     emission = planck @ (weight * _core.trapezoid_weights(np.log(rho)))
     # mean over the torus of exp(-q |cos theta|), the layer that shines
-    q, s = shape.q, np.sin(np.radians(shape.opening_angle))
-    mean = -np.expm1(-q * s) / (q * s) if q > 0.0 else 1.0
+    q = shape.q
+    s = np.sin(np.radians(shape.opening_angle))
+    if q > 0.0:
+        mean = -np.expm1(-q * s) / (q * s)
+    else:
+        mean = 1.0
     layer = e["te"] * (shape.tau97 * mean / 7.0) ** e["te_power"]
     angle = shape.inclination + shape.opening_angle - 40.0
     mu = np.cos(np.radians(shape.inclination))

@@ -233,7 +233,8 @@ class TableSFH(StarFormationHistory):
         return rate * (1e-6 / rate.sum())
 
     def invalid(self, values):
-        index, n = values["sfh_index"], len(self._rates)
+        index = values["sfh_index"]
+        n = len(self._rates)
         if index != int(index) or index >= n:
             return f"'sfh_index' must be a whole number below {n}, got {index:g}"
         steps = self.steps(values)

@@ -244,6 +244,9 @@ def _library_table(library, metallicity):
     rows = np.flatnonzero(library.axes["metallicity"] == metallicity)
     rows = rows[np.argsort(library.axes["age"][rows])]
     # the name in files made before
-    name = "surviving" if "surviving" in library.values else "living"
+    if "surviving" in library.values:
+        name = "surviving"
+    else:
+        name = "living"
     columns = library.axes["age"], library.spectra["luminosity"], library.values[name]
     return tuple(frozen_array(column[rows]) for column in columns)
