@@ -66,7 +66,10 @@ def find_filter(text):
     name = filter_of_band(text)
     if name is None and text in _curves():
         ours = [name for name in FILTERS.names() if FILTERS.metadata(name)["curve"] == text]
-        name = ours[0] if ours else SEDPY + text
+        if ours:
+            name = ours[0]
+        else:
+            name = SEDPY + text
     return name
 
 
@@ -94,7 +97,10 @@ def known_filter(given, known, kind="filter"):
         If it is none of them.
     """
     text = str(getattr(given, "name", given))
-    name = text if text in known else find_filter(text)
+    if text in known:
+        name = text
+    else:
+        name = find_filter(text)
     if name not in known:
         raise unknown_name(kind, text, known)
     return name
@@ -136,8 +142,12 @@ def filter_of_band(band):
     plain = _BETWEEN.sub(".", _ENDING.sub("", band.strip()))
     for rule, ours in free:
         match = rule.fullmatch(plain)
-        part = "".join(match.groups()) if match else ""
-        written = (part.lower(), part.upper(), part.capitalize()) if match else ()
+        if match:
+            part = "".join(match.groups())
+            written = (part.lower(), part.upper(), part.capitalize())
+        else:
+            part = ""
+            written = ()
         for name in map(ours.format, written):
             if _is_here(name):
                 return name
@@ -148,7 +158,10 @@ def _by_rule(band):
     """Filter of a band by CIGALE's own names, as they are written there; None if there is none."""
     for rule, ours, *_ in _tables()[1]:
         match = rule.fullmatch(band)
-        name = None if match is None else ours.format(match[1], match[1].lower())
+        if match is None:
+            name = None
+        else:
+            name = ours.format(match[1], match[1].lower())
         if name is not None and _is_here(name):
             return name
     return None
@@ -201,7 +214,9 @@ def xray_energies(band):
     """Lowest and highest energy in keV of a band of CIGALE such as ``xray_boxcar_0p5to2keV``; None of others."""
     match = _XRAY.fullmatch(band)
     ends = match and tuple(float(text.replace("p", ".")) for text in match.groups())
-    return ends if ends and 0 < ends[0] < ends[1] else None
+    if ends and 0 < ends[0] < ends[1]:
+        return ends
+    return None
 
 
 def band_filters(bands, known):
@@ -211,12 +226,17 @@ def band_filters(bands, known):
     ``known`` are filters that the user gave by CIGALE's names, as `given_filters` has them. Emission lines
     have no filter; two bands of the same filter are a ValueError. X-ray bands (`xray_energies`) keep their names.
     """
-    filters, lost = {}, []
+    filters = {}
+    lost = []
     for band in bands:
         given = known.get(band)
         own = filter_of_band(band) or (band if xray_energies(band) else None)
-        name = own if given is None else given.name
-        name = None if is_line(band) else name
+        if given is None:
+            name = own
+        else:
+            name = given.name
+        if is_line(band):
+            name = None
         if name is None:
             lost.append(band)
         elif name in filters:

@@ -103,7 +103,9 @@ def catalog_messages(lost, pieces, what="taken as missing, by the number that st
     """Yield warnings about bands without a filter, and numbers for no value in pieces (dicts as of `codes_of`)."""
     if lost:
         yield f"left out, no filter here: {', '.join(lost)}"
-    found, sizes, parts = {}, Counter(), []
+    found = {}
+    sizes = Counter()
+    parts = []
     for coded in pieces:
         for name, values in coded.items():
             sizes[name] += values.size
@@ -174,7 +176,8 @@ class CountedRows:
     """
 
     def __init__(self, rows):
-        self._rows, self.colnames = rows, ("id", *rows.colnames)
+        self._rows = rows
+        self.colnames = ("id", *rows.colnames)
 
     def __getattr__(self, name):
         return getattr(self._rows, name)
@@ -201,7 +204,9 @@ class MappedRows:
 
     def __init__(self, rows, catalog_map):
         names, self._lost = catalog_map.names(rows.colnames, rows.path.name)
-        self._rows, self.map, self.colnames = rows, catalog_map, tuple(names.values())
+        self._rows = rows
+        self.map = catalog_map
+        self.colnames = tuple(names.values())
 
     def __getattr__(self, name):
         return getattr(self._rows, name)

@@ -181,7 +181,9 @@ class CatalogMap:
     @property
     def id_names(self):
         """Column of the file that the map calls ``id``: a tuple, empty if it names none."""
-        return (self.columns["id"],) if "id" in self.columns else ()
+        if "id" in self.columns:
+            return (self.columns["id"],)
+        return ()
 
     def settings(self):
         """What the map says, in plain values."""
@@ -223,7 +225,8 @@ class CatalogMap:
             If a column is not there; if there is none of the survey, or several could be the ids.
         """
         colnames = list(colnames)
-        columns, lost = {}, []
+        columns = {}
+        lost = []
         if self.survey is not None:
             columns, lost = SURVEYS[self.survey].columns(colnames)
             if not any(is_band(name) for name in {**columns, **self.columns}):
@@ -305,17 +308,22 @@ class CatalogMap:
             missing |= values <= 0
         coded[self.factor] = np.where(missing, values, np.nan)
         values = np.where(missing, np.nan, values)
-        return 10 ** (-0.4 * values) if in_magnitudes else values
+        if in_magnitudes:
+            return 10 ** (-0.4 * values)
+        return values
 
     def _asked(self, name, column, of_flux, argument):
         """Unit that the caller says a column has, or the file's; a warning where these differ."""
         asked = self.units.get(name, self.units.get("flux") if of_flux else None)
         has = getattr(column, "unit", None)
-        has = None if has is None else flux_unit(has) or u.Unit(has)
+        if has is not None:
+            has = flux_unit(has) or u.Unit(has)
         if asked is None:
             if has is None and of_flux and self.survey is not None:
                 return u.Unit(SURVEYS[self.survey].unit)
-            return _DEFAULT_UNITS.get(name) if has is None else has
+            if has is None:
+                return _DEFAULT_UNITS.get(name)
+            return has
         asked = _unit(asked, name)
         if has is not None and has != asked and not (has == u.mag and _is_ab(asked)):
             msg = f"{argument}: {name!r} taken in {asked}, the file says {has}"
@@ -340,7 +348,8 @@ class CatalogMap:
         unit = self._asked(name, table[name], True, argument)
         if unit is None or unit == u.mag or not (_is_ab(unit) or unit.is_equivalent(FNU)):
             say = "AB magnitudes are units={'flux': 'ABmag'}"
-            say = "say it, such as units={'flux': 'uJy'}" if unit is None else say
+            if unit is None:
+                say = "say it, such as units={'flux': 'uJy'}"
             raise units_error(argument, f"convertible to {FNU}", f"{unit}: {say}", column=name)
         values = plain_floats(table[name], name, argument)
         errors = None
@@ -376,7 +385,10 @@ class CatalogMap:
     def _errors(self, column, name, errors, flux, ab, argument):
         """Errors of fluxes in uJy, from those in the file's unit."""
         stated = not ab or name in self.units or "flux" not in self.units
-        unit = self._asked(name, column, not ab, argument) if stated else u.mag
+        if stated:
+            unit = self._asked(name, column, not ab, argument)
+        else:
+            unit = u.mag
         factor = self.error_factors.get(name.removesuffix(error_column("")), 1.0)
         if ab and (unit in (None, u.mag, u.dimensionless_unscaled) or _is_ab(unit)):
             return _PER_MAGNITUDE * flux * errors * factor
@@ -392,7 +404,10 @@ def _translate_rows(text):
     with_commas = bool(lines) and lines[0].replace(" ", "").startswith("column,trans")
     rows = []
     for line in lines[1:] if with_commas else lines:
-        parts = [part.strip() for part in line.split(",")] if with_commas else line.split()
+        if with_commas:
+            parts = [part.strip() for part in line.split(",")]
+        else:
+            parts = line.split()
         parts = [part for part in parts if part]
         if len(parts) > 1:
             rows.append((parts[0], parts[1], parts[2] if len(parts) > 2 else 1.0))
@@ -415,7 +430,10 @@ def _translated(rows, path):
             if band is None:
                 left_out += [theirs] if kind == "F" else []
                 continue
-            ours = band if kind == "F" else error_column(band)
+            if kind == "F":
+                ours = band
+            else:
+                ours = error_column(band)
             what = f"has two columns for {ours} ({meaning}): {columns.get(ours)} and {theirs}; remove one"
             check_data(ours not in columns, path, what)
             columns[ours] = theirs
@@ -432,7 +450,10 @@ def _plain_ids(table, argument):
     if "id" not in table.colnames:
         return
     ids, missing = ids_and_missing(table["id"], argument)
-    table["id"] = MaskedColumn(ids, mask=missing) if missing.any() else ids
+    if missing.any():
+        table["id"] = MaskedColumn(ids, mask=missing)
+    else:
+        table["id"] = ids
 
 
 def _angles(column, unit, name, argument):
@@ -446,7 +467,10 @@ def _angles(column, unit, name, argument):
 
 def _unit(asked, name):
     """A unit that the caller gave; AB magnitudes by any of their names."""
-    known = flux_unit(asked) if isinstance(asked, (str, u.UnitBase)) else None
+    if isinstance(asked, (str, u.UnitBase)):
+        known = flux_unit(asked)
+    else:
+        known = None
     if known is not None:
         return known
     try:

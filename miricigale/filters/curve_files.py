@@ -83,7 +83,10 @@ def read_curve(path, unit=None):
         more than twice, or a throughput is below -5 % of the peak.
     """
     path = Path(path).expanduser()
-    read = _of_table if path.suffix.lower() in TABLE_FORMATS else _of_text
+    if path.suffix.lower() in TABLE_FORMATS:
+        read = _of_table
+    else:
+        read = _of_text
     wave, throughput, energy, name, options = read(path, unit)
     wave, throughput = _ascending(wave, throughput, path)
     if energy:
@@ -106,7 +109,10 @@ def _ascending(wave, throughput, path):
     value = wave.value[order]
     throughput = throughput[order]
     same = np.append(np.diff(value) == 0, False)
-    thrice = np.flatnonzero(same[:-1] & same[1:]) if same.size > 1 else np.zeros(0, int)
+    if same.size > 1:
+        thrice = np.flatnonzero(same[:-1] & same[1:])
+    else:
+        thrice = np.zeros(0, int)
     what = f"has the wavelength {value[thrice[0]] if thrice.size else 0:.8g} more than twice"
     check_data(not thrice.size, path, what)
     twins = np.flatnonzero(same)
@@ -131,7 +137,10 @@ def _not_negative(throughput, path):
 def _of_table(path, unit):
     table = read_table(path, wanted="a filter")
     columns = [table[name] for name in table.colnames[:2]]
-    has = getattr(columns[0], "unit", None) if columns else None
+    if columns:
+        has = getattr(columns[0], "unit", None)
+    else:
+        has = None
     if len(columns) < 2 or (unit is None and has is None):
         what = "has not two columns, the first with a unit of wavelength"
         raise data_error(path, f"{what}: give 'unit' if it has none")
@@ -188,7 +197,10 @@ def _of_text(path, unit):
     kinds = [text.lower() for text in comments[:3] if text.lower() in ("photon", "energy")]
     named = kinds and comments[0].lower() not in kinds
     if unit is None:
-        unit = u.AA if kinds else _unit_of(comments, path)
+        if kinds:
+            unit = u.AA
+        else:
+            unit = _unit_of(comments, path)
     said = _DETECTOR.search("\n".join(comments))
     energy = kinds[:1] == ["energy"] or (said is not None and said[1].lower() in _ENERGY)
     wave, throughput = data.T

@@ -34,8 +34,10 @@ _STEP = 1e-6
 def _padded(wave, throughput):
     """Trim zeros to one at each end, or add it."""
     inside = np.flatnonzero(throughput)
-    first, last = max(inside[0] - 1, 0), min(inside[-1] + 1, wave.size - 1)
-    wave, throughput = wave[first : last + 1], throughput[first : last + 1]
+    first = max(inside[0] - 1, 0)
+    last = min(inside[-1] + 1, wave.size - 1)
+    wave = wave[first : last + 1]
+    throughput = throughput[first : last + 1]
     if throughput[0] != 0:
         wave = np.concatenate([[wave[0] * (1 - _STEP)], wave])
         throughput = np.concatenate([[0.0], throughput])
@@ -96,7 +98,9 @@ class Filter(Frozen, Interactive):
     reference_temperature: u.Quantity | None = None
 
     def __post_init__(self):
-        wave, throughput, name = self.wave, self.throughput, self.name
+        wave = self.wave
+        throughput = self.throughput
+        name = self.name
         if isinstance(wave, str):
             if throughput is None:
                 self.__dict__.update(Filter.from_name(wave).__dict__)
@@ -115,7 +119,8 @@ class Filter(Frozen, Interactive):
         if np.any(throughput < 0) or not np.any(throughput > 0):
             raise argument_error("throughput", "not negative, and somewhere positive", throughput)
         wave, throughput = _padded(wave, throughput)
-        wave, throughput = frozen_quantity(wave * WAVE, WAVE, "wave"), frozen_array(throughput)
+        wave = frozen_quantity(wave * WAVE, WAVE, "wave")
+        throughput = frozen_array(throughput)
         meta = dict(self.meta or {})
         self.__dict__.update(wave=wave, throughput=throughput, name=str(name), meta=meta)
         for argument, unit in (("reference_wavelength", WAVE), ("reference_temperature", u.K)):
@@ -140,7 +145,9 @@ class Filter(Frozen, Interactive):
         return self.name, *curve, self.reference_wavelength, self.reference_temperature
 
     def __eq__(self, other):
-        return self._key() == other._key() if isinstance(other, Filter) else NotImplemented
+        if isinstance(other, Filter):
+            return self._key() == other._key()
+        return NotImplemented
 
     def __hash__(self):
         return hash(self._key()[:3])
@@ -213,7 +220,10 @@ class Filter(Frozen, Interactive):
         try:
             # text alone may be a unit too
             is_wave = not isinstance(text, str) or re.match(r"\s*[\d.]+\s*[A-Za-zµ]", text)
-            wave = u.Quantity(text) if is_wave else None
+            if is_wave:
+                wave = u.Quantity(text)
+            else:
+                wave = None
         except (TypeError, ValueError):
             wave = None
         if wave is None:

@@ -54,7 +54,8 @@ class FilterSet(Interactive):
     def __post_init__(self, unit):
         items = self.filters
         single = isinstance(items, (str, os.PathLike, Filter)) or hasattr(items, "waveset")
-        items = [items] if single or hasattr(items, "transmission") else items
+        if single or hasattr(items, "transmission"):
+            items = [items]
         # a set of sedpy's holds its filters
         items = getattr(items, "filters", items)
         filters = tuple(one for item in items for one in _each(item, unit))
@@ -107,7 +108,10 @@ class FilterSet(Interactive):
         return f"<FilterSet {', '.join(self.names)}>"
 
     def __add__(self, other):
-        others = other.filters if isinstance(other, FilterSet) else (as_filter(other),)
+        if isinstance(other, FilterSet):
+            others = other.filters
+        else:
+            others = (as_filter(other),)
         return FilterSet((*self.filters, *others))
 
     def to_table(self):

@@ -93,7 +93,10 @@ def given_filters(names):
 
 
 def _given(band, given):
-    ends = xray_energies(given) if isinstance(given, str) else None
+    if isinstance(given, str):
+        ends = xray_energies(given)
+    else:
+        ends = None
     if ends is not None:
         return Filter(_KEV / np.array(ends)[::-1] * u.um, [1.0, 1.0], name=given)
     found = as_filter(given, band, unit=u.AA)

@@ -28,7 +28,9 @@ def curve_folder():
 
 
 def _resource(curve):
-    return f"filters.{curve.partition('.')[0]}" if "." in curve else _RESOURCE
+    if "." in curve:
+        return f"filters.{curve.partition('.')[0]}"
+    return _RESOURCE
 
 
 def read_curve(curve):
@@ -37,7 +39,10 @@ def read_curve(curve):
     response, and how many values were negative (noise of the measurement) and are set to 0.
     """
     bundled = "." in curve
-    path = locate(_resource(curve)) if bundled else curve_folder() / f"{curve}.par"
+    if bundled:
+        path = locate(_resource(curve))
+    else:
+        path = curve_folder() / f"{curve}.par"
     # the files are yanny tables; in some the rows lack the leading table name
     rows = []
     for line in path.read_text(encoding="latin-1").splitlines():
@@ -53,13 +58,17 @@ def read_curve(curve):
     wave, index = np.unique(wave, return_index=True)
     throughput = throughput[index]
     good = np.isfinite(throughput) & (wave > 0)
-    wave, throughput = wave[good], throughput[good]
+    wave = wave[good]
+    throughput = throughput[good]
     n_negative = int(np.count_nonzero(throughput < 0))
     return wave * 1e-4, np.maximum(throughput, 0), n_negative
 
 
 def _load(name):
-    metadata = {} if name.startswith(SEDPY) else FILTERS.metadata(name)
+    if name.startswith(SEDPY):
+        metadata = {}
+    else:
+        metadata = FILTERS.metadata(name)
     curve = metadata.pop("curve", name.removeprefix(SEDPY))
     wave, throughput, n_negative = read_curve(curve)
     resource = _resource(curve)
@@ -87,11 +96,15 @@ def _register():
     """The registry of ``library.toml``."""
     registry = Registry("filter")
     for instrument, group in declared("miricigale.filters", "library.toml").items():
-        bands, about = group["bands"], {}
+        bands = group["bands"]
+        about = {}
         if "flux_convention" in group:
             about["flux_convention"] = group["flux_convention"]
         for band in bands:
-            curve = group["curves"].format(band) if "curves" in group else bands[band]
+            if "curves" in group:
+                curve = group["curves"].format(band)
+            else:
+                curve = bands[band]
             if "reference_wavelength" in group:
                 about["reference_wavelength"] = group["reference_wavelength"][band] * WAVE
             if "reference_temperature" in group:

@@ -84,7 +84,8 @@ def as_photometry(data, bands, argument="photometry", *, units=None):
     """
     if _is_of_prospector(data):
         data = _of_prospector(data)
-    table, bands = as_table(data, argument), tuple(bands)
+    table = as_table(data, argument)
+    bands = tuple(bands)
     names = _our_names(table.colnames, bands, argument)
     stated = _stated_units(table, names, bands, units)
     magnitudes = [name for name in bands if _is_ab(table, names.get(name)) and name not in stated]
@@ -189,7 +190,10 @@ def _of_prospector(data):
         error = floats(data.uncertainty)
         good = getattr(data, "mask", None)
         filters = data.filters
-    good = np.ones(flux.shape, dtype=bool) if good is None else np.broadcast_to(good, flux.shape)
+    if good is None:
+        good = np.ones(flux.shape, dtype=bool)
+    else:
+        good = np.broadcast_to(good, flux.shape)
     names = [getattr(item, "name", str(item)) for item in getattr(filters, "filters", filters)]
     names = [find_filter(name) or name for name in names]
     same = len(names) == flux.size == error.size
@@ -298,8 +302,13 @@ def _band_of(name, bands):
 
 
 def _find(text, bands):
-    band = text if text in bands else find_filter(text)
-    return band if band in bands else None
+    if text in bands:
+        band = text
+    else:
+        band = find_filter(text)
+    if band in bands:
+        return band
+    return None
 
 
 def _is_ab(table, name):

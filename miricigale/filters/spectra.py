@@ -11,7 +11,10 @@ from miricigale.utils.units import FNU, WAVE, to_array
 
 def check_wave(wave):
     """Wavelengths of a spectrum as an array in um."""
-    wave = to_array(wave, WAVE, "wave") if hasattr(wave, "unit") else floats(wave)
+    if hasattr(wave, "unit"):
+        wave = to_array(wave, WAVE, "wave")
+    else:
+        wave = floats(wave)
     if wave.ndim != 1 or wave.size < 2 or not np.all(np.diff(wave) > 0):
         raise argument_error("wave", "two or more strictly ascending wavelengths", wave)
     return wave
@@ -48,13 +51,18 @@ def spectrum_arrays(sed, bands):
         If it has other units than a flux density's.
     """
     if hasattr(sed, "wave") and hasattr(sed, "fnu"):
-        wave, flux = sed.wave, sed.fnu
+        wave = sed.wave
+        flux = sed.fnu
     elif isinstance(sed, (tuple, list)) and len(sed) == 2:
         wave, flux = sed
     elif hasattr(sed, "spectral_axis") and hasattr(sed, "flux"):
-        wave, flux = sed.spectral_axis.to(WAVE, u.spectral()), sed.flux
+        wave = sed.spectral_axis.to(WAVE, u.spectral())
+        flux = sed.flux
     elif hasattr(sed, "waveset"):
-        wave = _inside(bands) if sed.waveset is None else sed.waveset
+        if sed.waveset is None:
+            wave = _inside(bands)
+        else:
+            wave = sed.waveset
         flux = sed(wave, flux_unit=u.Jy)
     elif callable(sed):
         wave = _inside(bands)
@@ -65,9 +73,13 @@ def spectrum_arrays(sed, bands):
     if not hasattr(wave, "unit"):
         raise u.UnitsError("'sed' must have wavelengths with a unit, got bare numbers")
     order = slice(None, None, -1 if wave[-1] < wave[0] else 1)
-    wave, flux = check_wave(wave[order]), flux[order]
+    wave = check_wave(wave[order])
+    flux = flux[order]
     plain = getattr(flux, "unit", None) == FNU
-    spectral = [] if plain else u.spectral_density(wave * WAVE)
+    if plain:
+        spectral = []
+    else:
+        spectral = u.spectral_density(wave * WAVE)
     fnu = to_array(flux, FNU, "sed.fnu", ndim=1, equivalencies=spectral)
     got = f"{fnu.size} for {wave.size} wavelengths"
     check_that(wave.shape == fnu.shape, "sed.fnu", "as many values as sed.wave", got)

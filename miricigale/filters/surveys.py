@@ -29,7 +29,8 @@ class _Survey:
 
     def columns(self, colnames):
         """Our names of the columns that are there to theirs; the bands without a filter."""
-        found, lost = {}, []
+        found = {}
+        lost = []
         for ours, choices in self.names.items():
             theirs = next((name for name in choices if name in colnames), None)
             if theirs is not None:
@@ -39,7 +40,10 @@ class _Survey:
             error = match and match.expand(self.error)
             if error not in colnames:
                 continue
-            band = self.bands[match[1]] if match[1] in self.bands else find_filter(match[1])
+            if match[1] in self.bands:
+                band = self.bands[match[1]]
+            else:
+                band = find_filter(match[1])
             if not (band and is_band(band)):
                 lost.append(name)
             elif band in found:

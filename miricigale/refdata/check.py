@@ -84,6 +84,9 @@ def _state(record):
         if file_sha256(path) != wanted:
             return ResourceState(name, "wrong checksum", where, "sha256 differs from its record")
     except OSError as err:
-        message = str(err) if isinstance(err, DataError) else f"{path} cannot be read: {err}"
+        if isinstance(err, DataError):
+            message = str(err)
+        else:
+            message = f"{path} cannot be read: {err}"
         return ResourceState(name, "damaged", where, message)
     return ResourceState(name, "ok", where)

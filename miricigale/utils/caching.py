@@ -83,7 +83,9 @@ def frozen(value):
         return FrozenList(frozen(entry) for entry in value)
     if isinstance(value, tuple):
         entries = [frozen(entry) for entry in value]
-        return type(value)(*entries) if hasattr(value, "_fields") else tuple(entries)
+        if hasattr(value, "_fields"):
+            return type(value)(*entries)
+        return tuple(entries)
     if isinstance(value, set):
         return frozenset(value)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):

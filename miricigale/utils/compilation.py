@@ -49,7 +49,9 @@ class _Listener(event.Listener):
 def subpackage_of(module):
     """Subpackage of this package that a module is in, by their names; empty for numba's own and for others'."""
     package, _, rest = module.partition(".")
-    return rest.partition(".")[0] if package == __name__.partition(".")[0] else ""
+    if package == __name__.partition(".")[0]:
+        return rest.partition(".")[0]
+    return ""
 
 
 event.register("numba:compile", _Listener())
@@ -95,7 +97,8 @@ def _warn_of_no_cache():
 @cached
 def _forget_stale(folder, package):
     """Remove the index of what is kept in a folder, if it was compiled from other sources than today's."""
-    current, marker = _digest(package), Path(folder) / "kernels.sha256"
+    current = _digest(package)
+    marker = Path(folder) / "kernels.sha256"
     if marker.is_file() and marker.read_text() == current:
         return
     for index in Path(folder).glob("*.nbi"):
@@ -106,7 +109,8 @@ def _forget_stale(folder, package):
 @cached
 def _digest(package):
     """Checksum of all files of kernels of a package, ``_core.py`` and ``_core/*.py``."""
-    root, found = Path(sys.modules[package].__file__).parent, hashlib.sha256()
+    root = Path(sys.modules[package].__file__).parent
+    found = hashlib.sha256()
     for path in sorted([*root.glob("*/_core.py"), *root.glob("*/_core/*.py")]):
         found.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes())
     return found.hexdigest()

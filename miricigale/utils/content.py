@@ -64,7 +64,10 @@ def _feed(digest, value):
         names = [item.name for item in fields(value) if item.name != "meta"]
         _feed(digest, {name: getattr(value, name) for name in names})
     else:
-        named = value if hasattr(value, "__qualname__") else type(value)
+        if hasattr(value, "__qualname__"):
+            named = value
+        else:
+            named = type(value)
         _tag(digest, "name", f"{getattr(named, '__module__', '')}.{named.__qualname__}")
 
 

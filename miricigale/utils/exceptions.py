@@ -30,7 +30,8 @@ class OtherResultsError(ValueError):
     """
 
     def __init__(self, reason, remedy):
-        self.reason, self.remedy = reason, remedy
+        self.reason = reason
+        self.remedy = remedy
         super().__init__(f"{reason}; give another folder, or {remedy}")
 
 
@@ -77,7 +78,10 @@ def argument_error(name, wanted, got):
 
 def units_error(name, wanted, got, *, column=None):
     """Make the `~astropy.units.UnitsError` of an argument, or a column of it: what was wanted and what came."""
-    label = f"'{name}'" if column is None else f"'{name}' column {column!r}"
+    if column is None:
+        label = f"'{name}'"
+    else:
+        label = f"'{name}' column {column!r}"
     return UnitsError(f"{label} must be {wanted}, got {got}")
 
 
@@ -98,7 +102,10 @@ def file_errors(path, what, *kinds):
         yield
     except (KeyError, IndexError, TypeError, ValueError, *kinds) as err:
         # a name that is missing is quoted, a sentence is not
-        said = err.args[0] if isinstance(err, KeyError) and " " in f"{err}" else err
+        if isinstance(err, KeyError) and " " in f"{err}":
+            said = err.args[0]
+        else:
+            said = err
         raise data_error(path, f"{what}: {said}") from err
 
 
@@ -117,7 +124,10 @@ def unknown_name(kind, name, known):
         near = list(dict.fromkeys(lower[one] for one in close))[:3] or known[:3]
         return KeyError(f"no {kind} {name!r}; the nearest of {len(known)} are {', '.join(near)}")
     close = difflib.get_close_matches(str(name).lower(), lower, n=1, cutoff=0.7)
-    hint = f"; did you mean {lower[close[0]]!r}?" if close else ""
+    if close:
+        hint = f"; did you mean {lower[close[0]]!r}?"
+    else:
+        hint = ""
     return KeyError(f"no {kind} {name!r}; known: {', '.join(known)}{hint}")
 
 
@@ -127,7 +137,9 @@ _INNER = ("miricigale.", "contextlib", "functools")
 
 def warn(message, category):
     """Warn at the line outside of the package that led here, however deep the call is."""
-    frame, level = sys._getframe(1), 2
+    frame = sys._getframe(1)
+    level = 2
     while frame.f_back and frame.f_globals.get("__name__", "").startswith(_INNER):
-        frame, level = frame.f_back, level + 1
+        frame = frame.f_back
+        level += 1
     warnings.warn(message, category, stacklevel=level)

@@ -202,7 +202,8 @@ def file_place(path):
     extension, _, plane = (part.strip() for part in extension.rpartition(","))
     if plane != "mean" and not plane.isdigit():
         raise argument_error("path", "FILE[EXTENSION,PLANE], the plane a number or mean", path)
-    extension = int(extension) if extension.isdigit() else extension
+    if extension.isdigit():
+        extension = int(extension)
     return name, extension, plane if plane == "mean" else int(plane)
 
 
@@ -223,7 +224,10 @@ def _judge(caught):
 def _check_declared(path, hdus, n_bytes):
     """Refuse headers that declare more data than there are, or than tiles may unpack to."""
     last = hdus[-1].fileinfo()
-    wanted = 0 if last is None else last["datLoc"] + last["datSpan"]
+    if last is None:
+        wanted = 0
+    else:
+        wanted = last["datLoc"] + last["datSpan"]
     if bad := [i for i, hdu in enumerate(hdus) if not _is_sound(hdu)]:
         msg = f"damaged: the header of its extension {bad[0]}"
         raise OSError(msg)
@@ -415,7 +419,10 @@ def writing(path):
 def unreadable(path, wanted, err):
     """A `DataError` that says which file could not be read as what, and why."""
     if isinstance(err, OSError) and not Path(path).is_file():
-        err = "it is a folder, wanted is a file" if Path(path).is_dir() else "no such file"
+        if Path(path).is_dir():
+            err = "it is a folder, wanted is a file"
+        else:
+            err = "no such file"
     lines = str(err).strip().splitlines() or [type(err).__name__]
     return DataError(f"{path} cannot be read as {wanted}: {lines[0]}")
 

@@ -146,7 +146,8 @@ class RecordFolder(FileFolder):
         return self.path(f".{self.manifest_name}.journal")
 
     def _load(self):
-        self.facts, self.records = {}, {}
+        self.facts = {}
+        self.records = {}
         paths = [self.path(name) for name in self._manifests]
         texts = [path.read_bytes() if path.is_file() else None for path in paths]
         journal = self._journal
@@ -174,7 +175,8 @@ class RecordFolder(FileFolder):
         if values.get("sha256", _checksum(values)) != _checksum(values):
             log.warning("%s is damaged (its checksum is wrong)", path)
             return False
-        self.facts, self.records = facts, records
+        self.facts = facts
+        self.records = records
         return True
 
     def _read_journal(self, path):
@@ -274,7 +276,8 @@ class RecordFolder(FileFolder):
 
     def _fault(self, name, product):
         """What is wrong with a file, in words; empty if nothing is."""
-        path, size = self.path(name), product["bytes"]
+        path = self.path(name)
+        size = product["bytes"]
         if not path.is_file():
             return "missing"
         status = path.stat()

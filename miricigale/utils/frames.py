@@ -36,7 +36,10 @@ def frame_columns(data, argument):
     if not hasattr(data, "index"):
         from miricigale.utils.table_files import arrow_table
 
-        rows = data if hasattr(data, "to_pylist") else data.to_arrow()
+        if hasattr(data, "to_pylist"):
+            rows = data
+        else:
+            rows = data.to_arrow()
         table = arrow_table(rows, where=argument)
         return {name: table[name] for name in table.colnames}
     columns = {str(name): _of_series(data[name]) for name in data.columns}
@@ -63,7 +66,9 @@ def _of_index(data, columns, argument):
         counts = hasattr(index, "step") and index.start == 0 and index.step == 1
         # rows of a frame that has no other ids are known by it
         named = counts or any(map(is_id_name, columns))
-        return {} if named else {"id": _of_series(index)}
+        if named:
+            return {}
+        return {"id": _of_series(index)}
     levels = {}
     for i, name in enumerate(index.names):
         if name is None:

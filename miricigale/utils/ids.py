@@ -163,7 +163,10 @@ def ids_and_missing(column, argument):
         missing |= np.isnan(ids)
         ids = _of_floats(ids, missing, argument)
     # FITS takes numbers of one byte for true and false
-    dtype = np.dtype(np.int16) if ids.dtype == np.int8 else ids.dtype
+    if ids.dtype == np.int8:
+        dtype = np.dtype(np.int16)
+    else:
+        dtype = ids.dtype
     return ids.astype(dtype.newbyteorder("=")), missing
 
 
@@ -279,7 +282,10 @@ class Duplicates:
         """Warn if there are any; ``what`` says what becomes of them."""
         if self.n_rows:
             some = ", ".join(map(repr, self.first))
-            rows = "1 row has" if self.n_rows == 1 else f"{self.n_rows} rows have"
+            if self.n_rows == 1:
+                rows = "1 row has"
+            else:
+                rows = f"{self.n_rows} rows have"
             text = f"{argument}: {rows} an id that occurred before ({some}"
             warn(
                 f"{text}{', ...' if self.n_rows > len(self.first) else ''}); {what}", CatalogWarning

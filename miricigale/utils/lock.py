@@ -82,7 +82,9 @@ class FolderLock:
         """What the file says of the owner; empty if it says nothing that can be used."""
         try:
             owner = json.loads(self.path.read_text(encoding="utf-8"))
-            return owner if isinstance(owner["host"], str) else {}
+            if isinstance(owner["host"], str):
+                return owner
+            return {}
         except (FileNotFoundError, ValueError, KeyError, TypeError, RecursionError):
             return {}
 
@@ -93,7 +95,12 @@ class FolderLock:
             where += f", started {owner['started']}"
         # where locks are not passed on, the file that names the owner is the lock
         elsewhere = _is_elsewhere(owner)
-        place, file = (" on another host", self.path) if elsewhere else ("", self._lock.lock_file)
+        if elsewhere:
+            place = " on another host"
+            file = self.path
+        else:
+            place = ""
+            file = self._lock.lock_file
         return DataError(
             f"{self.folder} is in use by a {self.purpose}{place}: {where}; "
             f"if that process is gone, remove {file}"

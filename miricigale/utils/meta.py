@@ -82,7 +82,8 @@ def fits_meta(meta):
     cards = {}
     for key, value in meta.items():
         key = str(key)
-        value = value.item() if isinstance(value, np.generic) else value
+        if isinstance(value, np.generic):
+            value = value.item()
         finite = isinstance(value, float) and math.isfinite(value)
         plain = finite or isinstance(value, (bool, int))
         if plain or (isinstance(value, str) and _TEXT.fullmatch(value)):
@@ -93,7 +94,9 @@ def fits_meta(meta):
 
 def full_meta(meta):
     """The meta dictionary that `fits_meta` put into a header; of other headers what they hold."""
-    return json.loads(meta["META"]) if "META" in meta else dict(meta)
+    if "META" in meta:
+        return json.loads(meta["META"])
+    return dict(meta)
 
 
 def plain_value(value):

@@ -32,14 +32,21 @@ def without_codes(values, errors=None, *, magnitudes=False, further=()):
         are missing though the value may be there: a negative code, unless the value is one to ten times as large
         and positive, as limits are.
     """
-    code, further = is_code(values), np.asarray(list(further), float)
+    code = is_code(values)
+    further = np.asarray(list(further), float)
     named = np.isin(values, further)
     none = np.zeros(np.shape(values), bool)
     if errors is None:
-        zero = (values == 0) if magnitudes else none
+        if magnitudes:
+            zero = values == 0
+        else:
+            zero = none
         return (code & (magnitudes | (values < 0))) | zero | named, none
-    same, size, sigma = errors == values, np.abs(values), np.abs(errors)
-    coded, noise = is_code(errors), (errors >= 0.2 * size) & (errors <= 100.0 * size)
+    same = errors == values
+    size = np.abs(values)
+    sigma = np.abs(errors)
+    coded = is_code(errors)
+    noise = (errors >= 0.2 * size) & (errors <= 100.0 * size)
     limit = (values >= sigma) & (values <= 10.0 * sigma)
     no_error = (coded & (((errors < 0) & ~limit) | magnitudes | same)) | np.isin(errors, further)
     zero = (values == 0) & (~(errors > 0) if magnitudes else errors == 0)
@@ -177,11 +184,10 @@ def without_mask(values):
         values = np.array(
             [None if value is np.ma.masked else value for value in values], dtype=object
         )
-    mask = (
-        mask_of(values)
-        if hasattr(values, "dtype") or hasattr(values, "mask")
-        else np.zeros((), bool)
-    )
+    if hasattr(values, "dtype") or hasattr(values, "mask"):
+        mask = mask_of(values)
+    else:
+        mask = np.zeros((), bool)
     if not np.any(mask):
         return getattr(values, "unmasked", values), None
     plain = getattr(values, "unmasked", values)
@@ -189,7 +195,8 @@ def without_mask(values):
         # columns keep their unit
         unit = getattr(plain, "unit", None)
         plain = np.ma.getdata(plain)
-        plain = plain if unit is None else plain << unit
+        if unit is not None:
+            plain = plain << unit
     if plain.dtype.kind == "O":
         plain = np.where(mask, 0.0, plain).astype(float)
     return plain, mask
@@ -210,7 +217,9 @@ def floats(values):
     """
     values, mask = without_mask(values)
     array = np.asarray(getattr(values, "value", values), dtype=float)
-    return array if mask is None else np.where(mask, np.nan, array)
+    if mask is None:
+        return array
+    return np.where(mask, np.nan, array)
 
 
 def plain_floats(column, name, argument):

@@ -66,7 +66,10 @@ class ObjectRows(Interactive):
             if isinstance(value, dict):
                 found[name] = _ByName({key: function(array) for key, array in value.items()})
             else:
-                found[name] = None if value is None else function(value)
+                if value is None:
+                    found[name] = None
+                else:
+                    found[name] = function(value)
         return found
 
     @property
@@ -105,7 +108,10 @@ class ObjectRows(Interactive):
 
     def _ipython_key_completions_(self):
         """What a session offers in brackets: names of parameters, and ids that are text."""
-        ids = [] if self.isscalar else [key for key in self.ids.tolist() if isinstance(key, str)]
+        if self.isscalar:
+            ids = []
+        else:
+            ids = [key for key in self.ids.tolist() if isinstance(key, str)]
         return [*getattr(self, "parameters", ()), *ids]
 
     @property
@@ -115,7 +121,10 @@ class ObjectRows(Interactive):
 
     def _column(self, name):
         """A column of the table, by name."""
-        table = self.to_table() if hasattr(self, "to_table") else {}
+        if hasattr(self, "to_table"):
+            table = self.to_table()
+        else:
+            table = {}
         if name not in getattr(table, "colnames", ()):
             known = [*getattr(table, "colnames", ()), *map(str, self._row_of_id)]
             raise unknown_name("column or id", name, known)
@@ -140,7 +149,9 @@ class ObjectRows(Interactive):
 
     def _several(self):
         """This, with an axis of objects where it is a single one."""
-        return self._take(None) if self.isscalar else self
+        if self.isscalar:
+            return self._take(None)
+        return self
 
     @cached_property
     def _row_of_id(self):
@@ -158,7 +169,8 @@ class ObjectRows(Interactive):
         KeyError
             If there is none.
         """
-        key = key.item() if isinstance(key, np.generic) else key
+        if isinstance(key, np.generic):
+            key = key.item()
         try:
             return self._row_of_id[key]
         except (KeyError, TypeError):
@@ -198,7 +210,10 @@ class ObjectRows(Interactive):
             elif any((one is None) != (value is None) for one in values):
                 raise argument_error("parts", f"all with {name!r} or all without", "some")
             else:
-                joined = None if value is None else _joined(values, name)
+                if value is None:
+                    joined = None
+                else:
+                    joined = _joined(values, name)
             new.__dict__[name] = joined
         return new
 

@@ -44,7 +44,9 @@ def available_memory():
         limit = Path("/sys/fs/cgroup/memory.max").read_text().strip()
     except OSError:
         return total
-    return min(total, int(limit)) if limit.isdigit() else total
+    if limit.isdigit():
+        return min(total, int(limit))
+    return total
 
 
 def check_memory(n_bytes, what, *, advice):
@@ -273,15 +275,18 @@ class _SingleThreaded:
 
     def __init__(self):
         self._lock = threading.Lock()
-        self._users, self._limits = 0, []
-        self._pools, self._known = None, 0
+        self._users = 0
+        self._limits = []
+        self._pools = None
+        self._known = 0
 
     def __enter__(self):
         with self._lock:
             self._users += 1
             # libraries may have been loaded since; looking for them takes milliseconds
             if self._known != len(sys.modules):
-                self._pools, self._known = threadpoolctl.ThreadpoolController(), len(sys.modules)
+                self._pools = threadpoolctl.ThreadpoolController()
+                self._known = len(sys.modules)
             if any(pool["num_threads"] > 1 for pool in self._pools.info()):
                 _take_over(force=True)
                 self._limits.append(self._pools.limit(limits=1))

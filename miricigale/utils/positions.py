@@ -121,7 +121,8 @@ def at_epoch(sky, epoch, argument):
             "stay where they are"
         )
         warn(msg, CatalogWarning)
-    ra, dec = floats(plain.ra.rad), floats(plain.dec.rad)
+    ra = floats(plain.ra.rad)
+    dec = floats(plain.dec.rad)
     zero = np.zeros_like(ra)
     vector = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
     to_east = np.stack([-np.sin(ra), np.cos(ra), zero])

@@ -28,9 +28,16 @@ class _Lines(contextlib.AbstractContextManager):
     """What `progress` returns where no bar is drawn: one line at the end, one a minute, or none."""
 
     def __init__(self, iterable, total, desc, unit, show):
-        self.iterable, self.desc, self.unit, self._show = iterable, desc, unit, show
-        self.total = len(iterable) if total is None and hasattr(iterable, "__len__") else total
-        self.n, self._begin = 0, time.monotonic()
+        self.iterable = iterable
+        self.desc = desc
+        self.unit = unit
+        self._show = show
+        if total is None and hasattr(iterable, "__len__"):
+            self.total = len(iterable)
+        else:
+            self.total = total
+        self.n = 0
+        self._begin = time.monotonic()
         self._last = self._begin
 
     def update(self, n=1):
@@ -49,8 +56,14 @@ class _Lines(contextlib.AbstractContextManager):
     def _line(self):
         self._last = time.monotonic()
         if self._show:
-            share = f"{self.n}" if self.total is None else f"{self.n} of {self.total}"
-            label = f"{self.desc}: " if self.desc else ""
+            if self.total is None:
+                share = f"{self.n}"
+            else:
+                share = f"{self.n} of {self.total}"
+            if self.desc:
+                label = f"{self.desc}: "
+            else:
+                label = ""
             print_line(f"{label}{share} {self.unit}, {self._last - self._begin:.0f} s")
 
     def __iter__(self):

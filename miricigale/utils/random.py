@@ -60,7 +60,10 @@ def stream(seed, *key):
     """
     words = []
     for part in key:
-        number = int(part) if isinstance(part, (int, np.integer)) else text_key(part)
+        if isinstance(part, (int, np.integer)):
+            number = int(part)
+        else:
+            number = text_key(part)
         # spawn keys are sequences of 32-bit words: two for each part, whatever its size
         words += divmod(number % 2**64, 2**32)
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=tuple(words)))

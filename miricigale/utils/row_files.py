@@ -56,8 +56,10 @@ def open_rows(path, chunk_rows, *, hdu=None, id_names=()):
     """
     chunk_rows = check_count(chunk_rows, "chunk_rows")
     path, extension = split_extension(path)
-    hdu = extension if hdu is None else hdu
-    path, start = Path(path), b""
+    if hdu is None:
+        hdu = extension
+    path = Path(path)
+    start = b""
     if path.is_file():
         with open(path, "rb") as stream:
             start = stream.read(6)
@@ -82,8 +84,10 @@ class RowFile:
     """A table on disk in pieces of rows; this class reads it as a whole when it is first used."""
 
     def __init__(self, path, chunk_rows, hdu, id_names=()):
-        self.path, self.chunk_rows = path, chunk_rows
-        self._hdu, self._id_names = hdu, id_names
+        self.path = path
+        self.chunk_rows = chunk_rows
+        self._hdu = hdu
+        self._id_names = id_names
 
     @cached_property
     def _table(self):
@@ -142,7 +146,8 @@ class _FitsRows(RowFile):
         super().__init__(path, chunk_rows, hdu, id_names)
         with open_fits(path, wanted="a catalog") as hdus:
             table = self._choose(hdus)
-            self._header, self.n_rows = table.header.copy(), table.header["NAXIS2"]
+            self._header = table.header.copy()
+            self.n_rows = table.header["NAXIS2"]
         # what belongs to the whole table
         for key in ("CHECKSUM", "DATASUM", "THEAP"):
             self._header.remove(key, ignore_missing=True)
@@ -152,7 +157,10 @@ class _FitsRows(RowFile):
 
     def _choose(self, hdus):
         tables = [i for i, item in enumerate(hdus) if isinstance(item, fits.BinTableHDU)]
-        wanted = self._hdu.upper() if isinstance(self._hdu, str) else self._hdu
+        if isinstance(self._hdu, str):
+            wanted = self._hdu.upper()
+        else:
+            wanted = self._hdu
         chosen = [i for i in tables if wanted in (None, i, hdus[i].name)]
         if wanted is None and len(chosen) > 1:
             chosen = [i for i in chosen if hdus[i].name != LDAC_HEADER]
@@ -190,7 +198,8 @@ class _ParquetRows(RowFile):
             raise unreadable(path, "a catalog", err) from err
 
     def _begin(self):
-        self._batches, self._at = self._file.iter_batches(self.chunk_rows), 0
+        self._batches = self._file.iter_batches(self.chunk_rows)
+        self._at = 0
         self._kept = self._file.schema_arrow.empty_table()
 
     def _take(self, n):
@@ -199,7 +208,8 @@ class _ParquetRows(RowFile):
         while sum(map(len, kept)) < n:
             kept.append(type(self._kept).from_batches([next(self._batches)]))
         rows = require("pyarrow", extra="parquet").concat_tables(kept)
-        self._kept, self._at = rows.slice(n), self._at + n
+        self._kept = rows.slice(n)
+        self._at += n
         return rows.slice(0, n)
 
     def _read(self, rows):
@@ -237,7 +247,10 @@ def write_rows(path, tables, n_rows, *, id_width=0, overwrite=False):
     OSError
         If the file is there and ``overwrite`` is not set.
     """
-    write = _write_parquet if Path(path).suffix.lower() == ".parquet" else _write_fits
+    if Path(path).suffix.lower() == ".parquet":
+        write = _write_parquet
+    else:
+        write = _write_fits
     with replacing(path, overwrite=overwrite) as partial:
         write(partial, (_same_ids(table, id_width) for table in tables), n_rows)
 
@@ -253,7 +266,8 @@ def _same_ids(table, width):
 
 def _write_parquet(path, tables, _):
     parquet = require("pyarrow.parquet", extra="parquet")
-    writer, piece = None, path.with_suffix(".piece")
+    writer = None
+    piece = path.with_suffix(".piece")
     with contextlib.ExitStack() as opened:
         opened.callback(piece.unlink, missing_ok=True)
         for table in tables:
@@ -267,13 +281,15 @@ def _write_parquet(path, tables, _):
 
 
 def _write_fits(path, tables, n_rows):
-    layout, n_bytes = None, 0
+    layout = None
+    n_bytes = 0
     with open(path, "wb") as stream:
         for table in tables:
             header, rows = _fits_rows(table)
             columns = [*header["TFORM*"].values()]
             if layout is None:
-                layout, header["NAXIS2"] = columns, n_rows
+                layout = columns
+                header["NAXIS2"] = n_rows
                 both = fits.PrimaryHDU().header.tostring() + header.tostring()
                 stream.write(both.encode("ascii"))
             _check_same(layout, columns)
@@ -288,13 +304,18 @@ def _check_same(layout, columns):
 
 def _fits_rows(table):
     """Header and rows of a table as astropy writes it."""
-    meta, table.meta = dict(table.meta), {}
+    meta = dict(table.meta)
+    table.meta = {}
     for key, value in meta.items():
         if key == "citations":
-            key, value = "cite", "; ".join(value)
+            key = "cite"
+            value = "; ".join(value)
         # headers hold no dicts
         plain = isinstance(value, (str, int, float, bool))
-        table.meta[key] = value if plain else json.dumps(value, default=plain_value)
+        if plain:
+            table.meta[key] = value
+        else:
+            table.meta[key] = json.dumps(value, default=plain_value)
     file = io.BytesIO()
     with warnings.catch_warnings():
         # FITS does not know dex; astropy does when it reads the table
@@ -302,5 +323,6 @@ def _fits_rows(table):
         table.write(file, format="fits")
     data = file.getvalue()
     with fits.open(io.BytesIO(data)) as hdus:
-        header, start = hdus[1].header.copy(), hdus[1].fileinfo()["datLoc"]
+        header = hdus[1].header.copy()
+        start = hdus[1].fileinfo()["datLoc"]
     return header, data[start : start + header["NAXIS1"] * header["NAXIS2"]]

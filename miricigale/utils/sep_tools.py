@@ -53,7 +53,10 @@ def _image(data, mask):
         check_that(mask.shape == data.shape, "mask", "of the image's shape", got)
     bad = ~np.isfinite(data)
     if bad.any():
-        mask = bad if mask is None else mask | bad
+        if mask is None:
+            mask = bad
+        else:
+            mask = mask | bad
         data = np.where(bad, data.dtype.type(0), data)
     return data, mask
 
@@ -91,7 +94,8 @@ def background(data, mask=None, box=64, filter_size=3):
     data, mask = _image(data, mask)
     if mask is not None and mask.all():
         raise argument_error("mask", "a mask that leaves some pixels", "all pixels masked")
-    box, size = check_count(box, "box"), check_count(filter_size, "filter_size")
+    box = check_count(box, "box")
+    size = check_count(filter_size, "filter_size")
     result = sep.Background(data, mask=mask, bw=box, bh=box, fw=size, fh=size)
     return result.back(dtype=data.dtype), result.rms(dtype=data.dtype)
 
@@ -153,7 +157,10 @@ def extract(
     check_that(err.shape == data.shape, "err", f"of the image's shape {data.shape}", str(err.shape))
     bad = ~(np.isfinite(err) & (err > 0))
     if bad.any():
-        mask = bad if mask is None else mask | bad
+        if mask is None:
+            mask = bad
+        else:
+            mask = mask | bad
         err = np.where(bad, err.dtype.type(1), err)
     # sep's buffer of detected pixels never overflows, also where all of them are above the threshold
     stack = data.size + data.shape[1] + 16
@@ -162,7 +169,10 @@ def extract(
     sep.set_sub_object_limit(min(_SUB_OBJECTS, math.isqrt((2**31 - 1) // levels)))
     form = {"err": err, "mask": mask, "minarea": check_count(min_area, "min_area")}
     form |= {"deblend_nthresh": levels, "deblend_cont": float(deblend_contrast)}
-    form["filter_kernel"] = None if filter_kernel is None else native(filter_kernel)
+    if filter_kernel is None:
+        form["filter_kernel"] = None
+    else:
+        form["filter_kernel"] = native(filter_kernel)
     try:
         return sep.extract(
             data, float(threshold), filter_type="conv", segmentation_map=True, **form

@@ -63,7 +63,10 @@ def write_parts(path, layout, *, shown=None, text=None, arrays=None, tables=None
                 hdu.header["BUNIT"] = unit.to_string("fits")
             hdus.append(hdu)
     for name, table in (tables or {}).items():
-        table = type(table)(table, copy=False) if isinstance(table, Table) else Table(table)
+        if isinstance(table, Table):
+            table = type(table)(table, copy=False)
+        else:
+            table = Table(table)
         table.meta = {}
         hdus.append(fits.table_to_hdu(table))
         hdus[-1].name = name
@@ -134,7 +137,8 @@ class Parts:
     """
 
     def __init__(self, hdus):
-        self._hdus, self.layout = hdus, hdus[0].header["FORMAT"]
+        self._hdus = hdus
+        self.layout = hdus[0].header["FORMAT"]
         self._names = {hdu.name for hdu in hdus}
         self.text = {}
         if _TEXT in self._names:

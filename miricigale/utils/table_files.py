@@ -83,16 +83,21 @@ def read_table(path, *, wanted, cls=QTable, form=None, hdu=None, id_names=()):
         Of columns of variable length in FITS, and of those of a parquet file that no table can hold.
     """
     path, extension = split_extension(path)
-    hdu = extension if hdu is None else hdu
+    if hdu is None:
+        hdu = extension
     # astropy would take text for the table itself
     if not Path(path).is_file():
         raise unreadable(path, wanted, FileNotFoundError())
     unpacked_size(path)
     try:
-        form = _table_format(path) if form is None else form
+        if form is None:
+            form = _table_format(path)
         if form == "fits":
             with open_fits(path, wanted=wanted) as hdus, silent_units():
-                chosen = _first_table(hdus) if hdu is None else hdu
+                if hdu is None:
+                    chosen = _first_table(hdus)
+                else:
+                    chosen = hdu
                 table = Table.read(hdus, format=form, character_as_bytes=False, hdu=chosen)
                 read = _table_read(hdus, chosen)
                 mask_scaled_nulls(table, read)
@@ -302,7 +307,8 @@ def _plain_columns(rows, where):
     pyarrow = require("pyarrow", extra="parquet")
     lost = []
     for field in list(rows.schema):
-        i, kind = rows.schema.get_field_index(field.name), field.type
+        i = rows.schema.get_field_index(field.name)
+        kind = field.type
         column = rows.column(i)
         if types.is_dictionary(kind):
             kind = kind.value_type
@@ -369,7 +375,10 @@ def _read_text(path, form, id_names):
         msg = f"of {form} in a zip archive: unpack it first"
         raise ValueError(msg)
     # names are what users see; astropy takes the IDs of fields
-    options = {"use_names_over_ids": True} if form == "votable" else {}
+    if form == "votable":
+        options = {"use_names_over_ids": True}
+    else:
+        options = {}
     return Table.read(path, format=form, **options)
 
 
@@ -413,7 +422,10 @@ def _ids_as_written(table, path, source, form, names):
             ids = texts[~missing]
         every = np.zeros(len(texts), dtype=ids.dtype)
         every[~missing] = ids
-        table[name] = MaskedColumn(every, mask=missing) if missing.any() else Column(every)
+        if missing.any():
+            table[name] = MaskedColumn(every, mask=missing)
+        else:
+            table[name] = Column(every)
 
 
 def _has_odd_numbers(path):
@@ -497,7 +509,10 @@ def write_table(table, path, *, overwrite=False):
             hdus = fits.HDUList([fits.PrimaryHDU(), table_hdu(table)])
             hdus.writeto(partial)
         else:
-            plain = sky_as_angles(table) if form == "votable" else table
+            if form == "votable":
+                plain = sky_as_angles(table)
+            else:
+                plain = table
             plain.write(partial, format=form, **_OPTIONS.get(form, {}))
 
 
@@ -528,4 +543,6 @@ def _table_format(path):
     if suffix in TABLE_FORMATS:
         return TABLE_FORMATS[suffix]
     named = first.startswith("#") and any(map(is_id_name, first.strip("# \r").split()))
-    return "ascii.commented_header" if named else "ascii"
+    if named:
+        return "ascii.commented_header"
+    return "ascii"

@@ -41,7 +41,8 @@ class Flags(enum.IntFlag):
         meanings : dict of int to tuple of str
             By value: its name in words, and a sentence.
         """
-        source, found = inspect.getsource(cls), {}
+        source = inspect.getsource(cls)
+        found = {}
         for member in cls:
             before = re.search(rf"((?: *#: .*\n)+) *{member.name} = ", source)
             after = re.search(rf'\b{member.name} = [^\n]*\n *"""(.*?)"""', source, flags=re.DOTALL)
@@ -106,7 +107,9 @@ def _filled(column, n):
     column = as_column(column)
     if np.ndim(column):
         return column
-    return np.full(n, column) if not hasattr(column, "unit") else u.Quantity([column] * n)
+    if not hasattr(column, "unit"):
+        return np.full(n, column)
+    return u.Quantity([column] * n)
 
 
 def described_table(columns, meta=None):
@@ -170,7 +173,10 @@ def described_rows(rows, texts):
     table : `~astropy.table.QTable`
     """
     rows = list(rows)
-    columns = zip(*rows, strict=True) if rows else [[]] * len(texts)
+    if rows:
+        columns = zip(*rows, strict=True)
+    else:
+        columns = [[]] * len(texts)
     return described_columns(map(np.array, columns), texts)
 
 
@@ -209,7 +215,8 @@ def require_columns(table, names, argument, *, units=None):
         if name not in table.colnames:
             continue
         have = getattr(table[name], "unit", None)
-        have = None if have is None else flux_unit(have) or u.Unit(have)
+        if have is not None:
+            have = flux_unit(have) or u.Unit(have)
         # magnitudes are no units of flux
         if not (isinstance(have, u.UnitBase) and have.is_equivalent(unit)):
             raise units_error(argument, f"convertible to {unit}", have, column=name)
@@ -267,7 +274,10 @@ def ascii_ids(ids, argument):
     if ids.dtype.kind in "UO":
         texts = [key for key in ids.tolist() if isinstance(key, str)]
         foreign = [key for key in texts if not key.isascii() or key != key.rstrip(" ")]
-        more = f" and {len(foreign) - 3} more" if len(foreign) > 3 else ""
+        if len(foreign) > 3:
+            more = f" and {len(foreign) - 3} more"
+        else:
+            more = ""
         wanted = "ASCII, with no blank at the end, where they go to a FITS file"
         check_that(not foreign, argument, wanted, ", ".join(map(repr, foreign[:3])) + more)
     return ids

@@ -105,15 +105,22 @@ def to_array(value, unit, name, *, ndim=None, finite=False, equivalencies=None):
     if isinstance(getattr(value, "unit", None), u.UnitBase) and unit.is_equivalent(u.Jy):
         # maggies, which astropy ties to no flux
         known = flux_unit(value.unit)
-        value = value if known is None else u.Quantity(getattr(value, "value", value), known)
+        if known is not None:
+            value = u.Quantity(getattr(value, "value", value), known)
     try:
         quantity = u.Quantity(value)
     except u.UnitTypeError:
         # magnitudes and other logarithms
         raise units_error(name, f"convertible to {unit}", value.unit) from None
     except (TypeError, ValueError):
-        wanted = "numbers" if unit == u.dimensionless_unscaled else f"convertible to {unit}"
-        got = repr(value) if isinstance(value, (str, list)) else type(value).__name__
+        if unit == u.dimensionless_unscaled:
+            wanted = "numbers"
+        else:
+            wanted = f"convertible to {unit}"
+        if isinstance(value, (str, list)):
+            got = repr(value)
+        else:
+            got = type(value).__name__
         raise argument_error(name, wanted, got) from None
     bare = not hasattr(value, "unit") and quantity.unit == u.dimensionless_unscaled
     if bare and unit != u.dimensionless_unscaled:
@@ -128,7 +135,10 @@ def to_array(value, unit, name, *, ndim=None, finite=False, equivalencies=None):
         raise argument_error(name, f"an array of {ndim} dimension(s)", f"shape {array.shape}")
     if finite and not np.all(np.isfinite(array)):
         n_bad = int(np.count_nonzero(~np.isfinite(array)))
-        masked = "" if mask is None else "masked, "
+        if mask is None:
+            masked = ""
+        else:
+            masked = "masked, "
         raise argument_error(name, "finite values", f"{n_bad} that are {masked}NaN or infinite")
     return array
 
@@ -170,7 +180,9 @@ def ab_magnitude(flux):
 
 def ab_quantity(value):
     """A flux or magnitude as a quantity; a bare number is an AB magnitude."""
-    return value if isinstance(value, u.Quantity) else float(value) * u.ABmag
+    if isinstance(value, u.Quantity):
+        return value
+    return float(value) * u.ABmag
 
 
 def frozen_array(value, dtype=float):

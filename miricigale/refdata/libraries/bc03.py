@@ -57,7 +57,8 @@ def read_bc03(path):
         than its name, or the files are not one set (IMF, wavelengths, ages, limits of mass).
     """
     paths = _files(path)
-    parts, files = [], {file.name: file_sha256(file) for file in paths}
+    parts = []
+    files = {file.name: file_sha256(file) for file in paths}
     for file in paths:
         part = read_ised(file)
         what = f"holds a composite population ({part.history}), wanted a single burst"
@@ -65,18 +66,23 @@ def read_bc03(path):
         parts.append((file, part, _metallicity(part, file), _imf(part, file)))
     _check_set(parts)
     parts.sort(key=lambda item: item[2])
-    first, imf = parts[0][1], parts[0][3]
+    first = parts[0][1]
+    imf = parts[0][3]
     wave, _ = _refine(first.wave / 1e4, first.spectra[:1])
     n_age = first.age.size
     spectra = np.empty((len(parts) * n_age, wave.size), dtype=np.float32)
-    surviving, remnants, basis = np.empty(len(spectra)), np.empty(len(spectra)), set()
+    surviving = np.empty(len(spectra))
+    remnants = np.empty(len(spectra))
+    basis = set()
     for i, (file, part, _, _) in enumerate(parts):
         rows = slice(i * n_age, (i + 1) * n_age)
         spectra[rows] = _refine(part.wave / 1e4, part.spectra)[1] * (SOLAR_LUMINOSITY * 1e4)
         surviving[rows], how = _surviving(part, file)
         remnants[rows] = part.quantities["remnants"]
         basis.add(how)
-    metal, name, (low, high) = [p[2] for p in parts], _set_name(paths[0].name), first.mass_limits
+    metal = [p[2] for p in parts]
+    name = _set_name(paths[0].name)
+    low, high = first.mass_limits
     last = first.wave[-1] / 1e4
     reach = f"the files reach {last:g} um"
     if last < LONGEST * (1 - 1e-6):
@@ -131,27 +137,37 @@ def _set_name(name):
 
 def _metallicity(part, file):
     match = re.search(r"_m(\d{2,3})(?=[_.])", file.name)
-    named = (PADOVA_1994 | PADOVA_2000).get(int(match[1])) if match else None
+    if match:
+        named = (PADOVA_1994 | PADOVA_2000).get(int(match[1]))
+    else:
+        named = None
     stated = part.metallicity
     wanted = "wanted 'Z=...' in its head or a name like _m62_"
     check_data(not (named is None and stated is None), file, f"states no metallicity: {wanted}")
     if named is not None and stated is not None and not np.isclose(named, stated, rtol=0.01):
         what = f"states Z = {stated:g}, but its name (m{match[1]}) means Z = {named:g}"
         raise data_error(file, what)
-    return named if stated is None else stated
+    if stated is None:
+        return named
+    return stated
 
 
 def _imf(part, file):
     named = {imf for token, imf in IMFS.items() if f"_{token}" in file.name.lower()}
     # Chabrier's is the only one that is no power law
-    stated = "Chabrier" if not part.slopes else None
+    if not part.slopes:
+        stated = "Chabrier"
+    else:
+        stated = None
     if len(part.slopes) == 1 and np.isclose(part.slopes[0], 1.35, atol=0.01):
         stated = "Salpeter"
     if len(named) != 1 and stated is None:
         raise data_error(file, f"names no IMF: wanted one of {', '.join(IMFS)} in its name")
     if len(named) == 1 and stated is not None and stated not in named:
         raise data_error(file, f"holds a {stated} IMF, but its name means {named.pop()}")
-    return stated if stated is not None else named.pop()
+    if stated is not None:
+        return stated
+    return named.pop()
 
 
 def _check_set(parts):
@@ -177,12 +193,15 @@ def _check_set(parts):
 def _version(part):
     """Year of the version that made a file, by its second age, or None."""
     years = [y for y, age in SECOND_AGE.items() if np.isclose(part.age[1], age, rtol=1e-3)]
-    return years[0] if years else None
+    if years:
+        return years[0]
+    return None
 
 
 def _surviving(part, file):
     """Mass in surviving stars without remnants, and how it was found."""
-    mass, remnants = part.quantities["mass"], part.quantities["remnants"]
+    mass = part.quantities["mass"]
+    remnants = part.quantities["remnants"]
     gas = part.quantities.get("gas")
     old = part.age > 1e8
     if gas is not None and np.any(gas[old] > 0):
@@ -197,7 +216,10 @@ def _surviving(part, file):
         ages = " or ".join(f"{second:g} yr ({year})" for year, second in SECOND_AGE.items())
         what = "does not tell whether its mass of stars includes remnants: wanted a mass of gas"
         raise data_error(file, f"{what}, or a second age of {ages}, got {part.age[1]:g} yr")
-    surviving = mass - remnants if take else mass.copy()
+    if take:
+        surviving = mass - remnants
+    else:
+        surviving = mass.copy()
     surviving[part.age == 0] = 1.0
     if surviving.min() < 0 or surviving.max() > 1.05:
         got = f"got up to {surviving.max():g}"
@@ -209,10 +231,16 @@ def _refine(wave, spectra):
     """Insert wavelengths beyond 10 um, log-log between neighbors, and go on to 160 um."""
     ends = wave[-1] < LONGEST * (1 - 1e-6)
     target = max(LONGEST, wave[-1])
-    points = np.append(wave, LONGEST) if ends else wave
+    if ends:
+        points = np.append(wave, LONGEST)
+    else:
+        points = wave
     pieces = [points[points <= DENSE_FROM]]
     far = points[points > DENSE_FROM]
-    start = pieces[0][-1:] if pieces[0].size else far[:1]
+    if pieces[0].size:
+        start = pieces[0][-1:]
+    else:
+        start = far[:1]
     for low, high in zip(np.append(start, far[:-1]), far, strict=True):
         n = max(1, int(np.ceil(np.log(high / low) * DENSITY)))
         pieces.append(np.append(np.geomspace(low, high, n + 1)[1:-1], high))

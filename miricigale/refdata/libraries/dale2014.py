@@ -70,7 +70,9 @@ def read_dale2014(path):
     emission = 10.0**log_power / wave[:, None]
     starlight = stars[:, None] * (emission[SCALED_AT] / stars[SCALED_AT])
     used = (wave >= SHORTEST) & (wave <= LONGEST)
-    nodes, emission, starlight = wave[used], emission[used].T, starlight[used].T
+    nodes = wave[used]
+    emission = emission[used].T
+    starlight = starlight[used].T
     removed = emission - starlight
     negative = int(np.sum(removed < 0))
     share = np.max(starlight[:, 0] / emission[:, 0])
@@ -104,7 +106,10 @@ def _find(path):
     wanted = (SPECTRA, CALIBRATION, STARS)
     if not path.is_dir() and not (path.is_file() and is_archive(path)):
         what = "cannot be read as templates of Dale et al. 2014: wanted a folder or an archive"
-        got = "got another file" if path.is_file() else "no such file or folder"
+        if path.is_file():
+            got = "got another file"
+        else:
+            got = "no such file or folder"
         raise data_error(path, f"{what} that holds {SPECTRA} and {CALIBRATION}, {got}")
     found = list(members(path, lambda name: name in wanted))
     folders = [place.parent for place, _, _ in found if place.name == SPECTRA]

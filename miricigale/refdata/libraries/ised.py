@@ -25,7 +25,8 @@ QUANTITIES = declared("miricigale.refdata.libraries", "formats.toml")["ised"]["q
 N_NEEDED = 10  # of them; later versions go on
 
 _LAWS = {0: "single burst (SSP)", 4: "exponential", 6: "delayed"}
-_MOST_AGES, _MOST_NUMBERS = 10**5, 10**7
+_MOST_AGES = 10**5
+_MOST_NUMBERS = 10**7
 _TEXT = 80
 
 
@@ -65,13 +66,17 @@ class Ised:
     def history(self):
         """The star-formation law in words."""
         words = _LAWS.get(self.law, f"law {self.law}")
-        return f"{words}, tau {self.tau / 1e9:g} Gyr" if self.law else words
+        if self.law:
+            return f"{words}, tau {self.tau / 1e9:g} Gyr"
+        return words
 
     @property
     def metallicity(self):
         """Mass fraction of metals that the texts state, or None."""
         found = {float(z) for text in self.texts for z in re.findall(r"\bZ\s*=\s*(\d*\.\d+)", text)}
-        return found.pop() if len(found) == 1 else None
+        if len(found) == 1:
+            return found.pop()
+        return None
 
 
 def read_ised(path):
@@ -96,7 +101,10 @@ def read_ised(path):
     path = Path(path)
     data = _unpacked(path)
     order = _byte_order(data)
-    source = _Words(data, path) if order is None else _Records(data, order, path)
+    if order is None:
+        source = _Words(data, path)
+    else:
+        source = _Records(data, order, path)
     out = _content(source)
     for name, array in (("ages", out.age), ("wavelengths", out.wave)):
         if array.size < 2 or not np.all(np.diff(array) > 0) or array[0] < 0:
@@ -114,7 +122,9 @@ def _unpacked(path):
     unpacked_size(path)
     try:
         data = path.read_bytes()
-        return gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data
+        if data[:2] == b"\x1f\x8b":
+            return gzip.decompress(data)
+        return data
     except (OSError, EOFError, zlib.error) as err:
         raise _foreign(path, err) from err
 
@@ -126,7 +136,9 @@ def _content(source):
     limits = tuple(source.floats(2).tolist())
     slopes = tuple(round(float(source.floats(6)[0]), 6) for _ in range(source.integer()))
     source.floats(3)  # mass, number of stars and mean mass of the IMF
-    law, tau, texts = source.integer(), float(source.floats(1)[0]), source.texts()
+    law = source.integer()
+    tau = float(source.floats(1)[0])
+    texts = source.texts()
     source.begin("wavelengths")
     wave = source.vector().astype(float)
     spectra = np.empty((age.size, wave.size), dtype=np.float32)
@@ -154,7 +166,8 @@ class _Source:
     """Numbers of a file, read from its beginning; `begin` starts a record."""
 
     def __init__(self, path):
-        self.path, self.title = path, ""
+        self.path = path
+        self.title = ""
 
     def begin(self, title):
         self.title = title
@@ -169,7 +182,10 @@ class _Source:
         """Numbers after their count, which may be known."""
         count = self.integer()
         if not 0 <= count < _MOST_NUMBERS or (n is not None and count != n):
-            wanted = "a count of" if n is None else n
+            if n is None:
+                wanted = "a count of"
+            else:
+                wanted = n
             raise _foreign(self.path, f"{self.title} must hold {wanted} numbers, got {count}")
         return self.floats(count)
 
@@ -194,7 +210,9 @@ def _byte_order(data):
 
 def _records(data, order, path):
     """Contents of the records, between their lengths."""
-    length, at, out = struct.Struct(f"{order}i"), 0, []
+    length = struct.Struct(f"{order}i")
+    at = 0
+    out = []
     while at < len(data):
         where = f"record {len(out) + 1}"
         try:
@@ -214,12 +232,15 @@ class _Records(_Source):
 
     def __init__(self, data, order, path):
         super().__init__(path)
-        self.records, self.order, self.number = _records(data, order, path), order, 0
+        self.records = _records(data, order, path)
+        self.order = order
+        self.number = 0
 
     def begin(self, title):
         if self.ended():
             raise _truncated(self.path, f"after {self.number} records, before {title}")
-        self.data, self.at = self.records[self.number], 0
+        self.data = self.records[self.number]
+        self.at = 0
         self.number += 1
         self.title = f"record {self.number}"
 

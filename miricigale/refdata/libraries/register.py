@@ -53,8 +53,11 @@ class Report:
     sha256: str
 
     def __str__(self):
-        library, files = self.library, self.library.meta["files"]
-        units, n, wave = library.units, library.n_rows, library.wave
+        library = self.library
+        files = self.library.meta["files"]
+        units = library.units
+        n = library.n_rows
+        wave = library.wave
         axes = library.levels
         number = f"{len(files):,} file{'s' if len(files) != 1 else ''}"
         rows = [("source", f"{self.source} ({number} read)")]
@@ -65,7 +68,10 @@ class Report:
             rows.append((name, f"{_some(values)} {units.get(name, '')}".rstrip()))
         grid = " x ".join(str(values.size) for values in axes.values())
         total = int(np.prod([values.size for values in axes.values()]))
-        missing = "complete" if library.complete else f"{total - n} of {total} not there"
+        if library.complete:
+            missing = "complete"
+        else:
+            missing = f"{total - n} of {total} not there"
         rows += [("grid", f"{grid}: {missing}")]
         rows += [("found", sentence) for sentence in library.summary]
         if len(files) <= 5:
@@ -117,7 +123,8 @@ def add_library(name, path, *, progress_bar=False):
         If the files are not there, not those of this library or not whole; the message
         names the file. Nothing was changed then.
     """
-    reader, record = _reader(name), resource(name)
+    reader = _reader(name)
+    record = resource(name)
     path = Path(path).expanduser()
     # some readers take a pattern of names
     if not path.exists() and not any(mark in path.name for mark in "*?["):
@@ -157,7 +164,8 @@ def _installing(target):
         To be filled with plain values, kept as JSON in ``<file>.json``; checksum, size and time
         of the file are added.
     """
-    beside, record = record_path(target), {}
+    beside = record_path(target)
+    record = {}
     target.parent.mkdir(parents=True, exist_ok=True)
     lock = FileLock(target.with_name(f".{target.name}.lock"))
     with lock, contextlib.ExitStack() as last, replacing(target) as partial:
@@ -179,7 +187,9 @@ def _installing(target):
 def _reader(name):
     check_names([name], "library", READERS)
     reader = READERS[name]
-    return pkgutil.resolve_name(reader) if isinstance(reader, str) else reader
+    if isinstance(reader, str):
+        return pkgutil.resolve_name(reader)
+    return reader
 
 
 def _read(reader, name, path):
@@ -189,7 +199,10 @@ def _read(reader, name, path):
     except DataError:
         raise
     except Exception as err:  # readers of different formats raise different exceptions
-        reason = err.args[0] if isinstance(err, KeyError) and err.args else err
+        if isinstance(err, KeyError) and err.args:
+            reason = err.args[0]
+        else:
+            reason = err
         what = f"cannot be read as {name!r}: {reason or type(err).__name__}"
         raise data_error(path, what) from err
 

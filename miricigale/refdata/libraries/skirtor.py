@@ -27,7 +27,8 @@ _NUMBER = r"(\d+(?:\.\d+)?)"
 _NAME = re.compile(
     rf"t{_NUMBER}_p{_NUMBER}_q{_NUMBER}_oa{_NUMBER}_R{_NUMBER}_Mcl0\.97_i{_NUMBER}_sed\.dat"
 )
-_ROWS, _COLUMNS = 132, 7
+_ROWS = 132
+_COLUMNS = 7
 
 # the files are for 1e11 Lsun of 3.839e26 W at 10 Mpc
 _SUN = 1e11
@@ -74,7 +75,10 @@ def read_skirtor(path):
     axes = {name: np.asarray(axes[name])[order] for name in SKIRTOR_AXES}
     _check_product(path, axes)
     n = len(order)
-    part = "the whole library" if n == _WHOLE else f"a part of the library, {n:,} of {_WHOLE:,}"
+    if n == _WHOLE:
+        part = "the whole library"
+    else:
+        part = f"a part of the library, {n:,} of {_WHOLE:,}"
     span = f"{wave.size} wavelengths, {wave[0]:g}-{wave[-1]:g} um"
     summary = (f"SKIRTOR 2016: {n:,} spectra ({part}) at {span}",)
     return LibraryTable(
@@ -131,7 +135,12 @@ def _texts(path):
 
 def _read_texts(path):
     """Wavelengths, axes, spectra and checksums from the authors' text files."""
-    wave, keys, disk, dust, files, known = None, [], [], [], {}, {}
+    wave = None
+    keys = []
+    disk = []
+    dust = []
+    files = {}
+    known = {}
     for name, data, source in _texts(path):
         key = tuple(map(float, _NAME.fullmatch(name).groups()))
         digest = hashlib.sha256(data).hexdigest()
@@ -192,7 +201,9 @@ def _check_columns(wave, table, seen, inclination, unit, source):
     The parts add up to the total, and the disk without dust shines as cos i (1 + 2 cos i)
     with 1e11 Lsun over all directions: a foreign unit or column breaks one of them.
     """
-    total, dust, transparent = table[0], table[3], table[-1]
+    total = table[0]
+    dust = table[3]
+    transparent = table[-1]
     what = "has a total that is not direct + scattered + dust: columns in another order?"
     check_data(np.abs(total - seen - dust).max() <= 1e-3 * total.max(), source, what)
     mu = np.cos(np.radians(inclination))

@@ -65,7 +65,10 @@ class LibraryTable:
     summary: tuple = ()
 
     def __post_init__(self):
-        wave = to_array(self.wave, WAVE, "wave") if hasattr(self.wave, "unit") else self.wave
+        if hasattr(self.wave, "unit"):
+            wave = to_array(self.wave, WAVE, "wave")
+        else:
+            wave = self.wave
         wave = self.__dict__["wave"] = frozen_array(wave)
         good = wave.ndim == 1 and wave.size > 1 and np.all(np.isfinite(wave)) and wave[0] > 0
         if not good or not np.all(np.diff(wave) > 0):
@@ -182,7 +185,9 @@ class LibraryTable:
         got = f"only {', '.join(values) or 'none'}"
         check_that(not missing, ", ".join(missing), f"given to find a row of {self.name!r}", got)
         codes = [int(self._codes(name, float(values[name]))) for name in self.axes]
-        return self._index.get(int(self._place(codes))) if min(codes) >= 0 else None
+        if min(codes) >= 0:
+            return self._index.get(int(self._place(codes)))
+        return None
 
     def spectrum(self, kind, row):
         """
@@ -227,7 +232,10 @@ def write_library(library, path):
         if array.dtype.kind != "f" or array.dtype.itemsize not in (4, 8):
             array = array.astype(float)
         unit = _fits_unit(library, name)
-        arrays[_extension(name)] = array if unit is None else u.Quantity(array, unit, copy=False)
+        if unit is None:
+            arrays[_extension(name)] = array
+        else:
+            arrays[_extension(name)] = u.Quantity(array, unit, copy=False)
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     text |= {"name": library.name, "meta": library.meta}
@@ -242,7 +250,9 @@ def _fits_unit(library, name):
     """The unit for other readers, or None where there is none that FITS knows; ours is in the text."""
     unit = u.Unit(library.units.get(name, ""))
     try:
-        return u.Unit(unit.to_string("fits")) if unit != u.one else None
+        if unit != u.one:
+            return u.Unit(unit.to_string("fits"))
+        return None
     except ValueError:
         return None
 
