@@ -78,7 +78,10 @@ class Charge(Timed):
     def read_variance(self):
         """Variance of one read in DN squared: read noise and rounding."""
         effect = self._effect(ReadNoise)
-        sigma = 0.0 if effect is None else effect.deviation(self.properties)
+        if effect is None:
+            sigma = 0.0
+        else:
+            sigma = effect.deviation(self.properties)
         return sigma**2 + 1 / 12
 
     @property
@@ -99,12 +102,17 @@ class Charge(Timed):
         """DN above the level that charges read."""
         dn = np.asarray(electrons, float) / self.properties.gain
         effect = self._effect(Nonlinearity)
-        return dn if effect is None else effect.response(dn, self.properties)
+        if effect is None:
+            return dn
+        return effect.response(dn, self.properties)
 
     def limit(self, dn):
         """Charge in electrons that reads ``dn`` above the level, or at which the pixel is full."""
         effect = self._effect(Nonlinearity)
-        linear = dn if effect is None else float(effect.linear_dn(dn, self.properties))
+        if effect is None:
+            linear = dn
+        else:
+            linear = float(effect.linear_dn(dn, self.properties))
         full = min(effect.limit(self.properties) for effect in self.effects)
         return min(self.properties.gain * linear, full)
 
@@ -112,7 +120,8 @@ class Charge(Timed):
         return next((effect for effect in self.effects if isinstance(effect, kind)), None)
 
     def __repr__(self):
-        e, (ny, nx) = self.exposure, self.mean.shape
+        e = self.exposure
+        ny, nx = self.mean.shape
         return (
             f"<Charge {e.filter}: {e.n_integrations} integration(s) x {e.n_groups} groups, "
             f"{ny} x {nx} pixels, {len(self.hit_electrons)} deposits of cosmic rays>"

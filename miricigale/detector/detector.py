@@ -81,7 +81,10 @@ class Detector(Interactive):
     properties: DetectorProperties | None = None
 
     def __post_init__(self):
-        effects = [kind() for kind in _STANDARD] if self.effects is None else self.effects
+        if self.effects is None:
+            effects = [kind() for kind in _STANDARD]
+        else:
+            effects = self.effects
         object.__setattr__(self, "effects", checked_effects(effects))
         check_order(self.effects)
         check_kind(self.properties, "properties", DetectorProperties)

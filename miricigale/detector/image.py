@@ -31,7 +31,8 @@ def checked_light(image, exposure):
         If the exposure has no filter or pointing, or the image another shape, filter or place on the
         sky than the exposure, masked pixels, or values that are not finite or that are negative.
     """
-    exposure = getattr(image, "exposure", None) if exposure is None else exposure
+    if exposure is None:
+        exposure = getattr(image, "exposure", None)
     check_that(isinstance(exposure, Exposure), "exposure", "an Exposure", type(exposure).__name__)
     exposure.check_sky()
     if hasattr(image, "render"):
@@ -67,7 +68,8 @@ def _check_place(image, exposure):
     if not isinstance(wcs, WCS) or not wcs.has_celestial:
         return
     ny, nx = exposure.shape
-    x, y = np.array([0.0, nx - 1.0, (nx - 1) / 2]), np.array([0.0, ny - 1.0, (ny - 1) / 2])
+    x = np.array([0.0, nx - 1.0, (nx - 1) / 2])
+    y = np.array([0.0, ny - 1.0, (ny - 1) / 2])
     wanted, have = (w.pixel_to_world(x, y) for w in (exposure.wcs, wcs))
     side = np.sqrt(proj_plane_pixel_area(exposure.wcs.celestial))
     off = float(np.max(wanted.separation(have).deg)) / side

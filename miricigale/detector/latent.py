@@ -76,7 +76,10 @@ class Latent(Frozen):
         gap = float(to_array(self.gap, TIME, "gap", ndim=0, finite=True))
         check_that(gap >= 0, "gap", "at least 0 s", self.gap)
         rate = u.Quantity(frozen_array(rate), unit, copy=False)
-        full = np.zeros(rate.shape, bool) if self.saturated is None else self.saturated
+        if self.saturated is None:
+            full = np.zeros(rate.shape, bool)
+        else:
+            full = self.saturated
         if np.shape(full) != rate.shape:
             raise argument_error("saturated", f"of shape {rate.shape}", np.shape(full))
         self.__dict__.update(rate=rate, gap=gap * TIME, saturated=frozen_array(full, bool))
@@ -140,7 +143,10 @@ def checked_previous(previous, exposure):
     """Exposures before one, a `Latent` or several, as a tuple; those of other pixels are refused."""
     if previous is None:
         return ()
-    previous = tuple(previous) if np.iterable(previous) else (previous,)
+    if np.iterable(previous):
+        previous = tuple(previous)
+    else:
+        previous = (previous,)
     for latent in previous:
         check_that(isinstance(latent, Latent), "previous", "a Latent or several", repr(latent))
         if latent.subarray != exposure.subarray or latent.rate.shape != exposure.shape:

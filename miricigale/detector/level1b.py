@@ -42,14 +42,19 @@ def header(exposure, *, filename="", start=None):
         raise argument_error("start", "one astropy Time", repr(start))
     duration = TimeDelta(exposure.duration.to_value("s"), format="sec")
     # as in real files, only the linear part of the WCS stands here
-    wcs, where = exposure.wcs.wcs, exposure.pointing_keywords()
-    matrix = wcs.pc * np.asarray(wcs.cdelt)[:, None] if not wcs.has_cd() else wcs.cd
+    wcs = exposure.wcs.wcs
+    where = exposure.pointing_keywords()
+    if not wcs.has_cd():
+        matrix = wcs.pc * np.asarray(wcs.cdelt)[:, None]
+    else:
+        matrix = wcs.cd
     times = {
         "TFRAME": exposure.frame_time, "TGROUP": exposure.group_time, "EFFINTTM": exposure.integration_time,
         "EFFEXPTM": exposure.exposure_time, "DURATION": exposure.duration,
     }  # fmt: skip
     days = {"EXPSTART": start, "EXPMID": start + duration / 2, "EXPEND": start + duration}
-    n_int, number = exposure.n_integrations, exposure.dither + 1
+    n_int = exposure.n_integrations
+    number = exposure.dither + 1
     name = exposure.filter.rpartition(".")[2]
     values = where | {
         # not the time of writing: the same exposure gives the same bytes
@@ -142,9 +147,13 @@ def row_writer(path, exposure, *, start=None, filename=None, overwrite=False, ob
         primary, science = header(exposure, filename=filename, start=start)
     else:
         primary, science = placed_keywords(kept_keywords(observation))
-        primary["FILENAME"], science["BUNIT"] = filename, "DN"
+        primary["FILENAME"] = filename
+        science["BUNIT"] = "DN"
     begun = primary.get("EXPSTART")
-    times = None if begun is None else _int_times(exposure, begun)
+    if begun is None:
+        times = None
+    else:
+        times = _int_times(exposure, begun)
     shape = (exposure.n_integrations, exposure.n_groups, *exposure.shape)
     axes = [("NAXIS", len(shape))] + [(f"NAXIS{i + 1}", n) for i, n in enumerate(shape[::-1])]
     structure = [("XTENSION", "IMAGE"), ("BITPIX", 16), *axes, ("PCOUNT", 0), ("GCOUNT", 1)]

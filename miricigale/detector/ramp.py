@@ -116,9 +116,16 @@ class Ramp(Interactive, NDData):
             raise argument_error("steps", f"of {sorted(STEPS.values())}", sorted(unknown))
         # the WCS is that of the two pixel axes
         super().__init__(_read_only(data), unit=DN, wcs=exposure.wcs, meta=dict(meta or {}))
-        self.exposure, self.pixel_dq, self.group_dq = exposure, pixel_dq, group_dq
-        self.effects, self.properties, self.steps = effects, properties, steps
-        self._header = None if header is None else header.copy()
+        self.exposure = exposure
+        self.pixel_dq = pixel_dq
+        self.group_dq = group_dq
+        self.effects = effects
+        self.properties = properties
+        self.steps = steps
+        if header is None:
+            self._header = None
+        else:
+            self._header = header.copy()
         self._frozen = True
 
     def __setattr__(self, name, value):
@@ -145,7 +152,10 @@ class Ramp(Interactive, NDData):
     @property
     def history(self):
         """Who made the counts and what was done to them, `~miricigale.instrument.ExposureHistory`."""
-        header = self.header if self.observed else {}
+        if self.observed:
+            header = self.header
+        else:
+            header = {}
         history = ExposureHistory.from_header(header, recorded=self.simulated)
         return history.replace(steps=self.steps)
 
@@ -164,8 +174,13 @@ class Ramp(Interactive, NDData):
     @property
     def group_time(self):
         """Time between groups in s: that of the header, or of the exposure."""
-        stated = None if self._header is None else self._header.get("TGROUP")
-        return self.exposure.group_time.to_value("s") if stated is None else float(stated)
+        if self._header is None:
+            stated = None
+        else:
+            stated = self._header.get("TGROUP")
+        if stated is None:
+            return self.exposure.group_time.to_value("s")
+        return float(stated)
 
     def integration(self, number):
         """
@@ -235,7 +250,10 @@ class Ramp(Interactive, NDData):
         x, y = (operator.index(number) for number in pixel)
         check_that(0 <= x < nx and 0 <= y < ny, "pixel", f"(x, y) below ({nx}, {ny})", pixel)
         time = (np.arange(self.shape[1]) + 1) * self.group_time
-        flags = None if self.group_dq is None else self.group_dq[:, :, y, x] != 0
+        if self.group_dq is None:
+            flags = None
+        else:
+            flags = self.group_dq[:, :, y, x] != 0
         title = f"pixel ({x}, {y})"
         return plot_ramp(time, self.data[:, :, y, x], flags, ax=ax, title=title, **kwargs)
 

@@ -117,9 +117,11 @@ def _exposure(path, header, shape):
     stated = [value is not None for value in pointed]
     if any(stated) and not all(stated):
         raise data_error(path, f"must have all of RA_REF, DEC_REF, ROLL_REF or none, got {pointed}")
-    pointing, roll = None, None
+    pointing = None
+    roll = None
     if all(stated):
-        pointing, roll = SkyCoord(*pointed[:2], unit="deg"), pointed[2] * u.deg
+        pointing = SkyCoord(*pointed[:2], unit="deg")
+        roll = pointed[2] * u.deg
     exposure = Exposure(
         name,
         readout=readout,
@@ -144,7 +146,8 @@ def _check_header(path, header, exposure):
         n_int = header["INTEND"] - header["INTSTART"] + 1
     elif "NINTS" in header:
         n_int = header["NINTS"]
-    part_name, pattern = f"of {part.name}", f"of {exposure.readout}"
+    part_name = f"of {part.name}"
+    pattern = f"of {exposure.readout}"
     wanted = {
         "NGROUPS": (header.get("NGROUPS"), exposure.n_groups, "in SCI"),
         "NINTS": (n_int, exposure.n_integrations, "in SCI"),

@@ -82,7 +82,8 @@ class Work:
     def collect(self, n_threads, progress_bar):
         """Collect the charge of all rows: mean rate, electrons, places and charge of hits, flags of pixels."""
         shape = self.shape[2:]
-        mean, electrons = np.empty(shape), np.empty(shape, np.float32)
+        mean = np.empty(shape)
+        electrons = np.empty(shape, np.float32)
         pixel_dq = np.zeros(shape, np.uint32)
 
         def work(rows):
@@ -146,7 +147,8 @@ class Work:
         mean, ramp, rest = self._lit(WholeBlock, where, chain)
         for effect, key in rest:
             block = WholeBlock(*where, key, self.previous)
-            mean, ramp = effect.expected(mean, block), effect.apply(ramp, block)
+            mean = effect.expected(mean, block)
+            ramp = effect.apply(ramp, block)
         hits = (np.empty((3, 0), np.int32), np.empty(0))
         flags = np.broadcast_to(np.uint8(0), (*self.shape[:2], rows.stop - rows.start, shape[1]))
         for effect, key in self.keyed:

@@ -28,7 +28,8 @@ _STUB = (
 )
 
 #: Orders of the polynomials from pixels to the telescope frame and back.
-_FORWARD, _INVERSE = 5, 8
+_FORWARD = 5
+_INVERSE = 8
 
 #: Keywords of the reference point: on the sky, and in the telescope frame.
 _REFERENCE = ("RA_REF", "DEC_REF", "ROLL_REF", "V2_REF", "V3_REF")
@@ -122,7 +123,8 @@ def _asdf_bytes(tree):
     place, so that it is written once more with them in order.
     """
     asdf = require("asdf", extra="gwcs")
-    draft, final = io.BytesIO(), io.BytesIO()
+    draft = io.BytesIO()
+    final = io.BytesIO()
     asdf.AsdfFile(tree).write_to(draft)
     draft.seek(0)
     with asdf.open(draft) as written:

@@ -45,7 +45,10 @@ def ceers_exposures(pointing, roll, *, filters=None, quick=False):
     >>> len(exposures), exposures[0].exposure_time
     (3, <Quantity 555. s>)
     """
-    filters = CEERS_FILTERS if filters is None else tuple(filters)
+    if filters is None:
+        filters = CEERS_FILTERS
+    else:
+        filters = tuple(filters)
     check_names(filters, "band of the survey", CEERS_FILTERS)
     exposures = []
     for name in filters:

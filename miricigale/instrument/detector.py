@@ -311,7 +311,8 @@ def reference_pixel_mask(*, subarray="FULL"):
     >>> print(reference_pixel_mask()[0].sum(), "columns")
     8 columns
     """
-    n, n_columns = miri_detector().reference_columns, aperture("FULL").shape[1]
+    n = miri_detector().reference_columns
+    n_columns = aperture("FULL").shape[1]
     return ~_columns_mask(n, n_columns - n, subarray)
 
 

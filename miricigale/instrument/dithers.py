@@ -24,7 +24,8 @@ from miricigale.utils.units import ANGLE, check_count, to_array
 _PIXEL = (0.110497, 0.111336)
 
 #: Apertures of the imager's full array, and types of exposures, in APT's list of pointings.
-_FULL, _USED = ("MIRIM_FULL", "MIRIM_ILLUM"), ("SCIENCE", "PARALLEL")
+_FULL = ("MIRIM_FULL", "MIRIM_ILLUM")
+_USED = ("SCIENCE", "PARALLEL")
 #: Points of the cycling patterns.
 _N_CYCLING = 311
 #: Half pixels in turn.
@@ -39,7 +40,8 @@ def _cycling(name):
     # evenly spread over 0 to 1 from any start; without the first, which is zero
     share, turn = Halton(2, scramble=False).random(_N_CYCLING + 1)[1:].T
     inner = (0.4 * limit if name == "cycling-small" else 0.0) ** 2 / (2 * sigma**2)
-    a, b = np.exp(-inner), np.exp(-((limit - 1) ** 2) / (2 * sigma**2))
+    a = np.exp(-inner)
+    b = np.exp(-((limit - 1) ** 2) / (2 * sigma**2))
     radius = sigma * np.sqrt(-2 * np.log(a - share * (a - b)))
     angle = 2 * np.pi * turn
     points = np.round(np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1))
@@ -50,7 +52,9 @@ def _cycling(name):
 
 def _points(pattern):
     fixed = table("dithers")["points"]
-    return np.array(fixed[pattern]) if pattern in fixed else _cycling(pattern)
+    if pattern in fixed:
+        return np.array(fixed[pattern])
+    return _cycling(pattern)
 
 
 def dither_patterns():
@@ -106,7 +110,8 @@ def dither_offsets(pattern, n=None, *, start=0):
                [-1.1 , -1.73],
                [ 1.16, -1.67]] arcsec>
     """
-    n = None if n is None else check_count(n, "n")
+    if n is not None:
+        n = check_count(n, "n")
     start = check_count(start, "start", 0)
     if isinstance(pattern, str):
         check_names([pattern], "dither pattern", dither_patterns())
@@ -119,7 +124,10 @@ def dither_offsets(pattern, n=None, *, start=0):
     elif isinstance(pattern, Table):
         pattern = _table_offsets(pattern, "pattern")
     offsets = to_array(pattern, ANGLE, "pattern", ndim=2, finite=True)
-    last = len(offsets) if n is None else start + n
+    if n is None:
+        last = len(offsets)
+    else:
+        last = start + n
     if offsets.shape[1] != 2 or len(offsets) < last or last <= start:
         wanted = f"offsets of shape ({last}, 2)"
         raise argument_error("pattern", wanted, f"shape {offsets.shape}")
@@ -156,7 +164,8 @@ def tile_offsets(n_x, n_y, *, overlap=0.1):
     <Quantity [[-33.2,   0. ],
                [ 33.2,   0. ]] arcsec>
     """
-    n_x, n_y = check_count(n_x, "n_x"), check_count(n_y, "n_y")
+    n_x = check_count(n_x, "n_x")
+    n_y = check_count(n_y, "n_y")
     check_that(0 <= overlap < 1, "overlap", "at least 0 and less than 1", overlap)
     first, last = imager_columns()
     sides = np.array([last - first, aperture("FULL").shape[0]]) * _PIXEL
@@ -239,7 +248,10 @@ def _rows(path):
         words = line.split()
         if line.startswith("* "):
             number = re.search(r"\(Obs (\d+)\)", line) or re.search(r"Observation (\d+)", line)
-            current = int(number.group(1)) if number else current + 1
+            if number:
+                current = int(number.group(1))
+            else:
+                current = current + 1
         if len(words) >= 19 and all(word.isdigit() for word in words[:4]):
             yield current, words
 
@@ -277,7 +289,9 @@ def read_centers(path, roll):
     >>> from miricigale.instrument import read_centers
     >>> centers, others = read_centers("program.pointing", 40 * u.deg)  # doctest: +SKIP
     """
-    path, found, others = Path(path).expanduser(), {}, set()
+    path = Path(path).expanduser()
+    found = {}
+    others = set()
     unpacked_size(path)
     with reading(path, "a list of pointings"):
         for observation, words in _rows(path):
@@ -304,7 +318,8 @@ def _looks_at(ra, dec, x, y, pa):
 
 def _read_pointings(path, observation, exposure):
     """Offsets of the dithers of an exposure."""
-    found, apertures = {}, set()
+    found = {}
+    apertures = set()
     for current, words in _rows(path):
         apertures.add(words[4])
         if not words[4].startswith("MIRIM") or words[18] not in _USED:
@@ -314,7 +329,8 @@ def _read_pointings(path, observation, exposure):
         offset = float(words[11]), float(words[12])
         places.setdefault((target, tile), {}).setdefault(dither, offset)
     check_data(found, path, f"has no exposures of MIRIM apertures; it has {sorted(apertures)}")
-    exposures, every = found[_chosen("observation", observation, found)], {}
+    exposures = found[_chosen("observation", observation, found)]
+    every = {}
     for places in exposures.values():
         for tile, offsets in places.items():
             every.setdefault(tile, []).extend(offsets.values())

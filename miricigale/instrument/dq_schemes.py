@@ -69,7 +69,10 @@ def bad_pixels(values, header, get, where):
         if instrument == "WFC3" and not detector:
             # filters of the two channels have other names: F160W, F606W
             is_infrared = str(get("FILTER") or "").strip().upper().startswith(("F0", "F1", "G1"))
-            detector = "IR" if is_infrared else "UVIS"
+            if is_infrared:
+                detector = "IR"
+            else:
+                detector = "UVIS"
         harmless = _HST_HARMLESS.get((instrument, detector), 0)
         return values & ~harmless != 0, f"bits of HST {instrument} without {harmless}"
     bad = values != 0

@@ -149,12 +149,17 @@ class Exposure(Interactive):
         roll=None,
         dither=0,
     ):
-        filter = None if filter is None else imager_filter(filter)
-        readout, subarray = str(readout).upper(), str(subarray).upper()
+        if filter is not None:
+            filter = imager_filter(filter)
+        readout = str(readout).upper()
+        subarray = str(subarray).upper()
         aperture(subarray)
         frame = frame_time(readout, subarray)
         if (n_groups is None) == (time is None):
-            got = "neither" if time is None else "both"
+            if time is None:
+                got = "neither"
+            else:
+                got = "both"
             raise argument_error("n_groups, time", "one of them given", got)
         counts = {"dither": check_count(dither, "dither", 0)}
         if n_integrations is not None:
@@ -165,7 +170,8 @@ class Exposure(Interactive):
         counts["n_integrations"] = n_integrations or 1
         if pointing is not None:
             pointing = as_position(pointing, "pointing")
-            roll = 0.0 * u.deg if roll is None else roll
+            if roll is None:
+                roll = 0.0 * u.deg
             roll = float(to_array(roll, u.deg, "roll", ndim=0, finite=True)) % 360 * u.deg
         elif roll is not None:
             raise argument_error("pointing", "given where 'roll' is", "None")
@@ -179,7 +185,8 @@ class Exposure(Interactive):
             f"{self.exposure_time.value:.1f} s, {self.subarray}"
         )
         if self.pointing is not None:
-            ra, dec = self.pointing.ra.deg, self.pointing.dec.deg
+            ra = self.pointing.ra.deg
+            dec = self.pointing.dec.deg
             text += f" at {ra:.8g} {dec:+.8g}, roll {self.roll.value:g} deg"
         return f"{text}>"
 
@@ -289,7 +296,8 @@ class Exposure(Interactive):
         from miricigale.plotting.axes import plain_text
         from miricigale.plotting.images import plot_footprint
 
-        corners, label = self.footprint, f"{plain_text(self.filter)}, dither {self.dither}"
+        corners = self.footprint
+        label = f"{plain_text(self.filter)}, dither {self.dither}"
         options = {"label": label} | kwargs
         return plot_footprint(corners.ra.deg, corners.dec.deg, ax=ax, **options)
 
@@ -336,7 +344,8 @@ class Exposure(Interactive):
         """
         self.check_sky()
         part = self.aperture
-        ra, dec = self.pointing.ra.deg, self.pointing.dec.deg
+        ra = self.pointing.ra.deg
+        dec = self.pointing.dec.deg
         v2, v3 = (float(v) for v in pixel_to_v2v3(*part.reference, subarray=self.subarray))
         matrix = attitude_matrix(ra, dec, self.roll.value, v2=v2, v3=v3)
         ra_v1, dec_v1 = v2v3_to_sky(0.0, 0.0, matrix)

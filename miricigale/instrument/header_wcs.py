@@ -164,4 +164,6 @@ def _pixels_apart(wcs, other, x, y):
     there = wcs.world_to_pixel(other.pixel_to_world(x, y))
     distance = np.hypot(there[0] - x, there[1] - y)
     finite = np.isfinite(distance)
-    return float(distance[finite].max()) if finite.any() else 0.0
+    if finite.any():
+        return float(distance[finite].max())
+    return 0.0

@@ -92,12 +92,16 @@ class ExposureHistory:
         -------
         history : `ExposureHistory`
         """
-        origin = "unrecorded" if header.get("ORIGIN") == ORIGIN else "other"
+        if header.get("ORIGIN") == ORIGIN:
+            origin = "unrecorded"
+        else:
+            origin = "other"
         # the first six letters of the type in CRDS
         words = {name: f"R_{TYPES.get(name, name)[:6].upper()}" for name in REFERENCES}
         known = {name: str(header[word]) for name, word in words.items() if word in header}
         used = {name: text.removeprefix("crds://") for name, text in known.items()}
-        origin = "simulated" if recorded else origin
+        if recorded:
+            origin = "simulated"
         return cls(origin=origin, steps=steps_done(header), references=used, day=_middle_of(header))
 
     @classmethod
@@ -202,4 +206,6 @@ def epoch_of(image):
         if text:
             return Time(text, scale="utc")
     day = _middle_of(header)
-    return None if day is None else Time(day, format="mjd", scale="utc")
+    if day is None:
+        return None
+    return Time(day, format="mjd", scale="utc")

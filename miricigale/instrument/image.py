@@ -63,7 +63,10 @@ class Image(Interactive, CCDData):
 
     def _facts(self):
         ny, nx = self.shape
-        known = {} if self.mask is None else {"masked": f"{100 * np.mean(self.mask):.3g} %"}
+        if self.mask is None:
+            known = {}
+        else:
+            known = {"masked": f"{100 * np.mean(self.mask):.3g} %"}
         if self.wcs is not None and self.wcs.has_celestial:
             known["center"] = self.wcs.pixel_to_world(nx / 2 - 0.5, ny / 2 - 0.5).to_string(
                 "hmsdms"

@@ -89,4 +89,6 @@ class ImageFacts:
     @property
     def band(self):
         """The filter without its instrument, lower case: headers write F770W for miri.f770w."""
-        return None if self.filter is None else self.filter.lower().rpartition(".")[2]
+        if self.filter is None:
+            return None
+        return self.filter.lower().rpartition(".")[2]

@@ -87,7 +87,10 @@ def write_image(image, path, *, planes=None, rounded=False, overwrite=False):
     >>> image = CCDData(np.ones((4, 4)), unit="MJy/sr", uncertainty=error)
     >>> write_image(image, "image.fits", planes={"dq": np.zeros((4, 4), np.int64)})  # doctest: +SKIP
     """
-    header = image.wcs.to_header(relax=True) if image.wcs is not None else fits.Header()
+    if image.wcs is not None:
+        header = image.wcs.to_header(relax=True)
+    else:
+        header = fits.Header()
     header["BUNIT"] = image.unit.to_string("fits")
     header["META"] = json_meta(image.meta)
     data = np.asarray(image.data, np.float32)
@@ -119,7 +122,10 @@ def _unit(header, path):
             return u.Unit(text)
     except ValueError:
         pass
-    got = f"BUNIT = {text!r}" if text else "none"
+    if text:
+        got = f"BUNIT = {text!r}"
+    else:
+        got = "none"
     wanted = "must state the unit of its pixels, such as MJy/sr, in the keyword BUNIT"
     raise data_error(path, f"{wanted}, got {got}")
 
@@ -157,7 +163,10 @@ def read_image(path, *, planes=()):
         check_data("SCI" in hdus, path, f"has no SCI extension, only {[hdu.name for hdu in hdus]}")
         header = hdus["SCI"].header
         wcs = header_wcs(header, where=str(path))
-        error = np.array(hdus["ERR"].data, np.float32) if "ERR" in hdus else None
+        if "ERR" in hdus:
+            error = np.array(hdus["ERR"].data, np.float32)
+        else:
+            error = None
         image = Image(
             np.array(hdus["SCI"].data, np.float32),
             unit=_unit(header, path),
@@ -172,4 +181,6 @@ def read_image(path, *, planes=()):
             else np.array(hdus[name.upper()].data)
             for name in planes
         ]
-    return (image, *extra) if extra else image
+    if extra:
+        return (image, *extra)
+    return image

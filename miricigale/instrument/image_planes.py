@@ -44,7 +44,9 @@ def plane_shape(hdu):
         return int(hdu.header["NPIX2"]), int(hdu.header["NPIX1"])
     while len(shape) > 2 and shape[0] == 1:
         shape = shape[1:]
-    return shape if len(shape) == 2 else None
+    if len(shape) == 2:
+        return shape
+    return None
 
 
 def plane_data(hdu, section=None):
@@ -64,11 +66,15 @@ def plane_data(hdu, section=None):
     """
     if not hdu.shape and _is_constant(hdu):
         data = np.full(plane_shape(hdu), float(hdu.header["PIXVALUE"]), np.float32)
-        return data if section is None else data[section]
+        if section is None:
+            return data
+        return data[section]
     extra = len(hdu.shape) - 2
     if section is None:
         data = hdu.data
-        return data if extra == 0 else data[(0,) * extra]
+        if extra == 0:
+            return data
+        return data[(0,) * extra]
     if extra == 0:
         return hdu.section[section]
     # a slice for each axis: astropy counts dimensions of numbers in another way

@@ -93,7 +93,10 @@ def joined_header(hdus, name="SCI"):
     ('F770W', 'MJy/sr')
     """
     header = hdus[0].header.copy(strip=True)
-    science = hdus[name].header.copy(strip=True) if name in hdus else fits.Header()
+    if name in hdus:
+        science = hdus[name].header.copy(strip=True)
+    else:
+        science = fits.Header()
     for layout in ("BSCALE", "BZERO", "EXTNAME", "EXTVER", "EXTEND", "NEXTEND"):
         header.remove(layout, ignore_missing=True)
         science.remove(layout, ignore_missing=True)
@@ -129,8 +132,10 @@ def check_imager(path, header, *, kinds=None, own=None):
     >>> from miricigale.instrument import check_imager
     >>> check_imager("a_rate.fits", Header({"DETECTOR": "MIRIMAGE"}))
     """
-    kinds = IMAGE_KINDS if kinds is None else kinds
-    kind, detector = str(header.get("EXP_TYPE", "")).strip(), header.get("DETECTOR", "MIRIMAGE")
+    if kinds is None:
+        kinds = IMAGE_KINDS
+    kind = str(header.get("EXP_TYPE", "")).strip()
+    detector = header.get("DETECTOR", "MIRIMAGE")
     instrument = header.get("INSTRUME", "MIRI" if own is not None or "DETECTOR" in header else None)
     if (instrument, detector) != ("MIRI", "MIRIMAGE") or kind not in kinds:
         types = f"EXP_TYPE {' or '.join(kinds[:3])}"
@@ -141,7 +146,8 @@ def check_imager(path, header, *, kinds=None, own=None):
     if str(header.get("FILTER", "")).strip() in _DISPERSERS:
         wanted = "must be an exposure of the MIRI imager through a filter"
         raise data_error(path, f"{wanted}, got the prism {header['FILTER']}")
-    stated, recorded = str(header.get("FILTER", "")).strip(), (own or {}).get("filter")
+    stated = str(header.get("FILTER", "")).strip()
+    recorded = (own or {}).get("filter")
     bands = {name.rpartition(".")[2].upper() for name in (stated, recorded) if name}
     what = f"FILTER is {stated} in the header and {recorded} in the package's record"
     check_data(len(bands) <= 1, path, f"contradicts itself: {what}")

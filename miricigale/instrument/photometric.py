@@ -45,7 +45,10 @@ def photmjsr(filter, *, gain=None):
     >>> round(photmjsr("miri.f770w", gain=3.1), 3)
     0.272
     """
-    gain = miri_detector().gain if gain is None else float(gain)
+    if gain is None:
+        gain = miri_detector().gain
+    else:
+        gain = float(gain)
     check_positive(gain, "gain")
     return filter_row(filter)["photmjsr"] * gain / table()["sensitivity"]["photmjsr_gain"]
 
@@ -186,7 +189,8 @@ def electrons_per_brightness(filter, detector=None, *, subarray="FULL"):
     >>> print(f"{electrons_per_brightness('miri.f770w'):.2f}")
     11.40
     """
-    detector = miri_detector() if detector is None else detector
+    if detector is None:
+        detector = miri_detector()
     response = detector.relative_response(filter, subarray)
     return response * detector.gain / photmjsr(filter, gain=detector.gain)
 
@@ -215,8 +219,12 @@ def electron_rate(filter, background=None, *, detector=None, subarray="FULL"):
     >>> print(f"{electron_rate('miri.f770w'):.1f} electrons per second")
     56.4 electrons per second
     """
-    detector = miri_detector() if detector is None else detector
-    level = background_level(filter) if background is None else background
+    if detector is None:
+        detector = miri_detector()
+    if background is None:
+        level = background_level(filter)
+    else:
+        level = background
     level = to_array(level, SURFACE_BRIGHTNESS, "background")
     electrons = electrons_per_brightness(filter, detector, subarray=subarray)
     return level * electrons + detector.dark_current

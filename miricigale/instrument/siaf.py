@@ -61,7 +61,8 @@ class Aperture:
     @property
     def slices(self):
         """Slices ``[y, x]`` that cut the sub-array out of a full frame."""
-        (x, y), (ny, nx) = self.origin, self.shape
+        x, y = self.origin
+        ny, nx = self.shape
         return slice(y, y + ny), slice(x, x + nx)
 
 
@@ -169,12 +170,14 @@ def pixel_to_v2v3(x, y, *, subarray="FULL"):
     >>> print(f"{v2:.1f}, {v3:.1f} arcsec")
     -453.3, -373.7 arcsec
     """
-    full, part = aperture("FULL"), aperture(subarray)
+    full = aperture("FULL")
+    part = aperture(subarray)
     x = np.asarray(x, dtype=float) + part.origin[0] - full.reference[0]
     y = np.asarray(y, dtype=float) + part.origin[1] - full.reference[1]
     x_ideal, y_ideal = _ideal(x, y)
     angle = np.radians(full.v3_ideal_y_angle)
-    cos, sin = np.cos(angle), np.sin(angle)
+    cos = np.cos(angle)
+    sin = np.sin(angle)
     v2 = full.v2 + full.parity * x_ideal * cos + y_ideal * sin
     v3 = full.v3 - full.parity * x_ideal * sin + y_ideal * cos
     return v2, v3

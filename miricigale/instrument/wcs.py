@@ -68,7 +68,8 @@ def pixel_to_sky(x, y, pointing, roll, *, subarray="FULL"):
 
 def scaled_fit(x, y, values, order):
     """Least-squares polynomial without a constant, as a (order+1)^2 table."""
-    sx, sy = np.abs(x).max(), np.abs(y).max()
+    sx = np.abs(x).max()
+    sy = np.abs(y).max()
     powers = [(i, n - i) for n in range(1, order + 1) for i in range(n, -1, -1)]
     design = np.stack([(x / sx) ** i * (y / sy) ** j for i, j in powers], axis=1)
     solution = np.linalg.lstsq(design, values, rcond=None)[0]
@@ -96,8 +97,10 @@ def _sip(subarray):
     ra, dec = v2v3_to_sky(*pixel_to_v2v3(gx, gy, subarray=subarray), matrix)
     # gnomonic coordinates (deg) about (0, 0)
     vector = unit_vector(np.radians(ra), np.radians(dec))
-    xi, eta = np.degrees(vector[1] / vector[0]), np.degrees(vector[2] / vector[0])
-    dx, dy = (gx - part.reference[0]).ravel(), (gy - part.reference[1]).ravel()
+    xi = np.degrees(vector[1] / vector[0])
+    eta = np.degrees(vector[2] / vector[0])
+    dx = (gx - part.reference[0]).ravel()
+    dy = (gy - part.reference[1]).ravel()
     forward = scaled_fit(dx, dy, np.stack([xi.ravel(), eta.ravel()], axis=1), _SIP_ORDER)
     cd = np.array([[t[1, 0], t[0, 1]] for t in forward])
     forward[:, 1, 0] = forward[:, 0, 1] = 0
@@ -155,7 +158,8 @@ def imager_wcs(pointing, roll, *, subarray="FULL"):
     part = aperture(subarray)
     cd, a, b, ap, bp = _sip(subarray)
     wcs = _gnomonic((ra, dec), [n + 1 for n in part.reference], part.shape, "-SIP")
-    cos, sin = np.cos(np.radians(roll)), np.sin(np.radians(roll))
+    cos = np.cos(np.radians(roll))
+    sin = np.sin(np.radians(roll))
     wcs.wcs.cd = np.array([[cos, sin], [-sin, cos]]) @ cd
     wcs.sip = Sip(a, b, ap, bp, wcs.wcs.crpix)
     wcs.wcs.set()
@@ -168,8 +172,10 @@ def _gnomonic(center, reference, shape, distortion=""):
 
     wcs = WCS(naxis=2)
     wcs.wcs.ctype = [f"RA---TAN{distortion}", f"DEC--TAN{distortion}"]
-    wcs.wcs.cunit, wcs.wcs.radesys = ["deg", "deg"], "ICRS"
-    wcs.wcs.crval, wcs.wcs.crpix = center, reference
+    wcs.wcs.cunit = ["deg", "deg"]
+    wcs.wcs.radesys = "ICRS"
+    wcs.wcs.crval = center
+    wcs.wcs.crpix = reference
     wcs.pixel_shape = shape[::-1]
     return wcs
 
@@ -259,7 +265,8 @@ def pixel_area_map(wcs, shape, out=None):
     along_x = (direction(step, 0) - direction(-step, 0)) / (2 * step)
     along_y = (direction(0, step) - direction(0, -step)) / (2 * step)
     area = np.linalg.norm(np.cross(along_x, along_y, axis=0), axis=0).reshape(x.shape)
-    out = np.empty(shape) if out is None else out
+    if out is None:
+        out = np.empty(shape)
     # bicubic splines as products: values at the nodes to those at all pixels, axis by axis
     down, along = (
         make_interp_spline(one, np.eye(len(one)))(np.arange(n))
@@ -352,19 +359,22 @@ def mosaic_wcs(exposures, pixel_scale):
 
     wcss = [getattr(item, "wcs", item) if not isinstance(item, WCS) else item for item in exposures]
     check_that(wcss, "exposures", "at least one exposure", "none")
-    ra, dec = [], []
+    ra = []
+    dec = []
     for wcs in wcss:
         if wcs.pixel_shape is None:
             raise argument_error("exposures", "WCSs with a pixel_shape", "one without")
         nx, ny = wcs.pixel_shape
         # distorted edges bulge between the corners
-        tx, ty = np.linspace(-0.5, nx - 0.5, 17), np.linspace(-0.5, ny - 0.5, 17)
+        tx = np.linspace(-0.5, nx - 0.5, 17)
+        ty = np.linspace(-0.5, ny - 0.5, 17)
         x = np.concatenate([tx, tx, np.full(17, -0.5), np.full(17, nx - 0.5)])
         y = np.concatenate([np.full(17, -0.5), np.full(17, ny - 0.5), ty, ty])
         edge = pixel_to_radec(wcs, x, y)
         ra.append(edge[0])
         dec.append(edge[1])
-    ra, dec = np.concatenate(ra), np.concatenate(dec)
+    ra = np.concatenate(ra)
+    dec = np.concatenate(dec)
     mean = unit_vector(np.radians(ra), np.radians(dec)).mean(axis=1)
     start = SkyCoord(*vector_angles(mean), unit="rad")
     # twice: the second time about the middle of the box that the first found

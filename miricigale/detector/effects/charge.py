@@ -54,7 +54,9 @@ class Dark(Effect):
         return array + self._rate(block.properties)
 
     def _rate(self, properties):
-        return properties.dark_current if self.current is None else self.current
+        if self.current is None:
+            return properties.dark_current
+        return self.current
 
 
 @dataclasses.dataclass(frozen=True)
@@ -183,7 +185,9 @@ class Persistence(Effect):
 
     def _kept(self, block):
         """Share of its charge that each pixel keeps, in each integration of a block, (n_int, 1, n_row, n_col)."""
-        exposure, number, kept = block.exposure, block.ramp_shape[0], 1.0
+        exposure = block.exposure
+        number = block.ramp_shape[0]
+        kept = 1.0
         each = (exposure.integration_time + exposure.frame_time).to_value(TIME)
         middle = each * exposure.n_integrations * (np.arange(number) + 0.5) / number
         for latent in block.previous:

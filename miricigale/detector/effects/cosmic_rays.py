@@ -110,7 +110,10 @@ class CosmicRays(Effect):
     def _arguments(self, block):
         """Arguments of the kernels."""
         properties = block.properties
-        flux = properties.cosmic_ray_flux if self.flux is None else self.flux
+        if self.flux is None:
+            flux = properties.cosmic_ray_flux
+        else:
+            flux = self.flux
         pitch = properties.pixel_pitch
         hits_per_row = flux * pitch**2 * block.ramp_shape[3] * block.total_time
         track = self.thickness / pitch, self.yield_median * pitch, self.yield_dex * np.log(10.0)

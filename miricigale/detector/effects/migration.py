@@ -55,12 +55,14 @@ class BrighterFatter(Effect):
 
     def apply(self, ramp, block):
         """Move the charge."""
-        most, scale = np.float32(self.strength), np.float32(0.5 / block.properties.full_well)
+        most = np.float32(self.strength)
+        scale = np.float32(0.5 / block.properties.full_well)
         pairs = (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])
         for integration in ramp:
             moved, before = np.zeros((2, *ramp.shape[2:]), np.float32)
             for group in integration:
-                charge, level = group - before, (group + before) * scale
+                charge = group - before
+                level = (group + before) * scale
                 before = group.copy()
                 for one, other in pairs:
                     flow = np.clip(level[one] - level[other], -1, 1) * most

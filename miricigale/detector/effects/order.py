@@ -59,7 +59,9 @@ def effect_from_record(record):
     settings = dict(record)
     name = settings.pop("effect")
     kind = next((kind for kind in ORDER if kind.__name__ == name), None)
-    return OtherEffect(name, tuple(settings.items())) if kind is None else kind(**settings)
+    if kind is None:
+        return OtherEffect(name, tuple(settings.items()))
+    return kind(**settings)
 
 
 def checked_effects(effects):
@@ -95,6 +97,9 @@ def keyed(effects, seed, exposure):
     for effect in effects:
         kind = type(effect).__name__
         seen[kind] = seen.get(kind, 0) + 1
-        name = kind if seen[kind] == 1 else f"{kind} {seen[kind]}"
+        if seen[kind] == 1:
+            name = kind
+        else:
+            name = f"{kind} {seen[kind]}"
         keyed.append((effect, stream_key(seed, exposure, name)))
     return tuple(keyed)

@@ -54,11 +54,15 @@ class Nonlinearity(Effect):
 
     def response(self, dn, properties):
         """Measured DN of linear ones."""
-        return dn if self.linear else properties.delinearize(dn)
+        if self.linear:
+            return dn
+        return properties.delinearize(dn)
 
     def linear_dn(self, dn, properties):
         """Linear DN of measured ones."""
-        return dn if self.linear else properties.linearize(dn)
+        if self.linear:
+            return dn
+        return properties.linearize(dn)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,7 +108,9 @@ class Bias(Effect):
 
     def mean(self, properties):
         """Mean level in DN."""
-        return properties.bias if self.level is None else self.level
+        if self.level is None:
+            return properties.bias
+        return self.level
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,7 +173,9 @@ class ReadNoise(Effect):
 
     def deviation(self, properties):
         """Standard deviation of one read in DN, without the 1/f part."""
-        return properties.read_noise if self.sigma is None else self.sigma
+        if self.sigma is None:
+            return properties.read_noise
+        return self.sigma
 
 
 @dataclasses.dataclass(frozen=True)
