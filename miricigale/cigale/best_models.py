@@ -74,7 +74,8 @@ def best_model_table(
     """
     values = model.values(parameters)
     spectra = model.evaluate(**parameters)
-    chain, mass = model.chain, values["mass"]
+    chain = model.chain
+    mass = values["mass"]
     derived = {name: quantity.value for name, quantity in spectra.derived.items()}
     stars, quantities = _stars(model, values)
     parts = {f"stellar.{age}": stars[age] for age in ("old", "young")}
@@ -82,7 +83,10 @@ def best_model_table(
     escaping = np.where(chain.wave < _LYMAN, values.get("f_esc", 1.0), 1.0)
     for kind in ("absorption", "lines", "continuum") if gas else ():
         for age in ("old", "young"):
-            light = stars[age] * (escaping - 1.0) if kind == "absorption" else stars[kind, age]
+            if kind == "absorption":
+                light = stars[age] * (escaping - 1.0)
+            else:
+                light = stars[kind, age]
             parts[f"nebular.{kind}_{age}"] = light
     young, old, of_gas = chain.factors(chain.key(values, "attenuation"))
     factor = {"young": young, "old": old}
@@ -90,12 +94,16 @@ def best_model_table(
         parts[f"attenuation.stellar.{age}"] = stars[age] * escaping * (factor[age] - 1.0)
     for kind in ("lines", "continuum") if gas else ():
         for age in ("old", "young"):
-            through = factor[age] if of_gas is None else of_gas
+            if of_gas is None:
+                through = factor[age]
+            else:
+                through = of_gas
             parts[f"attenuation.nebular.{kind}_{age}"] = stars[kind, age] * (through - 1.0)
     parts = {name: mass * light for name, light in parts.items()}
     parts["dust"] = derived["dust_luminosity"] * chain.dust(chain.key(values, "dust"))
     if model.has_agn:
-        nucleus, power = chain.agn(values), derived["agn_power"]
+        nucleus = chain.agn(values)
+        power = derived["agn_power"]
         for name, theirs in _AGN_COLUMNS.items():
             light = power * getattr(nucleus, name)
             parts[f"agn.SKIRTOR2016_{theirs}"] = light
@@ -136,7 +144,8 @@ def _xrays(options, derived, values, disk):
     """L_lambda of X-rays in W/um at rest, `_XRAY_WAVE`, of the galaxy and the corona; their quantities."""
     options = dict(options)
     slope = float(options.pop("alpha_ox", np.nan))
-    xrays, energy = XRays(**options), _KEV_UM / _XRAY_WAVE
+    xrays = XRays(**options)
+    energy = _KEV_UM / _XRAY_WAVE
     names = ("sfr_100myr", "stellar_mass", "age_mass")
     sources = xrays.galaxy(*(derived[name] for name in names), values["metallicity"])
     per_um = energy / _XRAY_WAVE  # keV for each um
@@ -155,12 +164,16 @@ def _xrays(options, derived, values, disk):
 
 def _stars(model, values):
     """Light of stars and gas for one solar mass formed, old and young, W/um; quantities of the stars."""
-    chain, mass = model.chain, values["mass"]
-    stellar, nebular = model.component("stellar"), model.component("nebular")
+    chain = model.chain
+    mass = values["mass"]
+    stellar = model.component("stellar")
+    nebular = model.component("nebular")
     history = model.component("sfh").history(values)
     age, spectra, surviving = stellar.table(values["metallicity"])
     rate = stellar.ionizing(values["metallicity"])
-    nodes, out, found = np.asarray(stellar.nodes()), {}, {}
+    nodes = np.asarray(stellar.nodes())
+    out = {}
+    found = {}
     hard = chain.wave < _LYMAN
     for name, weights in zip(("young", "old"), stellar.age_weights(history, values), strict=True):
         light = np.interp(chain.wave, nodes, weights @ spectra, left=0.0, right=0.0)
@@ -185,7 +198,8 @@ def _attenuation(chain, parts, bands):
     def light(*starts):
         return sum(part for name, part in parts.items() if name.startswith(starts))
 
-    before, out = light("stellar.", "nebular."), {}
+    before = light("stellar.", "nebular.")
+    out = {}
     after = before + light("attenuation.")
     for band in filter(filter_of_band, bands):
         weights = Filter.from_name(filter_of_band(band)).weights(chain.wave) * chain.to_lnu
@@ -250,11 +264,15 @@ def write_best_models(results, folder, *, xray=None, overwrite=False):
     for one, path in zip(fitted, paths, strict=True):
         if one.distance is not None:
             known = np.isfinite(one.distance)
-            options["far"] = float(one.distance) * u.Mpc if known else None
+            if known:
+                options["far"] = float(one.distance) * u.Mpc
+            else:
+                options["far"] = None
         if xray:
             options["xray"] = xray | {"alpha_ox": float(one.best.get("alpha_ox", np.nan))}
         table = best_model_table(one.model, best_parameters(one, one.model), **options)
-        meta, table.meta = table.meta | {"best.chi_square": float(one.chi2)}, {}
+        meta = table.meta | {"best.chi_square": float(one.chi2)}
+        table.meta = {}
         hdu = fits.table_to_hdu(table)
         for name, value in meta.items():
             hdu.header[f"HIERARCH {name}"] = value

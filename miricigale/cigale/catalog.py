@@ -91,7 +91,8 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
       a      2.0
     """
     path = Path(path)
-    bands = None if bands is None else list(bands)
+    if bands is not None:
+        bands = list(bands)
     table = read_table(path, wanted="a catalog of CIGALE", cls=Table)
     chosen = _choose(path, table, bands)
     with_error = {error_column(name) for name in chosen}.intersection(bands or table.colnames)
@@ -104,7 +105,10 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
     check_data(filters, path, f"has no band that is known here, of {', '.join(chosen) or 'none'}")
     left_out = [*lost, *(f"{name} (line)" for name in lines)]
     own = {*_OWN, *chosen, *map(error_column, chosen)}
-    other = [] if bands is not None else [name for name in table.colnames if name not in own]
+    if bands is not None:
+        other = []
+    else:
+        other = [name for name in table.colnames if name not in own]
     out = QTable()
     out["id"] = read_ids(table, path.name)
     redshift = _numbers(path, table, "redshift")
@@ -115,9 +119,13 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
         # CIGALE's advice for near galaxies, whose velocities say little of their distances
         near = (redshift < 0) & (redshift > -_NEAR) & (out["distance"] > 0)
         out["redshift"] = np.where(near, 0.0, out["redshift"])
-    no_error, no_limit = [], []
+    no_error = []
+    no_limit = []
     for name, band in filters.items():
-        column = error_column(band) if error_column(band) in with_error else None
+        if error_column(band) in with_error:
+            column = error_column(band)
+        else:
+            column = None
         flux, error = _fluxes(path, table, band, column)
         if column is None:
             no_error.append(band)
@@ -163,7 +171,10 @@ def _is_flux_of_line(column):
 def _fluxes(path, table, band, column):
     """Flux and error of a band in uJy, NaN where they are missing; 10 % of the flux without a column."""
     values = _numbers(path, table, band)
-    errors = None if column is None else _numbers(path, table, column)
+    if column is None:
+        errors = None
+    else:
+        errors = _numbers(path, table, column)
     missing, no_error = without_codes(values, errors)
     flux = np.where(missing | (values < THRESHOLD), np.nan, values)
     flux = _in_unit(path, table, band, flux, u.mJy).to_value(FNU)
@@ -184,7 +195,9 @@ def _add_band(out, name, flux, error, limits):
     if np.any(limit):
         out[f"{name}_limit"] = limit
         out[f"{name}_limit"].info.description = "whether the flux is an upper limit"
-    return np.count_nonzero(nothing) if limits else 0
+    if limits:
+        return np.count_nonzero(nothing)
+    return 0
 
 
 def _numbers(path, table, name):

@@ -62,7 +62,10 @@ def parse_values(value, name):
     expression of numbers, lists and the functions of numpy in `FUNCTIONS`. Nothing is executed: the
     expression is taken apart, and anything else in it, or a value that is there twice, is a ValueError.
     """
-    items = [value] if isinstance(value, str) else value
+    if isinstance(value, str):
+        items = [value]
+    else:
+        items = value
     # an expression without quotes was split at its commas
     text = ", ".join(items)
     try:
@@ -130,10 +133,14 @@ _OPERATORS = {
 def _value(node):
     match node:
         case ast.Constant(value=int() | float() | bool() as value):
-            return value if isinstance(value, bool) else float(value)
+            if isinstance(value, bool):
+                return value
+            return float(value)
         case ast.List() | ast.Tuple():
             items = [_value(x) for x in node.elts]
-            return np.array(items) if all(np.ndim(x) == 0 for x in items) else items
+            if all(np.ndim(x) == 0 for x in items):
+                return np.array(items)
+            return items
         case ast.UnaryOp(op=ast.USub()):
             return -_value(node.operand)
         case ast.UnaryOp(op=ast.UAdd()):

@@ -19,21 +19,32 @@ class Chain:
     """What came of the modules, by the names that it has in a `~miricigale.cigale.CigaleSetup`."""
 
     def __init__(self):
-        self.components, self.parameters, self.modules, self.xray = [], {}, {}, {}
-        self.redshift, self.frac_agn_definition, self.max_dev_alpha_ox = None, "dust", 0.0
-        self.left_out, self.replaced, self.differs = [], [], []
+        self.components = []
+        self.parameters = {}
+        self.modules = {}
+        self.xray = {}
+        self.redshift = None
+        self.frac_agn_definition = "dust"
+        self.max_dev_alpha_ox = 0.0
+        self.left_out = []
+        self.replaced = []
+        self.differs = []
 
 
 class Module:
     """One module: its parameters as text, taken one by one, and the chain it adds to."""
 
     def __init__(self, name, values, chain, *, folder, libraries):
-        self.name, self.chain, self.folder, self.libraries = name, chain, folder, libraries
+        self.name = name
+        self.chain = chain
+        self.folder = folder
+        self.libraries = libraries
         old = DECLARED["old_parameters"].get(name, {})
         old = {key: new for key, new in old.items() if new not in values}
         self._values = {old.get(key, key): value for key, value in values.items()}
         self._taken = set(DECLARED["without_effect"].get(name, ()))
-        self._lacking, self._factors = [], {}
+        self._lacking = []
+        self._factors = {}
 
     def label(self, key):
         """Name of a parameter in messages."""
@@ -48,13 +59,17 @@ class Module:
         self._taken.add(key)
         value = self._values.get(key, "")
         if value in ("", []):
-            return None if default is None else np.atleast_1d(np.asarray(default, dtype=float))
+            if default is None:
+                return None
+            return np.atleast_1d(np.asarray(default, dtype=float))
         return parse_values(value, self.label(key))
 
     def text(self, key, default=""):
         self._taken.add(key)
         value = self._values.get(key, default)
-        return value if isinstance(value, str) else ", ".join(value)
+        if isinstance(value, str):
+            return value
+        return ", ".join(value)
 
     def pair(self, key, default, wanted):
         """Two numbers, of which ``wanted`` says how they are written."""
@@ -139,7 +154,8 @@ class Module:
     def values(self, kind):
         """Values of the parameters of a component, each with its key in the file, for `add`."""
         names = cigale_names({kind.role: self.name})
-        out, declared = {}, kind.declared()
+        out = {}
+        declared = kind.declared()
         # in the order of the names there, which is that of the axes of a grid
         for name in sorted(declared, key=[*names, *declared].index):
             theirs, _, factor = names.get(name, (name, None, 1.0))
@@ -156,7 +172,9 @@ class Module:
         if find_resource(better.resource) is None:
             return plain, f"{better.resource} is not registered"
         why = covers(better())
-        return (plain, why) if why else (better, None)
+        if why:
+            return (plain, why)
+        return (better, None)
 
 
 _IMF = {0: "Salpeter", 1: "Chabrier"}
@@ -206,7 +224,8 @@ def _nebular(m):
         m.chain.differs.append("nebular.emission = False: no gas at all")
         return
     values = m.values(c.Nebular)
-    (_, zgas), stellar = values.pop("metallicity_gas"), _metallicity(m.chain)
+    _, zgas = values.pop("metallicity_gas")
+    stellar = _metallicity(m.chain)
     if m.numbers("ne", 100.0).tolist() != [100.0]:
         m.chain.left_out.append("nebular.ne")
     options = {"line_width": m.one("lines_width", 300.0), "gas": "stellar"}

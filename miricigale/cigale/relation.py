@@ -15,7 +15,8 @@ from miricigale.utils.parallel import chunks
 #: Just et al. 2007, ApJ 665, 1004, equation 3: slope and offset, for erg/s/Hz.
 _JUST = (-0.137, 2.638)
 #: Draws of each object, and objects whose draws are in memory at once.
-N_DRAWS, _OBJECTS = 2000, 64
+N_DRAWS = 2000
+_OBJECTS = 64
 #: Part of the draws below which nothing can be said of those that are left.
 _LEAST = 0.01
 
@@ -51,7 +52,10 @@ def near_relation(fitter, photometry, results, most, *, redshift=None, seed=0):
     """
     new = results._mapped(np.array)
     for rows in chunks(len(results), _OBJECTS):
-        z = None if redshift is None else np.asarray(redshift)[rows]
+        if redshift is None:
+            z = None
+        else:
+            z = np.asarray(redshift)[rows]
         with warnings.catch_warnings():
             # the fit has given this warning
             warnings.simplefilter("ignore", FitWarning)
@@ -59,16 +63,19 @@ def near_relation(fitter, photometry, results, most, *, redshift=None, seed=0):
         kept = _near(samples, most)
         values = {name: samples.values(name).value for name in results.parameters}
         for j in np.flatnonzero(samples.fitted & results.fitted[rows]):
-            i, some = range(len(results))[rows][j], kept[j]
+            i = range(len(results))[rows][j]
+            some = kept[j]
             if np.mean(some) < _LEAST:
                 new["flags"][i] |= int(FitFlags.OFF_RELATION)
                 continue
-            index, scale = samples.index[j][some], samples.scale[j][some]
+            index = samples.index[j][some]
+            scale = samples.scale[j][some]
             mine = {name: array[j][some] for name, array in values.items()}
             _summarize(results, new, i, index, mine)
             new["log_evidence"][i] += np.log(np.mean(some))
             flux = scale[:, None] * fitter.grid.flux(*np.maximum(index, 0).T)
-            new["model_flux"][i], new["model_flux_std"][i] = flux.mean(axis=0), flux.std(axis=0)
+            new["model_flux"][i] = flux.mean(axis=0)
+            new["model_flux_std"][i] = flux.std(axis=0)
             if not _best_is_near(results, i, most):
                 _take_best(results, new, i, index, scale, flux, mine)
     return dataclasses.replace(results, **new)
@@ -89,7 +96,10 @@ def _distance(slope, light):
 
 def _best_is_near(results, i, most):
     best = results.best.get("alpha_ox")
-    slope = results.constants.get("alpha_ox") if best is None else best.value[i]
+    if best is None:
+        slope = results.constants.get("alpha_ox")
+    else:
+        slope = best.value[i]
     return not _distance(slope, results.best["l_2500"][i]) > most
 
 
@@ -107,12 +117,15 @@ def _summarize(results, new, i, index, values):
 
 def _take_best(results, new, i, index, scale, flux, values):
     """The draw of the least chi2 as the best model."""
-    sigma, limit = results.sigma[i], results.limit[i]
+    sigma = results.sigma[i]
+    limit = results.limit[i]
     used = np.isfinite(sigma)
     data = (results.flux[i][used], sigma[used], limit[used])
     chi2 = chi2_at(np.ones(len(flux)), flux[:, used], *data)
     k = int(np.argmin(chi2))
-    new["chi2"][i], new["best_flux"][i] = chi2[k], flux[k]
-    new["best_index"][i], new["best_scale"][i] = index[k], scale[k]
+    new["chi2"][i] = chi2[k]
+    new["best_flux"][i] = flux[k]
+    new["best_index"][i] = index[k]
+    new["best_scale"][i] = scale[k]
     for name in new["best"].keys() & values.keys():
         new["best"][name][i] = values[name][k]

@@ -94,7 +94,10 @@ def write_cigale_results(results, path, *, variables=None, overwrite=False):
         table[f"best.{band}"] = fluxes[f"{name}_best"].to(u.mJy)
     table.meta["comments"] = [*described(note), f"flags: {FitFlags.describe()}"]
     text = Path(path).suffix.lower() == ".txt"
-    form = {"format": "ascii.fixed_width", "delimiter": None} if text else {"format": "fits"}
+    if text:
+        form = {"format": "ascii.fixed_width", "delimiter": None}
+    else:
+        form = {"format": "fits"}
     with replacing(path, overwrite=overwrite) as partial:
         table.write(partial, **form)
 
@@ -113,7 +116,8 @@ def _columns(results, names, variables):
     if gas != ["free"]:
         # the gas has the metallicity of the stars
         constants.pop("metallicity_gas", None)
-    columns, zero = {}, np.where(results.fitted, 0.0, np.nan)
+    columns = {}
+    zero = np.where(results.fitted, 0.0, np.nan)
     for ours, (theirs, unit, factor) in names.items():
         if ours in results.best:
             # a redshift at one node of a grid is yet of each object
@@ -122,11 +126,15 @@ def _columns(results, names, variables):
             best = np.where(results.fitted, constants[ours] * factor, np.nan)
         else:
             continue
-        mean, std = best, zero
+        mean = best
+        std = zero
         if ours in results.parameters:
             mean, std = (x.value * factor for x in (results.mean(ours), results.std(ours)))
         columns[theirs] = (mean, std, best, unit)
-    wanted = columns if variables is None else variables
+    if variables is None:
+        wanted = columns
+    else:
+        wanted = variables
     check_names(wanted, "quantity of the results", columns)
     for name in columns.keys() - set(wanted):
         columns[name] = (None, None, *columns[name][2:])

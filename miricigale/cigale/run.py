@@ -67,7 +67,8 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
     if config["parameters_file"]:
         raise config_error(path, "has lists of models (parameters_file), which are not read")
     try:
-        modules, columns = config["sed_modules_params"], config["bands"]
+        modules = config["sed_modules_params"]
+        columns = config["bands"]
         chain = read_modules(
             config["sed_modules"], modules, folder=path.parent, libraries=libraries
         )
@@ -77,7 +78,10 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
     except (ConfigError, ValueError) as err:
         raise config_error(path, f"cannot be used: {err}") from err
     hard = {x for x in (*bands, *predicted) if xray_energies(x) and x not in names}
-    dark = set() if chain.xray else hard
+    if chain.xray:
+        dark = set()
+    else:
+        dark = hard
     bands, predicted = ({k: v for k, v in x.items() if k not in dark} for x in (bands, predicted))
     if not bands:
         raise config_error(path, f"has no band that is known here, of {', '.join(lost) or 'none'}")
@@ -189,6 +193,9 @@ def fit_cigale(
     if output is not None:
         setup.write_results(results, output, overwrite=overwrite)
     if best_models is not None:
-        xray = setup.xray if setup.xray_bands() else None
+        if setup.xray_bands():
+            xray = setup.xray
+        else:
+            xray = None
         write_best_models(results, best_models, xray=xray, overwrite=overwrite)
     return results

@@ -33,7 +33,8 @@ def with_agn_parts(grid, model):
     """A grid whose AGN have the luminosities of their parts too (`AGN_PARTS`), for each W of AGN power."""
     if not grid.n_agn:
         return grid
-    chain, table = model.chain, grid.agn_properties.copy()
+    chain = model.chain
+    table = grid.agn_properties.copy()
     parts = [chain.agn(row_values(model, grid.agn_parameters, k)) for k in range(grid.n_agn)]
     for name, (ours, theirs) in AGN_PARTS.items():
         light = np.array([chain.weights @ getattr(part, name) for part in parts])
@@ -209,7 +210,8 @@ class CigaleSetup:
         """
         given = {one.name: one for one in self.names.values()}
         given |= {name: xray_filter(name, band) for name, band in self.xray_bands().items()}
-        names = [*self.bands, *self.predicted] if names is None else names
+        if names is None:
+            names = [*self.bands, *self.predicted]
         return FilterSet([given.get(name, name) for name in names])
 
     def xray_bands(self):
@@ -223,14 +225,17 @@ class CigaleSetup:
 
         Its AGN have the luminosities of their parts too if these are among the ``variables``.
         """
-        model, xray = self.model(), self.xray_bands()
+        model = self.model()
+        xray = self.xray_bands()
         bands = self.filters([name for name in names if name not in xray])
         grid = model.grid(self.axes(redshifts), bands)
         parts = {theirs for _, theirs in AGN_PARTS.values()}
         if parts.intersection(self.variables) or not self.variables:
             grid = with_agn_parts(grid, model)
         xray = {name: band for name, band in xray.items() if name in names}
-        return with_xray_bands(grid, model, xray, **self.xray) if xray else grid
+        if xray:
+            return with_xray_bands(grid, model, xray, **self.xray)
+        return grid
 
     def fitter(self, photometry, *, compat="cigale", **options):
         """
@@ -291,17 +296,24 @@ class CigaleSetup:
         fitter = self.fitter(photometry, compat=compat, **options)
         parallel = {"executor": executor, "progress_bar": progress_bar}
         known = _column(photometry, "redshift")
-        known = np.full(len(photometry), np.nan) if known is None else known
+        if known is None:
+            known = np.full(len(photometry), np.nan)
         z = self.rounded(known)
 
         def fit(redshift=None):
             found = fitter.fit(photometry, redshift=redshift, **parallel)
-            most = self.max_dev_alpha_ox if "l_2500" in found.quantities else 0.0
+            if "l_2500" in found.quantities:
+                most = self.max_dev_alpha_ox
+            else:
+                most = 0.0
             if not most:
                 return found
             return near_relation(fitter, photometry, found, most, redshift=redshift, seed=seed)
 
-        results = fit(z) if self.redshift is None else _by_redshift(fit, z, fitter.grid.redshift[0])
+        if self.redshift is None:
+            results = fit(z)
+        else:
+            results = _by_redshift(fit, z, fitter.grid.redshift[0])
         note = {
             "configuration": self.path.name,
             "bands": self.bands | self.predicted,
@@ -352,7 +364,8 @@ class CigaleSetup:
         grid = self.grid(list(every), redshifts)
         shape = grid.redshift.size, grid.n_galaxies, max(grid.n_agn, 1), grid.frac_agn.size
         index = np.indices(shape).reshape(4, -1).T
-        n, mass = len(index), np.where(grid.allowed[index[:, 0], index[:, 1]], 1.0, np.nan)
+        n = len(index)
+        mass = np.where(grid.allowed[index[:, 0], index[:, 1]], 1.0, np.nan)
         # each model as the only draw of an object, in the order of the file's parameters
         models = Samples(grid, np.arange(n), np.zeros(n, int), index[:, None], mass[:, None])
         models = models[np.lexsort([models.values(name)[:, 0].value for name in reversed(axes)])]
@@ -375,7 +388,9 @@ class CigaleSetup:
 
 def _column(table, name):
     """A column of a table; None if it has none of this name."""
-    return table[name] if name in table.colnames else None
+    if name in table.colnames:
+        return table[name]
+    return None
 
 
 def _by_redshift(fit, z, any_redshift):

@@ -44,7 +44,8 @@ def saturation_flux(exposure, *, background=None, psf=None, detector=None):
         detector=detector,
         subarray=exposure.subarray,
     )
-    psf = miri_psf(exposure.filter) if psf is None else psf
+    if psf is None:
+        psf = miri_psf(exposure.filter)
     peak = float(psf_image(psf, pixel_scale=MIRI_PIXEL_SCALE, shape=(3, 3))[1, 1])
     left = noise.detector.full_well / exposure.integration_time.to_value(u.s) - noise.rate
     return max(left, 0.0) / (noise.electrons * peak) * u.uJy

@@ -15,7 +15,8 @@ from miricigale.utils.units import ANGLE, positive, to_array
 EXCESS = {"flight": 1.4, "ideal": 1.0}
 
 #: Samples of a pixel's side, and pixels of the detector on which sources are weighed.
-_SAMPLES, _SIZE = 4, 91
+_SAMPLES = 4
+_SIZE = 91
 
 
 def extraction_map(share, boxes):
@@ -30,7 +31,8 @@ def extraction_map(share, boxes):
     """
     n = share.shape[0]
     period = scipy.fft.next_fast_len(n + 8 * _SAMPLES, True)
-    fy, fx = np.fft.fftfreq(period)[:, None], np.fft.rfftfreq(period)
+    fy = np.fft.fftfreq(period)[:, None]
+    fx = np.fft.rfftfreq(period)
     smear = np.ones(1)
     for box in boxes:
         width = box * _SAMPLES
@@ -133,7 +135,10 @@ def fitted_noise(
     check_that(n_frames >= 2, "time", f"at least two frames of {step} s in each integration", time)
     factor = excess_factor(excess)
     share = _share(filter, psf, size)
-    boxes = () if mosaic is None else (1.0, _pixels(mosaic, "mosaic"))
+    if mosaic is None:
+        boxes = ()
+    else:
+        boxes = (1.0, _pixels(mosaic, "mosaic"))
     weight = extraction_map(share, boxes)
     noise = ExposureNoise(
         filter=filter,
@@ -188,9 +193,14 @@ def _share(filter, psf, size):
     """Light of a source in a pixel, by the place of the pixel's middle."""
     pixel = u.Quantity(MIRI_PIXEL_SCALE, ANGLE) / _SAMPLES
     n = _SIZE * _SAMPLES
-    psf = miri_psf(filter) if psf is None else psf_of(psf, filter, with_pixel=False)
+    if psf is None:
+        psf = miri_psf(filter)
+    else:
+        psf = psf_of(psf, filter, with_pixel=False)
     share = psf_image(psf, pixel_scale=pixel, shape=n + 1 - n % 2) * _SAMPLES**2
     width = float(to_array(size, ANGLE, "size"))
     check_that(width >= 0, "size", "at least 0", size)
     width = width / np.sqrt(8 * np.log(2)) / pixel.value
-    return gaussian_filter(share, width) if width > 0 else share
+    if width > 0:
+        return gaussian_filter(share, width)
+    return share

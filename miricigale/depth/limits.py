@@ -40,7 +40,10 @@ def extraction_weights(radius, annulus=None, *, offset=(0.0, 0.0)):
 
 def _radii(aperture, annulus, setup):
     """Radii in arcsec, checked."""
-    radius = setup.radius if aperture is None else aperture
+    if aperture is None:
+        radius = setup.radius
+    else:
+        radius = aperture
     radius = float(to_array(radius, ANGLE, "aperture", ndim=0, finite=True))
     check_that(0 < radius < 8, "aperture", "between 0 and 8 arcsec", aperture)
     if annulus is None:
@@ -55,12 +58,16 @@ def _extraction(radius, annulus, psf, correlation, filter):
     """Light in the extraction and noise powers, means over positions within the pixel."""
     psf = psf_of(psf, filter)
     scale = MIRI_PIXEL_SCALE.value
-    edges = None if annulus is None else tuple(edge / scale for edge in annulus)
+    if annulus is None:
+        edges = None
+    else:
+        edges = tuple(edge / scale for edge in annulus)
     values = []
     for offset in itertools.product(_PHASES, _PHASES):
         weights = extraction_weights(radius / scale, edges, offset=offset)
         share = psf_image(psf, pixel_scale=MIRI_PIXEL_SCALE, shape=weights.shape, offset=offset)
-        light, shot = np.sum(weights * share), np.sum(weights**2 * share)
+        light = np.sum(weights * share)
+        shot = np.sum(weights**2 * share)
         values.append((light, noise_power(weights), shot, noise_power(weights, correlation)))
     return np.mean(values, axis=0)
 
@@ -162,7 +169,10 @@ def aperture_noise(
     radius, edges = _radii(aperture, annulus, setup)
     amplitude = pattern_amplitude(residual, filter)
     seconds = float(to_array(time, TIME, "time", ndim=0, finite=True))
-    groups = setup.n_groups if n_groups is None else n_groups
+    if n_groups is None:
+        groups = setup.n_groups
+    else:
+        groups = n_groups
     step = frame_time(readout, subarray).to_value(TIME)
     check_positive(n_sigma, "n_sigma")
     check_least(n_dithers, "n_dithers", 1)
@@ -179,9 +189,13 @@ def aperture_noise(
         subarray=subarray,
     )
     _check_well(noise)
-    variance, growth, sky, electrons = noise.variance(), noise.growth, noise.sky, noise.electrons
+    variance = noise.variance()
+    growth = noise.growth
+    sky = noise.sky
+    electrons = noise.electrons
 
-    psf = miri_psf(filter) if psf is None else psf
+    if psf is None:
+        psf = miri_psf(filter)
     light, white, shot, pattern = _extraction(radius, edges, psf, correlation, filter)
     check_that(light > 0, "annulus", "such that light of the source is left", annulus)
     shot_noise = n_sigma**2 * growth * shot / (light**2 * electrons)
@@ -309,7 +323,8 @@ def sensitivity(
         subarray=options["subarray"],
     )
     _check_well(noise)
-    excess = "flight" if excess is None else excess
+    if excess is None:
+        excess = "flight"
     sky, photon = fitted_noise(filter, time, residual=residual, excess=excess, **options)
     # F^2 = n^2 (sky^2 + photon F), solved for F
     linear = n_sigma**2 * photon
@@ -374,7 +389,10 @@ def sensitivity_table(filters=None, time=1e4 * u.s, *, residual="etc", n_sigma=5
     """
     if isinstance(filters, str):
         filters = [filters]
-    names = imager_filters() if filters is None else list(filters)
+    if filters is None:
+        names = imager_filters()
+    else:
+        names = list(filters)
     seconds = float(to_array(time, TIME, "time", ndim=0, finite=True))
     rows = []
     for name in names:

@@ -67,8 +67,14 @@ class ExposureNoise:
 
     def __post_init__(self):
         check_kind(self.detector, "detector", DetectorProperties)
-        detector = miri_detector() if self.detector is None else self.detector
-        level = background_level(self.filter) if self.background is None else self.background
+        if self.detector is None:
+            detector = miri_detector()
+        else:
+            detector = self.detector
+        if self.background is None:
+            level = background_level(self.filter)
+        else:
+            level = self.background
         value = float(to_array(level, SURFACE_BRIGHTNESS, "background", ndim=0, finite=True))
         check_that(value >= 0, "background", "at least 0", self.background)
         self.__dict__.update(detector=detector, background=value * SURFACE_BRIGHTNESS)

@@ -88,7 +88,8 @@ def etc_setup(filter):
     0.42 arcsec, 106 groups, 10001 s
     """
     name = _short(filter)
-    common, own = dict(table("etc")["setup"]), dict(table("etc")["filters"][name])
+    common = dict(table("etc")["setup"])
+    own = dict(table("etc")["filters"][name])
     radius = common.pop("radius_per_um") * own.pop("wavelength") * u.arcsec
     return EtcSetup(f"miri.{name}", radius, radius * common.pop("annulus"), **common, **own)
 

@@ -93,7 +93,10 @@ class SaturationForecast:
         step = exposure.group_time.to_value(u.s)
         group = saturation_group(rate, limit, step)
         good = rate[np.isfinite(rate)]
-        sky = float(np.median(good)) if good.size else np.nan
+        if good.size:
+            sky = float(np.median(good))
+        else:
+            sky = np.nan
         return cls(
             exposure,
             sky * u.electron / u.s,
@@ -122,7 +125,8 @@ class SaturationForecast:
         -------
         text : str
         """
-        e, rows = self.exposure, self.saturated
+        e = self.exposure
+        rows = self.saturated
         text = (
             f"{e.filter} dither {e.dither} ({e.readout} {e.subarray}, {e.n_integrations} x "
             f"{e.n_groups} groups): sky fills {100 * self.sky_fraction:.0f} % of the well; "
@@ -164,11 +168,14 @@ def saturation_forecast(exposure, *, background=None, detector=None):
     F770W 0.04
     F2100W 1.58
     """
-    detector = miri_detector() if detector is None else detector
+    if detector is None:
+        detector = miri_detector()
     part = {"detector": detector, "subarray": exposure.subarray}
     rate = electron_rate(exposure.filter, background, **part)
     fraction = _filled(rate, exposure, detector.full_well)
-    return float(fraction) if np.ndim(fraction) == 0 else fraction
+    if np.ndim(fraction) == 0:
+        return float(fraction)
+    return fraction
 
 
 def saturation_time(filter, *, background=None, detector=None):
@@ -188,7 +195,8 @@ def saturation_time(filter, *, background=None, detector=None):
     >>> print(f"{saturation_time('F770W'):.0f}, {saturation_time('F2550W'):.0f}")
     3722 s, 57 s
     """
-    detector = miri_detector() if detector is None else detector
+    if detector is None:
+        detector = miri_detector()
     return detector.full_well / electron_rate(filter, background, detector=detector) * u.s
 
 

@@ -167,7 +167,8 @@ def sky_quality(galaxies, wanted, selected, weight):
     0.50 0.67
     """
     wanted, selected = one_by_one(bool, wanted=wanted, selected=selected)
-    number, shares = np.unique(galaxies, return_inverse=True)[1], []
+    number = np.unique(galaxies, return_inverse=True)[1]
+    shares = []
     for of in (wanted, selected):
         found, among = (np.bincount(number, weight * one) for one in (wanted & selected, of))
         share = weighted_share(found, among)
@@ -177,7 +178,8 @@ def sky_quality(galaxies, wanted, selected, weight):
 
 def quality_columns(qualities):
     """Columns ``completeness`` and ``purity``, each with ``_low`` and ``_high``, of `SelectionQuality`."""
-    columns, qualities = {}, list(qualities)
+    columns = {}
+    qualities = list(qualities)
     for kind in ("completeness", "purity"):
         shares = [getattr(one, kind) for one in qualities]
         for end, key in (("", "value"), ("_low", "low"), ("_high", "high")):

@@ -138,7 +138,8 @@ def uvj_quiescent(u_v, v_j, redshift):
     >>> uvj_quiescent([1.0, 1.9] * u.mag, [1.0, 1.0] * u.mag, 1.0).tolist()
     [False, True]
     """
-    u_v, v_j = to_array(u_v, u.mag, "u_v"), to_array(v_j, u.mag, "v_j")
+    u_v = to_array(u_v, u.mag, "u_v")
+    v_j = to_array(v_j, u.mag, "v_j")
     z = to_array(redshift, u.dimensionless_unscaled, "redshift")
     red = u_v > np.where(z < 2.0, 1.3, 1.2)
     old = v_j < np.select([z < 1.5, z < 2.0], [1.6, 1.5], 1.4)
@@ -196,7 +197,8 @@ def main_sequence_dust(table, *, seed, scatter=0.2):
     """
     check_that(np.isfinite(scatter) and scatter >= 0, "scatter", "finite and >= 0", scatter)
     ids, z, mass, dust, galaxy, quiescent = _dusty_galaxies(table)
-    seed, rows = check_seed(seed), np.flatnonzero(galaxy & ~quiescent)
+    seed = check_seed(seed)
+    rows = np.flatnonzero(galaxy & ~quiescent)
     hidden = mass[rows] * u.Msun
     sfr = main_sequence_sfr(hidden, COSMOLOGY.age(z[rows])).value * dust_obscured_fraction(hidden)
     offset = [stream(seed, "main sequence", str(ids[row])).normal() for row in rows]
@@ -252,9 +254,13 @@ def ceers_dust(table, component, *, seed):
     ids, _, mass, dust, galaxy, quiescent = _dusty_galaxies(table)
     require_columns(table, ["sfr_100myr"], "table", units={"sfr_100myr": u.Msun / u.yr})
     at, by_mass, by_rate, scatter, low, wide = CEERS_DUST[component][:6]
-    seed, rows, excess = check_seed(seed), np.flatnonzero(galaxy), np.ones(len(ids))
+    seed = check_seed(seed)
+    rows = np.flatnonzero(galaxy)
+    excess = np.ones(len(ids))
     offset = [stream(seed, "dust", str(ids[row])).normal() for row in rows]
-    passive, mass, balance = quiescent[rows], np.log10(mass[rows]), dust[rows] * LUMINOSITY
+    passive = quiescent[rows]
+    mass = np.log10(mass[rows])
+    balance = dust[rows] * LUMINOSITY
     sfr = to_array(table["sfr_100myr"], u.Msun / u.yr, "sfr_100myr")[rows]
     rate = np.clip(np.log10(np.maximum(sfr, 1e-9)) - mass, -12.0, -8.0)
     forming = at + mass + by_mass * (np.clip(mass, 8.5, 10.3) - 10.3) + by_rate * (rate + 9.3)

@@ -64,20 +64,26 @@ def posterior_ranks(true, values, levels, *, seed=None):
     good = np.isfinite(true) & np.isfinite(values).all(axis=1) & np.isfinite(levels).all(axis=1)
     cell = np.clip(np.sum(values <= true[:, None], axis=1) - 1, 0, k - 2)
     rows = np.arange(n)
-    left, right = values[rows, cell], values[rows, cell + 1]
+    left = values[rows, cell]
+    right = values[rows, cell + 1]
     with np.errstate(divide="ignore", invalid="ignore"):
         inside = np.where(right > left, (true - left) / (right - left), 0.5)
     if seed is not None:
         inside = stream(check_seed(seed), "posterior ranks").uniform(size=n)
-    below, above = levels[rows, cell], levels[rows, cell + 1]
+    below = levels[rows, cell]
+    above = levels[rows, cell + 1]
     ranks = below + inside * (above - below)
     ranks = np.where(true < values[:, 0], 0.0, np.where(true > values[:, -1], 1.0, ranks))
     # where the distribution steps
-    first, last = (np.sum(values < true[:, None], axis=1), np.sum(values <= true[:, None], axis=1))
+    first = np.sum(values < true[:, None], axis=1)
+    last = np.sum(values <= true[:, None], axis=1)
     step = last - first > 1
     low = np.where(first > 0, levels[rows, np.minimum(first, k - 1)], 0.0)
     high = np.where(last < k, levels[rows, np.maximum(last - 1, 0)], 1.0)
-    part = inside if seed is not None else 0.5
+    if seed is not None:
+        part = inside
+    else:
+        part = 0.5
     ranks = np.where(step, low + part * (high - low), ranks)
     return np.where(good, ranks, np.nan)
 
@@ -126,8 +132,12 @@ def coverage_table(ranks, *, levels=(0.68, 0.95)):
         values = values[np.isfinite(values)]
         bad = (values < 0) | (values > 1)
         check_that(not np.any(bad), "ranks", "between 0 and 1", values[bad])
-        p_uniform = kstest(values, "uniform").pvalue if values.size else np.nan
-        mean = values.mean() if values.size else np.nan
+        if values.size:
+            p_uniform = kstest(values, "uniform").pvalue
+            mean = values.mean()
+        else:
+            p_uniform = np.nan
+            mean = np.nan
         for level in levels:
             inside = np.count_nonzero(np.abs(values - 0.5) <= 0.5 * level)
             share = fraction_interval(inside, values.size)

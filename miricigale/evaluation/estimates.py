@@ -51,7 +51,9 @@ class Estimate:
     @property
     def completeness(self):
         """Share of all sources that the number is of; NaN where that is unknown."""
-        return self.n / self.n_all if self.n_all else np.nan
+        if self.n_all:
+            return self.n / self.n_all
+        return np.nan
 
     @classmethod
     def of_fraction(cls, success, total, *, n_all=None):
@@ -98,7 +100,10 @@ def weighted_share(found, among):
         return Estimate(np.nan)
     value = np.sum(found) / total
     variance = np.sum((found - value * among) ** 2) / total**2
-    like = value * (1 - value) / variance if variance > 0 else total**2 / np.sum(among**2)
+    if variance > 0:
+        like = value * (1 - value) / variance
+    else:
+        like = total**2 / np.sum(among**2)
     interval = Estimate.of_fraction(round(value * like), max(round(like), 1))
     return Estimate(value, interval.low, interval.high, np.count_nonzero(among))
 

@@ -108,7 +108,8 @@ def feature_residuals(residual, redshift, *, feature, pivot, filter_width, seed)
     >>> inside.value, outside.value
     (-0.2, 0.0)
     """
-    residual, redshift = floats(residual), floats(redshift)
+    residual = floats(residual)
+    redshift = floats(redshift)
     low, high = feature_redshifts(feature, pivot, filter_width)
     rows = (redshift >= low) & (redshift < high)
     return tuple(bootstrap(median, residual[keep], seed=seed) for keep in (rows, ~rows))

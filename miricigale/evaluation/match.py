@@ -105,9 +105,12 @@ def associate(first, second, *, radius):
     alone = np.flatnonzero(near.partner[1] < 0)
     rows = (np.append(np.arange(len(pair)), np.full(len(alone), -1)), np.append(pair, alone))
     reasons = np.zeros(len(rows[0]), int)
-    columns, ids, counts = {}, {}, {}
+    columns = {}
+    ids = {}
+    counts = {}
     for k, (name, other) in enumerate((("first", "second"), ("second", "first"))):
-        catalog, here = (first, second)[k], rows[k] >= 0
+        catalog = (first, second)[k]
+        here = rows[k] >= 0
         columns[name] = (rows[k], f"Row of the {name} catalog, -1 for none")
         if isinstance(catalog, Table) and "id" in catalog.colnames:
             values, missing = ids_and_missing(catalog["id"], name)
@@ -130,7 +133,8 @@ def associate(first, second, *, radius):
     return described_table(columns, {"radius": limit, "counts": counts, "reasons": why})
 
 
-_NONE, _LOST = int(AssociationFlags.NONE_NEAR), int(AssociationFlags.NO_POSITION)
+_NONE = int(AssociationFlags.NONE_NEAR)
+_LOST = int(AssociationFlags.NO_POSITION)
 
 
 class _Candidates:
@@ -140,10 +144,14 @@ class _Candidates:
         self.sky = first, second
         self.finite = [np.isfinite(sky.ra.deg) & np.isfinite(sky.dec.deg) for sky in self.sky]
         rows = [np.flatnonzero(good) for good in self.finite]
-        i, j, distance = np.empty(0, int), np.empty(0, int), np.empty(0)
+        i = np.empty(0, int)
+        j = np.empty(0, int)
+        distance = np.empty(0)
         if len(rows[0]) and len(rows[1]):
             a, b, angle, _ = second[rows[1]].search_around_sky(first[rows[0]], limit * ANGLE)
-            i, j, distance = rows[0][a], rows[1][b], angle.to_value(ANGLE)
+            i = rows[0][a]
+            j = rows[1][b]
+            distance = angle.to_value(ANGLE)
         size = len(first), len(second)
         self.count = [np.bincount(k, minlength=n) for k, n in zip((i, j), size, strict=True)]
         # of equal distances the first row is taken
@@ -162,7 +170,10 @@ class _Candidates:
     def reasons(self, k):
         """`AssociationFlags` of the rows of list ``k``."""
         flags = np.zeros(len(self.sky[k]), int)
-        several = AssociationFlags.SEVERAL_SECOND if k == 0 else AssociationFlags.SEVERAL_FIRST
+        if k == 0:
+            several = AssociationFlags.SEVERAL_SECOND
+        else:
+            several = AssociationFlags.SEVERAL_FIRST
         flags[self.count[k] > 1] |= int(several)
         flags[(self.count[k] > 0) & (self.partner[k] < 0)] |= int(AssociationFlags.NOT_MUTUAL)
         flags[self.count[k] == 0] |= _NONE
@@ -182,7 +193,10 @@ def _positions(catalog, argument):
 
 def _at_one_time(first, second):
     """Two catalogs at the time of the second, if they have proper motions; of the first, if only it has one."""
-    epoch = second.obstime if first.obstime is None or second.obstime is not None else first.obstime
+    if first.obstime is None or second.obstime is not None:
+        epoch = second.obstime
+    else:
+        epoch = first.obstime
     return at_epoch(first, epoch, "first"), at_epoch(second, epoch, "second")
 
 
@@ -244,7 +258,10 @@ def match_truth(truth, measured, bands, *, radius=0.5 * u.arcsec):
     found = index >= 0
     table = QTable({"id": truth["id"], "sky": truth["sky"]})
     ids = read_ids(measured, "measured")
-    table["measured_id"] = np.where(found, ids[index], -1) if len(measured) else -1
+    if len(measured):
+        table["measured_id"] = np.where(found, ids[index], -1)
+    else:
+        table["measured_id"] = -1
     table["separation"] = separation
     table["matched"] = found
     limit = float(to_array(radius, ANGLE, "radius"))

@@ -16,8 +16,10 @@ OUTLIER = 0.15
 def one_by_one(dtype=float, **arrays):
     """Two 1-D arrays of one length, of a type; an error by their names if they are not."""
     (name, first), (other, second) = arrays.items()
-    first, second = _plain(first, name, dtype), _plain(second, other, dtype)
-    good, got = first.shape == second.shape, f"shapes {first.shape} and {second.shape}"
+    first = _plain(first, name, dtype)
+    second = _plain(second, other, dtype)
+    good = first.shape == second.shape
+    got = f"shapes {first.shape} and {second.shape}"
     check_that(good and first.ndim == 1, other, f"a 1-D array as long as '{name}'", got)
     return first, second
 
@@ -27,7 +29,10 @@ def _plain(values, name, dtype):
     if dtype is float:
         return floats(values)
     values, mask = without_mask(values)
-    n_masked = 0 if mask is None else int(np.count_nonzero(mask))
+    if mask is None:
+        n_masked = 0
+    else:
+        n_masked = int(np.count_nonzero(mask))
     check_that(mask is None, name, "without masked values", f"{n_masked} of them")
     return np.asarray(values, dtype)
 
@@ -63,10 +68,15 @@ def sigma_mad(values, *, axis=None, ignore_nan=False):
     values = floats(values)
     if values.size == 0:
         return np.nan
-    median = np.nanmedian if ignore_nan else np.median
+    if ignore_nan:
+        median = np.nanmedian
+    else:
+        median = np.median
     deviation = np.abs(values - median(values, axis=axis, keepdims=True))
     sigma = 1.48 * median(deviation, axis=axis)
-    return float(sigma) if axis is None else sigma
+    if axis is None:
+        return float(sigma)
+    return sigma
 
 
 def fraction_interval(n_success, n_total):
@@ -164,8 +174,12 @@ def photoz_metrics(z_true, z_fit):
     good = np.isfinite(z_true) & np.isfinite(z_fit)
     delta = (z_fit[good] - z_true[good]) / (1 + z_true[good])
     n_out = int(np.count_nonzero(np.abs(delta) > OUTLIER))
-    bias = float(np.median(delta)) if delta.size else np.nan
-    scatter, share = sigma_mad(delta), fraction_interval(n_out, delta.size)
+    if delta.size:
+        bias = float(np.median(delta))
+    else:
+        bias = np.nan
+    scatter = sigma_mad(delta)
+    share = fraction_interval(n_out, delta.size)
     return PhotozMetrics(delta.size, int(np.sum(~good)), bias, scatter, *share, n_out)
 
 
@@ -222,12 +236,18 @@ def recovery_metrics(true, measured, *, relative=False):
     """
     true, measured = one_by_one(true=true, measured=measured)
     with np.errstate(divide="ignore", invalid="ignore"):
-        delta = (measured - true) / true if relative else measured - true
+        if relative:
+            delta = (measured - true) / true
+        else:
+            delta = measured - true
     good = np.isfinite(delta)
     delta = delta[good]
-    sigma, median, error = sigma_mad(delta), np.nan, np.nan
+    sigma = sigma_mad(delta)
+    median = np.nan
+    error = np.nan
     if delta.size:
-        median, error = float(np.median(delta)), 1.2533 * sigma / np.sqrt(delta.size)
+        median = float(np.median(delta))
+        error = 1.2533 * sigma / np.sqrt(delta.size)
     return RecoveryMetrics(delta.size, int(np.sum(~good)), median, error, sigma)
 
 
@@ -260,8 +280,12 @@ def running_median(x, y, *, size=20):
     check_that(size >= 1, "size", "at least 1", size)
     good = np.isfinite(x) & np.isfinite(y)
     order = np.argsort(x[good], kind="stable")
-    x, y = x[good][order], y[good][order]
-    n_bins = max(1, x.size // size) if x.size else 0
+    x = x[good][order]
+    y = y[good][order]
+    if x.size:
+        n_bins = max(1, x.size // size)
+    else:
+        n_bins = 0
     edges = [k * size for k in range(n_bins)] + [x.size]
     bins = [slice(a, b) for a, b in itertools.pairwise(edges)]
     return (

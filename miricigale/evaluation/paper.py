@@ -136,7 +136,9 @@ def compare_with_paper(study, *, seed, n_draws=1000, reasons=None, same_exposure
     KeyError
         If ``reasons`` has a key that no published number has.
     """
-    seed, reasons, rows = check_seed(seed), dict(reasons or {}), []
+    seed = check_seed(seed)
+    reasons = dict(reasons or {})
+    rows = []
     check_names(reasons, "published number", [one.key for one in PUBLISHED])
     for one in PUBLISHED:
         if one.quantity == "extra":
@@ -146,9 +148,15 @@ def compare_with_paper(study, *, seed, n_draws=1000, reasons=None, same_exposure
             given["seed"] = stream(seed, "paper", one.key)
             ours = measure(study, one.quantity, **given, n_draws=n_draws)
         judged = same_exposures or one.quantity == "extra"
-        sigma = _difference(one, ours) if judged else np.nan
+        if judged:
+            sigma = _difference(one, ours)
+        else:
+            sigma = np.nan
         why = reasons.get(one.key, one.why)
-        verdict = _verdict(one, ours, sigma, why) if judged else OTHER_EXPOSURES
+        if judged:
+            verdict = _verdict(one, ours, sigma, why)
+        else:
+            verdict = OTHER_EXPOSURES
         text = QUANTITIES.get(one.quantity)
         right = one.quantity == "class_share"
         rows.append(
@@ -173,7 +181,9 @@ def _difference(one, ours):
         # our interval is none for theirs where one of the shares is near 0 or 1
         published = max(published, np.sqrt(one.value * (1 - one.value) / size))
     total = np.hypot(error, published)
-    return float(delta / total) if total > 0 else np.nan
+    if total > 0:
+        return float(delta / total)
+    return np.nan
 
 
 def _excess(one, ours):
@@ -193,7 +203,10 @@ def _verdict(one, ours, sigma, why):
             return f"agrees (to {one.tolerance:g})"
         return f"differs by {delta:+.3g}: {why or 'open'}"
     if abs(sigma) >= _AGREES:
-        size = f"{sigma:+.1f}" if abs(sigma) < _FAR else f"more than {_FAR:g}"
+        if abs(sigma) < _FAR:
+            size = f"{sigma:+.1f}"
+        else:
+            size = f"more than {_FAR:g}"
         return f"differs by {size} sigma: {why or 'open'}"
     if one.relation in "<>":
         delta = _excess(one, ours)

@@ -318,7 +318,8 @@ class AGNPopulation:
         seed = check_seed(seed)
         drawn = [stream(seed, "agn", str(key)).uniform(size=2) for key in ids]
         drawn = np.reshape(drawn, (len(ids), 2))
-        probability, log_l = np.zeros(len(ids)), np.full(len(ids), np.nan)
+        probability = np.zeros(len(ids))
+        log_l = np.full(len(ids), np.nan)
         grid = self._log_l
         for first in range(0, len(ids), _ROWS):
             part = slice(first, first + _ROWS)

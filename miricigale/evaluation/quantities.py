@@ -22,12 +22,14 @@ from miricigale.utils.units import ab_magnitude
 #: Bins of redshift.
 REDSHIFT_BINS = ((0.0, 0.2), (0.2, 1.0), (1.0, 2.0), (2.0, 3.0), (3.0, np.inf))
 #: Fewest draws of statistics that are fits themselves, and sources of a bin of the paper's error function.
-_FEW_DRAWS, _FEW = 100, 30
+_FEW_DRAWS = 100
+_FEW = 30
 
 
 def _share(found, n_all=None):
     """Share of sources that were found, of an array of bool; ``n_all`` is their number by default."""
-    n_all = found.size if n_all is None else n_all
+    if n_all is None:
+        n_all = found.size
     return Estimate.of_fraction(np.count_nonzero(found), found.size, n_all=n_all)
 
 
@@ -49,7 +51,8 @@ def _of_sample(values, statistic):
     def measure(_, one, band_set, option, draws):
         rows, n_all = _in_bin(one, option)
         columns = values(one, band_set)
-        columns = columns if isinstance(columns, tuple) else (columns,)
+        if not isinstance(columns, tuple):
+            columns = (columns,)
         return draws(statistic, *(column[rows] for column in columns), n_all=n_all)
 
     return measure
@@ -91,7 +94,8 @@ def _trend(values, statistic):
     return measure
 
 
-_DZ, _DF = TruthResults.redshift_error, TruthResults.fraction_error
+_DZ = TruthResults.redshift_error
+_DF = TruthResults.fraction_error
 
 
 def _detected_share(study, one, _, limit, draws):
@@ -116,8 +120,13 @@ def _etc_limit(study, one, band_set, band, draws):
 
 def _limit_offset(study, one, band_set, option, draws):
     """Limit of the error function minus another or the calculator's: negative where it is shallower."""
-    band, other = option if isinstance(option, tuple) else (option, None)
-    other = study.etc_limits.get(band, np.nan) if other is None else other
+    if isinstance(option, tuple):
+        band, other = option
+    else:
+        band = option
+        other = None
+    if other is None:
+        other = study.etc_limits.get(band, np.nan)
     return Estimate(float(study.limits.get(band, np.nan) - other))
 
 
@@ -130,7 +139,9 @@ def _of_kind(one, band, kind):
     """Sources by shape or with a bright neighbor in a band; with "not " before it the others."""
     if kind.startswith("not "):
         return ~_of_kind(one, band, kind.removeprefix("not "))
-    return one.crowded[band] if kind == "crowded" else one.shapes[kind]
+    if kind == "crowded":
+        return one.crowded[band]
+    return one.shapes[kind]
 
 
 def _kind_share(study, one, _, option, draws):
@@ -187,7 +198,10 @@ def _class_share(study, one, band_set, option, draws):
 
 def _truths(study, one, column):
     """One truth, or all with an AGN if none is given, that have a column."""
-    truths = study.with_agn if one is None else (one,)
+    if one is None:
+        truths = study.with_agn
+    else:
+        truths = (one,)
     return [t for t in truths if column in t.truth.colnames]
 
 
@@ -208,7 +222,8 @@ def _power(statistic):
 
 def xray_fluxes(one):
     """Log of the X-ray flux (erg/s/cm2) of all sources of a truth; NaN without an AGN, and of stars."""
-    redshift, power = floats(one.truth["redshift"]), one.truth["l_6um"]
+    redshift = floats(one.truth["redshift"])
+    power = one.truth["l_6um"]
     flux = np.full(redshift.size, np.nan)
     good = np.isfinite(redshift) & (power > 0)
     flux[good] = yang2021_xray_flux(power[good], redshift[good]).value
@@ -226,7 +241,9 @@ def _xray_half(study, one, band_set, option, draws):
     def statistic(flux, sample):
         rows = zip(np.atleast_2d(flux), np.atleast_2d(sample), strict=True)
         out = np.array([half_complete(x, np.nan_to_num(y) > 0) for x, y in rows])
-        return out[0] if np.ndim(flux) == 1 else out
+        if np.ndim(flux) == 1:
+            return out[0]
+        return out
 
     n_draws = max(_FEW_DRAWS, draws.keywords["n_draws"] // 10)
     return draws(statistic, np.stack(columns, axis=1), np.stack(found, axis=1), n_draws=n_draws)
@@ -348,7 +365,10 @@ def measure(study, quantity, *, truth=0.0, band_set="all", option=None, seed, n_
     0.25
     """
     check_names([quantity], "quantity", _MEASURES)
-    one = study.at(truth) if isinstance(truth, (int, float)) else truth
+    if isinstance(truth, (int, float)):
+        one = study.at(truth)
+    else:
+        one = truth
     if one is None and not (truth is None and quantity in _OF_ALL + _TRENDS):
         return Estimate(np.nan)
     lacks_fit = one is not None and quantity in OF_FITS and band_set not in one.fits

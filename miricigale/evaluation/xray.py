@@ -201,7 +201,8 @@ def half_complete(values, found):
     values, found = one_by_one(values=values, found=found)
     found = found > 0
     good = np.isfinite(values)
-    values, found = values[good], found[good]
+    values = values[good]
+    found = found[good]
     if not found.any() or found.all():
         return np.nan
     scale = max(float(values.std()), 1e-6)
@@ -223,4 +224,6 @@ def half_complete(values, found):
     if top <= 0.5:
         return np.nan
     half = center + width * ndtri(0.5 / top)
-    return float(half) if values.min() <= half <= values.max() else np.nan
+    if values.min() <= half <= values.max():
+        return float(half)
+    return np.nan

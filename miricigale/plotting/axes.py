@@ -5,7 +5,9 @@ import numpy as np
 #: Inches across the figures of a page, which are shown at one width, so that letters have one size.
 WIDTH = 10.5
 #: Colors of truth, of what is measured and of a second measurement.
-TRUE, MEASURED, SECOND = "0.35", "#9a3412", "#1d4ed8"
+TRUE = "0.35"
+MEASURED = "#9a3412"
+SECOND = "#1d4ed8"
 #: Colors and markers of samples drawn over each other, such as those of band sets, in their order.
 STYLES = ((MEASURED, "o"), (SECOND, "s"), ("0.4", "^"), ("#15803d", "D"))
 
@@ -14,7 +16,9 @@ def panel_columns(n):
     """Panels in a row of a figure of ``n``: three, or two or four where that leaves fewer places empty."""
     if n == 4:
         return 2
-    return 4 if n > 4 and -n % 4 < -n % 3 else min(3, max(n, 1))
+    if n > 4 and -n % 4 < -n % 3:
+        return 4
+    return min(3, max(n, 1))
 
 
 def new_figure(n_rows=1, n_columns=1, *, size=(4.2, 3.4), **kwargs):
@@ -141,7 +145,9 @@ def add_borders(ax, labels, x, y, **kwargs):
     """
     from matplotlib.collections import LineCollection
 
-    padded, x, y = np.pad(labels, 1), np.asarray(x), np.asarray(y)
+    padded = np.pad(labels, 1)
+    x = np.asarray(x)
+    y = np.asarray(y)
     j, i = np.nonzero(padded[1:-1, 1:] != padded[1:-1, :-1])
     lines = [np.stack([x[[i, i]], y[[j, j + 1]]], axis=-1)]
     j, i = np.nonzero(padded[1:, 1:-1] != padded[:-1, 1:-1])

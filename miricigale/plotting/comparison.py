@@ -30,7 +30,8 @@ def plot_offsets(true, offset, *, running=None, ax=None, title=None, limit=1.0):
     ax : `~matplotlib.axes.Axes`
     """
     ax = resolve_axes(ax)
-    true, offset = np.asarray(true), np.asarray(offset)
+    true = np.asarray(true)
+    offset = np.asarray(offset)
     ax.axhline(0, color=TRUE, lw=1)
     inside = np.abs(offset) <= limit
     shown = np.where(inside, offset, 0.97 * limit * np.sign(offset))
@@ -40,7 +41,10 @@ def plot_offsets(true, offset, *, running=None, ax=None, title=None, limit=1.0):
         mid, median, sigma = running
         ax.fill_between(mid, median - sigma, median + sigma, color=SECOND, alpha=0.18, lw=0)
         # a single bin makes no line
-        mark = "o" if len(mid) == 1 else None
+        if len(mid) == 1:
+            mark = "o"
+        else:
+            mark = None
         ax.plot(mid, median, color=SECOND, lw=1.8, marker=mark, label="running median, scatter")
         legend(ax, loc="lower left")
     ax.set(ylim=(-limit, limit), title=title)
@@ -100,7 +104,8 @@ def plot_redshifts(z_true, z_fit, *, z_err=None, ax=None, title=None):
     ax : `~matplotlib.axes.Axes`
     """
     ax = resolve_axes(ax)
-    z_true, z_fit = np.asarray(z_true), np.asarray(z_fit)
+    z_true = np.asarray(z_true)
+    z_fit = np.asarray(z_fit)
     top = max(4.0, np.nanmax(z_true, initial=0), np.nanmax(z_fit, initial=0)) + 0.3
     z = np.linspace(0, top, 200)
     ax.plot(z, z, color=TRUE, lw=1)

@@ -33,7 +33,8 @@ def plot_corner(labels, marginals, joints, *, truths=None, figure=None):
         side = 1.2 + 1.9 * n
         figure = plt.figure(figsize=(side, side), layout="constrained")
     axes = figure.subplots(n, n, squeeze=False, sharex="col")
-    truths = [None] * n if truths is None else truths
+    if truths is None:
+        truths = [None] * n
     for row in range(n):
         for column in range(n):
             ax = axes[row, column]

@@ -22,7 +22,8 @@ def plot_filters(curves, ax=None, **kwargs):
     -------
     ax : `~matplotlib.axes.Axes`
     """
-    ax, curves = resolve_axes(ax), list(curves)
+    ax = resolve_axes(ax)
+    curves = list(curves)
     for wave, throughput, name in curves:
         ax.plot(wave, throughput, **{"label": plain_text(name), **kwargs})
     ax.set(xlabel="wavelength (µm)", ylabel="throughput")

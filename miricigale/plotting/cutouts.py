@@ -12,13 +12,17 @@ from miricigale.plotting.images import filled
 from miricigale.utils.parallel import chunks
 
 #: Side of the pictures, and the finest pixels of those of the bands, in arcsec.
-BOX, FINEST = 5.3, 0.1
+BOX = 5.3
+FINEST = 0.1
 #: Pictures that are made at once, to limit memory.
 _AT_ONCE = 1000
 #: Shades of gray, and the color of pixels without data.
-N_GRAY, NO_DATA = 48, (242, 226, 208)
+N_GRAY = 48
+NO_DATA = (242, 226, 208)
 #: Stretch: asinh of the value over twice the noise, from -3 to at least 10 times the noise.
-SOFTENING, LOWEST, HIGHEST = 2.0, -3.0, 10.0
+SOFTENING = 2.0
+LOWEST = -3.0
+HIGHEST = 10.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -61,7 +65,8 @@ class _Panels:
 
     def squares(self, sky):
         """Pictures about positions, north up: array of shape (n_positions, n_planes, n, n)."""
-        half, parts = self.n // 2, []
+        half = self.n // 2
+        parts = []
         for value, size in zip(self.wcs.world_to_pixel(sky), self.shape[::-1], strict=True):
             # positions far off give pictures of the padding alone
             middle = np.clip(np.nan_to_num(value, nan=-np.inf), -half - 1, size + half)
@@ -85,7 +90,8 @@ class _Panels:
         brightest = np.nan_to_num(squares[:, len(self.planes) // 2], nan=-np.inf).max(axis=(1, 2))
         tops = np.maximum(HIGHEST * self.sigma, brightest)
         soft = SOFTENING * self.sigma
-        low, high = np.arcsinh(LOWEST / SOFTENING), np.arcsinh(tops / soft)[:, None, None, None]
+        low = np.arcsinh(LOWEST / SOFTENING)
+        high = np.arcsinh(tops / soft)[:, None, None, None]
         level = (np.arcsinh(squares / soft) - low) / (high - low)
         shades = np.clip(np.nan_to_num(level) * N_GRAY, 0, N_GRAY - 1).astype(np.uint8)
         return np.where(np.isfinite(squares), shades, np.uint8(N_GRAY)), tops
@@ -151,7 +157,8 @@ class Cutouts:
             Values at which the stretches of the prior and of each band end, in the unit of the images.
         """
         layout = self.describe()
-        side, width = layout["side"], self.prior.n + layout["side"] * len(self.bands)
+        side = layout["side"]
+        width = self.prior.n + layout["side"] * len(self.bands)
         strips = np.full((len(sky), layout["height"], width), N_GRAY, np.uint8)
         shades, tops = self.prior.shades(sky)
         strips[:, : self.prior.n, : self.prior.n] = shades[:, 0]

@@ -26,7 +26,10 @@ def _robust(image):
     middle = float(np.median(values))
     # the darker half knows little of sources
     low = values[values <= middle]
-    sigma = 1.4826 * float(np.median(middle - low)) if low.size else 0.0
+    if low.size:
+        sigma = 1.4826 * float(np.median(middle - low))
+    else:
+        sigma = 0.0
     return middle, sigma if sigma > 0 else float(values.std()) or 1.0
 
 
@@ -34,14 +37,21 @@ def _limits(image):
     """Values of the ends of the colors: from two sigma below the median to what is bright."""
     middle, sigma = _robust(image)
     finite = image[np.isfinite(image)]
-    high = np.percentile(finite, 99.7) if finite.size else 1.0
+    if finite.size:
+        high = np.percentile(finite, 99.7)
+    else:
+        high = 1.0
     return middle - 2 * sigma, max(high, middle + 8 * sigma)
 
 
 def _extent(shape, pixel_scale, center):
     """Edges in arcsec, zero in the middle of the image or at a pixel."""
     ny, nx = shape
-    x, y = ((nx - 1) / 2, (ny - 1) / 2) if center is None else center
+    if center is None:
+        x = (nx - 1) / 2
+        y = (ny - 1) / 2
+    else:
+        x, y = center
     return [edge * pixel_scale for edge in (-0.5 - x, nx - 0.5 - x, -0.5 - y, ny - 0.5 - y)]
 
 
@@ -130,7 +140,10 @@ def plot_image(
     check_choice(stretch, "stretch", ("asinh", "linear"))
     ax = resolve_axes(ax)
     image = np.asarray(image, float)
-    low, high = _limits(image) if limits is None else limits
+    if limits is None:
+        low, high = _limits(image)
+    else:
+        low, high = limits
     if stretch == "asinh":
         norm = AsinhNorm(softening or 2 * _robust(image)[1], vmin=low, vmax=high)
     else:
@@ -180,7 +193,8 @@ def plot_model_residual(
         _, ax = plt.subplots(1, 3, figsize=(12.6, 3.9), layout="constrained")
     ax = np.ravel(np.asarray(ax, dtype=object))
     check_that(len(ax) == 3, "ax", "three axes", len(ax))
-    image, model = np.asarray(image, float), np.asarray(model, float)
+    image = np.asarray(image, float)
+    model = np.asarray(model, float)
     residual = image - model
     noise = _robust(residual)[1]
     # one turnover for both, or a noiseless model would be stretched beyond comparison
@@ -219,8 +233,12 @@ def plot_offsets(xy, offset, field, *, used=None, ax=None, title=None):
     ax : `~matplotlib.axes.Axes`
     """
     ax = resolve_axes(ax)
-    xy, offset = np.asarray(xy, float).reshape(-1, 2), np.asarray(offset, float).reshape(-1, 2)
-    used = np.ones(len(xy), bool) if used is None else np.asarray(used, bool)
+    xy = np.asarray(xy, float).reshape(-1, 2)
+    offset = np.asarray(offset, float).reshape(-1, 2)
+    if used is None:
+        used = np.ones(len(xy), bool)
+    else:
+        used = np.asarray(used, bool)
     ny, nx = field.shape
     step = max(nx, ny) / 12
     x, y = np.meshgrid(np.arange(step / 2, nx, step), np.arange(step / 2, ny, step))
@@ -320,9 +338,12 @@ def mark_sky(ax, length, *, north=(0, 1), east=(-1, 0), color="black"):
     from matplotlib.patheffects import withStroke
 
     edge = [withStroke(linewidth=2.5, foreground="black" if np.mean(to_rgb(color)) > 0.5 else "w")]
-    (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
-    width, height = right - left, top - bottom
-    x, y = left + 0.05 * width, bottom + 0.045 * height
+    left, right = ax.get_xlim()
+    bottom, top = ax.get_ylim()
+    width = right - left
+    height = top - bottom
+    x = left + 0.05 * width
+    y = bottom + 0.045 * height
     style = {"color": color, "path_effects": edge}
     ax.plot([x, x + length], [y, y], lw=2, solid_capstyle="butt", **style)
     text = {"ha": "center", "va": "center", "fontsize": 8, **style}
@@ -386,7 +407,8 @@ def plot_segmentation(image, labels, *, ax=None, pixel_scale=1.0, center=None, *
     -------
     ax : `~matplotlib.axes.Axes`
     """
-    image, labels = np.asarray(image), np.asarray(labels)
+    image = np.asarray(image)
+    labels = np.asarray(labels)
     if image.shape != labels.shape:
         raise argument_error("labels", f"of the image's shape {image.shape}", labels.shape)
     ax = plot_image(image, ax=ax, pixel_scale=pixel_scale, center=center, **kwargs)

@@ -18,7 +18,9 @@ _SPECTRA = (("0.45", "-"), ("#1d4ed8", ":"), ("C1", "--"), ("C2", "-."))
 
 def _value(quantity, unit=None):
     quantity = u.Quantity(quantity)
-    return quantity.value if unit is None else quantity.to_value(unit)
+    if unit is None:
+        return quantity.value
+    return quantity.to_value(unit)
 
 
 def plot_pdf(edges, weights, *, ax=None, label=None, truth=None, log=False, **kwargs):
@@ -48,7 +50,8 @@ def plot_pdf(edges, weights, *, ax=None, label=None, truth=None, log=False, **kw
     """
     ax = resolve_axes(ax)
     unit = getattr(edges, "unit", u.dimensionless_unscaled)
-    edges, weights = np.asarray(_value(edges), dtype=float), np.asarray(weights, dtype=float)
+    edges = np.asarray(_value(edges), dtype=float)
+    weights = np.asarray(weights, dtype=float)
     width = np.diff(np.log10(np.maximum(edges, 1e-300)) if log else edges)
     density = np.divide(weights, width, out=np.zeros(weights.size), where=width > 0)
     ax.stairs(density, edges, **{"fill": True, "alpha": 0.5, **kwargs})
@@ -69,7 +72,10 @@ def plot_pdf(edges, weights, *, ax=None, label=None, truth=None, log=False, **kw
     if truth is not None:
         ax.axvline(truth, color="black", linestyle="--", linewidth=1)
     if label is not None:
-        text = "" if unit == u.dimensionless_unscaled else f" ({unit.to_string()})"
+        if unit == u.dimensionless_unscaled:
+            text = ""
+        else:
+            text = f" ({unit.to_string()})"
         ax.set_xlabel(f"{label}{text}")
     ax.set_ylabel("probability density" + (" per dex" if log else ""))
     ax.set_ylim(0, None, auto=True)
@@ -106,7 +112,8 @@ def plot_pdf_2d(
     ax : `~matplotlib.axes.Axes`
     """
     ax = resolve_axes(ax)
-    x, y = np.asarray(x_edges, dtype=float), np.asarray(y_edges, dtype=float)
+    x = np.asarray(x_edges, dtype=float)
+    y = np.asarray(y_edges, dtype=float)
     weights = np.asarray(weights, dtype=float)
     area = np.diff(x)[:, None] * np.diff(y)
     density = np.divide(weights, area, out=np.zeros(weights.shape), where=area > 0)
@@ -123,7 +130,8 @@ def plot_pdf_2d(
     for edges, sums, limits in ((x, weights.sum(axis=1), "xlim"), (y, weights.sum(axis=0), "ylim")):
         seen = np.flatnonzero(sums > 1e-4 * sums.sum())
         if seen.size:
-            low, high = max(seen[0] - 2, 0), min(seen[-1] + 3, edges.size - 1)
+            low = max(seen[0] - 2, 0)
+            high = min(seen[-1] + 3, edges.size - 1)
             ax.set(**{limits: (edges[low], edges[high])})
     if truth is not None:
         ax.plot(*truth, marker="x", color="tab:red", markersize=9, markeredgewidth=2)
@@ -186,17 +194,31 @@ def plot_sed_fit(
         _, (ax, residual_ax) = plt.subplots(2, 1, figsize=(7, 5), **panels)
     elif isinstance(ax, (tuple, list, np.ndarray)):
         ax, residual_ax = ax
-    wave, flux = _value(wave, u.um), _value(flux, u.uJy)
-    err, model = _value(flux_err, u.uJy), _value(model_flux, u.uJy)
-    used = np.ones(wave.size, bool) if used is None else np.asarray(used, bool)
-    limit = np.zeros(wave.size, bool) if limit is None else np.asarray(limit, bool)
+    wave = _value(wave, u.um)
+    flux = _value(flux, u.uJy)
+    err = _value(flux_err, u.uJy)
+    model = _value(model_flux, u.uJy)
+    if used is None:
+        used = np.ones(wave.size, bool)
+    else:
+        used = np.asarray(used, bool)
+    if limit is None:
+        limit = np.zeros(wave.size, bool)
+    else:
+        limit = np.asarray(limit, bool)
     have = np.isfinite(flux) & np.isfinite(err)
     shown = np.concatenate([flux[have & (flux > 0)], model[np.isfinite(model) & (model > 0)]])
-    low, high = (shown.min() / 4, shown.max() * 4) if shown.size else (0.1, 10.0)
+    if shown.size:
+        low = shown.min() / 4
+        high = shown.max() * 4
+    else:
+        low = 0.1
+        high = 10.0
     if spectrum is not None:
         parts = {"best model": spectrum, **(parts or {})}
     for k, (label, (x, y)) in enumerate((parts or {}).items()):
-        x, y = _value(x, u.um), _value(y, u.uJy)
+        x = _value(x, u.um)
+        y = _value(y, u.uJy)
         near = (x > 0.5 * wave.min()) & (x < 2.0 * wave.max())
         color, line = _SPECTRA[k % len(_SPECTRA)]
         ax.plot(x[near], y[near], color=color, ls=line, lw=1.0, zorder=1, label=label)
@@ -239,12 +261,18 @@ def plot_sed_fit(
 
 def _points(groups, used, limit):
     """Rows, label and style of the measured bands of each group, fitted (full) and not (open)."""
-    names = np.full(used.size, "") if groups is None else np.asarray(groups, str)
+    if groups is None:
+        names = np.full(used.size, "")
+    else:
+        names = np.asarray(groups, str)
     points = []
     for name, (color, marker) in zip(dict.fromkeys(names.tolist()), itertools.cycle(_GROUPS)):
         for rows, fill in ((used, "full"), (~used, "none")):
             style = {"color": color, "marker": marker, "fillstyle": fill, "markersize": 5, "ls": ""}
-            label = name if name and fill == "full" else None
+            if name and fill == "full":
+                label = name
+            else:
+                label = None
             points.append((rows & ~limit & (names == name), label, style))
     return points
 
@@ -284,7 +312,10 @@ def plot_sed_band(wave, bands, *, ax=None, rest=True, color="tab:blue", label=No
     style = {"color": color, "linewidth": 0, "alpha": 0.3, **kwargs}
     n = len(rows)
     for i in range(n // 2):
-        text = label if i == 0 and n % 2 == 0 else None
+        if i == 0 and n % 2 == 0:
+            text = label
+        else:
+            text = None
         ax.fill_between(x, rows[i], rows[n - 1 - i], label=text, **style)
     if n % 2:
         ax.plot(x, rows[n // 2], color=color, linewidth=1, label=label)

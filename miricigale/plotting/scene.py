@@ -37,8 +37,10 @@ def plot_scene(image, *, ax=None, marks=None, label="", **kwargs):
         # about the median: a bright background does not hide the sources
         if abs(middle) > width:
             image = image - middle
-            low, high = low - middle, high - middle
-            label = f"{label}, minus {middle:.3g}" if label else label
+            low = low - middle
+            high = high - middle
+            if label:
+                label = f"{label}, minus {middle:.3g}"
         options["norm"] = AsinhNorm(width, vmin=low, vmax=max(high, width))
     drawn = ax.imshow(image, **{**options, **kwargs})
     ax.set(xlabel="x (pixel)", ylabel="y (pixel)")

@@ -37,12 +37,15 @@ def ellipse_to_pixels(jacobian, *, radius, axis_ratio, position_angle):
     direction = np.pi / 2 - np.asarray(position_angle, dtype=float)
     jacobian = np.asarray(jacobian, dtype=float)
     radius, axis_ratio, direction = np.broadcast_arrays(radius, axis_ratio, direction)
-    cos, sin = np.cos(direction), np.sin(direction)
+    cos = np.cos(direction)
+    sin = np.sin(direction)
     # columns: the images of the two semi-axes; their outer products add up to the shape matrix
     axes = np.stack([cos, -axis_ratio * sin, sin, axis_ratio * cos], -1).reshape(*cos.shape, 2, 2)
     axes = jacobian @ (axes * radius[..., None, None])
     shape = axes @ np.swapaxes(axes, -1, -2)
-    a, b, c = shape[..., 0, 0], shape[..., 0, 1], shape[..., 1, 1]
+    a = shape[..., 0, 0]
+    b = shape[..., 0, 1]
+    c = shape[..., 1, 1]
     root = np.hypot(0.5 * (a - c), b)
     major2 = 0.5 * (a + c) + root
     area = np.abs(np.linalg.det(axes))  # keeps thin ellipses exact: major * minor

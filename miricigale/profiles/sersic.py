@@ -132,9 +132,13 @@ def parameter_rows(*, x, y, total_flux, r_eff, n, axis_ratio, theta):
     minor = axis_ratio * r_eff
     log_norm = 2 * n * np.log(bn) - scipy.special.gammaln(2 * n)
     intensity = total_flux * np.exp(log_norm) / (2 * np.pi * n * r_eff * minor)
-    xx, xy = np.cos(theta) / r_eff, np.sin(theta) / r_eff
-    yx, yy = -np.sin(theta) / minor, np.cos(theta) / minor
-    a, b, c = xx**2 + yx**2, xx * xy + yx * yy, xy**2 + yy**2
+    xx = np.cos(theta) / r_eff
+    xy = np.sin(theta) / r_eff
+    yx = -np.sin(theta) / minor
+    yy = np.cos(theta) / minor
+    a = xx**2 + yx**2
+    b = xx * xy + yx * yy
+    c = xy**2 + yy**2
     return np.stack([x, y, total_flux, intensity, xx, xy, yx, yy, a, b, c, 0.5 / n, bn], axis=-1)
 
 
@@ -235,8 +239,10 @@ def sersic_stamp(*, x, y, total_flux=1.0, r_eff, n, axis_ratio=1.0, theta=0.0, m
     radius = min(r_eff * sersic_radius(_IN_STAMP, n), max_radius)
     half_x = np.hypot(radius * np.cos(theta), radius * axis_ratio * np.sin(theta))
     half_y = np.hypot(radius * np.sin(theta), radius * axis_ratio * np.cos(theta))
-    x0, x1 = int(np.floor(x - half_x + 0.5)), int(np.ceil(x + half_x - 0.5))
-    y0, y1 = int(np.floor(y - half_y + 0.5)), int(np.ceil(y + half_y - 0.5))
+    x0 = int(np.floor(x - half_x + 0.5))
+    x1 = int(np.ceil(x + half_x - 0.5))
+    y0 = int(np.floor(y - half_y + 0.5))
+    y1 = int(np.ceil(y + half_y - 0.5))
     options = {"total_flux": total_flux, "r_eff": r_eff, "n": n, "axis_ratio": axis_ratio}
     stamp = sersic_image((y1 - y0 + 1, x1 - x0 + 1), x=x - x0, y=y - y0, theta=theta, **options)
     return stamp, (y0, x0)
