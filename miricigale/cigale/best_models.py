@@ -118,9 +118,9 @@ def best_model_table(
         wave = np.concatenate([_XRAY_WAVE, wave])
         parts = {name: np.pad(light, (_XRAY_WAVE.size, 0)) for name, light in parts.items()}
         disk = quantities.get("agn.intrin_Lnu_2500A_30deg", np.nan)
-        bright, found = _xrays(xray, derived, values, disk)
+        bright, xray_columns = _xrays(xray, derived, values, disk)
         parts |= {name: np.pad(light, (0, chain.wave.size)) for name, light in bright.items()}
-        quantities |= found
+        quantities |= xray_columns
     z = values["redshift"]
     far = float(distance(z, model.cosmology) if far is None else far.to_value(u.m))
     table = Table()
@@ -149,17 +149,19 @@ def _xrays(options, derived, values, disk):
     names = ("sfr_100myr", "stellar_mass", "age_mass")
     sources = xrays.galaxy(*(derived[name] for name in names), values["metallicity"])
     per_um = energy / _XRAY_WAVE  # keV for each um
-    light = {"xray.galaxy": sum(one.spectrum(energy) for one in sources.values()) * per_um}
-    found = {"xray.gam": xrays.photon_index, "xray.E_cut": xrays.cutoff.to_value(u.keV)}
-    found |= {"xray.det_lmxb": xrays.lmxb, "xray.det_hmxb": xrays.hmxb}
+    light = {
+        "xray.galaxy": sum(component.spectrum(energy) for component in sources.values()) * per_um
+    }
+    columns = {"xray.gam": xrays.photon_index, "xray.E_cut": xrays.cutoff.to_value(u.keV)}
+    columns |= {"xray.det_lmxb": xrays.lmxb, "xray.det_hmxb": xrays.hmxb}
     if np.isfinite(slope * disk):
         sources["agn"] = corona = xrays.corona(disk, slope, values["inclination"])
         light["xray.agn"] = corona.spectrum(energy) * per_um
-        found["xray.alpha_ox"] = slope
-    for name, one in sources.items():
-        low, high = (f"{energy:g}".replace(".", "p") for energy in one.band)
-        found[f"xray.{name}_Lx_{low}to{high}keV"] = one.power
-    return light, found
+        columns["xray.alpha_ox"] = slope
+    for name, component in sources.items():
+        low, high = (f"{energy:g}".replace(".", "p") for energy in component.band)
+        columns[f"xray.{name}_Lx_{low}to{high}keV"] = component.power
+    return light, columns
 
 
 def _stars(model, values):
@@ -173,23 +175,25 @@ def _stars(model, values):
     rate = stellar.ionizing(values["metallicity"])
     nodes = np.asarray(stellar.nodes())
     out = {}
-    found = {}
+    columns = {}
     hard = chain.wave < _LYMAN
     for name, weights in zip(("young", "old"), stellar.age_weights(history, values), strict=True):
         light = np.interp(chain.wave, nodes, weights @ spectra, left=0.0, right=0.0)
         out[name] = light
-        found[f"stellar.m_star_{name}"] = mass * float(weights @ surviving)
-        found[f"stellar.n_ly_{name}"] = mass * float(weights @ rate)
-        found[f"stellar.lum_{name}"] = mass * float(chain.weights @ light)
-        found[f"stellar.lum_ly_{name}"] = mass * float((chain.weights * hard) @ light)
+        columns[f"stellar.m_star_{name}"] = mass * float(weights @ surviving)
+        columns[f"stellar.n_ly_{name}"] = mass * float(weights @ rate)
+        columns[f"stellar.lum_{name}"] = mass * float(chain.weights @ light)
+        columns[f"stellar.lum_ly_{name}"] = mass * float((chain.weights * hard) @ light)
         if nebular is not None:
             pair = nebular.parts(age, weights, rate, values)
             for kind, part in zip(("continuum", "lines"), pair, strict=True):
                 grid = np.asarray(nebular.nodes())
                 out[kind, name] = np.interp(chain.wave, grid, part, left=0.0, right=0.0)
     for name in ("n_ly", "lum", "lum_ly"):
-        found[f"stellar.{name}"] = found[f"stellar.{name}_young"] + found[f"stellar.{name}_old"]
-    return out, found
+        columns[f"stellar.{name}"] = (
+            columns[f"stellar.{name}_young"] + columns[f"stellar.{name}_old"]
+        )
+    return out, columns
 
 
 def _attenuation(chain, parts, bands):
@@ -252,7 +256,7 @@ def write_best_models(results, folder, *, xray=None, overwrite=False):
     """
     folder = Path(folder)
     fitted = results[results.fitted]
-    names = [str(one) for one in np.atleast_1d(fitted.ids)]
+    names = [str(best) for best in np.atleast_1d(fitted.ids)]
     for name in names:
         # an id such as ../a would be a file elsewhere
         check_that(
@@ -261,17 +265,17 @@ def write_best_models(results, folder, *, xray=None, overwrite=False):
     paths = [folder / f"{name}_best_model.fits" for name in names]
     folder.mkdir(parents=True, exist_ok=True)
     options = {"modules": results.meta.get("cigale", {}).get("modules")}
-    for one, path in zip(fitted, paths, strict=True):
-        if one.distance is not None:
-            known = np.isfinite(one.distance)
-            if known:
-                options["far"] = float(one.distance) * u.Mpc
+    for best, path in zip(fitted, paths, strict=True):
+        if best.distance is not None:
+            has_distance = np.isfinite(best.distance)
+            if has_distance:
+                options["far"] = float(best.distance) * u.Mpc
             else:
                 options["far"] = None
         if xray:
-            options["xray"] = xray | {"alpha_ox": float(one.best.get("alpha_ox", np.nan))}
-        table = best_model_table(one.model, best_parameters(one, one.model), **options)
-        meta = table.meta | {"best.chi_square": float(one.chi2)}
+            options["xray"] = xray | {"alpha_ox": float(best.best.get("alpha_ox", np.nan))}
+        table = best_model_table(best.model, best_parameters(best, best.model), **options)
+        meta = table.meta | {"best.chi_square": float(best.chi2)}
         table.meta = {}
         hdu = fits.table_to_hdu(table)
         for name, value in meta.items():

@@ -104,11 +104,11 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
         raise data_error(path, f"cannot be used: {err}") from None
     check_data(filters, path, f"has no band that is known here, of {', '.join(chosen) or 'none'}")
     left_out = [*lost, *(f"{name} (line)" for name in lines)]
-    own = {*_OWN, *chosen, *map(error_column, chosen)}
+    named = {*_OWN, *chosen, *map(error_column, chosen)}
     if bands is not None:
-        other = []
+        unused = []
     else:
-        other = [name for name in table.colnames if name not in own]
+        unused = [name for name in table.colnames if name not in named]
     out = QTable()
     out["id"] = read_ids(table, path.name)
     redshift = _numbers(path, table, "redshift")
@@ -117,8 +117,8 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
         distance = _numbers(path, table, "distance")
         out["distance"] = _in_unit(path, table, "distance", distance, u.Mpc)
         # CIGALE's advice for near galaxies, whose velocities say little of their distances
-        near = (redshift < 0) & (redshift > -_NEAR) & (out["distance"] > 0)
-        out["redshift"] = np.where(near, 0.0, out["redshift"])
+        rounded_redshift = (redshift < 0) & (redshift > -_NEAR) & (out["distance"] > 0)
+        out["redshift"] = np.where(rounded_redshift, 0.0, out["redshift"])
     no_error = []
     no_limit = []
     for name, band in filters.items():
@@ -134,14 +134,15 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
             no_limit.append(f"{band} {n_lost}")
         out[name].info.description = band
     note = {"file": path.name, "bands": filters, "default_error": no_error}
-    out.meta["cigale"] = note | {"left_out": left_out + other}
+    out.meta["cigale"] = note | {"left_out": left_out + unused}
     notes = {
         f"left out, no filter here ({GIVE_FILTER})": left_out,
-        "left out, no bands": other,
+        "left out, no bands": unused,
         "10 % of the flux taken for the error": no_error,
         "taken as missing, upper limits that are not positive": no_limit,
     }
-    text = "; ".join(f"{what}: {', '.join(which)}" for what, which in notes.items() if which)
+    problems = [f"{problem}: {', '.join(names)}" for problem, names in notes.items() if names]
+    text = "; ".join(problems)
     check_data(not (strict and left_out), path, f"cannot be used as a whole: {text}")
     if text:
         warn(f"{path}: {text}", CatalogWarning)
@@ -156,8 +157,10 @@ def _choose(path, table, bands):
     """Bands to read."""
     have = table.colnames
     if bands is None:
-        own = [name for name in have if name not in _OWN]
-        bands = [x for x in own if error_column(x) in have or filter_of_band(x) or is_line(x)]
+        candidates = [name for name in have if name not in _OWN]
+        bands = [
+            x for x in candidates if error_column(x) in have or filter_of_band(x) or is_line(x)
+        ]
     lost = [name for name in ("id", "redshift", *bands) if name not in have]
     check_data(not lost, path, f"has no column {', '.join(lost)}; it has {', '.join(have)}")
     return [name for name in dict.fromkeys(bands) if not name.endswith("_err")]
@@ -214,5 +217,5 @@ def _in_unit(path, table, name, values, default):
     try:
         return (values * u.Unit(unit)).to(default)
     except (u.UnitConversionError, TypeError, ValueError):
-        what = f"cannot be used: column {name!r} must be convertible to {default}, got {unit}"
-        raise data_error(path, what) from None
+        problem = f"cannot be used: column {name!r} must be convertible to {default}, got {unit}"
+        raise data_error(path, problem) from None

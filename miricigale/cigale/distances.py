@@ -36,15 +36,23 @@ def at_their_distances(results, redshift, distances, cosmology):
     node = np.full(len(results), results.constants.get("redshift", np.nan))
     node = np.asarray(results.best.get("redshift", node), dtype=float)
     node = np.where(results.fitted, node, np.nan)
-    known = np.isfinite(redshift) & (redshift > 0) & np.isfinite(node)
-    z = np.where(known, redshift, node)
-    here, there = (distance(np.where(np.isfinite(x), x, 0.0), cosmology) for x in (z, node))
-    given = None
+    has_distance = np.isfinite(redshift) & (redshift > 0) & np.isfinite(node)
+    z = np.where(has_distance, redshift, node)
+    distance_of, distance_of_node = (
+        distance(np.where(np.isfinite(x), x, 0.0), cosmology) for x in (z, node)
+    )
+    stated_distance = None
     if distances is not None:
-        given = to_array(distances, u.Mpc, "distance")
-        given = np.where(np.isfinite(given) & (given > 0), given, np.nan)
-        here = np.where(np.isfinite(given), given * u.Mpc.to(u.m), here)
-    factor = np.where(np.isfinite(node), (here / there) ** 2 * (1.0 + node) / (1.0 + z), 1.0)
+        stated_distance = to_array(distances, u.Mpc, "distance")
+        stated_distance = np.where(
+            np.isfinite(stated_distance) & (stated_distance > 0), stated_distance, np.nan
+        )
+        distance_of = np.where(
+            np.isfinite(stated_distance), stated_distance * u.Mpc.to(u.m), distance_of
+        )
+    factor = np.where(
+        np.isfinite(node), (distance_of / distance_of_node) ** 2 * (1.0 + node) / (1.0 + z), 1.0
+    )
     rows = [results.extensive(name) for name in results.quantities]
     new = results._mapped(np.array)
     new["moments"][:, rows, :2] *= factor[:, None, None]
@@ -54,4 +62,4 @@ def at_their_distances(results, redshift, distances, cosmology):
         new["best"][name] *= factor
     new["best"]["redshift"] = np.where(np.isfinite(node), z, np.nan)
     new["best_scale"] *= factor
-    return dataclasses.replace(results, **new | {"distance": given})
+    return dataclasses.replace(results, **new | {"distance": stated_distance})

@@ -41,14 +41,14 @@ def parse_ini(path):
         raise data_error(path, f"cannot be read as a configuration of CIGALE: {err}") from None
     analysis = config.get("analysis_params", {})
     sections = config.get("sed_modules_params"), analysis
-    if "sed_modules" not in config or not all(isinstance(one, dict) for one in sections):
-        what = "is no configuration of CIGALE: no sed_modules, or no [sed_modules_params]"
-        raise data_error(path, what)
+    if "sed_modules" not in config or not all(isinstance(part, dict) for part in sections):
+        problem = "is no configuration of CIGALE: no sed_modules, or no [sed_modules_params]"
+        raise data_error(path, problem)
     for section in (config, analysis):
         for key in [key for key, value in section.items() if value == ""]:
             del section[key]
-    found = config.validate(validate.Validator(), preserve_errors=True)
-    for sections, key, error in configobj.flatten_errors(config, found):
+    validity = config.validate(validate.Validator(), preserve_errors=True)
+    for sections, key, error in configobj.flatten_errors(config, validity):
         key = ".".join([*sections, str(key)])
         raise config_error(path, f"is wrong at {key}: {error or 'missing'}")
     return config.dict()
@@ -103,12 +103,12 @@ def _count(number):
 
 
 def _spaced(function):
-    def made(start, stop, num=50, **options):
-        known = ["base", "endpoint"]
-        check_that({*options} <= {*known}, "arguments", f"of {known}", sorted(options))
+    def values(start, stop, num=50, **options):
+        names = ["base", "endpoint"]
+        check_that({*options} <= {*names}, "arguments", f"of {names}", sorted(options))
         return function(float(start), float(stop), _count(num), **options)
 
-    return made
+    return values
 
 
 def _round(values, decimals=0):

@@ -50,7 +50,7 @@ class Module:
         """Name of a parameter in messages."""
         return f"{self.name}.{key}"
 
-    def has(self, key):
+    def has_key(self, key):
         """Whether the file has a parameter."""
         return key in self._values
 
@@ -80,17 +80,17 @@ class Module:
             raise config_error(self.label(key), f"must be {wanted}, got {text!r}") from None
         return first, second
 
-    def one(self, key, default):
+    def single(self, key, default):
         """A parameter that can have one value here: the first; others are left out."""
         values = self.numbers(key, default)
         if values.size > 1:
-            others = ", ".join(f"{x:g}" for x in values[1:])
-            self.chain.left_out.append(f"{self.label(key)} = {others} (one value at a time)")
+            left_out = ", ".join(f"{x:g}" for x in values[1:])
+            self.chain.left_out.append(f"{self.label(key)} = {left_out} (one value at a time)")
         return float(values[0])
 
     def option(self, key, default, choices):
         """Take one value, by number, of an option."""
-        number = self.one(key, default)
+        number = self.single(key, default)
         if number not in choices:
             first = next(iter(choices))
             self.chain.replaced.append(f"{self.label(key)} = {number:g} by {first}")
@@ -100,7 +100,7 @@ class Module:
         """Take parameters that change nothing, or that another line of the report names."""
         self._taken.update(keys)
 
-    def rest(self):
+    def report_rest(self):
         """
         Report the parameters of the module that nothing here takes, and the defaults that are taken.
 
@@ -165,15 +165,15 @@ class Module:
             out[name] = (key, None if numbers is None else numbers / factor)
         return out
 
-    def choose(self, better, plain, covers):
+    def choose(self, better, fallback, covers):
         """The registered library if it holds the values, or what stands in for it, and why."""
         if self.libraries == "bundled":
-            return plain, "the bundled tables were asked for"
+            return fallback, "the bundled tables were asked for"
         if find_resource(better.resource) is None:
-            return plain, f"{better.resource} is not registered"
+            return fallback, f"{better.resource} is not registered"
         why = covers(better())
         if why:
-            return (plain, why)
+            return (fallback, why)
         return (better, None)
 
 
@@ -182,7 +182,7 @@ _IMF = {0: "Salpeter", 1: "Chabrier"}
 _KEYS = {"ebv": "E_BVs_young", "ebv_factor": "E_BVs_old_factor", "r_v_gas": "Rv"}
 
 
-def _plain(kind, **options):
+def _reader(kind, **options):
     """Reader of a module without rules of its own."""
     return lambda m: m.add(kind, m.values(kind), **options)
 
@@ -201,11 +201,11 @@ def _sfhfromfile(m):
 
 
 def _bc03(m):
-    imf = _IMF.get(int(m.one("imf", 0)), "another")
+    imf = _IMF.get(int(m.single("imf", 0)), "another")
     metallicity = m.numbers("metallicity", 0.02)
     numbers = {"metallicity": metallicity}
-    numbers["separation_age"] = np.array([m.one("separation_age", 10.0)])
-    values = {name: (name, some) for name, some in numbers.items()}
+    numbers["separation_age"] = np.array([m.single("separation_age", 10.0)])
+    values = {name: (name, array) for name, array in numbers.items()}
 
     def covers(library):
         if imf.lower() not in library.imf.lower():
@@ -228,10 +228,10 @@ def _nebular(m):
     stellar = _metallicity(m.chain)
     if m.numbers("ne", 100.0).tolist() != [100.0]:
         m.chain.left_out.append("nebular.ne")
-    options = {"line_width": m.one("lines_width", 300.0), "gas": "stellar"}
+    options = {"line_width": m.single("lines_width", 300.0), "gas": "stellar"}
     if zgas is not None and not np.array_equal(zgas, stellar):
-        known = np.unique(c.Nebular().table.metallicity)
-        nearest = known[np.argmin(np.abs(np.log(zgas[:, None] / known)), axis=1)]
+        metallicities = np.unique(c.Nebular().table.metallicity)
+        nearest = metallicities[np.argmin(np.abs(np.log(zgas[:, None] / metallicities)), axis=1)]
         for have, got in zip(zgas, nearest, strict=True):
             if abs(got / have - 1.0) > 1e-3:
                 m.chain.replaced.append(f"nebular.zgas = {have:g} by {got:g}")
@@ -269,9 +269,9 @@ def _dl2007(m):
 def _skirtor2016(m):
     values = m.values(c.Skirtor2016)
     # since the version that has a choice of disks, grains take the place of the laws below 0.1 um
-    laws = {0: "smc_wd01" if m.has("disk_type") else "smc", 1: "calzetti", 2: "gaskell"}
+    laws = {0: "smc_wd01" if m.has_key("disk_type") else "smc", 1: "calzetti", 2: "gaskell"}
     law = m.option("law", 0, laws)
-    if m.has("disk_type") and law in ("calzetti", "gaskell"):
+    if m.has_key("disk_type") and law in ("calzetti", "gaskell"):
         text = "continued below 0.1 um, where CIGALE has grains"
         m.chain.differs.append(f"skirtor2016.law {law}: {text}")
     # files of older versions have no choice
@@ -303,18 +303,18 @@ def _xray(m):
     m.chain.modules["xray"] = m.name
     m.chain.xray = {
         "alpha_ox": m.numbers("alpha_ox", ALPHA_OX),
-        "photon_index": m.one("gam", 1.8),
-        "cutoff": m.one("E_cut", 300.0) * u.keV,
+        "photon_index": m.single("gam", 1.8),
+        "cutoff": m.single("E_cut", 300.0) * u.keV,
         "angle_coefficients": m.pair("angle_coef", "0 & 0", "one pair of numbers as 0.5 & 0"),
-        "lmxb": m.one("det_lmxb", 0.0),
-        "hmxb": m.one("det_hmxb", 0.0),
-        "lmxb_index": m.one("gam_lmxb", 1.56),
-        "hmxb_index": m.one("gam_hmxb", 2.0),
+        "lmxb": m.single("det_lmxb", 0.0),
+        "hmxb": m.single("det_hmxb", 0.0),
+        "lmxb_index": m.single("gam_lmxb", 1.56),
+        "hmxb_index": m.single("gam_hmxb", 2.0),
     }
-    if not m.has("alpha_ox"):
+    if not m.has_key("alpha_ox"):
         text = "not in the file, the default here: alpha_ox = -1.9 to -1.1"
         m.chain.differs.append(f"{m.name}: {text}")
-    m.chain.max_dev_alpha_ox = max(m.one("max_dev_alpha_ox", 0.2), 0.0)
+    m.chain.max_dev_alpha_ox = max(m.single("max_dev_alpha_ox", 0.2), 0.0)
     if m.chain.max_dev_alpha_ox:
         text = f"by {N_DRAWS} draws of each posterior"
         m.chain.differs.append(f"{m.label('max_dev_alpha_ox')}: {text}")
@@ -326,16 +326,16 @@ def _redshifting(m):
 
 
 _MODULES = {
-    "sfhdelayed": _plain(c.DelayedSFH),
-    "sfh2exp": _plain(c.DoubleExponentialSFH),
+    "sfhdelayed": _reader(c.DelayedSFH),
+    "sfh2exp": _reader(c.DoubleExponentialSFH),
     "sfhfromfile": _sfhfromfile,
     "bc03": _bc03,
     "nebular": _nebular,
-    "dustatt_calzleit": _plain(c.CalzettiLeitherer, ebv_scaling="cigale"),
+    "dustatt_calzleit": _reader(c.CalzettiLeitherer, ebv_scaling="cigale"),
     "dustatt_modified_starburst": _modified_starburst,
-    "dustatt_modified_CF00": _plain(c.CharlotFall),
+    "dustatt_modified_CF00": _reader(c.CharlotFall),
     "dale2014": _dale2014,
-    "casey2012": _plain(c.Casey2012),
+    "casey2012": _reader(c.Casey2012),
     "dl2007": _dl2007,
     "skirtor2016": _skirtor2016,
     "xray": _xray,
@@ -369,7 +369,7 @@ def read_modules(names, parameters, *, folder, libraries):
             _MODULES[name](module)
         except (ValueError, TypeError) as err:
             raise config_error("[sed_modules_params]", f"[[{name}]]: {err}") from err
-        module.rest()
+        module.report_rest()
     have = {component.role for component in chain.components}
     lack = [role for role in ("sfh", "stellar") if role not in have]
     if "dust" in have and "attenuation" not in have:

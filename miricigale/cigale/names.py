@@ -22,8 +22,8 @@ def cigale_names(modules=None):
     """
     names = {}
     for ours, (theirs, unit) in DECLARED["quantities"].items():
-        own = u.Unit(DECLARED["units"].get(ours, unit))
-        names[ours] = (theirs, u.Unit(unit), own.to(unit))
+        our_unit = u.Unit(DECLARED["units"].get(ours, unit))
+        names[ours] = (theirs, u.Unit(unit), our_unit.to(unit))
     for module in (modules or {}).values():
         for ours, theirs in DECLARED["modules"].get(module, {}).items():
             names[ours] = (theirs, *names[ours][1:])
@@ -32,5 +32,5 @@ def cigale_names(modules=None):
 
 def unit_of(name):
     """Unit of a quantity of CIGALE's name; None if it is not known."""
-    every = (cigale_names({"": module}).values() for module in ("", *DECLARED["modules"]))
-    return next((unit for names in every for theirs, unit, _ in names if theirs == name), None)
+    tables = (cigale_names({"": module}).values() for module in ("", *DECLARED["modules"]))
+    return next((unit for names in tables for theirs, unit, _ in names if theirs == name), None)

@@ -21,7 +21,7 @@ _OBJECTS = 64
 _LEAST = 0.01
 
 
-def near_relation(fitter, photometry, results, most, *, redshift=None, seed=0):
+def near_relation(fitter, photometry, results, max_deviation, *, redshift=None, seed=0):
     """
     Leave out models whose corona is too far from what their disk should have, as X-CIGALE does.
 
@@ -36,7 +36,7 @@ def near_relation(fitter, photometry, results, most, *, redshift=None, seed=0):
         What was fitted.
     results : `~miricigale.fitting.FitResults`
         What ``fitter.fit(photometry, redshift=redshift)`` returned.
-    most : float
+    max_deviation : float
         Largest distance of alpha_ox from -0.137 log L_nu(2500 A) + 2.638 (Just et al. 2007).
     redshift : array_like, optional
         Known redshifts.
@@ -60,31 +60,31 @@ def near_relation(fitter, photometry, results, most, *, redshift=None, seed=0):
             # the fit has given this warning
             warnings.simplefilter("ignore", FitWarning)
             samples = fitter.sample(photometry[rows], N_DRAWS, seed=seed, redshift=z)
-        kept = _near(samples, most)
+        is_near = _is_near(samples, max_deviation)
         values = {name: samples.values(name).value for name in results.parameters}
         for j in np.flatnonzero(samples.fitted & results.fitted[rows]):
             i = range(len(results))[rows][j]
-            some = kept[j]
-            if np.mean(some) < _LEAST:
+            draws_near = is_near[j]
+            if np.mean(draws_near) < _LEAST:
                 new["flags"][i] |= int(FitFlags.OFF_RELATION)
                 continue
-            index = samples.index[j][some]
-            scale = samples.scale[j][some]
-            mine = {name: array[j][some] for name, array in values.items()}
+            index = samples.index[j][draws_near]
+            scale = samples.scale[j][draws_near]
+            mine = {name: array[j][draws_near] for name, array in values.items()}
             _summarize(results, new, i, index, mine)
-            new["log_evidence"][i] += np.log(np.mean(some))
+            new["log_evidence"][i] += np.log(np.mean(draws_near))
             flux = scale[:, None] * fitter.grid.flux(*np.maximum(index, 0).T)
             new["model_flux"][i] = flux.mean(axis=0)
             new["model_flux_std"][i] = flux.std(axis=0)
-            if not _best_is_near(results, i, most):
+            if not _best_is_near(results, i, max_deviation):
                 _take_best(results, new, i, index, scale, flux, mine)
     return dataclasses.replace(results, **new)
 
 
-def _near(samples, most):
+def _is_near(samples, max_deviation):
     """Which draws are near the relation, or have no AGN: shape (n, n_draws)."""
     slope = samples.grid.agn_parameters["alpha_ox"].value[np.maximum(samples.index[..., 2], 0)]
-    return ~(_distance(slope, samples.values("l_2500")) > most)
+    return ~(_distance(slope, samples.values("l_2500")) > max_deviation)
 
 
 def _distance(slope, light):
@@ -94,24 +94,24 @@ def _distance(slope, light):
     return np.abs(slope - (_JUST[0] * log_light + _JUST[1]))
 
 
-def _best_is_near(results, i, most):
+def _best_is_near(results, i, max_deviation):
     best = results.best.get("alpha_ox")
     if best is None:
         slope = results.constants.get("alpha_ox")
     else:
         slope = best.value[i]
-    return not _distance(slope, results.best["l_2500"][i]) > most
+    return not _distance(slope, results.best["l_2500"][i]) > max_deviation
 
 
 def _summarize(results, new, i, index, values):
     """Posteriors of parameters, moments and quantiles of derived quantities of one object."""
     new["pdf_2d"][i] = node_shares((index[:, 0], index[:, 3]), new["pdf_2d"].shape[1:])
     for name, axis in results.axes.items():
-        found = values[name][np.isfinite(values[name])]
-        node = np.argmin(np.abs(found[:, None] - axis.values), axis=1)
+        finite = values[name][np.isfinite(values[name])]
+        node = np.argmin(np.abs(finite[:, None] - axis.values), axis=1)
         # of parameters of an AGN that is not there the posterior is the prior
-        rest = (len(index) - found.size) * axis.weights
-        new["pdf"][name][i] = (np.bincount(node, minlength=axis.values.size) + rest) / len(index)
+        n_lost = (len(index) - finite.size) * axis.weights
+        new["pdf"][name][i] = (np.bincount(node, minlength=axis.values.size) + n_lost) / len(index)
     put_draws(results, new, i, values)
 
 
@@ -119,9 +119,9 @@ def _take_best(results, new, i, index, scale, flux, values):
     """The draw of the least chi2 as the best model."""
     sigma = results.sigma[i]
     limit = results.limit[i]
-    used = np.isfinite(sigma)
-    data = (results.flux[i][used], sigma[used], limit[used])
-    chi2 = chi2_at(np.ones(len(flux)), flux[:, used], *data)
+    has_data = np.isfinite(sigma)
+    data = (results.flux[i][has_data], sigma[has_data], limit[has_data])
+    chi2 = chi2_at(np.ones(len(flux)), flux[:, has_data], *data)
     k = int(np.argmin(chi2))
     new["chi2"][i] = chi2[k]
     new["best_flux"][i] = flux[k]

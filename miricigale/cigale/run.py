@@ -74,7 +74,7 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
         )
         bands, lost = band_filters(dict.fromkeys(c.removesuffix("_err") for c in columns), names)
         wanted = [band for band in analysis["bands"] if band not in bands.values()]
-        predicted, more = band_filters(dict.fromkeys(wanted), names)
+        predicted, xray_bands = band_filters(dict.fromkeys(wanted), names)
     except (ConfigError, ValueError) as err:
         raise config_error(path, f"cannot be used: {err}") from err
     hard = {x for x in (*bands, *predicted) if xray_energies(x) and x not in names}
@@ -88,13 +88,13 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
     for band in bands.values():
         if band not in columns:
             raise config_error(path, f"has {error_column(band)} among the bands, and not {band}")
-    known = {theirs for theirs, *_ in cigale_names(chain.modules).values()}
+    computed = {theirs for theirs, *_ in cigale_names(chain.modules).values()}
     if chain.xray and not hard:
         chain.left_out.append(f"{chain.modules['xray']} (no band of it)")
     if dark or not hard:
-        known -= {"xray.alpha_ox", "xray.agn_Lx_2to10keV", "agn.intrin_Lnu_2500A_30deg"}
+        computed -= {"xray.alpha_ox", "xray.agn_Lx_2to10keV", "agn.intrin_Lnu_2500A_30deg"}
     variables = analysis["variables"]
-    unknown = [f"band {name}" for name in dict.fromkeys([*lost, *more])]
+    unknown = [f"band {name}" for name in dict.fromkeys([*lost, *xray_bands])]
     if unknown:
         # the last one says what to do
         unknown[-1] += f" (no filter here: {GIVE_FILTER})"
@@ -102,7 +102,7 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
         *(f"module {x}" if "." not in x and " " not in x else x for x in chain.left_out),
         *(f"band {name} (no module xray)" for name in sorted(dark)),
         *unknown,
-        *(f"variable {x}" for x in variables if x not in known),
+        *(f"variable {x}" for x in variables if x not in computed),
         *(f"property {x}" for x in config["properties"] if not x.endswith("_err")),
     ]
     extended = [x for x in {**bands, **predicted}.values() if x.endswith("_ext") and x not in names]
@@ -117,7 +117,7 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
         bands=bands,
         predicted={name: band for name, band in predicted.items() if name not in bands},
         columns=tuple(c for c in columns if c.removesuffix("_err") in bands.values()),
-        variables=tuple(name for name in variables if name in known),
+        variables=tuple(name for name in variables if name in computed),
         additional_error=config["additionalerror"],
         limits=LIMIT_FLAGS[flag] != "none",
         redshift_decimals=analysis["redshift_decimals"],

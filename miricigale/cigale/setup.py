@@ -174,8 +174,8 @@ class CigaleSetup:
         z = np.where((z >= 0) & np.isfinite(z), z, np.nan)
         if self.redshift_decimals < 0:
             return z
-        near = np.round(z, self.redshift_decimals)
-        return np.where((near == 0) & (z > 0), z, near)
+        rounded = np.round(z, self.redshift_decimals)
+        return np.where((rounded == 0) & (z > 0), z, rounded)
 
     def catalog(self, path=None, *, strict=False):
         """
@@ -208,11 +208,11 @@ class CigaleSetup:
         names : iterable of str, optional
             Our names; those of ``bands`` and ``predicted`` by default.
         """
-        given = {one.name: one for one in self.names.values()}
-        given |= {name: xray_filter(name, band) for name, band in self.xray_bands().items()}
+        by_name = {filter_.name: filter_ for filter_ in self.names.values()}
+        by_name |= {name: xray_filter(name, band) for name, band in self.xray_bands().items()}
         if names is None:
             names = [*self.bands, *self.predicted]
-        return FilterSet([given.get(name, name) for name in names])
+        return FilterSet([by_name.get(name, name) for name in names])
 
     def xray_bands(self):
         """X-ray bands among ``bands`` and ``predicted``: name to lowest and highest energy."""
@@ -295,20 +295,22 @@ class CigaleSetup:
             options |= {"settings": settings}
         fitter = self.fitter(photometry, compat=compat, **options)
         parallel = {"executor": executor, "progress_bar": progress_bar}
-        known = _column(photometry, "redshift")
-        if known is None:
-            known = np.full(len(photometry), np.nan)
-        z = self.rounded(known)
+        distances = _column(photometry, "redshift")
+        if distances is None:
+            distances = np.full(len(photometry), np.nan)
+        z = self.rounded(distances)
 
         def fit(redshift=None):
-            found = fitter.fit(photometry, redshift=redshift, **parallel)
-            if "l_2500" in found.quantities:
-                most = self.max_dev_alpha_ox
+            fits = fitter.fit(photometry, redshift=redshift, **parallel)
+            if "l_2500" in fits.quantities:
+                max_deviation = self.max_dev_alpha_ox
             else:
-                most = 0.0
-            if not most:
-                return found
-            return near_relation(fitter, photometry, found, most, redshift=redshift, seed=seed)
+                max_deviation = 0.0
+            if not max_deviation:
+                return fits
+            return near_relation(
+                fitter, photometry, fits, max_deviation, redshift=redshift, seed=seed
+            )
 
         if self.redshift is None:
             results = fit(z)
@@ -324,10 +326,10 @@ class CigaleSetup:
         model = self.model()
         results = dataclasses.replace(results, meta=meta, model=model)
         # objects over all redshifts of the file are where the model is
-        known = floats(known)
-        known = np.where(np.isfinite(z), known, np.nan)
+        distances = floats(distances)
+        distances = np.where(np.isfinite(z), distances, np.nan)
         far = _column(photometry, "distance")
-        return at_their_distances(results, known, far, model.cosmology)
+        return at_their_distances(results, distances, far, model.cosmology)
 
     def save_models(self, path, redshifts=None, *, overwrite=False):
         """
@@ -360,8 +362,8 @@ class CigaleSetup:
         count = int(np.prod([len(values) for values in axes.values()], dtype=float))
         if count > _MOST:
             raise config_error(self.path, f"has {count:,} models; at most {_MOST:,} are written")
-        every = self.bands | self.predicted
-        grid = self.grid(list(every), redshifts)
+        bands = self.bands | self.predicted
+        grid = self.grid(list(bands), redshifts)
         shape = grid.redshift.size, grid.n_galaxies, max(grid.n_agn, 1), grid.frac_agn.size
         index = np.indices(shape).reshape(4, -1).T
         n = len(index)
@@ -369,9 +371,9 @@ class CigaleSetup:
         # each model as the only draw of an object, in the order of the file's parameters
         models = Samples(grid, np.arange(n), np.zeros(n, int), index[:, None], mass[:, None])
         models = models[np.lexsort([models.values(name)[:, 0].value for name in reversed(axes)])]
-        fluxes = models.fluxes(list(every))[:, 0]
+        fluxes = models.fluxes(list(bands))[:, 0]
         out = QTable({"id": np.arange(n)})
-        for i, band in enumerate(every.values()):
+        for i, band in enumerate(bands.values()):
             out[band] = fluxes[:, i].to(u.mJy)
         for ours, (theirs, unit, factor) in cigale_names(self.modules).items():
             if ours in models.parameters:
@@ -398,10 +400,10 @@ def _by_redshift(fit, z, any_redshift):
     fixed = np.isfinite(z)
     if np.all(fixed):
         return fit(z)
-    free = fit()
+    at_each_node = fit()
     if not np.any(fixed):
-        return free
+        return at_each_node
     # both fits get all objects, so that duplicate ids are flagged
     at = fit(np.where(fixed, z, any_redshift))
     rows = np.concatenate([np.flatnonzero(~fixed), np.flatnonzero(fixed)])
-    return FitResults.concatenate([free[~fixed], at[fixed]])[np.argsort(rows)]
+    return FitResults.concatenate([at_each_node[~fixed], at[fixed]])[np.argsort(rows)]

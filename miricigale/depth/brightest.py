@@ -47,5 +47,5 @@ def saturation_flux(exposure, *, background=None, psf=None, detector=None):
     if psf is None:
         psf = miri_psf(exposure.filter)
     peak = float(psf_image(psf, pixel_scale=MIRI_PIXEL_SCALE, shape=(3, 3))[1, 1])
-    left = noise.detector.full_well / exposure.integration_time.to_value(u.s) - noise.rate
-    return max(left, 0.0) / (noise.electrons * peak) * u.uJy
+    free_rate = noise.detector.full_well / exposure.integration_time.to_value(u.s) - noise.rate
+    return max(free_rate, 0.0) / (noise.electrons * peak) * u.uJy

@@ -202,9 +202,9 @@ def aperture_noise(
     white_noise = n_sigma**2 * variance * white / (light * electrons) ** 2
     residual_noise = (n_sigma * amplitude * sky / (light * electrons)) ** 2 * pattern / n_dithers
 
-    def limit(known):
+    def limit(parameters):
         # F^2 = n^2 (V + growth shot F), solved for F
-        return float((shot_noise + np.sqrt(shot_noise**2 + 4 * known)) / 2)
+        return float((shot_noise + np.sqrt(shot_noise**2 + 4 * parameters)) / 2)
 
     return {
         "flux": limit(white_noise + residual_noise),
@@ -295,14 +295,14 @@ def sensitivity(
     24.91 mag(AB) {'method': 'aperture'}
     """
     check_choice(method, "method", ("fit", "aperture"))
-    others = {"fit": ("aperture", "annulus", "correlation"), "aperture": ("size", "mosaic")}
-    for name in others[method]:
+    unused = {"fit": ("aperture", "annulus", "correlation"), "aperture": ("size", "mosaic")}
+    for name in unused[method]:
         check_that(name not in options, name, f"left out with method={method!r}", options.get(name))
     if method == "aperture":
         check_that(excess is None, "excess", "left out with method='aperture'", excess)
         options |= {"n_sigma": n_sigma, "residual": residual, "n_dithers": n_dithers}
-        found = aperture_noise(filter, time, **options)
-        return found["flux"] * u.uJy
+        aperture = aperture_noise(filter, time, **options)
+        return aperture["flux"] * u.uJy
     check_positive(n_sigma, "n_sigma")
     filter = etc_setup(filter).filter
     check_least(n_dithers, "n_dithers", 1, whole=True)
@@ -396,11 +396,11 @@ def sensitivity_table(filters=None, time=1e4 * u.s, *, residual="etc", n_sigma=5
     seconds = float(to_array(time, TIME, "time", ndim=0, finite=True))
     rows = []
     for name in names:
-        found = aperture_noise(name, time, n_sigma=n_sigma, residual=residual, **options)
-        row = {"filter": etc_setup(name).filter, "radius": found["radius"] * ANGLE}
-        row |= {"light": found["light"], "background": found["background"] * SURFACE_BRIGHTNESS}
+        noise = aperture_noise(name, time, n_sigma=n_sigma, residual=residual, **options)
+        row = {"filter": etc_setup(name).filter, "radius": noise["radius"] * ANGLE}
+        row |= {"light": noise["light"], "background": noise["background"] * SURFACE_BRIGHTNESS}
         for column, key in _COLUMNS.items():
-            row[column] = found[key] * u.uJy
+            row[column] = noise[key] * u.uJy
         for column, version in (("etc_40", "4.0"), ("etc_20", "2.0")):
             row[column] = scaled_limit(name, time, n_sigma=n_sigma, version=version)
         rows.append(row)

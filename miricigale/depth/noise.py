@@ -100,13 +100,13 @@ class ExposureNoise:
         """Electrons per second of 1 MJy/sr."""
         return electrons_per_brightness(self.filter, self.detector, subarray=self.subarray)
 
-    def variance(self, more=0.0):
+    def variance(self, further=0.0):
         """
         Variance of the mean slope.
 
         Parameters
         ----------
-        more : float, optional
+        further : float, optional
             Electrons per second beyond sky and dark current.
 
         Returns
@@ -116,7 +116,7 @@ class ExposureNoise:
         """
         ramp = {"n_groups": self.n_groups, "group_time": self.group_time}
         noise = self.detector.read_noise * self.detector.gain
-        return ramp_variance(self.rate + more, **ramp, read_noise=noise) / self.n_ramps
+        return ramp_variance(self.rate + further, **ramp, read_noise=noise) / self.n_ramps
 
     @property
     def growth(self):

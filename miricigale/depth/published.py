@@ -89,9 +89,9 @@ def etc_setup(filter):
     """
     name = _short(filter)
     common = dict(table("etc")["setup"])
-    own = dict(table("etc")["filters"][name])
-    radius = common.pop("radius_per_um") * own.pop("wavelength") * u.arcsec
-    return EtcSetup(f"miri.{name}", radius, radius * common.pop("annulus"), **common, **own)
+    setup = dict(table("etc")["filters"][name])
+    radius = common.pop("radius_per_um") * setup.pop("wavelength") * u.arcsec
+    return EtcSetup(f"miri.{name}", radius, radius * common.pop("annulus"), **common, **setup)
 
 
 def etc_limit(filter, version="4.0"):
@@ -181,8 +181,8 @@ def proposal_limit(filter):
     """
     row = filter_row(filter)
     if "proposal" not in row:
-        known = [name for name in imager_filters() if "proposal" in filter_row(name)]
-        raise unknown_name("band of the survey", filter, known)
+        filters = [name for name in imager_filters() if "proposal" in filter_row(name)]
+        raise unknown_name("band of the survey", filter, filters)
     return row["proposal"] * u.ABmag
 
 

@@ -284,9 +284,9 @@ def forecast_table(forecasts):
     """
     forecasts = list(forecasts)
     check_that(forecasts, "forecasts", "at least one forecast", "none")
-    for one in forecasts:
-        if not isinstance(one, SaturationForecast):
-            raise argument_error("forecasts", "made of SaturationForecast", repr(one))
+    for forecast in forecasts:
+        if not isinstance(forecast, SaturationForecast):
+            raise argument_error("forecasts", "made of SaturationForecast", repr(forecast))
     columns = {}
     for name in ("filter", "dither", "readout", "subarray", "n_groups", "n_integrations"):
         columns[name] = [getattr(f.exposure, name) for f in forecasts]

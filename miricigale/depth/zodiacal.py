@@ -98,8 +98,8 @@ def zodiacal_factor(filter, level="medium", *, position=None, date=None):
     if position is None:
         return float(rows[name][np.isnan(latitude)][0])
     ecliptic = position.transform_to(BarycentricMeanEcliptic)
-    known = np.isfinite(latitude)
-    return float(np.interp(abs(ecliptic.lat.deg), latitude[known], rows[name][known]))
+    is_known = np.isfinite(latitude)
+    return float(np.interp(abs(ecliptic.lat.deg), latitude[is_known], rows[name][is_known]))
 
 
 def sky_background(filter, level="low", *, position=None, date=None):
@@ -140,8 +140,8 @@ def sky_background(filter, level="low", *, position=None, date=None):
         filter_row(filter)
         value = float(to_array(level, SURFACE_BRIGHTNESS, "level", ndim=0, finite=True))
         check_that(value >= 0, "level", "at least 0", level)
-        for name, given in (("position", position), ("date", date)):
-            check_that(given is None, name, "left out with a surface brightness", given)
+        for name, argument in (("position", position), ("date", date)):
+            check_that(argument is None, name, "left out with a surface brightness", argument)
         return value * SURFACE_BRIGHTNESS
     if level == "low" and position is None and date is None:
         return background_level(filter)
@@ -153,9 +153,9 @@ def _factor_on(name, position, date):
     """Light of the model of Kelsall et al. 1998 on a day, over the low one."""
     sun = get_sun(date)
     angle = position.separation(SkyCoord(sun.ra, sun.dec)).deg
-    near, far = _FIELD_OF_REGARD
-    wanted = f"a day on which the position is {near:g} to {far:g} deg from the Sun"
-    check_that(near <= angle <= far, "date", wanted, f"{date.isot[:10]} ({angle:.0f} deg)")
+    nearest, farthest = _FIELD_OF_REGARD
+    wanted = f"a day on which the position is {nearest:g} to {farthest:g} deg from the Sun"
+    check_that(nearest <= angle <= farthest, "date", wanted, f"{date.isot[:10]} ({angle:.0f} deg)")
     zodipy = require("zodipy", extra="background")
     place = SkyCoord(position.ra, position.dec, obstime=date)
     light = zodipy.Model(Filter.from_name(name).pivot).evaluate(place, obspos="semb-l2")

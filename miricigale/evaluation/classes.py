@@ -80,10 +80,10 @@ def confusion(true, found):
           agn   2      0   1       1          0.5
     """
     true, found = one_by_one(str, true=true, found=found)
-    own = np.array(CLASS_NAMES)[:, None] == true
-    as_named = (np.sum(own & (found == name), axis=1) for name in (*CLASS_NAMES, "unknown"))
+    is_class = np.array(CLASS_NAMES)[:, None] == true
+    as_named = (np.sum(is_class & (found == name), axis=1) for name in (*CLASS_NAMES, "unknown"))
     shares = quality_columns(selection_quality(true == n, found == n) for n in CLASS_NAMES)
-    columns = CLASS_NAMES, own.sum(axis=1), *as_named, *shares.values()
+    columns = CLASS_NAMES, is_class.sum(axis=1), *as_named, *shares.values()
     texts = declared("miricigale.evaluation", "columns.toml")["confusion"]
     return described_columns(map(np.array, columns), texts)
 
@@ -134,8 +134,8 @@ def selection_quality(wanted, selected):
     (0.5, 1.0)
     """
     wanted, selected = one_by_one(bool, wanted=wanted, selected=selected)
-    both = np.count_nonzero(wanted & selected)
-    shares = (Estimate.of_fraction(both, np.count_nonzero(of)) for of in (wanted, selected))
+    n_right = np.count_nonzero(wanted & selected)
+    shares = (Estimate.of_fraction(n_right, np.count_nonzero(of)) for of in (wanted, selected))
     return SelectionQuality(*shares)
 
 
@@ -170,8 +170,10 @@ def sky_quality(galaxies, wanted, selected, weight):
     number = np.unique(galaxies, return_inverse=True)[1]
     shares = []
     for of in (wanted, selected):
-        found, among = (np.bincount(number, weight * one) for one in (wanted & selected, of))
-        share = weighted_share(found, among)
+        weight_right, weight_all = (
+            np.bincount(number, weight * chosen) for chosen in (wanted & selected, of)
+        )
+        share = weighted_share(weight_right, weight_all)
         shares.append(dataclasses.replace(share, n=np.count_nonzero(of)))
     return SelectionQuality(*shares)
 
@@ -181,7 +183,7 @@ def quality_columns(qualities):
     columns = {}
     qualities = list(qualities)
     for kind in ("completeness", "purity"):
-        shares = [getattr(one, kind) for one in qualities]
+        shares = [getattr(item, kind) for item in qualities]
         for end, key in (("", "value"), ("_low", "low"), ("_high", "high")):
-            columns[kind + end] = np.array([getattr(one, key) for one in shares])
+            columns[kind + end] = np.array([getattr(item, key) for item in shares])
     return columns

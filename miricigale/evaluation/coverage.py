@@ -64,15 +64,17 @@ def posterior_ranks(true, values, levels, *, seed=None):
     good = np.isfinite(true) & np.isfinite(values).all(axis=1) & np.isfinite(levels).all(axis=1)
     cell = np.clip(np.sum(values <= true[:, None], axis=1) - 1, 0, k - 2)
     rows = np.arange(n)
-    left = values[rows, cell]
-    right = values[rows, cell + 1]
+    low_value = values[rows, cell]
+    high_value = values[rows, cell + 1]
     with np.errstate(divide="ignore", invalid="ignore"):
-        inside = np.where(right > left, (true - left) / (right - left), 0.5)
+        inside = np.where(
+            high_value > low_value, (true - low_value) / (high_value - low_value), 0.5
+        )
     if seed is not None:
         inside = stream(check_seed(seed), "posterior ranks").uniform(size=n)
-    below = levels[rows, cell]
-    above = levels[rows, cell + 1]
-    ranks = below + inside * (above - below)
+    low_level = levels[rows, cell]
+    high_level = levels[rows, cell + 1]
+    ranks = low_level + inside * (high_level - low_level)
     ranks = np.where(true < values[:, 0], 0.0, np.where(true > values[:, -1], 1.0, ranks))
     # where the distribution steps
     first = np.sum(values < true[:, None], axis=1)

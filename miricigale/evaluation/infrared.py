@@ -67,10 +67,10 @@ def feature_redshifts(feature, pivot, filter_width):
     >>> print(f"{low:.2f} to {high:.2f}")
     1.19 to 1.66
     """
-    rest = positive(feature, WAVE, "feature")
+    rest_wave = positive(feature, WAVE, "feature")
     middle = positive(pivot, WAVE, "pivot")
     half = 0.5 * positive(filter_width, WAVE, "filter_width")
-    return max((middle - half) / rest - 1.0, 0.0), max((middle + half) / rest - 1.0, 0.0)
+    return max((middle - half) / rest_wave - 1.0, 0.0), max((middle + half) / rest_wave - 1.0, 0.0)
 
 
 def feature_residuals(residual, redshift, *, feature, pivot, filter_width, seed):

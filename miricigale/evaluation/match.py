@@ -100,29 +100,32 @@ def associate(first, second, *, radius):
     """
     limit = positive(radius, ANGLE, "radius")
     sky = _at_one_time(_positions(first, "first"), _positions(second, "second"))
-    near = _Candidates(*sky, limit)
-    pair = near.partner[0]
-    alone = np.flatnonzero(near.partner[1] < 0)
-    rows = (np.append(np.arange(len(pair)), np.full(len(alone), -1)), np.append(pair, alone))
+    candidates = _Candidates(*sky, limit)
+    pair = candidates.partner[0]
+    unmatched = np.flatnonzero(candidates.partner[1] < 0)
+    rows = (
+        np.append(np.arange(len(pair)), np.full(len(unmatched), -1)),
+        np.append(pair, unmatched),
+    )
     reasons = np.zeros(len(rows[0]), int)
     columns = {}
     ids = {}
     counts = {}
-    for k, (name, other) in enumerate((("first", "second"), ("second", "first"))):
+    for k, (name, partner) in enumerate((("first", "second"), ("second", "first"))):
         catalog = (first, second)[k]
-        here = rows[k] >= 0
+        has_row = rows[k] >= 0
         columns[name] = (rows[k], f"Row of the {name} catalog, -1 for none")
         if isinstance(catalog, Table) and "id" in catalog.colnames:
             values, missing = ids_and_missing(catalog["id"], name)
             values = np.append(values, np.zeros(1, values.dtype))[rows[k]]
             missing = np.append(missing, True)[rows[k]]
-            ids[f"{name}_id"] = (np.ma.MaskedArray(values, mask=missing | ~here), None)
-        near_by = np.full(len(here), -1)
-        near_by[here] = near.count[k][rows[k][here]]
-        text = f"Rows of the {other} catalog within the radius of the row of the {name}"
-        counts[f"n_{other}"] = (near_by, text)
-        reasons[here] |= near.reasons(k)[rows[k][here]]
-    separation = np.append(near.separation, np.full(len(alone), np.nan))
+            ids[f"{name}_id"] = (np.ma.MaskedArray(values, mask=missing | ~has_row), None)
+        near_by = np.full(len(has_row), -1)
+        near_by[has_row] = candidates.count[k][rows[k][has_row]]
+        text = f"Rows of the {partner} catalog within the radius of the row of the {name}"
+        counts[f"n_{partner}"] = (near_by, text)
+        reasons[has_row] |= candidates.reasons(k)[rows[k][has_row]]
+    separation = np.append(candidates.separation, np.full(len(unmatched), np.nan))
     columns |= ids | {"separation": (separation * ANGLE, "Distance between the partners")} | counts
     # of rows with a partner neither of the two reasons is set
     status = np.where(reasons == 0, 0, np.where(reasons & (_NONE | _LOST), 2, 1))
@@ -159,10 +162,10 @@ class _Candidates:
         nearest = [np.full(n, -1) for n in size]
         nearest[0][i[order]], nearest[1][j[order]] = j[order], i[order]
         self.partner = []
-        for one, other in (nearest, nearest[::-1]):
-            mutual = one >= 0
-            mutual[mutual] = other[one[mutual]] == np.flatnonzero(mutual)
-            self.partner.append(np.where(mutual, one, -1))
+        for forward, backward in (nearest, nearest[::-1]):
+            mutual = forward >= 0
+            mutual[mutual] = backward[forward[mutual]] == np.flatnonzero(mutual)
+            self.partner.append(np.where(mutual, forward, -1))
         self.separation = np.full(size[0], np.nan)
         chosen = self.partner[0][i] == j
         self.separation[i[chosen]] = distance[chosen]
@@ -171,10 +174,10 @@ class _Candidates:
         """`AssociationFlags` of the rows of list ``k``."""
         flags = np.zeros(len(self.sky[k]), int)
         if k == 0:
-            several = AssociationFlags.SEVERAL_SECOND
+            ambiguous = AssociationFlags.SEVERAL_SECOND
         else:
-            several = AssociationFlags.SEVERAL_FIRST
-        flags[self.count[k] > 1] |= int(several)
+            ambiguous = AssociationFlags.SEVERAL_FIRST
+        flags[self.count[k] > 1] |= int(ambiguous)
         flags[(self.count[k] > 0) & (self.partner[k] < 0)] |= int(AssociationFlags.NOT_MUTUAL)
         flags[self.count[k] == 0] |= _NONE
         flags[~self.finite[k]] = _LOST
@@ -255,19 +258,19 @@ def match_truth(truth, measured, bands, *, radius=0.5 * u.arcsec):
     require_columns(truth, ["id", "sky", *bands], "truth", units=dict.fromkeys(bands, FNU))
     require_columns(measured, ["id", "sky"], "measured", units=units)
     index, separation = match_sky(measured["sky"], truth["sky"], radius=radius)
-    found = index >= 0
+    matched = index >= 0
     table = QTable({"id": truth["id"], "sky": truth["sky"]})
     ids = read_ids(measured, "measured")
     if len(measured):
-        table["measured_id"] = np.where(found, ids[index], -1)
+        table["measured_id"] = np.where(matched, ids[index], -1)
     else:
         table["measured_id"] = -1
     table["separation"] = separation
-    table["matched"] = found
+    table["matched"] = matched
     limit = float(to_array(radius, ANGLE, "radius"))
-    near = _Candidates(truth["sky"].icrs, measured["sky"].icrs, limit)
-    reasons = near.reasons(0)
-    reasons[found] |= near.reasons(1)[index[found]]
+    candidates = _Candidates(truth["sky"].icrs, measured["sky"].icrs, limit)
+    reasons = candidates.reasons(0)
+    reasons[matched] |= candidates.reasons(1)[index[matched]]
     table["association"] = reasons
     table["association"].info.description = AssociationFlags.describe()
     for band in bands:
@@ -275,10 +278,10 @@ def match_truth(truth, measured, bands, *, radius=0.5 * u.arcsec):
         for name in (band, error_column(band)):
             values = np.full(len(truth), np.nan)
             if name in measured.colnames:
-                values[found] = to_array(measured[name], FNU, name)[index[found]]
+                values[matched] = to_array(measured[name], FNU, name)[index[matched]]
             table[name] = values * u.uJy
     for name in [c for c in measured.colnames if c == "flags" or c.endswith("_flags")]:
         values = np.zeros(len(truth), int)
-        values[found] = np.asarray(measured[name])[index[found]]
+        values[matched] = np.asarray(measured[name])[index[matched]]
         table[name] = values
     return table

@@ -15,16 +15,16 @@ OUTLIER = 0.15
 
 def one_by_one(dtype=float, **arrays):
     """Two 1-D arrays of one length, of a type; an error by their names if they are not."""
-    (name, first), (other, second) = arrays.items()
-    first = _plain(first, name, dtype)
-    second = _plain(second, other, dtype)
+    (name, first), (second_name, second) = arrays.items()
+    first = _plain_values(first, name, dtype)
+    second = _plain_values(second, second_name, dtype)
     good = first.shape == second.shape
     got = f"shapes {first.shape} and {second.shape}"
-    check_that(good and first.ndim == 1, other, f"a 1-D array as long as '{name}'", got)
+    check_that(good and first.ndim == 1, second_name, f"a 1-D array as long as '{name}'", got)
     return first, second
 
 
-def _plain(values, name, dtype):
+def _plain_values(values, name, dtype):
     """Values of a type: of numbers NaN where they are masked; others may not be masked."""
     if dtype is float:
         return floats(values)

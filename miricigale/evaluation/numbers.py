@@ -59,19 +59,19 @@ def study_numbers(study, *, seed, n_draws=500):
     seed = check_seed(seed)
     rows = []
     names = [name for name in OF_FITS if not name.endswith("_ratio")]
-    for one in study.truths:
-        for band_set in one.fits:
+    for sky in study.truths:
+        for band_set in sky.fits:
             for quantity in names:
                 of_power = quantity.startswith("power")
-                if of_power and "accretion_power" not in one.truth.colnames:
+                if of_power and "accretion_power" not in sky.truth.colnames:
                     continue
                 for option in (None,) if of_power else (None, *REDSHIFT_BINS):
-                    key = stream(seed, "numbers", one.name, band_set, quantity, str(option))
-                    given = {"truth": one, "band_set": band_set, "option": option}
-                    got = measure(study, quantity, **given, seed=key, n_draws=n_draws)
+                    key = stream(seed, "numbers", sky.name, band_set, quantity, str(option))
+                    row = {"truth": sky, "band_set": band_set, "option": option}
+                    got = measure(study, quantity, **row, seed=key, n_draws=n_draws)
                     span = option or (0.0, np.inf)
                     values = (got.value, got.low, got.high, got.n, got.completeness)
-                    rows.append((one.name, band_set, quantity, *span, *values))
+                    rows.append((sky.name, band_set, quantity, *span, *values))
     return described_rows(rows, declared("miricigale.evaluation", "columns.toml")["numbers"])
 
 
@@ -113,21 +113,21 @@ def study_confusion(study, band_set="all"):
     composite   0      0         0   0
           agn   0      0         0   0
     """
-    truths = [one for one in study.truths if one.frac_agn is not None and band_set in one.fits]
-    true = [classify(floats(one.truth["frac_agn"]))[one.field] for one in truths]
+    truths = [sky for sky in study.truths if sky.frac_agn is not None and band_set in sky.fits]
+    true = [classify(floats(sky.truth["frac_agn"]))[sky.field] for sky in truths]
     # "unknown" of those not in the sample
-    means = [one.of_catalog(one.fitted(band_set, "frac_agn_mean"))[one.field] for one in truths]
-    found = [classify(np.clip(mean, 0, 1)) for mean in means]
-    return confusion(np.concatenate([[], *true]), np.concatenate([[], *found]))
+    means = [sky.of_catalog(sky.fitted(band_set, "frac_agn_mean"))[sky.field] for sky in truths]
+    classes = [classify(np.clip(mean, 0, 1)) for mean in means]
+    return confusion(np.concatenate([[], *true]), np.concatenate([[], *classes]))
 
 
-def selection_table(one, *, limits=CLASS_LIMITS):
+def selection_table(sky, *, limits=CLASS_LIMITS):
     """
     Purity and completeness of selections by the fitted AGN fraction in a realistic field.
 
     Parameters
     ----------
-    one : `TruthResults`
+    sky : `TruthResults`
         A truth whose AGN have the numbers and luminosities of a real field.
     limits : tuple of float, optional
         Sources whose true AGN fraction is at least this are wanted, and those with such a posterior mean are
@@ -160,19 +160,19 @@ def selection_table(one, *, limits=CLASS_LIMITS):
     -------- ----- -------- ---------- ------
          all   0.1        0          1    0.0
     """
-    true = floats(one.truth["frac_agn"])[one.field]
-    pairs = [(band_set, limit) for band_set in one.fits for limit in limits]
-    found = []
+    true = floats(sky.truth["frac_agn"])[sky.field]
+    pairs = [(band_set, limit) for band_set in sky.fits for limit in limits]
+    qualities = []
     for band_set, limit in pairs:
-        mean = one.of_catalog(one.fitted(band_set, "frac_agn_mean"))[one.field]
+        mean = sky.of_catalog(sky.fitted(band_set, "frac_agn_mean"))[sky.field]
         # NaN is below every limit
-        found.append(selection_quality(true >= limit, mean >= limit))
-    wanted, selected = ([getattr(f, k).n for f in found] for k in ("completeness", "purity"))
+        qualities.append(selection_quality(true >= limit, mean >= limit))
+    wanted, selected = ([getattr(f, k).n for f in qualities] for k in ("completeness", "purity"))
     columns = (
         *map(list, zip(*pairs, strict=True)),
         wanted,
         selected,
-        *quality_columns(found).values(),
+        *quality_columns(qualities).values(),
     )
     return described_columns(
         columns, declared("miricigale.evaluation", "columns.toml")["selection"]

@@ -139,68 +139,76 @@ def compare_with_paper(study, *, seed, n_draws=1000, reasons=None, same_exposure
     seed = check_seed(seed)
     reasons = dict(reasons or {})
     rows = []
-    check_names(reasons, "published number", [one.key for one in PUBLISHED])
-    for one in PUBLISHED:
-        if one.quantity == "extra":
-            ours = study.extra.get(one.key, Estimate(np.nan))
+    check_names(reasons, "published number", [published.key for published in PUBLISHED])
+    for published in PUBLISHED:
+        if published.quantity == "extra":
+            ours = study.extra.get(published.key, Estimate(np.nan))
         else:
-            given = {"truth": one.truth, "band_set": one.band_set, "option": one.option}
-            given["seed"] = stream(seed, "paper", one.key)
-            ours = measure(study, one.quantity, **given, n_draws=n_draws)
-        judged = same_exposures or one.quantity == "extra"
+            row = {
+                "truth": published.truth,
+                "band_set": published.band_set,
+                "option": published.option,
+            }
+            row["seed"] = stream(seed, "paper", published.key)
+            ours = measure(study, published.quantity, **row, n_draws=n_draws)
+        judged = same_exposures or published.quantity == "extra"
         if judged:
-            sigma = _difference(one, ours)
+            sigma = _difference(published, ours)
         else:
             sigma = np.nan
-        why = reasons.get(one.key, one.why)
+        why = reasons.get(published.key, published.why)
         if judged:
-            verdict = _verdict(one, ours, sigma, why)
+            verdict = _verdict(published, ours, sigma, why)
         else:
             verdict = OTHER_EXPOSURES
-        text = QUANTITIES.get(one.quantity)
-        right = one.quantity == "class_share"
+        text = QUANTITIES.get(published.quantity)
+        right = published.quantity == "class_share"
         rows.append(
-            (one.key, one.section, f"{text}: {one.text}" if text else one.text)
-            + (one.relation, one.value, one.error)
+            (
+                published.key,
+                published.section,
+                f"{text}: {published.text}" if text else published.text,
+            )
+            + (published.relation, published.value, published.error)
             + (ours.value, ours.low, ours.high, ours.n, ours.completeness)
             + (ours.value * ours.completeness if right else np.nan, sigma)
-            + (verdict, one.definition, one.source)
+            + (verdict, published.definition, published.source)
         )
     return described_rows(rows, _TABLE["columns"])
 
 
-def _difference(one, ours):
+def _difference(number, ours):
     """Difference in units of its error; that of the paper is ours, where it has none, for its sample."""
-    delta = _excess(one, ours)
-    if (one.relation == "<" and delta <= 0) or (one.relation == ">" and delta >= 0):
+    delta = _excess(number, ours)
+    if (number.relation == "<" and delta <= 0) or (number.relation == ">" and delta >= 0):
         return 0.0
     error = np.nan_to_num(ours.error)
-    size = one.n or ours.n or 1
-    published = one.error or error * np.sqrt((ours.n or size) / size)
-    if one.quantity in SHARES and ours.n:
+    size = number.n or ours.n or 1
+    published = number.error or error * np.sqrt((ours.n or size) / size)
+    if number.quantity in SHARES and ours.n:
         # our interval is none for theirs where one of the shares is near 0 or 1
-        published = max(published, np.sqrt(one.value * (1 - one.value) / size))
+        published = max(published, np.sqrt(number.value * (1 - number.value) / size))
     total = np.hypot(error, published)
     if total > 0:
         return float(delta / total)
     return np.nan
 
 
-def _excess(one, ours):
+def _excess(published, ours):
     """How much our value, or of a bound its size, is above the published one."""
-    return (abs(ours.value) if one.relation == "<" else ours.value) - one.value
+    return (abs(ours.value) if published.relation == "<" else ours.value) - published.value
 
 
-def _verdict(one, ours, sigma, why):
+def _verdict(published, ours, sigma, why):
     """Whether the two agree, in words."""
     if not np.isfinite(ours.value):
         return "not measured"
-    if one.relation in "<>" and sigma == 0:
+    if published.relation in "<>" and sigma == 0:
         return "within the bound"
     if not np.isfinite(sigma):
-        delta = _excess(one, ours)
-        if abs(delta) <= one.tolerance:
-            return f"agrees (to {one.tolerance:g})"
+        delta = _excess(published, ours)
+        if abs(delta) <= published.tolerance:
+            return f"agrees (to {published.tolerance:g})"
         return f"differs by {delta:+.3g}: {why or 'open'}"
     if abs(sigma) >= _AGREES:
         if abs(sigma) < _FAR:
@@ -208,7 +216,7 @@ def _verdict(one, ours, sigma, why):
         else:
             size = f"more than {_FAR:g}"
         return f"differs by {size} sigma: {why or 'open'}"
-    if one.relation in "<>":
-        delta = _excess(one, ours)
+    if published.relation in "<>":
+        delta = _excess(published, ours)
         return f"agrees within its error: beyond the bound by {abs(delta):.2g} ({sigma:+.1f} sigma)"
     return f"agrees ({sigma:+.1f} sigma)"

@@ -217,16 +217,18 @@ class AGNPopulation:
     compton_thick: float = 1.0
 
     def __post_init__(self):
-        least = positive(self.min_luminosity, u.erg / u.s, "min_luminosity")
+        min_luminosity = positive(self.min_luminosity, u.erg / u.s, "min_luminosity")
         wanted = "from 1e41 to 1e46 erg/s"
-        check_that(1e41 <= least <= 1e46, "min_luminosity", wanted, self.min_luminosity)
+        check_that(1e41 <= min_luminosity <= 1e46, "min_luminosity", wanted, self.min_luminosity)
         check_that(self.compton_thick >= 0, "compton_thick", ">= 0", self.compton_thick)
 
     @property
     def _log_l(self):
         """Logarithms of luminosities, from the least."""
-        least = np.log10(self.min_luminosity.to_value(u.erg / u.s))
-        return np.linspace(least, _LOG_L_MAX, int(np.ceil((_LOG_L_MAX - least) / _STEP)) + 1)
+        log_minimum = np.log10(self.min_luminosity.to_value(u.erg / u.s))
+        return np.linspace(
+            log_minimum, _LOG_L_MAX, int(np.ceil((_LOG_L_MAX - log_minimum) / _STEP)) + 1
+        )
 
     def density(self, stellar_mass, redshift, l_x):
         """
@@ -255,8 +257,8 @@ class AGNPopulation:
         hosts = _smf(_LOG_MASS, redshift[:, None])
         weights = np.full(_LOG_MASS.size, _LOG_MASS[1] - _LOG_MASS[0])
         weights[[0, -1]] /= 2.0
-        every = hosts @ (weights[:, None] * _accretion(log_l - _LOG_MASS[:, None]))
-        out = agn / every * _accretion(log_l - log_mass[:, None])
+        density = hosts @ (weights[:, None] * _accretion(log_l - _LOG_MASS[:, None]))
+        out = agn / density * _accretion(log_l - log_mass[:, None])
         out[~(log_mass >= _LOG_MASS[0])] = 0.0
         return out
 
@@ -327,13 +329,13 @@ class AGNPopulation:
             probability[part] = above[:, 0]
             for row in np.flatnonzero(drawn[part, 0] < above[:, 0]):
                 log_l[first + row] = np.interp(drawn[first + row, 0], above[row, ::-1], grid[::-1])
-        has = np.isfinite(log_l)
-        psi = _psi(np.where(has, log_l, 44.0), redshift)
+        has_agn = np.isfinite(log_l)
+        psi = _psi(np.where(has_agn, log_l, 44.0), redshift)
         thick = self.compton_thick * psi / (1.0 + self.compton_thick * psi)
         hidden = thick + psi / (1.0 + self.compton_thick * psi)
-        l_x = np.where(has, 10.0 ** np.where(has, log_l, 0.0), 0.0) * u.erg / u.s
-        absorbed = (has & (drawn[:, 1] < share) for share in (hidden, thick))
-        columns = ids, probability, has, l_x.to(LUMINOSITY), stern2015_6um(l_x), *absorbed
+        l_x = np.where(has_agn, 10.0 ** np.where(has_agn, log_l, 0.0), 0.0) * u.erg / u.s
+        absorbed = (has_agn & (drawn[:, 1] < share) for share in (hidden, thick))
+        columns = ids, probability, has_agn, l_x.to(LUMINOSITY), stern2015_6um(l_x), *absorbed
         return described_columns(columns, declared("miricigale.evaluation", "columns.toml")["agn"])
 
 
@@ -382,8 +384,8 @@ def _smf(log_mass, z):
     place = np.interp(z, middles, np.arange(middles.size))
     low = np.minimum(place.astype(int), middles.size - 2)
     part = place - low
-    below, above = (_log_schechter(log_mass, row) for row in (low, low + 1))
-    return np.exp((1.0 - part) * below + part * above)
+    low_density, high_density = (_log_schechter(log_mass, row) for row in (low, low + 1))
+    return np.exp((1.0 - part) * low_density + part * high_density)
 
 
 def _log_schechter(log_mass, row):

@@ -26,31 +26,31 @@ _FEW_DRAWS = 100
 _FEW = 30
 
 
-def _share(found, n_all=None):
+def _share(is_detected, n_all=None):
     """Share of sources that were found, of an array of bool; ``n_all`` is their number by default."""
     if n_all is None:
-        n_all = found.size
-    return Estimate.of_fraction(np.count_nonzero(found), found.size, n_all=n_all)
+        n_all = is_detected.size
+    return Estimate.of_fraction(np.count_nonzero(is_detected), is_detected.size, n_all=n_all)
 
 
 # Each takes the study, one truth (or None for those of all), the band set, an option and `bootstrap` with
 # the seed and the number of draws of one number.
 
 
-def _in_bin(one, option):
+def _in_bin(sky, option):
     """Rows of the sample in a bin of true redshift (all without), and sources of the field in it."""
     low, high = option or (0.0, np.inf)
-    z = floats(one.truth["redshift"])
+    z = floats(sky.truth["redshift"])
     rows = (z >= low) & (z < high)
-    return rows[one.sample], int(np.count_nonzero(rows & one.field))
+    return rows[sky.sample], int(np.count_nonzero(rows & sky.field))
 
 
 def _of_sample(values, statistic):
     """Quantity that is a statistic of values of the sample, by bin of redshift."""
 
-    def measure(_, one, band_set, option, draws):
-        rows, n_all = _in_bin(one, option)
-        columns = values(one, band_set)
+    def measure(_, sky, band_set, option, draws):
+        rows, n_all = _in_bin(sky, option)
+        columns = values(sky, band_set)
         if not isinstance(columns, tuple):
             columns = (columns,)
         return draws(statistic, *(column[rows] for column in columns), n_all=n_all)
@@ -61,14 +61,16 @@ def _of_sample(values, statistic):
 def _ratio(values, statistic):
     """Ratio of a statistic of values of the sample without MIRI to that with a band set."""
 
-    def both(one, band_set):
-        return values(one, "none"), values(one, band_set)
+    def paired_columns(sky, band_set):
+        return values(sky, "none"), values(sky, band_set)
 
-    return _of_sample(both, lambda without, within: statistic(without) / statistic(within))
+    return _of_sample(
+        paired_columns, lambda without, within: statistic(without) / statistic(within)
+    )
 
 
-def _width(one, band_set):
-    return one.fitted(band_set, "frac_agn_std")
+def _width(sky, band_set):
+    return sky.fitted(band_set, "frac_agn_std")
 
 
 def _size(values):
@@ -84,11 +86,14 @@ def _trend(values, statistic):
 
     def measure(study, _, band_set, option, draws):
         ends = [study.at(frac) for frac in option]
-        if None in ends or any(band_set not in one.fits for one in ends):
+        if None in ends or any(band_set not in sky.fits for sky in ends):
             return Estimate(np.nan)
-        columns = [one.of_catalog(values(one, band_set)) for one in ends]
+        columns = [sky.of_catalog(values(sky, band_set)) for sky in ends]
+
         # a source has its two values side by side
-        ratio = lambda both: statistic(both[..., ::2]) / statistic(both[..., 1::2])  # noqa: E731
+        def ratio(pairs):
+            return statistic(pairs[..., ::2]) / statistic(pairs[..., 1::2])
+
         return draws(ratio, np.stack(columns, axis=1))
 
     return measure
@@ -98,118 +103,118 @@ _DZ = TruthResults.redshift_error
 _DF = TruthResults.fraction_error
 
 
-def _detected_share(study, one, _, limit, draws):
+def _detected_share(study, sky, _, limit, draws):
     """Share of the field brighter than a magnitude that is detected in two or more bands."""
-    found = np.asarray(one.matched["n_detected"]) >= min(2, len(study.bands))
-    return _share(found[one.field & (study.prior_magnitude(one) < limit)])
+    is_detected = np.asarray(sky.matched["n_detected"]) >= min(2, len(study.bands))
+    return _share(is_detected[sky.field & (study.prior_magnitude(sky) < limit)])
 
 
-def _mips_share(study, one, _, option, draws):
+def _mips_share(study, sky, _, option, draws):
     """Share of the field brighter than a magnitude that is above a limit in another band."""
     limit, band, depth = option
-    if band not in one.truth.colnames:
+    if band not in sky.truth.colnames:
         return Estimate(np.nan)
-    found = ab_magnitude(one.truth[band]) < depth
-    return _share(found[one.field & (study.prior_magnitude(one) < limit)])
+    is_detected = ab_magnitude(sky.truth[band]) < depth
+    return _share(is_detected[sky.field & (study.prior_magnitude(sky) < limit)])
 
 
-def _etc_limit(study, one, band_set, band, draws):
+def _etc_limit(study, sky, band_set, band, draws):
     """Limit of the exposure time calculator."""
     return Estimate(float(study.etc_limits.get(band, np.nan)))
 
 
-def _limit_offset(study, one, band_set, option, draws):
+def _limit_offset(study, sky, band_set, option, draws):
     """Limit of the error function minus another or the calculator's: negative where it is shallower."""
     if isinstance(option, tuple):
-        band, other = option
+        band, reference = option
     else:
         band = option
-        other = None
-    if other is None:
-        other = study.etc_limits.get(band, np.nan)
-    return Estimate(float(study.limits.get(band, np.nan) - other))
+        reference = None
+    if reference is None:
+        reference = study.etc_limits.get(band, np.nan)
+    return Estimate(float(study.limits.get(band, np.nan) - reference))
 
 
-def _known(study, one, band, kinds):
+def _types_known(study, sky, band, kinds):
     crowds = any("crowded" in kind for kind in kinds)
-    return band in study.bands and (not crowds or band in one.crowded)
+    return band in study.bands and (not crowds or band in sky.crowded)
 
 
-def _of_kind(one, band, kind):
+def _of_kind(sky, band, kind):
     """Sources by shape or with a bright neighbor in a band; with "not " before it the others."""
     if kind.startswith("not "):
-        return ~_of_kind(one, band, kind.removeprefix("not "))
+        return ~_of_kind(sky, band, kind.removeprefix("not "))
     if kind == "crowded":
-        return one.crowded[band]
-    return one.shapes[kind]
+        return sky.crowded[band]
+    return sky.shapes[kind]
 
 
-def _kind_share(study, one, _, option, draws):
+def _kind_share(study, sky, _, option, draws):
     """Share of a kind among the sources above 5 sigma in a band."""
     band, kind = option
-    if not _known(study, one, band, [kind]):
+    if not _types_known(study, sky, band, [kind]):
         return Estimate(np.nan)
-    return _share(_of_kind(one, band, kind)[one.field & one.is_bright(band)])
+    return _share(_of_kind(sky, band, kind)[sky.field & sky.is_bright(band)])
 
 
 def _kind_errors(statistic):
     """Of measured minus true magnitude in a band of the sources above 5 sigma that are of all kinds."""
 
-    def measure(study, one, _, option, draws):
+    def measure(study, sky, _, option, draws):
         band, *kinds = option
-        if not _known(study, one, band, kinds):
+        if not _types_known(study, sky, band, kinds):
             return Estimate(np.nan)
-        rows = np.logical_and.reduce([one.field, *(_of_kind(one, band, kind) for kind in kinds)])
-        bright = rows & one.is_bright(band)
+        rows = np.logical_and.reduce([sky.field, *(_of_kind(sky, band, kind) for kind in kinds)])
+        bright = rows & sky.is_bright(band)
         n_all = int(np.count_nonzero(rows))
-        return draws(statistic, one.magnitude_error(band)[bright], n_all=n_all)
+        return draws(statistic, sky.magnitude_error(band)[bright], n_all=n_all)
 
     return measure
 
 
-def _bright_error(study, one, _, band, draws):
+def _bright_error(study, sky, _, band, draws):
     """Median size of measured minus true magnitude of the 30 brightest of the field in a band."""
-    rows = np.flatnonzero(one.field & np.isfinite(one.magnitude_error(band)))
-    order = np.argsort(-one.matched[f"{band}_true"][rows])
-    return draws(_median, np.abs(one.magnitude_error(band)[rows[order[:_FEW]]]))
+    rows = np.flatnonzero(sky.field & np.isfinite(sky.magnitude_error(band)))
+    order = np.argsort(-sky.matched[f"{band}_true"][rows])
+    return draws(_median, np.abs(sky.magnitude_error(band)[rows[order[:_FEW]]]))
 
 
-def _signal_to_noise(study, one, _, band, draws):
+def _signal_to_noise(study, sky, _, band, draws):
     """Median ratio of flux to error in a band, of the sample."""
-    ratio = (one.matched[band] / one.matched[error_column(band)]).to_value(u.one)
-    return draws(_median, ratio[one.sample], n_all=int(np.count_nonzero(one.field)))
+    ratio = (sky.matched[band] / sky.matched[error_column(band)]).to_value(u.one)
+    return draws(_median, ratio[sky.sample], n_all=int(np.count_nonzero(sky.field)))
 
 
-def _outlier_share(study, one, band_set, option, draws):
+def _outlier_share(study, sky, band_set, option, draws):
     """Share of outliers in redshift, with its Wilson interval."""
-    rows, n_all = _in_bin(one, option)
-    delta = one.redshift_error(band_set)[rows]
+    rows, n_all = _in_bin(sky, option)
+    delta = sky.redshift_error(band_set)[rows]
     return _share(np.abs(delta[np.isfinite(delta)]) > OUTLIER, n_all)
 
 
-def _class_share(study, one, band_set, option, draws):
+def _class_share(study, sky, band_set, option, draws):
     """Share of the sample that is found in its true class, by the AGN fraction."""
-    rows, n_all = _in_bin(one, option)
-    mean = one.fitted(band_set, "frac_agn_mean")[rows]
+    rows, n_all = _in_bin(sky, option)
+    mean = sky.fitted(band_set, "frac_agn_mean")[rows]
     good = np.isfinite(mean)
-    found = classify(np.clip(mean[good], 0, 1)) == classify(one.true("frac_agn")[rows][good])
-    return _share(found, n_all)
+    is_right = classify(np.clip(mean[good], 0, 1)) == classify(sky.true("frac_agn")[rows][good])
+    return _share(is_right, n_all)
 
 
-def _truths(study, one, column):
+def _truths(study, sky, column):
     """One truth, or all with an AGN if none is given, that have a column."""
-    if one is None:
+    if sky is None:
         truths = study.with_agn
     else:
-        truths = (one,)
+        truths = (sky,)
     return [t for t in truths if column in t.truth.colnames]
 
 
 def _power(statistic):
     """Of the accretion power of one truth, or of all with an AGN together."""
 
-    def measure(study, one, band_set, option, draws):
-        truths = _truths(study, one, "accretion_power")
+    def measure(study, sky, band_set, option, draws):
+        truths = _truths(study, sky, "accretion_power")
         if not truths:
             return Estimate(np.nan)
         # the truths of a source are drawn together
@@ -220,23 +225,23 @@ def _power(statistic):
     return measure
 
 
-def xray_fluxes(one):
+def xray_fluxes(sky):
     """Log of the X-ray flux (erg/s/cm2) of all sources of a truth; NaN without an AGN, and of stars."""
-    redshift = floats(one.truth["redshift"])
-    power = one.truth["l_6um"]
+    redshift = floats(sky.truth["redshift"])
+    power = sky.truth["l_6um"]
     flux = np.full(redshift.size, np.nan)
     good = np.isfinite(redshift) & (power > 0)
     flux[good] = yang2021_xray_flux(power[good], redshift[good]).value
     return np.log10(flux)
 
 
-def _xray_half(study, one, band_set, option, draws):
+def _xray_half(study, sky, band_set, option, draws):
     """Log of the X-ray flux above which more than half of the AGN of the field are in the sample."""
-    truths = _truths(study, one, "l_6um")
+    truths = _truths(study, sky, "l_6um")
     if not truths:
         return Estimate(np.nan)
     columns = [np.where(t.field, xray_fluxes(t), np.nan) for t in truths]
-    found = [np.where(t.field, t.sample, np.nan) for t in truths]
+    samples = [np.where(t.field, t.sample, np.nan) for t in truths]
 
     def statistic(flux, sample):
         rows = zip(np.atleast_2d(flux), np.atleast_2d(sample), strict=True)
@@ -246,18 +251,18 @@ def _xray_half(study, one, band_set, option, draws):
         return out
 
     n_draws = max(_FEW_DRAWS, draws.keywords["n_draws"] // 10)
-    return draws(statistic, np.stack(columns, axis=1), np.stack(found, axis=1), n_draws=n_draws)
+    return draws(statistic, np.stack(columns, axis=1), np.stack(samples, axis=1), n_draws=n_draws)
 
 
-def _xray_luminosity(study, one, band_set, redshift, draws):
+def _xray_luminosity(study, sky, band_set, redshift, draws):
     """Log of the luminosity (2-10 keV, erg/s) at a redshift of that flux, before absorption."""
-    half = _xray_half(study, one, band_set, None, draws)
+    half = _xray_half(study, sky, band_set, None, draws)
     flux = 10.0 ** np.array([half.value, half.low, half.high]) * u.erg / u.s / u.cm**2
     values = np.log10(xray_luminosity_at(flux, redshift).value)
     return Estimate(*(float(value) for value in values), half.n, half.n_all)
 
 
-def _feature(study, one, band_set, option, draws):
+def _feature(study, sky, band_set, option, draws):
     """Magnitudes that a feature of given equivalent width (um) adds to a band at a redshift."""
     band, width, redshift = option
     value = feature_magnitude(width * u.um, redshift, Filter.from_name(band).width)
@@ -366,13 +371,13 @@ def measure(study, quantity, *, truth=0.0, band_set="all", option=None, seed, n_
     """
     check_names([quantity], "quantity", _MEASURES)
     if isinstance(truth, (int, float)):
-        one = study.at(truth)
+        sky = study.at(truth)
     else:
-        one = truth
-    if one is None and not (truth is None and quantity in _OF_ALL + _TRENDS):
+        sky = truth
+    if sky is None and not (truth is None and quantity in _OF_ALL + _TRENDS):
         return Estimate(np.nan)
-    lacks_fit = one is not None and quantity in OF_FITS and band_set not in one.fits
+    lacks_fit = sky is not None and quantity in OF_FITS and band_set not in sky.fits
     if lacks_fit or (quantity in _OF_BANDS and option not in study.bands):
         return Estimate(np.nan)
     draws = functools.partial(bootstrap, seed=seed, n_draws=n_draws)
-    return _MEASURES[quantity][1](study, one, band_set, option, draws)
+    return _MEASURES[quantity][1](study, sky, band_set, option, draws)

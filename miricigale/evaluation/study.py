@@ -195,16 +195,16 @@ class StudyResults:
 
     def at(self, frac_agn):
         """The truth of an AGN fraction, or None."""
-        for one in self.truths:
-            if one.frac_agn is not None and np.isclose(one.frac_agn, frac_agn, atol=1e-6):
-                return one
+        for sky in self.truths:
+            if sky.frac_agn is not None and np.isclose(sky.frac_agn, frac_agn, atol=1e-6):
+                return sky
         return None
 
     @property
     def with_agn(self):
         """Truths of one AGN fraction above 0."""
-        return tuple(one for one in self.truths if one.frac_agn)
+        return tuple(sky for sky in self.truths if sky.frac_agn)
 
-    def prior_magnitude(self, one):
+    def prior_magnitude(self, sky):
         """AB magnitudes of all sources of a truth in the prior's band."""
-        return ab_magnitude(one.truth[self.prior_band])
+        return ab_magnitude(sky.truth[self.prior_band])

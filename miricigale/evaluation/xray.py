@@ -60,8 +60,10 @@ class XRayLimit:
 #: paper calls MIRI (50 % at about 1e-16) "slightly more sensitive" than the deepest survey, and Nandra et
 #: al. call theirs a factor 2-3 shallower than the deep fields.
 XRAY_LIMITS = tuple(
-    XRayLimit(survey, flux * _CGS, *about)
-    for survey, flux, *about in declared("miricigale.evaluation", "population.toml")["xray"]["rows"]
+    XRayLimit(survey, flux * _CGS, *source)
+    for survey, flux, *source in declared("miricigale.evaluation", "population.toml")["xray"][
+        "rows"
+    ]
 )
 
 
