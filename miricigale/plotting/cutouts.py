@@ -72,8 +72,8 @@ class _Panels:
             middle = np.clip(np.nan_to_num(value, nan=-np.inf), -half - 1, size + half)
             parts.append(np.round(middle).astype(int)[:, None] + np.arange(self.n) + self.n - half)
         columns, rows = parts
-        found = [plane[rows[:, :, None], columns[:, None, :]] for plane in self.planes]
-        return np.stack(found, axis=1)[:, :, ::-1]
+        squares = [plane[rows[:, :, None], columns[:, None, :]] for plane in self.planes]
+        return np.stack(squares, axis=1)[:, :, ::-1]
 
     def shades(self, sky):
         """
@@ -131,12 +131,12 @@ class Cutouts:
 
     def on_image(self, sky):
         """Whether a picture about each position has data in any band: bool, shape (n,)."""
-        seen = np.zeros(len(sky), bool)
+        is_covered = np.zeros(len(sky), bool)
         # pictures of all sources of a large catalog would not fit in memory
         for part in chunks(len(sky), _AT_ONCE):
             for panels in self.bands.values():
-                seen[part] |= np.isfinite(panels.squares(sky[part])[:, 0]).any(axis=(1, 2))
-        return seen
+                is_covered[part] |= np.isfinite(panels.squares(sky[part])[:, 0]).any(axis=(1, 2))
+        return is_covered
 
     def sheet(self, sky):
         """
@@ -166,10 +166,10 @@ class Cutouts:
         for k, panels in enumerate(self.bands.values()):
             shades, tops = panels.shades(sky)
             limits.append(tops)
-            left = self.prior.n + k * side
+            x_start = self.prior.n + k * side
             for row in range(3):
                 top = row * side
-                strips[:, top : top + panels.n, left : left + panels.n] = shades[:, row]
+                strips[:, top : top + panels.n, x_start : x_start + panels.n] = shades[:, row]
         sheet = Image.fromarray(strips.reshape(-1, strips.shape[2]))
         gray = np.repeat(255 - np.round(255 * np.arange(N_GRAY) / (N_GRAY - 1)).astype(int), 3)
         sheet.putpalette([*gray.tolist(), *NO_DATA])

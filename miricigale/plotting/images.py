@@ -338,11 +338,11 @@ def mark_sky(ax, length, *, north=(0, 1), east=(-1, 0), color="black"):
     from matplotlib.patheffects import withStroke
 
     edge = [withStroke(linewidth=2.5, foreground="black" if np.mean(to_rgb(color)) > 0.5 else "w")]
-    left, right = ax.get_xlim()
+    x_min, x_max = ax.get_xlim()
     bottom, top = ax.get_ylim()
-    width = right - left
+    width = x_max - x_min
     height = top - bottom
-    x = left + 0.05 * width
+    x = x_min + 0.05 * width
     y = bottom + 0.045 * height
     style = {"color": color, "path_effects": edge}
     ax.plot([x, x + length], [y, y], lw=2, solid_capstyle="butt", **style)
@@ -350,14 +350,14 @@ def mark_sky(ax, length, *, north=(0, 1), east=(-1, 0), color="black"):
     ax.text(x + length / 2, y + 0.03 * height, f'{length:g}"', **text)
     size = 0.09 * min(width, height)
     # space for both arrows, wherever they point
-    origin = np.array([right - 0.05 * width - 1.2 * size, bottom + 0.045 * height + 0.3 * size])
+    origin = np.array([x_max - 0.05 * width - 1.2 * size, bottom + 0.045 * height + 0.3 * size])
     for direction, letter in ((north, "N"), (east, "E")):
         step = size * np.asarray(direction, float) / np.hypot(*direction)
         arrow = {"arrowstyle": "-|>", "color": color, "lw": 1.3, "shrinkA": 0, "shrinkB": 0}
         note = ax.annotate("", origin + step, origin, arrowprops=arrow)
         note.arrow_patch.set_path_effects(edge)
         ax.text(*(origin + 1.35 * step), letter, **text)
-    ax.set(xlim=(left, right), ylim=(bottom, top), xticks=[], yticks=[], xlabel="", ylabel="")
+    ax.set(xlim=(x_min, x_max), ylim=(bottom, top), xticks=[], yticks=[], xlabel="", ylabel="")
     return ax
 
 
@@ -412,7 +412,7 @@ def plot_segmentation(image, labels, *, ax=None, pixel_scale=1.0, center=None, *
     if image.shape != labels.shape:
         raise argument_error("labels", f"of the image's shape {image.shape}", labels.shape)
     ax = plot_image(image, ax=ax, pixel_scale=pixel_scale, center=center, **kwargs)
-    left, _, bottom, _ = _extent(image.shape, pixel_scale, center)
+    x_min, _, bottom, _ = _extent(image.shape, pixel_scale, center)
     y, x = (np.arange(n + 1) * pixel_scale for n in image.shape)
-    add_borders(ax, labels, left + x, bottom + y, colors=_LINES, linewidths=0.7)
+    add_borders(ax, labels, x_min + x, bottom + y, colors=_LINES, linewidths=0.7)
     return ax

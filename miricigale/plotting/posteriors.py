@@ -128,10 +128,10 @@ def plot_pdf_2d(
         border = {"colors": "black", "linewidth": max(1.5 - 0.7 * i, 0.5)}
         add_borders(ax, (inside < level).T, x, y, **border)
     for edges, sums, limits in ((x, weights.sum(axis=1), "xlim"), (y, weights.sum(axis=0), "ylim")):
-        seen = np.flatnonzero(sums > 1e-4 * sums.sum())
-        if seen.size:
-            low = max(seen[0] - 2, 0)
-            high = min(seen[-1] + 3, edges.size - 1)
+        occupied = np.flatnonzero(sums > 1e-4 * sums.sum())
+        if occupied.size:
+            low = max(occupied[0] - 2, 0)
+            high = min(occupied[-1] + 3, edges.size - 1)
             ax.set(**{limits: (edges[low], edges[high])})
     if truth is not None:
         ax.plot(*truth, marker="x", color="tab:red", markersize=9, markeredgewidth=2)
@@ -219,19 +219,19 @@ def plot_sed_fit(
     for k, (label, (x, y)) in enumerate((parts or {}).items()):
         x = _value(x, u.um)
         y = _value(y, u.uJy)
-        near = (x > 0.5 * wave.min()) & (x < 2.0 * wave.max())
+        in_range = (x > 0.5 * wave.min()) & (x < 2.0 * wave.max())
         color, line = _SPECTRA[k % len(_SPECTRA)]
-        ax.plot(x[near], y[near], color=color, ls=line, lw=1.0, zorder=1, label=label)
+        ax.plot(x[in_range], y[in_range], color=color, ls=line, lw=1.0, zorder=1, label=label)
     boxes = {"color": "tab:orange", "markersize": 7, "fillstyle": "none"}
     ax.plot(wave, model, "s", zorder=3, label="best model in the bands", **boxes)
     points = _points(groups, used, limit)
     for rows, label, style in points:
         rows = rows & have & (flux > 0)
         ax.errorbar(wave[rows], flux[rows], err[rows], zorder=4, label=label, **style)
-    below = have & ~(flux > 0) & ~limit
-    if np.any(below):
-        top = np.maximum(np.maximum(flux, 0.0) + 2.0 * err, low)[below]
-        ax.plot(wave[below], top, "v", color="tab:blue", zorder=4)
+    negative = have & ~(flux > 0) & ~limit
+    if np.any(negative):
+        top = np.maximum(np.maximum(flux, 0.0) + 2.0 * err, low)[negative]
+        ax.plot(wave[negative], top, "v", color="tab:blue", zorder=4)
     bound = have & limit
     if np.any(bound):
         top = np.maximum(flux[bound], 3.0 * low)
@@ -250,8 +250,8 @@ def plot_sed_fit(
     for rows, _, style in points:
         residual_ax.plot(wave[rows], pull[rows], **style)
     # of limits only those that the model passes have to be seen
-    seen = have & ~(limit & (pull > 0))
-    size = np.nanmax(np.abs(pull[seen]), initial=2.5) * 1.15
+    shown_pull = have & ~(limit & (pull > 0))
+    size = np.nanmax(np.abs(pull[shown_pull]), initial=2.5) * 1.15
     if np.any(bound):
         residual_ax.errorbar(wave[bound], pull[bound], yerr=0.25 * size, **_ARROW)
     residual_ax.set(ylim=(-size, size), ylabel="residual (sigma)")

@@ -61,7 +61,7 @@ class CatalogFlags(Flags):
         return cls.BAD_RADIUS | cls.BAD_INDEX | cls.BAD_AXIS_RATIO | cls.BAD_ANGLE
 
 
-def _plain(table, name, unit, argument):
+def _plain_column(table, name, unit, argument):
     """A column as numbers in ``unit``, NaN where it has none or one that stands for no value."""
     values = plain_floats(table[name], name, argument)
     if name != "position_angle":  # an angle on the sky may be -99
@@ -100,8 +100,8 @@ def as_sources(data, filter, argument="catalog"):
     ['id', 'miri.f770w', 'half_light_radius']
     """
     table = QTable(as_photometry(data, [filter], argument), copy=True)
-    for ours, others in _DECLARED["other_names"].items():
-        theirs = [name for name in table.colnames if name.lower() in others]
+    for ours, aliases in _DECLARED["other_names"].items():
+        theirs = [name for name in table.colnames if name.lower() in aliases]
         if ours not in table.colnames and theirs:
             table.rename_column(theirs[0], ours)
     return table
@@ -185,8 +185,8 @@ def check_catalog(table, *, filters=(), wcs=None, argument="catalog"):
     ids = read_ids(catalog, argument)
     wanted = "a table with integers or text in 'id'"
     # a number with a fraction is rather a measurement
-    plain = ids.dtype.kind in "iu" or (ids.dtype.kind == "U" and catalog["id"].dtype.kind != "f")
-    check_that(plain, argument, wanted, catalog["id"].dtype)
+    is_plain = ids.dtype.kind in "iu" or (ids.dtype.kind == "U" and catalog["id"].dtype.kind != "f")
+    check_that(is_plain, argument, wanted, catalog["id"].dtype)
     catalog["id"] = unique_ids(ascii_ids(ids, argument), argument)
     profile = catalog["profile"]
     # missing ones are refused below
@@ -201,7 +201,7 @@ def check_catalog(table, *, filters=(), wcs=None, argument="catalog"):
         if "." in name and linear and unit.is_equivalent(FNU):
             numbers[name] = FNU
     for name, unit in numbers.items():
-        catalog[name] = _plain(catalog, name, unit, argument)
+        catalog[name] = _plain_column(catalog, name, unit, argument)
     if "star" not in catalog.colnames:
         catalog["star"] = np.zeros(len(catalog), dtype=bool)
     star = catalog["star"]

@@ -79,8 +79,8 @@ def read_catalog(path, catalog_map=None, **options):
         path = locate(name)
     path = Path(path).expanduser()
     if not Path(split_extension(path)[0]).is_file():
-        known = ", ".join(key for key in sorted(resources()) if key.startswith("catalog."))
-        msg = f"no catalog {name!r}: neither a file nor one of {known}"
+        catalogs = ", ".join(key for key in sorted(resources()) if key.startswith("catalog."))
+        msg = f"no catalog {name!r}: neither a file nor one of {catalogs}"
         raise DataError(msg)
     catalog_map = as_catalog_map(catalog_map, options)
     table = read_table(path, wanted="a table", id_names=catalog_map.id_names)
@@ -117,12 +117,12 @@ def _missing_fluxes(catalog):
     if np.any(lost):
         first = ", ".join(map(str, catalog["id"][lost][:5].tolist()))
         if lost.sum() > 5:
-            more = ", ..."
+            ellipsis = ", ..."
         else:
-            more = ""
+            ellipsis = ""
         yield (
             f"{lost.sum()} of {len(catalog)} sources have no usable flux in any band "
-            f"(flag no_flux): ids {first}{more}"
+            f"(flag no_flux): ids {first}{ellipsis}"
         )
 
 
@@ -145,12 +145,12 @@ def _odd_units(catalog):
     pivots = {name: Filter.from_name(name).pivot.value for name in flux_bands(catalog.colnames)}
     galaxies = ~np.asarray(catalog["star"])
     mags = {name: np.where(galaxies, ab_magnitude(catalog[name]), np.nan) for name in pivots}
-    known = [name for name, mag in mags.items() if np.isfinite(mag).sum() >= _FEW]
-    if not known:
+    bands = [name for name, mag in mags.items() if np.isfinite(mag).sum() >= _FEW]
+    if not bands:
         return
-    reference = min(known, key=lambda name: abs(np.log(pivots[name] / 2.0)))
+    reference = min(bands, key=lambda name: abs(np.log(pivots[name] / 2.0)))
     yield from _odd_counts(catalog, mags[reference], reference)
-    for name in known:
+    for name in bands:
         color = mags[reference] - mags[name]
         if np.isfinite(color).sum() < _FEW:
             continue

@@ -37,9 +37,9 @@ class Places:
         if self._at.size == 1:
             return np.zeros(self._n_nodes, dtype=np.int64), np.zeros(self._n_nodes)
         node = np.arange(self._n_nodes) / self._oversampling - self._margin
-        below = np.clip(np.searchsorted(self._at, node, "right") - 1, 0, self._at.size - 2)
-        part = (node - self._at[below]) / np.diff(self._at)[below]
-        return below.astype(np.int64), np.clip(part, 0.0, 1.0)
+        lower_node = np.clip(np.searchsorted(self._at, node, "right") - 1, 0, self._at.size - 2)
+        part = (node - self._at[lower_node]) / np.diff(self._at)[lower_node]
+        return lower_node.astype(np.int64), np.clip(part, 0.0, 1.0)
 
     def tiles(self):
         """
@@ -131,32 +131,32 @@ def add_nodes(image, i, j, light, phases, *, margin):
         x0 = max(x - half, 0)
         x1 = min(x + half + 1, image.shape[1])
         if y1 > y0 and x1 > x0:
-            one = phases[row % os_, column % os_]
-            one = one[y0 - y + half : y1 - y + half, x0 - x + half : x1 - x + half]
-            image[y0:y1, x0:x1] += value * one
+            stamp = phases[row % os_, column % os_]
+            stamp = stamp[y0 - y + half : y1 - y + half, x0 - x + half : x1 - x + half]
+            image[y0:y1, x0:x1] += value * stamp
 
 
 def _kernels(data, origin, oversampling, order, y, x):
     """Phases of the kernels of 1, x, y and xy of the pixel, as far as they are not zero."""
     k_y, length_y = y
     k_x, length_x = x
-    one = data[order[k_y, k_x]]
+    corner = data[order[k_y, k_x]]
     # the splines' coefficients are those of the PSF times the offset: not the offset times them
-    u = (np.arange(one.shape[1]) - origin[0]) / oversampling / length_x
-    v = ((np.arange(one.shape[0]) - origin[1]) / oversampling / length_y)[:, None]
-    kernels = {(0, 0): one}
+    u = (np.arange(corner.shape[1]) - origin[0]) / oversampling / length_x
+    v = ((np.arange(corner.shape[0]) - origin[1]) / oversampling / length_y)[:, None]
+    kernels = {(0, 0): corner}
     if np.isfinite(length_x):
-        kernels[0, 1] = data[order[k_y, k_x + 1]] - one
-        kernels[0, 0] = one - u * kernels[0, 1]
+        kernels[0, 1] = data[order[k_y, k_x + 1]] - corner
+        kernels[0, 0] = corner - u * kernels[0, 1]
     if np.isfinite(length_y):
-        kernels[1, 0] = data[order[k_y + 1, k_x]] - one
+        kernels[1, 0] = data[order[k_y + 1, k_x]] - corner
         kernels[0, 0] = kernels[0, 0] - v * kernels[1, 0]
     if len(kernels) == 3:
-        both = data[order[k_y + 1, k_x + 1]] - one - kernels[0, 1] - kernels[1, 0]
-        kernels[1, 1] = both
-        kernels[0, 0] = kernels[0, 0] + u * v * both
-        kernels[0, 1] = kernels[0, 1] - v * both
-        kernels[1, 0] = kernels[1, 0] - u * both
+        opposite = data[order[k_y + 1, k_x + 1]] - corner - kernels[0, 1] - kernels[1, 0]
+        kernels[1, 1] = opposite
+        kernels[0, 0] = kernels[0, 0] + u * v * opposite
+        kernels[0, 1] = kernels[0, 1] - v * opposite
+        kernels[1, 0] = kernels[1, 0] - u * opposite
     return {power: phases(kernel, origin, oversampling) for power, kernel in kernels.items()}
 
 
@@ -191,16 +191,16 @@ def convolve(grid, data, order, rows, columns, *, origin, margin, oversampling, 
             x0, x1, low_x, high_x, size_x = _window(x_first, x_stop, columns.n_pixels, margin, os_)
             if high_y <= low_y or high_x <= low_x:
                 continue
-            light = own = grid[y_first:y_stop, x_first:x_stop]
-            if not own.any():
+            light = source_part = grid[y_first:y_stop, x_first:x_stop]
+            if not source_part.any():
                 continue
             full = (y1 - y0) * os_, (x1 - x0) * os_
-            if own.shape != full:
+            if source_part.shape != full:
                 # the tile begins or ends within a pixel
                 light = np.zeros(full, dtype=grid.dtype)
                 i = y_first - y0 * os_
                 j = x_first - x0 * os_
-                light[i : i + own.shape[0], j : j + own.shape[1]] = own
+                light[i : i + source_part.shape[0], j : j + source_part.shape[1]] = source_part
             kernels = _kernels(data, origin, os_, order, (k_y, length_y), (k_x, length_x))
             size = (size_y, size_x)
             totals = dict.fromkeys(kernels, 0.0)
@@ -216,10 +216,10 @@ def convolve(grid, data, order, rows, columns, *, origin, margin, oversampling, 
                         totals[power] += product
             y = np.arange(low_y - margin, high_y - margin)
             x = np.arange(low_x - margin, high_x - margin)
-            taken = np.ix_((y + margin - y0) % size_y, (x + margin - x0) % size_x)
+            wrapped = np.ix_((y + margin - y0) % size_y, (x + margin - x0) % size_x)
             target = image[y[0] : y[-1] + 1, x[0] : x[-1] + 1]
             for (in_y, in_x), total in totals.items():
-                piece = irfft2(total, size, workers=n_threads)[taken]
+                piece = irfft2(total, size, workers=n_threads)[wrapped]
                 if in_y:
                     piece *= ((y - y_0) / length_y)[:, None]
                 if in_x:

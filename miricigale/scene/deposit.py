@@ -89,9 +89,9 @@ def _cusps(grid, rows, tables, w_zone, land, executor):
         return part
 
     landed = np.zeros(rows.shape[0])
-    used = np.flatnonzero((box[:, 1] > box[:, 0]) & (box[:, 3] > box[:, 2]))
-    sizes = (box[used, 1] - box[used, 0]) * (box[used, 3] - box[used, 2])
-    for batch in np.array_split(used, max(1, math.ceil(sizes.sum() / _BATCH))):
+    drawn = np.flatnonzero((box[:, 1] > box[:, 0]) & (box[:, 3] > box[:, 2]))
+    sizes = (box[drawn, 1] - box[drawn, 0]) * (box[drawn, 3] - box[drawn, 2])
+    for batch in np.array_split(drawn, max(1, math.ceil(sizes.sum() / _BATCH))):
         parts = parallel_map(fill, batch, executor=executor)
         for k, part in zip(batch, parts, strict=True):
             landed[k] = _core.add_part(grid, part, box[k, 0], box[k, 2], land)

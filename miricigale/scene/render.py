@@ -76,10 +76,10 @@ class Painter:
 
     def __post_init__(self):
         data = np.asarray(self.psf.data, dtype=float)
-        where = [(0.0, 0.0)]
+        positions = [(0.0, 0.0)]
         if isinstance(self.psf, GriddedPSFModel):
             origin = np.subtract(data.shape[:0:-1], 1) / 2
-            where = np.asarray(self.psf.grid_xypos, dtype=float)
+            positions = np.asarray(self.psf.grid_xypos, dtype=float)
         elif isinstance(self.psf, ImagePSF):
             data = data[np.newaxis]
             origin = self.psf.origin
@@ -98,10 +98,10 @@ class Painter:
         thread_count(self.n_threads)
         oversampling = int(oversampling[0])
         origin = tuple(round(float(v)) for v in origin)
-        (x, k_x), (y, k_y) = (np.unique(v, return_inverse=True) for v in np.transpose(where))
+        (x, k_x), (y, k_y) = (np.unique(v, return_inverse=True) for v in np.transpose(positions))
         order = np.zeros((y.size, x.size), dtype=np.int64)
-        order[k_y, k_x] = np.arange(len(where))
-        tables = np.stack([phases(one, origin, oversampling) for one in data])
+        order[k_y, k_x] = np.arange(len(positions))
+        tables = np.stack([phases(image, origin, oversampling) for image in data])
         self.__dict__.update(_oversampling=oversampling, _origin=origin, _data=data)
         self.__dict__.update(_phases=tables, _order=order, _places=(y, x))
 
@@ -162,7 +162,7 @@ class Painter:
             Light in each pixel.
         in_image : `~numpy.ndarray`, shape (N,)
             Light of each source in the image; they add up to the image's sum.
-        kept : `~numpy.ndarray`, shape (N,)
+        landed_share : `~numpy.ndarray`, shape (N,)
             Fraction of the profile within the isophote at which it was cut.
         """
         os_ = self._oversampling
@@ -171,7 +171,7 @@ class Painter:
         node_x = (np.asarray(x) + margin) * os_
         node_y = (np.asarray(y) + margin) * os_
         in_image = np.zeros(len(node_x))
-        kept = np.ones(len(node_x))
+        landed_share = np.ones(len(node_x))
         extended = np.asarray(is_sersic) & (np.asarray(r_eff) * os_ >= _UNRESOLVED)
         points = ~extended
         points[list(images or {})] = False
@@ -184,7 +184,7 @@ class Painter:
             image = np.zeros(self.shape)
             # in the grid's precision: the same sum
             add_nodes(image, i, j, light.astype(np.float32), self._phases[0], margin=margin)
-            return image, in_image, kept
+            return image, in_image, landed_share
         grid = np.zeros((land.low_y.size, land.low_x.size), dtype=np.float32)
         if np.any(extended):
             radius = r_eff[extended] * os_
@@ -204,14 +204,18 @@ class Painter:
             in_image[extended] = deposit_profiles(
                 grid, rows, tables, w_zone, w_smooth, w_cut, land, n_threads=self.n_threads
             )
-            kept[extended] = sersic_enclosed_fraction(cut / radius, index)
+            landed_share[extended] = sersic_enclosed_fraction(cut / radius, index)
         for row, (dx, dy, share) in (images or {}).items():
             places = node_x[row] + dx * os_, node_y[row] + dy * os_
             in_image[row] = self._add_image(grid, *places, flux[row] * share, land)
         _core.deposit_nodes(grid, i, j, light)
         options = {"margin": margin, "oversampling": os_, "n_threads": self.n_threads}
         arrays = grid, self._data, self._order
-        return convolve(*arrays, *self._axes(), origin=self._origin, **options), in_image, kept
+        return (
+            convolve(*arrays, *self._axes(), origin=self._origin, **options),
+            in_image,
+            landed_share,
+        )
 
     @staticmethod
     def _add_image(grid, x, y, light, land):

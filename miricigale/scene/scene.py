@@ -280,9 +280,9 @@ class Scene(Interactive):
             got = f"turned by {turn:.1f} deg (see miricigale.psf.rotate_psf)"
             check_that(abs(turn) <= 1, "psf", "in the orientation of the WCS", got)
         if isinstance(psf, PSFGrid) and psf.subarray is not None:
-            own = aperture(psf.subarray).shape
-            got = f"those of {psf.subarray}, {own[1]} x {own[0]} pixels"
-            check_that(own == self._shape, "psf", "a grid of places on this image", got)
+            shape = aperture(psf.subarray).shape
+            got = f"those of {psf.subarray}, {shape[1]} x {shape[0]} pixels"
+            check_that(shape == self._shape, "psf", "a grid of places on this image", got)
         if psf.filter is not None:
             # other packages write F770W where we write miri.f770w
             wanted = self._filter.lower()
@@ -300,9 +300,9 @@ class Scene(Interactive):
         galaxy = self._galaxy_flux
         agn = self._agn_flux
         flux = galaxy + agn
-        x, y, near = pixel_positions(self._wcs, catalog["sky"], shape)
+        x, y, is_near = pixel_positions(self._wcs, catalog["sky"], shape)
         flags = np.zeros(len(catalog), dtype=int)
-        inside = near & (x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)
+        inside = is_near & (x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)
         flags[~inside] |= SceneFlags.OUTSIDE_IMAGE
         valid = np.isfinite(flux) & (flux >= 0)
         flags[~valid] |= SceneFlags.NO_FLUX
@@ -312,7 +312,7 @@ class Scene(Interactive):
         sersic &= ~spoilt
 
         # rows of the profiles, then those of the points at their centers
-        rows = np.flatnonzero(near & valid)
+        rows = np.flatnonzero(is_near & valid)
         n_profiles = rows.size
         rows = np.append(rows, rows[agn[rows] > 0])
         profile = np.arange(rows.size) < n_profiles
@@ -331,13 +331,13 @@ class Scene(Interactive):
         sources = {"is_sersic": is_sersic, "r_eff": radius, "axis_ratio": ratio, "theta": theta}
         sources |= {"x": x[rows], "y": y[rows], "n": catalog["sersic_index"][rows]}
         light = np.where(profile, galaxy[rows], agn[rows])
-        image, landed, whole = self._painter.paint(flux=light, images=images, **sources)
+        image, landed, total_flux = self._painter.paint(flux=light, images=images, **sources)
         in_image = np.bincount(rows, weights=landed, minlength=len(catalog))
         # of all light, the points' included
         lost = np.zeros(len(catalog))
-        own = rows[:n_profiles]
-        total = np.where(flux[own] > 0, flux[own], 1.0)
-        lost[own] = (1 - whole[:n_profiles]) * galaxy[own] / total
+        profile_rows = rows[:n_profiles]
+        total = np.where(flux[profile_rows] > 0, flux[profile_rows], 1.0)
+        lost[profile_rows] = (1 - total_flux[:n_profiles]) * galaxy[profile_rows] / total
         flags[lost > 0.01] |= SceneFlags.CUT_PROFILE
         dim = in_image < 0.95 * flux * (1 - lost) * self._painter.enclosed_by_psf
         flags[inside & valid & dim] |= SceneFlags.NEAR_EDGE

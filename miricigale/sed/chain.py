@@ -63,9 +63,9 @@ class Stars:
 
 def distinct(items):
     """Different items in the order of their first appearance, and which of them each one is."""
-    seen = {}
-    index = [seen.setdefault(item, len(seen)) for item in items]
-    return list(seen), np.array(index, dtype=np.int64)
+    row_of_value = {}
+    index = [row_of_value.setdefault(item, len(row_of_value)) for item in items]
+    return list(row_of_value), np.array(index, dtype=np.int64)
 
 
 class Chain:
@@ -210,28 +210,30 @@ class Chain:
             rows = np.flatnonzero(kind == i)
             v = self._dict(key, *STELLAR[1:])
             age, spectra, surviving, ionizing = self._populations(v["metallicity"])
-            some = [histories[row] for row in rows]
-            every = np.concatenate([*some, [0.0]])
-            end = np.cumsum([h.size for h in some])
-            weights = stellar.masses(every, end, v)
-            out["sfr"][rows] = every[end - 1]
+            parts = [histories[row] for row in rows]
+            flat = np.concatenate([*parts, [0.0]])
+            end = np.cumsum([h.size for h in parts])
+            weights = stellar.masses(flat, end, v)
+            out["sfr"][rows] = flat[end - 1]
             for last in (10, 100):
                 steps = np.minimum(np.diff(end, prepend=0), last)
                 ends = np.column_stack([end - steps, end]).ravel()
-                out[f"sfr_{last}myr"][rows] = np.add.reduceat(every, ends)[::2] / steps
-            both = weights.sum(axis=0)
-            bright = both * spectra[:, self.at[VISUAL]]
+                out[f"sfr_{last}myr"][rows] = np.add.reduceat(flat, ends)[::2] / steps
+            over_histories = weights.sum(axis=0)
+            bright = over_histories * spectra[:, self.at[VISUAL]]
             total = np.where(bright.any(axis=1), bright.sum(axis=1), np.nan)
             out["age_light"][rows] = (bright * age).sum(axis=1) / total * 1e-3
-            out["age_mass"][rows] = (both * age).sum(axis=1) / both.sum(axis=1) * 1e-3
-            out["stellar_mass"][rows] = (both * surviving).sum(axis=1)
-            for part, own in enumerate(weights):
-                light[part, rows] = _core.weighted_sums(own, spectra)
+            out["age_mass"][rows] = (
+                (over_histories * age).sum(axis=1) / over_histories.sum(axis=1) * 1e-3
+            )
+            out["stellar_mass"][rows] = (over_histories * surviving).sum(axis=1)
+            for part, shares in enumerate(weights):
+                light[part, rows] = _core.weighted_sums(shares, spectra)
                 if gas is not None:
                     hard = light[part, rows, : self._hard] * self.weights[: self._hard]
                     out["dust_power"][rows] += v["f_dust"] * hard.sum(axis=1)
                     light[part, rows, : self._hard] *= v["f_esc"]
-                    photons = _core.weighted_sums(own, ionizing)
+                    photons = _core.weighted_sums(shares, ionizing)
                     gas[part, rows] = _core.weighted_sums(photons, self._glow(key))
         light += 0.0 if gas is None else gas
         visual = light[:, :, self.at[VISUAL]].sum(axis=0)
@@ -244,8 +246,8 @@ class Chain:
         attenuation = self.by_role["attenuation"]
         values = self._dict(key, "attenuation")
         if attenuation is None:
-            ones = np.ones(self.wave.size)
-            return ones, ones, None
+            no_dimming = np.ones(self.wave.size)
+            return no_dimming, no_dimming, None
         if self.by_role["nebular"]:
             gas = attenuation.gas_factor(self.wave, values)
         else:
@@ -273,26 +275,27 @@ class Chain:
         """
         n = len(rows)
         none = np.zeros((0, self.wave.size))
-        some = slice(int(rows.min()), int(rows.max()) + 1)
+        block = slice(int(rows.min()), int(rows.max()) + 1)
         different, dim = distinct(keys)
         dust = np.zeros((1, self.wave.size))
         dusty = np.zeros(n, dtype=np.int64)
         if dust_keys is not None:
             dust_keys, dusty = distinct(dust_keys)
             dust = self.dusts(dust_keys)
-        parts = [stars.young[some], stars.old[some], none]
+        parts = [stars.young[block], stars.old[block], none]
         *dims, gas = zip(*map(self.factors, different), strict=True)
         dims = [*map(np.array, dims), none]
         if gas[0] is not None:
-            young = stars.nebular_young[some]
-            old = stars.nebular_old[some]
+            young = stars.nebular_young[block]
+            old = stars.nebular_old[block]
             parts = [parts[0] - young, parts[1] - old, young + old]
             dims[2] = np.array(gas)
         if out is None:
             out = np.empty((n, self.wave.size))
         absorbed = np.empty(n)
         _core.mix_light(
-            self.weights, *parts, rows - some.start, *dims, dim, stars.dust_power[some], dust, dusty, out, absorbed
+            self.weights, *parts, rows - block.start, *dims, dim, stars.dust_power[block], dust, dusty,
+            out, absorbed
         )  # fmt: skip
         return out, absorbed
 
@@ -340,8 +343,8 @@ class Chain:
         igm, foreground = (self.by_role[role] for role in SKY)
         out = np.ones(observed.size)
         if igm is not None:
-            own = {name: values[name] for name in self.names("igm")}
-            out = igm.transmission(observed, redshift, **own)
+            igm_values = {name: values[name] for name in self.names("igm")}
+            out = igm.transmission(observed, redshift, **igm_values)
         if foreground is not None:
             out = out * foreground.transmission(observed, values)
         return out

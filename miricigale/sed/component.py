@@ -50,12 +50,12 @@ def register(cls):
     check_that(cls.name, "name", "a name", f"{cls.name!r} of {cls.__name__}")
     got = f"{cls.role!r} of {cls.__name__}"
     check_that(cls.role in ROLES, "role", f"one of {', '.join(ROLES)}", got)
-    same = False
+    is_redefined = False
     if cls.name in COMPONENTS:
         old = COMPONENTS.get(cls.name)
-        same = (old.__module__, old.__qualname__) == (cls.__module__, cls.__qualname__)
+        is_redefined = (old.__module__, old.__qualname__) == (cls.__module__, cls.__qualname__)
     COMPONENTS.register(
-        cls.name, lambda _: cls, replace=same, role=cls.role, reference=cls.reference
+        cls.name, lambda _: cls, replace=is_redefined, role=cls.role, reference=cls.reference
     )
     return cls
 
@@ -115,17 +115,17 @@ class Component:
     options = {}
 
     def __init__(self, **defaults):
-        known = type(self).declared()
+        parameters = type(self).declared()
         options = type(self).all_options()
         self.__dict__.update({name: values[0] for name, values in options.items()})
         for name, value in defaults.items():
             if name in options:
                 wanted = f"one of {', '.join(options[name])}"
                 check_that(value in options[name], name, wanted, repr(value))
-            elif name in known:
-                value = known[name].check(value)
+            elif name in parameters:
+                value = parameters[name].check(value)
             else:
-                names = ", ".join([*known, *options])
+                names = ", ".join([*parameters, *options])
                 msg = f"{type(self).__name__} has no parameter {name!r}; known: {names}"
                 raise TypeError(msg)
             self.__dict__[name] = value
@@ -233,9 +233,9 @@ def read_config(config):
     """Components and other options of a model from plain values; see `SEDModel.from_dict`."""
     if not isinstance(config, Mapping):
         raise config_error("[sed]", f"must be a table of keys, got {type(config).__name__}")
-    known = ["components", "frac_agn_definition"]
-    if unknown := sorted(set(config).difference(known)):
-        raise config_error("[sed]", f"does not know {unknown}; known: {', '.join(known)}")
+    sections = ["components", "frac_agn_definition"]
+    if unknown := sorted(set(config).difference(sections)):
+        raise config_error("[sed]", f"does not know {unknown}; known: {', '.join(sections)}")
     parts = []
     entries = config.get("components", ())
     if isinstance(entries, (str, Mapping)) or not all(isinstance(e, Mapping) for e in entries):

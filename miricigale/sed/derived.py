@@ -71,32 +71,32 @@ def galaxy_quantities(stars, rows, absorbed, sums, reference_row=0):
     return out
 
 
-def agn_quantities(definition, ratio, galaxy, seen):
+def agn_quantities(definition, ratio, galaxy, observed):
     """
     Derived quantities of AGN, and ``ir_luminosity`` of galaxies with them: arrays of shape (n,).
 
     ``definition`` says what the fraction f refers to, ``ratio`` is f / (1 - f), ``galaxy`` comes from
-    `galaxy_quantities`; ``seen`` holds, for one watt of torus and polar emission, ``infrared``,
+    `galaxy_quantities`; ``observed`` holds, for one watt of torus and polar emission, ``infrared``,
     ``reference``, ``luminosity``, ``six`` and ``accretion``.
     """
     dust = galaxy["dust_luminosity"]
     infrared = galaxy["ir_luminosity"]
-    power = ratio * (dust if definition == "dust" else galaxy["reference"] / seen["reference"])
-    agn_infrared = power * seen["infrared"]
+    power = ratio * (dust if definition == "dust" else galaxy["reference"] / observed["reference"])
+    agn_infrared = power * observed["infrared"]
     total = infrared + agn_infrared
     return {
         "ir_luminosity": total,
         "agn_power": power,
-        "agn_luminosity": power * seen["luminosity"],
-        "accretion_power": power * seen["accretion"],
-        "l_6um": power * seen["six"],
+        "agn_luminosity": power * observed["luminosity"],
+        "accretion_power": power * observed["accretion"],
+        "l_6um": power * observed["six"],
         "frac_agn_dust": _fraction(power, power + dust),
         "frac_agn_ir": _fraction(agn_infrared, total),
     }
 
 
-def _fraction(part, whole):
-    return np.divide(part, whole, out=np.zeros_like(part), where=part > 0.0)
+def _fraction(part, total):
+    return np.divide(part, total, out=np.zeros_like(part), where=part > 0.0)
 
 
 def scaled_quantities(model, values, mass, redshift, far, parameters):
@@ -112,6 +112,6 @@ def scaled_quantities(model, values, mass, redshift, far, parameters):
     }
     xray = model.component("xray")
     if xray is not None:
-        own = {name: parameters[name] for name in xray.parameters}
-        out |= xray.derived(out["l_6um"], redshift, far, own)
+        xray_values = {name: parameters[name] for name in xray.parameters}
+        out |= xray.derived(out["l_6um"], redshift, far, xray_values)
     return out

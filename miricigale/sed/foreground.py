@@ -85,9 +85,9 @@ def extinction_curve(wave, law="G23", r_v=3.1):
     # rounding at the ends
     inside = (place > -1e-6) & (place < k.size - 1 + 1e-6)
     step = np.clip(place, 0.0, k.size - 1.0)
-    left = np.minimum(step.astype(int), k.size - 2)
-    part = step - left
-    return np.where(inside, k[left] * (1.0 - part) + k[left + 1] * part, np.nan)
+    node = np.minimum(step.astype(int), k.size - 2)
+    part = step - node
+    return np.where(inside, k[node] * (1.0 - part) + k[node + 1] * part, np.nan)
 
 
 def check_bands(filters, law, beyond="refuse"):
@@ -214,8 +214,8 @@ def _color_excess(ebv):
     flat = GalacticExtinction.ebv_galactic.replace(0.0, name="ebv").array(ebv)
     wrong = np.flatnonzero(~(np.isfinite(flat) & (flat >= 0)))
     if wrong.size:
-        some = ", ".join(map(str, wrong[:10])) + (", ..." if wrong.size > 10 else "")
-        got = f"something else in {wrong.size} of {flat.size} rows: {some}"
+        examples = ", ".join(map(str, wrong[:10])) + (", ..." if wrong.size > 10 else "")
+        got = f"something else in {wrong.size} of {flat.size} rows: {examples}"
         raise argument_error("ebv", "finite and not negative", got)
     return flat, np.ndim(ebv) == 0
 
@@ -232,8 +232,8 @@ def _band_grid(band, low, high, sed):
     if sed is not None:
         weights = weights * np.interp(wave, *sed)
     check_that(weights.sum() > 0, "sed", f"of positive flux in {band.name}", weights.sum())
-    used = (weights != 0) & (wave >= low) & (wave <= high)
-    return wave[used], weights[used], weights.sum()
+    inside = (weights != 0) & (wave >= low) & (wave <= high)
+    return wave[inside], weights[inside], weights.sum()
 
 
 def color_excess(sky, dust_map, *, scale=1.0):
@@ -415,8 +415,8 @@ def deredden(photometry, ebv, filters, *, law="G23", r_v=3.1, sed=None, beyond="
             if out[column].ndim != 1 or out[column].dtype.kind not in "fiu":
                 raise argument_error("photometry", "one number in each row", f"column {column!r}")
             info = out[column].info
-            kept = info.description, info.format
+            described = info.description, info.format
             out[column] = out[column] * factor
-            out[column].info.description, out[column].info.format = kept
+            out[column].info.description, out[column].info.format = described
     out.meta[_KEY] = dict(table.meta[_KEY])
     return out

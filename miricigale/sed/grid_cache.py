@@ -96,13 +96,13 @@ def cached_grid(model, axes, filters, make):
 
 def _make_room(folder, limit, keep):
     """Remove what was used least recently, unfinished files too, until the rest is small enough."""
-    found = {}
+    entries = {}
     for path in folder.iterdir():
         # another process may be at the same
         with contextlib.suppress(FileNotFoundError):
-            found[path] = path.stat()
-    total = sum(status.st_size for status in found.values())
-    for path in sorted(found, key=lambda path: found[path].st_mtime_ns):
+            entries[path] = path.stat()
+    total = sum(status.st_size for status in entries.values())
+    for path in sorted(entries, key=lambda path: entries[path].st_mtime_ns):
         if total > limit and path != keep:
             path.unlink(missing_ok=True)
-            total -= found[path].st_size
+            total -= entries[path].st_size

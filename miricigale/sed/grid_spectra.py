@@ -39,11 +39,11 @@ def band_names(grid, filters):
     wanted = "a list of names or a FilterSet"
     check_that(not isinstance(filters, str), "filters", wanted, repr(filters))
     if isinstance(filters, FilterSet):
-        given = {band.name: band for band in filters}
+        by_name = {band.name: band for band in filters}
     else:
-        given = {}
-    names = list(given or filters)
-    return names, {name: given.get(name) for name in names if name not in grid.filters}
+        by_name = {}
+    names = list(by_name or filters)
+    return names, {name: by_name.get(name) for name in names if name not in grid.filters}
 
 
 def draw_fluxes(grid, index, scale, names, extra, model):
@@ -56,17 +56,17 @@ def draw_fluxes(grid, index, scale, names, extra, model):
     that this has not, or None.
     """
     out = np.full((*scale.shape, len(names)), np.nan)
-    own = [i for i, name in enumerate(names) if name in grid.filters]
-    columns = [grid.filters.index(names[i]) for i in own]
-    for row in range(len(index)) if own else ():
+    in_grid = [i for i, name in enumerate(names) if name in grid.filters]
+    columns = [grid.filters.index(names[i]) for i in in_grid]
+    for row in range(len(index)) if in_grid else ():
         z, g, k, f = plain_index(grid, index[row]).T
         flux = grid.flux(z, g, k, f)[:, columns]
-        out[row][:, own] = scale[row][:, None] * flux
+        out[row][:, in_grid] = scale[row][:, None] * flux
     if extra and len(index):
         bands = [name if band is None else band for name, band in extra.items()]
-        other = [names.index(name) for name in extra]
+        extra_columns = [names.index(name) for name in extra]
         flux = model_fluxes(model, grid, index, bands)
-        out[:, :, other] = flux * scale[:, :, None]
+        out[:, :, extra_columns] = flux * scale[:, :, None]
     return out
 
 
@@ -151,16 +151,16 @@ def observed_spectra(model, grid, index, scale):
 
     As `rest_spectra`, but observed wavelengths that all models cover, and F_nu in uJy.
     """
-    rest, lnu = rest_spectra(model, grid, index, scale)
+    rest_wave, lnu = rest_spectra(model, grid, index, scale)
     redshift = grid.redshift[index[:, 0]]
-    wave = rest * (1.0 + np.median(redshift))
-    low = rest[0] * (1.0 + redshift.max())
-    high = rest[-1] * (1.0 + redshift.min())
+    wave = rest_wave * (1.0 + np.median(redshift))
+    low = rest_wave[0] * (1.0 + redshift.max())
+    high = rest_wave[-1] * (1.0 + redshift.min())
     wave = wave[(wave >= low) & (wave <= high)]
     out = np.empty((redshift.size, wave.size))
     for z in np.unique(redshift):
         sky = model.chain.sky(model.defaults | {"redshift": float(z)})
         factor = sky * float(dilution(z, distance(z, model.cosmology)))
         for row in np.flatnonzero(redshift == z):
-            out[row] = np.interp(wave, rest * (1.0 + z), lnu[row] * factor)
+            out[row] = np.interp(wave, rest_wave * (1.0 + z), lnu[row] * factor)
     return wave, out

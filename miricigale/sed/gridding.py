@@ -135,18 +135,18 @@ def _galaxy_tables(quantities):
 
 def agn_table(model, parts):
     """L_nu and properties of AGN for one watt of what the fraction refers to."""
-    spectra, seen = seen_agn(model.chain, parts)
+    spectra, observed = seen_agn(model.chain, parts)
     dusty = model.frac_agn_definition == "dust"
     if dusty:
         scale = np.ones(len(parts))
     else:
-        scale = 1.0 / seen["reference"]
+        scale = 1.0 / observed["reference"]
     values = {
         "agn_power": np.ones(len(parts)),
-        "agn_luminosity": seen["luminosity"],
-        "accretion_power": seen["accretion"],
-        "l_6um": seen["six"],
-        "ir_luminosity": seen["infrared"],
+        "agn_luminosity": observed["luminosity"],
+        "accretion_power": observed["accretion"],
+        "l_6um": observed["six"],
+        "ir_luminosity": observed["infrared"],
     }
     texts = {name: DERIVED[name].text for name in values}
     texts["ir_luminosity"] = "3-1000 um light of the AGN"
@@ -181,9 +181,9 @@ def model_grid(model, axes, filters):
     agn_spectra = np.zeros((0, chain.wave.size))
     agn_parameters = {n: p for n, p in of_agn.items() if n != "frac_agn"}
     if with_agn:
-        every = [r | {"frac_agn": 0.0} for r in _products(agn_parameters, axes)]
-        _refuse_invalid(model, [defaults | row for row in every], ("agn",))
-        agn_rows, count, inert = _distinct_agn(agn_component, every)
+        models = [r | {"frac_agn": 0.0} for r in _products(agn_parameters, axes)]
+        _refuse_invalid(model, [defaults | row for row in models], ("agn",))
+        agn_rows, count, inert = _distinct_agn(agn_component, models)
         parts = [chain.agn(row) for row in agn_rows]
         agn_spectra, properties_of_agn = agn_table(model, parts)
         nuclei = {

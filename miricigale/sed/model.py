@@ -90,10 +90,10 @@ class SEDModel(Interactive):
             twice = set(component.parameters) & (set(merged) | set(_MODEL_PARAMETERS))
             check_that(not twice, "components", "without shared parameter names", sorted(twice))
             merged.update(component.parameters)
-        own = dict(_MODEL_PARAMETERS)
+        model_parameters = dict(_MODEL_PARAMETERS)
         if self.component("dust") is None:
-            del own["dust_excess"]
-        self._parameters = merged | own
+            del model_parameters["dust_excess"]
+        self._parameters = merged | model_parameters
         self._notes = ()
         self.preset = None
 
@@ -162,8 +162,8 @@ class SEDModel(Interactive):
         >>> SEDModel.yang2021(libraries="bundled", igm="inoue2014")
         <SEDModel delayed -> bc03 -> calzetti -> dl07_alpha -> parametric_torus -> inoue2014>
         """
-        made = presets.yang2021_components(agn=agn, xray=xray, igm=igm, libraries=libraries)
-        return cls._of_preset("yang2021", made, options)
+        preset = presets.yang2021_components(agn=agn, xray=xray, igm=igm, libraries=libraries)
+        return cls._of_preset("yang2021", preset, options)
 
     @classmethod
     def survey(cls, *, agn=True, igm="meiksin2006", libraries="best", **options):
@@ -186,12 +186,12 @@ class SEDModel(Interactive):
         >>> SEDModel.survey(libraries="bundled", agn=False)
         <SEDModel delayed -> bc03 -> nebular -> calzetti -> dl07 -> meiksin2006>
         """
-        made = presets.survey_components(agn=agn, igm=igm, libraries=libraries)
-        return cls._of_preset("survey", made, options)
+        preset = presets.survey_components(agn=agn, igm=igm, libraries=libraries)
+        return cls._of_preset("survey", preset, options)
 
     @classmethod
-    def _of_preset(cls, name, made, options):
-        parts, notes = made
+    def _of_preset(cls, name, components, options):
+        parts, notes = components
         model = cls(parts, **options)
         model._notes = tuple(notes)
         model.preset = name
@@ -271,15 +271,15 @@ class SEDModel(Interactive):
         >>> SEDModel.survey(agn=False).named_axes()["metallicity"]
         array([0.004, 0.02 ])
         """
-        own = [n for n, (preset, _) in presets.GRIDS.items() if preset == self.preset]
+        names = [n for n, (preset, _) in presets.GRIDS.items() if preset == self.preset]
         if name is None:
-            if not own:
+            if not names:
                 wanted = "given for a model that has no grid of its own: a dict of its parameters to values"
                 raise argument_error("axes", wanted, "None")
             name = self.preset
         name = presets.grid_name(name)
-        if own and name not in own:
-            named = ", ".join(map(repr, own))
+        if names and name not in names:
+            named = ", ".join(map(repr, names))
             wanted = f"{named} or a dict of parameters to values for the model {self.preset!r}"
             raise argument_error("axes", wanted, repr(name))
         return presets.grid_axes(name, agn=self.has_agn)
@@ -304,10 +304,10 @@ class SEDModel(Interactive):
         return next((c for c in self.components if c.role == role), None)
 
     def __getitem__(self, name):
-        found = next((c for c in self.components if name in (c.name, c.role)), None)
-        if found is None:
+        component = next((c for c in self.components if name in (c.name, c.role)), None)
+        if component is None:
             raise unknown_name("component", name, [c.name for c in self.components])
-        return found
+        return component
 
     @property
     def has_agn(self):
@@ -363,10 +363,12 @@ class SEDModel(Interactive):
         xray = self.component("xray")
         # the relation is not linear: it is worked out after scaling
         if xray:
-            more = xray.columns
+            xray_columns = xray.columns
         else:
-            more = {}
-        return out | {n: Derived(unit, text, False, "xray") for n, (unit, text) in more.items()}
+            xray_columns = {}
+        return out | {
+            n: Derived(unit, text, False, "xray") for n, (unit, text) in xray_columns.items()
+        }
 
     def __getstate__(self):
         state = self.__dict__.copy()

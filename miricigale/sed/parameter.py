@@ -141,8 +141,8 @@ class Parameter:
         if isinstance(values, (list, tuple)) and any(hasattr(v, "unit") for v in values):
             values = self._quantity(values, "a mixture")
         mask = getattr(values, "mask", None)
-        plain = self.convert(getattr(values, "unmasked", values))
-        array = np.atleast_1d(np.asarray(np.ma.getdata(plain)))
+        converted = self.convert(getattr(values, "unmasked", values))
+        array = np.atleast_1d(np.asarray(np.ma.getdata(converted)))
         check_that(array.ndim == 1, self.name, "of one dimension", f"shape {array.shape}")
         check_that(array.dtype.kind in "iuf", self.name, "numbers", f"values of type {array.dtype}")
         out = array.astype(float)
@@ -159,18 +159,16 @@ class Parameter:
 
     def _refuse_logarithms(self, value):
         """Refuse bare numbers that are logarithms rather than values."""
-        plain = np.ma.getdata(value)
-        if self.logarithms is None or np.asarray(plain).dtype.kind not in "iuf":
+        data = np.ma.getdata(value)
+        if self.logarithms is None or np.asarray(data).dtype.kind not in "iuf":
             return
         low, high = self.logarithms
-        some = np.atleast_1d(plain)
-        some = some[(some > low) & (some < high)]
-        if some.size:
+        suspects = np.atleast_1d(data)
+        suspects = suspects[(suspects > low) & (suspects < high)]
+        if suspects.size:
             unit = self.unit.to_string()
-            wanted = (
-                f"in {unit}, not its logarithm: 10**{some[0]:g} or, if it is so small, a quantity"
-            )
-            raise argument_error(self.name, wanted, f"{some[0]:g}")
+            wanted = f"in {unit}, not its logarithm: 10**{suspects[0]:g} or, if it is so small, a quantity"
+            raise argument_error(self.name, wanted, f"{suspects[0]:g}")
 
     def _quantity(self, value, unit):
         try:

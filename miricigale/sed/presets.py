@@ -88,7 +88,7 @@ def _chooser(libraries):
     check_that(libraries in LIBRARIES, "libraries", f"one of {LIBRARIES}", repr(libraries))
     notes = []
 
-    def choose(what, better, plain, covers):
+    def choose(part, better, bundled, covers):
         if libraries == "bundled":
             why = ", as asked"
         elif find_resource(better.resource) is None:
@@ -100,11 +100,11 @@ def _chooser(libraries):
             else:
                 why = ""
         if why:
-            taken = plain
+            component = bundled
         else:
-            taken = better
-        notes.append(f"{what}: {taken.resource}{why}")
-        return taken
+            component = better
+        notes.append(f"{part}: {component.resource}{why}")
+        return component
 
     return choose, notes
 
@@ -232,9 +232,9 @@ def grid_name(name, argument="axes"):
         Of a former name.
     """
     if name in _FORMER:
-        now = _FORMER[name]
-        warn(f"{argument} {name!r} is now called {now!r}", AstropyDeprecationWarning)
-        return now
+        current = _FORMER[name]
+        warn(f"{argument} {name!r} is now called {current!r}", AstropyDeprecationWarning)
+        return current
     if name not in GRIDS:
         wanted = f"a dict of parameter name to values, or one of {', '.join(map(repr, GRIDS))}"
         raise argument_error(argument, wanted, repr(name))

@@ -117,17 +117,17 @@ def red_dot(**parameters):
     """
     check_names(parameters, "parameter of a red dot", _PARAMETERS)
     numbers = {}
-    known = {}
-    for name, (unit, default, least) in _PARAMETERS.items():
+    quantities = {}
+    for name, (unit, default, minimum) in _PARAMETERS.items():
         value = parameters.get(name, default * unit)
         number = to_array(value, unit, name, ndim=0, finite=True).item()
-        wanted = f"at least {least:g} {unit}".strip()
-        check_that(number >= least, name, wanted, f"{number:g}")
+        wanted = f"at least {minimum:g} {unit}".strip()
+        check_that(number >= minimum, name, wanted, f"{number:g}")
         numbers[name] = number
-        known[name] = number * unit
+        quantities[name] = number * unit
     fnu = _envelope(numbers) + _galaxy(numbers)
     fnu[_WAVE_UM <= _LYMAN] = 0.0
-    return SED(_WAVE_UM * WAVE, fnu * FNU, meta={"parameters": known})
+    return SED(_WAVE_UM * WAVE, fnu * FNU, meta={"parameters": quantities})
 
 
 def red_dots(axes=None):

@@ -109,19 +109,19 @@ class SED(Frozen, Interactive):
     def _value(self, name):
         # half-made copies have no meta yet
         if "meta" in self.__dict__:
-            known = self.derived | self.parameters
+            quantities = self.derived | self.parameters
         else:
-            known = {}
+            quantities = {}
         if name == "flux":
             return self.fnu.view(_Flux)
-        return known.get(name)
+        return quantities.get(name)
 
     def __post_init__(self):
         if not hasattr(self.fnu, "unit"):
             to_array(self.fnu, FNU, "fnu")
         # slow to make, and needed by other units than F_nu's own only
-        plain = self.fnu.unit == FNU
-        if plain:
+        is_converted = self.fnu.unit == FNU
+        if is_converted:
             spectral = []
         else:
             spectral = u.spectral_density(u.Quantity(self.wave, copy=False))
@@ -161,15 +161,15 @@ class SED(Frozen, Interactive):
         """Flux density F_lambda, erg/s/cm2/Angstrom."""
         return self.fnu.to(_FLAM, u.spectral_density(self.wave))
 
-    def _each(self, change):
+    def _changed(self, change):
         """Copy with F_nu of the whole and of each part changed."""
-        parts = {name: part._each(change) for name, part in self.components.items()}
+        parts = {name: part._changed(change) for name, part in self.components.items()}
         return self.replace(fnu=change(self.fnu), components=parts)
 
     def __mul__(self, number):
         if not is_number(number):
             return NotImplemented
-        return self._each(lambda fnu: fnu * number)
+        return self._changed(lambda fnu: fnu * number)
 
     __rmul__ = __mul__
 
@@ -258,7 +258,9 @@ class SED(Frozen, Interactive):
             table[name] = part.fnu
         table.meta["redshift"] = self.redshift
         for values in (self.parameters, self.derived):
-            table.meta |= {name: float(u.Quantity(one).value) for name, one in values.items()}
+            table.meta |= {
+                name: float(u.Quantity(quantity).value) for name, quantity in values.items()
+            }
         table.meta |= {k: v for k, v in self.meta.items() if k not in ("parameters", "derived")}
         return table
 
@@ -365,4 +367,6 @@ class SED(Frozen, Interactive):
         facts = {"SED": span, "redshift": f"{self.redshift:.4g}"}
         if self.components:
             facts["components"] = ", ".join(self.components)
-        return facts | {name: f"{u.Quantity(one):.4g}" for name, one in self.derived.items()}
+        return facts | {
+            name: f"{u.Quantity(quantity):.4g}" for name, quantity in self.derived.items()
+        }

@@ -144,8 +144,8 @@ def spectra(model, values):
         agn = chain.agn(values)
         fraction = values["frac_agn"]
         ratio = np.array([fraction / (1.0 - fraction)])
-        _, seen = seen_agn(chain, [agn])
-        got |= agn_quantities(model.frac_agn_definition, ratio, got, seen)
+        _, observed = seen_agn(chain, [agn])
+        got |= agn_quantities(model.frac_agn_definition, ratio, got, observed)
         spectrum = spectrum + got["agn_power"] * agn.total
         for name in ("disk", "torus", "polar"):
             parts[f"agn_{name}"] = got["agn_power"] * getattr(agn, name)
@@ -187,21 +187,23 @@ class _Blocks:
         """Light of galaxies, and their derived quantities."""
         chain = self.chain
         stars, dims, dusts = (self._keys(rows, *roles) for roles in GALAXY)
-        stars, which = chain.stars(stars)
-        light, absorbed = chain.attenuated(stars, which, dims, dusts, self._light[: len(rows)])
+        stars, history_of_row = chain.stars(stars)
+        light, absorbed = chain.attenuated(
+            stars, history_of_row, dims, dusts, self._light[: len(rows)]
+        )
         if "dust_excess" in self.values:
             excess = self.values["dust_excess"][rows]
             for i in np.flatnonzero(excess != 1.0):
                 light[i] += (excess[i] - 1.0) * absorbed[i] * chain.dust(dusts[i])
             absorbed *= excess
         sums = light @ chain.functionals.T
-        return light, galaxy_quantities(stars, which, absorbed, sums, chain.reference_row)
+        return light, galaxy_quantities(stars, history_of_row, absorbed, sums, chain.reference_row)
 
     def agn(self, rows):
         """Spectra of AGN for one watt, which of them each row has, and their sums."""
         chain = self.chain
         n = len(rows)
-        which = np.zeros(n, dtype=np.int64)
+        model_of_row = np.zeros(n, dtype=np.int64)
         names = chain.names("agn")
         active = np.flatnonzero(self.values["frac_agn"][rows] > 0)
         # without any the first row stands for all, at no power
@@ -212,9 +214,13 @@ class _Blocks:
         keys, place = distinct(keys)
         parts = list(map(chain.agn_templates, keys))
         # the others have the first one, at no power
-        which[active] = place[index]
-        spectra, seen = seen_agn(chain, parts)
-        return spectra, which, {name: array[which] for name, array in seen.items()}
+        model_of_row[active] = place[index]
+        spectra, observed = seen_agn(chain, parts)
+        return (
+            spectra,
+            model_of_row,
+            {name: array[model_of_row] for name, array in observed.items()},
+        )
 
     def run(self, rows):
         """Fluxes in uJy and derived quantities of rows, masses included."""
@@ -225,13 +231,13 @@ class _Blocks:
         mass = values["mass"][rows]
         light, derived = self.galaxies(rows)
         power = np.zeros(n)
-        which = np.zeros(n, dtype=np.int64)
+        model_of_row = np.zeros(n, dtype=np.int64)
         spectra = np.zeros((1, chain.wave.size))
         if self.model.has_agn:
-            spectra, which, seen = self.agn(rows)
+            spectra, model_of_row, observed = self.agn(rows)
             fraction = values["frac_agn"][rows]
             definition = self.model.frac_agn_definition
-            derived |= agn_quantities(definition, fraction / (1 - fraction), derived, seen)
+            derived |= agn_quantities(definition, fraction / (1 - fraction), derived, observed)
             power = derived["agn_power"]
         names = ("redshift", *chain.names(*SKY))
         different, sky = distinct(_keys(values, names, rows))
@@ -244,11 +250,11 @@ class _Blocks:
         flux = np.empty((n, self.bands[0].size - 1))
         scale = mass * dilution(z, self.far[rows])
         _core.block_fluxes(
-            chain.wave, chain.log_wave, chain.to_lnu, light, spectra, which, power, dim, sky, z, scale,
+            chain.wave, chain.log_wave, chain.to_lnu, light, spectra, model_of_row, power, dim, sky, z, scale,
             *self.bands, UNCOVERED, flux,
         )  # fmt: skip
-        own = {name: column[rows] for name, column in values.items()}
-        return flux, scaled_quantities(self.model, derived, mass, z, self.far[rows], own)
+        block = {name: column[rows] for name, column in values.items()}
+        return flux, scaled_quantities(self.model, derived, mass, z, self.far[rows], block)
 
 
 def flux_table(model, table, filters):
@@ -257,8 +263,8 @@ def flux_table(model, table, filters):
     _warn_of_slips(model, table.colnames)
     n = len(table)
     names = model.derived_columns()
-    taken = set(filters.names) & {"id", "flags", *names}
-    check_that(not taken, "filters", "without names of other columns", sorted(taken))
+    reserved = set(filters.names) & {"id", "flags", *names}
+    check_that(not reserved, "filters", "without names of other columns", sorted(reserved))
     values = _columns(model, table)
     flags = _row_flags(model, values, n)
     flux = np.full((n, len(filters)), np.nan)

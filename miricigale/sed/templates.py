@@ -73,10 +73,10 @@ def read_spectra(path):
         check_data(files, path, f"has no files of spectra ({', '.join(_SUFFIXES)})")
     out = {}
     for file in files:
-        found = _read_file(file)
-        if found.keys() & out.keys():
+        spectra = _read_file(file)
+        if spectra.keys() & out.keys():
             raise data_error(file, "has the name of another file of spectra but for its suffix")
-        out |= found
+        out |= spectra
     return out
 
 
@@ -88,15 +88,15 @@ def _read_file(file):
     if len(table.colnames) < 2:
         got = f"it has the columns {table.colnames}"
         raise data_error(file, f"cannot be read as a spectrum: {got}")
-    first, *others = table.colnames
-    gravities = [name for name in others if re.fullmatch(r"g\d\d", name)]
+    first, *fluxes = table.colnames
+    gravities = [name for name in fluxes if re.fullmatch(r"g\d\d", name)]
     with file_errors(file, "cannot be read as a spectrum"):
         # NaN where a value is lacking, which is none of a spectrum
         wave = plain_floats(table[first], first, "spectrum") * _unit(table[first], u.AA)
         endings = "|".join(map(re.escape, _SUFFIXES))
         stem = re.sub(rf"({endings})?(\.gz)?$", "", file.name, flags=re.I)
         out = {}
-        for column in gravities or others[:1]:
+        for column in gravities or fluxes[:1]:
             values = plain_floats(table[column], column, "spectrum").reshape(wave.size, -1).T
             if gravities:
                 parts = [column]
@@ -104,14 +104,14 @@ def _read_file(file):
                 parts = range(len(values))
             else:
                 parts = [None]
-            for part, one in zip(parts, values, strict=True):
+            for part, flux in zip(parts, values, strict=True):
                 # atmospheres that were not computed are 0 in such files
-                if not gravities or one.any():
+                if not gravities or flux.any():
                     if part is None:
                         name = stem
                     else:
                         name = f"{stem}[{part}]"
-                    out[name] = SED(wave, one * _unit(table[column], _FLAM))
+                    out[name] = SED(wave, flux * _unit(table[column], _FLAM))
         return out
 
 
@@ -174,7 +174,12 @@ def template_grid(spectra, filters, *, beyond="error", redshift=None):
     check_that(spectra, "spectra", "a dict of at least one spectrum", spectra)
     if not isinstance(filters, FilterSet):
         filters = FilterSet(filters)
-    seds = {k: one if isinstance(one, SED) else SED.from_synphot(one) for k, one in spectra.items()}
+    seds = {}
+    for name, spectrum in spectra.items():
+        if isinstance(spectrum, SED):
+            seds[name] = spectrum
+        else:
+            seds[name] = SED.from_synphot(spectrum)
     if beyond != "error":
         last = max(band.wave[-1] for band in filters)
         short = [name for name, sed in seds.items() if sed.wave[-1] < last]
@@ -191,7 +196,7 @@ def template_grid(spectra, filters, *, beyond="error", redshift=None):
     if redshift is None:
         flux = np.array([[_fluxes(name, sed, filters) for name, sed in seds.items()]])
     else:
-        flux = _seen(list(seds.values()), z, filters)
+        flux = _observed_fluxes(list(seds.values()), z, filters)
     mean = flux.mean(axis=-1, keepdims=True)
     n = len(seds)
     columns = _columns(list(seds.values()))
@@ -223,13 +228,13 @@ def _columns(seds):
     columns = {name: u.Quantity([sed.parameters[name] for sed in seds]) for name in names}
     values = [column.value.tolist() for column in columns.values()]
     n_points = len(set(zip(*values, strict=True)))
-    n_grid = np.prod([len(set(own)) for own in values])
+    n_grid = np.prod([len(set(labels)) for labels in values])
     if not n_points == n_grid == len(seds):
         return numbers
     return {name: (column, name) for name, column in columns.items()}
 
 
-def _seen(seds, redshifts, filters):
+def _observed_fluxes(seds, redshifts, filters):
     """Fluxes of spectra at redshifts, of any scale: shape (n_z, n, n_filters)."""
     igm = Meiksin2006()
     alike = {}
@@ -238,10 +243,10 @@ def _seen(seds, redshifts, filters):
         wave = sed.rest_wavelength.to_value(WAVE)
         alike.setdefault(wave.tobytes(), (wave, []))[1].append(i)
     out = np.empty((len(redshifts), len(seds), len(filters)))
-    for rest, rows in alike.values():
+    for shared, rows in alike.values():
         fnu = np.array([seds[i].fnu.to_value(FNU) for i in rows])
         for k, redshift in enumerate(redshifts):
-            wave = rest * (1.0 + redshift)
+            wave = shared * (1.0 + redshift)
             weights = filters.weights(wave) * igm.transmission(wave, redshift)
             out[k, rows] = fnu @ weights.T
     return out
@@ -253,8 +258,8 @@ def _continued(sed):
     fnu = sed.fnu.to_value(FNU)
     end = wave > _END * wave[-1]
     level = np.mean((fnu * wave**2)[end])
-    more = np.geomspace(wave[-1], max(_FAR, 2.0 * wave[-1]), 400)[1:]
-    return SED(np.append(wave, more) * WAVE, np.append(fnu, level / more**2) * FNU)
+    extension = np.geomspace(wave[-1], max(_FAR, 2.0 * wave[-1]), 400)[1:]
+    return SED(np.append(wave, extension) * WAVE, np.append(fnu, level / extension**2) * FNU)
 
 
 def _fluxes(name, sed, filters):

@@ -90,9 +90,9 @@ class XRays:
         cut = positive(self.cutoff, u.keV, "cutoff")
         a1, a2 = self.angle_coefficients
         mu = np.cos(np.radians([np.broadcast_to(_ANGLE, np.shape(inclination)), inclination]))
-        at_30, seen = a1 * mu + a2 * mu**2 + 1.0 - a1 - a2
+        at_30, at_angle = a1 * mu + a2 * mu**2 + 1.0 - a1 - a2
         # L_E at 2 keV, whose integral over the spectrum's shape is the power
-        at_two = 10.0 ** (alpha_ox / _PER_DEX) * disk * seen / at_30 * _PER_KEV
+        at_two = 10.0 ** (alpha_ox / _PER_DEX) * disk * at_angle / at_30 * _PER_KEV
         shape = _energy(*_HARD, self.photon_index, cut) / _shape(_TWO, self.photon_index, cut)
         return Source(at_two * shape, self.photon_index, cut, _HARD)
 
@@ -159,8 +159,8 @@ def with_xray_bands(grid, model, bands, *, alpha_ox=ALPHA_OX, **options):
     ('miri.f770w', 'chandra_hard')
     """
     energies = {name: check_band(band, f"bands[{name!r}]") for name, band in bands.items()}
-    taken = set(energies) & set(grid.filters)
-    if taken or not energies:
+    clashing = set(energies) & set(grid.filters)
+    if clashing or not energies:
         raise argument_error("bands", f"new ones beside {list(grid.filters)}", f"{list(bands)}")
     if "age_mass" not in grid.galaxy_shape.colnames or "alpha_ox" in grid.agn_parameters.colnames:
         got = f"{grid.galaxy_shape.colnames} and {grid.agn_parameters.colnames}"
@@ -175,8 +175,8 @@ def with_xray_bands(grid, model, bands, *, alpha_ox=ALPHA_OX, **options):
     def observed(*sources):
         """Fluxes in uJy, (nz, n, n_bands)."""
         ends = energies.values()
-        seen = [[s.dimming(two, z, far)[:, None] * s.power for s in sources] for two in ends]
-        return np.moveaxis(np.sum(seen, axis=1), 0, -1)
+        fluxes = [[s.dimming(two, z, far)[:, None] * s.power for s in sources] for two in ends]
+        return np.moveaxis(np.sum(fluxes, axis=1), 0, -1)
 
     galaxies = xrays.galaxy(
         grid.galaxy_properties["sfr_100myr"].to_value(1 / u.yr),

@@ -288,8 +288,8 @@ def _refined(wave, dust, fine):
 def _refusal(path, axes):
     values = dict(zip(SKIRTOR_AXES, axes, strict=True))
     parts = [
-        f"'{name}' must be one of {', '.join(f'{v:g}' for v in there)}, got {values[name]:g}"
-        for name, there in open_library(path, Skirtor2016.resource).missing(**values).items()
+        f"'{name}' must be one of {', '.join(f'{v:g}' for v in available)}, got {values[name]:g}"
+        for name, available in open_library(path, Skirtor2016.resource).missing(**values).items()
     ]
     if parts:
         return f"{'; '.join(parts)} (the library at {path} has no more)"
@@ -307,13 +307,13 @@ def _torus(path, wave_bytes, disk, slope, axes):
     above = table.row(**values | {"inclination": 0.0})
     wave = np.frombuffer(wave_bytes)
     places = (("disk", row), ("disk", above), ("dust", row))
-    seen, top, dust = (table.spectrum(*place) for place in places)
+    observed, top, dust = (table.spectrum(*place) for place in places)
     fine = _fine(table.wave)
     dust = _refined(table.wave, np.asarray(dust, dtype=float), fine)
     scale = 1.0 / np.trapezoid(dust, fine)
-    through = np.divide(seen, top, out=np.zeros_like(top), where=top > 0.0)
+    through = np.divide(observed, top, out=np.zeros_like(top), where=top > 0.0)
     face_on = _core.disk_spectrum(wave, slope, disk)
     face_on *= scale * np.trapezoid(top, table.wave) / np.trapezoid(face_on, wave)
-    seen = face_on * np.interp(wave, table.wave, through)
+    observed = face_on * np.interp(wave, table.wave, through)
     dust = np.interp(wave, fine, dust * scale, left=0.0, right=0.0)
-    return TorusSpectra(*map(frozen_array, (face_on, seen, dust)))
+    return TorusSpectra(*map(frozen_array, (face_on, observed, dust)))

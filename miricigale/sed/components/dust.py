@@ -85,7 +85,7 @@ class _Mixture(DustEmission):
         return self.spectra({name: np.array([value]) for name, value in values.items()})[0]
 
 
-def _between(axis, values):
+def _interpolation_weights(axis, values):
     """Weights, shape (n, n_axis), of the linear interpolation between ascending nodes."""
     cell, part = _core.cells(axis, values)
     out = np.zeros((values.size, axis.size))
@@ -133,7 +133,7 @@ class Dale2014(_Mixture):
 
     def mixture(self, columns):
         alphas, spectra = _sequence(open_library(self.path, self.resource), self.starlight)
-        return _between(alphas, columns["alpha"]), spectra
+        return _interpolation_weights(alphas, columns["alpha"]), spectra
 
 
 #: Constants of L(alpha, T) in um^1/2, um^1/2, 1 / (um K), 1 / (um K), of Casey 2012.
@@ -232,12 +232,12 @@ class _DraineLi(_Mixture):
 
     def mixture(self, columns):
         weight = self._weights(columns)
-        spectra, plain = self._tables()
+        spectra, minimum_spectra = self._tables()
         strength = columns["pah_33"][:, None]
         if np.all(strength == 1.0):
             return weight, spectra
-        both = np.hstack([strength * weight, (1.0 - strength) * weight])
-        return both, np.concatenate([spectra, plain])
+        both_weights = np.hstack([strength * weight, (1.0 - strength) * weight])
+        return both_weights, np.concatenate([spectra, minimum_spectra])
 
 
 @register
@@ -277,9 +277,11 @@ class DraineLi2007(_DraineLi):
         In units of the starlight near the Sun. The power per dust mass is P0 <U>, P0 being that at
         U = 1 (135 to 139 L_sun / M_sun in the table's source, by q_PAH).
         """
-        least = values["u_min"]
+        minimum = values["u_min"]
         gamma = values["gamma"]
-        return float(least * (1.0 + gamma * (np.log(U_MAX / least) / (1.0 - least / U_MAX) - 1.0)))
+        return float(
+            minimum * (1.0 + gamma * (np.log(U_MAX / minimum) / (1.0 - minimum / U_MAX) - 1.0))
+        )
 
     def _tables(self):
         return _by_mass(self.path)
@@ -287,8 +289,12 @@ class DraineLi2007(_DraineLi):
     def _weights(self, columns):
         table = load_dl07(self.path)
         u_min = columns["u_min"]
-        share = _between(table["qpah"], columns["q_pah"])
-        scale = _between(np.log(table["umin"]), np.log(u_min)) * u_min[:, None] / table["umin"]
+        share = _interpolation_weights(table["qpah"], columns["q_pah"])
+        scale = (
+            _interpolation_weights(np.log(table["umin"]), np.log(u_min))
+            * u_min[:, None]
+            / table["umin"]
+        )
         weight = (share[:, :, None] * scale[:, None]).reshape(u_min.size, -1)
         gamma = columns["gamma"][:, None]
         return np.hstack([(1.0 - gamma) * weight, gamma * weight])
@@ -353,9 +359,9 @@ def _without_feature(wave, spectra):
     log_wave = np.log(wave)
     share = (log_wave[feature] - log_wave[ends[0]]) / np.ptp(log_wave[ends])
     low, high = np.log(np.maximum(spectra[:, ends], 1e-300)).T[:, :, None]
-    plain = spectra.copy()
-    plain[:, feature] = np.exp(low + share * (high - low))
-    return plain
+    smooth = spectra.copy()
+    smooth[:, feature] = np.exp(low + share * (high - low))
+    return smooth
 
 
 @cached_by_file(maxsize=2)

@@ -63,8 +63,8 @@ class IGM(Component):
     def nodes(self):
         """Both sides of the Lyman lines and limit, where it jumps, and some below the limit."""
         edges = self.edges()
-        below = edges[-1] * _BELOW_LIMIT
-        return np.sort(np.concatenate([edges * (1 - 1e-5), edges * (1 + 1e-5), below]))
+        blue_edge = edges[-1] * _BELOW_LIMIT
+        return np.sort(np.concatenate([edges * (1 - 1e-5), edges * (1 + 1e-5), blue_edge]))
 
 
 @register
@@ -153,6 +153,6 @@ def load_lines(path):
         table = np.array([columns[name] for name in _COLUMNS], dtype=float).T
     positive = table.shape == (39, len(_COLUMNS)) and np.all(np.isfinite(table) & (table > 0))
     if not positive or np.any(np.diff(table[:, 0]) >= 0):
-        what = "must hold six columns of 39 positive numbers, from the longest wavelength on"
-        raise data_error(path, what)
+        problem = "must hold six columns of 39 positive numbers, from the longest wavelength on"
+        raise data_error(path, problem)
     return tuple(map(frozen_array, _core.inoue_lines(table)))

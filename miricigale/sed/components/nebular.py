@@ -180,11 +180,11 @@ class Nebular(Component):
         wanted = self._metallicity(values)
         models = table.models(wanted)
         if not models.size:
-            known = ", ".join(f"{z:g}" for z in np.unique(table.metallicity))
+            available = ", ".join(f"{z:g}" for z in np.unique(table.metallicity))
             if self.gas == "free":
-                return f"'metallicity_gas' must be one of {known}, got {wanted:g}"
+                return f"'metallicity_gas' must be one of {available}, got {wanted:g}"
             return (
-                f"'metallicity' must be one of {known} for the gas to have it, got {wanted:g};"
+                f"'metallicity' must be one of {available} for the gas to have it, got {wanted:g};"
                 " give the gas its own with gas='free'"
             )
         low, high = table.log_u[models[[0, -1]]]

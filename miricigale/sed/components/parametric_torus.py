@@ -104,11 +104,11 @@ def _torus(path, wave_bytes, disk, slope, shape):
     tau, inclination, opening, _, q, _ = shape
     face_on = _core.disk_spectrum(wave, slope, disk)
     face_on /= _core.DISK_MEAN * np.trapezoid(face_on, wave)
-    seen = face_on * _seen_fraction(const, wave, tau, inclination, opening, q)
+    observed = face_on * _seen_fraction(const, wave, tau, inclination, opening, q)
     dust = _dust_shape(const["emission"], wave_bytes, shape)
     power = _absorbed(path, tau, opening, q) * _anisotropy(const, tau, inclination, opening)
     dust *= power / np.trapezoid(dust, wave)
-    return TorusSpectra(*map(frozen_array, (face_on, seen, dust)))
+    return TorusSpectra(*map(frozen_array, (face_on, observed, dust)))
 
 
 def _seen_fraction(const, wave, tau, inclination, opening, q):
@@ -163,8 +163,8 @@ def _absorbed(path, tau, opening, q):
     escaped = 0.0
     for low, high in ((0.0, mu_edge), (mu_edge, 1.0)):
         angle = np.degrees(np.arccos(low + (high - low) * nodes))[:, None]
-        seen = _seen_fraction(const, wave, tau, angle, opening, q)
-        escaped += (high - low) * (weights @ np.trapezoid(spectrum * seen, wave, axis=1))
+        transmitted = _seen_fraction(const, wave, tau, angle, opening, q)
+        escaped += (high - low) * (weights @ np.trapezoid(spectrum * transmitted, wave, axis=1))
     return float(1.0 - escaped / _core.DISK_MEAN)
 
 

@@ -81,8 +81,8 @@ class StellarPopulations(Component):
             `table`; the integral is exact for spectra that are straight lines between `nodes`.
         """
         weights = _core.photon_weights(np.asarray(self.nodes()), _core.LYMAN_LIMIT)
-        some = np.flatnonzero(weights)
-        part = slice(0, some[-1] + 1 if some.size else 0)
+        used_ages = np.flatnonzero(weights)
+        part = slice(0, used_ages[-1] + 1 if used_ages.size else 0)
         return self.table(metallicity)[1][:, part] @ weights[part]
 
     def age_weights(self, history, values):
@@ -119,14 +119,14 @@ class StellarPopulations(Component):
     def invalid(self, values):
         wanted = values["metallicity"]
         if abs(self.nearest(wanted) / wanted - 1.0) > 1e-3:
-            known = ", ".join(f"{z:g}" for z in self.metallicities())
-            return f"'metallicity' must be one of {known}, got {wanted:g}"
+            available = ", ".join(f"{z:g}" for z in self.metallicities())
+            return f"'metallicity' must be one of {available}, got {wanted:g}"
         return None
 
 
 @cached(maxsize=256)
-def _nearest(known, metallicity):
-    return min(known, key=lambda z: abs(np.log(z / metallicity)))
+def _nearest(nodes, metallicity):
+    return min(nodes, key=lambda z: abs(np.log(z / metallicity)))
 
 
 @cached(maxsize=16)
