@@ -20,8 +20,8 @@ def _tables():
     """Names without a rule, rules of CIGALE's names, and rules of names written in any way."""
     tables = declared("miricigale.filters", "band_names.toml")
     rules = [(re.compile(rule), ours, *back) for rule, ours, *back in tables["rules"]]
-    free = [(re.compile(rule, re.IGNORECASE), ours) for rule, ours in tables["free"]]
-    return tables["names"], rules, free
+    patterns = [(re.compile(rule, re.IGNORECASE), ours) for rule, ours in tables["free"]]
+    return tables["names"], rules, patterns
 
 
 @cached
@@ -59,10 +59,10 @@ def find_filter(text):
     ('miri.f770w', 'sedpy.sdss_r0')
     """
     lower = text.lower()
-    alone = _ALONE.fullmatch(lower)
-    found = [n for n in FILTERS.names() if lower in (n, n.partition(".")[2] if alone else n)]
-    if len(found) == 1:
-        return found[0]
+    is_short = _ALONE.fullmatch(lower)
+    matches = [n for n in FILTERS.names() if lower in (n, n.partition(".")[2] if is_short else n)]
+    if len(matches) == 1:
+        return matches[0]
     name = filter_of_band(text)
     if name is None and text in _curves():
         ours = [name for name in FILTERS.names() if FILTERS.metadata(name)["curve"] == text]
@@ -73,15 +73,15 @@ def find_filter(text):
     return name
 
 
-def known_filter(given, known, kind="filter"):
+def known_filter(label, names, kind="filter"):
     """
     Filter out of some that a user means.
 
     Parameters
     ----------
-    given : str or `~miricigale.filters.Filter`
+    label : str or `~miricigale.filters.Filter`
         In any of the forms of `find_filter`.
-    known : iterable of str
+    names : iterable of str
         Our names of those that may be meant.
     kind : str, optional
         What they are called in messages.
@@ -89,20 +89,20 @@ def known_filter(given, known, kind="filter"):
     Returns
     -------
     name : str
-        One of ``known``.
+        One of ``names``.
 
     Raises
     ------
     KeyError
         If it is none of them.
     """
-    text = str(getattr(given, "name", given))
-    if text in known:
+    text = str(getattr(label, "name", label))
+    if text in names:
         name = text
     else:
         name = find_filter(text)
-    if name not in known:
-        raise unknown_name(kind, text, known)
+    if name not in names:
+        raise unknown_name(kind, text, names)
     return name
 
 
@@ -136,12 +136,12 @@ def filter_of_band(band):
     """
     if _is_here(band):
         return band
-    names, _, free = _tables()
+    names, _, patterns = _tables()
     if name := names.get(band) or _by_rule(band):
         return name
-    plain = _BETWEEN.sub(".", _ENDING.sub("", band.strip()))
-    for rule, ours in free:
-        match = rule.fullmatch(plain)
+    bare_name = _BETWEEN.sub(".", _ENDING.sub("", band.strip()))
+    for rule, ours in patterns:
+        match = rule.fullmatch(bare_name)
         if match:
             part = "".join(match.groups())
             written = (part.lower(), part.upper(), part.capitalize())
@@ -219,22 +219,22 @@ def xray_energies(band):
     return None
 
 
-def band_filters(bands, known):
+def band_filters(bands, names):
     """
     Filters of bands: a dict of our name to CIGALE's, and the bands without a filter here.
 
-    ``known`` are filters that the user gave by CIGALE's names, as `given_filters` has them. Emission lines
+    ``names`` are filters that the user gave by CIGALE's names, as `given_filters` has them. Emission lines
     have no filter; two bands of the same filter are a ValueError. X-ray bands (`xray_energies`) keep their names.
     """
     filters = {}
     lost = []
     for band in bands:
-        given = known.get(band)
-        own = filter_of_band(band) or (band if xray_energies(band) else None)
-        if given is None:
-            name = own
+        filter_name = names.get(band)
+        our_name = filter_of_band(band) or (band if xray_energies(band) else None)
+        if filter_name is None:
+            name = our_name
         else:
-            name = given.name
+            name = filter_name.name
         if is_line(band):
             name = None
         if name is None:

@@ -99,26 +99,26 @@ def _is_file_name(text):
     return text.lower().endswith((".toml", *TRANSLATE_SUFFIXES)) or os.sep in text
 
 
-def catalog_messages(lost, pieces, what="taken as missing, by the number that stands there"):
+def catalog_messages(lost, pieces, treatment="taken as missing, by the number that stands there"):
     """Yield warnings about bands without a filter, and numbers for no value in pieces (dicts as of `codes_of`)."""
     if lost:
         yield f"left out, no filter here: {', '.join(lost)}"
-    found = {}
+    by_code = {}
     sizes = Counter()
     parts = []
     for coded in pieces:
         for name, values in coded.items():
             sizes[name] += values.size
-            there = np.round(values[~np.isnan(values)], 4)
-            found.setdefault(name, Counter()).update(there.tolist())
-    for name, counts in found.items():
+            values_there = np.round(values[~np.isnan(values)], 4)
+            by_code.setdefault(name, Counter()).update(values_there.tolist())
+    for name, counts in by_code.items():
         if counts:
             codes = ", ".join(f"{value:g}" for value in sorted(counts)[:3])
             parts.append(f"{name} {counts.total()} of {sizes[name]} ({codes})")
     if len(parts) > _FEW:
         parts = [*parts[:_FEW], f"and {len(parts) - _FEW} more bands"]
     if parts:
-        yield f"{what}: {'; '.join(parts)}"
+        yield f"{treatment}: {'; '.join(parts)}"
 
 
 def codes_of(table, bands):
@@ -156,13 +156,13 @@ def codes_of(table, bands):
     return coded
 
 
-def warn_of_codes(pieces, where):
+def warn_of_codes(pieces, argument):
     """Warn of what `codes_of` found in pieces of a table, for fits that take the numbers as they are."""
     for text in catalog_messages(
         (), pieces, "look like numbers that stand for no value, and are fitted as they are"
     ):
         how = "NaN is a missing band; read_catalog_photometry, or --map, makes them so"
-        warn(f"{where}: {text} ({how})", CatalogWarning)
+        warn(f"{argument}: {text} ({how})", CatalogWarning)
 
 
 class CountedRows:

@@ -141,9 +141,9 @@ class CatalogMap:
             if path.suffix.lower() in TRANSLATE_SUFFIXES:
                 return cls(**_translated(_translate_rows(text), path))
             values = tomllib.loads(text)
-        known = [field.name for field in dataclasses.fields(cls)]
-        unknown = sorted(set(values) - set(known))
-        check_data(not unknown, path, f"is no map of columns: it has {unknown}; known: {known}")
+        fields = [field.name for field in dataclasses.fields(cls)]
+        unknown = sorted(set(values) - set(fields))
+        check_data(not unknown, path, f"is no map of columns: it has {unknown}; known: {fields}")
         return cls(**values)
 
     @classmethod
@@ -232,18 +232,18 @@ class CatalogMap:
             if not any(is_band(name) for name in {**columns, **self.columns}):
                 wanted = f"a table with columns of {self.survey!r}"
                 raise argument_error(argument, wanted, f"columns {colnames}")
-        taken = set(self.columns.values())
+        mapped = set(self.columns.values())
         if "id" not in {**columns, **self.columns}:
-            theirs = id_column([name for name in colnames if name not in taken], argument)
+            theirs = id_column([name for name in colnames if name not in mapped], argument)
             columns |= {} if theirs in (None, "id") else {"id": theirs}
-        columns = {ours: theirs for ours, theirs in columns.items() if theirs not in taken}
+        columns = {ours: theirs for ours, theirs in columns.items() if theirs not in mapped}
         columns |= self.columns
         for ours, theirs in columns.items():
             check_names([theirs], f"column of {argument} (for {ours!r})", colnames)
         ours = {theirs: name for name, theirs in columns.items()}
-        kept = (name for name in colnames if name in ours or name not in columns)
+        unmapped = (name for name in colnames if name in ours or name not in columns)
         lost = [*lost, *(name for name in self.left_out if name in colnames)]
-        return {name: ours.get(name, name) for name in kept}, [n for n in lost if n not in ours]
+        return {name: ours.get(name, name) for name in unmapped}, [n for n in lost if n not in ours]
 
     def convert(self, table, argument="catalog"):
         """
@@ -312,40 +312,41 @@ class CatalogMap:
             return 10 ** (-0.4 * values)
         return values
 
-    def _asked(self, name, column, of_flux, argument):
+    def _unit_of_column(self, name, column, of_flux, argument):
         """Unit that the caller says a column has, or the file's; a warning where these differ."""
-        asked = self.units.get(name, self.units.get("flux") if of_flux else None)
-        has = getattr(column, "unit", None)
-        if has is not None:
-            has = flux_unit(has) or u.Unit(has)
-        if asked is None:
-            if has is None and of_flux and self.survey is not None:
+        asked_unit = self.units.get(name, self.units.get("flux") if of_flux else None)
+        column_unit = getattr(column, "unit", None)
+        if column_unit is not None:
+            column_unit = flux_unit(column_unit) or u.Unit(column_unit)
+        if asked_unit is None:
+            if column_unit is None and of_flux and self.survey is not None:
                 return u.Unit(SURVEYS[self.survey].unit)
-            if has is None:
+            if column_unit is None:
                 return _DEFAULT_UNITS.get(name)
-            return has
-        asked = _unit(asked, name)
-        if has is not None and has != asked and not (has == u.mag and _is_ab(asked)):
-            msg = f"{argument}: {name!r} taken in {asked}, the file says {has}"
+            return column_unit
+        asked_unit = _unit(asked_unit, name)
+        differs = column_unit is not None and column_unit != asked_unit
+        if differs and not (column_unit == u.mag and _is_ab(asked_unit)):
+            msg = f"{argument}: {name!r} taken in {asked_unit}, the file says {column_unit}"
             warn(msg, CatalogWarning)
-        return asked
+        return asked_unit
 
     def _set_unit(self, table, name, argument):
         """Give a column that is no flux the unit that the caller says, or the usual one."""
         column = table[name]
-        unit = self._asked(name, column, False, argument)
-        asked = name in self.units
-        if unit is None or not (asked or getattr(column, "unit", None) is None):
+        unit = self._unit_of_column(name, column, False, argument)
+        is_asked = name in self.units
+        if unit is None or not (is_asked or getattr(column, "unit", None) is None):
             return
-        if asked and column.dtype.kind in "USO" and unit.is_equivalent(u.deg):
+        if is_asked and column.dtype.kind in "USO" and unit.is_equivalent(u.deg):
             table[name] = _angles(column, unit, name, argument)
-        elif asked or column.dtype.kind in "if":
+        elif is_asked or column.dtype.kind in "if":
             table[name] = u.Quantity(plain_floats(column, name, argument), unit)
 
     def set_band(self, table, name, factor, argument):
         """Bring fluxes and errors of a band to uJy; returns the numbers that stand for no value."""
         error = error_column(name)
-        unit = self._asked(name, table[name], True, argument)
+        unit = self._unit_of_column(name, table[name], True, argument)
         if unit is None or unit == u.mag or not (_is_ab(unit) or unit.is_equivalent(FNU)):
             say = "AB magnitudes are units={'flux': 'ABmag'}"
             if unit is None:
@@ -384,9 +385,9 @@ class CatalogMap:
 
     def _errors(self, column, name, errors, flux, ab, argument):
         """Errors of fluxes in uJy, from those in the file's unit."""
-        stated = not ab or name in self.units or "flux" not in self.units
-        if stated:
-            unit = self._asked(name, column, not ab, argument)
+        has_unit = not ab or name in self.units or "flux" not in self.units
+        if has_unit:
+            unit = self._unit_of_column(name, column, not ab, argument)
         else:
             unit = u.mag
         factor = self.error_factors.get(name.removesuffix(error_column("")), 1.0)
@@ -434,8 +435,8 @@ def _translated(rows, path):
                 ours = band
             else:
                 ours = error_column(band)
-            what = f"has two columns for {ours} ({meaning}): {columns.get(ours)} and {theirs}; remove one"
-            check_data(ours not in columns, path, what)
+            problem = f"has two columns for {ours} ({meaning}): {columns.get(ours)} and {theirs}; remove one"
+            check_data(ours not in columns, path, problem)
             columns[ours] = theirs
             if kind == "E" and float(factor) != 1.0:
                 factors[band] = float(factor)
@@ -465,18 +466,18 @@ def _angles(column, unit, name, argument):
         raise argument_error(argument, wanted, repr(str(column[0]))) from err
 
 
-def _unit(asked, name):
+def _unit(unit, name):
     """A unit that the caller gave; AB magnitudes by any of their names."""
-    if isinstance(asked, (str, u.UnitBase)):
-        known = flux_unit(asked)
+    if isinstance(unit, (str, u.UnitBase)):
+        flux = flux_unit(unit)
     else:
-        known = None
-    if known is not None:
-        return known
+        flux = None
+    if flux is not None:
+        return flux
     try:
-        return u.Unit(asked)
+        return u.Unit(unit)
     except (TypeError, ValueError) as err:
-        raise argument_error("units", f"a dict of units, also for {name!r}", asked) from err
+        raise argument_error("units", f"a dict of units, also for {name!r}", unit) from err
 
 
 def _is_ab(unit):

@@ -108,17 +108,17 @@ def _ascending(wave, throughput, path):
     order = np.argsort(wave, kind="stable")
     value = wave.value[order]
     throughput = throughput[order]
-    same = np.append(np.diff(value) == 0, False)
-    if same.size > 1:
-        thrice = np.flatnonzero(same[:-1] & same[1:])
+    repeated = np.append(np.diff(value) == 0, False)
+    if repeated.size > 1:
+        thrice = np.flatnonzero(repeated[:-1] & repeated[1:])
     else:
         thrice = np.zeros(0, int)
-    what = f"has the wavelength {value[thrice[0]] if thrice.size else 0:.8g} more than twice"
-    check_data(not thrice.size, path, what)
-    twins = np.flatnonzero(same)
+    problem = f"has the wavelength {value[thrice[0]] if thrice.size else 0:.8g} more than twice"
+    check_data(not thrice.size, path, problem)
+    twins = np.flatnonzero(repeated)
     # one of two equal points is enough
     equal = twins[throughput[twins] == throughput[twins + 1]]
-    value[same] *= 1.0 - _EDGE
+    value[repeated] *= 1.0 - _EDGE
     keep = np.ones(value.size, dtype=bool)
     keep[equal] = False
     return value[keep] * wave.unit, throughput[keep]
@@ -128,8 +128,8 @@ def _not_negative(throughput, path):
     """Throughput with negative points at zero, and their number."""
     peak = np.nanmax(throughput, initial=0.0)
     lowest = np.nanmin(throughput, initial=0.0)
-    what = f"has a throughput of {lowest:.3g}, beside a peak of {peak:.3g}"
-    check_data(lowest >= -_NOISE * peak, path, what)
+    problem = f"has a throughput of {lowest:.3g}, beside a peak of {peak:.3g}"
+    check_data(lowest >= -_NOISE * peak, path, problem)
     negative = throughput < 0
     return np.where(negative, 0.0, throughput), int(np.count_nonzero(negative))
 
@@ -138,28 +138,28 @@ def _of_table(path, unit):
     table = read_table(path, wanted="a filter")
     columns = [table[name] for name in table.colnames[:2]]
     if columns:
-        has = getattr(columns[0], "unit", None)
+        column_unit = getattr(columns[0], "unit", None)
     else:
-        has = None
-    if len(columns) < 2 or (unit is None and has is None):
-        what = "has not two columns, the first with a unit of wavelength"
-        raise data_error(path, f"{what}: give 'unit' if it has none")
+        column_unit = None
+    if len(columns) < 2 or (unit is None and column_unit is None):
+        problem = "has not two columns, the first with a unit of wavelength"
+        raise data_error(path, f"{problem}: give 'unit' if it has none")
     with file_errors(path, "is no filter: its first two columns are not numbers"):
         first, throughput = map(floats, columns)
-    wave = first * u.Unit(unit or has)
+    wave = first * u.Unit(unit or column_unit)
     meta = full_meta(table.meta)
     if path.suffix.lower() in (".xml", ".vot", ".votable"):
         meta = _parameters(path) | meta
-    plain = {str(key).lower().replace("_", ""): value for key, value in meta.items()}
-    energy = str(plain.get("detectortype", "")).strip().lower() in _ENERGY
-    name = plain.get("name") or plain.get("filterid") or path.stem
+    keywords = {str(key).lower().replace("_", ""): value for key, value in meta.items()}
+    energy = str(keywords.get("detectortype", "")).strip().lower() in _ENERGY
+    name = keywords.get("name") or keywords.get("filterid") or path.stem
     options = {}
     for key, reference in (("reference_wavelength", WAVE), ("reference_temperature", u.K)):
-        value = plain.get(key.replace("_", ""))
+        value = keywords.get(key.replace("_", ""))
         if value is not None:
             options[key] = float(value) * reference
-    kept = ("citations", "flux_convention", "n_negative")
-    options["meta"] = {key: meta[key] for key in kept if key in meta}
+    carried = ("citations", "flux_convention", "n_negative")
+    options["meta"] = {key: meta[key] for key in carried if key in meta}
     return wave, throughput, energy, str(name), options
 
 
@@ -244,6 +244,6 @@ def _unit_of(comments, path):
         if len(named) == 1:
             return named[0]
         if named:
-            some = " and ".join(map(str, named))
-            raise data_error(path, f"names {some} as units of its wavelengths: give 'unit'")
+            quoted = " and ".join(map(str, named))
+            raise data_error(path, f"names {quoted} as units of its wavelengths: give 'unit'")
     raise data_error(path, "does not state the unit of its wavelengths: give 'unit'")

@@ -178,10 +178,10 @@ class Filter(Frozen, Interactive):
         KeyError
             If there is no such filter; the message lists the nearest ones.
         """
-        found = find_filter(str(name))
-        if found is None and not str(name).startswith("sedpy."):
+        full_name = find_filter(str(name))
+        if full_name is None and not str(name).startswith("sedpy."):
             raise unknown_name("filter", name, FILTERS.names())
-        return _from_name(found or str(name))
+        return _from_name(full_name or str(name))
 
     @staticmethod
     def names():
@@ -229,12 +229,12 @@ class Filter(Frozen, Interactive):
         if wave is None:
             return tuple(name for name in FILTERS.names() if str(text).lower() in name)
         wave = to_array(wave, WAVE, "text", ndim=0, finite=True)
-        near = []
+        matches = []
         for name in FILTERS.names():
             band = Filter.from_name(name)
             if band(wave * WAVE) >= 0.5 * band.throughput.max():
-                near.append((abs(band.pivot.value - wave), name))
-        return tuple(name for _, name in sorted(near))
+                matches.append((abs(band.pivot.value - wave), name))
+        return tuple(name for _, name in sorted(matches))
 
     @classmethod
     def from_svo(cls, path, *, name=None):
@@ -259,8 +259,8 @@ class Filter(Frozen, Interactive):
         """
         if not Path(path).is_file():
             # the service has most curves of the library under its own names
-            what = "is no file; nothing is downloaded: save the VOTable of http://svo2.cab.inta-csic.es/theory/fps"
-            raise data_error(path, f"{what}, or take Filter({str(path)!r}) of the library")
+            problem = "is no file; nothing is downloaded: save the VOTable of http://svo2.cab.inta-csic.es/theory/fps"
+            raise data_error(path, f"{problem}, or take Filter({str(path)!r}) of the library")
         return cls.read(path, name=name)
 
     @property

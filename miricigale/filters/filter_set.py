@@ -58,7 +58,7 @@ class FilterSet(Interactive):
             items = [items]
         # a set of sedpy's holds its filters
         items = getattr(items, "filters", items)
-        filters = tuple(one for item in items for one in _each(item, unit))
+        filters = tuple(band for item in items for band in _members(item, unit))
         names = [f.name for f in filters]
         if not names or len(set(names)) < len(names):
             raise argument_error("filters", "one or more filters of different names", names)
@@ -109,10 +109,10 @@ class FilterSet(Interactive):
 
     def __add__(self, other):
         if isinstance(other, FilterSet):
-            others = other.filters
+            added = other.filters
         else:
-            others = (as_filter(other),)
-        return FilterSet((*self.filters, *others))
+            added = (as_filter(other),)
+        return FilterSet((*self.filters, *added))
 
     def to_table(self):
         """The filters as a `~astropy.table.QTable`: ``name``, ``pivot`` and ``width`` (um)."""
@@ -233,11 +233,11 @@ def _table(filters):
     return table
 
 
-def _each(item, unit):
+def _members(item, unit):
     """The filters that an item of a set stands for."""
     if isinstance(item, str) and "*" in item:
-        found = fnmatch.filter(Filter.names(), item.lower())
-        if not found:
+        names = fnmatch.filter(Filter.names(), item.lower())
+        if not names:
             raise unknown_name("filters like", item, Filter.names())
-        return [Filter.from_name(name) for name in found]
+        return [Filter.from_name(name) for name in names]
     return [as_filter(item, unit=unit)]

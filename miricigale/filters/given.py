@@ -65,14 +65,14 @@ def as_filter(given, name=None, *, unit=None):
     raise argument_error(name or "filter", wanted, type(given).__name__)
 
 
-def _of_sedpy(given, name):
+def _of_sedpy(curve, name):
     """Filter of sedpy's: wavelengths in Angstrom and the response to photons, whose noise may be negative."""
-    name = name or find_filter(given.name) or given.name
-    throughput = np.asarray(given.transmission, dtype=float)
+    name = name or find_filter(curve.name) or curve.name
+    throughput = np.asarray(curve.transmission, dtype=float)
     meta = {"source": "sedpy"}
     if np.any(throughput < 0):
         meta["n_negative"] = int(np.count_nonzero(throughput < 0))
-    return Filter(given.wavelength * u.AA, np.maximum(throughput, 0.0), str(name), meta=meta)
+    return Filter(curve.wavelength * u.AA, np.maximum(throughput, 0.0), str(name), meta=meta)
 
 
 def _is_path(text):
@@ -89,18 +89,18 @@ def given_filters(names):
     An X-ray band by its name (``xray_boxcar_0p5to2keV``) is a filter of that name, by which `xray_energies` knows
     it; a curve at its wavelengths is refused.
     """
-    return {band: _given(band, given) for band, given in (names or {}).items()}
+    return {band: _as_named_filter(band, curve) for band, curve in (names or {}).items()}
 
 
-def _given(band, given):
-    if isinstance(given, str):
-        ends = xray_energies(given)
+def _as_named_filter(band, curve):
+    if isinstance(curve, str):
+        ends = xray_energies(curve)
     else:
         ends = None
     if ends is not None:
-        return Filter(_KEV / np.array(ends)[::-1] * u.um, [1.0, 1.0], name=given)
-    found = as_filter(given, band, unit=u.AA)
-    if found.wave[0].to_value(u.um) < _KEV / 0.1:  # X-rays
+        return Filter(_KEV / np.array(ends)[::-1] * u.um, [1.0, 1.0], name=curve)
+    filter_ = as_filter(curve, band, unit=u.AA)
+    if filter_.wave[0].to_value(u.um) < _KEV / 0.1:  # X-rays
         wanted = "the energies of an X-ray band, such as 'xray_boxcar_0p5to2keV'"
         raise argument_error("names", wanted, f"a curve of X-rays for {band!r}")
-    return found
+    return filter_

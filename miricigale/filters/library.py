@@ -86,8 +86,8 @@ def _load(name):
 def load_curve(name):
     """Wavelengths, throughput and options of `Filter` of a filter of the library."""
     if name.startswith(SEDPY):
-        known = [path.stem for path in curve_folder().glob("*.par")]
-        check_names([name.removeprefix(SEDPY)], "curve of astro-sedpy", known)
+        curves = [path.stem for path in curve_folder().glob("*.par")]
+        check_names([name.removeprefix(SEDPY)], "curve of astro-sedpy", curves)
         return _load(name)
     return FILTERS.get(name)
 
@@ -97,19 +97,19 @@ def _register():
     registry = Registry("filter")
     for instrument, group in declared("miricigale.filters", "library.toml").items():
         bands = group["bands"]
-        about = {}
+        metadata = {}
         if "flux_convention" in group:
-            about["flux_convention"] = group["flux_convention"]
+            metadata["flux_convention"] = group["flux_convention"]
         for band in bands:
             if "curves" in group:
                 curve = group["curves"].format(band)
             else:
                 curve = bands[band]
             if "reference_wavelength" in group:
-                about["reference_wavelength"] = group["reference_wavelength"][band] * WAVE
+                metadata["reference_wavelength"] = group["reference_wavelength"][band] * WAVE
             if "reference_temperature" in group:
-                about["reference_temperature"] = group["reference_temperature"] * u.K
-            registry.register(f"{instrument}.{band}", _load, curve=curve, **about)
+                metadata["reference_temperature"] = group["reference_temperature"] * u.K
+            registry.register(f"{instrument}.{band}", _load, curve=curve, **metadata)
     return registry
 
 

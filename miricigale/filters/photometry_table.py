@@ -87,11 +87,13 @@ def as_photometry(data, bands, argument="photometry", *, units=None):
     table = as_table(data, argument)
     bands = tuple(bands)
     names = _our_names(table.colnames, bands, argument)
-    stated = _stated_units(table, names, bands, units)
-    magnitudes = [name for name in bands if _is_ab(table, names.get(name)) and name not in stated]
+    stated_units = _stated_units(table, names, bands, units)
+    magnitudes = [
+        name for name in bands if _is_ab(table, names.get(name)) and name not in stated_units
+    ]
     if (
         not magnitudes
-        and not stated
+        and not stated_units
         and "id" in names
         and all(ours == name for ours, name in names.items())
     ):
@@ -103,8 +105,8 @@ def as_photometry(data, bands, argument="photometry", *, units=None):
     out.meta = table.meta
     if "id" not in out.colnames:
         out["id"] = counted_ids(table, argument)
-    catalog_map = CatalogMap(units=dict.fromkeys(magnitudes, u.ABmag) | stated)
-    converted = [name for name in bands if name in magnitudes or name in stated]
+    catalog_map = CatalogMap(units=dict.fromkeys(magnitudes, u.ABmag) | stated_units)
+    converted = [name for name in bands if name in magnitudes or name in stated_units]
     coded = {name: catalog_map.set_band(out, name, 1.0, argument) for name in converted}
     for text in catalog_messages((), [coded]):
         warn(f"{argument}: {text}", CatalogWarning)
@@ -118,26 +120,28 @@ def _stated_units(table, names, bands, units):
     by_band = units
     if isinstance(units, Mapping):
         by_band = {find_filter(str(name)) or str(name): unit for name, unit in units.items()}
-        known = [*bands, "flux"]
-        check_that(set(by_band) <= set(known), "units", f"a dict with keys among {known}", units)
+        accepted = [*bands, "flux"]
+        check_that(
+            set(by_band) <= set(accepted), "units", f"a dict with keys among {accepted}", units
+        )
     else:
         by_band = {"flux": units}
-    stated = {}
+    units_by_column = {}
     for band in bands:
-        asked = by_band.get(band, by_band.get("flux"))
-        if asked is None or band not in names:
+        asked_unit = by_band.get(band, by_band.get("flux"))
+        if asked_unit is None or band not in names:
             continue
-        unit = unit_of_fluxes(asked)
+        unit = unit_of_fluxes(asked_unit)
         if _is_ab(table, names[band]):
             # magnitudes by their name or unit
             continue
         if getattr(table[names[band]], "unit", None) is None:
-            stated[band] = unit
+            units_by_column[band] = unit
         error = error_column(band)
-        bare = error in names and getattr(table[names[error]], "unit", None) is None
-        if bare and unit != u.ABmag:
-            stated[error] = unit
-    return stated
+        lacks_unit = error in names and getattr(table[names[error]], "unit", None) is None
+        if lacks_unit and unit != u.ABmag:
+            units_by_column[error] = unit
+    return units_by_column
 
 
 def unit_of_fluxes(unit, argument="units"):
@@ -162,13 +166,13 @@ def unit_of_fluxes(unit, argument="units"):
     """
     wanted = f"a unit of flux density, such as {FNU}, or 'ABmag'"
     try:
-        found = flux_unit(unit) or u.Unit(unit)
+        parsed = flux_unit(unit) or u.Unit(unit)
     except (TypeError, ValueError):
         raise units_error(argument, wanted, repr(unit)) from None
-    is_flux = isinstance(found, u.UnitBase) and found.is_equivalent(FNU)
-    if not is_flux and found != u.ABmag:
+    is_flux = isinstance(parsed, u.UnitBase) and parsed.is_equivalent(FNU)
+    if not is_flux and parsed != u.ABmag:
         raise units_error(argument, wanted, repr(str(unit)))
-    return found
+    return parsed
 
 
 def _is_of_prospector(data):
@@ -196,8 +200,10 @@ def _of_prospector(data):
         good = np.broadcast_to(good, flux.shape)
     names = [getattr(item, "name", str(item)) for item in getattr(filters, "filters", filters)]
     names = [find_filter(name) or name for name in names]
-    same = len(names) == flux.size == error.size
-    check_that(same, "photometry", "a flux and an error for each filter", f"{len(names)} filters")
+    is_consistent = len(names) == flux.size == error.size
+    check_that(
+        is_consistent, "photometry", "a flux and an error for each filter", f"{len(names)} filters"
+    )
     unit = flux_unit("maggies")
     columns = {}
     for name, value, sigma, is_good in zip(names, flux, error, good, strict=True):
@@ -229,11 +235,18 @@ def band_columns(table, argument="photometry"):
     ValueError
         If two columns are the same band, or several could be the ids.
     """
-    found = _our_names(table.colnames, FILTERS.names(), argument)
-    both = [name for name in found if error_column(name) in found]
-    kept = {"id", *both, *map(error_column, both), *(f"{name}{_LIMIT}" for name in both)}
-    names = {theirs: ours for ours, theirs in found.items() if ours in kept and ours != theirs}
-    return names, [name for name in both if _is_ab(table, found[name])]
+    columns = _our_names(table.colnames, FILTERS.names(), argument)
+    complete = [name for name in columns if error_column(name) in columns]
+    used_names = {
+        "id",
+        *complete,
+        *map(error_column, complete),
+        *(f"{name}{_LIMIT}" for name in complete),
+    }
+    names = {
+        theirs: ours for ours, theirs in columns.items() if ours in used_names and ours != theirs
+    }
+    return names, [name for name in complete if _is_ab(table, columns[name])]
 
 
 def our_names(colnames, argument="photometry"):
@@ -246,44 +259,44 @@ def our_names(colnames, argument="photometry"):
 def _our_names(colnames, bands, argument):
     """Our names of the columns that are fluxes and errors of bands, and of ids, to theirs."""
     errors = {error_column(name): name for name in bands}
-    found = {name: name for name in (*bands, *errors) if name in colnames}
+    columns = {name: name for name in (*bands, *errors) if name in colnames}
     ids = id_column(colnames, argument)
     if ids is not None:
-        found["id"] = ids
-    others = [name for name in colnames if name not in found and name != ids]
-    logarithmic = [name for name in others if _MAGNITUDE.match(name)]
-    linear = [name for name in others if name not in logarithmic]
-    found |= _matched(linear, colnames, bands, argument)
+        columns["id"] = ids
+    unmatched = [name for name in colnames if name not in columns and name != ids]
+    logarithmic = [name for name in unmatched if _MAGNITUDE.match(name)]
+    linear = [name for name in unmatched if name not in logarithmic]
+    columns |= _matched(linear, colnames, bands, argument)
     magnitudes = _matched(logarithmic, colnames, bands, argument)
     for band in bands:
         error = error_column(band)
-        complete = band in found and error in found
-        if band not in magnitudes or complete or (band in found and error not in magnitudes):
+        complete = band in columns and error in columns
+        if band not in magnitudes or complete or (band in columns and error not in magnitudes):
             continue
-        found[band] = magnitudes[band]
+        columns[band] = magnitudes[band]
         if error in magnitudes:
-            found[error] = magnitudes[error]
+            columns[error] = magnitudes[error]
     for theirs in colnames:
         band = theirs.endswith(_LIMIT) and _band_of(theirs.removesuffix(_LIMIT), bands)
         if band in bands and f"{band}{_LIMIT}" not in colnames:
-            found[f"{band}{_LIMIT}"] = theirs
-    alone = [name for name in colnames if name.lower() in _ALONE]
-    if len(bands) == len(alone) == 1 and bands[0] not in found:
-        found[bands[0]] = alone[0]
-    return found
+            columns[f"{band}{_LIMIT}"] = theirs
+    ambiguous = [name for name in colnames if name.lower() in _ALONE]
+    if len(bands) == len(ambiguous) == 1 and bands[0] not in columns:
+        columns[bands[0]] = ambiguous[0]
+    return columns
 
 
 def _matched(names, colnames, bands, argument):
     """Our names of columns under other names, to theirs."""
-    found = {}
+    matches = {}
     for theirs in names:
         ours = _band_of(theirs, bands)
         if ours is None or (ours in colnames):
             continue
         wanted = f"a table with one column for {ours!r}"
-        check_that(ours not in found, argument, wanted, f"{found.get(ours)!r} and {theirs!r}")
-        found[ours] = theirs
-    return found
+        check_that(ours not in matches, argument, wanted, f"{matches.get(ours)!r} and {theirs!r}")
+        matches[ours] = theirs
+    return matches
 
 
 def _band_of(name, bands):

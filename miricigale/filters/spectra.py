@@ -75,8 +75,8 @@ def spectrum_arrays(sed, bands):
     order = slice(None, None, -1 if wave[-1] < wave[0] else 1)
     wave = check_wave(wave[order])
     flux = flux[order]
-    plain = getattr(flux, "unit", None) == FNU
-    if plain:
+    is_converted = getattr(flux, "unit", None) == FNU
+    if is_converted:
         spectral = []
     else:
         spectral = u.spectral_density(wave * WAVE)

@@ -29,12 +29,12 @@ class _Survey:
 
     def columns(self, colnames):
         """Our names of the columns that are there to theirs; the bands without a filter."""
-        found = {}
+        columns = {}
         lost = []
         for ours, choices in self.names.items():
             theirs = next((name for name in choices if name in colnames), None)
             if theirs is not None:
-                found[ours] = theirs
+                columns[ours] = theirs
         for name in colnames:
             match = re.fullmatch(self.flux, name)
             error = match and match.expand(self.error)
@@ -46,12 +46,12 @@ class _Survey:
                 band = find_filter(match[1])
             if not (band and is_band(band)):
                 lost.append(name)
-            elif band in found:
-                msg = f"the columns {found[band]} and {name} are both the filter {band}"
+            elif band in columns:
+                msg = f"the columns {columns[band]} and {name} are both the filter {band}"
                 raise DataError(msg)
             else:
-                found |= {band: name, error_column(band): error}
-        return found, lost
+                columns |= {band: name, error_column(band): error}
+        return columns, lost
 
 
 #: Column names and units of catalogs, by name of the survey.

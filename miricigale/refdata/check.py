@@ -75,10 +75,10 @@ def _state(record):
         return ResourceState(name, "absent", record.source)
     where = str(path)
     try:
-        beside = stored_record(path)
+        record_file = stored_record(path)
         if name in READERS:
             verify_library(path, name)
-        wanted = record.sha256 or (beside or {}).get("sha256", "")
+        wanted = record.sha256 or (record_file or {}).get("sha256", "")
         if not wanted:
             return ResourceState(name, "unchecked", where, "no record of its checksum")
         if file_sha256(path) != wanted:

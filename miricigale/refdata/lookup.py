@@ -62,13 +62,15 @@ def stored_record(path):
 
     Checksum, size, source and what was found; a `DataError` if it is there and cannot be read.
     """
-    beside = record_path(path)
+    record_file = record_path(path)
     try:
-        return dict(_read_record(beside))
+        return dict(_read_record(record_file))
     except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, ValueError) as err:
-        raise data_error(beside, f"cannot be read as the record of {path.name}: {err}") from err
+        raise data_error(
+            record_file, f"cannot be read as the record of {path.name}: {err}"
+        ) from err
 
 
 @cached_by_file(16)
@@ -168,12 +170,12 @@ def locate(name):
     record = file_record(name)
     label, path = find_place(record)
     if path is None:
-        tried = ", ".join(f"{label} ({folder})" for label, folder in _places(record))
+        places = ", ".join(f"{label} ({folder})" for label, folder in _places(record))
         remedy = f"get it from {record.source} and run 'miricigale data add {name} PATH'"
-        msg = f"resource {name!r} ({record.title}) is in none of {tried}; {remedy}"
+        msg = f"resource {name!r} ({record.title}) is in none of {places}; {remedy}"
         raise DataError(msg)
-    own = record.kind == "bundled" and label != "the package"
-    if own and fingerprint_of(path) != record.sha256:
+    is_misplaced = record.kind == "bundled" and label != "the package"
+    if is_misplaced and fingerprint_of(path) != record.sha256:
         msg = f"resource {record.name!r} is taken from {path}, which differs from the bundled file"
         warn(msg, ReferenceWarning)
     return path

@@ -61,8 +61,8 @@ def read_bc03(path):
     files = {file.name: file_sha256(file) for file in paths}
     for file in paths:
         part = read_ised(file)
-        what = f"holds a composite population ({part.history}), wanted a single burst"
-        check_data(not part.law, file, what)
+        problem = f"holds a composite population ({part.history}), wanted a single burst"
+        check_data(not part.law, file, problem)
         parts.append((file, part, _metallicity(part, file), _imf(part, file)))
     _check_set(parts)
     parts.sort(key=lambda item: item[2])
@@ -115,14 +115,14 @@ def read_bc03(path):
 def _files(path):
     path = Path(path).expanduser()
     if path.is_dir():
-        found = sorted(p for p in path.iterdir() if _is_ised(p.name))
+        files = sorted(p for p in path.iterdir() if _is_ised(p.name))
     elif path.exists():
-        found = [path]
+        files = [path]
     else:
-        found = sorted(p for p in path.parent.glob(path.name) if _is_ised(p.name))
+        files = sorted(p for p in path.parent.glob(path.name) if _is_ised(p.name))
     wanted = "wanted files *.ised or *.ised_ASCII (also .gz), got none"
-    check_data(found, path, f"cannot be read as populations of BC03: {wanted}")
-    return found
+    check_data(files, path, f"cannot be read as populations of BC03: {wanted}")
+    return files
 
 
 def _is_ised(name):
@@ -141,53 +141,59 @@ def _metallicity(part, file):
         named = (PADOVA_1994 | PADOVA_2000).get(int(match[1]))
     else:
         named = None
-    stated = part.metallicity
+    metallicity = part.metallicity
     wanted = "wanted 'Z=...' in its head or a name like _m62_"
-    check_data(not (named is None and stated is None), file, f"states no metallicity: {wanted}")
-    if named is not None and stated is not None and not np.isclose(named, stated, rtol=0.01):
-        what = f"states Z = {stated:g}, but its name (m{match[1]}) means Z = {named:g}"
-        raise data_error(file, what)
-    if stated is None:
+    check_data(
+        not (named is None and metallicity is None), file, f"states no metallicity: {wanted}"
+    )
+    if (
+        named is not None
+        and metallicity is not None
+        and not np.isclose(named, metallicity, rtol=0.01)
+    ):
+        problem = f"states Z = {metallicity:g}, but its name (m{match[1]}) means Z = {named:g}"
+        raise data_error(file, problem)
+    if metallicity is None:
         return named
-    return stated
+    return metallicity
 
 
 def _imf(part, file):
     named = {imf for token, imf in IMFS.items() if f"_{token}" in file.name.lower()}
     # Chabrier's is the only one that is no power law
     if not part.slopes:
-        stated = "Chabrier"
+        stated_imf = "Chabrier"
     else:
-        stated = None
+        stated_imf = None
     if len(part.slopes) == 1 and np.isclose(part.slopes[0], 1.35, atol=0.01):
-        stated = "Salpeter"
-    if len(named) != 1 and stated is None:
+        stated_imf = "Salpeter"
+    if len(named) != 1 and stated_imf is None:
         raise data_error(file, f"names no IMF: wanted one of {', '.join(IMFS)} in its name")
-    if len(named) == 1 and stated is not None and stated not in named:
-        raise data_error(file, f"holds a {stated} IMF, but its name means {named.pop()}")
-    if stated is not None:
-        return stated
+    if len(named) == 1 and stated_imf is not None and stated_imf not in named:
+        raise data_error(file, f"holds a {stated_imf} IMF, but its name means {named.pop()}")
+    if stated_imf is not None:
+        return stated_imf
     return named.pop()
 
 
 def _check_set(parts):
     """Refuse files that are not one set, and say which two do not fit."""
     file, first, _, imf = parts[0]
-    seen = {}
-    for other, part, metallicity, other_imf in parts:
+    files = {}
+    for other_file, part, metallicity, other_imf in parts:
         ages = part.age.shape == first.age.shape and np.allclose(part.age, first.age, rtol=1e-4)
-        same = {
+        pairs = {
             "wavelengths": np.array_equal(part.wave, first.wave),
             "IMF": other_imf == imf,
             "limits of mass": part.mass_limits == first.mass_limits,
             "ages": ages,
         }
-        differ = ", ".join(name for name, is_same in same.items() if not is_same)
-        check_data(not differ, other, f"and {file.name} are not one set: other {differ}")
-        if metallicity in seen:
-            twice = f"the same metallicity as {seen[metallicity].name}, {metallicity:g}"
-            raise data_error(other, f"is not of one set: it has {twice}")
-        seen[metallicity] = other
+        differ = ", ".join(name for name, is_same in pairs.items() if not is_same)
+        check_data(not differ, other_file, f"and {file.name} are not one set: other {differ}")
+        if metallicity in files:
+            twice = f"the same metallicity as {files[metallicity].name}, {metallicity:g}"
+            raise data_error(other_file, f"is not of one set: it has {twice}")
+        files[metallicity] = other_file
 
 
 def _version(part):
@@ -207,15 +213,15 @@ def _surviving(part, file):
     if gas is not None and np.any(gas[old] > 0):
         with_remnants = np.abs(mass + gas - 1.0)[old].max()
         without = np.abs(mass + remnants + gas - 1.0)[old].max()
-        what = "has masses of stars, remnants and gas that do not sum to 1 Msun"
-        check_data(min(with_remnants, without) <= 0.01, file, what)
+        problem = "has masses of stars, remnants and gas that do not sum to 1 Msun"
+        check_data(min(with_remnants, without) <= 0.01, file, problem)
         take = with_remnants < without
     elif _version(part) is not None:
         take = _version(part) == 2003
     else:
         ages = " or ".join(f"{second:g} yr ({year})" for year, second in SECOND_AGE.items())
-        what = "does not tell whether its mass of stars includes remnants: wanted a mass of gas"
-        raise data_error(file, f"{what}, or a second age of {ages}, got {part.age[1]:g} yr")
+        problem = "does not tell whether its mass of stars includes remnants: wanted a mass of gas"
+        raise data_error(file, f"{problem}, or a second age of {ages}, got {part.age[1]:g} yr")
     if take:
         surviving = mass - remnants
     else:
@@ -246,16 +252,16 @@ def _refine(wave, spectra):
         pieces.append(np.append(np.geomspace(low, high, n + 1)[1:-1], high))
     fine = np.concatenate(pieces)
     out = np.empty((len(spectra), fine.size))
-    known = np.isin(fine, wave)
-    new = ~known
+    is_node = np.isin(fine, wave)
+    new = ~is_node
     logs = np.log(wave)
     at = np.log(np.minimum(fine[new], target))
     for row, spectrum in zip(out, spectra, strict=True):
-        row[known] = spectrum
+        row[is_node] = spectrum
         # a spectrum that is 0 stays 0, whatever the slope
         level = np.log(np.maximum(spectrum.astype(float), 1e-300))
         slope = (level[-1] - level[-2]) / (logs[-1] - logs[-2])
         inside = np.interp(at, logs, level)
-        beyond = level[-1] + slope * (at - logs[-1])
-        row[new] = np.exp(np.where(at > logs[-1], beyond, inside))
+        extrapolated = level[-1] + slope * (at - logs[-1])
+        row[new] = np.exp(np.where(at > logs[-1], extrapolated, inside))
     return fine, np.where(out < 1e-200, 0.0, out)

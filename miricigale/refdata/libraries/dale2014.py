@@ -69,10 +69,10 @@ def read_dale2014(path):
 
     emission = 10.0**log_power / wave[:, None]
     starlight = stars[:, None] * (emission[SCALED_AT] / stars[SCALED_AT])
-    used = (wave >= SHORTEST) & (wave <= LONGEST)
-    nodes = wave[used]
-    emission = emission[used].T
-    starlight = starlight[used].T
+    in_range = (wave >= SHORTEST) & (wave <= LONGEST)
+    nodes = wave[in_range]
+    emission = emission[in_range].T
+    starlight = starlight[in_range].T
     removed = emission - starlight
     negative = int(np.sum(removed < 0))
     share = np.max(starlight[:, 0] / emission[:, 0])
@@ -105,22 +105,22 @@ def _find(path):
     """Contents of the files by name, and where each was found."""
     wanted = (SPECTRA, CALIBRATION, STARS)
     if not path.is_dir() and not (path.is_file() and is_archive(path)):
-        what = "cannot be read as templates of Dale et al. 2014: wanted a folder or an archive"
+        problem = "cannot be read as templates of Dale et al. 2014: wanted a folder or an archive"
         if path.is_file():
             got = "got another file"
         else:
             got = "no such file or folder"
-        raise data_error(path, f"{what} that holds {SPECTRA} and {CALIBRATION}, {got}")
-    found = list(members(path, lambda name: name in wanted))
-    folders = [place.parent for place, _, _ in found if place.name == SPECTRA]
+        raise data_error(path, f"{problem} that holds {SPECTRA} and {CALIBRATION}, {got}")
+    tables = list(members(path, lambda name: name in wanted))
+    folders = [place.parent for place, _, _ in tables if place.name == SPECTRA]
     if len(folders) > 1:
         folders = [f for f in folders if f.parts[-2:] == ("database_builder", "dale2014")]
     check_data(len(folders) == 1, path, f"must hold one {SPECTRA}, got {len(folders) or 'none'}")
-    here = [(place.name, *rest) for place, *rest in found if place.parent == folders[0]]
-    contents = {name: data for name, data, _ in here}
-    what = f"has {SPECTRA} without {CALIBRATION}, which lists the alphas of its columns"
-    check_data(CALIBRATION in contents, path, what)
-    return contents, {name: source for name, _, source in here}
+    chosen = [(place.name, *content) for place, *content in tables if place.parent == folders[0]]
+    contents = {name: data for name, data, _ in chosen}
+    problem = f"has {SPECTRA} without {CALIBRATION}, which lists the alphas of its columns"
+    check_data(CALIBRATION in contents, path, problem)
+    return contents, {name: source for name, _, source in chosen}
 
 
 def _numbers(data, place, n_columns, wanted):
@@ -145,10 +145,10 @@ def _read_calibration(data, place):
 def _read_spectra(data, place):
     table = _numbers(data, place, 1 + ALPHA.size, "wavelength and log10 nuF_nu")
     wave = table[:, 0]
-    what = f"must have {N_WAVE} rows, got {wave.size}: truncated or another version"
-    check_data(wave.size == N_WAVE, place, what)
-    what = "must have ascending wavelengths in um, from 1 or less to 1000 or more"
-    check_data(np.all(np.diff(wave) > 0) and wave[0] <= 1.0 and wave[-1] >= 1e3, place, what)
+    problem = f"must have {N_WAVE} rows, got {wave.size}: truncated or another version"
+    check_data(wave.size == N_WAVE, place, problem)
+    problem = "must have ascending wavelengths in um, from 1 or less to 1000 or more"
+    check_data(np.all(np.diff(wave) > 0) and wave[0] <= 1.0 and wave[-1] >= 1e3, place, problem)
     return wave, table[:, 1:]
 
 
@@ -156,8 +156,8 @@ def _read_stars(data, place):
     wave, light, _, _ = _numbers(data, place, 4, "wavelength in A and starlight in W/A").T
     wave = wave / 1e4
     if not np.all(np.diff(wave) > 0) or wave[0] > 1.0 or wave[-1] < 5.0 or np.any(light < 0):
-        what = "must hold starlight, not negative, at ascending wavelengths from 1 to 5 um"
-        raise data_error(place, what)
+        problem = "must hold starlight, not negative, at ascending wavelengths from 1 to 5 um"
+        raise data_error(place, problem)
     return wave, light
 
 
@@ -165,10 +165,10 @@ def _check_order(wave, log_power, color, places):
     """Columns belong to the alphas if their colors do (dhcal.dat has those of IRAS bands)."""
     log_fnu = (log_power + np.log10(wave)[:, None]).T
     at = np.log([60.0, 100.0])
-    seen = np.array([np.subtract(*np.interp(at, np.log(wave), row)) for row in log_fnu])
-    worst = np.abs(seen - color).max()
-    what = f"does not fit {places[CALIBRATION]}: log f60/f100 differs by {worst:.2f}"
-    check_data(worst <= 0.06, places[SPECTRA], f"{what}, wanted less than 0.06")
+    colors = np.array([np.subtract(*np.interp(at, np.log(wave), row)) for row in log_fnu])
+    worst = np.abs(colors - color).max()
+    problem = f"does not fit {places[CALIBRATION]}: log f60/f100 differs by {worst:.2f}"
+    check_data(worst <= 0.06, places[SPECTRA], f"{problem}, wanted less than 0.06")
 
 
 def _bundled_starlight(wave):
@@ -176,5 +176,5 @@ def _bundled_starlight(wave):
     nodes, age, spectra, _ = load_ssp(locate("ssp.bc03"))
     born = np.arange(13000) + 0.5  # Myr ago
     # what each age counts for where spectra are linear between ages
-    weights = [np.interp(born, age, one) @ np.exp(born / 1e4) for one in np.eye(age.size)]
+    weights = [np.interp(born, age, basis) @ np.exp(born / 1e4) for basis in np.eye(age.size)]
     return np.interp(wave, nodes, weights @ spectra[0.02], right=0)

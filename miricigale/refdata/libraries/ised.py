@@ -73,9 +73,11 @@ class Ised:
     @property
     def metallicity(self):
         """Mass fraction of metals that the texts state, or None."""
-        found = {float(z) for text in self.texts for z in re.findall(r"\bZ\s*=\s*(\d*\.\d+)", text)}
-        if len(found) == 1:
-            return found.pop()
+        metallicities = {
+            float(z) for text in self.texts for z in re.findall(r"\bZ\s*=\s*(\d*\.\d+)", text)
+        }
+        if len(metallicities) == 1:
+            return metallicities.pop()
         return None
 
 
@@ -158,8 +160,8 @@ def _foreign(path, why):
     return data_error(path, f"cannot be read as a file of GALAXEV: {why}")
 
 
-def _truncated(path, where):
-    return _foreign(path, f"it ends {where}: truncated")
+def _truncated(path, place):
+    return _foreign(path, f"it ends {place}: truncated")
 
 
 class _Source:
@@ -214,14 +216,14 @@ def _records(data, order, path):
     at = 0
     out = []
     while at < len(data):
-        where = f"record {len(out) + 1}"
+        place = f"record {len(out) + 1}"
         try:
             (size,) = length.unpack_from(data, at)
-            (again,) = length.unpack_from(data, at + 4 + size)
+            (trailer,) = length.unpack_from(data, at + 4 + size)
         except struct.error:
-            raise _truncated(path, f"in {where}") from None
-        if size < 0 or again != size:
-            raise _foreign(path, f"the lengths before and after {where} differ")
+            raise _truncated(path, f"in {place}") from None
+        if size < 0 or trailer != size:
+            raise _foreign(path, f"the lengths before and after {place} differ")
         out.append(data[at + 4 : at + 4 + size])
         at += size + 8
     return out

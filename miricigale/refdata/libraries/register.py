@@ -65,7 +65,7 @@ class Report:
         span = f"{wave.size} wavelengths, {wave[0]:g} to {wave[-1]:g} um"
         rows += [("spectra", f"{n} of each kind: {kinds}; {span}")]
         for name, values in axes.items():
-            rows.append((name, f"{_some(values)} {units.get(name, '')}".rstrip()))
+            rows.append((name, f"{_listed(values)} {units.get(name, '')}".rstrip()))
         grid = " x ".join(str(values.size) for values in axes.values())
         total = int(np.prod([values.size for values in axes.values()]))
         if library.complete:
@@ -83,7 +83,7 @@ class Report:
         return "\n".join([library.name, *(f"    {key:{column}}{text}" for key, text in rows)])
 
 
-def _some(values):
+def _listed(values):
     """The values of an axis, or their number and ends where there are more than twelve."""
     if values.size <= 12:
         return f"{values.size}: {' '.join(f'{v:g}' for v in values)}"
@@ -164,7 +164,7 @@ def _installing(target):
         To be filled with plain values, kept as JSON in ``<file>.json``; checksum, size and time
         of the file are added.
     """
-    beside = record_path(target)
+    record_file = record_path(target)
     record = {}
     target.parent.mkdir(parents=True, exist_ok=True)
     lock = FileLock(target.with_name(f".{target.name}.lock"))
@@ -177,11 +177,11 @@ def _installing(target):
         with open(partial, "rb+") as handle:
             os.fsync(handle.fileno())
         status = partial.stat()
-        known = {"sha256": file_sha256(partial), "size": status.st_size}
-        known["mtime_ns"] = status.st_mtime_ns
-        new = last.enter_context(replacing(beside))
-        new.write_text(json.dumps(known | record, indent=1) + "\n", encoding="utf-8")
-        beside.unlink(missing_ok=True)
+        record_now = {"sha256": file_sha256(partial), "size": status.st_size}
+        record_now["mtime_ns"] = status.st_mtime_ns
+        new = last.enter_context(replacing(record_file))
+        new.write_text(json.dumps(record_now | record, indent=1) + "\n", encoding="utf-8")
+        record_file.unlink(missing_ok=True)
 
 
 def _reader(name):
@@ -203,8 +203,8 @@ def _read(reader, name, path):
             reason = err.args[0]
         else:
             reason = err
-        what = f"cannot be read as {name!r}: {reason or type(err).__name__}"
-        raise data_error(path, what) from err
+        problem = f"cannot be read as {name!r}: {reason or type(err).__name__}"
+        raise data_error(path, problem) from err
 
 
 def _entry(library, source):

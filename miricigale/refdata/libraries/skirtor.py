@@ -99,19 +99,19 @@ def read_skirtor(path):
 def _check_product(path, axes):
     """Refuse holes and values that are not the library's."""
     values = {name: np.unique(column) for name, column in axes.items()}
-    for name, here in values.items():
-        strange = sorted(set(here.tolist()) - set(SKIRTOR_AXES[name]))
+    for name, nodes in values.items():
+        strange = sorted(set(nodes.tolist()) - set(SKIRTOR_AXES[name]))
         if strange:
-            known = " ".join(f"{v:g}" for v in SKIRTOR_AXES[name])
-            what = f"has {name} {strange[0]:g}, which is not of SKIRTOR 2016: it has {known}"
-            raise data_error(path, what)
-    there = set(zip(*(column.tolist() for column in axes.values()), strict=True))
+            expected = " ".join(f"{v:g}" for v in SKIRTOR_AXES[name])
+            problem = f"has {name} {strange[0]:g}, which is not of SKIRTOR 2016: it has {expected}"
+            raise data_error(path, problem)
+    present = set(zip(*(column.tolist() for column in axes.values()), strict=True))
     wanted = int(np.prod([v.size for v in values.values()]))
-    if len(there) < wanted:
+    if len(present) < wanted:
         product = itertools.product(*(v.tolist() for v in values.values()))
-        holes = itertools.islice((key for key in product if key not in there), 3)
-        what = f"has {len(there):,} spectra, but the values found make {wanted:,}; missing, among others:"
-        raise data_error(path, f"{what} {', '.join(map(_file_name, holes))}")
+        holes = itertools.islice((key for key in product if key not in present), 3)
+        problem = f"has {len(present):,} spectra, but the values found make {wanted:,}; missing, among others:"
+        raise data_error(path, f"{problem} {', '.join(map(_file_name, holes))}")
     if values["inclination"][0] != 0.0:
         raise data_error(path, "has no spectrum at inclination 0: the disk seen from above")
 
@@ -140,25 +140,25 @@ def _read_texts(path):
     disk = []
     dust = []
     files = {}
-    known = {}
+    sources = {}
     for name, data, source in _texts(path):
         key = tuple(map(float, _NAME.fullmatch(name).groups()))
         digest = hashlib.sha256(data).hexdigest()
-        if key in known:
-            what = f"and {known[key][1]} are the same model with different numbers"
-            check_data(known[key][0] == digest, source, what)
+        if key in sources:
+            problem = f"and {sources[key][1]} are the same model with different numbers"
+            check_data(sources[key][0] == digest, source, problem)
             continue
-        known[key] = (digest, source)
+        sources[key] = (digest, source)
         table = _parse(data, source)
         if wave is None:
             wave = table[0]
             _check_wave(wave, source)
         elif not np.allclose(table[0], wave, rtol=1e-4, atol=0.0):
             raise data_error(source, "has other wavelengths than the files before it")
-        seen = table[2] + table[3]
-        _check_columns(wave, table[1:], seen, key[-1], _FLUX, source)
+        observed = table[2] + table[3]
+        _check_columns(wave, table[1:], observed, key[-1], _FLUX, source)
         keys.append(key)
-        disk.append((seen / (wave * _FLUX)).astype(np.float32))
+        disk.append((observed / (wave * _FLUX)).astype(np.float32))
         dust.append((table[4] / (wave * _FLUX)).astype(np.float32))
         files[source.removeprefix(f"{path}{'/' if path.is_dir() else ':'}")] = digest
     check_data(keys, path, f"holds no spectrum; wanted {_WANTED}")
@@ -171,10 +171,10 @@ def _parse(data, source):
     rows = [line for line in data.splitlines() if not line.startswith(b"#")]
     tokens = b"\n".join(rows).split()
     if len(tokens) != _ROWS * _COLUMNS:
-        what = (
+        problem = (
             f"must have {_ROWS} rows of {_COLUMNS} numbers below '#' lines, got {len(tokens)} words"
         )
-        raise data_error(source, f"{what}: truncated, or not a spectrum of SKIRTOR")
+        raise data_error(source, f"{problem}: truncated, or not a spectrum of SKIRTOR")
     with file_errors(source, "has text in a spectrum of SKIRTOR"):
         table = np.array([float(x) for x in tokens]).reshape(_ROWS, _COLUMNS)
     _check_numbers(table, source)
@@ -194,7 +194,7 @@ def _check_wave(wave, source):
         raise data_error(source, f"must have wavelengths from 0.001 to 1000 um, got {got}")
 
 
-def _check_columns(wave, table, seen, inclination, unit, source):
+def _check_columns(wave, table, observed, inclination, unit, source):
     """
     The columns are what they should be, by two laws that all spectra obey.
 
@@ -204,8 +204,8 @@ def _check_columns(wave, table, seen, inclination, unit, source):
     total = table[0]
     dust = table[3]
     transparent = table[-1]
-    what = "has a total that is not direct + scattered + dust: columns in another order?"
-    check_data(np.abs(total - seen - dust).max() <= 1e-3 * total.max(), source, what)
+    problem = "has a total that is not direct + scattered + dust: columns in another order?"
+    check_data(np.abs(total - observed - dust).max() <= 1e-3 * total.max(), source, problem)
     mu = np.cos(np.radians(inclination))
     power = np.trapezoid(transparent / wave, wave) / unit
     law = mu * (1.0 + 2.0 * mu) / 3.0 * 18.0 / 7.0
@@ -236,15 +236,15 @@ def _read_fits(path):
     power = {name: table[f"LNU_{name}"][:, order] * nu for name in _FITS_LIGHT}
     for name, array in power.items():
         _check_numbers(array, f"{path}, column LNU_{name},")
-    seen = power["DISK_DIRECT"] + power["DISK_SCATTERED"]
+    observed = power["DISK_DIRECT"] + power["DISK_SCATTERED"]
     for k, angle in enumerate(table["INCLINATION"]):
         part = [power["TOTAL"][k], None, None, power["DUST_TOTAL"][k], power["TRANSPARENT"][k]]
-        _check_columns(wave, part, seen[k], angle, _SUN, f"{path} row {k + 1}")
-    n = len(seen)
+        _check_columns(wave, part, observed[k], angle, _SUN, f"{path} row {k + 1}")
+    n = len(observed)
     axes = {"tau97": table["TAU"], "inclination": table["INCLINATION"]}
     axes |= {name: np.full(n, value) for name, value in _FITS_FIXED.items()}
     spectra = {
-        "disk": (seen / (wave * _SUN)).astype(np.float32),
+        "disk": (observed / (wave * _SUN)).astype(np.float32),
         "dust": (power["DUST_TOTAL"] / (wave * _SUN)).astype(np.float32),
     }
     return wave, axes, spectra, {path.name: file_sha256(path)}

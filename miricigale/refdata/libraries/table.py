@@ -110,9 +110,9 @@ class LibraryTable:
         """Different values of each axis, ascending: dict of name to `~numpy.ndarray`, read-only."""
         levels = {}
         for name, column in self.axes.items():
-            found = np.unique(column)
-            gap = _SAME * np.maximum(np.abs(found[1:]), np.abs(found[:-1]))
-            levels[name] = frozen_array(found[np.append(True, np.diff(found) > gap)])
+            nodes = np.unique(column)
+            gap = _SAME * np.maximum(np.abs(nodes[1:]), np.abs(nodes[:-1]))
+            levels[name] = frozen_array(nodes[np.append(True, np.diff(nodes) > gap)])
         return levels
 
     def _codes(self, axis, values):
@@ -120,8 +120,8 @@ class LibraryTable:
         levels = self.levels[axis]
         nearest = np.searchsorted(0.5 * (levels[1:] + levels[:-1]), values)
         # zero has no relative neighborhood: there the extent of the axis is the measure
-        near = _SAME * np.maximum(np.abs(levels), 1e-3 * np.ptp(levels))
-        return np.where(np.abs(values - levels[nearest]) <= near[nearest], nearest, -1)
+        tolerance = _SAME * np.maximum(np.abs(levels), 1e-3 * np.ptp(levels))
+        return np.where(np.abs(values - levels[nearest]) <= tolerance[nearest], nearest, -1)
 
     def _place(self, codes):
         """Number of a combination of levels among all of them."""
@@ -136,8 +136,10 @@ class LibraryTable:
         index = dict(zip(places.tolist(), range(self.n_rows), strict=True))
         if len(index) < self.n_rows:
             row = next(i for i, place in enumerate(places.tolist()) if index[place] != i)
-            where = ", ".join(f"{name} = {column[row]:g}" for name, column in self.axes.items())
-            got = f"{where} in rows {row} and {index[places[row]]}"
+            coordinates = ", ".join(
+                f"{name} = {column[row]:g}" for name, column in self.axes.items()
+            )
+            got = f"{coordinates} in rows {row} and {index[places[row]]}"
             raise argument_error("axes", "different in every row", got)
         return index
 
@@ -321,8 +323,8 @@ def verify_library(path, name):
     with open_fits(path, wanted=f"the library {name!r}") as hdus:
         for number, hdu in enumerate(hdus):
             # 1 is success, 2 no checksum
-            what = f"is damaged: wrong checksum in HDU {number} ({hdu.name})"
-            check_data((hdu.verify_datasum(), hdu.verify_checksum()) == (1, 1), path, what)
+            problem = f"is damaged: wrong checksum in HDU {number} ({hdu.name})"
+            check_data((hdu.verify_datasum(), hdu.verify_checksum()) == (1, 1), path, problem)
     for kind, spectra in library.spectra.items():
         for first in range(0, library.n_rows, 1000):
             if not np.all(np.isfinite(spectra[first : first + 1000])):
