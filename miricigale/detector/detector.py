@@ -246,8 +246,8 @@ class Detector(Interactive):
                 group_dq[i, g, rows.start + r] = group_flags[i, g, r]
 
         task.run(store, n_threads, progress_bar)
-        about = {"effects": task.effects, "properties": self.properties, "meta": task.meta}
-        return Ramp(data, task.exposure, pixel_dq=pixel_dq, group_dq=group_dq, **about)
+        attributes = {"effects": task.effects, "properties": self.properties, "meta": task.meta}
+        return Ramp(data, task.exposure, pixel_dq=pixel_dq, group_dq=group_dq, **attributes)
 
     __call__ = expose
 

@@ -43,7 +43,7 @@ def header(exposure, *, filename="", start=None):
     duration = TimeDelta(exposure.duration.to_value("s"), format="sec")
     # as in real files, only the linear part of the WCS stands here
     wcs = exposure.wcs.wcs
-    where = exposure.pointing_keywords()
+    pointing = exposure.pointing_keywords()
     if not wcs.has_cd():
         matrix = wcs.pc * np.asarray(wcs.cdelt)[:, None]
     else:
@@ -56,11 +56,12 @@ def header(exposure, *, filename="", start=None):
     n_int = exposure.n_integrations
     number = exposure.dither + 1
     name = exposure.filter.rpartition(".")[2]
-    values = where | {
+    values = pointing | {
         # not the time of writing: the same exposure gives the same bytes
         "DATE": days["EXPEND"].utc.isot, "DATE-OBS": start.utc.isot[:10], "TIME-OBS": start.utc.isot[11:],
         "FILENAME": filename, "FILTER": name.upper(), "READPATT": exposure.readout,
-        "TARG_RA": where["RA_REF"], "TARG_DEC": where["DEC_REF"], "APERNAME": f"MIRIM_{where['SUBARRAY']}",
+        "TARG_RA": pointing["RA_REF"], "TARG_DEC": pointing["DEC_REF"],
+        "APERNAME": f"MIRIM_{pointing['SUBARRAY']}",
         "NINTS": n_int, "INTEND": n_int, "NGROUPS": exposure.n_groups,
         "NSAMPLES": 9 if exposure.readout.startswith("SLOW") else 1,
         "EXPOSURE": f"{number:05d}", "PATT_NUM": number,

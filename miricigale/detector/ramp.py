@@ -175,12 +175,12 @@ class Ramp(Interactive, NDData):
     def group_time(self):
         """Time between groups in s: that of the header, or of the exposure."""
         if self._header is None:
-            stated = None
+            header_time = None
         else:
-            stated = self._header.get("TGROUP")
-        if stated is None:
+            header_time = self._header.get("TGROUP")
+        if header_time is None:
             return self.exposure.group_time.to_value("s")
-        return float(stated)
+        return float(header_time)
 
     def integration(self, number):
         """

@@ -67,10 +67,10 @@ def read(path):
 def _read(path, hdus):
     check_data("SCI" in hdus, path, "is no ramp: it has no SCI extension")
     header = joined_header(hdus)
-    own = None
+    sim_meta = None
     if "SIM_META" in hdus:
-        own = json.loads(hdus["SIM_META"].data["JSON"][0].tobytes())
-    check_imager(path, header, kinds=_KINDS, own=own)
+        sim_meta = json.loads(hdus["SIM_META"].data["JSON"][0].tobytes())
+    check_imager(path, header, kinds=_KINDS, own=sim_meta)
     shape = _ramp_shape(path, hdus["SCI"].header)
     exposure = _exposure(path, header, shape)
     _check_header(path, header, exposure)
@@ -86,9 +86,9 @@ def _read(path, hdus):
         "header": header,
         "meta": {"origin": header.get("ORIGIN", "unknown"), "filename": path.name},
     }
-    if own is not None:
-        values["meta"] = own
-        own.pop("filter", None)
+    if sim_meta is not None:
+        values["meta"] = sim_meta
+        sim_meta.pop("filter", None)
         if (records := values["meta"].pop("effects", None)) is not None:
             values["effects"] = [effect_from_record(record) for record in records]
         if (properties := values["meta"].pop("properties", None)) is not None:
@@ -114,12 +114,12 @@ def _exposure(path, header, shape):
     for key, value in (("READPATT", readout), ("SUBARRAY", part)):
         check_data(value is not None, path, f"has no keyword {key}")
     pointed = [header.get(key) for key in ("RA_REF", "DEC_REF", "ROLL_REF")]
-    stated = [value is not None for value in pointed]
-    if any(stated) and not all(stated):
+    is_stated = [value is not None for value in pointed]
+    if any(is_stated) and not all(is_stated):
         raise data_error(path, f"must have all of RA_REF, DEC_REF, ROLL_REF or none, got {pointed}")
     pointing = None
     roll = None
-    if all(stated):
+    if all(is_stated):
         pointing = SkyCoord(*pointed[:2], unit="deg")
         roll = pointed[2] * u.deg
     exposure = Exposure(
@@ -158,16 +158,18 @@ def _check_header(path, header, exposure):
         "SUBSTRT1": (header.get("SUBSTRT1"), part.origin[0] + 1, part_name),
         "SUBSTRT2": (header.get("SUBSTRT2"), part.origin[1] + 1, part_name),
     }
-    for name, (stated, true, where) in wanted.items():
-        what = f"{name} is {stated} in the header and {true} {where}"
-        check_data(not (stated is not None and stated != true), path, f"contradicts itself: {what}")
+    for name, (value, true, place) in wanted.items():
+        problem = f"{name} is {value} in the header and {true} {place}"
+        check_data(
+            not (value is not None and value != true), path, f"contradicts itself: {problem}"
+        )
     for name in ("TGROUP", "TFRAME"):
-        stated = header.get(name)
+        value = header.get(name)
         # the table of the read-out patterns is rounded to a millisecond or three digits
-        if stated is not None and not abs(stated - frame) < 5e-3 * frame:
+        if value is not None and not abs(value - frame) < 5e-3 * frame:
             truth = f"the frame of {exposure.readout} {exposure.subarray} takes {frame} s"
-            what = f"{name} = {stated} s, but {truth}, and is one group"
-            raise data_error(path, f"contradicts itself: {what}")
+            problem = f"{name} = {value} s, but {truth}, and is one group"
+            raise data_error(path, f"contradicts itself: {problem}")
 
 
 def _counts(hdu):
@@ -183,14 +185,14 @@ def _counts(hdu):
 def _flags(path, hdus, exposure, shape):
     """Flags of pixels and groups, as far as the file has them; reference pixels are always known."""
     pixel_dq = np.zeros(shape[2:], np.uint32)
-    found = {"SIM_PIXELDQ", "PIXELDQ"} & {hdu.name for hdu in hdus}
-    for name in sorted(found):
+    planes = {"SIM_PIXELDQ", "PIXELDQ"} & {hdu.name for hdu in hdus}
+    for name in sorted(planes):
         # unsigned 32 bits as FITS keeps them: BZERO 2^31
         stored = np.asarray(hdus[name].data).astype(np.int32).view(np.uint32)
         wanted = f"must have flags of {shape[2:]} pixels in {name}"
         check_data(stored.shape == shape[2:], path, f"{wanted}, got {stored.shape}")
         pixel_dq = pixel_dq | (stored ^ np.uint32(2**31))
-    if "SIM_PIXELDQ" not in found:
+    if "SIM_PIXELDQ" not in planes:
         mask = reference_pixel_mask(subarray=exposure.subarray)
         pixel_dq = np.where(mask, pixel_dq | _REFERENCE, pixel_dq)
     values = {"pixel_dq": pixel_dq}

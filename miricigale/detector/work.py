@@ -91,7 +91,7 @@ class Work:
             return hits
 
         hits = self._each_block(work, _ROWS, "charge", n_threads, progress_bar)
-        places = np.concatenate([where for where, _ in hits], axis=1)
+        places = np.concatenate([positions for positions, _ in hits], axis=1)
         return mean, electrons, places, np.concatenate([charge for _, charge in hits]), pixel_dq
 
     def _with_halo(self, rows, chain):
@@ -106,23 +106,23 @@ class Work:
         shape = (*self.shape[:2], wide.stop - wide.start, self.shape[3])
         pixel_dq = np.zeros(shape[2:], np.uint32)
         group_dq = np.zeros(shape, np.uint8)
-        where = (self.exposure, self.properties, wide, pixel_dq, group_dq)
-        _, array, rest = self._lit(Block, where, self.keyed)
-        for effect, key in rest:
-            array = effect.apply(array, Block(*where, key, self.previous))
+        context = (self.exposure, self.properties, wide, pixel_dq, group_dq)
+        _, array, later_effects = self._lit(Block, context, self.keyed)
+        for effect, key in later_effects:
+            array = effect.apply(array, Block(*context, key, self.previous))
         return array[:, :, inner], pixel_dq[inner], group_dq[:, :, inner]
 
-    def _lit(self, kind, where, chain):
+    def _lit(self, kind, context, chain):
         """
         Draw the electrons of light and dark current together: a sum of Poisson numbers is one.
 
         Returns the mean rate, the ramp, and the effects of the chain that are left.
         """
-        light = self.light[where[2]]
+        light = self.light[context[2]]
         n = next(i for i, (effect, _) in enumerate(chain) if isinstance(effect, Photons))
         for effect, key in chain[:n]:
-            light = effect.apply(light, kind(*where, key))
-        block = kind(*where, chain[n][1])
+            light = effect.apply(light, kind(*context, key))
+        block = kind(*context, chain[n][1])
         mean = chain[n][0].expected(light, block)
         if type(chain[n][0]).apply is not Photons.apply:
             # a kind of its own, that may draw otherwise
@@ -130,7 +130,7 @@ class Work:
         for effect, key in chain[n + 1 :]:
             if type(effect).apply is not Dark.apply:
                 break
-            mean = effect.expected(mean, kind(*where, key))
+            mean = effect.expected(mean, kind(*context, key))
             n += 1
         ramp = np.zeros(block.ramp_shape, np.float32)
         electrons = np.ascontiguousarray(mean * block.group_time, float)
@@ -143,10 +143,16 @@ class Work:
         wide, inner = self._with_halo(rows, chain)
         shape = (wide.stop - wide.start, self.shape[3])
         pixel_dq = np.zeros(shape, np.uint32)
-        where = (self.exposure, self.properties, wide, pixel_dq, np.zeros((1, 1, *shape), np.uint8))
-        mean, ramp, rest = self._lit(WholeBlock, where, chain)
-        for effect, key in rest:
-            block = WholeBlock(*where, key, self.previous)
+        context = (
+            self.exposure,
+            self.properties,
+            wide,
+            pixel_dq,
+            np.zeros((1, 1, *shape), np.uint8),
+        )
+        mean, ramp, later_effects = self._lit(WholeBlock, context, chain)
+        for effect, key in later_effects:
+            block = WholeBlock(*context, key, self.previous)
             mean = effect.expected(mean, block)
             ramp = effect.apply(ramp, block)
         hits = (np.empty((3, 0), np.int32), np.empty(0))
@@ -154,5 +160,5 @@ class Work:
         for effect, key in self.keyed:
             if isinstance(effect, CosmicRays):
                 # the shape alone is used of its flags
-                hits = effect.hits(Block(*where[:2], rows, pixel_dq, flags, key))
+                hits = effect.hits(Block(*context[:2], rows, pixel_dq, flags, key))
         return mean[inner], ramp[0, 0, inner], pixel_dq[inner], *hits

@@ -104,8 +104,8 @@ def asdf_extension(wcs=None, shape=None, header=None):
     hdu : `~astropy.io.fits.BinTableHDU`
     """
     content = _STUB
-    known = wcs is not None and all(header.get(name) is not None for name in _REFERENCE)
-    if known and importlib.util.find_spec("gwcs") is not None:
+    has_reference = wcs is not None and all(header.get(name) is not None for name in _REFERENCE)
+    if has_reference and importlib.util.find_spec("gwcs") is not None:
         content = _asdf_bytes({"meta": {"wcs": imager_gwcs(wcs, shape, header)}})
     return bytes_table(content, "ASDF_METADATA", "ASDF")
 
@@ -128,8 +128,8 @@ def _asdf_bytes(tree):
     asdf.AsdfFile(tree).write_to(draft)
     draft.seek(0)
     with asdf.open(draft) as written:
-        used = written.tree["history"]["extensions"]
-        ordered = sorted(used, key=_extension_name)
+        extensions = written.tree["history"]["extensions"]
+        ordered = sorted(extensions, key=_extension_name)
         asdf.AsdfFile({**tree, "history": {"extensions": ordered}}).write_to(final)
     return final.getvalue()
 
@@ -179,9 +179,9 @@ def imager_gwcs(wcs, shape, header):
     pixel = np.stack([np.append(nodes.mean(), nodes) for nodes in (x, y)])
     matrix = attitude_matrix(ra, dec, roll, v2=v2, v3=v3)
     sky = np.radians(pixel_to_radec(wcs, *pixel))
-    seen = np.degrees(vector_angles(matrix.T @ unit_vector(*sky))) * 3600
-    distortion = _polynomials(pixel, seen, _FORWARD)
-    distortion.inverse = _polynomials(seen, pixel, _INVERSE)
+    v2v3 = np.degrees(vector_angles(matrix.T @ unit_vector(*sky))) * 3600
+    distortion = _polynomials(pixel, v2v3, _FORWARD)
+    distortion.inverse = _polynomials(v2v3, pixel, _INVERSE)
     to_sky = (
         Scale(1 / 3600) & Scale(1 / 3600)
         | SphericalToCartesian(wrap_lon_at=180)

@@ -4,10 +4,10 @@ import tempfile
 from pathlib import Path
 
 
-def is_data_model(given):
+def is_data_model(value):
     """Whether something is a data model of ``jwst``, known without importing it."""
-    return callable(getattr(given, "save", None)) and hasattr(
-        getattr(given, "meta", None), "instrument"
+    return callable(getattr(value, "save", None)) and hasattr(
+        getattr(value, "meta", None), "instrument"
     )
 
 

@@ -131,10 +131,10 @@ class DetectorProperties:
             If ``response`` has rows, and none for them.
         """
         wanted = (imager_filter(filter), subarray)
-        known = {row[:2]: row[2] for row in self.response} or {wanted: 1.0}
-        what = f"with {' and '.join(wanted)}"
-        check_that(wanted in known, "response", what, f"{len(known)} others")
-        return known[wanted]
+        rates = {row[:2]: row[2] for row in self.response} or {wanted: 1.0}
+        condition = f"with {' and '.join(wanted)}"
+        check_that(wanted in rates, "response", condition, f"{len(rates)} others")
+        return rates[wanted]
 
     def linearize(self, dn):
         """
@@ -181,8 +181,8 @@ class DetectorProperties:
             if np.all(np.abs(step) < 1e-9 * (1 + target)):
                 break
         with np.errstate(divide="ignore", invalid="ignore"):
-            beyond = np.where(linear > top, measured * linear / top, measured)
-        return np.where(linear > 0, beyond, linear)
+            clipped = np.where(linear > top, measured * linear / top, measured)
+        return np.where(linear > 0, clipped, linear)
 
 
 @cached

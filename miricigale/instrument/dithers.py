@@ -235,8 +235,8 @@ def read_dithers(path, *, observation=None, exposure=None):
     unpacked_size(path)
     if path.suffix.lower() == ".pointing":
         return _read_pointings(path, observation, exposure)
-    for name, given in (("observation", observation), ("exposure", exposure)):
-        check_that(given is None, name, "left out, but for a .pointing file", given)
+    for name, number in (("observation", observation), ("exposure", exposure)):
+        check_that(number is None, name, "left out, but for a .pointing file", number)
     with reading(path, "a table"):
         return _table_offsets(read_table(path, wanted="a table"), path.name)
 
@@ -275,7 +275,7 @@ def read_centers(path, roll):
     -------
     centers : list of `~astropy.coordinates.SkyCoord`
         Of each tile of each observation, where the imager looks in the middle of its dithers.
-    others : list of str
+    detectors : list of str
         Apertures of exposures that are not used, with their types.
 
     Raises
@@ -290,20 +290,22 @@ def read_centers(path, roll):
     >>> centers, others = read_centers("program.pointing", 40 * u.deg)  # doctest: +SKIP
     """
     path = Path(path).expanduser()
-    found = {}
-    others = set()
+    centers = {}
+    detectors = set()
     unpacked_size(path)
     with reading(path, "a list of pointings"):
         for observation, words in _rows(path):
             if words[4] not in _FULL or words[18] not in _USED:
-                others.add(f"{words[4]} ({words[18]})")
+                detectors.add(f"{words[4]} ({words[18]})")
                 continue
             place = [float(words[k]) for k in (7, 8, 15, 16)]
-            found.setdefault((observation, *words[:2]), []).append(place)
-    if not found:
-        raise data_error(path, f"has no exposures of the full imager; it has {sorted(others)}")
+            centers.setdefault((observation, *words[:2]), []).append(place)
+    if not centers:
+        raise data_error(path, f"has no exposures of the full imager; it has {sorted(detectors)}")
     pa = roll + aperture().v3_ideal_y_angle * u.deg
-    return [_looks_at(*np.mean(places, axis=0), pa) for places in found.values()], sorted(others)
+    return [_looks_at(*np.mean(places, axis=0), pa) for places in centers.values()], sorted(
+        detectors
+    )
 
 
 def _looks_at(ra, dec, x, y, pa):
@@ -318,27 +320,32 @@ def _looks_at(ra, dec, x, y, pa):
 
 def _read_pointings(path, observation, exposure):
     """Offsets of the dithers of an exposure."""
-    found = {}
+    pointings = {}
     apertures = set()
     for current, words in _rows(path):
         apertures.add(words[4])
         if not words[4].startswith("MIRIM") or words[18] not in _USED:
             continue
         target, tile, number, dither = (int(word) for word in words[:4])
-        places = found.setdefault(current, {}).setdefault(number, {})
+        places = pointings.setdefault(current, {}).setdefault(number, {})
         offset = float(words[11]), float(words[12])
         places.setdefault((target, tile), {}).setdefault(dither, offset)
-    check_data(found, path, f"has no exposures of MIRIM apertures; it has {sorted(apertures)}")
-    exposures = found[_chosen("observation", observation, found)]
-    every = {}
+    check_data(pointings, path, f"has no exposures of MIRIM apertures; it has {sorted(apertures)}")
+    exposures = pointings[_chosen("observation", observation, pointings)]
+    positions = {}
     for places in exposures.values():
         for tile, offsets in places.items():
-            every.setdefault(tile, []).extend(offsets.values())
+            positions.setdefault(tile, []).extend(offsets.values())
     patterns = {
-        number: [np.mean(every[k], axis=0) - list(one.values()) for k, one in places.items()]
+        number: [
+            np.mean(positions[k], axis=0) - list(position.values())
+            for k, position in places.items()
+        ]
         for number, places in exposures.items()
     }
-    if exposure is not None or not _alike([one for some in patterns.values() for one in some]):
+    if exposure is not None or not _alike(
+        [position for pattern in patterns.values() for position in pattern]
+    ):
         patterns = {0: patterns[_chosen("exposure", exposure, patterns)]}
     offsets = next(iter(patterns.values()))
     if not _alike(offsets):
@@ -350,12 +357,15 @@ def _read_pointings(path, observation, exposure):
 def _alike(patterns):
     """Whether patterns are the same, to the digits of the list."""
     first = patterns[0]
-    return all(one.shape == first.shape and np.allclose(one, first, atol=2e-3) for one in patterns)
+    return all(
+        pattern.shape == first.shape and np.allclose(pattern, first, atol=2e-3)
+        for pattern in patterns
+    )
 
 
-def _chosen(name, value, known):
+def _chosen(name, value, available):
     """The key that is asked for, or the only one."""
-    if value is None and len(known) == 1:
-        return next(iter(known))
-    check_that(value in known, name, f"one of {sorted(known)}", value)
+    if value is None and len(available) == 1:
+        return next(iter(available))
+    check_that(value in available, name, f"one of {sorted(available)}", value)
     return value

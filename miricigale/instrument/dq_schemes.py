@@ -21,7 +21,7 @@ _BAD_PLANES = ("BAD", "SAT", "CR", "EDGE", "NO_DATA", "SUSPECT", "UNMASKEDNAN")
 _PLANE = "MP_"
 
 
-def bad_pixels(values, header, get, where):
+def bad_pixels(values, header, get, path):
     """
     Pixels of a mask that are not to be used.
 
@@ -33,7 +33,7 @@ def bad_pixels(values, header, get, where):
         Of the extension with the mask.
     get : callable
         Value of a keyword in the header of the image or the primary header, or None.
-    where : str
+    path : str
         File and extension, for messages.
 
     Returns
@@ -61,8 +61,8 @@ def bad_pixels(values, header, get, where):
         return values & bits != 0, f"planes {', '.join(names)}"
     telescope = str(get("TELESCOP") or "").strip().upper()
     instrument = str(get("INSTRUME") or "").strip().upper()
-    stated = str(header.get("DQSCHEME", "")).strip().upper()
-    if "JWST" in (telescope, stated) or (not telescope and instrument in _JWST_INSTRUMENTS):
+    scheme_name = str(header.get("DQSCHEME", "")).strip().upper()
+    if "JWST" in (telescope, scheme_name) or (not telescope and instrument in _JWST_INSTRUMENTS):
         return values & int(DQ.DO_NOT_USE) != 0, "bit DO_NOT_USE of JWST"
     if telescope == "HST":
         detector = str(get("DETECTOR") or "").strip().upper()
@@ -79,7 +79,7 @@ def bad_pixels(values, header, get, where):
     if np.any(values[bad] & (values[bad] - 1)) or np.unique(values[bad]).size > 1:
         part = np.mean(bad)
         msg = (
-            f"{where} has bits of which nothing says what they mean (TELESCOP {telescope or 'missing'!s}, no "
+            f"{path} has bits of which nothing says what they mean (TELESCOP {telescope or 'missing'!s}, no "
             f"MP_ cards): every pixel that is not 0 is taken as bad, {part:.2%} of them"
         )
         warn(msg, PhotometryWarning)

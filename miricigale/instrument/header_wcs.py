@@ -103,8 +103,8 @@ def image_wcs(header, hdus):
         If SIP coefficients are left out, distortion is in the ASDF extension alone and gwcs is not installed, or
         the coordinates of header and gwcs (where it is installed) are not the same.
     """
-    where = hdus.filename() or "the list of HDUs"
-    wcs = header_wcs(header, hdus, where=where)
+    file = hdus.filename() or "the list of HDUs"
+    wcs = header_wcs(header, hdus, where=file)
     if "ASDF" not in hdus:
         return wcs
     if wcs is None:
@@ -115,22 +115,22 @@ def image_wcs(header, hdus):
             distorted = asdf_wcs(header, hdus)
         except ImportError as err:
             msg = (
-                f"{where}: the coordinates in the header lack the distortion, which is in "
+                f"{file}: the coordinates in the header lack the distortion, which is in "
                 f"the extension ASDF: positions are pixels off. {err}"
             )
             warn(msg, PhotometryWarning)
             return wcs
         x, y = (np.atleast_1d(value - 1) for value in wcs.wcs.crpix)
         inside = -0.5 <= x[0] <= shape[1] - 0.5 and -0.5 <= y[0] <= shape[0] - 0.5
-        if inside and (apart := _pixels_apart(wcs, distorted, x, y)) > _APART_AT_REFERENCE:
+        if inside and (offset := _pixels_apart(wcs, distorted, x, y)) > _APART_AT_REFERENCE:
             msg = (
-                f"{where}: the coordinates in its header and those in its extension ASDF (gwcs) are {apart:.3g} "
+                f"{file}: the coordinates in its header and those in its extension ASDF (gwcs) are {offset:.3g} "
                 "pixels apart at the reference pixel: those of ASDF are used, which have the distortion. Was the "
                 "header aligned, but not the gwcs?"
             )
             warn(msg, PhotometryWarning)
         return distorted
-    _compare_with_gwcs(wcs, hdus, shape, where)
+    _compare_with_gwcs(wcs, hdus, shape, file)
     return wcs
 
 
@@ -139,7 +139,7 @@ def is_exposure(get):
     return get("S_WCS") == "COMPLETE" and get("S_RESAMP") != "COMPLETE"
 
 
-def _compare_with_gwcs(wcs, hdus, shape, where):
+def _compare_with_gwcs(wcs, hdus, shape, file):
     """Warn if the gwcs of a file, where it can be read, says something else than its header."""
     if any(importlib.util.find_spec(name) is None for name in ("gwcs", "asdf")):
         return
@@ -149,20 +149,20 @@ def _compare_with_gwcs(wcs, hdus, shape, where):
     ny, nx = shape
     x = np.array([0, nx - 1, 0, nx - 1, (nx - 1) / 2])
     y = np.array([0, 0, ny - 1, ny - 1, (ny - 1) / 2])
-    apart = _pixels_apart(wcs, exact, x, y)
-    if apart > _APART:
+    offset = _pixels_apart(wcs, exact, x, y)
+    if offset > _APART:
         msg = (
-            f"{where}: the coordinates in its header and those in its extension ASDF (gwcs) are up to {apart:.3g} "
+            f"{file}: the coordinates in its header and those in its extension ASDF (gwcs) are up to {offset:.3g} "
             "pixels apart: those of the header are used. If those of ASDF are right, remove the WCS keywords of "
             "the header; if not, the extension ASDF"
         )
         warn(msg, PhotometryWarning)
 
 
-def _pixels_apart(wcs, other, x, y):
+def _pixels_apart(wcs, reference, x, y):
     """Largest distance of positions by two coordinates, in pixels of the first; 0 where one of them has none."""
-    there = wcs.world_to_pixel(other.pixel_to_world(x, y))
-    distance = np.hypot(there[0] - x, there[1] - y)
+    mapped = wcs.world_to_pixel(reference.pixel_to_world(x, y))
+    distance = np.hypot(mapped[0] - x, mapped[1] - y)
     finite = np.isfinite(distance)
     if finite.any():
         return float(distance[finite].max())

@@ -98,11 +98,13 @@ class ExposureHistory:
             origin = "other"
         # the first six letters of the type in CRDS
         words = {name: f"R_{TYPES.get(name, name)[:6].upper()}" for name in REFERENCES}
-        known = {name: str(header[word]) for name, word in words.items() if word in header}
-        used = {name: text.removeprefix("crds://") for name, text in known.items()}
+        stated_files = {name: str(header[word]) for name, word in words.items() if word in header}
+        references = {name: text.removeprefix("crds://") for name, text in stated_files.items()}
         if recorded:
             origin = "simulated"
-        return cls(origin=origin, steps=steps_done(header), references=used, day=_middle_of(header))
+        return cls(
+            origin=origin, steps=steps_done(header), references=references, day=_middle_of(header)
+        )
 
     @classmethod
     def of(cls, exposure):
@@ -125,10 +127,10 @@ class ExposureHistory:
         values = {name: meta[name] for name in names if meta.get(name) is not None}
         if meta.get("simulated"):
             values["origin"] = "simulated"
-        used = {
+        references = {
             name: meta[f"reference_{name}"] for name in REFERENCES if f"reference_{name}" in meta
         }
-        return cls(**values, references=used)
+        return cls(**values, references=references)
 
     def meta(self):
         """Entries of the meta dictionary of an image, from which `of` makes it again."""
@@ -192,8 +194,8 @@ def epoch_of(image):
     2024-01-01 00:00:00.000
     """
     meta = getattr(image, "meta", None) or {}
-    kept = meta.get("keywords", {})
-    header = {name: card[0] if isinstance(card, list) else card for name, card in kept.items()}
+    keywords = meta.get("keywords", {})
+    header = {name: card[0] if isinstance(card, list) else card for name, card in keywords.items()}
     days = [header.get(name) for name in _MIDDLES[:3]]
     days += [meta.get("day"), *(header.get(name) for name in _MIDDLES[3:])]
     wcs = getattr(getattr(image, "wcs", None), "wcs", None)

@@ -64,16 +64,16 @@ class Image(Interactive, CCDData):
     def _facts(self):
         ny, nx = self.shape
         if self.mask is None:
-            known = {}
+            facts = {}
         else:
-            known = {"masked": f"{100 * np.mean(self.mask):.3g} %"}
+            facts = {"masked": f"{100 * np.mean(self.mask):.3g} %"}
         if self.wcs is not None and self.wcs.has_celestial:
-            known["center"] = self.wcs.pixel_to_world(nx / 2 - 0.5, ny / 2 - 0.5).to_string(
+            facts["center"] = self.wcs.pixel_to_world(nx / 2 - 0.5, ny / 2 - 0.5).to_string(
                 "hmsdms"
             )
         shown = ("filter", "subarray", "n_exposures", "exposure_time", "background", "steps")
-        known |= {name.replace("_", " "): self.meta[name] for name in shown if name in self.meta}
-        return {"pixels": f"{ny} x {nx}", "unit": self.unit, **known}
+        facts |= {name.replace("_", " "): self.meta[name] for name in shown if name in self.meta}
+        return {"pixels": f"{ny} x {nx}", "unit": self.unit, **facts}
 
     def plot(self, ax=None, **kwargs):
         """
@@ -128,12 +128,12 @@ class Image(Interactive, CCDData):
 
     def to_hdu(self, *args, **kwargs):
         """The HDUs that ``write`` writes; see `astropy.nddata.CCDData.to_hdu`."""
-        plain = CCDData(self, copy=False)
-        plain.flags = None
+        ccd = CCDData(self, copy=False)
+        ccd.flags = None
         if self.uncertainty is not None:
-            plain.uncertainty = standard_deviation(self)
-        plain.meta = fits.Header(fits_meta(self.meta))
-        hdus = plain.to_hdu(*args, **kwargs)
+            ccd.uncertainty = standard_deviation(self)
+        ccd.meta = fits.Header(fits_meta(self.meta))
+        hdus = ccd.to_hdu(*args, **kwargs)
         if self.flags is not None:
             planes = dq_planes(np.asarray(self.flags))
             hdus += [fits.ImageHDU(plane, legend, name=name) for name, plane, legend in planes]

@@ -106,17 +106,17 @@ def companion(hdus, index, name):
     """
     image = hdus[index]
     named = [hdu for hdu in hdus if hdu is not image and hdu.name == name]
-    same = [hdu for hdu in named if hdu.ver == image.ver]
-    if len(same) == 1:
+    same_version = [hdu for hdu in named if hdu.ver == image.ver]
+    if len(same_version) == 1:
         # of a file with two images and one map the map is that of the first by chance
-        return same[0]
+        return same_version[0]
     alike = [hdu for hdu in hdus if hdu.name == image.name and plane_shape(hdu) is not None]
     if len(named) == 1 and len(alike) <= 1:
         return named[0]
     return None
 
 
-def check_plane(hdu, shape, path, what):
+def check_plane(hdu, shape, path, plane_name):
     """
     Refuse a plane that is not on the pixels of its image.
 
@@ -134,11 +134,11 @@ def check_plane(hdu, shape, path, what):
     `~miricigale.utils.exceptions.DataError`
         If the shape is another one.
     """
-    own = plane_shape(hdu) or tuple(hdu.shape)
-    problem = (
-        f"has an extension {hdu.name} ({what}) of the shape {own}, and its image {tuple(shape)}"
+    plane_size = plane_shape(hdu) or tuple(hdu.shape)
+    problem = f"has an extension {hdu.name} ({plane_name}) of the shape {plane_size}, and its image {tuple(shape)}"
+    check_data(
+        plane_size == tuple(shape), path, f"{problem}: not on the same pixels; remove or mend it"
     )
-    check_data(own == tuple(shape), path, f"{problem}: not on the same pixels; remove or mend it")
 
 
 def noise_kind(hdu):
@@ -160,15 +160,15 @@ def noise_kind(hdu):
     `~miricigale.utils.exceptions.DataError`
         If UTYPE is one of an unknown uncertainty.
     """
-    stated = str(hdu.header.get("UTYPE", "")).strip().upper()
-    if stated in _UTYPES:
-        return _UTYPES[stated]
-    if stated.endswith("UNCERTAINTY"):
-        what = (
+    kind_name = str(hdu.header.get("UTYPE", "")).strip().upper()
+    if kind_name in _UTYPES:
+        return _UTYPES[kind_name]
+    if kind_name.endswith("UNCERTAINTY"):
+        problem = (
             f"holds an uncertainty of unknown kind (UTYPE {hdu.header['UTYPE']!r}): say which it is"
         )
         extension = f"extension {hdu.name}"
-        raise data_error(extension, what)
+        raise data_error(extension, problem)
     for kind, names in NOISE_MAPS.items():
         if hdu.name in names:
             return kind

@@ -146,11 +146,11 @@ def check_imager(path, header, *, kinds=None, own=None):
     if str(header.get("FILTER", "")).strip() in _DISPERSERS:
         wanted = "must be an exposure of the MIRI imager through a filter"
         raise data_error(path, f"{wanted}, got the prism {header['FILTER']}")
-    stated = str(header.get("FILTER", "")).strip()
+    filter_name = str(header.get("FILTER", "")).strip()
     recorded = (own or {}).get("filter")
-    bands = {name.rpartition(".")[2].upper() for name in (stated, recorded) if name}
-    what = f"FILTER is {stated} in the header and {recorded} in the package's record"
-    check_data(len(bands) <= 1, path, f"contradicts itself: {what}")
+    bands = {name.rpartition(".")[2].upper() for name in (filter_name, recorded) if name}
+    problem = f"FILTER is {filter_name} in the header and {recorded} in the package's record"
+    check_data(len(bands) <= 1, path, f"contradicts itself: {problem}")
 
 
 def exposure_keywords(header):
@@ -218,13 +218,13 @@ def kept_keywords(header):
     }
 
 
-def placed_keywords(kept, *, wcs=True):
+def placed_keywords(keywords, *, wcs=True):
     """
     Headers of keywords, in the extensions in which JWST has them.
 
     Parameters
     ----------
-    kept : dict of str to list
+    keywords : dict of str to list
         Of `kept_keywords`.
     wcs : bool, optional
         Whether world coordinates are among them.
@@ -241,7 +241,7 @@ def placed_keywords(kept, *, wcs=True):
     (['PROGRAM'], ['VPARITY'])
     """
     parts = fits.Header(), fits.Header()
-    for name, (value, comment) in kept.items():
+    for name, (value, comment) in keywords.items():
         # a card has 80 characters
         longest = max(0, 65 - max(20, len(str(value)) + 2))
         sky = _WCS.fullmatch(name) is not None

@@ -269,8 +269,8 @@ def pixel_area_map(wcs, shape, out=None):
         out = np.empty(shape)
     # bicubic splines as products: values at the nodes to those at all pixels, axis by axis
     down, along = (
-        make_interp_spline(one, np.eye(len(one)))(np.arange(n))
-        for one, n in zip(nodes, shape, strict=True)
+        make_interp_spline(axis_nodes, np.eye(len(axis_nodes)))(np.arange(n))
+        for axis_nodes, n in zip(nodes, shape, strict=True)
     )
     # about the mean, so that all digits are those of its changes
     mean = area.mean()

@@ -153,14 +153,14 @@ def cached(function=None, *, maxsize=None, copies=False):
             return frozen(function(*args, **kwargs))
 
         return functools.lru_cache(maxsize=maxsize)(make)
-    kept = functools.lru_cache(maxsize=maxsize)(function)
+    cached_function = functools.lru_cache(maxsize=maxsize)(function)
 
     @functools.wraps(function)
     def call(*args, **kwargs):
-        return copy.deepcopy(kept(*args, **kwargs))
+        return copy.deepcopy(cached_function(*args, **kwargs))
 
-    call.cache_info = kept.cache_info
-    call.cache_clear = kept.cache_clear
+    call.cache_info = cached_function.cache_info
+    call.cache_clear = cached_function.cache_clear
     return call
 
 

@@ -48,9 +48,9 @@ class _Listener(event.Listener):
 
 def subpackage_of(module):
     """Subpackage of this package that a module is in, by their names; empty for numba's own and for others'."""
-    package, _, rest = module.partition(".")
+    package, _, module_path = module.partition(".")
     if package == __name__.partition(".")[0]:
-        return rest.partition(".")[0]
+        return module_path.partition(".")[0]
     return ""
 
 
@@ -110,7 +110,7 @@ def _forget_stale(folder, package):
 def _digest(package):
     """Checksum of all files of kernels of a package, ``_core.py`` and ``_core/*.py``."""
     root = Path(sys.modules[package].__file__).parent
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for path in sorted([*root.glob("*/_core.py"), *root.glob("*/_core/*.py")]):
-        found.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes())
-    return found.hexdigest()
+        digest.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()

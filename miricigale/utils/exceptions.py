@@ -85,18 +85,18 @@ def units_error(name, wanted, got, *, column=None):
     return UnitsError(f"{label} must be {wanted}, got {got}")
 
 
-def config_error(where, what):
+def config_error(key, problem):
     """Make the `ConfigError` that says where a configuration is wrong (section, key or file), and how."""
-    return ConfigError(f"{where} {what}")
+    return ConfigError(f"{key} {problem}")
 
 
-def data_error(path, what):
+def data_error(path, problem):
     """Make the `DataError` that names a file and says what is wrong with it."""
-    return DataError(f"{path} {what}")
+    return DataError(f"{path} {problem}")
 
 
 @contextlib.contextmanager
-def file_errors(path, what, *kinds):
+def file_errors(path, problem, *kinds):
     """Raise what is wrong with the content of a file, or these kinds too, as a `DataError` that names it."""
     try:
         yield
@@ -106,29 +106,31 @@ def file_errors(path, what, *kinds):
             said = err.args[0]
         else:
             said = err
-        raise data_error(path, f"{what}: {said}") from err
+        raise data_error(path, f"{problem}: {said}") from err
 
 
 #: Of more names than this an error lists the nearest ones only.
 _LISTED = 40
 
 
-def unknown_name(kind, name, known):
+def unknown_name(kind, name, names):
     """Make the `KeyError` for an unknown name that lists the right ones, or of many the nearest three."""
-    known = sorted(map(str, known))
+    names = sorted(map(str, names))
     # also by the last part of names with dots
-    lower = {one.lower().rpartition(".")[2]: one for one in known}
-    lower |= {one.lower(): one for one in known}
-    if len(known) > _LISTED:
+    lower = {name_.lower().rpartition(".")[2]: name_ for name_ in names}
+    lower |= {name_.lower(): name_ for name_ in names}
+    if len(names) > _LISTED:
         close = difflib.get_close_matches(str(name).lower(), lower, n=6, cutoff=0.4)
-        near = list(dict.fromkeys(lower[one] for one in close))[:3] or known[:3]
-        return KeyError(f"no {kind} {name!r}; the nearest of {len(known)} are {', '.join(near)}")
+        suggestions = list(dict.fromkeys(lower[name_] for name_ in close))[:3] or names[:3]
+        return KeyError(
+            f"no {kind} {name!r}; the nearest of {len(names)} are {', '.join(suggestions)}"
+        )
     close = difflib.get_close_matches(str(name).lower(), lower, n=1, cutoff=0.7)
     if close:
         hint = f"; did you mean {lower[close[0]]!r}?"
     else:
         hint = ""
-    return KeyError(f"no {kind} {name!r}; known: {', '.join(known)}{hint}")
+    return KeyError(f"no {kind} {name!r}; known: {', '.join(names)}{hint}")
 
 
 #: Modules that are not the caller of a public function.

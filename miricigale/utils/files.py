@@ -51,7 +51,7 @@ def cached_by_file(maxsize, *, copies=False):
 
     def decorate(function):
         @cached(maxsize=maxsize, copies=copies)
-        def kept(path, state, *args):
+        def read_again(path, state, *args):
             del state
             return function(path, *args)
 
@@ -62,7 +62,7 @@ def cached_by_file(maxsize, *, copies=False):
             except OSError:
                 return function(path, *args)  # which says what is wrong
             state = (status.st_ino, status.st_size, status.st_mtime_ns)
-            return kept(str(path), state, *args)
+            return read_again(str(path), state, *args)
 
         return call
 
@@ -166,10 +166,10 @@ def split_extension(path):
     (('a.fits', 'SCI'), ('a.fits', 1), ('a.fits', None))
     """
     path = os.fspath(path)
-    name, bracket, rest = path.rpartition("[")
-    if not (bracket and name and rest.endswith("]")) or os.path.exists(path):
+    name, bracket, selector = path.rpartition("[")
+    if not (bracket and name and selector.endswith("]")) or os.path.exists(path):
         return path, None
-    extension = rest[:-1].strip()
+    extension = selector[:-1].strip()
     return name, int(extension) if extension.isdigit() else extension
 
 
@@ -216,8 +216,8 @@ def _judge(caught):
             raise OSError(msg)
         # that data are missing is said by `_check_declared`, of packed files too
         # deprecations within astropy do not concern the user
-        own = issubclass(warning.category, AstropyDeprecationWarning)
-        if not own and not text.startswith("File may have been trunc"):
+        is_deprecation = issubclass(warning.category, AstropyDeprecationWarning)
+        if not is_deprecation and not text.startswith("File may have been trunc"):
             warn(warning.message, warning.category)
 
 
@@ -241,8 +241,14 @@ def _check_declared(path, hdus, n_bytes):
 
 def _is_sound(hdu):
     """Whether a header declares an array, a table or nothing, of sizes that there are."""
-    known = fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU, fits.BinTableHDU, fits.TableHDU
-    if not isinstance(hdu, (*known, fits.GroupsHDU)):
+    standard_kinds = (
+        fits.PrimaryHDU,
+        fits.ImageHDU,
+        fits.CompImageHDU,
+        fits.BinTableHDU,
+        fits.TableHDU,
+    )
+    if not isinstance(hdu, (*standard_kinds, fits.GroupsHDU)):
         return False
     return all(value >= 0 for value in hdu.header["NAXIS*"].values())
 
@@ -343,7 +349,7 @@ def packed_open(path):
 
 
 @cached_by_file(256)
-def _count(path, most):
+def _count(path, limit):
     """Bytes after unpacking; one more than the most if there are more."""
     with open(path, "rb") as stream:
         start = stream.read(6)
@@ -356,9 +362,9 @@ def _count(path, most):
         if start.startswith(begin):
             n_bytes = 0
             with importlib.import_module(module).open(path) as stream:
-                while n_bytes <= most and (piece := stream.read(_CHUNK)):
+                while n_bytes <= limit and (piece := stream.read(_CHUNK)):
                     n_bytes += len(piece)
-            return min(n_bytes, most + 1)
+            return min(n_bytes, limit + 1)
     return os.stat(path).st_size
 
 

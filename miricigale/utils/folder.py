@@ -46,8 +46,8 @@ class FileFolder:
         parts = PurePosixPath(name).parts
         # also none that leads out of a folder of Windows
         if not parts or "/".join(parts) != name or ".." in parts or set(name) & set("\\:\0"):
-            what = f"is not the name of a product: products lie in {self.folder}"
-            raise data_error(repr(name), what)
+            problem = f"is not the name of a product: products lie in {self.folder}"
+            raise data_error(repr(name), problem)
         path = self.folder
         for part in parts:
             path = path / part
@@ -271,8 +271,8 @@ class RecordFolder(FileFolder):
     def faults(self, key):
         """What is wrong with the files of a record: dict of name to ``"missing"`` or what else, in words."""
         products = self.records[key]["products"].items()
-        found = {name: self._fault(name, product) for name, product in products}
-        return {name: fault for name, fault in found.items() if fault}
+        faults = {name: self._fault(name, product) for name, product in products}
+        return {name: fault for name, fault in faults.items() if fault}
 
     def _fault(self, name, product):
         """What is wrong with a file, in words; empty if nothing is."""

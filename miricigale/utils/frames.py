@@ -52,9 +52,9 @@ def as_column(values):
         return _of_series(values)
     if isinstance(values, list) and any(value is None for value in values):
         missing = np.array([value is None for value in values])
-        here = np.array([value for value in values if value is not None])
-        out = np.zeros(len(values), dtype=here.dtype)
-        out[~missing] = here
+        present = np.array([value for value in values if value is not None])
+        out = np.zeros(len(values), dtype=present.dtype)
+        out[~missing] = present
         return np.ma.MaskedArray(out, mask=missing)
     return values
 
@@ -75,9 +75,9 @@ def _of_index(data, columns, argument):
             continue
         values = _of_series(index.get_level_values(i))
         if str(name) in columns:
-            same = np.array_equal(np.ma.filled(values), np.ma.filled(columns[str(name)]))
+            is_repeated = np.array_equal(np.ma.filled(values), np.ma.filled(columns[str(name)]))
             wanted = "a frame whose index and columns have different names"
-            check_that(same, argument, wanted, f"two of {str(name)!r} that differ")
+            check_that(is_repeated, argument, wanted, f"two of {str(name)!r} that differ")
         else:
             levels[str(name)] = values
     return levels
@@ -89,13 +89,13 @@ def _of_series(series):
     if not missing.any():
         return series.to_numpy()
     # only what is there, for pandas makes floats of whole numbers beside a missing one
-    here = series[~missing].to_numpy()
-    if here.dtype.kind == "O":
-        here = np.array(here.tolist())
-    if here.dtype.kind == "f":
-        out = np.full(len(series), np.nan, dtype=here.dtype)
-        out[~missing] = here
+    present = series[~missing].to_numpy()
+    if present.dtype.kind == "O":
+        present = np.array(present.tolist())
+    if present.dtype.kind == "f":
+        out = np.full(len(series), np.nan, dtype=present.dtype)
+        out[~missing] = present
         return out
-    out = np.zeros(len(series), dtype=here.dtype)
-    out[~missing] = here
+    out = np.zeros(len(series), dtype=present.dtype)
+    out[~missing] = present
     return np.ma.MaskedArray(out, mask=missing)

@@ -23,14 +23,14 @@ _EXACT = {8: 2**53, 4: 2**24, 2: 2**11}
 _LISTED = 3
 
 
-def _plain(name):
+def _plain_name(name):
     """A name in lower case, without a byte-order mark and what stands between words."""
     return re.sub(r"[\ufeff\s_\-.]+", "", str(name)).lower()
 
 
 def is_id_name(name):
     """Whether a column of this name holds ids by its name alone."""
-    return _plain(name) in (*_NAMES, _LABEL)
+    return _plain_name(name) in (*_NAMES, _LABEL)
 
 
 def id_column(colnames, argument, *, labels=True):
@@ -64,7 +64,7 @@ def id_column(colnames, argument, *, labels=True):
     if "id" in colnames:
         return "id"
     for group in (_NAMES[:1], _NAMES[1:], (_LABEL,) if labels else ()):
-        names = [name for name in colnames if _plain(name) in group]
+        names = [name for name in colnames if _plain_name(name) in group]
         if len(names) == 1:
             return names[0]
         if names:
@@ -79,7 +79,7 @@ def likely_ids(table):
     names = []
     for name in table.colnames:
         kind = getattr(getattr(table[name], "dtype", None), "kind", "")
-        looks = _ID_PART.search(name) or _ID_END.search(name) or _plain(name) in _LIKELY
+        looks = _ID_PART.search(name) or _ID_END.search(name) or _plain_name(name) in _LIKELY
         if looks and kind in "iufUSO" and table[name].ndim == 1 and _is_distinct(table[name]):
             names.append(name)
     return names
@@ -180,12 +180,12 @@ def _is_empty(key):
 
 def _of_objects(ids, missing, argument):
     """Ids of Python objects as an array of one kind."""
-    here = [key for key, gone in zip(ids.tolist(), missing.tolist(), strict=True) if not gone]
-    kinds = sorted({type(key).__name__ for key in here})
+    present = [key for key, gone in zip(ids.tolist(), missing.tolist(), strict=True) if not gone]
+    kinds = sorted({type(key).__name__ for key in present})
     check_that(len(kinds) < 2, argument, "a table with ids of one kind", kinds)
-    if not here:
+    if not present:
         return ids.astype(str)
-    values = np.array(here)
+    values = np.array(present)
     if values.dtype.kind == "O" and kinds == ["int"]:
         # beyond 64 bits
         values = values.astype(str)
@@ -238,8 +238,8 @@ def ids_of_text(texts):
     >>> ids_of_text(["7", "12"]), ids_of_text(["0007", "12"])
     (array([ 7, 12]), array(['0007', '12'], dtype='<U4'))
     """
-    whole = re.compile(r"(-?(?:0|[1-9]\d*))(?:\.0*)?")
-    matches = [whole.fullmatch(text) for text in texts]
+    whole_number = re.compile(r"(-?(?:0|[1-9]\d*))(?:\.0*)?")
+    matches = [whole_number.fullmatch(text) for text in texts]
     if all(matches) and matches:
         numbers = [int(match[1]) for match in matches]
         for dtype in (np.int64, np.uint64):
@@ -267,12 +267,12 @@ class Duplicates:
 
     def add(self, ids, earlier=None):
         """Take the ids of a piece; ``earlier`` (bool, shape (n,)) are those of earlier pieces."""
-        again = np.ones(ids.size, dtype=bool)
-        again[np.unique(ids, return_index=True)[1]] = False
+        is_repeated = np.ones(ids.size, dtype=bool)
+        is_repeated[np.unique(ids, return_index=True)[1]] = False
         if earlier is not None:
-            again |= earlier
-        self.n_rows += int(np.count_nonzero(again))
-        for key in ids[again].tolist():
+            is_repeated |= earlier
+        self.n_rows += int(np.count_nonzero(is_repeated))
+        for key in ids[is_repeated].tolist():
             if len(self.first) == _LISTED:
                 break
             if key not in self.first:
@@ -281,12 +281,12 @@ class Duplicates:
     def warn(self, argument, what="only the first row of each is fitted"):
         """Warn if there are any; ``what`` says what becomes of them."""
         if self.n_rows:
-            some = ", ".join(map(repr, self.first))
+            examples = ", ".join(map(repr, self.first))
             if self.n_rows == 1:
                 rows = "1 row has"
             else:
                 rows = f"{self.n_rows} rows have"
-            text = f"{argument}: {rows} an id that occurred before ({some}"
+            text = f"{argument}: {rows} an id that occurred before ({examples}"
             warn(
                 f"{text}{', ...' if self.n_rows > len(self.first) else ''}); {what}", CatalogWarning
             )

@@ -57,14 +57,19 @@ class FolderLock:
         except PermissionError as err:
             raise data_error(self._lock.lock_file, "is a lock that this user may not open") from err
         except OSError as err:
-            what = f"cannot be locked ({err.strerror}): choose a folder on a file system with locks"
-            raise data_error(self._lock.lock_file, what) from err
+            problem = (
+                f"cannot be locked ({err.strerror}): choose a folder on a file system with locks"
+            )
+            raise data_error(self._lock.lock_file, problem) from err
         try:
             # where locks are not passed on to other hosts the file alone says who was first
             if _is_elsewhere(self._owner()):
                 raise self._refusal()
-            now = datetime.datetime.now(datetime.UTC)
-            owner = _here() | {"pid": os.getpid(), "started": f"{now:%Y-%m-%d %H:%M:%S} UTC"}
+            begin = datetime.datetime.now(datetime.UTC)
+            owner = _this_process() | {
+                "pid": os.getpid(),
+                "started": f"{begin:%Y-%m-%d %H:%M:%S} UTC",
+            }
             with replacing(self.path) as partial:
                 partial.write_text(json.dumps(owner) + "\n", encoding="utf-8")
         except BaseException:
@@ -90,9 +95,9 @@ class FolderLock:
 
     def _refusal(self):
         owner = self._owner()
-        where = f"process {owner.get('pid', '(unknown)')} on {owner.get('host', 'unknown host')}"
+        holder = f"process {owner.get('pid', '(unknown)')} on {owner.get('host', 'unknown host')}"
         if owner.get("started"):
-            where += f", started {owner['started']}"
+            holder += f", started {owner['started']}"
         # where locks are not passed on, the file that names the owner is the lock
         elsewhere = _is_elsewhere(owner)
         if elsewhere:
@@ -102,17 +107,17 @@ class FolderLock:
             place = ""
             file = self._lock.lock_file
         return DataError(
-            f"{self.folder} is in use by a {self.purpose}{place}: {where}; "
+            f"{self.folder} is in use by a {self.purpose}{place}: {holder}; "
             f"if that process is gone, remove {file}"
         )
 
 
 def _is_elsewhere(owner):
     """Whether a file names an owner on another host."""
-    return bool(owner) and not _here().items() <= owner.items()
+    return bool(owner) and not _this_process().items() <= owner.items()
 
 
-def _here():
+def _this_process():
     """This host; the machine's id distinguishes hosts of the same name."""
     try:
         machine = Path("/etc/machine-id").read_text(encoding="utf-8").strip()

@@ -35,8 +35,8 @@ def provenance(*, citations=(), **values):
     meta : dict
         Package name and version, UTC date, citations (sorted, unique) and the values.
     """
-    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    meta = {"package": "miricigale", "version": _version(), "created": now}
+    date = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    meta = {"package": "miricigale", "version": _version(), "created": date}
     if citations:
         meta["citations"] = sorted(set(citations))
     meta.update({key: value for key, value in values.items() if value is not None})
@@ -85,10 +85,10 @@ def fits_meta(meta):
         if isinstance(value, np.generic):
             value = value.item()
         finite = isinstance(value, float) and math.isfinite(value)
-        plain = finite or isinstance(value, (bool, int))
-        if plain or (isinstance(value, str) and _TEXT.fullmatch(value)):
-            own = _KEYWORD.fullmatch(key) is not None and key.upper() not in _RESERVED
-            cards[key if own else f"HIERARCH {key}"] = value
+        is_plain = finite or isinstance(value, (bool, int))
+        if is_plain or (isinstance(value, str) and _TEXT.fullmatch(value)):
+            fits_keyword = _KEYWORD.fullmatch(key) is not None and key.upper() not in _RESERVED
+            cards[key if fits_keyword else f"HIERARCH {key}"] = value
     return cards | {"META": json.dumps(meta, default=plain_value)}
 
 

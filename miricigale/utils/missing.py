@@ -42,15 +42,19 @@ def without_codes(values, errors=None, *, magnitudes=False, further=()):
         else:
             zero = none
         return (code & (magnitudes | (values < 0))) | zero | named, none
-    same = errors == values
+    repeats_value = errors == values
     size = np.abs(values)
     sigma = np.abs(errors)
     coded = is_code(errors)
     noise = (errors >= 0.2 * size) & (errors <= 100.0 * size)
     limit = (values >= sigma) & (values <= 10.0 * sigma)
-    no_error = (coded & (((errors < 0) & ~limit) | magnitudes | same)) | np.isin(errors, further)
+    no_error = (coded & (((errors < 0) & ~limit) | magnitudes | repeats_value)) | np.isin(
+        errors, further
+    )
     zero = (values == 0) & (~(errors > 0) if magnitudes else errors == 0)
-    missing = (code & (((values < 0) & (coded | ~noise)) | magnitudes | same)) | zero | named
+    missing = (
+        (code & (((values < 0) & (coded | ~noise)) | magnitudes | repeats_value)) | zero | named
+    )
     return missing, no_error
 
 
@@ -89,9 +93,9 @@ def negative_errors(values, errors):
     limit, nothing : `~numpy.ndarray` of bool, shape (n,)
         Upper limits, and those that are none because they are not positive: no source is fainter than nothing.
     """
-    known = np.isfinite(values) & np.isfinite(errors) & (errors < 0)
-    nothing = known & (values <= 0)
-    return known & ~nothing, nothing
+    is_negative = np.isfinite(values) & np.isfinite(errors) & (errors < 0)
+    nothing = is_negative & (values <= 0)
+    return is_negative & ~nothing, nothing
 
 
 def is_code(values):
@@ -174,10 +178,10 @@ def without_mask(values):
     """
     if hasattr(values, "isna") and hasattr(values, "to_numpy"):
         missing = np.asarray(values.isna(), dtype=bool)
-        here = values[~missing].to_numpy()
-        plain = np.zeros(len(values), dtype=here.dtype)
-        plain[~missing] = here
-        return plain, (missing if missing.any() else None)
+        present = values[~missing].to_numpy()
+        unmasked = np.zeros(len(values), dtype=present.dtype)
+        unmasked[~missing] = present
+        return unmasked, (missing if missing.any() else None)
     if isinstance(values, (list, tuple)) and any(
         value is None or value is np.ma.masked for value in values
     ):
@@ -190,16 +194,16 @@ def without_mask(values):
         mask = np.zeros((), bool)
     if not np.any(mask):
         return getattr(values, "unmasked", values), None
-    plain = getattr(values, "unmasked", values)
-    if isinstance(plain, np.ma.MaskedArray):
+    unmasked = getattr(values, "unmasked", values)
+    if isinstance(unmasked, np.ma.MaskedArray):
         # columns keep their unit
-        unit = getattr(plain, "unit", None)
-        plain = np.ma.getdata(plain)
+        unit = getattr(unmasked, "unit", None)
+        unmasked = np.ma.getdata(unmasked)
         if unit is not None:
-            plain = plain << unit
-    if plain.dtype.kind == "O":
-        plain = np.where(mask, 0.0, plain).astype(float)
-    return plain, mask
+            unmasked = unmasked << unit
+    if unmasked.dtype.kind == "O":
+        unmasked = np.where(mask, 0.0, unmasked).astype(float)
+    return unmasked, mask
 
 
 def floats(values):

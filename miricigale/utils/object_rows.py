@@ -61,16 +61,16 @@ class ObjectRows(Interactive):
 
     def _mapped(self, function):
         """Fields of arrays by name, after a function on each array."""
-        found = {}
+        mapped = {}
         for name, value in self._per_object():
             if isinstance(value, dict):
-                found[name] = _ByName({key: function(array) for key, array in value.items()})
+                mapped[name] = _ByName({key: function(array) for key, array in value.items()})
             else:
                 if value is None:
-                    found[name] = None
+                    mapped[name] = None
                 else:
-                    found[name] = function(value)
-        return found
+                    mapped[name] = function(value)
+        return mapped
 
     @property
     def isscalar(self):
@@ -126,8 +126,8 @@ class ObjectRows(Interactive):
         else:
             table = {}
         if name not in getattr(table, "colnames", ()):
-            known = [*getattr(table, "colnames", ()), *map(str, self._row_of_id)]
-            raise unknown_name("column or id", name, known)
+            available = [*getattr(table, "colnames", ()), *map(str, self._row_of_id)]
+            raise unknown_name("column or id", name, available)
         return table[name]
 
     def _take(self, rows):
@@ -174,8 +174,8 @@ class ObjectRows(Interactive):
         try:
             return self._row_of_id[key]
         except (KeyError, TypeError):
-            some = ", ".join(map(repr, list(self._row_of_id)[:5]))
-            msg = f"no object with the id {key!r} among {len(self)}; the first are {some}"
+            examples = ", ".join(map(repr, list(self._row_of_id)[:5]))
+            msg = f"no object with the id {key!r} among {len(self)}; the first are {examples}"
             raise KeyError(msg) from None
 
     @classmethod
@@ -204,10 +204,10 @@ class ObjectRows(Interactive):
         for name, value in parts[0]._per_object():
             values = [getattr(part, name) for part in parts]
             if isinstance(value, dict):
-                if any(one.keys() != value.keys() for one in values):
+                if any(mapping.keys() != value.keys() for mapping in values):
                     raise argument_error("parts", f"with the same {name!r}", "others")
-                joined = {k: _joined([one[k] for one in values], name) for k in value}
-            elif any((one is None) != (value is None) for one in values):
+                joined = {k: _joined([mapping[k] for mapping in values], name) for k in value}
+            elif any((mapping is None) != (value is None) for mapping in values):
                 raise argument_error("parts", f"all with {name!r} or all without", "some")
             else:
                 if value is None:
@@ -226,7 +226,7 @@ class ByID:
 
     def __getitem__(self, key):
         if isinstance(key, (list, np.ndarray)) and np.ndim(key):
-            return self._rows[[self._rows.row(one) for one in key]]
+            return self._rows[[self._rows.row(id_) for id_ in key]]
         return self._rows._take(self._rows.row(key))
 
 

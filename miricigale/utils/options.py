@@ -33,7 +33,7 @@ def check_that(good, name, wanted, got):
         raise argument_error(name, wanted, got)
 
 
-def check_data(good, path, what):
+def check_data(good, path, problem):
     """
     Refuse a file unless ``good`` holds.
 
@@ -58,19 +58,19 @@ def check_data(good, path, what):
     miricigale.utils.exceptions.DataError: image.fits has no SCI extension
     """
     if not good:
-        raise data_error(path, what)
+        raise data_error(path, problem)
 
 
-def check_choice(value, name, known):
+def check_choice(value, name, choices):
     """Refuse a value that is none of those known (a `ValueError`)."""
-    check_that(value in known, name, " or ".join(repr(one) for one in known), repr(value))
+    check_that(value in choices, name, " or ".join(repr(choice) for choice in choices), repr(value))
 
 
-def check_names(names, kind, known):
+def check_names(names, kind, available):
     """Refuse the first of some names that is not known (a `KeyError` that lists those that are)."""
     for name in names:
-        if name not in known:
-            raise unknown_name(kind, name, known)
+        if name not in available:
+            raise unknown_name(kind, name, available)
 
 
 def check_kind(value, name, kind):
@@ -79,10 +79,10 @@ def check_kind(value, name, kind):
         raise argument_error(name, f"a {kind.__name__}", repr(value))
 
 
-def check_least(value, name, least, *, whole=False):
-    """Refuse what is no number, below ``least`` or, with ``whole``, no integer (a `ValueError`)."""
-    if not (isinstance(value, numbers.Integral if whole else numbers.Real) and value >= least):
-        raise argument_error(name, f"at least {least}{', an integer' * whole}", value)
+def check_least(value, name, minimum, *, whole=False):
+    """Refuse what is no number, below ``minimum`` or, with ``whole``, no integer (a `ValueError`)."""
+    if not (isinstance(value, numbers.Integral if whole else numbers.Real) and value >= minimum):
+        raise argument_error(name, f"at least {minimum}{', an integer' * whole}", value)
 
 
 def check_positive(value, name, *, optional=False):

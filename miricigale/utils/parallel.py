@@ -49,7 +49,7 @@ def available_memory():
     return total
 
 
-def check_memory(n_bytes, what, *, advice):
+def check_memory(n_bytes, purpose, *, advice):
     """
     Refuse what does not fit into the memory, before it is begun.
 
@@ -57,7 +57,7 @@ def check_memory(n_bytes, what, *, advice):
     ----------
     n_bytes : int
         What would be allocated.
-    what : str
+    purpose : str
         What it is, for the message.
     advice : str
         What can be done instead.
@@ -67,10 +67,10 @@ def check_memory(n_bytes, what, *, advice):
     MemoryError
         If it is more than nine tenths of the memory (`available_memory`).
     """
-    most = 0.9 * available_memory()
-    if n_bytes > most:
-        had = f"{most / 1e9:.3g} GB can be had"
-        msg = f"{what} would take {n_bytes / 1e9:.3g} GB of memory, and {had}: {advice}"
+    limit = 0.9 * available_memory()
+    if n_bytes > limit:
+        available = f"{limit / 1e9:.3g} GB can be had"
+        msg = f"{purpose} would take {n_bytes / 1e9:.3g} GB of memory, and {available}: {advice}"
         raise MemoryError(msg)
 
 

@@ -105,9 +105,9 @@ def at_epoch(sky, epoch, argument):
     )
     unknown = ~(np.isfinite(east) & np.isfinite(north))
     moving = np.where(unknown, 0.0, np.hypot(east, north)) > 0
-    plain = SkyCoord(icrs.ra, icrs.dec)
+    positions = SkyCoord(icrs.ra, icrs.dec)
     if not moving.any():
-        return plain
+        return positions
     remedy = "sky.apply_space_motion(new_obstime=...) brings them to a time"
     if sky.obstime is None:
         wanted = "positions of a known time where they have proper motions (obstime=)"
@@ -121,8 +121,8 @@ def at_epoch(sky, epoch, argument):
             "stay where they are"
         )
         warn(msg, CatalogWarning)
-    ra = floats(plain.ra.rad)
-    dec = floats(plain.dec.rad)
+    ra = floats(positions.ra.rad)
+    dec = floats(positions.dec.rad)
     zero = np.zeros_like(ra)
     vector = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
     to_east = np.stack([-np.sin(ra), np.cos(ra), zero])

@@ -165,10 +165,10 @@ class _FitsRows(RowFile):
         if wanted is None and len(chosen) > 1:
             chosen = [i for i in chosen if hdus[i].name != LDAC_HEADER]
         if len(chosen) != 1:
-            what = f"no binary table in extension {wanted!r}"
+            problem = f"no binary table in extension {wanted!r}"
             if wanted is None:
-                what = f"{len(tables)} binary tables; 'hdu' says which is meant"
-            raise data_error(self.path, f"has {what}")
+                problem = f"{len(tables)} binary tables; 'hdu' says which is meant"
+            raise data_error(self.path, f"has {problem}")
         return hdus[chosen[0]]
 
     def _read(self, rows):
@@ -204,10 +204,10 @@ class _ParquetRows(RowFile):
 
     def _take(self, n):
         """Return the next rows, a `pyarrow.Table`."""
-        kept = [self._kept]
-        while sum(map(len, kept)) < n:
-            kept.append(type(self._kept).from_batches([next(self._batches)]))
-        rows = require("pyarrow", extra="parquet").concat_tables(kept)
+        batches = [self._kept]
+        while sum(map(len, batches)) < n:
+            batches.append(type(self._kept).from_batches([next(self._batches)]))
+        rows = require("pyarrow", extra="parquet").concat_tables(batches)
         self._kept = rows.slice(n)
         self._at += n
         return rows.slice(0, n)
@@ -258,9 +258,9 @@ def write_rows(path, tables, n_rows, *, id_width=0, overwrite=False):
 def _same_ids(table, width):
     """A table whose ids, if they are text, have the given width."""
     if "id" in table.colnames and table["id"].dtype.kind == "U":
-        about = table["id"].info.description
+        description = table["id"].info.description
         table["id"] = np.asarray(table["id"]).astype(f"U{max(1, width // 4)}")
-        table["id"].info.description = about
+        table["id"].info.description = description
     return table
 
 
@@ -290,8 +290,8 @@ def _write_fits(path, tables, n_rows):
             if layout is None:
                 layout = columns
                 header["NAXIS2"] = n_rows
-                both = fits.PrimaryHDU().header.tostring() + header.tostring()
-                stream.write(both.encode("ascii"))
+                headers = fits.PrimaryHDU().header.tostring() + header.tostring()
+                stream.write(headers.encode("ascii"))
             _check_same(layout, columns)
             n_bytes += stream.write(rows)
         stream.write(bytes(-n_bytes % 2880))
@@ -311,8 +311,8 @@ def _fits_rows(table):
             key = "cite"
             value = "; ".join(value)
         # headers hold no dicts
-        plain = isinstance(value, (str, int, float, bool))
-        if plain:
+        is_plain = isinstance(value, (str, int, float, bool))
+        if is_plain:
             table.meta[key] = value
         else:
             table.meta[key] = json.dumps(value, default=plain_value)

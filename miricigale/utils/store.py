@@ -108,15 +108,15 @@ def open_parts(path, layouts, *, wanted, memmap=False):
             yield Parts(hdus)
 
 
-def _foreign(layout, own, wanted):
+def _foreign(layout, package, wanted):
     """What is said of a file of another layout: of another version of the package, or something else."""
     stem, _, number = layout.rpartition("-")
-    if number.isdecimal() and stem == own.rpartition("-")[0]:
+    if number.isdecimal() and stem == package.rpartition("-")[0]:
         return (
             f"holds {wanted} in the layout {layout!r} of another version of the package, and this one reads "
-            f"{own!r}: make the file again with this version, or read it with the one that wrote it"
+            f"{package!r}: make the file again with this version, or read it with the one that wrote it"
         )
-    return f"holds no {wanted} (no FORMAT = {own!r} in its header)"
+    return f"holds no {wanted} (no FORMAT = {package!r} in its header)"
 
 
 class Parts:

@@ -205,7 +205,7 @@ def ragged_columns(hdu):
     return [column.name for column in columns if set(str(column.format)) & {"P", "Q"}]
 
 
-def leave_ragged_out(table, hdu, where):
+def leave_ragged_out(table, hdu, place):
     """
     Leave columns of variable length out of a table, with a warning that names them.
 
@@ -215,7 +215,7 @@ def leave_ragged_out(table, hdu, where):
         Changed in place.
     hdu : `~astropy.io.fits.BinTableHDU`
         What it was read from.
-    where : str
+    place : str
         Name of the file.
 
     Warns
@@ -225,14 +225,14 @@ def leave_ragged_out(table, hdu, where):
     """
     names = [name for name in ragged_columns(hdu) if name in table.colnames]
     table.remove_columns(names)
-    warn_of_ragged(names, where)
+    warn_of_ragged(names, place)
 
 
-def warn_of_ragged(names, where):
+def warn_of_ragged(names, place):
     """Warn of columns of variable length that are left out, if there are any."""
     if names:
         listed = ", ".join(map(repr, names))
-        warn(f"{where}: columns of variable length are left out: {listed}", CatalogWarning)
+        warn(f"{place}: columns of variable length are left out: {listed}", CatalogWarning)
 
 
 def _first_table(hdus):
@@ -301,7 +301,7 @@ def arrow_table(rows, cls=QTable, *, where=None):
     return in_units(table, cls)
 
 
-def _plain_columns(rows, where):
+def _plain_columns(rows, place):
     """Rows of Arrow with columns of types that a table can hold, and a warning about the others."""
     types = require("pyarrow", extra="parquet").types
     pyarrow = require("pyarrow", extra="parquet")
@@ -326,10 +326,10 @@ def _plain_columns(rows, where):
             continue
         if column is not rows.column(i):
             rows = rows.set_column(i, field.name, column)
-    if lost and where is not None:
+    if lost and place is not None:
         names = ", ".join(map(repr, lost))
         text = "columns of bytes, lists or structures, which a table cannot hold, are left out"
-        warn(f"{where}: {text}: {names}", CatalogWarning)
+        warn(f"{place}: {text}: {names}", CatalogWarning)
     return rows
 
 
@@ -420,12 +420,12 @@ def _ids_as_written(table, path, source, form, names):
             # a word may be an id among text
             missing = column.mask | (texts == "")
             ids = texts[~missing]
-        every = np.zeros(len(texts), dtype=ids.dtype)
-        every[~missing] = ids
+        texts_as_numbers = np.zeros(len(texts), dtype=ids.dtype)
+        texts_as_numbers[~missing] = ids
         if missing.any():
-            table[name] = MaskedColumn(every, mask=missing)
+            table[name] = MaskedColumn(texts_as_numbers, mask=missing)
         else:
-            table[name] = Column(every)
+            table[name] = Column(texts_as_numbers)
 
 
 def _has_odd_numbers(path):
@@ -510,10 +510,10 @@ def write_table(table, path, *, overwrite=False):
             hdus.writeto(partial)
         else:
             if form == "votable":
-                plain = sky_as_angles(table)
+                plain_table = sky_as_angles(table)
             else:
-                plain = table
-            plain.write(partial, format=form, **_OPTIONS.get(form, {}))
+                plain_table = table
+            plain_table.write(partial, format=form, **_OPTIONS.get(form, {}))
 
 
 def table_hdu(table):

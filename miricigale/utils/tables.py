@@ -42,15 +42,18 @@ class Flags(enum.IntFlag):
             By value: its name in words, and a sentence.
         """
         source = inspect.getsource(cls)
-        found = {}
+        meanings = {}
         for member in cls:
             before = re.search(rf"((?: *#: .*\n)+) *{member.name} = ", source)
             after = re.search(rf'\b{member.name} = [^\n]*\n *"""(.*?)"""', source, flags=re.DOTALL)
-            beside = re.search(rf"\b{member.name} = [^\n#]*# (.*)", source)
-            text = next((one[1] for one in (before, after, beside) if one), "")
-            plain = text.replace("#:", "").replace("``", "")
-            found[member.value] = member.name.lower().replace("_", " "), " ".join(plain.split())
-        return found
+            same_line = re.search(rf"\b{member.name} = [^\n#]*# (.*)", source)
+            text = next((match[1] for match in (before, after, same_line) if match), "")
+            meaning = text.replace("#:", "").replace("``", "")
+            meanings[member.value] = (
+                member.name.lower().replace("_", " "),
+                " ".join(meaning.split()),
+            )
+        return meanings
 
 
 def as_table(data, argument):
@@ -154,7 +157,7 @@ def described_columns(values, texts, meta=None):
     table : `~astropy.table.QTable`
     """
     pairs = zip(texts.items(), values, strict=True)
-    return described_table({name: (one, text or None) for (name, text), one in pairs}, meta)
+    return described_table({name: (column, text or None) for (name, text), column in pairs}, meta)
 
 
 def described_rows(rows, texts):
@@ -275,11 +278,11 @@ def ascii_ids(ids, argument):
         texts = [key for key in ids.tolist() if isinstance(key, str)]
         foreign = [key for key in texts if not key.isascii() or key != key.rstrip(" ")]
         if len(foreign) > 3:
-            more = f" and {len(foreign) - 3} more"
+            remainder = f" and {len(foreign) - 3} more"
         else:
-            more = ""
+            remainder = ""
         wanted = "ASCII, with no blank at the end, where they go to a FITS file"
-        check_that(not foreign, argument, wanted, ", ".join(map(repr, foreign[:3])) + more)
+        check_that(not foreign, argument, wanted, ", ".join(map(repr, foreign[:3])) + remainder)
     return ids
 
 

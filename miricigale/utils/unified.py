@@ -24,13 +24,13 @@ class _Method(UnifiedReadWrite):
 
     def _format(self, path, kwargs):
         importlib.import_module(self._cls.io_module)
-        known = kwargs.pop("format", None)
-        if known is not None:
-            return known
+        stated_format = kwargs.pop("format", None)
+        if stated_format is not None:
+            return stated_format
         path = os.fspath(path)
-        found = registry.identify_format(self.method, self._cls, path, None, [path], kwargs)
-        if len(found) == 1:
-            return found[0]
+        formats_found = registry.identify_format(self.method, self._cls, path, None, [path], kwargs)
+        if len(formats_found) == 1:
+            return formats_found[0]
         formats = registry.get_formats(self._cls, self.method.capitalize())["Format"].tolist()
         suffixes = [suffix for name in formats for suffix in _SUFFIXES.get(name, ())]
         msg = f"{path} must end in one of {', '.join(suffixes)}, or 'format' be one of {formats}"
@@ -57,8 +57,8 @@ class _Read(_Method):
     method = "read"
 
     def __call__(self, path, *args, **kwargs):
-        found = self._format(path, kwargs)
-        return self.registry.read(self._cls, path, *args, format=found, **kwargs)
+        file_format = self._format(path, kwargs)
+        return self.registry.read(self._cls, path, *args, format=file_format, **kwargs)
 
 
 class _Write(_Method):
@@ -84,12 +84,14 @@ class _Write(_Method):
 
     def __call__(self, path, *args, **kwargs):
         importlib.import_module(self._cls.io_module)
-        found = registry.identify_format("write", self._cls, os.fspath(path), None, [path], kwargs)
+        file_format = registry.identify_format(
+            "write", self._cls, os.fspath(path), None, [path], kwargs
+        )
         # other formats hold the table that people want, and cannot be read back as the whole
-        if not found and "format" not in kwargs and hasattr(self._instance, "to_table"):
+        if not file_format and "format" not in kwargs and hasattr(self._instance, "to_table"):
             return write_table(self._instance.to_table(), path, **kwargs)
-        found = self._format(path, kwargs)
-        return self.registry.write(self._instance, path, *args, format=found, **kwargs)
+        file_format = self._format(path, kwargs)
+        return self.registry.write(self._instance, path, *args, format=file_format, **kwargs)
 
 
 def read_write(what, options=""):

@@ -104,9 +104,9 @@ def to_array(value, unit, name, *, ndim=None, finite=False, equivalencies=None):
     value, mask = without_mask(value)
     if isinstance(getattr(value, "unit", None), u.UnitBase) and unit.is_equivalent(u.Jy):
         # maggies, which astropy ties to no flux
-        known = flux_unit(value.unit)
-        if known is not None:
-            value = u.Quantity(getattr(value, "value", value), known)
+        flux = flux_unit(value.unit)
+        if flux is not None:
+            value = u.Quantity(getattr(value, "value", value), flux)
     try:
         quantity = u.Quantity(value)
     except u.UnitTypeError:
@@ -122,8 +122,8 @@ def to_array(value, unit, name, *, ndim=None, finite=False, equivalencies=None):
         else:
             got = type(value).__name__
         raise argument_error(name, wanted, got) from None
-    bare = not hasattr(value, "unit") and quantity.unit == u.dimensionless_unscaled
-    if bare and unit != u.dimensionless_unscaled:
+    is_bare = not hasattr(value, "unit") and quantity.unit == u.dimensionless_unscaled
+    if is_bare and unit != u.dimensionless_unscaled:
         raise units_error(name, f"a quantity convertible to {unit}", "a bare number")
     try:
         array = np.asarray(quantity.to_value(unit, equivalencies or []), dtype=float)

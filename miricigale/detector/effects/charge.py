@@ -183,26 +183,26 @@ class Persistence(Effect):
             for a, t in zip(self.amplitudes, self.times, strict=True)
         )
 
-    def _kept(self, block):
+    def _remaining_share(self, block):
         """Share of its charge that each pixel keeps, in each integration of a block, (n_int, 1, n_row, n_col)."""
         exposure = block.exposure
         number = block.ramp_shape[0]
-        kept = 1.0
-        each = (exposure.integration_time + exposure.frame_time).to_value(TIME)
-        middle = each * exposure.n_integrations * (np.arange(number) + 0.5) / number
+        share = 1.0
+        duration = (exposure.integration_time + exposure.frame_time).to_value(TIME)
+        middle = duration * exposure.n_integrations * (np.arange(number) + 0.5) / number
         for latent in block.previous:
             # hours, while an integration lasts minutes
             lost = self.deficit * np.exp(-(latent.gap.to_value(TIME) + middle) / self.deficit_time)
-            kept = kept * (1 - np.multiply.outer(lost, latent.saturated[None, block.rows]))
-        return kept
+            share = share * (1 - np.multiply.outer(lost, latent.saturated[None, block.rows]))
+        return share
 
     def apply(self, ramp, block):
         """Add the charge that comes free, and take the deficit off."""
         if not block.previous:
             return ramp
         if self.deficit:
-            ramp *= self._kept(block)
-        rates, released = self._left(block)
+            ramp *= self._remaining_share(block)
+        rates, released = self._released_rates(block)
         if released.shape[1:] != block.ramp_shape[:2]:
             # all groups as one
             released = released.sum(axis=(1, 2), keepdims=True)
@@ -214,14 +214,16 @@ class Persistence(Effect):
         if not block.previous:
             return array
         if self.deficit:
-            array = array * self._kept(block).mean(axis=(0, 1))
-        rates, released = self._left(block)
+            array = array * self._remaining_share(block).mean(axis=(0, 1))
+        rates, released = self._released_rates(block)
         return array + np.tensordot(released.sum(axis=(1, 2)), rates, 1) / block.total_time
 
-    def _left(self, block):
+    def _released_rates(self, block):
         """Former rates of the rows of a block, and what comes free of one of 1, for each exposure before."""
         rates = np.stack([latent.rate.value[block.rows] for latent in block.previous])
-        return rates, np.stack([self.released(block.exposure, one.gap) for one in block.previous])
+        return rates, np.stack(
+            [self.released(block.exposure, exposed.gap) for exposed in block.previous]
+        )
 
 
 @dataclasses.dataclass(frozen=True)

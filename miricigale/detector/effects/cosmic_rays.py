@@ -96,16 +96,16 @@ class CosmicRays(Effect):
 
         Returns
         -------
-        where : `~numpy.ndarray` of int32, shape (3, n)
+        places : `~numpy.ndarray` of int32, shape (3, n)
             Group, counted through all integrations, row of the detector and column of each
             deposit, in the order of the groups.
         electrons : `~numpy.ndarray`, shape (n,)
             A pixel may have several in one group.
         """
         key, first, n_rows, settings = self._arguments(block)
-        where, electrons = cosmic_ray_deposits(key, first, n_rows, block.ramp_shape, settings)
-        where[1] += first
-        return where, electrons
+        places, electrons = cosmic_ray_deposits(key, first, n_rows, block.ramp_shape, settings)
+        places[1] += first
+        return places, electrons
 
     def _arguments(self, block):
         """Arguments of the kernels."""

@@ -63,13 +63,13 @@ class Residual(Effect):
         """Multiply surface brightness by the pattern."""
         reach = int(np.ceil(4 * self.correlation))
         n_row, n_col = array.shape
-        left, bottom = block.exposure.aperture.origin
+        x0, y0 = block.exposure.aperture.origin
         key = key_words(self.pattern, "detector", "residual", block.exposure.filter)
         # a row is drawn from the first column of the detector on, whatever part is read
-        white = np.empty((n_row + 2 * reach, left + n_col + 2 * reach))
+        white = np.empty((n_row + 2 * reach, x0 + n_col + 2 * reach))
         # rows beyond the detector have streams of their own
-        standard_normals(key, bottom + block.rows.start - reach + 10_000, white)
-        white = white[:, left:]
+        standard_normals(key, y0 + block.rows.start - reach + 10_000, white)
+        white = white[:, x0:]
         if reach:
             delta = np.zeros(2 * reach + 1)
             delta[reach] = 1.0

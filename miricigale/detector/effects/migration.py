@@ -55,7 +55,7 @@ class BrighterFatter(Effect):
 
     def apply(self, ramp, block):
         """Move the charge."""
-        most = np.float32(self.strength)
+        strength = np.float32(self.strength)
         scale = np.float32(0.5 / block.properties.full_well)
         pairs = (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])
         for integration in ramp:
@@ -64,10 +64,10 @@ class BrighterFatter(Effect):
                 charge = group - before
                 level = (group + before) * scale
                 before = group.copy()
-                for one, other in pairs:
-                    flow = np.clip(level[one] - level[other], -1, 1) * most
-                    flow *= np.where(flow > 0, charge[one], charge[other])
-                    moved[one] -= flow
-                    moved[other] += flow
+                for first, second in pairs:
+                    flow = np.clip(level[first] - level[second], -1, 1) * strength
+                    flow *= np.where(flow > 0, charge[first], charge[second])
+                    moved[first] -= flow
+                    moved[second] += flow
                 group += moved
         return ramp

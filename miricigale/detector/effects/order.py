@@ -84,22 +84,22 @@ def check_order(effects):
         raise argument_error("effects", "a tuple with one Photons in it", names or "none")
     if not isinstance(effects[-1], ADConversion):
         raise argument_error("effects", "a tuple that ends with ADConversion", names)
-    known = [(place, effect) for effect in effects if (place := place_of(effect)) is not None]
-    for (place, effect), (following, other) in itertools.pairwise(known):
-        wanted = f"in their order, {type(other).__name__} before {type(effect).__name__}"
+    placed = [(place, effect) for effect in effects if (place := place_of(effect)) is not None]
+    for (place, effect), (following, successor) in itertools.pairwise(placed):
+        wanted = f"in their order, {type(successor).__name__} before {type(effect).__name__}"
         check_that(place <= following, "effects", wanted, names)
 
 
 def keyed(effects, seed, exposure):
     """Pair each effect with the key of its streams; a second one of a kind has its own."""
-    seen = {}
+    counts = {}
     keyed = []
     for effect in effects:
         kind = type(effect).__name__
-        seen[kind] = seen.get(kind, 0) + 1
-        if seen[kind] == 1:
+        counts[kind] = counts.get(kind, 0) + 1
+        if counts[kind] == 1:
             name = kind
         else:
-            name = f"{kind} {seen[kind]}"
+            name = f"{kind} {counts[kind]}"
         keyed.append((effect, stream_key(seed, exposure, name)))
     return tuple(keyed)

@@ -203,9 +203,9 @@ class LastFrame(Effect):
         rows = np.arange(ramp.shape[2])
         before = rows - (block.rows.start + rows) % 2 - 2
         # rows whose preceding pair is not in the block are of its halo, or of the first pair
-        whole = before >= 0
+        has_frame = before >= 0
         last = ramp[:, -1]
-        pair = last[:, before[whole]] + last[:, before[whole] + 1]
+        pair = last[:, before[has_frame]] + last[:, before[has_frame] + 1]
         pull = np.float32(self.offset) - np.float32(0.5 * self.coupling) * pair
-        last[:, whole] += np.where(block.reference[whole], 0, pull)
+        last[:, has_frame] += np.where(block.reference[has_frame], 0, pull)
         return ramp
