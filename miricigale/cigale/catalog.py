@@ -158,9 +158,10 @@ def _choose(path, table, bands):
     have = table.colnames
     if bands is None:
         candidates = [name for name in have if name not in _OWN]
-        bands = [
-            x for x in candidates if error_column(x) in have or filter_of_band(x) or is_line(x)
-        ]
+        bands = []
+        for x in candidates:
+            if error_column(x) in have or filter_of_band(x) or is_line(x):
+                bands.append(x)
     lost = [name for name in ("id", "redshift", *bands) if name not in have]
     check_data(not lost, path, f"has no column {', '.join(lost)}; it has {', '.join(have)}")
     return [name for name in dict.fromkeys(bands) if not name.endswith("_err")]

@@ -172,10 +172,9 @@ class CatalogMap:
             rows = _translate_rows(translate)
         else:
             factors = translate.error
-            rows = [
-                (key, str(kind), float(factors.get(key, 1.0)))
-                for key, kind in translate.trans.items()
-            ]
+            rows = []
+            for key, kind in translate.trans.items():
+                rows.append((key, str(kind), float(factors.get(key, 1.0))))
         return cls(**_translated(rows, "the translate file"))
 
     @property

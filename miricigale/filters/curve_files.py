@@ -181,11 +181,10 @@ def _of_text(path, unit):
     lines = [line.strip() for line in lines]
     lines = [line for line in lines if line]
     comments = [line.lstrip("# ").strip() for line in lines if line.startswith("#")]
-    rows = [
-        line.partition("#")[0].replace(",", " ").split()
-        for line in lines
-        if not line.startswith("#")
-    ]
+    rows = []
+    for line in lines:
+        if not line.startswith("#"):
+            rows.append(line.partition("#")[0].replace(",", " ").split())
     if len(rows) > 2 and not (len(rows[0]) > 1 and all(map(_is_number, rows[0][:2]))):
         # names of columns without a mark, or what LePhare has there: a number of rows and a name
         comments.append(" ".join(rows.pop(0)))

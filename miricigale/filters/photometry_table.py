@@ -88,9 +88,10 @@ def as_photometry(data, bands, argument="photometry", *, units=None):
     bands = tuple(bands)
     names = _our_names(table.colnames, bands, argument)
     stated_units = _stated_units(table, names, bands, units)
-    magnitudes = [
-        name for name in bands if _is_ab(table, names.get(name)) and name not in stated_units
-    ]
+    magnitudes = []
+    for name in bands:
+        if _is_ab(table, names.get(name)) and name not in stated_units:
+            magnitudes.append(name)
     if (
         not magnitudes
         and not stated_units
@@ -243,17 +244,19 @@ def band_columns(table, argument="photometry"):
         *map(error_column, complete),
         *(f"{name}{_LIMIT}" for name in complete),
     }
-    names = {
-        theirs: ours for ours, theirs in columns.items() if ours in used_names and ours != theirs
-    }
+    names = {}
+    for ours, theirs in columns.items():
+        if ours in used_names and ours != theirs:
+            names[theirs] = ours
     return names, [name for name in complete if _is_ab(table, columns[name])]
 
 
 def our_names(colnames, argument="photometry"):
     """Our names of columns that are fluxes, magnitudes and errors of bands, and ids: dict by their names."""
-    return {
-        theirs: ours for ours, theirs in _our_names(colnames, FILTERS.names(), argument).items()
-    }
+    out = {}
+    for ours, theirs in _our_names(colnames, FILTERS.names(), argument).items():
+        out[theirs] = ours
+    return out
 
 
 def _our_names(colnames, bands, argument):

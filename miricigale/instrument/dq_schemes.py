@@ -50,11 +50,10 @@ def bad_pixels(values, header, get, path):
         If more than one bit is set and nothing says what the bits mean.
     """
     values = np.nan_to_num(np.asarray(values), nan=1.0).astype(np.int64)
-    planes = {
-        str(key).removeprefix(_PLANE): int(header[key])
-        for key in header
-        if str(key).startswith(_PLANE) and isinstance(header[key], int)
-    }
+    planes = {}
+    for key in header:
+        if str(key).startswith(_PLANE) and isinstance(header[key], int):
+            planes[str(key).removeprefix(_PLANE)] = int(header[key])
     if planes:
         names = [name for name in _BAD_PLANES if name in planes]
         bits = sum(1 << planes[name] for name in names)

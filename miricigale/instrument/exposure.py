@@ -394,7 +394,11 @@ class Exposure(Interactive):
         if isinstance(pattern, int):
             pattern, n = "4-point", pattern
         pa = self.pa_aper
-        return [
-            self.replace(pointing=tangent_offset(self.pointing, dx, dy, pa), dither=first + number)
-            for number, (dx, dy) in enumerate(dither_offsets(pattern, n, start=start))
-        ]
+        out = []
+        for number, (dx, dy) in enumerate(dither_offsets(pattern, n, start=start)):
+            out.append(
+                self.replace(
+                    pointing=tangent_offset(self.pointing, dx, dy, pa), dither=first + number
+                )
+            )
+        return out

@@ -127,9 +127,10 @@ class ExposureHistory:
         values = {name: meta[name] for name in names if meta.get(name) is not None}
         if meta.get("simulated"):
             values["origin"] = "simulated"
-        references = {
-            name: meta[f"reference_{name}"] for name in REFERENCES if f"reference_{name}" in meta
-        }
+        references = {}
+        for name in REFERENCES:
+            if f"reference_{name}" in meta:
+                references[name] = meta[f"reference_{name}"]
         return cls(**values, references=references)
 
     def meta(self):
@@ -195,7 +196,12 @@ def epoch_of(image):
     """
     meta = getattr(image, "meta", None) or {}
     keywords = meta.get("keywords", {})
-    header = {name: card[0] if isinstance(card, list) else card for name, card in keywords.items()}
+    header = {}
+    for name, card in keywords.items():
+        if isinstance(card, list):
+            header[name] = card[0]
+        else:
+            header[name] = card
     days = [header.get(name) for name in _MIDDLES[:3]]
     days += [meta.get("day"), *(header.get(name) for name in _MIDDLES[3:])]
     wcs = getattr(getattr(image, "wcs", None), "wcs", None)

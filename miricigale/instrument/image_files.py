@@ -175,12 +175,12 @@ def read_image(path, *, planes=()):
             mask=np.array(hdus["MASK"].data, bool) if "MASK" in hdus else None,
             meta=json.loads(header.get("META", "{}")),
         )
-        extra = [
-            with_own_bits(read_dq(hdus["DQ"]), hdus)
-            if name.lower() == "dq"
-            else np.array(hdus[name.upper()].data)
-            for name in planes
-        ]
+        extra = []
+        for name in planes:
+            if name.lower() == "dq":
+                extra.append(with_own_bits(read_dq(hdus["DQ"]), hdus))
+            else:
+                extra.append(np.array(hdus[name.upper()].data))
     if extra:
         return (image, *extra)
     return image

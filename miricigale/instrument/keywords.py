@@ -211,11 +211,11 @@ def kept_keywords(header):
     >>> kept_keywords(Header({"PROGRAM": "01345", "META": "{}", "NAXIS": 2}))
     {'PROGRAM': ['01345', '']}
     """
-    return {
-        card.keyword: [card.value, card.comment]
-        for card in header.copy(strip=True).cards
-        if _KEPT.fullmatch(card.keyword) and not _DROPPED.fullmatch(card.keyword)
-    }
+    out = {}
+    for card in header.copy(strip=True).cards:
+        if _KEPT.fullmatch(card.keyword) and not _DROPPED.fullmatch(card.keyword):
+            out[card.keyword] = [card.value, card.comment]
+    return out
 
 
 def placed_keywords(keywords, *, wcs=True):

@@ -357,7 +357,12 @@ def mosaic_wcs(exposures, pixel_scale):
     """
     from astropy.wcs import WCS
 
-    wcss = [getattr(item, "wcs", item) if not isinstance(item, WCS) else item for item in exposures]
+    wcss = []
+    for item in exposures:
+        if not isinstance(item, WCS):
+            wcss.append(getattr(item, "wcs", item))
+        else:
+            wcss.append(item)
     check_that(wcss, "exposures", "at least one exposure", "none")
     ra = []
     dec = []

@@ -47,9 +47,9 @@ class _Panels:
         scale = float(proj_plane_pixel_scales(first.wcs)[0] * 3600)
         factor = max(1, round(finest / scale))
         bad = ~np.isfinite(filled(first))
-        planes = [
-            block_reduce(np.where(bad, np.nan, filled(image)), factor, np.mean) for image in images
-        ]
+        planes = []
+        for image in images:
+            planes.append(block_reduce(np.where(bad, np.nan, filled(image)), factor, np.mean))
         n = 2 * round(0.5 * BOX / (factor * scale)) + 1
         sigma = float(mad_std(planes[-1][np.isfinite(planes[-1])]))
         if not sigma > 0:

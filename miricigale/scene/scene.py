@@ -323,11 +323,10 @@ class Scene(Interactive):
         ellipse = {"radius": radius, "axis_ratio": ratio}
         ellipse["position_angle"] = np.nan_to_num(catalog["position_angle"].to_value(u.rad))[rows]
         radius, ratio, theta = ellipse_to_pixels(jacobian, **ellipse)
-        images = {
-            k: self._cutouts[row].pieces(jacobian[k])
-            for k, row in enumerate(rows[:n_profiles])
-            if row in self._cutouts
-        }
+        images = {}
+        for k, row in enumerate(rows[:n_profiles]):
+            if row in self._cutouts:
+                images[k] = self._cutouts[row].pieces(jacobian[k])
         sources = {"is_sersic": is_sersic, "r_eff": radius, "axis_ratio": ratio, "theta": theta}
         sources |= {"x": x[rows], "y": y[rows], "n": catalog["sersic_index"][rows]}
         light = np.where(profile, galaxy[rows], agn[rows])

@@ -157,10 +157,13 @@ class Component:
     @property
     def parameters(self):
         """Parameters with the defaults of this instance: dict of name to Parameter."""
-        return {
-            name: par.replace(self.__dict__[name]) if name in self.__dict__ else par
-            for name, par in type(self).declared().items()
-        }
+        out = {}
+        for name, par in type(self).declared().items():
+            if name in self.__dict__:
+                out[name] = par.replace(self.__dict__[name])
+            else:
+                out[name] = par
+        return out
 
     def nodes(self):
         """Wavelengths in um between which the component's spectra are straight lines."""

@@ -54,10 +54,9 @@ def galaxy_quantities(stars, rows, absorbed, sums, reference_row=0):
         magnitude = -2.5 * np.log10(bands)
         a_v = 2.5 * np.log10(stars.visual[rows] / visual)
     step = _LOG_UV - _LOG_UV.mean()
-    out = {
-        name: getattr(stars, name)[rows]
-        for name in ("stellar_mass", "sfr", "sfr_10myr", "sfr_100myr", "age_mass", "age_light")
-    }
+    out = {}
+    for name in ("stellar_mass", "sfr", "sfr_10myr", "sfr_100myr", "age_mass", "age_light"):
+        out[name] = getattr(stars, name)[rows]
     out |= {
         "stellar_mass_formed": np.ones(len(rows)),
         "dust_luminosity": absorbed,
@@ -105,11 +104,13 @@ def scaled_quantities(model, values, mass, redshift, far, parameters):
 
     ``far`` is the luminosity distance in m, ``parameters`` holds values of all parameters.
     """
-    out = {
-        name: values[name] * mass if entry.extensive else values[name]
-        for name, entry in model.derived_columns().items()
-        if entry.of != "xray"
-    }
+    out = {}
+    for name, entry in model.derived_columns().items():
+        if entry.of != "xray":
+            if entry.extensive:
+                out[name] = values[name] * mass
+            else:
+                out[name] = values[name]
     xray = model.component("xray")
     if xray is not None:
         xray_values = {name: parameters[name] for name in xray.parameters}

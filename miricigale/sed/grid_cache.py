@@ -25,17 +25,18 @@ def grid_key(model, axes, filters):
     Code is known by the versions that it states, ``Component.version`` of a component and its
     bases and ``VERSION`` of what all share: a change of numbers raises one of them.
     """
-    parts = [
-        {
-            "name": c.name,
-            "versions": [vars(t)["version"] for t in type(c).__mro__ if "version" in vars(t)],
-            "settings": c.settings,
-            "defaults": {n: p.default for n, p in c.parameters.items()},
-            "data": c.fingerprint,
-            "packages": {name: importlib.metadata.version(name) for name in c.packages},
-        }
-        for c in model.components
-    ]
+    parts = []
+    for c in model.components:
+        parts.append(
+            {
+                "name": c.name,
+                "versions": [vars(t)["version"] for t in type(c).__mro__ if "version" in vars(t)],
+                "settings": c.settings,
+                "defaults": {n: p.default for n, p in c.parameters.items()},
+                "data": c.fingerprint,
+                "packages": {name: importlib.metadata.version(name) for name in c.packages},
+            }
+        )
     cosmology = model.cosmology
     content = {
         "versions": [chain.VERSION, filter_curves.VERSION],

@@ -63,7 +63,12 @@ def draw_fluxes(grid, index, scale, names, extra, model):
         flux = grid.flux(z, g, k, f)[:, columns]
         out[row][:, in_grid] = scale[row][:, None] * flux
     if extra and len(index):
-        bands = [name if band is None else band for name, band in extra.items()]
+        bands = []
+        for name, band in extra.items():
+            if band is None:
+                bands.append(name)
+            else:
+                bands.append(band)
         extra_columns = [names.index(name) for name in extra]
         flux = model_fluxes(model, grid, index, bands)
         out[:, :, extra_columns] = flux * scale[:, :, None]

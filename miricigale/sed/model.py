@@ -407,10 +407,12 @@ class SEDModel(Interactive):
         for name in parameters:
             if name not in self._parameters:
                 raise unknown_name("parameter", name, self._parameters)
-        out = {
-            name: par.check(parameters[name]) if name in parameters else par.default
-            for name, par in self._parameters.items()
-        }
+        out = {}
+        for name, par in self._parameters.items():
+            if name in parameters:
+                out[name] = par.check(parameters[name])
+            else:
+                out[name] = par.default
         for component in self.components:
             why = component.invalid(out)
             if why:

@@ -233,10 +233,9 @@ class SED(Frozen, Interactive):
         stretch = (1.0 + redshift) / (1.0 + self.redshift)
         ratio = distance(self.redshift, cosmology) / distance(redshift, cosmology)
         fnu = self.fnu * float(stretch * ratio**2)
-        parts = {
-            name: part.redshifted(redshift, cosmology=cosmology)
-            for name, part in self.components.items()
-        }
+        parts = {}
+        for name, part in self.components.items():
+            parts[name] = part.redshifted(redshift, cosmology=cosmology)
         return self.replace(wave=self.wave * stretch, fnu=fnu, redshift=redshift, components=parts)
 
     def synthetic_flux(self, band):

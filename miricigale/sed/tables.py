@@ -64,10 +64,13 @@ def _columns(model, table):
     """Values of every parameter for every row, in the declared units."""
     wanted = "a table with a column 'redshift'"
     check_that("redshift" in table.colnames, "table", wanted, table.colnames)
-    return {
-        name: par.array(table[name]) if name in table.colnames else np.full(len(table), par.default)
-        for name, par in model.parameters.items()
-    }
+    out = {}
+    for name, par in model.parameters.items():
+        if name in table.colnames:
+            out[name] = par.array(table[name])
+        else:
+            out[name] = np.full(len(table), par.default)
+    return out
 
 
 def _warn_of_slips(model, names):

@@ -149,7 +149,12 @@ class RecordFolder(FileFolder):
         self.facts = {}
         self.records = {}
         paths = [self.path(name) for name in self._manifests]
-        texts = [path.read_bytes() if path.is_file() else None for path in paths]
+        texts = []
+        for path in paths:
+            if path.is_file():
+                texts.append(path.read_bytes())
+            else:
+                texts.append(None)
         journal = self._journal
         self.is_sound = texts[0] is not None and texts[0] == texts[1] and not journal.is_file()
         for path, text in zip(paths, texts, strict=True):

@@ -57,11 +57,14 @@ def undated(meta):
     meta : dict
         For files that are to be the same bytes for the same content.
     """
-    return {
-        key: undated(value) if isinstance(value, dict) else value
-        for key, value in meta.items()
-        if key not in ("created", "keywords")
-    }
+    out = {}
+    for key, value in meta.items():
+        if key not in ("created", "keywords"):
+            if isinstance(value, dict):
+                out[key] = undated(value)
+            else:
+                out[key] = value
+    return out
 
 
 def fits_meta(meta):

@@ -152,10 +152,9 @@ def mask_of(values):
     if kind == "O" and not hasattr(values, "unit"):
         objects = np.asarray(values, dtype=object)
         if objects.shape == shape:
-            gone = [
-                v is None or v is np.ma.masked or type(v).__name__ == "NAType"
-                for v in objects.ravel()
-            ]
+            gone = []
+            for v in objects.ravel():
+                gone.append(v is None or v is np.ma.masked or type(v).__name__ == "NAType")
             mask = mask | np.array(gone, dtype=bool).reshape(shape)
     return mask
 

@@ -74,9 +74,10 @@ def _is_read_whole(path, hdu):
     """Whether astropy reads no pieces of a FITS table: one in ASCII, or with columns of variable length."""
     with open_fits(path, wanted="a catalog") as hdus:
         tables = [item for i, item in enumerate(hdus) if hdu in (None, i, item.name)]
-        kinds = [
-            type(item) for item in tables if isinstance(item, (fits.TableHDU, fits.BinTableHDU))
-        ]
+        kinds = []
+        for item in tables:
+            if isinstance(item, (fits.TableHDU, fits.BinTableHDU)):
+                kinds.append(type(item))
         return kinds == [fits.TableHDU] or any(map(ragged_columns, tables))
 
 

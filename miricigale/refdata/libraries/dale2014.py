@@ -76,10 +76,9 @@ def read_dale2014(path):
     removed = emission - starlight
     negative = int(np.sum(removed < 0))
     share = np.max(starlight[:, 0] / emission[:, 0])
-    spectra = {
-        name: part / np.trapezoid(part, nodes, axis=1)[:, None]
-        for name, part in (("removed", np.maximum(removed, 0.0)), ("kept", emission))
-    }
+    spectra = {}
+    for name, part in (("removed", np.maximum(removed, 0.0)), ("kept", emission)):
+        spectra[name] = part / np.trapezoid(part, nodes, axis=1)[:, None]
     files = {name: hashlib.sha256(data).hexdigest() for name, data in sorted(contents.items())}
     changed = [name for name, sha in KNOWN.items() if files[name] != sha]
     return LibraryTable(

@@ -157,11 +157,11 @@ class LibraryTable:
         missing : dict of str to tuple of float
             Name of the axis to the values that the library has; empty if it has them all.
         """
-        return {
-            name: tuple(levels.tolist())
-            for name, levels in self.levels.items()
-            if np.any(self._codes(name, np.atleast_1d(values.get(name, []))) < 0)
-        }
+        out = {}
+        for name, levels in self.levels.items():
+            if np.any(self._codes(name, np.atleast_1d(values.get(name, []))) < 0):
+                out[name] = tuple(levels.tolist())
+        return out
 
     @property
     def complete(self):

@@ -287,10 +287,11 @@ def _refined(wave, dust, fine):
 @cached_by_file(maxsize=4096)
 def _refusal(path, axes):
     values = dict(zip(SKIRTOR_AXES, axes, strict=True))
-    parts = [
-        f"'{name}' must be one of {', '.join(f'{v:g}' for v in available)}, got {values[name]:g}"
-        for name, available in open_library(path, Skirtor2016.resource).missing(**values).items()
-    ]
+    parts = []
+    for name, available in open_library(path, Skirtor2016.resource).missing(**values).items():
+        parts.append(
+            f"'{name}' must be one of {', '.join(f'{v:g}' for v in available)}, got {values[name]:g}"
+        )
     if parts:
         return f"{'; '.join(parts)} (the library at {path} has no more)"
     return None
